@@ -13,6 +13,6 @@ fn main() {
     println!("cargo:rustc-link-search={}", out.display());
     // cortex-m-rt's linker script, which includes memory.x.
     println!("cargo:rustc-link-arg-bins=-Tlink.x");
-    // Without it the linker pads the segments to pages, for an operating system that is not there.
+    // Without it the linker pads the segments to pages, as an operating system would need.
     println!("cargo:rustc-link-arg-bins=--nmagic");
 }

@@ -1,4 +1,5 @@
-//! Tests that run the firmware's ELF are compiled as ignored where there is none: a test that shows nothing must not say "ok".
+//! Tests that run the firmware's ELF are compiled as ignored if there is none: a test that checks nothing must not report
+//! "ok".
 
 fn main() {
     println!("cargo:rerun-if-changed=build.rs");

@@ -1,14 +1,14 @@
-//! Why the firmware failed, in memory that a reset leaves as it is.
+//! Why the firmware failed, in memory that a reset does not change.
 //!
-//! The log is written by a panic, a fault or the next start, and can be read until the chip loses its power. After that
-//! its memory may hold anything, which the checksum shows.
+//! A panic, a fault or the next start writes the log; it can be read until the chip loses power. After that the memory
+//! may hold anything, which the checksum reveals.
 
 use core::fmt::{self, Write};
 
 use cantap_wire::framing::checksum;
 use cantap_wire::message::{Failures, MAX_FAILURE_TEXT};
 
-/// The log as it lies in memory. All contents are valid values; not all of them are a log.
+/// The log as it is in memory. Any contents are valid values, but not all are a log.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 pub struct FailureLog {
@@ -19,11 +19,11 @@ pub struct FailureLog {
 }
 
 impl FailureLog {
-    /// What it holds: nothing, if the memory was lost.
+    /// The log's contents; empty if the memory was lost.
     pub fn failures(&self) -> Failures {
         let len = (self.len as usize).min(MAX_FAILURE_TEXT);
         match core::str::from_utf8(&self.text[..len]) {
-            // Cannot be too long: it was just cut.
+            // Cannot be too long: it has just been cut.
             Ok(text) if self.checksum == self.sum() => {
                 Failures { count: self.count, last: text.try_into().unwrap_or_default() }
             }
@@ -31,7 +31,7 @@ impl FailureLog {
         }
     }
 
-    /// Adds a failure, in place of the one before. Text that does not fit is cut; a line's end becomes a space.
+    /// Adds a failure, replacing the previous one. Text that does not fit is cut; line ends become spaces.
     pub fn add(&mut self, what: fmt::Arguments) {
         self.count = self.failures().count.wrapping_add(1);
         self.len = 0;
@@ -55,7 +55,7 @@ impl Write for FailureLog {
             let bytes = letter.encode_utf8(&mut bytes).as_bytes();
             let from = self.len as usize;
             let Some(room) = self.text.get_mut(from..from + bytes.len()) else {
-                // Nothing behind what was cut.
+                // Nothing may follow the cut.
                 return Err(fmt::Error);
             };
             room.copy_from_slice(bytes);

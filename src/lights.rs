@@ -1,23 +1,23 @@
 //! What the LEDs show: power, traffic, errors, and a pattern to find the device by.
 
-/// A traffic light that was lit by a frame stays so for this long, and is dark as long after it, in ms: at full
-/// load it flickers at 10 Hz.
+/// A frame lights the traffic LED for this long, in ms, after which it is dark for the same time: at full load
+/// it flickers at 10 Hz.
 const FLICKER_MS: u16 = 50;
 /// Half a period of the pattern for errors, in ms.
 const ERROR_MS: u16 = 125;
-/// An error is shown at least for this long, in ms.
+/// An error is shown for at least this long, in ms.
 const ERROR_FOR_MS: u16 = 1_000;
 /// Half a period of the pattern that shows where the device is, in ms.
 const IDENTIFY_MS: u16 = 60;
 
-/// A flash of the pattern for a clock that does not start, and the pause to the next, in ms.
+/// Length of each flash of the pattern for a clock that does not start, and of the pause after it, in ms.
 const NO_CLOCK_FLASH_MS: u32 = 100;
 /// Flashes of that pattern.
 const NO_CLOCK_FLASHES: u32 = 3;
 /// Its period in ms: the flashes, then dark for longer than any other pattern is.
 pub const NO_CLOCK_MS: u32 = 1_500;
 
-/// The pattern for a clock that does not start, so that nothing but it runs: three short flashes and a second in the dark.
+/// The pattern for a clock that does not start, when nothing else runs: three short flashes, then dark for a second.
 pub const fn no_clock(at_ms: u32) -> Lit {
     let half = at_ms % NO_CLOCK_MS / NO_CLOCK_FLASH_MS;
     let flash = half < 2 * NO_CLOCK_FLASHES && half.is_multiple_of(2);
@@ -45,7 +45,7 @@ pub struct Lit {
 }
 
 impl Lit {
-    /// For a board with a single LED: it is on, goes out for frames, and blinks slower for errors.
+    /// For a board with a single LED: it is on, goes out briefly for frames, and blinks more slowly for errors.
     pub const fn single(self) -> bool {
         self.power && !self.traffic && !self.error
     }
@@ -53,9 +53,9 @@ impl Lit {
 
 /// The LEDs' state.
 #[derive(Debug, Default)]
-#[expect(clippy::struct_field_names, reason = "a unit belongs into a name")]
+#[expect(clippy::struct_field_names, reason = "a unit belongs in a name")]
 pub struct Lights {
-    /// Counts milliseconds and wraps.
+    /// Millisecond count; wraps.
     now_ms: u16,
     traffic_left_ms: u16,
     error_left_ms: u16,
@@ -73,7 +73,7 @@ impl Lights {
         self.identify_left_ms = seconds as u32 * 1000;
     }
 
-    /// To be called each millisecond.
+    /// Call once a millisecond.
     pub fn tick(&mut self, activity: Activity) -> Lit {
         self.now_ms = self.now_ms.wrapping_add(1);
         self.traffic_left_ms = match self.traffic_left_ms {

@@ -4,15 +4,15 @@
 //! |---|---|---|
 //! | 5 | both channels' receive and transmit interrupts: the stamp, and nothing else | a late stamp is a wrong one |
 //! | 4 | draining both FIFOs, confirming, error interrupts, the transmission alarm | a FIFO of three frames waits 141 µs |
-//! | 3 | a receive pin that is measured | USB would blur it, and capture must not wait |
+//! | 3 | edges of a receive pin being measured | USB would blur it, and capture must not wait |
 //! | 2 | USB, the millisecond tick | a host can be made to wait |
 //! | – | idle | sleeps |
 //!
-//! Everything at one priority runs to its end before the next begins, so what only it touches needs no lock. Of those that wait, the
-//! lowest vector goes first (Armv7-M architecture reference manual, "Exception number and priority"): at priority 4 the two that drain
-//! have the lowest, so that transmission, however much of it a host asks for, never goes before capture.
-//! Priority 2 reaches what priority 4 owns by RTIC's lock, which raises BASEPRI and so never holds up a stamp. Nothing masks
-//! priority 5: all of USB runs at priority 2, with a driver that needs no mask (`hw/usb`).
+//! Everything at one priority runs to its end before the next begins, so what only it touches needs no lock. Of those pending, the
+//! lowest vector goes first (Armv7-M architecture reference manual, "Exception number and priority"): at priority 4 the two draining
+//! tasks have the lowest vectors, so transmission never goes before capture, however much of it a host asks for. Priority 2 reaches
+//! what priority 4 owns through RTIC's lock, which raises BASEPRI and so never holds up a stamp. Nothing masks priority 5: all of USB
+//! runs at priority 2, with a driver that needs no mask (`hw/usb`).
 #![cfg_attr(target_os = "none", no_std, no_main)]
 
 #[cfg(target_os = "none")]
@@ -54,9 +54,9 @@ mod app {
     struct Shared {
         /// Ceiling 4: what the tasks of priority 4 own.
         tap: Tap,
-        /// To be read at any priority.
+        /// Readable at any priority.
         stamp: StampTimer,
-        /// Takes down edges of the receive pin that is measured.
+        /// Notes the edges of the receive pin being measured.
         catcher: EdgeCatcher,
         /// The switches of CAN1's interrupts.
         can1_bells: Bells<0>,
@@ -87,7 +87,7 @@ mod app {
         watchdog: Watchdog,
     }
 
-    // What is large is made here, in its place: a value that `init` returned would pass over the stack.
+    // Large objects are constructed here, in place: a value returned by `init` would pass over the stack.
     #[init(local = [
         records: RecordQueue = RecordQueue::new(),
         tx_memory: [TxQueue; CHANNELS] = [const { TxQueue::new() }; CHANNELS],
@@ -141,8 +141,8 @@ mod app {
 
     /// Stamps the end of a frame on CAN1, and leaves the frame to [`can1_drain`].
     ///
-    /// Priority 5, the highest, and a dozen instructions: each microsecond of delay is one in the stamp. What can delay it is
-    /// [`can2_rx0`] and the two transmit interrupts, a dozen instructions each.
+    /// Priority 5, the highest, and a dozen instructions: each microsecond of delay makes the stamp a microsecond late. Only
+    /// [`can2_rx0`] and the two transmit interrupts can delay it, by a dozen instructions each.
     #[task(binds = CAN1_RX0, priority = 5, shared = [&stamp, &can1_bells, &can1_entered])]
     fn can1_rx0(cx: can1_rx0::Context) {
         cx.shared.can1_entered.store(cx.shared.stamp.now(), Ordering::Relaxed);
@@ -150,7 +150,7 @@ mod app {
         rtic::pend(Interrupt::CAN1_RX1);
     }
 
-    /// As [`can1_rx0`], for CAN2.
+    /// Same as [`can1_rx0`], for CAN2.
     #[task(binds = CAN2_RX0, priority = 5, shared = [&stamp, &can2_bells, &can2_entered])]
     fn can2_rx0(cx: can2_rx0::Context) {
         cx.shared.can2_entered.store(cx.shared.stamp.now(), Ordering::Relaxed);
@@ -161,7 +161,8 @@ mod app {
     /// Moves frames from CAN1's FIFO 0 to the record queue. FIFO 1 is not used, and its interrupt raises this task.
     ///
     /// Priority 4: FIFO 0 holds three frames (RM0090 Rev 21 §32.7.3) and no frame is shorter than 47 µs at 1 Mbit/s,
-    /// so starting later than 141 µs after the first loses the fourth. `otg_fs` (2) may wait: USB can NAK.
+    /// so if this starts more than 141 µs after the first frame, the fourth is lost. `otg_fs` (2) may wait: USB can
+    /// NAK.
     #[task(binds = CAN1_RX1, priority = 4, shared = [tap, &can1_bells, &can1_entered])]
     fn can1_drain(mut cx: can1_drain::Context) {
         let entered = cx.shared.can1_entered.load(Ordering::Relaxed);
@@ -171,7 +172,7 @@ mod app {
         cx.shared.can1_bells.open_receive();
     }
 
-    /// As [`can1_drain`], for CAN2. DMA is not used, and the interrupt of its first stream raises this task: the vector of CAN2's own
+    /// Same as [`can1_drain`], for CAN2. DMA is not used, and the interrupt of its first stream raises this task: the vector of CAN2's own
     /// FIFO 1 is above those of the tasks that send, which would then go first.
     #[task(binds = DMA1_STREAM0, priority = 4, shared = [tap, &can2_bells, &can2_entered])]
     fn can2_drain(mut cx: can2_drain::Context) {
@@ -184,7 +185,7 @@ mod app {
 
     /// Stamps the end of a transmission on CAN1, and leaves the mailbox to [`can1_sent`].
     ///
-    /// Priority 5, as [`can1_rx0`] and for the same reason: a confirmation's stamp is as good as a frame's.
+    /// Priority 5, as [`can1_rx0`] and for the same reason: a confirmation's stamp must be as good as a frame's.
     #[task(binds = CAN1_TX, priority = 5, shared = [&stamp, &can1_bells, &can1_sent_at])]
     fn can1_tx(cx: can1_tx::Context) {
         cx.shared.can1_sent_at.store(cx.shared.stamp.now(), Ordering::Relaxed);
@@ -192,7 +193,7 @@ mod app {
         rtic::pend(Interrupt::USART2);
     }
 
-    /// As [`can1_tx`], for CAN2.
+    /// Same as [`can1_tx`], for CAN2.
     #[task(binds = CAN2_TX, priority = 5, shared = [&stamp, &can2_bells, &can2_sent_at])]
     fn can2_tx(cx: can2_tx::Context) {
         cx.shared.can2_sent_at.store(cx.shared.stamp.now(), Ordering::Relaxed);
@@ -202,9 +203,9 @@ mod app {
 
     /// Fills CAN1's mailboxes again and confirms what was sent. USART2 is not used, and its interrupt raises this task.
     ///
-    /// Priority 4, because it writes records. Back-to-back transmission goes on if this starts before the other two
-    /// mailboxes are empty: 94 µs at 1 Mbit/s. Later, the bus has a pause. A transmission that ends before this has emptied the mailboxes
-    /// is stamped when it is found.
+    /// Priority 4, because it writes records. Transmission stays back to back if this starts before the other two mailboxes are empty: 94
+    /// µs at 1 Mbit/s. If it starts later, there is a pause on the bus. A further transmission that ends before this has emptied the
+    /// mailboxes is stamped when it is found.
     #[task(binds = USART2, priority = 4, shared = [tap])]
     fn can1_sent(mut cx: can1_sent::Context) {
         cx.shared.tap.lock(|Tap { capture, traffic, alarm }| {
@@ -213,7 +214,7 @@ mod app {
         });
     }
 
-    /// As [`can1_sent`], for CAN2, with USART3.
+    /// Same as [`can1_sent`], for CAN2, with USART3.
     #[task(binds = USART3, priority = 4, shared = [tap])]
     fn can2_sent(mut cx: can2_sent::Context) {
         cx.shared.tap.lock(|Tap { capture, traffic, alarm }| {
@@ -224,8 +225,8 @@ mod app {
 
     /// Records CAN1's errors and changes of state.
     ///
-    /// Priority 4, because it writes records. The controller keeps one error: a second one before this starts, at least
-    /// 14 bits later, replaces it uncounted.
+    /// Priority 4, because it writes records. The controller keeps one error: a second, which comes at least 14 bit
+    /// times later, replaces it uncounted if this has not started.
     #[task(binds = CAN1_SCE, priority = 4, shared = [tap, &stamp])]
     fn can1_sce(mut cx: can1_sce::Context) {
         let entered = cx.shared.stamp.now();
@@ -234,7 +235,7 @@ mod app {
         });
     }
 
-    /// As [`can1_sce`], for CAN2.
+    /// Same as [`can1_sce`], for CAN2.
     #[task(binds = CAN2_SCE, priority = 4, shared = [tap, &stamp])]
     fn can2_sce(mut cx: can2_sce::Context) {
         let entered = cx.shared.stamp.now();
@@ -245,7 +246,7 @@ mod app {
 
     /// Sends what is due.
     ///
-    /// Priority 4, because it writes mailboxes and records. Each microsecond of delay is one that a frame leaves late.
+    /// Priority 4, because it writes mailboxes and records. Each microsecond of delay makes a frame a microsecond late.
     #[task(binds = TIM2, priority = 4, shared = [tap])]
     fn tim2(mut cx: tim2::Context) {
         cx.shared.tap.lock(|Tap { capture, traffic, alarm }| {
@@ -254,23 +255,24 @@ mod app {
         });
     }
 
-    /// Takes down the edges of a receive pin that is measured: CAN1's or CAN2's, as the board has them. They never come while its
-    /// controller is on the bus.
+    /// Notes the edges of the receive pin being measured: CAN1's or CAN2's, depending on the board. Its interrupt is never
+    /// enabled while its controller is on the bus.
     ///
-    /// Priority 3: above USB, which may wait for the 6 ms that it lasts at most, and below everything that captures or sends. An edge of
-    /// 1 Mbit/s is over after a microsecond: what comes too late is marked, and a frame of it lost to the measurement.
+    /// Priority 3: above USB, which can wait for the 6 ms that this lasts at most, and below everything that captures or sends. At 1
+    /// Mbit/s an edge is followed by the next after a microsecond: edges noted too late are marked, and their frame is lost to the
+    /// measurement.
     #[task(binds = EXTI15_10, priority = 3, shared = [&catcher])]
     fn exti15_10(cx: exti15_10::Context) {
         cx.shared.catcher.catch();
     }
 
-    /// As [`exti15_10`], for a pin of the lines 5 to 9.
+    /// Same as [`exti15_10`], for a pin of the lines 5 to 9.
     #[task(binds = EXTI9_5, priority = 3, shared = [&catcher])]
     fn exti9_5(cx: exti9_5::Context) {
         cx.shared.catcher.catch();
     }
 
-    /// As [`exti15_10`], for a pin of line 0.
+    /// Same as [`exti15_10`], for a pin of line 0.
     #[task(binds = EXTI0, priority = 3, shared = [&catcher])]
     fn exti0(cx: exti0::Context) {
         cx.shared.catcher.catch();
@@ -278,7 +280,7 @@ mod app {
 
     /// Talks to the host.
     ///
-    /// Priority 2: the host waits for as long as it must (USB NAK), except that a bus reset wants an answer within 10 ms
+    /// Priority 2: the host waits as long as necessary (USB NAK), except that a bus reset wants an answer within 10 ms
     /// (USB 2.0 §7.1.7.5) and a control request within 50 ms (§9.2.6.4), or the enumeration fails.
     #[task(binds = OTG_FS, priority = 2, shared = [tap, session, usb, controls])]
     fn otg_fs(cx: otg_fs::Context) {
@@ -287,17 +289,17 @@ mod app {
         session.poll(usb, &mut Access { tap, controls });
     }
 
-    /// Once a millisecond: flushes batches, keeps time, looks after what no interrupt reports, feeds the watchdog.
+    /// Once a millisecond: flushes batches, keeps time, handles what no interrupt reports, feeds the watchdog.
     ///
-    /// Priority 2, with USB, because it talks to the host too. A tick that is late by milliseconds delays a batch; one that
-    /// is late by four seconds restarts the chip.
+    /// Priority 2, with USB, because it talks to the host too. A tick some milliseconds late delays a batch; one four
+    /// seconds late restarts the chip.
     #[task(binds = TIM7, priority = 2, local = [tick, watchdog], shared = [tap, session, usb, controls])]
     fn tim7(cx: tim7::Context) {
         let tim7::SharedResources { mut tap, session, usb, controls, .. } = cx.shared;
         cx.local.tick.acknowledge();
         cx.local.watchdog.feed();
-        // Short locks, so that the transmission alarm can come between them: it is 14 µs early, and a lock, a drain and its own
-        // work have to fit.
+        // Short locks, so that the transmission alarm can come between them: it fires 14 µs early, and a lock, a drain and its
+        // own work have to fit into that.
         for channel in Channel::ALL {
             let is_open = tap.lock(|Tap { capture, traffic, alarm }| {
                 capture.on_tick_errors(channel, &mut traffic[channel.index()], alarm)
@@ -321,7 +323,7 @@ mod app {
     fn idle(_: idle::Context) -> ! {
         loop {
             cortex_m::asm::wfi();
-            // A debugger keeps the clock on in sleep; see `hw::start`.
+            // With a debugger attached, the clock keeps running in sleep; see `hw::start`.
             cortex_m::asm::isb();
         }
     }

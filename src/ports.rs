@@ -1,8 +1,8 @@
-//! What the logic needs from hardware, as small traits: the board implements them over registers, tests
+//! What the logic needs from hardware, as small traits: the board implements them with registers, tests
 //! and the virtual device with fakes.
 //!
-//! A CAN controller has two sides. [`Traffic`] is touched by the tasks of priority 4 only,
-//! [`Control`] by commands only; the registers behind them are disjoint, so neither waits for the other.
+//! A CAN controller has two sides. [`Traffic`] is touched only by the tasks of priority 4, [`Control`]
+//! only by commands; the registers behind them are disjoint, so neither waits for the other.
 
 use cantap_wire::Frame;
 use cantap_wire::message::{ChannelConfig, Failures, RegisterSet};
@@ -17,8 +17,8 @@ pub trait Clock {
     /// Calls the alarm interrupt at this time; at once if it has passed (by less than half the
     /// timer's range); never if `None`.
     fn set_alarm(&self, at: Option<u32>);
-    /// Ticks by which the alarm is set before its time, so that an interrupt that is under way then has ended when
-    /// the time comes; the rest is left to [`Self::wait_until`]. None where no interrupt is ever late.
+    /// How many ticks early the alarm is set, so that an interrupt under way has ended when the time comes;
+    /// [`Self::wait_until`] waits for the rest. 0 where no interrupt is ever late.
     const ALARM_EARLY_TICKS: u32 = 0;
     /// Waits for a time that is at most one and a half times [`Self::ALARM_EARLY_TICKS`] ahead.
     fn wait_until(&self, _at: u32) {}
@@ -37,7 +37,7 @@ pub enum Outcome {
     Aborted,
 }
 
-/// The controller's error status.
+/// A controller's error status.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ErrorStatus {
     /// The error since the last call, if there was one.
@@ -63,23 +63,23 @@ pub trait Traffic {
     fn look(&mut self) -> (u8, bool) {
         (self.pending(), self.take_overrun())
     }
-    /// Writes a frame to a free mailbox, where it waits for [`Self::request`] or is overwritten by the next. Returns the
-    /// mailbox, a number below [`crate::bus::mailboxes::MAILBOXES`], or `None` if all are taken.
+    /// Writes a frame to a free mailbox, where it waits for [`Self::request`], or is overwritten by the next call.
+    /// Returns the mailbox, a number below [`crate::bus::mailboxes::MAILBOXES`], or `None` if all are taken.
     fn prepare(&mut self, frame: &Frame) -> Option<u8>;
     /// Requests transmission of the frame that was last prepared, which is in this mailbox. Takes next to no time; frames
     /// leave in the order of these calls.
     fn request(&mut self, mailbox: u8);
-    /// When the transmit interrupt stamped the first of the transmissions that have finished and were not taken; `None` if there are
-    /// none, or where the interrupt hands its stamp over itself.
+    /// When the transmit interrupt stamped the first of the finished transmissions not yet taken; `None` if there are none, or where
+    /// the interrupt passes on its stamp itself.
     fn stamped(&self) -> Option<u32> {
         None
     }
-    /// Nothing that has finished is left: the interrupt may stamp the next.
+    /// All finished transmissions have been taken: the interrupt may stamp the next.
     fn await_finished(&mut self) {}
     /// Takes one finished transmission: its mailbox and how it ended.
     fn take_finished(&mut self) -> Option<(u8, Outcome)>;
-    /// Asks for every mailbox to be given up. Those that can still be are reported as
-    /// [`Outcome::Aborted`], a frame already on the bus may end as sent.
+    /// Requests the abort of every mailbox. Those that can still be aborted are reported as
+    /// [`Outcome::Aborted`]; a frame already on the bus may end as sent.
     fn abort(&mut self);
     /// Reads and clears what the error interrupt reports.
     fn take_errors(&mut self) -> ErrorStatus;
@@ -91,8 +91,8 @@ pub trait Traffic {
 pub trait Control {
     /// Asks the controller to leave the bus. It does so when the frame on the bus, if any, has ended.
     fn stop(&mut self);
-    /// Makes it leave the bus at once, even in the middle of a frame: for a bus that is stuck. To be called again and again until
-    /// [`Self::is_stopped`]. It is a reset, behind which nothing is as it was written: the configuration, the filters of both
+    /// Makes it leave the bus at once, even in the middle of a frame: for a bus that is stuck. Call it repeatedly until
+    /// [`Self::is_stopped`]. It is a reset, after which nothing is as it was written: the configuration, the filters of both
     /// controllers, and perhaps not even the mailboxes' abort.
     fn halt(&mut self);
     /// Whether it has left the bus.
@@ -106,18 +106,18 @@ pub trait Control {
 
 /// The acceptance filters of all controllers.
 pub trait FilterBanks {
-    /// Writes what of the banks differs from the layout, as they are now. Reception is interrupted, so no channel may be open unless
-    /// the layout's shape (split, modes, scales) is what it was and only closed channels' banks differ. Returns whether anything
-    /// differed.
+    /// Compares the banks as they are now with the layout, and writes those that differ. Reception is interrupted, so no channel may
+    /// be open unless the layout's shape (split, modes, scales) is unchanged and only closed channels' banks differ. Returns whether
+    /// anything differed.
     fn write(&mut self, layout: &Layout) -> bool;
 }
 
 /// A change of a receive pin's level.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PinEdge {
-    /// The stamp timer when it came.
+    /// The stamp timer at the edge.
     pub at: u32,
-    /// The level behind it: dominant, or recessive.
+    /// Whether the level after it is dominant (or else recessive).
     pub dominant: bool,
     /// The meter was blind for a moment just before: edges may be missing, and this one may have been earlier.
     pub unsure: bool,
@@ -126,11 +126,11 @@ pub struct PinEdge {
 /// Measures when a channel's receive pin changes, whatever the bit rate. It only listens, and never at the cost of capture: what it misses
 /// is marked.
 pub trait EdgeMeter {
-    /// Forgets what was measured, and watches this channel's pin from now on; `None` for none.
+    /// Discards what was measured, and watches this channel's pin from now on; `None` stops watching.
     fn watch(&mut self, channel: Option<cantap_wire::Channel>);
     /// Takes the oldest edge. A meter keeps [`EDGES_KEPT`]; when they are full, it is blind until all of them are taken.
     fn next(&mut self) -> Option<PinEdge>;
-    /// The level of the pin that is watched; false if none is.
+    /// Whether the watched pin is dominant; false if no pin is watched.
     fn is_dominant(&self) -> bool;
 }
 
@@ -157,12 +157,12 @@ pub trait Chip {
     fn load(&mut self, out: &mut [u8]) -> usize;
 }
 
-/// What a host has done with a port, in numbers that wrap: a change is what counts.
+/// What a host has done with a port, as counters that wrap: only changes matter.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct PortHistory {
-    /// How often it was opened. A host that has configured the device anew and then opens the port opens it again.
+    /// How often it was opened. Opening it after the device was reconfigured counts as opening it again.
     pub opened: u8,
-    /// How often the device was configured anew with the port open, or its configuration taken away.
+    /// How often, with the port open, the device was reconfigured or its configuration was removed.
     pub configured: u8,
 }
 
@@ -170,8 +170,8 @@ pub struct PortHistory {
 pub trait Port {
     /// Whether a host has the port open.
     fn is_open(&self) -> bool;
-    /// Whether the host has put the bus to sleep, or taken the device's configuration away, with the port open. It is not open
-    /// meanwhile, and is again afterwards.
+    /// Whether, with the port open, the host has suspended the bus or removed the device's configuration. The port does not
+    /// count as open meanwhile, and does again afterwards.
     fn is_suspended(&self) -> bool {
         false
     }
@@ -179,16 +179,17 @@ pub trait Port {
     fn history(&self) -> PortHistory {
         PortHistory::default()
     }
-    /// Hands over as many of these bytes as go in one transfer and returns how many: all of them, or whole packets of [`PACKET`].
-    /// `None` if the last transfer is still under way. No bytes are an empty packet.
+    /// Hands over as many of these bytes as fit into one transfer and returns how many: all of them, or whole packets of
+    /// [`PACKET`]. `None` if the last transfer is still under way. Without bytes it sends an empty packet.
     fn write(&mut self, bytes: &[u8]) -> Option<usize>;
     /// Takes one packet and returns its length.
     fn read(&mut self, packet: &mut [u8; PACKET]) -> Option<usize>;
-    /// Makes the host wait with what it sends, or no longer. What is on its way still comes: at most [`ON_ITS_WAY`] packets.
+    /// Makes the host wait before it sends more, or lets it continue. What is already on its way still arrives: at most [`ON_ITS_WAY`]
+    /// packets.
     fn hold(&mut self, hold: bool);
 }
 
-/// Packets that may still come from a host that is made to wait: those that were let in before.
+/// Packets that may still arrive after the host is made to wait: those already let in.
 pub const ON_ITS_WAY: usize = 4;
 /// Largest packet of a full-speed bulk endpoint, in bytes (USB 2.0, 5.8.3).
 pub const PACKET: usize = 64;

@@ -1,11 +1,11 @@
-//! Keeps a few bytes over a power cycle: a log in one sector of flash.
+//! Keeps a few bytes across power cycles: a log in one sector of flash.
 //!
-//! Flash can be written word by word, but erased only a whole sector at a time, which on the board takes up to two
-//! seconds in which no instruction runs. So each save is appended, the newest counts, and the sector is
-//! erased only when it is full: once in some sixty saves of the largest size.
+//! Flash can be written word by word, but only erased a whole sector at a time, which on the board takes up to two
+//! seconds during which no instruction runs. So each save is appended, the newest is the one that counts, and the
+//! sector is erased only when it is full: once in some sixty saves of the largest size.
 //!
-//! An entry is a head (a mark and the length), the bytes in whole words, and their checksum. A save that
-//! was cut off by a loss of power leaves the one before in force.
+//! An entry is a head (a mark and the length), the bytes in whole words, and their checksum. If a loss
+//! of power cuts a save off, the previous one remains in force.
 
 use cantap_wire::framing::checksum;
 
@@ -19,7 +19,7 @@ pub trait Sector {
     fn erase(&mut self) -> bool;
 }
 
-/// What an erased word reads.
+/// The value of an erased word.
 pub const ERASED: u32 = u32::MAX;
 
 /// Upper half of an entry's head; the lower is the length in bytes.
@@ -29,11 +29,11 @@ const MARK_MASK: u32 = 0xFFFF_0000;
 /// Words around an entry's bytes: head and checksum.
 const FRAME_WORDS: usize = 2;
 
-/// Where the log stands.
+/// The state of the log.
 struct Scan {
     /// The newest whole entry: the index of its first word of bytes, and their number.
     newest: Option<(usize, usize)>,
-    /// The first word behind the log, if what follows is erased.
+    /// The first word after the log, if the rest is erased.
     end: Option<usize>,
 }
 
@@ -46,7 +46,7 @@ fn scan(words: &[u32]) -> Scan {
                 let len = (head & !MARK_MASK) as usize;
                 let body = at + 1;
                 let Some(&sum) = words.get(body + len.div_ceil(4)) else {
-                    // It would reach beyond the sector: not ours.
+                    // It would reach beyond the sector, so it is not ours.
                     return Scan { newest, end: None };
                 };
                 if sum == checksum_of(&words[body..], len) {
@@ -67,7 +67,7 @@ fn checksum_of(words: &[u32], len: usize) -> u32 {
     checksum(words.iter().flat_map(|word| word.to_le_bytes()).take(len))
 }
 
-/// Saves `bytes`; none forgets what was saved. Returns whether it worked.
+/// Saves `bytes`; an empty slice deletes what was saved. Returns whether it worked.
 pub fn save(sector: &mut impl Sector, bytes: &[u8]) -> bool {
     let needed = FRAME_WORDS + bytes.len().div_ceil(4);
     if needed > sector.words().len() || bytes.len() > !MARK_MASK as usize {
@@ -90,7 +90,7 @@ pub fn save(sector: &mut impl Sector, bytes: &[u8]) -> bool {
     programmed && sector.program(at, checksum(bytes.iter().copied()))
 }
 
-/// Reads what was saved last into `out` and returns its length: 0 if there is nothing, or more than fits.
+/// Reads what was last saved into `out` and returns its length: 0 if there is nothing, or if it does not fit.
 pub fn load(sector: &impl Sector, out: &mut [u8]) -> usize {
     let words = sector.words();
     let Some((body, len)) = scan(words).newest else { return 0 };

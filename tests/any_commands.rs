@@ -11,7 +11,7 @@ use cantap_wire::{CHANNELS, Channel, Command, Event, Reply, Request};
 use fakes::{Bench, encode, numbered};
 use proptest::prelude::*;
 
-/// Small enough that a short burst overflows it.
+/// Small enough for a short burst to overflow it.
 const QUEUE: usize = 8 * 1024 + 512;
 
 #[derive(Clone, Debug)]
@@ -23,7 +23,7 @@ enum Action {
         frames: u16,
         at_once: u8,
     },
-    /// The bus takes what waits in the mailboxes.
+    /// The bus takes what is waiting in the mailboxes.
     Take {
         channel: Channel,
         frames: u8,
@@ -73,7 +73,7 @@ fn action() -> impl Strategy<Value = Action> {
 struct Run<'q> {
     bench: Bench<'q, QUEUE>,
     asked: Vec<u16>,
-    /// Frames that the controllers' FIFOs took.
+    /// Frames that the controllers' FIFOs accepted.
     taken: [u32; CHANNELS],
 }
 
@@ -128,7 +128,7 @@ impl Run<'_> {
         }
     }
 
-    /// The host reads again, both channels are closed, and the books are held against each other.
+    /// The host reads again, both channels are closed, and the counts of both sides are compared.
     fn settle(mut self) -> Result<(), TestCaseError> {
         let bench = &mut self.bench;
         bench.port.takes = usize::MAX;
@@ -149,7 +149,7 @@ impl Run<'_> {
         bench.millisecond();
         let unanswered = self.asked.iter().filter(|id| answered.binary_search(id).is_err()).count();
         prop_assert!(answered.windows(2).all(|pair| pair[0] != pair[1]), "answered twice: {answered:?}");
-        // Only what found no room in the device's input, and is counted, may stay without an answer.
+        // Only requests that found no room in the device's input, which are counted, may stay unanswered.
         prop_assert!(unanswered <= status.bad_requests as usize, "{unanswered} of {status:?}");
         prop_assert!(bench.complaints.is_empty(), "{:?}", bench.complaints);
         for channel in Channel::ALL {

@@ -79,7 +79,7 @@ fn an_overrun_of_the_fifo_stands_behind_the_frames_that_it_kept() {
     assert_eq!(status.channels[1].lost_controller, 1);
 }
 
-/// A slow host must cost counted frames, never a FIFO overrun, and the count must stand where they are missing.
+/// A slow host must cost counted frames, never a FIFO overrun, and the count must stand where the frames are missing.
 #[test]
 fn a_full_queue_drops_and_counts_but_still_empties_the_fifo() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -104,7 +104,8 @@ fn a_full_queue_drops_and_counts_but_still_empties_the_fifo() {
     }
     bench.millisecond();
     bench.millisecond();
-    // Each loss record stands exactly in the gap: counting it as this many frames gives every later frame its number.
+    // Each loss record stands exactly in the gap: counted as that many frames, it gives every later frame its right
+    // number.
     let mut next = 0;
     let mut lost = 0;
     for (_, record) in &bench.records {
@@ -129,7 +130,7 @@ fn a_full_queue_drops_and_counts_but_still_empties_the_fifo() {
     assert!(bench.complaints.is_empty(), "{:?}", bench.complaints);
 }
 
-/// A loss that no later frame brings to light is still reported.
+/// A loss is reported even if no later frame reveals it.
 #[test]
 fn a_loss_at_the_very_end_is_reported_without_another_frame() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -182,7 +183,7 @@ fn data_and_stamps_are_left_out_on_request() {
     assert_eq!((received.frame.id(), received.frame.dlc()), (numbered(0x123).id(), 4));
 }
 
-/// The timer wraps after 358 s and a time difference holds 178 s: neither may show.
+/// The timer wraps after 358 s: that must not show.
 #[test]
 fn hours_of_silence_keep_the_time_right() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();

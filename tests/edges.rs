@@ -1,4 +1,5 @@
-//! The measurement of a receive pin, as a host sees it: what is reported, in which times, and what ends it.
+//! The measurement of a receive pin, as a host sees it: what is reported, with which times, and what ends
+//! it.
 
 mod fakes;
 
@@ -28,7 +29,7 @@ fn edges_are_told_once_with_the_time_between_them_over_the_timer_s_wrap() {
     let mut bench = Bench::new(&queue);
     bench.greet();
     assert_eq!(bench.ask(Command::Edges), Err(Refusal::NotMeasuring));
-    // No further at once than half of the timer's range, as the millisecond tick sees to it on the board.
+    // Never more than half of the timer's range at once, which the millisecond tick ensures on the board.
     for now in [1 << 30, 2 << 30, 3 << 30, u32::MAX - 100] {
         bench.board.clock.now.set(now);
         bench.ask(Command::Time).unwrap();
@@ -44,7 +45,7 @@ fn edges_are_told_once_with_the_time_between_them_over_the_timer_s_wrap() {
     let edge = |ticks, dominant, unsure| Edge { ticks, dominant, unsure };
     assert_eq!(told.edges[..], [edge(50, true, false), edge(60, false, false), edge(12, true, true)]);
     assert!(told.dominant && told.ticks & 0xFFFF_FFFF == 100 && told.ticks > u64::from(u32::MAX));
-    // One that came behind the reading of the time.
+    // One that came after the time was read.
     bench.board.meter.edges.push_back(PinEdge { at: 111, dominant: false, unsure: false });
     assert_eq!(edges(&mut bench).edges[..], [edge(90, false, false)]);
     assert_eq!(edges(&mut bench).edges[..], []);
@@ -66,7 +67,7 @@ fn more_edges_than_an_answer_holds_come_with_the_next() {
     assert!(rest.iter().all(|edge| edge.ticks == 12));
 }
 
-/// A 32-bit time that waited for long could be of another turn of the timer.
+/// A 32-bit time that waited too long could belong to another turn of the timer.
 #[test]
 fn a_measurement_that_nobody_asks_about_begins_anew_and_says_so() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -90,7 +91,7 @@ fn the_channel_must_be_closed_and_its_opening_ends_the_measurement() {
     bench.ask(open(CAN1)).unwrap();
     assert_eq!(measure(&mut bench, Some(CAN1)), Err(Refusal::ChannelOpen));
     assert_eq!(measure(&mut bench, Some(CAN2)), Ok(Reply::Done));
-    // The other channel comes and goes as it likes.
+    // The other channel can be opened and closed meanwhile.
     bench.ask(Command::Close { channel: CAN1 }).unwrap();
     bench.ask(open(CAN1)).unwrap();
     assert_eq!(edges(&mut bench).edges[..], []);

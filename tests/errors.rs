@@ -47,7 +47,7 @@ fn each_kind_is_reported_with_the_counters() {
 const PER_MS: u32 = 50;
 const MS: u32 = 1000;
 
-/// A stuck bus makes an error in each 20 µs or so: 50 000 a second.
+/// A stuck bus causes an error every 20 µs or so: 50 000 a second.
 #[test]
 fn a_broken_bus_cannot_flood_the_link_and_every_error_is_counted() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();

@@ -1,4 +1,4 @@
-//! Pauses longer than the stamp timer's range (358 s) and than half of it, wherever they fall: no stamp may show them.
+//! Pauses longer than the stamp timer's range (358 s) and than half of it, at any point: they must not show in any stamp.
 
 mod fakes;
 
@@ -32,7 +32,7 @@ impl<'q> Watched<'q> {
         Self { bench, ticks: seen.into(), seen }
     }
 
-    /// The true time. To be asked before the clock has wrapped.
+    /// The true time. Must be called again before the clock has wrapped.
     fn now(&mut self) -> u64 {
         let seen = self.bench.board.clock.now.get();
         self.ticks += u64::from(seen.wrapping_sub(self.seen));
@@ -53,7 +53,7 @@ impl<'q> Watched<'q> {
         self.bench.ask(Command::Open { channel: CAN1, config: Some(config(Mode::ListenOnly)) }).unwrap();
     }
 
-    /// A frame is received, and its time arrives as it was.
+    /// A frame is received, and must arrive with its true time.
     fn receive_in_time(&mut self) {
         self.bench.pass(1000);
         let at = self.now();
@@ -89,7 +89,7 @@ fn a_pause_between_closing_and_opening_shows_in_no_stamp() {
     watched.receive_in_time();
 }
 
-/// The queue is full, and events have filled what frames leave free: there is no room for anything that would tell the time.
+/// The queue is full, and events have filled the reserve: there is no room for anything that would carry the time.
 #[test]
 fn a_host_that_reads_nothing_for_long_gets_true_stamps_afterwards() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -120,19 +120,19 @@ fn the_time_goes_on_while_nobody_talks_to_the_device() {
     watched.bench.greet();
     let asked = watched.now();
     let Ok(Reply::Time(told)) = watched.bench.ask(Command::Time) else { panic!() };
-    assert!((asked..=watched.now()).contains(&told), "{told} was asked for from {asked} on");
+    assert!((asked..=watched.now()).contains(&told), "{told} was requested from {asked} on");
     watched.open();
     watched.receive_in_time();
 }
 
-/// What is written, and how long after the record before.
+/// What is written, and how long after the previous record.
 #[derive(Clone, Debug)]
 enum Write {
     Frame {
         stamp: Stamp,
     },
     Event,
-    /// The host takes what there is.
+    /// The host takes everything available.
     Read,
 }
 
@@ -143,7 +143,8 @@ fn write() -> impl Strategy<Value = (Write, i64)> {
         2 => Just(Write::Event),
         1 => Just(Write::Read),
     ];
-    // A moment before the last one, as when two interrupts wait; the usual; around the limits of 32 bits; five wraps; years.
+    // Shortly before the last one, as when two interrupts are pending; the usual case; around the limits of 32 bits; five
+    // wraps; years.
     let after = prop_oneof![
         8 => -2000..20_000i64,
         2 => (1i64 << 31) - 3..(1 << 31) + 3,
@@ -172,7 +173,7 @@ proptest! {
         let mut heard = Vec::new();
         let mut read = |out: &mut Vec<(u64, Record)>| {
             let mut bytes = [0; MAX_ENCODED];
-            // Twice: a batch is flushed when it is old.
+            // Repeatedly, because a batch is flushed only when it is old enough.
             for now in (0..40).map(|n| n * TICKS_PER_MS) {
                 let len = sender.next_batch(&mut consumer, now, &mut bytes, cantap_wire::framing::crc32);
                 decoder.push(&bytes[..len], |decoded| match decoded {
@@ -207,7 +208,7 @@ proptest! {
         for _ in 0..4 {
             read(&mut heard);
         }
-        // What was lost is reported in between, at the time of what follows.
+        // Losses are reported in between, at the time of the record that follows.
         heard.retain(|(_, record)| !matches!(record, Record::Event(Event::Lost { .. })));
         if lost == [0; 2] {
             prop_assert_eq!(heard, written);

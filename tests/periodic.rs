@@ -1,5 +1,5 @@
-//! Periodic entries that ask for more than a bus gives, on fakes: they cost no time, each gets its turn, and no period is
-//! forgotten.
+//! Periodic entries that ask for more than a bus can carry, on fakes: they cost no time, each gets its turn, and every
+//! period is accounted for.
 
 mod fakes;
 
@@ -30,7 +30,7 @@ fn counters(bench: &mut Bench<'_, SMALL_QUEUE>) -> (u32, u32) {
     (status.channels[0].transmitted, status.channels[0].transmit_failures)
 }
 
-/// Overtaken periods of channel 1, as the records tell them, by slot; and how many records that took.
+/// Overtaken periods of channel 1 by slot, according to the records, and how many records that took.
 fn told(bench: &Bench<'_, SMALL_QUEUE>) -> ([u32; PERIODIC_SLOTS], usize) {
     let (mut by_slot, mut records) = ([0; PERIODIC_SLOTS], 0);
     for event in bench.events() {
@@ -44,7 +44,7 @@ fn told(bench: &Bench<'_, SMALL_QUEUE>) -> ([u32; PERIODIC_SLOTS], usize) {
     (by_slot, records)
 }
 
-/// Lets time pass in steps of a microsecond, with the tick, and the alarm as often as it is due.
+/// Lets time pass in steps of a microsecond, with the tick and every alarm that becomes due.
 fn live(bench: &mut Bench<'_, SMALL_QUEUE>, microseconds: u32) -> usize {
     let mut alarms = 0;
     for at in 1..=microseconds {
@@ -80,7 +80,7 @@ fn full_tables_that_cannot_leave_cost_no_alarms_and_few_records() {
     assert_eq!(alarms, 0, "alarms for frames that wait for a mailbox");
     let records = bench.records.len();
     assert!(records <= 2 * PERIODIC_SLOTS * 4, "{records} records in 300 ms");
-    // All that passed is counted, though: each entry's periods, in whichever of them the two questions fall.
+    // Everything that passed is counted, though: each entry's periods, give or take one at either end.
     let passed = (bench.board.clock.now.get() - from) / MIN_PERIOD_TICKS;
     let counted = counters(&mut bench).1 - before;
     let all = passed * PERIODIC_SLOTS as u32;
@@ -90,7 +90,7 @@ fn full_tables_that_cannot_leave_cost_no_alarms_and_few_records() {
     assert!(told <= counted && told >= counted / 2, "{told} of {counted}");
 }
 
-/// Sent, overtaken or waiting: every period that has begun is one of the three, at any time, whatever the bus takes.
+/// At any time, every period that has begun is either sent, overtaken or waiting, whatever the bus takes.
 #[test]
 fn every_period_is_sent_or_waits_or_is_counted() {
     let queue = Queue::new();
@@ -113,16 +113,16 @@ fn every_period_is_sent_or_waits_or_is_counted() {
         let now = bench.board.clock.now.get();
         let (transmitted, failed) = counters(&mut bench);
         assert_eq!(transmitted, sent.iter().sum::<u32>());
-        // A question takes no time here, and an entry is set within a tick of the time noted.
+        // A request takes no time here, and an entry is set within a tick of the time noted.
         let begun: u32 = begun_at.iter().map(|(_, period, at)| (now - at) / period + 1).sum();
         let waiting = begun - transmitted - failed;
-        // One for each entry, and one more for each of the three mailboxes.
+        // One per entry, and one more for each of the three mailboxes.
         assert!(
             waiting <= PERIODIC_SLOTS as u32 + 3,
             "{begun} begun, {transmitted} sent, {failed} overtaken"
         );
     }
-    // By entry: the bus takes all that waits, and the records tell the rest.
+    // By entry: the bus takes everything waiting, and the records account for the rest.
     while let Some(frame) = bench.send_one(CAN1) {
         sent[frame.id().raw() as usize] += 1;
     }
@@ -143,7 +143,7 @@ fn every_period_is_sent_or_waits_or_is_counted() {
     }
 }
 
-/// More is asked for than the bus takes: whoever waits longest goes first.
+/// More is asked for than the bus can carry: the entry that has waited longest goes first.
 #[test]
 fn every_entry_of_a_table_that_asks_for_too_much_gets_its_turn() {
     let queue = Queue::new();
@@ -160,7 +160,7 @@ fn every_entry_of_a_table_that_asks_for_too_much_gets_its_turn() {
     assert!(sent.iter().all(|sent| (19..=21).contains(sent)), "{sent:?}");
 }
 
-/// An entry that is cleared, replaced or done takes nothing with it that was not reported.
+/// Nothing unreported is lost when an entry is cleared, replaced or done.
 #[test]
 fn what_passed_is_told_also_after_the_entry_is_gone() {
     let queue = Queue::new();
@@ -172,7 +172,7 @@ fn what_passed_is_told_also_after_the_entry_is_gone() {
     for slot in 0..3 {
         set(&mut bench, CAN1, slot, Some(entry(slot, TICKS_PER_MS, 1)));
     }
-    // Each waits behind the queue's frames, and ten of its periods pass, except for what earlier records reported.
+    // Each waits behind the queue's frames while ten of its periods pass, less those that earlier records reported.
     live(&mut bench, 10_500);
     set(&mut bench, CAN1, 0, None);
     set(&mut bench, CAN1, 1, Some(entry(1, 1000 * TICKS_PER_MS, 0)));
@@ -204,7 +204,7 @@ fn closing_tells_what_passed_before_the_stop() {
     assert!(failed > 19 * PERIODIC_SLOTS as u32);
 }
 
-/// The host reads nothing, and the queue is full: what explains missing frames still finds its place.
+/// The host reads nothing, and the queue is full: there must still be room for what explains missing frames.
 #[test]
 fn overtaken_periods_leave_the_reserve_of_a_full_queue_alone() {
     let queue = Queue::new();
@@ -216,7 +216,7 @@ fn overtaken_periods_leave_the_reserve_of_a_full_queue_alone() {
     bench.port.takes = 0;
     for number in 0..10_000 {
         bench.receive(Channel::Can2, numbered(number));
-        // A batch waits for the host, outside the queue.
+        // One batch waits for the host outside the queue.
         bench.poll();
     }
     let (full, _) = bench.board.capture.fill();
@@ -229,7 +229,7 @@ fn overtaken_periods_leave_the_reserve_of_a_full_queue_alone() {
     assert!(told <= counted && told > counted / 2, "{told} of {counted}");
 }
 
-/// While a controller stays bus-off, periodic frames wait: each would only be given up again.
+/// While a controller stays bus-off, periodic frames wait: each would only be given up again at once.
 #[test]
 fn periodic_frames_wait_while_a_controller_stays_off_the_bus() {
     let queue = Queue::new();
@@ -252,8 +252,8 @@ fn periodic_frames_wait_while_a_controller_stays_off_the_bus() {
     assert!(bench.send_one(CAN1).is_some());
 }
 
-/// Whatever a host queues and however close together its frames are due: a call waits for them for 50 µs at most, and the FIFOs
-/// are drained before the next.
+/// Whatever a host queues and however close together its frames are due, a call waits for them at most 50 µs, and the FIFOs are
+/// drained before the next call.
 #[test]
 fn no_call_waits_longer_than_it_may() {
     let queue = Queue::new();
@@ -289,7 +289,7 @@ fn no_call_waits_longer_than_it_may() {
     }
 }
 
-/// A whole queue that is given up at once would keep the other channel's FIFO waiting.
+/// Giving up a whole queue at once would keep the other channel's FIFO waiting.
 #[test]
 fn a_queue_is_given_up_in_pieces() {
     let queue = Queue::new();

@@ -21,7 +21,7 @@ fn numbered(number: u32) -> Received {
     }
 }
 
-/// Sets its flag when it goes, also by a panic.
+/// Sets its flag when dropped, even by a panic.
 struct Gone<'a>(&'a AtomicBool);
 
 impl Drop for Gone<'_> {
@@ -30,7 +30,8 @@ impl Drop for Gone<'_> {
     }
 }
 
-/// Reads everything as USB does and checks it: each frame is there or counted, in order. Returns the frames read.
+/// Reads everything as USB does and checks it: each frame is either there or counted as lost, in order. Returns
+/// the frames read.
 fn check(pace: impl Fn(u32)) -> u32 {
     let queue = RecordQueue::<{ 16 * 1024 }>::new();
     let (producer, mut consumer) = queue.split();

@@ -1,5 +1,5 @@
-//! Whatever is refused is refused with its reason, and nothing has changed: not the filters, not the controllers, not what is
-//! saved, not the tables, not what the other channel does.
+//! Every refusal gives its reason and changes nothing: not the filters, not the controllers, not what is saved, not the
+//! tables, not what the other channel does.
 
 mod fakes;
 
@@ -44,7 +44,7 @@ fn snapshot<const N: usize>(bench: &mut Bench<'_, N>) -> Snapshot {
     }
 }
 
-/// Holds each command against the reason that it must be refused with, and the board against what it was.
+/// Checks that each command is refused for the expected reason and that the board is unchanged.
 fn refuse<const N: usize>(bench: &mut Bench<'_, N>, commands: Vec<(Command, Refusal)>) {
     let before = snapshot(bench);
     for (command, refusal) in commands {
@@ -158,7 +158,7 @@ fn while_both_channels_are_open() {
         ],
     );
     bench.ask(Command::Close { channel: CAN1 }).unwrap();
-    // The other one is open still: what would interrupt it, or stop the processor, is refused.
+    // The other one is still open: commands that would interrupt it, or stop the processor, are refused.
     refuse(
         &mut bench,
         vec![
@@ -198,7 +198,7 @@ fn while_a_channel_can_send() {
             (trigger(0, filter(true, 1 << 29, 0)), Refusal::BadId),
         ],
     );
-    // Three are in mailboxes; the queue behind them is filled except for five places.
+    // Three are in mailboxes; the queue is filled except for five places.
     for _ in 0..TX_QUEUE / 8 {
         bench.ask(send(CAN1, 0..8, None)).unwrap();
     }
@@ -208,7 +208,7 @@ fn while_a_channel_can_send() {
     refuse(&mut bench, vec![(send(CAN1, 0..8, None), Refusal::QueueFull { free })]);
 }
 
-/// What was saved may be more than fits now, or by another firmware: nothing of it is applied then.
+/// What was saved may not fit now, or may come from another firmware: then none of it is applied.
 #[test]
 fn saved_settings_that_cannot_be_applied() {
     let saved = |config, extended_ids: u32| {
@@ -254,7 +254,7 @@ fn settings_are_saved_told_and_merged_without_a_channel_being_opened() {
     assert_eq!(bench.ask(Command::Defaults { channel: CAN2 }), Err(Refusal::NothingSaved));
 }
 
-/// On the board the answer is as long as it gets: every filter there can be.
+/// The longest possible answer: as many filters as there can be.
 #[test]
 fn the_longest_answer_is_readable() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -273,7 +273,7 @@ fn the_longest_answer_is_readable() {
     assert_eq!(defaults.filters, [longest; MAX_FILTERS]);
 }
 
-/// A frame that comes between bus-off and the end of giving the queue up is given up like the others, not forgotten.
+/// A frame that comes between bus-off and the end of giving the queue up is given up and reported like the others.
 #[test]
 fn a_frame_that_comes_while_the_queue_is_given_up_is_told_of() {
     use cantap_firmware::bus::transmit::{Transmitter, TxQueue};

@@ -34,7 +34,7 @@ fn nothing_is_sent_before_the_host_speaks() {
     assert!(bench.port.packets.is_empty());
 }
 
-/// The start of a session takes time; were it read twice, every stamp of the session would be off by it.
+/// The start of a session takes time; if the clock were read twice, every stamp of the session would be off by the difference.
 #[test]
 fn stamps_do_not_depend_on_how_long_the_start_of_the_session_takes() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -70,7 +70,7 @@ fn commands_before_the_greeting_are_refused() {
     assert_eq!(bench.ask(Command::Status), Err(Refusal::NoSession));
 }
 
-/// Nothing is acknowledged on the bus once nobody listens.
+/// Nothing is acknowledged on the bus once nobody is listening.
 #[test]
 fn closing_the_port_silences_both_channels_and_empties_the_queue() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -101,7 +101,7 @@ fn a_stuck_bus_does_not_keep_a_channel_from_closing() {
     assert_eq!(bench.board.control[0].halts, 1);
 }
 
-/// Behind a reset of the controller the filters may be gone, the other channel's too.
+/// After a reset of the controller the filters may be gone, including the other channel's.
 #[test]
 fn a_controller_that_was_made_to_leave_has_its_filters_written_again() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -114,12 +114,12 @@ fn a_controller_that_was_made_to_leave_has_its_filters_written_again() {
     }
     let written = bench.board.filters.written.clone();
     bench.ask(Command::Close { channel: CAN2 }).unwrap();
-    assert_eq!(bench.board.filters.written, written, "it left by itself");
+    assert_eq!(bench.board.filters.written, written, "it left on its own");
     bench.board.control[0].stuck = true;
     bench.board.control[0].halts_needed = 3;
     bench.ask(Command::Close { channel: CAN1 }).unwrap();
     assert_eq!(bench.board.control[0].halts, 3);
-    // Right behind the reset, and when it has left.
+    // Right after the reset, and again once it has left.
     assert_eq!(
         bench.board.filters.written[written.len()..],
         [(); 2].map(|()| written.last().unwrap().clone())
@@ -127,7 +127,7 @@ fn a_controller_that_was_made_to_leave_has_its_filters_written_again() {
     assert!(bench.board.traffic[0].aborts > 0);
 }
 
-/// What came while there were no filters is counted by nobody, so that there was something must be said.
+/// Nothing counts the frames that came while there were no filters, so the stream must say that some may be missing.
 #[test]
 fn a_channel_that_was_deaf_behind_the_others_reset_says_so() {
     for cleared in [false, true] {
@@ -190,7 +190,7 @@ fn refused_commands_say_why_and_change_nothing() {
     assert_eq!(bench.board.control[1].started.len(), 1);
 }
 
-/// Noise on the port, half a command, a flood: each leaves the device answering.
+/// Noise on the port, half a command, a flood: the device keeps answering after each.
 #[test]
 fn garbage_is_dropped_and_the_next_command_answered() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -312,7 +312,7 @@ fn a_restart_happens_though_the_host_is_gone_as_soon_as_it_is_answered() {
     }
 }
 
-/// What a program that ended asked is no answer for the next.
+/// Answers to a program that has ended must not reach the next.
 #[test]
 fn a_greeting_takes_back_the_answers_that_were_not_sent_yet() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -355,14 +355,14 @@ fn a_response_is_readable_behind_an_unfinished_message() {
     assert_eq!(bench.complaints, ["Corrupt(Framing(Cobs))"]);
 }
 
-/// A mailbox that is never reported must not keep the channel from closing.
+/// A mailbox that never reports its end must not keep the channel from closing.
 #[test]
 fn a_channel_closes_though_a_mailbox_stays_silent() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::opened(&queue, Mode::Normal);
     let frames = [TxFrame { tag: 1, frame: numbered(1), at_ticks: None }].into_iter().collect();
     bench.ask(Command::Send { channel: CAN1, frames }).unwrap();
-    // The controller forgets it.
+    // The controller forgets the frame.
     bench.board.traffic[0].order.clear();
     assert_eq!(bench.ask(Command::Close { channel: CAN1 }), Ok(Reply::Done));
     bench.millisecond();
@@ -374,8 +374,8 @@ fn a_channel_closes_though_a_mailbox_stays_silent() {
     );
 }
 
-/// What is queued when the host falls asleep is delivered when it wakes, and behind it the session's end: nothing is missing
-/// that is not counted.
+/// What is queued when the host falls asleep is delivered when it wakes, followed by the session's end: nothing is missing
+/// without being counted.
 #[test]
 fn a_host_that_wakes_gets_what_was_queued_and_is_told_that_the_session_has_ended() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -417,7 +417,7 @@ fn a_host_that_wakes_gets_what_was_queued_and_is_told_that_the_session_has_ended
     assert_eq!(bench.responses.last(), Some(&Response { id: 901, result: Err(Refusal::NoSession) }));
     assert!(bench.complaints.is_empty(), "{:?}", bench.complaints);
 
-    // Told once, and the next session is as any other.
+    // It is reported once, and the next session is like any other.
     bench.sleep(true);
     bench.millisecond();
     bench.sleep(false);
@@ -453,8 +453,8 @@ fn what_was_kept_for_a_sleeping_host_goes_with_it() {
     assert_eq!((status.queue_bytes, status.channels[0].open), (0, None));
 }
 
-/// A client whose host configured the device anew still has the port open, and may never have been told: when it asks for something, it
-/// gets what was captured, why there is no more, and the refusal, in this order.
+/// A client whose host reconfigured the device still has the port open, and may not know: when it makes a request, it gets what was
+/// captured, the reason why there is no more, and the refusal, in this order.
 #[test]
 fn a_host_that_configured_the_device_anew_gets_the_rest_and_the_reason_when_it_asks() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -474,9 +474,9 @@ fn a_host_that_configured_the_device_anew_gets_the_rest_and_the_reason_when_it_a
     for _ in 0..100 {
         bench.millisecond();
     }
-    assert_eq!(bench.port.from_device.len(), sent, "it may be another program that listens");
+    assert_eq!(bench.port.from_device.len(), sent, "it may be another program that is listening");
 
-    // In one packet each, so that the first answer is handed over before the rest is read.
+    // In one packet each, so that the first is answered before the rest is read.
     bench.say(&encode(&Request { id: 900, command: Command::Time }));
     let early: Vec<u16> = bench.responses.iter().map(|response| response.id).collect();
     assert!(bench.ends.len() == 1 || early.is_empty(), "a refusal before the end ends the client's reading");
@@ -492,7 +492,7 @@ fn a_host_that_configured_the_device_anew_gets_the_rest_and_the_reason_when_it_a
     assert_eq!(bench.responses, [refused(900), refused(901)]);
     assert!(bench.complaints.is_empty(), "{:?}", bench.complaints);
 
-    // On the same port it may begin again.
+    // It may begin again on the same port.
     bench.records.clear();
     bench.greet();
     bench.ask(Command::Open { channel: CAN1, config: Some(config(Mode::ListenOnly)) }).unwrap();
@@ -502,7 +502,7 @@ fn a_host_that_configured_the_device_anew_gets_the_rest_and_the_reason_when_it_a
     assert_eq!(bench.frames(CAN1), [numbered(4)]);
 }
 
-/// Refusals that overtake the rest of a session would end the client's reading before it.
+/// If refusals overtook the rest of a session, the client would stop reading before it.
 #[test]
 fn no_refusal_overtakes_what_a_session_that_ended_still_has_to_say() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -528,7 +528,7 @@ fn no_refusal_overtakes_what_a_session_that_ended_still_has_to_say() {
     assert_eq!(bench.frames(CAN1).len(), 1200);
 }
 
-/// Whoever opens the port after a new configuration, or greets the device, is another: it gets nothing of the session before.
+/// A program that opens the port after a reconfiguration, or greets the device, is a new one: it gets nothing of the previous session.
 #[test]
 fn what_was_left_when_the_device_was_configured_anew_is_not_for_the_next_program() {
     for opens in [true, false] {
@@ -549,7 +549,7 @@ fn what_was_left_when_the_device_was_configured_anew_is_not_for_the_next_program
     }
 }
 
-/// No configuration, no endpoints: what is left waits for them.
+/// Without a configuration there are no endpoints: what is left waits for them.
 #[test]
 fn what_is_left_outlives_a_time_without_a_configuration() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();

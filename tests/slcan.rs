@@ -14,7 +14,7 @@ use fakes::{Bench, SMALL_QUEUE};
 
 const CAN1: Channel = Channel::Can1;
 
-/// What the device answers to a line, frames of the bus included.
+/// What the device answers to a line, including frames from the bus.
 fn say<const N: usize>(bench: &mut Bench<'_, N>, line: &str) -> String {
     let before = bench.port.from_device.len();
     bench.say(format!("{line}\r").as_bytes());
@@ -24,7 +24,7 @@ fn say<const N: usize>(bench: &mut Bench<'_, N>, line: &str) -> String {
     String::from_utf8(bench.port.from_device[before..].to_vec()).unwrap()
 }
 
-/// Says each line and holds the answer against what stands beside it.
+/// Sends each line and compares the answer with the one beside it.
 fn converse<const N: usize>(bench: &mut Bench<'_, N>, conversation: &[(&str, &str)]) {
     for (line, answer) in conversation {
         assert_eq!(say(bench, line), *answer, "the answer to {line:?}");
@@ -84,7 +84,7 @@ fn each_s_digit_is_its_bit_rate() {
     }
 }
 
-/// Lawicel's `S7` is 800 kbit/s, python-can's 750: it alone sends an empty line behind it.
+/// Lawicel's `S7` is 800 kbit/s, python-can's 750: only python-can sends an empty line after it.
 #[test]
 fn s7_with_an_empty_line_behind_it_is_what_python_can_means() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -98,7 +98,7 @@ fn s7_with_an_empty_line_behind_it_is_what_python_can_means() {
     assert_eq!(rates, [750_000, 800_000, 500_000]);
 }
 
-/// A host that does not look at the answers would hear nothing but errors, or disturb the bus.
+/// A host that does not check the answers would otherwise hear nothing but errors, or disturb the bus.
 #[test]
 fn after_a_rate_that_was_refused_nothing_is_opened_at_the_one_before() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -158,14 +158,14 @@ fn a_full_transmit_queue_is_waited_for_and_then_refused_and_flagged() {
     converse(&mut bench, &[("S8", "\r"), ("O", "\r")]);
     let taken = (0..400).take_while(|_| say(&mut bench, "t1230") == "z\r").count();
     assert_eq!(taken, TX_QUEUE + MAILBOXES);
-    // One leaves, and the line that waited has room; the next finds none for too long.
+    // One is sent, which makes room for the line that waited; the next waits in vain.
     bench.send_one(CAN1);
     converse(&mut bench, &[("t1231AA", "z\r")]);
     for _ in 0..100 {
         bench.millisecond();
     }
     assert!(bench.port.from_device.ends_with(b"\x07"));
-    // So does each after it, but none waits as long again; and whatever else is asked is answered.
+    // So do those after it, but without waiting as long again; and other requests are answered.
     converse(
         &mut bench,
         &[("t1230", "\x07"), ("F", "F02\r"), ("t1230", "\x07"), ("F", "F02\r"), ("F", "F00\r")],
@@ -262,7 +262,8 @@ fn losses_and_errors_set_flags_that_reading_clears() {
     converse(&mut bench, &[("F", "F24\r"), ("F", "F00\r")]);
 }
 
-/// With K1, what `F` would report comes in lines that Linux' slcan driver takes, none of them shorter than five characters.
+/// With K1, what `F` would report comes in lines that Linux's slcan driver accepts, none of them shorter than five
+/// characters.
 #[test]
 fn losses_errors_and_states_are_lines_where_they_are_asked_for() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -307,7 +308,7 @@ fn losses_errors_and_states_are_lines_where_they_are_asked_for() {
         bench.millisecond();
         assert_eq!(bench.port.from_device[before..], *line.as_bytes(), "{state:?}");
     }
-    // The flags are there as without.
+    // The flags are still set, as without K1.
     converse(&mut bench, &[("F", "FAC\r"), ("C", "\r"), ("K0", "\r"), ("O", "\r")]);
     let before = bench.port.from_device.len();
     bench.board.traffic[0].error = Some(BusErrorKind::Stuff);
@@ -328,7 +329,7 @@ fn a_frame_refused_for_want_of_room_is_a_line_where_it_is_asked_for() {
     assert!(bench.port.from_device.ends_with(b"\x07e3OOO\r"));
 }
 
-/// A host that polls gets answers, and nothing between them.
+/// A host that polls gets answers and nothing in between.
 #[test]
 fn a_host_that_polls_is_not_interrupted_by_reports() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -341,7 +342,7 @@ fn a_host_that_polls_is_not_interrupted_by_reports() {
     converse(&mut bench, &[("F", "F80\r")]);
 }
 
-/// M and m are an SJA1000's acceptance code and mask; a mask bit of 1 does not count. With W1, one long filter.
+/// M and m are an SJA1000's acceptance code and mask; a mask bit of 1 means "don't care". With W1, one long filter.
 #[test]
 fn acceptance_code_and_mask_become_filters_of_a_closed_channel() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -393,7 +394,7 @@ fn q_keeps_the_bit_rate_for_the_next_session() {
     converse(&mut bench, &[("O", "\x07")]);
 }
 
-/// A rate counts without having been used; one that was refused is not replaced by the one before.
+/// A rate is saved even if it has not been used; a refused one is not replaced by the previous one.
 #[test]
 fn q_keeps_a_rate_that_was_only_set() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -412,7 +413,7 @@ fn again<const N: usize>(bench: &mut Bench<'_, N>) {
     bench.port.open = true;
 }
 
-/// Opens the channel as slcand does, and returns what a bus error makes the device say.
+/// Opens the channel as slcand does, and returns what the device sends on a bus error.
 fn reported<const N: usize>(bench: &mut Bench<'_, N>) -> String {
     converse(bench, &[("C", "\r"), ("S6", "\r"), ("O", "\r")]);
     let before = bench.port.from_device.len();
@@ -423,24 +424,25 @@ fn reported<const N: usize>(bench: &mut Bench<'_, N>) -> String {
     said
 }
 
-/// slcand never sends `K1`: who saved it has reports from it too, over a power cycle, and native programs leave it as it is.
+/// slcand never sends `K1`: once it is saved, slcand gets reports too, even after a power cycle, and native programs do not
+/// change it.
 #[test]
 fn q_keeps_k_so_that_programs_that_never_send_it_have_reports() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::new(&queue);
     assert_eq!(reported(&mut bench), "");
     again(&mut bench);
-    // Alone: no rate is saved with it.
+    // By itself: no rate is saved with it.
     converse(&mut bench, &[("K1", "\r"), ("Q1", "\r")]);
     again(&mut bench);
     converse(&mut bench, &[("O", "\x07")]);
     assert_eq!(reported(&mut bench), "e3sss\r");
-    // A session that says otherwise is its own matter.
+    // A session that sets it otherwise affects only itself.
     converse(&mut bench, &[("K0", "\r")]);
     assert_eq!(reported(&mut bench), "");
     again(&mut bench);
     assert_eq!(reported(&mut bench), "e3sss\r");
-    // Saving a rate keeps it, here and in the native protocol.
+    // Saving a rate keeps it, both here and in the native protocol.
     converse(&mut bench, &[("Q1", "\r")]);
     again(&mut bench);
     bench.greet();
@@ -453,7 +455,7 @@ fn q_keeps_k_so_that_programs_that_never_send_it_have_reports() {
     let mut bench = Bench::new(&queue);
     bench.board.chip.saved = saved.clone();
     assert_eq!(reported(&mut bench), "e3sss\r");
-    // What firmware without it saved is the same without the last byte; it has no reports, and loses nothing else.
+    // Settings saved by firmware without `K1` lack only the last byte: there are no reports, and nothing else is lost.
     let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::new(&queue);
     bench.board.chip.saved = saved[..saved.len() - 1].to_vec();
@@ -496,14 +498,15 @@ fn half_a_line_does_not_keep_the_native_language_from_taking_over() {
     let mut bench = Bench::new(&queue);
     bench.say(b"A");
     bench.greet();
-    // So long that the rest of the line is being skipped.
+    // Long enough that the rest of the line is being skipped.
     let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::new(&queue);
     bench.say(&[b't'; 200]);
     bench.greet();
 }
 
-/// slcan has no word for the end of a session: a BEL behind what was captured, and the channel is closed. Its settings stay.
+/// slcan has no message for the end of a session: a BEL follows what was captured, and the channel is closed. Its settings
+/// stay.
 #[test]
 fn a_host_that_wakes_gets_what_was_captured_and_a_bel() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -525,7 +528,7 @@ fn a_host_that_wakes_gets_what_was_captured_and_a_bel() {
     converse(&mut bench, &[("t1230", "\x07"), ("O", "\r")]);
 }
 
-/// What is said behind the rest of the session is the answer to the line that asked for it.
+/// What follows the rest of the session is the answer to the line that triggered it.
 #[test]
 fn a_program_whose_host_configured_the_device_anew_gets_the_rest_when_it_says_something() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -539,6 +542,6 @@ fn a_program_whose_host_configured_the_device_anew_gets_the_rest_when_it_says_so
         bench.millisecond();
     }
     assert!(!bench.board.control[0].running);
-    assert_eq!(bench.port.from_device.len(), before, "it may be another program that listens");
+    assert_eq!(bench.port.from_device.len(), before, "it may be another program that is listening");
     converse(&mut bench, &[("t1230", "t123111\r\x07"), ("t1230", "\x07"), ("O", "\r")]);
 }

@@ -12,7 +12,7 @@ use fakes::{Bench, SMALL_QUEUE, numbered};
 /// The host's frames start this long before the device's milliseconds.
 const PHASE_TICKS: u32 = 300 * TICKS_PER_US;
 
-/// So many milliseconds, each with a SOF, and the frames numbered from `frame` on.
+/// Lets `count` milliseconds pass, each with a SOF, the frames numbered from `frame` on.
 fn milliseconds<const N: usize>(bench: &mut Bench<'_, N>, frame: u16, count: u16) {
     for n in 0..count {
         let next = bench.board.clock.now.get().wrapping_add(TICKS_PER_MS);
@@ -77,7 +77,8 @@ fn slcan_has_no_marks() {
     assert_eq!(bench.port.from_device.len(), answered);
 }
 
-/// A mark's time is before that of what was recorded since, so the clock of the records goes back with it.
+/// A mark's time is earlier than that of records written since, so the running time of the records goes
+/// back with it.
 #[test]
 fn frames_around_a_mark_keep_their_times() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
@@ -109,7 +110,7 @@ fn a_full_queue_has_no_room_for_marks_and_loses_none_of_its_accounts() {
     for n in 0..4000 {
         bench.receive(Channel::Can1, numbered(n));
     }
-    // One batch moves on to the port, and waits there.
+    // One batch moves to the port and waits there.
     bench.millisecond();
     let (before, _) = bench.board.capture.fill();
     milliseconds(&mut bench, 0, 5000);

@@ -64,8 +64,8 @@ fn frames_leave_in_order_and_each_is_confirmed_with_its_time() {
     assert_eq!((status.channels[0].transmitted, status.channels[0].tx_pending), (40, 0));
 }
 
-/// The interrupt that stamps is silent until the task behind it has run. Two that ended meanwhile have one stamp between them, which is
-/// the first one's; the second must not be said to have ended before it did.
+/// The interrupt that stamps is silenced until its task has run. Two transmissions that end meanwhile have only one stamp, which is the
+/// first one's; the second must not be reported as ending earlier than it did.
 #[test]
 fn what_ended_while_the_task_was_kept_waiting_is_not_stamped_early() {
     let queue = Queue::new();
@@ -95,7 +95,7 @@ fn a_full_queue_pushes_back_and_takes_all_or_nothing() {
             other => panic!("{other:?}"),
         }
     };
-    // Three wait in mailboxes.
+    // Three are waiting in mailboxes.
     assert_eq!(accepted as usize + free as usize, TX_QUEUE + 3);
     for number in 0..accepted {
         assert_eq!(bench.send_one(CAN1), Some(numbered(number)));
@@ -168,7 +168,7 @@ fn a_periodic_frame_goes_before_a_queued_one_that_is_due_a_moment_later() {
     assert_eq!(bench.send_one(CAN2), Some(numbered(1)));
 }
 
-/// A bus on which nobody acknowledges keeps frames in their mailboxes, and a host may go meanwhile.
+/// If nobody acknowledges, frames stay in their mailboxes, and the host may leave meanwhile.
 #[test]
 fn nothing_of_a_session_is_sent_in_the_next() {
     let queue = Queue::new();
@@ -222,7 +222,7 @@ fn a_periodic_frame_keeps_its_period_without_drift() {
             sent.push((bench.board.clock.now.get() - start) / TICKS_PER_US);
         }
     }
-    // The first leaves while the response is on its way, before the first look.
+    // The first is sent while the response is on its way, before the first check.
     assert_eq!(sent, [1, 10_000, 20_000, 30_000, 40_000]);
     flush(&mut bench);
     assert_eq!(outcomes(&bench), vec![(DEVICE_TAG + 31, None); 5]);
@@ -256,7 +256,7 @@ fn modifiers_count_check_and_randomise() {
     assert!(random.len() > 20, "{random:?}");
 }
 
-/// Transmissions of channel 1 that failed, as the status counts them.
+/// Failed transmissions of channel 1, according to the status.
 fn failures<const N: usize>(bench: &mut Bench<'_, N>) -> u32 {
     match bench.ask(Command::Status).unwrap() {
         Reply::Status(status) => status.channels[0].transmit_failures,
@@ -279,7 +279,7 @@ fn a_period_that_passes_unsent_is_told() {
     assert_eq!(failures(&mut bench), 3);
     let sent: Vec<Frame> = std::iter::from_fn(|| bench.send_one(CAN1)).collect();
     assert_eq!(sent.len(), 4);
-    // How many there were is reported ten times a second.
+    // Their number is reported ten times a second.
     for _ in 0..200 {
         bench.millisecond();
         bench.alarm();
@@ -293,7 +293,7 @@ fn a_period_that_passes_unsent_is_told() {
         periods.sum::<u32>()
     };
     assert_eq!(overtaken(outcomes(&bench)), 3);
-    // A second in which nobody looks: of its 100 periods one is loaded at once and one waits behind it.
+    // A second in which nobody checks: of its 100 periods one is loaded at once and one waits after it.
     let before = failures(&mut bench);
     bench.pass(1000 * cantap_firmware::TICKS_PER_MS);
     bench.millisecond();
@@ -394,9 +394,8 @@ fn manual_recovery_gives_the_queue_up_and_waits_for_the_command() {
     }));
 }
 
-/// A confirmation is never lost: while the host reads nothing, transmission stops before it.
-/// One channel's periodic frames cannot be confirmed because there was no room, and wait; the other channel's frame is due meanwhile. An
-/// alarm that came again and again would keep USB from making room.
+/// One channel's periodic frames cannot be confirmed for lack of room, and wait; meanwhile the other channel's frame becomes due. An
+/// alarm that fired again and again would keep USB from making room.
 #[test]
 fn what_waits_for_room_on_one_channel_raises_no_storm_of_alarms_for_the_other() {
     let queue = Queue::new();
@@ -410,7 +409,7 @@ fn what_waits_for_room_on_one_channel_raises_no_storm_of_alarms_for_the_other() 
     for number in 0..5000 {
         bench.receive(CAN1, numbered(number));
     }
-    // The kept part of the queue fills up with events.
+    // The queue's reserve fills up with events.
     for _ in 0..300 {
         bench.millisecond();
         bench.alarm();
@@ -428,6 +427,7 @@ fn what_waits_for_room_on_one_channel_raises_no_storm_of_alarms_for_the_other() 
     assert_eq!(bench.send_one(CAN1), Some(numbered(7)));
 }
 
+/// A confirmation is never lost: while the host reads nothing, transmission stops before one could be.
 #[test]
 fn confirmations_survive_a_host_that_does_not_read() {
     let queue = Queue::new();

@@ -6,11 +6,11 @@
 
 use crate::Frame;
 
-/// The generator polynomial of classical CAN's CRC-15, without its leading term.
+/// The generator polynomial of classical CAN's CRC-15, without the leading term.
 const CRC15_POLYNOMIAL: u16 = 0x4599;
 /// Bits of the CRC sequence.
 const CRC_BITS: u32 = 15;
-/// CRC delimiter, ACK slot, ACK delimiter, seven bits end of frame: never stuffed.
+/// CRC delimiter, ACK slot, ACK delimiter and the seven bits of the end of frame: never stuffed.
 const TAIL_BITS: u32 = 1 + 1 + 1 + 7;
 /// Bits of the intermission, which keeps two frames apart.
 pub const INTERMISSION_BITS: u32 = 3;
@@ -20,11 +20,12 @@ const STANDARD_HEADER_BITS: u32 = 1 + 11 + 1 + 1 + 1 + 4;
 const EXTENDED_HEADER_BITS: u32 = 1 + 11 + 1 + 1 + 18 + 1 + 1 + 1 + 4;
 /// SRR and IDE of an extended frame, both recessive.
 const SRR_AND_IDE: u64 = 0b11;
-/// Bytes that the CRC covers at most: 39 header bits fill five bytes, then the data.
+/// The most bytes that the CRC covers: 39 header bits fill five bytes, then the data.
 const MAX_CRC_BYTES: usize = 5 + 8;
 
 /// `CRC_OF[k][b]` is the CRC of byte `b` followed by `k` zero bytes. The CRC is linear and starts at
-/// zero, so a frame's CRC is the exclusive or of one entry per byte, and zeros in front cost nothing.
+/// zero, so a frame's CRC is the exclusive or of one entry per byte, and leading zeros do not change
+/// it.
 static CRC_OF: [[u16; 256]; MAX_CRC_BYTES] = crc_tables();
 
 const fn crc_tables() -> [[u16; 256]; MAX_CRC_BYTES] {
@@ -57,7 +58,7 @@ const fn crc_byte(mut crc: u16, byte: u16) -> u16 {
     crc
 }
 
-/// What a frame is made of on the bus.
+/// The bits that make up a frame on the bus.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct FrameBits {
     /// Bits without stuff bits, with the intermission's three.
@@ -69,7 +70,7 @@ pub struct FrameBits {
 }
 
 impl FrameBits {
-    /// Works out `frame`.
+    /// Computes them for `frame`.
     #[inline]
     pub fn of(frame: &Frame) -> Self {
         let id = frame.id();
@@ -92,7 +93,7 @@ impl FrameBits {
             .zip(message.to_le_bytes())
             .take(message_bits.div_ceil(8) as usize)
             .fold(0, |crc, (table, byte)| crc ^ table[usize::from(byte)]);
-        // Everything that is stuffed, first bit on top.
+        // Everything that is subject to stuffing, the first bit in the top position.
         let stuffed_bits = message_bits + CRC_BITS;
         let sequence = (message << CRC_BITS | u128::from(crc)) << (128 - stuffed_bits);
         Self {
@@ -109,7 +110,7 @@ impl FrameBits {
 
     /// How long all bits take at `bitrate_bps`, in nanoseconds, rounded down.
     pub const fn duration_ns(&self, bitrate_bps: u32) -> u64 {
-        // A bit rate of zero is refused wherever one is entered; here it would mean a division by zero.
+        // Zero is refused wherever a bit rate is entered; here it would divide by zero.
         let bitrate_bps = if bitrate_bps == 0 { 1 } else { bitrate_bps };
         self.total() as u64 * 1_000_000_000 / bitrate_bps as u64
     }
@@ -121,14 +122,14 @@ pub fn bits_on_bus(frame: &Frame) -> u32 {
     FrameBits::of(frame).total()
 }
 
-/// Counts stuff bits of the top `len` bits of `sequence` (at most 118).
+/// Counts the stuff bits of the top `len` bits of `sequence` (at most 118).
 ///
-/// After five equal bits the opposite one is inserted, and that one counts for the next five. So a run of
-/// five to nine equal bits has one stuff bit, and nearly all runs are like that; only a longer run, or one of exactly
-/// five with exactly four of the opposite behind it, needs a closer look.
+/// After five equal bits the opposite bit is inserted, which counts towards the next five. So a run of five to nine
+/// equal bits has one stuff bit, and nearly all runs are like that; only a longer run, or a run of exactly five
+/// followed by exactly four of the opposite bit, needs a closer look.
 #[inline]
 fn count_stuff_bits(sequence: u128, len: u32) -> u32 {
-    // Bit i of each mask, counted from the top, speaks of bit i of the sequence.
+    // Bit i of each mask, counted from the top, describes bit i of the sequence.
     let same_as_before = !(sequence ^ sequence >> 1) & !TOP_BIT;
     let valid = !(u128::MAX >> len);
     let four_equal = same_as_before & same_as_before >> 1 & same_as_before >> 2;
@@ -146,8 +147,8 @@ fn count_stuff_bits(sequence: u128, len: u32) -> u32 {
 /// The first bit of a sequence.
 const TOP_BIT: u128 = 1 << 127;
 
-/// The next stuff bit is four bits on if they all repeat the last one, else where five equal bits end that begin
-/// later.
+/// The next stuff bit comes four bits on if these all repeat the last one; otherwise after the next five equal
+/// bits.
 fn count_one_by_one(five_equal: u128, four_equal_after_a_change: u128) -> u32 {
     let mut count = 0;
     let mut ahead = five_equal;
@@ -172,7 +173,7 @@ mod tests {
         text.parse().unwrap()
     }
 
-    /// The same by the book, one bit at a time.
+    /// The same as the standard describes it, one bit at a time.
     fn bit_by_bit(frame: &Frame) -> FrameBits {
         let mut bits = Vec::new();
         let mut put = |value: u32, width: u32| bits.extend((0..width).rev().map(|bit| value >> bit & 1));
@@ -217,7 +218,7 @@ mod tests {
         fn any_frame_agrees_with_the_bit_by_bit_model(
             extended: bool, raw: u32, remote: bool, dlc in 0..16u8, data: [u8; 8], sparse: bool,
         ) {
-            // Sparse data and identifiers make many stuff bits.
+            // Sparse data and identifiers cause many stuff bits.
             let (raw, data) = if sparse { (raw & raw >> 3 & raw << 2, data.map(|byte| byte & 0x81)) } else { (raw, data) };
             let id = if extended { crate::Id::extended_truncated(raw) } else { crate::Id::standard_truncated(raw) };
             let frame = Frame::from_bus(id, remote, dlc, data);

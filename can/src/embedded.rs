@@ -1,6 +1,7 @@
-//! embedded-can's traits, so that drivers and protocol stacks built on them take our frames.
+//! embedded-can's traits, so that drivers and protocol stacks built on them accept our frames.
 //!
-//! Its frames have no DLC above 8 that still means eight bytes: such a frame keeps its DLC here and says 8 there.
+//! embedded-can's frames have no DLC above 8, which on the bus still means eight bytes: such a frame keeps its
+//! DLC here and reports 8 there.
 
 use embedded_can as can;
 

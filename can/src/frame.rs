@@ -91,8 +91,8 @@ impl Frame {
         Self { id, remote, dlc, data: first(len, data) }
     }
 
-    /// A frame whose parts are as [`Self::from_bus`] would make them: a DLC of four bits, and zeros beyond the data. With others it
-    /// is not equal to the frame that it carries.
+    /// A frame whose parts are as [`Self::from_bus`] would make them: a DLC of four bits, and zeros beyond the data. With other
+    /// parts, it would not compare equal to the frame that it represents.
     #[inline]
     pub const fn from_clean_parts(id: Id, remote: bool, dlc: u8, data: [u8; 8]) -> Self {
         Self { id, remote, dlc, data }
@@ -135,10 +135,10 @@ impl Frame {
     }
 }
 
-/// The first `len` bytes (at most 8), and zeros behind them.
+/// The first `len` bytes (at most 8), followed by zeros.
 #[inline]
 pub fn first(len: usize, data: [u8; 8]) -> [u8; 8] {
-    // Shifts rather than a copy, which is a call where the length is not known.
+    // Shifts rather than a copy, which is a function call if the length is not a constant.
     match len {
         0 => [0; 8],
         1..8 => (u64::from_le_bytes(data) & ((1 << (8 * len)) - 1)).to_le_bytes(),
@@ -175,7 +175,7 @@ impl fmt::Debug for Frame {
 pub enum ParseFrameError {
     /// There is no `#` between identifier and data.
     MissingHash,
-    /// The identifier has other than three or eight hexadecimal digits, or is too large.
+    /// The identifier does not have three or eight hexadecimal digits, or is too large.
     BadId,
     /// The data is not whole bytes of hexadecimal digits.
     BadData,

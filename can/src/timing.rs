@@ -6,7 +6,7 @@
 
 use core::fmt;
 
-/// Slowest bit rate that is offered, in bit/s.
+/// Slowest bit rate supported, in bit/s.
 pub const MIN_BITRATE_BPS: u32 = 5_000;
 /// Fastest bit rate of classical CAN, in bit/s.
 pub const MAX_BITRATE_BPS: u32 = 1_000_000;
@@ -104,8 +104,8 @@ impl BitTiming {
         }
     }
 
-    /// Every timing whose bit rate, rounded to whole bit/s, is `bitrate_bps` (so that 83 333 is
-    /// 83 333.3), from the most quanta down, with the widest jump that it allows.
+    /// Every timing whose bit rate, rounded to whole bit/s, is `bitrate_bps` (so that 83 333 is 83
+    /// 333.3), from the most quanta down, each with the widest jump that it allows.
     pub fn all(clock_hz: u32, bitrate_bps: u32) -> impl Iterator<Item = BitTiming> {
         let clocks = (clock_hz + bitrate_bps / 2).checked_div(bitrate_bps).unwrap_or(0);
         let exact = clocks > 0 && rate_of(clock_hz, clocks) == bitrate_bps;
@@ -130,9 +130,9 @@ impl BitTiming {
             })
     }
 
-    /// The timing for a bit rate: nearest to the wanted sample point, then with the most quanta.
-    /// Without a sample point it is CiA's. The jump width is one quantum per eight of the bit, at least
-    /// one: enough for crystals, and not more sensitive to noise than it must be.
+    /// The timing for a bit rate: nearest to the wanted sample point, then with the most quanta. If no
+    /// sample point is given, CiA's is used. The jump width is one quantum for every eight of the bit,
+    /// at least one: enough for crystals, and no more sensitive to noise than necessary.
     pub fn choose(
         clock_hz: u32,
         bitrate_bps: u32,
@@ -183,8 +183,8 @@ const fn rate_of(clock_hz: u32, clocks: u32) -> u32 {
 mod tests {
     use super::*;
 
-    /// The CAN clock of cantap's boards. It divides to every bit rate that CiA lists; the 42 MHz of an
-    /// STM32F405 at full speed do not reach 800 kbit/s.
+    /// The CAN clock of cantap's boards. It divides into every bit rate that CiA lists; the 42 MHz of
+    /// an STM32F405 at full speed does not reach 800 kbit/s.
     const CLOCK: u32 = 36_000_000;
 
     #[test]

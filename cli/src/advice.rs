@@ -1,4 +1,5 @@
-//! What to do about an error of the libraries, in the words of this command: they know no options and no subcommands.
+//! Adds advice to the libraries' errors, in terms of this command: the libraries know nothing of options and
+//! subcommands.
 
 use std::error::Error;
 use std::io;
@@ -12,12 +13,12 @@ use cantap_signals::condition::{ConditionError, ConditionFault};
 use cantap_address::LinkError;
 use cantap_address::server::Server;
 
-/// Where nothing could be read.
+/// For when nothing could be read.
 const NAME_THE_FORMAT: &str = "; if it is a trace, name its format with --from";
 
-/// An error and its causes as the user reads them, but for causes that the error itself tells already.
+/// An error and its causes as shown to the user, leaving out causes already contained in the error.
 pub fn sentence(error: &anyhow::Error) -> String {
-    // Files are named with their errors; what has no name is standard output.
+    // Files are named with their errors; an error without a name concerns standard output.
     let is_full = |error: &io::Error| error.kind() == io::ErrorKind::StorageFull;
     if error.chain().count() == 1 && error.downcast_ref().is_some_and(is_full) {
         return format!("not all of the output could be written: {error}; make room or choose another place");
@@ -32,7 +33,7 @@ pub fn sentence(error: &anyhow::Error) -> String {
     })
 }
 
-/// One error as the user reads it: what happened, and what to do.
+/// One error as shown to the user: what happened, and what to do.
 pub fn told(error: &(dyn Error + 'static)) -> String {
     if let Some(condition) = error.downcast_ref::<ConditionError>() {
         return of_condition(condition);
@@ -45,7 +46,7 @@ pub fn told(error: &(dyn Error + 'static)) -> String {
     advice.map_or_else(|| error.to_string(), |advice| format!("{error}{advice}"))
 }
 
-/// What a device says, also on the way to it.
+/// The device's error, including one while connecting.
 fn device_error<'e>(error: &'e (dyn Error + 'static)) -> Option<&'e DeviceError> {
     match error.downcast_ref() {
         Some(LinkError::Device(error)) => Some(error),
@@ -91,7 +92,7 @@ fn of_timing(error: &TimingError) -> Option<String> {
     Some(advice.to_owned())
 }
 
-/// The format that a name does not tell, wherever that was found out.
+/// The error for a name that does not indicate a format, wherever that was found out.
 fn unknown_format<'e>(error: &'e (dyn Error + 'static)) -> Option<&'e UnknownFormat> {
     if let Some(OpenError::Format(unknown)) = error.downcast_ref() {
         return Some(unknown);
@@ -100,13 +101,13 @@ fn unknown_format<'e>(error: &'e (dyn Error + 'static)) -> Option<&'e UnknownFor
     within.and_then(|within| within.downcast_ref()).or_else(|| error.downcast_ref())
 }
 
-/// Whether an output's name or `--format` names no format. What is read is recognised by its content, so a name that says nothing is no mistake.
+/// Whether an output's name or `--format` names no format. Input is recognised by its content, so a name that says nothing is not a mistake there.
 pub fn is_unknown_format(error: &anyhow::Error) -> bool {
     error.chain().all(|cause| !cause.is::<OpenError>())
         && error.chain().any(|cause| unknown_format(cause).is_some())
 }
 
-/// The option that names the format: of what is read, or of what is written.
+/// The option that names the format: for input, or for output.
 fn option(error: &(dyn Error + 'static)) -> &'static str {
     if error.is::<OpenError>() { "--from" } else { "--format" }
 }
@@ -116,7 +117,7 @@ fn of_format(error: &UnknownFormat, option: &str) -> Option<String> {
     matches!(error, UnknownFormat::Suffix(_)).then(|| format!("; name it with one of {option} {formats}"))
 }
 
-/// The advice stands behind what is wrong, before the condition itself.
+/// The advice comes after what is wrong, before the condition itself.
 fn of_condition(error: &ConditionError) -> String {
     let text = error.to_string();
     match &error.fault {

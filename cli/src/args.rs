@@ -1,4 +1,4 @@
-//! Values on the command line that several commands share.
+//! Command-line values that several commands have in common.
 
 use std::time::Duration;
 
@@ -7,10 +7,10 @@ use cantap::wire::CHANNELS;
 
 use crate::wrong::wrong;
 
-/// Channels of all the devices that a command takes.
+/// The most channels that a command supports, over all its devices.
 pub const MOST_CHANNELS: u8 = 32;
 
-/// Below this, in bit/s, the k was forgotten. Controllers begin at 5000.
+/// Below this, in bit/s, the k was probably forgotten. Controllers start at 5000.
 const LEAST_BITRATE_BPS: f64 = 1_500.0;
 
 /// A bit rate in bit/s: `500000`, `500k`, `83.333k`, `1M`.
@@ -22,7 +22,7 @@ pub fn bitrate(text: &str) -> Result<u32, String> {
     Ok(bps)
 }
 
-/// So many in a second, at least one: bits or clock cycles.
+/// A number per second, at least one: bits or clock cycles.
 pub fn per_second(text: &str) -> Option<u32> {
     let (number, factor) = match text.as_bytes().last() {
         Some(b'k' | b'K') => (&text[..text.len() - 1], 1_000.0),
@@ -56,13 +56,13 @@ pub fn duration(text: &str) -> Result<Duration, String> {
         .ok_or_else(|| "write a time as a number and a unit, such as 400ms, 3s or 2m".to_owned())
 }
 
-/// As [`duration`], but longer than nothing.
+/// Like [`duration`], but greater than zero.
 pub fn positive_duration(text: &str) -> Result<Duration, String> {
     let duration = duration(text)?;
     if duration.is_zero() { Err("give a time longer than zero".to_owned()) } else { Ok(duration) }
 }
 
-/// A share in per cent, above 0 and up to 100.
+/// A percentage, above 0 and up to 100.
 pub fn percent(text: &str) -> Result<f64, String> {
     let number = text.trim_end_matches('%').trim_end().parse::<f64>().ok();
     number
@@ -70,25 +70,25 @@ pub fn percent(text: &str) -> Result<f64, String> {
         .ok_or_else(|| "give per cent, above 0 and up to 100".to_owned())
 }
 
-/// Channels, as `1`, `2`, several with commas, or `both`, which is all there are.
+/// Channels, as `1`, `2`, several separated by commas, or `both`, which means all.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Channels {
-    /// From 1; none for all.
+    /// From 1; empty for all.
     numbers: Vec<u8>,
 }
 
 impl Channels {
-    /// All there are.
+    /// All channels.
     pub const fn all() -> Self {
         Self { numbers: Vec::new() }
     }
 
-    /// Whether the channel with this number, from 1, is among them.
+    /// Whether the channel with this number, from 1, is included.
     pub fn has(&self, number: u8) -> bool {
         self.numbers.is_empty() || self.numbers.contains(&number)
     }
 
-    /// Those of one device, one by one.
+    /// Those of a single device, one by one.
     pub fn iter(&self) -> impl Iterator<Item = Channel> + use<'_> {
         Channel::ALL.into_iter().filter(|channel| self.has(channel.number()))
     }
@@ -120,14 +120,14 @@ pub fn channels(text: &str) -> Result<Channels, String> {
     })
 }
 
-/// As [`channels`], for one device.
+/// Like [`channels`], for one device.
 pub fn channels_of_one(text: &str) -> Result<Channels, String> {
     let channels = channels(text)?;
     channels.check(1).map_err(|error| error.to_string())?;
     Ok(channels)
 }
 
-/// A channel of a trace, which may have more than any device: as `1`, or as an interface, `can0`.
+/// A channel of a trace, which may have more channels than any device: as `1`, or as an interface, `can0`.
 pub fn channel_of_trace(text: &str) -> Result<u8, String> {
     let number = match text.strip_prefix("can") {
         Some(index) => index.parse::<u8>().ok().and_then(|index| index.checked_add(1)),
@@ -138,7 +138,7 @@ pub fn channel_of_trace(text: &str) -> Result<u8, String> {
     })
 }
 
-/// The number of a channel, from 1: as `1`, or as the interface that a trace calls it, `can0`.
+/// The number of a channel, from 1: as `1`, or as its interface in traces, `can0`.
 fn channel_number(text: &str) -> Option<u8> {
     channel_of_trace(text).ok().filter(|number| (1..=MOST_CHANNELS).contains(number))
 }
@@ -150,7 +150,7 @@ pub fn channel(text: &str) -> Result<Channel, String> {
     found.ok_or_else(|| "a channel is 1 or 2; can0 is channel 1, can1 is channel 2".to_owned())
 }
 
-/// Whether the terminal shows more than ASCII, as far as its environment tells.
+/// Whether the terminal shows more than ASCII, judging by its environment.
 pub fn is_utf8_locale() -> bool {
     if cfg!(windows) {
         return true;

@@ -1,4 +1,4 @@
-//! A file that takes another one's place only when it is whole.
+//! A file that replaces another one only once it is complete.
 
 use std::fs;
 use std::io;
@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use crate::interrupt;
 
-/// A temporary file beside the one that is to be written. It ends like that one, so that it has the same format and compression.
+/// A temporary file beside the one to be written. It has the same suffix, so that it has the same format and compression.
 pub struct Beside {
     /// Where to write.
     pub temporary: PathBuf,
@@ -14,13 +14,13 @@ pub struct Beside {
 }
 
 impl Beside {
-    /// The file beside `path`; `None` for standard output, pipes and devices, and where no file can be made there: those are
-    /// written themselves.
+    /// The file beside `path`; `None` for standard output, pipes and devices, and if no file can be created there: those are
+    /// written to directly.
     pub fn of(path: &Path) -> Option<Self> {
         if path.as_os_str() == "-" || path.exists() && !path.is_file() {
             return None;
         }
-        // A link stays a link.
+        // A link remains a link.
         let path = if path.exists() { path.canonicalize().ok()? } else { path.to_owned() };
         let name = path.file_name()?.to_str()?;
         let temporary = path.with_file_name(format!(".cantap-{}-{name}", std::process::id()));
@@ -33,21 +33,21 @@ impl Beside {
         made.is_ok().then_some(beside)
     }
 
-    /// Puts the whole file where it belongs.
+    /// Moves the complete file to its place.
     pub fn put_in_place(self) -> io::Result<()> {
         fs::rename(&self.temporary, &self.path)
     }
 }
 
 impl Drop for Beside {
-    /// What was not put in place was not finished.
+    /// A file that was not put in place is incomplete.
     fn drop(&mut self) {
         let _ = fs::remove_file(&self.temporary);
         interrupt::finished(&self.temporary);
     }
 }
 
-/// Writes a file at once: as a whole, or not at all.
+/// Writes a file completely or not at all.
 pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
     match Beside::of(path) {
         Some(beside) => fs::write(&beside.temporary, bytes).and_then(|()| beside.put_in_place()),

@@ -1,4 +1,4 @@
-//! Which boards a command uses: those that it is given, else the one that is connected.
+//! Which boards a command uses: those given, otherwise the one that is connected.
 
 use cantap::Channel;
 use cantap::device::channel_number;
@@ -10,10 +10,10 @@ use crate::args::Channels;
 use crate::completion;
 use crate::wrong::wrong;
 
-/// More than this many boards no command takes: channels are numbered up to 32.
+/// No command supports more boards than this: channels are numbered up to 32.
 const MOST: usize = 16;
 
-/// The device of a command that has one; for commands to flatten into theirs.
+/// The device of a command that uses a single one; commands flatten this into their arguments.
 #[derive(clap::Args, Clone, Debug)]
 pub struct OneBoard {
     /// Where the device is: a serial port, or virtual. Without it, the board that is connected, if there is one.
@@ -27,7 +27,7 @@ impl OneBoard {
         self.device.clone().map_or_else(the_one_connected, Ok)
     }
 
-    /// Its address, if it was given.
+    /// Its address, if given.
     pub const fn given(&self) -> Option<&Address> {
         self.device.as_ref()
     }
@@ -54,8 +54,8 @@ fn choose(ports: &[String]) -> anyhow::Result<Address> {
     }
 }
 
-/// The boards of a command, and which channels of them it uses. Channels are numbered on: 1 and 2 are the first board's, 3 and
-/// 4 the second one's.
+/// The boards of a command, and which of their channels it uses. Channels are numbered consecutively: 1 and 2 are the first
+/// board's, 3 and 4 the second one's.
 #[derive(Clone, Debug)]
 pub struct Boards {
     addresses: Vec<Address>,
@@ -63,7 +63,7 @@ pub struct Boards {
 }
 
 impl Boards {
-    /// The boards that were given, else the one that is connected.
+    /// The given boards, otherwise the one that is connected.
     pub fn new(given: &[Address], channels: &Channels) -> anyhow::Result<Self> {
         let addresses = if given.is_empty() { vec![the_one_connected()?] } else { given.to_vec() };
         if addresses.len() > MOST {
@@ -83,25 +83,26 @@ impl Boards {
         &self.addresses
     }
 
-    /// The channels of a board, counted from 0, that are used.
+    /// The used channels of a board, counted from 0.
     pub fn channels_of(&self, board: usize) -> impl Iterator<Item = Channel> + use<'_> {
         Channel::ALL.into_iter().filter(move |channel| self.channels.has(channel_number(board, *channel)))
     }
 
-    /// The numbers of all channels that are used.
+    /// The numbers of all used channels.
     pub fn channel_numbers(&self) -> impl Iterator<Item = u8> + use<'_> {
         (0..self.addresses.len())
             .flat_map(|board| self.channels_of(board).map(move |channel| channel_number(board, channel)))
     }
 }
 
-/// The board, from 0, and the channel of it that a number, from 1, is.
+/// The board, from 0, and its channel for a number, from 1.
 pub fn place_of(number: u8) -> (usize, Channel) {
     let index = usize::from(number.saturating_sub(1));
     (index / CHANNELS, Channel::ALL[index % CHANNELS])
 }
 
-/// Filters as a board takes them: its channels have their own numbers, and other boards' none that it has.
+/// Filters for a board: its channels have their own numbers there, and other boards' channels get numbers
+/// that it does not have.
 pub fn filters_on(board: usize, filters: &[Filter]) -> Vec<Filter> {
     let own = |number: u8| match place_of(number) {
         (place, channel) if place == board && number > 0 => channel.number(),

@@ -1,4 +1,4 @@
-//! How a channel is opened; the same options in every command that opens one.
+//! How a channel is opened: the options of every command that opens one.
 
 use std::time::Duration;
 
@@ -16,7 +16,7 @@ use crate::channel_bitrate::ChannelBitrate;
 use crate::rescue::Rescue;
 use crate::timing_args::TimingArgs;
 
-/// How to open a channel; for commands to flatten into theirs.
+/// How to open a channel; commands flatten this into their arguments.
 #[derive(clap::Args, Clone, Debug, Default)]
 pub struct ChannelArgs {
     #[command(flatten)]
@@ -27,11 +27,11 @@ pub struct ChannelArgs {
     /// Send each frame once: no retransmission after an error or lost arbitration.
     #[arg(long)]
     one_shot: bool,
-    /// How to leave bus-off: auto, by the controller itself, as it does unless told otherwise; manual, not at all while the
-    /// command runs; or after a time, such as 100ms.
+    /// How to leave bus-off: auto, by the controller itself (the default); manual, not at all while the command runs; or
+    /// after a time, such as 100ms.
     #[arg(long, value_name = "auto|manual|TIME", value_parser = recovery)]
     recovery: Option<RecoveryArg>,
-    /// Leave data bytes out of the stream, to save bandwidth: files have zeros in their place.
+    /// Leave data bytes out of the stream, to save bandwidth: files contain zeros instead.
     #[arg(long)]
     no_data: bool,
     /// Leave time stamps out of the stream, to save bandwidth: times are only upper bounds.
@@ -48,9 +48,9 @@ enum ModeArg {
     Listen,
     /// Acknowledge and send.
     Normal,
-    /// Hear only what is sent from here; the bus sees it too.
+    /// Receive only what is sent from here; the bus sees it too.
     Loopback,
-    /// Hear only what is sent from here; the bus sees nothing.
+    /// Receive only what is sent from here; the bus sees nothing.
     SilentLoopback,
 }
 
@@ -60,7 +60,7 @@ enum RecoveryArg {
     Auto,
     /// Never.
     Manual,
-    /// So long after it went off, by this program.
+    /// This long after it went bus-off, by this program.
     After(Duration),
 }
 
@@ -74,33 +74,33 @@ fn recovery(text: &str) -> Result<RecoveryArg, String> {
     }
 }
 
-/// What a channel is to be opened with.
+/// The settings for opening a channel.
 struct Plan {
     channel: Channel,
     config: ChannelConfig,
-    /// What is saved on the device, where that is used.
+    /// What is saved on the device, if that is used.
     saved: Option<Defaults>,
 }
 
 impl ChannelArgs {
-    /// Only listening, at these bit rates; where there are none, with what is saved on the device.
+    /// Only listening, at these bit rates; without any, with what is saved on the device.
     pub fn listening(bitrates: Vec<ChannelBitrate>) -> Self {
         let mut args = Self::default();
         args.timing.bitrates = bitrates;
         args
     }
 
-    /// What of it concerns one of several boards, counted from 0, whose channels have their own numbers there.
+    /// The part for one of several boards, counted from 0, whose channels have their own numbers there.
     pub fn on_board(&self, board: usize) -> Self {
         Self { timing: self.timing.on_board(board), board, ..self.clone() }
     }
 
-    /// The number that users know a channel by.
+    /// The channel's number for users.
     const fn number(&self, channel: Channel) -> u8 {
         channel_number(self.board, channel)
     }
 
-    /// Whether anything was asked for.
+    /// Whether any option is given.
     pub fn is_given(&self) -> bool {
         let Self { timing, mode, one_shot, recovery, no_data, no_stamps, board: _ } = self;
         timing.is_given_or_wished()
@@ -109,7 +109,7 @@ impl ChannelArgs {
             || [one_shot, no_data, no_stamps].into_iter().any(|flag| *flag)
     }
 
-    /// The mode that was asked for, if one was.
+    /// The requested mode, if any.
     pub fn mode(&self) -> Option<Mode> {
         Some(match self.mode? {
             ModeArg::Listen => Mode::ListenOnly,
@@ -119,7 +119,7 @@ impl ChannelArgs {
         })
     }
 
-    /// Asks for another mode.
+    /// Requests another mode.
     pub fn set_mode(&mut self, mode: Mode) {
         self.mode = Some(match mode {
             Mode::ListenOnly => ModeArg::Listen,
@@ -129,12 +129,13 @@ impl ChannelArgs {
         });
     }
 
-    /// Brings channels back from bus-off while the command runs, if the user says so.
+    /// Brings channels back from bus-off while the command runs, if the user requested that.
     pub fn rescue(&self) -> Rescue {
         Rescue::new(self.recovery())
     }
 
-    /// What brings channels back from bus-off, if the user says so, for whoever says it in their own way.
+    /// Brings channels back from bus-off if the user requested that; for callers that report it in their own
+    /// way.
     pub fn recovery(&self) -> Option<Recovery> {
         match self.recovery {
             Some(RecoveryArg::After(time)) => Some(Recovery::new(time)),
@@ -142,9 +143,10 @@ impl ChannelArgs {
         }
     }
 
-    /// Opens channels, with `mode` unless the user says otherwise, and returns how. Whatever is impossible is found before
-    /// the first is opened. Commands that receive give their filters; with none of them, those saved on the device count.
-    /// Says on standard error which filters the hardware could not take, and that saved ones count.
+    /// Opens channels, with `mode` unless the user requested another, and returns how they were opened. Anything
+    /// impossible is detected before the first one is opened. Commands that receive pass their filters; with none, those
+    /// saved on the device apply. Reports on standard error which filters the hardware could not take, and that saved ones
+    /// apply.
     pub fn open(
         &self,
         device: &OpenDevice,
@@ -153,7 +155,7 @@ impl ChannelArgs {
         filters: Option<&[Filter]>,
     ) -> anyhow::Result<Vec<(Channel, ChannelConfig)>> {
         let plans = self.plan(device, channels, Some(mode))?;
-        // Filters of a channel can be changed only while both are closed.
+        // A channel's filters can be changed only while both channels are closed.
         for Plan { channel, saved, .. } in &plans {
             match (filters, saved) {
                 (Some(filters), _) if !filters.is_empty() => {
@@ -177,7 +179,7 @@ impl ChannelArgs {
         Ok(plans.into_iter().map(|plan| (plan.channel, plan.config)).collect())
     }
 
-    /// How channels would be opened, with `mode` unless the user says otherwise. Nothing is opened.
+    /// How channels would be opened, with `mode` unless the user requested another. Nothing is opened.
     pub fn configs(
         &self,
         device: &OpenDevice,
@@ -188,8 +190,8 @@ impl ChannelArgs {
         Ok(plans.into_iter().map(|plan| (plan.channel, plan.config)).collect())
     }
 
-    /// Gives closed channels the configuration and filters that were asked for, without opening them: what
-    /// [`Device::save_defaults`] stores. What is not asked for stays as it was saved before.
+    /// Gives closed channels the requested configuration and filters, without opening them: what
+    /// [`Device::save_defaults`] stores. Anything not requested stays as it was saved before.
     pub fn configure(
         &self,
         device: &OpenDevice,
@@ -221,8 +223,8 @@ impl ChannelArgs {
         channels.map(|channel| self.plan_one(device, channel, mode)).collect()
     }
 
-    /// The configuration that was asked for; where no bit timing was, the one saved on the device. The mode is the user's, else
-    /// `mode`, else the saved one.
+    /// The requested configuration; without bit timing, the one saved on the device. The mode is the user's, otherwise `mode`,
+    /// otherwise the saved one.
     fn plan_one(&self, device: &OpenDevice, channel: Channel, mode: Option<Mode>) -> anyhow::Result<Plan> {
         let (base, saved) = match self.timing.request(channel)? {
             Some(request) => {
@@ -252,7 +254,7 @@ impl ChannelArgs {
     }
 }
 
-/// How a channel is open, in words.
+/// A description of how a channel is open.
 pub fn description(config: &ChannelConfig, can_clock_hz: u32) -> String {
     let mode = match config.mode {
         Mode::ListenOnly => "listening only",
@@ -263,7 +265,7 @@ pub fn description(config: &ChannelConfig, can_clock_hz: u32) -> String {
     format!("{} bit/s, {mode}", config.timing.bitrate_bps(can_clock_hz))
 }
 
-/// The mode as `--mode` takes it.
+/// The mode as written for `--mode`.
 pub const fn mode_name(mode: Mode) -> &'static str {
     match mode {
         Mode::ListenOnly => "listen",

@@ -1,4 +1,4 @@
-//! A bit rate on the command line, of all channels or of one: `500k`, `2:250k`.
+//! A bit rate on the command line, for all channels or for one: `500k`, `2:250k`.
 
 use std::str::FromStr;
 
@@ -6,7 +6,7 @@ use cantap_analysis::stats::Options;
 
 use crate::args;
 
-/// A bit rate, of one channel or of all that have none of their own.
+/// A bit rate, for one channel or for all that have none of their own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ChannelBitrate {
     /// From 1.
@@ -41,7 +41,7 @@ impl ChannelBitrate {
         }
     }
 
-    /// The bit rate of a channel, from 1, in bit/s: its own, or the one that is for all.
+    /// The bit rate of a channel, from 1, in bit/s: its own, or the one for all.
     pub fn of(rates: &[Self], channel: u8) -> Option<u32> {
         Self::options(rates).bitrate_of(channel)
     }

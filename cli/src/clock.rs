@@ -3,7 +3,7 @@
 use cantap::device::{ClockReport, ClockSource};
 use serde_json::{Value, json};
 
-/// In a line.
+/// On one line.
 pub fn line(report: &ClockReport) -> String {
     let drift =
         report.drift_ppm.map_or("drift not known yet".to_owned(), |ppm| format!("drift {ppm:+.2} ppm"));

@@ -1,4 +1,4 @@
-//! Parquet files that commands write.
+//! The Parquet files that commands write.
 
 use std::path::Path;
 
@@ -8,18 +8,18 @@ use cantap_columns::parquet::{Dataset, Key, ParquetError, ParquetFile, Table};
 
 use crate::wrong::wrong;
 
-/// Whether a file of this name is to be a Parquet file.
+/// Whether the name is that of a Parquet file.
 pub fn is_parquet(path: &Path) -> bool {
     path.extension().is_some_and(|suffix| suffix.eq_ignore_ascii_case("parquet"))
 }
 
-/// What the files of a dataset are called: as the trace that they are made from, so that doing it again replaces them.
+/// The name of a dataset's files: that of the trace from which they are made, so that repeating it replaces them.
 pub fn name_of(trace: &Path) -> &str {
     let name = trace.file_name().and_then(|name| name.to_str()).filter(|name| *name != "-");
     name.and_then(|name| name.split('.').find(|part| !part.is_empty())).unwrap_or("trace")
 }
 
-/// Refuses a file's name where a folder is to be made.
+/// Refuses a file's name where a folder is needed.
 pub fn refuse_file(folder: &Path) -> anyhow::Result<()> {
     if folder.as_os_str() == "-" || is_parquet(folder) || folder.is_file() {
         let shown = folder.display();
@@ -37,7 +37,7 @@ pub enum Files<T, F> {
 }
 
 impl<T: Table, F: Fn() -> T> Files<T, F> {
-    /// The table that a record belongs into.
+    /// The table for a record.
     pub fn table_of(&mut self, record: &TraceRecord) -> Result<&mut T, ParquetError> {
         match self {
             Self::One(file) => {

@@ -1,7 +1,7 @@
-//! What a shell offers where a value is expected: devices, channels, and what the databases on the line have.
+//! What a shell offers as values: devices, channels, and the content of the databases on the command line.
 //!
-//! A shell runs `cantap` with the words of the line so far; [`crate::shells`] says how. Nothing here opens a device, and what cannot
-//! be read is not offered.
+//! A shell runs `cantap` with the words typed so far; [`crate::shells`] defines how. Nothing here opens a device, and what cannot be
+//! read is not offered.
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -17,7 +17,7 @@ use crate::shells;
 /// Suffixes of databases.
 const DATABASES: [&str; 5] = ["dbc", "kcd", "sym", "arxml", "toml"];
 
-/// Where devices are: connected boards, and those that need none.
+/// Device addresses: connected boards, and devices that need none.
 pub fn devices() -> ArgValueCompleter {
     ArgValueCompleter::new(offer_devices)
 }
@@ -32,7 +32,7 @@ pub fn channel() -> ArgValueCompleter {
     ArgValueCompleter::new(offer_channel)
 }
 
-/// Bit rates that are common.
+/// Common bit rates.
 pub fn bit_rates() -> ArgValueCompleter {
     ArgValueCompleter::new(offer_bit_rates)
 }
@@ -47,7 +47,7 @@ pub fn written_formats() -> ArgValueCompleter {
     ArgValueCompleter::new(offer_written_formats)
 }
 
-/// Database files, with or without the channel that they are for.
+/// Database files, with or without a channel.
 pub fn databases() -> ArgValueCompleter {
     ArgValueCompleter::new(offer_databases)
 }
@@ -77,7 +77,7 @@ pub fn values() -> ArgValueCompleter {
     ArgValueCompleter::new(offer_values)
 }
 
-/// Those of the values, each with what it is, that go on as `current` begins.
+/// Those of the values, each with its description, that continue `current`.
 fn beginning<V, H>(current: &OsStr, values: impl IntoIterator<Item = (V, H)>) -> Vec<CompletionCandidate>
 where
     V: AsRef<str>,
@@ -150,7 +150,7 @@ fn is_database(path: &Path) -> bool {
     DATABASES.iter().any(|known| suffix.eq_ignore_ascii_case(known))
 }
 
-/// The databases that are named on the line, else the virtual vehicle's if it is.
+/// The databases named on the command line, otherwise the virtual vehicle's if it is used.
 fn loaded() -> Vec<Database> {
     let words = shells::words();
     let path = |word: &String| {

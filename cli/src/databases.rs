@@ -1,4 +1,4 @@
-//! The signal databases that a command uses.
+//! The signal databases of a command.
 
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -9,14 +9,14 @@ use cantap_signals::{Database, DatabaseError, Decoder, Override, Selection, Sour
 
 use crate::completion;
 
-/// Which databases; for commands to flatten into theirs.
+/// Which databases; commands flatten this into their arguments.
 #[derive(Clone, clap::Args)]
 pub struct DatabaseArgs {
-    /// A database: DBC, KCD, SYM, ARXML or a .toml signal file; with a channel before it (2:FILE) it is that
-    /// channel's only one, without it serves all others. FILE#BUS is one bus of a KCD or ARXML file. Can be repeated.
+    /// A database: DBC, KCD, SYM, ARXML or a .toml signal file; with a channel before it (2:FILE), it is used only
+    /// for that channel, otherwise for all others. FILE#BUS selects one bus of a KCD or ARXML file. Can be repeated.
     #[arg(long = "db", value_name = "[CHANNEL:]FILE", add = completion::databases())]
     databases: Vec<DatabasePath>,
-    /// Take all 29-bit messages for J1939 parameter groups, even if the database does not say so.
+    /// Treat all 29-bit messages as J1939 parameter groups, even if the database does not say so.
     #[arg(long)]
     j1939: bool,
     /// The virtual vehicle's own database.
@@ -24,7 +24,7 @@ pub struct DatabaseArgs {
     car: bool,
 }
 
-/// Said where the vehicle's own database is used.
+/// Reported when the vehicle's own database is used.
 pub const CAR: &str = "signals are shown by the vehicle's own database; `cantap virtual car --dbc` prints it";
 
 /// A database file and its channel.
@@ -38,7 +38,7 @@ impl FromStr for DatabasePath {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        // A drive letter is no number, so that Windows' paths pass.
+        // A drive letter is not a number, so Windows paths are accepted.
         let numbered = text
             .split_once(':')
             .filter(|(number, _)| !number.is_empty() && number.bytes().all(|byte| byte.is_ascii_digit()));
@@ -53,7 +53,7 @@ impl FromStr for DatabasePath {
 }
 
 impl DatabaseArgs {
-    /// These, or, if there are none and a virtual vehicle is listened to, the vehicle's own, for all channels.
+    /// These, or, if there are none and it listens to a virtual vehicle, the vehicle's own, for all channels.
     #[must_use]
     pub fn or_of<'a>(&self, devices: impl IntoIterator<Item = &'a Address>) -> Self {
         let car = self.databases.is_empty() && devices.into_iter().any(Address::is_car);
@@ -65,7 +65,7 @@ impl DatabaseArgs {
         self.databases.is_empty() && !self.car
     }
 
-    /// The virtual vehicle's own, if it is to be used.
+    /// The virtual vehicle's own, if it should be used.
     fn own(&self) -> Result<Option<Source>, DatabaseError> {
         let database = self.car.then(cantap_virtual::car::database).transpose()?;
         Ok(database.map(|database| Source { channel: None, database }))
@@ -94,7 +94,7 @@ impl DatabaseArgs {
         Ok(decoder)
     }
 
-    /// These to begin with, for programs that go on without one, and can take further ones.
+    /// The initial databases, for programs that also run without any and can load more.
     pub fn to_begin_with(&self, said: &mut Said) -> Databases {
         let sources = self.own().ok().flatten().into_iter().collect();
         let mut databases = Databases { sources, j1939: self.j1939 };
@@ -107,7 +107,7 @@ impl DatabaseArgs {
         databases
     }
 
-    /// As [`Self::load`], for commands that are useless without a database.
+    /// Like [`Self::load`], for commands that are useless without a database.
     pub fn load_some(&self, strict: bool, quiet: bool, patterns: &[String]) -> anyhow::Result<Decoder> {
         let mut decoder = self.load(strict, quiet)?;
         decoder.select(&Selection::new(patterns)?).context("--signal")?;
@@ -115,16 +115,16 @@ impl DatabaseArgs {
     }
 }
 
-/// What there is to be said about what was loaded.
+/// Messages about what was loaded.
 #[derive(Clone, Debug, Default)]
 pub struct Said {
-    /// What was asked for and is not there.
+    /// What was requested but could not be loaded.
     pub faults: Vec<String>,
     /// What else is worth knowing.
     pub remarks: Vec<String>,
 }
 
-/// Databases that become more.
+/// Databases to which more can be added.
 #[derive(Clone, Debug, Default)]
 pub struct Databases {
     sources: Vec<Source>,
@@ -132,7 +132,7 @@ pub struct Databases {
 }
 
 impl Databases {
-    /// Adds one, as typed after `--db`; a path that is not absolute begins in `folder`.
+    /// Adds one, as typed after `--db`; a relative path is relative to `folder`.
     pub fn add(&mut self, text: &str, folder: &Path, said: &mut Said) {
         match text.parse::<DatabasePath>() {
             Ok(DatabasePath { channel, path }) => {
@@ -166,7 +166,7 @@ impl Databases {
         self.sources.is_empty()
     }
 
-    /// What decodes with them.
+    /// The decoder for them.
     pub fn decoder(&self) -> Decoder {
         let mut decoder = Decoder::new(self.sources.clone());
         if self.j1939 {
@@ -175,7 +175,7 @@ impl Databases {
         decoder
     }
 
-    /// As [`Self::decoder`], saying which messages replace others.
+    /// Like [`Self::decoder`], also reporting which messages replace others.
     pub fn decoder_saying(&self, said: &mut Said) -> Decoder {
         let decoder = self.decoder();
         said.remarks.extend(overrides(&decoder));
@@ -183,9 +183,9 @@ impl Databases {
     }
 }
 
-/// Says what is wrong with a database that can be used.
+/// Reports what is wrong with a usable database.
 fn warn(database: &Database) {
-    /// More would scroll the results of the command off the screen.
+    /// More would scroll the command's results off the screen.
     const SHOWN: usize = 10;
     for warning in database.warnings.iter().take(SHOWN) {
         eprintln!("cantap: {}: {warning}", database.file);
@@ -199,7 +199,7 @@ fn warn(database: &Database) {
     }
 }
 
-/// Which databases replace messages of others, a sentence each.
+/// Which databases replace messages of others, one sentence each.
 fn overrides(decoder: &Decoder) -> impl Iterator<Item = String> {
     decoder.overrides().iter().map(|Override { file, by, messages }| {
         let count = messages.len();

@@ -1,8 +1,8 @@
-//! Exit codes beside 0 (success). Documented in `cantap --help`.
+//! Exit codes other than 0 (success). Documented in `cantap --help`.
 
-/// Something failed; the message on stderr says what and what to do next.
+/// Something failed; the message on stderr says what happened and what to do next.
 pub const FAILURE: u8 = 1;
-/// A wrong command line; clap uses it by itself.
+/// The command line is wrong; clap also uses this code.
 pub const WRONG_COMMAND_LINE: u8 = 2;
-/// A check did not hold.
+/// A check failed.
 pub const CHECK_FAILED: u8 = 3;

@@ -1,14 +1,14 @@
-//! Notices at once that a channel hears errors and no frame: the sign of a wrong bit rate.
+//! Notices quickly that a channel receives errors but no frame: the sign of a wrong bit rate.
 
 use std::time::{Duration, Instant};
 
 use cantap::{TraceEvent, TraceRecord};
 
-/// How long after its first error a channel that has heard no frame is reported. At any bit rate, a bus on which anything
-/// happens has had frames by then.
+/// How long after its first error a channel that has received no frame is reported. By then, at any bit rate, an active
+/// bus has had frames.
 const PATIENCE: Duration = Duration::from_secs(1);
 
-/// What each channel has heard so far.
+/// What each channel has received so far.
 #[derive(Clone, Debug, Default)]
 pub struct Hearing {
     /// By number, from 1.
@@ -17,14 +17,14 @@ pub struct Hearing {
 
 #[derive(Clone, Debug, Default)]
 struct Heard {
-    /// Those that were lost are frames, too.
+    /// Lost frames count as frames, too.
     has_frames: bool,
     first_error: Option<Instant>,
     is_told: bool,
 }
 
 impl Hearing {
-    /// Takes what was heard until `now`.
+    /// Takes what was received until `now`.
     pub fn take(&mut self, records: &[TraceRecord], now: Instant) {
         for record in records {
             let index = usize::from(record.channel.saturating_sub(1));
@@ -42,7 +42,7 @@ impl Hearing {
         }
     }
 
-    /// The channels, from 1, that have heard errors and no frame for long enough to say so and have not been reported yet.
+    /// The channels, from 1, that have received errors but no frame for long enough, and have not been reported yet.
     pub fn news(&mut self, now: Instant) -> Vec<u8> {
         let is_new = |heard: &Heard| !heard.is_told && heard.has_errors_only_since(now);
         let told: Vec<u8> =
@@ -53,7 +53,7 @@ impl Hearing {
         told
     }
 
-    /// The channels, from 1, that have heard errors and no frame for long enough, reported or not.
+    /// The channels, from 1, that have received errors but no frame for long enough, reported or not.
     pub fn errors_only(&self, now: Instant) -> impl Iterator<Item = u8> {
         (1..)
             .zip(&self.channels)
@@ -61,18 +61,18 @@ impl Hearing {
             .map(|(number, _)| number)
     }
 
-    /// The channels, from 1, that have heard errors and no frame at the end of everything, however short that was.
+    /// The channels, from 1, that have received errors but no frame in the end, however short that was.
     pub fn deaf(&self) -> impl Iterator<Item = u8> {
         let is_deaf = |heard: &Heard| !heard.has_frames && heard.first_error.is_some();
         (1..).zip(&self.channels).filter_map(move |(number, heard)| is_deaf(heard).then_some(number))
     }
 
-    /// Whether any channel has heard a frame.
+    /// Whether any channel has received a frame.
     pub fn has_frames(&self) -> bool {
         self.channels.iter().any(|heard| heard.has_frames)
     }
 
-    /// Whether that was reported of a channel.
+    /// Whether this was reported for a channel.
     pub fn is_told(&self, number: u8) -> bool {
         self.channels.get(usize::from(number.saturating_sub(1))).is_some_and(|heard| heard.is_told)
     }
@@ -85,7 +85,7 @@ impl Heard {
     }
 }
 
-/// What it means, and what to do; `device` is the address to look for the bit rate at.
+/// What it means, and what to do; `device` is the address for finding the bit rate.
 pub fn meaning(number: u8, device: &str, channel_there: u8) -> String {
     format!(
         "channel {number}: only errors and no frame, which usually means a wrong bit rate or a broken bus, or a lone node that \

@@ -1,4 +1,4 @@
-//! The trace that a command reads: which file, and what to do about what is wrong in it.
+//! The trace that a command reads: which file, and how to deal with faults in it.
 
 use std::path::{Path, PathBuf};
 
@@ -12,27 +12,27 @@ use crate::interrupt;
 use crate::live::{LiveArgs, LiveRecords};
 use crate::missing::Missing;
 
-/// How to read a trace; for commands to flatten into theirs.
+/// How to read a trace; commands flatten this into their arguments.
 #[derive(clap::Args)]
 pub struct ReadArgs {
-    /// The trace's format, where neither its content nor its name tell, or tell the wrong one.
+    /// The trace's format, if neither its content nor its name show it, or show the wrong one.
     #[arg(long = "from", value_name = "FORMAT", add = completion::formats())]
     pub format: Option<Format>,
     /// Wait for more at the end of the file, until Ctrl-C.
     #[arg(long)]
     pub follow: bool,
-    /// Stop at the first thing that is wrong instead of leaving it out.
+    /// Stop at the first fault instead of leaving it out.
     #[arg(long)]
     pub strict: bool,
-    /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j. Repeat for any of several.
+    /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j. If repeated, any may match.
     #[arg(short, long, value_name = "FILTER")]
     pub filter: Vec<Filter>,
-    /// The time zone of dates in files that name none, such as ASC, TRC and BLF: Europe/Berlin, +02:00.
+    /// The time zone of dates in files that do not name one, such as ASC, TRC and BLF: Europe/Berlin, +02:00.
     #[arg(long, value_name = "ZONE", default_value_t)]
     pub zone: Zone,
 }
 
-/// Broken lines are reported one by one until it is clear that the whole file is.
+/// Broken lines are reported individually until it is clear that the whole file is broken.
 const ISSUES_SHOWN: u64 = 20;
 
 /// The records of a trace or a device. Issues go to standard error.
@@ -40,7 +40,7 @@ pub struct Records {
     source: Source,
     filters: Vec<Filter>,
     strict: bool,
-    /// What [`Self::next`] takes from; the records before `at` are used up.
+    /// The batch from which [`Self::next`] takes; the records before `at` are used up.
     batch: Vec<TraceRecord>,
     at: usize,
 }
@@ -76,7 +76,7 @@ impl ReadArgs {
         Ok(self.records(Source::File(reader, grows)))
     }
 
-    /// Opens the device if one was given, else the file.
+    /// Opens the device if given, otherwise the file.
     pub fn open_either(&self, path: Option<&PathBuf>, live: &LiveArgs) -> anyhow::Result<Records> {
         match (live.open(path)?, path) {
             (Some(live), _) => Ok(self.records(Source::Device(live))),
@@ -92,7 +92,7 @@ impl ReadArgs {
 }
 
 impl Records {
-    /// Whether the next record may take a while, so that results should not wait in a buffer.
+    /// Whether the next record may take a while, so that results should not be buffered.
     pub fn may_wait(&self) -> bool {
         self.at == self.batch.len()
             && match &self.source {
@@ -109,7 +109,7 @@ impl Records {
         }
     }
 
-    /// Ends a file that grows as soon as this is true; says whether it is one.
+    /// Ends a growing file as soon as `stop` returns true; returns whether it is one.
     pub fn end_when(&mut self, stop: fn() -> bool) -> bool {
         match &mut self.source {
             Source::File(reader, true) => {
@@ -120,7 +120,7 @@ impl Records {
         }
     }
 
-    /// What is not in the records that were read.
+    /// What is missing from the records that were read.
     pub fn missing(&self) -> Missing {
         match &self.source {
             Source::File(reader, _) => Missing::of(reader),
@@ -128,7 +128,7 @@ impl Records {
         }
     }
 
-    /// What else there is to know about a file so far, and how often.
+    /// What else is known about a file so far, and how often.
     pub fn notes(&self) -> LeftOut {
         match &self.source {
             Source::File(reader, _) => reader.notes().clone(),
@@ -136,7 +136,7 @@ impl Records {
         }
     }
 
-    /// At the end: an error if this was a device that heard errors and no frame, as at a wrong bit rate.
+    /// At the end: an error if this was a device that received errors but no frame, as at a wrong bit rate.
     pub fn judge(&self) -> anyhow::Result<()> {
         match &self.source {
             Source::File(..) => Ok(()),
@@ -144,7 +144,7 @@ impl Records {
         }
     }
 
-    /// Puts the next records that pass the filters in the place of what is in `records`, which may be none; false at the
+    /// Replaces the content of `records` with the next records that pass the filters, which may be none; false at the
     /// end. With `--strict`, an issue is an error.
     pub fn next_batch(&mut self, records: &mut Vec<TraceRecord>) -> anyhow::Result<bool> {
         let more = match &mut self.source {
@@ -157,7 +157,7 @@ impl Records {
         Ok(more)
     }
 
-    /// The next record, as [`Self::next_batch`].
+    /// The next record, like [`Self::next_batch`].
     pub fn next(&mut self) -> anyhow::Result<Option<TraceRecord>> {
         while self.at == self.batch.len() {
             let mut batch = std::mem::take(&mut self.batch);
@@ -172,7 +172,7 @@ impl Records {
     }
 }
 
-/// The next records; says what is wrong on the way, and at the end how often that was.
+/// The next records; reports faults on the way, and their number at the end.
 fn batch_of_file(
     reader: &mut TraceReader,
     strict: bool,

@@ -1,30 +1,30 @@
-//! Ctrl-C as a flag: a command that runs until it is stopped ends cleanly, with its summary. Any other command ends at once, and
-//! leaves no half-written file behind.
+//! Ctrl-C as a flag: a command that runs until it is stopped ends cleanly, with its summary. Any other command ends immediately,
+//! and leaves no half-written file behind.
 
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
-/// What shells report for a program that Ctrl-C ended.
+/// The exit code that shells report for a program ended by Ctrl-C.
 const ENDED_BY_SIGNAL: i32 = 130;
-/// A second signal so soon after the first is the same request: `timeout` and some shells signal the program, and then its
-/// whole group, it among them.
+/// A second signal this soon after the first is the same request: `timeout` and some shells signal the program and then
+/// its whole process group.
 const ECHO: Duration = Duration::from_secs(2);
 
 static HANDLER: OnceLock<()> = OnceLock::new();
 static STATE: Mutex<State> =
     Mutex::new(State { is_watched: false, request: Request::NONE, unfinished: Vec::new() });
 
-/// What a signal finds.
+/// What a signal acts on.
 struct State {
-    /// Whether the command looks for the flag.
+    /// Whether the command checks the flag.
     is_watched: bool,
     request: Request,
-    /// Files that are worth nothing yet.
+    /// Incomplete files.
     unfinished: Vec<PathBuf>,
 }
 
-/// Signals that came.
+/// The signals received.
 #[derive(Clone, Copy, Debug)]
 struct Request {
     first_at: Option<Instant>,
@@ -34,7 +34,7 @@ struct Request {
 impl Request {
     const NONE: Self = Self { first_at: None, signals: 0 };
 
-    /// Takes the next signal; returns whether to end at once.
+    /// Takes the next signal; returns whether to end immediately.
     fn signal(&mut self, now: Instant) -> bool {
         self.signals += 1;
         let first_at = *self.first_at.get_or_insert(now);
@@ -61,8 +61,8 @@ fn handle() -> Result<(), ctrlc::Error> {
     })
 }
 
-/// From now on Ctrl-C (and the system's polite request to end) sets a flag instead of ending the program. Only a third one, or
-/// one that comes [`ECHO`] after the first, ends it at once.
+/// From now on, Ctrl-C (and the system's request to terminate) sets a flag instead of ending the program. Only a third one, or
+/// one that comes [`ECHO`] after the first, ends it immediately.
 pub fn watch() -> anyhow::Result<()> {
     handle()?;
     state().is_watched = true;
@@ -74,14 +74,14 @@ pub fn requested() -> bool {
     state().request.first_at.is_some()
 }
 
-/// A file to remove if a signal ends the program.
+/// Registers a file to remove if a signal ends the program.
 pub fn unfinished(path: &Path) {
-    // Without a handler the file stays, which is untidy and no loss.
+    // Without a handler the file stays, which is untidy but does no harm.
     let _ = handle();
     state().unfinished.push(path.to_owned());
 }
 
-/// The file is to stay, or is gone.
+/// The file should stay, or is gone.
 pub fn finished(path: &Path) {
     state().unfinished.retain(|unfinished| unfinished != path);
 }

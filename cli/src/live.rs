@@ -18,17 +18,18 @@ use crate::completion;
 use crate::hearing::{self, Hearing};
 use crate::{advice, args, interrupt, stderr};
 
-/// Which devices, and how; for commands to flatten into theirs, beside an input file.
+/// Which devices, and how; commands flatten this into their arguments, in addition to an input file.
 #[derive(clap::Args)]
 pub struct LiveArgs {
-    /// Listen to a device instead of reading a file, until Ctrl-C. Repeat for several, whose channels are numbered on.
+    /// Listen to a device instead of reading a file, until Ctrl-C. Repeat for several, with channels numbered
+    /// consecutively.
     #[arg(short, long, conflicts_with = "input", add = completion::devices())]
     device: Vec<Address>,
-    /// The device's channels to listen to: 1, 2, several as 1,3, or both, which is all.
+    /// The device's channels to listen to: 1, 2, several as 1,3, or both, which means all.
     #[arg(short, long, default_value = "both", value_parser = args::channels, add = completion::channels())]
     channel: args::Channels,
-    /// Bit rate of the bus in bit/s: 500000, 500k, 1M; with a channel before it (2:250k), that channel's only. Can be
-    /// repeated. Without it, the one saved on the device.
+    /// Bit rate of the bus in bit/s: 500000, 500k, 1M; with a channel before it (2:250k), only for that channel. Can
+    /// be repeated. Without it, the one saved on the device.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", add = completion::bit_rates())]
     bitrates: Vec<ChannelBitrate>,
     /// How long to listen, as 10, 500ms or 2m.
@@ -36,15 +37,16 @@ pub struct LiveArgs {
     time: Option<Duration>,
 }
 
-/// How often to check whether to go on while nothing arrives.
+/// How often to check whether to continue while nothing arrives.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
 
-/// A device that the command goes on with when it is back; errors are shown to the user.
+/// A device with which the command continues when it is back; errors are shown to the user.
 pub type Line = Reconnecting<OpenDevice, anyhow::Error>;
 /// Several of them.
 pub type Lines = Several<OpenDevice, anyhow::Error>;
 
-/// The devices, each as soon as it is there; `setup` opens the channels of the one with that number, from 0.
+/// Opens the devices, each as soon as it is there; `setup` opens the channels of the one with that index,
+/// from 0.
 pub fn lines<S>(addresses: &[Address], setup: S) -> Lines
 where
     S: FnMut(usize, &OpenDevice) -> anyhow::Result<()> + Clone + Send + 'static,
@@ -57,31 +59,31 @@ where
     Several::new(addresses.iter().enumerate().map(line).collect())
 }
 
-/// What devices hear.
+/// The records received by devices.
 pub struct LiveRecords {
     lines: Lines,
     addresses: Vec<Address>,
     ends: Option<Instant>,
-    /// Devices that have been away for this long are not waited for.
+    /// Devices that have been away for this long are given up.
     give_up_after: Option<Duration>,
-    /// How stopping went.
+    /// The result of stopping.
     stopped: Option<anyhow::Result<()>>,
     hearing: Hearing,
-    /// Frames may be there although none is heard, so that silence says nothing.
+    /// There may be frames although none is received, so silence means nothing.
     is_filtered: bool,
-    /// Takes what happens, instead of standard error.
+    /// Receives reports instead of standard error.
     reporter: Option<Reporter>,
 }
 
 type Reporter = Box<dyn FnMut(&str)>;
 
 impl LiveArgs {
-    /// The devices that were given.
+    /// The given devices.
     pub fn devices(&self) -> impl Iterator<Item = &Address> {
         self.device.iter()
     }
 
-    /// Opens the devices and their channels: those that were given, or, without a file, the one that is connected.
+    /// Opens the devices and their channels: the given ones or, without a file, the one that is connected.
     pub fn open(&self, input: Option<&PathBuf>) -> anyhow::Result<Option<LiveRecords>> {
         if input.is_some() {
             return Ok(None);
@@ -93,7 +95,7 @@ impl LiveArgs {
 }
 
 impl LiveRecords {
-    /// Only listens, at these bit rates and else at the saved ones, until Ctrl-C or the end of the time.
+    /// Only listens, at these bit rates or otherwise the saved ones, until Ctrl-C or the end of the time.
     pub fn listen(
         boards: &Boards,
         bitrates: &[ChannelBitrate],
@@ -103,7 +105,7 @@ impl LiveRecords {
         Self::open(boards, &open, &[], time)
     }
 
-    /// Opens the boards' channels, which only listen unless `open` says otherwise, until Ctrl-C or the end of the time.
+    /// Opens the boards' channels, which only listen unless `open` does otherwise, until Ctrl-C or the end of the time.
     pub fn open(
         boards: &Boards,
         open: &ChannelArgs,
@@ -116,7 +118,7 @@ impl LiveRecords {
             let (open, filters) = (open.on_board(board), filters_on(board, &setup_filters));
             open.open(device, setup_boards.channels_of(board), Mode::ListenOnly, Some(&filters)).map(|_| ())
         });
-        // Until here, Ctrl-C ends the program: nothing has been captured.
+        // Up to here, Ctrl-C ends the program: nothing has been captured.
         lines.connect()?;
         interrupt::watch()?;
         Ok(Self {
@@ -131,7 +133,7 @@ impl LiveRecords {
         })
     }
 
-    /// Reports what happens to devices and channels there, instead of on standard error.
+    /// Reports events of devices and channels there, instead of on standard error.
     pub fn report_to(&mut self, reporter: impl FnMut(&str) + 'static) {
         self.reporter = Some(Box::new(reporter));
     }
@@ -149,18 +151,18 @@ impl LiveRecords {
         self.give_up_after = time;
     }
 
-    /// The devices, wherever they are.
+    /// The devices, whether connected or not.
     pub const fn lines(&self) -> &Lines {
         &self.lines
     }
 
-    /// The bit rates of the channels that are open, by number, in bit/s.
+    /// The bit rates of the open channels, by number, in bit/s.
     pub fn bit_rates(&self) -> Vec<(u8, u32)> {
         let opened = self.opened();
         opened.map(|(number, config, clock_hz)| (number, config.timing.bitrate_bps(clock_hz))).collect()
     }
 
-    /// The channels that are open, by number, each with how it was opened and its controller's clock in Hz.
+    /// The open channels, by number, each with its configuration and its controller's clock in Hz.
     pub fn opened(&self) -> impl Iterator<Item = (u8, ChannelConfig, u32)> {
         self.lines.devices().flat_map(|(board, device)| {
             let clock_hz = device.hello().can_clock_hz;
@@ -169,7 +171,7 @@ impl LiveRecords {
         })
     }
 
-    /// The channels that are open, as files can describe them.
+    /// The open channels, described for files.
     pub fn channels(&self) -> Vec<ChannelInfo> {
         let info = |(number, config, clock_hz): (u8, ChannelConfig, u32)| {
             let (board, channel) = place_of(number);
@@ -189,8 +191,9 @@ impl LiveRecords {
         &self.addresses
     }
 
-    /// At the end: says what it means that channels heard errors and no frame, where that was not said on the way; an error if nothing
-    /// else was heard at all, since that must not look like success. With a filter in the device, there may still be frames.
+    /// At the end: says what it means that channels received errors but no frame, unless that was already reported; an error if
+    /// nothing else was received at all, since that must not look like success. With a filter in the device, there may still be
+    /// frames.
     pub fn judge(&self) -> anyhow::Result<()> {
         if self.is_filtered {
             return Ok(());
@@ -207,15 +210,15 @@ impl LiveRecords {
         Ok(())
     }
 
-    /// What it means that a channel hears errors only, and what to do.
+    /// What it means that a channel receives only errors, and what to do.
     fn errors_only(&self, number: u8) -> String {
         let (board, channel) = place_of(number);
         let device = self.addresses.get(board).map(ToString::to_string).unwrap_or_default();
         hearing::meaning(number, &device, channel.number())
     }
 
-    /// Ends the capture: what is left comes from [`Self::next_batch`], and an error at its end if a device did not have its
-    /// last word.
+    /// Ends the capture: the rest comes from [`Self::next_batch`], with an error at its end if a device did not end
+    /// properly.
     pub fn stop(&mut self) {
         if self.stopped.is_none() {
             let mut errors = self.lines.stop().into_iter();
@@ -227,7 +230,7 @@ impl LiveRecords {
         }
     }
 
-    /// Ends the capture, and what is left is not wanted.
+    /// Ends the capture and discards the rest.
     pub fn end(&mut self) -> anyhow::Result<()> {
         self.stop();
         self.stopped.take().unwrap_or(Ok(()))
@@ -245,9 +248,9 @@ impl LiveRecords {
         })
     }
 
-    /// Puts the next records, or none after a while without any, in the place of what is in `records`; false after Ctrl-C
-    /// or the end of the time, when everything that was captured has been handed out. Says on standard error when a device
-    /// goes, when it is back, and when a channel hears nothing but errors.
+    /// Replaces the content of `records` with the next records, or none if there were none for a while; false after Ctrl-C
+    /// or the end of the time, when everything captured has been returned. Reports on standard error when a device goes,
+    /// when it is back, and when a channel receives nothing but errors.
     pub fn next_batch(&mut self, records: &mut Vec<TraceRecord>) -> anyhow::Result<bool> {
         if self.is_over() {
             self.stop();
@@ -307,12 +310,12 @@ impl LiveRecords {
     }
 }
 
-/// An error about a device that nobody named: it says why one is looked for.
+/// An error about a device that nobody named: it says why one is needed.
 pub fn unasked(error: anyhow::Error, given: &[Address], without: &str) -> anyhow::Error {
     if given.is_empty() { error.context(format!("{without}, a device is listened to")) } else { error }
 }
 
-/// What there is to say of a device that is there again, with its name if there are several.
+/// The message for a device that is back, with its name if there are several.
 pub fn welcome(board: usize, name: Option<&Address>, back: &Return) -> String {
     let after = back.after.unwrap_or_default().as_secs_f64();
     let at = name.map_or_else(String::new, |name| format!(" at '{name}'"));

@@ -2,7 +2,7 @@
 
 use cantap::device::Counters;
 
-/// Frames lost at each stage, both channels together.
+/// Frames lost at each stage, on both channels together.
 #[derive(Clone, Copy, Default, serde::Serialize)]
 pub struct Losses {
     /// In the controller's FIFO: at least this many.
@@ -28,7 +28,7 @@ impl Losses {
         losses
     }
 
-    /// Those of two devices together.
+    /// The sum of those of two devices.
     pub const fn plus(self, other: Self) -> Self {
         Self {
             controller: self.controller + other.controller,
@@ -38,7 +38,7 @@ impl Losses {
         }
     }
 
-    /// At all stages.
+    /// The total of all stages.
     pub const fn total(&self) -> u64 {
         self.controller + self.queue + self.link + self.host
     }

@@ -1,8 +1,9 @@
-//! The `cantap` command. Each subcommand is a file in `commands/`; this one only chooses.
+//! The `cantap` command. Each subcommand is a file in `commands/`; this one only selects.
 
 #![forbid(unsafe_code)]
 
-/// Standard error may be closed or full, and std's macro panics then. Whoever does not read what went wrong still gets the exit code.
+/// Standard error may be closed or full, in which case std's macro panics. Anyone who does not read the message still gets the exit
+/// code.
 macro_rules! eprintln {
     ($($part:tt)*) => {{
         use std::io::Write as _;
@@ -12,7 +13,7 @@ macro_rules! eprintln {
     }};
 }
 
-/// As `eprintln`.
+/// Like `eprintln`.
 macro_rules! eprint {
     ($($part:tt)*) => {{
         use std::io::Write as _;
@@ -75,13 +76,13 @@ struct Cli {
 }
 
 fn main() -> ExitCode {
-    // A shell asks, and the program ends here.
+    // For completion by a shell, the program ends here.
     CompleteEnv::with_factory(Cli::command).var(shells::VARIABLE).shells(shells::ALL).complete();
     let arguments = commands::extcap::arguments(std::env::args_os());
     let cli = Cli::try_parse_from(arguments).unwrap_or_else(|error| leave(&error));
     match cli.command.run(Cli::command()) {
         Ok(code) => code,
-        // `cantap … | head` has read what it wanted.
+        // `cantap … | head` has read enough.
         Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("cantap: {}", advice::sentence(&error));
@@ -94,8 +95,8 @@ fn main() -> ExitCode {
     }
 }
 
-/// The command line is wrong, or asks for help. A device's options are a language of their own: what is wrong with one is reported as
-/// what is wrong with a condition, in one line.
+/// The command line is wrong, or requests help. A device's options are a language of their own: an error in one is reported like an
+/// error in a condition, on one line.
 fn leave(error: &clap::Error) -> ! {
     let address = error.source().and_then(|source| source.downcast_ref());
     if let Some(address @ cantap_address::AddressError::Option { .. }) = address {
@@ -105,7 +106,8 @@ fn leave(error: &clap::Error) -> ! {
     error.exit()
 }
 
-/// What belongs to the command line and is understood only later, as a condition is when the databases have been read.
+/// Errors of the command line that are detected only later, such as those in a condition after the databases have been
+/// read.
 fn is_wrong_command_line(error: &anyhow::Error) -> bool {
     error.is::<wrong::WrongCommandLine>()
         || error.is::<cantap_signals::condition::ConditionError>()

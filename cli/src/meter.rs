@@ -1,4 +1,4 @@
-//! What a capture's summary says of a channel.
+//! The figures for a channel in a capture's summary.
 
 use cantap::wire::message::ChannelConfig;
 use cantap::{TraceEvent, TraceRecord};
@@ -9,9 +9,9 @@ pub struct Meter {
     frames: u64,
     lost: u64,
     bus_errors: u64,
-    /// Time of the last frame, where nothing is between it and the next.
+    /// Time of the last frame, if nothing lies between it and the next.
     latest_ns: Option<i64>,
-    /// Times from one frame to the next, all together, and how many.
+    /// The sum of the times from one frame to the next, and their number.
     covered_ns: i64,
     intervals: u64,
     load: WorkLoad,
@@ -21,7 +21,7 @@ pub struct Meter {
 }
 
 impl Meter {
-    /// Nothing delivered yet, of a channel that streams everything.
+    /// Nothing has been delivered yet, for a channel that streams everything.
     pub fn new(bitrate_bps: u32) -> Self {
         Self {
             frames: 0,
@@ -37,7 +37,7 @@ impl Meter {
         }
     }
 
-    /// Nothing delivered yet, of a channel opened this way.
+    /// Nothing has been delivered yet, for a channel opened in this way.
     pub fn of(config: &ChannelConfig, can_clock_hz: u32) -> Self {
         Self {
             omits_data: config.omit_data,
@@ -82,32 +82,32 @@ impl Meter {
         self.lost
     }
 
-    /// Bus errors, those reported one by one and those only counted.
+    /// Bus errors, including those only counted.
     pub const fn bus_errors(&self) -> u64 {
         self.bus_errors
     }
 
-    /// From the first frame to the last, in seconds, without the time in which the device was not there.
+    /// From the first frame to the last, in seconds, excluding times when the device was not there.
     pub fn seconds(&self) -> f64 {
         self.covered_ns as f64 / 1e9
     }
 
-    /// Delivered frames per second, in [`Self::seconds`]; `None` where frames came without their times.
+    /// Delivered frames per second, over [`Self::seconds`]; `None` if frames came without times.
     pub fn frames_per_s(&self) -> Option<f64> {
         let seconds = self.seconds();
         let rate = if seconds > 0.0 { self.intervals as f64 / seconds } else { 0.0 };
         (!self.omits_stamps).then_some(rate)
     }
 
-    /// Bus load in per cent, from exact lengths, over the intervals without a loss; `None` where times or data, and so the
-    /// stuff bits, are not known.
+    /// Bus load in per cent, from exact lengths, over the intervals without a loss; `None` if times or data, and therefore
+    /// stuff bits, are unknown.
     pub fn bus_load_pct(&self) -> Option<f64> {
         let is_known = !self.omits_stamps && self.without_data == 0;
         is_known.then(|| self.load.mean_pct().unwrap_or(0.0))
     }
 }
 
-/// For people: as many decimals as say something.
+/// For people: with as many decimals as are meaningful.
 pub fn rounded(value: f64, decimals: i32) -> f64 {
     let factor = 10_f64.powi(decimals);
     (value * factor).round() / factor
@@ -153,7 +153,7 @@ mod tests {
         let without = meter(|config| config.omit_data = true, &data);
         assert_eq!((without.without_data, without.bus_load_pct()), (1, None));
         assert_eq!(without.frames_per_s(), Some(1000.0));
-        // What has no data lacks none.
+        // A channel without data does not lack them.
         let without = meter(|config| config.omit_data = true, &data[1..]);
         assert!(without.without_data == 0 && without.bus_load_pct() > Some(0.0));
     }

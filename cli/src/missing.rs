@@ -1,44 +1,44 @@
-//! What is not in the records that were read or written, counted by kind.
+//! What is missing from the records read or written, counted by kind.
 
 use cantap_formats::{LeftOut, TraceReader};
 use serde_json::{Map, Value};
 
-/// Counts by kind, as the JSON objects have them.
+/// Counts by kind, as in the JSON objects.
 pub fn by_kind(counts: &LeftOut) -> Map<String, Value> {
     counts.iter().map(|(what, count)| (what.to_owned(), count.into())).collect()
 }
 
-/// What is not in the records of a file.
+/// What is missing from the records of a file.
 #[derive(Default)]
 pub struct Missing {
     /// Places that could not be read.
     pub issues: u64,
-    /// What is no part of a CAN trace, by kind.
+    /// What is not part of a CAN trace, by kind.
     pub left_out: LeftOut,
     /// Records that were read.
     pub entries: u64,
 }
 
 impl Missing {
-    /// Of what was read so far.
+    /// For what has been read so far.
     pub fn of(reader: &TraceReader) -> Self {
         Self { issues: reader.issues(), left_out: reader.left_out().clone(), entries: reader.records() }
     }
 
-    /// The share of the file's entries that is missing, in per cent; an issue counts as one.
+    /// The percentage of the file's entries that is missing; an issue counts as one entry.
     pub fn share_pct(&self) -> f64 {
         let missing = self.issues + self.left_out.total();
         missing as f64 * 100.0 / (self.entries + missing).max(1) as f64
     }
 
-    /// Another file's too.
+    /// Adds those of another file.
     pub fn merge(&mut self, other: &Self) {
         self.issues += other.issues;
         self.left_out.merge(&other.left_out);
         self.entries += other.entries;
     }
 
-    /// The members that every object with `--json` has of what was read.
+    /// Adds the members that every object with `--json` has about what was read.
     pub fn put_into(&self, object: &mut Value) {
         object["issues"] = self.issues.into();
         object["left_out"] = by_kind(&self.left_out).into();

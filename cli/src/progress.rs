@@ -1,7 +1,7 @@
-//! One line at the bottom of the terminal that tells how a long command goes, and how to end it.
+//! One line at the bottom of the terminal that shows the progress of a long command, and how to end it.
 //!
-//! Messages go above it: the program's `eprintln` takes the line away first. Where standard error is no terminal there is no
-//! line at all.
+//! Messages are printed above it: the program's `eprintln` removes the line first. If standard error is not a terminal,
+//! there is no line.
 
 use std::io::IsTerminal;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -9,17 +9,17 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
-/// The line is written anew so often.
+/// How often the line is updated.
 const EVERY: Duration = Duration::from_millis(500);
 
-/// The line that is shown now.
+/// The current line.
 static SHOWN: Mutex<Option<ProgressBar>> = Mutex::new(None);
 
 fn shown() -> MutexGuard<'static, Option<ProgressBar>> {
     SHOWN.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Writes a message while the line is away.
+/// Writes a message while the line is hidden.
 pub fn aside(write: impl FnOnce()) {
     let bar = shown().clone();
     match bar {
@@ -34,7 +34,7 @@ pub struct Progress {
 }
 
 impl Progress {
-    /// Shows a line, if there is a terminal to show it on.
+    /// Shows a line if there is a terminal.
     pub fn start() -> Option<Self> {
         if !std::io::stderr().is_terminal() {
             return None;
@@ -48,7 +48,7 @@ impl Progress {
         Some(Self { next: Instant::now() })
     }
 
-    /// Writes the line anew if it is time to.
+    /// Updates the line if it is time to.
     pub fn tell(&mut self, text: impl FnOnce() -> String) {
         let now = Instant::now();
         if now < self.next {

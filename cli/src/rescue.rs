@@ -1,4 +1,4 @@
-//! Brings channels back from bus-off while a command runs, and says so.
+//! Brings channels back from bus-off while a command runs, and reports it.
 
 use std::time::Duration;
 
@@ -9,10 +9,10 @@ use cantap::{Device, DeviceError};
 
 use crate::interrupt;
 
-/// How often [`Rescue::wait`] looks.
+/// How often [`Rescue::wait`] checks.
 const WAIT_EVERY: Duration = Duration::from_millis(5);
 
-/// Looks after the channels that a command has open.
+/// Looks after a command's open channels.
 pub struct Rescue {
     recovery: Option<Recovery>,
 }
@@ -23,7 +23,7 @@ impl Rescue {
         Self { recovery }
     }
 
-    /// To be called again and again. Says on standard error what it did.
+    /// Call this repeatedly. It reports on standard error what it did.
     pub fn look(&mut self, device: &Device) -> Result<(), DeviceError> {
         let Some(recovery) = &mut self.recovery else { return Ok(()) };
         for channel in recovery.look(device)? {
@@ -32,8 +32,8 @@ impl Rescue {
         Ok(())
     }
 
-    /// As [`Self::look`], and waits until no channel is bus-off, or Ctrl-C: what is sent meanwhile would only fail. Returns
-    /// whether it had to wait. An error comes with the next request.
+    /// Like [`Self::look`], but waits until no channel is bus-off, or for Ctrl-C: frames sent meanwhile would only fail.
+    /// Returns whether it had to wait. Errors come with the next request.
     pub fn wait(&mut self, device: &Device) -> bool {
         let mut waited = false;
         while self.look(device).is_ok() && self.is_waiting() && !interrupt::requested() {
@@ -48,7 +48,7 @@ impl Rescue {
         self.recovery.as_ref().is_some_and(Recovery::is_waiting)
     }
 
-    /// Looks the next time at once if a transmission failed for bus-off.
+    /// Checks immediately the next time if a transmission failed because of bus-off.
     pub fn note(&mut self, ends: &[Transmission]) {
         let off = |end: &Transmission| end.result == Err(TransmitFailure::BusOff);
         if let Some(recovery) = self.recovery.as_mut().filter(|_| ends.iter().any(off)) {

@@ -1,4 +1,4 @@
-//! What commands that send have in common: what became of each frame, how long to wait, and why frames were not sent.
+//! What sending commands have in common: the fate of each frame, how long to wait, and why frames were not sent.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -18,10 +18,10 @@ use crate::interrupt;
 use crate::rescue::Rescue;
 use crate::words::failure_name;
 
-/// How often to check whether to go on.
+/// How often to check whether to continue.
 pub const LOOK_EVERY: Duration = Duration::from_millis(20);
 
-/// Frames being sent: counts their ends, prints them as candump would, and notices when none leaves any more.
+/// Frames being sent: counts their ends, prints them like candump, and notices when no more can be sent.
 pub struct Sending<'d> {
     device: &'d Device,
     rescue: Rescue,
@@ -29,17 +29,17 @@ pub struct Sending<'d> {
     quiet: bool,
     sent: u64,
     failed: u64,
-    /// Those that failed, by the reason that the device gave.
+    /// Failed frames, by the device's reason.
     failures: BTreeMap<Cow<'static, str>, u64>,
-    /// Periods that passed before their frame could leave.
+    /// Number of periods that passed before their frame could be sent.
     overtaken: u64,
     stands_still: bool,
-    /// What ended it, where only a yes or no could be given.
+    /// The error that ended it, where only yes or no could be returned.
     error: Option<anyhow::Error>,
 }
 
 impl<'d> Sending<'d> {
-    /// Nothing sent yet. Prints nothing if `quiet`.
+    /// Nothing has been sent yet. Prints nothing if `quiet`.
     pub fn new(device: &'d Device, rescue: Rescue, quiet: bool) -> Self {
         Self::over(device, Watch::new(device, rescue.is_on_duty()), rescue, quiet)
     }
@@ -59,32 +59,33 @@ impl<'d> Sending<'d> {
         }
     }
 
-    /// The same for a command that uses the device's records itself, and hands each of them to [`Self::take`]. Prints nothing.
+    /// The same for a command that uses the device's records itself, and passes each of them to [`Self::take`]. Prints
+    /// nothing.
     pub fn fed(device: &'d Device, rescue: Rescue) -> Self {
         Self::over(device, Watch::fed(device, rescue.is_on_duty()), rescue, true)
     }
 
-    /// Takes notice of what was on the bus.
+    /// Notes what was on the bus.
     pub fn take(&mut self, records: &[TraceRecord]) {
         self.watch.take(records);
     }
 
-    /// Frames that were sent.
+    /// The number of frames sent.
     pub const fn sent(&self) -> u64 {
         self.sent
     }
 
-    /// Frames that ended, sent or not.
+    /// The number of frames that ended, sent or not.
     pub const fn ended(&self) -> u64 {
         self.sent + self.failed
     }
 
-    /// Whether it was given up because nothing left any more.
+    /// Whether it was given up because no more frames could be sent.
     pub const fn stands_still(&self) -> bool {
         self.stands_still
     }
 
-    /// Whether nothing more is to be sent: frames no longer leave, an error came, or Ctrl-C.
+    /// Whether nothing more will be sent: frames are stuck, an error came, or Ctrl-C.
     pub fn has_stopped(&self) -> bool {
         self.stands_still || self.error.is_some() || interrupt::requested()
     }
@@ -102,7 +103,7 @@ impl<'d> Sending<'d> {
                         writeln!(out, "({seconds}.{us:06}) can{} {frame} T", end.channel.index())?;
                     }
                 }
-                // The frame still waits, and will end once.
+                // The frame is still waiting, and will end once.
                 Err(TransmitFailure::Overtaken { periods }) => self.overtaken += u64::from(periods),
                 Err(reason) => {
                     self.failed += 1;
@@ -113,8 +114,9 @@ impl<'d> Sending<'d> {
         Ok(())
     }
 
-    /// Takes notice of ends; false after Ctrl-C, an error, or when frames that are due (see [`Stream::oldest_due`]) stand
-    /// still. Waits while a channel is to come back from bus-off: what is sent meanwhile would only fail.
+    /// Takes ends of transmissions; false after Ctrl-C, an error, or when frames that are due (see
+    /// [`Stream::oldest_due`]) are stuck. Waits while a channel is to come back from bus-off: frames sent meanwhile would
+    /// only fail.
     pub fn goes_on(&mut self, ends: &[Transmission], due: [Option<u64>; CHANNELS]) -> bool {
         let goes_on = self.add(ends).and_then(|()| {
             if self.rescue.wait(self.device) {
@@ -126,7 +128,7 @@ impl<'d> Sending<'d> {
         self.or_stop(goes_on)
     }
 
-    /// As [`Self::goes_on`], for what the device sends by itself, and without waiting.
+    /// Like [`Self::goes_on`], for what the device sends on its own, and without waiting.
     pub fn device_goes_on(&mut self, ends: &[Transmission]) -> bool {
         let goes_on = self.add(ends).and_then(|()| {
             self.rescue.look(self.device)?;
@@ -146,8 +148,8 @@ impl<'d> Sending<'d> {
         })
     }
 
-    /// Periods of a channel that passed without a frame, and frames that still wait, by the device's own count: the stream tells
-    /// of them only ten times a second.
+    /// The number of a channel's periods that passed without a frame, and of frames still waiting, according to the device: the
+    /// stream reports them only ten times a second.
     pub fn periods_missed(&mut self, channel: Channel) -> anyhow::Result<u64> {
         let status = self.device.status()?.channels[channel.index()];
         let waiting = if self.stands_still { u64::from(status.tx_pending) } else { 0 };
@@ -155,8 +157,7 @@ impl<'d> Sending<'d> {
         Ok(self.overtaken + waiting)
     }
 
-    /// What became of as many frames as were asked for; fewer if the user ended it. To be called before the channels are
-    /// closed.
+    /// The fate of as many frames as were requested; fewer if the user ended it. Call it before the channels are closed.
     pub fn outcome(&mut self, asked: u64) -> anyhow::Result<Outcome> {
         if let Some(error) = self.error.take() {
             return Err(error);
@@ -176,7 +177,7 @@ impl<'d> Sending<'d> {
         Ok(Outcome { asked, not_sent, left_out, overtaken, is_one_shot, cause })
     }
 
-    /// Waits for the rest of a stream, until frames no longer leave or Ctrl-C.
+    /// Waits for the rest of a stream, until frames are stuck or Ctrl-C.
     pub fn finish(&mut self, stream: &mut Stream<'_>) -> anyhow::Result<()> {
         stream.flush()?;
         while self.goes_on(&stream.take_ended(), stream.oldest_due()) && stream.under_way() > 0 {
@@ -185,7 +186,7 @@ impl<'d> Sending<'d> {
         Ok(())
     }
 
-    /// As [`Self::finish`], for a replay, whose last frames may be due long after the others.
+    /// Like [`Self::finish`], for a replay, whose last frames may be due long after the others.
     pub fn finish_replay(&mut self, replay: &mut Replay<'_>) -> anyhow::Result<()> {
         replay.flush()?;
         while self.goes_on(&replay.take_ended(), replay.oldest_due()) && replay.under_way() > 0 {
@@ -195,21 +196,21 @@ impl<'d> Sending<'d> {
     }
 }
 
-/// What became of the frames.
+/// The fate of the frames.
 pub struct Outcome {
     asked: u64,
     not_sent: u64,
     /// The same by reason.
     left_out: BTreeMap<Cow<'static, str>, u64>,
     overtaken: u64,
-    /// Some failed for good at the first try.
+    /// Whether some failed for good at the first try.
     is_one_shot: bool,
-    /// Why, if anything went wrong.
+    /// The cause, if anything went wrong.
     cause: Option<Cause>,
 }
 
 impl Outcome {
-    /// Why, in a sentence with what to do; nothing if all is well.
+    /// The reason in a sentence, with what to do; `None` if all is well.
     pub fn reason(&self) -> Option<String> {
         let Self { asked, not_sent, overtaken, .. } = self;
         let were_not = format!("{not_sent} of {asked} frames were not sent");

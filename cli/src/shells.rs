@@ -1,5 +1,4 @@
-//! How shells ask for what may stand at a place of the command line: they run `cantap` with an environment variable, and the line's
-//! words behind `--`.
+//! How shells request completions: they run `cantap` with an environment variable, and the words of the command line after `--`.
 
 use std::ffi::OsString;
 use std::io::{self, Write};
@@ -9,13 +8,13 @@ use clap_complete::Shell;
 use clap_complete::engine::complete;
 use clap_complete::env::{Elvish, EnvCompleter, Fish, Powershell, Shells, Zsh};
 
-/// It names the shell that asks.
+/// The variable that names the requesting shell.
 pub const VARIABLE: &str = "CANTAP_COMPLETE";
 
-/// All that are known.
+/// All supported shells.
 pub const ALL: Shells<'static> = Shells(&[&Bash, &Elvish, &Fish, &Powershell, &Zsh]);
 
-/// The script that makes a shell ask; it runs `cantap` from wherever it is found.
+/// The script that makes a shell request completions; it runs whichever `cantap` is found.
 pub fn script(shell: Shell) -> io::Result<Vec<u8>> {
     let completer = ALL.completer(&shell.to_string());
     let completer =
@@ -25,27 +24,27 @@ pub fn script(shell: Shell) -> io::Result<Vec<u8>> {
     Ok(script)
 }
 
-/// The words of the line that a shell asks about.
+/// The words of the command line for which a shell requests completions.
 pub fn words() -> Vec<String> {
     let words = std::env::args_os().skip_while(|word| word != "--").skip(1).collect();
     let (words, _) = join(words, 0);
     words.into_iter().filter_map(|word| word.into_string().ok()).collect()
 }
 
-/// Bash takes a line apart at colons and equals signs, and puts what it is given in the place of the last part alone.
+/// Bash splits a line at colons and equals signs, and replaces only the last part with what it gets.
 struct Bash;
 
-/// Bash's number of the word that the cursor is in.
+/// Bash's index of the word with the cursor.
 const WORD: &str = "_CANTAP_WORD";
 
-/// A part that only separates others.
+/// Whether a part only separates others.
 fn separates(word: &OsString) -> bool {
     let bytes = word.as_encoded_bytes();
     !bytes.is_empty() && bytes.iter().all(|byte| matches!(byte, b':' | b'='))
 }
 
-/// Puts the parts of words together again. Of the part with the number `at`: the number of its word, and what of that is before
-/// the part, or before the cursor where the part only separates.
+/// Joins the parts of words again. For the part with index `at`, returns the index of its word, and the text of that before the
+/// part, or before the cursor if the part only separates.
 fn join(parts: Vec<OsString>, at: usize) -> (Vec<OsString>, (usize, OsString)) {
     let mut words: Vec<OsString> = Vec::new();
     let mut place = (0, OsString::new());
@@ -87,7 +86,8 @@ impl EnvCompleter for Bash {
         completer: &str,
         out: &mut dyn Write,
     ) -> io::Result<()> {
-        // Nothing is sorted anew and nothing ends in a blank that more may follow; bash before 4.4 and 4.0 cannot do that.
+        // Nothing is sorted again, and nothing that may be continued ends in a blank; bash before 4.4 and 4.0 cannot do
+        // that.
         write!(
             out,
             r#"_{name}() {{
@@ -139,7 +139,7 @@ mod tests {
             joined("cantap capture -d virtual : c", 5),
             ("cantap capture -d virtual:c".into(), 3, "virtual:".into())
         );
-        // The cursor is behind the colon, which bash counts as the word.
+        // The cursor is after the colon, which bash counts as the word.
         assert_eq!(
             joined("cantap capture -d virtual :", 4),
             ("cantap capture -d virtual:".into(), 3, "virtual:".into())

@@ -1,4 +1,4 @@
-//! Commands that talk with nodes: they open a channel in normal mode, connect a client (a [`Machine`]) to the device, and show what
+//! Commands that talk to nodes: they open a channel in normal mode, connect a client (a [`Machine`]) to the device, and show what
 //! really was on the bus, as `conversations` would.
 
 use std::collections::VecDeque;
@@ -25,12 +25,12 @@ use crate::words::{counted, state_name};
 use crate::wrong::wrong;
 use crate::{args, interrupt};
 
-/// The longest time between two looks at what is being sent, and at Ctrl-C.
+/// The longest time between two checks of what is being sent, and of Ctrl-C.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
-/// The device's slot for frames that are repeated.
+/// The device's slot for repeated frames.
 const REPEAT_SLOT: u8 = 0;
 
-/// Where to talk; for commands to flatten into theirs.
+/// Where to talk; commands flatten this into their arguments.
 #[derive(clap::Args)]
 pub struct SpeakArgs {
     /// Where the device is: a serial port, or virtual. Without it, the board that is connected, if there is one.
@@ -48,7 +48,8 @@ pub struct SpeakArgs {
 }
 
 impl SpeakArgs {
-    /// Begins a session with the device, and opens the channel: it acknowledges from now on, and sends what it is told to.
+    /// Begins a session with the device, and opens the channel: from now on it acknowledges, and sends what it is asked
+    /// to.
     pub fn open(&self) -> anyhow::Result<OpenDevice> {
         self.open_in(Mode::Normal)
     }
@@ -74,7 +75,7 @@ impl SpeakArgs {
         ChannelArgs::listening(self.bitrates.clone())
     }
 
-    /// Talks over the device.
+    /// Starts talking over the device.
     pub fn speak<'d>(&self, device: &'d OpenDevice, witness: Box<dyn Assembler>) -> Speaking<'d> {
         let open = device.open_channels().into_iter().find(|(channel, _)| *channel == self.channel);
         let clock_hz = device.hello().can_clock_hz;
@@ -96,7 +97,7 @@ impl SpeakArgs {
     }
 }
 
-/// What was on the bus beside our own frames, since the last question.
+/// What else was on the bus besides our own frames, since the last request.
 #[derive(Clone, Copy, Debug, Default)]
 struct Heard {
     since: Option<Instant>,
@@ -115,7 +116,7 @@ pub struct Speaking<'d> {
     sending: Sending<'d>,
     started: Instant,
     pushed: u64,
-    /// Frames that were not confirmed so far.
+    /// Frames not yet confirmed.
     under_way: VecDeque<Frame>,
     witness: Box<dyn Assembler>,
     events: Vec<Event>,
@@ -138,17 +139,17 @@ impl Speaking<'_> {
         self.device
     }
 
-    /// What the reader of the bus has said since the last call.
+    /// The events from the bus's reader since the last call.
     pub fn take_events(&mut self) -> Vec<Event> {
         std::mem::take(&mut self.events)
     }
 
-    /// Takes back what [`Self::take_events`] gave.
+    /// Puts back what [`Self::take_events`] returned.
     pub fn put_back(&mut self, events: Vec<Event>) {
         self.events = events;
     }
 
-    /// Prints what the reader of the bus has said since the last call, as far as it is wanted.
+    /// Prints the wanted events from the bus's reader since the last call.
     pub fn tell(&mut self, mut is_wanted: impl FnMut(&Event) -> bool) -> anyhow::Result<()> {
         let mut out = std::io::stdout().lock();
         for event in self.events.drain(..).filter(|event| is_wanted(event)) {
@@ -157,8 +158,8 @@ impl Speaking<'_> {
         Ok(out.flush()?)
     }
 
-    /// Runs a client until it ends. The error is that frames do not leave, the device is gone, or Ctrl-C; how the client fared it
-    /// says itself.
+    /// Runs a client until it ends. An error means that frames are stuck, the device is gone, or Ctrl-C; the client itself has
+    /// its result.
     pub fn run(&mut self, machine: &mut dyn Machine) -> anyhow::Result<()> {
         self.heard = Heard { since: Some(Instant::now()), ..Heard::default() };
         self.take_records(Duration::ZERO, None)?;
@@ -182,7 +183,7 @@ impl Speaking<'_> {
         }
     }
 
-    /// Has the device send frames again and again by its own clock, until as many as wanted, the end of the time, or Ctrl-C. Returns
+    /// Has the device send frames periodically by its own clock, until the requested number, the end of the time, or Ctrl-C. Returns
     /// how many were sent.
     pub fn repeat(
         &mut self,
@@ -218,7 +219,7 @@ impl Speaking<'_> {
         }
     }
 
-    /// Only listens, and lets the reader of the bus read.
+    /// Only listens, and lets the bus's reader work.
     pub fn listen(&mut self, time: Duration) -> anyhow::Result<()> {
         let until = Instant::now() + time;
         loop {
@@ -263,7 +264,7 @@ impl Speaking<'_> {
         let now_ns = self.now_ns();
         match record.event {
             TraceEvent::Frame { frame, .. } => {
-                // On a shared board, other programs' frames are sent from here as well.
+                // On a shared board, other programs' frames are also sent from here.
                 if let Some(place) = self.under_way.iter().position(|own| frame == *own) {
                     self.under_way.remove(place);
                     if let Some(machine) = machine {
@@ -287,7 +288,7 @@ impl Speaking<'_> {
         }
     }
 
-    /// Whether everything that was to be sent leaves.
+    /// Checks that everything to be sent leaves.
     fn look(&mut self) -> anyhow::Result<()> {
         self.stream.wait(Duration::ZERO)?;
         let goes_on = self.sending.goes_on(&self.stream.take_ended(), self.stream.oldest_due());
@@ -307,7 +308,8 @@ impl Speaking<'_> {
         }
     }
 
-    /// What can be said of the bus when somebody does not answer: the last question was acknowledged, and what else there was.
+    /// What is known of the bus when a node does not answer: whether the last request was acknowledged, and what else there
+    /// was.
     pub fn circumstances(&self) -> String {
         let Heard { since, frames, bits, lost } = self.heard;
         let seconds = since.map_or(0.0, |since| since.elapsed().as_secs_f64()).max(1e-3);

@@ -1,4 +1,4 @@
-//! How a user gives a bit timing; the same options in every command that opens a channel.
+//! How a user gives a bit timing: the options of every command that opens a channel.
 
 use cantap::Channel;
 use cantap::bit_timing::{self, TimingError, TimingRequest};
@@ -10,10 +10,11 @@ use crate::channel_bitrate::ChannelBitrate;
 use crate::completion;
 use crate::wrong::wrong;
 
-/// A bit timing on the command line; for commands to flatten into theirs.
+/// A bit timing on the command line; commands flatten this into their arguments.
 #[derive(clap::Args, Clone, Debug, Default)]
 pub struct TimingArgs {
-    /// Bit rate in bit/s: 500000, 500k, 1M; with a channel before it (2:250k), that channel's only. Can be repeated.
+    /// Bit rate in bit/s: 500000, 500k, 1M; with a channel before it (2:250k), only for that channel. Can be
+    /// repeated.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", add = completion::bit_rates())]
     pub bitrates: Vec<ChannelBitrate>,
     #[command(flatten)]
@@ -28,7 +29,7 @@ pub struct TimingArgs {
     btr: Option<BitTiming>,
 }
 
-/// What one may wish of a timing beside its bit rate.
+/// Optional wishes for a timing besides its bit rate.
 #[derive(clap::Args, Clone, Debug, Default)]
 pub struct Wishes {
     /// Sample point in per cent of the bit, instead of the one that CiA recommends.
@@ -37,31 +38,31 @@ pub struct Wishes {
     /// Resynchronisation jump width in quanta, 1 to 4.
     #[arg(long, value_name = "QUANTA", value_parser = clap::value_parser!(u8).range(1..=4))]
     pub sjw: Option<u8>,
-    /// Sample each bit three times: refused, since bxCAN cannot.
+    /// Sample each bit three times: refused, since bxCAN cannot do this.
     #[arg(long)]
     triple: bool,
 }
 
 impl Wishes {
-    /// Refuses what no timing has.
+    /// Refuses what no timing can have.
     pub fn check(&self) -> Result<(), TimingError> {
         if self.triple { Err(TimingError::TripleSampling) } else { Ok(()) }
     }
 }
 
 impl TimingArgs {
-    /// Whether any timing was asked for.
+    /// Whether any timing was given.
     pub fn is_given(&self) -> bool {
         !self.bitrates.is_empty() || self.segments.is_some() || self.btr.is_some()
     }
 
-    /// Whether anything was asked for, be it only how a timing should be.
+    /// Whether anything was given, even if only a wish.
     pub fn is_given_or_wished(&self) -> bool {
         let Wishes { sample_point, sjw, triple } = &self.wishes;
         self.is_given() || sample_point.is_some() || sjw.is_some() || *triple
     }
 
-    /// Asks for these bit rates in place of any other timing.
+    /// Requests these bit rates instead of any other timing.
     pub fn set_bit_rates(&mut self, rates: Vec<ChannelBitrate>) {
         (self.segments, self.btr) = (None, None);
         self.bitrates = rates;
@@ -83,7 +84,7 @@ impl TimingArgs {
         }))
     }
 
-    /// What of it concerns one of several boards, counted from 0, whose channels have their own numbers there.
+    /// The part for one of several boards, counted from 0, whose channels have their own numbers there.
     pub fn on_board(&self, board: usize) -> Self {
         let own = |rate: &ChannelBitrate| match rate.channel.map(place_of) {
             None => Some(*rate),
@@ -95,7 +96,7 @@ impl TimingArgs {
         Self { bitrates: self.bitrates.iter().filter_map(own).collect(), ..self.clone() }
     }
 
-    /// What was asked for on a channel, if anything was.
+    /// The request for a channel, if any.
     pub fn request(&self, channel: Channel) -> anyhow::Result<Option<TimingRequest>> {
         self.wishes.check()?;
         self.check_channels(1)?;
@@ -168,7 +169,7 @@ mod tests {
             Some(TimingRequest::Rate { bitrate_bps, .. }) => bitrate_bps,
             other => panic!("{other:?}"),
         };
-        // As with any option that is given twice, the last one counts.
+        // As with any option given twice, the last one counts.
         assert_eq!((rate(Channel::Can1), rate(Channel::Can2)), (1_000_000, 250_000));
         let line = Line::try_parse_from("x -b 2:250k".split(' ')).unwrap();
         assert_eq!(line.timing.request(Channel::Can1).unwrap(), None);

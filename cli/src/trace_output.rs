@@ -1,4 +1,4 @@
-//! A trace that a command writes.
+//! The trace that a command writes.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -13,7 +13,7 @@ use crate::beside::Beside;
 #[cfg(feature = "parquet")]
 use crate::columns::{self, FrameFiles};
 
-/// A trace being written. An older file of its name stays as it is until this one is whole.
+/// A trace being written. An older file with its name stays unchanged until this one is complete.
 pub struct TraceOutput {
     path: PathBuf,
     sink: Sink,
@@ -29,8 +29,8 @@ enum Sink {
 }
 
 impl TraceOutput {
-    /// Begins the file. What `grows`, as what comes from a bus, is for others to read meanwhile: it is written in place, as are
-    /// files that follow one another.
+    /// Begins the file. If it `grows`, as with data from a bus, others may read it meanwhile: it is written in place, as are
+    /// files of a series.
     pub fn create(path: &Path, options: &WriteOptions, grows: bool) -> anyhow::Result<Self> {
         #[cfg(feature = "parquet")]
         if options.format.is_none() && columns::is_parquet(path) {
@@ -65,7 +65,7 @@ impl TraceOutput {
         }
     }
 
-    /// Writes what waits in memory, where a reader could take it before the end.
+    /// Writes what is waiting in memory, if a reader could take it before the end.
     pub fn flush(&mut self) -> anyhow::Result<()> {
         match &mut self.sink {
             Sink::Trace { writer, .. } => writer.flush().with_context(|| failed(&self.path)),
@@ -74,8 +74,8 @@ impl TraceOutput {
         }
     }
 
-    /// Ends it where what is read failed. A file that was written beside is dropped, and what is in its place stays; what was written in
-    /// place as it came is ended properly, because it may be nowhere else.
+    /// Ends it when reading the input has failed. A temporary file is dropped, and the existing one stays; a file written in place is
+    /// ended properly, because its content may be nowhere else.
     pub fn give_up(self) -> anyhow::Result<()> {
         match self.sink {
             Sink::Trace { writer, beside: None } => {
@@ -93,7 +93,7 @@ impl TraceOutput {
         Ok(())
     }
 
-    /// Ends the file and puts it in its place. Says what it could not carry, and returns it.
+    /// Ends the file and puts it in its place. Reports what it could not carry, and returns that.
     pub fn finish(self) -> anyhow::Result<LeftOut> {
         let left_out = match self.sink {
             Sink::Trace { writer, beside } => {
@@ -114,7 +114,7 @@ impl TraceOutput {
     }
 }
 
-/// The options with the format that the file's name tells, where no other is given.
+/// The options with the format of the file's name, if no other is given.
 pub fn named(mut options: WriteOptions, path: &Path) -> anyhow::Result<WriteOptions> {
     if options.format.is_none() && path.as_os_str() != "-" {
         let format = Format::of_path(path);
@@ -124,27 +124,27 @@ pub fn named(mut options: WriteOptions, path: &Path) -> anyhow::Result<WriteOpti
     Ok(options)
 }
 
-/// Refuses to write over what a bus said once and will not say again.
+/// Refuses to overwrite what a bus said once and will not say again.
 pub fn refuse_older(path: &Path, force: bool) -> anyhow::Result<()> {
     if path.is_file() && !force {
-        bail!("'{}' is there already; choose another name, or write over it with --force", path.display());
+        bail!("'{}' already exists; choose another name, or overwrite it with --force", path.display());
     }
     Ok(())
 }
 
-/// How a file is called in messages.
+/// A file's name in messages.
 pub fn shown(path: &Path) -> String {
     if path.as_os_str() == "-" { "standard output".to_owned() } else { path.display().to_string() }
 }
 
-/// Says what a finished file could not carry.
+/// Reports what a finished file could not carry.
 pub fn report(left_out: &LeftOut, path: &Path) {
     for (what, count) in left_out.iter() {
         eprintln!("cantap: {} does not carry {what} ({count})", shown(path));
     }
 }
 
-/// What is said where it cannot be written.
+/// The message if it cannot be written.
 pub fn failed(path: &Path) -> String {
     format!("cannot write {}", shown(path))
 }

@@ -1,4 +1,4 @@
-//! Triggers on the command line: keep what happened around events only.
+//! Triggers on the command line: keep only what happened around events.
 
 use std::time::Duration;
 
@@ -11,17 +11,17 @@ use crate::completion;
 use crate::databases::DatabaseArgs;
 use crate::protocols;
 
-/// When to keep records; for commands to flatten into theirs.
+/// When to keep records; commands flatten this into their arguments.
 #[derive(clap::Args)]
 pub struct TriggerArgs {
     /// Keep only what happens around this condition, such as "Speed > 80 and Gear == Drive", "id == 0x123",
     /// "error" or "uds.nrc" (see cantap search --help).
     #[arg(long, value_name = "CONDITION", add = completion::conditions())]
     pub trigger: Option<String>,
-    /// Also keep what happened in this time before the condition held.
+    /// Also keep what happened during this time before the condition held.
     #[arg(long, value_name = "TIME", default_value = "1s", requires = "trigger", value_parser = args::duration)]
     pre: Duration,
-    /// Also keep what happens in this time after it held.
+    /// Also keep what happens during this time after it held.
     #[arg(long, value_name = "TIME", default_value = "1s", requires = "trigger", value_parser = args::duration)]
     post: Duration,
     /// End after this many events, and the time after the last one.
@@ -32,7 +32,7 @@ pub struct TriggerArgs {
 }
 
 impl TriggerArgs {
-    /// The trigger, if one was asked for, for what these devices hear.
+    /// The trigger, if requested, for what these devices receive.
     pub fn trigger<'a>(
         &self,
         devices: impl IntoIterator<Item = &'a Address>,

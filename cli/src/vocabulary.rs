@@ -1,5 +1,5 @@
-//! One meaning for each option, in every command: held by walking the command line that clap knows. What commands print is held in
-//! `tests/vocabulary.rs`.
+//! Every option has the same meaning in every command, which is checked by walking the command line that clap has. The output of
+//! commands is checked in `tests/vocabulary.rs`.
 
 use std::collections::BTreeMap;
 
@@ -36,7 +36,7 @@ const LETTERS: [(char, &[&str]); 20] = [
 /// Letters of can-utils, which users of `cangen` and `canplayer` type without looking.
 const OF_CAN_UTILS: [(&str, &str); 2] = [("gen", "DEILRcefgimpx8"), ("replay", "Igilstx")];
 
-/// Options whose values do not follow from their name alone, and why.
+/// Options whose values do not follow from their name alone, with the reason.
 const MANY_KINDS: [(&str, &str); 6] = [
     ("count", "as in grep, search counts instead of printing; send's is a number"),
     ("id", "gen makes identifiers, search looks for them"),
@@ -46,7 +46,7 @@ const MANY_KINDS: [(&str, &str); 6] = [
     ("check", "diff says whether, align how much"),
 ];
 
-/// Calls `see` with each command that does something, by its whole name, and each of its options.
+/// Calls `see` with each command that does something, with its full name, and each of its options.
 fn each(command: &Command, name: &str, see: &mut impl FnMut(&str, &Arg)) {
     for argument in command.get_arguments() {
         see(name, argument);
@@ -89,20 +89,21 @@ fn a_name_takes_one_kind_of_value_in_every_command() {
     assert!(kinds.is_empty(), "{kinds:#?}");
 }
 
-/// `10` is ten seconds everywhere but in `gen` and `replay`, whose gaps are milliseconds as in can-utils; and says so.
+/// `10` is ten seconds everywhere except in `gen` and `replay`, whose gaps are milliseconds as in can-utils, and whose
+/// help says so.
 #[test]
 fn every_time_is_written_as_the_others() {
     let mut seen = 0;
     each(&Cli::command(), "", &mut |command, argument| {
         let is_time = argument.get_value_names().unwrap_or_default().iter().any(|name| name == "TIME");
-        // Points in time have a language of their own.
+        // Points in time have a syntax of their own.
         let is_point = matches!(argument.get_long(), Some("start" | "end"));
         if !is_time || is_point {
             return;
         }
         seen += 1;
         let parse = |text: &str| {
-            // Its parser alone: what else it needs beside it is no part of a time.
+            // Only its parser: what else it requires is not part of a time.
             let line = Arg::new("time").long("time").value_parser(argument.get_value_parser().clone());
             let parser = Command::new("x").arg(line);
             parser.try_get_matches_from(["x", "--time", text]).map(|_| ())
@@ -117,7 +118,7 @@ fn every_time_is_written_as_the_others() {
     assert!(seen > 15, "{seen}");
 }
 
-/// `docs/interoperability.md` says what is shown, and by what: that has to be there.
+/// `docs/interoperability.md` names what is shown, and by which test: that test must exist.
 #[test]
 fn the_page_on_other_programs_names_tests_that_exist() {
     let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
@@ -135,7 +136,7 @@ fn the_page_on_other_programs_names_tests_that_exist() {
     assert!(named > 15, "{named}");
 }
 
-/// What is asked for in every object of what was measured can be asked for everywhere.
+/// Output that is available as JSON in one measuring command is available in all.
 #[test]
 fn what_measures_or_tells_has_json() {
     let mut without = Vec::new();
@@ -148,7 +149,7 @@ fn what_measures_or_tells_has_json() {
         }
     }
     without.sort();
-    // There on one system alone.
+    // Exists on only one system.
     without.retain(|name| name != "bridge");
     // They write scripts or files, act, serve, or show a screen.
     let expected =

@@ -1,4 +1,4 @@
-//! What devices report, in the words of the field.
+//! What devices report, in the usual terms.
 
 use std::borrow::Cow;
 
@@ -9,7 +9,7 @@ pub fn counted(count: usize, noun: &str) -> String {
     format!("{count} {noun}{}", if count == 1 { "" } else { "s" })
 }
 
-/// A kind of error in the words of the field.
+/// The usual name of an error.
 pub fn error_name(kind: BusErrorKind) -> &'static str {
     match kind {
         BusErrorKind::Stuff => "stuff",
@@ -21,7 +21,7 @@ pub fn error_name(kind: BusErrorKind) -> &'static str {
     }
 }
 
-/// A state in the words of the field.
+/// The usual name of a state.
 pub fn state_name(state: ErrorState) -> &'static str {
     match state {
         ErrorState::Active => "error active",

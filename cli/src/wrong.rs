@@ -1,4 +1,4 @@
-//! What is wrong with a command line and cannot be seen by looking at one option alone.
+//! Errors in a command line that do not show in a single option.
 
 use std::fmt;
 
@@ -14,7 +14,7 @@ impl fmt::Display for WrongCommandLine {
 
 impl std::error::Error for WrongCommandLine {}
 
-/// The error that says so.
+/// The error with this message.
 pub fn wrong(message: impl Into<String>) -> anyhow::Error {
     WrongCommandLine(message.into()).into()
 }

@@ -19,8 +19,8 @@ fn cantap(folder: &Path, arguments: &[&str]) -> (Option<i32>, String, String) {
     (output.status.code(), text(output.stdout), text(output.stderr))
 }
 
-/// A candump log of a bus whose frames carry a counter, as a clock shows it that is `ahead_s` ahead and gains `ppm`. The
-/// clocks' microseconds are all that a log has.
+/// A candump log of a bus whose frames carry a counter, as recorded with a clock that is `ahead_s` ahead and gains
+/// `ppm`. A log has no more than the clock's microseconds.
 fn log(interface: &str, frames: std::ops::Range<u64>, ahead_s: f64, ppm: f64, salt: u64) -> String {
     frames.fold(String::new(), |mut log, frame| {
         // 1 ms apart, and up to 0.3 ms later.

@@ -25,7 +25,7 @@ fn golden_burst(folder: &Path) -> PathBuf {
     path
 }
 
-/// Runs it and returns what it printed, on standard output and standard error, with this exit code.
+/// Runs a command and returns its standard output and standard error; it must exit with this code.
 fn run(command: &mut Command, code: i32) -> (String, String) {
     let Output { status, stdout, stderr } = command.output().unwrap();
     let (stdout, stderr) = (String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap());
@@ -132,7 +132,7 @@ fn one_screen_is_printed_and_a_device_that_is_not_there_is_told() {
         stdout(cantap().args(["monitor", "-d", "virtual", "--once", "-t", "600ms", "--view", "trace"]));
     assert!(text.contains(" virtual listen-only: running"), "{text}");
     let reason = failure(cantap().args(["monitor", "-d", "/dev/nowhere", "--once"]));
-    // Without a bit rate too: the board may have one saved.
+    // Also without a bit rate: the board may have one saved.
     assert!(reason.contains("there is no device at '/dev/nowhere'"), "{reason}");
 }
 
@@ -163,7 +163,7 @@ fn the_live_view_of_the_virtual_device_loses_nothing() {
     assert_eq!(text.matches("Lost               0 ").count(), 2, "{text}");
 }
 
-/// A channel that only has errors begins where the trace does, not in 1970, and nothing begins at minus zero.
+/// A channel with only errors begins where the trace does, not in 1970, and nothing begins at minus zero.
 #[test]
 fn windows_count_from_the_traces_start() {
     let folder = tempfile::tempdir().unwrap();

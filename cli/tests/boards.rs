@@ -36,7 +36,7 @@ fn two_boards_are_four_channels_of_one_trace_on_one_clock() {
     let devices = summary["devices"].as_array().unwrap();
     let channels: Vec<_> = devices.iter().map(|device| device["channels"].to_string()).collect();
     assert_eq!(channels, ["[1,2]", "[3,4]"]);
-    // How well, `host/tests/several_devices.rs` tests: a busy computer's virtual devices may not be on one clock yet.
+    // `host/tests/several_devices.rs` tests how well: a busy computer's virtual devices may not be on one clock yet.
     let told = &devices[1];
     assert_eq!(told["by_usb_frames"] == true, told["no_usb_frames_because"].is_null(), "{out}");
     assert_eq!(told["by_usb_frames"] == true, told["uncertainty_us"].is_null(), "{out}");
@@ -118,15 +118,15 @@ fn a_capture_that_hears_only_errors_says_so_at_once_and_fails() {
     assert!(summary["channels"][0]["bus_errors"].as_u64() > Some(0), "{out}");
     assert_eq!((code, &summary["channels"][0]["frames"]), (Some(1), &0.into()), "{err}");
     let told: Vec<&str> = err.lines().filter(|line| line.contains("only errors and no frame")).collect();
-    // On each channel while it ran, and at the end as the reason.
+    // For each channel while it ran, and at the end as the reason.
     assert!(told.len() == 3 && told[0].contains("cantap autobaud -d virtual"), "{err}");
-    // With one good channel it is a capture.
+    // With one good channel, the capture succeeds.
     let (code, _, err) = line("capture -d virtual:bitrate=500k,load=50 -b 500k -b 2:250k -t 2s --json");
     assert_eq!(code, Some(0), "{err}");
     assert_eq!(err.matches("channel 2: only errors").count(), 1, "{err}");
 }
 
-/// Too short a time for the warning on the way: the end says it all the same.
+/// The time is too short for the earlier warning: the end reports it anyway.
 #[test]
 fn whatever_listens_and_hears_only_errors_fails_and_says_why() {
     for command in [
@@ -142,14 +142,15 @@ fn whatever_listens_and_hears_only_errors_fails_and_says_why() {
         let told = err.matches("channel 1: only errors and no frame").count();
         assert!(told == 1 && err.contains("cantap autobaud -d virtual"), "{command}: {err}");
     }
-    // One good channel is enough, and silence is nothing wrong.
+    // One good channel is enough, and silence is not an error.
     for bus in ["virtual:bitrate=500k,load=50 -b 500k -b 2:250k", "virtual:load=0 -b 500k"] {
         let (code, _, err) = line(&format!("stats -d {bus} -t 400ms"));
         assert!(code == Some(0) && !err.contains("channel 1: only errors"), "{bus}: {err}");
     }
 }
 
-/// The window in which listening ends is milliseconds long, and has errors of a tenth of a second before it.
+/// The window in which listening ends is milliseconds long, but contains errors from a tenth of a second
+/// before it.
 #[test]
 fn live_statistics_have_a_line_for_each_whole_window() {
     for (options, steady) in
@@ -164,7 +165,7 @@ fn live_statistics_have_a_line_for_each_whole_window() {
         assert_eq!(loads.len(), 4, "{err}");
         let is_likely = |load: &f64| if steady { (45.0..55.0).contains(load) } else { *load < 90.0 };
         assert!(loads.iter().all(is_likely), "{err}");
-        // Shorter than a window: that is all there is.
+        // Shorter than a window: there is nothing else.
         let (_, _, err) = line(&format!("stats -d {options} --window 5s -t 400ms"));
         assert_eq!(err.lines().filter(|line| line.contains(" frames/s ")).count(), 2, "{err}");
     }

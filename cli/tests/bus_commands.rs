@@ -8,12 +8,12 @@ fn cantap(arguments: &str) -> (Option<i32>, String, String) {
     (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
 }
 
-/// Frames that a command printed, without their times.
+/// The frames printed by a command, without their times.
 fn frames(out: &str) -> Vec<String> {
     out.lines().map(|line| line.split_once(") ").unwrap().1.to_owned()).collect()
 }
 
-/// Times that a command printed, in microseconds.
+/// The times printed by a command, in microseconds.
 fn times_us(out: &str) -> Vec<i64> {
     out.lines().map(|line| line[1..line.find(')').unwrap()].replace('.', "").parse().unwrap()).collect()
 }
@@ -71,7 +71,7 @@ fn faulty_lines_are_refused_before_anything_is_sent() {
     for (line, code, part) in [
         ("send -d virtual can2 123#", 2, "can0"),
         ("send -d virtual can0 123", 2, "123#DEADBEEF"),
-        ("send -d virtual can0 123#GG", 2, "'123#GG' is no frame"),
+        ("send -d virtual can0 123#GG", 2, "'123#GG' is not a frame"),
         ("send -d virtual can0 800#", 2, "7FF"),
         ("send -d virtual can0 123# --counter 0", 2, "--period"),
         ("send -d virtual can0 123#00 --period 46us", 2, "46µs is too short: no frame is shorter than 47µs"),
@@ -142,7 +142,7 @@ fn status_tells_of_a_bus_that_it_listened_to() {
         out.contains("channel 1    open, normal, 500000 bit/s") && out.contains("channel 2    closed"),
         "{out}"
     );
-    // A frame in twenty is good, and takes it back from passive for a moment.
+    // One frame in twenty is good, and brings it back from passive for a moment.
     let passive_or_nearly = ["passive", "warning"].map(|state| format!("state      {state}, TEC 0, REC 1"));
     assert!(passive_or_nearly.iter().any(|line| out.contains(line)), "{out}");
     let registers = out.split("registers of channel 1").nth(1).unwrap();
@@ -210,7 +210,7 @@ fn a_replayed_trace_keeps_its_times_and_order() {
     assert_eq!((code, err.as_str()), (Some(0), ""));
     let object: serde_json::Value = serde_json::from_str(&out).unwrap();
     assert_eq!((&object["sent"], &object["not_sent"]), (&600.into(), &0.into()));
-    // Both ways a tick's rounding.
+    // Both directions: a tick's rounding.
     assert!(object["early_us"].as_f64() <= Some(0.2) && object["late_us"].as_f64() <= Some(0.2), "{out}");
     let (code, out, _) = cantap(&format!("replay -d virtual:load=0 {} --speed 4 -v", path.display()));
     assert_eq!((code, frames(&out)), (Some(0), expected));
@@ -243,7 +243,7 @@ fn a_channel_leaves_bus_off_by_itself_and_sends_what_waited() {
     let (code, out, err) = cantap("send -d virtual:load=0,disturb=32 can0 123#11 124#22");
     assert_eq!((code, err.as_str()), (Some(0), ""));
     assert_eq!(frames(&out), ["can0 123#11 T", "can0 124#22 T"]);
-    // One less, and it never went off.
+    // With one less, it never went off.
     let (code, out, _) = cantap("send -d virtual:load=0,disturb=31 can0 123#11");
     assert_eq!((code, frames(&out).len()), (Some(0), 1));
 }
@@ -263,7 +263,7 @@ fn after_a_time_the_command_brings_the_channel_back() {
     let (code, out, err) = cantap(line);
     assert_eq!(code, Some(1), "{err}");
     assert!(err.contains("channel 2 was bus-off and joins the bus again"), "{err}");
-    // What was queued when it went off failed; what came when it was back went out.
+    // What was queued when it went off failed; what came when it was back was sent.
     let sent = frames(&out);
     assert!(!sent.is_empty() && sent.last().is_some_and(|frame| frame == "can1 42A#8F01 T"), "{out}{err}");
     assert!(err.contains(&format!("{} of 400 frames were not sent", 400 - sent.len())), "{err}");
@@ -271,26 +271,26 @@ fn after_a_time_the_command_brings_the_channel_back() {
     assert!(code == Some(2) && err.contains("write auto, manual, or a time"), "{err}");
 }
 
-/// As Linux's error frames have them: byte 2 tells the kind, byte 3 the place.
+/// As in Linux's error frames: byte 2 has the kind, byte 3 the position.
 #[test]
 fn errors_are_captured_by_kind_and_a_broken_bus_does_not_flood_the_link() {
     let capture = |bus: &str| {
         let (code, out, err) = cantap(&format!("capture -d virtual:{bus},frames=std8 -c 1 -b 500k -t 500ms"));
-        // A capture of nothing but errors is none.
+        // A capture with nothing but errors is a failure.
         assert_eq!(code, Some(i32::from(err.contains("channel 1: 0 frames"))), "{bus}: {err}");
         let details = |class: &str| -> Vec<String> {
             let lines =
                 out.lines().filter_map(|line| line.split_once(class).map(|(_, data)| data.to_owned()));
             lines.collect()
         };
-        // A bus error of the protocol with counters; and one without a kind: those suppressed, and how many.
+        // A protocol error with counters; and one without a kind: the suppressed ones, and their number.
         (details(" 20000288#"), details(" 20000080#"))
     };
     let (destroyed, _) = capture("errors=50,load=80");
     for (kind, part) in [("stuff", "00000400"), ("form", "00000200"), ("CRC", "00000008")] {
         assert!(destroyed.iter().any(|data| data.starts_with(part)), "no {kind} error in {destroyed:?}");
     }
-    // What nobody acknowledges ends in the sender's error flag, again and again.
+    // An unacknowledged frame ends in the sender's error flag, repeatedly.
     let (alone, suppressed) = capture("ack=no,load=100");
     assert!(!alone.is_empty() && alone.iter().all(|data| data.starts_with("00000200")), "{alone:?}");
     assert!(alone.len() < 500, "{} error records in half a second", alone.len());
@@ -299,7 +299,8 @@ fn errors_are_captured_by_kind_and_a_broken_bus_does_not_flood_the_link() {
     assert!(suppressed > 500, "{suppressed}");
 }
 
-/// Both channels on one wire, and nobody else acknowledges: a frame gets across only if the other channel was opened.
+/// Both channels are on one wire, and nobody else acknowledges: a frame gets across only if the other channel was
+/// opened.
 #[test]
 fn a_replay_opens_only_the_channels_that_the_trace_sends_on() {
     let path = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("one_channel.log");
@@ -325,7 +326,7 @@ fn a_replay_takes_canplayers_options() {
         assert_eq!(code, Some(0), "{options}: {err}");
         (frames(&out), times_us(&out))
     };
-    // Longer pauses than a second are skipped: the next frame follows at once.
+    // Pauses longer than a second are skipped: the next frame follows immediately.
     let (sent, times) = play(&format!("-I {} can1=can0 -s 1 -x", path.display()));
     assert_eq!(sent, ["can1 001# T", "can1 002# T", "can1 003# T"]);
     assert!((times[1] - times[0] - 10_000).abs() <= 2 && times[2] - times[1] < 1_000, "{times:?}");
@@ -338,7 +339,7 @@ fn a_replay_takes_canplayers_options() {
         ("-l 0", "from 1, or i"),
         ("-n 0", "0"),
         ("stdout=can0", "a channel is 1 or 2"),
-        // Without times there is nothing to hold apart, and canplayer sends a frame once.
+        // Without times there is nothing to keep apart, and canplayer sends a frame once.
         ("-t -g 50", "--gap"),
         ("-t --speed 2", "--speed"),
         ("-t -s 1", "--skip"),
@@ -359,7 +360,7 @@ fn made_up_frames_take_cangens_options() {
         let gap = pair[1] - pair[0];
         assert!(if at % 4 == 3 { gap > 45_000 } else { (90..130).contains(&gap) }, "{times:?}");
     }
-    // They begin so far apart, and the first frame has some stuff bits more.
+    // They begin this far apart, and the first frame has a few more stuff bits.
     assert!((times[8] - times[0] - 100_000).abs() <= 20, "{times:?}");
     for (options, code, part) in [
         ("-f", 1, "classical CAN"),
@@ -376,7 +377,7 @@ fn made_up_frames_take_cangens_options() {
     }
 }
 
-/// As `man candump` has them.
+/// As documented in `man candump`.
 #[test]
 fn filters_are_candumps() {
     let ids = |filter: &str| -> Vec<String> {
@@ -391,14 +392,14 @@ fn filters_are_candumps() {
     assert!(
         all.iter().any(|frame| frame.find('#') == Some(8)) && all.iter().any(|frame| frame.contains("#R"))
     );
-    // Eight digits are a 29-bit identifier; C-something tells standard data frames from the others.
+    // Eight digits are a 29-bit identifier; C-something selects standard data frames.
     assert!(ids("any,00000000:80000000").iter().all(|frame| frame.find('#') == Some(8) && !is_error(frame)));
     assert!(ids("can0,000:C0000000").iter().all(|frame| frame.find('#') == Some(3) && !frame.contains('R')));
     // Joined: both must hold.
     let joined = ids("can0,000:C0000400,001:001,j");
     let id = |frame: &String| u32::from_str_radix(&frame[..3], 16).unwrap();
     assert!(!joined.is_empty() && joined.iter().all(|frame| id(frame) & 0x401 == 1), "{joined:?}");
-    // Only errors, none of the frames.
+    // Only errors, no frames.
     let (code, out, err) = cantap("capture -d virtual:errors=30 -c 1 -b 500k -t 300ms -f any,0~0,#FFFFFFFF");
     assert_eq!(code, Some(0), "{err}");
     assert!(out.lines().count() > 5 && out.lines().all(|line| line.contains(" 200")), "{out}");
@@ -412,7 +413,7 @@ fn filters_are_candumps() {
 fn a_frame_is_told_when_it_was_sent_and_not_when_all_were() {
     let folder = tempfile::tempdir().unwrap();
     let log = folder.path().join("pause.log");
-    // More than a day apart: no device takes the second one now.
+    // More than a day apart: no device accepts the second one now.
     std::fs::write(&log, "(0.000000) can0 123#01\n(90000.000000) can0 123#02\n").unwrap();
     let mut replay = std::process::Command::new(env!("CARGO_BIN_EXE_cantap"))
         .args(["replay", "-d", "virtual:load=0", "-b", "500k", "-v"])

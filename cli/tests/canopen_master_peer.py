@@ -15,7 +15,7 @@ LONG = bytes(range(256)) * 5 + b"the end"
 
 
 def attempt(action):
-    """What an action gives, or the abort code."""
+    """The result of an action, or the abort code."""
     try:
         return action()
     except canopen.SdoAbortedError as error:
@@ -51,12 +51,12 @@ def main(host, port, sheet):
         attempt(lambda: node.sdo.download(0x1017, 0, b"\0")),
     ]
 
-    # Segments and blocks, both ways.
+    # Segments and blocks, in both directions.
     node.sdo.download(0x2000, 0, LONG[:100], force_segment=True)
     said["segments"] = node.sdo.upload(0x2000, 0) == LONG[:100]
     write_blocks(node, LONG)
     said["blocks"] = read_blocks(node) == LONG
-    # The nodes lose one segment each way, and the master sends it again or asks for it again.
+    # The nodes lose one segment in each direction, and the master sends or requests it again.
     node.sdo[0x2004].raw = 5
     write_blocks(node, LONG[1:])
     said["written_again"] = node.sdo.upload(0x2000, 0) == LONG[1:]
@@ -81,13 +81,13 @@ def main(host, port, sheet):
     said["timer_pdo"] = node.tpdo[2].wait_for_reception(5) is not None
     said["speed"] = node.tpdo[2]["Speed"].raw
     node.sdo[0x2003].raw = 0x4210
-    # It may be there before the write is confirmed.
+    # It may arrive before the write is confirmed.
     until = time.monotonic() + 5
     while not node.emcy.log and time.monotonic() < until:
         time.sleep(0.05)
     said["emergency"] = [node.emcy.log[-1].code, node.emcy.log[-1].register]
 
-    # The node that has no number.
+    # The node without a number.
     network.lss.RESPONSE_TIMEOUT = 0.15
     found, identity = network.lss.fast_scan()
     said["found"], said["identity"] = found, list(identity)

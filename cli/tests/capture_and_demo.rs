@@ -27,7 +27,7 @@ fn keys(value: &serde_json::Value) -> Vec<&str> {
     keys
 }
 
-/// Every line is whole: time, interface, frame.
+/// Checks that every line is complete: time, interface, frame.
 fn whole_lines(path: &Path) -> usize {
     let text = std::fs::read_to_string(path).unwrap();
     assert!(text.ends_with('\n'), "the last line is cut");
@@ -38,7 +38,7 @@ fn whole_lines(path: &Path) -> usize {
     text.lines().count()
 }
 
-/// A virtual device behind a pseudo terminal, in a process of its own, until it is dropped.
+/// A virtual device behind a pseudo-terminal, in a separate process, until it is dropped.
 #[cfg(unix)]
 struct Virtual {
     process: Child,
@@ -142,12 +142,12 @@ fn capture_with_json_prints_one_object_and_nothing_else() {
     assert!((55.0..65.0).contains(&load), "{load}");
 }
 
-/// A captured channel, and what `stats` says of it by the recorded file.
+/// A captured channel, and its figures from `stats` for the recorded file.
 fn captured_and_counted(options: &str, channel: usize) -> (serde_json::Value, serde_json::Value, String) {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("trace.log");
     let (code, out, err) = cantap(&format!("capture {options} --json -o {}", file.display()));
-    // A capture of nothing but errors is none.
+    // A capture with nothing but errors is a failure.
     assert_eq!(code, Some(i32::from(json(&out)["channels"][channel]["frames"] == 0)), "{err}");
     let (code, counted, _) = cantap(&format!("stats {} --json", file.display()));
     assert_eq!(code, Some(0));
@@ -167,7 +167,7 @@ fn a_bus_with_nothing_but_errors_is_told_from_a_silent_one() {
         "{err}"
     );
     assert!(err.contains("`cantap autobaud -d virtual:"), "{err}");
-    // The other node's rate is another.
+    // The other node has a different rate.
     let (code, _, err) = cantap("capture -d virtual:load=50,bitrate=250k -c 1 -b 500k -t 300ms");
     assert_eq!(code, Some(1));
     let line = err.lines().find(|line| line.starts_with("channel 1: 0 frames, ")).unwrap();
@@ -184,7 +184,7 @@ fn a_bus_with_nothing_but_errors_is_told_from_a_silent_one() {
     assert!(!err.contains("autobaud"), "{err}");
     let (_, _, err) = cantap("capture -d virtual:load=0 -c 1 -b 500k -t 100ms");
     assert!(err.contains(" 0 lost, 0 bus errors") && !err.contains("autobaud"), "{err}");
-    // Errors say how the bus is, whatever is captured of it.
+    // Errors describe the state of the bus, whatever is captured of it.
     let (_, out, err) =
         cantap("capture -d virtual:errors=100,load=100 -c 1 -b 1M -t 300ms -f can0,123:7FF --json");
     assert!(json(&out)["channels"][0]["bus_errors"].as_u64() > Some(100), "{out}");
@@ -203,7 +203,7 @@ fn data_that_was_left_out_is_told_and_gives_no_load() {
     assert_eq!(err, "");
     let channel = &json(&out)["channels"][0];
     assert!(channel["bus_load_pct"].is_null() && channel["frames_per_s"].is_f64(), "{out}");
-    // Frames without data lack nothing.
+    // Frames without data do not lack them.
     let (_, _, err) = cantap("capture -d virtual:load=50,frames=std0 -c 1 -b 500k -n 30 --no-data");
     assert!(err.contains("bus load ") && !err.contains("zeros"), "{err}");
 }
@@ -272,7 +272,7 @@ fn what_cannot_work_is_one_line_with_the_next_step() {
 #[test]
 fn a_capture_that_outgrows_its_place_says_how_many_frames_the_file_has() {
     let folder = tempfile::tempdir().unwrap();
-    // A file may have 64 KiB here.
+    // Files are limited to 64 KiB here.
     let script =
         "trap '' XFSZ; ulimit -f 128; exec \"$0\" capture -d virtual:load=100 -b 1M -t 20 -o cut.log --json";
     let output = Command::new("sh")
@@ -320,7 +320,7 @@ fn a_port_that_vanishes_leaves_a_whole_file_and_an_error() {
     let capture = command(&arguments).stderr(Stdio::piped()).spawn().unwrap();
     wait_for_bytes(&file, 10_000);
     drop(device);
-    // It waits for the device to come back, until it is told not to.
+    // It waits for the device to come back until it is stopped.
     let pid = capture.id().to_string();
     assert!(Command::new("kill").args(["-INT", &pid]).status().unwrap().success());
     let output = capture.wait_with_output().unwrap();

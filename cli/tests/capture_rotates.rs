@@ -1,4 +1,5 @@
-//! `cantap capture --rotate`, ended politely and by SIGKILL: every file of the row stands alone.
+//! `cantap capture --rotate`, ended by a request and by SIGKILL: every file of the series is valid on its
+//! own.
 
 #![cfg(unix)]
 
@@ -17,24 +18,24 @@ fn cantap() -> Command {
     command
 }
 
-/// The files of a folder by name.
+/// The files in a folder by name.
 fn files(folder: &Path) -> Vec<PathBuf> {
     let mut paths: Vec<_> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
     paths.sort();
     paths
 }
 
-/// How many records a file has; nothing may be wrong with it.
+/// The number of records in a file; nothing may be wrong with it.
 fn records(path: &Path) -> usize {
     let reader = open_reader(path, &ReadOptions::default()).unwrap();
     reader.collect::<Result<Vec<_>, _>>().unwrap().len()
 }
 
-/// As [`records`], of a file that was being written to: the system may have been stopped between two of its pages. Then the
+/// Like [`records`], for a file that was being written: the system may have been stopped between two of its pages. Then the
 /// cut is reported, and nothing else is wrong.
 fn records_of_the_last(path: &Path) -> usize {
     if path.metadata().unwrap().len() == 0 {
-        // Created, and killed before anything was in it.
+        // Created, and killed before anything was written.
         return 0;
     }
     let items: Vec<_> = open_reader(path, &ReadOptions::default()).unwrap().collect();
@@ -72,7 +73,7 @@ fn a_capture_that_is_killed_leaves_files_that_are_each_whole() {
             assert!(Instant::now() < deadline, "{name}: nothing was captured");
             std::thread::sleep(Duration::from_millis(5));
         }
-        // SIGKILL.
+        // This sends SIGKILL.
         capture.kill().unwrap();
         capture.wait().unwrap();
         let paths = files(folder.path());

@@ -1,6 +1,7 @@
-//! `virtual:car` through the command: its database goes with it, and another program reads what it sends by that database.
+//! `virtual:car` through the command: its database is built in, and another program reads what it sends with that
+//! database.
 //!
-//! cantools is in `CANTAP_PYTHON`, else `python3`. Where it is missing that is said and the test passes, unless
+//! cantools is in `CANTAP_PYTHON`, otherwise `python3`. If it is missing, the test says so and passes, unless
 //! `CANTAP_REQUIRE_PEERS=1`.
 
 use std::process::{Command, Output};
@@ -36,7 +37,7 @@ fn cantools_reads_the_database_and_finds_every_frame_in_range() {
     let words: Vec<&str> = said.split_whitespace().collect();
     let [frames, messages] = words[..] else { panic!("{said}") };
     assert!(frames.parse::<u32>().unwrap() >= 50_000, "{said}");
-    // All but those of testers and of a key's buttons.
+    // All except those of testers and of a key's buttons.
     assert!(messages.parse::<u32>().unwrap() >= 34, "{said}");
 }
 

@@ -1,4 +1,4 @@
-"""cantools reads a database, without a warning, and every frame of a candump log by it: frames and messages are counted."""
+"""cantools reads a database without a warning, and decodes every frame of a candump log with it: frames and messages are counted."""
 import sys
 import warnings
 

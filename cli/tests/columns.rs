@@ -1,6 +1,6 @@
-//! Parquet files that the command writes, as other people's programs read them.
+//! Parquet files written by the command, read by other programs.
 //!
-//! pyarrow, DuckDB, Polars and pandas are in `CANTAP_PYTHON`, else `python3`. Where they are missing that is said and the test passes,
+//! pyarrow, DuckDB, Polars and pandas are in `CANTAP_PYTHON`, otherwise `python3`. If they are missing, the test says so and passes,
 //! unless `CANTAP_REQUIRE_PEERS=1`.
 #![cfg(feature = "parquet")]
 
@@ -27,7 +27,7 @@ fn cantap(folder: &Path, line: &str) -> String {
     out
 }
 
-/// Twenty thousand frames of the virtual car, with its database, a loss and a bus error among them.
+/// Twenty thousand frames from the virtual car, with its database, including a loss and a bus error.
 fn drive(folder: &Path) {
     fs::write(folder.join("car.dbc"), cantap(folder, "virtual car --dbc")).unwrap();
     cantap(folder, "capture -d virtual:car,pace=fast -n 20000 -o captured.log");
@@ -77,7 +77,7 @@ fn engines_read_what_the_trace_has() {
     assert!(events.contains(&json!(["bus-error", 1])), "{events:?}");
     assert_eq!(found["zone"], "timestamp[ns, tz=UTC]");
 
-    // Each signal's number of values and their sum, as the JSON lines have them.
+    // Each signal's number of values and their sum, from the JSON lines.
     let mut sums: BTreeMap<String, (u64, f64)> = BTreeMap::new();
     for line in cantap(folder, "decode --db car.dbc drive.log --json").lines() {
         let line: Value = serde_json::from_str(line).unwrap();
@@ -126,7 +126,7 @@ fn a_name_or_a_wish_that_does_not_fit_is_refused() {
         assert_eq!(code, Some(2), "{line}: {err}");
         assert!(err.contains(says), "{line}: {err}");
     }
-    // What cannot be read leaves an older file as it is.
+    // If the input cannot be read, an older file stays unchanged.
     fs::write(folder.join("older.parquet"), "older").unwrap();
     fs::write(folder.join("b.log"), "no trace\nat all\n").unwrap();
     for line in ["convert b.log older.parquet", "decode --db car.dbc b.log -o older.parquet"] {
@@ -150,7 +150,7 @@ fn decoded_signals_go_to_a_file_of_their_form() {
         assert_eq!(cantap(folder, &format!("decode --db car.dbc a.log -o {name}")), "");
         assert_eq!(fs::read_to_string(folder.join(name)).unwrap(), said, "{name}");
     }
-    // Lines of text would pass for something else under such a name.
+    // Lines of text would be mistaken for something else under such a name.
     for name in ["a.mf4", "a.xlsx", "a.blf", "a.foo"] {
         let arguments = format!("decode --db car.dbc a.log -o {name}");
         let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));

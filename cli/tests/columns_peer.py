@@ -1,4 +1,4 @@
-"""Parquet files as other programs read them: pyarrow, DuckDB, Polars and pandas must agree; what they find is printed as JSON."""
+"""Parquet files as read by other programs: pyarrow, DuckDB, Polars and pandas must agree; their result is printed as JSON."""
 import json
 import sys
 
@@ -32,7 +32,7 @@ def sums(rows):
 
 
 table = pyarrow.parquet.read_table(frames)
-# pandas keeps nanoseconds and zone.
+# pandas keeps nanoseconds and the zone.
 frame = pandas.read_parquet(frames)
 lazy = polars.read_parquet(frames)
 found = {

@@ -1,4 +1,4 @@
-//! What shells are offered where a value is expected: asked as each of them does, and in the shells themselves where they are there.
+//! The values that shells offer: requested as each of them does, and in the shells themselves if they are installed.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ fn directory(test: &str) -> PathBuf {
 
 const SHELLS: [&str; 5] = ["bash", "elvish", "fish", "powershell", "zsh"];
 
-/// What a shell gets for a line whose last word is not finished. Descriptions are left away.
+/// What a shell gets for a line whose last word is unfinished. Descriptions are left out.
 fn offered(shell: &str, words: &[&str]) -> Vec<String> {
     let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
     let at = words.len().to_string();
@@ -66,7 +66,7 @@ fn devices_channels_databases_messages_and_signals_are_offered_to_every_shell() 
     ] {
         for shell in SHELLS {
             let mut found = offered(shell, &words);
-            // Boards that are connected come first.
+            // Connected boards come first.
             found.retain(|value| !value.starts_with("/dev/") && !value.starts_with("COM"));
             if words.last().is_some_and(|word| word.is_empty()) {
                 // Options may follow too.
@@ -80,7 +80,7 @@ fn devices_channels_databases_messages_and_signals_are_offered_to_every_shell() 
     }
 }
 
-/// The shell itself, with the script that `cantap completions` prints; `None` if it is not there.
+/// The shell itself, with the script printed by `cantap completions`; `None` if it is not installed.
 fn in_shell(shell: &str, script: &str) -> Option<Vec<String>> {
     let path = Path::new(env!("CARGO_BIN_EXE_cantap")).parent().unwrap().to_owned();
     let others = std::env::var_os("PATH").unwrap_or_default();
@@ -96,7 +96,7 @@ fn in_shell(shell: &str, script: &str) -> Option<Vec<String>> {
     Some(text.lines().map(|line| line.split('\t').next().unwrap_or_default().to_owned()).collect())
 }
 
-/// Bash takes lines apart at colons and equals signs, and replaces the last part only.
+/// Bash splits lines at colons and equals signs, and replaces only the last part.
 #[test]
 fn bash_completes_behind_colons_and_equals_signs() {
     let complete = |words: &str, at: usize| {
@@ -127,13 +127,15 @@ fn fish_elvish_and_zsh_take_their_scripts() {
     if let Some(found) = in_shell("fish", fish) {
         assert_eq!(found, ["Speed", "virtual:car"]);
     }
-    // Elvish has its line editor's names only where there is one: what is registered there gets another name here.
+    // Elvish has its line editor's names only in interactive mode: what is registered there gets another name
+    // here.
     let elvish = "use str; eval (str:replace 'set edit:completion:arg-completer[cantap] =' 'var asked~ =' (cantap completions elvish | \
                   slurp))\"\nasked cantap decode --db car.dbc trace.log -s Sp\nasked cantap capture -d virtual:\"";
     if let Some(found) = in_shell("elvish", elvish) {
         assert_eq!(found, ["Speed", "virtual:car"]);
     }
-    // Zsh completes in its line editor only: that the script is one, and registers, is what can be seen without a terminal.
+    // Zsh completes only in its line editor: without a terminal, all that can be checked is that the script is valid and
+    // registers.
     let zsh =
         "autoload -Uz compinit; compinit -D -u; source <(cantap completions zsh); print ${_comps[cantap]}";
     if let Some(found) = in_shell("zsh", zsh) {
@@ -141,7 +143,7 @@ fn fish_elvish_and_zsh_take_their_scripts() {
     }
 }
 
-/// A user who has the variable of another program set loses nothing.
+/// A user who has another program's variable set is not affected.
 #[test]
 fn without_a_shell_that_asks_the_command_runs() {
     let run = |variable: &str| {

@@ -13,7 +13,8 @@ fn cantap(test: &str, log: &str, arguments: &[&str]) -> (Option<i32>, String, St
     (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
 }
 
-/// A workshop: a VIN is read while the car talks, a service is refused, one transfer breaks, nobody answers the last request.
+/// A workshop: a VIN is read while the car talks, a service is refused, one transfer breaks, and the last request is not
+/// answered.
 const WORKSHOP: &str = "\
 (1.000000) can0 7E0#0322F190AAAAAAAA
 (1.000500) can0 123#1008112233445566
@@ -56,12 +57,12 @@ fn frames_are_shown_as_what_they_say() {
 #[test]
 fn one_protocol_or_only_faults_can_be_asked_for() {
     let lines = |arguments: &[&str]| cantap("conversations_choice", WORKSHOP, arguments).1.lines().count();
-    // What broke may have been one of theirs.
+    // The broken one may have been one of theirs.
     assert_eq!(lines(&["--protocol", "obd"]), 2);
     assert_eq!(lines(&["--protocol", "uds,obd"]), 5);
     assert_eq!(lines(&["--protocol", "j1939"]), 0);
     assert_eq!(lines(&["--faults"]), 3);
-    // Each message by itself, and the broken one.
+    // Each message on its own, and the broken one.
     assert_eq!(lines(&["--protocol", "isotp"]), 8);
     let (code, _, err) = cantap("conversations_choice", WORKSHOP, &["--protocol", "odb"]);
     assert_eq!(code, Some(2));
@@ -119,7 +120,8 @@ fn a_bus_that_speaks_nothing_known_says_what_to_do() {
     assert!(err.contains("name one with --protocol"), "{err}");
 }
 
-/// A vehicle on channel 1, a machine on channel 2, a boat on channel 3, a plant on channel 4: each is read by what it speaks.
+/// A vehicle on channel 1, a machine on channel 2, a boat on channel 3, a plant on channel 4: each is decoded by its own
+/// protocol.
 #[test]
 fn each_channel_is_read_by_what_it_speaks() {
     let log = "\
@@ -163,7 +165,7 @@ fn a_sheet_names_what_pdos_carry_and_one_that_is_none_is_refused() {
     assert!(out.contains("TPDO1: Statusword 567\n") && out.contains("TPDO1: data 37 02\n"), "{out}");
     assert!(err.contains("drive.eds: line 11: neither a section nor a key: rubbish"), "{err}");
     let (code, _, err) = cantap("conversations_sheet", log, &["--eds", "bus.log"]);
-    assert!(code == Some(1) && err.contains("is no EDS or DCF"), "{err}");
+    assert!(code == Some(1) && err.contains("is not an EDS or DCF"), "{err}");
     let (code, _, err) = cantap("conversations_sheet", log, &["--eds", "200:drive.eds"]);
     assert!(code == Some(2) && err.contains("nodes from 1 to 127"), "{err}");
 }

@@ -11,10 +11,10 @@ const TRACE: &str = "(1410714882.000000) can0 123#1122\n\
                      (1410714885.000000) can0 20000088#0000040000000000\n\
                      (1410714886.500000) can1 400#\n";
 
-/// An empty directory for each test, but for the trace.
+/// An empty directory for each test, except for the trace.
 fn directory(test: &str) -> PathBuf {
     let directory = Path::new(env!("CARGO_TARGET_TMPDIR")).join("convert").join(test);
-    // A run before may have left files that would be counted.
+    // An earlier run may have left files that would be counted.
     let _ = fs::remove_dir_all(&directory);
     fs::create_dir_all(&directory).unwrap();
     fs::write(directory.join("trace.log"), TRACE).unwrap();
@@ -30,7 +30,7 @@ fn texts(output: Output) -> (Option<i32>, String, String) {
     (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
 }
 
-/// The trace's lines whose numbers are given.
+/// The lines of the trace with these numbers.
 fn lines(numbers: &[usize]) -> String {
     numbers.iter().map(|number| TRACE.split_inclusive('\n').nth(*number).unwrap()).collect()
 }
@@ -40,7 +40,7 @@ fn a_trace_comes_back_from_every_format_that_carries_everything_plain_and_compre
     let directory = directory("there_and_back");
     for format in ["asc", "blf", "pcapng", "trc", "log", "mf4"] {
         for compression in ["", ".gz", ".zst", ".xz", ".lz4"] {
-            // Which would say that it is marked as unfinished.
+            // This would report that it is marked as unfinished.
             if format == "mf4" && !compression.is_empty() {
                 continue;
             }
@@ -53,7 +53,8 @@ fn a_trace_comes_back_from_every_format_that_carries_everything_plain_and_compre
     }
 }
 
-/// A log of BUSMASTER has the suffix of candump's, and an ASC the clock of the computer that wrote it.
+/// A BUSMASTER log has the same suffix as candump's, and an ASC file has the clock of the computer that wrote
+/// it.
 #[test]
 fn logs_of_other_programs_are_known_by_their_beginning_and_their_dates_have_the_zone_that_is_named() {
     let directory = directory("zones");
@@ -140,7 +141,7 @@ fn details_of_error_frames_that_are_not_kept_are_counted() {
             err.contains("error frames say more than their kind") && err.contains("(2)"),
             "{name}: {err}"
         );
-        // What was written is reported whole.
+        // Everything that was written is reported.
         let (_, _, err) = cantap(&directory, &["convert", name, "twice.log"]);
         assert!(!err.contains("error frames say more"), "{name}: {err}");
     }

@@ -1,4 +1,4 @@
-//! `cantap db`: what databases say, and how they suit a trace.
+//! `cantap db`: the content of databases, and how they match a trace.
 
 use std::fmt::Write as _;
 use std::path::PathBuf;

@@ -20,7 +20,7 @@ const BODY: &str = "BO_ 1560 Body: 8 A\n SG_ Door : 7|1@1+ (1,0) [0|0] \"\" A\n 
 const TRACE: &str = "(1.000000) can0 618#004023FF\n(1.500000) can1 618#800000C07F\nbroken\n(2.000000) can0 123#00\n\
                      (3.000000) can1 618#0000C07F\n";
 
-/// A directory of its own for each test.
+/// A separate directory for each test.
 fn directory(test: &str) -> PathBuf {
     let directory = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(test);
     std::fs::create_dir_all(&directory).unwrap();
@@ -89,7 +89,7 @@ fn what_is_wrong_is_named_and_ends_with_1() {
     for (arguments, expected) in [
         (&["--db", "bad.dbc", "trace.log"][..], "cantap: bad.dbc: line 2: M.S: not of the form SG_ NAME"),
         (&["--db", "none.dbc", "trace.log"], "cantap: cannot read database none.dbc: No such file"),
-        (&["--db", "trace.log", "trace.log"], "cantap: trace.log is no known kind of database"),
+        (&["--db", "trace.log", "trace.log"], "cantap: trace.log is not a known kind of database"),
         (&["--db", "body.dbc", "none.log"], "cantap: cannot open none.log"),
         (
             &["--db", "dashboard.toml", "trace.log", "-s", "Sped"],
@@ -117,7 +117,7 @@ fn truck(test: &str) {
     std::fs::write(directory.join("truck.log"), TRUCK_TRACE).unwrap();
 }
 
-/// 8191.875 rpm is what 0xFFFF would be; J1939 says that there is no value.
+/// 0xFFFF would be 8191.875 rpm; J1939 says that there is no value.
 #[test]
 fn what_is_not_available_is_told_as_such() {
     truck("available");
@@ -172,7 +172,7 @@ fn a_resampled_table_holds_values_but_not_over_a_silence() {
         ["decode", "--db", "truck.dbc", "truck.log", "--csv", "--resample", "500ms", "--signal", "Speed"];
     let (code, out, err) = cantap("resampled", &arguments);
     assert_eq!(code, Some(0), "{err}");
-    // The signal comes every 100 ms: a second later nobody knows it any more.
+    // The signal comes every 100 ms: a second later its value is unknown.
     assert_eq!(out, "time,EEC1.Speed [rpm]\r\n1.500000,1792\r\n2.000000,1792\r\n61.500000,1792.125\r\n");
 }
 

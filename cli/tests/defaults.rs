@@ -1,5 +1,5 @@
-//! What a device keeps over a power cycle, as users set and use it. The virtual device's settings live in a file, so each
-//! command here meets the device after a power cycle.
+//! What a device keeps across a power cycle, as users set and use it. The virtual device's settings are in a file, so
+//! each command here meets the device after a power cycle.
 
 use std::path::PathBuf;
 use std::process::{Command, Output};
@@ -10,7 +10,7 @@ fn cantap(arguments: &str) -> (Option<i32>, String, String) {
     (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
 }
 
-/// A settings file of this test's own, not there yet.
+/// A settings file for this test only, which does not exist yet.
 fn settings(name: &str) -> PathBuf {
     let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(name);
     let _ = std::fs::remove_file(&path);
@@ -21,19 +21,19 @@ fn done(arguments: &str, out: &str) {
     assert_eq!(cantap(arguments), (Some(0), out.to_owned(), String::new()), "{arguments}");
 }
 
-/// On a bus on which nobody else acknowledges, every frame that is received whole was acknowledged by this device. A capture
-/// without -b has to learn what is saved, and must not do it by joining the bus as saved.
+/// On a bus on which nobody else acknowledges, every completely received frame was acknowledged by this device. A capture
+/// without -b has to find out what is saved, and must not do so by joining the bus as saved.
 #[test]
 fn a_capture_only_listens_though_normal_mode_is_saved() {
     let file = settings("normal.settings");
     let device = format!("virtual:ack=no,load=60,frames=std8,bitrate=500k,settings={}", file.display());
     done(&format!("defaults save -d {device} -b 500k --mode normal"), "saved on the device\n");
     let (code, out, err) = cantap(&format!("capture -d {device} -t 400ms"));
-    // A capture of nothing but errors is none.
+    // A capture with nothing but errors is a failure.
     assert_eq!(code, Some(1), "{err}");
     let frames = |out: &str| out.lines().filter(|line| !line.contains(" 2000") && line.contains('#')).count();
     assert_eq!(frames(&out), 0, "{out}");
-    // The bus was alive all the time, and it does get frames across once somebody acknowledges them.
+    // The bus was active all the time, and it does get frames across once somebody acknowledges them.
     assert!(err.contains("channel 1: 0 frames"), "{err}");
     assert!(out.lines().count() > 10, "{out}");
     let (code, out, err) = cantap(&format!("capture -d {device} --mode normal -n 20 -t 5s"));
@@ -46,7 +46,7 @@ fn saved_settings_survive_a_power_cycle_and_are_used_where_no_bit_rate_is_given(
     let device = format!("virtual:frames=std8,bitrate=250k,settings={}", file.display());
     done(&format!("defaults show -d {device}"), "channel 1  nothing saved\nchannel 2  nothing saved\n");
     done(&format!("defaults save -d {device} -c 1 -b 250k -f 000:C0000400"), "saved on the device\n");
-    // The other channel, from another session: the first one stays.
+    // The other channel, from another session: the first one stays unchanged.
     done(
         &format!("defaults save -d {device} -c 2 -b 125k --one-shot --recovery manual"),
         "saved on the device\n",
@@ -64,10 +64,10 @@ fn saved_settings_survive_a_power_cycle_and_are_used_where_no_bit_rate_is_given(
         .map(|line| u32::from_str_radix(line.split([' ', '#']).nth(2).unwrap(), 16).unwrap())
         .collect();
     assert!(ids.len() == 50 && ids.iter().all(|id| id & 0x400 == 0), "{out}");
-    // What is given on the line counts instead.
+    // Options on the command line take precedence.
     let (code, out, err) = cantap(&format!("capture -d {device} -c 1 -f 400:C0000400 -n 5 -t 5s"));
     assert!(code == Some(0) && out.lines().count() == 5, "{err}");
-    // A change of the mode leaves rate and filters as they are.
+    // Changing the mode leaves rate and filters unchanged.
     done(&format!("defaults save -d {device} -c 1 --mode normal"), "saved on the device\n");
     let (_, out, _) = cantap(&format!("defaults show -d {device} --json"));
     let object: serde_json::Value = serde_json::from_str(&out).unwrap();

@@ -5,7 +5,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-/// A folder of this test's own, with a firmware image in it.
+/// A folder for this test only, with a firmware image in it.
 fn folder(name: &str) -> (PathBuf, PathBuf) {
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
     let _ = std::fs::remove_dir_all(&folder);
@@ -23,7 +23,7 @@ fn cantap(path: &Path, arguments: &[&str]) -> (Option<i32>, String, String) {
     (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
 }
 
-/// A dfu-util that notes how it was called.
+/// A dfu-util that records how it was called.
 fn fake_dfu_util(folder: &Path, exit_code: u8, mode: u32) {
     let script =
         format!("#!/bin/sh\nprintf '%s\\n' \"$@\" > '{}/called'\nexit {exit_code}\n", folder.display());
@@ -39,7 +39,7 @@ fn without_dfu_util_the_line_to_run_is_printed_ready_for_a_shell() {
     assert_eq!((code, err.as_str()), (Some(0), ""));
     let line = out.lines().last().unwrap().trim();
     assert!(out.contains("Install dfu-util") && line.starts_with("dfu-util -d 0483:df11 "), "{out}");
-    // The printed line does what the command would have done.
+    // The printed command line does what the command would have done.
     fake_dfu_util(&folder, 0, 0o755);
     let run = Command::new("/bin/sh").args(["-c", line]).env("PATH", &folder).status().unwrap();
     assert!(run.success());
@@ -79,7 +79,7 @@ fn what_is_no_image_never_brings_the_device_out_of_its_firmware() {
         (b"a text that is long enough to have two words", "no firmware image"),
     ] {
         std::fs::write(&other, content).unwrap();
-        // There is no such device: an open would be reported first.
+        // There is no such device: an attempt to open it would be reported first.
         let (code, _, err) = cantap(&folder, &["update", "-d", "/dev/nowhere", other.to_str().unwrap()]);
         assert!(code == Some(1) && err.contains(part), "{err}");
     }

@@ -76,7 +76,7 @@ fn an_ecu_is_asked_and_refuses_by_name() {
     assert!(code == Some(0) && said.contains("7DF > 7E9"), "{said}");
 }
 
-/// Its engine tells its trouble codes every second, asked or not.
+/// Its engine sends its trouble codes every second, whether requested or not.
 #[test]
 fn a_node_of_j1939_is_heard_for_a_bounded_time() {
     let started = std::time::Instant::now();
@@ -89,7 +89,7 @@ fn a_node_of_j1939_is_heard_for_a_bounded_time() {
 fn the_device_answers_first_frames_by_itself_where_that_is_asked_for() {
     let out = well("uds -d virtual:car read F190 F190 --flow-control device");
     assert_eq!(out.lines().filter(|line| line.contains("(VIN)")).count(), 2, "{out}");
-    // A small block: the rest of the flow control is the computer's.
+    // A small block: the computer sends the rest of the flow control.
     let out = well("uds -d virtual:car read F190 --flow-control device --block-size 1");
     assert!(out.contains("(VIN)"), "{out}");
 }

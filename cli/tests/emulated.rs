@@ -1,5 +1,5 @@
 //! The same conversation with the firmware's logic running natively (`virtual:`) and with its ELF on the emulated board
-//! (`emu:`): what one answers the other must answer too, and both capture the same log alike.
+//! (`emu:`): both must answer alike, and both capture the same log alike.
 #![cfg(feature = "emu")]
 
 #[path = "../../sim/tests/common/mod.rs"]
@@ -33,7 +33,8 @@ fn config(mode: Mode) -> ChannelConfig {
     ChannelConfig { mode, ..ChannelConfig::listen_only(timing) }
 }
 
-/// What must be equal of an answer: all of it but times, measured values, and what names the device.
+/// The part of an answer that must be equal: everything except times, measured values, and names of the
+/// device.
 fn comparable(result: Result<Reply, DeviceError>) -> Result<Reply, Refusal> {
     match result {
         Ok(Reply::Status(mut status)) => {
@@ -154,7 +155,8 @@ fn both_devices_capture_a_log_alike() {
     std::fs::write(&log, lines.concat()).unwrap();
     let [native, emulated] = both(&format!("log={}", log.display()));
     let [mut one, mut other] = [capture(&native), capture(&emulated)];
-    // A busy machine may have opened a channel late, and frames were waiting then: what both saw in peace counts.
+    // A busy machine may have opened a channel late, when frames were already waiting: compare what both saw
+    // undisturbed.
     let first = number(&one[0].1).max(number(&other[0].1)) + 50;
     for frames in [&mut one, &mut other] {
         frames.retain(|(_, frame, _)| number(frame) >= first);
@@ -165,13 +167,13 @@ fn both_devices_capture_a_log_alike() {
     for (native, emulated) in one.iter().zip(&other) {
         assert_eq!((native.0, native.1), (emulated.0, emulated.1));
         let apart = (native.2 - one[0].2) - (emulated.2 - other[0].2);
-        // The emulated device's clock is mapped to a wall clock that it does not keep up with.
+        // The emulated device's clock is mapped to a wall clock with which it cannot keep up.
         assert!(apart.abs() < 20_000, "{native:?} and {emulated:?}");
     }
 }
 
-/// The whole way: the host's stream, the emulated USB, the firmware's alarm, the bus. Time is slow, so that a busy machine is
-/// no slow host.
+/// The whole way: the host's stream, the emulated USB, the firmware's alarm, the bus. Time is slowed down, so that a busy
+/// machine does not act as a slow host.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_replay_keeps_the_traces_spacing_and_order_on_the_elf() {

@@ -1,5 +1,5 @@
-//! The search for a bit rate on the firmware's ELF: right, fast, silent, harmless to the other channel, and told apart from silence and
-//! noise.
+//! The search for a bit rate with the firmware's ELF: correct, fast, silent, harmless to the other channel, and able to distinguish
+//! silence and noise.
 #![cfg(feature = "emu")]
 
 #[path = "../../sim/tests/common/mod.rs"]
@@ -17,14 +17,14 @@ use cantap_sim::address::Address;
 
 const TICK_HZ: f64 = 12e6;
 
-/// What a search said, and how many seconds of the device's time it took.
+/// The result of a search, and how many seconds of the device's time it took.
 struct Found {
     outcome: Outcome,
     seconds: f64,
 }
 
 impl Found {
-    /// The bit rate, or nothing where there is none.
+    /// The bit rate, or `None` if there is none.
     fn bitrate_bps(&self) -> Option<u32> {
         match self.outcome {
             Outcome::Found { bitrate_bps, .. } => Some(bitrate_bps),
@@ -71,7 +71,7 @@ fn search_on(channel: Channel, options: &str) -> Found {
     search_beside(channel, options, Duration::from_millis(1200), None)
 }
 
-/// Each board has its receive pins elsewhere, and its firmware says where.
+/// Each board has its receive pins in different places, which its firmware knows.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn every_board_hears_both_of_its_buses() {
@@ -85,8 +85,8 @@ fn every_board_hears_both_of_its_buses() {
     }
 }
 
-/// Every rate of CiA's and the others in common use, each frame twenty milliseconds after the one before. The emulation is
-/// slowed down so that a busy machine is no busy host.
+/// Every CiA rate and the others in common use, with frames twenty milliseconds apart. The emulation is slowed down so
+/// that a busy machine does not act as a slow host.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn fifty_frames_a_second_are_enough_to_find_any_common_rate_within_a_second() {
@@ -101,8 +101,8 @@ fn fifty_frames_a_second_are_enough_to_find_any_common_rate_within_a_second() {
     assert!(longest < 1.0, "{longest} s");
 }
 
-/// One second, or two frames. It found none of these while it guessed. The emulation is slowed down so that a busy machine is no busy
-/// host.
+/// One second, or two frames. It once found none of these while it guessed. The emulation is slowed down so that a busy machine does
+/// not act as a slow host.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_bus_that_is_nearly_silent_is_found_in_little_more_than_a_second() {
@@ -111,7 +111,7 @@ fn a_bus_that_is_nearly_silent_is_found_in_little_more_than_a_second() {
             let options = format!("bitrate={bitrate},burst={burst},speed=0.5");
             let found = search_on(Channel::ALL[at % 2], &options);
             assert_eq!(found.bitrate_bps(), Some(bitrate), "{bitrate}, {burst}: {:?}", found.outcome);
-            // Beside the second, what a host that is busy with other tests adds.
+            // In addition to the second, what a host adds that is busy with other tests.
             assert!(found.seconds < 1.5, "{bitrate}, {burst}: {} s", found.seconds);
         }
     }
@@ -184,7 +184,7 @@ fn silence_destroyed_frames_and_a_sender_without_an_audience_are_told_apart() {
     let within = |options| search_beside(Channel::Can2, options, Duration::from_millis(400), None).outcome;
     assert_eq!(within("load=0"), Outcome::NoTraffic);
     let outcome = within("bitrate=500k,load=80,errors=100");
-    // What is left of such frames may be enough for a guess, which the controller then does not confirm.
+    // What remains of such frames may be enough for a guess, which the controller then does not confirm.
     assert!(
         matches!(
             outcome,

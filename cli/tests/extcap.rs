@@ -1,5 +1,5 @@
-//! `cantap extcap` as Wireshark calls it: by hand with its pipes, and by tshark, where that is installed (`CANTAP_REQUIRE_PEERS=1` asks for
-//! it).
+//! `cantap extcap` as Wireshark calls it: manually with its pipes, and by tshark if it is installed (required with
+//! `CANTAP_REQUIRE_PEERS=1`).
 #![cfg(unix)]
 
 mod firmware;
@@ -35,7 +35,7 @@ fn run(line: &str) -> (Option<i32>, String, String) {
     said(&cantap(line.split_whitespace()).output().unwrap())
 }
 
-/// Waits until something is so.
+/// Waits until a condition holds.
 fn until(what: &str, mut is_so: impl FnMut() -> bool) {
     let deadline = Instant::now() + PATIENCE;
     while !is_so() {
@@ -98,7 +98,7 @@ fn what_cannot_be_done_says_what_can() {
         ("extcap", 2, "cantap extcap install"),
         ("--extcap-interface cantap-3A --extcap-config", 1, "'cantap-3A' is not connected"),
         ("--extcap-interface cantap-virtual", 2, "--capture --fifo PIPE"),
-        ("--extcap-interface cantap-virtual --extcap-capture-filter tcp", 2, "'tcp' is no filter"),
+        ("--extcap-interface cantap-virtual --extcap-capture-filter tcp", 2, "'tcp' is not a filter"),
         ("--capture --extcap-interface cantap-virtual", 2, "--fifo"),
         ("--capture --extcap-interface cantap-virtual --fifo x --bitrate1 fast", 2, "auto"),
         ("--capture --extcap-interface cantap-virtual --fifo /nowhere/x", 1, "Wireshark makes this pipe"),
@@ -129,7 +129,7 @@ impl Pipes {
         cantap(line.split_whitespace()).spawn().unwrap()
     }
 
-    /// What comes through a pipe, as it comes.
+    /// What comes through a pipe, as it arrives.
     fn read(&self, name: &str) -> Receiver<Vec<u8>> {
         let (sender, received) = channel();
         let path = self.path(name);
@@ -146,7 +146,7 @@ impl Pipes {
     }
 }
 
-/// Puts what came into a file that others read.
+/// Appends what has arrived to a file that others read.
 fn keep(received: &Receiver<Vec<u8>>, bytes: &mut Vec<u8>) {
     bytes.extend(received.try_iter().flatten());
 }
@@ -204,7 +204,7 @@ fn the_polite_end_leaves_a_whole_file_and_a_silent_board() {
     }
 }
 
-/// A tshark that was left waiting for a pipe would wait for ever.
+/// A tshark left waiting for a pipe would wait for ever.
 #[test]
 fn what_goes_wrong_closes_the_pipe_and_is_said() {
     for (device, says) in [
@@ -240,7 +240,7 @@ fn the_toolbar_shows_the_load_and_changes_bit_rate_and_mode_of_a_running_capture
         pipes.path("out")
     ));
     let mut toolbar = OpenOptions::new().write(true).open(pipes.path("in")).unwrap();
-    // What stood there before nobody has asked for in this capture.
+    // Nobody has requested in this capture what was there before.
     toolbar.write_all(&message(2, 1, "normal")).unwrap();
     toolbar.write_all(&message(255, 0, "")).unwrap();
     let (mut bytes, mut seen) = (Vec::new(), Vec::new());
@@ -254,7 +254,7 @@ fn the_toolbar_shows_the_load_and_changes_bit_rate_and_mode_of_a_running_capture
         assert!(!has(&seen, b"acknowledge"));
         String::from_utf8_lossy(&seen).into_owned()
     };
-    // A rate that is not offered is added.
+    // A rate that is not in the list is added.
     wait(&message(1, 2, "95238\x0095238 bit/s"), &mut bytes);
     wait(&message(1, 1, "95238"), &mut bytes);
     wait(&message(0, 1, "500k"), &mut bytes);
@@ -276,13 +276,13 @@ fn the_toolbar_shows_the_load_and_changes_bit_rate_and_mode_of_a_running_capture
     let (code, out, err) = end(child, Signal::TERM);
     assert_eq!((code, &*out, &*err), (Some(0), "", ""));
     bytes.extend(received.iter().flatten());
-    // The trace says it, too, on the first packet to which it applies.
+    // The trace also says so, on the first packet to which it applies.
     for remark in ["from here on 250000 bit/s, listening only", "from here on 500000 bit/s, taking part"] {
         assert!(has(&bytes, remark.as_bytes()), "{remark}");
     }
 }
 
-/// tshark with a home of its own, in which `cantap extcap install` put the command; `None` after saying that there is none.
+/// tshark with its own home, in which `cantap extcap install` put the command; `None` after reporting that it is missing.
 struct Tshark(tempfile::TempDir);
 
 impl Tshark {
@@ -329,7 +329,7 @@ impl Tshark {
         until("tshark writes packets", || self.file().metadata().is_ok_and(|file| file.len() > bytes));
     }
 
-    /// What tshark shows of the packets that a filter lets through.
+    /// tshark's output for the packets that pass a filter.
     fn fields(&self, filter: &str, fields: &[&str]) -> Vec<String> {
         let mut command = self.command("tshark");
         command.arg("-r").arg(self.file()).args(["-Y", filter, "-T", "fields", "-E", "separator=|"]);
@@ -339,7 +339,7 @@ impl Tshark {
         out.lines().map(str::to_owned).collect()
     }
 
-    /// That nothing of ours runs any more.
+    /// Checks that nothing of ours is still running.
     fn leaves_nothing_behind(&self) {
         let folder = self.0.path().to_str().unwrap().as_bytes().to_vec();
         until("the capture has ended", || {
@@ -354,7 +354,7 @@ impl Tshark {
 const AT_1M: [&str; 4] =
     ["-o", "extcap.cantap_address.bitrate1:1M", "-o", "extcap.cantap_address.bitrate2:1M"];
 
-/// Frames without data follow each other every 48 µs: were one missing, the next would be late.
+/// Frames without data follow each other every 48 µs: if one were missing, the next would be late.
 #[test]
 fn tshark_captures_two_saturated_channels_and_nothing_is_dropped_in_between() {
     let Some(tshark) = Tshark::install() else { return };
@@ -369,7 +369,8 @@ fn tshark_captures_two_saturated_channels_and_nothing_is_dropped_in_between() {
         let times = times(&all, channel);
         let span_ns = times[times.len() - 1] - times[0];
         assert!(times.len() > 30_000, "{}", times.len());
-        // The device's clock against this computer's is measured on the way, the worse the busier this computer is.
+        // The device's clock is compared with this computer's on the way, and the result is worse on a busy
+        // computer.
         let frames = span_ns as f64 / 48_000.0;
         let off = frames / (times.len() - 1) as f64 - 1.0;
         assert!(off.abs() < 0.001, "channel {channel}: {frames} of {}", times.len());
@@ -378,8 +379,8 @@ fn tshark_captures_two_saturated_channels_and_nothing_is_dropped_in_between() {
     assert!(!all.iter().any(is_loss));
 }
 
-/// dumpcap throws away what it has no room for when it captures from several interfaces, however it is handed over: at most a few of a
-/// thousand, where nearly two in a hundred went when they came in bursts.
+/// dumpcap discards what it has no room for when it captures from several interfaces, however it is delivered: at most a few in a
+/// thousand, compared with nearly two in a hundred when they came in bursts.
 #[test]
 fn tshark_captures_two_devices_at_once_and_its_own_queue_holds() {
     let Some(tshark) = Tshark::install() else { return };
@@ -409,7 +410,7 @@ fn tshark_shows_what_a_shared_board_sends_and_where_frames_are_missing() {
     until("the server listens", || Path::new(&socket).exists());
     let child = tshark.capture(&format!("unix:{socket}"), &[]);
     tshark.grows_to(20_000);
-    // For its sender the server has the channel take part in the bus and then listen again: two gaps, of unknown length.
+    // For its sender, the server has the channel take part in the bus and then listen again: two gaps of unknown length.
     let (code, _, err) = run(&format!("send -d unix:{socket} 1 7aa#1122 7ab#33"));
     assert_eq!(code, Some(0), "{err}");
     let now = tshark.file().metadata().unwrap().len();
@@ -427,7 +428,7 @@ fn tshark_shows_what_a_shared_board_sends_and_where_frames_are_missing() {
     for line in &lost {
         let words: Vec<_> = line.split('|').collect();
         assert!(words[0] == "can0" && ["1", "True"].contains(&words[1]), "{line}");
-        assert_eq!(words[2], "frames were lost here between device and computer, nobody knows how many");
+        assert_eq!(words[2], "an unknown number of frames was lost here between device and computer");
     }
     // And what it wrote is what we read.
     let all = records(&tshark.file());

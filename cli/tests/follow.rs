@@ -1,4 +1,5 @@
-//! `--follow` and `-` in every command that reads a trace: what has come is shown at once, and Ctrl-C ends with the summary.
+//! `--follow` and `-` in every command that reads a trace: what has arrived is shown immediately, and Ctrl-C ends with the
+//! summary.
 
 #![cfg(unix)]
 
@@ -25,7 +26,7 @@ fn line(number: usize) -> String {
     format!("(170000000{number}.000000) can0 123#0{number}\n")
 }
 
-/// Ends a program as Ctrl-C does, and says what it printed beyond what was read of it.
+/// Ends a program as Ctrl-C does, and returns its output beyond what was already read.
 fn interrupt(child: Child) -> (Option<i32>, String, String) {
     let status = Command::new("kill").args(["-INT", &child.id().to_string()]).status();
     assert!(status.unwrap().success());
@@ -52,7 +53,7 @@ fn what_is_appended_to_a_followed_file_is_shown_at_once() {
         let mut file = OpenOptions::new().append(true).open(&path).unwrap();
         let mut shown = String::new();
         for number in 1..=3 {
-            // A line that is half there is waited for.
+            // A partial line is waited for.
             shown.clear();
             out.read_line(&mut shown).unwrap();
             assert!(
@@ -78,7 +79,7 @@ fn statistics_of_a_followed_file_come_with_ctrl_c() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("a.log"), [line(1), line(2)].concat()).unwrap();
     let child = spawn(folder.path(), &["stats", "--follow", "a.log", "-b", "500k", "--json"]);
-    // Long enough for it to have begun; before that Ctrl-C would end it without a word.
+    // Long enough for it to have begun; before that, Ctrl-C would end it without a word.
     std::thread::sleep(std::time::Duration::from_secs(2));
     let (code, out, err) = interrupt(child);
     assert_eq!(code, Some(0), "{err}");

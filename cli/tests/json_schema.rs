@@ -1,4 +1,4 @@
-//! What every command prints with `--json` is what `docs/json.schema.json` and `docs/json.md` say.
+//! The output of every command with `--json` matches `docs/json.schema.json` and `docs/json.md`.
 
 mod schema;
 
@@ -15,7 +15,7 @@ fn schema() -> Schema {
     Schema::new(include_str!("../../docs/json.schema.json"))
 }
 
-/// A directory for each test, with traces and databases that have something of everything.
+/// A directory for each test, with traces and databases that cover everything.
 fn directory(test: &str) -> PathBuf {
     let directory = Path::new(env!("CARGO_TARGET_TMPDIR")).join("json_schema").join(test);
     fs::create_dir_all(&directory).unwrap();
@@ -45,14 +45,14 @@ fn directory(test: &str) -> PathBuf {
 
 fn cantap(directory: &Path, line: &str) -> (Option<i32>, String, String) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
-    // A condition has blanks in it.
+    // A condition contains blanks.
     let words = line.split(' ').map(|word| word.replace('%', " "));
     command.args(words).current_dir(directory).stdin(Stdio::null());
     let Output { status, stdout, stderr } = command.output().unwrap();
     (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
 }
 
-/// A command line, without `--json`; its exit code; the type of its object, or of each of its lines but the last, and of the last.
+/// A command line without `--json`; its exit code; the type of its object, or of each of its lines but the last, and of the last.
 const LINES: [(&str, i32, &[&str]); 65] = [
     ("list", 0, &["list"]),
     ("info -d virtual", 0, &["info"]),
@@ -125,7 +125,7 @@ const LINES: [(&str, i32, &[&str]); 65] = [
     ("demo -t 300ms", 0, &["demo"]),
 ];
 
-/// Commands that print something only where there are nodes: `tests/nodes.rs` holds what they print.
+/// Commands that print something only if there are nodes: `tests/nodes.rs` checks their output.
 const WITH_NODES: [&str; 6] =
     ["canopen read", "canopen write", "canopen monitor", "canopen lss", "j1939 request", "j1939 dm1"];
 
@@ -152,7 +152,7 @@ fn hold(schema: &Schema, line: &str, code: Option<i32>, types: &[&str]) {
 fn every_command_prints_what_the_schema_says() {
     let schema = schema();
     for (line, code, types) in LINES {
-        // Nothing is full by itself elsewhere.
+        // Elsewhere there is no device that is always full.
         if cfg!(target_os = "linux") || !line.contains("/dev/full") {
             hold(&schema, line, Some(code), types);
         }
@@ -172,7 +172,7 @@ fn a_board_that_has_something_saved_and_one_that_is_tested_print_what_the_schema
     let saved: Value = serde_json::from_str(&out).unwrap();
     assert!(saved["channels"][0]["saved"].is_object(), "{out}");
     assert_eq!(schema.faults("defaults_show", &saved), [""; 0]);
-    // On a busy computer a step may fail, and the object is the same.
+    // On a busy computer a step may fail, but the object is the same.
     hold(
         &schema,
         "selftest -d virtual:load=0,wire=joined,ack=no --loop --load-time 100ms",
@@ -181,7 +181,7 @@ fn a_board_that_has_something_saved_and_one_that_is_tested_print_what_the_schema
     );
 }
 
-/// Commands that have `--json` by their own help are those above.
+/// Commands whose own help lists `--json` are those above.
 #[test]
 fn no_command_with_json_is_left_out() {
     let directory = directory("all");
@@ -231,7 +231,8 @@ fn an_unknown_key_a_missing_one_and_a_wrong_type_are_faults() {
     assert_eq!(schema.faults("list", &json!({ "devices": {} })).len(), 1);
 }
 
-/// Every type has its table in the page, with the same keys, and every object of the schema knows all of its keys.
+/// Every type has its table in the page, with the same keys, and every object of the schema defines all of its
+/// keys.
 #[test]
 fn the_page_has_each_key_of_the_schema_and_no_other() {
     let schema = schema();

@@ -1,4 +1,5 @@
-//! What commands do with a device that misbehaves at the other end of a real terminal: say so, go on, and end whole.
+//! Commands and a device that misbehaves at the other end of a real terminal: they report it, continue, and end
+//! properly.
 #![cfg(unix)]
 
 #[path = "../../host/tests/fake_device/mod.rs"]
@@ -19,12 +20,12 @@ use fake_device::{FakeDevice, Fault, Log};
 use port::Port;
 use portable_pty::{PtySize, native_pty_system};
 
-/// Longer than anything here takes, however busy the machine is.
+/// Longer than anything here takes, however busy the machine.
 const PATIENCE: Duration = Duration::from_mins(1);
-/// Frames on a channel before a device misbehaves.
+/// Number of frames on a channel before a device misbehaves.
 const BEFORE: u32 = 100;
 
-/// What a program writes into a terminal; nothing when it has closed it.
+/// What a program writes into a terminal; nothing once it has closed it.
 struct Input {
     pieces: Receiver<Vec<u8>>,
     rest: Vec<u8>,
@@ -46,7 +47,8 @@ impl Read for Input {
     }
 }
 
-/// A device behind a terminal, with a fault in each session; without any after the last. Returns the terminal's name.
+/// A device behind a terminal, with a fault in each session, and without any after the last. Returns the terminal's
+/// name.
 fn device(faults: &[Fault]) -> (String, Arc<Mutex<Log>>) {
     let pair = native_pty_system().openpty(PtySize::default()).unwrap();
     let name = pair.master.tty_name().unwrap().to_str().unwrap().to_owned();
@@ -84,7 +86,7 @@ fn device(faults: &[Fault]) -> (String, Arc<Mutex<Log>>) {
     (name, log)
 }
 
-/// A running command, whose messages are read as they come.
+/// A running command, whose messages are read as they arrive.
 struct Running {
     child: Child,
     lines: Receiver<String>,
@@ -124,14 +126,14 @@ impl Running {
         }
     }
 
-    /// As `timeout` does: the child, then its group.
+    /// Like `timeout`: the child, then its process group.
     fn signal_twice(&self) {
         let pid = self.child.id();
         let script = format!("kill -TERM {pid}; kill -TERM {pid}");
         assert!(Command::new("sh").args(["-c", &script]).status().unwrap().success());
     }
 
-    /// The exit code, what it printed, and what it said since.
+    /// The exit code, its output, and its messages since then.
     fn end(mut self) -> (Option<i32>, String, Vec<String>) {
         let mut out = self.child.stdout.take().unwrap();
         let printing = std::thread::spawn(move || {
@@ -172,7 +174,7 @@ fn gaps_of(records: &[TraceRecord]) -> Vec<u8> {
     gaps.map(|record| record.channel).collect()
 }
 
-/// Waits until a file grows no further than this many frames.
+/// Waits until a file does not grow beyond this many frames.
 fn wait_for_frames(path: &Path, count: usize) {
     let deadline = Instant::now() + PATIENCE;
     while !path.exists() || frames_of(&records(path)) < count {
@@ -181,7 +183,7 @@ fn wait_for_frames(path: &Path, count: usize) {
     }
 }
 
-/// Frames of all channels, as the summary counts them.
+/// Number of frames on all channels, as in the summary.
 fn frames_told(said: &[String]) -> usize {
     let frames = |line: &String| {
         line.strip_prefix("channel ")?.split_once(": ")?.1.split_once(" frames")?.0.parse::<usize>().ok()
@@ -211,7 +213,7 @@ fn a_capture_goes_on_when_a_device_that_fell_silent_answers_again() {
         assert!(said.iter().any(|line| line.starts_with("gaps: 1, ")), "{said:#?}");
         let records = records(&file);
         assert_eq!((frames_of(&records), gaps_of(&records)), (frames_told(&said), vec![1, 2]));
-        // As it was asked for, both times.
+        // As requested, both times.
         let opened = log.lock().unwrap().opened.clone();
         assert_eq!((opened.len(), &opened[..2]), (4, &opened[2..]));
     }
@@ -245,7 +247,7 @@ fn a_capture_goes_on_when_the_cable_is_plugged_in_again() {
     let frames: u64 =
         object["channels"].as_array().unwrap().iter().map(|c| c["frames"].as_u64().unwrap()).sum();
     assert_eq!(frames_of(&records) as u64, frames);
-    // The load is that of the time in which the device was there.
+    // The load covers only the time in which the device was there.
     let load = object["channels"][0]["bus_load_pct"].as_f64().unwrap();
     assert!((load - 20.0).abs() < 2.0, "{out}");
 }

@@ -1,5 +1,5 @@
-//! A device that is unplugged and plugged in again while the live view runs: a virtual device behind a pseudo
-//! terminal, at the end of a link with a name that stays.
+//! A device is unplugged and plugged in again while the live view runs: a virtual device behind a
+//! pseudo-terminal, at the end of a link with a stable name.
 #![cfg(unix)]
 
 mod port;
@@ -18,7 +18,7 @@ fn records(path: &Path) -> Vec<TraceRecord> {
     open_reader(path, &ReadOptions::default()).unwrap().map(Result::unwrap).collect()
 }
 
-/// A figure that stands behind a word on the screen.
+/// The figure after a word on the screen.
 fn figure(screen: &str, word: &str) -> Option<u64> {
     screen.split_once(word)?.1.split_whitespace().next()?.parse().ok()
 }
@@ -38,7 +38,7 @@ fn an_unplugged_device_is_missed_and_goes_on_when_it_is_back() {
     let gone = view.wait_for("GONE, trying again");
     assert!(gone.contains("lost 0+"), "{gone}");
     let before = figure(&gone, "Frames").unwrap();
-    // What was seen stays, and it can be looked at.
+    // What was seen remains, and can be viewed.
     view.keys("2");
     view.wait_for("Period ms");
     view.keys("1");
@@ -51,12 +51,12 @@ fn an_unplugged_device_is_missed_and_goes_on_when_it_is_back() {
     let back = view.wait_until("more frames", |screen| {
         figure(screen, "Frames").is_some_and(|frames| frames > before + 500)
     });
-    // The load is that of the time in which the device was there.
+    // The load covers only the time in which the device was there.
     let mean = back.split_once("mean ").unwrap().1.split_once(" %").unwrap().0.parse::<f64>().unwrap();
     assert!((mean - 20.0).abs() < 1.0, "{back}");
     assert!(back.contains("1 reconnects"), "{back}");
 
-    // Another board in its place is reported.
+    // A different board in its place is reported.
     port.unplug();
     view.wait_for("GONE, trying again");
     port.plug("load=20,frames=std8,serial=TWO");
@@ -99,7 +99,7 @@ fn what_was_sent_periodically_is_off_when_the_device_is_back() {
     view.wait_until("a sent frame", |screen| screen.contains("      123   "));
     port.unplug();
     view.wait_for("GONE, trying again");
-    // Nothing can be sent meanwhile, and it is said.
+    // Nothing can be sent meanwhile, and a message says so.
     view.keys("6\r");
     view.wait_for("there is no device to send with");
     port.plug("load=0");
@@ -122,7 +122,7 @@ fn a_device_in_use_elsewhere_and_one_that_comes_late_are_waited_for() {
     view.wait_for("running");
     port.unplug();
     view.wait_for("GONE, trying again");
-    // Somebody else is quicker. The view may have it in the meantime, so that it takes more than one try.
+    // Another program is quicker. The view may have it in between, so it takes more than one try.
     let address = port.name().to_owned();
     let elsewhere = loop {
         port.plug("load=20");
@@ -143,7 +143,7 @@ fn a_device_in_use_elsewhere_and_one_that_comes_late_are_waited_for() {
 #[test]
 fn a_device_that_vanishes_while_its_bit_rate_is_looked_for_comes_back_too() {
     let mut port = Port::new();
-    // Nothing to be heard, so that the search takes its time.
+    // Nothing to receive, so that the search takes its time.
     port.plug("load=0,bitrate=250k");
     let line = format!("monitor -d {} -b 500k --view statistics", port.name());
     let mut view = Terminal::start(&line, (120, 24));
@@ -163,7 +163,7 @@ fn a_device_that_vanishes_while_its_bit_rate_is_looked_for_comes_back_too() {
     view.keys("A");
     view.wait_for("channel 1: 250000 bit/s; channel 2: 250000 bit/s");
     view.wait_for("Channel 1: 250000 bit/s");
-    // And left.
+    // And it can be left.
     port.unplug();
     view.wait_for("GONE, trying again");
     port.plug("load=0,bitrate=250k");

@@ -1,7 +1,8 @@
-//! The documents' pictures, made by the command from recorded buses, and the live view's `--once` as scripts use it.
+//! The pictures in the documents, made by the command from recorded buses, and the live view's `--once` as scripts
+//! use it.
 //!
-//! After a change that is meant, write them anew with `CANTAP_OVERWRITE=1 cargo test -p cantap-cli --test
-//! monitor_screens` and look at them.
+//! After an intended change, rewrite them with `CANTAP_OVERWRITE=1 cargo test -p cantap-cli --test
+//! monitor_screens` and check them.
 
 use std::path::Path;
 use std::process::{Command, Output};
@@ -56,7 +57,7 @@ fn one_screen_is_text_of_the_size_that_was_asked_for() {
     assert_eq!((code, err.as_str()), (Some(0), ""));
     assert!(out.lines().count() == 12 && out.lines().all(|line| line.chars().count() <= 90), "{out}");
     assert!(out.contains("PositionRapid.Latitude") && out.contains("deg"), "{out}");
-    // Where it cannot look at anything, it says so and fails.
+    // If it cannot show anything, it says so and fails.
     for (line, code, part) in [
         ("monitor nothing.log --once", 1, "nothing.log"),
         ("monitor -d /dev/nothing -b 500k --once", 1, "there is no device at '/dev/nothing'"),
@@ -110,7 +111,7 @@ fn a_profile_is_read_where_it_is_and_what_it_names_must_be_there() {
         let path = |name: &str| folder.path().join(name).display().to_string();
         cantap(&format!("monitor {} -p {} --once {more}", path("drive.log"), path("car-profile.toml")))
     };
-    // The test runs in another folder than the profile's.
+    // The test does not run in the profile's folder.
     for graph in ["Speed", "Engine.Speed", "Engine.*"] {
         let (code, out, err) =
             once(&format!("databases = [\"db/car.toml\"]\ngraph = [\"{graph}\"]\nview = \"graph\"\n"), "");
@@ -177,7 +178,7 @@ fn what_the_device_leaves_out_gives_no_load() {
         (
             out.contains("Load"),
             out.lines().nth(1).unwrap().contains(" %"),
-            out.contains("zeros stand in its place"),
+            out.contains("there are zeros in its place"),
         )
     };
     assert_eq!(load(""), (true, true, false));

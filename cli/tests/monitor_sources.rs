@@ -1,5 +1,5 @@
-//! Where the live view's records come from, and where they go: files with faults in them, the emulated board, recordings on
-//! a condition.
+//! Where the live view's records come from, and where they go: files with faults in them, the emulated board, conditional
+//! recordings.
 #![cfg(unix)]
 
 mod firmware;
@@ -33,7 +33,7 @@ fn what_cannot_be_read_in_a_file_is_counted_and_the_first_of_it_shown() {
     assert!(text.contains("faulty.log:2") || text.contains("line 2"), "{text}");
     view.keys("2");
     view.wait_until("the rest", |screen| ["123", "124", "125"].iter().all(|id| screen.contains(id)));
-    // Once more from its beginning: counted anew, not on top.
+    // Once more from its beginning: counted from zero, not added.
     view.keys("l");
     view.wait_for("loop");
     view.keys("5");
@@ -61,8 +61,8 @@ fn a_file_is_played_slower_faster_stopped_and_by_steps_and_left_for_a_device() {
     view.keys(">>");
     view.wait_until("two more", |screen| rows(screen) == before + 2);
     view.keys("p..........");
-    view.wait_for("ended as fast as can be");
-    // It sends nothing, and says what would.
+    view.wait_for("ended as fast as possible");
+    // It sends nothing, and says what would be needed.
     view.keys("6a123#1122\r\r");
     view.wait_for("a file sends nothing; open a device with D");
     view.keys("D\x15virtual:load=30\r");
@@ -81,7 +81,7 @@ fn a_recording_on_a_condition_has_what_is_around_the_events_only() {
         "car.toml",
         "version = 1\n[[message]]\nname = \"Engine\"\nid = 0x123\nlength = 1\n[[message.signal]]\nname = \"Speed\"\nat = \"D1\"\n",
     );
-    // A minute, ten frames a second, fast at 30 s only.
+    // A minute, ten frames a second, fast only at 30 s.
     let mut log = String::new();
     for n in 0..600 {
         let speed = if n == 300 { 100 } else { 10 };
@@ -91,7 +91,7 @@ fn a_recording_on_a_condition_has_what_is_around_the_events_only() {
     let recording = folder.path().join("fast.asc");
     let mut view = Terminal::start(&format!("monitor {file} -b 500k --db {database}"), (120, 24));
     view.wait_for("playing");
-    // A condition that is none is refused, and what it was is said.
+    // An invalid condition is refused, and the message shows it.
     view.keys(&format!("r{} if Sped > 80\r", recording.display()));
     view.wait_for("nothing is recorded: ");
     view.keys(&format!("r{} if Speed > 80\r", recording.display()));
@@ -101,11 +101,11 @@ fn a_recording_on_a_condition_has_what_is_around_the_events_only() {
     view.wait_for("Records   71");
     view.keys("r");
     view.wait_for("71 records are in");
-    // What was recorded is not overwritten by a slip.
+    // A recording is not overwritten by accident.
     view.keys(&format!("r{}\r", recording.display()));
     view.wait_for("exists already; choose another name");
     view.keys("\x1b");
-    // Escape and a letter at once would be Alt and that letter.
+    // Escape immediately followed by a letter would be Alt and that letter.
     view.wait_until("no prompt", |screen| !screen.contains(" > /"));
     view.keys("q");
     assert_eq!(view.end(), 0);
@@ -136,7 +136,7 @@ fn in_a_file_one_goes_to_any_place_and_sees_what_it_has_up_to_there() {
     view.wait_for("/ 1:40");
     view.keys("pT50%\r");
     let text = view.wait_for("stopped ×1 0:50 / 1:40");
-    // The last one before that place, and all before it, once each.
+    // The last one before that position, and all before it, once each.
     assert!(text.contains("01 F3") && !text.contains("01 F5"), "{text}");
     view.keys("B5");
     view.wait_for("Frames           500");
@@ -151,7 +151,7 @@ fn in_a_file_one_goes_to_any_place_and_sees_what_it_has_up_to_there() {
     view.keys(" ");
     view.wait_for("ended ×1 1:40 / 1:40");
     view.wait_for("Frames          1001");
-    // From its end it begins anew.
+    // At its end it restarts.
     view.keys(" ");
     view.wait_for("playing ×1 0:0");
     view.keys("...");
@@ -241,7 +241,7 @@ fn a_channel_that_is_bus_off_is_brought_back_from_inside() {
     view.wait_until("it is back", |screen| !screen.contains("BUS-OFF"));
     view.keys("q");
     assert_eq!(view.end(), 0);
-    // By itself after a time, as by every other command.
+    // On its own after a time, as in every other command.
     let line = "monitor virtual:load=0,disturb=32 -b 500k --normal --recovery 100ms --view send";
     let mut view = Terminal::start(line, (140, 24));
     view.wait_for("NORMAL: running");
@@ -266,7 +266,7 @@ fn the_emulated_board_is_watched_sent_with_and_recorded() {
     view.wait_for("running");
     view.wait_for("Channel 2: 500000 bit/s");
     view.wait_for("Device olimex-p405");
-    // Into the bus, and onto it.
+    // Onto the bus with a mode, then with a frame.
     view.keys("my\r");
     view.wait_for("NORMAL: running");
     view.keys("6a6F7#DEADBEEF\r\r1f6F7:7FF\r");

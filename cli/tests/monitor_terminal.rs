@@ -1,4 +1,4 @@
-//! The live view in terminals of every kind, and what it leaves behind.
+//! The live view in terminals of every kind, and how it leaves them.
 #![cfg(unix)]
 
 mod terminal;
@@ -20,7 +20,7 @@ fn without_a_terminal_it_says_what_to_use_instead() {
     assert_eq!((output.status.code(), output.stdout.as_slice()), (Some(1), &b""[..]));
     let said = String::from_utf8(output.stderr).unwrap();
     assert!(said.contains("needs a terminal; use --once"), "{said}");
-    // A terminal that cannot move its cursor is none either.
+    // A terminal that cannot move its cursor is not usable either.
     for kind in ["dumb", ""] {
         let mut view = Terminal::start_with(BUSY, (120, 24), &[("TERM", Some(kind))]);
         assert_eq!(view.end(), 1);
@@ -91,7 +91,7 @@ fn a_window_that_is_closed_ends_it_with_the_recording_whole() {
     view.wait_for("REC");
     std::thread::sleep(std::time::Duration::from_millis(300));
     view.close();
-    // By itself, or by an error that nobody can read.
+    // It ends on its own, or with an error that nobody can read.
     view.end();
     check_complete(&file);
 }
@@ -125,7 +125,7 @@ fn the_shell_can_have_the_terminal_for_a_while() {
     }
 }
 
-/// Nothing that is displayed slowly thins what is recorded.
+/// A slow display must not thin out the recording.
 #[test]
 fn a_terminal_that_takes_nothing_does_not_hold_up_the_recording() {
     let folder = tempfile::tempdir().unwrap();
@@ -134,7 +134,7 @@ fn a_terminal_that_takes_nothing_does_not_hold_up_the_recording() {
     let mut view = Terminal::start(&line, (160, 50));
     view.wait_for("REC");
     view.stall(true);
-    // Until the terminal's own buffer is full, and some more.
+    // Until the terminal's own buffer is full, and a little longer.
     std::thread::sleep(Duration::from_millis(800));
     let size = || std::fs::metadata(&file).unwrap().len();
     let before = size();
@@ -165,7 +165,7 @@ fn what_is_wrong_with_profile_and_database_is_said_and_the_view_opens_without_it
     view.wait_for("virtual listen-only: running");
     view.keys("q");
     assert_eq!(view.end(), 0);
-    // A part of a profile that is wrong leaves the others in force.
+    // A part of a profile that is wrong does not affect the others.
     let profile = write(
         "bus.toml",
         "device = \"virtual:load=30\"\nbitrates = [\"2:250k\", \"fast\"]\nfilters = [\"nonsense,,\"]\nview = \"statistics\"\n\

@@ -1,4 +1,4 @@
-"""Other people's nodes on a board that `cantap serve` shares, for nodes.rs: they join by socketcand.
+"""Nodes of other programs on a board shared by `cantap serve`, for nodes.rs: they connect through socketcand.
 
 uds, ecus, obd, obd_29, canopen, j1939 HOST PORT     serves until standard input ends; prints "ready" when it does
 tester HOST PORT                                     prints "ready", and then what udsoncan has read of the ECU that is asked with 7E0
@@ -245,7 +245,7 @@ DefaultValue=7
 
 
 def serve_canopen(host, port):
-    """Node 5 on python-canopen. Its library is no LSS slave: the one that has no number yet is written here, by CiA 305."""
+    """Node 5 on python-canopen. Its library has no LSS slave: the node without a number is implemented here, according to CiA 305."""
     import io
 
     import canopen
@@ -289,7 +289,7 @@ def serve_canopen(host, port):
 
 
 def serve_j1939(host, port):
-    """Node 129 on can-j1939: answers requests for two groups, one of them in many frames, and repeats what it is sent."""
+    """Node 129 on can-j1939: answers requests for two groups, one of them in many frames, and repeats what is sent to it."""
     import j1939
 
     ecu = j1939.ElectronicControlUnit()

@@ -1,7 +1,7 @@
-//! `cantap uds`, `canopen` and `j1939` with other people's nodes at the other end: can-isotp, python-canopen and can-j1939 on a board that
-//! `cantap serve` shares, joined by python-can's socketcand.
+//! `cantap uds`, `canopen` and `j1939` with nodes of other programs: can-isotp, python-canopen and can-j1939 on a board shared by `cantap
+//! serve`, connected through python-can's socketcand.
 //!
-//! Python is `CANTAP_PYTHON`, else `python3`; where it or a package is missing that is said and the test passes, unless
+//! Python is `CANTAP_PYTHON`, otherwise `python3`; if it or a package is missing, the test says so and passes, unless
 //! `CANTAP_REQUIRE_PEERS=1`.
 #![cfg(unix)]
 
@@ -80,7 +80,7 @@ impl Rig {
         out
     }
 
-    /// Each line's object, held to its type.
+    /// Each line's object, checked against its type.
     fn json(&self, line: &str, name: &str) -> Vec<Value> {
         let schema = Schema::new(include_str!("../../docs/json.schema.json"));
         let out = self.well(&format!("{line} --json"));
@@ -114,7 +114,7 @@ fn an_ecu_on_can_isotp_is_asked_unlocked_and_given_long_requests() {
     let out = rig.well("uds read F190 --block-size 1 --separation 5ms --padding none");
     assert!(out.contains("WVWZZZ1KZAW000001"), "{out}");
     assert!(rig.well("uds dtc --mask 09").contains("P0123-11"));
-    // The seed, in hexadecimal, is turned round: 11223344 becomes EEDDCCBB.
+    // The seed, in hexadecimal, is inverted: 11223344 becomes EEDDCCBB.
     let key = "tr${IFS}0123456789ABCDEF${IFS}FEDCBA9876543210";
     let out =
         rig.well(&format!("uds --session extended --security 1 --key-command {key} routine start FF00"));
@@ -125,7 +125,7 @@ fn an_ecu_on_can_isotp_is_asked_unlocked_and_given_long_requests() {
     assert!(code == Some(1) && err.contains("invalidKey (35)") && err.contains("--key-command"), "{err}");
     let (code, _, err) = rig.run("uds --security 1 --key-command false tester-present");
     assert!(code == Some(1) && err.contains("no key was sent"), "{err}");
-    // 200 bytes, in blocks of three with a least distance.
+    // 200 bytes, in blocks of three with a minimum separation.
     let request = "36".repeat(200);
     let said = rig.json(&format!("uds raw {request}"), "conversations");
     assert_eq!(said[0]["data"], "760100C8", "{}", said[0]);
@@ -163,7 +163,7 @@ fn a_node_on_python_canopen_is_found_read_written_and_commanded() {
     assert!(code == Some(1) && err.contains("nothing there is overwritten"), "{err}");
     assert_eq!(rig.run("canopen read 5 3000 -o nothing.bin").0, Some(1));
     assert!(!rig.folder.path().join("nothing.bin").exists());
-    // A sheet tells types and names.
+    // A sheet provides types and names.
     let sheet = "[DeviceInfo]\nProductName=Node\n[2001]\nParameterName=Counter\nObjectType=0x7\nDataType=0x0007\nAccessType=rw\n";
     std::fs::write(rig.folder.path().join("node.eds"), sheet).unwrap();
     rig.well("canopen write 5 2001 0 123456 --eds 5:node.eds");
@@ -181,7 +181,7 @@ fn a_node_on_python_canopen_is_found_read_written_and_commanded() {
     );
     let (code, _, err) = rig.run("canopen write 5 2002 0 1");
     assert!(code == Some(2) && err.contains("--type"), "{err}");
-    // Its state by its heartbeat.
+    // Its state from its heartbeat.
     rig.well("canopen write 5 1017 0 100");
     let out = rig.well("canopen nmt 5 start");
     assert!(out.contains("start") && out.contains("operational"), "{out}");
@@ -189,7 +189,7 @@ fn a_node_on_python_canopen_is_found_read_written_and_commanded() {
     assert!(monitored.iter().any(|event| event["from"] == "5"), "{monitored:?}");
     let out = rig.well("canopen scan --listen 500ms");
     assert!(out.contains("node 5, operational"), "{out}");
-    // A node without a number gets one, and does not answer any more.
+    // A node without a number gets one, and then no longer answers.
     let given = &rig.json("canopen lss --node 12 --node-bitrate 250k --store", "canopen_lss")[0];
     assert_eq!((&given["vendor_id"], &given["serial_number"]), (&0x29C.into(), &0x4D2.into()), "{given}");
     let (code, _, err) = rig.run("canopen lss");
@@ -210,7 +210,7 @@ fn a_node_on_can_j1939_is_seen_asked_and_told() {
     assert_eq!(data("j1939 request 0xEF00 --to 129").len(), 200);
     assert!(rig.well("j1939 dm1 --to 129").contains("SPN 100 FMI 3"));
     assert_eq!(data("j1939 dm1"), "04FF64000305FFFF");
-    // A long message to it: what it says of it is heard by another.
+    // A long message to it: what it reports about that is received by another program.
     let message = "01".repeat(150);
     let sent = rig.json(&format!("j1939 send 0xD000 {message} --to 129"), "conversations");
     assert_eq!(sent[0]["data"].as_str().unwrap().len(), 300);
@@ -219,7 +219,7 @@ fn a_node_on_can_j1939_is_seen_asked_and_told() {
         code == Some(1) && err.contains("no answer within 1250 ms") && err.contains("j1939 claim"),
         "{err}"
     );
-    // Its NAME is lower than ours: it keeps the address.
+    // Its NAME is lower than ours, so it keeps the address.
     let (code, out, err) = rig.run("j1939 claim --address 129");
     assert!(code == Some(0) && err.contains("the address 129 is taken"), "{out}{err}");
     let (code, _, err) = rig.run("j1939 claim --address 129 --name 7FFFFFFFFFFFFFFF");

@@ -1,4 +1,4 @@
-//! What cannot be read is no success, whatever the command, and nothing is left out in silence.
+//! Unreadable input is not a success, whatever the command, and nothing is silently left out.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -61,7 +61,7 @@ fn an_older_output_stays_as_it_is_where_nothing_can_be_read() {
     let (code, _, err) = cantap(&directory, &["convert", "broken.csv", "out.log"]);
     assert_eq!(code, Some(1), "{err}");
     assert_eq!(fs::read_to_string(directory.join("out.log")).unwrap(), "older\n");
-    // A trace without any frame is still a trace, and takes the older one's place.
+    // A trace without any frame is still a trace, and replaces the older one.
     fs::write(directory.join("empty.log"), "").unwrap();
     let (code, _, err) = cantap(&directory, &["convert", "empty.log", "out.log"]);
     assert_eq!((code, err.as_str()), (Some(0), "cantap: note: the file is empty (1)\n"));
@@ -69,7 +69,8 @@ fn an_older_output_stays_as_it_is_where_nothing_can_be_read() {
     assert_eq!(fs::read_dir(&directory).unwrap().count(), 3, "nothing temporary is left");
 }
 
-/// As for every command that writes a file: a run that fails leaves the older one. What comes from a pipe is nowhere else, and is kept.
+/// As with every command that writes a file, a failed run leaves the older one. What comes from a pipe exists nowhere else, and is
+/// kept.
 #[test]
 fn a_strict_end_leaves_the_older_output_and_keeps_what_came_from_a_pipe() {
     let directory = directory("strict");
@@ -95,7 +96,7 @@ fn a_strict_end_leaves_the_older_output_and_keeps_what_came_from_a_pipe() {
     assert_eq!(fs::read_to_string(directory.join("piped.log")).unwrap(), "(1.000000) can0 123#11\n");
 }
 
-/// Of all formats only those without a head can be of no byte at all; what is empty is told.
+/// Only formats without a header can have files of zero bytes; that a file is empty is reported.
 #[test]
 fn an_empty_file_is_an_empty_trace_only_where_the_format_has_no_head() {
     let directory = directory("empty");
@@ -115,7 +116,7 @@ fn an_empty_file_is_an_empty_trace_only_where_the_format_has_no_head() {
         assert!(err.contains(&format!("nothing in {name} could be read")), "{err}");
         assert!(err.contains("it looks like an empty file"), "{err}");
     }
-    // What we write of an empty trace has its head.
+    // What we write for an empty trace has its header.
     for suffix in ["log", "asc", "blf", "trc", "csv", "pcapng", "mf4", "dif", "asc.zst", "blf.gz"] {
         let name = format!("written.{suffix}");
         assert_eq!(cantap(&directory, &["convert", "a.log", &name]).0, Some(0), "{name}");
@@ -125,7 +126,7 @@ fn an_empty_file_is_an_empty_trace_only_where_the_format_has_no_head() {
     }
 }
 
-/// The live view shows what it can; as a command of a script it says that there was nothing.
+/// The live view shows what it can; used in a script, it reports that there was nothing.
 #[test]
 fn one_screen_of_a_file_that_could_not_be_read_is_no_success() {
     let directory = directory("once");
@@ -153,7 +154,7 @@ fn content_decides_where_it_is_clear_and_from_overrides() {
         let (code, out, err) = cantap(&directory, &["convert", wrong, "-", "--from", "dif"]);
         assert_eq!((code, out.as_str()), (Some(1), ""), "{wrong}: {err}");
     }
-    // The logs of other programs, too, but where they are commonly named so.
+    // The logs of other programs, too, except with their usual names.
     let printed = "Timestamp: 1410714882.000000    ID:      123    S Rx                DL:  2    11 22     Channel: can0\n";
     let shown = " (1410714882.000000)  can0  123   [2]  11 22\n";
     for (name, text, format) in [
@@ -174,7 +175,7 @@ fn content_decides_where_it_is_clear_and_from_overrides() {
     assert!(code == Some(1) && err.contains("name it with one of --from "), "{err}");
 }
 
-/// Well-formed captures and measurements that have nothing of CAN in them.
+/// Well-formed captures and measurements without any CAN traffic.
 #[test]
 fn a_file_without_traffic_of_can_is_no_success_and_says_what_is_in_it() {
     let directory = directory("without_can");
@@ -223,7 +224,8 @@ fn what_is_left_out_is_told_by_kind_with_its_share_and_is_in_the_json() {
 #[test]
 fn fd_frames_have_their_load_only_with_the_data_bit_rate() {
     let directory = directory("fd");
-    // 17 bits of arbitration, no stuff bit in it, 12 behind the data phase; 500 kbit/s, one frame in a millisecond.
+    // 17 bits of arbitration, with no stuff bit in it, and 12 after the data phase; 500 kbit/s, one frame per
+    // millisecond.
     let frame = format!("2AA##1{}", "AA".repeat(64));
     let line = |at: u32| format!("(1.{:06}) can0 {frame}\n", at * 1000);
     fs::write(directory.join("fd.log"), (0..10).map(line).collect::<String>()).unwrap();
@@ -241,7 +243,7 @@ fn fd_frames_have_their_load_only_with_the_data_bit_rate() {
     );
     let (_, out, _) = cantap(&directory, &["bits", &frame, "-b", "500k", "--data-bitrate", "2M", "--json"]);
     let bits: serde_json::Value = serde_json::from_str(&out).unwrap();
-    // 5 + 512 + 4 + 21 + 7 + 1, and what stuff bits the length code 1111 has with its neighbours.
+    // 5 + 512 + 4 + 21 + 7 + 1, plus the stuff bits that the length code 1111 causes with its neighbours.
     let (nominal, data) = (bits["nominal_bits"].as_u64().unwrap(), bits["data_phase_bits"].as_u64().unwrap());
     assert_eq!((nominal, data), (29, 550 + bits["stuff_bits"].as_u64().unwrap()));
     let expected = (nominal as f64 / 500e3 + data as f64 / 2e6) / 1e-3 * 100.0;

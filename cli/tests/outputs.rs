@@ -1,13 +1,13 @@
-//! Files that commands write take an older one's place only when they are whole.
+//! Files written by commands replace older ones only once they are complete.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-/// An empty directory for each test, with a trace that has a broken line in the middle, and one that has none.
+/// An empty directory for each test, with a trace that has a broken line in the middle, and one without.
 fn directory(test: &str) -> PathBuf {
     let directory = Path::new(env!("CARGO_TARGET_TMPDIR")).join("outputs").join(test);
-    // A run before may have left files that would be counted.
+    // An earlier run may have left files that would be counted.
     let _ = fs::remove_dir_all(&directory);
     fs::create_dir_all(&directory).unwrap();
     let line =
@@ -39,7 +39,7 @@ fn names(directory: &Path) -> Vec<String> {
     names
 }
 
-/// Commands that write a file of what they read.
+/// Commands that write a file from what they read.
 const COMMANDS: [(&str, &str); 4] = [
     ("search IN --id 101 -o", "out.log"),
     ("align IN whole.log -o", "out.blf"),
@@ -60,7 +60,7 @@ fn a_run_that_fails_leaves_the_older_file_and_nothing_else() {
         assert_eq!(code, Some(1), "{line}: {err}");
         assert_eq!(fs::read_to_string(directory.join(output)).unwrap(), "older\n", "{line}");
         assert_eq!(names(&directory), before, "{line}");
-        // Without --strict it is left out, and the file is whole.
+        // Without --strict it is left out, and the file is complete.
         let (code, _, err) = cantap(&directory, &line);
         assert_eq!(code, Some(0), "{line}: {err}");
         assert_ne!(fs::read(directory.join(output)).unwrap(), b"older\n", "{line}");
@@ -68,7 +68,7 @@ fn a_run_that_fails_leaves_the_older_file_and_nothing_else() {
     }
 }
 
-/// A trace that does not end, as a pipe has it: the command is in the middle of its work when Ctrl-C comes.
+/// A trace without an end, like a pipe: the command is in the middle of its work when Ctrl-C comes.
 #[cfg(unix)]
 #[test]
 fn a_run_that_is_interrupted_leaves_the_older_file_and_nothing_else() {
@@ -86,7 +86,7 @@ fn a_run_that_is_interrupted_leaves_the_older_file_and_nothing_else() {
             .current_dir(&directory)
             .spawn()
             .unwrap();
-        // To write alone would wait for a reader, even for one that is no more.
+        // Opening for writing only would wait for a reader, even if there will never be one.
         let mut pipe =
             fs::OpenOptions::new().read(true).write(true).open(directory.join("pipe.log")).unwrap();
         pipe.write_all(&fs::read(directory.join("whole.log")).unwrap()).unwrap();
@@ -104,7 +104,7 @@ fn a_run_that_is_interrupted_leaves_the_older_file_and_nothing_else() {
     }
 }
 
-/// What could not be read, and what is no part of a CAN trace, in every object about what was read.
+/// What could not be read, and what is not part of a CAN trace, in every object about what was read.
 #[test]
 fn what_is_missing_is_in_the_json_of_every_command_that_reads_a_trace() {
     let directory = directory("missing");
@@ -165,7 +165,7 @@ fn a_replay_and_a_send_count_what_did_not_go_out_by_reason() {
         (&1.into(), &1.into()),
         "{sent}"
     );
-    // A database with a fault that leaves the rest of it usable.
+    // A database with a fault, of which the rest is usable.
     fs::write(
         directory.join("odd.dbc"),
         "BO_ 256 M: 1 A\n SG_ S : 0|8@1+ (1,0) [0|0] \"\" A\n SG_ T : 0|99@1+ (1,0) [0|0] \"\" A\n",

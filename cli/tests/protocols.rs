@@ -1,4 +1,4 @@
-//! What frames say together, in the commands that are not `cantap conversations`.
+//! What frames say together, in commands other than `cantap conversations`.
 
 use std::path::PathBuf;
 use std::process::{Command, Output};
@@ -153,7 +153,7 @@ fn a_table_has_the_numbers_of_what_was_said() {
     let asked = lines.iter().find(|line| line[0] == "2.000000").unwrap();
     assert_eq!((asked[nrc], asked[pci]), ("", "3"), "{out}");
     assert!(lines.iter().all(|line| line.len() == lines[0].len()), "{out}");
-    // At equal distances, each with its last value.
+    // At regular intervals, each with its last value.
     let (code, out, err) = decode(&["--resample", "500ms"]);
     assert_eq!(code, Some(0), "{err}");
     let times: Vec<f64> =

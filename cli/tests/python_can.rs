@@ -1,10 +1,10 @@
-//! python-can's slcan interface, unchanged, on the virtual device's pseudo terminal.
+//! python-can's slcan interface, unmodified, on the virtual device's pseudo-terminal.
 #![cfg(unix)]
 
 use std::io::{BufRead, BufReader};
 use std::process::{Command, Stdio};
 
-/// Receives, sends, and compares what the device says of itself.
+/// Receives, sends, and compares with what the device reports about itself.
 const PROGRAM: &str = r#"
 import sys, can
 bus = can.Bus(interface="slcan", channel=sys.argv[1], bitrate=500000)
@@ -21,7 +21,7 @@ bus.shutdown()
 print("done")
 "#;
 
-/// What python-can sends for a rate is what the device is at: it reads no answer that could tell otherwise.
+/// python-can's command for a rate must give that rate: python-can reads no answer that could tell otherwise.
 const RATE: &str = r#"
 import sys, can
 bus = can.Bus(interface="slcan", channel=sys.argv[1], bitrate=int(sys.argv[2]), listen_only=True, sleep_after_open=0.2)
@@ -29,7 +29,7 @@ print("heard" if bus.recv(5) is not None else "nothing")
 bus.shutdown()
 "#;
 
-/// Those of its rates that Lawicel's manual has not, or has otherwise.
+/// Those of its rates that are missing or different in Lawicel's manual.
 #[test]
 fn python_cans_own_bit_rates_are_what_it_means_by_them() {
     for (asked, bus) in [("750000", "750k"), ("83300", "83.333k"), ("500000", "500k")] {
@@ -48,7 +48,7 @@ fn python_can_talks_to_the_virtual_device() {
     }
 }
 
-/// What a program prints that gets the virtual device's port and what stands behind it here; `None` without python-can.
+/// The output of a program that gets the virtual device's port and these arguments; `None` without python-can.
 fn on_virtual_device(options: &str, program: &[&str]) -> Option<String> {
     let python = std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned());
     let imports = Command::new(&python).args(["-c", "import can, serial"]).output();

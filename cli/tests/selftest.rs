@@ -1,4 +1,4 @@
-//! `cantap selftest` on devices that are as they should be, and on one that is not; `gen --saturate`.
+//! `cantap selftest` on good devices, and on a faulty one; `gen --saturate`.
 
 mod firmware;
 
@@ -72,7 +72,7 @@ fn a_loop_that_is_not_there_fails_and_says_what_to_look_at() {
     let line =
         out.lines().find(|line| line.starts_with("FAIL  channel 1 to channel 2 and back, 500000")).unwrap();
     assert!(line.contains("nothing arrived: are the channels wired to each other"), "{line}");
-    // What has nothing to do with it is still tested.
+    // Unrelated steps are still tested.
     assert!(out.lines().any(|line| line.starts_with("pass  saved settings untouched")), "{out}");
 }
 

@@ -1,9 +1,9 @@
-//! `cantap send` with messages and values in place of bytes, by DBC.
+//! `cantap send` with messages and values instead of bytes, using a DBC file.
 
 use std::path::Path;
 use std::process::{Command, Output};
 
-/// Sends on the virtual device's channel 1; without the time in front of each line.
+/// Sends on the virtual device's channel 1; returns the lines without their times.
 fn send(arguments: &[&str]) -> (Option<i32>, Vec<String>, String) {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../host/signals/tests/data/dbc");
     let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
@@ -26,14 +26,14 @@ fn values_become_the_frame_that_other_tools_make() {
     // As cantools encodes them: see its tests of this file.
     let line = "ExampleMessage:Temperature=250.55,AverageRadius=3.2,Enable=1";
     assert_eq!(sent(&[&[line], &db[..]].concat()), ["can0 1F0#C006E00000000000 T"]);
-    // Spaces, a value of the table, hexadecimal and raw bits say the same.
+    // Spaces, a text of the value table, hexadecimal and raw bits mean the same.
     for line in [
         "ExampleMessage: Temperature = 250.55, AverageRadius = 3.2, Enable = Enabled",
         "ExampleMessage:Temperature=raw:0x37,AverageRadius=raw:32,Enable=0x1",
     ] {
         assert_eq!(sent(&[&[line], &db[..]].concat()), ["can0 1F0#C006E00000000000 T"], "{line}");
     }
-    // What is not given is zero or the database's start value; frames and messages mix, in their order.
+    // Values not given are zero or the database's start value; frames and messages mix, in order.
     let mixed = ["123#11", "ExampleMessage:Enable=1", "ExampleMessage:Enable=0", "--db", "motohawk.dbc"];
     let expected = ["can0 123#11 T", "can0 1F0#8000000000000000 T", "can0 1F0#0000000000000000 T"];
     assert_eq!(sent(&mixed), expected);
@@ -60,7 +60,7 @@ fn what_no_frame_can_say_is_refused_before_anything_is_sent() {
         ("ExampleMessage:Enabel=1", "did you mean Enable"),
         ("ExampleMessage:Enable=1,Enable=0", "given twice"),
         ("ExampleMessage:Enable=2", "does not fit Enable, which goes from 0 to 1"),
-        ("ExampleMessage:Enable=Maybe", "is no value for Enable"),
+        ("ExampleMessage:Enable=Maybe", "is not a value for Enable"),
         ("ExampleMessage:Temperature=300", "does not fit Temperature"),
         ("ExampleMessage:AverageRadius=5.5", "raw:55"),
         ("ExampleMessage:Enable", "write it as Message:Signal=value"),
@@ -71,14 +71,14 @@ fn what_no_frame_can_say_is_refused_before_anything_is_sent() {
         let (code, lines, err) = send(&["123#11", line, "--db", "motohawk.dbc"]);
         assert!(code == Some(1) && lines.is_empty() && err.contains(part), "{line}: {err}");
     }
-    // Without a database there is no message at all.
+    // Without a database there are no messages.
     let (code, _, err) = send(&["ExampleMessage:Enable=1"]);
     assert!(code == Some(1) && err.contains("no database has a message"), "{err}");
     let (code, _, err) = send(&["ExampleMessage:Enable=1", "--db", "nowhere.dbc"]);
     assert!(code == Some(1) && err.contains("nowhere.dbc"), "{err}");
 }
 
-/// The device repeats and changes what was made from values as any other frame.
+/// The device repeats and modifies a frame made from values like any other.
 #[test]
 fn a_message_with_values_can_be_periodic_and_count() {
     let line =

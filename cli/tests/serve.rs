@@ -1,4 +1,4 @@
-//! `cantap serve`, and commands on the other side of it: on a UNIX socket, over TCP, through ssh.
+//! `cantap serve`, and commands that use it: on a UNIX socket, over TCP, through ssh.
 #![cfg(unix)]
 
 use std::io::{BufRead, BufReader, Read, Write};
@@ -31,10 +31,10 @@ fn said(output: &Output) -> (Option<i32>, String, String) {
     (output.status.code(), text(&output.stdout), text(&output.stderr))
 }
 
-/// A server that runs.
+/// A running server.
 struct Server {
     child: Child,
-    /// Where it listens, as it prints it.
+    /// Its addresses, as printed.
     at: Vec<String>,
 }
 
@@ -77,7 +77,7 @@ fn log(path: &Path) -> Vec<(f64, String)> {
     text.lines().filter_map(line).filter(|(_, frame)| !frame.contains(" 20000")).collect()
 }
 
-/// Two traces of one bus: the frames that both have, one after the other, are the same, at the same times.
+/// Checks two traces of one bus: the frames in both are the same, in the same order and at the same times.
 fn agree(one: &[(f64, String)], other: &[(f64, String)]) {
     let of = |all: &[(f64, String)], channel: &str| {
         all.iter().filter(|(_, frame)| frame.starts_with(channel)).cloned().collect::<Vec<_>>()
@@ -90,7 +90,7 @@ fn agree(one: &[(f64, String)], other: &[(f64, String)]) {
         };
         let find =
             |of: &[(f64, String)], what: &[String]| (0..of.len() - 12).find(|at| frames(of, *at) == what);
-        // Whichever began later is within the other.
+        // The one that began later starts within the other.
         let (from, to) = match find(&one, &frames(&other, 0)) {
             Some(at) => (at, 0),
             None => (0, find(&other, &frames(&one, 0)).expect("common frames")),
@@ -127,7 +127,7 @@ fn programs_share_a_device_each_with_all_of_its_frames() {
     assert!(server.at[1].starts_with("tcp://127.0.0.1:"), "{:?}", server.at);
     assert_eq!(std::fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o600);
     let files: Vec<PathBuf> = (0..3).map(|number| folder.path().join(format!("{number}.log"))).collect();
-    // One without a bit rate takes the server's.
+    // Without a bit rate it uses the server's.
     let captures: Vec<Child> = [(&server.at[0], "-b 500k"), (&server.at[0], ""), (&server.at[1], "")]
         .iter()
         .zip(&files)
@@ -138,13 +138,13 @@ fn programs_share_a_device_each_with_all_of_its_frames() {
     }
     agree(&log(&files[0]), &log(&files[1]));
     agree(&log(&files[0]), &log(&files[2]));
-    // Every command takes the address.
+    // Every command accepts the address.
     let (code, out, err) = run(&format!("info -d {} --json", server.at[0]));
     assert_eq!(code, Some(0), "{err}");
     assert!(out.contains("VIRTUAL"), "{out}");
     let (code, out, err) = run(&format!("stats -d {} -t 500ms", server.at[1]));
     assert_eq!(code, Some(0), "{out}{err}");
-    // What is not granted is refused, with the way out.
+    // What is not allowed is refused, with the remedy.
     let (code, _, err) = run(&format!("send -d {} 1 123#11", server.at[0]));
     assert_eq!(code, Some(1));
     assert!(err.contains("the right to send") && err.contains("--allow send"), "{err}");
@@ -184,7 +184,7 @@ fn who_may_send_sends_and_others_see_it() {
     assert_eq!(heard.iter().filter(|(_, frame)| frame.starts_with("can1 ")).count(), 50);
 }
 
-/// A stand-in for ssh: what the other computer's shell would do, on this one.
+/// A stand-in for ssh: does on this computer what the other computer's shell would do.
 fn ssh(folder: &Path) -> PathBuf {
     let program = folder.join("ssh");
     std::fs::write(
@@ -208,7 +208,7 @@ fn a_capture_through_ssh_is_one_made_beside_it() {
     };
     let (near, far) = (folder.path().join("near.log"), folder.path().join("far.log"));
     let beside = capture(&server.at[0], &near, "-t 2500ms").spawn().unwrap();
-    // A server's board is as good a device as any.
+    // A server's board is as good as any device.
     let remote = through(&mut capture(&format!("ssh://me@there/unix:{path}"), &far, "-b 500k -t 1s"));
     nothing_lost(&remote.wait_with_output().unwrap());
     nothing_lost(&beside.wait_with_output().unwrap());
@@ -222,10 +222,10 @@ fn a_capture_through_ssh_is_one_made_beside_it() {
     assert!(err.contains("the right to send"), "{err}");
     let (code, _, err) = send("ssh://there/virtual?allow=send");
     assert_eq!(code, Some(0), "{err}");
-    // A computer that it takes long to get to.
+    // A computer that takes a long time to reach.
     let far_away = through(cantap("info -d ssh://there/virtual").env("FAR", "4")).wait_with_output().unwrap();
     assert_eq!(far_away.status.code(), Some(0), "{}", String::from_utf8_lossy(&far_away.stderr));
-    // Ctrl-C ends the capture, and then the other side: whole, with its summary.
+    // Ctrl-C ends the capture, and then the other side: complete, with its summary.
     let mut interrupted =
         through(&mut capture("ssh://there/virtual:load=50", &folder.path().join("c.log"), "-b 500k"));
     std::thread::sleep(Duration::from_millis(1500));
@@ -240,10 +240,10 @@ fn a_capture_through_ssh_is_one_made_beside_it() {
 
 const SSHD: &str = "/usr/sbin/sshd";
 
-/// A real ssh server on this computer, with keys of its own, and the client's way to it.
+/// A real ssh server on this computer, with its own keys, and the client's configuration for it.
 struct Sshd {
     child: Child,
-    /// What is started in ssh's place: ssh, with this server's settings.
+    /// The program used in place of ssh: ssh, with this server's settings.
     program: PathBuf,
 }
 
@@ -254,7 +254,7 @@ impl Drop for Sshd {
     }
 }
 
-/// Starts it; the reason where that cannot be.
+/// Starts it, or returns the reason why that is impossible.
 fn sshd(folder: &Path) -> Result<Sshd, String> {
     let has = |program: &str| Path::new(program).exists();
     if !has(SSHD) || !has("/usr/bin/ssh") {
@@ -272,7 +272,7 @@ fn sshd(folder: &Path) -> Result<Sshd, String> {
     let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let host_key = std::fs::read_to_string(at("host.pub")).unwrap();
     std::fs::write(at("known"), format!("[127.0.0.1]:{port} {host_key}")).unwrap();
-    // The other computer has a `cantap` in its path.
+    // The other computer has `cantap` in its path.
     let bin = Path::new(CANTAP).parent().unwrap().display().to_string();
     let server = format!(
         "Port {port}\nListenAddress 127.0.0.1\nHostKey {}\nPidFile none\nAuthorizedKeysFile {}\nStrictModes no\nUsePAM no\n\
@@ -292,7 +292,7 @@ fn sshd(folder: &Path) -> Result<Sshd, String> {
     std::fs::write(&program, format!("#!/bin/sh\nexec /usr/bin/ssh -F {} \"$@\"\n", at("client"))).unwrap();
     std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
     if rustix::process::getuid().is_root() {
-        // Where it confines itself; a package's own start makes it otherwise.
+        // The folder to which it confines itself; a package's own start script creates it otherwise.
         std::fs::create_dir_all("/run/sshd").unwrap();
     }
     let log = std::fs::File::create(at("log")).unwrap();
@@ -326,7 +326,7 @@ fn a_capture_over_a_real_ssh_is_one_made_beside_it() {
     let (near, far) = (folder.path().join("near.log"), folder.path().join("far.log"));
     let beside = capture(&server.at[0], &near, "-t 4s").spawn().unwrap();
     let through = |command: &mut Command| command.env("CANTAP_SSH", &sshd.program).output().unwrap();
-    // A server's board is as good a device as any.
+    // A server's board is as good as any device.
     nothing_lost(&through(&mut capture(&format!("ssh://localhost/unix:{path}"), &far, "-b 500k -t 1s")));
     nothing_lost(&beside.wait_with_output().unwrap());
     agree(&log(&near), &log(&far));
@@ -336,7 +336,7 @@ fn a_capture_over_a_real_ssh_is_one_made_beside_it() {
     assert!(err.contains("the right to send"), "{err}");
     let (code, _, err) = send(&format!("ssh://localhost/unix:{path}?allow=send"));
     assert_eq!(code, Some(0), "{err}");
-    // Whoever ssh does not know gets no further.
+    // A client unknown to ssh gets no further.
     std::fs::write(folder.path().join("authorized"), "").unwrap();
     let (code, _, err) = send("ssh://localhost/virtual");
     assert_eq!(code, Some(1), "{err}");
@@ -376,7 +376,7 @@ impl Cable {
     }
 }
 
-/// The client's trace has the gaps and the frames around them; the server is none the worse.
+/// The client's trace has the gaps, and the frames around them; the server is unaffected.
 #[test]
 fn cut_connections_are_gaps_and_the_capture_goes_on() {
     let folder = tempfile::tempdir().unwrap();
@@ -385,7 +385,7 @@ fn cut_connections_are_gaps_and_the_capture_goes_on() {
     let cable = Cable::new(server.at[1].strip_prefix("tcp://").unwrap());
     let (near, far) = (folder.path().join("near.log"), folder.path().join("far.log"));
     let beside = capture(&server.at[0], &near, "-t 8s").spawn().unwrap();
-    // It begins before the other and ends after it, however busy the computer is.
+    // It begins before the other and ends after it, however busy the computer.
     let started = Instant::now();
     while std::fs::metadata(&near).map_or(0, |file| file.len()) < 1000 {
         assert!(started.elapsed() < Duration::from_secs(10), "nothing is captured");
@@ -432,7 +432,7 @@ fn a_server_that_is_killed_leaves_a_gap_and_the_capture_goes_on_with_the_next() 
     let file = folder.path().join("all.log");
     let listener = capture(&server.at[0], &file, "-t 5s").spawn().unwrap();
     std::thread::sleep(Duration::from_millis(1200));
-    // Kill -9: its socket stays behind, which the next one replaces.
+    // kill -9: its socket stays behind, and the next server replaces it.
     drop(server);
     assert!(Path::new(&path).exists());
     let _server = start();
@@ -467,7 +467,8 @@ fn clients_of_other_computers_come_with_keys() {
     let (code, _, err) = run(&format!("send -d {at}?keys={keys}/alice -b 500k 1 123#11"));
     assert_eq!(code, Some(1));
     assert!(err.contains("the right to send"), "{err}");
-    // With another authority's keys, which names the right one as the server's: refused at once, with the reason.
+    // With another authority's keys, among them one named like the server's: refused immediately, with the
+    // reason.
     let other = folder.path().join("other").display().to_string();
     let (code, _, err) = run(&format!("serve keygen {other} --host 127.0.0.1 --client eve:send"));
     assert_eq!(code, Some(0), "{err}");
@@ -475,13 +476,13 @@ fn clients_of_other_computers_come_with_keys() {
     let (code, _, err) = run(&format!("info -d {at}?keys={other}/eve"));
     assert_eq!(code, Some(1));
     assert!(err.contains("lets nobody in with these keys") && err.contains("alert"), "{err}");
-    // Unencrypted, it is nobody.
+    // Without encryption, nothing answers.
     let (code, _, err) = run(&format!("info -d {}", at.replace("tls:", "tcp:")));
     assert_eq!(code, Some(1), "{err}");
     assert!(err.contains("does not let this client in"), "{err}");
 }
 
-/// Garbage, half-open peers and floods harm nobody, and hear nothing.
+/// Garbage, half-open peers and floods harm nobody, and receive nothing.
 #[test]
 fn strangers_on_the_port_hear_nothing_and_take_nobodys_place() {
     let mut server = Server::start("-d virtual:load=30 -b 500k --tcp 0", 1);
@@ -492,7 +493,7 @@ fn strangers_on_the_port_hear_nothing_and_take_nobodys_place() {
     let flood: Vec<TcpStream> = (0..60).map(|_| TcpStream::connect(place).unwrap()).collect();
     browser.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
     let mut heard = Vec::new();
-    // It is let go without a byte: whoever does not greet has nothing to say.
+    // It is dropped without a byte: a peer that does not greet gets no answer.
     let closed = browser.read_to_end(&mut heard);
     assert!(closed.is_ok() && heard.is_empty(), "{closed:?} {heard:?}");
     drop(flood);
@@ -515,7 +516,7 @@ fn what_cannot_be_served_is_said_at_once() {
         ("serve -d /dev/nothing -b 500k", 1, "there is no device at '/dev/nothing'"),
         ("serve -d virtual -d virtual --stdio", 2, "--stdio serves one device"),
         ("capture -d tcp://127.0.0.1:9 -b 500k", 1, "there is no server"),
-        ("capture -d ssh://-oProxyCommand=x -b 500k", 2, "is no name of a computer"),
+        ("capture -d ssh://-oProxyCommand=x -b 500k", 2, "is not the name of a computer"),
     ] {
         let (exit, out, err) = run(arguments);
         assert_eq!(exit, Some(code), "{arguments}: {out}{err}");

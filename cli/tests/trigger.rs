@@ -5,7 +5,7 @@ use std::process::{Command, Output};
 
 const DATABASE: &str = "BO_ 1 Engine: 8 A\n SG_ Speed : 0|8@1+ (2,-40) [0|0] \"km/h\" A\n";
 
-/// Runs it on a virtual device that replays 60 frames, one each 10 ms, numbered in their first byte.
+/// Runs it on a virtual device that replays 60 frames, one every 10 ms, numbered in their first byte.
 fn cantap(test: &str, arguments: &[&str]) -> (Option<i32>, String, String) {
     let directory = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(test);
     std::fs::create_dir_all(&directory).unwrap();

@@ -1,4 +1,4 @@
-//! Frames that are not sent: `send`, `gen` and `replay` end, say the true reason, and count each frame once.
+//! Frames that are not sent: `send`, `gen` and `replay` end, give the true reason, and count each frame once.
 
 use std::fmt::Write;
 use std::path::PathBuf;
@@ -43,7 +43,7 @@ fn periodic_frames_on_a_bus_that_takes_none_end_with_the_reason_and_the_count_th
         assert_eq!((code, lines.len()), (Some(1), sent), "{line}: {err}");
         assert!(err.contains(part) && err.lines().count() == 1, "{line}: {err}");
     }
-    // Ended by its time, it has the same reason.
+    // If its time ends it, it has the same reason.
     let (code, _, err) = cantap(&format!("send -d {DEAD_BUS} can0 7FF#11 --period 10ms --time 500ms"));
     assert!(code == Some(1) && err.contains(NOBODY), "{err}");
 }
@@ -76,7 +76,7 @@ fn on_a_full_bus_everything_that_sends_ends_and_names_the_load() {
         let load: f64 = load.split_once(" %) of frames with lower identifiers").unwrap().0.parse().unwrap();
         assert!((95.0..=100.0).contains(&load), "{line}: {err}");
     }
-    // Without stamps no load is known, and none invented.
+    // Without stamps the load is unknown, and none is invented.
     let (_, _, err) = cantap(&format!("send -d {FULL_BUS} can0 7FF#11 --no-stamps"));
     assert!(err.contains("the bus is full of frames with lower identifiers"), "{err}");
     // A lower identifier does get through.
@@ -84,7 +84,7 @@ fn on_a_full_bus_everything_that_sends_ends_and_names_the_load() {
     assert_eq!((code, lines.len()), (Some(0), 1), "{err}");
 }
 
-/// More than the device's queue holds, so that some were never handed over.
+/// More than fit in the device's queue, so that some were never handed over.
 #[test]
 fn totals_name_every_frame_that_was_asked_for() {
     let (code, _, err) = cantap(&format!("send -d {DEAD_BUS} can0 123#11 124#22 -n 300"));

@@ -1,8 +1,8 @@
-//! `virtual:canopen` by other people's program: python-canopen as its master on a board that `cantap serve` shares, joined by python-can's
-//! socketcand, while `cantap conversations` listens. So the server's blocks, the nodes' LSS and what is said of both are held against a master
-//! that is not ours.
+//! `virtual:canopen` with another program: python-canopen as its master on a board shared by `cantap serve`, connected through python-can's
+//! socketcand, while `cantap conversations` listens. So the server's blocks, the nodes' LSS and the events for both are checked against a
+//! master that is not ours.
 //!
-//! Python is `CANTAP_PYTHON`, else `python3`; where it or a package is missing that is said and the test passes, unless
+//! Python is `CANTAP_PYTHON`, otherwise `python3`; if it or a package is missing, the test says so and passes, unless
 //! `CANTAP_REQUIRE_PEERS=1`.
 #![cfg(unix)]
 
@@ -55,7 +55,7 @@ fn python_canopen_masters_the_nodes_and_a_listener_hears_the_same() {
         .stdin(Stdio::null())
         .spawn()
         .unwrap();
-    // The server says that it is there.
+    // The server reports that it is ready.
     let mut words = BufReader::new(server.stderr.take().unwrap()).lines();
     assert!(words.any(|line| line.unwrap().contains("is in and may")));
     let rest = std::thread::spawn(move || words.count());
@@ -63,7 +63,7 @@ fn python_canopen_masters_the_nodes_and_a_listener_hears_the_same() {
     let peer = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/canopen_master_peer.py");
     let output = Command::new(&python).args([peer, host, port]).arg(&sheet).output().unwrap();
     let text = String::from_utf8_lossy(&output.stderr).into_owned();
-    // Ended as by Ctrl-C, so that the file is whole.
+    // Ended as by Ctrl-C, so that the file is complete.
     Command::new("kill").args(["-INT", &listener.id().to_string()]).status().unwrap();
     listener.wait().unwrap();
     server.kill().unwrap();
@@ -94,7 +94,7 @@ fn python_canopen_masters_the_nodes_and_a_listener_hears_the_same() {
     }
     assert!(said["speed"].as_i64().is_some_and(|speed| (1..=500).contains(&speed)), "{said}");
 
-    // What the listener heard of it.
+    // What the listener received of it.
     let told = Command::new(CANTAP)
         .args(["conversations", "--json", "--quiet", "--protocol", "canopen"])
         .args(["--eds", &sheet.display().to_string()])

@@ -1,4 +1,4 @@
-//! What is called the same everywhere: channels, JSON keys, mistakes and their exit codes.
+//! Names that are the same everywhere: channels, JSON keys, mistakes and their exit codes.
 
 use std::process::{Command, Output, Stdio};
 
@@ -32,7 +32,7 @@ fn each(value: &serde_json::Value, see: &mut impl FnMut(&str, &serde_json::Value
 
 const TRACE: &str = "../host/formats/tests/data/nmea2000.log.gz";
 
-/// As `docs/json.md` has it.
+/// As in `docs/json.md`.
 #[test]
 fn json_speaks_one_language_in_every_command() {
     for arguments in [
@@ -84,7 +84,7 @@ fn send_tells_scripts_what_became_of_the_frames() {
     assert!(failed["reason"].as_str().unwrap().contains("nobody acknowledged"), "{failed}");
 }
 
-/// Channel 1 is 1 in words, and `can0` where a trace wants an interface; both are understood.
+/// Channel 1 is 1 in words, and `can0` where a trace wants an interface; both are accepted.
 #[test]
 fn a_channel_has_one_number_in_every_command() {
     for (arguments, part) in [
@@ -138,7 +138,7 @@ fn the_same_mistake_has_the_same_words_and_exit_code_everywhere() {
             "search -d virtual -c 3 --id 1".to_owned(),
             "cantap: a device has channels 1 and 2, and no channel 3",
         ),
-        // It is for what is written.
+        // This option is for output.
         (format!("stats {TRACE} --format asc"), "unexpected argument '--format'"),
         ("send -d virtual 123#11".to_owned(), "as in: cantap send 1 123#11"),
         ("capture -d virtual -b 500k -f 12x".to_owned(), "neither an ID, such as 123"),
@@ -150,7 +150,7 @@ fn the_same_mistake_has_the_same_words_and_exit_code_everywhere() {
         assert_eq!(code, Some(2), "{arguments}: {err}");
         assert!(err.contains(part), "{arguments}: {err}");
     }
-    // What is there is not lost by a slip.
+    // An existing file is not lost by a slip.
     let (code, _, err) = cantap(&format!("capture -d virtual -b 500k -n 5 -o {there}"));
     assert!(code == Some(1) && err.contains("there already"), "{err}");
     assert_eq!(std::fs::read_to_string(folder.path().join("there.log")).unwrap(), "kept");
@@ -167,7 +167,7 @@ fn the_same_mistake_has_the_same_words_and_exit_code_everywhere() {
     let (code, _, err) =
         cantap(&format!("search {TRACE} --id 9F80102 -m 1 -o {} --format asc", found.display()));
     assert!(code == Some(0) && std::fs::read_to_string(&found).unwrap().starts_with("date "), "{err}");
-    // What candump's users type.
+    // What users of candump type.
     let (code, out, err) = cantap("capture -d virtual:frames=std8 -b 500k -f 123 -t 300ms");
     assert!(code == Some(0) && out.lines().all(|line| line.contains(" 123#")), "{err}{out}");
     let (code, out, err) = cantap(&format!("search {TRACE} --id 9F80102 --count"));

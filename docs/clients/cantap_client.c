@@ -75,7 +75,7 @@ static uint32_t crc32(const uint8_t *bytes, size_t len) {
     return ~crc;
 }
 
-/* `message` has room for four bytes more; `out` for one byte in 254 more than that, and two. */
+/* `message` has room for four more bytes, and `out` for that plus one byte in 254 and two. */
 static size_t seal(uint8_t *message, size_t len, uint8_t *out) {
     uint32_t crc = crc32(message, len);
     for (int i = 0; i < 4; i++) message[len++] = (uint8_t)(crc >> 8 * i);
@@ -140,7 +140,7 @@ static uint64_t frame_record(uint8_t qualifiers, uint8_t head, Reader *m, uint64
 
 static uint64_t event_record(uint8_t index, Reader *m, uint64_t ticks) {
     static char text[160];
-    FILE *out = fmemopen(text, sizeof text, "w"); /* the time stands behind the fields, and is printed before them */
+    FILE *out = fmemopen(text, sizeof text, "w"); /* the time follows the fields, but is printed before them */
     if (!out) abort();
     unsigned channel = 0;
     uint32_t losses = 0, confirmations = 0;
@@ -171,7 +171,7 @@ static uint64_t event_record(uint8_t index, Reader *m, uint64_t ticks) {
         if (b == 5) fprintf(out, " %" PRIu64, number(m));
         break;
     case 8: a = number(m), b = number(m); fprintf(out, "sof %" PRIu64 " doubled %" PRIu64, a, b); break;
-    default: m->ok = false; /* a record of a newer protocol: nothing behind it can be read */
+    default: m->ok = false; /* a record of a newer protocol: nothing after it can be read */
     }
     fclose(out);
     ticks += zigzag(m);
@@ -192,7 +192,7 @@ static void batch(Reader *m, bool last) {
         old |= missing[i] > INT32_MAX;
     }
     if (!m->ok) { puts("unreadable"); return; }
-    if (old) { puts("out of order"); return; } /* an older session's, or a repetition */
+    if (old) { puts("out of order"); return; } /* from an older session, or a repetition */
     if (missing[0] || missing[1]) printf("lost on the link %" PRIu32 " %" PRIu32 "\n", missing[0], missing[1]);
     for (int i = 0; i < 2; i++) lost[i] += missing[i], frames[i] = before[i];
     sequence = told + 1;
@@ -258,7 +258,7 @@ static void receive(void) {
     push(bytes, (size_t)len);
 }
 
-/* Sends a command with its fields and waits for the response, whose fields are in `reply` then. */
+/* Sends a command with its fields and waits for the response, whose fields are then in `reply`. */
 static void ask(const uint8_t *command, size_t len) {
     static unsigned id;
     uint8_t request[128], encoded[140];
@@ -286,7 +286,7 @@ int main(int argc, char **argv) {
     if (port < 0 || tcgetattr(port, &raw)) fail("cannot open the port");
     cfmakeraw(&raw);
     tcsetattr(port, TCSANOW, &raw);
-    if (write(port, "", 1) != 1) fail("the port takes nothing"); /* a zero: ends half a request, and chooses this protocol */
+    if (write(port, "", 1) != 1) fail("the port takes nothing"); /* a zero: ends an unfinished request, and chooses this protocol */
 
     ask((uint8_t[]){HELLO, PROTOCOL}, 2);
     for (int i = 0; i < 4; i++) number(&reply); /* protocol and firmware versions */
@@ -308,7 +308,7 @@ int main(int argc, char **argv) {
     /* One frame, identifier 123, two bytes, at once. */
     ask((uint8_t[]){6, 0, 1, OWN_TAG, 0xA3, 0x02, 2, 2, 0x11, 0x22, 0}, 11);
     for (double ends = now() + seconds; now() < ends && !ended;) receive();
-    /* A response overtakes records: all of them are there when `Stopped` is. */
+    /* Responses overtake records: all of them have arrived once `Stopped` has. */
     ask((uint8_t[]){2, 0}, 2);
     while (!stopped) receive();
     ask((uint8_t[]){3}, 1);

@@ -11,7 +11,7 @@ REPLIES = "Hello Done Opened Status Time Filters Queued Registers Defaults Failu
 REFUSALS = ("Protocol Malformed NoSession Unsupported BadTiming BadId BadDlc BadTag BadEntry BadSlot ChannelOpen ChannelClosed "
             "ListenOnly QueueFull BanksExhausted WouldDisturb TooFarAhead Hardware NothingSaved NotBusOff "
             "NotMeasuring NotGranted Held OtherSettings NoBoard").split()
-NUMBERS = {"Protocol": 1, "QueueFull": 1, "BanksExhausted": 2, "NotGranted": 1}  # numbers behind a refusal
+NUMBERS = {"Protocol": 1, "QueueFull": 1, "BanksExhausted": 2, "NotGranted": 1}  # numbers after a refusal
 STAGES = "controller queue link host".split()
 ERRORS = "stuff form acknowledgment bit-recessive bit-dominant crc".split()
 STATES = "active warning passive bus-off".split()
@@ -120,7 +120,7 @@ class Stream:
         ahead = sequence - self.sequence & 0xFFFFFFFF
         missing = [told - had & 0xFFFFFFFF for told, had in zip(before, self.frames)]
         if max(ahead, *missing) >= 1 << 31:
-            return self.say("out of order")  # an older session's, or a repetition
+            return self.say("out of order")  # from an older session, or a repetition
         if any(missing):
             self.say(f"lost on the link {missing[0]} {missing[1]}")
         self.lost = [lost + more for lost, more in zip(self.lost, missing)]
@@ -185,7 +185,7 @@ class Stream:
             tag, reason = m.number(), m.number()
             text = f"not-sent tag {tag} {FAILURES[reason]}" + (f" {m.number()}" if reason == 5 else "")
         else:
-            raise IndexError  # a record of a newer protocol: nothing behind it can be read
+            raise IndexError  # a record of a newer protocol: nothing after it can be read
         return self.told(f"can{channel + 1} {text}", m, ticks)
 
     def told(self, text, m, ticks):
@@ -199,7 +199,7 @@ class Client:
         self.port = os.open(path, os.O_RDWR | os.O_NOCTTY)  # opening it raises DTR
         tty.setraw(self.port)
         self.stream, self.next_id = Stream(print), 0
-        os.write(self.port, b"\0")  # ends half a request of somebody else's, and chooses this protocol
+        os.write(self.port, b"\0")  # ends another program's unfinished request, and chooses this protocol
 
     def read(self, seconds):
         if select.select([self.port], [], [], seconds)[0]:
@@ -246,7 +246,7 @@ def main(path, bitrate=500_000, seconds=2.0):
     ends = time.monotonic() + float(seconds)
     while time.monotonic() < ends and not client.stream.ended:
         client.read(0.05)
-    # A response overtakes records: all of them are there when `Stopped` is.
+    # Responses overtake records: all of them have arrived once `Stopped` has.
     stopped = []
     said, client.stream.say = client.stream.say, lambda line: (print(line), stopped.append(line.endswith("can1 stopped")))
     client.ask(2, 0)

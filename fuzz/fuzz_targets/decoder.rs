@@ -1,4 +1,4 @@
-//! The wire's decoder against any bytes, in any pieces, as they are and as the contents of messages whose CRC holds: no panic,
+//! The wire's decoder against any bytes, in any pieces, both raw and as the contents of messages with a valid CRC: no panic,
 //! and what is understood does not depend on how the bytes arrive.
 #![no_main]
 
@@ -24,7 +24,7 @@ fuzz_target!(|input: (u8, Vec<&[u8]>, &[u8])| {
     for bytes in stream.chunks(usize::from(piece).max(1)) {
         decoder.push(bytes, |decoded| pieces.push(describe(&decoded)));
     }
-    // Overlong garbage is reported when it becomes too long, so only what was understood is compared.
+    // Overlong garbage is reported at the moment it becomes too long, so only what was understood is compared.
     whole.retain(|line| !line.starts_with("Corrupt"));
     pieces.retain(|line| !line.starts_with("Corrupt"));
     assert_eq!(whole, pieces);

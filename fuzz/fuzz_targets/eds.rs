@@ -1,4 +1,4 @@
-//! Any bytes as a CANopen sheet: each object that is there can be looked up.
+//! Any bytes as a CANopen sheet: every object in it can be looked up.
 
 #![no_main]
 

@@ -1,4 +1,4 @@
-//! Any text as a condition on what frames say, and any frames for it.
+//! Any text as a condition on what frames mean, tried on any frames.
 
 #![no_main]
 

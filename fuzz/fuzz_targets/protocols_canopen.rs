@@ -1,4 +1,4 @@
-//! The whole of CANopen, of four nodes.
+//! The whole of CANopen, with four nodes.
 
 #![no_main]
 

@@ -1,4 +1,4 @@
-//! Transfers of ISO 15765-2 between few identifiers, so that they meet.
+//! Transfers of ISO 15765-2 between few identifiers, so that they collide.
 
 #![no_main]
 

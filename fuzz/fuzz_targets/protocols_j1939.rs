@@ -1,4 +1,4 @@
-//! Groups of J1939, with transport between few addresses.
+//! Parameter groups of J1939, with transport between few addresses.
 
 #![no_main]
 

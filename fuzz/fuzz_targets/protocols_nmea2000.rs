@@ -1,4 +1,4 @@
-//! Groups of NMEA 2000 of few senders.
+//! Parameter groups of NMEA 2000 from few senders.
 
 #![no_main]
 

@@ -1,18 +1,18 @@
-//! What the targets of all trace readers do with their bytes. Seeds: `host/formats/tests/data/nmea2000.log.gz` converted
-//! to the format.
+//! What the targets of all trace readers share. Seeds: `host/formats/tests/data/nmea2000.log.gz` converted to each
+//! format.
 
 use std::io::Cursor;
 
 use cantap_formats::{Format, ReadOptions, TraceReader};
 
-/// Reads a file in every way: no panic, an end, and no more found than the file can hold.
+/// Reads a file in every way: it must not panic, must come to an end, and must find no more than the file can hold.
 pub fn read(format: Format, bytes: &[u8]) {
     let strict = ReadOptions { strict: true, ..ReadOptions::default() };
     let lenient = ReadOptions::default();
     let [strict, lenient] = [strict, lenient]
         .map(|options| TraceReader::from_source("fuzz", Cursor::new(bytes.to_vec()), format, &options).ok());
     let (Some(strict), Some(lenient)) = (strict, lenient) else { return };
-    // The strict reader finds what the other one does, up to and with the first issue.
+    // The strict reader finds what the lenient one does, up to and including the first issue.
     let mut issues = 0_u64;
     let mut lenient = lenient.take(1 << 16);
     for item in strict.take(1 << 16) {

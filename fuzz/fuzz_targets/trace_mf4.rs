@@ -1,4 +1,4 @@
-//! Any bytes as MF4.
+//! Any bytes as MF4 files.
 
 #![no_main]
 

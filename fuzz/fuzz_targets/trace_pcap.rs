@@ -1,4 +1,4 @@
-//! Any bytes as pcap.
+//! Any bytes as pcap files.
 
 #![no_main]
 

@@ -1,4 +1,4 @@
-//! Any text as one of the logs of other programs: the first byte says which.
+//! Any text as the log of another program: the first byte chooses which.
 
 #![no_main]
 

@@ -4,7 +4,7 @@ use cantap_protocols::{Conversations, Event, Options, Protocol};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceRecord};
 use cantap_wire::{Frame, Id};
 
-/// A record of any frame, or of a loss where the data fit into none.
+/// A record of a frame, or of a loss if the data does not fit into a frame.
 pub fn record(time_ns: i64, id: Id, data: &[u8]) -> TraceRecord {
     let frame = Frame::data_frame(id, data).map(Into::into);
     let frame = frame.or_else(|| FdFrame::new(id, false, false, data).map(Into::into));
@@ -20,8 +20,8 @@ pub fn id(number: u32) -> Id {
     if number & 1 == 0 { Id::standard_truncated(number >> 1) } else { Id::extended_truncated(number >> 1) }
 }
 
-/// Has one protocol read frames with these identifiers, and its events written. What comes is of that protocol, and not later than the
-/// last frame but for what was waited for.
+/// Lets one protocol read frames with these identifiers, and formats its events. Every event must be of that protocol, and no later
+/// than the last frame, except for timeouts.
 pub fn read(protocol: Protocol, frames: &[(u32, u16, Vec<u8>)], of: impl Fn(u32) -> Id) {
     let options = Options { protocols: vec![protocol], ..Options::default() };
     let (mut conversations, mut events) = (Conversations::new(&options), Vec::<Event>::new());

@@ -19,7 +19,7 @@ pub fn capture(device: &Device, file: &Path, time: Duration) -> Result<(u64, u64
     }
     let end = Instant::now() + time;
     let mut stopped = false;
-    // After `stop` comes what was captured until then, and `None` behind it.
+    // After `stop` comes whatever was captured until then, and finally `None`.
     while let Some(batch) = records.next_batch(Duration::from_millis(50))? {
         for record in &batch {
             writer.write(record)?;

@@ -1,4 +1,4 @@
-//! Shows the signals of a bus as they come: `cargo run -p cantap --example live_signals [PORT]`.
+//! Shows the signals of a bus as they arrive: `cargo run -p cantap --example live_signals [PORT]`.
 
 mod device;
 
@@ -9,7 +9,7 @@ use cantap_signals::{Decoder, Source, dbc};
 
 const DATABASE: &str = include_str!("data/engine.dbc");
 
-/// Shows this many messages; returns the last one's signals as text.
+/// Shows `messages` messages; returns the signals of the last one as text.
 pub fn show(device: &Device, messages: usize) -> Result<String, Box<dyn Error>> {
     let database = dbc::parse("engine.dbc", DATABASE.as_bytes())?;
     let decoder = Decoder::new(vec![Source { channel: None, database }]);

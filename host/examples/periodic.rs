@@ -1,5 +1,6 @@
-//! Has the device repeat a frame with a counter and a checksum, kept by the device itself:
-//! `cargo run -p cantap --example periodic [PORT]`. It takes part in the bus.
+//! Has the device repeat a frame with a counter and a checksum, which the device itself
+//! keeps up to date: `cargo run -p cantap --example periodic [PORT]`. It takes part in the
+//! bus.
 
 mod device;
 
@@ -10,7 +11,7 @@ use cantap::periodic::{check_modifiers, period_ticks};
 use cantap::wire::message::{Checksum, Modifier, Periodic};
 use cantap::{Channel, Device, Frame};
 
-/// Sends this many frames, 10 ms apart; returns them as they were on the bus.
+/// Sends `count` frames, 10 ms apart; returns them as they were on the bus.
 pub fn repeat(device: &Device, count: u32) -> Result<Vec<Frame>, Box<dyn Error>> {
     let frame: Frame = "123#00A5000000000000".parse()?;
     let modifiers = [

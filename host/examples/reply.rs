@@ -28,7 +28,7 @@ pub fn ask(device: &Device) -> Result<Frame, Box<dyn Error>> {
         match asked_ns {
             None => asked_ns = Some(record.time_ns),
             Some(asked_ns) => {
-                println!("{frame} came {} µs behind the question", (record.time_ns - asked_ns) / 1000);
+                println!("{frame} came {} µs after the question", (record.time_ns - asked_ns) / 1000);
                 return Ok(frame);
             }
         }

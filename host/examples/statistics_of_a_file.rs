@@ -1,17 +1,17 @@
-//! What a trace file amounts to: `cargo run -p cantap --example statistics_of_a_file [FILE] [BITRATE]`.
+//! Summarises a trace file: `cargo run -p cantap --example statistics_of_a_file [FILE] [BITRATE]`.
 
 use std::error::Error;
 
 use cantap_analysis::stats::{Options, Statistics, Summary};
 use cantap_formats::{ReadOptions, open_reader};
 
-/// Reads a file on whose buses this was the bit rate.
+/// Summarises a file recorded on buses of this bit rate.
 pub fn summary(file: &str, bitrate_bps: u32) -> Result<Summary, Box<dyn Error>> {
     let mut statistics = Statistics::new(Options { bitrate_bps: Some(bitrate_bps), ..Options::default() })?;
     for record in open_reader(file, &ReadOptions::default())? {
         match record {
             Ok(record) => statistics.push(&record),
-            // Reading goes on behind it.
+            // Reading continues after a damaged place.
             Err(issue) => eprintln!("{issue}"),
         }
     }

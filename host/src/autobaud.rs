@@ -1,8 +1,9 @@
-//! Finds a bus's bit rate without a word, by measuring it.
+//! Finds the bit rate of a bus by measuring it, without sending anything.
 //!
-//! The device tells the edges of the channel's receive pin while its controller is off the bus. One frame is enough to know the length of a
-//! bit to a thousandth (`measure`), whatever the bit rate; where none is whole, pieces of many give a guess (`rough`). What the clock
-//! reaches of that is `rates`'. The controller then listens at that rate, to confirm it with frames of its own. Nothing is ever driven.
+//! The device reports the edges on the channel's receive pin while its controller is off the bus. One frame is enough to know the length of
+//! a bit to a thousandth (`measure`), whatever the bit rate; if none is whole, pieces of many frames give a guess (`rough`). `rates` picks
+//! the bit rate that the controller's clock can reach. The controller then listens at that rate and confirms it with frames that it
+//! receives itself. Nothing is ever driven.
 
 mod measure;
 mod rates;
@@ -22,39 +23,41 @@ use self::reading::PinEdge;
 use self::rough::estimate;
 use crate::{Device, DeviceError};
 
-/// Frames that the controller has to hear.
+/// Frames that the controller has to receive.
 const GOOD_FRAMES: u32 = 4;
-/// With fewer, an answer is given after this time, so that it is there within a second.
+/// With fewer frames, the answer is given after this time, so that it is there within a second.
 const ANSWER_AFTER: Duration = Duration::from_millis(900);
-/// The controller listens for at least this long if it hears nothing.
+/// The controller listens for at least this long if it receives nothing.
 const LISTEN: Duration = Duration::from_millis(100);
-/// The same where two frames were read bit by bit: they prove the bit rate, so only errors could still contradict it.
+/// The same after two frames were read bit by bit: they prove the bit rate, so only errors could still contradict it.
 const LISTEN_PROVEN: Duration = Duration::from_millis(10);
-/// Errors without a frame between them that say that a measured rate was wrong, or that no frame ends well.
+/// This many errors without a frame between them mean that the measured rate was wrong, or that no frame ends
+/// well.
 const MOST_ERRORS: u32 = 12;
-/// How often it is measured again then.
+/// How often to measure again in that case.
 const ROUNDS: u32 = 3;
-/// How often the device is asked.
+/// How often to ask the device.
 const ASK_EVERY: Duration = Duration::from_millis(2);
-/// A measurement is good enough at this standard error, and else goes on for a while.
+/// A measurement with this standard error is good enough; otherwise measuring continues for a while.
 const GOOD_ERROR: f64 = 0.000_3;
-/// Is what is measured not better after this time, it is taken as it is.
+/// If the measurement has not improved after this time, it is used as it is.
 const BETTER_WITHIN: Duration = Duration::from_millis(150);
-/// After one frame another may follow at once, which makes the measurement sure: a pause of this many bits says that none does.
+/// Another frame may follow the first at once and makes the measurement certain; after a pause of this many bits, none does.
 const PAUSE_BITS: f64 = 30.0;
-/// And of this length, at a high bit rate.
+/// The minimum for that pause, which matters at high bit rates.
 const PAUSE: Duration = Duration::from_millis(5);
-/// How far off a guess may be, as a part of the bit rate: whoever is interrupted sees edges late, and not all of them alike.
+/// How far off a guess may be, as a fraction of the bit rate: interrupts make the device see edges late, and not all of them
+/// equally late.
 const GUESS_ERROR: f64 = 0.004;
-/// Edges that are looked at together: those of half a dozen frames.
+/// Edges evaluated together: those of half a dozen frames.
 const MOST_EDGES: usize = 700;
-/// New edges that are worth a look while there is no pause: those of two frames.
+/// New edges that are worth evaluating while there is no pause: those of two frames.
 const MANY_EDGES: usize = 120;
-/// Where this much was seen for this long and not one frame was whole, a guess must do.
+/// With this many edges seen for [`GUESS_AFTER`] and not one whole frame, a guess has to do.
 const GUESS_EDGES: u64 = 300;
 /// See [`GUESS_EDGES`].
 const GUESS_AFTER: Duration = Duration::from_millis(250);
-/// Without a pause between frames, a look is due after this time.
+/// Without a pause between frames, evaluate after this time.
 const LOOK_EVERY: Duration = Duration::from_millis(40);
 
 /// What the search is doing.
@@ -94,7 +97,7 @@ pub enum Outcome {
     Stuck,
     /// Something happened, but nothing of it was a whole frame.
     Unreadable {
-        /// Changes of the level.
+        /// Level changes.
         edges: u64,
     },
     /// No rate that the controller's clock reaches is near enough to receive every frame.
@@ -104,25 +107,25 @@ pub enum Outcome {
         /// The nearest that the clock reaches, in bit/s.
         nearest_bps: Option<u32>,
     },
-    /// The bits were measured, and then no good frame came.
+    /// The bits were measured, but then no good frame was received.
     Unconfirmed {
         /// In bit/s, as the controller has it.
         bitrate_bps: u32,
         /// What was measured, in bit/s.
         measured_bps: f64,
-        /// Whether anybody acknowledged what was measured; true if no frame was whole.
+        /// Whether anybody acknowledged the measured frames; true if no frame was whole.
         acknowledged: bool,
-        /// Errors that the controller saw.
+        /// Errors that the controller counted.
         errors: u32,
     },
-    /// It was asked to stop.
+    /// The caller asked to stop.
     Stopped,
 }
 
-/// How long to look, by the device's clock.
+/// How long to search, by the device's clock.
 #[derive(Clone, Copy, Debug)]
 pub struct Limits {
-    /// Without anything new.
+    /// Give up after this long without anything new.
     pub silence: Duration,
 }
 
@@ -141,15 +144,15 @@ struct Search<'a> {
     /// The device's time at the beginning, and when something was last heard.
     began: u64,
     heard: u64,
-    /// Changes of the level altogether.
+    /// Level changes in total.
     seen: u64,
-    /// The last of them, and the time of the very last, in ticks since the measurement began.
+    /// The latest edges, and the time of the very last one, in ticks since the measurement began.
     edges: Vec<PinEdge>,
     at: f64,
 }
 
-/// Finds the bit rate of a channel's bus. `progress` is called again and again, and ends the search by returning false. The channel has to
-/// be closed, and is so afterwards.
+/// Finds the bit rate of a channel's bus. `progress` is called repeatedly and ends the search by returning false. The channel must be
+/// closed, and is closed afterwards.
 pub fn search(
     device: &Device,
     channel: Channel,
@@ -169,15 +172,15 @@ pub fn search(
         at: 0.0,
     };
     let outcome = search.run();
-    // Also where the search was given up in the middle.
+    // Also when the search was abandoned half-way.
     let ended = device.measure_edges(None);
     let outcome = outcome?;
     ended.map(|()| outcome)
 }
 
-/// What one measurement came to.
+/// The result of one measurement.
 enum Heard {
-    /// Of frames, or of none where it is a guess.
+    /// Frames, or a guess that has none.
     Frames(Measured),
     /// The search is over.
     Over(Outcome),
@@ -186,7 +189,8 @@ enum Heard {
 impl Search<'_> {
     fn run(&mut self) -> Result<Outcome, DeviceError> {
         let mut rounds = 0;
-        // That the clock does not reach a rate is said of two frames, and a contradiction measured again.
+        // Before saying that the clock does not reach a rate, read two frames; after a contradiction, measure
+        // again.
         let mut wanted = 1;
         let mut goes_on = false;
         loop {
@@ -206,7 +210,7 @@ impl Search<'_> {
                     (wanted, goes_on) = (2, true);
                     continue;
                 }
-                // What is no better known than this is not said to be beyond reach.
+                // A guess is not certain enough to call a rate out of reach.
                 Reached::Not { .. } if is_guess => return Ok(Outcome::Unreadable { edges: self.seen }),
                 Reached::Not { nearest_bps } => {
                     return Ok(Outcome::Unreachable { measured_bps, nearest_bps });
@@ -225,7 +229,7 @@ impl Search<'_> {
         (time.as_secs_f64() * f64::from(self.device.hello().tick_hz)) as u64
     }
 
-    /// Begins to measure, with nothing measured.
+    /// Starts a measurement from scratch.
     fn begin(&mut self) -> Result<(), DeviceError> {
         self.device.measure_edges(Some(self.channel))?;
         self.edges.clear();
@@ -233,15 +237,17 @@ impl Search<'_> {
         Ok(())
     }
 
-    /// Measures until this many frames were read, or nothing new comes. What was read since the measurement began counts.
+    /// Measures until this many frames were read, or nothing new arrives. Everything read since the measurement began
+    /// counts.
     fn measure(&mut self, wanted: u32) -> Result<Heard, DeviceError> {
         let tick_hz = f64::from(self.device.hello().tick_hz);
-        // A little beyond what a device opens, so that a rate out there is named and not taken for another.
+        // Slightly wider than what a device can open, so that a rate beyond it is named rather than mistaken
+        // for another.
         let [least, most] = [MAX_BITRATE_BPS, MIN_BITRATE_BPS].map(|bps| tick_hz / f64::from(bps));
         let (mut unread, mut looked) = (0, self.began);
         let begun = self.device.time()?;
         let guess_at = begun + self.ticks(GUESS_AFTER);
-        // When the first frame was read, and what all of them tell.
+        // When the first frame was read, and the result of all frames so far.
         let mut found = measure(&self.edges, least, most).map(|measured| (begun, measured));
         loop {
             let told = self.device.edges()?;
@@ -292,7 +298,7 @@ impl Search<'_> {
         }
     }
 
-    /// Whether it is time to give up, and with what.
+    /// Whether it is time to give up, and with which outcome.
     fn is_over(&self, told: &Edges, has_frames: bool) -> Option<Outcome> {
         let limit = self.ticks(self.limits.silence);
         let quiet = told.ticks.saturating_sub(self.heard) > limit;
@@ -305,7 +311,7 @@ impl Search<'_> {
         }
     }
 
-    /// Lets the controller listen at a rate that was measured.
+    /// Lets the controller listen at a measured rate.
     fn confirm(
         &mut self,
         bitrate_bps: u32,
@@ -331,7 +337,7 @@ impl Search<'_> {
         frames_before: u32,
         errors_before: u32,
     ) -> Result<Outcome, DeviceError> {
-        // The device's time, not ours: an emulated one may be slower.
+        // The device's time, not the host's: an emulated device may run slower.
         let opened = self.device.time()?;
         let is_proven = measured.frames > 1 && measured.acknowledged > 0;
         let listen = if is_proven { LISTEN_PROVEN } else { LISTEN };
@@ -342,7 +348,8 @@ impl Search<'_> {
             let now = status.channels[self.channel.index()];
             let frames = now.frames.wrapping_sub(frames_before);
             let errors = now.bus_errors.wrapping_sub(errors_before);
-            // A frame that the controller took, or two that were read bit by bit and nothing that speaks against them.
+            // One frame that the controller received, or two that were read bit by bit with nothing to contradict
+            // them.
             let is_enough = frames > 0 || is_proven && errors == 0;
             if frames >= GOOD_FRAMES || is_enough && status.ticks >= answer_at {
                 let frames = frames + measured.frames;

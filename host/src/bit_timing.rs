@@ -1,6 +1,7 @@
-//! Bit timing as users give it and judge it: parsing, choosing, and what each choice is worth on a real bus.
+//! Bit timing as users give it and judge it: parsing it, choosing one, and what each choice is worth on a
+//! real bus.
 //!
-//! The arithmetic of dividers is [`BitTiming`]'s; here is what needs fractions.
+//! The integer arithmetic of dividers is in [`BitTiming`]; this module has what needs fractions.
 //!
 //! bxCAN programs propagation and phase segment 1 as one ("segment 1"), so how much of it absorbs delay is up to the
 //! bus. All figures here take phase segment 1 as long as the jump width, the least that resynchronisation
@@ -24,24 +25,24 @@ pub const NODE_DELAY_NS: f64 = 150.0;
 /// Delay of the line that the cable lengths assume, in ns per metre.
 pub const LINE_DELAY_NS_PER_M: f64 = 5.0;
 
-/// Why no timing comes of what was asked for.
+/// Why a request cannot be turned into a timing.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum TimingError {
     /// The bit rate cannot be reached.
     #[error("{}", no_timing(*bitrate_bps, reason))]
     BitRate {
-        /// What was asked for, in bit/s.
+        /// The requested rate, in bit/s.
         bitrate_bps: u32,
-        /// Why not, and what is near.
+        /// Why not, and which rates are near.
         reason: NoTiming,
     },
     /// Only timings with a shorter phase segment 2 reach this bit rate.
     #[error("no timing of {bitrate_bps} bit/s allows a jump width of {sjw} quanta")]
     JumpWidth {
-        /// What was asked for, in bit/s.
+        /// The requested rate, in bit/s.
         bitrate_bps: u32,
-        /// What was asked for, in quanta.
+        /// The requested jump width, in quanta.
         sjw: u8,
     },
     /// Segments outside the controller's registers.
@@ -68,7 +69,7 @@ pub enum TimingError {
     TripleSampling,
 }
 
-/// Which part of a timing makes it invalid.
+/// Says which part of a timing makes it invalid.
 fn out_of_range(timing: BitTiming) -> &'static str {
     if !(1..=1024).contains(&timing.prescaler) {
         "the prescaler"
@@ -84,21 +85,21 @@ fn out_of_range(timing: BitTiming) -> &'static str {
 /// How a user gives a bit timing.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum TimingRequest {
-    /// By bit rate, and wishes.
+    /// By bit rate, with optional wishes.
     Rate {
         /// In bit/s.
         bitrate_bps: u32,
-        /// In per cent of the bit; CiA's recommendation if there is none.
+        /// In per cent of the bit; `None` for CiA's recommendation.
         sample_point_percent: Option<f64>,
-        /// Jump width in quanta; an eighth of the bit, at least one, if there is none.
+        /// Jump width in quanta; `None` for an eighth of the bit, at least one.
         sjw: Option<u8>,
     },
-    /// As it is.
+    /// Used as it is.
     Exact(BitTiming),
 }
 
 impl TimingRequest {
-    /// The timing that a CAN clock makes of it.
+    /// Computes the timing for a CAN clock.
     pub fn resolve(&self, clock_hz: u32) -> Result<BitTiming, TimingError> {
         match *self {
             Self::Rate { bitrate_bps, sample_point_percent, sjw } => {
@@ -129,7 +130,7 @@ impl TimingRequest {
     }
 }
 
-/// Reads `BRP,SEG1,SEG2,SJW`, in quanta as one counts them, not as registers hold them.
+/// Reads `BRP,SEG1,SEG2,SJW`, in quanta as people count them, not as registers hold them.
 pub fn parse_segments(text: &str) -> Result<BitTiming, TimingError> {
     let numbers: Vec<u16> = text
         .split(',')
@@ -138,7 +139,7 @@ pub fn parse_segments(text: &str) -> Result<BitTiming, TimingError> {
     let [prescaler, segment1, segment2, jump_width] = numbers[..] else {
         return Err(TimingError::NotSegments);
     };
-    // What does not fit is out of range anyhow.
+    // What does not fit in a byte is out of range anyway.
     let narrow = |value: u16| u8::try_from(value).unwrap_or(u8::MAX);
     let timing = BitTiming {
         prescaler,
@@ -191,7 +192,7 @@ pub struct Assessment {
     pub max_jump_width: u8,
     /// How far each node's clock may be off, in per cent.
     pub oscillator_tolerance_percent: f64,
-    /// Longest cable between two nodes, in m; 0 if the delays of the nodes alone are too much.
+    /// Longest cable between two nodes, in m; 0 if the nodes' delays alone are too long.
     pub cable_m: f64,
 }
 
@@ -224,14 +225,14 @@ impl Assessment {
         (self.bitrate_bps / f64::from(bitrate_bps) - 1.0) * 1e6
     }
 
-    /// The bit, drawn: a cell per quantum and a mark at the sample point.
+    /// A drawing of the bit: a cell per quantum and a mark at the sample point.
     pub const fn drawing(&self) -> Drawing<'_> {
         Drawing(self)
     }
 }
 
 /// Every timing of a bit rate, assessed. The jump width is `sjw` where the segments allow it, otherwise the widest
-/// that they do; without, an eighth of the bit, as the chosen one has it.
+/// that they do. Without `sjw`, it is an eighth of the bit, as in the timing that is chosen by default.
 pub fn all(clock_hz: u32, bitrate_bps: u32, sjw: Option<u8>) -> Vec<Assessment> {
     BitTiming::all(clock_hz, bitrate_bps)
         .map(|timing| {
@@ -303,7 +304,7 @@ mod tests {
     fn wishes_are_kept_or_refused() {
         let timing = rate(500_000, Some(80.0), Some(2)).resolve(CLOCK).unwrap();
         assert!(timing.jump_width == 2 && timing.sample_point_permille().abs_diff(800) < 40, "{timing:?}");
-        // The recommended one has no room for it, another has.
+        // The recommended timing has no room for it; another one has.
         let timing = rate(500_000, None, Some(2)).resolve(CLOCK).unwrap();
         assert!(timing.segment2 >= 2 && timing.bitrate_bps(CLOCK) == 500_000, "{timing:?}");
         let error = rate(999_999, None, None).resolve(CLOCK).unwrap_err().to_string();

@@ -1,7 +1,8 @@
-//! candump's filters in the device's hardware: what it can express saves bandwidth, the rest is left to the host.
+//! candump's filters in the device's hardware: whatever it can express saves bandwidth, the rest is left to the
+//! host.
 //!
-//! The hardware never drops what the filters accept. Where it lets more pass, [`Remainder`] says why, and
-//! the host still has to hold the records against the filters.
+//! The hardware never drops anything that the filters accept. If it lets more pass, [`Remainder`] says why,
+//! and the host still has to apply the filters to the records.
 
 use cantap_wire::message::{Filter as HardwareFilter, FrameKind, MAX_FILTERS};
 use cantap_wire::{Channel, Id, Refusal};
@@ -16,21 +17,21 @@ pub enum Remainder {
     /// `ID~MASK`.
     #[error("the hardware has no inverse filters (~), so the computer sorts out what they exclude")]
     Inverse,
-    /// The filters accept no frame of this channel, and a controller cannot receive nothing.
+    /// The filters accept no frame of this channel, but a controller cannot be set to receive nothing.
     #[error("the filters accept no frame of this channel, so the computer drops them all")]
     Nothing,
-    /// More than a request holds.
+    /// More than fit in a request.
     #[error(
         "there are more filters than the device takes ({MAX_FILTERS}; each counts twice, for standard and for extended \
          frames, unless its mask names one kind, as 123:C00007FF does), so the computer does the filtering"
     )]
     TooMany,
-    /// More than the hardware holds.
+    /// More than fit in the hardware.
     #[error("the filters need {needed} hardware banks of {available}, so the computer does the filtering")]
     Banks {
-        /// Needed.
+        /// Banks needed.
         needed: u8,
-        /// There.
+        /// Banks that there are.
         available: u8,
     },
     /// The other channel is open.
@@ -38,12 +39,12 @@ pub enum Remainder {
     OtherOpen,
 }
 
-/// Filters as far as hardware can express them.
+/// Filters, as far as the hardware can express them.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Compiled {
-    /// For the device; none means that it receives everything.
+    /// For the device; if empty, it receives everything.
     pub hardware: Vec<HardwareFilter>,
-    /// What is left to the host, if anything is.
+    /// What is left to the host, if anything.
     pub remainder: Option<Remainder>,
 }
 
@@ -53,7 +54,7 @@ impl Compiled {
     }
 }
 
-/// Compiles filters, of which any one accepts a frame, for one channel.
+/// Compiles filters for one channel. A frame is accepted if any one of them accepts it.
 pub fn compile(filters: &[Filter], channel: Channel) -> Compiled {
     let ours = |filter: &&Filter| filter.channel.is_none_or(|number| number == channel.number());
     let mut hardware = Vec::new();
@@ -95,7 +96,8 @@ pub fn compile(filters: &[Filter], channel: Channel) -> Compiled {
     }
 }
 
-/// Compiles filters and gives them to a closed channel. If the device has no room for them it receives everything.
+/// Compiles filters and gives them to a closed channel. If the device has no room for them, it receives
+/// everything.
 pub fn apply(device: &Device, channel: Channel, filters: &[Filter]) -> Result<Compiled, DeviceError> {
     let compiled = compile(filters, channel);
     let remainder = match device.set_filters(channel, &compiled.hardware) {
@@ -133,7 +135,7 @@ fn alternatives(element: &IdFilter) -> Vec<HardwareFilter> {
     found
 }
 
-/// The filter that accepts what both accept, if there is such a frame.
+/// The filter that accepts what both accept, if such a frame exists.
 fn both(a: &HardwareFilter, b: &HardwareFilter) -> Option<HardwareFilter> {
     let kind = match (a.kind, b.kind) {
         (FrameKind::Any, kind) | (kind, FrameKind::Any) => kind,
@@ -168,7 +170,7 @@ mod tests {
         let filter =
             HardwareFilter { extended: false, kind: FrameKind::Data, id: 0x123, mask: Id::MAX_STANDARD };
         assert_eq!(compiled("can0,123:C00007FF"), Compiled { hardware: vec![filter], remainder: None });
-        // Without, a 29-bit frame with these low bits passes too.
+        // Without the format, a 29-bit frame with these low bits passes too.
         assert_eq!(compiled("can0,123:7FF").hardware.len(), 2);
     }
 
@@ -179,7 +181,7 @@ mod tests {
         assert_eq!(compiled("can0,100:C00007FF,200:C00007FF,j").remainder, Some(Remainder::Nothing));
         let many: Vec<String> = (0..60).map(|id| format!("{id:03X}:C00007FF")).collect();
         assert_eq!(compiled(&many.join(",")).remainder, Some(Remainder::TooMany));
-        // Half as many are too many where they do not name their format, and the sentence says why.
+        // If they do not name their format, half as many are too many, and the message says why.
         let both_kinds = |count| {
             let ids: Vec<String> = (0..count).map(|id| format!("{id:03X}:7FF")).collect();
             compiled(&ids.join(","))

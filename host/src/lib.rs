@@ -1,9 +1,10 @@
 #![doc = include_str!("../README.md")]
 //!
-//! [`Device`] is where everything begins. It speaks through a [`device::Link`], a byte stream that a serial port makes, or a
-//! device without a board. [`transmit`] sends many frames and accounts for each, [`replay`] sends them at a trace's own times,
-//! [`periodic`] checks what the device is to repeat, [`hw_filter`] has it drop what is not wanted, [`autobaud`] finds a bus's
-//! bit rate by listening, [`recovery`] brings it back from bus-off, and [`unsent`] says why something was not sent.
+//! [`Device`] is the starting point. It talks through a [`device::Link`], a byte stream made by a serial port or by a device
+//! without a board. [`transmit`] sends many frames and accounts for each, [`replay`] sends them with a trace's own timing,
+//! [`periodic`] checks what the device is asked to repeat, [`hw_filter`] has it drop unwanted frames, [`autobaud`] finds a
+//! bus's bit rate by listening, [`recovery`] brings a channel back from bus-off, and [`unsent`] says why something was not
+//! sent.
 
 #![forbid(unsafe_code)]
 

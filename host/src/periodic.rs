@@ -1,4 +1,5 @@
-//! Periodic frames, checked before a device is asked: it refuses a wrong one as a whole, and this says what is wrong with it.
+//! Checks periodic frames before they are sent to a device: the device only refuses a wrong one, this module says what is
+//! wrong with it.
 
 use std::time::Duration;
 
@@ -7,7 +8,7 @@ use cantap_wire::message::Modifier;
 
 /// Shortest period that a device takes, in µs: no frame is shorter (docs/wire-protocol.md, "Periodic").
 pub const SHORTEST_PERIOD_US: u64 = 47;
-/// As a duration.
+/// The same as a duration.
 pub const SHORTEST_PERIOD: Duration = Duration::from_micros(SHORTEST_PERIOD_US);
 
 /// Why a frame cannot be sent periodically as it is.
@@ -19,15 +20,15 @@ pub enum BadPeriodic {
         "a period of {period:?} is too short: no frame is shorter than {SHORTEST_PERIOD:?}; give at least that"
     )]
     TooShort {
-        /// What was asked for.
+        /// The requested period.
         period: Duration,
     },
-    /// The device's counter of ticks does not hold it.
+    /// It exceeds the device's tick counter.
     #[error("a period of {period:?} is too long; give at most {longest:?}")]
     TooLong {
-        /// What was asked for.
+        /// The requested period.
         period: Duration,
-        /// What the device takes.
+        /// The longest that the device accepts.
         longest: Duration,
     },
     /// A modifier changes a byte that the frame does not have.
@@ -37,15 +38,15 @@ pub enum BadPeriodic {
         byte: u8,
         /// The frame.
         frame: Frame,
-        /// Its bytes.
+        /// Its length in bytes.
         len: usize,
     },
     /// A counter's bits do not fit a byte.
     #[error("a counter of {bits} bits from bit {low_bit} does not fit a byte; its bits are 0 to 7")]
     OutsideByte {
-        /// Lowest bit.
+        /// The counter's lowest bit.
         low_bit: u8,
-        /// Width.
+        /// Its width in bits.
         bits: u8,
     },
 }
@@ -63,7 +64,7 @@ pub fn period_ticks(period: Duration, tick_hz: u32) -> Result<u32, BadPeriodic> 
     Ok(ticks as u32)
 }
 
-/// Whether modifiers can change a frame.
+/// Checks whether modifiers can change a frame.
 pub fn check_modifiers(frame: &Frame, modifiers: &[Modifier]) -> Result<(), BadPeriodic> {
     let len = frame.data_len();
     for modifier in modifiers {

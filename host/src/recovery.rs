@@ -1,7 +1,7 @@
-//! Brings channels back on the bus some time after they went bus-off, where their configuration leaves that to the host.
+//! Brings channels back on the bus some time after they went bus-off, if their configuration leaves that to the host.
 //!
-//! It is what `restart-ms` is to SocketCAN: longer than the controller's own recovery (128 times 11 recessive bits), so that
-//! a broken node does not come back every few milliseconds.
+//! It corresponds to SocketCAN's `restart-ms`: it takes longer than the controller's own recovery (128 times 11 recessive
+//! bits), so that a broken node does not come back every few milliseconds.
 
 use std::time::{Duration, Instant};
 
@@ -10,23 +10,23 @@ use cantap_wire::{CHANNELS, Channel, Refusal};
 
 use crate::{Device, DeviceError};
 
-/// How often the device is asked.
+/// How often to ask the device.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
-/// A channel that was asked to come back is there after 128 times 11 recessive bits, 0.3 s at 5 kbit/s on a quiet bus. One that is
-/// bus-off still, or again, after this long is asked once more.
+/// A channel that was asked to come back does so after 128 times 11 recessive bits, 0.3 s at 5 kbit/s on a quiet bus. If it is
+/// still bus-off after this long, or again, it is asked once more.
 const COMES_WITHIN: Duration = Duration::from_secs(1);
 
 /// A channel that is bus-off.
 #[derive(Clone, Copy, Debug)]
 enum Off {
-    /// Left alone, since then.
+    /// Left alone since this moment.
     Since(Instant),
-    /// Told to come back, then.
+    /// Asked to come back at this moment.
     Told(Instant),
 }
 
-/// Looks after channels that are open with manual recovery.
+/// Looks after open channels with manual recovery.
 #[derive(Clone, Debug)]
 pub struct Recovery {
     after: Duration,
@@ -40,18 +40,19 @@ impl Recovery {
         Self { after, off: [None; CHANNELS], look_at: Instant::now() }
     }
 
-    /// Looks the next time, however soon that is: there is a sign that a channel went off.
+    /// Asks the device on the next call, however soon that is: something suggests that a channel went
+    /// bus-off.
     pub fn hurry(&mut self) {
         self.look_at = Instant::now();
     }
 
-    /// Whether a channel is bus-off and will be brought back; what is sent on it meanwhile fails.
+    /// Whether a channel is bus-off and will be brought back; frames sent on it in the meantime fail.
     pub fn is_waiting(&self) -> bool {
         self.off.iter().any(Option::is_some)
     }
 
-    /// To be called again and again: asks the device now and then, and recovers what has been off for long enough.
-    /// Returns the channels that are back.
+    /// Call this repeatedly: it asks the device now and then, and recovers channels that have been off for long
+    /// enough. Returns the channels that are back.
     pub fn look(&mut self, device: &Device) -> Result<Vec<Channel>, DeviceError> {
         let now = Instant::now();
         let mut recovered = Vec::new();

@@ -1,8 +1,8 @@
-//! Plays a trace on a bus at its own times, kept by the device's clock.
+//! Plays a trace on a bus with its original timing, kept by the device's clock.
 //!
-//! A trace's time is a frame's end; the device needs to know when to begin. So each frame's exact length is taken off, and the
-//! frames end as far apart as in the trace, whatever their lengths. The host streams ahead of time as much as
-//! the device's queue holds; its own delays do not show on the bus.
+//! A time in a trace is the end of a frame, but the device needs to know when to begin. So each frame's exact length is
+//! subtracted, and the frames end as far apart as in the trace, whatever their lengths. The host streams as far ahead as the
+//! device's queue allows; its own delays do not show on the bus.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -16,9 +16,9 @@ use cantap_trace::bits::{FrameBits, INTERMISSION_BITS};
 
 /// From now to the first frame: time to fill the device's queue.
 const LEAD: Duration = Duration::from_millis(100);
-/// Frames due later than this wait in the host: a device takes none that is more than a day ahead.
+/// Frames due later than this wait in the host: a device refuses those more than a day ahead.
 const MOST_AHEAD: Duration = Duration::from_hours(1);
-/// How often to check whether to go on.
+/// How often to check whether to continue.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// How to change the trace's times.
@@ -26,13 +26,13 @@ const LOOK_EVERY: Duration = Duration::from_millis(20);
 pub struct Pace {
     /// 2 plays twice as fast, 0.5 at half the speed.
     pub speed: f64,
-    /// Longer pauses are skipped: the next frame follows at once.
+    /// Longer pauses are skipped: the next frame follows immediately.
     pub longest_gap: Option<Duration>,
-    /// Bursts begin at least this long after each other, on all channels together.
+    /// Bursts begin at least this far apart, across all channels.
     pub shortest_gap: Duration,
-    /// Frames of a burst, from 1: those after its first wait for nothing but the trace's own times.
+    /// Frames in a burst, from 1: those after the first wait only for the trace's own times.
     pub burst: u32,
-    /// As fast as the bus takes them.
+    /// As fast as the bus accepts frames.
     pub ignore_times: bool,
 }
 
@@ -42,7 +42,7 @@ impl Default for Pace {
     }
 }
 
-/// Turns times of a trace into times of the device.
+/// Converts times in a trace to times of the device.
 #[derive(Clone, Debug)]
 pub struct Timetable {
     pace: Pace,
@@ -51,7 +51,7 @@ pub struct Timetable {
     first_ticks: u64,
     /// Begin of the last frame in the trace and in the replay, in ns since the first.
     last: Option<(i64, f64)>,
-    /// Begin of the burst under way, in ns since the first, and its frames so far.
+    /// Begin of the current burst, in ns since the first frame, and the number of its frames so far.
     burst: (f64, u32),
 }
 
@@ -74,13 +74,13 @@ impl Timetable {
         f64::from(bits) * 1e9 / f64::from(self.bitrates_bps[channel.index()].max(1))
     }
 
-    /// When a frame that ended at `end_ns` in the trace begins, and when it will end, in ticks. A begin before the device's
-    /// start is 0, an end before it wraps.
+    /// When a frame that ended at `end_ns` in the trace should begin, and when it will end, in ticks. A beginning before
+    /// the device's start becomes 0; an end before it wraps.
     pub fn next(&mut self, end_ns: i64, channel: Channel, frame: &Frame) -> (u64, u64) {
         let length_ns = self.length_ns(channel, frame);
         let begin_ns = end_ns - length_ns.round() as i64;
         let at_ns = self.last.map_or(0.0, |(last_ns, last_at_ns)| {
-            // Negative where the other channel's shorter frame ended first.
+            // Negative if the other channel's shorter frame ended first.
             let mut gap_ns = (begin_ns - last_ns) as f64;
             if self.pace.longest_gap.is_some_and(|longest| gap_ns > longest.as_nanos() as f64) {
                 gap_ns = 0.0;
@@ -97,36 +97,37 @@ impl Timetable {
         self.burst =
             if frames == 0 || frames >= self.pace.burst { (at_ns, 1) } else { (burst_at_ns, frames + 1) };
         self.last = Some((begin_ns, at_ns));
-        // Whole ticks first: a float does not hold a long uptime's nanoseconds.
+        // Whole ticks first: a float cannot hold the nanoseconds of a long uptime.
         let ticks = |ns: f64| (ns / self.tick_ns).round() as i64;
-        // A trace out of order may plan an end before the device's start: lateness counts from there, too.
+        // In a trace out of order, an end may be planned before the device's start: lateness counts from
+        // there, too.
         let end = self.first_ticks.wrapping_add_signed(ticks(at_ns + length_ns));
         (self.first_ticks.saturating_add_signed(ticks(at_ns)), end)
     }
 }
 
-/// How well a replay kept its times.
+/// How accurately a replay kept its times.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Accuracy {
     /// Frames compared.
     pub frames: u64,
-    /// How much earlier than planned a frame ended, at most, against the first one, in µs.
+    /// How much earlier than planned a frame ended, at most, relative to the first one, in µs.
     pub early_us: f64,
-    /// How much later, at most, in µs. A bus that was busy makes frames late.
+    /// How much later, at most, in µs. A busy bus delays frames.
     pub late_us: f64,
 }
 
-/// A replay under way.
+/// A replay in progress.
 pub struct Replay<'d> {
     device: &'d Device,
     stream: Stream<'d>,
-    /// Later frames wait here until they are nearer.
+    /// Frames later than this wait until they are nearer.
     horizon_ticks: u64,
     timetable: Timetable,
     tick_hz: u32,
-    /// Planned ends of what is under way, per channel.
+    /// Planned ends of frames in progress, per channel.
     planned: [VecDeque<(u32, u64)>; CHANNELS],
-    /// Lateness of the first frame, in ticks, which all others are compared with.
+    /// Lateness of the first frame, in ticks; all others are compared with it.
     first_late: Option<i64>,
     accuracy: Accuracy,
 }
@@ -149,8 +150,8 @@ impl<'d> Replay<'d> {
         })
     }
 
-    /// Adds the trace's next frame. Waits while the device's queue is full or the frame's time too far ahead; returns false if
-    /// `go_on` said no meanwhile.
+    /// Adds the trace's next frame. Waits while the device's queue is full or the frame is due too far ahead; returns false if
+    /// `go_on` returned false meanwhile.
     pub fn push(
         &mut self,
         end_ns: i64,
@@ -163,7 +164,7 @@ impl<'d> Replay<'d> {
         let at = (!ignore_times).then_some(begin);
         let horizon = MOST_AHEAD.as_secs() * u64::from(self.tick_hz);
         if !ignore_times && begin > self.horizon_ticks {
-            // Nothing may stay here meanwhile.
+            // Nothing may be left here while waiting.
             self.stream.flush()?;
             loop {
                 self.horizon_ticks = self.device.time()? + horizon;
@@ -199,12 +200,12 @@ impl<'d> Replay<'d> {
         self.stream.flush()
     }
 
-    /// Waits for the next end of a transmission, at most this long.
+    /// Waits for the next transmission to end, at most this long.
     pub fn wait(&mut self, at_most: Duration) -> Result<(), DeviceError> {
         self.stream.wait(at_most)
     }
 
-    /// Frames handed over that have not ended.
+    /// Number of frames handed over that have not ended.
     pub fn under_way(&self) -> usize {
         self.stream.under_way()
     }
@@ -219,7 +220,7 @@ impl<'d> Replay<'d> {
         let ended = self.stream.take_ended();
         for end in &ended {
             let planned = &mut self.planned[end.channel.index()];
-            // What failed was not at its time; what was sent is found in order.
+            // A failed frame was not sent at its time; the sent ones are found in order.
             while let Some((tag, at)) = planned.pop_front() {
                 if tag == end.tag {
                     if end.result.is_ok() {
@@ -233,7 +234,7 @@ impl<'d> Replay<'d> {
     }
 
     fn compare(&mut self, ticks: u64, planned: u64) {
-        // Either may be the greater one; a planned end may lie before zero.
+        // Either may be the greater; a planned end may lie before zero.
         let late = ticks.wrapping_sub(planned) as i64;
         let first = *self.first_late.get_or_insert(late);
         let off_us = (late - first) as f64 * 1e6 / f64::from(self.tick_hz);
@@ -242,7 +243,7 @@ impl<'d> Replay<'d> {
         self.accuracy.early_us = self.accuracy.early_us.max(-off_us);
     }
 
-    /// How well the times were kept so far.
+    /// How accurately the times have been kept so far.
     pub const fn accuracy(&self) -> Accuracy {
         self.accuracy
     }
@@ -285,11 +286,11 @@ mod tests {
         assert_eq!(begins(Pace { longest_gap, ..Pace::default() }), [0, 12_000, 12_000]);
         let shortest_gap = Duration::from_millis(5);
         assert_eq!(begins(Pace { shortest_gap, ..Pace::default() }), [0, 60_000, 180_000]);
-        // The second belongs to the first one's burst; the third is late by itself.
+        // The second belongs to the first one's burst; the third is late anyway.
         assert_eq!(begins(Pace { shortest_gap, burst: 2, ..Pace::default() }), [0, 12_000, 132_000]);
     }
 
-    /// The device may have started a moment ago: what was planned long before that is late by all of it.
+    /// The device may have just started: a frame planned long before that is late by the whole difference.
     #[test]
     fn an_end_planned_before_the_devices_start_is_not_clipped() {
         let mut table = table(Pace::default());

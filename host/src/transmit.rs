@@ -1,8 +1,9 @@
-//! Sends frames in a stream: many under way at once, never more than the device's queue holds, each accounted for.
+//! Sends frames in a stream: many in flight at once, never more than fit in the device's queue, each accounted
+//! for.
 //!
-//! A request carries up to 20 frames and its answer takes a USB round trip, so several requests are under way at a time. What
-//! is not confirmed yet is counted, and no more is sent than fits the device's queue: it never refuses, so
-//! the order is kept.
+//! A request carries up to 20 frames and its answer takes a USB round trip, so several requests are in flight at a time.
+//! Unconfirmed frames are counted, and no more are sent than fit in the device's queue: it never refuses any, so the order is
+//! kept.
 
 use std::collections::VecDeque;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
@@ -14,24 +15,25 @@ use cantap_wire::{CHANNELS, Channel, Command, Frame};
 use crate::device::{Pending, Transmission};
 use crate::{Device, DeviceError};
 
-/// Requests under way: with 20 frames each, more than both buses take in a USB round trip.
+/// Requests in flight: with 20 frames each, more than both buses can send in a USB round trip.
 const REQUESTS: usize = 6;
-/// How long to wait for a confirmation before looking whether to go on.
+/// How often to check whether to continue while waiting for a confirmation.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
-/// Tags wrap here, far below the device's own and far above what is under way.
+/// Tags wrap here, far below the device's own tags and far above the number in flight.
 const TAGS: u32 = 1 << 24;
 
 #[derive(Default)]
 struct Lane {
     batch: heapless::Vec<TxFrame, MAX_SEND>,
-    /// Tag and due time (0: at once) of what has not ended, in order, the batch's frames included.
+    /// Tag and due time (0: immediately) of frames that have not ended, in order, including those in the
+    /// batch.
     waiting: VecDeque<(u32, u64)>,
     next_tag: u32,
 }
 
 impl Lane {
     fn end(&mut self, tag: u32) {
-        // Nearly always the first; what is given up may end out of order.
+        // Nearly always the first one, but frames that were given up may end out of order.
         if let Some(at) = self.waiting.iter().position(|(waiting, _)| *waiting == tag) {
             self.waiting.remove(at);
         }
@@ -44,12 +46,12 @@ pub struct Stream<'d> {
     confirmations: Receiver<Transmission>,
     lanes: [Lane; CHANNELS],
     requests: VecDeque<Pending<'d>>,
-    /// Ends, in the device's order, for [`Self::take_ended`].
+    /// Ended transmissions, in the device's order, for [`Self::take_ended`].
     ended: Vec<Transmission>,
 }
 
 impl<'d> Stream<'d> {
-    /// A stream to a device whose channels are open; it takes the device's confirmations over.
+    /// A stream to a device whose channels are open; it takes over the device's confirmations.
     pub fn new(device: &'d Device) -> Self {
         Self {
             device,
@@ -60,8 +62,8 @@ impl<'d> Stream<'d> {
         }
     }
 
-    /// Adds a frame, to be sent not before a device time. Waits while the device's queue is full, and returns
-    /// nothing if `go_on` said no meanwhile. Returns the tag that its confirmation will bear.
+    /// Adds a frame, to be sent no earlier than a device time. Waits while the device's queue is full, and
+    /// returns `None` if `go_on` returned false meanwhile. Otherwise returns the tag of its confirmation.
     pub fn push(
         &mut self,
         channel: Channel,
@@ -78,20 +80,20 @@ impl<'d> Stream<'d> {
         self.add(channel, frame, at_ticks).map(Some)
     }
 
-    /// Whether there is no room in the device's queue.
+    /// Whether the device's queue is full.
     pub(crate) fn is_full(&self, channel: Channel) -> bool {
         let room = usize::from(self.device.hello().tx_queue).max(1);
         self.lanes[channel.index()].waiting.len() >= room
     }
 
-    /// Waits a while for something to end.
+    /// Waits a while for a transmission to end.
     pub(crate) fn wait_for_room(&mut self) -> Result<(), DeviceError> {
-        // All of it has to be on its way before anything can be waited for.
+        // Everything has to be on its way before waiting for anything.
         self.flush()?;
         self.collect(LOOK_EVERY)
     }
 
-    /// Adds a frame where there is room.
+    /// Adds a frame; there must be room.
     pub(crate) fn add(
         &mut self,
         channel: Channel,
@@ -124,8 +126,8 @@ impl<'d> Stream<'d> {
         Ok(())
     }
 
-    /// Waits until everything has ended, as long as `go_on` says so; it is given the time since the last end.
-    /// Returns whether everything has.
+    /// Waits until everything has ended, as long as `go_on` returns true; it is given the time since the last
+    /// end. Returns whether everything has ended.
     pub fn finish(&mut self, mut go_on: impl FnMut(Duration) -> bool) -> Result<bool, DeviceError> {
         self.flush()?;
         let mut last = Instant::now();
@@ -141,17 +143,17 @@ impl<'d> Stream<'d> {
         Ok(true)
     }
 
-    /// Waits for the next end of a transmission, at most this long.
+    /// Waits for the next transmission to end, at most this long.
     pub fn wait(&mut self, at_most: Duration) -> Result<(), DeviceError> {
         self.collect(at_most)
     }
 
-    /// Frames handed over that have not ended.
+    /// Number of frames handed over that have not ended.
     pub fn under_way(&self) -> usize {
         self.lanes.iter().map(|lane| lane.waiting.len() - lane.batch.len()).sum()
     }
 
-    /// Since when the oldest frame of each channel is due, in ticks (0: at once), if one has not ended.
+    /// For each channel, when its oldest frame became due, in ticks (0: immediately), if one has not ended.
     pub fn oldest_due(&self) -> [Option<u64>; CHANNELS] {
         self.lanes.each_ref().map(|lane| lane.waiting.front().map(|(_, due)| *due))
     }
@@ -177,7 +179,7 @@ impl<'d> Stream<'d> {
         Ok(())
     }
 
-    /// Takes confirmations: what is there, after at most `wait` for the first.
+    /// Takes confirmations, waiting at most `wait` for the first.
     fn collect(&mut self, wait: Duration) -> Result<(), DeviceError> {
         let mut wait = wait;
         loop {
@@ -190,7 +192,7 @@ impl<'d> Stream<'d> {
                     wait = Duration::ZERO;
                 }
                 Err(RecvTimeoutError::Timeout) => return Ok(()),
-                // The reader has ended: a request says why.
+                // The reader has ended: a request returns the reason.
                 Err(RecvTimeoutError::Disconnected) => return self.device.time().map(|_| ()),
             }
         }

@@ -1,8 +1,8 @@
-//! Why frames were not sent: the one place that decides it, from what the device's stream and its status tell.
+//! Why frames were not sent: the only place that decides it, from the device's stream and status.
 //!
-//! A device reports how each transmission ended, but not why one does not end at all: a controller tries for ever. Then the
-//! errors since its last frame, its state and what others send tell what is in the way. The records of the device are taken
-//! for it, unless the program uses them itself and hands them in.
+//! A device reports how each transmission ended, but not why one does not end at all: a controller keeps trying for ever.
+//! In that case the errors since its last frame, its state and the other nodes' traffic show what is in the way. This
+//! module takes the device's records for that, unless the program uses them itself and hands them in.
 
 use std::time::{Duration, Instant};
 
@@ -13,13 +13,13 @@ use cantap_wire::{CHANNELS, Channel};
 use crate::device::{Records, Transmission};
 use crate::{Device, DeviceError, Direction, TraceEvent, TraceRecord};
 
-/// Frames that are due and of which none ended for this long stand still.
+/// Frames are stuck if they are due and none of them has ended for this long.
 pub const PATIENCE: Duration = Duration::from_secs(1);
-/// How often the device is asked how it is.
+/// How often to ask the device for its status.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
-/// From this load on, in per cent, a bus is full for whoever has a high identifier.
+/// From this load on, in per cent, a bus is full for anyone with a high identifier.
 const FULL_PCT: f64 = 80.0;
-/// A load means something only over a time that is long against a frame.
+/// A load is meaningful only over a time much longer than a frame.
 const LEAST_SPAN_NS: i64 = 100_000_000;
 
 /// Why frames were not sent.
@@ -31,12 +31,12 @@ pub enum Cause {
     Destroyed,
     /// Arbitration was lost to other frames again and again.
     BusFull {
-        /// Load by others in per cent, where the stream's stamps and data tell it.
+        /// Load from other nodes in per cent, if the stream has the stamps and data to compute it.
         load_pct: Option<f64>,
     },
     /// The controller went bus-off.
     BusOff,
-    /// One-shot mode, and arbitration was lost.
+    /// Arbitration was lost in one-shot mode.
     ArbitrationLost,
     /// Their period is shorter than the bus allows.
     Overtaken,
@@ -44,17 +44,17 @@ pub enum Cause {
     Aborted,
     /// The channel was closed.
     Closed,
-    /// Nothing was seen on the bus that would tell.
+    /// Nothing on the bus explained it.
     Unknown,
 }
 
-/// Bus errors by what they say of our frames.
+/// Bus errors, by what they say about our frames.
 #[derive(Clone, Copy, Default)]
 struct Errors {
     unacknowledged: u64,
-    /// Bits read otherwise than sent: only a sender finds those.
+    /// Bits read differently from those sent: only a sender finds those.
     destroyed: u64,
-    /// Found while others sent.
+    /// Found while other nodes sent.
     received: u64,
 }
 
@@ -67,7 +67,7 @@ impl Errors {
         } += 1;
     }
 
-    /// What hit our own frames, if anything did.
+    /// What hit our own frames, if anything.
     fn cause(self) -> Option<Cause> {
         match self {
             Self { unacknowledged: 0, destroyed: 0, .. } => None,
@@ -79,12 +79,12 @@ impl Errors {
     }
 }
 
-/// Frames of other nodes.
+/// Frames from other nodes.
 #[derive(Clone, Copy, Default)]
 struct Others {
-    /// End of the first and of the last.
+    /// End of the first and of the last frame.
     span_ns: Option<(i64, i64)>,
-    /// On the bus within the span.
+    /// Bits on the bus within the span.
     bits: u64,
 }
 
@@ -111,14 +111,14 @@ impl Others {
 #[derive(Default)]
 struct Seen {
     errors: Errors,
-    /// The next three: since a frame of ours was sent last.
+    /// The next three fields count since our last frame was sent.
     errors_since: Errors,
     others_since: Others,
     went_off_since: bool,
-    /// How often each reason was given, [`TransmitFailure::Overtaken`] apart.
+    /// How often each reason was given, except [`TransmitFailure::Overtaken`].
     failures: Vec<(TransmitFailure, u64)>,
     overtaken: u64,
-    /// Device time, in ticks, and the host's, from which a standstill counts.
+    /// The device's time, in ticks, and the host's, from which the standstill counts.
     waiting_since: Option<(u64, Instant)>,
     stands_still: bool,
 }
@@ -146,7 +146,7 @@ impl Seen {
     fn note(&mut self, end: &Transmission) {
         let Err(reason) = end.result else { return self.moved(end.ticks) };
         if let TransmitFailure::Overtaken { periods } = reason {
-            // Periods have passed; the frame still waits.
+            // Periods passed while the frame was waiting.
             self.overtaken += u64::from(periods);
             return;
         }
@@ -157,7 +157,7 @@ impl Seen {
         }
     }
 
-    /// Something ended.
+    /// A transmission ended.
     fn moved(&mut self, ticks: u64) {
         self.waiting_since = Some((ticks, Instant::now()));
     }
@@ -183,12 +183,12 @@ impl Seen {
         }
     }
 
-    /// What is in the way of frames that still wait.
+    /// What is in the way of frames that are still waiting.
     fn obstacle(&self, status: &ChannelStatus, clock_hz: u32) -> Cause {
         if let Some(cause) = self.errors_since.cause() {
             return cause;
         }
-        // A load takes times and data, which a channel may leave out.
+        // A load is computed from times and data, which a channel may leave out.
         let whole = status.open.filter(|config| !config.omit_stamps && !config.omit_data);
         let load_pct =
             whole.and_then(|config| self.others_since.load_pct(config.timing.bitrate_bps(clock_hz)));
@@ -216,7 +216,7 @@ fn take(channels: &mut [Seen; CHANNELS], records: &[TraceRecord]) {
 /// Watches frames being sent.
 pub struct Watch<'d> {
     device: &'d Device,
-    /// None where whoever uses the records hands them in.
+    /// `None` if the program uses the records itself and hands them in.
     records: Option<Records>,
     channels: [Seen; CHANNELS],
     recovers: bool,
@@ -225,7 +225,7 @@ pub struct Watch<'d> {
 
 impl<'d> Watch<'d> {
     /// Watches a device from now on. `recovers` says that the caller brings channels with manual recovery back from bus-off;
-    /// otherwise such a channel stands still.
+    /// otherwise such a channel is stuck.
     pub fn new(device: &'d Device, recovers: bool) -> Self {
         Self {
             device,
@@ -236,33 +236,33 @@ impl<'d> Watch<'d> {
         }
     }
 
-    /// The same for a program that uses the records itself, and hands each of them to [`Self::take`].
+    /// The same for a program that uses the records itself and passes each of them to [`Self::take`].
     pub fn fed(device: &'d Device, recovers: bool) -> Self {
         Self { device, records: None, channels: Default::default(), recovers, look_at: Instant::now() }
     }
 
-    /// Takes notice of what was on the bus.
+    /// Notes what was on the bus.
     pub fn take(&mut self, records: &[TraceRecord]) {
         take(&mut self.channels, records);
     }
 
-    /// Takes notice of how transmissions ended.
+    /// Notes how transmissions ended.
     pub fn note(&mut self, ends: &[Transmission]) {
         for end in ends {
             self.channels[end.channel.index()].note(end);
         }
     }
 
-    /// What waited so far did so for a good reason: patience begins anew.
+    /// Frames had a good reason to wait so far: patience starts again.
     pub fn excuse(&mut self) {
         for seen in &mut self.channels {
             seen.waiting_since = None;
         }
     }
 
-    /// Whether frames of a channel stand still: due, by the device's clock, and none of them ended for [`PATIENCE`]. `due`
-    /// tells since when the oldest frame of a channel waits, in ticks, if one does. To be called again and again; the device
-    /// is asked now and then.
+    /// Whether a channel's frames are stuck: due by the device's clock, and none of them ended for [`PATIENCE`]. `due` gives
+    /// when the oldest frame of a channel became due, in ticks, if one is waiting. Call it repeatedly; it asks the device
+    /// now and then.
     pub fn stands_still(
         &mut self,
         due: impl Fn(Channel, &ChannelStatus) -> Option<u64>,
@@ -377,7 +377,7 @@ mod tests {
         assert_eq!(cause(seen(&[bit, ours, ack], &[]), true), Cause::Unacknowledged);
         assert_eq!(cause(seen(&[ack, ours, bit], &[]), true), Cause::Destroyed);
         assert_eq!(cause(seen(&[ack, ours], &[]), true), Cause::Unknown);
-        // Only a receiver finds those: others cannot send either.
+        // Only a receiver finds those: other nodes cannot send either.
         assert_eq!(cause(seen(&[error(BusErrorKind::Stuff)], &[]), true), Cause::Destroyed);
         let off = TraceEvent::State { state: ErrorState::BusOff, counters: None };
         assert_eq!(cause(seen(&[bit, off], &[]), true), Cause::BusOff);
@@ -388,7 +388,7 @@ mod tests {
     fn a_bus_is_full_only_with_the_load_to_show_for_it() {
         let text = "0F0#1122334455667788";
         let others = frame(Direction::Rx, text);
-        // A quarter of each millisecond is not full.
+        // A quarter of each millisecond does not make the bus full.
         assert_eq!(cause(seen(&[others; 200], &[]), true), Cause::Unknown);
         let length_ns = i64::from(crate::bits_on_bus(&text.parse().unwrap())) * 2_000;
         let mut full = Seen::default();
@@ -403,7 +403,7 @@ mod tests {
         use TransmitFailure::{ArbitrationLost, BusError, BusOff, Overtaken};
         let ours = frame(Direction::Tx, "123#");
         let (ack, bit) = (error(BusErrorKind::Acknowledgment), error(BusErrorKind::BitRecessive));
-        // One-shot: the errors were before the frames that came through.
+        // One-shot: the errors came before the frames that got through.
         assert_eq!(cause(seen(&[bit, bit, ours], &[BusError; 2]), false), Cause::Destroyed);
         assert_eq!(cause(seen(&[ack, ack, ours], &[BusError; 2]), false), Cause::Unacknowledged);
         assert_eq!(
@@ -411,7 +411,7 @@ mod tests {
             Cause::ArbitrationLost
         );
         assert_eq!(cause(seen(&[ours], &[BusOff]), false), Cause::BusOff);
-        // A period that passed is no frame that failed.
+        // A period that passed is not a failed frame.
         let overtaken = seen(&[ours], &[Overtaken { periods: 5 }, Overtaken { periods: 2 }]);
         assert_eq!((overtaken.failed(), overtaken.overtaken), (0, 7));
         assert_eq!(cause(overtaken, false), Cause::Overtaken);

@@ -1,4 +1,5 @@
-//! The search for a bit rate on the virtual device: its pins show bits with a crystal's error and edges of unequal delay.
+//! The search for a bit rate on the virtual device: its pins show bits with a crystal's error and unequally delayed
+//! edges.
 
 use std::time::Duration;
 
@@ -31,7 +32,7 @@ fn every_common_rate_is_found() {
     }
 }
 
-/// It did not find these at all while it guessed: a wrong guess needs traffic to be seen as one.
+/// The search once missed these entirely while it guessed: it takes traffic to recognise a wrong guess.
 #[test]
 fn a_sparse_bus_is_found_within_two_frames() {
     for (options, most_s) in [
@@ -78,7 +79,7 @@ fn a_rate_that_the_clock_does_not_reach_is_named_and_is_no_success() {
     }
 }
 
-/// It is said of two frames. The first one was forgotten when the second was waited for, so that it took three.
+/// Two frames must be enough. The first was once forgotten while waiting for the second, so that it took three.
 #[test]
 fn a_rate_beyond_reach_is_named_after_two_frames() {
     let (outcome, seconds) = search_on("bitrate=615384,burst=1/700ms");
@@ -101,7 +102,7 @@ fn a_bus_on_which_frames_are_destroyed_is_found_all_the_same() {
     }
 }
 
-/// Some are destroyed behind their CRC, and can still be measured.
+/// Some are destroyed after their CRC and can still be measured.
 #[test]
 fn a_bus_without_one_good_frame_is_no_success() {
     let (outcome, _) = search_within(Duration::from_millis(600), "bitrate=500k,load=80,errors=100");

@@ -1,4 +1,4 @@
-//! The device handle against a hand-made device at the other end of a pipe.
+//! The device handle against a scripted device at the other end of a pipe.
 
 #[expect(dead_code, reason = "other tests use the rest of it")]
 mod fake_device;
@@ -15,11 +15,11 @@ use cantap::wire::{Command, Event, Hello, Received, Refusal, Reply, Request, Res
 use cantap::{Channel, Device, DeviceError, Direction, TraceEvent, TraceRecord};
 use fake_device::{FakeDevice, hello};
 
-/// A device whose records a test writes by hand, in ticks from a second on.
+/// A device whose records a test writes by hand, in ticks, starting at one second.
 struct Scripted(FakeDevice);
 
 const BASE_TICKS: u64 = 1_000_000;
-/// What it says the time is: later than all of them.
+/// The time it reports: later than all of them.
 const NOW_TICKS: u64 = 1_000_000_000;
 
 impl Scripted {
@@ -37,7 +37,7 @@ impl Scripted {
     }
 
     /// Answers everything; `on_open` is called after a channel opened. Ends when the host goes, or when
-    /// `on_open` says so by returning false.
+    /// `on_open` returns false.
     fn serve(mut self, mut on_open: impl FnMut(&mut Self) -> bool + Send + 'static) -> JoinHandle<()> {
         std::thread::spawn(move || {
             while let Some(Request { id, command }) = self.0.next_request() {
@@ -199,7 +199,7 @@ fn a_refusal_becomes_a_sentence() {
     served.join().unwrap();
 }
 
-/// Marks of USB's frames begin as soon as the session does.
+/// Marks of USB frames begin as soon as the session does.
 #[test]
 fn a_sessions_first_batch_may_stand_right_behind_the_answer_to_hello() {
     let batch = |writer: &mut BatchWriter, text: &str| {
@@ -214,7 +214,7 @@ fn a_sessions_first_batch_may_stand_right_behind_the_answer_to_hello() {
     let (mut message, mut answer) = ([0; MAX_MESSAGE + CRC_LEN], [0; MAX_ENCODED]);
     let response = DeviceMessage::Response(Response { id: 1, result: Ok(Reply::Hello(hello())) });
     let len = framing::encode(&response, &mut message, &mut answer).unwrap();
-    // Of the session before, the answer, and the first of this one, in a single read.
+    // From the session before, the answer, and the first batch of this one, in a single read.
     let mut writer = BatchWriter::new();
     let mut bytes = batch(&mut writer, "200#");
     bytes.extend(&answer[..len]);

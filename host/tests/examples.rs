@@ -1,4 +1,4 @@
-//! The examples, each run against the virtual device.
+//! Runs each of the examples against the virtual device.
 
 #![allow(dead_code, reason = "their `main` and what it needs")]
 #![allow(clippy::duplicate_mod, reason = "each example is a program of its own")]
@@ -56,7 +56,7 @@ fn periodic_frames_count_and_bear_their_checksum() {
     }
 }
 
-/// By the book, one bit at a time: polynomial 0x1D, initial value and final exclusive-or 0xFF.
+/// As defined, one bit at a time: polynomial 0x1D, initial value and final exclusive-or 0xFF.
 fn crc8_j1850(data: &[u8]) -> u8 {
     let crc = data.iter().fold(0xFF, |crc: u8, byte| {
         (0..8).fold(crc ^ byte, |crc, _| if crc & 0x80 == 0 { crc << 1 } else { crc << 1 ^ 0x1D })

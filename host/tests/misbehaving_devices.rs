@@ -1,4 +1,5 @@
-//! Devices that fall silent, lose their session, repeat themselves or vanish: what a capture says, counts and does.
+//! Devices that fall silent, lose their session, repeat themselves or vanish: what a capture reports, counts and
+//! does.
 
 #[expect(dead_code, reason = "other tests use the rest of it")]
 mod fake_device;
@@ -36,7 +37,7 @@ fn config(device: &Device, mode: Mode) -> ChannelConfig {
     ChannelConfig { mode, ..ChannelConfig::listen_only(device.timing(500_000).unwrap()) }
 }
 
-/// A port behind which there is one device after the other, each with its fault, the last one without.
+/// A port with one device after the other, each with its fault, the last one without.
 fn line(faults: &[(Fault, &'static str)], mode: Mode, log: &Arc<Mutex<Log>>) -> Line {
     let mut devices = VecDeque::from(faults.to_vec());
     let log = Arc::clone(log);
@@ -52,7 +53,8 @@ fn line(faults: &[(Fault, &'static str)], mode: Mode, log: &Arc<Mutex<Log>>) -> 
     })
 }
 
-/// Everything that happened until there were this many records behind the last return, and what came of the end.
+/// Everything that happened until this many records had arrived after the last return, and the result of
+/// stopping.
 #[derive(Default)]
 struct Seen {
     records: Vec<TraceRecord>,
@@ -83,7 +85,7 @@ impl Seen {
         true
     }
 
-    /// Numbers of a channel's frames, up to the first gap and between the others.
+    /// Numbers of a channel's frames, in one list per stretch between gaps.
     fn numbers(&self, channel: Channel) -> Vec<Vec<u32>> {
         let mut parts = vec![Vec::new()];
         for record in self.records.iter().filter(|record| record.channel == channel.number()) {
@@ -93,7 +95,7 @@ impl Seen {
                     parts.last_mut().unwrap().push(number);
                 }
                 TraceEvent::GAP => parts.push(Vec::new()),
-                // Counted, as far as it can be.
+                // Counted as far as possible.
                 TraceEvent::Lost { stage: Some(LossStage::Link), at_least: false, .. } => {}
                 event => panic!("{event:?}"),
             }
@@ -112,10 +114,10 @@ fn whatever_ends_a_session_is_said_and_the_capture_goes_on_with_the_gap_in_place
         (Fault::Deaf, "the device at 'fake' has answered nothing for 1."),
         (Fault::Mute, "the device at 'fake' has answered nothing for 1."),
         (Fault::Suspended, "this computer put the device to sleep"),
-        (Fault::Configured, "this computer set the device up anew"),
+        (Fault::Configured, "this computer configured the device again"),
         (Fault::SessionLost, "this computer slept, or the device was restarted"),
         (Fault::Stolen, "another program took it over; close that program"),
-        (Fault::GoesBack, "its stream began anew"),
+        (Fault::GoesBack, "its stream started over"),
         (Fault::SetBack, "its times contradict one another"),
         (Fault::TimeBehind, "its times contradict one another"),
         (Fault::Vanishes, "the device at 'fake' vanished (the connection was closed)"),
@@ -143,16 +145,16 @@ fn whatever_ends_a_session_is_said_and_the_capture_goes_on_with_the_gap_in_place
         // Nothing that arrived is lost, and all sessions count.
         let counted = line.counters().channels;
         assert_eq!(counted.iter().map(ChannelCounters::delivered).sum::<u64>(), frames as u64, "{fault:?}");
-        // What the device could tell of is counted: the batch that was lost before it ended the session.
+        // What the device could report is counted: the batch that was lost before it ended the session.
         let lost: Vec<u64> = counted.iter().map(|channel| channel.lost_link).collect();
         if fault == Fault::SetBack {
-            // What arrived with a time that cannot be.
+            // Frames that arrived with an impossible time.
             assert!(lost.iter().all(|lost| (1..50).contains(lost)), "{lost:?}");
         } else {
             let says_so = matches!(fault, Fault::Suspended | Fault::Configured);
             assert_eq!(lost, [u64::from(says_so); 2], "{fault:?}");
         }
-        // Both channels were opened as they had been, in the mode that was asked for.
+        // Both channels were opened as before, in the requested mode.
         let opened = log.lock().unwrap().opened.clone();
         assert_eq!((opened.len(), &opened[..2]), (4, &opened[2..]), "{fault:?}");
         assert!(opened.iter().all(|(_, config)| config.mode == Mode::Normal), "{fault:?}");
@@ -174,7 +176,7 @@ fn what_only_looks_bad_ends_no_session_and_loses_nothing() {
     }
 }
 
-/// Stamps, loads and bit rates would all be wrong, and a mode may disturb the bus.
+/// Otherwise stamps, loads and bit rates would all be wrong, and a mode might disturb the bus.
 #[test]
 fn what_a_device_says_of_itself_and_cannot_be_is_refused() {
     for (says, words) in [
@@ -237,7 +239,7 @@ fn a_device_that_is_gone_at_the_end_is_told_and_the_gap_stands_there() {
         let mut line = Line::new("fake", connect, |device| device.listen(Channel::Can1, 500_000).map(|_| ()));
         let mut seen = Seen::default();
         let started = Instant::now();
-        // Before anything has been noticed.
+        // Before the fault is noticed.
         while seen.numbers(Channel::Can1)[0].len() < BEFORE as usize - 30 {
             assert!(started.elapsed() < PATIENCE);
             seen.take(line.next(WAIT));
@@ -295,7 +297,7 @@ fn requests_to_a_device_that_is_gone_say_why() {
             }
         };
         assert!(error.contains(words), "{fault:?}: {error}");
-        // Whoever sends learns it, too.
+        // A sender learns about it, too.
         let told = device.send(Channel::Can1, &[]).unwrap_err().to_string();
         assert_eq!(told, error);
     }

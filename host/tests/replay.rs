@@ -21,7 +21,7 @@ fn lateness_of_a_trace_out_of_order_is_measured_on_the_traces_own_schedule() {
     assert!(replay.finish(|since| since < Duration::from_secs(10)).unwrap());
     assert!(replay.take_ended().iter().all(|end| end.result.is_ok()));
     let Accuracy { frames, early_us, late_us } = replay.accuracy();
-    // The second leaves behind the first: half a second and a frame (57 bits and the intermission) late.
+    // The second starts after the first ends: half a second and a frame (57 bits and the intermission) late.
     assert_eq!(frames, 5);
     assert!((500_100.0..500_140.0).contains(&late_us) && early_us < 1.0, "{late_us} {early_us}");
 }

@@ -42,7 +42,7 @@ fn fake_board(faults: &[Fault], silent: Duration) -> Line {
     )
 }
 
-/// All records until enough, and what happened.
+/// All records until there are enough, and what happened.
 fn collect(
     devices: &mut Several<Device, DeviceError>,
     mut enough: impl FnMut(&[TraceRecord], &[usize]) -> bool,
@@ -80,7 +80,7 @@ fn two_devices() -> FollowerReport {
     let started = Instant::now();
     let (records, _) = collect(&mut devices, |_, _| started.elapsed() > Duration::from_secs(8));
     let late = records.windows(2).filter(|pair| pair[0].time_ns > pair[1].time_ns).count();
-    // A thread that stood still for long may have sent its records late; that is rare.
+    // A thread that was held up for long may have sent its records late; that is rare.
     assert!(late <= records.len() / 1000, "{late} of {} are out of order", records.len());
     for (line, board) in devices.lines().zip([0_u8, 1]) {
         for channel in Channel::ALL {
@@ -92,8 +92,8 @@ fn two_devices() -> FollowerReport {
     devices.clocks().next().unwrap()
 }
 
-/// How well they are on one clock is measured where time is the emulator's (`cli/tests/emulated_clock`): a virtual device's milliseconds
-/// are the computer's, and on a busy one they are later than a clock allows. Then that must be what is said.
+/// How well they match is measured where the emulator defines time (`cli/tests/emulated_clock`): a virtual device's milliseconds are the
+/// computer's, and on a busy one they are later than a clock allows. In that case the report must say so.
 #[test]
 fn two_devices_are_one_stream_of_four_channels_in_order_and_are_on_one_clock_or_it_is_said_why_not() {
     let clock = two_devices();
@@ -141,7 +141,7 @@ fn one_device_that_goes_leaves_its_gap_and_the_other_goes_on() {
     assert!(records.iter().all(|record| record.channel > 2 || record.event != TraceEvent::GAP));
 }
 
-/// A port that takes two seconds to say no holds up nobody: neither records nor the end.
+/// A port that takes two seconds to refuse delays nobody: neither records nor the end.
 #[test]
 fn a_port_that_does_not_answer_holds_up_nothing() {
     let silent = Duration::from_secs(5);
@@ -151,7 +151,7 @@ fn a_port_that_does_not_answer_holds_up_nothing() {
     while !matches!(line.next(WAIT), Happening::Gone(_)) {
         assert!(started.elapsed() < PATIENCE);
     }
-    // By now it is being tried.
+    // At this point it is being tried.
     let tried = Instant::now();
     while tried.elapsed() < Duration::from_secs(1) {
         let asked = Instant::now();

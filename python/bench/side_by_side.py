@@ -1,4 +1,4 @@
-"""Times this package beside python-can, cantools and asammdf, in one run: `cargo xtask bench python`.
+"""Compares the speed of this package with that of python-can, cantools and asammdf, in one run: `cargo xtask bench python`.
 
 Prints a table for docs/benchmarks.md. Times are the process's processor seconds, which say the same whatever else the machine does: the best of
 a few runs each, in turns, after one that nobody counts.
@@ -19,7 +19,7 @@ CAR = pathlib.Path(__file__).parents[2] / "host/virtual/src/car/car.dbc"
 
 
 def beside(theirs, ours, runs):
-    """The shortest processor time in seconds and the result of each, in turns."""
+    """The shortest processor time in seconds and the result of each, run in turn."""
     times, results = ([], []), [None, None]
     for _ in range(runs + 1):
         for which, work in enumerate((theirs, ours)):
@@ -31,7 +31,7 @@ def beside(theirs, ours, runs):
 
 
 def make(folder, frames):
-    """Five seconds of the virtual car, again and again, as BLF and as MF4."""
+    """Five seconds of the virtual car, repeated, as BLF and as MF4."""
     with cantap.open("virtual:car") as device:
         device.open_channel(1)
         device.open_channel(2)
@@ -73,7 +73,7 @@ def decode_with_asammdf(path):
 
 
 def recv_loop(messages):
-    """Messages per second of this thread, of `can.Bus.recv`, out of messages that are there already."""
+    """Messages per second of this thread through `can.Bus.recv`, when they are already waiting."""
     with can.Bus(
         interface="cantap", channel="virtual:pace=fast,load=100,channels=1", bitrate=1_000_000, listen_only=True
     ) as bus:
@@ -88,7 +88,7 @@ def recv_loop(messages):
 
 
 def message_alone(messages):
-    """Messages per second of python-can's constructor, kept as a program keeps them that receives them one after the other."""
+    """Messages per second of python-can's constructor, kept as by a program that receives them one after the other."""
     begin = time.thread_time()
     for _ in range(messages):
         message = can.Message(1.7e9, 0x123, False, False, False, 0, 8, bytearray(8), False, True)
@@ -97,7 +97,7 @@ def message_alone(messages):
 
 
 def virtual_loop(messages):
-    """Messages per second of `can.Bus.recv` on python-can's own virtual interface."""
+    """Messages per second through `can.Bus.recv` on python-can's own virtual interface."""
     with can.Bus(interface="virtual", channel="a") as sender, can.Bus(interface="virtual", channel="a") as bus:
         message = can.Message(arbitration_id=0x123, data=bytes(8), is_extended_id=False)
         for _ in range(messages):
@@ -109,12 +109,12 @@ def virtual_loop(messages):
 
 
 def most(loop):
-    """The best of some runs."""
+    """The best of several runs."""
     return max(loop(100_000) for _ in range(3))
 
 
 def capture(seconds):
-    """Records per second in tables, out of a device that is faster than any bus."""
+    """Records per second in tables, from a device that is faster than any bus."""
     with cantap.open("virtual:pace=fast,load=100", 1_000_000) as device:
         begin, records = time.perf_counter(), 0
         while (passed := time.perf_counter() - begin) < seconds:

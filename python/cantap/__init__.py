@@ -1,6 +1,7 @@
 """CAN buses and traces: the cantap analyser, trace files of every common format, signals as Arrow tables.
 
-`open` begins a session with the analyser; `read` and `scan` take a trace of any format, with a database as decoded signals.
+`open` begins a session with the analyser; `read` and `scan` take a trace of any format and, with a
+database, return decoded signals.
 """
 
 from ._native import (

@@ -10,7 +10,7 @@ from ._native import Table
 
 
 def to_numpy(table: Table) -> dict[str, Any]:
-    """The columns by name; what has no value is masked."""
+    """The columns by name; missing values are masked."""
     return {name: _column(table, name) for name in table.column_names}
 
 
@@ -20,7 +20,7 @@ def _column(table: Table, name: str) -> Any:
     if name == "data":
         values = values.reshape(len(table), width)
     if texts is not None:
-        # A text for rows that have none: they are masked.
+        # A placeholder for rows without a text: they are masked.
         values = np.array([*texts, ""], dtype=object)[values]
     if missing is None:
         return values

@@ -40,13 +40,13 @@ class DeviceError(CantapError):
     """A device could not be opened, refused a request, or is gone."""
 
 class FormatError(CantapError):
-    """A file is no trace of a format that is read or written."""
+    """A file is not a trace in a format that can be read or written."""
 
 class DatabaseError(CantapError):
     """A signal database cannot be used, or does not fit."""
 
 class CantapWarning(UserWarning):
-    """Something was left out, and the rest can be used."""
+    """Something was left out, but the rest can be used."""
 
 @type_check_only
 class Options(TypedDict):
@@ -63,7 +63,7 @@ class Options(TypedDict):
 
 @final
 class Database:
-    """Databases, compiled: read once, used for any number of traces, devices and frames, in any thread."""
+    """Compiled databases: loaded once, used for any number of traces, devices and frames, in any thread."""
 
     def __new__(cls, files: list[tuple[int | None, str | os.PathLike[str]]], j1939: bool) -> Database: ...
     @staticmethod
@@ -71,7 +71,7 @@ class Database:
         """The database of the virtual car (`virtual:car`)."""
     @property
     def warnings(self) -> list[str]:
-        """What is wrong with the files, and can be lived with."""
+        """What is wrong with the files although they are usable."""
     @property
     def message_names(self) -> list[str]:
         """The names of all messages."""
@@ -80,17 +80,17 @@ class Database:
 
 @final
 class Report:
-    """What was read of a file, and what could not be."""
+    """What was read from a file, and what could not be read."""
 
     @property
     def file(self) -> str:
-        """The file's name, as it was given."""
+        """The file's name, as given."""
     @property
     def format(self) -> str:
-        """The format that it was read as."""
+        """The format as which it was read."""
     @property
     def records_read(self) -> int:
-        """Records that the file had, before any filter."""
+        """Records in the file, before any filter."""
     @property
     def records(self) -> int:
         """Records that passed the filters."""
@@ -99,16 +99,16 @@ class Report:
         """Frames among them."""
     @property
     def lost(self) -> int:
-        """Frames that the trace says are missing in it."""
+        """Frames that are missing according to the trace."""
     @property
     def lost_at_least(self) -> bool:
         """Whether there may be more missing than `lost`."""
     @property
     def bus_errors(self) -> int:
-        """Bus errors, with those that were only counted."""
+        """Bus errors, including those that were only counted."""
     @property
     def decoded(self) -> int:
-        """Frames that a database had a message for."""
+        """Frames that a database has a message for."""
     @property
     def values(self) -> int:
         """Values in them."""
@@ -123,18 +123,18 @@ class Report:
         """Whether the file ends in the middle of something."""
     @property
     def left_out(self) -> dict[str, int]:
-        """What is well-formed and no part of a CAN trace, by kind."""
+        """What is well-formed but not part of a CAN trace, by kind."""
     @property
     def notes(self) -> dict[str, int]:
-        """What is nothing wrong and should be known all the same, by kind."""
+        """What is not wrong but should be known, by kind."""
     @property
     def missing_pct(self) -> float:
-        """The share of the file's entries that could not be read or are left out, in per cent."""
+        """The percentage of the file's entries that could not be read or were left out."""
     @property
     def is_whole(self) -> bool:
         """Whether the file was read to its end and every place of it could be read."""
     def to_dict(self) -> dict[str, Any]:
-        """All of it."""
+        """Everything as a dictionary."""
 
 @final
 class Table:
@@ -142,31 +142,31 @@ class Table:
 
     @property
     def num_rows(self) -> int:
-        """How many rows there are."""
+        """The number of rows."""
     @property
     def column_names(self) -> tuple[str, ...]:
         """The columns' names, in order."""
     @property
     def metadata(self) -> dict[str, str]:
-        """What is known about the table beside its columns."""
+        """Metadata of the table: for example, its message."""
     @property
     def report(self) -> Report | None:
-        """What was read, and what could not be; `None` for a table that came from no file."""
+        """What was read, and what could not be read; `None` for a table that was not read from a file."""
     def column_metadata(self, name: str) -> dict[str, str]:
-        """What is known about a column beside its values: its unit, its description."""
+        """Metadata of a column: its unit, its description."""
     def batches(self) -> list[Table]:
-        """The table in the pieces that it has in memory."""
+        """The pieces in which the table is held in memory."""
     def to_numpy(self) -> dict[str, Any]:
         """The columns as NumPy arrays: times as datetime64, texts as objects, data bytes as a row of numbers for each frame.
 
-        What has no value is masked.
+        Missing values are masked.
         """
     def to_pyarrow(self) -> Any:
-        """The same table as pyarrow's."""
+        """The same table for pyarrow."""
     def to_pandas(self) -> Any:
-        """The same table as pandas'."""
+        """The same table for pandas."""
     def to_polars(self) -> Any:
-        """The same table as Polars'."""
+        """The same table for Polars."""
     def _parts(self, name: str) -> tuple[str, bytes, bytes | None, list[str] | None, int]: ...
     def __len__(self) -> int: ...
     def __arrow_c_schema__(self) -> object: ...
@@ -180,12 +180,12 @@ class Scan(Iterator[Table]):
     def __new__(cls, options: Options, batch_rows: int) -> Scan: ...
     @property
     def report(self) -> Report:
-        """What was read so far, and what could not be."""
+        """What was read so far, and what could not be read."""
     @property
     def column_names(self) -> tuple[str, ...]:
         """The columns' names, in order."""
     def read_all(self) -> Table:
-        """All that is left, as one table."""
+        """The rest, as one table."""
     def close(self) -> None:
         """Closes the file."""
     def __iter__(self) -> Scan: ...
@@ -212,7 +212,7 @@ class Frame:
     ) -> Frame: ...
     @staticmethod
     def parse(text: str) -> Frame:
-        """Reads a frame as can-utils write it: `123#1122`, `00000123#R3`."""
+        """Parses a frame as can-utils writes it: `123#1122`, `00000123#R3`."""
     @property
     def id(self) -> int:
         """The identifier."""
@@ -224,7 +224,7 @@ class Frame:
         """Whether it asks for data and has none."""
     @property
     def dlc(self) -> int:
-        """The length code on the bus."""
+        """The length code, as on the bus."""
     @property
     def data(self) -> bytes:
         """The data bytes."""
@@ -233,20 +233,20 @@ class Frame:
 
 @final
 class Record:
-    """What happened on a bus: a frame, an error, a loss."""
+    """An event on a bus: a frame, an error, a loss."""
 
     @property
     def time_s(self) -> float:
         """Seconds since 1970, UTC."""
     @property
     def time_ns(self) -> int:
-        """Nanoseconds since 1970, UTC. Of a frame it is the end."""
+        """Nanoseconds since 1970, UTC. For a frame it is the end."""
     @property
     def channel(self) -> int:
         """The channel, from 1."""
     @property
     def event(self) -> str:
-        """What happened: `frame`, `lost`, `bus-error`, `errors-suppressed`, `state`, `transmit-failed`."""
+        """The kind of event: `frame`, `lost`, `bus-error`, `errors-suppressed`, `state`, `transmit-failed`."""
     @property
     def detail(self) -> str | None:
         """Where frames were lost, which error, which state, why not sent."""
@@ -267,22 +267,22 @@ class Record:
         """Whether the frame asks for data and has none."""
     @property
     def dlc(self) -> int | None:
-        """The frame's length code on the bus."""
+        """The frame's length code, as on the bus."""
     @property
     def data(self) -> bytes | None:
         """The frame's data bytes."""
     @property
     def direction(self) -> str | None:
-        """`rx` or `tx`, of a frame."""
+        """`rx` or `tx`, for a frame."""
     @property
     def late(self) -> bool:
-        """Whether the frame ended then or earlier."""
+        """Whether the time is only an upper bound: the frame ended then or earlier."""
     def __hash__(self) -> int: ...
     def __eq__(self, other: object, /) -> bool: ...
 
 @final
 class Records(Iterator[Record]):
-    """The records of a device from the time on at which this was made."""
+    """The records of a device from the time at which this was made."""
 
     def __iter__(self) -> Records: ...
     def __next__(self) -> Record: ...
@@ -292,11 +292,11 @@ class Records(Iterator[Record]):
         """Records of the next `seconds`, at most `rows`, as a table."""
     @property
     def lost(self) -> tuple[int, int]:
-        """Frames lost here because this program did not take them, of channel 1 and 2."""
+        """Frames lost here because this program did not take them, on channels 1 and 2."""
     def fileno(self) -> int:
-        """A file descriptor that is readable while a record waits."""
+        """A file descriptor that is readable while a record is waiting."""
     def close(self) -> None:
-        """Hears nothing more; what waits can still be read."""
+        """Stops listening; waiting records can still be read."""
     def _messages(
         self, timeout: float | None
     ) -> list[tuple[float, int, bool, bool, bool, int, int, bytearray, bool, bool]]: ...
@@ -305,25 +305,25 @@ class Records(Iterator[Record]):
 
 @final
 class PeriodicFrame:
-    """A frame that the device sends again and again, until this is stopped or forgotten."""
+    """A frame that the device sends repeatedly, until this is stopped or dropped."""
 
     @property
     def is_running(self) -> bool:
-        """Whether it goes on, as far as it was not given a count."""
+        """Whether it is still active, apart from any limit to its count."""
     def update(self, frame: Frame | str) -> None:
         """Sends another frame from now on."""
     def stop(self) -> None:
-        """Ends it."""
+        """Stops it."""
 
 @final
 class Reply:
-    """A frame that the device sends whenever it receives a matching one, until this is stopped or forgotten."""
+    """A frame that the device sends whenever it receives a matching one, until this is stopped or dropped."""
 
     @property
     def is_running(self) -> bool:
-        """Whether it goes on, as far as it was not given a count."""
+        """Whether it is still active, apart from any limit to its count."""
     def stop(self) -> None:
-        """Ends it."""
+        """Stops it."""
 
 @final
 class Device:

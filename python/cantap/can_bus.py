@@ -22,12 +22,12 @@ from ._native import DeviceError, PeriodicFrame
 from .device import CAPACITY, Device, Mode, boards
 
 LOG = logging.getLogger("can.bus")
-"""python-can's own, which has what is received."""
+"""python-can's own logger for received messages."""
 
 ALL_ERRORS = "#1FFFFFFF"
 EXTENDED = 0x8000_0000
 QUEUE_TIMEOUT = 10.0
-"""How long a frame waits for room in the device's queue, in seconds, where no other time is given."""
+"""How long a frame waits for room in the device's queue, in seconds, if no other time is given."""
 
 
 class _Session:
@@ -51,17 +51,17 @@ def _split(channel: str) -> tuple[str, int]:
 
 
 class CantapBus(can.BusABC):
-    """A channel of a cantap analyser. Two channels of one are two Bus objects; they share its session.
+    """A channel of a cantap analyser. Two channels of one analyser are two Bus objects that share its session.
 
     :param channel: the device's address and the channel's number: `/dev/ttyACM0:1`, `virtual:2`, `tcp://bench:1`.
-    :param bitrate: in bit/s; without it the one saved on the device. `timing` in its place.
-    :param receive_own_messages: also those that this device sends on this channel.
+    :param bitrate: in bit/s; without it, the one saved on the device. `timing` may be given instead.
+    :param receive_own_messages: also receive messages that this device sends on this channel.
     :param listen_only: send nothing and acknowledge nothing. Also with `state=can.BusState.PASSIVE`.
     :param one_shot: send each frame once.
     :param manual_recovery: stay bus-off until :meth:`recover`.
-    :param rx_capacity: messages that wait; more are lost, counted, and an error frame says so.
+    :param rx_capacity: how many messages may wait; others are lost and counted, and an error frame says so.
 
-    Times are the device's stamps. Bus errors, changes of state and losses are error frames as SocketCAN has them.
+    Times are the device's stamps. Bus errors, state changes and losses are error frames as in SocketCAN.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class CantapBus(can.BusABC):
                     session = _Session(self._address)
                 self._device = session.device
                 self._options["segments"] = self._segments(timing)
-                # Before the first frame can come.
+                # Before the first frame can arrive.
                 self._records = self._device.records(
                     self._number, filter=texts, only_received=not self._own, capacity=rx_capacity
                 )
@@ -119,7 +119,7 @@ class CantapBus(can.BusABC):
             session.users[self._number] = session.users.get(self._number, 0) + 1
             _sessions[self._address] = session
         self._session = session
-        # What came from the device together, as arguments of `can.Message`.
+        # What came from the device in one call, as arguments of `can.Message`.
         self._waiting: collections.deque[
             tuple[float, int, bool, bool, bool, int, int, bytearray, bool, bool]
         ] = collections.deque()
@@ -139,7 +139,7 @@ class CantapBus(can.BusABC):
         )
 
     def _join(self, mode: Mode) -> None:
-        """Another Bus object has the channel open: that stays as it is."""
+        """Another Bus object has the channel open: its settings stay as they are."""
         now = self._device.channels[self._number]
         wanted = self._options["bitrate"]
         if wanted not in (None, now["bitrate"]) or now["mode"] != mode:
@@ -149,14 +149,14 @@ class CantapBus(can.BusABC):
 
     @property
     def device(self) -> Device:
-        """The device, for what python-can has no words for: its clock, replies, timed sending."""
+        """The device, for what python-can does not support: its clock, replies, timed sending."""
         return self._device
 
     # Receiving
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """As python-can's, which looks at each message again: here filters are done."""
-        # By the method that classes derived from this one may have of their own.
+        """Like python-can's, which filters each message again: here filters have already been applied."""
+        # Through this method, because derived classes may override it.
         message, _ = self._recv_internal(timeout)
         if message is not None and LOG.isEnabledFor(self.RECV_LOGGING_LEVEL):
             LOG.log(self.RECV_LOGGING_LEVEL, "Received: %s", message)
@@ -179,7 +179,7 @@ class CantapBus(can.BusABC):
                     raise can.CanOperationError(str(error)) from error
                 if not more:
                     return None
-                # In place: another thread may have got some at the same time.
+                # In place: another thread may have added some at the same time.
                 waiting.extend(more)
                 continue
             if not waiting:
@@ -190,10 +190,10 @@ class CantapBus(can.BusABC):
         self._records._filter(_filter_texts(filters), not self._own)
 
     def losses(self) -> dict[str, int]:
-        """Frames of this channel that were received and lost since the session began, by where; `bus`: by this object.
+        """Frames of this channel that were received and lost since the session began, by stage; `bus` is this object.
 
-        Where they are missing, :meth:`recv` gives an error frame with the class "controller problem" and the detail "RX buffer overflow",
-        whose bytes 2 to 5 are how many.
+        Where frames are missing, :meth:`recv` returns an error frame with the class "controller problem" and the detail "RX buffer overflow",
+        whose bytes 2 to 5 contain their number.
         """
         counts = dict(self._device.losses[self._number])
         counts["bus"] = self._records.lost[self._number - 1]
@@ -201,13 +201,13 @@ class CantapBus(can.BusABC):
         return counts
 
     def fileno(self) -> int:
-        """Readable while a message waits: for `asyncio` and `select`."""
+        """A file descriptor that is readable while a message is waiting: for `asyncio` and `select`."""
         return self._records.fileno()
 
     # Sending
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Hands a message to the device; with `timeout` (seconds) waits until it was on the bus."""
+        """Passes a message to the device; with `timeout` (seconds), waits until it was on the bus."""
         frame = _frame(msg)
         wait = timeout if timeout is not None and timeout > 0 else None
         try:
@@ -216,7 +216,7 @@ class CantapBus(can.BusABC):
             raise can.CanOperationError(str(error)) from error
 
     def flush_tx_buffer(self) -> None:
-        """Takes back what was not sent yet."""
+        """Withdraws what has not been sent yet."""
         self._device.abort(self._number)
 
     def _send_periodic_internal(
@@ -232,7 +232,7 @@ class CantapBus(can.BusABC):
             try:
                 return DeviceCyclicTask(self, messages, period, duration, autostart)
             except (ValueError, DeviceError):
-                pass  # What the device cannot do, or has no room for, a thread of Python's does.
+                pass  # The device cannot do this, or has no room for it: use a Python thread.
         return super()._send_periodic_internal(msgs, period, duration, autostart, modifier_callback)
 
     # State
@@ -256,11 +256,11 @@ class CantapBus(can.BusABC):
         self._open(mode, _filter_texts(self._filters))
 
     def recover(self) -> None:
-        """Comes back from bus-off, where that is manual."""
+        """Comes back from bus-off if recovery is manual."""
         self._device.recover(self._number)
 
     def shutdown(self) -> None:
-        """Stops what is sent periodically, and closes the channel when no other Bus object uses it."""
+        """Stops periodic messages, and closes the channel if no other Bus object uses it."""
         if self._is_shutdown:
             return
         super().shutdown()
@@ -313,8 +313,8 @@ class DeviceCyclicTask(
             self.start()
 
     def start(self) -> None:
-        """Begins, or begins anew."""
-        # Not `stop`, which the bus has wrapped so that it forgets the task.
+        """Starts or restarts it."""
+        # Not `stop`, which the bus has wrapped so as to forget the task.
         self._end()
         count = 0 if self.duration is None else max(1, math.ceil(self.duration / self.period))
         self._task = self._bus.device.send_periodic(
@@ -322,7 +322,7 @@ class DeviceCyclicTask(
         )
 
     def stop(self) -> None:
-        """Ends it; :meth:`start` begins it anew."""
+        """Stops it; :meth:`start` restarts it."""
         self._end()
 
     def _end(self) -> None:
@@ -351,7 +351,7 @@ def _frame(msg: can.Message) -> _native.Frame:
 
 
 def _filter_texts(filters: Any) -> list[str]:
-    """python-can's filters in candump's syntax. Error frames pass, as they do with SocketCAN."""
+    """python-can's filters in candump's syntax. Error frames pass, as with SocketCAN."""
     if not filters:
         return []
     elements = []
@@ -364,6 +364,6 @@ def _filter_texts(filters: Any) -> list[str]:
         elif identifier & mask <= 0x7FF:
             elements.append(f"{identifier & 0x7FF:03X}:{mask | flag:X}")
         # No standard identifier is that large.
-    # Nothing matches both, where nothing is wanted.
+    # If nothing is wanted: no frame matches both.
     none = [] if elements else ["000:0", "000~0", "j"]
     return [",".join(["any", *elements, *none, ALL_ERRORS])]

@@ -17,7 +17,7 @@ AnyFrame: TypeAlias = "Frame | str"
 ChecksumName: TypeAlias = Literal["xor", "sum", "crc8-j1850"]
 
 CAPACITY = 1 << 20
-"""Records that wait for a program that is busy: half a minute of two saturated channels."""
+"""How many records may wait for a busy program: half a minute of two saturated channels."""
 
 _open: weakref.WeakSet[Device] = weakref.WeakSet()
 
@@ -44,10 +44,10 @@ class RandomByte:
 
 
 class Device:
-    """A device in a session of this program. `open` makes one.
+    """A device in a session of this program, made by `open`.
 
-    Nothing is sent and nothing acknowledged until a channel is opened in another mode than `listen-only`. When the session ends,
-    however it does, the channels close and what the device sends by itself stops.
+    Nothing is sent or acknowledged until a channel is opened in a mode other than `listen-only`. When the session ends, for
+    whatever reason, the channels close and the device stops sending on its own.
     """
 
     def __init__(self, address: str, *, capacity: int = CAPACITY) -> None:
@@ -57,7 +57,7 @@ class Device:
 
     @property
     def address(self) -> str:
-        """Its address, as it was opened."""
+        """Its address, as given when it was opened."""
         return self._native.address
 
     @property
@@ -67,7 +67,7 @@ class Device:
 
     @property
     def info(self) -> dict[str, Any]:
-        """What it is: board, serial number, versions, clocks, sizes of its tables."""
+        """The device's description: board, serial number, versions, clocks, sizes of its tables."""
         return self._native.info()
 
     # Channels
@@ -87,9 +87,9 @@ class Device:
     ) -> int:
         """Opens a channel, 1 or 2, and returns its bit rate in bit/s.
 
-        Without a bit rate it is the one saved on the device; the virtual device's buses have 500 kbit/s.
-        `sample_point` in per cent; `segments`: prescaler, segment 1, segment 2 and jump width in place of a bit rate.
-        `filter` as with `cantap.read`: the device drops the rest in hardware, as far as it can, and this computer does what is left.
+        Without a bit rate, the one saved on the device is used; the virtual device's buses have 500 kbit/s.
+        `sample_point` is in per cent; `segments` is prescaler, segment 1, segment 2 and jump width, instead of a bit rate.
+        `filter` as with `cantap.read`: the device drops other frames in hardware as far as it can, and this computer drops the rest.
         """
         rate, _ = self._native.open_channel(
             channel,
@@ -107,7 +107,7 @@ class Device:
         return rate
 
     def close_channel(self, channel: int) -> None:
-        """Closes a channel, after everything it captured has come."""
+        """Closes a channel, after everything it captured has arrived."""
         self._native.close_channel(channel)
 
     @property
@@ -116,13 +116,13 @@ class Device:
         return self._native.open_channels()
 
     def recover(self, channel: int) -> None:
-        """Brings a channel back from bus-off that was opened with `manual_recovery`."""
+        """Brings a channel that was opened with `manual_recovery` back from bus-off."""
         self._native.recover(channel)
 
     # Listening
 
     def __iter__(self) -> Iterator[Record]:
-        """Records as they come: frames, errors, states, losses. Ends when the device is closed."""
+        """Records as they arrive: frames, errors, states, losses. Ends when the device is closed."""
         return self._records
 
     def read(self, timeout: float | None = None) -> Record | None:
@@ -134,7 +134,7 @@ class Device:
         return self._records.batch(seconds, rows)
 
     def batches(self, seconds: float = 0.1, rows: int = 65_536) -> Iterator[Table]:
-        """Tables of what came in the last `seconds` or so, one after the other, until the device is closed. None is empty."""
+        """Tables of what arrived in the last `seconds` or so, one after the other, until the device is closed. None is empty."""
         while not self.closed:
             table = self._records.batch(seconds, rows)
             if len(table):
@@ -148,9 +148,9 @@ class Device:
         only_received: bool = False,
         capacity: int = CAPACITY,
     ) -> Records:
-        """Another stream of records, from now on: of one channel, of some frames, without those that this device sends.
+        """Another stream of records, from now on: optionally of one channel, of some frames, or without those that this device sends.
 
-        Who does not take them loses frames when `capacity` records wait: they are counted, and a loss stands in their place.
+        If they are not taken, frames are lost once `capacity` records are waiting: they are counted, and a loss takes their place.
         """
         filters = [filter] if isinstance(filter, str) else list(filter)
         return self._native.records(channel, filters, only_received, capacity)
@@ -167,10 +167,10 @@ class Device:
     ) -> list[float]:
         """Sends a frame or several, in order, and returns when each was on the bus, in seconds since 1970.
 
-        What is not sent within `timeout` seconds is taken back, with everything else that the channel still had to send, and is a
-        `DeviceError`. With `timeout=None` the frames are only handed to the device.
-        `at`: not before this time, in seconds since 1970 or a date with a time zone; the device keeps it, the times of the
-        frames counting into `timeout`.
+        If they are not sent within `timeout` seconds, they are withdrawn, with everything else that the channel still had to send,
+        and `DeviceError` is raised. With `timeout=None` the frames are only passed to the device.
+        `at`: not before this time, in seconds since 1970 or a date with a time zone. The device does the timing, and `timeout`
+        includes the time until then.
         """
         all_frames = [frames] if isinstance(frames, (Frame, str)) else list(frames)
         at_ns = None
@@ -183,7 +183,7 @@ class Device:
         return [time_ns / 1e9 for time_ns in self._native.send(channel, all_frames, timeout, at_ns)]
 
     def abort(self, channel: int) -> None:
-        """Takes back what a channel still has to send."""
+        """Withdraws what a channel still has to send."""
         self._native.abort(channel)
 
     def send_periodic(
@@ -195,9 +195,9 @@ class Device:
         count: int = 0,
         modifiers: Iterable[Counter | Checksum | RandomByte] = (),
     ) -> PeriodicFrame:
-        """Has the device send a frame every `period` seconds by its own timer, `count` times or for ever, until it is stopped.
+        """Has the device send a frame every `period` seconds by its own timer, `count` times or until it is stopped.
 
-        `modifiers` change its data before each transmission, in their order: `[Counter(0, bits=4), Checksum(7)]`.
+        `modifiers` change its data before each transmission, in this order: `[Counter(0, bits=4), Checksum(7)]`.
         """
         words = [modifier.words for modifier in modifiers]
         return self._native.periodic(channel, frame, period, count, words)
@@ -219,20 +219,20 @@ class Device:
 
     @property
     def status(self) -> dict[str, Any]:
-        """How the device and its channels are: states, error counters, queues."""
+        """The status of the device and its channels: states, error counters, queues."""
         return self._native.status()
 
     @property
     def losses(self) -> dict[int, dict[str, int]]:
         """Frames received and lost since the session began, by channel: at the controller, in the queue, on the link, here.
 
-        `host` is what this session's own reader lost; what a stream of records lost is in `Records.lost`.
+        `host` is what this session's own reader lost; the losses of a stream of records are in `Records.lost`.
         """
         return self._native.losses()
 
     @property
     def clock(self) -> dict[str, Any]:
-        """What is known about the device's clock: `drift_ppm`, `uncertainty_ns`, what it is measured with."""
+        """What is known about the device's clock: `drift_ppm`, `uncertainty_ns`, what measures it."""
         return self._native.clock()
 
     def time(self) -> float:
@@ -244,7 +244,7 @@ class Device:
         self._native.identify(seconds)
 
     def close(self) -> None:
-        """Closes the channels and ends the session. Records that came can still be read."""
+        """Closes the channels and ends the session. Records already received can still be read."""
         self._native.close()
         _open.discard(self)
 
@@ -282,11 +282,11 @@ def open(
     filter: str | Iterable[str] = (),
     capacity: int = CAPACITY,
 ) -> Device:
-    """Begins a session with the device at an address, as the command takes it after `-d`.
+    """Begins a session with the device at an address, as for the command's `-d`.
 
     `/dev/ttyACM0`, `COM5`, `virtual`, `virtual:car`, `unix:`, `tcp://HOST`, `tls://HOST`, `ssh://[USER@]HOST`.
 
-    With a bit rate, the `channels` are opened; without one, none is: `Device.open_channel` does that one by one.
+    With a bit rate, the `channels` are opened. Without one, none is: use `Device.open_channel` for each.
 
         with cantap.open("/dev/ttyACM0", 500_000) as device:
             for record in device:
@@ -305,7 +305,7 @@ def open(
 
 
 def boards() -> list[dict[str, str | None]]:
-    """The boards that are connected to this computer: `port`, `serial`, `product`."""
+    """The boards connected to this computer: `port`, `serial`, `product`."""
     return [
         {"port": port, "serial": serial, "product": product}
         for port, serial, product in _native.list_boards()

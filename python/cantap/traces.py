@@ -27,10 +27,10 @@ def load_database(
 ) -> Database:
     """Reads signal databases: DBC, KCD, SYM, ARXML, or cantap's own .toml.
 
-    Several are one; of a message that two have, the later counts. A mapping gives each channel (from 1) its own. With `j1939`
-    all 29-bit messages are taken for J1939 parameter groups.
+    Several files are combined; if two have the same message, the later one is used. A mapping gives each channel (from 1) its
+    own database. With `j1939` all 29-bit messages are treated as J1939 parameter groups.
 
-    What is wrong with a file and can be lived with is in `Database.warnings`, and is a `CantapWarning`.
+    What is wrong with a usable file is in `Database.warnings`, and causes a `CantapWarning`.
     """
     database = Database(_pairs(files), j1939)
     for text in database.warnings:
@@ -62,19 +62,19 @@ def scan(
 ) -> Scan:
     """Reads a trace in batches; memory does not grow with the file.
 
-    The result is an iterator of tables, and a stream for whatever takes Arrow: `pyarrow.RecordBatchReader.from_stream(scan)`,
+    The result is an iterator of tables, and a stream for anything that takes Arrow: `pyarrow.RecordBatchReader.from_stream(scan)`,
     `duckdb.sql("select … from scan")`.
 
-    Without `db` there is a row for each record: frames, bus errors, losses. With it there is a row for each value of each frame that
-    the database has, and for what happened beside frames.
+    Without `db` there is a row for each record: frames, bus errors, losses. With it there is a row for each value of each frame in
+    the database, and for each event other than a frame.
 
-    `signals`: only these, `Speed`, `Engine.Speed`, with `*`, `?` and `[a-z]`.
-    `filter`: only these frames, in candump's syntax, such as `123` or `can0,120:7F0`; any of several.
+    `signals`: only these, such as `Speed` or `Engine.Speed`, with the wildcards `*`, `?` and `[a-z]`.
+    `filter`: only these frames, in candump's syntax, such as `123` or `can0,120:7F0`; if several are given, any may match.
     `start`, `end`: seconds from the first record or since 1970, `"10m"`, a date, a `timedelta`; the end is exclusive.
-    `format`: where neither content nor name tell. `zone`: of dates in files that name none, such as `Europe/Berlin`.
-    `strict`: what is wrong in the file is a `FormatError` instead of a `CantapWarning`.
+    `format`: if neither content nor name show it. `zone`: for dates in files that do not name one, such as `Europe/Berlin`.
+    `strict`: anything wrong in the file raises `FormatError` instead of causing a `CantapWarning`.
 
-    What was read, and what could not be, is in `Scan.report`.
+    What was read, and what could not be read, is in `Scan.report`.
     """
     return Scan(_options(path, db, signals, filter, channel, start, end, format, zone, strict), batch_rows)
 
@@ -92,23 +92,23 @@ def read(
     zone: str | None = None,
     strict: bool = False,
 ) -> Table:
-    """Reads a trace as one table; everything is as with `scan`."""
+    """Reads a trace as one table; the arguments are those of `scan`."""
     options = _options(path, db, signals, filter, channel, start, end, format, zone, strict)
     return Scan(options, BATCH_ROWS).read_all()
 
 
 class Messages(Mapping[str, Table]):
-    """A decoded trace: by message's name a table with the columns `time`, `channel`, `id` and one for each signal.
+    """A decoded trace: for each message's name, a table with the columns `time`, `channel`, `id` and one for each signal.
 
-    A signal with texts has two: `Gear` and `Gear.text`. Where a frame does not have a signal, there is no value.
+    A signal with texts has two: `Gear` and `Gear.text`. If a frame does not have a signal, there is no value.
     """
 
     def __init__(self, tables: dict[str, Table], events: Table, report: Report | None) -> None:
         self._tables = tables
         self.events = events
-        """What happened beside frames: losses, bus errors, states. A series with a hole is explained here."""
+        """Events other than frames: losses, bus errors, states. They explain gaps in a series."""
         self.report = report
-        """What was read, and what could not be; `None` if no file was."""
+        """What was read, and what could not be read; `None` if there was no file."""
 
     def __getitem__(self, message: str) -> Table:
         return self._tables[message]
@@ -138,8 +138,8 @@ def decode(
 ) -> Messages:
     """Decodes a trace into a table for each message, with a column for each signal.
 
-    `source` is a file, or a table of records, such as a device's batches: of this package, or of anything else that exports Arrow.
-    What of a file is asked for is as with `scan`; of a table it is `signals` alone.
+    `source` is a file, or a table of records, such as a device's batches: from this package, or anything else that exports Arrow.
+    The other arguments are those of `scan`; for a table, only `signals` is allowed.
     """
     if isinstance(source, (str, os.PathLike)):
         options = _options(source, db, signals, filter, channel, start, end, format, zone, strict)
@@ -167,10 +167,10 @@ def search(
     zone: str | None = None,
     strict: bool = False,
 ) -> Table:
-    """The records for which everything that is given holds, with `place`, their number among those that were read, from 0.
+    """The records that meet every given criterion, with `place`, their index among those that were read, from 0.
 
-    `condition`: as `cantap search` takes it, such as `"Speed > 80 and Gear == Drive"`. `id`: `123`, `18FEF1??`, `100-1FF`; any of
-    several. `data`: bytes from the first on, `"11 ?? 3?"`, with `*` for any number; any of several.
+    `condition`: as for `cantap search`, such as `"Speed > 80 and Gear == Drive"`. `id`: `123`, `18FEF1??`, `100-1FF`; any of
+    several may match. `data`: bytes from the first on, `"11 ?? 3?"`, with `*` for any number; any of several may match.
     """
     options = _options(path, db, (), filter, channel, start, end, format, zone, strict)
     return _native.search(options, condition, _words(id), _words(data), max_count)
@@ -190,10 +190,10 @@ def stats(
     zone: str | None = None,
     strict: bool = False,
 ) -> dict[str, Any]:
-    """Statistics of a trace, as `cantap stats --json` has them: load, rates, periods and jitter by identifier, losses, errors.
+    """Statistics of a trace, as from `cantap stats --json`: load, rates, periods and jitter by identifier, losses, errors.
 
-    `bitrate` in bit/s, of all channels or by channel; without it there is no load. `data_bitrate`: of CAN FD's data phases.
-    `window`: seconds in which peaks are looked for.
+    `bitrate`: in bit/s, for all channels or by channel; without it there is no load. `data_bitrate`: for CAN FD's data phases.
+    `window`: length in seconds of the windows searched for peaks.
     """
     options = _options(path, None, (), filter, channel, start, end, format, zone, strict)
     return _native.stats(options, _rates(bitrate), _rates(data_bitrate), window)
@@ -212,11 +212,11 @@ def _rates(rates: int | Mapping[int, int] | None) -> list[tuple[int | None, int]
 def write(
     table: Any, path: Path, *, format: str | None = None, zone: str | None = None
 ) -> dict[str, int]:
-    """Writes a table of records as a trace, in the format that the name says or `format`; `.parquet` as well.
+    """Writes a table of records as a trace, in the format of the file's name or in `format`; `.parquet` works, too.
 
-    `table` is of this package, or of anything else that exports Arrow, with the columns of `read`. An older file of that name
-    stays as it is until the new one is whole. Returns what the format could not carry, by kind; if it is anything, it is a
-    `CantapWarning` too.
+    `table` comes from this package, or anything else that exports Arrow, with the columns of `read`. An older file with that name
+    stays unchanged until the new one is complete. Returns what the format could not carry, by kind; anything at all also causes
+    a `CantapWarning`.
     """
     left_out = _native.write(_with_our_types(table), path, format, zone)
     for what, count in left_out.items():
@@ -225,7 +225,7 @@ def write(
 
 
 def _with_our_types(table: Any) -> Any:
-    """Other programs have types of their own for texts and bytes; pyarrow, where it is installed, casts them."""
+    """Other programs have their own types for texts and bytes; pyarrow, if it is installed, casts them."""
     if isinstance(table, (Table, Scan)) or not hasattr(table, "__arrow_c_stream__"):
         return table
     try:
@@ -244,12 +244,12 @@ def _with_our_types(table: Any) -> Any:
                 to = pa.string() if pa.types.is_dictionary(field.type) else field.type
                 columns[field.name] = column.cast(to)
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
-        raise _native.FormatError(f"the table is no trace: {error}") from error
+        raise _native.FormatError(f"the table is not a trace: {error}") from error
     return pa.table(columns)
 
 
 def _plain(chunk: Any) -> Any:
-    """The texts of a dictionary. Its own may be of a type that pyarrow does not take texts out of."""
+    """The texts of a dictionary. Their type may be one from which pyarrow cannot take texts."""
     import pyarrow as pa
 
     texts = chunk.dictionary.cast(pa.string())
@@ -299,11 +299,11 @@ def _words(words: Words) -> list[str]:
 
 
 def _time(time: Time | None) -> str | None:
-    """A time as the command takes it."""
+    """A time in the command's syntax."""
     if time is None or isinstance(time, str):
         return time
     if isinstance(time, datetime.timedelta):
-        # The letter keeps a long one from being taken for a date.
+        # The letter keeps a long one from being mistaken for a date.
         return f"{time.total_seconds():.9f}s"
     if isinstance(time, datetime.datetime):
         if time.tzinfo is None:

@@ -9,18 +9,18 @@ use pyo3::types::PyDict;
 
 use crate::error::Error;
 
-/// Databases, compiled: read once, used for any number of traces, devices and frames, in any thread.
+/// Compiled databases: loaded once, used for any number of traces, devices and frames, in any thread.
 #[pyclass(module = "cantap", frozen)]
 pub struct Database {
     pub decoder: Arc<Decoder>,
-    /// The files, for pickles.
+    /// The files, for pickling.
     files: Vec<(Option<u8>, PathBuf)>,
     is_j1939: bool,
     warnings: Vec<String>,
 }
 
 impl Database {
-    /// What decodes these signals only; all without patterns.
+    /// A decoder for these signals only; for all if there are no patterns.
     pub fn selecting(&self, patterns: &[String]) -> Result<Arc<Decoder>, Error> {
         if patterns.is_empty() {
             return Ok(Arc::clone(&self.decoder));
@@ -59,7 +59,7 @@ impl Database {
         Ok(Self { decoder: Arc::new(decoder), files, is_j1939: j1939, warnings })
     }
 
-    /// The database of the virtual car.
+    /// The virtual car's database.
     #[staticmethod]
     fn of_virtual_car() -> PyResult<Self> {
         let database = cantap_virtual::car::database().map_err(Error::from)?;
@@ -67,7 +67,7 @@ impl Database {
         Ok(Self { decoder: Arc::new(decoder), files: Vec::new(), is_j1939: false, warnings: Vec::new() })
     }
 
-    /// What is wrong with the files, and can be lived with.
+    /// What is wrong with the files although they are usable.
     #[getter]
     fn warnings(&self) -> Vec<String> {
         self.warnings.clone()

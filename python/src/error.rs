@@ -26,7 +26,7 @@ pyo3::create_exception!(
     cantap,
     FormatError,
     CantapError,
-    "A file is no trace of a format that is read or written."
+    "A file is not a trace in a format that can be read or written."
 );
 pyo3::create_exception!(
     cantap,
@@ -44,42 +44,42 @@ pyo3::create_exception!(
 /// An error of this package's libraries.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// Of a file, with its name.
+    /// A file's error, with its name.
     #[error("{1}: {0}")]
     Io(#[source] io::Error, String),
-    /// No trace of this format.
+    /// The file is not a trace in this format.
     #[error("{0}")]
     Format(String),
-    /// Of a database.
+    /// A database's error.
     #[error("{0}")]
     Database(String),
-    /// Of a device.
+    /// A device's error.
     #[error(transparent)]
     Device(#[from] DeviceFault),
-    /// The way to a device.
+    /// The device's address is wrong, or it cannot be reached.
     #[error("{0}")]
     Address(String),
     /// A wrong argument.
     #[error("{0}")]
     Argument(String),
-    /// What Python itself raised.
+    /// An exception raised by Python.
     #[error("{0}")]
     Python(#[from] PyErr),
 }
 
 impl Error {
-    /// What the system says about a file.
+    /// The system's error for a file.
     pub fn of_file(error: io::Error, path: &Path) -> Self {
         Self::Io(error, path.display().to_string())
     }
 
-    /// A wrong argument, in words.
+    /// A wrong argument, described in words.
     pub fn argument(words: impl ToString) -> Self {
         Self::Argument(words.to_string())
     }
 }
 
-/// What an error does not say itself of what caused it.
+/// The cause of an error, if its own message does not include it.
 fn because(error: &LinkError) -> String {
     let cause = error.source().map(ToString::to_string);
     cause

@@ -1,4 +1,4 @@
-//! Frames and records, as Python has them.
+//! Frames and records, for Python.
 
 use cantap_trace::names::{self, BUS_ERRORS, ERROR_STATES, LOSS_STAGES, OVERTAKEN, TRANSMIT_FAILURES};
 use cantap_trace::{Direction, Frame as ClassicFrame, Id, TraceEvent, TraceFrame, TraceRecord};
@@ -14,12 +14,12 @@ use crate::error::Error;
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Frame(pub ClassicFrame);
 
-/// An identifier; of 29 bits if that is said, or if it is too large for 11.
+/// An identifier; of 29 bits if `extended` says so, or if it is too large for 11.
 pub fn identifier(raw: u32, extended: Option<bool>) -> Result<Id, Error> {
     let id = if extended.unwrap_or(raw > Id::MAX_STANDARD) { Id::extended(raw) } else { Id::standard(raw) };
     id.ok_or_else(|| {
         Error::argument(format!(
-            "{raw:#X} is no identifier; 0x7FF is the last standard one, 0x1FFFFFFF the last extended one"
+            "{raw:#X} is not an identifier; 0x7FF is the last standard one, 0x1FFFFFFF the last extended one"
         ))
     })
 }
@@ -73,7 +73,7 @@ impl Frame {
         self.0.is_remote()
     }
 
-    /// The length code on the bus.
+    /// The length code, as on the bus.
     #[getter]
     fn dlc(&self) -> u8 {
         self.0.dlc()
@@ -97,15 +97,15 @@ impl Frame {
         Ok((py.get_type::<Self>().getattr("parse")?.unbind(), (self.0.to_string(),)))
     }
 
-    /// Reads a frame as can-utils write it: `123#1122`, `00000123#R3`.
+    /// Parses a frame as can-utils writes it: `123#1122`, `00000123#R3`.
     #[staticmethod]
     fn parse(text: &str) -> PyResult<Self> {
         let frame = text.parse::<ClassicFrame>();
-        frame.map(Self).map_err(|error| PyValueError::new_err(format!("'{text}' is no frame: {error}")))
+        frame.map(Self).map_err(|error| PyValueError::new_err(format!("'{text}' is not a frame: {error}")))
     }
 }
 
-/// A frame, or a text that is one.
+/// A frame, or a text that can be parsed as one.
 pub struct AnyFrame(pub ClassicFrame);
 
 impl<'py> FromPyObject<'_, 'py> for AnyFrame {
@@ -125,7 +125,7 @@ impl<'py> FromPyObject<'_, 'py> for AnyFrame {
     }
 }
 
-/// What happened on a bus: a frame, an error, a loss.
+/// An event on a bus: a frame, an error, a loss.
 #[pyclass(module = "cantap", frozen, eq, hash)]
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Record(pub TraceRecord);
@@ -144,7 +144,7 @@ impl Record {
         self.0.time_ns as f64 / 1e9
     }
 
-    /// Nanoseconds since 1970, UTC. Of a frame it is the end.
+    /// Nanoseconds since 1970, UTC. For a frame it is the end.
     #[getter]
     fn time_ns(&self) -> i64 {
         self.0.time_ns
@@ -156,7 +156,7 @@ impl Record {
         self.0.channel
     }
 
-    /// What happened: `frame`, `lost`, `bus-error`, `errors-suppressed`, `state`, `transmit-failed`.
+    /// The kind of event: `frame`, `lost`, `bus-error`, `errors-suppressed`, `state`, `transmit-failed`.
     #[getter]
     fn event(&self) -> &'static str {
         match self.0.event {
@@ -217,7 +217,7 @@ impl Record {
         self.frame().is_some_and(TraceFrame::is_remote)
     }
 
-    /// The frame's length code on the bus.
+    /// The frame's length code, as on the bus.
     #[getter]
     fn dlc(&self) -> Option<u8> {
         self.frame().map(TraceFrame::dlc)
@@ -229,7 +229,7 @@ impl Record {
         self.frame().map(|frame| PyBytes::new(py, frame.data()))
     }
 
-    /// `rx` or `tx`, of a frame.
+    /// `rx` or `tx`, for a frame.
     #[getter]
     fn direction(&self) -> Option<&'static str> {
         match self.0.event {
@@ -239,7 +239,7 @@ impl Record {
         }
     }
 
-    /// Whether the frame ended then or earlier.
+    /// Whether the time is only an upper bound: the frame ended then or earlier.
     #[getter]
     fn late(&self) -> bool {
         matches!(self.0.event, TraceEvent::Frame { late: true, .. })

@@ -1,4 +1,4 @@
-//! The compiled half of the package `cantap` for Python. `cantap/` beside it is what Python sees.
+//! The compiled half of the Python package `cantap`. Python users see the folder `cantap/` beside it.
 
 #![deny(unsafe_op_in_unsafe_fn)]
 

@@ -1,4 +1,4 @@
-//! Columns as NumPy takes them: bytes of one type, and which rows have a value.
+//! Columns for NumPy: bytes of one type, and which rows have a value.
 
 use arrow_array::cast::AsArray;
 use arrow_array::types::{
@@ -11,7 +11,8 @@ use pyo3::types::PyBytes;
 
 use crate::error::Error;
 
-/// Type in NumPy's words, bytes, the mask of rows without a value if there are any, texts that the numbers stand for, bytes per row.
+/// NumPy's name of the type, bytes, a mask of rows without a value if there are any, texts for the numbers if there are any, bytes
+/// per row.
 pub type Parts<'py> =
     (&'static str, Bound<'py, PyBytes>, Option<Bound<'py, PyBytes>>, Option<Vec<String>>, usize);
 
@@ -46,7 +47,7 @@ pub fn parts<'py>(py: Python<'py>, column: &dyn Array) -> Result<Parts<'py>, Err
             };
             Ok((kind, PyBytes::new(py, &bytes), mask, Some(texts), size))
         }
-        other => Err(Error::Format(format!("a column of {other} is none of NumPy's"))),
+        other => Err(Error::Format(format!("a column of {other} is not supported by NumPy"))),
     }
 }
 
@@ -55,7 +56,7 @@ fn bytes<T: ArrowPrimitiveType>(column: &dyn Array) -> Vec<u8> {
     values.values().inner().as_slice().to_vec()
 }
 
-/// Rows of one width, with zeros behind shorter ones.
+/// Rows of one width, padded with zeros.
 fn padded(column: &BinaryArray) -> (Vec<u8>, usize) {
     let width = column.iter().flatten().map(<[u8]>::len).max().unwrap_or(0);
     let mut rows = vec![0; width * column.len()];

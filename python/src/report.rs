@@ -1,4 +1,4 @@
-//! What became of a file: what was read of it, and what was not.
+//! What was read from a file, and what was not.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -8,7 +8,7 @@ use cantap_trace::{TraceEvent, TraceRecord};
 use pyo3::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// Faults are kept in words until it is clear that the whole file is one.
+/// How many faults are kept as text.
 const FAULTS_KEPT: usize = 20;
 
 /// The numbers.
@@ -33,7 +33,7 @@ pub struct Counts {
 }
 
 impl Counts {
-    /// Counts a record that is handed on.
+    /// Counts a record that is passed on.
     pub fn count(&mut self, record: &TraceRecord) {
         self.records += 1;
         match record.event {
@@ -57,20 +57,20 @@ impl Counts {
         }
     }
 
-    /// Takes over what the reader knows by now.
+    /// Takes over the reader's current counts.
     pub fn update(&mut self, reader: &TraceReader) {
         self.records_read = reader.records();
         self.left_out = by_kind(reader.left_out());
         self.notes = by_kind(reader.notes());
     }
 
-    /// The share of the file's entries that is missing, in per cent; an issue counts as one.
+    /// The percentage of the file's entries that is missing; an issue counts as one entry.
     pub fn missing_pct(&self) -> f64 {
         let missing = self.issues + self.left_out.values().sum::<u64>();
         missing as f64 * 100.0 / (self.records_read + missing).max(1) as f64
     }
 
-    /// What is wrong with the file, in words, if anything is.
+    /// What is wrong with the file, in words, if anything.
     pub fn warning(&self) -> Option<String> {
         let first = self.faults.first()?;
         let more = self.issues - 1;
@@ -89,18 +89,18 @@ pub fn by_kind(counts: &LeftOut) -> BTreeMap<String, u64> {
     counts.iter().map(|(what, count)| (what.to_owned(), count)).collect()
 }
 
-/// What was read of a file, and what could not be.
+/// What was read from a file, and what could not be read.
 #[pyclass(module = "cantap", frozen)]
 #[derive(Clone, Default)]
 pub struct Report(pub Arc<Mutex<Counts>>);
 
 impl Report {
-    /// As it is now.
+    /// The current counts.
     pub fn now(&self) -> Counts {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Says how many frames were decoded, and how many values they had.
+    /// Sets how many frames were decoded, and how many values they had.
     pub fn set_decoded(&self, (decoded, values): (u64, u64)) {
         let mut counts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         (counts.decoded, counts.values) = (decoded, values);
@@ -114,19 +114,19 @@ impl Report {
 
 #[pymethods]
 impl Report {
-    /// The file's name, as it was given.
+    /// The file's name, as given.
     #[getter]
     fn file(&self) -> String {
         self.now().file
     }
 
-    /// The format that it was read as.
+    /// The format as which it was read.
     #[getter]
     fn format(&self) -> String {
         self.now().format
     }
 
-    /// Records that the file had, before any filter.
+    /// Records in the file, before any filter.
     #[getter]
     fn records_read(&self) -> u64 {
         self.now().records_read
@@ -144,7 +144,7 @@ impl Report {
         self.now().frames
     }
 
-    /// Frames that the trace says are missing in it.
+    /// Frames that are missing according to the trace.
     #[getter]
     fn lost(&self) -> u64 {
         self.now().lost
@@ -156,13 +156,13 @@ impl Report {
         self.now().lost_at_least
     }
 
-    /// Bus errors, with those that were only counted.
+    /// Bus errors, including those that were only counted.
     #[getter]
     fn bus_errors(&self) -> u64 {
         self.now().bus_errors
     }
 
-    /// Frames that a database had a message for.
+    /// Frames that a database has a message for.
     #[getter]
     fn decoded(&self) -> u64 {
         self.now().decoded
@@ -192,32 +192,32 @@ impl Report {
         self.now().is_cut
     }
 
-    /// What is well-formed and no part of a CAN trace, by kind.
+    /// What is well-formed but not part of a CAN trace, by kind.
     #[getter]
     fn left_out(&self) -> BTreeMap<String, u64> {
         self.now().left_out
     }
 
-    /// What is nothing wrong and should be known all the same, by kind.
+    /// What is not wrong but should be known, by kind.
     #[getter]
     fn notes(&self) -> BTreeMap<String, u64> {
         self.now().notes
     }
 
-    /// The share of the file's entries that could not be read or are left out, in per cent.
+    /// The percentage of the file's entries that could not be read or were left out.
     #[getter]
     fn missing_pct(&self) -> f64 {
         self.now().missing_pct()
     }
 
-    /// Whether the file was read to its end and nothing of it is missing here.
+    /// Whether the file was read to its end and nothing of it is missing.
     #[getter]
     fn is_whole(&self) -> bool {
         let counts = self.now();
         counts.is_whole && counts.issues == 0
     }
 
-    /// All of it.
+    /// Everything as a dictionary.
     fn to_dict<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let counts = self.now();
         let mut object = serde_json::to_value(&counts).unwrap_or_default();
@@ -248,7 +248,7 @@ impl Report {
     }
 }
 
-/// What a JSON text says, as Python's own objects.
+/// The content of a JSON text, as Python objects.
 pub fn from_json<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyAny>> {
     py.import("json")?.call_method1("loads", (text,))
 }

@@ -16,7 +16,7 @@ use crate::report::{Counts, Report};
 use crate::source::{Options, TraceSource};
 use crate::table::{Table, stream_capsule};
 
-/// What rows are made of.
+/// What the rows contain.
 enum Columns {
     Frames(Box<FrameColumns>),
     Values { table: Box<SignalColumns>, decoder: Arc<Decoder>, values: Vec<SignalValue>, chosen: bool },
@@ -69,7 +69,7 @@ impl Columns {
                     return None;
                 };
                 let message = decoder.decode(record.channel, frame, values)?;
-                // Chosen signals only: a message without any of them counts for nothing.
+                // With chosen signals only, a message without any of them is not counted.
                 if values.is_empty() && *chosen {
                     return None;
                 }
@@ -80,11 +80,11 @@ impl Columns {
     }
 }
 
-/// Records that become batches.
+/// Turns records into batches.
 pub struct Pipeline {
     source: TraceSource,
     columns: Columns,
-    /// What was read and is not in a batch: those before `at` are.
+    /// Records read but not yet in a batch; those before `at` are.
     waiting: Vec<TraceRecord>,
     at: usize,
     batch_rows: usize,
@@ -101,7 +101,7 @@ impl Pipeline {
         Ok(Self { source, columns, waiting: Vec::new(), at: 0, batch_rows, ended: false })
     }
 
-    /// The next batch: of as many rows as were asked for, or one frame's values more; fewer at the end.
+    /// The next batch: with as many rows as requested, or up to one frame's values more; fewer at the end.
     fn next(&mut self) -> Result<Option<RecordBatch>, Error> {
         while !self.ended {
             if self.at == self.waiting.len() {
@@ -134,17 +134,17 @@ pub struct Scan {
     state: Mutex<State>,
 }
 
-/// Where a scan is.
+/// The state of a scan.
 enum State {
     /// Between two batches.
     Ready(Box<Pipeline>),
-    /// A thread makes a batch.
+    /// A thread is making a batch.
     Busy,
-    /// At its end, closed, or given away.
+    /// At its end, closed, or handed over.
     Ended,
 }
 
-/// Says what could not be read, as a Python warning.
+/// Reports what could not be read, as a Python warning.
 pub fn warn(py: Python<'_>, report: &Report) -> PyResult<()> {
     let Some(text) = report.now().warning() else { return Ok(()) };
     let text = std::ffi::CString::new(text.replace('\0', " "))?;
@@ -152,7 +152,7 @@ pub fn warn(py: Python<'_>, report: &Report) -> PyResult<()> {
 }
 
 impl Scan {
-    /// Takes what reads the file; none at the end.
+    /// Takes the pipeline; `None` at the end.
     fn take(&self) -> PyResult<Option<Box<Pipeline>>> {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         match std::mem::replace(&mut *state, State::Busy) {
@@ -175,7 +175,7 @@ impl Scan {
         let Some(mut pipeline) = self.take()? else { return Ok(None) };
         let batch = py.detach(|| {
             let batch = pipeline.next();
-            // With an error, and at the end, the file is closed.
+            // After an error, and at the end, the file is closed.
             self.put_back(if matches!(batch, Ok(Some(_))) { State::Ready(pipeline) } else { State::Ended });
             batch
         })?;
@@ -197,7 +197,7 @@ impl Scan {
         Ok(Self { schema, report: Py::new(py, report)?, state: Mutex::new(State::Ready(Box::new(pipeline))) })
     }
 
-    /// What was read so far, and what could not be.
+    /// What was read so far, and what could not be read.
     #[getter]
     fn report(&self, py: Python<'_>) -> Py<Report> {
         self.report.clone_ref(py)
@@ -209,7 +209,7 @@ impl Scan {
         PyTuple::new(py, self.schema.fields().iter().map(|field| field.name()))
     }
 
-    /// All that is left, as one table.
+    /// The rest, as one table.
     fn read_all(&self, py: Python<'_>) -> PyResult<Table> {
         let mut batches = Vec::new();
         while let Some(batch) = self.next_batch(py)? {
@@ -268,7 +268,7 @@ impl Scan {
     }
 }
 
-/// The rest of a scan, for whoever takes it.
+/// The rest of a scan, handed over to a consumer.
 struct Stream {
     pipeline: Box<Pipeline>,
     schema: SchemaRef,
@@ -286,7 +286,7 @@ impl Iterator for Stream {
             Ok(Some(batch)) => Some(Ok(batch)),
             Ok(None) => {
                 self.ended = true;
-                // Whoever calls may not hold Python's lock, so that a warning of Python's is out of the question.
+                // The caller may not hold Python's lock, so a Python warning is impossible.
                 if let Some(text) = self.pipeline.source.counts.warning() {
                     eprintln!("cantap: {text}");
                 }

@@ -1,4 +1,4 @@
-//! The records of a trace file that were asked for.
+//! The requested records of a trace file.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -14,7 +14,7 @@ use crate::database::Database;
 use crate::error::Error;
 use crate::report::{Counts, Report};
 
-/// What to read of a file, as Python's half hands it over.
+/// What to read from a file, as passed by the Python half.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct Options {
@@ -31,7 +31,7 @@ pub struct Options {
 }
 
 impl Options {
-    /// What decodes, if a database was given.
+    /// The decoder, if a database was given.
     pub fn decoder(&self) -> Result<Option<Arc<Decoder>>, Error> {
         match &self.db {
             Some(database) => database.get().selecting(&self.signals).map(Some),
@@ -65,7 +65,7 @@ pub struct TraceSource {
 }
 
 impl TraceSource {
-    /// Opens the file. How it goes is told to the report.
+    /// Opens the file. Progress is recorded in the report.
     pub fn open(options: &Options, report: Report) -> Result<Self, Error> {
         let read = options.read()?;
         let filters =
@@ -90,7 +90,7 @@ impl TraceSource {
         Ok(Self { reader, strict: options.strict, filters, channels, window, is_all, counts, report })
     }
 
-    /// Puts the next records in the place of what is in `records`, perhaps none; false at the end.
+    /// Replaces the content of `records` with the next ones, perhaps none; false at the end.
     pub fn next_batch(&mut self, records: &mut Vec<TraceRecord>) -> Result<bool, Error> {
         loop {
             match self.reader.next_batch(records) {
@@ -104,7 +104,7 @@ impl TraceSource {
                 }
                 Some(Err(issue)) => {
                     self.counts.fault(&issue);
-                    // Of a file that the system stops to deliver nobody may think that this was all.
+                    // If the system stops delivering a file, nobody must think that this was all of it.
                     if self.strict || matches!(issue.fault, Fault::Io(_)) {
                         self.tell();
                         return Err(issue.into());
@@ -133,7 +133,7 @@ impl TraceSource {
         }
         let Self { filters, channels, window, .. } = self;
         records.retain(|record| {
-            // The window's first record is the trace's, whatever the channel.
+            // The window starts at the trace's first record, whatever its channel.
             let inside = window.contains(record);
             inside
                 && (channels.is_empty() || channels.contains(&record.channel))

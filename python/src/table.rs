@@ -23,7 +23,7 @@ const STREAM: &CStr = c"arrow_array_stream";
 const SCHEMA: &CStr = c"arrow_schema";
 const ARRAY: &CStr = c"arrow_array";
 
-/// What pickle makes a table of again.
+/// What pickle needs to rebuild a table.
 type Reduced<'py> = (Py<PyAny>, (Bound<'py, PyBytes>, Option<Py<Report>>));
 
 /// A table in memory, in one or several batches.
@@ -39,12 +39,12 @@ fn arrow_error(error: ArrowError) -> PyErr {
 }
 
 impl Table {
-    /// Of batches that have this schema, and what is to be said about their source.
+    /// From batches with this schema, and the report about their source.
     pub fn new(schema: SchemaRef, batches: Vec<RecordBatch>, report: Option<Py<Report>>) -> Self {
         Self { schema, batches, report }
     }
 
-    /// One batch.
+    /// From a single batch.
     pub fn of_batch(batch: RecordBatch) -> Self {
         Self { schema: batch.schema(), batches: vec![batch], report: None }
     }
@@ -56,7 +56,7 @@ impl Table {
 
 #[pymethods]
 impl Table {
-    /// How many rows there are.
+    /// The number of rows.
     #[getter]
     fn num_rows(&self) -> usize {
         self.rows()
@@ -68,7 +68,7 @@ impl Table {
         PyTuple::new(py, self.schema.fields().iter().map(|field| field.name()))
     }
 
-    /// What is known about a column beside its values: its unit, its description.
+    /// Metadata of a column: its unit, its description.
     fn column_metadata<'py>(&self, py: Python<'py>, name: &str) -> PyResult<Bound<'py, PyDict>> {
         let field = self.schema.field_with_name(name).map_err(|_| self.no_column(name))?;
         let about = PyDict::new(py);
@@ -78,7 +78,7 @@ impl Table {
         Ok(about)
     }
 
-    /// What is known about the table beside its columns: of which message it is, for example.
+    /// Metadata of the table: for example, its message.
     #[getter]
     fn metadata<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let about = PyDict::new(py);
@@ -88,7 +88,7 @@ impl Table {
         Ok(about)
     }
 
-    /// What was read, and what could not be; `None` for a table that came from nowhere else.
+    /// What was read, and what could not be read; `None` for a table that was not read from anywhere.
     #[getter]
     fn report(&self, py: Python<'_>) -> Option<Py<Report>> {
         self.report.as_ref().map(|report| report.clone_ref(py))
@@ -99,7 +99,7 @@ impl Table {
         self.batches.iter().cloned().map(Self::of_batch).collect()
     }
 
-    /// A column as NumPy takes it, for Python's half.
+    /// A column's parts for NumPy, for the Python half.
     fn _parts<'py>(&self, py: Python<'py>, name: &str) -> PyResult<Parts<'py>> {
         let batch = self.one_batch()?;
         let column = batch.column_by_name(name).ok_or_else(|| self.no_column(name))?;
@@ -107,22 +107,22 @@ impl Table {
     }
 
     /// The columns as NumPy arrays, by name: times as datetime64, texts as objects, data bytes as a row of numbers for each frame.
-    /// What has no value is masked.
+    /// Missing values are masked.
     fn to_numpy<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
         slf.py().import("cantap._arrays")?.call_method1("to_numpy", (slf,))
     }
 
-    /// The same table as pyarrow's.
+    /// The same table for pyarrow.
     fn to_pyarrow<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
         slf.py().import("pyarrow")?.call_method1("table", (slf,))
     }
 
-    /// The same table as pandas'.
+    /// The same table for pandas.
     fn to_pandas<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
         Self::to_pyarrow(slf)?.call_method0("to_pandas")
     }
 
-    /// The same table as Polars'.
+    /// The same table for Polars.
     fn to_polars<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
         slf.py().import("polars")?.call_method1("DataFrame", (slf,))
     }
@@ -146,7 +146,7 @@ impl Table {
         py: Python<'py>,
         requested_schema: Option<Bound<'py, PyAny>>,
     ) -> PyResult<Bound<'py, PyCapsule>> {
-        // Whoever asks for other types casts: the interface leaves it open.
+        // Consumers that want other types convert: the interface allows that.
         drop(requested_schema);
         let batches = self.batches.clone().into_iter().map(Ok);
         stream_capsule(py, Box::new(RecordBatchIterator::new(batches, Arc::clone(&self.schema))))
@@ -191,7 +191,7 @@ impl Table {
         PyValueError::new_err(format!("there is no column '{name}'; there are {}", names.join(", ")))
     }
 
-    /// All rows in one piece; nothing is copied if they are already.
+    /// All rows in one batch; nothing is copied if they already are.
     pub fn one_batch(&self) -> PyResult<RecordBatch> {
         match self.batches.as_slice() {
             [batch] => Ok(batch.clone()),
@@ -200,13 +200,13 @@ impl Table {
     }
 }
 
-/// The columns, for whoever takes them.
+/// The schema as a capsule.
 pub fn schema_capsule<'py>(py: Python<'py>, schema: &SchemaRef) -> PyResult<Bound<'py, PyCapsule>> {
     let schema = FFI_ArrowSchema::try_from(schema.as_ref()).map_err(arrow_error)?;
     PyCapsule::new_with_value(py, schema, SCHEMA)
 }
 
-/// A stream of batches, for whoever takes it.
+/// A stream of batches as a capsule.
 pub fn stream_capsule(
     py: Python<'_>,
     reader: Box<dyn RecordBatchReader + Send>,
@@ -214,7 +214,7 @@ pub fn stream_capsule(
     PyCapsule::new_with_value(py, FFI_ArrowArrayStream::new(reader), STREAM)
 }
 
-/// The batches of whatever has some: a table of this package, of pyarrow, pandas, Polars, DuckDB.
+/// The batches of anything that has some: a table of this package, of pyarrow, pandas, Polars, DuckDB.
 pub fn batches_of(object: &Bound<'_, PyAny>) -> PyResult<Box<dyn RecordBatchReader + Send>> {
     if let Ok(table) = object.cast::<Table>() {
         let table = table.get();
@@ -229,8 +229,8 @@ pub fn batches_of(object: &Bound<'_, PyAny>) -> PyResult<Box<dyn RecordBatchRead
     };
     let capsule = export.call0()?.cast_into::<PyCapsule>()?;
     let pointer = capsule.pointer_checked(Some(STREAM))?.cast::<FFI_ArrowArrayStream>();
-    // SAFETY: the name says that the capsule has an initialised stream, which the interface lets its one consumer take. What
-    // is left behind is marked as released, which the capsule's destructor looks at.
+    // SAFETY: the name says that the capsule has an initialised stream, which the interface lets its only consumer take. The
+    // original is then marked as released, which the capsule's destructor checks.
     let reader = unsafe { RecordBatchStreamReader::from_raw(pointer.as_ptr()) };
     Ok(Box::new(reader.map_err(arrow_error)?))
 }

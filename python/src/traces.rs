@@ -1,4 +1,4 @@
-//! What is done with a whole trace.
+//! Operations on a whole trace.
 
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
@@ -24,7 +24,7 @@ use crate::scan::warn;
 use crate::source::{Options, TraceSource};
 use crate::table::{Table, batches_of};
 
-/// Goes through a trace; Ctrl-C ends it.
+/// Reads a trace to the end; Ctrl-C stops it.
 fn walk(
     py: Python<'_>,
     options: &Options,
@@ -45,7 +45,7 @@ fn walk(
     warn(py, report)
 }
 
-/// Statistics of a trace, as `cantap stats --json` has them.
+/// Statistics of a trace, as from `cantap stats --json`.
 #[pyfunction]
 pub fn stats(
     py: Python<'_>,
@@ -61,7 +61,7 @@ pub fn stats(
         rates.iter().filter_map(|(channel, rate)| Some(((*channel)?, *rate))).collect::<Vec<_>>()
     };
     let window = Duration::try_from_secs_f64(window_s);
-    let window = window.map_err(|_| Error::argument(format!("{window_s} s is no length of a window")))?;
+    let window = window.map_err(|_| Error::argument(format!("{window_s} s is not a valid window length")))?;
     let statistics = Statistics::new(StatOptions {
         bitrate_bps: all(&bitrates),
         channel_bitrate_bps: of_channels(&bitrates),
@@ -85,20 +85,20 @@ pub fn stats(
     from_json(py, &summary.to_string())
 }
 
-/// Records that become a table for each message, and one of what happened beside frames.
+/// Turns records into a table for each message, and one for events other than frames.
 struct PerMessage {
     decoder: Arc<Decoder>,
-    /// Of chosen signals only: a message without any of them counts for nothing.
+    /// Only chosen signals: a message without any of them is not counted.
     chosen: Option<Selection>,
     /// By [`MessageRef::index`](cantap_signals::MessageRef::index).
     tables: Vec<Option<Box<MessageColumns>>>,
     events: FrameColumns,
     values: Vec<SignalValue>,
-    /// Frames of messages.
+    /// Number of decoded frames.
     decoded: u64,
 }
 
-/// What Python's half makes a mapping of: tables by name, and the events.
+/// The Python half makes a mapping of these: tables by name, and the events.
 type Tables = (Vec<(String, Table)>, Table);
 
 impl PerMessage {
@@ -125,7 +125,7 @@ impl PerMessage {
         let table = &mut tables[reference.index()];
         let table = table.get_or_insert_with(|| Box::new(MessageColumns::new(decoder, reference)));
         if chosen.is_some() && !table.has_value(frame) {
-            // Whether it has one of the signals depends on its bytes.
+            // It depends on its bytes whether it has one of the signals.
             values.clear();
             decoder.decode_data(reference, frame.data(), values);
             if values.is_empty() {
@@ -138,7 +138,7 @@ impl PerMessage {
         *decoded += 1;
     }
 
-    /// How many frames were decoded, and how many values they had.
+    /// The number of decoded frames, and of values in them.
     fn counts(&mut self) -> (u64, u64) {
         (self.decoded, self.tables.iter_mut().flatten().map(|table| table.values()).sum())
     }
@@ -148,7 +148,7 @@ impl PerMessage {
     }
 }
 
-/// A trace as a table for each message, and one of what happened beside frames.
+/// A trace as a table for each message, and one for events other than frames.
 #[pyfunction]
 pub fn decode(py: Python<'_>, options: Options) -> PyResult<(Tables, Py<Report>)> {
     let decoder =
@@ -163,7 +163,7 @@ pub fn decode(py: Python<'_>, options: Options) -> PyResult<(Tables, Py<Report>)
     Ok((tables.finish(), Py::new(py, report)?))
 }
 
-/// The same of a table of records.
+/// The same for a table of records.
 #[pyfunction]
 pub fn decode_table(
     py: Python<'_>,
@@ -184,7 +184,8 @@ pub fn decode_table(
     Ok(tables.finish())
 }
 
-/// The tables by their messages' names, in the database's order. Of two with one name the later has its identifier behind it.
+/// The tables by their messages' names, in the database's order. If two have the same name, the identifier is appended to the
+/// later one.
 fn named(
     decoder: &Decoder,
     mut tables: Vec<Option<Box<MessageColumns>>>,
@@ -208,7 +209,7 @@ fn named(
     named
 }
 
-/// The columns of time, channel and identifier, and those of the chosen signals.
+/// The columns for time, channel and identifier, and those of the chosen signals.
 fn only(batch: &RecordBatch, message: &Message, chosen: &Selection) -> RecordBatch {
     let left_out: HashSet<_> = message
         .signals
@@ -220,11 +221,11 @@ fn only(batch: &RecordBatch, message: &Message, chosen: &Selection) -> RecordBat
     let kept: Vec<_> = (0..schema.fields().len())
         .filter(|at| *at < 3 || !left_out.contains(schema.field(*at).name()))
         .collect();
-    // Cannot fail: all of these are there.
+    // This cannot fail: all of these exist.
     batch.project(&kept).unwrap_or_else(|_| batch.clone())
 }
 
-/// The records that are looked for, each with its place in the trace.
+/// The records that match, each with its position in the trace.
 #[pyfunction]
 pub fn search(
     py: Python<'_>,
@@ -276,7 +277,8 @@ pub fn no_records() -> Table {
     Table::of_batch(FrameColumns::default().take())
 }
 
-/// Writes a table of records as a trace. An older file of its name stays as it is until this one is whole.
+/// Writes a table of records as a trace. An older file with its name stays unchanged until this one is
+/// complete.
 #[pyfunction]
 pub fn write<'py>(
     py: Python<'py>,
@@ -286,7 +288,7 @@ pub fn write<'py>(
     zone: Option<String>,
 ) -> PyResult<Bound<'py, PyAny>> {
     let batches = batches_of(table)?;
-    // Before anything is created; a table without rows must be one of records, too.
+    // Check this before creating anything; a table without rows must also be one of records.
     cantap_columns::records(&RecordBatch::new_empty(batches.schema())).map_err(Error::from)?;
     let is_parquet = path.extension().is_some_and(|suffix| suffix.eq_ignore_ascii_case("parquet"));
     let left_out = py.detach(|| -> Result<_, Error> {
@@ -329,7 +331,7 @@ fn write_trace(
     mut options: WriteOptions,
 ) -> Result<LeftOut, Error> {
     let failed = |error: io::Error| match error.kind() {
-        // No format of the name, or one that is only read.
+        // The name indicates no format, or one that can only be read.
         io::ErrorKind::InvalidInput | io::ErrorKind::Unsupported => Error::Format(error.to_string()),
         _ => Error::of_file(error, path),
     };
@@ -337,7 +339,7 @@ fn write_trace(
         options.format =
             Some(cantap_formats::Format::of_path(path).map_err(|error| Error::Format(error.to_string()))?);
     }
-    // A pipe or a device is written itself.
+    // A pipe or a device is written to directly.
     let is_file = !path.exists() || path.is_file();
     let temporary = if is_file { Temporary::beside(path).map_err(failed)? } else { None };
     let written = temporary.as_ref().map_or(path, |temporary| &temporary.0);
@@ -349,14 +351,15 @@ fn write_trace(
     }
     let left_out = writer.finish().map_err(failed)?;
     if let Some(temporary) = &temporary {
-        // A link stays a link.
+        // A link remains a link.
         let place = path.canonicalize().unwrap_or_else(|_| path.to_owned());
         fs::rename(&temporary.0, place).map_err(failed)?;
     }
     Ok(left_out)
 }
 
-/// A file that is removed if it is still there at the end. It ends like the other, so that it has its format and compression.
+/// A file that is removed on drop if it still exists. Its suffix is that of the final file, which determines format and
+/// compression.
 struct Temporary(PathBuf);
 
 impl Temporary {

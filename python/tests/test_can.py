@@ -88,7 +88,7 @@ def test_errors_are_error_frames_as_socketcan_has_them():
     with can.Bus(interface="cantap", channel="virtual:load=50,errors=20", bitrate=500_000, listen_only=True) as bus:
         errors = [found for found in (bus.recv(1) for _ in range(2000)) if found.is_error_frame]
     assert errors and all(error.dlc == 8 for error in errors)
-    # linux/can/error.h: 0x80 is a bus error, 0x04 a problem of the controller.
+    # linux/can/error.h: 0x80 is a bus error, 0x04 a controller problem.
     assert any(error.arbitration_id & 0x80 for error in errors)
 
 

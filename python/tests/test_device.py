@@ -19,7 +19,7 @@ QUIET = "virtual:load=0,wire=joined"
 
 @pytest.fixture
 def pair():
-    """Both channels on one bus, and nobody else."""
+    """Both channels on one bus, without any other node."""
     with cantap.open(QUIET, 500_000, mode="normal") as device:
         yield device
 

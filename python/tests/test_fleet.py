@@ -1,6 +1,6 @@
 """The fleet's job on a Spark cluster of two worker processes: `python/examples/fleet`.
 
-Needs Java 17 and what `python/examples/fleet/requirements.txt` names; without pyspark it is skipped, and says so.
+Needs Java 17 and the packages in `python/examples/fleet/requirements.txt`; without pyspark it is skipped, and says so.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from pyspark.sql import SparkSession
 
 VEHICLES = 20
 TRACES_EACH = 10
-#: 2026-03-01 22:59:59 UTC: every trace goes over an hour, those of every fourth vehicle over midnight.
+#: 2026-03-01 22:59:59 UTC: every trace crosses a full hour, those of every fourth vehicle cross midnight.
 BEGIN_US = 1_772_405_999_000_000
 STEP_US = 10_000
 STEPS = 200
@@ -58,7 +58,7 @@ FACTORS = {"a": 0.01, "b": 0.05}
 
 @dataclass
 class Sent:
-    """A frame, as the generator knows it."""
+    """A frame in the generator."""
 
     time_us: int
     channel: int
@@ -94,7 +94,7 @@ def candump(frames: list[Sent]) -> str:
 
 
 def write(path: Path, frames: list[Sent]) -> None:
-    """By python-can, where it is no text of candump's."""
+    """Written by python-can, unless it is a candump text."""
     if path.name.endswith(".log"):
         path.write_text(candump(frames))
     elif path.name.endswith(".gz"):
@@ -117,9 +117,9 @@ def write(path: Path, frames: list[Sent]) -> None:
 @dataclass
 class Fleet:
     folder: Path
-    #: Of traces that are whole, what the generator put in.
+    #: For complete traces, what the generator put in.
     whole: dict[str, list[Sent]]
-    #: Of the others, the state that they must have, and the frames: none where that is not known to the frame.
+    #: For the others, the state that they must have, and the number of frames: `None` if that is not known exactly.
     broken: dict[str, tuple[str, int | None]]
 
     @property
@@ -150,7 +150,7 @@ def fleet(tmp_path_factory):
     table.append("baddb,,databases/broken.dbc,500000")
     (folder / "vehicles.csv").write_text("\n".join(table) + "\n")
     broken = break_some(folder)
-    # Not hidden from us, as it would be from Spark's own sources.
+    # We see it, although Spark's own sources would hide it.
     whole["odd/_begins with a line.log"] = frames_of(2, 1)
     write(folder / "odd" / "_begins with a line.log", whole["odd/_begins with a line.log"])
     return Fleet(folder, whole, broken)
@@ -184,7 +184,7 @@ def break_some(folder: Path) -> dict[str, tuple[str, int | None]]:
     put("odd/empty.log", b"", "empty", 0)
     put("in no folder.log", text.encode(), "refused", 0)
     put("baddb/drive.log", text.encode(), "refused", 0)
-    # Whoever opens it waits for somebody to write.
+    # Opening it waits for somebody to write.
     os.mkfifo(folder / "odd" / "hangs.log")
     broken["odd/hangs.log"] = ("failed", 0)
     return broken
@@ -198,7 +198,7 @@ def spark():
         .appName("test_fleet")
         .config("spark.sql.session.timeZone", "UTC")
         .config("spark.sql.shuffle.partitions", "2")
-        # A cluster for a minute: compiling code well takes longer than running it, and folders are listed faster than tasks begin.
+        # A cluster for a minute: optimising compilation takes longer than running the code, and listing folders is faster than starting tasks.
         .config("spark.driver.extraJavaOptions", "-XX:TieredStopAtLevel=1 -XX:+UseSerialGC")
         .config("spark.executor.extraJavaOptions", "-XX:TieredStopAtLevel=1 -XX:+UseSerialGC")
         .config("spark.sql.sources.parallelPartitionDiscovery.threshold", "10000")
@@ -222,7 +222,7 @@ def output(spark, fleet, tmp_path_factory):
 
 
 def rows_in(output: Path, part: str) -> pa.Table:
-    """The rows of a part, in an order that does not depend on how they lie in files."""
+    """The rows of a part, in an order that does not depend on how they are stored in files."""
     partitions = pa.dataset.partitioning(
         pa.schema([("vehicle", pa.string()), ("day", pa.string()), ("channel", pa.int16())]), flavor="hive"
     )
@@ -254,7 +254,7 @@ def test_each_input_has_an_entry_that_says_what_became_of_it(fleet, output):
     assert ledger["odd/damaged.log"]["issues"] == 3
     assert "databases/broken.dbc" in ledger["baddb/drive.log"]["problem"]
     assert "within 10 s" in ledger["odd/hangs.log"]["problem"]
-    # Names as the user has them, nothing of a worker's folders.
+    # Names as the user gave them, without a worker's folders.
     assert all(str(fleet.folder) not in str(entry) and "/tmp" not in str(entry) for entry in ledger.values())
 
 
@@ -280,7 +280,7 @@ def test_every_frame_is_in_the_dataset_once_as_it_was_sent(fleet, output):
 
 
 def test_values_are_those_of_each_vehicles_own_database(spark, fleet, output):
-    # What half of the vehicles send would be another speed by the other's database.
+    # What half of the vehicles send would be a different speed with the other database.
     found = spark.sql(
         "SELECT trace, count(*) AS rows, min(value) AS low, max(value) AS high FROM signals "
         "WHERE signal = 'VehicleSpeed' GROUP BY trace"
@@ -312,9 +312,9 @@ def test_a_condition_is_found_with_a_second_before_and_after(spark, output):
     assert len({row["began"] for row in rows}) == 1
     assert rows[0]["seconds"] == pytest.approx(0.1, abs=1e-3)
     speeds = [row for row in rows if row["signal"] == "VehicleSpeed"]
-    # 1 s before is 100 steps, 0.1 s that it held, 1 s after: up to the step at which it is over, and what is left of the trace.
+    # 100 steps for the 1 s before, 0.1 s during which it held, 1 s after: up to the step at which it is over, and the rest of the trace.
     assert len(speeds) == STEPS and sum(row["value"] > 120 for row in speeds) == 10
-    # The frame after the last that held ends the place; nothing holds at this limit.
+    # The frame after the last one for which it held ends the place; at this limit nothing holds.
     assert questions.ask(spark, "condition", {"speed": 150.0}).count() == 0
     everywhere = questions.ask(spark, "condition", {"speed": 99.0, "pressure": 1.0})
     assert everywhere.select("trace").distinct().count() >= VEHICLES * TRACES_EACH
@@ -328,7 +328,7 @@ def test_the_load_of_a_vehicle_and_hour_is_between_its_bounds(spark, output):
     # 100 frames of 47 + 64 bits and 50 of 67 + 64 in 0.991 s, at 500 kbit/s.
     assert one["recorded_s"] == pytest.approx(0.99, abs=0.001) and one["frames"] == 150
     assert one["load_at_least_pct"] == pytest.approx(100 * (100 * 111 + 50 * 131) / 500_000 / 0.99, rel=1e-3)
-    # One byte: 34 + 8 bits can be stuffed, 10 times at most.
+    # One byte: 34 + 8 bits are subject to stuffing, with at most 10 stuff bits.
     assert other["load_at_least_pct"] == pytest.approx(100 * 100 * 55 / 250_000 / 0.99, rel=1e-3)
     assert other["load_at_most_pct"] == pytest.approx(100 * 100 * 65 / 250_000 / 0.99, rel=1e-3)
 
@@ -360,7 +360,7 @@ def descendants() -> dict[int, tuple[int, str]]:
 
 
 class Killer(threading.Thread):
-    """Ends one process of each kind with SIGKILL, as soon as it is there and at work."""
+    """Ends one process of each kind with SIGKILL, as soon as it exists and is working."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
@@ -402,7 +402,7 @@ def test_a_second_run_with_workers_killed_gives_the_same_rows(spark, fleet, outp
 
 
 def test_traces_come_from_any_file_system_that_spark_has(spark, fleet, output, tmp_path):
-    # A file system of Hadoop's that Python knows nothing of: what is read comes through Spark.
+    # A Hadoop file system that Python cannot access: everything is read through Spark.
     few = tmp_path / "few"
     for name in ("001/drive 0.blf", "002/drive 0.asc", "odd/cut.log", "odd/_begins with a line.log"):
         (few / name).parent.mkdir(parents=True, exist_ok=True)
@@ -428,7 +428,7 @@ def test_spark_reads_what_the_command_calls_parquet(spark, fleet, tmp_path):
     trace, database = fleet.folder / "001/drive 0.blf", fleet.folder / "databases/b.dbc"
     subprocess.run([program, "convert", trace, tmp_path / "f.parquet"], check=True)
     subprocess.run([program, "decode", "--db", database, trace, "-o", tmp_path / "s.parquet"], check=True)
-    # Spark has no nanoseconds, and says so unless it is told to take them for numbers.
+    # Spark has no nanoseconds, and fails unless it is configured to read them as numbers.
     with pytest.raises(Exception, match="NANOS"):
         spark.read.parquet(str(tmp_path / "f.parquet"))
     spark.conf.set("spark.sql.legacy.parquet.nanosAsLong", "true")
@@ -502,7 +502,7 @@ def test_rows_that_are_missing_or_twice_are_noticed(spark, fleet, output, tmp_pa
 
 
 def test_no_column_of_the_package_is_left_out(fleet):
-    """A column that the package gets and the job does not know would be lost in silence."""
+    """A column added to the package but unknown to the job would be silently lost."""
     trace, database = fleet.folder / "001/drive 0.blf", fleet.folder / "databases/b.dbc"
     assert set(cantap.scan(trace).column_names) <= set(columns.FRAMES)
     assert set(cantap.scan(trace, db=database).column_names) <= set(columns.SIGNALS)

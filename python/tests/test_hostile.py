@@ -1,4 +1,4 @@
-"""What a program does wrong, or has done to it: each time a Python exception, never an abort or a hang."""
+"""What a program does wrong, or what happens to it: always a Python exception, never an abort or a hang."""
 
 import copy
 import os
@@ -32,9 +32,9 @@ def dbc(tmp_path):
 
 
 WRONG = [None, 5, -1, 2**70, 1.5, float("nan"), b"\xff\x00", "", "no such thing", [], [None], {}, {1: None}, {0: "x"}, object(), [[]]]
-"""What somebody may hand over by mistake."""
+"""Objects that may be passed by mistake."""
 CLEAN = (TypeError, ValueError, OverflowError, OSError, cantap.CantapError)
-"""What may come of it, if not a result."""
+"""The exceptions that this may raise."""
 
 
 @pytest.mark.parametrize(

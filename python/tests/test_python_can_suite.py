@@ -10,8 +10,8 @@ import pytest
 
 SOURCE = os.environ.get("CANTAP_PYTHON_CAN_SOURCE")
 
-# Each file, what of it is for any interface, and how many tests pass at least. In the first two, python-can leaves out one test
-# that measures time where the variable `CI` says that nobody is watching.
+# Each file, the part of it that applies to any interface, and the least number of tests that pass. In the first two,
+# python-can leaves out one test that measures time if the variable `CI` is set.
 TESTS = [
     # `unique` opens a third bus, and there are two channels; the second object of a channel does not hear the first one's frames.
     ("back2back_test.py", "Back2BackTestCase and not unique", 10),

@@ -1,4 +1,4 @@
-"""Analysers of other computers: through a real ssh, and over TLS. The server is the command `cantap`, which `CANTAP_COMMAND` names."""
+"""Analysers on other computers: through a real ssh, and over TLS. The server is the command `cantap`, named by `CANTAP_COMMAND`."""
 
 import os
 import pathlib
@@ -83,7 +83,7 @@ def test_without_the_right_keys_tls_lets_nobody_in(tls, keys, tmp_path, monkeypa
 
 @pytest.fixture
 def ssh(tmp_path, monkeypatch):
-    """An ssh server of this computer with keys of its own, and `CANTAP_SSH` as the way to it."""
+    """An ssh server on this computer with its own keys, which `CANTAP_SSH` connects to."""
     sshd = pathlib.Path("/usr/sbin/sshd")
     if not sshd.exists() or not pathlib.Path("/usr/bin/ssh").exists():
         pytest.skip("there is no ssh and sshd; on Debian run `apt-get install openssh-server`")
@@ -105,7 +105,7 @@ def ssh(tmp_path, monkeypatch):
     program.write_text(f'#!/bin/sh\nexec /usr/bin/ssh -F {tmp_path}/client "$@"\n')
     program.chmod(0o755)
     if os.getuid() == 0:
-        # Where it confines itself; a package's own start makes it otherwise.
+        # The folder to which it confines itself; a package's own start script creates it otherwise.
         os.makedirs("/run/sshd", exist_ok=True)
     with (tmp_path / "log").open("w") as log:
         server = subprocess.Popen([sshd, "-D", "-e", "-f", tmp_path / "server"], stderr=log)

@@ -1,4 +1,4 @@
-"""What is done with a whole trace."""
+"""Operations on a whole trace."""
 
 import os
 

@@ -6,8 +6,8 @@ cache=$1
 share=$2
 # shellcheck source=/dev/null
 . "$share/ports"
-# The kernel tests the timer against a loop, which fails where this computer is busy: no_timer_check.
-# A guest that hangs ends after LIMIT seconds.
+# The kernel tests the timer against a loop, which fails when this computer is busy: hence no_timer_check.
+# A guest that hangs is ended after LIMIT seconds.
 exec timeout "${LIMIT:-900}" qemu-system-x86_64 \
   -machine q35 -accel tcg,thread=multi -cpu max -smp 1 -m 1024 \
   -nodefaults -no-user-config -display none -no-reboot \

@@ -31,7 +31,7 @@ done
 
 bash "$here/boot.sh" "$cache" "$share" 2>&1 | stdbuf -oL tr -d '\r' | tee "$work/output" || true
 
-# The board must have lived through all of it.
+# The board must have survived all of it.
 if ! kill -0 "$server" 2>/dev/null; then
   echo "FAIL  the server ended: $(cat "$work/server.err")"
   exit 1

@@ -1,4 +1,4 @@
-//! What follows `emu:` in a device's address: the firmware's file, and options behind commas.
+//! What follows `emu:` in a device's address: the firmware's file, and options after commas.
 
 use std::path::PathBuf;
 
@@ -12,20 +12,19 @@ use crate::link::{EmulatedPort, Manner, Pace, ServeError};
 use crate::run::{DEFAULT_BITRATE_BPS, Load, Options, replay};
 use cantap_emu::traffic::{Kind, parse_log};
 
-/// Traffic that leaves the emulation close to real time.
+/// A load at which the emulation stays close to real time.
 const DEFAULT_LOAD_PERCENT: f64 = 20.0;
-/// A crystal is not off by more than this; a USB host's frames may not be either (USB 2.0, 7.1.12: 500 ppm).
+/// No crystal is off by more than this, and a USB host's frames must not be either (USB 2.0, 7.1.12: 500 ppm).
 const MOST_PPM: f64 = 500.0;
 
 /// An emulated device: `FILE.elf`, or `FILE.elf,load=50,frames=std8,bitrate=500000,seed=7`.
 ///
-/// Keys: `load` (per cent), `frames` (`std0` `std8` `ext0` `ext8` `rtr` `mix`), `burst` (`10/960us`: frames in a burst,
-/// and its period), `bitrate` (bit/s; by default that of whoever opens the channel), `channels` (`1`, `2` or `both`:
-/// those with traffic), `ack` (`yes`, `no`: whether the simulated nodes acknowledge),
-/// `errors` (per cent of the frames destroyed), `seed`, `ppm` (how much too fast the board's crystal is), `wire` (`apart`: a bus for each channel; `joined`: one bus for both), `pace` (`client`:
-/// time stands still while the client does not read; `real`: it goes on), `speed` (how fast time passes at most; 1 is
-/// real time), `timing` (`best`, `worst`: how long memories and buses keep the core waiting), and at the end `log=FILE` (a candump log, replayed at its own times from the moment a channel is
-/// opened; its first interface is channel 1).
+/// Keys: `load` (per cent), `frames` (`std0` `std8` `ext0` `ext8` `rtr` `mix`), `burst` (`10/960us`: frames in a burst, and its period), `bitrate`
+/// (bit/s; by default the rate at which the channel is opened), `channels` (`1`, `2` or `both`: those with traffic), `ack` (`yes`, `no`: whether the
+/// simulated nodes acknowledge), `errors` (per cent of the frames destroyed), `seed`, `ppm` (how much too fast the board's crystal is), `wire`
+/// (`apart`: a bus for each channel; `joined`: one bus for both), `pace` (`client`: time stands still while the client does not read; `real`: it
+/// continues), `speed` (how fast time passes at most; 1 is real time), `timing` (`best`, `worst`: how long memories and buses keep the core waiting),
+/// and at the end `log=FILE` (a candump log, replayed at its own times from the moment a channel is opened; its first interface is channel 1).
 #[derive(Clone, Debug)]
 pub struct Address {
     /// The firmware.
@@ -36,7 +35,7 @@ pub struct Address {
     pub manner: Manner,
 }
 
-/// Why an emulated device cannot be had.
+/// Why an emulated device cannot be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum AddressError {
     /// There is no such option.
@@ -54,7 +53,7 @@ pub enum AddressError {
         /// What would fit.
         reason: String,
     },
-    /// The file is not a firmware.
+    /// The file is not firmware.
     #[error("{0}")]
     Firmware(#[from] FirmwareError),
     /// The firmware does not come up.
@@ -67,7 +66,7 @@ impl std::str::FromStr for Address {
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let (text, log) = text.split_once(",log=").map_or((text, None), |(text, log)| (text, Some(log)));
-        // A comma in the file's name is part of it, unless what follows is an option.
+        // A comma in the file's name is part of it, unless an option follows it.
         let mut file = text;
         let mut given = Vec::new();
         while let Some((front, option)) = file.rsplit_once(',')
@@ -126,7 +125,7 @@ impl Address {
                 self.options.load = Load::Bursts { kind: self.kind(), frames, period };
             }
             "bitrate" => {
-                // The other nodes' clocks need not reach the same rates as the board's.
+                // The other nodes' clocks may reach rates that the board's cannot.
                 let bps = number(value).filter(|bps| (MIN_BITRATE_BPS..=MAX_BITRATE_BPS).contains(bps));
                 self.options.bitrate_bps =
                     Some(bps.ok_or_else(|| bad("give 5k to 1M, in bit/s, such as 500000"))?);
@@ -261,7 +260,7 @@ mod tests {
         let keys: Vec<&str> = error.split_once("there are ").unwrap().1.split(", ").collect();
         for key in &keys {
             assert!(docs.contains(&format!("\n| `{key}` | ")), "{key}");
-            // What it lists, it knows.
+            // It accepts every option that it lists.
             let error = format!("a.elf,{key}=").parse::<Address>().unwrap_err();
             assert!(matches!(error, AddressError::Value { .. }), "{key}: {error}");
         }

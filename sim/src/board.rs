@@ -1,4 +1,4 @@
-//! What the emulator is to know of our boards and of the firmware: clock, crystal, and the interrupts that capture.
+//! What the emulator must know about our boards and the firmware: clock, crystal, and the interrupts that capture.
 
 use cantap_emu::{Clock, Image, Setup};
 use cantap_wire::RECEIVE_PINS_SYMBOL;
@@ -15,7 +15,7 @@ pub fn setup() -> Setup {
     Setup { watched: 1 << CAPTURE_IRQS[0][0] | 1 << CAPTURE_IRQS[1][0], ..Setup::new(CLOCK, CRYSTAL_HZ) }
 }
 
-/// The same with the buses at the pins that a firmware has them at.
+/// The same with the buses at the pins that the firmware uses.
 pub fn setup_for(image: &Image) -> Setup {
     let pins = image.datum(RECEIVE_PINS_SYMBOL).and_then(|address| image.bytes_at(address));
     let mut setup = setup();

@@ -1,5 +1,5 @@
 //! What the firmware does to a bus, measured on the bus itself: how soon it replies, how well it keeps times, how
-//! much it can send. For tests, which hold it against limits, and for the benchmark, which prints it.
+//! much it can send. For tests, which compare the figures with limits, and for the benchmark, which prints them.
 
 use crate::board::CLOCK;
 use cantap_wire::message::{Checksum, Filter, FrameKind, Modifier, Periodic, Trigger};
@@ -50,8 +50,8 @@ fn ours(frames: &[BusFrame]) -> impl Iterator<Item = &BusFrame> {
     frames.iter().filter(|frame| frame.sender == Member::Controller(CHANNEL.index()) && frame.error.is_none())
 }
 
-/// From the end of a frame (its last end-of-frame bit) to the start of the reply that it calls for; the
-/// intermission of 3 µs is part of it.
+/// From the end of a frame (its last end-of-frame bit) to the start of the reply that it triggers; this
+/// includes the intermission of 3 µs.
 pub fn reply_latency(rig: &mut Rig) -> Result<Option<Range>, RigError> {
     const CALLS: u64 = 100;
     const EVERY_US: u64 = 733;
@@ -70,11 +70,11 @@ pub fn reply_latency(rig: &mut Rig) -> Result<Option<Range>, RigError> {
     let replied = crossed.windows(2).filter(|pair| pair[0].frame == call && pair[1].frame == reply);
     let latencies: Vec<i64> = replied.map(|pair| (pair[1].start - pair[0].end) as i64).collect();
     rig.ask(Command::SetTrigger { channel: CHANNEL, slot: 0, entry: None })?;
-    // A call that was not replied to at once is no measurement but a failure.
+    // A trigger frame that was not replied to at once is a failure, not a measurement.
     Ok(Range::of(latencies.iter().copied()).filter(|_| latencies.len() as u64 == CALLS))
 }
 
-/// How far the intervals of a periodic frame are from its period.
+/// How far the intervals of a periodic frame deviate from its period.
 pub fn periodic_jitter(rig: &mut Rig, period_us: u64) -> Result<Option<Range>, RigError> {
     const COUNT: u64 = 100;
     let period_ticks = (period_us * TICKS_PER_US) as u32;
@@ -84,7 +84,7 @@ pub fn periodic_jitter(rig: &mut Rig, period_us: u64) -> Result<Option<Range>, R
     let crossed = watch(rig, (COUNT + 2) * period_us * CYCLES_PER_US)?;
     let starts: Vec<u64> = ours(&crossed).map(|frame| frame.start).collect();
     let period = (period_us * CYCLES_PER_US) as i64;
-    // The first was on the bus before the watch began, perhaps.
+    // The first may have been on the bus before the watch began.
     let whole = starts.len() as u64 >= COUNT - 1;
     Ok(Range::of(starts.windows(2).map(|pair| (pair[1] - pair[0]) as i64 - period)).filter(|_| whole))
 }
@@ -92,17 +92,18 @@ pub fn periodic_jitter(rig: &mut Rig, period_us: u64) -> Result<Option<Range>, R
 /// How two channels kept the periods of full tables.
 #[derive(Clone, Copy, Debug)]
 pub struct Tables {
-    /// Start of each frame less when it was due by its entry's first: what another frame kept it waiting.
+    /// Start of each frame minus the time at which it was due, counted from its entry's first: how long other frames kept it
+    /// waiting.
     pub late: Range,
     /// Frames that crossed the buses.
     pub frames: usize,
-    /// Frames of which a modifier's byte is not what it should be.
+    /// Frames in which a modifier's byte is wrong.
     pub wrong: usize,
 }
 
-/// Fills every periodic entry of both channels, which are on buses of their own, with frames of eight bytes that count and carry a
-/// checksum, and watches for this long. Each entry's period is 13 µs longer than that of the one before, so that all of them
-/// meet. `None` if an entry left out a frame.
+/// Fills every periodic entry of both channels, which are on separate buses, with frames of eight bytes that have a counter and a
+/// checksum, and watches for this long. Each entry's period is 13 µs longer than the previous one's, so that all of them meet.
+/// `None` if an entry left out a frame.
 pub fn periodic_tables(rig: &mut Rig, shortest_us: u64, watch_us: u64) -> Result<Option<Tables>, RigError> {
     let period_us = |slot: usize| shortest_us + 13 * slot as u64;
     let modifiers = [
@@ -131,13 +132,13 @@ pub fn periodic_tables(rig: &mut Rig, shortest_us: u64, watch_us: u64) -> Result
                     && frame.frame.id().raw() == id(slot)
             };
             let crossed: Vec<&BusFrame> = watched[channel.index()].iter().filter(own).collect();
-            // The watch may begin and end between two of them.
+            // The watch may begin and end between two frames.
             if (crossed.len() as u64) < watch_us / period_us(slot) - 1 {
                 return Ok(None);
             }
             frames += crossed.len();
             let period = period_us(slot) * CYCLES_PER_US;
-            // None leaves early, so the least late one tells when they were due.
+            // None is sent early, so the least late one shows when they were due.
             let phases = crossed.iter().zip(0..).map(|(frame, n)| frame.start as i64 - (n * period) as i64);
             let due = phases.clone().min().unwrap_or(0);
             late.extend(phases.map(|phase| phase - due));

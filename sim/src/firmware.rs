@@ -1,11 +1,12 @@
-//! Our firmware among the programs that the emulator runs: it names the version of the protocol that it speaks.
+//! Our firmware among the programs that the emulator runs: it states the version of the protocol that it
+//! speaks.
 
 use std::path::Path;
 
 use cantap_emu::{ElfError, Image};
 use cantap_wire::{PROTOCOL_SYMBOL, PROTOCOL_VERSION};
 
-/// Why a file is not a firmware that can be used here.
+/// Why a file is not firmware that can be used here.
 #[derive(Debug, thiserror::Error)]
 pub enum FirmwareError {
     /// The file cannot be read.

@@ -3,8 +3,8 @@
 //! [`rig`] is a board with a capture host, which keeps books on every frame ([`capture`]); [`run`] is a whole run of it. [`drive`] and
 //! [`stream`] send, [`address`] reads the addresses that the command understands, [`usbip`] serves the board to a Linux kernel.
 //!
-//! The board itself is `cantap-emu`'s and knows nothing of this product; what it must know of our boards is in [`board`].
-//! Nothing here uses the firmware's library: this is an independent witness that sees only the ELF, and shares the wire protocol's types
+//! The board itself is `cantap-emu`'s and knows nothing about this product; [`board`] has what it must know about our boards. Nothing
+//! here uses the firmware's library: this is an independent witness that sees only the ELF, and shares only the wire protocol's types
 //! with it. Time is core cycles everywhere ([`CYCLES_PER_SECOND`]).
 
 #![forbid(unsafe_code)]

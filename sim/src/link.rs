@@ -1,8 +1,8 @@
 //! The emulated device as another program's serial port: behind a pseudo-terminal, or behind a reader and a
 //! writer in this process.
 //!
-//! Emulated time follows the clock on the wall, or a share of it, and never runs ahead of it; under full load it
-//! falls behind. What happens when the client does not read is [`Pace`]'s question.
+//! Emulated time follows the wall clock, or a fraction of it, and never runs ahead of it; under full load it
+//! falls behind. [`Pace`] decides what happens when the client does not read.
 
 use std::collections::VecDeque;
 use std::io::{self, Read, Write};
@@ -25,9 +25,9 @@ use cantap_wire::{CHANNELS, Channel};
 /// What happens while the client does not read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pace {
-    /// Time stands still: the client sets the pace, and nothing is lost through its fault.
+    /// Time stands still: the client sets the pace, and nothing is lost on its account.
     Client,
-    /// Time goes on, and the device's queue fills.
+    /// Time continues, and the device's queue fills.
     RealTime,
 }
 
@@ -36,8 +36,8 @@ pub enum Pace {
 pub struct Manner {
     /// What happens while the client does not read.
     pub pace: Pace,
-    /// Emulated time passes at most this many times as fast as the wall clock. A client on a busy machine has more time for
-    /// each emulated millisecond if this is small.
+    /// Emulated time passes at most this many times as fast as the wall clock. The smaller this is, the more time a client
+    /// on a busy machine has for each emulated millisecond.
     pub speed: f64,
     /// Both channels on one bus.
     pub joined: bool,
@@ -50,7 +50,7 @@ pub struct Manner {
 }
 
 impl Default for Manner {
-    /// The client sets the pace, up to real time; two buses, and nothing is kept.
+    /// The client sets the pace, up to real time; two buses; nothing is kept.
     fn default() -> Self {
         Self {
             pace: Pace::Client,
@@ -63,29 +63,29 @@ impl Default for Manner {
     }
 }
 
-/// What really happened on the buses, whatever the device says of it.
+/// What really happened on the buses, whatever the device says about it.
 #[derive(Clone, Debug, Default)]
 pub struct Witness {
-    /// Core cycle up to which it was seen.
+    /// Core cycle up to which it was observed.
     pub now: u64,
-    /// Frames that crossed each bus, if [`Manner::witness`] was asked for.
+    /// Frames that crossed each bus, if [`Manner::witness`] was set.
     pub frames: [Vec<BusFrame>; CHANNELS],
     /// Bits that each controller has driven dominant since power-on.
     pub dominant_bits: [u64; CHANNELS],
 }
 
-/// Pieces that wait for a reader in this process; each is what the device sent in a millisecond.
+/// Most pieces that wait for a reader in this process; each is what the device sent in a millisecond.
 const PIECES: usize = 64;
-/// A read without bytes returns after this time.
+/// A read that gets no bytes returns after this time.
 const READ_WAIT: Duration = Duration::from_millis(50);
-/// How long to wait before looking again at a client that lags.
+/// How long to wait before checking a lagging client again.
 const LAG_WAIT: Duration = Duration::from_micros(500);
-/// How far the emulation may lag behind the wall clock before it gives the difference up.
+/// How far the emulation may lag behind the wall clock before it drops the difference.
 const MOST_BEHIND: Duration = Duration::from_millis(100);
 
 /// A client's end of the byte stream. Neither direction waits.
 pub trait Client {
-    /// What the client wrote since the last time. An error means that it is gone.
+    /// What the client has written since the last call. An error means that it is gone.
     fn receive(&self) -> io::Result<Vec<u8>>;
     /// Takes as many of the bytes as it can and says how many.
     fn deliver(&self, bytes: &[u8]) -> io::Result<usize>;
@@ -116,9 +116,9 @@ pub struct Served {
     manner: Manner,
     options: Options,
     witness: Arc<Mutex<Witness>>,
-    /// Cycles of a bit of each channel that is open.
+    /// Cycles per bit of each open channel.
     open: [Option<u64>; CHANNELS],
-    /// When the first of the channels that are open was opened: what is replayed begins then.
+    /// When the first of the open channels was opened: a replay begins then.
     origin: u64,
     waiting: VecDeque<u8>,
     /// From the client, until the device knows that its port is open.
@@ -128,8 +128,8 @@ pub struct Served {
 }
 
 impl Served {
-    /// Boots the firmware, enumerates the device and opens its port. A bus with a bit rate of its own carries the traffic
-    /// of `options` from now on, any other and a replayed log as long as the channel is open.
+    /// Boots the firmware, enumerates the device and opens its port. A bus with a given bit rate carries the traffic of
+    /// `options` from now on; any other bus, or a replayed log, only while the channel is open.
     pub fn start(image: Image, options: Options, manner: Manner) -> Result<Self, RigError> {
         let setup = Setup { joined: manner.joined, bound: options.bound, ..board::setup_for(&image) };
         let mut rig = Rig::new(image, setup, options.timing);
@@ -153,23 +153,23 @@ impl Served {
         Ok(Self { rig, manner, options, witness, open, origin, waiting, to_device, attended })
     }
 
-    /// Whether the buses' traffic goes on whoever opens and closes the channels.
+    /// Whether the buses' traffic continues regardless of which channels are open.
     fn is_independent(options: &Options) -> bool {
         options.bitrate_bps.is_some() && !matches!(options.load, Load::Replay(_))
     }
 
-    /// Where to see what really happens on the buses.
+    /// Shows what really happens on the buses.
     pub fn witness(&self) -> Arc<Mutex<Witness>> {
         Arc::clone(&self.witness)
     }
 
-    /// Starts and ends the traffic of channels that were opened and closed.
+    /// Starts and ends the traffic of channels as they are opened and closed.
     fn follow_channels(&mut self) {
         if Self::is_independent(&self.options) {
             return;
         }
         for channel in Channel::ALL {
-            // A pin that is measured needs something to be measured.
+            // A pin being measured needs something to measure.
             let watched =
                 self.rig.watches(channel).then(|| BitTime::of_rate(DEFAULT_BITRATE_BPS, CLOCK).cycles(1));
             let bit = self.rig.bit_cycles(channel).or(watched);
@@ -196,7 +196,7 @@ impl Served {
     pub fn until(&mut self, seconds: Option<Duration>, client: &impl Client) -> Result<(), ServeError> {
         let cycles = seconds.map(|seconds| (seconds.as_secs_f64() * CYCLES_PER_SECOND as f64) as u64);
         let end = cycles.map_or(u64::MAX, |cycles| self.rig.now().saturating_add(cycles));
-        // A board with a fast crystal has its cycles behind it sooner.
+        // A board with a fast crystal gets through its cycles sooner.
         let millisecond =
             Duration::from_millis(1).div_f64(self.manner.speed * self.options.timing.board_rate());
         let mut due = Instant::now();
@@ -231,13 +231,13 @@ impl Served {
         self.follow_channels();
         self.waiting.extend(bytes);
         if self.attended {
-            // The client cannot see a device that comes back by itself after a reset: its port stays.
+            // The client cannot see that a device comes back on its own after a reset: its port stays.
             self.rig.with_host(|host, _| host.open_port());
         }
         Ok(())
     }
 
-    /// Writes down what happened on the buses.
+    /// Records what happened on the buses.
     fn testify(&self, crossed: [Vec<BusFrame>; CHANNELS]) {
         let mut witness = self.witness.lock().unwrap_or_else(PoisonError::into_inner);
         witness.now = self.rig.now();
@@ -289,7 +289,7 @@ pub enum ServeError {
     Client(#[from] io::Error),
 }
 
-/// The ends that a thread of the emulation talks to.
+/// The channel ends used by the emulation's thread.
 struct Channels {
     to_client: SyncSender<Vec<u8>>,
     from_client: Receiver<Vec<u8>>,
@@ -303,7 +303,7 @@ impl Client for Channels {
         }
         match self.from_client.try_recv() {
             Ok(bytes) => Ok(bytes),
-            // A writer that is gone says nothing more; the reader may still want to hear.
+            // A writer that is gone sends no more; the reader may still be listening.
             Err(TryRecvError::Empty | TryRecvError::Disconnected) => Ok(Vec::new()),
         }
     }
@@ -317,10 +317,10 @@ impl Client for Channels {
     }
 }
 
-/// An emulated device in a thread of its own, as two halves of a byte stream.
+/// An emulated device in its own thread, as two halves of a byte stream.
 pub struct EmulatedPort {
-    /// From the device. Without bytes it returns [`io::ErrorKind::TimedOut`] after a moment; no bytes (`Ok(0)`) mean
-    /// that the emulation has ended.
+    /// From the device. If there are no bytes, it returns [`io::ErrorKind::TimedOut`] after a moment; no bytes
+    /// (`Ok(0)`) mean that the emulation has ended.
     pub reader: PortReader,
     /// To the device.
     pub writer: PortWriter,
@@ -329,7 +329,7 @@ pub struct EmulatedPort {
 }
 
 impl EmulatedPort {
-    /// Boots `image` and opens its port; returns when a host would see it.
+    /// Boots `image` and opens its port; returns once a host would see it.
     pub fn start(image: Image, options: Options, manner: Manner) -> Result<Self, ServeError> {
         let (to_client, from_device) = sync_channel(PIECES);
         let (to_device, from_client) = sync_channel(PIECES);
@@ -351,7 +351,7 @@ impl EmulatedPort {
                 *last_words.lock().unwrap_or_else(PoisonError::into_inner) = Some(error.to_string());
             }
         })?;
-        // The thread ends only after it has said one or the other.
+        // The thread ends only after it has reported one or the other.
         let said = ready.recv().map_err(|_| io::Error::other("the emulation ended before it began"))?;
         let device = EmulatedDevice { stop, thread: Some(thread), witness: said? };
         Ok(Self {
@@ -413,7 +413,7 @@ pub struct EmulatedDevice {
 }
 
 impl EmulatedDevice {
-    /// Where to see what really happens on the buses.
+    /// Shows what really happens on the buses.
     pub fn witness(&self) -> Arc<Mutex<Witness>> {
         Arc::clone(&self.witness)
     }
@@ -423,7 +423,7 @@ impl Drop for EmulatedDevice {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
-            // A thread that panicked has said so.
+            // A thread that panicked has already reported it.
             let _ = thread.join();
         }
     }

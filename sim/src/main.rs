@@ -21,7 +21,7 @@ use clap::{Parser, Subcommand};
 
 mod serve;
 
-/// The check of a run did not hold.
+/// The check of a run failed.
 const CHECK_FAILED: u8 = 3;
 
 /// Runs cantap's firmware on an emulated STM32F405 board.
@@ -53,14 +53,14 @@ enum Command {
 struct UsbipArgs {
     /// The firmware's ELF, as `cargo xtask firmware` makes it.
     firmware: PathBuf,
-    /// Where the ports are written, and what a line asks for.
+    /// Where the ports are written, and whatever a line asks to be written.
     folder: PathBuf,
 }
 
 /// The command line of `run`.
 #[derive(clap::Args)]
 #[command(
-    after_help = "The host that captures is the emulator's own. Both channels only listen, at 1 Mbit/s unless told \
+    after_help = "The host that captures is the emulator's own. Both channels only listen, at 1 Mbit/s unless set \
                         otherwise.\nExit code 0 means that every frame on the buses was delivered in order and bit for \
                         bit, or counted lost.\n\n\
                         Examples:\n  cantap-sim run target/firmware/cantap-olimex-p405.elf\n  \
@@ -71,7 +71,7 @@ struct UsbipArgs {
 pub struct Args {
     /// The firmware's ELF, as `cargo xtask firmware` makes it.
     firmware: PathBuf,
-    /// Emulated seconds of traffic. Without, 1, or the length of what is replayed; a PTY is served without end.
+    /// Emulated seconds of traffic. By default 1, or the length of the replay; a PTY is served without end.
     #[arg(long, value_parser = some_seconds)]
     seconds: Option<Duration>,
     /// Bus load in per cent.
@@ -83,13 +83,13 @@ pub struct Args {
     /// Channels that carry traffic and are captured: 1, 2 or both.
     #[arg(long, default_value = "both", value_parser = channels)]
     channels: Channels,
-    /// Bit rate of both buses, in bit/s. Without, 1000000; with --pty, that of whoever opens the channel.
+    /// Bit rate of both buses, in bit/s. By default 1000000; with --pty, the rate at which the channel is opened.
     #[arg(long, value_name = "BPS")]
     bitrate: Option<u32>,
     /// The host stops reading for this time, in the middle of the run.
     #[arg(long, value_name = "TIME", value_parser = seconds)]
     stall: Option<Duration>,
-    /// The host is behind a high-speed hub, and this many microframes pass from one packet to the next: 2 is 0.26 MB/s.
+    /// Put the host behind a high-speed hub, with this many microframes from one packet to the next: 2 gives 0.26 MB/s.
     #[arg(long, value_name = "MICROFRAMES", default_value = "0")]
     hub: u32,
     /// Replay this candump log at its own times, in place of generated frames.
@@ -104,7 +104,7 @@ pub struct Args {
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
-    /// Write a picture of interrupts, masked windows, sleep, FIFO fills and frames (Chrome trace, Perfetto).
+    /// Write a picture of interrupts, masked windows, sleep, FIFO fill levels and frames (Chrome trace, Perfetto).
     #[arg(long, value_name = "FILE")]
     trace: Option<PathBuf>,
     /// Print where the core's cycles go, by interrupt and function.
@@ -114,7 +114,7 @@ pub struct Args {
     /// still while the client does not read.
     #[arg(long, conflicts_with_all = ["stall", "json", "trace", "profile"])]
     pty: bool,
-    /// With --pty: time goes on while the client does not read.
+    /// With --pty: time continues while the client does not read.
     #[arg(long, requires = "pty")]
     real_time: bool,
 }
@@ -131,7 +131,7 @@ fn channels(text: &str) -> Result<Channels, String> {
     }
 }
 
-/// A time: a number of seconds, or with a unit: `400ms`, `3s`, `250us`.
+/// A time: a number of seconds, or a number with a unit: `400ms`, `3s`, `250us`.
 fn seconds(text: &str) -> Result<Duration, String> {
     let unit_at = text.find(|symbol: char| symbol.is_ascii_alphabetic()).unwrap_or(text.len());
     let (number, unit) = text.split_at(unit_at);
@@ -145,7 +145,7 @@ fn seconds(text: &str) -> Result<Duration, String> {
     value.ok_or_else(|| "give a time as a number and a unit, such as 400ms".to_owned())
 }
 
-/// A time that is not nothing.
+/// A time that is not zero.
 fn some_seconds(text: &str) -> Result<Duration, String> {
     seconds(text).and_then(|time| if time.is_zero() { Err("give more than 0".to_owned()) } else { Ok(time) })
 }
@@ -188,7 +188,7 @@ fn run(args: &Args) -> anyhow::Result<ExitCode> {
         serve::pty(image, options, args.seconds, args.real_time)?;
         return Ok(ExitCode::SUCCESS);
     }
-    // Before the run, so that a file that cannot be written does not cost one.
+    // Before the run, so that a file that cannot be written does not waste it.
     let trace_file = args.trace.as_deref().map(create).transpose()?;
     let (report, picture) = run::run(image, &options)?;
     if let (Some(mut file), Some((machine, trace))) = (trace_file, picture) {
@@ -199,7 +199,7 @@ fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let mut out = io::stdout().lock();
     let printed = if args.json { writeln!(out, "{}", report.to_json()) } else { print(&mut out, &report) };
-    // Whoever closed the pipe has seen enough.
+    // If the pipe is closed, its reader has seen enough.
     printed.or_else(|error| if error.kind() == io::ErrorKind::BrokenPipe { Ok(()) } else { Err(error) })?;
     Ok(if report.ok { ExitCode::SUCCESS } else { ExitCode::from(CHECK_FAILED) })
 }

@@ -1,5 +1,5 @@
-//! A pseudo-terminal that stands for the device's serial port, so that any program which opens a
-//! serial port can use the emulated device.
+//! A pseudo-terminal in place of the device's serial port, so that any program that opens a serial
+//! port can use the emulated device.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -10,7 +10,7 @@ use rustix::io::Errno;
 use rustix::termios::OptionalActions;
 use rustix_openpty::openpty;
 
-/// Bytes that one exchange moves at most.
+/// Most bytes that one exchange moves.
 const PIECE: usize = 4096;
 
 /// The device's end of a pseudo-terminal.
@@ -23,7 +23,7 @@ pub struct Pty {
 }
 
 impl Pty {
-    /// Opens one, in raw mode before its name can be known: a cooked terminal would change bytes and
+    /// Opens one, in raw mode before its name is known: a cooked terminal would change bytes and
     /// echo them.
     pub fn open() -> io::Result<Self> {
         let pair = openpty(None, None)?;
@@ -34,7 +34,8 @@ impl Pty {
         let status = rustix::fs::fcntl_getfl(&pair.controller)?;
         rustix::fs::fcntl_setfl(&pair.controller, status | OFlags::NONBLOCK)?;
         let name = path.into_string().map_err(|_| io::Error::other("the terminal's name is not text"))?;
-        // With no other end open, reading says so; that is how the last client's close is seen. The settings stay.
+        // While no other end is open, reading reports it; this shows when the last client has closed. The settings
+        // stay.
         drop(pair.user);
         Ok(Self { controller: pair.controller, name, has_client: AtomicBool::new(false) })
     }
@@ -44,7 +45,7 @@ impl Pty {
         &self.name
     }
 
-    /// Takes what clients wrote, without waiting.
+    /// Takes what clients have written, without waiting.
     pub fn read(&self) -> io::Result<Vec<u8>> {
         let mut bytes = vec![0; PIECE];
         let read = rustix::io::read(&self.controller, &mut bytes[..]);

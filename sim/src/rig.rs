@@ -1,5 +1,5 @@
 //! A bench with everything on it: the board with its firmware, two CAN buses, a USB host, the capture
-//! host and the books. Runs are sequences of calls here; time is emulated and stands still between them.
+//! host and the books. A run is a sequence of calls; time is emulated and stands still between them.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -24,10 +24,10 @@ pub const MS: u64 = 1000 * CYCLES_PER_US;
 const ENUMERATION_TIMEOUT: u64 = 3 * CYCLES_PER_SECOND;
 /// How long a request may take.
 const REQUEST_TIMEOUT: u64 = CYCLES_PER_SECOND;
-/// A stream that is silent for this long has nothing more to say.
+/// A stream that has been silent for this long has ended.
 const SILENCE: u64 = 20 * MS;
 
-/// What went wrong on the bench, apart from wrong frames, which are the ledger's.
+/// What went wrong on the bench, apart from wrong frames, which the ledger reports.
 #[derive(Debug, thiserror::Error)]
 pub enum RigError {
     /// The firmware ended.
@@ -44,12 +44,12 @@ pub enum RigError {
     NoAnswer {
         /// The request.
         command: String,
-        /// How long was waited.
+        /// How long the rig waited.
         millis: u64,
         /// How long the device had been silent.
         silent_ms: u64,
     },
-    /// A request was refused that must not be.
+    /// A request was refused that must be accepted.
     #[error("{command} was refused: {refusal:?}")]
     Refused {
         /// The request.
@@ -57,7 +57,7 @@ pub enum RigError {
         /// The reason.
         refusal: Refusal,
     },
-    /// A request was answered with a value that does not answer it.
+    /// A request was answered with the wrong kind of value.
     #[error("{command} was answered with {reply}")]
     WrongReply {
         /// The request.
@@ -77,25 +77,25 @@ pub enum RigError {
 pub struct Rig {
     /// The board.
     pub machine: Machine,
-    /// What the device said.
+    /// What the device sent.
     pub session: Session,
-    /// Whether what it says is true.
+    /// The books that check it.
     pub ledger: Ledger,
     usb: Arc<Mutex<UsbPort>>,
     /// Channels whose frames are in the books.
     booked: [bool; CHANNELS],
-    /// From a cut to the next greeting: records are remains of the session before.
+    /// From a cut to the next greeting, records are remains of the previous session.
     between_sessions: bool,
     events: Vec<(u64, Event)>,
-    /// The device has ended the session by itself.
+    /// When and why the device ended the session on its own.
     ended: Option<(u64, EndReason)>,
     last_bytes_at: u64,
-    /// Places in each channel's transmit queue, once the device has said.
+    /// Places in each channel's transmit queue, once the device has reported them.
     tx_queue: usize,
     periodic_slots: usize,
-    /// What crossed the buses, if it is kept.
+    /// What crossed the buses, if it is being kept.
     watched: Option<[Vec<BusFrame>; CHANNELS]>,
-    /// Bits of frames on each bus, with intermission, as long as it was booked.
+    /// Bits of frames on each bus, with intermission, while it was booked.
     bus_bits: [u64; CHANNELS],
     recording: Option<Vec<u8>>,
 }
@@ -129,16 +129,16 @@ impl Rig {
         self.machine.now()
     }
 
-    /// Does something with the USB host, at the present time.
+    /// Runs `action` on the USB host, at the present time.
     pub fn with_host<R>(&mut self, action: impl FnOnce(&mut UsbHost, &mut Otg) -> R) -> R {
         let now = self.machine.now();
-        // A thread that panicked while it held the lock left a port that is as good as any other.
+        // If a thread panicked while it held the lock, the port's state is as good as any other.
         let mut usb = self.usb.lock().unwrap_or_else(PoisonError::into_inner);
         let (host, otg) = usb.host(now);
         action(host, otg)
     }
 
-    /// Runs for `cycles`, and takes in what the buses carried and the device said.
+    /// Runs for `cycles`, and collects what the buses carried and the device sent.
     pub fn run_for(&mut self, cycles: u64) -> Result<(), RigError> {
         let until = self.now() + cycles;
         while self.now() < until {
@@ -161,7 +161,8 @@ impl Rig {
         Ok((self.with_host(|host, _| host.receive()), crossed))
     }
 
-    /// Runs while `goes_on` says so, asking once a millisecond; whether it ended before `limit` cycles were over.
+    /// Runs while `goes_on` returns true, checked once a millisecond; returns whether it ended before `limit` cycles were
+    /// over.
     pub fn run_while(
         &mut self,
         limit: u64,
@@ -269,7 +270,7 @@ impl Rig {
         self.greet()
     }
 
-    /// Tells the ledger how the device's clock stands, taken from the stamp timer itself.
+    /// Sets the ledger's idea of the device's clock, taken from the stamp timer itself.
     fn follow_clock(&mut self, tick_hz: u32) {
         let origin = self.clock_origin();
         self.ledger.set_clock(origin, CYCLES_PER_SECOND / u64::from(tick_hz));
@@ -311,7 +312,7 @@ impl Rig {
         self.open(channel, ChannelConfig::listen_only(timing(bitrate_bps)?))
     }
 
-    /// Waits until the device has nothing more to say, for `limit` cycles at most.
+    /// Waits until the device has nothing more to send, for at most `limit` cycles.
     pub fn drain(&mut self, limit: u64) -> Result<bool, RigError> {
         let from = self.now();
         self.run_while(limit, |rig| rig.now() - from.max(rig.last_bytes_at) < SILENCE)
@@ -330,9 +331,9 @@ impl Rig {
         Ok(())
     }
 
-    /// The session was cut (unplugged, reset, suspended): what has not arrived will not. What waits in
-    /// the device's endpoint or the host's driver may still come when the port is opened again; like every host, this one
-    /// ignores it until it has greeted the device again.
+    /// The session was cut (unplugged, reset, suspended): what has not arrived will not. What is left in the device's
+    /// endpoint or the host's driver may still arrive when the port is opened again; like every host, this one ignores it
+    /// until it has greeted the device again.
     pub fn cut(&mut self) {
         self.exchange();
         self.between_sessions = true;
@@ -342,7 +343,7 @@ impl Rig {
         }
     }
 
-    /// Closes the books of a session that the device ended by itself: it has delivered everything.
+    /// Closes the books of a session that the device ended on its own: it has delivered everything.
     pub fn follow_session_end(&mut self) {
         for channel in Channel::ALL {
             if std::mem::take(&mut self.booked[channel.index()]) {
@@ -367,14 +368,14 @@ impl Rig {
         wire.add(Node::new(bit));
     }
 
-    /// Gives the two nodes of [`Self::add_traffic`] another bit time and other frames.
+    /// Gives the two nodes of [`Self::add_traffic`] another bit time and different frames.
     pub fn change_traffic(&mut self, channel: Channel, bit: BitTime, source: Option<Box<dyn Source>>) {
         let wire = &mut self.machine.board().wires[channel.index()];
         wire.node(0).restart(bit, source);
         wire.node(1).restart(bit, None);
     }
 
-    /// Core cycles of a bit on a channel that takes part in its bus.
+    /// Core cycles per bit on a channel that takes part in its bus.
     pub fn bit_cycles(&self, channel: Channel) -> Option<u64> {
         let controller = &self.machine.board().can.controllers[channel.index()];
         controller.listens().then(|| controller.timing().bit())
@@ -405,7 +406,7 @@ impl Rig {
         &self.events
     }
 
-    /// When the device ended the session by itself, by its own time, and why.
+    /// When, by its own clock, the device ended the session on its own, and why.
     pub fn session_end(&self) -> Option<(u64, EndReason)> {
         self.ended
     }
@@ -420,7 +421,7 @@ impl Rig {
         self.watched = Some(Default::default());
     }
 
-    /// What crossed each bus since [`Self::watch`], which ends.
+    /// Returns what crossed each bus since [`Self::watch`], and stops watching.
     pub fn take_watched(&mut self) -> [Vec<BusFrame>; CHANNELS] {
         self.watched.take().unwrap_or_default()
     }
@@ -447,7 +448,7 @@ impl Rig {
     }
 }
 
-/// The bit timing for a bit rate, from the clock that the product's boards have.
+/// The bit timing for a bit rate, with the clock of the product's boards.
 pub fn timing(bitrate_bps: u32) -> Result<BitTiming, RigError> {
     /// APB1 at 36 MHz.
     const CAN_CLOCK_HZ: u32 = (CYCLES_PER_SECOND / 4) as u32;

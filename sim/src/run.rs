@@ -1,5 +1,5 @@
 //! One run of the command: traffic on the buses, a capture over USB, and the figures. Everything in it
-//! depends on the options only, except how long it took.
+//! depends only on the options, except how long it took.
 
 use std::time::{Duration, Instant};
 
@@ -26,7 +26,7 @@ use cantap_emu::usb_host::Timing;
 pub const DEFAULT_BITRATE_BPS: u32 = 1_000_000;
 /// The first 16 exceptions are the core's own.
 const FIRST_INTERRUPT: u16 = 16;
-/// The device may take this long to empty its queue when the traffic has ended.
+/// The device may take this long to empty its queue after the traffic has ended.
 const DRAIN: u64 = 5 * CYCLES_PER_SECOND;
 /// Quiet time before the traffic begins and after it ends.
 const MARGIN: u64 = 2 * MS;
@@ -63,14 +63,14 @@ pub struct Options {
     pub load: Load,
     /// Channels that are captured and carry traffic.
     pub channels: Vec<Channel>,
-    /// Bit rate of both buses, in bit/s. Without, a run takes [`DEFAULT_BITRATE_BPS`], and a device that serves
-    /// another program's host has buses at the rate at which that host opens the channel.
+    /// Bit rate of both buses, in bit/s. If `None`, a run uses [`DEFAULT_BITRATE_BPS`], and a device that
+    /// serves another program's host uses the rate at which that host opens the channel.
     pub bitrate_bps: Option<u32>,
     /// The host stops reading for this long, in the middle of the run.
     pub stall: Option<Duration>,
     /// Seed of the traffic.
     pub seed: u64,
-    /// How the USB host keeps time.
+    /// The USB host's timing.
     pub timing: Timing,
     /// How long memories and buses keep the core waiting.
     pub bound: Bound,
@@ -115,7 +115,7 @@ pub struct ChannelReport {
     pub bus_load_pct: f64,
 }
 
-/// What a run showed.
+/// The result of a run.
 #[derive(Debug)]
 pub struct Report {
     /// Emulated seconds of traffic.
@@ -124,15 +124,15 @@ pub struct Report {
     pub bound: Bound,
     /// Each captured channel.
     pub channels: Vec<ChannelReport>,
-    /// Bytes over USB per frame delivered, everything included.
+    /// Bytes over USB per frame delivered, including everything else.
     pub wire_bytes_per_frame: f64,
     /// Size of the device's record queue.
     pub queue_bytes: u32,
-    /// Most bytes that were in it.
+    /// The most bytes that were in it.
     pub queue_high_water_bytes: u32,
     /// How late stamps were.
     pub stamps: Stamps,
-    /// The longest time in which the interrupt that stamps was masked, in nanoseconds.
+    /// The longest time for which the stamping interrupt was masked, in nanoseconds.
     pub masked_ns_max: f64,
     /// Share of the traffic's time in which the core was not asleep.
     pub cpu_load_pct: f64,
@@ -140,13 +140,13 @@ pub struct Report {
     pub isr_cycles_per_frame: f64,
     /// Seconds that the emulation took per emulated second of traffic.
     pub host_s_per_emulated_s: f64,
-    /// What each exception that ran cost of the traffic's time.
+    /// How much of the traffic's time each exception that ran took.
     pub tasks: Vec<Task>,
     /// Where the cycles went, as a table, if it was asked for.
     pub profile: Option<String>,
     /// What broke the law of counting.
     pub faults: Vec<String>,
-    /// Accesses to registers that no model knows, or that the hardware would not take.
+    /// Accesses to registers that no model knows, or that the hardware would not accept.
     pub odd_accesses: Vec<OddAccess>,
     /// Whether every frame was delivered in order and bit for bit, or counted lost where it is missing.
     pub ok: bool,
@@ -208,7 +208,7 @@ pub fn run(image: Image, options: &Options) -> Result<(Report, Option<(Machine, 
     let mut faults = rig.ledger.faults().to_vec();
     faults.extend(rig.session.corruptions().iter().map(|corruption| format!("on USB: {corruption:?}")));
     if !drained {
-        faults.push("the device did not come to an end of what it had to say".to_owned());
+        faults.push("the device did not finish sending what it had to send".to_owned());
     }
     let report = Report {
         seconds,
@@ -236,10 +236,10 @@ pub fn run(image: Image, options: &Options) -> Result<(Report, Option<(Machine, 
 }
 
 impl Options {
-    /// The traffic of a channel's bus, from core cycle `from` to `until`. What is replayed has its first frame at
+    /// The traffic of a channel's bus, from core cycle `from` to `until`. A replay has its first frame at
     /// `origin`.
     pub fn source(&self, channel: Channel, origin: u64, from: u64, until: u64) -> Box<dyn Source> {
-        // Two channels of one seed must not carry the same frames.
+        // Two channels with one seed must not carry the same frames.
         let seed = self.seed.wrapping_mul(CHANNELS as u64).wrapping_add(channel.index() as u64);
         match &self.load {
             Load::Frames { kind, percent } => Box::new(Traffic::new(*kind, seed, *percent, from, until)),
@@ -247,7 +247,7 @@ impl Options {
                 Box::new(Bursts::new(*kind, seed, *frames, *period, from, until))
             }
             Load::Replay(logs) => {
-                // The log's times are the world's; the board's crystal may count more or fewer cycles meanwhile.
+                // The log's times are real ones; the board's crystal may count more or fewer cycles in them.
                 let place = |at: u64| origin + (at as f64 * self.timing.board_rate()) as u64;
                 let frames = logs[channel.index()].iter().map(|(at, frame)| (place(*at), *frame));
                 Box::new(Script::new(frames.filter(|(at, _)| (from..until).contains(at)).collect()))
@@ -265,7 +265,7 @@ fn channel_report(rig: &Rig, channel: Channel, seconds: f64, bitrate_bps: u32) -
         delivered: rig.ledger.delivered_count(channel),
         lost: rig.ledger.losses(channel),
         frames_per_s: sent as f64 / seconds,
-        // The last frame may have ended after the traffic's time.
+        // The last frame may have ended after the end of the traffic.
         bus_load_pct: (100.0 * bits / (seconds * f64::from(bitrate_bps))).min(100.0),
     }
 }
@@ -344,7 +344,7 @@ fn rounded(value: f64, digits: i32) -> f64 {
 }
 
 /// Recorded frames for each channel: a log's first interface is channel 1, its second channel 2, further ones are
-/// left out. Also the length of the log in cycles, its last frame included.
+/// left out. Also returns the length of the log in cycles, including its last frame.
 pub fn replay(lines: Vec<(u64, String, Frame)>, bitrate_bps: u32) -> (Load, u64) {
     let mut interfaces: Vec<String> = Vec::new();
     let mut channels: [Vec<(u64, Frame)>; CHANNELS] = Default::default();

@@ -22,7 +22,8 @@ mod terminal {
     /// What shells report for a program that Ctrl-C ended.
     const ENDED_BY_SIGNAL: i32 = 130;
 
-    /// Serves the device until it fails, `seconds` of emulated time are over, or the user or the system asks it to end.
+    /// Serves the device until it fails, until `seconds` of emulated time are over, or until the user or the system
+    /// asks it to end.
     pub fn pty(
         image: Image,
         options: Options,
@@ -40,7 +41,8 @@ mod terminal {
         if client.is_asked() { Ok(()) } else { Ok(end?) }
     }
 
-    /// From now on Ctrl-C and the system's polite request to end set a flag. Asked twice, the program ends at once.
+    /// From now on Ctrl-C and the system's polite request to end (SIGTERM) set a flag. Asked twice, the program ends at
+    /// once.
     fn watch() -> anyhow::Result<Arc<AtomicBool>> {
         let asked = Arc::new(AtomicBool::new(false));
         let flag = Arc::clone(&asked);

@@ -1,5 +1,5 @@
-//! A host that streams frames for transmission, as the host library does: several requests under way, never more frames
-//! than the device's queue holds. And what became of each, on the bus and in the device's words.
+//! A host that streams frames for transmission, as the host library does: several requests under way, but never more
+//! frames than the device's queue holds. It also tracks what became of each, on the bus and according to the device.
 
 use std::collections::VecDeque;
 
@@ -20,9 +20,9 @@ const TICKS_PER_US: u64 = 12;
 const CYCLES_PER_TICK: u64 = CYCLES_PER_US / TICKS_PER_US;
 /// Requests of a channel under way: half of the host library's.
 const REQUESTS: usize = 3;
-/// From the plan to its first frame.
+/// Time from the plan to its first frame.
 const LEAD: u64 = 100 * MS;
-/// A stream of which nothing ends for this long, after its first frame, has come to a halt.
+/// If, after its first frame, nothing in a stream ends for this long, it has come to a halt.
 const STANDSTILL: u64 = 200 * MS;
 /// Bits between two frames.
 const INTERMISSION_BITS: u64 = 3;
@@ -48,14 +48,14 @@ impl Sent {
             && confirmed.eq(planned.iter().map(|planned| planned.tag))
     }
 
-    /// Stamps of the confirmations, less the moment at which the transmission was valid: the end of the frame.
+    /// Stamps of the confirmations, minus the moment at which the transmission was valid: the end of the frame.
     pub fn stamps(&self) -> Option<Range> {
         let stamps = self.confirmed.iter().zip(&self.crossed);
         Range::of(stamps.map(|((_, stamp), crossed)| *stamp as i64 - crossed.end as i64))
     }
 }
 
-/// Opens channels to take part in buses at 1 Mbit/s, each with a node that acknowledges.
+/// Opens channels as participants of buses at 1 Mbit/s, each with a node that acknowledges.
 pub fn join(rig: &mut Rig, channels: &[Channel]) -> Result<(), RigError> {
     for &channel in channels {
         let config = ChannelConfig { mode: Mode::Normal, ..ChannelConfig::listen_only(timing(MEGABIT)?) };
@@ -74,7 +74,7 @@ struct Lane<'p> {
     sent: Sent,
 }
 
-/// Sends everything planned for each channel and waits until all of it has ended, or nothing more does.
+/// Sends everything planned for each channel and waits until all of it has ended, or the stream comes to a halt.
 pub fn stream(rig: &mut Rig, plans: [&[TxFrame]; CHANNELS]) -> Result<[Sent; CHANNELS], RigError> {
     let origin = rig.clock_origin();
     let mut lanes = Channel::ALL.map(|channel| Lane {
@@ -151,14 +151,14 @@ impl Lane<'_> {
 /// How a replay kept its times.
 #[derive(Clone, Copy, Debug)]
 pub struct Replayed {
-    /// Start on the bus less the time planned; the range's width is the error of the spacing.
+    /// Start on the bus minus the planned time; the range's width is the error of the spacing.
     pub late: Range,
     /// Stamps of the confirmations.
     pub stamps: Range,
 }
 
-/// Streams `seconds` of timed frames to channels that are open: random ones of every kind that occupy `load_percent` of each
-/// bus, at times of their own. `None` if one is missing, doubled or out of order.
+/// Streams `seconds` of timed frames to open channels: random ones of every kind that occupy `load_percent` of each bus, at
+/// separate times for each channel. `None` if one is missing, doubled or out of order.
 pub fn replay(
     rig: &mut Rig,
     channels: &[Channel],
@@ -200,8 +200,8 @@ pub struct Filled {
     pub stamps: Range,
 }
 
-/// Streams `seconds` of frames to channels that are open, as fast as the buses take them. `None` if one is missing,
-/// doubled or out of order.
+/// Streams `seconds` of frames to open channels, as fast as the buses take them. `None` if one is missing, doubled
+/// or out of order.
 pub fn fill(
     rig: &mut Rig,
     channels: &[Channel],

@@ -1,5 +1,5 @@
-//! The emulator itself must survive whatever it is given: files that are not quite ELFs, and programs that are
-//! not quite programs.
+//! The emulator itself must survive any input: files that are not quite ELFs, and programs that are not quite
+//! programs.
 
 mod common;
 
@@ -13,7 +13,7 @@ use cantap_sim::board::{self, CLOCK};
 use cantap_sim::firmware;
 use fastrand::Rng;
 
-/// Random halfwords, and stores to random registers of known peripherals among them.
+/// Random halfwords, with stores to random registers of known peripherals among them.
 fn random_program(random: &mut Rng) -> Image {
     const BASES: [u32; 16] = [
         0x4000_0000,

@@ -28,7 +28,7 @@ fn connected_under(bound: Bound) -> Rig {
     rig
 }
 
-/// Three seconds of emulation would be no better: 100 replies at different phases of the other channel's traffic.
+/// Longer emulation would add nothing: these are 100 replies at different phases of the other channel's traffic.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_reply_starts_within_50_us_even_with_the_other_channel_full() {
@@ -59,7 +59,8 @@ fn periodic_frames_keep_their_period() {
     }
 }
 
-/// 6150 frames a second on each bus, 78 % of it: none is left out, and one that is due with others waits for some of theirs, of 0.13 ms each.
+/// 6150 frames a second on each bus, 78 % of it: none is left out, and one that is due together with others waits for some of them, 0.13 ms
+/// each.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn all_periodic_entries_of_both_channels_keep_their_periods() {
@@ -105,7 +106,7 @@ fn hardware_filters_accept_and_reject() {
     assert_eq!(wanted, 5);
     for channel in [Can1, Can2] {
         rig.ask(Command::SetFilters { channel, filters: filters.into_iter().collect() }).unwrap();
-        // Not through the books: they expect every frame of the bus.
+        // Not through the books, which expect every frame on the bus.
         let config = ChannelConfig::listen_only(timing(MEGABIT).unwrap());
         rig.ask(Command::Open { channel, config: Some(config) }).unwrap();
         let from = rig.now() + MS;

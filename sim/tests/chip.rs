@@ -38,7 +38,7 @@ fn led_changes(rig: &mut Rig, ms: u64) -> usize {
     lit.windows(2).filter(|pair| pair[0] != pair[1]).count()
 }
 
-/// An overflow would fault, so a quarter of the stack is kept for what these tests do not reach.
+/// An overflow would fault, so a quarter of the stack is kept in reserve for what these tests do not reach.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn the_stack_is_never_used_beyond_three_quarters() {
@@ -64,7 +64,7 @@ fn the_stack_is_never_used_beyond_three_quarters() {
     rig.ask(Command::Open { channel: Channel::Can2, config: None }).unwrap();
     let mut stack = vec![0; STACK_LEN];
     assert!(rig.machine.cpu().memory(STACK).unwrap().read(STACK, &mut stack));
-    // Memory is zero at power-on, and the deepest word that was ever pushed is not.
+    // Memory is zero at power-on, and the deepest word ever pushed is not.
     let untouched = stack.iter().take_while(|&&byte| byte == 0).count();
     let used = STACK_LEN - untouched;
     println!("deepest use of the stack: {used} of {STACK_LEN} bytes");
@@ -93,7 +93,7 @@ fn traffic_and_errors_show_on_the_light() {
     assert!((6..=9).contains(&led_changes(&mut rig, 400)));
 }
 
-/// What follows is ST's ROM, of which the emulator has the vectors only: the run ends at its first instruction.
+/// What follows is ST's ROM, of which the emulator has only the vectors: the run ends at its first instruction.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn the_bootloader_is_entered_after_the_answer_is_sent() {

@@ -130,7 +130,7 @@ fn a_served_device_talks_to_whoever_reads_and_writes() {
     exchange(&hello, &mut |session, _| {
         session.response(id).is_some_and(|response| matches!(response.result, Ok(Reply::Hello(_))))
     });
-    // Half the speed that the traffic would have by itself: the buses follow whoever opens the channel.
+    // Half the default bit rate: the buses use the rate at which the channel is opened.
     let config = Some(ChannelConfig::listen_only(timing(500_000).unwrap()));
     let (id, open) = requests.request(cantap_wire::Command::Open { channel: Channel::Can1, config });
     exchange(&open, &mut |session, _| session.response(id).is_some_and(|response| response.result.is_ok()));
@@ -138,7 +138,7 @@ fn a_served_device_talks_to_whoever_reads_and_writes() {
     assert_eq!(session.corruptions(), []);
 }
 
-/// A client that is killed closes the port as any other: the channel leaves the bus, and the next client finds it closed.
+/// A client that is killed closes the port like any other: the channel leaves the bus, and the next client finds it closed.
 #[cfg(unix)]
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
@@ -156,7 +156,7 @@ fn a_pty_whose_client_is_gone_leaves_the_bus() {
     let mut name = String::new();
     BufReader::new(server.stdout.take().unwrap()).read_line(&mut name).unwrap();
     let open = || File::options().read(true).write(true).open(name.trim()).unwrap();
-    // An slcan channel that receives, and nobody who closes it.
+    // An slcan channel that receives and is never closed.
     let mut first = open();
     first.write_all(b"\rS6\rO\r").unwrap();
     let mut heard = Vec::new();
@@ -210,7 +210,7 @@ fn a_pty_is_announced_by_its_name_and_answers() {
     assert_eq!(server.wait().unwrap().code(), Some(0));
 }
 
-/// Asked politely, by Ctrl-C or by the system, it ends as a device that is no longer needed, whether a client is there or not.
+/// Asked politely, by Ctrl-C or by the system, it ends as a device that is no longer needed, with or without a client.
 #[cfg(unix)]
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]

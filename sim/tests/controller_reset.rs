@@ -1,5 +1,5 @@
-//! A controller whose bus is stuck in the middle of a frame is reset to leave it. What such a reset takes with it the manual leaves
-//! open, so everything must be right afterwards in both cases.
+//! A controller whose bus is stuck in the middle of a frame is reset to leave it. The manual leaves open what such a reset clears,
+//! so everything must be right afterwards in either case.
 
 mod common;
 
@@ -45,23 +45,23 @@ fn stuck_and_closed(master_reset: MasterReset) -> Rig {
         rig.ask(Command::SetFilters { channel, filters: [filter(id)].into_iter().collect() }).unwrap();
     }
     for channel in Channel::ALL {
-        // Not through the books: they expect every frame of the bus.
+        // Not through the books, which expect every frame on the bus.
         let mode = if channel == Can1 { Mode::Normal } else { Mode::ListenOnly };
         rig.ask(Command::Open { channel, config: Some(config(mode)) }).unwrap();
     }
-    // Nobody acknowledges: one of them is on the bus when it gets stuck, two wait in mailboxes, one in the queue.
+    // Nobody acknowledges: one frame is on the bus when it gets stuck, two wait in mailboxes, one in the queue.
     for tag in 0..4 {
         send(&mut rig, tag, "7AA#1122334455667788");
     }
     rig.run_for(3 * MS).unwrap();
     hold(&mut rig, true);
     rig.run_for(2 * MS).unwrap();
-    // Answered, which it was not when each poll reset the controller anew.
+    // This is answered; it was not when each poll reset the controller again.
     rig.ask(Command::Close { channel: Can1 }).unwrap();
     rig.run_for(5 * MS).unwrap();
     let ended =
         rig.events().iter().filter(|(_, event)| matches!(event, Event::TransmitFailed { .. })).count();
-    assert_eq!(ended, 4, "each is told of");
+    assert_eq!(ended, 4, "each is reported");
     assert_eq!(rig.events().last().map(|(_, event)| *event), Some(Event::Stopped { channel: Can1 }));
     hold(&mut rig, false);
     rig.run_for(2 * MS).unwrap();
@@ -80,7 +80,7 @@ fn some_frames(rig: &Rig, ids: [u32; 3]) -> Vec<(u64, Frame)> {
 fn nothing_of_before_is_sent_and_the_filters_stand_after_a_reset() {
     for master_reset in [MasterReset::Least, MasterReset::Most] {
         let mut rig = stuck_and_closed(master_reset);
-        // The other channel was open all the time, and its banks lie in the registers of the one that was reset.
+        // The other channel was open all the time, and its banks are in the registers of the one that was reset.
         let before = rig.status().unwrap().channels[1].frames;
         let script = Script::new(some_frames(&rig, [0x200, 0x201, 0x200]));
         rig.add_traffic(Can2, MEGABIT, script);
@@ -132,8 +132,8 @@ fn a_reset_beside_a_full_channel_costs_it_no_frame_where_the_banks_survive() {
     assert_eq!(rig.ledger.losses(Can2).total(), 0);
 }
 
-/// Where the reset clears the banks, the other channel hears nothing until they are written again: at most one frame long, and what
-/// may be missing is reported.
+/// If the reset clears the banks, the other channel hears nothing until they are written again: for at most one frame, and that
+/// something may be missing is reported.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_reset_that_clears_the_banks_costs_a_full_channel_a_frame_at_most_and_is_told_of() {
@@ -143,7 +143,7 @@ fn a_reset_that_clears_the_banks_costs_a_full_channel_a_frame_at_most_and_is_tol
         rig.connect().unwrap();
         rig.ask(Command::Open { channel: Can1, config: Some(config(Mode::Normal)) }).unwrap();
         rig.listen(Can2, MEGABIT).unwrap();
-        // The reset falls elsewhere in the frames each time.
+        // Each time the reset comes at a different point of the frames.
         let from = rig.now() + round * MS / 71;
         rig.add_traffic(Can2, MEGABIT, Traffic::new(Kind::Std0, 1, 100.0, from, from + 130 * MS));
         hold(&mut rig, true);

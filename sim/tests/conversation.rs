@@ -1,5 +1,5 @@
-//! The port: every request is answered, and whatever else arrives is answered or dropped, never with a hang and never
-//! to the bus's harm.
+//! The port: every request is answered, and whatever else arrives is answered or dropped, and never makes the device
+//! hang or disturbs the bus.
 
 mod common;
 
@@ -19,7 +19,7 @@ fn connected() -> Rig {
     rig
 }
 
-/// Says bytes that are not ours and lets the device think about them.
+/// Sends bytes that are not a request of ours and gives the device time to handle them.
 fn say(rig: &mut Rig, bytes: &[u8]) {
     rig.with_host(|host, _| host.send(bytes));
     let sent = rig.run_while(2000 * MS, |rig| rig.with_host(|host, _| host.unsent()) > 0).unwrap();
@@ -128,7 +128,7 @@ fn a_reset_request_brings_the_device_back_on_the_bus() {
     rig.greet().unwrap();
 }
 
-/// Random bytes, in pieces of every length, while a capture runs: it loses nothing and the bus sees nothing.
+/// Random bytes, in pieces of every length, while a capture runs: the capture loses nothing, and nothing reaches the bus.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn garbage_neither_hangs_the_device_nor_disturbs_the_capture() {
@@ -168,8 +168,8 @@ fn half_a_request_waits_and_a_zero_throws_it_away() {
     rig.ask(Command::Time).unwrap();
 }
 
-/// Faster than they can be answered, while the host reads and while it does not: it is made to wait, the control pipe is not,
-/// and each is answered.
+/// Requests faster than they can be answered, both while the host reads and while it does not: the host is made to wait,
+/// except on the control pipe, and every request is answered.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn every_request_of_a_flood_is_answered() {
@@ -194,7 +194,7 @@ fn every_request_of_a_flood_is_answered() {
     }
 }
 
-/// The news that the port is closed comes by the control pipe, past packets that must wait, and ends the capture.
+/// The closing of the port arrives by the control pipe, past packets that must wait, and ends the capture.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_host_that_floods_and_never_reads_can_close_the_port() {
@@ -216,7 +216,7 @@ fn a_host_that_floods_and_never_reads_can_close_the_port() {
     assert!(status.channels.iter().all(|channel| channel.open.is_none()), "{status:?}");
 }
 
-/// What a device need not know it stalls, and goes on.
+/// The device stalls requests that it need not support, and carries on.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn unknown_control_requests_are_refused_and_harm_nothing() {

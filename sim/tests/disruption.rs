@@ -19,7 +19,7 @@ const INSTANTS_PER_BOARD: u64 = 25;
 const MEGABIT: u32 = 1_000_000;
 /// Load that the test can afford.
 const LOAD_PERCENT: f64 = 30.0;
-/// The device may need this long to see that nobody is there: 3 ms of silence on the bus, and a tick.
+/// The device may need this long to notice that nobody is there: 3 ms of silence on the bus, and a tick.
 const GRACE: u64 = 8 * MS;
 /// A capture after the device came back.
 const AGAIN: u64 = 4 * MS;
@@ -65,13 +65,13 @@ impl Disruption {
         });
     }
 
-    /// Whether the device can know that nobody is there.
+    /// Whether the device can notice that nobody is there.
     fn ends_the_session(self) -> bool {
         self != Self::StopReading
     }
 }
 
-/// A board on a host that resets a new device twice, or once.
+/// A board on a host that resets a new device twice or once.
 fn board(second_reset: bool) -> Rig {
     let timing = Timing { second_reset, ..Timing::hasty(CLOCK) };
     let mut rig = Rig::new(common::firmware(), common::setup(), timing);
@@ -108,7 +108,10 @@ fn the_device_survives_a_host_that_goes_away_at_any_instant() {
             rig.run_for(GRACE).unwrap();
             if disruption.ends_the_session() {
                 for channel in Channel::ALL {
-                    assert!(!rig.takes_part(channel), "{disruption:?}: {channel:?} listens on for nobody");
+                    assert!(
+                        !rig.takes_part(channel),
+                        "{disruption:?}: {channel:?} still listens with nobody there"
+                    );
                 }
             }
             rig.run_for(random.u64(..10 * MS)).unwrap();
@@ -179,8 +182,8 @@ fn a_lost_handshake_neither_loses_nor_doubles_a_frame() {
     assert!(rig.ledger.holds(), "{:?}", rig.ledger.faults());
 }
 
-/// Suspended and woken without losing the configuration, as a laptop's lid does: the session is over, and a new one
-/// begins without an enumeration.
+/// Suspended and woken without losing the configuration, as when a laptop is closed and opened: the session is
+/// over, and a new one begins without an enumeration.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn resume_needs_no_enumeration() {
@@ -200,8 +203,8 @@ fn resume_needs_no_enumeration() {
     rig.ask(Command::Status).unwrap();
 }
 
-/// A laptop that sleeps and wakes with the port open: all that was captured until then is delivered, and the device says that the
-/// session has ended, and when. Nothing is missing, and nobody waits for frames that will not come.
+/// A laptop that sleeps and wakes with the port open: everything captured until then is delivered, and the device says that and
+/// when the session ended. Nothing is missing, and nobody waits for frames that will not come.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_host_that_wakes_is_told_that_the_session_has_ended_and_misses_nothing() {
@@ -209,14 +212,14 @@ fn a_host_that_wakes_is_told_that_the_session_has_ended_and_misses_nothing() {
     for (round, stalled) in [(1, false), (2, true), (3, false)] {
         begin(&mut rig);
         rig.run_for(5 * MS + round * MS / 3).unwrap();
-        // A reader that stands still leaves frames in the queue, the endpoint, the batch.
+        // A stalled reader leaves frames in the queue, the endpoint and the batch.
         rig.with_host(|host, _| host.read(!stalled));
         rig.run_for(4 * MS).unwrap();
         rig.with_host(|host, _| host.suspend());
         let asleep_at = rig.now();
         rig.run_for(50 * MS).unwrap();
         for channel in Channel::ALL {
-            assert!(!rig.takes_part(channel), "{channel:?} listens on for nobody");
+            assert!(!rig.takes_part(channel), "{channel:?} still listens with nobody there");
         }
         assert_eq!(rig.session_end(), None);
         rig.with_host(UsbHost::resume);

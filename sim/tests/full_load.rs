@@ -1,5 +1,5 @@
 //! The product's claim: both channels saturated at 1 Mbit/s, and every frame arrives, in order and bit for
-//! bit; and where the host stops reading for longer than the queue lasts, every frame is counted.
+//! bit; and if the host stops reading for longer than the queue lasts, every lost frame is counted.
 
 mod common;
 
@@ -28,7 +28,7 @@ fn at_full_load(kind: Kind, seconds: f64) -> Options {
     Options { seconds, load, bound: common::bound(), ..Options::default() }
 }
 
-/// Both channels at full load lose nothing, and stamps are at most 0.6 us late; with a core that waits as long as it can, 1.
+/// Both channels at full load lose nothing, and stamps are at most 0.6 us late; with a core that waits as long as possible, 1.
 fn nothing_is_lost(options: &Options, least_frames_per_s: f64) -> Report {
     let report = capture(options);
     assert_eq!(report.channels.len(), 2);
@@ -49,7 +49,7 @@ fn two_seconds_of_the_shortest_data_frames_on_both_channels_lose_nothing() {
     assert!(report.bound == Bound::Worst || report.cpu_load_pct <= 25.0, "{} %", report.cpu_load_pct);
 }
 
-/// Beside the capture of a full channel, with everything as slow as the manuals allow.
+/// During the capture of a full channel, with everything as slow as the manuals allow.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_queue_that_has_filled_drains_at_a_megabyte_a_second() {
@@ -133,7 +133,7 @@ fn each_row_of_the_earlier_analysers_table_is_carried_at_full_load() {
         rig.run_for(105 * MS).unwrap();
         for channel in Channel::ALL {
             rig.close(channel).unwrap();
-            // 100 ms of back-to-back bits, except for the frame that the end of the traffic cut off.
+            // 100 ms of back-to-back bits, except for the frame cut off by the end of the traffic.
             assert!(
                 (99_800..=100_200).contains(&rig.bus_bits(channel)),
                 "{kind:?}: {}",
@@ -158,7 +158,7 @@ fn a_host_that_stalls_for_100_300_or_600_ms_costs_nothing_on_one_channel() {
         let report = capture(&options);
         assert_eq!(report.channels[0].lost.total(), 0);
         assert!(report.queue_high_water_bytes <= report.queue_bytes);
-        // What the stall left in the queue, less what the last moment before it flushed.
+        // What the stall left in the queue, minus what was flushed just before it.
         let least = 20_833.0 * 4.5 * millis as f64 / 1000.0;
         assert!(f64::from(report.queue_high_water_bytes) > least, "{report:?}");
     }
@@ -213,11 +213,11 @@ fn a_host_behind_a_high_speed_hub_carries_both_channels() {
     options.timing = options.timing.behind_hub(2);
     let report = capture(&options);
     assert!(report.channels.iter().all(|channel| channel.lost.total() == 0), "{report:?}");
-    // What a host without a hub leaves in the queue is a batch; a queue that only fills would have 25 kB at 130 kB/s.
+    // A host without a hub leaves no more than a batch in the queue; at 130 kB/s, a queue that only filled would hold 25 kB.
     assert!(report.queue_high_water_bytes < 10_000, "{report:?}");
 }
 
-/// The same seed gives the same run, another seed another.
+/// The same seed gives the same run, a different seed a different one.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_run_depends_on_its_seed_only() {

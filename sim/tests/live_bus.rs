@@ -1,5 +1,5 @@
 //! The firmware as a node that takes part: transmission, confirmation, fault confinement, and a bus that
-//! does not play along.
+//! does not cooperate.
 
 mod common;
 
@@ -132,7 +132,7 @@ fn a_timed_frame_starts_at_its_tick() {
     rig.run_for(50 * MS).unwrap();
     assert_eq!(confirmed(&rig), [7]);
     let end = rig.events().iter().find(|(_, event)| matches!(event, Event::Transmitted { .. })).unwrap().0;
-    // 58 bits without intermission, less a little; what remains is the interrupt's latency.
+    // 58 bits without intermission, minus a little; what remains is the interrupt's latency.
     let bits = u64::from(cantap_emu::bus::bits::bus_bits(&frame("123#AB"))) - 3;
     let late = end as f64 / 12.0 - at as f64 / 12.0 - bits as f64;
     assert!((0.0..6.0).contains(&late), "{late} us");
@@ -188,8 +188,8 @@ fn bus_off_is_reported_and_left_as_configured() {
     }
 }
 
-/// Nobody acknowledges: error-passive, never bus-off, and the device still answers. When somebody does, the frame
-/// goes out.
+/// Nobody acknowledges: error-passive, never bus-off, and the device still answers. As soon as somebody does, the
+/// frame is sent.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_lone_node_floods_nobody() {
@@ -241,7 +241,7 @@ fn a_stuck_bus_hangs_nothing() {
     settle(&mut rig);
 }
 
-/// Erasing a flash sector stops the core for a second, which the watchdog must survive and the host too.
+/// Erasing a flash sector stops the core for a second, which must trigger neither the watchdog nor the host's timeout.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn defaults_are_saved_and_used_after_a_reset() {
@@ -283,7 +283,7 @@ fn the_order_on_the_bus_is_the_order_of_confirmation() {
     for channel in Channel::ALL {
         rig.open(channel, normal()).unwrap();
     }
-    // Both channels send at the same time, and lower identifiers of the other win in between.
+    // Both channels send at the same time, and the other's lower identifiers win in between.
     send(&mut rig, Can1, 0, &["300#", "301#", "302#", "303#"]);
     send(&mut rig, Can2, 100, &["200#", "201#", "402#", "203#"]);
     rig.run_for(20 * MS).unwrap();

@@ -1,5 +1,5 @@
-//! Capture is never the victim of transmission: with everything set that a host can set, no receive FIFO overruns, USB answers and the
-//! watchdog is fed, with and without a node that acknowledges.
+//! Capture is never the victim of transmission: whatever a host sets, no receive FIFO overruns, USB answers and the watchdog is fed,
+//! with or without a node that acknowledges.
 
 mod common;
 
@@ -20,15 +20,15 @@ const MEGABIT: u32 = 1_000_000;
 const TICKS_PER_US: u32 = 12;
 /// The shortest period that a device takes.
 const SHORTEST_US: u32 = 47;
-/// So long each storm lasts, in device time.
+/// How long each storm lasts, in device time.
 const STORM: u64 = 100 * MS;
-/// A request is answered within this, whatever else goes on. A host gives up after ten times as long.
+/// A request is answered within this time, whatever else is going on. A host gives up after ten times as long.
 const ANSWERED_WITHIN: u64 = 30 * MS;
 
-/// What drains, sends and records.
+/// The tasks that drain, send and record.
 const PRIORITY_4: [&str; 7] =
     ["CAN1_RX1", "DMA1_STREAM0", "USART2", "USART3", "TIM2", "CAN1_SCE", "CAN2_SCE"];
-/// The longest call of those: a FIFO bears 141 µs, less the other channel's drain.
+/// The longest call of these: a FIFO can wait 141 µs, minus the other channel's drain.
 const LONGEST_CALL_US: f64 = 120.0;
 
 fn connected(bound: Bound) -> Rig {
@@ -50,7 +50,7 @@ fn frame(text: &str) -> Frame {
     text.parse().unwrap()
 }
 
-/// All periodic entries at the shortest period, and all replies to everything.
+/// Sets all periodic entries at the shortest period, and all replies to every frame.
 fn fill_tables(rig: &mut Rig, channel: Channel) {
     for slot in 0..32 {
         let entry = Periodic {
@@ -68,13 +68,13 @@ fn fill_tables(rig: &mut Rig, channel: Channel) {
     }
 }
 
-/// Queues frames that are due together.
+/// Queues frames that are due at the same time.
 fn send_timed(rig: &mut Rig, channel: Channel, at_ticks: u64) {
     let frames = (0..20).map(|tag| TxFrame { tag, frame: frame("155#"), at_ticks: Some(at_ticks) }).collect();
     rig.ask(Command::Send { channel, frames }).unwrap();
 }
 
-/// Lets the storm rage, and asks the device how it is in the middle of it.
+/// Lets the storm rage, and asks for the device's status in the middle of it.
 fn weather(rig: &mut Rig, what: &str) {
     rig.machine.reset_probe();
     let from = rig.now();
@@ -93,7 +93,7 @@ fn weather(rig: &mut Rig, what: &str) {
     for (n, channel) in status.channels.iter().enumerate() {
         let fifo = rig.machine.probe().fifo_max(n);
         assert_eq!(channel.lost_controller, 0, "{what}: CAN{}", n + 1);
-        // Three are its depth: a call that takes as long as two frames, 94 µs, would show.
+        // The depth is three: a call as long as two frames, 94 µs, would show.
         assert!(fifo <= 2, "{what}: {fifo} frames waited in CAN{}'s FIFO", n + 1);
         eprintln!(
             "{what}: CAN{}: {} received, {} lost by the queue, {} sent, {} periods left out; at most {fifo} in the FIFO",
@@ -114,7 +114,7 @@ fn weather(rig: &mut Rig, what: &str) {
     eprintln!("    load {:.1} %", rig.machine.probe().load_percent(rig.now()));
 }
 
-/// CAN1 sends as much as can be asked for beside a full CAN2.
+/// CAN1 sends as much as can be requested, next to a full CAN2.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_full_table_costs_the_other_channel_no_frame() {
@@ -138,7 +138,7 @@ fn a_full_table_costs_the_other_channel_no_frame() {
     }
 }
 
-/// Both channels send as much as can be asked for.
+/// Both channels send as much as can be requested.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn full_tables_on_both_channels_leave_usb_alive() {
@@ -186,14 +186,14 @@ fn full_tables_on_both_channels_leave_usb_alive() {
             assert_eq!(told, u64::from(counted.transmit_failures), "{channel:?}");
             let all = u64::from(counted.transmitted) + told;
             let (empty, full) = filled[channel.index()];
-            // One of each entry may wait when it ends, and the queue's frames and the replies are no periods.
+            // Each entry may have one frame waiting at the end, and queued frames and replies are not periods.
             let (least, most) = (periods(full, closing) - 32, periods(empty, ended.ticks) + 32 + 20);
             assert!((least..=most).contains(&all), "{channel:?}: {all}, not {least} to {most}");
         }
     }
 }
 
-/// A queue that is given up is reported frame by frame, and not all at once.
+/// A queue that is given up is reported frame by frame, not all at once.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn an_aborted_queue_costs_the_other_channel_no_frame() {
@@ -216,7 +216,7 @@ fn an_aborted_queue_costs_the_other_channel_no_frame() {
     assert_eq!(rig.ledger.losses(Can2).total(), 0);
 }
 
-/// Frames with times so close that each is waited for rather than left to the alarm: the longest that one call can last.
+/// Frames due so close together that each is waited for rather than left to the alarm: this is the longest that one call can last.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn frames_that_are_due_one_after_the_other_hold_up_no_drain_for_long() {
@@ -228,7 +228,7 @@ fn frames_that_are_due_one_after_the_other_hold_up_no_drain_for_long() {
         let first = rig.status().unwrap().ticks + u64::from(8_000 * TICKS_PER_US);
         for channel in Channel::ALL {
             for burst in 0..4 {
-                // As many as there are mailboxes, in turn with the other channel's.
+                // As many as there are mailboxes, alternating with the other channel's.
                 let at = |n: u64| {
                     let nth = 2 * n + channel.index() as u64;
                     first + (burst * 2_000 + nth * spacing_us) * u64::from(TICKS_PER_US)

@@ -1,5 +1,5 @@
-//! slcan (Lawicel) on the firmware's ELF: every letter with both of its answers, overruns that are reported, and python-can
-//! unchanged.
+//! slcan (Lawicel) on the firmware's ELF: every letter with both of its answers, reported overruns, and unmodified
+//! python-can.
 
 mod common;
 
@@ -21,7 +21,7 @@ fn plugged_in() -> Rig {
     rig
 }
 
-/// What the device says to a line.
+/// The device's answer to a line.
 fn say(rig: &mut Rig, line: &str) -> String {
     rig.with_host(|host, _| host.send(line.as_bytes()));
     String::from_utf8(rig.run_unbooked(5 * MS).unwrap()).unwrap()
@@ -57,7 +57,7 @@ fn every_letter_is_answered_on_a_closed_channel() {
     converse(
         &mut rig,
         &[
-            // Nothing saved yet, and a rate is set: what needs an open channel is refused.
+            // Nothing is saved yet, and a rate is set: commands that need an open channel are refused.
             ("V\r", "V1001\r"),
             ("F\r", "\x07"),
             ("P\r", "\x07"),
@@ -142,7 +142,7 @@ fn every_letter_is_answered_on_an_open_channel_and_what_would_change_it_is_refus
         assert!(line.starts_with("t1231AB") && line.len() == 8 + digits, "{mode:?}: {line:?}");
         converse(&mut rig, &[("C\r", "\r")]);
     }
-    // Polled: a frame only when it is asked for.
+    // Polled: a frame only on request.
     converse(&mut rig, &[("Z0\r", "\r"), ("X0\r", "\r"), ("O\r", "\r")]);
     on_the_bus(&mut rig, &["101#", "102#", "103#"]);
     assert_eq!(text(rig.run_unbooked(8 * MS).unwrap()), "");
@@ -160,7 +160,7 @@ fn every_letter_is_answered_on_an_open_channel_and_what_would_change_it_is_refus
     }
 }
 
-/// Through the flash: who saved `K1` has reports from programs that never send it.
+/// Through the flash: once `K1` is saved, programs that never send it get reports.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn reports_that_were_saved_are_there_without_being_asked_for() {
@@ -191,7 +191,7 @@ fn slcands_opening_opens_the_channel() {
     assert_eq!(text(rig.run_unbooked(4 * MS).unwrap()), "t1230\r");
 }
 
-/// Frames that the controller's FIFO dropped, because its interrupt came too late.
+/// Frames that the controller's FIFO dropped because its interrupt was handled too late.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn an_overrun_sets_the_data_overrun_flag_once() {
@@ -225,7 +225,7 @@ mod peers {
     use cantap_sim::pty::Pty;
     use cantap_sim::run::{Load, Options};
 
-    /// Receives, sends, and compares what the device says of itself.
+    /// Receives, sends, and compares what the device says about itself.
     const PROGRAM: &str = r#"
 import sys, can
 bus = can.Bus(interface="slcan", channel=sys.argv[1], bitrate=500000)
@@ -247,7 +247,7 @@ bus.shutdown()
 print("done")
 "#;
 
-    /// A terminal, until somebody says that it is enough.
+    /// A terminal, until the flag says that it is enough.
     struct UntilDone<'a>(&'a Pty, &'a AtomicBool);
 
     impl Client for UntilDone<'_> {
@@ -264,7 +264,7 @@ print("done")
         }
     }
 
-    /// A Python with python-can: `CANTAP_PYTHON`, the one that `cargo xtask test` made, or the system's.
+    /// A Python with python-can: `CANTAP_PYTHON`, the one made by `cargo xtask test`, or the system's.
     fn python() -> Option<String> {
         let made = concat!(env!("CARGO_MANIFEST_DIR"), "/../target/peers/bin/python");
         let named = std::env::var("CANTAP_PYTHON").ok();
@@ -275,7 +275,7 @@ print("done")
             }
         }
         assert!(std::env::var_os("CANTAP_REQUIRE_PEERS").is_none(), "no Python with python-can and pyserial");
-        eprintln!("SKIPPED: no Python with python-can and pyserial; name one that has in CANTAP_PYTHON");
+        eprintln!("SKIPPED: no Python with python-can and pyserial; name one that has them in CANTAP_PYTHON");
         None
     }
 

@@ -1,4 +1,4 @@
-//! Marks of USB's start of frame: what the ELF says of each against what the host really did.
+//! Marks of USB's start of frame: what the ELF reports for each, compared with what the host really did.
 
 mod common;
 
@@ -40,7 +40,8 @@ fn check(rig: &mut Rig, timing: &Timing, least: usize) {
     }
 }
 
-/// Over the wrap of the frame number, with a board that is 80 ppm fast and a host whose frames jitter by 500 ns.
+/// Across the wrap of the frame number, with a board that is 80 ppm fast and a host whose frames jitter by 500
+/// ns.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn an_idle_session_has_exact_marks_once_a_second() {
@@ -55,7 +56,7 @@ fn an_idle_session_has_exact_marks_once_a_second() {
     assert_eq!(rig.machine.board().odd_accesses(), []);
 }
 
-/// Both buses full, and the millisecond tick with all there is to do.
+/// Both buses full, and as much as possible to do for the millisecond tick.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn marks_are_exact_beside_two_full_buses() {

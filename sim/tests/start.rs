@@ -1,5 +1,5 @@
-//! How the firmware starts: after power-on, behind the ROM bootloader, with a crystal that is slow or broken, and after a run
-//! that failed.
+//! How the firmware starts: after power-on, after the ROM bootloader, with a crystal that is slow or broken, and after a
+//! failed run.
 
 #[path = "../emu/tests/assembly/mod.rs"]
 mod assembly;
@@ -33,7 +33,7 @@ fn behind_the_bootloader(hz: u64) -> Setup {
     Setup { start: Start::Bootloader, crystal: crystal(hz), ..board::setup() }
 }
 
-/// A rig whose firmware is up and greeted, or none without a firmware.
+/// A rig whose firmware is running and has been greeted.
 fn connected(name: &str, setup: Setup) -> Rig {
     let mut rig = Rig::new(common::board(name), setup, Timing::hasty(CLOCK));
     rig.connect().unwrap_or_else(|error| panic!("{name}: {error}"));
@@ -53,7 +53,7 @@ fn every_board_starts_behind_the_rom_bootloader() {
     }
 }
 
-/// A host must see the bootloader's device go, or it goes on talking to it.
+/// A host must see the bootloader's device disconnect, or it goes on talking to it.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn the_bootloaders_usb_device_goes_before_ours_comes() {
@@ -74,7 +74,7 @@ fn the_bootloaders_usb_device_goes_before_ours_comes() {
     assert!(back && gone >= 10 * MS, "gone for {} us", gone / CYCLES_PER_US);
 }
 
-/// The bootloader leaves the flash interface open, with errors that nobody has cleared.
+/// The bootloader leaves the flash interface open, with uncleared errors.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn defaults_are_saved_behind_the_bootloader() {
@@ -111,8 +111,8 @@ fn the_rom_bootloader_finds_its_memory_at_zero_and_its_vectors_there() {
     assert_eq!(board.odd_accesses(), []);
 }
 
-/// What the chip's errata sheet tells of a peripheral whose clock was just switched on, in the emulator: a store right behind
-/// it is lost, one behind a barrier is not.
+/// What the chip's errata sheet says about a peripheral whose clock was just switched on, in the emulator: a store directly
+/// afterwards is lost, one after a barrier is not.
 #[test]
 fn a_peripheral_is_there_only_some_cycles_after_its_clock_was_switched_on() {
     let mode = |barrier: &[u16]| {
@@ -163,7 +163,7 @@ fn a_debugger_keeps_its_connection_while_the_processor_sleeps() {
     assert_eq!(rig.machine.board().debug_control() & 1, 1);
 }
 
-/// The firmware waits 100 ms of HSI; the emulator's time passes at 144 MHz, where those cycles are 15.
+/// The firmware waits 100 ms at HSI's frequency; the emulator's time passes at 144 MHz, where that takes 15 ms.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_crystal_that_is_slow_is_waited_for() {
@@ -177,7 +177,7 @@ fn a_crystal_that_does_not_start_is_told_by_the_led_and_tried_again() {
     let image = common::firmware();
     let broken = Crystal { hz: 8_000_000, start_us: None };
     let mut rig = Rig::new(image, Setup { crystal: broken, ..board::setup() }, Timing::hasty(CLOCK));
-    // A millisecond of the firmware, which runs from HSI: 16 000 cycles, which its waiting loop makes a third more here.
+    // A millisecond of the firmware, which runs from HSI: 16 000 cycles, of which its delay loop takes a third more here.
     let ms = 21_333;
     // How long it was dark before each flash.
     let mut dark_ms = Vec::new();
@@ -221,7 +221,7 @@ fn words(words: &[u32]) -> Vec<u8> {
     words.iter().flat_map(|word| word.to_le_bytes()).collect()
 }
 
-/// Bends the vector of TIM7 to `target`, lets the firmware fail by it, and bends it back: the next run has no reason to.
+/// Redirects TIM7's vector to `target`, lets the firmware fail there, and restores it, so that the next run does not fail.
 fn fail_once(rig: &mut Rig, target: u32) {
     let vector = FLASH.start + 4 * (16 + TIM7);
     let flash = rig.machine.cpu().memory(vector).unwrap().clone();
@@ -231,7 +231,7 @@ fn fail_once(rig: &mut Rig, target: u32) {
     assert!(rig.run_while(100 * MS, |rig| rig.machine.resets() == resets).unwrap(), "it did not restart");
     rig.cut();
     assert!(flash.write(vector, &right.to_le_bytes()));
-    // The host sees the device go at its next frame.
+    // The host sees the device disconnect at its next frame.
     rig.run_for(5 * MS).unwrap();
     rig.wait_for_port().unwrap();
     rig.greet().unwrap();
@@ -244,13 +244,13 @@ fn the_last_failure_outlives_the_restart_and_can_be_asked_for() {
     let mut rig = connected("olimex-p405", setup);
     assert_eq!(failures(&mut rig), Failures::default());
 
-    // A panic, as an index beyond its slice in line 7 of `src/a.rs` calls it: index, length and place in registers.
+    // A panic as caused by an index out of range in line 7 of `src/a.rs`: index, length and location in registers.
     let panic =
         rig.machine.image().address_of("core::panicking::panic_bounds_check").expect("slices are indexed");
     let ram = rig.machine.cpu().memory(SRAM.start).unwrap().clone();
     let [file, location] = [SRAM.end - 48, SRAM.end - 32];
     assert!(ram.write(file, b"src/a.rs\0") && ram.write(location, &words(&[file, 8, 7, 5])));
-    // LDR r0, r1, r2, r3 from behind the code; BX r3.
+    // LDR r0, r1, r2, r3 from after the code; BX r3.
     let halves: [u16; 6] = [0x4802, 0x4903, 0x4A03, 0x4B04, 0x4718, 0xBF00];
     let bytes = [halves.map(u16::to_le_bytes).concat(), words(&[5, 3, location, panic | 1])].concat();
     let code = FLASH.start + 0xC_0000;

@@ -1,4 +1,4 @@
-//! Runs that end before their time: each says why, where, and who called.
+//! Runs that end early: each says why, where, and from which calls.
 
 #[path = "../emu/tests/assembly/mod.rs"]
 mod assembly;
@@ -74,7 +74,7 @@ fn an_unfed_watchdog_ends_the_run_or_restarts_the_firmware() {
 fn a_requested_reset_restarts_the_firmware_unless_told_otherwise() {
     let program = || {
         let mut program = Program::new();
-        // Two starts ask for a reset, the third sleeps.
+        // The first two starts request a reset, the third sleeps.
         let sleep = program.here();
         program.put(&[wfi()]);
         program.branch_to(sleep);
@@ -96,7 +96,7 @@ fn a_requested_reset_restarts_the_firmware_unless_told_otherwise() {
     assert!(machine.cpu().asleep());
 }
 
-/// The firmware with one exception's vector bent to `target`, until it ends there.
+/// Runs the firmware with one exception's vector redirected to `target`, until it ends there.
 fn bend(number: u32, target: impl Fn(&Image) -> u32) -> (Image, Stopped) {
     let image = common::firmware();
     let mut rig = Rig::new(image.clone(), common::setup(), Timing::new(CLOCK));

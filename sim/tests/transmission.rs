@@ -1,5 +1,5 @@
-//! What a host streams for transmission through the firmware's ELF: in order, at its times, filling the bus, confirmed one by
-//! one, and at no cost to what the other channel captures.
+//! What a host streams for transmission through the firmware's ELF: in order, on time, filling the bus, confirmed one by one,
+//! and at no cost to the other channel's capture.
 
 mod common;
 
@@ -31,19 +31,19 @@ fn joined_under(bound: Bound, channels: &[Channel]) -> Rig {
     rig
 }
 
-/// Full load of the shortest frames on a channel that only listens, for `ms` from now on.
+/// Full load of the shortest frames on a channel that only listens, for `ms` from now.
 fn saturate(rig: &mut Rig, channel: Channel, ms: u64) {
     rig.listen(channel, MEGABIT).unwrap();
     let from = rig.now();
     rig.add_traffic(channel, MEGABIT, Traffic::new(Kind::Std0, 1, 100.0, from, from + ms * MS));
 }
 
-/// How late a stamp may be, beside anything: nothing masks the interrupt that stamps, only another stamp delays it.
+/// How late a stamp may be, whatever else happens: nothing masks the interrupt that stamps, only another stamp delays it.
 fn latest_stamp_us(bound: Bound) -> f64 {
     if bound == Best { 0.6 } else { 1.0 }
 }
 
-/// Spacing within so much of the plan's, and each confirmation's stamp soon after the frame's end.
+/// Checks that the spacing is within `within_us` of the plan, and each confirmation's stamp soon after the frame's end.
 fn hold_times(bound: Bound, what: &str, replayed: Option<&[Replayed]>, within_us: f64) {
     let replayed = replayed.unwrap_or_else(|| panic!("{bound}, {what}: not all frames in order"));
     let latest_us = latest_stamp_us(bound);
@@ -71,8 +71,8 @@ fn a_replay_keeps_its_spacing_at_any_load_below_saturation() {
     }
 }
 
-/// The alarm comes early and the rest is waited for at the priority that drains the FIFOs: it must not cost the other channel
-/// a frame.
+/// The alarm comes early, and the rest of the time is spent waiting at the priority that drains the FIFOs: that must not cost
+/// the other channel a frame.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_replay_keeps_its_spacing_beside_a_full_channel_and_costs_it_nothing() {
@@ -137,7 +137,7 @@ fn two_streams_at_once_fill_both_buses() {
     }
 }
 
-/// The most frames and confirmations that there can be: 20 833 a second of each on each channel.
+/// The most frames and confirmations possible: 20 833 a second of each on each channel.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn two_streams_of_frames_without_data_fill_both_buses() {
@@ -151,8 +151,8 @@ fn two_streams_of_frames_without_data_fill_both_buses() {
     }
 }
 
-/// A full record queue has no room for confirmations. What is due then waits for room; an alarm that came again and again would
-/// keep USB from making it.
+/// A full record queue has no room for confirmations. Frames that are due then wait for room; an alarm that fired again and
+/// again would keep USB from making room.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn timed_frames_that_cannot_be_confirmed_do_not_keep_the_host_out() {

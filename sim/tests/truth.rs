@@ -1,5 +1,5 @@
-//! What the firmware reports is what was on the bus: stamps, losses, errors, and never a trace of its own
-//! on a bus that it only listens to.
+//! What the firmware reports is what was on the bus: stamps, losses, errors, and it leaves no trace on a bus
+//! that it only listens to.
 
 mod common;
 
@@ -21,7 +21,7 @@ const BOTH: [Channel; 2] = Channel::ALL;
 /// Device ticks in a microsecond.
 const TICKS_PER_US: f64 = 12.0;
 
-/// A board that listens on both channels, with a session that keeps every byte.
+/// A board that listens on both channels, whose session keeps every byte.
 fn listening() -> Rig {
     listening_under(common::bound())
 }
@@ -38,14 +38,14 @@ fn listening_under(bound: Bound) -> Rig {
     rig
 }
 
-/// Closes the channels, settles the books, and sees that firmware and chip got along.
+/// Closes the channels, settles the books, and checks that the firmware made no bad accesses to the chip.
 fn settle(rig: &mut Rig) {
     for channel in BOTH {
         rig.close(channel).unwrap();
     }
     assert!(rig.ledger.holds(), "{:?}", rig.ledger.faults());
     assert_eq!(rig.session.corruptions(), []);
-    assert_eq!(rig.machine.board().odd_accesses(), [], "accesses that no model knows or no hardware takes");
+    assert_eq!(rig.machine.board().odd_accesses(), [], "accesses that no model knows or no hardware accepts");
 }
 
 /// Received frames with their stamps in ticks.
@@ -67,7 +67,7 @@ fn frame(text: &str) -> Frame {
     text.parse().unwrap()
 }
 
-/// At 1 Mbit/s receivers take a frame 1 us before its end, which is then still to come when it is stamped.
+/// At 1 Mbit/s receivers accept a frame 1 us before its end, which is then still to come when it is stamped.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn stamps_are_at_most_a_microsecond_late_under_full_load() {
@@ -129,7 +129,7 @@ fn bursts_of_five_are_never_lost() {
     assert_eq!(rig.ledger.losses(Channel::Can1).total(), 0);
 }
 
-/// Two nodes with identifiers 1 and 2: the times from frame to frame are the lengths of the frames, bit for
+/// Two nodes with identifiers 1 and 2: the intervals between frames are the lengths of the frames, bit for
 /// bit.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
@@ -166,7 +166,7 @@ fn two_node_traffic_has_its_golden_lengths() {
 }
 
 /// Two full buses with errors, a sender that nobody acknowledges, a bus stuck dominant, another bit rate: the
-/// device's pins stay recessive, the ACK slot included.
+/// device's pins stay recessive, even in the ACK slot.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn listen_only_never_drives_the_bus() {
@@ -205,7 +205,7 @@ fn every_error_on_the_bus_is_reported_by_its_name() {
     let from = rig.now() + MS;
     let script = (0..4).map(|n| (from + n * 10 * MS, frame("555#00"))).collect();
     rig.add_traffic(Channel::Can2, MEGABIT, Script::new(script));
-    // A disturbed frame is repeated at once, so the next one in order is two on.
+    // A disturbed frame is repeated at once, so the next in order is two further on.
     for (n, disturbance) in [Disturbance::Stuff, Disturbance::Form, Disturbance::Crc].into_iter().enumerate()
     {
         rig.machine.board().wires[1].disturb(2 * n as u64, disturbance);
@@ -224,7 +224,7 @@ fn every_error_on_the_bus_is_reported_by_its_name() {
     assert_eq!(rig.ledger.delivered_count(Channel::Can2), 4);
 }
 
-/// What autobaud builds on: the wrong rate gives errors and no frame, and harms nobody.
+/// What autobaud builds on: the wrong rate gives errors and no frame, and disturbs nobody.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_wrong_bit_rate_shows_as_errors_and_disturbs_nobody() {
@@ -252,7 +252,7 @@ fn a_wrong_bit_rate_shows_as_errors_and_disturbs_nobody() {
     }
 }
 
-/// Everything else here rests on these: the time of the bus, of the stamps and of USB.
+/// Everything else here relies on these: the time of the bus, of the stamps and of USB.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn the_clock_tree_is_set_up_as_designed() {
@@ -263,7 +263,7 @@ fn the_clock_tree_is_set_up_as_designed() {
     assert_eq!(clocks.cycles_per_timer_clock, 2, "72 MHz");
 }
 
-/// A firmware that cannot get at its FIFOs in time loses frames, and says so.
+/// Firmware that cannot reach its FIFOs in time loses frames, and says so.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_forced_overrun_is_counted() {

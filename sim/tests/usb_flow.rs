@@ -1,4 +1,4 @@
-//! The pipes under load: a host that floods, and who touches the controller.
+//! The pipes under load: a host that floods, and the question of who touches the controller.
 
 mod common;
 
@@ -11,8 +11,8 @@ use cantap_sim::rig::{MS, Rig, timing};
 use cantap_wire::message::{ChannelConfig, Mode, TxFrame};
 use cantap_wire::{Channel, Command, Frame};
 
-/// A host that sends faster than it is served, in pieces that end anywhere in a packet. NAK is its only brake; taken back before
-/// the end of a transfer it would cost four bytes of a packet.
+/// A host that sends faster than it is served, in pieces that end anywhere in a packet. Only NAK slows it down; cleared before
+/// the end of a transfer, that would cost four bytes of a packet.
 fn flood(mut next: impl FnMut(&mut fastrand::Rng) -> Command) {
     let image = common::firmware();
     let mut rig = Rig::new(image, Setup { joined: true, ..board::setup() }, Timing::new(CLOCK));

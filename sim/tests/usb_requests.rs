@@ -1,5 +1,5 @@
-//! What hosts ask of a device beside data: configured again, interfaces set anew, endpoints halted, requests that are too long or
-//! not offered. The port works afterwards as before, and every frame is delivered or counted.
+//! What hosts request from a device apart from data: a new configuration, interfaces set again, endpoints halted, requests that
+//! are too long or not supported. Afterwards the port works as before, and every frame is delivered or counted.
 
 mod common;
 
@@ -54,7 +54,7 @@ fn ask(rig: &mut Rig, request: Request) -> Outcome {
     outcome.expect("a request ends")
 }
 
-/// Nothing was lost on the way, and the controller was driven as it wants to be.
+/// Nothing was lost on the way, and the controller was driven correctly.
 fn nothing_was_lost(mut rig: Rig) {
     rig.run_for(3 * MS).unwrap();
     for channel in Channel::ALL {
@@ -72,7 +72,7 @@ fn nothing_was_lost(mut rig: Rig) {
 fn a_device_that_is_configured_again_begins_with_data0_on_every_pipe() {
     let mut rig = capturing();
     for round in 0..6 {
-        // Another number of packets on each pipe every time, so that toggles are odd and even.
+        // A different number of packets on each pipe every time, so that both states of the toggles occur.
         for _ in 0..round % 3 {
             rig.ask(Command::Status).unwrap();
         }
@@ -80,7 +80,7 @@ fn a_device_that_is_configured_again_begins_with_data0_on_every_pipe() {
         assert_eq!(ask(&mut rig, Request::set_configuration(0)), Outcome::Done(Vec::new()), "round {round}");
         rig.run_for(5 * MS).unwrap();
         for channel in Channel::ALL {
-            assert!(!rig.takes_part(channel), "{channel:?} listens on for nobody");
+            assert!(!rig.takes_part(channel), "{channel:?} still listens with nobody there");
         }
         rig.cut();
         assert_eq!(ask(&mut rig, Request::set_configuration(1)), Outcome::Done(Vec::new()), "round {round}");
@@ -91,8 +91,8 @@ fn a_device_that_is_configured_again_begins_with_data0_on_every_pipe() {
     nothing_was_lost(rig);
 }
 
-/// A configuration under an open port, of which the program that has it is told nothing: when that asks for something, it learns when its
-/// session ended and why. What the configuration took out of the endpoint is counted, and nothing else is missing.
+/// A reconfiguration under an open port, of which the program that has it learns nothing: when it makes a request, it learns when and why
+/// its session ended. What the reconfiguration removed from the endpoint is counted, and nothing else is missing.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_client_under_which_the_device_is_configured_anew_is_told_when_it_asks() {
@@ -108,12 +108,12 @@ fn a_client_under_which_the_device_is_configured_anew_is_told_when_it_asks() {
         assert_eq!(ask(&mut rig, Request::set_configuration(1)), Outcome::Done(Vec::new()));
         rig.run_for(10 * MS).unwrap();
         for channel in Channel::ALL {
-            assert!(!rig.takes_part(channel), "{channel:?} listens on for nobody");
+            assert!(!rig.takes_part(channel), "{channel:?} still listens with nobody there");
         }
-        assert_eq!(rig.session_end(), None, "round {round}: told to whoever listens");
+        assert_eq!(rig.session_end(), None, "round {round}: reported to a program that may be a new one");
         rig.ask(Command::Status).unwrap_err();
         let Some((ticks, EndReason::Configured)) = rig.session_end() else {
-            panic!("round {round}: refused before the end was told: {:?}", rig.session_end());
+            panic!("round {round}: refused before the end was reported: {:?}", rig.session_end());
         };
         let ended_at = rig.clock_origin() + ticks * 12;
         assert!((configured_at..configured_at + 3 * MS).contains(&ended_at), "round {round}");
@@ -125,7 +125,7 @@ fn a_client_under_which_the_device_is_configured_anew_is_told_when_it_asks() {
         }
         assert!(rig.ledger.holds(), "round {round}: {:?}", rig.ledger.faults());
         assert_eq!(rig.with_host(|host, _| host.counters().enumerations), 1);
-        // Whoever greets the device on the same port goes on.
+        // A program that greets the device on the same port can carry on.
         rig.greet().unwrap();
         listen(&mut rig);
         rig.with_host(|host, _| host.keep_port(false));
@@ -145,7 +145,7 @@ fn an_interface_set_anew_under_an_open_port_loses_nothing() {
     nothing_was_lost(rig);
 }
 
-/// The driver comes upon the halt with its next token or packet and ends it, as Linux's does.
+/// The driver notices the halt with its next token or packet and clears it, as Linux's does.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_halt_and_its_end_lose_nothing() {
@@ -170,7 +170,7 @@ fn a_halt_and_its_end_lose_nothing() {
 fn a_configuration_ends_a_halt() {
     let mut rig = capturing();
     for endpoint in [BULK_IN, BULK_OUT, NOTIFY_IN] {
-        // With the port closed, no driver comes upon the halt.
+        // With the port closed, no driver notices the halt.
         rig.with_host(|host, _| host.close_port());
         rig.run_for(5 * MS).unwrap();
         rig.cut();
@@ -227,6 +227,6 @@ fn what_the_descriptors_do_not_offer_is_refused() {
     let Outcome::Done(head) = ask(&mut rig, Request::new(0x80, GET_DESCRIPTOR, 2 << 8, 0, 9)) else {
         panic!()
     };
-    assert_eq!((head[7], head[8]), (0x80, 50), "fed by the bus, without remote wakeup, 100 mA");
+    assert_eq!((head[7], head[8]), (0x80, 50), "powered by the bus, without remote wakeup, 100 mA");
     nothing_was_lost(rig);
 }

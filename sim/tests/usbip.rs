@@ -1,4 +1,5 @@
-//! The USB/IP server, with this file in the kernel's place: what `cargo xtask test --only kernel` shows with a real one, in a second.
+//! The USB/IP server, with this file in place of the kernel: what `cargo xtask test --only kernel` shows with a real one, but in a
+//! second.
 #![cfg(unix)]
 
 mod common;
@@ -34,7 +35,7 @@ impl Server {
         Self { process, folder, usbip: ports[0], control: ports[2] }
     }
 
-    /// Says a line and returns the answer.
+    /// Sends a line and returns the answer.
     fn say(&self, line: &str) -> String {
         let mut stream = TcpStream::connect(("127.0.0.1", self.control)).unwrap();
         writeln!(stream, "{line}").unwrap();
@@ -47,7 +48,7 @@ impl Server {
         serde_json::from_str::<Value>(&self.say("status")).unwrap()[name].clone()
     }
 
-    /// As `usbip attach` does: asks for the device by its bus ID.
+    /// Like `usbip attach`: asks for the device by its bus ID.
     fn import(&self, name: &[u8]) -> Kernel {
         let mut stream = TcpStream::connect(("127.0.0.1", self.usbip)).unwrap();
         stream.set_read_timeout(Some(Duration::from_mins(1))).unwrap();
@@ -65,7 +66,7 @@ impl Server {
         assert_eq!(reply[..8], [1, 0x11, 0, 3, 0, 0, 0, 0]);
         assert_eq!(reply[8 + 300..8 + 304], [0x12, 0x09, 0, 1], "vendor and product");
         let (status, device) = kernel.control([0x80, 6, 0, 1, 0, 0, 64, 0], &[]);
-        // One packet: its size is what Linux wants to know.
+        // One packet: Linux wants to know its size.
         assert!(status == 0 && device.len() >= 8, "{device:02x?}");
         let (_, whole) = kernel.control([0x80, 6, 0, 1, 0, 0, 18, 0], &[]);
         assert!(whole.len() == 18 && whole.starts_with(&device), "{whole:02x?}");
@@ -125,7 +126,7 @@ impl Kernel {
         self.seq
     }
 
-    /// The next end of a transfer: its number, status, and data, which only comes in.
+    /// The next completed transfer: its number, its status, and its data if that came in.
     fn end(&mut self, input: bool) -> (u32, i32, Vec<u8>) {
         let head = self.read(48);
         let word = |n: usize| u32::from_be_bytes(head[4 * n..4 * n + 4].try_into().unwrap());
@@ -133,7 +134,7 @@ impl Kernel {
         (word(1), word(5) as i32, data)
     }
 
-    /// Takes back a transfer.
+    /// Withdraws a transfer.
     fn take_back(&mut self, seq: u32, victim: u32) {
         let head = [2, seq, 0x1_0002, 0, 0, victim, 0, 0, 0, 0, 0, 0];
         let bytes: Vec<u8> = head.iter().flat_map(|word: &u32| word.to_be_bytes()).collect();
@@ -164,7 +165,7 @@ impl Kernel {
         self.submit(self.input, true, 128, [0; 8], &[])
     }
 
-    /// Reads until the bytes end so.
+    /// Reads until the bytes end like this.
     fn read_until(&mut self, end: &str) -> String {
         let mut text = Vec::new();
         while !text.ends_with(end.as_bytes()) {
@@ -176,7 +177,7 @@ impl Kernel {
         String::from_utf8(text).unwrap()
     }
 
-    /// Says slcan lines and reads their answers.
+    /// Sends slcan lines and reads their answers.
     fn converse(&mut self, conversation: &[(&str, &str)]) {
         for (line, answer) in conversation {
             self.write(format!("{line}\r").as_bytes());
@@ -227,8 +228,8 @@ fn a_read_is_taken_back_and_what_it_would_have_brought_comes_with_the_next() {
     kernel.converse(&[("V", "V1001\r")]);
 }
 
-/// Linux' virtual controller may send the taking back of a transfer before the transfer. Were it answered as one that has ended, and the
-/// transfer then carried out, the kernel would give the device up.
+/// Linux's virtual controller may send the withdrawal of a transfer before the transfer itself. If the answer were that it has ended,
+/// and the transfer were then carried out, the kernel would give up the device.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_transfer_that_is_taken_back_before_it_comes_is_not_carried_out() {
@@ -258,7 +259,7 @@ fn one_kernel_has_the_device_and_another_may_when_it_is_gone() {
     let kernel = server.attach();
     assert_eq!(server.import(b"1-1").read(8)[4..], [0, 0, 0, 1], "somebody has it");
     drop(kernel);
-    // The end of a connection is seen a moment later.
+    // The end of a connection is noticed a moment later.
     wait_for(|| (server.import(b"1-1").read(8)[4..] == [0; 4]).then_some(()));
     assert_eq!(server.import(b"7-7").read(8)[4..], [0, 0, 0, 1], "there is no such device");
 }
@@ -277,7 +278,7 @@ fn a_pulled_cable_ends_the_connection_without_answers() {
     server.attach();
 }
 
-/// A client that is slow does not lose frames while it sets the pace, since time stands still; in real time the device's queue fills.
+/// A slow client does not lose frames while it sets the pace, since time stands still; in real time the device's queue fills.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn time_stands_still_while_the_kernel_owes_reads() {

@@ -5,11 +5,11 @@
 //!   D9/D10 (PB8/PB9), LED on PC1 lit by high, USB on PA11/PA12, SD_DETECT on PB12, SCK on PB13, the flash chip's
 //!   MOSI on PB5.
 //! - Zephyr 4.3 `boards/adafruit/feather_stm32f405`: the same crystal, LED and USB pins.
-//! - stm32f4xx-hal 0.23 `src/gpio/alt/f4.rs`: CAN2 has PB5 or PB12 for RX, PB6 or PB13 for TX, all as AF9. Neither RX
+//! - stm32f4xx-hal 0.23 `src/gpio/alt/f4.rs`: CAN2's RX is PB5 or PB12, its TX PB6 or PB13, all as AF9. Neither RX
 //!   pin is on the headers; PB12 goes to the card socket's detect switch, which is open without a card (MicroPython
 //!   reads it with a pull-up, low for a card).
-//! - AN2606, "STM32F40xxx/41xxx": the ROM bootloader has CAN2's RX on PB5, which no bus is on here, and TX on PB13, which is
-//!   channel 2's.
+//! - AN2606, "STM32F40xxx/41xxx": the ROM bootloader has CAN2's RX on PB5, which has no bus here, and TX on PB13, which is
+//!   channel 2's TX here, too.
 
 use stm32f4xx_hal::gpio::{GpioExt, PC1, PinState};
 use stm32f4xx_hal::rcc::Rcc;
@@ -42,7 +42,7 @@ pub fn connect(ports: Ports, rcc: &mut Rcc) -> Leds {
     led(c.pc1)
 }
 
-/// Connects the LED, and nothing else.
+/// Connects the LED only.
 pub fn leds(ports: Ports, rcc: &mut Rcc) -> Leds {
     led(ports.c.split(rcc).pc1)
 }

@@ -1,5 +1,5 @@
-//! The boards: one file each, chosen by a feature. A board file says where things are connected, with
-//! the source of each statement; what is done with them is `hw`'s business.
+//! The boards: one file each, chosen by a feature. A board file says what is connected where, with
+//! the source of each statement; what is done with it is `hw`'s business.
 
 #[cfg(feature = "feather-f405")]
 mod feather_f405;
@@ -34,7 +34,7 @@ pub struct Ports {
     pub d: pac::GPIOD,
 }
 
-/// A port that a receive pin is on, by the number that EXTI's sources have for it (RM0090, SYSCFG_EXTICR1).
+/// The port of a receive pin, by its number among EXTI's sources (RM0090, SYSCFG_EXTICR1).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Port {
     /// Port B.
@@ -44,7 +44,8 @@ pub enum Port {
     D = 3,
 }
 
-/// A CAN controller's RX pin. Those of both channels have different numbers, since a line of EXTI is one number's of all ports.
+/// A CAN controller's RX pin. The two channels' pins have different numbers, because an EXTI line serves one pin number of all
+/// ports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ReceivePin {
     /// The port.
@@ -53,8 +54,8 @@ pub struct ReceivePin {
     pub pin: u8,
 }
 
-/// A CAN controller's TX pin, whose edges are to take next to nothing of the shortest bit, 1 µs: at the lowest speed, which is the
-/// reset's, an edge may take 100 ns (STM32F405 data sheet, "I/O AC characteristics"), differently long up and down.
+/// A CAN controller's TX pin, whose edges must take next to nothing of the shortest bit, 1 µs: at the lowest speed, the default
+/// after a reset, an edge may take 100 ns (STM32F405 data sheet, "I/O AC characteristics"), and rising and falling edges differ.
 fn fast<P: PinSpeed>(pin: P) -> P {
     pin.speed(Speed::High)
 }
@@ -71,17 +72,17 @@ impl Led {
         Self { pin: pin.into(), on }
     }
 
-    /// Lights it or puts it out.
+    /// Switches it on or off.
     pub fn set(&mut self, lit: bool) {
         self.pin.set_state(if lit { self.on } else { !self.on });
     }
 }
 
-/// The LEDs that a board has for the analyser.
+/// The board's LEDs that the analyser uses.
 pub enum Leds {
-    /// One, which must tell everything.
+    /// One, which must show everything.
     One(Led),
-    /// One for each thing to tell.
+    /// One for each thing to show.
     Three {
         /// There is power and a host.
         power: Led,

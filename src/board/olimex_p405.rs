@@ -3,15 +3,15 @@
 //! Sources:
 //! - Zephyr 4.3 `boards/olimex/stm32_p405` (`olimex_stm32_p405.dts` and `doc/index.rst`): crystal 8 MHz, CAN1 on
 //!   PB8/PB9, LED on PC12, the pins of the GPIO row and of UEXT.
-//! - The printed circuit is the STM32-P103's, as the name of Olimex's schematic, `STM32-P103_P405_sch.pdf`, says.
-//!   ChibiOS `os/hal/boards/OLIMEX_STM32_P103/board.h`: PC10 is the transceiver's mode pin, PC11 low connects a
-//!   pull-up to the USB line, PB12 to PB15 go to the card socket. Zephyr's `doc/index.rst` has PB12 in the GPIO row, too; on a
-//!   card it is the select line, an input, so that a card in the socket does not disturb it.
+//! - The circuit board is the STM32-P103's, as the name of Olimex's schematic, `STM32-P103_P405_sch.pdf`, says. ChibiOS
+//!   `os/hal/boards/OLIMEX_STM32_P103/board.h`: PC10 is the transceiver's mode pin, PC11 low connects a pull-up to the USB
+//!   line, PB12 to PB15 go to the card socket. Zephyr's `doc/index.rst` lists PB12 in the GPIO row, too; on a card it is the
+//!   select line, an input, so a card in the socket does not disturb it.
 //! - Feaser LibMicroBLT `demos/ARMCM4_STM32F4_Olimex_STM32P405_CubeIDE/App/led.c`: PC12 low lights the LED. (Zephyr
-//!   and RIOT say high; this demonstration was made for the board and the P103's LED is lit by low, too.)
+//!   and RIOT say high; this demonstration was made for this board, and the P103's LED is lit by low, too.)
 //! - stm32f4xx-hal 0.23 `src/gpio/alt/f4.rs`: AF9 is CAN1 on PB8/PB9 and CAN2 on PB12/PB6, AF10 is OTG_FS on PA11/PA12.
-//! - AN2606, "STM32F40xxx/41xxx": the ROM bootloader listens on CAN2's other pins, PB5 and PB13. Neither is channel 2's here, so
-//!   that a bus with traffic does not take the bootloader from USB.
+//! - AN2606, "STM32F40xxx/41xxx": the ROM bootloader listens on CAN2's other pins, PB5 and PB13. Channel 2 uses neither here, so
+//!   bus traffic cannot draw the bootloader away from USB.
 //! - SN65HVD230 data sheet (SLOS346), "RS": low selects the high-speed mode.
 
 use stm32f4xx_hal::gpio::{GpioExt, PC12, PinState};
@@ -41,15 +41,15 @@ pub fn connect(ports: Ports, rcc: &mut Rcc) -> Leds {
     fast(b.pb9.into_alternate::<9>());
     b.pb12.into_alternate::<9>().internal_pull_up(true);
     fast(b.pb6.into_alternate::<9>());
-    // The transceiver's high-speed mode; high would be standby.
+    // Low selects the transceiver's high-speed mode; high would be standby.
     c.pc10.into_push_pull_output_in_state(PinState::Low);
-    // The chip pulls the USB line up by itself.
+    // The chip pulls the USB line up itself.
     c.pc11.into_push_pull_output_in_state(PinState::High);
 
     led(c.pc12)
 }
 
-/// Connects the LED, and nothing else.
+/// Connects the LED only.
 pub fn leds(ports: Ports, rcc: &mut Rcc) -> Leds {
     led(ports.c.split(rcc).pc12)
 }

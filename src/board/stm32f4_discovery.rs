@@ -4,12 +4,12 @@
 //! - Zephyr 4.3 `boards/st/stm32f4_disco/stm32f4_disco.dts`: crystal 8 MHz; LEDs on PD12 (green), PD13 (orange), PD14
 //!   (red), PD15 (blue), lit by high; USB on PA11/PA12; CAN2's TX on PB13; PB6/PB9 belong to the audio codec, so CAN1
 //!   is not on PB8/PB9.
-//! - NuttX `boards/arm/stm32/stm32f4discovery/README.txt`, "UART/USART PINS", which has it from the board's user guide: PB12 and
-//!   PB13 have no function on the board.
-//! - AN2606, "STM32F40xxx/41xxx": the ROM bootloader has CAN2's RX on PB5, which no bus is on here, and TX on PB13, which is
-//!   channel 2's.
-//! - NuttX `boards/arm/stm32/stm32f4discovery/src/stm32f4discovery.h`: PC0 switches 5 V to the USB connector on, for
-//!   when the board is the host; ST's generated code for the board sets it high, which is off.
+//! - NuttX `boards/arm/stm32/stm32f4discovery/README.txt`, "UART/USART PINS", which takes this from the board's user guide: PB12
+//!   and PB13 have no function on the board.
+//! - AN2606, "STM32F40xxx/41xxx": the ROM bootloader has CAN2's RX on PB5, which has no bus here, and TX on PB13, which is
+//!   channel 2's TX here, too.
+//! - NuttX `boards/arm/stm32/stm32f4discovery/src/stm32f4discovery.h`: PC0 switches on 5 V to the USB connector, for
+//!   use as a host; ST's generated code for the board sets it high, which is off.
 //! - stm32f4xx-hal 0.23 `src/gpio/alt/f4.rs`: AF9 is CAN1 on PD0/PD1 and CAN2 on PB12/PB13.
 
 use stm32f4xx_hal::gpio::{GpioExt, PD12, PD13, PD14, PinState};
@@ -40,13 +40,13 @@ pub fn connect(ports: Ports, rcc: &mut Rcc) -> Leds {
     fast(d.pd1.into_alternate::<9>());
     b.pb12.into_alternate::<9>().internal_pull_up(true);
     fast(b.pb13.into_alternate::<9>());
-    // The host feeds the board, not the board the host.
+    // The host powers the board, not the other way round.
     c.pc0.into_push_pull_output_in_state(PinState::High);
 
     three(d.pd12, d.pd13, d.pd14)
 }
 
-/// Connects the LEDs, and nothing else.
+/// Connects the LEDs only.
 pub fn leds(ports: Ports, rcc: &mut Rcc) -> Leds {
     let d = ports.d.split(rcc);
     three(d.pd12, d.pd13, d.pd14)

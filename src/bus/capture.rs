@@ -1,9 +1,8 @@
 //! What the tasks of priority 4 do: drain the FIFOs, confirm, record errors, send what is due.
 //!
-//! The receive interrupt, one priority higher, only reads the stamp timer. A single frame in the FIFO is the one that raised
-//! the interrupt, so its stamp is its end plus the interrupt's latency. Frames found queued behind one
-//! another, or while the FIFO is being drained, ended at unknown times before now: their stamp says so, and
-//! the host tightens it.
+//! The receive interrupt, one priority higher, only reads the stamp timer. If the FIFO holds a single frame, that frame
+//! raised the interrupt, so its stamp is its end plus the interrupt's latency. Frames queued behind another, or that arrive
+//! while the FIFO is being drained, ended at some unknown earlier time: their stamps say so, and the host tightens them.
 
 mod orders;
 
@@ -21,7 +20,7 @@ use crate::bus::transmit::{Transmitter, TxQueue};
 use crate::lights::Activity;
 use crate::ports::{Clock, Traffic};
 
-/// An alarm is never set farther ahead than this, a quarter of the timer's range; it is set again then.
+/// An alarm is never set farther ahead than this, a quarter of the timer's range. When it fires, the next one is set.
 const ALARM_AHEAD_TICKS: u64 = 1 << 30;
 
 /// One channel's state.
@@ -39,9 +38,9 @@ struct ChannelState<'q> {
 pub struct Capture<'q, const N: usize = QUEUE_BYTES> {
     recorder: Recorder<'q, N>,
     channels: [ChannelState<'q>; CHANNELS],
-    /// For when the alarm is set, with how early it is; [`NEVER`] if it is off.
+    /// The time at which the alarm is to fire, its lead already taken off; [`NEVER`] if it is off.
     alarm: u64,
-    /// Per channel, frames and mishaps at the last [`Self::take_activity`].
+    /// Per channel, the counts of frames and of errors and losses at the last [`Self::take_activity`].
     seen: [(u32, u32); CHANNELS],
 }
 
@@ -91,7 +90,7 @@ impl<'q, const N: usize> Capture<'q, N> {
             }
             let mut quality = Stamp::Exact;
             if pending > 1 || !first {
-                // The last of them may have ended after the interrupt was entered.
+                // The last frame may have ended after the interrupt was entered.
                 stamp = clock.now();
                 quality = Stamp::UpperBound;
             }
@@ -110,7 +109,7 @@ impl<'q, const N: usize> Capture<'q, N> {
                 self.recorder.frame(&received, at);
             }
             if overrun {
-                // The FIFO kept the frames before and dropped those after.
+                // The FIFO keeps the frames it holds and drops those that follow.
                 state.overruns = state.overruns.wrapping_add(1);
                 let lost = Event::Lost { channel, stage: LossStage::Controller, count: 1, at_least: true };
                 self.recorder.event(&lost, at);
@@ -122,8 +121,8 @@ impl<'q, const N: usize> Capture<'q, N> {
         }
     }
 
-    /// A mailbox has finished. `entered` is the clock, read by the transmit interrupt before anything else; `None` if what it came for
-    /// was collected meanwhile, by whoever waited at this priority.
+    /// A mailbox has finished. `entered` is the clock, read by the transmit interrupt before anything else; `None` if another task of
+    /// this priority, waiting for a due time, has already collected the mailbox.
     pub fn on_transmit<T: Traffic, C: Clock>(
         &mut self,
         channel: Channel,
@@ -138,8 +137,8 @@ impl<'q, const N: usize> Capture<'q, N> {
             self.recorder.time(clock.now())
         };
         let patience = ended + Self::patience_ticks::<C>();
-        // On a busy bus the next frame is due at once: recording first, or leaving for the alarm, would cost more time
-        // than there is.
+        // On a busy bus the next frame is due at once: there is no time to record first, or to return and wait for the
+        // alarm.
         self.load_in_time(traffic, clock, patience);
         let state = &mut self.channels[channel.index()];
         let recorded = state.transmitter.record(&mut self.recorder);
@@ -147,16 +146,16 @@ impl<'q, const N: usize> Capture<'q, N> {
         if !recorded || state.transmitter.has_more(now) {
             state.transmitter.service(&mut traffic[channel.index()], &mut self.recorder, now);
         }
-        // That took a while, and the other channel's turn may come next: the alarm would be too late.
+        // Recording took a while, and the other channel's frame may be due: the alarm would be too late for it.
         self.load_in_time(traffic, clock, patience);
         self.arm(clock);
     }
 
-    /// While this waits, until `at`, what ends is not to wait for its own task: the transmission after it would find no interrupt that
-    /// stamps it.
+    /// Waits until `at` and collects the mailboxes that finish meanwhile. Left to their own task, they would keep the interrupt from
+    /// stamping the next transmission.
     fn collect_until<T: Traffic, C: Clock>(&mut self, traffic: &mut [T; CHANNELS], clock: &C, at: u32) {
         for channel in Channel::ALL {
-            // For one channel that takes 3 µs at worst.
+            // Collecting takes at most 3 µs per channel.
             if at.wrapping_sub(clock.now()) as i32 <= (C::ALARM_EARLY_TICKS / 4) as i32 {
                 return;
             }
@@ -182,31 +181,31 @@ impl<'q, const N: usize> Capture<'q, N> {
         ended
     }
 
-    /// For this long a call goes on to wait for what is due: twice the time by which alarms are early, so that the frame that it came
-    /// for, and one that is due soon after it on the other channel, leave in time. For what is due later the alarm is set
-    /// again: the tasks that drain the FIFOs come before it.
+    /// How long a call keeps waiting for what is due: twice the lead of the alarms, so that both the frame it was called for and one
+    /// due soon afterwards on the other channel leave in time. For anything later the alarm is set again, since the tasks that drain
+    /// the FIFOs come first.
     const fn patience_ticks<C: Clock>() -> u64 {
         2 * C::ALARM_EARLY_TICKS as u64
     }
 
-    /// To set the alarm, leave, and come back with the next frame prepared takes up to 9 µs. What is due earlier is waited for.
+    /// Setting the alarm, returning, and coming back with the next frame prepared takes up to 9 µs. A frame due sooner is waited for.
     const fn return_ticks<C: Clock>() -> u32 {
         C::ALARM_EARLY_TICKS / 4 * 3
     }
 
-    /// Sends what of the queues is due, and waits for what is due so soon that the alarm would come too late for it: until `patience`
-    /// ends, and after that only from one frame to the next while they are too close for the alarm; the mailboxes take six. All
-    /// but the request itself is done ahead, so that two frames due at one moment leave at one moment.
+    /// Sends the queued frames that are due, and waits for those due too soon for the alarm: until `patience` ends, and beyond that
+    /// only from one frame to the next while they are too close together for the alarm. That is six frames at most, one per mailbox.
+    /// Everything but the request itself is done ahead of time, so that two frames due at the same moment leave at the same moment.
     #[inline]
     fn load_in_time<T: Traffic, C: Clock>(&mut self, traffic: &mut [T; CHANNELS], clock: &C, patience: u64) {
         let heads = self.due(Transmitter::head_due);
-        // As a rule the mailboxes have just been filled.
+        // Usually the mailboxes have just been filled.
         if heads.iter().any(|&at| at != NEVER) {
             self.load_heads(traffic, clock, patience, heads);
         }
     }
 
-    /// The rest of [`Self::load_in_time`], with when the queues' heads are due.
+    /// The rest of [`Self::load_in_time`]; `heads` are the times at which the queues' first frames are due.
     #[inline(never)]
     fn load_heads<T: Traffic, C: Clock>(
         &mut self,
@@ -219,7 +218,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         loop {
             let now = self.recorder.time(clock.now());
             if heads.iter().all(|&at| at == 0 || at == NEVER) {
-                // Without a time: nothing is to be waited for.
+                // These frames have no due time: there is nothing to wait for.
                 for ((state, traffic), at) in self.channels.iter_mut().zip(traffic).zip(heads) {
                     if at == 0 {
                         state.transmitter.load_due(traffic, now);
@@ -227,15 +226,15 @@ impl<'q, const N: usize> Capture<'q, N> {
                 }
                 return;
             }
-            // From now on, 0 if it has passed: 32 bits are half the work.
+            // Ticks from now, or 0 if the time has passed. 32 bits halve the work.
             let ahead = |at: u64| u32::try_from(at.saturating_sub(now)).unwrap_or(u32::MAX);
             let [first, second] = heads.map(ahead);
             let next = first.min(second);
             if next > early.min(ahead(patience)).max(Self::return_ticks::<C>()) {
                 return;
             }
-            // What is due soon after it would find no time for this between the two. A periodic frame is not waited past; one that
-            // is due already is no matter of waiting.
+            // Prepare now what is due soon after: there is no time for it between the two. Never wait past a periodic frame's due
+            // time; if it is already due, waiting does not matter.
             let periodic = self.due(Transmitter::periodic_due).map(ahead);
             let periodic = periodic.into_iter().filter(|ahead| *ahead > 0).min().unwrap_or(u32::MAX);
             let until = (next + early / 2).min(periodic);
@@ -303,7 +302,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         self.arm(clock);
     }
 
-    /// Once a millisecond: keeps time going, reads what no interrupt reports, retries what found no room.
+    /// Once a millisecond: keeps time, reads what no interrupt reports, retries what had no room.
     pub fn on_tick<T: Traffic>(&mut self, traffic: &mut [T; CHANNELS], clock: &impl Clock) {
         for channel in Channel::ALL {
             if self.on_tick_errors(channel, &mut traffic[channel.index()], clock) {
@@ -319,8 +318,8 @@ impl<'q, const N: usize> Capture<'q, N> {
         self.recorder.aside(&mark.event, at);
     }
 
-    /// Part of [`Self::on_tick`], apart for where the alarm must be able to come between the parts: a channel's errors. Returns whether
-    /// the channel is open; if not, the rest has nothing to do.
+    /// Part of [`Self::on_tick`], for callers that must let the alarm in between the parts: handles a channel's errors. Returns whether
+    /// the channel is open; if it is not, the other part has nothing to do.
     pub fn on_tick_errors(
         &mut self,
         channel: Channel,
@@ -338,11 +337,11 @@ impl<'q, const N: usize> Capture<'q, N> {
         true
     }
 
-    /// Part of [`Self::on_tick`]: what a channel sends, and what was lost. [`Self::arm`] belongs behind it.
+    /// Part of [`Self::on_tick`]: what a channel sends, and what was lost. Call [`Self::arm`] afterwards.
     pub fn on_tick_queues(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) {
         let now = self.recorder.time(clock.now());
         let state = &mut self.channels[channel.index()];
-        // Mailboxes that finish meanwhile are left to the interrupt, which knows when.
+        // Mailboxes that finish meanwhile are left to the interrupt, which knows when they did.
         state.transmitter.service(traffic, &mut self.recorder, now);
         state.transmitter.tick(&mut self.recorder, now);
         self.recorder.tick(now);
@@ -386,9 +385,9 @@ impl<'q, const N: usize> Capture<'q, N> {
         }
         let now = self.recorder.time(clock.now());
         let early = next.saturating_sub(u64::from(C::ALARM_EARLY_TICKS));
-        // Not earlier than now: a time that has passed for long would look like one that is far ahead.
+        // Not earlier than now: the 32-bit timer would take a time long past for one far ahead.
         let at = early.clamp(now, now + ALARM_AHEAD_TICKS);
-        // One that is still to come stands already.
+        // An alarm that is still to come is already set.
         if at != self.alarm || at <= now {
             self.alarm = at;
             clock.set_alarm(Some(at as u32));

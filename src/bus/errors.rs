@@ -8,9 +8,10 @@ use crate::bus::recorder::Recorder;
 use crate::ports::{ErrorStatus, Traffic};
 use crate::{TICK_HZ, TICKS_PER_MS};
 
-/// Errors that are reported one by one in each [`WINDOW_TICKS`]; a broken bus makes up to 50 000 a second.
+/// How many errors are reported one by one in each [`WINDOW_TICKS`]; a broken bus causes up to 50 000 a
+/// second.
 const REPORTED_PER_WINDOW: u8 = 20;
-/// Then the count of the others is reported.
+/// After this time the number of the remaining errors is reported.
 const WINDOW_TICKS: u64 = (TICK_HZ / 10) as u64;
 
 /// One channel's errors.
@@ -50,8 +51,8 @@ impl ErrorMonitor {
         *self = Self { errors: self.errors, ..Self::new(self.channel) };
     }
 
-    /// Reads the controller's errors and records what is new. Called by the error interrupt, and each
-    /// millisecond, because nothing interrupts when a state is left for a better one.
+    /// Reads the controller's errors and records what is new. Called by the error interrupt, and once a
+    /// millisecond, because a change to a better state raises no interrupt.
     pub fn update<const N: usize>(
         &mut self,
         traffic: &mut impl Traffic,
@@ -73,7 +74,7 @@ impl ErrorMonitor {
                 self.suppressed += 1;
             }
         }
-        // A state that found no room is recorded by the next update.
+        // If there is no room, the next update records the state.
         if state != self.status.state && !recorder.event(&Event::State { channel, state, tec, rec }, now) {
             self.status = ErrorStatus { state: self.status.state, ..status };
         } else {
@@ -90,7 +91,7 @@ impl ErrorMonitor {
         }
     }
 
-    /// Reports the suppressed errors' count.
+    /// Reports how many errors were suppressed.
     pub fn flush<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) {
         let event = Event::ErrorsSuppressed { channel: self.channel, count: self.suppressed };
         if self.suppressed > 0 && recorder.event(&event, now) {

@@ -115,7 +115,7 @@ struct Packer {
     list32: Pack<2>,
 }
 
-/// Entries of one kind that do not fill a bank yet.
+/// Entries of one kind, not yet enough to fill a bank.
 struct Pack<const N: usize> {
     entries: [u32; N],
     len: usize,
@@ -126,7 +126,7 @@ impl<const N: usize> Pack<N> {
         Self { entries: [0; N], len: 0 }
     }
 
-    /// Adds one; returns all when there are enough.
+    /// Adds an entry; returns a bank's worth once there are enough.
     fn add(&mut self, entry: u32) -> Option<[u32; N]> {
         self.entries[self.len] = entry;
         self.len += 1;
@@ -140,7 +140,7 @@ impl<const N: usize> Pack<N> {
         core::mem::replace(self, Self::new())
     }
 
-    /// What is left, filled up with repetitions of the last.
+    /// The remaining entries, padded with copies of the last.
     fn rest(mut self) -> Option<[u32; N]> {
         let last = *self.entries.get(self.len.checked_sub(1)?)?;
         self.entries[self.len..].fill(last);

@@ -5,7 +5,8 @@ use cantap_wire::Frame;
 /// Transmit mailboxes of a controller.
 pub const MAILBOXES: usize = 3;
 
-/// Frames by mailbox, with their tags. How many there are is asked far more often than it changes.
+/// Frames by mailbox, with their tags. The count is kept because it is read far more often than it
+/// changes.
 pub(crate) struct Mailboxes {
     places: [Option<(u32, Frame)>; MAILBOXES],
     taken: usize,
@@ -38,7 +39,7 @@ impl Mailboxes {
         }
     }
 
-    /// Empties one; `None` if it was.
+    /// Empties a mailbox; `None` if it was empty already.
     #[inline]
     pub fn take(&mut self, mailbox: u8) -> Option<(u32, Frame)> {
         let held = self.places.get_mut(usize::from(mailbox))?.take()?;

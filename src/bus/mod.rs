@@ -1,7 +1,7 @@
-//! The side of the buses: from the controllers to the record queue, and from what a host asked for to the mailboxes.
+//! The bus side: from the controllers to the record queue, and from what a host requested to the mailboxes.
 //!
-//! Everything here runs at priority 4 on the board, except the queue's far end and [`sof`]. None of it knows of USB, sessions or
-//! commands: that is [`crate::port`].
+//! Everything here runs at priority 4 on the board, except the queue's far end and [`sof`]. None of it knows about USB, sessions
+//! or commands: those are in [`crate::port`].
 
 pub mod capture;
 pub mod checksum;

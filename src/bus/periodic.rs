@@ -1,10 +1,10 @@
 //! A channel's periodic entries: which are due, in which order they wait for a mailbox, and how many periods passed
 //! without a frame.
 //!
-//! An entry that waits is not due again: the bus takes its frame when it can, and no sooner for being asked again. So entries
-//! that cannot leave cost nothing, however short their periods; those that pass meanwhile are counted by arithmetic
-//! when the frame leaves, or when a host asks. The longest wait goes first: where more is asked for than a bus can carry, each
-//! entry gets its turn.
+//! An entry that is already waiting does not become due again: the bus takes its frame when it can, and no sooner for being
+//! asked twice. So entries that cannot be sent cost nothing, however short their periods; the periods that pass meanwhile are
+//! counted by arithmetic when the frame is sent, or when a host asks. The longest wait goes first: if more is asked for than
+//! the bus can carry, each entry still gets its turn.
 
 use cantap_wire::message::{DEVICE_TAG, Modifier, Periodic};
 use cantap_wire::record::TransmitFailure;
@@ -16,23 +16,23 @@ use crate::bus::recorder::Recorder;
 use crate::bus::time::NEVER;
 use crate::{TICK_HZ, TICKS_PER_US};
 
-/// Entries of a channel: as many as a word has bits.
+/// Entries per channel: one for each bit of a word.
 pub const PERIODIC_SLOTS: usize = u32::BITS as usize;
 /// Shortest period: no frame is shorter than 47 µs.
 pub const MIN_PERIOD_TICKS: u32 = 47 * TICKS_PER_US;
 
-/// The table is looked at no more often than this, so that entries that become due one after another are found together.
+/// The table is checked no more often than this, so that entries due shortly after one another are found together.
 const LOOK_EVERY_TICKS: u64 = 20 * TICKS_PER_US as u64;
-/// Periods that passed without a frame are reported no more often than this for each entry, as a number.
+/// For each entry, the number of periods that passed without a frame is reported no more often than this.
 const TELL_EVERY_TICKS: u64 = TICK_HZ as u64 / 10;
-/// Records of those that one call writes at the end of a session on the bus: 8 take 20 µs, see `docs/architecture.md`.
+/// How many of those records one call writes when a channel closes: 8 take 20 µs, see `docs/architecture.md`.
 const TOLD_PER_CALL: usize = 8;
 
 struct PeriodicState {
     entry: Periodic,
     /// When the next period begins.
     next_due: u64,
-    /// Left to send; `None` for ever.
+    /// Transmissions left; `None` means for ever.
     left: Option<u32>,
     step: u32,
 }
@@ -42,7 +42,7 @@ impl PeriodicState {
     fn begin_periods(&mut self, now: u64) -> u32 {
         let Some(behind) = now.checked_sub(self.next_due) else { return 0 };
         let period = self.entry.period_ticks.max(1);
-        // The processor divides 32 bits in a dozen cycles, 64 in hundreds.
+        // The processor takes a dozen cycles for a 32-bit division, hundreds for a 64-bit one.
         let begun = match u32::try_from(behind) {
             Ok(behind) => u64::from(behind / period),
             Err(_) => behind / u64::from(period),
@@ -56,18 +56,18 @@ impl PeriodicState {
 pub struct PeriodicTable {
     channel: Channel,
     entries: [Option<PeriodicState>; PERIODIC_SLOTS],
-    /// Slots that are due and wait for a mailbox, the longest wait first.
+    /// Slots that are due and waiting for a mailbox, the longest wait first.
     waiting: Deque<u8, PERIODIC_SLOTS>,
-    /// The other entries, a bit for each slot: in a table that asks for too much there are few, and only they must be looked at.
+    /// The other entries, one bit per slot. Only these need checking, and an overloaded table has few of them.
     idle: u32,
-    /// When the table is to be looked at: when the first of those that do not wait is due, but not before `look_from`.
+    /// When to check the table next: when the first entry that is not waiting becomes due, but not before `look_from`.
     due: u64,
     look_from: u64,
     /// Periods that passed without a frame, since [`Self::reset_counter`].
     overtaken: u32,
-    /// By slot, those of them that no record reports yet. They outlive their entry.
+    /// By slot, how many of these no record has reported yet. They outlive their entry.
     untold: [u32; PERIODIC_SLOTS],
-    /// The slots that have some, and those of them whose turn it is: a bit for each.
+    /// The slots that have unreported periods, and those of them whose turn it is: one bit per slot.
     owed: u32,
     telling: u32,
     tell_from: u64,
@@ -113,13 +113,13 @@ impl PeriodicTable {
         self.find_due();
     }
 
-    /// Forgets the entries; what passed until `now` is counted.
+    /// Forgets the entries; periods that passed until `now` are counted.
     pub fn clear(&mut self, now: u64) {
         self.count_overtaken(now);
         self.remove_all();
     }
 
-    /// Forgets the entries and what was not reported of them.
+    /// Forgets the entries and their unreported periods.
     pub fn forget(&mut self) {
         self.remove_all();
         self.untold = [0; PERIODIC_SLOTS];
@@ -139,7 +139,7 @@ impl PeriodicTable {
         self.due = due.map_or(NEVER, |due| due.max(self.look_from));
     }
 
-    /// When [`Self::look`] is to be called; [`NEVER`] if all entries wait.
+    /// When [`Self::look`] must be called next; [`NEVER`] if all entries wait.
     #[inline]
     pub const fn due(&self) -> u64 {
         self.due
@@ -151,7 +151,7 @@ impl PeriodicTable {
         !self.waiting.is_empty()
     }
 
-    /// Finds the entries that have become due, and when the next one will.
+    /// Finds the entries that have become due, and when the next one will be.
     pub fn look(&mut self, now: u64) {
         self.look_from = now + LOOK_EVERY_TICKS;
         let mut due = NEVER;
@@ -163,7 +163,7 @@ impl PeriodicTable {
                 continue;
             }
             self.idle &= !(1 << slot);
-            // Cannot fail: there is a place for each.
+            // Cannot fail: there is room for every slot.
             let _ = self.waiting.push_back(slot as u8);
             self.add_overtaken(slot, begun - 1);
         }
@@ -190,7 +190,7 @@ impl PeriodicTable {
         self.overtaken
     }
 
-    /// Starts that counter over.
+    /// Resets that counter to zero.
     pub const fn reset_counter(&mut self) {
         self.overtaken = 0;
     }
@@ -219,8 +219,8 @@ impl PeriodicTable {
         self.add_overtaken(slot, overtaken);
     }
 
-    /// Once a millisecond: reports how many periods of one entry passed without a frame. It waits for room rather than take what is
-    /// kept for what explains missing frames.
+    /// Once a millisecond: reports how many periods of one entry passed without a frame. It waits until there is room, rather than
+    /// use the reserve that is kept for explaining missing frames.
     pub fn tick<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) {
         if now >= self.tell_from {
             self.tell_from = now + TELL_EVERY_TICKS;
@@ -232,14 +232,14 @@ impl PeriodicTable {
         }
     }
 
-    /// Reports all that is left, a few records in each call; returns whether that was all.
+    /// Reports what is left, a few records per call; returns whether nothing is left.
     pub fn tell_rest<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) -> bool {
         self.telling = self.owed;
         self.tell(recorder, now, TOLD_PER_CALL);
         self.owed == 0
     }
 
-    /// Writes this many records of those that are to be written now, if there is room.
+    /// Writes up to `most` of the records that are due now, if there is room.
     fn tell<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64, most: usize) {
         for slot in slots(self.telling).take(most) {
             let tag = DEVICE_TAG + slot as u32;

@@ -9,10 +9,11 @@ use cantap_wire::record::MAX_RECORD;
 
 use crate::QUEUE_BYTES;
 
-/// Bytes that frames leave free, so that what explains their absence (loss, state, stop) still fits.
+/// Bytes that frames must leave free, so that the records that explain their absence (loss, state, stop) still
+/// fit.
 const RESERVE: u32 = 512;
-/// After the queue was full, frames are taken again when so much is free: one long gap says the same as
-/// hundreds of short ones, in fewer bytes.
+/// Once the queue has been full, frames are accepted again only when this much is free: one long gap
+/// says the same as hundreds of short ones, in fewer bytes.
 const RESUME_FREE: u32 = 4096;
 
 /// The ring.
@@ -29,7 +30,7 @@ impl<const N: usize> RecordQueue<N> {
         Self { ring: Churrasco::new(), released: AtomicU32::new(0) }
     }
 
-    /// Its two ends. There must be one of each only.
+    /// Its two ends. There must be only one of each.
     pub const fn split(&self) -> (Producer<'_, N>, Consumer<'_, N>) {
         let producer = Producer {
             queue: self,
@@ -48,10 +49,10 @@ impl<const N: usize> Default for RecordQueue<N> {
     }
 }
 
-/// What a record is to the queue.
+/// How the queue treats a record.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
-    /// A received frame: is refused when the queue runs full.
+    /// A received frame: refused when the queue is full.
     Frame,
     /// Anything else: may use the reserve.
     Event,
@@ -82,7 +83,8 @@ impl<const N: usize> Producer<'_, N> {
         self.high_water = self.fill();
     }
 
-    /// Whether a frame would be taken now. Once full, not before much is free.
+    /// Whether a frame would be accepted now. After the queue was full, only once `RESUME_FREE` bytes are
+    /// free.
     #[inline]
     pub fn takes_frames(&mut self) -> bool {
         self.has_room_beside(self.fill())
@@ -95,7 +97,7 @@ impl<const N: usize> Producer<'_, N> {
         !self.full
     }
 
-    /// Lets `encode` write one record in place. Returns false, without a call, if there is no room.
+    /// Lets `encode` write one record in place. Returns false, without calling it, if there is no room.
     #[inline]
     pub fn push(&mut self, kind: Kind, encode: impl FnOnce(&mut [u8; MAX_RECORD]) -> usize) -> bool {
         let fill = self.fill();
@@ -110,7 +112,7 @@ impl<const N: usize> Producer<'_, N> {
         let len = encode(room);
         grant.commit(len);
         self.written = self.written.wrapping_add(len as u32);
-        // The reader may have taken some since: one look at it for each record is enough.
+        // The reader may have taken some since then: reading its position once per record is enough.
         self.high_water = self.high_water.max(fill + len as u32);
         true
     }
@@ -123,7 +125,7 @@ pub struct Consumer<'q, const N: usize> {
 }
 
 impl<const N: usize> Consumer<'_, N> {
-    /// Shows `take` the contiguous bytes that are there, whole records all of them; it returns how many it used.
+    /// Passes `take` the contiguous bytes available, which are whole records; `take` returns how many it used.
     pub fn read(&mut self, take: impl FnOnce(&[u8]) -> usize) -> usize {
         let Ok(grant) = self.ring.read() else { return 0 };
         let used = take(&grant).min(grant.len());
@@ -132,12 +134,12 @@ impl<const N: usize> Consumer<'_, N> {
         used
     }
 
-    /// Whether there is nothing in it.
+    /// Whether the queue is empty.
     pub fn is_empty(&mut self) -> bool {
         self.ring.read().is_err()
     }
 
-    /// Drops everything. Nothing may be pushed meanwhile.
+    /// Drops everything. Nothing may be pushed at the same time.
     pub fn clear(&mut self) {
         while self.read(<[u8]>::len) > 0 {}
     }

@@ -12,9 +12,9 @@ use crate::bus::time::Timebase;
 pub struct Recorder<'q, const N: usize = QUEUE_BYTES> {
     producer: Producer<'q, N>,
     time: Timebase,
-    /// Time of the last record, which the next difference counts from.
+    /// Time of the last record, from which the next difference counts.
     last_ticks: u64,
-    /// Frames that did not fit and that no loss record stands for yet.
+    /// Frames that did not fit and that no loss record reports yet.
     unreported: [u32; CHANNELS],
     /// All frames that did not fit.
     lost: [u32; CHANNELS],
@@ -54,7 +54,7 @@ impl<'q, const N: usize> Recorder<'q, N> {
         }
         let index = received.channel.index();
         let difference = self.difference(at);
-        // Room that the reader made since a moment ago is for the loss record: it stands before the next frame.
+        // If the reader has just made room, the loss record gets it first: it belongs before the next frame.
         let in_turn = self.unreported == [0; CHANNELS];
         if in_turn && self.producer.push(Kind::Frame, |room| encode_received(received, difference, room)) {
             if received.stamp != cantap_wire::Stamp::Omitted {
@@ -74,7 +74,7 @@ impl<'q, const N: usize> Recorder<'q, N> {
         self.write(event, at)
     }
 
-    /// Writes an event that nobody misses: not while the queue takes no frames.
+    /// Writes an event that can be left out: it is dropped while the queue accepts no frames.
     pub fn aside(&mut self, event: &Event, at: u64) {
         if self.producer.takes_frames() {
             self.event(event, at);
@@ -96,8 +96,8 @@ impl<'q, const N: usize> Recorder<'q, N> {
         at.wrapping_sub(self.last_ticks) as i64
     }
 
-    /// Writes a loss record for each channel that lost frames, once the queue takes frames again. It then
-    /// stands exactly where they are missing.
+    /// Writes a loss record for each channel that lost frames, once the queue accepts frames again. The record
+    /// then stands exactly where they are missing.
     fn report_losses(&mut self, at: u64) {
         if !self.producer.takes_frames() {
             return;
@@ -123,7 +123,7 @@ impl<'q, const N: usize> Recorder<'q, N> {
         }
     }
 
-    /// Whether the queue has room for more than what explains that frames are missing.
+    /// Whether the queue has room beyond the reserve for records that explain missing frames.
     pub fn takes_frames(&mut self) -> bool {
         self.producer.takes_frames()
     }

@@ -1,29 +1,30 @@
-//! Marks of USB's start of frame: now and then, the stamp timer's value at the start of a numbered frame.
+//! Marks of USB's start of frame: once a second, the stamp timer's value at the start of a numbered frame.
 //!
-//! The hardware latches the timer at each SOF token; nothing here has a latency of its own. What can go wrong is the
-//! pairing: the frame's number and the latched time are two registers, and another SOF may come between their readings. So the latch is
-//! read on both sides of the number, and neither edge of a frame is trusted, where the one may be updated and the other not yet.
+//! The hardware latches the timer at each SOF token; nothing here has a latency of its own. What can go wrong is the pairing: the
+//! frame's number and the latched time are in two registers, and another SOF may come between the two reads. So the latch is read both
+//! before and after the number, and readings near either edge of a frame are not trusted, because one register may be updated before
+//! the other.
 //!
-//! Whether the numbers make sense from mark to mark is the host's business: it has the time and the arithmetic.
+//! Whether the numbers make sense from mark to mark is checked by the host, which has the time and the arithmetic for it.
 
 use cantap_wire::Event;
 
 use crate::{TICK_HZ, TICKS_PER_MS, TICKS_PER_US};
 
-/// How far from a SOF the registers are read. The pulse that latches the timer is twelve system clocks long (RM0090, "Peripheral SOFs"), and
-/// two microseconds are 288 of them: whichever of the registers is the slower one has followed by then.
+/// The least distance from a SOF at which a reading is trusted. The pulse that latches the timer is twelve system clocks long (RM0090,
+/// "Peripheral SOFs"), and two microseconds are 288 of them: by then the slower of the two registers has followed.
 const EDGE_TICKS: u32 = 2 * TICKS_PER_US;
-/// A mark is due this long after the last one.
+/// Time from one mark to the next.
 const EVERY_TICKS: u32 = TICK_HZ;
 
-/// What is latched of the last start of frame.
+/// What the hardware latched at the last start of frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SofReading {
     /// The stamp timer at the last SOF, read before and after the frame's number.
     pub latched: [u32; 2],
     /// The frame's number, 11 bits.
     pub frame: u16,
-    /// The stamp timer after all that.
+    /// The stamp timer after these reads.
     pub now: u32,
     /// More than one SOF came since the last reading.
     pub several: bool,
@@ -50,12 +51,12 @@ impl SofMarks {
         Self { last: None, doubled: 0 }
     }
 
-    /// Once a millisecond, with what was latched since the last time. Returns the mark, if one is due and the reading is
-    /// beyond doubt; else the next millisecond's may be.
+    /// Call once a millisecond, with what was latched since the last call. Returns a mark if one is due and the reading
+    /// is beyond doubt; otherwise the next call may return it.
     pub fn tick(&mut self, reading: Option<SofReading>) -> Option<SofMark> {
         let SofReading { latched: [at, again], frame, now, several } = reading?;
         self.doubled = self.doubled.saturating_add(u16::from(several));
-        // A latch as old as a frame is of a SOF that no other followed: the bus is silent.
+        // A latch a whole frame old means that no SOF has followed: the bus is silent.
         let whole = at == again && (EDGE_TICKS..TICKS_PER_MS - EDGE_TICKS).contains(&now.wrapping_sub(at));
         let due = self.last.is_none_or(|last| now.wrapping_sub(last) >= EVERY_TICKS);
         if !(whole && due) {

@@ -16,8 +16,8 @@ impl Timebase {
         Self { latest: 0 }
     }
 
-    /// The 64-bit time of a stamp. A stamp a little older than the latest one is fine: it was read in an
-    /// interrupt that waited while another read a newer one.
+    /// The 64-bit time of a stamp. A stamp slightly older than the latest one is fine: another interrupt
+    /// may have read a newer one before this one was handled.
     pub fn extend(&mut self, stamp: u32) -> u64 {
         let ahead = stamp.wrapping_sub(self.latest as u32) as i32;
         let time = self.latest.wrapping_add_signed(i64::from(ahead));

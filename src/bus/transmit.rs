@@ -1,11 +1,10 @@
 //! Puts frames on the bus: a queue in order, frames at their time, periodic frames, replies.
 //!
-//! One per channel, in the tasks of priority 4. Mailboxes leave in the order in which they were requested.
-//! Whenever one is free, a reply goes first, then a periodic frame that is due ([`crate::bus::periodic`]), then the queue's head once
-//! its time has come.
+//! One per channel, in the tasks of priority 4. Mailboxes are sent in the order in which they were requested. Whenever one is free, a
+//! reply goes first, then a periodic frame that is due ([`crate::bus::periodic`]), then the head of the queue once its time has come.
 //!
-//! Each call does a bounded piece of work: it fills the free mailboxes, three at most, and writes at most `GIVEN_UP_PER_CALL`
-//! records of frames that are given up. `docs/architecture.md` has the time that this takes.
+//! Each call does a bounded amount of work: it fills the free mailboxes, three at most, and writes at most
+//! `GIVEN_UP_PER_CALL` records of frames that are given up. `docs/architecture.md` says how long this takes.
 
 use cantap_wire::message::{Periodic, TRIGGER_TAG, Trigger, TxFrame};
 use cantap_wire::record::TransmitFailure;
@@ -23,14 +22,14 @@ pub const TX_QUEUE: usize = 256;
 /// Replies.
 pub const TRIGGER_SLOTS: usize = 8;
 
-/// Frames of the queue that one call gives up: a whole queue at once would take longer than a receive FIFO can wait.
+/// Queued frames that one call gives up: a whole queue at once would take longer than a receive FIFO can wait.
 const GIVEN_UP_PER_CALL: usize = 16;
 
 #[derive(Clone, Copy)]
 struct Queued {
     tag: u32,
     frame: Frame,
-    /// 0: at once.
+    /// Due time; 0 means at once.
     at: u64,
 }
 
@@ -38,7 +37,7 @@ struct Queued {
 struct Ended {
     tag: u32,
     frame: Frame,
-    /// `None`: it was sent.
+    /// `None` if it was sent.
     failure: Option<TransmitFailure>,
     at: u64,
 }
@@ -49,7 +48,7 @@ struct TriggerState {
     waiting: bool,
 }
 
-/// The memory of a channel's queue: eight kilobytes, which are made where they stay and never pass over a stack.
+/// The memory of a channel's queue: eight kilobytes, constructed in place, never on a stack.
 pub struct TxQueue(Deque<Queued, TX_QUEUE>);
 
 impl TxQueue {
@@ -74,12 +73,12 @@ pub struct Transmitter<'q> {
     triggers: [Option<TriggerState>; TRIGGER_SLOTS],
     triggers_armed: bool,
     replies_waiting: u8,
-    /// Finished and not recorded yet. What finds no room in the queue would break "each one is confirmed", so nothing more
-    /// is sent until it is written; what was in the mailboxes by then has room here too.
+    /// Finished but not recorded yet. Every transmission must be confirmed, so if the record queue has no room, nothing
+    /// more is sent until these are written. There is room here for what is then still in the mailboxes, too.
     unconfirmed: Deque<Ended, { 2 * MAILBOXES }>,
-    /// The queue is being given up, as fast as its records find room.
+    /// The queue is being given up, as fast as there is room for the records.
     dropping: Option<TransmitFailure>,
-    /// The controller stays off the bus: no mailbox is filled.
+    /// The controller is to stay off the bus: no mailbox is filled.
     off: bool,
     sent: u32,
     failed: u32,
@@ -104,8 +103,8 @@ impl<'q> Transmitter<'q> {
         }
     }
 
-    /// Frames sent, and frames not sent, since [`Self::reset_counters`]. Of periods that passed without a frame those that
-    /// were counted: see [`Self::count_overtaken`].
+    /// Frames sent, and frames not sent, since [`Self::reset_counters`]. The second includes periods that passed without a
+    /// frame as of the last [`Self::count_overtaken`].
     pub const fn counters(&self) -> (u32, u32) {
         (self.sent, self.failed.wrapping_add(self.periodic.overtaken()))
     }
@@ -115,7 +114,7 @@ impl<'q> Transmitter<'q> {
         self.periodic.count_overtaken(now);
     }
 
-    /// Starts the counters over.
+    /// Resets the counters to zero.
     pub const fn reset_counters(&mut self) {
         self.sent = 0;
         self.failed = 0;
@@ -137,7 +136,7 @@ impl<'q> Transmitter<'q> {
         if self.dropping.is_some() { 0 } else { TX_QUEUE - self.queue.len() }
     }
 
-    /// Queues one frame; false if the queue is full. A frame that comes while the queue is being given up is given up
+    /// Queues one frame; false if the queue is full. A frame queued while the queue is being given up is given up
     /// with it, and recorded like the others.
     pub fn enqueue(&mut self, frame: &TxFrame) -> bool {
         let queued = Queued { tag: frame.tag, frame: frame.frame, at: frame.at_ticks.unwrap_or(0) };
@@ -170,8 +169,8 @@ impl<'q> Transmitter<'q> {
         self.replies_waiting = self.triggers.iter().flatten().filter(|entry| entry.waiting).count() as u8;
     }
 
-    /// Gives up everything queued or in a mailbox; each frame is recorded with `reason`. What cannot be
-    /// taken back any more may still be sent.
+    /// Gives up everything queued or in a mailbox; each frame is recorded with `reason`. A frame that
+    /// can no longer be withdrawn may still be sent.
     pub fn drop_all(&mut self, reason: TransmitFailure, traffic: &mut impl Traffic) {
         if !self.queue.is_empty() {
             self.dropping = Some(reason);
@@ -181,8 +180,8 @@ impl<'q> Transmitter<'q> {
         }
     }
 
-    /// The controller is off the bus and reports its mailboxes no more: records them with `reason`, and gives them up for good, so
-    /// that nothing of them is sent when it is on a bus again.
+    /// The controller is off the bus and no longer reports its mailboxes: records their frames with `reason` and aborts them for
+    /// good, so that none is sent when it is back on a bus.
     pub fn give_up_mailboxes<const N: usize>(
         &mut self,
         traffic: &mut impl Traffic,
@@ -198,7 +197,7 @@ impl<'q> Transmitter<'q> {
             self.failed = self.failed.wrapping_add(1);
             self.mailboxes.take(mailbox);
         }
-        // How they ended is recorded.
+        // Their end has just been recorded.
         while traffic.take_finished().is_some() {}
     }
 
@@ -213,7 +212,7 @@ impl<'q> Transmitter<'q> {
         self.count_triggers();
     }
 
-    /// Forgets everything, unrecorded, for when nobody listens any more.
+    /// Forgets everything without recording it, for when nobody is listening any more.
     pub fn clear(&mut self) {
         self.periodic.forget();
         self.clear_triggers();
@@ -224,23 +223,23 @@ impl<'q> Transmitter<'q> {
         self.off = false;
     }
 
-    /// Once a millisecond: records periods that passed without a frame, by their number rather than one by one.
+    /// Once a millisecond: records how many periods passed without a frame, rather than each of them.
     pub fn tick<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) {
         self.periodic.tick(recorder, now);
     }
 
-    /// The channel is closed: records what [`Self::tick`] has not recorded yet, a little in each call. Returns whether that was all.
+    /// The channel is closed: records what [`Self::tick`] has not recorded yet, a little per call. Returns whether nothing is left.
     pub fn tell_rest<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) -> bool {
         self.periodic.tell_rest(recorder, now)
     }
 
-    /// A frame was received: arms the replies that it asks for. Returns whether there is one.
+    /// A frame was received: arms the replies that it triggers. Returns whether there is one.
     #[inline]
     pub fn on_frame(&mut self, frame: &Frame) -> bool {
         self.triggers_armed && self.arm_replies(frame)
     }
 
-    /// Apart from [`Self::on_frame`], and out of line: where no replies are set, the loop that drains has the registers to itself.
+    /// Separate from [`Self::on_frame`] and out of line, so that without replies the draining loop has the registers to itself.
     #[inline(never)]
     fn arm_replies(&mut self, frame: &Frame) -> bool {
         for trigger in self.triggers.iter_mut().flatten() {
@@ -252,7 +251,7 @@ impl<'q> Transmitter<'q> {
         self.replies_waiting > 0
     }
 
-    /// Mailboxes may have finished: records how, and fills them again. `reason` names what an abort was for.
+    /// Mailboxes may have finished: records how, and fills them again. `reason` says why frames were aborted, if they were.
     pub fn on_finished<const N: usize>(
         &mut self,
         traffic: &mut impl Traffic,
@@ -267,7 +266,7 @@ impl<'q> Transmitter<'q> {
     /// First part of [`Self::on_finished`]: empties the mailboxes that have finished. [`Self::prepare_head`] may follow before
     /// [`Self::record`], so that a busy bus need not wait for the record.
     ///
-    /// The first ended at `ended`. Whatever else has finished did so later, at a time that is not known: it is given the time at which it was found.
+    /// The first ended at `ended`. Any others finished later, at unknown times: they get the time at which they were found.
     pub fn collect(
         &mut self,
         traffic: &mut impl Traffic,
@@ -292,11 +291,11 @@ impl<'q> Transmitter<'q> {
             // Cannot fail: checked above.
             let _ = self.unconfirmed.push_back(Ended { tag, frame, failure, at });
         }
-        // Whoever collects: a stamp that stays would be taken for the next one's.
+        // No matter which task collects: a stamp that stays would be mistaken for the next transmission's.
         traffic.await_finished();
     }
 
-    /// Whether something other than the queue's frames is waiting, for [`Self::service`].
+    /// Whether anything but queued frames is waiting for [`Self::service`].
     pub fn has_more(&self, now: u64) -> bool {
         let waiting = self.replies_waiting > 0 || self.periodic.is_waiting() || self.dropping.is_some();
         waiting || self.periodic.due() <= now
@@ -312,11 +311,11 @@ impl<'q> Transmitter<'q> {
         }
     }
 
-    /// Writes the queue's head to a mailbox, unless something else goes first at this time. It is sent by [`Traffic::request`],
-    /// with [`Self::requested`] afterwards.
+    /// Writes the queue's head to a mailbox, unless something else goes first at this time. Send it with [`Traffic::request`],
+    /// then call [`Self::requested`].
     #[inline]
     pub fn prepare_head(&mut self, traffic: &mut impl Traffic, at: u64) -> Option<u8> {
-        // Whatever is in a mailbox must find room to be kept when it has finished.
+        // There must be room for everything in a mailbox once it has finished.
         let kept = self.unconfirmed.len() + self.mailboxes.len();
         if kept >= self.unconfirmed.capacity() || self.off || self.has_more(at) {
             return None;
@@ -324,7 +323,7 @@ impl<'q> Transmitter<'q> {
         traffic.prepare(&self.queue.front()?.frame)
     }
 
-    /// The queue's head is in this mailbox, and was requested.
+    /// The queue's head is in this mailbox, and its transmission was requested.
     #[inline]
     pub fn requested(&mut self, mailbox: u8) {
         if let Some(Queued { tag, frame, .. }) = self.queue.pop_front() {
@@ -332,7 +331,7 @@ impl<'q> Transmitter<'q> {
         }
     }
 
-    /// Records what has finished, each at its time; false if the queue has no room for all of it.
+    /// Records what has finished, each at its time; false if the record queue has no room for all of them.
     pub fn record<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>) -> bool {
         let channel = self.channel;
         while let Some(&Ended { tag, frame, failure, at }) = self.unconfirmed.front() {
@@ -391,16 +390,16 @@ impl<'q> Transmitter<'q> {
         self.load_due(traffic, now);
     }
 
-    /// Whether a frame that becomes due can leave. Otherwise it waits for something else than time: for a mailbox, of which the
-    /// interrupt tells, or for room in the record queue, which is tried every millisecond. An alarm for it would come again
-    /// and again, and keep the USB that makes the room from running.
+    /// Whether a frame that becomes due can leave. Otherwise it waits for something other than time: for a mailbox, which an
+    /// interrupt announces, or for room in the record queue, which is tried every millisecond. An alarm for it would fire again
+    /// and again, and keep USB, which makes the room, from running.
     #[inline]
     fn can_load(&self) -> bool {
         !self.mailboxes.are_full() && self.unconfirmed.is_empty() && self.dropping.is_none() && !self.off
     }
 
-    /// When the queue's head is due, if there is one and a mailbox is free: one that is due waits for a mailbox, not for time. 0
-    /// if it has no time.
+    /// When the queue's head is due, if there is one and a mailbox is free: a frame that is already due waits for a mailbox, not
+    /// for time. 0 if it has no due time.
     #[inline]
     pub fn head_due(&self) -> u64 {
         if self.mailboxes.are_full() {
@@ -415,14 +414,14 @@ impl<'q> Transmitter<'q> {
         if self.can_load() { self.periodic.due() } else { NEVER }
     }
 
-    /// The next time at which [`Self::service`] has something to do that no interrupt of the controller announces.
+    /// The next time at which [`Self::service`] has something to do that no controller interrupt announces.
     #[inline]
     pub fn next_due(&self) -> u64 {
         if !self.can_load() {
             return NEVER;
         }
         let head = self.head_due();
-        // Without a time it waits for something else.
+        // A frame without a due time waits for something other than time.
         self.periodic.due().min(if head == 0 { NEVER } else { head })
     }
 

@@ -1,4 +1,5 @@
-//! Joins the session, at priority 2, to what the tasks of priority 4 own: [`Board`] over the board.
+//! Joins the session, at priority 2, to what the tasks of priority 4 own: [`Board`] for the real
+//! board.
 
 use cantap_firmware::QUEUE_BYTES;
 use cantap_firmware::bus::capture::Capture;
@@ -32,19 +33,19 @@ pub struct Controls {
     pub filters: CanFilters,
     /// The chip.
     pub chip: BoardChip,
-    /// The stamp timer, to be read.
+    /// The stamp timer, for reading.
     pub stamp: StampTimer,
     /// Its latch of USB's start of frame.
     pub sof: SofLatch,
     /// The CRC unit.
     pub crc: CrcUnit,
-    /// What measures the receive pins.
+    /// The meter for the receive pins.
     pub meter: PinMeter,
 }
 
-/// Commands' own, and the way to the rest.
+/// What commands own, and access to the rest.
 pub struct Access<'a, T> {
-    /// The resource to lock: it raises the priority to the capture's for as long as it is held.
+    /// The resource to lock: holding it raises the priority to the capture's.
     pub tap: T,
     /// What needs no lock.
     pub controls: &'a mut Controls,

@@ -1,6 +1,6 @@
 //! The two bxCAN controllers (RM0090, "Controller area network"), each in two halves that share no register
-//! that both write: [`CanTraffic`] for the tasks of priority 4, [`CanControl`] for commands.
-//! [`CanFilters`] are the banks, which lie in CAN1's registers for both.
+//! that both write: [`CanTraffic`] for the tasks of priority 4, [`CanControl`] for commands. [`CanFilters`]
+//! are the filter banks; CAN1's registers hold those of both.
 //!
 //! The `bxcan` crate is not used: its `enable` waits for the bus, it cannot lock the receive FIFO (so an
 //! overrun would overwrite the newest frame) and it hides which mailbox a confirmation belongs to.
@@ -37,7 +37,7 @@ pub struct Controllers {
 }
 
 impl Controllers {
-    /// Switches both controllers on; they are off the bus and let no frame pass.
+    /// Switches both controllers on; they stay off the bus and let no frame pass.
     pub fn new(_: CAN1, _: CAN2, rcc: &mut Rcc, sent_at: &'static [AtomicU32; CHANNELS]) -> Self {
         CAN1::enable(rcc);
         CAN2::enable(rcc);

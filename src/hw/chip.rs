@@ -1,4 +1,4 @@
-//! The chip itself: who it is, how it feels, what it remembers, how it restarts.
+//! The chip itself: its identity, temperature and voltage, what it stores, and how it restarts.
 
 use core::fmt::Write;
 
@@ -37,12 +37,12 @@ pub struct BoardChip {
 }
 
 impl BoardChip {
-    /// Puts it together.
+    /// Assembles it from its parts.
     pub const fn new(sensors: Sensors, sector: LastSector, leds: Leds) -> Self {
         Self { sensors, sector, leds, lights: Lights::new() }
     }
 
-    /// Shows what happened on the LEDs. To be called each millisecond.
+    /// Shows what happened on the LEDs. Call once a millisecond.
     pub fn tick(&mut self, activity: Activity) {
         let lit = self.lights.tick(activity);
         self.leds.show(lit);

@@ -1,8 +1,8 @@
 //! The clock tree: 144 MHz for the processor, a quarter of it for CAN, 48 MHz for USB: from a crystal of 8 or 12 MHz by a PLL at
 //! 288 MHz, divided by 2 and by 6.
 //!
-//! The HAL sets it up, but computes only what it wrote: it neither switches a running PLL off, whose factors it could not
-//! change, nor does it give up on a crystal that never starts. Both are done here, and what the registers hold at the end
+//! The HAL sets it up, but assumes the state after a reset: it neither switches off a running PLL, whose factors it then
+//! cannot change, nor gives up on a crystal that never starts. Both are done here, and what the registers hold at the end
 //! is checked.
 
 use cantap_firmware::CAN_CLOCK_HZ;
@@ -16,27 +16,27 @@ use crate::board;
 pub const SYSCLK_HZ: u32 = 144_000_000;
 /// USB's clock.
 const USB_HZ: u32 = 48_000_000;
-/// The processor's clock before that.
+/// The processor's clock before that: the internal oscillator, HSI.
 pub const HSI_HZ: u32 = 16_000_000;
-/// Cycles that a turn of cortex-m's waiting loop takes on this core, at least (cortex-m 0.7, `asm::delay`).
+/// Least number of cycles that a turn of cortex-m's delay loop takes on this core (cortex-m 0.7, `asm::delay`).
 const CYCLES_PER_TURN: u32 = 3;
-/// A crystal that has not started after this long, in ms, does not start: the data sheet says 2 ms typically (STM32F405, "HSE
-/// 4-26 MHz oscillator characteristics"), ST's drivers give it 100.
+/// A crystal that has not started after this time, in ms, will not: the data sheet gives 2 ms as typical (STM32F405, "HSE
+/// 4-26 MHz oscillator characteristics"), and ST's drivers allow 100.
 const CRYSTAL_MS: u32 = 100;
-/// Reads of a register for which a switch over is waited: it takes a few clocks.
+/// Most reads of a register while waiting for a switch-over, which takes a few clocks.
 const MOST_READS: u32 = 10_000;
 /// Flash wait states above 120 and up to 150 MHz at 2.7 to 3.6 V (RM0090, "Number of wait states according to CPU clock
 /// frequency").
 const WAIT_STATES: u8 = 4;
 
-/// The processor on HSI, everything else off: PLL, I2S's PLL, crystal, clock security. Wait states stay until the HAL sets them:
-/// too many do no harm. The caches are emptied, because what they hold may be older than the flash.
+/// Puts the processor on HSI and switches everything else off: PLL, I2S's PLL, crystal, clock security. Wait states stay until
+/// the HAL sets them: too many do no harm. The caches are emptied, because their contents may be older than the flash.
 pub fn back_to_hsi(rcc: &pac::RCC, flash: &pac::FLASH) {
     rcc.cr().modify(|_, w| w.hsion().on());
     wait_until(|| rcc.cr().read().hsirdy().is_ready());
     rcc.cfgr().modify(|_, w| w.sw().hsi());
     wait_until(|| rcc.cfgr().read().sws().is_hsi());
-    // Prescalers 1, no clock outputs.
+    // Prescalers of 1, no clock outputs.
     rcc.cfgr().reset();
     rcc.cr().modify(|_, w| w.csson().off().pllon().off().plli2son().off());
     wait_until(|| rcc.cr().read().pllrdy().is_not_ready() && rcc.cr().read().plli2srdy().is_not_ready());
@@ -51,7 +51,7 @@ pub fn back_to_hsi(rcc: &pac::RCC, flash: &pac::FLASH) {
     flash.acr().modify(|_, w| w.icrst().clear_bit().dcrst().clear_bit());
 }
 
-/// Waits, with a processor's clock of this many Hz; rather too long than too short.
+/// Waits this many ms or a little longer, at a processor clock of `hz`.
 pub fn wait_ms(ms: u32, hz: u32) {
     cortex_m::asm::delay(ms * (hz / 1_000 / CYCLES_PER_TURN));
 }
@@ -63,7 +63,7 @@ fn wait_until(done: impl Fn() -> bool) {
     }
 }
 
-/// Starts the crystal; returns whether it oscillates. Runs from HSI.
+/// Starts the crystal, while running from HSI; returns whether it oscillates.
 pub fn start_crystal(rcc: &pac::RCC) -> bool {
     rcc.cr().modify(|_, w| w.hseon().on());
     for _ in 0..CRYSTAL_MS {
@@ -75,7 +75,7 @@ pub fn start_crystal(rcc: &pac::RCC) -> bool {
     false
 }
 
-/// Goes over to the crystal, which oscillates.
+/// Switches to the crystal, which must already oscillate.
 pub fn run(rcc: Rcc) -> Rcc {
     let config = Config::hse(board::HSE_MHZ.MHz())
         .sysclk(SYSCLK_HZ.Hz())
@@ -89,7 +89,7 @@ pub fn run(rcc: Rcc) -> Rcc {
 }
 
 /// Wrong clocks would give wrong bit rates and wrong times: what counts is what the registers hold, not what was
-/// meant.
+/// intended.
 fn check(rcc: &Rcc) {
     let (cfgr, pll) = (rcc.cfgr().read(), rcc.pllcfgr().read());
     // SAFETY: reads a register that has no effect on being read.

@@ -1,8 +1,8 @@
-//! Copies memory, in place of the compiler's library.
+//! Copies memory, in place of the compiler's runtime library.
 //!
-//! That is made for cores that cannot read a word across a word's boundary: it puts such words together from two, in some 22 cycles for
-//! four bytes, and copies less than 16 bytes one by one. Records have any length, so nearly nothing that is copied here is aligned. A
-//! Cortex-M4's LDR and STR take unaligned words in memory, and are a little slower then (Cortex-M4 devices generic user guide, ARM DUI 0553A,
+//! The library's version is made for cores that cannot read a word across a word boundary: it assembles such words from two, in some 22
+//! cycles for four bytes, and copies fewer than 16 bytes one by one. Records have any length, so hardly anything copied here is aligned. A
+//! Cortex-M4's LDR and STR accept unaligned words in memory, at a small cost in speed (Cortex-M4 devices generic user guide, ARM DUI 0553A,
 //! 3.3.5); CCR.UNALIGN_TRP, which would make them fault, is off after a reset. Registers are never copied like this.
 
 use core::arch::global_asm;
@@ -37,7 +37,7 @@ global_asm!(
     "    str   r3, [r12], #4",
     "    subs  r2, #16",
     "    bhs   1b",
-    // 0 to 15 are left: r2 is that less 16, then less 4.
+    // 0 to 15 bytes are left: r2 is that number minus 16, then minus 4.
     "2:  adds  r2, #12",
     "    bmi   4f",
     "3:  ldr   r3, [r1], #4",

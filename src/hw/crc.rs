@@ -1,5 +1,5 @@
 //! The chip's CRC unit, which does four bytes in as many clocks: CRC-32 with the wire's polynomial, but with the highest bit first. So
-//! words go in and the result comes out with their bits reversed.
+//! words go in, and the result comes out, with bits reversed.
 
 use stm32f4xx_hal::pac::CRC;
 use stm32f4xx_hal::rcc::{Enable, Rcc};
@@ -7,7 +7,7 @@ use stm32f4xx_hal::rcc::{Enable, Rcc};
 /// The wire's polynomial, 04C11DB7, with the lowest bit first.
 const POLYNOMIAL: u32 = 0xEDB8_8320;
 
-/// The unit. It is used at one priority only.
+/// The unit. It is used at only one priority.
 pub struct CrcUnit(CRC);
 
 impl CrcUnit {

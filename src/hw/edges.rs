@@ -1,12 +1,12 @@
 //! The receive pins as edge detectors, for a host that looks for a bit rate: [`EdgeCatcher`] in the pins' interrupts, [`PinMeter`] for
 //! commands.
 //!
-//! A pin keeps its alternate function meanwhile: its input is read and leads to EXTI in every digital mode (RM0090 Rev 21 §8.3.11, "Alternate
-//! function configuration": the Schmitt trigger is on, and the level is sampled into IDR). Its controller is off the bus.
+//! A pin keeps its alternate function while it is measured: its input can be read and reaches EXTI in every digital mode (RM0090 Rev 21
+//! §8.3.11, "Alternate function configuration": the Schmitt trigger is on, and the level is sampled into IDR). Its controller is off the bus.
 //!
-//! At 1 Mbit/s edges are a microsecond apart, 144 cycles, which is too little for one interrupt each. So the interrupt that the first one
-//! raises stays and watches the pin until it is quiet for [`STAY_TICKS`]. It runs below everything that captures or sends, which may
-//! interrupt it at any instant: that shows as a jump of the time between two looks, and the edge behind it is marked as unsure.
+//! At 1 Mbit/s edges are a microsecond apart, 144 cycles, which is too little for one interrupt each. So the first edge's interrupt stays
+//! and watches the pin until it has been quiet for [`STAY_TICKS`]. It runs below everything that captures or sends, which may interrupt
+//! it at any instant: that shows as a jump in time between two samples, and the edge that follows is marked as unsure.
 
 use core::sync::atomic::Ordering::{Acquire, Relaxed, Release};
 use core::sync::atomic::{AtomicBool, AtomicU8, AtomicU32};
@@ -20,32 +20,32 @@ use stm32f4xx_hal::rcc::{Enable, Rcc};
 use super::stamp::StampTimer;
 use crate::board::{Port, RECEIVE_PINS, ReceivePin};
 
-/// Within a frame the level stays for five bits at most: from 200 kbit/s up, one interrupt sees a whole frame. What is of a lower priority,
-/// USB, waits meanwhile: for 256 edges that come just in time, 6 ms.
+/// Within a frame the level stays the same for at most five bits: from 200 kbit/s up, one interrupt sees a whole frame. USB, of a lower
+/// priority, waits meanwhile: 6 ms if 256 edges each come just in time.
 const STAY_TICKS: u32 = 24 * TICKS_PER_US;
-/// Between two looks at the pin are some 30 cycles at most, 3 ticks. More than this is an interruption, and half of the shortest bit.
+/// Two samples of the pin are some 30 cycles apart at most, 3 ticks. More than this, half of the shortest bit, is an interruption.
 const MOST_BLIND_TICKS: u32 = TICKS_PER_US / 2;
-/// Between an edge and the first look behind it are some 110 cycles at most, in which it is written down: less than the shortest bit, in which
-/// there is no other edge.
+/// From an edge to the next sample it takes some 110 cycles at most, in which the edge is written down: less than the shortest bit, so that no
+/// other edge can come in between.
 const WRITING_TICKS: u32 = TICKS_PER_US - 1;
 
 const DOMINANT: u8 = 1;
 const UNSURE: u8 = 2;
 
-/// What the interrupt has written and commands have not taken, and what both know of the pin. One measurement at a time.
+/// What the interrupt has written and commands have not yet taken, and what both know about the pin. There is one measurement at a time.
 struct Kept {
     at: [AtomicU32; EDGES_KEPT],
     marks: [AtomicU8; EDGES_KEPT],
     /// Edges written, and taken, since the measurement began; both wrap.
     written: AtomicU32,
     taken: AtomicU32,
-    /// There was no room, and the pin's interrupt is off.
+    /// There was no room left, so the pin's interrupt is off.
     full: AtomicBool,
     /// Edges may have been missed since the last one.
     blind: AtomicBool,
-    /// The level behind the last one.
+    /// The level after the last edge.
     dominant: AtomicBool,
-    /// [`Channel::index`] of the one that is watched.
+    /// [`Channel::index`] of the channel being watched.
     channel: AtomicU8,
 }
 
@@ -61,7 +61,7 @@ static KEPT: Kept = Kept {
 };
 
 impl Kept {
-    /// Writes an edge down; false if there is no room.
+    /// Notes an edge; false if there is no room.
     #[inline]
     fn push(&self, at: u32, dominant: bool, unsure: bool) -> bool {
         let written = self.written.load(Relaxed);
@@ -81,9 +81,9 @@ impl ReceivePin {
         1 << self.pin
     }
 
-    /// Where its level is.
+    /// Where to read its level.
     fn level(self) -> Level {
-        // SAFETY: the ports' registers are there for the whole program.
+        // SAFETY: the ports' registers exist for the whole program.
         let idr = unsafe {
             match self.port {
                 #[cfg(feature = "stm32f4-discovery")]
@@ -99,7 +99,7 @@ impl ReceivePin {
     }
 }
 
-/// A pin's input, found once and read often.
+/// A pin's input, looked up once and read often.
 #[derive(Clone, Copy)]
 struct Level {
     idr: *const u32,
@@ -116,12 +116,12 @@ impl Level {
 }
 
 fn exti() -> &'static pac::exti::RegisterBlock {
-    // SAFETY: the registers are there for the whole program, and `PinMeter::new` took the peripheral. RTSR and FTSR are the meter's;
-    // IMR is written by the interrupt only while the meter cannot run, and by the meter while the interrupt is off.
+    // SAFETY: the registers exist for the whole program, and `PinMeter::new` took the peripheral. RTSR and FTSR are the meter's; IMR
+    // is written by the interrupt only while the meter cannot run, and by the meter while the interrupt is off.
     unsafe { &*pac::EXTI::ptr() }
 }
 
-/// Lets a line interrupt, or not. What comes meanwhile stays pending.
+/// Unmasks or masks a line's interrupt. What comes while it is masked stays pending.
 fn unmask(line: u32, on: bool) {
     exti().imr().modify(|r, w| {
         let others = r.bits() & !line;
@@ -130,7 +130,7 @@ fn unmask(line: u32, on: bool) {
     });
 }
 
-/// Ends what is pending on a line.
+/// Clears what is pending on a line.
 fn acknowledge(line: u32) {
     // SAFETY: one bit for each line; those written as 0 stay.
     exti().pr().write(|w| unsafe { w.bits(line) });
@@ -140,7 +140,7 @@ fn acknowledge(line: u32) {
 pub struct EdgeCatcher(StampTimer);
 
 impl EdgeCatcher {
-    /// Takes down the edge that raised the interrupt, and those that follow closely.
+    /// Notes the edge that raised the interrupt, and those that follow closely.
     pub fn catch(&self) {
         let mut at = self.0.now();
         let pin = RECEIVE_PINS[usize::from(KEPT.channel.load(Relaxed)) % RECEIVE_PINS.len()];
@@ -151,7 +151,7 @@ impl EdgeCatcher {
         acknowledge(pin.bit());
         loop {
             if dominant == last {
-                // There and back, before anybody looked.
+                // The level changed and changed back between two samples.
                 blind = true;
             } else if KEPT.push(at, dominant, blind) {
                 last = dominant;
@@ -177,7 +177,7 @@ impl EdgeCatcher {
                     KEPT.dominant.store(last, Relaxed);
                     KEPT.blind.store(blind, Relaxed);
                     acknowledge(pin.bit());
-                    // One that came before that is not pending any more.
+                    // An edge that came before that is no longer pending.
                     dominant = level.is_dominant();
                     if dominant == last {
                         return;
@@ -198,12 +198,12 @@ pub struct PinMeter {
 impl PinMeter {
     /// A meter that watches nothing, and what the interrupts need.
     pub fn new(_: pac::EXTI, syscfg: pac::SYSCFG, timer: StampTimer, rcc: &mut Rcc) -> (Self, EdgeCatcher) {
-        // Where lines are led to ports.
+        // SYSCFG connects lines to ports.
         pac::SYSCFG::enable(rcc);
         (Self { syscfg, watched: None }, EdgeCatcher(timer))
     }
 
-    /// Leads a pin to its line of EXTI.
+    /// Connects a pin to its EXTI line.
     fn select(&self, pin: ReceivePin) {
         let shift = 4 * u32::from(pin.pin % 4);
         let source = |bits: u32| bits & !(0xF << shift) | (pin.port as u32) << shift;
@@ -219,7 +219,7 @@ impl PinMeter {
         };
     }
 
-    /// Watches a pin from its present level on.
+    /// Watches a pin, starting from its present level.
     fn resume(pin: ReceivePin, blind: bool) {
         KEPT.full.store(false, Relaxed);
         KEPT.blind.store(blind, Relaxed);

@@ -1,19 +1,19 @@
-//! The first instructions, and a chip as a reset leaves it, whoever ran before.
+//! The first instructions: they put the chip into the state after a reset, no matter what ran before.
 //!
-//! The ROM bootloader starts the program that it was given with its own vectors, clocks and peripherals as they are ("the Jump to
+//! The ROM bootloader leaves its own vectors, clocks and peripherals as they are when it starts a program ("the Jump to
 //! application works only if the user application sets the vector table correctly", AN3156); a debugger or another program may do
-//! the same.
+//! so too.
 
 use core::arch::global_asm;
 
 use cortex_m::peripheral::{NVIC, SCB};
 use stm32f4xx_hal::pac;
 
-// Before anything else, memory included: no interrupt may find another program's memory with our vectors, or ours with its
-// vectors. So cortex-m-rt's `set-vtor`, which does not mask, is not enough. The order: mask (PRIMASK, and BASEPRI open),
-// VTOR, then SysTick, SysTick's and PendSV's pending bits, and every interrupt's enable and pending bits (82 of them in three
-// words). cortex-m-rt calls this with the stack set and before memory is initialised, which it does for SRAM only: what of the
-// core-coupled memory begins as zero is made so here.
+// Before anything else, memory included: no interrupt may run with our vectors on another program's memory, or with its
+// vectors on ours. So cortex-m-rt's `set-vtor`, which does not mask, is not enough. The order: mask (PRIMASK, and BASEPRI
+// open), VTOR, then SysTick, SysTick's and PendSV's pending bits, and every interrupt's enable and pending bits (82 of them in
+// three words). cortex-m-rt calls this with the stack set and before memory is initialised, which it does for SRAM only: the
+// part of the core-coupled memory that must begin as zero is cleared here.
 global_asm!(
     ".section .text.__pre_init, \"ax\"",
     ".global __pre_init",
@@ -44,7 +44,7 @@ global_asm!(
     "str r2, [r1]",
     "str r2, [r1, #4]",
     "str r2, [r1, #8]",
-    // The memory that `init` shares out (memory.x).
+    // The memory that `init` hands out (memory.x).
     "ldr r1, =__sshared_out",
     "ldr r2, =__eshared_out",
     "1:",
@@ -62,21 +62,21 @@ global_asm!(
 
 /// RCC_AHB1ENR after a reset: the core-coupled memory, where the stack is (RM0090, RCC_AHB1ENR).
 const CCM_ENABLED: u32 = 1 << 20;
-/// Every peripheral that a reset register has on the F405/407 (RM0090, RCC_AHB1RSTR and following).
+/// Every peripheral that has a reset bit on the F405/407 (RM0090, RCC_AHB1RSTR and following).
 const AHB1: u32 = 0x2260_11FF;
 const AHB2: u32 = 0x0000_00F1;
 const AHB3: u32 = 0x0000_0001;
 const APB1: u32 = 0x36FE_C9FF;
 const APB2: u32 = 0x0007_5933;
 
-/// What was found and undone.
+/// What was found at the start.
 pub struct Found {
-    /// A host may have seen a USB device here, of this firmware or another.
+    /// A host may have seen a USB device here, run by this firmware or another program.
     pub usb_was_connected: bool,
 }
 
-/// Makes clocks, peripherals, memory map and flash interface what they are after a reset. From here on the processor runs
-/// from HSI, and USB is disconnected.
+/// Puts clocks, peripherals, memory map and flash interface into their state after a reset. From here on the processor
+/// runs from HSI, and USB is disconnected.
 pub fn restore(rcc: &pac::RCC, syscfg: &pac::SYSCFG, flash: &pac::FLASH) -> Found {
     let usb_was_connected =
         rcc.ahb2enr().read().otgfsen().is_enabled() || rcc.csr().read().porrstf().is_no_reset();
@@ -84,7 +84,7 @@ pub fn restore(rcc: &pac::RCC, syscfg: &pac::SYSCFG, flash: &pac::FLASH) -> Foun
     reset_peripherals(rcc);
     map_flash_at_zero(rcc, syscfg);
     super::flash::lock(flash);
-    // What the peripherals asked for before they were reset.
+    // Clear the interrupts that peripherals raised before they were reset.
     // SAFETY: no interrupt is wanted yet, and all are masked.
     unsafe { (*NVIC::PTR).icpr.iter().for_each(|clear| clear.write(u32::MAX)) };
     Found { usb_was_connected }
@@ -113,18 +113,18 @@ fn reset_peripherals(rcc: &pac::RCC) {
     }
 }
 
-/// Flash at address 0. After a reset of SYSCFG that is what the boot pins say, and the jumper that chose the bootloader may
-/// still be in.
+/// Maps flash at address 0. A reset of SYSCFG leaves the mapping to the boot pins, and the jumper that selects the
+/// bootloader may still be in.
 fn map_flash_at_zero(rcc: &pac::RCC, syscfg: &pac::SYSCFG) {
     enable_syscfg(rcc);
     // SAFETY: 0 is the field's value for flash.
     syscfg.memrmp().modify(|_, w| unsafe { w.mem_mode().bits(0) });
-    // What address 0 shows is another memory from the next instruction on.
+    // From the next instruction on, address 0 is a different memory.
     cortex_m::asm::dsb();
     cortex_m::asm::isb();
 }
 
-/// Switches SYSCFG's clock on, and waits until the peripheral is there (ES0182, "Delay after an RCC peripheral clock
+/// Switches SYSCFG's clock on, and waits until the peripheral responds (ES0182, "Delay after an RCC peripheral clock
 /// enabling").
 pub fn enable_syscfg(rcc: &pac::RCC) {
     rcc.apb2enr().modify(|_, w| w.syscfgen().enabled());

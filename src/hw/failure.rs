@@ -1,4 +1,4 @@
-//! What is left of a run that failed, for the next one: the log of [`cantap_firmware::failures`], in memory that startup does not touch.
+//! What a failed run leaves for the next: the log of [`cantap_firmware::failures`], in memory that startup does not touch.
 
 use core::arch::global_asm;
 use core::fmt;
@@ -26,11 +26,11 @@ fn load() -> FailureLog {
 pub fn record(what: fmt::Arguments) {
     let mut log = load();
     log.add(what);
-    // SAFETY: as in `load`; whoever writes does not return to what it may have interrupted, or nothing else runs yet.
+    // SAFETY: as in `load`; the writer either never returns to what it interrupted, or runs before anything else.
     unsafe { addr_of_mut!(LOG).cast::<FailureLog>().write_volatile(log) }
 }
 
-/// How often the firmware failed since the chip got its power, and why last.
+/// How often the firmware failed since power-on, and why it last did.
 pub fn failures() -> Failures {
     load().failures()
 }
@@ -53,15 +53,15 @@ fn panic(info: &PanicInfo) -> ! {
     fail(format_args!("{info}"))
 }
 
-/// An interrupt or exception that nothing here switches on.
+/// An interrupt or exception that nothing here enables.
 // SAFETY: as a panic.
 #[exception]
 unsafe fn DefaultHandler(irq: i16) -> ! {
     fail(format_args!("interrupt {irq} has no handler"))
 }
 
-// Takes PC and LR out of the frame that the fault pushed, unless the stack is what failed, and goes on with an empty stack, since
-// nothing returns from here and the old one may have no room.
+// Takes PC and LR out of the frame that the fault pushed, unless it was the stack that failed, and continues on an empty stack:
+// nothing returns from here, and the old one may have no room.
 global_asm!(
     ".section .HardFaultTrampoline, \"ax\"",
     ".global HardFault",

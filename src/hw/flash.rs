@@ -1,11 +1,12 @@
-//! The last sector of the flash, for what is saved over a power cycle (RM0090, "Embedded flash memory
+//! The last sector of the flash, for what is kept over a power cycle (RM0090, "Embedded flash memory
 //! interface").
 //!
 //! Erasing and programming stop every instruction fetch from flash: 16 µs for a word, which the receive FIFOs
-//! bear, up to 2 s for the sector, which they do not (STM32F405 data sheet, "Flash memory programming").
+//! can bear, and up to 2 s for the sector, which they cannot (STM32F405 data sheet, "Flash memory
+//! programming").
 //!
-//! An error's flag stays until it is cleared, and while one is set the interface takes nothing: users of the chip report it,
-//! and ST's drivers clear the flags before each operation. So does this one, whoever left them.
+//! An error flag stays until it is cleared, and while one is set the interface accepts nothing: users of the chip report
+//! this, and ST's drivers clear the flags before each operation. So does this one, no matter what set them.
 
 use cantap_firmware::saved::Sector;
 use stm32f4xx_hal::pac::FLASH;
@@ -17,7 +18,7 @@ const WORDS: usize = 128 * 1024 / 4;
 /// RM0090, "Unlocking the Flash control register".
 const KEYS: [u32; 2] = [0x4567_0123, 0xCDEF_89AB];
 
-/// Locks the control register, which another program may have left open, and clears what errors it left.
+/// Locks the control register, which another program may have left open, and clears any error flags left behind.
 pub fn lock(flash: &FLASH) {
     wait(flash);
     clear_flags(flash);
@@ -48,15 +49,16 @@ fn went_well(flash: &FLASH) -> bool {
 pub struct LastSector(FLASH);
 
 impl LastSector {
-    /// Takes the flash interface; the clock setup is done with it.
+    /// Takes the flash interface, which the clock setup no longer needs.
     pub const fn new(flash: FLASH) -> Self {
         Self(flash)
     }
 
-    /// Unlocks the flash, does something, waits for its end, locks the flash. Returns whether it went well.
+    /// Unlocks the flash, runs `act`, waits until it is done, locks the flash. Returns whether it succeeded.
     fn unlocked(&mut self, act: impl FnOnce(&FLASH)) -> bool {
         wait(&self.0);
-        // Keys that are not wanted lock the register until the next reset. It is locked: `lock` at the start, and here below.
+        // Keys written when the register is not locked would lock it until the next reset. It is locked: by `lock` at the
+        // start, and at the end of this function.
         for key in KEYS {
             // SAFETY: the two keys, in their order.
             self.0.keyr().write(|w| unsafe { w.bits(key) });
@@ -68,7 +70,7 @@ impl LastSector {
         wait(&self.0);
         let went_well = went_well(&self.0);
         self.0.cr().modify(|_, w| w.pg().clear_bit().ser().clear_bit().lock().set_bit());
-        // What was read before is not there any more.
+        // The data cache may hold what was there before.
         self.0.acr().modify(|_, w| w.dcen().clear_bit());
         self.0.acr().modify(|_, w| w.dcrst().set_bit());
         self.0.acr().modify(|_, w| w.dcrst().clear_bit().dcen().set_bit());

@@ -1,12 +1,12 @@
-//! What one run of the firmware tells the next: a word of RAM that startup does not touch, which outlives every reset but a loss of
-//! power.
+//! A message from one run of the firmware to the next: a word of RAM that startup does not touch and that survives every reset
+//! except a loss of power.
 
 use core::mem::MaybeUninit;
 use core::ptr::{addr_of, addr_of_mut};
 
 /// The next run is to enter the ROM bootloader. This and [`FAILED`] are numbers that RAM is unlikely to hold by chance.
 pub const ENTER_BOOTLOADER: u32 = 0xB007_10AD;
-/// The run has failed, and recorded why.
+/// The run failed, and recorded why.
 pub const FAILED: u32 = 0x0BAD_C0DE;
 
 #[unsafe(link_section = ".uninit.cantap_restart")]

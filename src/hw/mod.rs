@@ -1,5 +1,6 @@
-//! The board's side of the firmware: the logic's traits over stm32f4xx-hal and the chip's registers. The only
-//! place with `unsafe`. What is decided here is how, never what: that is the logic's.
+//! The board's side of the firmware: implements the logic's traits with stm32f4xx-hal and the chip's
+//! registers. The only place with `unsafe`. This code decides how things are done; the logic decides what is
+//! done.
 
 pub mod access;
 pub mod can;
@@ -31,13 +32,13 @@ use stm32f4xx_hal::prelude::*;
 
 use crate::board::{self, Leds, Ports};
 
-/// The protocol's version, for those who load the ELF ([`cantap_wire::PROTOCOL_SYMBOL`]).
+/// The protocol version, for programs that load the ELF ([`cantap_wire::PROTOCOL_SYMBOL`]).
 // SAFETY: no other symbol has this name. `used`, because nothing in the firmware reads it.
 #[used]
 #[unsafe(no_mangle)]
 static CANTAP_PROTOCOL_VERSION: u16 = cantap_wire::PROTOCOL_VERSION;
 
-/// Where the buses arrive, for those who load the ELF ([`cantap_wire::RECEIVE_PINS_SYMBOL`]).
+/// The buses' receive pins, for programs that load the ELF ([`cantap_wire::RECEIVE_PINS_SYMBOL`]).
 // SAFETY: as above.
 #[used]
 #[unsafe(no_mangle)]
@@ -58,9 +59,9 @@ pub struct Hardware {
     pub tick: tick::Tick,
     /// The CRC unit.
     pub crc: crc::CrcUnit,
-    /// What measures the receive pins.
+    /// The meter for the receive pins.
     pub meter: edges::PinMeter,
-    /// The same, in the pins' interrupts.
+    /// Its half for the pins' interrupts.
     pub catcher: edges::EdgeCatcher,
     /// The virtual COM port.
     pub usb: usb::UsbPort,
@@ -74,11 +75,11 @@ pub struct Hardware {
     pub restarted_after_failure: bool,
 }
 
-/// So long USB stays disconnected at a start that finds it connected, in ms. 2.5 µs are enough for a hub to see it (USB 2.0
-/// §7.1.7.3); what a host's software makes of a device that is back at once is another matter.
+/// How long USB stays disconnected if it is found connected at the start, in ms. 2.5 µs are enough for a hub to notice (USB
+/// 2.0 §7.1.7.3), but a host's software may need longer.
 const DISCONNECTED_MS: u32 = 10;
 
-/// Sets the board up. To be called once, first of all. `sent_at` is where the transmit interrupts leave their stamps.
+/// Sets the board up. Call it once, before anything else. `sent_at` is where the transmit interrupts leave their stamps.
 pub fn start(
     device: pac::Peripherals,
     usb_memory: &'static mut usb::Memory,
@@ -120,8 +121,8 @@ pub fn start(
     }
 }
 
-/// Says by the LED, from HSI, that the crystal does not start, for a period of the pattern; then starts again, which is the next
-/// try. So a board without a crystal blinks for ever, and one whose crystal comes up late comes up late.
+/// Running from HSI, shows on the LED for one period of the pattern that the crystal does not start; then restarts the firmware,
+/// which tries again. So a board without a crystal blinks for ever, and one whose crystal starts late still comes up.
 fn show_no_crystal(leds: &mut Leds, watchdog: &mut watchdog::Watchdog) -> ! {
     failure::record(format_args!("the {} MHz crystal did not start", board::HSE_MHZ));
     for at_ms in 0..lights::NO_CLOCK_MS {
@@ -132,9 +133,9 @@ fn show_no_crystal(leds: &mut Leds, watchdog: &mut watchdog::Watchdog) -> ! {
     failure::restart()
 }
 
-/// Keeps the processor's clock on for a debugger while the processor sleeps (RM0090, DBGMCU_CR, DBG_SLEEP). It costs some of
-/// the current that sleep saves. Chips of ST's were seen to execute nonsense when they wake from WFI like this, with interrupts
-/// disabled: so nothing here sleeps with interrupts disabled, and `idle` has a barrier behind its WFI.
+/// Keeps the processor's clock running for a debugger while the processor sleeps (RM0090, DBGMCU_CR, DBG_SLEEP). It costs some
+/// of the current that sleep saves. Some ST chips have been seen to execute garbage when they wake from WFI like this with
+/// interrupts disabled. So nothing here sleeps with interrupts disabled, and `idle` has a barrier after its WFI.
 fn stay_in_reach_of_a_debugger(debug: &pac::DBGMCU) {
     debug.cr().modify(|_, w| w.dbg_sleep().set_bit());
 }

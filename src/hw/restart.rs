@@ -32,7 +32,7 @@ pub fn begin(rcc: &pac::RCC, syscfg: &pac::SYSCFG) -> bool {
         syscfg.memrmp().modify(|_, w| unsafe { w.mem_mode().bits(MAP_SYSTEM_MEMORY) });
         cortex_m::asm::dsb();
         // SAFETY: with the tasks' interrupts off again and the vector table at 0, nothing but the clock gate above differs from
-        // the state after a reset, which is what the bootloader expects; it needs interrupts as such, which startup has masked.
+        // the state after a reset, which is what the bootloader expects; it needs interrupts enabled, which startup has masked.
         unsafe {
             (*NVIC::PTR).icer.iter().for_each(|disable| disable.write(u32::MAX));
             entry::forget_vectors();
@@ -48,7 +48,7 @@ pub fn begin(rcc: &pac::RCC, syscfg: &pac::SYSCFG) -> bool {
     failed || bitten
 }
 
-/// Forgets why the chip was last reset, so that the next start finds its own reason.
+/// Forgets why the chip was last reset, so that the next start finds only its own.
 pub fn forget_reset_cause(rcc: &pac::RCC) {
     rcc.csr().modify(|_, w| w.rmvf().clear());
 }

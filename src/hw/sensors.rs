@@ -11,7 +11,7 @@ const REFERENCE: u8 = 17;
 /// A conversion takes 480 + 12 clocks at 18 MHz, 27 µs; this many reads of a register take longer. The bound keeps
 /// a chip without an ADC from hanging.
 const MOST_READS: u32 = 10_000;
-/// Longest sampling time, 480 clocks at 18 MHz = 27 µs; the sensors ask for 10 µs (STM32F405 data sheet,
+/// Longest sampling time, 480 clocks at 18 MHz = 27 µs; the sensors need 10 µs (STM32F405 data sheet,
 /// "Temperature sensor characteristics" and "Embedded reference voltage").
 const SAMPLE_480: u8 = 0b111;
 
@@ -45,7 +45,7 @@ impl Sensors {
         let at_30 = calibration(VtempCal30::get().read())?;
         let at_110 = calibration(VtempCal110::get().read())?;
         let supply = u32::from(self.supply_millivolts()?);
-        // What the sample would be at the voltage of the calibration.
+        // The sample as it would be at the calibration's supply voltage.
         let sample = self.convert(TEMPERATURE)? * supply / VDDA_CALIB;
         let rise = (sample as i32 - at_30 as i32) * 800;
         let temperature = 300 + rise.checked_div(at_110 as i32 - at_30 as i32)?;
@@ -66,7 +66,7 @@ impl Sensors {
     }
 }
 
-/// A calibration value of the factory, if there is one.
+/// A factory calibration value, if there is one.
 fn calibration(value: u16) -> Option<u32> {
     (1..0xFFF).contains(&value).then_some(u32::from(value))
 }

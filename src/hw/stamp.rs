@@ -1,4 +1,4 @@
-//! The stamp timer: TIM2, 32 bits, free running at 12 MHz, with one compare channel as the alarm. Another is `sof.rs`'s.
+//! The stamp timer: TIM2, 32 bits, free running at 12 MHz, with one compare channel as the alarm. `sof.rs` uses another channel.
 
 use cantap_firmware::ports::Clock;
 use cantap_firmware::{TICK_HZ, TICKS_PER_US};
@@ -6,11 +6,11 @@ use stm32f4xx_hal::pac::TIM2;
 use stm32f4xx_hal::pac::tim2::RegisterBlock;
 use stm32f4xx_hal::rcc::{BusTimerClock, Enable, Rcc, Reset};
 
-/// The running timer, to be read: by any task, at any time. Copies are the same timer.
+/// The running timer, readable by any task at any time. Copies refer to the same timer.
 #[derive(Clone, Copy)]
 pub struct StampTimer(());
 
-/// The timer with its alarm. There is one, which cannot be copied: whoever has it sets the alarm, and nobody else can.
+/// The timer with its alarm. There is only one, which cannot be copied: only its owner can set the alarm.
 pub struct StampAlarm(StampTimer);
 
 impl StampTimer {
@@ -19,36 +19,36 @@ impl StampTimer {
         TIM2::enable(rcc);
         TIM2::reset(rcc);
         let timer = Self(()).registers();
-        // 72 MHz / 6: the timers of APB1 run at twice its 36 MHz.
+        // 72 MHz / 6: APB1's timers run at twice its 36 MHz.
         let divider = TIM2::timer_clock(&rcc.clocks).raw() / TICK_HZ;
         timer.psc().write(|w| w.psc().set((divider - 1) as u16));
         // SAFETY: every value is a period; this one is the longest.
         timer.arr().write(|w| unsafe { w.bits(u32::MAX) });
-        // The divider takes effect with an update event, whose flag is not wanted.
+        // The divider takes effect with an update event, whose flag must not stay set.
         timer.egr().write(|w| w.ug().update());
         timer.sr().write(|w| w.uif().clear());
         timer.cr1().modify(|_, w| w.cen().enabled());
         StampAlarm(Self(()))
     }
 
-    /// The timer now.
+    /// The current count.
     #[inline]
     pub fn now(self) -> u32 {
         self.registers().cnt().read().bits()
     }
 
-    /// The registers: for [`StampAlarm`], and for the latch, whose channel is another.
+    /// The registers, for [`StampAlarm`] and for the latch, which uses another channel.
     #[inline]
     #[expect(clippy::unused_self, reason = "a timer proves that it was started")]
     pub(super) fn registers(self) -> &'static RegisterBlock {
-        // SAFETY: the registers are there for the whole program. `start` took the peripheral and makes the only alarm, so that
-        // the alarm's registers are written by its owner alone; the latch writes those of channel 4, at start.
+        // SAFETY: the registers exist for the whole program. `start` took the peripheral and makes the only alarm, so only its
+        // owner writes the alarm's registers; the latch writes channel 4's, at the start.
         unsafe { &*TIM2::ptr() }
     }
 }
 
 impl StampAlarm {
-    /// The timer, to be read.
+    /// The timer, for reading.
     pub fn timer(&self) -> StampTimer {
         self.0
     }
@@ -60,13 +60,13 @@ impl StampAlarm {
 }
 
 impl Clock for StampAlarm {
-    /// 14 µs: longer than the other handlers of the alarm's priority take for a frame, those that drain before it, and any lock.
-    /// Stamps are taken at a higher priority and do not wait; draining the FIFOs has 141 µs.
+    /// 14 µs: longer than any lock, and than what the other handlers of the alarm's priority, which drain before it runs, take
+    /// for a frame. Stamps are taken at a higher priority and do not wait; draining the FIFOs may wait 141 µs.
     const ALARM_EARLY_TICKS: u32 = 14 * TICKS_PER_US;
 
     #[inline]
     fn wait_until(&self, at: u32) {
-        // Bounded: whoever calls this has found that the time is at most 1.5 ALARM_EARLY_TICKS ahead.
+        // Bounded: the caller has made sure that the time is at most 1.5 ALARM_EARLY_TICKS ahead.
         while (at.wrapping_sub(self.now()) as i32) > 0 {}
     }
 
@@ -86,8 +86,8 @@ impl Clock for StampAlarm {
         timer.ccr1().write(|w| unsafe { w.bits(at) });
         self.acknowledge();
         timer.dier().modify(|_, w| w.cc1ie().enabled());
-        // The counter may have passed the time before the comparison was set. If it passes it just now, the
-        // interrupt comes twice, which does no harm.
+        // The counter may have passed the time before the comparison was set. If it passes it right now,
+        // the interrupt comes twice, which does no harm.
         if at.wrapping_sub(self.now()) as i32 <= 0 {
             timer.egr().write(|w| w.cc1g().set_bit());
         }

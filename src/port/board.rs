@@ -7,7 +7,7 @@ use crate::bus::capture::Capture;
 use crate::bus::sof::SofReading;
 use crate::ports::{Chip, Clock, Control, EdgeMeter, FilterBanks, Traffic};
 
-/// All of the hardware, and the way to the buses' state.
+/// All of the hardware, and access to the buses' state.
 pub trait Board<'q, const N: usize> {
     /// Controllers' traffic side.
     type Traffic: Traffic;
@@ -19,11 +19,11 @@ pub trait Board<'q, const N: usize> {
     type Filters: FilterBanks;
     /// The chip.
     type Chip: Chip;
-    /// What measures receive pins.
+    /// Meter for the receive pins.
     type Meter: EdgeMeter;
 
     /// Lets `act` touch what the tasks of priority 4 own. It holds them up meanwhile, so `act` must be short: frames wait in the
-    /// FIFOs, and what is due leaves late. Stamps are taken at a higher priority and do not wait.
+    /// FIFOs, and frames that are due are sent late. Stamps are taken at a higher priority and do not wait.
     fn with_capture<R>(
         &mut self,
         act: impl FnOnce(&mut Capture<'q, N>, &mut [Self::Traffic; CHANNELS], &Self::Clock) -> R,
@@ -32,7 +32,7 @@ pub trait Board<'q, const N: usize> {
     fn now(&self) -> u32;
     /// What the stamp timer has latched of USB's start of frame since the last call; nothing if none came.
     fn take_sof(&mut self) -> Option<SofReading>;
-    /// The CRC of a message ([`cantap_wire::framing::crc32`]), by hardware where there is some.
+    /// The CRC of a message ([`cantap_wire::framing::crc32`]), in hardware where available.
     fn crc32(&mut self, message: &[u8]) -> u32 {
         framing::crc32(message)
     }
@@ -42,7 +42,7 @@ pub trait Board<'q, const N: usize> {
     fn filters(&mut self) -> &mut Self::Filters;
     /// The chip.
     fn chip(&mut self) -> &mut Self::Chip;
-    /// What measures receive pins.
+    /// The meter for the receive pins.
     fn meter(&mut self) -> &mut Self::Meter;
 
     /// Whether a channel is open.

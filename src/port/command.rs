@@ -1,5 +1,5 @@
-//! Does what a host asks. Commands that must wait for a controller become [`Work`], which is looked
-//! after at each poll; nothing here blocks.
+//! Carries out a host's commands. Those that must wait for a controller become [`Work`], which each
+//! poll advances; nothing here blocks.
 
 use cantap_wire::message::{ChannelConfig, Defaults, Filter, MAX_FILTERS, Status, capability};
 use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
@@ -26,8 +26,8 @@ use settings::{ChannelSettings, add_reports, saved, saved_reports, store};
 /// A controller leaves the bus when the frame on it has ended: 160 bits at 5 kbit/s are 32 ms. After this long the
 /// bus is stuck, and the controller is made to leave.
 const STOP_WITHIN_TICKS: u32 = 100 * TICKS_PER_MS;
-/// A controller that is made to leave takes a moment (Linux's driver, `drivers/net/can/bxcan.c`, looks every 10 ms). After this long it
-/// has no clock, or is broken.
+/// A controller that is made to leave takes a moment (Linux's driver, `drivers/net/can/bxcan.c`, checks every 10 ms). If it takes
+/// longer than this, it has no clock or is broken.
 const HALT_WITHIN_TICKS: u32 = 100 * TICKS_PER_MS;
 /// Time for the answer to reach the host before the device restarts.
 const LEAVE_AFTER_TICKS: u32 = 50 * TICKS_PER_MS;
@@ -44,9 +44,9 @@ pub struct Identity {
 /// Something that takes more than one poll.
 #[derive(Clone, Copy, Debug)]
 pub enum Work {
-    /// Both channels leave the bus and everything is forgotten: a session begins or ends.
+    /// Both channels leave the bus and everything is dropped: a session begins or ends.
     Silence,
-    /// Both channels leave the bus and say so in the stream, which is kept: the host sleeps.
+    /// Both channels leave the bus and say so in the stream, which is kept: the host is asleep.
     Retreat,
     /// A channel joins the bus.
     Open(Channel, ChannelConfig),
@@ -54,13 +54,13 @@ pub enum Work {
     Close(Channel),
     /// A channel leaves the bus and joins it again.
     Recover(Channel),
-    /// The firmware ends.
+    /// The firmware restarts.
     Restart,
-    /// The firmware ends, and the bootloader begins.
+    /// The bootloader takes over.
     Bootloader,
 }
 
-/// What a command comes to at once.
+/// The immediate result of a command.
 #[expect(clippy::large_enum_variant, reason = "no allocation on the device")]
 pub enum Step {
     /// It is done.
@@ -74,11 +74,11 @@ pub struct Commands {
     identity: Identity,
     layout: Layout,
     settings: [ChannelSettings; CHANNELS],
-    /// Controllers that are being made to leave their bus.
+    /// Which controllers are being made to leave their bus.
     halting: [bool; CHANNELS],
-    /// The receive pin that is watched.
+    /// The measurement of a receive pin under way, if any.
     measuring: Option<Measuring>,
-    /// When the work under way was begun.
+    /// When the work under way began.
     begun: u32,
     /// Requests that could not be read.
     pub bad_requests: u32,
@@ -99,7 +99,7 @@ impl Commands {
         }
     }
 
-    /// What [`Command::Hello`] answers.
+    /// The answer to [`Command::Hello`].
     pub fn hello(&self) -> Hello {
         Hello {
             protocol: PROTOCOL_VERSION,
@@ -124,7 +124,7 @@ impl Commands {
         }
     }
 
-    /// Does a command, or begins it.
+    /// Carries out a command, or begins to.
     pub fn execute<'q, const N: usize>(
         &mut self,
         command: Command,
@@ -174,7 +174,7 @@ impl Commands {
         Ok(Step::Done(reply))
     }
 
-    /// Begins work that the session looks after.
+    /// Begins work, which the session then advances.
     pub fn begin<'q, const N: usize>(&mut self, work: Work, board: &mut impl Board<'q, N>) -> Step {
         self.begun = board.now();
         self.end_measurement(work, board);
@@ -203,7 +203,7 @@ impl Commands {
         Step::Begun(work)
     }
 
-    /// Whatever ends the session ends a measurement, and so does the opening of its channel.
+    /// Anything that ends the session also ends a measurement, and so does opening its channel.
     fn end_measurement<'q, const N: usize>(&mut self, work: Work, board: &mut impl Board<'q, N>) {
         let ends = match work {
             Work::Open(channel, _) => self.measuring.is_some_and(|measuring| measuring.channel == channel),
@@ -215,7 +215,7 @@ impl Commands {
         }
     }
 
-    /// Looks after work: its result when it is done, `None` while it is under way.
+    /// Advances work: returns its result when it is done, `None` while it is under way.
     pub fn progress<'q, const N: usize>(
         &mut self,
         work: Work,
@@ -224,7 +224,7 @@ impl Commands {
         let waited = board.now().wrapping_sub(self.begun);
         match work {
             Work::Silence => {
-                // Both are looked after, also when one does not follow.
+                // Handle both, even if one of them does not respond.
                 let leave = Channel::ALL.map(|channel| self.leave(channel, waited, board));
                 if leave.iter().any(Option::is_none) {
                     return None;
@@ -234,7 +234,7 @@ impl Commands {
                 Some(refused.map_or_else(|| Ok(Reply::Hello(self.hello())), Err))
             }
             Work::Retreat => {
-                // As for silence.
+                // Both, as for `Silence`.
                 let closed = Channel::ALL.map(|channel| self.leave_and_close(channel, waited, board));
                 if closed.iter().any(Option::is_none) {
                     return None;
@@ -273,13 +273,13 @@ impl Commands {
                     board.chip().bootloader();
                 }
                 board.chip().reset();
-                // Only where there is no chip to restart.
+                // Reached only where there is no chip to restart.
                 Some(Ok(Reply::Done))
             }
         }
     }
 
-    /// Whether a channel has left the bus; after too long it is made to. `None` while it is under way.
+    /// Whether a channel has left the bus; if that takes too long, it is made to. `None` while it is under way.
     fn leave<'q, const N: usize>(
         &mut self,
         channel: Channel,
@@ -289,7 +289,7 @@ impl Commands {
         let halting = &mut self.halting[channel.index()];
         if !board.control(channel).is_stopped() && waited > STOP_WITHIN_TICKS {
             board.control(channel).halt();
-            // Right behind the reset, because the other channel may hear nothing until then.
+            // Right after the reset, because the other channel may hear nothing until then.
             if !core::mem::replace(halting, true) {
                 self.restore_filters(channel, board);
             }
@@ -308,8 +308,8 @@ impl Commands {
         })
     }
 
-    /// A channel's controller was reset. If that took the filters with it, another open channel may have missed frames: nobody
-    /// knows how many.
+    /// A channel's controller was reset. If that took the filters with it, another open channel may have missed an unknown
+    /// number of frames.
     fn restore_filters<'q, const N: usize>(&self, channel: Channel, board: &mut impl Board<'q, N>) {
         if !board.filters().write(&self.layout) {
             return;
@@ -321,7 +321,7 @@ impl Commands {
         }
     }
 
-    /// As [`Self::leave`]; a channel that was open has said its last word too.
+    /// As [`Self::leave`], and if the channel was open, its last records have been written too.
     fn leave_and_close<'q, const N: usize>(
         &mut self,
         channel: Channel,
@@ -459,7 +459,7 @@ impl Commands {
 
     fn status<'q, const N: usize>(&self, board: &mut impl Board<'q, N>) -> Status {
         let (ticks, fill) = board.with_capture(|capture, _, clock| (capture.now(clock), capture.fill()));
-        // One channel a time, to hold the interrupts up for less.
+        // One channel at a time, to hold up the tasks of priority 4 for less time.
         let channels = Channel::ALL
             .map(|channel| board.with_capture(|capture, _, clock| capture.status(channel, clock)));
         let chip = board.chip();
@@ -474,13 +474,13 @@ impl Commands {
         }
     }
 
-    /// Whether slcan's reports are wanted by what was saved.
+    /// Whether the saved settings ask for slcan's reports.
     pub fn saved_reports<'q, const N: usize>(&self, board: &mut impl Board<'q, N>) -> bool {
         saved_reports(board)
     }
 
-    /// Stores each configured channel's settings beside what is stored for the other, and whether slcan's reports are wanted, if
-    /// that was said.
+    /// Stores each configured channel's settings, keeping what is stored for the other, and, if given, whether slcan's reports
+    /// are wanted.
     #[inline(never)]
     pub fn save<'q, const N: usize>(
         &self,
@@ -501,7 +501,7 @@ impl Commands {
                 }
                 _ => postcard::to_slice(settings, out),
             };
-            // Cannot fail: so much is the most that there can be.
+            // Cannot fail: there is room for the most there can be.
             len += written.map_err(|_| Refusal::Hardware)?.len();
         }
         let len = add_reports(reports, len, &mut bytes);
@@ -509,7 +509,7 @@ impl Commands {
     }
 }
 
-/// A configuration that a controller can be given. Beyond the bit rates, the arithmetic of deadlines does not hold.
+/// Checks that a controller can take a configuration. Outside the range of bit rates, the arithmetic of the deadlines does not hold.
 fn check(config: &ChannelConfig) -> Result<(), Refusal> {
     let timing = &config.timing;
     let possible =

@@ -1,4 +1,4 @@
-//! Bytes from the host, until a whole request or line is there.
+//! Bytes from the host, collected until a whole request or line is there.
 
 /// Room for bytes: six of the longest requests to send.
 const INBOX: usize = 4096;
@@ -6,13 +6,13 @@ const INBOX: usize = 4096;
 /// Received bytes in order.
 pub struct Inbox {
     bytes: [u8; INBOX],
-    /// The first byte that is still wanted: the rest moves up only when room is short.
+    /// The first unread byte: the rest moves to the front only when room is short.
     start: usize,
-    /// Behind the last byte.
+    /// One past the last byte.
     end: usize,
-    /// What [`Self::take_until`] last looked for, and how many of the unread bytes are known not to be it.
+    /// What [`Self::take_until`] last looked for, and how many of the unread bytes are known not to match.
     searched: (u8, usize),
-    /// In the middle of something too long: all up to the next end is thrown away.
+    /// In the middle of something too long: everything up to the next end is thrown away.
     skipping: bool,
 }
 
@@ -47,7 +47,7 @@ impl Inbox {
         true
     }
 
-    /// Bytes that there is room for.
+    /// How many bytes there is room for.
     pub const fn room(&self) -> usize {
         INBOX - (self.end - self.start)
     }
@@ -63,13 +63,14 @@ impl Inbox {
         self.searched.1 = 0;
     }
 
-    /// The end of something too long has come: what follows is good again. Returns whether something was being thrown away.
+    /// The end of something too long has been reached: what follows is read again. Returns whether something was being thrown
+    /// away.
     pub const fn end_skipping(&mut self) -> bool {
         core::mem::replace(&mut self.skipping, false)
     }
 
-    /// Throws away an unfinished line: what stands before a zero that comes earlier than the next `end`. Returns whether there
-    /// was one.
+    /// Throws away an unfinished line, which is whatever precedes a zero that comes before the next `end`. Returns whether
+    /// there was one.
     pub fn drop_unfinished(&mut self, end: u8) -> bool {
         match self.unread().iter().position(|&byte| byte == 0 || byte == end) {
             Some(at) if self.unread()[at] == 0 => {
@@ -81,8 +82,8 @@ impl Inbox {
         }
     }
 
-    /// Shows `read` what stands before the first `end`, which is then dropped with it. `None` if there is
-    /// no `end` yet; `Some(None)` if something longer than `max` was thrown away.
+    /// Passes `read` the bytes before the first `end`, then drops them together with it. `None` if there
+    /// is no `end` yet; `Some(None)` if something longer than `max` was thrown away.
     pub fn take_until<R>(&mut self, end: u8, max: usize, read: impl FnOnce(&[u8]) -> R) -> Option<Option<R>> {
         let searched = if self.searched.0 == end { self.searched.1 } else { 0 };
         let Some(at) = position(&self.unread()[searched..], end) else {
@@ -108,7 +109,7 @@ impl Default for Inbox {
     }
 }
 
-/// Where a byte stands first: four are looked at in one go.
+/// The first position of a byte; four bytes are checked at a time.
 fn position(bytes: &[u8], wanted: u8) -> Option<usize> {
     let (words, rest) = bytes.as_chunks::<4>();
     for (index, word) in words.iter().enumerate() {
@@ -127,7 +128,8 @@ fn position(bytes: &[u8], wanted: u8) -> Option<usize> {
 mod tests {
     use super::*;
 
-    /// Pushes messages of growing length and takes them a few later, so that what is unread wraps past the end many times.
+    /// Pushes messages of growing length and takes each a few pushes later, so that the unread bytes wrap past the end many
+    /// times.
     #[test]
     fn messages_come_out_as_they_went_in_wherever_they_lie() {
         let mut inbox = Inbox::new();

@@ -1,7 +1,7 @@
-//! The side of the host: from the record queue to USB, and from a host's requests to what they ask for.
+//! The host side: from the record queue to USB, and from a host's requests to their execution.
 //!
 //! Everything here runs at priority 2 on the board. It reaches what belongs to the buses' tasks only through
-//! [`board::Board::with_capture`], which is RTIC's lock there.
+//! [`board::Board::with_capture`], which on the board is RTIC's lock.
 
 pub mod answers;
 pub mod board;

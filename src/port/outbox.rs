@@ -5,7 +5,7 @@ use cantap_wire::framing::MAX_ENCODED;
 use crate::port::answers;
 use crate::ports::{PACKET, Port};
 
-/// Room for all answers and a batch behind them.
+/// Room for all answers and a batch after them.
 const ROOM: usize = answers::ROOM + MAX_ENCODED;
 
 /// What is on its way out.
@@ -30,18 +30,18 @@ impl Outbox {
         self.must_end = false;
     }
 
-    /// Whether it can be filled again.
+    /// Whether everything has been sent, so that it can be filled again.
     pub const fn is_empty(&self) -> bool {
         self.sent == self.len
     }
 
-    /// Lets `write` fill in what goes next; it returns its length.
+    /// Lets `write` fill in what is sent next; `write` returns its length.
     pub fn fill(&mut self, write: impl FnOnce(&mut [u8]) -> usize) {
         self.len = write(&mut self.bytes).min(ROOM);
         self.sent = 0;
     }
 
-    /// Hands bytes to the port until it takes no more or all have gone.
+    /// Hands bytes to the port until it takes no more or none are left.
     pub fn pump(&mut self, port: &mut impl Port) {
         while self.sent < self.len {
             let Some(taken) = port.write(&self.bytes[self.sent..self.len]) else { return };

@@ -1,5 +1,5 @@
 //! Packs queued records into batches: walks whole records and keeps the running time, so that every
-//! batch carries an absolute time of its own.
+//! batch carries its own absolute time.
 
 use cantap_wire::CHANNELS;
 use cantap_wire::batch::BatchWriter;
@@ -9,7 +9,7 @@ use cantap_wire::record::{self, Outline};
 use crate::TICKS_PER_MS;
 use crate::bus::queue::Consumer;
 
-/// A batch is sent when it is full, or this long after its first record came.
+/// A batch is sent when it is full, or this long after its first record was added.
 const FLUSH_AFTER_TICKS: u32 = TICKS_PER_MS;
 
 /// Turns queued records into batches.
@@ -19,7 +19,7 @@ pub struct Sender {
     running_ticks: u64,
     /// When the batch got its first record.
     started: u32,
-    /// The next record does not fit any more.
+    /// The next record no longer fits.
     full: bool,
 }
 
@@ -36,8 +36,8 @@ impl Sender {
         self.full = false;
     }
 
-    /// Takes records from the queue; if a batch is due, writes it to `out`, encoded, and returns its length. `crc32` makes its
-    /// CRC.
+    /// Takes records from the queue; if a batch is due, writes it to `out`, encoded, and returns its length. `crc32` computes
+    /// its CRC.
     pub fn next_batch<const N: usize>(
         &mut self,
         queue: &mut Consumer<'_, N>,
@@ -55,7 +55,8 @@ impl Sender {
         self.batch.finish_with(out, crc32)
     }
 
-    /// Writes the end of the session to `out` and returns its length; 0 as long as there are records before it. It came at `at`.
+    /// Writes the end of the session, which came at `at`, to `out` and returns its length; 0 while there are records still to be
+    /// sent before it.
     pub fn end<const N: usize>(
         &mut self,
         queue: &mut Consumer<'_, N>,
@@ -74,7 +75,7 @@ impl Sender {
         let mut rest = bytes;
         while !rest.is_empty() {
             let Ok(Outline { len, ticks, frame_of }) = record::outline(rest) else {
-                // Cannot happen, since the recorder wrote it; if it did, the rest could not be read either.
+                // Cannot happen, since the recorder wrote the record; if it did, the rest could not be read either.
                 return bytes.len();
             };
             if bytes.len() - rest.len() + len > room {
@@ -92,7 +93,7 @@ impl Sender {
             if self.batch.is_empty() {
                 self.started = now;
             }
-            // Fits: it is no more than there was room for.
+            // It fits: it is no more than there was room for.
             self.batch.append(&bytes[..taken], self.running_ticks, frames);
             self.running_ticks = running_ticks;
         }

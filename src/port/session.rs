@@ -1,7 +1,8 @@
-//! One host at a time: what it sends is read here, and everything that it gets leaves here.
+//! One host at a time: what it sends is read here, and everything it receives is sent from here.
 //!
 //! The port speaks two languages. A first byte of 0 means the native protocol, a letter means slcan.
-//! Runs below the tasks of priority 4, in the USB interrupt and the millisecond tick; nothing waits.
+//! Runs below the tasks of priority 4, in the USB interrupt and the millisecond tick; nothing here
+//! waits.
 
 use cantap_wire::framing::{MAX_REQUEST, max_encoded_len, unseal_with};
 use cantap_wire::message::{EndReason, read_send, why_unreadable};
@@ -44,20 +45,20 @@ enum Origin {
     Device,
 }
 
-/// How far the device is with a session that it ends by itself.
+/// How far the device has come in ending a session on its own initiative.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Ending {
-    /// There is none, or its host knows.
+    /// There is no such session, or its host knows that it has ended.
     No,
-    /// As soon as what is under way lets it.
+    /// It is to end as soon as the work under way allows.
     Wanted(EndReason),
     /// The channels leave their buses.
     Leaving(EndReason),
-    /// They had left at this time, which the host is to hear behind what is queued.
+    /// The channels had left by this time, of which the host is informed after what is queued.
     Since(EndReason, u64),
 }
 
-/// The memory of a session: a dozen kilobytes, which are made where they stay and never pass over a stack.
+/// The memory of a session: a dozen kilobytes, constructed in place, never on a stack.
 pub struct Memory {
     sender: Sender,
     inbox: Inbox,
@@ -99,9 +100,9 @@ pub struct Session<'q, const N: usize = QUEUE_BYTES> {
     language: Language,
     work: Option<(Work, Origin)>,
     ending: Ending,
-    /// The host of a session that has ended is there still, as far as the device can tell: what is left of the session is for it.
+    /// As far as the device can tell, the host of a session that has ended is still there: what is left of the session is for it.
     is_heir: bool,
-    /// What the host had done with the port when it was last looked at.
+    /// What the host had done with the port at the last check.
     history: PortHistory,
     answers: &'q mut Answers,
     marks: SofMarks,
@@ -132,12 +133,12 @@ impl<'q, const N: usize> Session<'q, N> {
         }
     }
 
-    /// Whether a host talks to the device.
+    /// Whether a host is talking to the device.
     pub fn is_active(&self) -> bool {
         self.language != Language::Unknown
     }
 
-    /// Marks the start of a USB frame now and then. To be called every millisecond.
+    /// Marks the start of a USB frame once a second. Call it every millisecond.
     pub fn tick(&mut self, board: &mut impl Board<'q, N>) {
         let reading = board.take_sof();
         // Only a native session has a place for marks.
@@ -148,7 +149,7 @@ impl<'q, const N: usize> Session<'q, N> {
         }
     }
 
-    /// Reads, works and writes as far as it goes without waiting. To be called at every USB interrupt and
+    /// Reads, works and writes as far as possible without waiting. Call it at every USB interrupt and
     /// every millisecond.
     pub fn poll(&mut self, port: &mut impl Port, board: &mut impl Board<'q, N>) {
         self.notice(port.history(), board);
@@ -180,13 +181,15 @@ impl<'q, const N: usize> Session<'q, N> {
         }
     }
 
-    /// Whether what is left of a session waits for whoever asks: its host may be gone, and the next is not to get any of it.
+    /// Whether what is left of a session is held back until a request comes: its host may be gone, and the next host must not get
+    /// any of it.
     fn is_holding_back(&self) -> bool {
         self.ending != Ending::No && !self.is_heir
     }
 
-    /// Looks at what the host has done with the port since the last time. Configured anew, it may or may not have told the program
-    /// that has the port open, so what is left of the session waits until one asks. One that opens the port is another.
+    /// Checks what the host has done with the port since the last call. A host that reconfigured the device may or may not have
+    /// told the program that has the port open, so what is left of the session waits until a program sends a request. One that
+    /// opens the port is a new program.
     fn notice(&mut self, now: PortHistory, board: &mut impl Board<'q, N>) {
         let seen = core::mem::replace(&mut self.history, now);
         if seen.opened != now.opened {
@@ -205,11 +208,11 @@ impl<'q, const N: usize> Session<'q, N> {
         }
     }
 
-    /// Ends the session if that is wanted: the channels leave their buses. What is queued stays, and after a suspension what the
-    /// controller has taken of it: the host gets it, and behind it the end.
+    /// Ends the session if requested: the channels leave their buses. What is queued stays, and so, after a suspension, does
+    /// what the USB controller has already taken: the host receives all of it, and then the session's end.
     fn begin_end(&mut self, board: &mut impl Board<'q, N>) {
         let Ending::Wanted(reason) = self.ending else { return };
-        // A session that is just beginning begins first, and a restart that was asked for comes.
+        // A session that is just beginning is begun first, and a requested restart is carried out.
         if matches!(self.work, Some((Work::Silence | Work::Restart | Work::Bootloader, _))) {
             return;
         }
@@ -232,7 +235,7 @@ impl<'q, const N: usize> Session<'q, N> {
         self.begin(Work::Retreat, Origin::Device, board);
     }
 
-    /// The host is gone: the channels leave the bus, and nothing of it remains.
+    /// The host is gone: the channels leave the bus, and nothing of the session remains.
     fn hang_up(&mut self, port: &mut impl Port, board: &mut impl Board<'q, N>) {
         port.hold(false);
         while port.read(self.packet).is_some() {}
@@ -247,15 +250,16 @@ impl<'q, const N: usize> Session<'q, N> {
             self.inbox.clear();
             self.outbox.clear();
             self.answers.clear();
-            // A host that asked for a restart may be gone before it comes.
+            // A host that requested a restart may be gone before it happens.
             if !matches!(self.work, Some((Work::Restart | Work::Bootloader, _))) {
                 self.begin(Work::Silence, Origin::Device, board);
             }
         }
     }
 
-    /// Takes every packet that is there: one left in the USB peripheral would hold up the control pipe behind it. So the host is
-    /// made to wait before there is no room for what is on its way. What finds no room even so is dropped and counted.
+    /// Takes every packet available: one left in the USB peripheral would hold up the control pipe behind it. So the host is
+    /// made to wait while there is still room for what is on its way. If there is no room nevertheless, the packet is dropped
+    /// and counted.
     fn read(&mut self, port: &mut impl Port) {
         loop {
             self.hold(port);
@@ -326,7 +330,7 @@ impl<'q, const N: usize> Session<'q, N> {
         }
     }
 
-    /// The first byte decides the language. A zero changes to the native one at any time.
+    /// The first byte decides the language. A zero switches to the native one at any time.
     fn choose_language(&mut self, board: &mut impl Board<'q, N>) -> bool {
         let Some(first) = self.inbox.first() else { return false };
         match first {
@@ -355,7 +359,7 @@ impl<'q, const N: usize> Session<'q, N> {
         });
         let Some(len) = taken else { return false };
         let Some(Ok(len)) = len else {
-            // Damaged: there is no telling whom to answer.
+            // Damaged: the id of the request to answer is unknown.
             self.commands.bad_requests = self.commands.bad_requests.wrapping_add(1);
             return true;
         };
@@ -367,7 +371,7 @@ impl<'q, const N: usize> Session<'q, N> {
 
     /// Queues the frames of the request to send, of this many bytes; returns whether it is one.
     ///
-    /// Not inlined, nor is what does the other requests: neither is to take the stack that only the other needs.
+    /// Not inlined, nor is the function for the other requests: neither should use the stack that only the other needs.
     #[inline(never)]
     fn execute_send(&mut self, len: usize, board: &mut impl Board<'q, N>) -> bool {
         let mut frames = heapless::Vec::new();
@@ -377,7 +381,7 @@ impl<'q, const N: usize> Session<'q, N> {
         true
     }
 
-    /// Does what the request, of this many bytes, asks for.
+    /// Carries out the request of this many bytes.
     #[inline(never)]
     fn execute(&mut self, len: usize, greeted: bool, board: &mut impl Board<'q, N>) {
         let message = &self.request[..len];
@@ -392,7 +396,7 @@ impl<'q, const N: usize> Session<'q, N> {
             Err(_) => {
                 self.commands.bad_requests = self.commands.bad_requests.wrapping_add(1);
                 let Ok((id, _)) = postcard::take_from_bytes(message) else { return };
-                // It was sent as it is, and is something that this device does not know.
+                // It arrived undamaged, but is something that this device does not know.
                 (id, Err(why_unreadable(message)))
             }
         };
@@ -431,7 +435,7 @@ impl<'q, const N: usize> Session<'q, N> {
             return false;
         };
         if matches!(self.ending, Ending::Since(..)) && !self.is_heir {
-            // What is said behind the rest of the session is the answer.
+            // The end of the session, sent after the rest of it, is the answer.
             self.is_heir = true;
             return true;
         }
@@ -445,10 +449,11 @@ impl<'q, const N: usize> Session<'q, N> {
         true
     }
 
-    /// Fills the empty outbox with what goes next: the answers, and behind them what was captured. Returns whether there was
+    /// Fills the empty outbox with what is to be sent next: the answers, then what was captured. Returns whether there was
     /// something.
     ///
-    /// Answers wait for the end of a session that has ended: a host takes the first refusal for it, and listens no more.
+    /// Answers wait until the end of an ended session has been sent: a host takes the first refusal for that end, and stops
+    /// listening.
     fn fill_outbox(&mut self, board: &mut impl Board<'q, N>) -> bool {
         if self.is_holding_back() {
             return false;

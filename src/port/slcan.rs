@@ -1,8 +1,8 @@
 //! slcan: Lawicel's ASCII protocol on channel 1, for python-can, slcand and terminal programs.
 //!
-//! Commands follow the CANUSB manual (Lawicel AB, version 1.0D): a letter, parameters, CR; answered by CR, or BEL for
-//! a refusal. `I` and `Y`, the registers now and at the last error, are those of an earlier analyser. What was lost shows in
-//! the flags that `F` reads, and with `K1` in lines of its own.
+//! Commands follow the CANUSB manual (Lawicel AB, version 1.0D): a letter, parameters, CR; answered by CR, or BEL for a
+//! refusal. `I` and `Y`, the registers now and at the last error, are those of an earlier analyser. Losses show in the flags
+//! that `F` reads, and with `K1` as separate lines.
 
 mod report;
 
@@ -20,21 +20,21 @@ use crate::{CAN_CLOCK_HZ, TICKS_PER_MS, TICKS_PER_US};
 
 /// The channel that slcan works on.
 const CHANNEL: Channel = Channel::Can1;
-/// Bit rates of `S0` to `S9`, in bit/s. Lawicel's manual ends with `S8`; python-can means 83.3 kbit/s by `S9`.
+/// Bit rates of `S0` to `S9`, in bit/s. Lawicel's manual ends with `S8`; python-can uses `S9` for 83.3 kbit/s.
 const RATES_BPS: [u32; 10] =
     [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000, 83_333];
-/// What python-can means by `S7`. It tells itself apart by the empty line that it sends behind every `S`, in the place of a
-/// data bit rate (python-can 4.5, `interfaces/slcan.py`).
+/// The bit rate that python-can means by `S7`. It can be recognised by the empty line that it sends after every `S`, in
+/// place of a data bit rate (python-can 4.5, `interfaces/slcan.py`).
 const S7_OF_PYTHON_CAN_BPS: u32 = 750_000;
-/// Clock that the registers of `s` count: an SJA1000 with 16 MHz, which it halves.
+/// Clock that the registers of `s` refer to: an SJA1000 at 16 MHz, which it halves.
 const SJA1000_HZ: u32 = 8_000_000;
 /// Stamps of `Z1` wrap after a minute.
 const STAMP_WRAP_MS: u64 = 60_000;
-/// Longest line that a frame makes: `T`, 8 identifier, 1 DLC, 16 data, 8 stamp, CR.
+/// Longest line for a frame: `T`, 8 identifier, 1 DLC, 16 data, 8 stamp, CR.
 const MAX_FRAME_LINE: usize = 1 + 8 + 1 + 16 + 8 + 1;
-/// A frame waits this long for room in a queue from which nothing leaves: no frame at 10 kbit/s and above takes longer.
+/// How long a frame waits for room in a queue in which nothing moves: no frame at 10 kbit/s and above takes longer.
 const FULL_TICKS: u32 = 100 * TICKS_PER_MS;
-/// Lines for one filling of the outbox.
+/// Bytes of lines for one filling of the outbox.
 const MAX_LINES_BYTES: usize = 1024;
 
 /// Bits of the answer to `F`.
@@ -55,11 +55,11 @@ pub enum Answer {
     Ok,
     /// BEL.
     Refused,
-    /// This and CR.
+    /// This text and CR.
     Text(String<64>),
 }
 
-/// Stamps behind frames.
+/// Stamps after frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Stamps {
     Off,
@@ -72,15 +72,16 @@ enum Stamps {
 /// The bit rate that the host asked for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Rate {
-    /// None: the saved one counts.
+    /// None: the saved one applies.
     Unset,
-    /// One that is not to be had. Few programs look at the answers: nothing is opened at a rate that was not asked for.
+    /// One that is not available. Few programs check the answers, so this is remembered: no channel is opened at a rate that was
+    /// not asked for.
     Refused,
     Set(BitTiming),
 }
 
 impl Rate {
-    /// What an `S` asks for, if there is such a timing.
+    /// The rate that an `S` asks for, if there is a timing for it.
     fn of(bitrate_bps: u32) -> Option<Self> {
         BitTiming::choose(CAN_CLOCK_HZ, bitrate_bps, None).ok().map(Self::Set)
     }
@@ -96,7 +97,7 @@ pub struct Slcan {
     /// Frames are sent as they come (`X1`), rather than on `P` and `A`. On from the start, as
     /// python-can and slcand expect.
     auto_poll: bool,
-    /// Frames asked for by `P` and `A` and not sent yet.
+    /// Frames requested by `P` and `A` and not sent yet.
     polled: u32,
     /// `A` ends its frames with an `A`.
     polling_all: bool,
@@ -105,11 +106,11 @@ pub struct Slcan {
     code: u32,
     mask: u32,
     flags: u8,
-    /// What `K` said, if it was sent: whether losses, errors and states are lines.
+    /// What `K` set, if it was sent: whether losses, errors and states are reported as lines.
     asked_reports: Option<bool>,
-    /// They are, since the channel was opened: without a `K`, as it was saved.
+    /// Whether they are reported, as decided when the channel was opened: without a `K`, as saved.
     reports: bool,
-    /// A frame was refused because there was no room, which is still to be reported.
+    /// A frame was refused because there was no room, and this has not been reported yet.
     refused_frame: bool,
     tag: u32,
     running_ticks: u64,
@@ -118,10 +119,11 @@ pub struct Slcan {
 }
 
 impl Slcan {
-    /// Longest line, CR not counted: `T`, 8 identifier, 1 DLC, 16 data; and room for more that is refused as a line.
+    /// Longest line, CR not counted: `T`, 8 identifier, 1 DLC, 16 data; and room beyond that, so that a longer line is still read
+    /// and refused.
     pub const MAX_LINE: usize = 64;
 
-    /// As after `C`.
+    /// The state after `C`.
     pub const fn new() -> Self {
         Self {
             answer: None,
@@ -149,13 +151,14 @@ impl Slcan {
         *self = Self { running_ticks: now, ..Self::new() };
     }
 
-    /// Whether an answer waits to be sent.
+    /// Whether an answer is waiting to be sent.
     pub const fn is_answering(&self) -> bool {
         self.answer.is_some()
     }
 
-    /// Whether a line that begins so must wait: a frame to be sent, for room in the queue. Few programs look at the answers, and a
-    /// refused frame would be lost to them. When nothing has left for a while, it is refused even so.
+    /// Whether a line that begins with this byte must wait, as a frame to be sent does for room in the queue. Few programs check
+    /// the answers, so a refused frame would simply be lost. If nothing has left the queue for a while, it is refused
+    /// nevertheless.
     pub fn must_wait<'q, const N: usize>(
         &mut self,
         first: Option<u8>,
@@ -180,7 +183,7 @@ impl Slcan {
         self.answer = Some(answer);
     }
 
-    /// Handles one line: answers it, or returns the work that does.
+    /// Handles one line: answers it, or returns the work whose result answers it.
     pub fn line<'q, const N: usize>(
         &mut self,
         line: &[u8],
@@ -206,7 +209,7 @@ impl Slcan {
         None
     }
 
-    /// `None` is a refusal.
+    /// Carries out a line. `None` is a refusal.
     fn obey<'q, const N: usize>(
         &mut self,
         letter: u8,
@@ -324,7 +327,7 @@ impl Slcan {
         run(Command::Open { channel: CHANNEL, config: Some(config) }, commands, board)
     }
 
-    /// Saves the bit rate that is set, and what `K` said, if one of them was sent.
+    /// Saves the bit rate and what `K` set, if one of them was sent.
     fn save<'q, const N: usize>(
         &self,
         commands: &mut Commands,
@@ -363,8 +366,8 @@ impl Slcan {
         }
     }
 
-    /// Applies `M`, `m` and `W`: an SJA1000's acceptance code and mask (a mask bit of 1 does not count).
-    /// What it filters by data bytes is not filtered.
+    /// Applies `M`, `m` and `W`: an SJA1000's acceptance code and mask (a mask bit of 1 means "don't
+    /// care"). Its filtering by data bytes is not supported.
     fn set_filters<'q, const N: usize>(
         &self,
         commands: &mut Commands,
@@ -396,7 +399,7 @@ impl Slcan {
     /// Writes the answer and lines of captured frames to `out` and returns their length.
     pub fn next_lines<const N: usize>(&mut self, queue: &mut Consumer<'_, N>, out: &mut [u8]) -> usize {
         let mut lines = Vec::<u8, MAX_LINES_BYTES>::new();
-        // None of these can fail: there is room for the longest answer, and for a line before each one.
+        // None of these can fail: there is room for the longest answer, and for a line before each.
         let _ = match self.answer.take() {
             Some(Answer::Ok) => lines.push(b'\r').is_ok(),
             Some(Answer::Refused) => lines.push(7).is_ok(),
@@ -410,7 +413,7 @@ impl Slcan {
         }
         while queue.read(|bytes| self.take(bytes, &mut lines)) > 0 {}
         if self.polled > 0 {
-            // The queue is drained: `A` ends, and a `P` that found nothing is answered.
+            // The queue is empty: `A` ends, and a `P` that found nothing is answered.
             let ended: &[u8] = if self.polling_all { b"A\r" } else { b"\r" };
             if lines.extend_from_slice(ended).is_ok() {
                 self.polled = 0;
@@ -420,7 +423,7 @@ impl Slcan {
         lines.len()
     }
 
-    /// Turns records into lines while there is room and they are wanted; returns the length of what it took.
+    /// Turns records into lines while there is room and lines are wanted; returns how many bytes it took.
     fn take(&mut self, bytes: &[u8], lines: &mut Vec<u8, MAX_LINES_BYTES>) -> usize {
         let mut rest = bytes;
         while lines.capacity() - lines.len() > MAX_FRAME_LINE {
@@ -438,7 +441,7 @@ impl Slcan {
                 }
                 Record::Event(event) => {
                     self.note(&event);
-                    // A host that polls expects nothing between its questions.
+                    // A host that polls expects nothing between its requests.
                     if let Some(line) = report::line(&event).filter(|_| self.reports && self.auto_poll) {
                         // Fits: it is shorter than a frame's line.
                         let _ = lines.extend_from_slice(line.as_bytes());
@@ -471,7 +474,7 @@ impl Slcan {
         let _ = lines.push(b'\r');
     }
 
-    /// Keeps what `F` reports.
+    /// Notes what `F` reports.
     fn note(&mut self, event: &Event) {
         self.flags |= match event {
             Event::Lost { stage: LossStage::Controller, .. } => flag::OVERRUN,
@@ -487,11 +490,11 @@ impl Slcan {
     }
 }
 
-/// What a line came to.
+/// The result of a line.
 enum Done {
     Answer(Answer),
     Begun(Work),
-    /// The answer is made of frames.
+    /// The answer consists of frames.
     Silent,
 }
 

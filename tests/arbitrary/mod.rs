@@ -1,4 +1,4 @@
-//! Commands as a careless program sends them: mostly possible, often not.
+//! Commands as a careless program sends them: mostly valid, often not.
 
 use cantap_firmware::CAN_CLOCK_HZ;
 use cantap_wire::message::{

@@ -1,4 +1,4 @@
-//! A board of fakes: controllers, clock and port that a test moves by hand.
+//! A board of fakes: controllers, clock and port that a test drives by hand.
 #![allow(dead_code, reason = "each test file uses its part")]
 
 use std::cell::Cell;
@@ -55,7 +55,8 @@ impl Clock for FakeClock {
     }
 }
 
-/// A controller's traffic side: a FIFO three deep that keeps the oldest, three mailboxes.
+/// A controller's traffic side: a FIFO three deep that keeps the oldest frames, and three
+/// mailboxes.
 #[derive(Default)]
 pub struct FakeTraffic {
     pub fifo: VecDeque<Frame>,
@@ -101,7 +102,7 @@ impl Traffic for FakeTraffic {
 
     fn prepare(&mut self, frame: &Frame) -> Option<u8> {
         let free = self.mailboxes.iter().position(Option::is_none)?;
-        // A mailbox is free for the next frame only when its end was taken, as on the chip.
+        // As on the chip, a mailbox is free for the next frame only once its outcome was taken.
         if self.finished.iter().any(|(mailbox, _)| *mailbox as usize == free) {
             return None;
         }
@@ -146,9 +147,9 @@ impl Traffic for FakeTraffic {
 #[derive(Default)]
 pub struct FakeControl {
     pub running: bool,
-    /// The bus is stuck: it does not leave by itself.
+    /// The bus is stuck: the controller does not leave on its own.
     pub stuck: bool,
-    /// Calls of `halt` until it has left.
+    /// How many calls of `halt` it takes to leave.
     pub halts_needed: usize,
     pub halts: usize,
     pub started: Vec<ChannelConfig>,
@@ -241,7 +242,7 @@ impl Chip for FakeChip {
     }
 }
 
-/// A port whose host takes a number of transfers and then none.
+/// A port whose host takes a number of transfers and then no more.
 #[derive(Default)]
 pub struct FakePort {
     pub open: bool,
@@ -252,7 +253,7 @@ pub struct FakePort {
     pub packets: Vec<usize>,
     /// The host was made to wait.
     pub held: bool,
-    /// Transfers that the host still takes.
+    /// How many more transfers the host takes.
     pub takes: usize,
 }
 
@@ -273,7 +274,7 @@ impl Port for FakePort {
         if self.takes == 0 {
             return None;
         }
-        // A transfer of at most five packets.
+        // A transfer has at most five packets.
         let len = bytes.len().min(5 * PACKET);
         self.takes -= 1;
         self.packets.extend(bytes[..len].chunks(PACKET).map(<[u8]>::len));
@@ -293,10 +294,10 @@ impl Port for FakePort {
     }
 }
 
-/// A meter whose edges a test puts there.
+/// A meter whose edges are supplied by a test.
 #[derive(Default)]
 pub struct FakeMeter {
-    /// How it was told what to watch.
+    /// What it was asked to watch, in order.
     pub watched: Vec<Option<Channel>>,
     pub edges: VecDeque<PinEdge>,
     pub dominant: bool,
@@ -369,7 +370,7 @@ impl<'q, const N: usize> Board<'q, N> for FakeBoard<'q, N> {
     }
 }
 
-/// A device of fakes with a host at its port.
+/// A device made of fakes, with a host at its port.
 pub struct Bench<'q, const N: usize> {
     pub board: FakeBoard<'q, N>,
     pub session: Session<'q, N>,
@@ -377,16 +378,16 @@ pub struct Bench<'q, const N: usize> {
     pub decoder: Decoder,
     pub records: Vec<(u64, Record)>,
     pub responses: Vec<Response>,
-    /// When the device ended a session by itself, and why.
+    /// When the device ended a session on its own, and why.
     pub ends: Vec<(u64, EndReason)>,
-    /// Anything else that the decoder said.
+    /// Anything else that the decoder reported.
     pub complaints: Vec<String>,
     decoded: usize,
     next_id: u16,
 }
 
 impl<'q, const N: usize> Bench<'q, N> {
-    /// A device whose port is open and read.
+    /// A device whose port is open and being read.
     pub fn new(queue: &'q RecordQueue<N>) -> Self {
         let (producer, consumer) = queue.split();
         let identity = Identity { board: "fake", serial: "0123456789ABCDEF".try_into().unwrap() };
@@ -458,7 +459,7 @@ impl<'q, const N: usize> Bench<'q, N> {
         panic!("no response to request {id}");
     }
 
-    /// One poll of the session, and what it sent decoded.
+    /// Polls the session once and decodes what it sent.
     pub fn poll(&mut self) {
         self.session.poll(&mut self.port, &mut self.board);
         let Self { decoder, records, responses, ends, complaints, .. } = self;
@@ -478,7 +479,7 @@ impl<'q, const N: usize> Bench<'q, N> {
         self.board.capture.on_transmit(channel, &mut self.board.traffic, &self.board.clock, Some(entered));
     }
 
-    /// A millisecond passes. Mailboxes that were given up have reported that meanwhile.
+    /// A millisecond passes. Aborted mailboxes report that meanwhile.
     pub fn millisecond(&mut self) {
         self.pass(cantap_firmware::TICKS_PER_MS);
         for channel in Channel::ALL {

@@ -1,4 +1,4 @@
-//! Batches: records packed so that each batch stands alone. Losing one loses its records only, and
+//! Batches: records packed so that each batch stands alone. Losing one loses only its records, and
 //! the next one says exactly how many frames those were.
 
 use crate::framing::{CRC_LEN, MAX_MESSAGE, crc32, seal, seal_with};
@@ -7,7 +7,7 @@ use crate::{CHANNELS, Channel};
 
 pub use crate::message::BatchHeader;
 
-/// Room a header takes at most: message kind, sequence, base, two counts.
+/// The most room that a header takes: message kind, sequence, base, two counts.
 const MAX_HEADER: usize = 1 + 5 + 10 + 2 * 5;
 
 /// Packs records into batches. No allocation; about [`MAX_MESSAGE`] bytes of state.
@@ -31,7 +31,7 @@ impl BatchWriter {
         }
     }
 
-    /// Starts over at sequence number 0 and drops what was not finished.
+    /// Starts again at sequence number 0 and drops an unfinished batch.
     pub fn restart(&mut self) {
         self.len = 0;
         self.header_len = 0;
@@ -39,7 +39,7 @@ impl BatchWriter {
         self.frames = [0; CHANNELS];
     }
 
-    /// Whether no record waits to be sent.
+    /// Whether no record is waiting to be sent.
     pub const fn is_empty(&self) -> bool {
         self.len == self.header_len
     }
@@ -57,7 +57,8 @@ impl BatchWriter {
         self.append(record, base_ticks, frames)
     }
 
-    /// Appends whole encoded records, as [`Self::push`] does one after the other; `frames` of each channel are among them.
+    /// Appends whole encoded records, as [`Self::push`] would one by one; `frames` says how many of each channel's frames are
+    /// among them.
     pub fn append(&mut self, records: &[u8], base_ticks: u64, frames: [u32; CHANNELS]) -> bool {
         if records.len() > self.room() {
             return false;
@@ -77,7 +78,7 @@ impl BatchWriter {
         true
     }
 
-    /// Writes the session's end, encoded and with its zero byte, into `out` and returns its length. To be called when the last
+    /// Writes the session's end, encoded and with its zero byte, into `out` and returns its length. Call it when the last
     /// batch is finished; `out` as for [`Self::finish`].
     pub fn end(&mut self, reason: EndReason, at_ticks: u64, out: &mut [u8]) -> usize {
         let header =
@@ -94,7 +95,7 @@ impl BatchWriter {
         self.finish_with(out, crc32)
     }
 
-    /// The same for who has a faster way to the CRC of a message than [`crc32`].
+    /// The same, for callers that have a faster way than [`crc32`] to compute a message's CRC.
     pub fn finish_with(&mut self, out: &mut [u8], crc32: impl FnOnce(&[u8]) -> u32) -> usize {
         if self.is_empty() {
             return 0;

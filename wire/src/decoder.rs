@@ -18,18 +18,18 @@ pub enum Corruption {
     TooLong,
     /// A message that is not of this protocol version.
     Unknown,
-    /// The last batch once more. Nothing is missing.
+    /// The last batch again. Nothing is missing.
     Repeated {
         /// Its sequence number.
         sequence: u32,
     },
-    /// A batch that is older than one already seen. A device never goes back within a session: this one is another's, and
-    /// how many frames are missing cannot be known.
+    /// A batch that is older than one already seen. A device never goes back within a session: this one belongs to
+    /// another session, and how many frames are missing cannot be known.
     OutOfOrder {
         /// Its sequence number.
         sequence: u32,
     },
-    /// A batch whose records end in something unreadable. The records before are good, and the
+    /// A batch whose records end in something unreadable. The records before it are good, and the
     /// next batch's [`Decoded::BatchesLost`] counts the frames that follow it.
     Records,
 }
@@ -47,14 +47,14 @@ pub enum Decoded<'a> {
     },
     /// An answer.
     Response(&'a Response),
-    /// Batches, or the end of one, are missing between the last record and the next.
+    /// Whole batches or the end of one are missing between the last record and the next.
     BatchesLost {
         /// How many whole batches.
         batches: u32,
         /// How many received frames went with them, per channel.
         frames: [u32; CHANNELS],
     },
-    /// The device has ended the session; nothing of it follows.
+    /// The device has ended the session; nothing more follows.
     Ended {
         /// Ticks since the device started, when both channels were off their buses.
         ticks: u64,
@@ -71,7 +71,7 @@ pub enum Decoded<'a> {
 pub struct Decoder {
     partial: [u8; MAX_ENCODED],
     len: usize,
-    /// Throwing away up to the next zero.
+    /// Everything up to the next zero is being thrown away.
     overlong: bool,
     expected: Expected,
     message: [u8; MAX_ENCODED],
@@ -81,14 +81,14 @@ pub struct Decoder {
 struct Expected {
     sequence: u32,
     frames: [u32; CHANNELS],
-    /// The last batch's, to tell a repetition.
+    /// The last batch's, to recognise a repetition.
     last: Option<BatchHeader>,
 }
 
 impl Expected {
     const FIRST: Self = Self { sequence: 0, frames: [0; CHANNELS], last: None };
 
-    /// Holds a header against what was expected. Returns whether the batch may be read.
+    /// Compares a header with what was expected. Returns whether the batch may be read.
     fn take(&mut self, header: &BatchHeader, report: &mut impl FnMut(Decoded<'_>)) -> bool {
         let goes_back = |ahead: u32| ahead > u32::MAX / 2;
         let ahead = header.sequence.wrapping_sub(self.sequence);
@@ -127,7 +127,7 @@ impl Decoder {
         }
     }
 
-    /// Takes any piece of the stream and reports what is complete.
+    /// Takes any piece of the stream and reports everything that it completes.
     pub fn push(&mut self, mut bytes: &[u8], mut report: impl FnMut(Decoded<'_>)) {
         while let Some(end) = bytes.iter().position(|&byte| byte == 0) {
             let (piece, rest) = bytes.split_at(end);
@@ -159,7 +159,7 @@ impl Decoder {
         true
     }
 
-    /// One whole message: `piece`, or what was kept.
+    /// One whole message: `piece`, or the bytes kept so far.
     fn message(&mut self, piece: Option<&[u8]>, report: &mut impl FnMut(Decoded<'_>)) {
         let encoded = piece.unwrap_or(&self.partial[..self.len]);
         // Zeros in a row are idle, not messages.
@@ -184,13 +184,13 @@ impl Decoder {
                     report(Decoded::Ended { ticks: header.base_ticks, reason });
                 }
             }
-            // A Hello whose fixed first field gives another version is not read any further.
+            // A Hello whose fixed first field gives another version is read no further.
             Ok((DeviceMessage::Response(response), [])) => {
                 if let Some(version) = foreign_protocol(message) {
                     return report(Decoded::OtherProtocol(version));
                 }
                 if matches!(response.result, Ok(Reply::Hello(_))) {
-                    // A session begins: the next batch is its first, and may stand right behind.
+                    // A session begins: the next batch is its first, and may follow directly.
                     self.expected = Expected::FIRST;
                 }
                 report(Decoded::Response(&response));
@@ -232,7 +232,7 @@ fn walk(
 }
 
 /// The version in a response to `Hello`, if it is not ours. It reads only what never changes: kind,
-/// request id, `Ok(Hello)` or `Err(Protocol)`, and the version in front.
+/// request id, `Ok(Hello)` or `Err(Protocol)`, and the version that comes first in either.
 fn foreign_protocol(message: &[u8]) -> Option<u16> {
     let ((kind, _id, result, variant, version), _) =
         postcard::take_from_bytes::<(u8, u16, u8, u8, u16)>(message).ok()?;

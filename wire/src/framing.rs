@@ -1,7 +1,7 @@
 //! How a message is framed in the byte stream: COBS of (message, CRC), then a zero byte.
 //!
 //! COBS only says where a message ends; a damaged message can still be well-formed COBS. The CRC
-//! is what proves it.
+//! proves that it is intact.
 
 use core::fmt;
 
@@ -10,13 +10,13 @@ use serde::Serialize;
 
 /// Largest message before CRC and COBS, in bytes, in either direction.
 pub const MAX_MESSAGE: usize = 2048;
-/// Largest request before CRC and COBS, in bytes: what a device must be ready to hold. The longest there is sets
+/// Largest request before CRC and COBS, in bytes: which a device must be able to hold. The longest request sets
 /// [`MAX_FILTERS`](crate::message::MAX_FILTERS) filters of 12 bytes each.
 pub const MAX_REQUEST: usize = 704;
 /// Bytes of the CRC, which follows the message, little-endian.
 pub const CRC_LEN: usize = 4;
 
-/// Bytes that a message of `len` bytes takes on the wire at most: CRC, one COBS byte for each
+/// The most bytes that a message of `len` bytes takes on the wire: CRC, one COBS byte for each
 /// started run of 254, and the zero.
 pub const fn max_encoded_len(len: usize) -> usize {
     let sealed = len + CRC_LEN;
@@ -26,8 +26,8 @@ pub const fn max_encoded_len(len: usize) -> usize {
 /// Largest encoded message, its zero byte included.
 pub const MAX_ENCODED: usize = max_encoded_len(MAX_MESSAGE);
 
-/// CRC-32/ISO-HDLC, the one of Ethernet and zip. Slower with the small table, but 1 KiB of flash
-/// in place of 16.
+/// CRC-32/ISO-HDLC, the one of Ethernet and zip. The small table is slower, but takes 1 KiB of
+/// flash instead of 16.
 #[cfg(target_os = "none")]
 static CRC: Crc<u32, crc::Table<1>> = Crc::<u32, crc::Table<1>>::new(&crc::CRC_32_ISO_HDLC);
 /// CRC-32/ISO-HDLC, the one of Ethernet and zip.
@@ -69,8 +69,8 @@ impl fmt::Display for FramingError {
 
 impl core::error::Error for FramingError {}
 
-/// Writes `message` to `out` as it goes over the wire and returns the length. `buffer` is room for the message and its CRC.
-/// `None` if either is too short.
+/// Writes `message` to `out` as it goes over the wire and returns the length. `buffer` holds the message and its CRC
+/// meanwhile. `None` if either is too short.
 pub fn encode(message: &impl Serialize, buffer: &mut [u8], out: &mut [u8]) -> Option<usize> {
     let room = buffer.len().checked_sub(CRC_LEN)?;
     let len = postcard::to_slice(message, &mut buffer[..room]).ok()?.len();
@@ -78,13 +78,13 @@ pub fn encode(message: &impl Serialize, buffer: &mut [u8], out: &mut [u8]) -> Op
 }
 
 /// Encodes the first `len` bytes of `message` into `out` and returns the encoded length, zero byte
-/// included. The [`CRC_LEN`] bytes behind them are overwritten. `None` if `message` has no room for
+/// included. The [`CRC_LEN`] bytes after them are overwritten. `None` if `message` has no room for
 /// the CRC or `out` is shorter than [`max_encoded_len`].
 pub fn seal(message: &mut [u8], len: usize, out: &mut [u8]) -> Option<usize> {
     seal_with(message, len, out, crc32)
 }
 
-/// The same for who has a faster way to the CRC of a message than [`crc32`].
+/// The same, for callers that have a faster way than [`crc32`] to compute a message's CRC.
 pub fn seal_with(
     message: &mut [u8],
     len: usize,
@@ -107,7 +107,7 @@ pub fn unseal<'a>(encoded: &[u8], out: &'a mut [u8]) -> Result<&'a [u8], Framing
     unseal_with(encoded, out, crc32)
 }
 
-/// The same for who has a faster way to the CRC of a message than [`crc32`].
+/// The same, for callers that have a faster way than [`crc32`] to compute a message's CRC.
 pub fn unseal_with<'a>(
     encoded: &[u8],
     out: &'a mut [u8],
@@ -122,11 +122,11 @@ pub fn unseal_with<'a>(
     if crc32(message).to_le_bytes() == crc { Ok(message) } else { Err(FramingError::Crc) }
 }
 
-/// Encodes COBS into `out`, which is long enough. Four bytes are looked through and copied at once: `cobs::encode` goes byte by
-/// byte, which costs the device a tenth of its time for USB.
+/// Encodes COBS into `out`, which is long enough. Checks and copies four bytes at a time: `cobs::encode` goes byte by byte,
+/// which costs the device a tenth of its time for USB.
 fn encode_cobs(message: &[u8], out: &mut [u8]) -> usize {
     const MAX_RUN: usize = 254;
-    // Where the run's length is to stand, and where its next byte.
+    // The positions of the run's length and of its next byte.
     let (mut code, mut len) = (0, 1);
     let mut rest = message;
     loop {
@@ -134,7 +134,7 @@ fn encode_cobs(message: &[u8], out: &mut [u8]) -> usize {
         let zero = if let Some((word, behind)) = rest.split_first_chunk::<4>()
             && run + 4 <= MAX_RUN
         {
-            // What is copied behind a zero is written over.
+            // What is copied after a zero gets overwritten.
             out[len..len + 4].copy_from_slice(word);
             let bytes = u32::from_le_bytes(*word);
             // The lowest bit 7 that is set belongs to the first byte that is zero: subtracting 1 borrows there first.
@@ -164,7 +164,7 @@ fn encode_cobs(message: &[u8], out: &mut [u8]) -> usize {
         if zero {
             out[code] = run as u8 + 1;
         } else if run == MAX_RUN {
-            // No zero stands behind a full run, and nothing at all where the message ends with it.
+            // No zero follows a full run, and nothing at all follows it at the end of the message.
             out[code] = u8::MAX;
             if rest.is_empty() {
                 return len;
@@ -177,7 +177,7 @@ fn encode_cobs(message: &[u8], out: &mut [u8]) -> usize {
     }
 }
 
-/// Decodes COBS in whole runs: `cobs::decode` goes byte by byte, which costs the host a fifth of its decoding.
+/// Decodes COBS in whole runs: `cobs::decode` goes byte by byte, which costs the host a fifth of its decoding time.
 fn decode_cobs(mut encoded: &[u8], out: &mut [u8]) -> Option<usize> {
     let mut len = 0;
     while let Some((&code, rest)) = encoded.split_first() {
@@ -186,7 +186,7 @@ fn decode_cobs(mut encoded: &[u8], out: &mut [u8]) -> Option<usize> {
             && run <= 8
             && let Some(room) = out.get_mut(len..len + 8)
         {
-            // Where there are many zeros runs are short. What is copied behind the run is written over.
+            // Where there are many zeros, runs are short. What is copied past the run gets overwritten.
             room.copy_from_slice(eight);
             encoded = &rest[run..];
         } else {
@@ -195,7 +195,7 @@ fn decode_cobs(mut encoded: &[u8], out: &mut [u8]) -> Option<usize> {
             encoded = rest;
         }
         len += run;
-        // Each run but a full one stands for a zero behind it, except at the end.
+        // A zero follows each run that is not full, except the last.
         if code != u8::MAX && !encoded.is_empty() {
             *out.get_mut(len)? = 0;
             len += 1;
@@ -212,7 +212,8 @@ mod tests {
     proptest! {
         #[test]
         fn cobs_is_the_crate_s_in_both_directions(
-            // Few zeros, so that there are full runs; or many. Never empty: a message has its CRC, and the crate has no run for nothing.
+            // Few zeros, so that there are full runs, or many. Never empty: a message always has its CRC, and the crate encodes nothing
+            // as nothing.
             message in prop_oneof![
                 proptest::collection::vec(0..=255u8, 1..600),
                 proptest::collection::vec(0..3u8, 1..600),

@@ -1,6 +1,6 @@
 #![doc = include_str!("../README.md")]
 //!
-//! Everything here exists once: the firmware, the host library and the emulator all use it.
+//! Everything here is defined only once: the firmware, the host library and the emulator all use it.
 
 #![forbid(unsafe_code)]
 #![cfg_attr(not(test), no_std)]
@@ -26,8 +26,8 @@ pub const PROTOCOL_VERSION: u16 = 5;
 /// firmware, so that a program that loads the ELF can refuse a mismatch before it runs it.
 pub const PROTOCOL_SYMBOL: &str = "CANTAP_PROTOCOL_VERSION";
 
-/// Name of the ELF symbol that says where each channel's RX is: two bytes a channel, the port (0 is A) and the pin, so that a program that
-/// loads the ELF can connect the buses.
+/// Name of the ELF symbol that says where each channel's RX is: two bytes per channel, the port (0 is A) and the pin, so that a program
+/// that loads the ELF can connect the buses.
 pub const RECEIVE_PINS_SYMBOL: &str = "CANTAP_RECEIVE_PINS";
 
 /// USB vendor and product ID. These are pid.codes' test IDs, for use until a product ID is assigned;
@@ -69,5 +69,5 @@ impl Channel {
     }
 }
 
-/// Channels a device has.
+/// Channels of a device.
 pub const CHANNELS: usize = 2;

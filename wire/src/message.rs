@@ -30,21 +30,21 @@ pub const MAX_SEND: usize = 20;
 /// Host → device.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Request {
-    /// Comes back in the response.
+    /// Returned in the response.
     pub id: u16,
     /// What to do.
     pub command: Command,
 }
 
-/// Stands in front of a batch's records.
+/// Precedes a batch's records.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct BatchHeader {
     /// Counts batches from 0 at `Hello`; wraps.
     pub sequence: u32,
-    /// Absolute device time, in ticks, that the first record's time difference is added to.
+    /// Absolute device time, in ticks, to which the first record's time difference is added.
     pub base_ticks: u64,
-    /// Received-frame records in all batches before this one since `Hello`, per channel; wraps. The
-    /// host takes from it how many frames went with a lost batch.
+    /// Received-frame records in all batches before this one since `Hello`, per channel; wraps.
+    /// From this the host knows how many frames were lost with a batch.
     pub frames_before: [u32; CHANNELS],
 }
 
@@ -52,7 +52,7 @@ pub struct BatchHeader {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant, reason = "no allocation on the device")]
 pub enum DeviceMessage {
-    /// Records follow behind the header.
+    /// Records follow the header.
     Batch(BatchHeader),
     /// An answer.
     Response(Response),
@@ -60,14 +60,14 @@ pub enum DeviceMessage {
     Ended(SessionEnd),
 }
 
-/// Sent behind everything else of a session that the device has ended by itself. What is asked then, except `Hello`, is
-/// refused with [`Refusal::NoSession`].
+/// Sent after everything else of a session that the device has ended on its own. From then on every request except
+/// `Hello` is refused with [`Refusal::NoSession`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SessionEnd {
     /// Why.
     pub reason: EndReason,
-    /// What the next batch would have begun with, its base the time at which both channels were off their buses: a host that has
-    /// decoded less knows exactly how much it has lost.
+    /// The header that the next batch would have had; its base is the time at which both channels were off their buses. A host
+    /// that has decoded less knows exactly how much it has lost.
     pub header: BatchHeader,
 }
 
@@ -80,8 +80,8 @@ pub enum EndReason {
     BoardLost,
     /// Never from a device: the server of a shared board has ended.
     ServerEnded,
-    /// The host configured the device anew (USB 2.0, 9.4.7) without having closed the port. Sent only when a host that does not know
-    /// asks for something: whoever opens the port meanwhile is another.
+    /// The host reconfigured the device (USB 2.0, 9.4.7) without having closed the port. Sent only if a program that does not know
+    /// this makes a request: a program that opens the port in the meantime is a new one.
     Configured,
 }
 
@@ -94,7 +94,7 @@ pub struct Response {
     pub result: Result<Reply, Refusal>,
 }
 
-/// What a host may ask.
+/// What a host may request.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant, reason = "no allocation on the device")]
 pub enum Command {
@@ -116,9 +116,9 @@ pub enum Command {
         /// Which.
         channel: Channel,
     },
-    /// Asks for [`Status`].
+    /// Requests [`Status`].
     Status,
-    /// Asks for the device's time.
+    /// Requests the device's time.
     Time,
     /// Replaces all filters of a closed channel; none means that everything is received.
     SetFilters {
@@ -157,12 +157,12 @@ pub enum Command {
         /// `None` clears it.
         entry: Option<Trigger>,
     },
-    /// Asks for the controller's registers.
+    /// Requests the controller's registers.
     Registers {
         /// Which.
         channel: Channel,
     },
-    /// Leaves bus-off where recovery is manual.
+    /// Leaves bus-off if recovery is manual.
     Recover {
         /// Which.
         channel: Channel,
@@ -185,23 +185,23 @@ pub enum Command {
     Configure {
         /// Which.
         channel: Channel,
-        /// How [`Command::SaveDefaults`] says that it is to be opened.
+        /// The configuration that [`Command::SaveDefaults`] stores.
         config: ChannelConfig,
     },
-    /// Asks for what is stored for a channel. Nothing is opened, and nothing changes.
+    /// Requests what is stored for a channel. Nothing is opened, and nothing changes.
     Defaults {
         /// Which.
         channel: Channel,
     },
-    /// Asks for [`Failures`]. They stay until the device loses its power.
+    /// Requests [`Failures`]. They stay until the device loses power.
     Failures,
-    /// Watches the receive pin of a closed channel from now on, in place of any that was watched before; its controller stays off the
-    /// bus. What had been measured is forgotten. It ends when the channel is opened, and with the session.
+    /// Watches the receive pin of a closed channel from now on, in place of any watched before; its controller stays off the bus.
+    /// Earlier measurements are discarded. It ends when the channel is opened, and with the session.
     MeasureEdges {
         /// Which; `None` ends it.
         channel: Option<Channel>,
     },
-    /// Asks for the [`Edges`] that were measured since the last answer.
+    /// Requests the [`Edges`] measured since the last answer.
     Edges,
 }
 
@@ -211,7 +211,7 @@ pub enum Command {
 pub enum Reply {
     /// To [`Command::Hello`].
     Hello(Hello),
-    /// Done; there is nothing to say.
+    /// Done; there is no value.
     Done,
     /// To [`Command::Open`]: what was applied.
     Opened(ChannelConfig),
@@ -226,7 +226,7 @@ pub enum Reply {
         /// Banks that this channel could use.
         banks_total: u8,
     },
-    /// To [`Command::Send`]: free places in the channel's transmit queue after it.
+    /// To [`Command::Send`]: free places left in the channel's transmit queue.
     Queued {
         /// Frames.
         free: u16,
@@ -268,7 +268,7 @@ pub enum Refusal {
     BadTiming,
     /// An identifier or filter is out of range.
     BadId,
-    /// A DLC is above 15, or the data are not as long as it says.
+    /// A DLC is above 15, or the data is not as long as it says.
     BadDlc,
     /// A tag is in the device's own range.
     BadTag,
@@ -291,14 +291,14 @@ pub enum Refusal {
     BanksExhausted {
         /// Banks that they need.
         needed: u8,
-        /// Banks that there are.
+        /// Banks available.
         available: u8,
     },
     /// It cannot be done without disturbing the other channel, which is open.
     WouldDisturb,
     /// The target time is too far ahead.
     TooFarAhead,
-    /// The controller did not follow (is there a clock, a transceiver, a stuck bus?).
+    /// The controller did not respond (is there a clock, a transceiver, a stuck bus?).
     Hardware,
     /// There is nothing saved on the device.
     NothingSaved,
@@ -308,12 +308,12 @@ pub enum Refusal {
     NotMeasuring,
     /// Never from a device: the server of a shared board does not let this client do that.
     NotGranted {
-        /// What it would have to be granted.
+        /// The role that it would have to be granted.
         needs: Role,
     },
     /// Never from a device: another client of the server holds the right to configure.
     Held,
-    /// Never from a device: other clients of the server have the channel open, with another bit timing or mode.
+    /// Never from a device: other clients of the server have the channel open with another bit timing or mode.
     OtherSettings,
     /// Never from a device: the server has no board at the moment.
     NoBoard,

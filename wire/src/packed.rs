@@ -1,5 +1,5 @@
-//! Frames inside commands and events. `#[serde(with = "crate::packed")]` stands at each of them: how a frame crosses USB is
-//! the protocol's to say, not the frame's.
+//! Frames inside commands and events. Each is marked `#[serde(with = "crate::packed")]`, since the protocol decides how a
+//! frame crosses USB, not the frame.
 
 use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -20,12 +20,12 @@ pub(crate) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<
     packed.frame().map_err(|_| D::Error::custom("identifier or length out of range"))
 }
 
-/// The first `len` bytes (at most 8) with zeros behind them, and what follows.
+/// The first `len` bytes (at most 8) padded with zeros, and the bytes that follow.
 #[inline]
 pub(crate) fn take_data(len: usize, bytes: &[u8]) -> Option<([u8; 8], &[u8])> {
     let (data, rest) = bytes.split_at_checked(len.min(8))?;
     if let Some(eight) = bytes.first_chunk::<8>() {
-        // More follows than the data: eight bytes are read at once, and those that are not the frame's dropped.
+        // More follows than just the data: eight bytes are read at once, and those that are not the frame's are dropped.
         return Some((first(len, *eight), rest));
     }
     let mut padded = [0; 8];
@@ -66,20 +66,20 @@ fn packed_id(frame: &Frame) -> u32 {
 /// Bytes of the longest frame.
 const MAX_PACKED: usize = 5 + 1 + 1 + 8;
 
-/// Writes a frame as [`Packed`] stands in a message and returns its length, without serde: a device confirms thousands a second.
+/// Writes a frame in [`Packed`]'s encoding, without serde, and returns its length: a device confirms thousands a second.
 #[inline]
 pub(crate) fn put_packed(frame: &Frame, out: &mut [u8; MAX_PACKED]) -> usize {
     let len = put_u32(packed_id(frame), out);
     let data_len = frame.data_len();
     out[len] = frame.dlc();
     out[len + 1] = data_len as u8;
-    // What is behind the data is not the frame's, and what follows is written over it.
+    // The bytes after the data are padding, which what follows overwrites.
     out[len + 2..len + 10].copy_from_slice(&frame.padded_data());
     len + 2 + data_len
 }
 
 impl Packed {
-    /// The frame, or what keeps it from being one.
+    /// The frame, or why it is not one.
     pub(crate) fn frame(&self) -> Result<Frame, Refusal> {
         let mut data = [0; 8];
         data[..self.data.len()].copy_from_slice(&self.data);
@@ -87,7 +87,7 @@ impl Packed {
     }
 }
 
-/// The frame with [`Packed`]'s fields, or what keeps it from being one.
+/// The frame with [`Packed`]'s fields, or why they do not make one.
 #[inline]
 fn unpack(id: u32, dlc: u8, len: usize, data: [u8; 8]) -> Result<Frame, Refusal> {
     let raw = id & !(EXTENDED | PACKED_REMOTE);
@@ -98,8 +98,8 @@ fn unpack(id: u32, dlc: u8, len: usize, data: [u8; 8]) -> Result<Frame, Refusal>
     if is_right { Ok(frame) } else { Err(Refusal::BadDlc) }
 }
 
-/// Reads a frame as [`Packed`] stands in a message, with what follows it, without serde: a streaming host sends thousands a
-/// second. `None` if it cannot be.
+/// Reads a frame in [`Packed`]'s encoding, without serde, and returns it with the bytes that follow: a streaming host sends
+/// thousands a second. `None` if it is not a frame.
 pub(crate) fn take_packed(bytes: &[u8]) -> Option<(Frame, &[u8])> {
     let (id, rest) = take_u32(bytes)?;
     let (&[dlc, len], rest) = rest.split_first_chunk()?;

@@ -8,9 +8,9 @@
 //! | `0x40..=0x47` | qualifiers of the frame that follows: bit 0 the stamp is only an upper bound, bit 1 no time difference, bit 2 no data |
 //! | `0x80..=0xFF` | a received frame: bit 6 channel, bit 5 extended, bit 4 remote, bits 3..0 DLC; then the ID (2 or 4 bytes, little-endian), the time difference, the data |
 //!
-//! Time differences are postcard's `i64` (zigzag, 7 bits a byte), in ticks since the record before.
-//! They are signed because a stamp may be computed back to before the other channel's last one, and wide because nothing bounds
-//! the time between two records: a host may open a channel hours after its greeting, or read nothing for as long.
+//! Time differences are postcard's `i64` (zigzag, 7 bits a byte), in ticks since the previous record. They are signed because
+//! a stamp may be computed back to a time before the other channel's last one, and wide because nothing bounds the time
+//! between two records: a host may open a channel hours after its greeting, or read nothing for hours.
 
 pub use cantap_can::{BusErrorKind, ErrorState};
 use serde::{Deserialize, Serialize};
@@ -36,14 +36,14 @@ const UPPER_BOUND: u8 = 1;
 const NO_STAMP: u8 = 2;
 const NO_DATA: u8 = 4;
 
-/// What the stamp of a received frame says.
+/// What the stamp of a received frame means.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Stamp {
     /// Read at the end of the frame, plus the interrupt's latency.
     Exact,
     /// The frame was found queued behind another one: it ended at this time or earlier.
     UpperBound,
-    /// Left out on request; the record's time is that of the record before.
+    /// Left out on request; the record's time is that of the previous record.
     Omitted,
 }
 
@@ -54,7 +54,7 @@ pub struct Received {
     pub channel: Channel,
     /// The frame. With [`Self::data_omitted`] its data bytes read zero.
     pub frame: Frame,
-    /// What its time means.
+    /// What its stamp means.
     pub stamp: Stamp,
     /// Whether the data bytes were left out on request.
     pub data_omitted: bool,
@@ -119,7 +119,7 @@ pub enum Event {
         /// Receive error counter after it.
         rec: u8,
     },
-    /// Bus errors that were counted, but not reported one by one, because there were too many.
+    /// Bus errors that were counted but not reported one by one, because there were too many.
     ErrorsSuppressed {
         /// Where.
         channel: Channel,
@@ -142,7 +142,7 @@ pub enum Event {
         /// Which.
         channel: Channel,
     },
-    /// The channel was closed: nothing of it follows.
+    /// The channel was closed: nothing more of it follows.
     Stopped {
         /// Which.
         channel: Channel,
@@ -152,7 +152,7 @@ pub enum Event {
         /// Where.
         channel: Channel,
         /// The tag from the request (see [`crate::message::TxFrame`]); for frames that the device
-        /// sends by itself, see [`crate::message::DEVICE_TAG`].
+        /// sends on its own, see [`crate::message::DEVICE_TAG`].
         tag: u32,
         /// The frame as sent.
         #[serde(with = "crate::packed")]
@@ -173,13 +173,13 @@ pub enum Event {
     SofMark {
         /// The frame number in that token: 11 bits, one more each millisecond, 0 after 2047.
         frame: u16,
-        /// Milliseconds since the last mark in which more than one SOF was latched. Near 1000 when a host
-        /// or a chip makes two of each; then half of the latched times are not a frame's start.
+        /// Milliseconds since the last mark in which more than one SOF was latched. Near 1000 if a host
+        /// or chip doubles each SOF; then half of the latched times are not the start of a frame.
         doubled: u16,
     },
 }
 
-/// One entry of the stream. Its absolute time is the decoder's business.
+/// One entry of the stream. The decoder knows its absolute time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Record {
     /// A received frame.
@@ -192,7 +192,7 @@ pub enum Record {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BadRecord;
 
-/// Writes a received frame and returns its length. `ticks` is the time since the record before.
+/// Writes a received frame and returns its length. `ticks` is the time since the previous record.
 #[inline]
 pub fn encode_received(received: &Received, ticks: i64, out: &mut [u8; MAX_RECORD]) -> usize {
     let frame = &received.frame;
@@ -231,7 +231,7 @@ pub fn encode_received(received: &Received, ticks: i64, out: &mut [u8; MAX_RECOR
     len
 }
 
-/// Writes an event and returns its length. `ticks` is the time since the record before.
+/// Writes an event and returns its length. `ticks` is the time since the previous record.
 #[inline]
 pub fn encode_event(event: &Event, ticks: i64, out: &mut [u8; MAX_RECORD]) -> usize {
     // While a host streams, nearly all events are confirmations.
@@ -259,7 +259,7 @@ fn put_transmitted(channel: Channel, tag: u32, frame: &Frame, out: &mut [u8; MAX
 /// postcard's `i64`.
 #[inline]
 fn encode_ticks(ticks: i64, out: &mut [u8]) -> usize {
-    // Nearly all there are; and half the registers, on the device.
+    // Nearly all fit into 32 bits, which on the device takes half the registers.
     let Ok(ticks) = i32::try_from(ticks) else { return encode_long_ticks(ticks, out) };
     put_u32(((ticks << 1) ^ (ticks >> 31)) as u32, out)
 }
@@ -271,12 +271,12 @@ fn encode_long_ticks(ticks: i64, out: &mut [u8]) -> usize {
     postcard::to_slice(&ticks, out).map_or(0, |written| written.len())
 }
 
-/// postcard's `i64`, with what follows it. Always inline: a call would hand the result over in memory, for each record that the device
-/// packs.
+/// postcard's `i64`, with what follows it. Always inline: a call would return the result through memory, for each record that the
+/// device packs.
 #[inline(always)]
 #[expect(clippy::inline_always, reason = "measured: a tenth of the time for packing")]
 fn decode_ticks(bytes: &[u8]) -> Result<(i64, &[u8]), BadRecord> {
-    // One and two bytes are nearly all there is; postcard takes the rest.
+    // Nearly all take one or two bytes; postcard reads the rest.
     let (zigzag, rest) = match *bytes {
         [a, ref rest @ ..] if a < 0x80 => (u32::from(a), rest),
         [a, b, ref rest @ ..] if b < 0x80 => (u32::from(a & 0x7F) | u32::from(b) << 7, rest),
@@ -316,7 +316,7 @@ fn decode_event(bytes: &[u8]) -> Result<(Record, i64, &[u8]), BadRecord> {
     Ok((Record::Event(event), ticks, rest))
 }
 
-/// Reads a received frame behind its header byte.
+/// Reads a received frame after its header byte.
 #[inline(always)]
 #[allow(clippy::inline_always, reason = "the host's decoder is a third slower without")]
 fn decode_frame(qualifiers: u8, header: u8, rest: &[u8]) -> Result<(Record, i64, &[u8]), BadRecord> {
@@ -345,7 +345,7 @@ fn decode_frame(qualifiers: u8, header: u8, rest: &[u8]) -> Result<(Record, i64,
     Ok((Record::Received(Received { channel, frame, stamp, data_omitted }), ticks, rest))
 }
 
-/// What must be known of a record to pass it on.
+/// What must be known about a record to pass it on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Outline {
     /// Bytes of it.
@@ -356,11 +356,11 @@ pub struct Outline {
     pub frame_of: Option<Channel>,
 }
 
-/// Finds a record's end without reading what is between, for the device, which packs what it wrote itself. Takes
-/// everything that [`decode`] takes, and says the same of it.
+/// Finds a record's end without reading its contents, for the device, which packs what it wrote itself. Accepts
+/// everything that [`decode`] accepts, and reports the same about it.
 #[inline]
 pub fn outline(bytes: &[u8]) -> Result<Outline, BadRecord> {
-    // A received frame without qualifiers: nearly all there is.
+    // A received frame without qualifiers: nearly every record.
     if let [header @ FRAME..=u8::MAX, ref rest @ ..] = *bytes {
         let id_len = if header & 0x20 == 0 { 2 } else { 4 };
         let remote = header & 0x10 != 0;
@@ -374,7 +374,7 @@ pub fn outline(bytes: &[u8]) -> Result<Outline, BadRecord> {
         }
         return Ok(Outline { len, ticks, frame_of: Some(channel) });
     }
-    // A confirmation: nearly all else, while a host streams.
+    // A confirmation: nearly everything else, while a host streams.
     if let [TRANSMITTED, 0 | 1, ref rest @ ..] = *bytes {
         let (_tag, rest) = take_u32(rest).ok_or(BadRecord)?;
         let (_id, rest) = take_u32(rest).ok_or(BadRecord)?;
@@ -452,7 +452,7 @@ mod tests {
                 };
                 prop_assert_eq!(outline(&bytes), Ok(Outline { len: bytes.len() - rest.len(), ticks, frame_of }));
             } else if let Ok(outline) = outline(&bytes) {
-                // An identifier that is too large is none of its business.
+                // It does not check whether an identifier is too large.
                 prop_assert!(outline.len <= bytes.len());
             }
         }

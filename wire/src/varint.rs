@@ -1,10 +1,10 @@
-//! postcard's unsigned integers, for what is read thousands of times a second: seven bits a byte, the low ones first, and
-//! bit 7 set in all bytes but the last.
+//! postcard's unsigned integers, for what is read thousands of times a second: seven bits per byte, the low ones first,
+//! with bit 7 set in all bytes but the last.
 
 /// Bytes of the longest `u32`.
 const MAX_U32: usize = 5;
 
-/// Writes a `u32` and returns its length. `out` has room for it.
+/// Writes a `u32` and returns its length. `out` must have room for it.
 #[inline]
 pub(crate) fn put_u32(mut value: u32, out: &mut [u8]) -> usize {
     let mut len = 0;
@@ -17,10 +17,10 @@ pub(crate) fn put_u32(mut value: u32, out: &mut [u8]) -> usize {
     len + 1
 }
 
-/// Reads a `u64`, with what follows it.
+/// Reads a `u64`, with the bytes that follow.
 #[inline]
 pub(crate) fn take_u64(bytes: &[u8]) -> Option<(u64, &[u8])> {
-    // Most are short, and 64 bits are slow to shift on the device.
+    // Most are short, and 64-bit shifts are slow on the device.
     if let Some((value, rest)) = take_short(bytes) {
         return Some((value.into(), rest));
     }
@@ -28,7 +28,7 @@ pub(crate) fn take_u64(bytes: &[u8]) -> Option<(u64, &[u8])> {
     for (index, &byte) in bytes.iter().enumerate() {
         let bits = u64::from(byte & 0x7F);
         let shift = 7 * index as u32;
-        // Ten bytes have room for more than 64 bits.
+        // Ten bytes can hold more than 64 bits.
         if shift >= u64::BITS || bits > u64::MAX >> shift {
             return None;
         }
@@ -40,7 +40,7 @@ pub(crate) fn take_u64(bytes: &[u8]) -> Option<(u64, &[u8])> {
     None
 }
 
-/// Reads what takes at most four bytes.
+/// Reads a value of at most four bytes.
 #[inline]
 fn take_short(bytes: &[u8]) -> Option<(u32, &[u8])> {
     let mut value = 0;
@@ -53,7 +53,7 @@ fn take_short(bytes: &[u8]) -> Option<(u32, &[u8])> {
     None
 }
 
-/// Reads a `u32`, with what follows it.
+/// Reads a `u32`, with the bytes that follow.
 #[inline]
 pub(crate) fn take_u32(bytes: &[u8]) -> Option<(u32, &[u8])> {
     if let Some(short) = take_short(bytes) {
@@ -78,7 +78,7 @@ mod tests {
         fn any_bytes_are_what_postcard_says(
             bytes in prop_oneof![
                 proptest::collection::vec(any::<u8>(), 0..12),
-                // Long ones, many of them too long.
+                // Long values, many of them too long.
                 proptest::collection::vec(0x7E..0x82u8, 0..12),
                 (any::<u64>(), 0..64u32).prop_map(|(value, bits)| encoded(value >> bits)),
             ],

@@ -8,7 +8,8 @@ use cantap_wire::{Channel, Frame, Received, Stamp};
 /// 12 ticks per µs.
 const TICKS_PER_BIT: i64 = 12;
 
-/// Fills batches with one frame over and over, on one channel of 1 Mbit/s at full load, after three days.
+/// Fills batches with the same frame repeated, on one channel at 1 Mbit/s and full load, three days after
+/// the start.
 fn bytes_per_frame(text: &str, bits_on_bus: i64) -> f64 {
     let frame: Frame = text.parse().unwrap();
     let received = Received { channel: Channel::Can1, frame, stamp: Stamp::Exact, data_omitted: false };

@@ -1,5 +1,5 @@
 //! The decoder against everything that a cable, a driver or another program can do to a stream: it never panics,
-//! accepts no wrong frame, finds its way back, and every frame that is missing is counted where it is missing.
+//! accepts no wrong frame, recovers, and counts every missing frame where it is missing.
 
 use cantap_wire::batch::BatchWriter;
 use cantap_wire::framing::MAX_ENCODED;
@@ -14,15 +14,15 @@ use proptest::sample::Index;
 enum Damage {
     /// A bit changes.
     Flip(Index, u8),
-    /// Bytes go missing.
+    /// Bytes are removed.
     Cut(Index, usize),
-    /// Bytes come in.
+    /// Bytes are inserted.
     Insert(Index, Vec<u8>),
-    /// A batch comes before the one in front of it.
+    /// A batch arrives before its predecessor.
     Swap(Index),
-    /// A batch comes twice.
+    /// A batch arrives twice.
     Repeat(Index),
-    /// A batch does not come.
+    /// A batch does not arrive.
     Drop(Index),
 }
 
@@ -37,7 +37,7 @@ fn damage() -> impl Strategy<Value = Damage> {
     ]
 }
 
-/// A frame that tells its channel and its number among those of its channel.
+/// A frame whose contents say its channel and its number among that channel's frames.
 fn numbered(channel: Channel, number: u32) -> Frame {
     let id = Id::standard_truncated(number * 7 + channel.index() as u32);
     Frame::data_frame(id, &number.to_be_bytes()[..=number as usize % 4]).unwrap()
@@ -71,7 +71,8 @@ impl Sender {
     }
 }
 
-/// Follows what the decoder reports and insists that every frame is delivered once or counted lost, in its place.
+/// Follows what the decoder reports and insists that every frame is either delivered once or counted as lost, in
+/// its place.
 #[derive(Default)]
 struct Books {
     next: [u32; CHANNELS],
@@ -156,7 +157,7 @@ proptest! {
         let mut sender = Sender { writer: BatchWriter::new(), sent: [0; CHANNELS] };
         let mut batches: Vec<Vec<u8>> = frames.iter().map(|frames| sender.batch(frames)).collect();
         let mut stream = apply(&mut batches, &damages);
-        // One good batch behind it all: by then everything must be accounted for.
+        // A good batch after everything else: then everything must be accounted for.
         stream.push(0);
         stream.extend(sender.batch(&[false, true]));
         let (mut decoder, mut books, mut verdict) = (Decoder::new(), Books::default(), Ok(()));

@@ -46,7 +46,7 @@ fn received_frames() {
         record("1F334455#11", Can1, Stamp::Exact, false, i64::from(i32::MAX)),
         "a1 55 44 33 1f fe ff ff ff 0f 11"
     );
-    // Two wraps of a 32-bit timer: a difference has no bound.
+    // Two wraps of a 32-bit timer: differences are not bounded.
     assert_eq!(record("1F334455#11", Can1, Stamp::Exact, false, 2 << 32), "a1 55 44 33 1f 80 80 80 80 40 11");
     assert_eq!(record("555#", Can1, Stamp::Exact, false, i64::MIN), "80 55 05 ff ff ff ff ff ff ff ff ff 01");
     assert_eq!(record("1F334455#11", Can1, Stamp::UpperBound, false, 64), "41 a1 55 44 33 1f 80 01 11");
@@ -112,7 +112,7 @@ fn batch_headers_and_the_end_of_a_session() {
     }
 }
 
-/// What a device reads apart must be what the whole type reads.
+/// What a device reads by hand must be what the whole type reads.
 #[test]
 fn frames_to_be_sent_are_read_as_the_request_has_them_and_no_other_request_is() {
     let tx = |tag: u32| TxFrame {
@@ -142,7 +142,7 @@ fn frames_to_be_sent_are_read_as_the_request_has_them_and_no_other_request_is() 
     assert_eq!(read(&encoded(5, Command::Close { channel: Can1 })), None);
 }
 
-/// Requests of a client that does not keep to the ranges, byte by byte.
+/// Requests, byte by byte, of a client that does not respect the ranges.
 #[test]
 fn a_frame_that_cannot_be_is_refused_by_its_fault_and_all_else_as_malformed() {
     let refusal = |text: &str| {
@@ -159,7 +159,7 @@ fn a_frame_that_cannot_be_is_refused_by_its_fault_and_all_else_as_malformed() {
         ("05 08 00 00 01 80 10 00 00 ac 02 00 00", Refusal::BadId),
         ("05 08 00 00 01 a3 02 10 00 ac 02 00 00", Refusal::BadDlc),
         ("05 09 00 00 01 00 02 01 01 80 10 00 00 00", Refusal::BadId),
-        // A third channel, a command that does not exist, one that is cut off, and nothing.
+        // A third channel, a command that does not exist, one that is cut off, and an empty request.
         ("05 06 02 00", Refusal::Malformed),
         ("05 7f", Refusal::Malformed),
         ("05 06 00 01 01", Refusal::Malformed),
@@ -169,7 +169,7 @@ fn a_frame_that_cannot_be_is_refused_by_its_fault_and_all_else_as_malformed() {
     }
 }
 
-/// Every request there can be fits what a device holds.
+/// Every possible request fits into what a device can hold.
 #[test]
 fn the_longest_request_fits() {
     let filter = Filter { extended: true, kind: FrameKind::Any, id: 0x1FFF_FFFF, mask: 0x1FFF_FFFF };

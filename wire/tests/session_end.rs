@@ -1,4 +1,5 @@
-//! A session that the device ends: what went missing before is counted, and what is older does not end it again.
+//! A session that the device ends: frames lost before the end are counted, and an older message does not end it
+//! again.
 
 use cantap_wire::batch::BatchWriter;
 use cantap_wire::framing::MAX_ENCODED;

@@ -1,6 +1,7 @@
-//! `wire/vectors.json`: what crosses USB, byte for byte, for those who write a client in another language.
+//! `wire/vectors.json`: what crosses USB, byte for byte, for authors of clients in other languages.
 //!
-//! The file is made here and pinned: a change of the protocol changes it, and this test says how to write it again.
+//! The file is generated and pinned here: a change to the protocol changes it, and this test says how to regenerate
+//! it.
 
 mod samples;
 
@@ -145,7 +146,7 @@ impl Session {
 }
 
 impl Session {
-    /// Many records in one batch, without a zero among them: a full COBS block.
+    /// Many records in one batch without a zero byte among them: a full COBS block.
     fn long_batch(&mut self) {
         let (base, mut reads) = (self.ticks, Vec::new());
         let frame = frame("123#1122334455667788");
@@ -239,7 +240,7 @@ fn batches() -> Vec<Value> {
         stamp: Stamp::Exact,
         data_omitted: false,
     };
-    // Two batches that are not in the file: the next one counts what was in them.
+    // Two batches that are left out of the file: the next one counts what was in them.
     let told = session.lines.len();
     session.record("", &Value::Null, &Record::Received(frame("100#")));
     session.record("", &Value::Null, &Record::Received(frame("101#")));
@@ -255,7 +256,7 @@ fn batches() -> Vec<Value> {
     session.lines
 }
 
-/// COBS around its block of 254 bytes, and messages that are none.
+/// COBS near its block size of 254 bytes, and bytes that are not messages.
 fn framing() -> Vec<Value> {
     let vector = |what: &str, message: &[u8]| {
         let (mut buffer, mut out) = ([0; MAX_MESSAGE + CRC_LEN], [0; MAX_ENCODED]);
@@ -284,7 +285,7 @@ fn framing() -> Vec<Value> {
     all
 }
 
-/// Each vector on a line of its own, so that a change shows.
+/// One vector per line, so that a diff shows what changed.
 fn file() -> String {
     let parts = [
         ("framing", framing()),
@@ -315,7 +316,7 @@ fn the_file_is_what_this_protocol_says() {
     );
 }
 
-/// A variant without a sample would be missing in the file.
+/// A variant without a sample would be missing from the file.
 #[test]
 fn there_is_a_sample_of_every_variant() {
     fn check<T: Serialize + for<'a> serde::Deserialize<'a>>(what: &str, samples: &[T]) {
@@ -338,7 +339,7 @@ fn there_is_a_sample_of_every_variant() {
     check("event", &values(events()));
 }
 
-/// The page's tables name every variant, behind its index.
+/// The page's tables name every variant, after its index.
 #[test]
 fn the_document_has_every_variant() {
     let document = include_str!("../../docs/wire-protocol.md");
@@ -358,7 +359,7 @@ fn the_document_has_every_variant() {
     assert!(document.contains(&format!("version {PROTOCOL_VERSION}")));
 }
 
-/// The vectors say what our own decoder says.
+/// The vectors say what our own decoder reports.
 #[test]
 fn the_session_in_the_file_is_whole() {
     let mut decoder = Decoder::new();

@@ -5,7 +5,7 @@ use cantap_wire::framing::{self, CRC_LEN, MAX_ENCODED, MAX_MESSAGE};
 use cantap_wire::record::{LossStage, MAX_RECORD, encode_event, encode_received};
 use cantap_wire::{Channel, Command, Decoded, Decoder, Event, Received, Record, Request, Stamp};
 
-/// The bytes of the code block behind `heading` in the document.
+/// The bytes of the code block after `heading` in the document.
 fn documented(heading: &str) -> Vec<u8> {
     let document = include_str!("../../docs/wire-protocol.md");
     let (_, after) = document.split_once(heading).unwrap_or_else(|| panic!("no heading {heading:?}"));

@@ -1,11 +1,11 @@
-//! The boards that there is firmware for. Each is a feature of the firmware package and a file in
+//! The boards for which there is firmware. Each is a feature of the firmware package and a file in
 //! `src/board/`.
 
 use std::path::PathBuf;
 
 use crate::workspace;
 
-/// A board, by the name that is also its feature and what the device says in `Hello`.
+/// A board, by the name that its feature and the device's `Hello` use, too.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Board {
     /// Olimex STM32-P405.

@@ -1,4 +1,5 @@
-//! Checks of the sources and the pages, which need parsers: where this program has none, it runs itself again with them.
+//! Checks of the sources and the pages that need parsers: if this program was built without them, it runs itself again
+//! with them.
 
 use anyhow::Result;
 
@@ -10,7 +11,7 @@ pub fn circles() -> Result<()> {
     again("circles")
 }
 
-/// Links that lead nowhere.
+/// Broken links.
 pub fn links() -> Result<()> {
     #[cfg(feature = "check")]
     return crate::links::check();

@@ -1,8 +1,8 @@
 //! Finds files of one crate that import each other in a circle, and public types of a library that share a name.
 //!
-//! Read from the sources by the compiler's grammar: which file names a path into which other. A `pub use` by itself is a front door and
-//! no import; what a file uses through one leads to where it is defined. What only tests import does not count, and neither do methods,
-//! which name no file. Inside a macro's arguments, which have no grammar, only paths from `crate`, `self` or `super` are seen.
+//! Parses the sources to find which file names a path into which other. A `pub use` alone is a front door, not an import; a path
+//! through one leads to where the item is defined. Imports by tests alone do not count, and neither do methods, which name no file.
+//! Inside a macro's arguments, which have no grammar, only paths from `crate`, `self` or `super` are seen.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -47,20 +47,20 @@ fn manifests(root: &Path) -> Result<Vec<PathBuf>> {
     Ok(std::iter::once(root.to_owned()).chain(members).collect())
 }
 
-/// What is known of one crate.
+/// What is known about one crate.
 #[derive(Default)]
 struct Crate {
     /// Its modules, with the file that each is in.
     files: BTreeMap<Module, PathBuf>,
     /// The paths that each module names.
     named: Vec<(Module, Paths)>,
-    /// Names that a module passes on by `pub use`: where they come from.
+    /// Names that a module re-exports with `pub use`, and where they come from.
     doors: BTreeMap<(Module, String), Module>,
     /// Public types by name: the files that define one.
     types: BTreeMap<String, Vec<PathBuf>>,
 }
 
-/// The paths that a module names, as they are written there.
+/// The paths that a module names, as written there.
 #[derive(Default)]
 struct Paths(BTreeSet<Vec<String>>);
 
@@ -71,7 +71,7 @@ impl Crate {
         Ok(krate)
     }
 
-    /// Takes in a file and the modules that it declares; those of their own file are below `folder`.
+    /// Reads a file and the modules that it declares; modules with a file of their own are below `folder`.
     fn read_file(&mut self, file: &Path, folder: &Path, module: Module) -> Result<()> {
         let text = fs::read_to_string(file).with_context(|| file.display().to_string())?;
         let parsed = syn::parse_file(&text).with_context(|| file.display().to_string())?;
@@ -131,7 +131,7 @@ impl Crate {
         }
     }
 
-    /// The file that defines what a path names, if that is in this crate.
+    /// The file that defines what a path names, if it is in this crate.
     fn file_of(&self, from: &Module, path: &[String], depth: usize) -> Option<&PathBuf> {
         let mut at = from.clone();
         let mut rest = path;
@@ -209,7 +209,7 @@ impl Crate {
         groups.into_iter().map(describe).collect()
     }
 
-    /// A line for each name that more than one public type has.
+    /// A line for each name shared by several public types.
     fn namesakes(&self) -> Vec<String> {
         let twice = self.types.iter().filter(|(_, files)| files.len() > 1);
         let describe = |(name, files): (&String, &Vec<PathBuf>)| {
@@ -220,7 +220,7 @@ impl Crate {
     }
 }
 
-/// All files that `from` imports, and those that they do.
+/// All files that `from` imports, directly or indirectly.
 fn reach<'a>(
     imports: &BTreeMap<&'a PathBuf, BTreeSet<&'a PathBuf>>,
     from: &PathBuf,
@@ -258,7 +258,7 @@ fn attributes(item: &Item) -> &[Attribute] {
     }
 }
 
-/// What only tests have, and a file that `#[path]` takes from elsewhere: it is another crate's.
+/// Test-only items, and files that `#[path]` takes from elsewhere, which belong to another crate.
 fn is_left_out(attributes: &[Attribute]) -> bool {
     attributes.iter().any(|attribute| match &attribute.meta {
         syn::Meta::List(list) => list.path.is_ident("cfg") && list.tokens.to_string() == "test",
@@ -266,7 +266,7 @@ fn is_left_out(attributes: &[Attribute]) -> bool {
     })
 }
 
-/// The paths of a `use`, each with the name that it gives: `*` for all of a module's.
+/// The paths of a `use`, each with the name it introduces: `*` for all names of a module.
 fn leaves(tree: &UseTree) -> Vec<(Vec<String>, String)> {
     match tree {
         UseTree::Path(path) => {
@@ -308,7 +308,7 @@ impl Visit<'_> for Paths {
 }
 
 impl Paths {
-    /// Finds `crate::…`, `self::…` and `super::…` in what has no grammar.
+    /// Finds `crate::…`, `self::…` and `super::…` in unparsed tokens.
     fn visit_tokens(&mut self, tokens: TokenStream) {
         let mut path: Vec<String> = Vec::new();
         let mut colons = 0;
@@ -345,7 +345,7 @@ impl Paths {
 mod tests {
     use super::*;
 
-    /// A crate of these files, and what is wrong with it.
+    /// The faults found in a crate made of these files.
     fn faults(files: &[(&str, &str)]) -> Vec<String> {
         let folder = std::env::temp_dir().join(format!("circles-{}", std::process::id()));
         for (name, text) in files {

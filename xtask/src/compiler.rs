@@ -23,7 +23,7 @@ struct Package {
     rust_version: String,
 }
 
-/// Compiles everything with that compiler. Where it is the one that does the other steps, they are the check.
+/// Compiles everything with that compiler. If the other steps already use that compiler, they are the check.
 pub fn check(shell: &Shell) -> Result<Outcome> {
     let manifest: Manifest = toml::from_str(&shell.read_file("Cargo.toml")?).context("Cargo.toml")?;
     let oldest = manifest.workspace.package.rust_version;
@@ -40,7 +40,7 @@ pub fn check(shell: &Shell) -> Result<Outcome> {
         .is_err()
     {
         return Ok(Outcome::Skipped(format!(
-            "here is {here}; `rustup toolchain install {oldest}` brings the one to check"
+            "this is {here}; `rustup toolchain install {oldest}` installs the one to check"
         )));
     }
     let target = workspace::target().join("oldest-compiler");

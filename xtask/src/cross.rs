@@ -1,5 +1,5 @@
-//! What compiles for targets that are not this machine: the libraries without ports and threads for WebAssembly, and as much for
-//! Windows and macOS as needs no C compiler of theirs. Compiled, not linked and not run: that is hosted CI's.
+//! Compiles for other targets: the libraries without ports and threads for WebAssembly, and for Windows and macOS whatever needs
+//! no C compiler of theirs. The result is neither linked nor run: hosted CI does that.
 
 use anyhow::Result;
 use xshell::Shell;
@@ -11,9 +11,9 @@ use crate::workspace;
 /// A target, and what is checked for it.
 pub struct Check {
     target: &'static str,
-    /// What cargo is given.
+    /// Arguments for cargo.
     arguments: &'static [&'static str],
-    /// A program that compiling its standard library takes, and Debian's package with it.
+    /// A program needed to compile its standard library, and the Debian package that has it.
     needs: Option<(&'static str, &'static str)>,
 }
 
@@ -42,7 +42,8 @@ pub const WASM: &[Check] = &[Check {
     needs: None,
 }];
 
-/// On Windows the whole command but zstd and SQLite, which are C. For macOS, signals are missing, too: their parser's stack guard is assembly.
+/// For Windows, the whole command except zstd and SQLite, which are C. For macOS, signals are left out, too: their parser's stack guard is
+/// assembly.
 pub const SYSTEMS: &[Check] = &[
     Check {
         target: "x86_64-pc-windows-gnu",
@@ -64,7 +65,7 @@ pub const SYSTEMS: &[Check] = &[
     },
 ];
 
-/// Compiles them, for each target that there is a standard library for.
+/// Runs the checks, for each target that has a standard library here.
 pub fn check(shell: &Shell, toolchain: Toolchain, checks: &[Check]) -> Result<Outcome> {
     let mut skipped = Vec::new();
     for Check { target, arguments, needs } in checks {
@@ -82,8 +83,8 @@ pub fn check(shell: &Shell, toolchain: Toolchain, checks: &[Check]) -> Result<Ou
         let target_dir = workspace::target().join("cross");
         toolchain
             .cargo_for(shell, "check", target, "std,panic_abort", &target_dir)?
-            // A standard library that has to be built is compiled even for a check, but never run: without optimisation, and without
-            // the parts that read debug information for backtraces.
+            // A standard library that has to be built is compiled even for a check, but never run: so without optimisation, and
+            // without the parts that read debug information for backtraces.
             .envs([("CARGO_PROFILE_DEV_OPT_LEVEL", "0"), ("CARGO_PROFILE_DEV_DEBUG", "0")])
             .args(toolchain.std_features())
             .args(*arguments)

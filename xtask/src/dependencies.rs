@@ -1,8 +1,8 @@
-//! Other people's crates, held to `deny.toml`: licences that may be in what we publish, no crate twice without a reason, no sources
-//! but the registry.
+//! Other people's crates, checked against `deny.toml`: only licences allowed in what we publish, no crate in two versions without a
+//! reason, no source other than the registry.
 //!
-//! cargo-deny, which reads the same file, does this in hosted CI and knows the advisories as well. It is not built here: it has some 300
-//! dependencies of its own.
+//! cargo-deny, which reads the same file, does this in hosted CI and checks advisories as well. It is not built here because it has some
+//! 300 dependencies itself.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -13,7 +13,7 @@ use xshell::Shell;
 
 use crate::metadata::{Metadata, Package};
 
-/// What of `deny.toml` is checked here.
+/// The part of `deny.toml` that is checked here.
 #[derive(Deserialize)]
 struct Rules {
     licenses: Licences,
@@ -30,14 +30,14 @@ struct Bans {
     skip: Vec<Skip>,
 }
 
-/// A version of a crate that may be there beside another.
+/// A version of a crate that is allowed alongside another.
 #[derive(Deserialize)]
 struct Skip {
     #[serde(rename = "crate")]
     name_and_version: String,
 }
 
-/// Checks all of them and names every fault.
+/// Checks all crates and names every fault.
 pub fn check(shell: &Shell) -> Result<()> {
     let rules: Rules = toml::from_str(&shell.read_file("deny.toml")?).context("deny.toml")?;
     let metadata = Metadata::read(shell)?;
@@ -47,7 +47,7 @@ pub fn check(shell: &Shell) -> Result<()> {
         .chain(sources(&others))
         .collect();
     ensure!(faults.is_empty(), "against deny.toml:\n{}", faults.join("\n"));
-    println!("{} crates of others: licences, versions and sources are as deny.toml allows", others.len());
+    println!("{} crates of other people: licences, versions and sources are allowed", others.len());
     Ok(())
 }
 
@@ -57,7 +57,7 @@ fn licences<'a>(others: &'a [&Package], allowed: &'a [String]) -> impl Iterator<
         let Some(text) = &package.license else { return Some(format!("{name} {version} names no licence")) };
         // Older crates write `/` for OR.
         match Expression::parse_mode(text, ParseMode::LAX) {
-            Err(error) => Some(format!("{name} {version} has a licence that is no SPDX expression: {error}")),
+            Err(error) => Some(format!("{name} {version} has a licence that is not valid SPDX: {error}")),
             Ok(expression) if expression.evaluate(|licence| is_allowed(licence, allowed)) => None,
             Ok(_) => Some(format!("{name} {version} is under {text}, which is not allowed")),
         }
@@ -68,7 +68,7 @@ fn is_allowed(licence: &LicenseReq, allowed: &[String]) -> bool {
     allowed.contains(&licence.to_string())
 }
 
-/// Crates that are there in several versions, of which not all but one are excused; and excuses that nothing needs any more.
+/// Crates present in several versions of which more than one is not excused, and excuses that are no longer needed.
 fn duplicates(others: &[&Package], skip: &[Skip]) -> impl Iterator<Item = String> {
     let excused: BTreeSet<&str> = skip.iter().map(|skip| skip.name_and_version.as_str()).collect();
     let mut versions: BTreeMap<&str, Vec<String>> = BTreeMap::new();
@@ -80,7 +80,7 @@ fn duplicates(others: &[&Package], skip: &[Skip]) -> impl Iterator<Item = String
     for (name, versions) in versions.iter().filter(|(_, versions)| versions.len() > 1) {
         let open = versions.iter().filter(|version| !excused.contains(version.as_str())).count();
         if open > 1 {
-            faults.push(format!("{name} is there {} times: {}", versions.len(), versions.join(", ")));
+            faults.push(format!("{name} is present in {} versions: {}", versions.len(), versions.join(", ")));
         }
         needed.extend(versions.iter().cloned());
     }
@@ -88,7 +88,7 @@ fn duplicates(others: &[&Package], skip: &[Skip]) -> impl Iterator<Item = String
         excused
             .iter()
             .filter(|excuse| !needed.contains(**excuse))
-            .map(|excuse| format!("{excuse} needs no excuse any more")),
+            .map(|excuse| format!("{excuse} no longer needs an excuse")),
     );
     faults.into_iter()
 }

@@ -1,12 +1,12 @@
-//! Each crate compiles by itself, without features and with each one alone. In the workspace's build, features that one crate forgot to ask
-//! for come with another.
+//! Checks that each crate compiles by itself, without features and with each one alone. In the workspace's build, a feature that one crate
+//! forgot to request may come with another.
 
 use anyhow::Result;
 use xshell::{Shell, cmd};
 
 use crate::metadata::Metadata;
 
-/// Compiles all of them, as far as that makes a difference on the host.
+/// Compiles every combination that makes a difference on the host.
 pub fn check(shell: &Shell) -> Result<()> {
     let metadata = Metadata::read(shell)?;
     for package in metadata.members() {

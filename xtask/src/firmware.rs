@@ -9,7 +9,7 @@ use crate::board::Board;
 use crate::toolchain::{TARGET, Toolchain};
 use crate::workspace;
 
-/// What `cargo xtask firmware` takes.
+/// The arguments of `cargo xtask firmware`.
 #[derive(clap::Args)]
 pub struct Args {
     /// The board to build for.
@@ -63,7 +63,7 @@ pub fn clippy(shell: &Shell, toolchain: Toolchain) -> Result<()> {
     Ok(())
 }
 
-/// Apart from the host's builds, because Debian's compiler is another version.
+/// Separate from the host's builds, because Debian's compiler has another version.
 pub fn target_dir() -> PathBuf {
     workspace::target().join("fw")
 }

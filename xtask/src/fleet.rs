@@ -7,7 +7,7 @@ use xshell::{Shell, cmd};
 
 use crate::{peers, toolchain, workspace};
 
-/// Spark (430 MB, kept in `target/spark`) and what the job and its tests need beside it.
+/// Spark (430 MB, kept in `target/spark`) and what else the job and its tests need.
 const REQUIREMENTS: &str = "python/examples/fleet/requirements.txt";
 /// What Spark runs on.
 const JAVA: &str = "openjdk-17-jre-headless";
@@ -17,8 +17,11 @@ pub fn check(shell: &Shell, wheel: &Path) -> Result<()> {
     if !toolchain::is_installed("java") {
         if !toolchain::can_install() {
             let is_wanted = std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1");
-            ensure!(!is_wanted, "Spark needs Java 17: run `apt-get install {JAVA}` or your system's like");
-            println!("the fleet's job was not run: run `apt-get install {JAVA}` or your system's like");
+            ensure!(
+                !is_wanted,
+                "Spark needs Java 17: run `apt-get install {JAVA}` or your system's equivalent"
+            );
+            println!("the fleet's job was not run: run `apt-get install {JAVA}` or your system's equivalent");
             return Ok(());
         }
         toolchain::install(shell, &[JAVA])?;
@@ -28,7 +31,7 @@ pub fn check(shell: &Shell, wheel: &Path) -> Result<()> {
     let fleet = "python/examples/fleet";
     cmd!(shell, "{python} -m mypy --config-file {fleet}/mypy.ini {fleet}/job.py {fleet}/cantap_fleet")
         .run()?;
-    // As the tests' step leaves it; without it one test says that it was skipped.
+    // Built by the tests' step; without it one test says that it was skipped.
     let command = workspace::target().join("debug/cantap");
     let named = command.exists().then_some(("CANTAP_COMMAND", command));
     cmd!(shell, "{python} -m pytest --quiet python/tests/test_fleet.py").envs(named).run()?;

@@ -18,23 +18,23 @@ const PROGRAMS: [(&str, &str); 5] = [
     ("xz", "xz-utils"),
 ];
 
-/// What `prepare.sh` ends with where the guest's packages cannot be fetched: `EX_TEMPFAIL` of sysexits.h.
+/// The exit code of `prepare.sh` when the guest's packages cannot be fetched: `EX_TEMPFAIL` of sysexits.h.
 const NOT_FETCHED: i32 = 75;
 
-/// Boots the guest and runs its checks. Where QEMU or the guest cannot be had, gives the reason and does nothing, unless peers are
-/// required.
+/// Boots the guest and runs its checks. If QEMU or the guest is not available, returns the reason and does nothing, unless peers
+/// are required.
 pub fn run(shell: &Shell) -> Result<Outcome> {
     let elf = Board::ALL[0].elf();
     ensure!(elf.exists(), "there is no {}; run `cargo xtask firmware`", elf.display());
     if let Err(reason) = install_missing(shell) {
         return skip(reason);
     }
-    // The programs that the tests' build makes, too: another selection of packages would compile everything once more.
+    // Builds the same programs as the tests do: another selection of packages would compile everything once more.
     crate::tests::build(shell)?;
     let programs = workspace::target().join("debug");
     let (cantap, simulator) = (programs.join("cantap"), programs.join("cantap-sim"));
     let cache = workspace::target().join("kernel");
-    // Its own words are on the screen already.
+    // Its own messages are already on the screen.
     let prepared = std::process::Command::new("bash")
         .arg("sim/kernel/prepare.sh")
         .arg(&cache)
@@ -48,7 +48,7 @@ pub fn run(shell: &Shell) -> Result<Outcome> {
     Ok(Outcome::Passed)
 }
 
-/// Not run, for a reason, which is a failure where peers are required.
+/// Not run, for a reason; this is a failure if peers are required.
 fn skip(reason: String) -> Result<Outcome> {
     if std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1") {
         bail!("{reason}");
@@ -56,7 +56,7 @@ fn skip(reason: String) -> Result<Outcome> {
     Ok(Outcome::Skipped(reason))
 }
 
-/// Installs what is missing, if that is possible; the reason if it is not.
+/// Installs what is missing, if possible; otherwise returns the reason.
 fn install_missing(shell: &Shell) -> Result<(), String> {
     let missing: Vec<&str> =
         PROGRAMS.iter().filter(|(program, _)| !is_installed(program)).map(|(_, package)| *package).collect();

@@ -1,5 +1,5 @@
-//! Finds links in the pages that lead nowhere: to a file or a heading that is not there. The same for files that are only named: code
-//! that reads as a path from the root, such as `wire/src/lib.rs`. Addresses on the network are not looked up.
+//! Finds broken links in the pages: to a file or a heading that does not exist. Checks files that are only named, too: code that
+//! looks like a path from the root, such as `wire/src/lib.rs`. Addresses on the network are not looked up.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -10,7 +10,7 @@ use pulldown_cmark::{Event, Options, Parser, Tag, TagEnd};
 
 use crate::workspace;
 
-/// Endings of what is taken for a file in code.
+/// Suffixes by which code is recognised as a file's path.
 const FILES: [&str; 7] = [".rs", ".md", ".toml", ".sh", ".svg", ".rules", ".yml"];
 
 /// Checks every page of the repository.
@@ -24,8 +24,8 @@ pub fn check() -> Result<()> {
     ensure!(!pages.is_empty(), "no page in {}", root.display());
     let faults: Vec<String> =
         pages.iter().flat_map(|(path, page)| page.faults(&root, path, &pages)).collect();
-    ensure!(faults.is_empty(), "links that lead nowhere:\n{}", faults.join("\n"));
-    println!("{} pages: every link leads somewhere", pages.len());
+    ensure!(faults.is_empty(), "broken links:\n{}", faults.join("\n"));
+    println!("{} pages: no broken links", pages.len());
     Ok(())
 }
 
@@ -36,7 +36,7 @@ struct Page {
     links: Vec<(usize, String)>,
     /// Line and code.
     named: Vec<(usize, String)>,
-    /// Headings, as links name them.
+    /// Headings, in the form that links use.
     anchors: Vec<String>,
 }
 
@@ -84,16 +84,16 @@ impl Page {
     }
 }
 
-/// Whether code names a file, from the root on, that is not there.
+/// Whether code is the path of a file, from the root, that does not exist.
 fn is_missing(root: &Path, code: &str) -> bool {
     let Some((top, _)) = code.split_once('/') else { return false };
     let is_path = !code.contains(|other: char| other.is_whitespace() || "*{}<>…".contains(other));
     let is_file = FILES.iter().any(|ending| code.ends_with(ending));
-    // What is built is there only when it has been.
+    // Build results exist only after a build.
     is_path && is_file && top != "target" && root.join(top).is_dir() && !root.join(code).exists()
 }
 
-/// A heading as GitHub names it in links: small letters, digits, `-` and `_`, with a `-` for each blank.
+/// A heading as GitHub names it in links: lower-case letters, digits, `-` and `_`, with a `-` for each blank.
 fn anchor(heading: &str) -> String {
     let kept = |letter: char| match letter {
         ' ' => Some('-'),
@@ -103,7 +103,7 @@ fn anchor(heading: &str) -> String {
     heading.to_lowercase().chars().filter_map(kept).collect()
 }
 
-/// Every page below a folder, except for hidden folders and what is built.
+/// Every page below a folder, except hidden folders and build results.
 fn pages_under(folder: &Path) -> Result<Vec<PathBuf>> {
     let mut pages = Vec::new();
     for entry in fs::read_dir(folder)? {

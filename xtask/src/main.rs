@@ -1,6 +1,7 @@
 //! The project's own build steps: `cargo xtask firmware | test | circles | links | size | bench | soak | dist`.
 //!
-//! Kept light, because `cargo fw` builds it first: what only measurements and checks need is behind features.
+//! Kept light, because `cargo fw` builds it first: what only measurements and checks need is optional, behind
+//! features.
 
 #![forbid(unsafe_code)]
 
@@ -49,11 +50,11 @@ struct Cli {
 enum Task {
     /// Builds the firmware into `target/firmware/cantap-BOARD.elf` (also `cargo fw`).
     Firmware(firmware::Args),
-    /// Does everything that must hold before a change lands, from a fresh clone on.
+    /// Checks everything that must hold before a change lands, from a fresh clone on.
     Test(test::Args),
     /// Finds files of one crate that import each other in a circle, and public types of one crate that share a name.
     Circles,
-    /// Finds links in the pages that lead nowhere, and files named there that do not exist.
+    /// Finds broken links in the pages, and files named there that do not exist.
     Links,
     /// Prints each board's flash and static RAM, and fails past `size-budget.toml`.
     Size,
@@ -61,7 +62,7 @@ enum Task {
     Bench(bench::Args),
     /// Runs the firmware on the emulated board for a long time, with a new seed for each run.
     Soak(soak::Args),
-    /// Packs what a release has: the command, Debian's package, each board's firmware.
+    /// Packs a release: the command, Debian's package, each board's firmware.
     Dist(dist::Args),
 }
 

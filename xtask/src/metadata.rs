@@ -1,4 +1,4 @@
-//! What cargo knows of the workspace and of everything in its lock file.
+//! What cargo knows about the workspace and everything in its lock file.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -7,7 +7,7 @@ use anyhow::{Context, Result};
 use serde::Deserialize;
 use xshell::{Shell, cmd};
 
-/// What `cargo metadata` says, as far as it is used here.
+/// The part of `cargo metadata` that is used here.
 #[derive(Deserialize)]
 pub struct Metadata {
     /// Our own packages and everybody else's.
@@ -29,7 +29,7 @@ pub struct Package {
     pub features: BTreeMap<String, Vec<String>>,
     /// Where its source is.
     pub manifest_path: PathBuf,
-    /// Empty where it may not be published.
+    /// Empty if it must not be published.
     publish: Option<Vec<String>>,
     /// Where it comes from; nothing for our own.
     pub source: Option<String>,
@@ -38,7 +38,7 @@ pub struct Package {
 }
 
 impl Metadata {
-    /// Asks cargo, for all targets and with all features.
+    /// Asks cargo for all targets with all features.
     pub fn read(shell: &Shell) -> Result<Self> {
         let text = cmd!(shell, "cargo metadata --locked --format-version 1 --all-features").quiet().read()?;
         serde_json::from_str(&text).context("cargo metadata")
@@ -49,7 +49,7 @@ impl Metadata {
         self.packages.iter().filter(|package| self.workspace_members.contains(&package.id))
     }
 
-    /// The packages of others.
+    /// Other people's packages.
     pub fn others(&self) -> impl Iterator<Item = &Package> {
         self.packages.iter().filter(|package| !self.workspace_members.contains(&package.id))
     }

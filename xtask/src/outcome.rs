@@ -1,6 +1,6 @@
-//! How a step of `cargo xtask test` ended that did not fail.
+//! How a step of `cargo xtask test` ended, if it did not fail.
 
-/// What came of a step.
+/// The outcome of a step.
 pub enum Outcome {
     /// All of it ran.
     Passed,

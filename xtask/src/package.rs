@@ -1,5 +1,5 @@
-//! The crates as they would be published: each packs, with the licences' own texts. That each builds from its package alone is for the
-//! release workflow (`cargo package`), since it compiles everything once more.
+//! The crates as they would be published: each packs, with the texts of its licences. Whether each builds from its package alone is
+//! checked by the release workflow (`cargo package`), since that compiles everything once more.
 
 use anyhow::{Context, Result, ensure};
 use xshell::{Shell, cmd};
@@ -18,14 +18,14 @@ pub fn check(shell: &Shell) -> Result<()> {
     Ok(())
 }
 
-/// A package has its own copies: a link would be a file with a path in it wherever links are not kept.
+/// A package has its own copies: where symbolic links are not preserved, a link would become a file containing a path.
 fn licences(shell: &Shell, package: &Package) -> Result<()> {
-    let directory = package.manifest_path.parent().context("a manifest lies in no directory")?;
+    let directory = package.manifest_path.parent().context("a manifest has no directory")?;
     for licence in ["LICENSE-MIT", "LICENSE-APACHE"] {
         let own = shell.read_file(directory.join(licence)).with_context(|| package.name.clone())?;
         ensure!(
             own == shell.read_file(licence)?,
-            "{}'s {licence} is not the workspace's: copy it",
+            "{}'s {licence} differs from the workspace's: copy it",
             package.name
         );
     }

@@ -10,8 +10,8 @@ use crate::workspace;
 
 /// Programs from Debian's packages: a program, and the package that has it.
 const PROGRAMS: [(&str, &str); 2] = [("log2asc", "can-utils"), ("tshark", "tshark")];
-/// Also where no peer may be skipped: its package starts a server that other computers reach, which is nobody's wish but a test
-/// machine's.
+/// Installed only where no peer may be skipped: its package starts a server that other computers can reach, which nobody wants
+/// except on a test machine.
 const SSH_SERVER: (&str, &str) = ("/usr/sbin/sshd", "openssh-server");
 /// Python packages, with their versions.
 pub const REQUIREMENTS: &str = "xtask/peers.txt";
@@ -23,8 +23,8 @@ pub struct Peers {
 }
 
 impl Peers {
-    /// Finds the peers, and installs what is missing where that is possible. `None`, with a word on
-    /// what to run, where it is not: the tests that need them then say that they were skipped.
+    /// Finds the peers, and installs what is missing if possible. If not, prints what to run and
+    /// returns `None`: the tests that need the peers then say that they were skipped.
     pub fn find_or_install(shell: &Shell) -> Result<Option<Self>> {
         let must_not_skip = std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1");
         let missing: Vec<&str> = PROGRAMS
@@ -37,7 +37,7 @@ impl Peers {
             let packages = missing.join(" ");
             if !toolchain::can_install() {
                 println!(
-                    "not compared with {packages}: run `apt-get install {packages}` or your system's like"
+                    "not compared with {packages}: run `apt-get install {packages}` or your system's equivalent"
                 );
                 return Ok(None);
             }
@@ -52,7 +52,7 @@ pub fn venv(shell: &Shell) -> Result<PathBuf> {
     environment(shell, "peers", REQUIREMENTS)
 }
 
-/// A Python environment under this name in `target/`, with the packages that a file names, made anew where that has changed.
+/// A Python environment under this name in `target/`, with the packages that a file names, made again if that file has changed.
 pub fn environment(shell: &Shell, name: &str, requirements: &str) -> Result<PathBuf> {
     let venv = workspace::target().join(name);
     let installed = venv.join("installed.txt");
@@ -60,7 +60,7 @@ pub fn environment(shell: &Shell, name: &str, requirements: &str) -> Result<Path
     if shell.read_file(&installed).is_ok_and(|text| text == wanted) {
         return Ok(venv);
     }
-    // Debian has what a venv needs in a package of its own.
+    // On Debian, what a venv needs is in a separate package.
     if cmd!(shell, "python3 -c 'import ensurepip'").quiet().ignore_stderr().run().is_err()
         && toolchain::can_install()
     {

@@ -13,7 +13,7 @@ use crate::workspace;
 /// Where its crate is.
 const MANIFEST: &str = "python/Cargo.toml";
 
-/// Packs the sources, with those of the crates that it is made of, and builds a wheel from them alone. Returns both.
+/// Packs the sources, including those of the crates it is made of, and builds a wheel from them alone. Returns both.
 pub fn dist(shell: &Shell) -> Result<[PathBuf; 2]> {
     let maturin = peers::venv(shell)?.join("bin/maturin");
     let packed = target().join("sources");
@@ -31,13 +31,13 @@ pub fn dist(shell: &Shell) -> Result<[PathBuf; 2]> {
 /// What a wheel is built for.
 #[derive(Clone, Copy)]
 enum Profile {
-    /// For tests: the workspace's profile, beside its own, so that what other people's crates compile to is shared.
+    /// For tests: the workspace's profile, next to its builds, so that compiled crates of other people are shared.
     Dev,
     /// For users.
     Release,
 }
 
-/// Builds a wheel of the sources in a folder and returns its path.
+/// Builds a wheel from the sources in a folder and returns its path.
 fn wheel(shell: &Shell, sources: &Path, profile: Profile, out: &Path) -> Result<PathBuf> {
     let maturin = peers::venv(shell)?.join("bin/maturin");
     let manifest = sources.join(MANIFEST);
@@ -68,7 +68,7 @@ pub fn check(shell: &Shell, peers: Option<&Peers>) -> Result<Outcome> {
     cmd!(shell, "{python} -m mypy.stubtest cantap._native").run()?;
     let suite = python_can(shell, &python)?;
     let pytest = python.with_file_name("python");
-    // As the tests' step leaves it; without it those say that they were skipped that need a server.
+    // Built by the tests' step; without it, the tests that need a server say that they were skipped.
     let command = workspace::target().join("debug/cantap");
     let named = command.exists().then_some(("CANTAP_COMMAND", command));
     // Not from `python/`, where `import cantap` would find the sources.
@@ -80,7 +80,7 @@ pub fn check(shell: &Shell, peers: Option<&Peers>) -> Result<Outcome> {
     Ok(Outcome::Passed)
 }
 
-/// Times it beside other people's packages.
+/// Times it against other people's packages.
 #[cfg(feature = "bench")]
 pub fn measure() -> Result<()> {
     let shell = workspace::shell()?;
@@ -89,12 +89,12 @@ pub fn measure() -> Result<()> {
     Ok(cmd!(shell, "{python} python/bench/side_by_side.py").run()?)
 }
 
-/// Where what belongs to it is made.
+/// The folder for everything that belongs to it.
 fn target() -> PathBuf {
     workspace::target().join("python")
 }
 
-/// A fresh environment that has this wheel, and sees the peers' packages.
+/// A fresh environment that has this wheel and can see the peers' packages.
 fn environment(shell: &Shell, wheel: &Path) -> Result<PathBuf> {
     let venv = target().join("venv");
     cmd!(shell, "python3 -m venv --clear {venv}").run()?;
@@ -108,7 +108,7 @@ fn environment(shell: &Shell, wheel: &Path) -> Result<PathBuf> {
     Ok(python)
 }
 
-/// The sources of the python-can that the peers have, with its own tests.
+/// The sources, with tests, of the python-can version among the peers.
 fn python_can(shell: &Shell, python: &Path) -> Result<PathBuf> {
     let wanted = shell.read_file(peers::REQUIREMENTS)?;
     let wanted =
@@ -127,6 +127,6 @@ fn python_can(shell: &Shell, python: &Path) -> Result<PathBuf> {
 
 fn only_file(folder: &Path) -> Result<PathBuf> {
     let mut files = std::fs::read_dir(folder)?.map(|entry| Ok(entry?.path())).collect::<Result<Vec<_>>>()?;
-    ensure!(files.len() == 1, "one file was to be made in {}, there are {}", folder.display(), files.len());
+    ensure!(files.len() == 1, "expected one file in {}, found {}", folder.display(), files.len());
     Ok(files.remove(0))
 }

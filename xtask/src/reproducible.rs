@@ -1,7 +1,7 @@
 //! Proves that the same source gives the same firmware, wherever it is built.
 //!
 //! The whole source tree is copied to another directory and built there from nothing; every byte must be equal.
-//! Building twice in one place would not notice a path of that place in the binary.
+//! Building twice in one place would not reveal a path of that place in the binary.
 
 use std::path::Path;
 
@@ -13,7 +13,7 @@ use crate::firmware;
 use crate::toolchain::Toolchain;
 use crate::workspace;
 
-/// Builds the default board's firmware again, elsewhere, and compares it with the one that is there.
+/// Builds the default board's firmware again, elsewhere, and compares it with the existing one.
 pub fn check(shell: &Shell, toolchain: Toolchain) -> Result<()> {
     let board = Board::ALL[0];
     let elsewhere = workspace::target().join("reproducible");
@@ -36,11 +36,11 @@ pub fn check(shell: &Shell, toolchain: Toolchain) -> Result<()> {
     Ok(())
 }
 
-/// Copies every file that belongs to the source: what git knows, and what it does not ignore.
+/// Copies every file that belongs to the source: those that git tracks or does not ignore.
 fn copy_sources(shell: &Shell, to: &Path) -> Result<()> {
     let files = cmd!(shell, "git ls-files --cached --others --exclude-standard").quiet().read()?;
     for file in files.lines() {
-        // A file that was deleted and not yet committed is still listed.
+        // A file whose deletion is not yet committed is still listed.
         if shell.path_exists(file) {
             shell.create_dir(to.join(file).parent().unwrap_or(to))?;
             shell.copy_file(file, to.join(file))?;

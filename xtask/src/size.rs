@@ -1,4 +1,4 @@
-//! `cargo xtask size`: how much of each board the firmware takes, against a budget.
+//! `cargo xtask size`: how much memory the firmware takes on each board, against a budget.
 
 use std::path::Path;
 
@@ -10,7 +10,7 @@ use serde::Deserialize;
 use crate::board::Board;
 use crate::workspace;
 
-/// Bytes per kind of memory: taken, or allowed.
+/// Bytes per kind of memory, either used or allowed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Sizes {
@@ -68,7 +68,7 @@ fn measure(path: &Path) -> Result<Sizes> {
         }
         let address = u64::from(section.sh_addr(endian));
         let size = u64::from(section.sh_size(endian));
-        // Initial values of data in RAM lie in flash, too.
+        // Initial values of data in RAM are in flash, too.
         let stored = section.sh_type(endian) != elf::SHT_NOBITS;
         if FLASH.contains(&address) || stored {
             sizes.flash += size;

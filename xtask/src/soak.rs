@@ -1,4 +1,5 @@
-//! `cargo xtask soak`: the real firmware on the emulated board, hour after hour, never twice the same traffic.
+//! `cargo xtask soak`: the real firmware on the emulated board, hour after hour, never with the same traffic
+//! twice.
 
 use std::time::{Duration, Instant};
 
@@ -8,13 +9,13 @@ use xshell::cmd;
 use crate::board::Board;
 use crate::workspace;
 
-/// What `cargo xtask soak` takes.
+/// The arguments of `cargo xtask soak`.
 #[derive(clap::Args)]
 pub struct Args {
-    /// How long, in minutes. The run that is under way then is still finished.
+    /// How long, in minutes. The run under way at that time is still finished.
     #[arg(long)]
     minutes: u64,
-    /// Seed of the first run; each next run takes the next number.
+    /// Seed of the first run; each further run takes the next number.
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// Emulated seconds per run.
@@ -22,7 +23,7 @@ pub struct Args {
     seconds: u64,
 }
 
-/// Runs until the time is up or a run's check does not hold.
+/// Runs until the time is up or a check fails.
 pub fn run(args: &Args) -> Result<()> {
     let shell = workspace::shell()?;
     let elf = Board::ALL[0].elf();

@@ -14,7 +14,7 @@ use crate::{
     tests, typos, workspace,
 };
 
-/// What `cargo xtask test` takes.
+/// The arguments of `cargo xtask test`.
 #[derive(clap::Args)]
 pub struct Args {
     /// Only this step; may be given again. Later steps use the firmware that earlier ones built.
@@ -22,7 +22,8 @@ pub struct Args {
     only: Vec<Step>,
 }
 
-/// One thing that is checked. The order is the order of the run: what fails fast comes first, what takes long last.
+/// One thing that is checked. The order is the order of the run: what fails quickly comes first, what takes long
+/// comes last.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum Step {
     /// Formatting.
@@ -31,11 +32,11 @@ enum Step {
     Typos,
     /// Files of one crate that import each other in a circle, and public types of one crate that share a name.
     Circles,
-    /// Links in the pages, and files that they name.
+    /// Links in the pages, and files named there.
     Links,
     /// Other people's crates: licences, duplicates, sources.
     Dependencies,
-    /// The compiler is the oldest that the packages promise to build with, or that one is tried.
+    /// The oldest compiler that the packages promise to build with.
     OldestCompiler,
     /// Lints of everything for the host.
     Clippy,
@@ -43,21 +44,21 @@ enum Step {
     Features,
     /// The fuzz targets compile.
     Fuzz,
-    /// Public items' documentation, with every link checked.
+    /// The documentation of public items, with every link checked.
     Doc,
     /// The libraries without ports and threads compile for WebAssembly.
     Wasm,
-    /// Windows and macOS, as far as they can be compiled for here.
+    /// Windows and macOS, as far as they can be checked here.
     Systems,
     /// The firmware of every board.
     Firmware,
-    /// What the firmware takes, against its budget.
+    /// The firmware's memory against its budget.
     Size,
     /// Lints of the firmware for each board.
     ClippyFirmware,
-    /// A second build, elsewhere, gives the same bytes.
+    /// A second build in another place gives the same bytes.
     Reproducible,
-    /// Every test, those that run the firmware's ELF on the emulated board included.
+    /// Every test, including those that run the firmware's ELF on the emulated board.
     Tests,
     /// A stock Linux kernel under QEMU drives the firmware on the emulated board.
     Kernel,
@@ -76,7 +77,7 @@ pub fn run(args: &Args) -> Result<()> {
     let steps = if args.only.is_empty() { Step::value_variants() } else { &args.only };
     let shell = workspace::shell()?;
     if std::env::var_os("CI").is_some() {
-        // Nothing is compiled twice there, and nobody looks with a debugger.
+        // In CI nothing is compiled twice, and nobody uses a debugger.
         for name in ["CARGO_INCREMENTAL", "CARGO_PROFILE_DEV_DEBUG"] {
             if std::env::var_os(name).is_none() {
                 shell.set_var(name, "0");
@@ -120,7 +121,7 @@ impl Step {
             Step::Features => features::check(shell)?,
             Step::Fuzz => {
                 let target = workspace::target().join("fuzz");
-                // A workspace of its own, but with everybody's versions.
+                // A separate workspace, but with the same versions.
                 shell.copy_file("Cargo.lock", "fuzz/Cargo.lock")?;
                 cmd!(shell, "cargo check --manifest-path fuzz/Cargo.toml --target-dir {target}").run()?;
             }

@@ -1,7 +1,7 @@
 //! Every test of the workspace, in one build.
 //!
-//! One selection of packages and features for all of them: cargo unifies features over what it builds at once, and any other selection
-//! would compile the same crates again with others.
+//! All use one selection of packages and features: cargo unifies features across what it builds at once, so another selection would
+//! compile the same crates again with other features.
 
 use anyhow::{Result, ensure};
 use xshell::{Cmd, Shell, cmd};
@@ -14,7 +14,7 @@ pub fn build(shell: &Shell) -> Result<()> {
     Ok(cargo_test(shell)?.arg("--no-run").run()?)
 }
 
-/// Runs them, those on the emulated board with the default board's firmware. With peers, they must not skip one.
+/// Runs them; those on the emulated board use the default board's firmware. If there are peers, none may be skipped.
 pub fn run(shell: &Shell, peers: Option<&Peers>) -> Result<()> {
     let mut test = cargo_test(shell)?;
     if let Some(peers) = peers {

@@ -1,8 +1,8 @@
 //! Finds a compiler for the chip.
 //!
-//! An ordinary rustup has the target's standard library, because `rust-toolchain.toml` names it. Where it is
-//! absent and cannot be fetched, Debian's packaged toolchain builds `core` from its own source. Core's source
-//! must be the compiler's own version, so the two toolchains' parts are never mixed.
+//! An ordinary rustup has the target's standard library, because `rust-toolchain.toml` names it. If it is
+//! absent and cannot be fetched, Debian's packaged toolchain builds `core` from source. That source must
+//! match the compiler's version, so parts of the two toolchains are never mixed.
 
 use std::path::{Path, PathBuf};
 
@@ -30,7 +30,7 @@ pub enum Toolchain {
 }
 
 impl Toolchain {
-    /// The toolchain that is here.
+    /// The toolchain that is installed.
     pub fn find(shell: &Shell) -> Result<Self> {
         if has_std(shell, TARGET)? {
             return Ok(Toolchain::Rustup);
@@ -48,7 +48,7 @@ impl Toolchain {
         )
     }
 
-    /// As [`Self::find`], but on Debian, as root, installs what is missing.
+    /// Like [`Self::find`], but on Debian, as root, installs what is missing.
     pub fn find_or_install(shell: &Shell) -> Result<Self> {
         match Self::find(shell) {
             Ok(toolchain) => Ok(toolchain),
@@ -61,7 +61,7 @@ impl Toolchain {
         }
     }
 
-    /// `cargo SUBCOMMAND` for the chip. Paths of this machine do not get into what it builds.
+    /// `cargo SUBCOMMAND` for the chip. What it builds contains no paths of this machine.
     pub fn cargo<'a>(self, shell: &'a Shell, subcommand: &str, target_dir: &Path) -> Result<Cmd<'a>> {
         let flags = remaps(shell, &sysroot(shell, self.rustc())?)?;
         Ok(self
@@ -69,7 +69,7 @@ impl Toolchain {
             .env("CARGO_ENCODED_RUSTFLAGS", flags))
     }
 
-    /// The way to check for a target with a standard library, of which rustup's is the first choice; `None` without one.
+    /// The toolchain that has a standard library for a target, preferably rustup's; `None` if neither has one.
     pub fn with_std(self, shell: &Shell, target: &str) -> Result<Option<Self>> {
         if has_std(shell, target)? {
             return Ok(Some(Toolchain::Rustup));
@@ -77,7 +77,7 @@ impl Toolchain {
         Ok((self == Toolchain::Debian).then_some(self))
     }
 
-    /// `cargo SUBCOMMAND` for a target; `parts` are those of the standard library that are built where there is none.
+    /// `cargo SUBCOMMAND` for a target; `parts` are the parts of the standard library to build if there is none.
     pub fn cargo_for<'a>(
         self,
         shell: &'a Shell,
@@ -98,7 +98,7 @@ impl Toolchain {
                 .arg(format!("-Zbuild-std={parts}"))
                 .env("RUSTC", DEBIAN_RUSTC)
                 .env("RUSTC_BOOTSTRAP", "1")
-                // `cargo clippy` takes the first cargo-clippy of the path, which must be of the same compiler.
+                // `cargo clippy` runs the first cargo-clippy on the path, which must belong to the same compiler.
                 .env("PATH", debian_first()?)
                 .env("CARGO_TARGET_THUMBV7EM_NONE_EABIHF_LINKER", "ld.lld")
                 .env_remove("RUSTUP_TOOLCHAIN")
@@ -107,7 +107,8 @@ impl Toolchain {
         Ok(cmd)
     }
 
-    /// What chooses the features of a standard library that is built, where it is: only what an executable cannot do without.
+    /// The argument that selects the features of the standard library if it is built: only those an executable cannot do
+    /// without.
     pub const fn std_features(self) -> Option<&'static str> {
         match self {
             Toolchain::Rustup => None,
@@ -159,15 +160,15 @@ fn sysroot(shell: &Shell, rustc: &str) -> Result<PathBuf> {
     Ok(cmd!(shell, "{rustc} --print sysroot").quiet().read()?.into())
 }
 
-/// Compiler flags, as `CARGO_ENCODED_RUSTFLAGS` wants them, that replace this machine's directories.
+/// Compiler flags, in `CARGO_ENCODED_RUSTFLAGS`' form, that replace this machine's directories.
 fn remaps(shell: &Shell, sysroot: &Path) -> Result<String> {
     let home = std::env::var_os("CARGO_HOME")
         .map(PathBuf::from)
         .or_else(|| std::env::home_dir().map(|home| home.join(".cargo")))
         .context("neither CARGO_HOME nor a home directory is known; set CARGO_HOME")?;
-    // The compiler takes the last flag that matches, so the most specific ones stand last.
+    // The compiler takes the last flag that matches, so the most specific ones come last.
     let mut flags = vec![remap(&home, "/cargo")];
-    // A registry's directory is named by the place it was fetched from, which is not the source's business.
+    // A registry's directory is named after where it was fetched from, which must not affect the result.
     if let Ok(registries) = shell.read_dir(home.join("registry/src")) {
         flags.extend(registries.iter().map(|registry| remap(registry, "/crates")));
     }
@@ -177,7 +178,7 @@ fn remaps(shell: &Shell, sysroot: &Path) -> Result<String> {
     }
     flags.push(remap(&library, "/rust"));
     flags.push(remap(&shell.current_dir(), "/cantap"));
-    // Both chips' core, for which the target's code is not arranged by itself.
+    // Both chips' core: the target alone does not schedule code for it.
     flags.push("-Ctarget-cpu=cortex-m4".to_owned());
     Ok(flags.join("\x1f"))
 }

@@ -1,4 +1,4 @@
-//! Spelling, by `typos`. Words that it does not know are in `typos.toml`.
+//! Spelling, by `typos`. Words that it would wrongly flag are in `typos.toml`.
 
 use anyhow::Result;
 use xshell::{Shell, cmd};
@@ -6,7 +6,7 @@ use xshell::{Shell, cmd};
 use crate::outcome::Outcome;
 use crate::{peers, toolchain};
 
-/// Looks through every file that belongs to the source.
+/// Checks every file that belongs to the source.
 pub fn check(shell: &Shell) -> Result<Outcome> {
     if !toolchain::is_installed("python3") {
         return Ok(Outcome::Skipped(

@@ -1,4 +1,4 @@
-//! Where things are in the source tree, and a shell that stands there.
+//! Where things are in the source tree, and a shell in its root.
 
 use std::path::{Path, PathBuf};
 
@@ -16,7 +16,7 @@ pub fn target() -> PathBuf {
     std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root().join("target"), PathBuf::from)
 }
 
-/// Where the finished firmware lies.
+/// Where the finished firmware is put.
 pub fn firmware_dir() -> PathBuf {
     target().join("firmware")
 }

@@ -1,4 +1,4 @@
-//! `cantap align`: traces of several recorders that heard the same bus, in one trace on one clock.
+//! `cantap align`: puts traces of several recorders on the same bus into one trace with one clock.
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -35,13 +35,13 @@ pub struct Args {
     /// The trace to write, with all channels.
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// The format of the traces, where neither their names nor their beginnings tell.
+    /// The format of the traces, if neither their names nor their beginnings show it.
     #[arg(long, value_name = "FORMAT", add = completion::formats())]
     from: Option<Format>,
-    /// Stop at the first thing in a trace that is wrong instead of leaving it out.
+    /// Stop at the first fault in a trace instead of leaving it out.
     #[arg(long)]
     strict: bool,
-    /// End with 3 if the stamps of any frame are further apart, such as 10us.
+    /// End with 3 if the stamps of any frame are farther apart than this, such as 10us.
     #[arg(long, value_name = "TIME", value_parser = duration)]
     check: Option<Duration>,
     /// Print one JSON object.
@@ -51,17 +51,17 @@ pub struct Args {
     write: WriteArgs,
 }
 
-/// One of the traces that are set on the first one's clock.
+/// One of the traces that are put on the first one's clock.
 struct Other {
     alignment: Alignment,
     verifier: Verifier,
 }
 
-/// What was found of it.
+/// The result for it.
 struct Found {
     alignment: Alignment,
     agreement: Agreement,
-    /// What is added to its channels.
+    /// Offset for its channels.
     channel_offset: u8,
 }
 
@@ -110,7 +110,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(if found.iter().all(within) { ExitCode::SUCCESS } else { ExitCode::from(exit::CHECK_FAILED) })
 }
 
-/// How each of the others relates to the first, and what is added to each trace's channels.
+/// How each of the others relates to the first, and the offset of each trace's channels.
 fn find(args: &Args) -> anyhow::Result<(Vec<Alignment>, Vec<u8>)> {
     let mut unclear = None;
     'longer: for length in RUN_LENGTHS {
@@ -153,7 +153,7 @@ fn sketch(args: &Args, path: &Path, length: usize) -> anyhow::Result<Sketch> {
     Ok(sketch)
 }
 
-/// Each trace's channels follow those of the traces before.
+/// Each trace's channels follow those of the previous traces.
 fn channel_offsets(sketches: &[Sketch]) -> anyhow::Result<Vec<u8>> {
     let mut next = 0_u8;
     sketches
@@ -168,7 +168,7 @@ fn channel_offsets(sketches: &[Sketch]) -> anyhow::Result<Vec<u8>> {
         .collect()
 }
 
-/// All traces as one, in order of the first one's time.
+/// All traces as one, ordered by the first one's time.
 struct Merged<'a> {
     sources: Vec<Records>,
     /// Each source's next record, on the first one's clock.
@@ -234,7 +234,7 @@ fn print(first: &Path, path: &Path, found: &Found) {
     println!(
         "its clock was {:+.6} s from the first one's and gains {:+.3} ppm on it{steps}",
         -(alignment.map.ahead_ns() as f64) / 1e9,
-        // No minus before a zero.
+        // Avoid a minus sign before zero.
         (-alignment.map.drift_ppm() * 1e3).round() / 1e3 + 0.0,
     );
     println!(

@@ -76,7 +76,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
 }
 
-/// Why there is no bit rate, and what to do.
+/// Why no bit rate was found, and what to do.
 pub fn failure(outcome: Outcome, channel: Channel, seconds: f64) -> String {
     let channel = channel.number();
     match outcome {

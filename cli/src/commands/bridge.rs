@@ -1,4 +1,4 @@
-//! `cantap bridge`: a device's channels as CAN interfaces of Linux, for every program that knows SocketCAN.
+//! `cantap bridge`: a device's channels as CAN interfaces of Linux, for every program that uses SocketCAN.
 
 mod frames;
 mod interface;
@@ -42,17 +42,18 @@ use crate::{advice, args, interrupt, live, stderr};
 pub struct Args {
     #[command(flatten)]
     board: OneBoard,
-    /// Interfaces: the first is channel 1's, the second channel 2's, unless a channel stands before it (2:can1).
+    /// Interfaces: the first is for channel 1, the second for channel 2, unless a channel comes before it
+    /// (2:can1).
     #[arg(required = true, num_args = 1..=2, value_name = "[CHANNEL:]INTERFACE")]
     interfaces: Vec<String>,
     #[command(flatten)]
     open: ChannelArgs,
 }
 
-/// How often to check whether to go on while nothing arrives.
+/// How often to check whether to continue while nothing arrives.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
 
-/// A device that both directions use.
+/// A device used by both directions.
 struct Handle(Arc<OpenDevice>);
 
 impl Borrow<Device> for Handle {
@@ -61,7 +62,7 @@ impl Borrow<Device> for Handle {
     }
 }
 
-/// Which interface is which channel's.
+/// Which interface belongs to which channel.
 fn places(interfaces: &[String]) -> anyhow::Result<Vec<(Channel, &str)>> {
     let mut places: Vec<(Channel, &str)> = Vec::new();
     for (text, usual) in interfaces.iter().zip(Channel::ALL) {
@@ -139,7 +140,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             Happening::Ended => break,
         }
         match line.device().map(|device| rescue.look(device)) {
-            // The stream tells.
+            // The stream reports it.
             Some(Err(error)) if !error.is_of_the_connection() => return Err(error.into()),
             _ => {}
         }
@@ -155,7 +156,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     stopped.map(|()| ExitCode::SUCCESS)
 }
 
-/// The way from the buses to programs.
+/// The direction from the buses to programs.
 struct Bridge<'l> {
     lanes: &'l [Lane],
     hearing: Hearing,
@@ -176,7 +177,7 @@ impl Bridge<'_> {
     }
 }
 
-/// What a user is told of a channel at its beginning.
+/// What to tell the user about a channel at its beginning.
 fn begun(lane: &Lane, device: Option<&OpenDevice>) -> String {
     let opened = device.map(|device| device.open_channels()).unwrap_or_default();
     let config = opened.iter().find(|(channel, _)| *channel == lane.channel).map(|(_, config)| config);
@@ -185,7 +186,7 @@ fn begun(lane: &Lane, device: Option<&OpenDevice>) -> String {
     format!("channel {} is at {}; {may}; Ctrl-C ends it", lane.channel.number(), lane.name)
 }
 
-/// And at its end.
+/// The same at its end.
 fn ended(lane: &Lane) -> String {
     let counts = &lane.counts;
     let [heard, lost, undelivered, sent, not_sent] =

@@ -35,7 +35,7 @@ pub struct Args {
     /// The sheet (EDS or DCF) of nodes; with a node's number before it (5:drive.eds), that node's. Can be repeated.
     #[arg(long = "eds", value_name = "[NODE:]FILE", global = true)]
     sheets: Vec<SheetPath>,
-    /// How long to wait for each answer; by default 1s, and 100ms for LSS.
+    /// How long to wait for each answer; default 1s, or 100ms for LSS.
     #[arg(long, value_name = "TIME", value_parser = args::positive_duration, global = true)]
     timeout: Option<Duration>,
     #[command(subcommand)]
@@ -59,13 +59,13 @@ enum What {
         #[arg(value_enum)]
         command: Command,
     },
-    /// Show what nodes say: states, emergencies, heartbeats that are missing, transfers of others. Nothing is sent.
+    /// Show what nodes say: states, emergencies, missing heartbeats, other clients' transfers. Nothing is sent.
     Monitor {
         /// End after this time.
         #[arg(short, long, value_name = "TIME", value_parser = args::positive_duration)]
         time: Option<Duration>,
     },
-    /// Send SYNC again and again, by the device's clock.
+    /// Send SYNC periodically, timed by the device's clock.
     Sync {
         #[command(flatten)]
         cyclic: Cyclic,
@@ -73,12 +73,12 @@ enum What {
         #[arg(long, value_name = "ID", default_value = "080")]
         cob_id: Id,
     },
-    /// Send the heartbeat of a node again and again, by the device's clock.
+    /// Send a node's heartbeat periodically, timed by the device's clock.
     Heartbeat {
-        /// The node that it pretends to be, 1 to 127.
+        /// The number of the node to imitate, 1 to 127.
         #[arg(value_parser = clap::value_parser!(u8).range(1..=127))]
         node: u8,
-        /// Its state.
+        /// The state to report.
         #[arg(long, value_enum, default_value = "operational")]
         state: State,
         #[command(flatten)]
@@ -88,16 +88,16 @@ enum What {
     Lss(lss::LssArgs),
 }
 
-/// How often.
+/// How often to send.
 #[derive(clap::Args)]
 struct Cyclic {
-    /// The time between two.
+    /// The time between two frames.
     #[arg(long, value_name = "TIME", value_parser = args::positive_duration)]
     period: Duration,
-    /// How many.
+    /// How many frames.
     #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     count: Option<u32>,
-    /// End after this time. Without it and --count, it goes on until Ctrl-C.
+    /// End after this time. Without this and --count, it continues until Ctrl-C.
     #[arg(short, long, value_name = "TIME", value_parser = args::positive_duration)]
     time: Option<Duration>,
 }
@@ -128,7 +128,7 @@ fn node_or_all(text: &str) -> Result<u8, String> {
     }
 }
 
-/// The time after a state was asked for in which it is heard.
+/// How long to listen for the new state after requesting it.
 const OBEYS: Duration = Duration::from_secs(1);
 const ANSWER: Duration = Duration::from_secs(1);
 
@@ -179,7 +179,7 @@ fn nmt(speak: &SpeakArgs, node: u8, command: Command, sheets: Vec<Sheet>) -> any
     speaking.run(&mut Announcement::new([frame]))?;
     let said = |event: &Event| matches!(event.kind, "nmt" | "boot_up" | "state" | "emergency");
     speaking.tell(said)?;
-    // What became of it, where nodes tell their states.
+    // Show the result, if nodes report their states.
     speaking.listen(OBEYS)?;
     let events = speaking.take_events();
     let is_heard = events.iter().any(|event| matches!(event.kind, "boot_up" | "state"));
@@ -188,7 +188,7 @@ fn nmt(speak: &SpeakArgs, node: u8, command: Command, sheets: Vec<Sheet>) -> any
     if !is_heard {
         let state = state_name(becomes).unwrap_or_default();
         eprintln!(
-            "cantap: the command was sent and acknowledged; no node told a new state within {} s, so whether it is {state} is not known",
+            "cantap: the command was sent and acknowledged; no node reported a new state within {} s, so it is unknown whether it is {state}",
             OBEYS.as_secs()
         );
     }

@@ -1,4 +1,4 @@
-//! `cantap capture`: what a device hears, into a file.
+//! `cantap capture`: captures what a device receives, into a file.
 
 mod sink;
 mod summary;
@@ -46,7 +46,7 @@ pub struct Args {
     /// 4, and so on. Without it, the board that is connected.
     #[arg(short, long = "device", value_name = "DEVICE", add = completion::devices())]
     devices: Vec<Address>,
-    /// Which channels: 1, 2, several as 1,3, or both, which is all.
+    /// Which channels: 1, 2, several as 1,3, or both, which means all.
     #[arg(short, long, default_value = "both", value_parser = args::channels, add = completion::channels())]
     channel: args::Channels,
     #[command(flatten)]
@@ -55,10 +55,11 @@ pub struct Args {
     /// twice (standard and extended) and 123:C00007FF once. Repeat for any of several.
     #[arg(short, long, value_name = "FILTER")]
     filter: Vec<Filter>,
-    /// File to write; its suffix picks the format, if --format does not. Without a suffix it is a candump log.
+    /// File to write; its suffix determines the format, unless --format does. Without a suffix it is a candump
+    /// log.
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Write over a file that is there already.
+    /// Overwrite an existing file.
     #[arg(long, requires = "output")]
     force: bool,
     /// End after this many frames.
@@ -67,8 +68,8 @@ pub struct Args {
     /// End after this time, as 10, 500ms or 2m.
     #[arg(short, long, value_parser = args::positive_duration)]
     time: Option<Duration>,
-    /// End with exit code 1 when every device has been away for this long. With -n it is 30s unless given, otherwise never: a device
-    /// that is back goes on.
+    /// End with exit code 1 when every device has been away for this long. The default is 30s with -n, otherwise never: a device
+    /// that comes back continues.
     #[arg(long, value_name = "TIME", value_parser = args::positive_duration)]
     give_up_after: Option<Duration>,
     /// Print one JSON object with the summary.
@@ -80,12 +81,12 @@ pub struct Args {
     write: WriteArgs,
 }
 
-/// With a number of frames to wait for, devices that have been away for this long are given up.
+/// When waiting for a number of frames, devices that have been away for this long are given up.
 const GIVE_UP_AFTER: Duration = Duration::from_secs(30);
-/// How long records may stay in memory while others follow slowly.
+/// How long records may stay in memory while others arrive slowly.
 const FLUSH_EVERY: Duration = Duration::from_millis(200);
 
-/// Whether a channel to open has no bit rate.
+/// Whether a channel to be opened has no bit rate.
 fn needs_bit_rate(args: &Args, board: usize, boards: &Boards) -> anyhow::Result<bool> {
     let timing = args.open.timing.on_board(board);
     for channel in boards.channels_of(board) {
@@ -112,7 +113,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let trigger = args.trigger.trigger(boards.addresses())?;
     let mut live = LiveRecords::open(&boards, &args.open, &args.filter, args.time)?;
     live.give_up_after(args.give_up_after.or(args.frames.map(|_| GIVE_UP_AFTER)));
-    // The time that was asked for runs from here.
+    // The requested time starts here.
     let started = Instant::now();
     let mut sink = create_sink(args, trigger, live.channels())?;
     let mut channels: Vec<_> = boards.channel_numbers().map(|number| (number, Meter::new(0))).collect();
@@ -146,7 +147,7 @@ fn create_sink(args: &Args, trigger: Option<Trigger>, channels: Vec<ChannelInfo>
     let mut sink = Sink::new(trigger);
     let path = match &args.output {
         Some(path) => path.as_path(),
-        // Standard output is for one JSON object then.
+        // Standard output is then reserved for one JSON object.
         None if args.json => return Ok(sink),
         None => Path::new("-"),
     };
@@ -161,11 +162,11 @@ fn refuse_output(args: &Args) -> anyhow::Result<()> {
     if args.write.options(implied_format(path))?.format.is_none() {
         Format::of_path(path)?;
     }
-    // Files that follow one another take numbers that are free.
+    // Files of a series get numbers that are free.
     if args.write.rotate.is_empty() { refuse_older(path, args.force) } else { Ok(()) }
 }
 
-/// The channels that are captured, by number.
+/// The captured channels, by number.
 struct Meters {
     channels: Vec<(u8, Meter)>,
 }
@@ -188,14 +189,15 @@ impl Args {
         self.filter.is_empty() || self.filter.iter().any(|filter| filter.accepts(record))
     }
 
-    /// Whether a record counts in the summary: errors say how the bus is, whatever is captured of it.
+    /// Whether a record counts in the summary: errors describe the state of the bus, whatever is captured of
+    /// it.
     fn counts(&self, record: &TraceRecord) -> bool {
         matches!(record.event, TraceEvent::BusError { .. } | TraceEvent::ErrorsSuppressed { .. })
             || self.accepts(record)
     }
 }
 
-/// Writes what is captured until Ctrl-C or a limit, and what had been captured by then.
+/// Writes what is captured until Ctrl-C or a limit, including what had been captured by then.
 fn write_all(
     args: &Args,
     live: &mut LiveRecords,
@@ -228,7 +230,7 @@ fn write_all(
         }
         for (board, device) in live.lines().devices() {
             match rescues[board].look(device) {
-                // The stream tells.
+                // The stream reports it.
                 Err(error) if error.is_of_the_connection() => {}
                 looked => looked?,
             }
@@ -237,17 +239,17 @@ fn write_all(
     Ok(())
 }
 
-/// What the terminal shows of a capture into a file while it runs.
+/// The terminal's display of a capture into a file while it runs.
 struct View {
     progress: Progress,
     path: PathBuf,
     started: Instant,
-    /// When it was last written, with the frames of each channel by then.
+    /// When it was last updated, with the number of frames of each channel at that time.
     before: Option<(Instant, Vec<u64>)>,
 }
 
 impl View {
-    /// Where records go to standard output, they are what is seen.
+    /// If records go to standard output, they are the display.
     fn of(args: &Args) -> Option<Self> {
         let path = args.output.clone().filter(|path| path.as_os_str() != "-")?;
         Some(Self { progress: Progress::start()?, path, started: Instant::now(), before: None })
@@ -280,19 +282,19 @@ impl View {
     }
 }
 
-/// Whether a limit is reached, so that what follows is not wanted.
+/// Whether a limit has been reached, so that nothing more is wanted.
 fn is_enough(args: &Args, sink: &Sink, meters: &Meters) -> bool {
     args.frames.is_some_and(|frames| meters.frames() >= frames)
         || sink.trigger.as_ref().is_some_and(|trigger| args.trigger.is_over(trigger))
 }
 
-/// The format where the file's suffix does not say one.
+/// The format if the file's suffix does not determine one.
 fn implied_format(path: &Path) -> Option<Format> {
     path.extension().is_none().then_some(Format::Candump)
 }
 
-/// How many frames are in the one regular file that was written, by reading it again; `None` if there is no such file, or
-/// not every frame was meant for it.
+/// The number of frames in the only regular file that was written, by reading it again; `None` if there is no such file,
+/// or not every frame was meant for it.
 fn frames_in_file(args: &Args) -> Option<u64> {
     let is_one = args.write.rotate.is_empty() && args.trigger.trigger.is_none();
     let path = args.output.as_deref().filter(|path| is_one && path.is_file())?;

@@ -1,4 +1,4 @@
-//! What is done to the device itself: `cantap identify` and `cantap reset`.
+//! Commands for the device itself: `cantap identify` and `cantap reset`.
 
 use std::io::Write;
 use std::process::ExitCode;

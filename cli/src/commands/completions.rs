@@ -1,4 +1,4 @@
-//! `cantap completions`: what a shell needs to complete the command line.
+//! `cantap completions`: a shell's script for completing the command line.
 
 use std::process::ExitCode;
 

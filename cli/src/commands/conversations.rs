@@ -48,10 +48,10 @@ pub struct Args {
     protocols: Vec<Protocol>,
     #[command(flatten)]
     help: ProtocolArgs,
-    /// Only what went wrong: refusals, requests without a response, transfers that broke.
+    /// Only what went wrong: refusals, unanswered requests, broken transfers.
     #[arg(long)]
     faults: bool,
-    /// Print one JSON object per line, and behind them one with the summary.
+    /// Print one JSON object per line, followed by one with the summary.
     #[arg(long)]
     json: bool,
     /// Leave out the summary.

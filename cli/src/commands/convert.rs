@@ -45,34 +45,36 @@ pub struct Args {
     /// The trace to write; - for standard output.
     #[arg(value_name = "OUT")]
     output: PathBuf,
-    /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j. Any of several.
+    /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j. If several are given, any may
+    /// match.
     #[arg(value_name = "FILTER")]
     filters: Vec<Filter>,
-    /// The format of IN, where neither its content nor its name tell, or tell the wrong one. All are listed below.
+    /// The format of IN, if neither its content nor its name show it, or show the wrong one. All are listed below.
     #[arg(long, value_name = "FORMAT", add = completion::formats())]
     from: Option<Format>,
     /// Wait for more at the end of IN, until Ctrl-C.
     #[arg(long)]
     follow: bool,
-    /// Stop at the first thing in IN that is wrong instead of leaving it out.
+    /// Stop at the first fault in IN instead of leaving it out.
     #[arg(long)]
     strict: bool,
     /// Only these frames, as FILTER.
     #[arg(short, long = "filter", value_name = "FILTER")]
     filter_options: Vec<Filter>,
-    /// Only these channels: 1, 2, several as 1,3. Can be repeated. All without it.
+    /// Only these channels: 1, 2, several as 1,3. Can be repeated. Default: all.
     #[arg(short, long, value_delimiter = ',', value_parser = args::channel_of_trace)]
     channel: Vec<u8>,
-    /// From here on: seconds from the first record (also 90s, 10m, 2h), seconds since 1970, or a date in UTC.
+    /// From this time: seconds from the first record (also 90s, 10m, 2h), seconds since 1970, or a date in
+    /// UTC.
     #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
     start: Option<TimePoint>,
-    /// Up to here, exclusive.
+    /// Up to this time, exclusive.
     #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
     end: Option<TimePoint>,
     #[command(flatten)]
     write: WriteArgs,
-    /// Make OUT a folder of Parquet files, in folders named by these in this order: day, channel, or NAME=VALUE. Engines read it as
-    /// one table. Files are called as IN: converting it again replaces them.
+    /// Make OUT a folder of Parquet files, in folders named after these, in this order: day, channel, or NAME=VALUE. Engines read
+    /// it as one table. The files are named after IN: converting it again replaces them.
     #[cfg(feature = "parquet")]
     #[arg(long, value_name = "KEY", value_delimiter = ',', conflicts_with = "format")]
     partition: Vec<Key>,
@@ -81,10 +83,10 @@ pub struct Args {
     json: bool,
 }
 
-/// How to write; for other commands to flatten too.
+/// Output options; other commands flatten them too.
 #[derive(clap::Args)]
 pub struct WriteArgs {
-    /// The format to write, where the file's name does not tell: candump, asc, blf, trc (2.1), trc2.0, trc1.3, trc1.2,
+    /// The format to write, if the file's name does not show it: candump, asc, blf, trc (2.1), trc2.0, trc1.3, trc1.2,
     /// trc1.1, trc1.0, csv (python-can's), csv-full, csv-analyser, csv-gvret, pcapng, mf4, dif.
     #[arg(long, visible_alias = "to", value_name = "FORMAT", add = completion::written_formats())]
     format: Option<Format>,
@@ -94,19 +96,19 @@ pub struct WriteArgs {
     /// Keep only this many of these files: the oldest are deleted.
     #[arg(long, value_name = "N", requires = "rotate", value_parser = clap::value_parser!(u32).range(1..))]
     keep: Option<u32>,
-    /// What separates the columns of the earlier analyser's CSV.
+    /// The column separator of the earlier analyser's CSV.
     #[arg(long, value_name = "CHARACTER", default_value = ";", value_parser = character)]
     separator: u8,
-    /// What separates fractions in the earlier analyser's tables.
+    /// The decimal mark of the earlier analyser's tables.
     #[arg(long, value_name = "CHARACTER", default_value = ",", value_parser = character)]
     decimal_mark: u8,
-    /// How lines of the earlier analyser's tables end.
+    /// The line ends of the earlier analyser's tables.
     #[arg(long, value_name = "END", default_value = "crlf", value_parser = ["crlf", "lf"])]
     line_end: String,
     /// What VECTORS counts in DIF, and whether V or an empty line follows a number: columns and V, or rows.
     #[arg(long, value_name = "CONVENTION", default_value = "columns", value_parser = ["columns", "rows"])]
     dif: String,
-    /// The time zone of dates in files that name none, read or written: Europe/Berlin, +02:00.
+    /// The time zone of dates in files that do not name one, when reading or writing: Europe/Berlin, +02:00.
     #[arg(long, value_name = "ZONE", default_value_t)]
     pub zone: Zone,
 }
@@ -122,7 +124,7 @@ fn character(text: &str) -> Result<u8, String> {
 }
 
 impl WriteArgs {
-    /// The library's options, with the format of a file whose name does not tell it.
+    /// The library's options, with the format for a file whose name does not show it.
     pub fn options(&self, implied: Option<Format>) -> anyhow::Result<WriteOptions> {
         if self.separator == self.decimal_mark {
             bail!("the separator and the decimal mark are the same character; choose different ones");
@@ -137,7 +139,7 @@ impl WriteArgs {
 }
 
 impl Args {
-    /// Whether OUT is no trace file but columns.
+    /// Whether OUT contains columns rather than a trace.
     fn is_columns(&self) -> anyhow::Result<bool> {
         #[cfg(feature = "parquet")]
         {
@@ -177,7 +179,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         interrupt::watch()?;
     }
     let mut output: Option<TraceOutput> = None;
-    // Not before there is something to write: where nothing can be read, an older OUT stays as it is.
+    // Only once there is something to write: if nothing can be read, an older OUT stays unchanged.
     let create = || args.create(&options, grows);
     let mut window = TimeRange::new(args.start, args.end);
     let mut written = 0_u64;
@@ -193,7 +195,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             none => none.insert(create()?),
         };
         for record in &batch {
-            // The window's first record is the trace's, whatever the channel.
+            // The window starts at the trace's first record, whatever its channel.
             let inside = window.contains(record);
             if inside && (args.channel.is_empty() || args.channel.contains(&record.channel)) {
                 output.write(record)?;
@@ -226,7 +228,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Creating OUT empties it: if it is IN, the trace would be gone.
+/// Creating OUT empties it: if it were IN, the trace would be lost.
 pub fn refuse_same_file(input: &Path, output: &Path) -> anyhow::Result<()> {
     if input.as_os_str() == "-" || output.as_os_str() == "-" {
         return Ok(());

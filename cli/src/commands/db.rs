@@ -1,4 +1,4 @@
-//! `cantap db`: what databases say, and how they suit a trace.
+//! `cantap db`: the content of databases, and how they match a trace.
 
 mod coverage;
 mod describe;
@@ -30,13 +30,13 @@ pub struct Args {
     /// (3 or 8 digits). Can be repeated.
     #[arg(long = "message", value_name = "PATTERN", add = completion::messages())]
     messages: Vec<String>,
-    /// Compare with this trace: which identifiers the databases lack, which messages never came, actual against nominal cycles.
+    /// Compare with this trace: identifiers missing from the databases, messages that never came, actual and nominal cycles.
     #[arg(long, value_name = "TRACE", conflicts_with = "messages")]
     coverage: Option<PathBuf>,
     /// List everything that is wrong with the files.
     #[arg(long, conflicts_with_all = ["messages", "coverage"])]
     warnings: bool,
-    /// Take all 29-bit messages for J1939 parameter groups, even if the database does not say so.
+    /// Treat all 29-bit messages as J1939 parameter groups, even if the database does not say so.
     #[arg(long)]
     j1939: bool,
     /// Print one JSON object.

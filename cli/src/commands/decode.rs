@@ -28,14 +28,14 @@ use crate::input::Records;
 use crate::protocols::{Read, Reading};
 use crate::wrong::wrong;
 
-/// What the summary says.
+/// The figures in the summary.
 #[derive(Default, serde::Serialize)]
 struct Count {
     frames: u64,
     decoded: u64,
     values: u64,
     lost: u64,
-    /// What was said, with `--protocols`.
+    /// Number of events, with `--protocols`.
     #[serde(skip_serializing_if = "is_zero")]
     events: u64,
 }
@@ -131,7 +131,7 @@ fn one(
     let Some(frame) = record.frame() else { return output.push_event(record) };
     count.frames += 1;
     let Some(reference) = decoder.decode(record.channel, frame, values) else { return Ok(()) };
-    // Chosen signals only: a message without any of them is not worth a line.
+    // With chosen signals only, a message without any of them is not worth a line.
     if values.is_empty() && !args.signals.is_empty() {
         return Ok(());
     }

@@ -1,4 +1,4 @@
-//! `cantap defaults`: what a device keeps over a power cycle. Nothing here opens a channel.
+//! `cantap defaults`: what a device keeps across a power cycle. Nothing here opens a channel.
 
 use std::io::Write;
 use std::process::ExitCode;
@@ -28,7 +28,7 @@ pub struct Args {
 
 #[derive(clap::Subcommand)]
 enum Action {
-    /// Store how channels are opened, so that it survives a power cycle; commands without -b use it.
+    /// Store how channels are opened, so that this survives a power cycle; commands without -b use it.
     Save(Save),
     /// Print what is stored.
     Show(Show),
@@ -99,7 +99,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// The options that are set, as the command line names them.
+/// The options that are set, by their names on the command line.
 fn flags(defaults: &Defaults) -> Vec<&'static str> {
     let config = &defaults.config;
     [

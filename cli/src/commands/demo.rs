@@ -1,4 +1,4 @@
-//! `cantap demo`: the worst traffic there is, without a board, and the check that nothing is lost silently.
+//! `cantap demo`: the worst possible traffic, without a board, and the check that nothing is lost silently.
 
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
@@ -42,7 +42,7 @@ pub struct Args {
     /// Which frames: std0, std8, ext0, ext8, rtr or mix.
     #[arg(long, alias = "frames", default_value = "std0")]
     kind: Frames,
-    /// The host stops reading for this time in mid-run.
+    /// Make the host stop reading for this time in mid-run.
     #[arg(long, value_name = "TIME", value_parser = args::duration)]
     stall: Option<Duration>,
     /// Keep the captured trace in this file.
@@ -54,7 +54,7 @@ pub struct Args {
 }
 
 const BITRATE_BPS: u32 = 1_000_000;
-/// How long the capture goes on before and after a stall, at least.
+/// The minimum time for which the capture runs before and after a stall.
 const AROUND_STALL: Duration = Duration::from_secs(1);
 const LOOK_EVERY: Duration = Duration::from_millis(50);
 
@@ -139,7 +139,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(if summary.ok { ExitCode::SUCCESS } else { ExitCode::from(exit::CHECK_FAILED) })
 }
 
-/// What is kept of the records as they come.
+/// What is kept of the records as they arrive.
 struct Books {
     meters: [Meter; CHANNELS],
     checks: [SequenceCheck; CHANNELS],
@@ -176,7 +176,7 @@ impl Books {
     }
 }
 
-/// Takes what had been captured when the channels were closed.
+/// Takes what had been captured by the time the channels were closed.
 fn drain(records: &mut Records, books: &mut Books, file: &mut TraceFile) -> anyhow::Result<()> {
     for record in records {
         let record = record?;
@@ -258,7 +258,7 @@ impl TraceFile {
         Ok(Self { writer, temporary })
     }
 
-    /// Ends the file. Returns how many frames it holds, if it is ours to read back.
+    /// Ends the file. Returns how many frames it contains, if it can be read back.
     fn finish(self) -> anyhow::Result<Option<u64>> {
         self.writer.finish().context("the trace cannot be written; make room on the disk")?;
         let Some(path) = self.temporary else { return Ok(None) };
@@ -270,13 +270,13 @@ impl TraceFile {
     }
 }
 
-/// A pause of the host's reading: from when, for how long.
+/// A pause in the host's reading: its start and length.
 #[derive(Clone, Default)]
 struct Stall(Arc<OnceLock<(Instant, Duration)>>);
 
 impl Stall {
     fn plan(&self, from: Instant, length: Duration) {
-        // It is planned once.
+        // It is set only once.
         let _ = self.0.set((from, length));
     }
 }

@@ -1,4 +1,4 @@
-//! `cantap diff`: what two traces say differently.
+//! `cantap diff`: how two traces differ.
 
 mod protocols;
 
@@ -31,10 +31,10 @@ pub struct Args {
     /// Mean periods count as changed if they differ by more than this many percent.
     #[arg(long, value_name = "PERCENT", default_value_t = 10.0, value_parser = percent)]
     tolerance: f64,
-    /// Compare identifiers whatever channel they are on.
+    /// Compare identifiers regardless of channel.
     #[arg(long)]
     ignore_channels: bool,
-    /// Compare nodes and objects too, by the protocols that each trace shows.
+    /// Also compare nodes and objects, by the protocols found in each trace.
     #[arg(long)]
     protocols: bool,
     #[command(flatten)]

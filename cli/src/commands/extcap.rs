@@ -1,5 +1,5 @@
-//! `cantap extcap`: boards as interfaces of Wireshark. It is Wireshark that calls it, with the arguments of extcap(4), and through a name
-//! in a folder of its own that `cantap extcap install` puts there.
+//! `cantap extcap`: boards as interfaces of Wireshark. Wireshark itself calls it, with the arguments of extcap(4), through a name in a
+//! separate folder that `cantap extcap install` puts there.
 
 mod bit_rates;
 mod capture;
@@ -43,10 +43,10 @@ pub struct Args {
     /// List the interfaces.
     #[arg(long, help_heading = WIRESHARK)]
     extcap_interfaces: bool,
-    /// Which Wireshark asks.
+    /// Wireshark's version.
     #[arg(long, value_name = "VERSION", num_args = 0..=1, default_missing_value = "", help_heading = WIRESHARK)]
     extcap_version: Option<String>,
-    /// The interface that is meant.
+    /// The interface concerned.
     #[arg(long, value_name = "INTERFACE", help_heading = WIRESHARK)]
     extcap_interface: Option<String>,
     /// List the link types of an interface.
@@ -55,7 +55,7 @@ pub struct Args {
     /// List the options of an interface.
     #[arg(long, requires = "extcap_interface", help_heading = WIRESHARK)]
     extcap_config: bool,
-    /// List the values of one option anew.
+    /// List the values of one option again.
     #[arg(long, value_name = "OPTION", help_heading = WIRESHARK)]
     extcap_reload_option: Option<String>,
     /// Capture, until stopped.
@@ -64,10 +64,10 @@ pub struct Args {
     /// The pipe to write to.
     #[arg(long, value_name = "PIPE", help_heading = WIRESHARK)]
     fifo: Option<PathBuf>,
-    /// Only these frames, in candump's syntax. Without --capture it is only checked.
+    /// Only these frames, in candump's syntax. Without --capture this is only checked.
     #[arg(long, value_name = "FILTERS", value_parser = filters, help_heading = WIRESHARK)]
     extcap_capture_filter: Option<Filters>,
-    /// The pipe that tells what is changed in the toolbar.
+    /// The pipe with changes in the toolbar.
     #[arg(long, value_name = "PIPE", help_heading = WIRESHARK)]
     extcap_control_in: Option<PathBuf>,
     /// The pipe to the toolbar.
@@ -76,13 +76,14 @@ pub struct Args {
     /// Clean up after a capture that was killed: there is nothing to do.
     #[arg(long, help_heading = WIRESHARK)]
     extcap_cleanup_postkill: bool,
-    /// Where the device of the interface cantap-address is: a server, a serial port, virtual:OPTIONS.
+    /// The address of the device of the interface cantap-address: a server, a serial port, virtual:OPTIONS.
     #[arg(short, long, help_heading = OPTIONS, add = completion::devices())]
     device: Option<Address>,
-    /// Bit rate of channel 1 in bit/s; auto: saved on the board, else found by listening; off: not captured.
+    /// Bit rate of channel 1 in bit/s; auto: as saved on the board, otherwise found by listening; off: not
+    /// captured.
     #[arg(long, value_name = "RATE", default_value = "auto", help_heading = OPTIONS)]
     bitrate1: BitRate,
-    /// Bit rate of channel 2, alike.
+    /// The same for channel 2.
     #[arg(long, value_name = "RATE", default_value = "auto", help_heading = OPTIONS)]
     bitrate2: BitRate,
     /// How to take part in the buses.
@@ -95,7 +96,7 @@ const OPTIONS: &str = "Options of an interface";
 
 #[derive(clap::Subcommand)]
 enum Action {
-    /// Put it where Wireshark looks, or take it away.
+    /// Put it where Wireshark looks, or remove it.
     Install(install::Args),
 }
 
@@ -107,16 +108,16 @@ enum ModeArg {
     Normal,
 }
 
-/// Several, of which one is enough.
+/// Several filters, any of which may match.
 #[derive(Clone, Debug, PartialEq)]
 struct Filters(Vec<Filter>);
 
 fn filters(text: &str) -> Result<Filters, String> {
-    let parse = |word: &str| word.parse().map_err(|error| format!("'{word}' is no filter: {error}"));
+    let parse = |word: &str| word.parse().map_err(|error| format!("'{word}' is not a filter: {error}"));
     text.split_whitespace().map(parse).collect::<Result<_, _>>().map(Filters)
 }
 
-/// The arguments as this command takes them. Wireshark starts what is in its folder without a subcommand.
+/// Converts the arguments for this command. Wireshark starts what is in its folder without a subcommand.
 pub fn arguments(given: impl Iterator<Item = OsString>) -> Vec<OsString> {
     let mut arguments: Vec<_> = given.collect();
     let is_wireshark = arguments.get(1).and_then(|first| first.to_str()).is_some_and(|first| {
@@ -133,7 +134,7 @@ pub fn run(args: Args) -> anyhow::Result<ExitCode> {
     if let Some(Action::Install(args)) = &args.command {
         return install::run(args);
     }
-    // The version stands in front of the interfaces.
+    // The version comes before the interfaces.
     if args.extcap_interfaces || args.extcap_interface.is_none() && args.extcap_version.is_some() {
         return say(&sentences::interfaces(&places::all()));
     }
@@ -209,6 +210,6 @@ mod tests {
     fn a_capture_filter_is_several_of_candumps() {
         assert_eq!(filters("").unwrap().0.len(), 0);
         assert_eq!(filters("can0,123:7FF  #FF").unwrap().0.len(), 2);
-        assert!(filters("tcp port 80").unwrap_err().starts_with("'tcp' is no filter"));
+        assert!(filters("tcp port 80").unwrap_err().starts_with("'tcp' is not a filter"));
     }
 }

@@ -38,11 +38,11 @@ pub struct Args {
     channel: Channels,
     #[command(flatten)]
     open: ChannelArgs,
-    /// Time from one frame to the next in milliseconds; 0 as fast as the bus takes them.
+    /// Time from one frame to the next in milliseconds; 0 for as fast as the bus can take them.
     #[arg(short, long, value_name = "MS", default_value_t = 200.0, value_parser = gap)]
     gap: f64,
-    /// Fill the bus: no gap, and frames without data, the most that a bus can carry, unless -L or -D says otherwise. Says at
-    /// the end how full it was.
+    /// Fill the bus: no gap, and frames without data (the most that a bus can carry), unless -L or -D says otherwise.
+    /// Reports at the end how full it was.
     #[arg(long, conflicts_with_all = ["gap", "burst"])]
     saturate: bool,
     /// 29-bit identifiers.
@@ -66,28 +66,29 @@ pub struct Args {
     /// End after this many frames.
     #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     frames: Option<u64>,
-    /// Frames of a burst: they follow one another at once, and the gap is from burst to burst.
+    /// Frames per burst: they are sent back to back, and the gap is from burst to burst.
     #[arg(short = 'c', long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     burst: u32,
     /// Lengths up to 15, of which a controller carries eight bytes.
     #[arg(short = '8', long)]
     raw_dlc: bool,
-    /// Accepted as cangen's: a full queue is always waited for.
+    /// Accepted for compatibility with cangen: a full queue is always waited for.
     #[arg(short = 'p', value_name = "MS", hide = true, value_parser = gap)]
     poll: Option<f64>,
-    /// Accepted as cangen's: a full queue is no error here.
+    /// Accepted for compatibility with cangen: a full queue is not an error here.
     #[arg(short = 'i', hide = true)]
     ignore_full: bool,
-    /// Accepted as cangen's: what this device sends does not come back to other programs of this computer anyway.
+    /// Accepted for compatibility with cangen: what this device sends never comes back to other programs on this
+    /// computer.
     #[arg(short = 'x', hide = true)]
     no_loopback: bool,
-    /// Refused: this is cangen's CAN FD.
+    /// Refused: in cangen this means CAN FD.
     #[arg(short = 'f', hide = true)]
     fd: bool,
     /// Refused: see -f.
     #[arg(short = 'E', hide = true)]
     fd_error_state: bool,
-    /// Makes another sequence.
+    /// Select another sequence.
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// Print each frame that was sent.
@@ -109,7 +110,7 @@ fn channels(text: &str) -> Result<Channels, String> {
     Ok([channel].into_iter().collect())
 }
 
-/// Where a number comes from.
+/// The source of a number.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Values {
     Random,
@@ -154,7 +155,7 @@ fn data(text: &str) -> Result<Data, String> {
     if let Some(mode) = mode(text) {
         return Ok(Data::Varying(mode));
     }
-    // The frame's own parser knows what data look like.
+    // The frame's own parser checks the data.
     let frame = format!("000#{text}").parse::<Frame>().ok().filter(|frame| !frame.is_remote());
     frame
         .map(|frame| Data::Fixed(frame.data().to_vec()))
@@ -166,7 +167,7 @@ fn gap(text: &str) -> Result<f64, String> {
     value.ok_or_else(|| "write milliseconds, such as 200 or 0.5".to_owned())
 }
 
-/// Makes the frames.
+/// Generates the frames.
 struct Generator<'a> {
     args: &'a Args,
     random: fastrand::Rng,
@@ -178,7 +179,7 @@ impl Generator<'_> {
         match values {
             Values::Random => self.random.u32(..below),
             Values::Even => self.random.u32(..below) & !1,
-            // Of an odd limit (lengths 0 to 8) the highest number is even.
+            // With an odd limit (lengths 0 to 8), the highest number is even.
             Values::Odd => self.random.u32(..below & !1) | 1,
             Values::Count => (self.count % u64::from(below)) as u32,
             Values::Fixed(value) => value,
@@ -207,7 +208,7 @@ impl Generator<'_> {
         let mut bytes = [0; 8];
         match data {
             Data::Fixed(fixed) => bytes[..fixed.len()].copy_from_slice(fixed),
-            // Counts as one number, the first byte fastest, as cangen does.
+            // Counts as one number, least significant byte first, as cangen does.
             Data::Varying(Values::Count) => bytes = self.count.to_le_bytes(),
             Data::Varying(values) => {
                 let (keep, set) = match values {
@@ -223,7 +224,7 @@ impl Generator<'_> {
     }
 }
 
-/// How full the buses were, from the first frame that was sent to the last that was seen to end.
+/// How full the buses were, from the first frame sent to the last one known to have ended.
 struct Filled {
     bitrates_bps: [u32; CHANNELS],
     frames: [u64; CHANNELS],
@@ -251,7 +252,7 @@ impl Filled {
         }
     }
 
-    /// Each channel's frames in a second, and its load in per cent, from what was sent here alone.
+    /// Each channel's frames per second, and its load in per cent, counting only what was sent here.
     fn rates(&self, tick_hz: u32) -> impl Iterator<Item = (Channel, f64, f64)> + use<'_> {
         Channel::ALL.into_iter().filter_map(move |channel| {
             let index = channel.index();
@@ -300,7 +301,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         bitrates_bps[channel.index()] = config.timing.bitrate_bps(device.hello().can_clock_hz);
     }
     let gap = Duration::from_secs_f64(if args.saturate { 0.0 } else { args.gap / 1e3 });
-    // A trace of frames that all end at once, held apart by the gap.
+    // A trace in which all frames end at the same time, separated by the gap.
     let pace = Pace { shortest_gap: gap, burst: args.burst, ignore_times: gap.is_zero(), ..Pace::default() };
     let mut replay = Replay::new(&device, pace, bitrates_bps)?;
     let mut sending = Sending::new(&device, args.open.rescue(), !args.verbose);
@@ -368,7 +369,7 @@ mod tests {
         assert_eq!(frames("-I 7FF -L 4 -R", 1), ["7FF#R4"]);
         assert_eq!(frames("-e -I 1 -L 0", 1), ["00000001#"]);
         assert_eq!(frames("-I 1FFFFFFF -L 0", 1), ["1FFFFFFF#"]);
-        // Data that count up are one byte at least.
+        // Counting data have at least one byte.
         assert_eq!(frames("-I 1 -L 0 -D i", 2), ["001#00", "001#01"]);
         assert!(frames("-I 1 -L r -D i", 200).iter().all(|frame| !frame.ends_with('#')));
         assert_eq!(frames("-I 1 -L 15 -8 -D 1122334455667788", 1), ["001#1122334455667788_F"]);

@@ -20,7 +20,7 @@ pub struct Args {
     json: bool,
 }
 
-/// The device's abilities by name.
+/// Names of the device's capabilities.
 const CAPABILITIES: [(u32, &str); 6] = [
     (capability::TRANSMIT, "transmit"),
     (capability::TIMED_TRANSMIT, "timed-transmit"),

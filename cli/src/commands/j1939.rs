@@ -1,4 +1,4 @@
-//! `cantap j1939`: a node of its own.
+//! `cantap j1939`: acts as a node.
 
 use std::process::ExitCode;
 
@@ -17,9 +17,10 @@ const CLAIM: u32 = 0xEE00;
 /// Active trouble codes.
 const DM1: u32 = 0xFECA;
 const GLOBAL: u8 = 255;
-/// An off-board diagnostic tool (J1939-81), that takes any address; its maker is nobody, and its number is made up.
+/// An off-board diagnostic tool (J1939-81) that accepts any address, without a manufacturer and with a random
+/// number.
 const TOOL: u64 = 1 << 63 | 29 << 40 | 0x7FF << 21;
-/// What a message may have at most, in bytes.
+/// The longest message, in bytes.
 const MOST_BYTES: usize = 1785;
 
 /// The command line.
@@ -39,7 +40,7 @@ pub struct Args {
     /// The address to claim, 0 to 253.
     #[arg(long, value_name = "ADDRESS", default_value_t = 249, value_parser = clap::value_parser!(u8).range(0..=253), global = true)]
     address: u8,
-    /// The NAME to claim it with, 16 hexadecimal digits; without it, that of a diagnostic tool with a number that is made up.
+    /// The NAME to claim it with, 16 hexadecimal digits; without it, that of a diagnostic tool with a random number.
     #[arg(long, value_name = "HEX", value_parser = name, global = true)]
     name: Option<u64>,
     #[command(subcommand)]
@@ -48,12 +49,12 @@ pub struct Args {
 
 #[derive(clap::Subcommand)]
 enum What {
-    /// Ask for a parameter group, and show the answer, however many frames it has.
+    /// Request a parameter group, and show the answer, however many frames it has.
     Request {
         /// The group: 65260, or 0xFEEC.
         #[arg(value_parser = pgn)]
         pgn: u32,
-        /// Who is asked: an address, or all.
+        /// Whom to ask: an address, or all.
         #[arg(long, value_name = "ADDRESS", default_value = "all", value_parser = address)]
         to: u8,
     },
@@ -61,7 +62,7 @@ enum What {
     Claim,
     /// Show active trouble codes.
     Dm1 {
-        /// Who is asked: an address, or all.
+        /// Whom to ask: an address, or all.
         #[arg(long, value_name = "ADDRESS", default_value = "all", value_parser = address)]
         to: u8,
     },
@@ -73,7 +74,7 @@ enum What {
         /// Its bytes in hexadecimal.
         #[arg(value_name = "HEX", value_parser = bytes)]
         data: Bytes,
-        /// To whom: an address, or all.
+        /// The receiver: an address, or all.
         #[arg(long, value_name = "ADDRESS", default_value = "all", value_parser = address)]
         to: u8,
         /// 0, the highest, to 7.
@@ -174,7 +175,7 @@ fn is_answer(event: &Event, pgn: u32, to: u8, own: u8) -> bool {
 fn finish<T>(speaking: &Speaking<'_>, ended: Result<T, StationError>, args: &Args) -> anyhow::Result<()> {
     match ended {
         Ok(_) => Ok(()),
-        // Nobody but this one is an answer, too.
+        // That there is no other node is also an answer.
         Err(StationError::NoAnswer { .. }) if matches!(args.what, What::Claim) => Ok(()),
         Err(error @ StationError::NoAnswer { .. }) => {
             Err(anyhow!("{error}; {}; `cantap j1939 claim` shows who is there", speaking.circumstances()))

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 /// The command line.
 #[derive(clap::Args)]
 pub struct Args {
-    /// The directory to write to, which must be there.
+    /// The directory to write to, which must exist.
     directory: PathBuf,
 }
 

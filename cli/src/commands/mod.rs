@@ -53,54 +53,54 @@ pub enum Command {
     Stats(stats::Args),
     /// Convert a trace from any format to any other: filtered, cut out, split.
     Convert(convert::Args),
-    /// Show what two traces say differently: IDs, periods, lengths, bits.
+    /// Compare two traces: IDs, periods, lengths, bits.
     Diff(diff::Args),
-    /// Set traces of several recorders on one clock by the frames that they share.
+    /// Put traces of several recorders on one clock, using the frames that they have in common.
     Align(align::Args),
     /// Find frames in a trace by ID, data or a condition on signals.
     Search(search::Args),
-    /// List every bit timing of a bit rate, what each is worth, and the one to choose.
+    /// List every bit timing for a bit rate, with the properties of each, and the recommended one.
     Timing(timing::Args),
-    /// Capture what a device hears into a file.
+    /// Capture what a device receives into a file.
     Capture(capture::Args),
     /// Show what the frames mean: requests and responses, transfers, by protocol.
     Conversations(conversations::Args),
-    /// Ask a vehicle by OBD-II: what it supports, live values, trouble codes, its VIN.
+    /// Query a vehicle by OBD-II: what it supports, live values, trouble codes, its VIN.
     Obd(Box<obd::Args>),
-    /// Ask an ECU by UDS: identifiers, sessions, routines, trouble codes, any request.
+    /// Query an ECU by UDS: identifiers, sessions, routines, trouble codes, any request.
     Uds(Box<uds::Args>),
-    /// Talk with CANopen nodes: find them, read and write objects, start and stop them, give them numbers.
+    /// Talk to CANopen nodes: find them, read and write objects, start and stop them, give them numbers.
     Canopen(Box<canopen::Args>),
-    /// Talk with J1939 nodes: claim an address, ask for parameter groups and trouble codes, send messages.
+    /// Talk to J1939 nodes: claim an address, request parameter groups and trouble codes, send messages.
     J1939(Box<j1939::Args>),
     /// Print the completion script of a shell.
     Completions(completions::Args),
     /// Write the manual pages.
     #[command(hide = true)]
     Man(man::Args),
-    /// Show what databases say, and how they suit a trace.
+    /// Show the content of databases, and how they match a trace.
     Db(db::Args),
-    /// Show a trace as signals, by a database.
+    /// Show a trace as signals, using a database.
     Decode(decode::Args),
-    /// Capture the worst traffic there is, without a board, and check that nothing is lost silently.
+    /// Capture the worst possible traffic, without a board, and check that nothing is lost silently.
     Demo(demo::Args),
-    /// Show what a device is.
+    /// Describe a device.
     Info(info::Args),
     /// List connected boards.
     List(list::Args),
-    /// Run a virtual device behind a pseudo terminal.
+    /// Run a virtual device behind a pseudo-terminal.
     #[cfg(unix)]
     Virtual(virtual_device::Args),
-    /// Carry a device's channels to and from CAN interfaces of Linux: SocketCAN.
+    /// Connect a device's channels with Linux CAN interfaces: SocketCAN.
     #[cfg(target_os = "linux")]
     Bridge(bridge::Args),
     /// Share a device: many programs at once, on this machine or on others.
     Serve(serve::Args),
-    /// Be interfaces of Wireshark: `cantap extcap install`.
+    /// Provide interfaces for Wireshark: `cantap extcap install`.
     Extcap(Box<extcap::Args>),
     /// Show a device's state: counters, errors, queue, temperature, registers.
     Status(status::Args),
-    /// Test a board: everything that it can show by itself, and a report to send in.
+    /// Test a board: everything that it can show on its own, with a report to send in.
     Selftest(selftest::Args),
     /// Find a bus's bit rate by listening only.
     Autobaud(autobaud::Args),
@@ -108,15 +108,15 @@ pub enum Command {
     Send(Box<send::Args>),
     /// Send made-up frames, with cangen's options.
     Gen(r#gen::Args),
-    /// Play a trace on a bus at its own times.
+    /// Play a trace on a bus with its original timing.
     Replay(Box<replay::Args>),
     /// Blink a device's LEDs, to find it among others.
     Identify(care::Identify),
     /// Restart a device's firmware.
     Reset(care::Reset),
-    /// Bring a device into its USB bootloader and write a firmware.
+    /// Put a device into its USB bootloader and write a firmware.
     Update(update::Args),
-    /// Keep a configuration on the device over a power cycle, or erase it.
+    /// Keep a configuration on the device across power cycles, or erase it.
     Defaults(Box<defaults::Args>),
 }
 

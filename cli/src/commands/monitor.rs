@@ -42,20 +42,20 @@ pub struct Args {
     /// A trace to play back, or a device's address.
     #[arg(value_name = "FILE|DEVICE", conflicts_with = "devices")]
     file: Option<PathBuf>,
-    /// The device. Repeat for several, whose channels are numbered on: the second one's are 3 and 4.
+    /// The device. Repeat for several, with channels numbered consecutively: the second one's are 3 and 4.
     #[arg(short, long = "device", value_name = "DEVICE", add = completion::devices())]
     devices: Vec<Address>,
-    /// Which channels: 1, 2, several as 1,3, or both, which is all. Without it, those whose bit rate is given; all if none is.
+    /// Which channels: 1, 2, several as 1,3, or both, which means all. Default: those whose bit rate is given; all if none is.
     #[arg(short, long, value_parser = args::channels, add = completion::channels())]
     channel: Option<args::Channels>,
     #[command(flatten)]
     open: ChannelArgs,
-    /// Take part in the bus: acknowledge, and send on request. Listen-only without it. The same as --mode normal.
+    /// Take part in the bus: acknowledge, and send on request. Otherwise listen only. The same as --mode normal.
     #[arg(long, conflicts_with = "mode")]
     normal: bool,
     #[command(flatten)]
     databases: DatabaseArgs,
-    /// Show only these frames, in candump's syntax. Can be repeated. The recording takes all.
+    /// Show only these frames, in candump's syntax. Can be repeated. Recordings contain all frames.
     #[arg(short, long, value_name = "FILTER")]
     filter: Vec<Filter>,
     /// A profile: device, bit rates, databases, filters, view, send list.
@@ -67,7 +67,7 @@ pub struct Args {
     /// Record to this file from the start.
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Record over a file that is there already.
+    /// Overwrite an existing recording.
     #[arg(long, requires = "output")]
     force: bool,
     /// Memory for scrolling back, in MB.
@@ -76,7 +76,7 @@ pub struct Args {
     /// Colours for a light background.
     #[arg(long)]
     light: bool,
-    /// Print one screen as text and leave.
+    /// Print one screen as text and exit.
     #[arg(long)]
     once: bool,
     /// With --once: write the screen to this file as an SVG picture instead, with its colours.
@@ -108,7 +108,7 @@ fn size(text: &str) -> Result<(u16, u16), String> {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let (file, devices) = args.source()?;
     refuse_recording(args)?;
-    // What is wrong with profile and databases is shown, and the view opens without it; with --once it is an error.
+    // Faults in profile and databases are shown, and the view opens without them; with --once they are errors.
     let mut said = Said::default();
     let profile = load_profile(args.profile.as_deref(), &mut said);
     let databases = load_databases(args, &devices, &profile, &mut said);
@@ -166,7 +166,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 }
 
 impl Args {
-    /// The trace or the devices that were given.
+    /// The given trace or devices.
     fn source(&self) -> anyhow::Result<(Option<PathBuf>, Vec<Address>)> {
         let Some(path) = &self.file else {
             return Ok((None, self.devices.clone()));
@@ -189,7 +189,8 @@ fn wrong_address(error: AddressError) -> anyhow::Error {
     wrong(error.to_string())
 }
 
-/// Refuses a recording that cannot be made as asked. Its name may have a condition behind it: `FILE if CONDITION`.
+/// Refuses a recording that cannot be made as requested. Its name may be followed by a condition: `FILE if
+/// CONDITION`.
 fn refuse_recording(args: &Args) -> anyhow::Result<()> {
     let Some(text) = args.output.as_deref().and_then(Path::to_str) else { return Ok(()) };
     let path = Path::new(text.split(" if ").next().unwrap_or(text));
@@ -219,7 +220,7 @@ fn load_databases(args: &Args, devices: &[Address], profile: &Profile, said: &mu
     databases
 }
 
-/// How channels are opened: what the command line leaves open, the profile says.
+/// How to open channels: the profile supplies what the command line leaves open.
 fn channel_args(args: &Args, profile: &Profile, said: &mut Said) -> ChannelArgs {
     let mut open = args.open.clone();
     if !open.timing.is_given() {

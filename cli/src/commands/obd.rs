@@ -1,4 +1,4 @@
-//! `cantap obd`: asks a vehicle.
+//! `cantap obd`: queries a vehicle.
 
 use std::collections::BTreeMap;
 use std::io::Write as _;
@@ -16,7 +16,7 @@ use crate::speaking::SpeakArgs;
 use crate::wrong::wrong;
 use crate::{args, interrupt};
 
-/// How long all ECUs have to answer, where it is not known how many there are. ISO 15765-4 has 50 ms.
+/// How long all ECUs have to answer, if their number is unknown. ISO 15765-4 has 50 ms.
 const ALL_ANSWER: Duration = Duration::from_millis(200);
 /// Bits of a list of supported parameters.
 const LIST: u8 = 0x20;
@@ -40,11 +40,11 @@ pub struct Args {
 
 #[derive(clap::Subcommand)]
 enum What {
-    /// Which parameters each ECU has.
+    /// List the parameters of each ECU.
     Supported,
-    /// Values of now, until Ctrl-C.
+    /// Current values, until Ctrl-C.
     Live {
-        /// Parameters in hexadecimal, as 0C; without any, all that there are.
+        /// Parameters in hexadecimal, as 0C; default: all that are supported.
         #[arg(value_name = "PID", value_parser = pid)]
         pids: Vec<u8>,
         /// How often.
@@ -56,11 +56,11 @@ enum What {
     },
     /// Trouble codes: stored, pending and permanent.
     Codes,
-    /// The vehicle's identification number, and what its ECUs call themselves.
+    /// The vehicle's identification number, and the names of its ECUs.
     Vin,
-    /// Erase the trouble codes, and what was stored with them, which needs --yes.
+    /// Erase the trouble codes and the data stored with them; requires --yes.
     Clear {
-        /// Yes, erase them.
+        /// Confirm erasing.
         #[arg(short, long)]
         yes: bool,
     },
@@ -81,7 +81,7 @@ struct Server {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if matches!(args.what, Some(What::Clear { yes: false })) {
         return Err(wrong(
-            "clearing erases what the workshop needs to find the fault, and readiness tests start anew; if that is meant, add --yes",
+            "clearing erases what the workshop needs to find the fault, and readiness tests start over; to go ahead, add --yes",
         ));
     }
     let device = args.speak.open()?;
@@ -116,7 +116,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// How all ECUs are asked.
+/// How to address all ECUs.
 fn transfer(extended: bool) -> TransferArgs {
     let endpoint = |id| Endpoint { id, address: None };
     let (a, b) = if extended {
@@ -127,12 +127,12 @@ fn transfer(extended: bool) -> TransferArgs {
     TransferArgs::of_obd(Pair { a: endpoint(a), b: endpoint(b) }, ALL_ANSWER, true)
 }
 
-/// Answers, and what broke.
+/// Whether it is an answer, or a broken one.
 fn is_answer(event: &Event) -> bool {
     matches!(event.kind, "exchange" | "refusal" | "broken")
 }
 
-/// The parameters of a list that begins behind `base`.
+/// The parameters of a list that starts after `base`.
 fn listed(base: u8, bits: &[u8]) -> Vec<u8> {
     let bits = bits.iter().take(4).fold(0_u32, |all, byte| all << 8 | u32::from(*byte));
     (0..u32::from(LIST))
@@ -147,7 +147,7 @@ struct Vehicle<'d> {
 }
 
 impl Vehicle<'_> {
-    /// Who answers.
+    /// Finds out which ECUs answer.
     fn find(&mut self) -> anyhow::Result<()> {
         for extended in [false, true] {
             self.client.set_transfer(transfer(extended));
@@ -168,7 +168,7 @@ impl Vehicle<'_> {
         ))
     }
 
-    /// The lists behind the first, as far as they go.
+    /// Reads the lists after the first one, as far as they go.
     fn lists(&mut self) -> anyhow::Result<()> {
         for base in (LIST..=0xE0).step_by(usize::from(LIST)) {
             let servers = self.having(base);
@@ -186,7 +186,7 @@ impl Vehicle<'_> {
         Ok(())
     }
 
-    /// How many ECUs have a parameter.
+    /// The number of ECUs that have a parameter.
     fn having(&self, pid: u8) -> usize {
         self.servers.iter().filter(|server| server.pids.contains(&pid)).count()
     }
@@ -206,7 +206,7 @@ impl Vehicle<'_> {
         Ok(())
     }
 
-    /// Values, each as soon as it is there.
+    /// Shows values, each as soon as it is there.
     fn live(&mut self, wanted: &[u8], period: Duration, count: Option<u32>) -> anyhow::Result<()> {
         self.lists()?;
         self.client.speaking.take_events();

@@ -38,13 +38,13 @@ pub struct Args {
     input: PathBuf,
     #[command(flatten)]
     databases: DatabaseArgs,
-    /// Signals to draw, by name or Message.Signal; with *, ? and [a-z]. Can be repeated. All without it.
+    /// Signals to draw, by name or Message.Signal; with *, ? and [a-z]. Can be repeated. Default: all.
     #[arg(short, long = "signal", value_name = "PATTERN", add = completion::signals())]
     signals: Vec<String>,
-    /// Draw the bus load over time, or frames/s where no bit rate is given.
+    /// Draw the bus load over time, or frames/s if no bit rate is given.
     #[arg(long, conflicts_with_all = ["signals", "timing"])]
     bus_load: bool,
-    /// Draw how long the periods of this identifier are: 3 hexadecimal digits, or 8 for 29 bits.
+    /// Draw a histogram of this identifier's periods: 3 hexadecimal digits, or 8 for 29 bits.
     #[arg(long, value_name = "ID", conflicts_with = "signals", add = completion::identifiers())]
     timing: Option<Id>,
     /// The bit rate for the load, such as 500k, or 2:250k for one channel.
@@ -59,10 +59,11 @@ pub struct Args {
     /// Width: pixels in a file, columns in the terminal.
     #[arg(long)]
     width: Option<u32>,
-    /// Leave out what is before: a time since the trace's start (10s, 2m), a date, or seconds since 1970.
+    /// Leave out everything before this time: since the trace's start (10s, 2m), seconds since 1970, or a
+    /// date.
     #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
     start: Option<TimePoint>,
-    /// Leave out what is from there on: as --start.
+    /// Leave out everything from this time on; written like --start.
     #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
     end: Option<TimePoint>,
     /// The vertical range, LOW:HIGH.
@@ -71,10 +72,10 @@ pub struct Args {
     /// Draw at most this many signals.
     #[arg(long, value_name = "N", default_value_t = MOST_CURVES)]
     curves: usize,
-    /// Heading; the trace's name without it.
+    /// Title; default: the trace's name.
     #[arg(long)]
     title: Option<String>,
-    /// Leave out what is wrong with databases that can be used, and which of them replaces another.
+    /// Do not report what is wrong with usable databases, and which of them replaces another.
     #[arg(short, long)]
     quiet: bool,
     /// Print one JSON object about the picture.
@@ -86,7 +87,7 @@ pub struct Args {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    // A wrong name should not be found out after an hour of reading.
+    // A wrong name should not be discovered after an hour of reading.
     if let Some(path) = &args.output {
         PictureFormat::of_path(path).map_err(|error| wrong(error.to_string()))?;
     }
@@ -116,13 +117,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// What there is to know of the trace besides its picture.
+/// What is known of the trace besides its picture.
 #[derive(Default)]
 struct Read {
-    /// When the part that is drawn begins.
+    /// The beginning of the part that is drawn.
     first_ns: Option<i64>,
     missing: Missing,
-    /// Signals that were too many.
+    /// Number of signals beyond the limit.
     not_drawn: u64,
 }
 
@@ -165,7 +166,7 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
     Ok((dated(collector.finish(title("signals")), read.first_ns), read))
 }
 
-/// Reads the part of the trace that is to be drawn.
+/// Reads the part of the trace to be drawn.
 fn for_each(args: &Args, mut take: impl FnMut(&cantap::TraceRecord)) -> anyhow::Result<Read> {
     let mut records = args.read.open(&args.input)?;
     let mut window = TimeRange::new(args.start, args.end);
@@ -180,7 +181,7 @@ fn for_each(args: &Args, mut take: impl FnMut(&cantap::TraceRecord)) -> anyhow::
     Ok(Read { first_ns, missing: records.missing(), not_drawn: 0 })
 }
 
-/// The plot with the date of its beginning on its axis.
+/// The plot with the date of its beginning on the axis.
 fn dated(plot: Plot, first_ns: Option<i64>) -> Plot {
     let Some(date) = first_ns.and_then(date_text) else { return plot };
     let axis = match plot.axis {
@@ -199,7 +200,7 @@ fn vertical(text: &str) -> Result<(f64, f64), String> {
         .ok_or_else(|| "write the range as LOW:HIGH, such as 0:100".to_owned())
 }
 
-/// What the terminal can show; a file or pipe gets no colours.
+/// What the terminal supports; a file or pipe gets no colours.
 fn terminal_style(args: &Args) -> TextStyle {
     let is_terminal = std::io::stdout().is_terminal();
     let columns = || terminal_size::terminal_size().map(|(columns, _)| usize::from(columns.0));

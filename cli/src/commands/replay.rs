@@ -1,4 +1,4 @@
-//! `cantap replay`: a trace on the bus again, at its own times.
+//! `cantap replay`: plays a trace on the bus again, with its original timing.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -35,10 +35,10 @@ pub struct Args {
     /// The trace; - for standard input.
     #[arg(value_name = "FILE", required_unless_present = "from")]
     input: Option<PathBuf>,
-    /// The trace, as canplayer takes it.
+    /// The trace, as an option for compatibility with canplayer.
     #[arg(short = 'I', value_name = "FILE")]
     from: Option<PathBuf>,
-    /// Send what was captured on one channel on another, as canplayer: TO=FROM, such as can1=can0.
+    /// Send what was captured on one channel on another, as with canplayer: TO=FROM, such as can1=can0.
     #[arg(value_name = "TO=FROM", value_parser = mapping)]
     mapping: Vec<(Channel, u8)>,
     #[command(flatten)]
@@ -48,13 +48,13 @@ pub struct Args {
     /// Play this many times, or i for ever.
     #[arg(short = 'l', long = "loop", value_name = "N|i", default_value = "1", value_parser = rounds)]
     rounds: Rounds,
-    /// Skip pauses that are longer than this.
+    /// Skip pauses longer than this.
     #[arg(short, long, value_name = "TIME", value_parser = args::duration)]
     skip: Option<Duration>,
-    /// Least time between two frames, in milliseconds.
+    /// Minimum time between two frames, in milliseconds.
     #[arg(short, long, value_name = "MS", default_value_t = 0.0, value_parser = milliseconds)]
     gap: f64,
-    /// Ignore the trace's times: as fast as the bus takes it, so that --gap, --skip and --speed have no meaning.
+    /// Ignore the trace's times: as fast as the bus can take it. --gap, --skip and --speed then have no effect.
     #[arg(short = 't', long, conflicts_with_all = ["gap", "skip", "speed"])]
     ignore_times: bool,
     /// Play faster (2) or slower (0.5).
@@ -66,7 +66,8 @@ pub struct Args {
     /// Wait for Enter before the first frame.
     #[arg(short, long)]
     interactive: bool,
-    /// Accepted as canplayer's: what this device sends does not come back to other programs of this computer anyway.
+    /// Accepted for compatibility with canplayer: what this device sends never comes back to other programs on this
+    /// computer.
     #[arg(short = 'x', hide = true)]
     no_loopback: bool,
     /// Print each frame that was sent.
@@ -115,11 +116,11 @@ fn mapping(text: &str) -> Result<(Channel, u8), String> {
     Ok((args::channel(to)?, from.filter(|from| *from > 0).ok_or_else(wrong)?))
 }
 
-/// The device's channels. One that nothing is sent on is never opened: it would acknowledge on a bus that is none of the
-/// trace's business, perhaps at another bit rate.
+/// The device's channels. A channel on which nothing is sent is never opened: it would acknowledge on a bus that has
+/// nothing to do with the trace, perhaps at another bit rate.
 struct Buses<'d> {
     device: &'d Device,
-    /// Not opened yet, and how they will be.
+    /// Those not yet opened, with their configurations.
     closed: Vec<(Channel, ChannelConfig)>,
 }
 
@@ -146,7 +147,7 @@ fn wait_for_enter() -> anyhow::Result<()> {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
     let source = args.source()?;
-    // What is wrong with the file is found before anything is opened.
+    // Faults in the file are found before anything is opened.
     if !source.is_pipe() {
         drop(args.read.open(&source.input)?);
     } else if args.rounds != Rounds::Times(1) {
@@ -220,29 +221,29 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 /// What was played.
 #[derive(Default)]
 struct Played {
-    /// Frames that were to be sent: after a standstill those that were never handed over too, after Ctrl-C only those that
-    /// ended.
+    /// Frames that should have been sent: after a standstill including those never handed over, after Ctrl-C only those
+    /// that ended.
     asked: u64,
-    /// Frames of channels that nothing is sent to.
+    /// Frames of channels that are not mapped to any.
     left_out: u64,
     /// CAN FD frames, which the device cannot send.
     fd_left_out: u64,
-    /// What of the file was not read in the last round.
+    /// What was not read from the file in the last round.
     missing: Missing,
 }
 
-/// Kinds of frames that are left out, as the JSON object has them.
+/// Kinds of frames that are left out, as named in the JSON object.
 const OTHER_CHANNELS: &str = "frames of channels that nothing is sent to";
 const FD: &str = "CAN FD frames, which the device cannot send";
 
-/// What is played, and where to.
+/// What is played, and on which channels.
 struct Source {
     input: PathBuf,
     mapping: Vec<(Channel, u8)>,
 }
 
 impl Source {
-    /// Channels that something may be sent on.
+    /// Channels on which something may be sent.
     fn channels(&self) -> Vec<Channel> {
         if self.mapping.is_empty() {
             return Channel::ALL.to_vec();
@@ -250,7 +251,7 @@ impl Source {
         Channel::ALL.into_iter().filter(|channel| self.mapping.iter().any(|(to, _)| to == channel)).collect()
     }
 
-    /// Whether it can be read only once, and as fast as it comes.
+    /// Whether it can be read only once, and only as fast as it arrives.
     fn is_pipe(&self) -> bool {
         self.input.as_os_str() == "-"
     }
@@ -268,7 +269,7 @@ impl Args {
         let mut mapping = self.mapping.clone();
         let input = match (&self.from, &self.input) {
             (Some(from), first) => {
-                // With -I the first word is a mapping too.
+                // With -I, the first word is a mapping too.
                 if let Some(word) = first {
                     mapping.insert(0, self::mapping(&word.to_string_lossy()).map_err(wrong)?);
                 }
@@ -290,7 +291,7 @@ impl Args {
         Ok(Source { input, mapping })
     }
 
-    /// Plays the trace until everything has ended or frames no longer leave.
+    /// Plays the trace until everything has ended, or frames can no longer be sent.
     fn play(
         &self,
         source: &Source,
@@ -299,7 +300,7 @@ impl Args {
         buses: &mut Buses<'_>,
     ) -> anyhow::Result<Played> {
         let mut played = Played::default();
-        // A round begins where the one before ended.
+        // A round begins where the previous one ended.
         let mut shift_ns = 0;
         let mut round = 0_u32;
         while self.rounds != Rounds::Times(round) && !self.has_all(&played) && !sending.has_stopped() {
@@ -307,7 +308,7 @@ impl Args {
             let mut first_ns = None;
             let mut last_ns = 0;
             let mut records = self.read.open(&source.input)?;
-            // A pipe may have no end, and what is played for ever has none: there nothing is counted that was not read.
+            // A pipe may have no end, and endless playing has none: in those cases, what was not read is not counted.
             let ends = !source.is_pipe() && self.rounds != Rounds::ForEver;
             while !self.has_all(&played)
                 && (ends || !sending.has_stopped())
@@ -327,7 +328,7 @@ impl Args {
                 };
                 played.asked += 1;
                 if sending.has_stopped() {
-                    // Never handed over, but asked for.
+                    // Never handed over, but requested.
                     continue;
                 }
                 buses.open(channel)?;

@@ -1,4 +1,4 @@
-//! `cantap search`: finding frames in a trace.
+//! `cantap search`: finds frames in a trace.
 
 use std::collections::VecDeque;
 use std::io::{BufWriter, Write};
@@ -43,16 +43,16 @@ pub struct Args {
     /// The trace; - for standard input.
     #[arg(value_name = "FILE")]
     input: Option<PathBuf>,
-    /// What must hold, such as "Speed > 80 and Gear == 3".
+    /// The condition, such as "Speed > 80 and Gear == 3".
     #[arg(value_name = "CONDITION", conflicts_with = "condition", add = completion::conditions())]
     positional: Option<String>,
     /// The condition, as an option.
     #[arg(short = 'e', long = "condition", visible_alias = "where", value_name = "CONDITION", add = completion::conditions())]
     condition: Option<String>,
-    /// This identifier: 123, 18FEF1?? with ? for any digit, or 100-1FF. Repeat for any of several.
+    /// This identifier: 123, 18FEF1?? with ? for any digit, or 100-1FF. If repeated, any may match.
     #[arg(short, long = "id", value_name = "ID", add = completion::identifiers())]
     ids: Vec<IdPattern>,
-    /// These data bytes from the first on: "11 ?? 3?"; * for any number. Repeat for any of several.
+    /// These data bytes from the first on: "11 ?? 3?"; * for any number. If repeated, any may match.
     #[arg(long, value_name = "BYTES")]
     data: Vec<DataPattern>,
     #[command(flatten)]
@@ -70,29 +70,29 @@ pub struct Args {
     /// Show this many records before and after each one found.
     #[arg(short = 'C', long, value_name = "N", default_value_t = 0)]
     context: usize,
-    /// Stop after this many were found.
+    /// Stop after finding this many.
     #[arg(short, long, value_name = "N")]
     max_count: Option<u64>,
-    /// Print only how many were found.
+    /// Print only the number found.
     #[arg(long, conflicts_with_all = ["output", "json"])]
     count: bool,
     /// Write what was found, with its context, as a trace.
     #[arg(short, long, value_name = "FILE", conflicts_with = "json")]
     output: Option<PathBuf>,
-    /// The format to write, where the output's name does not tell.
+    /// The format to write, if the output's name does not show it.
     #[arg(long = "format", visible_alias = "to", value_name = "FORMAT", requires = "output", add = completion::written_formats())]
     written_format: Option<Format>,
-    /// Print one JSON object per record, and behind them one with the summary.
+    /// Print one JSON object per record, followed by one with the summary.
     #[arg(long)]
     json: bool,
-    /// Leave out what is wrong with databases that can be used, and which of them replaces another.
+    /// Do not report what is wrong with usable databases, and which of them replaces another.
     #[arg(short, long)]
     quiet: bool,
     #[command(flatten)]
     read: ReadArgs,
 }
 
-/// More context than anybody looks at would only take memory.
+/// More context than anyone would look at only takes memory.
 const MAX_CONTEXT: usize = 1_000_000;
 
 /// Runs it.
@@ -127,13 +127,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::from(exit::FAILURE))
 }
 
-/// Goes through the trace and hands on what was found with its context; returns how many were.
+/// Searches the trace and passes on what was found, with its context; returns the number found.
 fn find(args: &Args, records: &mut Records, search: &mut Search, sink: &mut Sink) -> anyhow::Result<u64> {
     let before = args.before_context.unwrap_or(args.context).min(MAX_CONTEXT);
     let after = args.after_context.unwrap_or(args.context);
     let mut earlier: VecDeque<TraceRecord> = VecDeque::new();
     let (mut found, mut still_after) = (0, 0);
-    // Whether something lies between the last record shown and the next.
+    // Whether there are records between the last one shown and the next.
     let mut gap = false;
     while let Some(record) = records.next()? {
         let is_last = args.max_count.is_some_and(|max| found >= max);
@@ -165,7 +165,7 @@ fn find(args: &Args, records: &mut Records, search: &mut Search, sink: &mut Sink
     Ok(found)
 }
 
-/// Where what was found goes.
+/// The destination of what was found.
 struct Sink {
     kind: Kind,
     decoder: Decoder,
@@ -180,7 +180,7 @@ enum Kind {
 }
 
 impl Sink {
-    /// What `grows` is written as it comes.
+    /// If the trace `grows`, output is written as it comes.
     fn new(args: &Args, decoder: Decoder, grows: bool) -> anyhow::Result<Self> {
         let stdout = || BufWriter::with_capacity(1 << 16, std::io::stdout());
         let kind = match (&args.output, args.count, args.json) {
@@ -203,7 +203,7 @@ impl Sink {
         }
     }
 
-    /// `found` is what was said with a record that was found; records around it have none.
+    /// `found` contains the events for a record that was found; it is `None` for records around it.
     fn show(&mut self, record: &TraceRecord, found: Option<&[String]>) -> anyhow::Result<()> {
         let message =
             record.frame().and_then(|frame| self.decoder.decode(record.channel, frame, &mut self.values));
@@ -257,7 +257,7 @@ impl Sink {
         }
     }
 
-    /// The last line, where scripts read, and what a file could not carry.
+    /// The last line, if scripts read it, and what a file could not carry.
     fn finish(mut self, found: u64, missing: &Missing) -> anyhow::Result<()> {
         if let Kind::Json(out) = &mut self.kind {
             let mut summary = serde_json::json!({ "found": found });
@@ -272,7 +272,7 @@ impl Sink {
     }
 }
 
-/// An event that is no frame, in words.
+/// A description of an event other than a frame.
 fn describe(event: &TraceEvent) -> String {
     match event {
         TraceEvent::Frame { frame, .. } => frame.to_string(),

@@ -1,4 +1,5 @@
-//! `cantap selftest`: what a board can show by itself, in one command, and a report to send in.
+//! `cantap selftest`: tests what a board can show on its own, with a single command, and makes a report to
+//! send in.
 
 mod buses;
 mod report;
@@ -31,16 +32,16 @@ use crate::{args, beside, exit, interrupt};
 pub struct Args {
     #[command(flatten)]
     device: OneBoard,
-    /// Channel 1 is wired to channel 2, and to nothing else: both take part in the bus and send.
+    /// Channel 1 is wired to channel 2 and nothing else: both take part in the bus and send.
     #[arg(long = "loop")]
     looped: bool,
     /// How long each saturating load lasts, as 5s or 2m.
     #[arg(long, alias = "seconds", value_name = "TIME", default_value = "5s", value_parser = args::positive_duration)]
     load_time: Duration,
-    /// Restart the firmware at the end, and see it come back.
+    /// Restart the firmware at the end, and wait for it to come back.
     #[arg(long)]
     restart: bool,
-    /// Write the report to this file: the lines, and behind them the JSON object.
+    /// Write the report to this file: the lines, followed by the JSON object.
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
     /// Print one JSON object.
@@ -48,7 +49,7 @@ pub struct Args {
     json: bool,
 }
 
-/// Bit rates that frames are sent at.
+/// Bit rates at which frames are sent.
 const BITRATES_BPS: [u32; 4] = [1_000_000, 500_000, 250_000, 125_000];
 
 /// Runs it.
@@ -71,9 +72,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(if report.has_passed() { ExitCode::SUCCESS } else { ExitCode::from(exit::CHECK_FAILED) })
 }
 
-/// Every step but the restart.
+/// All steps except the restart.
 fn test(args: &Args, address: &Address, device: &Device, report: &mut Report) {
-    // What is wrong with it shows when it is read again.
+    // If something is wrong with it, that shows when it is read again.
     let saved = steps::saved(device).unwrap_or_default();
     report.step("identity", || Ok(steps::identity(device.hello())));
     report.step("USB", || steps::usb(address, device.hello()));

@@ -1,4 +1,4 @@
-//! `cantap send`: frames now, periodically, or as replies.
+//! `cantap send`: sends frames now, periodically, or as replies.
 
 mod modifiers;
 
@@ -46,10 +46,10 @@ pub struct Args {
     open: ChannelArgs,
     #[command(flatten)]
     databases: DatabaseArgs,
-    /// Send again and again, by the device's own timer, at least 47us apart.
+    /// Send repeatedly, by the device's own timer, at intervals of at least 47us.
     #[arg(long, value_name = "TIME", value_parser = args::duration)]
     period: Option<Duration>,
-    /// How many times each frame is sent. Without --period and --on-rx they follow one another at once.
+    /// How many times to send each frame. Without --period and --on-rx they are sent back to back.
     #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     count: Option<u32>,
     /// Send when a frame is received that this filter accepts: ID, or ID:MASK as in candump.
@@ -58,7 +58,7 @@ pub struct Args {
     /// Send as the answer to remote frames of the same ID.
     #[arg(long, conflicts_with_all = ["period", "on_rx"])]
     reply: bool,
-    /// End after this time. Without it and --count, periodic frames and replies go on until Ctrl-C.
+    /// End after this time. Without this and --count, periodic frames and replies continue until Ctrl-C.
     #[arg(short, long, value_name = "TIME", value_parser = args::positive_duration)]
     time: Option<Duration>,
     #[command(flatten)]
@@ -66,7 +66,7 @@ pub struct Args {
     /// Print nothing about frames that were sent.
     #[arg(short, long)]
     quiet: bool,
-    /// Print one JSON object at the end, and nothing about single frames.
+    /// Print one JSON object at the end, and nothing about individual frames.
     #[arg(long)]
     json: bool,
 }
@@ -84,7 +84,7 @@ fn channel(text: &str) -> Result<Channel, String> {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    // Everything that can be wrong on the line is found before anything is sent.
+    // Everything wrong on the command line is found before anything is sent.
     let (frames, faults) = args.frames()?;
     let triggers = args.triggers(&frames)?;
     let periodic = args.periodic(&frames)?;
@@ -143,9 +143,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 }
 
 impl Args {
-    /// The frames, and how many places of the databases are wrong.
+    /// The frames, and the number of faults in the databases.
     fn frames(&self) -> anyhow::Result<(Vec<Frame>, usize)> {
-        // A colon stands in no frame and in every message with values.
+        // No frame contains a colon, and every message with values does.
         let is_message = |text: &String| text.contains(':') && !text.contains('#');
         let device = self.device.given().filter(|_| self.frames.iter().any(is_message));
         let database = self.databases.or_of(device).load(false, self.quiet)?;
@@ -154,14 +154,14 @@ impl Args {
                 Ok(cantap_signals::encode::encode(&database, Some(self.channel.number()), text)?.frame)
             } else {
                 let frame = text.parse::<Frame>();
-                Ok(frame.map_err(|error| wrong(format!("'{text}' is no frame: {error}")))?)
+                Ok(frame.map_err(|error| wrong(format!("'{text}' is not a frame: {error}")))?)
             }
         };
         let frames = self.frames.iter().map(frame).collect::<anyhow::Result<_>>()?;
         Ok((frames, database.faults()))
     }
 
-    /// The period and what changes each time, if frames are to be sent periodically.
+    /// The period and what changes each time, if frames should be sent periodically.
     fn periodic(&self, frames: &[Frame]) -> anyhow::Result<Option<(Duration, Modifiers)>> {
         let Some(period) = self.period else { return Ok(None) };
         if period < SHORTEST_PERIOD {
@@ -174,7 +174,7 @@ impl Args {
         Ok(Some((period, modifiers)))
     }
 
-    /// The replies, if replies are wanted: for each frame one for each hardware filter.
+    /// The replies, if requested: for each frame, one per hardware filter.
     fn triggers(&self, frames: &[Frame]) -> anyhow::Result<Option<Vec<Trigger>>> {
         let count = self.count.unwrap_or(0);
         if self.reply {
@@ -212,7 +212,7 @@ impl Args {
         interrupt::requested() || self.time.is_some_and(|time| started.elapsed() >= time)
     }
 
-    /// Sends the frames one after the other, `count` times. Returns how many were asked for.
+    /// Sends the frames one after the other, `count` times. Returns how many were requested.
     fn send_now(&self, device: &Device, frames: &[Frame], sending: &mut Sending<'_>) -> anyhow::Result<u64> {
         let mut stream = Stream::new(device);
         let started = Instant::now();
@@ -232,8 +232,8 @@ impl Args {
         Ok(if sending.stands_still() { all } else { sending.ended() })
     }
 
-    /// Watches what the device sends by itself, with tags from `first_tag`, until as many as wanted have ended. Returns how
-    /// many were asked for.
+    /// Watches what the device sends on its own, with tags from `first_tag`, until the requested number has ended. Returns
+    /// how many were requested.
     fn watch(
         &self,
         mut stream: Stream<'_>,
@@ -253,7 +253,7 @@ impl Args {
         let missed = if self.period.is_some() { sending.periods_missed(self.channel)? } else { 0 };
         Ok(match wanted {
             Some(wanted) if sending.stands_still() => wanted,
-            // Ended by its time or Ctrl-C: what was due until then.
+            // Ended by time or Ctrl-C: count what was due until then.
             Some(wanted) => wanted.min(sending.ended() + missed),
             None => sending.ended() + missed,
         })

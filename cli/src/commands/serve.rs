@@ -51,35 +51,36 @@ pub struct Args {
     /// Where the device is: a serial port, or virtual. Repeat for several. Without it, the board that is connected.
     #[arg(short, long = "device", value_name = "DEVICE")]
     devices: Vec<Address>,
-    /// Bit rate of the buses in bit/s: 500000, 500k, 1M; with a channel before it (2:250k), that channel's only. Can be repeated.
-    /// Without it, the one saved on the device.
+    /// Bit rate of the buses in bit/s: 500000, 500k, 1M; with a channel before it (2:250k), only for that channel. Can be
+    /// repeated. Without it, the one saved on the device.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE")]
     bitrates: Vec<ChannelBitrate>,
-    /// The most that a client may do: listen; configure, which is to choose bit rates and to store settings, one client at a time;
+    /// The maximum role of clients: listen; configure, which allows choosing bit rates and storing settings, one client at a time;
     /// send, which includes acknowledging.
     #[arg(long, value_name = "ROLE", value_parser = role, default_value = "listen")]
     allow: Role,
-    /// Listen on a UNIX socket, which is this user's alone; the default, at a path of the user's own.
+    /// Listen on a UNIX socket that only this user can reach; the default, at a path in the user's own
+    /// folder.
     #[cfg(unix)]
     #[arg(long, value_name = "PATH")]
     unix: Option<PathBuf>,
-    /// Listen on a TCP port of this computer, which all its users can reach; 127.0.0.1:29537 unless given. At another
-    /// address only with --tls.
+    /// Listen on a TCP port of this computer, which all its users can reach; default 127.0.0.1:29537. Other addresses
+    /// require --tls.
     #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
     tcp: Option<String>,
-    /// Let clients of other computers in at --tcp, encrypted: this server's certificate and key (PEM).
+    /// Admit clients from other computers at --tcp, encrypted: this server's certificate and key (PEM).
     #[cfg(feature = "tls")]
     #[arg(long, value_name = "CERT,KEY", requires_all = ["tcp", "clients"], value_parser = keys::two_files)]
     tls: Option<(PathBuf, PathBuf)>,
-    /// The certificate of the authority that clients' certificates are of.
+    /// The certificate of the authority that signed the clients' certificates.
     #[cfg(feature = "tls")]
     #[arg(long, value_name = "CA", requires = "tls")]
     clients: Option<PathBuf>,
-    /// Speak the socketcand protocol, for SavvyCAN, Kayak and python-can; at 127.0.0.1:29536 unless given. At an address that other
-    /// computers reach, clients may only listen: the protocol does not ask who they are.
+    /// Speak the socketcand protocol, for SavvyCAN, Kayak and python-can; default 127.0.0.1:29536. At an address that other
+    /// computers can reach, clients may only listen: the protocol has no authentication.
     #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
     socketcand: Option<String>,
-    /// Write candump's log lines to whoever connects, for nc and SavvyCAN's log server; at 127.0.0.1:29538 unless given.
+    /// Write candump's log lines to anyone who connects, for nc and SavvyCAN's log server; default 127.0.0.1:29538.
     #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
     lines: Option<String>,
     /// Serve one client through standard input and output, as ssh starts it.
@@ -89,9 +90,9 @@ pub struct Args {
 
 /// How often to check whether to end.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
-/// The port of `--lines`, unless another is given.
+/// The default port of `--lines`.
 const LINES_PORT: u16 = 29_538;
-/// Bytes of standard input that wait at most.
+/// How many bytes of standard input may wait.
 const STDIN_BYTES: usize = 16 * 1024;
 
 /// Runs it.
@@ -119,7 +120,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         socketcand: args.socketcand.as_deref().map(|text| address(text, socketcand::PORT)).transpose()?,
         lines: args.lines.as_deref().map(|text| loopback(text, LINES_PORT)).transpose()?,
     };
-    // From here on Ctrl-C ends it in order.
+    // From here on, Ctrl-C ends it properly.
     interrupt::watch()?;
     let mut boards = Vec::new();
     for (number, address) in addresses.iter().enumerate() {
@@ -138,7 +139,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Takes a device, which must be there.
+/// Opens a device, which must be there.
 fn start(args: &Args, number: usize, address: &Address) -> anyhow::Result<Board> {
     let of_buses = address.bitrates_of_buses();
     let bitrates_bps: [Option<u32>; CHANNELS] = Channel::ALL.map(|channel| {
@@ -158,7 +159,7 @@ fn start(args: &Args, number: usize, address: &Address) -> anyhow::Result<Board>
     })
 }
 
-/// Whoever runs it sees who comes and goes; what must not be overlooked stands out.
+/// Whoever runs the server sees who comes and goes; what must not be overlooked stands out.
 fn tell(news: News) {
     match news {
         News::BoardLost { .. } | News::Refused { .. } => stderr::warn(&news.to_string()),
@@ -166,7 +167,7 @@ fn tell(news: News) {
     }
 }
 
-/// Where nobody may choose a bit rate there has to be one.
+/// If nobody may choose a bit rate, there has to be one.
 fn check_bitrates(args: &Args, number: usize, board: &Board) -> anyhow::Result<()> {
     if args.allow >= Role::Configure {
         return Ok(());
@@ -192,7 +193,7 @@ fn check_bitrates(args: &Args, number: usize, board: &Board) -> anyhow::Result<(
 
 /// An address, a port of this computer, or both.
 fn address(text: &str, port: u16) -> anyhow::Result<SocketAddr> {
-    let not_one = || wrong(format!("'{text}' is no address to listen at; write it as 127.0.0.1:{port}"));
+    let not_one = || wrong(format!("'{text}' is not an address to listen at; write it as 127.0.0.1:{port}"));
     let address: SocketAddr = match text.parse() {
         Ok(address) => address,
         Err(_) => match (text.parse(), text.parse()) {
@@ -209,7 +210,7 @@ fn address(text: &str, port: u16) -> anyhow::Result<SocketAddr> {
     Ok(address)
 }
 
-/// An address that only this computer reaches.
+/// An address that can only be reached from this computer.
 fn loopback(text: &str, port: u16) -> anyhow::Result<SocketAddr> {
     let address = address(text, port)?;
     if !address.ip().is_loopback() {
@@ -221,7 +222,7 @@ fn loopback(text: &str, port: u16) -> anyhow::Result<SocketAddr> {
     Ok(address)
 }
 
-/// Opens every way in and prints it.
+/// Opens every listener and prints it.
 fn listen(
     args: &Args,
     tcp: Option<&(SocketAddr, Way)>,
@@ -230,7 +231,7 @@ fn listen(
 ) -> anyhow::Result<Vec<Listening>> {
     let mut ways = Vec::new();
     let mut said = Vec::new();
-    // Where there are no sockets with paths, one on this computer alone takes their place.
+    // On systems without UNIX sockets, one for this computer only takes their place.
     #[cfg(not(unix))]
     let loopback = (SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::LOCALHOST), PORT), Way::Plain);
     #[cfg(not(unix))]
@@ -290,11 +291,11 @@ fn listen(
     Ok(ways)
 }
 
-/// How clients are let in at a TCP port.
+/// How clients are admitted at a TCP port.
 enum Way {
-    /// As they are.
+    /// Without authentication.
     Plain,
-    /// By their certificates.
+    /// By certificate.
     #[cfg(feature = "tls")]
     Encrypted(cantap_serve::tls::Server),
 }
@@ -312,7 +313,7 @@ impl Way {
         Ok(Self::Plain)
     }
 
-    /// As addresses name it.
+    /// The scheme in addresses.
     const fn scheme(&self) -> &'static str {
         match self {
             Self::Plain => "tcp",
@@ -330,14 +331,14 @@ impl Way {
     }
 }
 
-/// Other programs' ways in, each to all boards.
+/// Listeners for other programs, each for all boards.
 struct Beside {
     socketcand: Option<SocketAddr>,
     lines: Option<SocketAddr>,
 }
 
 impl Beside {
-    /// Opens them. Returns what each is called.
+    /// Opens them. Returns their names.
     fn listen(&self, role: Role, boards: &[Arc<Board>]) -> anyhow::Result<Vec<(String, Listening)>> {
         let mut ways = Vec::new();
         if let Some(address) = self.socketcand {
@@ -346,7 +347,9 @@ impl Beside {
             })?;
             let address = way.address().unwrap_or(address);
             if !address.ip().is_loopback() {
-                stderr::warn(&format!("whoever reaches {address} can hear the buses; nobody can send there"));
+                stderr::warn(&format!(
+                    "anyone who reaches {address} can listen to the buses; nobody can send there"
+                ));
             }
             ways.push((format!("can://{address}"), way));
         }
@@ -359,7 +362,7 @@ impl Beside {
     }
 }
 
-/// The path of a further device.
+/// The path for a further device.
 #[cfg(unix)]
 fn numbered(path: &Path, number: usize) -> PathBuf {
     if number == 0 {
@@ -370,10 +373,10 @@ fn numbered(path: &Path, number: usize) -> PathBuf {
     path.with_file_name(format!("{stem}-{}{suffix}", number + 1))
 }
 
-/// Serves whoever is at the other end of standard input and output until that is closed.
+/// Serves the client at the other end of standard input and output until that is closed.
 fn serve_stdio(board: &Board, role: Role) -> anyhow::Result<ExitCode> {
     let (input, mut to_input) = pipe(STDIN_BYTES);
-    // Standard input can be waited for only without a limit.
+    // Standard input can only be waited for without a time limit.
     std::thread::Builder::new().name("cantap-stdin".to_owned()).spawn(move || {
         let mut bytes = [0; 4096];
         let mut stdin = io::stdin().lock();
@@ -384,7 +387,7 @@ fn serve_stdio(board: &Board, role: Role) -> anyhow::Result<ExitCode> {
         }
     })?;
     let mut stdout = io::stdout();
-    // The client has waited for this: to get here took as long as it took.
+    // The client has been waiting for this, since getting here may have taken a while.
     stdout.write_all(&connect::READY)?;
     stdout.flush()?;
     board.admit(input, stdout, "the client", role)?;

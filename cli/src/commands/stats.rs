@@ -1,4 +1,4 @@
-//! `cantap stats`: what a trace or a bus does: load, rates, periods, losses, errors.
+//! `cantap stats`: measures a trace or a bus: load, rates, periods, losses, errors.
 
 mod live;
 mod table;
@@ -36,16 +36,16 @@ pub struct Args {
     /// The trace; - for standard input.
     #[arg(value_name = "FILE")]
     input: Option<PathBuf>,
-    /// Listen to a device instead of reading a file, until Ctrl-C. Repeat for several, whose channels are numbered on.
-    /// Without it and a file, the board that is connected is listened to.
+    /// Listen to a device instead of reading a file, until Ctrl-C. Repeat for several, with channels numbered
+    /// consecutively. Without this and without a file, it listens to the board that is connected.
     #[arg(short, long, conflicts_with = "input", add = completion::devices())]
     device: Vec<Address>,
-    /// The bus's bit rate, such as 500k; with a channel before it (2:250k), that channel's only. Can be
-    /// repeated. A file has no load without it; a device is listened to at the saved one.
+    /// The bus's bit rate, such as 500k; with a channel before it (2:250k), only for that channel. Can be
+    /// repeated. Without it, a file has no load, and a device listens at the saved bit rate.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", add = completion::bit_rates())]
     bitrates: Vec<ChannelBitrate>,
-    /// The bit rate of CAN FD's data phases, such as 2M; with a channel before it (2:5M), that channel's only. Can be
-    /// repeated. Without it a channel with switched bit rates has no load.
+    /// The bit rate of CAN FD's data phases, such as 2M; with a channel before it (2:5M), only for that channel. Can
+    /// be repeated. Without it a channel with switched bit rates has no load.
     #[arg(
         long = "data-bitrate",
         value_name = "[CHANNEL:]RATE",
@@ -54,13 +54,13 @@ pub struct Args {
         add = completion::bit_rates()
     )]
     data_bitrates: Vec<ChannelBitrate>,
-    /// The device's channels to listen to: 1, 2, several as 1,3, or both, which is all.
+    /// The device's channels to listen to: 1, 2, several as 1,3, or both, which means all.
     #[arg(short, long, default_value = "both", value_parser = args::channels, add = completion::channels())]
     channel: args::Channels,
     /// How long to listen.
     #[arg(short = 't', long, value_name = "TIME", conflicts_with = "input", value_parser = args::positive_duration)]
     time: Option<Duration>,
-    /// Length of the windows that peaks are looked for in.
+    /// Length of the windows in which peaks are searched.
     #[arg(short, long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration)]
     window: Duration,
     /// List every window.
@@ -69,13 +69,12 @@ pub struct Args {
     /// List every identifier with count, period, jitter and DLCs.
     #[arg(long)]
     per_id: bool,
-    /// Also tell how long responses took, by service, and which nodes there are with their states and trouble codes, by the protocols that
-    /// each channel shows.
+    /// Also show response times by service, and nodes with their states and trouble codes, by the protocols found on each channel.
     #[arg(long)]
     protocols: bool,
     #[command(flatten)]
     protocol: ProtocolArgs,
-    /// Print one JSON object, identifiers included.
+    /// Print one JSON object, including identifiers.
     #[arg(long)]
     json: bool,
     #[command(flatten)]
@@ -112,7 +111,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut missing = Missing::default();
     if let Some(mut live) = live {
         ended = live::run(!args.json, &mut live, &mut statistics, &mut windows, &mut known);
-        // What was heard is shown, and is no success if it was errors only.
+        // What was received is shown, but it is a failure if there were only errors.
         ended = ended.and_then(|()| live.judge());
     } else if let Some(path) = &args.input {
         let mut records = args.read.open(path)?;
@@ -137,12 +136,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         known.take(&[], false);
     }
     if statistics.channels().is_empty() {
-        // Nothing was heard: the reason is all there is to say.
+        // Nothing was received: the reason is all that can be reported.
         ended?;
         ended = Ok(());
     }
     let summary = statistics.summary();
-    // Its reader may have gone; that is an error as any other.
+    // The reader may have gone; that is an error like any other.
     let mut out = BufWriter::new(std::io::stdout().lock());
     if args.json {
         write_json(&summary, &missing, windows, known.as_ref(), &mut out)?;
@@ -161,7 +160,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// One object; the windows are its last member and go through memory one by one.
+/// One object; the windows are its last member and are written one by one.
 fn write_json(
     summary: &Summary,
     missing: &Missing,

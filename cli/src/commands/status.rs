@@ -35,7 +35,7 @@ pub struct Args {
     channel: args::Channels,
     #[command(flatten)]
     open: ChannelArgs,
-    /// The controllers' registers too, now and at the last error.
+    /// Also the controllers' registers, now and at the last error.
     #[arg(long)]
     registers: bool,
     /// Print one JSON object.
@@ -43,7 +43,7 @@ pub struct Args {
     json: bool,
 }
 
-/// How often Ctrl-C is looked for.
+/// How often to check for Ctrl-C.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// Runs it.
@@ -133,7 +133,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// How often the firmware failed since power-on, and why last.
+/// How often the firmware has failed since power-on, and the last reason.
 fn in_words(failures: &Failures) -> String {
     match failures.count {
         0 => "none since power-on".to_owned(),

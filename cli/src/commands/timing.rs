@@ -1,4 +1,4 @@
-//! `cantap timing`: every way to a bit rate, and what each is worth. It needs no device.
+//! `cantap timing`: every timing for a bit rate, and its properties. It needs no device.
 
 use std::io::Write;
 use std::process::ExitCode;
@@ -31,7 +31,7 @@ pub struct Args {
     json: bool,
 }
 
-/// No CAN controller's clock is faster.
+/// No CAN controller has a faster clock.
 const MAX_CLOCK_HZ: u32 = 1_000_000_000;
 
 fn clock(text: &str) -> Result<u32, String> {

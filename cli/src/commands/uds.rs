@@ -1,4 +1,4 @@
-//! `cantap uds`: asks an ECU.
+//! `cantap uds`: queries an ECU.
 
 mod client;
 pub mod hex;
@@ -67,9 +67,9 @@ enum What {
         #[arg(value_name = "HEX", value_parser = bytes)]
         option: Option<Hex>,
     },
-    /// Say that a tester is there, so that a session lasts.
+    /// Send "tester present", so that a session does not end.
     TesterPresent {
-        /// Again and again, until Ctrl-C, --count or --time, without asking for answers.
+        /// Repeatedly, until Ctrl-C, --count or --time, without requesting answers.
         #[arg(long, value_name = "TIME", value_parser = args::positive_duration)]
         period: Option<Duration>,
         /// How many times.
@@ -90,10 +90,10 @@ enum What {
         /// Only those with one of these status bits set, in hexadecimal.
         #[arg(long, value_name = "HEX", default_value = "FF", value_parser = byte)]
         mask: u8,
-        /// Clear all of them, which needs --yes.
+        /// Clear all of them; requires --yes.
         #[arg(long)]
         clear: bool,
-        /// Yes, clear them.
+        /// Confirm clearing.
         #[arg(short, long, requires = "clear")]
         yes: bool,
     },
@@ -109,7 +109,7 @@ enum What {
 enum RoutineAction {
     Start,
     Stop,
-    /// What came of it.
+    /// The result.
     Result,
 }
 
@@ -132,7 +132,7 @@ fn session(text: &str) -> Result<u8, String> {
     }
 }
 
-/// What the listener to our own conversation says of it.
+/// Whether an event in our own conversation is a result.
 fn is_ours(event: &Event) -> bool {
     matches!(event.kind, "exchange" | "refusal" | "request" | "broken")
 }
@@ -167,7 +167,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Says again and again that a tester is there.
+/// Sends "tester present" repeatedly.
 fn stay(
     client: &mut Client<'_>,
     period: Duration,
@@ -194,7 +194,7 @@ fn stay(
 }
 
 impl Args {
-    /// The requests that were asked for.
+    /// The requests to send.
     fn requests(&self) -> anyhow::Result<Vec<Vec<u8>>> {
         Ok(match &self.what {
             What::Read { dids } => {

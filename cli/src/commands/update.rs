@@ -1,4 +1,4 @@
-//! `cantap update`: a firmware onto the board, through the chip's own USB bootloader.
+//! `cantap update`: writes a firmware to the board, through the chip's own USB bootloader.
 
 use std::io::{ErrorKind, IsTerminal, Write};
 use std::path::{Path, PathBuf};
@@ -69,13 +69,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
 }
 
-/// Whether the ROM bootloader's CAN pins (PB5 and PB13, AN2606) are channel 2's, as on every board that does not keep them apart
+/// Whether the ROM bootloader's CAN pins (PB5 and PB13, AN2606) are channel 2's, as on every board that does not separate them
 /// (`docs/wiring.md`).
 fn drives_channel_2(board: &str) -> bool {
     !matches!(board, "olimex-p405" | "virtual" | "virtual-car")
 }
 
-/// Says that channel 2 must be unplugged, and asks whether it is where somebody can answer.
+/// Says that channel 2 must be unplugged, and, if somebody can answer, asks whether it is.
 fn is_unplugged() -> anyhow::Result<bool> {
     let mut err = std::io::stderr();
     writeln!(
@@ -92,13 +92,13 @@ fn is_unplugged() -> anyhow::Result<bool> {
     Ok(matches!(answer.trim(), "y" | "Y" | "yes"))
 }
 
-/// A file's name for a shell.
+/// Quotes a file name for a shell.
 fn quoted(path: &Path) -> String {
     format!("'{}'", path.display().to_string().replace('\'', r"'\''"))
 }
 
-/// Refuses what is no image for this chip, before the device leaves its firmware: an image begins with the stack's
-/// end, in RAM, and the reset vector, an odd address in flash.
+/// Refuses a file that is not an image for this chip, before the device leaves its firmware: an image begins with
+/// the end of the stack, in RAM, and the reset vector, an odd address in flash.
 fn check_image(image: &[u8]) -> anyhow::Result<()> {
     let word =
         |at: usize| image.get(at..at + 4).and_then(|bytes| bytes.try_into().ok()).map(u32::from_le_bytes);
@@ -109,7 +109,7 @@ fn check_image(image: &[u8]) -> anyhow::Result<()> {
     let in_ram = matches!(stack >> 24, 0x10 | 0x20);
     let in_flash = reset & 1 == 1 && (FLASH_START..FLASH_START + MAX_IMAGE as u32).contains(&reset);
     if !in_ram || !in_flash || image.len() as u64 > MAX_IMAGE {
-        bail!("it is no firmware image for this chip; give the .bin that `cargo xtask dist` makes");
+        bail!("it is not a firmware image for this chip; give the .bin that `cargo xtask dist` makes");
     }
     Ok(())
 }

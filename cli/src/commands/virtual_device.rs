@@ -33,13 +33,13 @@ use crate::interrupt;
                         Examples:\n  cantap virtual load=100,frames=std0\n  cantap virtual bitrate=250k,log=drive.log\n  \
                         cantap virtual car\n  cantap virtual car --dbc > car.dbc")]
 pub struct Args {
-    /// What happens on the simulated buses.
+    /// The simulated buses.
     #[arg(default_value = "")]
     options: Options,
-    /// Print the database of the vehicle (a DBC file) and leave.
+    /// Print the vehicle's database (a DBC file) and exit.
     #[arg(long, conflicts_with = "print_eds")]
     dbc: bool,
-    /// Print the sheet of the CANopen nodes (an EDS file) and leave.
+    /// Print the sheet of the CANopen nodes (an EDS file) and exit.
     #[arg(long)]
     print_eds: bool,
 }

@@ -1,4 +1,4 @@
-//! Records in words, and bytes as text.
+//! Records as text, and bytes as text.
 
 use std::fmt::Write as _;
 
@@ -9,7 +9,7 @@ use super::times::seconds;
 
 use crate::words::{error_name, failure_name, state_name};
 
-/// What a record says that is no frame.
+/// The text for a record that is not a frame.
 pub fn event_text(event: &TraceEvent) -> String {
     let counters = |counters: Option<(u8, u8)>| {
         counters.map_or(String::new(), |(tec, rec)| format!(", counters {tec} / {rec}"))
@@ -30,10 +30,10 @@ pub fn event_text(event: &TraceEvent) -> String {
     }
 }
 
-/// How many frames are missing.
+/// The number of missing frames.
 pub fn lost(count: u32, at_least: bool) -> String {
     match (count, at_least) {
-        // As while a device was gone.
+        // For example while a device was gone.
         (0, true) => "an unknown number of".to_owned(),
         (count, true) => format!("at least {count}"),
         (count, false) => count.to_string(),
@@ -65,7 +65,7 @@ pub fn hex(data: &[u8]) -> String {
     text
 }
 
-/// Bytes as characters, dots for those without one.
+/// Bytes as characters, with dots for unprintable ones.
 pub fn printable(data: &[u8]) -> String {
     data.iter().map(|byte| if (0x20..0x7F).contains(byte) { *byte as char } else { '.' }).collect()
 }

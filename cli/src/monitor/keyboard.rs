@@ -1,33 +1,34 @@
-//! Waiting for keys, mouse and changes of size.
+//! Waits for keys, mouse and changes of size.
 //!
-//! crossterm's own wait never ends once the terminal is gone: every read then gives nothing, and it reads on. So on Unix the wait is
-//! done here, and crossterm is only asked what has come.
+//! crossterm's own wait never ends once the terminal is gone: every read then returns nothing, and it keeps reading. So on Unix this
+//! module waits, and crossterm is only asked for what has arrived.
 
 use std::io;
 use std::time::Duration;
 
 use ratatui::crossterm::event;
 
-/// What a wait comes to.
+/// The result of waiting.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Waited {
     /// An event can be read.
     Event,
     /// Nothing came.
     Nothing,
-    /// There is no terminal any more.
+    /// The terminal is gone.
     Gone,
 }
 
 /// The terminal's input.
 pub struct Keyboard {
-    /// Where crossterm reads from.
+    /// The source from which crossterm reads.
     #[cfg(unix)]
     terminal: Box<dyn std::os::fd::AsFd>,
 }
 
 impl Keyboard {
-    /// The one that crossterm uses: standard input, or the controlling terminal if that is something else.
+    /// The terminal that crossterm uses: standard input, or the controlling terminal if that is something
+    /// else.
     #[cfg(unix)]
     pub fn new() -> io::Result<Self> {
         use std::io::IsTerminal;
@@ -37,14 +38,14 @@ impl Keyboard {
         Ok(Self { terminal: Box::new(std::fs::File::open("/dev/tty")?) })
     }
 
-    /// Waits for an event, at most for this time.
+    /// Waits for an event, at most this long.
     #[cfg(unix)]
     pub fn wait(&self, most: Duration) -> io::Result<Waited> {
         use rustix::event::{PollFd, PollFlags, Timespec, poll};
         let mut terminal = [PollFd::new(&self.terminal, PollFlags::IN)];
         let most = Timespec { tv_sec: most.as_secs() as i64, tv_nsec: most.subsec_nanos().into() };
         match poll(&mut terminal, Some(&most)) {
-            // A signal, as when the size has changed.
+            // A signal, for example because the size has changed.
             Ok(_) | Err(rustix::io::Errno::INTR) => {}
             Err(error) => return Err(error.into()),
         }
@@ -54,14 +55,14 @@ impl Keyboard {
         Ok(if event::poll(Duration::ZERO)? { Waited::Event } else { Waited::Nothing })
     }
 
-    /// The one that there is.
+    /// The only one.
     #[cfg(not(unix))]
     #[expect(clippy::unnecessary_wraps, reason = "it can fail elsewhere")]
     pub fn new() -> io::Result<Self> {
         Ok(Self {})
     }
 
-    /// Waits for an event, at most for this time.
+    /// Waits for an event, at most this long.
     #[cfg(not(unix))]
     #[expect(clippy::unused_self, reason = "there is only one here")]
     pub fn wait(&self, most: Duration) -> io::Result<Waited> {

@@ -1,5 +1,5 @@
-//! The live view: a source thread fills a [`model::Model`], the pages draw it, and what is recorded does not
-//! depend on either.
+//! The live view: a source thread fills a [`model::Model`], the pages draw it, and recording depends on
+//! neither.
 
 pub mod app;
 mod event_text;
@@ -36,7 +36,7 @@ use order::Order;
 use screen::Screen;
 use source::{Origin, Shared, lock};
 
-/// The display is drawn anew so often: 25 times a second.
+/// The display is redrawn at this interval: 25 times a second.
 const FRAME: Duration = Duration::from_millis(40);
 
 /// Shows the display until the user leaves.
@@ -51,7 +51,7 @@ pub fn run(
     let mut sources = vec![Watched::start(origin, app, model, orders)?];
     let result = display(&mut screen, &mut sources);
     drop(screen);
-    // Each ends its recording properly before it goes.
+    // Each source finishes its recording properly first.
     let notices: Vec<_> = sources.into_iter().map(Watched::end).collect();
     for notice in notices {
         let notice = notice?;
@@ -62,7 +62,7 @@ pub fn run(
     result
 }
 
-/// A source, what is known of it, and how it is looked at.
+/// A source, what is known of it, and its view.
 struct Watched {
     app: App,
     model: Shared,
@@ -81,7 +81,7 @@ impl Watched {
         Ok(Self { app, model, thread })
     }
 
-    /// A trace beside this one, with the same databases, bit rates and room for the past.
+    /// A trace beside this one, with the same databases, bit rates and memory for history.
     fn beside(&self, path: std::path::PathBuf) -> anyhow::Result<Self> {
         let (sender, receiver) = orders();
         let model = {
@@ -95,9 +95,9 @@ impl Watched {
         Self::start(Origin::File(path), app, model, receiver)
     }
 
-    /// Ends it; what there is to be said then.
+    /// Ends it; returns what to report then.
     fn end(self) -> anyhow::Result<String> {
-        // It may have ended by itself.
+        // It may have ended on its own.
         let _ = self.app.orders.send(Order::Quit);
         if self.thread.join().is_err() {
             bail!("the source thread failed; please report this");
@@ -116,7 +116,7 @@ fn start(
     std::thread::Builder::new().name("cantap-source".to_owned()).spawn(body)
 }
 
-/// Until the user leaves, a signal asks for it, or there is no source or no terminal any more.
+/// Runs until the user leaves, a signal requests it, or there is no source or terminal left.
 fn display(screen: &mut Screen, sources: &mut Vec<Watched>) -> anyhow::Result<()> {
     let stops = Stops::watch()?;
     let keyboard = Keyboard::new()?;
@@ -128,7 +128,7 @@ fn display(screen: &mut Screen, sources: &mut Vec<Watched>) -> anyhow::Result<()
         app.beside = (current + 1, count);
         screen.draw(app, model)?;
         let mut flow = if stops.asked() { Flow::Suspend } else { Flow::GoOn };
-        // What happens meanwhile is answered at once.
+        // Events in the meantime are handled immediately.
         let mut wait = FRAME.saturating_sub(drawn.elapsed());
         while flow == Flow::GoOn && app.wish.is_none() {
             match keyboard.wait(wait)? {
@@ -160,7 +160,7 @@ fn display(screen: &mut Screen, sources: &mut Vec<Watched>) -> anyhow::Result<()
     Ok(())
 }
 
-/// Opens, chooses or closes a source; which one is looked at then.
+/// Opens, selects or closes a source; returns the one to show.
 fn follow(wish: Wish, sources: &mut Vec<Watched>, current: usize) -> anyhow::Result<usize> {
     match wish {
         Wish::Beside(path) => {
@@ -219,7 +219,7 @@ impl Stops {
     }
 }
 
-/// One screen, and what was wrong first where nothing else could be read of a file.
+/// One screen, and the first fault if nothing else could be read from a file.
 pub struct Once {
     pub screen: Buffer,
     pub nothing_read: Option<String>,
@@ -266,7 +266,7 @@ pub fn once(
     Ok(Once { screen, nothing_read })
 }
 
-/// One screen of this size.
+/// A screen of this size.
 pub fn screen(app: &mut App, model: &Model, (width, height): (u16, u16)) -> anyhow::Result<Buffer> {
     let mut terminal = Terminal::new(TestBackend::new(width, height))?;
     terminal.draw(|frame| views::draw(frame, app, model))?;

@@ -1,4 +1,4 @@
-//! What the display asks of the source.
+//! The display's orders to the source.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -7,7 +7,7 @@ use cantap::Frame;
 
 use super::plan::Plan;
 
-/// What the display asks of the source.
+/// An order from the display to the source.
 #[derive(Clone, Debug)]
 pub enum Order {
     /// Record to this file.
@@ -16,23 +16,23 @@ pub enum Order {
     StopRecording,
     /// Send a frame once, on the channel with this number.
     Send(u8, Frame),
-    /// Let the device send a frame periodically; `None` ends it.
+    /// Have the device send a frame periodically; `None` ends it.
     SetPeriodic(u8, u8, Option<(Frame, Duration)>),
     /// Playback: faster.
     Faster,
     /// Playback: slower.
     Slower,
-    /// Playback: pause or go on.
+    /// Playback: pause or resume.
     TogglePause,
     /// Playback: one record.
     Step,
     /// Playback: loop or not.
     ToggleLoop,
-    /// Playback: to the first record that is no older than this, in nanoseconds as in a record.
+    /// Playback: to the first record that is not older than this, in nanoseconds as in a record.
     Seek(i64),
-    /// Bring the channels that are bus-off back onto the bus.
+    /// Bring the channels that are bus-off back on the bus.
     Recover,
-    /// Find the bit rates of the device's channels, only listening; stop doing so.
+    /// Find the bit rates of the device's channels by listening, or stop searching.
     Autobaud,
     /// Another device, other bit rates, another mode.
     Open(Plan),

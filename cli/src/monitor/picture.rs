@@ -9,12 +9,12 @@ use ratatui::style::{Color, Modifier};
 const CHARACTER: (f64, f64) = (8.4, 18.0);
 /// Room around the screen.
 const MARGIN: f64 = 10.0;
-/// Where a character stands above the lower edge of its row.
+/// Distance of a character's base line from the lower edge of its row.
 const DESCENT: f64 = 5.0;
 const BACKGROUND: &str = "#14181d";
 const FOREGROUND: &str = "#d4d4d4";
 
-/// Colours and modifiers of a run of characters.
+/// Colours and modifiers for a run of characters.
 #[derive(Clone, PartialEq)]
 struct Look {
     foreground: String,
@@ -62,7 +62,7 @@ pub fn svg(buffer: &Buffer) -> String {
     out
 }
 
-/// Characters of one look; `span` is their first column and how many they are.
+/// Draws a run of characters; `span` is their first column and their number.
 fn run(out: &mut String, text: &str, look: &Look, span: (u16, u16), row: u16) {
     let x = MARGIN + f64::from(span.0) * CHARACTER.0;
     let (y, width) = (MARGIN + f64::from(row) * CHARACTER.1, f64::from(span.1) * CHARACTER.0);
@@ -74,7 +74,7 @@ fn run(out: &mut String, text: &str, look: &Look, span: (u16, u16), row: u16) {
             "<rect x=\"{x:.1}\" y=\"{y:.1}\" width=\"{width:.1}\" height=\"{height}\" fill=\"{background}\"/>"
         );
     }
-    // Blanks at the ends are left out: not everybody counts them.
+    // Blanks at the ends are left out: not every renderer counts them.
     let visible = text.trim();
     if visible.is_empty() {
         return;
@@ -94,7 +94,7 @@ fn run(out: &mut String, text: &str, look: &Look, span: (u16, u16), row: u16) {
         }
     }
     let baseline = y + CHARACTER.1 - DESCENT;
-    // The length keeps columns in line, whatever font the reader has.
+    // The length keeps columns aligned, whatever the reader's font.
     let _ = writeln!(
         out,
         "<text x=\"{x:.1}\" y=\"{baseline:.1}\" textLength=\"{width:.1}\" fill=\"{}\"{style}>{}</text>",
@@ -104,7 +104,7 @@ fn run(out: &mut String, text: &str, look: &Look, span: (u16, u16), row: u16) {
     );
 }
 
-/// As usual terminals show it; `None` is the terminal's own.
+/// As terminals usually show it; `None` is the terminal's own colour.
 fn colour(colour: Color) -> Option<String> {
     let fixed = match colour {
         Color::Rgb(red, green, blue) => return Some(format!("#{red:02x}{green:02x}{blue:02x}")),

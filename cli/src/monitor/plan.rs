@@ -16,12 +16,12 @@ pub struct Plan {
     pub addresses: Vec<Address>,
     /// Channels to open, by number.
     pub channels: Vec<u8>,
-    /// How to open them, as on the command line; only listening where it does not say.
+    /// How to open them, as on the command line; unless it says otherwise, only listening.
     pub open: ChannelArgs,
 }
 
 impl Plan {
-    /// Only listening to devices, on the channels whose bit rates are known; on all if none is.
+    /// Only listens to devices, on the channels whose bit rates are known; on all if none is.
     pub fn listening(addresses: Vec<Address>, options: &cantap_analysis::stats::Options) -> Self {
         let mut plan = Self { addresses, channels: Vec::new(), open: ChannelArgs::default() };
         for channel in plan.all_channels() {
@@ -33,7 +33,7 @@ impl Plan {
         plan
     }
 
-    /// The same with other devices. With more or fewer of them, it has other channels, too.
+    /// The same with other devices. If their number differs, so do the channels.
     pub fn at(&self, addresses: Vec<Address>) -> Self {
         let is_as_many = addresses.len() == self.addresses.len();
         let mut plan = Self { addresses, ..self.clone() };
@@ -43,20 +43,20 @@ impl Plan {
         plan
     }
 
-    /// What messages call the devices.
+    /// The devices' name in messages.
     pub fn name(&self) -> String {
         let names: Vec<String> = self.addresses.iter().map(ToString::to_string).collect();
         names.join(" + ")
     }
 
-    /// The channels of a device, from 0, that are to be opened.
+    /// The channels to open on a device, counted from 0.
     pub fn channels_of(&self, board: usize) -> impl Iterator<Item = Channel> + use<'_> {
         Channel::ALL
             .into_iter()
             .filter(move |channel| self.channels.contains(&channel_number(board, *channel)))
     }
 
-    /// The numbers of all channels that the devices have.
+    /// The numbers of all the devices' channels.
     fn all_channels(&self) -> std::ops::RangeInclusive<u8> {
         1..=(self.addresses.len() * CHANNELS) as u8
     }
@@ -66,13 +66,13 @@ impl Plan {
         self.open.mode().unwrap_or(Mode::ListenOnly)
     }
 
-    /// Other bit rates, in place of whatever timing there was. A rate that is for one channel alone opens that channel alone.
+    /// Sets other bit rates, replacing any earlier timing. If a rate is for one channel, only that channel is opened.
     pub fn set_bit_rates(&mut self, rates: Vec<ChannelBitrate>) {
         self.open.timing.set_bit_rates(rates);
         self.choose_channels();
     }
 
-    /// The channels that bit rates speak of; all if there are none.
+    /// Selects the channels that have bit rates; all if there are none.
     pub fn choose_channels(&mut self) {
         let rates = &self.open.timing.bitrates;
         self.channels = self
@@ -81,7 +81,7 @@ impl Plan {
             .collect();
     }
 
-    /// The statistics' options with this plan's bit rates, as far as it has any.
+    /// The statistics' options with this plan's bit rates, if it has any.
     pub fn options(&self, others: &cantap_analysis::stats::Options) -> cantap_analysis::stats::Options {
         let rates = self.channels.iter().copied().filter_map(|number| {
             let own = ChannelBitrate::of(&self.open.timing.bitrates, number);

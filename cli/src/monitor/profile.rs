@@ -4,41 +4,41 @@ use std::path::{Path, PathBuf};
 
 use super::app::{Column, View};
 
-/// A profile as it is written. Every key may be left out; the command line goes before the profile.
+/// A profile as written. Every key is optional; the command line takes precedence over the profile.
 #[derive(Clone, Debug, Default, PartialEq, Eq, serde::Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Profile {
     /// The device's address, as after `-d`.
     pub device: Option<String>,
-    /// Several devices' addresses: their channels are numbered on.
+    /// Several devices' addresses: their channels are numbered consecutively.
     pub devices: Vec<String>,
     /// Bit rates, as after `-b`: `["500k", "2:250k"]`.
     pub bitrates: Vec<String>,
     /// Take part in the bus instead of listening only.
     pub normal: bool,
-    /// Signal databases, as after `--db`; where they are begins at the profile.
+    /// Signal databases, as after `--db`; paths are relative to the profile.
     pub databases: Vec<String>,
     /// Filters in candump's syntax.
     pub filters: Vec<String>,
     /// The page to begin with.
     pub view: Option<View>,
-    /// What the fixed view is sorted by.
+    /// The column by which the fixed view is sorted.
     pub sort: Option<Column>,
     /// Signals in the graph: `Speed`, `Engine.Speed`, patterns such as `Wheel*`.
     pub graph: Vec<String>,
     /// Frames to send, as typed on the page Send: `["123#11 100ms"]`.
     pub send: Vec<String>,
-    /// A file to record to from the start; where it is begins at the profile.
+    /// A file to record to from the start; its path is relative to the profile.
     pub record: Option<String>,
     /// For light backgrounds.
     pub light: bool,
-    /// Where it was read from: paths in it that are not absolute begin there.
+    /// The folder from which it was read: relative paths in it start there.
     #[serde(skip)]
     pub folder: PathBuf,
 }
 
 impl Profile {
-    /// Reads a profile. The reason why not names the file, the line and what is wrong.
+    /// Reads a profile. An error names the file, the line and what is wrong.
     pub fn load(path: &Path) -> Result<Self, String> {
         let text =
             std::fs::read_to_string(path).map_err(|error| format!("profile {}: {error}", path.display()))?;

@@ -1,4 +1,4 @@
-//! Recording what comes, all of it, whatever is displayed.
+//! Records everything that arrives, whatever is displayed.
 
 use std::path::{Path, PathBuf};
 
@@ -11,13 +11,13 @@ use super::model::Recording;
 use crate::advice;
 use crate::protocols;
 
-/// What is kept around an event where a condition is given.
+/// The time kept around an event if a condition is given.
 const WINDOW: Window = Window { pre_ns: 2_000_000_000, post_ns: 5_000_000_000, events: None };
 
-/// What stands between a file's name and the condition on which it is written.
+/// Separates a file's name from the condition for recording.
 const IF: &str = " if ";
 
-/// A file's name, and the condition on which it is written, if there is one.
+/// A file's name, and the condition for recording, if there is one.
 pub fn parts(text: &Path) -> (&Path, Option<&str>) {
     match text.to_str().and_then(|text| text.split_once(IF)) {
         None => (text, None),
@@ -25,7 +25,7 @@ pub fn parts(text: &Path) -> (&Path, Option<&str>) {
     }
 }
 
-/// A file that grows.
+/// A growing file.
 pub struct Recorder {
     path: PathBuf,
     writer: Box<dyn TraceWriter>,
@@ -35,8 +35,8 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// Creates the file, in the format of its suffix. Behind the name may stand a condition, as in
-    /// `fast.blf if Speed > 80`: then only what is around such events is recorded.
+    /// Creates the file, in the format of its suffix. The name may be followed by a condition, as
+    /// in `fast.blf if Speed > 80`: then only the records around such events are written.
     pub fn create(text: &Path, decoder: &Decoder) -> anyhow::Result<Self> {
         let (path, condition) = parts(text);
         let trigger = match condition {
@@ -72,7 +72,7 @@ impl Recorder {
         Ok(())
     }
 
-    /// Hands what was written to the system, and says how things are.
+    /// Passes what was written to the system, and returns the recording's state.
     pub fn state(&mut self) -> std::io::Result<Recording> {
         self.writer.flush()?;
         Ok(Recording {
@@ -83,7 +83,7 @@ impl Recorder {
         })
     }
 
-    /// Ends the file and says so in a sentence.
+    /// Ends the file and returns a sentence about it.
     pub fn finish(self) -> String {
         let (path, records) = (self.path.display().to_string(), self.records);
         match self.writer.finish() {

@@ -1,4 +1,5 @@
-//! The terminal in our hands: taken, given back however we leave, and never waited for with the model locked.
+//! The terminal while it is ours: taken over, restored however we leave, and never waited for with the model
+//! locked.
 
 use std::cell::RefCell;
 use std::io::{IsTerminal, Write};
@@ -21,13 +22,13 @@ use super::model::Model;
 use super::source::{Shared, lock};
 use super::views;
 
-/// The terminal, taken; dropping it gives it back.
+/// The terminal, taken over; dropping this restores it.
 pub struct Screen {
     terminal: Terminal<CrosstermBackend<Page>>,
     page: Page,
 }
 
-/// What is to be written. Drawing needs the model, whose lock must not be held while a slow terminal takes its time.
+/// Output to be written. Drawing needs the model, whose lock must not be held while a slow terminal takes its time.
 #[derive(Clone, Default)]
 struct Page(Rc<RefCell<Vec<u8>>>);
 
@@ -43,7 +44,7 @@ impl Write for Page {
 }
 
 impl Screen {
-    /// Refuses what is no terminal with what to do instead, and takes it otherwise.
+    /// Takes over the terminal; if there is none, the error says what to do instead.
     pub fn enter() -> anyhow::Result<Self> {
         const INSTEAD: &str = "use --once for one screen, or `cantap capture` and `cantap stats`";
         if !std::io::stdout().is_terminal() || !std::io::stdin().is_terminal() {
@@ -67,7 +68,7 @@ impl Screen {
         Ok(screen)
     }
 
-    /// Draws the page that the user looks at.
+    /// Draws the page that the user is viewing.
     pub fn draw(&mut self, app: &mut App, model: &Shared) -> anyhow::Result<()> {
         {
             let mut model = lock(model);
@@ -81,13 +82,13 @@ impl Screen {
     }
 
     fn render(&mut self, app: &mut App, model: &Model) -> anyhow::Result<()> {
-        // A terminal that knows this shows the page at once when it is whole.
+        // A terminal that supports this shows the page only once it is complete.
         queue!(self.page, BeginSynchronizedUpdate)?;
         self.terminal.draw(|frame| views::draw(frame, app, model))?;
         Ok(queue!(self.page, EndSynchronizedUpdate)?)
     }
 
-    /// Stops the program until the shell lets it go on, with the terminal as it was.
+    /// Stops the program until the shell resumes it, with the terminal restored.
     #[cfg(unix)]
     pub fn suspend(&mut self) -> anyhow::Result<()> {
         use ratatui::crossterm::terminal::{Clear, ClearType};
@@ -95,12 +96,12 @@ impl Screen {
         give_back();
         signal_hook::low_level::emulate_default_handler(signal_hook::consts::SIGTSTP)?;
         take()?;
-        // Nothing of what was drawn before is there any more.
+        // Nothing that was drawn before is there any more.
         self.terminal = Terminal::new(CrosstermBackend::new(self.page.clone()))?;
         Ok(execute!(std::io::stdout(), Clear(ClearType::All))?)
     }
 
-    /// There is no such thing on this system.
+    /// Not available on this system.
     #[cfg(not(unix))]
     pub fn suspend(&mut self) -> anyhow::Result<()> {
         Ok(())
@@ -119,7 +120,7 @@ fn take() -> anyhow::Result<()> {
 }
 
 fn give_back() {
-    // There is nobody left to tell if that fails. The cursor was hidden by the first drawing.
+    // If that fails, there is nobody left to report it to. The first drawing has hidden the cursor.
     let _ = execute!(
         std::io::stdout(),
         DisableMouseCapture,
@@ -129,7 +130,7 @@ fn give_back() {
     let _ = disable_raw_mode();
 }
 
-/// Puts text into the clipboard through the terminal (xterm's OSC 52), which works over a network too.
+/// Copies text to the clipboard through the terminal (xterm's OSC 52), which also works over a network.
 pub fn copy(text: &str) -> std::io::Result<()> {
     let mut out = std::io::stdout();
     write!(out, "\x1b]52;c;{}\x07", STANDARD.encode(text))?;
@@ -160,7 +161,7 @@ mod tests {
         let mut child = pair.slave.spawn_command(command).unwrap();
         drop(pair.slave);
         let (mut reader, mut output) = (pair.master.try_clone_reader().unwrap(), Vec::new());
-        // Ends with an error when the child has closed its terminal.
+        // It ends with an error when the child has closed its terminal.
         let _ = reader.read_to_end(&mut output);
         child.wait().unwrap();
         let mut terminal = vt100::Parser::default();

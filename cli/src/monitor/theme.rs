@@ -1,22 +1,22 @@
-//! Colours, for dark and light backgrounds and for colour-blind eyes; modifiers alone where there are none.
+//! Colours for dark and light backgrounds and for colour-blind users; only modifiers if there are no colours.
 //!
-//! No meaning is in a colour only: errors have a letter, alarms an arrow, losses a text.
+//! Nothing is conveyed by colour alone: errors have a letter, alarms an arrow, losses a text.
 
 use ratatui::style::{Color, Modifier, Style};
 
 /// How to draw.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Theme {
-    /// Colours may be used.
+    /// Whether colours may be used.
     pub colour: bool,
-    /// The background is light.
+    /// Whether the background is light.
     pub light: bool,
-    /// Characters beyond ASCII may be used.
+    /// Whether characters beyond ASCII may be used.
     pub unicode: bool,
 }
 
 impl Theme {
-    /// By what the environment says: `NO_COLOR`, `COLORFGBG`, the locale, and what the user asked for.
+    /// From the environment: `NO_COLOR`, `COLORFGBG`, the locale; and from the user's choice.
     pub fn from_environment(light: bool) -> Self {
         let has = |name: &str| std::env::var_os(name).is_some_and(|value| !value.is_empty());
         // "foreground;background", where 7 and 15 are light.
@@ -33,22 +33,22 @@ impl Theme {
         }
     }
 
-    /// Errors, and what is above its alarm limit.
+    /// Errors, and values above their alarm limit.
     pub fn error(self) -> Style {
         self.style(Color::LightRed, Color::Red, Modifier::BOLD).add_modifier(Modifier::BOLD)
     }
 
-    /// What follows a loss.
+    /// Whatever follows a loss.
     pub fn loss(self) -> Style {
         self.style(Color::Yellow, Color::Rgb(0x99, 0x66, 0), Modifier::REVERSED)
     }
 
-    /// Below its alarm limit.
+    /// Values below their alarm limit.
     pub fn below(self) -> Style {
         self.style(Color::LightBlue, Color::Blue, Modifier::UNDERLINED).add_modifier(Modifier::BOLD)
     }
 
-    /// Sent by ourselves.
+    /// Frames sent by this device.
     pub fn sent(self) -> Style {
         self.style(Color::LightCyan, Color::Rgb(0, 0x60, 0x70), Modifier::ITALIC)
     }
@@ -68,12 +68,12 @@ impl Theme {
         Style::new().add_modifier(Modifier::BOLD)
     }
 
-    /// The upper and lower line of the screen, and what is selected.
+    /// The top and bottom line of the screen, and the selection.
     pub fn bar() -> Style {
         Style::new().add_modifier(Modifier::REVERSED)
     }
 
-    /// The style of a byte by how long ago it changed, in nanoseconds: it fades.
+    /// The style of a byte by the time since its last change, in nanoseconds: it fades.
     pub fn changed(self, age_ns: i64) -> Style {
         match age_ns {
             i64::MIN..300_000_000 => self
@@ -89,7 +89,7 @@ impl Theme {
         }
     }
 
-    /// The colour of a curve or a mark: Okabe and Ito's, which all eyes tell apart.
+    /// The colour of a curve or a mark: Okabe and Ito's, which everyone can tell apart.
     pub fn series(self, index: usize) -> Style {
         const DARK: [Color; 6] = [
             Color::Rgb(0x56, 0xB4, 0xE9),

@@ -1,4 +1,4 @@
-//! Times in words.
+//! Times as text.
 
 /// A time in seconds with six decimals.
 pub fn seconds(ns: i64) -> String {
@@ -19,7 +19,7 @@ pub fn clock(time_ns: i64, decimals: usize) -> String {
     }
 }
 
-/// How long something lasts, as a player shows it: `0:05`, `12:30`, `1:02:03`.
+/// A duration as a player shows it: `0:05`, `12:30`, `1:02:03`.
 pub fn duration(ns: i64) -> String {
     let seconds = ns.max(0) / 1_000_000_000;
     match seconds / 3600 {

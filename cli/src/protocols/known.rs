@@ -1,4 +1,4 @@
-//! What a bus is made of, in words and in JSON.
+//! An inventory of a bus, as text and JSON.
 
 use std::fmt::Write as _;
 
@@ -8,19 +8,19 @@ use serde_json::{Value, json};
 
 use super::reading::Reading;
 
-/// Responses, nodes and objects of a trace, found by reading it.
+/// Responses, nodes and objects of a trace, collected by reading it.
 pub struct Known {
     reading: Reading,
     overview: Overview,
 }
 
 impl Known {
-    /// With a reader that has read nothing.
+    /// With a reader that has not read anything.
     pub fn new(reading: Reading) -> Self {
         Self { reading, overview: Overview::default() }
     }
 
-    /// Takes records; without `more`, this was the end.
+    /// Takes records; if `more` is false, this was the end.
     pub fn take(&mut self, records: &[TraceRecord], more: bool) {
         let overview = &mut self.overview;
         let Ok(()) = self.reading.take(records, more, |event| {
@@ -122,7 +122,7 @@ fn times(responses: &Histogram) -> Option<[f64; 4]> {
     Some([at(0.0)?, at(50.0)?, at(99.0)?, at(100.0)?])
 }
 
-/// Faults, state, identity and codes, each where there is one.
+/// Faults, state, identity and codes, as far as there are any.
 pub fn about(known: &KnownNode) -> String {
     let mut about = String::new();
     if known.faults > 0 {

@@ -1,4 +1,5 @@
-//! What the frames mean, for every command that asks: the options, and reading records as the bus speaks.
+//! What the frames mean, for every command that needs it: the options, and reading records by the bus's
+//! protocols.
 
 mod known;
 mod reading;
@@ -14,25 +15,27 @@ pub use self::known::{Known, about, named};
 pub use self::reading::{Read, Reading};
 pub use self::sheet::SheetPath;
 
-/// What helps to understand a bus; for commands to flatten into theirs.
+/// What helps to understand a bus; commands flatten this into their arguments.
 #[derive(Clone, Debug, Default, clap::Args)]
 pub struct ProtocolArgs {
     /// Two identifiers that talk to each other by ISO 15765-2, as 7E0:7E8; with an address in the first data byte as
-    /// 6F1/12:612/F1. Can be repeated. Others are found by what they do.
+    /// 6F1/12:612/F1. Can be repeated. Others are found by their behaviour.
     #[arg(long = "pair", value_name = "ID:ID")]
     pairs: Vec<Pair>,
-    /// The sheet (EDS or DCF) of CANopen nodes; with a node's number before it (5:drive.eds), that node's. Can be repeated.
+    /// The sheet (EDS or DCF) of CANopen nodes; with a node's number before it (5:drive.eds), only for that node. Can be
+    /// repeated.
     #[arg(long = "eds", value_name = "[NODE:]FILE")]
     sheets: Vec<SheetPath>,
 }
 
 impl ProtocolArgs {
-    /// What reads a trace for its nodes and services.
+    /// A reader that collects a trace's nodes and services.
     pub fn known(&self, quiet: bool) -> anyhow::Result<Known> {
         Ok(Known::new(Reading::new(self.options(quiet)?, None, quiet)))
     }
 
-    /// As the library takes it; what of a sheet is not understood goes to standard error, unless `quiet`.
+    /// The library's options; what is not understood in a sheet is reported on standard error, unless
+    /// `quiet`.
     pub fn options(&self, quiet: bool) -> anyhow::Result<Options> {
         let sheets = self.sheets.iter().map(|path| path.load(quiet)).collect::<anyhow::Result<Vec<_>>>()?;
         Ok(Options { pairs: self.pairs.clone(), sheets, ..Options::default() })
@@ -44,7 +47,7 @@ pub fn condition(text: &str, decoder: &Decoder) -> Result<Condition, ConditionEr
     cantap_protocols::condition(text, decoder, &Options::default())
 }
 
-/// Says which of a condition's names nothing had: a name that is misspelt would find nothing, and look as if there were nothing.
+/// Reports which of a condition's names never occurred: a misspelt name finds nothing, as if there were nothing.
 pub fn tell_unheard(condition: &Condition) {
     let names: Vec<_> = condition.unheard().collect();
     if !names.is_empty() {

@@ -1,4 +1,4 @@
-//! Records read as their bus speaks.
+//! Reads records by their bus's protocols.
 
 use std::sync::Arc;
 
@@ -8,7 +8,7 @@ use cantap_signals::Decoder;
 
 use super::surveyed::{self, Surveyed};
 
-/// Reads records by the protocols that were asked for, or by those that the first records of each channel show.
+/// Reads records by the requested protocols, or by those found in the first records of each channel.
 pub struct Reading {
     options: Options,
     surveyed: Surveyed,
@@ -18,19 +18,19 @@ pub struct Reading {
 }
 
 impl Reading {
-    /// What is spoken goes to standard error, unless `quiet`.
+    /// The protocols found are reported on standard error, unless `quiet`.
     pub fn new(options: Options, decoder: Option<Arc<Decoder>>, quiet: bool) -> Self {
         let surveyed = Surveyed::new(options.protocols.is_empty());
         let options = Options { decoder, ..options };
         Self { options, surveyed, conversations: None, events: Vec::new(), quiet }
     }
 
-    /// The transfers that have begun and have not ended.
+    /// The transfers in progress.
     pub fn under_way(&self) -> Vec<UnderWay> {
         self.conversations.as_ref().map_or_else(Vec::new, Conversations::under_way)
     }
 
-    /// Takes records, and hands out what was said. Until it is clear what is spoken, records wait. Without `more`, this was the end.
+    /// Takes records, and passes on events. Until the protocols are known, records wait. If `more` is false, this was the end.
     pub fn take<E>(
         &mut self,
         records: &[TraceRecord],
@@ -43,7 +43,7 @@ impl Reading {
         })
     }
 
-    /// The same, with the records in between: each before what it completes.
+    /// The same, with the records in between: each before the events that it completes.
     pub fn take_both<E>(
         &mut self,
         records: &[TraceRecord],
@@ -69,7 +69,7 @@ impl Reading {
         for record in records {
             read(Read::Record(record))?;
             conversations.take(record, events);
-            // One by one: what is freed at once is there for the next.
+            // One by one: what is freed immediately is available for the next.
             events.drain(..).try_for_each(|event| read(Read::Event(event)))?;
         }
         if !more {
@@ -80,10 +80,10 @@ impl Reading {
     }
 }
 
-/// A record, or what was said.
+/// A record or an event.
 pub enum Read<'a> {
     /// The record.
     Record(&'a TraceRecord),
-    /// What was said.
+    /// The event.
     Event(Event),
 }

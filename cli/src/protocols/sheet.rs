@@ -1,4 +1,4 @@
-//! The sheets of CANopen nodes, as they are given.
+//! The sheets of CANopen nodes, as given.
 
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -19,7 +19,7 @@ impl FromStr for SheetPath {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        // A drive letter is no number, so that Windows' paths pass.
+        // A drive letter is not a number, so Windows paths are accepted.
         let numbered = text.split_once(':').filter(|(number, _)| number.parse::<u32>().is_ok());
         let Some((number, path)) = numbered else { return Ok(Self { node: None, path: text.into() }) };
         match number.parse() {
@@ -30,14 +30,14 @@ impl FromStr for SheetPath {
 }
 
 impl SheetPath {
-    /// Reads the file; what of it is not understood goes to standard error, unless `quiet`.
+    /// Reads the file; what is not understood is reported on standard error, unless `quiet`.
     pub fn load(&self, quiet: bool) -> anyhow::Result<Sheet> {
         let name = self.path.display();
         let bytes = std::fs::read(&self.path).with_context(|| format!("cannot read the sheet {name}"))?;
         let eds = Eds::parse(&bytes);
         anyhow::ensure!(
             !eds.objects.is_empty(),
-            "{name} is no EDS or DCF: there is no object in it; give the file that came with the device"
+            "{name} is not an EDS or DCF: there is no object in it; give the file that came with the device"
         );
         if !quiet {
             for issue in &eds.issues {

@@ -1,14 +1,15 @@
-//! The first records show what a bus speaks. They wait meanwhile, and are then read like all others.
+//! The first records show which protocols a bus uses. They wait until then, and are then read like all
+//! others.
 
 use cantap::TraceRecord;
 use cantap_protocols::{Evidence, Relative, Survey};
 
-/// No survey looks at more records than this.
+/// A survey examines no more records than this.
 const MOST_RECORDS: usize = 200_000;
-/// Nor at more than this time of the bus, in nanoseconds.
+/// Nor more than this time of the bus, in nanoseconds.
 const LONGEST_NS: i64 = 3_000_000_000;
 
-/// Records that wait for the survey.
+/// Records waiting for the survey.
 pub(super) struct Surveyed {
     survey: Option<Survey>,
     waiting: Vec<TraceRecord>,
@@ -20,7 +21,7 @@ impl Surveyed {
         Self { survey: is_wanted.then(Survey::new), waiting: Vec::new() }
     }
 
-    /// Takes records; whether the survey is done.
+    /// Takes records; returns whether the survey is done.
     pub fn take(&mut self, records: &[TraceRecord], more: bool) -> bool {
         let Some(survey) = &mut self.survey else {
             self.waiting.extend_from_slice(records);
@@ -37,12 +38,12 @@ impl Surveyed {
         !more || self.waiting.len() >= MOST_RECORDS || spans >= LONGEST_NS
     }
 
-    /// What each channel speaks; `None` without a survey.
+    /// The protocols of each channel; `None` without a survey.
     pub fn found(&self) -> Option<Vec<Evidence>> {
         self.survey.as_ref().map(Survey::found)
     }
 
-    /// What is recognised and not read.
+    /// Protocols recognised but not decoded.
     pub fn relatives(&self) -> Vec<(u8, Relative)> {
         self.survey.as_ref().map_or_else(Vec::new, Survey::relatives)
     }
@@ -53,7 +54,7 @@ impl Surveyed {
     }
 }
 
-/// Says what was found.
+/// Reports what was found.
 pub(super) fn tell(found: Option<&[Evidence]>, relatives: &[(u8, Relative)]) {
     let Some(found) = found else { return };
     for (channel, relative) in relatives {

@@ -28,7 +28,7 @@ fn two_boards_80_ppm_apart_are_on_one_clock_and_on_utc() {
     assert_eq!(report.source, ClockSource::Frames);
     assert!(errors.worst_us < 60.0, "{errors:?}");
     assert!(errors.worst_us * 1e3 < report.uncertainty_ns.unwrap() as f64, "{errors:?}, {report:?}");
-    // Against a computer that is 25 ppm fast.
+    // Compared with a computer that is 25 ppm fast.
     assert!((report.drift_ppm.unwrap() - 15.0).abs() < 5.0, "{report:?}");
     assert!(matches!(clocks.alone.1.source, ClockSource::RoundTrips(_)));
 }

@@ -1,9 +1,9 @@
-//! How well device time is mapped to UTC, and one board's time to another's: measured on boards that run the firmware's ELF, whose true
-//! time is known.
+//! How accurately device time is mapped to UTC, and one board's time to another's: measured on boards that run the firmware's ELF,
+//! whose true time is known.
 //!
-//! The world's time is what the emulated USB host's frames count exactly. The computer's clock runs by another crystal, the
-//! boards by their own. A round trip takes what the emulated bus and the firmware need for it; on each way, an operating system takes
-//! a random time on top.
+//! World time is what the emulated USB host's frames count exactly. The computer's clock runs from another crystal, the boards from
+//! their own. A round trip takes the time that the emulated bus and the firmware need; an operating system adds a random time in each
+//! direction.
 
 use std::sync::Arc;
 
@@ -21,17 +21,18 @@ const START_NS: i64 = 1_700_000_000_000_000_000;
 const COMPUTER_PPM: f64 = 25.0;
 /// USB allows a host ±500 ns from frame to frame (2.0, 7.1.12).
 const SOF_JITTER: u64 = CYCLES_PER_US / 2;
-/// What the operating system takes on each way at least, and on average on top: a thread that is woken.
+/// The operating system's minimum delay in each direction, which is also the mean of the random addition: a
+/// thread is woken.
 const LEAST_DELAY_NS: f64 = 30_000.0;
 const MORE_DELAY_NS: f64 = 100_000.0;
-/// The answer is looked for so often.
+/// How often to check for the answer.
 const LOOK_CYCLES: u64 = 20 * CYCLES_PER_US;
-/// Round trips at the start.
+/// Number of round trips at the start.
 const ROUNDS: u32 = 8;
-/// Errors are taken from this many places in each second.
+/// Number of times per second at which errors are measured.
 const PLACES: u32 = 20;
 
-/// What was measured of errors, in microseconds.
+/// Measured errors, in microseconds.
 #[derive(Clone, Copy, Debug)]
 pub struct Errors {
     pub median_us: f64,
@@ -49,7 +50,7 @@ impl Errors {
     }
 }
 
-/// One board, its time by round trips alone and by USB frames.
+/// One board, with its time from round trips alone and from USB frames.
 struct Board {
     rig: Rig,
     ppm: f64,
@@ -75,7 +76,7 @@ impl Board {
         Ok(board)
     }
 
-    /// The core cycle at a world time.
+    /// The core's cycle count at a world time.
     fn cycle(&self, world_s: f64) -> u64 {
         (world_s * CYCLES_PER_SECOND as f64 * (1.0 + self.ppm * 1e-6)) as u64
     }
@@ -129,23 +130,24 @@ impl Board {
     }
 }
 
-/// What the computer's clock shows at a world time.
+/// The computer's clock at a world time.
 fn utc(world_s: f64) -> UtcNs {
     UtcNs(START_NS + (world_s * 1e9 * (1.0 + COMPUTER_PPM * 1e-6)) as i64)
 }
 
-/// What two boards' clocks are worth.
+/// The quality of two boards' clocks.
 #[derive(Debug)]
 pub struct Clocks {
-    /// The first board's UTC by round trips alone, and what it said of itself at the end.
+    /// The first board's UTC from round trips alone, and its own report at the end.
     pub alone: (Errors, ClockReport),
-    /// By USB frames.
+    /// The same with USB frames.
     pub frames: (Errors, ClockReport),
-    /// The second board's time from the first one's: by the frames, and by each one's UTC with round trips alone.
+    /// The second board's time from the first one's: from the frames, and from each one's UTC with round trips
+    /// alone.
     pub common: Result<Errors, NotCommon>,
     pub by_utc: Errors,
-    /// The second board's times put on the first one's clock while both run, as a capture does: beside what the first one's map has
-    /// for the same moment.
+    /// The second board's times converted to the first one's clock while both run, as in a capture, compared with the first one's
+    /// map for the same moment.
     pub live: Errors,
 }
 
@@ -163,7 +165,7 @@ pub fn measure(image: &Image, ppm: [f64; 2], seconds: u32, settled_s: u32) -> Re
         let [first, other] = boards.each_ref().map(|board| Arc::new(board.frames.clone()));
         follower.update(first, other);
         if second < settled_s {
-            // As records do that are not measured.
+            // Like records that are not measured.
             for place in 1..PLACES {
                 let ticks = boards[1].ticks(f64::from(second) + f64::from(place) / f64::from(PLACES));
                 follower.place(boards[1].frames.utc(ticks).0);

@@ -1,4 +1,4 @@
-//! A virtual device behind a pseudo terminal, at the end of a link with a name that stays.
+//! A virtual device behind a pseudo-terminal, at the end of a link with a stable name.
 
 use std::os::unix::fs::symlink;
 use std::path::PathBuf;
@@ -32,7 +32,7 @@ impl Port {
     }
 
     pub fn unplug(&mut self) {
-        // Ended before its name goes, as a cable does it.
+        // It ends before its name disappears, as with a cable.
         self.device = None;
         let _ = std::fs::remove_file(&self.name);
     }

@@ -1,7 +1,7 @@
-//! Holds JSON values to a JSON Schema.
+//! Checks JSON values against a JSON Schema.
 //!
-//! Only what our own schema uses is known, and everything else in it is an error, so that no part of it is overlooked: a whole
-//! validator would bring forty crates for a handful of keywords.
+//! It supports only what our own schema uses, and everything else in a schema is an error, so that no part of it is
+//! overlooked: a complete validator would need forty crates for a handful of keywords.
 
 use serde_json::{Map, Value};
 
@@ -21,7 +21,7 @@ impl Schema {
         self.root["$defs"].as_object().unwrap()
     }
 
-    /// What of a value is not as the type says; nothing if all is.
+    /// Where a value violates the type; empty if it is valid.
     pub fn faults(&self, name: &str, value: &Value) -> Vec<String> {
         let mut faults = Vec::new();
         self.check(&self.root["$defs"][name], value, name, &mut faults);

@@ -1,4 +1,4 @@
-//! The command in a terminal, as a user has it: keys go in, a screen comes out.
+//! The command in a terminal, as users have it: keys go in, a screen comes out.
 
 use std::io::{Read, Write};
 use std::path::Path;
@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use portable_pty::{Child, CommandBuilder, MasterPty, PtySize, native_pty_system};
 
-/// Longer than anything that is waited for takes, however busy the machine is.
+/// Longer than anything awaited takes, however busy the machine.
 const PATIENCE: Duration = Duration::from_mins(1);
 
 /// A running `cantap` and its terminal.
@@ -32,7 +32,7 @@ impl Terminal {
         Self::start_with(arguments, columns_rows, &[])
     }
 
-    /// With changes to the environment: a variable's value, or none.
+    /// With changes to the environment: a variable's value, or `None` to remove it.
     pub fn start_with(
         arguments: &str,
         columns_rows: (u16, u16),
@@ -78,9 +78,9 @@ impl Terminal {
         Self { child, ours: Some((pair.master, writer)), parser, stalled, closed }
     }
 
-    /// Closes the window: the program has no terminal any more.
+    /// Closes the window: the program no longer has a terminal.
     pub fn close(&mut self) {
-        // The reader goes when it has read once more, and with it the last of our ends.
+        // The reader ends after its next read, and with it the last of our ends.
         self.closed.store(true, Ordering::Relaxed);
         self.ours = None;
     }
@@ -92,22 +92,22 @@ impl Terminal {
         writer.flush().unwrap();
     }
 
-    /// What stands on the screen.
+    /// The text on the screen.
     pub fn text(&self) -> String {
         self.parser.lock().unwrap().screen().contents()
     }
 
-    /// Looks at the screen as the terminal knows it.
+    /// Examines the screen as the terminal shows it.
     pub fn screen<T>(&self, look: impl Fn(&vt100::Screen) -> T) -> T {
         look(self.parser.lock().unwrap().screen())
     }
 
-    /// Waits until the screen has this text, and returns all of it.
+    /// Waits until the screen contains this text, and returns the whole screen.
     pub fn wait_for(&self, text: &str) -> String {
         self.wait_until(text, |screen| screen.contains(text))
     }
 
-    /// Waits until the screen is as it should be.
+    /// Waits until the screen meets a condition.
     pub fn wait_until(&self, what: &str, is_so: impl Fn(&str) -> bool) -> String {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -120,14 +120,14 @@ impl Terminal {
         }
     }
 
-    /// Another size.
+    /// Changes the size.
     pub fn resize(&self, columns_rows: (u16, u16)) {
         let (columns, rows) = columns_rows;
         self.parser.lock().unwrap().set_size(rows.try_into().unwrap(), columns.try_into().unwrap());
         self.ours.as_ref().unwrap().0.resize(size(columns_rows)).unwrap();
     }
 
-    /// The terminal takes no more output, or takes it again.
+    /// Makes the terminal stop taking output, or resume.
     pub fn stall(&self, stalled: bool) {
         self.stalled.store(stalled, Ordering::Relaxed);
     }
@@ -138,18 +138,18 @@ impl Terminal {
         assert!(Command::new("kill").args(["-s", name, &process]).status().unwrap().success());
     }
 
-    /// Whether the terminal waits for whole lines and shows them, as it does for a shell.
+    /// Whether the terminal waits for whole lines and echoes them, as for a shell.
     pub fn is_as_a_shell_wants_it(&self) -> bool {
         let local = format!("{:?}", self.ours.as_ref().unwrap().0.get_termios().unwrap().local_flags);
         local.contains("ICANON") && local.contains("ECHO")
     }
 
-    /// Waits for the end; its exit code.
+    /// Waits for the end; returns the exit code.
     pub fn end(&mut self) -> u32 {
         let deadline = Instant::now() + PATIENCE;
         loop {
             if let Some(status) = self.child.try_wait().unwrap() {
-                // What it wrote last is on its way.
+                // Its last output is on its way.
                 std::thread::sleep(Duration::from_millis(100));
                 return status.exit_code();
             }
@@ -158,7 +158,7 @@ impl Terminal {
         }
     }
 
-    /// The screen of before is back: cursor shown, no mouse, lines and echo.
+    /// Checks that the previous screen is back: cursor shown, no mouse, lines and echo.
     pub fn check_given_back(&self) {
         self.screen(|screen| {
             assert!(!screen.alternate_screen() && !screen.hide_cursor(), "{}", screen.contents());

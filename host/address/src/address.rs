@@ -14,7 +14,8 @@ use cantap_virtual::Options;
 
 use crate::server::{Server, ServerError};
 
-/// The virtual device's buses have the bit rate of whoever opens a channel: this one, if nobody says another.
+/// The bit rate of the virtual device's buses is set by the program that opens a channel; this is the one assumed
+/// otherwise.
 const VIRTUAL_BITRATE_BPS: u32 = 500_000;
 
 /// The address of a device, as users type it after `-d`.
@@ -28,7 +29,7 @@ pub struct Address {
 /// What an address names.
 #[derive(Clone, Debug)]
 enum Place {
-    /// The serial port that the address is the name of.
+    /// The serial port of that name.
     Serial,
     /// A server that shares a board.
     Server(Server),
@@ -39,51 +40,51 @@ enum Place {
     Emulated(Box<cantap_sim::address::Address>),
 }
 
-/// Why a text is no device address.
+/// Why a text is not a device address.
 #[derive(Debug, thiserror::Error)]
 pub enum AddressError {
-    /// It is not one.
+    /// It is not an address.
     #[error("'{address}' is not a device address: {reason}")]
     Bad {
-        /// As it was given.
+        /// As given.
         address: String,
         /// What is wrong with it and what would be right.
         reason: String,
     },
-    /// An option in it is none of that device's.
+    /// The device has no such option.
     #[error("'{address}' is not a device address: {reason}")]
     Option {
-        /// As it was given.
+        /// As given.
         address: String,
         /// What is wrong with it and what would be right.
         reason: String,
     },
-    /// This build cannot do it.
+    /// This build does not support it.
     #[cfg(not(feature = "emu"))]
     #[error("this build of cantap has no support for '{0}'; build it with the feature `emu`")]
     NotBuilt(String),
 }
 
-/// Why there is no way to a device.
+/// Why a device cannot be reached.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum LinkError {
-    /// The port cannot be opened, or what is there is no cantap.
+    /// The port cannot be opened, or what is there is not cantap.
     #[error(transparent)]
     Device(#[from] DeviceError),
     /// The server cannot be used.
     #[error(transparent)]
     Server(#[from] ServerError),
-    /// The virtual device has no thread to live in.
+    /// The virtual device's thread could not be started.
     #[error("the system refused a thread; close other programs and try again")]
     Virtual(#[source] io::Error),
-    /// The firmware's ELF cannot be used, or does not start.
+    /// The firmware's ELF is unusable, or does not start.
     #[cfg(feature = "emu")]
     #[error("the emulated board at '{address}' does not start")]
     Emulated {
-        /// As it was given.
+        /// As given.
         address: String,
-        /// Why.
+        /// The reason.
         source: cantap_sim::address::AddressError,
     },
 }
@@ -126,23 +127,23 @@ impl FromStr for Address {
 }
 
 impl Address {
-    /// The virtual device with `options`, which are nowhere typed.
+    /// The virtual device with default options, without an address typed by the user.
     pub fn of_virtual_device() -> Self {
         Self { text: "virtual".to_owned(), place: Place::Virtual(Box::default()) }
     }
 
-    /// Whether a device there can have a configuration saved from before: not a virtual one without a file for it.
+    /// Whether a device there can have a stored configuration; a virtual one cannot unless a file is given for it.
     pub fn may_have_saved(&self) -> bool {
         !matches!(&self.place, Place::Virtual(options) if options.settings.is_none())
     }
 
-    /// Whether a text is meant for a device that needs no port, and for nothing else.
+    /// Whether a text can only mean a device that needs no port.
     pub fn is_no_port(text: &str) -> bool {
         text == "virtual" || text.starts_with("virtual:") || text.starts_with("emu:")
     }
 
-    /// Whether what stands where a trace or a device can stand is meant for a device: one that needs no port, one at a server, or a
-    /// serial port. What is there as a file is one.
+    /// Whether an argument that can be either a trace or a device means a device: one that needs no port, one at a server, or a
+    /// serial port. An existing file is a trace.
     pub fn is_meant_by(path: &Path) -> bool {
         if let Ok(there) = path.metadata() {
             return is_port(&there);
@@ -156,17 +157,17 @@ impl Address {
         Self::is_no_port(text) || Server::is_meant(text) || text.starts_with("/dev/") || is_com(text)
     }
 
-    /// Whether a vehicle is on the virtual device's buses, which has a database of its own.
+    /// Whether the virtual device simulates a vehicle, which has its own database.
     pub fn is_car(&self) -> bool {
         matches!(&self.place, Place::Virtual(options) if options.car)
     }
 
-    /// Whether a device there can go and come back: one that lives in this process cannot.
+    /// Whether a device there can go and come back; one inside this process cannot.
     pub const fn may_come_back(&self) -> bool {
         matches!(self.place, Place::Serial | Place::Server(_))
     }
 
-    /// Begins a session with the board of a serial number, wherever it is plugged in now, as far as the system tells; else with
+    /// Begins a session with the board of a serial number at its current port, if the system can find it; otherwise with
     /// whatever is at the address.
     pub fn open_again(&self, serial_number: Option<&str>) -> Result<OpenDevice, LinkError> {
         let device = Device::over(self.link(serial_number)?, &self.text)?;
@@ -178,7 +179,8 @@ impl Address {
         self.open_again(None)
     }
 
-    /// The way to the device; to the board of a serial number wherever it is now, as far as the system tells.
+    /// Connects to the device; if a serial number is given, to that board at its current port, if the system
+    /// can find it.
     pub fn link(&self, serial_number: Option<&str>) -> Result<Link, LinkError> {
         Ok(match &self.place {
             Place::Serial => {
@@ -200,7 +202,7 @@ impl Address {
         })
     }
 
-    /// The bit rates of the buses in bit/s, where they are known without listening.
+    /// The bit rates of the buses in bit/s, if they are known without listening.
     pub fn bitrates_of_buses(&self) -> [Option<u32>; CHANNELS] {
         match &self.place {
             Place::Virtual(options) => Channel::ALL
@@ -233,10 +235,10 @@ impl fmt::Display for Address {
     }
 }
 
-/// A device in a session, and what only its address tells about it.
+/// A device in a session, with what only its address says about it.
 pub struct OpenDevice {
     device: Device,
-    /// Its buses' bit rates in bit/s, where they are known.
+    /// Its buses' bit rates in bit/s, if known.
     bitrates: [Option<u32>; CHANNELS],
 }
 

@@ -1,6 +1,7 @@
 #![doc = include_str!("../README.md")]
 //!
-//! `cantap` knows a `Link`, not who makes one; this crate knows them all. Its errors are for people, with what to do next.
+//! `cantap` takes a `Link` without knowing who makes it; this crate knows all of them. Its errors are written for people
+//! and say what to do next.
 
 #![forbid(unsafe_code)]
 

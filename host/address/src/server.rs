@@ -1,4 +1,4 @@
-//! Where a server is that shares a board: `unix:PATH`, `tcp://HOST:PORT`, `tls://HOST:PORT`, `ssh://[USER@]HOST[/DEVICE]`.
+//! Where a server that shares a board is: `unix:PATH`, `tcp://HOST:PORT`, `tls://HOST:PORT`, `ssh://[USER@]HOST[/DEVICE]`.
 
 use std::io::{self, ErrorKind};
 #[cfg(any(unix, feature = "tls"))]
@@ -8,7 +8,7 @@ use std::process::Command;
 use cantap::device::Link;
 use cantap_serve::{Role, connect};
 
-/// The port of `cantap serve --tcp`, unless another is given.
+/// The default port of `cantap serve --tcp`.
 pub const PORT: u16 = 29_537;
 
 /// A server.
@@ -19,96 +19,96 @@ pub enum Server {
     Unix(PathBuf),
     /// At `HOST:PORT`.
     Tcp(String),
-    /// At `HOST:PORT`, encrypted, with this client's keys, if they are named here.
+    /// At `HOST:PORT`, encrypted, with this client's keys, if the address names them.
     #[cfg(feature = "tls")]
     Tls(String, Option<PathBuf>),
     /// Started for this client on another computer.
     Ssh(Ssh),
 }
 
-/// What is started through ssh.
+/// A server that is started through ssh.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Ssh {
-    /// As ssh takes it, with the user if one was given.
+    /// As ssh takes it, including the user if given.
     host: String,
-    /// Without one, the board that is connected there.
+    /// If `None`, the board that is connected there.
     device: Option<String>,
     /// What this client may do.
     allow: Role,
 }
 
-/// Why a server cannot be used. Each says what to do next.
+/// Why a server cannot be used. Each message says what to do next.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ServerError {
     /// Nobody listens there.
     #[error("'{server}': there is no server; start one with `cantap serve` ({source})")]
     Absent {
-        /// As it was addressed.
+        /// As addressed.
         server: String,
-        /// What the system says.
+        /// The system's error.
         source: io::Error,
     },
-    /// It is another user's.
+    /// It belongs to another user.
     #[error("'{server}': it belongs to another user of this computer, who alone can use it ({source})")]
     NotYours {
-        /// As it was addressed.
+        /// As addressed.
         server: String,
-        /// What the system says.
+        /// The system's error.
         source: io::Error,
     },
-    /// The way there fails.
+    /// The connection failed.
     #[error("'{server}': it cannot be reached ({source})")]
     Unreachable {
-        /// As it was addressed.
+        /// As addressed.
         server: String,
-        /// What the system says.
+        /// The system's error.
         source: io::Error,
     },
-    /// What ssh started there gives no answer.
+    /// The program started there through ssh does not answer.
     #[error(
         "'{host}': no server there answers ({source}); try `{program} {host} cantap serve --stdio` by hand"
     )]
     Mute {
         /// The other computer.
         host: String,
-        /// ssh, or what `CANTAP_SSH` names.
+        /// ssh, or the program named by `CANTAP_SSH`.
         program: String,
-        /// What the system says.
+        /// The system's error.
         source: io::Error,
     },
-    /// ssh does not start.
+    /// ssh could not be started.
     #[error("'{program}' does not start ({source}); install it, or name another in CANTAP_SSH")]
     NoSsh {
-        /// ssh, or what `CANTAP_SSH` names.
+        /// ssh, or the program named by `CANTAP_SSH`.
         program: String,
-        /// What the system says.
+        /// The system's error.
         source: io::Error,
     },
     /// An encrypted connection needs keys.
     #[cfg(feature = "tls")]
     #[error(
-        "no keys are given: name them in CANTAP_KEYS as FOLDER/NAME, or behind the address as ?keys=FOLDER/NAME"
+        "no keys are given: name them in CANTAP_KEYS as FOLDER/NAME, or after the address as ?keys=FOLDER/NAME"
     )]
     NoKeys,
     /// These cannot be the names of keys.
     #[cfg(feature = "tls")]
     #[error("'{}' names no keys; write FOLDER/NAME, as for FOLDER/NAME.pem", .0.display())]
     BadKeys(PathBuf),
-    /// No encrypted connection comes about.
+    /// The encrypted connection could not be established.
     #[cfg(feature = "tls")]
     #[error(
-        "'{server}' lets nobody in with these keys, or is not there; they and the server's must be of one authority"
+        "'{server}' lets nobody in with these keys, or is not there; they and the server's must be from the same authority"
     )]
     Tls {
-        /// As it was addressed.
+        /// As addressed.
         server: String,
-        /// What went wrong.
+        /// The cause.
         source: cantap_serve::tls::TlsError,
     },
 }
 
-/// How servers' addresses begin.
+/// The schemes of server addresses.
 const SCHEMES: [&str; 4] = ["unix:", "tcp:", "tls:", "ssh:"];
 
 impl Server {
@@ -117,7 +117,7 @@ impl Server {
         SCHEMES.iter().any(|scheme| text.starts_with(scheme))
     }
 
-    /// Reads such a text. An error says what would be right.
+    /// Parses such a text. The error says what would be right.
     pub fn parse(text: &str) -> Result<Self, String> {
         if let Some(path) = text.strip_prefix("unix:") {
             #[cfg(unix)]
@@ -186,17 +186,19 @@ fn files(keys: Option<&std::path::Path>) -> Result<cantap_serve::tls::Files, Ser
     }
 }
 
-/// The port that goes without saying.
+/// Adds the default port if there is none.
 fn with_port(place: &str) -> Result<String, String> {
     let has_port = |rest: &str| rest.rsplit_once(':').is_some_and(|(_, port)| port.parse::<u16>().is_ok());
     let host_only = match place.strip_prefix('[') {
         Some(rest) => match rest.split_once(']') {
             Some((_, "")) => true,
             Some((_, rest)) if has_port(rest) => false,
-            _ => return Err(format!("'{place}' is no address; write it as [::1]:{PORT}")),
+            _ => return Err(format!("'{place}' is not an address; write it as [::1]:{PORT}")),
         },
         None if place.matches(':').count() > 1 => {
-            return Err(format!("'{place}' is no address; an IPv6 one stands in brackets, as [::1]:{PORT}"));
+            return Err(format!(
+                "'{place}' is not an address; an IPv6 address needs brackets, as [::1]:{PORT}"
+            ));
         }
         None if place.contains(':') && !has_port(place) => {
             return Err(format!("'{place}' has no port number behind its colon; write it as HOST:{PORT}"));
@@ -215,15 +217,17 @@ impl Ssh {
         };
         let (host, device) = match place.split_once('/') {
             Some((host, "")) => (host, None),
-            // A port of that computer, whether its first slash was doubled or not.
+            // A port of that computer, whether or not its first slash was doubled.
             Some((host, device)) if device.starts_with("dev/") => (host, Some(format!("/{device}"))),
             Some((host, device)) => (host, Some(device.to_owned())),
             None => (place, None),
         };
         let name = host.rsplit_once('@').map_or(host, |(_, name)| name);
-        // What begins with a dash would be an option of ssh.
+        // ssh would take anything that begins with a dash as an option.
         if name.is_empty() || name.starts_with('-') || host.starts_with(['-', '@']) {
-            return Err(format!("'{host}' is no name of a computer; write it as ssh://[USER@]HOST[/DEVICE]"));
+            return Err(format!(
+                "'{host}' is not the name of a computer; write it as ssh://[USER@]HOST[/DEVICE]"
+            ));
         }
         Ok(Self { host: host.to_owned(), device, allow })
     }
@@ -232,7 +236,8 @@ impl Ssh {
     fn command(&self) -> Command {
         let program = std::env::var_os("CANTAP_SSH").unwrap_or_else(|| "ssh".into());
         let mut command = Command::new(program);
-        // It is no part of the terminal's foreground, so that Ctrl-C does not end it before the capture: it cannot ask for anything.
+        // ssh is kept out of the terminal's foreground, so that Ctrl-C does not end it before the capture; it therefore cannot ask
+        // for anything.
         command.args(["-T", "-oBatchMode=yes", "--", &self.host]);
         command.args(["cantap", "serve", "--stdio", "--allow", self.allow.name()]);
         if let Some(device) = &self.device {
@@ -244,12 +249,12 @@ impl Ssh {
     }
 }
 
-/// For the shell of the other computer, which ssh hands everything to.
+/// Quotes text for the other computer's shell, to which ssh passes everything.
 fn quoted(text: &str) -> String {
     format!("'{}'", text.replace('\'', r"'\''"))
 }
 
-/// A role as it is typed.
+/// Parses a role as typed.
 pub fn role(text: &str) -> Result<Role, String> {
     let found = Role::ALL.into_iter().find(|role| role.name() == text);
     found.ok_or_else(|| "clients may listen, configure or send".to_owned())
@@ -285,7 +290,7 @@ mod tests {
         }
     }
 
-    /// What the other computer's shell is given is one word, whatever is in it.
+    /// The other computer's shell gets it as one word, whatever it contains.
     #[test]
     fn ssh_is_given_the_device_as_one_word_and_no_option() {
         let command = |text: &str| {

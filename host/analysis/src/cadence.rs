@@ -1,15 +1,15 @@
-//! How often something comes, and when it has been silent for long.
+//! Measures how often something comes, and detects when it has been silent for long.
 
-/// How many intervals are remembered. The middle one of them is the usual length, whatever a few of them are.
+/// How many intervals are remembered. Their median is the usual length, unaffected by a few outliers.
 const REMEMBERED: usize = 15;
 
-/// So many times its usual interval without a new value is silence, and no slow change.
+/// After this many of its usual intervals without a new value, it is silent, not just slow.
 const SILENCE: i64 = 10;
 
-/// When something came last, and how long its intervals usually are.
+/// When something last came, and its usual interval.
 #[derive(Clone, Debug)]
 pub struct Cadence {
-    /// As long as a database says it is, in nanoseconds; 0 if it does not say.
+    /// The length according to a database, in nanoseconds; 0 if it gives none.
     cycle_ns: i64,
     last_ns: Option<i64>,
     intervals: [i64; REMEMBERED],
@@ -17,13 +17,13 @@ pub struct Cadence {
 }
 
 impl Cadence {
-    /// Nothing came yet. The cycle is that of a database, in milliseconds.
+    /// Nothing has come yet. The cycle comes from a database, in milliseconds.
     pub fn new(cycle_ms: Option<u32>) -> Self {
         let cycle_ns = i64::from(cycle_ms.unwrap_or(0)) * 1_000_000;
         Self { cycle_ns, last_ns: None, intervals: [0; REMEMBERED], count: 0 }
     }
 
-    /// It came at this time; says whether it had been silent until then.
+    /// It came at this time; returns whether it had been silent until then.
     pub fn arrive(&mut self, time_ns: i64) -> bool {
         let Some(before) = self.last_ns.replace(time_ns) else { return false };
         let interval = time_ns.saturating_sub(before);
@@ -32,12 +32,13 @@ impl Cadence {
         }
         let silent = self.is_silence(interval);
         self.intervals[self.count % REMEMBERED] = interval;
-        // It stays below twice the number, where it would overflow on a long trace.
+        // It is kept below twice the number, because it would overflow on a long trace.
         self.count = if self.count + 1 < 2 * REMEMBERED { self.count + 1 } else { REMEMBERED };
         silent
     }
 
-    /// Whether an interval of this many nanoseconds is much longer than usual. Of the first nobody can tell.
+    /// Whether an interval of this many nanoseconds is much longer than usual. For the first one that is
+    /// unknown.
     pub fn is_silence(&self, interval_ns: i64) -> bool {
         let known = self.count.min(REMEMBERED);
         let mut intervals = self.intervals;
@@ -59,7 +60,7 @@ mod tests {
         assert_eq!(silences, 0);
         assert!(!fast.arrive(9_900 + 900));
         assert!(fast.arrive(10_800 + 1_500_000));
-        // Whoever becomes slow is silent until that is what is usual.
+        // Something that becomes slow counts as silent until the new interval is the usual one.
         let mut slower = Cadence::new(None);
         (0..20).for_each(|n| {
             slower.arrive(n * 10);

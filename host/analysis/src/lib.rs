@@ -1,6 +1,6 @@
 #![doc = include_str!("../README.md")]
 //!
-//! [`stats`] measures, [`align`] sets several recorders on one clock, `plot` draws.
+//! [`stats`] measures, [`align`] puts several recorders on one clock, `plot` draws.
 
 #![forbid(unsafe_code)]
 

@@ -1,4 +1,4 @@
-//! The columns that every table begins with: when, on which channel, what happened, and how often.
+//! The columns with which every table begins: when, on which channel, what happened, and how often.
 
 use std::sync::Arc;
 
@@ -12,16 +12,16 @@ use cantap_wire::record::TransmitFailure;
 
 use crate::texts::Texts;
 
-/// The zone of all times.
+/// The time zone of all times.
 pub const UTC: &str = "UTC";
 
-/// What a row is if it is none of the table's own.
+/// The event of a row that is not of the table's own kind.
 pub const LOST: &str = "lost";
 pub const BUS_ERROR: &str = "bus-error";
 pub const SUPPRESSED: &str = "errors-suppressed";
 pub const STATE: &str = "state";
 pub const TRANSMIT_FAILED: &str = "transmit-failed";
-/// Their order in the column of events, behind the table's own.
+/// Their order in the column of events, after the table's own.
 const KINDS: [&str; 5] = [LOST, BUS_ERROR, SUPPRESSED, STATE, TRANSMIT_FAILED];
 
 /// The columns' names and types.
@@ -52,12 +52,12 @@ pub struct Events {
     tx_errors: UInt8Builder,
     rx_errors: UInt8Builder,
     tag: UInt32Builder,
-    /// Rows of the table's own at the end, of which only time and channel are in the columns yet: there is nothing else to say about
-    /// them, and most rows are such.
+    /// Number of the table's own rows at the end for which only time and channel are in the columns so far: there is nothing else to
+    /// add for them, and most rows are like that.
     plain: usize,
 }
 
-/// What a record says beside time and channel.
+/// What a record says besides time and channel.
 #[derive(Default)]
 struct Said {
     /// The index in the column of events; 0 is the table's own.
@@ -70,7 +70,7 @@ struct Said {
 }
 
 impl Events {
-    /// For a table whose own rows are called `own`.
+    /// For a table whose own rows are named `own`.
     pub fn new(own: &str) -> Self {
         let mut details = Vec::new();
         let names = LOSS_STAGES.map(|(_, name)| name).into_iter();
@@ -95,7 +95,7 @@ impl Events {
         }
     }
 
-    /// Appends a row for the record; a frame is one of the table's own.
+    /// Appends a row for the record; a frame is a row of the table's own.
     pub fn push(&mut self, record: &TraceRecord) {
         if matches!(record.event, TraceEvent::Frame { .. }) {
             self.time.append_value(record.time_ns);
@@ -113,7 +113,7 @@ impl Events {
         self.plain += rows;
     }
 
-    /// Has the plain rows in all columns.
+    /// Adds the plain rows to all columns.
     fn complete(&mut self) {
         let rows = std::mem::take(&mut self.plain);
         self.event.push_n(0, rows);
@@ -141,7 +141,7 @@ impl Events {
         self.tag.append_option(said.tag);
     }
 
-    /// The columns so far; the next ones begin empty.
+    /// Returns the columns so far; the next ones start empty.
     pub fn take(&mut self) -> Vec<ArrayRef> {
         self.complete();
         vec![

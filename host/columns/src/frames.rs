@@ -1,4 +1,4 @@
-//! A table with a row per record: frames and whatever else happened.
+//! A table with a row per record: frames and everything else that happened.
 
 use std::sync::{Arc, LazyLock};
 
@@ -11,12 +11,12 @@ use cantap_trace::{Direction, FdFrame, TraceEvent, TraceRecord};
 use crate::events::{self, Events};
 use crate::texts::Texts;
 
-/// What rows with a frame are called in the column `event`.
+/// The value of the column `event` in rows with a frame.
 pub const FRAME: &str = "frame";
 pub const RX: &str = "rx";
 pub const TX: &str = "tx";
 
-/// Records as columns. Nothing of a record is left out: [`crate::records`] gives them back.
+/// Records as columns. Nothing is left out: [`crate::records`] turns them back into records.
 ///
 /// | column | type | of |
 /// |---|---|---|
@@ -37,7 +37,7 @@ pub const TX: &str = "tx";
 pub struct FrameColumns {
     events: Events,
     id: UInt32Builder,
-    /// As [`FLAGS`].
+    /// In the order of [`FLAGS`].
     flags: [BooleanBuilder; 6],
     direction: Texts<Int8Type>,
     dlc: UInt8Builder,
@@ -98,12 +98,12 @@ impl FrameColumns {
         }
     }
 
-    /// Rows so far.
+    /// The number of rows so far.
     pub fn rows(&self) -> usize {
         self.dlc.len()
     }
 
-    /// The rows so far; the next ones begin a new batch.
+    /// Returns the rows so far; the next ones start a new batch.
     pub fn take(&mut self) -> RecordBatch {
         let mut columns = self.events.take();
         columns.push(Arc::new(self.id.finish()));

@@ -17,5 +17,5 @@ pub use records::{BadColumns, records};
 pub use signals::SignalColumns;
 pub use wide::WideColumns;
 
-/// Rows that a batch has at most where nothing else is asked for: a few megabytes, and what a reader of Parquet takes at once.
+/// The default limit of rows in a batch: a few megabytes, and what a Parquet reader takes at once.
 pub const BATCH_ROWS: usize = 1 << 16;

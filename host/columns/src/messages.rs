@@ -14,21 +14,21 @@ use rustc_hash::FxHashMap;
 use crate::events;
 use crate::texts::Texts;
 
-/// So many frames are decoded at once: their columns stay in the processor's nearest memory, and what is done once for each signal
-/// counts for nothing.
+/// How many frames are decoded at once: their columns stay in the processor's nearest cache, and the work done once per signal
+/// becomes negligible.
 const ROWS_AT_ONCE: usize = 512;
 
 /// One message's frames as columns: `time`, `channel`, `id`, then for each signal its physical value as float64 under its own name,
-/// null where the frame does not have it; for a signal with a value table also `NAME.text`. Unit, description, range and cycle
-/// time are the columns' and the table's metadata.
+/// null if the frame does not have it; for a signal with a value table also `NAME.text`. Unit, description, range and cycle time
+/// are in the metadata of the columns and the table.
 pub struct MessageColumns {
     schema: SchemaRef,
-    /// What every row has.
+    /// Columns that every row has.
     time_ns: Vec<i64>,
     channel: Vec<u8>,
     id: Vec<u32>,
     signals: Vec<Column>,
-    /// The last rows' frames, of which there are no values in the columns yet.
+    /// The frames of the last rows, whose values are not yet in the columns.
     waiting: MessageRows,
     values: u64,
     scratch: Scratch,
@@ -39,9 +39,9 @@ struct Column {
     text: Option<(Texts<Int32Type>, Keys)>,
 }
 
-/// The texts' indexes by what stands in the frame.
+/// The texts' indexes, by a signal's value in the frame.
 enum Keys {
-    /// Of a short signal by its bits; [`NO_TEXT`] where the table has none.
+    /// For a short signal, by its bits; [`NO_TEXT`] if the table has none.
     ByBits(Vec<i32>),
     /// By [`Signal::table_key`].
     ByValue(FxHashMap<i64, i32>),
@@ -58,7 +58,7 @@ struct Scratch {
 }
 
 impl Keys {
-    /// Longer signals have a table of their values rather than of their bits.
+    /// Longer signals have a table by value rather than by bits.
     const MOST_BITS: u16 = 8;
 
     fn of(signal: &Signal) -> Self {
@@ -81,7 +81,7 @@ impl Keys {
 }
 
 impl MessageColumns {
-    /// A table for a message of this decoder: of its signals those have values that were chosen by now.
+    /// A table for a message of this decoder: of its signals, those chosen up to now have values.
     pub fn new(decoder: &Decoder, reference: MessageRef) -> Self {
         let message = decoder.message(reference);
         let mut fields = events::fields();
@@ -122,12 +122,13 @@ impl MessageColumns {
         Arc::clone(&self.schema)
     }
 
-    /// Whether this frame has a value for the table, whatever its bytes are: chosen signals may be there in some frames only.
+    /// Whether this frame certainly has a value for the table, whatever its bytes: chosen signals may be present in only some
+    /// frames.
     pub fn has_value(&self, frame: &TraceFrame) -> bool {
         self.waiting.is_certain(frame.data_len())
     }
 
-    /// Appends a row for a data frame of the message, with what the decoder gives for it; nothing for another record.
+    /// Appends a row for a data frame of the message, decoding it; nothing for another record.
     #[inline]
     pub fn push(&mut self, record: &TraceRecord) {
         let Some(frame) = record.frame() else { return };
@@ -145,7 +146,7 @@ impl MessageColumns {
         }
     }
 
-    /// Appends a row for a frame of the message, with the values that were decoded from it; nothing for another record.
+    /// Appends a row for a frame of the message, with the values decoded from it; nothing for another record.
     pub fn push_values(&mut self, record: &TraceRecord, values: &[SignalValue]) {
         let Some(frame) = record.frame() else { return };
         self.decode();
@@ -170,7 +171,7 @@ impl MessageColumns {
         self.id.push(frame.id().raw());
     }
 
-    /// Decodes the frames that wait for it.
+    /// Decodes the waiting frames.
     fn decode(&mut self) {
         if self.waiting.is_empty() {
             return;
@@ -186,7 +187,7 @@ impl MessageColumns {
         self.fill();
     }
 
-    /// Columns without a value in the last rows get none.
+    /// Appends nulls to columns without a value in the last rows.
     fn fill(&mut self) {
         let rows = self.time_ns.len();
         for column in &mut self.signals {
@@ -200,18 +201,18 @@ impl MessageColumns {
         }
     }
 
-    /// Rows so far.
+    /// The number of rows so far.
     pub fn rows(&self) -> usize {
         self.time_ns.len()
     }
 
-    /// How many values were decoded so far, those included that only say that there is none.
+    /// The number of values decoded so far, including those that only say that there is none.
     pub fn values(&mut self) -> u64 {
         self.decode();
         self.values
     }
 
-    /// The rows so far; the next ones begin a new batch.
+    /// Returns the rows so far; the next ones start a new batch.
     pub fn take(&mut self) -> RecordBatch {
         self.decode();
         let time = TimestampNanosecondArray::from(std::mem::take(&mut self.time_ns));

@@ -1,4 +1,4 @@
-//! Back from columns to records.
+//! Converts columns back to records.
 
 use arrow_array::cast::AsArray;
 use arrow_array::types::{
@@ -13,26 +13,26 @@ use cantap_wire::record::TransmitFailure;
 use crate::events::{BUS_ERROR, LOST, STATE, SUPPRESSED, TRANSMIT_FAILED};
 use crate::frames::{FRAME, RX, TX};
 
-/// Columns that are no trace.
+/// Why columns are not a trace.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum BadColumns {
-    /// A column is missing or of another type.
+    /// A column is missing or has another type.
     #[error("a trace has a column '{column}' of type {wanted}; {found}")]
     Column {
         /// Its name.
         column: &'static str,
-        /// The type that it should have.
+        /// The required type.
         wanted: &'static str,
-        /// What there is instead.
+        /// What was found instead.
         found: String,
     },
-    /// A row says nothing that a trace could hold.
-    #[error("row {row} is no {what}")]
+    /// A row contains something that a trace cannot hold.
+    #[error("row {row} is not {what}")]
     Row {
-        /// The row in its batch, from 0.
+        /// The row's index in its batch, from 0.
         row: usize,
-        /// What it should be.
+        /// What was expected.
         what: &'static str,
     },
     /// The file cannot be read.
@@ -40,8 +40,8 @@ pub enum BadColumns {
     Arrow(#[from] ArrowError),
 }
 
-/// The records of a batch that has the columns of [`crate::FrameColumns`], in any order and among others. Texts may be
-/// dictionaries or plain.
+/// The records of a batch that has the columns of [`crate::FrameColumns`], in any order and possibly among others.
+/// Texts may be dictionaries or plain.
 pub fn records(batch: &RecordBatch) -> Result<Vec<TraceRecord>, BadColumns> {
     let columns = Columns::of(batch)?;
     (0..batch.num_rows()).map(|row| columns.record(row)).collect()
@@ -69,7 +69,7 @@ struct Columns<'a> {
     data: &'a BinaryArray,
 }
 
-/// A column of texts, in whichever way they are kept.
+/// A column of texts, in any representation.
 enum Text<'a> {
     Plain(&'a StringArray),
     Indexed { keys: Vec<Option<usize>>, texts: &'a StringArray },
@@ -149,27 +149,27 @@ impl<'a> Columns<'a> {
     fn record(&self, row: usize) -> Result<TraceRecord, BadColumns> {
         let bad = |what| BadColumns::Row { row, what };
         if self.time.is_null(row) || self.channel.is_null(row) {
-            return Err(bad("record: it has no time or no channel"));
+            return Err(bad("a valid record: it has no time or no channel"));
         }
-        let event = self.event.at(row).ok_or(bad("record: it does not say what happened"))?;
+        let event = self.event.at(row).ok_or(bad("a valid record: it does not say what happened"))?;
         let detail = self.detail.at(row);
         let count = self.count.is_valid(row).then(|| self.count.value(row));
         let event = match event {
-            FRAME => self.frame(row).ok_or(bad("frame"))?,
+            FRAME => self.frame(row).ok_or(bad("a valid frame"))?,
             LOST => {
                 let stage =
-                    detail.map(|detail| item(&LOSS_STAGES, detail).ok_or(bad("known place of a loss")));
+                    detail.map(|detail| item(&LOSS_STAGES, detail).ok_or(bad("a known place of a loss")));
                 let at_least = self.at_least.is_valid(row) && self.at_least.value(row);
                 TraceEvent::Lost { stage: stage.transpose()?, count: count.unwrap_or(0), at_least }
             }
             BUS_ERROR => {
-                let kind = detail.map(|detail| item(&BUS_ERRORS, detail).ok_or(bad("known bus error")));
+                let kind = detail.map(|detail| item(&BUS_ERRORS, detail).ok_or(bad("a known bus error")));
                 TraceEvent::BusError { kind: kind.transpose()?, counters: self.counters(row) }
             }
             SUPPRESSED => TraceEvent::ErrorsSuppressed { count: count.unwrap_or(0) },
             STATE => {
                 let state = detail.and_then(|detail| item(&ERROR_STATES, detail));
-                TraceEvent::State { state: state.ok_or(bad("known state"))?, counters: self.counters(row) }
+                TraceEvent::State { state: state.ok_or(bad("a known state"))?, counters: self.counters(row) }
             }
             TRANSMIT_FAILED => {
                 let tag = if self.tag.is_valid(row) { self.tag.value(row) } else { 0 };
@@ -177,9 +177,9 @@ impl<'a> Columns<'a> {
                     Some(OVERTAKEN) => Some(TransmitFailure::Overtaken { periods: count.unwrap_or(1) }),
                     detail => detail.and_then(|detail| item(&TRANSMIT_FAILURES, detail)),
                 };
-                TraceEvent::TransmitFailed { tag, reason: reason.ok_or(bad("known failure"))? }
+                TraceEvent::TransmitFailed { tag, reason: reason.ok_or(bad("a known failure"))? }
             }
-            _ => return Err(bad("known kind of record")),
+            _ => return Err(bad("a known kind of record")),
         };
         Ok(TraceRecord { time_ns: self.time.value(row), channel: self.channel.value(row), event })
     }

@@ -14,7 +14,8 @@ use rustc_hash::FxHashMap;
 use crate::events::{self, Events};
 use crate::texts::Texts;
 
-/// Decoded values as columns, in the trace's order. What happened beside frames has rows too: a series with a hole says so.
+/// Decoded values as columns, in the trace's order. Events other than frames have rows too, so that a gap in a series is
+/// explained.
 ///
 /// | column | type | of |
 /// |---|---|---|
@@ -36,15 +37,15 @@ pub struct SignalColumns {
     raw: UInt64Builder,
     text: Texts<Int32Type>,
     unit: Texts<Int32Type>,
-    /// By [`MessageRef::index`].
+    /// Indexed by [`MessageRef::index`].
     keys: Arc<[MessageKeys]>,
     indicators: [i32; 2],
 }
 
-/// What rows with a value are called in the column `event`.
+/// The value of the column `event` in rows with a value.
 const VALUE: &str = "value";
 
-/// Where a message's texts are in the columns.
+/// The indexes of a message's texts in the columns.
 struct MessageKeys {
     message: i32,
     signals: Vec<SignalKeys>,
@@ -56,7 +57,7 @@ struct SignalKeys {
     texts: FxHashMap<i64, i32>,
 }
 
-/// Texts, each once, in the order in which they came.
+/// Texts without duplicates, in the order in which they came.
 #[derive(Default)]
 struct Interned {
     texts: Vec<String>,
@@ -93,7 +94,7 @@ pub fn fields() -> Vec<Field> {
 }
 
 impl SignalColumns {
-    /// A table for what this decoder finds.
+    /// A table for the values found by this decoder.
     pub fn new(decoder: &Decoder) -> Self {
         let [mut messages, mut signals, mut texts, mut units] = [(); 4].map(|()| Interned::default());
         let indicators = [Indicator::Error, Indicator::NotAvailable].map(|what| texts.place(what.name()));
@@ -123,7 +124,7 @@ impl SignalColumns {
         }
     }
 
-    /// An empty table of the same decoder.
+    /// An empty table for the same decoder.
     #[must_use]
     pub fn another(&self) -> Self {
         Self {
@@ -147,7 +148,7 @@ impl SignalColumns {
         Arc::clone(&self.schema)
     }
 
-    /// Appends a row for each value of the frame. `values` and `reference` are what [`Decoder::decode`] of the table's decoder gave for it.
+    /// Appends a row for each value of the frame. `values` and `reference` come from [`Decoder::decode`] of the table's decoder.
     pub fn push_values(
         &mut self,
         decoder: &Decoder,
@@ -171,7 +172,7 @@ impl SignalColumns {
                 Some(Indicator::NotAvailable) => Some(self.indicators[1]),
                 None => None,
             };
-            // A table may name these values itself.
+            // A value table may also name these values itself.
             let table = || signal.table_key(value.raw).and_then(|key| keys_of.texts.get(&key)).copied();
             let named = if keys_of.texts.is_empty() { None } else { table() };
             self.signal.push(keys_of.signal);
@@ -182,7 +183,7 @@ impl SignalColumns {
         }
     }
 
-    /// Appends a row for what happened beside frames; nothing for a frame.
+    /// Appends a row for an event other than a frame; nothing for a frame.
     pub fn push_event(&mut self, record: &TraceRecord) {
         if matches!(record.event, TraceEvent::Frame { .. }) {
             return;
@@ -198,12 +199,12 @@ impl SignalColumns {
         self.unit.push_option(None);
     }
 
-    /// Rows so far.
+    /// The number of rows so far.
     pub fn rows(&self) -> usize {
         self.raw.len()
     }
 
-    /// The rows so far; the next ones begin a new batch.
+    /// Returns the rows so far; the next ones start a new batch.
     pub fn take(&mut self) -> RecordBatch {
         let mut columns = self.events.take();
         columns.push(Arc::new(self.id.finish()));

@@ -1,4 +1,4 @@
-//! Columns of texts out of a set that is known beforehand: an index per row, and the texts once.
+//! Columns of texts from a set known in advance: an index per row, and each text once.
 
 use std::sync::Arc;
 
@@ -7,19 +7,19 @@ use arrow_array::types::ArrowDictionaryKeyType;
 use arrow_array::{ArrayRef, DictionaryArray, StringArray};
 use arrow_schema::DataType;
 
-/// A column under construction. Every batch of it has the same texts, so that readers who join batches need not compare them.
+/// A column under construction. All its batches have the same texts, so that readers who join batches need not compare them.
 pub struct Texts<K: ArrowDictionaryKeyType> {
     texts: Arc<StringArray>,
     keys: PrimitiveBuilder<K>,
 }
 
 impl<K: ArrowDictionaryKeyType> Texts<K> {
-    /// A column of these texts; there must be fewer than the index can count.
+    /// A column of these texts; there must be fewer than the index type can count.
     pub fn new<T: AsRef<str>>(texts: impl IntoIterator<Item = T>) -> Self {
         Self { texts: Arc::new(StringArray::from_iter_values(texts)), keys: PrimitiveBuilder::new() }
     }
 
-    /// An empty column of the same texts.
+    /// An empty column with the same texts.
     pub fn another(&self) -> Self {
         Self { texts: Arc::clone(&self.texts), keys: PrimitiveBuilder::new() }
     }
@@ -29,32 +29,32 @@ impl<K: ArrowDictionaryKeyType> Texts<K> {
         DataType::Dictionary(Box::new(K::DATA_TYPE), Box::new(DataType::Utf8))
     }
 
-    /// Appends the text of this index.
+    /// Appends the text with this index.
     pub fn push(&mut self, key: K::Native) {
         self.keys.append_value(key);
     }
 
-    /// Appends the text of this index, or none.
+    /// Appends the text with this index, or null.
     pub fn push_option(&mut self, key: Option<K::Native>) {
         self.keys.append_option(key);
     }
 
-    /// Appends the text of this index several times.
+    /// Appends the text with this index several times.
     pub fn push_n(&mut self, key: K::Native, times: usize) {
         self.keys.append_value_n(key, times);
     }
 
-    /// Appends no text several times.
+    /// Appends null several times.
     pub fn push_none(&mut self, times: usize) {
         self.keys.append_nulls(times);
     }
 
-    /// Appends the texts of these indexes; none where `is_text` is false.
+    /// Appends the texts with these indexes; null where `is_text` is false.
     pub fn push_all(&mut self, keys: &[K::Native], is_text: &[bool]) {
         self.keys.append_values(keys, is_text);
     }
 
-    /// The column so far; the next one begins empty.
+    /// Returns the column so far; the next one starts empty.
     pub fn take(&mut self) -> ArrayRef {
         let texts = Arc::clone(&self.texts) as ArrayRef;
         Arc::new(DictionaryArray::new(self.keys.finish(), texts))

@@ -1,4 +1,4 @@
-//! A table of signals side by side: a row per time, a column per signal.
+//! A table with signals side by side: a row per time, a column per signal.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -9,7 +9,7 @@ use arrow_schema::{DataType, Field, Schema, SchemaRef};
 
 use crate::events;
 
-/// Signals side by side: `time`, then a float64 for each name, null where there is no value at that time.
+/// Signals side by side: `time`, then a float64 for each name, null if there is no value at that time.
 pub struct WideColumns {
     schema: SchemaRef,
     time: TimestampNanosecondBuilder,
@@ -39,7 +39,7 @@ impl WideColumns {
         Arc::clone(&self.schema)
     }
 
-    /// Appends a row. Columns for which there is no value any more get none.
+    /// Appends a row. Columns beyond the last value get null.
     pub fn push(&mut self, time_ns: i64, values: impl IntoIterator<Item = Option<f64>>) {
         self.time.append_value(time_ns);
         let mut values = values.into_iter();
@@ -48,12 +48,12 @@ impl WideColumns {
         }
     }
 
-    /// Rows so far.
+    /// The number of rows so far.
     pub fn rows(&self) -> usize {
         self.time.len()
     }
 
-    /// The rows so far; the next ones begin a new batch.
+    /// Returns the rows so far; the next ones start a new batch.
     pub fn take(&mut self) -> RecordBatch {
         let mut columns: Vec<ArrayRef> = vec![Arc::new(self.time.finish())];
         columns.extend(self.values.iter_mut().map(|values| Arc::new(values.finish()) as ArrayRef));

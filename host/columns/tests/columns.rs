@@ -1,4 +1,4 @@
-//! Columns hold everything that a record says, and decoded values as the decoder gives them.
+//! Columns hold everything in a record, and decoded values as the decoder returns them.
 
 use arrow_array::cast::AsArray;
 use arrow_array::types::{Float64Type, Int32Type, UInt64Type};
@@ -139,8 +139,8 @@ prop_compose! {
 }
 
 proptest! {
-    /// Frames that are decoded together have the values that each has alone: whatever the signals are, of J1939 and not, chosen and
-    /// not, in short frames and in those of CAN FD.
+    /// Frames decoded together have the same values as when decoded one by one: whatever the signals, J1939 or not, chosen or not,
+    /// in short frames and in CAN FD frames.
     #[test]
     fn frames_are_decoded_together_as_one_by_one(
         signals in prop::collection::vec(signal(), 1..6),
@@ -162,7 +162,7 @@ proptest! {
         let (reference, ..) = decoder.messages().next().unwrap();
         let (mut together, mut alone) = (MessageColumns::new(&decoder, reference), MessageColumns::new(&decoder, reference));
         let (mut values, mut count) = (Vec::new(), 0);
-        // Again and again, so that more are decoded than fit into one go.
+        // Repeated, so that there are more than are decoded at once.
         for (at, (len, word)) in data.iter().cycle().take(700).enumerate() {
             let word = if ones && at % 3 == 0 { u64::MAX } else { word.rotate_left(at as u32) };
             let bytes = word.to_le_bytes().repeat(8);

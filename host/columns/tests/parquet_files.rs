@@ -1,4 +1,4 @@
-//! Parquet files and datasets of them hold what was put into them.
+//! Parquet files and datasets hold what was put into them.
 #![cfg(feature = "parquet")]
 
 use std::fs::{self, File};
@@ -52,7 +52,7 @@ fn a_dataset_has_a_folder_for_each_day_and_channel() {
     let keys = vec!["vehicle=a/b".parse().unwrap(), Key::Day, Key::Channel];
     let write = || {
         let mut dataset = Dataset::new(folder.path(), "drive", keys.clone(), FrameColumns::default);
-        // Seventeen days of two channels are more files than are open at once; each is come back to.
+        // Seventeen days of two channels are more files than are open at once; each is returned to.
         for turn in 0..2 {
             for day in 0..17 {
                 for channel in [1, 2] {

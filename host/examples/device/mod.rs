@@ -1,8 +1,8 @@
-//! The device that an example talks to.
+//! The device that the examples talk to.
 
 use cantap::{Device, DeviceError};
 
-/// The one at the port that the command line names; without one a virtual device with these options.
+/// Opens the port named on the command line; without one, a virtual device with these options.
 pub fn chosen(options: &str) -> Result<Device, DeviceError> {
     match std::env::args().nth(1) {
         Some(port) => Device::open(&port),

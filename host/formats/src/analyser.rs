@@ -1,10 +1,10 @@
-//! The table of the earlier CANanalyser, which its CSV and DIF files share: an index, the time from the start,
+//! The table of the earlier CANanalyser, shared by its CSV and DIF files: an index, the time from the start,
 //! the frame, its errors, and its length on the bus.
 //!
 //! `Index;TimeStamps;D/R;S/E;CANId;DLC;D1;…;D8;ACK;FRM;CRC;STF;DE;SE;OVRBUF;FSiZ;SFF`: D or R for data or
-//! remote, S or E for standard or extended, hexadecimal ID and data, Y under the error that a row tells
-//! of, Y for data and stamps being recorded, Y where frames were lost behind this one, and the bits of the
-//! frame without and of stuffing. Channel, direction, states and numbers of losses have no column.
+//! remote, S or E for standard or extended, hexadecimal ID and data, Y in the column of the row's error, Y if
+//! data and stamps were recorded, Y if frames were lost after this one, and the bits of the frame without
+//! stuffing and of stuffing. Channel, direction, states and numbers of losses have no column.
 
 mod csv;
 mod decode;
@@ -45,7 +45,7 @@ pub(crate) const COLUMNS: [&str; 23] = [
     "SFF",
 ];
 
-/// The error that each of the four columns from `ACK` on tells of.
+/// The error for each of the four columns from `ACK` on.
 const ERRORS: [BusErrorKind; 4] =
     [BusErrorKind::Acknowledgment, BusErrorKind::Form, BusErrorKind::Crc, BusErrorKind::Stuff];
 
@@ -64,7 +64,7 @@ mod tests {
         WriteOptions { format: Some(format), table, ..WriteOptions::default() }
     }
 
-    /// What the table carries of records.
+    /// The part of the records that the table can hold.
     fn kept(records: &[TraceRecord]) -> Vec<TraceRecord> {
         let mut kept: Vec<TraceRecord> = Vec::new();
         for record in records {
@@ -127,7 +127,7 @@ mod tests {
         }
     }
 
-    /// The row of the analyser's own documentation.
+    /// The row from the analyser's own documentation.
     #[test]
     fn rows_are_the_analysers() {
         let frame = "000#55".parse().unwrap();
@@ -141,7 +141,7 @@ mod tests {
             "Index;TimeStamps;D/R;S/E;CANId;DLC;D1;D2;D3;D4;D5;D6;D7;D8;ACK;FRM;CRC;STF;DE;SE;OVRBUF;FSiZ;SFF"
         );
         assert_eq!(lines[3..], [row, ""]);
-        // Read from a file with comments of which nothing is known.
+        // Read from a file with comments of unknown meaning.
         let file =
             format!("CANanalyser\r\nDate : 14/09/2014 17:14:42\r\nFilter : all\r\n{}\r\n{row}\r\n", lines[2]);
         let (records, issues) = tests::read(CSV, file);

@@ -1,8 +1,8 @@
-//! Vector's ASC: lines of text with times relative to a date in the head.
+//! Vector's ASC: lines of text with times relative to a date in the header.
 //!
-//! Classical frames, error frames and the controller's state are events of the format; a loss is a status
-//! line with the details in a trailing comment. Everything else that is known of such files (statistics, other
-//! buses, markers) is counted by its kind. Dates are taken as UTC.
+//! Classical frames, error frames and the controller's state are events of the format; a loss is a status line
+//! with the details in a trailing comment. Everything else that is known to occur in such files (statistics,
+//! other buses, markers) is counted by kind. Dates are taken as UTC.
 
 mod content;
 mod decode;
@@ -20,7 +20,7 @@ const FD_FORMAT: u32 = 1 << 12;
 const SWITCHED_BIT_RATE: u32 = 1 << 13;
 const PASSIVE_SENDER: u32 = 1 << 14;
 
-/// What a status line says of the controller.
+/// The controller's states as status lines name them.
 const STATES: [(ErrorState, &str); 4] = [
     (ErrorState::Passive, "chip status error passive"),
     (ErrorState::Active, "chip status error active"),
@@ -46,7 +46,7 @@ mod tests {
                         internal events logged\n// version 9.0.0\n\
                         Begin Triggerblock Sam Sep 30 15:06:13.191 2017\n   0.000000 Start of measurement\n";
 
-    /// The records of some lines behind an ordinary head, as a candump log, and the issues.
+    /// The records of some lines after an ordinary header, as a candump log, and the issues.
     fn as_log(lines: &str) -> (String, Vec<String>) {
         let (records, issues) = tests::read(Format::Asc, format!("{HEAD}{lines}"));
         (tests::write(Format::Candump, &records), issues)
@@ -120,8 +120,8 @@ mod tests {
         );
     }
 
-    /// python-can writes the time of writing as `date`, and the trace's own at the trigger block. A trace
-    /// triggered long after its start has times from the start.
+    /// python-can writes the time of writing as `date`, and the trace's own date in the trigger block. A
+    /// trace triggered long after its start has times from the start.
     #[test]
     fn the_trigger_blocks_date_counts_unless_times_run_from_the_start() {
         let first = |block: &str, time: &str| {
@@ -135,7 +135,7 @@ mod tests {
         assert_eq!(first("30 15:10:00.000 2017", "599.5"), "(1506784199.500000) can0 123#\n");
     }
 
-    /// As programs write on a computer whose language has it.
+    /// As programs write on a computer whose language uses it.
     #[test]
     fn a_comma_in_front_of_fractions_is_read() {
         let file =
@@ -157,9 +157,9 @@ mod tests {
             [
                 "test, line 7: expected 2 data bytes, found '11'",
                 "test, line 8: expected a data length code of 0 to F, found '40'",
-                "test, line 9: expected an identifier up to 7FF, or up to 1FFFFFFF with x behind it, found '12345678'",
+                "test, line 9: expected an identifier up to 7FF, or up to 1FFFFFFF followed by x, found '12345678'",
                 "test, line 10: expected a line that begins with a time in seconds, found 'rubbish'",
-                "test, line 11: expected 'd' or 'r' behind the direction, found nothing",
+                "test, line 11: expected 'd' or 'r' after the direction, found nothing",
                 "test, line 12: expected 1 data bytes, found '1G'",
                 "test, line 14: the file ends inside a line; everything before it was read",
             ]

@@ -1,9 +1,9 @@
-//! Vector's BLF: objects in compressed containers behind a header of 144 bytes.
+//! Vector's BLF: objects in compressed containers after a header of 144 bytes.
 //!
-//! Vector publishes no description. What is known comes from Tobias Lorenz's vector_blf and from
-//! python-can; field names follow them. Written are CAN_MESSAGE, CAN_FD_MESSAGE, CAN_ERROR_EXT, DATA_LOST_END, and
-//! EVENT_COMMENT for what has no object of its own. A container that is on the disk can be read
-//! whatever happens afterwards: the header's totals are for information.
+//! Vector publishes no description. This is based on Tobias Lorenz's vector_blf and on python-can; field names
+//! follow them. The writer uses CAN_MESSAGE, CAN_FD_MESSAGE, CAN_ERROR_EXT, DATA_LOST_END, and EVENT_COMMENT for
+//! anything without its own kind of object. A container that is on the disk can be read whatever happens
+//! afterwards: the header's totals are only informative.
 
 mod decode;
 mod encode;
@@ -13,12 +13,12 @@ mod object;
 pub(crate) use decode::Decoder;
 pub(crate) use encode::Encoder;
 
-/// First bytes of a file, and its header's length.
+/// A file's first bytes.
 pub(crate) const FILE_MAGIC: &[u8; 4] = b"LOGG";
 const FILE_HEADER_BYTES: usize = 144;
-/// Where the header has the file's length.
+/// Offset of the file's length in the header.
 const FILE_BYTES_OFFSET: usize = 16;
-/// Where the header has the time of measurement start.
+/// Offset of the time of measurement start in the header.
 const START_OFFSET: usize = 40;
 
 const OBJECT_MAGIC: &[u8; 4] = b"LOBJ";
@@ -26,7 +26,7 @@ const OBJECT_MAGIC: &[u8; 4] = b"LOBJ";
 const BASE_HEADER_BYTES: usize = 16;
 /// The base header with flags, client, version and time.
 const HEADER_BYTES: usize = 32;
-/// A container's own fields: compression, length when decompressed.
+/// A container's own fields: compression, and length after decompression.
 const CONTAINER_FIELDS_BYTES: usize = 16;
 
 const TIME_IN_TEN_US: u32 = 1;
@@ -66,8 +66,8 @@ const FD64_PASSIVE_SENDER: u32 = 1 << 14;
 
 /// In an error object: the SJA1000's error code is valid.
 const HAS_SJA1000_CODE: u32 = 1;
-/// Ours, in the data bytes of an error object whose length is 0: this mark, then the kind from 1, whether
-/// the counters are known, and the counters. Other programs look at no byte beyond the length.
+/// Ours, in the data bytes of an error object whose length is 0: this mark, then the kind from 1, whether the
+/// counters are known, and the counters. Other programs ignore bytes beyond the length.
 const OWN_MARK: u8 = b'c';
 
 #[cfg(test)]
@@ -91,7 +91,7 @@ mod tests {
         }
     }
 
-    /// A file of one object.
+    /// A file with a single object.
     fn object(kind: u32, header_version: u16, fields: &[u8]) -> Vec<u8> {
         let mut bytes = file(&[]);
         bytes.truncate(super::FILE_HEADER_BYTES);
@@ -170,11 +170,11 @@ mod tests {
             assert!(cut == 144 || issues.len() == 1, "{cut}: {issues:?}");
             most = most.max(read.len());
         }
-        // The cut container gives what it has.
+        // The cut container yields what it has.
         assert!(most > 19_900, "{most}");
     }
 
-    /// Found by random damage: all times were moved to 1970 without a word.
+    /// Found by random damage: all times silently moved to 1970.
     #[test]
     fn a_start_that_is_no_date_is_named_and_none_at_all_is_not() {
         let whole = file(&[data_record(1_410_714_882_000_000_000)]);

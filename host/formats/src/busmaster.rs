@@ -1,5 +1,5 @@
-//! BUSMASTER's log: `11:49:12:9420 Rx 1 0x023 s 8 40 …` behind a head between stars. Times are the computer's clock, or run from
-//! the start, or are differences; numbers are hexadecimal or decimal: the head says which.
+//! BUSMASTER's log: `11:49:12:9420 Rx 1 0x023 s 8 40 …` after a header between asterisks. Times are the computer's clock, count
+//! from the start, or are differences; numbers are hexadecimal or decimal: the header says which.
 
 use super::calendar::{Date, NS_PER_DAY};
 use super::frame_fields::{FrameFields, Payload, decimal_byte, direction, hex_byte, identifier};
@@ -16,7 +16,7 @@ pub(crate) struct Decoder {
     times: Times,
     /// When the session began, by the computer's clock.
     start_ns: i64,
-    /// The last time in a line, as it stands there, and with the days or the sum that belong to it.
+    /// The last time in a line, as written, and with the days or the sum added to it.
     last_ns: i64,
     base_ns: i64,
 }
@@ -30,7 +30,7 @@ enum Times {
     Differences,
 }
 
-/// Whether a text begins as such a file does.
+/// Whether a text begins like such a file.
 pub(crate) fn is_head(text: &[u8]) -> bool {
     text.starts_with(b"***BUSMASTER")
 }
@@ -74,7 +74,7 @@ impl RowFormat for Decoder {
     }
 
     fn may_be_cut(&self, _line: &[u8], record: &TraceRecord) -> bool {
-        // The bytes are as many as the length says; a decimal one may lack a digit.
+        // There are as many bytes as the length says; a decimal one may lack a digit.
         self.decimal || record.frame().is_none_or(|frame| frame.is_remote() || frame.data().is_empty())
     }
 }
@@ -115,7 +115,7 @@ impl Decoder {
             Times::Clock => {
                 let begin_ns = self.start_ns.rem_euclid(NS_PER_DAY);
                 let before_ns = if self.last_ns == 0 { begin_ns } else { self.last_ns };
-                // Far back on the clock is the next day; a little is another channel's frame.
+                // A time that is far earlier is on the next day; a little earlier is another channel's frame.
                 if shown_ns < before_ns - NS_PER_DAY / 2 {
                     self.base_ns += NS_PER_DAY;
                 }
@@ -131,7 +131,7 @@ impl Decoder {
 fn clock(text: &[u8]) -> Option<i64> {
     let mut parts = text.splitn(4, |byte| *byte == b':');
     let mut whole = || text::decimal(parts.next()?).and_then(|part| i64::try_from(part).ok());
-    // Times from the start go on beyond a day.
+    // Times from the start may exceed a day.
     let (hours, minutes, seconds) = (whole()?, whole()?, whole()?);
     let fraction = [b"0.", parts.next()?].concat();
     let fraction_ns = text::time(&fraction, NS_PER_S, b'.')?;
@@ -139,7 +139,7 @@ fn clock(text: &[u8]) -> Option<i64> {
     valid.then(|| ((hours * 60 + minutes) * 60 + seconds) * NS_PER_S + fraction_ns)
 }
 
-/// `8:8:2014 11:49:7:965`: day, month, year, and a clock whose last part are milliseconds.
+/// `8:8:2014 11:49:7:965`: day, month, year, and a clock whose last part is milliseconds.
 fn date(text: &[u8]) -> Option<i64> {
     const NS_PER_MS: i64 = 1_000_000;
     let text = std::str::from_utf8(text).ok()?.trim();

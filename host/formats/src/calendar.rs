@@ -1,4 +1,4 @@
-//! Dates in the heads of trace files. All are taken as UTC: the formats do not name a time zone, and a file
+//! Dates in the headers of trace files. All are taken as UTC: the formats do not name a time zone, and a file
 //! must mean the same on every machine.
 
 use super::text::NS_PER_S;
@@ -9,7 +9,7 @@ const S_PER_DAY: i64 = 86_400;
 pub(crate) const NS_PER_DAY: i64 = S_PER_DAY * NS_PER_S;
 
 /// A trace whose first time is before 1990 has times from its own start: no analyser is that old. python-can
-/// draws the same line.
+/// uses the same limit.
 pub(crate) const FIRST_DATE_NS: i64 = 631_152_000 * NS_PER_S;
 
 /// English month names, as ASC files have them.
@@ -61,7 +61,7 @@ impl Date {
         days.checked_mul(NS_PER_DAY)?.checked_add(self.of_day_ns)
     }
 
-    /// Hour, minute, second and the nanoseconds beyond.
+    /// Hour, minute, second and remaining nanoseconds.
     pub(crate) fn clock(&self) -> (u8, u8, u8, u32) {
         let seconds = self.of_day_ns / NS_PER_S;
         let ns = (self.of_day_ns % NS_PER_S) as u32;
@@ -81,8 +81,8 @@ impl Date {
     }
 }
 
-/// The start that a file's head names for a trace beginning at `first_ns`: whole milliseconds, which is
-/// what the formats can say; 0 for a trace without a date.
+/// The start in a file's header for a trace beginning at `first_ns`: in whole milliseconds, the formats'
+/// resolution; 0 for a trace without a date.
 pub(crate) fn start_of_trace(first_ns: i64) -> i64 {
     const NS_PER_MS: i64 = 1_000_000;
     if (0..FIRST_DATE_NS).contains(&first_ns) { 0 } else { first_ns.div_euclid(NS_PER_MS) * NS_PER_MS }

@@ -62,10 +62,10 @@ mod tests {
         }
     }
 
-    /// A complete log may lack its last line end; a cut line can look whole.
+    /// A complete log may lack its last line end, and a cut line can look whole.
     #[test]
     fn a_last_line_without_its_end_counts_unless_the_identifier_had_longer_frames() {
-        // The last frame before was a short one; what counts is the longest.
+        // The frame before the last line was a short one; what counts is the longest.
         let before = "(1.000000) can0 123#DEADBEEF\n(2.000000) can0 456#\n(2.000000) can0 123#DE\n";
         for (last, records, issues) in [
             ("(3.000000) can0 123#DEADBEEF", 3, 0),
@@ -143,7 +143,7 @@ mod tests {
                 "test, line 6: expected a CAN FD frame such as 123##1DEADBEEF, with a length that FD has, found '123##111111111111111111'",
                 "test, line 7: expected an identifier of 3 digits up to 7FF or 8 up to 1FFFFFFF, found '800#'",
                 "test, line 8: expected a frame such as 123#DEADBEEF (the data must be pairs of hexadecimal digits, with '.' between pairs if you like), found '123#1'",
-                "test, line 9: expected 'R', 'T' or nothing behind the frame, found 'Q'",
+                "test, line 9: expected 'R', 'T' or nothing after the frame, found 'Q'",
                 "test, line 10: expected a frame such as 123#DEADBEEF (the data must be pairs of hexadecimal digits, with '.' between pairs if you like), found '123#5.6'",
             ]
         );

@@ -1,5 +1,5 @@
-//! What candump shows on a screen: `(time)  can0  123   [8]  11 22 33 44 55 66 77 88   '.."3DUfw'`, with any of its options
-//! for times (`-t a`, `-t d`, `-t z`, `-t A`), `-x` and `-a`, with colours or without.
+//! candump's screen output: `(time) can0 123 [8] 11 22 33 44 55 66 77 88 '.."3DUfw'`, with any of its options for times
+//! (`-t a`, `-t d`, `-t z`, `-t A`), `-x` and `-a`, with or without colours.
 
 use super::date_time_ns;
 use super::error_frames::ErrorFrames;
@@ -23,17 +23,17 @@ pub(crate) struct Decoder {
     /// Whether times are differences.
     differences: bool,
     last_ns: i64,
-    /// What is to be reported of the last line.
+    /// What to report about the last line.
     note: Option<&'static str>,
 }
 
-/// Whether a line is one of these.
+/// Whether a line is in this format.
 pub(crate) fn is_line(line: &[u8]) -> bool {
     let line = plain(line);
     let Some((_, rest)) = stamp(&line) else { return false };
     let mut words = rest.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
     let _interface = words.next();
-    // Behind the interface and the columns of -x: the identifier, then the length.
+    // After the interface and the columns of -x: the identifier, then the length.
     let mut before = words.next().unwrap_or_default();
     for word in words.take(4) {
         if length(word).is_some() {
@@ -44,7 +44,7 @@ pub(crate) fn is_line(line: &[u8]) -> bool {
     false
 }
 
-/// `[8]` for a classical frame, `[08]` for one of CAN FD, `{F}` for a code of more than the eight bytes.
+/// `[8]` for a classical frame, `[08]` for one of CAN FD, `{F}` for a length code above 8.
 fn length(word: &[u8]) -> Option<(u8, bool)> {
     match word {
         [b'[', digit @ b'0'..=b'8', b']'] => Some((digit - b'0', false)),
@@ -57,7 +57,7 @@ fn length(word: &[u8]) -> Option<(u8, bool)> {
     }
 }
 
-/// A line without the sequences that colour it: `ESC [`, numbers, `m`. Any other use of the character stays, and makes the line no row.
+/// A line without its colour sequences: `ESC [`, numbers, `m`. Any other use of the character stays, and the line is then not a row.
 fn plain(line: &[u8]) -> std::borrow::Cow<'_, [u8]> {
     const ESCAPE: u8 = 0x1B;
     if !line.contains(&ESCAPE) {
@@ -77,7 +77,7 @@ fn plain(line: &[u8]) -> std::borrow::Cow<'_, [u8]> {
     out.into()
 }
 
-/// The time in parentheses in front of a line, empty if there is none, and what follows it.
+/// The time in parentheses at the beginning of a line, empty if there is none, and the text after it.
 fn stamp(line: &[u8]) -> Option<(&[u8], &[u8])> {
     let line = line.trim_ascii();
     match line.strip_prefix(b"(") {
@@ -89,8 +89,8 @@ fn stamp(line: &[u8]) -> Option<(&[u8], &[u8])> {
     }
 }
 
-/// Whether times that begin at about zero are differences. As times from the start they would not go back, and no two frames
-/// of a bus have the same one.
+/// Whether times that begin at about zero are differences. Times from the start would not go back, and no two frames on a
+/// bus have the same one.
 fn are_differences(times: &[i64]) -> bool {
     let pairs = || times.windows(2).map(|pair| (pair[0], pair[1]));
     let same = pairs().filter(|(before, after)| before == after && *after > 0).count();
@@ -113,7 +113,7 @@ impl RowFormat for Decoder {
 
     fn line(&mut self, line: &[u8], zone: &Zone) -> Result<Line, Fault> {
         let line = plain(line);
-        // What an error frame means (-e) stands below it.
+        // The explanation of an error frame (-e) is on the lines below it.
         if line.is_empty() || line.starts_with(b"\t") {
             return Ok(Line::Nothing);
         }
@@ -137,7 +137,7 @@ impl RowFormat for Decoder {
     }
 
     fn may_be_cut(&self, line: &[u8], record: &TraceRecord) -> bool {
-        // The bytes are as many as the length says.
+        // There are as many bytes as the length says.
         record.frame().is_none_or(cantap_trace::TraceFrame::is_remote) && !line.ends_with(b"remote request")
     }
 }
@@ -175,7 +175,7 @@ impl Decoder {
         let id = identifier(raw, id.len() == 8, id)?;
         let fields = FrameFields { id, remote, direction, len, fd };
         let data = Payload::words(&mut words, fields.data_len(), hex_byte)?;
-        // A byte more is a length less: a digit changed.
+        // With a byte too many, the length is wrong: a digit was changed.
         if !remote && words.next().and_then(hex_byte).is_some() {
             return Err(Fault::malformed(format!("{len} data bytes"), rest.trim_ascii()));
         }

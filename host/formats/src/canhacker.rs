@@ -1,5 +1,5 @@
-//! CANHacker's trace: `00.000 00004000 8 36 47 19 43 01 00 00 80` below `Time   ID     DLC Data`. Its seconds begin anew each
-//! minute, with a point or a comma; extended identifiers have eight digits.
+//! CANHacker's trace: `00.000 00004000 8 36 47 19 43 01 00 00 80` below `Time ID DLC Data`. Its seconds restart each minute
+//! and have a point or a comma; extended identifiers have eight digits.
 
 use super::frame_fields::{FrameFields, Payload, hex_byte, identifier, length_code};
 use super::issue::Fault;
@@ -9,7 +9,7 @@ use super::zone::Zone;
 use cantap_trace::{Direction, TraceRecord};
 
 const MINUTES: &str =
-    "times begin anew each minute: of a pause of more than a minute only the seconds are known";
+    "times restart each minute: for a pause of more than a minute, only the seconds are known";
 
 const NS_PER_MINUTE: i64 = 60 * NS_PER_S;
 
@@ -21,7 +21,7 @@ pub(crate) struct Decoder {
     note: Option<&'static str>,
 }
 
-/// Whether a text begins as such a file does.
+/// Whether a line is the header of such a file.
 pub(crate) fn is_head(line: &[u8]) -> bool {
     let mut words = line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
     [&b"Time"[..], b"ID", b"DLC", b"Data"].iter().all(|name| words.next() == Some(*name))
@@ -58,7 +58,7 @@ impl RowFormat for Decoder {
     }
 
     fn may_be_cut(&self, _line: &[u8], record: &TraceRecord) -> bool {
-        // The bytes are as many as the length says.
+        // There are as many bytes as the length says.
         record.frame().is_none_or(|frame| frame.data().is_empty())
     }
 }

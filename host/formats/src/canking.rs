@@ -1,8 +1,8 @@
-//! The text of Kvaser's CanKing, as its output window is saved: ` 0    0CFBFFDB X       8  1B  31 …     100.000139 R`. Channels count from
-//! 0, times from the start of the measurement, which no line tells.
+//! The text of Kvaser's CanKing, as saved from its output window: ` 0 0CFBFFDB X 8 1B 31 … 100.000139 R`. Channels count from 0. Times
+//! count from the start of the measurement, whose date no line gives.
 //!
-//! Nothing says either whether numbers are hexadecimal, as the user of CanKing can choose. Hexadecimal ones are written with all
-//! their digits, eight of an identifier and two of a byte, so the rows tell: see [`Decoder::is_decimal`].
+//! Nor does anything say whether numbers are hexadecimal, which CanKing's user can choose. Hexadecimal ones are written with all
+//! their digits, eight for an identifier and two for a byte, so the rows show it: see [`Decoder::is_decimal`].
 
 use super::frame_fields::{
     FdFields, FrameFields, Payload, decimal_byte, fd_len, hex_byte, identifier, length_code,
@@ -23,7 +23,7 @@ pub(crate) struct Decoder {
 
 const TAKEN_AS_DECIMAL: &str = "identifiers and bytes were taken as decimal numbers, because they have not all digits of hexadecimal ones";
 
-/// Whether a text begins as such a file does.
+/// Whether a line is the header of such a file.
 pub(crate) fn is_head(line: &[u8]) -> bool {
     is_names(line)
 }
@@ -32,12 +32,12 @@ fn is_names(line: &[u8]) -> bool {
     line.starts_with(b"Chn") && text::word(&line[3..]).0 == b"Identifier"
 }
 
-/// A line in words, at most as many as one with 64 bytes has.
+/// Splits a line into words, at most as many as in a line with 64 bytes.
 fn words(line: &[u8]) -> Vec<&[u8]> {
     line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty()).take(80).collect()
 }
 
-/// What stands between the identifier and the time.
+/// The columns between the identifier and the time.
 struct Columns<'a> {
     channel: &'a [u8],
     id: &'a [u8],
@@ -48,7 +48,7 @@ struct Columns<'a> {
     direction: &'a [u8],
 }
 
-/// The columns of a row; `None` for what is none.
+/// The columns of a row; `None` if it is not a row.
 fn columns(line: &[u8]) -> Option<Columns<'_>> {
     let words = words(line);
     let [channel, id, middle @ .., time, direction] = &words[..] else { return None };
@@ -59,8 +59,8 @@ fn columns(line: &[u8]) -> Option<Columns<'_>> {
 }
 
 impl Decoder {
-    /// Whether more bytes are written as only decimal numbers are, with one or three digits, than as only hexadecimal ones are, with
-    /// a letter or a zero in front.
+    /// Whether more bytes are written in a way only decimal numbers are (one or three digits) than in a way only hexadecimal ones
+    /// are (a letter or a leading zero).
     fn is_decimal(rows: &[u8]) -> bool {
         let rows = rows.split(|byte| *byte == b'\n').filter_map(columns);
         let (mut decimal, mut hexadecimal) = (0, 0);
@@ -84,7 +84,7 @@ impl Decoder {
         let direction = match *direction {
             b"R" => Direction::Rx,
             b"T" => Direction::Tx,
-            other => return Err(Fault::malformed("'R' or 'T' behind the time", other)),
+            other => return Err(Fault::malformed("'R' or 'T' after the time", other)),
         };
         let record = |event| TraceRecord { time_ns, channel, event };
         if flags.eq_ignore_ascii_case(b"ErrorFrame") || flags.eq_ignore_ascii_case(b"XErrorFrame") {
@@ -121,7 +121,7 @@ impl RowFormat for Decoder {
     }
 
     fn line(&mut self, line: &[u8], _zone: &Zone) -> Result<Line, Fault> {
-        // What CanKing says of itself, such as `Logging stopped.`
+        // CanKing's own messages, such as `Logging stopped.`
         if line.is_empty() || is_names(line) || line.starts_with(b"Logging ") {
             return Ok(Line::Nothing);
         }
@@ -129,7 +129,7 @@ impl RowFormat for Decoder {
         self.row(&columns(line).ok_or_else(fault)?, line).map(Line::Record)
     }
 
-    /// With its direction a row is whole.
+    /// A row that has its direction is complete.
     fn may_be_cut(&self, _line: &[u8], _record: &TraceRecord) -> bool {
         false
     }
@@ -190,7 +190,7 @@ mod tests {
         let (log, issues) = as_log(rows);
         assert_eq!((log.as_str(), issues.len()), ("", 10), "{issues:#?}");
         assert!(issues[9].contains("line 11: the file ends inside a line"), "{issues:#?}");
-        // Whatever a row is cut to, it is no other row.
+        // However much of a row is cut off, the rest is never a different row.
         let row = " 0    0CFBFFDB X       8  1B  31  20  EB  B3  FF  D9  FF     100.000139 R";
         for keep in 1..row.len() {
             let (log, issues) = as_log(&row[..keep]);

@@ -1,5 +1,5 @@
-//! The two halves of a format, which know neither files nor compression: a [`Decode`] takes bytes from an [`Input`], an
-//! [`Encode`] appends them to a buffer.
+//! The two halves of a format, which know nothing of files or compression: a [`Decode`] takes bytes from an [`Input`],
+//! an [`Encode`] appends them to a buffer.
 
 use std::io;
 
@@ -12,22 +12,22 @@ use cantap_trace::TraceRecord;
 /// Records decoded at a time: few enough to stay in the processor's cache.
 pub(crate) const BATCH: usize = 256;
 
-/// Of the rows and objects that Vector's programs write before they send a frame.
+/// Name of the rows and objects that Vector's programs write before they send a frame.
 pub(crate) const REQUESTS_TO_SEND: &str =
-    "requests to send were passed over: what was sent is in the trace again as sent";
+    "requests to send were skipped: what was sent is in the trace as sent";
 
 /// The reading half of a format.
 pub(crate) trait Decode: Send {
-    /// The next record or issue. Errors are those of the system.
+    /// The next record or issue. Errors are the system's.
     fn next(&mut self, input: &mut Input) -> io::Result<Found>;
 
-    /// Whether a line that is there is enough for [`Self::next`] not to wait for more.
+    /// Whether [`Self::next`] can return for a single line without waiting for more.
     fn needs_one_line(&self) -> bool {
         true
     }
 
-    /// Records up to something else, which is returned; `None` if there are enough, or if more must be waited for. Here,
-    /// so that each format's [`Self::next`] becomes part of its own loop.
+    /// Adds records until it finds something else, which is returned; `None` if there are enough, or if it would have to
+    /// wait for more. It is in the trait so that each format's [`Self::next`] is inlined into its own loop.
     fn batch(&mut self, input: &mut Input, records: &mut Vec<TraceRecord>) -> io::Result<Option<Found>> {
         loop {
             match self.next(input)? {
@@ -41,7 +41,7 @@ pub(crate) trait Decode: Send {
     }
 }
 
-/// In the place of a format that this build was made without: an error of the system that says so.
+/// Takes the place of a format that this build leaves out, and returns a system error saying so.
 #[cfg(not(feature = "sqlite"))]
 pub(crate) struct Missing(pub &'static str);
 
@@ -52,9 +52,9 @@ impl Decode for Missing {
     }
 }
 
-/// The writing half of a format: appends to a buffer, knows nothing of files.
+/// The writing half of a format: appends to a buffer and knows nothing of files.
 pub(crate) trait Encode: Send {
-    /// Appends a record, and before the first one the file's head.
+    /// Appends a record, preceded by the file's header the first time.
     fn record(&mut self, record: &TraceRecord, out: &mut Vec<u8>, left_out: &mut LeftOut);
 
     /// Whether the format can say that a frame's time is only an upper bound.
@@ -62,25 +62,25 @@ pub(crate) trait Encode: Send {
         false
     }
 
-    /// Appends what was held back, so that a file ending here is valid.
+    /// Appends whatever was held back, so that a file ending here is valid.
     fn flush(&mut self, _out: &mut Vec<u8>, _left_out: &mut LeftOut) {}
 
-    /// Bytes that [`Self::flush`] or [`Self::finish`] would append at most, where that is much.
+    /// The most bytes that [`Self::flush`] or [`Self::finish`] would append, if that is a lot.
     fn held_back(&self) -> usize {
         0
     }
 
-    /// Has the next record of a channel say something more, where a record can.
+    /// Adds a remark to the next record of a channel, if the format allows it.
     fn remark(&mut self, _channel: u8, _text: &str) {}
 
-    /// Appends the file's end. A file without any record gets its head here.
+    /// Appends the file's end. A file without records gets its header here.
     fn finish(&mut self, out: &mut Vec<u8>, left_out: &mut LeftOut);
 
-    /// Appends what would make a file end here: what [`Self::finish`] would append, and what is held back for a record that
-    /// may come.
+    /// Appends what is needed for the file to end here: what [`Self::finish`] would append, and what is held back for a
+    /// possible next record.
     fn provisional_end(&self, _out: &mut Vec<u8>) {}
 
-    /// What to change in the bytes already written, after `written` bytes in all.
+    /// Changes to make in bytes already written, after `written` bytes in total.
     fn patch(&self, _written: u64) -> Option<Patch> {
         None
     }
@@ -91,19 +91,19 @@ pub(crate) trait Encode: Send {
     }
 }
 
-/// The line in front of the first row of a table.
+/// The line before the first row of a table.
 pub(crate) struct HeadLine {
     text: &'static str,
     is_written: bool,
 }
 
 impl HeadLine {
-    /// Not written yet; `text` is without its line end.
+    /// Not written yet; `text` has no line end.
     pub(crate) const fn of(text: &'static str) -> Self {
         Self { text, is_written: false }
     }
 
-    /// Writes it, the first time.
+    /// Writes it, but only once.
     pub(crate) fn write(&mut self, out: &mut Vec<u8>) {
         if !std::mem::replace(&mut self.is_written, true) {
             out.extend_from_slice(self.text.as_bytes());

@@ -1,4 +1,4 @@
-//! Compressed files that are whole whenever this program ends.
+//! Compressed files that are complete whenever this program ends.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -8,30 +8,31 @@ use super::compression::Compression;
 #[cfg(not(feature = "zstd"))]
 use super::compression::without_zstd;
 
-/// Compression that leaves a slow machine time to capture: level 1 of 9.
+/// A compression level that leaves a slow machine time to capture: 1 of 9.
 const GZIP_LEVEL: u32 = 1;
 /// zstd's own default.
 #[cfg(feature = "zstd")]
 const ZSTD_LEVEL: i32 = 3;
 /// xz is for archives; with its default a conversion would take minutes.
 const XZ_PRESET: u32 = 1;
-/// Compressed bytes are kept until this many are together or until a flush.
+/// Compressed bytes are collected until there are this many, or until a flush.
 const COMPRESSED_BYTES: usize = 512 * 1024;
-/// Of a file that is cut, a reader gets the blocks that are whole. zstd's own have 128 KiB, which can be all of a capture.
+/// From a truncated file, a reader gets the blocks that are whole. zstd's own have 128 KiB, which can be an entire
+/// capture.
 const BLOCK_BYTES: usize = 16 * 1024;
-/// The encoder of xz keeps what it made until its stream ends: that is after this many bytes at the latest, and as many can be lost where
-/// a file is cut. A log in such streams is 3 % larger than in streams of a megabyte, and a third smaller than gzip's.
+/// The xz encoder keeps its output until its stream ends, so streams end after this many bytes at the latest; that much can be lost when
+/// a file is truncated. A log in such streams is 3 % larger than in streams of a megabyte, and a third smaller than gzip's.
 const XZ_STREAM_BYTES: usize = 128 * 1024;
-/// What a program that is killed loses at most, where nothing asks for a flush.
+/// How much a killed program loses at most, if nothing requests a flush.
 const KEPT_BACK: Duration = Duration::from_secs(1);
 
-/// A compressed file. A flush ends what gzip calls a member and xz a stream, and the others a frame, and the next bytes begin
-/// another: until then they stay in memory, so that the file is whole whenever this program ends.
+/// A compressed file. A flush ends what gzip calls a member, xz a stream and the others a frame, and the next bytes begin
+/// another: until then they stay in memory, so that the file is complete whenever this program ends.
 pub(crate) struct Compressed {
     file: File,
     compression: Compression,
     encoder: Encoder,
-    /// Bytes that the encoder was given since the last flush, and since the last end of a block.
+    /// Bytes given to the encoder since the last flush, and since the last end of a block.
     begun: usize,
     in_block: usize,
     flushed: Instant,
@@ -56,7 +57,7 @@ impl Encoder {
             #[cfg(feature = "zstd")]
             Compression::Zstd => {
                 let mut encoder = zstd::stream::write::Encoder::new(out, ZSTD_LEVEL)?;
-                // Neither this nor LZ4 has a checksum by itself, and damage would give other frames.
+                // Neither this nor LZ4 has a checksum by default, and damage would yield wrong frames.
                 encoder.include_checksum(true)?;
                 Self::Zstd(encoder)
             }
@@ -73,7 +74,7 @@ impl Encoder {
         })
     }
 
-    /// What compresses, as any writer.
+    /// The encoder, as a writer.
     fn writer(&mut self) -> &mut dyn Write {
         match self {
             Self::Gzip(encoder) => encoder,
@@ -84,7 +85,7 @@ impl Encoder {
         }
     }
 
-    /// What came out and was not taken, where the encoder shows it.
+    /// Output that was not taken yet, if the encoder exposes it.
     fn out(&mut self) -> Option<&mut Vec<u8>> {
         match self {
             Self::Gzip(encoder) => Some(encoder.get_mut()),
@@ -114,7 +115,7 @@ impl Compressed {
         Ok(Self { file, compression, encoder, begun: 0, in_block: 0, flushed, written: 0 })
     }
 
-    /// Takes bytes to be compressed.
+    /// Compresses bytes.
     pub(crate) fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
         for piece in bytes.chunks(BLOCK_BYTES) {
             self.encoder.writer().write_all(piece)?;
@@ -122,13 +123,13 @@ impl Compressed {
             self.in_block += piece.len();
             if self.in_block >= BLOCK_BYTES {
                 self.in_block = 0;
-                // gzip's blocks are short enough, and a reader gets what is whole of them too.
+                // gzip's blocks are short enough, and a reader also gets what is whole of them.
                 if matches!(self.compression, Compression::Zstd | Compression::Lz4) {
                     self.encoder.writer().flush()?;
                 }
             }
         }
-        // Only here, where what was written ends with a record: a program that is killed leaves no half of one.
+        // Only here, where the written data end with a record, so that a killed program leaves no half record.
         let stream_is_long = self.compression == Compression::Xz && self.begun >= XZ_STREAM_BYTES;
         if stream_is_long || self.flushed.elapsed() >= KEPT_BACK {
             return self.flush();
@@ -139,7 +140,7 @@ impl Compressed {
         Ok(())
     }
 
-    /// How large the file is, with what is to be written next. What the encoder still holds is not in it.
+    /// The size of the file including what is written next, but without what the encoder still holds.
     pub(crate) fn size(&mut self) -> u64 {
         self.written + self.encoder.out().map_or(0, |out| out.len() as u64)
     }
@@ -152,7 +153,7 @@ impl Compressed {
         Ok(())
     }
 
-    /// Ends the member, stream or frame, if there is anything in it.
+    /// Ends the member, stream or frame, unless it is empty.
     pub(crate) fn flush(&mut self) -> io::Result<()> {
         if std::mem::take(&mut self.begun) > 0 { self.end() } else { Ok(()) }
     }
@@ -168,7 +169,7 @@ impl Compressed {
 
     /// Ends the file.
     pub(crate) fn finish(mut self) -> io::Result<()> {
-        // A file without anything in it is still a compressed one.
+        // A file without content is still a valid compressed file.
         if self.begun > 0 || self.written == 0 { self.end() } else { Ok(()) }
     }
 }
@@ -178,7 +179,7 @@ mod tests {
     use super::*;
     use std::io::Read;
 
-    /// Text like a log's, of which no two lines are the same.
+    /// Text like that of a log, with no two lines equal.
     fn text() -> Vec<u8> {
         let line = |at: u32| {
             format!(
@@ -191,7 +192,7 @@ mod tests {
         (0..40_000).map(line).collect::<String>().into_bytes()
     }
 
-    /// Found by random damage: files in zstd and LZ4 gave other frames without a word.
+    /// Found by random damage: zstd and LZ4 files silently gave wrong frames.
     #[test]
     fn damage_to_a_compressed_file_is_noticed() {
         let directory = tempfile::tempdir().unwrap();
@@ -236,7 +237,7 @@ mod tests {
             let mut read = Vec::new();
             let result = Compression::Xz.unpack(io::Cursor::new(cut)).unwrap().read_to_end(&mut read);
             assert!(result.is_err() && text.starts_with(&read), "{percent}");
-            // The text is the same everywhere, so as much of the one is as much of the other.
+            // The text is uniform, so equal fractions of it and of the file correspond.
             let least = text.len() * percent / 100 - 2 * XZ_STREAM_BYTES;
             assert!(read.len() >= least, "{percent} %: {} of {}", read.len(), text.len());
         }

@@ -1,4 +1,4 @@
-//! How files are compressed: by suffix, by their first bytes.
+//! How files are compressed: detected by suffix, and by their first bytes.
 
 use std::io::{self, Read};
 use std::path::Path;
@@ -12,7 +12,7 @@ pub(crate) enum Compression {
     Lz4,
 }
 
-/// Each with its suffix and its first four bytes, as many of them as do not vary.
+/// Each with its suffix and as many of its first four bytes as do not vary.
 const KNOWN: [(Compression, &str, &[u8]); 4] = [
     (Compression::Gzip, ".gz", &[0x1F, 0x8B]),
     (Compression::Zstd, ".zst", &[0x28, 0xB5, 0x2F, 0xFD]),
@@ -20,13 +20,13 @@ const KNOWN: [(Compression, &str, &[u8]); 4] = [
     (Compression::Lz4, ".lz4", &[0x04, 0x22, 0x4D, 0x18]),
 ];
 
-/// So many bytes of a file tell how it is compressed.
+/// This many bytes are enough to detect how a file is compressed.
 pub(crate) const MAGIC_BYTES: usize = 4;
 
-/// An xz file says how much memory it takes to unpack; `xz -9` takes 65 MiB. More than this is damage or malice.
+/// An xz file says how much memory unpacking takes; `xz -9` takes 65 MiB. More than this is damage or malice.
 const XZ_MEMORY_KIB: u32 = 256 * 1024;
 
-/// What a build without zstd says to such a file.
+/// The error for such a file in a build without zstd.
 #[cfg(not(feature = "zstd"))]
 pub(crate) fn without_zstd() -> io::Error {
     let reason = "this build has no zstd; build it with the feature `zstd`, or use gzip";
@@ -39,7 +39,7 @@ impl Compression {
         Self::split(&path.file_name()?.to_string_lossy()).1
     }
 
-    /// A file's name without the suffix that says how it is compressed, and what that says.
+    /// Splits a file's name into the part without the compression suffix and the compression.
     pub(crate) fn split(name: &str) -> (&str, Option<Self>) {
         KNOWN
             .iter()
@@ -56,7 +56,7 @@ impl Compression {
         KNOWN.iter().find(|(.., magic)| head.starts_with(magic)).map(|(compression, ..)| *compression)
     }
 
-    /// What unpacks a file; several members, frames or streams one after another are one file.
+    /// Unpacks a file; several members, frames or streams one after another are one file.
     pub(crate) fn unpack(self, source: impl Read + Send + 'static) -> io::Result<Box<dyn Read + Send>> {
         Ok(match self {
             Self::Gzip => Box::new(flate2::read::MultiGzDecoder::new(source)),
@@ -70,10 +70,11 @@ impl Compression {
     }
 }
 
-/// xz streams one after another: the crate's decoder takes a file that ends between two blocks for a whole one.
+/// xz streams one after another: the crate's decoder takes a file that ends between two blocks for a complete
+/// one.
 struct XzStreams<R: Read>(lzma_rust2::XzReader<Tail<R>>);
 
-/// A source, and the last two bytes that came from it: zeros may follow a stream.
+/// A source that remembers the last two bytes read: zeros may follow a stream.
 struct Tail<R> {
     source: R,
     last: [u8; 2],
@@ -98,9 +99,9 @@ impl<R: Read> XzStreams<R> {
 
 impl<R: Read> Read for XzStreams<R> {
     fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
-        /// What each stream ends with.
+        /// How each stream ends.
         const END: &[u8; 2] = b"YZ";
-        /// The decoder gives nothing of what it was asked for where the file ends within it.
+        /// If the file ends within what the decoder was asked for, it returns none of it.
         const MOST: usize = 4096;
         let len = out.len().min(MOST);
         let read = self.0.read(&mut out[..len])?;
@@ -111,14 +112,14 @@ impl<R: Read> Read for XzStreams<R> {
     }
 }
 
-/// LZ4 frames one after another: the crate's decoder ends with the first.
+/// LZ4 frames one after another: the crate's decoder stops after the first.
 struct Lz4Frames<R: Read> {
     decoder: lz4_flex::frame::FrameDecoder<Peeked<R>>,
-    /// Whether a frame has begun whose end mark was not seen.
+    /// Whether a frame has begun whose end mark has not been seen.
     within: bool,
 }
 
-/// A source of which a byte may have been looked at.
+/// A source that can be peeked at by one byte.
 struct Peeked<R> {
     source: R,
     byte: Option<u8>,
@@ -143,7 +144,7 @@ impl<R: Read> Read for Peeked<R> {
 }
 
 impl<R: Read> Peeked<R> {
-    /// Whether nothing more comes.
+    /// Whether the source has ended.
     fn is_at_end(&mut self) -> io::Result<bool> {
         if self.byte.is_none() {
             let mut byte = [0];
@@ -170,7 +171,7 @@ impl<R: Read> Read for Lz4Frames<R> {
             if read > 0 {
                 return Ok(read);
             }
-            // The decoder says the same of a frame's end mark and of a file that ends before it.
+            // The decoder returns the same for a frame's end mark and for a file that ends before it.
             if self.decoder.get_ref().ended && self.within {
                 return Err(io::ErrorKind::UnexpectedEof.into());
             }

@@ -1,11 +1,11 @@
-//! What the beginning of a file looks like, in words, for whoever gave the wrong one.
+//! Describes what the beginning of a file looks like, for users who gave the wrong one.
 
 use super::Format;
 
-/// Bytes that are looked at.
+/// How many bytes to look at.
 pub(crate) const HEAD_BYTES: usize = 256;
 
-/// Other things that are taken for traces, by their first bytes.
+/// Other files that users mistake for traces, by their first bytes.
 const KNOWN: [(&[u8], &str); 11] = [
     (b"PK\x03\x04", "a ZIP archive or spreadsheet"),
     (b"%PDF", "a PDF document"),
@@ -20,7 +20,7 @@ const KNOWN: [(&[u8], &str); 11] = [
     (b"FormatVersion=", "a SYM database"),
 ];
 
-/// What a file that begins so looks like. `read_as` is what it was taken for.
+/// What a file with this beginning looks like. `read_as` is the format it was taken for.
 pub(crate) fn looks_like(head: &[u8], read_as: Format) -> String {
     let text = head.trim_ascii();
     if text.is_empty() {

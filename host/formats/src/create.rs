@@ -1,4 +1,4 @@
-//! The writer that a path and the options ask for.
+//! Creates the writer for a path and options.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -8,8 +8,8 @@ use super::file_writer::FileWriter;
 use super::rotate::Rotating;
 use super::writer::{TraceWriter, WriteOptions};
 
-/// Creates a trace file, or writes to standard output for `-`. A name that ends in `.gz`, `.zst`,
-/// `.xz` or `.lz4` is compressed. With a rotation it is a row of files, `trace-000001.log` and so on.
+/// Creates a trace file, or writes to standard output for `-`. A name that ends in `.gz`, `.zst`, `.xz` or
+/// `.lz4` is compressed. With rotation it is a series of files: `trace-000001.log` and so on.
 pub fn create_writer(path: impl AsRef<Path>, options: &WriteOptions) -> io::Result<Box<dyn TraceWriter>> {
     let path = path.as_ref();
     if options.rotation.at.is_empty() {
@@ -19,8 +19,7 @@ pub fn create_writer(path: impl AsRef<Path>, options: &WriteOptions) -> io::Resu
     }
 }
 
-/// Writes a trace to what only takes bytes, such as a pipe that is open already: a candump log, if the options name no format. It cannot
-/// be rotated.
+/// Writes a trace to any byte stream, such as an open pipe: as a candump log, if the options name no format. It cannot be rotated.
 pub fn create_stream_writer(
     stream: Box<dyn Write + Send>,
     options: &WriteOptions,

@@ -1,5 +1,5 @@
-//! CRTD, the log of the Open Vehicle Monitoring System: `1320745424.002 1R11 402 FA 01 C3`. `R` or `T` with the bits of the
-//! identifier, in front of it the number of the bus; what begins with `C` is a comment.
+//! CRTD, the log of the Open Vehicle Monitoring System: `1320745424.002 1R11 402 FA 01 C3`. `R` or `T` is followed by the
+//! bits of the identifier and preceded by the number of the bus; lines that begin with `C` are comments.
 
 use super::frame_fields::{FrameFields, Payload, hex_byte, identifier};
 use super::issue::Fault;
@@ -12,13 +12,13 @@ use cantap_trace::{Direction, TraceRecord};
 #[derive(Default)]
 pub(crate) struct Decoder;
 
-/// What the second word of a line says.
+/// The meaning of a line's second word.
 enum Kind {
     Frame { direction: Direction, extended: bool },
     Comment,
 }
 
-/// The bus, 1 where none is named, and what kind of line it is.
+/// The bus, 1 if none is given, and the kind of line.
 fn kind(word: &[u8]) -> Option<(u8, Kind)> {
     let digits = word.iter().take_while(|byte| byte.is_ascii_digit()).count();
     let bus = if digits == 0 { 1 } else { text::decimal(&word[..digits])? };
@@ -34,7 +34,7 @@ fn kind(word: &[u8]) -> Option<(u8, Kind)> {
     u8::try_from(bus).ok().map(|bus| (bus, kind))
 }
 
-/// Whether a line is one of these.
+/// Whether a line is in this format.
 pub(crate) fn is_line(line: &[u8]) -> bool {
     let (time, rest) = text::word(line);
     text::time(time, NS_PER_S, b'.').is_some() && kind(text::word(rest).0).is_some()

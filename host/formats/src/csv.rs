@@ -1,4 +1,4 @@
-//! CSV in four dialects; reading takes the dialect from the head.
+//! CSV in four dialects; the reader detects the dialect from the header.
 //!
 //! python-can's and our own are below; the earlier CANanalyser's is in [`analyser`](super::analyser), SavvyCAN's in
 //! [`gvret`](super::gvret).
@@ -25,13 +25,13 @@ use super::issue::{Fault, Place};
 use super::zone::Zone;
 use cantap_trace::{TraceEvent, TraceRecord};
 
-/// Which columns.
+/// The columns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum CsvDialect {
     /// As python-can writes and reads it.
     PythonCan,
-    /// Ours: everything, for people and spreadsheets.
+    /// Ours: complete, for people and spreadsheets.
     Full,
     /// The earlier CANanalyser's.
     Analyser,
@@ -45,13 +45,13 @@ pub(crate) struct Decoder {
     dialect: Option<CsvDialect>,
     analyser: analyser::RowDecoder,
     gvret: gvret::RowDecoder,
-    /// Lines before the head that may be the analyser's comments: what is wrong if they are not.
+    /// Lines before the header that may be the analyser's comments, with the fault to report if they are not.
     no_head: VecDeque<(Place, Fault)>,
     error_frames: ErrorFrames,
 }
 
 impl Decoder {
-    /// With the zone of the file's date, if it has one.
+    /// `zone` is the zone of the file's date, if it has one.
     pub(crate) fn new(zone: &Zone) -> Self {
         Self { analyser: analyser::RowDecoder::new(zone), ..Self::default() }
     }
@@ -62,7 +62,7 @@ impl Decode for Decoder {
         if let Some(found) = self.error_frames.next() {
             return Ok(found);
         }
-        // Too many for comments, or in front of a head that has none.
+        // Too many for comments, or before a header that allows none.
         if (self.dialect.is_some() || self.no_head.len() > MAX_COMMENTS)
             && let Some((place, fault)) = self.no_head.pop_front()
         {
@@ -90,7 +90,8 @@ impl Decode for Decoder {
                 }
                 Ok(None) => {}
                 Err(fault) if self.dialect.is_none() => {
-                    // The analyser's file begins with comments; the head behind them says that they are no damage.
+                    // The analyser's file begins with comments; only the header after them shows that they are not
+                    // damage.
                     self.no_head.push_back((Place::Line(line.number), fault));
                     if self.no_head.len() > MAX_COMMENTS
                         && let Some((place, fault)) = self.no_head.pop_front()
@@ -105,11 +106,11 @@ impl Decode for Decoder {
     }
 }
 
-/// More lines than this before the head are no comments.
+/// More lines than this before the header are not comments.
 const MAX_COMMENTS: usize = 100;
 
 impl Decoder {
-    /// Whether a last row that looks whole, and has no line end, may have lost the end of what it says.
+    /// Whether a last row that looks whole but has no line end may have lost its end.
     fn may_be_cut(&self, row: &[u8], read: &Result<Row, Fault>) -> bool {
         let Ok(Some((TraceRecord { event, .. }, _))) = read else { return false };
         let is_frame = matches!(event, TraceEvent::Frame { .. });
@@ -133,7 +134,7 @@ impl Decoder {
             self.dialect = Some(CsvDialect::Analyser);
             self.no_head.clear();
         } else {
-            // Without its head a table is most likely one of python-can's columns, cut out of a file.
+            // A table without its header is most likely one in python-can's columns, cut out of a file.
             let row = python_can::row(line, &mut self.error_frames);
             if row.is_ok() {
                 self.dialect = Some(CsvDialect::PythonCan);
@@ -207,7 +208,7 @@ mod tests {
         );
     }
 
-    /// python-can writes a longer frame with its length and its bytes, and nothing else that tells FD.
+    /// python-can writes a longer frame with its length and bytes, and nothing else that shows it is FD.
     #[test]
     fn python_cans_dialect_keeps_the_data_of_fd_frames_and_counts_what_it_has_no_column_for() {
         let log = "(1.000000) can0 123##1000102030405060708090A0B\n(2.000000) can0 124##0AA\n";
@@ -246,7 +247,7 @@ mod tests {
             "(1.000000) can0 00000800#\n(2.000000) can0 001#\n"
         );
         assert_eq!(issues.len(), 3, "{issues:?}");
-        // Every line of a file that is none of ours counts, and those before a head too.
+        // Every line of a file that is not in our formats counts, including those before a header.
         let file = "not a table\n".repeat(150);
         assert_eq!(tests::read(Format::Csv(CsvDialect::PythonCan), &file).1.len(), 150);
         let file = format!("rubbish\nmore\n{}\n2.0,0x1,0,0,0,0,\n", python_can::HEAD);

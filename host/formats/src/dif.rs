@@ -1,8 +1,8 @@
 //! The earlier CANanalyser's table as DIF, the data interchange format of old spreadsheets.
 //!
 //! Pairs of lines: a header of named items, then for each cell its type and number, and its text. See
-//! [`DifConvention`] for the two ways in which programs count rows and columns; the reader needs
-//! neither number.
+//! [`DifConvention`] for the two ways in which programs count rows and columns; the reader uses neither
+//! number.
 
 use std::io;
 
@@ -15,13 +15,13 @@ use super::output::Patch;
 use super::zone::Zone;
 use cantap_trace::{TraceEvent, TraceRecord};
 
-/// The number of rows has a fixed width, so that it can be put in at the end.
+/// The number of rows has a fixed width, so that it can be filled in at the end.
 const COUNT_DIGITS: usize = 10;
 
 /// Writes DIF.
 pub(crate) struct DifLayout {
     style: TableStyle,
-    /// Where the number of rows stands in the file, once it does.
+    /// The position of the number of rows in the file, once it is written.
     count_at: Option<u64>,
 }
 
@@ -66,7 +66,7 @@ pub(super) const ROWS_UNTOLD: &str =
 
 impl Layout for DifLayout {
     fn head(&mut self, date: &str, out: &mut Vec<u8>) {
-        // The start stands in the title, as it does in a comment of the analyser's CSV.
+        // The start is in the title, as it is in a comment of the analyser's CSV.
         let count = "0".repeat(COUNT_DIGITS);
         let columns = COLUMNS.len().to_string();
         let (vectors, tuples) = match self.style.dif {
@@ -110,13 +110,13 @@ impl Layout for DifLayout {
     }
 
     fn patch(&self, rows: u64) -> Option<Patch> {
-        // One more for the names of the columns.
+        // One more, for the names of the columns.
         let count = format!("{:0COUNT_DIGITS$}", rows + 1);
         self.count_at.map(|offset| Patch { offset, bytes: count.into_bytes(), missed: Some(ROWS_UNTOLD) })
     }
 }
 
-/// More cells than this in a row are damage.
+/// More cells than this in a row mean damage.
 const MAX_CELLS: usize = 256;
 
 /// Reads DIF.
@@ -125,17 +125,17 @@ pub(crate) struct Decoder {
     rows: RowDecoder,
     /// The cells of the row being read.
     cells: Vec<Vec<u8>>,
-    /// `DATA` was seen, then the names of the columns.
+    /// `DATA` has been seen, then the names of the columns.
     in_data: bool,
     named: bool,
-    /// Line of the row's beginning.
+    /// The line at which the row begins.
     row_line: u64,
     pending: Option<TraceRecord>,
     ended: bool,
 }
 
 impl Decoder {
-    /// With the zone of the file's date.
+    /// `zone` is the zone of the file's date.
     pub(crate) fn new(zone: &Zone) -> Self {
         Self { rows: RowDecoder::new(zone), ..Self::default() }
     }
@@ -160,7 +160,7 @@ impl Decode for Decoder {
             let place = Place::Line(input.line_number() + 1);
             let Some(first) = input.line()? else {
                 self.ended = true;
-                // Without its end the last row may lack cells.
+                // Without its end, the last row may lack cells.
                 let cut = Fault::Truncated("a table; its last row is left out");
                 return Ok(Found::Issue(place, cut));
             };
@@ -196,7 +196,7 @@ impl Decode for Decoder {
                 Err(fault) => return Ok(Found::Issue(row_place, fault)),
             }
         }
-        // Whether a compressed file is whole is known at its end.
+        // Only the end shows whether a compressed file is complete.
         while !input.follows() && !input.peek(1)?.is_empty() {
             input.consume(input.buffered().len());
         }
@@ -204,11 +204,11 @@ impl Decode for Decoder {
     }
 }
 
-/// A line of the buffer without its end and the space around it.
+/// A line of the buffer without its line end and surrounding space.
 #[inline]
 fn trimmed(line: &[u8]) -> &[u8] {
     match line {
-        // As most lines are.
+        // Most lines are like this.
         [b'!'..=b'~', .., b'!'..=b'~', b'\r'] => &line[..line.len() - 1],
         [b'!'..=b'~', .., b'!'..=b'~'] => line,
         _ => line.trim_ascii(),
@@ -216,8 +216,8 @@ fn trimmed(line: &[u8]) -> &[u8] {
 }
 
 impl Decoder {
-    /// A row that is in the buffer from its first cell to the beginning of the next, as nearly all are, read without copying
-    /// a cell. `None` if there is none such; then its lines are read one by one.
+    /// Reads a row that is in the buffer from its first cell to the beginning of the next, as nearly all are, without
+    /// copying a cell. `None` if it is not; then its lines are read one by one.
     fn whole_row(&mut self, input: &mut Input) -> Option<Found> {
         let buffered = input.buffered();
         let mut ends = memchr::memchr_iter(b'\n', buffered);

@@ -1,5 +1,5 @@
-//! Events in words, for the formats that let a comment stand where they have no form of their own:
-//! `lost 5+ queue`, `bus-error stuff tec=8 rec=0`, `state passive`, `errors-suppressed 17`,
+//! Events as words, for formats that allow comments but have no form for these events: `lost 5+
+//! queue`, `bus-error stuff tec=8 rec=0`, `state passive`, `errors-suppressed 17`,
 //! `transmit-failed aborted tag=3`, `transmit-failed overtaken tag=4294901760 periods=12`.
 
 use std::fmt;
@@ -12,7 +12,7 @@ use cantap_wire::record::TransmitFailure;
 /// Marks such a text in a comment.
 pub(crate) const MARK: &str = "cantap: ";
 
-/// An event other than a frame, in words. A frame has none and shows as nothing.
+/// An event other than a frame, as words. A frame has none and displays as nothing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct EventText(pub TraceEvent);
 

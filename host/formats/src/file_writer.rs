@@ -1,4 +1,4 @@
-//! One file being written, in whichever format.
+//! Writes one file in any format.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -14,7 +14,7 @@ use super::writer::{TraceWriter, WriteOptions};
 use super::{Format, asc, blf, candump, csv, gvret, mf4, pcapng, trc};
 use cantap_trace::{TraceEvent, TraceRecord};
 
-/// Bytes collected before they go to the system.
+/// Bytes collected before they are passed to the system.
 const BUFFER_BYTES: usize = 128 * 1024;
 
 /// The writer of one file.
@@ -22,15 +22,15 @@ pub(crate) struct FileWriter {
     encoder: Box<dyn Encode>,
     output: Output,
     buffer: Vec<u8>,
-    /// Bytes made so far, before compression, without the buffer.
+    /// Bytes produced so far, before compression, excluding the buffer.
     written: u64,
     has_records: bool,
-    /// Size of the file when last looked at.
+    /// Size of the file when last checked.
     size: u64,
     left_out: LeftOut,
 }
 
-/// The format that a path and the options ask for.
+/// The format for a path and options.
 fn format_of(path: &Path, options: &WriteOptions) -> io::Result<Format> {
     match options.format {
         Some(format) => Ok(format),
@@ -39,7 +39,7 @@ fn format_of(path: &Path, options: &WriteOptions) -> io::Result<Format> {
     }
 }
 
-/// What writes a format. The error names those that are written, for one that is only read.
+/// The encoder of a format. For a format that can only be read, the error names those that can be written.
 fn encoder_of(format: Format, options: &WriteOptions) -> io::Result<Box<dyn Encode>> {
     Ok(match format {
         Format::Candump => Box::new(candump::Encoder::default()),
@@ -61,7 +61,7 @@ fn encoder_of(format: Format, options: &WriteOptions) -> io::Result<Box<dyn Enco
 
 impl FileWriter {
     pub(crate) fn create(path: &Path, options: &WriteOptions) -> io::Result<Self> {
-        // Nothing is created, and nothing overwritten, for a format that is not written.
+        // If the format cannot be written, nothing is created or overwritten.
         let encoder = encoder_of(format_of(path, options)?, options)?;
         Ok(Self::with(Output::create(path)?, encoder))
     }
@@ -92,7 +92,7 @@ impl FileWriter {
         }
     }
 
-    /// Bytes the file has, with what is still held back.
+    /// The file's size in bytes, including what is still held back.
     pub(crate) fn size(&self) -> u64 {
         self.size + (self.buffer.len() + self.encoder.held_back()) as u64
     }
@@ -102,7 +102,7 @@ impl FileWriter {
         self.has_records
     }
 
-    /// Hands the buffer on, and makes the file one that may end there.
+    /// Passes the buffer on, and leaves a file that may end there.
     fn drain(&mut self) -> io::Result<()> {
         let encoder = &self.encoder;
         let result = self.output.write(&self.buffer, |bytes| encoder.whole(bytes));
@@ -117,7 +117,7 @@ impl FileWriter {
         result
     }
 
-    /// Brings the head up to date; returns what other programs miss in it where that cannot be done.
+    /// Brings the header up to date; where that is impossible, returns what other programs will miss in it.
     fn patch(&mut self) -> io::Result<Option<&'static str>> {
         let Some(patch) = self.encoder.patch(self.written) else { return Ok(None) };
         let patched = self.output.patch(&patch)?;

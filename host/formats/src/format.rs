@@ -57,8 +57,8 @@ pub enum Format {
 /// The first bytes of an SQLite database.
 const SQLITE_MAGIC: &[u8] = b"SQLite format 3\0";
 
-/// Names, suffixes and a description of each format. The first name is the one shown; the first
-/// format with a suffix is the one that the suffix picks.
+/// Names, suffixes and a description of each format. The first name is the one shown; a suffix
+/// selects the first format that has it.
 const FORMATS: &[(Format, &[&str], &[&str])] = &[
     (Format::Candump, &["candump", "log"], &["log", "txt"]),
     (Format::Asc, &["asc"], &["asc"]),
@@ -88,19 +88,19 @@ const FORMATS: &[(Format, &[&str], &[&str])] = &[
     (Format::Sqlite, &["sqlite"], &["db", "sqlite", "sqlite3"]),
 ];
 
-/// No such format.
+/// There is no such format.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum UnknownFormat {
     /// Not a format's name.
-    #[error("'{0}' is no trace format; the formats are {known}", known = Format::names())]
+    #[error("'{0}' is not a trace format; the formats are {known}", known = Format::names())]
     Name(String),
-    /// A file's suffix says nothing.
+    /// A file's suffix does not name a format.
     #[error("the name '{0}' does not tell the format")]
     Suffix(String),
 }
 
-/// A format that is read and not written.
+/// A format that can be read but not written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{0} is a format that is only read; those that are written are {written}", written = Format::written_names())]
 pub struct NotWritten(pub Format);
@@ -111,7 +111,7 @@ impl Format {
         FORMATS.iter().map(|(format, ..)| *format)
     }
 
-    /// Whether files of the format are written, and not only read.
+    /// Whether files of the format can be written, not only read.
     pub fn is_written(self) -> bool {
         !matches!(
             self,
@@ -128,17 +128,17 @@ impl Format {
         )
     }
 
-    /// Whether its files begin with something that is no record, so that one of no bytes at all is none.
+    /// Whether its files begin with something other than a record, so that an empty file is not one of them.
     pub(crate) fn has_head(self) -> bool {
         !matches!(self, Self::Candump | Self::CandumpScreen | Self::Crtd | Self::Printer)
     }
 
-    /// Every format that is written.
+    /// Every format that can be written.
     pub fn written() -> impl Iterator<Item = Self> {
         Self::all().filter(|format| format.is_written())
     }
 
-    /// The names of the formats that are written, for messages.
+    /// The names of the formats that can be written, for messages.
     pub fn written_names() -> String {
         Self::written().map(|format| format.to_string()).collect::<Vec<_>>().join(", ")
     }
@@ -148,14 +148,14 @@ impl Format {
         FORMATS.iter().map(|(_, names, _)| names[0]).collect::<Vec<_>>().join(", ")
     }
 
-    /// By a path's suffix; `.gz`, `.zst`, `.xz` and `.lz4` are looked through.
+    /// By a path's suffix; `.gz`, `.zst`, `.xz` and `.lz4` are skipped.
     pub fn of_path(path: &Path) -> Result<Self, UnknownFormat> {
         Self::all()
             .find(|format| format.has_suffix_of(path))
             .ok_or_else(|| UnknownFormat::Suffix(path.display().to_string()))
     }
 
-    /// Whether a file of the format may be named so.
+    /// Whether a file of the format may have this name.
     pub(crate) fn has_suffix_of(self, path: &Path) -> bool {
         let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
         let (bare, _) = Compression::split(&name);
@@ -164,14 +164,14 @@ impl Format {
         bare.rsplit_once('.').is_some_and(|(_, suffix)| suffixes.contains(&suffix))
     }
 
-    /// Whether both are read by the same reader: the content says which version or dialect it is.
+    /// Whether both are read by the same reader: the content shows which version or dialect it is.
     pub fn is_kind_of(self, other: Self) -> bool {
         std::mem::discriminant(&self) == std::mem::discriminant(&other)
     }
 
     /// By a file's first bytes.
     pub fn of_content(head: &[u8]) -> Option<Self> {
-        /// Where the head of a log names its program.
+        /// Where the header of a log names its program.
         const HEAD_BYTES: usize = 1024;
         let text = head[..head.len().min(HEAD_BYTES)].trim_ascii_start();
         let line = text.split(|byte| *byte == b'\n').next().unwrap_or_default().trim_ascii_end();
@@ -223,7 +223,7 @@ impl Format {
     }
 }
 
-/// Whether a text begins as Vector's do: with its date, or with the base of its numbers, and comments in front of them.
+/// Whether a text begins like Vector's: with its date or the base of its numbers, possibly after comments.
 fn is_asc(text: &[u8]) -> bool {
     let lines = text.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii_start);
     let mut lines = lines.skip_while(|line| line.is_empty() || line.starts_with(b"//"));

@@ -1,4 +1,4 @@
-//! From the fields of a row to an event, for the formats that have an identifier, a length and bytes side by side.
+//! Turns the fields of a row into an event, for the formats with an identifier, a length and bytes side by side.
 
 use cantap_wire::{Frame, Id};
 
@@ -7,18 +7,18 @@ use super::text;
 use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
 use cantap_trace::{Direction, FdFrame, TraceEvent};
 
-/// What a row says of a frame beside its bytes.
+/// A frame's fields in a row, other than its bytes.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct FrameFields {
     pub id: Id,
     pub remote: bool,
     pub direction: Direction,
-    /// The length as the row says it: of a classical frame the code of the bus, of one of CAN FD the number of bytes.
+    /// The length as in the row: the bus's length code for a classical frame, the number of bytes for a CAN FD one.
     pub len: u8,
     pub fd: Option<FdFields>,
 }
 
-/// What only frames of CAN FD have.
+/// The fields that only CAN FD frames have.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct FdFields {
     pub brs: bool,
@@ -44,7 +44,7 @@ impl Payload {
         Some(payload)
     }
 
-    /// The first `len` of these words, each a byte as `parse` reads it. What stands behind them is not looked at.
+    /// The first `len` of these words, each a byte as `parse` reads it. Anything after them is ignored.
     pub(crate) fn words<'a>(
         mut words: impl Iterator<Item = &'a [u8]>,
         len: usize,
@@ -62,7 +62,7 @@ impl Payload {
         Ok(payload)
     }
 
-    /// As [`Self::words`], and behind them stands no further byte: else the length would be wrong.
+    /// Like [`Self::words`], but no further byte may follow: otherwise the length would be wrong.
     pub(crate) fn exactly<'a>(
         mut words: impl Iterator<Item = &'a [u8]>,
         len: usize,
@@ -81,7 +81,7 @@ impl Payload {
         &self.bytes[..self.len]
     }
 
-    /// The first eight, zeros behind what is there: the form of a classical frame's data.
+    /// The first eight bytes, padded with zeros: the form of a classical frame's data.
     pub(crate) fn first_eight(&self) -> [u8; 8] {
         self.bytes.first_chunk().copied().unwrap_or_default()
     }
@@ -100,7 +100,7 @@ pub(crate) fn decimal_byte(word: &[u8]) -> Option<u8> {
     text::decimal(word).and_then(|byte| u8::try_from(byte).ok())
 }
 
-/// An identifier that must fit its format.
+/// Checks that an identifier fits its format.
 pub(crate) fn identifier(raw: u32, extended: bool, shown: &[u8]) -> Result<Id, Fault> {
     let (id, expected) = if extended {
         (Id::extended(raw), "an identifier up to 1FFFFFFF")
@@ -117,7 +117,7 @@ pub(crate) fn length_code(word: &[u8]) -> Result<u8, Fault> {
 }
 
 impl FrameFields {
-    /// The number of bytes that must be there.
+    /// The number of bytes that are required.
     pub(crate) fn data_len(&self) -> usize {
         match self.fd {
             _ if self.remote => 0,
@@ -126,7 +126,7 @@ impl FrameFields {
         }
     }
 
-    /// The frame with these bytes, of which there are as many as [`Self::data_len`] says.
+    /// The frame with these bytes, as many as [`Self::data_len`] says.
     pub(crate) fn event(&self, data: &Payload) -> Result<TraceEvent, Fault> {
         let frame = match self.fd {
             None => Frame::from_bus(self.id, self.remote, self.len, data.first_eight()).into(),
@@ -141,7 +141,7 @@ impl FrameFields {
     }
 }
 
-/// The bytes that a length code, 0 to 15, stands for in a frame of CAN FD.
+/// The number of bytes for a length code, 0 to 15, in a CAN FD frame.
 pub(crate) fn fd_len(code: u8) -> u8 {
     FD_LENGTHS[usize::from(code & 15)]
 }

@@ -17,16 +17,16 @@ pub(crate) struct RowDecoder {
 
 const HEAD: &[u8] = b"Time Stamp,ID,Extended,";
 
-/// Whether a text begins as such a file does.
+/// Whether a line is the header of such a file.
 pub(crate) fn is_head(line: &[u8]) -> bool {
     line.get(..HEAD.len()).is_some_and(|start| start.eq_ignore_ascii_case(HEAD))
 }
 
-/// Nanoseconds of the unit that times are in.
+/// Nanoseconds per unit of time in the file.
 const NS_PER_US: i64 = 1000;
 
 impl RowDecoder {
-    /// Looks at a line that may be the head; true if it is.
+    /// Takes a line that may be the header; true if it is.
     pub(crate) fn head(&mut self, line: &[u8]) -> bool {
         self.has_direction =
             line.split(|byte| *byte == b',').nth(3).is_some_and(|name| name.eq_ignore_ascii_case(b"Dir"));
@@ -44,7 +44,7 @@ impl RowDecoder {
         let raw =
             text::hex(digits).ok_or_else(|| Fault::malformed("an identifier in hexadecimal digits", id))?;
         let extended = match extended {
-            // Some files leave the mark out where the identifier alone says it.
+            // Some files leave the mark out if the identifier alone shows it.
             b"false" | b"False" | b"FALSE" | b"0" => raw > 0x7FF,
             b"true" | b"True" | b"TRUE" | b"1" => true,
             other => return Err(Fault::malformed("'true' or 'false' under Extended", other)),
@@ -58,14 +58,14 @@ impl RowDecoder {
         let len = number.ok_or_else(|| Fault::malformed("a length of 0 to 64", len))? as u8;
         let fd = (len > 8).then(FdFields::default);
         let fields = FrameFields { id: identifier(raw, extended, id)?, remote: false, direction, len, fd };
-        // Some programs write 0x in front of bytes.
+        // Some programs write 0x before bytes.
         let byte = |cell: &[u8]| hex_byte(cell.strip_prefix(b"0x").unwrap_or(cell));
         let data = Payload::words(cells, fields.data_len(), byte)?;
         Ok(Some((TraceRecord { time_ns, channel, event: fields.event(&data)? }, None)))
     }
 }
 
-/// What this writes in front of the rows.
+/// The header written before the rows.
 const WRITTEN_HEAD: &str = "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8";
 
 /// Writes the rows.

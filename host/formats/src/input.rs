@@ -16,12 +16,12 @@ use super::zone::Zone;
 /// Bytes asked of the system at a time.
 const CHUNK_BYTES: usize = 256 * 1024;
 
-/// Longest line or object held at once. Far above anything a trace contains, and small enough for
-/// the memory of a small machine.
+/// Longest line or object held at once. It is far more than anything in a trace, and little
+/// enough for a machine with little memory.
 pub(crate) const MAX_ITEM_BYTES: usize = 8 * 1024 * 1024;
 
-/// How long to wait before looking again at a file that is being followed. Short against what an
-/// eye notices, long against the cost of the look.
+/// How long to wait before checking a followed file again. It is short enough not to be noticed
+/// by a viewer, and long compared with the cost of the check.
 const FOLLOW_INTERVAL: Duration = Duration::from_millis(50);
 
 /// A buffered source of bytes.
@@ -36,14 +36,14 @@ pub(crate) struct Input {
     /// Lines handed out so far.
     lines: u64,
     follow: bool,
-    /// Whether its bytes may come slowly: a pipe, a terminal, a file that is followed.
+    /// Whether its bytes may arrive slowly: a pipe, a terminal, a followed file.
     may_wait: bool,
     ended: bool,
     cut: bool,
     stop: Box<dyn Fn() -> bool + Send>,
-    /// The same file again, where it is a plain one: for formats that are read at any place.
+    /// The same file again, if it is a plain one: for formats read with random access.
     file: Option<File>,
-    /// Whether its bytes are the file's, neither unpacked nor turned into others.
+    /// Whether its bytes are the file's own, neither decompressed nor converted.
     is_as_it_is: bool,
     zone: Zone,
     /// The beginning of a line too long to hold.
@@ -59,12 +59,12 @@ pub(crate) struct Line<'a> {
     pub number: u64,
     /// Whether a line end follows: false only for the last line of a file.
     pub terminated: bool,
-    /// Whether the text is only the beginning of a line too long to hold.
+    /// Whether the text is only the beginning of a line that is too long to hold.
     pub too_long: bool,
 }
 
 impl Line<'_> {
-    /// What is wrong with this line. The last line of a file that was cut off is not a broken one.
+    /// The issue with this line. The last line of a truncated file is not reported as broken.
     pub(crate) fn issue(&self, fault: Fault) -> Found {
         let fault = match fault {
             Fault::Malformed { .. } if !self.terminated && !self.too_long => Fault::Truncated("a line"),
@@ -73,14 +73,14 @@ impl Line<'_> {
         Found::Issue(Place::Line(self.number), fault)
     }
 
-    /// For the last line of a file, if it looks whole and yet may have lost its end.
+    /// The issue for a file's last line that looks whole but may have lost its end.
     pub(crate) fn cut(&self) -> Found {
         Found::Issue(Place::Line(self.number), Fault::Truncated("a line"))
     }
 }
 
 impl Input {
-    /// Reads from any source. With `follow`, its end only means "not yet".
+    /// Reads from any source. With `follow`, the end only means "not yet".
     pub(crate) fn new(source: Box<dyn Read + Send>, follow: bool) -> Self {
         Self {
             source,
@@ -135,7 +135,7 @@ impl Input {
         input.without_byte_order_mark()
     }
 
-    /// Passes over UTF-8's byte order mark, which some editors put in front of a text.
+    /// Skips UTF-8's byte order mark, which some editors put at the beginning of a text.
     fn without_byte_order_mark(mut self) -> io::Result<Self> {
         const MARK: &[u8] = &[0xEF, 0xBB, 0xBF];
         if self.peek(MARK.len())?.starts_with(MARK) {
@@ -144,14 +144,14 @@ impl Input {
         Ok(self)
     }
 
-    /// What was buffered and all that follows, as a reader.
+    /// The buffered bytes and all that follow, as a reader.
     fn into_rest(self) -> impl Read + Send {
         let buffered = self.buffer[self.start..self.end].to_vec();
         io::Cursor::new(buffered).chain(self.source)
     }
 
-    /// All of it, for formats that are read at any place: the file itself, or a copy in memory of what was compressed or comes
-    /// through a pipe. Nothing may be used up before.
+    /// All of it, for formats read with random access: the file itself, or a copy in memory if it is compressed or comes
+    /// through a pipe. Nothing may have been used up before.
     pub(crate) fn whole(&mut self) -> io::Result<Whole> {
         if let Some(file) = self.file.take() {
             self.consume(self.buffered().len());
@@ -182,12 +182,12 @@ impl Input {
         self.zone = zone;
     }
 
-    /// Ends the input as soon as this is true.
+    /// Ends the input as soon as `stop` returns true.
     pub(crate) fn end_when(&mut self, stop: Box<dyn Fn() -> bool + Send>) {
         self.stop = stop;
     }
 
-    /// Whether its bytes may come slowly.
+    /// Whether its bytes may arrive slowly.
     #[inline]
     pub(crate) fn may_wait(&self) -> bool {
         self.may_wait
@@ -198,7 +198,7 @@ impl Input {
         self.follow
     }
 
-    /// Whether a whole line has been read and is not used up.
+    /// Whether a whole line has been read and not used up.
     pub(crate) fn has_line(&self) -> bool {
         memchr::memchr(b'\n', &self.buffer[self.start..self.end]).is_some()
     }
@@ -213,12 +213,12 @@ impl Input {
         self.offset
     }
 
-    /// Number of the line handed out last.
+    /// The number of the last line handed out.
     pub(crate) fn line_number(&self) -> u64 {
         self.lines
     }
 
-    /// Reads more, keeping what is not used up. False at the end.
+    /// Reads more, keeping what has not been used up. False at the end.
     fn fill(&mut self) -> io::Result<bool> {
         if self.ended {
             return Ok(false);
@@ -231,7 +231,7 @@ impl Input {
         if self.buffer.len() < self.end + CHUNK_BYTES {
             self.buffer.resize(self.end + CHUNK_BYTES, 0);
         }
-        // A source that never ends is left when asked; what it gave is still read.
+        // An endless source is left on request; what it has delivered is still read.
         if (self.stop)() {
             self.ended = true;
             return Ok(false);
@@ -248,7 +248,7 @@ impl Input {
                     return Ok(true);
                 }
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-                // A compressed file that was cut off ends where it ends.
+                // A truncated compressed file ends where it was cut.
                 Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => {
                     self.ended = true;
                     self.cut = true;
@@ -260,7 +260,7 @@ impl Input {
     }
 
     /// At least `len` bytes (at most [`MAX_ITEM_BYTES`]) without using them up; fewer only at the end.
-    /// All that is buffered is returned.
+    /// Everything buffered is returned.
     #[inline]
     pub(crate) fn peek(&mut self, len: usize) -> io::Result<&[u8]> {
         while self.end - self.start < len.min(MAX_ITEM_BYTES) && self.fill()? {}
@@ -275,13 +275,13 @@ impl Input {
         self.offset += len as u64;
     }
 
-    /// All that is buffered and not used up.
+    /// Everything buffered and not used up.
     #[inline]
     pub(crate) fn buffered(&self) -> &[u8] {
         &self.buffer[self.start..self.end]
     }
 
-    /// Uses up this many lines that [`Self::buffered`] showed, `len` bytes in all.
+    /// Uses up this many lines that [`Self::buffered`] showed, `len` bytes in total.
     pub(crate) fn consume_lines(&mut self, len: usize, lines: u64) {
         self.consume(len);
         self.lines += lines;
@@ -317,7 +317,7 @@ impl Input {
         Ok(Some(Line { text, number: self.lines, terminated, too_long: false }))
     }
 
-    /// A line too long to hold: its beginning. The rest is passed over.
+    /// A line too long to hold: its beginning. The rest is skipped.
     #[cold]
     fn long_line(&mut self) -> io::Result<Line<'_>> {
         const KEPT: usize = 200;

@@ -1,7 +1,7 @@
 //! Interface names (`can0`, `vcan1`, `OBD`) as channel numbers.
 
-/// Remembers which channel each interface name of a file stands for. `can0` is channel 1, as users
-/// count; a name that would take another's number, or has none, gets the next free one.
+/// Remembers the channel of each interface name in a file. `can0` is channel 1, as users count; a
+/// name without a number, or with a number already used by another name, gets the next free one.
 #[derive(Default)]
 pub(crate) struct Interfaces {
     known: Vec<(Vec<u8>, u8)>,

@@ -1,4 +1,4 @@
-//! What can be wrong with a trace file, with the place, so that a user can look there.
+//! What can be wrong with a trace file, and where, so that users can look there.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -13,7 +13,7 @@ pub enum Place {
     Line(u64),
     /// Bytes from the start of a binary file, after decompression.
     Offset(u64),
-    /// A row of a database's table, by its number there.
+    /// A row of a database table, by its number.
     Row(i64),
 }
 
@@ -31,12 +31,12 @@ impl fmt::Display for Place {
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Fault {
-    /// The text or bytes are not what the format says.
+    /// The text or bytes do not follow the format.
     #[error("expected {expected}, found {found}")]
     Malformed {
-        /// What should stand there.
+        /// What should be there.
         expected: Cow<'static, str>,
-        /// What stands there, shortened.
+        /// What is there, shortened.
         found: String,
     },
     /// The file ends in the middle of something.
@@ -66,16 +66,16 @@ impl Fault {
     }
 }
 
-/// One thing wrong with a file. Reading goes on after it, except after [`Fault::Io`] and in strict
-/// mode.
+/// One thing wrong with a file. Reading continues after it, except after [`Fault::Io`] and in
+/// strict mode.
 #[derive(Debug, thiserror::Error)]
 #[error("{file}, {place}: {fault}")]
 pub struct ReadIssue {
-    /// The file's name as it was given.
+    /// The file's name, as given.
     pub file: Arc<str>,
-    /// Where.
+    /// The place.
     pub place: Place,
-    /// What.
+    /// The fault.
     #[source]
     pub fault: Fault,
 }

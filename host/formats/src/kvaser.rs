@@ -1,5 +1,5 @@
-//! Kvaser's text of a Memorator's log: `0.123456  1         123x   Rx   R       8  11 22 …       counter`. Whether identifiers
-//! and bytes are hexadecimal stands in the head. Times run from the start of the measurement, which the head does not tell.
+//! Kvaser's text of a Memorator's log: `0.123456 1 123x Rx R 8 11 22 … counter`. The header says whether identifiers and bytes
+//! are hexadecimal. Times count from the start of the measurement, which the header does not give.
 
 use std::collections::VecDeque;
 
@@ -24,7 +24,7 @@ pub(crate) struct Decoder {
     notes: VecDeque<&'static str>,
 }
 
-/// Whether a text begins as such a file does.
+/// Whether a text begins like such a file.
 pub(crate) fn is_head(text: &[u8]) -> bool {
     memchr::memmem::find(text, b"Kvaser Memorator Log").is_some()
 }
@@ -50,7 +50,7 @@ impl RowFormat for Decoder {
         let record = |event| TraceRecord { time_ns, channel, event };
         let (id, mut rest) = text::word(rest);
         let (mut word, behind) = text::word(rest);
-        // The mark of an extended identifier may stand apart.
+        // The mark of an extended identifier may be a separate word.
         let (digits, extended) = match id {
             [digits @ .., b'x'] => (digits, true),
             _ if word == b"x" => (id, true),
@@ -73,11 +73,11 @@ impl RowFormat for Decoder {
         let (mut len, mut behind) = text::word(rest);
         while !len.is_empty() && len.iter().all(|flag| b"EFBPRW#".contains(flag)) {
             flags.extend_from_slice(len);
-            // `ERROR FRAME` is where the bytes are, and no flags.
+            // `ERROR FRAME` is in the place of the bytes and is not flags.
             (len, behind) = text::word(behind);
         }
         let has = |flag: u8| flags.contains(&flag);
-        // A frame that was overwritten in the device before this one.
+        // A frame before this one was overwritten in the device.
         let lost = has(b'#').then_some(TraceEvent::Lost { stage: None, count: 1, at_least: true });
         if digits.eq_ignore_ascii_case(b"ErrorFrame") {
             let event = TraceEvent::BusError { kind: None, counters: None };
@@ -101,7 +101,7 @@ impl RowFormat for Decoder {
     }
 
     fn missing(&self) -> Option<&'static str> {
-        (!self.in_rows).then_some("a line of '=' below the names of columns, and rows behind it")
+        (!self.in_rows).then_some("a line of '=' below the names of columns, followed by rows")
     }
 
     fn note(&mut self) -> Option<&'static str> {
@@ -109,7 +109,7 @@ impl RowFormat for Decoder {
     }
 }
 
-/// A loss stands before the frame that tells of it.
+/// A loss comes before the frame that reports it.
 fn with(lost: Option<TraceEvent>, record: TraceRecord) -> Line {
     match lost {
         Some(lost) => Line::Two(TraceRecord { event: lost, ..record }, record.event),

@@ -2,22 +2,22 @@
 
 use std::collections::BTreeMap;
 
-/// What a file could not carry, or what there is to know about one: a description and how often.
+/// What a file could not carry, or what users should know about a file: a description and how often.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct LeftOut(BTreeMap<&'static str, u64>);
 
 impl LeftOut {
-    /// Counts one more of something.
+    /// Counts one occurrence.
     pub(crate) fn note(&mut self, what: &'static str) {
         self.add(what, 1);
     }
 
-    /// Counts `count` more of something.
+    /// Counts `count` occurrences.
     pub(crate) fn add(&mut self, what: &'static str, count: u64) {
         *self.0.entry(what).or_default() += count;
     }
 
-    /// Adds another file's.
+    /// Adds the counts of another file.
     pub fn merge(&mut self, other: &Self) {
         for (what, count) in &other.0 {
             self.add(what, *count);
@@ -29,7 +29,7 @@ impl LeftOut {
         self.0.is_empty()
     }
 
-    /// All counts together.
+    /// The sum of all counts.
     pub fn total(&self) -> u64 {
         self.0.values().sum()
     }

@@ -1,8 +1,8 @@
 #![doc = include_str!("../README.md")]
 //!
 //! [`open_reader`] gives an iterator over records and issues, [`create_writer`] a [`TraceWriter`]. The format follows the file's
-//! suffix; `-` is standard input or output. Each format is a file here, split into a decoder that takes bytes from an
-//! `Input` and an encoder that appends to a buffer; neither knows files, compression or rotation.
+//! suffix; `-` is standard input or output. Each format is a module here, split into a decoder that takes bytes from an `Input`
+//! and an encoder that appends to a buffer; neither knows files, compression or rotation.
 
 #![forbid(unsafe_code)]
 

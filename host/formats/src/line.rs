@@ -1,12 +1,12 @@
-//! A line of text built in place, for the writers whose lines are short and many: appending field by field to a growing
-//! buffer costs more than the fields.
+//! A line of text built in place, for writers with many short lines: appending field by field to a growing buffer costs
+//! more than formatting the fields.
 
 use super::text;
 
-/// No line that is built here is longer.
+/// No line built here is longer.
 const LONGEST: usize = 80;
 
-/// A line so far. What is not written is spaces.
+/// A line so far. Everything not yet written is spaces.
 pub(crate) struct Line {
     bytes: [u8; LONGEST],
     len: usize,
@@ -26,7 +26,7 @@ impl Line {
         self.len += N;
     }
 
-    /// Appends the first `len` bytes of a text. What is behind them must be spaces, or be written over.
+    /// Appends the first `len` bytes of a text. The bytes after them must be spaces or be overwritten later.
     #[inline]
     pub(crate) fn put_start<const N: usize>(&mut self, text: &[u8; N], len: usize) {
         self.put(text);
@@ -51,7 +51,7 @@ impl Line {
         self.put(&[b'0' + value % 10]);
     }
 
-    /// Appends a number in hexadecimal digits, as many as it needs; says how many.
+    /// Appends a number in as many hexadecimal digits as it needs; returns how many.
     #[inline]
     pub(crate) fn put_hex(&mut self, value: u32) -> usize {
         let digits = text::hex_len(value);
@@ -65,7 +65,7 @@ impl Line {
     /// Appends the whole line to a file.
     #[inline]
     pub(crate) fn end(self, out: &mut Vec<u8>) {
-        // A copy of constant length is faster than one of the right length.
+        // Copying a constant length is faster than copying the exact length.
         let end = out.len() + self.len;
         out.extend_from_slice(&self.bytes);
         out.truncate(end);
@@ -80,7 +80,7 @@ pub(crate) struct Seconds<const WIDTH: usize> {
 }
 
 impl<const WIDTH: usize> Seconds<WIDTH> {
-    /// Nothing remembered.
+    /// With nothing remembered.
     pub(crate) fn new() -> Self {
         let mut new = Self { last: 0, text: [b' '; 24], len: 0 };
         new.render(0);
@@ -99,8 +99,7 @@ impl<const WIDTH: usize> Seconds<WIDTH> {
         self.last = seconds;
     }
 
-    /// Appends a time in microseconds as seconds, the whole ones aligned to the right of the width, with six
-    /// decimals.
+    /// Appends a time given in microseconds as seconds, right-aligned to the width, with six decimals.
     #[inline]
     pub(crate) fn put(&mut self, line: &mut Line, us: u64) {
         const US_PER_S: u64 = 1_000_000;

@@ -1,9 +1,9 @@
-//! ASAM MDF 4, the format of loggers and measurement programs, as far as it holds the traffic of a bus: the names
-//! `CAN_DataFrame`, `CAN_RemoteFrame` and `CAN_ErrorFrame` with their parts, which ASAM's *Bus Logging* gives such records.
+//! ASAM MDF 4, the format of loggers and measurement programs, as far as it holds bus traffic: the names `CAN_DataFrame`,
+//! `CAN_RemoteFrame` and `CAN_ErrorFrame` with their parts, which ASAM's *Bus Logging* gives such records.
 //!
-//! A file is blocks with links between them, so it is read at any place and not as a stream. Groups sorted and not, data in
-//! one block or in lists, compressed by deflate, zstd or LZ4, with rows and columns exchanged or not, bytes in the records or
-//! apart, files that were not finished: all is read. Data kept in columns (4.2), whose times are in another group, is not. Measured signals are counted.
+//! A file consists of linked blocks, so it needs random access and cannot be read as a stream. Supported are sorted and unsorted groups; data in one
+//! block or in lists, compressed by deflate, zstd or LZ4, transposed or not; bytes inside or outside the records; and unfinished files. Data stored
+//! in columns (4.2), whose times are in another group, are not supported. Measured signals are counted.
 
 mod blocks;
 mod decode;
@@ -25,13 +25,13 @@ use cantap_wire::record::BusErrorKind;
 pub(crate) const FILE_MAGIC: &[u8] = b"MDF     ";
 pub(crate) const UNFINISHED_MAGIC: &[u8] = b"UnFinMF ";
 
-/// The channel of what the standard has no event for, in the words of [`super::event_text`].
+/// The channel for events that the standard does not have, in the words of [`super::event_text`].
 const WORDS: &str = "cantap_Event";
 
 /// Where the first block is.
 const HEADER_AT: u64 = 64;
 
-/// The kinds of errors by the standard's numbers. It has one, 1, for bit errors of either direction.
+/// The kinds of errors by the standard's numbers. It has a single one, 1, for bit errors in either direction.
 const ERROR_TYPES: [(u64, BusErrorKind); 4] = [
     (2, BusErrorKind::Form),
     (3, BusErrorKind::Stuff),

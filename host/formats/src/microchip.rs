@@ -1,5 +1,5 @@
-//! Microchip's CAN Bus Analyzer: `1247;RX;0xC2;8;0x5C;0x87;…`, times in milliseconds from the start. The date in the head is not
-//! used: whether its first number is the day or the month depends on the computer that wrote it.
+//! Microchip's CAN Bus Analyzer: `1247;RX;0xC2;8;0x5C;0x87;…`, times in milliseconds from the start. The date in the header is
+//! not used: whether its first number is the day or the month depends on the computer that wrote it.
 
 use super::frame_fields::{FrameFields, Payload, direction, identifier, length_code};
 use super::issue::Fault;
@@ -11,11 +11,11 @@ use cantap_trace::TraceRecord;
 /// Reads a log.
 #[derive(Default)]
 pub(crate) struct Decoder {
-    /// Between the two lines of dashes that enclose the head.
+    /// Between the two dashed lines around the header.
     in_head: bool,
 }
 
-/// Whether a text begins as such a file does.
+/// Whether a text begins like such a file.
 pub(crate) fn is_head(text: &[u8]) -> bool {
     text.starts_with(b"//-----") && memchr::memmem::find(text, b"Microchip").is_some()
 }

@@ -9,26 +9,26 @@ use super::compression::Compression;
 
 /// A destination of bytes.
 pub(crate) enum Output {
-    /// A plain file: can be patched, and is cut back to whole records when the disk is full.
+    /// A plain file: it can be patched, and is truncated to whole records when the disk is full.
     File {
         file: File,
         written: u64,
-        /// How long the file is with its provisional end.
+        /// The file's length including its provisional end.
         extent: u64,
     },
     /// A compressed file.
     Compressed(Box<Compressed>),
-    /// Standard output and whatever else only takes bytes.
+    /// Standard output and any other byte stream.
     Stream(Box<dyn Write + Send>),
 }
 
-/// Bytes to be changed after the fact, such as a length in a header.
+/// Bytes to be changed later, such as a length in a header.
 pub(crate) struct Patch {
     /// From the start of the file.
     pub offset: u64,
-    /// What shall stand there.
+    /// The new bytes.
     pub bytes: Vec<u8>,
-    /// What other programs miss where it cannot be done.
+    /// What other programs will miss if it cannot be done.
     pub missed: Option<&'static str>,
 }
 
@@ -40,15 +40,15 @@ impl Output {
         }
         let file = File::create(path)?;
         Ok(match Compression::of_path(path) {
-            // A pipe or device has no place to go back to.
+            // A pipe or device cannot be rewound.
             None if !file.metadata()?.is_file() => Self::Stream(Box::new(file)),
             None => Self::File { file, written: 0, extent: 0 },
             Some(compression) => Self::Compressed(Box::new(Compressed::new(file, compression)?)),
         })
     }
 
-    /// Writes whole records. If that fails half-way, a plain file is cut back to the last record
-    /// that is complete, as `whole` tells from the bytes that went out.
+    /// Writes whole records. If that fails half-way, a plain file is truncated to the last complete record,
+    /// which `whole` determines from the bytes that were written.
     pub(crate) fn write(&mut self, bytes: &[u8], whole: impl Fn(&[u8]) -> usize) -> io::Result<()> {
         let (file, written, extent) = match self {
             Self::Compressed(compressed) => return compressed.write(bytes),
@@ -67,14 +67,14 @@ impl Output {
                 Err(error) => error,
             };
             let kept = *written + whole(&bytes[..done]) as u64;
-            // The first error is the one to report; this is only tidying up after it.
+            // The first error is the one to report; this only tidies up after it.
             if file.set_len(kept).and_then(|()| file.seek(SeekFrom::Start(kept))).is_ok() {
                 *written = kept;
             }
             return Err(error);
         }
         *written += done as u64;
-        // What is left of a provisional end that was longer.
+        // The rest of a longer provisional end.
         if *extent > *written {
             file.set_len(*written)?;
         }
@@ -82,8 +82,8 @@ impl Output {
         Ok(())
     }
 
-    /// Writes a provisional end, so that the file is whole if nothing more comes: what does come is written over it.
-    /// Where that cannot be done, nothing is written.
+    /// Writes a provisional end, so that the file is valid if nothing more comes; whatever comes next overwrites it.
+    /// If that is impossible, nothing is written.
     pub(crate) fn provisional_end(&mut self, bytes: &[u8]) -> io::Result<()> {
         let Self::File { file, written, extent } = self else { return Ok(()) };
         if bytes.is_empty() {
@@ -92,15 +92,15 @@ impl Output {
         *extent = *written + bytes.len() as u64;
         let result = file.write_all(bytes);
         if result.is_err() {
-            // The first error is the one to report; this is only tidying up after it.
+            // The first error is the one to report; this only tidies up after it.
             let _ = file.set_len(*written);
         }
         file.seek(SeekFrom::Start(*written))?;
         result
     }
 
-    /// How large the file is by now, with what is to be written next; `None` for what is no file. What a compressor still
-    /// holds is not in it.
+    /// The current size of the file, including what is written next; `None` if it is not a file. What a compressor still
+    /// holds is not included.
     pub(crate) fn size(&mut self) -> Option<u64> {
         match self {
             Self::File { written, .. } => Some(*written),
@@ -109,7 +109,7 @@ impl Output {
         }
     }
 
-    /// Changes bytes already written. False where that cannot be done.
+    /// Changes bytes already written. False if that is impossible.
     pub(crate) fn patch(&mut self, patch: &Patch) -> io::Result<bool> {
         let Self::File { file, written, .. } = self else { return Ok(false) };
         file.seek(SeekFrom::Start(patch.offset))?;
@@ -118,7 +118,7 @@ impl Output {
         Ok(true)
     }
 
-    /// Hands everything to the system, so that a crash of this program loses none of it.
+    /// Passes everything to the system, so that a crash of this program loses none of it.
     pub(crate) fn flush(&mut self) -> io::Result<()> {
         match self {
             Self::File { file, .. } => file.flush(),

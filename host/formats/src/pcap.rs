@@ -1,6 +1,7 @@
-//! pcap, the older format of Wireshark and tcpdump, with packets of SocketCAN, also out of captures of any interface.
+//! pcap, the older format of Wireshark and tcpdump, with SocketCAN packets, including captures of the "any"
+//! interface.
 //!
-//! Read only: pcapng carries channels and losses, and this does not.
+//! It can only be read: pcapng carries channels and losses, pcap does not.
 
 use std::io;
 
@@ -19,10 +20,10 @@ const NANOSECONDS: u32 = 0xA1B2_3C4D;
 const FILE_HEAD_BYTES: usize = 24;
 const PACKET_HEAD_BYTES: usize = 16;
 
-/// Longest packet; programs cut at a quarter of a megabyte.
+/// Longest packet; programs truncate at a quarter of a megabyte.
 const MAX_PACKET_BYTES: u32 = 1 << 18;
 
-/// Whether a file begins as one of these.
+/// Whether a file begins like one of these.
 pub(crate) fn is_head(head: &[u8]) -> bool {
     order(head).is_some()
 }
@@ -47,17 +48,17 @@ pub(crate) struct Decoder {
     packets: Packets,
 }
 
-/// What a file's head says.
+/// The content of a file's header.
 #[derive(Clone, Copy)]
 struct Capture {
     big_endian: bool,
     ns_per_unit: i64,
     link: Option<Link>,
-    /// The seconds of the last packet, by which the next is found behind damage.
+    /// The seconds of the last packet, used to find the next one after damage.
     last_s: u32,
 }
 
-/// What stands in front of a packet.
+/// The header of a packet.
 struct PacketHead {
     seconds: u32,
     units: u32,
@@ -76,14 +77,14 @@ impl Capture {
         PacketHead { seconds, units, captured, original }
     }
 
-    /// Whether a packet can be so.
+    /// Whether a packet's header is plausible.
     fn is_sane(self, head: &PacketHead) -> bool {
         i64::from(head.units) * self.ns_per_unit < NS_PER_S
             && head.captured <= head.original
             && head.captured <= MAX_PACKET_BYTES
     }
 
-    /// Whether a packet of CAN that follows the last one begins here.
+    /// Whether a CAN packet that follows the last one begins here.
     fn is_packet(self, bytes: &[u8]) -> bool {
         const S_PER_DAY: u32 = 86_400;
         const LONGEST: u32 = 128;
@@ -157,9 +158,9 @@ impl Decode for Decoder {
 }
 
 impl Decoder {
-    /// Reads the file's head; what is to be said if there is none.
+    /// Reads the file's header; returns what to report if there is none.
     fn begin(&mut self, input: &mut Input) -> io::Result<Option<Found>> {
-        /// The number of the link; above it are other things.
+        /// The bits with the link type; those above are for other purposes.
         const LINK: u32 = 0x0FFF_FFFF;
         let place = Place::Offset(input.offset());
         let head = input.peek(FILE_HEAD_BYTES)?;
@@ -176,7 +177,7 @@ impl Decoder {
             None if len == 0 => return Ok(Some(Found::End)),
             None => Fault::malformed("a pcap file, which begins with a magic number", &head[..len.min(4)]),
         };
-        // Nothing behind a wrong head can be trusted.
+        // Nothing after a wrong header can be trusted.
         while !input.buffered().is_empty() {
             let rest = input.peek(1)?.len();
             input.consume(rest);
@@ -186,7 +187,7 @@ impl Decoder {
     }
 }
 
-/// Goes on to what looks like a packet of CAN, or to the end.
+/// Skips to what looks like a CAN packet, or to the end.
 fn resync(capture: Capture, input: &mut Input) -> io::Result<()> {
     input.consume(1);
     loop {
@@ -227,7 +228,7 @@ mod tests {
         (tests::write(Format::Candump, &records), issues)
     }
 
-    /// What tshark reads of the same bytes.
+    /// As tshark reads the same bytes.
     #[test]
     fn every_link_byte_order_and_resolution_is_read() {
         let data = [2, 0, 0, 0, 0x11, 0x22, 0, 0, 0, 0, 0, 0];

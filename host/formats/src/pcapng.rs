@@ -1,10 +1,9 @@
 //! pcapng with SocketCAN packets (link type 227), as Wireshark and tcpdump write and read them.
 //!
-//! The few blocks that matter are read and written here and not by the `pcap-file` crate: a file may grow
-//! while it is read, reading must go on behind a damaged block, and times may lie before 1970. Each
-//! channel is an interface `can0`, `can1`…; what is not a frame is an error frame as SocketCAN has
-//! them. A loss is also a drop count and a comment, and what a channel had and lost altogether is in statistics blocks: at the end, and
-//! regularly for somebody who reads meanwhile.
+//! The few blocks that matter are read and written here rather than by the `pcap-file` crate: a file may grow while it is read, reading
+//! must continue after a damaged block, and times may be before 1970. Each channel is an interface `can0`, `can1`…; everything that is
+//! not a frame is an error frame as in SocketCAN. A loss is also a drop count and a comment, and the totals received and lost on a
+//! channel are in statistics blocks: at the end, and regularly for anyone who reads meanwhile.
 
 mod decode;
 mod encode;
@@ -21,14 +20,14 @@ const NAME_RESOLUTION: u32 = 4;
 const STATISTICS: u32 = 5;
 const ENHANCED_PACKET: u32 = 6;
 const SECRETS: u32 = 0xA;
-/// What programs add for themselves; the second kind is not to be copied to another file.
+/// Blocks that programs add for themselves; the second kind must not be copied to other files.
 const CUSTOM: u32 = 0xBAD;
 const CUSTOM_NOT_COPIED: u32 = 0x4000_0BAD;
 
 /// How a section header shows its byte order.
 const BYTE_ORDER_MAGIC: u32 = 0x1A2B_3C4D;
 
-/// A block's type and length in front, and its length again behind.
+/// A block's type and length at its beginning, and its length again at its end.
 const BLOCK_FRAME_BYTES: usize = 12;
 
 // Options.
@@ -46,7 +45,7 @@ const ISB_IFDROP: u16 = 5;
 const ISB_USRDELIV: u16 = 8;
 const SHB_USERAPPL: u16 = 4;
 
-/// The comment on a frame whose time is only an upper bound, by which it is known again.
+/// The comment that marks a frame whose time is only an upper bound.
 const LATE: &str = "the time is only an upper bound";
 
 /// The direction's bits in a packet's flags, and the value for a sent packet.
@@ -85,14 +84,14 @@ mod tests {
         let (read, issues) = tests::read(Format::Pcapng, &whole[..whole.len() - 64 - 10]);
         assert_eq!((read.len(), issues.len()), (99, 1));
         let mut damaged = whole.clone();
-        // Behind the packets are the statistics of one channel.
+        // The statistics of one channel follow the packets.
         let block = whole.len() - 64 - 50 * 48;
         damaged[block + 4..block + 8].copy_from_slice(&[0xFF; 4]);
         let (read, issues) = tests::read(Format::Pcapng, &damaged);
         assert_eq!((read.len(), issues.len()), (99, 1), "{issues:?}");
     }
 
-    /// Found by random damage: the block was passed over as one that is none of ours.
+    /// Found by random damage: the block was skipped as one of an unknown kind.
     #[test]
     fn a_packet_whose_kind_is_damaged_is_counted() {
         let records: Vec<_> = (0..10).map(data_record).collect();
@@ -126,7 +125,7 @@ mod tests {
         let fd = [0, 0, 1, 0x23, 2, 4, 0, 0, 0xAB, 0xCD, 0, 0];
         let options = [0, 2, 0, 4, 0, 0, 0, 2, 0, 4, 0, 8, 0, 0, 0, 0, 0, 0, 0, 4, 0, 0, 0, 0];
         block(6, &[&head[..], &fd, &options].concat());
-        // And four more, then an error frame that says two things: error-passive, by a stuff error.
+        // Four more, then an error frame with two events: error-passive, by a stuff error.
         let error = [0x20, 0, 0, 0x8C, 8, 0, 0, 0, 0, 0x20, 4, 0, 0, 0, 0, 0];
         let head = [0_u32, 0, 1_500_000, 16, 16].map(u32::to_be_bytes).concat();
         block(6, &[&head[..], &error, &options].concat());
@@ -141,7 +140,7 @@ mod tests {
         assert_eq!(issues, Vec::<String>::new());
     }
 
-    /// What went through a pipe so far.
+    /// What has gone through a pipe so far.
     #[derive(Clone, Default)]
     struct Pipe(Arc<Mutex<Vec<u8>>>);
 
@@ -156,7 +155,7 @@ mod tests {
         }
     }
 
-    /// Types of blocks, and what is in them.
+    /// Types and contents of blocks.
     fn blocks(mut bytes: &[u8]) -> Vec<(u32, Vec<u8>)> {
         let mut blocks = Vec::new();
         while let Some((head, _)) = bytes.split_first_chunk::<8>() {
@@ -218,7 +217,7 @@ mod tests {
         assert_eq!(statistics(&seen())[4..], [[0, 1, 0, 1], [1, 7, 7, 0]]);
     }
 
-    /// Wireshark shows drop counts only to those who look for them.
+    /// Wireshark shows drop counts only to users who look for them.
     #[test]
     fn a_loss_is_said_in_words_and_a_remark_stands_on_the_next_packet() {
         let options = WriteOptions { format: Some(Format::Pcapng), ..WriteOptions::default() };
@@ -242,7 +241,10 @@ mod tests {
             "{packets:?}"
         );
         assert!(packets[2].contains("from here on at 250000 bit/s"), "{packets:?}");
-        assert!(packets[2].contains("between device and computer, nobody knows how many"), "{packets:?}");
+        assert!(
+            packets[2].contains("an unknown number of frames was lost here between device and computer"),
+            "{packets:?}"
+        );
     }
 
     #[test]

@@ -1,5 +1,5 @@
-//! What python-can's Printer and its command `can_logger` print: `Timestamp: 1410714882.000000    ID:      123    S Rx
-//! DL:  2    11 22    Channel: can0`.
+//! The output of python-can's Printer and its command `can_logger`: `Timestamp: 1410714882.000000 ID: 123 S Rx DL: 2
+//! 11 22 Channel: can0`.
 
 use super::error_frames::ErrorFrames;
 use super::frame_fields::{FdFields, FrameFields, Payload, direction, hex_byte, identifier};
@@ -11,14 +11,14 @@ use super::zone::Zone;
 use cantap_trace::TraceRecord;
 use cantap_trace::socketcan::ERROR_FLAG;
 
-/// Reads what was printed.
+/// Reads the output.
 #[derive(Default)]
 pub(crate) struct Decoder {
     interfaces: Interfaces,
     errors: ErrorFrames,
 }
 
-/// Whether a text begins so.
+/// Whether a line is in this format.
 pub(crate) fn is_line(line: &[u8]) -> bool {
     line.trim_ascii_start().starts_with(b"Timestamp: ")
 }

@@ -22,7 +22,8 @@ use cantap_trace::TraceRecord;
 /// How to read.
 #[derive(Clone, Debug, Default)]
 pub struct ReadOptions {
-    /// The format; if not given, by the file's first bytes where they are clear, else by its suffix.
+    /// The format; if not given, it is determined by the file's first bytes where they are clear, otherwise
+    /// by its suffix.
     pub format: Option<Format>,
     /// Wait for more at the end of the file instead of ending.
     pub follow: bool,
@@ -39,7 +40,7 @@ pub enum OpenError {
     /// The system refused.
     #[error("cannot open {0}: {1}")]
     Io(String, #[source] io::Error),
-    /// Neither name nor content tell the format.
+    /// Neither name nor content show the format.
     #[error(transparent)]
     Format(#[from] UnknownFormat),
 }
@@ -48,11 +49,11 @@ pub enum OpenError {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("nothing in {file} could be read as {format}; it looks like {looks_like}")]
 pub struct NothingRead {
-    /// The file's name as it was given.
+    /// The file's name, as given.
     pub file: Arc<str>,
-    /// What it was read as.
+    /// The format it was read as.
     pub format: Format,
-    /// What its beginning looks like, in words.
+    /// A description of what its beginning looks like.
     pub looks_like: String,
 }
 
@@ -63,7 +64,7 @@ pub struct TraceReader {
     format: Format,
     input: Input,
     decoder: Box<dyn Decode>,
-    /// Records decoded; those before `at` are used up.
+    /// Decoded records; those before `at` are used up.
     batch: Vec<TraceRecord>,
     at: usize,
     /// What follows them.
@@ -73,22 +74,22 @@ pub struct TraceReader {
     notes: LeftOut,
     left_out: LeftOut,
     ended: bool,
-    /// How many were decoded.
+    /// Number of records decoded.
     records: u64,
-    /// The format that the name says, where the content says another one.
+    /// The format according to the name, if the content is in another one.
     named: Option<Format>,
     head: Vec<u8>,
 }
 
-/// What comes behind a batch of records.
+/// What follows a batch of records.
 enum Beyond {
     Batch,
     Issue(ReadIssue),
     End,
 }
 
-/// Opens a trace file, or standard input for `-` (a candump log unless the options or the first bytes
-/// say otherwise). gzip and zstd are recognised by content.
+/// Opens a trace file, or standard input for `-` (a candump log unless the options or the first bytes say
+/// otherwise). Compression (gzip, zstd, xz, LZ4) is recognised by content.
 pub fn open_reader(path: impl AsRef<Path>, options: &ReadOptions) -> Result<TraceReader, OpenError> {
     let path = path.as_ref();
     let name = if path.as_os_str() == "-" { "standard input".to_owned() } else { path.display().to_string() };
@@ -98,11 +99,11 @@ pub fn open_reader(path: impl AsRef<Path>, options: &ReadOptions) -> Result<Trac
     let format = if let Some(format) = options.format {
         format
     } else {
-        // A pipe may give no more than a line for a long time.
+        // A pipe may deliver only a single line for a long time.
         let head = if input.has_line() { input.buffered() } else { input.peek(64).map_err(failed)? };
         match (Format::of_path(path), Format::of_content(head)) {
             (Ok(format), Some(content)) if !content.is_kind_of(format) => {
-                // The logs of other programs share their suffixes with formats of ours.
+                // The logs of other programs use the same suffixes as our formats.
                 named = (!content.has_suffix_of(path)).then_some(format);
                 content
             }
@@ -164,7 +165,7 @@ impl TraceReader {
         }
     }
 
-    /// Reads from any source of bytes, plain or compressed. `name` is what issues call it.
+    /// Reads from any source of bytes, plain or compressed. Issues refer to it as `name`.
     pub fn from_source(
         name: &str,
         source: impl Read + Send + 'static,
@@ -181,7 +182,8 @@ impl TraceReader {
         self.format
     }
 
-    /// The format that the file's name tells, where its content was clearly another one, which it is read as.
+    /// The format according to the file's name, if the content was clearly in another one, as which it is
+    /// read.
     pub fn named_otherwise(&self) -> Option<Format> {
         self.named
     }
@@ -191,7 +193,7 @@ impl TraceReader {
         self.records
     }
 
-    /// Whether nothing of the file could be read so far although there is something in it.
+    /// Whether nothing of the file could be read so far although it is not empty.
     pub fn nothing_read(&self) -> Option<NothingRead> {
         let something = self.issues > 0 || !self.left_out.is_empty();
         (self.records == 0 && something).then(|| NothingRead {
@@ -207,30 +209,30 @@ impl TraceReader {
         })
     }
 
-    /// While waiting for more of a file that is followed, ends as soon as this is true.
+    /// While waiting for more of a followed file, ends as soon as `stop` returns true.
     pub fn end_when(&mut self, stop: impl Fn() -> bool + Send + 'static) {
         self.input.end_when(Box::new(stop));
     }
 
-    /// Whether the next record may have to be waited for: what was read before is used up.
+    /// Whether the next record may have to be waited for: everything read before is used up.
     pub fn would_wait(&self) -> bool {
         self.at == self.batch.len()
             && self.after.is_none()
             && !(self.decoder.needs_one_line() && self.input.has_line())
     }
 
-    /// How many issues have come so far.
+    /// Number of issues so far.
     pub fn issues(&self) -> u64 {
         self.issues
     }
 
-    /// What is not wrong and should still be known, such as requests to send a frame that were passed over: so
-    /// far, and how often.
+    /// What is not wrong but should be known, such as skipped requests to send a frame: so far, and how often.
     pub fn notes(&self) -> &LeftOut {
         &self.notes
     }
 
-    /// What of the file is well-formed and no part of a CAN trace, such as LIN frames or markers: so far, by kind.
+    /// Well-formed parts of the file that do not belong in a CAN trace, such as LIN frames or markers: so far, by
+    /// kind.
     pub fn left_out(&self) -> &LeftOut {
         &self.left_out
     }
@@ -241,7 +243,7 @@ impl TraceReader {
         ReadIssue { file: self.name.clone(), place, fault }
     }
 
-    /// What comes when the batch is used up. A new batch may be empty.
+    /// What follows when the batch is used up. A new batch may be empty.
     fn beyond_batch(&mut self) -> Beyond {
         if self.ended {
             return Beyond::End;
@@ -263,7 +265,7 @@ impl TraceReader {
                 self.notes.note(what);
                 Beyond::Batch
             }
-            // Nothing is wrong with it, only none of ours.
+            // Nothing is wrong with it; it is just not ours.
             Ok(Found::LeftOut(what) | Found::Issue(_, Fault::Unsupported(Cow::Borrowed(what)))) => {
                 self.left_out.note(what);
                 Beyond::Batch
@@ -292,8 +294,8 @@ impl TraceReader {
         }
     }
 
-    /// Puts the next records, at least one and as many as are at hand, in the place of what is in `records`: for loops
-    /// that [`Iterator::next`] would be the slowest part of. `None` at the end.
+    /// Replaces the content of `records` with the next records, at least one and as many as are at hand: for loops in
+    /// which [`Iterator::next`] would be the slowest part. `None` at the end.
     pub fn next_batch(&mut self, records: &mut Vec<TraceRecord>) -> Option<Result<(), ReadIssue>> {
         records.clear();
         while self.at == self.batch.len() {

@@ -1,4 +1,4 @@
-//! A trace as a row of files, each limited in size or time and each valid by itself: for captures that
+//! A trace as a series of files, each limited in size or time and each valid on its own: for captures that
 //! run for days.
 
 use std::collections::VecDeque;
@@ -21,7 +21,7 @@ const RESERVE_BYTES: u64 = 1024;
 /// Digits of the number in a file's name. More files than that get longer names.
 const NUMBER_DIGITS: usize = 6;
 
-/// The writer of a row of files.
+/// The writer of a series of files.
 pub(crate) struct Rotating {
     path: PathBuf,
     options: WriteOptions,
@@ -42,7 +42,7 @@ fn numbered(path: &Path, number: u64) -> PathBuf {
     path.with_file_name(OsString::from(format!("{stem}-{number:0NUMBER_DIGITS$}{suffixes}")))
 }
 
-/// Creates the next file. One that exists is never overwritten: an earlier capture lies there.
+/// Creates the next file. An existing one is never overwritten: it is an earlier capture.
 fn create(path: &Path, number: &mut u64, options: &WriteOptions) -> io::Result<(PathBuf, Box<FileWriter>)> {
     loop {
         *number += 1;
@@ -83,7 +83,8 @@ impl Rotating {
     }
 
     fn next_file(&mut self) -> io::Result<()> {
-        // Whole before there is another, if only with a provisional end: the program may be killed at any moment.
+        // It must be valid before there is another, if only with a provisional end: the program may be killed at
+        // any moment.
         self.current.flush()?;
         let (name, next) = create(&self.path, &mut self.number, &self.options)?;
         let full = std::mem::replace(&mut self.current, next);
@@ -92,7 +93,7 @@ impl Rotating {
         while self.options.rotation.keep.is_some_and(|keep| self.made.len() > keep.max(1)) {
             if let Some(oldest) = self.made.pop_front() {
                 match fs::remove_file(&oldest) {
-                    // Somebody else took it away: that is what was wanted.
+                    // Somebody else removed it, which is what was wanted.
                     Err(error) if error.kind() == io::ErrorKind::NotFound => {}
                     result => result?,
                 }
@@ -109,7 +110,7 @@ impl TraceWriter for Rotating {
             self.next_file()?;
             self.since_ns = Some(record.time_ns);
             self.current.write(record)?;
-            // A file without even its head is no trace, should the program be killed now.
+            // A file without even its header is not a trace, should the program be killed now.
             return self.current.flush();
         }
         self.current.write(record)
@@ -150,7 +151,7 @@ mod tests {
         }
     }
 
-    /// Writes 1000 frames 1 s apart and returns the files and how many frames each has.
+    /// Writes 1000 frames 1 s apart, and returns the files and the number of frames in each.
     fn rotate(name: &str, at: &str, keep: Option<usize>) -> Vec<(PathBuf, usize, u64)> {
         let dir = tempfile::tempdir().unwrap();
         let rotation = Rotation { at: vec![at.parse().unwrap()], keep };

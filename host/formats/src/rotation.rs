@@ -1,4 +1,4 @@
-//! When a trace goes on in a new file.
+//! When a trace continues in a new file.
 
 use std::str::FromStr;
 use std::time::Duration;
@@ -49,9 +49,9 @@ impl FromStr for RotateAt {
 /// How to split a trace into files.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Rotation {
-    /// Any of these begins a new file; none, and there is only one file, with the plain name.
+    /// Any of these begins a new file; if empty, there is only one file, with the plain name.
     pub at: Vec<RotateAt>,
-    /// How many files to keep: the oldest of this run are deleted beyond that. All, if not given.
+    /// How many files to keep: older ones of this run are deleted. All, if not given.
     pub keep: Option<usize>,
 }
 

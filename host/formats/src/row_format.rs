@@ -1,4 +1,5 @@
-//! Formats with one event in each line: what reads the lines is here, what a line says is the format's.
+//! Formats with one event per line: reading the lines is done here, interpreting a line is left to the
+//! format.
 
 use std::io;
 
@@ -10,40 +11,41 @@ use super::issue::{Fault, Place};
 use super::zone::Zone;
 use cantap_trace::{TraceEvent, TraceRecord};
 
-/// What a line says.
+/// The content of a line.
 pub(crate) enum Line {
     /// An event.
     Record(TraceRecord),
     /// Two at the same time.
     Two(TraceRecord, TraceEvent),
-    /// Nothing of the bus: part of the head, a comment, an empty line.
+    /// Nothing from the bus: part of the header, a comment, an empty line.
     Nothing,
 }
 
-/// A format of lines.
+/// A line-based format.
 pub(crate) trait RowFormat: Send {
     /// Looks ahead, before the first line.
     fn begin(&mut self, _buffered: &[u8]) {}
 
-    /// What a line says. It has neither line end nor space around it, but where [`Self::trims`] says so.
+    /// The content of a line, without line end and surrounding space, except where [`Self::trims`] says
+    /// otherwise.
     fn line(&mut self, line: &[u8], zone: &Zone) -> Result<Line, Fault>;
 
-    /// Whether a last line that reads well, and has no line end, may have lost the end of what it says.
+    /// Whether a last line that reads well but has no line end may have lost its end.
     fn may_be_cut(&self, _line: &[u8], _record: &TraceRecord) -> bool {
         true
     }
 
-    /// What else there is to know of the last line, to be counted.
+    /// What else to report about the last line, to be counted.
     fn note(&mut self) -> Option<&'static str> {
         None
     }
 
-    /// What is missing at the end of a file, the same for any file of another format.
+    /// What a file of this format always lacks at its end.
     fn missing(&self) -> Option<&'static str> {
         None
     }
 
-    /// Whether space in front of a line means nothing.
+    /// Whether leading space is insignificant.
     fn trims(&self) -> bool {
         true
     }

@@ -1,5 +1,5 @@
 //! The error code capture register of Philips' SJA1000 controller (product specification of 2000-01-04, section 6.4.9 with
-//! table 21): the form in which Vector's and PEAK's files say what kind of bus error it was.
+//! table 21): in this form, Vector's and PEAK's files give the kind of a bus error.
 
 use cantap_wire::record::BusErrorKind;
 
@@ -28,7 +28,7 @@ pub(crate) fn code(kind: BusErrorKind) -> u8 {
     kind << KIND_SHIFT | direction | segment
 }
 
-/// The kind of error that the register names, as far as it can.
+/// The kind of error in the register, as far as it can be expressed.
 pub(crate) fn kind(code: u8) -> Option<BusErrorKind> {
     match (code >> KIND_SHIFT, code & SEGMENT) {
         (STUFF, _) => Some(BusErrorKind::Stuff),

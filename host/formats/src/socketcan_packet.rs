@@ -1,5 +1,5 @@
-//! Linux's CAN frames as packets of a capture: as they are (link type 227), and behind the header of a capture of any interface
-//! (113 and 276, `tcpdump -i any`).
+//! Linux's CAN frames as packets of a capture: directly (link type 227), or after the header of a capture of the "any"
+//! interface (113 and 276, `tcpdump -i any`).
 
 use cantap_wire::{Frame, Id};
 
@@ -18,37 +18,38 @@ pub(crate) const REMOTE: u32 = 1 << 30;
 
 /// Length of a classical packet: identifier, length, two bytes for CAN FD, the raw DLC, data.
 pub(crate) const PACKET_BYTES: usize = 16;
-/// Length of a CAN FD packet: the second byte behind the length has its flags.
+/// Length of a CAN FD packet: the byte after the length has its flags.
 pub(crate) const FD_PACKET_BYTES: usize = 8 + 64;
 
-/// What is in front of a frame.
+/// What precedes a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Link {
-    /// Nothing: the identifier stands in network byte order.
+    /// Nothing: the identifier is in network byte order.
     SocketCan,
-    /// The header of a capture of any interface, whose frames are as the computer had them: in the file's byte order.
+    /// The header of a capture of the "any" interface, whose frames are as the computer had them: in the file's byte
+    /// order.
     Cooked { big_endian: bool },
     /// Its second version, which names the interface.
     Cooked2 { big_endian: bool },
 }
 
-/// What a packet says.
+/// The content of a packet.
 pub(crate) enum Packet {
-    /// One event, or two of the same time.
+    /// One event, or two at the same time.
     Events(TraceEvent, Option<TraceEvent>),
-    /// Something that is no classical or FD frame of CAN.
+    /// Something that is not a classical or FD CAN frame.
     LeftOut(&'static str),
 }
 
-/// Reads packets, and knows what is still to be reported of them.
+/// Reads packets, and keeps what remains to be reported of them.
 #[derive(Default)]
 pub(crate) struct Packets {
     pub errors: ErrorFrames,
-    /// Whether bytes that should be zero were seen not to be: then none of them says anything.
+    /// Whether bytes that should be zero were found not to be: then none of them has a meaning.
     dirty: bool,
 }
 
-/// What the link says of the frame behind it.
+/// What the link says about its frame.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Says {
     Nothing,
@@ -57,7 +58,7 @@ enum Says {
 }
 
 impl Link {
-    /// The link that a capture's number stands for.
+    /// The link for a capture's link type.
     pub(crate) fn of(number: u32, big_endian: bool) -> Option<Self> {
         const COOKED: u32 = 113;
         const COOKED_2: u32 = 276;
@@ -69,7 +70,7 @@ impl Link {
         }
     }
 
-    /// The number of the interface, where the packet names it.
+    /// The number of the interface, if the packet has it.
     pub(crate) fn interface(self, packet: &[u8]) -> Option<u32> {
         let Self::Cooked2 { .. } = self else { return None };
         packet.get(4..8)?.first_chunk().map(|bytes| u32::from_be_bytes(*bytes))
@@ -82,7 +83,7 @@ fn short(packet: &[u8]) -> Fault {
 }
 
 impl Packets {
-    /// What a packet says. `direction`: what the capture says of it.
+    /// The content of a packet. `direction`: according to the capture.
     #[inline]
     pub(crate) fn read(
         &mut self,
@@ -127,7 +128,7 @@ impl Packets {
         self.frame(frame, big_endian, says, direction.unwrap_or(sent))
     }
 
-    /// A frame without what was in front of it.
+    /// A frame, without what preceded it.
     #[inline]
     fn frame(
         &mut self,
@@ -144,8 +145,8 @@ impl Packets {
         }
         let id = [*a, *b, *c, *d];
         let id = if big_endian { u32::from_be_bytes(id) } else { u32::from_le_bytes(id) };
-        // Some captures have anything in the bytes between the length and the data, so a flag there makes no FD frame where the
-        // length of the packet tells.
+        // Some captures have arbitrary bytes between the length and the data, so a flag there does not make an FD frame if the
+        // length of the packet decides.
         let is_fd = match (says, packet.len()) {
             (Says::Fd, _) => true,
             (Says::Classic, _) => false,
@@ -222,7 +223,7 @@ mod tests {
         }
     }
 
-    /// From public captures: the bytes behind the length are what was in memory before.
+    /// From public captures: the bytes after the length are old memory contents.
     #[test]
     fn dirty_padding_makes_no_fd_frame_and_no_long_code() {
         let mut packets = Packets::default();
@@ -230,7 +231,7 @@ mod tests {
         assert_eq!(read(&mut packets, &dirty), "0DFF182B#0102030405060708");
         let code = [0x8D, 0xFF, 0x18, 0x2B, 8, 0, 0, 12, 1, 2, 3, 4, 5, 6, 7, 8];
         assert_eq!(read(&mut packets, &code), "0DFF182B#0102030405060708");
-        // In a clean capture the code is one.
+        // In a clean capture it is a length code.
         assert_eq!(read(&mut Packets::default(), &code), "0DFF182B#0102030405060708_C");
     }
 

@@ -1,7 +1,7 @@
 //! python-can's SQLite: one table with the columns of its CSV, `ts`, `arbitration_id`, `extended`, `remote`, `error`, `dlc`, `data`,
-//! and like that without channel, direction and CAN FD's flags. The table may have any name.
+//! and likewise without channel, direction and CAN FD's flags. The table may have any name.
 //!
-//! The file is taken into memory, which SQLite reads as well as a file, so that a compressed one and one from a pipe are read too.
+//! The file is loaded into memory, which SQLite reads as well as a file, so that compressed files and pipes can be read, too.
 
 use std::io;
 
@@ -21,7 +21,7 @@ const COLUMNS: [&str; 7] = ["ts", "arbitration_id", "extended", "remote", "error
 
 const UNTAKEN_JOURNAL: &str = "the database has a journal beside it (write-ahead log): what is only there and not in the file itself is not read";
 
-/// Rows asked of the database at a time.
+/// Rows requested from the database at a time.
 const ROWS: i64 = 512;
 
 /// Reads a database.
@@ -29,7 +29,7 @@ const ROWS: i64 = 512;
 pub(crate) struct Decoder {
     state: State,
     errors: ErrorFrames,
-    /// What the last rows say, the last one first.
+    /// What the last rows contained, the last one first.
     found: Vec<Found>,
 }
 
@@ -40,25 +40,25 @@ enum State {
     Open {
         database: Connection,
         query: String,
-        /// The row that was read last.
+        /// The last row that was read.
         row: i64,
         is_cut: bool,
     },
     Ended,
 }
 
-/// What is known of a database before it is asked.
+/// What is known of a database before it is queried.
 struct Opened {
     database: Connection,
-    /// It has a journal beside it.
+    /// There is a journal beside it.
     has_journal: bool,
-    /// The file is shorter than its head says.
+    /// The file is shorter than its header says.
     is_cut: bool,
 }
 
 /// The whole database in memory.
 fn open(mut file: Whole) -> io::Result<Opened> {
-    /// Where the head says how the file is written and read: 1 with a journal for what is taken back, 2 with one for what is new.
+    /// Where the header says how the file is written and read: 1 with a rollback journal, 2 with a write-ahead log.
     const VERSIONS: std::ops::Range<usize> = 18..20;
     if file.len() > MAX_MEMORY_BYTES {
         let message = "an SQLite database of more than 1 GiB is not read; give the part that you need";
@@ -68,7 +68,7 @@ fn open(mut file: Whole) -> io::Result<Opened> {
     let is_cut = head_says(&bytes).is_none_or(|len| len > file.len());
     let mut has_journal = false;
     for version in bytes.get_mut(VERSIONS).unwrap_or_default() {
-        // What is in memory has nothing beside it, and SQLite would not open it.
+        // In memory there is no journal beside it, and SQLite would not open it.
         has_journal |= *version == 2;
         *version = 1;
     }
@@ -76,14 +76,14 @@ fn open(mut file: Whole) -> io::Result<Opened> {
     let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_NO_MUTEX;
     let database = Connection::open_in_memory_with_flags(flags).and_then(|mut database| {
         database.deserialize_read_exact("main", io::Cursor::new(bytes), len, true)?;
-        // Nothing that a stranger put into the file is run.
+        // Nothing that a stranger put into the file is executed.
         database.execute_batch("PRAGMA trusted_schema = OFF; PRAGMA cell_size_check = ON")?;
         Ok(database)
     });
     Ok(Opened { database: database.map_err(io::Error::other)?, has_journal, is_cut })
 }
 
-/// How long the head says that the file is; 0 where an earlier version left that out, `None` if there is no whole head.
+/// The file's length according to its header; 0 if an earlier version left it out, `None` if the header is incomplete.
 fn head_says(bytes: &[u8]) -> Option<u64> {
     let head: &[u8; 100] = bytes.first_chunk()?;
     let word = |at: usize| u32::from_be_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
@@ -91,7 +91,7 @@ fn head_says(bytes: &[u8]) -> Option<u64> {
         1 => 65_536,
         bytes => u64::from(bytes),
     };
-    // The number of pages counts if it was written by the last change.
+    // The number of pages is valid if it was written by the last change.
     Some(if word(24) == word(92) { page * u64::from(word(28)) } else { 0 })
 }
 
@@ -119,7 +119,7 @@ fn of_database(error: &rusqlite::Error) -> Fault {
 }
 
 impl Decoder {
-    /// The state that reading begins in, and what there is to tell of it.
+    /// The state in which reading begins, and what to report about it.
     fn open(&mut self, input: &mut Input) -> io::Result<State> {
         let file = input.whole()?;
         if file.len() == 0 {
@@ -156,7 +156,7 @@ impl Decoder {
             let mut rows = statement.query([*last])?;
             while let Some(row) = rows.next()? {
                 let number = row.get(0)?;
-                // In a damaged file pages can be linked to a circle.
+                // In a damaged file, pages can be linked in a circle.
                 if number <= *last {
                     return Ok(false);
                 }
@@ -203,7 +203,7 @@ impl Decode for Decoder {
     }
 }
 
-/// What a row says. SQLite takes any type in any column.
+/// The content of a row. SQLite allows any type in any column.
 fn record(row: &Row<'_>, errors: &mut ErrorFrames) -> Result<(TraceRecord, Option<TraceEvent>), Fault> {
     let value = |column: usize| row.get_ref(column).map_err(|error| of_database(&error));
     let whole = |column: usize| match value(column)? {
@@ -216,7 +216,7 @@ fn record(row: &Row<'_>, errors: &mut ErrorFrames) -> Result<(TraceRecord, Optio
         other => Err(wrong(column, "0 or 1", ValueRef::Integer(other))),
     };
     let time = match value(1)? {
-        // The digits that stand for this number and no other: those that were written.
+        // The shortest digits for this number: those that were written.
         ValueRef::Real(seconds) => python_time_ns(format!("{seconds}").as_bytes()),
         ValueRef::Integer(seconds) => seconds.checked_mul(super::text::NS_PER_S),
         _ => None,
@@ -252,7 +252,7 @@ mod tests {
     use super::super::tests;
     use crate::{Format, ReadOptions, TraceReader};
 
-    /// A database in a file, made by these commands.
+    /// A database in a file, made by these statements.
     fn database(commands: &str) -> Vec<u8> {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("a.db");
@@ -314,7 +314,7 @@ mod tests {
         );
     }
 
-    /// Found by random damage: it was read for ever.
+    /// Found by random damage: reading never ended.
     #[test]
     fn pages_linked_to_a_circle_are_damage_and_have_an_end() {
         const PAGE: usize = 512;

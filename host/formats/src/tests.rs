@@ -1,4 +1,4 @@
-//! What the tests of all formats share: files in memory.
+//! What the tests of all formats have in common: files in memory.
 
 use std::io;
 use std::sync::{Arc, Mutex};
@@ -23,7 +23,7 @@ impl io::Write for Memory {
     }
 }
 
-/// What a format makes of records, and what it could not carry.
+/// The file that a format makes of records, and what it could not carry.
 pub(crate) fn write_with(options: &WriteOptions, records: &[TraceRecord]) -> (Vec<u8>, LeftOut) {
     let memory = Memory::default();
     let output = Output::Stream(Box::new(memory.clone()));
@@ -36,7 +36,7 @@ pub(crate) fn write_with(options: &WriteOptions, records: &[TraceRecord]) -> (Ve
     (bytes, left_out)
 }
 
-/// What a text format makes of records.
+/// The file that a text format makes of records.
 pub(crate) fn write(format: Format, records: &[TraceRecord]) -> String {
     let options = WriteOptions { format: Some(format), ..WriteOptions::default() };
     String::from_utf8(write_with(&options, records).0).unwrap()
@@ -66,7 +66,7 @@ pub(crate) fn read_with(options: &ReadOptions, bytes: impl AsRef<[u8]>) -> (Vec<
 pub(crate) fn round_trip(format: Format, records: &[TraceRecord]) -> Vec<TraceRecord> {
     let options = WriteOptions { format: Some(format), ..WriteOptions::default() };
     let (bytes, left_out) = write_with(&options, records);
-    // What is written here is no plain file.
+    // The output here is not a plain file.
     let untold = [super::dif::ROWS_UNTOLD, super::mf4::COUNTS_UNTOLD];
     let left_out = left_out.iter().find(|(what, _)| !untold.contains(what));
     assert_eq!(left_out, None);

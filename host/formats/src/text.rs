@@ -1,4 +1,4 @@
-//! Numbers in lines of text, from and to bytes, without allocation: the readers and writers of
+//! Numbers in lines of text, from and to bytes, without allocation: readers and writers of
 //! text formats spend most of their time here.
 
 /// Nanoseconds per second.
@@ -95,7 +95,7 @@ pub(crate) const fn hex_len(value: u32) -> usize {
 /// Appends a decimal number.
 #[inline]
 pub(crate) fn push_decimal(out: &mut Vec<u8>, value: u64) {
-    // Channels and lengths, which most numbers are.
+    // Most numbers are channels and lengths.
     if value < 10 {
         out.push(b'0' + value as u8);
     } else {
@@ -119,7 +119,7 @@ pub(crate) fn push_padded(out: &mut Vec<u8>, mut value: u64, width: usize) {
 /// Appends `value_ns` as seconds (or another unit of `unit_ns` nanoseconds, a power of ten) with
 /// `decimals` digits after `mark`, rounded down.
 ///
-/// Inlined, because the unit is a constant wherever this is used, and three divisions by it are then none.
+/// Inlined because the unit is always a constant, so that three divisions by it disappear.
 #[inline]
 pub(crate) fn push_time(out: &mut Vec<u8>, value_ns: i64, unit_ns: i64, decimals: u32, mark: u8) {
     let step = (unit_ns / 10_i64.pow(decimals)).max(1);
@@ -136,7 +136,7 @@ pub(crate) fn push_time(out: &mut Vec<u8>, value_ns: i64, unit_ns: i64, decimals
     }
 }
 
-/// Makes `out` at least `width` long since `start` by putting spaces in front.
+/// Pads `out` with spaces before `start` until it has at least `width` bytes since then.
 pub(crate) fn pad_left(out: &mut Vec<u8>, start: usize, width: usize) {
     let missing = width.saturating_sub(out.len() - start);
     if missing > 0 {
@@ -147,7 +147,7 @@ pub(crate) fn pad_left(out: &mut Vec<u8>, start: usize, width: usize) {
     }
 }
 
-/// Makes `out` at least `width` long since `start` by adding spaces.
+/// Pads `out` with spaces at its end until it has at least `width` bytes since `start`.
 pub(crate) fn pad_right(out: &mut Vec<u8>, start: usize, width: usize) {
     let end = start + width;
     if out.len() < end {
@@ -198,13 +198,13 @@ pub(crate) fn eight_bytes(digits: &[u8; 16]) -> Option<[u8; 8]> {
     (seen < 16).then_some(bytes)
 }
 
-/// A decimal number of exactly this many digits, at most 18, tested once for all of them.
+/// A decimal number of exactly this many digits, at most 18, checked in a single test.
 #[inline]
 pub(crate) fn digits<const N: usize>(digits: &[u8; N]) -> Option<i64> {
     const { assert!(N <= 18, "more digits than an i64 holds") };
     let mut value = 0_i64;
     let mut all = true;
-    // Two by two: a chain of multiplications half as long.
+    // In pairs: the chain of multiplications is half as long.
     for pair in digits.chunks(2) {
         let mut number = 0;
         for digit in pair {
@@ -233,7 +233,7 @@ pub(crate) fn decimal(digits: &[u8]) -> Option<u64> {
     Some(value)
 }
 
-/// A decimal number with an optional sign and fraction, in units of `unit_ns` nanoseconds, as
+/// A decimal number with an optional sign and fraction, in units of `unit_ns` nanoseconds, converted to
 /// nanoseconds. Digits beyond a nanosecond are dropped. `mark` separates the fraction.
 pub(crate) fn time(text: &[u8], unit_ns: i64, mark: u8) -> Option<i64> {
     let (negative, text) = match text {
@@ -270,13 +270,13 @@ pub(crate) fn time(text: &[u8], unit_ns: i64, mark: u8) -> Option<i64> {
     Some(if negative { -value } else { value })
 }
 
-/// As [`time`], with a point or a comma in front of the fraction: programs write what their computer's language has.
+/// Like [`time`], with a point or a comma before the fraction: programs follow their computer's language.
 #[inline]
 pub(crate) fn time_of_any_mark(text: &[u8], unit_ns: i64) -> Option<i64> {
     time(text, unit_ns, b'.').or_else(|| time(text, unit_ns, b','))
 }
 
-/// Cuts the first word off: the word and what follows it. The word is empty at the end.
+/// Splits off the first word: returns it and the rest. The word is empty at the end.
 #[inline]
 pub(crate) fn word(text: &[u8]) -> (&[u8], &[u8]) {
     let text = text.trim_ascii_start();
@@ -330,7 +330,7 @@ mod tests {
             prop_assert_eq!(super::digits::<10>(ten.first_chunk().unwrap()), Some(i64::from(id)));
             prop_assert_eq!(super::digits(b"12:4"), None);
             prop_assert_eq!(eight_bytes(b"0123456789ABCDEG"), None);
-            // The extreme second cannot be written without overflow on the way back.
+            // The extreme second cannot be written without an overflow when read back.
             let time_ns = time_ns.clamp(-i64::MAX, i64::MAX);
             let written = text(|out| push_time(out, time_ns, NS_PER_S, 9, b'.'));
             prop_assert_eq!(time(written.as_bytes(), NS_PER_S, b'.'), Some(time_ns));

@@ -1,4 +1,4 @@
-//! A part of a trace by time: from and to a point, absolute or counted from the trace's first record.
+//! A part of a trace by time: between two points, absolute or counted from the trace's first record.
 
 use std::str::FromStr;
 
@@ -17,12 +17,12 @@ pub enum TimePoint {
 /// Not a point in time.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "'{0}' is no time; write seconds from the first record (12.5, or 90s, 10m, 2h), seconds since 1970 \
+    "'{0}' is not a time; write seconds from the first record (12.5, or 90s, 10m, 2h), seconds since 1970 \
      (1410714882.5), or a date in UTC (2014-09-14T17:14:42)"
 )]
 pub struct BadTime(String);
 
-/// Numbers from here on are seconds since 1970: it is 1990 then, and no trace is twenty years long.
+/// Numbers from here on are seconds since 1970: they mean 1990 or later, and no trace is twenty years long.
 const FIRST_EPOCH_NS: i64 = 631_152_000_000_000_000;
 
 impl FromStr for TimePoint {
@@ -45,7 +45,7 @@ impl FromStr for TimePoint {
     }
 }
 
-/// The date of a time in nanoseconds since the Unix epoch, with microseconds; `None` where a trace's times are from its own
+/// The date of a time in nanoseconds since the Unix epoch, with microseconds; `None` if a trace's times count from its own
 /// start.
 pub fn date_text(time_ns: i64) -> Option<String> {
     if time_ns < calendar::FIRST_DATE_NS {
@@ -57,7 +57,7 @@ pub fn date_text(time_ns: i64) -> Option<String> {
     Some(format!("{year:04}-{month:02}-{day:02} {hour:02}:{minute:02}:{second:02}.{us:06} UTC"))
 }
 
-/// Which part of a trace. The start belongs to it, the end does not.
+/// A part of a trace. It includes the start but not the end.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct TimeRange {
     start: Option<TimePoint>,
@@ -66,12 +66,12 @@ pub struct TimeRange {
 }
 
 impl TimeRange {
-    /// From one point to another; open where there is none.
+    /// From one point to another; open if one is missing.
     pub fn new(start: Option<TimePoint>, end: Option<TimePoint>) -> Self {
         Self { start, end, first_ns: None }
     }
 
-    /// Whether a record is in it. The first one asked about is the trace's first.
+    /// Whether a record is in it. The first record passed is taken as the trace's first.
     pub fn contains(&mut self, record: &TraceRecord) -> bool {
         let first_ns = *self.first_ns.get_or_insert(record.time_ns);
         let absolute = |point| match point {

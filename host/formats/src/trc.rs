@@ -1,8 +1,8 @@
 //! PEAK's TRC, versions 1.0 to 2.1 (document "PEAK CAN TRC File Format", last update 2020-07-27): columns of text with
-//! times relative to a date in the head, lines ended by CR LF.
+//! times relative to a date in the header, and lines ended by CR LF.
 //!
-//! What each version can carry differs; what it cannot is counted. Everything that is not a frame is
-//! written in the version's own form with an exact text beside it. Dates are taken as UTC.
+//! What each version can carry differs; what it cannot is counted. Everything that is not a frame is written
+//! in the version's own form, accompanied by an exact text. Dates are taken as UTC.
 
 mod decode;
 mod encode;
@@ -25,16 +25,16 @@ pub enum TrcVersion {
     V1_1,
     /// Microseconds and the bus number.
     V1_2,
-    /// A column in reserve.
+    /// A reserved column.
     V1_3,
-    /// Columns named in the head; no bus number.
+    /// Columns named in the header; no bus number.
     V2_0,
-    /// The bus number again.
+    /// With the bus number again.
     V2_1,
 }
 
 impl TrcVersion {
-    /// As the file's head has it; it has none for 1.0.
+    /// The name in the file's header; 1.0 has none.
     fn name(self) -> &'static str {
         match self {
             Self::V1_0 => "1.0",
@@ -51,12 +51,12 @@ impl TrcVersion {
         matches!(self, Self::V1_2 | Self::V1_3 | Self::V2_1)
     }
 
-    /// Whether the length column counts bytes instead of showing the code of the bus.
+    /// Whether the length column is a number of bytes instead of the bus's length code.
     fn has_length(self) -> bool {
         matches!(self, Self::V1_1 | Self::V2_0)
     }
 
-    /// Digits of a millisecond.
+    /// Decimal digits of a millisecond.
     fn decimals(self) -> u32 {
         match self {
             Self::V1_0 => 0,
@@ -80,13 +80,13 @@ const BUS_OFF: u32 = 0x10;
 const QUEUE_OVERRUN: u32 = 0x40;
 const BUS_PASSIVE: u32 = 0x4_0000;
 
-// What an error row says it was.
+// The types of errors in error rows.
 const BIT: u8 = 1;
 const FORM: u8 = 2;
 const STUFF: u8 = 4;
 const OTHER: u8 = 8;
 
-/// The status that tells of an event; 0 for those that are no status.
+/// The status for an event; 0 if there is none.
 fn status_of(event: &TraceEvent) -> u32 {
     match event {
         TraceEvent::Lost { stage: Some(LossStage::Controller), .. } => OVERRUN,
@@ -98,7 +98,7 @@ fn status_of(event: &TraceEvent) -> u32 {
     }
 }
 
-/// What a status tells; `None` if it is about neither the bus nor a loss.
+/// The event for a status; `None` if it concerns neither the bus nor a loss.
 fn event_of(status: u32) -> Option<TraceEvent> {
     let state = |state| Some(TraceEvent::State { state, counters: None });
     match status {
@@ -164,7 +164,7 @@ mod tests {
         }
         let mut kept = *record;
         let is_frame = record.frame().is_some();
-        // The texts of events name the channel.
+        // The texts of events include the channel.
         if !version.has_bus() && is_frame {
             kept.channel = 1;
         }

@@ -1,20 +1,20 @@
-//! Texts in UTF-16, as Windows programs save them, as UTF-8.
+//! Converts texts in UTF-16, as Windows programs save them, to UTF-8.
 
 use std::io::{self, Read};
 
-/// The order of the bytes in a text's words.
+/// The byte order of a text's words.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Utf16 {
     LittleEndian,
     BigEndian,
 }
 
-/// So many bytes of a text tell that it is one in UTF-16.
+/// This many bytes are enough to recognise a text in UTF-16.
 pub(crate) const HEAD_BYTES: usize = 4;
 
 impl Utf16 {
-    /// By the first [`HEAD_BYTES`]: a byte order mark, or two ASCII characters without one, which no format here begins with
-    /// otherwise.
+    /// Detects UTF-16 by the first [`HEAD_BYTES`]: a byte order mark, or two ASCII characters without one, with which no
+    /// other format here begins.
     pub(crate) fn of_content(head: &[u8]) -> Option<Self> {
         match head {
             [0xFF, 0xFE, ..] | [9..=126, 0, 9..=126, 0, ..] => Some(Self::LittleEndian),
@@ -24,20 +24,20 @@ impl Utf16 {
     }
 }
 
-/// Turns UTF-16 into UTF-8. What is no character becomes the replacement character, so that lines stay lines.
+/// Converts UTF-16 to UTF-8. Invalid characters become the replacement character, so that lines stay lines.
 pub(crate) struct ToUtf8<R> {
     source: R,
     order: Utf16,
-    /// Bytes read that are not yet a whole character.
+    /// Bytes read that are not yet a complete character.
     rest: Vec<u8>,
-    /// What has been turned; the bytes before `at` are used up.
+    /// Converted text; the bytes before `at` are used up.
     text: Vec<u8>,
     at: usize,
     /// Whether the source's end only means "not yet".
     grows: bool,
 }
 
-/// Bytes asked of the source at a time.
+/// Bytes requested from the source at a time.
 const CHUNK_BYTES: usize = 64 * 1024;
 
 impl<R: Read> ToUtf8<R> {
@@ -45,7 +45,7 @@ impl<R: Read> ToUtf8<R> {
         Self { source, order, rest: Vec::new(), text: Vec::new(), at: 0, grows }
     }
 
-    /// Reads on; false if nothing came.
+    /// Reads more; false if nothing came.
     fn fill(&mut self) -> io::Result<bool> {
         let kept = self.rest.len();
         self.rest.resize(kept + CHUNK_BYTES, 0);
@@ -58,7 +58,7 @@ impl<R: Read> ToUtf8<R> {
             Utf16::BigEndian => u16::from_be_bytes([pair[0], pair[1]]),
         };
         let mut words: Vec<u16> = self.rest.chunks_exact(2).map(word).collect();
-        // The first half of a character whose second is not there yet.
+        // The first half of a character whose second half has not arrived.
         let halved = !ended && words.last().is_some_and(|word| (0xD800..0xDC00).contains(word));
         words.truncate(words.len() - usize::from(halved));
         let odd = ended && self.rest.len() % 2 == 1;
@@ -93,7 +93,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// A source that gives few bytes at a time.
+    /// A source that delivers few bytes at a time.
     struct Slow<'a>(&'a [u8], usize);
 
     impl Read for Slow<'_> {

@@ -1,18 +1,18 @@
-//! A file that is read at any place, for the formats that are no streams.
+//! A file with random access, for the formats that cannot be read as streams.
 
 use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
 
-/// What is compressed or comes through a pipe is kept in memory, at most so much of it.
+/// Data that are compressed or come through a pipe are kept in memory, up to this many bytes.
 pub(crate) const MAX_MEMORY_BYTES: u64 = 1 << 30;
 
-/// A source that is read at any place.
+/// A source with random access.
 pub(crate) struct Whole {
     source: Box<dyn ReadSeek>,
     len: u64,
 }
 
-/// A source that can be read at any place.
+/// A reader that can seek.
 pub(crate) trait ReadSeek: Read + Seek + Send {}
 
 impl ReadSeek for File {}
@@ -24,12 +24,12 @@ impl Whole {
         Ok(Self { source, len })
     }
 
-    /// Bytes in the file.
+    /// Length of the file in bytes.
     pub(crate) fn len(&self) -> u64 {
         self.len
     }
 
-    /// As many bytes as there are at a place, at most those asked for.
+    /// The bytes at a position, at most as many as requested.
     pub(crate) fn read_at(&mut self, at: u64, len: usize) -> io::Result<Vec<u8>> {
         let there = self.len.saturating_sub(at).min(len as u64);
         let mut bytes = vec![0; there as usize];

@@ -1,4 +1,4 @@
-//! What writes a trace, and how it is to be written.
+//! Writers of traces, and their options.
 
 use std::io;
 use std::time::Duration;
@@ -13,19 +13,19 @@ use cantap_trace::TraceRecord;
 /// How to write.
 #[derive(Clone, Debug, Default)]
 pub struct WriteOptions {
-    /// The format; by the file's suffix if not given, and a candump log to standard output.
+    /// The format; if not given, determined by the file's suffix, or a candump log for standard output.
     pub format: Option<Format>,
     /// When to begin a new file.
     pub rotation: Rotation,
     /// How the earlier CANanalyser's tables look.
     pub table: TableStyle,
-    /// The zone of dates in formats that name none.
+    /// The zone of dates in formats that do not name one.
     pub zone: Zone,
-    /// What is known of the channels, for formats that have a place for it. Those that are here are in the file even if they carry
-    /// nothing, as far as the format can say so.
+    /// What is known of the channels, for formats that have a place for it. Channels listed here are in the file even if they
+    /// carry nothing, as far as the format allows.
     pub channels: Vec<ChannelInfo>,
-    /// For somebody who reads while it is written, in formats that have a place for it: [`TraceWriter::flush`] writes the head even
-    /// before the first record, and at this interval how many frames each channel has had and lost.
+    /// For anyone who reads while it is written, in formats that have a place for it: [`TraceWriter::flush`] writes the header even
+    /// before the first record, and each channel's frames received and lost at this interval.
     pub statistics_every: Option<Duration>,
 }
 
@@ -34,24 +34,24 @@ pub struct WriteOptions {
 pub struct ChannelInfo {
     /// From 1.
     pub channel: u8,
-    /// Of its bus, in bit/s.
+    /// The bus's bit rate, in bit/s.
     pub bitrate_bps: Option<u32>,
-    /// Where it is and how it was opened, in words.
+    /// A description of where it is and how it was opened.
     pub description: String,
 }
 
-/// Takes records and makes a file of them.
+/// Takes records and writes them to a file.
 pub trait TraceWriter: Send {
     /// Adds a record. It may stay in a buffer until [`Self::flush`].
     fn write(&mut self, record: &TraceRecord) -> io::Result<()>;
 
-    /// Hands everything to the system: what was written until now survives a crash of the program,
-    /// in a file that is valid.
+    /// Passes everything to the system: what has been written so far survives a crash of the program, in a
+    /// valid file.
     fn flush(&mut self) -> io::Result<()>;
 
-    /// Has the next record of a channel say something more, in formats where a record can.
+    /// Adds a remark to the next record of a channel, in formats that allow it.
     fn remark(&mut self, _channel: u8, _text: &str) {}
 
-    /// Ends the file and says what it could not carry.
+    /// Ends the file and returns what it could not carry.
     fn finish(self: Box<Self>) -> io::Result<LeftOut>;
 }

@@ -9,20 +9,22 @@ use jiff::tz::{Offset, TimeZone};
 use super::calendar::FIRST_DATE_NS;
 use super::text::NS_PER_S;
 
-/// The zone of dates in files that name none. The default is UTC, so that a file means the same on every machine.
+/// The time zone of dates in files that do not name one. The default is UTC, so that a file means the same on
+/// every machine.
 ///
 /// The rules of all zones are built in: the same text gives the same times everywhere.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Zone(Option<TimeZone>);
 
-/// Not a time zone.
+/// This is not a time zone.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("'{0}' is no time zone; write a name such as Europe/Berlin, an offset such as +02:00, or UTC")]
+#[error("'{0}' is not a time zone; write a name such as Europe/Berlin, an offset such as +02:00, or UTC")]
 pub struct UnknownZone(String);
 
 impl Zone {
-    /// Nanoseconds since the Unix epoch of what a clock in this zone shows, written as if it were UTC. Of an hour that comes twice
-    /// it is the first; of one that is left out, as if the clock had not been set. A trace without a date has none.
+    /// Converts the time shown by a clock in this zone, written as if it were UTC, to nanoseconds since the Unix epoch. In an hour
+    /// that occurs twice, it is the first; in one that is skipped, it is as if the clock had not been changed. Times of a trace
+    /// without a date are not converted.
     pub(crate) fn utc_ns(&self, clock_ns: i64) -> i64 {
         let Some(zone) = self.zone_of(clock_ns) else { return clock_ns };
         let shown = Offset::UTC.to_datetime(timestamp(clock_ns));
@@ -32,7 +34,8 @@ impl Zone {
         }
     }
 
-    /// What a clock in this zone shows at a time since the Unix epoch, as nanoseconds, as if it were UTC.
+    /// The time shown by a clock in this zone at a time since the Unix epoch, in nanoseconds, as if it were
+    /// UTC.
     pub(crate) fn clock_ns(&self, utc_ns: i64) -> i64 {
         let Some(zone) = self.zone_of(utc_ns) else { return utc_ns };
         let offset_s = i64::from(zone.to_offset(timestamp(utc_ns)).seconds());
@@ -45,7 +48,7 @@ impl Zone {
 }
 
 fn timestamp(time_ns: i64) -> Timestamp {
-    // Every number of 64 bits is a time between 1677 and 2262, which it takes.
+    // Every 64-bit number is a time between 1677 and 2262, which is in range.
     Timestamp::from_nanosecond(i128::from(time_ns)).unwrap_or(Timestamp::UNIX_EPOCH)
 }
 
@@ -129,7 +132,7 @@ mod tests {
     fn a_trace_without_a_date_has_no_zone_and_clocks_that_are_set_have_a_rule() {
         let berlin: Zone = "Europe/Berlin".parse().unwrap();
         assert_eq!((berlin.utc_ns(5), berlin.clock_ns(5)), (5, 5));
-        // 27 October 2024: 02:00 to 03:00 comes twice. 31 March: it does not come.
+        // 27 October 2024: 02:00 to 03:00 occurs twice. 31 March: it does not occur.
         assert_eq!(berlin.utc_ns(clock(2024, 10, 27, 2)), clock(2024, 10, 27, 0));
         assert_eq!(berlin.utc_ns(clock(2024, 3, 31, 2)), clock(2024, 3, 31, 1));
         for extreme in [i64::MIN, i64::MAX] {
@@ -138,7 +141,7 @@ mod tests {
         }
     }
 
-    /// A date in a file is what a clock on the wall showed.
+    /// Dates in files are what a clock on the wall showed.
     #[test]
     fn the_dates_of_every_format_without_a_zone_follow_the_option() {
         use crate::{CsvDialect, Format, ReadOptions, TrcVersion, WriteOptions, tests};

@@ -1,4 +1,5 @@
-//! Frames of CAN FD of every length, with every flag: other programs read them in our files, and we in theirs.
+//! CAN FD frames of every length with every flag: other programs read them in our files, and we read them in
+//! theirs.
 
 mod peers;
 mod traces;
@@ -12,7 +13,8 @@ use cantap_trace::{Direction, FdFrame, Frame, Id, TraceEvent, TraceFrame, TraceR
 use peers::{python_can, python_can_reads, run};
 use traces::{directory, file_name, read, write};
 
-/// All lengths with all flags, standard and extended, received and sent, on two channels, and a classical frame behind each.
+/// All lengths with all flags, standard and extended, received and sent, on two channels, each followed by a classical
+/// frame.
 fn frames() -> Vec<TraceRecord> {
     let mut records = Vec::new();
     let mut push = |frame: TraceFrame| {
@@ -68,8 +70,7 @@ fn python_can_reads_them_in_our_files() {
     }
     let Some(theirs) = python_can_reads(&paths) else { return };
     for (format, path) in formats.iter().zip(&paths) {
-        // In PEAK's files python-can takes the code of the bus for the number of bytes, and the two types of frames with ESI for each
-        // other.
+        // In PEAK's files python-can mistakes the length code for the number of bytes, and confuses the two types of frames with ESI.
         let comparable = |line: &str| {
             let words = line
                 .split(' ')
@@ -94,7 +95,7 @@ fn we_read_them_in_the_files_that_python_can_writes() {
         .map(|name| directory.join(name))
         .into();
     for path in &paths {
-        // It adds to a database that is there.
+        // It appends to an existing database.
         let _ = std::fs::remove_file(path);
     }
     let arguments: Vec<_> = std::iter::once(&source).chain(&paths).map(PathBuf::as_path).collect();
@@ -102,7 +103,7 @@ fn we_read_them_in_the_files_that_python_can_writes() {
         return;
     }
     let bare = records.iter().map(|record| {
-        // Its tables have neither channel nor direction, and of CAN FD only the longer frames.
+        // Its tables have neither channel nor direction, and only the longer of the CAN FD frames.
         let TraceEvent::Frame { frame, .. } = &record.event else { panic!("{record:?}") };
         let id = frame.id();
         let frame: TraceFrame = match frame.data_len() {
@@ -185,7 +186,7 @@ fn can_utils_and_we_read_each_others_logs_and_asc_files_with_them() {
     let mut asc2log = Command::new("asc2log");
     asc2log.arg("-I").arg(at("ours.asc")).arg("-O").arg(at("theirs.log"));
     run("asc2log (can-utils)", &[], &mut asc2log);
-    // Its dates are those of one language, and times are from the start.
+    // It reads dates in only one language, so compare times from the start.
     let from_start = |records: &[TraceRecord]| {
         let first = records[0].time_ns;
         let shifted = records.iter().map(|record| TraceRecord { time_ns: record.time_ns - first, ..*record });

@@ -1,4 +1,5 @@
-//! One byte of every line is changed: each line is a record, a known other thing that is counted, or an issue.
+//! Changes one byte of every line: each line is then a record, something else that is known and counted, or an
+//! issue.
 
 use std::io::{Cursor, Read};
 use std::path::Path;
@@ -10,7 +11,7 @@ use cantap_trace::{Direction, FdFrame, TraceEvent, TraceRecord};
 
 const LINES: usize = 4000;
 
-/// Real traffic, and an FD frame in every tenth place where the format has them.
+/// Real traffic, with an FD frame in every tenth place if the format has them.
 fn records(fd: bool) -> Vec<TraceRecord> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/nmea2000.log.gz");
     let records = open_reader(path, &ReadOptions::default()).unwrap().map(Result::unwrap).take(LINES);
@@ -28,7 +29,7 @@ fn records(fd: bool) -> Vec<TraceRecord> {
     records.enumerate().map(flexible).collect()
 }
 
-/// A text of each format: what stands in front of the rows, and the rows.
+/// A text in each format: what comes before the rows, and the rows.
 struct Text {
     format: Format,
     head: Vec<u8>,
@@ -54,7 +55,7 @@ impl Text {
         Self { format, head: lines.concat(), rows: rows.into_iter().take(LINES).collect() }
     }
 
-    /// As another program writes it: `row` is given the record's number, identifier, whether that is extended, and its bytes.
+    /// As another program writes it: `row` gets the record's number, its identifier, whether that is extended, and its bytes.
     fn foreign(format: Format, head: &str, row: impl Fn(usize, u32, bool, &[u8]) -> String) -> Self {
         let rows = records(false).into_iter().enumerate().map(|(at, record)| {
             let frame = record.frame().unwrap();
@@ -63,7 +64,7 @@ impl Text {
         Self { format, head: head.as_bytes().to_vec(), rows: rows.collect() }
     }
 
-    /// How many records and issues, and how many other things that are counted, are in a file of the head and these rows.
+    /// How many records, issues, and other counted things are in a file of the header and these rows.
     fn found(&self, rows: &[&[u8]]) -> (u64, u64, u64) {
         let source = Cursor::new([&self.head, &rows.concat()[..]].concat());
         let mut reader =
@@ -77,7 +78,7 @@ fn hex(data: &[u8], between: &str) -> String {
     data.iter().map(|byte| format!("{byte:02X}")).collect::<Vec<_>>().join(between)
 }
 
-/// The formats that are only read.
+/// The formats that can only be read.
 fn foreign() -> Vec<Text> {
     let letter = |extended, yes, no| if extended { yes } else { no };
     vec![
@@ -165,7 +166,7 @@ fn with_one_byte_changed_in_every_line_none_is_lost_without_being_counted() {
     for text in written.chain(foreign()) {
         let (format, whole) = (text.format, &text.rows);
         let all: Vec<&[u8]> = whole.iter().map(Vec::as_slice).collect();
-        // Nobody writes a comment or a warning without being asked.
+        // Comments and warnings are written only on request.
         assert_eq!(text.found(&all), (LINES as u64, 0, 0), "{format}: the rows are none");
         for seed in 0..2 {
             let mut random = fastrand::Rng::with_seed(seed);
@@ -178,9 +179,9 @@ fn with_one_byte_changed_in_every_line_none_is_lost_without_being_counted() {
                 while row[at] == old || matches!(row[at], b'\n' | b'\r') {
                     row[at] = random.u8(..);
                 }
-                // With a whole row in front, alone: a line that says two things would make up for one that is lost.
+                // After a whole row, on its own: a line with two events would make up for one that is lost.
                 let (records, wrong, others) = text.found(&[&whole[0], &row]);
-                // A comment is one of its own kind, which the program that made it may have written.
+                // Comments are a separate kind; the program that made the file may have written them.
                 let is_comment = match format {
                     Format::Candump => row.starts_with(b"#"),
                     Format::Csv(CsvDialect::Analyser) => matches!(row[0], b'#' | b'/'),
@@ -193,7 +194,7 @@ fn with_one_byte_changed_in_every_line_none_is_lost_without_being_counted() {
                 );
                 issues += u64::from(wrong > 0);
             }
-            // A test that damages nothing would show nothing.
+            // If the test damaged nothing, it would show nothing.
             assert!(issues > LINES as u64 / 20, "{format}: {issues}");
         }
     }
@@ -218,7 +219,7 @@ fn with_one_byte_changed_in_every_row_of_a_table_each_is_a_record_or_an_issue() 
     let mut counts = [0; 2];
     for row in begins[1..].windows(2) {
         let mut damaged = [&text[..begins[2]], &text[row[0]..row[1]], &text[begins[LINES]..]].concat();
-        // The row in the middle, but for the mark that it begins with, which is the end of the row before.
+        // The row in the middle, except for its starting mark, which ends the row before.
         let at = begins[2] + BEGIN.len() + random.usize(..row[1] - row[0] - BEGIN.len());
         let old = damaged[at];
         while damaged[at] == old {
@@ -234,7 +235,7 @@ fn with_one_byte_changed_in_every_row_of_a_table_each_is_a_record_or_an_issue() 
     assert!(counts[0] > LINES / 20, "{counts:?}");
 }
 
-/// Not all that changes can be noticed, but what is not there any more.
+/// Not every change can be noticed, but missing records can.
 #[test]
 fn with_one_byte_of_a_binary_file_changed_no_record_is_lost_without_being_told() {
     const RECORDS: usize = 200;
@@ -261,7 +262,7 @@ fn with_one_byte_of_a_binary_file_changed_no_record_is_lost_without_being_told()
         let mut told = 0;
         for turn in 0..6000 {
             let mut damaged = whole.clone();
-            // What describes the file is short, and has its turn too.
+            // What describes the file is short, and gets its turn, too.
             let at = random.usize(..if turn % 2 == 0 { whole.len() } else { whole.len().min(2000) });
             damaged[at] ^= random.u8(1..);
             let (at_value, (records, words)) = (damaged[at], found(damaged));

@@ -13,7 +13,7 @@ use cantap_wire::record::{ErrorState, LossStage};
 use peers::{peers_are_required, python, python_can, python_can_reads, run};
 use traces::{directory, file_name, frames, odd, read, real, split, write};
 
-/// What a format leaves of a line.
+/// How much of a line a format carries.
 #[derive(Clone, Copy)]
 struct Carries {
     step_us: i64,
@@ -21,7 +21,7 @@ struct Carries {
     direction: bool,
     /// Whether a remote frame keeps its length.
     remote_length: bool,
-    /// What else than frames python-can gets.
+    /// What python-can gets besides frames.
     events: Events,
     /// Subtracted from all times.
     from_us: i64,
@@ -30,11 +30,11 @@ struct Carries {
 /// Which events come as error frames.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Events {
-    /// None: its reader passes over them.
+    /// None: its reader skips them.
     None,
-    /// Bus errors; states and losses have forms that it passes over.
+    /// Bus errors; states and losses have forms that it skips.
     BusErrors,
-    /// All, as SocketCAN's error frames, and without their channel.
+    /// All, as SocketCAN's error frames, but without their channel.
     All,
 }
 
@@ -47,7 +47,7 @@ const EVERYTHING: Carries = Carries {
     from_us: 0,
 };
 
-/// A record as the script prints it; `None` for what python-can has no message for.
+/// A record as the script prints it; `None` if python-can has no message for it.
 fn line(record: &TraceRecord, carries: Carries) -> Option<String> {
     // python-can's times are floating-point numbers.
     let micros = (record.time_ns + 500).div_euclid(1000).div_euclid(carries.step_us) * carries.step_us
@@ -83,7 +83,7 @@ fn lines(records: &[TraceRecord], carries: Carries) -> Vec<String> {
     records.iter().filter_map(|record| line(record, carries)).collect()
 }
 
-/// Real traffic, and records of every kind behind it.
+/// Real traffic, followed by records of every kind.
 fn records_of_every_kind(directory: &Path) -> Vec<TraceRecord> {
     let mut records = real(1000);
     let last_ns = records.last().unwrap().time_ns;
@@ -96,15 +96,15 @@ fn records_of_every_kind(directory: &Path) -> Vec<TraceRecord> {
     records
 }
 
-/// Only the frames among them.
+/// Only the frames among those.
 fn frames_of_every_kind(directory: &Path) -> Vec<TraceRecord> {
     frames(&records_of_every_kind(directory))
 }
 
-/// What python-can's readers can give back of each format.
+/// What python-can's readers can return of each format.
 fn python_can_formats(start_us: i64) -> Vec<(Format, Carries)> {
     let version = |version, step_us, channel, direction| {
-        // It does not read the date in the head of version 1.0.
+        // It does not read the date in the header of version 1.0.
         let from_us = if version == TrcVersion::V1_0 { start_us / step_us * step_us } else { 0 };
         let events = Events::None;
         (Format::Trc(version), Carries { step_us, channel, direction, events, from_us, ..EVERYTHING })
@@ -177,14 +177,14 @@ fn we_read_every_message_of_the_files_that_python_can_writes() {
     for ((name, carries), path) in cases.iter().zip(&paths) {
         let (read, issues) = read(path);
         assert_eq!(issues, Vec::<String>::new(), "{name}");
-        // It cuts the date in the head to milliseconds, but not what the times count from.
+        // It truncates the date in the header to milliseconds, but not what the times count from.
         let (ours, mut expected) = if *name == "a.asc" {
             (from_start(&read), from_start(&records))
         } else {
             (lines(&read, EVERYTHING), lines(&records, *carries))
         };
         if *name == "a.trc" {
-            // It writes none into PEAK's files, and says so in a warning.
+            // It writes none into PEAK's files, and warns about it.
             expected.retain(|line| !line.contains(" remote ") && !line.ends_with(" error"));
         }
         for (at, (ours, expected)) in ours.iter().zip(&expected).enumerate() {
@@ -246,7 +246,7 @@ fn wireshark_and_we_read_each_others_pcapng_files() {
         assert!(words.len() == 5 && extended.contains(words[1]) && remote.contains(words[2]), "{line}");
         assert_eq!(words[3..], [frame.dlc().to_string(), frame.id().raw().to_string()], "{line}");
     }
-    // What it writes has the same packets in blocks of its own making, gzip included.
+    // It writes the same packets in its own kinds of blocks, gzip included.
     for (name, compress) in [("theirs.pcapng", "none"), ("theirs.pcapng.gz", "gzip")] {
         let path = theirs.with_file_name(name);
         let mut command = Command::new("tshark");
@@ -262,7 +262,7 @@ fn wireshark_and_we_read_each_others_pcapng_files() {
     }
 }
 
-/// Beside the error frame, which says that frames were lost but not to everybody how many.
+/// This is in addition to the error frame, which reports the loss, but not its size to every reader.
 #[test]
 fn wireshark_shows_losses_as_drop_counts_with_words_and_sent_frames_as_outbound() {
     let directory = directory("wireshark_losses");
@@ -288,13 +288,13 @@ fn wireshark_shows_losses_as_drop_counts_with_words_and_sent_frames_as_outbound(
             "can1|1|1 frame was lost here in the device's queue|",
         ]
     );
-    // The statistics are no packets, and nothing that it would complain about.
+    // The statistics are not packets, and nothing that it complains about.
     let mut command = Command::new("capinfos");
     let Some(text) = run("capinfos", &["--version"], command.arg("-M").arg(&path)) else { return };
     assert_eq!(text.matches("Number of stat entries = 1").count(), 2, "{text}");
 }
 
-/// Times from the first record: can-utils' asc2log takes the date only in one language.
+/// Times from the first record: can-utils' asc2log understands the date in only one language.
 fn from_start(records: &[TraceRecord]) -> Vec<String> {
     lines(records, Carries { from_us: records[0].time_ns / 1000, ..EVERYTHING })
 }
@@ -308,21 +308,21 @@ fn can_utils_and_we_read_each_others_logs_and_asc_files() {
     write(&at("ours.asc"), Format::Asc, &records);
     let mut log2asc = Command::new("log2asc");
     log2asc.arg("-I").arg(at("ours.log")).arg("-O").arg(at("theirs.asc")).args(["can0", "can1"]);
-    // Neither program knows an option that does nothing: whether it starts is all that can be asked.
+    // Neither program has an option that does nothing: all that can be checked is whether it starts.
     if run("log2asc (can-utils)", &[], &mut log2asc).is_none() {
         return;
     }
     let mut asc2log = Command::new("asc2log");
     asc2log.arg("-I").arg(at("ours.asc")).arg("-O").arg(at("theirs.log"));
     run("asc2log (can-utils)", &[], &mut asc2log);
-    // It prints each line of a log, error frames with what they say.
+    // It prints each line of a log, error frames with their meaning.
     let every = records_of_every_kind(&directory);
     write(&at("every.log"), Format::Candump, &every);
     let mut log2long = Command::new("log2long");
     log2long.stdin(fs::File::open(at("every.log")).unwrap());
     let text = run("log2long (can-utils)", &[], &mut log2long).unwrap();
     assert_eq!(text.lines().filter(|line| line.starts_with('(')).count(), every.len(), "{text}");
-    // It prints as candump does.
+    // It prints like candump.
     fs::write(at("screen.txt"), &text).unwrap();
     let options = ReadOptions { format: Some(Format::CandumpScreen), ..ReadOptions::default() };
     let (screen, issues) = split(open_reader(at("screen.txt"), &options).unwrap());
@@ -353,7 +353,8 @@ fn python_can_test_data() -> Option<PathBuf> {
                 "download",
                 "--quiet",
                 "--no-deps",
-                // All others in binary: what building this one takes would be built from source, too, which takes minutes.
+                // All others as binaries: building this one would otherwise build its build dependencies from source,
+                // which takes minutes.
                 "--no-binary",
                 "python-can",
                 "python-can",
@@ -376,7 +377,7 @@ fn python_can_test_data() -> Option<PathBuf> {
     unpacked(&directory)
 }
 
-/// Other people's files, cut at a hundred places, give no more than they did and no panic.
+/// Files by other programs, cut at a hundred places, yield no more than whole ones and no panic.
 fn cut_everywhere(path: &Path) {
     let whole = fs::read(path).unwrap();
     let all = read(path).0.len();
@@ -405,8 +406,8 @@ const DIFFERENT: &[(&str, &str)] = &[
     ("test_CanFdMessage64.blf", "an identifier of 31 bits is an issue here"),
     ("test_CanFdRemoteMessage.asc", "a remote frame in a CANFD row is a classical one"),
     ("test_CanMessage.asc.gz", "the date has PM behind it, which python-can does not read"),
-    ("test_CanMessage.blf", "a mere request to send is no frame on the bus"),
-    ("test_CanMessage2.blf", "a mere request to send is no frame on the bus"),
+    ("test_CanMessage.blf", "a mere request to send is not a frame on the bus"),
+    ("test_CanMessage2.blf", "a mere request to send is not a frame on the bus"),
     ("test_CanMessage_V1_0_BUS1.trc", "python-can does not read the date of version 1.0"),
 ];
 

@@ -1,4 +1,4 @@
-//! Every format gives back what was written, plain and compressed, and says what it could not carry.
+//! Every format returns what was written, plain and compressed, and reports what it could not carry.
 
 mod traces;
 
@@ -10,7 +10,7 @@ use cantap_trace::{Direction, TraceEvent, TraceRecord};
 use proptest::prelude::*;
 use traces::{directory, file_name, read, real, write};
 
-/// The finest step of a format's times.
+/// The resolution of a format's times.
 fn resolution_ns(format: Format) -> i64 {
     match format {
         Format::Trc(TrcVersion::V1_0) => 1_000_000,
@@ -21,7 +21,7 @@ fn resolution_ns(format: Format) -> i64 {
     }
 }
 
-/// Whether records or parts of them are missing from a file, which the number of its rows is not.
+/// Whether records or parts of them are missing from a file, rather than just the number of its rows.
 fn lacks_records(left_out: &LeftOut) -> bool {
     left_out.iter().any(|(what, _)| {
         !what.starts_with("the number of rows") && !what.starts_with("the numbers of records")
@@ -83,7 +83,7 @@ proptest! {
         }
     }
 
-    /// What a format read can be written again in the same format without loss.
+    /// Whatever a format could read can be written again in the same format without loss.
     #[test]
     fn a_second_trip_through_the_same_format_changes_nothing(
         records in prop::collection::vec(testing::record(1), 0..16),
@@ -99,7 +99,7 @@ proptest! {
     }
 }
 
-/// The formats that carry everything carry times that no other does.
+/// The formats that carry everything carry times that others cannot.
 #[test]
 fn nanoseconds_and_late_marks_survive_in_our_own_table_and_in_pcapng() {
     let directory = directory("own_table");
@@ -116,7 +116,7 @@ fn nanoseconds_and_late_marks_survive_in_our_own_table_and_in_pcapng() {
         assert!(write(&path, format, &records).is_empty(), "{format}");
         assert_eq!(read(&path), (records.to_vec(), Vec::new()), "{format}");
     }
-    // The others say what they leave out.
+    // The others report what they leave out.
     for format in Format::written().filter(|format| !carrying.contains(format)) {
         let left_out = write(&directory.join(file_name(format, "")), format, &records);
         let late: Vec<_> = left_out.iter().filter(|(what, _)| what.contains("upper bounds")).collect();
@@ -124,7 +124,7 @@ fn nanoseconds_and_late_marks_survive_in_our_own_table_and_in_pcapng() {
     }
 }
 
-/// What Vector's programs write before a frame is sent is counted and named, and no frame.
+/// What Vector's programs write before a frame is sent is counted and named, but is not a frame.
 #[test]
 fn requests_to_send_are_passed_over_and_counted() {
     let path = directory("requests").join("requests.asc");
@@ -141,7 +141,7 @@ fn requests_to_send_are_passed_over_and_counted() {
     assert_eq!(notes, [(true, 2)]);
 }
 
-/// Reading finds out by itself which spreadsheet a table was written for.
+/// Reading detects for which spreadsheet a table was written.
 #[test]
 fn the_earlier_analysers_tables_read_back_in_every_style() {
     let directory = directory("table_styles");

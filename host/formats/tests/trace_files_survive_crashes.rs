@@ -1,5 +1,5 @@
-//! A program that ends without warning leaves files that other programs read: what was flushed is there, whole. So it is to whoever reads
-//! on while a file is written.
+//! A program that ends without warning leaves files that other programs can read: whatever was flushed is there and complete. The same
+//! goes for anyone reading while a file is written.
 
 mod traces;
 
@@ -32,13 +32,13 @@ fn what_was_flushed_is_a_whole_file_whatever_happens_afterwards() {
                     writer.flush().unwrap();
                 }
             }
-            // No destructor runs in a program that is killed.
+            // A killed program runs no destructors.
             std::mem::forget(writer);
             let (left, issues) = read(&path);
             let place = path.display();
-            // More than what was flushed is there if the writer's buffer was full. What makes an end provisional is that it
-            // is written over, which a compressed file does not allow: there the earlier analyser's tables lack the
-            // row that is held back for a loss behind it, and a DIF's reader the row before the missing end.
+            // More than was flushed is there if the writer's buffer was full. A provisional end is overwritten later, which
+            // a compressed file does not allow: there the earlier analyser's tables lack the row held back for a loss after
+            // it, and a DIF reader misses the row before the missing end.
             let without_end = usize::from(!compression.is_empty());
             let missing = match format {
                 Format::Csv(CsvDialect::Analyser) => without_end,
@@ -54,8 +54,8 @@ fn what_was_flushed_is_a_whole_file_whatever_happens_afterwards() {
             let same = directory.join(format!("whole-{}", file_name(format, "")));
             write(&same, format, &records[..left.len()]);
             assert!(left == read(&same).0, "{place}");
-            // Nothing of a provisional end may be left between the rows. Statistics at the end of a pcapng file, and ASC's last line, are no
-            // part of it: whoever reads the file while it grows has read on behind them.
+            // Nothing of a provisional end may remain between the rows. Statistics at the end of a pcapng file, and ASC's last line, are not
+            // part of it: anyone who reads the growing file has read on past them.
             if compression.is_empty() && !matches!(format, Format::Blf) {
                 let (left, whole) = (fs::read(&path).unwrap(), fs::read(&same).unwrap());
                 assert!(whole.starts_with(&left), "{place}");
@@ -69,7 +69,8 @@ fn what_was_flushed_is_a_whole_file_whatever_happens_afterwards() {
     }
 }
 
-/// Each record is read as soon as it is flushed. Not in the tables of the earlier analyser, which have a provisional end that is written over.
+/// Each record is read as soon as it is flushed. This does not apply to the tables of the earlier analyser, whose provisional end is
+/// overwritten.
 #[test]
 fn a_file_can_be_followed_while_it_is_written() {
     let directory = directory("followed");
@@ -95,7 +96,7 @@ fn a_file_can_be_followed_while_it_is_written() {
     }
 }
 
-/// gzip and zstd find nothing wrong with a file, where they are installed.
+/// gzip and zstd find nothing wrong with a file, if they are installed.
 fn test_by_its_own_program(path: &Path) {
     let program = match path.extension().and_then(|suffix| suffix.to_str()) {
         Some("gz") => "gzip",
@@ -109,12 +110,12 @@ fn test_by_its_own_program(path: &Path) {
     }
 }
 
-/// A BLF is small: what zstd makes of it in one piece is nothing to a reader until the piece is whole.
+/// A BLF is small: a piece that zstd compresses is of no use to a reader until it is complete.
 #[test]
 fn of_a_compressed_file_that_is_cut_only_the_end_is_missing() {
     let directory = directory("cut_late");
     let records = real(6158);
-    // xz is for archives: its unit is a stream of a megabyte.
+    // xz is left out: its unit is a longer stream.
     for compression in [".gz", ".zst", ".lz4"] {
         let path = directory.join(file_name(Format::Blf, compression));
         write(&path, Format::Blf, &records);
@@ -128,7 +129,7 @@ fn of_a_compressed_file_that_is_cut_only_the_end_is_missing() {
     }
 }
 
-/// A conversion asks for no flush.
+/// A conversion requests no flush.
 #[test]
 fn what_is_older_than_a_second_is_in_a_compressed_file_without_a_flush() {
     let directory = directory("unflushed");
@@ -154,7 +155,8 @@ fn files(directory: &Path) -> Vec<PathBuf> {
     paths
 }
 
-/// Each file of a row stands alone, by size and by time, in every format, and so does the last one after a crash.
+/// Each file of a series is valid on its own, by size and by time, in every format, and so is the last one after
+/// a crash.
 #[test]
 fn every_file_of_a_row_is_whole_and_within_its_limit() {
     let records = real(usize::MAX);

@@ -20,7 +20,7 @@ def channel_from_1(message, suffix):
         return 0
     if isinstance(channel, str):
         return int("".join(filter(str.isdigit, channel)) or 0) + 1
-    # The readers of PEAK's files and of MF4 hand the bus number on, the others count from 0.
+    # The readers of PEAK's files and of MF4 pass on the bus number, the others count from 0.
     return channel if suffix in (".trc", ".mf4") else channel + 1
 
 
@@ -45,7 +45,7 @@ def suffix_of(path):
 
 
 def reader(path, suffix):
-    # Vector's reader gives times from the start of the measurement unless it is told otherwise.
+    # Vector's reader gives times from the start of the measurement by default.
     options = {"relative_timestamp": False} if suffix == ".asc" else {}
     return can.LogReader(path, **options)
 
@@ -83,10 +83,10 @@ def write(lines, paths):
             )
         )
     for path in paths:
-        # Only the candump log and what is printed name interfaces; MF4 counts from 1.
+        # Only the candump log and printed output name interfaces; MF4 counts from 1.
         named = suffix_of(path) in (".log", ".txt")
         first = 1 if suffix_of(path) == ".mf4" else 0
-        # a0.mf4 is plain, a1.mf4 deflated, a2.mf4 with rows and columns exchanged before.
+        # a0.mf4 is plain, a1.mf4 deflated, a2.mf4 transposed and deflated.
         options = {"compression_level": int(Path(path).stem[-1])} if first else {}
         with can.Logger(path, **options) as logger:
             for message in messages:

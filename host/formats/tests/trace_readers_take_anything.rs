@@ -1,4 +1,4 @@
-//! Cut, damaged and foreign files: readers never panic, give everything up to the cut, and say where
+//! Truncated, damaged and foreign files: readers never panic, return everything up to the cut, and say where
 //! something is wrong and what was expected.
 
 mod traces;
@@ -47,12 +47,12 @@ fn is_text(format: Format) -> bool {
     !matches!(format, Format::Blf | Format::Pcapng | Format::Mf4)
 }
 
-/// Formats with one record in each line and nothing else that counts but the head.
+/// Formats with one record per line and nothing else of importance but the header.
 const LINES: &[Format] =
     &[Format::Candump, Format::Csv(CsvDialect::Full), Format::Csv(CsvDialect::PythonCan)];
 
-/// What a cut leaves is whole records and nothing that it made of one; and the reader says that the file was cut, unless
-/// the cut is where a complete file could end.
+/// What remains after a cut are whole records and nothing misread from a part of one; and the reader reports the cut,
+/// unless it is where a complete file could end.
 #[test]
 fn a_file_cut_at_any_byte_gives_everything_before_the_cut_and_says_so() {
     for (format, whole) in files("cut_anywhere", 12, "") {
@@ -64,8 +64,8 @@ fn a_file_cut_at_any_byte_gives_everything_before_the_cut_and_says_so() {
             let place = format!("{format} cut at {cut}: {issues:?}, {} records", got.len());
             let same = got.iter().zip(&all).take_while(|(got, all)| got == all).count();
             if same < got.len() {
-                // A log's lines do not tell their length: the first frame of an identifier may be taken for a shorter
-                // one.
+                // A log's lines do not contain their length: the first frame of an identifier may be mistaken for a
+                // shorter one.
                 let id = |record: &TraceRecord| record.frame().map(|frame| (frame.id(), frame.is_remote()));
                 let is_first = all[..same].iter().all(|record| id(record) != id(&got[same]));
                 assert!(
@@ -81,7 +81,7 @@ fn a_file_cut_at_any_byte_gives_everything_before_the_cut_and_says_so() {
                 Format::Blf => false,
                 // Blocks are whole words, and some end where one does.
                 Format::Pcapng => cut % 4 == 0,
-                // What the last row says is there, or it has not begun.
+                // The last row is complete as far as it matters, or has not begun.
                 _ => {
                     row.trim_ascii().is_empty()
                         || got.len() > rows_before
@@ -98,7 +98,7 @@ fn a_file_cut_at_any_byte_gives_everything_before_the_cut_and_says_so() {
                 assert!(got.len() + head >= rows, "{place} of {rows} rows");
             }
         }
-        // One byte less than whole loses one record at most.
+        // With one byte missing, at most one record is lost.
         let (got, _) = read_bytes(format, &whole[..whole.len() - 1]);
         assert!(got.len() + 1 >= all.len(), "{format}: {} of {}", got.len(), all.len());
     }
@@ -128,7 +128,8 @@ fn no_flipped_byte_makes_a_reader_panic_or_invent_records() {
             for value in [0, 0xFF, original ^ 1, original ^ 0x80, b'\n', b'9'] {
                 bytes[at] = value;
                 let (got, _) = read_bytes(format, &bytes);
-                // A damaged error frame can read as two events, and so can each if the head is damaged.
+                // A damaged error frame can read as two events, and so can all of them if the header is
+                // damaged.
                 assert!(got.len() <= 2 * all.len(), "{format} byte {at} = {value}: {}", got.len());
                 if format == Format::Candump {
                     assert!(got.len() + 2 >= all.len(), "{format} byte {at} = {value}: {}", got.len());
@@ -142,7 +143,7 @@ fn no_flipped_byte_makes_a_reader_panic_or_invent_records() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// Damage in many places, pieces missing, doubled and moved.
+    /// Damage in many places, with pieces missing, doubled and moved.
     #[test]
     fn no_damage_makes_a_reader_panic(
         seed in prop::collection::vec((any::<prop::sample::Index>(), any::<prop::sample::Index>(), any::<u8>(), 0..4_u8), 1..20),
@@ -175,7 +176,7 @@ proptest! {
     }
 }
 
-/// One format's file must not make another's reader stumble: users mistake suffixes.
+/// One format's file must not trip another's reader: users mix up suffixes.
 #[test]
 fn every_reader_survives_every_other_formats_file() {
     for (format, bytes) in files("mistaken", 40, "") {
@@ -197,14 +198,14 @@ fn a_broken_line_is_named_by_file_and_line_with_what_was_expected_and_strict_end
         let (whole, _) = read(&path);
         let text = fs::read_to_string(&path).unwrap();
         let mut lines: Vec<_> = text.lines().collect();
-        // Behind the first frames and before the last, whatever the length of the head.
+        // After the first frames and before the last, whatever the length of the header.
         let at = lines.len() - 16;
         lines.insert(at, "rubbish");
         fs::write(&path, lines.join("\n") + "\n").unwrap();
         let (left, issues) = read(&path);
         let place = format!("{}, line {}: expected ", path.display(), at + 1);
         assert!(issues.len() == 1 && issues[0].starts_with(&place), "{format}: {issues:?}");
-        // In PEAK's files the second word is the first that counts.
+        // In PEAK's files the second word is the first that matters.
         let found = if matches!(format, Format::Trc(_)) { "found nothing" } else { "found 'rubbish'" };
         assert!(issues[0].contains(found), "{issues:?}");
         assert_eq!(left, whole, "{format}");

@@ -1,8 +1,8 @@
-//! How many frames a second all protocols read together: `cargo run --release -p cantap-protocols --example speed`,
-//! with the name of one of them for that alone.
+//! How many frames per second all protocols read together: `cargo run --release -p cantap-protocols --example
+//! speed`, optionally with the name of a single one.
 //!
-//! A second of a vehicle with a diagnostic session beside its cyclic frames, a truck, a boat and a plant, again and again; each on a channel of its
-//! own, as a survey would find them, and once more with every protocol on every channel.
+//! A second of a vehicle with a diagnostic session besides its cyclic frames, a truck, a boat and a plant, repeated; each on its own channel, as a
+//! survey would find them, and once more with every protocol on every channel.
 
 use std::hint::black_box;
 use std::process::ExitCode;
@@ -12,7 +12,7 @@ use cantap_protocols::{Conversations, Evidence, Options, Protocol};
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
 const ROUNDS: i64 = 200;
-/// What is asked for of each bus as a survey finds it, in frames per second of the processor's time.
+/// The required speed for each bus as a survey finds it, in frames per second of processor time.
 const AT_LEAST: f64 = 2e6;
 
 fn main() -> ExitCode {
@@ -47,7 +47,7 @@ fn record(channel: u8, at: u32, frame: &str) -> TraceRecord {
     TraceRecord { time_ns: i64::from(at) * 100_000, channel, event }
 }
 
-/// Frames per second, of the processor's time where the system tells it.
+/// Frames per second, of processor time where the system provides it.
 fn measure(name: &str, records: &[TraceRecord], options: &Options) -> f64 {
     let mut conversations = Conversations::new(options);
     let (mut events, mut count) = (Vec::new(), 0);
@@ -57,7 +57,7 @@ fn measure(name: &str, records: &[TraceRecord], options: &Options) -> f64 {
         for record in records {
             let record = TraceRecord { time_ns: record.time_ns + round * 1_000_000_000, ..*record };
             conversations.take(&record, &mut events);
-            // As the command does.
+            // Like the command.
             count += events.len();
             black_box(&events);
             events.clear();
@@ -74,13 +74,13 @@ fn measure(name: &str, records: &[TraceRecord], options: &Options) -> f64 {
     by_processor.unwrap_or(frames / seconds)
 }
 
-/// This thread's time on a processor, where Linux tells it: what a busy machine takes does not count.
+/// This thread's processor time, if Linux reports it: the load of a busy machine does not count.
 fn processor_s() -> Option<f64> {
     let text = std::fs::read_to_string("/proc/thread-self/schedstat").ok()?;
     Some(text.split(' ').next()?.parse::<f64>().ok()? / 1e9)
 }
 
-/// One frame in ten is diagnostics.
+/// One frame in ten is for diagnostics.
 fn vehicle(at: u32) -> String {
     const TALK: [&str; 5] = [
         "7E0#0322F190",
@@ -97,7 +97,7 @@ fn vehicle(at: u32) -> String {
     }
 }
 
-/// Trouble codes by broadcast beside groups of one frame.
+/// Trouble codes by broadcast, among groups of one frame.
 fn truck(at: u32) -> String {
     const TALK: [&str; 3] =
         ["1CECFF00#200A0002FFCAFE00", "1CEBFF00#0104FFBE0A038221", "1CEBFF00#021F037FFFFFFFFF"];
@@ -107,7 +107,7 @@ fn truck(at: u32) -> String {
     }
 }
 
-/// A position in a fast packet of seven frames, beside groups of one frame.
+/// A position in a fast packet of seven frames, among groups of one frame.
 fn boat(at: u32) -> String {
     const TALK: [&str; 7] = [
         "0DF80502#402FD2C73F00E73A",

@@ -1,4 +1,5 @@
-//! Conditions on what frames say together: `uds.sid == 0x22 and uds.nrc`, beside signals and parts of frames.
+//! Conditions on what frames say together, such as `uds.sid == 0x22 and uds.nrc`, in addition to signals and
+//! parts of frames.
 
 use std::fmt;
 
@@ -9,8 +10,8 @@ use cantap_trace::TraceRecord;
 use crate::naming;
 use crate::{Conversations, Event, Options};
 
-/// Parses a condition whose names may be those of [`crate::naming`] too. The protocols that it names are read on every channel, with what
-/// the options say of pairs and sheets; the decoder's signals are those of J1939's long messages as well.
+/// Parses a condition whose names may also be those of [`crate::naming`]. The protocols that it names are decoded on every channel, with
+/// the pairs and sheets of the options; the decoder's signals include those of J1939's long messages.
 pub fn condition(text: &str, decoder: &Decoder, options: &Options) -> Result<Condition, ConditionError> {
     let options = Options {
         protocols: Vec::new(),
@@ -23,10 +24,10 @@ pub fn condition(text: &str, decoder: &Decoder, options: &Options) -> Result<Con
     Condition::with_listener(text, decoder, Box::new(listener))
 }
 
-/// Reads the protocols that a condition names.
+/// Decodes the protocols that a condition names.
 struct Watcher {
     options: Options,
-    /// From the first record on.
+    /// Set from the first record on.
     conversations: Option<Box<Conversations>>,
     events: Vec<Event>,
 }
@@ -74,7 +75,7 @@ mod tests {
         (5000.0, "123#00"),
     ];
 
-    /// With which frames the condition holds.
+    /// The frames at which the condition holds.
     fn hits(text: &str) -> Vec<usize> {
         let mut condition = condition(text, &Decoder::new(Vec::new()), &Options::default()).unwrap();
         (0..TALK.len()).filter(|&place| condition.holds(&at(TALK[place].0, TALK[place].1))).collect()

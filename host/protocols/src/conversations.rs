@@ -1,4 +1,4 @@
-//! Several protocols at once.
+//! Decodes several protocols at once.
 
 use std::sync::Arc;
 
@@ -12,15 +12,15 @@ use crate::iso_tp::{IsoTp, Pair};
 use crate::j1939::J1939;
 use crate::{Assembler, Event, Evidence, Protocol, UnderWay};
 
-/// What to listen for.
+/// What to decode.
 #[derive(Clone, Debug, Default)]
 pub struct Options {
     /// Only these protocols; all if empty. `isotp` alone shows every transfer as it is.
     pub protocols: Vec<Protocol>,
-    /// What each channel speaks, as a survey found it. Without one, channels speak the protocols above; and if there are none, ISO
-    /// 15765-2 and what stands on it, which need no survey.
+    /// What each channel speaks, according to a survey. Without one, channels are decoded by the protocols above; if those are
+    /// empty too, by ISO 15765-2 and the protocols on top of it, which need no survey.
     pub spoken: Option<Vec<Evidence>>,
-    /// Pairs of identifiers that talk by ISO 15765-2, beside those of the standards.
+    /// Pairs of identifiers that communicate by ISO 15765-2, in addition to those of the standards.
     pub pairs: Vec<Pair>,
     /// Signals for the messages of J1939 and NMEA 2000.
     pub decoder: Option<Arc<Decoder>>,
@@ -28,25 +28,25 @@ pub struct Options {
     pub sheets: Vec<Sheet>,
 }
 
-/// Takes records and gives the events of all protocols, in the order in which they are complete.
+/// Takes records and returns the events of all protocols, in the order of completion.
 pub struct Conversations {
     readers: Vec<Box<dyn Assembler + Send + Sync>>,
-    /// Which of them read each channel, a bit each.
+    /// Which of them decode each channel, one bit each.
     of_channel: Box<[u8; 256]>,
     wanted: u16,
 }
 
 const DIAGNOSTICS: u16 =
     Protocol::IsoTp.bit() | Protocol::Uds.bit() | Protocol::Kwp2000.bit() | Protocol::Obd.bit();
-/// Both have the same frames: one reader tells them apart by their groups.
+/// Both use the same frames: a single decoder distinguishes them by their groups.
 const VEHICLE_AND_BOAT: u16 = Protocol::J1939.bit() | Protocol::Nmea2000.bit();
 
 impl Conversations {
-    /// Listens for what the options say.
+    /// Sets up decoding according to the options.
     pub fn new(options: &Options) -> Self {
         let bits = |protocols: &[Protocol]| protocols.iter().fold(0, |bits, protocol| bits | protocol.bit());
         let wanted = if options.protocols.is_empty() { u16::MAX } else { bits(&options.protocols) };
-        // Without a survey and a choice, frames that two protocols could claim would be read twice.
+        // Without a survey or a choice, frames that fit two protocols would be decoded twice.
         let everywhere = match (&options.spoken, options.protocols.is_empty()) {
             (Some(_), _) => 0,
             (None, true) => DIAGNOSTICS,
@@ -86,7 +86,7 @@ impl Conversations {
         this
     }
 
-    /// Adds a reader for the channels that need it, if there are any.
+    /// Adds a decoder for the channels that need it, if there are any.
     fn add(
         &mut self,
         spoken: &[u16; 256],
@@ -119,7 +119,7 @@ impl Conversations {
         }
     }
 
-    /// The trace has ended: appends what was under way.
+    /// The trace has ended: appends whatever was in progress.
     pub fn finish(&mut self, events: &mut Vec<Event>) {
         let before = events.len();
         for reader in &mut self.readers {
@@ -128,7 +128,7 @@ impl Conversations {
         self.keep_wanted(before, events);
     }
 
-    /// The transfers that have begun and have not ended, in the order in which they began.
+    /// The transfers in progress, in the order in which they began.
     pub fn under_way(&self) -> Vec<UnderWay> {
         let mut under_way = Vec::new();
         self.readers.iter().for_each(|reader| reader.under_way(&mut under_way));
@@ -136,17 +136,17 @@ impl Conversations {
         under_way
     }
 
-    /// Leaves out what is of a protocol that is not wanted.
+    /// Removes the events of protocols that were not requested.
     fn keep_wanted(&self, before: usize, events: &mut Vec<Event>) {
         if self.wanted == u16::MAX {
             return;
         }
-        // Only what is new: the caller may keep all events of a long trace in the same vector.
+        // Only new events: the caller may keep all events of a long trace in the same vector.
         let mut end = before;
         let diagnostics = self.wanted & DIAGNOSTICS != 0;
         for at in before..events.len() {
             let Event { protocol, trouble, .. } = &events[at];
-            // A transfer that broke may have been a request, or its response: which, nobody can tell.
+            // A broken transfer may have been a request, or its response: nobody can tell which.
             let broke = diagnostics && *protocol == Protocol::IsoTp && trouble.is_some();
             if broke || self.wanted & protocol.bit() != 0 {
                 events.swap(end, at);
@@ -172,7 +172,8 @@ mod tests {
         events.iter().map(ToString::to_string).collect()
     }
 
-    /// Who asks for one protocol alone must not take a bus for sound on which its transfers break.
+    /// Anyone who decodes a single protocol must not think that a bus on which its transfers break is in
+    /// order.
     #[test]
     fn transfers_that_break_are_said_whatever_they_would_have_been() {
         let frames =

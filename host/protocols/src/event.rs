@@ -1,4 +1,4 @@
-//! What an assembler says.
+//! The output of an assembler.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -7,10 +7,11 @@ use cantap_trace::{Id, TraceRecord};
 
 use crate::Protocol;
 
-/// Something that was said on a bus: a message, an exchange, or one that failed.
+/// Something said on a bus: a message, an exchange, or a failed one.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Event {
-    /// When it was complete: the stamp of its last frame, or when it was given up. Nanoseconds, as in records.
+    /// When it was complete: the stamp of its last frame, or when it was abandoned. Nanoseconds, as in
+    /// records.
     pub time_ns: i64,
     /// The stamp of its first frame.
     pub start_ns: i64,
@@ -18,38 +19,38 @@ pub struct Event {
     pub channel: u8,
     /// The protocol.
     pub protocol: Protocol,
-    /// Who said it.
+    /// The sender.
     pub from: Party,
-    /// To whom.
+    /// The receiver.
     pub to: Party,
-    /// What kind of event it is among those of its protocol, such as `exchange`.
+    /// The kind of event within its protocol, such as `exchange`.
     pub kind: &'static str,
     /// The service, message or parameter group.
     pub title: Cow<'static, str>,
-    /// What was said, in order.
+    /// The content, in order.
     pub fields: Vec<Field>,
-    /// The bytes behind it, as far as they are known.
+    /// The underlying bytes, as far as they are known.
     pub data: Vec<u8>,
     /// From the end of a request to the first frame of its response, in nanoseconds.
     pub response_ns: Option<i64>,
-    /// How many frames it took.
+    /// Number of frames.
     pub frames: u32,
     /// What went wrong.
     pub trouble: Option<Trouble>,
-    /// Frames of this channel were lost while it was under way, so it may not be what was sent.
+    /// Frames of this channel were lost while it was in progress, so it may differ from what was sent.
     pub frames_lost: bool,
 }
 
 /// A sender or receiver.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Party {
-    /// Not known, or nobody in particular.
+    /// Unknown, or nobody in particular.
     Unknown,
-    /// All who listen.
+    /// All listeners.
     Everyone,
-    /// Whoever uses this identifier.
+    /// The user of this identifier.
     Id(Id),
-    /// Whoever uses this identifier with this address in the first data byte.
+    /// The user of this identifier with this address in the first data byte.
     Addressed(Id, u8),
     /// A node by its number or address.
     Node(u8),
@@ -64,24 +65,24 @@ pub struct Field {
     pub value: Value,
     /// The value's unit; empty without one.
     pub unit: Cow<'static, str>,
-    /// What the value stands for.
+    /// The meaning of the value.
     pub text: Option<Cow<'static, str>>,
 }
 
 /// A field's value.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Value {
-    /// A whole number that people know in decimal.
+    /// An integer usually written in decimal.
     Number(i64),
-    /// A number that people know in hexadecimal, with at least this many digits.
+    /// A number usually written in hexadecimal, with at least this many digits.
     Hex(u64, u8),
     /// A physical value.
     Real(f64),
     /// A text.
     Text(Cow<'static, str>),
-    /// Bytes without a meaning known here.
+    /// Bytes whose meaning is unknown.
     Bytes(Vec<u8>),
-    /// There is no value: not available, or not to be read.
+    /// There is no value: not available, or unreadable.
     Missing,
 }
 
@@ -92,45 +93,45 @@ pub enum Trouble {
     /// Frames are missing or out of order.
     #[error("frame {got} came instead of {expected}")]
     Sequence {
-        /// The sequence number that was due.
+        /// The expected sequence number.
         expected: u32,
-        /// The one that came.
+        /// The one received.
         got: u32,
     },
     /// The other side, or the next frame, did not come in time.
     #[error("nothing came for {after_ms} ms")]
     Timeout {
-        /// How long was waited, in milliseconds.
+        /// How long we waited, in milliseconds.
         after_ms: u32,
     },
-    /// A new one of the same sender began before it was complete.
+    /// Before it was complete, the same sender began a new one.
     #[error("the next one began before it was complete")]
     Overlapped,
     /// The receiver has no room for it.
     #[error("refused by the receiver: too long for it")]
     Overflow,
-    /// One side ended it.
+    /// One side aborted it.
     #[error("aborted: {0}")]
     Aborted(&'static str),
     /// The trace ended.
     #[error("the trace ends here")]
     Unfinished,
-    /// More were under way than are kept in memory.
+    /// More transfers were in progress than are kept in memory.
     #[error("given up: too many were under way")]
     GivenUp,
-    /// It is longer than what is kept in memory.
+    /// It is longer than the limit kept in memory.
     #[error("too long to be kept: the first bytes only")]
     Cut,
-    /// It is not as the protocol has it.
+    /// It violates the protocol.
     #[error("malformed: {0}")]
     Malformed(&'static str),
-    /// What it belongs to was not heard.
+    /// Its beginning was not observed.
     #[error("its beginning was not heard")]
     Headless,
 }
 
 impl Trouble {
-    /// One word for programs.
+    /// A word for programs.
     pub const fn code(&self) -> &'static str {
         match self {
             Self::Sequence { .. } => "sequence",
@@ -152,12 +153,12 @@ impl Field {
         Self { name: name.into(), value, unit: Cow::Borrowed(""), text: None }
     }
 
-    /// A number that people know in decimal.
+    /// An integer usually written in decimal.
     pub fn number(name: impl Into<Cow<'static, str>>, value: impl Into<i64>) -> Self {
         Self::new(name, Value::Number(value.into()))
     }
 
-    /// A number that people know in hexadecimal.
+    /// A number usually written in hexadecimal.
     pub fn hex(name: impl Into<Cow<'static, str>>, value: impl Into<u64>, digits: u8) -> Self {
         Self::new(name, Value::Hex(value.into(), digits))
     }
@@ -172,7 +173,7 @@ impl Field {
         Self::new(name, Value::Text(value.into()))
     }
 
-    /// Bytes without a meaning known here.
+    /// Bytes whose meaning is unknown.
     pub fn bytes(name: impl Into<Cow<'static, str>>, value: &[u8]) -> Self {
         Self::new(name, Value::Bytes(value.to_vec()))
     }
@@ -182,14 +183,14 @@ impl Field {
         Self::new(name, Value::Missing)
     }
 
-    /// With what the value stands for.
+    /// Adds the meaning of the value.
     #[must_use]
     pub fn meaning(mut self, text: Option<impl Into<Cow<'static, str>>>) -> Self {
         self.text = text.map(Into::into);
         self
     }
 
-    /// With a unit.
+    /// Adds a unit.
     #[must_use]
     pub fn unit(mut self, unit: impl Into<Cow<'static, str>>) -> Self {
         self.unit = unit.into();
@@ -210,7 +211,7 @@ impl Value {
 }
 
 impl Event {
-    /// An event without fields, of one frame.
+    /// An event without fields, for one frame.
     pub fn new(
         protocol: Protocol,
         record: &TraceRecord,
@@ -235,7 +236,7 @@ impl Event {
         }
     }
 
-    /// The field of this name.
+    /// The field with this name.
     pub fn field(&self, name: &str) -> Option<&Field> {
         self.fields.iter().find(|field| field.name == name)
     }
@@ -248,7 +249,7 @@ impl From<Id> for Party {
 }
 
 impl fmt::Display for Party {
-    /// `7E0`, `6F1/12`, `5`, `all`; `?` where nobody is known.
+    /// `7E0`, `6F1/12`, `5`, `all`; `?` if unknown.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Unknown => f.write_str("?"),
@@ -288,12 +289,12 @@ pub(crate) fn hex(bytes: &[u8]) -> String {
     text
 }
 
-/// Up to here, a value's product with ten million is known to a quarter of a thousandth.
+/// Below this, a value's product with ten million is exact to a quarter of a thousandth.
 const MOST_IN_WHOLE_NUMBERS: f64 = 109_951.0;
 
-/// Seven decimals at most, as positions have, and none that say nothing.
+/// At most seven decimals, as positions have, without trailing zeros.
 fn write_real(f: &mut fmt::Formatter<'_>, value: f64) -> fmt::Result {
-    // With whole numbers that takes a fifth of the time. What may have to be rounded the other way is left to the digits.
+    // Whole numbers are faster than the digits of a float. Values near a half go the slow way, so that rounding is the same.
     let scaled = value.abs() * 1e7;
     let from_half = (scaled.fract() - 0.5).abs();
     if value.abs() < MOST_IN_WHOLE_NUMBERS && scaled >= 1.0 && from_half > 1e-3 {

@@ -1,7 +1,7 @@
 #![doc = include_str!("../README.md")]
 //!
-//! An [`Assembler`] takes records and gives [`Event`]s. [`Conversations`] runs those of several protocols; a [`Survey`] says which of
-//! them a bus speaks.
+//! An [`Assembler`] takes records and returns [`Event`]s. [`Conversations`] runs the assemblers of several protocols; a [`Survey`]
+//! finds out which of them are used on a bus.
 
 #![forbid(unsafe_code)]
 

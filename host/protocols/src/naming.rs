@@ -1,14 +1,15 @@
-//! One way of naming what events say: the protocol, a dot, and the field: `uds.sid`, `j1939.pgn`, `canopen.node`.
+//! Names for the content of events: the protocol, a dot, and the field: `uds.sid`, `j1939.pgn`, `canopen.node`.
 //!
-//! A field's name is that in the event, in small letters, with `_` for whatever is neither letter nor digit: `nmea2000.cog_reference`.
-//! The second of a name is `NAME_2`, as in JSON; without a number, each of them. Every event has also what [`COMMON`] lists.
+//! A field has its name in the event, in lower case, with `_` for everything that is neither a letter nor a digit:
+//! `nmea2000.cog_reference`. The second field with a name is `NAME_2`, as in JSON; without a number, all of them are meant. Every
+//! event also has the names in [`COMMON`].
 
 use cantap_signals::condition::Said;
 use cantap_trace::TraceRecord;
 
 use crate::{Event, Field, Party, Protocol, Value};
 
-/// What every event may be asked for, beside its own fields, which go before these.
+/// The names that every event has besides its own fields, which take precedence.
 pub const COMMON: [(&str, &str); 13] = [
     ("kind", "what kind of event it is, such as exchange"),
     ("title", "the service, message or parameter group"),
@@ -28,7 +29,7 @@ pub const COMMON: [(&str, &str); 13] = [
     ("frames_lost", "there, and 1, if frames were lost meanwhile"),
 ];
 
-/// A field's name as conditions and columns have it.
+/// A field's name in conditions and columns.
 pub fn plain(name: &str) -> String {
     let mut plain = String::with_capacity(name.len());
     for letter in name.chars() {
@@ -42,7 +43,7 @@ pub fn plain(name: &str) -> String {
 }
 
 fn is_plain(name: &str, wanted: &str) -> bool {
-    // Most names are as they should be already.
+    // Most names are already in this form.
     name == wanted || plain(name) == wanted
 }
 
@@ -53,7 +54,7 @@ pub fn parts(name: &str) -> Option<(Protocol, String)> {
     Some((protocol.parse().ok()?, field)).filter(|(_, field)| !field.is_empty())
 }
 
-/// A value that a name stands for.
+/// A value for a name.
 enum Named<'a> {
     Field(&'a Field),
     Number(f64),
@@ -61,17 +62,17 @@ enum Named<'a> {
 }
 
 impl Event {
-    /// Whether something went wrong: a refusal, a request without a response, a transfer that broke, frames that are missing.
+    /// Whether something went wrong: a refusal, an unanswered request, a broken transfer, missing frames.
     pub fn is_fault(&self) -> bool {
         self.trouble.is_some() || self.frames_lost || self.kind == "refusal"
     }
 
-    /// The node that said it, or that it was said to.
+    /// The node that sent it, or that it was sent to.
     pub fn node(&self) -> Option<u8> {
         self.from.node().or(self.to.node())
     }
 
-    /// Its fields of this name, which must be plain.
+    /// Its fields with this name, which must be in plain form.
     fn named<'a>(&'a self, wanted: &'a str) -> Vec<Named<'a>> {
         let all = |wanted: &str| {
             self.fields
@@ -114,7 +115,7 @@ impl Event {
         }
     }
 
-    /// What a condition's name asks of it; `None` for another protocol's.
+    /// The values for a condition's name; `None` if it belongs to another protocol.
     fn asked<'a>(&'a self, field: &'a mut String, name: &str) -> Option<Vec<Named<'a>>> {
         let (protocol, plain) = parts(name)?;
         *field = plain;

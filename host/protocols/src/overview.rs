@@ -1,7 +1,8 @@
-//! What a bus is made of, by what was said on it: its nodes with their states and trouble codes, the objects that were read, written
-//! or sent, and how long responses take.
+//! An inventory of a bus, from what was said on it: its nodes with their states and trouble codes, the objects that were read,
+//! written or sent, and response times.
 //!
-//! Memory: so many nodes, services and objects as the constants here say; what comes beyond is counted.
+//! Memory is limited by the numbers of nodes, services and objects in the constants here; anything beyond is
+//! counted.
 
 use std::collections::BTreeMap;
 
@@ -12,12 +13,12 @@ use crate::{Event, Party, Protocol, Trouble, Value};
 const MOST_NODES: usize = 1024;
 const MOST_SERVICES: usize = 256;
 const MOST_OBJECTS: usize = 8192;
-/// Lists of trouble codes of a node: confirmed, pending, previously active.
+/// Number of trouble code lists per node: confirmed, pending, previously active.
 const MOST_LISTS: usize = 8;
-/// Characters that are kept of a value.
+/// How many characters of a value are kept.
 const MOST_TEXT: usize = 256;
 
-/// Counts what events say.
+/// Collects figures from events.
 #[derive(Clone, Debug, Default)]
 pub struct Overview {
     services: BTreeMap<(u8, Protocol, String), ServiceFigures>,
@@ -26,20 +27,20 @@ pub struct Overview {
     left_out: u64,
 }
 
-/// How often a service was used, and how long its responses took.
+/// How often a service was used, and its response times.
 #[derive(Clone, Debug, Default)]
 pub struct ServiceFigures {
-    /// Requests and their responses, or messages of a kind.
+    /// Number of requests with their responses, or messages of a kind.
     pub count: u64,
-    /// Those in which something went wrong.
+    /// Number of those in which something went wrong.
     pub faults: u64,
-    /// Requests that nobody answered.
+    /// Number of unanswered requests.
     pub unanswered: u64,
-    /// From the end of the request to the first frame of its response.
+    /// Times from the end of a request to the first frame of its response.
     pub responses: Histogram,
 }
 
-/// Times in nanoseconds: least and most as they were, what lies between within 0.1 %.
+/// Times in nanoseconds: exact minimum and maximum, the rest within 0.1 %.
 #[derive(Clone, Debug, Default)]
 pub struct Histogram {
     counts: Option<Box<Counts<u32>>>,
@@ -54,55 +55,55 @@ pub struct KnownNode {
     pub first_ns: i64,
     /// See [`Self::first_ns`].
     pub last_ns: i64,
-    /// What it had to do with.
+    /// Number of events that involved it.
     pub events: u64,
-    /// Those in which something went wrong.
+    /// Number of those in which something went wrong.
     pub faults: u64,
     /// Its state: CANopen's, or that it is missing.
     pub state: Option<String>,
-    /// The time between two heartbeats in milliseconds, once one was missed.
+    /// The heartbeat period in milliseconds, once a heartbeat was missed.
     pub period_ms: Option<f64>,
-    /// How often a heartbeat or the answer to a guard was missed.
+    /// How often a heartbeat or the answer to a guarding request was missed.
     pub missed: u64,
-    /// Who it is: a VIN, the function and manufacturer of a NAME.
+    /// Its identity: a VIN, or the function and manufacturer in a NAME.
     pub identity: Option<String>,
-    /// Its trouble codes, by the list that they were in.
+    /// Its trouble codes, by list.
     pub codes: BTreeMap<String, String>,
 }
 
 /// Something of a node that was read, written or sent.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct KnownObject {
-    /// Its name, where it is known.
+    /// Its name, if known.
     pub name: Option<String>,
     /// How often.
     pub count: u64,
-    /// Its last value as text, where it is one that need not change.
+    /// Its last value as text, if it is of a kind that need not change.
     pub value: Option<String>,
-    /// It has had several values.
+    /// It has had different values.
     pub varies: bool,
 }
 
 impl Histogram {
     fn add(&mut self, ns: i64) {
         if self.counts.is_none() {
-            // A tenth of a microsecond is finer than any stamp is good; three digits are what memory is worth.
+            // A tenth of a microsecond is finer than any stamp; three digits are a reasonable use of memory.
             self.counts = Counts::new(3).ok().map(Box::new);
             (self.least_ns, self.most_ns) = (ns, ns);
         }
         (self.least_ns, self.most_ns) = (self.least_ns.min(ns), self.most_ns.max(ns));
         if let Some(counts) = &mut self.counts {
-            // It grows as it needs to: only what no memory could hold would not be counted.
+            // It grows as needed; only a value too large for memory would not be counted.
             let _ = counts.record((ns.max(0) / UNIT_NS).unsigned_abs());
         }
     }
 
-    /// How many times there are.
+    /// The number of times.
     pub fn count(&self) -> u64 {
         self.counts.as_ref().map_or(0, |counts| counts.len())
     }
 
-    /// The time, in milliseconds, that so many percent of them do not exceed: 0 for the least, 100 for the most.
+    /// The time in milliseconds that this percentage does not exceed: 0 for the minimum, 100 for the maximum.
     pub fn percentile_ms(&self, percent: f64) -> Option<f64> {
         let counts = self.counts.as_ref()?;
         let ns = if percent <= 0.0 {
@@ -149,13 +150,14 @@ impl Overview {
         })
     }
 
-    /// What was not counted because there are too many.
+    /// The number of items not counted because there were too many.
     pub const fn left_out(&self) -> u64 {
         self.left_out
     }
 
     fn service(&mut self, event: &Event) {
-        // Only where somebody answers: what is sent by itself has its period in the statistics of its identifier.
+        // Only if somebody answers: what is sent without being asked has its period in the statistics of its
+        // identifier.
         if event.response_ns.is_none() && event.kind != "no_response" {
             return;
         }
@@ -233,7 +235,7 @@ impl Overview {
     }
 }
 
-/// The entry, which is made where there is room.
+/// The entry, created if there is room.
 fn entry<K: Ord, V: Default>(map: &mut BTreeMap<K, V>, key: K, most: usize) -> Option<&mut V> {
     if map.len() >= most && !map.contains_key(&key) {
         return None;
@@ -266,7 +268,7 @@ fn text(field: &crate::Field) -> Option<String> {
     }
 }
 
-/// Services as people count them: SDO's by what they do, not by object.
+/// Services as people would count them: those of SDO by what they do, not by object.
 fn service_name(event: &Event) -> String {
     match event.kind {
         "sdo_read" => "SDO read".to_owned(),
@@ -276,11 +278,11 @@ fn service_name(event: &Event) -> String {
     }
 }
 
-/// Whom the event is about: the server that was asked, or the sender.
+/// The party that the event is about: the server that was asked, or the sender.
 fn subject(event: &Event) -> Option<Party> {
     let known = |party: Party| (!matches!(party, Party::Unknown | Party::Everyone)).then_some(party);
     match event.protocol {
-        // A request that nobody answers says nothing about a node, and one to all nothing about any.
+        // An unanswered request says nothing about a node, and one to all says nothing about any.
         Protocol::J1939 | Protocol::Nmea2000 if event.kind == "no_response" => known(event.to),
         Protocol::J1939 | Protocol::Nmea2000 | Protocol::IsoTp => known(event.from),
         Protocol::Uds | Protocol::Kwp2000 | Protocol::Obd => match event.kind {
@@ -296,7 +298,7 @@ fn subject(event: &Event) -> Option<Party> {
     }
 }
 
-/// Who a NAME says that a node is.
+/// The identity of a node according to its NAME.
 fn identity(event: &Event) -> String {
     let part = |name: &str| {
         let field = event.field(name)?;
@@ -306,7 +308,8 @@ fn identity(event: &Event) -> String {
     parts.collect::<Vec<_>>().join(", ")
 }
 
-/// The object that an event is about: its number, its name, and its value where it is one that need not change.
+/// The object that an event is about: its number, its name, and its value if it is of a kind that need not
+/// change.
 fn object(event: &Event) -> Option<(String, Option<String>, Option<String>)> {
     let field = |name: &str| event.field(name);
     let meaning = |name: &str| field(name).and_then(|field| field.text.as_ref()).map(ToString::to_string);

@@ -1,13 +1,13 @@
-//! The protocols, by name.
+//! Protocols and their names.
 
 use std::fmt;
 use std::str::FromStr;
 
-/// A protocol that events are of.
+/// The protocol of an event.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 #[non_exhaustive]
 pub enum Protocol {
-    /// Transfers of ISO 15765-2 whose content is no known service.
+    /// Transfers of ISO 15765-2 whose content is not a known service.
     IsoTp,
     /// Diagnostic services of ISO 14229.
     Uds,
@@ -38,7 +38,7 @@ impl Protocol {
         Self::DeviceNet,
     ];
 
-    /// As it is called in text, JSON and on the command line.
+    /// Its name in text, JSON and on the command line.
     pub const fn name(self) -> &'static str {
         match self {
             Self::IsoTp => "isotp",
@@ -68,7 +68,7 @@ impl fmt::Display for Protocol {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("there is no protocol '{name}'; there are {}", Protocol::ALL.map(Protocol::name).join(", "))]
 pub struct UnknownProtocol {
-    /// What was given.
+    /// The given name.
     pub name: String,
 }
 
@@ -86,7 +86,8 @@ impl FromStr for Protocol {
 mod tests {
     use super::*;
 
-    /// A protocol that is missing in the list could not be asked for by its name. The last one's number is the list's length.
+    /// A protocol that is missing from the list could not be selected by name. The last one's number must match the list's
+    /// length.
     #[test]
     fn every_protocol_can_be_named() {
         assert_eq!(Protocol::ALL.len(), Protocol::DeviceNet as usize + 1);

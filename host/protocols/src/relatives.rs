@@ -1,16 +1,17 @@
-//! Old relatives, which are named and not read: OSEK network management and CAN Kingdom, by what their frames look like.
+//! Related old protocols that are recognised but not decoded: OSEK network management and CAN Kingdom, by what their
+//! frames look like.
 
 use std::fmt;
 
 use cantap_trace::TraceFrame;
 
-/// A protocol that is recognised, and not decoded.
+/// A protocol that is recognised but not decoded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 #[non_exhaustive]
 pub enum Relative {
-    /// OSEK/VDX network management, direct monitoring: a token goes round a ring of nodes.
+    /// OSEK/VDX network management, direct monitoring: a token circulates in a ring of nodes.
     OsekNm {
-        /// The identifiers of the ring without their low byte, which is the node.
+        /// The identifiers of the ring without their low byte, which is the node number.
         base: u32,
     },
     /// CAN Kingdom: the king tells cities what to do, with identifier 0.
@@ -28,9 +29,9 @@ impl fmt::Display for Relative {
     }
 }
 
-/// So many times must the token have been handed on to the node that it was meant for.
+/// How often the token must have been passed on by the node it was meant for.
 const HANDED_ON: u32 = 4;
-/// Rings that are looked at: bases of 11-bit identifiers.
+/// How many rings are tracked: bases of 11-bit identifiers.
 const BASES: usize = 8;
 
 /// Counts on one channel.
@@ -40,20 +41,20 @@ pub(crate) struct Relatives {
     king: King,
 }
 
-/// One base's frames.
+/// The frames of one base.
 #[derive(Clone, Copy, Debug, Default)]
 struct Ring {
-    /// Whom the last ring message was for.
+    /// The receiver of the last ring message.
     next: Option<u8>,
     handed_on: u32,
-    /// Ring messages of somebody else, and frames that are no messages of network management.
+    /// Ring messages from other nodes, and frames that are not network management messages.
     other: u32,
 }
 
 /// Frames with identifier 0.
 #[derive(Clone, Copy, Debug, Default)]
 struct King {
-    /// Which of the pages 0, 1, 2, 3, 4 and 16 there were, a bit each.
+    /// Which of the pages 0, 1, 2, 3, 4 and 16 occurred, one bit each.
     pages: u32,
     other: u32,
 }
@@ -70,7 +71,8 @@ impl Relatives {
             return;
         }
         let ring = &mut self.rings[(id >> 8) as usize & (BASES - 1)];
-        // Receiver, then what the message is: alive, ring or limp home, with sleep indication and acknowledgement.
+        // The receiver, then the kind of message: alive, ring or limp home, with sleep indication and
+        // acknowledgement.
         let [to, code, ..] = data else {
             ring.other += 1;
             return;
@@ -78,7 +80,7 @@ impl Relatives {
         match code & 0xCF {
             1 | 4 if data.len() == 8 => {}
             2 if data.len() == 8 => match ring.next.replace(*to) {
-                // A ring of one sends to itself, as any constant does.
+                // A ring of one node sends to itself, as would any constant.
                 Some(due) if due == id as u8 && *to != id as u8 => ring.handed_on += 1,
                 Some(_) => ring.other += 1,
                 None => {}
@@ -87,7 +89,7 @@ impl Relatives {
         }
     }
 
-    /// What was seen.
+    /// The protocols recognised.
     pub fn found(&self) -> Vec<Relative> {
         let rings = self
             .rings
@@ -103,7 +105,7 @@ impl Relatives {
 }
 
 impl King {
-    /// City, page, and what the page says.
+    /// City, page, and the content of the page.
     fn take(&mut self, data: &[u8]) {
         match data {
             [_, page @ (0..=4 | 16), ..] if data.len() == 8 => self.pages |= 1 << page,

@@ -1,4 +1,4 @@
-//! Which protocols a bus speaks, by what only they would do.
+//! Finds out which protocols are used on a bus, by signs that are specific to them.
 
 use cantap_trace::TraceRecord;
 use rustc_hash::FxHashMap;
@@ -11,32 +11,32 @@ use crate::nmea2000;
 use crate::relatives::{Relative, Relatives};
 use crate::{Assembler, Event, Protocol};
 
-/// Looks at the first records of a trace or a bus.
+/// Examines the first records of a trace or a bus.
 #[derive(Clone, Debug, Default)]
 pub struct Survey {
     diagnostics: Diagnostics,
     events: Vec<Event>,
     seen: FxHashMap<(u8, Protocol), u32>,
-    /// Extended frames: those of NMEA 2000's groups, of J1939's, and all.
+    /// Numbers of extended frames: those of NMEA 2000's groups, those of J1939's, and all.
     extended: FxHashMap<u8, [u32; 3]>,
     canopen: FxHashMap<u8, canopen::CanOpenSigns>,
     devicenet: FxHashMap<u8, devicenet::DeviceNetSigns>,
     relatives: FxHashMap<u8, Relatives>,
 }
 
-/// That a channel speaks a protocol.
+/// Evidence that a channel uses a protocol.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Evidence {
     /// The channel, from 1.
     pub channel: u8,
     /// The protocol.
     pub protocol: Protocol,
-    /// How many messages showed it.
+    /// The number of messages that indicate it.
     pub messages: u32,
 }
 
 impl Survey {
-    /// Nothing seen so far.
+    /// Nothing has been seen yet.
     pub fn new() -> Self {
         Self { diagnostics: Diagnostics::new(&[], true), ..Self::default() }
     }
@@ -68,7 +68,7 @@ impl Survey {
         }
     }
 
-    /// Protocols that are recognised and not read, by channel.
+    /// Protocols that are recognised but not decoded, by channel.
     pub fn relatives(&self) -> Vec<(u8, Relative)> {
         let found = self.relatives.iter().flat_map(|(channel, relatives)| {
             relatives.found().into_iter().map(|relative| (*channel, relative))
@@ -78,7 +78,7 @@ impl Survey {
         found
     }
 
-    /// What was seen, by channel.
+    /// The protocols found, by channel.
     pub fn found(&self) -> Vec<Evidence> {
         let mut found: Vec<_> = self
             .seen
@@ -86,7 +86,7 @@ impl Survey {
             .map(|(&(channel, protocol), &messages)| Evidence { channel, protocol, messages })
             .collect();
         for (&channel, &[marine, vehicle, all]) in &self.extended {
-            // Other 29-bit traffic hits a known number now and then.
+            // Other 29-bit traffic occasionally matches a known number.
             let enough = |known: u32| known > 1 && known > all / 10;
             let protocol = match (enough(marine), enough(vehicle)) {
                 (true, _) => Protocol::Nmea2000,
@@ -103,7 +103,7 @@ impl Survey {
         }
         for (&channel, signs) in &self.devicenet {
             let messages = signs.count();
-            // CANopen's SDO servers have identifiers that are DeviceNet's, too.
+            // CANopen's SDO servers use identifiers that also occur in DeviceNet.
             let is_canopen = self.canopen.get(&channel).is_some_and(|signs| signs.count() > 0);
             if messages > 0 && !is_canopen {
                 found.push(Evidence { channel, protocol: Protocol::DeviceNet, messages });

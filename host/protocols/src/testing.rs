@@ -1,4 +1,4 @@
-//! Records for the tests.
+//! Records for tests.
 
 use std::fmt::Write as _;
 
@@ -13,13 +13,13 @@ pub fn at(time_ms: f64, frame: &str) -> TraceRecord {
     TraceRecord { time_ns: (time_ms * 1e6) as i64, channel: 1, event }
 }
 
-/// A frame of channel 1 was lost.
+/// A lost frame on channel 1.
 pub fn lost(time_ms: f64) -> TraceRecord {
     let event = TraceEvent::Lost { stage: Some(LossStage::Queue), count: 1, at_least: false };
     TraceRecord { time_ns: (time_ms * 1e6) as i64, channel: 1, event }
 }
 
-/// As in a frame's text.
+/// Formatted as in a frame's text.
 pub fn hex(bytes: &[u8]) -> String {
     bytes.iter().fold(String::new(), |mut text, byte| {
         write!(text, "{byte:02X}").unwrap();
@@ -39,7 +39,7 @@ pub fn disturb<T: Clone>(frames: &mut Vec<T>, random: &mut fastrand::Rng) {
     }
 }
 
-/// What an assembler makes of the records.
+/// The events that an assembler makes from the records.
 pub fn events(mut assembler: impl Assembler, records: &[TraceRecord]) -> Vec<Event> {
     let mut events = Vec::new();
     for record in records {
@@ -49,7 +49,7 @@ pub fn events(mut assembler: impl Assembler, records: &[TraceRecord]) -> Vec<Eve
     events
 }
 
-/// The same, of frames at times in milliseconds, in words.
+/// The same as text, for frames with times in milliseconds.
 pub fn said(assembler: impl Assembler, frames: &[(f64, &str)]) -> Vec<String> {
     let records: Vec<_> = frames.iter().map(|(ms, frame)| at(*ms, frame)).collect();
     events(assembler, &records).iter().map(ToString::to_string).collect()

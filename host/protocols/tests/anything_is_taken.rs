@@ -1,5 +1,5 @@
-//! The properties of the fuzz targets, with random bytes: nothing panics, every event can be written, and memory is flat under a flood
-//! of messages that are never finished.
+//! The properties checked by the fuzz targets, with random bytes: nothing panics, every event can be written, and memory stays flat
+//! under a flood of messages that are never finished.
 
 use cantap_protocols::canopen::Sheet;
 use cantap_protocols::canopen::eds::Eds;
@@ -16,7 +16,7 @@ fn record(time_ns: i64, id: Id, data: &[u8]) -> TraceRecord {
     TraceRecord { time_ns, channel: 1, event }
 }
 
-/// Identifiers that protocols know, few of each, so that frames meet.
+/// Identifiers that protocols use, few of each, so that frames collide.
 fn known_id(random: &mut fastrand::Rng) -> Id {
     let node = random.u32(0..4);
     match random.u8(0..8) {
@@ -48,7 +48,7 @@ fn any_frames_are_taken_by_every_protocol_and_each_event_can_be_written() {
         for _ in 0..20_000 {
             time_ns += random.i64(0..3_000_000);
             let mut data: Vec<u8> = (0..random.usize(0..9)).map(|_| random.u8(..)).collect();
-            // What begins, goes on and ends.
+            // Frames that begin, continue and end transfers.
             if let Some(first) = data.first_mut().filter(|_| random.bool()) {
                 *first = [0x10, 0x20, 0x21, 0x22, 0x30, 0x03, 0x40, 0x43, 0x60, 0x80][random.usize(0..10)];
             }
@@ -96,14 +96,14 @@ fn any_text_is_taken_as_a_sheet() {
     }
 }
 
-/// This process's memory that is in use, in bytes.
+/// This process's memory in use, in bytes.
 #[cfg(target_os = "linux")]
 fn resident() -> usize {
     let text = std::fs::read_to_string("/proc/self/statm").unwrap();
     text.split(' ').nth(1).unwrap().parse::<usize>().unwrap() * 4096
 }
 
-/// What begins a message of a protocol, by a count: ever new senders, as far as the protocol has them, none of which goes on.
+/// Begins a message of a protocol, numbered by a count: as many senders as the protocol has, none of which completes it.
 #[cfg(target_os = "linux")]
 type Beginning = fn(u32) -> (Id, Vec<u8>);
 
@@ -139,9 +139,9 @@ const BEGINNINGS: [(&str, &[Protocol], Beginning); 9] = [
         (Id::extended_truncated(0x0DF8_0500 | at & 0xFF), vec![(at >> 8 << 5) as u8, 223, 1, 2, 3, 4, 5, 6])
     }),
     ("SDO segments", &[Protocol::CanOpen], |at| {
-        let (node, toggle) = (at / 64 % 127 + 1, (at % 2 * 0x10) as u8);
-        // A write without an end, which is begun anew after 63 segments.
-        let bytes = if at.is_multiple_of(64) { vec![0x20, 0, 0x20, 1, 0, 0, 0, 0] } else { vec![toggle; 8] };
+        let node = at / 64 % 127 + 1;
+        // A write that never ends, restarted after 63 segments.
+        let bytes = if at.is_multiple_of(64) { vec![0x20, 0, 0x20, 1, 0, 0, 0, 0] } else { vec![0; 8] };
         (Id::standard_truncated(0x600 + node), bytes)
     }),
     // Each write gives a node another SDO channel, on which a transfer begins.
@@ -156,7 +156,7 @@ const BEGINNINGS: [(&str, &[Protocol], Beginning); 9] = [
             2 => (Id::standard_truncated(0x600 + node), vec![0x23, low, high, 2, id_low, 5, 0, 0]),
             3 => (Id::standard_truncated(0x580 + node), vec![0x60, low, high, 2, 0, 0, 0, 0]),
             4 => (Id::standard_truncated(request), vec![0x20, 0, 0x20, 1, 0, 0, 0, 0]),
-            _ => (Id::standard_truncated(request), vec![((place % 2) * 0x10) as u8; 8]),
+            _ => (Id::standard_truncated(request), vec![0; 8]),
         }
     }),
     // The first fragment and those in the middle, without a last one.

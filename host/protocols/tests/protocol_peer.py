@@ -1,4 +1,4 @@
-"""Other people's nodes on a simulated bus, and other people's decoders, for protocols_agree_with_peers.rs.
+"""Nodes of other programs on a simulated bus, and other decoders, for protocols_agree_with_peers.rs.
 
 isotp, uds, canopen, j1939     two nodes talk; prints each frame as "MILLISECONDS ID#DATA", and what was said as "= JSON"
 nmea2000 LOG                   prints canboat's reading of a candump log, one JSON object per message
@@ -15,7 +15,7 @@ import can
 
 
 class Listener(can.Listener):
-    """Remembers every frame in the order of the bus."""
+    """Records every frame in bus order."""
 
     def __init__(self):
         self.frames = []
@@ -266,7 +266,7 @@ def talk_j1939():
     return said
 
 
-# The types of fields that nothing is in: reserved and spare.
+# The types of unused fields: reserved and spare.
 UNUSED = ([19], [20])
 
 
@@ -308,7 +308,7 @@ def read_eds(paths):
         print("file", path)
         dictionary = canopen.import_od(path)
         for index, thing in sorted(dictionary.items()):
-            # Below are the data types, which are mapped where a PDO has room that nothing is in.
+            # Lower numbers are data types, which are mapped to unused space in a PDO.
             if index < 0x20:
                 continue
             if isinstance(thing, canopen.objectdictionary.ODVariable):

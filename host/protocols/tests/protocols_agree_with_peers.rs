@@ -1,8 +1,9 @@
-//! Other people's nodes talk on a simulated bus and we say what they said: can-isotp, udsoncan, python-canopen, can-j1939. Canboat's
-//! own decoder, in the package nmea2000, and we read the same recorded boat; python-canopen and we the same sheets.
+//! Nodes of other programs talk on a simulated bus and our events match what they said: can-isotp, udsoncan, python-canopen,
+//! can-j1939. Canboat's own decoder, from the package nmea2000, reads the same recorded boat as we do; python-canopen reads the same
+//! sheets.
 //!
-//! The Python that has them is in `CANTAP_PYTHON`, else `python3`. A peer that is missing is named and its test passes, unless
-//! `CANTAP_REQUIRE_PEERS=1`.
+//! The Python that has them is `CANTAP_PYTHON`, otherwise `python3`. If a peer is missing, it is named and its test passes,
+//! unless `CANTAP_REQUIRE_PEERS=1`.
 
 use std::io::Read;
 use std::process::Command;
@@ -14,7 +15,7 @@ use cantap_trace::{Direction, TraceEvent, TraceRecord};
 const SCRIPT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/protocol_peer.py");
 const BOAT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../formats/tests/data/nmea2000.log.gz");
 
-/// What the script prints, or `None` after saying that a module is missing.
+/// The output of the script, or `None` after reporting that a module is missing.
 fn peer(module: &str, arguments: &[&str]) -> Option<String> {
     let python = std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned());
     let probe = Command::new(&python).args(["-c", &format!("import can, {module}")]).output();
@@ -34,7 +35,7 @@ fn record(time_ns: i64, frame: &str) -> TraceRecord {
     TraceRecord { time_ns, channel: 1, event }
 }
 
-/// The frames that a talk printed, and what was said.
+/// The frames printed by a talk, and what was said.
 fn talk(module: &str, what: &str) -> Option<(Vec<TraceRecord>, Vec<serde_json::Value>)> {
     let text = peer(module, &[what])?;
     let (mut records, mut said) = (Vec::new(), Vec::new());
@@ -73,7 +74,7 @@ fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02X}")).collect::<Vec<_>>().concat()
 }
 
-/// Whether a field is what the peer has for it.
+/// Whether a field has the peer's value.
 fn agrees(event: &Event, name: &str, value: &serde_json::Value) -> bool {
     match name {
         "kind" => return event.kind == value,
@@ -84,7 +85,7 @@ fn agrees(event: &Event, name: &str, value: &serde_json::Value) -> bool {
         _ => {}
     }
     if let Some(of) = name.strip_suffix("_text") {
-        // Each writes it in its own way: InvalidKey, invalidKey.
+        // They are spelt differently: InvalidKey, invalidKey.
         let plain = |text: &str| text.to_lowercase().replace([' ', '-'], "");
         let text = event.field(of).and_then(|field| field.text.as_deref()).unwrap_or_default();
         return value.as_str().is_some_and(|value| plain(value).contains(&plain(text)) && !text.is_empty());
@@ -97,7 +98,7 @@ fn agrees(event: &Event, name: &str, value: &serde_json::Value) -> bool {
     }
 }
 
-/// Each thing that was said is an event, in this order.
+/// Checks that everything said is an event, in this order.
 fn all_are_there(events: &[Event], said: &[serde_json::Value]) {
     let text: Vec<_> = events.iter().map(ToString::to_string).collect();
     let mut rest = events.iter();
@@ -146,14 +147,14 @@ fn python_canopens_nodes_are_understood() {
 fn can_j1939s_messages_are_put_together() {
     let Some((records, said)) = talk("j1939", "j1939") else { return };
     assert_eq!(found(&records), [Protocol::J1939]);
-    // Address claims come from both at once, in either order.
+    // Address claims come from both at the same time, in either order.
     let events = events(&records, &[Protocol::J1939]);
     for one in said {
         all_are_there(&events, &[one]);
     }
 }
 
-/// The recorded boat, each field of each message.
+/// Compares the recorded boat, each field of each message.
 #[test]
 fn canboat_reads_the_boat_as_we_do() {
     let Some(text) = peer("nmea2000", &["nmea2000", BOAT]) else { return };
@@ -173,7 +174,7 @@ fn canboat_reads_the_boat_as_we_do() {
     let mut whole: Vec<_> = all.iter().filter(|event| event.trouble.is_none()).collect();
     let mut theirs: Vec<serde_json::Value> =
         text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
-    // Each group of each sender in its order.
+    // Each sender's groups in order.
     let pgn_of = |event: &Event| event.field("pgn").and_then(|field| field.value.as_number()).unwrap() as u64;
     whole.sort_by_key(|event| (pgn_of(event), event.from.node().map_or(254, u64::from)));
     theirs.sort_by_key(|their| (their["pgn"].as_u64(), their["source"].as_u64()));
@@ -181,7 +182,8 @@ fn canboat_reads_the_boat_as_we_do() {
     let (mut fields, mut late) = (0, 0);
     for (our, their) in whole.iter().zip(&theirs) {
         let wrong = differences(our, their, &mut fields);
-        // Where the altitude changes, theirs is that of the message before; the bytes of the log say that ours is right.
+        // Where the altitude changes, theirs is that of the previous message; the bytes in the log show that ours is
+        // right.
         let is_late = wrong.iter().all(|wrong| wrong.starts_with("129029 Altitude"));
         assert!(is_late, "{}", wrong.join("\n"));
         late += wrong.len();
@@ -189,7 +191,7 @@ fn canboat_reads_the_boat_as_we_do() {
     assert!(fields > 18_000 && late <= 4, "{fields} {late}");
 }
 
-/// Which fields of a message canboat reads in another way.
+/// The fields of a message that canboat decodes differently.
 fn differences(our: &Event, their: &serde_json::Value, fields: &mut usize) -> Vec<String> {
     let mut wrong = Vec::new();
     let pgn = their["pgn"].as_u64().unwrap();
@@ -198,11 +200,11 @@ fn differences(our: &Event, their: &serde_json::Value, fields: &mut usize) -> Ve
         wrong.push(format!("{our}: {pgn} of {}", their["source"]));
         return wrong;
     }
-    // Address claims and requests are J1939's, and have its names.
+    // Address claims and requests belong to J1939, and have its names.
     if matches!(pgn, 60_928 | 59_904 | 59_392) {
         return wrong;
     }
-    // Theirs says of groups that nobody knows which range they are in.
+    // For unknown groups, theirs gives the range they are in.
     let title = their["title"].as_str().unwrap();
     if our.title != title && !title.starts_with("0x") {
         wrong.push(format!("{}: {title}", our.title));
@@ -238,7 +240,7 @@ fn differences(our: &Event, their: &serde_json::Value, fields: &mut usize) -> Ve
     wrong
 }
 
-/// python-canopen's own sheets, where its source is at hand.
+/// Compares python-canopen's own sheets, if its source is available.
 #[test]
 fn sheets_have_every_entry_that_python_canopen_has() {
     let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data");

@@ -1,4 +1,5 @@
-//! Wireshark's dissectors and we read the same frames, field by field: iso15765, uds, obd-ii, canopen, devicenet, j1939, isobus.
+//! Wireshark's dissectors and we decode the same frames, compared field by field: iso15765, uds, obd-ii, canopen, devicenet,
+//! j1939, isobus.
 //!
 //! Without `tshark` the tests say so and pass, unless `CANTAP_REQUIRE_PEERS=1`.
 
@@ -13,10 +14,10 @@ use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
 
 const BOAT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../formats/tests/data/nmea2000.log.gz");
 
-/// A frame's fields by name, those that it has.
+/// A frame's fields by name, as far as it has them.
 type Row = HashMap<String, String>;
 
-/// What tshark says of each frame, one a millisecond; `None` after saying that it is missing.
+/// tshark's output for each frame, one per millisecond; `None` after reporting that it is missing.
 fn tshark(test: &str, frames: &[TraceFrame], decode_as: &[&str], fields: &[&str]) -> Option<Vec<Row>> {
     if !Command::new("tshark").arg("--version").output().is_ok_and(|output| output.status.success()) {
         let required = std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1");
@@ -100,13 +101,13 @@ fn ours(event: &Event, name: &str) -> Option<f64> {
     event.field(name)?.value.as_number()
 }
 
-/// Random messages of 1 to 400 bytes between two pairs, in turns.
+/// Random messages of 1 to 400 bytes between two pairs, alternating.
 fn transfers(random: &mut fastrand::Rng) -> Vec<TraceFrame> {
     let mut frames = Vec::new();
     for round in 0..60 {
         let (from, to) = if round % 3 == 0 { ("7E0", "7E8") } else { ("7E9", "7E1") };
         let length = if round % 2 == 0 { random.usize(1..8) } else { random.usize(8..400) };
-        // No service of UDS or OBD, so that nothing else has a say.
+        // Not a UDS or OBD service, so that no other dissector takes over.
         let data: Vec<u8> = (0..length).map(|_| random.u8(..)).collect();
         if length < 8 {
             frames.push(frame(from, &[&[length as u8], &data[..]].concat()));
@@ -421,7 +422,7 @@ fn devicenet_messages() {
     assert!(checks == 50 && inputs > 40, "{checks} {inputs}");
 }
 
-/// The recorded boat, and identifiers at random.
+/// The recorded boat, and random identifiers.
 #[test]
 fn j1939_headers() {
     let mut log = String::new();
@@ -438,7 +439,7 @@ fn j1939_headers() {
         let header = Header::of(frame.id()).unwrap();
         let all = [u32::from(header.priority), header.pgn, header.source.into(), header.destination.into()];
         for (name, ours) in names.iter().zip(all) {
-            // Of groups that go to all it has no receiver.
+            // For groups sent to all, it has no receiver.
             let theirs = number(row, name).or((*name == "j1939.dst_addr").then_some(255.0));
             assert_eq!(theirs, Some(f64::from(ours)), "{frame} {name} {row:?}");
         }
@@ -484,7 +485,7 @@ fn isobus_transport() {
     ];
     let names: Vec<_> = names.iter().map(String::as_str).collect();
     let Some(rows) = tshark("isobus", &frames, &["can.subdissector,isobus"], &names) else { return };
-    // Its own length of what it put together counts padding in, so the announced one is compared.
+    // Its own length of a reassembled message includes padding, so compare the announced one.
     let (mut announced, mut whole) = (None, 0);
     for (row, events) in rows.iter().zip(events(&frames, Protocol::J1939)) {
         let either = |a: usize, b: usize| number(row, names[a]).or_else(|| number(row, names[b]));

@@ -1,7 +1,7 @@
-//! A vehicle, a machine and a boat, made frame by frame, and what is said of each: the transcripts are `buses/*.txt`, the buses
-//! `buses/*.log`, which every command reads.
+//! A vehicle, a machine and a boat, made frame by frame, and what is said on each: the transcripts are `buses/*.txt`, the buses
+//! `buses/*.log`, which every command can read.
 //!
-//! After a change that is meant, write them anew with `CANTAP_OVERWRITE=1` and look at the difference.
+//! After an intended change, rewrite them with `CANTAP_OVERWRITE=1` and check the difference.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -30,7 +30,7 @@ impl Bus {
         self.now_us += ms * 1000;
     }
 
-    /// A message of ISO 15765-2, with the other side's flow control where it needs one.
+    /// An ISO 15765-2 message, with the other side's flow control if it needs that.
     fn iso_tp(&mut self, from: &str, to: &str, data: &[u8]) {
         let padded = |bytes: &[u8]| {
             let mut bytes = bytes.to_vec();
@@ -55,7 +55,7 @@ impl Bus {
         self.wait_ms(10);
     }
 
-    /// An expedited SDO transfer of node 5.
+    /// An expedited SDO transfer with node 5.
     fn sdo(&mut self, command: u8, object: [u8; 3], data: [u8; 4], answer: u8, answered: [u8; 4]) {
         self.frame("605", &[&[command], &object[..], &data].concat());
         self.frame("585", &[&[answer], &object[..], &answered].concat());
@@ -74,7 +74,8 @@ impl Bus {
     }
 }
 
-/// A workshop at a car: session, identity, codes, a refusal, a server that asks for time, one that is silent; OBD-II.
+/// A workshop at a car: session, identity, codes, a refusal, a server that asks for more time, one that is silent;
+/// OBD-II.
 fn vehicle() -> Bus {
     let mut bus = Bus::default();
     bus.ask(&[0x10, 0x03], &[0x50, 0x03, 0x00, 0x32, 0x01, 0xF4]);
@@ -101,7 +102,7 @@ fn vehicle() -> Bus {
     bus
 }
 
-/// A machine with two CANopen nodes: boot-up, a mapping that is written, transfers of each kind, an emergency, a node that goes silent.
+/// A machine with two CANopen nodes: boot-up, a mapping being written, transfers of each kind, an emergency, a node that falls silent.
 fn machine() -> Bus {
     let mut bus = Bus::default();
     bus.frame("705", &[0]);
@@ -136,7 +137,7 @@ fn machine() -> Bus {
     bus
 }
 
-/// A boat: its devices claim addresses, and tell position, engine and wind.
+/// A boat: its devices claim addresses and send position, engine and wind.
 fn boat() -> Bus {
     let mut bus = Bus::default();
     bus.frame("18EEFF05", &[0x01, 0x00, 0x20, 0xE0, 0x00, 0x91, 0x78, 0xC0]);

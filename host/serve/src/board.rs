@@ -1,4 +1,4 @@
-//! The board that is shared: the session with it, which begins anew whenever it is there, and questions to it.
+//! The shared board: the session with it, which starts again whenever the board is there, and requests to it.
 
 use std::io::{Read, Write};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -25,33 +25,33 @@ use crate::shared::{Refused, Settings, Shared, WRITE_PATIENCE, lock};
 use crate::state::{Asked, State, Then};
 use crate::stream::Entry;
 
-/// Connects to the board: the one with this serial number, if one was there before and it can be found by it.
+/// Connects to the board: the one with this serial number, if one was there before and can be found by it.
 pub type Connect = Box<dyn FnMut(Option<&str>) -> Result<Link, ConnectError> + Send>;
-/// Why it could not.
+/// Why connecting failed.
 pub type ConnectError = Box<dyn std::error::Error + Send + Sync>;
 
 /// Why a board cannot be shared.
 #[derive(Debug, thiserror::Error)]
 pub enum BoardError {
-    /// It is there, and something is wrong with it.
+    /// It is there, but something is wrong with it.
     #[error(transparent)]
     Device(#[from] DeviceError),
-    /// There is no way to it.
+    /// It cannot be reached.
     #[error(transparent)]
     Connect(ConnectError),
 }
 
-/// How long after a failure the board is tried again.
+/// Time from a failure to the next try.
 const RETRY_AFTER: Duration = Duration::from_millis(500);
-/// `Hello` is tried so often, since a board may have half a line of somebody else's in its input.
+/// How often `Hello` is tried, since a board may have half a line from another program in its input.
 const HELLO_TRIES: u32 = 3;
-/// So long for each try, and for each other question before there are clients.
+/// Time limit for each try, and for every other request before there are clients.
 const HELLO_TIMEOUT: Duration = Duration::from_millis(700);
-/// How long a server that ends waits for its clients to take its last words.
+/// How long a server that is ending waits for its clients to take its last messages.
 const LAST_WORDS: Duration = Duration::from_millis(1500);
-/// Read at a time.
+/// Bytes read at a time.
 const READ_BYTES: usize = 64 * 1024;
-/// Bytes on their way to a client in this process, and back.
+/// Bytes on their way to a client in this process, and from it.
 const PIPE_BYTES: usize = 64 * 1024;
 
 /// A shared board. Dropping it ends every session, and the board leaves its buses.
@@ -62,7 +62,7 @@ pub struct Board {
 
 impl Board {
     /// Begins a session with a board, which must be there now and may go and come back later; messages call it `name`. `news` is
-    /// told what happens, from any thread, and must not wait.
+    /// called with what happens, from any thread, and must not block.
     pub fn start(
         name: &str,
         connect: Connect,
@@ -94,24 +94,24 @@ impl Board {
         }
     }
 
-    /// What the board is, while it is there.
+    /// The board's description of itself, while it is there.
     pub fn hello(&self) -> Option<Hello> {
         self.shared.state().hello.clone()
     }
 
-    /// As messages call it.
+    /// Its name in messages.
     pub fn name(&self) -> &str {
         &self.shared.name
     }
 
-    /// The bit rate of each channel at which clients hear it who choose none, in bit/s.
+    /// The bit rate of each channel for clients that choose none, in bit/s.
     pub fn bitrates_bps(&self) -> [Option<u32>; CHANNELS] {
         let state = self.shared.state();
         let clock_hz = state.hello.as_ref().map_or(1, |hello| hello.can_clock_hz);
         state.base.map(|config| config.map(|config| config.timing.bitrate_bps(clock_hz)))
     }
 
-    /// How many clients there are.
+    /// The number of clients.
     pub fn clients(&self) -> usize {
         self.shared.state().clients.len()
     }
@@ -120,8 +120,8 @@ impl Board {
         self.shared.tell(news);
     }
 
-    /// Lets a client in that speaks through a stream; messages call it `name`. `input` must return within a fraction of a second, as a
-    /// [`Link`]'s reader. Returns when it is in; threads of its own serve it.
+    /// Admits a client that talks through a stream; messages call it `name`. Reading from `input` must return within a fraction of a
+    /// second, as with a [`Link`]'s reader. Returns once the client is admitted; separate threads serve it.
     pub fn admit(
         &self,
         input: impl Read + Send + 'static,
@@ -132,7 +132,7 @@ impl Board {
         client::admit(&self.shared, Box::new(input), Box::new(output), name, role)
     }
 
-    /// A client in this process: what it makes a device of.
+    /// Admits a client in this process, which makes a device from this link.
     pub fn link(&self, name: &str, role: Role) -> Result<Link, Refused> {
         let (reader, output) = pipe(PIPE_BYTES);
         let (input, writer) = pipe(PIPE_BYTES);
@@ -147,12 +147,12 @@ impl Drop for Board {
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }
-        // Clients that read learn that it is over.
+        // Clients that are still reading learn that it is over.
         self.shared.wait_for(LAST_WORDS, |state| state.writers == 0);
     }
 }
 
-/// The thread's body: one session with the board after the other.
+/// The thread's body: one session with the board after another.
 fn run(shared: &Arc<Shared>, mut connect: Connect, first: Sender<Result<(), BoardError>>) {
     let mut first = Some(first);
     let mut serial: Option<String> = None;
@@ -169,7 +169,7 @@ fn run(shared: &Arc<Shared>, mut connect: Connect, first: Sender<Result<(), Boar
                 told = None;
                 session.publish(shared);
                 match first.take() {
-                    // Whoever started it has gone meanwhile: `quit` says so.
+                    // If whoever started it has gone meanwhile, `quit` is set.
                     Some(first) => drop(first.send(Ok(()))),
                     None => shared.tell(News::BoardBack { board: shared.name.clone() }),
                 }
@@ -202,7 +202,7 @@ fn run(shared: &Arc<Shared>, mut connect: Connect, first: Sender<Result<(), Boar
     state.clients.values().for_each(|member| member.outbox.close());
 }
 
-/// Tells every client that its session is over. What it had been sent before comes first.
+/// Tells every client that its session is over, after everything sent to it before.
 fn end_sessions(shared: &Shared, reason: EndReason) {
     *lock(&shared.port) = None;
     let mut state = shared.state();
@@ -228,7 +228,7 @@ struct Session {
 }
 
 impl Session {
-    /// Greets the board, and learns what there is to know before anybody asks.
+    /// Greets the board, and finds out what must be known before the first request.
     fn begin(shared: &Shared, link: Link) -> Result<Self, DeviceError> {
         let Link { mut reader, mut writer, keep_alive } = link;
         let mut decoder = Box::new(Decoder::new());
@@ -236,7 +236,7 @@ impl Session {
             exchange(&mut *reader, &mut *writer, &mut decoder, &Request { id, command }, &shared.name)
         };
         let not_cantap = || DeviceError::NotCantap { address: shared.name.clone() };
-        // Answers to a host before us must not be taken for ours: begin at an arbitrary number.
+        // Answers to an earlier host must not be mistaken for ours, so begin at an arbitrary number.
         let start = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
         let mut id = start.map_or(1, |since| (since.as_micros() >> 4) as u16);
         let mut hello = None;
@@ -273,7 +273,7 @@ impl Session {
         Ok(Self { link: Link { reader, writer, keep_alive }, decoder, hello, base, ticks })
     }
 
-    /// From now on clients may ask.
+    /// From now on, clients may send requests.
     fn publish(&self, shared: &Shared) {
         let mut state = shared.state();
         state.base = self.base;
@@ -281,7 +281,7 @@ impl Session {
         state.hello = Some(self.hello.clone());
     }
 
-    /// Reads until the board is gone. Returns why, or nothing if the server is to end.
+    /// Reads until the board is gone. Returns the reason, or `None` if the server should end.
     fn run(self, shared: &Arc<Shared>) -> Option<DeviceError> {
         let Link { mut reader, writer, keep_alive } = self.link;
         let mut decoder = self.decoder;
@@ -339,23 +339,23 @@ impl Session {
     }
 }
 
-/// Leaves the buses. A board does that by itself when the port closes; telling it is quicker.
+/// Leaves the buses. A board does that by itself when the port closes, but a request is quicker.
 fn leave_buses(shared: &Shared, reader: &mut dyn Read) {
     for channel in Channel::ALL {
         shared.send_unattended(Command::Close { channel }, Then::Nothing);
     }
-    // A port that closes at once may take what is still to be written with it.
+    // Closing the port immediately may discard what is still to be written.
     let _ = reader.read(&mut [0; 4096]);
 }
 
-/// What was in one read, beside records.
+/// The content of one read, besides records.
 #[derive(Default)]
 struct Heard {
     answered: bool,
     end: Option<SessionOver>,
 }
 
-/// Takes bytes of the board: records go on to the clients, answers to whoever asked.
+/// Takes bytes from the board: records go to the clients, answers to the client that sent the request.
 fn take(state: &mut State, decoder: &mut Decoder, piece: &[u8], heard: &mut Heard) {
     let mut chunk: Vec<Entry> = Vec::new();
     decoder.push(piece, |decoded| match decoded {
@@ -377,7 +377,7 @@ fn take(state: &mut State, decoder: &mut Decoder, piece: &[u8], heard: &mut Hear
                 }
                 return;
             };
-            // What came before the answer belongs to before.
+            // What came before the answer belongs to the time before it.
             state.deliver(&mut chunk);
             match (then, result) {
                 (Then::Opened { client, channel }, Ok(Reply::Opened(config))) => {
@@ -389,7 +389,7 @@ fn take(state: &mut State, decoder: &mut Decoder, piece: &[u8], heard: &mut Hear
                 (Then::SentAgain(tag), Err(_)) => chunk.extend(state.give_up(tag)),
                 _ => {}
             }
-            // There is room for one; if nobody waits any more, that is fine.
+            // There is room for one; it does not matter if nobody waits any more.
             let _ = answer.try_send(result.clone());
         }
         Decoded::Ended { reason, .. } => {
@@ -406,7 +406,8 @@ fn take(state: &mut State, decoder: &mut Decoder, piece: &[u8], heard: &mut Hear
     state.deliver(&mut chunk);
 }
 
-/// Asks and waits, before there is a thread to do it. Nothing if nothing is answered in time.
+/// Sends a request and waits for the answer, before the thread for that exists. `None` if there is no answer
+/// in time.
 fn exchange(
     reader: &mut dyn Read,
     writer: &mut dyn Write,
@@ -415,7 +416,7 @@ fn exchange(
     name: &str,
 ) -> Result<Option<Result<Reply, Refusal>>, DeviceError> {
     let vanished = |reason: String| DeviceError::Vanished { address: name.to_owned(), reason };
-    // The zero ends whatever stands in the board's input, and chooses our language over slcan.
+    // The zero ends anything left in the board's input and selects our protocol over slcan.
     let bytes = [vec![0], encode(request)?].concat();
     write_patiently(writer, &bytes, WRITE_PATIENCE)
         .and_then(|()| writer.flush())

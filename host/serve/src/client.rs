@@ -1,4 +1,4 @@
-//! One client: what it asks is done, and what it may not do is refused.
+//! One client: its requests are carried out, and those beyond its role are refused.
 
 mod channels;
 mod sending;
@@ -21,10 +21,10 @@ use crate::state::{Member, State, Then};
 use crate::stream::{ClientId, Views};
 use crate::writer;
 
-/// A client that has not greeted by then is let go.
+/// A client that has not greeted by this time is dropped.
 const GREETING_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Lets a client in. Two threads of its own serve it until either side ends.
+/// Admits a client. Two separate threads serve it until either side ends.
 pub fn admit(
     shared: &Arc<Shared>,
     mut input: Box<dyn Read + Send>,
@@ -94,13 +94,13 @@ pub fn admit(
     Ok(())
 }
 
-/// A client, as the thread that does what it asks has it.
+/// A client, as seen by the thread that carries out its requests.
 struct Client {
     shared: Arc<Shared>,
     id: ClientId,
     role: Role,
     name: String,
-    /// Those who only knock are not reported to anybody.
+    /// Clients that connect without greeting are not reported.
     has_greeted: Arc<AtomicBool>,
     outbox: Arc<Outbox>,
 }
@@ -139,19 +139,19 @@ impl Client {
         }
     }
 
-    /// Gives back what it had.
+    /// Gives back everything it had.
     fn leave(&self) {
         self.end_session();
         self.shared.state().clients.remove(&self.id);
-        // What waits is written if anybody reads it.
+        // What is waiting is written if anybody reads it.
         self.outbox.close();
     }
 
-    /// Closes its channels, as far as others do not use them.
+    /// Closes its channels unless others use them.
     fn end_session(&self) {
         let setup = self.setup();
         for channel in Channel::ALL {
-            // If the board does not follow, its thread notices.
+            // If the board does not respond, its thread notices.
             let _ = self.close(channel);
         }
         drop(setup);
@@ -188,13 +188,13 @@ impl Client {
             drop(state);
             return self.answer(id, &Err(Refusal::NoBoard));
         };
-        // What only one who has the port can do.
+        // These are possible only for a program that has the port.
         let local = capability::SLCAN | capability::BOOTLOADER;
         let hello = Hello { capabilities: hello.capabilities & !local, ..hello };
         let ticks = state.latest_ticks;
         if let Some(member) = state.clients.get_mut(&self.id) {
             member.in_session = true;
-            // Under the lock: nothing of the session can be put in before.
+            // Under the lock, so that nothing of the session can come before it.
             member.outbox.restart(encoded(id, &Ok(Reply::Hello(hello))), ticks);
         }
         true
@@ -206,7 +206,7 @@ impl Client {
         }
         let result = self.perform_in_session(command);
         match result {
-            // The board has gone meanwhile, and the session with it.
+            // The board has gone meanwhile, and with it the session.
             Err(Refusal::NoBoard) if !self.with(|_, member| member.in_session) => Err(Refusal::NoSession),
             result => result,
         }
@@ -214,7 +214,7 @@ impl Client {
 
     fn perform_in_session(&self, command: Command) -> Result<Reply, Refusal> {
         match command {
-            // Greeted elsewhere.
+            // Greeting is handled elsewhere.
             Command::Hello { .. } => Err(Refusal::Malformed),
             Command::Open { channel, config } => {
                 let _setup = self.setup();
@@ -248,7 +248,8 @@ impl Client {
                     None => self.shared.ask(command, Then::Nothing),
                 }
             }
-            // A measurement has one to whom its edges go: who holds the right. It ends when a channel opens.
+            // A measurement's edges go to a single client: the one with the right to configure. It ends when
+            // a channel opens.
             Command::Configure { .. }
             | Command::ClearDefaults
             | Command::MeasureEdges { .. }
@@ -266,12 +267,12 @@ impl Client {
                 drop(state);
                 self.shared.ask(command, Then::Nothing)
             }
-            // Whoever writes a firmware is beside the board.
+            // Whoever flashes a firmware is at the board.
             Command::Bootloader => Err(Refusal::Unsupported),
         }
     }
 
-    /// Looks at what is known of it; of one that is not there any more, at nothing.
+    /// Looks up something about it; returns the default if it is not there any more.
     fn with<T: Default>(&self, look: impl FnOnce(&State, &Member) -> T) -> T {
         let state = self.shared.state();
         state.clients.get(&self.id).map(|member| look(&state, member)).unwrap_or_default()
@@ -305,7 +306,7 @@ impl Client {
 fn encoded(id: u16, result: &Result<Reply, Refusal>) -> Vec<u8> {
     let mut message = vec![0; MAX_MESSAGE + CRC_LEN];
     let mut out = vec![0; MAX_ENCODED];
-    // Cannot fail: the longest answer is shorter than the longest message.
+    // This cannot fail: the longest answer is shorter than the longest message.
     let len = write_response(id, result, &mut message[..MAX_MESSAGE])
         .and_then(|len| seal(&mut message, len, &mut out))
         .unwrap_or(0);

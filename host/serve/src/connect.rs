@@ -1,4 +1,4 @@
-//! Links to a server: what a client makes a device of.
+//! Links to a server, from which a client makes a device.
 
 use std::io::{self, Read};
 use std::net::{TcpStream, ToSocketAddrs};
@@ -11,18 +11,19 @@ use std::time::Duration;
 
 use cantap::device::{Link, pipe};
 
-/// A read or write of a socket returns at the latest after this time.
+/// A read or write on a socket returns after this time at the latest.
 pub(crate) const SOCKET_TIMEOUT: Duration = Duration::from_millis(50);
-/// A computer that does not answer is given up after this time.
+/// Time limit for connecting to a computer.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
-/// A server that a program starts on another computer is ready by then: ssh has to get there, and the board has to greet it.
+/// Time limit for a server that a program starts on another computer: ssh has to get there, and the server has to greet the
+/// board.
 const START_TIMEOUT: Duration = Duration::from_secs(30);
-/// What such a server says first, when it is ready: the end of no message.
+/// What such a server sends first, when it is ready: the end of no message.
 pub const READY: [u8; 1] = [0];
-/// Bytes of a program's output that wait at most.
+/// Maximum number of bytes of a program's output that wait.
 const PIPE_BYTES: usize = 256 * 1024;
 
-/// Where a server's socket is unless somebody says otherwise: the user's own directory for such things, where the system has one.
+/// The default path of a server's socket: in the user's runtime directory, if the system has one.
 #[cfg(unix)]
 pub fn default_socket() -> PathBuf {
     match std::env::var_os("XDG_RUNTIME_DIR").filter(|folder| !folder.is_empty()) {
@@ -31,7 +32,7 @@ pub fn default_socket() -> PathBuf {
     }
 }
 
-/// To a server on this machine.
+/// Connects to a server on this machine.
 #[cfg(unix)]
 pub fn unix(path: &Path) -> io::Result<Link> {
     let reader = UnixStream::connect(path)?;
@@ -41,7 +42,7 @@ pub fn unix(path: &Path) -> io::Result<Link> {
     Ok(Link::new(reader, writer))
 }
 
-/// To a server at `HOST:PORT`, without encryption.
+/// Connects to a server at `HOST:PORT`, without encryption.
 pub fn tcp(address: &str) -> io::Result<Link> {
     let reader = dial(address)?;
     let writer = reader.try_clone()?;
@@ -66,19 +67,19 @@ pub(crate) fn dial(address: &str) -> io::Result<TcpStream> {
 pub(crate) fn prepare(stream: &TcpStream) -> io::Result<()> {
     stream.set_read_timeout(Some(SOCKET_TIMEOUT))?;
     stream.set_write_timeout(Some(SOCKET_TIMEOUT))?;
-    // An answer is a small packet that somebody waits for.
+    // An answer is a small packet that somebody is waiting for.
     stream.set_nodelay(true)
 }
 
-/// To a server that a program is: through its standard input and output, when it has said [`READY`]. What it says on standard error, the user
-/// sees. It ends with the link. A program that has ended makes a link that is closed.
+/// Connects to a program that is a server, through its standard input and output, once it has sent [`READY`]. The user sees its standard
+/// error. It ends with the link. If it has ended, the link is closed.
 pub fn program(command: &mut Command) -> io::Result<Link> {
     let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn()?;
     let (Some(writer), Some(mut output)) = (child.stdin.take(), child.stdout.take()) else {
         return Err(io::ErrorKind::BrokenPipe.into());
     };
     let child = Running(child);
-    // Its output can be waited for only without a limit.
+    // Its output can only be waited for without a time limit.
     let (reader, mut to_reader) = pipe(PIPE_BYTES);
     std::thread::Builder::new().name("cantap-program".to_owned()).spawn(move || {
         let mut bytes = vec![0; 64 * 1024];
@@ -100,7 +101,7 @@ struct Running(Child);
 
 impl Drop for Running {
     fn drop(&mut self) {
-        // It ends by itself when its input does, unless something holds it up.
+        // It ends on its own when its input does, unless something delays it.
         for _ in 0..20 {
             if matches!(self.0.try_wait(), Ok(Some(_)) | Err(_)) {
                 return;

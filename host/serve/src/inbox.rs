@@ -1,21 +1,21 @@
-//! A client's requests, found in what it sends.
+//! Finds a client's requests in what it sends.
 
 use cantap_wire::Refusal;
 use cantap_wire::framing::{CRC_LEN, MAX_REQUEST, max_encoded_len, unseal};
 use cantap_wire::message::{Request, why_unreadable};
 
-/// Most bytes in front of a zero that can be a request.
+/// The most bytes before a zero that can be a request.
 const MOST: usize = max_encoded_len(MAX_REQUEST) - 1;
 
-/// What stood between two zeros.
+/// What came between two zeros.
 #[derive(Debug, PartialEq, Eq)]
 #[expect(clippy::large_enum_variant, reason = "one for each request, taken at once")]
 pub enum Heard {
     /// A request.
     Request(Request),
-    /// One whose number alone can be read, and what is wrong with it.
+    /// A request of which only the number is readable, and what is wrong with it.
     Unreadable(u16, Refusal),
-    /// What cannot be answered: nobody can tell whose it is.
+    /// It cannot be answered: nobody can tell which request it was.
     Damaged,
 }
 
@@ -60,7 +60,7 @@ fn read(encoded: &[u8]) -> Heard {
     }
 }
 
-// The CRC is part of what is counted above.
+// The CRC is included in the count above.
 const _: () = assert!(MOST > MAX_REQUEST + CRC_LEN);
 
 #[cfg(test)]

@@ -1,8 +1,8 @@
 #![doc = include_str!("../README.md")]
 //!
-//! [`Board`] holds the board and lets clients in. Each has a queue of its own: one that is slow loses frames, which are counted at the stage
-//! `host` in its own stream, and holds up neither the board nor anybody else. What each may do is a [`Role`]; nothing is sent and
-//! nothing acknowledged while no client that may send has a channel open for it.
+//! [`Board`] holds the board and admits clients. Each has its own queue: a slow client loses frames, which are counted at the stage `host`
+//! in its own stream, and delays neither the board nor anybody else. What each may do is its [`Role`]; nothing is sent or acknowledged
+//! unless a client that may send has a channel open for it.
 
 #![forbid(unsafe_code)]
 

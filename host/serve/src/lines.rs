@@ -1,4 +1,4 @@
-//! candump's log lines over TCP, for `nc` and for SavvyCAN's log server: whoever connects hears, and says nothing.
+//! candump's log lines over TCP, for `nc` and for SavvyCAN's log server: clients receive and cannot send.
 
 use std::io;
 use std::net::SocketAddr;
@@ -14,15 +14,15 @@ use cantap_wire::{Channel, Refusal};
 use crate::listen::{Listening, accept, bind_loopback};
 use crate::{Board, News};
 
-/// Records that wait for one client at most, beside what waits in the server's queue.
+/// Limit for records waiting for one client, in addition to those in the server's queue.
 pub(crate) const HELD_RECORDS: usize = 1 << 16;
-/// A client that takes nothing for this long is gone.
+/// A client that takes nothing for this long is considered gone.
 const PATIENCE: Duration = Duration::from_secs(30);
-/// How long to wait for records before looking at the other board's.
+/// How long to wait for records before checking the other board's.
 const WAIT: Duration = Duration::from_millis(10);
 
-/// Lets clients in at an address of this machine (loopback). They hear every channel of the boards whose bit rate is known, numbered on as
-/// everywhere.
+/// Admits clients at an address of this machine (loopback). They receive every channel of the boards whose bit rate is known, with
+/// consecutive numbers as everywhere.
 pub fn listen(boards: &[Arc<Board>], address: SocketAddr) -> io::Result<Listening> {
     let (listener, address) = bind_loopback(address)?;
     let boards = boards.to_vec();
@@ -39,7 +39,7 @@ pub fn listen(boards: &[Arc<Board>], address: SocketAddr) -> io::Result<Listenin
     })
 }
 
-/// A device on a board of this process.
+/// A device for a board of this process.
 pub(crate) fn device_of(board: &Board, name: &str, role: Role) -> Result<Device, String> {
     let link = board.link(name, role).map_err(|refused| refused.to_string())?;
     Device::over_holding(link, name, HELD_RECORDS).map_err(|error| error.to_string())
@@ -51,7 +51,7 @@ fn serve(boards: &[Arc<Board>], mut stream: TcpStream, name: &str) -> Result<(),
         let device = device_of(board, name, Role::Listen)?;
         for channel in Channel::ALL {
             match device.open_channel(channel, None) {
-                // Nobody has said how fast its bus is.
+                // The bit rate of its bus is unknown.
                 Ok(_) | Err(cantap::DeviceError::Refused { refusal: Refusal::NothingSaved }) => {}
                 Err(error) => return Err(error.to_string()),
             }
@@ -62,7 +62,7 @@ fn serve(boards: &[Arc<Board>], mut stream: TcpStream, name: &str) -> Result<(),
     let mut out = String::new();
     loop {
         for (number, _, records) in &mut heard {
-            // The board or the server is gone: so is the connection.
+            // The board or the server is gone, so the connection is, too.
             let Ok(Some(batch)) = records.next_batch(WAIT) else { return Ok(()) };
             for record in &batch {
                 let Some(channel) = Channel::from_number(record.channel) else { continue };
@@ -79,7 +79,7 @@ fn serve(boards: &[Arc<Board>], mut stream: TcpStream, name: &str) -> Result<(),
     }
 }
 
-/// Whether the other end has closed, as far as it shows without a word.
+/// Whether the other end has closed, as far as that shows without sending.
 fn is_closed(stream: &TcpStream) -> bool {
     match stream.peek(&mut [0]) {
         Ok(0) => true,

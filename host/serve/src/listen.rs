@@ -1,4 +1,4 @@
-//! Where clients knock: sockets of this machine.
+//! Where clients connect: sockets of this machine.
 
 use std::io::{self, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -16,10 +16,10 @@ use cantap_wire::message::Role;
 use crate::connect::{SOCKET_TIMEOUT, prepare};
 use crate::{Board, News};
 
-/// How often to check whether somebody knocks.
+/// How often to check for new connections.
 const LOOK_EVERY: Duration = Duration::from_millis(10);
 
-/// Lets clients in until it is dropped. Those who are in stay.
+/// Admits clients until it is dropped. Those already admitted stay.
 pub struct Listening {
     quit: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
@@ -30,7 +30,7 @@ pub struct Listening {
 }
 
 impl Listening {
-    /// The address with the port that the system has chosen, of a TCP socket.
+    /// The address of a TCP socket, with the port chosen by the system.
     pub const fn address(&self) -> Option<SocketAddr> {
         self.address
     }
@@ -44,7 +44,8 @@ impl Listening {
         let until = Arc::clone(&quit);
         let thread = std::thread::Builder::new().name(name.to_owned()).spawn(move || {
             while !until.load(Ordering::Relaxed) {
-                // Nobody is there, or one who has gone already, or the system has no room: later it may be otherwise.
+                // Nobody is there, or the client has already gone, or the system has no resources: later it may be
+                // different.
                 if accept().is_err() {
                     std::thread::sleep(LOOK_EVERY);
                 }
@@ -73,8 +74,8 @@ impl Drop for Listening {
     }
 }
 
-/// Lets clients in, of this user on this machine alone: nobody else can open the socket at `path`. One that a server has left behind is
-/// replaced; [`AddrInUse`](io::ErrorKind::AddrInUse) if a server is behind it.
+/// Admits clients of this user on this machine only: nobody else can open the socket at `path`. A socket left behind by a server is
+/// replaced; [`AddrInUse`](io::ErrorKind::AddrInUse) if a server is still listening on it.
 #[cfg(unix)]
 pub fn unix(board: &Arc<Board>, path: &Path, role: Role) -> io::Result<Listening> {
     if path.exists() {
@@ -83,7 +84,7 @@ pub fn unix(board: &Arc<Board>, path: &Path, role: Role) -> io::Result<Listening
             _ => return Err(io::ErrorKind::AddrInUse.into()),
         }
     }
-    // From its first moment on: a mode that is set afterwards comes too late.
+    // This must apply from the beginning: setting the mode afterwards would be too late.
     let before = rustix::process::umask(rustix::fs::Mode::from_raw_mode(0o177));
     let bound = UnixListener::bind(path);
     rustix::process::umask(before);
@@ -106,8 +107,8 @@ pub fn unix(board: &Arc<Board>, path: &Path, role: Role) -> io::Result<Listening
     Ok(listening)
 }
 
-/// Lets clients in, without encryption and without asking who they are: `address` must be one of this machine's own
-/// (loopback), which every user of it can reach; [`PermissionDenied`](io::ErrorKind::PermissionDenied) for any other.
+/// Admits clients, without encryption and authentication: `address` must be one of this machine's own (loopback),
+/// which every user of the machine can reach; [`PermissionDenied`](io::ErrorKind::PermissionDenied) for any other.
 pub fn tcp(board: &Arc<Board>, address: SocketAddr, role: Role) -> io::Result<Listening> {
     let (listener, address) = bind_loopback(address)?;
     let board = Arc::clone(board);
@@ -119,7 +120,7 @@ pub fn tcp(board: &Arc<Board>, address: SocketAddr, role: Role) -> io::Result<Li
     })
 }
 
-/// A socket that only this machine reaches.
+/// A socket that can only be reached from this machine.
 pub(crate) fn bind_loopback(address: SocketAddr) -> io::Result<(TcpListener, SocketAddr)> {
     if !address.ip().is_loopback() {
         return Err(io::ErrorKind::PermissionDenied.into());
@@ -143,19 +144,20 @@ pub(crate) fn accept(listener: &TcpListener) -> io::Result<(TcpStream, SocketAdd
     Ok((stream, peer))
 }
 
-/// What waits for a client waits in its outbox, where answers go first and losses are counted, and not in the system, whose hundreds of
-/// kilobytes are seconds of a slow line. Linux doubles this; it is a second of a line that carries half of two saturated channels.
+/// Data for a client should wait in its outbox, where answers go first and losses are counted, rather than in the system, whose
+/// hundreds of kilobytes are seconds of a slow line. Linux doubles this; it is a second of a line that can carry half of two saturated
+/// channels.
 #[cfg(unix)]
 const SYSTEM_KEEPS: usize = 32 * 1024;
 
-/// Sets how much of what is written the system keeps.
+/// Sets how much written data the system buffers.
 #[cfg(unix)]
 fn keep_little(stream: &impl std::os::fd::AsFd) -> io::Result<()> {
     use nix::sys::socket::{setsockopt, sockopt};
     Ok(setsockopt(stream, sockopt::SndBuf, &SYSTEM_KEEPS)?)
 }
 
-/// Lets one in, or tells that it was not.
+/// Admits a client, or reports that it was refused.
 pub(crate) fn admit(
     board: &Board,
     input: impl Read + Send + 'static,

@@ -1,4 +1,4 @@
-//! What a server tells whoever runs it.
+//! What a server reports to the program that runs it.
 
 use std::fmt;
 
@@ -8,37 +8,37 @@ use cantap_wire::message::Role;
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum News {
-    /// A client is in.
+    /// A client was admitted.
     ClientCame {
-        /// As it is called.
+        /// Its name.
         client: String,
-        /// What it may do at most.
+        /// Its maximum role.
         role: Role,
     },
-    /// A client has left, or was let go.
+    /// A client has left, or was dropped.
     ClientLeft {
-        /// As it is called.
+        /// Its name.
         client: String,
-        /// Why, if not by itself.
+        /// The reason, if it did not leave on its own.
         reason: Option<String>,
     },
-    /// Somebody was not let in.
+    /// A client was refused.
     Refused {
-        /// Who.
+        /// Its name.
         client: String,
-        /// Why not.
+        /// The reason.
         reason: String,
     },
-    /// The board is gone. It is tried again.
+    /// The board is gone. The server keeps trying it.
     BoardLost {
-        /// As it is called.
+        /// Its name.
         board: String,
-        /// What shows it.
+        /// How that was noticed.
         reason: String,
     },
-    /// The board is there again.
+    /// The board is back.
     BoardBack {
-        /// As it is called.
+        /// Its name.
         board: String,
     },
 }

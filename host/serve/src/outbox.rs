@@ -1,4 +1,5 @@
-//! What waits for one client. Whoever puts something in never waits; where there is no room, the client loses, counted.
+//! Queues everything for one client. Adding never blocks; if there is no room, the client loses records, which are
+//! counted.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -9,37 +10,37 @@ use cantap_wire::{CHANNELS, Channel};
 
 use crate::stream::{ClientId, Counts, Entry, Gap, View, Views, count, shown};
 
-/// Records that wait for a client at most: six seconds of two saturated channels, in at most 15 MB, which all clients share as far as they
-/// wait for the same.
+/// Limit for records waiting for a client: six seconds of two saturated channels, in at most 15 MB, which clients share if they wait for
+/// the same records.
 pub const MOST_RECORDS: usize = 1 << 18;
-/// Answers that wait at most; with more, the client's next request is not read.
+/// Limit for waiting answers; beyond it, the client's next request is not read.
 const MOST_ANSWERS: usize = 64;
-/// Taken to be written at a time.
+/// Records taken for writing at a time.
 const TAKEN_RECORDS: usize = 4096;
 
-/// One thing to tell the client.
+/// One thing to send to the client.
 pub enum Item {
-    /// A session begins with this answer, encoded, at this time.
+    /// A session begins with this encoded answer, at this time.
     Restart(Vec<u8>, u64),
-    /// A channel is the client's from here on.
+    /// The client has a channel from here on.
     Attach(Channel, View, u64),
-    /// Nothing of the channel follows.
+    /// Nothing more follows of the channel.
     Detach(Channel, u64),
     /// Records.
     Chunk(Arc<[Entry]>),
-    /// Records that there was no room for.
+    /// Records for which there was no room.
     Gap(Gap),
     /// The session is over.
     Ended(EndReason, u64),
 }
 
-/// What there is to write.
+/// What to write.
 #[derive(Default)]
 pub struct Work {
-    /// Encoded.
+    /// Encoded answers.
     pub answers: Vec<Vec<u8>>,
     pub items: Vec<Item>,
-    /// Nothing follows.
+    /// Nothing more follows.
     pub is_last: bool,
 }
 
@@ -47,16 +48,16 @@ pub struct Work {
 struct Queue {
     answers: VecDeque<Vec<u8>>,
     items: VecDeque<Item>,
-    /// Records in the items.
+    /// Number of records in the items.
     records: usize,
     gap: Option<Gap>,
-    /// Nothing more is put in.
+    /// Nothing more is added.
     is_closed: bool,
-    /// Nobody takes anything out any more.
+    /// Nothing more is taken out.
     is_abandoned: bool,
 }
 
-/// What waits for one client.
+/// The queue for one client.
 pub struct Outbox {
     queue: Mutex<Queue>,
     changed: Condvar,
@@ -69,11 +70,12 @@ impl Outbox {
     }
 
     fn lock(&self) -> MutexGuard<'_, Queue> {
-        // Every holder leaves the queue whole.
+        // Every holder of the lock leaves the queue consistent.
         self.queue.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Puts records in, as far as the client sees them, and counts them for its status. It may have no room: then they are its losses.
+    /// Adds records, as far as the client sees them, and counts them for its status. Records for which there is no room are the
+    /// client's losses.
     pub fn offer(
         &self,
         chunk: &Arc<[Entry]>,
@@ -82,7 +84,7 @@ impl Outbox {
         counts: &mut [Counts; CHANNELS],
     ) {
         let mut queue = self.lock();
-        // After a loss there has to be some room before anything is taken: one long gap says the same as many short ones.
+        // After a loss, wait for some room before accepting anything: one long gap says the same as many short ones.
         let most = if queue.gap.is_some() { self.most_records / 2 } else { self.most_records };
         let has_room = queue.records + chunk.len() <= most;
         let mut seen = 0;
@@ -95,7 +97,7 @@ impl Outbox {
                 && let Some(channel) = queue.gap.get_or_insert_default().absorb(entry.ticks, &record)
                 && !matches!(record, cantap_wire::record::Record::Received(_))
             {
-                // The client will count it among what arrived and was lost.
+                // The client will count it as both received and lost.
                 let frames = &mut counts[channel.index()].frames;
                 *frames = frames.wrapping_add(1);
             }
@@ -108,13 +110,13 @@ impl Outbox {
         self.changed.notify_all();
     }
 
-    /// Puts something in that takes no room.
+    /// Adds something that takes no room.
     pub fn push(&self, item: Item) {
         self.lock().push(item);
         self.changed.notify_all();
     }
 
-    /// Begins a session: what waits belongs to none.
+    /// Begins a session: what is waiting belongs to none.
     pub fn restart(&self, answer: Vec<u8>, ticks: u64) {
         let mut queue = self.lock();
         let is_closed = queue.is_closed;
@@ -125,7 +127,7 @@ impl Outbox {
         self.changed.notify_all();
     }
 
-    /// Puts an answer in. Waits while too many are there. Returns whether anybody takes them.
+    /// Adds an answer. Waits while there are too many. Returns whether anybody takes them.
     pub fn answer(&self, bytes: Vec<u8>) -> bool {
         let full = |queue: &mut Queue| queue.answers.len() >= MOST_ANSWERS && !queue.is_abandoned;
         let waited = self.changed.wait_while(self.lock(), full);
@@ -137,7 +139,7 @@ impl Outbox {
         is_there
     }
 
-    /// What there is to write next, waited for at most `timeout`.
+    /// What to write next, waiting at most `timeout`.
     pub fn take(&self, timeout: Duration) -> Work {
         let idle = |queue: &mut Queue| {
             queue.answers.is_empty() && queue.items.is_empty() && queue.gap.is_none() && !queue.is_closed
@@ -164,13 +166,13 @@ impl Outbox {
         work
     }
 
-    /// Nothing more is put in; what waits can still be taken.
+    /// Nothing more is added; what is waiting can still be taken.
     pub fn close(&self) {
         self.lock().is_closed = true;
         self.changed.notify_all();
     }
 
-    /// Nobody takes anything any more.
+    /// Nothing more is taken.
     pub fn abandon(&self) {
         let mut queue = self.lock();
         *queue = Queue { is_closed: true, is_abandoned: true, ..Queue::default() };

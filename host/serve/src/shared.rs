@@ -1,4 +1,4 @@
-//! What the threads of a shared board have in common: its state, the way to it, and questions to it.
+//! What the threads of a shared board have in common: its state, the connection to it, and requests to it.
 
 use std::io::Write;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -15,20 +15,20 @@ use crate::outbox::MOST_RECORDS;
 use crate::state::{Asked, State, Then};
 use crate::stream::ClientId;
 
-/// Longest answer of a board: saving takes two seconds.
+/// The longest time a board takes to answer: saving takes two seconds.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(3);
-/// A board makes us wait while it has no room; one that takes nothing for this long is stuck.
+/// A board makes the server wait while it has no room; one that accepts nothing for this long is stuck.
 pub(crate) const WRITE_PATIENCE: Duration = Duration::from_secs(2);
 
 /// How a board is shared.
 #[derive(Clone, Debug)]
 pub struct Settings {
-    /// The bit rate of each channel's bus, in bit/s, at which clients hear it who choose none. Where there is none it is the one saved on
-    /// the board, if one is; else a client has to choose it, which takes [`Role::Configure`](crate::Role::Configure).
+    /// The bit rate of each channel's bus, in bit/s, for clients that choose none. Without one, it is the one saved on the board, if any;
+    /// otherwise a client has to choose it, which requires [`Role::Configure`](crate::Role::Configure).
     pub bitrates_bps: [Option<u32>; CHANNELS],
-    /// Records that wait for a slow client at most.
+    /// Limit for records waiting for a slow client.
     pub most_records: usize,
-    /// Clients at a time.
+    /// Limit for clients at a time.
     pub most_clients: usize,
 }
 
@@ -45,15 +45,15 @@ impl Default for Settings {
     }
 }
 
-/// What the threads share.
+/// Shared by the threads.
 pub(crate) struct Shared {
     pub name: String,
     pub settings: Settings,
     pub port: Mutex<Option<Box<dyn Write + Send>>>,
     pub state: Mutex<State>,
-    /// Something has come from the board.
+    /// Something has arrived from the board.
     pub changed: Condvar,
-    /// Held by whoever opens and closes channels: one at a time.
+    /// Held while opening or closing channels: one at a time.
     pub setup: Mutex<()>,
     pub quit: AtomicBool,
     pub next_client: AtomicU64,
@@ -61,7 +61,7 @@ pub(crate) struct Shared {
 }
 
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Every holder leaves the state whole, even if it panicked elsewhere.
+    // Every holder leaves the state consistent, even if it panicked elsewhere.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -78,7 +78,7 @@ impl Shared {
         self.next_client.fetch_add(1, Ordering::Relaxed)
     }
 
-    /// Asks the board and waits for its answer. What is to happen in the order of its stream is `then`.
+    /// Sends a request to the board and waits for its answer. `then` is done in the order of its stream.
     pub fn ask(&self, command: Command, then: Then) -> Result<Reply, Refusal> {
         let (answer, answered) = sync_channel(1);
         let id = self.send(command, Asked { answer, then })?;
@@ -88,7 +88,7 @@ impl Shared {
         })
     }
 
-    /// Asks without waiting.
+    /// Sends a request without waiting.
     pub fn send(&self, command: Command, asked: Asked) -> Result<u16, Refusal> {
         let id = {
             let mut state = self.state();
@@ -107,43 +107,44 @@ impl Shared {
         if !matches!(written, Some(Ok(()))) {
             let mut state = self.state();
             state.asked.remove(&id);
-            // Half a request may be on its way.
+            // Half a request may have been sent.
             state.must_end = true;
             return Err(Refusal::NoBoard);
         }
         Ok(id)
     }
 
-    /// Asks what nobody waits for.
+    /// Sends a request for whose answer nobody waits.
     pub fn send_unattended(&self, command: Command, then: Then) {
         let (answer, _) = sync_channel(1);
         // If it fails, the board's thread notices.
         let _ = self.send(command, Asked { answer, then });
     }
 
-    /// A client is not written to any more.
+    /// Nothing more is written to a client.
     pub fn has_written(&self) {
         self.state().writers -= 1;
         self.changed.notify_all();
     }
 
-    /// Waits until the board has said what `is_there` looks for, at most `timeout`. Returns whether it has.
+    /// Waits until `is_there` finds what it looks for in the board's messages, at most `timeout`. Returns
+    /// whether it did.
     pub fn wait_for(&self, timeout: Duration, mut is_there: impl FnMut(&State) -> bool) -> bool {
         let waited = self.changed.wait_timeout_while(self.state(), timeout, |state| !is_there(state));
         !waited.unwrap_or_else(PoisonError::into_inner).1.timed_out()
     }
 }
 
-/// Why a client was not let in.
+/// Why a client was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum Refused {
-    /// There are as many as there may be.
+    /// There are as many as allowed.
     #[error("there are {0} clients already")]
     TooMany(usize),
-    /// The server ends.
+    /// The server is ending.
     #[error("the server ends")]
     Over,
-    /// The system has no thread left.
+    /// The system could not start a thread.
     #[error("the system refused a thread: {0}")]
     Thread(#[source] std::io::Error),
 }

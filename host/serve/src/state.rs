@@ -1,5 +1,5 @@
-//! What a server knows of its board and of those who share it. One lock is around it, which nobody holds while waiting for
-//! anything.
+//! What a server knows about its board and the clients who share it. It is protected by one lock, which nobody holds while
+//! waiting for anything.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -12,14 +12,14 @@ use cantap_wire::{CHANNELS, Channel, Command, Event, Hello, Refusal, Reply};
 use crate::outbox::{Item, Outbox};
 use crate::stream::{ClientId, Counts, Entry, Owner, Views};
 
-/// Tags of a board's queue are counted up to here: far below the board's own, far above what is under way.
+/// Tags in a board's queue wrap here: far below the board's own tags, far above the number in flight.
 const TAGS: u32 = 1 << 30;
 
 /// One client.
 pub struct Member {
     pub role: Role,
     pub outbox: Arc<Outbox>,
-    /// It has greeted, and the session is not over.
+    /// It has greeted, and its session is not over.
     pub in_session: bool,
     pub views: Views,
     pub counts: [Counts; CHANNELS],
@@ -28,32 +28,32 @@ pub struct Member {
 /// A frame in the board's queue, or in a mailbox.
 pub struct Sent {
     pub client: ClientId,
-    /// As the client calls it.
+    /// With the client's tag.
     pub frame: TxFrame,
     pub channel: Channel,
-    /// Another client's frames are being withdrawn: this one is sent again.
+    /// Another client's frames are being withdrawn: this one must be sent again.
     pub keep: bool,
-    /// The client has closed the channel, which is how its end is reported.
+    /// The client has closed the channel, which is reported as the reason.
     pub is_closed: bool,
 }
 
-/// What happens when an answer is there, in the order of the stream.
+/// What to do when an answer arrives, in the order of the stream.
 pub enum Then {
     /// Nothing.
     Nothing,
-    /// The channel is open on the board; it becomes this client's, if it is one's.
+    /// The channel is open on the board; it becomes this client's, if there is one.
     Opened { client: Option<(ClientId, ChannelConfig)>, channel: Channel },
     /// A frame was sent again.
     SentAgain(u32),
 }
 
-/// A question to the board.
+/// A request to the board.
 pub struct Asked {
     pub answer: SyncSender<Result<Reply, Refusal>>,
     pub then: Then,
 }
 
-/// Which table of a board.
+/// One of the board's tables.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Table {
     Periodic,
@@ -70,7 +70,8 @@ impl Table {
     }
 }
 
-/// Who has which entries of the board's tables on one channel, and by which numbers they know them.
+/// Which client has which entries of the board's tables on one channel, and the client's own numbers for
+/// them.
 #[derive(Default)]
 pub struct Entries {
     periodic: BTreeMap<u8, (ClientId, u8)>,
@@ -85,7 +86,7 @@ impl Entries {
         }
     }
 
-    /// The board's entry that is a client's, if it has one.
+    /// The board's entry for a client's, if it has one.
     pub fn find(&mut self, table: Table, client: ClientId, slot: u8) -> Option<u8> {
         self.table(table).iter().find(|(_, owner)| **owner == (client, slot)).map(|(entry, _)| *entry)
     }
@@ -94,7 +95,8 @@ impl Entries {
     pub fn take(&mut self, table: Table, client: ClientId, slot: u8, slots: u8) -> Option<u8> {
         let found = self.find(table, client, slot);
         let table = self.table(table);
-        // Each client's own number where it is free, so that one alone finds the board's tables as they are.
+        // Each client gets its own number if it is free, so that a single client sees the board's tables as
+        // they are.
         let entry = found
             .or_else(|| std::iter::once(slot).chain(0..slots).find(|entry| !table.contains_key(entry)))?;
         table.insert(entry, (client, slot));
@@ -115,7 +117,7 @@ impl Entries {
         all
     }
 
-    /// Whose a tag of the board's own is, and what it is called there.
+    /// The client to whom one of the board's own tags belongs, and its number there.
     fn owner(&self, tag: u32) -> Option<Owner> {
         let (table, entries) = if tag >= TRIGGER_TAG {
             (Table::Triggers, &self.triggers)
@@ -131,40 +133,40 @@ impl Entries {
     }
 }
 
-/// All of it.
+/// The whole state.
 #[derive(Default)]
 pub struct State {
     /// The board, while it is there.
     pub hello: Option<Hello>,
-    /// How each channel is opened unless somebody may say otherwise and does.
+    /// How each channel is opened unless a client that may change it does.
     pub base: [Option<ChannelConfig>; CHANNELS],
     /// How each channel is open on the board.
     pub open: [Option<ChannelConfig>; CHANNELS],
     controller: [Option<(ErrorState, u8, u8)>; CHANNELS],
     /// Device time of the latest record.
     pub latest_ticks: u64,
-    /// Times each channel has stopped.
+    /// How often each channel has stopped.
     pub stopped: [u32; CHANNELS],
     pub clients: BTreeMap<ClientId, Member>,
-    /// Who configures.
+    /// The client with the right to configure.
     pub holder: Option<ClientId>,
     pub sent: HashMap<u32, Sent>,
     next_tag: u32,
     pub entries: [Entries; CHANNELS],
     pub asked: HashMap<u16, Asked>,
     next_request: u16,
-    /// Frames to be sent once more, with their channel, when the lock is free.
+    /// Frames to send once more, with their channel, when the lock is free.
     pub again: Vec<(Channel, TxFrame)>,
-    /// The board is to be let go.
+    /// The connection to the board must be ended.
     pub must_end: bool,
-    /// Clients that are written to.
+    /// Number of clients being written to.
     pub writers: usize,
-    /// The server ends: nobody else is let in.
+    /// The server is ending: nobody else is admitted.
     pub is_over: bool,
 }
 
 impl State {
-    /// Notes a question. Returns its number.
+    /// Records a request. Returns its number.
     pub fn ask(&mut self, asked: Asked) -> u16 {
         let id = self.next_request;
         self.next_request = id.wrapping_add(1);
@@ -172,7 +174,7 @@ impl State {
         id
     }
 
-    /// Notes a frame that is going to the board. Returns its tag there.
+    /// Records a frame that is going to the board. Returns its tag there.
     pub fn note_sent(&mut self, client: ClientId, channel: Channel, frame: TxFrame) -> u32 {
         let tag = self.next_tag;
         self.next_tag = (tag + 1) % TAGS;
@@ -180,12 +182,12 @@ impl State {
         tag
     }
 
-    /// Frames of a client that are under way on a channel.
+    /// Number of a client's frames in flight on a channel.
     pub fn under_way(&self, client: ClientId, channel: Channel) -> usize {
         self.sent.values().filter(|sent| sent.client == client && sent.channel == channel).count()
     }
 
-    /// Whether another client than this one has a channel open, and whether one of them may send on it.
+    /// Whether another client has a channel open, and whether one of them may send on it.
     pub fn others_on(&self, client: ClientId, channel: Channel) -> (bool, bool) {
         let others = self.clients.iter().filter(|(id, _)| **id != client);
         others
@@ -210,9 +212,9 @@ impl State {
         }
     }
 
-    /// Takes a record of the board. Returns how it goes on to the clients, if it does.
+    /// Takes a record from the board. Returns how it is passed on to the clients, if it is.
     pub fn take(&mut self, ticks: u64, record: Record) -> Option<Entry> {
-        // Stamps can be computed back to before an earlier record.
+        // Stamps can be corrected to before an earlier record.
         self.latest_ticks = self.latest_ticks.max(ticks);
         let mut entry = Entry { ticks, record, owner: None };
         let Record::Event(event) = record else { return Some(entry) };
@@ -250,7 +252,7 @@ impl State {
         Some(entry)
     }
 
-    /// A frame that was to be sent again was not taken.
+    /// A frame that should have been sent again was not accepted.
     pub fn give_up(&mut self, tag: u32) -> Option<Entry> {
         let Sent { client, frame, channel, is_closed, .. } = self.sent.remove(&tag)?;
         let reason = if is_closed { TransmitFailure::Closed } else { TransmitFailure::Aborted };
@@ -260,7 +262,7 @@ impl State {
         Some(entry)
     }
 
-    /// Hands records to every client. Nobody waits.
+    /// Passes records to every client. Nobody waits.
     pub fn deliver(&mut self, chunk: &mut Vec<Entry>) {
         if chunk.is_empty() {
             return;
@@ -278,12 +280,12 @@ impl State {
         self.open[channel.index()] = Some(config);
         self.controller[channel.index()] = None;
         self.entries[channel.index()].clear();
-        // Whoever had it open has missed something.
+        // Clients that had it open have missed something.
         let gap = Event::Lost { channel, stage: LossStage::Link, count: 0, at_least: true };
         self.deliver(&mut vec![Entry::event(self.latest_ticks, gap)]);
     }
 
-    /// A channel is a client's from here on.
+    /// A client has a channel from here on.
     pub fn attach(&mut self, client: ClientId, channel: Channel, config: ChannelConfig) {
         let ticks = self.latest_ticks;
         let controller = self.controller[channel.index()];
@@ -297,7 +299,7 @@ impl State {
         }
     }
 
-    /// Nothing of a channel follows for a client.
+    /// Nothing more of a channel follows for a client.
     pub fn detach(&mut self, client: ClientId, channel: Channel) {
         let ticks = self.latest_ticks;
         if let Some(member) = self.clients.get_mut(&client)
@@ -307,7 +309,7 @@ impl State {
         }
     }
 
-    /// The board's channels are closed, whatever had been asked of it.
+    /// The board's channels are closed, whatever was requested of it.
     pub fn forget_board(&mut self) {
         self.hello = None;
         self.open = [None; CHANNELS];
@@ -316,20 +318,21 @@ impl State {
         self.sent.clear();
         self.again.clear();
         self.entries = Default::default();
-        // Whoever waits for an answer learns that none will come.
+        // Everyone waiting for an answer learns that none will come.
         self.asked.clear();
         self.must_end = false;
     }
 }
 
 impl Entries {
-    /// The same as [`Self::owner`] for any tag.
+    /// Like [`Self::owner`], for any tag.
     fn owner_of_own(&self, tag: u32) -> Option<Owner> {
         (tag >= DEVICE_TAG).then(|| self.owner(tag)).flatten()
     }
 }
 
-/// How a channel is opened on the board, for all who share it: what a client wants left out is left out behind it.
+/// How a channel is opened on the board for all who share it: what a client wants left out is left out by the
+/// server.
 pub const fn for_all(config: ChannelConfig) -> ChannelConfig {
     let sends = !matches!(config.mode, Mode::ListenOnly);
     ChannelConfig {

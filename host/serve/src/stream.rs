@@ -1,4 +1,4 @@
-//! What a board says, on its way to each client: once in memory, whoever waits for it.
+//! The board's stream on its way to each client: once in memory, however many clients wait for it.
 
 use cantap_wire::message::{ChannelConfig, DEVICE_TAG, Filter, OTHERS_TAG};
 use cantap_wire::record::{LossStage, Record, Stamp, TransmitFailure};
@@ -7,7 +7,7 @@ use cantap_wire::{CHANNELS, Channel, Event, Frame};
 /// A client's number, never used twice.
 pub type ClientId = u64;
 
-/// Who asked for a transmission, and what it is called there.
+/// The client that requested a transmission, and its tag there.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Owner {
     pub client: ClientId,
@@ -19,27 +19,27 @@ pub struct Owner {
 pub struct Entry {
     pub ticks: u64,
     pub record: Record,
-    /// Of a transmission's end, if somebody asked for it.
+    /// For the end of a transmission, if a client requested it.
     pub owner: Option<Owner>,
 }
 
 impl Entry {
-    /// An event that is nobody's.
+    /// An event without an owner.
     pub const fn event(ticks: u64, event: Event) -> Self {
         Self { ticks, record: Record::Event(event), owner: None }
     }
 }
 
-/// A channel as one client has it.
+/// A client's view of a channel.
 #[derive(Clone, Debug, Default)]
 pub struct View {
-    /// How it was opened, if it is open.
+    /// Its configuration, if it is open.
     pub config: Option<ChannelConfig>,
-    /// What passes; none means everything.
+    /// What passes; if empty, everything.
     pub filters: Vec<Filter>,
 }
 
-/// Both channels as one client has them.
+/// A client's view of both channels.
 pub type Views = [View; CHANNELS];
 
 impl View {
@@ -74,7 +74,7 @@ pub fn shown(entry: &Entry, client: ClientId, views: &Views) -> Option<Record> {
                     Event::SofMark { .. } => Some(event),
                     Event::Transmitted { channel, frame, .. } => is_open(channel)
                         .then(|| Event::Transmitted { channel, tag: own_tag.unwrap_or(OTHERS_TAG), frame }),
-                    // Whose it is not learns nothing by it: no frame of anybody was on the bus.
+                    // It means nothing to other clients: no frame was on the bus.
                     Event::TransmitFailed { channel, reason, .. } => own_tag
                         .filter(|_| is_open(channel))
                         .map(|tag| Event::TransmitFailed { channel, tag, reason }),
@@ -82,7 +82,7 @@ pub fn shown(entry: &Entry, client: ClientId, views: &Views) -> Option<Record> {
                     | Event::BusError { channel, .. }
                     | Event::ErrorsSuppressed { channel, .. }
                     | Event::State { channel, .. } => is_open(channel).then_some(event),
-                    // Each client's channels start and stop for themselves.
+                    // Each client's channels start and stop on their own.
                     Event::Started { .. } | Event::Stopped { .. } => None,
                 };
             event.map(Record::Event)
@@ -90,10 +90,10 @@ pub fn shown(entry: &Entry, client: ClientId, views: &Views) -> Option<Record> {
     }
 }
 
-/// What a client was given on one channel, as a board's status counts it.
+/// What a client received on one channel, as counted in a board's status.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Counts {
-    /// Frames received, those among them that were lost behind the controller.
+    /// Frames received, including those lost after the controller.
     pub frames: u32,
     pub lost_controller: u32,
     pub lost_queue: u32,
@@ -101,7 +101,7 @@ pub struct Counts {
     pub transmit_failures: u32,
 }
 
-/// Counts what a client is shown.
+/// Counts what is passed to a client.
 pub fn count(counts: &mut [Counts; CHANNELS], record: &Record, is_own: bool) {
     match *record {
         Record::Received(received) => add(&mut counts[received.channel.index()].frames, 1),
@@ -127,24 +127,25 @@ pub fn count(counts: &mut [Counts; CHANNELS], record: &Record, is_own: bool) {
     }
 }
 
-/// Counters wrap, as a board's do.
+/// Counters wrap, like those of a board.
 fn add(counter: &mut u32, count: u32) {
     *counter = counter.wrapping_add(count);
 }
 
-/// Where a client was too slow: what it lost, and what is too important to be lost.
+/// Where a client was too slow: what it lost, and what is too important to lose.
 #[derive(Debug, Default)]
 pub struct Gap {
-    /// In order, as the client sees them.
+    /// In order, as the client sees it.
     kept: Vec<(u64, Event)>,
     lost: [u32; CHANNELS],
     errors: [u32; CHANNELS],
-    /// Of the last record in it.
+    /// Of its last record.
     ticks: u64,
 }
 
 impl Gap {
-    /// Takes a record that the client would have seen. Returns the channel of a frame that is lost by it.
+    /// Takes a record that the client would have seen. Returns the channel of a frame that is lost as a
+    /// result.
     pub fn absorb(&mut self, ticks: u64, record: &Record) -> Option<Channel> {
         self.ticks = ticks;
         match *record {
@@ -153,7 +154,7 @@ impl Gap {
                 return Some(received.channel);
             }
             Record::Event(event) => match event {
-                // As many as are under way.
+                // Bounded by the number in flight.
                 Event::Transmitted { tag, .. } if tag < DEVICE_TAG => self.kept.push((ticks, event)),
                 Event::Transmitted { channel, .. } => {
                     self.lost[channel.index()] += 1;
@@ -164,14 +165,14 @@ impl Gap {
                 }
                 Event::BusError { channel, .. } => self.errors[channel.index()] += 1,
                 Event::ErrorsSuppressed { channel, count } => self.errors[channel.index()] += count,
-                // A mark is left out where there is no room, as on a board.
+                // Marks are left out if there is no room, as on a board.
                 Event::Started { .. } | Event::Stopped { .. } | Event::SofMark { .. } => {}
             },
         }
         None
     }
 
-    /// Keeps one event, or adds it to one of its kind: what is kept is bounded.
+    /// Keeps an event, or merges it with one of its kind: the number kept is bounded.
     fn keep(&mut self, ticks: u64, event: Event) {
         let place = self.kept.iter_mut().rev().find_map(|(at, kept)| merge(kept, &event).then_some(at));
         match place {
@@ -180,7 +181,7 @@ impl Gap {
         }
     }
 
-    /// What stands in the stream in place of all that.
+    /// What appears in the stream instead.
     pub fn events(mut self) -> Vec<(u64, Event)> {
         self.kept.sort_by_key(|(ticks, _)| *ticks);
         let ticks = self.ticks;
@@ -198,7 +199,7 @@ impl Gap {
     }
 }
 
-/// Makes one event of two of a kind. Returns whether it could.
+/// Merges two events of one kind. Returns whether that was possible.
 fn merge(kept: &mut Event, next: &Event) -> bool {
     match (kept, next) {
         (

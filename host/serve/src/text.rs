@@ -1,4 +1,4 @@
-//! Records as text: what the protocols of lines and words have in common.
+//! Records as text: what the text protocols have in common.
 
 use std::fmt::{self, Write};
 
@@ -6,7 +6,7 @@ use cantap::{TraceEvent, TraceRecord};
 use cantap_trace::Interface;
 use cantap_trace::socketcan::{ERROR_FLAG, ErrorFrame};
 
-/// A time as can-utils write it: seconds and microseconds.
+/// A time as can-utils writes it: seconds and microseconds.
 pub struct Seconds(pub i64);
 
 impl fmt::Display for Seconds {
@@ -16,15 +16,15 @@ impl fmt::Display for Seconds {
     }
 }
 
-/// The identifier of an error frame, its flag included, and its data.
+/// The identifier of an error frame, including its flag, and its data.
 pub fn error_frame(event: &TraceEvent) -> Option<(u32, [u8; 8])> {
     ErrorFrame::of(event).map(|frame| (ERROR_FLAG | frame.classes, frame.data))
 }
 
-/// Adds a line as `candump -L` writes it; errors and losses as SocketCAN's error frames. `number` is the channel's, from 1.
+/// Adds a line as `candump -L` writes it; errors and losses as SocketCAN error frames. `number` is the channel's, from 1.
 pub fn put_line(out: &mut String, number: u8, record: &TraceRecord) {
     let (time, interface) = (Seconds(record.time_ns), Interface(number));
-    // Cannot fail: it is memory.
+    // Writing to memory cannot fail.
     let _ = match &record.event {
         TraceEvent::Frame { frame, .. } => writeln!(out, "({time}) {interface} {frame}"),
         event => match error_frame(event) {
@@ -38,7 +38,7 @@ pub fn put_line(out: &mut String, number: u8, record: &TraceRecord) {
     };
 }
 
-/// Adds bytes in hexadecimal, each with `behind` behind it.
+/// Adds bytes in hexadecimal, each followed by `behind`.
 pub fn put_bytes(out: &mut String, bytes: &[u8], behind: &str) {
     for byte in bytes {
         let _ = write!(out, "{byte:02X}{behind}");

@@ -1,4 +1,4 @@
-//! The thread that writes to one client: whatever waits, encoded as the client has its channels.
+//! The thread that writes to one client: whatever is waiting, encoded for the client's view of the channels.
 
 use std::io::Write;
 use std::time::{Duration, Instant};
@@ -15,16 +15,16 @@ use crate::stream::{ClientId, Views, shown};
 
 /// How often to check whether the connection is over while there is nothing to write.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
-/// A client that takes nothing for this long is gone: a peer that was switched off says nothing.
+/// A client that takes nothing for this long is gone: a peer that was switched off sends nothing.
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// Writes until nothing follows. An error says why the client is let go.
+/// Writes until nothing follows. An error says why the client is dropped.
 pub fn run(outbox: &Outbox, output: &mut dyn Write, client: ClientId) -> Result<(), String> {
     let mut encoder = Encoder::new(client);
     loop {
         let work = outbox.take(LOOK_EVERY);
         for answer in &work.answers {
-            // A batch of before may be half read.
+            // An earlier batch may have been read only in part.
             encoder.out.push(0);
             encoder.out.extend_from_slice(answer);
         }
@@ -54,13 +54,13 @@ fn write(output: &mut dyn Write, mut bytes: &[u8], outbox: &Outbox) -> Result<()
                 if moved.elapsed() >= PATIENCE {
                     return Err(format!("it took nothing for {} s", PATIENCE.as_secs()));
                 }
-                // Whoever does not read is not waited for at the end.
+                // At the end, a client that does not read is not waited for.
                 let is_late = |since: &mut Instant| since.elapsed() >= Duration::from_secs(1);
                 if outbox.is_closed() && is_late(closing.get_or_insert_with(Instant::now)) {
                     return Ok(());
                 }
             }
-            // It has left, which the other thread sees too.
+            // It has left, which the other thread notices too.
             Err(_) => return Ok(()),
         }
     }
@@ -69,10 +69,10 @@ fn write(output: &mut dyn Write, mut bytes: &[u8], outbox: &Outbox) -> Result<()
     Ok(())
 }
 
-/// Makes bytes of what waits.
+/// Encodes what is waiting.
 struct Encoder {
     batch: Box<BatchWriter>,
-    /// Time of the last record, or the session's beginning.
+    /// Time of the last record, or of the session's beginning.
     last_ticks: u64,
     views: Views,
     client: ClientId,
@@ -154,7 +154,7 @@ impl Encoder {
         };
         if !self.batch.push(&bytes[..len], self.last_ticks, frame_of) {
             self.finish();
-            // Cannot fail: any record fits an empty batch.
+            // This cannot fail: any record fits in an empty batch.
             let _ = self.batch.push(&bytes[..len], self.last_ticks, frame_of);
         }
         if is_stamped {
@@ -162,7 +162,7 @@ impl Encoder {
         }
     }
 
-    /// Writes the batch that was begun.
+    /// Writes the current batch.
     fn finish(&mut self) {
         let at = self.out.len();
         self.out.resize(at + MAX_ENCODED, 0);

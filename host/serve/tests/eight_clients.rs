@@ -1,5 +1,5 @@
-//! Eight clients on two saturated channels, two of them slow on purpose: each has every frame, or its loss, counted where the frames are
-//! missing. `cargo xtask bench serve` is the long form.
+//! Eight clients on two saturated channels, two of them slow on purpose: each gets every frame, or its loss, counted where the frames
+//! are missing. `cargo xtask bench serve` is the long version.
 
 use std::io::Read;
 use std::sync::Arc;
@@ -14,15 +14,16 @@ use cantap_serve::{Board, Settings};
 const BITRATE_BPS: u32 = 1_000_000;
 const CLIENTS: usize = 8;
 const SLOW: usize = 2;
-/// What waits for a client: less than a second of two saturated channels, shorter than a slow client's pauses.
+/// The limit for records waiting for a client: less than a second of two saturated channels, shorter than a
+/// slow client's pauses.
 const MOST_RECORDS: usize = 30_000;
-/// Shorter than what makes a client give its server up.
+/// Shorter than the time after which a client gives up its server.
 const PAUSE: Duration = Duration::from_millis(1600);
 
-/// Enough to read all that waits.
+/// Enough to read everything that is waiting.
 const CATCH_UP: Duration = Duration::from_millis(600);
 
-/// A reader that pauses while it is told so.
+/// A reader that pauses on demand.
 struct Gated {
     reader: Box<dyn Read + Send>,
     is_closed: Arc<AtomicBool>,
@@ -38,7 +39,7 @@ impl Read for Gated {
     }
 }
 
-/// A channel's frames, each with the number of frames that were lost before it.
+/// A channel's frames, each with the number of frames lost before it.
 fn frames_of(records: &[TraceRecord], channel: Channel) -> Vec<(u32, cantap::Frame)> {
     let mut frames = Vec::new();
     let mut lost = 0;
@@ -82,7 +83,8 @@ fn eight_clients_each_have_every_frame_or_its_loss_in_place() {
         .collect();
     std::thread::sleep(Duration::from_millis(200));
     let deadline = Instant::now() + Duration::from_secs(20);
-    // Until they have caught up, which shows what comes after the loss. On a busy computer the board is slower, too.
+    // Wait until they have caught up, which shows what comes after the loss. On a busy computer the board is slower,
+    // too.
     while devices[..SLOW].iter().any(|device| device.counters().channels.iter().any(|of| of.lost_host == 0)) {
         assert!(Instant::now() < deadline, "the slow ones lose");
         is_closed.store(true, Ordering::Relaxed);
@@ -105,7 +107,7 @@ fn eight_clients_each_have_every_frame_or_its_loss_in_place() {
         }
     }
     for channel in Channel::ALL {
-        // The last of the quick ones began last, and lost nothing.
+        // The last of the fast ones began last and lost nothing.
         let whole: Vec<cantap::Frame> =
             frames_of(&traces[CLIENTS - 1], channel).into_iter().map(|(_, frame)| frame).collect();
         assert!(whole.len() > 20_000, "{}", whole.len());

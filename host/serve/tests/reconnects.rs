@@ -1,4 +1,4 @@
-//! Clients that come and go, a thousand of them. A file of its own: they are in the way of tests that count what is slow.
+//! A thousand clients that come and go. This is a separate file because they would disturb tests that count what is slow.
 #![cfg(target_os = "linux")]
 
 use std::io::Write;
@@ -27,12 +27,12 @@ fn held() -> [usize; 2] {
     ["/proc/self/task", "/proc/self/fd"].map(|folder| std::fs::read_dir(folder).unwrap().count())
 }
 
-/// Some leave politely, some are cut off at any point; nothing of them stays behind, and who listens beside them loses nothing.
+/// Some leave politely, some are cut off at any point; nothing of them remains, and a listener beside them loses nothing.
 #[test]
 fn a_thousand_clients_come_and_go_and_nothing_of_them_stays() {
     const THREADS: usize = 16;
     const EACH: usize = 63;
-    // Those who only knocked are noticed a moment later.
+    // Clients that only connected are noticed a moment later.
     let settings = Settings { most_clients: 400, ..Settings::at(BITRATE_BPS) };
     let connect = Box::new(|_: Option<&str>| Ok(cantap_virtual::start("load=50".parse()?)?.into_link()));
     let board = Arc::new(Board::start("board", connect, settings, |_| {}).unwrap());
@@ -65,7 +65,7 @@ fn a_thousand_clients_come_and_go_and_nothing_of_them_stays() {
                             let device = Device::over(link().unwrap(), "one of many").unwrap();
                             device.listen(Channel::Can1, BITRATE_BPS).unwrap();
                         }
-                        // Greeted, opened, and cut off with answers under way.
+                        // Greeted, opened, and cut off with answers in flight.
                         1 => {
                             let Link { mut writer, .. } = link().unwrap();
                             let commands = [
@@ -78,7 +78,7 @@ fn a_thousand_clients_come_and_go_and_nothing_of_them_stays() {
                                 writer.write_all(&encode(&request).unwrap()).unwrap();
                             }
                         }
-                        // Only knocked.
+                        // Only connected.
                         _ => drop(link().unwrap()),
                     }
                     came.fetch_add(1, Ordering::Relaxed);

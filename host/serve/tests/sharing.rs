@@ -1,4 +1,5 @@
-//! Several clients on one board: each has what the board has, each loss is where it belongs, and nobody may do more than granted.
+//! Several clients on one board: each gets what the board has, each loss is where it belongs, and nobody may do more than
+//! allowed.
 
 use std::collections::HashMap;
 use std::sync::mpsc::{Receiver, channel};
@@ -31,7 +32,7 @@ fn client(board: &Board, name: &str, role: Role) -> Device {
     Device::over(board.link(name, role).unwrap(), name).unwrap()
 }
 
-/// What a device has captured until it was stopped.
+/// What a device captured until it was stopped.
 fn drain(device: &Device) -> Vec<TraceRecord> {
     device.stop().unwrap();
     device.records().map(Result::unwrap).collect()
@@ -60,7 +61,7 @@ fn wait_until(what: &str, mut holds: impl FnMut() -> bool) {
     }
 }
 
-/// The board's time of each record is the same for all, to the tick; UTC is each one's own.
+/// The board's time of each record is the same for all clients, to the tick; UTC is each client's own.
 #[test]
 fn two_clients_have_the_same_frames_in_the_same_order_and_nothing_is_lost() {
     let board = board("load=90");
@@ -77,7 +78,7 @@ fn two_clients_have_the_same_frames_in_the_same_order_and_nothing_is_lost() {
         assert!(counters.channels.iter().all(|channel| channel.lost() == 0), "{counters:?}");
     }
     let (one, other) = (frames(&one), frames(&other));
-    // The first began a little earlier and ended a little earlier; per channel, for the two are closed one after the other.
+    // The first began and ended a little earlier; compare per channel, because the two are closed one after the other.
     for channel in [1, 2] {
         let of = |all: &[(u8, String)]| {
             all.iter()
@@ -93,13 +94,13 @@ fn two_clients_have_the_same_frames_in_the_same_order_and_nothing_is_lost() {
     }
 }
 
-/// Frames delivered and frames counted lost make all that there were; the other client has them all.
+/// Delivered frames and frames counted as lost add up to all there were; the other client has all of them.
 #[test]
 fn a_slow_client_loses_counted_frames_at_stage_host_and_holds_up_nobody() {
     let settings = Settings { most_records: 2000, ..Settings::at(FAST_BPS) };
     let (board, _told) = board_at("load=100,frames=std8", settings);
     let good = client(&board, "good", Role::Listen);
-    // A link that reads nothing on demand, but not long enough for the device to be given up as silent.
+    // A link that stops reading on demand, but not long enough for the device to be given up as silent.
     let gate = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
     let Link { reader, writer, keep_alive } = board.link("slow", Role::Listen).unwrap();
     let gated = Gated { reader, gate: gate.clone() };
@@ -120,7 +121,7 @@ fn a_slow_client_loses_counted_frames_at_stage_host_and_holds_up_nobody() {
     assert_eq!(of_good.lost(), 0, "{of_good:?}");
     assert!(of_slow.lost_host > 1000, "{of_slow:?}");
     assert_eq!(of_slow.lost(), of_slow.lost_host, "{of_slow:?}");
-    // In place: the frames around a loss are those of the other's trace, that many apart.
+    // In place: the frames around a loss are in the other client's trace, that far apart.
     let on_first = |(channel, frame): (u8, String)| (channel == 1).then_some(frame);
     let all: Vec<String> = frames(&all).into_iter().filter_map(on_first).collect();
     let mut at = None;
@@ -183,7 +184,7 @@ fn a_listener_changes_nothing_and_is_told_what_it_would_take() {
     let periodic =
         Periodic { frame: frame.frame, period_ticks: 100_000, count: 0, modifiers: heapless_none() };
     assert_eq!(refusal(device.set_periodic(Channel::Can1, 0, Some(periodic))), not_granted(Role::Send));
-    // What was refused is said in words.
+    // The refusal says what was refused.
     let said = device.send(Channel::Can1, &[frame]).unwrap_err().to_string();
     assert_eq!(
         said,
@@ -201,7 +202,7 @@ fn one_client_configures_at_a_time_and_nobody_changes_what_others_hear() {
     let (first, second) =
         (client(&board, "first", Role::Configure), client(&board, "second", Role::Configure));
     let third = client(&board, "third", Role::Listen);
-    // Nothing is known of the buses: somebody has to say it.
+    // The bit rate of the buses is unknown: somebody has to give it.
     assert_eq!(
         refusal(third.listen(Channel::Can1, BITRATE_BPS)),
         Refusal::NotGranted { needs: Role::Configure }
@@ -217,8 +218,8 @@ fn one_client_configures_at_a_time_and_nobody_changes_what_others_hear() {
     wait_until("the right is free", || second.listen(Channel::Can2, BITRATE_BPS).is_ok());
 }
 
-/// Who sends has the confirmation with its own tag, others have the frame as sent by the board; the board acknowledges only while
-/// somebody may.
+/// The sender gets the confirmation with its own tag, others the frame as sent by the board; the board acknowledges only while
+/// somebody may send.
 #[test]
 fn a_sender_is_confirmed_others_see_the_frame_and_the_board_listens_again_when_it_leaves() {
     let board = board("load=0");
@@ -231,7 +232,7 @@ fn a_sender_is_confirmed_others_see_the_frame_and_the_board_listens_again_when_i
     sender.send(Channel::Can1, &[TxFrame { tag: 77, frame, at_ticks: None }]).unwrap();
     let end = ends.recv_timeout(Duration::from_secs(2)).unwrap();
     assert_eq!((end.tag, end.result), (77, Ok(frame)));
-    // The same entry number for two clients; each has its own.
+    // The same entry number for two clients; each has its own entry.
     let other = client(&board, "other", Role::Send);
     let other_ends = other.transmissions();
     other.open_channel(Channel::Can1, Some(normal(&other))).unwrap();
@@ -254,7 +255,7 @@ fn a_sender_is_confirmed_others_see_the_frame_and_the_board_listens_again_when_i
             }
         }
     }
-    // Filters are each client's own.
+    // Each client has its own filters.
     other.close_channel(Channel::Can1).unwrap();
     drop(sender);
     wait_until("the board only listens", || {
@@ -267,7 +268,7 @@ fn a_sender_is_confirmed_others_see_the_frame_and_the_board_listens_again_when_i
         .iter()
         .filter(|record| matches!(record.event, TraceEvent::Frame { direction: Direction::Tx, .. }));
     assert_eq!(sent.count(), 7);
-    // It was not on the bus for a moment, twice: when the first sender came and when the last one had left.
+    // It was off the bus for a moment, twice: when the first sender came and when the last one had left.
     assert_eq!(heard.iter().filter(|record| record.event == TraceEvent::GAP).count(), 2, "{heard:?}");
 }
 
@@ -333,7 +334,7 @@ fn when_the_board_goes_clients_are_told_and_find_it_again() {
     device.listen(Channel::Can1, BITRATE_BPS).unwrap();
     let mut records = device.records();
     std::thread::sleep(Duration::from_millis(100));
-    // Not below others.
+    // Not while others use the channels.
     assert_eq!(refusal(manager.reset()), Refusal::OtherSettings);
     device.close_channel(Channel::Can1).unwrap();
     manager.reset().unwrap();

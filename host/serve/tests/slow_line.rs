@@ -1,40 +1,24 @@
-//! A client behind a line that carries less than its buses do: it loses, counted, and its requests are answered in time all the same.
+//! A client on a line that carries less than its buses do: it loses frames, counted, and its requests are still answered in time.
 #![cfg(unix)]
 
-use std::io::Read;
+mod line;
+
 use std::os::unix::net::UnixStream;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use cantap::Channel;
 use cantap::device::{Device, Link};
 use cantap::wire::message::Role;
 use cantap_serve::{Board, Settings, listen};
+use line::SlowLine;
 
 const BITRATE_BPS: u32 = 1_000_000;
-/// Two saturated channels take 210 000.
+/// Two saturated channels need 210 000.
 const BYTES_PER_S: usize = 80_000;
 const SOCKET_TIMEOUT: Duration = Duration::from_millis(50);
 
-/// A line that carries so many bytes in a second.
-struct SlowLine {
-    stream: UnixStream,
-    began: Instant,
-    taken: usize,
-}
-
-impl Read for SlowLine {
-    fn read(&mut self, out: &mut [u8]) -> std::io::Result<usize> {
-        let due = self.began + Duration::from_secs_f64(self.taken as f64 / BYTES_PER_S as f64);
-        std::thread::sleep(due.saturating_duration_since(Instant::now()));
-        let most = out.len().min(BYTES_PER_S / 50);
-        let len = self.stream.read(&mut out[..most])?;
-        self.taken += len;
-        Ok(len)
-    }
-}
-
-/// Answers go before records that wait, unless the system has those already.
+/// Answers go before waiting records, unless the system already has those.
 #[test]
 fn requests_over_a_slow_line_are_answered_in_time() {
     let connect =
@@ -47,12 +31,11 @@ fn requests_over_a_slow_line_are_answered_in_time() {
     stream.set_read_timeout(Some(SOCKET_TIMEOUT)).unwrap();
     stream.set_write_timeout(Some(SOCKET_TIMEOUT)).unwrap();
     let writer = stream.try_clone().unwrap();
-    let line = SlowLine { stream, began: Instant::now(), taken: 0 };
-    let device = Device::over(Link::new(line, writer), "slow").unwrap();
+    let device = Device::over(Link::new(SlowLine::new(stream, BYTES_PER_S), writer), "slow").unwrap();
     for channel in Channel::ALL {
         device.listen(channel, BITRATE_BPS).unwrap();
     }
-    // Until all that can wait on the way waits.
+    // Until everything on the way is full.
     std::thread::sleep(Duration::from_secs(3));
     for _ in 0..3 {
         device.status().unwrap();

@@ -1,6 +1,8 @@
-//! The socketcand protocol and candump lines over TCP: the page's transcripts, and python-can unchanged.
+//! The socketcand protocol and candump lines over TCP: the protocol page's transcripts, and unmodified
+//! python-can.
 //!
-//! Python is `CANTAP_PYTHON`, else `python3`; without python-can the test says that it was skipped, unless `CANTAP_REQUIRE_PEERS=1`.
+//! Python is `CANTAP_PYTHON`, otherwise `python3`; without python-can the test says that it was skipped, unless
+//! `CANTAP_REQUIRE_PEERS=1`.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -26,7 +28,7 @@ fn listen(board: &Arc<Board>, role: Role) -> Listening {
     socketcand::listen(std::slice::from_ref(board), "127.0.0.1:0".parse().unwrap(), role).unwrap()
 }
 
-/// A client that reads as the careful ones do: by what stands between `<` and `>`.
+/// A client that reads carefully: by messages between `<` and `>`.
 struct Client {
     stream: TcpStream,
     text: String,
@@ -76,7 +78,7 @@ impl Client {
     }
 }
 
-/// A program on the same bus, by our own protocol.
+/// A program on the same bus, using our own protocol.
 fn other(board: &Board) -> Device {
     let device = Device::over(board.link("other", Role::Send).unwrap(), "other").unwrap();
     let timing = device.timing(BITRATE_BPS).unwrap();
@@ -90,7 +92,7 @@ fn send(device: &Device, frame: &str) {
     device.send(Channel::Can1, &[frame]).unwrap();
 }
 
-/// Without its time.
+/// A message without its time.
 fn timeless(message: &str) -> String {
     let words: Vec<&str> = message.splitn(5, ' ').collect();
     assert!(words[3].contains('.'), "{message}");
@@ -112,7 +114,7 @@ fn raw_mode_tells_every_frame_and_sends() {
     }
     let heard: Vec<String> = (0..4).map(|_| timeless(&client.one())).collect();
     assert_eq!(heard, ["frame 123 11223344 >", "frame 1AAAAAAA 01F1 >", "frame 123  >", "rtr 00000123 2 >"]);
-    // Its own it does not hear; others do.
+    // It does not receive its own frames; others do.
     client.say("< send 7FF 2 ffffffffffffff80 1 >< sendrtr 123 3 >");
     send(&other, "321#99");
     let mut own = Vec::new();
@@ -125,7 +127,7 @@ fn raw_mode_tells_every_frame_and_sends() {
             );
         }
     }
-    // The first is that of the other.
+    // The first one is the other program's.
     assert_eq!(own.iter().filter(|frame| *frame == "7FF#8001").count(), 1, "{own:?}");
     client.say("< isotpmode >");
     let mut rest: Vec<String> = std::iter::from_fn(|| client.next(Duration::from_millis(500))).collect();
@@ -143,7 +145,7 @@ fn bcm_mode_sends_again_and_again_by_the_board_s_clock_and_tells_what_was_subscr
     let other = other(&board);
     let mut records = other.records();
     let mut client = Client::new(&server);
-    // Two commands at once have two answers.
+    // Two commands sent together get two answers.
     client.say("< open can0 >< subscribe 0 0 123 >< filter 0 0 124 1 F0 >< add 0 5000 200 2 1 FF >");
     assert_eq!(client.one(), "< ok >");
     let mut times = Vec::new();
@@ -153,7 +155,7 @@ fn bcm_mode_sends_again_and_again_by_the_board_s_clock_and_tells_what_was_subscr
             times.push(record.time_ns);
         }
     }
-    // UTC itself is found anew now and then, by some microseconds.
+    // UTC itself is estimated again now and then, moving by some microseconds.
     assert!(times.windows(2).all(|pair| (pair[1] - pair[0] - 5_000_000).abs() < 500_000), "{times:?}");
     client.say("< update 200 1 AA >");
     while records.next().unwrap().unwrap().frame().is_none_or(|frame| frame.to_string() != "200#AA") {}
@@ -161,11 +163,11 @@ fn bcm_mode_sends_again_and_again_by_the_board_s_clock_and_tells_what_was_subscr
     for frame in ["123#11", "125#", "124#11", "124#12", "124#21", "123#R"] {
         send(&other, frame);
     }
-    // It was not on the bus for a moment, when it began to send.
+    // It was off the bus for a moment when it began to send.
     assert_eq!(timeless(&client.one()), "error 20000004 83 01 00 00 00 00 00 00  >");
     let heard: Vec<String> = (0..4).map(|_| timeless(&client.one())).collect();
     assert_eq!(heard, ["frame 123 11  >", "frame 124 11  >", "frame 124 21  >", "rtr 123 0 >"]);
-    assert_eq!(client.ask("< delete 200 >"), "< error nothing is sent again and again as 200 >");
+    assert_eq!(client.ask("< delete 200 >"), "< error nothing is sent periodically as 200 >");
     assert_eq!(client.ask("< add 1000 0 200 0 >"), "< error the board's longest period is 357 s >");
     assert_eq!(client.ask("< send 123 2 11 >"), "< error the number of bytes is wrong in 'send 123 2 11' >");
 }
@@ -223,8 +225,8 @@ fn lines_are_a_candump_log_of_all_channels() {
     }
 }
 
-/// The protocol page's own texts, in its order, and what is said to each: `>` is the client's, `<` the server's, where a time is
-/// written as T, and `!` what another node sends.
+/// The protocol page's own texts, in order: `>` is the client's, `<` the server's, where a time is written as T, and `!` what
+/// another node sends.
 const PAGE: &str = "
 > < can0 B 500000 0 0 0 0 0 0 0 >
 < < ok >
@@ -290,12 +292,13 @@ fn the_protocol_page_is_a_transcript() {
         match who {
             "> " => client.say(text),
             "! " => {
-                // What the client has said is done by then.
+                // By then the client's commands have been carried out.
                 assert_eq!(client.ask("< echo >"), "< echo >", "before {line}");
                 send(&other, text);
                 while records.next().unwrap().unwrap().frame().is_none_or(|frame| frame.to_string() != text) {
                 }
-                // This client is given it by another thread, and what it says next must not overtake it.
+                // Another thread sends this to the client, and the client's next command must not overtake
+                // it.
                 std::thread::sleep(Duration::from_millis(150));
             }
             _ => {
@@ -308,12 +311,12 @@ fn the_protocol_page_is_a_transcript() {
             }
         }
     }
-    // Every frame of the page's examples, the interval of 10 µs aside, which no bus carries.
+    // Every frame of the page's examples, except for the interval of 10 µs, which no bus can carry.
     other.stop().unwrap();
     assert_eq!(client.next(Duration::from_millis(300)), None);
 }
 
-/// What an interval holds back is told when it is over, also where nothing else is on the bus.
+/// A frame held back by an interval is sent when that is over, even if nothing else is on the bus.
 #[test]
 fn a_throttled_frame_is_told_on_a_silent_bus() {
     let board = board("load=0");
@@ -330,7 +333,7 @@ fn a_throttled_frame_is_told_on_a_silent_bus() {
     assert_eq!(timeless(&client.one()), "frame 123 03  >");
 }
 
-/// SavvyCAN compares what one read gives it, and connects anew after ten seconds without a byte.
+/// SavvyCAN compares the result of one read, and reconnects after ten seconds without a byte.
 #[test]
 fn savvycan_stays_connected_on_a_silent_bus() {
     let board = board("load=0");
@@ -351,7 +354,7 @@ fn savvycan_stays_connected_on_a_silent_bus() {
     assert!(silent_since.elapsed() > Duration::from_secs(5), "a bus with traffic needs none");
 }
 
-/// Finds the server by its beacon, hears frames with and without data, sends, has one sent again and again.
+/// Finds the server by its beacon, receives frames with and without data, sends, and has one sent repeatedly.
 const PROGRAM: &str = r#"
 import sys, time, can
 from can.interfaces.socketcand import socketcand

@@ -1,4 +1,5 @@
-//! Clients from other computers: who shows which certificate may do what, and who shows none hears nothing.
+//! Clients on other computers: the certificate shown decides what a client may do, and without one it
+//! receives nothing.
 #![cfg(feature = "tls")]
 
 use std::io::{Read, Write};
@@ -64,7 +65,7 @@ fn refuses_to_send(device: &Device) {
 fn a_capture_over_tls_is_one_made_beside_it_and_the_certificate_says_what_is_allowed() {
     let folder = tempfile::tempdir().unwrap();
     let served = serve(folder.path(), Role::Send);
-    // Clients are added later, by the authority that is there.
+    // Clients are added later, by the existing authority.
     let keys = Keys::in_folder(folder.path()).unwrap();
     let listener = keys.add_client("listener", Role::Listen).unwrap();
     let sender = keys.add_client("sender", Role::Send).unwrap();
@@ -109,16 +110,17 @@ fn strangers_and_wrong_certificates_hear_nothing() {
     let keys = Keys::in_folder(folder.path()).unwrap();
     let good = keys.add_client("good", Role::Listen).unwrap();
     let foreign = Keys::in_folder(other.path()).unwrap().add_client("good", Role::Send).unwrap();
-    // Another authority's client; a server that is not of the authority the client believes; a server's key as a client's.
+    // Another authority's client; a server that is not from the authority that the client trusts; a server's key used as a
+    // client's.
     let of_stranger = Files { authority: good.authority.clone(), ..foreign.clone() };
     let of_server = Keys::files(folder.path(), "server");
     for files in [&of_stranger, &foreign, &of_server] {
         let refused = served.connect("localhost", files);
         assert!(refused.is_err(), "{files:?}");
     }
-    // A name that the server's certificate does not have.
+    // A name that is not in the server's certificate.
     assert!(served.connect("127.0.0.2", &good).is_err());
-    // Plain text, nothing, and a flood: not one byte of ours before the peer has shown who it is.
+    // Plain text, nothing, and a flood: not one byte of ours before the peer has proved who it is.
     let address = served.listening.address().unwrap();
     let mut plain = TcpStream::connect(address).unwrap();
     plain.write_all(&[0, 2, 1, 6, 3, 0x9f, 0xe2, 0x8a, 0x67, 0]).unwrap();
@@ -127,7 +129,7 @@ fn strangers_and_wrong_certificates_hear_nothing() {
     for mut stream in std::iter::once(plain).chain(flood) {
         stream.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
         let mut heard = Vec::new();
-        // Ended or cut; an alert of TLS at most, which is seven bytes.
+        // Ended or cut off; at most a TLS alert, which is seven bytes.
         let _ = stream.read_to_end(&mut heard);
         assert!(heard.len() <= 7, "{heard:?}");
     }
@@ -138,7 +140,8 @@ fn strangers_and_wrong_certificates_hear_nothing() {
     assert!(said.contains("was not let in"), "{said}");
 }
 
-/// A certificate of the folder's authority, for `hosts` and `purpose`, good from 1 January of one year to that of another.
+/// A certificate from the folder's authority, for `hosts` and `purpose`, valid from 1 January of one year to that of
+/// another.
 fn forge(
     folder: &Path,
     name: &str,
@@ -167,7 +170,7 @@ fn forge(
 const ROLE: &str = "send.role.cantap.invalid";
 const NOW: [i32; 2] = [2020, 2060];
 
-/// Each is of the right authority, and differs from a good one in one thing.
+/// Each is from the right authority, and differs from a good one in one respect.
 #[test]
 fn certificates_that_are_expired_not_valid_yet_or_name_no_role_let_nobody_in() {
     let folder = tempfile::tempdir().unwrap();
@@ -191,7 +194,8 @@ fn certificates_that_are_expired_not_valid_yet_or_name_no_role_let_nobody_in() {
         assert!(!refused.is_empty());
     }
     assert_eq!(served.board.clients(), 0);
-    // And the other way round: a client goes to no server whose certificate is over, or is a client's.
+    // And the other way round: a client does not connect to a server whose certificate has expired or is a
+    // client's.
     for (purpose, years) in
         [(ExtendedKeyUsagePurpose::ServerAuth, [2010, 2020]), (ExtendedKeyUsagePurpose::ClientAuth, NOW)]
     {
@@ -213,14 +217,15 @@ fn wait_until(mut holds: impl FnMut() -> bool) {
     }
 }
 
-/// Peers that stop in the middle: of TLS' first message, of the handshake a byte at a time, and after it without a word of ours.
+/// Peers that stop in the middle: in TLS's first message, during the handshake a byte at a time, and after it without sending
+/// anything of ours.
 #[test]
 fn half_open_peers_are_let_go_and_the_others_are_served_meanwhile() {
     let folder = tempfile::tempdir().unwrap();
     let served = serve(folder.path(), Role::Send);
     let good = Keys::in_folder(folder.path()).unwrap().add_client("good", Role::Listen).unwrap();
     let address = served.listening.address().unwrap();
-    // TLS' record header of a first message that does not come.
+    // TLS's record header for a first message that never arrives.
     let begun = |rest: &[u8]| {
         let mut stream = TcpStream::connect(address).unwrap();
         stream.write_all(&[0x16, 3, 1, 2, 0]).unwrap();
@@ -237,7 +242,7 @@ fn half_open_peers_are_let_go_and_the_others_are_served_meanwhile() {
         }
     });
     let started = Instant::now();
-    // Through the handshake, and then nothing.
+    // Completes the handshake, then sends nothing.
     let mute = tls::connect(&format!("localhost:{}", address.port()), &good).unwrap();
     wait_until(|| served.board.clients() == 1);
     let device = served.connect("localhost", &good).unwrap();
@@ -272,7 +277,7 @@ fn keys_are_secret_and_nothing_is_overwritten() {
         use std::os::unix::fs::PermissionsExt;
         assert_eq!(std::fs::metadata(key).unwrap().permissions().mode() & 0o777, 0o600);
     }
-    assert!(keys.add_client("alice", Role::Send).unwrap_err().to_string().contains("is there already"));
+    assert!(keys.add_client("alice", Role::Send).unwrap_err().to_string().contains("already exists"));
     for name in ["", "../x", "a b", "ca-key"] {
         assert!(keys.add_client(name, Role::Listen).is_err(), "{name}");
     }

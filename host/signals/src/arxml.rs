@@ -1,8 +1,8 @@
 //! Databases from ARXML files, AUTOSAR's system descriptions of version 3 and 4.
 //!
-//! A frame's identifier stands where a CAN channel sends it, its signals in the PDUs that are mapped into it, and how their bits become
-//! values in yet other places, named by paths. Of a secured PDU the payload is read, and what follows it: freshness value and authenticator. What a
-//! container PDU holds says each frame anew, so it is not read: its frames keep what else is in them, with a warning.
+//! A frame's identifier is where a CAN channel sends it, its signals are in the PDUs mapped into it, and how their bits become values is in yet
+//! other places, all named by paths. Of a secured PDU, the payload is read and what follows it: freshness value and authenticator. The content of a
+//! container PDU differs from frame to frame, so it is not read: such frames keep their other content, with a warning.
 
 use std::collections::{HashMap, HashSet};
 
@@ -19,7 +19,7 @@ pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
     parse_bus(file, bytes, None)
 }
 
-/// As [`parse`], only the bus of this name.
+/// Like [`parse`], but only the bus of this name.
 pub fn parse_bus(file: &str, bytes: &[u8], bus: Option<&str>) -> Result<Database, DatabaseError> {
     let text = xml::decode(bytes);
     let document = xml::parse(file, &text)?;
@@ -48,7 +48,7 @@ pub fn parse_bus(file: &str, bytes: &[u8], bus: Option<&str>) -> Result<Database
             continue;
         }
         let Some(message) = reader.message(triggering) else { continue };
-        // A frame that several channels send is one message.
+        // A frame sent by several channels is one message.
         if seen.insert((message.id, message.name.clone())) {
             ids.extend(at.map(|at| (message.id, at)));
             messages.push(message);
@@ -63,7 +63,7 @@ pub fn parse_bus(file: &str, bytes: &[u8], bus: Option<&str>) -> Result<Database
     Ok(Database { buses, ..database })
 }
 
-/// The name of the bus, a cluster, that a frame is sent on; empty where it is in none.
+/// The name of the bus (a cluster) on which a frame is sent; empty if it is in none.
 fn bus_of(triggering: Node<'_, '_>) -> String {
     let cluster = triggering.ancestors().find(|node| node.tag_name().name() == "CAN-CLUSTER");
     cluster.map(short_name).unwrap_or_default()
@@ -71,7 +71,7 @@ fn bus_of(triggering: Node<'_, '_>) -> String {
 
 struct Reader<'a> {
     document: &'a Document<'a>,
-    /// Everything that has a name, by its path.
+    /// Everything with a name, by its path.
     by_path: HashMap<String, Node<'a, 'a>>,
     faults: Vec<Fault>,
 }
@@ -89,7 +89,7 @@ fn number(node: Node<'_, '_>, name: &str) -> Option<i64> {
     content(node, name).and_then(|text| integer(&text)).and_then(|value| i64::try_from(value).ok())
 }
 
-/// As AUTOSAR writes integers: a zero in front makes them octal.
+/// Integers as AUTOSAR writes them: a leading zero makes them octal.
 fn integer(text: &str) -> Option<i128> {
     let text = text.trim();
     let (sign, digits) = text.strip_prefix('-').map_or((1, text), |digits| (-1, digits));
@@ -128,21 +128,21 @@ fn order_of(node: Node<'_, '_>, name: &str) -> ByteOrder {
 /// Where a PDU's signals go.
 struct Target<'m> {
     name: &'m str,
-    /// The first bit of the PDU in its frame, a whole number of bytes.
+    /// The position of the PDU's first bit in its frame, always a whole number of bytes.
     offset: u16,
     signals: Vec<Signal>,
     cycle_ms: Option<u32>,
-    /// How deep the PDU is that is being read, and how many were read for this frame.
+    /// How deeply nested the current PDU is, and how many have been read for this frame.
     depth: u32,
     pdus: u32,
 }
 
-/// PDUs of PDUs go no deeper than this, and no frame has more of them: a file can name one as a part of itself.
+/// Limits on the nesting of PDUs and on their number in a frame: a file can name a PDU as part of itself.
 const MOST_DEPTH: u32 = 8;
 const MOST_PDUS: u32 = 1000;
 
 impl<'a> Reader<'a> {
-    /// Notes the path of everything below `node`.
+    /// Indexes everything below `node` by path.
     fn index(&mut self, root: Node<'a, 'a>) {
         let mut open = vec![(root, String::new())];
         while let Some((node, path)) = open.pop() {
@@ -161,7 +161,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// What a reference below `node` names.
+    /// The element that a reference below `node` points to.
     fn reference(&self, node: Node<'a, 'a>, name: &str) -> Option<Node<'a, 'a>> {
         self.by_path.get(&content(node, name)?).copied()
     }
@@ -259,7 +259,7 @@ impl<'a> Reader<'a> {
             "CONTAINER-I-PDU" => {
                 let name = short_name(pdu);
                 let reason = format!(
-                    "{name} is a container PDU: what a frame holds stands in the frame itself, and is not read"
+                    "{name} is a container PDU: the frame itself says what it contains, which is not read"
                 );
                 self.warn(pdu, target.name, &reason);
                 Ok(())
@@ -269,7 +269,7 @@ impl<'a> Reader<'a> {
                 target.cycle_ms = target.cycle_ms.or_else(|| cycle_ms(pdu));
                 let mappings = within(pdu, "I-SIGNAL-TO-I-PDU-MAPPING");
                 for mapping in mappings.collect::<Vec<_>>() {
-                    // A group's mapping has no place: its signals have theirs.
+                    // A group's mapping has no position: those of its signals do.
                     if number(mapping, "START-POSITION").is_none() {
                         continue;
                     }
@@ -294,7 +294,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// A PDU with the payload of another one in front of what proves who sent it.
+    /// A PDU with the payload of another one, followed by the proof of who sent it.
     fn secured(&mut self, pdu: Node<'a, 'a>, target: &mut Target) -> Result<(), (Node<'a, 'a>, FaultKind)> {
         let name = short_name(pdu);
         if content(pdu, "USE-AS-CRYPTOGRAPHIC-I-PDU").as_deref() == Some("true") {
@@ -317,8 +317,8 @@ impl<'a> Reader<'a> {
         Ok(())
     }
 
-    /// The freshness value and the authenticator that follow a payload, as far as a frame carries them. They have no names in the
-    /// file; these are what cantools calls them.
+    /// The freshness value and the authenticator after a payload, as far as a frame carries them. They have no names in the file;
+    /// cantools gives them these.
     fn proof(&mut self, pdu: Node<'a, 'a>, payload: Node<'a, 'a>, target: &mut Target) {
         let parts = [
             ("Freshness", "FRESHNESS-PROPS-REF", "FRESHNESS-VALUE-TX-LENGTH"),
@@ -353,7 +353,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// A PDU whose selector says which of several others is in it.
+    /// A PDU whose selector says which of several others it contains.
     fn multiplexed(
         &mut self,
         pdu: Node<'a, 'a>,
@@ -372,7 +372,7 @@ impl<'a> Reader<'a> {
             return Err((pdu, FaultKind::Syntax("the selector has no place".to_owned())));
         };
         let switch = target.signals.len();
-        // A selector has no name in the file; this is what cantools calls it.
+        // A selector has no name in the file; cantools gives it this one.
         let selectors = target.signals.iter().filter(|signal| signal.is_switch).count();
         let name = format!("{}_selector{}", target.name, selectors + 1);
         target.signals.push(Signal {
@@ -423,7 +423,8 @@ impl<'a> Reader<'a> {
             line: self.line(i_signal),
             ..Signal::new(short_name(i_signal), place, length)
         };
-        // How it travels goes before what it is inside of a control unit; in version 3 the type says it.
+        // How it is transmitted takes precedence over how a control unit stores it; in version 3 the type
+        // says so.
         let data_type = system.and_then(|system| self.reference(system, "DATA-TYPE-REF"));
         let sources: Vec<_> = [Some(i_signal), system, data_type].into_iter().flatten().collect();
         let find = |name: &'static str| {
@@ -461,7 +462,7 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// What the name of an encoding means.
+/// The value kind for the name of an encoding.
 fn kind(encoding: &str, length: u16) -> ValueKind {
     match (encoding, length) {
         ("2C", _) => ValueKind::Signed,
@@ -495,7 +496,7 @@ fn compute(method: Node<'_, '_>, signal: &mut Signal) -> Result<(), FaultKind> {
         let (low, high) = (limit("LOWER-LIMIT"), limit("UPPER-LIMIT"));
         let named = |name: &'static str| scale.descendants().find(move |node| node.tag_name().name() == name);
         if let Some(text) = named("VT") {
-            // One limit alone is both.
+            // A single limit is both.
             if let Some((low, high)) = low.or(high).zip(high.or(low))
                 && low <= high
                 && high - low < xml::MOST_TEXTS as f64
@@ -516,7 +517,7 @@ fn compute(method: Node<'_, '_>, signal: &mut Signal) -> Result<(), FaultKind> {
             continue;
         }
         let (&[offset, factor], [divisor]) = (&numerator[..], &denominator[..]) else {
-            return Err(FaultKind::Syntax(format!("{} is no linear computation", short_name(method))));
+            return Err(FaultKind::Syntax(format!("{} is not a linear computation", short_name(method))));
         };
         let found = (factor / divisor, offset / divisor);
         if line.replace(found).is_some_and(|before| before != found) {

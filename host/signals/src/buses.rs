@@ -1,4 +1,4 @@
-//! Files that describe several buses: which of them are read, and what is said where all are.
+//! Files that describe several buses: which of them are read, and the warning if all are.
 
 use std::collections::HashMap;
 
@@ -7,7 +7,7 @@ use cantap_wire::Id;
 use super::fault::{DatabaseError, Fault, FaultKind};
 use super::xml;
 
-/// The buses that are read of those that a file has: the one that is wanted, or all.
+/// Which of a file's buses are read: the requested one, or all.
 pub fn chosen(file: &str, all: Vec<String>, wanted: Option<&str>) -> Result<Vec<String>, DatabaseError> {
     let Some(wanted) = wanted else { return Ok(all) };
     if all.iter().any(|name| name == wanted) {
@@ -20,7 +20,8 @@ pub fn chosen(file: &str, all: Vec<String>, wanted: Option<&str>) -> Result<Vec<
     Err(xml::faulty(file, reason))
 }
 
-/// The warning where identifiers are on several buses that are read as one. `messages` are identifiers with the number of their bus.
+/// The warning if identifiers are used on several buses that are read as one. `messages` are identifiers with the number of their
+/// bus.
 pub fn warning(buses: &[String], messages: impl IntoIterator<Item = (Id, usize)>) -> Option<Fault> {
     let mut first: HashMap<Id, usize> = HashMap::new();
     let others = messages.into_iter().filter(|(id, bus)| first.entry(*id).or_insert(*bus) != bus).count();

@@ -1,9 +1,9 @@
-//! Texts of files, fit for a terminal.
+//! Makes texts from files safe for a terminal.
 
 use std::borrow::Cow;
 
-/// Whether a character moves the cursor, starts an escape sequence, ends a line or turns the direction of writing: none of
-/// that may come from a file that somebody else wrote.
+/// Whether a character moves the cursor, starts an escape sequence, ends a line or changes the writing direction: none of
+/// that may come from somebody else's file.
 fn is_harmful(character: char) -> bool {
     character.is_control()
         || matches!(
@@ -12,7 +12,8 @@ fn is_harmful(character: char) -> bool {
         )
 }
 
-/// The text on one line, with `\u{FFFD}` for what a terminal would obey. Line ends and tabs become spaces.
+/// The text on one line, with `\u{FFFD}` for characters that a terminal would interpret. Line ends and tabs
+/// become spaces.
 pub fn line(text: &str) -> Cow<'_, str> {
     if !text.contains(is_harmful) {
         return Cow::Borrowed(text);
@@ -26,7 +27,7 @@ pub fn line(text: &str) -> Cow<'_, str> {
     text.chars().map(harmless).collect::<String>().into()
 }
 
-/// As [`line`], but with the text's own lines, each ended by `\n`.
+/// Like [`line`], but keeps the text's own lines, each ended by `\n`.
 pub fn lines(text: &str) -> Cow<'_, str> {
     if !text.contains(is_harmful) {
         return Cow::Borrowed(text);
@@ -35,7 +36,7 @@ pub fn lines(text: &str) -> Cow<'_, str> {
     text.split('\n').map(line).collect::<Vec<_>>().join("\n").into()
 }
 
-/// Makes a string fit, where it is not.
+/// Cleans a string if necessary.
 pub fn make(text: &mut String, clean: fn(&str) -> Cow<'_, str>) {
     if let Cow::Owned(cleaned) = clean(text) {
         *text = cleaned;

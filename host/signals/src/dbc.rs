@@ -1,8 +1,8 @@
 //! Databases from DBC files, parsed by can-dbc.
 //!
-//! Beyond the definitions themselves these attributes count: `SystemMessageLongSymbol` and
-//! `SystemSignalLongSymbol` (names above 32 characters), `VFrameFormat` and `ProtocolType` (whether a
-//! message is a J1939 parameter group), `GenMsgCycleTime`, `GenSigStartValue`.
+//! Besides the definitions, these attributes are used: `SystemMessageLongSymbol` and `SystemSignalLongSymbol`
+//! (names above 32 characters), `VFrameFormat` and `ProtocolType` (whether a message is a J1939 parameter
+//! group), `GenMsgCycleTime`, `GenSigStartValue`.
 
 use std::collections::HashMap;
 
@@ -32,7 +32,7 @@ pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
     validate::finish(file, messages, faults)
 }
 
-/// Everything that the file says about one signal elsewhere than in its definition.
+/// Everything that the file says about a signal outside its definition.
 #[derive(Default)]
 struct SignalExtras<'a> {
     comment: Option<&'a str>,
@@ -52,7 +52,7 @@ struct MessageExtras<'a> {
     frame_format: Option<&'a AttributeValue>,
 }
 
-/// Turns can-dbc's tables into messages.
+/// Converts can-dbc's tables to messages.
 struct Reader<'a> {
     dbc: &'a Dbc,
     index: &'a Index,
@@ -60,9 +60,9 @@ struct Reader<'a> {
     messages: HashMap<MessageId, MessageExtras<'a>>,
     signals: HashMap<(MessageId, &'a str), SignalExtras<'a>>,
     frame_formats: FrameFormats<'a>,
-    /// Whether extended frames without a format of their own are J1939's.
+    /// Whether extended frames without their own format are J1939.
     j1939: bool,
-    /// What signals without a start value of their own get.
+    /// The start value of signals that have none of their own.
     initial: Option<f64>,
 }
 
@@ -136,7 +136,7 @@ impl<'a> Reader<'a> {
         let frame_formats = FrameFormats::of(dbc);
         let j1939 = match dbc.attribute_default("VFrameFormat").and_then(|format| frame_formats.name(format))
         {
-            // A 29-bit message is none of a standard frame: that default says nothing of it.
+            // A 29-bit message cannot be a standard frame, so that default does not apply to it.
             None | Some("StandardCAN" | "StandardCAN_FD") => by_protocol,
             Some(format) => is_j1939(format),
         };
@@ -159,7 +159,7 @@ impl<'a> Reader<'a> {
         let line = self.index.message_line(place);
         let extras = self.messages.remove(&message.id).unwrap_or_default();
         let name = extras.long_name.unwrap_or(&message.name).to_owned();
-        // can-dbc keeps 16 bits of a standard identifier: the file's own number is the truth.
+        // can-dbc keeps 16 bits of a standard identifier: the number in the file is the right one.
         let written = self.index.messages.get(place).map_or(message.id.raw().into(), |&(id, _, _)| id);
         let Some(id) = dbc_parse::id_of(written) else {
             self.faults.push(Fault { line, symbol: name, kind: FaultKind::Id(written) });
@@ -234,7 +234,7 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// The names that the file gives to the values of `VFrameFormat`. Writers number them as they like.
+/// The file's names for the values of `VFrameFormat`. Writers number them as they like.
 struct FrameFormats<'a>(Option<&'a [String]>);
 
 impl<'a> FrameFormats<'a> {
@@ -252,7 +252,7 @@ impl<'a> FrameFormats<'a> {
         match (format, self.0) {
             (AttributeValue::String(name), _) => Some(name),
             (value, Some(names)) => names.get(number(value)? as usize).map(String::as_str),
-            // Vector's own list, where the file has none.
+            // Vector's own list, if the file has none.
             (value, None) => (number(value) == Some(3.0)).then_some("J1939PG"),
         }
     }
@@ -291,13 +291,13 @@ fn plain_switch(definitions: &[can_dbc::Signal]) -> Option<&str> {
     only.map(|signal| signal.name.as_str())
 }
 
-/// The signal's multiplexer and the values under which it is there.
+/// The signal's multiplexer and the values for which it is present.
 fn switch<'a>(
     definition: &can_dbc::Signal,
     extras: &SignalExtras<'a>,
     plain_switch: Option<&'a str>,
 ) -> Option<(&'a str, Vec<std::ops::RangeInclusive<u64>>)> {
-    // SG_MUL_VAL_ knows better than the indicator, which some writers reduce to M.
+    // SG_MUL_VAL_ is more precise than the indicator, which some writers reduce to M.
     if let Some(multiplex) = extras.switch {
         let ranges = multiplex.mappings.iter().map(|mapping| mapping.min_value..=mapping.max_value);
         return Some((&multiplex.multiplexor_signal_name, ranges.collect()));
@@ -330,7 +330,7 @@ fn signal(definition: &can_dbc::Signal, extras: &SignalExtras, start: u16, lengt
         NumericValue::Double(value) => value,
     };
     let (min, max) = (float(definition.min), float(definition.max));
-    // [0|0] is how a DBC file says that it does not say.
+    // In a DBC file, [0|0] means that the limits are not given.
     let limited = min != 0.0 || max != 0.0;
     let values = extras.values.unwrap_or_default();
     let texts = values.iter().map(|value| (value.id, unescape(&value.description)));
@@ -356,7 +356,7 @@ fn signal(definition: &can_dbc::Signal, extras: &SignalExtras, start: u16, lengt
     }
 }
 
-/// can-dbc leaves `\"` in strings as it stands.
+/// can-dbc leaves `\"` in strings unchanged.
 fn unescape(text: &str) -> String {
     text.replace("\\\"", "\"")
 }

@@ -1,7 +1,7 @@
-//! From a DBC file's text to can-dbc's tables, leaving out what cannot be understood.
+//! Converts a DBC file's text to can-dbc's tables, leaving out what cannot be understood.
 //!
-//! can-dbc takes a file whole or not at all. So a file that it refuses is given to it statement by statement, and what it
-//! refuses then is left out with a warning: a message with its signals, or one statement about them.
+//! can-dbc accepts or refuses a file as a whole. So a file that it refuses is passed to it statement by statement, and
+//! each part it refuses is left out with a warning: a message with its signals, or a single statement about them.
 
 use std::borrow::Cow;
 use std::collections::HashSet;
@@ -14,13 +14,13 @@ use pest::error::{ErrorVariant, LineColLocation};
 use super::dbc_text::{Index, Statement};
 use super::fault::{Fault, FaultKind};
 
-/// Holds signals that belong to no message, with an identifier that no frame can have.
+/// Holds signals that belong to no message, under an identifier that no frame can have.
 pub const NO_MESSAGE: &str = "VECTOR__INDEPENDENT_SIG_MSG";
 
 /// The flag of an extended identifier in a DBC file.
 pub const EXTENDED: u64 = 1 << 31;
 
-/// The identifier that a number in the file stands for, if a frame can have it.
+/// The identifier for a number in the file, if a frame can have it.
 pub fn id_of(written: u64) -> Option<Id> {
     match u32::try_from(written & !EXTENDED) {
         Ok(raw) if written & EXTENDED != 0 => Id::extended(raw),
@@ -29,7 +29,7 @@ pub fn id_of(written: u64) -> Option<Id> {
     }
 }
 
-/// The tables, and where in the text what is in them stands. `None` if the text is no DBC file at all; the faults then say why.
+/// The tables, and where in the text their content is. `None` if the text is not a DBC file at all; the faults then say why.
 pub fn parse(text: &str, faults: &mut Vec<Fault>) -> Option<(Dbc, Index)> {
     let index = Index::of(text);
     if index.statements.is_empty() {
@@ -48,7 +48,7 @@ pub fn parse(text: &str, faults: &mut Vec<Fault>) -> Option<(Dbc, Index)> {
     };
     text = without_bad_statements(&text, faults).into();
     index = Index::of(&text);
-    // What is right by itself is right together. Should can-dbc ever think otherwise, it says where.
+    // Statements that are right individually are right together. Should can-dbc ever disagree, it says where.
     for _ in 0..=index.statements.len() {
         match try_parse(&text) {
             Ok(dbc) => return Some((dbc, index)),
@@ -75,12 +75,12 @@ pub fn parse(text: &str, faults: &mut Vec<Fault>) -> Option<(Dbc, Index)> {
 }
 
 fn try_parse(text: &str) -> Result<Dbc, DbcError> {
-    // can-dbc's grammar accepts a file's last line only with its end.
+    // can-dbc's grammar requires a line end after a file's last line.
     Dbc::try_from(format!("{text}\n").as_str())
 }
 
 /// Leaves out messages whose identifier no frame can have, and everything said about them: can-dbc keeps 16 bits of a
-/// standard identifier, so that it would be said of another message.
+/// standard identifier and would attach those statements to another message.
 fn without_bad_ids<'a>(text: &'a str, index: Index, faults: &mut Vec<Fault>) -> (Cow<'a, str>, Index) {
     let mut bad = HashSet::new();
     for (id, name, line) in &index.messages {
@@ -98,8 +98,8 @@ fn without_bad_ids<'a>(text: &'a str, index: Index, faults: &mut Vec<Fault>) -> 
     (blanked.into(), index)
 }
 
-/// The text with spaces in place of messages with these identifiers, as written in the file, and of everything said about
-/// them.
+/// The text with messages of these identifiers, as written in the file, and everything said about them replaced by
+/// spaces.
 fn without_messages(text: &str, index: &Index, ids: &HashSet<String>) -> String {
     let mut blanks = Blanks::of(text);
     let mut place = 0;
@@ -114,22 +114,22 @@ fn without_messages(text: &str, index: &Index, ids: &HashSet<String>) -> String 
     blanks.text()
 }
 
-/// The identifier of the message that a statement is about: `BO_ ID`, `VAL_ ID SIGNAL`, `CM_ SG_ ID SIGNAL`,
-/// `BA_ "ATTRIBUTE" SG_ ID SIGNAL VALUE`.
+/// The identifier of a statement's message: `BO_ ID`, `VAL_ ID SIGNAL`, `CM_ SG_ ID SIGNAL`, `BA_ "ATTRIBUTE"
+/// SG_ ID SIGNAL VALUE`.
 fn id_word(statement: &str) -> Option<&str> {
     let words: Vec<_> = statement.lines().next()?.split_whitespace().take(4).collect();
     let kind = words.iter().skip(1).position(|word| matches!(*word, "BO_" | "SG_"));
     words.get(kind.map_or(1, |kind| kind + 2)).copied()
 }
 
-/// The text with spaces in place of each statement that can-dbc refuses, a message going with its signals.
+/// The text with each statement that can-dbc refuses replaced by spaces; a message goes with its signals.
 fn without_bad_statements(text: &str, faults: &mut Vec<Fault>) -> String {
     let mut blanks = Blanks::of(text);
     let mut index = Index::of(text);
     let mut place = 0;
-    // Signals at a block's start are those of a message that was left out.
+    // Signals at the beginning of a block belong to a message that was left out.
     let mut left_out = false;
-    // Without these statements a message's signals have other values, or come at other times.
+    // Without these statements, a message's signals would have other values or appear at other times.
     let mut messages = HashSet::new();
     while place < index.statements.len() {
         let block = block(&index.statements, place);
@@ -149,8 +149,8 @@ fn without_bad_statements(text: &str, faults: &mut Vec<Fault>) -> String {
             }
             None => (first.line, "no message is before it".to_owned()),
         };
-        // A statement whose string does not end takes others into it: then only its first line goes, and the rest is looked at
-        // anew.
+        // A statement with an unterminated string swallows others: then only its first line is removed, and the rest is
+        // examined again.
         let swallower = block.clone().find(|&place| {
             let content = &text[index.statements[place].range.clone()];
             ["\nBO_ ", "\n SG_ ", "\nCM_ ", "\nBA_ ", "\nVAL_ "].iter().any(|start| content.contains(start))
@@ -187,7 +187,7 @@ fn without_bad_statements(text: &str, faults: &mut Vec<Fault>) -> String {
     without_messages(&text, &index, &messages)
 }
 
-/// A text in which statements become spaces, so that everything else keeps its place.
+/// A text in which statements are replaced by spaces, so that everything else keeps its place.
 struct Blanks(Vec<u8>);
 
 impl Blanks {
@@ -195,7 +195,7 @@ impl Blanks {
         Self(text.as_bytes().to_vec())
     }
 
-    /// Blanks whole characters, all but line ends.
+    /// Replaces whole characters by spaces, except for line ends.
     fn blank(&mut self, range: Range<usize>) {
         let bytes = &mut self.0[range];
         bytes.iter_mut().filter(|byte| !matches!(byte, b'\n' | b'\r')).for_each(|byte| *byte = b' ');
@@ -206,7 +206,7 @@ impl Blanks {
     }
 }
 
-/// A message's statement with those of its signals, or a statement alone.
+/// A message's statement with those of its signals, or a single statement.
 fn block(statements: &[Statement], place: usize) -> Range<usize> {
     let heads = matches!(statements[place].keyword.as_str(), "BO_" | "SG_");
     let signals = statements[place + 1..].iter().take_while(|statement| heads && statement.keyword == "SG_");
@@ -230,8 +230,8 @@ fn fault(statement: &Statement, line: u32, reason: String, of_message: bool) -> 
     Fault { line, symbol: statement.symbol.clone(), kind }
 }
 
-/// What a statement looks like. can-dbc's errors mostly point at its start and name rules of a grammar
-/// that nobody knows.
+/// The form of a statement. can-dbc's errors mostly point at its beginning and name rules of an obscure
+/// grammar.
 fn form(keyword: &str) -> Option<&'static str> {
     Some(match keyword {
         "BO_" => "BO_ ID NAME : LENGTH SENDER",
@@ -243,10 +243,10 @@ fn form(keyword: &str) -> Option<&'static str> {
     })
 }
 
-/// The line of can-dbc's error and what it says, in words.
+/// The line of can-dbc's error, and its meaning in words.
 fn explain(error: &DbcError, text: &str) -> (u32, String) {
-    // can-dbc says which number is wrong and not where. A signal's place goes before other numbers,
-    // because nothing else may not be negative.
+    // can-dbc says which number is wrong but not where. A signal's position is tried before other numbers,
+    // because only it must not be negative.
     let line_of = |token: &str| {
         let (start, length) = (format!(": {token}|"), format!("|{token}@"));
         let is_word = |line: &str| {

@@ -1,13 +1,13 @@
-//! The text of a DBC file before it is parsed: its encoding, and which line says what.
+//! Handles the text of a DBC file before it is parsed: its encoding, and which line contains what.
 //!
 //! can-dbc's result has no positions, so the lines of messages and signals are found here. A
-//! statement starts on its own line; a string may run over several.
+//! statement starts on a new line; a string may span several.
 
 use std::borrow::Cow;
 use std::collections::HashMap;
 use std::ops::Range;
 
-/// Statements that say nothing about how frames are decoded.
+/// Statements that do not affect how frames are decoded.
 const NEEDLESS: &[&str] = &[
     "VERSION",
     "NS_",
@@ -63,18 +63,18 @@ pub struct Statement {
     pub range: Range<usize>,
     /// Its first word.
     pub keyword: String,
-    /// `Message` or `Message.Signal` for definitions, else the keyword and the words after it.
+    /// `Message` or `Message.Signal` for definitions, otherwise the keyword and the words after it.
     pub symbol: String,
 }
 
-/// Where everything is.
+/// The positions of everything.
 #[derive(Debug, Default)]
 pub struct Index {
     /// In the order of the text.
     pub statements: Vec<Statement>,
-    /// Identifier as written in the file, and name, of each `BO_` with its line.
+    /// Identifier as written in the file, name and line of each `BO_`.
     pub messages: Vec<(u64, String, u32)>,
-    /// Lines of signals by their message's place in `messages` and their name.
+    /// Lines of signals, by their message's index in `messages` and their name.
     signals: HashMap<(usize, String), u32>,
     /// Lines of the first statement about a signal, by keyword, message identifier and name.
     references: HashMap<(String, String, String), u32>,
@@ -89,7 +89,7 @@ impl Index {
         let mut offset = 0;
         for (number, line) in text.split_inclusive('\n').enumerate() {
             if !in_string {
-                // The list after NS_ names keywords on indented lines of their own.
+                // The list after NS_ names keywords on separate, indented lines.
                 in_symbols &= line.starts_with([' ', '\t', '\r', '\n']);
                 if !in_symbols {
                     index.start_statement(line, number as u32 + 1, offset);
@@ -109,7 +109,7 @@ impl Index {
         let mut words = line.split(|c: char| c.is_ascii_whitespace() || c == ':').filter(|w| !w.is_empty());
         let Some(keyword) = words.next() else { return };
         if !NEEDED.contains(&keyword) && !NEEDLESS.contains(&keyword) {
-            // Something unheard of is a statement of its own if it looks like one.
+            // An unknown keyword starts a statement if it looks like one.
             let looks_like = keyword.len() > 1
                 && keyword.ends_with('_')
                 && keyword.bytes().all(|byte| byte.is_ascii_uppercase() || byte == b'_');
@@ -156,7 +156,7 @@ impl Index {
         self.signals.get(&(message, name.to_owned())).copied().unwrap_or_default()
     }
 
-    /// The place in [`Self::statements`] of the one that a line belongs to.
+    /// The index in [`Self::statements`] of the one that a line belongs to.
     pub fn place_at(&self, line: u32) -> Option<usize> {
         self.statements.partition_point(|statement| statement.line <= line).checked_sub(1)
     }

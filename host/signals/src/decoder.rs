@@ -1,4 +1,4 @@
-//! Finding a frame's message, over several databases and channels.
+//! Finds a frame's message, over several databases and channels.
 
 use std::collections::HashMap;
 
@@ -24,13 +24,13 @@ pub struct Source {
 pub struct MessageRef(u32);
 
 impl MessageRef {
-    /// Its place among [`Decoder::messages`], from 0.
+    /// Its index in [`Decoder::messages`], from 0.
     pub const fn index(self) -> usize {
         self.0 as usize
     }
 }
 
-/// Decodes frames by one or several databases.
+/// Decodes frames with one or several databases.
 ///
 /// An extended frame whose exact identifier is not in the database is looked up as a J1939 parameter
 /// group: without its priority, then also without its source address.
@@ -44,14 +44,14 @@ pub struct Decoder {
     faults: usize,
 }
 
-/// Messages of one database that a later one of the same channel describes too, and otherwise.
+/// Messages of one database that a later one for the same channel describes differently.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Override {
-    /// The file whose messages do not count.
+    /// The file whose messages are ignored.
     pub file: String,
-    /// The later file, whose do.
+    /// The later file, whose messages are used.
     pub by: String,
-    /// The names of the messages that do not count.
+    /// The names of the ignored messages.
     pub messages: Vec<String>,
 }
 
@@ -67,7 +67,7 @@ struct Lookup {
     parameter_group: FxHashMap<u32, u32>,
 }
 
-/// Identifier bits that are a parameter group's number: priority and source address are not, nor is
+/// The identifier bits that make up a parameter group's number: they exclude priority and source address, and
 /// the destination address, which PDU format 1 (below 240) has in bits 8 to 15 (SAE J1939-21 §5.2).
 fn parameter_group(id: u32) -> u32 {
     let group = id & 0x03FF_FF00;
@@ -84,8 +84,8 @@ impl Lookup {
         }
     }
 
-    /// Adds a message; returns the one of the same identifier that it takes the place of. Messages below `own` are other
-    /// databases', and give way as parameter groups too.
+    /// Adds a message; returns the one with the same identifier that it replaces. Messages below `own` belong to other
+    /// databases and are also replaced as parameter groups.
     fn insert(&mut self, place: u32, id: Id, j1939: bool, own: u32) -> Option<u32> {
         let raw = id.raw();
         if !id.is_extended() {
@@ -124,15 +124,14 @@ impl Lookup {
 }
 
 impl Decoder {
-    /// Compiles the databases. Where two of the same channel have the same identifier, the later one
-    /// counts.
+    /// Compiles the databases. If two for the same channel have the same identifier, the later one is used.
     pub fn new(sources: Vec<Source>) -> Self {
         let mut common = Lookup::new();
         let mut by_channel = HashMap::new();
         let mut messages: Vec<(Option<u8>, Message, MessagePlan)> = Vec::new();
         let mut overrides: Vec<Override> = Vec::new();
         let faults = sources.iter().map(|source| source.database.warnings.len()).sum();
-        // Each database's file and first message.
+        // Each database's first message and file.
         let mut files: Vec<(u32, String)> = Vec::new();
         for Source { channel, database } in sources {
             let lookup = match channel {
@@ -159,7 +158,7 @@ impl Decoder {
         Self { messages, common, by_channel, overrides, faults }
     }
 
-    /// How many places of the databases are wrong (see [`Database::warnings`]).
+    /// The number of faults in the databases (see [`Database::warnings`]).
     pub const fn faults(&self) -> usize {
         self.faults
     }
@@ -169,8 +168,8 @@ impl Decoder {
         &self.overrides
     }
 
-    /// Treats every extended message as a J1939 parameter group, for databases that do not say so. To be called before signals
-    /// are chosen.
+    /// Treats every extended message as a J1939 parameter group, for databases that do not say so. Call it before choosing
+    /// signals.
     pub fn assume_j1939(&mut self) {
         for (place, (channel, message, plan)) in self.messages.iter_mut().enumerate() {
             if message.id.is_extended() && !message.j1939 {
@@ -187,7 +186,7 @@ impl Decoder {
         }
     }
 
-    /// Decodes only the chosen signals from now on.
+    /// Restricts decoding to the chosen signals.
     pub fn select(&mut self, selection: &Selection) -> Result<(), SelectionError> {
         selection.check(&self.messages.iter().map(|(_, message, _)| message))?;
         for (_, message, plan) in &mut self.messages {
@@ -196,7 +195,7 @@ impl Decoder {
         Ok(())
     }
 
-    /// Decodes only those signals from now on that `keep` accepts, by message and index.
+    /// Restricts decoding to the signals that `keep` accepts, by message and index.
     pub fn retain(&mut self, keep: impl Fn(MessageRef, usize, &Signal) -> bool) {
         for (place, (_, message, plan)) in self.messages.iter_mut().enumerate() {
             let reference = MessageRef(place as u32);
@@ -212,7 +211,7 @@ impl Decoder {
             .map(|(place, (channel, message, _))| (MessageRef(place as u32), *channel, message))
     }
 
-    /// The message behind a reference of this decoder.
+    /// The message for a reference of this decoder.
     pub fn message(&self, message: MessageRef) -> &Message {
         &self.messages[message.0 as usize].1
     }
@@ -229,18 +228,18 @@ impl Decoder {
         })
     }
 
-    /// The message that an identifier means on a channel.
+    /// The message for an identifier on a channel.
     pub fn find(&self, channel: u8, id: Id) -> Option<MessageRef> {
         self.by_channel.get(&channel).unwrap_or(&self.common).find(id).map(MessageRef)
     }
 
-    /// Whether any signal of the message was chosen.
+    /// Whether any of the message's signals is chosen.
     pub fn is_selected(&self, message: MessageRef) -> bool {
         !self.messages[message.0 as usize].2.is_empty()
     }
 
-    /// Decodes a frame: `values` is emptied and gets the chosen signals that are there and that
-    /// fit the frame. `None` for remote frames and for identifiers of no message.
+    /// Decodes a frame: `values` is cleared and gets the chosen signals that are present and fit the frame.
+    /// `None` for remote frames and for identifiers without a message.
     pub fn decode(
         &self,
         channel: u8,
@@ -256,7 +255,7 @@ impl Decoder {
         Some(place)
     }
 
-    /// For frames of this message that are decoded together: much faster than one after another where columns are wanted.
+    /// For decoding frames of this message together: much faster than one by one if columns are needed.
     pub fn rows(&self, message: MessageRef) -> MessageRows {
         let (_, message, plan) = &self.messages[message.0 as usize];
         MessageRows::new(message.clone(), plan.clone())

@@ -1,4 +1,4 @@
-//! From values to frames: `EngineData:Speed=1200,Gear=Drive`.
+//! Turns values into frames: `EngineData:Speed=1200,Gear=Drive`.
 
 mod error;
 mod parse;
@@ -21,7 +21,7 @@ use value::raw;
 /// A frame made from values.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Encoded {
-    /// The channel that the message's database is for, if it is for one.
+    /// The channel that the message's database is for, if it is for a single one.
     pub channel: Option<u8>,
     /// The message.
     pub message: MessageRef,
@@ -31,8 +31,8 @@ pub struct Encoded {
 
 /// Makes a frame from `Message:Signal=value,…`.
 ///
-/// Signals that are not given get the database's start value, or zero. A multiplexer that is not given
-/// takes the first value under which the given signals are there.
+/// Signals that are not given have the database's start value, or zero. A multiplexer that is not given has
+/// the first value for which the given signals are present.
 pub fn encode(decoder: &Decoder, channel: Option<u8>, text: &str) -> Result<Encoded, EncodeError> {
     let (name, inputs) = parse(text)?;
     let reference = find_message(decoder, channel, &name)?;
@@ -60,7 +60,7 @@ fn find_message(decoder: &Decoder, channel: Option<u8>, name: &str) -> Result<Me
                 let second = of_channel.unwrap_or(first);
                 return Err(EncodeError::Ambiguous { name: name.to_owned(), first, second });
             }
-            // A channel's own database goes before one for all.
+            // A channel's own database takes precedence over one for all channels.
             Some((_, Some(_))) if of_channel.is_none() => {}
             _ => found = Some((reference, of_channel)),
         }
@@ -101,8 +101,8 @@ pub fn encode_message(message: &Message, inputs: &[(String, Input)]) -> Result<V
     Ok(data)
 }
 
-/// Which of the message's signals a name means: of several under different values of a multiplexer, the one under the value
-/// that is given for that.
+/// Which of the message's signals a name means: if there are several for different values of a multiplexer, the one for its
+/// given value.
 fn place_of(message: &Message, name: &str, inputs: &[(String, Input)]) -> Result<usize, EncodeError> {
     let signals = &message.signals;
     let named: Vec<_> = (0..signals.len()).filter(|&place| signals[place].label() == name).collect();
@@ -123,12 +123,12 @@ fn fits(message: &Message, signal: &Signal) -> bool {
     (1..=64).contains(&signal.length) && signal.bytes_needed() <= message.length.into()
 }
 
-/// What a signal depends on, if it is in this message.
+/// The multiplexer a signal depends on, if it is in this message.
 fn multiplexed(signals: &[Signal], place: usize) -> Option<&Multiplexed> {
     signals[place].multiplexed.as_ref().filter(|multiplexed| multiplexed.switch < signals.len())
 }
 
-/// Gives every multiplexer that the given signals need, and that is not given itself, a value.
+/// Gives a value to every multiplexer that the given signals need and that is not given itself.
 fn choose_switches(
     signals: &[Signal],
     given: &BTreeSet<usize>,
@@ -161,7 +161,7 @@ fn choose_switches(
             }
             continue;
         }
-        // A value that suits all starts one of the ranges, if there is one.
+        // A value that suits all of them is the start of one of the ranges, if it exists.
         let ranges = dependents.iter().filter_map(|&place| wanted(place)).flat_map(|m| &m.values);
         let mut candidates = ranges.map(|range| *range.start());
         let raw = candidates.find(|&raw| refused(raw).is_none()).ok_or_else(|| {
@@ -176,7 +176,7 @@ fn choose_switches(
 
 fn is_present(signals: &[Signal], place: usize, raw_of: &impl Fn(usize) -> u64) -> bool {
     let mut at = place;
-    // Files are checked for circles; a database made by a program may have one.
+    // Files are checked for cycles; a database made by a program may have one.
     for _ in 0..=MAX_SWITCHES {
         let Some(multiplexed) = multiplexed(signals, at) else { return true };
         if !multiplexed.matches(raw_of(multiplexed.switch)) {

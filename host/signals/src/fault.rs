@@ -13,12 +13,12 @@ pub enum DatabaseError {
     Read {
         /// The file.
         file: String,
-        /// The system's reason.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// The suffix is that of no database.
+    /// The suffix does not belong to any kind of database.
     #[error(
-        "{file} is no known kind of database; use a .dbc, .kcd, .sym or .arxml file, or a .toml signal file (docs/signal-file.md)"
+        "{file} is not a known kind of database; use a .dbc, .kcd, .sym or .arxml file, or a .toml signal file (docs/signal-file.md)"
     )]
     UnknownKind {
         /// The file.
@@ -29,12 +29,12 @@ pub enum DatabaseError {
     Faulty {
         /// The file.
         file: String,
-        /// Everything that is wrong, in the order of lines; at least one.
+        /// Everything that is wrong, by line; at least one fault.
         faults: Vec<Fault>,
     },
 }
 
-/// More would scroll the first, which is mostly the cause of the others, off the screen.
+/// More would scroll the first one, usually the cause of the others, off the screen.
 const FAULTS_SHOWN: usize = 10;
 
 fn list(file: &str, faults: &[Fault]) -> String {
@@ -45,15 +45,15 @@ fn list(file: &str, faults: &[Fault]) -> String {
     text.join("\n")
 }
 
-/// Most multiplexers, one after another, that a signal may depend on. Databases have two or three.
+/// The longest chain of multiplexers that a signal may depend on. Databases have two or three.
 pub(super) const MAX_SWITCHES: usize = 16;
 
 /// One thing that is wrong in a database.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Fault {
-    /// The line, from 1; 0 if it is not known.
+    /// The line, from 1; 0 if unknown.
     pub line: u32,
-    /// The message or signal (`Message.Signal`), or the statement; empty if it is not known.
+    /// The message or signal (`Message.Signal`), or the statement; empty if unknown.
     pub symbol: String,
     /// What is wrong.
     pub kind: FaultKind,
@@ -64,7 +64,7 @@ impl fmt::Display for Fault {
         if self.line > 0 {
             write!(f, "line {}: ", self.line)?;
         }
-        // Words of the file stand in both.
+        // Both contain words of the file.
         if !self.symbol.is_empty() {
             write!(f, "{}: ", clean::line(&self.symbol))?;
         }
@@ -76,7 +76,7 @@ impl fmt::Display for Fault {
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum FaultKind {
-    /// The text is not what the format says. Carries what was expected.
+    /// The text does not follow the format. Contains what was expected.
     #[error("{0}")]
     Syntax(String),
     /// An identifier that no frame can have.
@@ -90,7 +90,7 @@ pub enum FaultKind {
     /// More bits than a value can have.
     #[error("{0} bits are more than a number can have (64); the signal is left out")]
     TooManyBits(u64),
-    /// A place that no message has.
+    /// A position that no message has.
     #[error("start bit {0} is beyond the longest message")]
     Start(u64),
     /// A message longer than any transport carries.
@@ -110,7 +110,7 @@ pub enum FaultKind {
     /// The factor is zero.
     #[error("the factor is 0, so that every value is the offset")]
     ZeroFactor,
-    /// Factor or offset is no finite number.
+    /// Factor or offset is not a finite number.
     #[error("factor {factor} and offset {offset} make no value")]
     Scale {
         /// The factor.
@@ -126,7 +126,7 @@ pub enum FaultKind {
         /// The earlier message.
         other: String,
     },
-    /// Several buses are read as one, and messages of different ones have the same identifier.
+    /// Several buses are read as one, and some of their messages have the same identifier.
     #[error(
         "the file has the buses {}, of which {messages} messages have the identifier of another bus's; name the channel's bus behind \
          the file, as in FILE#{}", .buses.join(", "), .buses[0]
@@ -134,28 +134,29 @@ pub enum FaultKind {
     SeveralBuses {
         /// Their names, at least two.
         buses: Vec<String>,
-        /// Messages whose identifier is also that of one on a bus before.
+        /// The number of messages whose identifier is also used on an earlier bus.
         messages: usize,
     },
     /// Two signals of a message with the same name.
     #[error("the message has another signal of this name")]
     DuplicateSignal,
-    /// A multiplexed signal whose multiplexer is not there.
+    /// A multiplexed signal whose multiplexer does not exist.
     #[error("there is no multiplexer {0:?} in this message; the signal is taken as always present")]
     NoMultiplexer(String),
-    /// Multiplexers that depend on each other, or too many of them.
+    /// Multiplexers that depend on each other, or too long a chain of them.
     #[error("the signal is multiplexed by itself through {0:?}, or through more than {max} others", max = MAX_SWITCHES)]
     Multiplexers(String),
-    /// A statement about a message or signal that is not there.
+    /// A statement about a message or signal that does not exist.
     #[error("there is no such message or signal; the statement is left out")]
     UnknownSymbol,
-    /// A statement without which the values stay right, and that cannot be understood.
+    /// A statement that cannot be understood, but does not affect values.
     #[error("this statement is not understood and left out ({0})")]
     Ignored(String),
-    /// A statement that a message's values depend on cannot be understood.
+    /// A statement that affects a message's values and cannot be understood.
     #[error("a statement that its values depend on is not understood")]
     Related,
-    /// A message with a fault that would make values wrong, in a database that can be used without it.
+    /// A message that is left out because a fault would make its values wrong; the rest of the database is
+    /// usable.
     #[error("{0}; the message is left out")]
     LeftOut(Box<FaultKind>),
     /// A float with a length that most programs refuse.
@@ -164,7 +165,7 @@ pub enum FaultKind {
 }
 
 impl FaultKind {
-    /// Whether the message can still be used. Everything else makes values wrong.
+    /// Whether the message can still be used. All other faults make values wrong.
     pub fn is_warning(&self) -> bool {
         matches!(
             self,

@@ -1,6 +1,6 @@
 //! cantap's own signal file: TOML that carries everything a database can say.
 //!
-//! `docs/signal-file.md` is its description for users; the structures here are its grammar.
+//! `docs/signal-file.md` describes it for users; the structures here define its grammar.
 
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
@@ -172,7 +172,7 @@ pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
 
 fn line_of(bytes: &[u8], offset: usize) -> u32 {
     let before = &bytes[..offset.min(bytes.len())];
-    // A signal file is small and this is for errors and once per table.
+    // A signal file is small, and this runs only for errors and once per table.
     before.split(|&byte| byte == b'\n').count() as u32
 }
 
@@ -264,7 +264,7 @@ fn ranges(choices: OneOrMany) -> Result<Vec<RangeInclusive<u64>>, FaultKind> {
             match (low.trim().parse::<u64>(), high.trim().parse::<u64>()) {
                 (Ok(low), Ok(high)) if low <= high => Ok(low..=high),
                 _ => Err(FaultKind::Syntax(format!(
-                    "{text:?} is no range; write the lower value first, as in \"3-5\""
+                    "{text:?} is not a range; write the lower value first, as in \"3-5\""
                 ))),
             }
         }
@@ -288,12 +288,14 @@ fn signal(entry: SignalEntry, line: u32) -> Result<(Signal, Option<When>), Fault
     let values = entry.values.into_iter().map(|(value, text)| match value.parse() {
         Ok(value) => Ok((value, text)),
         Err(_) => {
-            Err(FaultKind::Syntax(format!("the text {text:?} stands for {value:?}, which is no integer")))
+            Err(FaultKind::Syntax(format!("the text {text:?} stands for {value:?}, which is not an integer")))
         }
     });
     let values: Vec<_> = values.collect::<Result<_, _>>()?;
     let colour = entry.colour.map(|colour| {
-        colour.parse::<Colour>().map_err(|hint| FaultKind::Syntax(format!("{colour:?} is no colour; {hint}")))
+        colour
+            .parse::<Colour>()
+            .map_err(|hint| FaultKind::Syntax(format!("{colour:?} is not a colour; {hint}")))
     });
     let kind = match entry.kind {
         Kind::Unsigned => ValueKind::Unsigned,
@@ -350,10 +352,12 @@ fn order_missing() -> FaultKind {
     FaultKind::Syntax(text.to_owned())
 }
 
-/// `D2`, `D2:D3`, `D1.5`, `D1.7-4`: bytes count from 1, bits from 0, the least significant.
+/// `D2`, `D2:D3`, `D1.5`, `D1.7-4`: bytes count from 1, bits from 0 at the least significant.
 fn place_at(at: &str, order: Option<ByteOrder>) -> Result<Place, FaultKind> {
     let bad = || {
-        FaultKind::Syntax(format!("at = {at:?} is no place; write \"D2\", \"D2:D3\", \"D1.5\" or \"D1.7-4\""))
+        FaultKind::Syntax(format!(
+            "at = {at:?} is not a place; write \"D2\", \"D2:D3\", \"D1.5\" or \"D1.7-4\""
+        ))
     };
     let byte = |text: &str| {
         let number = text.trim().strip_prefix(['D', 'd']).and_then(|digits| digits.parse::<u16>().ok());

@@ -1,24 +1,26 @@
-//! What a J1939 parameter's bits say in place of a value: that its sensor failed, or that there is none.
+//! What a J1939 parameter's bits can say instead of a value: that its sensor failed, or that there is no
+//! value.
 //!
-//! SAE J1939-71 keeps the top of each range for this: in a byte 0xFE and 0xFF, in two to four bytes what has these in
-//! its highest byte, in two bits 2 and 3. NMEA 2000, which is J1939 too, has signed values, whose largest two these are.
+//! SAE J1939-71 reserves the top of each range for this: in a byte 0xFE and 0xFF, in two to four bytes the values with
+//! these in the highest byte, in two bits 2 and 3. NMEA 2000, which is based on J1939, has signed values, for which
+//! these are the largest two.
 
 use std::fmt;
 
 use super::layout;
 use super::model::{Message, Signal, ValueKind};
 
-/// What a parameter says in place of a value.
+/// What a parameter sends instead of a value.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Indicator {
-    /// The sensor, or whoever sends the parameter, failed.
+    /// The sensor, or the sender of the parameter, failed.
     Error,
     /// There is no such value.
     NotAvailable,
 }
 
 impl Indicator {
-    /// What it is called.
+    /// Its name.
     pub fn name(self) -> &'static str {
         match self {
             Self::Error => "error",
@@ -34,13 +36,13 @@ impl fmt::Display for Indicator {
 }
 
 impl Message {
-    /// What the bits say in place of a value; `None` if they are one, as always outside of J1939.
+    /// What the bits say instead of a value; `None` if they are a value, as always outside J1939.
     pub fn indicator(&self, signal: &Signal, raw: u64) -> Option<Indicator> {
         if self.j1939 { signal.indicator(raw) } else { None }
     }
 }
 
-/// The bits that the sender of an indicator would write.
+/// The bits that a sender would use for an indicator.
 pub(super) fn raw_of(signal: &Signal, indicator: Indicator) -> Option<u64> {
     let (mask, length) = (layout::mask(signal.length), u32::from(signal.length));
     let raw = match (signal.kind, indicator) {
@@ -54,7 +56,7 @@ pub(super) fn raw_of(signal: &Signal, indicator: Indicator) -> Option<u64> {
 }
 
 impl Signal {
-    /// As [`Message::indicator`], for a signal of J1939.
+    /// Like [`Message::indicator`], for a signal of J1939.
     pub(super) fn indicator(&self, raw: u64) -> Option<Indicator> {
         if self.is_switch {
             return None;
@@ -75,17 +77,17 @@ impl Signal {
         if self.length < 8
             && let Some(text) = self.text(raw)
         {
-            // A list of states may well use all its numbers; its own words are the truth.
+            // A list of states may use all its numbers; its own texts decide.
             return named(text);
         }
-        // A file that says how far values go knows its signal better than the standard, unless it only says how
-        // many bits there are.
+        // A file that gives a signal's range knows it better than the standard, unless the range is only that
+        // of the bits.
         let within = |max| max < self.physical(largest) && self.physical(raw) <= max;
         (!self.max.is_some_and(within)).then_some(found)
     }
 }
 
-/// The indicator that a value table's text is.
+/// The indicator that a value table's text stands for.
 fn named(text: &str) -> Option<Indicator> {
     let text = text.to_lowercase();
     let says = |words: &[&str]| words.iter().any(|word| text.contains(word));
@@ -137,7 +139,7 @@ mod tests {
         assert_eq!((gear.indicator(2), gear.indicator(3)), (None, None));
         let lamp = Signal { values: table(&[(3, "Not Available")]), ..Signal::new("Lamp", 0, 2) };
         assert_eq!(lamp.indicator(3), Some(Indicator::NotAvailable));
-        // NMEA 2000 uses all but the last three; a range as wide as the bits says nothing.
+        // NMEA 2000 uses all but the last three; a range as wide as the bits does not matter.
         let depth = Signal { max: Some(65_532.0), ..Signal::new("Depth", 0, 16) };
         assert_eq!((depth.indicator(0xFE00), depth.indicator(0xFFFF)), (None, Some(Indicator::NotAvailable)));
         let speed = Signal { max: Some(65_535.0), ..Signal::new("Speed", 0, 16) };

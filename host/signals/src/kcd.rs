@@ -1,7 +1,7 @@
 //! Databases from KCD files, Kayak's XML.
 //!
-//! A bit offset counts, for big-endian signals, from the highest bit of the first byte on. Which of a file's buses a channel is, the
-//! file does not say.
+//! For big-endian signals, a bit offset counts from the highest bit of the first byte. The file does not say which of its buses a
+//! channel is.
 
 use cantap_wire::Id;
 use roxmltree::{Document, Node};
@@ -16,7 +16,7 @@ pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
     parse_bus(file, bytes, None)
 }
 
-/// As [`parse`], only the bus of this name.
+/// Like [`parse`], but only the bus of this name.
 pub fn parse_bus(file: &str, bytes: &[u8], bus: Option<&str>) -> Result<Database, DatabaseError> {
     let text = xml::decode(bytes);
     let document = xml::parse(file, &text)?;
@@ -44,7 +44,7 @@ pub fn parse_bus(file: &str, bytes: &[u8], bus: Option<&str>) -> Result<Database
     Ok(Database { buses, ..database })
 }
 
-/// Elements by local name: writers differ in what they do with the namespace.
+/// Elements by local name: writers treat the namespace differently.
 trait Local {
     fn has_tag_name_of(&self, name: &str) -> bool;
 }
@@ -69,7 +69,7 @@ fn message(document: &Document, node: Node, faults: &mut Vec<Fault>) -> Option<M
     let mut fault = |kind| faults.push(Fault { line, symbol: name.clone(), kind });
     let written = node.attribute("id").unwrap_or_default();
     let Some(number) = xml::integer(written) else {
-        fault(FaultKind::Syntax(format!("the identifier {written:?} is no number")));
+        fault(FaultKind::Syntax(format!("the identifier {written:?} is not a number")));
         return None;
     };
     let extended = node.attribute("format") == Some("extended");
@@ -114,8 +114,8 @@ fn multiplex(document: &Document, node: Node, signals: &mut Vec<Signal>) -> Resu
     for group in node.children().filter(|node| node.has_tag_name_of("MuxGroup")) {
         let written = group.attribute("count").unwrap_or_default();
         let value = xml::integer(written).and_then(|value| u64::try_from(value).ok());
-        let value =
-            value.ok_or_else(|| FaultKind::Syntax(format!("the group's count {written:?} is no number")))?;
+        let value = value
+            .ok_or_else(|| FaultKind::Syntax(format!("the group's count {written:?} is not a number")))?;
         for part in group.children().filter(|node| node.has_tag_name_of("Signal")) {
             let multiplexed = Some(Multiplexed { switch, values: vec![value..=value] });
             signals.push(Signal { multiplexed, ..signal(document, part)? });
@@ -130,7 +130,7 @@ fn signal(document: &Document, node: Node) -> Result<Signal, FaultKind> {
         Some(text) => text
             .trim()
             .parse::<f64>()
-            .map_err(|_| FaultKind::Syntax(format!("{name} = {text:?} is no number"))),
+            .map_err(|_| FaultKind::Syntax(format!("{name} = {text:?} is not a number"))),
     };
     let name = node.attribute("name").unwrap_or_default();
     let offset = number(node, "offset", 0.0)? as u64;

@@ -1,10 +1,10 @@
-//! Where a signal's bits lie in the data bytes.
+//! Where a signal's bits are in the data bytes.
 //!
 //! Bits are numbered as in DBC files: bit 0 is the least significant of the first byte, bit 7 its
 //! most significant, bit 8 the least significant of the second. A little-endian (Intel) signal
 //! starts at its least significant bit, a big-endian (Motorola) one at its most significant.
 
-/// In which order a signal's bytes follow.
+/// The order of a signal's bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ByteOrder {
     /// Least significant byte first; Intel.
@@ -13,8 +13,8 @@ pub enum ByteOrder {
     Big,
 }
 
-/// The bit's place when bits are counted in the order in which they cross the bus: the most
-/// significant of the first byte is 0.
+/// The bit's position when bits are counted in the order in which they are sent: the most significant of
+/// the first byte is 0.
 pub fn wire_position(bit: u32) -> u32 {
     bit / 8 * 8 + 7 - bit % 8
 }
@@ -56,7 +56,7 @@ pub fn extract(order: ByteOrder, start: u16, length: u16, data: &[u8]) -> Option
 
 /// Writes the low `length` bits of `raw` into `data`. The signal must fit.
 pub fn insert(order: ByteOrder, start: u16, length: u16, raw: u64, data: &mut [u8]) {
-    // Encoding happens once per frame that a person asked for: clear before fast.
+    // Encoding happens once per frame that a person requested: clarity before speed.
     for bit in 0..u32::from(length) {
         let place = match order {
             ByteOrder::Little => u32::from(start) + bit,

@@ -1,10 +1,10 @@
 #![doc = include_str!("../README.md")]
 //!
 //! A [`Database`] describes messages and their signals. A [`Decoder`] holds one or several databases, compiled so that decoding
-//! is a shift and a mask per signal. [`mod@encode`] goes the other way, [`condition`] asks whether something holds for a record,
-//! [`search`] and [`trigger`] choose records by conditions.
+//! takes a shift and a mask per signal. [`mod@encode`] goes the other way, [`condition`] decides whether something is true of a
+//! record, [`search`] and [`trigger`] select records by conditions.
 //!
-//! Where records come from and how values are shown is for others.
+//! Getting records and displaying values is left to other crates.
 
 #![forbid(unsafe_code)]
 
@@ -48,8 +48,8 @@ pub use number::Number;
 pub use plan::{MessageRows, SignalRows, SignalValue};
 pub use select::{Selection, SelectionError, Suggestion};
 
-/// Reads a database, by its suffix: `.dbc`, `.kcd`, `.sym`, `.arxml`, or `.toml` for cantap's own signal file. Of a KCD or ARXML file
-/// with several buses, `FILE#BUS` is one; without it, all are read as one.
+/// Reads a database, by its suffix: `.dbc`, `.kcd`, `.sym`, `.arxml`, or `.toml` for cantap's own signal file. For a KCD or ARXML
+/// file with several buses, `FILE#BUS` selects one; without it, all are read as one.
 ///
 /// Faults that leave a database usable are in [`Database::warnings`].
 pub fn load(path: &Path) -> Result<Database, DatabaseError> {
@@ -70,7 +70,7 @@ pub fn load(path: &Path) -> Result<Database, DatabaseError> {
     }
 }
 
-/// A file's path and the bus behind it. A file that has `#` in its name is itself.
+/// Splits a file's path from the bus after it. `#` may also be part of an existing file's name.
 fn with_bus(path: &Path) -> (&Path, Option<&str>) {
     let parts = path.to_str().filter(|_| !path.exists()).and_then(|text| text.rsplit_once('#'));
     match parts {

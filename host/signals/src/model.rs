@@ -1,4 +1,4 @@
-//! What a database says: messages, signals, and how their bits become values.
+//! The content of a database: messages, signals, and how their bits become values.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -20,26 +20,26 @@ pub struct Database {
     pub file: String,
     /// The messages, in the file's order.
     pub messages: Vec<Message>,
-    /// The buses that the file has and that were read, by name; empty where its format knows none.
+    /// The buses of the file that were read, by name; empty if its format has none.
     pub buses: Vec<String>,
-    /// What is wrong with the file although it can be used.
+    /// What is wrong with the file although it is usable.
     pub warnings: Vec<Fault>,
 }
 
 /// One kind of frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Message {
-    /// The identifier it is sent with.
+    /// The identifier of its frames.
     pub id: Id,
     /// Its name.
     pub name: String,
-    /// What it is for; may be empty.
+    /// Its purpose; may be empty.
     pub description: String,
-    /// Its length in bytes. Above eight it is a message of CAN FD or of a transport protocol.
+    /// Its length in bytes. Above eight, it is a CAN FD message or one of a transport protocol.
     pub length: u16,
-    /// How often it is sent, in milliseconds, if that is known.
+    /// How often it is sent, in milliseconds, if known.
     pub cycle_ms: Option<u32>,
-    /// Whether it is a J1939 parameter group: priority and source address do not matter in a match.
+    /// Whether it is a J1939 parameter group: priority and source address are ignored when matching.
     pub j1939: bool,
     /// Its signals, in the file's order.
     pub signals: Vec<Signal>,
@@ -48,18 +48,18 @@ pub struct Message {
 }
 
 impl Message {
-    /// The signal of that name.
+    /// The signal with that name.
     pub fn signal(&self, name: &str) -> Option<&Signal> {
         self.signals.iter().find(|signal| signal.name == name)
     }
 }
 
-/// One value inside a message.
+/// One value in a message.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Signal {
     /// Its name.
     pub name: String,
-    /// What it means; may be empty.
+    /// Its meaning; may be empty.
     pub description: String,
     /// Its unit, such as `km/h`; may be empty.
     pub unit: String,
@@ -68,42 +68,43 @@ pub struct Signal {
     pub start: u16,
     /// Number of bits, 1 to 64.
     pub length: u16,
-    /// In which order its bytes follow.
+    /// The order of its bytes.
     pub order: ByteOrder,
-    /// What its bits are.
+    /// How to interpret its bits.
     pub kind: ValueKind,
     /// Physical value = raw value · factor + offset.
     pub factor: f64,
     /// Physical value = raw value · factor + offset.
     pub offset: f64,
-    /// The smallest physical value the file allows, if it says.
+    /// The smallest physical value that the file allows, if it gives one.
     pub min: Option<f64>,
-    /// The largest physical value the file allows, if it says.
+    /// The largest physical value that the file allows, if it gives one.
     pub max: Option<f64>,
     /// Texts for raw values.
     pub values: ValueTable,
-    /// When the signal is there, if not always.
+    /// When the signal is present, if not always.
     pub multiplexed: Option<Multiplexed>,
     /// Whether other signals depend on its value.
     pub is_switch: bool,
-    /// The raw value to send where the user gives none.
+    /// The raw value to send if the user gives none.
     pub initial_raw: u64,
-    /// How to show it as on and off, if it is to be.
+    /// How to show it as on and off, if desired.
     pub digital: Option<Digital>,
     /// Limits beyond which it is shown as an alarm.
     pub alarms: Alarms,
-    /// The colour to draw it with.
+    /// The colour in which to draw it.
     pub colour: Option<Colour>,
-    /// How many signals of the same name come before it that a frame may carry together with it: mostly none.
+    /// How many signals with the same name come before it that a frame may carry together with it: mostly
+    /// none.
     pub twins_before: u16,
     /// The line in the file, from 1; 0 if there is none.
     pub line: u32,
 }
 
-/// What a signal's bits are.
+/// How to interpret a signal's bits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ValueKind {
-    /// An integer without sign.
+    /// An unsigned integer.
     Unsigned,
     /// An integer in two's complement.
     Signed,
@@ -113,13 +114,15 @@ pub enum ValueKind {
     OnesComplement,
     /// IEEE 754 half precision, 16 bits.
     Half,
-    /// IEEE 754 single precision. Fewer than 32 bits are its upper bits, the rest being zero.
+    /// IEEE 754 single precision. If there are fewer than 32 bits, they are the upper ones, and the rest are
+    /// zero.
     Single,
-    /// IEEE 754 double precision. Fewer than 64 bits are its upper bits, the rest being zero.
+    /// IEEE 754 double precision. If there are fewer than 64 bits, they are the upper ones, and the rest are
+    /// zero.
     Double,
 }
 
-/// Under which values of another signal a signal is there.
+/// The values of another signal for which a signal is present.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Multiplexed {
     /// The other signal's index in [`Message::signals`].
@@ -129,13 +132,13 @@ pub struct Multiplexed {
 }
 
 impl Multiplexed {
-    /// Whether the signal is there when the switch has this raw value.
+    /// Whether the signal is present when the switch has this raw value.
     pub fn matches(&self, raw: u64) -> bool {
         self.values.iter().any(|range| range.contains(&raw))
     }
 }
 
-/// A signal with two states: on from `high` upwards, off from `low` downwards, in between as before.
+/// A signal with two states: on from `high` upwards, off from `low` downwards, unchanged in between.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Digital {
     /// Off at this physical value and below.
@@ -145,7 +148,7 @@ pub struct Digital {
 }
 
 impl Digital {
-    /// The state after `value`, from the state before it.
+    /// The state after `value`, given the state before it.
     pub fn state(self, before: bool, value: f64) -> bool {
         if value >= self.high { true } else { before && value > self.low }
     }
@@ -160,7 +163,7 @@ pub struct Alarms {
     pub max: Option<f64>,
 }
 
-/// Which limit a value has left.
+/// Which limit a value exceeds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Alarm {
     /// Below [`Alarms::min`]; shown blue.
@@ -170,7 +173,7 @@ pub enum Alarm {
 }
 
 impl Alarms {
-    /// The alarm that this physical value raises, if it does.
+    /// The alarm that this physical value raises, if any.
     pub fn check(self, value: f64) -> Option<Alarm> {
         if self.max.is_some_and(|max| value > max) {
             Some(Alarm::Above)
@@ -214,12 +217,12 @@ impl fmt::Display for Colour {
 /// Texts for raw values, such as 3 = "Drive".
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ValueTable {
-    /// Sorted by value, each once.
+    /// Sorted by value, without duplicates.
     entries: Vec<(i64, String)>,
 }
 
 impl ValueTable {
-    /// Makes a table; where a value occurs twice the last text counts.
+    /// Makes a table; if a value occurs twice, the last text is used.
     pub fn new(entries: impl IntoIterator<Item = (i64, String)>) -> Self {
         let by_value: std::collections::BTreeMap<_, _> = entries.into_iter().collect();
         Self { entries: by_value.into_iter().collect() }
@@ -231,8 +234,8 @@ impl ValueTable {
         Some(&self.entries[found].1)
     }
 
-    /// The raw values that a text stands for, in ascending order: those with the text as written, else those with it in
-    /// another case. Many tables use a text for several values.
+    /// The raw values with a text, in ascending order: those with the text as written, otherwise those with it in
+    /// another case. Many tables use one text for several values.
     pub fn values(&self, text: &str) -> Vec<i64> {
         let find = |same: fn(&str, &str) -> bool| -> Vec<i64> {
             self.entries.iter().filter(|(_, entry)| same(entry, text)).map(|(value, _)| *value).collect()
@@ -241,12 +244,12 @@ impl ValueTable {
         if exact.is_empty() { find(str::eq_ignore_ascii_case) } else { exact }
     }
 
-    /// Makes the texts fit for a terminal.
+    /// Makes the texts safe for a terminal.
     pub(super) fn clean(&mut self) {
         self.entries.iter_mut().for_each(|(_, text)| clean::make(text, clean::line));
     }
 
-    /// All values with their texts, by value.
+    /// All values with their texts, sorted by value.
     pub fn iter(&self) -> impl Iterator<Item = (i64, &str)> {
         self.entries.iter().map(|(value, text)| (*value, text.as_str()))
     }
@@ -258,7 +261,7 @@ impl ValueTable {
 }
 
 impl Signal {
-    /// An unsigned little-endian signal with factor 1 and nothing else said.
+    /// An unsigned little-endian signal with factor 1 and no other properties.
     pub fn new(name: impl Into<String>, start: u16, length: u16) -> Self {
         Self {
             name: name.into(),
@@ -284,7 +287,7 @@ impl Signal {
         }
     }
 
-    /// Its name, with a number behind it (`Speed#2`) where a frame may carry another of this name.
+    /// Its name, followed by a number (`Speed#2`) if a frame may carry another signal with this name.
     pub fn label(&self) -> Cow<'_, str> {
         match self.twins_before {
             0 => Cow::Borrowed(&self.name),
@@ -297,7 +300,7 @@ impl Signal {
         layout::bytes_needed(self.order, self.start, self.length)
     }
 
-    /// The signal's bits from a message's data; `None` if the data is too short.
+    /// The signal's bits from a message's data; `None` if the data are too short.
     pub fn extract(&self, data: &[u8]) -> Option<u64> {
         layout::extract(self.order, self.start, self.length, data)
     }
@@ -334,8 +337,8 @@ impl Signal {
         }
     }
 
-    /// The physical value of the raw bits, as a float: of an integer the one nearest to the decimal that factor and offset
-    /// make, 0.7 and not 0.7000000000000001.
+    /// The physical value of the raw bits as a float: for an integer, the one nearest to the decimal result of factor and
+    /// offset, such as 0.7 rather than 0.7000000000000001.
     pub fn physical(&self, raw: u64) -> f64 {
         self.scale().apply(self.raw_to_f64(raw))
     }
@@ -351,7 +354,7 @@ impl Signal {
         }
     }
 
-    /// The physical value of the raw bits, exact where it is an integer.
+    /// The physical value of the raw bits, exact if it is an integer.
     pub fn number(&self, raw: u64) -> Number {
         match self.integer(raw) {
             Some(integer) if is_integer(self.factor) && is_integer(self.offset) => {
@@ -361,7 +364,7 @@ impl Signal {
         }
     }
 
-    /// What the value table knows the raw bits by: the integer they are, before factor and offset.
+    /// The key of the raw bits in the value table: the integer that they represent, before factor and offset.
     pub fn table_key(&self, raw: u64) -> Option<i64> {
         let value = self.integer(raw).or_else(|| {
             let value = self.raw_to_f64(raw);
@@ -370,7 +373,7 @@ impl Signal {
         i64::try_from(value?).ok()
     }
 
-    /// The text that the value table has for the raw bits.
+    /// The value table's text for the raw bits.
     pub fn text(&self, raw: u64) -> Option<&str> {
         if self.values.is_empty() {
             return None;
@@ -379,7 +382,7 @@ impl Signal {
     }
 }
 
-/// Whether a float is an integer that it can hold exactly beside its neighbours.
+/// Whether a float is an integer small enough to be represented exactly.
 fn is_integer(value: f64) -> bool {
     value.fract() == 0.0 && value.abs() <= (1u64 << 53) as f64
 }
@@ -388,7 +391,7 @@ fn is_integer(value: f64) -> bool {
 mod tests {
     use super::*;
 
-    /// The "Signed" of the earlier analyser.
+    /// The earlier analyser's "Signed".
     #[test]
     fn sign_magnitude_has_its_sign_in_the_first_bit() {
         let signal = Signal { kind: ValueKind::SignMagnitude, ..Signal::new("S", 0, 16) };
@@ -404,7 +407,7 @@ mod tests {
         }
     }
 
-    /// The "Float" of the earlier analyser: fewer bits are the upper ones.
+    /// The earlier analyser's "Float": if there are fewer bits, they are the upper ones.
     #[test]
     fn floats_are_left_aligned() {
         let upper = Signal { kind: ValueKind::Single, ..Signal::new("F", 0, 16) };

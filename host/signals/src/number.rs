@@ -1,8 +1,8 @@
-//! A physical value without loss: 64-bit counters do not fit a float.
+//! A physical value without loss of precision: 64-bit counters do not fit in a float.
 
 use std::fmt;
 
-/// A signal's physical value, exact.
+/// A signal's exact physical value.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Number {
     /// Integer raw value with integer factor and offset. Wide enough for every product of 64-bit
@@ -21,7 +21,7 @@ impl Number {
         }
     }
 
-    /// The number for a person's eyes: a float at 15 digits, which hides that 379220534 · 1e-7 is
+    /// The number for display: a float with 15 digits, which hides that 379220534 · 1e-7 is
     /// 37.922053399999996.
     #[must_use]
     pub fn for_people(self) -> Self {
@@ -31,7 +31,7 @@ impl Number {
         }
     }
 
-    /// Whether it is a number that JSON can carry: neither infinite nor not-a-number.
+    /// Whether JSON can represent it: neither infinite nor not-a-number.
     pub fn is_finite(self) -> bool {
         match self {
             Self::Integer(_) => true,
@@ -41,12 +41,12 @@ impl Number {
 }
 
 impl fmt::Display for Number {
-    /// The shortest decimal that reads back as the same value; it is also a JSON number if finite.
+    /// The shortest decimal that reads back as the same value; if finite, it is also a JSON number.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Integer(value) => fmt::Display::fmt(value, f),
             Self::Real(value) => {
-                // Display never uses an exponent: the extremes of a double would run to 300 digits.
+                // Display never uses an exponent: the extremes of a double would have 300 digits.
                 let size = value.abs();
                 if value.is_finite() && size != 0.0 && !(1e-7..1e17).contains(&size) {
                     fmt::LowerExp::fmt(value, f)

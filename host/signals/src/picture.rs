@@ -1,16 +1,16 @@
-//! Where a message's signals lie, drawn with characters.
+//! Draws where a message's signals are, in text.
 
 use std::fmt::Write as _;
 
 use super::layout::{ByteOrder, wire_position};
 use super::model::{Message, Signal};
 
-/// Columns of a bit's cell, without its left border.
+/// Columns of a bit's cell, excluding its left border.
 const CELL: usize = 4;
 
 impl Message {
-    /// Sets of signals that one frame may carry, by index and in the file's order: those that are always there, or, with
-    /// multiplexers, a set for each of their values.
+    /// Sets of signals that one frame may carry, by index and in the file's order: those that are always present or,
+    /// with multiplexers, one set for each of their values.
     pub fn pages(&self) -> Vec<Vec<usize>> {
         let mut leaves: Vec<Vec<usize>> = Vec::new();
         for place in 0..self.signals.len() {
@@ -24,14 +24,14 @@ impl Message {
                 leaves.push(page);
             }
         }
-        // A page that lies within another shows nothing of its own.
+        // A page contained in another shows nothing new.
         let within =
             |page: &Vec<usize>, other: &Vec<usize>| page != other && page.iter().all(|at| other.contains(at));
         let pages = leaves.iter().filter(|page| !leaves.iter().any(|other| within(page, other)));
         pages.cloned().collect()
     }
 
-    /// The multiplexers that a signal depends on, each with the values under which it is there.
+    /// The multiplexers that a signal depends on, each with the values for which it is present.
     fn chain(&self, place: usize) -> Option<Vec<(usize, Vec<std::ops::RangeInclusive<u64>>)>> {
         let mut chain = Vec::new();
         let mut at = place;
@@ -45,8 +45,8 @@ impl Message {
         Some(chain)
     }
 
-    /// Draws where the chosen signals lie: a line per byte, the highest bit on the left. `<` is a signal's most significant bit, `x` its
-    /// least significant one, `X` a bit of several signals. Bytes without any signal are left out behind the last one that has some.
+    /// Draws where the chosen signals are: a line per byte, with the highest bit on the left. `<` is a signal's most significant bit,
+    /// `x` its least significant one, `X` a bit of several signals. Bytes after the last one with a signal are left out.
     pub fn layout_picture(&self, signals: &[usize]) -> String {
         let chosen: Vec<&Signal> = signals.iter().filter_map(|&place| self.signals.get(place)).collect();
         let needed = chosen.iter().map(|signal| signal.bytes_needed()).max().unwrap_or(0);
@@ -92,7 +92,7 @@ impl Message {
     }
 }
 
-/// Three characters for a bit.
+/// The three characters for a bit.
 fn cell(signals: &[&Signal], owners: &[usize], place: usize) -> String {
     let (left, right) = match owners {
         [] => return " ".repeat(CELL - 1),

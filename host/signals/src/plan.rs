@@ -1,7 +1,7 @@
-//! A message compiled for decoding: per signal one shift, one mask and one multiplication.
+//! A message compiled for decoding: one shift, one mask and one multiplication per signal.
 //!
-//! Frames carry at most eight bytes, so the data is loaded twice into a register, once per byte
-//! order, and every signal is cut out of the one that suits it. Signals under the same multiplexer
+//! Most frames carry at most eight bytes, so the data are loaded into a register twice, once per byte
+//! order, and every signal is extracted from the one that suits it. Signals for the same multiplexer
 //! values form a group whose condition is tested once.
 
 mod rows;
@@ -23,7 +23,7 @@ pub struct SignalValue {
     pub signal: u32,
     /// Its bits.
     pub raw: u64,
-    /// Its physical value; not a number where J1939 says that there is none ([`Message::indicator`]).
+    /// Its physical value; not-a-number if J1939 says that there is none ([`Message::indicator`]).
     /// [`Signal::number`] gives it exactly where 53 bits are not enough.
     pub value: f64,
 }
@@ -36,7 +36,7 @@ pub struct MessagePlan {
 
 #[derive(Clone, Debug)]
 struct Group {
-    /// All must hold; none for signals that are always there.
+    /// All must hold; empty for signals that are always present.
     conditions: Vec<Condition>,
     signals: Vec<SignalPlan>,
 }
@@ -53,7 +53,7 @@ struct Field {
     order: ByteOrder,
     /// For data of up to eight bytes: right shift of the register.
     shift: u8,
-    /// Fewest data bytes; 255 if no frame has enough.
+    /// Least number of data bytes; 255 if no frame has enough.
     needed: u8,
     mask: u64,
     /// For longer data.
@@ -67,7 +67,7 @@ struct SignalPlan {
     conversion: Conversion,
     index: u32,
     scale: Scale,
-    /// Whether some of its bits may say that there is no value.
+    /// Whether some of its bits may mean that there is no value.
     indicates: bool,
 }
 
@@ -80,11 +80,11 @@ enum Conversion {
     Single(u8),
     /// Left shift that aligns a double-precision float.
     Double(u8),
-    /// Too rare to be fast.
+    /// Too rare to be optimised.
     Other,
 }
 
-/// Data as the decoder reads it.
+/// Data in the form that the decoder reads.
 #[derive(Clone, Copy)]
 enum Payload<'a> {
     /// Up to eight bytes, in both orders.
@@ -94,7 +94,7 @@ enum Payload<'a> {
 }
 
 impl Field {
-    /// `None` for signals that no database from a file has: without bits, or with too many.
+    /// `None` for signals that no database from a file has: with no bits, or too many.
     fn of(signal: &Signal) -> Option<Self> {
         let (order, start, length) = (signal.order, signal.start, signal.length);
         if !(1..=64).contains(&length) {
@@ -157,7 +157,7 @@ impl MessagePlan {
         self.groups.is_empty()
     }
 
-    /// Appends every signal that is there and fits `data`.
+    /// Appends every signal that is present and fits `data`.
     pub fn decode(&self, message: &Message, data: &[u8], values: &mut Vec<SignalValue>) {
         let payload = if data.len() <= 8 {
             let mut padded = [0; 8];
@@ -202,13 +202,13 @@ impl SignalPlan {
     }
 }
 
-/// All that must hold for the signal to be there, the outermost multiplexer last; `None` if it
+/// The conditions for the signal to be present, the outermost multiplexer last; `None` if it
 /// never is.
 fn conditions(signals: &[Signal], signal: &Signal) -> Option<Vec<Condition>> {
     let mut conditions = Vec::new();
     let mut at = signal;
     while let Some(multiplexed) = &at.multiplexed {
-        // Files are checked for circles; a database made by a program may have one.
+        // Files are checked for cycles; a database made by a program may have one.
         let switch = signals.get(multiplexed.switch).filter(|_| conditions.len() < MAX_SWITCHES)?;
         conditions.push(Condition { switch: Field::of(switch)?, values: multiplexed.values.clone() });
         at = switch;

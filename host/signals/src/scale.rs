@@ -1,23 +1,23 @@
-//! Factor and offset as the decimal numbers that a file has, so that seven times 0.1 is 0.7.
+//! Factor and offset as the decimal numbers in a file, so that seven times 0.1 is 0.7.
 
 /// How raw values become physical ones.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Scale {
     factor: f64,
     offset: f64,
-    /// A power of ten that both were multiplied by; 1 where they are no short decimals.
+    /// A power of ten by which both were multiplied; 1 if they are not short decimals.
     divisor: f64,
 }
 
 impl Scale {
-    /// Finds the integers and the power of ten that factor and offset are made of: 0.1 and −40 are 1 and −400 tenths. One
-    /// division then rounds once, to the float nearest to the decimal result; a factor that is itself rounded
-    /// would have its error multiplied.
+    /// Finds integers and a power of ten that give factor and offset: 0.1 and −40 are 1 and −400 tenths. A single
+    /// division then rounds once, to the float nearest to the decimal result; the error of a factor that is itself
+    /// rounded would be multiplied.
     #[expect(clippy::float_cmp, reason = "the decimal must be the very same float")]
     pub fn of(factor: f64, offset: f64) -> Self {
-        /// More decimals than files have. Powers of ten are exact up to the 22nd.
+        /// More decimals than occur in files. Powers of ten are exact up to the 22nd.
         const MOST_DECIMALS: u32 = 18;
-        /// With more digits it is a fraction such as 1/3 cut off, and products would lose some.
+        /// With more digits it is a truncated fraction such as 1/3, and products would lose digits.
         const LARGEST: f64 = 1e12;
         let mut divisor = 1.0;
         for _ in 0..=MOST_DECIMALS {
@@ -33,7 +33,7 @@ impl Scale {
         Self::plain(factor, offset)
     }
 
-    /// Multiplies and adds, nothing else: for floats, whose bits are no decimals either.
+    /// Only multiplies and adds: for floats, whose bits are not decimals either.
     pub fn plain(factor: f64, offset: f64) -> Self {
         Self { factor, offset, divisor: 1.0 }
     }
@@ -46,7 +46,7 @@ impl Scale {
         if self.divisor == 1.0 { scaled } else { scaled / self.divisor }
     }
 
-    /// Appends the physical value of each: [`Self::apply`], without asking each time whether there is something to do.
+    /// Appends the physical value of each: [`Self::apply`] without checking the divisor each time.
     #[inline]
     #[expect(clippy::float_cmp, reason = "a power of ten is exact")]
     pub fn apply_all(self, unscaled: impl Iterator<Item = f64>, values: &mut Vec<f64>) {
@@ -77,7 +77,7 @@ mod tests {
         ] {
             assert_eq!(Scale::of(factor, offset).apply(raw), expected, "{raw} * {factor} + {offset}");
         }
-        // No short decimal: as it always was.
+        // Not a short decimal: computed in the plain way.
         let third = 1.0 / 3.0;
         assert_eq!(Scale::of(third, 0.0).apply(5.0), 5.0 * third);
         assert_eq!(Scale::of(1e300, 0.5).apply(2.0), 2e300);

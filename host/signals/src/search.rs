@@ -8,7 +8,7 @@ use cantap_wire::Id;
 use crate::condition::Condition;
 use cantap_trace::{TraceFrame, TraceRecord};
 
-/// What to look for. Everything that is given must hold.
+/// What to look for. Every given criterion must match.
 #[derive(Clone, Debug, Default)]
 pub struct Search {
     /// One of these identifiers; any if empty.
@@ -20,8 +20,8 @@ pub struct Search {
 }
 
 impl Search {
-    /// Whether the record is one of those looked for. Every record of the trace must come here, in order,
-    /// for conditions to know their signals' last values.
+    /// Whether the record matches. Pass every record of the trace, in order, so that conditions know their
+    /// signals' last values.
     pub fn finds(&mut self, record: &TraceRecord) -> bool {
         let holds = self.condition.as_mut().is_none_or(|condition| condition.holds(record));
         let by_frame = self.ids.is_empty() && self.data.is_empty();
@@ -52,7 +52,7 @@ enum IdKind {
 }
 
 impl IdPattern {
-    /// Whether an identifier is meant.
+    /// Whether an identifier matches.
     pub fn matches(self, id: Id) -> bool {
         id.is_extended() == self.extended
             && match self.kind {
@@ -62,23 +62,23 @@ impl IdPattern {
     }
 }
 
-/// Why a text is no pattern.
+/// Why a text is not a pattern.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum PatternError {
-    /// No identifier.
+    /// Not an identifier.
     #[error(
-        "{0:?} is no identifier; write up to 3 hexadecimal digits, or up to 8 (29 bits), with ? for any digit, or LOW-HIGH"
+        "{0:?} is not an identifier; write up to 3 hexadecimal digits, or up to 8 (29 bits), with ? for any digit, or LOW-HIGH"
     )]
     Id(String),
-    /// No data.
+    /// Not data.
     #[error(
-        "{0:?} is no byte; write hexadecimal digits in pairs such as 1F, 3? or ??, and * for any number of bytes"
+        "{0:?} is not a byte; write hexadecimal digits in pairs such as 1F, 3? or ??, and * for any number of bytes"
     )]
     Data(String),
 }
 
-/// Value and mask of hexadecimal digits, where `?` is any.
+/// Value and mask of hexadecimal digits, where `?` means any.
 fn digits(text: &str) -> Option<(u32, u32)> {
     let mut both = (0u32, 0u32);
     for digit in text.chars() {
@@ -110,7 +110,7 @@ impl FromStr for IdPattern {
         let (value, mask) = digits(plain).ok_or_else(wrong)?;
         let (extended, largest) = match plain.len() {
             1..=3 => (false, Id::MAX_STANDARD),
-            // Too long for a standard one: the leading zeros are left out.
+            // Too long for a standard identifier: leading zeros may be left out.
             4..=8 => (true, Id::MAX_EXTENDED),
             _ => return Err(wrong()),
         };
@@ -122,18 +122,18 @@ impl FromStr for IdPattern {
     }
 }
 
-/// Data bytes from the first on, such as `11 ?? 3?`; what follows is free. A leading `*` looks for them
-/// anywhere; one between bytes stands for any number of bytes.
+/// Data bytes from the first on, such as `11 ?? 3?`; the bytes after them may be anything. A leading `*`
+/// finds them anywhere; between bytes, it means any number of bytes.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DataPattern {
-    /// Each found somewhere behind the one before. Value and mask per byte.
+    /// Each is found somewhere after the one before. Value and mask per byte.
     pieces: Vec<Vec<(u8, u8)>>,
     /// Whether the first piece starts at the first byte.
     anchored: bool,
 }
 
 impl DataPattern {
-    /// Whether a frame's data is meant. Remote frames have none.
+    /// Whether a frame's data match. Remote frames have none.
     pub fn matches(&self, frame: &TraceFrame) -> bool {
         let mut data = frame.data();
         for (at, piece) in self.pieces.iter().enumerate() {

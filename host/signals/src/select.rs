@@ -1,4 +1,4 @@
-//! Choosing signals by patterns such as `Engine.*` or `*Temp`.
+//! Selects signals by patterns such as `Engine.*` or `*Temp`.
 
 use std::fmt;
 
@@ -6,10 +6,10 @@ use glob::Pattern;
 
 use super::model::{Message, Signal};
 
-/// Patterns of signals; without any, all signals are chosen.
+/// Patterns for signals; without any, all signals are selected.
 ///
-/// A pattern with a dot is matched against `Message.Signal`, one without against the signal's name.
-/// `*` is any text, `?` one character, `[a-z]` one of several. Upper and lower case differ.
+/// A pattern with a dot is matched against `Message.Signal`, one without against the signal's name. `*`
+/// matches any text, `?` one character, `[a-z]` one of several. Matching is case-sensitive.
 #[derive(Clone, Debug, Default)]
 pub struct Selection {
     patterns: Vec<Pattern>,
@@ -27,12 +27,12 @@ pub enum SelectionError {
         /// What is wrong with it.
         source: glob::PatternError,
     },
-    /// No signal has such a name.
+    /// No signal has a matching name.
     #[error("no signal of the databases matches {pattern:?}{near}")]
     NoMatch {
         /// The pattern.
         pattern: String,
-        /// A name that it may have meant.
+        /// A name that may have been meant.
         near: Suggestion,
     },
 }
@@ -48,17 +48,17 @@ impl Selection {
         Ok(Self { patterns: patterns.iter().map(compile).collect::<Result<_, _>>()? })
     }
 
-    /// Whether the signal is chosen.
+    /// Whether the signal is selected.
     pub fn matches(&self, message: &Message, signal: &Signal) -> bool {
         self.patterns.is_empty() || self.patterns.iter().any(|pattern| matches(pattern, message, signal))
     }
 
-    /// Whether a message's name is chosen.
+    /// Whether a pattern matches the message's name.
     pub fn names(&self, message: &Message) -> bool {
         self.patterns.iter().any(|pattern| pattern.matches(&message.name))
     }
 
-    /// Fails if one of the patterns chooses nothing of these messages: most likely a slip of the pen.
+    /// Fails if one of the patterns selects nothing in these messages, which is most likely a typing error.
     pub fn check<'a>(
         &self,
         messages: &(impl Iterator<Item = &'a Message> + Clone),
@@ -86,15 +86,15 @@ fn matches(pattern: &Pattern, message: &Message, signal: &Signal) -> bool {
     }
 }
 
-/// The end of a message about a name that is not there: the name that may have been meant, if one
-/// is like it.
+/// The end of a message about an unknown name: a similar name that may have been meant, if there is
+/// one.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Suggestion(Option<String>);
 
 impl Suggestion {
     /// Looks for the name most like `wanted`.
     pub fn nearest<'a>(wanted: &str, names: impl Iterator<Item = &'a str>) -> Self {
-        /// Below this, suggestions are worse than none.
+        /// If names are less similar than this, a suggestion is worse than none.
         const LIKE: f64 = 0.7;
         let wanted = wanted.to_lowercase();
         let scored = names.map(|name| (strsim::jaro_winkler(&wanted, &name.to_lowercase()), name));

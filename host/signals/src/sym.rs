@@ -1,6 +1,6 @@
 //! Databases from SYM files, PCAN's symbols, versions 5 and 6.
 //!
-//! A start bit counts, for Motorola signals (`-m`), from the highest bit of the first byte on. The blocks of one symbol, of
+//! For Motorola signals (`-m`), a start bit counts from the highest bit of the first byte. The blocks of one symbol, of
 //! which only the first has an identifier, are the values of its multiplexer.
 
 use std::collections::HashMap;
@@ -35,7 +35,7 @@ pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
     validate::finish(file, messages, faults)
 }
 
-/// Lines with what belongs together: an enumeration may run over several, each with a comment.
+/// Joins lines that belong together: an enumeration may span several, each with a comment.
 fn statements(text: &str) -> Vec<(u32, Statement)> {
     let mut statements: Vec<(u32, Statement)> = Vec::new();
     let mut open = false;
@@ -58,7 +58,7 @@ fn statements(text: &str) -> Vec<(u32, Statement)> {
     statements
 }
 
-/// A statement and the comment behind it.
+/// A statement and the comment after it.
 struct Statement {
     content: String,
     comment: String,
@@ -77,7 +77,7 @@ fn split_comment(line: &str) -> (&str, &str) {
     (line, "")
 }
 
-/// Whether the parenthesis of an enumeration is closed.
+/// Whether an enumeration's parenthesis is closed.
 fn is_closed(text: &str) -> bool {
     let mut quoted = false;
     text.chars().any(|character| {
@@ -86,7 +86,7 @@ fn is_closed(text: &str) -> bool {
     })
 }
 
-/// Words, with quotes taken off: `"A B"`, `/u:"A B"`.
+/// Splits into words, removing quotes: `"A B"`, `/u:"A B"`.
 fn words(text: &str) -> Vec<String> {
     let mut words = vec![String::new()];
     let mut quoted = false;
@@ -123,7 +123,7 @@ struct Reader {
     in_block: bool,
 }
 
-/// What stands under one `[Symbol]`.
+/// The content under one `[Symbol]`.
 struct Block {
     name: String,
     line: u32,
@@ -172,7 +172,7 @@ impl Reader {
             if let Some(block) = block {
                 block.is_bad |= !kind.is_warning();
             }
-            // A signal that nobody refers to spoils nothing; one that somebody does is not there.
+            // A faulty signal that nothing refers to does no harm; one that is referred to is then missing.
             let kind = if self.in_block { kind } else { FaultKind::Ignored(kind.to_string()) };
             self.faults.push(Fault { line, symbol, kind });
         }
@@ -246,7 +246,7 @@ impl Reader {
                     words.get(2).and_then(|value| integer(value)).and_then(|value| u64::try_from(value).ok());
                 let ((start, length), value) =
                     place.zip(value).ok_or_else(|| bad("Mux=NAME START,LENGTH VALUE"))?;
-                // Without bits it is a name for the only variant there is.
+                // Without bits, it is a name for the only variant.
                 if length > 0 {
                     let order = order_of(&words);
                     let length = u16::try_from(length)
@@ -306,7 +306,7 @@ impl Reader {
             let Some((option, value)) = word.split_once(':') else { continue };
             let number = || {
                 let value = value.parse::<f64>();
-                value.map_err(|_| FaultKind::Syntax(format!("{word} of {name} is no number")))
+                value.map_err(|_| FaultKind::Syntax(format!("{word} of {name} is not a number")))
             };
             match option {
                 "/u" => value.clone_into(&mut signal.unit),
@@ -326,7 +326,7 @@ impl Reader {
         if placed { at(signal, start) } else { Ok(signal) }
     }
 
-    /// Puts blocks of the same name together.
+    /// Combines blocks of the same name.
     fn messages(self, faults: &mut Vec<Fault>) -> Vec<Message> {
         let mut groups: Vec<Vec<Block>> = Vec::new();
         for block in self.blocks {
@@ -341,7 +341,7 @@ impl Reader {
     }
 }
 
-/// The order that the options say.
+/// The byte order according to the options.
 fn order_of(words: &[String]) -> ByteOrder {
     if words.iter().any(|word| word == "-m") { ByteOrder::Big } else { ByteOrder::Little }
 }
@@ -354,7 +354,7 @@ fn at(signal: Signal, start: i64) -> Result<Signal, FaultKind> {
     Ok(Signal { start, ..signal })
 }
 
-/// More identifiers than the range of a symbol has.
+/// No symbol has a range of more identifiers.
 const MOST_IDS: u32 = 256;
 
 /// A symbol's messages: one for each identifier.

@@ -1,52 +1,51 @@
-//! Keeping what happened around an event: a ring of records before it, everything for a while after.
+//! Keeps what happened around an event: a ring of records before it, and everything for a while after it.
 //!
-//! A [`Trigger`] stands between a source of records and whatever keeps them. Until its condition
-//! holds it remembers the last records and lets nothing through; then it lets the remembered
-//! ones out, and everything that follows until the time after the event is over. Another event
-//! before that starts the time anew.
+//! A [`Trigger`] sits between a source of records and their destination. Until its condition holds, it
+//! remembers the last records and passes nothing on; then it passes on the remembered ones and everything
+//! that follows until the time after the event is over. Another event before that restarts the time.
 //!
-//! A condition about signals alone is an event when it begins to hold: `Speed > 80` once, however long the
-//! car is fast. One about frames is an event for each frame for which it holds.
+//! For a condition about signals alone, the event is when it begins to hold: `Speed > 80` occurs once,
+//! however long the car stays fast. A condition about frames is an event for each frame for which it holds.
 
 use std::collections::VecDeque;
 
 use crate::condition::Condition;
 use cantap_trace::TraceRecord;
 
-/// How many records are remembered at most: 96 MiB.
+/// How many records can be remembered: 96 MiB.
 const MAX_REMEMBERED: usize = (96 << 20) / size_of::<TraceRecord>();
 
-/// What a trigger does with time.
+/// Which records a trigger keeps, by time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Window {
     /// How long before the event records are kept, in nanoseconds.
     pub pre_ns: i64,
     /// How long after the event records are kept, in nanoseconds.
     pub post_ns: i64,
-    /// Only this many events count: those after them do not lengthen the time. All without it.
+    /// Only this many events count: later ones do not extend the time. `None` for all.
     pub events: Option<u64>,
 }
 
-/// What happened so far.
+/// Counts so far.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct TriggerCounts {
-    /// How many events there were.
+    /// Number of events.
     pub events: u64,
-    /// Records let through.
+    /// Number of records passed on.
     pub kept: u64,
-    /// Records that would have been within the time before an event but had to be forgotten, because
-    /// no more can be remembered.
+    /// Number of records within the time before an event that had to be forgotten because of the limit.
     pub forgotten: u64,
 }
 
-/// Lets records through around events.
+/// Passes on records around events.
 #[derive(Debug)]
 pub struct Trigger {
     condition: Condition,
     window: Window,
     capacity: usize,
     ring: VecDeque<TraceRecord>,
-    /// Records that left the full ring, by time of the last; they matter if an event comes soon.
+    /// Number of records dropped from the full ring, by time of the last; they matter if an event follows
+    /// soon.
     overflowed: VecDeque<(i64, u64)>,
     held: bool,
     /// Open until this time.
@@ -73,7 +72,7 @@ impl Trigger {
         }
     }
 
-    /// Takes the next record; `keep` gets every record that is to be kept, in order, each once.
+    /// Takes the next record; `keep` gets every record to be kept, in order and once.
     pub fn push<E>(
         &mut self,
         record: &TraceRecord,
@@ -92,7 +91,7 @@ impl Trigger {
                 keep(&remembered)?;
             }
         }
-        // A record that has nothing to do with the condition leaves it as it was.
+        // An irrelevant record does not change the condition.
         if self.condition.was_concerned() {
             self.held = holds;
         }
@@ -113,7 +112,7 @@ impl Trigger {
         if self.ring.len() > self.capacity
             && let Some(oldest) = self.ring.pop_front()
         {
-            /// Losses are counted in steps of this, so that counting them does not itself take memory.
+            /// Losses are counted in steps of this length, so that counting them does not itself take memory.
             const STEP_NS: i64 = 1_000_000;
             match self.overflowed.back_mut() {
                 Some((since_ns, count)) if oldest.time_ns - *since_ns < STEP_NS => *count += 1,
@@ -131,12 +130,12 @@ impl Trigger {
         }
     }
 
-    /// Whether records are let through at this moment.
+    /// Whether records are currently passed on.
     pub fn is_open(&self) -> bool {
         self.open_until_ns.is_some()
     }
 
-    /// What happened so far.
+    /// The counts so far.
     pub fn counts(&self) -> TriggerCounts {
         self.counts
     }
@@ -152,7 +151,7 @@ mod tests {
 
     const SECOND: i64 = 1_000_000_000;
 
-    /// One frame per second; its number is its first byte. Returns the numbers that are kept.
+    /// One frame per second; its number is its first byte. Returns the numbers of those kept.
     fn kept(trigger: &mut Trigger, numbers: std::ops::Range<u8>) -> Vec<u8> {
         let mut kept = Vec::new();
         for number in numbers {

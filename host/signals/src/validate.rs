@@ -1,4 +1,4 @@
-//! What every database must hold to, whatever file it comes from.
+//! The rules for every database, whatever file it comes from.
 
 use std::collections::{HashMap, HashSet};
 
@@ -9,8 +9,8 @@ use super::model::{Database, Message, Signal, ValueKind};
 /// The longest message: J1939's transport protocol carries 1785 bytes.
 pub const MAX_BYTES: u16 = 1785;
 
-/// Makes a database of the messages. Those with a fault that makes values wrong are left out with a warning; where no message
-/// is left, and something was wrong, it is an error.
+/// Makes a database from messages. Those with a fault that would make values wrong are left out with a warning; if nothing is
+/// left and something was wrong, it is an error.
 pub fn finish(file: &str, messages: Vec<Message>, mut faults: Vec<Fault>) -> Result<Database, DatabaseError> {
     let mut usable = Vec::with_capacity(messages.len());
     for mut message in messages {
@@ -41,7 +41,7 @@ pub fn finish(file: &str, messages: Vec<Message>, mut faults: Vec<Fault>) -> Res
     Ok(database)
 }
 
-/// As [`finish`], for a file whose reader wrote it: whatever makes values wrong is an error.
+/// Like [`finish`], for files that our own reader defines: whatever makes values wrong is an error.
 pub fn finish_strictly(
     file: &str,
     messages: Vec<Message>,
@@ -62,7 +62,7 @@ pub fn finish_strictly(
     Ok(database)
 }
 
-/// Texts become fit for a terminal, and signals of one name in one frame get numbers.
+/// Makes texts safe for a terminal, and numbers signals with the same name in one frame.
 fn tidy(database: &mut Database) {
     for message in &mut database.messages {
         clean::make(&mut message.name, clean::line);
@@ -77,7 +77,7 @@ fn tidy(database: &mut Database) {
     }
 }
 
-/// Numbers signals of the same name that one frame may carry together.
+/// Numbers signals with the same name that one frame may carry together.
 fn number_twins(message: &mut Message) {
     let mut by_name: HashMap<&str, Vec<usize>> = HashMap::new();
     for (place, signal) in message.signals.iter().enumerate() {
@@ -95,7 +95,7 @@ fn number_twins(message: &mut Message) {
     }
 }
 
-/// Whether one frame may carry both. Signals under different values of one multiplexer never meet.
+/// Whether one frame may carry both. Signals for different values of one multiplexer never occur together.
 fn meet(one: &Signal, other: &Signal) -> bool {
     match (&one.multiplexed, &other.multiplexed) {
         (Some(one), Some(other)) if one.switch == other.switch => {
@@ -161,7 +161,7 @@ fn check_message(message: &mut Message, faults: &mut Vec<Fault>) {
     }
 }
 
-/// The signal's multiplexer, if following multiplexers from it does not end soon.
+/// The signal's multiplexer, if the chain of multiplexers from it is too long or has no end.
 fn switch_cycle<'a>(signals: &'a [Signal], signal: &'a Signal) -> Option<&'a Signal> {
     let first = &signals[signal.multiplexed.as_ref()?.switch];
     let mut at = first;

@@ -1,4 +1,4 @@
-//! What the readers of XML databases share.
+//! What the readers of XML databases have in common.
 
 use std::borrow::Cow;
 
@@ -6,10 +6,10 @@ use roxmltree::{Document, Node, ParsingOptions};
 
 use super::fault::{DatabaseError, Fault, FaultKind};
 
-/// A range of values that one text stands for is written out up to this many of them.
+/// A range of values with one text is expanded up to this many values.
 pub const MOST_TEXTS: i64 = 4096;
 
-/// The text of an XML file: UTF-8, UTF-16 with its mark, or else Windows' Western code page.
+/// The text of an XML file: UTF-8, UTF-16 with its mark, or otherwise Windows' Western code page.
 pub fn decode(bytes: &[u8]) -> Cow<'_, str> {
     let units = |order: fn([u8; 2]) -> u16| -> Vec<u16> {
         bytes[2..].chunks_exact(2).map(|pair| order([pair[0], pair[1]])).collect()
@@ -21,7 +21,8 @@ pub fn decode(bytes: &[u8]) -> Cow<'_, str> {
     }
 }
 
-/// Parses, or says where the text is no XML. A document type is read over: nothing is fetched, nothing expanded without bound.
+/// Parses XML, or says where the text is not XML. A document type is skipped: nothing is fetched, and nothing expanded without
+/// bound.
 pub fn parse<'a>(file: &str, text: &'a str) -> Result<Document<'a>, DatabaseError> {
     if text.trim().is_empty() {
         return Err(faulty(
@@ -45,7 +46,7 @@ pub fn faulty(file: &str, reason: String) -> DatabaseError {
     DatabaseError::Faulty { file: file.to_owned(), faults: vec![fault] }
 }
 
-/// The line that an element begins in.
+/// The line on which an element begins.
 pub fn line(document: &Document, node: Node) -> u32 {
     document.text_pos_at(node.range().start).row
 }

@@ -1,4 +1,4 @@
-"""What cantools decodes, as JSON lines, for tests/signals_agree_with_cantools.rs.
+"""cantools' decoded values, as JSON lines, for tests/signals_agree_with_cantools.rs.
 
     cantools_peer.py decode FILE...    100 random payloads per message of each database
     cantools_peer.py files DIR         fetch cantools' source from PyPI and print its test files
@@ -25,7 +25,7 @@ def text(value):
 
 def decode(message, node, data, texts):
     """Message.decode, which gives up on a multiplexer value that the database does not list, does the
-    same walk; this one keeps what is there in any case. `texts` gets those of value tables."""
+    same walk; this one keeps what is present in any case. `texts` gets those of value tables."""
     from cantools.database.namedsignalvalue import NamedSignalValue
     from cantools.database.utils import decode_data
 
@@ -45,7 +45,7 @@ def decode_file(path):
 
     try:
         database = cantools.database.load_file(path, database_format=pathlib.Path(path).suffix.lower()[1:], strict=False)
-    except Exception as error:  # whatever makes cantools refuse a file is its answer
+    except Exception as error:  # the reason why cantools refuses a file is its answer
         print(json.dumps({"file": path, "refused": str(error).splitlines()[0]}))
         return
     print(json.dumps({"file": path, "messages": len(database.messages)}))

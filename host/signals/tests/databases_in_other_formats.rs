@@ -1,4 +1,4 @@
-//! KCD, SYM and ARXML files: what is in them, and what is said where something is wrong. That they decode as elsewhere is for
+//! KCD, SYM and ARXML files: their content, and the messages if something is wrong. That they decode like others is tested in
 //! `signals_agree_with_cantools.rs`.
 
 use cantap_signals::{Database, DatabaseError, Decoder, Source, arxml, kcd, sym};
@@ -45,7 +45,7 @@ const TWO_BUSES: &str = r#"<NetworkDefinition><Document name="x"/>
  <Bus name="Comfort"><Message id="0x10" name="Seat"><Signal name="Heat" offset="0" length="8"/></Message>
   <Message id="0x12" name="Door"><Signal name="Open" offset="0" length="1"/></Message></Bus></NetworkDefinition>"#;
 
-/// Both were read as one, so that a frame of the one was shown as the other's.
+/// Both were once read as one, so that a frame on one bus was shown as one on the other.
 #[test]
 fn one_bus_of_several_is_read_and_all_of_them_as_one_are_warned_of() {
     let folder = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("buses");
@@ -143,13 +143,13 @@ fn an_arxml_file_is_read() {
     assert!(warnings[0].contains("U: the frame \"/P/Gone\" is not in the file"), "{warnings:?}");
     assert_eq!(decode(database.clone(), "00000123#00FFF6"), "Sig=-0.5°C");
     assert_eq!(decode(database, "00000123#007FFF"), "Sig=3277.2(Broken)°C");
-    // UTF-16, as some tools write.
+    // UTF-16, as written by some tools.
     let wide: Vec<u8> =
         std::iter::once(0xFEFF).chain(ARXML.encode_utf16()).flat_map(u16::to_le_bytes).collect();
     assert_eq!(arxml::parse("x.arxml", &wide).unwrap().messages[0].signals[0].unit, "°C");
 }
 
-/// A zero in front makes a number octal in AUTOSAR: lengths and identifiers were read as decimal ones.
+/// A leading zero makes a number octal in AUTOSAR: lengths and identifiers were once read as decimal.
 #[test]
 fn an_arxml_files_numbers_may_be_octal_or_hexadecimal_and_in_ones_complement() {
     let text = ARXML
@@ -181,7 +181,7 @@ fn what_follows_the_payload_of_a_secured_pdu_is_read_as_far_as_it_fits_a_signal(
             .replace("<X><CAN-FRAME-TRIGGERING>", "<X><PDU-TRIGGERING><SHORT-NAME>Tr</SHORT-NAME><I-PDU-REF>/P/Pdu</I-PDU-REF></PDU-TRIGGERING><CAN-FRAME-TRIGGERING>");
         arxml::parse("x.arxml", text.as_bytes()).unwrap()
     };
-    // Behind three bytes: 4 bits, then 12.
+    // After three bytes: 4 bits, then 12.
     let database = with_proof(4, 12);
     assert_eq!(decode(database, "00000123#00FFF6A5C3"), "Sig=-0.5°C F_Freshness=10 F_Authenticator=1475");
     let database = with_proof(0, 128);
@@ -225,7 +225,8 @@ fn the_payload_of_a_secured_pdu_is_read_and_of_a_container_it_is_said_that_it_is
     );
 }
 
-/// Each PDU is a part of itself, once and many times over: the first ended the program, the second would have taken years.
+/// Each PDU is a part of itself, once and many times over: the first crashed the program, the second would have taken
+/// years.
 #[test]
 fn pdus_that_are_parts_of_themselves_leave_their_frame_out() {
     for parts in [1, 40] {
@@ -270,7 +271,7 @@ fn what_is_no_database_is_an_error() {
     }
 }
 
-/// Cut anywhere, a file is an error or a smaller database, and never the end of the program.
+/// Cut anywhere, a file is an error or a smaller database, and never crashes the program.
 #[test]
 fn files_cut_anywhere_are_read_or_refused() {
     for (parse, text) in [(kcd::parse as Parse, KCD), (sym::parse, SYM), (arxml::parse, ARXML)] {

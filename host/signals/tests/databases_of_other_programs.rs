@@ -1,5 +1,5 @@
-//! What databases in use have, and what a reader must make of it: own numberings, doubled texts and names, damage, and texts that
-//! a terminal would obey.
+//! What databases in use contain, and how a reader must handle it: their own numberings, duplicate texts and names, damage, and
+//! texts that a terminal would interpret.
 
 use std::fmt::Write as _;
 
@@ -34,7 +34,7 @@ fn decoded(decoder: &Decoder, frame: &str) -> Option<Vec<(String, String, Option
 const ENGINE: &str = "BO_ 2364539904 EEC1: 8 A\n SG_ Speed : 24|16@1+ (0.125,0) [0|8031.875] \"rpm\" A\n\
                       SG_ Torque : 16|8@1+ (1,-125) [-125|125] \"%\" A\n SG_ Mode : 0|2@1+ (1,0) [0|3] \"\" A\n";
 
-/// Vector's numbering is not everybody's: canmatrix's own J1939 file has `J1939PG` fourth.
+/// Not everybody uses Vector's numbering: canmatrix's own J1939 file has `J1939PG` fourth.
 #[test]
 fn j1939_is_what_the_file_calls_so() {
     let fourth = "BA_DEF_ BO_  \"VFrameFormat\" ENUM  \"StandardCAN\",\"ExtendedCAN\",\"reserved\",\"reserved\",\"J1939PG\";\n";
@@ -51,7 +51,7 @@ fn j1939_is_what_the_file_calls_so() {
         (format!("{other}{}{protocol}", default("StandardCAN")), true),
         (format!("{other}{}{protocol}", default("ExtendedCAN")), false),
         (protocol.to_owned(), true),
-        // Without any list it is Vector's.
+        // Without a list, Vector's applies.
         (value(3), true),
         (value(4), false),
         (String::new(), false),
@@ -73,14 +73,14 @@ fn a_parameter_that_is_not_there_is_no_value() {
     let mut values = Vec::new();
     j1939.decode(1, &frame.parse().unwrap(), &mut values);
     assert!(values[0].value.is_nan() && values[1].value.is_nan() && !values[2].value.is_nan(), "{values:?}");
-    // So no condition takes it for a high speed.
+    // So no condition mistakes it for a high speed.
     let mut condition = Condition::new("Speed > 1000", &j1939).unwrap();
     assert!(!condition.holds(&record(frame)));
     assert!(condition.holds(&record("0CF00400#FDFFFE00FAFFFFFF")));
     // What decoding prints can be sent again.
     let sent = encode::encode(&j1939, None, "EEC1:Speed=not available,Torque=error,Mode=1").unwrap();
     assert_eq!(sent.frame.to_string(), "0CF00400#0100FEFFFF000000");
-    // Elsewhere these are numbers.
+    // Elsewhere these are ordinary numbers.
     let plain = decoder(ENGINE);
     assert!(decoded(&plain, frame).unwrap().iter().all(|(.., found)| found.is_none()));
 }
@@ -108,7 +108,7 @@ fn a_text_of_several_values_means_all_of_them() {
     assert_eq!(error, "\"Drive\" stands for several values of Gear; choose one: raw:255, raw:3, raw:7");
     assert_eq!(encode::encode(&decoder, None, "Box:Gear=raw:255").unwrap().frame.to_string(), "005#FF00");
     let error = encode::encode(&decoder, None, "Box:Gear=Reverse").unwrap_err().to_string();
-    assert_eq!(error, "\"Reverse\" is no value for Gear; it takes a number or one of: Drive, Park");
+    assert_eq!(error, "\"Reverse\" is not a value for Gear; it takes a number or one of: Drive, Park");
 }
 
 #[test]
@@ -122,7 +122,7 @@ fn a_table_takes_no_fraction() {
     assert_eq!(encode::encode(&decoder, None, "Box:Gear=3.0").unwrap().frame.to_string(), "005#0300");
 }
 
-/// Every value of a frame that keeps the limits goes back into the same frame.
+/// Every value in a frame that respects the limits encodes to the same frame.
 #[test]
 fn what_is_decoded_can_be_sent() {
     let text = "BO_ 5 M: 8 A\n SG_ Volt : 0|11@1+ (0.1,0) [0|204.7] \"V\" A\n SG_ Temp : 16|12@1- (0.05,-40) [-142.4|62.35] \"C\" A\n \
@@ -168,12 +168,12 @@ fn one_bad_message_leaves_the_others() {
     let good = "BO_ 6 Good: 8 A\n SG_ S : 0|8@1+ (1,0) [0|0] \"\" A\n";
     let about = "CM_ BO_ 5 \"bad\";\nVAL_ 5 Bad 1 \"one\" ;\n";
     for (bad, warning) in [
-        // An extended identifier without its flag, as in files that are used every day.
+        // An extended identifier without its flag, as in files used every day.
         (
             "BO_ 419361278 Bad: 8 A\n SG_ S : 0|8@1+ (1,0) [0|0] \"\" A\nVAL_ 419361278 S 1 \"one\" ;\n",
             "line 3: Bad: identifier 0x18FEF1FE does not fit 11 bits (standard) or 29 bits (extended: add 0x80000000 in DBC); the message is left out",
         ),
-        // Its lower 16 bits are those of the good one.
+        // Its lower 16 bits equal those of the good one.
         ("BO_ 65542 Bad: 8 A\nVAL_ 65542 S 1 \"one\" ;\n", "line 3: Bad: identifier 0x10006"),
         (
             "BO_ 5 Bad: 8 A\n SG_ Bad : 0|0@1+ (1,0) [0|0] \"\" A\n",
@@ -189,7 +189,7 @@ fn one_bad_message_leaves_the_others() {
             "BO_ 5 Bad: 8 A\n SG_ Bad : 0|32@1+ (1,0) [0|0] \"\" A\nSIG_VALTYPE_ 5 Bad : x;\n",
             "line 3: Bad: a statement that its values depend on is not understood; the message is left out",
         ),
-        // A quote that does not end takes what follows into it.
+        // An unterminated quote swallows what follows it.
         (
             "BO_ 5 Bad: 8 A\n SG_ Bad : 0|8@1+ (1,0) [0|0] \"km/h A\n SG_ Next : 8|8@1+ (1,0) [0|0] \"\" A\n",
             "line 4: Bad.Bad:",
@@ -209,7 +209,7 @@ fn one_bad_message_leaves_the_others() {
     }
 }
 
-/// Fifty was the end once.
+/// Fifty was once the limit.
 #[test]
 fn warnings_are_not_counted_against_a_database() {
     let mut text = "BO_ 6 Good: 8 A\n SG_ S : 0|8@1+ (1,0) [0|0] \"\" A\n".to_owned();
@@ -261,7 +261,7 @@ fn no_text_of_a_database_moves_the_cursor() {
         for signal in &message.signals {
             shown.extend([signal.name.clone(), signal.unit.clone()]);
             shown.extend(signal.values.iter().map(|(_, text)| text.to_owned()));
-            // A description has lines, but nothing else.
+            // A description may have several lines, but nothing else of this kind.
             shown.push(signal.description.replace('\n', " "));
         }
     }
@@ -283,7 +283,7 @@ fn signals_of_one_name_keep_both_values() {
             .collect()
     };
     assert_eq!(names("005#010203"), ["Speed=1", "Speed#2=2"]);
-    // Those that never meet keep their name.
+    // Those that never occur together keep their names.
     assert_eq!(names("006#010203"), ["Page=1", "Temp=2"]);
     assert_eq!(names("006#020203"), ["Page=2", "Temp=3"]);
     let sent = |text| encode::encode(&decoder, None, text).unwrap().frame.to_string();
@@ -291,7 +291,7 @@ fn signals_of_one_name_keep_both_values() {
     assert_eq!(sent("N:Page=2,Temp=3"), "006#020003");
 }
 
-/// 64 bytes, with a signal behind the eighth.
+/// 64 bytes, with a signal after the eighth.
 #[test]
 fn fd_frames_decode_as_far_as_they_reach() {
     let decoder = decoder(

@@ -36,7 +36,7 @@ fn dbc_faults(text: &str) -> String {
     }
 }
 
-/// The documentation's example is the earlier analyser's worked example.
+/// The documentation's example comes from the earlier analyser's documentation.
 #[test]
 fn the_documented_example_decodes_as_documented() {
     let docs = include_str!("../../../docs/signal-file.md");
@@ -90,7 +90,7 @@ fn a_fault_in_a_signal_file_names_line_and_symbol() {
     for (rest, expected) in [
         (
             "name = \"S\"\nat = \"D0\"",
-            "x.toml: line 5: M.S: at = \"D0\" is no place; write \"D2\", \"D2:D3\", \"D1.5\" or \"D1.7-4\"",
+            "x.toml: line 5: M.S: at = \"D0\" is not a place; write \"D2\", \"D2:D3\", \"D1.5\" or \"D1.7-4\"",
         ),
         ("name = \"S\"\nfaktor = 2\nat = \"D1\"", "line 7: M.S: unknown field `faktor`"),
         ("at = \"D1\"\nname = \"S\"\nfactor = \"x\"", "line 8: M.S: invalid type: string \"x\""),
@@ -108,7 +108,7 @@ fn a_fault_in_a_signal_file_names_line_and_symbol() {
             "line 5: M.S: the signal is multiplexed by itself",
         ),
         ("name = \"S\"\nat = \"D1\"\nvalues = { a = \"b\" }", "line 5: M.S: the text \"b\" stands for \"a\""),
-        ("name = \"S\"\nat = \"D1\"\ncolour = \"red\"", "line 5: M.S: \"red\" is no colour"),
+        ("name = \"S\"\nat = \"D1\"\ncolour = \"red\"", "line 5: M.S: \"red\" is not a colour"),
         ("name = \"S\"\nat = D1", "line 7: M.S: "),
     ] {
         let found = toml_faults(&format!("{head}{rest}\n"));
@@ -275,22 +275,20 @@ fn values_become_frames() {
         ("Muxed:Y=7,Z=9", Ok("006#020709")),
         (
             "EngineData:Speed=9000",
-            Err(
-                "the database allows Speed from 0 to 8000, not 9000; write raw:18000 to send it all the same",
-            ),
+            Err("the database allows Speed from 0 to 8000, not 9000; write raw:18000 to send it anyway"),
         ),
         ("EngineData:Temp=-119", Err("-119 does not fit Temp, which goes from -118 to 137")),
         ("EngineData:Gear=raw:16", Err("raw:16 does not fit Gear, which goes from 0 to 15")),
         (
             "EngineData:Gear=Reverse",
-            Err("\"Reverse\" is no value for Gear; it takes a number or one of: Park, Drive"),
+            Err("\"Reverse\" is not a value for Gear; it takes a number or one of: Park, Drive"),
         ),
         ("EngineData:Sped=1", Err("message EngineData has no signal \"Sped\"; did you mean Speed?")),
         ("EngineDate:Speed=1", Err("no database has a message \"EngineDate\"; did you mean EngineData?")),
         (
             "EngineData:Speed",
             Err(
-                "\"EngineData:Speed\" is no message with values; write it as Message:Signal=value,Signal=value",
+                "\"EngineData:Speed\" is not a message with values; write it as Message:Signal=value,Signal=value",
             ),
         ),
         ("EngineData:Temp=1,Temp=2", Err("signal Temp is given twice")),

@@ -1,5 +1,5 @@
-//! No text makes the parsers of databases, conditions and values panic or run away; and what they accept can be
-//! decoded and encoded.
+//! No text makes the parsers of databases, conditions and values panic or run away; and whatever they accept
+//! can be decoded and encoded.
 
 use cantap_signals::condition::Condition;
 use cantap_signals::search::{DataPattern, IdPattern};
@@ -17,7 +17,7 @@ const DBC: &[&[u8]] = &[
     include_bytes!("data/dbc/signed.dbc"),
 ];
 
-/// Pieces that formats and conditions are made of, and some that they are not.
+/// Pieces of which formats and conditions consist, and some that do not belong in them.
 const PIECES: &[&str] = &[
     "\"",
     "\\\"",
@@ -91,7 +91,7 @@ fn changed(bytes: &[u8], changes: &[Change]) -> Vec<u8> {
     let mut bytes = bytes.to_vec();
     for change in changes {
         let len = bytes.len().max(1);
-        // A short stretch: removing half of the file leaves little to test.
+        // A short stretch: removing half of the file would leave little to test.
         let stretch = |from: &prop::sample::Index, to: &prop::sample::Index, len: usize| {
             let from = from.index(len);
             from..(from + to.index(60)).min(len - 1)
@@ -121,7 +121,7 @@ fn changed(bytes: &[u8], changes: &[Change]) -> Vec<u8> {
     bytes
 }
 
-/// Everything that a program does with a database.
+/// Does everything that a program does with a database.
 fn use_it(database: Database) {
     let names: Vec<_> = database.messages.iter().map(|message| message.name.clone()).collect();
     let ids: Vec<_> = database.messages.iter().map(|message| message.id).collect();
@@ -193,7 +193,7 @@ proptest! {
     }
 }
 
-/// Texts that grow work faster than their length, if something is wrong.
+/// Texts for which the work would grow faster than their length if something were wrong.
 #[test]
 fn large_files_take_no_more_than_their_share() {
     let signals: String = (0..3000)

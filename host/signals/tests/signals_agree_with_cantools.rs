@@ -1,8 +1,8 @@
 //! Decoding agrees with cantools: the same signals with the same values, for 100 random payloads per
 //! message of every database in `tests/data` and of cantools' own test databases.
 //!
-//! Needs a Python with cantools (`CANTAP_PYTHON`, else `python3`). Without it the test says so and
-//! passes, unless `CANTAP_REQUIRE_PEERS=1`.
+//! Needs a Python with cantools (`CANTAP_PYTHON`, otherwise `python3`). Without it, the test says so
+//! and passes, unless `CANTAP_REQUIRE_PEERS=1`.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -93,7 +93,7 @@ fn peer(arguments: &[&Path]) -> Result<String, String> {
     }
 }
 
-/// The script's output, or `None` after saying that the peer is missing.
+/// The script's output, or `None` after reporting that the peer is missing.
 fn peer_or_skip(arguments: &[&Path]) -> Option<String> {
     match peer(arguments) {
         Ok(text) => Some(text),
@@ -116,8 +116,8 @@ fn own_files() -> Vec<PathBuf> {
     files
 }
 
-/// The same number. An integer is the very same; cantools multiplies by the factor's float and is off by its rounding,
-/// where ours is the float nearest to the decimal result.
+/// Whether the numbers are equal. Integers must be identical; cantools multiplies by the factor as a float and is off
+/// by its rounding, whereas ours is the float nearest to the decimal result.
 fn equal(theirs: &str, ours: Number, signal: &Signal) -> bool {
     match (theirs.parse::<i128>(), ours) {
         (Ok(theirs), Number::Integer(ours)) => theirs == ours,
@@ -137,7 +137,7 @@ fn bytes(hex: &str) -> Vec<u8> {
     (0..hex.len() / 2).map(|at| u8::from_str_radix(&hex[2 * at..2 * at + 2], 16).unwrap()).collect()
 }
 
-/// What differs for one payload.
+/// The differences for one payload.
 fn differences(decoder: &Decoder, line: &Line) -> Vec<String> {
     let id = if line.extended { Id::extended(line.id) } else { Id::standard(line.id) }.unwrap();
     let Some(reference) = decoder.find(1, id) else { return vec!["no such message here".to_owned()] };
@@ -184,7 +184,7 @@ fn differences(decoder: &Decoder, line: &Line) -> Vec<String> {
     found
 }
 
-/// Compares all files; returns every difference that is not listed, and how much was compared.
+/// Compares all files; returns every unlisted difference, and how much was compared.
 fn compare(files: &[PathBuf]) -> Option<(Vec<String>, usize, usize)> {
     let mut arguments = vec![Path::new("decode")];
     arguments.extend(files.iter().map(PathBuf::as_path));
@@ -225,7 +225,7 @@ fn compare(files: &[PathBuf]) -> Option<(Vec<String>, usize, usize)> {
                 continue;
             }
             let found = differences(decoder, &line);
-            // The first payload that shows a message's difference is enough to read.
+            // The first payload that shows a message's difference is enough.
             let difference =
                 found.first().map(|found| format!("{name}: {}: {found} (data {})", line.message, line.data));
             let known = |text: &String| text.starts_with(&format!("{name}: {}: ", line.message));

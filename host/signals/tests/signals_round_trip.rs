@@ -1,4 +1,4 @@
-//! What is encoded is decoded: for every kind of signal, every place, and every value it can have.
+//! What is encoded decodes to the same: for every kind of signal, every position, and every possible value.
 
 use cantap_signals::{
     ByteOrder, Database, Decoder, Message, Multiplexed, Number, Signal, Source, ValueKind, encode,
@@ -29,7 +29,7 @@ prop_compose! {
     ) -> Signal {
         let length = match kind {
             ValueKind::Half => 16,
-            // Ten bits hold sign, exponent and a bit of the fraction.
+            // Ten bits hold the sign, the exponent and one bit of the fraction.
             ValueKind::Single => length.clamp(10, 32),
             ValueKind::Double => length.max(13),
             _ => length,
@@ -49,7 +49,7 @@ proptest! {
         let raw = raw >> (64 - signal.length);
         let number = signal.number(raw);
         prop_assume!(number.is_finite());
-        // A float has 53 bits: what scaling takes from a longer integer cannot come back.
+        // A float has 53 bits: what scaling removes from a longer integer cannot come back.
         let is_float = signal.integer(raw).is_none();
         prop_assume!(matches!(number, Number::Integer(_)) || signal.length <= 48 || is_float);
         let decoder = decoder(message(vec![signal.clone()]));
@@ -92,7 +92,7 @@ proptest! {
     }
 }
 
-/// Loops and other nonsense that no file can have, but a program can make.
+/// Cycles and other nonsense that no file can contain but a program can make.
 #[test]
 fn databases_made_by_programs_cannot_make_the_decoder_run_away() {
     let loops = |at: usize| Some(Multiplexed { switch: at, values: vec![0..=255] });

@@ -1,40 +1,42 @@
-//! The length of a bit, from the edges of a receive pin.
+//! Measures the length of a bit from the edges of a receive pin.
 //!
-//! Every bit time there can be is tried, in steps of a per cent: the right one is the one at which frames can be read, CRC and all. Which bit
-//! each of a frame's edges begins is then known, and a line through them gives the bit time. Edges to dominant and to recessive have a line
-//! each, of one slope: what delays one kind more than the other drops out. So do a frame that was destroyed and a glitch: they are
-//! not read.
+//! Every possible bit time is tried, in steps of one per cent: the right one is the one at which frames can be read, including their CRC. It
+//! is then known which bit each edge of a frame begins, and a line through the edges gives the bit time. Edges to dominant and edges to
+//! recessive get a line each, with a common slope, so a delay that affects one kind more than the other cancels out. Destroyed frames and
+//! glitches have no effect because they are not read.
 
 use super::reading::{PinEdge, ReadFrame, read_frames};
 
-/// From one bit time that is tried to the next. A bit is placed from one edge to dominant to the next, ten bits at most: half a step makes a
-/// twentieth of a bit.
+/// Step from one trial bit time to the next. A bit is placed relative to the previous edge to dominant, at most ten bits away, so half a
+/// step is a twentieth of a bit.
 const STEP: f64 = 1.01;
-/// An edge that is farther from its place than this part of a bit, beside what the others scatter, is left out.
+/// An edge farther from its place than this fraction of a bit, on top of the scatter of the others, is left
+/// out.
 const OUTLIER_BITS: f64 = 0.1;
-/// Edges of a frame scatter less than this part of a bit around their places; those of what only looks like one, by more.
+/// The edges of a real frame scatter by less than this fraction of a bit around their places; those of something that
+/// only looks like a frame, by more.
 const MOST_SCATTER_BITS: f64 = 0.12;
-/// A frame can be read beside its bit time, but not farther away than this part of it.
+/// A frame can still be read with a wrong bit time, but not with one that is off by more than this fraction.
 const FARTHEST_GUESS: f64 = 0.1;
-/// A tick's rounding, in ticks.
+/// Error from rounding to ticks, in ticks.
 pub(super) const ROUNDING_TICKS: f64 = 0.29;
 
-/// What was measured.
+/// The result of a measurement.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Measured {
-    /// A bit, in ticks.
+    /// Length of a bit, in ticks.
     pub bit_ticks: f64,
-    /// Standard error, as a part of it.
+    /// Standard error, as a fraction of the bit.
     pub error: f64,
-    /// Frames that were read whole.
+    /// Frames read completely.
     pub frames: u32,
-    /// How many of them were acknowledged.
+    /// How many of those were acknowledged.
     pub acknowledged: u32,
 }
 
-/// Measures a bit that is between `least` and `most` ticks long; `None` where no frame can be read.
+/// Measures a bit that is between `least` and `most` ticks long; `None` if no frame can be read.
 pub(super) fn measure(edges: &[PinEdge], least: f64, most: f64) -> Option<Measured> {
-    // The most edges that were placed, and the first and last bit time in a row with so many.
+    // The largest number of edges placed, and the first and last bit time in a row that reached it.
     let mut best = (0, least, least);
     let mut tried = least / STEP;
     while tried <= most * STEP {
@@ -47,17 +49,17 @@ pub(super) fn measure(edges: &[PinEdge], least: f64, most: f64) -> Option<Measur
         tried *= STEP;
     }
     let (1.., first, last) = best else { return None };
-    // A short frame can be read far beside its bit time: to either side.
+    // A short frame can be read far off its bit time, in both directions.
     let guess = (first * last).sqrt();
     let rough = fit(&read_frames(edges, guess), guess)?;
-    // With the true bit time, frames can be read that the guess was too far off for.
+    // With the true bit time, frames become readable for which the guess was too far off.
     let frames = read_frames(edges, rough.bit_ticks);
     let fine = fit(&frames, rough.bit_ticks)?;
     let acknowledged = frames.iter().filter(|frame| frame.acknowledged).count() as u32;
     Some(Measured { frames: frames.len() as u32, acknowledged, ..fine })
 }
 
-/// A sum over the edges of one kind in one frame.
+/// Sums over the edges of one kind in one frame.
 #[derive(Clone, Copy, Debug, Default)]
 struct Line {
     count: f64,
@@ -65,7 +67,7 @@ struct Line {
     ticks: f64,
 }
 
-/// The slope of parallel lines: one for each kind of edge in each frame.
+/// The common slope of parallel lines: one line for each kind of edge in each frame.
 fn fit(frames: &[ReadFrame], guess: f64) -> Option<Measured> {
     let kinds = || frames.iter().flat_map(|frame| [true, false].map(|dominant| (frame, dominant)));
     let mut points: Vec<Vec<(f64, f64)>> = kinds()
@@ -109,7 +111,7 @@ fn fit(frames: &[ReadFrame], guess: f64) -> Option<Measured> {
     fits.then_some(Measured { bit_ticks: slope, error, frames: frames.len() as u32, acknowledged: 0 })
 }
 
-/// The middle of some points.
+/// The centre of some points.
 fn line(points: &[(f64, f64)]) -> Line {
     let count = points.len() as f64;
     let mean = |sum: f64| if points.is_empty() { 0.0 } else { sum / count };
@@ -129,10 +131,10 @@ pub(super) mod tests {
     pub const LEAST: f64 = 12.0;
     pub const MOST: f64 = 2400.0;
 
-    /// A pin: frames one after the other.
+    /// A simulated pin that carries one frame after the other.
     pub struct Pin {
         pub bit: f64,
-        /// By how much edges to recessive are late, in ticks.
+        /// How late edges to recessive are, in ticks.
         pub slow: f64,
         now: f64,
         pub edges: Vec<PinEdge>,
@@ -166,7 +168,7 @@ pub(super) mod tests {
             self.levels(&bits);
         }
 
-        /// A frame that is cut off by an error flag.
+        /// A frame cut off by an error flag.
         pub fn destroyed(&mut self, text: &str, after: usize) {
             let mut bits = levels(&text.parse().unwrap());
             bits.truncate(after);
@@ -233,7 +235,7 @@ pub(super) mod tests {
         assert_eq!(pin.measure(), None);
     }
 
-    /// A third of a bit: what a long line makes at 1 Mbit/s.
+    /// A third of a bit: what a long line causes at 1 Mbit/s.
     #[test]
     fn bits_of_unequal_length_are_measured_right() {
         for slow in [-0.2, 0.0, 0.2, 0.33, 0.5] {

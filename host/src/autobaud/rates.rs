@@ -1,32 +1,33 @@
-//! Which bit rate a measured one is, as far as the controller's clock reaches it.
+//! Turns a measured bit rate into one that the controller's clock can reach.
 
 use cantap_wire::BitTiming;
 use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
 
-/// Bit rates in use, in bit/s, those of CiA and of vehicles.
+/// Bit rates in use, in bit/s: those of CiA and those of vehicles.
 pub const COMMON_BPS: [u32; 14] = [
     500_000, 250_000, 125_000, 1_000_000, 100_000, 50_000, 83_333, 33_333, 800_000, 20_000, 10_000, 5_000,
     95_238, 62_500,
 ];
 
-/// What two crystals are off from one another, at most: 100 ppm each, and what a warm device adds.
+/// The largest difference between two crystals: 100 ppm each, plus what a warm device adds.
 const CRYSTALS: f64 = 0.000_3;
-/// So much beside the bus's rate a receiver takes every frame, whatever its sample point: in the ten bits that may pass without an edge to
-/// synchronise on, it makes a twentieth of a bit.
+/// A receiver this far off the bus's rate still takes every frame, whatever its sample point: over the ten bits that may pass without an
+/// edge to synchronise on, it amounts to a twentieth of a bit.
 const REACH: f64 = 0.005;
 
-/// A measured bit rate, as a controller has it.
+/// What a controller can do with a measured bit rate.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Reached {
-    /// At this one.
+    /// It reaches this rate, in bit/s.
     At { bitrate_bps: u32 },
-    /// Its clock reaches none that is near enough; this one is the nearest.
+    /// Its clock reaches no rate that is near enough; this one is the nearest.
     Not { nearest_bps: Option<u32> },
 }
 
-/// The bit rate of a controller with this clock that a measured one is, give or take its standard error (a part of it).
+/// Finds the bit rate that a controller with this clock should use for a measured one. `error` is the measurement's
+/// standard error, as a fraction.
 ///
-/// A common rate is taken for one where the measurement allows it. Below 100 kbit/s the clock's own rates are less than a thousandth apart.
+/// A common rate is preferred if the measurement allows it. Below 100 kbit/s the clock's own rates are less than a thousandth apart.
 pub(super) fn reach(clock_hz: u32, measured_bps: f64, error: f64) -> Reached {
     let off = |bps: u32| (f64::from(bps) / measured_bps - 1.0).abs();
     let allowed = 3.0 * error + CRYSTALS;
@@ -38,7 +39,7 @@ pub(super) fn reach(clock_hz: u32, measured_bps: f64, error: f64) -> Reached {
         return Reached::At { bitrate_bps };
     }
     let clocks = (f64::from(clock_hz) / measured_bps).round() as u32;
-    // One clock in three or four has a timing up there, nearly every one further down.
+    // At high rates one number of clocks in three or four has a timing, at low rates nearly every one.
     let around = clocks.saturating_sub(8).max(1)..=clocks + 8;
     let rates = around
         .filter(|clocks| BitTiming::of_clocks(*clocks).next().is_some())
@@ -69,7 +70,7 @@ mod tests {
                 let Reached::At { bitrate_bps } = reach(CLOCK_HZ, exact * (1.0 + ppm / 1e6), 0.000_02) else {
                     panic!("{exact}")
                 };
-                // A neighbour that is common may be taken for it, where a measurement cannot tell them apart.
+                // If the measurement cannot tell two neighbours apart, prefer the common one.
                 let off = (f64::from(bitrate_bps) / exact - 1.0).abs();
                 assert!(off <= 0.000_45, "{exact} by {ppm} ppm: {bitrate_bps}");
             }

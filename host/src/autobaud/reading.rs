@@ -1,4 +1,5 @@
-//! Frames read from the edges of a receive pin, at a bit time that is only a guess: if it is wrong, stuffing or the CRC says so.
+//! Reads frames from the edges of a receive pin at a bit time that is only a guess: if the guess is wrong, stuffing or the CRC
+//! shows it.
 
 use cantap_wire::{Frame, Id};
 
@@ -9,9 +10,9 @@ use cantap_trace::bits::FrameBits;
 pub(super) struct PinEdge {
     /// In ticks.
     pub at: f64,
-    /// The level behind it.
+    /// The level after it.
     pub dominant: bool,
-    /// Edges before it may be missing.
+    /// Edges may be missing before it.
     pub unsure: bool,
 }
 
@@ -22,28 +23,29 @@ pub(super) struct PlacedEdge {
     pub edge: PinEdge,
 }
 
-/// A frame whose CRC is right.
+/// A frame with a correct CRC.
 #[derive(Clone, Debug)]
 pub(super) struct ReadFrame {
-    /// Its sender's edges: up to the CRC's end, without those that may have been earlier.
+    /// Its sender's edges up to the end of the CRC, except for those that may have come too early.
     pub edges: Vec<PlacedEdge>,
-    /// Somebody acknowledged it.
+    /// Whether anybody acknowledged it.
     pub acknowledged: bool,
 }
 
-/// Before a start of frame the bus was recessive for eleven bits at least: the end of a frame, or of an error frame, and the intermission.
+/// Before a start of frame the bus is recessive for at least eleven bits: the end of a frame or error frame, and the intermission.
 const IDLE_BITS: f64 = 9.5;
-/// Pulses shorter than this part of a bit are none.
+/// Pulses shorter than this fraction of a bit are ignored.
 const GLITCH_BITS: f64 = 0.3;
-/// Where a dominant pulse is cut into bits: edges to recessive come late rather than early.
+/// Where to cut a dominant pulse into bits, as a fraction of a bit: edges to recessive come late rather than
+/// early.
 const LATE_BITS: f64 = 0.15;
-/// Equal bits that stuffing allows.
+/// How many equal bits stuffing allows.
 const STUFF_AFTER: u32 = 5;
-/// Recessive bits that a bus without further edges shows for certain.
+/// Recessive bits that are certain once a bus shows no further edge.
 const SILENT_BITS: u32 = 11;
 
-/// Every frame that can be read at this bit time, also across a moment in which edges may be missing: if one is, the levels do not alternate,
-/// or the CRC is wrong.
+/// Reads every frame that can be read at this bit time, even across a moment in which edges may be missing: if one is missing, the levels do
+/// not alternate or the CRC is wrong.
 pub(super) fn read_frames(edges: &[PinEdge], bit_ticks: f64) -> Vec<ReadFrame> {
     let mut frames = Vec::new();
     let mut at = 0;
@@ -59,7 +61,7 @@ pub(super) fn read_frames(edges: &[PinEdge], bit_ticks: f64) -> Vec<ReadFrame> {
     frames
 }
 
-/// The frame that begins with an edge, and the first edge behind it.
+/// The frame that begins at an edge, and the first edge after it.
 fn read_frame(edges: &[PinEdge], start: usize, bit_ticks: f64) -> Option<(ReadFrame, usize)> {
     let first = edges[start];
     let idle = |before: &PinEdge| first.unsure || first.at - before.at > IDLE_BITS * bit_ticks;
@@ -79,7 +81,7 @@ fn read_frame(edges: &[PinEdge], start: usize, bit_ticks: f64) -> Option<(ReadFr
         }
         let dominant = dominant as u32;
         let recessive = match down {
-            // From one edge to dominant to the next, which asymmetry does not touch.
+            // Measured from one edge to dominant to the next, which asymmetry does not affect.
             Some((_, next)) if next.dominant => {
                 let whole = ((next.at - falling.at) / bit_ticks).round();
                 if whole <= f64::from(dominant) {
@@ -95,11 +97,11 @@ fn read_frame(edges: &[PinEdge], start: usize, bit_ticks: f64) -> Option<(ReadFr
         for (n, level) in levels.enumerate() {
             match bits.push(level)? {
                 Step::More => {}
-                // The delimiter behind the CRC: what follows is somebody else's.
+                // The delimiter after the CRC: what follows comes from other nodes.
                 Step::End => {
                     let end = bit + n as u32;
                     placed.retain(|placed| placed.bit <= end && !placed.edge.unsure);
-                    // The delimiter alone, and then dominant: the acknowledgement.
+                    // Only the delimiter and then dominant: the acknowledgement.
                     let acknowledged = down.is_some() && bit + dominant + recessive == end + 1;
                     let next = down.map_or(edges.len(), |(next, _)| next);
                     return Some((ReadFrame { edges: placed, acknowledged }, next));
@@ -113,7 +115,7 @@ fn read_frame(edges: &[PinEdge], start: usize, bit_ticks: f64) -> Option<(ReadFr
     }
 }
 
-/// The next edge, without pulses that are too short to be a bit.
+/// The next edge, skipping pulses too short to be a bit.
 fn next_pulse(edges: &[PinEdge], mut at: usize, bit_ticks: f64) -> Option<(usize, PinEdge)> {
     loop {
         at += 1;
@@ -127,11 +129,11 @@ fn next_pulse(edges: &[PinEdge], mut at: usize, bit_ticks: f64) -> Option<(usize
 
 enum Step {
     More,
-    /// This was the recessive bit behind a CRC that is right.
+    /// This was the recessive bit after a correct CRC.
     End,
 }
 
-/// A frame's bits as they come.
+/// Collects a frame's bits as they arrive.
 #[derive(Default)]
 struct Parser {
     /// Without stuff bits; true for recessive.
@@ -141,7 +143,7 @@ struct Parser {
 }
 
 impl Parser {
-    /// Takes a bit; `None` if there is no such frame.
+    /// Takes a bit; `None` if this cannot be a frame.
     fn push(&mut self, recessive: bool) -> Option<Step> {
         let same = self.last == Some(recessive);
         let (run, whole) = (self.run, self.wanted() == Some(self.bits.len()));
@@ -157,7 +159,7 @@ impl Parser {
         Some(Step::More)
     }
 
-    /// Whether there are 29 bits of identifier, and where RTR and the DLC are.
+    /// Whether the identifier has 29 bits, and where RTR and the DLC are.
     fn layout(&self) -> Option<(bool, usize, usize)> {
         let extended = *self.bits.get(13)?;
         Some(if extended { (true, 32, 35) } else { (false, 12, 15) })
@@ -168,7 +170,7 @@ impl Parser {
         Some(bits.iter().fold(0, |value, bit| value << 1 | u32::from(*bit)))
     }
 
-    /// Bits up to the CRC's end, once the DLC is there.
+    /// Number of bits up to the end of the CRC, once the DLC is known.
     fn wanted(&self) -> Option<usize> {
         let (_, rtr, dlc) = self.layout()?;
         let bytes = self.value(dlc, 4)?.min(8) as usize;
@@ -191,7 +193,7 @@ impl Parser {
             for (n, byte) in data.iter_mut().enumerate().take(bytes) {
                 *byte = self.value(dlc + 4 + 8 * n, 8)? as u8;
             }
-            // Reserved bits count as dominant here: CAN FD's frames have another CRC anyway.
+            // Reserved bits are taken as dominant: CAN FD frames have a different CRC anyway.
             let frame = Frame::from_bus(id, remote, code as u8, data);
             let crc = self.value(dlc + 4 + 8 * bytes, 15)?;
             Some(u32::from(FrameBits::of(&frame).crc) == crc)

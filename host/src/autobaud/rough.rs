@@ -1,27 +1,30 @@
-//! The length of a bit where no frame can be read whole: beside a channel that is full, the device may be blind for a part of every frame, and on
-//! a bad bus every frame may be destroyed.
+//! Estimates the length of a bit when no frame can be read completely: next to a channel under full load, the device may miss a part of every
+//! frame, and on a bad bus every frame may be destroyed.
 //!
-//! What is left are distances from one edge to the next of its kind, each a whole number of bits, ten at most. The bit time is the one of
-//! which they are multiples, and of which there are single bits. That is no proof, so it counts only if the controller then hears frames.
+//! What remains are distances from one edge to the next of the same kind, each a whole number of bits, ten at most. The bit time is the
+//! one that they are all multiples of and at which single bits occur. That is not proof, so the result counts only if the controller then
+//! receives frames.
 
 use super::measure::{Measured, ROUNDING_TICKS};
 use super::reading::PinEdge;
 
-/// From one bit time that is tried to the next: a third of a per cent makes a sixtieth of a bit in five.
+/// Step from one trial bit time to the next: a third of a per cent is a sixtieth of a bit over five bits.
 const STEP: f64 = 1.003;
 /// Five bits of one level and five of the other are the most that stuffing allows.
 const MOST_BITS: f64 = 10.5;
-/// So near to a whole number of bits is a distance that is one, and one in five of those that are not.
+/// How near a distance must be to a whole number of bits. One in five random distances is that near by
+/// chance.
 const NEAR_BITS: f64 = 0.1;
-/// Distances that are looked at, at least.
+/// Distances needed at least.
 const LEAST_DISTANCES: usize = 100;
-/// The part of all distances that must be short enough, and the part of those that must be near a whole number.
+/// The fraction of all distances that must be short enough, and the fraction of those that must be near a whole
+/// number.
 const LEAST_SHORT: f64 = 0.6;
 const LEAST_NEAR: f64 = 0.75;
-/// The part of all pulses that must be single bits: nearly half are.
+/// The fraction of all pulses that must be single bits: nearly half of them are.
 const LEAST_SINGLE: f64 = 0.2;
 
-/// A guess at a bit that is between `least` and `most` ticks long.
+/// Estimates a bit that is between `least` and `most` ticks long.
 pub(super) fn estimate(edges: &[PinEdge], least: f64, most: f64) -> Option<Measured> {
     let in_turn = edges
         .windows(3)
@@ -61,13 +64,13 @@ pub(super) fn estimate(edges: &[PinEdge], least: f64, most: f64) -> Option<Measu
     Some(Measured { bit_ticks, error, frames: 0, acknowledged: 0 })
 }
 
-/// The whole number of bits that a distance is.
+/// The whole number of bits in a distance.
 fn bits_of(distance: f64, bit_ticks: f64) -> Option<f64> {
     let bits = distance / bit_ticks;
     (bits < MOST_BITS && (bits - bits.round()).abs() < NEAR_BITS && bits > 1.5).then_some(bits.round())
 }
 
-/// How well a bit time fits: 0 where it does not.
+/// How well a bit time fits; 0 if it does not.
 fn score(distances: &[f64], pulses: &[f64], bit_ticks: f64) -> f64 {
     let part = |count: usize, of: usize| count as f64 / of.max(1) as f64;
     let short = distances.iter().filter(|distance| **distance < MOST_BITS * bit_ticks).count();

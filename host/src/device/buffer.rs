@@ -1,5 +1,5 @@
-//! Between the reader thread and the consumer of the records: bounded, and the reader never waits. What does
-//! not fit is counted, and a loss record stands in its place.
+//! The bounded buffer between the reader thread and the consumer of the records. The reader never waits: what
+//! does not fit is counted, and a loss record stands in its place.
 
 use std::collections::VecDeque;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
@@ -11,7 +11,7 @@ use cantap_wire::record::LossStage;
 use super::DeviceError;
 use crate::{TraceEvent, TraceRecord};
 
-/// Records that are not frames may go beyond the capacity by this many, so that what explains a gap is kept.
+/// This many records that are not frames may exceed the capacity, so that what explains a gap is kept.
 const RESERVE: usize = 65_536;
 /// Used-up vectors kept for the next batches.
 const SPARES: usize = 4;
@@ -26,14 +26,14 @@ struct State {
     batches: VecDeque<Vec<TraceRecord>>,
     records: usize,
     spares: Vec<Vec<TraceRecord>>,
-    /// Lost here, and no record says so yet.
+    /// Frames lost here that no record reports yet.
     unreported: [u32; CHANNELS],
-    /// Time of the last record that was not kept.
+    /// Time of the last record that was dropped.
     lost_at_ns: i64,
     end: Option<End>,
 }
 
-/// The buffer: for whoever hands on records that came from a device too.
+/// The buffer, also for programs that pass on records that came from a device.
 pub struct Buffer {
     state: Mutex<State>,
     changed: Condvar,
@@ -55,12 +55,12 @@ impl Buffer {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        // Nobody panics in between, and the state would still be whole.
+        // Nothing panics while the lock is held, and the state would still be consistent.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Takes the records out of `batch`, leaving it empty, and returns how many frames found no room, per
-    /// channel. What comes behind the end belongs to nobody: it is neither kept nor lost.
+    /// channel. Records after the end belong to nobody: they are neither kept nor counted as lost.
     pub fn push(&self, batch: &mut Vec<TraceRecord>) -> [u32; CHANNELS] {
         if batch.is_empty() {
             return [0; CHANNELS];
@@ -104,12 +104,12 @@ impl Buffer {
         lost
     }
 
-    /// Nothing follows.
+    /// Ends the stream.
     pub fn finish(&self) {
         self.end(End::Clean);
     }
 
-    /// Nothing follows, for this reason.
+    /// Ends the stream with an error.
     pub fn fail(&self, error: DeviceError) {
         self.end(End::Failed(Some(error)));
     }
@@ -129,7 +129,7 @@ impl Buffer {
         self.changed.notify_all();
     }
 
-    /// Whether nothing follows.
+    /// Whether the stream has ended.
     pub fn has_ended(&self) -> bool {
         self.lock().end.is_some()
     }
@@ -140,8 +140,8 @@ impl Buffer {
         !state.batches.is_empty() || state.end.is_some()
     }
 
-    /// The next records; none if there are none within `timeout`; `None` after the last. An error is
-    /// reported once, after everything before it was taken.
+    /// The next records; empty if there are none within `timeout`; `None` after the last. An error is
+    /// reported once, after everything before it has been taken.
     pub fn pop(&self, timeout: Option<Duration>) -> Result<Option<Vec<TraceRecord>>, DeviceError> {
         let deadline = timeout.map(|timeout| Instant::now() + timeout);
         let mut state = self.lock();
@@ -200,7 +200,7 @@ mod tests {
         times.map(|time_ns| TraceRecord { time_ns, channel: 2, event }).collect()
     }
 
-    /// Whoever closed the stream reads as many losses in it as it counts.
+    /// Whoever closed the stream must find as many losses in it as the counters say.
     #[test]
     fn what_comes_behind_the_end_is_not_lost() {
         let buffer = Buffer::new(1);

@@ -1,4 +1,4 @@
-//! What a device can be asked, one method each.
+//! The requests to a device, one method each.
 
 use cantap_wire::message::{
     ChannelConfig, Defaults, Edges, Failures, Filter, Periodic, Registers, Status, Trigger, TxFrame,
@@ -16,7 +16,7 @@ impl Device {
         }
     }
 
-    /// How often the firmware failed since the device got its power, and why last.
+    /// How often the firmware has failed since the device was powered, and the reason for the last failure.
     pub fn failures(&self) -> Result<Failures, DeviceError> {
         match self.request(Command::Failures)? {
             Reply::Failures(failures) => Ok(failures),
@@ -29,7 +29,8 @@ impl Device {
         self.done(Command::MeasureEdges { channel })
     }
 
-    /// What was measured since the last call. Where there are [`MAX_EDGES`](cantap_wire::message::MAX_EDGES), there are more.
+    /// Returns what was measured since the last call. If it is [`MAX_EDGES`](cantap_wire::message::MAX_EDGES) edges, there
+    /// are more.
     pub fn edges(&self) -> Result<Edges, DeviceError> {
         match self.request(Command::Edges)? {
             Reply::Edges(edges) => Ok(edges),
@@ -45,7 +46,8 @@ impl Device {
         }
     }
 
-    /// Replaces all filters of a closed channel. Returns the hardware banks that it uses and could use.
+    /// Replaces all filters of a closed channel. Returns how many hardware banks they use and how many there
+    /// are.
     pub fn set_filters(&self, channel: Channel, filters: &[Filter]) -> Result<(u8, u8), DeviceError> {
         let list = heapless::Vec::from_slice(filters).map_err(|_| DeviceError::RequestTooLong)?;
         match self.request(Command::SetFilters { channel, filters: list })? {
@@ -57,7 +59,7 @@ impl Device {
         }
     }
 
-    /// Queues frames for transmission, all or none. Returns the places that are free after it.
+    /// Queues frames for transmission, all or none. Returns how many places are free afterwards.
     pub fn send(&self, channel: Channel, frames: &[TxFrame]) -> Result<u16, DeviceError> {
         let frames = heapless::Vec::from_slice(frames).map_err(|_| DeviceError::RequestTooLong)?;
         match self.request(Command::Send { channel, frames })? {
@@ -94,7 +96,7 @@ impl Device {
         }
     }
 
-    /// Leaves bus-off where recovery is manual.
+    /// Leaves bus-off when recovery is manual.
     pub fn recover(&self, channel: Channel) -> Result<(), DeviceError> {
         self.done(Command::Recover { channel })
     }
@@ -119,7 +121,7 @@ impl Device {
         self.done(Command::Configure { channel, config })
     }
 
-    /// What is stored on the device for a channel, if anything is. Nothing is opened.
+    /// What the device has stored for a channel, if anything. Nothing is opened.
     pub fn defaults(&self, channel: Channel) -> Result<Option<Defaults>, DeviceError> {
         match self.request(Command::Defaults { channel }) {
             Ok(Reply::Defaults(defaults)) => Ok(Some(defaults)),
@@ -129,8 +131,8 @@ impl Device {
         }
     }
 
-    /// Stores the filters and configuration that each channel has in this session on the device; a channel that has none
-    /// keeps what is stored.
+    /// Stores each channel's filters and configuration of this session on the device; a channel that has none keeps what
+    /// is stored.
     pub fn save_defaults(&self) -> Result<(), DeviceError> {
         self.done(Command::SaveDefaults)
     }

@@ -14,13 +14,13 @@ pub enum DeviceError {
     /// There is nothing at the address.
     #[error("there is no device at '{address}'")]
     NotFound {
-        /// As it was given.
+        /// As given.
         address: String,
     },
     /// Another program has the port open.
     #[error("'{address}' is in use by another program; close it there and try again")]
     Busy {
-        /// As it was given.
+        /// As given.
         address: String,
     },
     /// The operating system forbids it.
@@ -29,24 +29,24 @@ pub enum DeviceError {
          (usually `dialout`) and log in again"
     )]
     Forbidden {
-        /// As it was given.
+        /// As given.
         address: String,
     },
     /// The port cannot be opened for another reason.
     #[error("'{address}' cannot be opened as a serial port: {source}")]
     Open {
-        /// As it was given.
+        /// As given.
         address: String,
         /// What the system says.
         source: Box<dyn std::error::Error + Send + Sync>,
     },
-    /// It does not answer, or not in our language.
+    /// It does not answer, or not in cantap's protocol.
     #[error("'{address}' does not answer as a cantap device")]
     NotCantap {
-        /// As it was given.
+        /// As given.
         address: String,
     },
-    /// Versions differ.
+    /// The protocol versions differ.
     #[error(
         "the device speaks protocol version {device}, this program version {PROTOCOL_VERSION}: update the {}",
         older_side(*device)
@@ -64,7 +64,7 @@ pub enum DeviceError {
     /// A request got no answer.
     #[error("the device did not answer within {seconds} s; unplug it and plug it in again")]
     Timeout {
-        /// How long was waited, in seconds.
+        /// How long the host waited, in seconds.
         seconds: f32,
     },
     /// The device gave an answer that does not belong to the request.
@@ -76,49 +76,49 @@ pub enum DeviceError {
     /// The port is gone: unplugged, reset, or its other end closed.
     #[error("the device at '{address}' vanished ({reason})")]
     Vanished {
-        /// As it was given.
+        /// As given.
         address: String,
         /// The system's message.
         reason: String,
     },
-    /// The port is there, and nothing is answered any more.
+    /// The port is there, but nothing is answered any more.
     #[error("the device at '{address}' has answered nothing for {seconds:.1} s")]
     Silent {
-        /// As it was given.
+        /// As given.
         address: String,
         /// For how long, in seconds.
         seconds: f32,
     },
-    /// The session is over, and what was captured since went nowhere.
+    /// The session is over; nothing captured since then was delivered.
     #[error("the session with the device at '{address}' has ended: {reason}")]
     SessionEnded {
-        /// As it was given.
+        /// As given.
         address: String,
-        /// How it shows.
+        /// How this was noticed.
         reason: SessionOver,
     },
-    /// It was not there when the capture ended.
+    /// The device was absent when the capture ended.
     #[error("the device at '{address}' was not there at the end: {reason}")]
     StillGone {
-        /// As it was given.
+        /// As given.
         address: String,
-        /// What was wrong with it last.
+        /// The last error.
         reason: String,
     },
-    /// The capture could not be ended as it should be.
+    /// The capture could not be ended properly.
     #[error(
         "the capture from '{address}' ended without the device's last word, and frames may be missing at its end: {reason}"
     )]
     BadEnd {
-        /// As it was given.
+        /// As given.
         address: String,
         /// What was wrong.
         reason: String,
     },
-    /// Another board is at the address, on which what was set up before cannot be set up again.
+    /// There is another board at the address, on which the earlier set-up cannot be repeated.
     #[error("another board is at '{address}' now ({name}), and its clock is another; start again with it")]
     OtherClock {
-        /// As it was given.
+        /// As given.
         address: String,
         /// Its name and serial number.
         name: String,
@@ -126,34 +126,34 @@ pub enum DeviceError {
     /// The bit rate cannot be set.
     #[error("{}", no_timing(*bitrate_bps, reason))]
     BitRate {
-        /// What was asked for, in bit/s.
+        /// The requested rate, in bit/s.
         bitrate_bps: u32,
-        /// Why not, and what is near.
+        /// Why not, and which rates are near.
         reason: NoTiming,
     },
-    /// What the device says of itself cannot be.
+    /// The device reports something about itself that is impossible.
     #[error("the device says {what}, which cannot be; update its firmware")]
     Impossible {
-        /// What it says.
+        /// What it reports.
         what: String,
     },
-    /// The device opened a channel in another way than it was asked to. It was closed again.
+    /// The device opened a channel differently from the request. The channel was closed again.
     #[error(
         "the device opened channel {} at {bitrate_bps} bit/s in the mode {mode:?}, which is not what it was asked for; update its firmware",
         .channel.number()
     )]
     OpenedOtherwise {
-        /// Which.
+        /// The channel.
         channel: Channel,
-        /// The bit rate it tells, in bit/s.
+        /// The bit rate it reports, in bit/s.
         bitrate_bps: u32,
-        /// The mode it tells.
+        /// The mode it reports.
         mode: Mode,
     },
     /// The device has fewer channels.
     #[error("the device has no channel {}", .channel.number())]
     NoChannel {
-        /// What was asked for.
+        /// The requested channel.
         channel: Channel,
     },
     /// A thread could not be started.
@@ -161,21 +161,21 @@ pub enum DeviceError {
     Thread(#[source] io::Error),
 }
 
-/// How it shows that a session is over.
+/// How the end of a session was noticed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum SessionOver {
-    /// The device says that the computer suspended it.
+    /// The device reports that the computer suspended it.
     Suspended,
-    /// The device says that the computer configured it anew.
+    /// The device reports that the computer configured it again.
     Configured,
-    /// The device refuses requests because there is none.
+    /// The device refuses requests because there is no session.
     Refused,
     /// Another program greets the device on our port.
     Greeted,
-    /// The stream begins anew.
+    /// The stream started over.
     StreamWentBack,
-    /// The device's clock was set back, or its records are later than it says it is.
+    /// The device's clock was set back, or its records are later than its own time.
     TimesDisagree,
     /// The board's server has lost it.
     BoardLost,
@@ -184,7 +184,7 @@ pub enum SessionOver {
 }
 
 impl DeviceError {
-    /// Whether it is the connection that fails, and not what was asked for.
+    /// Whether the connection failed, rather than the request.
     pub const fn is_of_the_connection(&self) -> bool {
         matches!(
             self,
@@ -197,13 +197,13 @@ impl fmt::Display for SessionOver {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Suspended => "this computer put the device to sleep, as when it sleeps itself",
-            Self::Configured => "this computer set the device up anew, as when its driver is loaded again",
+            Self::Configured => "this computer configured the device again, as when its driver is reloaded",
             Self::Refused => {
                 "this computer slept, or the device was restarted, or another program took it over"
             }
             Self::Greeted => "another program took it over; close that program",
             Self::StreamWentBack => {
-                "its stream began anew, because another program took it over or it was restarted"
+                "its stream started over, because another program took it over or it was restarted"
             }
             Self::TimesDisagree => {
                 "its times contradict one another, so its last stamps may be wrong; if that stays so, update its firmware"
@@ -214,7 +214,7 @@ impl fmt::Display for SessionOver {
     }
 }
 
-/// Why a connection is of no use any more; kept as the answer to every later request.
+/// Why a connection is no longer usable; kept as the answer to every later request.
 #[derive(Clone, Debug)]
 pub(super) enum Gone {
     Vanished(String),
@@ -259,7 +259,7 @@ pub(crate) fn no_timing(bitrate_bps: u32, reason: &NoTiming) -> String {
     }
 }
 
-/// A refusal, and what to do about it.
+/// A refusal in words, with what to do about it.
 fn sentence(refusal: Refusal) -> String {
     let fixed = match refusal {
         Refusal::Protocol { device } => {

@@ -1,5 +1,5 @@
-//! Bytes in, trace records out: decodes a device's stream, tightens stamps, maps them to UTC and counts.
-//! No threads, no I/O: the reader thread drives it, and so do tests and the benchmark.
+//! Turns bytes into trace records: decodes a device's stream, tightens stamps, maps them to UTC and counts.
+//! It has no threads and does no I/O: the reader thread drives it, and so do tests and the benchmark.
 
 use std::ops::Add;
 use std::time::Instant;
@@ -12,10 +12,10 @@ use super::clock::{ClockMap, SofMark, Ticks, UtcClock};
 use super::stamps::{BitLengths, Stamped, tighten};
 use crate::{Direction, TraceEvent, TraceRecord};
 
-/// Bytes decoded at a time: their records stay in the processor's cache through every pass.
+/// Bytes decoded at a time, few enough that their records stay in the processor's cache through every pass.
 pub const PIECE_BYTES: usize = 4096;
 
-/// A device's times are in order but for a tenth of a second: a mark of USB is up to a millisecond older than the record in front of it.
+/// A device's times are in order to within a tenth of a second: a USB mark can be up to a millisecond older than the record before it.
 const DISORDER_PER_S: u64 = 10;
 
 /// What was received and lost on one channel since the session began.
@@ -29,7 +29,7 @@ pub struct ChannelCounters {
     pub lost_queue: u64,
     /// Frames lost between device and host.
     pub lost_link: u64,
-    /// Frames that arrived and that a slow consumer lost.
+    /// Frames that arrived but that a slow consumer lost.
     pub lost_host: u64,
 }
 
@@ -52,7 +52,7 @@ pub struct Counters {
     pub channels: [ChannelCounters; CHANNELS],
     /// Bytes that came from the device.
     pub bytes: u64,
-    /// Messages thrown away because they were damaged. What was in them is counted as lost on the link.
+    /// Messages discarded because they were damaged. Their content is counted as lost on the link.
     pub corrupt: u64,
 }
 
@@ -85,7 +85,7 @@ impl Add for Counters {
 /// How a transmission ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Transmission {
-    /// Where.
+    /// The channel.
     pub channel: Channel,
     /// The request's tag.
     pub tag: u32,
@@ -97,23 +97,23 @@ pub struct Transmission {
     pub result: Result<Frame, TransmitFailure>,
 }
 
-/// What else the stream says, beside records.
+/// What the stream contains besides records.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[expect(clippy::large_enum_variant, reason = "handed on at once, a few in a second")]
 pub enum Notice {
     /// An answer.
     Response(Response),
-    /// The device speaks this other version.
+    /// The device speaks this other protocol version.
     OtherProtocol(u16),
-    /// Nothing more follows of this channel.
+    /// Nothing more follows from this channel.
     Stopped(Channel),
-    /// The stream has begun anew: the session is not ours any more.
+    /// The stream started over: the session is no longer ours.
     WentBack,
-    /// The device's times contradict one another: its stamps are not to be trusted.
+    /// The device's times contradict one another: its stamps cannot be trusted.
     TimesDisagree,
     /// The device has ended the session.
     Ended {
-        /// From when on nothing was captured, in UTC nanoseconds since the Unix epoch.
+        /// The time after which nothing was captured, in UTC nanoseconds since the Unix epoch.
         time_ns: i64,
         /// Why.
         reason: EndReason,
@@ -125,7 +125,7 @@ pub enum Notice {
 /// One device's stream.
 pub struct Intake {
     decoder: Decoder,
-    /// What was decoded and is not placed in time yet.
+    /// What was decoded but not yet placed in time.
     stamped: Vec<Stamped>,
     records: Vec<TraceRecord>,
     lengths: BitLengths,
@@ -136,9 +136,9 @@ pub struct Intake {
     counters: Counters,
     /// Device time of the latest record, in ticks.
     latest_ticks: u64,
-    /// By how much a time may be before one that stands in front of it, in ticks.
+    /// How far a time may be before that of the preceding record, in ticks.
     disorder_ticks: u64,
-    /// `Hello` was answered; what came before belongs to another program's session.
+    /// Whether `Hello` was answered; anything earlier belongs to another program's session.
     in_session: bool,
 }
 
@@ -161,7 +161,7 @@ impl Intake {
         }
     }
 
-    /// Takes at most [`PIECE_BYTES`] (more is fine, and slower), reports notices, and returns the records, to
+    /// Takes [`PIECE_BYTES`] or fewer (more works, but slower), reports notices, and returns the records, to
     /// be taken out of the vector.
     pub fn push(&mut self, bytes: &[u8], mut notice: impl FnMut(Notice)) -> &mut Vec<TraceRecord> {
         let Self {
@@ -203,15 +203,16 @@ impl Intake {
             Decoded::BatchesLost { frames, .. } => {
                 for (channel, count) in Channel::ALL.into_iter().zip(frames) {
                     counters.channels[channel.index()].lost_link += u64::from(count);
-                    // Its time is known when the next record is; zero stands for "not earlier than the last".
+                    // Its time is known once the next record is; zero means "not earlier than the last".
                     let at = Ticks(last_ticks.unwrap_or(0));
                     stamped.extend(lost(channel, at, LossStage::Link, count, false));
                 }
             }
             Decoded::Response(response) => {
-                // A later one was asked for by another program, or twice by us before the first was answered.
+                // A later answer was requested by another program, or by us a second time before the first
+                // arrived.
                 if let (Ok(Reply::Hello(answer)), false) = (&response.result, *in_session) {
-                    // What stands before belongs to a session that is over.
+                    // What comes before belongs to a session that is over.
                     *in_session = true;
                     stamped.clear();
                     records.clear();
@@ -223,7 +224,7 @@ impl Intake {
                     *last_ns = i64::MIN;
                     *clock = ClockMap::new(answer.tick_hz, utc.at(Instant::now()));
                 }
-                // Whatever stands in front of it had happened by then.
+                // Everything before it had already happened.
                 if let (Ok(Reply::Time(now)), true) = (&response.result, *in_session) {
                     let latest = last_ticks.unwrap_or(0).max(*latest_ticks);
                     disagree |= latest.saturating_sub(*now) > *disorder_ticks;
@@ -259,7 +260,7 @@ impl Intake {
         &mut self.records
     }
 
-    /// Counts the new frames as lost: nobody knows when they were.
+    /// Counts the new frames as lost, because their times are unknown.
     fn withhold(&mut self) {
         let at = Ticks(self.latest_ticks);
         let mut frames = [0; CHANNELS];
@@ -275,8 +276,9 @@ impl Intake {
         }
     }
 
-    /// Tightens the new records, maps them to UTC and puts them in order. A channel whose stamps were moved
-    /// back may now stand before the other's; nothing moves to before what was already handed over.
+    /// Tightens the new records, maps them to UTC and puts them in order. If the stamps of one channel were
+    /// moved back, it may now come before the other channel; nothing moves to before what was already handed
+    /// over.
     fn place_in_time(&mut self) {
         tighten(&mut self.stamped, &self.lengths);
         let mut sorted = true;
@@ -295,7 +297,7 @@ impl Intake {
         }
     }
 
-    /// Orders by time and keeps each channel's order: no record goes before one of its own channel.
+    /// Orders by time and keeps each channel's order: no record overtakes another of its own channel.
     fn sort(&mut self) {
         let mut latest = [i64::MIN; CHANNELS];
         for record in &mut self.records {
@@ -311,12 +313,12 @@ impl Intake {
         self.clock.add(ticks, self.utc.at(asked), self.utc.at(answered));
     }
 
-    /// The clock's map, to be read or settled.
+    /// The clock's map, for reading or settling.
     pub fn clock(&mut self) -> &mut ClockMap {
         &mut self.clock
     }
 
-    /// The bits' lengths, to be set when a channel opens.
+    /// The bit lengths, to be set when a channel opens.
     pub fn lengths(&mut self) -> &mut BitLengths {
         &mut self.lengths
     }
@@ -336,7 +338,7 @@ impl Intake {
         &self.counters
     }
 
-    /// Counts frames that the consumer lost.
+    /// Counts frames lost by the consumer.
     pub fn count_host_losses(&mut self, lost: [u32; CHANNELS]) {
         for (channel, lost) in self.counters.channels.iter_mut().zip(lost) {
             channel.lost_host += u64::from(lost);
@@ -390,7 +392,7 @@ fn on_event(
                 LossStage::Controller => counters.lost_controller += u64::from(count),
                 LossStage::Queue => counters.lost_queue += u64::from(count),
                 LossStage::Link => counters.lost_link += u64::from(count),
-                // A server of a shared board had them, and this client was too slow.
+                // A server of a shared board had them, but this client was too slow.
                 LossStage::Host => {
                     counters.received += u64::from(count);
                     counters.lost_host += u64::from(count);

@@ -5,9 +5,9 @@ use std::io::{self, Read, Write};
 
 /// Both directions of a byte stream, to be used from two threads.
 ///
-/// Reading must return within a fraction of a second: with bytes, or with a
-/// [`TimedOut`](io::ErrorKind::TimedOut) or [`WouldBlock`](io::ErrorKind::WouldBlock) error while there
-/// are none. No bytes (`Ok(0)`) or any other error means that the other end is gone.
+/// Reading must return within a fraction of a second: with bytes, or, while there are none, with a
+/// [`TimedOut`](io::ErrorKind::TimedOut) or [`WouldBlock`](io::ErrorKind::WouldBlock) error. No bytes
+/// (`Ok(0)`) or any other error means that the other end is gone.
 pub struct Link {
     /// From the device.
     pub reader: Box<dyn Read + Send>,
@@ -23,7 +23,7 @@ impl Link {
         Self { reader: Box::new(reader), writer: Box::new(writer), keep_alive: Box::new(()) }
     }
 
-    /// The same, and `keep` is dropped only after both halves.
+    /// The same, but `keep` is dropped only after both halves.
     #[must_use]
     pub fn keeping(mut self, keep: impl Any + Send) -> Self {
         self.keep_alive = Box::new(keep);
@@ -31,7 +31,7 @@ impl Link {
     }
 }
 
-/// Whether a read only found nothing yet.
+/// Whether a read merely found nothing yet.
 pub fn is_idle(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::TimedOut | io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted)
 }

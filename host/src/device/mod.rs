@@ -1,9 +1,8 @@
-//! A device: opening it, asking it, and the records it captures.
+//! A device: opening it, sending it requests, and the records it captures.
 //!
-//! [`Device::open`] connects to a serial port, [`Device::over`] to whatever makes a [`Link`]; [`Device::records`] hands out
-//! what is captured, the other methods are requests.
-//! A thread of its own reads the port, so that a slow program loses nothing as long as the buffer lasts, and
-//! is shown exactly what it lost after that.
+//! [`Device::open`] connects to a serial port, [`Device::over`] to anything that makes a [`Link`]; [`Device::records`]
+//! hands out what is captured, the other methods are requests. A separate thread reads the port, so a slow program loses
+//! nothing as long as the buffer lasts, and after that is shown exactly what it lost.
 
 mod buffer;
 mod clock;
@@ -55,17 +54,17 @@ use reader::{Answer, Order, Shared};
 
 /// Records that wait for a consumer: 32 MB, half a minute of two saturated channels.
 const BUFFER_RECORDS: usize = 1 << 20;
-/// A request is given up after this time.
+/// Time limit for a request.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(2);
 /// How often `Hello` is tried: a device may have half a line from another program in its input.
 const HELLO_TRIES: u32 = 3;
-/// So long for each try.
+/// Time limit for each try.
 const HELLO_TIMEOUT: Duration = Duration::from_millis(700);
-/// Round trips that set the clock at the start.
+/// Round trips that set the clock at the beginning.
 const CLOCK_ROUNDS: u32 = 8;
-/// A closing channel's last records are given up when none has come for this long.
+/// When closing a channel, its last records are given up if none has arrived for this long.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(1);
-/// Transmissions that a subscriber may leave waiting.
+/// How many transmissions may wait for a subscriber.
 const TRANSMISSIONS: usize = 65_536;
 
 /// A device in a session of ours.
@@ -77,7 +76,7 @@ pub struct Device {
     settings: Mutex<Settings>,
 }
 
-/// What the channels were given in this session, to be given to them again in the next.
+/// The channels' settings in this session, to be applied again in the next.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Settings {
     filters: [Option<Vec<Filter>>; CHANNELS],
@@ -91,12 +90,12 @@ impl Device {
         Self::over(serial::open(port)?, port)
     }
 
-    /// Talks to the device at the other end of a byte stream; `name` is what messages call it.
+    /// Talks to the device at the other end of a byte stream; messages call it `name`.
     pub fn over(link: Link, name: &str) -> Result<Self, DeviceError> {
         Self::over_holding(link, name, BUFFER_RECORDS)
     }
 
-    /// The same, and at most this many records wait to be taken; others are lost, and counted.
+    /// The same, with a limit on how many records may wait to be taken; others are lost and counted.
     pub fn over_holding(link: Link, name: &str, records: usize) -> Result<Self, DeviceError> {
         let Link { reader, writer, keep_alive } = link;
         let shared = Arc::new(Shared::new(name, writer, records));
@@ -109,7 +108,7 @@ impl Device {
                 drop(keep_alive);
             })
             .map_err(DeviceError::Thread)?;
-        // Its end stops the thread, whatever happens from here on.
+        // Dropping it stops the thread, whatever happens from here on.
         let settings = Mutex::default();
         let mut device = Self { shared, orders, hello: no_hello(), thread: Some(thread), settings };
         device.hello = device.shake_hands()?;
@@ -122,7 +121,7 @@ impl Device {
 
     fn shake_hands(&self) -> Result<Hello, DeviceError> {
         for _ in 0..HELLO_TRIES {
-            // The zero ends whatever stands in the device's input, and chooses our language over slcan.
+            // The zero byte ends anything left in the device's input and selects our protocol over slcan.
             self.shared.write(&[0])?;
             match self.request_within(Command::Hello { protocol: PROTOCOL_VERSION }, HELLO_TIMEOUT) {
                 Ok(Reply::Hello(hello)) => return Ok(hello),
@@ -134,12 +133,12 @@ impl Device {
         Err(DeviceError::NotCantap { address: self.shared.name.clone() })
     }
 
-    /// What the device is.
+    /// The device's description of itself.
     pub const fn hello(&self) -> &Hello {
         &self.hello
     }
 
-    /// Its address, as it was opened.
+    /// Its address, as given when it was opened.
     pub fn name(&self) -> &str {
         &self.shared.name
     }
@@ -149,8 +148,8 @@ impl Device {
         self.request_within(command, REQUEST_TIMEOUT)
     }
 
-    /// Sends any request without waiting for its answer, so that several can be under way: a device handles them
-    /// in order. A few at a time; their bytes wait in the device's input.
+    /// Sends any request without waiting for its answer, so that several can be in flight: a device handles them
+    /// in order. Use it for a few at a time; their bytes wait in the device's input.
     pub fn request_later(&self, command: Command) -> Result<Pending<'_>, DeviceError> {
         if let Some(gone) = self.shared.gone() {
             return Err(gone);
@@ -164,18 +163,18 @@ impl Device {
     }
 
     fn order(&self, order: Order) {
-        // If the thread has ended, there is nothing left to order.
+        // If the thread has ended, nobody needs the order.
         let _ = self.orders.send(order);
     }
 
-    /// The bit timing for a bit rate on this device: the recommended sample point.
+    /// The bit timing for a bit rate on this device, with the recommended sample point.
     pub fn timing(&self, bitrate_bps: u32) -> Result<BitTiming, DeviceError> {
         BitTiming::choose(self.hello.can_clock_hz, bitrate_bps, None)
             .map_err(|reason| DeviceError::BitRate { bitrate_bps, reason })
     }
 
-    /// Opens a channel; without a configuration, with the one saved on the device, whatever its mode: [`Self::defaults`]
-    /// tells it beforehand. Returns what was applied.
+    /// Opens a channel. Without a configuration, the one saved on the device applies, whatever its mode
+    /// ([`Self::defaults`] reads it beforehand). Returns what was applied.
     pub fn open_channel(
         &self,
         channel: Channel,
@@ -184,7 +183,7 @@ impl Device {
         if channel.number() > self.hello.channels {
             return Err(DeviceError::NoChannel { channel });
         }
-        // Before the first frame can arrive.
+        // This must be set before the first frame can arrive.
         if let Some(config) = &config {
             self.set_bit_length(channel, config);
         }
@@ -193,7 +192,7 @@ impl Device {
                 if config
                     .is_some_and(|asked| (asked.timing, asked.mode) != (applied.timing, applied.mode)) =>
             {
-                // It may acknowledge, or destroy frames at a wrong bit rate.
+                // Left open, it might acknowledge frames, or destroy them at a wrong bit rate.
                 self.done(Command::Close { channel })?;
                 let bitrate_bps = applied.timing.bitrate_bps(self.hello.can_clock_hz);
                 Err(DeviceError::OpenedOtherwise { channel, bitrate_bps, mode: applied.mode })
@@ -222,7 +221,7 @@ impl Device {
         self.open_channel(channel, Some(ChannelConfig::listen_only(timing)))
     }
 
-    /// Opens a channel that takes part in the bus, at a bit rate: it acknowledges, and may send.
+    /// Opens a channel that takes part in the bus, at a bit rate: it acknowledges frames and may send.
     pub fn join(&self, channel: Channel, bitrate_bps: u32) -> Result<ChannelConfig, DeviceError> {
         let timing = self.timing(bitrate_bps)?;
         let config = ChannelConfig { mode: Mode::Normal, ..ChannelConfig::listen_only(timing) };
@@ -233,7 +232,7 @@ impl Device {
         self.settings.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The channels that are open, and how they were opened.
+    /// The open channels, with their configurations.
     pub fn open_channels(&self) -> Vec<(Channel, ChannelConfig)> {
         let open = self.settings().open;
         Channel::ALL.into_iter().filter_map(|channel| Some((channel, open[channel.index()]?))).collect()
@@ -244,7 +243,7 @@ impl Device {
         let before = self.shared.published();
         let was_open = self.status()?.channels[channel.index()].open.is_some();
         self.done(Command::Close { channel })?;
-        // The record that says so is in the device's queue by now, so nothing of a later time is in front of it.
+        // The record that reports it is already in the device's queue, so nothing later comes before it.
         let closed_at = self.time()?;
         let mut seen = self.shared.published();
         let mut quiet = Instant::now();
@@ -258,7 +257,7 @@ impl Device {
             }
             seen = now;
             if seen.latest_ticks > closed_at || quiet.elapsed() > DRAIN_TIMEOUT {
-                // The record itself was lost on the way; the device's counters tell the rest.
+                // The record itself was lost on the way; the device's counters cover what else was.
                 break;
             }
         }
@@ -267,7 +266,8 @@ impl Device {
     }
 
     /// Closes both channels, waits for everything they captured, accounts for what the link lost at the very
-    /// end, and ends the stream of records, even if it fails. Returns the device's last status.
+    /// end, and ends the stream of records, even if one of these steps fails. Returns the device's last
+    /// status.
     pub fn stop(&self) -> Result<Status, DeviceError> {
         let status = self.close_and_account();
         self.order(Order::Finish);
@@ -286,7 +286,8 @@ impl Device {
         let counters = self.counters();
         for channel in Channel::ALL {
             let (device, ours) = (&status.channels[channel.index()], &counters.channels[channel.index()]);
-            // A lost batch may have held loss records, and after the last batch nothing tells what was in it.
+            // A lost batch may have contained loss records, and nothing after the last batch reports its
+            // content.
             let missing = |device: u32, ours: u64| device.wrapping_sub(ours as u32);
             let on_the_link =
                 missing(device.frames.wrapping_sub(device.lost_queue), ours.received + ours.lost_link);
@@ -303,7 +304,7 @@ impl Device {
         Ok(status)
     }
 
-    /// The records captured from now on. Two handles share the records between them.
+    /// The records captured from now on. If there are two handles, each record goes to one of them.
     pub fn records(&self) -> Records {
         Records { shared: Arc::clone(&self.shared), batch: Vec::new().into_iter() }
     }
@@ -315,13 +316,13 @@ impl Device {
         receiver
     }
 
-    /// What was received and lost so far.
+    /// What has been received and lost so far.
     pub fn counters(&self) -> Counters {
         self.shared.published().counters
     }
 
-    /// From when on nothing is known of its buses, in UTC nanoseconds since the Unix epoch, and how long ago that is: when
-    /// it ended the session, or was last heard of.
+    /// The time after which nothing is known of its buses, in UTC nanoseconds since the Unix epoch, and how long ago that
+    /// is: when it ended the session, or was last heard of.
     pub(crate) fn last_known(&self) -> (i64, Duration) {
         let now_ns = UtcClock::start().at(Instant::now()).0;
         let published = self.shared.published();
@@ -337,15 +338,15 @@ impl Device {
         self.shared.published().clock
     }
 
-    /// The map from the device's time to UTC as it is now, with the marks that it is made of. It goes on for as long as
-    /// crystals keep their rate: some seconds. Before the device's time is known, one that maps tick 0 to the epoch.
+    /// The current map from the device's time to UTC, with the marks that it is based on. It stays valid for as long as
+    /// crystals keep their rate: some seconds. Before the device's time is known, a map from tick 0 to the epoch.
     pub fn clock_map(&self) -> Arc<ClockMap> {
         self.shared.clock_map().unwrap_or_else(|| Arc::new(ClockMap::new(self.hello.tick_hz, UtcNs(0))))
     }
 }
 
 impl Drop for Device {
-    /// Leaves the bus. A device does that by itself when the port closes; telling it is quicker.
+    /// Leaves the bus. A device does that by itself when the port closes, but a request is quicker.
     fn drop(&mut self) {
         if !self.shared.buffer.has_ended() && self.shared.gone().is_none() && self.hello.channels > 0 {
             for channel in Channel::ALL {
@@ -354,13 +355,13 @@ impl Drop for Device {
         }
         self.shared.quit.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
-            // Joined so that the port is closed when the next one opens it.
+            // Joined so that the port is closed before anyone opens it again.
             let _ = thread.join();
         }
     }
 }
 
-/// Stands in while there is no answer yet.
+/// A placeholder until there is an answer.
 fn no_hello() -> Hello {
     Hello {
         protocol: PROTOCOL_VERSION,
@@ -414,7 +415,7 @@ impl Drop for Pending<'_> {
     }
 }
 
-/// Captured records, in order. As an iterator it waits for the next one and ends after [`Device::stop`], or
+/// Captured records, in order. As an iterator, it waits for the next one and ends after [`Device::stop`], or
 /// with an error when the device vanished, in both cases after everything received.
 pub struct Records {
     shared: Arc<Shared>,
@@ -422,13 +423,13 @@ pub struct Records {
 }
 
 impl Records {
-    /// The next records, in one piece: none if there are none within `timeout`, `None` after the last.
+    /// The next records in one piece; empty if there are none within `timeout`, `None` after the last.
     pub fn next_batch(&mut self, timeout: Duration) -> Result<Option<Vec<TraceRecord>>, DeviceError> {
         let rest: Vec<TraceRecord> = std::mem::take(&mut self.batch).collect();
         if rest.is_empty() { self.shared.buffer.pop(Some(timeout)) } else { Ok(Some(rest)) }
     }
 
-    /// Takes back the memory of a batch. Not necessary, only quicker.
+    /// Takes back the memory of a batch. Optional, but faster.
     pub fn recycle(&self, batch: Vec<TraceRecord>) {
         self.shared.buffer.recycle(batch);
     }

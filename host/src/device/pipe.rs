@@ -1,11 +1,11 @@
-//! A byte pipe inside the process: what a serial port is to a real device, for a virtual one and for tests.
+//! A byte pipe within the process: the equivalent of a serial port for virtual devices and tests.
 
 use std::collections::VecDeque;
 use std::io::{self, Read, Write};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-/// A read of an empty pipe returns after this time, a write to a full one too.
+/// A read from an empty pipe returns after this time, and so does a write to a full one.
 const WAIT: Duration = Duration::from_millis(50);
 
 struct State {
@@ -22,7 +22,7 @@ struct Shared {
 
 impl Shared {
     fn lock(&self) -> MutexGuard<'_, State> {
-        // Every holder leaves the state whole.
+        // Every holder of the lock leaves the state consistent.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -77,7 +77,7 @@ impl PipeWriter {
         state.capacity - state.bytes.len()
     }
 
-    /// Waits until `len` bytes fit, at most `timeout`. Returns whether they do, or nobody reads any more.
+    /// Waits until `len` bytes fit, at most `timeout`. Returns true if they do, or if nobody reads any more.
     pub fn wait_for_room(&self, len: usize, timeout: Duration) -> bool {
         let full = |state: &mut State| state.capacity - state.bytes.len() < len && !state.reader_gone;
         let waited = self.0.changed.wait_timeout_while(self.0.lock(), timeout, full);

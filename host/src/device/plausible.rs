@@ -1,14 +1,15 @@
-//! What a device says of itself and cannot be. Times, loads and bit rates are made of it, so none of them could be right.
+//! Rejects impossible statements of a device about itself. Times, loads and bit rates are computed from them, so none of
+//! those could be right.
 
 use cantap_wire::message::ChannelConfig;
 use cantap_wire::{Hello, Reply};
 
 use super::DeviceError;
 
-/// No clock of a device is slower: a tick is a microsecond at most, and so is the shortest bit.
+/// No device has a slower clock: a tick is a microsecond at most, and so is the shortest bit.
 const LEAST_CLOCK_HZ: u32 = 1_000_000;
 
-/// The answer, if it can be.
+/// Returns the answer if it is possible.
 pub(super) fn believe(reply: Reply) -> Result<Reply, DeviceError> {
     let is_wrong = |config: &ChannelConfig| !config.timing.is_valid();
     let what = match &reply {

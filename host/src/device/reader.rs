@@ -21,23 +21,24 @@ use super::link::is_idle;
 use super::watch::{Next, SilenceWatch};
 use super::{DeviceError, SessionOver};
 
-/// Read at a time; an operating system's serial buffer is smaller.
+/// Bytes read at a time; an operating system's serial buffer is smaller.
 const READ_BYTES: usize = 64 * 1024;
-/// A device makes the host wait while it has no room; one that takes nothing for this long is stuck.
+/// A device makes the host wait while it has no room; one that accepts nothing for this long is stuck.
 const WRITE_PATIENCE: Duration = Duration::from_secs(2);
 
-/// What a request's answer can be.
+/// The possible answers to a request.
 #[expect(clippy::large_enum_variant, reason = "one for each request, taken at once")]
 pub(super) enum Answer {
     Response(Response),
     OtherProtocol(u16),
 }
 
-/// What the reader is asked for from outside.
+/// Orders to the reader from outside.
 pub(super) enum Order {
-    /// A channel's bits are this long from now on: clocks of the controller per bit, its clock, tick rate.
+    /// From now on, a channel's bits have this length: clocks of the controller per bit, its clock, tick
+    /// rate.
     BitLength { channel: Channel, clocks_per_bit: u32, clock_hz: u32, tick_hz: u32 },
-    /// The samples of the clock so far are the first; start from the best.
+    /// The first clock samples are complete; start from the best.
     SettleClock,
     /// Losses that only the device's counters show.
     Losses { channel: Channel, stage: LossStage, count: u32 },
@@ -50,7 +51,7 @@ pub(super) enum Order {
 pub(super) struct Published {
     pub counters: Counters,
     pub clock: ClockReport,
-    /// Times each channel stopped.
+    /// How often each channel has stopped.
     pub stopped: [u32; CHANNELS],
     /// Device time of the latest record, in ticks.
     pub latest_ticks: u64,
@@ -67,16 +68,16 @@ pub(super) struct Shared {
     pub buffer: Buffer,
     pub quit: AtomicBool,
     published: Mutex<Published>,
-    /// After the last round trip.
+    /// As of the last round trip.
     clock_map: Mutex<Option<Arc<ClockMap>>>,
     changed: Condvar,
     pending: Mutex<Pending>,
 }
 
-/// Towards the device.
+/// The direction towards the device.
 struct Output {
     port: Box<dyn Write + Send>,
-    /// The last message was cut short: what follows must not be read as its end.
+    /// The last message was cut short: the next one must not be read as its end.
     is_cut: bool,
 }
 
@@ -92,7 +93,7 @@ impl Output {
     }
 }
 
-/// Writes all, waiting as long as the other end makes us wait, at most for `patience` without taking anything.
+/// Writes everything, waiting as long as the other end accepts something at least every `patience`.
 pub fn write_patiently(
     port: &mut (impl Write + ?Sized),
     mut bytes: &[u8],
@@ -115,11 +116,11 @@ pub fn write_patiently(
 
 #[derive(Default)]
 struct Pending {
-    /// The first number that was ours.
+    /// Our first request number.
     first_id: u16,
     next_id: u16,
     waiting: HashMap<u16, SyncSender<Answer>>,
-    /// Questions for the device's time that are under way.
+    /// A request for the device's time that is in flight.
     clock: Option<(u16, Instant)>,
     subscriber: Option<SyncSender<Transmission>>,
     gone: Option<Gone>,
@@ -132,20 +133,20 @@ impl Pending {
         id
     }
 
-    /// Whether we asked something with this number. (After 65,536 questions, every number was ours.)
+    /// Whether one of our requests had this number. (After 65,536 requests, every number was ours.)
     fn is_ours(&self, id: u16) -> bool {
         id.wrapping_sub(self.first_id) < self.next_id.wrapping_sub(self.first_id)
     }
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Every holder leaves the state whole, even if it panicked elsewhere.
+    // Every holder leaves the state consistent, even if it panicked elsewhere.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Shared {
     pub fn new(name: &str, writer: Box<dyn Write + Send>, capacity: usize) -> Self {
-        // Answers to a host before us must not be taken for ours: begin at an arbitrary number.
+        // Answers to an earlier host must not be mistaken for ours, so begin at an arbitrary number.
         let start = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
         let next_id = start.map_or(1, |since| (since.as_micros() >> 4) as u16);
         Self {
@@ -177,12 +178,12 @@ impl Shared {
         *waited.unwrap_or_else(PoisonError::into_inner).0
     }
 
-    /// Where transmissions are reported.
+    /// Sets where transmissions are reported.
     pub fn subscribe(&self, subscriber: SyncSender<Transmission>) {
         lock(&self.pending).subscriber = Some(subscriber);
     }
 
-    /// Why the connection is of no use any more, if so.
+    /// Why the connection is no longer usable, if it is not.
     pub fn gone(&self) -> Option<DeviceError> {
         lock(&self.pending).gone.as_ref().map(|gone| gone.error(&self.name))
     }
@@ -208,7 +209,7 @@ impl Shared {
         Ok((id, receiver))
     }
 
-    /// Gives up on an answer.
+    /// Stops waiting for an answer.
     pub fn forget(&self, id: u16) {
         lock(&self.pending).waiting.remove(&id);
     }
@@ -227,7 +228,7 @@ impl Shared {
         })
     }
 
-    /// The reader's own question for the time; nothing waits for it, and it waits for nothing.
+    /// The reader's own request for the time; nothing waits for it, and it waits for nothing.
     fn ask_time(&self) {
         let Ok(mut output) = self.output.try_lock() else { return };
         let mut pending = lock(&self.pending);
@@ -235,13 +236,13 @@ impl Shared {
         pending.clock = Some((id, Instant::now()));
         drop(pending);
         if let Ok(bytes) = encode(&Request { id, command: Command::Time }) {
-            // If it fails, reading fails too and says why, or nothing is answered, which is noticed.
+            // If it fails, reading fails too and says why, or the missing answer is noticed.
             let _ = output.write(&bytes, Duration::ZERO);
         }
     }
 }
 
-/// A request as it goes over the wire.
+/// Encodes a request as it goes over the wire.
 pub fn encode(request: &Request) -> Result<Vec<u8>, DeviceError> {
     let mut message = [0; MAX_REQUEST + CRC_LEN];
     let mut out = vec![0; max_encoded_len(MAX_REQUEST)];
@@ -330,14 +331,14 @@ pub(super) fn run(mut port: Box<dyn Read + Send>, shared: &Arc<Shared>, orders: 
     shared.buffer.fail(gone.error(&shared.name));
     let mut pending = lock(&shared.pending);
     pending.gone = Some(gone);
-    // Whoever waits for an answer learns that none will come.
+    // Everyone waiting for an answer learns that none will come.
     pending.waiting.clear();
     pending.subscriber = None;
     drop(pending);
     shared.changed.notify_all();
 }
 
-/// What was in one read, beside records.
+/// The content of one read, besides records.
 #[derive(Default)]
 struct Heard {
     answered: bool,
@@ -353,7 +354,7 @@ fn ends_session(shared: &Shared, response: &Response) -> Option<SessionOver> {
     }
 }
 
-/// Does what was ordered. Returns whether to finish.
+/// Carries out orders. Returns whether to finish.
 fn follow(orders: &Receiver<Order>, intake: &mut Intake, shared: &Shared) -> bool {
     while let Ok(order) = orders.try_recv() {
         match order {
@@ -373,7 +374,8 @@ fn follow(orders: &Receiver<Order>, intake: &mut Intake, shared: &Shared) -> boo
     false
 }
 
-/// Passes an answer to the caller that asked. Returns the device's time and when it was asked for, if it was.
+/// Passes an answer to the caller that asked. If it is the device's time, returns that and when it was asked
+/// for.
 fn answer(shared: &Shared, response: Response) -> Option<(Ticks, Instant)> {
     let mut pending = lock(&shared.pending);
     let time = match (&response.result, pending.clock) {
@@ -381,13 +383,13 @@ fn answer(shared: &Shared, response: Response) -> Option<(Ticks, Instant)> {
         _ => None,
     };
     if let Some(waiting) = pending.waiting.remove(&response.id) {
-        // The channel has room for one; if nobody waits any more, that is fine.
+        // The channel has room for one; it does not matter if nobody waits any more.
         let _ = waiting.try_send(Answer::Response(response));
     }
     time
 }
 
-/// Tells everybody who waits that the device speaks another version.
+/// Tells everyone waiting that the device speaks another version.
 fn refuse(shared: &Shared, version: u16) {
     for (_, waiting) in lock(&shared.pending).waiting.drain() {
         let _ = waiting.try_send(Answer::OtherProtocol(version));

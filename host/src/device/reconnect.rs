@@ -1,7 +1,8 @@
-//! A device that may go and come back: unplugged, silent, its session taken or ended by a computer that slept.
+//! A device that may go and come back: unplugged, silent, its session taken over by another program or ended
+//! because the computer slept.
 //!
-//! What it captures goes on by itself when it is there again, on channels opened as they were, with the gap in the trace.
-//! What it sent does not: only who asked for that knows whether it is still wanted.
+//! When it is there again, capturing continues automatically, on channels opened as before, with the gap in the trace.
+//! Sending does not: only whoever asked for it knows whether it is still wanted.
 
 use std::borrow::Borrow;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -15,18 +16,18 @@ use cantap_wire::{Channel, Hello};
 use super::{ClockReport, Counters, Device, DeviceError, Records, Settings};
 use crate::{TraceEvent, TraceRecord};
 
-/// How long after a failure it is tried again.
+/// Time from a failure to the next try.
 const RETRY_AFTER: Duration = Duration::from_millis(500);
 
-/// What came next. `E` is the caller's error.
+/// What happened next. `E` is the caller's error.
 #[derive(Debug)]
 pub enum Happening<E> {
-    /// Records, or none within the time.
+    /// Records; an empty vector if none arrived in time.
     Records(Vec<TraceRecord>),
-    /// The device is gone, or still not there for another reason than before. Where it was lost, the records before this
+    /// The device is gone, or still absent for a different reason than before. When it was lost, the records before this
     /// end with a loss of an unknown number of frames on each open channel.
     Gone(E),
-    /// It is there, and its channels are open. The first time, nothing was gone before.
+    /// It is there, and its channels are open. The first time, no absence preceded it.
     Back(Return),
     /// Everything captured before [`Reconnecting::stop`] has been handed out.
     Ended,
@@ -37,15 +38,15 @@ pub enum Happening<E> {
 pub struct Return {
     /// How long it was away; `None` the first time.
     pub after: Option<Duration>,
-    /// What it is, if it is another board than before.
+    /// Its name, if it is a different board from before.
     pub other_board: Option<String>,
-    /// Channels that took part in their bus and only listen now: another board's buses may be others.
+    /// Channels that took part in their bus and now only listen: another board may be on other buses.
     pub only_listening: Vec<Channel>,
 }
 
-/// Connects to the device: the one with this serial number, if it is known and can be found by it.
+/// Connects to the device: the one with this serial number, if it is known and the device can be found by it.
 type Connect<D, E> = Box<dyn FnMut(Option<&str>) -> Result<D, E> + Send>;
-/// Opens channels on a device that was not there before.
+/// Opens channels on a device the first time.
 type Setup<D, E> = Box<dyn FnMut(&D) -> Result<(), E> + Send>;
 
 /// Brings a device here and sets it up.
@@ -54,7 +55,7 @@ struct Hands<D, E> {
     setup: Setup<D, E>,
 }
 
-/// A device that is there, with its channels open.
+/// A connected device with its channels open.
 struct Opened<D> {
     handle: D,
     records: Records,
@@ -62,8 +63,8 @@ struct Opened<D> {
     back: Return,
 }
 
-/// The device being tried, in a thread of its own: a port that does not answer takes seconds, and whoever waits for
-/// records does not.
+/// The current attempt to open the device, in a separate thread: a port that does not answer takes seconds, and
+/// whoever waits for records should not have to.
 struct Attempt<D, E> {
     result: Receiver<Result<Opened<D>, E>>,
     is_wanted: Arc<AtomicBool>,
@@ -75,43 +76,43 @@ impl<D, E> Drop for Attempt<D, E> {
     }
 }
 
-/// A device that is opened again whenever it is there. `D` is the handle that connecting makes: a [`Device`], or what a program
-/// wraps around one.
+/// A device that is opened again whenever it is there. `D` is the handle that connecting makes: a [`Device`], or a program's
+/// wrapper around one.
 pub struct Reconnecting<D, E> {
-    /// What messages call it.
+    /// Its name in messages.
     name: String,
     hands: Arc<Mutex<Hands<D, E>>>,
     attempt: Option<Attempt<D, E>>,
     session: Option<(D, Records)>,
     known: Option<Known>,
-    /// Counted in sessions that are over.
+    /// Counted in earlier sessions.
     before: Counters,
     clock: ClockReport,
-    /// When it was noticed that the device is gone, and how long it had been then.
+    /// When it was noticed that the device is gone, and how long it had been gone then.
     gone: Option<(Instant, Duration)>,
-    /// What was last reported, so that nothing is reported twice.
+    /// The last report, so that nothing is reported twice.
     told: Option<String>,
     retry_at: Instant,
     /// Time of the last record handed out.
     latest_ns: i64,
     next: Option<Happening<E>>,
     gaps: Gaps,
-    /// The capture is over: what is gone now is not waited for.
+    /// The capture is over: a device that goes now is not waited for.
     stopped: bool,
-    /// Why it did not end well: how much is missing at its end is not known.
+    /// Why it did not end properly: how much is missing at its end is unknown.
     unaccounted: Option<DeviceError>,
 }
 
-/// Times in which a device was not there.
+/// How often and how long a device was absent.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Gaps {
-    /// How many.
+    /// How often.
     pub count: u32,
-    /// All together.
+    /// In total.
     pub time: Duration,
 }
 
-/// The board of the last session, and what it was to do.
+/// The board of the last session, and its settings.
 #[derive(Clone)]
 struct Known {
     board: String,
@@ -135,8 +136,8 @@ where
     D: Borrow<Device> + Send + 'static,
     E: From<DeviceError> + std::fmt::Display + Send + 'static,
 {
-    /// A device that need not be there yet; messages call it `name`. `connect` is given the serial number of the board that was
-    /// there, if one was: `port_of` tells where it is now. `setup` opens its channels the first time; later they are opened as
+    /// A device that need not be there yet; messages call it `name`. `connect` gets the serial number of the board that was
+    /// there, if any: `port_of` finds its current port. `setup` opens its channels the first time; later they are opened as
     /// they were.
     pub fn new(
         name: &str,
@@ -169,7 +170,7 @@ where
         Ok(())
     }
 
-    /// How long it has been away by now; `None` while it is there.
+    /// How long it has been away; `None` while it is there.
     pub fn away_for(&self) -> Option<Duration> {
         self.gone.map(|(noticed_at, ago)| ago + noticed_at.elapsed())
     }
@@ -179,7 +180,7 @@ where
         self.session.as_ref().map(|(handle, _)| handle.borrow())
     }
 
-    /// What comes next, waited for at most `timeout`.
+    /// Waits for the next happening, at most `timeout`.
     pub fn next(&mut self, timeout: Duration) -> Happening<E> {
         if let Some(next) = self.next.take() {
             return next;
@@ -200,15 +201,15 @@ where
         }
     }
 
-    /// Takes back the memory of a batch. Not necessary, only quicker.
+    /// Takes back the memory of a batch. Optional, but faster.
     pub fn recycle(&self, batch: Vec<TraceRecord>) {
         if let Some((_, records)) = &self.session {
             records.recycle(batch);
         }
     }
 
-    /// Ends the capture. What is left comes from [`Self::next`], up to [`Happening::Ended`]. An error if the device is not
-    /// there, or is lost on the way; then what follows ends as well.
+    /// Ends the capture. The rest comes from [`Self::next`], up to [`Happening::Ended`]. Returns an error if the device is
+    /// not there or is lost while stopping; the rest then ends as well.
     pub fn stop(&mut self) -> Result<(), E> {
         self.stopped = true;
         self.attempt = None;
@@ -222,17 +223,17 @@ where
         Err(said.into())
     }
 
-    /// What was received and lost, in all sessions.
+    /// What was received and lost in all sessions.
     pub fn counters(&self) -> Counters {
         self.device().map_or(self.before, |device| self.before + device.counters())
     }
 
-    /// What is known of the clock of the device.
+    /// What is known of the device's clock.
     pub fn clock(&self) -> ClockReport {
         self.device().map_or(self.clock, Device::clock)
     }
 
-    /// When it was not there, one that has not ended among them.
+    /// The device's absences, including the current one.
     pub fn gaps(&self) -> Gaps {
         let open = self.away_for();
         Gaps {
@@ -242,14 +243,14 @@ where
     }
 
     fn keep_in_order(&mut self, records: &mut [TraceRecord]) {
-        // Within a session they are in order; each session has its own idea of what time it is.
+        // Within a session they are in order, but each session has its own estimate of UTC.
         for record in records.iter_mut().take_while(|record| record.time_ns < self.latest_ns) {
             record.time_ns = self.latest_ns;
         }
         self.latest_ns = records.last().map_or(self.latest_ns, |last| last.time_ns);
     }
 
-    /// The device has gone: its last word is the gap.
+    /// The device has gone: the gap is the last record it leaves.
     fn lose(&mut self, error: DeviceError) -> Happening<E> {
         let Some((handle, _)) = self.session.take() else { return Happening::Gone(error.into()) };
         let device: &Device = handle.borrow();
@@ -292,7 +293,7 @@ where
                 self.attempt = Some(attempt);
                 nothing()
             }
-            // It panicked, and has said so.
+            // The thread panicked and has reported it.
             Err(RecvTimeoutError::Disconnected) => {
                 self.retry_at = Instant::now() + RETRY_AFTER;
                 nothing()
@@ -312,7 +313,7 @@ where
         Ok(Attempt { result, is_wanted })
     }
 
-    /// It is not there yet.
+    /// The device could not be opened.
     fn failed(&mut self, error: E) -> Happening<E> {
         self.retry_at = Instant::now() + RETRY_AFTER;
         let reason = error.to_string();
@@ -323,7 +324,7 @@ where
         Happening::Gone(error)
     }
 
-    /// It is there.
+    /// The device was opened.
     fn welcome(&mut self, opened: Opened<D>) -> Return {
         let Opened { handle, records, known, mut back } = opened;
         self.known = Some(known);
@@ -339,7 +340,7 @@ where
     }
 }
 
-/// Opens a device, wherever it is now, and its channels: as before, if it is known.
+/// Opens a device at its current port, and its channels: as before, if it is known.
 fn open<D: Borrow<Device>, E: From<DeviceError>>(
     hands: &Mutex<Hands<D, E>>,
     name: &str,
@@ -379,7 +380,8 @@ fn open<D: Borrow<Device>, E: From<DeviceError>>(
 }
 
 impl Settings {
-    /// Takes every channel that took part in its bus out of it; says which.
+    /// Takes every channel that took part in its bus off it and opens it to listen only; returns those
+    /// channels.
     fn only_listen(&mut self) -> Vec<Channel> {
         let mut changed = Vec::new();
         for channel in Channel::ALL {
@@ -395,9 +397,9 @@ impl Settings {
 }
 
 impl Device {
-    /// Gives the channels filters and configurations as they were in another session.
+    /// Gives the channels the filters and configurations of another session.
     fn restore(&self, settings: &Settings) -> Result<(), DeviceError> {
-        // Filters of a channel can be changed only while both are closed.
+        // A channel's filters can be changed only while both channels are closed.
         for (channel, filters) in Channel::ALL.into_iter().zip(&settings.filters) {
             if let Some(filters) = filters {
                 self.set_filters(channel, filters)?;

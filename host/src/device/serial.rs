@@ -7,7 +7,7 @@ use serialport::{ErrorKind, SerialPortType};
 
 use super::{DeviceError, Link};
 
-/// A read returns at the latest after this time.
+/// A read returns after this time at the latest.
 const READ_TIMEOUT: Duration = Duration::from_millis(50);
 /// CDC-ACM has no line speed; the number only has to be valid.
 const NOMINAL_BAUD: u32 = 115_200;
@@ -19,11 +19,11 @@ pub struct Board {
     pub port: String,
     /// The board's serial number, if the system knows it.
     pub serial_number: Option<String>,
-    /// What the board calls itself, if the system knows it.
+    /// The board's product name, if the system knows it.
     pub product: Option<String>,
 }
 
-/// Finds connected boards by their USB IDs. Where the system knows no IDs, it finds none.
+/// Finds connected boards by their USB IDs. On a system that does not report IDs, it finds none.
 pub fn list() -> Result<Vec<Board>, DeviceError> {
     let ports = serialport::available_ports()
         .map_err(|error| DeviceError::Open { address: "serial ports".to_owned(), source: error.into() })?;
@@ -38,14 +38,14 @@ pub fn list() -> Result<Vec<Board>, DeviceError> {
         .collect())
 }
 
-/// The port at which the board with a serial number is now, if the system knows it.
+/// The current port of the board with a serial number, if the system knows it.
 pub fn port_of(serial_number: &str) -> Option<String> {
     let board =
         list().ok()?.into_iter().find(|board| board.serial_number.as_deref() == Some(serial_number))?;
     Some(board.port)
 }
 
-/// Opens a port for this program alone, in raw mode, and raises DTR.
+/// Opens a port exclusively, in raw mode, and raises DTR.
 pub fn open(port: &str) -> Result<Link, DeviceError> {
     let open = serialport::new(port, NOMINAL_BAUD).timeout(READ_TIMEOUT).dtr_on_open(true).open();
     let reader = open.map_err(|error| translate(port, error))?;

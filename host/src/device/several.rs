@@ -1,11 +1,12 @@
-//! Several devices as one: their records in one order of time, on channels that are numbered on.
+//! Several devices as one: their records in a single time order, on channels numbered consecutively.
 //!
-//! Channel `c` of device `k`, both from 0, is channel `2k + c`, numbered from 1 as everywhere. The first device's clock is
-//! everybody's: the others' records are put on it by the USB frames that all of them have marked
-//! ([`Follower`](super::clock::Follower)), and by each one's own UTC where they are not on one USB host controller.
+//! Channel `c` of device `k`, both from 0, is channel `2k + c`, numbered from 1 in records and words as everywhere. The
+//! first device's clock is the common one: the other devices' records are put on it by the USB frames that all of them
+//! have marked ([`Follower`](super::clock::Follower)), or by each device's own UTC if they are not on one USB host
+//! controller.
 //!
-//! A record is handed out when none can come before it: each other device has sent a later one, is gone, or has had nothing to
-//! send for [`PATIENCE`] since. What comes even later keeps its true time.
+//! A record is handed out once none can come before it: each other device has sent a later one, is gone, or has sent nothing
+//! for [`PATIENCE`] since. Anything that comes even later keeps its true time.
 
 use std::borrow::Borrow;
 use std::collections::VecDeque;
@@ -17,21 +18,21 @@ use super::clock::{Follower, FollowerReport};
 use super::{Device, DeviceError, Happening, Reconnecting};
 use crate::TraceRecord;
 
-/// So long a record waits for those of a device that is silent. On the way to the host they take some milliseconds, and
-/// a computer's thread that is held up takes some tens.
+/// How long a record waits for those of a silent device. On the way to the host they take some milliseconds; a delayed
+/// thread of the computer adds some tens.
 const PATIENCE: Duration = Duration::from_millis(100);
 /// How long to sleep while nothing comes.
 const NAP: Duration = Duration::from_millis(2);
 
-/// The number in records and words, from 1, of a channel of one of several devices, which are counted from 0.
+/// The number (from 1, as in records and words) of a channel of one of several devices (counted from 0).
 pub const fn channel_number(device: usize, channel: Channel) -> u8 {
     (device * CHANNELS) as u8 + channel.number()
 }
 
-/// Several devices that may each go and come back. With one, it is that device and nothing else.
+/// Several devices that may each go and come back. A single one behaves as if it were alone.
 pub struct Several<D, E> {
     members: Vec<Member<D, E>>,
-    /// Who is asked first, so that nobody's news waits behind another's.
+    /// Which device is asked first, so that none has to wait behind the others.
     turn: usize,
 }
 
@@ -40,13 +41,13 @@ struct Member<D, E> {
     number: usize,
     follower: Follower,
     waiting: VecDeque<TraceRecord>,
-    /// When batches came, each with its last record's time.
+    /// When batches arrived, each with the time of its last record.
     arrivals: VecDeque<(Instant, i64)>,
-    /// No record before this time follows, in this session.
+    /// No record before this time will follow in this session.
     horizon_ns: i64,
-    /// There was nothing to hand out when it was last asked.
+    /// It had nothing to hand out when it was last asked.
     is_silent: bool,
-    /// It is there, and has more to send.
+    /// It is there and has more to send.
     goes_on: bool,
     ended: bool,
 }
@@ -56,7 +57,7 @@ where
     D: Borrow<Device> + Send + 'static,
     E: From<DeviceError> + std::fmt::Display + Send + 'static,
 {
-    /// These devices, the first of which has the clock.
+    /// Combines devices, the first of which has the clock.
     pub fn new(lines: Vec<Reconnecting<D, E>>) -> Self {
         let member = |(number, line)| Member {
             line,
@@ -72,7 +73,7 @@ where
         Self { members: lines.into_iter().enumerate().map(member).collect(), turn: 0 }
     }
 
-    /// Connects now, to devices that must all be there.
+    /// Connects now; all devices must be there.
     pub fn connect(&mut self) -> Result<(), E> {
         self.members.iter_mut().try_for_each(|member| member.line.connect())
     }
@@ -82,18 +83,18 @@ where
         self.members.iter().map(|member| &member.line)
     }
 
-    /// The devices that are there, each with its place.
+    /// The devices that are there, each with its index.
     pub fn devices(&self) -> impl Iterator<Item = (usize, &Device)> {
         self.lines().enumerate().filter_map(|(number, line)| Some((number, line.device()?)))
     }
 
-    /// How well each device but the first is on the first one's clock.
+    /// How well the times of each device but the first match the first one's clock.
     pub fn clocks(&self) -> impl Iterator<Item = FollowerReport> {
         self.members.iter().skip(1).map(|member| member.follower.report())
     }
 
-    /// What comes next, and from which device, counted from 0, unless it is records, which are of all of them; waited for at most
-    /// `timeout`. [`Happening::Ended`] comes once, when all have ended.
+    /// Waits for the next happening, at most `timeout`, and returns it with the index of its device (from 0); records are of all
+    /// devices. [`Happening::Ended`] comes once, when all have ended.
     pub fn next(&mut self, timeout: Duration) -> (usize, Happening<E>) {
         if let [only] = self.members.as_mut_slice() {
             return (0, only.line.next(timeout));
@@ -124,19 +125,20 @@ where
         }
     }
 
-    /// Takes back the memory of a batch, where it can be used again.
+    /// Takes back the memory of a batch if it can be used again.
     pub fn recycle(&self, batch: Vec<TraceRecord>) {
         if let [only] = self.members.as_slice() {
             only.line.recycle(batch);
         }
     }
 
-    /// Ends the capture on every device, as [`Reconnecting::stop`]. The errors of those that did not have their last word.
+    /// Ends the capture on every device, like [`Reconnecting::stop`]. Returns the errors of those that did not end
+    /// properly.
     pub fn stop(&mut self) -> Vec<E> {
         self.members.iter_mut().filter_map(|member| member.line.stop().err()).collect()
     }
 
-    /// Takes what a device has. Returns what happened to it, if anything did.
+    /// Takes what a device has. Returns what happened to it, if anything.
     fn ask(&mut self, number: usize) -> Option<Happening<E>> {
         let first = match &self.members[0].line.device() {
             Some(device) if number > 0 => Some(device.clock_map()),
@@ -173,14 +175,14 @@ where
         }
     }
 
-    /// Records that nothing can come before any more, in order.
+    /// Takes the records that nothing can precede any more, in order.
     fn take_ready(&mut self, now: Instant) -> Vec<TraceRecord> {
         let live = || self.members.iter().filter(|member| member.goes_on);
         let horizon = |members: &mut dyn Iterator<Item = &Member<D, E>>| {
             members.map(|member| member.horizon_ns).min().unwrap_or(i64::MAX)
         };
         let safe_ns = horizon(&mut live());
-        // Whoever has more to hand out is waited for, however long that takes.
+        // A device with more to hand out is waited for, however long that takes.
         let busy_ns = horizon(&mut live().filter(|member| !member.is_silent));
         let ripe_ns = self.members.iter_mut().filter_map(|member| member.ripe_ns(now)).max();
         let limit_ns = ripe_ns.map_or(safe_ns, |ripe_ns| safe_ns.max(ripe_ns.min(busy_ns)));
@@ -206,7 +208,7 @@ impl<D, E> Member<D, E> {
                 record.time_ns = self.follower.place(record.time_ns);
                 record.channel += (self.number * CHANNELS) as u8;
             }
-            // The gap at the end of a session comes from another clock than the records before it.
+            // The gap at the end of a session is timed by another clock than the records before it.
             record.time_ns = record.time_ns.max(self.horizon_ns);
             self.horizon_ns = record.time_ns;
             self.waiting.push_back(record);

@@ -1,8 +1,8 @@
 //! Tightens late stamps.
 //!
 //! A device's stamp is never early, only late: by the interrupt's latency, or, for a frame found queued
-//! behind another, by up to a whole frame and flagged. But two frames never overlap: frame k ended no later
-//! than frame k+1 on the same channel minus that one's exact length.
+//! behind another, by up to a whole frame, in which case it is flagged. But two frames never overlap: frame k
+//! ended no later than the end of frame k+1 on the same channel minus the exact length of frame k+1.
 
 use cantap_wire::CHANNELS;
 
@@ -12,9 +12,9 @@ use crate::TraceEvent;
 /// A record as it came from the device, by the device's own clock.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Stamped {
-    /// When.
+    /// The time.
     pub at: Ticks,
-    /// Where: 1 or 2.
+    /// The channel: 1 or 2.
     pub channel: u8,
     /// What happened.
     pub event: TraceEvent,
@@ -48,7 +48,8 @@ impl BitLengths {
     }
 }
 
-/// Tightens records in stream order. What stands behind a loss bounds what stands before it all the more.
+/// Tightens records in stream order. A record after a loss still bounds the one before it, since even more
+/// lay between them.
 pub fn tighten(records: &mut [Stamped], lengths: &BitLengths) {
     let mut limits = [None; CHANNELS];
     for record in records.iter_mut().rev() {
@@ -88,7 +89,7 @@ mod tests {
         ];
         tighten(&mut records, &lengths);
         let times: Vec<u64> = records.iter().map(|record| record.at.0).collect();
-        // Channel 2 has no known bit rate and stays.
+        // Channel 2 has no known bit rate and stays unchanged.
         assert_eq!(times, [8512, 10_001, 9208, 9904, 10_600]);
     }
 

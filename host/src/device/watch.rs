@@ -1,22 +1,23 @@
-//! Whether a device still answers: a stream that falls silent may be a quiet bus, or a device that is gone without a word.
+//! Detects that a device no longer answers: a silent stream may be a quiet bus, or a device that went away without notice.
 //!
-//! The reader asks for the time now and then; a device that leaves all of it unanswered is given up. Only time in which the
-//! reader was there to hear counts, so that a computer that slept, or had other things to do, accuses nobody.
+//! The reader regularly asks for the time; a device that answers none of these requests is given up. Only time in which the
+//! reader was listening counts, so a computer that slept or was busy blames no device.
 
 use std::time::Duration;
 
-/// How often the device's time is asked for.
+/// How often to ask for the device's time.
 const ASK_EVERY: Duration = Duration::from_millis(500);
-/// A device that has answered nothing for this long is given up. With [`ASK_EVERY`] before it, that is within two seconds of
-/// its last answer.
+/// A device that has answered nothing for this long is given up. With [`ASK_EVERY`] added, that is within two seconds of its
+/// last answer.
 const PATIENCE: Duration = Duration::from_millis(1400);
-/// A pass takes as long as a read waits, about 50 ms. What is longer, the reader was not there.
+/// A pass takes as long as a read waits, about 50 ms. During the rest of a longer pass, the reader was not
+/// listening.
 const LONGEST_PASS: Duration = Duration::from_millis(100);
 
-/// What the reader is to do next.
+/// What the reader should do next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Next {
-    /// Nothing.
+    /// Just listen.
     Listen,
     /// Ask for the time.
     Ask,
@@ -24,16 +25,16 @@ pub enum Next {
     GiveUp(Duration),
 }
 
-/// Counts the silence.
+/// Measures the silence.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct SilenceWatch {
     since_asked: Duration,
-    /// Since the first question behind the last answer.
+    /// Since the first request after the last answer.
     unanswered: Option<Duration>,
 }
 
 impl SilenceWatch {
-    /// Time has passed; `answered` if anything was in it, refusals among it.
+    /// Accounts for time that has passed; `answered` if any answer arrived in it, even a refusal.
     pub fn pass(&mut self, passed: Duration, answered: bool) -> Next {
         let passed = passed.min(LONGEST_PASS);
         self.since_asked += passed;
@@ -60,7 +61,7 @@ mod tests {
 
     const PASS: Duration = Duration::from_millis(50);
 
-    /// How long the watch takes to give up, in passes of one length.
+    /// How long the watch takes to give up, with passes of equal length.
     fn gives_up_after(pass: Duration, answered: impl Fn(u32) -> bool) -> Option<Duration> {
         let mut watch = SilenceWatch::default();
         (1..1000).find(|at| matches!(watch.pass(pass, answered(*at)), Next::GiveUp(_))).map(|at| pass * at)
@@ -68,7 +69,7 @@ mod tests {
 
     #[test]
     fn a_device_that_answers_nothing_is_given_up_within_two_seconds() {
-        // Whenever its last answer was.
+        // Whenever the last answer came.
         for last in 1..20 {
             let given_up = gives_up_after(PASS, |at| at == last).unwrap();
             assert!(given_up <= PASS * last + Duration::from_secs(2), "{given_up:?} for {last}");
@@ -78,7 +79,7 @@ mod tests {
 
     #[test]
     fn time_in_which_nobody_listened_accuses_nobody() {
-        // A computer that slept for an hour, and one on which each pass takes a second.
+        // A computer that slept for an hour, and one so busy that each pass takes a second.
         let mut watch = SilenceWatch::default();
         while watch.pass(PASS, false) != Next::Ask {}
         assert_ne!(watch.pass(Duration::from_hours(1), false), Next::GiveUp(Duration::from_hours(1)));

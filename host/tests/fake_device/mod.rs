@@ -1,4 +1,5 @@
-//! A hand-made device at the other end of a byte stream, which answers as a device does, or misbehaves as asked.
+//! A scripted device at the other end of a byte stream, which answers like a real device or misbehaves on
+//! request.
 
 use std::io::{ErrorKind, Read, Write};
 use std::sync::{Arc, Mutex};
@@ -15,10 +16,10 @@ use cantap::wire::{
 };
 
 const TICK_HZ: u32 = 12_000_000;
-/// One frame on each open channel in this time.
+/// One frame arrives on each open channel in this time.
 const FRAME_EVERY: Duration = Duration::from_millis(2);
 
-/// What a device does wrong, from some moment on.
+/// What a device does wrong, from a given moment on.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Fault {
     /// Nothing.
@@ -26,30 +27,31 @@ pub enum Fault {
     None,
     /// It neither answers nor sends.
     Deaf,
-    /// It goes on sending, and answers nothing.
+    /// It keeps sending but answers nothing.
     Mute,
-    /// It has no session any more, and does not say so.
+    /// It has lost its session and does not say so.
     SessionLost,
-    /// It was suspended and resumed: after what it had captured it says that the session has ended. Its last batch is lost.
+    /// It was suspended and resumed: after its captured frames it reports that the session has ended. Its last batch is
+    /// lost.
     Suspended,
-    /// It was configured anew: at the next request it says what it had captured, that the session has ended, and refuses. Its last
-    /// batch is lost.
+    /// It was configured again: at the next request it delivers its captured frames, reports that the session has ended, and
+    /// refuses. Its last batch is lost.
     Configured,
-    /// It was greeted by another program, which has the session now.
+    /// Another program has greeted it and now has the session.
     Stolen,
-    /// Its batches begin anew.
+    /// Its batches start over.
     GoesBack,
     /// Every batch comes twice.
     Repeats,
-    /// Bytes that mean nothing between its messages.
+    /// Meaningless bytes come between its messages.
     Garbage,
     /// Every answer takes 300 ms.
     Slow,
     /// The record that ends a channel never comes.
     NeverStops,
-    /// Its clock is a second behind where it was.
+    /// Its clock was set back by a second.
     SetBack,
-    /// It says that it is a second earlier than its records.
+    /// The time it reports is a second earlier than its records.
     TimeBehind,
     /// The port is gone.
     Vanishes,
@@ -64,12 +66,12 @@ pub enum Asked {
     Gone,
 }
 
-/// What tests ask a device about afterwards.
+/// What tests ask about afterwards.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Log {
-    /// Every channel that was opened, and how.
+    /// Every channel that was opened, with its configuration.
     pub opened: Vec<(Channel, ChannelConfig)>,
-    /// Requests to transmit anything.
+    /// Number of requests to transmit anything.
     pub sent: u32,
 }
 
@@ -84,11 +86,11 @@ pub struct FakeDevice {
     started: Instant,
     set_back: u64,
     time_behind: u64,
-    /// What it answers to `Open`, if that is not what it was asked for.
+    /// Its answer to `Open`, if different from the request.
     pub opens: Option<ChannelConfig>,
-    /// What it says of itself.
+    /// Its description of itself.
     pub says: Hello,
-    /// No request of this host has this number.
+    /// A number that no request of this host has.
     strangers_id: u16,
     log: Arc<Mutex<Log>>,
 }
@@ -164,13 +166,13 @@ impl FakeDevice {
         (Link::new(host_reader, host_writer), Self::over(input, output))
     }
 
-    /// Where it notes what it was asked.
+    /// Sets where it logs requests.
     pub fn log_to(mut self, log: &Arc<Mutex<Log>>) -> Self {
         self.log = Arc::clone(log);
         self
     }
 
-    /// The next request, if there is one within a moment.
+    /// The next request, if one arrives within a moment.
     pub fn asked(&mut self) -> Asked {
         loop {
             if let Some(end) = self.kept.iter().position(|byte| *byte == 0) {
@@ -203,7 +205,7 @@ impl FakeDevice {
         }
     }
 
-    /// Bytes as they are. A host that has gone takes none.
+    /// Writes bytes as they are. A host that has gone takes none.
     pub fn write(&mut self, mut bytes: &[u8]) {
         while !bytes.is_empty() {
             match self.output.write(bytes) {
@@ -222,7 +224,7 @@ impl FakeDevice {
         self.write(&out[..len]);
     }
 
-    /// Puts a received frame into the batch, this many ticks after the record before; the first counts from `base_ticks`.
+    /// Adds a received frame to the batch, this many ticks after the record before; the first counts from `base_ticks`.
     pub fn frame(&mut self, channel: Channel, frame: Frame, stamp: Stamp, ticks: i64, base_ticks: u64) {
         let received = Received { channel, frame, stamp, data_omitted: false };
         let mut record = [0; MAX_RECORD];
@@ -239,7 +241,7 @@ impl FakeDevice {
         assert!(self.batch.push(&record[..len], base_ticks, None));
     }
 
-    /// Sends the batch, if anything is in it, and returns its bytes.
+    /// Sends the batch if it is not empty, and returns its bytes.
     pub fn flush(&mut self) -> Vec<u8> {
         let mut out = [0; MAX_ENCODED];
         let len = self.batch.finish(&mut out);
@@ -247,12 +249,12 @@ impl FakeDevice {
         out[..len].to_vec()
     }
 
-    /// Drops the batch as a bad cable would.
+    /// Drops the batch, as a bad cable would.
     pub fn lose(&mut self) {
         self.batch.finish(&mut [0; MAX_ENCODED]);
     }
 
-    /// It has run for ten seconds when it is opened.
+    /// It has been running for ten seconds when it is opened.
     fn ticks(&self) -> u64 {
         let ran = self.started.elapsed() + Duration::from_secs(10);
         (ran.as_nanos() * u128::from(TICK_HZ) / 1_000_000_000) as u64 - self.set_back
@@ -267,7 +269,7 @@ impl FakeDevice {
         self.status.channels = [channel_status(); 2];
     }
 
-    /// Does what a request asks for, as far as these tests ask.
+    /// Carries out a request, as far as these tests need it.
     pub fn handle(&mut self, id: u16, command: &Command, says_stopped: bool) {
         let result = match command {
             Command::Hello { .. } => {
@@ -314,7 +316,7 @@ impl FakeDevice {
         }
     }
 
-    /// Frames, of which a batch is lost, and the end.
+    /// Sends frames, of which a batch is lost, and the end.
     fn end_session(&mut self, reason: EndReason) {
         self.hear_frames();
         self.lose();
@@ -323,8 +325,8 @@ impl FakeDevice {
         self.write(&out[..len]);
     }
 
-    /// Answers as a device does, and hears a numbered frame on each open channel every [`FRAME_EVERY`]. From `frames` of them
-    /// on it misbehaves. Returns when the host closes the port, or when it vanishes.
+    /// Answers like a device, and hears a numbered frame on each open channel every [`FRAME_EVERY`]. After `frames` of them
+    /// it misbehaves. Returns when the host closes the port, or when the device vanishes.
     pub fn run(&mut self, fault: Fault, frames: u32) {
         let (mut next, mut greeted, mut turned, mut told) = (Instant::now(), false, false, false);
         loop {

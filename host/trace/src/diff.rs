@@ -1,7 +1,7 @@
-//! What two traces say differently: identifiers, periods, lengths, bits.
+//! How two traces differ: identifiers, periods, lengths, bits.
 //!
-//! Each trace is boiled down to a [`Profile`] as it goes by, so that memory depends on the number of
-//! identifiers and not on the traces' length; [`compare`] sets two profiles side by side.
+//! Each trace is reduced to a [`Profile`] as it is read, so memory depends on the number of identifiers and
+//! not on the length of the traces; [`compare`] compares two profiles.
 
 use std::collections::BTreeMap;
 
@@ -10,7 +10,7 @@ use cantap_wire::Id;
 use crate::fd::FD_MAX_BYTES;
 use crate::{TraceFrame, TraceRecord};
 
-/// A kind of frame: channel, identifier, and whether it is remote, or an FD one.
+/// A kind of frame: channel, identifier, and whether it is a remote or an FD frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Key {
     /// From 1; 0 if channels are not distinguished.
@@ -26,23 +26,23 @@ pub struct Key {
 /// Everything about one kind of frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct IdProfile {
-    /// How many frames.
+    /// Number of frames.
     pub count: u64,
     first_ns: i64,
     last_ns: i64,
-    /// Bit n: a frame with DLC n was there.
+    /// Bit n: a frame with DLC n occurred.
     dlcs: u16,
-    /// Bit n: an FD frame with flags n was there.
+    /// Bit n: an FD frame with flags n occurred.
     flags: u8,
-    /// Bits that were 1 in every frame that has them.
+    /// Bits that were 1 in every frame that had them.
     always: [u8; FD_MAX_BYTES],
     /// Bits that were 1 in any frame.
     ever: [u8; FD_MAX_BYTES],
-    /// How many bytes the longest frame has.
+    /// Number of bytes in the longest frame.
     len: u8,
 }
 
-/// A trace boiled down.
+/// A trace reduced to what is compared.
 #[derive(Clone, Debug, Default)]
 pub struct Profile {
     kinds: BTreeMap<Key, IdProfile>,
@@ -78,17 +78,17 @@ impl IdProfile {
         }
     }
 
-    /// The mean period in nanoseconds, if there are two frames.
+    /// The mean period in nanoseconds, if there are at least two frames.
     pub fn period_ns(&self) -> Option<f64> {
         (self.count > 1).then(|| (self.last_ns - self.first_ns) as f64 / (self.count - 1) as f64)
     }
 
-    /// The length codes that were there, in order.
+    /// The length codes that occurred, in order.
     pub fn dlcs(&self) -> Vec<u8> {
         (0..16).filter(|dlc| self.dlcs >> dlc & 1 == 1).collect()
     }
 
-    /// The flags of FD frames that were there, in order: 1 for a switched bit rate, 2 for an error passive sender.
+    /// The flags of FD frames that occurred, in order: 1 for a switched bit rate, 2 for an error passive sender.
     pub fn flags(&self) -> Vec<u8> {
         (0..4).filter(|flags| self.flags >> flags & 1 == 1).collect()
     }
@@ -107,7 +107,7 @@ impl IdProfile {
 }
 
 impl Profile {
-    /// A profile that does not tell channels apart.
+    /// A profile that does not distinguish channels.
     pub fn ignoring_channels() -> Self {
         Self { ignore_channels: true, ..Self::default() }
     }
@@ -136,7 +136,7 @@ pub struct Difference {
     pub only_a: Vec<(Key, u64)>,
     /// Kinds of frames only in the second, with their number.
     pub only_b: Vec<(Key, u64)>,
-    /// Kinds of frames in both that are not the same.
+    /// Kinds of frames in both that differ.
     pub changed: Vec<Changed>,
     /// How many kinds of frames are the same.
     pub same: usize,
@@ -145,7 +145,7 @@ pub struct Difference {
 /// How one kind of frame differs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Changed {
-    /// Which.
+    /// The kind of frame.
     pub key: Key,
     /// Mean periods in nanoseconds, if they differ.
     pub period_ns: Option<(f64, f64)>,
@@ -153,14 +153,14 @@ pub struct Changed {
     pub dlcs: Option<(Vec<u8>, Vec<u8>)>,
     /// Flags of FD frames, if they differ.
     pub flags: Option<(Vec<u8>, Vec<u8>)>,
-    /// Bytes that differ, by place.
+    /// Bytes that differ, by position.
     pub bytes: Vec<ChangedByte>,
 }
 
 /// How one byte differs.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ChangedByte {
-    /// Its place, from 0.
+    /// Its position, from 0.
     pub byte: usize,
     /// Its bits in the first trace as [`IdProfile::bits`] gives them, empty if it has no such byte.
     pub a: String,
@@ -169,7 +169,7 @@ pub struct ChangedByte {
 }
 
 impl Difference {
-    /// Whether there is none.
+    /// Whether there is no difference.
     pub fn is_none(&self) -> bool {
         self.only_a.is_empty() && self.only_b.is_empty() && self.changed.is_empty()
     }

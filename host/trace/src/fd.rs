@@ -1,16 +1,16 @@
-//! A CAN FD frame. Devices of cantap are classic ones; traces from other tools are full of these.
+//! A CAN FD frame. cantap's devices are classical only, but traces from other tools are full of FD frames.
 
 use std::fmt;
 
 use cantap_can::Id;
 
-/// The data length that each code of the bus stands for in an FD frame (ISO 11898-1:2015, table 5).
+/// The data length of each length code in an FD frame (ISO 11898-1:2015, table 5).
 pub const FD_LENGTHS: [u8; 16] = [0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64];
 
-/// Data bytes that an FD frame carries at most.
+/// The largest number of data bytes in an FD frame.
 pub const FD_MAX_BYTES: usize = 64;
 
-/// A CAN FD data frame; there are no remote ones.
+/// A CAN FD data frame; FD has no remote frames.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 pub struct FdFrame {
     id: Id,
@@ -21,9 +21,9 @@ pub struct FdFrame {
 }
 
 impl FdFrame {
-    /// A frame with these bytes; `None` if FD has no code for their number ([`FD_LENGTHS`]).
+    /// A frame with these bytes; `None` if FD has no length code for their number ([`FD_LENGTHS`]).
     ///
-    /// `brs`: the data phase has a bit rate of its own. `esi`: the sender is error passive.
+    /// `brs`: the data phase has its own bit rate. `esi`: the sender is error passive.
     pub fn new(id: Id, brs: bool, esi: bool, bytes: &[u8]) -> Option<Self> {
         let dlc = FD_LENGTHS.iter().position(|len| usize::from(*len) == bytes.len())? as u8;
         let mut data = [0; FD_MAX_BYTES];
@@ -36,7 +36,7 @@ impl FdFrame {
         self.id
     }
 
-    /// Whether the data phase has a bit rate of its own.
+    /// Whether the data phase has its own bit rate.
     pub const fn brs(&self) -> bool {
         self.brs
     }
@@ -56,18 +56,17 @@ impl FdFrame {
         &self.data[..self.data_len()]
     }
 
-    /// How many data bytes there are.
+    /// The number of data bytes.
     pub const fn data_len(&self) -> usize {
         FD_LENGTHS[(self.dlc & 15) as usize] as usize
     }
 }
 
-/// In the text form's one digit of flags, as in Linux's `canfd_frame`: bit rate switch, error passive sender, and that the frame
-/// is an FD one, which it is anyway.
+/// Flag in the text form's single digit, as in Linux's `canfd_frame`: the bit rate is switched.
 pub const FLAG_BRS: u8 = 1;
 /// The sender is error passive.
 pub const FLAG_ESI: u8 = 2;
-/// It is an FD frame; kernels differ in whether they set it.
+/// Flag for an FD frame, which it is anyway; kernels differ in whether they set it.
 pub const FLAG_FDF: u8 = 4;
 
 impl FdFrame {
@@ -78,7 +77,7 @@ impl FdFrame {
 }
 
 impl fmt::Display for FdFrame {
-    /// `123##1DEADBEEF`: the digit behind `##` has the flags.
+    /// `123##1DEADBEEF`: the digit after `##` has the flags.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}##{:X}", self.id, self.flags())?;
         self.data().iter().try_for_each(|byte| write!(f, "{byte:02X}"))

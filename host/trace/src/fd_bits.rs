@@ -1,43 +1,44 @@
-//! Exact length of a CAN FD frame on the bus (ISO 11898-1:2015, 10.4 and 10.5): which bits take the nominal bit rate, and which
-//! that of the data phase.
+//! Exact length of a CAN FD frame on the bus (ISO 11898-1:2015, 10.4 and 10.5): which bits have the nominal bit rate and which
+//! have that of the data phase.
 //!
-//! Up to the end of the data, stuff bits are where the levels ask for them. Behind it they are at fixed places: one before the
-//! count of stuff bits, and one behind every four bits of that count and the CRC. So the CRC's value does not change the length.
+//! Up to the end of the data, the levels determine where stuff bits are. After it they are in fixed places: one before the stuff
+//! count, and one after every four bits of the stuff count and the CRC. So the CRC's value does not change the length.
 
 use crate::fd::FdFrame;
 use cantap_can::bits::INTERMISSION_BITS;
 
-/// ACK slot, ACK delimiter, seven bits end of frame.
+/// ACK slot, ACK delimiter, and seven bits of end of frame.
 const TAIL_BITS: u32 = 1 + 1 + 7;
-/// The count of stuff bits: three bits and their parity.
+/// The stuff count: three bits and their parity.
 const STUFF_COUNT_BITS: u32 = 4;
-/// Frames with more data have the longer CRC.
+/// Frames with more data than this have the longer CRC.
 const MOST_BYTES_OF_CRC17: usize = 16;
 /// Generator polynomials without their leading term.
 const CRC17_POLYNOMIAL: u32 = 0x1_685B;
 const CRC21_POLYNOMIAL: u32 = 0x10_2899;
 
-/// What an FD frame is made of on the bus.
+/// The bits of an FD frame on the bus.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct FdBits {
-    /// Bits at the nominal rate, with stuff bits and the intermission's three: all but those of the data phase.
+    /// Bits at the nominal rate, including stuff bits and the three bits of intermission: all but those of the
+    /// data phase.
     pub nominal: u32,
-    /// Bits at the rate of the data phase, stuff bits included; none without a switched bit rate.
+    /// Bits at the rate of the data phase, including stuff bits; 0 without a switched bit rate.
     ///
-    /// The rate changes at the sample points of the BRS bit and of the CRC delimiter, so each of these two is part nominal, part
-    /// data. Together they take one bit time of each, wherever the sample points are; so the first is counted as nominal, the
-    /// second as data.
+    /// The rate changes at the sample points of the BRS bit and of the CRC delimiter, so each of these two is partly nominal,
+    /// partly data. Together they take one bit time of each, wherever the sample points are; so the first is counted as nominal,
+    /// the second as data.
     pub data: u32,
-    /// Stuff bits up to the end of the data: where the levels ask for them.
+    /// Stuff bits up to the end of the data, where the levels require them.
     pub stuff: u32,
-    /// Stuff bits at fixed places behind the data.
+    /// Stuff bits in fixed places after the data.
     pub fixed_stuff: u32,
     /// The CRC sequence: 17 bits up to 16 data bytes, 21 above.
     pub crc: u32,
 }
 
 impl FdBits {
-    /// Works out `frame`.
+    /// Computes the bits of `frame`.
     pub fn of(frame: &FdFrame) -> Self {
         let length = Length::of(frame);
         let (crc_bits, fixed_stuff) = crc_and_fixed_stuff(frame);
@@ -66,7 +67,7 @@ impl FdBits {
     }
 }
 
-/// The lengths alone, which statistics need of each frame.
+/// Only the lengths, which statistics need for each frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Length {
     pub nominal: u32,
@@ -83,7 +84,7 @@ impl Length {
         let first_stuff = stuffing.count();
         stuffing.bits(control, control_bits);
         frame.data().iter().for_each(|byte| stuffing.byte(*byte));
-        // A stuff bit that is due behind the last data bit is the first of those at fixed places.
+        // A stuff bit due after the last data bit is the first of those in fixed places.
         let stuff = stuffing.count();
         let (crc_bits, fixed_stuff) = crc_and_fixed_stuff(frame);
         let first = arbitration_bits + first_stuff;
@@ -124,28 +125,28 @@ fn control(frame: &FdFrame) -> (u64, u32) {
     (u64::from(frame.esi()) << 4 | u64::from(frame.dlc()), 1 + 4)
 }
 
-/// Bits of the CRC sequence, and stuff bits at fixed places around it.
+/// Number of bits in the CRC sequence, and of the fixed stuff bits in and before it.
 fn crc_and_fixed_stuff(frame: &FdFrame) -> (u32, u32) {
     let crc_bits = if frame.data_len() <= MOST_BYTES_OF_CRC17 { 17 } else { 21 };
     (crc_bits, 1 + (STUFF_COUNT_BITS + crc_bits) / 4)
 }
 
-/// Counts stuff bits as the bits go by.
+/// Counts stuff bits while bits pass.
 ///
-/// The state is the last level and how often it came in a row. A stuff bit is counted before the bit that follows it, so that one
-/// that is due at the very end is not.
+/// The state is the last level and how many times in a row it has occurred. A stuff bit is counted before the bit that follows
+/// it, so one due at the very end is not counted.
 #[derive(Clone, Copy)]
 struct Stuffing {
     state: usize,
     count: u32,
 }
 
-/// Equal bits in a row that a stuff bit follows.
+/// A stuff bit follows this many equal bits in a row.
 const LONGEST_RUN: usize = 5;
 /// One state for each level and run.
 const STATES: usize = 2 * LONGEST_RUN;
 
-/// By state and byte: the state afterwards, and above it how many stuff bits were counted.
+/// By state and byte: the state afterwards, and in the bits above it the number of stuff bits counted.
 static BYTES: [[u8; 256]; STATES] = {
     let mut table = [[0; 256]; STATES];
     let mut state = 0;
@@ -167,7 +168,7 @@ static BYTES: [[u8; 256]; STATES] = {
     table
 };
 
-/// The next bit: the state afterwards, and whether a stuff bit went before it.
+/// Takes the next bit: the state afterwards, and whether a stuff bit came before it.
 const fn step(state: usize, bit: usize) -> (usize, usize) {
     let (level, run) = (state / LONGEST_RUN, state % LONGEST_RUN + 1);
     // The stuff bit is the opposite, and the first of a new run.
@@ -177,7 +178,8 @@ const fn step(state: usize, bit: usize) -> (usize, usize) {
 }
 
 impl Default for Stuffing {
-    /// Before the start of frame: the bus was recessive, and the dominant bit begins a run. As if one recessive bit had been.
+    /// Before the start of frame: the bus was recessive, and the dominant bit begins a run. It is as if there had been one
+    /// recessive bit.
     fn default() -> Self {
         Self { state: LONGEST_RUN, count: 0 }
     }
@@ -203,7 +205,7 @@ impl Stuffing {
     }
 }
 
-/// The CRC sequence: over all bits from start of frame to the end of the data, stuff bits among them, and the count of stuff bits.
+/// The CRC sequence: over all bits from start of frame to the end of the data, including stuff bits, and the stuff count.
 fn crc(frame: &FdFrame, stuff: u32, crc_bits: u32) -> u32 {
     let polynomial = if crc_bits == 17 { CRC17_POLYNOMIAL } else { CRC21_POLYNOMIAL };
     let mut register = Register { value: 1 << (crc_bits - 1), bits: crc_bits, polynomial };
@@ -213,7 +215,7 @@ fn crc(frame: &FdFrame, stuff: u32, crc_bits: u32) -> u32 {
             let bit = (bits >> bit & 1) as usize;
             let (next, stuffed) = step(state, bit);
             if stuffed == 1 {
-                // The opposite of the level that was there five times.
+                // The opposite of the level that occurred five times.
                 register.push(1 - (state / LONGEST_RUN) as u32);
             }
             register.push(bit as u32);
@@ -224,7 +226,7 @@ fn crc(frame: &FdFrame, stuff: u32, crc_bits: u32) -> u32 {
         put(bits, len);
     }
     frame.data().iter().for_each(|byte| put(u64::from(*byte), 8));
-    // In Gray code, with an even parity behind it.
+    // In Gray code, followed by an even parity bit.
     let count = stuff % 8;
     let gray = count ^ count >> 1;
     let field = gray << 1 | (gray.count_ones() % 2);

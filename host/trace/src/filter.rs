@@ -1,20 +1,20 @@
 //! Filters in the syntax of can-utils' `candump`: `can0,123:7FF,400~7F0,#FF,j`.
 //!
-//! An interface, then comma-separated: `ID:MASK` accepts frames with `id & MASK == ID & MASK`, `ID~MASK` those
-//! without, `#MASK` error frames of these SocketCAN classes, `j` demands all instead of any. All
-//! numbers are hexadecimal; an ID of eight digits means a 29-bit one. As on Linux, a mask without
-//! the flag bits (80000000 extended, 40000000 remote) does not look at them.
+//! An interface, then comma-separated items: `ID:MASK` accepts frames with `id & MASK == ID & MASK`, `ID~MASK`
+//! all other frames, `#MASK` error frames of these SocketCAN classes, and `j` requires all items to match
+//! instead of any. All numbers are hexadecimal; an ID of eight digits is a 29-bit one. As on Linux, a mask
+//! without the flag bits (80000000 extended, 40000000 remote) ignores them.
 
 use std::fmt;
 use std::str::FromStr;
 
 use crate::{CHANNEL_0, Interface, TraceEvent, TraceFrame, TraceRecord};
 
-/// The flag of an extended identifier, as on Linux.
+/// The flag for an extended identifier, as on Linux.
 pub const EXTENDED: u32 = 1 << 31;
-/// The flag of a remote frame, as on Linux.
+/// The flag for a remote frame, as on Linux.
 pub const REMOTE: u32 = 1 << 30;
-/// The kernel keeps bit 29 for itself: it marks inverse filters and error frames.
+/// Bit 29 is reserved by the kernel: it marks inverse filters and error frames.
 const RESERVED: u32 = 1 << 29;
 const STANDARD_BITS: u32 = 0x7FF;
 const EXTENDED_BITS: u32 = 0x1FFF_FFFF;
@@ -24,9 +24,9 @@ const EXTENDED_BITS: u32 = 0x1FFF_FFFF;
 pub struct IdFilter {
     /// The identifier, with [`EXTENDED`] and [`REMOTE`].
     pub id: u32,
-    /// The bits of it that are compared.
+    /// The bits that are compared.
     pub mask: u32,
-    /// Accepts what does not match.
+    /// Accepts whatever does not match.
     pub inverse: bool,
 }
 
@@ -37,13 +37,13 @@ pub struct Filter {
     pub channel: Option<u8>,
     /// Which identifiers; any if there are none.
     pub ids: Vec<IdFilter>,
-    /// SocketCAN error classes to accept; `None` if the filter does not speak of errors.
+    /// SocketCAN error classes to accept; `None` if the filter does not mention errors.
     pub errors: Option<u32>,
-    /// A frame must match all of [`Self::ids`] instead of one.
+    /// A frame must match all of [`Self::ids`] instead of any.
     pub join: bool,
 }
 
-/// Why a text is no filter.
+/// Why a text is not a filter.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum ParseFilterError {
@@ -55,16 +55,17 @@ pub enum ParseFilterError {
     Interface(String),
     /// Neither an ID nor an ID with a mask.
     #[error(
-        "'{0}' is no filter; write ID, such as 123 or 09F80102, ID:MASK, such as 120:7F0, or ID~MASK for everything else"
+        "'{0}' is not a filter; write ID, such as 123 or 09F80102, ID:MASK, such as 120:7F0, or ID~MASK for everything else"
     )]
     Element(String),
     /// A number.
-    #[error("'{0}' is no hexadecimal number of up to 8 digits")]
+    #[error("'{0}' is not a hexadecimal number of up to 8 digits")]
     Number(String),
 }
 
 impl IdFilter {
-    /// The mask as the kernel takes it: a standard ID compared with its format has no bits above the eleventh.
+    /// The mask as the kernel applies it: a standard ID compared with its format has no bits above the
+    /// eleventh.
     pub const fn effective_mask(&self) -> u32 {
         if self.mask & EXTENDED != 0 && self.id & EXTENDED == 0 {
             self.mask & (STANDARD_BITS | EXTENDED | REMOTE)
@@ -100,7 +101,7 @@ impl Filter {
     }
 
     /// Whether a record passes. Errors pass if their class is in `#MASK`, or if the filter names only an
-    /// interface. A loss passes always: it says that the trace is not complete.
+    /// interface. A loss always passes: it says that the trace is incomplete.
     pub fn accepts(&self, record: &TraceRecord) -> bool {
         if self.channel.is_some_and(|channel| channel != record.channel) {
             return false;
@@ -126,7 +127,7 @@ fn number(text: &str) -> Result<u32, ParseFilterError> {
         .ok_or_else(|| ParseFilterError::Number(text.to_owned()))
 }
 
-/// `can0` is channel 1; the letters before the number are free, as in `vcan0`.
+/// `can0` is channel 1; any letters may precede the number, as in `vcan0`.
 fn interface(text: &str) -> Result<Option<u8>, ParseFilterError> {
     if text.is_empty() || text == "any" {
         return Ok(None);
@@ -142,7 +143,7 @@ fn interface(text: &str) -> Result<Option<u8>, ParseFilterError> {
     }
 }
 
-/// An identifier without a mask is exactly that one: three digits at most for a standard one, more for one of 29 bits. candump wants
+/// An identifier without a mask matches exactly: up to three digits are a standard one, more are one of 29 bits. candump requires
 /// the mask, but everybody forgets it.
 fn lone_id(text: &str) -> Option<IdFilter> {
     let id = number(text).ok()?;
@@ -156,7 +157,8 @@ fn lone_id(text: &str) -> Option<IdFilter> {
 impl FromStr for Filter {
     type Err = ParseFilterError;
 
-    /// The interface may be left out: `123:7FF` looks at every channel. So may the mask: `123` is that identifier alone.
+    /// The interface may be left out: `123:7FF` applies to every channel. So may the mask: `123` is that identifier
+    /// alone.
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let mut filter = Self::default();
         for (at, part) in text.split(',').enumerate() {
@@ -218,7 +220,7 @@ mod tests {
         assert!(!accepts("123", "124#") && !accepts("123", "00000123#"));
         assert!(accepts("9F80102", "09F80102#") && accepts("09F80102", "09F80102#11"));
         assert!(!accepts("9F80102", "09F80103#") && accepts("can0,100,200", "200#"));
-        // Letters and a number are an interface first.
+        // Letters followed by a number are tried as an interface first.
         assert_eq!("ca0".parse::<Filter>().unwrap().channel, Some(1));
         for text in ["800", "3FFFFFFF", "123456789", "12g", ","] {
             assert!(text.parse::<Filter>().is_err() || text == ",", "{text}");
@@ -286,16 +288,16 @@ mod tests {
         for (text, message) in [
             (
                 "can0,x",
-                "'x' is no filter; write ID, such as 123 or 09F80102, ID:MASK, such as 120:7F0, or ID~MASK for everything else",
+                "'x' is not a filter; write ID, such as 123 or 09F80102, ID:MASK, such as 120:7F0, or ID~MASK for everything else",
             ),
             (
                 "x",
                 "'x' is neither an ID, such as 123, 123:7FF or 09F80102, nor an interface, such as can0 for channel 1, can1 for channel 2, \
                  or any",
             ),
-            ("can0,12G:7FF", "'12G' is no hexadecimal number of up to 8 digits"),
-            ("can0,#", "'' is no hexadecimal number of up to 8 digits"),
-            ("can0,+1:7FF", "'+1' is no hexadecimal number of up to 8 digits"),
+            ("can0,12G:7FF", "'12G' is not a hexadecimal number of up to 8 digits"),
+            ("can0,#", "'' is not a hexadecimal number of up to 8 digits"),
+            ("can0,+1:7FF", "'+1' is not a hexadecimal number of up to 8 digits"),
         ] {
             assert_eq!(text.parse::<Filter>().unwrap_err().to_string(), message);
         }

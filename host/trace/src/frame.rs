@@ -8,7 +8,7 @@ use cantap_can::{Frame, Id};
 
 use crate::fd::{FLAG_BRS, FLAG_ESI, FLAG_FDF, FdFrame};
 
-/// A frame of a trace. What both kinds have is asked here; what only one has, of [`Self::classic`] or [`Self::fd`].
+/// A frame of a trace. Its methods give what both kinds have; for the rest use [`Self::classic`] or [`Self::fd`].
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 pub enum TraceFrame {
     /// A classical frame: data or remote.
@@ -51,7 +51,7 @@ impl TraceFrame {
         }
     }
 
-    /// The data bytes: up to 8, in an FD frame up to 64; none in a remote frame.
+    /// The data bytes: up to 8, or up to 64 in an FD frame; none in a remote frame.
     #[inline]
     pub fn data(&self) -> &[u8] {
         match self {
@@ -60,7 +60,7 @@ impl TraceFrame {
         }
     }
 
-    /// How many data bytes the frame carries.
+    /// The number of data bytes in the frame.
     #[inline]
     pub const fn data_len(&self) -> usize {
         match self {
@@ -69,7 +69,7 @@ impl TraceFrame {
         }
     }
 
-    /// The classical frame, if it is one: all that a device of cantap can send.
+    /// The classical frame, if it is one: the only kind that cantap's devices can send.
     #[inline]
     pub const fn classic(&self) -> Option<&Frame> {
         match self {
@@ -109,7 +109,8 @@ impl PartialEq<Frame> for TraceFrame {
 }
 
 impl fmt::Display for TraceFrame {
-    /// As can-utils write it: `123#DEADBEEF`, `123#R3`; an FD frame as `123##1DEADBEEF`, the digit for its flags.
+    /// As can-utils writes it: `123#DEADBEEF`, `123#R3`; an FD frame as `123##1DEADBEEF`, where the digit has its
+    /// flags.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Classic(frame) => frame.fmt(f),
@@ -134,12 +135,12 @@ pub enum ParseTraceFrameError {
     /// It is not a classical frame either.
     #[error(transparent)]
     Classic(#[from] ParseFrameError),
-    /// What follows `##` is no digit of flags.
+    /// What follows `##` is not a digit of flags.
     #[error(
         "the digit behind '##' has the flags: 1 for a switched bit rate, 2 for an error passive sender, 4 for FD"
     )]
     BadFlags,
-    /// A number of bytes that FD has no code for.
+    /// FD has no length code for this number of bytes.
     #[error("a CAN FD frame carries 0 to 8, 12, 16, 20, 24, 32, 48 or 64 data bytes")]
     BadLength,
 }
@@ -187,7 +188,7 @@ mod tests {
         {
             assert_eq!(text.parse::<TraceFrame>().unwrap().to_string(), text);
         }
-        // Newer kernels say FD by a flag too; dots may separate bytes.
+        // Newer kernels also flag FD; dots may separate bytes.
         assert_eq!("123##511.22".parse::<TraceFrame>().unwrap().to_string(), "123##11122");
     }
 

@@ -1,8 +1,8 @@
-//! Channels as can-utils name them.
+//! Channels as can-utils names them.
 
 use std::fmt;
 
-/// What stands for channel 0, which some formats have: `can0` is channel 1, as users count.
+/// The name of channel 0, which some formats have: `can0` is channel 1, as users count.
 pub const CHANNEL_0: &str = "channel0";
 
 /// A channel's interface name: `can0` for channel 1.

@@ -1,4 +1,4 @@
-//! How long a frame of a trace is on the bus.
+//! The length of a trace's frame on the bus.
 
 use cantap_can::bits_on_bus;
 
@@ -7,7 +7,7 @@ use crate::FdBits;
 use crate::TraceFrame;
 use crate::fd_bits::Length;
 
-/// Bits that a frame takes on the bus, with stuff bits and intermission, by the rate they are sent at.
+/// The bits of a frame on the bus, with stuff bits and intermission, by the rate at which they are sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct BusBits {
     /// At the nominal rate: all of a classical frame.
@@ -17,7 +17,7 @@ pub struct BusBits {
 }
 
 impl BusBits {
-    /// Both.
+    /// All bits.
     #[inline]
     pub const fn total(self) -> u32 {
         self.nominal + self.data
@@ -25,7 +25,7 @@ impl BusBits {
 }
 
 impl TraceFrame {
-    /// How many bits the frame takes on the bus.
+    /// The number of bits of the frame on the bus.
     #[inline]
     pub fn bus_bits(&self) -> BusBits {
         match self {

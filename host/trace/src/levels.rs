@@ -1,15 +1,15 @@
-//! A frame as the levels that cross the bus, bit by bit (ISO 11898-1:2015, 10.4 and 10.5): for whoever simulates or reads edges. For lengths
-//! alone [`crate::bits`] is a hundred times faster.
+//! A frame as the levels that cross the bus, bit by bit (ISO 11898-1:2015, 10.4 and 10.5), for simulating or reading edges. If you need only
+//! lengths, [`crate::bits`] is a hundred times faster.
 
 use cantap_can::{Frame, FrameBits};
 
-/// Equal bits in a row, after which the sender puts in a different one.
+/// After this many equal bits in a row, the sender inserts an opposite one.
 const STUFF_AFTER: usize = 5;
-/// Of the end of frame.
+/// Bits of the end of frame.
 const END_OF_FRAME_BITS: usize = 7;
 
-/// The bits from the start of frame to the end of the end of frame, true for recessive, stuff bits among them. The ACK slot is recessive,
-/// as the sender leaves it: it is [`ACK_SLOT_FROM_END`] from the end.
+/// The bits from start of frame to the last bit of end of frame, true for recessive, including stuff bits. The ACK slot is recessive, as
+/// the sender leaves it; it is at [`ACK_SLOT_FROM_END`] from the end.
 pub fn levels(frame: &Frame) -> Vec<bool> {
     let id = frame.id();
     let mut bits = vec![false];

@@ -1,7 +1,8 @@
 #![doc = include_str!("../README.md")]
 //!
-//! A [`TraceRecord`] is one entry of a trace. [`filter`] chooses among them, [`playback`] gives them out at their own times,
-//! [`diff`] compares two traces, [`bits`] knows how long a frame is on the bus, [`levels`] how it looks there, and [`socketcan`] writes events as Linux does.
+//! A [`TraceRecord`] is one entry of a trace. [`filter`] selects among them, [`playback`] hands them out at their original times, [`diff`] compares
+//! two traces, [`bits`] computes how long a frame is on the bus, [`levels`] what it looks like there, and [`socketcan`] represents events as Linux
+//! does.
 
 #![forbid(unsafe_code)]
 

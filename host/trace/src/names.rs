@@ -1,4 +1,5 @@
-//! Names of what happens beside frames, as text files and tables have them: `queue`, `bit-recessive`, `bus-off`.
+//! Names for everything that is not a frame, as used in text files and tables: `queue`, `bit-recessive`,
+//! `bus-off`.
 
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 
@@ -25,7 +26,8 @@ pub const ERROR_STATES: [(ErrorState, &str); 4] = [
     (ErrorState::Passive, "passive"),
     (ErrorState::BusOff, "bus-off"),
 ];
-/// Why a frame was not sent. [`TransmitFailure::Overtaken`], which has a number, is [`OVERTAKEN`].
+/// Why a frame was not sent. [`TransmitFailure::Overtaken`], which carries a number, has the name
+/// [`OVERTAKEN`].
 pub const TRANSMIT_FAILURES: [(TransmitFailure, &str); 5] = [
     (TransmitFailure::ArbitrationLost, "arbitration-lost"),
     (TransmitFailure::BusError, "bus-error"),
@@ -41,7 +43,7 @@ pub fn name<T: PartialEq>(names: &[(T, &'static str)], item: &T) -> &'static str
     names.iter().find(|(known, _)| known == item).map_or("", |(_, name)| *name)
 }
 
-/// The item of a name in one of these tables.
+/// The item with a name in one of these tables.
 pub fn item<T: Copy>(names: &[(T, &str)], name: &str) -> Option<T> {
     names.iter().find(|(_, known)| *known == name).map(|(item, _)| *item)
 }

@@ -1,7 +1,7 @@
-//! A trace played back: its records handed out when they are due, at any speed.
+//! Plays a trace back: its records are handed out when they are due, at any speed.
 //!
-//! It knows no clock and never waits: the caller says what time it is, and gets the records that are due by
-//! then, or how long to sleep. So the same engine drives the live view and a test.
+//! It has no clock and never waits: the caller passes the time, and gets the records that are due by then, or
+//! how long to sleep. So the same engine drives the live view and tests.
 
 use std::time::Duration;
 
@@ -12,13 +12,13 @@ use crate::TraceRecord;
 const FACTORS: [f64; 16] =
     [0.0, 0.001, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 1000.0];
 
-/// The slowest that can be asked for.
+/// The slowest speed that can be set.
 const MOST_FACTOR: f64 = 1e6;
 
-/// A pause in the trace longer than this is played as one of this length, if gaps are to be skipped.
+/// When gaps are skipped, a longer pause in the trace is shortened to this length.
 const SKIPPED_TO: Duration = Duration::from_secs(1);
 
-/// What there is to do now.
+/// What to do now.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Due {
     /// This record is due.
@@ -27,26 +27,26 @@ pub enum Due {
     Wait(Duration),
     /// Paused: nothing is due before [`Playback::resume`], [`Playback::step`] or the like.
     Paused,
-    /// The trace is over, and it is not played in a loop.
+    /// The trace has ended and does not loop.
     Ended,
 }
 
-/// Plays a trace that `open` begins anew whenever it is asked to, for the loop.
+/// Plays a trace. `open` opens it, again for each round of the loop.
 pub struct Playback<O, I> {
     open: O,
     records: I,
     next: Option<TraceRecord>,
-    /// The trace's time that [`Self::anchor_at`] stands for.
+    /// The time in the trace that [`Self::anchor_at`] corresponds to.
     anchor_trace_ns: i64,
-    /// The caller's time at which the trace stood at [`Self::anchor_trace_ns`].
+    /// The caller's time that [`Self::anchor_trace_ns`] corresponds to.
     anchor_at: Duration,
     factor: f64,
     paused: bool,
-    /// Records to hand out although paused.
+    /// Number of records to hand out although paused.
     steps: u64,
     looped: bool,
     skips_gaps: bool,
-    /// Rounds that were played to the end.
+    /// Number of rounds played to the end.
     rounds: u64,
     last_ns: Option<i64>,
 }
@@ -56,8 +56,8 @@ where
     O: FnMut() -> Result<I, E>,
     I: Iterator<Item = TraceRecord>,
 {
-    /// Opens the trace and plays it in real time from `now` on. Times are the caller's: any clock that goes
-    /// forward.
+    /// Opens the trace and plays it in real time from `now` on. Times are the caller's, from any clock that
+    /// goes forward.
     pub fn new(mut open: O, now: Duration) -> Result<Self, E> {
         let mut records = open()?;
         let next = records.next();
@@ -77,7 +77,7 @@ where
         })
     }
 
-    /// What is due at `now`. Asked again and again, it hands out every record once and in order.
+    /// What is due at `now`. Called repeatedly, it hands out every record once and in order.
     pub fn poll(&mut self, now: Duration) -> Result<Due, E> {
         let Some(record) = self.next else {
             if !self.looped || self.last_ns.is_none() {
@@ -89,7 +89,7 @@ where
         if self.steps > 0 {
             self.steps -= 1;
             self.take(record);
-            // What comes then is due as if this one had been in time.
+            // Whatever follows is due as if this one had been on time.
             self.anchor(record.time_ns, now);
             return Ok(Due::Record(record));
         }
@@ -103,7 +103,7 @@ where
         if self.paused {
             return Due::Paused;
         }
-        // A clock that was set back in the trace must not stop it, nor one that was set ahead.
+        // The trace must not stall where its clock was set back or ahead.
         let ahead = record.time_ns.saturating_sub(self.last_ns.unwrap_or(self.anchor_trace_ns));
         if ahead < 0 || (self.skips_gaps && ahead > SKIPPED_TO.as_nanos() as i64) {
             let wait = if ahead < 0 { 0 } else { SKIPPED_TO.as_nanos() as i64 };
@@ -131,7 +131,7 @@ where
     /// When a record with this trace time is due.
     fn due_at(&self, trace_ns: i64) -> Duration {
         let ahead = trace_ns.saturating_sub(self.anchor_trace_ns).max(0) as f64;
-        // A trace of centuries in slow motion is longer than a Duration holds.
+        // A trace of centuries in slow motion exceeds a Duration.
         let ahead = Duration::try_from_secs_f64(ahead * self.factor / 1e9).unwrap_or(Duration::MAX);
         self.anchor_at.saturating_add(ahead)
     }
@@ -141,8 +141,8 @@ where
         self.anchor_at = now;
     }
 
-    /// The trace's time at `now`, in nanoseconds as in [`TraceRecord::time_ns`]; never past the next record
-    /// that was not handed out.
+    /// The trace's time at `now`, in nanoseconds as in [`TraceRecord::time_ns`]; never later than the next
+    /// record to be handed out.
     pub fn position_ns(&self, now: Duration) -> i64 {
         let limit =
             self.next.map_or(self.last_ns, |record| Some(record.time_ns)).unwrap_or(self.anchor_trace_ns);
@@ -156,7 +156,7 @@ where
         self.anchor_trace_ns.saturating_add(played as i64).min(limit)
     }
 
-    /// Begins the trace anew, as at the end in a loop.
+    /// Starts the trace again, as at the end in a loop.
     pub fn start_over(&mut self, now: Duration) -> Result<(), E> {
         self.records = (self.open)()?;
         self.next = self.records.next();
@@ -165,13 +165,12 @@ where
         Ok(())
     }
 
-    /// The delay factor: 1 is real time, 2 takes twice as long, 0 is as fast as can be.
+    /// The delay factor: 1 is real time, 2 takes twice as long, 0 is as fast as possible.
     pub fn factor(&self) -> f64 {
         self.factor
     }
 
-    /// Sets the delay factor from `now` on; it is kept between 0 and a million. What is not a number
-    /// changes nothing.
+    /// Sets the delay factor from `now` on; it is limited to between 0 and a million. NaN changes nothing.
     pub fn set_factor(&mut self, factor: f64, now: Duration) {
         if !factor.is_nan() {
             let position = self.position_ns(now);
@@ -206,7 +205,7 @@ where
         }
     }
 
-    /// Lets the trace's time go on where it was stopped.
+    /// Lets the trace's time continue from where it stopped.
     pub fn resume(&mut self, now: Duration) {
         if self.paused {
             self.anchor(self.anchor_trace_ns, now);
@@ -215,14 +214,14 @@ where
         }
     }
 
-    /// Pauses and hands out the next record at once.
+    /// Pauses and hands out the next record immediately.
     pub fn step(&mut self, now: Duration) {
         self.pause(now);
         self.steps += 1;
     }
 
-    /// On the way to another place: hands out the next record at once if it is older than a time, whatever the speed. `None` once
-    /// the trace is there; what follows is due as if it had come there by itself.
+    /// For skipping to another place: hands out the next record immediately if it is older than a time, whatever the speed.
+    /// `None` once that time is reached; what follows is due as if it had been reached by playing.
     pub fn forward_to(&mut self, time_ns: i64, now: Duration) -> Option<TraceRecord> {
         if let Some(record) = self.next.filter(|record| record.time_ns < time_ns) {
             self.take(record);
@@ -233,22 +232,22 @@ where
         None
     }
 
-    /// Whether the trace begins anew after its end.
+    /// Whether the trace starts again after its end.
     pub fn is_looped(&self) -> bool {
         self.looped
     }
 
-    /// Lets the trace begin anew after its end, or not.
+    /// Sets whether the trace starts again after its end.
     pub fn set_looped(&mut self, looped: bool) {
         self.looped = looped;
     }
 
-    /// Plays pauses of more than a second as a second, or not.
+    /// Sets whether pauses of more than a second are shortened to a second.
     pub fn set_skips_gaps(&mut self, skips: bool) {
         self.skips_gaps = skips;
     }
 
-    /// Rounds that were played to the end.
+    /// Number of rounds played to the end.
     pub fn rounds(&self) -> u64 {
         self.rounds
     }
@@ -284,7 +283,7 @@ mod tests {
         Playback::new(move || Ok(records.clone().into_iter()), ms(500)).unwrap()
     }
 
-    /// The times, in milliseconds of the trace, of what is due; then what there is to do.
+    /// The times, in milliseconds of the trace, of the records that are due; then what to do next.
     fn due<O, I>(playback: &mut Playback<O, I>, now: u64) -> (Vec<i64>, Due)
     where
         O: FnMut() -> Result<I, Infallible>,
@@ -395,7 +394,7 @@ mod tests {
         playback.resume(ms(1000));
         assert_eq!(due(&mut playback, 1000), (vec![], Due::Wait(ms(50))));
         assert_eq!(due(&mut playback, 1050), (vec![100], Due::Wait(ms(100))));
-        // Beyond its end it is at its end.
+        // Skipping past the end leads to the end.
         while playback.forward_to(at(9999).time_ns, ms(1060)).is_some() {}
         assert_eq!(
             (playback.position_ns(ms(1060)), due(&mut playback, 1060).1),

@@ -17,16 +17,16 @@ pub enum Direction {
 /// One entry of a trace.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct TraceRecord {
-    /// Nanoseconds since the Unix epoch (UTC); since the trace's start where no date is known. For a frame it
-    /// is the end of the frame.
+    /// Nanoseconds since the Unix epoch (UTC), or since the trace's start if the date is unknown. For a frame
+    /// it is the end of the frame.
     pub time_ns: i64,
-    /// The channel as users count, from 1. Devices have two; files may name more.
+    /// The channel, counted from 1. Devices have two; files may have more.
     pub channel: u8,
     /// What happened.
     pub event: TraceEvent,
 }
 
-/// What a trace entry says.
+/// The content of a trace entry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum TraceEvent {
     /// A frame was received or sent.
@@ -38,17 +38,17 @@ pub enum TraceEvent {
         /// Its time is only an upper bound: the frame ended then or earlier.
         late: bool,
     },
-    /// The controller saw an error on the bus. Kind and counters are known from a device, and from
-    /// those formats that carry them.
+    /// The controller detected an error on the bus. Kind and counters are known from a device, and from
+    /// formats that carry them.
     BusError {
-        /// What, if known.
+        /// The kind of error, if known.
         kind: Option<BusErrorKind>,
         /// Transmit and receive error counters after it, if known.
         counters: Option<(u8, u8)>,
     },
     /// Bus errors that were counted but not reported one by one.
     ErrorsSuppressed {
-        /// How many.
+        /// Number of errors.
         count: u32,
     },
     /// The controller's fault confinement changed.
@@ -62,22 +62,22 @@ pub enum TraceEvent {
     Lost {
         /// The stage that lost them, if known.
         stage: Option<LossStage>,
-        /// How many.
+        /// Number of frames.
         count: u32,
         /// Whether there may have been more.
         at_least: bool,
     },
-    /// The device was asked to send a frame and did not.
+    /// The device did not send a frame that it was asked to send.
     TransmitFailed {
         /// The request's tag.
         tag: u32,
-        /// Why.
+        /// The reason.
         reason: TransmitFailure,
     },
 }
 
 impl TraceEvent {
-    /// From here to the next record nothing is known: the device was not there. How many frames are missing nobody can tell.
+    /// Nothing is known from here to the next record: the device was not there. The number of missing frames is unknown.
     pub const GAP: Self = Self::Lost { stage: Some(LossStage::Link), count: 0, at_least: true };
 }
 

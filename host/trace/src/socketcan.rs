@@ -1,8 +1,8 @@
-//! Error frames as Linux's SocketCAN defines them (`linux/can/error.h`): the form in which candump logs,
-//! pcapng and python-can's CSV carry everything that is not a frame.
+//! Error frames as Linux's SocketCAN defines them (`linux/can/error.h`): the form in which everything that is
+//! not a frame appears in candump logs, pcapng and python-can's CSV.
 //!
-//! A frame with bit 29 set in its ID has error classes in the low bits and details in eight data
-//! bytes. What SocketCAN has no place for (how many frames were lost, and where) goes into bytes that the
+//! A frame with bit 29 set in its ID has error classes in the low bits and details in eight data bytes.
+//! Information without a place in SocketCAN (how many frames were lost, and where) goes into bytes that the
 //! classes in use leave free, so other programs see an ordinary error frame of the right class.
 
 use cantap_wire::message::DEVICE_TAG;
@@ -10,7 +10,7 @@ use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 
 use crate::TraceEvent;
 
-/// The flag that makes an ID an error frame.
+/// The flag in an ID that marks an error frame.
 pub const ERROR_FLAG: u32 = 0x2000_0000;
 
 const TX_TIMEOUT: u32 = 0x001;
@@ -18,9 +18,9 @@ const LOST_ARBITRATION: u32 = 0x002;
 const CONTROLLER: u32 = 0x004;
 const PROTOCOL: u32 = 0x008;
 const NO_ACK: u32 = 0x020;
-/// The class of a controller that went off the bus.
+/// The class for a controller that went bus-off.
 pub const BUS_OFF: u32 = 0x040;
-/// The class that python-can takes as the sign of an error frame.
+/// The class by which python-can recognises an error frame.
 pub const BUS_ERROR: u32 = 0x080;
 const RESTARTED: u32 = 0x100;
 const COUNTERS: u32 = 0x200;
@@ -42,7 +42,8 @@ const AT_CRC: u8 = 0x08;
 const AT_CRC_DELIMITER: u8 = 0x18;
 const AT_ACK: u8 = 0x19;
 
-// Ours. data[0] belongs to LOST_ARBITRATION, data[2..6] to PROTOCOL and to the transceiver's status.
+// These are ours. data[0] belongs to LOST_ARBITRATION, data[2..6] to PROTOCOL and to the transceiver's
+// status.
 const AT_LEAST: u8 = 0x80;
 const SUPPRESSED: u8 = 0x40;
 
@@ -54,8 +55,8 @@ const FAILURES: [TransmitFailure; 5] = [
     TransmitFailure::Closed,
     TransmitFailure::BusOff,
 ];
-/// In the place of a number among [`FAILURES`]: the count is then that of the periods. Only the device's own frames are overtaken, so
-/// the lower half of the tag says all of it; it takes the bytes of the error counters.
+/// Takes the place of a position in [`FAILURES`]: the count is then that of the periods. Only the device's own frames are overtaken,
+/// so the lower half of the tag is enough; it uses the bytes of the error counters.
 const OVERTAKEN: u8 = 6;
 
 /// An error frame: its classes, without [`ERROR_FLAG`], and its data.
@@ -67,13 +68,13 @@ pub struct ErrorFrame {
     pub data: [u8; 8],
 }
 
-/// The place of `item` in `list` from 1; 0 if it is not known.
+/// The position of `item` in `list`, from 1; 0 if it is unknown.
 fn position<T: PartialEq>(list: &[T], item: Option<T>) -> u8 {
     item.and_then(|item| list.iter().position(|entry| *entry == item)).map_or(0, |at| at as u8 + 1)
 }
 
 impl ErrorFrame {
-    /// The error frame of an event; `None` for a frame.
+    /// The error frame for an event; `None` for a frame.
     pub fn of(event: &TraceEvent) -> Option<Self> {
         let mut data = [0; 8];
         let mut classes = match *event {
@@ -136,7 +137,7 @@ impl ErrorFrame {
         Some(Self { classes, data })
     }
 
-    /// What an error frame says: the most telling event, and beside a change of state the bus error
+    /// The meaning of an error frame: the most important event, and for a change of state also the bus error
     /// that caused it, if the frame names one.
     pub fn events(&self) -> (TraceEvent, Option<TraceEvent>) {
         let Self { classes, data } = *self;
@@ -147,7 +148,7 @@ impl ErrorFrame {
         if has(CONTROLLER) && data[1] & RX_OVERFLOW != 0 {
             let stage = STAGES.get((data[0] & !AT_LEAST).wrapping_sub(1) as usize).copied();
             let is_at_least = data[0] & AT_LEAST != 0;
-            // A count only stands here if nobody else claims the bytes. A loss of nobody knows how many has none, and its stage.
+            // There is a count only if nothing else uses the bytes. A loss of unknown size has no count, but it has a stage.
             let counted = (number > 0 || is_at_least && stage.is_some()) && !has(PROTOCOL);
             let (count, at_least) = if counted { (number, is_at_least) } else { (1, true) };
             return (TraceEvent::Lost { stage, count, at_least }, None);
@@ -191,7 +192,7 @@ impl ErrorFrame {
         (bus_error, None)
     }
 
-    /// Whether [`Self::events`] tell all that the frame says.
+    /// Whether [`Self::events`] return everything that the frame says.
     pub fn is_told_whole(&self) -> bool {
         let (event, second) = self.events();
         let mut again = Self { classes: 0, data: [0; 8] };
@@ -204,7 +205,8 @@ impl ErrorFrame {
         match event {
             TraceEvent::Lost { .. } => bare.data = [0, RX_OVERFLOW, 0, 0, 0, 0, 0, 0],
             TraceEvent::TransmitFailed { .. } => bare.data = [0; 8],
-            // Which of the counters, and how the change came about, the state itself need not say.
+            // Which of the counters, and which way the state changed, may be missing: the state itself is
+            // enough.
             TraceEvent::State { .. } => {
                 const CHANGES: u32 = CONTROLLER | BUS_OFF | RESTARTED;
                 bare.classes = bare.classes & !CHANGES | self.classes & CHANGES;
@@ -250,7 +252,7 @@ mod tests {
             let frame = ErrorFrame::of(&event).unwrap();
             prop_assert_eq!(frame.events(), (event, None));
             prop_assert!(frame.is_told_whole());
-            // With the class that makes python-can see an error frame.
+            // With the class by which python-can recognises an error frame.
             let marked = ErrorFrame { classes: frame.classes | BUS_ERROR, ..frame };
             prop_assert_eq!(marked.events(), (event, None));
         }
@@ -262,7 +264,7 @@ mod tests {
         }
     }
 
-    /// Frames that Linux drivers make.
+    /// Frames as Linux drivers make them.
     #[test]
     fn drivers_error_frames_are_understood() {
         let events = |classes, data| ErrorFrame { classes, data }.events();
@@ -283,7 +285,8 @@ mod tests {
         let whole = |classes, data| ErrorFrame { classes, data }.is_told_whole();
         assert!(whole(0x204, [0, 0x10, 0, 0, 0, 0, 0, 128]) && whole(0x08C, [0, 8, 4, 0, 0, 0, 0, 0]));
         assert!(whole(0x004, [0, 1, 0, 0, 0, 0, 0, 0]) && whole(0x001, [0; 8]) && whole(0x020, [0; 8]));
-        // Where in the frame it was, at which bit arbitration was lost, and a transceiver's fault are not kept.
+        // The position in the frame, the bit at which arbitration was lost, and a transceiver's fault are not
+        // kept.
         assert!(!whole(0x088, [0, 0, 4, 0x0B, 0, 0, 0, 0]) && !whole(0x002, [9, 0, 0, 0, 0, 0, 0, 0]));
         assert!(!whole(0x010, [0, 0, 0, 0, 4, 0, 0, 0]));
     }

@@ -1,4 +1,4 @@
-//! Records for tests: random ones, and one to count.
+//! Records for tests: random ones, and simple numbered ones.
 
 use cantap_wire::message::DEVICE_TAG;
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
@@ -15,7 +15,7 @@ fn id() -> impl Strategy<Value = Id> {
     ]
 }
 
-/// Any frame that a classical bus can carry.
+/// Any frame that is possible on a classical bus.
 pub fn frame() -> impl Strategy<Value = Frame> {
     (id(), any::<bool>(), 0..16_u8, any::<[u8; 8]>())
         .prop_map(|(id, remote, dlc, data)| Frame::from_bus(id, remote, dlc, data))
@@ -63,7 +63,7 @@ pub fn event() -> impl Strategy<Value = TraceEvent> {
     ]
 }
 
-/// A data frame at a time.
+/// A data frame at a given time.
 pub fn data_record(time_ns: i64) -> TraceRecord {
     let frame = "123#DEADBEEF".parse().unwrap();
     let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
@@ -75,7 +75,7 @@ pub fn record(resolution_ns: i64) -> impl Strategy<Value = TraceRecord> {
     record_of(frame().prop_map(TraceFrame::from), resolution_ns)
 }
 
-/// As [`record`], FD frames among them.
+/// Like [`record`], but including FD frames.
 pub fn record_or_fd(resolution_ns: i64) -> impl Strategy<Value = TraceRecord> {
     record_of(
         prop_oneof![frame().prop_map(TraceFrame::from), fd_frame().prop_map(TraceFrame::from)],

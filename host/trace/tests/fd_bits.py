@@ -14,7 +14,7 @@ def bits(value, width):
 
 
 def dynamic_stuffing(text):
-    """The stream with a complementary bit behind five equal ones, and where the bits of the text came to stand."""
+    """The stream with a complementary bit after five equal ones, and the new positions of the text's bits."""
     out, places = "", []
     for bit in text:
         if len(out) >= 5 and out[-5:] == out[-1] * 5:
@@ -25,7 +25,7 @@ def dynamic_stuffing(text):
 
 
 def remainder(text, polynomial):
-    """The CRC as long division, the dividend with the start value in front: a one and zeros."""
+    """The CRC as long division, the dividend preceded by the start value: a one and zeros."""
     width = polynomial.bit_length() - 1
     value = int(text + "0" * width, 2) ^ (1 << (len(text) + width - 1))
     for at in range(len(text) + width - 1, width - 1, -1):

@@ -1,6 +1,8 @@
-//! Exact lengths of CAN FD frames against a model in another language, which builds the levels on the bus one by one.
+//! Checks exact lengths of CAN FD frames against a model in another language, which builds the levels on the bus one
+//! by one.
 //!
-//! Python is `CANTAP_PYTHON`, else `python3`. Where there is none the test says so and passes, unless `CANTAP_REQUIRE_PEERS=1`.
+//! The interpreter is `CANTAP_PYTHON`, otherwise `python3`. Without one, the test says so and passes, unless
+//! `CANTAP_REQUIRE_PEERS=1`.
 
 use std::io::Write;
 use std::process::{Command, Stdio};
@@ -10,7 +12,7 @@ use cantap_trace::{FdBits, FdFrame, Id};
 
 const MODEL: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fd_bits.py");
 
-/// Every length with every flag, with data that make many stuff bits and few.
+/// Every length with every flag, with data that cause many stuff bits and few.
 fn frames() -> Vec<FdFrame> {
     let mut random = fastrand::Rng::with_seed(12);
     let mut frames = Vec::new();

@@ -1,8 +1,8 @@
-//! Whatever a host sends, in any order, on both channels, at any load: the device keeps answering, and every frame that
+//! Whatever a host sends, in any order, on both channels, at any load, the device keeps answering, and every frame that
 //! was on the bus is delivered or counted.
 //!
 //! Real firmware logic on the simulated bus, in model time that this host advances itself, so that a failing sequence fails
-//! again. The sequences hold possible and impossible commands, greetings in the middle, resets, the bootloader, garbage, a
+//! again. The sequences contain possible and impossible commands, repeated greetings, resets, the bootloader, garbage, a
 //! port that closes and opens, slcan lines, and a host that does not read for a while.
 
 #[path = "../../../tests/arbitrary/mod.rs"]
@@ -28,14 +28,14 @@ use super::machine::{Machine, Memory, Witness, World};
 use crate::simbus::Frames;
 use cantap::device::{PipeReader, PipeWriter, pipe};
 
-/// Sequences, each on a device of its own.
+/// Number of sequences, each on a new device.
 const SEQUENCES: u32 = 10_000;
-/// Times that the firmware may start in one sequence.
+/// How often the firmware may start in one sequence.
 const LIVES: usize = 5;
-/// Model time within which a device must have answered: it waits 100 ms for a stuck bus before it leaves it by force.
+/// Model time within which a device must have answered: it waits 100 ms for a stuck bus before it leaves by force.
 const PATIENCE_MS: u32 = 400;
 const MS_NS: u64 = 1_000_000;
-/// Bytes under way in each direction.
+/// Bytes in flight in each direction.
 const PIPE_BYTES: usize = 16 * 1024;
 
 #[derive(Clone, Debug)]
@@ -43,9 +43,9 @@ enum Action {
     Ask(Box<Command>),
     /// A new session.
     Greet,
-    /// The books are held against each other, and the session goes on.
+    /// The books are balanced, and the session continues.
     Balance,
-    /// The firmware ends, by one of the two commands for it.
+    /// The firmware ends, through one of the two commands for it.
     End(Box<Command>),
     Garbage(Vec<u8>),
     Line(Vec<u8>),
@@ -103,7 +103,7 @@ fn line() -> impl Strategy<Value = Vec<u8>> {
 fn action() -> impl Strategy<Value = Action> {
     let end = prop::sample::select(vec![Command::Reset, Command::Bootloader]);
     prop_oneof![
-        // Rare, because it is much to compute.
+        // Rare, because it takes much computing.
         40 => (600..1400_u16).prop_map(Action::Stall),
         4200 => command().prop_map(|command| Action::Ask(Box::new(command))),
         100 => Just(Action::Greet),
@@ -139,23 +139,23 @@ fn world() -> impl Strategy<Value = Options> {
     )
 }
 
-/// What is known of the session under way.
+/// What is known of the current session.
 #[derive(Default)]
 struct Books {
     /// What each bus had carried when it began.
     heard_before: [u64; CHANNELS],
     received: [u64; CHANNELS],
     lost: [u64; CHANNELS],
-    /// Frames that the device took for transmission, and those whose end it has reported.
+    /// Frames that the device accepted for transmission, and those whose end it has reported.
     taken: [usize; CHANNELS],
     ended: [usize; CHANNELS],
-    /// Anything that a decoder in a session should not say.
+    /// Everything that a decoder in a session should not report.
     complaints: Vec<String>,
 }
 
 /// A host and its device.
 struct Rig<'q> {
-    /// For each life of the firmware.
+    /// One for each life of the firmware.
     memories: IterMut<'q, Option<Box<Memory>>>,
     machine: Option<Machine<'q>>,
     from_device: PipeReader,
@@ -163,13 +163,13 @@ struct Rig<'q> {
     open: Arc<Dtr>,
     witness: Arc<Witness>,
     decoder: Box<Decoder>,
-    /// The host reads.
+    /// Whether the host reads.
     reads: bool,
     next_id: u16,
-    /// Requests that wait for their answer, with the frames that they carry.
+    /// Requests waiting for their answer, with the frames that they carry.
     waiting: Vec<(u16, Option<(Channel, usize)>)>,
     answers: Vec<Response>,
-    /// Answers to what was not asked, or twice.
+    /// Answers that were not requested, or came twice.
     surplus: Vec<u16>,
     books: Option<Books>,
 }
@@ -205,7 +205,7 @@ impl<'q> Rig<'q> {
         self.machine = Some(Machine::power_up(memory, world));
     }
 
-    /// What was under way comes to nothing.
+    /// Whatever was in progress is lost.
     fn forget(&mut self) {
         self.books = None;
         self.waiting.clear();
@@ -219,7 +219,7 @@ impl<'q> Rig<'q> {
             self.read();
         }
         if let Some(machine) = self.machine.take_if(|machine| machine.ending().is_some()) {
-            // What it had said is with the host already.
+            // What it had said has already reached the host.
             self.read();
             self.forget();
             // After the bootloader, somebody switched it off and on.
@@ -258,7 +258,7 @@ impl<'q> Rig<'q> {
                         None => surplus.push(response.id),
                     }
                     if matches!(response.result, Ok(Reply::Hello(_))) {
-                        // What was asked before it may have been dropped with its session.
+                        // Earlier requests may have been dropped with their session.
                         waiting.clear();
                         let heard_before = witness.heard().frames;
                         *books = Some(Books { heard_before, ..Books::default() });
@@ -288,14 +288,14 @@ impl<'q> Rig<'q> {
         let mut message = [0; MAX_REQUEST + CRC_LEN];
         let mut encoded = vec![0; max_encoded_len(MAX_REQUEST)];
         let length = framing::encode(&Request { id, command }, &mut message, &mut encoded).unwrap();
-        // The zero ends whatever stands in the device's input, and chooses our language.
+        // The zero ends anything left in the device's input and selects our protocol.
         self.say(&[0]);
         self.say(&encoded[..length]);
         self.waiting.push((id, carried));
         id
     }
 
-    /// Asks and reads until the answer is there; `None` if a reset that was asked for before took it away.
+    /// Sends a request and reads until the answer arrives; `None` if an earlier reset request lost it.
     fn await_answer(&mut self, command: Command) -> Result<Option<Response>, TestCaseError> {
         self.reads = true;
         self.answers.clear();
@@ -315,7 +315,7 @@ impl<'q> Rig<'q> {
 
     fn greet(&mut self) -> Result<(), TestCaseError> {
         loop {
-            // As a host does, which tries again when nothing answers.
+            // Like a host that tries again when nothing answers.
             let Some(answer) = self.await_answer(Command::Hello { protocol: PROTOCOL_VERSION })? else {
                 continue;
             };
@@ -324,7 +324,7 @@ impl<'q> Rig<'q> {
         }
     }
 
-    /// The status, as soon as everything recorded has been read; `None` after a reset.
+    /// The status, once everything recorded has been read; `None` after a reset.
     fn drain(&mut self) -> Result<Option<Status>, TestCaseError> {
         // Answers overtake records: a full queue takes a tenth of a second.
         for _ in 0..PATIENCE_MS {
@@ -359,7 +359,7 @@ impl<'q> Rig<'q> {
             Action::Close(ms) => {
                 self.open.set(false);
                 self.pass(u32::from(ms) + 1);
-                // The next program finds nothing of what was under way.
+                // The next program finds nothing of what was in progress.
                 while self.from_device.take(&mut [0; 4096]) > 0 {}
                 *self.decoder = Decoder::new();
                 self.forget();
@@ -375,10 +375,10 @@ impl<'q> Rig<'q> {
         Ok(())
     }
 
-    /// Both channels are closed and the books are held against each other, if there is a session.
+    /// Closes both channels and balances the books, if there is a session.
     fn balance(&mut self) -> Result<(), TestCaseError> {
         self.reads = true;
-        // Half a line in the device's input would be the beginning of what is asked next.
+        // Half a line in the device's input would become the beginning of the next request.
         self.say(&[0]);
         self.pass(1);
         if self.books.is_none() {
@@ -391,7 +391,7 @@ impl<'q> Rig<'q> {
         let Some(status) = self.drain()? else { return Ok(()) };
         self.pass(3);
         let Some(books) = &self.books else { return Ok(()) };
-        // Only what found no room in the device's input, and is counted, may stay without an answer.
+        // Only requests that found no room in the device's input, which are counted, may stay unanswered.
         prop_assert!(self.waiting.len() <= status.bad_requests as usize, "{:?} of {status:?}", self.waiting);
         prop_assert!(books.complaints.is_empty(), "{:?}", books.complaints);
         let heard = self.witness.heard().frames;
@@ -408,7 +408,7 @@ impl<'q> Rig<'q> {
         Ok(())
     }
 
-    /// After all of it, the device serves the next host as if nothing had been.
+    /// After all of it, the device serves the next host as if nothing had happened.
     fn settle(mut self) -> Result<(), TestCaseError> {
         self.reads = true;
         self.pass(60);

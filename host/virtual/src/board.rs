@@ -20,34 +20,34 @@ use super::edges::VirtualMeter;
 use super::flash::Flash;
 use cantap::device::{PipeReader, PipeWriter};
 
-/// Bulk packets in each millisecond: 1.02 MB/s. Full speed would allow 19 (USB 2.0, table 5-9).
+/// Bulk packets per millisecond: 1.02 MB/s. Full speed would allow 19 (USB 2.0, table 5-9).
 const PACKETS_PER_MS: u32 = 16;
 
 /// Nanoseconds in 10⁹ seconds.
 const GS_NS: u128 = 1_000_000_000_000_000_000;
 /// Nanoseconds of a USB frame.
 pub const FRAME_NS: u64 = 1_000_000;
-/// How long after the host's frames start the device's millisecond ticks come, when neither delays the other.
+/// When the device's millisecond ticks come after the start of the host's frames, if neither is delayed.
 pub const TICK_PHASE_NS: u64 = 700_000;
 /// The bits of a frame number in a SOF token (USB 2.0, 8.4.3).
 const FRAME_NUMBER: u16 = 0x7FF;
 
-/// Model time, seen as the firmware's stamp timer.
+/// Model time as the firmware's stamp timer shows it.
 pub struct ModelClock {
     now_ns: Cell<u64>,
     /// When the firmware started.
     started_ns: u64,
     alarm_ns: Cell<Option<u64>>,
-    /// Ticks in 10⁹ seconds: [`TICK_HZ`], more or less what the crystal is off.
+    /// Ticks in 10⁹ seconds: [`TICK_HZ`], adjusted by the error of the crystal.
     ticks_per_gs: u64,
-    /// Model time and this are the USB host's, whose frames are whole milliseconds.
+    /// Added to model time, this gives the USB host's time, whose frames are whole milliseconds.
     usb_ahead_ns: Cell<u64>,
-    /// The last frame that the latch has shown.
+    /// The last frame shown by the latch.
     frame_seen: Cell<u64>,
 }
 
 impl ModelClock {
-    /// The clock of a firmware that starts now, with a crystal that is so much too fast.
+    /// The clock of a firmware that starts now, with a crystal that is too fast by this much.
     pub fn started_at(now_ns: u64, crystal_ppm: f64) -> Self {
         Self {
             now_ns: Cell::new(now_ns),
@@ -70,7 +70,7 @@ impl ModelClock {
         self.usb_ahead_ns.set(ahead_ns);
     }
 
-    /// What the latch shows of the USB host's frames.
+    /// Takes the latch's reading of the USB host's frames.
     fn take_sof(&self) -> Option<SofReading> {
         let ahead_ns = self.usb_ahead_ns.get();
         let frame = (self.now_ns.get() + ahead_ns) / FRAME_NS;
@@ -115,7 +115,7 @@ impl Clock for ModelClock {
         let at_ns = at.map(|at| {
             let now = self.ticks();
             let ahead = at.wrapping_sub(now as u32) as i32;
-            // One that has passed goes off a tick from now, as a handler that is left takes a moment to be entered again.
+            // One that has passed goes off a tick from now, because a handler takes a moment to be entered again.
             let at = now + u64::from(ahead.max(1) as u32);
             self.started_ns + (u128::from(at) * GS_NS).div_ceil(u128::from(self.ticks_per_gs)) as u64
         });
@@ -135,7 +135,7 @@ pub enum Ending {
 /// The chip.
 pub struct VirtualChip {
     pub flash: Flash,
-    /// The firmware asked for it.
+    /// Set when the firmware asked to end.
     pub ending: Option<Ending>,
 }
 
@@ -155,7 +155,7 @@ impl Chip for VirtualChip {
     fn identify(&mut self, _seconds: u8) {}
 
     fn reset(&mut self) {
-        // Asked for the bootloader, the logic asks for a reset too, in case that there is none.
+        // When asked for the bootloader, the logic also asks for a reset, in case there is none.
         self.ending.get_or_insert(Ending::Restart);
     }
 
@@ -187,7 +187,7 @@ impl FilterBanks for Filters {
     }
 }
 
-/// Everything that the firmware's commands see.
+/// Everything that the firmware's commands access.
 pub struct VirtualBoard<'q> {
     pub capture: Capture<'q>,
     pub traffic: [TrafficSide; CHANNELS],
@@ -238,7 +238,7 @@ impl<'q> Board<'q, QUEUE_BYTES> for VirtualBoard<'q> {
     }
 }
 
-/// Whether the host has the port open: set on its side, seen by the firmware when it looks.
+/// Whether the host has the port open: set by the host, seen by the firmware when it looks.
 #[derive(Debug)]
 pub struct Dtr {
     is_up: AtomicBool,
@@ -246,7 +246,7 @@ pub struct Dtr {
 }
 
 impl Dtr {
-    /// As both sides know it.
+    /// In a state that both sides know.
     pub const fn new(is_up: bool) -> Self {
         Self { is_up: AtomicBool::new(is_up), seen: AtomicBool::new(is_up) }
     }
@@ -261,7 +261,7 @@ impl Dtr {
         self.is_up.load(Ordering::SeqCst)
     }
 
-    /// Whether the firmware has taken notice: what it did because of what was before is over.
+    /// Whether the firmware has noticed the current state: it has finished reacting to the previous one.
     pub fn is_seen(&self) -> bool {
         self.seen.load(Ordering::SeqCst) == self.is_up()
     }
@@ -273,7 +273,7 @@ impl Dtr {
     }
 }
 
-/// USB as a pipe: a limited number of packets each millisecond, none while the host does not read.
+/// USB as a pipe: a limited number of packets per millisecond, none while the host does not read.
 pub struct VirtualPort {
     pub from_host: PipeReader,
     pub to_host: PipeWriter,
@@ -281,7 +281,7 @@ pub struct VirtualPort {
     pub open: Arc<Dtr>,
     /// Packets that may still be sent now.
     credit: u32,
-    /// The host was made to wait.
+    /// Whether the host has to wait.
     held: bool,
 }
 
@@ -290,7 +290,7 @@ impl VirtualPort {
         Self { from_host, to_host, open, credit: 0, held: false }
     }
 
-    /// A share of a millisecond has passed: one of `parts`.
+    /// A fraction of a millisecond has passed: one of `parts`.
     pub fn allow(&mut self, parts: u32) {
         self.credit = PACKETS_PER_MS.div_ceil(parts);
     }

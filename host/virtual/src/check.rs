@@ -1,5 +1,5 @@
-//! The law of counting, checked: every frame that was on the bus was delivered, in order and bit for bit, or
-//! is counted as lost exactly where it is missing.
+//! Checks the law of counting: every frame that was on the bus was delivered, in order and bit for bit, or is
+//! counted as lost exactly where it is missing.
 
 use crate::simbus::FrameSource;
 use cantap_trace::{TraceEvent, TraceRecord};
@@ -48,7 +48,7 @@ impl SequenceCheck {
         self.lost
     }
 
-    /// Whether each delivered frame was the one that had to come, each loss counted as its number of frames.
+    /// Whether each delivered frame was the expected one, with each loss counting for its number of frames.
     pub const fn in_order(&self) -> bool {
         self.in_order
     }

@@ -16,7 +16,7 @@ use cantap_wire::record::{BusErrorKind, ErrorState};
 
 use crate::simbus::Node;
 
-/// Frames that a receive FIFO holds (RM0090 Rev 21 §32.7.3).
+/// Number of frames that a receive FIFO holds (RM0090 Rev 21 §32.7.3).
 const FIFO_FRAMES: usize = 3;
 /// Error counters at which fault confinement changes (ISO 11898-1:2015, 12.1.4).
 const WARNING: u16 = 96;
@@ -25,7 +25,7 @@ const BUS_OFF: u16 = 256;
 /// Bits that a controller waits in bus-off: 128 times 11 recessive ones.
 const RECOVERY_BITS: u64 = 128 * 11;
 
-/// Where a controller is.
+/// What a controller is doing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Phase {
     Off,
@@ -36,7 +36,7 @@ enum Phase {
     Leaving,
 }
 
-/// What the controller asks the processor for.
+/// The controller's interrupt requests.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Interrupts {
     pub receive: bool,
@@ -55,25 +55,25 @@ pub struct Controller {
     mailboxes: [Option<Frame>; MAILBOXES],
     /// Mailboxes in the order in which they were requested.
     order: VecDeque<u8>,
-    /// Written to a mailbox and not requested.
+    /// Written to a mailbox but not requested.
     prepared: Option<Frame>,
     finished: VecDeque<(u8, Outcome)>,
-    /// The first of `order` is on the bus.
+    /// Whether the first of `order` is on the bus.
     sending: bool,
     aborting: bool,
     tec: u16,
     rec: u16,
     error: Option<BusErrorKind>,
     last_error: u32,
-    /// Left to wait in bus-off, in nanoseconds of model time at which it ends; set by the machine.
+    /// When waiting in bus-off ends, in nanoseconds of model time; set by the machine.
     recovers_at_ns: Option<u64>,
-    /// It was started while bus-off: initialisation mode was entered and left, which begins the recovery.
+    /// It was started while bus-off: entering and leaving initialisation mode begins the recovery.
     is_told_to_recover: bool,
-    /// Set when something happened, taken by the machine.
+    /// Set when something happened, and cleared by the machine.
     pub interrupts: Interrupts,
     /// Frames on the bus that passed the filters while the controller took part, delivered to the FIFO or not.
     pub heard: u64,
-    /// Times that it put a dominant level on a bus that others hear.
+    /// How often it put a dominant level on a bus with other nodes.
     pub driven: u64,
 }
 
@@ -104,19 +104,19 @@ impl Controller {
         }
     }
 
-    /// Whether it plays with itself only.
+    /// Whether it is in a loopback mode without the bus.
     pub fn is_looped(&self) -> bool {
         matches!(self.mode(), Some(Mode::Loopback | Mode::SilentLoopback))
     }
 
-    /// Returns whether they were others.
+    /// Returns whether they changed.
     pub fn set_filters(&mut self, filters: Vec<Bank>) -> bool {
         let differed = self.filters != filters;
         self.filters = filters;
         differed
     }
 
-    /// Called as time passes: ends bus-off when its time is over.
+    /// Called as time passes: ends bus-off when its time has come.
     pub fn pass(&mut self, now_ns: u64) {
         let is_manual = self.config.is_some_and(|config| config.manual_recovery);
         if self.state() != ErrorState::BusOff
@@ -140,8 +140,8 @@ impl Controller {
         self.is_told_to_recover = false;
     }
 
-    /// Initialisation mode is left. It does not touch the error counters: only the controller's reset does, and the sequence
-    /// that ends bus-off, which begins here (RM0090 Rev 21 §32.7.6).
+    /// Leaves initialisation mode. That does not affect the error counters: only the controller's reset does, and the
+    /// sequence that ends bus-off, which begins here (RM0090 Rev 21 §32.7.6).
     fn begin(&mut self) {
         self.recovers_at_ns = None;
         self.is_told_to_recover = self.state() == ErrorState::BusOff;
@@ -215,7 +215,8 @@ impl Controller {
         match self.mode() {
             // A silent controller's counters do not change.
             Some(Mode::ListenOnly) | None => {}
-            // A passive sender that nobody acknowledges does not count further (ISO 11898-1:2015, 12.1.4.2).
+            // A passive sender without an acknowledgement does not count any further (ISO 11898-1:2015,
+            // 12.1.4.2).
             Some(_) if own && kind == BusErrorKind::Acknowledgment && self.tec >= PASSIVE => {}
             Some(_) if own => self.tec = (self.tec + 8).min(BUS_OFF),
             Some(_) => self.rec = (self.rec + 1).min(PASSIVE),
@@ -235,7 +236,7 @@ impl Node for Controller {
     }
 
     fn acknowledges(&self) -> bool {
-        // In loopback the controller is its own audience.
+        // In loopback, the controller is its own receiver.
         self.takes_part() && self.mode().is_some_and(Mode::transmits) || self.is_looped()
     }
 
@@ -268,7 +269,7 @@ impl Node for Controller {
             self.tec = self.tec.saturating_sub(1);
             self.finish_first(Outcome::Sent);
         } else {
-            // It acknowledges, whatever its filters say.
+            // It acknowledges, whatever its filters.
             self.driven += u64::from(self.mode() == Some(Mode::Normal));
             self.rec = if self.rec > PASSIVE - 1 { PASSIVE - 9 } else { self.rec.saturating_sub(1) };
         }
@@ -281,7 +282,7 @@ impl Node for Controller {
         if !self.takes_part() {
             return;
         }
-        // An error-active controller's flag is dominant.
+        // The flag of an error-active controller is dominant.
         self.driven += u64::from(self.destroys());
         self.count_error(kind, own);
         if own {
@@ -290,7 +291,8 @@ impl Node for Controller {
             if std::mem::take(&mut self.aborting) {
                 self.finish_first(Outcome::Aborted);
             } else if one_shot {
-                // Otherwise the mailbox waits, through bus-off too (RM0090 Rev 21 §32.7.1: it is emptied by success or abort).
+                // Otherwise the mailbox waits, even through bus-off (RM0090 Rev 21 §32.7.1: it is emptied by success or
+                // abort).
                 self.finish_first(Outcome::Error);
             }
         }
@@ -361,7 +363,7 @@ impl Traffic for TrafficSide {
     fn registers(&self) -> RegisterSet {
         let controller = self.0.borrow();
         let state = controller.state();
-        // RM0090 Rev 21 §32.9.2; only what this model knows.
+        // RM0090 Rev 21 §32.9.2; only the parts that this model has.
         let esr = u32::from(state >= ErrorState::Warning)
             | u32::from(state >= ErrorState::Passive) << 1
             | u32::from(state == ErrorState::BusOff) << 2
@@ -402,7 +404,7 @@ impl Control for ControlSide {
         }
     }
 
-    /// By the controller's own reset, which clears its error counters.
+    /// Uses the controller's own reset, which clears its error counters.
     fn halt(&mut self) {
         let mut controller = self.0.borrow_mut();
         controller.leave();

@@ -1,4 +1,4 @@
-//! Receive pins measured: what the board's interrupt does, without its haste.
+//! Measures receive pins: what the board's interrupt does, without its timing constraints.
 
 use std::collections::VecDeque;
 
@@ -10,19 +10,19 @@ use cantap_wire::Channel;
 pub struct VirtualMeter {
     watched: Option<Channel>,
     kept: VecDeque<PinEdge>,
-    /// There was no room, and nothing is taken down until there is.
+    /// There was no room, and nothing is recorded until there is.
     full: bool,
     blind: bool,
     dominant: bool,
 }
 
 impl VirtualMeter {
-    /// Which channel's pin is watched.
+    /// The channel whose pin is watched.
     pub const fn watched(&self) -> Option<Channel> {
         self.watched
     }
 
-    /// The level of the pin that is watched changed.
+    /// The level of the watched pin changed.
     pub fn edge(&mut self, at: u32, dominant: bool) {
         self.dominant = dominant;
         if self.kept.len() >= EDGES_KEPT {

@@ -14,8 +14,8 @@ pub struct Flash {
 }
 
 impl Flash {
-    /// Erased, or as an earlier device left it in the file. A file that is not there yet, or is something else, reads as
-    /// erased.
+    /// Erased, or as an earlier device left it in the file. A file that does not exist yet, or is something else, reads
+    /// as erased.
     pub fn new(file: Option<PathBuf>) -> Self {
         let kept = file.as_ref().and_then(|file| std::fs::read(file).ok()).unwrap_or_default();
         let mut words: Vec<u32> = kept
@@ -27,7 +27,7 @@ impl Flash {
         Self { words, file }
     }
 
-    /// Saves as the board does. Returns whether it worked and the file, if there is one, has it.
+    /// Saves like the board. Returns whether it worked and, if there is a file, whether it was written.
     pub fn save(&mut self, bytes: &[u8]) -> bool {
         let saved = saved::save(self, bytes);
         let kept = self.file.as_ref().is_none_or(|file| {
@@ -37,7 +37,7 @@ impl Flash {
         saved && kept
     }
 
-    /// Reads what was saved last into `out`, and returns its length.
+    /// Reads what was last saved into `out`, and returns its length.
     pub fn load(&self, out: &mut [u8]) -> usize {
         saved::load(self, out)
     }

@@ -1,12 +1,12 @@
 #![doc = include_str!("../README.md")]
 //!
 //! It proves the logic and the host, in real time or as fast as possible. It does not prove interrupts,
-//! registers or USB: every interrupt is served at once, so stamps are exact and the controllers' FIFOs never
-//! overrun. USB is a pipe that carries no more than the bus would.
+//! registers or USB: every interrupt is served immediately, so stamps are exact and the controllers' FIFOs
+//! never overrun. USB is a pipe that carries no more than the bus would.
 //!
 //! Model time never depends on when the operating system runs the thread: bus, firmware and USB advance
-//! together, in steps that follow the wall clock. A thread that was held up catches up, and gives the host the
-//! time to read that it missed as well.
+//! together, in steps that follow the wall clock. A delayed thread catches up, and also gives the host the
+//! time to read that it missed.
 
 #![forbid(unsafe_code)]
 

@@ -1,4 +1,4 @@
-//! A trace file as the traffic of the simulated buses.
+//! Uses a trace file as the traffic of the simulated buses.
 
 use std::path::Path;
 
@@ -9,8 +9,8 @@ use cantap_formats::{ReadOptions, open_reader};
 use cantap_trace::{TraceEvent, TraceFrame};
 
 impl Options {
-    /// Replays a trace file at its own times in place of made-up frames: channel 1 of the file on the first
-    /// bus, 2 on the second. The file's first frame marks time zero, which is when a channel is opened.
+    /// Replays a trace file with its own timing instead of made-up frames: channel 1 of the file on the first
+    /// bus, 2 on the second. The file's first frame is at time zero, which is when a channel is opened.
     pub fn read_log(&mut self, path: &Path) -> Result<(), BadOption> {
         let bad = |reason: String| BadOption::Value {
             key: "log".to_owned(),

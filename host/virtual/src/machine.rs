@@ -25,10 +25,10 @@ use super::options::Options;
 use crate::simbus::{Node, Schedule, SimBus, Traffic};
 
 const MS_NS: u64 = 1_000_000;
-/// How many times in a millisecond USB is served.
+/// How many times per millisecond USB is served.
 const USB_POLLS_PER_MS: u32 = 4;
 
-/// What the simulated bus knows and no device can: how many frames a channel really heard.
+/// What the simulated bus knows and no device can: how many frames a channel really received.
 #[derive(Debug, Default)]
 pub struct Witness {
     heard: [AtomicU64; CHANNELS],
@@ -38,7 +38,7 @@ pub struct Witness {
 /// See [`Witness`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Heard {
-    /// Frames that ended well on each channel's bus while it was open and that its filters let pass.
+    /// Frames that ended well on each channel's bus while it was open, and that its filters let pass.
     pub frames: [u64; CHANNELS],
     /// Times that each channel's controller put a dominant level on its bus: frames that it began to send, acknowledged, or
     /// destroyed by an error flag.
@@ -54,7 +54,7 @@ impl Witness {
     }
 }
 
-/// The memory that the firmware is given at its start.
+/// The memory that the firmware gets at its start.
 pub struct Memory {
     records: RecordQueue,
     transmit: [TxQueue; CHANNELS],
@@ -97,7 +97,7 @@ impl World {
             joined: options.joined,
             witness,
             flash: Flash::new(options.settings.clone()),
-            // Cannot fail: longer ones are refused.
+            // This cannot fail: longer ones are refused.
             serial: String::try_from(options.serial.as_str()).unwrap_or_default(),
             name: if options.car { car::BOARD } else { "virtual" },
             crystal_ppm: options.crystal_ppm,
@@ -112,16 +112,16 @@ pub struct Machine<'q> {
     session: Session<'q>,
     port: VirtualPort,
     controllers: [Rc<RefCell<Controller>>; CHANNELS],
-    /// A bus for each channel; with `joined`, the first is both's.
+    /// A bus for each channel; with `joined`, the first serves both.
     buses: [SimBus; CHANNELS],
-    /// Where a controller in loopback mode plays with itself.
+    /// The bus of a controller in loopback mode.
     loops: [SimBus; CHANNELS],
     joined: bool,
     witness: Arc<Witness>,
     serial: String<24>,
     name: &'static str,
     crystal_ppm: f64,
-    /// What it reported of earlier firmwares' controllers.
+    /// What was counted in earlier lives of the firmware.
     heard_before: Heard,
     now_ns: u64,
     next_usb_ns: u64,
@@ -129,7 +129,7 @@ pub struct Machine<'q> {
 }
 
 impl<'q> Machine<'q> {
-    /// The firmware starts in new memory, with nothing open.
+    /// The firmware starts with new memory and nothing open.
     pub fn power_up(memory: &'q mut Memory, world: World) -> Self {
         let World { port, buses, loops, joined, witness, flash, serial, name, crystal_ppm, now_ns } = world;
         let controllers = [(); CHANNELS].map(|()| Rc::new(RefCell::new(Controller::new())));
@@ -167,7 +167,7 @@ impl<'q> Machine<'q> {
     /// The firmware is gone; buses, port and flash remain.
     pub fn power_down(self) -> World {
         let Self { board, port, buses, loops, joined, witness, serial, name, crystal_ppm, now_ns, .. } = self;
-        // What it had not read is lost with it.
+        // Whatever it had not read is lost with it.
         while port.from_host.take(&mut [0; 64]) > 0 {}
         World {
             port,
@@ -183,7 +183,8 @@ impl<'q> Machine<'q> {
         }
     }
 
-    /// Hangs the device on a USB host whose time is so far ahead of model time: its frames are whole milliseconds of it.
+    /// Connects the device to a USB host whose time is this far ahead of model time; its frames are whole milliseconds
+    /// of its time.
     pub fn plug_in(&mut self, usb_ahead_ns: u64) {
         self.board.clock.set_usb_ahead_ns(usb_ahead_ns);
         let phase_ns = (self.now_ns + usb_ahead_ns) % FRAME_NS;
@@ -222,7 +223,7 @@ impl<'q> Machine<'q> {
         }
     }
 
-    /// Everything that is due now.
+    /// Does everything that is due now.
     fn step(&mut self) {
         let now_ns = self.now_ns;
         for index in 0..2 * CHANNELS {
@@ -250,7 +251,7 @@ impl<'q> Machine<'q> {
         }
     }
 
-    /// Lets the meter see the edges of the pin that it watches.
+    /// Passes the edges of the watched pin to the meter.
     fn pass_edges(&mut self) {
         let watched = self.board.meter.watched().map(|channel| if self.joined { 0 } else { channel.index() });
         for (index, bus) in self.buses.iter_mut().enumerate() {
@@ -261,7 +262,7 @@ impl<'q> Machine<'q> {
         }
     }
 
-    /// Serves the interrupts that controllers ask for, at once.
+    /// Serves the controllers' interrupts immediately.
     fn interrupt(&mut self) {
         let Self { board, controllers, witness, heard_before, .. } = self;
         for channel in Channel::ALL {
@@ -295,7 +296,7 @@ impl<'q> Machine<'q> {
             is_looped == looped && (channel == index % CHANNELS || *joined && !looped)
         };
         match (on_it(0, first.is_looped()), on_it(1, second.is_looped())) {
-            // With both on one wire, the second bus is nobody's.
+            // With both channels on one wire, the second bus has no nodes.
             (true, true) if index == 1 => act(bus, &mut []),
             (true, true) => act(bus, &mut [&mut *first, &mut *second]),
             (true, false) if !*joined || index != 1 => act(bus, &mut [&mut *first]),

@@ -1,4 +1,4 @@
-//! What can be written after `virtual:`.
+//! The options after `virtual:`.
 
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
@@ -12,14 +12,14 @@ use crate::canopen::CanOpenBus;
 use crate::car::{self, CarBus};
 use crate::simbus::{FrameSource, Frames, Schedule, SimBus, Traffic};
 
-/// A crystal is not off by more than this; a USB host's frames may not be either (USB 2.0, 7.1.12: 500 ppm).
+/// The largest error of a crystal; a USB host's frames have the same limit (USB 2.0, 7.1.12: 500 ppm).
 const MOST_PPM: f64 = 500.0;
-/// As long as a serial number can be.
+/// The maximum length of a serial number.
 const MAX_SERIAL_BYTES: usize = 24;
 
-/// What a car on the bus leaves no room for.
+/// Options that a car on the bus excludes.
 const MADE_UP: [&str; 5] = ["load", "frames", "bitrate", "burst", "wire"];
-/// And CANopen nodes, which speak at any bit rate.
+/// Options that CANopen nodes exclude; they work at any bit rate.
 const MADE_UP_FRAMES: [&str; 3] = ["load", "frames", "burst"];
 
 /// How model time passes.
@@ -34,32 +34,33 @@ pub enum Pace {
 
 /// The simulated buses, their traffic, and the pace.
 ///
-/// As text: `load=50,frames=std8,bitrate=500k,seed=7`. Keys: `car` (a vehicle in place of made-up frames: see [`crate::car`]), `canopen` (CANopen nodes on the first bus: see [`crate::canopen`]), `load` (per cent), `frames` (`std0` `std8` `ext0`
-/// `ext8` `rtr` `mix`), `bitrate` (by default that of whoever opens the channel), `burst` (`10/960us`: frames
-/// in a burst, and its period), `errors` (per cent of the frames destroyed), `disturb` (this many of the frames that the device
-/// sends first are destroyed on each bus), `ack` (`yes`, `no`), `seed`, `settings` (a file that keeps what the device
-/// saves), `serial` (the serial number that it tells), `ppm` (how much too fast its crystal is, in parts per million), `pace` (`real`, `fast`), `wire` (`apart`: a bus for each channel;
-/// `joined`: one bus for both), `channels` (`1`, `2` or `both`: those with traffic), and at the end `log=FILE` (a trace
-/// file, replayed at its own times).
+/// As text: `load=50,frames=std8,bitrate=500k,seed=7`. Keys: `car` (a vehicle in place of made-up frames: see [`crate::car`]), `canopen` (CANopen
+/// nodes on the first bus: see [`crate::canopen`]), `load` (per cent), `frames` (`std0` `std8` `ext0` `ext8` `rtr` `mix`), `bitrate` (by default that
+/// with which the channel is opened), `burst` (`10/960us`: frames in a burst, and its period), `errors` (per cent of the frames destroyed), `disturb`
+/// (the number of frames destroyed on each bus, the first ones that the device sends), `ack` (`yes`, `no`), `seed`, `settings` (a file that keeps
+/// what the device saves), `serial` (its serial number), `ppm` (how much too fast its crystal is, in parts per million), `pace` (`real`, `fast`),
+/// `wire` (`apart`: a bus for each channel; `joined`: one bus for both), `channels` (`1`, `2` or `both`: those with traffic), and at the end
+/// `log=FILE` (a trace file, replayed with its own timing).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Options {
     /// Bus load in per cent, 0 to 100.
     pub load_percent: f64,
     /// Kind of frames.
     pub frames: Frames,
-    /// The buses' bit rate in bit/s; that of the channel's configuration if there is none.
+    /// The buses' bit rate in bit/s; `None` for that of the channel's configuration.
     pub bitrate_bps: Option<u32>,
-    /// Frames in a burst and the bursts' period, in place of an even load.
+    /// Number of frames in a burst and the bursts' period, instead of an even load.
     pub burst: Option<(u32, Duration)>,
-    /// Share of the frames that are destroyed and sent again, in per cent.
+    /// Percentage of the frames that are destroyed and sent again.
     pub error_percent: f64,
-    /// Frames of the device that are destroyed on each bus, the first ones. 32 in a row make a channel bus-off.
+    /// How many of the device's frames are destroyed on each bus, starting with the first. 32 in a row make a
+    /// channel bus-off.
     pub disturb: u32,
     /// Whether the simulated nodes acknowledge.
     pub acknowledge: bool,
-    /// File that keeps what the device saves, as flash does over a power cycle.
+    /// A file that keeps what the device saves, as flash does across a power cycle.
     pub settings: Option<PathBuf>,
-    /// Makes another sequence of frames.
+    /// Selects the sequence of frames.
     pub seed: u64,
     /// How time passes.
     pub pace: Pace,
@@ -69,13 +70,13 @@ pub struct Options {
     pub traffic_on: [bool; CHANNELS],
     /// How much faster the device's crystal runs than the computer's clock, in parts per million.
     pub crystal_ppm: f64,
-    /// The serial number that the device tells, at most 24 bytes.
+    /// The device's serial number, at most 24 bytes.
     pub serial: String,
     /// A vehicle on the buses, at its own bit rates: see [`crate::car`].
     pub car: bool,
     /// CANopen nodes on the first bus: see [`crate::canopen`].
     pub canopen: bool,
-    /// Frames to be replayed at their own times (nanoseconds since the start), in place of made-up ones, per channel.
+    /// Frames to replay at their own times (nanoseconds since the start) instead of made-up ones, per channel.
     pub log: Option<[Vec<(u64, Frame)>; CHANNELS]>,
 }
 
@@ -112,14 +113,14 @@ pub enum BadOption {
         "there is no option '{0}'; there are car, canopen, load, frames, bitrate, burst, errors, disturb, ack, seed, settings, serial, ppm, pace, wire, channels, log"
     )]
     Unknown(String),
-    /// The value does not fit.
+    /// The value is invalid.
     #[error("'{value}' does not fit the option '{key}': {reason}")]
     Value {
         /// The option.
         key: String,
         /// Its value.
         value: String,
-        /// What would fit.
+        /// What would be valid.
         reason: String,
     },
 }
@@ -131,7 +132,7 @@ impl FromStr for Options {
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let mut options = Self::default();
         let mut given = Vec::new();
-        // A file's name may have commas: it takes the rest.
+        // A file's name may contain commas: it extends to the end.
         let (text, log) = match text.strip_prefix("log=") {
             Some(file) => ("", Some(file)),
             None => text.split_once(",log=").map_or((text, None), |(text, file)| (text, Some(file))),
@@ -234,7 +235,7 @@ impl Options {
         FrameSource::new(self.frames, self.seed.wrapping_mul(2).wrapping_add(channel as u64))
     }
 
-    /// The bit rate of a channel's bus in bit/s, if it has one of its own.
+    /// The bit rate of a channel's bus in bit/s, if it is fixed.
     pub fn bitrate_of_bus(&self, channel: usize) -> Option<u32> {
         if self.car { car::BITRATES_BPS.get(channel).copied() } else { self.bitrate_bps }
     }

@@ -1,4 +1,4 @@
-//! The virtual device behind a pseudo terminal, so that any program that opens serial ports can use it.
+//! The virtual device behind a pseudo-terminal, so that any program that opens serial ports can use it.
 
 use std::io::{self, ErrorKind, Write};
 use std::os::fd::OwnedFd;
@@ -20,8 +20,8 @@ use cantap::device::{PipeReader, PipeWriter};
 /// How often to check whether a terminal is still, or again, in use.
 const LOOK_EVERY: Duration = Duration::from_millis(10);
 
-/// A pseudo terminal with a virtual device behind it, until it is dropped. A reset starts its firmware
-/// again behind the same path; the program that has it open finds no session any more.
+/// A pseudo-terminal with a virtual device behind it, until it is dropped. After a reset its firmware starts
+/// again at the same path; a program that has it open finds that there is no session any more.
 pub struct Terminal {
     path: String,
     quit: Arc<AtomicBool>,
@@ -35,28 +35,28 @@ impl Terminal {
         &self.path
     }
 
-    /// False once the firmware has left for the bootloader, which the virtual device does not have.
+    /// False once the firmware has entered the bootloader, which the virtual device does not have.
     pub fn is_running(&self) -> bool {
         self.device.as_ref().is_some_and(VirtualDevice::is_running)
     }
 }
 
-/// Why there is no virtual device behind a pseudo terminal.
+/// Why a virtual device behind a pseudo-terminal could not be started.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum TerminalError {
-    /// The system gave no pseudo terminal.
+    /// The system provided no pseudo-terminal.
     #[error("cannot open a pseudo terminal: {0}")]
     Terminal(#[source] io::Error),
-    /// The system gave no thread.
+    /// The system could not start a thread.
     #[error("the system refused a thread: {0}; close other programs and try again")]
     Thread(#[from] io::Error),
 }
 
-/// Starts a virtual device behind a new pseudo terminal.
+/// Starts a virtual device behind a new pseudo-terminal.
 pub fn open_terminal(options: Options) -> Result<Terminal, TerminalError> {
     let (terminal, path) = new_terminal().map_err(TerminalError::Terminal)?;
-    // A board's port comes back under the same name.
+    // A board's port comes back with the same name.
     let connection = start_with(options, After::Restart)?;
     connection.open.set(false);
     let quit = Arc::new(AtomicBool::new(false));
@@ -84,7 +84,7 @@ struct Line {
     path: String,
     dtr: Arc<Dtr>,
     from_device: PipeReader,
-    /// Held by whoever has bytes on their way to the program.
+    /// Held while bytes are on their way to the program.
     in_hand: Mutex<()>,
     quit: Arc<AtomicBool>,
 }
@@ -100,7 +100,7 @@ impl Line {
         while !self.is_over() {
             let events = self.wait_for(PollFlags::IN, LOOK_EVERY);
             if events.contains(PollFlags::HUP) {
-                // What a program wrote before it closed the port is its own, and not the next one's.
+                // What a program wrote before it closed the port is its own, not the next program's.
                 if events.contains(PollFlags::IN) {
                     self.open();
                     while let Ok(len @ 1..) = rustix::io::read(&self.terminal, &mut bytes[..]) {
@@ -111,7 +111,7 @@ impl Line {
                 std::thread::sleep(LOOK_EVERY);
                 continue;
             }
-            // Before anything of it is read: the firmware drops what it finds while the port is closed.
+            // This must come before reading: the firmware drops what it finds while the port is closed.
             self.open();
             if let Ok(len) = rustix::io::read(&self.terminal, &mut bytes[..]) {
                 self.hand_in(&bytes[..len], &mut device);
@@ -119,7 +119,7 @@ impl Line {
         }
     }
 
-    /// A device that makes the host wait makes the program wait: nothing is lost, unless it closes the port.
+    /// A device that makes the host wait makes the program wait: nothing is lost unless it closes the port.
     fn hand_in(&self, mut bytes: &[u8], device: &mut PipeWriter) {
         while !bytes.is_empty() && !self.is_over() {
             match device.write(bytes) {
@@ -138,7 +138,7 @@ impl Line {
     fn wait_for(&self, what: PollFlags, timeout: Duration) -> PollFlags {
         let mut fds = [PollFd::new(&self.terminal, what)];
         let timeout = Timespec { tv_sec: 0, tv_nsec: timeout.subsec_nanos().into() };
-        // Interrupted, or nothing within the time: it is asked again.
+        // Interrupted, or nothing in time: the caller tries again.
         let _ = poll(&mut fds, Some(&timeout));
         fds[0].revents()
     }
@@ -150,14 +150,14 @@ impl Line {
         }
     }
 
-    /// The program has closed the port: what the device still had for it must not reach the next program.
+    /// The program has closed the port: nothing that the device still had for it may reach the next program.
     fn close(&self) {
         if self.dtr.is_up() {
             self.dtr.set(false);
             self.wait_until_seen();
             let _in_hand = self.in_hand.lock().unwrap_or_else(PoisonError::into_inner);
             while self.from_device.take(&mut [0; 4096]) > 0 {}
-            // Only its other end can empty what is in the terminal.
+            // Only the other end can discard what is in the terminal.
             if let Ok(other) = other_end(&self.path) {
                 let _ = rustix::termios::tcflush(other, QueueSelector::IFlush);
             }
@@ -192,8 +192,8 @@ impl Line {
     }
 }
 
-/// A pseudo terminal in raw mode, and the path of its other end. That end was open and is closed, so that the system tells when
-/// a program opens it.
+/// A pseudo-terminal in raw mode, and the path of its other end. That end has been opened and closed once, so that the system
+/// reports when a program opens it.
 fn new_terminal() -> io::Result<(OwnedFd, String)> {
     let Pty { controller, user } = openpty(None, None)?;
     let mut settings = rustix::termios::tcgetattr(&user)?;

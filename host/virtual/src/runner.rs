@@ -1,4 +1,4 @@
-//! The thread that a virtual device runs in, and how its time follows the wall clock.
+//! The thread of a virtual device, and how its time follows the wall clock.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
@@ -11,22 +11,22 @@ use super::options::{Options, Pace};
 use cantap::device::{Link, PipeReader, PipeWriter, pipe};
 use cantap::{Device, DeviceError};
 
-/// Bytes on their way to the host: about what an operating system's serial driver holds.
+/// Bytes on their way to the host: about what an operating system's serial driver buffers.
 const TO_HOST_BYTES: usize = 32 * 1024;
 /// Bytes on their way to the device.
 const FROM_HOST_BYTES: usize = 16 * 1024;
 /// Model time advances in steps of this length.
 const STEP: Duration = Duration::from_millis(1);
-/// A thread that wakes up later than this was held up by other programs.
+/// A thread that wakes up later than this was delayed by other programs.
 const HELD_UP: Duration = Duration::from_millis(3);
-/// So much lateness is made good to the host.
+/// The most lateness for which the host is compensated.
 const MAX_OWED: Duration = Duration::from_millis(500);
 /// The host is given time when the pipe has less room than one step can fill at full USB speed.
 const LITTLE_ROOM: usize = 2 * 1024;
-/// In one piece.
+/// The length of a single wait.
 const WAIT: Duration = Duration::from_millis(5);
 
-/// When the USB host of all virtual devices began its frames.
+/// When the USB host of all virtual devices started its frames.
 static USB_HOST: OnceLock<Instant> = OnceLock::new();
 
 /// A running virtual device. It ends when this is dropped or the host closes its pipe.
@@ -45,21 +45,21 @@ pub struct Connection {
     pub witness: Arc<Witness>,
     /// The device.
     pub device: VirtualDevice,
-    /// Whether the device sees its port as open; it is to begin with.
+    /// Whether the device sees its port as open; initially it does.
     pub open: Arc<Dtr>,
 }
 
 impl Connection {
-    /// As a device's link.
+    /// Converts it to a device's link.
     pub fn into_link(self) -> Link {
         Link::new(self.reader, self.writer).keeping(self.device)
     }
 }
 
-/// What a reset of the firmware is to the host.
+/// How the host sees a reset of the firmware.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum After {
-    /// The port vanishes, as it does when a board enumerates again; whoever opens a virtual device anew gets another one.
+    /// The port vanishes, as when a board enumerates again; opening a virtual device again gives a new one.
     Vanish,
     /// The firmware starts again behind the same port.
     #[cfg(unix)]
@@ -127,14 +127,15 @@ fn run(mut options: Options, port: VirtualPort, witness: Arc<Witness>, after: Af
     }
 }
 
-/// Model time is wall time, seen in steps.
+/// Model time follows wall time in steps.
 fn follow_the_wall_clock(machine: &mut Machine<'_>, is_over: impl Fn(&Machine<'_>) -> bool) {
     let (started, started_ns) = (Instant::now(), machine.now_ns());
-    // All virtual devices of a program hang on one USB host, which began with the first of them.
+    // All virtual devices of a program are on one USB host, which started with the first of them.
     let usb_ns = started.saturating_duration_since(*USB_HOST.get_or_init(|| started)).as_nanos() as u64;
     machine.plug_in(usb_ns.saturating_sub(started_ns));
     let mut slept_at = started;
-    // Time in which the host could not read because this thread, and so perhaps the host too, was held up.
+    // Time during which the host could not read because this thread, and so perhaps the host too, was
+    // delayed.
     let mut owed = Duration::ZERO;
     while !is_over(machine) {
         let late = slept_at.elapsed();

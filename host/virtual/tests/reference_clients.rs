@@ -1,8 +1,8 @@
-//! The clients in `docs/clients`, which were written from `docs/wire-protocol.md` alone: they read the test vectors, and they work
-//! with the virtual device.
+//! The clients in `docs/clients`, written from `docs/wire-protocol.md` alone: they read the test vectors and work with the virtual
+//! device.
 //!
-//! Python is `CANTAP_PYTHON`, else `python3`; the C compiler is `cc`. One that is missing is named and its client passes, unless
-//! `CANTAP_REQUIRE_PEERS=1`.
+//! Python is `CANTAP_PYTHON`, otherwise `python3`; the C compiler is `cc`. If one is missing, it is named and its client passes,
+//! unless `CANTAP_REQUIRE_PEERS=1`.
 #![cfg(unix)]
 
 use std::io::{BufRead, BufReader, Read};
@@ -15,11 +15,11 @@ use serde_json::Value;
 const CLIENTS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/clients");
 const VECTORS: &str = include_str!("../../../wire/vectors.json");
 
-/// A client, ready to run.
+/// A client that is ready to run.
 struct Client {
     name: &'static str,
     command: Vec<String>,
-    /// Where the compiled one is.
+    /// The folder of a compiled one.
     _directory: Option<tempfile::TempDir>,
 }
 
@@ -67,7 +67,7 @@ impl Client {
         command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
     }
 
-    /// Everything that it prints, and whether it ended well.
+    /// Everything that it prints, and whether it succeeded.
     fn run(&self, arguments: &[&str]) -> (Vec<String>, bool) {
         let output = self.start(arguments).wait_with_output().unwrap();
         let said = String::from_utf8(output.stdout).unwrap();
@@ -89,7 +89,7 @@ fn bytes(hex: &Value) -> Vec<u8> {
     hex.split(' ').map(|byte| u8::from_str_radix(byte, 16).unwrap()).collect()
 }
 
-/// The number behind a word of the last line.
+/// The number after a word in the last line.
 fn told(lines: &[String], word: &str) -> u64 {
     let mut words = lines.last().map_or("", String::as_str).split(' ');
     words.find(|found| *found == word).unwrap_or_else(|| panic!("no {word:?} in {:?}", lines.last()));
@@ -121,7 +121,7 @@ fn both_capture_send_and_balance_their_books() {
         let terminal = open_terminal("load=30,bitrate=500k".parse().unwrap()).unwrap();
         let (lines, good) = client.run(&[terminal.path(), "500000", "1.5"]);
         assert!(good, "{}: {:?}", client.name, lines.last());
-        // Records may stand before it: they are printed as they come.
+        // Records may come before it: they are printed as they arrive.
         let board = lines.iter().find(|line| line.starts_with("board virtual serial VIRTUAL channels 2"));
         assert!(board.is_some(), "{}: {:?}", client.name, lines.first());
         let sent = lines.iter().filter(|line| line.ends_with(" can1 sent tag 7 123 2 1122")).count();
@@ -142,7 +142,7 @@ fn both_count_what_a_stalled_host_loses() {
         while !text.contains("can1 started") {
             assert!(output.read_line(&mut text).unwrap() > 0, "{}: {text}", client.name);
         }
-        // Nobody reads what it prints, so it stands still: no signal is needed.
+        // Nobody reads what it prints, so it blocks: no signal is needed.
         std::thread::sleep(std::time::Duration::from_secs(4));
         output.read_to_string(&mut text).unwrap();
         let lines: Vec<String> = text.lines().map(str::to_owned).collect();

@@ -26,7 +26,7 @@ fn config(device: &Device, mode: Mode) -> ChannelConfig {
     ChannelConfig { mode, ..ChannelConfig::listen_only(timing) }
 }
 
-/// Takes records, in whole batches, until `enough` says so; fails after ten seconds.
+/// Takes records, in whole batches, until `enough` returns true; fails after ten seconds.
 fn collect(device: &Device, mut enough: impl FnMut(&TraceRecord) -> bool) -> Vec<TraceRecord> {
     let mut records = device.records();
     let mut taken = Vec::new();
@@ -42,7 +42,7 @@ fn collect(device: &Device, mut enough: impl FnMut(&TraceRecord) -> bool) -> Vec
     panic!("{} records and not what was waited for", taken.len());
 }
 
-/// Checks the law of counting on both channels. Returns what each delivered and lost.
+/// Checks the law of counting on both channels. Returns how much each delivered and lost.
 fn check_law(records: &[TraceRecord], options: &Options, heard: [u64; 2]) -> ([u64; 2], [u64; 2]) {
     let mut checks = [0, 1].map(|channel| SequenceCheck::new(options.source(channel)));
     for record in records {
@@ -87,7 +87,7 @@ fn both_channels_saturated_arrive_complete_in_order_and_spaced_by_their_lengths(
     }
 }
 
-/// Reads nothing for a while, once.
+/// Stops reading for a while, once.
 struct Stalling<R> {
     inner: R,
     from: Instant,
@@ -167,7 +167,7 @@ fn two_channels_on_one_wire_hear_each_other() {
     collect(&device, |record| record.channel == 2 && record.event == event);
 }
 
-/// The bus's own view: the controllers drove not one dominant bit.
+/// According to the bus, the controllers did not drive a single dominant bit.
 #[test]
 fn whatever_only_listens_never_drives_the_bus() {
     let pace = Pace::RealTime;
@@ -184,7 +184,7 @@ fn whatever_only_listens_never_drives_the_bus() {
     let found =
         autobaud::search(&device, Channel::Can1, &autobaud::Limits::default(), &mut |_| true).unwrap();
     assert!(matches!(found, autobaud::Outcome::Found { bitrate_bps: 250_000, .. }), "{found:?}");
-    // At the right rate, and at a wrong one.
+    // At the right bit rate, and at a wrong one.
     device.listen(Channel::Can1, 250_000).unwrap();
     device.listen(Channel::Can2, BITRATE).unwrap();
     let mut count = 0;
@@ -214,7 +214,7 @@ fn the_wrong_bit_rate_shows_as_bus_errors() {
     });
     let status = device.status().unwrap();
     assert_eq!(status.channels[0].frames, 0);
-    // A silent controller's counters stand still.
+    // A silent controller's counters do not change.
     assert_eq!((status.channels[0].tec, status.channels[0].rec), (0, 0));
 }
 
@@ -275,7 +275,7 @@ fn behind_a_pseudo_terminal_it_is_a_serial_port_and_can_be_opened_again() {
     assert!(Device::open(&port).is_err());
 }
 
-/// As a board's port comes back under the same name, with what was saved in its flash.
+/// A board's port comes back with the same name, and with what was saved in its flash.
 #[cfg(unix)]
 #[test]
 fn behind_a_pseudo_terminal_it_comes_back_after_a_reset_and_not_from_the_bootloader() {
@@ -290,14 +290,14 @@ fn behind_a_pseudo_terminal_it_comes_back_after_a_reset_and_not_from_the_bootloa
     std::thread::sleep(Duration::from_millis(300));
     device.reset().unwrap();
     let deadline = Instant::now() + Duration::from_secs(5);
-    // Whoever has it open finds no session any more.
+    // A program that has it open finds that there is no session any more.
     while device.status().is_ok() {
         assert!(Instant::now() < deadline, "it was not restarted");
         std::thread::sleep(Duration::from_millis(5));
     }
     drop(device);
     let device = Device::open(&port).unwrap();
-    // The firmware's time began anew.
+    // The firmware's time started over.
     let since_reset = Duration::from_millis(device.time().unwrap() / 12_000);
     assert!(since_reset + Duration::from_millis(300) < started.elapsed() && terminal.is_running());
     assert_eq!(device.defaults(Channel::Can1).unwrap().unwrap().config, normal);
@@ -332,7 +332,7 @@ fn a_log_is_replayed_at_its_own_times() {
     assert!((times[1] - times[0] - 10_000_000).abs() < 5000, "{times:?}");
 }
 
-/// One channel's errors and changes of state until `enough`, and the device's own count of errors.
+/// One channel's errors and state changes until `enough`, and the device's own count of errors.
 fn errors_of(bus: Options, frames: &[&str]) -> (Vec<TraceEvent>, u32) {
     let device = open(bus);
     device.open_channel(Channel::Can1, Some(config(&device, Mode::Normal))).unwrap();
@@ -369,7 +369,7 @@ fn errors_states_and_recovery_are_told_in_order_and_every_error_counted() {
             TraceEvent::BusError { kind, counters } => {
                 kinds.extend(*kind);
                 counted += 1;
-                // Eight for each, from the first on.
+                // Eight for each, starting with the first.
                 assert_eq!(
                     counters.map(|(tec, _)| u32::from(tec)),
                     Some((counted * 8).min(255)),
@@ -399,7 +399,7 @@ fn errors_states_and_recovery_are_told_in_order_and_every_error_counted() {
     assert!(!events.iter().any(|event| matches!(event, TraceEvent::State { state: BusOff, .. })));
 }
 
-/// As on the board (`sim/tests/live_bus.rs`): initialisation mode does not touch them.
+/// Like the board (`sim/tests/live_bus.rs`): initialisation mode does not affect them.
 #[test]
 fn error_counters_outlive_closing_and_opening() {
     let device = open(Options { acknowledge: false, ..options(0.0, Frames::Std8) });
@@ -434,7 +434,7 @@ fn a_channel_with_manual_recovery_stays_off_until_it_is_told_to_come_back() {
         (end.tag, end.result.map(|_| ()))
     };
     assert_eq!(send(1), (1, Err(TransmitFailure::BusOff)));
-    // It is not forgotten that it is off: frames fail at once, with the reason.
+    // It does not forget that it is bus-off: frames fail immediately, with the reason.
     assert_eq!(send(2), (2, Err(TransmitFailure::BusOff)));
     assert_eq!(device.status().unwrap().channels[0].state, ErrorState::BusOff);
     let mut recovery = cantap::recovery::Recovery::new(Duration::from_millis(40));
@@ -472,7 +472,7 @@ fn a_crystal_that_is_off_shows_against_usb_frames() {
         assert!(Instant::now() < deadline, "{:?}", map.frames().trust(now));
         std::thread::sleep(Duration::from_millis(1));
     };
-    // A frame is a millisecond of the world, in which a crystal that is 80 ppm slow has fewer ticks by this number.
+    // A frame is a millisecond of real time, in which a crystal that is 80 ppm slow has fewer ticks by this number.
     let (mut ticks, mut frames) = (Vec::new(), Vec::new());
     for (at, frame) in map.frames().marks() {
         ticks.push(at.0);

@@ -28,7 +28,7 @@ fn hello(id: u16) -> Vec<u8> {
     [vec![0], request(id, Command::Hello { protocol: PROTOCOL_VERSION })].concat()
 }
 
-/// Numbers of the answers in order, until there are this many.
+/// The first `count` answers' numbers, in order.
 fn answers(port: &mut impl Read, decoder: &mut Decoder, count: usize) -> Vec<u16> {
     let mut ids = Vec::new();
     let started = Instant::now();
@@ -67,7 +67,7 @@ fn requests_that_a_program_writes_before_it_reads_are_all_answered() {
             }
         }
     });
-    // Long enough that whoever waits 50 ms for room gives up.
+    // Long enough for anyone who waits 50 ms for room to give up.
     std::thread::sleep(Duration::from_millis(500));
     let ids = answers(&mut port, &mut Decoder::new(), usize::from(count));
     assert!(ids.iter().copied().eq(0..count));
@@ -90,7 +90,7 @@ fn nothing_of_a_closed_session_reaches_the_next_program() {
         std::thread::sleep(Duration::from_millis(300));
         assert!(port.bytes_to_read().unwrap() > 0);
         drop(port);
-        // A program that is started next takes longer.
+        // Starting the next program takes longer in practice.
         std::thread::sleep(Duration::from_millis(200));
         let mut port = open(terminal.path());
         std::thread::sleep(Duration::from_millis(50));
@@ -99,7 +99,7 @@ fn nothing_of_a_closed_session_reaches_the_next_program() {
     }
 }
 
-/// They waited in the terminal, and were done, or refused, when the next program opened it.
+/// They once waited in the terminal and were carried out or refused when the next program opened it.
 #[test]
 fn requests_that_a_program_left_unread_are_not_the_next_one_s() {
     let terminal = open_terminal("load=0".parse().unwrap()).unwrap();
@@ -123,13 +123,13 @@ fn the_first_request_is_answered_however_soon_the_port_is_opened_again() {
         port.write_all(&hello(id)).unwrap();
         let mut decoder = Decoder::new();
         while answers(&mut port, &mut decoder, 1) != [id] {}
-        // Left in the midst of everything.
+        // Left in the middle of everything.
         let config = Some(ChannelConfig::listen_only(timing));
         port.write_all(&request(1000, Command::Open { channel: Channel::Can1, config })).unwrap();
         answers(&mut port, &mut decoder, 1);
         port.write_all(&request(1001, Command::Time)[..5]).unwrap();
         drop(port);
-        // From at once to beyond the time after which a closed port is noticed.
+        // From immediately to beyond the time after which a closed port is noticed.
         std::thread::sleep(Duration::from_micros(u64::from(id % 30) * 700));
     }
 }

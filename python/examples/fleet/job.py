@@ -1,4 +1,4 @@
-"""What `spark-submit` starts. The package beside it is sent to the workers from here."""
+"""The file that `spark-submit` starts. It sends the package beside it to the workers."""
 
 import sys
 

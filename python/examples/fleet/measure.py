@@ -22,7 +22,7 @@ _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 class Processor(threading.Thread):
-    """Processor seconds of all processes below this one, also of those that have ended. What runs for less than the look is missed."""
+    """Processor seconds of all processes below this one, including those that have ended. Processes that run only between two samples are missed."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
@@ -34,12 +34,12 @@ class Processor(threading.Thread):
             self.look()
 
     def look(self) -> None:
-        """Takes down what each has used by now."""
+        """Records what each has used so far."""
         parents: dict[int, int] = {}
         used: dict[int, tuple[str, float]] = {}
         for folder in Path("/proc").glob("[0-9]*"):
             try:
-                # proc(5): behind the name in brackets come the state, the parent, and as 14th and 15th field the time.
+                # proc(5): after the name in brackets come the state, the parent, and as 14th and 15th field the time.
                 fields = (folder / "stat").read_text().rsplit(") ", 1)[1].split()
             except (OSError, IndexError):
                 continue
@@ -50,12 +50,12 @@ class Processor(threading.Thread):
         while more := {number for number, parent in parents.items() if parent in below} - below:
             below |= more
         for number in below & used.keys():
-            # With its start: numbers are used again.
+            # With its start time: process numbers are reused.
             start, seconds = used[number]
             self._used[number, start] = seconds
 
     def seconds(self) -> float:
-        """All of it so far."""
+        """The total so far."""
         self.look()
         return sum(list(self._used.values()))
 
@@ -92,7 +92,7 @@ def main() -> int:
         )
         spark.sparkContext.setLogLevel("ERROR")
         failed = 0
-        # What a cluster does once is no part of it: workers that start, code that is compiled.
+        # This excludes what a cluster does only once: starting workers, compiling code.
         for number, traces in enumerate((8, *chosen.traces)):
             fleet = folder / f"fleet{number}"
             fleet.mkdir()

@@ -1,7 +1,7 @@
-//! One device's records, for several who listen.
+//! Distributes one device's records to several listeners.
 //!
-//! A thread without Python takes them from the device and gives each listener its own. Who does not keep up loses records: they are
-//! counted, and a loss stands in their place.
+//! A thread without Python takes them from the device and gives each listener its own copy. A listener that does not keep up loses
+//! records: they are counted, and a loss takes their place.
 
 use std::collections::HashMap;
 use std::io::{self, PipeReader, PipeWriter, Read, Write};
@@ -17,14 +17,14 @@ use cantap_trace::filter::Filter;
 /// How often to check whether to go on.
 pub const LOOK_EVERY: Duration = Duration::from_millis(100);
 
-/// What a listener wants to hear.
+/// What a listener wants to receive.
 #[derive(Clone, Debug, Default)]
 pub struct Wanted {
-    /// This channel only, from 1.
+    /// Only this channel, from 1.
     pub channel: Option<u8>,
-    /// These frames only; any of several.
+    /// Only these frames; a frame need match only one of several.
     pub filters: Vec<Filter>,
-    /// Not the frames that this device sends.
+    /// Not the frames sent by this device.
     pub only_received: bool,
 }
 
@@ -37,7 +37,7 @@ impl Wanted {
     }
 }
 
-/// Whether one of the filters accepts a record; without filters all do.
+/// Whether one of the filters accepts a record; without filters all are accepted.
 fn passes(filters: &[Filter], record: &TraceRecord) -> bool {
     filters.is_empty() || filters.iter().any(|filter| filter.accepts(record))
 }
@@ -46,11 +46,11 @@ pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Somebody who listens.
+/// A listener.
 pub struct Listener {
     buffer: Buffer,
     wanted: Mutex<Wanted>,
-    /// Readable while something waits, once somebody asked for it.
+    /// Readable while something is waiting; created on demand.
     signal: Mutex<Option<Signal>>,
     lost: Mutex<[u64; CHANNELS]>,
     failure: Mutex<Option<String>>,
@@ -110,25 +110,26 @@ impl Listener {
         }
     }
 
-    /// Nothing follows, for this reason if there is one.
+    /// Nothing more follows, for this reason if there is one.
     pub fn end(&self, failure: Option<String>) {
         *lock(&self.failure) = failure;
         self.buffer.finish();
         self.wake();
     }
 
-    /// The next records, none if there are none within this time; `None` after the last.
+    /// The next records; empty if there are none within this time; `None` after the last.
     pub fn pop(&self, timeout: Duration) -> Option<Vec<TraceRecord>> {
-        // A listener's buffer ends without an error; its reason is kept apart, so that each listener has it.
+        // A listener's buffer ends without an error; the reason is kept separately, so that each listener
+        // gets it.
         self.buffer.pop(Some(timeout)).unwrap_or(None)
     }
 
-    /// Why nothing follows, if it is not that it was asked for. Told once.
+    /// Why nothing more follows, unless that was requested. Returned once.
     pub fn failure(&self) -> Option<String> {
         lock(&self.failure).take()
     }
 
-    /// To be called when everything that was popped is used up: from then on the pipe says whether there is more.
+    /// Call it when everything that was popped is used up: from then on, the pipe shows whether there is more.
     pub fn used_up(&self) {
         if let Some(signal) = lock(&self.signal).as_mut() {
             signal.clear();
@@ -138,7 +139,7 @@ impl Listener {
         }
     }
 
-    /// A pipe that is readable while something waits: here, or with whoever has popped it.
+    /// A pipe that is readable while something is waiting: here, or in what the caller has popped.
     pub fn signal(&self, is_waiting: bool) -> io::Result<&Self> {
         let mut signal = lock(&self.signal);
         if signal.is_none() {
@@ -159,7 +160,7 @@ impl Listener {
         lock(&self.signal).as_ref().map(|signal| signal.reader.as_raw_fd())
     }
 
-    /// Changes what is heard from now on.
+    /// Changes what is received from now on.
     pub fn want(&self, change: impl FnOnce(&mut Wanted)) {
         change(&mut lock(&self.wanted));
     }
@@ -170,27 +171,27 @@ impl Listener {
     }
 }
 
-/// Who listens to a device, and who waits for what it sends.
+/// The listeners of a device, and those waiting for confirmations.
 #[derive(Default)]
 pub struct Fanout {
     listeners: Mutex<Listeners>,
     /// By tag.
     waiting: Mutex<HashMap<u32, SyncSender<Transmission>>>,
-    /// What a channel was opened for; its hardware may pass more.
+    /// The filters with which a channel was opened; its hardware may pass more.
     filters: Mutex<[Vec<Filter>; CHANNELS]>,
 }
 
 #[derive(Default)]
 struct Listeners {
     all: Vec<Weak<Listener>>,
-    /// Nothing follows.
+    /// Nothing more follows.
     has_ended: bool,
-    /// For this reason, if it is not that it was asked for.
+    /// The reason, unless the end was requested.
     failure: Option<String>,
 }
 
 impl Fanout {
-    /// Hears from now on.
+    /// Adds a listener from now on.
     pub fn listen(&self, wanted: Wanted, capacity: usize) -> Arc<Listener> {
         let listener = Arc::new(Listener::new(wanted, capacity));
         let mut listeners = lock(&self.listeners);
@@ -202,12 +203,12 @@ impl Fanout {
         listener
     }
 
-    /// Lets only these pass from a channel from now on.
+    /// From now on, only frames matching these filters pass on a channel.
     pub fn set_filters(&self, channel: Channel, filters: Vec<Filter>) {
         lock(&self.filters)[channel.index()] = filters;
     }
 
-    /// Hands out a device's records until they end. For a thread of its own.
+    /// Distributes a device's records until they end. It needs a thread of its own.
     pub fn pump(&self, mut records: Records) {
         let failure = loop {
             match records.next_batch(LOOK_EVERY) {
@@ -240,19 +241,19 @@ impl Fanout {
         listeners.failure = failure;
     }
 
-    /// Tells how transmissions end, until no more do. For a thread of its own.
+    /// Reports how transmissions end, until there are no more. It needs a thread of its own.
     pub fn report(&self, ends: &Receiver<Transmission>) {
         while let Ok(end) = ends.recv() {
             if let Some(waiting) = lock(&self.waiting).remove(&end.tag) {
-                // Who does not wait any more has not to be told.
+                // It does not matter if nobody waits any more.
                 let _ = waiting.try_send(end);
             }
         }
-        // Whoever waits learns that nothing comes.
+        // Everyone waiting learns that nothing comes.
         lock(&self.waiting).clear();
     }
 
-    /// Has the end of a transmission told to somebody.
+    /// Has the end of a transmission reported to a channel.
     pub fn wait_for(&self, tag: u32, told: SyncSender<Transmission>) {
         lock(&self.waiting).insert(tag, told);
     }

@@ -1,4 +1,4 @@
-//! A device, for Python. Every call that waits lets other threads of Python run, and Ctrl-C through.
+//! A device, for Python. Every waiting call lets other Python threads run, and Ctrl-C through.
 
 mod fanout;
 mod records;
@@ -36,7 +36,7 @@ const MODES: [(Mode, &str); 4] = [
     (Mode::Loopback, "loopback"),
     (Mode::SilentLoopback, "silent-loopback"),
 ];
-/// A frame that has not ended after this time will not by itself.
+/// A frame that has not ended after this time will not end on its own.
 const MOST_TIME: Duration = Duration::from_hours(24);
 
 /// A device in a session of this program.
@@ -45,7 +45,7 @@ pub struct Device {
     session: Mutex<Option<Arc<Session>>>,
 }
 
-/// How a channel is to be opened, as Python's half hands it over.
+/// How to open a channel, as passed by the Python half.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct ChannelOptions {
@@ -60,7 +60,7 @@ pub struct ChannelOptions {
     filters: Vec<String>,
 }
 
-/// A channel by its number.
+/// A channel from its number.
 pub fn channel(number: u8) -> Result<Channel, Error> {
     Channel::ALL
         .into_iter()
@@ -68,13 +68,13 @@ pub fn channel(number: u8) -> Result<Channel, Error> {
         .ok_or_else(|| Error::argument(format!("there is no channel {number}; a device has 1 and 2")))
 }
 
-/// Lets Python's signals through.
+/// Lets Python handle signals.
 #[expect(clippy::redundant_closure_for_method_calls, reason = "the method is for one lifetime")]
 pub fn signals() -> Result<(), Error> {
     Python::attach(|py| py.check_signals()).map_err(Error::Python)
 }
 
-/// A frame that was not sent.
+/// The error for a frame that was not sent.
 fn not_sent(end: &Transmission, frame: &ClassicFrame) -> Error {
     let reason = end.result.err().map_or("", failure);
     Error::Address(format!("{frame} was not sent on channel {}: {reason}", end.channel.number()))
@@ -89,7 +89,7 @@ impl Device {
         Ok(session)
     }
 
-    /// Asks the device, while Python goes on.
+    /// Sends a request to the device while other Python threads run.
     fn ask<T: Send>(
         &self,
         py: Python<'_>,
@@ -120,13 +120,13 @@ impl Device {
         lock(&self.session).is_none()
     }
 
-    /// Whether a vehicle with a database of its own is on its buses.
+    /// Whether a vehicle with its own database is on its buses.
     #[getter]
     fn is_virtual_car(&self) -> PyResult<bool> {
         Ok(self.session()?.is_car)
     }
 
-    /// What it is.
+    /// The device's description.
     fn info<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let session = self.session()?;
         let hello = session.device()?.hello();
@@ -147,7 +147,7 @@ impl Device {
         from_json(py, &object.to_string())
     }
 
-    /// Opens a channel. Returns its bit rate, and what of its filters this computer has to do.
+    /// Opens a channel. Returns its bit rate, and what part of its filters is left to this computer.
     fn open_channel(
         &self,
         py: Python<'_>,
@@ -161,7 +161,7 @@ impl Device {
             let found = MODES.iter().find(|(_, name)| *name == options.mode);
             let Some((mode, _)) = found else {
                 let words = format!(
-                    "'{}' is no mode; there are listen-only, normal, loopback and silent-loopback",
+                    "'{}' is not a mode; there are listen-only, normal, loopback and silent-loopback",
                     options.mode
                 );
                 return Err(Error::argument(words));
@@ -200,13 +200,13 @@ impl Device {
         Ok(opened)
     }
 
-    /// Closes a channel, after everything it captured has come.
+    /// Closes a channel, after everything it captured has arrived.
     fn close_channel(&self, py: Python<'_>, number: u8) -> PyResult<()> {
         let channel = channel(number)?;
         self.ask(py, |device| device.close_channel(channel))
     }
 
-    /// How open channels are: by number, bit rate and mode.
+    /// The open channels: by number, bit rate and mode.
     fn open_channels<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let session = self.session()?;
         let device = session.device()?;
@@ -220,7 +220,7 @@ impl Device {
         Ok(open)
     }
 
-    /// Hears from now on; what waits is at most `capacity` records.
+    /// Starts listening; at most `capacity` records wait.
     #[pyo3(signature = (channel_number=None, filters=vec![], only_received=false, capacity=1 << 20))]
     fn records(
         slf: &Bound<'_, Self>,
@@ -240,7 +240,7 @@ impl Device {
         Ok(Records::new(slf.clone().unbind(), listener))
     }
 
-    /// Sends frames and returns when each was on the bus, in nanoseconds since 1970; without `timeout` they are only handed to the device.
+    /// Sends frames and returns when each was on the bus, in nanoseconds since 1970; without `timeout` they are only passed to the device.
     #[pyo3(signature = (number, frames, timeout, at_ns=None, queue_timeout=1.0))]
     fn send(
         &self,
@@ -256,7 +256,7 @@ impl Device {
         let frames: Vec<ClassicFrame> = frames.into_iter().map(|frame| frame.0).collect();
         let seconds = timeout.unwrap_or(queue_timeout);
         let patience = Duration::try_from_secs_f64(seconds)
-            .map_err(|_| PyValueError::new_err(format!("{seconds} s is no time to wait")))?
+            .map_err(|_| PyValueError::new_err(format!("{seconds} s is not a valid time to wait")))?
             .min(MOST_TIME);
         let ended = py.detach(|| -> Result<_, Error> {
             let device = session.device()?;
@@ -264,7 +264,7 @@ impl Device {
             let deadline = Instant::now() + patience;
             let sending = session.send(channel, &frames, at_ticks, timeout.is_some(), deadline, signals)?;
             let ended = sending.wait(deadline, SLICE, signals);
-            // Nobody may be surprised by it later.
+            // It must not surprise anyone by being sent later.
             if timeout.is_some() && !matches!(ended, Ok(Some(_))) {
                 device.abort(channel)?;
             }
@@ -284,13 +284,13 @@ impl Device {
         Ok(ended.iter().map(|end| end.time_ns).collect())
     }
 
-    /// Takes back what a channel still has to send.
+    /// Withdraws what a channel still has to send.
     fn abort(&self, py: Python<'_>, number: u8) -> PyResult<()> {
         let channel = channel(number)?;
         self.ask(py, |device| device.abort(channel))
     }
 
-    /// Begins a periodic frame.
+    /// Starts a periodic frame.
     fn periodic(
         &self,
         py: Python<'_>,
@@ -305,7 +305,7 @@ impl Device {
         Ok(py.detach(|| PeriodicFrame::begin(session, channel, frame.0, period_s, count, &modifiers))?)
     }
 
-    /// Begins to reply.
+    /// Starts a reply.
     fn reply(
         &self,
         py: Python<'_>,
@@ -319,7 +319,7 @@ impl Device {
         Ok(py.detach(|| Reply::begin(session, channel, to, frame.0, count))?)
     }
 
-    /// How the device and its channels are.
+    /// The status of the device and its channels.
     fn status<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let status = self.ask(py, cantap::Device::status)?;
         let channels = Channel::ALL.map(|channel| {
@@ -351,7 +351,7 @@ impl Device {
         from_json(py, &object.to_string())
     }
 
-    /// Frames that came and that were lost since the session began, by channel and stage.
+    /// Frames received and lost since the session began, by channel and stage.
     fn losses<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let session = self.session()?;
         let counters = session.device()?.counters();
@@ -370,7 +370,7 @@ impl Device {
         Ok(all)
     }
 
-    /// What is known about its clock.
+    /// What is known about the device's clock.
     fn clock<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let session = self.session()?;
         let report = session.device()?.clock();
@@ -391,23 +391,24 @@ impl Device {
         })
     }
 
-    /// Brings a channel back from bus-off that was opened with manual recovery.
+    /// Brings a channel that was opened with manual recovery back from bus-off.
     fn recover(&self, py: Python<'_>, number: u8) -> PyResult<()> {
         let channel = channel(number)?;
         self.ask(py, |device| device.recover(channel))
     }
 
-    /// Shows an LED pattern, to find it among others.
+    /// Shows an LED pattern, to find the device among others.
     fn identify(&self, py: Python<'_>, seconds: u8) -> PyResult<()> {
         self.ask(py, |device| device.identify(seconds))
     }
 
-    /// Closes the channels and ends the session; records that came can still be read.
+    /// Closes the channels and ends the session; records already received can still be read.
     fn close(&self, py: Python<'_>) {
         let Some(session) = lock(&self.session).take() else { return };
         py.detach(|| {
             if let Ok(device) = session.device() {
-                // What was captured until the end still comes. If the device is gone, its records end by themselves.
+                // What was captured until the end still arrives. If the device is gone, its records end on their
+                // own.
                 let _ = device.stop();
             }
             drop(session);
@@ -418,7 +419,7 @@ impl Device {
 /// Port, serial number, product.
 type BoardWords = (String, Option<String>, Option<String>);
 
-/// The boards that are connected.
+/// The connected boards.
 #[pyfunction]
 pub fn list_boards(py: Python<'_>) -> PyResult<Vec<BoardWords>> {
     let boards = py.detach(cantap::device::list).map_err(Error::from)?;

@@ -1,4 +1,4 @@
-//! What is heard, for Python.
+//! Received records, for Python.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
@@ -17,37 +17,38 @@ use crate::error::{DeviceError, Error};
 use crate::frame::Record;
 use crate::table::Table;
 
-/// How long Python's signals may wait.
+/// The longest delay for Python's signals.
 pub const SLICE: Duration = Duration::from_millis(50);
 
-/// The records of a device from the time on at which this was made. Several are independent of each other.
+/// The records of a device from the time at which this was made. Several of these are independent of each
+/// other.
 #[pyclass(module = "cantap", frozen)]
 pub struct Records {
-    /// Kept, so that a device that nobody closes is there for as long as somebody listens.
+    /// Kept so that a device that nobody closes stays open as long as somebody listens.
     _device: Py<Device>,
     listener: Arc<Listener>,
     waiting: Mutex<std::vec::IntoIter<TraceRecord>>,
-    /// The plugin has messages that it did not give to anybody yet.
+    /// The plugin has messages that it has not delivered yet.
     is_handed_out: AtomicBool,
 }
 
-/// So many messages cross to Python at a time: the way there costs as much as a message.
+/// How many messages are passed to Python at a time: the call costs as much as a message.
 const MOST_MESSAGES: usize = 64;
 
-/// Until when to wait for something.
+/// How long to wait for something.
 #[derive(Clone, Copy)]
 pub struct Until(Option<Instant>);
 
 impl Until {
-    /// From seconds; for ever without.
+    /// From seconds; `None` for ever.
     pub fn of(timeout: Option<f64>) -> Result<Self, Error> {
         let Some(seconds) = timeout else { return Ok(Self(None)) };
         let time = Duration::try_from_secs_f64(seconds.max(0.0));
-        let time = time.map_err(|_| Error::argument(format!("{seconds} s is no time to wait")))?;
+        let time = time.map_err(|_| Error::argument(format!("{seconds} s is not a valid time to wait")))?;
         Ok(Self(Instant::now().checked_add(time)))
     }
 
-    /// What is left, at most a slice; none when it is over.
+    /// The rest, at most a slice; `None` when the time is over.
     fn slice(self) -> Option<Duration> {
         let Some(deadline) = self.0 else { return Some(SLICE) };
         let left = deadline.saturating_duration_since(Instant::now());
@@ -55,7 +56,7 @@ impl Until {
     }
 }
 
-/// What came of waiting.
+/// The result of waiting.
 enum Next {
     One(TraceRecord),
     Nothing,
@@ -67,7 +68,7 @@ impl Records {
         Self { _device: device, listener, waiting: Mutex::default(), is_handed_out: AtomicBool::new(false) }
     }
 
-    /// One that is there already.
+    /// A record that is already there.
     fn at_hand(&self) -> Option<TraceRecord> {
         let mut waiting = lock(&self.waiting);
         let next = waiting.next();
@@ -107,7 +108,7 @@ impl Records {
 }
 
 /// A message as python-can's constructor takes it: time, identifier, whether it is extended, remote, an error; channel from 0, length
-/// code, data, whether it is of CAN FD, whether it was received.
+/// code, data, whether it is CAN FD, whether it was received.
 type Message<'py> = (f64, u32, bool, bool, bool, u8, u8, Bound<'py, PyByteArray>, bool, bool);
 
 fn message<'py>(py: Python<'py>, record: &TraceRecord) -> Message<'py> {
@@ -146,7 +147,7 @@ impl Records {
         }
     }
 
-    /// Records of up to `seconds`, at most `rows`, as a table; fewer after the device was closed.
+    /// Records of up to `seconds`, at most `rows`, as a table; fewer once the device has been closed.
     #[pyo3(signature = (seconds=None, rows=65_536))]
     fn batch(&self, py: Python<'_>, seconds: Option<f64>, rows: usize) -> PyResult<Table> {
         if rows == 0 {
@@ -161,7 +162,7 @@ impl Records {
                 Next::Nothing | Next::End => break,
             }
             left -= 1;
-            // The rest of what came with it, in one go.
+            // The rest of what came with it, all together.
             let mut waiting = lock(&self.waiting);
             let at_hand = waiting.as_slice().len().min(left);
             waiting.by_ref().take(at_hand).for_each(|record| columns.push(&record));
@@ -175,7 +176,7 @@ impl Records {
         Ok(Table::of_batch(columns.take()))
     }
 
-    /// For the plugin: the next records as python-can's messages, those that are at hand; none if there is none within the time.
+    /// For the plugin: the next records that are at hand, as python-can's messages; empty if there are none within the time.
     /// Until [`Self::_used_up`] they count as waiting.
     fn _messages<'py>(&self, py: Python<'py>, timeout: Option<f64>) -> PyResult<Vec<Message<'py>>> {
         let first = match self.next(py, Until::of(timeout)?)? {
@@ -189,7 +190,7 @@ impl Records {
         Ok(std::iter::once(first).chain(more).map(|record| message(py, &record)).collect())
     }
 
-    /// For the plugin: all messages that were handed out are used up.
+    /// For the plugin: all messages that were returned are used up.
     fn _used_up(&self) {
         self.is_handed_out.store(false, Ordering::Relaxed);
         if lock(&self.waiting).as_slice().is_empty() {
@@ -197,7 +198,7 @@ impl Records {
         }
     }
 
-    /// For the plugin: what is heard from now on.
+    /// For the plugin: sets what is received from now on.
     fn _filter(&self, filters: Vec<String>, only_received: bool) -> PyResult<()> {
         let filters = filters.iter().map(|text| text.parse()).collect::<Result<Vec<_>, _>>();
         let filters = filters.map_err(Error::argument)?;
@@ -208,21 +209,21 @@ impl Records {
         Ok(())
     }
 
-    /// For the plugin: drops what waits.
+    /// For the plugin: discards what is waiting.
     fn _clear(&self) {
         *lock(&self.waiting) = Vec::new().into_iter();
         while self.listener.pop(Duration::ZERO).is_some_and(|batch| !batch.is_empty()) {}
         self.listener.used_up();
     }
 
-    /// Frames lost here because this program did not take them, of channel 1 and 2.
+    /// Frames lost here because this program did not take them, on channels 1 and 2.
     #[getter]
     fn lost(&self) -> (u64, u64) {
         let [first, second] = self.listener.lost();
         (first, second)
     }
 
-    /// A file descriptor that is readable while a record waits.
+    /// A file descriptor that is readable while a record is waiting.
     fn fileno(&self) -> PyResult<i32> {
         let is_waiting =
             self.is_handed_out.load(Ordering::Relaxed) || !lock(&self.waiting).as_slice().is_empty();
@@ -234,7 +235,7 @@ impl Records {
         Err(pyo3::exceptions::PyNotImplementedError::new_err("this system waits for no file descriptors"))
     }
 
-    /// Hears nothing more; what waits can still be read.
+    /// Stops listening; waiting records can still be read.
     fn close(&self) {
         self.listener.end(None);
     }

@@ -1,4 +1,4 @@
-//! A session with a device, for everybody in this process who uses it.
+//! A session with a device, shared by everything in this process that uses it.
 
 use std::collections::HashMap;
 use std::mem::ManuallyDrop;
@@ -18,30 +18,30 @@ use cantap_trace::filter::Filter;
 use super::fanout::{Fanout, lock};
 use crate::error::Error;
 
-/// Tags wrap here: a device keeps those from `DEVICE_TAG` up for itself.
+/// Tags wrap here: a device reserves those from `DEVICE_TAG` up for itself.
 const TAGS: u32 = 0x7FFF_0000;
-/// While the device's queue is full it is tried again after this time.
+/// While the device's queue is full, sending is retried after this time.
 const RETRY_AFTER: Duration = Duration::from_millis(1);
 
 /// A session.
 pub struct Session {
-    /// Never dropped in another process than the one that opened it, see [`Drop`].
+    /// Never dropped in a process other than the one that opened it, see [`Drop`].
     device: ManuallyDrop<OpenDevice>,
     pub address: String,
     pub is_car: bool,
     process: u32,
     pub fanout: Arc<Fanout>,
     next_tag: AtomicU32,
-    /// Entries of the device's tables in use.
+    /// Entries in use in the device's tables.
     slots: Mutex<HashMap<(Table, Channel), Vec<bool>>>,
 }
 
-/// A table of what a device sends by itself.
+/// A table of what a device sends on its own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Table {
-    /// Again and again.
+    /// Periodic frames.
     Periodic,
-    /// In reply.
+    /// Replies.
     Replies,
 }
 
@@ -67,7 +67,8 @@ impl Session {
         })
     }
 
-    /// The device, in the process that opened it: after a fork the thread that reads it is in the other one.
+    /// The device, in the process that opened it: after a fork, the thread that reads it is in the other
+    /// process.
     pub fn device(&self) -> Result<&Device, Error> {
         if self.process == std::process::id() {
             Ok(&self.device)
@@ -84,7 +85,7 @@ impl Session {
         self.device.bitrate_of_bus(channel)
     }
 
-    /// Opens a channel; what its filters leave to this computer is returned.
+    /// Opens a channel; returns what its filters leave to this computer.
     pub fn open_channel(
         &self,
         channel: Channel,
@@ -93,14 +94,14 @@ impl Session {
     ) -> Result<Option<Remainder>, Error> {
         let device = self.device()?;
         let compiled = hw_filter::apply(device, channel, filters)?;
-        // Before the first frame comes.
+        // This must be set before the first frame arrives.
         self.fanout.set_filters(channel, filters.to_vec());
         device.open_channel(channel, Some(config))?;
         Ok(compiled.remainder)
     }
 
-    /// Hands frames to the device, to be sent not before a device time. With `told`, how each ended can be waited for; while
-    /// the device's queue is full it is waited for until `deadline`, as long as `go_on` says so.
+    /// Passes frames to the device, to be sent no earlier than a device time. With `told`, the end of each can be awaited.
+    /// While the device's queue is full, it waits until `deadline`, as long as `go_on` returns true.
     pub fn send(
         &self,
         channel: Channel,
@@ -121,7 +122,7 @@ impl Session {
                     self.fanout.wait_for(tag, told);
                     sending.ends.push((tag, end));
                 }
-                // Cannot fail: a chunk is no longer.
+                // This cannot fail: a chunk is no longer.
                 let _ = batch.push(TxFrame { tag, frame: *frame, at_ticks });
             }
             while let Err(error) = device.send(channel, &batch) {
@@ -168,8 +169,8 @@ fn spawn(name: &str, work: impl FnOnce() + Send + 'static) -> Result<(), Error> 
 }
 
 impl Drop for Session {
-    /// Leaves the bus. A copy of the session in a forked process does nothing: the port belongs to the other one, and so does the
-    /// thread that would have to be waited for.
+    /// Leaves the bus. A copy of the session in a forked process does nothing: the port belongs to the other process, and so does
+    /// the thread that would have to be joined.
     fn drop(&mut self) {
         if self.process == std::process::id() {
             // SAFETY: nothing uses it after this.
@@ -178,15 +179,15 @@ impl Drop for Session {
     }
 }
 
-/// Frames that are with the device.
+/// Frames passed to the device.
 pub struct Sending {
     fanout: Arc<Fanout>,
-    /// In the order in which they were handed over.
+    /// In the order in which they were passed.
     ends: Vec<(u32, Receiver<Transmission>)>,
 }
 
 impl Sending {
-    /// How the frames ended, in order. `None` if one has not until `deadline`.
+    /// How the frames ended, in order. `None` if one has not ended by `deadline`.
     pub fn wait(
         &self,
         deadline: Instant,

@@ -1,4 +1,5 @@
-//! What the device sends by itself: again and again, and in reply. It ends with the object that asked for it.
+//! What the device sends on its own: periodic frames and replies. Each ends with the object that requested
+//! it.
 
 use std::sync::{Arc, Mutex, Weak};
 use std::time::Duration;
@@ -13,10 +14,10 @@ use super::session::{Session, Table};
 use crate::error::Error;
 use crate::frame::{AnyFrame, identifier};
 
-/// A modifier as Python has it: what it is, the byte, and two numbers or a name.
+/// A modifier as it comes from Python: its kind, the byte, and two numbers or a name.
 pub type ModifierWords = (String, u8, u8, u8, String);
 
-/// What is replied to: identifier, mask, whether it has 29 bits.
+/// What to reply to: identifier, mask, whether it has 29 bits.
 pub type Match = (u32, Option<u32>, Option<bool>);
 
 fn modifier((kind, byte, low_bit, bits, algorithm): &ModifierWords) -> Result<Modifier, Error> {
@@ -30,7 +31,7 @@ fn modifier((kind, byte, low_bit, bits, algorithm): &ModifierWords) -> Result<Mo
                 "sum" => Checksum::Sum,
                 "crc8-j1850" => Checksum::Crc8J1850,
                 other => {
-                    let words = format!("'{other}' is no checksum; there are xor, sum and crc8-j1850");
+                    let words = format!("'{other}' is not a checksum; there are xor, sum and crc8-j1850");
                     return Err(Error::argument(words));
                 }
             };
@@ -39,9 +40,9 @@ fn modifier((kind, byte, low_bit, bits, algorithm): &ModifierWords) -> Result<Mo
     })
 }
 
-/// An entry of a table of the device's.
+/// An entry in one of the device's tables.
 struct Entry {
-    /// Gone when the device is closed, and with it everything that it sends by itself.
+    /// Gone when the device is closed, and with it everything that it sends on its own.
     session: Weak<Session>,
     table: Table,
     channel: Channel,
@@ -54,7 +55,7 @@ impl Entry {
         Ok(Self { session: Arc::downgrade(session), table, channel, slot: Mutex::new(Some(slot)) })
     }
 
-    /// Ends it; what has ended stays so.
+    /// Ends it, unless it has already ended.
     fn clear(&self) -> Result<(), Error> {
         let Some(slot) = lock(&self.slot).take() else { return Ok(()) };
         let Some(session) = self.session.upgrade() else { return Ok(()) };
@@ -70,12 +71,12 @@ impl Entry {
 
 impl Drop for Entry {
     fn drop(&mut self) {
-        // If it cannot be told, the device is gone, and the session with it.
+        // If the request fails, the device is gone, and with it the session.
         let _ = self.clear();
     }
 }
 
-/// A frame that the device sends again and again, by its own timer, until this is stopped or forgotten.
+/// A frame that the device sends repeatedly, by its own timer, until this is stopped or dropped.
 #[pyclass(module = "cantap", frozen)]
 pub struct PeriodicFrame {
     entry: Entry,
@@ -92,7 +93,7 @@ impl PeriodicFrame {
         modifiers: &[ModifierWords],
     ) -> Result<Self, Error> {
         let period = Duration::try_from_secs_f64(period_s)
-            .map_err(|_| Error::argument(format!("{period_s} s is no period")))?;
+            .map_err(|_| Error::argument(format!("{period_s} s is not a valid period")))?;
         let ticks = period_ticks(period, session.device()?.hello().tick_hz).map_err(Error::argument)?;
         let list = modifiers.iter().map(modifier).collect::<Result<Vec<_>, _>>()?;
         check_modifiers(&frame, &list).map_err(Error::argument)?;
@@ -118,13 +119,13 @@ impl PeriodicFrame {
 
 #[pymethods]
 impl PeriodicFrame {
-    /// Whether it goes on, as far as it was not given a count.
+    /// Whether it is still active, apart from any limit to its count.
     #[getter]
     fn is_running(&self) -> bool {
         lock(&self.entry.slot).is_some()
     }
 
-    /// Sends another frame from now on; its period begins anew.
+    /// Sends another frame from now on; its period starts over.
     fn update(&self, py: Python<'_>, frame: AnyFrame) -> PyResult<()> {
         let changed = {
             let set = lock(&self.set);
@@ -135,13 +136,13 @@ impl PeriodicFrame {
         Ok(py.detach(|| self.apply())?)
     }
 
-    /// Ends it.
+    /// Stops it.
     fn stop(&self, py: Python<'_>) -> PyResult<()> {
         Ok(py.detach(|| self.entry.clear())?)
     }
 }
 
-/// A frame that the device sends whenever it receives a matching one, until this is stopped or forgotten.
+/// A frame that the device sends whenever it receives a matching one, until this is stopped or dropped.
 #[pyclass(module = "cantap", frozen)]
 pub struct Reply {
     entry: Entry,
@@ -173,13 +174,13 @@ impl Reply {
 
 #[pymethods]
 impl Reply {
-    /// Whether it goes on, as far as it was not given a count.
+    /// Whether it is still active, apart from any limit to its count.
     #[getter]
     fn is_running(&self) -> bool {
         lock(&self.entry.slot).is_some()
     }
 
-    /// Ends it.
+    /// Stops it.
     fn stop(&self, py: Python<'_>) -> PyResult<()> {
         Ok(py.detach(|| self.entry.clear())?)
     }

@@ -1,8 +1,8 @@
-"""Lets python-can's own tests run on the analyser: a pytest plugin that puts it in the place of python-can's virtual interface.
+"""Lets python-can's own tests run on the analyser: a pytest plugin that replaces python-can's virtual interface with it.
 
-Those tests open two buses of one name, which see each other: here they are the two channels of a virtual device on one bus. Each name is
-a device. They look at details of python-can's virtual interface and of its threads, which are added here and are no part of the plugin:
-how many messages wait (`queue`), and the thread of a periodic task (`thread`).
+Those tests open two buses with the same name, which see each other: here they are the two channels of a virtual device on one bus. Each
+name is a device. The tests use details of python-can's virtual interface and its threads, which are added here and are not part of the
+plugin: the number of waiting messages (`queue`), and the thread of a periodic task (`thread`).
 """
 
 import collections
@@ -16,24 +16,24 @@ _lock = threading.Lock()
 
 
 class Queue:
-    """What of a message queue these tests ask for."""
+    """The part of a message queue that these tests use."""
 
     def __init__(self, bus):
         self._bus = bus
 
     def qsize(self):
-        """How many messages wait."""
+        """The number of waiting messages."""
         while (message := self._bus._take(0)) is not None:
             self._bus.waiting.append(message)
         return len(self._bus.waiting)
 
     def empty(self):
-        """Whether none does."""
+        """Whether no message is waiting."""
         return self.qsize() == 0
 
 
 class Bus(CantapBus):
-    """As python-can's virtual interface is opened."""
+    """Opened like python-can's virtual interface."""
 
     def __init__(self, channel=None, bitrate=500_000, receive_own_messages=False, **kwargs):
         self.name = channel
@@ -43,7 +43,7 @@ class Bus(CantapBus):
             self.taken = next(number for number in (1, 2) if number not in _in_use[channel])
             _in_use[channel].add(self.taken)
         serial = "".join(letter for letter in str(channel) if letter.isalnum())
-        # Before anything can fail.
+        # Set this before anything can fail.
         self._periodic_tasks = []
         for option in ("fd", "single_handle", "preserve_timestamps", "rx_queue_size", "interface"):
             kwargs.pop(option, None)
@@ -73,13 +73,13 @@ class Bus(CantapBus):
 
 
 can.interfaces.BACKENDS["virtual"] = (__name__, "Bus")
-# The analyser has no CAN FD.
+# The analyser does not support CAN FD.
 DeviceCyclicTask.thread = threading.Thread(target=lambda: None)
 DeviceCyclicTask.thread.start()
 
 
 def pytest_collection_modifyitems(config, items):
-    """CAN FD is what the analyser does not have."""
+    """The analyser does not support CAN FD."""
     kept = [item for item in items if "_fd" not in item.name]
     config.hook.pytest_deselected(items=[item for item in items if item not in kept])
     items[:] = kept

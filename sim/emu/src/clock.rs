@@ -1,6 +1,6 @@
-//! What a machine's time is counted in.
+//! The unit of a machine's time.
 
-/// How many core cycles a second has, once the firmware has set the chip's clocks up. All times of a machine are in these cycles;
+/// How many core cycles a second has, once the firmware has set up the chip's clocks. All times of a machine are in these cycles;
 /// the few microseconds before that are counted in the same unit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Clock {
@@ -8,7 +8,7 @@ pub struct Clock {
 }
 
 impl Clock {
-    /// A core clock in Hz: a multiple of 12 MHz, so that a bit of full-speed USB is whole cycles.
+    /// A core clock in Hz: a multiple of 12 MHz, so that a bit of full-speed USB is a whole number of cycles.
     ///
     /// # Panics
     /// If it is not.

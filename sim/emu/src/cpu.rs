@@ -1,9 +1,9 @@
-//! The processor: a thin module over rsemu's Cortex-M4F, the only one that knows its API, so that the
-//! core can be exchanged. It counts the cycles, owns flash and RAM, and mends two defects of rsemu 0.0.7
-//! around IT blocks (`docs/upstream-rsemu.md`).
+//! The processor: a thin module over rsemu's Cortex-M4F, and the only module that knows its API, so that
+//! the core can be replaced. It counts the cycles, owns flash and RAM, and works around two defects of
+//! rsemu 0.0.7 with IT blocks (`docs/upstream-rsemu.md`).
 //!
 //! By itself the core takes one cycle per instruction, one more per data access, two per taken branch, 12
-//! and 10 for exception entry and return; what it waits for beside is [`crate::timing`]'s.
+//! and 10 for exception entry and return; [`crate::timing`] adds what it waits for.
 
 mod bus;
 mod memory;
@@ -22,18 +22,18 @@ pub use bus::Bus;
 pub use memory::{Memories, Memory};
 use window::{Shared, Window};
 
-/// A table of 64 KiB pages finds memories and peripherals faster than a search; the few above it are
-/// searched for.
+/// A table of 64 KiB pages finds memories and peripherals faster than a search; only the few above
+/// it are searched for.
 const PAGES: DispatchPolicy = DispatchPolicy::Dense { page_bits: 16, cover: map::PERIPHERALS.end as u64 };
 
-/// rsemu charges each of a stack frame's words on top of the 12 and 10 cycles of exception entry and return, which
-/// contain them (ARM DDI 0439D §3.9.1).
+/// rsemu charges each word of a stack frame in addition to the 12 and 10 cycles of exception entry and return,
+/// which already include them (ARM DDI 0439D §3.9.1).
 const FRAME: u64 = 8;
-/// More than any tail-chained return takes in rsemu, at six cycles and one for each register that is popped; one that unstacks
-/// takes 19 and more.
+/// More than any tail-chained return takes in rsemu, which is six cycles plus one for each register popped; a return that
+/// unstacks takes at least 19.
 const TAIL_CHAIN: u64 = 18;
 
-/// The processor's registers, as far as anything outside needs them.
+/// The processor's registers, as far as they are needed outside.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct State {
     /// R15: address of the next instruction.
@@ -81,7 +81,7 @@ impl From<Regs> for State {
 pub struct Cpu {
     core: ArmV7m,
     shared: Shared,
-    /// What the last step waited for.
+    /// What the last step waited for, and how long.
     waits: Waits,
     now: u64,
     state: State,
@@ -114,7 +114,7 @@ impl Cpu {
                 topology.map_with(mapping).expect("the regions of the fixed memory map do not overlap")
             };
             let delays = shared.delays.as_ref();
-            // Reads of flash take the short way to memory; writes go to the flash controller.
+            // Reads of flash go directly to memory; writes go to the flash controller.
             put(window::memory("flash", &memories.flash, delays), map::FLASH.start, Perms::RX, 1);
             let at_zero = put(window::memory("boot alias", &memories.flash, delays), 0, Perms::RX, 1);
             put(
@@ -179,8 +179,9 @@ impl Cpu {
         self.at_zero = (id, bootloader);
     }
 
-    /// The core as the ROM bootloader leaves it, about to execute the program's first instruction: the program's stack and
-    /// entry, the bootloader's vectors, SysTick running, the USB interrupt enabled and pending.
+    /// Puts the core into the state in which the ROM bootloader leaves it, about to execute the program's first
+    /// instruction: the program's stack and entry, the bootloader's vectors, SysTick running, the USB interrupt enabled
+    /// and pending.
     pub fn leave_bootloader(&mut self) {
         // The reset sequence, which takes stack and entry from flash.
         self.core.step();
@@ -221,7 +222,7 @@ impl Cpu {
         &self.state
     }
 
-    /// Whether the core sleeps in WFI or WFE. It may be found out a cycle late.
+    /// Whether the core sleeps in WFI or WFE. This may be noticed a cycle late.
     pub fn asleep(&self) -> bool {
         self.asleep
     }
@@ -231,9 +232,9 @@ impl Cpu {
         self.core.is_locked_up()
     }
 
-    /// Whether the last steps reached beyond memory; asking clears it.
+    /// Whether the last steps accessed anything but memory; reading this clears it.
     pub fn take_touched(&self) -> bool {
-        // One thread only; a swap would cost a bus lock in every step.
+        // There is only one thread; a swap would cost a bus lock in every step.
         let touched = self.shared.touched.load(Ordering::Relaxed);
         if touched {
             self.shared.touched.store(false, Ordering::Relaxed);
@@ -344,9 +345,10 @@ impl Cpu {
         })
     }
 
-    /// rsemu does not stack ITSTATE when an exception comes, so the rest of the block would run
-    /// unconditionally afterwards: exceptions wait until the block's end, at most four instructions.
-    /// And an exception return that is itself in a block leaves ITSTATE advanced once too often.
+    /// When an exception comes, rsemu does not stack ITSTATE, so the rest of an IT block would run
+    /// unconditionally afterwards. Exceptions therefore wait for the block's end, at most four
+    /// instructions. And an exception return that is itself in a block leaves ITSTATE advanced once
+    /// too often.
     fn step_in_it_block(&mut self, before: State) -> u64 {
         let could_be_taken =
             self.lines != 0 || self.core.with_sys(|sys| sys.pending.iter().any(|word| *word != 0));
@@ -369,8 +371,8 @@ impl Cpu {
         }
     }
 
-    /// Lets a sleeping core's time pass until `until`, or until its own SysTick is due or a write reaches its
-    /// peripheral if that is sooner.
+    /// Lets a sleeping core's time pass until `until`, or until its SysTick is due or a write reaches its
+    /// peripheral, whichever comes first.
     pub fn advance_idle(&mut self, until: u64) {
         let posted_at = self.shared.delays().and_then(|delays| delays.posted_at());
         let mut span = until.min(posted_at.unwrap_or(until)).saturating_sub(self.now).max(1);

@@ -1,5 +1,5 @@
 //! A program's ELF: what goes into flash, the names of its functions, and the checks that refuse a
-//! file that could not run, in one line each.
+//! file that could not run, with a one-line message each.
 
 use object::{Object, ObjectSymbol, SymbolKind};
 
@@ -39,7 +39,7 @@ pub struct Image {
     segments: Vec<(u32, Vec<u8>)>,
     /// Functions, by address.
     functions: Vec<Symbol>,
-    /// Everything else that has a name.
+    /// Everything else with a name.
     data: Vec<(String, u32)>,
 }
 
@@ -98,7 +98,7 @@ impl Image {
         self.segments.iter().map(|(address, bytes)| (*address, &bytes[..]))
     }
 
-    /// The function at `address` and the distance from its start, if there is one.
+    /// The function at `address` and the distance from its start, if there is a function.
     pub fn function_at(&self, address: u32) -> Option<(&str, u32)> {
         let after = self.functions.partition_point(|symbol| symbol.address <= address);
         let symbol = &self.functions[..after].last()?;
@@ -111,7 +111,7 @@ impl Image {
         self.functions.iter().find(|symbol| symbol.name == name).map(|symbol| symbol.address)
     }
 
-    /// `name+0x12`, or the bare address where there is no name.
+    /// `name+0x12`, or the bare address if there is no name.
     pub fn describe(&self, address: u32) -> String {
         match self.function_at(address) {
             Some((name, 0)) => name.to_owned(),
@@ -128,7 +128,7 @@ impl Image {
     /// What is in flash from `address` on.
     pub fn bytes_at(&self, address: u32) -> Option<&[u8]> {
         self.segments.iter().find_map(|(base, bytes)| {
-            // The address just behind a segment is not in it, and may be the next one's first.
+            // The address just past a segment is not in it, and may be the next one's first.
             bytes.get(address.checked_sub(*base)? as usize..).filter(|bytes| !bytes.is_empty())
         })
     }
@@ -150,8 +150,8 @@ impl Image {
     }
 }
 
-/// The segments with their load addresses: that of initialised data is in flash, although its home
-/// is in RAM.
+/// The segments with their load addresses: initialised data is loaded into flash, although it lives
+/// in RAM.
 fn load_segments(elf: &[u8]) -> Result<Vec<(u32, Vec<u8>)>, ElfError> {
     use object::elf::{FileHeader32, PT_LOAD};
     use object::read::elf::{FileHeader, ProgramHeader};

@@ -1,8 +1,8 @@
 #![doc = include_str!("../README.md")]
 //!
-//! It knows nothing of what the program is for. What it must know is in [`Setup`]: the core's clock, the board's crystal, which
-//! interrupts' masking is to be measured. Time is core cycles everywhere ([`Clock`]); nothing here looks at the host's clock, so the
-//! same inputs give the same run, byte for byte. How long the core waits for its memories is one of two bounds ([`timing`]).
+//! It knows nothing about what the program is for. What it must know is in [`Setup`]: the core's clock, the board's crystal, the
+//! interrupts whose masking is to be measured. Time is core cycles everywhere ([`Clock`]); nothing here looks at the host's clock,
+//! so the same inputs give the same run, byte for byte. How long the core waits for its memories is one of two bounds ([`timing`]).
 
 #![forbid(unsafe_code)]
 

@@ -1,4 +1,4 @@
-//! The machine: core, chip and buses in one time.
+//! The machine: core, chip and buses on one timeline.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -19,10 +19,10 @@ use crate::timing::Bound;
 use crate::trace::Trace;
 use crate::{Clock, Peripheral};
 
-/// How often, in steps, what the core does not report is looked at: a reset request, a lock-up.
+/// How often, in steps, to check for what the core does not report: a reset request, a lock-up.
 const LOOK_EVERY: u32 = 1024;
 const HARD_FAULT: u16 = 3;
-/// Functions in which a panic is seen to begin.
+/// Functions whose entry marks the start of a panic.
 const PANIC_FUNCTIONS: [&str; 4] =
     ["rust_begin_unwind", "__rustc::rust_begin_unwind", "core::panicking::panic_fmt", "panic_handler"];
 
@@ -37,11 +37,11 @@ pub struct Setup {
     pub start: Start,
     /// The interrupts whose masking is measured: bit n is interrupt n.
     pub watched: u128,
-    /// Where each bus arrives: port (0 for A) and pin.
+    /// The receive pin of each bus: port (0 for A) and pin.
     pub receive_pins: [(usize, u32); 2],
     /// Both controllers on one bus.
     pub joined: bool,
-    /// A reset that the firmware asks for ends the run, rather than restarting it.
+    /// A reset requested by the firmware ends the run, rather than restarting the firmware.
     pub stop_on_reset: bool,
     /// A watchdog reset restarts the firmware, rather than ending the run.
     pub survive_watchdog: bool,
@@ -49,13 +49,13 @@ pub struct Setup {
     pub survive_failures: bool,
     /// How long memories and buses keep the core waiting.
     pub bound: Bound,
-    /// What a CAN controller's master reset takes with it.
+    /// What a CAN controller's master reset clears.
     pub master_reset: MasterReset,
 }
 
 impl Setup {
-    /// A good crystal of this frequency, no interrupt watched, two buses, restart on request, end on a watchdog reset, a core that
-    /// never waits.
+    /// The defaults: a good crystal of this frequency, no interrupt watched, two buses, restart on request, end on a watchdog
+    /// reset, a core that never waits.
     pub fn new(clock: Clock, crystal_hz: u64) -> Self {
         Self {
             clock,
@@ -89,13 +89,13 @@ pub struct Machine {
     stalled_until: u64,
     look_in: u32,
     resets: u64,
-    /// It matters if the core executes a barrier.
+    /// Whether it matters if the core executes a barrier.
     awaits_barrier: bool,
     /// Whether the chip has run at all.
     started: bool,
-    /// Which exceptions have reached each attached device, by the device's interrupt.
+    /// Which exceptions have accessed each attached device, by the device's interrupt.
     accessors: BTreeMap<u16, BTreeSet<u16>>,
-    /// The watched interrupts' priority, the least urgent one's, looked up when BASEPRI is first seen set.
+    /// The priority of the least urgent watched interrupt, looked up when BASEPRI is first seen set.
     watched_priority: Option<u8>,
 }
 
@@ -138,8 +138,8 @@ impl Machine {
         }
     }
 
-    /// The chip and what is wired to it. It is locked as long as the guard lives: hold one at a time, and none
-    /// across [`Self::run_until`].
+    /// The chip and what is wired to it. It stays locked while the guard lives: hold only one at a time, and
+    /// none across [`Self::run_until`].
     pub fn board(&self) -> MutexGuard<'_, Board> {
         lock(&self.board)
     }
@@ -174,19 +174,19 @@ impl Machine {
         &self.probe
     }
 
-    /// Starts counting anew.
+    /// Starts counting from zero.
     pub fn reset_probe(&mut self) {
         self.probe.reset(self.cpu.now());
         self.watched_priority = None;
     }
 
-    /// System resets so far, power-on not counted.
+    /// System resets so far, not counting power-on.
     pub fn resets(&self) -> u64 {
         self.resets
     }
 
-    /// Keeps interrupt lines (bit n is interrupt n) from reaching the core, as a firmware that masks them
-    /// for too long would. 0 lets all through again.
+    /// Keeps interrupt lines (bit n is interrupt n) from reaching the core, as firmware that masks them
+    /// for too long would. 0 lets all of them through again.
     pub fn hold_lines(&mut self, lines: u128) {
         self.held_lines = lines;
     }
@@ -205,12 +205,12 @@ impl Machine {
         self.trace.take()
     }
 
-    /// Records where the cycles go from now on.
+    /// Starts recording where the cycles go.
     pub fn start_profile(&mut self) {
         self.profile = Some(Profile::default());
     }
 
-    /// Ends that and returns it.
+    /// Ends recording and returns the profile.
     pub fn take_profile(&mut self) -> Option<Profile> {
         self.profile.take()
     }
@@ -229,17 +229,17 @@ impl Machine {
             .collect()
     }
 
-    /// What runs as exception `number`: its name, or that it is none.
+    /// What runs as exception `number`: its name, or thread mode.
     pub fn task_name(&self, number: u16) -> String {
         if number == 0 { "thread mode".to_owned() } else { self.exception_name(number) }
     }
 
-    /// The exceptions that have reached an attached device's registers, by the device's interrupt; 0 is thread mode.
+    /// The exceptions that have accessed an attached device's registers, by the device's interrupt; 0 is thread mode.
     pub fn accessors(&self, irq: u16) -> impl Iterator<Item = u16> {
         self.accessors.get(&irq).into_iter().flatten().copied()
     }
 
-    /// An exception's name: its handler's, where the vector table and the symbols tell it.
+    /// An exception's name: its handler's, if the vector table and the symbols give it.
     pub fn exception_name(&self, number: u16) -> String {
         let handler = self.cpu.word(map::FLASH.start + 4 * u32::from(number)).unwrap_or(0) & !1;
         match self.image.function_at(handler) {
@@ -249,7 +249,7 @@ impl Machine {
         }
     }
 
-    /// Runs until core cycle `until`, or a few beyond: an instruction is never cut.
+    /// Runs until core cycle `until`, or a few cycles beyond: instructions are not interrupted.
     pub fn run_until(&mut self, until: u64) -> Result<(), Stopped> {
         if !self.started {
             self.started = true;
@@ -364,7 +364,7 @@ impl Machine {
         })
     }
 
-    /// What the core does not report by itself.
+    /// Checks for what the core does not report.
     fn look(&mut self) -> Result<(), Stopped> {
         self.look_in = LOOK_EVERY;
         if self.cpu.locked_up() {
@@ -405,7 +405,7 @@ impl Machine {
         self.refresh();
     }
 
-    /// Asks everything for its interrupt line and its next event.
+    /// Queries everything for its interrupt line and next event.
     fn refresh(&mut self) {
         let mut board = lock(&self.board);
         self.lines = board.lines() & !self.held_lines;
@@ -433,7 +433,7 @@ impl Machine {
     }
 }
 
-/// A peer that panicked while it held the lock leaves a state that is as good as any other.
+/// If another holder of the lock panicked, the state it left is as good as any other.
 fn lock(board: &Mutex<Board>) -> MutexGuard<'_, Board> {
     board.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -10,7 +10,7 @@ pub const CCM: Range<u32> = 0x1000_0000..0x1001_0000;
 pub const SRAM: Range<u32> = 0x2000_0000..0x2002_0000;
 /// ROM bootloader, OTP area, unique ID, flash size, calibration values, option bytes.
 pub const SYSTEM_MEMORY: Range<u32> = 0x1FFF_0000..0x2000_0000;
-/// The part of it that is the ROM bootloader.
+/// The ROM bootloader's part of it.
 pub const BOOTLOADER: Range<u32> = 0x1FFF_0000..0x1FFF_7800;
 /// Every peripheral of APB1, APB2, AHB1 and AHB2.
 pub const PERIPHERALS: Range<u32> = 0x4000_0000..0x6000_0000;

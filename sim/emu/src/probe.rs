@@ -1,13 +1,13 @@
-//! What a run costs: cycles per exception and asleep, the longest time in which interrupts were
-//! masked, how full the receive FIFOs became. What a cycle count means depends on the bound (see
+//! What a run costs: cycles per exception and asleep, the longest time for which interrupts were
+//! masked, and how full the receive FIFOs became. What a cycle count means depends on the bound (see
 //! [`crate::timing`]).
 
 use crate::cpu::State;
 
-/// Exception numbers that are counted: 16 of the core and the chip's interrupts.
+/// Exception numbers that are counted: the core's 16 and the chip's interrupts.
 pub const EXCEPTIONS: usize = 128;
 
-/// A time in which the watched interrupts ([`crate::Setup::watched`]) were masked.
+/// A period in which the watched interrupts ([`crate::Setup::watched`]) were masked.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct MaskedWindow {
     /// When it began, in core cycles.
@@ -23,7 +23,7 @@ pub struct MaskedWindow {
 /// What an exception cost, without what interrupted it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Task {
-    /// The exception's, as the image names its handler.
+    /// The exception's name: that of its handler in the image.
     pub name: String,
     /// How often it ran.
     pub entries: u64,
@@ -38,7 +38,7 @@ pub struct Task {
 pub enum Change {
     /// An exception was entered, perhaps within another.
     Enter(u16),
-    /// An exception ended, and with it what it may have interrupted goes on.
+    /// An exception ended, and what it interrupted continues.
     Leave(u16),
     /// One exception ended and the next began at once.
     Chain(u16, u16),
@@ -80,8 +80,8 @@ impl Default for Probe {
 }
 
 impl Probe {
-    /// Counts from `now` on. A masked window under way does not count: start-up, for example, is masked
-    /// from end to end.
+    /// Starts counting at `now`. A masked window under way is not counted: start-up, for example, is
+    /// masked from beginning to end.
     pub fn reset(&mut self, now: u64) {
         let active = std::mem::take(&mut self.active);
         *self = Self { since: now, active, ..Self::default() };
@@ -112,17 +112,17 @@ impl Probe {
         self.asleep
     }
 
-    /// Core cycles in which the core stood still because flash was being written.
+    /// Core cycles in which the core was stalled because flash was being written.
     pub fn stalled(&self) -> u64 {
         self.stalled
     }
 
-    /// The longest time in which the watched interrupts were masked.
+    /// The longest period in which the watched interrupts were masked.
     pub fn longest_masked(&self) -> MaskedWindow {
         self.longest
     }
 
-    /// The longest one of those at whose end one was waiting.
+    /// The longest of these at the end of which an interrupt was waiting.
     pub fn longest_masked_with_one_waiting(&self) -> MaskedWindow {
         self.longest_with_one_waiting
     }
@@ -132,7 +132,7 @@ impl Probe {
         self.fifo_max[controller]
     }
 
-    /// The share of time that the core was awake, in per cent, until `now`.
+    /// The share of the time until `now` in which the core was awake, in per cent.
     pub fn load_percent(&self, now: u64) -> f64 {
         let span = (now - self.since).max(1);
         100.0 - 100.0 * self.asleep as f64 / span as f64

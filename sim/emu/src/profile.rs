@@ -1,4 +1,4 @@
-//! Where the core's cycles go: by interrupt and function, what the code takes itself and what it waits for.
+//! Where the core's cycles go: by interrupt and function, what the code itself takes and what it waits for.
 
 use std::collections::HashMap;
 use std::fmt;
@@ -14,7 +14,7 @@ pub struct Cost {
     pub steps: u64,
     /// Cycles of the code itself.
     pub own: u64,
-    /// Cycles that it waited.
+    /// Cycles spent waiting.
     pub waits: Waits,
 }
 
@@ -45,7 +45,8 @@ pub struct Profile {
 pub struct Row {
     /// The exception's number; 0 is thread mode.
     pub exception: u16,
-    /// The function, as far as the symbols tell. What the compiler put into another function counts there.
+    /// The function, as far as the symbols tell. Code that was inlined counts for the function it was
+    /// inlined into.
     pub function: String,
     /// Its cost.
     pub cost: Cost,
@@ -60,12 +61,12 @@ impl Profile {
         self.costs.entry((of.exception(), of.pc)).or_default().add(&cost);
     }
 
-    /// Each instruction's cost: exception, address, cost; in no order.
+    /// Each instruction's cost: exception, address, cost; in no particular order.
     pub fn instructions(&self) -> impl Iterator<Item = (u16, u32, &Cost)> {
         self.costs.iter().map(|((exception, pc), cost)| (*exception, *pc, cost))
     }
 
-    /// The functions of `image` that cost anything, the dearest first.
+    /// The functions of `image` that cost anything, the most expensive first.
     pub fn by_function(&self, image: &Image) -> Vec<Row> {
         let mut functions: HashMap<(u16, &str), Cost> = HashMap::new();
         for ((exception, pc), cost) in &self.costs {
@@ -83,14 +84,15 @@ impl Profile {
     }
 }
 
-/// A function's path without what its type and itself are generic over: `<a::B<7>>::c::<d::E>` is `a::B::c`.
+/// A function's path without the generic arguments of its type and itself: `<a::B<7>>::c::<d::E>` is
+/// `a::B::c`.
 fn without_generics(name: &str) -> String {
     let mut depth = 0u32;
     let mut short = String::new();
     for symbol in name.strip_prefix('<').unwrap_or(name).chars() {
         match symbol {
             '<' => depth += 1,
-            // The bracket that closes a type in front has lost its partner.
+            // The bracket that closes a leading type has lost its partner.
             '>' => depth = depth.saturating_sub(1),
             _ if depth == 0 => short.push(symbol),
             _ => {}
@@ -99,15 +101,15 @@ fn without_generics(name: &str) -> String {
     short.trim_end_matches("::").to_owned()
 }
 
-/// Rows as a table, in shares of a span of time.
+/// Rows as a table, as shares of a span of time.
 pub struct Table<'a> {
     /// The rows.
     pub rows: &'a [Row],
     /// Names of the exceptions.
     pub name_of: &'a dyn Fn(u16) -> String,
-    /// The time in cycles that is 100 %.
+    /// The number of cycles that is 100 %.
     pub span: u64,
-    /// Rows with less are left out.
+    /// Rows below this are left out.
     pub least_percent: f64,
 }
 

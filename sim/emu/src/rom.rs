@@ -1,5 +1,5 @@
-//! What stands in for ST's bootloader in ROM, and how the chip was started. What the bootloader leaves behind is in
-//! [`crate::soc::bootloader`].
+//! What stands in for ST's bootloader in ROM, and how the chip was started. For what the bootloader leaves behind
+//! see [`crate::soc::bootloader`].
 
 use crate::memory_map as map;
 
@@ -14,7 +14,7 @@ pub enum Start {
     /// Power came on, and the boot pins chose flash.
     #[default]
     PowerOn,
-    /// The ROM bootloader has written the program and started it; the jumper that chose the bootloader is still in.
+    /// The ROM bootloader has written the program and started it; the jumper that selects the bootloader is still in.
     Bootloader,
 }
 
@@ -27,8 +27,8 @@ const RETURN: u32 = map::BOOTLOADER.start + 0x405;
 const VECTORS: usize = 16 + 82;
 const SYSTICK: usize = 15;
 
-/// What stands in for ST's code: its vectors, handlers that return for what it uses, an endless loop for the rest, and an
-/// undefined instruction at its entry, where a run ends.
+/// What stands in for ST's code: its vectors, handlers that simply return for the exceptions it uses, an endless loop for
+/// the rest, and an undefined instruction at its entry, which ends a run.
 pub fn contents() -> Vec<u8> {
     let mut vectors = [ENDLESS; VECTORS];
     vectors[0] = STACK;

@@ -1,4 +1,4 @@
-//! Why a run ended before its time, in words that somebody can act on.
+//! Why a run ended early, in words that help somebody act on it.
 
 use std::fmt;
 
@@ -7,12 +7,12 @@ use crate::cpu::Cpu;
 use crate::elf::Image;
 use crate::memory_map as map;
 
-/// Frames of a call stack that are looked for.
+/// Most frames of a call stack to look for.
 const MAX_DEPTH: usize = 32;
-/// Bytes of stack that are searched for them.
+/// Bytes of stack to search for them.
 const MAX_STACK: u32 = 8 * 1024;
 
-/// Why the firmware cannot go on.
+/// Why the firmware cannot continue.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reason {
     /// A fault, with CFSR, HFSR, MMFAR and BFAR.
@@ -23,7 +23,7 @@ pub enum Reason {
     Watchdog,
     /// It panicked.
     Panic,
-    /// It asked for a reset, and the run was set up to end there.
+    /// It requested a reset, and the run was set up to end there.
     Reset,
     /// It jumped to the ROM bootloader, which is not emulated.
     Bootloader,
@@ -36,12 +36,12 @@ pub struct Stopped {
     pub reason: Reason,
     /// Core cycle.
     pub at: u64,
-    /// What cycles are.
+    /// How long a cycle is.
     pub clock: Clock,
     /// The instruction it happened at.
     pub pc: u32,
-    /// Functions on the stack, the innermost first. Found by searching the stack for return addresses: a
-    /// stale one may be among them.
+    /// Functions on the stack, the innermost first. Found by searching the stack for return addresses,
+    /// so there may be stale ones among them.
     pub stack: Vec<String>,
 }
 
@@ -67,7 +67,7 @@ impl fmt::Display for Stopped {
 }
 
 impl Stopped {
-    /// Describes where the core is now. In a fault handler that is where the fault came from.
+    /// Describes where the core is now. In a fault handler, that is where the fault came from.
     pub(crate) fn here(reason: Reason, clock: Clock, cpu: &Cpu, image: &Image) -> Self {
         let state = cpu.state();
         let [mut pc, mut lr, mut sp] = [state.pc, state.lr, state.sp];
@@ -78,12 +78,12 @@ impl Stopped {
             sp = sp.wrapping_add(32);
         }
         let mut stack = vec![image.describe(pc)];
-        // The link register, then the stack, each with the address above it.
+        // The link register, then the stack; each word with the address above it.
         let words = (0..MAX_STACK / 4).map(|word| sp.wrapping_add(4 * word));
         let words = words.map_while(|at| Some((cpu.word(at)?, at.wrapping_add(4))));
         for (word, above) in std::iter::once((lr, sp)).chain(words) {
             let caller = if is_exception_return(word) {
-                // A handler's return lies right below what it interrupted.
+                // A handler's return value is directly below the frame of what it interrupted.
                 cpu.word(above.wrapping_add(24)).filter(|pc| map::FLASH.contains(pc))
             } else {
                 is_return_address(word, cpu).then_some(word & !1)
@@ -97,7 +97,7 @@ impl Stopped {
     }
 }
 
-/// Whether a word is what a handler finds in its link register.
+/// Whether a word is an exception return value, as a handler finds it in its link register.
 fn is_exception_return(word: u32) -> bool {
     matches!(word | 0x10, 0xFFFF_FFF1 | 0xFFFF_FFF9 | 0xFFFF_FFFD)
 }

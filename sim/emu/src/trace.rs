@@ -1,6 +1,6 @@
 //! A run as a picture: a file in the Chrome trace event format, which Perfetto (ui.perfetto.dev) and
-//! chrome://tracing show. One line each for every interrupt, for masked windows, sleep and each bus;
-//! FIFO fills are counters.
+//! chrome://tracing can show. There is a line for every interrupt, for masked windows, for sleep and
+//! for each bus; FIFO fill levels are counters.
 
 use std::collections::BTreeSet;
 use std::io::{self, Write};
@@ -11,7 +11,7 @@ use serde_json::json;
 use crate::Clock;
 use crate::bus::{BusFrame, Member};
 
-/// Lines of the picture that are not an exception's.
+/// Lines of the picture that do not belong to an exception.
 const MASKED: u32 = 1000;
 const SLEEP: u32 = 1001;
 const STALL: u32 = 1002;
@@ -35,7 +35,7 @@ pub struct Trace {
 }
 
 impl Trace {
-    /// Nothing yet.
+    /// An empty trace.
     pub(crate) fn new(clock: Clock) -> Self {
         Self { clock, entries: Vec::new(), open: Vec::new(), fifo: [0; 2], seen: [0; 2] }
     }
@@ -66,7 +66,7 @@ impl Trace {
     }
 
     pub(crate) fn slept(&mut self, start: u64, end: u64) {
-        // A sleep is cut at every event of the emulation; the picture shows it whole.
+        // Every event of the emulation splits a sleep; the picture shows it in one piece.
         if let Some(Entry::Span { line: SLEEP, end: last, .. }) = self.entries.last_mut()
             && *last == start
         {
@@ -87,7 +87,7 @@ impl Trace {
         }
     }
 
-    /// Takes over what is new in a bus's history.
+    /// Adds what is new in a bus's history.
     pub(crate) fn frames(&mut self, wire: usize, history: &[BusFrame]) {
         let seen = if self.seen[wire] <= history.len() { self.seen[wire] } else { 0 };
         self.entries.extend(history[seen..].iter().map(|frame| Entry::Bus { wire, frame: *frame }));

@@ -12,7 +12,7 @@ use crate::bus::{BitTime, Source};
 /// Kinds of frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
-    /// Standard frames without data of the least possible length: 48 bits with intermission.
+    /// Standard frames without data of the shortest possible length: 48 bits with intermission.
     Std0,
     /// Standard frames with 8 random bytes.
     Std8,
@@ -20,14 +20,14 @@ pub enum Kind {
     Ext0,
     /// Extended frames with 8 random bytes.
     Ext8,
-    /// Standard remote frames of the least possible length: 47 bits with intermission.
+    /// Standard remote frames of the shortest possible length: 47 bits with intermission.
     Rtr,
     /// Everything: both formats, data and remote, every length.
     Mix,
 }
 
 impl Kind {
-    /// All of them, with the names that the command knows.
+    /// All kinds, with the names that the command uses.
     pub const ALL: [(&'static str, Kind); 6] = [
         ("std0", Kind::Std0),
         ("std8", Kind::Std8),
@@ -54,7 +54,7 @@ impl FromStr for Kind {
 pub struct Frames {
     kind: Kind,
     random: Rng,
-    /// The frames of least length, for the kinds that mean these.
+    /// The shortest frames, for the kinds that use them.
     shortest: Vec<Frame>,
 }
 
@@ -108,8 +108,8 @@ pub struct Traffic {
 }
 
 impl Traffic {
-    /// Frames of `kind` from `seed` that occupy `load_percent` of the bus (0 to 100; 100 is back to back),
-    /// from core cycle `from` to `until`.
+    /// Random frames of `kind` from `seed` that occupy `load_percent` of the bus (0 to 100; 100 is back to
+    /// back), from core cycle `from` to `until`.
     pub fn new(kind: Kind, seed: u64, load_percent: f64, from: u64, until: u64) -> Self {
         Self { frames: Frames::new(kind, seed), load_percent, from, until, due_bits: 0.0 }
     }
@@ -183,7 +183,7 @@ impl Source for Script {
 pub struct LogError {
     /// Which line, from 1.
     pub line: usize,
-    /// What it says.
+    /// Its text.
     pub text: String,
 }
 

@@ -25,7 +25,7 @@ impl<D: HostDriver> UsbPort<D> {
         Self { otg: Otg::new(), host: UsbHost::new(timing, driver) }
     }
 
-    /// The host, brought up to `now`, with the controller that some of its actions need.
+    /// The host, advanced to `now`, and the controller, which some of its actions need.
     pub fn host(&mut self, now: u64) -> (&mut UsbHost<D>, &mut Otg) {
         self.host.advance(&mut self.otg, now);
         (&mut self.host, &mut self.otg)
@@ -45,7 +45,8 @@ impl<D: HostDriver> Peripheral for UsbPort<D> {
     }
 
     fn write(&mut self, offset: u32, _size: u8, value: u32, now: u64) {
-        // The core's bus interface takes whole words only (RM0090, "CSR memory map"); drivers know.
+        // The core's bus interface accepts only whole words (RM0090, "CSR memory map"), as drivers
+        // know.
         self.host.advance(&mut self.otg, now);
         self.otg.write(offset & !3, value);
     }
@@ -67,7 +68,7 @@ impl<D: HostDriver> Peripheral for UsbPort<D> {
     }
 
     fn reset(&mut self, now: u64) {
-        // The pull-up goes with the registers; the host notices at its next frame.
+        // The reset of the registers removes the pull-up; the host notices at its next frame.
         self.host.advance(&mut self.otg, now);
         self.otg = Otg::new();
     }

@@ -1,5 +1,5 @@
-//! The CAN controllers' registers and the bus between them, as RM0090 and ISO 11898-1 have them: what
-//! firmware would see, without a firmware.
+//! The CAN controllers' registers and the bus between them, as RM0090 and ISO 11898-1 describe them:
+//! what firmware would see, without firmware.
 
 use cantap_can::Frame;
 use cantap_emu::Clock;
@@ -73,7 +73,7 @@ impl Bench {
         self.wire.advance(self.now, &mut self.can);
     }
 
-    /// The initialisation handshake, to the point where the controller has synchronised.
+    /// The initialisation handshake, up to the point where the controller has synchronised.
     fn start(&mut self, base: u32, mcr: u32, btr: u32) {
         self.write(base + MCR, INRQ | mcr);
         assert_eq!(self.read(base + MSR) & 3, 1, "INAK, no longer SLAK");
@@ -186,7 +186,7 @@ fn a_lone_sender_turns_passive_and_never_bus_off() {
     assert!(bench.can.irqs(0)[3], "warning and passive were reported");
     bench.write(MSR, 1 << 2);
     assert!(!bench.can.irqs(0)[3]);
-    // With somebody to acknowledge, it gets through and recovers.
+    // Once a node acknowledges, it gets through and recovers.
     bench.add_peer();
     bench.run(MS);
     assert_eq!(bench.good_frames().len(), 1);
@@ -255,7 +255,7 @@ fn every_disturbance_reaches_the_last_error_code() {
     }
 }
 
-/// Frames, errors, a stuck bus, a wrong bit rate: not one dominant bit.
+/// Frames, errors, a stuck bus, a wrong bit rate: not a single dominant bit.
 #[test]
 fn a_silent_controller_never_drives_the_bus() {
     for btr in [MEGABIT, HALF_MEGABIT] {
@@ -298,7 +298,7 @@ fn a_listener_at_the_wrong_rate_sees_errors_and_disturbs_nobody() {
     assert!(bench.wire.history().iter().all(|frame| frame.error.is_none() && frame.taken_by == 0));
     let (_, _, _, code, _, rec) = bench.esr(0);
     assert!(code != 0 && rec > 0, "last error {code}, counter {rec}");
-    // One that is not silent ruins everybody's frames until it is error-passive.
+    // A controller that is not silent destroys everybody's frames until it is error-passive.
     let mut bench = Bench::new(&[0]);
     bench.add_peer();
     bench.start(0, 0, HALF_MEGABIT);
@@ -364,7 +364,7 @@ fn a_frame_wakes_a_sleeping_controller() {
         bench.run(2 * MS);
         assert_eq!(bench.read(MSR) >> 3 & 1, 1, "WKUI");
         assert!(bench.can.irqs(0)[3]);
-        // The frame that wakes it is lost on it; the next one is not.
+        // It misses the frame that wakes it, but not the next.
         let taken: Vec<u8> = bench.wire.history().iter().map(|frame| frame.taken_by).collect();
         assert_eq!(taken, if automatic { [0, 1] } else { [0, 0] });
         assert_eq!(bench.read(MSR) >> 1 & 1, u32::from(!automatic), "SLAK");
@@ -385,7 +385,7 @@ fn a_stuck_bus_keeps_a_controller_from_synchronising() {
     assert_eq!(bench.read(MSR) & 1, 0);
 }
 
-/// The earlier analyser's two tests with bursts, on the bus itself: the frames start where they must.
+/// The earlier analyser's two burst tests, on the bus itself: the frames start where they must.
 #[test]
 fn bursts_are_as_long_as_the_earlier_analyser_measured() {
     let mut bench = Bench::new(&[]);

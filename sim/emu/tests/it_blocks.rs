@@ -1,6 +1,6 @@
-//! Interrupts in IT blocks: the core underneath loses the block's state on exception entry, and the
-//! emulator mends that. The proof: one interrupt at every instant of a loop full of IT blocks leaves the
-//! loop's result as it is.
+//! Interrupts in IT blocks: the core underneath loses the block's state on exception entry, and the emulator
+//! works around that. The proof: an interrupt at any instant of a loop full of IT blocks does not change the
+//! loop's result.
 
 mod assembly;
 
@@ -14,7 +14,7 @@ const CLOCK: Clock = Clock::new(144_000_000);
 
 const DEVICE: u32 = 0x5005_0000;
 const IRQ: u16 = 40;
-/// Where the program leaves its result, its handler's count and a mark that it is done.
+/// Where the program leaves its result, its handler's count and a mark when it is done.
 const RESULT: u32 = SRAM.start;
 const HANDLED: u32 = SRAM.start + 4;
 const DONE: u32 = SRAM.start + 8;
@@ -27,7 +27,7 @@ fn program() -> Image {
     program.load(0, DEVICE);
     program.put(&[str(0, 0, 0)]);
     program.load(0, RESULT);
-    // Flags that are the opposite of what the interrupted code may rely on, then a conditional return.
+    // Set the flags to the opposite of what the interrupted code relies on, then return conditionally.
     program.put(&[ldr(1, 0, 1), adds(1, 1), str(1, 0, 1), cmp(1, 1), it(EQ, 0b1000), bx_lr()]);
     let endless = program.here();
     program.branch_to(endless);
@@ -76,7 +76,7 @@ fn program() -> Image {
     program.image()
 }
 
-/// What the loop computes, worked out here.
+/// What the loop should compute.
 fn expected() -> u32 {
     (0..ROUNDS).fold(1u32, |sum, round| {
         let (odd, low) = (round & 1, round & 3);
@@ -87,7 +87,8 @@ fn expected() -> u32 {
     })
 }
 
-/// Runs the program with the interrupt at cycle `at`; returns result, interrupts handled and when it was done.
+/// Runs the program with the interrupt at cycle `at`; returns the result, the interrupts handled and when it
+/// was done.
 fn run(at: Option<u64>) -> (u32, u32, u64) {
     let mut machine = Machine::new(program(), Setup::new(CLOCK, 8_000_000));
     let alarm = Arc::new(Mutex::new(Alarm::new(at)));

@@ -1,4 +1,4 @@
-//! A bus's level at the pins, and what the external interrupts make of it (RM0090 Rev 21 §8, §9.2, §12), without a firmware.
+//! A bus's level at the pins, and how the external interrupts respond to it (RM0090 Rev 21 §8, §9.2, §12), without firmware.
 
 use std::sync::{Arc, Mutex, MutexGuard};
 
@@ -66,7 +66,7 @@ impl Bench {
         self.write(IMR, PB12);
     }
 
-    /// Goes to what happens next, by the board's own word; nothing behind `until`.
+    /// Advances to the next event that the board announces, but not beyond `until`.
     fn step(&mut self, until: u64) -> bool {
         let next = self.board().next_event().filter(|next| *next <= until);
         let Some(next) = next else { return false };
@@ -80,7 +80,7 @@ impl Bench {
     }
 }
 
-/// The levels of a frame that is acknowledged, true for recessive.
+/// The levels of an acknowledged frame, true for recessive.
 fn levels(frame: &str) -> Vec<bool> {
     let bits = FrameBits::new(&frame.parse().unwrap());
     let mut levels = bits.levels().to_vec();
@@ -136,7 +136,7 @@ fn an_edge_to_recessive_can_be_late() {
 
 #[test]
 fn a_line_that_is_led_elsewhere_hears_nothing_and_costs_nothing() {
-    // Port A's pin 12, and PB8, which is the other bus's.
+    // Port A's pin 12, and PB8, which belongs to the other bus.
     for (register, port) in [(EXTICR4, 0), (EXTICR3, 1)] {
         let mut bench = Bench::new("123#DEADBEEF");
         bench.watch(0);

@@ -1,5 +1,5 @@
-//! What the core waits for, by small programs whose cycles can be counted by hand. Each measures itself with the
-//! core's own cycle counter.
+//! What the core waits for, shown by small programs whose cycles can be counted by hand. Each measures itself
+//! with the core's own cycle counter.
 
 mod assembly;
 
@@ -26,7 +26,7 @@ const QUARTER_AND_HALF: u32 = 5 << 10 | 4 << 13;
 const ON_APB1: u32 = 0x4000_3004;
 /// Bit 0 of that word.
 const ON_APB1_BIT: u32 = 0x4200_0000 + 0x3004 * 32;
-/// A device of the tests' own on APB1, and its interrupt.
+/// The tests' own device on APB1, and its interrupt.
 const ALARM: u32 = 0x4000_7800;
 const IRQ: u16 = 5;
 /// Somewhere in flash, at the start of a line.
@@ -43,7 +43,7 @@ fn start() -> Program {
     start_with(Program::new())
 }
 
-/// The same behind code that a program has already.
+/// The same, after code that a program already has.
 fn start_with(mut program: Program) -> Program {
     program.handler(1);
     for (address, value) in
@@ -59,9 +59,9 @@ fn start_with(mut program: Program) -> Program {
     program
 }
 
-/// Reads the counter in the last place of a line, so that what follows begins a line that has been read ahead; and APB1
-/// before it, so that what follows begins at an edge of its clock: two cycles of the read are left behind the edge, and
-/// the counter takes two.
+/// Reads the counter in the last word of a line, so that what follows begins a line that has been read ahead. Before
+/// that it reads APB1, so that what follows begins at an edge of its clock: two cycles of that read come after the
+/// edge, and the counter takes two.
 fn begin(program: &mut Program) {
     while program.here() % 16 != 12 {
         program.put(&[nop()]);
@@ -71,7 +71,7 @@ fn begin(program: &mut Program) {
     assert_eq!(program.here() % 16, 0);
 }
 
-/// Reads the counter again, writes the difference and ends.
+/// Reads the counter again, writes the difference and ends the program.
 fn end(mut program: Program, bound: Bound) -> u32 {
     // SUBS r5, r5, r6
     program.put(&[ldr(5, 7, 1), 0x1BAD]);
@@ -82,7 +82,8 @@ fn end(mut program: Program, bound: Bound) -> u32 {
     program.branch_to(sleep);
     let mut machine = Machine::new(program.image(), Setup { bound, ..Setup::new(CLOCK, 8_000_000) });
     machine.run_until(10_000).unwrap();
-    // The read at the beginning is of the measured time; one of the core's own registers takes two cycles.
+    // The first read of the counter is part of the measured time; reading one of the core's own registers takes two
+    // cycles.
     machine.cpu().word(RESULT).unwrap() - 2
 }
 
@@ -96,20 +97,20 @@ fn cycles(body: impl Fn(&mut Program)) -> [u32; 2] {
     })
 }
 
-/// Cycles of the same instructions in a row.
+/// Cycles of these instructions in a row.
 fn row(instructions: &[u16]) -> [u32; 2] {
     cycles(|program| program.put(instructions))
 }
 
-/// A line of four long instructions takes four cycles to execute and five to read, all but the first of which is
-/// waited for.
+/// A line of four long instructions takes four cycles to execute and five to read, and all lines but the first
+/// are waited for.
 #[test]
 fn straight_code_waits_a_cycle_for_each_line() {
     assert_eq!(row(&MOVW.repeat(16)), [16, 16 + 3]);
     assert_eq!(row(&[nop(); 32]), [32, 32], "eight short instructions leave the time");
 }
 
-/// A loop within a line is fetched once; at worst, filling the pipeline takes a cycle more.
+/// A loop within a line is fetched once; at worst, refilling the pipeline takes one more cycle.
 #[test]
 fn a_loop_waits_for_its_branches_only() {
     let rounds = |count| {
@@ -125,16 +126,16 @@ fn a_loop_waits_for_its_branches_only() {
     assert_eq!([best_thirty - best_ten, worst_thirty - worst_ten], [20 * 4, 20 * 5]);
 }
 
-/// From its edge on, two cycles of the slower clock and the core's own two; the next misses an edge by two and waits as
-/// long for another.
+/// From the edge on, two cycles of the slower clock and the core's own two; the next read misses an edge by two cycles
+/// and waits two for another.
 #[test]
 fn reads_through_a_bridge_take_three_of_its_cycles() {
     assert_eq!(row(&[ldr(0, 1, 0); 1]), [2, 10]);
     assert_eq!(row(&[ldr(0, 1, 0); 7]), [14, 10 + 6 * 12]);
 }
 
-/// A write is over for the core at once. The next must wait for it: two cycles of the slower clock, one of the core's in
-/// the bridge's register, and what is left to the next edge.
+/// For the core, a write is over at once. The next must wait for it: two cycles of the slower clock, one of the core's
+/// for the bridge's register, and the rest until the next edge.
 #[test]
 fn writes_through_a_bridge_wait_for_the_one_before() {
     assert_eq!(row(&[str(0, 1, 0); 2]), [4, 9 + 2]);
@@ -155,7 +156,7 @@ fn what_is_on_the_same_bus_waits_for_a_write() {
     assert_eq!(after_write(&DSB), [3, 3 + 7], "a barrier");
 }
 
-/// A bit's write is a read and a write, and the next must wait for both.
+/// Writing a bit is a read and a write, and the next access must wait for both.
 #[test]
 fn a_bits_write_takes_two_accesses() {
     let bits = |n: usize| {
@@ -172,16 +173,16 @@ fn a_bits_write_takes_two_accesses() {
 /// unit.
 #[test]
 fn data_in_flash_comes_from_the_data_cache() {
-    // Five cycles in which the line behind is read.
+    // Five cycles in which the following line is read.
     let after = |loads: &[u16]| row(&[&[nop(); 5][..], loads].concat()).map(|cycles| cycles - 5);
     assert_eq!(after(&[ldr(0, 5, 0), ldr(0, 5, 1), ldr(0, 5, 3)]), [6, 6 + 4 + 3], "a line");
     assert_eq!(after(&[ldr(0, 5, 0), ldr(0, 5, 4), ldr(0, 5, 8)]), [6, 6 + 3 * 4 + 3], "three lines");
     assert_eq!(row(&[ldr(0, 5, 0)]), [2, 2 + 1 + 4 + 4], "a cycle of the five has gone by");
 }
 
-/// Vector and handler are waited for, and so is the line that was left, which had been read ahead and is in no cache. The
-/// second time, the handler's line is, and the one returned to. Either time the vector waits for what is still being read
-/// ahead: three of its five cycles, then one. A return refills the pipeline.
+/// Vector and handler are waited for, and so is the interrupted line, which had been read ahead and is in no cache. The
+/// second time, the handler's line is cached, and so is the one returned to. Either time the vector waits for what is
+/// still being read ahead: three of its five cycles, then one. A return refills the pipeline.
 #[test]
 fn an_interrupt_waits_for_its_vector_its_handler_and_its_return() {
     let interrupts = |count: u16| {
@@ -191,7 +192,7 @@ fn an_interrupt_waits_for_its_vector_its_handler_and_its_return() {
             program.put(&[bx_lr()]);
             let endless = program.here();
             program.branch_to(endless);
-            // So that what is read ahead behind the handler is not what is returned to.
+            // So that the line read ahead after the handler is not the one returned to.
             program.put(&[nop(); 24]);
             let mut program = start_with(program);
             program.load(3, NVIC);
@@ -211,7 +212,7 @@ fn an_interrupt_waits_for_its_vector_its_handler_and_its_return() {
     assert_eq!([worst_one - worst_none, worst_two - worst_one], [own + 3 + 4 + 4 + 1 + 4, own + 1 + 4 + 1]);
 }
 
-/// What a handler writes last is not yet written when it returns: the interrupt is still asserted and comes again, unless
+/// A handler's last write has not arrived yet when it returns: the interrupt is still asserted and comes again, unless
 /// the handler waits for its write.
 #[test]
 fn an_interrupt_that_is_cleared_last_comes_again() {
@@ -243,7 +244,7 @@ fn an_interrupt_that_is_cleared_last_comes_again() {
     assert_eq!(handled(&DSB), [1, 1]);
 }
 
-/// Below the wait states of RM0090's table the hardware reads rubbish; the emulator says so.
+/// Below the wait states of RM0090's table the hardware reads garbage; the emulator reports it.
 #[test]
 fn too_few_wait_states_are_reported() {
     let odd = |wait_states: u32, bound: Bound| {
@@ -260,7 +261,7 @@ fn too_few_wait_states_are_reported() {
             program.load(1, value);
             program.put(&[str(1, 0, 0)]);
         }
-        // The switch goes over when the PLL is ready, which whoever reads it sees.
+        // The switch takes place once the PLL is ready, which reading the register shows.
         program.load(0, RCC + 8);
         let endless = program.here();
         program.put(&[ldr(1, 0, 0)]);

@@ -12,7 +12,7 @@ FAILED=0
 
 mkdir -p /work
 cd /work || exit 1
-# What lies in /share is fetched anew at every use.
+# What is in /share is read again at every use.
 cp /share/cantap .
 dmesg -n 1
 modprobe -a vhci-hcd cdc-acm can-raw slcan
@@ -34,7 +34,7 @@ random() { echo $(($(od -An -N4 -tu4 /dev/urandom) % $1)); }
 
 # ---- Checks ----
 
-# verdict STATUS NAME [DETAIL]: counts a check, by its exit status. What NAME says must hold.
+# verdict STATUS NAME [DETAIL]: counts a check, by its exit status. NAME says what must hold.
 verdict() {
   CHECKS=$((CHECKS + 1))
   if [ "$1" = 0 ]; then
@@ -55,7 +55,7 @@ check() {
 
 # ---- The board's script (docs/emulator.md) ----
 
-# board LINE...: says a line to the board and returns its answer.
+# board LINE...: sends a line to the board and returns its answer.
 board() {
   _answer=$(echo "$*" | nc -w 30 "$OUTSIDE" "$CONTROL")
   case $_answer in
@@ -65,13 +65,13 @@ board() {
 
 figures() { echo status | nc -w 30 "$OUTSIDE" "$CONTROL"; }
 
-# figure NAME: a number since the mark; of those with one for each channel, the first.
+# figure NAME: a number counted since the mark; if there is one per channel, the first.
 figure() { figures | sed "s/.*\"$1\":\[*\([0-9.]*\).*/\1/"; }
 
-# both NAME: the two numbers of a figure with one for each channel.
+# both NAME: the two numbers of a figure with one per channel.
 both() { figures | sed "s/.*\"$1\":\[\([0-9]*\),\([0-9]*\)\].*/\1 \2/"; }
 
-# settled: waits until nothing comes from the device any more.
+# settled: waits until nothing more comes from the device.
 settled() {
   _before=none
   while _now=$(figure in_bytes) && [ "$_before" != "$_now" ]; do
@@ -82,7 +82,7 @@ settled() {
 
 # ---- The device ----
 
-# The port gets another name while a client still holds the one that went away.
+# The port gets another name while a client still holds the old one.
 has_port() {
   for _port in /dev/ttyACM*; do
     [ -c "$_port" ] && PORT=$_port && return
@@ -120,7 +120,7 @@ start() {
   CAPTURE=$!
 }
 
-# stream [OPTION...]: the same, from a mark on, and returns when frames flow.
+# stream [OPTION...]: the same, beginning at a mark; returns once frames flow.
 is_flowing() { [ "$(figure taken)" -gt 50 ]; }
 stream() {
   board mark
@@ -134,11 +134,11 @@ ended() {
   [ $? = "$1" ]
 }
 
-# A child that has ended is a zombie, or gone.
+# A child that has ended is either a zombie or gone.
 is_capturing() { [ -e "/proc/$CAPTURE/status" ] && ! grep -q '^State:.*Z' "/proc/$CAPTURE/status"; }
 has_told() { grep -q "$1" capture.err; }
 
-# survived: the capture has told that the device went away and that it is back, and ends as though nothing had been.
+# survived: the capture has reported that the device went away and came back, and ends as if nothing had happened.
 survived() {
   wait_until has_told "goes on when the device is back" &&
     wait_until has_told "the device is back after" &&
@@ -148,7 +148,7 @@ survived() {
   return 1
 }
 
-# exact NAME: the capture is every frame that the controllers took, in order, and many.
+# exact NAME: the capture holds every frame that the controllers received, in order, and there are many.
 exact() {
   board dump capture
   _bad=0
@@ -161,7 +161,7 @@ exact() {
   [ $_bad = 0 ] || { wc -l /share/capture.taken?; cat capture.json capture.err; }
 }
 
-# capture_is_exact NAME [SECONDS]: a capture from beginning to end.
+# capture_is_exact NAME [SECONDS]: a complete capture from beginning to end.
 capture_is_exact() {
   wait_until has_port
   board mark
@@ -170,10 +170,10 @@ capture_is_exact() {
   exact "$1"
 }
 
-# of_channel N: frames delivered and frames counted lost, as the capture's summary has them.
+# of_channel N: frames delivered and frames counted lost, from the capture's summary.
 of_channel() { sed "s/.*\"channel\":$1,\"frames\":\([0-9]*\),\"lost\":\([0-9]*\).*/\1 \2/" capture.json; }
 
-# counted NAME: delivered and counted lost make what crossed, on both channels.
+# counted NAME: frames delivered plus frames counted lost equal those that crossed, on both channels.
 counted() {
   board dump capture
   for _n in 1 2; do

@@ -1,5 +1,5 @@
-# odd_requests.pl DEVICE: requests through usbfs that no driver makes. Each must be answered as USB 2.0, chapter 9, has it: with these bytes, or
-# by a stall, and the device must go on.
+# odd_requests.pl DEVICE: requests through usbfs that no driver makes. Each must be answered as USB 2.0, chapter 9, requires: with these bytes
+# or with a stall, and the device must carry on.
 use strict;
 use warnings;
 

@@ -1,6 +1,6 @@
-//! The books: what crossed a bus while its channel was open, against what the device delivered and
-//! what it said it lost. The law: *frames on the bus = frames delivered + frames counted lost*, in order,
-//! bit for bit, and each loss counted where the frames are missing.
+//! The books: what crossed a bus while its channel was open, compared with what the device delivered and
+//! what it reported lost. The law: *frames on the bus = frames delivered + frames counted lost*, in
+//! order, bit for bit, and each loss counted where the frames are missing.
 
 use std::collections::VecDeque;
 
@@ -10,9 +10,9 @@ use cantap_wire::{CHANNELS, Channel, Event, Frame, Received, Record};
 use super::session::Heard;
 use crate::CYCLES_PER_SECOND;
 
-/// Faults that are kept word for word; the rest is counted.
+/// How many faults are kept word for word; the rest are only counted.
 const KEPT_FAULTS: usize = 20;
-/// Stamps are held against the truth in nanoseconds.
+/// Stamps are compared with the truth in nanoseconds.
 const NS_PER_SECOND: i64 = 1_000_000_000;
 
 /// Frames that one channel lost, by stage.
@@ -27,7 +27,7 @@ pub struct Losses {
 }
 
 impl Losses {
-    /// All of them.
+    /// The sum of all stages.
     pub fn total(&self) -> u64 {
         self.controller + self.queue + self.link
     }
@@ -39,7 +39,7 @@ impl Losses {
 pub struct Stamps {
     /// The earliest.
     pub min: i64,
-    /// Half are not later.
+    /// Half are no later.
     pub median: i64,
     /// The latest.
     pub max: i64,
@@ -49,7 +49,7 @@ pub struct Stamps {
     pub bounds: u64,
 }
 
-/// A frame on the bus that the device should have.
+/// A frame on the bus that the device should have received.
 #[derive(Clone, Copy, Debug)]
 struct Truth {
     frame: Frame,
@@ -64,7 +64,7 @@ struct Books {
     on_bus: u64,
     delivered: u64,
     losses: Losses,
-    /// Announced since the last delivered frame: stage and number, and whether it may be more.
+    /// Losses announced since the last delivered frame: stage and number, and whether there may be more.
     announced: Losses,
     at_least: bool,
     /// Never delivered and not announced, because the session was cut.
@@ -89,20 +89,20 @@ impl Ledger {
         Self::default()
     }
 
-    /// Says when the device's clock stood at zero and how many core cycles a tick has. Without, stamps
+    /// Sets when the device's clock was at zero and how many core cycles a tick has. Without this, stamps
     /// are not judged.
     pub fn set_clock(&mut self, origin: u64, cycles_per_tick: u64) {
         self.clock = Some((origin, cycles_per_tick));
     }
 
-    /// A frame that a channel's controller took without error, valid at a core cycle.
+    /// A frame that a channel's controller received without error, valid at a core cycle.
     pub fn on_bus(&mut self, channel: Channel, frame: Frame, valid: u64) {
         let books = &mut self.books[channel.index()];
         books.on_bus += 1;
         books.open.push_back(Truth { frame, valid });
     }
 
-    /// Something that the device said.
+    /// Something that the device reported.
     pub fn heard(&mut self, heard: &Heard) {
         match heard {
             Heard::Record(ticks, Record::Received(received)) => self.delivered(*ticks, received),
@@ -173,7 +173,7 @@ impl Ledger {
         }
     }
 
-    /// After a fault: goes on behind the next equal frame, so that one fault is not reported a thousand
+    /// After a fault: continues after the next equal frame, so that one fault is not reported a thousand
     /// times.
     fn resynchronise(&mut self, channel: Channel, received: &Received) {
         let books = &mut self.books[channel.index()];
@@ -200,8 +200,8 @@ impl Ledger {
         }
     }
 
-    /// Ends a channel's session. `whole` says that the device had the time to deliver everything: then
-    /// every frame must be delivered or announced as lost. Otherwise the rest is only counted.
+    /// Ends a channel's session. `whole` says that the device had time to deliver everything: then every
+    /// frame must have been delivered or announced as lost. Otherwise the rest are only counted.
     pub fn close(&mut self, channel: Channel, whole: bool) {
         let books = &mut self.books[channel.index()];
         let rest = books.open.len() as u64;
@@ -233,7 +233,7 @@ impl Ledger {
         self.books[channel.index()].delivered
     }
 
-    /// Frames counted lost, the announced ones at the end of the stream included.
+    /// Frames counted lost, including those announced at the end of the stream.
     pub fn losses(&self, channel: Channel) -> Losses {
         let books = &self.books[channel.index()];
         Losses {
@@ -286,8 +286,8 @@ impl Ledger {
 }
 
 impl Books {
-    /// Books `missing` frames as lost, where announced says; what an "at least" left open is the
-    /// controller's.
+    /// Books `missing` frames as lost, at the stages announced; whatever an "at least" left open goes to
+    /// the controller.
     fn settle_losses(&mut self, missing: u64) {
         self.losses.queue += self.announced.queue;
         self.losses.link += self.announced.link;
@@ -298,8 +298,8 @@ impl Books {
     }
 }
 
-/// How many frames are missing before `frame` where the device could only say "at least `announced`": up
-/// to the last equal frame that was valid when the stamp was taken, or without a stamp the first one.
+/// How many frames are missing before `frame` if the device could only say "at least `announced`": up to
+/// the last equal frame that was valid when the stamp was taken, or, without a stamp, the first one.
 fn missing_at_least(
     open: &VecDeque<Truth>,
     announced: usize,

@@ -1,5 +1,5 @@
-//! The emulator's own host: it speaks the wire protocol ([`session`]) and holds what the device
-//! delivers against what really crossed the buses ([`ledger`]). It shares the wire types with the
+//! The emulator's own host: it speaks the wire protocol ([`session`]) and compares what the device
+//! delivers with what really crossed the buses ([`ledger`]). It shares the wire types with the
 //! product's host library and nothing else, so that a fault in that library cannot hide here.
 
 pub mod ledger;

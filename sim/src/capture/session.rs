@@ -4,7 +4,7 @@ use cantap_wire::framing::{self, CRC_LEN, MAX_ENCODED, MAX_MESSAGE};
 use cantap_wire::message::{EndReason, Response};
 use cantap_wire::{CHANNELS, Command, Corruption, Decoded, Decoder, PROTOCOL_VERSION, Record, Request};
 
-/// What the device said, apart from responses.
+/// What the device sent, apart from responses.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Heard {
     /// A record at its device time in ticks.
@@ -30,8 +30,8 @@ impl Session {
         Self { decoder: Decoder::new(), next_id: 1, responses: Vec::new(), corruptions: Vec::new(), bytes: 0 }
     }
 
-    /// The bytes of a request, and its id. A zero goes in front: it ends what another program may have
-    /// left in the device's input and chooses the native protocol.
+    /// The bytes of a request, and its id. A zero goes first: it ends whatever another program may
+    /// have left in the device's input, and chooses the native protocol.
     pub fn request(&mut self, command: Command) -> (u16, Vec<u8>) {
         let id = self.next_id;
         self.next_id = self.next_id.wrapping_add(1);
@@ -48,8 +48,8 @@ impl Session {
         self.request(Command::Hello { protocol: PROTOCOL_VERSION })
     }
 
-    /// Expects a new conversation on a port that was opened again: half a message of the old one is
-    /// thrown away.
+    /// Expects a new conversation on a port that was opened again: an unfinished message of the old
+    /// one is thrown away.
     pub fn restart(&mut self) {
         self.decoder = Decoder::new();
     }
@@ -68,13 +68,13 @@ impl Session {
         });
     }
 
-    /// Takes the response to request `id`, if it came.
+    /// Takes the response to request `id`, if it has come.
     pub fn response(&mut self, id: u16) -> Option<Response> {
         let at = self.responses.iter().position(|response| response.id == id)?;
         Some(self.responses.remove(at))
     }
 
-    /// Responses that nobody took.
+    /// Responses that have not been taken.
     pub fn responses(&self) -> &[Response] {
         &self.responses
     }
@@ -84,7 +84,7 @@ impl Session {
         &self.corruptions
     }
 
-    /// Bytes received so far, of everything.
+    /// Bytes received so far, in total.
     pub fn bytes(&self) -> u64 {
         self.bytes
     }

@@ -20,9 +20,10 @@ use cantap_emu::traffic::{Kind, Traffic};
 use cantap_emu::usb::UsbPort;
 use cantap_emu::usb_host::{Counters, Outcome, Request, Timing, UsbHost};
 
-/// Milliseconds that a device may take from the cable to the end of its first reset, or for the server's first look.
+/// Milliseconds that a device may take from plugging in to the end of its first reset, or for the server's first
+/// look.
 const PATIENCE_MS: u32 = 3000;
-/// The simulated node that sends a channel's traffic, and the one that sends single frames. Both acknowledge.
+/// The simulated nodes that send a channel's traffic and its single frames. Both acknowledge.
 const TRAFFIC: usize = 0;
 const SINGLE: usize = 1;
 /// Seeds that one setting of the traffic may use.
@@ -35,11 +36,11 @@ pub struct BusLoad {
     pub percent: f64,
     /// Which frames.
     pub kind: Kind,
-    /// Of the buses; without, that of whoever opens the channel.
+    /// Bit rate of the buses; if `None`, the rate at which the channel is opened.
     pub bitrate_bps: Option<u32>,
 }
 
-/// So many frames of a source.
+/// The first frames of a source, this many.
 struct First(Traffic, u64);
 
 impl Source for First {
@@ -49,18 +50,18 @@ impl Source for First {
     }
 }
 
-/// Everything that is counted, since the board was made or since a mark.
+/// All counters, since the board was made or since a mark.
 #[derive(Clone, Copy, Debug)]
 pub struct Figures {
-    /// By the wall clock.
+    /// Wall-clock time.
     pub at: Instant,
     /// Core cycles.
     pub cycles: u64,
-    /// Time that the emulation took.
+    /// Time spent on emulating.
     pub computing: Duration,
-    /// Time that stood still because the kernel did not read.
+    /// Time for which emulated time stood still because the kernel did not read.
     pub starving: Duration,
-    /// Of the bus.
+    /// Counters of the USB.
     pub usb: Counters,
     /// Resets of the bus.
     pub bus_resets: u64,
@@ -78,7 +79,7 @@ pub struct Board {
     port: Arc<Mutex<UsbPort<Urbs>>>,
     load: BusLoad,
     seed: u64,
-    /// Cycles of a bit of each channel that is open.
+    /// Cycles per bit of each open channel.
     open: [Option<u64>; CHANNELS],
     openings: [u64; CHANNELS],
     taken: [Vec<Frame>; CHANNELS],
@@ -131,10 +132,10 @@ impl Board {
         &self.machine
     }
 
-    /// Does something with the host at the far end of the cable, at the present time.
+    /// Runs `action` on the host at the far end of the cable, at the present time.
     pub fn with_host<R>(&self, action: impl FnOnce(&mut UsbHost<Urbs>, &mut Otg) -> R) -> R {
         let now = self.machine.now();
-        // A thread that panicked while it held the lock left a port that is as good as any other.
+        // If a thread panicked while it held the lock, the port's state is as good as any other.
         let mut port: MutexGuard<'_, _> = self.port.lock().unwrap_or_else(PoisonError::into_inner);
         let (host, otg) = port.host(now);
         action(host, otg)
@@ -155,7 +156,7 @@ impl Board {
         Ok(())
     }
 
-    /// Time stood still for this long.
+    /// Emulated time stood still for this long.
     pub fn starved(&mut self, time: Duration) {
         self.starving += time;
     }
@@ -173,7 +174,7 @@ impl Board {
         }
     }
 
-    /// Starts and ends the traffic of channels that were opened and closed.
+    /// Starts and ends the traffic of channels as they are opened and closed.
     fn follow_channels(&mut self) {
         let now = self.machine.now();
         let mut board = self.machine.board();
@@ -197,7 +198,7 @@ impl Board {
         }
     }
 
-    /// Traffic for channels that are opened from now on.
+    /// Sets the traffic for channels that are opened from now on.
     pub fn set_load(&mut self, load: BusLoad) {
         self.load = load;
         self.seed += SEEDS;
@@ -218,7 +219,7 @@ impl Board {
         self.machine.board().wires[n].node(SINGLE).send_at(now, frame);
     }
 
-    /// Whether the simulated nodes acknowledge.
+    /// Sets whether the simulated nodes acknowledge.
     pub fn acknowledge(&mut self, acknowledge: bool) {
         for wire in &mut self.machine.board().wires {
             wire.node(TRAFFIC).acknowledge(acknowledge);
@@ -233,12 +234,12 @@ impl Board {
         }
     }
 
-    /// Frames that a channel's controller took, and those that it sent, since the mark.
+    /// The frames that a channel's controller has received, and those it has sent, since the mark.
     pub fn books(&self, n: usize) -> (&[Frame], &[Frame]) {
         (&self.taken[n], &self.sent[n])
     }
 
-    /// Begins the books and the figures.
+    /// Restarts the books and the figures.
     pub fn mark(&mut self) {
         (self.taken, self.sent) = Default::default();
         self.marked = self.totals();
@@ -266,7 +267,7 @@ impl Board {
         (self.marked, self.totals())
     }
 
-    /// Runs while `goes_on` says so; whether it ended in time.
+    /// Runs while `goes_on` returns true; returns whether it ended in time.
     fn run_while(&mut self, mut goes_on: impl FnMut(&mut Self) -> bool) -> Result<bool, Error> {
         for _ in 0..PATIENCE_MS {
             if !goes_on(self) {
@@ -277,25 +278,25 @@ impl Board {
         Ok(false)
     }
 
-    /// Puts the cable in; whether a device came up.
+    /// Puts the cable in; returns whether a device came up.
     pub fn plug_in(&mut self) -> Result<bool, Error> {
         self.with_host(|host, _| host.plug());
         self.run_while(|board| !board.with_host(|host, _| host.is_running() && host.driver().is_present()))
     }
 
-    /// Pulls it.
+    /// Pulls the cable out.
     pub fn unplug(&mut self) {
         self.with_host(|host, _| host.unplug());
     }
 
-    /// The server's own look at the device, before any kernel's. The cable is out again when it ends.
+    /// The server's own look at the device, before any kernel sees it. The cable is out again afterwards.
     pub fn look(&mut self) -> Result<Exported, Error> {
         if !self.plug_in()? {
             return Err(Error::NoDevice);
         }
         let descriptor = |kind: u16, length: u16| Request::new(0x80, 6, kind << 8, 0, length);
         self.with_urbs(|urbs| {
-            // The size of endpoint 0's packets first.
+            // First the size of endpoint 0's packets.
             for request in [descriptor(1, 8), descriptor(1, 18), descriptor(2, 255)] {
                 urbs.ask(request);
             }

@@ -10,7 +10,7 @@ pub enum Error {
     /// The firmware ended.
     #[error("{0}")]
     Stopped(#[from] Stopped),
-    /// A socket, or the folder.
+    /// A socket or the folder failed.
     #[error("{0}")]
     Io(#[from] io::Error),
     /// Nothing came up on the port.

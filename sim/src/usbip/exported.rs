@@ -1,4 +1,5 @@
-//! What the server says of its device before a kernel has seen it: a record made of the device's own descriptors.
+//! What the server says about its device before a kernel has seen it: a record made from the device's own
+//! descriptors.
 
 use super::error::Error;
 
@@ -24,7 +25,7 @@ pub struct Endpoint {
     pub address: u8,
     /// wMaxPacketSize.
     pub packet: usize,
-    /// Of which interface.
+    /// Its interface's number.
     pub interface: u8,
     /// bmAttributes' transfer type.
     pub kind: u8,
@@ -83,7 +84,7 @@ impl Exported {
         &self.device
     }
 
-    /// For an import.
+    /// The record for an import.
     pub fn record(&self) -> Vec<u8> {
         self.record.clone()
     }
@@ -122,7 +123,7 @@ mod tests {
         assert_eq!(exported.endpoints(), endpoints);
     }
 
-    /// However a configuration is cut, what stands before the cut is read.
+    /// Wherever a configuration is cut off, everything before the cut is read.
     #[test]
     fn broken_configurations_end_where_they_break() {
         for end in [0, 1, 9, 200] {

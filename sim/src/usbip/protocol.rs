@@ -1,5 +1,5 @@
-//! USB/IP, version 1.1.1, as the kernel's `Documentation/usb/usbip_protocol.rst` has it: all fields big-endian, the data as on
-//! the bus.
+//! USB/IP, version 1.1.1, as the kernel's `Documentation/usb/usbip_protocol.rst` describes it: all fields are big-endian, the
+//! data is as on the bus.
 
 use std::io::{self, Read};
 
@@ -17,9 +17,9 @@ const SUBMITTED: u32 = 3;
 const UNLINKED: u32 = 4;
 /// A transfer that ends with a full packet is followed by an empty one (the kernel's URB_ZERO_PACKET).
 const ZERO_PACKET: u32 = 0x40;
-/// Longest transfer that is taken. The kernel's drivers for serial ports ask for some kilobytes.
+/// Longest transfer accepted. The kernel's drivers for serial ports ask for a few kilobytes.
 const MAX_TRANSFER: usize = 1 << 20;
-/// Bytes of a bus ID, zeros behind it.
+/// Bytes of a bus ID, padded with zeros.
 const BUS_ID_BYTES: usize = 32;
 
 /// What a connection is for.
@@ -31,12 +31,12 @@ pub enum Opening {
     Import(String),
 }
 
-/// What a kernel says once it has a device.
+/// What a kernel sends once it has a device.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Message {
     /// A transfer.
     Submit(Urb),
-    /// A transfer is taken back.
+    /// A transfer is withdrawn.
     Unlink {
         /// This message's number.
         seq: u32,
@@ -113,7 +113,7 @@ pub fn list(exported: &Exported) -> Vec<u8> {
     reply
 }
 
-/// The answer to an import; without a device it is refused.
+/// The answer to an import, which is refused if there is no device.
 pub fn imported(exported: Option<&Exported>) -> Vec<u8> {
     let mut reply = words(&[VERSION << 16 | IMPORT_REPLY, u32::from(exported.is_none())]);
     reply.extend(exported.into_iter().flat_map(Exported::record));
@@ -128,7 +128,7 @@ pub fn submitted(completion: &Completion) -> Vec<u8> {
     reply
 }
 
-/// A transfer was taken back (`status` is then ECONNRESET), or had ended before (0).
+/// A transfer was withdrawn (`status` is then ECONNRESET), or had already ended (0).
 pub fn unlinked(seq: u32, status: i32) -> Vec<u8> {
     words(&[UNLINKED, seq, 0, 0, 0, status as u32, 0, 0, 0, 0, 0, 0])
 }

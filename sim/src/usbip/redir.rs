@@ -1,5 +1,5 @@
 //! usbredir, version 0.7, as QEMU's `usb-redir` device speaks it (`usbredirproto.h`): all fields little-endian. The device is then on a
-//! host controller that QEMU emulates, xHCI for example, and the guest's own driver for that controller drives it.
+//! host controller that QEMU emulates, such as xHCI, and driven by the guest's own driver for that controller.
 
 use std::collections::HashMap;
 use std::io::{self, Read};
@@ -33,18 +33,18 @@ const IO_ERROR: u8 = 3;
 const STALL: u8 = 4;
 const BABBLE: u8 = 6;
 
-/// `device_connect` has a release, `ep_info` has sizes of packets, numbers have 64 bits in all but the greeting, and lengths of bulk
-/// transfers have 32. QEMU's xHCI takes no device without the last three.
+/// `device_connect` has a release, `ep_info` has sizes of packets, ids have 64 bits in all but the greeting, and lengths of bulk
+/// transfers have 32. QEMU's xHCI accepts no device without the last three.
 const CAPABILITIES: u32 = 1 << 1 | 1 << 4 | 1 << 5 | 1 << 6;
 const FULL_SPEED: u8 = 1;
-/// No endpoint there.
+/// No endpoint in this place.
 const NO_ENDPOINT: u8 = 255;
 /// Places for interfaces and endpoints.
 const PLACES: usize = 32;
-/// Longest packet that is taken. The kernel's drivers for serial ports ask for some kilobytes.
+/// Longest packet accepted. The kernel's drivers for serial ports ask for a few kilobytes.
 const MAX_PACKET: usize = 1 << 17;
 
-/// A packet of QEMU's.
+/// A packet from QEMU.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Packet {
     kind: u32,
@@ -83,13 +83,13 @@ fn packet(kind: u32, id: u64, head: &[u8], data: &[u8]) -> Vec<u8> {
 pub enum Action {
     /// A transfer.
     Submit(Urb),
-    /// A transfer is taken back; if it is still pending, [`Redir::cancelled`] says what to answer.
+    /// A transfer is withdrawn; if it is still pending, [`Redir::cancelled`] gives the answer.
     Unlink(u32),
     /// A reset of the port.
     Reset,
 }
 
-/// How a transfer was asked for; its end is reported in the same way.
+/// How a transfer was requested; its end is reported in the same way.
 #[derive(Clone, Copy, Debug)]
 enum Asked {
     Control([u8; 10]),
@@ -115,7 +115,7 @@ impl Redir {
         Self { exported, last: 0, pending: HashMap::new() }
     }
 
-    /// How the device appears: a greeting, what it is made of, and that it is there.
+    /// How the device appears: a greeting, its interfaces and endpoints, and its connection.
     pub fn greeting(&self) -> Vec<u8> {
         let mut version = [0; 64];
         version[..10].copy_from_slice(b"cantap-sim");
@@ -146,7 +146,7 @@ impl Redir {
         .concat()
     }
 
-    /// The transfer, with a number of its own.
+    /// The transfer, with a number of this side's.
     fn numbered(&mut self, id: u64, asked: Asked, urb: Urb) -> Urb {
         self.last = self.last.wrapping_add(1);
         self.pending.insert(self.last, (id, asked));
@@ -165,7 +165,7 @@ impl Redir {
         Some(self.numbered(id, Asked::Interrupts { endpoint }, urb))
     }
 
-    /// What a packet asks for; nothing where it is one of those that need no answer, or is not understood.
+    /// What a packet asks for; `None` if it needs no answer or is not understood.
     pub fn take(&mut self, packet: Packet) -> Option<Action> {
         let Packet { kind, id, body } = packet;
         let urb = match (kind, &body[..]) {
@@ -187,7 +187,7 @@ impl Redir {
                 let data = data.to_vec();
                 self.numbered(id, asked, Urb { endpoint: kind & 0x80, length, setup, data, ..Urb::default() })
             }
-            // The upper half of the length stands behind the stream.
+            // The upper half of the length comes after the stream.
             (BULK, &[endpoint, _, l0, l1, t0, t1, t2, t3, l2, l3, ref data @ ..]) => {
                 let length = (u32::from_le_bytes([l0, l1, l2, l3]) as usize).min(MAX_PACKET);
                 let asked = Asked::Bulk { endpoint, stream: [t0, t1, t2, t3] };
@@ -210,20 +210,20 @@ impl Redir {
         Some(Action::Submit(urb))
     }
 
-    /// What to say at once to a packet that starts or stops interrupts.
+    /// The immediate answer to a packet that starts or stops interrupts.
     pub fn acknowledge(packet: &Packet) -> Option<Vec<u8>> {
         let answered = matches!(packet.kind, START_INTERRUPTS | STOP_INTERRUPTS);
         let endpoint = *packet.body.first().filter(|_| answered)?;
         Some(self::packet(INTERRUPTS_STATUS, packet.id, &[SUCCESS, endpoint], &[]))
     }
 
-    /// A transfer was taken back before it ended.
+    /// A transfer was withdrawn before it ended.
     pub fn cancelled(&mut self, seq: u32) -> Vec<u8> {
         let Some((id, asked)) = self.pending.remove(&seq) else { return Vec::new() };
         answer(id, asked, CANCELLED, 0, &[])
     }
 
-    /// A transfer has ended: what to say, and what to ask for again.
+    /// A transfer has ended: what to send, and what to submit again.
     pub fn ended(&mut self, completion: &Completion) -> (Vec<u8>, Option<Urb>) {
         let Completion { seq, status, actual, data } = completion;
         let Some((id, asked)) = self.pending.remove(seq) else { return (Vec::new(), None) };

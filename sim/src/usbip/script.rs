@@ -1,5 +1,5 @@
-//! What a test says while a kernel drives the board: one line, one answer. An answer is an object with the figures, or a line that
-//! begins with `error:`.
+//! What a test may send while a kernel drives the board: for each line, one answer. An answer is an object with the figures, or a
+//! line that begins with `error:`.
 
 use std::fs;
 use std::path::Path;
@@ -15,14 +15,14 @@ use cantap_emu::usb_host::Request;
 const SET_ENDPOINT_FEATURE: (u8, u8) = (0x02, 3);
 const ENDPOINT_HALT: u16 = 0;
 
-/// What a line asks for that is not the board's.
+/// What a line asks for that does not concern the board.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Wish {
     /// Nothing.
     None,
     /// Whether time stands still while the kernel does not read.
     ClientPace(bool),
-    /// The cable is put into the QEMU that waits for a device.
+    /// The cable is plugged into the QEMU that waits for a device.
     Redirect,
     /// The cable is pulled.
     Unplug,
@@ -30,13 +30,13 @@ pub enum Wish {
     Quit,
 }
 
-/// Obeys a line.
+/// Carries out a line.
 pub fn obey(line: &str, board: &mut Board, folder: &Path) -> Result<Wish, String> {
     let words: Vec<&str> = line.split_whitespace().collect();
     match words[..] {
         ["status"] => {}
         ["mark"] => board.mark(),
-        // Traffic on both channels, for those that are opened from now on.
+        // Traffic on both channels, once they are opened.
         ["traffic", percent, kind, ref rate @ ..] => {
             let bitrate_bps = match *rate {
                 [] => None,
@@ -56,17 +56,17 @@ pub fn obey(line: &str, board: &mut Board, folder: &Path) -> Result<Wish, String
         ["noise", percent] => board.make_noise(number(percent)?),
         ["pace", "client"] => return Ok(Wish::ClientPace(true)),
         ["pace", "real"] => return Ok(Wish::ClientPace(false)),
-        // Behind a high-speed hub: microframes for a transaction; 0 is a root port again.
+        // Puts the device behind a high-speed hub, with this many microframes per transaction; 0 is a root port again.
         ["hub", microframes] => {
             let microframes = number(microframes)?;
             board.with_host(|host, _| *host.timing_mut() = host.timing_mut().behind_hub(microframes));
         }
-        // Every so-many-th handshake is lost; 0 loses none.
+        // Every n-th handshake is lost; 0 loses none.
         ["lose", every] => {
             let every = number(every)?;
             board.with_host(|host, _| host.drop_handshake_every(Some(every).filter(|every| *every > 1)));
         }
-        // An endpoint, as its address in hexadecimal, is halted behind the kernel's back, which sees STALL.
+        // Halts an endpoint, given by its address in hexadecimal, behind the kernel's back, which then sees STALL.
         ["halt", address] => {
             let address = u16::from_str_radix(address, 16).map_err(|error| error.to_string())?;
             let (kind, request) = SET_ENDPOINT_FEATURE;
@@ -76,7 +76,7 @@ pub fn obey(line: &str, board: &mut Board, folder: &Path) -> Result<Wish, String
         ["resume"] => board.with_host(cantap_emu::usb_host::UsbHost::resume),
         ["redirect"] => return Ok(Wish::Redirect),
         ["unplug"] => return Ok(Wish::Unplug),
-        // What each controller took and sent, as FOLDER/NAME.taken1 and so on.
+        // Writes what each controller received and sent, as FOLDER/NAME.taken1 and so on.
         ["dump", name] => dump(board, folder, name)?,
         ["quit"] => return Ok(Wish::Quit),
         _ => return Err(format!("no such line: {line}")),

@@ -1,4 +1,4 @@
-//! The sockets, and the loop that lets time pass between what comes through them.
+//! The sockets, and the loop that lets time pass between what arrives through them.
 
 use std::io::{self, BufRead, BufReader, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -19,16 +19,16 @@ use super::urbs::Urbs;
 use crate::{CYCLES_PER_SECOND, CYCLES_PER_US};
 use cantap_emu::elf::Image;
 
-/// How long the machine runs between two looks at the sockets.
+/// How long the machine runs between two checks of the sockets.
 const SLICE: u64 = 100 * CYCLES_PER_US;
 const SLICE_WALL: Duration = Duration::from_nanos(SLICE * 1_000_000_000 / CYCLES_PER_SECOND);
-/// How long to wait for a kernel that owes reads before looking again.
+/// How long to wait before checking a kernel that owes reads again.
 const STARVED_WAIT: Duration = Duration::from_millis(20);
-/// Emulated time ahead of the wall clock by less is not worth a wait.
+/// If emulated time is ahead of the wall clock by less, a wait is not worth it.
 const LEAST_WAIT: Duration = Duration::from_millis(1);
-/// How far the emulation may lag behind the wall clock before it gives the difference up.
+/// How far the emulation may lag behind the wall clock before it drops the difference.
 const MOST_BEHIND: Duration = Duration::from_millis(100);
-/// Linux' ECONNRESET: a transfer was taken back.
+/// Linux's ECONNRESET: a transfer was withdrawn.
 const ECONNRESET: i32 = -104;
 
 enum Event {
@@ -50,11 +50,11 @@ enum Event {
 struct Kernel {
     connection: u64,
     stream: TcpStream,
-    /// What QEMU is answered in; without, it is USB/IP.
+    /// The usbredir state for QEMU; without it, this is USB/IP.
     redir: Option<Redir>,
 }
 
-/// Serves the board to kernels on this computer, one after the other, until a line says `quit`. The ports are written to
+/// Serves the board to kernels on this computer, one at a time, until a line says `quit`. The ports are written to
 /// `folder/ports`, as variables of a shell: USBIP for `usbip attach`, REDIR for QEMU's `usb-redir`, CONTROL for lines.
 pub fn serve(image: Image, folder: &Path) -> Result<(), Error> {
     let mut board = Board::new(image);
@@ -88,7 +88,7 @@ fn listen_to_kernels(listener: TcpListener, exported: Arc<Exported>, to: Sender<
         for (stream, n) in listener.incoming().flatten().zip(1..) {
             let (to, exported, connection) = (to.clone(), Arc::clone(&exported), 2 * n);
             thread::spawn(move || {
-                // A connection that breaks is a kernel that is gone.
+                // A broken connection means that the kernel is gone.
                 let _ = follow_kernel(stream, connection, &exported, &to);
                 let _ = to.send(Event::Gone(connection));
             });
@@ -112,7 +112,7 @@ fn follow_kernel(
         Opening::Import(_) => return stream.write_all(&protocol::imported(None)),
     }
     loop {
-        // The loop below ends first only when the whole program does.
+        // The loop below only ends before this when the whole program ends.
         let _ = to.send(match protocol::read_message(&mut stream)? {
             Message::Submit(urb) => Event::Submit(connection, urb),
             Message::Unlink { seq, victim } => Event::Unlink { connection, seq, victim },
@@ -126,7 +126,7 @@ fn listen_to_qemu(listener: TcpListener, to: Sender<Event>) {
         for (stream, n) in listener.incoming().flatten().zip(0..) {
             let (to, connection) = (to.clone(), 2 * n + 1);
             thread::spawn(move || {
-                // A connection that breaks is a QEMU that is gone.
+                // A broken connection means that QEMU is gone.
                 let _ = follow_qemu(stream, connection, &to);
                 let _ = to.send(Event::Gone(connection));
             });
@@ -162,10 +162,10 @@ struct Server {
     exported: Arc<Exported>,
     folder: PathBuf,
     kernel: Option<Kernel>,
-    /// The last transfer that came.
+    /// The last transfer that arrived.
     last: u32,
-    /// Transfers that were taken back before they came: Linux' `vhci_hcd` sends what it takes back and what it submits from two lists, and
-    /// may look at the first while the second is being filled.
+    /// Transfers that were withdrawn before they arrived: Linux's `vhci_hcd` sends withdrawals and submissions from two lists, and may
+    /// look at the first while the second is being filled.
     taken_back: Vec<u32>,
     /// The QEMU that waits for a device.
     waits: Option<(TcpStream, u64)>,
@@ -192,7 +192,7 @@ impl Server {
             self.board.run(SLICE)?;
             self.deliver();
             if self.kernel.is_some() && !self.board.with_urbs(|urbs| urbs.is_present()) {
-                // It took its pull-up away by itself: a reset, or the bootloader.
+                // The device removed its pull-up: a reset, or the bootloader.
                 self.cut();
             }
             due += SLICE_WALL;
@@ -206,7 +206,7 @@ impl Server {
         Ok(())
     }
 
-    /// Handles what comes within a time; false if nothing can come any more.
+    /// Handles what arrives within a time; false if nothing more can arrive.
     fn wait(&mut self, events: &Receiver<Event>, time: Duration) -> Result<bool, Error> {
         match events.recv_timeout(time) {
             Ok(event) => self.handle(event).map(|()| true),
@@ -215,7 +215,7 @@ impl Server {
         }
     }
 
-    /// The kernel sets the pace, owes reads, and waits for nothing that takes time.
+    /// Whether time stands still: the kernel sets the pace, owes reads, and waits for nothing that takes time.
     fn stands_still(&self) -> bool {
         self.kernel.is_some()
             && self.client_pace
@@ -255,7 +255,7 @@ impl Server {
                     }
                     Err(error) => format!("error: {error}"),
                 };
-                // Who does not wait for the answer does not want it.
+                // A client that does not wait for the answer does not want it.
                 let _ = writeln!(stream, "{answer}");
             }
         }
@@ -264,7 +264,7 @@ impl Server {
 
     fn submit(&mut self, urb: Urb) {
         self.board.with_host(|host, otg| {
-            // The kernel resumes a port without a word; requests are the first that it sends then.
+            // The kernel resumes a port without announcing it; the first thing it sends then is a request.
             if urb.is_control() {
                 host.resume(otg);
             }
@@ -272,7 +272,7 @@ impl Server {
         });
     }
 
-    /// Takes back a transfer; whether it was still pending.
+    /// Withdraws a transfer; returns whether it was still pending.
     fn unlink(&mut self, victim: u32) -> bool {
         self.board.with_host(|host, _| {
             let pending = host.driver().unlink(victim);
@@ -339,7 +339,7 @@ impl Server {
         Ok(())
     }
 
-    /// Gives the kernel what has ended.
+    /// Sends the kernel the transfers that have ended.
     fn deliver(&mut self) {
         let completed = self.board.with_urbs(Urbs::take_completed);
         let Some(kernel) = &mut self.kernel else { return };
@@ -368,7 +368,7 @@ impl Server {
         }
     }
 
-    /// The cable is out, and the connection ends. Transfers that are pending are not answered: see `Urbs::submit`.
+    /// The cable is out, and the connection ends. Pending transfers are not answered: see `Urbs::submit`.
     fn cut(&mut self) {
         if let Some(Kernel { stream, .. }) = self.kernel.take() {
             let _ = stream.shutdown(Shutdown::Both);

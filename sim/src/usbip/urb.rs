@@ -1,13 +1,13 @@
-//! A transfer that the kernel wants, and its end.
+//! A transfer requested by the kernel, and its completion.
 
-/// A transfer that the kernel wants.
+/// A transfer requested by the kernel.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Urb {
     /// Its number.
     pub seq: u32,
-    /// bEndpointAddress; of endpoint 0, the data stage's direction.
+    /// bEndpointAddress; for endpoint 0, the data stage's direction.
     pub endpoint: u8,
-    /// Bytes wanted or carried.
+    /// Bytes requested or carried.
     pub length: usize,
     /// Frames between two attempts on an interrupt endpoint; 0 on all others.
     pub interval: u32,
@@ -15,11 +15,11 @@ pub struct Urb {
     pub zero_packet: bool,
     /// The request, on endpoint 0.
     pub setup: [u8; 8],
-    /// What goes out, or came in.
+    /// The data sent or received.
     pub data: Vec<u8>,
-    /// How much of it has gone out.
+    /// How much of it has been sent.
     pub sent: usize,
-    /// Attempts at the present packet that were not answered.
+    /// Unanswered attempts at the current packet.
     pub silences: u32,
 }
 
@@ -43,6 +43,6 @@ pub struct Completion {
     pub status: i32,
     /// Bytes moved.
     pub actual: usize,
-    /// Those that came in.
+    /// The bytes received.
     pub data: Vec<u8>,
 }

@@ -1,9 +1,9 @@
-//! A kernel's transfers as transactions: the part of a host controller that USB/IP leaves to this side. It keeps a queue for
-//! each endpoint, the toggles, and endpoint 0's transfers in order.
+//! A kernel's transfers as transactions: the part of a host controller that USB/IP leaves to this side. It keeps a queue and
+//! toggles for each endpoint, and endpoint 0's transfers in order.
 //!
-//! The kernel's virtual controller keeps resets of the port and SET_ADDRESS to itself. That it reset the port shows in what its
-//! enumeration begins with, 64 bytes of the device descriptor: a reset is driven before them, and another, with an address,
-//! before what comes next, as on a port that the kernel drives itself.
+//! The kernel's virtual controller keeps resets of the port and SET_ADDRESS to itself. A reset of the port shows in the
+//! beginning of its enumeration, a request for 64 bytes of the device descriptor: this side drives a reset before it, and
+//! another, with an address, before what comes next, as on a port that the kernel drives itself.
 
 use std::collections::VecDeque;
 
@@ -12,12 +12,12 @@ use super::urb::{Completion, Urb};
 use cantap_emu::otg::{InReply, OutReply};
 use cantap_emu::usb_host::{Counters, HostDriver, Outcome, Request, Step, Token, Transfer};
 
-// Linux' error numbers, which USB/IP carries.
+// Linux's error numbers, which USB/IP carries.
 /// The endpoint is halted, or the request was refused.
 pub const EPIPE: i32 = -32;
 /// No answer, or a broken protocol.
 const EPROTO: i32 = -71;
-/// More came than was asked for.
+/// More arrived than was requested.
 pub const EOVERFLOW: i32 = -75;
 
 const GET_DESCRIPTOR: (u8, u8) = (0x80, 6);
@@ -31,12 +31,12 @@ const DEVICE_DESCRIPTOR: u16 = 0x0100;
 const FIRST_LOOK_BYTES: u16 = 64;
 /// Endpoint 0's packets, until the device has said how large they are.
 const LARGEST_PACKET: usize = 64;
-/// What a device has to take its address (USB 2.0, 9.2.6.3).
+/// The time a device has to adopt its address, in ms (USB 2.0, 9.2.6.3).
 const ADDRESS_PAUSE_MS: u64 = 2;
-/// Attempts at a transaction that is not answered (USB 2.0, 10.2.6).
+/// Attempts at a transaction that gets no answer (USB 2.0, 10.2.6).
 const ATTEMPTS: u32 = 3;
 
-/// Whose a control transfer is.
+/// Who requested a control transfer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Owner {
     Kernel(u32),
@@ -69,9 +69,9 @@ struct Pipe {
 pub struct Urbs {
     address: u8,
     addresses_given: u8,
-    /// A reset has ended since the cable was put in, and the device is still there.
+    /// A reset has ended since the cable was plugged in, and the device is still there.
     present: bool,
-    /// The kernel believes that the device has an address; so far it has only been reset.
+    /// The kernel assumes that the device has an address, but so far it has only been reset.
     unaddressed: bool,
     ep0_packet: usize,
     ep0_deferred: bool,
@@ -80,12 +80,12 @@ pub struct Urbs {
     pause: Option<u64>,
     endpoints: Vec<Endpoint>,
     pipes: Vec<Pipe>,
-    /// The pipe of the token that was chosen last; none is endpoint 0.
+    /// The pipe of the last chosen token; `None` is endpoint 0.
     chosen: Option<usize>,
     turn: usize,
     completed: Vec<Completion>,
     answers: Vec<Outcome>,
-    /// The kernel has taken what it asked for and asks for no more.
+    /// The kernel has taken what it requested and requests no more.
     starved: bool,
     resets: u64,
 }
@@ -114,7 +114,7 @@ impl Urbs {
         }
     }
 
-    /// Says which endpoints there are, once the descriptors are known.
+    /// Sets which endpoints there are, once the descriptors are known.
     pub fn set_endpoints(&mut self, endpoints: &[Endpoint]) {
         self.endpoints = endpoints.to_vec();
     }
@@ -134,23 +134,23 @@ impl Urbs {
         self.starved
     }
 
-    /// Whether something waits that a standing clock would keep waiting.
+    /// Whether something is waiting that would wait for ever if time stood still.
     pub fn waits_for_time(&self) -> bool {
         let waits = |pipe: &Pipe| pipe.endpoint.address & 0x80 == 0 && !pipe.queue.is_empty();
         !self.jobs.is_empty() || self.pipes.iter().any(waits)
     }
 
-    /// What has ended since the last call.
+    /// The transfers that have ended since the last call.
     pub fn take_completed(&mut self) -> Vec<Completion> {
         std::mem::take(&mut self.completed)
     }
 
-    /// The kernel resets the port. It is driven, with an address, before what comes next.
+    /// The kernel resets the port. The reset is driven, and an address set, before what comes next.
     pub fn reset(&mut self) {
         self.unaddressed = true;
     }
 
-    /// A request of the server's own; how it ends comes through [`Self::take_answers`].
+    /// A request from the server itself; [`Self::take_answers`] returns how it ended.
     pub fn ask(&mut self, request: Request) {
         self.jobs.push_back(Job::Transfer(Owner::Server, Transfer::new(request)));
     }
@@ -160,11 +160,11 @@ impl Urbs {
         (self.answers.len() >= count).then(|| std::mem::take(&mut self.answers))
     }
 
-    /// Takes a transfer of the kernel's.
+    /// Takes a transfer from the kernel.
     pub fn submit(&mut self, urb: Urb) {
         if !self.present {
-            // Who asked learns it from the end of the connection: an answer now would make the kernel's driver ask again
-            // while its controller shuts down, which Linux 6.1 never ends.
+            // The kernel learns it from the end of the connection: an answer now would make its driver submit again
+            // while its controller shuts down, and Linux 6.1 never gets out of that.
             return;
         }
         if urb.is_control() {
@@ -207,13 +207,13 @@ impl Urbs {
             self.unaddressed = false;
         }
         if what == SET_CONTROL_LINE_STATE && request.value & 1 == 0 {
-            // Nobody reads a port that is closed.
+            // Nobody reads a closed port.
             self.starved = false;
         }
         self.jobs.push_back(Job::Transfer(Owner::Kernel(urb.seq), Transfer::new(request)));
     }
 
-    /// Takes back a transfer; whether it was still pending.
+    /// Withdraws a transfer; returns whether it was still pending.
     pub fn unlink(&mut self, seq: u32) -> bool {
         self.starved = false;
         let before = self.pending();

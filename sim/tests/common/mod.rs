@@ -24,7 +24,7 @@ pub const BOARDS: [BoardFacts; 3] = [
     ("stm32f4-discovery", 8_000_000, [(3, 1), (1, 13)]),
 ];
 
-/// A board's firmware, which lies beside the default board's.
+/// A board's firmware, which is next to the default board's.
 pub fn board(name: &str) -> Image {
     open(&elf().with_file_name(format!("cantap-{name}.elf")))
 }
@@ -41,8 +41,8 @@ pub fn elf() -> PathBuf {
     path.expect("CANTAP_FIRMWARE_ELF is not set; build the firmware with `cargo xtask firmware`").into()
 }
 
-/// How long memories and buses keep the core waiting in a test that does not choose: `CANTAP_TIMING` (`best` or `worst`), or
-/// the best.
+/// How long memories and buses keep the core waiting in a test that does not choose: `CANTAP_TIMING` (`best` or `worst`), by
+/// default the best.
 pub fn bound() -> Bound {
     std::env::var("CANTAP_TIMING").map_or(Bound::Best, |text| {
         text.parse().unwrap_or_else(|reason| panic!("CANTAP_TIMING={text}: {reason}"))

@@ -13,8 +13,8 @@ use crate::ports::{Clock, Traffic};
 impl<'q, const N: usize> Capture<'q, N> {
     /// Starts a session: counters at zero. Both channels are closed and the queue is empty.
     ///
-    /// Returns the time that the first record's difference counts from, which the sender must have too: a
-    /// later reading would move every stamp of the session.
+    /// Returns the time from which the first record's difference counts. The sender must start from the
+    /// same value: a later reading would shift every stamp of the session.
     pub fn restart(&mut self, clock: &impl Clock) -> u64 {
         let now = self.now(clock);
         self.recorder.restart(now);
@@ -38,14 +38,14 @@ impl<'q, const N: usize> Capture<'q, N> {
         self.recorder.event(&Event::Started { channel }, now);
     }
 
-    /// The channel's filters let nothing pass for a moment. What came then is not even counted by the controller.
+    /// The channel's filters let nothing pass for a moment. The controller does not even count what arrived then.
     pub fn was_deaf(&mut self, channel: Channel, clock: &impl Clock) {
         let now = self.now(clock);
         let lost = Event::Lost { channel, stage: LossStage::Controller, count: 0, at_least: true };
         self.recorder.event(&lost, now);
     }
 
-    /// First half of closing: gives up transmissions. The channel is still on the bus.
+    /// First half of closing: aborts transmissions. The channel is still on the bus.
     pub fn begin_close(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) {
         let now = self.now(clock);
         let state = &mut self.channels[channel.index()];
@@ -55,9 +55,9 @@ impl<'q, const N: usize> Capture<'q, N> {
         state.transmitter.on_finished(traffic, &mut self.recorder, now, state.abort_reason);
     }
 
-    /// Second half of closing: the channel has left the bus. Records the rest and returns true; or
-    /// false if the queue has no room for it yet, or a mailbox has not been reported given up. With `overdue`
-    /// mailboxes are waited for no longer.
+    /// Second half of closing: the channel has left the bus. Records the rest and returns true; or false if
+    /// the queue has no room for it yet, or a mailbox has not yet reported its abort. If `overdue`, mailboxes
+    /// are no longer waited for.
     pub fn finish_close(
         &mut self,
         channel: Channel,
@@ -93,7 +93,7 @@ impl<'q, const N: usize> Capture<'q, N> {
 
     /// The channel has left the bus and nobody listens: forgets it, unrecorded.
     pub fn abandon(&mut self, channel: Channel, traffic: &mut impl Traffic) {
-        // Whatever is still in a mailbox would go out in the next session.
+        // What is still in a mailbox would otherwise be sent in the next session.
         traffic.abort();
         while traffic.receive().is_some() {}
         traffic.take_overrun();
@@ -103,7 +103,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         state.open = None;
     }
 
-    /// How the channel is open, if it is.
+    /// The configuration the channel was opened with; `None` if it is closed.
     pub const fn config(&self, channel: Channel) -> Option<&ChannelConfig> {
         self.channels[channel.index()].open.as_ref()
     }

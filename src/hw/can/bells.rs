@@ -8,18 +8,18 @@ pub(super) const TMEIE: usize = 0;
 const FMPIE0: usize = 1;
 
 /// The switches of a controller's receive and transmit interrupts: `CAN` is 0 or 1. Each interrupt only stamps, silences itself and leaves
-/// the rest to a task of lower priority, which switches it on again.
+/// the rest to a task of lower priority, which enables it again.
 ///
-/// Both tasks and both interrupts share these. The switches are bits of one register, each changed through its bit-band alias (Cortex-M4
-/// technical reference manual, "Bit-banding"), one at a time and untorn: an interrupt between reading and writing the whole register
-/// would be undone. Commands write the register only while the controller is off the bus.
+/// Both tasks and both interrupts share these. The switches are bits of one register, each changed atomically through its bit-band alias
+/// (Cortex-M4 technical reference manual, "Bit-banding"): if the whole register were read and written back, a change made by an
+/// interrupt in between would be undone. Commands write the register only while the controller is off the bus.
 ///
-/// FIFO 0's overrun needs no interrupt: a FIFO that overran is full, and the frames in it interrupt.
+/// FIFO 0's overrun needs no interrupt: a FIFO that overran is full, and the frames in it raise the receive interrupt.
 pub struct Bells<const CAN: usize>(());
 
-#[expect(clippy::unused_self, reason = "only whoever holds the bells may ring them")]
+#[expect(clippy::unused_self, reason = "only the owner of the bells may ring them")]
 impl<const CAN: usize> Bells<CAN> {
-    /// For `Controllers::new` alone.
+    /// Only for `Controllers::new`.
     pub(super) const fn new() -> Self {
         Self(())
     }
@@ -27,37 +27,37 @@ impl<const CAN: usize> Bells<CAN> {
     #[inline]
     fn registers() -> &'static RegisterBlock {
         let block = if CAN == 0 { CAN1::ptr() } else { CAN2::ptr() };
-        // SAFETY: the registers are there for the whole program, and `Controllers::new`, which makes the only bells, took them.
+        // SAFETY: the registers exist for the whole program, and `Controllers::new`, which makes the only bells, took them.
         unsafe { &*block }
     }
 
-    /// Silenced bells are read back, so that the line has fallen before the interrupt returns.
+    /// Reads the register back, so that the interrupt line has fallen before the handler returns.
     #[inline]
     fn silence(bit: usize) {
         switch(Self::registers(), bit, false);
         Self::registers().ier().read();
     }
 
-    /// Ends the receive interrupt though frames are waiting.
+    /// Ends the receive interrupt although frames are waiting.
     #[inline]
     pub fn silence_receive(&self) {
         Self::silence(FMPIE0);
     }
 
-    /// Interrupts again on a frame: at once if one is waiting.
+    /// Enables the receive interrupt again; it comes at once if a frame is waiting.
     #[inline]
     pub fn open_receive(&self) {
         switch(Self::registers(), FMPIE0, true);
     }
 
-    /// Ends the transmit interrupt though a mailbox has finished, until [`Traffic::await_finished`].
+    /// Ends the transmit interrupt although a mailbox has finished, until [`Traffic::await_finished`].
     #[inline]
     pub fn silence_transmit(&self) {
         Self::silence(TMEIE);
     }
 }
 
-/// Switches an interrupt of a controller through its bit's alias (see [`Bells`]).
+/// Switches a controller's interrupt through its bit's alias (see [`Bells`]).
 #[inline]
 pub(super) fn switch(controller: &RegisterBlock, bit: usize, on: bool) {
     const PERIPHERALS: usize = 0x4000_0000;

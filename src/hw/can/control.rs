@@ -1,4 +1,4 @@
-//! A controller on and off its bus.
+//! Takes a controller on and off its bus.
 
 use cantap_firmware::ports::Control;
 use cantap_wire::message::{ChannelConfig, Mode};
@@ -9,9 +9,9 @@ use super::registers::Registers;
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Halt {
     None,
-    /// The reset is written; the controller acknowledges it by sleeping.
+    /// The reset is requested; the controller acknowledges it by sleeping.
     Resetting,
-    /// It no longer sleeps, and is asked for initialisation mode.
+    /// It has been woken and is to enter initialisation mode.
     Entering,
 }
 
@@ -26,8 +26,8 @@ impl CanControl {
         Self { can, halt: Halt::None }
     }
 
-    /// Sleep is left and initialisation mode entered by one write: without INRQ a controller would first wait for eleven recessive
-    /// bits, which a stuck bus does not have (Zephyr, issue 71142).
+    /// Leaves sleep and enters initialisation mode with one write: without INRQ a controller would first wait for eleven recessive
+    /// bits, which never come on a stuck bus (Zephyr, issue 71142).
     fn ask_for_initialisation(&self) {
         self.can.mcr().modify(|_, w| w.sleep().clear_bit().inrq().set_bit());
     }
@@ -39,8 +39,8 @@ impl Control for CanControl {
         self.ask_for_initialisation();
     }
 
-    /// The controller's own reset, once: another, or any write of MCR before SLAK has acknowledged the first, would begin it anew or
-    /// be lost. As Linux's `bxcan_chip_softreset`, but without waiting.
+    /// The controller's own reset, requested only once: a second request, or any write to MCR before SLAK has acknowledged the
+    /// first, would restart it or be lost. Same as Linux's `bxcan_chip_softreset`, but without waiting.
     fn halt(&mut self) {
         match self.halt {
             Halt::None => {
@@ -64,7 +64,7 @@ impl Control for CanControl {
         let silent = matches!(config.mode, Mode::ListenOnly | Mode::SilentLoopback);
         let loopback = matches!(config.mode, Mode::Loopback | Mode::SilentLoopback);
         self.can.btr().write(|w| {
-            // SAFETY: the timing is valid, so each value less one fits its field.
+            // SAFETY: the timing is valid, so each value minus one fits its field.
             unsafe {
                 w.brp().bits(timing.prescaler - 1);
                 w.ts1().bits(timing.segment1 - 1);
@@ -74,15 +74,15 @@ impl Control for CanControl {
             w.silm().bit(silent).lbkm().bit(loopback)
         });
         self.can.mcr().modify(|_, w| {
-            // The stamps of time-triggered mode are not to be used (ES0206 2.13.1, for the F42x; the F405 is taken for
-            // alike).
+            // The stamps of time-triggered mode must not be used (ES0206 2.13.1, for the F42x; the F405 is assumed to
+            // be the same).
             w.ttcm().clear_bit();
             w.abom().bit(!config.manual_recovery);
             w.awum().clear_bit();
             w.nart().bit(config.one_shot);
-            // A full FIFO keeps what it has.
+            // A full FIFO keeps the frames it holds.
             w.rflm().set_bit();
-            // Mailboxes leave in the order of their requests.
+            // Mailboxes are sent in the order of their requests.
             w.txfp().set_bit()
         });
         self.can.ier().modify(|_, w| {

@@ -30,8 +30,8 @@ impl FilterBanks for CanFilters {
         let wide = bits(|shape| matches!(shape, Shape::List32 | Shape::Mask32));
         let active = bits(|_| true);
 
-        // In initialisation mode neither controller receives, so it is entered only if it must be.
-        // It is in that mode after a reset, too.
+        // In initialisation mode neither controller receives, so it is entered only when necessary. It is
+        // also the mode after a reset.
         let reshaped = can.fmr().read().finit().bit()
             || can.fmr().read().can2sb().bits() != layout.split
             || can.fm1r().read().bits() != lists

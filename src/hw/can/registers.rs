@@ -9,14 +9,14 @@ use stm32f4xx_hal::pac::can1::RegisterBlock;
 pub(super) struct Registers(*const RegisterBlock);
 
 impl Registers {
-    /// For `Controllers::new` alone, with the PAC's pointers.
+    /// Only for `Controllers::new`, with the PAC's pointers.
     pub(super) const fn of(block: *const RegisterBlock) -> Self {
         Self(block)
     }
 }
 
-// SAFETY: the registers are there for the whole program, wherever it touches them from. What the halves that hold
-// copies of the pointer write is disjoint, as their docs say.
+// SAFETY: the registers exist for the whole program, from whatever context it touches them. The halves that hold
+// copies of the pointer write disjoint registers, as their docs say.
 unsafe impl Send for Registers {}
 
 impl Deref for Registers {

@@ -1,4 +1,4 @@
-//! A controller's frames: what is received, and what is sent.
+//! A controller's frames: those received, and those sent.
 
 use core::sync::atomic::{AtomicU32, Ordering};
 
@@ -12,10 +12,11 @@ use stm32f4xx_hal::pac::can1::rx::rir;
 use super::bells::{TMEIE, switch};
 use super::registers::Registers;
 
-/// After a frame is released from the FIFO, the next is there some APB1 clocks later. So many reads, of at
-/// least two such clocks each, are far more than that; the bound only keeps a defect from hanging an interrupt.
+/// After a frame is released from the FIFO, the next appears some APB1 clocks later. This many reads, of at
+/// least two such clocks each, take far longer than that; the bound only keeps a defect from hanging an
+/// interrupt.
 const RELEASE_READS: u32 = 32;
-/// LEC's value that the hardware never writes: it shows whether there was an error since.
+/// The value of LEC that the hardware never writes: once written, it shows whether there has been an error since.
 const LEC_SEEN: u8 = 7;
 
 /// Bits of TSR (RM0090, CAN_TSR): a byte for each mailbox, and the flags of empty ones.
@@ -45,9 +46,9 @@ pub struct CanTraffic {
     next_request: u32,
     /// Per mailbox: TIxR as it was written, so that the request need not read it.
     identifiers: [u32; MAILBOXES],
-    /// Per mailbox: whether it was asked to be given up.
+    /// Per mailbox: whether its abort was requested.
     aborting: [bool; MAILBOXES],
-    /// When the transmit interrupt last stamped. It holds while that is silent.
+    /// When the transmit interrupt last stamped. Valid while that interrupt is silenced.
     sent_at: &'static AtomicU32,
 }
 
@@ -63,7 +64,7 @@ impl CanTraffic {
         }
     }
 
-    /// Of mailboxes that have completed, a flag for each, the one with the oldest request.
+    /// Of the completed mailboxes, given as one flag each, the one with the oldest request.
     fn oldest(&self, completed: u32) -> usize {
         if completed.is_power_of_two() {
             return completed.trailing_zeros() as usize / tsr::MAILBOX_BITS;
@@ -127,7 +128,7 @@ impl Traffic for CanTraffic {
 
     fn prepare(&mut self, frame: &Frame) -> Option<u8> {
         let tsr = self.can.tsr().read().bits();
-        // A mailbox whose outcome nobody has taken yet is empty, but not free.
+        // A mailbox whose outcome has not been taken yet is empty, but not free.
         let number = (0..MAILBOXES).find(|number| {
             tsr >> (tsr::TME_SHIFT + number) & 1 != 0 && tsr >> (number * tsr::MAILBOX_BITS) & tsr::RQCP == 0
         })?;
@@ -141,7 +142,7 @@ impl Traffic for CanTraffic {
             // SAFETY: a frame's DLC has four bits, as the field.
             unsafe { w.dlc().bits(frame.dlc()) }
         });
-        // What is behind the data is not sent, and a write takes as long as a dozen instructions.
+        // Bytes past the data are not sent, and a write takes as long as a dozen instructions.
         if frame.data_len() > 0 {
             mailbox.tdlr().write(|w| {
                 // SAFETY: every value is data.
@@ -179,7 +180,7 @@ impl Traffic for CanTraffic {
 
     #[inline]
     fn stamped(&self) -> Option<u32> {
-        // The interrupt silences itself when it has stamped. Without one that has finished, the stamp is an old one.
+        // The interrupt silences itself once it has stamped. If no mailbox has finished, the stamp is an old one.
         let finished = self.can.tsr().read().bits() & tsr::EACH_RQCP != 0;
         let stamped = finished && self.can.ier().read().bits() & 1 << TMEIE == 0;
         stamped.then(|| self.sent_at.load(Ordering::Relaxed))
@@ -201,7 +202,7 @@ impl Traffic for CanTraffic {
         let outcome = if flags & tsr::TXOK != 0 {
             Outcome::Sent
         } else if self.aborting[mailbox] {
-            // Before the flags: they may be of an attempt before.
+            // Checked before the flags, which may come from an earlier attempt.
             Outcome::Aborted
         } else if flags & tsr::ALST != 0 {
             Outcome::ArbitrationLost
@@ -224,7 +225,7 @@ impl Traffic for CanTraffic {
     }
 
     fn take_errors(&mut self) -> ErrorStatus {
-        // In this order an error that comes in between raises the interrupt again.
+        // In this order, an error that occurs in between raises the interrupt again.
         self.can.msr().write(|w| w.erri().set_bit());
         let esr = self.can.esr().read();
         let kind = match esr.lec().bits() {

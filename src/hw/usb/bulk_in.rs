@@ -1,4 +1,4 @@
-//! The data endpoint towards the host: one transfer of several packets at a time, and one interrupt for all of it.
+//! The data endpoint towards the host: one transfer of several packets at a time, with one interrupt for all of them.
 
 use cantap_firmware::ports::PACKET;
 
@@ -18,7 +18,7 @@ const ACTIVE: u32 = epctl::USBAEP
 
 /// Bulk IN.
 pub struct BulkIn {
-    /// The transfer under way, to be sent again from where the host has got to if it has to be taken back.
+    /// The transfer under way. If it has to be taken back, it is sent again from where the host had got to.
     bytes: [u8; TRANSFER],
     start: usize,
     end: usize,
@@ -32,7 +32,7 @@ impl BulkIn {
         Self { bytes: [0; TRANSFER], start: 0, end: 0, under_way: false, active: false, halted: false }
     }
 
-    /// Into or out of use, empty, with DATA0 and not halted (USB 2.0, 9.1.1.5).
+    /// Puts the endpoint into or out of use: empty, with DATA0 and not halted (USB 2.0, 9.1.1.5).
     pub fn configure(&mut self, registers: &mut Registers, active: bool) {
         registers.disable_input(BULK_IN);
         registers.write(ENDPOINT.int(), epint::XFRC);
@@ -42,7 +42,7 @@ impl BulkIn {
         self.active = active;
     }
 
-    /// Begins a transfer with as much as goes into one and returns how much that is; `None` if the last one is still under way.
+    /// Begins a transfer with as many bytes as fit into one and returns how many; `None` if the last one is still under way.
     pub fn write(&mut self, registers: &mut Registers, bytes: &[u8]) -> Option<usize> {
         if !self.active || self.under_way {
             return None;
@@ -69,12 +69,12 @@ impl BulkIn {
         fifo::push(registers, BULK_IN, bytes);
     }
 
-    /// The transfer is through.
+    /// The transfer has completed.
     pub fn done(&mut self) {
         self.under_way = false;
     }
 
-    /// Takes the transfer under way out of the controller and keeps what the host has not got of it.
+    /// Takes the transfer under way out of the controller and keeps what the host has not received.
     fn take_back(&mut self, registers: &mut Registers) {
         if !self.under_way || self.halted {
             return;
@@ -96,7 +96,7 @@ impl BulkIn {
         registers.control(ENDPOINT, 0, epctl::STALL);
     }
 
-    /// Begins with DATA0 again, not halted any more (USB 2.0, 9.4.5), with what the host has not got yet.
+    /// Begins with DATA0 again, no longer halted (USB 2.0, 9.4.5), with what the host has not received yet.
     pub fn restart(&mut self, registers: &mut Registers) {
         if !self.active {
             return;

@@ -1,5 +1,5 @@
-//! The data endpoint from the host. It is armed for as many packets as there is room for, and again only when all of them have
-//! been read and the port is not held: until then the host is answered with NAK.
+//! The data endpoint from the host. It is armed for as many packets as there is room for, and again only once all of them have
+//! been read and the port is not held: until then the answer is NAK.
 //!
 //! Nothing arms it between a packet's data and the end of its transfer, where cores of this family lose four bytes of the packet
 //! (libopencm3 #600, #672, #873).
@@ -17,7 +17,7 @@ const ACTIVE: u32 = epctl::USBAEP | 2 << epctl::EPTYP_SHIFT | PACKET as u32 | ep
 pub struct BulkOut {
     packets: [[u8; PACKET]; ON_ITS_WAY],
     lens: [usize; ON_ITS_WAY],
-    /// Packets taken from the FIFO since it was armed, and how many of them have been read.
+    /// Packets taken from the FIFO since the endpoint was armed, and how many of them have been read.
     taken: usize,
     read: usize,
     armed: bool,
@@ -49,8 +49,8 @@ impl BulkOut {
         *self = Self { held: self.held, ..Self::new() };
     }
 
-    /// Into or out of use, with DATA0 and not halted (USB 2.0, 9.1.1.5). What has been received stays, and so does a transfer
-    /// that is armed: there is nothing in it.
+    /// Puts the endpoint into or out of use, with DATA0 and not halted (USB 2.0, 9.1.1.5). What has been received stays, and
+    /// so does an armed transfer, which is still empty.
     pub fn configure(&mut self, registers: &mut Registers, active: bool) {
         self.active = active;
         self.halted = false;
@@ -58,7 +58,7 @@ impl BulkOut {
         self.arm(registers);
     }
 
-    /// Lets packets in, if there is room for all that may come.
+    /// Lets packets in, if there is room for as many as may come.
     pub fn arm(&mut self, registers: &mut Registers) {
         if !self.active || self.armed || self.held || self.read < self.taken {
             return;
@@ -78,12 +78,12 @@ impl BulkOut {
                 self.lens[self.taken] = len.min(PACKET);
                 self.taken += 1;
             }
-            // Cannot be: no more are let in than there is room for.
+            // Cannot happen: no more are let in than there is room for.
             None => fifo::pop(registers, len, &mut []),
         }
     }
 
-    /// The transfer has ended, because it is full or with a packet that was not.
+    /// The transfer has ended: it is full, or its last packet was short.
     pub fn transfer_done(&mut self) {
         self.armed = false;
     }
@@ -101,7 +101,7 @@ impl BulkOut {
         Some(len)
     }
 
-    /// Lets no more packets in than those it is armed for, or lets them in again.
+    /// If `held`, lets in no packets beyond those it is armed for; otherwise lets them in again.
     pub fn hold(&mut self, registers: &mut Registers, held: bool) {
         self.held = held;
         self.arm(registers);
@@ -113,7 +113,7 @@ impl BulkOut {
         registers.control(ENDPOINT, 0, epctl::STALL);
     }
 
-    /// Begins with DATA0 again, not halted any more (USB 2.0, 9.4.5).
+    /// Begins with DATA0 again, no longer halted (USB 2.0, 9.4.5).
     pub fn restart(&mut self, registers: &mut Registers) {
         if self.active {
             self.halted = false;

@@ -31,11 +31,11 @@ const NOTIFY_PACKET: u16 = 8;
 /// Whether the host has the port open.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Line {
-    /// It has not: DTR is down.
+    /// No: DTR is down.
     Down,
-    /// It has.
+    /// Yes: DTR is up.
     Up,
-    /// It had when it configured the device anew, and has said nothing of DTR since.
+    /// It had when it reconfigured the device, and has not set DTR since.
     Assumed,
 }
 
@@ -49,7 +49,7 @@ pub struct Core {
     configured: bool,
     line: Line,
     history: PortHistory,
-    /// As usb-device knows it.
+    /// Whether usb-device takes the bus for suspended.
     suspended: bool,
 }
 
@@ -77,13 +77,13 @@ impl Core {
         registers.write(GRSTCTL, grstctl::CSRST);
         registers.wait_until(GRSTCTL, |value| value & grstctl::CSRST == 0);
         registers.wait_until(GRSTCTL, |value| value & grstctl::AHBIDL != 0);
-        // Nothing on our boards measures VBUS.
+        // None of our boards measures VBUS.
         registers.write(GCCFG, gccfg::PWRDWN | gccfg::NOVBUSSENS);
         registers.write(PCGCCTL, 0);
         registers.modify(DCTL, 0, dctl::SDIS);
         registers.modify(DCFG, 0, dcfg::DSPD_FULL);
         registers.write(DIEPMSK, epint::XFRC);
-        // The receive FIFO's status says what comes.
+        // The receive FIFO's status reports what arrives.
         registers.write(DOEPMSK, 0);
         registers.write(DAINTMSK, 1 | 1 << BULK_IN);
         registers.write(GINTSTS, !0);
@@ -93,8 +93,8 @@ impl Core {
         registers.modify(DCTL, dctl::SDIS, 0);
     }
 
-    /// The host drives a reset: all that was going on is over (RM0090, "Endpoint initialization on USB reset"). Endpoint 0 takes
-    /// OUT packets from the end of the enumeration on.
+    /// The host drives a reset: everything under way is over (RM0090, "Endpoint initialization on USB reset"). Endpoint 0
+    /// accepts OUT packets once the speed enumeration has ended.
     fn reset(&mut self) {
         let Self { registers, control, bulk_in, bulk_out, .. } = self;
         bulk_in.configure(registers, false);
@@ -110,7 +110,7 @@ impl Core {
         self.line = Line::Down;
     }
 
-    /// SET_CONFIGURATION. Whoever had the port open has lost it, and may not know.
+    /// SET_CONFIGURATION. A program that had the port open has lost it, and may not know.
     pub fn configure(&mut self, configured: bool) {
         let Self { registers, bulk_in, bulk_out, .. } = self;
         bulk_in.configure(registers, configured);
@@ -167,7 +167,7 @@ impl Core {
     fn poll(&mut self) -> PollResult {
         let flags = self.registers.read(GINTSTS);
         if flags & gint::USBRST != 0 {
-            // The silence before a reset is of no interest any more.
+            // The silence before a reset no longer matters.
             self.registers.write(GINTSTS, gint::USBRST | gint::USBSUSP | gint::WKUPINT);
             return PollResult::Reset;
         }
@@ -182,7 +182,7 @@ impl Core {
         }
         if flags & gint::USBSUSP != 0 {
             self.registers.write(GINTSTS, gint::USBSUSP);
-            // It may have been woken since.
+            // The bus may have been woken since.
             if self.registers.read(DSTS) & dsts::SUSPSTS != 0 {
                 return PollResult::Suspend;
             }
@@ -190,7 +190,7 @@ impl Core {
         let received = self.receive();
         let sent = if flags & gint::IEPINT == 0 { 0 } else { self.sent() };
         let (setup, packet) = self.control.waits();
-        // The data endpoints concern usb-device only where they show that the bus is alive.
+        // usb-device needs the data endpoints' events only as a sign that the bus is alive.
         let data = if self.suspended { received | sent & !1 } else { 0 };
         if setup || packet || (sent & 1 | data) != 0 {
             return PollResult::Data {
@@ -227,7 +227,7 @@ impl Core {
         bulk
     }
 
-    /// Takes note of the IN endpoints whose transfer is through, a bit for each.
+    /// Handles the IN endpoints whose transfer has completed; returns a bit for each.
     fn sent(&mut self) -> u16 {
         let Self { registers, bulk_in, .. } = self;
         let ended = registers.read(DAINT) & (1 | 1 << BULK_IN);
@@ -251,7 +251,7 @@ impl Core {
         self.line = line;
     }
 
-    /// What the device knows of DTR.
+    /// What the device knows about DTR.
     pub const fn line(&self) -> Line {
         self.line
     }
@@ -271,16 +271,16 @@ impl Core {
         self.bulk_out.read(&mut self.registers, out)
     }
 
-    /// Makes the host wait, or no longer: see [`BulkOut::hold`].
+    /// Makes the host wait, or lets it send again: see [`BulkOut::hold`].
     pub fn hold_bulk(&mut self, held: bool) {
         self.bulk_out.hold(&mut self.registers, held);
     }
 }
 
-/// The core, for those who share it at one priority.
+/// The core, shared by code of one priority.
 pub struct Shared(UnsafeCell<Core>);
 
-// SAFETY: all who have a reference to it live in the one `UsbPort`: its `UsbDevice`, its class, its observer. The port is
+// SAFETY: everything that has a reference to it lives in the one `UsbPort`: its `UsbDevice`, its class, its observer. The port is
 // RTIC's `#[lock_free]` resource of tasks at priority 2, each of which runs to its end before another begins, and every way in is
 // through `&mut UsbPort`. So there is never more than one context, as with a `Cell` in one thread.
 unsafe impl Sync for Shared {}
@@ -290,7 +290,7 @@ impl Shared {
         Self(UnsafeCell::new(core))
     }
 
-    /// Does something with the core, which must not come back here; it cannot, since the core does not know of this.
+    /// Runs `act` on the core. `act` must not come back here; it cannot, since the core does not know of `Shared`.
     pub fn with<R>(&self, act: impl FnOnce(&mut Core) -> R) -> R {
         // SAFETY: the only reference: one context (see `Sync` above), and no `act` in this module's files calls `with`.
         act(unsafe { &mut *self.0.get() })
@@ -300,7 +300,7 @@ impl Shared {
 /// What usb-device drives.
 pub struct Bus {
     core: &'static Shared,
-    /// Endpoints that are given away, IN in the upper half.
+    /// Endpoints already allocated, IN in the upper half.
     given: u32,
 }
 
@@ -371,8 +371,8 @@ impl usb_device::bus::UsbBus for Bus {
         self.core.with(|core| core.is_halted(address))
     }
 
-    /// The transceiver's clock stays on. Stopping it saves little beside a processor at 144 MHz, and whether a reset after
-    /// a replug is then seen, with nothing that measures VBUS, only a board can show.
+    /// The transceiver's clock stays on. Stopping it saves little compared with a processor at 144 MHz, and whether a
+    /// reset after a replug would then be noticed, where nothing measures VBUS, only a real board can show.
     fn suspend(&self) {
         self.core.with(|core| core.suspended = true);
     }
@@ -385,7 +385,7 @@ impl usb_device::bus::UsbBus for Bus {
         self.core.with(Core::poll)
     }
 
-    /// The controller answers the status stage with the address that it had, and takes the new one behind it (RM0090, "Endpoint
+    /// The controller answers the status stage with its old address, and adopts the new one afterwards (RM0090, "Endpoint
     /// initialization on SetAddress command").
     const QUIRK_SET_ADDRESS_BEFORE_STATUS: bool = true;
 }

@@ -6,8 +6,8 @@ use usb_device::{Result, UsbError};
 use super::fifo;
 use super::registers::{Endpoint, Registers, epctl, eptsiz};
 
-/// What usb-device has room for in the data of a request (`control-buffer-256` is off). It ignores a request that has more, and
-/// the data that follow it would stay in the way.
+/// The most data of a request that usb-device has room for (`control-buffer-256` is off). It ignores a request with more, and
+/// the data that follow would stay in the way.
 const MOST_DATA: u16 = 128;
 
 const IN: Endpoint = Endpoint::input(0);
@@ -27,7 +27,7 @@ impl Control {
         Self { setup: [0; 8], setup_waits: false, packet: [0; PACKET], packet_len: 0, packet_waits: false }
     }
 
-    /// After a bus reset: nothing waits; answers nothing but SETUP packets. Packets of 64 bytes are MPSIZ 0.
+    /// After a bus reset: nothing is waiting, and only SETUP packets are answered. MPSIZ 0 means packets of 64 bytes.
     pub fn reset(&mut self, registers: &mut Registers) {
         self.setup_waits = false;
         self.packet_waits = false;
@@ -44,12 +44,12 @@ impl Control {
         registers.control(OUT, 0, epctl::EPENA | epctl::CNAK);
     }
 
-    /// A SETUP packet is in the FIFO; the last of several counts.
+    /// A SETUP packet is in the FIFO; of several, the last counts.
     pub fn take_setup(&mut self, registers: &Registers, len: usize) {
         fifo::pop(registers, len, &mut self.setup);
     }
 
-    /// The setup stage is over: whatever of an earlier request was under way is not wanted any more.
+    /// The setup stage is over: what was left of an earlier request is dropped.
     pub fn setup_done(&mut self, registers: &mut Registers) {
         self.packet_waits = false;
         registers.disable_input(0);
@@ -69,17 +69,17 @@ impl Control {
         self.packet_len = len.min(PACKET);
     }
 
-    /// The packet is complete. The next one is let in when it has been read.
+    /// The packet is complete. The next one is let in once it has been read.
     pub fn packet_done(&mut self) {
         self.packet_waits = true;
     }
 
-    /// Whether a SETUP packet, and whether an OUT packet waits to be read.
+    /// Whether a SETUP packet and whether an OUT packet is waiting to be read.
     pub const fn waits(&self) -> (bool, bool) {
         (self.setup_waits, self.packet_waits)
     }
 
-    /// Takes what waits. A packet for which there is no room is lost.
+    /// Takes what is waiting. A packet too long for `out` is lost.
     pub fn read(&mut self, registers: &mut Registers, out: &mut [u8]) -> Result<usize> {
         let bytes = if core::mem::take(&mut self.setup_waits) {
             &self.setup[..]

@@ -1,4 +1,4 @@
-//! OTG_FS's FIFO RAM: who has which words of it, and the way in and out.
+//! OTG_FS's FIFO RAM: how it is divided up, written and read.
 
 use cantap_firmware::ports::PACKET;
 
@@ -10,15 +10,15 @@ const WORDS: usize = 320;
 const PACKET_WORDS: usize = PACKET / 4;
 
 /// The receive FIFO ("Receive data FIFO"): 5 · 1 + 8 words for SETUP packets of one control endpoint, 1 for global OUT NAK, the
-/// packets with a status word each, and two words of status for each of two OUT endpoints.
+/// packets with a status word each, and two status words for each of the two OUT endpoints.
 const RX_WORDS: usize = 5 + 8 + 1 + RX_PACKETS * (PACKET_WORDS + 1) + 2 * 2;
-/// Two, so that one can come while the last one is taken out. What comes meanwhile is answered with NAK.
+/// Two, so that one can arrive while the previous one is taken out. Anything more is answered with NAK.
 const RX_PACKETS: usize = 2;
-/// One packet, which is also the least that a transmit FIFO may have (16 words).
+/// One packet, which is also the smallest transmit FIFO allowed (16 words).
 const CONTROL_WORDS: usize = PACKET_WORDS;
-/// Nothing is ever sent there, but the least that there may be is 16 words.
+/// Nothing is ever sent there, but 16 words are the minimum.
 const NOTIFY_WORDS: usize = PACKET_WORDS;
-/// Whole packets in what is left: 320 − 52 − 16 − 16 = 236 words, 14 packets.
+/// Whole packets that fit into the rest: 320 − 52 − 16 − 16 = 236 words, 14 packets.
 pub const BULK_PACKETS: usize = (WORDS - RX_WORDS - CONTROL_WORDS - NOTIFY_WORDS) / PACKET_WORDS;
 const BULK_WORDS: usize = BULK_PACKETS * PACKET_WORDS;
 

@@ -1,4 +1,4 @@
-//! The virtual COM port: usb-device and usbd-serial for what hosts ask, the bus itself for data.
+//! The virtual COM port: usb-device and usbd-serial answer the host's control requests, data goes to the bus directly.
 
 use cantap_firmware::ports::{PACKET, Port, PortHistory};
 use cantap_wire::{USB_PID, USB_VID};
@@ -13,7 +13,7 @@ use super::bus::{Bus, Core, Line, Shared};
 use super::registers::Registers;
 use super::requests::Requests;
 
-/// Current that is asked of the bus, in mA: what a hub without a supply of its own has for a device (USB 2.0, 7.2.1: one unit load).
+/// Current requested from the bus, in mA: what a bus-powered hub has for a device (USB 2.0, 7.2.1: one unit load).
 const MAX_POWER_MA: usize = 100;
 
 /// The peripheral.
@@ -35,7 +35,7 @@ pub struct Memory {
 }
 
 impl Memory {
-    /// Nothing yet.
+    /// Empty memory, for [`UsbPort::new`].
     pub const fn new() -> Self {
         Self { core: None, bus: None, serial: String::new() }
     }
@@ -55,7 +55,7 @@ impl UsbPort {
             .product("cantap CAN analyser")
             .serial_number(&memory.serial);
         let device = UsbDeviceBuilder::new(bus, UsbVidPid(USB_VID, USB_PID))
-            // 2.1 would promise link power management.
+            // USB 2.1 would promise link power management.
             .usb_rev(UsbRev::Usb200)
             .device_class(USB_CLASS_CDC)
             .composite_with_iads()
@@ -68,9 +68,9 @@ impl UsbPort {
         Self { device, class, requests: Requests::new(core), core }
     }
 
-    /// Looks after the bus: resets, control requests, packets that have come or gone.
+    /// Services the bus: resets, control requests, packets received and sent.
     pub fn poll(&mut self) {
-        // Each turn takes something that waits.
+        // Each turn handles something that is waiting.
         while self.device.poll(&mut [&mut self.requests, &mut self.class]) {}
     }
 }
@@ -81,7 +81,7 @@ impl Port for UsbPort {
     }
 
     fn is_suspended(&self) -> bool {
-        // A pulled cable, too, shows as suspend, because nothing measures VBUS.
+        // A pulled cable looks like a suspend, too, because nothing measures VBUS.
         self.device.state() != UsbDeviceState::Configured && self.core.with(|core| core.line()) != Line::Down
     }
 

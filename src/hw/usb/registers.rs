@@ -1,5 +1,5 @@
-//! OTG_FS's registers in device mode (RM0090, "OTG_FS control and status registers"): offsets, bits, and the one way to reach
-//! them. Names are the manual's.
+//! OTG_FS's registers in device mode (RM0090, "OTG_FS control and status registers"): offsets, bits, and the only access to
+//! them. The names are the manual's.
 
 use stm32f4xx_hal::pac::{OTG_FS_DEVICE, OTG_FS_GLOBAL, OTG_FS_PWRCLK};
 
@@ -12,7 +12,7 @@ pub const GRXSTSP: usize = 0x020;
 pub const GRXFSIZ: usize = 0x024;
 pub const DIEPTXF0: usize = 0x028;
 pub const GCCFG: usize = 0x038;
-/// DIEPTXF1, the first of those of the endpoints beside endpoint 0.
+/// DIEPTXF1, the first of the registers for endpoints other than 0.
 pub const DIEPTXF: usize = 0x104;
 pub const DCFG: usize = 0x800;
 pub const DCTL: usize = 0x804;
@@ -102,7 +102,7 @@ pub mod epctl {
     pub const SD0PID: u32 = 1 << 28;
     pub const EPDIS: u32 = 1 << 30;
     pub const EPENA: u32 = 1 << 31;
-    /// What does something when a 1 is written to it, and must not be written back as it was read: a transfer that ends in
+    /// Bits that trigger an action when written as 1. They must not be written back as read: a transfer that ends in
     /// between would be armed again.
     pub const ACTIONS: u32 = CNAK | SNAK | SD0PID | 1 << 29 | EPDIS | EPENA;
 }
@@ -153,16 +153,16 @@ impl Endpoint {
     }
 }
 
-/// A flag of the controller follows within a few clocks of USB; this many reads are more than that, and the end of waiting for
+/// A flag of the controller follows within a few clocks of USB; this many reads take longer than that, and end the wait for
 /// hardware that does not answer.
 const MOST_READS: u32 = 1_000;
 
-/// The controller. Whoever has it is the only one who touches it.
+/// The controller. Only the owner of this value touches it.
 pub struct Registers(());
 
 #[expect(clippy::unused_self, reason = "having it is the right to touch the controller")]
 impl Registers {
-    /// From the peripheral itself, which nobody else has then.
+    /// Made from the peripheral itself, which nobody else can then have.
     pub fn new(_peripheral: (OTG_FS_GLOBAL, OTG_FS_DEVICE, OTG_FS_PWRCLK)) -> Self {
         Self(())
     }
@@ -171,7 +171,7 @@ impl Registers {
         OTG_FS_GLOBAL::ptr().cast_mut().cast::<u32>().wrapping_byte_add(offset)
     }
 
-    /// Reads a register; of some, the next value differs.
+    /// Reads a register. Some change by being read.
     #[inline]
     pub fn read(&self, offset: usize) -> u32 {
         // SAFETY: an aligned address within OTG_FS's 256 KiB, since all offsets are from this file; there is only one `self`.
@@ -190,7 +190,7 @@ impl Registers {
         self.write(offset, self.read(offset) & !clear | set);
     }
 
-    /// Clears bits of an endpoint's control register, sets others or does what they stand for.
+    /// Clears bits of an endpoint's control register, and sets others or triggers their actions.
     #[inline]
     pub fn control(&mut self, endpoint: Endpoint, clear: u32, set: u32) {
         self.modify(endpoint.ctl(), clear | epctl::ACTIONS, set);
@@ -201,7 +201,7 @@ impl Registers {
         self.read(endpoint.ctl()) & epctl::EPENA != 0
     }
 
-    /// Waits until the register's value is what is wanted, or for too long.
+    /// Waits until `wanted` accepts the register's value, but not for ever.
     pub fn wait_until(&self, offset: usize, wanted: impl Fn(u32) -> bool) {
         let mut reads = MOST_READS;
         while reads > 0 && !wanted(self.read(offset)) {
@@ -209,8 +209,8 @@ impl Registers {
         }
     }
 
-    /// Ends an IN endpoint's transfer in the manual's order: no more packets, off, and what is left of it out of the FIFO of the
-    /// same number (RM0090, "IN endpoint disable").
+    /// Ends an IN endpoint's transfer in the manual's order: NAK, disable, and flush the FIFO of the same number (RM0090, "IN
+    /// endpoint disable").
     pub fn disable_input(&mut self, number: usize) {
         let endpoint = Endpoint::input(number);
         if self.is_armed(endpoint) {

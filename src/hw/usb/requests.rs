@@ -1,5 +1,5 @@
-//! What usb-device keeps to itself of the host's requests: which configuration is set, which interface is set anew. An observer
-//! in the list of classes sees each request before it is carried out.
+//! Host requests that usb-device does not pass on: setting a configuration or an interface. An observer in the list of classes
+//! sees each request before it is carried out.
 
 use usb_device::UsbDirection;
 use usb_device::class::{ControlOut, UsbClass};
@@ -32,7 +32,7 @@ impl UsbClass<Bus> for Requests {
     fn control_out(&mut self, transfer: ControlOut<Bus>) {
         let request = *transfer.request();
         match (request.request_type, request.recipient, request.request) {
-            // usb-device takes no other value than these two.
+            // usb-device accepts only these two values.
             (RequestType::Standard, Recipient::Device, Request::SET_CONFIGURATION) if request.value <= 1 => {
                 self.0.with(|core| core.configure(request.value == 1));
             }
@@ -44,12 +44,12 @@ impl UsbClass<Bus> for Requests {
                         self.restart(BULK_OUT, UsbDirection::Out);
                     }
                     _ => {
-                        // Fails only where nobody waits for an answer.
+                        // Fails only if nobody waits for an answer.
                         let _ = transfer.reject();
                     }
                 }
             }
-            // bmAttributes does not offer it (USB 2.0, 9.4.9: a request error).
+            // bmAttributes does not offer remote wakeup (USB 2.0, 9.4.9: a request error).
             (RequestType::Standard, Recipient::Device, Request::SET_FEATURE | Request::CLEAR_FEATURE)
                 if request.value == Request::FEATURE_DEVICE_REMOTE_WAKEUP =>
             {

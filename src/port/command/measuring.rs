@@ -1,4 +1,4 @@
-//! Edges of a receive pin, for a host that looks for a bit rate: the controller is off the bus meanwhile, and nothing is driven.
+//! Edges of a receive pin, for a host looking for a bit rate: meanwhile the controller is off the bus, and nothing is driven.
 
 use cantap_wire::message::{Edge, Edges};
 use cantap_wire::{Channel, Refusal, Reply};
@@ -7,18 +7,18 @@ use heapless::Vec;
 use crate::port::board::Board;
 use crate::ports::EdgeMeter;
 
-/// The meter's 32 bits of time are extended to 64 when a host asks, and tell what is younger than half of their range. What nobody has
-/// fetched may have waited for four answers ([`cantap_wire::message::MAX_EDGES`] of the 256 that a meter keeps are in one), so a
-/// pause between two may take an eighth of that half: 22 s.
+/// The meter's 32-bit times are extended to 64 bits when a host asks, which works for edges younger than half their range. An edge may
+/// have to wait for four answers (each has [`cantap_wire::message::MAX_EDGES`] of the 256 that a meter keeps), so the pause between
+/// two answers may be an eighth of that half: 22 s.
 const MOST_PAUSE_TICKS: u64 = 1 << 28;
 
 /// A measurement under way.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Measuring {
     pub(super) channel: Channel,
-    /// The last edge that was reported, or the beginning.
+    /// The time of the last reported edge, or of the beginning.
     last: u64,
-    /// When the host asked last.
+    /// When the host last asked.
     asked: u64,
     /// Something may be missing before the next edge.
     unsure: bool,
@@ -46,9 +46,9 @@ fn begin<'q, const N: usize>(channel: Channel, unsure: bool, board: &mut impl Bo
     Measuring { channel, last: now, asked: now, unsure }
 }
 
-/// What was measured since the last answer.
+/// What has been measured since the last answer.
 ///
-/// Not inlined, as the others that put an answer on the stack.
+/// Not inlined, like the other functions that put an answer on the stack.
 #[inline(never)]
 pub(super) fn edges<'q, const N: usize>(
     measuring: &mut Option<Measuring>,
@@ -65,7 +65,7 @@ pub(super) fn edges<'q, const N: usize>(
     while !edges.is_full()
         && let Some(edge) = board.meter().next()
     {
-        // One that came since `now` was read lies a little ahead.
+        // An edge that came after `now` was read lies slightly ahead of it.
         let distance = edge.at.wrapping_sub(now as u32) as i32;
         let at = now.saturating_add_signed(i64::from(distance)).max(measuring.last);
         let ticks = u32::try_from(at - measuring.last).unwrap_or(u32::MAX);

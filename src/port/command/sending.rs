@@ -1,4 +1,4 @@
-//! What a host asks to be sent: once, again and again, in reply.
+//! What a host asks to be sent: once, periodically, or in reply.
 
 use cantap_wire::message::{DEVICE_TAG, MAX_SEND, Periodic, Trigger, TxFrame};
 use cantap_wire::{Channel, Refusal, Reply};
@@ -9,10 +9,11 @@ use crate::bus::periodic::{self, PERIODIC_SLOTS};
 use crate::bus::transmit::TRIGGER_SLOTS;
 use crate::port::board::Board;
 
-/// Target times may be so far ahead: a day.
+/// How far ahead target times may be: a day.
 const MAX_AHEAD_TICKS: u64 = 24 * 3600 * TICK_HZ as u64;
 
-/// Frames that are queued while the tasks of priority 4 are held up: two microseconds' worth.
+/// Frames that are queued at a time while the tasks of priority 4 are held up: two microseconds'
+/// worth.
 const QUEUED_AT_ONCE: usize = 5;
 
 /// Checks that a channel can send.
@@ -22,7 +23,7 @@ fn can_send<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, N>)
     if config.mode.transmits() { Ok(()) } else { Err(Refusal::ListenOnly) }
 }
 
-/// Queues frames, all or none, and returns how many places are free after it.
+/// Queues frames, all or none, and returns how many places are free afterwards.
 pub fn send<'q, const N: usize>(
     channel: Channel,
     frames: &Vec<TxFrame, MAX_SEND>,

@@ -12,8 +12,8 @@ use crate::ports::Chip;
 /// slcan's byte.
 pub const MAX_SAVED: usize = CHANNELS * (16 + MAX_FILTERS * 12) + 1;
 
-/// slcan's byte stands behind the channels' settings, where it is wanted: firmware that knows nothing of it leaves it unread, and
-/// without it nothing is reported. Bit 0: `K1`.
+/// slcan's byte, if present, follows the channels' settings: older firmware leaves it unread, and without it nothing is reported.
+/// Bit 0: `K1`.
 const REPORTS: u8 = 1 << 0;
 
 /// One channel's settings, applied or saved.
@@ -23,9 +23,9 @@ pub(super) struct ChannelSettings {
     pub(super) filters: Vec<Filter, MAX_FILTERS>,
 }
 
-/// What is stored for a channel: one channel's settings stand behind the other's.
+/// What is stored for a channel: the channels' settings follow one another.
 ///
-/// As the others that must not be inlined: each keeps bytes on the stack that the next does not need any more.
+/// Not inlined, like the others here: each keeps bytes on the stack that the next no longer needs.
 #[inline(never)]
 pub(super) fn saved<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, N>) -> Option<Defaults> {
     let mut bytes = [0; MAX_SAVED];
@@ -41,7 +41,7 @@ pub(super) fn saved<'q, const N: usize>(channel: Channel, board: &mut impl Board
     None
 }
 
-/// Whether slcan's reports were saved as wanted (`K1`).
+/// Whether the saved settings ask for slcan's reports (`K1`).
 #[inline(never)]
 pub(super) fn saved_reports<'q, const N: usize>(board: &mut impl Board<'q, N>) -> bool {
     let mut bytes = [0; MAX_SAVED];
@@ -54,7 +54,7 @@ pub(super) fn saved_reports<'q, const N: usize>(board: &mut impl Board<'q, N>) -
     rest.first().is_some_and(|flags| flags & REPORTS != 0)
 }
 
-/// Adds slcan's byte behind `len` bytes of the channels' settings. Returns the length with it.
+/// Adds slcan's byte after `len` bytes of the channels' settings. Returns the new length.
 pub(super) fn add_reports(reports: bool, len: usize, bytes: &mut [u8; MAX_SAVED]) -> usize {
     match bytes.get_mut(len).filter(|_| reports) {
         Some(at) => {

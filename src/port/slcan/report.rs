@@ -1,9 +1,10 @@
-//! Losses, errors and states as lines of their own, where a host asks for them (`K1`): those that Linux' slcan driver
-//! understands from 6.0 on (`drivers/net/can/slcan/slcan-core.c`), so that they reach `ip -details -statistics link`.
+//! Losses, errors and states as separate lines, if a host asks for them (`K1`), in the form that Linux's slcan driver
+//! has understood since 6.0 (`drivers/net/can/slcan/slcan-core.c`), so that they reach `ip -details -statistics
+//! link`.
 //!
-//! `e`, a digit and this many letters are errors; each line counts once, however often it names one. The driver ignores lines
-//! shorter than five characters, so an error is named three times. `s`, a letter and two counters of three decimal digits, receive
-//! and transmit, are a new state.
+//! `e`, a digit and that many letters are errors; each line counts an error once, however often it names it. The driver ignores
+//! lines shorter than five characters, so an error is named three times. `s`, a letter and two counters of three decimal digits,
+//! receive and transmit, are a new state.
 
 use core::fmt::Write;
 
@@ -22,7 +23,7 @@ pub fn transmit_overrun() -> Line {
     error('O')
 }
 
-/// An event's line, if it has one. Errors beyond the device's limit for one by one have no kind, and no line.
+/// An event's line, if it has one. Errors beyond the number that the device reports one by one have no kind, and so no line.
 pub fn line(event: &Event) -> Option<Line> {
     match event {
         Event::Lost { .. } => Some(error('o')),

@@ -1,4 +1,4 @@
-//! Requests and answers as bytes, where a value with room for the longest would be moved about, or cannot be made.
+//! Requests and answers as bytes, for where a value with room for the longest would have to be moved around, or cannot be built.
 
 use heapless::Vec;
 
@@ -7,13 +7,13 @@ use crate::Channel;
 use crate::packed::{Packed, take_packed};
 use crate::varint::{take_u32, take_u64};
 
-/// The index of [`super::Command::Send`], as the pinned bytes have it.
+/// The index of [`super::Command::Send`], as in the pinned bytes.
 const SEND: u32 = 6;
 
 /// Reads a request that is a [`super::Command::Send`] into `frames`, which is empty, and returns its id and channel. `None` if it is
-/// another or cannot be read; what is in `frames` then means nothing.
+/// another request or cannot be read; `frames` is then meaningless.
 ///
-/// It is what a streaming host sends thousands of times a second: as a [`super::Request`] it would be moved about with room for the
+/// A streaming host sends thousands of these a second: as a [`super::Request`], each would be moved around with room for the
 /// longest command.
 pub fn read_send(request: &[u8], frames: &mut Vec<TxFrame, MAX_SEND>) -> Option<(u16, Channel)> {
     let ((id, command), rest) = postcard::take_from_bytes::<(u16, u32)>(request).ok()?;
@@ -36,15 +36,15 @@ pub fn read_send(request: &[u8], frames: &mut Vec<TxFrame, MAX_SEND>) -> Option<
 }
 
 /// Writes a [`super::DeviceMessage::Response`] to `out` and returns its length, `None` if there is no room. The answer stays where
-/// it is: a [`super::Response`] that is moved about has room for the longest.
+/// it is: moving it into a [`super::Response`] would copy room for the longest.
 pub fn write_response(id: u16, result: &Result<Reply, Refusal>, out: &mut [u8]) -> Option<usize> {
-    /// The variant's index, as the pinned bytes have it.
+    /// The variant's index, as in the pinned bytes.
     const RESPONSE: u32 = 1;
     postcard::to_slice(&(RESPONSE, id, result), out).ok().map(|written| written.len())
 }
 
-/// Why a request, sealed as it was sent, cannot be read: [`Refusal::BadId`] or [`Refusal::BadDlc`] where it carries a frame
-/// that cannot be, else [`Refusal::Malformed`].
+/// Why a request that arrived undamaged cannot be read: [`Refusal::BadId`] or [`Refusal::BadDlc`] if it carries an
+/// impossible frame, otherwise [`Refusal::Malformed`].
 pub fn why_unreadable(request: &[u8]) -> Refusal {
     // The indices of the other commands that carry frames, as the pinned bytes have them.
     const SET_PERIODIC: u32 = 8;

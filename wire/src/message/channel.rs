@@ -7,13 +7,13 @@ use crate::{BitTiming, Frame, Id};
 /// How a channel takes part in its bus.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum Mode {
-    /// Sends nothing at all, no acknowledge either.
+    /// Sends nothing at all, not even acknowledgements.
     ListenOnly,
     /// Acknowledges, transmits.
     Normal,
     /// Sends and receives its own frames; hears nothing from the bus.
     Loopback,
-    /// As [`Mode::Loopback`], but the bus sees nothing.
+    /// Like [`Mode::Loopback`], but nothing reaches the bus.
     SilentLoopback,
 }
 
@@ -33,7 +33,7 @@ pub struct ChannelConfig {
     pub mode: Mode,
     /// No automatic retransmission.
     pub one_shot: bool,
-    /// Leave bus-off only by [`super::Command::Recover`].
+    /// Leave bus-off only on [`super::Command::Recover`].
     pub manual_recovery: bool,
     /// Leave received frames' data bytes out of the stream.
     pub omit_data: bool,
@@ -55,7 +55,7 @@ impl ChannelConfig {
     }
 }
 
-/// Which frames a filter lets through, beside the identifier.
+/// Which frames a filter lets through, apart from the identifier.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum FrameKind {
     /// Data frames.

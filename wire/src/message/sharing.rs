@@ -4,7 +4,8 @@ use core::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// What a server lets a client do with the board that it shares; each includes those before it.
+/// What a server lets a client do with the board that it shares. Each role includes those before
+/// it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub enum Role {
     /// Hear what the board hears.
@@ -17,10 +18,10 @@ pub enum Role {
 }
 
 impl Role {
-    /// All of them, the least first.
+    /// All roles, the lowest first.
     pub const ALL: [Self; 3] = [Self::Listen, Self::Configure, Self::Send];
 
-    /// As it is typed.
+    /// The name as users type it.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Listen => "listen",

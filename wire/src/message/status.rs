@@ -1,4 +1,4 @@
-//! How a device and its channels are.
+//! The state of a device and its channels.
 
 use heapless::String;
 use serde::{Deserialize, Serialize};
@@ -14,7 +14,7 @@ pub struct Status {
     pub ticks: u64,
     /// Bytes in the record queue.
     pub queue_bytes: u32,
-    /// Most bytes that were ever in it since `Hello`.
+    /// The most bytes in it at any time since `Hello`.
     pub queue_high_water_bytes: u32,
     /// Requests that could not be read.
     pub bad_requests: u32,
@@ -39,13 +39,13 @@ pub struct ChannelStatus {
     pub rec: u8,
     /// The last error.
     pub last_error: Option<BusErrorKind>,
-    /// Frames taken from the controller, those that the queue lost included.
+    /// Frames taken from the controller, including those that the queue lost.
     pub frames: u32,
     /// Times the controller's FIFO overran: at least this many frames were lost.
     pub lost_controller: u32,
     /// Frames lost because the queue was full.
     pub lost_queue: u32,
-    /// Bus errors, those not reported one by one included.
+    /// Bus errors, including those not reported one by one.
     pub bus_errors: u32,
     /// Frames sent.
     pub transmitted: u32,
@@ -61,7 +61,7 @@ pub const MAX_FAILURE_TEXT: usize = 200;
 /// Starts that followed a failure of the firmware: a panic, a fault, the watchdog, a clock that did not come up.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Failures {
-    /// How many since the device got its power.
+    /// How many since power-on.
     pub count: u32,
     /// What the last one was, in words for a developer; empty if there was none.
     pub last: String<MAX_FAILURE_TEXT>,

@@ -1,4 +1,4 @@
-//! Frames to be sent: once, again and again, in reply.
+//! Frames to be sent: once, periodically, or in reply.
 
 use heapless::Vec;
 use serde::{Deserialize, Serialize};
@@ -8,19 +8,19 @@ use crate::Frame;
 
 /// Most modifiers of one periodic frame.
 pub const MAX_MODIFIERS: usize = 4;
-/// Tags from here up name frames that the device sends by itself: a periodic entry's slot, or
+/// Tags from here up belong to frames that the device sends on its own: a periodic entry's slot, or
 /// [`TRIGGER_TAG`] plus a trigger's slot.
 pub const DEVICE_TAG: u32 = 0xFFFF_0000;
 /// See [`DEVICE_TAG`].
 pub const TRIGGER_TAG: u32 = 0xFFFF_8000;
 
-/// Never from a device: the tag of what another client of a shared board has sent.
+/// Never from a device: the tag of frames that another client of a shared board has sent.
 pub const OTHERS_TAG: u32 = u32::MAX;
 
 /// A frame to be sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct TxFrame {
-    /// Comes back in [`crate::Event::Transmitted`] or [`crate::Event::TransmitFailed`]. Below [`DEVICE_TAG`].
+    /// Returned in [`crate::Event::Transmitted`] or [`crate::Event::TransmitFailed`]. Below [`DEVICE_TAG`].
     pub tag: u32,
     /// The frame.
     #[serde(with = "crate::packed")]
@@ -30,7 +30,7 @@ pub struct TxFrame {
     pub at_ticks: Option<u64>,
 }
 
-/// A frame that the device sends again and again.
+/// A frame that the device sends periodically.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Periodic {
     /// The frame, before modifiers.

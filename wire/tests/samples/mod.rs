@@ -7,7 +7,7 @@ use cantap_wire::message::{
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 use cantap_wire::{BitTiming, Channel, Command, Event, Frame, Hello, Refusal, Reply};
 
-/// Bytes as the tables have them.
+/// Bytes in the tables' notation.
 pub fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect::<Vec<_>>().join(" ")
 }

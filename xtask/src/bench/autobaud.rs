@@ -12,7 +12,7 @@ use cantap_sim::address::Address;
 use super::extent::Extent;
 use crate::board::Board;
 
-/// The bus's rate as it is asked for, and what it must be called; nothing where the controller's clock does not reach it.
+/// The bus's rate and the rate that must be reported; `None` if the controller's clock cannot reach it.
 const RATES: [(u32, Option<u32>); 10] = [
     (1_000_000, Some(1_000_000)),
     (500_000, Some(500_000)),
@@ -33,9 +33,9 @@ const DENSITIES: [(&str, &str); 4] = [
 ];
 /// Frames destroyed, in per cent.
 const DAMAGE: [u32; 2] = [0, 30];
-/// Runs of each cell, on both channels in turn, and of a quick measurement.
+/// Runs per cell, alternating between both channels: normally, and for a quick measurement.
 const RUNS: [u64; 2] = [6, 2];
-/// Without anything new a search is given up.
+/// How long without anything new until a search is given up.
 const SILENCE: Duration = Duration::from_secs(3);
 
 /// Some runs under one condition.
@@ -44,11 +44,11 @@ struct Cell {
     runs: u32,
     right: u32,
     longest_s: f64,
-    /// Farthest of what was measured from the bus's rate, as a part of it.
+    /// The largest deviation of a measurement from the bus's rate, as a fraction of it.
     farthest: f64,
 }
 
-/// Measures.
+/// Measures and prints.
 pub fn run(extent: &Extent) -> Result<()> {
     let elf = Board::ALL[0].elf();
     ensure!(elf.exists(), "{}: run `cargo xtask firmware`", elf.display());

@@ -1,5 +1,5 @@
-//! What the firmware does to a bus on request, measured on the emulated bus under both bounds of time
-//! (`docs/emulator.md`): replies, periods, times, load. Each cell has the best, then the worst.
+//! What the firmware does on a bus on request, measured on the emulated bus with both bounds of time
+//! (`docs/emulator.md`): replies, periods, times, load. Each cell shows the best, then the worst.
 
 use anyhow::{Context, Result};
 use cantap_emu::machine::Setup;
@@ -27,9 +27,9 @@ const BUS_MS: u64 = 300;
 enum Other {
     /// It is closed.
     Idle,
-    /// It receives all that a bus can carry.
+    /// It receives as much as a bus can carry.
     Full,
-    /// It takes part in a bus of its own and does the same as channel 1.
+    /// It takes part in a separate bus and does the same as channel 1.
     Joined,
 }
 
@@ -54,7 +54,7 @@ pub fn run(extent: &Extent) -> Result<()> {
     rows(extent, ["period of 1 ms off by, us"], alone, |rig, _| {
         Ok([range(drive::periodic_jitter(rig, 1000)?)])
     })?;
-    // In three tenths of a second each entry's frame is sent about sixty times.
+    // Within three tenths of a second each entry's frame is sent about sixty times.
     rows(extent, ["32 periods of 5.0 to 5.4 ms, late, us"], &[Other::Joined], |rig, _| {
         let tables = drive::periodic_tables(rig, 5_000, 1000 * ms)?;
         Ok([range(tables.filter(|tables| tables.wrong == 0).map(|tables| tables.late))])
@@ -92,7 +92,7 @@ pub fn run(extent: &Extent) -> Result<()> {
     Ok(())
 }
 
-/// Prints rows that one measurement fills, if one of them is wanted.
+/// Prints the rows that one measurement fills, if any of them is wanted.
 fn rows<const N: usize>(
     extent: &Extent,
     names: [&str; N],
@@ -123,7 +123,7 @@ fn range(range: Option<Range>) -> String {
     range.map_or("incomplete".to_owned(), |range| format!("{:.2} to {:.2}", range.min_us, range.max_us))
 }
 
-/// The greatest of a figure over the channels, as text.
+/// The greatest value of a figure over the channels, as text.
 fn greatest<T>(measured: Option<&[T]>, figure: impl Fn(&T) -> f64, text: impl Fn(f64) -> String) -> String {
     let figures = measured.map(|measured| measured.iter().map(figure));
     figures.and_then(|figures| figures.reduce(f64::max)).map_or("incomplete".to_owned(), text)

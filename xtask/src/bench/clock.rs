@@ -12,9 +12,9 @@ mod measure;
 
 use measure::Errors;
 
-/// What the two crystals are off.
+/// By how much the two crystals are off, in ppm.
 const PPM: [f64; 2] = [40.0, -40.0];
-/// Emulated seconds, and from when on errors count.
+/// Emulated seconds, and the second from which errors count.
 const SECONDS: u32 = 300;
 const SETTLED_S: [u32; 2] = [5, 60];
 
@@ -40,7 +40,7 @@ pub fn run() -> Result<()> {
         line("the same while both run, as in a capture", clocks.live);
         let bound = |report: ClockReport| report.uncertainty_ns.map_or(f64::NAN, |ns| ns as f64 / 1e3);
         println!(
-            "  bounds that the clock tells at the end: {:.0} us by round trips alone, {:.0} us by frames",
+            "  bounds that the clock reports at the end: {:.0} us by round trips alone, {:.0} us by frames",
             bound(clocks.alone.1),
             bound(clocks.frames.1)
         );

@@ -1,4 +1,5 @@
-//! Sizes and times of Parquet beside trace formats: the same frames of the virtual car in each, the same question to each.
+//! Sizes and times of Parquet compared with trace formats: each has the same frames of the virtual car and answers the same
+//! question.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -10,16 +11,16 @@ use super::formats::make_trace;
 use crate::peers::Peers;
 use crate::workspace;
 
-/// What the car says in this time is repeated.
+/// What the car sends in this time is repeated.
 const CAPTURE_S: u32 = 60;
 /// Frames of the trace made of it.
 const FRAMES: u64 = 1_000_000;
-/// The best of so many rounds counts.
+/// Rounds, of which the best counts.
 const ROUNDS: usize = 3;
 const DATABASE: &str = "host/virtual/src/car/car.dbc";
-/// The question is what its mean is.
+/// The signal whose mean is asked for.
 const SIGNAL: &str = "EngineSpeed";
-/// The kernel's unit of processor time (`sysconf(_SC_CLK_TCK)`, 100 on Linux everywhere).
+/// The kernel's unit of processor time (`sysconf(_SC_CLK_TCK)`, which is always 100 on Linux).
 const TICKS_PER_S: f64 = 100.0;
 
 /// Trace formats, by the file's name.
@@ -30,7 +31,7 @@ const TRACES: &[(&str, &str)] = &[
     ("BLF", "copy.blf"),
     ("MF4", "copy.mf4"),
 ];
-/// What `decode` makes: its options, and where the question's signal is in it. Then how DuckDB asks for it.
+/// What `decode` writes: name, its options, the file with the signal in question, and how DuckDB asks for it.
 const DECODED: &[(&str, &str, &str, &str)] = &[
     ("Parquet, a row per value", "", "long.parquet", "value FROM 'FILE' WHERE signal = 'EngineSpeed'"),
     (
@@ -98,7 +99,7 @@ fn line(name: &str, bytes: u64, written: f64, asked: Option<f64>) {
     println!("{name:<28} {bytes:>12} {per_frame:>14.2} {written:>12.2} {asked:>22}");
 }
 
-/// Processor seconds of DuckDB, with the start of Python and its own.
+/// Processor seconds of DuckDB, including its own start and Python's.
 fn ask(shell: &Shell, python: &Path, question: &str, file: &Path) -> Result<f64> {
     let (column, rest) = question.split_once(' ').context("a column and where it is")?;
     let rest = rest.replace("FILE", &file.display().to_string());
@@ -107,7 +108,7 @@ fn ask(shell: &Shell, python: &Path, question: &str, file: &Path) -> Result<f64>
     best(|| Ok(cmd!(shell, "{python} -c {script}").ignore_stdout()))
 }
 
-/// The least processor time of several rounds.
+/// The shortest processor time of several rounds.
 fn best<'a>(mut command: impl FnMut() -> Result<Cmd<'a>>) -> Result<f64> {
     let mut least = f64::MAX;
     for _ in 0..ROUNDS {
@@ -118,8 +119,8 @@ fn best<'a>(mut command: impl FnMut() -> Result<Cmd<'a>>) -> Result<f64> {
     Ok(least)
 }
 
-/// Processor time of all programs that this one has run, in seconds: unlike the time on the wall it does not depend on what
-/// else the machine does. proc(5): fields 16 and 17 of `stat`, of which the second may have spaces and ends with a bracket.
+/// Processor time of all programs that this one has run, in seconds: unlike wall-clock time it does not depend on what else
+/// the machine does. proc(5): fields 16 and 17 of `stat`, whose second field may contain spaces and ends with a bracket.
 fn children_s() -> Result<f64> {
     let stat = fs::read_to_string("/proc/self/stat")?;
     let (_, fields) = stat.rsplit_once(") ").context("/proc/self/stat has no name")?;

@@ -1,5 +1,5 @@
-//! What the real firmware costs and bears, measured on the emulated board under both bounds of time
-//! (`docs/emulator.md`): each cell has the best, then the worst.
+//! What the real firmware costs and can bear, measured on the emulated board with both bounds of
+//! time (`docs/emulator.md`): each cell shows the best, then the worst.
 
 use std::time::Instant;
 
@@ -19,7 +19,7 @@ use super::tasks;
 use crate::board::Board;
 
 const BITRATE_BPS: u32 = 1_000_000;
-/// Exceptions are numbered from the system's 16 on.
+/// Interrupts are numbered after the 16 system exceptions.
 const FIRST_IRQ: u16 = 16;
 /// How long each load lasts.
 const LOAD_MS: u64 = 500;
@@ -71,7 +71,8 @@ pub fn run(extent: &Extent) -> Result<()> {
     Ok(())
 }
 
-/// A board with its firmware that captures `channels`, and traffic that begins in a millisecond and lasts for `ms`.
+/// A board with its firmware that captures `channels`, and traffic that begins after a millisecond and lasts for
+/// `ms`.
 fn loaded(kind: Kind, channels: &[Channel], ms: u64, bound: Bound) -> Result<Rig> {
     let elf = Board::ALL[0].elf();
     let image =
@@ -159,7 +160,7 @@ fn load(name: &str, kind: Kind, channels: &[Channel], ms: u64) -> Result<Load> {
     Ok(measured)
 }
 
-/// The host stops reading in the middle of the worst traffic on one channel, and reads again.
+/// The host stops reading in the middle of the worst traffic on one channel, then resumes.
 fn stall(bound: Bound) -> Result<()> {
     let channel = Channel::Can1;
     let mut rig = loaded(Kind::Std0, &[channel], STALL_MS + 2 * BEFORE_STALL_MS, bound)?;
@@ -179,7 +180,7 @@ fn stall(bound: Bound) -> Result<()> {
 
     let sent = rig.ledger.on_bus_count(channel) - until_stall;
     let lost = rig.ledger.losses(channel).total();
-    // Frames are 48 µs apart; except for the few after there is room again, those lost are the last ones.
+    // Frames are 48 µs apart, and apart from a few after there is room again, the lost ones are the last.
     let lost_ms = lost as f64 * 0.048;
     println!("host stall at 100 % of one channel (std0), {STALL_MS} ms, at {bound}:");
     println!(

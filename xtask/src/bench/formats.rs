@@ -1,5 +1,5 @@
 //! Converting and reading trace files, side by side with can-utils' log2asc and python-can: the same million frames of
-//! a ship's bus, from file to file, in one run. Conversions are those of the command, from its start to its end.
+//! a ship's bus, from file to file, in one run. A conversion is timed from the command's start to its end.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -16,10 +16,11 @@ use crate::workspace;
 pub(super) const RECORDING: &str = "host/formats/tests/data/nmea2000.log.gz";
 /// Frames of the trace made of it.
 const FRAMES: u64 = 1_000_000;
-/// Ours and log2asc take turns so often, and the best of each counts. python-can takes longer than the machine's moods.
+/// How often ours and log2asc take turns; the best of each counts. python-can takes so long that the machine's moods
+/// average out.
 const ROUNDS: usize = 5;
 
-/// The files, kept in `target/` for whoever wants to look at them.
+/// The files, kept in `target/` for inspection.
 struct Files {
     log: PathBuf,
     asc: PathBuf,
@@ -65,7 +66,7 @@ pub fn run() -> Result<()> {
     Ok(())
 }
 
-/// A recording over and over, with times that go on, up to this many frames.
+/// Writes a recording repeatedly, with continuing times, up to this many frames.
 pub(super) fn make_trace(recording: &Path, log: &Path, frames: u64) -> Result<()> {
     let records: Vec<_> = open_reader(recording, &ReadOptions::default())?.collect::<Result<_, _>>()?;
     let (first, last) = records.first().zip(records.last()).context("the recording is empty")?;
@@ -81,7 +82,7 @@ pub(super) fn make_trace(recording: &Path, log: &Path, frames: u64) -> Result<()
     Ok(())
 }
 
-/// All conversions with ours and a peer's program; which of them are slower than promised.
+/// Times all conversions with our command and a peer's program; returns those that are slower than promised.
 fn compare(shell: &Shell, peers: &Peers, files: &Files) -> Result<Vec<&'static str>> {
     println!(
         "{:<16} {:>10} {:<12} {:>10} {:>7} {:>9}",
@@ -123,7 +124,7 @@ fn compare(shell: &Shell, peers: &Peers, files: &Files) -> Result<Vec<&'static s
     Ok(slow)
 }
 
-/// Seconds that python-can takes for a file, or from one to another, without its start.
+/// Seconds that python-can takes to read a file, or to convert one to another, without its start-up.
 fn python_can(shell: &Shell, peers: &Peers, files: &[&Path]) -> Result<f64> {
     let (python, script) = (&peers.python, "xtask/src/bench/formats.py");
     let output = cmd!(shell, "{python} {script} {files...}").quiet().read()?;
@@ -133,7 +134,7 @@ fn python_can(shell: &Shell, peers: &Peers, files: &[&Path]) -> Result<f64> {
     Ok(seconds.parse()?)
 }
 
-/// From one file to another by the command.
+/// Converts one file to another with the command.
 fn convert(shell: &Shell, from: &Path, to: &Path) -> Result<u64> {
     let program = workspace::target().join("release/cantap");
     cmd!(shell, "{program} convert {from} {to}").quiet().run()?;

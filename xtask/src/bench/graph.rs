@@ -1,5 +1,5 @@
-//! How long the live view's graph takes to be drawn anew with millions of values in its window. What is drawn is inside of the command,
-//! so its own test measures.
+//! How long redrawing the live view's graph takes with millions of values in its window. The graph is internal to the command, so one
+//! of its own tests measures this.
 
 use anyhow::Result;
 use xshell::cmd;

@@ -11,11 +11,11 @@ use cantap_wire::{Decoded, Decoder, Hello, PROTOCOL_VERSION, Record, Reply, Resp
 
 use super::wire::{KINDS, encode};
 
-/// Frames of each kind: a stream that does not fit a cache.
+/// Frames of each kind: a stream too long for a cache.
 const FRAMES: u64 = 2_000_000;
-/// Each measurement is the best of this many, for the machine may be busy with something else.
+/// Each measurement is the best of this many, because the machine may be busy with something else.
 const ROUNDS: usize = 5;
-/// What the design asks for, in million frames per second.
+/// What the design requires, in million frames per second.
 const WANTED_MILLIONS: f64 = 10.0;
 
 /// Measures each kind of frame.

@@ -11,14 +11,15 @@ use xshell::cmd;
 use super::formats::{RECORDING, make_trace};
 use crate::workspace;
 
-/// Frames of the traces: ten times as many must not take more.
+/// Frames of the traces: ten times as many must not take more memory.
 const FRAMES: [u64; 2] = [1_000_000, 10_000_000];
-/// What the project promises of a trace of any length.
+/// What the project promises for a trace of any length.
 const MOST_MIB: f64 = 64.0;
-/// How often the kernel's figure is read while the command runs. It never falls, so only the last moment is missed.
+/// How often the kernel's figure is read while the command runs. The figure never falls, so only what happens after
+/// the last reading is missed.
 const LOOK_EVERY: Duration = Duration::from_millis(2);
 
-/// Each with the traces' format as its file's suffixes, and its name where the suffix is not enough.
+/// Each format: its file suffix, and its name where the suffix is not enough.
 const FORMATS: &[(&str, &str)] = &[
     ("asc", "asc"),
     ("blf", "blf"),
@@ -52,7 +53,7 @@ const DATABASE: &str = "BO_ 2314731778 Position: 8 A\n SG_ Latitude : 0|32@1- (1
                         SG_ Longitude : 32|32@1- (1e-7,0) [0|0] \"deg\" A\n\
                         BO_ 2314732034 Course: 8 A\n SG_ Course : 16|16@1+ (0.0001,0) [0|0] \"rad\" A\n";
 
-/// Measures each and fails beyond the promise.
+/// Measures each, and fails if one exceeds the promise.
 pub fn run() -> Result<()> {
     let shell = workspace::shell()?;
     if !Path::new("/proc/self/status").exists() {
@@ -106,11 +107,11 @@ pub fn run() -> Result<()> {
         println!("{name:<32} {:>10.1} {:>10.1}", mib[0], mib[1]);
     }
     let most = rows.iter().flat_map(|(_, mib)| mib).copied().fold(0.0, f64::max);
-    ensure!(most < MOST_MIB, "{most:.1} MiB are too many; {MOST_MIB} are allowed");
+    ensure!(most < MOST_MIB, "{most:.1} MiB is too much; {MOST_MIB} MiB is allowed");
     Ok(())
 }
 
-/// Runs the command; how much memory it had resident at most.
+/// Runs the command; returns the most memory it had resident.
 fn peak_mib(dir: &Path, arguments: &[&Path]) -> Result<f64> {
     let program = workspace::target().join("release/cantap");
     let mut command = Command::new(program);
@@ -119,7 +120,7 @@ fn peak_mib(dir: &Path, arguments: &[&Path]) -> Result<f64> {
     let status = format!("/proc/{}/status", child.id());
     let mut kib = 0;
     loop {
-        // While it ends the line is gone.
+        // While the process ends, the line is missing.
         let text = fs::read_to_string(&status).unwrap_or_default();
         let line = text.lines().find_map(|line| line.strip_prefix("VmHWM:"));
         kib = line

@@ -1,7 +1,7 @@
-//! `cargo xtask bench`: measures, and says against what.
+//! `cargo xtask bench`: measures, and names the standard of comparison.
 //!
-//! Figures only mean something in a release build, so this builds itself again in one, with what the measurements
-//! need. One file per subject; each has `run()`, which prints its own table.
+//! Figures only mean something in a release build, so this program rebuilds itself as one, with what the
+//! measurements need. One file per subject; each has `run()`, which prints its own table.
 
 #[cfg(feature = "bench")]
 mod autobaud;
@@ -45,33 +45,33 @@ use xshell::cmd;
 /// What is measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum Subject {
-    /// Bytes per frame on the wire, and the encoder's cost.
+    /// Bytes per frame on the wire, and the encoder's cost in time.
     Wire,
     /// Converting and reading trace files, against log2asc and python-can.
     Formats,
-    /// Sizes and times of Parquet, beside trace formats.
+    /// Sizes and times of Parquet, compared with trace formats.
     Columns,
-    /// What the command occupies with long traces, in every format.
+    /// How much memory the command occupies with long traces, in every format.
     Memory,
     /// Decoding signals, against cantools.
     Signals,
-    /// What the firmware's ELF costs and bears on the emulated board.
+    /// What the firmware's ELF costs and can bear on the emulated board.
     Emulated,
     /// Replies, periods, replay and load on the emulated bus.
     Bus,
     /// The search for a bit rate, by rates, densities and damage.
     Autobaud,
-    /// Device time to UTC, and two boards' times to one another.
+    /// Mapping device time to UTC, and two boards' times to each other.
     Clock,
-    /// Frames per second that the host decodes, tightens and places in time.
+    /// Frames per second that the host decodes, with stamps tightened and converted to UTC.
     Host,
-    /// Frames per second whose load, periods and losses are measured.
+    /// Frames per second for which load, periods and losses are computed.
     Stats,
     /// Frames per second that all protocols read together.
     Protocols,
     /// Redraws of the live view's graph with five million values in the window.
     Graph,
-    /// The package for Python, beside python-can, cantools and asammdf.
+    /// The package for Python, compared with python-can, cantools and asammdf.
     Python,
     /// The live view in tmux at full load: redraws, answers to keys, processor, memory, recording.
     Monitor,
@@ -79,7 +79,7 @@ enum Subject {
     Serve,
 }
 
-/// What `cargo xtask bench` takes.
+/// The arguments of `cargo xtask bench`.
 #[derive(clap::Args)]
 pub struct Args {
     /// What to measure; everything if not given.
@@ -87,15 +87,15 @@ pub struct Args {
     /// How long the live view is watched, and how long the board is shared.
     #[arg(long, value_name = "N", default_value_t = 60)]
     seconds: u32,
-    /// Of what is measured on the emulated board, only the rows whose names contain this.
+    /// Of the measurements on the emulated board, only the rows whose names contain this.
     #[arg(long, value_name = "TEXT", default_value = "")]
     rows: String,
-    /// Measure on the emulated board for a tenth of the time: figures that are good enough to work by.
+    /// Measure on the emulated board for a tenth of the time: the figures are good enough to work with.
     #[arg(long)]
     quick: bool,
 }
 
-/// Builds this program in release and measures there.
+/// Builds this program in release mode and measures with it.
 #[cfg(not(feature = "bench"))]
 pub fn run(args: &Args) -> Result<()> {
     use clap::ValueEnum;
@@ -115,7 +115,7 @@ pub fn run(args: &Args) -> Result<()> {
     Ok(())
 }
 
-/// Measures.
+/// Runs the measurements.
 #[cfg(feature = "bench")]
 pub fn run(args: &Args) -> Result<()> {
     use clap::ValueEnum;
@@ -143,7 +143,7 @@ pub fn run(args: &Args) -> Result<()> {
             Subject::Serve => serve::run(args.seconds)?,
             #[cfg(not(unix))]
             Subject::Serve => {
-                anyhow::bail!("a board is shared by UNIX sockets here, which this system has none of")
+                anyhow::bail!("this shares a board over UNIX sockets, which this system does not have")
             }
         }
     }

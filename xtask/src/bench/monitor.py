@@ -1,10 +1,10 @@
-"""Runs `cantap monitor` in tmux at full load on both channels and measures what a user feels.
+"""Runs `cantap monitor` in tmux at full load on both channels and measures how responsive it is.
 
     cargo xtask bench monitor [--seconds N]
 
-Redraws per second, time from a key to its page, processor time per thread, memory every ten seconds. Keys go in by
-`tmux send-keys` and pages come out by `tmux pipe-pane`, so that starting tmux's client counts, too. Then it counts the
-recording: at 100 % load of these frames the bus carries 20 833.3 per second and channel.
+Redraws per second, time from a key to its page, processor time per thread, memory every ten seconds. Keys go in through
+`tmux send-keys` and pages come out through `tmux pipe-pane`, so that starting tmux's client counts, too. Then it counts the
+frames recorded: at 100 % load of these frames the bus carries 20 833.3 per second and channel.
 """
 import json
 import math
@@ -18,9 +18,9 @@ import time
 
 ROWS, COLUMNS = 50, 160
 WARM_UP_S = 8
-# Pages one after the other, each another than the one before.
+# Pages one after another, each different from the previous one.
 KEYS = "12534"
-# The mark at the shown page's tab: the first output that has it is the answer to a key.
+# The mark at the current page's tab: the first output that contains it is the response to a key.
 MARK = "▸".encode()
 # Each redraw is wrapped in these (synchronized output).
 REDRAW = b"\x1b[?2026h"
@@ -64,7 +64,7 @@ class View:
         return done.stdout.decode()
 
     def read_until(self, end, wanted=None):
-        """Reads until that time, or until `wanted` comes; then returns when it came."""
+        """Reads until `end`, or until `wanted` arrives; in that case returns when it did."""
         seen = b""
         while (now := time.time()) < end:
             ready, _, _ = select.select([self.output], [], [], min(0.02, end - now))
@@ -123,7 +123,7 @@ class View:
         self.tmux("send-keys", "5")
         self.read_until(time.time() + 0.5)
         print("the page of statistics then:\n" + self.tmux("capture-pane", "-p").rstrip())
-        # The pane's end must not end the server before the recording is whole.
+        # The end of the pane must not end the server before the recording is complete.
         self.tmux("set", "-g", "remain-on-exit", "on")
         self.tmux("send-keys", "q")
         while os.path.exists(f"/proc/{self.pid}") and self.tmux("display", "-p", "#{pane_dead}").strip() != "1":

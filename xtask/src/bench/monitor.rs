@@ -1,4 +1,5 @@
-//! The live view in a terminal, at full load on both channels: what a user feels, and whether the recording is whole.
+//! The live view in a terminal, at full load on both channels: how responsive it is, and whether the recording is
+//! complete.
 
 use anyhow::{Result, ensure};
 use xshell::cmd;

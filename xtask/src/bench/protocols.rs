@@ -1,9 +1,10 @@
-//! Frames per second that all protocols read together. The measurement is an example of cantap-protocols, so that it can be run alone.
+//! Frames per second that all protocols read together. The measurement is an example of cantap-protocols, so that it can also be run
+//! by itself.
 
 use anyhow::Result;
 use xshell::cmd;
 
-/// Fails where a bus is read more slowly than was asked for.
+/// Fails if a bus is read more slowly than required.
 pub(super) fn run() -> Result<()> {
     println!("Protocols: buses as a survey finds them, and with every protocol on every channel");
     let shell = crate::workspace::shell()?;

@@ -1,7 +1,10 @@
-//! One board and eight clients on two saturated channels: what the server takes, what it adds, and whether each client has everything or
-//! its loss counted.
+//! One board and eight clients on two saturated channels: what the server consumes, how much delay it adds, and whether each client gets
+//! everything or has its losses counted.
 
-use std::io::{BufRead, BufReader, Read};
+#[path = "../../../host/serve/tests/line/mod.rs"]
+mod line;
+
+use std::io::{BufRead, BufReader};
 use std::os::unix::net::UnixStream;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -11,6 +14,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use anyhow::{Context, Result, ensure};
 use cantap::device::{ChannelCounters, Device, Link};
 use cantap_wire::Channel;
+use line::SlowLine;
 use xshell::cmd;
 
 use crate::workspace;
@@ -18,15 +22,15 @@ use crate::workspace;
 const BITRATE_BPS: u32 = 1_000_000;
 /// Clients that read as fast as they can.
 const QUICK: usize = 6;
-/// Clients behind a slow line: half of what two such channels take.
+/// Clients on a slow line, which carries half of what two such channels need.
 const SLOW: usize = 2;
 const SLOW_BYTES_PER_S: usize = 100_000;
-/// A read or write of a socket returns at the latest after this time.
+/// A read or write of a socket returns after this time at the latest.
 const SOCKET_TIMEOUT: Duration = Duration::from_millis(50);
-/// Ages of records that are kept for the table, at most.
+/// Most ages of records that are kept for the table.
 const MOST_AGES: usize = 1 << 20;
 
-/// A program that is ended with this.
+/// A running program, which is ended when this is dropped.
 struct Running {
     child: Child,
     /// The first line that it wrote.
@@ -43,13 +47,13 @@ impl Running {
         Ok(Self { child, said: said.trim().to_owned() })
     }
 
-    /// Seconds of processor time by now.
+    /// Seconds of processor time so far.
     fn processor_s(&self) -> Result<f64> {
         let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.child.id()))?;
         let (_, fields) = stat.rsplit_once(')').context("/proc/PID/stat")?;
         let ticks: Vec<f64> =
             fields.split_whitespace().skip(11).take(2).map(str::parse).collect::<Result<_, _>>()?;
-        // USER_HZ is 100 wherever Linux runs.
+        // USER_HZ is always 100 on Linux.
         Ok(ticks.iter().sum::<f64>() / 100.0)
     }
 
@@ -69,10 +73,10 @@ impl Drop for Running {
     }
 }
 
-/// What one client had.
+/// What one client received.
 struct Outcome {
     channels: [ChannelCounters; 2],
-    /// How old records were when they came, in seconds: now less their time.
+    /// How old records were on arrival, in seconds: the current time minus theirs.
     ages: Vec<f64>,
 }
 
@@ -87,7 +91,7 @@ fn listen(device: &Device, is_over: &AtomicBool) -> Result<Outcome> {
     while !is_over.load(Ordering::Relaxed) {
         let Some(batch) = records.next_batch(SOCKET_TIMEOUT)? else { break };
         let now_ns = SystemTime::now().duration_since(UNIX_EPOCH)?.as_nanos() as i64;
-        // The clock is found in the first seconds.
+        // The clock is not determined until after the first seconds.
         if let Some(last) =
             batch.last().filter(|_| began.elapsed() > Duration::from_secs(3) && ages.len() < MOST_AGES)
         {
@@ -100,38 +104,20 @@ fn listen(device: &Device, is_over: &AtomicBool) -> Result<Outcome> {
     Ok(Outcome { channels: device.counters().channels, ages })
 }
 
-/// A line that carries so many bytes in a second.
-struct SlowLine {
-    stream: UnixStream,
-    began: Instant,
-    taken: usize,
-}
-
-impl Read for SlowLine {
-    fn read(&mut self, out: &mut [u8]) -> std::io::Result<usize> {
-        let due = self.began + Duration::from_secs_f64(self.taken as f64 / SLOW_BYTES_PER_S as f64);
-        std::thread::sleep(due.saturating_duration_since(Instant::now()));
-        let most = out.len().min(SLOW_BYTES_PER_S / 50);
-        let len = self.stream.read(&mut out[..most])?;
-        self.taken += len;
-        Ok(len)
-    }
-}
-
 fn client(socket: &str, name: &str, is_slow: bool) -> Result<Device> {
     let stream = UnixStream::connect(socket)?;
     stream.set_read_timeout(Some(SOCKET_TIMEOUT))?;
     stream.set_write_timeout(Some(SOCKET_TIMEOUT))?;
     let writer = stream.try_clone()?;
     let link = if is_slow {
-        Link::new(SlowLine { stream, began: Instant::now(), taken: 0 }, writer)
+        Link::new(SlowLine::new(stream, SLOW_BYTES_PER_S), writer)
     } else {
         Link::new(stream, writer)
     };
     Ok(Device::over(link, name)?)
 }
 
-/// The median and what 99 % are within, in milliseconds.
+/// The median and the 99th percentile, in milliseconds.
 fn quantiles(mut ages: Vec<f64>) -> (f64, f64) {
     ages.sort_by(f64::total_cmp);
     let at = |share: f64| ages.get((ages.len() as f64 * share) as usize).copied().unwrap_or(f64::NAN) * 1e3;
@@ -141,7 +127,7 @@ fn quantiles(mut ages: Vec<f64>) -> (f64, f64) {
 /// Runs it for this long.
 pub fn run(seconds: u32) -> Result<()> {
     let shell = workspace::shell()?;
-    // As this program is built: in release, unless somebody runs it otherwise.
+    // Built as this program is: in release mode, unless somebody runs it otherwise.
     let (profile, folder) = if cfg!(debug_assertions) { ("dev", "debug") } else { ("release", "release") };
     if folder == "release" || !workspace::target().join("debug/cantap").exists() {
         cmd!(shell, "cargo build --profile {profile} --quiet -p cantap-cli").quiet().run()?;

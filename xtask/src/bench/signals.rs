@@ -1,4 +1,5 @@
-//! Decoding signals, side by side with cantools: the same frames by the same database, in one run.
+//! Decoding signals, side by side with cantools: the same frames with the same database, in one
+//! run.
 
 use std::fmt::Write;
 use std::time::{Duration, Instant};
@@ -17,7 +18,7 @@ const DATABASE: &str = "host/signals/tests/data/dbc/vehicle.dbc";
 const PAYLOADS: u64 = 50;
 /// How often cantools decodes all frames; about a second.
 const PEER_ROUNDS: u32 = 20;
-/// How long ours decodes at least.
+/// How long ours decodes, at least.
 const DURATION: Duration = Duration::from_secs(2);
 /// What the project promises.
 const LEAST_RATIO: f64 = 30.0;
@@ -33,7 +34,7 @@ pub fn run() -> Result<()> {
     let (signals, seconds) = ours(&decoder, &frames);
     let per_round = signals.1;
     let rate = signals.0 as f64 / seconds;
-    println!("signals: {} frames of {DATABASE}, decoded over and over", frames.len());
+    println!("signals: {} frames of {DATABASE}, decoded repeatedly", frames.len());
     println!("{:<10} {:>12} {:>12}", "", "signals/s", "frames/s");
     let frames_per_signal = frames.len() as f64 / per_round as f64;
     println!("{:<10} {:>12.0} {:>12.0}", "cantap", rate, rate * frames_per_signal);
@@ -64,7 +65,7 @@ pub fn run() -> Result<()> {
     Ok(())
 }
 
-/// Random payloads that every program makes the same way.
+/// Random payloads, generated in the same way for every program.
 fn frames_of(message: &cantap_signals::Message) -> Vec<TraceFrame> {
     let payload = |number: u64| {
         let mut random = (u64::from(message.id.raw()) << 32 | number).wrapping_mul(0x9E37_79B9_7F4A_7C15);

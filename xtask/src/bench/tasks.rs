@@ -6,10 +6,11 @@ use cantap_emu::profile::Table;
 use cantap_emu::timing::Bound;
 use cantap_sim::rig::Rig;
 
-/// Functions that cost less of the processor are not listed.
+/// Functions with a smaller share of the processor's time are not listed.
 const LEAST_PERCENT: f64 = 0.2;
 
-/// Prints the shares while `act` runs on what `prepare` made: by interrupt at best and at worst, by function at worst.
+/// Prints the shares while `act` runs on what `prepare` made: by interrupt for the best and the worst bound, by
+/// function for the worst.
 pub fn print(
     what: &str,
     prepare: impl Fn(Bound) -> Result<Rig>,

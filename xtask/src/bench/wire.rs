@@ -20,12 +20,12 @@ pub const KINDS: [Kind; 4] = [
 
 /// A kind of frames.
 pub struct Kind {
-    /// As `cantap demo` calls it.
+    /// Its name in `cantap demo`.
     pub name: &'static str,
     extended: bool,
     len: usize,
     ticks: i64,
-    /// Most bytes per frame that the design allows (for ext0, that of ext8 less its data).
+    /// Most bytes per frame that the design allows (for ext0, that of ext8 minus its data).
     budget: f64,
 }
 
@@ -40,12 +40,12 @@ pub fn run() -> Result<()> {
         let nanos = begin.elapsed().as_nanos() as f64 / FRAMES as f64;
         let per_frame = bytes as f64 / FRAMES as f64;
         println!("{:<6} {:>12.2} {:>8.1} {:>14.1}", kind.name, per_frame, kind.budget, nanos);
-        ensure!(per_frame <= kind.budget, "{} takes more bytes per frame than it may", kind.name);
+        ensure!(per_frame <= kind.budget, "{} takes more bytes per frame than allowed", kind.name);
     }
     Ok(())
 }
 
-/// Encodes frames of a kind as the device does, and hands over each batch as it goes over the wire.
+/// Encodes frames of a kind as the device does, and passes on each batch as it goes over the wire.
 pub fn encode(kind: &Kind, frames: u64, mut batch: impl FnMut(&[u8])) {
     let mut writer = BatchWriter::new();
     let mut out = [0; MAX_ENCODED];

@@ -1,4 +1,4 @@
-//! A release's archives, and where their content is put together.
+//! A release's archives, and where their contents are assembled.
 
 use std::path::{Path, PathBuf};
 
@@ -12,7 +12,7 @@ pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 /// What goes into every archive.
 const PAPERS: [&str; 4] = ["README.md", "CHANGELOG.md", "LICENSE-MIT", "LICENSE-APACHE"];
 
-/// Packs what is in a directory, and the papers, into `DIST/NAME.tar.gz`, under a directory `NAME`.
+/// Packs a directory's contents and the papers into `DIST/NAME.tar.gz`, under a directory `NAME`.
 pub fn archive(shell: &Shell, dist: &Path, name: &str, content: &Path) -> Result<()> {
     for paper in PAPERS {
         shell.copy_file(paper, content)?;
@@ -43,7 +43,7 @@ fn files_under(shell: &Shell, directory: &Path) -> Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// An empty directory to put a package's files together in.
+/// An empty directory in which to assemble a package.
 pub fn staging(shell: &Shell, dist: &Path, name: &str) -> Result<PathBuf> {
     let staging = dist.join("staging").join(name);
     shell.remove_path(&staging)?;

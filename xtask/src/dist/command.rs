@@ -9,7 +9,7 @@ use super::archive::{VERSION, archive, staging};
 use super::notices;
 use crate::workspace;
 
-/// Shells, and what each calls the file with a command's completions.
+/// Shells, and how each names the file with a command's completions.
 const COMPLETIONS: [(&str, &str); 4] =
     [("bash", "cantap"), ("zsh", "_cantap"), ("fish", "cantap.fish"), ("powershell", "_cantap.ps1")];
 
@@ -31,13 +31,13 @@ pub fn pack(shell: &Shell, dist: &Path) -> Result<()> {
     archive(shell, dist, &name, &content)
 }
 
-/// Builds the command as it is released.
+/// Builds the command as released.
 pub fn build(shell: &Shell) -> Result<PathBuf> {
     cmd!(shell, "cargo build --locked --release -p cantap-cli").run()?;
     Ok(workspace::target().join("release").join(format!("cantap{}", std::env::consts::EXE_SUFFIX)))
 }
 
-/// Writes the manual pages into a directory, which is made.
+/// Writes the manual pages into a directory, which it creates.
 pub fn man_pages(shell: &Shell, command: &Path, directory: &Path) -> Result<()> {
     shell.create_dir(directory)?;
     Ok(cmd!(shell, "{command} man {directory}").quiet().run()?)

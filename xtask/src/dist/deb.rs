@@ -1,6 +1,6 @@
 //! Debian's package: the command, its manual pages and completions, and the udev rule.
 //!
-//! Put together by hand and packed by `dpkg-deb`: cargo-deb would be one more program to build, for a page of files.
+//! Assembled by hand and packed by `dpkg-deb`: cargo-deb would be one more program to build, for a handful of files.
 
 use std::path::Path;
 
@@ -22,7 +22,7 @@ const COMPLETIONS: [(&str, &str); 3] = [
 pub fn pack(shell: &Shell, dist: &Path) -> Result<()> {
     ensure!(
         is_installed("dpkg-deb"),
-        "there is no dpkg-deb; on Debian it belongs to the system, elsewhere install `dpkg`"
+        "dpkg-deb is missing; on Debian it is part of the system, elsewhere install `dpkg`"
     );
     let built = command::build(shell)?;
     let architecture = cmd!(shell, "dpkg --print-architecture").quiet().read()?;
@@ -31,7 +31,7 @@ pub fn pack(shell: &Shell, dist: &Path) -> Result<()> {
     let program = root.join("usr/bin/cantap");
     shell.create_dir(root.join("usr/bin"))?;
     shell.copy_file(&built, &program)?;
-    // Debug information is for whoever builds it.
+    // Debug information is for developers.
     cmd!(shell, "strip --strip-unneeded {program}").run()?;
     let man = root.join("usr/share/man/man1");
     command::man_pages(shell, &built, &man)?;
@@ -62,7 +62,7 @@ pub fn pack(shell: &Shell, dist: &Path) -> Result<()> {
     Ok(())
 }
 
-/// The package's own description. It asks for the oldest glibc that has every symbol the program uses.
+/// The package's own description. It requires the oldest glibc that has every symbol the program uses.
 fn control(shell: &Shell, root: &Path, program: &Path, architecture: &str) -> Result<String> {
     let symbols = cmd!(shell, "objdump -T {program}").quiet().read()?;
     let glibc = newest_glibc(&symbols).context("the program uses no versioned symbol of glibc")?;
@@ -78,7 +78,7 @@ fn control(shell: &Shell, root: &Path, program: &Path, architecture: &str) -> Re
     ))
 }
 
-/// Debian's machine-readable form. The Apache licence is on every Debian system; only its place is named.
+/// Debian's machine-readable form. The Apache licence is on every Debian system; only its location is named.
 fn copyright(mit: &str) -> String {
     let lines = mit.trim().lines().map(|line| format!(" {}", if line.is_empty() { "." } else { line }));
     let indented = lines.collect::<Vec<_>>().join("\n");

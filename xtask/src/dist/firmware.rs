@@ -38,22 +38,22 @@ pub fn pack(shell: &Shell, dist: &Path) -> Result<()> {
     Ok(())
 }
 
-/// The bytes that go to the start of the flash, as `dfu-util` wants them.
+/// The flash's contents from its start, in the form that `dfu-util` expects.
 fn flash_image(bytes: &[u8]) -> Result<Vec<u8>> {
     const FLASH_START: usize = 0x0800_0000;
-    /// The flash's size: nothing may lie behind it.
+    /// The flash's size: nothing may lie beyond it.
     const FLASH_LEN: usize = 1 << 20;
 
     let file = ElfFile32::<Endianness>::parse(bytes)?;
     let endian = file.endian();
     let mut image = Vec::new();
     for segment in file.elf_header().program_headers(endian, bytes)? {
-        let data = segment.data(endian, bytes).ok().context("a segment lies outside the ELF")?;
+        let data = segment.data(endian, bytes).ok().context("a segment is outside the ELF")?;
         if segment.p_type(endian) != elf::PT_LOAD || data.is_empty() {
             continue;
         }
         let start = (segment.p_paddr(endian) as usize).wrapping_sub(FLASH_START);
-        ensure!(start < FLASH_LEN, "a segment lies outside the flash");
+        ensure!(start < FLASH_LEN, "a segment is outside the flash");
         // Erased flash reads as ones.
         image.resize(image.len().max(start + data.len()), 0xFF);
         image[start..start + data.len()].copy_from_slice(data);

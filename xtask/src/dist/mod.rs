@@ -1,4 +1,5 @@
-//! `cargo xtask dist`: what a release has, in `target/dist`, named by what it is and its version.
+//! `cargo xtask dist`: builds a release's files in `target/dist`, each named by its content and
+//! version.
 
 mod archive;
 mod command;
@@ -10,10 +11,10 @@ use anyhow::Result;
 
 use crate::{python, workspace};
 
-/// What `cargo xtask dist` takes.
+/// The arguments of `cargo xtask dist`.
 #[derive(clap::Args)]
 pub struct Args {
-    /// What to make; everything without it.
+    /// What to make; everything if not given.
     what: Vec<What>,
 }
 
@@ -40,7 +41,7 @@ pub fn run(args: &Args) -> Result<()> {
     for what in if args.what.is_empty() { What::value_variants() } else { &args.what } {
         match what {
             What::Command => command::pack(&shell, &dist)?,
-            What::Deb if !cfg!(target_os = "linux") => println!("no Debian package: this is no Linux"),
+            What::Deb if !cfg!(target_os = "linux") => println!("no Debian package: this is not Linux"),
             What::Deb => deb::pack(&shell, &dist)?,
             What::Python => {
                 for file in python::dist(&shell)? {

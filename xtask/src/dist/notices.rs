@@ -1,4 +1,4 @@
-//! The licences of other people's crates that are in a program, which most of them ask to be handed on.
+//! The licences of other people's crates in a program, most of which require that their text is passed on.
 
 use std::collections::BTreeSet;
 use std::fmt::Write;
@@ -9,10 +9,10 @@ use xshell::{Shell, cmd};
 
 use crate::metadata::{Metadata, Package};
 
-/// Names that files with a licence or what belongs to it begin with.
+/// How the names of files begin that hold a licence or accompany one.
 const FILES: [&str; 5] = ["LICENSE", "LICENCE", "COPYING", "NOTICE", "UNLICENSE"];
 
-/// Writes each crate that `cargo tree` finds in a selection of packages, with the texts that lie beside its source.
+/// Writes each crate that `cargo tree` finds in a selection of packages, with the licence texts from its source.
 pub fn write(shell: &Shell, path: &Path, selection: &[&str]) -> Result<()> {
     // cargo's own placeholder for a package.
     let line = "{p}";
@@ -29,12 +29,12 @@ pub fn write(shell: &Shell, path: &Path, selection: &[&str]) -> Result<()> {
             count += 1;
         }
     }
-    ensure!(count > 0, "cargo tree names no crate of others");
+    ensure!(count > 0, "cargo tree names no crates of other people");
     shell.write_file(path, text)?;
     Ok(())
 }
 
-/// Of a line such as `clap v4.6.0 (proc-macro)`.
+/// The name and version in a line such as `clap v4.6.0 (proc-macro)`.
 fn name_and_version(line: &str) -> Option<(&str, &str)> {
     let mut words = line.split(' ');
     Some((words.next()?, words.next()?.strip_prefix('v')?))
@@ -44,11 +44,11 @@ fn add(shell: &Shell, text: &mut String, package: &Package) -> Result<()> {
     let licence = package.license.as_deref().unwrap_or("see below");
     let rule = "=".repeat(100);
     write!(text, "\n{rule}\n{} {}: {licence}\n", package.name, package.version)?;
-    // Under the MPL, whoever has the program may have the source.
+    // The MPL entitles anyone who has the program to the source.
     if let Some(repository) = &package.repository {
         writeln!(text, "{repository}")?;
     }
-    let directory = package.manifest_path.parent().context("a manifest lies in no directory")?;
+    let directory = package.manifest_path.parent().context("a manifest has no directory")?;
     for file in shell.read_dir(directory)? {
         let name = file.file_name().map(|name| name.to_string_lossy().to_uppercase()).unwrap_or_default();
         if file.is_file() && FILES.iter().any(|known| name.starts_with(known)) {

@@ -1,4 +1,4 @@
-//! What crosses a raw CAN socket: `struct can_frame` of Linux (`linux/can.h`), 16 bytes, and what it is here.
+//! What crosses a raw CAN socket, Linux's 16-byte `struct can_frame` (`linux/can.h`), and its meaning here.
 
 use cantap::TraceEvent;
 use cantap::wire::{Frame, Id};
@@ -9,7 +9,7 @@ pub type RawFrame = [u8; 16];
 
 const EXTENDED_FLAG: u32 = 0x8000_0000;
 const REMOTE_FLAG: u32 = 0x4000_0000;
-/// Places in a raw frame.
+/// Offsets in a raw frame.
 const LEN: usize = 4;
 const DLC_ABOVE_8: usize = 7;
 const DATA: usize = 8;
@@ -26,7 +26,7 @@ pub fn raw_frame(frame: &Frame) -> RawFrame {
     raw
 }
 
-/// An error, a state or a loss for programs; nothing for a frame.
+/// An error, a state or a loss for programs; `None` for a frame.
 pub fn raw_error(event: &TraceEvent) -> Option<RawFrame> {
     let ErrorFrame { classes, data } = ErrorFrame::of(event)?;
     let mut raw = raw(ERROR_FLAG | classes, data);
@@ -41,7 +41,7 @@ fn raw(id: u32, data: [u8; 8]) -> RawFrame {
     raw
 }
 
-/// A program's frame; nothing if it is none that a bus carries: an error frame, or one of more than eight bytes.
+/// A program's frame; `None` if no bus can carry it: an error frame, or one of more than eight bytes.
 pub fn frame_of(raw: &RawFrame) -> Option<Frame> {
     let [a, b, c, d, len, _, _, above_8, data @ ..] = *raw;
     let id = u32::from_ne_bytes([a, b, c, d]);
@@ -91,7 +91,7 @@ mod tests {
         }
     }
 
-    /// What programs write beyond the length, and where nothing belongs, goes nowhere.
+    /// Bytes that programs write beyond the length, and in unused places, are dropped.
     #[test]
     fn what_no_bus_carries_is_no_frame_and_bytes_beyond_the_length_are_left_out() {
         let beyond = bytes(0x123, [1, 9, 9, 9, 0x11, 9, 9, 9, 9, 9, 9, 9]);

@@ -1,4 +1,4 @@
-//! A CAN interface of Linux, by its raw socket: many frames with each system call.
+//! A Linux CAN interface, through a raw socket: many frames with each system call.
 
 use std::io::{self, IoSlice, IoSliceMut};
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd};
@@ -14,48 +14,49 @@ use socketcan::{CanSocket, Socket, SocketOptions};
 
 use super::frames::RawFrame;
 
-/// Frames of one system call.
+/// Frames per system call.
 pub const BATCH: usize = 64;
-/// So often a full socket is tried again, a millisecond apart.
+/// How often a full socket is retried, a millisecond apart.
 const TRIES: u32 = 200;
-/// Where the kernel tells of its network interfaces.
+/// Where the kernel describes its network interfaces.
 const NETWORK: &str = "/sys/class/net";
 /// ARPHRD_CAN of `linux/if_arp.h`.
 const TYPE_OF_CAN: &str = "280";
 /// Of `linux/if.h`.
 const IFF_UP: u32 = 1;
 const IFF_ECHO: u32 = 1 << 18;
-/// What controllers' interfaces queue (`linux/can/dev.h`'s users); virtual ones have none of their own, which the kernel makes 1000.
+/// The queue length of controllers' interfaces (users of `linux/can/dev.h`); virtual ones have no driver of their own to set it, and
+/// the kernel makes it 1000.
 const QUEUE_OF_CONTROLLERS: &str = "10";
 
-/// Where frames go to and come from. A trait, because no CAN socket can be had where tests run.
+/// Where frames go to and come from. It is a trait because there are no CAN sockets where the tests run.
 pub trait Port: Send + Sync {
-    /// Adds frames that programs have written, at most so many, without waiting. Returns how many the kernel has thrown away so far
-    /// because nobody took them.
+    /// Adds frames written by programs, up to a limit, without waiting. Returns how many the kernel has discarded so far because
+    /// nobody took them.
     fn receive(&self, most: usize, frames: &mut Vec<RawFrame>) -> io::Result<u32>;
-    /// Hands frames to programs. Returns how many were taken; an error if none was.
+    /// Passes frames to programs. Returns how many were taken; an error if none was.
     fn send(&self, frames: &[RawFrame]) -> io::Result<usize>;
-    /// What can be waited for.
+    /// A descriptor to wait on.
     fn as_fd(&self) -> Option<BorrowedFd<'_>>;
 }
 
-/// An interface that is open.
+/// An open interface.
 pub struct CanPort(CanSocket);
 
 /// What is known of an interface before it is opened.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Known {
-    /// Who sends on it is not shown its own frame by the kernel, so that a confirmation can be the echo.
+    /// The kernel does not show a sender its own frame, so a confirmation can serve as the echo.
     pub echoes: bool,
 }
 
 impl CanPort {
-    /// Opens an interface, which must be virtual, and up. The error says the line that makes it so.
+    /// Opens an interface, which must be virtual, and up. The error contains the command for that.
     pub fn open(name: &str) -> anyhow::Result<(Self, Known)> {
         let known = look(Path::new(NETWORK), name)?;
         let opened = || -> io::Result<CanSocket> {
             let socket = CanSocket::open(name)?;
-            // Errors of this interface would be our own.
+            // Errors on this interface would be our own.
             socket.set_error_filter_drop_all()?;
             socket.set_loopback(true)?;
             socket.set_recv_own_msgs(false)?;
@@ -69,7 +70,7 @@ impl CanPort {
     }
 }
 
-/// Whether an interface can be bridged, and how it echoes.
+/// Checks whether an interface can be bridged, and how it echoes.
 fn look(network: &Path, name: &str) -> anyhow::Result<Known> {
     let folder = network.join(name);
     let read = |file: &str| {
@@ -82,10 +83,10 @@ fn look(network: &Path, name: &str) -> anyhow::Result<Known> {
         );
     }
     if read("type") != TYPE_OF_CAN {
-        bail!("'{name}' is no CAN interface; as root: ip link add can0 type vcan && ip link set can0 up");
+        bail!("'{name}' is not a CAN interface; as root: ip link add can0 type vcan && ip link set can0 up");
     }
     let flags = u32::from_str_radix(read("flags").trim_start_matches("0x"), 16).unwrap_or(0);
-    // Ends of a vxcan pair name each other.
+    // The ends of a vxcan pair name each other.
     let is_pair = read("iflink") != read("ifindex");
     let is_virtual =
         folder.canonicalize().is_ok_and(|path| path.components().any(|part| part.as_os_str() == "virtual"));
@@ -99,8 +100,8 @@ fn look(network: &Path, name: &str) -> anyhow::Result<Known> {
     if flags & IFF_UP == 0 {
         bail!("the interface '{name}' is down; as root: ip link set {name} up");
     }
-    // vcan shows each frame to the other programs as it is written; so do pairs of newer kernels, which do not claim that their driver
-    // does.
+    // vcan shows each frame to the other programs as it is written; so do pairs in newer kernels, although the driver does not declare
+    // it.
     Ok(Known { echoes: is_pair && flags & IFF_ECHO != 0 })
 }
 
@@ -126,7 +127,7 @@ impl Port for CanPort {
                         }
                     }
                 }
-                // One that is down may come up again.
+                // An interface that is down may come up again.
                 Err(Errno::EAGAIN | Errno::EINTR | Errno::ENETDOWN) => {}
                 Err(error) => return Err(error.into()),
             }
@@ -177,7 +178,7 @@ impl Port for CanPort {
 mod tests {
     use super::*;
 
-    /// An interface as the kernel shows it.
+    /// An interface, as shown by the kernel.
     fn interface(network: &Path, place: &str, name: &str, files: [(&str, &str); 5]) {
         let folder = network.join("devices").join(place).join("net").join(name);
         std::fs::create_dir_all(&folder).unwrap();

@@ -1,4 +1,4 @@
-//! One channel and its interface: what both directions share.
+//! One channel and its interface: what both directions have in common.
 
 use std::collections::VecDeque;
 use std::io;
@@ -22,31 +22,31 @@ pub struct Lane {
     known: Known,
     /// Programs' frames that are on their way to the bus.
     own: Mutex<VecDeque<Frame>>,
-    /// Frames and errors that the interface did not take, and nobody was told of yet.
+    /// Frames and errors that the interface did not take, and that have not been reported.
     missing: Mutex<u32>,
-    /// It has been said that frames are not sent because the channel only listens.
+    /// The user has been told that frames are not sent because the channel only listens.
     told_refusal: AtomicBool,
     pub counts: Counts,
 }
 
-/// What went which way.
+/// Counts for both directions.
 #[derive(Default)]
 pub struct Counts {
-    /// Frames that programs were given.
+    /// Frames passed to programs.
     pub heard: AtomicU64,
     /// Programs' frames that were on the bus.
     pub sent: AtomicU64,
-    /// Programs' frames that were not, or of which nobody knows.
+    /// Programs' frames that were not, or whose fate is unknown.
     pub not_sent: AtomicU64,
     /// Frames that the interface did not take.
     pub undelivered: AtomicU64,
-    /// Frames that were lost before they came here, and whether it may have been more.
+    /// Frames lost before they came here, and whether there may have been more.
     pub lost: AtomicU64,
     pub lost_more: AtomicBool,
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Every holder leaves the state whole.
+    // Every holder leaves the state consistent.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -73,7 +73,7 @@ impl Lane {
         lock(&self.own).push_back(frame);
     }
 
-    /// It is not any more. Returns whether it was.
+    /// It has ended. Returns whether it was on its way.
     pub fn has_ended(&self, frame: &Frame) -> bool {
         let mut own = lock(&self.own);
         let at = own.iter().position(|own| own == frame);
@@ -85,12 +85,12 @@ impl Lane {
         add(&self.counts.sent, 1);
     }
 
-    /// Counts one that was not, which programs are told of otherwise.
+    /// Counts one that was not, of which programs are informed elsewhere.
     pub fn count_not_sent(&self) {
         add(&self.counts.not_sent, 1);
     }
 
-    /// Hands programs what was heard of this channel.
+    /// Passes this channel's records to programs.
     pub fn hear(&self, records: &[TraceRecord]) -> io::Result<()> {
         let number = channel_number(0, self.channel);
         let mut raw = Vec::new();
@@ -98,7 +98,7 @@ impl Lane {
             match &record.event {
                 TraceEvent::Frame { frame, direction, .. } => {
                     let Some(frame) = frame.classic() else { continue };
-                    // Where the kernel has shown it to the others already, once is enough.
+                    // If the kernel has already shown it to the others, once is enough.
                     if *direction == Direction::Tx && self.has_ended(frame) && !self.known.echoes {
                         continue;
                     }
@@ -108,7 +108,7 @@ impl Lane {
                     if let TraceEvent::Lost { count, at_least, .. } = event {
                         add(&self.counts.lost, *count as usize);
                         self.counts.lost_more.fetch_or(*at_least, Ordering::Relaxed);
-                        // A confirmation may be among what is lost, and what it was for is not waited for for ever.
+                        // A confirmation may be among the lost records; do not wait for it for ever.
                         lock(&self.own).clear();
                     }
                     raw.extend(raw_error(event));
@@ -118,14 +118,14 @@ impl Lane {
         self.deliver(raw)
     }
 
-    /// A program's frames are not sent, or nobody knows whether they were: it is told by an error frame for each.
+    /// A program's frames were not sent, or their fate is unknown: the program gets an error frame for each.
     pub fn refuse(&self, number: usize) -> io::Result<()> {
         add(&self.counts.not_sent, number);
         let failed = TraceEvent::TransmitFailed { tag: 0, reason: TransmitFailure::Aborted };
         self.deliver(vec![raw_error(&failed).unwrap_or_default(); number])
     }
 
-    /// The same, because the channel only listens, which is said once.
+    /// The same because the channel only listens, which is reported once.
     pub fn refuse_listening(&self, number: usize) -> io::Result<()> {
         if !self.told_refusal.swap(true, Ordering::Relaxed) {
             stderr::warn(&format!(
@@ -137,7 +137,7 @@ impl Lane {
         self.refuse(number)
     }
 
-    /// Counts frames that programs wrote and the kernel threw away before they were read.
+    /// Counts frames that programs wrote and the kernel discarded before they were read.
     pub fn overflowed(&self, number: u32) -> io::Result<()> {
         stderr::warn(&format!(
             "{} takes frames faster than its bus: {number} were not sent, because the socket was full",
@@ -148,8 +148,8 @@ impl Lane {
         self.deliver(vec![raw_error(&failed).unwrap_or_default()])
     }
 
-    /// Hands programs raw frames. What the interface does not take is counted, and told in place when it takes some again. An error if
-    /// the interface is gone.
+    /// Passes raw frames to programs. What the interface does not take is counted, and reported in place once it accepts frames again.
+    /// An error means that the interface is gone.
     fn deliver(&self, mut raw: Vec<RawFrame>) -> io::Result<()> {
         if raw.is_empty() {
             return Ok(());
@@ -191,7 +191,7 @@ impl Lane {
     }
 }
 
-/// Those of them that are frames of a bus, and no errors.
+/// The number of those that are bus frames rather than errors.
 fn count_frames(raw: &[RawFrame]) -> usize {
     raw.iter().filter(|raw| frame_of(raw).is_some()).count()
 }

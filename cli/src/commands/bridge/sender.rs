@@ -1,5 +1,5 @@
-//! The way from programs to the buses. It waits neither for what is heard nor for the other channel: a bus on which nothing leaves
-//! leaves its own frames in the interface's socket.
+//! The direction from programs to the buses. It waits neither for reception nor for the other channel: if nothing leaves on a bus,
+//! its frames stay in the interface's socket.
 
 use std::collections::HashMap;
 use std::io;
@@ -21,11 +21,11 @@ use super::interface::BATCH;
 use super::lane::Lane;
 use crate::{advice, stderr};
 
-/// How often to look for confirmations while frames are on their way.
+/// How often to check for confirmations while frames are on their way.
 const CONFIRM_EVERY: Duration = Duration::from_millis(2);
-/// A thread that waits for nothing follows a change within this many milliseconds.
+/// A thread that is not waiting for anything follows a change within this many milliseconds.
 const FOLLOWS_IN_MS: u32 = 500;
-/// How often to check whether to go on.
+/// How often to check whether to continue.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// The thread that sends.
@@ -37,11 +37,11 @@ pub struct Sender {
 struct Shared {
     /// The device, while it is there.
     device: Mutex<Option<Arc<OpenDevice>>>,
-    /// How often that has changed, and which change the thread has followed.
+    /// How often that has changed, and the last change followed by the thread.
     wanted: AtomicU32,
     followed: AtomicU32,
     quit: AtomicBool,
-    /// An interface is gone.
+    /// Set when an interface is gone.
     failed: Mutex<Option<String>>,
 }
 
@@ -74,7 +74,7 @@ impl Sender {
         Ok(Self { shared, thread: Some(thread) })
     }
 
-    /// A device is there, or none is. What programs wrote before is not sent; what they write when this returns is, unless the thread
+    /// Sets the device, or none. What programs wrote before is not sent; what they write after this returns is, unless the thread
     /// does not follow in time.
     pub fn use_device(&self, device: Option<Arc<OpenDevice>>) {
         *self.shared.device.lock().unwrap_or_else(PoisonError::into_inner) = device;
@@ -87,7 +87,7 @@ impl Sender {
         }
     }
 
-    /// Why it cannot go on, if it cannot.
+    /// Why it cannot continue, if so.
     pub fn failed(&self) -> Option<String> {
         self.shared.failed.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
@@ -106,9 +106,9 @@ impl Drop for Sender {
 struct Inlet<'l> {
     lane: &'l Lane,
     raw: Vec<RawFrame>,
-    /// What the kernel has thrown away by now.
+    /// Number of frames that the kernel has discarded so far.
     thrown_away: u32,
-    /// On their way, by tag.
+    /// Frames on their way, by tag.
     under_way: HashMap<u32, Frame>,
 }
 
@@ -117,11 +117,11 @@ impl<'l> Inlet<'l> {
         Self { lane, raw: Vec::new(), thrown_away: 0, under_way: HashMap::new() }
     }
 
-    /// Takes what is there, at most so much. Returns whether there was anything.
+    /// Takes what is there, up to a limit. Returns whether there was anything.
     fn receive(&mut self, most: usize) -> io::Result<bool> {
         self.raw.clear();
         let thrown_away = self.lane.port.receive(most.min(BATCH), &mut self.raw)?;
-        // The kernel tells the number with frames alone.
+        // The kernel reports the number only together with frames.
         if thrown_away > self.thrown_away {
             self.lane.overflowed(thrown_away - self.thrown_away)?;
             self.thrown_away = thrown_away;
@@ -129,7 +129,7 @@ impl<'l> Inlet<'l> {
         Ok(!self.raw.is_empty())
     }
 
-    /// Refuses what is there.
+    /// Refuses everything that is there.
     fn refuse_all(&mut self) -> io::Result<()> {
         while self.receive(BATCH)? {
             self.lane.refuse(self.raw.len())?;
@@ -137,7 +137,7 @@ impl<'l> Inlet<'l> {
         Ok(())
     }
 
-    /// Nobody knows what becomes of what is on its way.
+    /// The fate of the frames on their way is unknown.
     fn forget(&mut self) -> io::Result<()> {
         let under_way = std::mem::take(&mut self.under_way);
         for frame in under_way.values() {
@@ -147,13 +147,13 @@ impl<'l> Inlet<'l> {
     }
 }
 
-/// The thread's body. An error is an interface that is gone.
+/// The thread's body. An error means that an interface is gone.
 fn run(shared: &Shared, lanes: &[Lane]) -> io::Result<()> {
     let mut inlets: Vec<Inlet<'_>> = lanes.iter().map(Inlet::new).collect();
     while !shared.quit.load(Ordering::Relaxed) {
         let wanted = shared.wanted.load(Ordering::Relaxed);
         let current = shared.device();
-        // What was written while there was no device, or another one, was meant for then.
+        // What was written while there was no device, or another one, was meant for that time.
         if current.is_none() || shared.followed.load(Ordering::Relaxed) != wanted {
             for inlet in &mut inlets {
                 inlet.refuse_all()?;
@@ -171,7 +171,7 @@ fn run(shared: &Shared, lanes: &[Lane]) -> io::Result<()> {
         match ended {
             Ok(()) => {}
             Err(Ended::Interface(error)) => return Err(error),
-            // The stream of records tells.
+            // The stream of records reports it.
             Err(Ended::Device(error)) if error.is_of_the_connection() => {
                 let mut current = shared.device.lock().unwrap_or_else(PoisonError::into_inner);
                 if current.as_ref().is_some_and(|current| Arc::ptr_eq(current, &device)) {
@@ -180,7 +180,7 @@ fn run(shared: &Shared, lanes: &[Lane]) -> io::Result<()> {
             }
             Err(Ended::Device(error)) => {
                 stderr::warn(&format!(
-                    "frames of programs were not sent, or nobody knows: {}",
+                    "programs' frames were not sent, or it is unknown whether they were: {}",
                     advice::sentence(&error.into())
                 ));
             }
@@ -207,7 +207,7 @@ impl From<io::Error> for Ended {
     }
 }
 
-/// Sends to a device until it is another's turn.
+/// Sends to a device until it is replaced.
 fn session(shared: &Shared, device: &Arc<OpenDevice>, inlets: &mut [Inlet<'_>]) -> Result<(), Ended> {
     let room = usize::from(device.hello().tx_queue).max(1);
     let mut stream = Stream::new(device);
@@ -231,7 +231,7 @@ fn session(shared: &Shared, device: &Arc<OpenDevice>, inlets: &mut [Inlet<'_>]) 
             if end.result.is_ok() {
                 inlet.lane.count_sent();
             } else {
-                // Programs are told by the record.
+                // The record informs the programs.
                 inlet.lane.has_ended(&frame);
                 inlet.lane.count_not_sent();
             }
@@ -262,9 +262,9 @@ fn take(inlet: &mut Inlet<'_>, device: &Device, stream: &mut Stream<'_>) -> Resu
             refused += 1;
             continue;
         };
-        // Before it can be confirmed.
+        // This must come before it can be confirmed.
         lane.sends(frame);
-        // There is room: it does not wait.
+        // There is room, so it does not wait.
         match stream.push(lane.channel, frame, None, |_| true)? {
             Some(tag) => drop(inlet.under_way.insert(tag, frame)),
             None => refused += 1,
@@ -273,7 +273,7 @@ fn take(inlet: &mut Inlet<'_>, device: &Device, stream: &mut Stream<'_>) -> Resu
     Ok(lane.refuse(refused)?)
 }
 
-/// Waits until a program has written, at most so long.
+/// Waits until a program has written, at most this long.
 fn wait_for<'i, 'l: 'i>(inlets: impl Iterator<Item = &'i Inlet<'l>>, timeout: Duration) {
     let sockets: Vec<BorrowedFd<'_>> = inlets.filter_map(|inlet| inlet.lane.port.as_fd()).collect();
     let mut waiting: Vec<PollFd<'_>> =

@@ -1,5 +1,5 @@
-//! Both directions over a virtual device, with an interface that is memory: no CAN socket can be had where tests run. The kernel's own
-//! are in `sim/kernel/guest/parts/bridge.sh`.
+//! Both directions over a virtual device, with an interface in memory: there are no CAN sockets where the tests run. The kernel's own
+//! are tested in `sim/kernel/guest/parts/bridge.sh`.
 
 use std::collections::VecDeque;
 use std::io;
@@ -29,7 +29,7 @@ struct Memory {
     /// To programs.
     told: Mutex<Vec<RawFrame>>,
     is_full: AtomicBool,
-    /// It takes this many at once, if not all.
+    /// The number of frames that it takes at once, if limited.
     takes: Option<usize>,
     thrown_away: AtomicU32,
 }
@@ -61,7 +61,7 @@ impl Memory {
         self.written.lock().unwrap().push_back(raw_frame(&frame.parse().unwrap()));
     }
 
-    /// Frames as text, errors as what they say.
+    /// Frames as text, and errors as their meaning.
     fn told(&self) -> Vec<String> {
         let told = self.told.lock().unwrap();
         let text = |raw: &RawFrame| {
@@ -108,7 +108,7 @@ impl Bridged {
         Self { records: device.records(), device, lanes, memories, sender }
     }
 
-    /// Carries what is heard until something holds.
+    /// Passes records on until a condition holds.
     fn until(&mut self, what: &str, mut holds: impl FnMut(&[Arc<Memory>; 2]) -> bool) {
         let deadline = Instant::now() + Duration::from_secs(10);
         while !holds(&self.memories) {
@@ -140,7 +140,7 @@ fn programs_hear_both_buses_and_errors_as_error_frames() {
             told.len() > 200 && told.iter().any(|text| text.starts_with("BusError"))
         })
     });
-    // They come as the bus had them, and nothing twice: what the lanes were given is what programs have.
+    // They come as the bus had them, and nothing twice: programs have exactly what the lanes got.
     let heard: u64 = bridged.lanes.iter().map(|lane| lane.counts.heard.load(Ordering::Relaxed)).sum();
     let frames =
         bridged.memories.iter().flat_map(|memory| memory.told()).filter(|text| text.contains('#')).count();
@@ -160,7 +160,7 @@ fn what_programs_write_is_sent_in_order_on_both_channels_and_not_shown_twice() {
         lanes.iter().all(|lane| lane.counts.sent.load(Ordering::Relaxed) == u64::from(FRAMES))
     });
     assert_eq!(bridged.sent(), [FRAMES; 2]);
-    // Another's frame, through the same device, is told.
+    // Another sender's frame, through the same device, is passed on.
     let frame = TxFrame { tag: 1 << 30, frame: "321#99".parse().unwrap(), at_ticks: None };
     bridged.device.send(Channel::Can1, &[frame]).unwrap();
     bridged.until("the other's frame", |memories| !memories[0].told().is_empty());
@@ -168,7 +168,7 @@ fn what_programs_write_is_sent_in_order_on_both_channels_and_not_shown_twice() {
     assert!(bridged.memories[1].told().is_empty());
 }
 
-/// Where the kernel does not show a written frame to anybody, its confirmation does, in its place among what is heard.
+/// If the kernel shows a written frame to nobody, its confirmation does, in its place among the received frames.
 #[test]
 fn confirmations_are_the_echo_where_the_kernel_makes_none() {
     let mut bridged = Bridged::new("load=0", Mode::Normal, true);
@@ -190,7 +190,7 @@ fn a_channel_that_only_listens_sends_nothing_and_programs_are_told_of_each_frame
     assert_eq!(bridged.sent(), [0, 0]);
 }
 
-/// What was written while the device was away was meant for then.
+/// Frames written while the device was away were meant for that time.
 #[test]
 fn frames_written_without_a_device_are_refused_and_never_sent_later() {
     let mut bridged = Bridged::new("load=0", Mode::Normal, false);
@@ -210,7 +210,7 @@ fn frames_written_without_a_device_are_refused_and_never_sent_later() {
 #[test]
 fn a_bus_on_which_nothing_leaves_does_not_hold_up_the_other() {
     let mut bridged = Bridged::new("load=0", Mode::Normal, false);
-    // Channel 2's queue is full of what is due in an hour.
+    // Channel 2's queue is full of frames that are due in an hour.
     let due = bridged.device.time().unwrap() + u64::from(bridged.device.hello().tick_hz) * 3600;
     let room = u32::from(bridged.device.hello().tx_queue);
     for tag in 0..room {
@@ -222,7 +222,7 @@ fn a_bus_on_which_nothing_leaves_does_not_hold_up_the_other() {
     }
     let lanes = Arc::clone(&bridged.lanes);
     bridged.until("the first channel's are sent", |_| lanes[0].counts.sent.load(Ordering::Relaxed) == 500);
-    // On the full one a frame is refused by the device, and its program is told.
+    // On the full one, the device refuses a frame, and its program is informed.
     bridged.memories[1].write("222#");
     bridged.until("the refusal", |memories| memories[1].told().contains(&not_sent()));
 }
@@ -249,7 +249,7 @@ fn what_an_interface_does_not_take_is_counted_and_told_in_place() {
     assert_eq!(lane.counts.undelivered.load(Ordering::Relaxed), 3);
 }
 
-/// Of what was heard, whatever programs were not given is counted: by the interface, or lost before.
+/// Of the received frames, those not passed to programs are counted: at the interface, or as lost before.
 #[test]
 fn frames_heard_and_frames_counted_are_all_there_were() {
     let memory = Arc::new(Memory { takes: Some(3), ..Memory::default() });
@@ -263,7 +263,7 @@ fn frames_heard_and_frames_counted_are_all_there_were() {
             .map(|count| count.load(Ordering::Relaxed))
     };
     assert_eq!(counts(), [2, 10, 2]);
-    // What was not taken, the error among it, is told first.
+    // What was not taken, including the error, is reported first.
     lane.hear(&[heard("105#")]).unwrap();
     let told = TraceEvent::Lost { stage: Some(LossStage::Host), count: 3, at_least: false };
     assert_eq!(memory.told()[3..], [format!("{told:?}"), "105#".to_owned()]);

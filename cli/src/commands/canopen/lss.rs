@@ -14,14 +14,14 @@ use crate::wrong::wrong;
 /// The command line.
 #[derive(clap::Args)]
 pub(super) struct LssArgs {
-    /// The node's identity (object 1018) in hexadecimal, where it is known: vendor, product, revision, serial number, as
-    /// 29C:1:10002:4D2. Without it, a node that has no number is looked for.
+    /// The node's identity (object 1018) in hexadecimal, if known: vendor, product, revision, serial number, as
+    /// 29C:1:10002:4D2. Without it, a node without a number is searched for.
     #[arg(long, value_name = "VENDOR:PRODUCT:REVISION:SERIAL", value_parser = address)]
     identity: Option<LssAddress>,
     /// Give it this number, 1 to 127.
     #[arg(long, value_name = "NODE", value_parser = clap::value_parser!(u8).range(1..=127))]
     node: Option<u8>,
-    /// Give it this bit rate; it takes it after a restart.
+    /// Give it this bit rate, which takes effect after a restart.
     #[arg(long, value_name = "RATE", value_parser = args::bitrate)]
     node_bitrate: Option<u32>,
     /// Have it keep both over a restart.
@@ -37,7 +37,7 @@ fn address(text: &str) -> Result<LssAddress, String> {
     }
 }
 
-/// Finds a node, and gives it what was asked for.
+/// Finds a node, and configures it as requested.
 pub(super) fn run(speak: &SpeakArgs, args: &LssArgs, timeout_ns: u64) -> anyhow::Result<()> {
     let index = args
         .node_bitrate
@@ -48,7 +48,7 @@ pub(super) fn run(speak: &SpeakArgs, args: &LssArgs, timeout_ns: u64) -> anyhow:
         .transpose()?;
     let device = speak.open()?;
     let mut speaking = speak.speak(&device, Box::new(CanOpen::new(Vec::new())));
-    // Nobody else may listen to the orders.
+    // No other node may take the orders.
     order(&mut speaking, LssOrder::SwitchAll(false), timeout_ns)?;
     let found = match args.identity {
         Some(address) => {
@@ -69,7 +69,7 @@ pub(super) fn run(speak: &SpeakArgs, args: &LssArgs, timeout_ns: u64) -> anyhow:
             break;
         }
     }
-    // Whatever became of it, the node is not left waiting for orders.
+    // Whatever happened, the node must not stay in configuration mode.
     order(&mut speaking, LssOrder::SwitchAll(false), timeout_ns)?;
     given?;
     let LssAddress { vendor, product, revision, serial } = found;

@@ -21,10 +21,10 @@ struct Place {
     /// The object's index in hexadecimal, as 1018.
     #[arg(value_parser = index)]
     index: u16,
-    /// By block transfer: up to 127 frames for one answer. Not every node has it.
+    /// By block transfer: up to 127 frames for one answer. Not every node supports it.
     #[arg(long)]
     block: bool,
-    /// The identifiers of the SDO channel where they are not the node's usual ones: the request's and the answer's, as 605:585.
+    /// The identifiers of the SDO channel, if not the node's usual ones: the request's and the answer's, as 605:585.
     #[arg(long, value_name = "ID:ID")]
     sdo: Option<Pair>,
 }
@@ -50,10 +50,10 @@ pub(super) struct WriteObject {
     /// Its sub-index in hexadecimal.
     #[arg(value_parser = sub)]
     sub: u8,
-    /// The value, as its type has it: 1500, 0x5DC, -3, 1.5, a text; @FILE for a file's bytes.
+    /// The value, as its type requires: 1500, 0x5DC, -3, 1.5, a text; @FILE for a file's bytes.
     #[arg(allow_hyphen_values = true)]
     value: String,
-    /// Its type, where no sheet tells it: bool, u8 to u64, i8 to i64, f32, f64, text, utf16, hex.
+    /// Its type, if no sheet gives it: bool, u8 to u64, i8 to i64, f32, f64, text, utf16, hex.
     #[arg(long = "type", value_name = "TYPE")]
     data_type: Option<String>,
 }
@@ -74,7 +74,7 @@ impl Place {
             .map_or_else(|| SdoIds::of(self.node), |pair| SdoIds { request: pair.a.id, response: pair.b.id })
     }
 
-    /// Reads the conversation, on whatever identifiers it is.
+    /// Reads the conversation, whatever its identifiers.
     fn witness(&self, sheets: Vec<Sheet>) -> Box<dyn Assembler> {
         let witness = Box::new(CanOpen::new(sheets));
         match self.sdo {
@@ -152,7 +152,7 @@ pub(super) fn read(
     timeout_ns: u64,
     sheets: Vec<Sheet>,
 ) -> anyhow::Result<()> {
-    // Made first: an object that cannot be kept need not be read.
+    // Create this first: if the object cannot be stored, it need not be read.
     let output = args.output.as_ref().map(|path| {
         let file = std::fs::File::create_new(path);
         file.with_context(|| format!("cannot write {}; nothing there is overwritten", path.display()))
@@ -162,7 +162,7 @@ pub(super) fn read(
     let mut speaking = speak.speak(&device, args.place.witness(sheets));
     let read = args.place.transfer(&mut speaking, args.sub, SdoJob::Read, timeout_ns);
     if let (Err(_), Some(path)) = (&read, &args.output) {
-        // It is empty, and was not there before.
+        // It is empty, and did not exist before.
         let _ = std::fs::remove_file(path);
     }
     let data = read?;
@@ -181,7 +181,7 @@ pub(super) fn write(
     timeout_ns: u64,
     sheets: Vec<Sheet>,
 ) -> anyhow::Result<()> {
-    // Everything that can be wrong is found before anything is sent.
+    // Everything is checked before anything is sent.
     let data = args.bytes(&sheets)?;
     let device = speak.open()?;
     let mut speaking = speak.speak(&device, args.place.witness(sheets));

@@ -1,4 +1,4 @@
-//! Which nodes there are.
+//! Finds the nodes that exist.
 
 use std::io::Write as _;
 
@@ -16,7 +16,7 @@ pub(super) struct ScanArgs {
     /// Only these nodes: 1 to 127, as 5 or 1-20.
     #[arg(value_name = "NODES", default_value = "1-127", value_parser = nodes)]
     nodes: (u8, u8),
-    /// Ask nobody: only hear heartbeats, for this long.
+    /// Send nothing: only listen to heartbeats, for this long.
     #[arg(long, value_name = "TIME", value_parser = args::positive_duration)]
     listen: Option<std::time::Duration>,
 }
@@ -29,7 +29,7 @@ fn nodes(text: &str) -> Result<(u8, u8), String> {
     }
 }
 
-/// Objects that say who a node is: its name in JSON, index, sub-index.
+/// Objects that identify a node: its name in JSON, index, sub-index.
 const IDENTITY: [(&str, u16, u8); 5] = [
     ("vendor_id", 0x1018, 1),
     ("product_code", 0x1018, 2),
@@ -38,7 +38,7 @@ const IDENTITY: [(&str, u16, u8); 5] = [
     ("name", 0x1008, 0),
 ];
 
-/// Scans, asks those that answer who they are, and shows them.
+/// Scans, asks the nodes that answer for their identity, and shows them.
 pub(super) fn run(
     speak: &SpeakArgs,
     args: &ScanArgs,
@@ -85,7 +85,7 @@ fn describe(speaking: &mut Speaking<'_>, node: FoundNode, wait_ns: u64) -> anyho
         if node.answers {
             let mut client = SdoClient::new(SdoIds::of(node.node), index, sub, SdoJob::Read, false, wait_ns);
             speaking.run(&mut client)?;
-            // What a node does not have it need not tell.
+            // A node need not answer for an object that it does not have.
             if let Ok(data) = client.finish() {
                 value = match <[u8; 4]>::try_from(&data[..]) {
                     Ok(word) if index == 0x1018 => u32::from_le_bytes(word).into(),

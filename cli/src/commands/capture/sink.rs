@@ -16,14 +16,14 @@ pub struct Sink {
     name: String,
     to_stdout: bool,
     pub trigger: Option<Trigger>,
-    /// Channels, by number, that were opened to leave data out.
+    /// Channels, by number, that were opened without data.
     pub omits_data: Vec<u8>,
-    /// Frames written whose data is not known.
+    /// Frames written without their data being known.
     without_data: u64,
 }
 
 impl Sink {
-    /// Of records that this trigger lets pass, if there is one. Nothing is written yet.
+    /// For the records that this trigger passes, if there is one. Nothing is written yet.
     pub fn new(trigger: Option<Trigger>) -> Self {
         Self {
             writer: None,
@@ -46,7 +46,7 @@ impl Sink {
         Ok(())
     }
 
-    /// Writes a record, if the trigger does not hold it back. Returns whether anybody still reads.
+    /// Writes a record, unless the trigger holds it back. Returns whether anybody still reads.
     pub fn write(&mut self, record: &TraceRecord) -> anyhow::Result<bool> {
         let Self { writer, omits_data, without_data, .. } = self;
         let mut write = |record: &TraceRecord| {
@@ -61,7 +61,7 @@ impl Sink {
         self.judge(result)
     }
 
-    /// Writes what waits in memory. Returns whether anybody still reads.
+    /// Writes what is waiting in memory. Returns whether anybody still reads.
     pub fn flush(&mut self) -> anyhow::Result<bool> {
         let result = self.writer.as_mut().map_or(Ok(()), |writer| writer.flush());
         self.judge(result)
@@ -75,7 +75,7 @@ impl Sink {
                 Ok(false)
             }
             Err(error) => {
-                // Nothing more can be written; what was is complete to the last whole record.
+                // Nothing more can be written; the file is valid up to the last whole record.
                 self.writer = None;
                 Err(error).with_context(|| self.failure())
             }
@@ -89,7 +89,7 @@ impl Sink {
         )
     }
 
-    /// Ends the file, and says what it could not carry.
+    /// Ends the file, and reports what it could not carry.
     pub fn finish(mut self) -> anyhow::Result<()> {
         let Some(writer) = self.writer.take() else { return Ok(()) };
         match writer.finish() {

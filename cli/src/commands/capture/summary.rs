@@ -1,4 +1,4 @@
-//! What a capture says of itself at its end: one object for scripts, lines for people.
+//! The summary at the end of a capture: one object for scripts, lines for people.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -18,9 +18,9 @@ pub struct ChannelSummary {
     pub channel: u8,
     pub frames: u64,
     lost: u64,
-    /// Reported and suppressed ones, whatever the filters.
+    /// Those reported and those suppressed, whatever the filters.
     pub bus_errors: u64,
-    /// `null` where the device left out what it takes to know it, as the next one.
+    /// `null` if the device left out what is needed for it, like the next one.
     frames_per_s: Option<f64>,
     bus_load_pct: Option<f64>,
 }
@@ -32,15 +32,15 @@ pub struct Summary {
     pub channels: Vec<ChannelSummary>,
     lost: Losses,
     clock_drift_ppm: Option<f64>,
-    /// If there are several.
+    /// If there are several devices.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     devices: Vec<DeviceSummary>,
-    /// If there were any.
+    /// If there were any gaps.
     #[serde(skip_serializing_if = "Option::is_none")]
     gaps: Option<GapSummary>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub trigger: Option<TriggerSummary>,
-    /// After a failure: how many of the frames the file has.
+    /// After a failure: the number of frames in the file.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub frames_in_file: Option<u64>,
 }
@@ -53,24 +53,24 @@ struct DeviceSummary {
     clock_drift_ppm: Option<f64>,
     /// Whether its times are on the first device's clock by USB frames.
     by_usb_frames: bool,
-    /// Why not.
+    /// If not, the reason.
     no_usb_frames_because: Option<String>,
-    /// From when on, in seconds since the Unix epoch.
+    /// Since when, in seconds since the Unix epoch.
     by_usb_frames_since_s: Option<f64>,
-    /// How far its own round trips had put its times off by then.
+    /// The error of the times from its own round trips that was corrected.
     moved_us: f64,
-    /// How far off the first device's its times may be without USB frames.
+    /// The uncertainty of its times relative to the first device's, without USB frames.
     uncertainty_us: Option<f64>,
 }
 
-/// Times in which the device was not there. The frames of that time are in no count.
+/// Times in which the device was not there. Frames of those times are not counted.
 #[derive(serde::Serialize)]
 struct GapSummary {
     count: u32,
     seconds: f64,
 }
 
-/// What a trigger did.
+/// What a trigger has done.
 #[derive(serde::Serialize)]
 pub struct TriggerSummary {
     events: u64,
@@ -79,7 +79,7 @@ pub struct TriggerSummary {
 }
 
 impl TriggerSummary {
-    /// As far as it came.
+    /// The counts so far.
     pub fn of(trigger: &Trigger) -> Self {
         let TriggerCounts { events, kept, forgotten } = trigger.counts();
         Self { events, kept, forgotten }
@@ -87,7 +87,7 @@ impl TriggerSummary {
 }
 
 impl Summary {
-    /// Of what these devices heard in this many seconds, by channel; neither a trigger nor a file is known of yet.
+    /// For what these devices received in this many seconds, by channel; without a trigger or file so far.
     pub fn of(seconds: f64, channels: Vec<ChannelSummary>, live: &LiveRecords, boards: &Boards) -> Self {
         let gaps = live.lines().lines().map(Line::gaps);
         let gaps = gaps.fold(Gaps::default(), |sum, gaps| Gaps {
@@ -133,7 +133,7 @@ impl Summary {
         eprintln!("lost: {}", self.lost.line());
         if let Some(GapSummary { count, seconds }) = &self.gaps {
             eprintln!(
-                "gaps: {count}, {seconds} s in which the device was not there: what was on the bus then nobody counted"
+                "gaps: {count}, {seconds} s in which the device was not there: frames on the bus at that time were not counted"
             );
         }
         if let Some(ppm) = self.clock_drift_ppm {
@@ -151,7 +151,7 @@ fn drift_ppm(line: &Line) -> Option<f64> {
     line.clock().drift_ppm.map(|ppm| rounded(ppm, 2))
 }
 
-/// What is known of several devices' clocks; nothing of one, which is its own.
+/// What is known of several devices' clocks; empty for a single one, which has the only clock.
 fn devices(live: &LiveRecords, boards: &Boards) -> Vec<DeviceSummary> {
     if live.addresses().len() < 2 {
         return Vec::new();
@@ -178,7 +178,7 @@ fn devices(live: &LiveRecords, boards: &Boards) -> Vec<DeviceSummary> {
 }
 
 impl DeviceSummary {
-    /// How well its times are on the first device's clock, for people.
+    /// How well its times match the first device's clock, for people.
     fn line(&self) -> String {
         let Self { device, moved_us, uncertainty_us, .. } = self;
         let channels: Vec<String> = self.channels.iter().map(u8::to_string).collect();
@@ -199,7 +199,7 @@ impl DeviceSummary {
 }
 
 impl ChannelSummary {
-    /// Of a channel with this number.
+    /// For the channel with this number.
     pub fn of(channel: u8, meter: &Meter) -> Self {
         Self {
             channel,
@@ -211,7 +211,7 @@ impl ChannelSummary {
         }
     }
 
-    /// One line, without what is not known.
+    /// One line, leaving out what is unknown.
     fn line(&self) -> String {
         let Self { channel, frames, lost, bus_errors, frames_per_s, bus_load_pct } = self;
         let rate = frames_per_s.map_or_else(String::new, |rate| format!(", {rate} frames/s"));

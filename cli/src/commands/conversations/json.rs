@@ -8,7 +8,7 @@ use crate::commands::decode::Seconds;
 
 /// Writes the object.
 pub(super) fn write(out: &mut impl Write, event: &Event) -> io::Result<()> {
-    // Written by hand, as decode's, for times that keep every digit.
+    // Written by hand, as in decode, so that times keep every digit.
     write!(
         out,
         "{{\"time_s\":{},\"start_s\":{},\"channel\":{},\"protocol\":\"{}\",\"kind\":\"{}\"",
@@ -59,7 +59,7 @@ pub(super) fn write(out: &mut impl Write, event: &Event) -> io::Result<()> {
     out.write_all(b"}\n")
 }
 
-/// Members of an object; the second and later ones of a name have its number behind them: `did`, `did_2`.
+/// Members of an object; the second and later ones with the same name have a number appended: `did`, `did_2`.
 fn members<W: Write>(
     out: &mut W,
     fields: &[Field],

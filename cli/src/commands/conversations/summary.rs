@@ -1,4 +1,4 @@
-//! What there was, in a few lines on standard error.
+//! A summary in a few lines on standard error.
 
 use std::collections::BTreeMap;
 
@@ -11,7 +11,7 @@ pub(super) struct Summary {
     frames: u64,
     lost: u64,
     gaps: u64,
-    /// Of each protocol: events, and those in which something went wrong.
+    /// For each protocol: events, and those in which something went wrong.
     events: BTreeMap<Protocol, (u64, u64)>,
 }
 

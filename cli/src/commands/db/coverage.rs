@@ -1,4 +1,4 @@
-//! How databases suit a trace.
+//! How databases match a trace.
 
 use std::collections::HashMap;
 use std::io::Write;
@@ -10,10 +10,10 @@ use serde_json::json;
 use crate::input::Records;
 use crate::words::counted;
 
-/// A cycle counts as another one than the database says if it differs by more than this share.
+/// A cycle differs from the database's if it deviates by more than this fraction.
 const TOLERANCE: f64 = 0.1;
 
-/// An identifier of the trace.
+/// An identifier in the trace.
 struct Heard {
     channel: u8,
     id: String,

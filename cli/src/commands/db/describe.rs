@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use crate::words::counted;
 
-/// Shows the messages that were asked for.
+/// Shows the requested messages.
 pub fn run(
     messages: &[String],
     json: bool,
@@ -35,7 +35,7 @@ pub fn run(
     })
 }
 
-/// A message that is asked for, by identifier or name.
+/// A requested message, by identifier or name.
 struct Wanted {
     text: String,
     selection: Selection,
@@ -112,7 +112,7 @@ fn comment(text: &str, indent: &str, out: &mut impl Write) -> anyhow::Result<()>
     Ok(())
 }
 
-/// `Page is 1 or 3 to 5`, if the signal is not always there.
+/// `Page is 1 or 3 to 5`, if the signal is not always present.
 fn condition(message: &Message, signal: &Signal) -> Option<String> {
     let multiplexed = signal.multiplexed.as_ref()?;
     let switch = message.signals.get(multiplexed.switch)?;

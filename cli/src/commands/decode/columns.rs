@@ -1,4 +1,4 @@
-//! For engines: Parquet files.
+//! Parquet files, for engines.
 
 use std::collections::{HashMap, HashSet};
 use std::fs;
@@ -47,7 +47,7 @@ impl Long {
     }
 }
 
-/// A file for each message, and one for what happened beside frames.
+/// A file for each message, and one for events other than frames.
 pub struct PerMessage {
     folder: PathBuf,
     files: HashMap<MessageRef, ParquetFile<MessageColumns>>,
@@ -55,7 +55,7 @@ pub struct PerMessage {
     events: Option<ParquetFile<FrameColumns>>,
 }
 
-/// The file of what happened beside frames.
+/// The file for events other than frames.
 const EVENTS: &str = "events";
 
 impl PerMessage {
@@ -70,7 +70,7 @@ impl PerMessage {
         if !self.files.contains_key(reference) {
             let fit = |c: char| if c.is_alphanumeric() || "-_ ".contains(c) { c } else { '_' };
             let mut name: String = message.name.chars().map(fit).collect();
-            // File systems differ in whether the case of letters counts.
+            // Some file systems ignore the case of letters.
             while !self.names.insert(name.to_lowercase()) {
                 name = format!("{name}-{}", message.id);
             }

@@ -1,4 +1,4 @@
-//! What can be asked of `cantap decode`.
+//! The options of `cantap decode`.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -24,7 +24,7 @@ use crate::protocols::ProtocolArgs;
     cantap decode --db car.dbc -d /dev/ttyACM0 -b 500k\n  \
     cantap decode workshop.log --protocols --csv\n\n\
 JSON lines are {\"time_s\", \"channel\", \"id\", \"message\", \"signals\": {NAME: NUMBER}}:\nseconds, channel from 1, \
-    identifier in hexadecimal (3 or 8 digits),\nphysical values (null where there is none: a float that is no number, or J1939's error or not available).\n\
+    identifier in hexadecimal (3 or 8 digits),\nphysical values (null where there is none: a float that is not a number, or J1939's error or not available).\n\
 With --details each signal is {\"value\", \"unit\", \"text\", \"raw\"}, without those that it does not have.\n\
 With --protocols, what was said has also protocol, from and to.\n\
 The last line is {\"summary\"}: how much there was, was decoded, and could not be read.")]
@@ -40,15 +40,15 @@ pub struct Args {
     /// repeated.
     #[arg(short, long = "signal", value_name = "PATTERN", value_delimiter = ',', add = completion::signals())]
     pub signals: Vec<String>,
-    /// Also what frames say together, by the protocols that each channel shows: its fields as signals, named uds.sid, j1939.pgn
-    /// and so on (docs/protocols.md). Tables with a column per signal have its numbers; Parquet with a row per value has no
-    /// place for it.
+    /// Also what frames say together, by the protocols found on each channel: their fields as signals, named uds.sid, j1939.pgn
+    /// and so on (docs/protocols.md). Tables with a column per signal contain the numbers; Parquet with a row per value has no
+    /// place for them.
     #[arg(long)]
     pub protocols: bool,
     #[command(flatten)]
     pub protocol: ProtocolArgs,
-    /// Write to this file instead of standard output. Its name may say the form: .csv, .json, or .parquet, a table for DuckDB,
-    /// Polars, pandas and Spark with a row per value, and one per loss or bus error.
+    /// Write to this file instead of standard output. Its name may select the form: .csv, .json, or .parquet, a table for
+    /// DuckDB, Polars, pandas and Spark with a row per value, and one per loss or bus error.
     #[arg(short, long, value_name = "FILE")]
     pub output: Option<PathBuf>,
     /// One line of CSV per signal.
@@ -61,23 +61,23 @@ pub struct Args {
     /// frames were lost. Written at the end of the trace.
     #[arg(long, value_name = "TIME", value_parser = args::positive_duration)]
     pub resample: Option<Duration>,
-    /// Make FILE a folder with a Parquet file for each message, which has a column per signal, and one for losses and bus errors.
+    /// Make FILE a folder with a Parquet file for each message, with a column per signal, and one for losses and bus errors.
     #[cfg(feature = "parquet")]
     #[arg(long, requires = "output", conflicts_with_all = ["csv", "json", "wide", "resample"])]
     pub per_message: bool,
-    /// Make FILE a folder of Parquet files, in folders named by these in this order: day, channel, or NAME=VALUE. Engines read it
-    /// as one table. Files are called as IN: decoding it again replaces them.
+    /// Make FILE a folder of Parquet files, in folders named after these, in this order: day, channel, or NAME=VALUE. Engines
+    /// read it as one table. The files are named after IN: decoding it again replaces them.
     #[cfg(feature = "parquet")]
     #[arg(long, value_name = "KEY", value_delimiter = ',', requires = "output")]
     #[arg(conflicts_with_all = ["csv", "json", "wide", "resample", "per_message"])]
     pub partition: Vec<Key>,
-    /// Print one JSON object per message, and behind them one with the summary.
+    /// Print one JSON object per message, followed by one with the summary.
     #[arg(long)]
     pub json: bool,
-    /// Unit, text and raw value of each signal too.
+    /// Also unit, text and raw value of each signal.
     #[arg(long, requires = "json")]
     pub details: bool,
-    /// Leave out what is wrong with databases that can be used, and which of them replaces another.
+    /// Do not report what is wrong with usable databases, and which of them replaces another.
     #[arg(short, long)]
     pub quiet: bool,
     #[command(flatten)]

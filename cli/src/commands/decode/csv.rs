@@ -30,7 +30,7 @@ pub fn write(out: &mut impl Write, decoded: &Decoded) -> io::Result<()> {
     Ok(())
 }
 
-/// Quotes what a comma, a quote or a line end would break.
+/// Quotes a field if it contains a comma, a quote or a line end.
 pub fn field(text: &str) -> Cow<'_, str> {
     if text.contains([',', '"', '\n', '\r']) {
         format!("\"{}\"", text.replace('"', "\"\"")).into()

@@ -1,11 +1,11 @@
-//! A decoded frame, and how its time and values are written.
+//! A decoded frame, and the form of its time and values.
 
 use std::borrow::Cow;
 
 use cantap::{TraceFrame, TraceRecord};
 use cantap_signals::{Message, MessageRef, Number, Signal, SignalValue};
 
-/// A decoded frame, as the outputs take it.
+/// A decoded frame, for the outputs.
 pub struct Decoded<'a> {
     pub record: &'a TraceRecord,
     pub frame: &'a TraceFrame,
@@ -14,14 +14,14 @@ pub struct Decoded<'a> {
     pub values: &'a [SignalValue],
 }
 
-/// What one signal of a frame says.
+/// One signal of a frame.
 pub struct Reading<'a> {
     pub signal: &'a Signal,
     /// Its name in this message.
     pub label: Cow<'a, str>,
-    /// Its value; `None` where the bits say that there is none.
+    /// Its value; `None` if the bits mean that there is none.
     pub number: Option<Number>,
-    /// What J1939 says in place of a value.
+    /// What J1939 says instead of a value.
     pub indicator: Option<&'static str>,
     /// The value table's text.
     pub text: Option<&'a str>,
@@ -41,13 +41,13 @@ impl<'a> Reading<'a> {
         }
     }
 
-    /// The value table's text, or what stands in place of a value.
+    /// The value table's text, or what replaces a value.
     pub fn text(&self) -> Option<&'a str> {
         self.text.or(self.indicator)
     }
 }
 
-/// Seconds with six decimals, or nine where the trace has them.
+/// Seconds with six decimals, or nine if the trace has them.
 pub struct Seconds(pub i64);
 
 impl std::fmt::Display for Seconds {

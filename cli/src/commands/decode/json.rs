@@ -7,7 +7,8 @@ use super::decoded::{Decoded, Reading, Seconds};
 /// Writes the object; with `details` each signal is an object too, with its unit and text.
 pub fn write(out: &mut impl Write, decoded: &Decoded, details: bool) -> io::Result<()> {
     let Decoded { record, frame, message, values, .. } = decoded;
-    // Written by hand: numbers keep every digit, and it is several times faster than a tree of values.
+    // Written by hand: numbers keep every digit, and it is several times faster than building a tree of
+    // values.
     write!(
         out,
         "{{\"time_s\":{},\"channel\":{},\"id\":\"{}\",",

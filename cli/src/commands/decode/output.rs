@@ -1,4 +1,4 @@
-//! Where decoded frames go, and in which form.
+//! Where decoded frames go, and in what form.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -19,7 +19,7 @@ use crate::beside::Beside;
 use crate::trace_output::failed;
 use crate::wrong::wrong;
 
-/// The form that was asked for, by an option or by the file's name.
+/// The requested form, by an option or by the file's name.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Form {
     Text,
@@ -45,7 +45,7 @@ impl Form {
             Some("csv") => Self::Csv,
             Some("json" | "jsonl" | "ndjson") => Self::Json,
             None | Some("txt" | "log") => Self::Text,
-            // Lines of text under the name of a spreadsheet or a trace would pass for one.
+            // Lines of text in a file named like a spreadsheet or a trace would be mistaken for one.
             Some(_) => {
                 let name = args.output.as_deref().unwrap_or(Path::new("-"));
                 return Err(wrong(format!(
@@ -98,7 +98,7 @@ enum WideTo {
     Parquet(WideFile),
 }
 
-/// Lines for standard output, or for a file that takes its name when it is whole.
+/// Lines for standard output, or for a file that takes its name once it is complete.
 struct Lines {
     out: BufWriter<Box<dyn Write>>,
     beside: Option<Beside>,
@@ -175,7 +175,7 @@ impl<'a> Output<'a> {
         Ok(())
     }
 
-    /// Takes what frames said together.
+    /// Takes an event from several frames.
     pub fn push_said(&mut self, event: &Event) -> anyhow::Result<()> {
         match &mut self.to {
             To::Lines { lines, json: true, details } => said::json(&mut lines.out, event, *details)?,
@@ -189,7 +189,7 @@ impl<'a> Output<'a> {
         Ok(())
     }
 
-    /// Takes what happened beside frames. Lines do not have it; the summary counts losses.
+    /// Takes an event other than a frame. Lines leave these out; the summary counts losses.
     pub fn push_event(&mut self, record: &TraceRecord) -> anyhow::Result<()> {
         match &mut self.to {
             To::Wide(wide, _) if matches!(record.event, TraceEvent::Lost { .. }) => {
@@ -204,12 +204,12 @@ impl<'a> Output<'a> {
         Ok(())
     }
 
-    /// Texts and bytes of what was said, which the table has no columns for.
+    /// The number of texts and bytes in events for which the table has no columns.
     pub fn left_out(&self) -> u64 {
         if let To::Wide(wide, _) = &self.to { wide.left_out() } else { 0 }
     }
 
-    /// Gives out what waits, where somebody may read along.
+    /// Writes out what is waiting, if somebody may be reading along.
     pub fn flush(&mut self) -> anyhow::Result<()> {
         match &mut self.to {
             To::Lines { lines, .. } | To::Csv(lines) => Ok(lines.out.flush()?),
@@ -217,7 +217,7 @@ impl<'a> Output<'a> {
         }
     }
 
-    /// Ends the output and puts it in its place; behind JSON lines comes the summary.
+    /// Ends the output and puts it in its place; JSON lines are followed by the summary.
     pub fn finish(self, summary: &serde_json::Value) -> anyhow::Result<()> {
         match self.to {
             To::Lines { mut lines, json, .. } => {

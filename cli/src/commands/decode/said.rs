@@ -1,4 +1,4 @@
-//! What frames say together, in the forms of decoded frames.
+//! Events from several frames, in the forms of decoded frames.
 
 use std::io::{self, Write};
 
@@ -15,7 +15,7 @@ fn is_again(known: &str, name: &str) -> bool {
     })
 }
 
-/// Names and values, with those that every event has behind its own.
+/// Names and values, followed by those that every event has.
 fn fields(event: &Event) -> Vec<(String, Value, String, Option<String>)> {
     let mut fields: Vec<(String, Value, String, Option<String>)> = Vec::new();
     for field in &event.fields {
@@ -39,7 +39,7 @@ fn fields(event: &Event) -> Vec<(String, Value, String, Option<String>)> {
     fields
 }
 
-/// Names, units and values of an event, each a number as text; `None` for one of its own fields that is none.
+/// Names, units and values of an event, each a number as text; `None` for an own field that is not a number.
 pub fn numbers(event: &Event) -> impl Iterator<Item = (String, String, Option<String>)> {
     let protocol = event.protocol;
     let own = event.fields.len();
@@ -48,7 +48,7 @@ pub fn numbers(event: &Event) -> impl Iterator<Item = (String, String, Option<St
             Value::Number(number) => Some(number.to_string()),
             Value::Hex(number, _) => Some(number.to_string()),
             Value::Real(number) if number.is_finite() => Some(number.to_string()),
-            // The kind and what went wrong are words of every event.
+            // The kind and the fault are texts in every event.
             _ if place >= own => return None,
             _ => None,
         };
@@ -56,17 +56,17 @@ pub fn numbers(event: &Event) -> impl Iterator<Item = (String, String, Option<St
     })
 }
 
-/// The identifier or node that said it; empty where it is not known.
+/// The identifier or node that sent it; empty if unknown.
 fn sender(event: &Event) -> String {
     if event.from == Party::Unknown { String::new() } else { event.from.to_string() }
 }
 
-/// As `cantap conversations` has it.
+/// As in `cantap conversations`.
 pub fn text(out: &mut impl Write, event: &Event) -> io::Result<()> {
     writeln!(out, "({}) {} {event}", Seconds(event.time_ns), Interface(event.channel))
 }
 
-/// A line per field; a text stands in the last column.
+/// A line per field; texts are in the last column.
 pub fn csv(out: &mut impl Write, event: &Event) -> io::Result<()> {
     for (name, value, unit, text) in fields(event) {
         let (number, own) = match &value {
@@ -91,7 +91,7 @@ pub fn csv(out: &mut impl Write, event: &Event) -> io::Result<()> {
     Ok(())
 }
 
-/// An object; with `details` each value is one too.
+/// An object; with `details` each value is an object too.
 pub fn json(out: &mut impl Write, event: &Event, details: bool) -> io::Result<()> {
     let mut signals = serde_json::Map::new();
     for (name, value, unit, text) in fields(event) {
@@ -122,7 +122,7 @@ pub fn json(out: &mut impl Write, event: &Event, details: bool) -> io::Result<()
         "id": sender(event), "message": event.title, "protocol": event.protocol.name(),
         "from": party(event.from), "to": party(event.to), "signals": signals,
     });
-    // The time by hand, for all of its digits.
+    // The time is written by hand, to keep all its digits.
     let rest = rest.to_string();
     writeln!(out, "{{\"time_s\":{},\"channel\":{},{}", Seconds(event.time_ns), event.channel, &rest[1..])
 }

@@ -30,7 +30,7 @@ pub fn write_values(out: &mut impl Write, message: &Message, values: &[SignalVal
             }
             (None, indicator) => out.write_all(indicator.unwrap_or_default().as_bytes())?,
         }
-        // "not available (Not Available)" says it twice.
+        // "not available (Not Available)" would be redundant.
         let said =
             |text: &&str| reading.indicator.is_some_and(|indicator| text.eq_ignore_ascii_case(indicator));
         if let Some(text) = reading.text.filter(|text| !said(text)) {

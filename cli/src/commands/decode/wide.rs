@@ -1,6 +1,6 @@
 //! For spreadsheets and numerical programs: a column per signal, a line per frame or per interval of time.
 //!
-//! Which columns there are is known only at the end, so lines wait in a file that nobody else sees.
+//! The columns are known only at the end, so lines wait in a temporary file.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -15,27 +15,27 @@ use super::csv::field;
 use super::decoded::{Decoded, Reading, Seconds};
 use super::said;
 
-/// Between cells of a waiting line: it stands in no number and no time.
+/// Separates cells of a waiting line: it occurs in no number and no time.
 const SEPARATOR: char = '\x1f';
 
-/// Lines that wait, and the columns that they need.
+/// Waiting lines, and the columns that they need.
 pub struct Wide {
     waiting: BufWriter<File>,
     columns: Vec<Column>,
     places: HashMap<Place, usize>,
-    /// Texts and bytes of what was said, which no column takes.
+    /// Number of texts and bytes in events, which no column takes.
     left_out: u64,
-    /// Distance of lines; one per frame without it.
+    /// Interval between lines; `None` for one line per frame.
     step_ns: Option<i64>,
     /// When the next line is due.
     due_ns: Option<i64>,
 }
 
-/// What a column is of.
+/// The content of a column.
 #[derive(PartialEq, Eq, Hash)]
 enum Place {
     Signal(u8, MessageRef, u32),
-    /// Of what frames say together, by its name.
+    /// A field of events from several frames, by name.
     Field(u8, String),
 }
 
@@ -57,14 +57,15 @@ impl Wide {
         Ok(Self { waiting: BufWriter::new(file), columns, places, left_out: 0, step_ns, due_ns: None })
     }
 
-    /// Texts and bytes of what was said, which no column takes.
+    /// The number of texts and bytes in events, which no column takes.
     pub const fn left_out(&self) -> u64 {
         self.left_out
     }
 
-    /// Takes what frames said together: its numbers.
+    /// Takes an event from several frames: its numbers.
     pub fn push_said(&mut self, event: &Event) -> io::Result<()> {
-        // What ends because nothing came is said with the frame that shows it: lines at equal distances do not go back for it.
+        // An event that ends because nothing came is reported with the frame that shows it: lines at regular intervals do not
+        // go back for it.
         let time_ns = match (self.step_ns, self.due_ns) {
             (Some(step_ns), Some(due_ns)) => event.time_ns.max(due_ns.saturating_sub(step_ns)),
             _ => event.time_ns,
@@ -94,7 +95,7 @@ impl Wide {
         self.line(time_ns, &cells)
     }
 
-    /// A line of these cells, unless lines stand at equal distances.
+    /// Adds a line of these cells, unless lines are at regular intervals.
     fn line(&mut self, time_ns: i64, cells: &[(usize, String)]) -> io::Result<()> {
         if self.step_ns.is_some() || cells.is_empty() {
             return Ok(());
@@ -127,7 +128,7 @@ impl Wide {
         self.line(time_ns, &cells)
     }
 
-    /// Frames of the channel are missing: its last values are the present ones no longer.
+    /// Frames on the channel are missing: its last values are no longer current.
     pub fn interrupt(&mut self, channel: u8) {
         for column in self.columns.iter_mut().filter(|column| column.channel == channel) {
             column.last = None;
@@ -149,13 +150,13 @@ impl Wide {
         })
     }
 
-    /// Writes the lines that are due before `now_ns`.
+    /// Writes the lines due before `now_ns`.
     fn advance(&mut self, now_ns: i64) -> io::Result<()> {
         let Some(step_ns) = self.step_ns else { return Ok(()) };
         let mut due_ns = match self.due_ns {
-            // A clock that is set back begins anew.
+            // After the clock was set back, start over.
             Some(due_ns) if now_ns >= due_ns.saturating_sub(step_ns) => due_ns,
-            // Lines stand at whole multiples.
+            // Lines are at whole multiples.
             _ => now_ns.div_euclid(step_ns).saturating_add(1).saturating_mul(step_ns),
         };
         while due_ns <= now_ns {
@@ -182,10 +183,10 @@ impl Wide {
         Ok(())
     }
 
-    /// Gives out the table.
+    /// Passes the table on.
     pub fn finish(mut self, out: &mut impl Rows) -> anyhow::Result<()> {
         if let Some(due_ns) = self.due_ns {
-            // The last values have their line too.
+            // The last values get a line too.
             self.advance(due_ns)?;
         }
         let of_several = self.columns.iter().any(|column| column.channel != self.columns[0].channel);
@@ -200,7 +201,7 @@ impl Wide {
             let line = line?;
             let mut cells = line.split(SEPARATOR);
             let time_ns = cells.next().and_then(|time| time.parse().ok()).unwrap_or_default();
-            // Then columns that came later.
+            // Pad with the columns that were added later.
             let cells = cells.chain(std::iter::repeat("")).take(self.columns.len());
             out.row(time_ns, cells)?;
         }
@@ -208,7 +209,7 @@ impl Wide {
     }
 }
 
-/// Takes a table.
+/// A destination for a table.
 pub trait Rows {
     /// The columns' names and units.
     fn begin(&mut self, names_and_units: &[(String, String)]) -> anyhow::Result<()>;

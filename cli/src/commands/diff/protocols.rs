@@ -1,4 +1,4 @@
-//! Which nodes and objects two buses have, and what they say differently.
+//! Which nodes and objects are on two buses, and how they differ.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write;
@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 
 use crate::protocols::named;
 
-/// Channel, which is 0 where it does not matter, protocol and node.
+/// Channel (0 if irrelevant), protocol and node.
 type Node = (u8, Protocol, String);
 
 /// The difference.
@@ -16,7 +16,7 @@ type Node = (u8, Protocol, String);
 pub(super) struct Protocols {
     nodes: [Vec<Node>; 2],
     objects: [Vec<(Node, String)>; 2],
-    /// Values that do not change in either trace, and are not the same.
+    /// Values that change in neither trace, but differ between them.
     values: Vec<(Node, String, [String; 2])>,
     same: usize,
 }
@@ -40,7 +40,7 @@ impl Protocols {
         let mut this = Self::default();
         for (side, other) in [(0, 1), (1, 0)] {
             this.nodes[side] = nodes[side].difference(&nodes[other]).cloned().collect();
-            // Objects of a node that the other does not have say no more than the node.
+            // The objects of a node that the other trace does not have add nothing to the node itself.
             let only = objects[side].keys().filter(|key| !objects[other].contains_key(*key));
             this.objects[side] = only.filter(|(node, _)| nodes[other].contains(node)).cloned().collect();
         }

@@ -11,7 +11,7 @@ use super::super::autobaud::failure;
 use crate::channel_bitrate::ChannelBitrate;
 use crate::{args, interrupt};
 
-/// Those that are offered in words; any other can be given, too.
+/// The ones offered in a list; any other can be given, too.
 pub const OFFERED: [(&str, &str); 12] = [
     ("1M", "1 Mbit/s"),
     ("800k", "800 kbit/s"),
@@ -27,10 +27,10 @@ pub const OFFERED: [(&str, &str); 12] = [
     ("10k", "10 kbit/s"),
 ];
 
-/// What is asked for on one channel.
+/// The choice for one channel.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum BitRate {
-    /// As saved on the board; else found by listening.
+    /// As saved on the board; otherwise found by listening.
     #[default]
     Auto,
     /// The channel is not captured.
@@ -53,11 +53,11 @@ impl FromStr for BitRate {
     }
 }
 
-/// How long to wait for a word on a silent channel while another one can be captured: Wireshark shows nothing meanwhile.
+/// How long to wait for a silent channel if another one can be captured: Wireshark shows nothing meanwhile.
 const PATIENCE_BESIDE: Duration = Duration::from_secs(3);
 
-/// The channels to capture, by number, and the bit rates that have to be given for them. Reports what it does. A silent channel
-/// is left out if another one speaks.
+/// Determines the channels to capture, by number, and the bit rates that must be given for them. Reports progress. A silent
+/// channel is left out if there is traffic on another one.
 pub fn settle(
     wanted: [BitRate; 2],
     address: &Address,
@@ -66,7 +66,7 @@ pub fn settle(
     let mut channels = Vec::new();
     let mut rates = Vec::new();
     let mut reasons = Vec::new();
-    // Only where it has to be asked.
+    // Opened only if it has to be asked.
     let mut device = None;
     for (channel, wanted) in Channel::ALL.into_iter().zip(wanted) {
         let number = channel.number();

@@ -22,25 +22,27 @@ use crate::live::{Line, LiveRecords};
 use crate::losses::Losses;
 use crate::{advice, args, exit, interrupt};
 
-/// How long a reader waits at most for what is captured while there is more; what is captured on a quiet bus goes at once. Two saturated
-/// channels have 208 frames in this time.
+/// The longest delay of captured records while there are more; on a quiet bus they are passed on immediately. Two saturated channels
+/// have 208 frames in this time.
 const FLUSH_EVERY: Duration = Duration::from_millis(5);
-/// A reader is given no more packets than this at once, and a pause before the next. dumpcap queues what it reads of several interfaces, and
-/// throws away what goes beyond 1000 packets (its option -N, which tshark and Wireshark do not pass on).
+/// A reader gets no more packets than this at once, with a pause before the next ones. dumpcap queues what it reads from several interfaces,
+/// and discards everything beyond 1000 packets (its option -N, which tshark and Wireshark do not pass on).
 const MOST_AT_ONCE: usize = 250;
 const PAUSE: Duration = Duration::from_millis(1);
-/// How often Wireshark learns how many frames each channel has had and lost. A reader that is gone is noticed by then at the latest.
+/// How often Wireshark is told how many frames each channel has had and lost. A reader that is gone is noticed within that
+/// time.
 const STATISTICS_EVERY: Duration = Duration::from_secs(1);
 /// Wireshark opens its pipe within this time, or never.
 const PIPE_PATIENCE: Duration = Duration::from_secs(30);
-/// After a failure it opens it within this time.
+/// After a failure, it opens it within this time.
 const GRACE: Duration = Duration::from_secs(3);
-/// This long after the request to end, the program ends even if nobody takes its last words: the board falls silent with it.
+/// The program ends this long after the request to end, even if nobody reads its last messages, and with it the board falls
+/// silent.
 const LAST_WORDS: Duration = Duration::from_secs(3);
 
-/// What is asked for.
+/// The requested capture.
 pub struct Wanted {
-    /// Or why there is none: it is reported when Wireshark's pipe is open.
+    /// An error is reported once Wireshark's pipe is open.
     pub address: anyhow::Result<Address>,
     pub bit_rates: [BitRate; 2],
     pub mode: Mode,
@@ -62,7 +64,7 @@ pub fn run(wanted: &Wanted) -> anyhow::Result<ExitCode> {
     captured.map(|()| ExitCode::SUCCESS)
 }
 
-/// Wireshark has gone without closing its pipe, or reads no more of it.
+/// Wireshark has gone without closing its pipe, or no longer reads from it.
 fn end_anyway() {
     while !interrupt::requested() {
         std::thread::sleep(LAST_WORDS / 10);
@@ -107,13 +109,13 @@ fn open(wanted: &Wanted, pipe: &Opening) -> anyhow::Result<()> {
     Capture { wanted, live, writer, traffic: Traffic::default(), remarks: Vec::new() }.run()
 }
 
-/// A capture that runs.
+/// A running capture.
 struct Capture<'w> {
     wanted: &'w Wanted,
     live: LiveRecords,
     writer: Box<dyn TraceWriter>,
     traffic: Traffic,
-    /// What is to stand on the next packet of a channel from this time on.
+    /// Remarks for the next packet of a channel, from this time on.
     remarks: Vec<(u8, i64, String)>,
 }
 
@@ -132,7 +134,7 @@ impl Capture<'_> {
         let counters = self.live.lines().lines().map(Line::counters);
         let lost = counters.map(|counters| Losses::of(&counters)).fold(Losses::default(), Losses::plus);
         if lost.total() > 0 {
-            // Wireshark shows what is said here when the capture has ended.
+            // Wireshark shows these messages when the capture has ended.
             eprintln!("cantap: frames were lost, which is marked where they are missing: {}", lost.line());
         }
         let finished = self.writer.finish().map(|_| ());
@@ -144,7 +146,7 @@ impl Capture<'_> {
         let screen = &self.wanted.toolbar.screen;
         screen.begin();
         self.show_channels();
-        // The head, so that Wireshark shows at once that it captures.
+        // Write the header, so that Wireshark immediately shows that it is capturing.
         let mut goes_on = is_read(self.writer.flush())?;
         let mut batch = Vec::new();
         let (mut flushed, mut shown) = (Instant::now(), Instant::now());
@@ -190,7 +192,7 @@ impl Capture<'_> {
         }
     }
 
-    /// Hands the writer what is to be said from this record on.
+    /// Passes the writer the remarks that are due with this record.
     fn remark(&mut self, record: &TraceRecord) {
         if self.remarks.is_empty() {
             return;
@@ -203,7 +205,8 @@ impl Capture<'_> {
         }
     }
 
-    /// Opens channels anew, as the user wants them. What goes wrong is said, and the capture goes on as it was.
+    /// Opens channels again, as the user wants them. Failures are reported, and the capture continues as
+    /// before.
     fn change(&mut self, change: Change) {
         let screen = &self.wanted.toolbar.screen;
         let Some((_, device)) = self.live.lines().devices().next() else {

@@ -17,17 +17,17 @@ use super::places::Place;
                         cantap extcap install --remove"
 )]
 pub struct Args {
-    /// Take it away again.
+    /// Remove it again.
     #[arg(long)]
     remove: bool,
-    /// Wireshark's folder for such programs, where tshark cannot be asked: Help, About Wireshark, Folders, Personal Extcap path.
+    /// Wireshark's folder for such programs, if tshark cannot be asked: Help, About Wireshark, Folders, Personal Extcap path.
     #[arg(long, value_name = "FOLDER")]
     folder: Option<PathBuf>,
 }
 
-/// What Wireshark starts.
+/// The file that Wireshark starts.
 const NAME: &str = if cfg!(windows) { "cantap.bat" } else { "cantap" };
-/// How the small program begins that stands there on Windows, where links ask for a right of their own.
+/// The first line of the small program on Windows, where creating links requires a special right.
 const MARK: &str = "@rem cantap extcap install wrote this";
 
 /// Runs it.
@@ -94,7 +94,7 @@ fn tshark() -> Option<PathBuf> {
     })
 }
 
-/// Where it looks.
+/// Asks tshark for the folder.
 fn ask(tshark: &Path) -> anyhow::Result<PathBuf> {
     let output = Command::new(tshark).args(["-G", "folders"]).output();
     let output = output.with_context(|| format!("'{}' does not start", tshark.display()))?;
@@ -104,7 +104,8 @@ fn ask(tshark: &Path) -> anyhow::Result<PathBuf> {
     })
 }
 
-/// The user's own folder in what `tshark -G folders` prints. Before 4.2 it was below the configuration, and not printed.
+/// The user's own folder in the output of `tshark -G folders`. Before 4.2 it was inside the configuration folder, and
+/// not printed.
 fn personal_folder(text: &str) -> Option<PathBuf> {
     let value = |name: &str| {
         let line = text.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(':'))?;
@@ -120,7 +121,7 @@ fn sees(tshark: &Path) -> Option<bool> {
     (!text.trim().is_empty()).then(|| text.contains(Place::Virtual.name()))
 }
 
-/// Whether what is there was put there by us; an error if it was somebody else.
+/// Whether the existing file is ours; an error if it is somebody else's.
 fn is_ours(place: &Path) -> anyhow::Result<bool> {
     let Ok(there) = place.symlink_metadata() else { return Ok(false) };
     let is_ours = there.is_symlink() || fs::read_to_string(place).is_ok_and(|text| text.starts_with(MARK));
@@ -132,7 +133,8 @@ fn is_ours(place: &Path) -> anyhow::Result<bool> {
     Ok(true)
 }
 
-/// This program as it is called: through a name on the path that stays when a package manager replaces what is behind it.
+/// This program's path: through a name on the path that stays valid when a package manager replaces the program behind
+/// it.
 fn program() -> anyhow::Result<PathBuf> {
     let this = std::env::current_exe().context("the system does not say where this program is")?;
     let real = fs::canonicalize(&this).unwrap_or_else(|_| this.clone());
@@ -154,7 +156,7 @@ fn put(place: &Path, program: &Path) -> std::io::Result<()> {
     fs::write(place, batch(program))
 }
 
-/// What starts the program from Windows' shell, in whose files a per cent sign is doubled.
+/// The program's path for a Windows batch file, in which per cent signs are doubled.
 #[cfg(any(not(unix), test))]
 fn batch(program: &Path) -> String {
     let program = program.display().to_string().replace('%', "%%");
@@ -165,7 +167,7 @@ fn batch(program: &Path) -> String {
 mod tests {
     use super::*;
 
-    /// As 4.0 and 4.2 print them.
+    /// As printed by 4.0 and 4.2.
     #[test]
     fn the_personal_folder_is_the_one_that_this_tshark_looks_in() {
         let old = "Temp:                \t/tmp\nPersonal configuration:\t/home/me/.config/wireshark\n\

@@ -1,4 +1,4 @@
-//! The pipe that Wireshark reads a capture from.
+//! The pipe from which Wireshark reads a capture.
 
 use std::fs::{File, OpenOptions};
 use std::io;
@@ -10,20 +10,20 @@ use anyhow::Context;
 
 use crate::interrupt;
 
-/// How often to check whether to go on.
+/// How often to check whether to continue.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
-/// A pipe that is being opened, which waits until somebody reads it.
+/// A pipe being opened, which waits until somebody reads it.
 pub struct Opening(Receiver<io::Result<File>>);
 
 impl Opening {
-    /// Begins.
+    /// Starts opening.
     pub fn start(path: &Path) -> anyhow::Result<Self> {
         let (sender, opened) = sync_channel(1);
         let path = path.to_owned();
         let open = move || {
             let opened = OpenOptions::new().write(true).open(&path);
-            // If nobody waits any more, it is closed.
+            // If nobody waits any more, this closes it.
             let _ = sender.send(opened);
         };
         std::thread::Builder::new()
@@ -33,7 +33,7 @@ impl Opening {
         Ok(Self(opened))
     }
 
-    /// The pipe; `None` if the capture is to end before anybody reads, or nobody does within this time.
+    /// The pipe; `None` if the capture should end before anybody reads, or if nobody does within this time.
     pub fn wait(&self, patience: Duration) -> io::Result<Option<File>> {
         let deadline = Instant::now() + patience;
         loop {

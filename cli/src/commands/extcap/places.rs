@@ -1,4 +1,4 @@
-//! The interfaces that Wireshark shows: one for each connected board, the virtual device, and whatever has an address.
+//! The interfaces shown by Wireshark: one for each connected board, the virtual device, and one for any address.
 
 use cantap::device::Board;
 
@@ -7,15 +7,15 @@ use cantap_address::Address;
 /// An interface.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Place {
-    /// A connected board, and what tells it from the others.
+    /// A connected board, and its distinguishing name.
     Board(Board, String),
     /// The virtual device.
     Virtual,
-    /// What the user names: a server, a port, a virtual device with options.
+    /// An address given by the user: a server, a port, a virtual device with options.
     Address,
 }
 
-/// All of them now. Nothing is opened.
+/// All interfaces at this moment. Nothing is opened.
 pub fn all() -> Vec<Place> {
     let boards = cantap::device::list().unwrap_or_else(|error| {
         eprintln!("cantap: {error}");
@@ -49,7 +49,7 @@ pub fn find(name: &str) -> anyhow::Result<Place> {
 }
 
 impl Place {
-    /// What Wireshark calls it. A board keeps its name wherever it is plugged in, and Wireshark its settings.
+    /// Its name in Wireshark. A board keeps its name wherever it is plugged in, and Wireshark its settings.
     pub fn name(&self) -> &str {
         match self {
             Self::Board(_, name) => name,
@@ -58,7 +58,7 @@ impl Place {
         }
     }
 
-    /// What users read.
+    /// The name shown to users.
     pub fn shown(&self) -> String {
         match self {
             Self::Board(board, _) => {
@@ -70,7 +70,7 @@ impl Place {
         }
     }
 
-    /// Where it is; `given` is the address that the user names.
+    /// Its address; `given` is the one from the user.
     pub fn address(&self, given: Option<&Address>) -> anyhow::Result<Address> {
         match (self, given) {
             (_, Some(given)) => Ok(given.clone()),

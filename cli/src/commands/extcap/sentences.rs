@@ -1,4 +1,5 @@
-//! What Wireshark asks before a capture: interfaces, their link type, their options, the toolbar. The answers are sentences of extcap(4).
+//! Answers to Wireshark's questions before a capture: interfaces, their link type, their options, the toolbar. They are sentences of
+//! extcap(4).
 
 use std::fmt::Write;
 
@@ -9,7 +10,7 @@ use super::toolbar::{Control, MODES};
 /// SocketCAN's link type.
 const LINK_TYPE: u16 = 227;
 
-/// A text in a sentence: braces and line ends would end it.
+/// Makes a text safe for a sentence: braces and line ends would end it.
 fn clean(text: &str) -> String {
     text.chars().map(|char| if matches!(char, '{' | '}') || char.is_control() { ' ' } else { char }).collect()
 }
@@ -38,19 +39,19 @@ pub fn interfaces(places: &[Place]) -> String {
     }
     value(Control::Mode, "", "as opened", true);
     for (mode, shown) in MODES {
-        // What makes this control wide is taken from load and losses, which are then cut: "1: 30 %" showed as "0 %".
+        // If this control becomes wider, load and losses are truncated: "1: 30 %" showed as "0 %".
         let short = shown.split(':').next().unwrap_or(shown);
         value(Control::Mode, mode, short, false);
     }
     out
 }
 
-/// The link type, which all have.
+/// The link type, which is the same for all.
 pub fn link_types() -> String {
     format!("dlt {{number={LINK_TYPE}}}{{name=CAN_SOCKETCAN}}{{display=SocketCAN}}\n")
 }
 
-/// What can be chosen before a capture. The first value of each is the default.
+/// The options before a capture. The first value of each is the default.
 pub fn config(place: &Place) -> String {
     let mut out = String::new();
     let mut number = 0;
@@ -118,7 +119,7 @@ mod tests {
         }
         assert!(said.contains("{display=a  board  of mine, CAN analyser at /dev/ttyACM0}"), "{said}");
         assert!(said.contains("dlt {number=227}{name=CAN_SOCKETCAN}"));
-        // Only where somebody has to say where it is.
+        // Only if somebody has to give the address.
         assert_eq!(said.matches("call=--device").count(), 1);
         assert!(
             said.contains("{value=listen}{display=listen only: send and acknowledge nothing}{default=true}")

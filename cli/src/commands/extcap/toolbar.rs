@@ -1,5 +1,5 @@
-//! Wireshark's toolbar during a capture: what it shows, and what its user changes. Messages as in the developer's guide: `T`, the length
-//! of the rest in three bytes, the control's number, the command, its payload.
+//! Wireshark's toolbar during a capture: what it shows, and what the user changes. Messages are as in the developer's guide: `T`, the
+//! length of the rest in three bytes, the control's number, the command, its payload.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, BufReader, Read, Write};
@@ -25,9 +25,9 @@ const DISABLE: u8 = 5;
 const STATUS: u8 = 6;
 
 const SYNC: u8 = b'T';
-/// In the place of a control's number, for what concerns none.
+/// Used instead of a control's number if a message concerns none.
 const NO_CONTROL: u8 = 255;
-/// Wireshark sends nothing near this length.
+/// Wireshark's messages are far shorter than this.
 const MAX_MESSAGE_BYTES: usize = 64 * 1024;
 
 /// A part of the toolbar.
@@ -53,13 +53,13 @@ impl Control {
     pub const fn description(self) -> &'static str {
         match self {
             Self::BitRate1 => {
-                "{type=selector}{display=Channel 1}{tooltip=Bit rate; changing it opens the channel anew}"
+                "{type=selector}{display=Channel 1}{tooltip=Bit rate; changing it reopens the channel}"
             }
             Self::BitRate2 => {
-                "{type=selector}{display=Channel 2}{tooltip=Bit rate; changing it opens the channel anew}"
+                "{type=selector}{display=Channel 2}{tooltip=Bit rate; changing it reopens the channel}"
             }
             Self::Mode => {
-                "{type=selector}{display=Mode}{tooltip=How both channels take part; changing it opens them anew}"
+                "{type=selector}{display=Mode}{tooltip=How both channels take part; changing it reopens them}"
             }
             Self::Load => "{type=string}{display=Load}{tooltip=Bus load of each channel in the last second}",
             Self::Lost => {
@@ -76,7 +76,7 @@ impl Control {
     }
 }
 
-/// What the user wants changed.
+/// A change that the user wants.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Change {
     /// Another bit rate, in bit/s.
@@ -85,21 +85,21 @@ pub enum Change {
     Mode(Mode),
 }
 
-/// The toolbar, where there is one: tshark has none.
+/// The toolbar, if there is one: tshark has none.
 pub struct Toolbar {
     pub screen: Screen,
     changes: Option<Receiver<Change>>,
 }
 
-/// The half of it that shows something.
+/// The half that shows something.
 #[derive(Clone)]
 pub struct Screen(
-    /// To the thread that writes: a Wireshark that does not read holds up nothing.
+    /// Messages to the thread that writes, so that a Wireshark that does not read delays nothing.
     Option<Sender<Vec<u8>>>,
 );
 
 impl Toolbar {
-    /// Of the pipes that Wireshark names. They are opened by threads of their own, since that can wait for Wireshark.
+    /// Opens the pipes named by Wireshark, in separate threads because opening can wait for Wireshark.
     pub fn open(control_in: Option<&Path>, control_out: Option<&Path>) -> io::Result<Self> {
         let thread = |name: &str| std::thread::Builder::new().name(name.to_owned());
         let mut toolbar = Self { screen: Screen(None), changes: None };
@@ -114,7 +114,7 @@ impl Toolbar {
         if let Some(path) = control_in.map(PathBuf::from) {
             let (sender, changes) = channel();
             thread("cantap-toolbar-in").spawn(move || {
-                // Its end is Wireshark's, which the capture's own pipe tells.
+                // The end of this pipe means that Wireshark has ended, which the capture's own pipe shows.
                 let _ = File::open(path).and_then(|pipe| listen(BufReader::new(pipe), &sender));
             })?;
             toolbar.changes = Some(changes);
@@ -122,14 +122,14 @@ impl Toolbar {
         Ok(toolbar)
     }
 
-    /// What the user has changed since the last time.
+    /// What the user has changed since the last call.
     pub fn changes(&self) -> Vec<Change> {
         self.changes.iter().flat_map(Receiver::try_iter).collect()
     }
 }
 
 impl Screen {
-    /// One that a test looks at.
+    /// A toolbar that a test can examine.
     #[cfg(test)]
     pub fn of_test() -> (Self, Receiver<Vec<u8>>) {
         let (sender, messages) = channel();
@@ -141,7 +141,7 @@ impl Screen {
         self.0.is_some()
     }
 
-    /// How it looks as the capture begins.
+    /// Sets its initial state for the capture.
     pub fn begin(&self) {
         for control in [Control::Load, Control::Lost] {
             self.send(control.number(), DISABLE, "");
@@ -153,7 +153,7 @@ impl Screen {
         self.send(control.number(), SET, text);
     }
 
-    /// Shows how a channel is open.
+    /// Shows a channel's settings.
     pub fn show_channel(&self, channel: Channel, bitrate_bps: u32, mode: Mode) {
         let control = Control::of_channel(channel);
         let mut offered = OFFERED.iter().map(|(offered, _)| *offered);
@@ -166,7 +166,7 @@ impl Screen {
         self.set(Control::Mode, mode_name(mode));
     }
 
-    /// Says something in the status bar and in the log.
+    /// Shows a message in the status bar and in the log.
     pub fn report(&self, text: &str) {
         self.send(NO_CONTROL, STATUS, text);
         self.log(text);
@@ -191,8 +191,8 @@ fn message(control: u8, command: u8, payload: &[u8]) -> Vec<u8> {
     [&[SYNC], &length[..], &[control, command], payload].concat()
 }
 
-/// Hands on what the user changes, until the pipe ends. What Wireshark says before it is initialised is what stood in the toolbar from an
-/// earlier capture: nobody has asked for that in this one.
+/// Passes on the user's changes, until the pipe ends. What Wireshark sends before it is initialised are values left in the toolbar by an
+/// earlier capture: nobody has requested them for this one.
 fn listen(mut pipe: impl Read, changes: &Sender<Change>) -> io::Result<()> {
     let mut is_initialized = false;
     loop {

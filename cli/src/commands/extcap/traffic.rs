@@ -1,4 +1,4 @@
-//! What the toolbar shows of the traffic: load and losses of each channel.
+//! What the toolbar shows of the traffic: each channel's load and losses.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -8,7 +8,7 @@ use cantap_trace::names::{LOSS_STAGES, name};
 
 use super::toolbar::{Control, Screen};
 
-/// What went by, by the number of its channel.
+/// The traffic, by channel number.
 #[derive(Default)]
 pub struct Traffic {
     channels: BTreeMap<u8, OfChannel>,
@@ -18,20 +18,20 @@ pub struct Traffic {
 #[derive(Default)]
 struct OfChannel {
     bitrate_bps: u32,
-    /// Since it was last shown.
+    /// Since the last update.
     bits: u64,
     lost: u64,
     is_at_least: bool,
-    /// Since it was last shown, in words.
+    /// Descriptions since the last update.
     losses: Vec<String>,
     unlisted: u64,
 }
 
-/// This many losses are listed one by one between two looks at the toolbar, and the rest as a number.
+/// How many losses are listed individually between two updates of the toolbar; the rest is shown as a number.
 const MOST_LISTED: usize = 8;
 
 impl Traffic {
-    /// How fast a channel's bus is, in bit/s.
+    /// Sets the bit rate of a channel's bus, in bit/s.
     pub fn set_bit_rate(&mut self, channel: u8, bitrate_bps: u32) {
         self.channels.entry(channel).or_default().bitrate_bps = bitrate_bps;
     }
@@ -56,7 +56,7 @@ impl Traffic {
         }
     }
 
-    /// Shows what went by in the time since it was last shown.
+    /// Shows the traffic in the time since the last update.
     pub fn show(&mut self, screen: &Screen, passed: Duration) {
         self.since_start += passed;
         if screen.is_there() {

@@ -1,4 +1,4 @@
-//! Steps on the buses, and beside them.
+//! Steps on the buses, and without them.
 
 use std::time::{Duration, Instant};
 
@@ -14,17 +14,17 @@ use crate::meter::rounded;
 
 /// Bit rate of the steps that need only one.
 const BITRATE_BPS: u32 = 500_000;
-/// The rate at which a load is worst.
+/// The rate at which a load is hardest.
 const FULL_RATE_BPS: u32 = 1_000_000;
-/// Frames on a channel at each bit rate.
+/// Number of frames on a channel at each bit rate.
 const FRAMES: u32 = 100;
 /// How long a channel listens.
 const LISTENING: Duration = Duration::from_secs(1);
-/// A bus that is to be full is.
+/// The load of a bus that counts as full.
 const FULL_PCT: f64 = 90.0;
-/// What an unacknowledged frame brings the transmit error counter to: there it stays (ISO 11898-1:2015, 12.1.4.2).
+/// The transmit error counter stops here if a frame is not acknowledged (ISO 11898-1:2015, 12.1.4.2).
 const UNACKNOWLEDGED_TEC: u8 = 128;
-/// The longest wait; everything that is waited for comes sooner.
+/// The longest wait; everything awaited comes sooner.
 const PATIENCE: Duration = Duration::from_secs(3);
 
 type Result = anyhow::Result<Outcome>;
@@ -39,8 +39,8 @@ fn state(device: &Device, channel: Channel) -> anyhow::Result<ChannelStatus> {
     Ok(device.status()?.channels[channel.index()])
 }
 
-/// Listens, and must have driven nothing: nothing was sent, and the transmit error counter, which a controller may keep from
-/// what it did before, has not gone up.
+/// Listens, and must not have driven the bus: nothing was sent, and the transmit error counter, which a controller may keep
+/// from earlier, has not increased.
 pub fn listen(device: &Device, channel: Channel) -> Result {
     open(device, channel, BITRATE_BPS, Mode::ListenOnly)?;
     let before = state(device, channel)?;
@@ -61,8 +61,8 @@ pub fn listen(device: &Device, channel: Channel) -> Result {
     Ok(Outcome::of(holds, says, measured))
 }
 
-/// A channel plays with itself inside the controller; its bus sees nothing. Then it is opened again: what its error counters are
-/// is told.
+/// A channel in loopback inside the controller; its bus sees nothing. Then it is opened again, and its error counters are
+/// reported.
 pub fn alone(device: &Device, channel: Channel, bitrate_bps: u32) -> Result {
     let mut records = device.records();
     forget(&mut records);
@@ -93,12 +93,12 @@ fn is_clean(flow: &Flow) -> bool {
     flow.is_accounted_for() && flow.lost == 0 && flow.bus_errors == 0
 }
 
-/// Frames for later fill the queue to its end; taken back, each is reported.
+/// Frames for later fill the queue completely; once withdrawn, each is reported.
 pub fn fill_queue(device: &Device, channel: Channel) -> Result {
     open(device, channel, BITRATE_BPS, Mode::SilentLoopback)?;
     let ends = device.transmissions();
     let places = u32::from(device.hello().tx_queue);
-    // Long after the end of this step, and within the day that a device allows.
+    // Long after the end of this step, but within the day that a device allows.
     let at_ticks = Some(device.time()? + u64::from(device.hello().tick_hz) * 60);
     let frame: Frame = "123#".parse()?;
     let (mut queued, mut refused) = (0, false);
@@ -118,15 +118,15 @@ pub fn fill_queue(device: &Device, channel: Channel) -> Result {
         }
     }
     device.close_channel(channel)?;
-    // Mailboxes take some more than the queue.
+    // Mailboxes take a few more than the queue.
     let holds = refused && queued >= places && told == queued;
     let says = format!(
-        "{queued} frames taken (the queue has {places}), then refused; {told} told as taken back, in order"
+        "{queued} frames taken (the queue has {places}), then refused; {told} reported as withdrawn, in order"
     );
     Ok(Outcome::of(holds, says, json!({ "queued": queued, "refused": refused, "told": told })))
 }
 
-/// Both channels send as much as fits: each by itself, or both on one bus.
+/// Both channels send as much as possible: each on its own bus, or both on one.
 pub fn saturate(device: &Device, is_one_bus: bool, time: Duration) -> Result {
     let mut records = device.records();
     forget(&mut records);
@@ -193,7 +193,7 @@ pub fn cross(device: &Device, bitrate_bps: u32) -> Result {
 }
 
 /// One channel sends while the other only listens: nobody acknowledges, so the frame never ends, and the sender stops counting
-/// at error-passive. Whether it keeps that over Close and Open is the controller's business, and reported.
+/// at error-passive. Whether it keeps that across Close and Open depends on the controller, and is reported.
 pub fn unacknowledged(device: &Device, sender: Channel) -> Result {
     let listener = if sender == Channel::Can1 { Channel::Can2 } else { Channel::Can1 };
     open(device, listener, BITRATE_BPS, Mode::ListenOnly)?;

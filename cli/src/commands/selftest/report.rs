@@ -1,4 +1,4 @@
-//! What was found, line by line and as one object.
+//! The results, line by line and as one object.
 
 use std::fmt::Write;
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
@@ -8,19 +8,19 @@ use serde_json::{Value, json};
 
 use cantap_address::Address;
 
-/// How a step went.
+/// The result of a step.
 #[derive(Clone, Debug)]
 pub enum Outcome {
-    /// As it should be: what was seen, and the figures.
+    /// As expected: what was seen, and the figures.
     Pass(String, Value),
-    /// Not as it should be: what was seen, and the figures.
+    /// Not as expected: what was seen, and the figures.
     Fail(String, Value),
-    /// Not tried, and why.
+    /// Not tried, with the reason.
     Skip(String),
 }
 
 impl Outcome {
-    /// A pass if `holds`.
+    /// A pass if `holds` is true.
     pub fn of(holds: bool, says: String, measured: Value) -> Self {
         if holds { Self::Pass(says, measured) } else { Self::Fail(says, measured) }
     }
@@ -34,7 +34,7 @@ struct Step {
     measured: Value,
 }
 
-/// What is written for whoever reads it elsewhere.
+/// The report for readers elsewhere.
 #[derive(serde::Serialize)]
 pub struct Report {
     cantap: &'static str,
@@ -55,7 +55,7 @@ pub struct Report {
 }
 
 impl Report {
-    /// Nothing tested yet; each step is printed as it ends if `shown`.
+    /// Nothing has been tested yet; if `shown`, each step is printed as it ends.
     pub fn new(address: &Address, device: &Device, shown: bool) -> Self {
         let hello = device.hello();
         let [major, minor, patch] = hello.firmware;
@@ -78,7 +78,7 @@ impl Report {
         report
     }
 
-    /// Does a step. What goes wrong on the way is a failure, and the next step is still tried.
+    /// Performs a step. An error is a failure, and the next step is still tried.
     pub fn step(&mut self, name: &str, act: impl FnOnce() -> anyhow::Result<Outcome>) {
         let outcome =
             act().unwrap_or_else(|error| Outcome::Fail(crate::advice::sentence(&error), Value::Null));
@@ -92,7 +92,7 @@ impl Report {
         self.steps.push(step);
     }
 
-    /// The last word.
+    /// Prints the result.
     pub fn finish(&mut self) {
         self.seconds = crate::meter::rounded(self.started.elapsed().as_secs_f64(), 1);
         self.passed = self.count("FAIL") == 0;
@@ -104,7 +104,7 @@ impl Report {
         self.passed
     }
 
-    /// All of it: the lines, and behind them the object.
+    /// The whole report: the lines, followed by the object.
     pub fn text(&self) -> serde_json::Result<String> {
         let mut text = self.head();
         for step in &self.steps {
@@ -146,10 +146,10 @@ fn line(step: &Step) -> String {
     format!("{}  {}: {}\n", step.outcome, step.name, step.says)
 }
 
-/// What this computer runs.
+/// This computer's operating system.
 fn host() -> String {
     let (system, machine) = (std::env::consts::OS, std::env::consts::ARCH);
-    // Linux tells its release as text.
+    // Linux provides its release as text.
     match std::fs::read_to_string("/proc/sys/kernel/osrelease") {
         Ok(release) => format!("{system} {} {machine}", release.trim()),
         Err(_) => format!("{system} {machine}"),

@@ -11,19 +11,19 @@ use serde_json::{Value, json};
 use super::report::Outcome;
 use crate::meter::rounded;
 
-/// Questions for the device's time.
+/// Number of requests for the device's time.
 const ROUND_TRIPS: usize = 500;
-/// A crystal and this computer's clock together are never so far apart; a device that runs from its internal oscillator, which
-/// is good for about 1 %, is.
+/// A crystal and this computer's clock together never differ by this much; a device running from its internal oscillator,
+/// which is accurate to about 1 %, does.
 const MAX_DRIFT_PPM: f64 = 500.0;
-/// How long it takes to know a drift, from samples that are good enough.
+/// How long it takes to determine a drift from good samples.
 const CLOCK_PATIENCE: Duration = Duration::from_secs(12);
-/// How long a firmware that restarts takes to be on the bus again, however slow the computer's USB is.
+/// How long a restarting firmware takes to be on USB again, however slow the computer.
 const RESTART_PATIENCE: Duration = Duration::from_secs(15);
 
 type Result<T = Outcome> = anyhow::Result<T>;
 
-/// What the device says of itself.
+/// The device's description of itself.
 pub fn identity(hello: &Hello) -> Outcome {
     let holds = hello.protocol == PROTOCOL_VERSION
         && usize::from(hello.channels) == CHANNELS
@@ -47,7 +47,7 @@ pub fn identity(hello: &Hello) -> Outcome {
     Outcome::of(holds, says, measured)
 }
 
-/// What the system says of its port.
+/// The system's description of its port.
 pub fn usb(address: &Address, hello: &Hello) -> Result {
     if !address.may_come_back() {
         return Ok(Outcome::Skip("this device has no USB port".to_owned()));
@@ -91,7 +91,7 @@ pub fn round_trips(device: &Device) -> Result {
 pub fn clock(device: &Device) -> Outcome {
     let started = Instant::now();
     let drift = || device.clock().drift_ppm;
-    // A first figure from while this computer was busy does not last; that of a bad clock does.
+    // A first figure from when this computer was busy does not last; that of a bad clock does.
     while drift().is_none_or(|ppm| ppm.abs() > MAX_DRIFT_PPM) && started.elapsed() < CLOCK_PATIENCE {
         std::thread::sleep(Duration::from_millis(100));
     }
@@ -104,7 +104,7 @@ pub fn clock(device: &Device) -> Outcome {
     Outcome::of(ppm.abs() <= MAX_DRIFT_PPM, says, json!({ "drift_ppm": ppm }))
 }
 
-/// What the device keeps for each channel.
+/// What the device has stored for each channel.
 pub fn saved(device: &Device) -> anyhow::Result<Vec<Option<Defaults>>> {
     Ok(Channel::ALL
         .into_iter()
@@ -112,7 +112,7 @@ pub fn saved(device: &Device) -> anyhow::Result<Vec<Option<Defaults>>> {
         .collect::<std::result::Result<_, _>>()?)
 }
 
-/// Whether what it keeps is what it kept before.
+/// Whether what it has stored is the same as before.
 pub fn compare_saved(before: &[Option<Defaults>], now: &[Option<Defaults>]) -> Outcome {
     let what = now.iter().map(|saved| if saved.is_some() { "saved" } else { "nothing saved" });
     let says = format!("as before: channel 1 {}", what.collect::<Vec<_>>().join(", channel 2 "));
@@ -123,12 +123,12 @@ pub fn compare_saved(before: &[Option<Defaults>], now: &[Option<Defaults>]) -> O
     }
 }
 
-/// Restarts the firmware and waits until it is back.
+/// Restarts the firmware and waits for it to come back.
 pub fn restart(address: &Address, device: OpenDevice, serial: &str) -> Result {
     let asked = Instant::now();
     device.reset()?;
     drop(device);
-    // The port is still there for a moment.
+    // The port remains for a moment.
     std::thread::sleep(Duration::from_millis(500));
     let device = loop {
         match address.open() {

@@ -1,4 +1,4 @@
-//! Frames that a device sends itself, each with its number: who heard which, in what order, how far apart.
+//! Numbered frames that the device itself sends: who received which, in what order, how far apart.
 
 use std::time::{Duration, Instant};
 
@@ -11,24 +11,25 @@ use serde_json::{Value, json};
 use crate::interrupt;
 use crate::meter::rounded;
 
-/// After this time in which no frame ended, sending is stuck.
+/// If no frame has ended for this long, sending is stuck.
 const PATIENCE: Duration = Duration::from_secs(3);
-/// How far a stamp may be from where the frame's exact length puts it, in microseconds.
+/// How far a stamp may be from the position given by the frame's exact length, in microseconds.
 pub const STAMP_TOLERANCE_US: f64 = 5.0;
 
 /// How much to send.
 #[derive(Clone, Copy)]
 pub enum Amount {
-    /// So many frames on each sending channel.
+    /// This many frames on each sending channel.
     Frames(u32),
-    /// As many as fit.
+    /// As many as possible.
     For(Duration),
 }
 
-/// The frame with a number: it and the channel in the data, everything else another in each.
+/// The frame with a number: the number and the channel are in the data, everything else varies.
 fn numbered(from: Channel, number: u32) -> Frame {
     let [a, b, c, d] = number.to_be_bytes();
-    // Scattered, so that both channels win and lose arbitration; never the same, which two nodes must not send.
+    // Scattered, so that both channels win and lose arbitration; never the same identifier, which two nodes
+    // must not send.
     let scattered = number.wrapping_mul(0x9E37_79B1) << 1 | from.index() as u32;
     let id =
         if number % 4 == 3 { Id::extended_truncated(scattered) } else { Id::standard_truncated(scattered) };
@@ -36,7 +37,7 @@ fn numbered(from: Channel, number: u32) -> Frame {
     Frame::from_bus(id, false, dlc, [from.number(), a, b, c, d, !a, !d, d])
 }
 
-/// What became of one channel's frames.
+/// The results for one channel's frames.
 pub struct Flow {
     pub from: Channel,
     pub to: Channel,
@@ -44,21 +45,21 @@ pub struct Flow {
     pub sent: u32,
     /// Those that were not sent.
     pub failed: u32,
-    /// Those that were heard, in order and bit for bit.
+    /// Those received, in order and bit for bit.
     pub heard: u32,
-    /// What was heard beside them.
+    /// Anything else received.
     pub wrong: u32,
-    /// Counted as lost where they should have been heard.
+    /// Counted as lost where they should have been received.
     pub lost: u64,
     pub bus_errors: u32,
-    /// Number that is heard next if none is lost.
+    /// The next number to be received if none is lost.
     next: u32,
     bits: u64,
     bitrate_bps: u32,
     tick_hz: u32,
     /// Device time of the first and last confirmation.
     span_ticks: Option<(u64, u64)>,
-    /// For each frame, how much later it ended than its length behind the one before, in microseconds.
+    /// For each frame, how much later it ended than its length after the previous one, in microseconds.
     behind_us: Vec<f32>,
 }
 
@@ -91,14 +92,15 @@ impl Flow {
         }
     }
 
-    /// Load that the frames made, in per cent, between the first and the last.
+    /// Load caused by the frames, in per cent, between the first and the last.
     pub fn load_pct(&self) -> f64 {
         let (first, last) = self.span_ticks.unwrap_or_default();
         let seconds = last.wrapping_sub(first) as f64 / f64::from(self.tick_hz);
         if seconds > 0.0 { self.bits as f64 * 100.0 / (f64::from(self.bitrate_bps) * seconds) } else { 0.0 }
     }
 
-    /// The most that a frame ended too early, and the median of how late, against exact lengths, in microseconds.
+    /// The most that a frame ended too early, and the median lateness, compared with exact lengths, in
+    /// microseconds.
     pub fn spacing_us(&self) -> (f64, f64) {
         let mut behind = self.behind_us.clone();
         behind.sort_by(f32::total_cmp);
@@ -107,7 +109,7 @@ impl Flow {
         (early.max(0.0), median)
     }
 
-    /// Whether each frame that was to be sent was, and was heard once or counted lost.
+    /// Whether each requested frame was sent, and was received once or counted as lost.
     pub fn is_accounted_for(&self) -> bool {
         self.sent > 0
             && self.failed == 0
@@ -138,7 +140,7 @@ impl Flow {
     }
 }
 
-/// Load that the frames of several channels made on one bus, in per cent, from the first of all to the last.
+/// Load caused by the frames of several channels on one bus, in per cent, from the very first to the last.
 pub fn load_together_pct(flows: &[Flow]) -> f64 {
     let first = flows.iter().filter_map(|flow| Some(flow.span_ticks?.0)).min().unwrap_or_default();
     let last = flows.iter().filter_map(|flow| Some(flow.span_ticks?.1)).max().unwrap_or_default();
@@ -147,7 +149,8 @@ pub fn load_together_pct(flows: &[Flow]) -> f64 {
     rates.filter(|_| last > first).map_or(0.0, |rate| bits as f64 * 100.0 / ((last - first) as f64 * rate))
 }
 
-/// Sends on each channel of `ways`, and listens to where it should be heard. The channels are open, and stay so.
+/// Sends on each channel of `ways`, and listens where it should be received. The channels are open, and stay
+/// open.
 pub fn exchange(
     device: &Device,
     records: &mut Records,
@@ -214,7 +217,7 @@ pub fn exchange(
     Ok(flows)
 }
 
-/// Takes ends of transmissions, and what was heard.
+/// Takes ends of transmissions, and received records.
 fn take(stream: &mut Stream<'_>, records: &mut Records, flows: &mut [Flow], moved: &mut Instant) {
     for end in stream.take_ended() {
         *moved = Instant::now();
@@ -247,7 +250,7 @@ fn hear(record: &TraceRecord, flows: &mut [Flow]) {
     }
 }
 
-/// Everything that is there is thrown away: it belongs to the step before.
+/// Discards everything that is there: it belongs to the previous step.
 pub fn forget(records: &mut Records) {
     while records.next_batch(Duration::ZERO).is_ok_and(|batch| batch.is_some_and(|batch| !batch.is_empty())) {
     }

@@ -10,10 +10,10 @@ pub struct ModifierArgs {
     /// Count up in a byte of the data (from 0), or in some of its bits: BYTE or BYTE.LOWBIT:BITS, such as 7.0:4.
     #[arg(long, value_name = "BYTE[.BIT:BITS]", value_parser = counter, requires = "period", conflicts_with_all = ["on_rx", "reply"])]
     counter: Vec<Modifier>,
-    /// A new random value in a byte.
+    /// Put a new random value into a byte.
     #[arg(long, value_name = "BYTE", requires = "period", conflicts_with_all = ["on_rx", "reply"])]
     random: Vec<u8>,
-    /// A checksum over the other bytes in a byte: xor, sum, or crc8 (SAE-J1850).
+    /// Put a checksum over the other bytes into a byte: xor, sum, or crc8 (SAE-J1850).
     #[arg(long, value_name = "BYTE:KIND", value_parser = checksum, requires = "period", conflicts_with_all = ["on_rx", "reply"])]
     checksum: Vec<Modifier>,
 }

@@ -1,4 +1,4 @@
-//! `cantap serve keygen`, and what `--tls` names: who the server is, and whom it believes.
+//! `cantap serve keygen`, and the files for `--tls`: the server's identity, and whom it trusts.
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -10,23 +10,23 @@ use cantap_serve::tls::{Files, Keys, Server};
 
 use crate::wrong::wrong;
 
-/// What there is to do beside serving.
+/// What else the command can do.
 #[derive(clap::Subcommand)]
 pub enum Command {
-    /// Make keys: an authority, the server's, and clients' with what each may do.
+    /// Make keys: an authority, the server's, and clients' with their roles.
     Keygen {
-        /// Folder for the files; an authority that is in it makes further clients.
+        /// Folder for the files; an existing authority in it makes further clients.
         folder: PathBuf,
         /// A name or address by which clients reach the server. Can be repeated.
         #[arg(long = "host", value_name = "HOST")]
         hosts: Vec<String>,
-        /// A client and what it may do at most: alice:listen, bob:send. Can be repeated.
+        /// A client and its maximum role: alice:listen, bob:send. Can be repeated.
         #[arg(long = "client", value_name = "NAME:ROLE", value_parser = named_role)]
         clients: Vec<(String, Role)>,
     },
 }
 
-/// Two files' names.
+/// Parses two file names.
 pub fn two_files(text: &str) -> Result<(PathBuf, PathBuf), String> {
     let files = text.split_once(',');
     let files =
@@ -40,7 +40,7 @@ fn named_role(text: &str) -> Result<(String, Role), String> {
 }
 
 impl Command {
-    /// Makes keys and says which.
+    /// Makes keys and lists them.
     pub fn run(&self) -> anyhow::Result<ExitCode> {
         let Self::Keygen { folder, hosts, clients } = self;
         let has_server = Keys::files(folder, "server").certificate.exists();
@@ -68,7 +68,7 @@ fn make(folder: &Path, hosts: &[String], clients: &[(String, Role)]) -> anyhow::
         writeln!(out, "{}", files.key.display())?;
     }
     eprintln!(
-        "cantap: give each client its two files and ca.pem; whoever has ca-key.pem can make clients: keep it where nobody \
+        "cantap: give each client its two files and ca.pem; anyone who has ca-key.pem can make clients: keep it where nobody \
          gets at it"
     );
     Ok(ExitCode::SUCCESS)

@@ -1,4 +1,4 @@
-//! Statistics of a device's bus while it runs: a line per channel and window, as canbusload prints them.
+//! Statistics of a device's bus while it runs: a line per channel and window, like canbusload.
 
 use std::collections::BTreeSet;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -15,12 +15,12 @@ use crate::live::{LiveRecords, unasked};
 use crate::protocols::Known;
 use crate::stderr;
 
-/// How long after its end a window is closed, so that what is still on the way gets into it.
+/// How long after its end a window is closed, so that it includes what is still on the way.
 const LATENESS_NS: i64 = 1_000_000_000;
-/// Columns of the bar for 100 %.
+/// Number of columns for 100 % in the bar.
 const BAR_COLUMNS: usize = 20;
 
-/// Opens the devices that the command line names, else the one that is connected.
+/// Opens the devices named on the command line, otherwise the one that is connected.
 pub(super) fn open(
     devices: &[Address],
     channels: &Channels,
@@ -32,7 +32,7 @@ pub(super) fn open(
     LiveRecords::listen(&boards, bitrates, time)
 }
 
-/// Listens until Ctrl-C or the end of the time, and prints a line per window if `shown`. What was heard counts, even where this
+/// Listens until Ctrl-C or the end of the time, and prints a line per window if `shown`. What was received counts, even if this
 /// fails.
 pub(super) fn run(
     shown: bool,
@@ -72,13 +72,13 @@ fn listen(
     Ok(())
 }
 
-/// The machine's UTC time, which the device's is mapped to.
+/// The machine's UTC time, to which the device's is mapped.
 fn now_ns() -> i64 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     i64::try_from(since.as_nanos()).unwrap_or(i64::MAX)
 }
 
-/// Prints a line per window; on a terminal in colour.
+/// Prints a line per window, in colour on a terminal.
 struct Lines {
     shown: bool,
     colour: bool,
@@ -96,11 +96,9 @@ impl Lines {
             eprintln!("{}", line(window, self.colour));
         }
     }
-}
 
-impl Lines {
-    /// The window in which listening ended is cut short: channels end a little after one another, and errors of before it are counted in
-    /// it, so that its rates would say of a steady bus that it was not. It is shown where it is all there is.
+    /// The window in which listening ended is truncated: channels end a little apart, and earlier errors are counted in it, so its rates
+    /// would make a steady bus look unsteady. It is shown only if there is no other.
     fn is_worth_a_line(&mut self, window: &Window) -> bool {
         let is_first = self.channels.insert(window.channel);
         is_first || !window.is_cut

@@ -6,7 +6,7 @@ use cantap_analysis::stats::{ChannelSummary, IdSummary, PeakSummary, Summary};
 
 use crate::missing::Missing;
 
-/// Everything, for a terminal of any width above eighty columns.
+/// The whole text, for a terminal of at least eighty columns.
 pub(super) fn text(summary: &Summary, missing: &Missing, per_id: bool) -> String {
     let mut out = String::new();
     // Writing to a String cannot fail.
@@ -32,7 +32,7 @@ pub(super) fn text(summary: &Summary, missing: &Missing, per_id: bool) -> String
     out
 }
 
-/// What else there would be to see, behind everything else.
+/// What else can be shown, after everything else.
 pub(super) fn hint(summary: &Summary, per_id: bool) -> &'static str {
     let has_ids = summary.channels.iter().any(|channel| !channel.ids.is_empty());
     if has_ids && !per_id { "\nperiods and jitter of each identifier: --per-id\n" } else { "" }
@@ -121,7 +121,7 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
         ];
         let places = if lost.gaps == 1 { "1 place".to_owned() } else { format!("{} places", lost.gaps) };
         let _ = match (lost.total, lost.at_least) {
-            // As while a device was gone.
+            // For example while a device was gone.
             (0, _) => writeln!(out, "  lost      an unknown number at {places}"),
             (total, true) => writeln!(out, "  lost      at least {total} at {places}: {}", listed(&stages)),
             (total, false) => writeln!(out, "  lost      {total} at {places}: {}", listed(&stages)),
@@ -169,7 +169,7 @@ fn listed(counts: &[(u64, &str)]) -> String {
 /// A window with its start relative to `zero_s`.
 pub(super) fn window_line(window: &PeakSummary, zero_s: f64) -> String {
     let load = window.load_pct.map_or(String::new(), |load| format!("{load:>8.3} %"));
-    // What rounds to nothing has no sign.
+    // A value that rounds to zero has no sign.
     let since_s = window.start_s - zero_s;
     let since_s = if since_s.abs() < 0.000_5 { 0.0 } else { since_s };
     let line = format!(
@@ -179,7 +179,7 @@ pub(super) fn window_line(window: &PeakSummary, zero_s: f64) -> String {
     line + &remarks(window.errors, window.lost, window.incomplete)
 }
 
-/// What is not as it should be in a window, to be put behind its figures.
+/// Remarks about a window, to be appended to its figures.
 pub(super) fn remarks(errors: u64, lost: u64, incomplete: bool) -> String {
     let mut text = String::new();
     // Writing to a String cannot fail.

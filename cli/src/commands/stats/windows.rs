@@ -1,5 +1,5 @@
-//! The windows of a trace, on disk until the summary has been printed: a long trace has more of them than memory
-//! should hold.
+//! The windows of a trace, on disk until the summary has been printed: a long trace has too many of them for
+//! memory.
 
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, BufWriter, Seek, Write};
@@ -11,12 +11,12 @@ use cantap_analysis::stats::{PeakSummary, Window};
 pub(super) struct Windows {
     /// One JSON object per line.
     file: BufWriter<File>,
-    /// The first thing that went wrong.
+    /// The first error.
     result: io::Result<()>,
 }
 
 impl Windows {
-    /// None yet, in a file that nobody else sees.
+    /// Empty, in a temporary file.
     pub(super) fn new() -> anyhow::Result<Self> {
         let file = tempfile::tempfile()
             .context("the windows need room for a temporary file; make some, or name a folder in TMPDIR")?;
@@ -31,7 +31,7 @@ impl Windows {
         }
     }
 
-    /// Hands out all windows, each as the JSON object that it is.
+    /// Passes on all windows, each as a JSON object.
     pub(super) fn for_each(self, mut take: impl FnMut(&str) -> anyhow::Result<()>) -> anyhow::Result<()> {
         self.result?;
         let mut file = self.file.into_inner().map_err(io::IntoInnerError::into_error)?;

@@ -1,4 +1,4 @@
-//! Requests and answers over a device.
+//! Sends requests over a device and receives the answers.
 
 use std::time::Duration;
 
@@ -13,38 +13,37 @@ use cantap_protocols::iso_tp::{Endpoint, Pair};
 use crate::args;
 use crate::speaking::Speaking;
 
-/// The reply slot of the device that sends flow control.
+/// The device's reply slot for flow control.
 const FLOW_SLOT: u8 = 0;
 
-/// Whom to ask, and how transfers go; for commands to flatten into theirs.
+/// Whom to ask, and the parameters of transfers; commands flatten this into their arguments.
 #[derive(clap::Args, Clone, Copy)]
 pub struct TransferArgs {
-    /// The ECU: the identifier that it is asked with, and the one that it answers with; 6F1/12:612/F1 where the first data byte is an
-    /// address.
+    /// The ECU: the identifier of requests, and that of its answers; 6F1/12:612/F1 if the first data byte is an address.
     #[arg(long, value_name = "ID:ID", default_value = "7E0:7E8", global = true)]
     pair: Pair,
-    /// Ask all ECUs at once: with 7DF, or with 18DB33F1 where the pair has identifiers of 29 bits.
+    /// Ask all ECUs at once: with 7DF, or with 18DB33F1 if the pair has 29-bit identifiers.
     #[arg(long, global = true)]
     functional: bool,
-    /// How long to wait for the beginning of an answer (P2, and what gateways take).
+    /// How long to wait for the beginning of an answer (P2, plus delays by gateways).
     #[arg(long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration, global = true)]
     p2: Duration,
     /// The same after the ECU has said that its answer is pending (P2*).
     #[arg(long, value_name = "TIME", default_value = "5s", value_parser = args::positive_duration, global = true)]
     p2_star: Duration,
-    /// How long to wait for one answer at most, however often it is pending.
+    /// Maximum time to wait for one answer, however often it is pending.
     #[arg(long, value_name = "TIME", default_value = "60s", value_parser = args::positive_duration, global = true)]
     patience: Duration,
-    /// The least distance of the frames of an answer (STmin): up to 127ms, or 100us to 900us.
+    /// Minimum separation of an answer's frames (STmin): up to 127ms, or 100us to 900us.
     #[arg(long, value_name = "STMIN", default_value = "0ms", value_parser = separation, global = true)]
     separation: u8,
-    /// Frames of an answer for one flow control frame; 0 for all.
+    /// Frames of an answer per flow control frame; 0 for all.
     #[arg(long, value_name = "N", default_value_t = 0, global = true)]
     block_size: u8,
-    /// What fills frames up to eight bytes, in hexadecimal; none sends them as short as they are.
+    /// The byte that pads frames to eight bytes, in hexadecimal; none keeps them as short as possible.
     #[arg(long, value_name = "HEX|none", default_value = "CC", value_parser = padding, global = true)]
     padding: Padding,
-    /// Who sends the first flow control frame of an answer: this computer, when it has seen that one is wanted, or the device, within
+    /// Who sends the first flow control frame of an answer: this computer, once it has seen that one is needed, or the device, within
     /// microseconds, after the ECU's next frame of any kind.
     #[arg(long, value_enum, default_value = "host", global = true)]
     flow_control: FlowBy,
@@ -68,7 +67,7 @@ fn padding(text: &str) -> Result<Padding, String> {
     }
 }
 
-/// As flow control has it.
+/// Encoded as in flow control.
 fn separation(text: &str) -> Result<u8, String> {
     let time = args::duration(text)?;
     match time.as_micros() {
@@ -80,7 +79,7 @@ fn separation(text: &str) -> Result<u8, String> {
 }
 
 impl TransferArgs {
-    /// For requests of OBD-II.
+    /// For OBD-II requests.
     pub fn of_obd(pair: Pair, p2: Duration, functional: bool) -> Self {
         Self {
             pair,
@@ -95,7 +94,7 @@ impl TransferArgs {
         }
     }
 
-    /// Who talks.
+    /// The pair of identifiers.
     pub const fn pair(&self) -> Pair {
         self.pair
     }
@@ -117,7 +116,7 @@ impl TransferArgs {
         }
     }
 
-    /// The request as a client.
+    /// The client for a request.
     fn exchange(&self, request: &[u8]) -> Exchange {
         let ns = |time: Duration| u64::try_from(time.as_nanos()).unwrap_or(u64::MAX / 4).min(u64::MAX / 4);
         let settings = TransferSettings {
@@ -155,11 +154,11 @@ fn refusal_text(who: &str, request: &[u8], code: u8) -> String {
     format!("{who} refused {service}: {} ({code:02X}){advice}", reason(code))
 }
 
-/// Asks.
+/// Sends requests.
 pub struct Client<'d> {
     pub speaking: Speaking<'d>,
     args: TransferArgs,
-    /// The first refusal, where refusals do not end everything.
+    /// The first refusal, if refusals do not end everything.
     refused: Option<anyhow::Error>,
 }
 
@@ -169,7 +168,7 @@ impl<'d> Client<'d> {
         Self { speaking, args, refused: None }
     }
 
-    /// Asks others, or in another way.
+    /// Addresses other ECUs, or uses other parameters.
     pub const fn set_transfer(&mut self, args: TransferArgs) {
         self.args = args;
     }
@@ -178,12 +177,12 @@ impl<'d> Client<'d> {
         self.speaking.channel()
     }
 
-    /// Asks, and returns the answers; refusals among them are remembered for [`Self::all_agreed`].
+    /// Sends a request, and returns the answers; refusals among them are remembered for [`Self::all_agreed`].
     pub fn ask(&mut self, request: &[u8]) -> anyhow::Result<Vec<ServerAnswer>> {
         self.ask_so_many(request, None).map_err(|failure| self.explain(failure))
     }
 
-    /// As [`Self::ask`], but nobody has to answer.
+    /// Like [`Self::ask`], but answers are optional.
     pub fn ask_whoever(
         &mut self,
         request: &[u8],
@@ -196,7 +195,7 @@ impl<'d> Client<'d> {
         }
     }
 
-    /// Says something that no answer is wanted to, and does not wait for a refusal.
+    /// Sends a request that wants no answer, and does not wait for a refusal.
     pub fn tell_only(&mut self, request: &[u8]) -> anyhow::Result<()> {
         let p2 = std::mem::replace(&mut self.args.p2, Duration::from_millis(50));
         let told = self.ask(request);
@@ -274,7 +273,7 @@ enum Failure {
     Other(anyhow::Error),
 }
 
-/// For callers that need at least one.
+/// The first answer, for callers that need at least one.
 pub fn first(answers: Vec<ServerAnswer>) -> anyhow::Result<ServerAnswer> {
     match answers.into_iter().next() {
         Some(answer) => Ok(answer),

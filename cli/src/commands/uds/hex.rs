@@ -1,6 +1,6 @@
 //! Numbers and bytes in hexadecimal, as users write them.
 
-/// Bytes as they are given in hexadecimal.
+/// Bytes given in hexadecimal.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Hex(pub Vec<u8>);
 
@@ -17,7 +17,7 @@ pub fn bytes(text: &str) -> Result<Hex, String> {
         .ok_or_else(|| "write bytes in hexadecimal, two digits each, as 22F190".to_owned())
 }
 
-/// A number of at most so much.
+/// A number up to a maximum.
 pub fn number(text: &str, most: u32) -> Option<u32> {
     let digits = text.trim_start_matches("0x").trim_start_matches("0X");
     u32::from_str_radix(digits, 16).ok().filter(|number| *number <= most)

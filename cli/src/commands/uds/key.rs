@@ -1,4 +1,4 @@
-//! Security access: the ECU's seed goes to the user's command, whose key goes to the ECU.
+//! Security access: the ECU's seed goes to the user's command, and the command's key to the ECU.
 
 use std::fmt::Write as _;
 use std::io::Write as _;
@@ -9,14 +9,14 @@ use anyhow::{Context, bail, ensure};
 use super::client::{Client, first};
 use super::hex::{Hex, byte, bytes};
 
-/// How to unlock the ECU; for commands to flatten into theirs.
+/// How to unlock the ECU; commands flatten this into their arguments.
 #[derive(clap::Args, Clone)]
 pub struct KeyArgs {
-    /// Then unlock the ECU at this level: an odd number in hexadecimal, as 1, which needs --key-command.
+    /// Then unlock the ECU at this level: an odd number in hexadecimal, as 1. Requires --key-command.
     #[arg(long, value_name = "LEVEL", value_parser = level, requires = "key_command", global = true)]
     security: Option<u8>,
-    /// A command that makes the key: it gets the seed in hexadecimal on standard input, and in place of {seed}, and prints the key in
-    /// hexadecimal.
+    /// A command that computes the key: it gets the seed in hexadecimal on standard input, and in place of {seed}, and prints the key
+    /// in hexadecimal.
     #[arg(long, value_name = "COMMAND", global = true)]
     key_command: Option<String>,
 }
@@ -27,13 +27,13 @@ fn level(text: &str) -> Result<u8, String> {
 }
 
 impl KeyArgs {
-    /// Unlocks it, if that was asked for.
+    /// Unlocks it, if requested.
     pub fn unlock(&self, client: &mut Client<'_>) -> anyhow::Result<()> {
         let (Some(level), Some(command)) = (self.security, &self.key_command) else { return Ok(()) };
         let answer = first(client.ask(&[0x27, level])?)?;
         client.all_agreed()?;
         let seed = answer.data.get(2..).unwrap_or_default();
-        // An ECU that is unlocked says so by a seed of zeros (ISO 14229-1).
+        // An ECU that is already unlocked sends a seed of zeros (ISO 14229-1).
         if seed.iter().all(|byte| *byte == 0) {
             return Ok(());
         }
@@ -53,7 +53,7 @@ fn key(command: &str, seed: &[u8]) -> anyhow::Result<Vec<u8>> {
     shell.args([if cfg!(windows) { "/C" } else { "-c" }, &line]).stdin(Stdio::piped()).stdout(Stdio::piped());
     let mut child = shell.spawn().context("cannot run the shell for --key-command")?;
     if let Some(mut stdin) = child.stdin.take() {
-        // A command that takes the seed from its line may not read.
+        // A command that takes the seed from its arguments may not read it.
         let _ = writeln!(stdin, "{seed}");
     }
     let output = child.wait_with_output().context("cannot read from --key-command")?;
@@ -63,7 +63,7 @@ fn key(command: &str, seed: &[u8]) -> anyhow::Result<Vec<u8>> {
         Ok(Hex(key)) => Ok(key),
         Err(_) => {
             bail!(
-                "--key-command '{command}' printed '{}', which is no key in hexadecimal; no key was sent",
+                "--key-command '{command}' printed '{}', which is not a key in hexadecimal; no key was sent",
                 text.trim()
             )
         }

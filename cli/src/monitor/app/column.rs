@@ -1,4 +1,4 @@
-//! What the fixed view can be sorted by.
+//! The columns by which the fixed view can be sorted.
 
 /// A column to sort by.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Deserialize)]

@@ -1,13 +1,13 @@
-//! Completing what is typed for the send list: messages, their signals, texts of values.
+//! Completes what is typed for the send list: messages, their signals, texts of values.
 
 use cantap_signals::Decoder;
 
-/// What completing came to.
+/// The result of completing.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Completed {
-    /// The text, as far as it is certain.
+    /// The text, as far as it is unambiguous.
     pub text: String,
-    /// What it can go on with, if that is several things.
+    /// The possible continuations, if there are several.
     pub choices: Vec<String>,
 }
 
@@ -42,7 +42,7 @@ pub fn complete(text: &str, decoder: &Decoder) -> Completed {
     }
 }
 
-/// The names that begin with what was typed, in whatever case.
+/// The names that begin with what was typed, ignoring case.
 fn best<'a>(before: &str, typed: &str, names: impl Iterator<Item = &'a str>, behind: &str) -> Completed {
     let small = typed.to_lowercase();
     let mut fitting: Vec<&str> = names.filter(|name| name.to_lowercase().starts_with(&small)).collect();
@@ -57,7 +57,7 @@ fn best<'a>(before: &str, typed: &str, names: impl Iterator<Item = &'a str>, beh
                 start.is_some() && fitting.iter().all(|name| name.get(..*len) == start)
             };
             let common = (0..=first.len()).rev().find(is_common).unwrap_or(0);
-            // Names that differ in capitals only share less than was typed.
+            // Names that differ only in case have less in common than was typed.
             let text = if common < typed.len() { typed } else { &first[..common] };
             Completed {
                 text: format!("{before}{text}"),

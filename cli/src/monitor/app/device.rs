@@ -1,4 +1,4 @@
-//! Another device, other bit rates, another mode.
+//! Changes the device, bit rates, or mode.
 
 use cantap::wire::message::Mode;
 use cantap_address::{Address, AddressError};
@@ -12,7 +12,7 @@ use super::state::App;
 use crate::channel_bitrate::ChannelBitrate;
 
 impl App {
-    /// Between listen-only and taking part, which is asked for: whatever acknowledges changes the bus.
+    /// Switches between listen-only and taking part, after asking: acknowledging changes the bus.
     pub(super) fn toggle_mode(&mut self) {
         match &self.plan {
             None => "a file has no mode".clone_into(&mut self.message),
@@ -21,7 +21,7 @@ impl App {
         }
     }
 
-    /// Whether to take part was answered: only a clear yes is one.
+    /// The answer to whether to take part: only a clear yes counts.
     pub(super) fn answer_normal(&mut self, text: &str) {
         if matches!(text.to_ascii_lowercase().as_str(), "y" | "yes") {
             self.set_mode(Mode::Normal);
@@ -76,7 +76,7 @@ impl App {
         self.open(plan, model)
     }
 
-    /// Opens another device, or at other bit rates: whatever was agreed to before was for another bus, so it only listens.
+    /// Opens another device, or other bit rates: what the user agreed to before concerned another bus, so it only listens.
     fn open(&mut self, mut plan: Plan, model: &Model) -> Result<(), String> {
         if plan.mode() != Mode::ListenOnly {
             plan.open.set_mode(Mode::ListenOnly);

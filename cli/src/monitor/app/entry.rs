@@ -13,19 +13,19 @@ use crate::args::MOST_CHANNELS;
 pub struct SendEntry {
     /// As typed: a frame, or a message with its signals.
     pub text: String,
-    /// Where to: the channel's number, from 1.
+    /// The channel's number, from 1.
     pub channel: u8,
     /// The frame.
     pub frame: Frame,
-    /// How often; once per key without.
+    /// The period; `None` to send once per key press.
     pub period: Option<Duration>,
-    /// The device's slot that sends it now, if one does.
+    /// The device's slot that is sending it, if any.
     pub slot: Option<u8>,
     /// How often it was sent by key.
     pub sent: u64,
 }
 
-/// A line of the send list: `[CHANNEL:]FRAME [PERIOD]`, or a message with its signals in the frame's place.
+/// A line of the send list: `[CHANNEL:]FRAME [PERIOD]`, or a message with its signals instead of the frame.
 pub fn parse_entry(text: &str, model: &Model) -> Result<SendEntry, String> {
     let (what, period) = match text.split_once(char::is_whitespace) {
         Some((what, period)) => (what, Some(crate::args::duration(period.trim())?)),

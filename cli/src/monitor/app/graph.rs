@@ -1,40 +1,40 @@
-//! The graph's window in time and its two cursors, and what keys and the mouse do to them.
+//! The graph's time window and its two cursors, and how keys and the mouse change them.
 
 use ratatui::crossterm::event::{KeyCode, KeyModifiers, MouseButton, MouseEvent, MouseEventKind};
 use ratatui::layout::Rect;
 
-/// The shortest window, in nanoseconds: 0.1 ms, in which a fast bus has two frames.
+/// The shortest window, in nanoseconds: 0.1 ms, which contains two frames of a fast bus.
 const LEAST_SPAN_NS: i64 = 100_000;
 /// The longest, in nanoseconds: a week.
 const MOST_SPAN_NS: i64 = 604_800_000_000_000;
-/// So much of the window a key pans by: one part in this many.
+/// A key pans by the window's length divided by this.
 const PAN: i64 = 10;
 
-/// What the graph shows of the time.
+/// The graph's view of time.
 #[derive(Clone, Debug)]
 pub struct Graph {
     /// Length of the window, in nanoseconds.
     pub span_ns: i64,
-    /// Where it ends, in nanoseconds as in a record; with the newest without.
+    /// Its end, in nanoseconds as in a record; `None` to follow the newest.
     pub end_ns: Option<i64>,
     /// The cursors A and B.
     pub cursors: [Option<i64>; 2],
-    /// Which of them the keys move.
+    /// The cursor moved by the keys.
     pub active: usize,
-    /// Straight lines from value to value, in place of steps that hold each until the next.
+    /// Straight lines from value to value, instead of steps that hold each value until the next.
     pub lines: bool,
-    /// What was drawn last.
+    /// What was last drawn.
     pub drawn: Drawn,
 }
 
 /// A graph as it was drawn.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Drawn {
-    /// The columns that the curves take.
+    /// The columns taken by the curves.
     pub area: Rect,
     /// The window's begin.
     pub from_ns: i64,
-    /// The time of the oldest value there is.
+    /// The time of the oldest value.
     pub oldest_ns: i64,
     /// The time of the newest record.
     pub now_ns: i64,
@@ -54,13 +54,13 @@ impl Default for Graph {
 }
 
 impl Graph {
-    /// The window in time: from when until when.
+    /// The time window: its beginning and end.
     pub fn window(&self, now_ns: i64) -> (i64, i64) {
         let end = self.end_ns.unwrap_or(now_ns);
         (end.saturating_sub(self.span_ns), end)
     }
 
-    /// The time in the middle of a column of the screen, if curves are there.
+    /// The time in the middle of a screen column, if it is part of the curves.
     fn time_at(&self, column: u16) -> Option<i64> {
         let area = self.drawn.area;
         let place = column.checked_sub(area.x).filter(|place| *place < area.width)?;
@@ -68,18 +68,19 @@ impl Graph {
         Some(self.drawn.from_ns.saturating_add((share * self.span_ns as f64) as i64))
     }
 
-    /// Lets the window end there; at the newest it goes on following.
+    /// Ends the window at this time; at the newest, it continues to follow.
     fn end_at(&mut self, end_ns: i64) {
         self.end_ns = (end_ns < self.drawn.now_ns).then_some(end_ns);
     }
 
     fn pan(&mut self, by_ns: i64) {
         let end = self.drawn.from_ns.saturating_add(self.span_ns).saturating_add(by_ns);
-        // Something of the past stays in sight.
+        // Some of the past stays in sight.
         self.end_at(end.max(self.drawn.oldest_ns.saturating_add(self.span_ns / PAN)));
     }
 
-    /// A window of another length in which one time keeps its place; without one, the end does if it follows, else the middle.
+    /// Changes the window's length while one time keeps its place; without one, the end does when following, otherwise the
+    /// middle.
     fn zoom(&mut self, factor: f64, around_ns: Option<i64>) {
         let (from, span) = (self.drawn.from_ns, self.span_ns);
         let wanted = ((span as f64 * factor) as i64).clamp(LEAST_SPAN_NS, MOST_SPAN_NS);
@@ -92,20 +93,21 @@ impl Graph {
         }
     }
 
-    /// Everything there is.
+    /// Shows the whole time.
     fn show_all(&mut self) {
         let all = self.drawn.now_ns.saturating_sub(self.drawn.oldest_ns);
         self.span_ns = all.saturating_add(all / 50).clamp(LEAST_SPAN_NS, MOST_SPAN_NS);
         self.end_ns = None;
     }
 
-    /// The cursor that keys move, if it is in sight.
+    /// The cursor moved by keys, if it is in sight.
     fn cursor_in_sight(&self) -> Option<i64> {
         let (from, until) = (self.drawn.from_ns, self.drawn.from_ns.saturating_add(self.span_ns));
         self.cursors[self.active].filter(|cursor| (from..=until).contains(cursor))
     }
 
-    /// Sets the first cursor, then the second, each in the middle; then lets the keys move the other one.
+    /// Sets the first cursor, then the second, each in the middle; after that, switches the cursor that keys
+    /// move.
     fn next_cursor(&mut self) {
         let middle = self.drawn.from_ns.saturating_add(self.span_ns / 2);
         match self.cursors {
@@ -115,7 +117,7 @@ impl Graph {
         }
     }
 
-    /// One column further; the window goes with a cursor that leaves it.
+    /// Moves a cursor by columns; the window follows a cursor that leaves it.
     fn move_cursor(&mut self, cursor_ns: i64, columns: i64) {
         let column = self.span_ns / i64::from(self.drawn.area.width.max(1));
         let moved = cursor_ns.saturating_add(columns.saturating_mul(column.max(1)));
@@ -126,7 +128,7 @@ impl Graph {
         }
     }
 
-    /// A key on the graph's page.
+    /// Handles a key on the graph's page.
     pub fn key(&mut self, code: KeyCode) {
         let step = self.span_ns / PAN;
         let cursor = self.cursor_in_sight();
@@ -153,7 +155,8 @@ impl Graph {
         }
     }
 
-    /// The mouse on the graph: its buttons set a cursor each and drag it, the wheel zooms where it points, and pans with Shift.
+    /// Handles the mouse on the graph: its buttons set a cursor each and drag it, the wheel zooms at the pointer, or pans with
+    /// Shift.
     pub fn mouse(&mut self, event: MouseEvent) {
         let at = self.time_at(event.column);
         let step = self.span_ns / PAN;
@@ -173,7 +176,7 @@ impl Graph {
             MouseEventKind::ScrollDown if shift => self.pan(step),
             MouseEventKind::ScrollLeft => self.pan(-step),
             MouseEventKind::ScrollRight => self.pan(step),
-            // What the mouse points at stays where it is; at the newest it goes on following.
+            // The time under the pointer stays where it is; at the newest, it continues to follow.
             MouseEventKind::ScrollUp => self.zoom(0.5, at),
             MouseEventKind::ScrollDown => self.zoom(2.0, at),
             _ => {}

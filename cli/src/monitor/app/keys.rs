@@ -1,4 +1,4 @@
-//! What keys and the mouse do.
+//! Handles keys and the mouse.
 
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers, MouseButton, MouseEvent, MouseEventKind};
 
@@ -11,20 +11,20 @@ use super::scroll::first_row;
 use super::state::{App, Direction, Flow, View};
 use super::wish::Wish;
 
-/// The row where a page's own rows begin, its heading.
+/// The row where a page's own rows begin: its heading.
 const BODY_ROW: u16 = 2;
-/// Rows that one step of the wheel scrolls.
+/// Number of rows that one step of the wheel scrolls.
 const WHEEL_ROWS: usize = 3;
 
 impl App {
-    /// A key was pressed.
+    /// Handles a key.
     pub fn key(&mut self, key: KeyEvent, model: &mut Model) -> Flow {
         self.message.clear();
         self.search = None;
-        // Whoever presses a key has read it.
+        // Anyone who presses a key has read it.
         model.notice.clear();
         let key = match (key.code, key.modifiers) {
-            // So arrives an Enter that was typed before the terminal was ours, or pasted.
+            // This is how Enter arrives when typed before the program took over the terminal, or when pasted.
             (KeyCode::Char('j'), KeyModifiers::CONTROL) => KeyEvent::from(KeyCode::Enter),
             _ => key,
         };
@@ -101,7 +101,7 @@ impl App {
         Flow::GoOn
     }
 
-    /// A key with Control, which a plain letter's meaning must not get.
+    /// A key with Control, which must not act like the plain letter.
     fn key_with_control(&mut self, key: KeyEvent) -> Flow {
         match (key.code, &mut self.prompt) {
             (KeyCode::Char('c'), _) => return Flow::Quit,
@@ -112,7 +112,7 @@ impl App {
         Flow::GoOn
     }
 
-    /// Keys that mean something on this page only.
+    /// Keys that have a meaning only on this page.
     fn page_key(&mut self, code: KeyCode, model: &mut Model) {
         match (self.view, code) {
             (View::Trace, KeyCode::Char('y')) => self.copy(model),
@@ -148,7 +148,7 @@ impl App {
         }
     }
 
-    /// Shows the signals of the selected row of the fixed view below it, or no more.
+    /// Shows or hides the signals of the selected row below it in the fixed view.
     fn open_row(&mut self) {
         if let Some(key) = self.fixed_order.get(self.selected).copied()
             && !self.opened.remove(&key)
@@ -173,7 +173,7 @@ impl App {
         });
     }
 
-    /// Puts a signal into the graph, or takes it out, in what is shown and in what goes on behind it.
+    /// Adds a signal to the graph, or removes it, both in what is shown and in what continues behind it.
     fn toggle_signal(&mut self, row: usize, model: &mut Model) {
         let Model { history, seen, .. } = model;
         for seen in std::iter::once(seen).chain(self.frozen.as_deref_mut()) {
@@ -181,7 +181,7 @@ impl App {
         }
     }
 
-    /// Sorts by the heading in this column; once more, the other way round.
+    /// Sorts by the heading in this column; a second time in reverse.
     fn click_heading(&mut self, column: u16) {
         match self.view {
             View::Fixed => {
@@ -206,11 +206,12 @@ impl App {
     fn copy(&mut self, model: &Model) {
         let place = self.cursor.or(model.history.end().checked_sub(1));
         self.clipboard = place.and_then(|place| candump_line(&model.history.get(place)?));
-        let said = if self.clipboard.is_some() { "copied" } else { "this is no frame; nothing was copied" };
+        let said =
+            if self.clipboard.is_some() { "copied" } else { "this is not a frame; nothing was copied" };
         said.clone_into(&mut self.message);
     }
 
-    /// The mouse was used.
+    /// Handles the mouse.
     pub fn mouse(&mut self, event: MouseEvent, model: &mut Model) {
         let is_busy = self.prompt.is_some() || self.help;
         let is_on_page = event.row >= BODY_ROW;
@@ -249,7 +250,7 @@ impl App {
         if event.row == BODY_ROW {
             return self.click_heading(event.column);
         }
-        // The page begins with a heading; the send list's stands below a sentence.
+        // A page begins with a heading; that of the send list is below a sentence.
         let body_row = BODY_ROW + if self.view == View::Send { 2 } else { 1 };
         let Some(row) = event.row.checked_sub(body_row).map(usize::from).filter(|row| *row < self.page_rows)
         else {

@@ -1,8 +1,8 @@
-//! A line of text that is being typed.
+//! A line of text being typed.
 
 use ratatui::crossterm::event::KeyCode;
 
-/// Text with a place in it.
+/// Text with a cursor.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Line {
     text: Vec<char>,
@@ -10,24 +10,24 @@ pub struct Line {
 }
 
 impl Line {
-    /// This text, to be continued at its end.
+    /// This text, with the cursor at its end.
     pub fn new(text: &str) -> Self {
         let text: Vec<char> = text.chars().collect();
         Self { place: text.len(), text }
     }
 
-    /// What stands there.
+    /// The whole text.
     pub fn text(&self) -> String {
         self.text.iter().collect()
     }
 
-    /// What stands before the place, and from it on.
+    /// The text before the cursor, and the text after it.
     pub fn halves(&self) -> (String, String) {
         let (before, behind) = self.text.split_at(self.place);
         (before.iter().collect(), behind.iter().collect())
     }
 
-    /// What stands before the place becomes this.
+    /// Replaces the text before the cursor.
     pub fn replace_before(&mut self, text: &str) {
         let behind = self.text.split_off(self.place);
         self.text = text.chars().collect();
@@ -40,7 +40,7 @@ impl Line {
         *self = Self::default();
     }
 
-    /// A key that edits; others do nothing.
+    /// Handles an editing key; others do nothing.
     pub fn key(&mut self, code: KeyCode) {
         match code {
             KeyCode::Char(character) => {
@@ -63,10 +63,10 @@ impl Line {
     }
 }
 
-/// What a line of input is for.
+/// The purpose of an input line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PromptKind {
-    /// Text to look for in the trace.
+    /// Text to search for in the trace.
     Search,
     /// Filters in candump's syntax.
     Filter,
@@ -82,16 +82,16 @@ pub enum PromptKind {
     Normal,
     /// Which signals to show.
     Signals,
-    /// A place in a file.
+    /// A position in a file.
     Time,
     /// A trace or a database.
     Open,
 }
 
-/// A line of input.
+/// An input line.
 #[derive(Clone, Debug)]
 pub struct Prompt {
-    /// What for.
+    /// Its purpose.
     pub kind: PromptKind,
     /// What was typed.
     pub line: Line,

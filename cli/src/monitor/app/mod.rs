@@ -1,4 +1,4 @@
-//! What the user has chosen: page, place, sorting, lines of input. What keys do is in the files beside this one.
+//! The user's choices: page, position, sorting, input lines. The files beside this one handle keys.
 
 mod column;
 mod completion;
@@ -33,13 +33,13 @@ pub use state::{App, Flow, TimeMode, View};
 pub use wish::Wish;
 
 impl App {
-    /// Decodes with the databases that there are now; what was frozen goes on.
+    /// Decodes with the current databases; a frozen display is updated too.
     pub(super) fn use_databases(&mut self, model: &mut Model) {
         model.set_decoder(Arc::new(self.databases.decoder()));
         self.frozen = None;
     }
 
-    /// Takes over what the source found out, and goes on with a search. To be called before each drawing.
+    /// Takes over what the source has found out, and continues a search. Call it before each drawing.
     pub fn catch_up(&mut self, model: &mut Model) {
         self.search_on(model);
         if let Some(plan) = model.found.take() {
@@ -48,7 +48,7 @@ impl App {
         if self.sessions != model.sessions {
             let known = std::mem::replace(&mut self.sessions, model.sessions.clone());
             let is_new = |board: usize| known.get(board) != model.sessions.get(board);
-            // A device forgets what it was to send periodically when its session ends.
+            // A device forgets periodic frames when its session ends.
             let entries = self.send.iter_mut().filter(|entry| is_new(place_of(entry.channel).0));
             let were_on = entries.filter_map(|entry| entry.slot.take()).count();
             if were_on > 0 {

@@ -1,4 +1,4 @@
-//! Traces and databases opened from inside, and which of several sources is looked at.
+//! Opens traces and databases from inside, and selects which of several sources is shown.
 
 use std::path::Path;
 
@@ -11,7 +11,7 @@ use super::wish::Wish;
 use crate::databases::Said;
 
 impl App {
-    /// A database is used from now on, besides the others; a trace is opened beside what runs.
+    /// Uses a database from now on, in addition to the others; a trace is opened beside what is running.
     pub(super) fn open_file(&mut self, text: &str, model: &mut Model) -> Result<(), String> {
         let path = Path::new(text);
         if !is_database(path) {
@@ -34,7 +34,7 @@ impl App {
         Ok(())
     }
 
-    /// A trace's name where a device's could stand, though no such file may be there: a slip must not close the device.
+    /// Whether a text typed as a device is the name of a trace, existing or not: a slip must not close the device.
     pub(super) fn is_trace(text: &str) -> bool {
         let path = Path::new(text);
         !Address::is_meant_by(path) && (path.is_file() || Format::of_path(path).is_ok())
@@ -49,7 +49,7 @@ impl App {
     }
 }
 
-/// Whether a file is a signal database, by its name, which may have a channel before it.
+/// Whether a file is a signal database, judging by its name, which may have a channel before it.
 fn is_database(path: &Path) -> bool {
     let suffix = path.extension().and_then(|suffix| suffix.to_str()).unwrap_or_default();
     ["dbc", "toml", "arxml", "kcd", "sym"].iter().any(|known| suffix.eq_ignore_ascii_case(known))

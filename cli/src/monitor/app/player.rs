@@ -1,11 +1,11 @@
-//! Playback: where to go in a file, and bookmarks.
+//! Playback: moving within a file, and bookmarks.
 
 use super::super::model::{Model, Playing, SourceState};
 use super::super::order::Order;
 use super::state::{App, View};
 use crate::args;
 
-/// How far a key goes, in nanoseconds.
+/// How far a key moves, in nanoseconds.
 const STEP_NS: i64 = 10_000_000_000;
 
 impl App {
@@ -17,7 +17,7 @@ impl App {
         None
     }
 
-    /// Forward or back by ten seconds.
+    /// Moves forward or back by ten seconds.
     pub(super) fn seek_by(&mut self, steps: i64, model: &Model) {
         if let Some(playing) = self.playing(model) {
             self.seek(playing.position_ns.saturating_add(steps * STEP_NS), playing);
@@ -26,13 +26,13 @@ impl App {
 
     fn seek(&mut self, time_ns: i64, playing: Playing) {
         let last = playing.end_ns.unwrap_or(i64::MAX).max(playing.first_ns);
-        // What is shown next is another place.
+        // What is shown next is elsewhere.
         self.cursor = None;
         self.frozen = None;
         self.order(Order::Seek(time_ns.clamp(playing.first_ns, last)));
     }
 
-    /// To a time since the beginning, or a share of the whole.
+    /// Moves to a time since the beginning, or a fraction of the whole.
     pub(super) fn seek_to(&mut self, text: &str, model: &Model) -> Result<(), String> {
         let Some(playing) = self.playing(model) else { return Ok(()) };
         let ahead = match text.strip_suffix('%') {
@@ -48,7 +48,7 @@ impl App {
         Ok(())
     }
 
-    /// To where a click on the bar points.
+    /// Moves to where the bar was clicked.
     pub(super) fn seek_share(&mut self, share: f64, model: &Model) {
         if let SourceState::Playing(playing @ Playing { end_ns: Some(end), .. }) = model.source {
             let ahead = (end.saturating_sub(playing.first_ns) as f64 * share) as i64;
@@ -56,7 +56,7 @@ impl App {
         }
     }
 
-    /// Stops the playback or lets it go on; from its end, from the beginning.
+    /// Pauses or resumes playback; at the end, restarts it from the beginning.
     pub(super) fn toggle_playback(&mut self, model: &Model) {
         match model.source {
             SourceState::Playing(playing) if playing.ended => {
@@ -69,7 +69,7 @@ impl App {
         }
     }
 
-    /// Marks the selected record's time, or the position.
+    /// Bookmarks the selected record's time, or the position.
     pub(super) fn bookmark(&mut self, model: &Model) {
         let selected = self.cursor.filter(|_| self.view == View::Trace);
         let selected = selected.and_then(|place| model.history.get(place)).map(|record| record.time_ns);
@@ -84,7 +84,8 @@ impl App {
         self.message = format!("bookmark {} set; {{ and }} go to them", self.bookmarks.len());
     }
 
-    /// To the bookmark before or after: in a file by playing from there, in what a device sent by selecting it.
+    /// Moves to the previous or next bookmark: in a file by playing from there, in a device's records by
+    /// selecting one.
     pub(super) fn go_to_bookmark(&mut self, forward: bool, model: &Model) {
         let selected = self.cursor.and_then(|place| model.history.get(place));
         let here = match model.source {

@@ -1,4 +1,4 @@
-//! What becomes of what was typed into a line of input.
+//! Handles what was typed into an input line.
 
 use std::path::Path;
 
@@ -34,7 +34,7 @@ impl App {
         }
     }
 
-    /// A line was typed. What is wrong with it is said, and the line stays open.
+    /// Handles a completed line. Errors are shown, and the line stays open.
     fn answer(&mut self, prompt: Prompt, model: &mut Model) {
         let line = prompt.line.text();
         let text = line.trim();
@@ -81,7 +81,7 @@ impl App {
         Ok(())
     }
 
-    /// Which signals this page shows, or has rows of.
+    /// The filter for the signals that this page shows, or for its rows.
     pub(super) fn signal_filter(&mut self) -> &mut SignalFilter {
         if self.view == View::Fixed { &mut self.row_filter } else { &mut self.signals.filter }
     }

@@ -1,4 +1,4 @@
-//! Moving through a page's rows.
+//! Moves through a page's rows.
 
 use ratatui::crossterm::event::KeyCode;
 
@@ -11,7 +11,7 @@ pub fn first_row(selected: usize, rows: usize) -> usize {
 }
 
 impl App {
-    /// In a list: what is past its end is drawn as its end.
+    /// In a list: a position past its end is drawn as its end.
     pub(super) fn scroll(&mut self, code: KeyCode) {
         let page = self.page_rows.max(1);
         self.selected = match code {
@@ -25,7 +25,7 @@ impl App {
         };
     }
 
-    /// In the trace, whose end moves on.
+    /// In the trace, whose end keeps moving.
     pub(super) fn scroll_trace(&mut self, code: KeyCode, model: &Model) {
         let (first, Some(last)) = (model.history.first(), model.history.end().checked_sub(1)) else {
             return;
@@ -45,7 +45,7 @@ impl App {
             }
             _ => return,
         };
-        // Everything may be filtered out: then there is nothing to select.
+        // Everything may be filtered out, in which case there is nothing to select.
         self.cursor = (first <= last).then(|| wanted.clamp(first, last));
     }
 }

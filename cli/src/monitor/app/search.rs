@@ -1,4 +1,4 @@
-//! Looking for something in the trace: a piece at a time, so that millions of records hold up neither the source nor the display.
+//! Searches the trace: a piece at a time, so that millions of records delay neither the source nor the display.
 
 use std::fmt::{Display, Write};
 
@@ -9,11 +9,11 @@ use super::super::model::Model;
 use super::line::PromptKind;
 use super::state::{App, Direction, Search, View};
 
-/// Records that are looked at between two drawings, in some twenty milliseconds.
+/// How many records are searched between two drawings, which takes some twenty milliseconds.
 const AT_ONCE: u64 = 100_000;
 
 impl App {
-    /// Whether there is something to search on this page; says so if not.
+    /// Whether this page can be searched; shows a message if not.
     pub(super) fn can_search(&mut self) -> bool {
         let can = matches!(self.view, View::Trace | View::Fixed | View::Signals | View::Send);
         if !can {
@@ -23,7 +23,7 @@ impl App {
         can
     }
 
-    /// Looks for the next record or row that has what was last looked for. In the trace that is back in time, in a list downwards.
+    /// Finds the next record or row with the last search text. In the trace that is back in time, in a list downwards.
     pub(super) fn find(&mut self, model: &Model, direction: Direction) {
         if self.wanted.is_empty() {
             return self.ask(PromptKind::Search, "");
@@ -40,7 +40,7 @@ impl App {
         self.search_on(model);
     }
 
-    /// In a list, from the row after the selected one on, round its end.
+    /// In a list: from the row after the selected one, wrapping at the end.
     fn find_row(&mut self, model: &Model, direction: Direction) {
         let seen = self.frozen.as_deref().unwrap_or(&model.seen);
         let signals = &seen.signals;
@@ -73,11 +73,11 @@ impl App {
         });
         match steps.into_iter().find(|place| rows[*place].to_uppercase().contains(&self.wanted)) {
             Some(place) => self.selected = place,
-            None => self.message = format!("'{}' is not there", self.wanted),
+            None => self.message = format!("'{}' was not found", self.wanted),
         }
     }
 
-    /// Goes on with a search for a while.
+    /// Continues a search for a while.
     pub(super) fn search_on(&mut self, model: &Model) {
         let Some(search) = self.search.take() else {
             return;
@@ -109,7 +109,7 @@ impl App {
                 self.search = Some(Search { at, ..search });
                 self.message = format!("looking for '{}'; any key stops", self.wanted);
             }
-            (None, None) => self.message = format!("'{}' is not there", self.wanted),
+            (None, None) => self.message = format!("'{}' was not found", self.wanted),
         }
     }
 }
@@ -119,11 +119,11 @@ fn compact(text: &str) -> String {
 }
 
 struct Matcher<'a> {
-    /// In capitals.
+    /// In upper case.
     text: &'a str,
     /// The same without blanks, for bytes.
     compact: String,
-    /// One for all records.
+    /// One buffer for all records.
     line: String,
 }
 

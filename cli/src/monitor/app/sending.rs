@@ -1,4 +1,4 @@
-//! The send list: frames that go onto the bus by key, or periodically by the device itself.
+//! The send list: frames sent by key, or periodically by the device itself.
 
 use super::super::order::Order;
 use super::entry::SendEntry;
@@ -6,7 +6,7 @@ use super::line::{Line, Prompt, PromptKind};
 use super::state::App;
 
 impl App {
-    /// Whether frames can be sent; says why not.
+    /// Whether frames can be sent; shows a message if not.
     fn can_send(&mut self) -> bool {
         let reason = match &self.plan {
             None => "a file sends nothing; open a device with D",
@@ -42,7 +42,7 @@ impl App {
         }
     }
 
-    /// Lets the device send an entry periodically, in a slot of its own.
+    /// Has the device send an entry periodically, in a separate slot.
     fn start_periodic(&mut self, place: usize) {
         let Some(SendEntry { channel, frame, period: Some(period), .. }) = self.send.get(place).cloned()
         else {
@@ -67,7 +67,7 @@ impl App {
         }
     }
 
-    /// Puts an entry at its place; what is sent periodically goes on as it is now.
+    /// Puts an entry in its place; if it is being sent periodically, that continues with the new one.
     pub(super) fn put_entry(&mut self, place: Option<usize>, entry: SendEntry) {
         let Some(place) = place.filter(|place| *place < self.send.len()) else {
             self.send.push(entry);

@@ -1,8 +1,8 @@
-//! The signals page: what it is sorted by, and which signals it shows.
+//! The signals page: its sorting, and which signals it shows.
 
 use std::ops::Range;
 
-/// What the signals page can be sorted by.
+/// The columns by which the signals page can be sorted.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum SignalColumn {
     /// In order of appearance.
@@ -34,23 +34,23 @@ impl SignalColumn {
     }
 }
 
-/// How the signals page is.
+/// The state of the signals page.
 #[derive(Clone, Debug, Default)]
 pub struct SignalsPage {
-    /// What it is sorted by.
+    /// The column by which it is sorted.
     pub sort: SignalColumn,
-    /// Sorted the other way round.
+    /// In reverse order.
     pub reverse: bool,
-    /// Below their messages.
+    /// Grouped by message.
     pub grouped: bool,
     /// Which signals are shown.
     pub filter: SignalFilter,
-    /// Where the headings that sort stand, as last drawn.
+    /// The positions of the headings that sort, as last drawn.
     pub headings: Vec<(Range<u16>, SignalColumn)>,
 }
 
 impl SignalsPage {
-    /// A heading was clicked: sorts by it, and again the other way round.
+    /// Handles a click on a heading: sorts by it, or reverses the order.
     pub fn sort_by(&mut self, column: SignalColumn) {
         if self.sort == column {
             self.reverse = !self.reverse;
@@ -67,7 +67,7 @@ pub struct SignalFilter {
     conditions: Vec<Condition>,
 }
 
-/// A part of a name, in small letters, with `*` for anything; and what the value must be.
+/// A part of a name, in lower case, with `*` for anything; and a condition for the value.
 #[derive(Clone, Debug)]
 struct Condition {
     name: Vec<String>,
@@ -96,7 +96,7 @@ impl Comparison {
     ];
 
     fn holds(self, value: f64, than: f64) -> bool {
-        /// Values with fractions are what a multiplication makes of whole numbers, and off by its rounding.
+        /// Fractions come from multiplying integers, and have a rounding error.
         const ROUNDING: f64 = 1e-9;
         let is_same = (value - than).abs() <= ROUNDING * value.abs().max(than.abs());
         match self {
@@ -111,14 +111,14 @@ impl Comparison {
 }
 
 impl SignalFilter {
-    /// `Speed > 80 and Wheel`: parts of names (`*` is anything), values, `alarm`. Nothing shows all.
+    /// `Speed > 80 and Wheel`: parts of names (`*` is anything), values, `alarm`. An empty text shows all.
     pub fn new(text: &str) -> Result<Self, String> {
         let parts = text.split(" and ").map(str::trim).filter(|part| !part.is_empty());
         let conditions = parts.map(Condition::new).collect::<Result<_, _>>()?;
         Ok(Self { text: text.trim().to_owned(), conditions })
     }
 
-    /// As it was typed.
+    /// The text as typed.
     pub fn text(&self) -> &str {
         &self.text
     }
@@ -150,7 +150,7 @@ impl Condition {
             Some((name, comparison, value)) => {
                 let number = value.parse::<f64>().ok().filter(|number| number.is_finite());
                 let number = number.ok_or_else(|| {
-                    format!("'{value}' is no number; write part of a name, a condition such as Speed > 80, or alarm")
+                    format!("'{value}' is not a number; write part of a name, a condition such as Speed > 80, or alarm")
                 })?;
                 (name, Some((comparison, number)))
             }

@@ -37,7 +37,7 @@ pub enum View {
     Send,
     /// Recording.
     Record,
-    /// Nodes, transfers, and what was said.
+    /// Nodes, transfers, and events.
     Nodes,
 }
 
@@ -54,7 +54,7 @@ impl View {
         View::Nodes,
     ];
 
-    /// What its tab says.
+    /// The text of its tab.
     pub const fn title(self) -> &'static str {
         match self {
             Self::Trace => "Trace",
@@ -78,14 +78,14 @@ impl View {
     }
 }
 
-/// How times are shown.
+/// The form in which times are shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TimeMode {
     /// The time of day, UTC.
     Absolute,
     /// Seconds since the first record.
     Relative,
-    /// Seconds since the record before.
+    /// Seconds since the previous record.
     Delta,
 }
 
@@ -105,90 +105,91 @@ pub struct App {
     pub view: View,
     /// How to draw.
     pub theme: Theme,
-    /// What there was to see when the display was stopped; the model goes on.
+    /// What was on display when it was paused; the model continues.
     pub frozen: Option<Box<Seen>>,
-    /// How times are shown.
+    /// The form in which times are shown.
     pub time_mode: TimeMode,
-    /// Place of the trace's selected record; the newest without.
+    /// Position of the trace's selected record; `None` for the newest.
     pub cursor: Option<u64>,
-    /// Place of the first record below the trace's page, as last drawn.
+    /// Position of the first record below the trace's page, as last drawn.
     pub bottom: u64,
-    /// What was last looked for, in capitals.
+    /// The last search text, in upper case.
     pub(super) wanted: String,
-    /// The search that is under way.
+    /// The search in progress.
     pub(super) search: Option<Search>,
-    /// The fixed view's column that rows are sorted by.
+    /// The column by which the fixed view's rows are sorted.
     pub sort: Column,
-    /// Sorted the other way round.
+    /// In reverse order.
     pub reverse: bool,
     /// Rows grouped by channel.
     pub grouped: bool,
     /// Show how often each bit changed.
     pub heat: bool,
-    /// Where the fixed view's headings that sort stand, as last drawn.
+    /// The positions of the fixed view's headings that sort, as last drawn.
     pub sort_columns: Vec<(Range<u16>, Column)>,
-    /// Identifiers whose signals stand below their row.
+    /// Identifiers whose signals are shown below their row.
     pub opened: HashSet<(u8, Id)>,
-    /// The fixed view shows identifiers with a signal that is so.
+    /// The fixed view shows only identifiers with a matching signal.
     pub row_filter: SignalFilter,
     /// The signals of the trace's selected record are shown.
     pub record_opened: bool,
-    /// How the signals page is.
+    /// The state of the signals page.
     pub signals: SignalsPage,
     /// Selected row of the fixed, signals and send views.
     pub selected: usize,
-    /// What the fixed view's rows are, by identifier, as last drawn.
+    /// The identifiers in the fixed view's rows, as last drawn.
     pub fixed_order: Vec<(u8, Id)>,
-    /// What the signals view's rows are, by place in the table, as last drawn; none is a message's name.
+    /// The signals in the signals view's rows, by index in the table, as last drawn; `None` for a message's
+    /// name.
     pub signal_order: Vec<Option<usize>>,
-    /// Rows of the page that fit, as last drawn.
+    /// Number of rows that fit on the page, as last drawn.
     pub page_rows: usize,
-    /// What the graph shows of the time.
+    /// The graph's view of time.
     pub graph: Graph,
     /// Frames to send.
     pub send: Vec<SendEntry>,
     /// The help is shown.
     pub help: bool,
-    /// Its first line in sight; what is past the last is drawn as that.
+    /// The first line of the help that is shown; a position past the end is drawn as the end.
     pub help_first: usize,
-    /// A line of input.
+    /// The input line, if any.
     pub prompt: Option<Prompt>,
-    /// Something to tell once, such as what is wrong with what was typed.
+    /// A message to show once, such as an error in what was typed.
     pub message: String,
-    /// Times to come back to, in their order.
+    /// Times to return to, in order.
     pub bookmarks: Vec<i64>,
-    /// Where the file's bar is, as last drawn.
+    /// The position of the file's bar, as last drawn.
     pub bar: Option<Rect>,
-    /// What the source is called where it is a file.
+    /// The source's name if it is a file.
     pub file: Option<String>,
-    /// What is asked of whoever has the display.
+    /// A request to the owner of the display.
     pub wish: Option<Wish>,
-    /// Which of how many sources this is, from 1.
+    /// The number of this source, from 1, and the number of sources.
     pub beside: (usize, usize),
-    /// Text for the clipboard, to be taken by whoever owns the terminal.
+    /// Text for the clipboard, to be taken by the owner of the terminal.
     pub clipboard: Option<String>,
     /// The signal databases.
     pub databases: Databases,
     /// The device and its buses, if the source is one.
     pub plan: Option<Plan>,
-    /// The sessions of the devices that the send list's periodic entries belong to.
+    /// The devices' sessions to which the send list's periodic entries belong.
     pub(super) sessions: Vec<u32>,
-    /// Where orders for the source go.
+    /// Where orders to the source go.
     pub orders: Sender<Order>,
 }
 
-/// Whether to go on.
+/// Whether to continue.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Flow {
     /// Yes.
     GoOn,
     /// The user wants to leave.
     Quit,
-    /// The user wants the shell back for a while.
+    /// The user wants to return to the shell for a while.
     Suspend,
 }
 
-/// Which way to look.
+/// The direction of a search.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Direction {
     /// To older records.
@@ -197,16 +198,16 @@ pub enum Direction {
     Forward,
 }
 
-/// A search under way.
+/// A search in progress.
 #[derive(Clone, Copy, Debug)]
 pub struct Search {
     pub(super) direction: Direction,
-    /// The place to go on at; going back, the one behind it.
+    /// The position at which to continue; when going back, the one after it.
     pub(super) at: u64,
 }
 
 impl App {
-    /// As it is at the start.
+    /// The initial state.
     pub fn new(view: View, theme: Theme, plan: Option<Plan>, orders: Sender<Order>) -> Self {
         Self {
             view,
@@ -266,7 +267,7 @@ impl App {
         self.prompt = Some(Prompt { kind, line: Line::new(text), entry: None });
     }
 
-    /// Stops the display, or lets it go on.
+    /// Pauses the display, or resumes it.
     pub(super) fn pause(&mut self, model: &Model) {
         if self.frozen.take().is_some() {
             self.cursor = None;
@@ -276,7 +277,7 @@ impl App {
         }
     }
 
-    /// Forgets everything that was seen; the display goes on.
+    /// Forgets everything seen; the display continues.
     pub(super) fn clear(&mut self, model: &mut Model) {
         model.clear();
         self.cursor = None;
@@ -284,7 +285,7 @@ impl App {
         self.frozen = None;
     }
 
-    /// What is changed on a page is changed in what is shown and in what goes on behind it.
+    /// Applies a change on a page both to what is shown and to what continues behind it.
     pub(super) fn each_seen(&mut self, model: &mut Model, change: impl Fn(&mut Seen)) {
         change(&mut model.seen);
         if let Some(frozen) = &mut self.frozen {

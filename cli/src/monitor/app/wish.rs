@@ -1,13 +1,13 @@
-//! What the keys of one source ask of the whole display.
+//! Requests from one source's keys to the whole display.
 
 use std::path::PathBuf;
 
-/// What only whoever has the display can do.
+/// What only the owner of the display can do.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Wish {
-    /// Open this trace beside what runs.
+    /// Open this trace beside what is running.
     Beside(PathBuf),
-    /// Look at the next source.
+    /// Show the next source.
     Next,
     /// Close this one, unless it is the only one.
     Close,

@@ -1,4 +1,4 @@
-//! One row per identifier: its last frame, how often it comes, and which of its bits change.
+//! One row per identifier: its last frame, its period, and which of its bits change.
 
 use std::collections::HashMap;
 
@@ -6,9 +6,9 @@ use cantap_trace::fd::FD_MAX_BYTES;
 
 use cantap::{Direction, Id, TraceEvent, TraceFrame, TraceRecord};
 
-/// Rows there may be; the frames of further identifiers are counted together.
+/// Limit for rows; the frames of further identifiers are counted together.
 const MOST_ROWS: usize = 8192;
-/// Share of a new interval in the smoothed period and jitter: one part in this many.
+/// The weight of a new interval in the smoothed period and jitter is one divided by this.
 const SMOOTHING: f64 = 8.0;
 
 /// One identifier on one channel.
@@ -18,27 +18,27 @@ pub struct Row {
     pub channel: u8,
     /// Its last frame.
     pub frame: TraceFrame,
-    /// Whether that was sent by us.
+    /// Whether we sent it.
     pub direction: Direction,
     /// Frames so far.
     pub count: u64,
     /// When the last one ended.
     pub last_ns: i64,
-    /// The last intervals, smoothed, in nanoseconds.
+    /// The smoothed interval, in nanoseconds.
     pub period_ns: Option<f64>,
-    /// How far intervals are from that, smoothed, in nanoseconds.
+    /// The smoothed deviation of intervals from that, in nanoseconds.
     pub jitter_ns: f64,
-    /// When each hexadecimal digit last changed; the first byte's upper one is the first.
+    /// When each hexadecimal digit last changed, starting with the upper digit of the first byte.
     pub changed_ns: Box<[i64; 2 * FD_MAX_BYTES]>,
-    /// How often each bit changed; the first byte's highest bit is the first.
+    /// How often each bit changed, starting with the highest bit of the first byte.
     pub heat: Box<[u32; 8 * FD_MAX_BYTES]>,
-    /// Bits whose changes are not shown, by byte.
+    /// Bits whose changes are suppressed, by byte.
     pub notched: [u8; FD_MAX_BYTES],
-    /// Not to be shown.
+    /// Whether it is hidden.
     pub hidden: bool,
-    /// Number of the colour it is marked with; 0 is none.
+    /// Number of its marking colour; 0 for none.
     pub mark: u8,
-    /// Frames were lost since the one before: the interval says nothing.
+    /// Frames were lost since the previous one: the interval is meaningless.
     gap: bool,
 }
 
@@ -62,7 +62,7 @@ impl Row {
     }
 
     fn take(&mut self, time_ns: i64, frame: TraceFrame, direction: Direction) {
-        // A clock that was set back, as where a file begins anew, says nothing either.
+        // If the clock was set back, as where a file starts again, the interval is meaningless, too.
         if self.count > 0 && !self.gap && time_ns >= self.last_ns {
             let interval = time_ns.saturating_sub(self.last_ns) as f64;
             match &mut self.period_ns {
@@ -87,13 +87,13 @@ impl Row {
         self.direction = direction;
     }
 
-    /// Of the byte at `at`, these bits changed.
+    /// These bits of the byte at `at` have changed.
     fn byte_changed(&mut self, at: usize, mut bits: u8, time_ns: i64) {
         while bits != 0 {
             let bit = bits.leading_zeros() as usize;
             let place = 8 * at + bit;
             self.heat[place] = self.heat[place].saturating_add(1);
-            // What is notched is not worth a glance.
+            // Suppressed changes do not deserve attention.
             if self.notched[at] >> (7 - bit) & 1 == 0 {
                 self.changed_ns[place / 4] = time_ns;
             }
@@ -107,7 +107,7 @@ impl Row {
         TraceRecord { time_ns: self.last_ns, channel: self.channel, event }
     }
 
-    /// Hides changes of all bits that changed so far.
+    /// Suppresses changes of all bits that have changed so far.
     fn notch(&mut self) {
         self.changed_ns.fill(i64::MIN);
         for (bit, count) in self.heat.iter().enumerate() {
@@ -123,7 +123,7 @@ impl Row {
 pub struct FixedTable {
     rows: Vec<Row>,
     places: HashMap<(u8, Id), usize>,
-    /// Frames of identifiers that found no room.
+    /// Frames of identifiers for which there was no room.
     pub unlisted: u64,
 }
 
@@ -155,7 +155,7 @@ impl FixedTable {
         }
     }
 
-    /// Nothing is known about the time from here to the next frames: the intervals say nothing.
+    /// Nothing is known about the time until the next frames: the intervals are meaningless.
     pub fn interrupt(&mut self) {
         self.rows.iter_mut().for_each(|row| row.gap = true);
     }
@@ -175,7 +175,7 @@ impl FixedTable {
         self.places.get(&(channel, id)).map(|place| &mut self.rows[*place])
     }
 
-    /// Hides changes of all bits that changed so far: what changes anyway.
+    /// Suppresses changes of all bits that have changed so far: those that change anyway.
     pub fn notch(&mut self) {
         self.rows.iter_mut().for_each(Row::notch);
     }

@@ -1,4 +1,4 @@
-//! The last records, within a budget of memory, and which of them are listed.
+//! The last records, within a memory budget, and which of them are listed.
 
 use std::collections::VecDeque;
 
@@ -7,32 +7,33 @@ use cantap_trace::filter::Filter;
 
 use super::kept::Kept;
 
-/// Records that are kept however little memory there is.
+/// Records that are kept even with little memory.
 const LEAST: usize = 1000;
 
-/// The past: every record, and a list of those that the filters accept.
+/// The past: every record, and a list of those accepted by the filters.
 ///
-/// A place in the list counts from the first record ever listed, and stays what it is while older ones make room.
+/// A position in the list counts from the first record ever listed, and stays the same while older ones are
+/// dropped.
 pub struct History {
     records: VecDeque<Kept>,
     most: usize,
-    /// The CAN FD frames among the records, and the number of the first: numbers count on, and wrap.
+    /// The CAN FD frames among the records, and the number of the first one: numbers continue, and wrap.
     fd: VecDeque<TraceEvent>,
     first_fd: u32,
-    /// Number of the oldest record, from the first one ever.
+    /// Number of the oldest record, counted from the first one ever.
     first: u64,
     filters: Vec<Filter>,
-    /// Numbers of the accepted records; all are listed without filters.
+    /// Numbers of the accepted records; without filters, all are listed.
     listed: VecDeque<u64>,
-    /// Place of the first of them.
+    /// Position of the first of them.
     first_listed: u64,
 }
 
 impl History {
-    /// Room for as many records as `bytes` hold, at least a thousand.
+    /// Room for as many records as fit in `bytes`, at least a thousand.
     pub fn new(bytes: usize) -> Self {
         let most = (bytes / size_of::<Kept>()).max(LEAST);
-        // Reserved at once: growing would copy everything, and the display would freeze meanwhile.
+        // Reserved in advance: growing would copy everything, and freeze the display meanwhile.
         let records = VecDeque::with_capacity(most);
         let fd = VecDeque::new();
         Self {
@@ -47,7 +48,7 @@ impl History {
         }
     }
 
-    /// Appends a record; the oldest makes room.
+    /// Appends a record; if necessary the oldest is dropped.
     pub fn push(&mut self, record: TraceRecord) {
         while self.records.len() == self.most
             || self.records.len() >= LEAST && self.kept_bytes() > self.memory().1
@@ -77,13 +78,13 @@ impl History {
         &self.filters
     }
 
-    /// Whether a record is to be shown: without filters, or if one of them accepts it.
+    /// Whether a record should be shown: without filters, or if one of them accepts it.
     pub fn accepts(&self, record: &TraceRecord) -> bool {
         self.filters.is_empty() || self.filters.iter().any(|filter| filter.accepts(record))
     }
 
-    /// Lists only what one of these accepts, of the past too. Returns where the record listed at `place` is now, or
-    /// the next one listed.
+    /// Lists only what one of these accepts, including the past. Returns the new position of the record listed at
+    /// `place`, or of the next one listed.
     pub fn set_filters(&mut self, filters: Vec<Filter>, place: Option<u64>) -> Option<u64> {
         let number = place.map(|place| self.number(place));
         self.filters = filters;
@@ -104,7 +105,7 @@ impl History {
         })
     }
 
-    /// The number of the record listed at a place.
+    /// The number of the record listed at a position.
     fn number(&self, place: u64) -> u64 {
         if self.filters.is_empty() {
             return place;
@@ -113,12 +114,12 @@ impl History {
         self.listed.get(index).copied().unwrap_or(self.first + self.records.len() as u64)
     }
 
-    /// Place of the oldest listed record that is still there.
+    /// Position of the oldest listed record that is still there.
     pub fn first(&self) -> u64 {
         if self.filters.is_empty() { self.first } else { self.first_listed }
     }
 
-    /// Place that the next listed record will have.
+    /// Position that the next listed record will have.
     pub fn end(&self) -> u64 {
         if self.filters.is_empty() {
             self.first + self.records.len() as u64
@@ -127,7 +128,7 @@ impl History {
         }
     }
 
-    /// The record listed at a place, if it is still there.
+    /// The record listed at a position, if it is still there.
     pub fn get(&self, place: u64) -> Option<TraceRecord> {
         if place < self.first() || place >= self.end() {
             return None;
@@ -137,7 +138,7 @@ impl History {
             .and_then(|kept| self.whole(kept))
     }
 
-    /// Place of the first listed record that is no older than a time, else of the last one.
+    /// Position of the first listed record that is not older than a time, otherwise of the last one.
     pub fn place_at(&self, time_ns: i64) -> Option<u64> {
         let (mut low, mut high) = (self.first(), self.end());
         while low < high {
@@ -151,17 +152,17 @@ impl History {
         last.map(|last| low.min(last))
     }
 
-    /// All records there are, listed or not, the oldest first.
+    /// All records kept, listed or not, the oldest first.
     pub fn all(&self) -> impl Iterator<Item = TraceRecord> + use<'_> {
         self.records.iter().filter_map(|kept| self.whole(kept))
     }
 
-    /// Records there are, listed or not.
+    /// Number of records kept, listed or not.
     pub fn len(&self) -> usize {
         self.records.len()
     }
 
-    /// Bytes in use, the list's included, and bytes there may be of records.
+    /// Bytes in use, including the list, and the budget for records in bytes.
     pub fn memory(&self) -> (usize, usize) {
         (self.kept_bytes() + self.listed.len() * size_of::<u64>(), self.most * size_of::<Kept>())
     }
@@ -174,7 +175,7 @@ impl History {
         self.records.len() * size_of::<Kept>() + self.fd.len() * size_of::<TraceEvent>()
     }
 
-    /// Forgets everything but the filters; numbers and places go on.
+    /// Forgets everything but the filters; numbers and positions continue.
     pub fn clear(&mut self) {
         self.first += self.records.len() as u64;
         self.first_listed += self.listed.len() as u64;
@@ -250,7 +251,7 @@ mod tests {
     fn filters_list_the_past_and_what_comes_and_keep_what_they_do_not_list() {
         let mut history = History::new(0);
         (0..10).for_each(|n| history.push(frame(n)));
-        // The fifth record is not listed any more: the next one is.
+        // The fifth record is no longer listed: the next one is.
         assert_eq!(history.set_filters(vec!["123:7FF".parse().unwrap()], Some(5)), Some(2));
         assert_eq!(listed(&history), [0, 3, 6, 9]);
         (10..1004).for_each(|n| history.push(frame(n)));
@@ -258,7 +259,7 @@ mod tests {
         assert_eq!(listed(&history), (6..1004).step_by(3).collect::<Vec<_>>());
         assert_eq!(history.set_filters(Vec::new(), Some(2)), Some(6));
         assert_eq!(listed(&history), (4..1004).collect::<Vec<_>>());
-        // Nothing is listed, and a place behind the end is none.
+        // Nothing is listed, and a position after the end does not exist.
         assert_eq!(history.set_filters(vec!["7FF:7FF".parse().unwrap()], Some(500)), Some(0));
         assert_eq!((history.first(), history.end(), history.get(0)), (0, 0, None));
         history.clear();

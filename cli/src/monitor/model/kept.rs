@@ -1,9 +1,9 @@
-//! A record as the history keeps it: a third of the size of one that has room for a CAN FD frame.
+//! A record as the history keeps it: a third of the size of one with room for a CAN FD frame.
 
 use cantap::wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 use cantap::{Direction, Frame, TraceEvent, TraceFrame, TraceRecord};
 
-/// A record. What a classical device delivers is kept here; a CAN FD frame elsewhere, under a number.
+/// A record. What a classical device delivers is kept here; a CAN FD frame elsewhere, by number.
 pub struct Kept {
     time_ns: i64,
     channel: u8,
@@ -21,7 +21,8 @@ enum What {
 }
 
 impl Kept {
-    /// A record as it is kept. `number` is what its event is kept under if it is a CAN FD frame.
+    /// Converts a record for keeping. `number` is the one under which its event is kept if it is a CAN FD
+    /// frame.
     pub fn new(record: &TraceRecord, number: u32) -> Self {
         let what = match record.event {
             TraceEvent::Frame { frame: TraceFrame::Classic(frame), direction, late } => {
@@ -42,7 +43,7 @@ impl Kept {
         matches!(self.what, What::Fd(_))
     }
 
-    /// The record again; `elsewhere` gives the CAN FD frame of a number.
+    /// The original record; `elsewhere` returns the CAN FD frame with a number.
     pub fn record(&self, elsewhere: impl FnOnce(u32) -> Option<TraceEvent>) -> Option<TraceRecord> {
         let event = match &self.what {
             What::Frame { frame, direction, late } => {

@@ -1,4 +1,4 @@
-//! What the live view knows: a bounded past, one row per identifier, signals, statistics. A source thread
+//! What the live view knows: a limited history, one row per identifier, signals, statistics. A source thread
 //! fills it; the pages only read it.
 
 pub mod fixed;
@@ -27,62 +27,62 @@ pub use series::{Column, Point, Series};
 pub use signals::{Decoded, SignalRow, SignalTable};
 pub use talk::{Talk, Talked};
 
-/// Windows of the load's history.
+/// Length of the windows in the load's history.
 pub const LOAD_WINDOW: Duration = Duration::from_millis(250);
 /// How many are kept: five minutes.
 const LOAD_WINDOWS: usize = 1200;
 
-/// Where the records come from, and how that goes.
+/// The state of the source of records.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub enum SourceState {
     /// Nothing yet.
     #[default]
     Starting,
-    /// Records come.
+    /// Records are arriving.
     Running,
-    /// It is gone, for this reason; it is tried again.
+    /// It is gone, for this reason; opening it is being retried.
     Gone(String),
-    /// The bit rates of a device's channels are looked for.
+    /// Searching the bit rates of a device's channels.
     Searching,
     /// A file, in playback.
     Playing(Playing),
 }
 
-/// How a playback goes. Times are in nanoseconds as in [`TraceRecord::time_ns`].
+/// The state of a playback. Times are in nanoseconds as in [`TraceRecord::time_ns`].
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Playing {
-    /// Delay factor: 1 is real time, 2 takes twice as long, 0 is as fast as can be.
+    /// Delay factor: 1 is real time, 2 takes twice as long, 0 is as fast as possible.
     pub factor: f64,
     /// Whether it is paused.
     pub paused: bool,
-    /// Whether it begins anew after its end.
+    /// Whether it restarts after its end.
     pub looped: bool,
-    /// Whether it is over.
+    /// Whether it has ended.
     pub ended: bool,
-    /// Whether it is on its way to another place.
+    /// Whether it is moving to another position.
     pub seeking: bool,
     /// Time of the file's first record.
     pub first_ns: i64,
-    /// Where it is.
+    /// Its position.
     pub position_ns: i64,
-    /// The latest time in the file, once that is known.
+    /// The latest time in the file, once known.
     pub end_ns: Option<i64>,
 }
 
-/// A recording that runs.
+/// A recording in progress.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Recording {
     /// The file.
     pub path: String,
     /// Records written.
     pub records: u64,
-    /// Size of the file as the system tells it, in bytes.
+    /// Size of the file according to the system, in bytes.
     pub bytes: u64,
     /// When it began, in nanoseconds as in [`TraceRecord::time_ns`].
     pub since_ns: i64,
 }
 
-/// What a device says about itself.
+/// A device's figures about itself.
 #[derive(Clone, Debug, Default)]
 pub struct DeviceFigures {
     /// Its state.
@@ -93,13 +93,13 @@ pub struct DeviceFigures {
     pub clock: Option<ClockReport>,
     /// Size of its record queue, in bytes.
     pub queue_bytes: u32,
-    /// What it is.
+    /// Its name.
     pub name: String,
-    /// How often it was opened again after it had gone.
+    /// How often it was opened again after an absence.
     pub reconnects: u32,
 }
 
-/// What the pages show beside the trace. A copy of it is what they show while the display is stopped.
+/// What the pages show besides the trace. While the display is paused, they show a copy of it.
 #[derive(Clone)]
 pub struct Seen {
     /// A row per identifier.
@@ -110,19 +110,19 @@ pub struct Seen {
     pub statistics: Statistics,
     /// The load of the last windows, per channel, the newest last.
     pub loads: Vec<(u8, VecDeque<Window>)>,
-    /// What the frames mean.
+    /// The meaning of the frames.
     pub talked: Talked,
-    /// The devices, if the source is some.
+    /// The devices, if the source consists of devices.
     pub devices: Vec<DeviceFigures>,
-    /// Records taken.
+    /// Number of records taken.
     pub taken: u64,
-    /// The time, as far as it is known from the last record, in nanoseconds as in [`TraceRecord::time_ns`]. A file that
-    /// begins anew sets it back.
+    /// The current time, as far as known from the last record, in nanoseconds as in [`TraceRecord::time_ns`]. A file
+    /// that restarts sets it back.
     pub now_ns: i64,
 }
 
 impl Seen {
-    /// Frames lost so far, and whether there may have been more.
+    /// Number of frames lost so far, and whether there may have been more.
     pub fn lost(&self) -> (u64, bool) {
         let channels = self.statistics.channels();
         let count = channels.iter().map(|channel| channel.losses.total()).sum();
@@ -130,38 +130,38 @@ impl Seen {
     }
 }
 
-/// Everything that there is to show.
+/// Everything that can be shown.
 pub struct Model {
-    /// The past, record by record, and which filters choose what is shown of it.
+    /// The past, record by record, and the filters for what is shown of it.
     pub history: History,
-    /// What else there is to see.
+    /// Everything else that is shown.
     pub seen: Seen,
-    /// Time of the first record since the beginning, or since everything was forgotten.
+    /// Time of the first record, since the beginning or since everything was forgotten.
     pub first_ns: Option<i64>,
     /// The source.
     pub source: SourceState,
-    /// How often each device was opened: with another session, what it sent periodically has ended.
+    /// How often each device was opened: a new session means that its periodic frames have ended.
     pub sessions: Vec<u32>,
-    /// The plan with the bit rates that were found by listening, until the display has taken it over.
+    /// The plan with the bit rates that were found by listening, until the display takes it over.
     pub found: Option<Plan>,
-    /// Periodic transmissions that the device refused, by channel and slot, until the display has taken note.
+    /// Periodic transmissions refused by the device, by channel and slot, until the display has noted them.
     pub refused: Vec<(u8, u8)>,
-    /// A virtual vehicle is at one of the ports, until the display has taken note.
+    /// There is a virtual vehicle at one of the ports, until the display has noted it.
     pub met_car: bool,
-    /// What the device's channels hear.
+    /// What the device's channels receive.
     pub hearing: Hearing,
-    /// Places in the file played back that could not be read, and what was wrong with the first of them.
+    /// The number of unreadable places in the file being played back, and what was wrong with the first one.
     pub unread: Option<(u64, String)>,
-    /// The recording, if one runs.
+    /// The recording, if there is one.
     pub recording: Option<Recording>,
-    /// The last thing that the user should know.
+    /// The latest message for the user.
     pub notice: String,
     talk: Talk,
     options: Options,
 }
 
 impl Model {
-    /// Nothing known yet. `options` must be good for [`Statistics::new`].
+    /// Nothing is known yet. `options` must be valid for [`Statistics::new`].
     pub fn new(decoder: Arc<Decoder>, options: Options, history_bytes: usize) -> anyhow::Result<Self> {
         let options = Options { window: LOAD_WINDOW, ..options };
         let seen = Seen {
@@ -192,19 +192,19 @@ impl Model {
         })
     }
 
-    /// The options that the statistics were made with.
+    /// The options of the statistics.
     pub fn options(&self) -> &Options {
         &self.options
     }
 
-    /// Decodes otherwise from now on, the past too.
+    /// Changes the decoding from now on, including the past.
     pub fn set_decoder(&mut self, decoder: Arc<Decoder>) {
         let Seen { signals, .. } = &mut self.seen;
         signals.set_decoder(decoder);
         self.history.all().for_each(|record| signals.take(&record));
     }
 
-    /// Takes records in their order.
+    /// Takes records in order.
     pub fn take(&mut self, records: &[TraceRecord]) {
         if let (None, Some(first)) = (self.first_ns, records.first()) {
             self.first_ns = Some(first.time_ns);
@@ -221,21 +221,21 @@ impl Model {
         *taken += records.len() as u64;
     }
 
-    /// Time has come to `now_ns` although nothing happened.
+    /// The time is now `now_ns` although nothing happened.
     pub fn advance(&mut self, now_ns: i64) {
         let Seen { statistics, loads, now_ns: latest_ns, .. } = &mut self.seen;
         *latest_ns = now_ns.max(*latest_ns);
         statistics.advance_with(now_ns, |window| keep_load(loads, window));
     }
 
-    /// Nothing is known about the time from here to the next record: no interval that spans it counts.
+    /// Nothing is known about the time from here to the next record: intervals that span it do not count.
     pub fn interrupt(&mut self) {
         self.seen.statistics.interrupt();
         self.seen.table.interrupt();
         self.seen.signals.interrupt();
     }
 
-    /// Forgets what was seen, not how things are set.
+    /// Forgets what was seen, but not the settings.
     pub fn clear(&mut self) {
         self.history.clear();
         self.seen.table = FixedTable::default();
@@ -246,16 +246,16 @@ impl Model {
         self.begin_statistics();
     }
 
-    /// Other buses from now on: the statistics begin anew.
+    /// The buses are different from now on: the statistics start over.
     pub fn begin_statistics(&mut self) {
-        // The options were good before.
+        // The options were valid before.
         if let Ok(statistics) = Statistics::new(self.options.clone()) {
             self.seen.statistics = statistics;
         }
         self.seen.loads.clear();
     }
 
-    /// Other bit rates from now on; the statistics begin anew.
+    /// The bit rates are different from now on; the statistics start over.
     pub fn set_options(&mut self, options: Options) -> anyhow::Result<()> {
         let options = Options { window: LOAD_WINDOW, ..options };
         self.seen.statistics = Statistics::new(options.clone())?;

@@ -1,25 +1,26 @@
-//! Every value that a signal had, for the graph: at full resolution, as far back as there is room.
+//! Every value of a signal, for the graph: at full resolution, as far back as there is room.
 //!
-//! Values are kept in blocks with their extremes, so that a column of the screen that a million values fall into costs no more
-//! than a few hundred looks.
+//! Values are kept in blocks with their extremes, so a screen column with a million values costs no more than examining a few
+//! hundred.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-/// Values in a block. Whoever asks for extremes looks at the values of two blocks at most, and at the extremes of those between.
+/// Number of values in a block. To find extremes, at most the values of two blocks are examined, plus the extremes of those
+/// between.
 const BLOCK: usize = 256;
-/// So many blocks back a value is put in its place when it comes late, as between two devices; what is older than that is
-/// another beginning, as where a file is played anew.
+/// A late value, as with two devices, is sorted in up to this many blocks back; an older one means a restart, as where a
+/// file is played again.
 const LATE_BLOCKS: usize = 4;
 /// Memory that a block takes, in bytes.
 pub const BLOCK_BYTES: usize = BLOCK * size_of::<Point>() + size_of::<Block>();
 
-/// A value at its time.
+/// A value and its time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Point {
-    /// When it came, in nanoseconds as in a record.
+    /// Its time, in nanoseconds as in a record.
     pub time_ns: i64,
-    /// Not a number where from then on nothing is known.
+    /// Not-a-number if nothing is known from then on.
     pub value: f64,
 }
 
@@ -29,7 +30,7 @@ impl Point {
     }
 }
 
-/// What falls into a stretch of time that is drawn as one column.
+/// The content of a stretch of time that is drawn as one column.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Column {
     /// The smallest value.
@@ -40,15 +41,15 @@ pub struct Column {
     pub first: Point,
     /// The last value.
     pub last: Point,
-    /// Nothing is known of the time before the first value.
+    /// Nothing is known about the time before the first value.
     pub after_gap: bool,
-    /// Nothing is known of the time after the last value.
+    /// Nothing is known about the time after the last value.
     pub before_gap: bool,
 }
 
 #[derive(Clone, Debug)]
 struct Block {
-    /// In the order of their times; never empty.
+    /// Sorted by time; never empty.
     points: Vec<Point>,
     min: f64,
     max: f64,
@@ -64,7 +65,7 @@ impl Block {
 
     fn insert(&mut self, place: usize, point: Point) {
         self.points.insert(place, point);
-        // Neither takes what is not a number.
+        // Both ignore not-a-number.
         self.min = self.min.min(point.value);
         self.max = self.max.max(point.value);
     }
@@ -77,14 +78,14 @@ impl Block {
 /// The values of one signal.
 #[derive(Clone, Debug, Default)]
 pub struct Series {
-    /// Shared with the display where that stands still, so that stopping it copies next to nothing.
+    /// Shared with the display while that is paused, so that pausing copies next to nothing.
     blocks: VecDeque<Arc<Block>>,
-    /// Older values have made room.
+    /// Whether older values have been dropped.
     is_cut: bool,
 }
 
 impl Series {
-    /// Takes a value, or one that is none.
+    /// Takes a value, or not-a-number.
     pub fn push(&mut self, time_ns: i64, value: f64) {
         let point = Point { time_ns, value };
         let Some(last) = self.last() else {
@@ -101,7 +102,7 @@ impl Series {
             let place = block.points.partition_point(|other| other.time_ns <= time_ns);
             Arc::make_mut(block).insert(place, point);
         } else {
-            // Time runs anew: there is nothing to compare with.
+            // Time restarts: there is nothing to compare with.
             self.clear();
             self.append(point);
         }
@@ -117,7 +118,7 @@ impl Series {
         }
     }
 
-    /// Nothing is known of the time from the last value to the next.
+    /// Nothing is known about the time from the last value to the next.
     pub fn interrupt(&mut self) {
         if let Some(last) = self.last() {
             self.push(last.time_ns, f64::NAN);
@@ -129,22 +130,22 @@ impl Series {
         *self = Self::default();
     }
 
-    /// Blocks there are, each of [`BLOCK_BYTES`].
+    /// The number of blocks, each of [`BLOCK_BYTES`].
     pub fn blocks(&self) -> usize {
         self.blocks.len()
     }
 
-    /// Values there are.
+    /// The number of values.
     pub fn len(&self) -> usize {
         self.blocks.iter().map(|block| block.points.len()).sum()
     }
 
-    /// The oldest block makes room.
+    /// Drops the oldest block.
     pub fn cut(&mut self) {
         self.is_cut |= self.blocks.pop_front().is_some();
     }
 
-    /// Whether older values have made room.
+    /// Whether older values have been dropped.
     pub const fn is_cut(&self) -> bool {
         self.is_cut
     }
@@ -158,9 +159,9 @@ impl Series {
         self.blocks.back().and_then(|block| block.points.last()).copied()
     }
 
-    /// Where the first point is that is no older than a time: its block and its place there.
+    /// The position of the first point that is not older than a time: its block, and its index there.
     fn place(&self, time_ns: i64) -> (usize, usize) {
-        // The last block that begins before that time, since it may have later points, too.
+        // The last block that begins before that time, since it may also have later points.
         let block = self.blocks.partition_point(|block| block.first_ns() < time_ns).saturating_sub(1);
         let Some(points) = self.blocks.get(block).map(|block| &block.points) else {
             return (0, 0);
@@ -171,7 +172,7 @@ impl Series {
         }
     }
 
-    /// The point before a place.
+    /// The point before a position.
     fn before_place(&self, (block, place): (usize, usize)) -> Option<Point> {
         if place > 0 {
             return self.blocks.get(block)?.points.get(place - 1).copied();
@@ -179,23 +180,23 @@ impl Series {
         self.blocks.get(block.checked_sub(1)?)?.points.last().copied()
     }
 
-    /// The last value before a time; none where nothing is known then.
+    /// The last value before a time; `None` if it is unknown then.
     pub fn before(&self, time_ns: i64) -> Option<Point> {
         self.before_place(self.place(time_ns)).filter(|point| !point.is_gap())
     }
 
-    /// The first value from a time on; none where nothing is known until then.
+    /// The first value from a time on; `None` if nothing is known until then.
     pub fn after(&self, time_ns: i64) -> Option<Point> {
         let (block, place) = self.place(time_ns);
         self.blocks.get(block)?.points.get(place).copied().filter(|point| !point.is_gap())
     }
 
-    /// The value that the signal had at a time: the last one that had come by then.
+    /// The signal's value at a time: the last one up to then.
     pub fn at(&self, time_ns: i64) -> Option<f64> {
         self.before(time_ns.saturating_add(1)).map(|point| point.value)
     }
 
-    /// What there is from a time until before another; `None` if there is no value.
+    /// The content from one time until before another; `None` if there is no value.
     pub fn column(&self, from_ns: i64, until_ns: i64) -> Option<Column> {
         if until_ns <= from_ns {
             return None;

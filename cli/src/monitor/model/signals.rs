@@ -8,13 +8,13 @@ use cantap_signals::{Alarm, Decoder, MessageRef, Selection, SelectionError, Sign
 
 use super::series::{BLOCK_BYTES, Series};
 
-/// Signals with a row; more than any screen shows.
+/// Limit for rows; more than fit on any screen.
 const MOST_SIGNALS: usize = 1024;
-/// Of values within this time the recent past keeps the last.
+/// The recent past keeps the last value in each such interval.
 const RECENT_STEP_NS: i64 = 100_000_000;
-/// How many of them it keeps: eight seconds and a little.
+/// How many of these it keeps: a little more than eight seconds.
 const MOST_RECENT: usize = 90;
-/// Memory that the graph's values may take however little there is, in bytes.
+/// Minimum memory for the graph's values, in bytes.
 const LEAST_ROOM: usize = 16 * BLOCK_BYTES;
 
 /// One signal on one channel.
@@ -26,41 +26,41 @@ pub struct SignalRow {
     pub message: MessageRef,
     /// Its index in the message.
     pub signal: u32,
-    /// The frame that had the last value.
+    /// The frame with the last value.
     pub frame: TraceFrame,
     /// The last value's bits.
     pub raw: u64,
     /// The last value.
     pub value: f64,
-    /// When it came.
+    /// The time of the last value.
     pub time_ns: i64,
-    /// When it last became another one.
+    /// When the value last changed.
     pub changed_ns: i64,
     /// The smallest value so far.
     pub min: f64,
     /// The largest value so far.
     pub max: f64,
-    /// Values of the last seconds with their times, the newest last, a few a second.
+    /// Values of the last seconds with their times, a few per second, the newest last.
     pub recent: VecDeque<(i64, f64)>,
     /// All its values, while it is in the graph.
     pub series: Option<Series>,
 }
 
 impl SignalRow {
-    /// The frame that had the last value, as a record.
+    /// The frame with the last value, as a record.
     pub fn last(&self) -> TraceRecord {
         let event = TraceEvent::Frame { frame: self.frame, direction: Direction::Rx, late: false };
         TraceRecord { time_ns: self.time_ns, channel: self.channel, event }
     }
 }
 
-/// A signal in a frame, in words.
+/// A signal in a frame, as text.
 pub struct Decoded {
-    /// What the signal is called.
+    /// The signal's name.
     pub name: String,
     /// Its value with text and unit.
     pub text: String,
-    /// The alarm that it raises.
+    /// The alarm that it raises, if any.
     pub alarm: Option<Alarm>,
 }
 
@@ -71,16 +71,16 @@ pub struct SignalTable {
     rows: Vec<SignalRow>,
     places: HashMap<(u8, MessageRef, u32), usize>,
     values: Vec<SignalValue>,
-    /// Patterns of signals that go into the graph when they are first seen.
+    /// Patterns of signals to add to the graph when they are first seen.
     chosen: Vec<Selection>,
     /// Which signals were in the graph when everything was forgotten, and which were not.
     decided: HashMap<(u8, MessageRef, u32), bool>,
-    /// Memory that the values of the signals in the graph may take, in bytes.
+    /// Memory for the values of the signals in the graph, in bytes.
     room: usize,
 }
 
 impl SignalTable {
-    /// Nothing seen yet. The values of signals in the graph take at most this many bytes.
+    /// Nothing has been seen yet. The values of signals in the graph take at most this many bytes.
     pub fn new(decoder: Arc<Decoder>, room: usize) -> Self {
         Self {
             decoder,
@@ -93,7 +93,8 @@ impl SignalTable {
         }
     }
 
-    /// Decodes by other databases from now on. Nothing is seen yet; of what was in the graph, signals of the same name will be.
+    /// Uses other databases from now on. Nothing has been seen yet; signals with the same names as those in the graph will be
+    /// added again.
     pub fn set_decoder(&mut self, decoder: Arc<Decoder>) {
         let graphed = self.rows.iter().filter(|row| row.series.is_some());
         let names = graphed.map(|row| format!("{}.{}", self.message_name(row), self.signal(row).name));
@@ -169,11 +170,11 @@ impl SignalTable {
         }
     }
 
-    /// The oldest values of the signals in the graph make room.
+    /// Drops the oldest values of the signals in the graph.
     fn make_room(&mut self) {
         while self.graph_bytes() > self.room {
             let graphed = self.rows.iter_mut().filter_map(|row| row.series.as_mut());
-            // The one that goes back furthest; what comes now must stay.
+            // The one that goes back farthest; current values must stay.
             let Some(oldest) =
                 graphed.filter(|series| series.blocks() > 1).min_by_key(|series| series.first_ns())
             else {
@@ -191,17 +192,17 @@ impl SignalTable {
         self.series().map(|series| series.blocks() * BLOCK_BYTES).sum()
     }
 
-    /// Values kept for the graph, the bytes that they take, and the bytes that there are for them.
+    /// The number of values kept for the graph, the bytes that they take, and the limit in bytes.
     pub fn graph_memory(&self) -> (usize, usize, usize) {
         (self.series().map(Series::len).sum(), self.graph_bytes(), self.room)
     }
 
-    /// Nothing is known of the time from here to the next values.
+    /// Nothing is known about the time from here to the next values.
     pub fn interrupt(&mut self) {
         self.rows.iter_mut().filter_map(|row| row.series.as_mut()).for_each(Series::interrupt);
     }
 
-    /// Frames of a channel are missing here: any signal's may be among them.
+    /// Frames of a channel are missing here: they may have contained any signal.
     fn interrupt_channel(&mut self, channel: u8) {
         let of_channel = self.rows.iter_mut().filter(|row| row.channel == channel);
         of_channel.filter_map(|row| row.series.as_mut()).for_each(Series::interrupt);
@@ -212,8 +213,8 @@ impl SignalTable {
         &self.rows
     }
 
-    /// Signals that a pattern matches, such as `Speed` or `Engine.*`, go into the graph when they are first seen. Fails if no signal
-    /// of the databases does.
+    /// Adds signals that match a pattern, such as `Speed` or `Engine.*`, to the graph when they are first seen. Fails if no signal
+    /// of the databases matches.
     pub fn choose(&mut self, pattern: &str) -> Result<(), SelectionError> {
         let selection = Selection::new(&[pattern])?;
         selection.check(&self.decoder.messages().map(|(_, _, message)| message))?;
@@ -221,7 +222,7 @@ impl SignalTable {
         Ok(())
     }
 
-    /// Puts a signal into the graph, with what the past has of it, or takes it out.
+    /// Adds a signal to the graph, with its past values, or removes it.
     pub fn toggle(&mut self, row: usize, past: impl Iterator<Item = TraceRecord>) {
         let Some(row) = self.rows.get_mut(row) else {
             return;
@@ -247,7 +248,7 @@ impl SignalTable {
         self.make_room();
     }
 
-    /// What the database says about a row's signal.
+    /// The database's definition of a row's signal.
     pub fn signal(&self, row: &SignalRow) -> &Signal {
         &self.decoder.message(row.message).signals[row.signal as usize]
     }
@@ -257,12 +258,12 @@ impl SignalTable {
         &self.decoder.message(row.message).name
     }
 
-    /// `Message.Signal`, by which signals are looked for.
+    /// `Message.Signal`, the name used in searches.
     pub fn full_name(&self, row: &SignalRow) -> String {
         format!("{}.{}", self.message_name(row), self.signal(row).label())
     }
 
-    /// The message that a frame is, by name.
+    /// The name of a frame's message.
     pub fn name_of(&self, record: &TraceRecord) -> Option<&str> {
         let message = self.decoder.find(record.channel, record.frame()?.id())?;
         Some(&self.decoder.message(message).name)
@@ -286,7 +287,7 @@ impl SignalTable {
         }
     }
 
-    /// What is in a frame, signal by signal.
+    /// The content of a frame, signal by signal.
     pub fn in_frame(&self, channel: u8, frame: &TraceFrame) -> Vec<Decoded> {
         let mut values = Vec::new();
         let Some(message) = self.decoder.decode(channel, frame, &mut values) else {
@@ -303,7 +304,7 @@ impl SignalTable {
         decoded.collect()
     }
 
-    /// As [`Self::text`] in this many columns: digits go before the unit does.
+    /// Like [`Self::text`], in this many columns: digits take precedence over the unit.
     pub fn short_text(&self, row: &SignalRow, columns: usize) -> String {
         let text = self.text(row);
         let signal = self.signal(row);
@@ -321,7 +322,7 @@ impl SignalTable {
         format!("{number} {}", signal.unit).chars().take(columns).collect()
     }
 
-    /// The alarm that a row's value raises.
+    /// The alarm that a row's value raises, if any.
     pub fn alarm(&self, row: &SignalRow) -> Option<Alarm> {
         self.signal(row).alarms.check(row.value)
     }
@@ -336,7 +337,7 @@ impl SignalTable {
         &self.decoder
     }
 
-    /// Forgets all values; what is in the graph is there again when it is seen again.
+    /// Forgets all values; signals in the graph return when they are seen again.
     pub fn clear(&mut self) {
         for row in self.rows.drain(..) {
             self.decided.insert((row.channel, row.message, row.signal), row.series.is_some());
@@ -345,7 +346,7 @@ impl SignalTable {
     }
 }
 
-/// A name as the pattern that matches nothing else.
+/// A name as a pattern that matches nothing else.
 fn glob_escaped(name: &str) -> String {
     let escape = |character: char| match character {
         '*' | '?' | '[' => format!("[{character}]"),
@@ -354,12 +355,12 @@ fn glob_escaped(name: &str) -> String {
     name.chars().map(escape).collect()
 }
 
-/// Keeps the last value of each step of time.
+/// Keeps the last value in each interval.
 fn keep_recent(recent: &mut VecDeque<(i64, f64)>, time_ns: i64, value: f64) {
     if value.is_nan() {
         return;
     }
-    // Time that runs backwards, as where a file begins anew, leaves nothing to compare with.
+    // If time goes back, as where a file restarts, there is nothing to compare with.
     if recent.back().is_some_and(|(last_ns, _)| time_ns < *last_ns) {
         recent.clear();
     }

@@ -1,4 +1,4 @@
-//! What the frames mean, as they come.
+//! The meaning of the frames, as they arrive.
 
 use std::collections::VecDeque;
 
@@ -7,25 +7,25 @@ use cantap_protocols::{Event, Options, Overview, UnderWay};
 
 use crate::protocols::Reading;
 
-/// Events that are kept in words.
+/// How many events are kept.
 const RECENT: usize = 500;
 
-/// What there is to see of it.
+/// What can be shown of it.
 #[derive(Clone, Default)]
 pub struct Talked {
     /// Nodes, services and objects.
     pub overview: Overview,
     /// The last events; the newest last.
     pub recent: VecDeque<Event>,
-    /// Transfers that have begun and have not ended.
+    /// Transfers in progress.
     pub under_way: Vec<UnderWay>,
-    /// Events so far, and those in which something went wrong.
+    /// Number of events so far, and of those in which something went wrong.
     pub events: u64,
     /// See [`Self::events`].
     pub faults: u64,
 }
 
-/// Reads the protocols that each channel shows.
+/// Decodes the protocols found on each channel.
 pub struct Talk {
     reading: Reading,
 }
@@ -37,7 +37,7 @@ impl Default for Talk {
 }
 
 impl Talk {
-    /// Takes records. The first seconds of a bus are looked at before they are read.
+    /// Takes records. The first seconds of a bus are examined before they are decoded.
     pub fn take(&mut self, records: &[TraceRecord], talked: &mut Talked) {
         let Ok(()) = self.reading.take(records, true, |event| {
             talked.events += 1;

@@ -1,4 +1,4 @@
-//! Bit rates found by listening, with progress; it can be stopped at any time.
+//! Finds bit rates by listening, showing progress; it can be stopped at any time.
 
 use std::sync::mpsc::TryRecvError;
 
@@ -14,8 +14,8 @@ use crate::advice;
 use crate::channel_bitrate::ChannelBitrate;
 
 impl Source<'_> {
-    /// Puts the bit rates that are found into the plan; what is not found stays as it was. Says what is to be done
-    /// after it: an order may have come meanwhile.
+    /// Adds the bit rates that are found to the plan; those not found stay as they were. Returns what to do next:
+    /// an order may have come meanwhile.
     pub(super) fn autobaud(&mut self, plan: &mut Plan) -> Then {
         lock(self.model).source = SourceState::Searching;
         let mut said = Vec::new();
@@ -62,11 +62,11 @@ impl Source<'_> {
             }
         }
         if !rates.is_empty() {
-            // Behind the others: the last one counts.
+            // After the others: the last one counts.
             rates.splice(0..0, plan.open.timing.bitrates.clone());
             plan.open.timing.set_bit_rates(rates);
             if plan.mode() != Mode::ListenOnly {
-                // It was agreed to at another bit rate.
+                // The user agreed to it at another bit rate.
                 plan.open.set_mode(Mode::ListenOnly);
                 said.push("listen-only now".to_owned());
             }
@@ -76,8 +76,8 @@ impl Source<'_> {
         then
     }
 
-    /// Whether a channel that is to be opened has a bit rate from nowhere: not given, and not saved on its device. A device that is
-    /// not there tells so when it is opened.
+    /// Whether a channel to be opened has no bit rate from anywhere: not given, and not saved on its device. An absent device shows
+    /// this when it is opened.
     pub(super) fn lacks_bit_rates(plan: &Plan) -> bool {
         if plan.open.timing.is_given() {
             return false;
@@ -92,7 +92,8 @@ impl Source<'_> {
         })
     }
 
-    /// Looks for the bit rates of a plan that has none, until at least one is found. What has none then is not opened.
+    /// Finds the bit rates for a plan without any, until at least one is found. Channels without a bit rate are then
+    /// not opened.
     pub(super) fn find_bit_rates(&mut self, plan: &mut Plan) -> Then {
         loop {
             let then = self.autobaud(plan);
@@ -107,7 +108,7 @@ impl Source<'_> {
         }
     }
 
-    /// What was ordered during the search; anything that concerns the device ends it.
+    /// Handles orders during the search; any that concerns the device ends it.
     fn order_meanwhile(&mut self) -> Then {
         loop {
             match self.orders.try_recv() {

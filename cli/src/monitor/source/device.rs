@@ -1,4 +1,4 @@
-//! A device as the source: session after session, whenever it is there.
+//! A device as the source: one session after another, whenever it is there.
 
 use std::collections::VecDeque;
 use std::sync::mpsc::TryRecvError;
@@ -18,7 +18,7 @@ use crate::boards::place_of;
 use crate::hearing::Hearing;
 use crate::live::{Line, Lines, lines};
 
-/// How long after its end a window is closed when nothing comes, so that a late frame still finds it open.
+/// How long after its end a window is closed if nothing arrives, so that a late frame still finds it open.
 const LATENESS_NS: i64 = 1_000_000_000;
 
 impl Source<'_> {
@@ -67,12 +67,13 @@ impl Source<'_> {
         }
     }
 
-    /// Takes what comes, while the devices are there and when they are back, and follows orders, until one ends it.
+    /// Takes what arrives while the devices are there, and when they are back, and follows orders until one ends
+    /// it.
     fn listen(&mut self, plan: &Plan, lines: &mut Lines, reconnects: &[u32]) -> Then {
         let clock = UtcClock::start();
         let mut next_figures = Instant::now();
         let mut paces = vec![None; plan.addresses.len()];
-        // Devices of which nothing is known yet, and what was ordered meanwhile.
+        // Devices of which nothing is known yet, and orders that came meanwhile.
         let mut unknown = vec![true; plan.addresses.len()];
         let mut early = VecDeque::new();
         let mut recoveries: Vec<_> = plan.addresses.iter().map(|_| plan.open.recovery()).collect();
@@ -101,7 +102,7 @@ impl Source<'_> {
                 (_, Happening::Ended) => return Then::GoOn,
             }
             for (board, device) in lines.devices() {
-                // If it does not answer, the stream says so.
+                // If it does not answer, the stream reports that.
                 let back = recoveries[board].as_mut().and_then(|recovery| recovery.look(device).ok());
                 for channel in back.into_iter().flatten() {
                     let number = channel_number(board, channel);
@@ -132,9 +133,9 @@ impl Source<'_> {
         }
     }
 
-    /// Ends the session; what was captured until then is shown and recorded.
+    /// Ends the session; what was captured up to then is shown and recorded.
     fn end(&mut self, lines: &mut Lines) {
-        // If that fails a device has just gone, and what was ordered still counts.
+        // If that fails, a device has just gone, and the order still applies.
         let _ = lines.stop();
         loop {
             match lines.next(WAIT).1 {
@@ -148,7 +149,7 @@ impl Source<'_> {
     fn show_figures(&self, lines: &Lines, clock: &UtcClock, paces: &mut [Option<Pace>]) {
         let mut earliest_ns: Option<i64> = None;
         for (board, device) in lines.devices() {
-            // If it does not answer, the stream says so.
+            // If it does not answer, the stream reports that.
             let Ok(status) = device.status() else { continue };
             let now_ns = clock.at(Instant::now()).0;
             let pace =
@@ -162,12 +163,12 @@ impl Source<'_> {
             }
         }
         if let Some(now_ns) = earliest_ns {
-            // What is still on the way must not find its window closed.
+            // Records still on the way must not find their window closed.
             lock(self.model).advance(now_ns.saturating_sub(LATENESS_NS));
         }
     }
 
-    /// The device is there: says whether it is the one from before, and takes over its bit rates.
+    /// The device is there: reports whether it is the same as before, and takes over its bit rates.
     fn greet(&self, board: usize, lines: &Lines, plan: &Plan, back: &Return, reconnects: u32) {
         let Some((line, device)) = lines.lines().nth(board).and_then(|line| Some((line, line.device()?)))
         else {
@@ -216,7 +217,7 @@ impl Source<'_> {
         let without_load: Vec<u8> =
             lacks(|config| config.omit_data || config.omit_stamps).map(|(number, ..)| *number).collect();
         if lacks(|config| config.omit_data).next().is_some() && model.notice.is_empty() {
-            "the device leaves data out: zeros stand in its place, and the load is not known"
+            "the device leaves data out: there are zeros in its place, and the load is unknown"
                 .clone_into(&mut model.notice);
         }
         if without_load != model.options().without_load
@@ -234,7 +235,7 @@ impl Source<'_> {
         }
     }
 
-    /// An order, where there is a device to send with.
+    /// Follows an order when there is a device to send with.
     fn follow_with(&mut self, lines: &Lines, order: Order) -> Then {
         if matches!(order, Order::Recover) && lines.devices().next().is_some() {
             self.recover(lines);
@@ -294,7 +295,7 @@ impl Source<'_> {
         self.notice(said.join("; "));
     }
 
-    /// From now on nothing is known about the buses: the trace and the recording say so in place, and no figure
+    /// From now on nothing is known about the buses: the trace and the recording mark the gap, and no figure
     /// spans it.
     fn note_gap(&mut self, channels: &[u8]) {
         let time_ns = UtcClock::start().at(Instant::now()).0;
@@ -305,7 +306,7 @@ impl Source<'_> {
         lock(self.model).interrupt();
     }
 
-    /// The windows of the time before a gap may be closed already.
+    /// The windows before a gap may already be closed.
     fn keep_up(&self, records: &mut [TraceRecord]) {
         let now_ns = lock(self.model).seen.now_ns;
         for gap in records.iter_mut().filter(|record| record.event == TraceEvent::GAP) {
@@ -330,17 +331,17 @@ impl Source<'_> {
     }
 }
 
-/// Devices that are opened as the plan says.
+/// Devices opened according to the plan.
 fn open_as(plan: &Plan) -> Lines {
     let for_setup = plan.clone();
     lines(&plan.addresses, move |board, device| {
         let open = for_setup.open.on_board(board);
-        // No filters, saved ones neither: what is not shown is still recorded.
+        // No filters, not even saved ones: what is not shown is still recorded.
         open.open(device, for_setup.channels_of(board), for_setup.mode(), None).map(|_| ())
     })
 }
 
-/// How a device's time passes: with the computer's, or, where it does not run in real time (an emulated board), behind it.
+/// How a device's time passes: with the computer's or, if it does not run in real time (an emulated board), behind it.
 #[derive(Clone)]
 struct Pace {
     start_ns: i64,
@@ -349,15 +350,15 @@ struct Pace {
 }
 
 impl Pace {
-    /// A request's round trip, and what a busy computer adds.
+    /// A request's round trip, plus the delays of a busy computer.
     const JITTER_NS: i64 = 500_000_000;
 
     fn new(start_ns: i64, start_ticks: u64, tick_hz: u32) -> Self {
         Self { start_ns, start_ticks, tick_hz: tick_hz.max(1) }
     }
 
-    /// The time on the device, which told `ticks` at `utc_ns`: the computer's, unless the device is more behind than a
-    /// crystal can be.
+    /// The time on the device, which reported `ticks` at `utc_ns`: the computer's, unless the device is farther behind
+    /// than a crystal can be.
     fn now_ns(&self, utc_ns: i64, ticks: u64) -> i64 {
         let ticks = u128::from(ticks.saturating_sub(self.start_ticks));
         let passed_ns = (ticks * 1_000_000_000 / u128::from(self.tick_hz)) as i64;
@@ -387,11 +388,11 @@ mod tests {
     fn a_device_that_lags_behind_tells_the_time_itself() {
         let pace = Pace::new(1000 * S, 12_000_000, 12_000_000);
         let at = |utc_s: i64, device_s: u64| pace.now_ns(utc_s * S, 12_000_000 * (1 + device_s)) / S;
-        // A real one: drift and round trips do not matter, not for days.
+        // A real one: drift and round trips do not matter, even after days.
         assert_eq!(at(1000, 0), 1000);
         assert_eq!(at(1000 + 100_000, 99_990), 101_000);
         assert_eq!(at(1000 + 100_000, 100_010), 101_000);
-        // An emulated one at half the speed.
+        // An emulated one at half speed.
         assert_eq!(at(1010, 5), 1005);
         assert_eq!(at(1100, 50), 1050);
     }

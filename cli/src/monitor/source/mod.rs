@@ -1,7 +1,7 @@
-//! Where the records come from: a thread that reads a device or plays a file, records, and fills the model.
+//! The source of the records: a thread that reads a device or plays a file, records, and fills the model.
 //!
-//! It holds the model's lock only to hand over what it has, so that the display cannot make it late; a
-//! device's own buffer in the library bridges a slow moment.
+//! It holds the model's lock only to hand over what it has, so that the display cannot delay it; a device's
+//! buffer in the library covers slow moments.
 
 mod autobaud;
 mod device;
@@ -36,7 +36,7 @@ pub enum Origin {
     File(PathBuf),
 }
 
-/// What becomes of the source after an order.
+/// What the source does after an order.
 enum Then {
     GoOn,
     Autobaud,
@@ -44,9 +44,9 @@ enum Then {
     Quit,
 }
 
-/// How long to wait for records at once.
+/// How long a single wait for records lasts.
 const WAIT: Duration = Duration::from_millis(20);
-/// How often the device is asked for its state, and a recording flushed.
+/// How often to ask for the device's state, and to flush a recording.
 const FIGURES_EVERY: Duration = Duration::from_millis(500);
 
 /// Runs until [`Order::Quit`].
@@ -70,7 +70,7 @@ impl Source<'_> {
         lock(self.model).notice = text.into();
     }
 
-    /// Records, then shows.
+    /// Records first, then shows.
     fn take(&mut self, records: &[TraceRecord]) {
         if let Some(recorder) = &mut self.recorder
             && let Err(error) = recorder.write(records)
@@ -117,7 +117,7 @@ impl Source<'_> {
         }
     }
 
-    /// Orders that any source follows.
+    /// Follows orders that apply to every source.
     fn follow(&mut self, order: Order) -> Then {
         match order {
             Order::Record(path) => self.record(&path),

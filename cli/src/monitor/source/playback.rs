@@ -18,20 +18,20 @@ use super::super::plan::Plan;
 use super::{FIGURES_EVERY, Source, Then, WAIT, lock};
 use crate::advice;
 
-/// Records handed over under one lock.
+/// How many records are handed over under one lock.
 const MOST_AT_ONCE: usize = 4096;
 
-/// What could not be read: how often, and what was wrong first.
+/// What could not be read: how often, and the first fault.
 type Unread = Rc<RefCell<Option<(u64, String)>>>;
 
-/// The records that can be read; the rest is counted.
+/// The readable records; the rest is counted.
 struct Readable {
     reader: TraceReader,
     unread: Unread,
 }
 
 impl Readable {
-    /// Opens the file at its beginning and forgets what was counted before.
+    /// Opens the file at its beginning and forgets earlier counts.
     fn open(path: &Path, unread: &Unread) -> Result<Self, OpenError> {
         let reader = open_reader(path, &ReadOptions::default())?;
         unread.borrow_mut().take();
@@ -55,7 +55,7 @@ impl Iterator for Readable {
     }
 }
 
-/// The latest time in a file, looked for while it is played: the whole file must be read for it.
+/// The latest time in a file, determined while it is played: that requires reading the whole file.
 struct Length {
     /// [`i64::MIN`] until it is known.
     end_ns: Arc<AtomicI64>,
@@ -67,7 +67,7 @@ impl Length {
         Self { end_ns: Arc::new(AtomicI64::new(i64::MIN)), is_over: Arc::default() }
     }
 
-    /// Begins to look for it. If the system refuses a thread, it stays unknown.
+    /// Starts determining it. If the system refuses a thread, it stays unknown.
     fn look_for(&self, path: &Path) {
         let (path, end_ns, is_over) = (path.to_owned(), Arc::clone(&self.end_ns), Arc::clone(&self.is_over));
         let body = move || {
@@ -84,7 +84,7 @@ impl Length {
         let _ = std::thread::Builder::new().name("cantap-length".to_owned()).spawn(body);
     }
 
-    /// It is the latest time that was played, now that all was.
+    /// It is the latest time played, now that everything has been played.
     fn is(&self, latest_ns: i64) {
         self.end_ns.fetch_max(latest_ns, Ordering::Relaxed);
     }
@@ -100,10 +100,10 @@ impl Drop for Length {
     }
 }
 
-/// A file is played this long before its length is looked for: a short one may be over by then.
+/// A file is played for this long before its length is determined: a short one may have ended by then.
 const LENGTH_AFTER: Duration = Duration::from_millis(300);
 
-/// What plays a file.
+/// The engine that plays a file.
 type Player<F> = Playback<F, Readable>;
 
 impl Source<'_> {
@@ -128,7 +128,7 @@ impl Source<'_> {
         let mut is_looked_for = false;
         let first_ns = playback.position_ns(start.elapsed());
         let mut latest_ns = i64::MIN;
-        // Where to go, while it goes there.
+        // The destination while seeking.
         let mut seek: Option<i64> = None;
         let mut due = Vec::with_capacity(MOST_AT_ONCE);
         let mut next_figures = Instant::now();
@@ -202,7 +202,7 @@ impl Source<'_> {
                 Ok(Order::ToggleLoop) => playback.set_looped(!playback.is_looped()),
                 Ok(Order::Seek(time_ns)) => {
                     if time_ns < playback.position_ns(now) {
-                        // What is shown is then what the file has up to there, and nothing twice.
+                        // Then what is shown is what the file has up to there, and nothing twice.
                         if let Err(error) = playback.start_over(now) {
                             self.notice(error.to_string());
                             continue;
@@ -222,7 +222,7 @@ impl Source<'_> {
         }
     }
 
-    /// The file cannot be opened; the user may choose a device.
+    /// The file cannot be opened; the user may select a device.
     fn wait_without_source(&mut self) {
         while let Ok(order) = self.orders.recv() {
             match self.follow(order) {

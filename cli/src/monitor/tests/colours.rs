@@ -1,4 +1,4 @@
-//! What is coloured, and how it is told apart without colours.
+//! What is coloured, and how it can be distinguished without colours.
 
 use std::sync::Arc;
 
@@ -54,7 +54,7 @@ fn digits_that_changed_are_marked_fade_and_can_be_notched() {
     let at = |ms: i64, text: &str| TraceRecord { time_ns: ms * 1_000_000, channel: 1, event: frame(text) };
     model.take(&[at(0, "123#1020"), at(10, "123#1320")]);
     let (mut app, _orders) = app(View::Fixed);
-    // The low half of the first byte only.
+    // Only the low half of the first byte.
     let fresh = buffer(&mut app, &model);
     assert_eq!((style_of(&fresh, "13 20").0, style_of(&fresh, "20 ").0), (Color::Reset, Color::Reset));
     assert_eq!(style_of(&fresh, "3 20").0, Color::LightYellow);
@@ -62,7 +62,7 @@ fn digits_that_changed_are_marked_fade_and_can_be_notched() {
     assert_eq!(style_of(&buffer(&mut app, &model), "3 20").0, Color::Yellow);
     model.take(&[at(9000, "124#")]);
     assert_eq!(style_of(&buffer(&mut app, &model), "3 20").0, Color::Reset);
-    // What changes anyway is hidden, another bit of the same digit is not.
+    // What changes anyway is suppressed, another bit of the same digit is not.
     press(&mut app, &mut model, "#");
     model.take(&[at(9001, "123#1020")]);
     assert_eq!(style_of(&buffer(&mut app, &model), "0 20").0, Color::Reset);

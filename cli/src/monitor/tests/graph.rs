@@ -1,4 +1,4 @@
-//! The graph shows what was sampled, at any length of time, and its cursors tell it.
+//! The graph shows what was sampled, at any time scale, and its cursors give the values.
 
 use cantap::{TraceEvent, TraceRecord};
 use cantap_analysis::stats::Options;
@@ -10,7 +10,7 @@ use super::{SIGNALS, app, database, frame, press, screen_text};
 
 const MS: i64 = 1_000_000;
 const S: i64 = 1000 * MS;
-/// 12:00:00 of a day.
+/// 12:00:00 on some day.
 const NOON: i64 = (20_000 * 86_400 + 43_200) * S;
 
 fn model(history_bytes: usize) -> Model {
@@ -35,7 +35,7 @@ fn mouse(app: &mut App, model: &mut Model, kind: MouseEventKind, column: u16) ->
     screen_text(app, model, (100, 24)).unwrap()
 }
 
-/// Rows of the pane that have something in them, besides the values at the left.
+/// Number of rows of the pane with content, apart from the values on the left.
 fn drawn_rows(screen: &str) -> usize {
     let pane = screen.lines().skip(3).take(18);
     pane.filter(|line| line.chars().skip(10).any(|character| character != ' ')).count()
@@ -53,12 +53,12 @@ fn one_value_of_a_millisecond_among_an_hour_of_others_is_seen_and_found() {
     // The last ten seconds: nothing but a straight line.
     let screen = screen_text(&mut app, &model, (100, 24)).unwrap();
     assert_eq!(drawn_rows(&screen), 1, "{screen}");
-    // Everything: the one value stands out.
+    // Everything: the single value stands out.
     press(&mut app, &mut model, "a");
     let screen = screen_text(&mut app, &model, (100, 24)).unwrap();
     assert!(drawn_rows(&screen) > 14 && screen.contains("200┤"), "{screen}");
     assert!(screen.contains("╵12:15:00") && screen.contains("╵12:30:00"), "{screen}");
-    // Going there with the wheel, column by column: at last it is a millisecond wide.
+    // Zooming in with the wheel, column by column: in the end it is a millisecond wide.
     let column = |screen: &str| {
         let line: Vec<char> = screen.lines().nth(6).unwrap().chars().collect();
         (11..line.len()).find(|at| line[*at] != ' ').map(|at| at as u16)
@@ -78,13 +78,13 @@ fn two_cursors_tell_times_values_and_what_is_between() {
     model.take(&(0..=100).map(|n| sample(n * 100 * MS, n as u8, 0)).collect::<Vec<_>>());
     let (mut app, _orders) = app(View::Graph);
     screen_text(&mut app, &model, (100, 24)).unwrap();
-    // Ninety columns for ten seconds: the tenth's middle is at 1.055 s.
+    // Ninety columns for ten seconds: the middle of the tenth is at 1.055 s.
     mouse(&mut app, &mut model, MouseEventKind::Down(MouseButton::Left), 19);
     mouse(&mut app, &mut model, MouseEventKind::Down(MouseButton::Right), 30);
     let screen = mouse(&mut app, &mut model, MouseEventKind::Drag(MouseButton::Right), 55);
     assert!(screen.contains("Speed A 10 B 50 Δ 40"), "{screen}");
     assert!(screen.contains("A 12:00:01.055555  B 12:00:05.055555  Δt 4.000000 s"), "{screen}");
-    // Keys move the one that was set last, a column at a time, then the other.
+    // Keys move the cursor set last, a column at a time, then the other one.
     keys(&mut app, &mut model, &[KeyCode::Left, KeyCode::Char('x'), KeyCode::Right, KeyCode::Right]);
     let screen = screen_text(&mut app, &model, (100, 24)).unwrap();
     assert!(screen.contains("Δt 3.666666 s") || screen.contains("Δt 3.666667 s"), "{screen}");
@@ -105,7 +105,7 @@ fn a_value_is_held_until_the_next_or_led_there_by_a_line() {
     assert_eq!(middle(&steps), Some(' '), "{steps}");
     assert_ne!(middle(&lines), Some(' '), "{lines}");
     assert!(steps.contains("10 s, steps") && lines.contains("10 s, lines"));
-    // Between the values, where none is in sight, the one before is held.
+    // Between values, with none in sight, the previous one is held.
     press(&mut app, &mut model, "s");
     app.graph.span_ns = S;
     app.graph.end_ns = Some(NOON + 5 * S);
@@ -154,14 +154,14 @@ fn a_signal_that_is_chosen_late_has_its_past_and_what_fell_out_is_told() {
     let (high, low) = (lane.matches('▔').count(), lane.matches('▁').count());
     assert!((40..50).contains(&high) && (40..50).contains(&low), "{screen}");
     assert!(!screen.contains("nothing is kept"), "{screen}");
-    // Within a memory of its own, which is shown, the oldest makes room.
+    // Within its memory limit, which is shown, the oldest values are dropped.
     model.take(&(20_000..200_000).map(|n| sample(n * MS, 1, 0)).collect::<Vec<_>>());
     let (values, used, most) = model.seen.signals.graph_memory();
     assert!(used <= most && most == 1_000_000 && values > 50_000, "{values} {used} {most}");
     press(&mut app, &mut model, "a-");
     let screen = screen_text(&mut app, &model, (140, 24)).unwrap();
     assert!(screen.contains("before 12:02:4") && screen.contains("nothing is kept (--history)"), "{screen}");
-    // Out of the graph, its memory is free again.
+    // Removed from the graph, its memory is free again.
     press(&mut app, &mut model, "3");
     screen_text(&mut app, &model, (100, 24)).unwrap();
     keys(&mut app, &mut model, &[KeyCode::Enter]);
@@ -185,8 +185,8 @@ fn the_window_pans_back_and_follows_again() {
     assert_eq!(app.graph.end_ns, None);
 }
 
-/// What `cargo xtask bench graph` prints: how long a redraw takes with five million values in the window, and where the window is a
-/// hundredth of them. A second of memory and decoding is no test for every day.
+/// For `cargo xtask bench graph`: how long a redraw takes with five million values in the window, and with a window of a hundredth
+/// of them. It needs too much time and memory for everyday testing.
 #[test]
 #[ignore = "a measurement: cargo xtask bench graph"]
 fn redraws_of_five_million_values() {
@@ -227,7 +227,7 @@ fn redraws_of_five_million_values() {
                 "{window:<12} {:>3} x {:<3} median {:.2} ms, most {:.2} ms",
                 size.0, size.1, times[25], times[49]
             );
-            // Each redraw has 40 ms; this one must leave the others time.
+            // Each redraw has 40 ms; this one must leave time for the others.
             assert!(times[25] < 20.0, "{times:?}");
         }
     }

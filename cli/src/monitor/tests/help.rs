@@ -1,4 +1,4 @@
-//! No key without an entry in the help.
+//! Every key has an entry in the help.
 
 use std::collections::BTreeSet;
 
@@ -6,7 +6,7 @@ use super::super::views::help::KEYS;
 
 const SOURCES: [&str; 2] = [include_str!("../app/keys.rs"), include_str!("../app/graph.rs")];
 
-/// The characters that the sources look for: `'x'` in a pattern that begins with `KeyCode::Char(`.
+/// The characters handled in the sources: `'x'` in a pattern that begins with `KeyCode::Char(`.
 fn letters(source: &str) -> BTreeSet<char> {
     let mut letters = BTreeSet::new();
     for pattern in source.split("KeyCode::Char(").skip(1) {
@@ -26,14 +26,14 @@ fn every_key_that_does_something_is_in_the_help() {
     let letters: BTreeSet<char> = SOURCES.iter().flat_map(|source| letters(source)).collect();
     assert!(letters.len() > 40 && letters.is_superset(&BTreeSet::from(['m', 'A', '{', '#'])), "{letters:?}");
     let told: BTreeSet<&str> = KEYS.iter().flat_map(|(keys, _)| keys.split([' ', ','])).collect();
-    // Page numbers are shown as a range, blank by its name, k and j are the arrows' doubles, Ctrl-J is Enter.
+    // Page numbers are shown as a range, blank by its name, k and j duplicate the arrows, Ctrl-J is Enter.
     let otherwise = ['1', '8', ' ', 'j', 'k', 'z', 'u', 'h', '?', ','];
     let missing: Vec<_> = letters
         .iter()
         .filter(|letter| !otherwise.contains(letter) && !told.contains(letter.to_string().as_str()))
         .collect();
     assert!(missing.is_empty(), "{missing:?} are not in {told:?}");
-    // All of it can be read on the smallest screen that is usual.
+    // All of it can be read on the smallest usual screen.
     let wide = KEYS.iter().find(|(keys, what)| keys.chars().count() > 16 || what.chars().count() > 60);
     assert_eq!(wide, None);
     for name in ["Space", "Enter", "Esc", "Tab", "Ctrl-C", "Ctrl-Z"] {

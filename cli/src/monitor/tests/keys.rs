@@ -1,4 +1,4 @@
-//! What keys do.
+//! What the keys do.
 
 use cantap::TraceRecord;
 use cantap::wire::message::Mode;
@@ -51,12 +51,12 @@ fn a_search_finds_older_and_newer_frames_by_bytes_and_by_name() {
     let record = model.history.get(app.cursor.unwrap()).unwrap();
     assert_eq!(record.frame().unwrap().id().to_string(), "09F80102");
     press(&mut app, &mut model, "/7FF#1234\n");
-    assert_eq!(app.message, "'7FF#1234' is not there");
+    assert_eq!(app.message, "'7FF#1234' was not found");
     press(&mut app, &mut model, "y");
     assert!(app.clipboard.unwrap().contains("can0 09F80102#"));
 }
 
-/// A long trace is searched a piece at a time, and keys are answered meanwhile.
+/// A long trace is searched a piece at a time, and keys are handled meanwhile.
 #[test]
 fn a_long_search_goes_on_between_drawings_and_can_be_stopped() {
     let mut model = Model::new(Decoder::new(Vec::new()).into(), Options::default(), 16_000_000).unwrap();
@@ -85,7 +85,7 @@ fn a_long_search_goes_on_between_drawings_and_can_be_stopped() {
     for _ in 0..5 {
         app.catch_up(&mut model);
     }
-    assert_eq!((app.cursor, app.message.as_str()), (Some(1001), "'7AB' is not there"));
+    assert_eq!((app.cursor, app.message.as_str()), (Some(1001), "'7AB' was not found"));
 }
 
 #[test]
@@ -173,11 +173,11 @@ fn a_filter_hides_what_was_seen_before_too_and_gives_it_back() {
         assert!(text.contains("FILTER") && text.contains("CogSogRapid"), "{text}");
         assert!(!text.contains("PositionRapid") && !text.contains("09F80102"), "{text}");
     }
-    // Losses are shown whatever is filtered.
+    // Losses are shown regardless of filters.
     assert!(show(View::Trace, &mut app, &model).contains("17 frames lost"));
     let listed = model.history.end() - model.history.first();
     assert!((300..1000).contains(&listed), "{listed}");
-    // What comes is filtered alike, and statistics and recording take everything.
+    // New records are filtered in the same way, and statistics and recording take everything.
     let last = model.history.get(model.history.end() - 1).unwrap();
     let other = TraceRecord { event: super::frame("123#11"), ..last };
     model.take(&[last, other]);
@@ -198,7 +198,7 @@ fn the_selected_record_stays_selected_when_the_filter_changes() {
     let selected = model.history.get(app.cursor.unwrap()).unwrap();
     press(&mut app, &mut model, "f09F80202:1FFFFFFF\n");
     assert_eq!(model.history.get(app.cursor.unwrap()).unwrap(), selected);
-    // Nothing passes: nothing is selected, and no key minds.
+    // Nothing passes: nothing is selected, and all keys work.
     press(&mut app, &mut model, "f,7FF:7FF\n");
     screen_text(&mut app, &model, (80, 24)).unwrap();
     press(&mut app, &mut model, "njky ");
@@ -218,7 +218,7 @@ fn while_the_display_stands_still_rows_can_be_hidden_and_values_do_not_move() {
         let moved = TraceRecord { event: super::frame("09F80202#01FC6C000001FFFF"), ..last };
         model.take(&[TraceRecord { time_ns: last.time_ns + 1_000_000_000, ..moved }; 30]);
         let after = page(screen_text(&mut app, &model, (110, 30)).unwrap());
-        // The memory in use is shown as it is.
+        // The memory in use is displayed correctly.
         let told =
             |lines: &[String]| lines.iter().filter(|line| !line.starts_with("Memory")).cloned().collect();
         let (before, after): (Vec<String>, Vec<String>) = (told(&before), told(&after));
@@ -243,14 +243,14 @@ fn an_entry_that_is_edited_while_it_is_sent_changes_on_the_bus() {
     press(&mut app, &mut model, "my\na123#11 100ms\n ");
     assert!(matches!(orders.try_recv().unwrap(), Order::Open(_)));
     assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(1, 0, Some(_))));
-    // To the other channel: it must end on the first.
+    // To the other channel: it must end on the first one.
     press(&mut app, &mut model, "e");
     app.key(KeyEvent::from(KeyCode::Home), &mut model);
     press(&mut app, &mut model, "2:\n");
     assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(1, 0, None)));
     assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(2, 0, Some(_))));
     assert_eq!(app.send[0].text, "2:123#11 100ms");
-    // Each has a slot of its own, and keeps it when others go.
+    // Each has its own slot, and keeps it when others end.
     press(&mut app, &mut model, "a2:124#22 50ms\n");
     app.key(KeyEvent::from(KeyCode::Down), &mut model);
     press(&mut app, &mut model, " ");
@@ -259,7 +259,7 @@ fn an_entry_that_is_edited_while_it_is_sent_changes_on_the_bus() {
     press(&mut app, &mut model, "d");
     assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(2, 0, None)));
     assert_eq!((app.send.len(), app.send[0].slot), (1, Some(1)));
-    // The device has no such slot.
+    // The device does not have this slot.
     model.refused.push((2, 1));
     app.catch_up(&mut model);
     assert_eq!(app.send[0].slot, None);
@@ -291,14 +291,14 @@ fn nothing_takes_part_in_a_bus_that_was_not_asked_for_just_now() {
         };
         orders.try_iter().map(plan).collect()
     };
-    // Asked, and anything but a yes is a no.
+    // It asks, and anything but a yes is a no.
     for no in ["mn\n", "m\n", "mm\n"] {
         press(&mut app, &mut model, no);
         assert_eq!((modes(), app.message.as_str()), (Vec::new(), "it stays listen-only"), "{no}");
     }
     press(&mut app, &mut model, "my\n");
     assert_eq!(modes(), [Mode::Normal]);
-    // Other bit rates, another device: it only listens, and says so.
+    // With other bit rates or another device, it only listens, and says so.
     for other in ["b", "D"] {
         press(&mut app, &mut model, &format!("{other}\n"));
         assert_eq!(modes(), [Mode::ListenOnly], "{other}");
@@ -306,7 +306,7 @@ fn nothing_takes_part_in_a_bus_that_was_not_asked_for_just_now() {
         press(&mut app, &mut model, "my\n");
         assert_eq!(modes(), [Mode::Normal]);
     }
-    // Leaving the bus needs no question.
+    // Leaving the bus needs no confirmation.
     press(&mut app, &mut model, "m");
     assert_eq!(modes(), [Mode::ListenOnly]);
 }

@@ -1,7 +1,7 @@
-//! The pages over real traffic, as whole screens, and what keys do.
+//! The pages with real traffic, as whole screens, and what the keys do.
 //!
-//! The screens are files in `snapshots/`. After a change that is meant, write them anew with
-//! `CANTAP_OVERWRITE=1 cargo test -p cantap-cli monitor` and look at the difference.
+//! The screens are files in `snapshots/`. After an intended change, rewrite them with
+//! `CANTAP_OVERWRITE=1 cargo test -p cantap-cli monitor` and check the difference.
 
 mod colours;
 mod graph;
@@ -68,7 +68,7 @@ fn here() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("src/monitor/snapshots")
 }
 
-/// Two minutes of a boat's bus, with an error, a loss, and frames of a second channel in between.
+/// Two minutes of a boat's bus, with an error, a loss, and frames on a second channel in between.
 fn model() -> Model {
     let database = cantap_signals::load(&here().join("nmea2000.toml")).unwrap();
     assert_eq!(database.warnings, []);
@@ -98,7 +98,7 @@ fn model() -> Model {
     model
 }
 
-/// What a board says about itself in the middle of work.
+/// A board's figures about itself in the middle of its work.
 fn device() -> DeviceFigures {
     let mut figures = DeviceFigures {
         queue_bytes: 98_304,
@@ -152,7 +152,7 @@ fn app(view: View) -> (App, Receiver<Order>) {
     (App::new(view, theme, Some(plan), sender), receiver)
 }
 
-/// A signal file's text as what decodes with it.
+/// A decoder from the text of a signal file.
 fn database(text: &str) -> Arc<Decoder> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("m.toml");
@@ -177,7 +177,7 @@ fn press(app: &mut App, model: &mut Model, keys: &str) {
     }
 }
 
-/// Compares a screen with the file of that name.
+/// Compares a screen with the file with that name.
 fn check(name: &str, text: &str) {
     let path = here().join(format!("{name}.txt"));
     if std::env::var_os("CANTAP_OVERWRITE").is_some() {
@@ -246,13 +246,13 @@ fn the_record_page_is_as_agreed() {
     check_page(View::Record);
 }
 
-/// The boat's nodes, and what they said.
+/// The boat's nodes, and their events.
 #[test]
 fn the_nodes_page_is_as_agreed() {
     check_page(View::Nodes);
 }
 
-/// A transfer stands there until it is done, and a fault is seen.
+/// A transfer is shown until it is done, and a fault is visible.
 #[test]
 fn transfers_under_way_are_shown_until_they_end() {
     let mut model = Model::new(database("version = 1"), Options::default(), 1_000_000).unwrap();
@@ -293,7 +293,7 @@ fn the_help_lies_over_the_page() {
     assert!(!app.help);
 }
 
-/// What is asked for, what is typed and what is wrong with it are in sight on the smallest usual screen.
+/// The question, the input and any error are visible on the smallest usual screen.
 #[test]
 fn a_line_of_input_is_in_sight_whatever_is_asked() {
     let mut model = model();

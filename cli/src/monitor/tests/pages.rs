@@ -1,4 +1,4 @@
-//! Rows that open, lists that are searched, sorted and narrowed, and what the second line tells.
+//! Rows that open, lists that are searched, sorted and filtered, and the content of the second line.
 
 use cantap::wire::record::ErrorState;
 use cantap::{TraceEvent, TraceRecord};
@@ -43,7 +43,7 @@ fn a_row_opens_to_its_signals_and_on_wide_screens_they_stand_beside_it() {
     assert!(!screen_text(&mut app, &model, (80, 24)).unwrap().contains("OilTemp"));
     let wide = screen_text(&mut app, &model, (160, 24)).unwrap();
     assert!(wide.lines().any(|line| line.contains("Engine  Speed 20 rpm  OilTemp 200▲")), "{wide}");
-    // In the trace, the selected record's.
+    // In the trace: those of the selected record.
     press(&mut app, &mut model, "1\n");
     let trace = screen_text(&mut app, &model, (80, 24)).unwrap();
     assert!(trace.contains("1 100  Engine") && trace.contains("20 rpm"), "{trace}");
@@ -68,10 +68,10 @@ fn signals_are_searched_grouped_sorted_and_narrowed() {
     press(&mut app, &mut model, "N");
     assert_eq!(app.selected, 0);
     press(&mut app, &mut model, "/nothing\n");
-    assert_eq!((app.selected, app.message.as_str()), (0, "'NOTHING' is not there"));
+    assert_eq!((app.selected, app.message.as_str()), (0, "'NOTHING' was not found"));
     press(&mut app, &mut model, "s");
     assert_eq!(names(&mut app, &model), ["Body.Door", "Engine.OilTemp", "Engine.Speed"]);
-    // Clicks on headings sort, and once more the other way round.
+    // Clicks on headings sort; a second click reverses the order.
     let heading = screen_text(&mut app, &model, (110, 24)).unwrap().lines().nth(2).unwrap().to_owned();
     let column = heading.chars().collect::<String>().find("Value").unwrap() as u16;
     click(&mut app, &mut model, column, 2);
@@ -81,7 +81,7 @@ fn signals_are_searched_grouped_sorted_and_narrowed() {
     assert_eq!(names(&mut app, &model)[0], "Body.Door");
     press(&mut app, &mut model, "g");
     assert_eq!(names(&mut app, &model), ["Body", "Door", "Engine", "Speed", "OilTemp"]);
-    // A message's name is no signal.
+    // A message's name is not a signal.
     app.selected = 0;
     press(&mut app, &mut model, "\n");
     assert_eq!(model.seen.signals.graph_memory().0, 0);
@@ -105,7 +105,7 @@ fn the_fixed_page_is_narrowed_by_signals_with_a_condition_of_its_own() {
     assert_eq!(ids(&mut app, &model), ["100"]);
     let text = screen_text(&mut app, &model, (110, 24)).unwrap();
     assert!(text.contains("(F oiltemp > 100: 1 hidden)"), "{text}");
-    // The page of signals shows all; what is typed there is another condition.
+    // The signals page shows all; what is typed there is a separate condition.
     press(&mut app, &mut model, "3");
     assert!(screen_text(&mut app, &model, (110, 24)).unwrap().contains("Body.Door"));
     press(&mut app, &mut model, "2F");
@@ -169,7 +169,7 @@ fn the_second_line_tells_mode_rates_errors_and_bus_off_as_far_as_there_is_room()
     }
     let at = line.find("NORMAL").unwrap() as u16;
     assert!(wide[(at, 1)].modifier.contains(Modifier::BOLD));
-    // What must be seen is there on the smallest screen that is usual, too.
+    // What must be seen is visible on the smallest usual screen, too.
     let narrow = screen_text(&mut app, &model, (80, 24)).unwrap();
     let line = narrow.lines().nth(1).unwrap();
     for part in ["NORMAL", "BUS-OFF", "errors 1", "lost 17"] {
@@ -218,7 +218,7 @@ fn a_file_tells_where_it_is_and_goes_where_it_is_told() {
     assert_eq!(sought(), 220);
     click(&mut app, &mut model, bar.x, 1);
     assert_eq!(sought(), 100);
-    // One key stops it and lets it go on; at its end it begins anew.
+    // One key pauses and resumes it; at the end it restarts.
     press(&mut app, &mut model, " ");
     assert!(matches!(orders.try_recv(), Ok(Order::TogglePause)));
     model.source = SourceState::Playing(Playing { ended: true, ..playing });
@@ -258,13 +258,13 @@ fn a_trace_opens_beside_and_a_database_decodes_what_was_seen_before() {
     assert_eq!(app.wish.take(), Some(Wish::Beside(trace.clone().into())));
     press(&mut app, &mut model, &format!("O{trace}\n"));
     assert_eq!(app.wish.take(), Some(Wish::Beside(trace.into())));
-    // A slip of the pen is no device.
+    // A typing error is not a device.
     press(&mut app, &mut model, "D");
     app.key(KeyEvent::new(KeyCode::Char('u'), KeyModifiers::CONTROL), &mut model);
     press(&mut app, &mut model, "/nothing/drive.blf\n");
     assert_eq!(app.message, "there is no file /nothing/drive.blf");
     app.key(KeyEvent::from(KeyCode::Esc), &mut model);
-    // Nothing of what runs was touched.
+    // What was running is untouched.
     assert!(orders.try_recv().is_err() && app.plan.is_some());
     press(&mut app, &mut model, "O/nothing.dbc\n");
     assert!(app.prompt.is_some() && app.message.contains("/nothing.dbc"), "{}", app.message);

@@ -102,7 +102,7 @@ fn record(random: &mut fastrand::Rng, now_ns: &mut i64) -> TraceRecord {
     TraceRecord { time_ns: *now_ns, channel: random.u8(1..4), event }
 }
 
-/// Something happens beside the user's keys.
+/// Something happens besides the user's keys.
 fn happen(random: &mut fastrand::Rng, model: &mut Model, now_ns: &mut i64) {
     match random.u32(..10) {
         0 => model.source = SourceState::Gone("the device vanished; plug it in again".to_owned()),

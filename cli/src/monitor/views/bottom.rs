@@ -1,4 +1,4 @@
-//! The last line: keys, what was just said, or a line of input. What is too long for it lies over the page.
+//! The last line: keys, the latest message, or an input line. Longer text is drawn over the page.
 
 use ratatui::Frame;
 use ratatui::layout::Rect;
@@ -10,7 +10,7 @@ use super::super::app::{App, Prompt, PromptKind, View};
 use super::super::model::{Model, SourceState};
 use super::super::theme::Theme;
 
-/// Draws it, and what is too long for it over the end of `body`.
+/// Draws it, and any text too long for it over the end of `body`.
 pub fn draw(frame: &mut Frame<'_>, body: Rect, bottom: Rect, app: &App, model: &Model) {
     let width = usize::from(bottom.width);
     let line = if let Some(prompt) = &app.prompt {
@@ -30,7 +30,7 @@ pub fn draw(frame: &mut Frame<'_>, body: Rect, bottom: Rect, app: &App, model: &
     frame.render_widget(Paragraph::new(line).style(Theme::bar()), bottom);
 }
 
-/// A text over the page's last lines, as many as it needs.
+/// Draws a text over the page's last lines, using as many as it needs.
 fn over(frame: &mut Frame<'_>, body: Rect, text: &str) {
     let lines = wrapped(text, usize::from(body.width).saturating_sub(1));
     let height = body.height.min(u16::try_from(lines.len()).unwrap_or(u16::MAX));
@@ -40,7 +40,7 @@ fn over(frame: &mut Frame<'_>, body: Rect, text: &str) {
     frame.render_widget(Paragraph::new(lines).style(Theme::bar()), place);
 }
 
-/// Lines no longer than the width in characters; only a word that is longer is cut.
+/// Lines no longer than the width in characters; only longer words are split.
 fn wrapped(text: &str, width: usize) -> Vec<String> {
     let width = width.max(1);
     let mut lines = vec![String::new()];
@@ -74,13 +74,13 @@ fn wrapped(text: &str, width: usize) -> Vec<String> {
     lines
 }
 
-/// The line of input, scrolled so that its cursor is in sight.
+/// The input line, scrolled so that its cursor is visible.
 fn input(prompt: &Prompt, width: usize) -> Line<'static> {
     let (before, behind) = prompt.line.halves();
     let hidden = (before.chars().count() + 4).saturating_sub(width);
     let before: String = before.chars().skip(hidden).collect();
     let mut behind = behind.chars();
-    // The cursor is a block, and an underscore where there is nothing.
+    // The cursor is a block, or an underscore at the end.
     let cursor = behind.next().map_or("_".to_owned(), String::from);
     Line::from(vec![
         Span::raw(format!(" > {before}")),
@@ -116,7 +116,7 @@ fn question(kind: PromptKind) -> &'static str {
     }
 }
 
-/// What there is to say.
+/// The message to show, if any.
 fn said(app: &App, model: &Model) -> Option<String> {
     if !app.message.is_empty() {
         return Some(app.message.clone());
@@ -133,7 +133,7 @@ fn said(app: &App, model: &Model) -> Option<String> {
     }
 }
 
-/// As many of the page's keys, which stand two blanks apart, as there is room for.
+/// As many of the page's keys, which are two blanks apart, as fit.
 fn keys(app: &App, model: &Model, width: usize) -> String {
     let keys = match app.view {
         View::Trace => "t time  / search  n N next  Enter signals  y copy  ↑↓ scroll  End newest  f filter",

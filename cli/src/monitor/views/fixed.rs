@@ -15,11 +15,11 @@ use super::super::theme::Theme;
 use super::list::list;
 use super::signals::{alarm, in_line};
 
-/// Where the characters, and the rows' signals, have room beside the data.
+/// With at least this many columns, there is room for the characters and the rows' signals beside the data.
 const LEAST_WITH_CHARACTERS: u16 = 100;
-/// Where the rows' signals have room beside the data.
+/// With at least this many columns, there is room for the rows' signals beside the data.
 const LEAST_WITH_SIGNALS: u16 = 120;
-/// The columns' headings; what they are sorted by, their width, and whether they begin at its left.
+/// The columns' headings, with their sort column, their width, and whether they are left-aligned.
 const COLUMNS: [(&str, Option<Column>, usize, bool); 9] = [
     ("C", None, 1, true),
     ("ID", Some(Column::Id), 9, false),
@@ -34,9 +34,9 @@ const COLUMNS: [(&str, Option<Column>, usize, bool); 9] = [
 
 /// A line of the page.
 enum Entry<'a> {
-    /// An identifier's.
+    /// An identifier.
     Row(&'a Row),
-    /// One of the signals of the row above, which is opened.
+    /// A signal of the opened row above.
     Signal(Decoded),
 }
 
@@ -65,7 +65,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
     });
 }
 
-/// The headings; where those that sort stand is noted for clicks.
+/// The headings; the positions of those that sort are recorded for clicks.
 fn heading(app: &mut App, seen: &Seen, ascii: bool, hidden: usize) -> Line<'static> {
     let mut text = String::new();
     app.sort_columns.clear();
@@ -91,7 +91,7 @@ fn heading(app: &mut App, seen: &Seen, ascii: bool, hidden: usize) -> Line<'stat
     }
 }
 
-/// Which way the page is sorted by a column, if it is.
+/// The direction in which the page is sorted by a column, if it is.
 fn arrow(app: &App, column: Option<Column>) -> &'static str {
     match (app.theme.unicode, app.reverse) {
         _ if column != Some(app.sort) => "",
@@ -147,7 +147,7 @@ fn sorted<'a>(app: &App, model: &Model, seen: &'a Seen) -> Vec<&'a Row> {
     rows
 }
 
-/// The messages, each with its channel, with a signal that is as the page's condition says.
+/// The messages, each with its channel, that have a signal matching the page's condition.
 fn chosen_messages(app: &App, seen: &Seen) -> HashSet<(u8, MessageRef)> {
     let filter = &app.row_filter;
     let is_chosen = |row: &&SignalRow| {
@@ -201,7 +201,7 @@ fn line(row: &Row, ascii: bool, beside: bool, app: &App, seen: &Seen) -> Line<'s
     Line::from(spans)
 }
 
-/// Highlighted for a while after a change, unless its bits are notched.
+/// Highlighted for a while after a change, unless its bits are suppressed.
 fn changed_style(row: &Row, digit: usize, now_ns: i64, app: &App) -> Style {
     match row.changed_ns[digit] {
         i64::MIN => Style::new(),
@@ -209,7 +209,7 @@ fn changed_style(row: &Row, digit: usize, now_ns: i64, app: &App) -> Style {
     }
 }
 
-/// The more often the digit's busiest bit changes, the hotter.
+/// The more often the digit's most active bit changes, the hotter.
 fn heat_style(row: &Row, digit: usize, app: &App) -> Style {
     let busiest = row.heat[digit * 4..digit * 4 + 4].iter().copied().max().unwrap_or(0);
     let share = f64::from(busiest) / row.count.max(1) as f64;

@@ -8,7 +8,7 @@ use ratatui::widgets::{Block, Clear, Paragraph};
 use super::super::app::App;
 use super::super::theme::Theme;
 
-/// Every key; `tests/help.rs` holds them to what the keys do.
+/// Every key; `tests/help.rs` checks these against the keys that are handled.
 pub const KEYS: &[(&str, &str)] = &[
     ("1 … 8, Tab", "pages: trace, fixed, signals, graph, statistics, send …"),
     ("q, Ctrl-C Ctrl-Z", "leave; give the shell back for a while"),
@@ -37,7 +37,7 @@ pub const KEYS: &[(&str, &str)] = &[
     ("B  {  }", "bookmark here, go to the one before, after"),
 ];
 
-/// Draws the help over the page; the arrows show what has no room.
+/// Draws the help over the page; the arrows scroll to the rest.
 pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App) {
     let width = area.width.min(92);
     let height = area.height.min(KEYS.len() as u16 + 2);

@@ -1,4 +1,4 @@
-//! Rows below a heading, and what several pages write alike.
+//! Rows below a heading, and text that several pages have in common.
 
 use ratatui::Frame;
 use ratatui::layout::Rect;
@@ -8,7 +8,7 @@ use ratatui::widgets::Paragraph;
 use super::super::app::{App, first_row};
 use super::super::theme::Theme;
 
-/// A number of bytes for people.
+/// A number of bytes for display.
 pub fn bytes(bytes: u64) -> String {
     match bytes {
         0..10_000 => format!("{bytes} B"),
@@ -18,7 +18,7 @@ pub fn bytes(bytes: u64) -> String {
     }
 }
 
-/// Lines below a heading, from the first row that keeps the selected one in sight.
+/// Lines below a heading, starting at a row that keeps the selected one in sight.
 pub fn list(
     frame: &mut Frame<'_>,
     area: Rect,

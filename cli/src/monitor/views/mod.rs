@@ -1,4 +1,4 @@
-//! The pages, each a file of its own, and what is around them.
+//! The pages, each in its own file, and what surrounds them.
 
 mod bottom;
 pub mod fixed;
@@ -24,7 +24,7 @@ use super::app::{App, View};
 use super::model::Model;
 use super::theme::Theme;
 
-/// The smallest screen that anything fits on.
+/// The smallest usable screen.
 pub const LEAST: (u16, u16) = (40, 8);
 
 /// Draws everything.
@@ -44,7 +44,7 @@ pub fn draw(frame: &mut Frame<'_>, app: &mut App, model: &Model) {
     .areas(area);
     frame.render_widget(Paragraph::new(tabs(app)).style(Theme::bar()), top);
     state::draw(frame, state, app, model);
-    // While the display is stopped, the pages show what was seen then.
+    // While the display is paused, the pages show what had been seen then.
     let frozen = app.frozen.take();
     let seen = frozen.as_deref().unwrap_or(&model.seen);
     match app.view {
@@ -67,7 +67,7 @@ pub fn draw(frame: &mut Frame<'_>, app: &mut App, model: &Model) {
     }
 }
 
-/// Replaces what a terminal without Unicode cannot show.
+/// Replaces characters that a terminal without Unicode cannot show.
 fn make_ascii(buffer: &mut Buffer) {
     for cell in &mut buffer.content {
         let plain = match cell.symbol() {

@@ -1,4 +1,4 @@
-//! What the bus says: its nodes with their states and trouble codes, transfers under way, and the last that was said.
+//! What the bus says: its nodes with their states and trouble codes, transfers in progress, and the latest events.
 
 use ratatui::Frame;
 use ratatui::layout::Rect;
@@ -10,7 +10,7 @@ use super::super::model::{Model, Seen};
 use super::super::theme::Theme;
 use crate::protocols::about;
 
-/// Lines of what was said that stand above everything else on a small screen.
+/// Minimum number of event lines, which on a small screen take precedence over everything else.
 const LEAST_SAID: usize = 6;
 
 /// Draws the page.
@@ -39,7 +39,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
         )));
     }
     app.page_rows = rows;
-    // The newest is in sight as long as nothing was scrolled.
+    // The newest event is in sight as long as nothing was scrolled.
     let said = rows.saturating_sub(lines.len() + 1).max(LEAST_SAID).min(talked.recent.len());
     let mut tail = vec![heading("Said last".to_owned())];
     for event in talked.recent.iter().skip(talked.recent.len() - said) {

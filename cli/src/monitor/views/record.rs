@@ -1,4 +1,4 @@
-//! The recording that runs, if one does.
+//! The current recording, if any.
 
 use ratatui::Frame;
 use ratatui::layout::Rect;

@@ -12,16 +12,16 @@ use super::super::model::{Decoded, Model, Seen, SignalRow};
 use super::super::theme::Theme;
 use super::list::list;
 
-/// Columns of the small curve.
+/// Number of columns in the small curve.
 const SPARK_COLUMNS: usize = 16;
-/// Time that each of them stands for: the last eight seconds altogether.
+/// Time per column: the last eight seconds altogether.
 const SPARK_COLUMN_NS: i64 = 500_000_000;
 
 /// A line of the page.
 enum Entry<'a> {
     /// A message's name, above its signals.
     Message(String),
-    /// A signal's.
+    /// A signal.
     Signal(&'a SignalRow),
 }
 
@@ -66,7 +66,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
     });
 }
 
-/// The places of the signals that are shown, in their order.
+/// The indexes of the signals shown, in order.
 fn chosen(app: &App, model: &Model, seen: &Seen) -> Vec<usize> {
     let rows = seen.signals.rows();
     let filter = &app.signals.filter;
@@ -99,7 +99,7 @@ fn chosen(app: &App, model: &Model, seen: &Seen) -> Vec<usize> {
     places
 }
 
-/// The headings; where those that sort stand is noted for clicks.
+/// The headings; the positions of those that sort are recorded for clicks.
 fn heading(app: &mut App, name_columns: usize) -> Line<'static> {
     let page = &mut app.signals;
     let arrow = match (app.theme.unicode, page.reverse) {
@@ -127,7 +127,7 @@ fn heading(app: &mut App, name_columns: usize) -> Line<'static> {
     Line::from(text.trim_end().to_owned())
 }
 
-/// An alarm's arrow, and the style of the value that raises it.
+/// An alarm's arrow, and the style for the value that raises it.
 pub fn alarm(alarm: Option<Alarm>, theme: Theme) -> (&'static str, Style) {
     match alarm {
         Some(Alarm::Above) => (if theme.unicode { "▲" } else { "^" }, theme.error()),
@@ -136,7 +136,7 @@ pub fn alarm(alarm: Option<Alarm>, theme: Theme) -> (&'static str, Style) {
     }
 }
 
-/// A frame's signals one after the other, for what is beside its data.
+/// A frame's signals one after the other, for display beside its data.
 pub fn in_line(signals: &[Decoded], theme: Theme) -> Vec<Span<'static>> {
     let spans = signals.iter().flat_map(|signal| {
         let (arrow, style) = alarm(signal.alarm, theme);
@@ -180,7 +180,8 @@ pub fn short(value: f64) -> String {
     if rounded.len() <= 10 { rounded } else { format!("{value:.3e}") }
 }
 
-/// The recent past as a row of blocks, each the value that the signal had then, from its lowest to its highest.
+/// The recent past as a row of blocks, each for the signal's value at that time, from its lowest to its
+/// highest.
 fn spark(row: &SignalRow, now_ns: i64, unicode: bool) -> String {
     let levels: &[char] = if unicode {
         &['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█']

@@ -1,4 +1,5 @@
-//! The second line: source, mode, what each channel does, losses, recording, what hides something; of a file, where it is.
+//! The second line: source, mode, each channel's activity, losses, recording, anything that hides records; for a file, the
+//! position.
 
 use std::time::Instant;
 
@@ -17,14 +18,14 @@ use super::super::theme::Theme;
 use super::super::times::duration;
 use super::list::bytes;
 
-/// Characters of an address that there is room for beside the rest, on a wide screen and on a narrow one.
+/// Maximum number of characters of an address, on a wide screen and on a narrow one.
 const MOST_ADDRESS: [usize; 2] = [32, 16];
-/// Windows whose mean is the rate shown: a second.
+/// Number of windows over which the displayed rate is averaged: a second.
 const RATE_WINDOWS: usize = 4;
-/// Fewer columns are no bar.
+/// With fewer columns than this, there is no bar.
 const LEAST_BAR: usize = 10;
 
-/// How much is shown of each channel, as far as there is room.
+/// How much is shown of each channel, depending on the room.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Detail {
     Nothing,
@@ -59,7 +60,7 @@ fn width(spans: &[Span<'_>]) -> usize {
     spans.iter().map(|span| span.content.chars().count()).sum()
 }
 
-/// What stands there, with this much of each channel and this many characters of an address.
+/// The line, with this much of each channel and this many characters of an address.
 fn line(app: &App, model: &Model, detail: Detail, most_address: usize) -> Vec<Span<'static>> {
     let theme = app.theme;
     let style = match model.source {
@@ -133,7 +134,7 @@ fn line(app: &App, model: &Model, detail: Detail, most_address: usize) -> Vec<Sp
     spans
 }
 
-/// What acknowledges and sends is not to be overlooked.
+/// A mode that acknowledges and sends must not be overlooked.
 fn mode(mode: Mode, theme: Theme, quiet: Style) -> (&'static str, Style) {
     match mode {
         Mode::ListenOnly => ("listen-only", quiet),
@@ -171,7 +172,7 @@ fn channel_text<'a>(
     spans
 }
 
-/// The end of a long address, where its name is.
+/// The end of a long address, which contains its name.
 fn end_of(address: &str, most: usize) -> String {
     let hidden = address.chars().count().saturating_sub(most);
     if hidden == 0 {
@@ -180,7 +181,7 @@ fn end_of(address: &str, most: usize) -> String {
     std::iter::once('…').chain(address.chars().skip(hidden + 1)).collect()
 }
 
-/// How the source is, in words.
+/// The state of the source, as text.
 fn source_text(app: &App, model: &Model) -> String {
     match &model.source {
         SourceState::Starting => "connecting".to_owned(),
@@ -199,9 +200,9 @@ fn playing_text(playing: Playing) -> String {
         (_, true, _) => "stopped",
         _ => "playing",
     };
-    // Above 1 it is faster than it was; the engine counts the delay.
+    // The engine's factor is the delay: above 1, speed is its inverse.
     let speed = match playing.factor {
-        0.0 => "as fast as can be".to_owned(),
+        0.0 => "as fast as possible".to_owned(),
         factor => format!("×{}", (1e4 / factor).round() / 1e4),
     };
     let at = duration(playing.position_ns.saturating_sub(playing.first_ns));
@@ -210,7 +211,7 @@ fn playing_text(playing: Playing) -> String {
     format!("{state} {speed}{} {at} / {of}", if playing.looped { ", loop" } else { "" })
 }
 
-/// Where the file is, with the bookmarks.
+/// The position in the file, with the bookmarks.
 fn bar(playing: Playing, end_ns: i64, bookmarks: &[i64], columns: usize) -> String {
     let span = (end_ns as f64 - playing.first_ns as f64).max(1.0);
     let place = |time_ns: i64| {

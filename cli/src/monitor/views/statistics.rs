@@ -1,4 +1,4 @@
-//! Load with its history, rates, errors, losses per stage, and how the device is.
+//! Load with its history, rates, errors, losses per stage, and the device's state.
 
 use cantap::Channel;
 use cantap::device::{ClockSource, channel_number};
@@ -15,7 +15,7 @@ use super::super::theme::Theme;
 use super::list::bytes;
 use crate::words::{error_name, state_name};
 
-/// Columns of the gauge on a narrow and on a wide screen.
+/// Number of columns of the gauge on a narrow and on a wide screen.
 const GAUGE_COLUMNS: [usize; 2] = [12, 40];
 
 const KINDS: [BusErrorKind; 6] = [
@@ -59,7 +59,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
         bytes(most as u64)
     )));
     app.page_rows = usize::from(area.height);
-    // Scrolled with the arrows where the screen is small.
+    // Scrolled with the arrows if the screen is small.
     let most = lines.len().saturating_sub(app.page_rows);
     app.selected = app.selected.min(most);
     let first = app.selected;
@@ -131,7 +131,7 @@ fn channel_lines(
     }
 }
 
-/// A bar of the load, with the instant, mean and peak as figures.
+/// A bar for the load, with current, mean and peak load as figures.
 fn gauge(load: f64, columns: usize, channel: &ChannelStatistics, app: &App) -> Line<'static> {
     let (full, empty) = if app.theme.unicode { ('█', '░') } else { ('#', '.') };
     let filled = ((load * columns as f64 / 100.0).round() as usize).min(columns);
@@ -139,7 +139,7 @@ fn gauge(load: f64, columns: usize, channel: &ChannelStatistics, app: &App) -> L
     let percent = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.1} %"));
     let work = channel.load.as_ref();
     let peak = channel.window_largest_pct();
-    // What was lost is not in it.
+    // It does not include lost frames.
     let bound = match (channel.losses.total(), app.theme.unicode) {
         (0, _) => "",
         (_, true) => "≥ ",

@@ -18,7 +18,7 @@ use super::super::times::{clock, seconds};
 use super::list::bytes;
 use super::signals::{alarm, in_line};
 
-/// Where a frame's signals have room beside the data.
+/// With at least this many columns, there is room for a frame's signals beside the data.
 const LEAST_WITH_SIGNALS: u16 = 120;
 
 /// Draws the page.
@@ -32,7 +32,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
         && cursor < first
         && end > first
     {
-        // What was looked at has made room.
+        // The record being viewed has been dropped.
         app.cursor = Some(first);
     }
     app.bottom = match app.cursor {
@@ -41,7 +41,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
         Some(cursor) if (app.bottom.saturating_sub(rows)..app.bottom).contains(&cursor) => app.bottom,
         Some(cursor) if cursor + 1 == app.bottom.saturating_sub(rows) => cursor + rows,
         Some(cursor) if cursor == app.bottom => cursor + 1,
-        // Far away: into the middle, so that there is something to see on both sides.
+        // Far away: move it to the middle, so that there is something to see on both sides.
         Some(cursor) => cursor + rows / 2 + 1,
     };
     app.bottom = app.bottom.clamp(end.min(first + rows), end);
@@ -71,7 +71,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
     frame.render_widget(Paragraph::new(lines), area);
 }
 
-/// The signals of the selected record, or of the newest, below the page; returns what is left of it.
+/// The signals of the selected record, or of the newest, below the page; returns the rest of the area.
 fn opened(frame: &mut Frame<'_>, area: Rect, app: &App, model: &Model) -> Rect {
     let place = app.cursor.or(model.history.end().checked_sub(1));
     let record = place.and_then(|place| model.history.get(place));
@@ -147,7 +147,7 @@ fn line(record: &TraceRecord, before: Option<&TraceRecord>, app: &App, model: &M
     }
 }
 
-/// How what is no frame is drawn.
+/// The style of records that are not frames.
 fn event_style(event: &TraceEvent, theme: Theme) -> Style {
     match event {
         TraceEvent::Lost { .. } => theme.loss(),

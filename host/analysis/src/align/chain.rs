@@ -1,23 +1,24 @@
-//! Which moments of two traces really are the same: those whose times agree with their neighbours'.
+//! Finds which moments of two traces really are the same: those whose times agree with their neighbours'.
 
 use super::sketch::Pair;
 
-/// Two clocks differ in speed by less: crystals by 0.01 %, an operating system that slews its clock by 0.05 %.
+/// Two clocks differ in speed by less than this: crystals by 0.01 %, an operating system that slews its clock
+/// by 0.05 %.
 pub(super) const MOST_DRIFT: f64 = 1e-3;
-/// Fewer moments that agree with each other may be chance.
+/// Fewer moments agreeing with each other may be chance.
 pub(super) const FEWEST: usize = 8;
-/// Chains that are followed at a time.
+/// How many chains are followed at a time.
 const MOST_OPEN: usize = 64;
 
-/// Moments in order of time, each in agreement with the one before.
+/// Moments in order of time, each consistent with the one before.
 #[derive(Clone, Debug)]
 pub(super) struct Chain {
     pub pairs: Vec<Pair>,
 }
 
 impl Chain {
-    /// Whether the pair can follow: the clocks' difference has changed by no more than drift and the stamps' own error
-    /// explain.
+    /// Whether the pair can follow: the change in the clocks' difference is no more than drift and the stamps' own
+    /// error explain.
     fn takes(&self, pair: &Pair, slack_ns: i64) -> bool {
         let Some(last) = self.pairs.last() else { return true };
         let (a, b) = (pair.a_ns - last.a_ns, pair.b_ns - last.b_ns);
@@ -41,13 +42,13 @@ impl Chain {
 /// Why no chain can be trusted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Unclear {
-    /// Too few moments agree with each other.
+    /// Too few moments are consistent with each other.
     TooFew,
     /// More than one answer is possible.
     Ambiguous,
 }
 
-/// The chains that cover the common time of both traces: one, or more where a clock was set meanwhile.
+/// The chains that cover the common time of both traces: one, or more if a clock was set meanwhile.
 pub(super) fn chains(pairs: &[Pair], slack_ns: i64) -> Result<Vec<Chain>, Unclear> {
     let mut open: Vec<Chain> = Vec::new();
     let mut closed: Vec<Chain> = Vec::new();
@@ -71,7 +72,7 @@ pub(super) fn chains(pairs: &[Pair], slack_ns: i64) -> Result<Vec<Chain>, Unclea
     for chain in closed {
         match chosen.iter().find(|better| better.overlaps(&chain)) {
             None => chosen.push(chain),
-            // Nearly as good, and not at the same time: who could tell which is true?
+            // Nearly as good, and not at the same time: it is impossible to tell which is right.
             Some(better) if chain.pairs.len() * 2 > better.pairs.len() => return Err(Unclear::Ambiguous),
             Some(_) => {}
         }

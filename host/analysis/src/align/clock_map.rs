@@ -1,4 +1,4 @@
-//! One trace's clock in terms of the other's: straight pieces between points that many moments determine.
+//! Maps one trace's clock to the other's: straight pieces between points, each determined by many moments.
 
 use super::chain::{Chain, MOST_DRIFT};
 use super::sketch::Pair;
@@ -6,18 +6,18 @@ use super::sketch::Pair;
 /// A piece of the map is at least this long and has at least [`PIECE_PAIRS`] moments: a crystal's rate is constant for a
 /// second to 0.1 ppm or better, and the error of single stamps averages out.
 const PIECE_NS: i64 = 1_000_000_000;
-/// Moments in a piece.
+/// Number of moments in a piece.
 const PIECE_PAIRS: usize = 32;
-/// Moments further from a piece's line than this many times the typical distance are left out of it.
+/// Moments farther from a piece's line than this many times the typical distance are left out.
 const OUTLIER: f64 = 4.0;
-/// Rounds of leaving out.
+/// How many times to leave out outliers.
 const ROUNDS: usize = 3;
 
 /// Maps the second trace's times to the first one's.
 #[derive(Clone, Debug)]
 pub struct ClockMap {
     knots: Vec<Knot>,
-    /// Times the clocks were set against each other while both recorded.
+    /// How many times the clocks were set against each other while both recorded.
     steps: usize,
 }
 
@@ -27,9 +27,9 @@ struct Knot {
     b_ns: i64,
     ahead_ns: i64,
     fraction_ns: f64,
-    /// What the first clock gains on the second, in nanoseconds a nanosecond.
+    /// How much the first clock gains on the second, in nanoseconds per nanosecond.
     rate: f64,
-    /// Which chain it belongs to: between two, a clock was set.
+    /// The chain it belongs to: between two chains, a clock was set.
     chain: usize,
 }
 
@@ -42,13 +42,13 @@ impl ClockMap {
         Self { knots, steps: chains.len().saturating_sub(1) }
     }
 
-    /// When it was in the first trace's time, in nanoseconds.
+    /// A time of the second trace as a time of the first, in nanoseconds.
     pub fn to_first(&self, b_ns: i64) -> i64 {
         let after = self.knots.partition_point(|knot| knot.b_ns <= b_ns);
         let (before, after) = (after.checked_sub(1).map(|at| &self.knots[at]), self.knots.get(after));
         match (before, after) {
             (Some(before), Some(after)) if before.chain == after.chain => before.between(after, b_ns),
-            // A clock was set somewhere between: the nearer side is the better guess.
+            // A clock was set somewhere between them: the nearer side is the better guess.
             (Some(before), Some(after)) => {
                 if b_ns - before.b_ns <= after.b_ns - b_ns {
                     before.extend(b_ns)
@@ -61,12 +61,12 @@ impl ClockMap {
         }
     }
 
-    /// What the first clock is ahead of the second, at the beginning of the common time, in nanoseconds.
+    /// How far the first clock is ahead of the second at the beginning of the common time, in nanoseconds.
     pub fn ahead_ns(&self) -> i64 {
         self.knots.first().map_or(0, |knot| knot.ahead_ns + knot.fraction_ns.round() as i64)
     }
 
-    /// By how much the first clock runs faster than the second, in parts per million; over the longest time without a step.
+    /// How much faster the first clock runs than the second, in parts per million, over the longest time without a step.
     pub fn drift_ppm(&self) -> f64 {
         let mut longest = (0, 0.0);
         for chain in self.knots.chunk_by(|one, next| one.chain == next.chain) {
@@ -108,7 +108,7 @@ fn is_long(piece: &[Pair]) -> bool {
 }
 
 impl Knot {
-    /// The straight line through a piece's moments, less those that are far from it.
+    /// The straight line through a piece's moments, excluding outliers.
     fn fit(pairs: &[Pair], chain: usize) -> Self {
         let (first, last) = (pairs[0], pairs[pairs.len() - 1]);
         let b_ns = first.b_ns + (last.b_ns - first.b_ns) / 2;
@@ -157,7 +157,7 @@ impl Line {
     }
 }
 
-/// Least squares. Clocks do not differ by more than [`MOST_DRIFT`], however little a short piece says.
+/// Least squares. The slope is limited to [`MOST_DRIFT`], however little a short piece says.
 fn line(points: &[(f64, f64)]) -> Line {
     let count = points.len() as f64;
     let (x, y) = points.iter().fold((0.0, 0.0), |(x, y), point| (x + point.0, y + point.1));

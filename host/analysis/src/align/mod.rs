@@ -1,14 +1,14 @@
-//! Traces of several recorders that heard the same bus, set on one clock by the frames themselves.
+//! Puts traces of several recorders on the same bus on one clock, by means of the frames themselves.
 //!
-//! Recorders on different computers have different clocks, and the difference changes while they record. A bus gives every
-//! one of them the same frames in the same order, so the frames tell: runs of frames that occur once in each trace are found
-//! ([`Sketch`]), those whose times agree with each other are kept, and a piecewise straight [`ClockMap`] is laid through
-//! them. [`Verifier`] then compares the traces frame by frame and says how far apart the stamps of the same frame still are,
-//! and which frames only one of them has.
+//! Recorders on different computers have different clocks, and the difference changes while they record. But a bus gives all
+//! of them the same frames in the same order. So runs of frames that occur once in each trace are found ([`Sketch`]), those
+//! whose times are consistent with each other are kept, and a piecewise linear [`ClockMap`] is fitted to them. [`Verifier`]
+//! then compares the traces frame by frame and says how far apart the stamps of the same frame still are, and which frames
+//! only one of them has.
 //!
-//! Nothing is assumed of how the clocks are set: one trace may have dates and the other only seconds since its start. Frames
-//! that repeat themselves exactly, without a counter or a measured value anywhere, cannot be told apart; then
-//! [`AlignError`] says so rather than guessing.
+//! Nothing is assumed about how the clocks are set: one trace may have dates and the other only seconds since its start.
+//! Frames that repeat exactly, without any counter or measured value, cannot be told apart; in that case there is an
+//! [`AlignError`] rather than a guess.
 
 mod chain;
 mod clock_map;
@@ -25,25 +25,26 @@ use sketch::Pair;
 pub use sketch::Sketch;
 pub use verify::{Agreement, Verifier};
 
-/// Frames in a run, for one attempt after the other: where little changes on a bus, only long runs occur once.
+/// Lengths of runs in frames, tried one after the other: if little changes on a bus, only long runs occur
+/// once.
 pub const RUN_LENGTHS: [usize; 3] = [4, 32, 256];
 
-/// How far the stamps of two neighbouring moments may be off, from the best recorders to those with stamps of milliseconds
-/// that come late. The first at which most moments agree is taken.
+/// How far off the stamps of two neighbouring moments may be, from the best recorders to those with late stamps in
+/// milliseconds. The first value for which most moments agree is used.
 const SLACKS_NS: [i64; 3] = [100_000, 2_000_000, 20_000_000];
 
 /// How the second trace's clock and channels relate to the first one's.
 #[derive(Clone, Debug)]
 pub struct Alignment {
-    /// The second trace's times in terms of the first one's.
+    /// Converts the second trace's times to the first one's.
     pub map: ClockMap,
     /// Channels of the first trace, each with that of the second on the same bus.
     pub channels: Vec<(u8, u8)>,
-    /// How many moments the map rests on.
+    /// Number of moments on which the map is based.
     pub moments: usize,
     /// The first and the last of them, in the first trace's time.
     pub common_ns: (i64, i64),
-    /// How far stamps may be off for frames to be taken for the same.
+    /// How far apart stamps of the same frame may be.
     tolerance_ns: i64,
 }
 
@@ -52,17 +53,17 @@ pub struct Alignment {
 #[non_exhaustive]
 pub enum AlignError {
     /// Hardly any run of frames is in both.
-    #[error("no stretch of the one is found in the other: did both hear the same bus at the same time?")]
+    #[error("no part of one is found in the other: did both record the same bus at the same time?")]
     NothingInCommon,
-    /// The times of what both have do not agree with each other.
+    /// The times of what both have do not agree.
     #[error("the same frames are in both, but their times do not fit together")]
     TimesDisagree,
-    /// Several answers are equally good.
+    /// There are several equally good answers.
     #[error("the traffic repeats itself, so that several time differences fit equally well")]
     Ambiguous,
 }
 
-/// Finds out how the second trace's clock relates to the first one's. Both sketches must be of runs of the same length.
+/// Determines how the second trace's clock relates to the first one's. Both sketches must have runs of the same length.
 pub fn align(first: &Sketch, second: &Sketch) -> Result<Alignment, AlignError> {
     let mut pairs = first.pairs(second);
     keep_partners(&mut pairs);
@@ -111,7 +112,7 @@ fn covered(chains: &[Chain]) -> usize {
     chains.iter().map(|chain| chain.pairs.len()).sum()
 }
 
-/// Keeps the pairs of channels that have the most in common with each other: those are on the same bus.
+/// Keeps the pairs of channels that have the most in common: those are on the same bus.
 fn keep_partners(pairs: &mut Vec<Pair>) {
     let mut counts: BTreeMap<(u8, u8), usize> = BTreeMap::new();
     for pair in &*pairs {

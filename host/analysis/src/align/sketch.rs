@@ -1,13 +1,13 @@
-//! What of a trace can be found again in another one: runs of consecutive frames that occur only once.
+//! Extracts what can be recognised in another trace: runs of consecutive frames that occur only once.
 //!
-//! Memory is bounded: of a long trace, runs are sampled by their own hash, so that two traces keep the same ones.
+//! Memory is bounded: in a long trace, runs are sampled by their own hash, so that two traces keep the same ones.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};
 
 use cantap_trace::{TraceEvent, TraceRecord};
 
-/// Runs that are kept of a trace: seven a second of ten hours at 5000 frames a second, in some 16 MiB.
+/// How many runs are kept of a trace: seven a second over ten hours at 5000 frames a second, in about 16 MiB.
 const MOST_RUNS: usize = 1 << 18;
 /// An odd number without structure (2⁶⁴ divided by the golden ratio), for the rolling hash.
 const FACTOR: u64 = 0x9E37_79B9_7F4A_7C15;
@@ -15,9 +15,9 @@ const FACTOR: u64 = 0x9E37_79B9_7F4A_7C15;
 /// A trace's runs of consecutive frames, by content.
 #[derive(Debug)]
 pub struct Sketch {
-    /// Frames in a run.
+    /// Number of frames in a run.
     length: usize,
-    /// Runs whose hash is above this are not kept.
+    /// Runs with a hash above this are not kept.
     threshold: u64,
     channels: BTreeMap<u8, Rolling>,
     runs: HashMap<(u64, u8), Run>,
@@ -48,7 +48,8 @@ pub(super) struct Pair {
 }
 
 impl Sketch {
-    /// A sketch of runs of this many frames: longer ones are told apart better, shorter ones survive more losses.
+    /// A sketch with runs of this many frames: longer ones are easier to distinguish, shorter ones survive more
+    /// losses.
     pub fn new(length: usize) -> Self {
         Self {
             length: length.max(1),
@@ -84,12 +85,12 @@ impl Sketch {
         }
     }
 
-    /// The highest channel number of any record; 0 without one.
+    /// The highest channel number of any record; 0 if there is none.
     pub fn highest_channel(&self) -> u8 {
         self.highest_channel
     }
 
-    /// How many frames were seen.
+    /// The number of frames so far.
     pub fn frames(&self) -> u64 {
         self.frames
     }
@@ -126,7 +127,7 @@ impl Rolling {
             let gone = self.frames.pop_front()?;
             self.sum = self.sum.wrapping_sub(gone.wrapping_mul(FACTOR.wrapping_pow(length as u32)));
         }
-        // The low bits of the sum know little of the frames before: mix them, since the sampling looks at the whole.
+        // The low bits of the sum depend little on earlier frames: mix them, since sampling looks at the whole hash.
         (self.frames.len() == length).then(|| (self.sum ^ self.sum >> 32).wrapping_mul(FACTOR))
     }
 }

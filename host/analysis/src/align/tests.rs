@@ -4,7 +4,7 @@ use proptest::prelude::*;
 use super::*;
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
-/// A frame of a bus with a few identifiers; `content` is what changes.
+/// A frame on a bus with a few identifiers; `content` is what changes.
 fn record(time_ns: i64, channel: u8, id: u16, content: u64) -> TraceRecord {
     let frame = Frame::data_frame(Id::standard(id.into()).unwrap(), &content.to_le_bytes()).unwrap();
     TraceRecord {
@@ -14,7 +14,7 @@ fn record(time_ns: i64, channel: u8, id: u16, content: u64) -> TraceRecord {
     }
 }
 
-/// A second clock: set and running differently, and read with an error of up to `jitter_ns`.
+/// A second clock: with a different setting and rate, and read with an error of up to `jitter_ns`.
 #[derive(Clone, Copy)]
 struct Clock {
     ahead_ns: i64,
@@ -93,7 +93,7 @@ fn clocks_an_hour_and_80_ppm_apart_are_set_on_one() {
     assert!((alignment.map.drift_ppm() + 80.0).abs() < 0.1, "{}", alignment.map.drift_ppm());
     let agreement = verify(&bus, &second, &alignment);
     assert_eq!((agreement.both, agreement.only_first, agreement.only_second), (40_000, 0, 0));
-    // The stamps' own error is even between 0 and 1 µs, and its mean goes into the offset.
+    // The stamps' own error is uniform between 0 and 1 µs, and its mean becomes part of the offset.
     assert!(agreement.median_ns < 300 && agreement.worst_ns < 750, "{agreement:?}");
 }
 
@@ -138,7 +138,7 @@ fn stamps_of_milliseconds_are_enough() {
         record.time_ns -= record.time_ns % 1_000_000;
     }
     let alignment = align(&sketch(&bus), &sketch(&second)).unwrap();
-    // The stamps are late by 0 to 5 ms, and on average cut by half a millisecond.
+    // The stamps are late by 0 to 5 ms, and truncated by half a millisecond on average.
     let off = alignment.map.to_first(second[30_000].time_ns) - bus[30_000].time_ns;
     assert!(off.abs() < 4_000_000, "{off}");
     assert!((alignment.map.drift_ppm() + 80.0).abs() < 50.0, "{}", alignment.map.drift_ppm());
@@ -202,7 +202,7 @@ fn a_long_trace_keeps_only_so_many_runs_and_is_still_found() {
 }
 
 proptest! {
-    /// Whatever the records: a result or a refusal, and times that stay in order of magnitude.
+    /// Whatever the records, there is a result or a refusal, and times keep their order of magnitude.
     #[test]
     fn any_records_are_taken(
         times in prop::collection::vec((any::<i64>(), 0_u8..4, 0_u64..3), 0..400),

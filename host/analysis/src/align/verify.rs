@@ -1,4 +1,4 @@
-//! Whether two aligned traces really have the same frames at the same times.
+//! Checks whether two aligned traces really have the same frames at the same times.
 
 use std::collections::VecDeque;
 
@@ -7,10 +7,10 @@ use hdrhistogram::Histogram;
 use super::Alignment;
 use cantap_trace::{TraceEvent, TraceFrame, TraceRecord};
 
-/// The longest difference that is counted, in nanoseconds: beyond every tolerance.
+/// The longest difference that is counted, in nanoseconds: longer than any tolerance.
 const MOST_NS: u64 = 1_000_000_000;
 
-/// Compares two traces frame by frame as they go by, in order of the common time.
+/// Compares two traces frame by frame, in order of the common time.
 pub struct Verifier {
     channels: Vec<(u8, u8)>,
     common_ns: (i64, i64),
@@ -21,10 +21,10 @@ pub struct Verifier {
     only: [u64; 2],
 }
 
-/// A frame whose twin has not come yet.
+/// A frame whose counterpart has not been found yet.
 struct Waiting {
     time_ns: i64,
-    /// Which of the pairs of channels.
+    /// Index of the pair of channels.
     bus: usize,
     frame: TraceFrame,
     late: bool,
@@ -35,23 +35,23 @@ struct Waiting {
 pub struct Agreement {
     /// Frames that both have.
     pub both: u64,
-    /// Frames that only the first has, of the time when both recorded.
+    /// Frames that only the first has, during the time when both recorded.
     pub only_first: u64,
     /// Frames that only the second has.
     pub only_second: u64,
-    /// How far the two stamps of a frame are apart, half of them at most, in nanoseconds. Stamps that are only upper bounds
-    /// are not among them.
+    /// The median distance between the two stamps of a frame, in nanoseconds. Stamps that are only upper bounds are
+    /// excluded.
     pub median_ns: u64,
-    /// The same for 99 % of them.
+    /// The same for the 99th percentile.
     pub most_ns: u64,
-    /// The same for all of them.
+    /// The same for the maximum.
     pub worst_ns: u64,
 }
 
 impl Verifier {
-    /// Nothing compared yet.
+    /// Nothing has been compared yet.
     pub fn new(alignment: &Alignment) -> Self {
-        // Cannot fail: the bounds are constants, and two digits are few.
+        // This cannot fail: the bounds are constants, and two digits are few.
         let differences = Histogram::new_with_bounds(1, MOST_NS, 2).expect("constant bounds");
         Self {
             channels: alignment.channels.clone(),
@@ -70,7 +70,7 @@ impl Verifier {
         self.take(0, bus, record);
     }
 
-    /// Takes the second trace's next record, its time already mapped, its channel not.
+    /// Takes the second trace's next record, its time already mapped but not its channel.
     pub fn second(&mut self, record: &TraceRecord) {
         let bus = self.channels.iter().position(|channels| channels.1 == record.channel);
         self.take(1, bus, record);
@@ -92,7 +92,7 @@ impl Verifier {
         }
     }
 
-    /// Frames from before have no twin.
+    /// Frames before this time have no counterpart.
     fn give_up(&mut self, before_ns: i64) {
         let (begin, end) = self.common_ns;
         for (waiting, only) in self.waiting.iter_mut().zip(&mut self.only) {

@@ -1,4 +1,5 @@
-//! Pictures from records as they go by: signals, bus load, periods. Memory does not grow with the trace.
+//! Collects pictures from a stream of records: signals, bus load, periods. Memory does not grow with the
+//! trace.
 
 mod load;
 mod signals;
@@ -13,7 +14,7 @@ use std::collections::HashMap;
 use super::{Axis, Gap};
 use cantap_trace::{TraceEvent, TraceRecord};
 
-/// Gaps that are kept one by one. Behind them, the last one grows.
+/// How many gaps are kept individually. After that, the last one is extended.
 const MOST_GAPS: usize = 2000;
 
 /// The horizontal axis of a trace: seconds since its first record.
@@ -29,7 +30,7 @@ impl TimeAxis {
     }
 
     fn axis(&self) -> Axis {
-        // The form that candump's logs have, so that a place in the picture is found in the file.
+        // In the form of candump's logs, so that a place in the picture can be found in the file.
         let first = self.first_ns.unwrap_or(0);
         let zero = if first == 0 {
             String::new()
@@ -86,7 +87,7 @@ impl Gaps {
         }
     }
 
-    /// The gaps, with those that reach the trace's end.
+    /// The gaps, including those that extend to the trace's end.
     fn finish(mut self, end: f64) -> Vec<Gap> {
         for channel in std::mem::take(&mut self.channels).into_values().filter(|channel| channel.lost > 0) {
             let from = channel.last_frame.unwrap_or(end);

@@ -4,7 +4,7 @@
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum PlotError {
-    /// The name does not say which format.
+    /// The name does not indicate the format.
     #[error("'{0}' names no picture format; let it end in .svg, .png or .html")]
     UnknownFormat(String),
     /// The picture is too large, or too small, for PNG.

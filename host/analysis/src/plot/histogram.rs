@@ -1,17 +1,17 @@
-//! How often an interval had which length, in bounded memory and without knowing the range beforehand.
+//! Counts intervals by length, with bounded memory and without knowing the range in advance.
 
 use std::collections::BTreeMap;
 
-/// Bins that are kept at most; with more, they become twice as wide.
+/// Maximum number of bins; if more are needed, they become twice as wide.
 const MOST_BINS: usize = 2048;
 
-/// No bar is narrower: most traces have whole microseconds.
+/// The minimum width of a bar: most traces have whole microseconds.
 const NARROWEST_NS: i64 = 1000;
 
-/// Share of all intervals that the bars show; what is further out is only counted.
+/// Fraction of all intervals that the bars show; those farther out are only counted.
 const SHOWN_SHARE: f64 = 0.998;
 
-/// Counts of intervals by length. The bins begin one nanosecond wide and widen as the range asks.
+/// Counts of intervals by length. Bins start one nanosecond wide and widen as the range requires.
 #[derive(Clone, Debug)]
 pub struct Histogram {
     bin_ns: i64,
@@ -22,11 +22,11 @@ pub struct Histogram {
 /// A bar of a histogram.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bar {
-    /// Where it begins, in the axis's unit.
+    /// Where it begins, in the unit of the axis.
     pub from: f64,
     /// Where it ends.
     pub to: f64,
-    /// How often.
+    /// The count.
     pub count: u64,
 }
 
@@ -56,13 +56,13 @@ impl Histogram {
         self.total
     }
 
-    /// At most `most` bars of equal width, in milliseconds, and how many intervals lie outside of them:
-    /// of many intervals, the farthest 0.2 %.
+    /// At most `most` bars of equal width, in milliseconds, and how many intervals lie outside them: with
+    /// many intervals, the farthest 0.2 %.
     pub fn bars(&self, most: usize) -> (Vec<Bar>, u64) {
         let Some((first, last)) = self.shown_bins() else {
             return (Vec::new(), 0);
         };
-        // Whole multiples of a bin, so that no bar gets more bins than its neighbour.
+        // Whole multiples of a bin, so that no bar covers more bins than its neighbour.
         let per_bar = ((last - first) / most.max(1) as i64 + 1).max(NARROWEST_NS / self.bin_ns).max(1);
         let bar_count = (last - first) / per_bar + 1;
         let mut counts = vec![0; bar_count as usize];

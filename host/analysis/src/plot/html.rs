@@ -1,5 +1,5 @@
-//! A page with the vector graphics in it: a cursor that reads the curves' values, and a legend whose entries
-//! hide and show them. It needs nothing from anywhere else.
+//! A page containing the vector graphics, with a cursor that reads the curves' values, and a legend whose
+//! entries hide and show them. It is self-contained.
 
 use std::fmt::Write as _;
 
@@ -7,7 +7,7 @@ use super::model::{Plot, colour_of};
 use super::scene::Scene;
 use super::svg;
 
-/// The page.
+/// Makes the page.
 pub(super) fn write(plot: &Plot, scene: &Scene) -> String {
     let title = svg::escaped(if plot.title.is_empty() { "cantap plot" } else { &plot.title });
     format!(
@@ -60,7 +60,7 @@ fn data(plot: &Plot, scene: &Scene) -> String {
     out
 }
 
-/// A string for a script inside a page: nothing in it can end the string or the script.
+/// A string for a script in a page: nothing in it can end the string or the script.
 fn quoted(text: &str) -> String {
     let mut out = String::from("\"");
     for character in text.chars() {
@@ -90,7 +90,7 @@ cursor.setAttribute("stroke-dasharray", "3 3");
 cursor.setAttribute("pointer-events", "none");
 const hidden = new Set();
 
-// The curve's value at x; null where it is interrupted or not there.
+// The curve's value at x; null if it is interrupted or undefined there.
 function valueAt(curve, x) {
   const points = curve.points;
   let low = 0, high = points.length;

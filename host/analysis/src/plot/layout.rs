@@ -1,4 +1,4 @@
-//! Where everything in a picture goes.
+//! Computes where everything in a picture goes.
 
 use super::model::{Axis, Content, Curve, PALETTE, Pane, Plot, colour_of};
 use super::scale::{self, Range};
@@ -12,11 +12,11 @@ const LEGEND_HEIGHT: f32 = 24.0;
 const AXIS_HEIGHT: f32 = 48.0;
 const ANALOGUE_HEIGHT: f32 = 200.0;
 const BARS_HEIGHT: f32 = 320.0;
-/// A digital signal's lane: its name, and below it its line.
+/// Height of a digital signal's lane: its name, and its line below that.
 const LANE_HEIGHT: f32 = 46.0;
 const LANE_NAME_HEIGHT: f32 = 18.0;
 const PANE_DISTANCE: f32 = 16.0;
-/// Text is 13 units high; DejaVu Sans takes about this share of its height per character.
+/// Text is 13 units high; a DejaVu Sans character is about this fraction of that wide.
 const TEXT_SIZE: f32 = 13.0;
 const CHARACTER_WIDTH: f32 = TEXT_SIZE * 0.62;
 
@@ -27,7 +27,7 @@ const LOSS: Colour = Colour([0x88, 0x88, 0x88], 90);
 const ABOVE: Colour = Colour([0xD0, 0x20, 0x20], 34);
 const BELOW: Colour = Colour([0x20, 0x50, 0xD0], 34);
 
-/// The plot as shapes, `width` units wide.
+/// Lays the plot out as shapes, `width` units wide.
 pub(super) fn lay_out(plot: &Plot, width: u32) -> Scene {
     let mut scene =
         Scene { width: width as f32, height: 0.0, shapes: Vec::new(), panes: Vec::new(), span: plot.span() };
@@ -108,7 +108,7 @@ fn lay_out_pane(plot: &Plot, pane: &Pane, top: f32, first_curve: usize, scene: &
     area.bottom + PANE_DISTANCE
 }
 
-/// Names and colours of the pane's curves, in as many rows as they need. Returns where the pane begins.
+/// Draws names and colours of the pane's curves, in as many rows as they need. Returns where the pane begins.
 fn legend(pane: &Pane, top: f32, first_curve: usize, scene: &mut Scene) -> f32 {
     let right = scene.width - RIGHT;
     let mut x = LEFT;
@@ -118,7 +118,7 @@ fn legend(pane: &Pane, top: f32, first_curve: usize, scene: &mut Scene) -> f32 {
         if width <= LEFT - 14.0 {
             text(scene, (LEFT - 10.0, baseline), TEXT_SIZE, Anchor::End, SOFT_INK, &pane.label);
         } else {
-            // A long unit has the room that it needs, and the names follow it.
+            // A long unit takes as much space as it needs, followed by the names.
             text(scene, (4.0, baseline), TEXT_SIZE, Anchor::Start, SOFT_INK, &pane.label);
             x = (4.0 + width + 14.0).max(LEFT);
         }
@@ -139,7 +139,7 @@ fn legend(pane: &Pane, top: f32, first_curve: usize, scene: &mut Scene) -> f32 {
     baseline + 8.0
 }
 
-/// A curve's colour and name.
+/// Draws a curve's colour and name.
 fn entry(scene: &mut Scene, (x, baseline): (f32, f32), curve: &Curve, number: usize) {
     let colour = Colour(colour_of(curve, number), 255);
     let swatch = vec![(x, baseline - 5.0), (x + 18.0, baseline - 5.0)];
@@ -155,13 +155,13 @@ fn entry(scene: &mut Scene, (x, baseline): (f32, f32), curve: &Curve, number: us
     });
 }
 
-/// Where a digital signal's line is.
+/// The area of a digital signal's line.
 fn lane_area(pane: &PaneArea, lane: usize) -> PaneArea {
     let top = pane.top + LANE_HEIGHT * lane as f32;
     PaneArea { top: top + LANE_NAME_HEIGHT + 3.0, bottom: top + LANE_HEIGHT - 5.0, ..*pane }
 }
 
-/// From values to places in a pane.
+/// Maps values to positions in a pane.
 struct Places {
     area: PaneArea,
     x: (f64, f64),
@@ -180,7 +180,7 @@ impl Places {
     }
 }
 
-/// The values that a pane's height shows.
+/// The range of values that a pane's height shows.
 pub(super) fn vertical_range(pane: &Pane) -> (f64, f64) {
     if let Some(range) = pane.range {
         return range;
@@ -198,7 +198,7 @@ pub(super) fn vertical_range(pane: &Pane) -> (f64, f64) {
                     range.include(point.y);
                 }
             }
-            // An alarm limit near the curve belongs to the picture; a far one would flatten the curve.
+            // An alarm limit near the curve belongs in the picture; a distant one would flatten the curve.
             let (low, high) = range.or_unit();
             let near = (high - low) * 0.5;
             let limits = curves.iter().flat_map(|curve| [curve.alarm_below, curve.alarm_above]).flatten();
@@ -286,7 +286,7 @@ fn draw_curve(curve: &Curve, number: usize, places: &Places, scene: &mut Scene) 
     }
 }
 
-/// The line's corners. Of many points in one column of half a unit, only the ends and extremes are drawn.
+/// The line's corners. If many points share a column of half a unit, only first, last and extremes are drawn.
 fn outline(points: &[Point], stepped: bool, places: &Places) -> Vec<(f32, f32)> {
     let mut out: Vec<(f32, f32)> = Vec::with_capacity(points.len().min(16_384));
     let corner = |out: &mut Vec<(f32, f32)>, next: (f32, f32)| {
@@ -338,7 +338,7 @@ fn lay_out_axis(plot: &Plot, top: f32, scene: &mut Scene) {
     }
 }
 
-/// The text, cut where it would not fit this many units.
+/// The text, truncated if it would be wider than this many units.
 fn fitting(text: &str, width: f32, size: f32) -> String {
     let most = (width / (size * 0.62)) as usize;
     if text.chars().count() <= most {
@@ -347,7 +347,7 @@ fn fitting(text: &str, width: f32, size: f32) -> String {
     text.chars().take(most.saturating_sub(1)).chain(['…']).collect()
 }
 
-/// What the horizontal axis shows.
+/// The label of the horizontal axis.
 pub(super) fn axis_label(plot: &Plot, span: f64) -> String {
     match &plot.axis {
         Axis::Value { label } => label.clone(),

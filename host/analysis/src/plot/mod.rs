@@ -1,9 +1,9 @@
-//! Pictures of a trace: signals, bus load and period histograms as SVG, PNG, HTML or characters in a terminal.
+//! Pictures of a trace: signals, bus load and period histograms as SVG, PNG, HTML or text for a terminal.
 //!
-//! A [`Plot`] says what is to be seen: panes above each other that share a horizontal axis. `layout` turns
-//! it once into lines, areas and text at places; the SVG, PNG and HTML writers only write those down, so
-//! they show the same. The terminal has its own drawing, made of characters. The font is part of the
-//! program: nothing is looked up on the machine.
+//! A [`Plot`] describes what to show: panes above each other that share a horizontal axis. `layout` turns it
+//! once into positioned lines, areas and text; the SVG, PNG and HTML writers only write those down, so they
+//! show the same. The terminal has its own drawing, made of characters. The font is part of the program:
+//! nothing is looked up on the machine.
 
 mod collect;
 mod error;
@@ -35,12 +35,12 @@ pub enum PictureFormat {
     Svg,
     /// Pixels.
     Png,
-    /// A page with the vector graphics in it and a cursor that reads values.
+    /// A page with the vector graphics and a cursor that reads values.
     Html,
 }
 
 impl PictureFormat {
-    /// The format that a file's name ends in.
+    /// The format for a file name's suffix.
     pub fn of_path(path: &Path) -> Result<Self, PlotError> {
         let suffix = path.extension().and_then(|suffix| suffix.to_str()).map(str::to_ascii_lowercase);
         match suffix.as_deref() {
@@ -52,7 +52,7 @@ impl PictureFormat {
     }
 }
 
-/// Width of a picture where none is asked for, in pixels.
+/// Default width of a picture, in pixels.
 pub const DEFAULT_WIDTH: u32 = 1200;
 
 impl Plot {

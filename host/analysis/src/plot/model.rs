@@ -1,4 +1,4 @@
-//! What is to be seen: panes above each other that share a horizontal axis.
+//! What to show: panes above each other that share a horizontal axis.
 
 use super::histogram::Bar;
 use super::scale::{self, Range};
@@ -7,7 +7,7 @@ use super::series::Series;
 /// A picture.
 #[derive(Clone, Debug, Default)]
 pub struct Plot {
-    /// What it shows, above everything.
+    /// Its title, at the top.
     pub title: String,
     /// The horizontal axis of all panes.
     pub axis: Axis,
@@ -22,12 +22,12 @@ pub struct Plot {
 pub enum Axis {
     /// Time in seconds.
     Time {
-        /// What zero is, such as a date; may be empty.
+        /// What zero means, such as a date; may be empty.
         zero: String,
     },
     /// Anything else, with its unit.
     Value {
-        /// What it is, such as `period in ms`.
+        /// Its label, such as `period in ms`.
         label: String,
     },
 }
@@ -41,29 +41,29 @@ impl Default for Axis {
 /// A place where frames are missing.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Gap {
-    /// The last thing known before it, on the horizontal axis.
+    /// The last known point before it, on the horizontal axis.
     pub from: f64,
-    /// The first thing known after it.
+    /// The first known point after it.
     pub to: f64,
-    /// How many frames, as far as known.
+    /// Number of missing frames, as far as known.
     pub frames: u64,
 }
 
 /// One of the areas above each other.
 #[derive(Clone, Debug)]
 pub struct Pane {
-    /// What its vertical axis shows, such as a unit; may be empty.
+    /// The label of its vertical axis, such as a unit; may be empty.
     pub label: String,
-    /// The vertical range; by the data where there is none.
+    /// The vertical range; `None` to derive it from the data.
     pub range: Option<(f64, f64)>,
-    /// What is in it.
+    /// Its content.
     pub content: Content,
 }
 
 /// What a pane shows.
 #[derive(Clone, Debug)]
 pub enum Content {
-    /// Curves over a common vertical axis.
+    /// Curves on a common vertical axis.
     Analogue(Vec<Curve>),
     /// Signals that are on (1) or off (0), one above the other.
     Digital(Vec<Curve>),
@@ -86,19 +86,19 @@ impl Content {
 pub struct Curve {
     /// Its name, for the legend.
     pub name: String,
-    /// Its colour as red, green, blue; chosen from a palette for colour-blind eyes where there is none.
+    /// Its colour as red, green, blue; `None` for one from a palette suitable for colour-blind people.
     pub colour: Option<[u8; 3]>,
-    /// Its points. Between them a line is drawn, or for a stepped curve the value before.
+    /// Its points. They are joined by lines; a stepped curve keeps the previous value in between.
     pub series: Series,
-    /// Keeps its value until the next point instead of moving there in a line.
+    /// Whether the value stays the same until the next point instead of moving there in a line.
     pub stepped: bool,
-    /// Below this value it is an alarm: shaded blue.
+    /// Values below this are an alarm: shaded blue.
     pub alarm_below: Option<f64>,
-    /// Above this value it is an alarm: shaded red.
+    /// Values above this are an alarm: shaded red.
     pub alarm_above: Option<f64>,
-    /// Texts for values, in ascending order of the table's: shown on the axis and at the cursor.
+    /// Texts for values, in ascending order: shown on the axis and at the cursor.
     pub texts: Vec<(f64, String)>,
-    /// Has whole numbers only, so that nothing between them is on its axis.
+    /// Whether it has only whole numbers, so that its axis shows nothing between them.
     pub whole: bool,
 }
 
@@ -119,7 +119,7 @@ impl Curve {
 }
 
 impl Pane {
-    /// Whether its vertical axis has whole numbers only.
+    /// Whether its vertical axis has only whole numbers.
     pub(super) fn is_whole(&self) -> bool {
         match &self.content {
             Content::Bars(_) => true,
@@ -128,7 +128,7 @@ impl Pane {
         }
     }
 
-    /// The texts on its vertical axis, if it is one curve's alone.
+    /// The texts on its vertical axis, if it has a single curve.
     pub(super) fn texts(&self) -> &[(f64, String)] {
         match &self.content {
             Content::Analogue(curves) if curves.len() == 1 => &curves[0].texts,
@@ -136,7 +136,7 @@ impl Pane {
         }
     }
 
-    /// Ticks of the vertical axis, about `wanted` of them, with what stands at them.
+    /// Ticks of the vertical axis, about `wanted` of them, with their labels.
     pub(super) fn ticks(&self, range: (f64, f64), wanted: usize) -> Vec<(f64, String)> {
         let shown = |(value, _): &&(f64, String)| (range.0..=range.1).contains(value);
         let texts: Vec<_> = self.texts().iter().filter(shown).cloned().collect();
@@ -150,7 +150,7 @@ impl Pane {
 }
 
 impl Plot {
-    /// The horizontal range of everything in it; zero to one where there is nothing.
+    /// The horizontal range of its whole content; zero to one if it is empty.
     pub(super) fn span(&self) -> (f64, f64) {
         let mut span = Range::default();
         for pane in &self.panes {
@@ -160,7 +160,7 @@ impl Plot {
                 }
             }
             if let Content::Bars(bars) = &pane.content {
-                // From zero, so that the scatter is seen for what it is beside the period.
+                // From zero, so that the scatter is seen in proportion to the period.
                 span.include(0.0);
                 for bar in bars {
                     span.include(bar.to * 1.05);
@@ -175,7 +175,7 @@ impl Plot {
     }
 }
 
-/// Colours that all eyes can tell apart (Okabe and Ito, "Color Universal Design", 2008), without its yellow,
+/// Colours that everyone can tell apart (Okabe and Ito, "Color Universal Design", 2008), without its yellow,
 /// which is too pale on white.
 pub(super) const PALETTE: [[u8; 3]; 7] = [
     [0x00, 0x72, 0xB2],
@@ -187,7 +187,7 @@ pub(super) const PALETTE: [[u8; 3]; 7] = [
     [0x33, 0x33, 0x33],
 ];
 
-/// The colour of the curve that is `index`th in the whole plot.
+/// The colour of a curve with this index in the whole plot.
 pub(super) fn colour_of(curve: &Curve, index: usize) -> [u8; 3] {
     curve.colour.unwrap_or(PALETTE[index % PALETTE.len()])
 }

@@ -1,4 +1,4 @@
-//! Pixels: the scene drawn with tiny-skia, text as outlines of a font that is part of the program.
+//! Pixels: the scene drawn with tiny-skia, and text as outlines of a built-in font.
 
 use ab_glyph::{Font, FontRef, OutlineCurve, ScaleFont};
 use tiny_skia::{

@@ -1,6 +1,6 @@
-//! Ranges, ticks at round values, and how they are written.
+//! Ranges, ticks at round values, and their labels.
 
-/// The least range that includes everything.
+/// The smallest range that includes everything.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Range(Option<(f64, f64)>);
 
@@ -12,7 +12,7 @@ impl Range {
         }
     }
 
-    /// The range, at least a little wide; zero to one if there was nothing.
+    /// The range, with a minimum width; zero to one if it is empty.
     pub(super) fn or_unit(self) -> (f64, f64) {
         match self.0 {
             None => (0.0, 1.0),
@@ -39,13 +39,13 @@ pub fn ticks((low, high): (f64, f64), wanted: usize) -> (Vec<f64>, f64) {
     multiples((low, high), step.unwrap_or(rough))
 }
 
-/// As [`ticks`], at whole numbers only.
+/// Like [`ticks`], but only at whole numbers.
 pub(super) fn whole_ticks(range: (f64, f64), wanted: usize) -> (Vec<f64>, f64) {
     let (found, step) = ticks(range, wanted);
     if step < 1.0 { multiples(range, 1.0) } else { (found, step) }
 }
 
-/// Ticks for seconds: as [`ticks`] up to a second, then parts of minutes, hours and days.
+/// Ticks for seconds: like [`ticks`] up to a second, then at parts of minutes, hours and days.
 pub fn time_ticks((low, high): (f64, f64), wanted: usize) -> (Vec<f64>, f64) {
     const STEPS: [f64; 21] = [
         2.0,
@@ -78,7 +78,7 @@ pub fn time_ticks((low, high): (f64, f64), wanted: usize) -> (Vec<f64>, f64) {
 }
 
 fn multiples((low, high): (f64, f64), step: f64) -> (Vec<f64>, f64) {
-    // A step that vanishes beside the values (or is not a number) would never reach the end.
+    // A step that vanishes compared with the values (or is not a number) would never reach the end.
     if !(step.is_finite() && step > 0.0 && (high - low) / step < 1000.0) {
         return (vec![low, high], high - low);
     }
@@ -87,7 +87,7 @@ fn multiples((low, high): (f64, f64), step: f64) -> (Vec<f64>, f64) {
     ((first..=last).map(|n| n as f64 * step).collect(), step)
 }
 
-/// A value with as many decimals as a tick's step needs.
+/// A value with as many decimals as the step between ticks needs.
 pub fn label(value: f64, step: f64) -> String {
     let magnitude = value.abs().max(step.abs());
     if magnitude >= 1e7 || (magnitude > 0.0 && magnitude < 1e-4) {
@@ -102,7 +102,7 @@ pub fn label(value: f64, step: f64) -> String {
     }
 }
 
-/// Seconds with as much as a tick's step needs: `0.25`, `75`, `12:30`, `3:00:00`.
+/// Seconds with as many digits as the step between ticks needs: `0.25`, `75`, `12:30`, `3:00:00`.
 pub(super) fn time_label(seconds: f64, step: f64, span: f64) -> String {
     if span < 300.0 || step < 1.0 {
         return label(seconds, step);

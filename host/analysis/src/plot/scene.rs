@@ -1,4 +1,4 @@
-//! Shapes at places: what every picture format can draw.
+//! Positioned shapes: what every picture format can draw.
 
 /// A finished picture.
 #[derive(Clone, Debug)]
@@ -9,7 +9,7 @@ pub(super) struct Scene {
     pub height: f32,
     /// In drawing order.
     pub shapes: Vec<Shape>,
-    /// Where the panes' insides are, for a cursor.
+    /// The inner areas of the panes, for a cursor.
     pub panes: Vec<PaneArea>,
     /// The horizontal range that the panes' width shows.
     pub span: (f64, f64),
@@ -24,11 +24,11 @@ pub(super) struct PaneArea {
     pub bottom: f32,
 }
 
-/// Red, green, blue, and how opaque: 0 to 255.
+/// Red, green, blue and opacity: 0 to 255.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Colour(pub [u8; 3], pub u8);
 
-/// Where a text's place is.
+/// Which part of a text its position refers to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Anchor {
     Start,
@@ -36,7 +36,7 @@ pub(super) enum Anchor {
     End,
 }
 
-/// Something to draw. Coordinates are pixels from the upper left corner.
+/// Something to draw. Coordinates are in pixels from the upper left corner.
 #[derive(Clone, Debug)]
 pub(super) enum Shape {
     Area { x: f32, y: f32, width: f32, height: f32, colour: Colour },

@@ -1,35 +1,35 @@
-//! A curve's points, of which a picture needs only a limited number: memory does not grow with the trace.
+//! A curve's points. A picture needs only a limited number of them, so memory does not grow with the trace.
 
-/// Points that a [`Series`] keeps at most.
+/// Maximum number of points in a [`Series`].
 pub const MOST_POINTS: usize = 32_768;
 
-/// Stretches that a full series is thinned to. Each keeps up to four points and a break.
+/// Number of stretches to which a full series is reduced. Each keeps up to four points and a break.
 const STRETCHES: usize = MOST_POINTS / 8;
 
 /// A point of a curve.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Point {
-    /// Horizontal, in seconds or the axis's unit.
+    /// Horizontal position, in seconds or the axis's unit.
     pub x: f64,
-    /// Vertical. Not a number where the curve is interrupted.
+    /// Vertical position. Not-a-number where the curve is interrupted.
     pub y: f64,
 }
 
-/// Points in ascending horizontal order. When there are too many, each short stretch is reduced to its first,
-/// lowest, highest and last point: at a picture's resolution the curve stays the same, peaks included.
+/// Points in ascending horizontal order. If there are too many, each short stretch is reduced to its first,
+/// lowest, highest and last point: at a picture's resolution the curve looks the same, peaks included.
 #[derive(Clone, Debug, Default)]
 pub struct Series {
     points: Vec<Point>,
 }
 
 impl Series {
-    /// Appends a point. Values that are not finite interrupt the curve.
+    /// Appends a point. Non-finite values interrupt the curve.
     pub fn push(&mut self, x: f64, y: f64) {
         let point = Point { x, y: if y.is_finite() { y } else { f64::NAN } };
         if !x.is_finite() || (point.y.is_nan() && self.points.last().is_none_or(|last| last.y.is_nan())) {
             return;
         }
-        // Three in a row at the same height are a line between two.
+        // Three in a row at the same height need only the outer two.
         #[expect(clippy::float_cmp, reason = "only points of exactly the same height are left out")]
         if let [.., before, last] = self.points.as_mut_slice()
             && before.y == y
@@ -44,14 +44,14 @@ impl Series {
         }
     }
 
-    /// Interrupts the curve behind the last point: what came then is not known.
+    /// Interrupts the curve after the last point: what came then is unknown.
     pub fn interrupt(&mut self) {
         if let Some(last) = self.points.last().copied() {
             self.push(last.x, f64::NAN);
         }
     }
 
-    /// The points as they are to be drawn.
+    /// The points to draw.
     pub fn points(&self) -> &[Point] {
         &self.points
     }
@@ -71,7 +71,7 @@ impl Series {
         for points in self.points.chunk_by(|a, b| stretch(a) == stretch(b)) {
             keep_outline(points, &mut thinned);
         }
-        // Where all points lie at one place there are no stretches; half of them will do.
+        // If all points are at one position there are no stretches; keep half of them.
         if thinned.len() > MOST_POINTS / 4 * 3 {
             thinned = thinned.chunks(2).map(|pair| pair[0]).collect();
         }
@@ -79,7 +79,7 @@ impl Series {
     }
 }
 
-/// Keeps a stretch's first, lowest, highest and last point in their order, and an interruption.
+/// Keeps a stretch's first, lowest, highest and last point in order, and an interruption.
 fn keep_outline(points: &[Point], out: &mut Vec<Point>) {
     let values = || points.iter().enumerate().filter(|(_, point)| !point.y.is_nan());
     let by_y = |a: &(usize, &Point), b: &(usize, &Point)| a.1.y.total_cmp(&b.1.y);

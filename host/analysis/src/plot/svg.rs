@@ -78,7 +78,7 @@ fn paint(attribute: &str, Colour([red, green, blue], opacity): Colour) -> String
     out
 }
 
-/// Text with everything that has a meaning in XML replaced, and without characters that XML forbids.
+/// Text with everything that has a meaning in XML escaped, and without characters that XML forbids.
 pub(super) fn escaped(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for character in text.chars() {

@@ -57,7 +57,7 @@ fn histogram() -> Plot {
     }
 }
 
-/// Everything of the plot is in the document, and what a name contains cannot break it.
+/// Everything in the plot is in the document, and the content of a name cannot break it.
 #[test]
 fn an_svg_names_its_curves_and_escapes_them() {
     let svg = String::from_utf8(drive().render(PictureFormat::Svg, 1000).unwrap()).unwrap();
@@ -135,7 +135,7 @@ fn a_terminal_shows_a_ramp_rising_from_corner_to_corner() {
     assert!(plot.to_text(&TextStyle { unicode: true, ..style }).contains("       On│▁▁▁"));
 }
 
-/// What a value means stands where it is, and whole numbers have nothing between them.
+/// Texts are shown at their values, and whole numbers have nothing between them.
 #[test]
 fn axes_name_states_and_whole_numbers() {
     let mut gear = Curve::new("Gear");
@@ -194,7 +194,8 @@ fn the_suffix_chooses_the_format() {
     assert_eq!(message, "'b.gif' names no picture format; let it end in .svg, .png or .html");
 }
 
-/// Writes the pictures to a folder, to be looked at: `CANTAP_PICTURES=DIR cargo test -p cantap pictures`.
+/// Writes the pictures to a folder for inspection: `CANTAP_PICTURES=DIR cargo test -p cantap-analysis
+/// --all-features pictures`.
 #[test]
 fn pictures_to_look_at_can_be_written() {
     let folder = std::env::var_os("CANTAP_PICTURES").map_or_else(std::env::temp_dir, Into::into);

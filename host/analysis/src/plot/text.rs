@@ -1,5 +1,5 @@
-//! A picture made of characters, for terminals: braille dots for curves, blocks for bars; plain ASCII
-//! where the terminal has nothing else.
+//! A picture made of characters, for terminals: braille dots for curves, blocks for bars; plain ASCII if the
+//! terminal has nothing else.
 
 use std::fmt::Write as _;
 
@@ -16,12 +16,12 @@ pub struct TextStyle {
     pub pane_height: usize,
     /// Colours by ANSI sequences.
     pub colour: bool,
-    /// Braille and block characters; ASCII without.
+    /// Use braille and block characters; otherwise ASCII.
     pub unicode: bool,
 }
 
 impl Default for TextStyle {
-    /// Eighty columns, colourless, with braille.
+    /// Eighty columns, without colour, with braille.
     fn default() -> Self {
         Self { width: 80, pane_height: 12, colour: false, unicode: true }
     }
@@ -108,7 +108,7 @@ fn coloured(out: &mut String, style: &TextStyle, [red, green, blue]: [u8; 3], te
 struct Canvas {
     columns: usize,
     rows: usize,
-    /// Braille dots, one bit each, as in Unicode's block.
+    /// Braille dots, one bit each, as in Unicode's braille block.
     dots: Vec<u8>,
     colours: Vec<Option<[u8; 3]>>,
     /// Eighths of a cell that a bar fills.
@@ -262,7 +262,7 @@ fn lanes(
     let column =
         |x: f64| (((x - span.0) / (span.1 - span.0)).clamp(0.0, 1.0) * (columns - 1) as f64) as usize;
     for (index, curve) in curves.iter().enumerate() {
-        // Bit 0: was low in this column; bit 1: was high.
+        // Bit 0: low in this column; bit 1: high.
         let mut seen = vec![0u8; columns];
         let mut before: Option<(usize, u8)> = None;
         for point in curve.series.points() {

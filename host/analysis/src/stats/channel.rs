@@ -1,4 +1,4 @@
-//! What one channel did.
+//! Statistics of one channel.
 
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 
@@ -18,17 +18,17 @@ pub struct ChannelStatistics {
     pub data_bitrate_bps: Option<u32>,
     /// Frames, sent and received.
     pub frames: u64,
-    /// Those that the device sent.
+    /// Frames sent by the device.
     pub sent: u64,
-    /// Those with a 29-bit identifier.
+    /// Frames with a 29-bit identifier.
     pub extended: u64,
     /// Remote frames.
     pub remote: u64,
     /// CAN FD frames.
     pub fd: u64,
-    /// CAN FD frames with a bit rate of its own in the data phase.
+    /// CAN FD frames with a separate bit rate in the data phase.
     pub brs: u64,
-    /// CAN FD frames of an error passive sender.
+    /// CAN FD frames from an error passive sender.
     pub esi: u64,
     /// Frames whose time is only an upper bound.
     pub late: u64,
@@ -38,9 +38,9 @@ pub struct ChannelStatistics {
     pub data_bytes: u64,
     /// Ends of the first and the last frame, in nanoseconds.
     pub span_ns: Option<(i64, i64)>,
-    /// Records whose time lies before that of the record before.
+    /// Records with a time before that of the previous record.
     pub out_of_order: u64,
-    /// Work load; `None` without a bit rate, or where that of a frame's data phase is not known.
+    /// Work load; `None` without a bit rate, or if that of a frame's data phase is unknown.
     pub load: Option<WorkLoad>,
     /// Errors on the bus.
     pub errors: Errors,
@@ -48,11 +48,11 @@ pub struct ChannelStatistics {
     pub losses: Losses,
     /// The controller's state, if it was reported.
     pub state: Option<ErrorState>,
-    /// How often it changed.
+    /// How often the state changed.
     pub state_changes: u64,
     /// The controller's transmit and receive error counters, if they were reported.
     pub counters: Option<(u8, u8)>,
-    /// Frames that were to be sent and were not.
+    /// Frames that should have been sent but were not.
     pub transmit_failures: u64,
     windows: Windows,
     ids: Ids,
@@ -62,13 +62,13 @@ pub struct ChannelStatistics {
     latest_frame_ns: Option<i64>,
     /// Time between frames, where it went forward.
     covered_ns: u64,
-    /// What every interval between two frames is a multiple of; 0 before the first.
+    /// The common divisor of all intervals between two frames; 0 before the first.
     step_ns: u64,
-    /// Frames with the stamp of the frame before.
+    /// Frames with the same stamp as the frame before.
     shared_stamps: u64,
 }
 
-/// Errors that a channel's controller saw.
+/// Errors detected by a channel's controller.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Errors {
     /// By kind, in the order of [`BusErrorKind`].
@@ -80,12 +80,12 @@ pub struct Errors {
 }
 
 impl Errors {
-    /// All of them.
+    /// The total.
     pub fn total(&self) -> u64 {
         self.by_kind.iter().sum::<u64>() + self.unknown + self.suppressed
     }
 
-    /// Those of one kind.
+    /// Errors of one kind.
     pub fn of(&self, kind: BusErrorKind) -> u64 {
         self.by_kind[kind as usize]
     }
@@ -96,21 +96,21 @@ impl Errors {
 pub struct Losses {
     /// By stage, in the order of [`LossStage`].
     pub by_stage: [u64; 4],
-    /// By a stage that the trace does not name.
+    /// Losses at a stage that the trace does not name.
     pub unknown: u64,
     /// Places in the trace where frames are missing.
     pub gaps: u64,
-    /// Whether there may be more: a hardware overrun cannot count.
+    /// Whether there may be more: hardware cannot count the frames lost in an overrun.
     pub at_least: bool,
 }
 
 impl Losses {
-    /// All of them.
+    /// The total.
     pub fn total(&self) -> u64 {
         self.by_stage.iter().sum::<u64>() + self.unknown
     }
 
-    /// Those that one stage lost.
+    /// Frames lost at one stage.
     pub fn of(&self, stage: LossStage) -> u64 {
         self.by_stage[stage as usize]
     }
@@ -243,7 +243,7 @@ impl ChannelStatistics {
         let interval = self.latest_frame_ns.map_or(0, |before| end_ns.saturating_sub(before));
         if self.latest_frame_ns.is_some() {
             self.shared_stamps += u64::from(interval == 0);
-            // Soon it divides every interval, and one division is all that this costs.
+            // It soon divides every interval, so that this costs only one division.
             let step = interval.unsigned_abs();
             if self.step_ns == 0 || !step.is_multiple_of(self.step_ns) {
                 self.step_ns = common_divisor(self.step_ns, step);
@@ -253,7 +253,7 @@ impl ChannelStatistics {
         self.covered_ns = self.covered_ns.saturating_add(interval.max(0) as u64);
         self.span_ns = Some((first.min(end_ns), last.max(end_ns)));
         if let Some(load) = &mut self.load {
-            // Without its rate the data phase has no bits here: see `fd_frame`.
+            // Without its rate, the data phase has no bits here: see `fd_frame`.
             let data = match (self.bitrate_bps, self.data_bitrate_bps) {
                 (Some(nominal), Some(data)) if on_bus.data > 0 => {
                     f64::from(on_bus.data) * f64::from(nominal) / f64::from(data)
@@ -271,13 +271,13 @@ impl ChannelStatistics {
         self.fd += 1;
         self.brs += u64::from(is_switched);
         self.esi += u64::from(frame.fd().is_some_and(cantap_trace::FdFrame::esi));
-        // How long a data phase takes that has a rate of its own, nobody can tell without that rate.
+        // The duration of a data phase with a separate rate is unknown without that rate.
         if is_switched && self.data_bitrate_bps.is_none() && self.load.take().is_some() {
             self.windows.forget_load();
         }
     }
 
-    /// The interval from the last frame to the next one says nothing.
+    /// The interval from the last frame to the next one is meaningless.
     fn interrupt(&mut self) {
         self.gaps = self.gaps.wrapping_add(1);
         self.windows.gap();
@@ -286,7 +286,7 @@ impl ChannelStatistics {
         }
     }
 
-    /// Nothing at all is known about the time from the last record to the next one.
+    /// Nothing is known about the time from the last record to the next one.
     pub(super) fn suspend(&mut self) {
         self.interrupt();
         self.latest_frame_ns = None;
@@ -294,7 +294,7 @@ impl ChannelStatistics {
     }
 
     pub(super) fn advance(&mut self, now_ns: i64, closed: &mut impl FnMut(&Window)) {
-        // Only a record's own time may say that the clock was set back, or that a suspended time is over.
+        // Only a record's own time can show that the clock was set back, or end a suspended time.
         if now_ns > self.latest_ns && !self.windows.is_suspended() {
             self.windows.advance(now_ns, closed);
         }
@@ -304,7 +304,7 @@ impl ChannelStatistics {
         self.windows.finish(now_ns, closed);
     }
 
-    /// From the first frame's end to the last one's, in nanoseconds; where the trace's clock was set back (two
+    /// From the first frame's end to the last one's, in nanoseconds; if the trace's clock was set back (two
     /// logs were joined), the sum of its parts.
     pub fn covered_ns(&self) -> u64 {
         self.covered_ns
@@ -315,49 +315,49 @@ impl ChannelStatistics {
         self.first_bits
     }
 
-    /// What all stamps are multiples of, in nanoseconds, where that is coarser than the frames: many of them share a stamp,
-    /// which on a bus they cannot.
+    /// The resolution of all stamps, in nanoseconds, if it is coarser than the frames: many of them share a stamp, which is
+    /// impossible on a bus.
     pub fn coarse_step_ns(&self) -> Option<u64> {
-        /// Frames that share a stamp, of a hundred: some do where two of a USB packet are stamped on arrival.
+        /// Percentage of frames that share a stamp: some do if two from a USB packet are stamped on arrival.
         const SHARED_PCT: u64 = 10;
-        /// Nothing shorter hides a frame's length.
+        /// A finer resolution hides no frame's length.
         const FINE_NS: u64 = 100_000;
         let many = self.shared_stamps * 100 >= self.frames * SHARED_PCT && self.shared_stamps > 1;
         (many && self.step_ns >= FINE_NS).then_some(self.step_ns)
     }
 
-    /// Frames per second from the first to the last: intervals over time.
+    /// Frames per second from the first to the last: number of intervals over time.
     pub fn frames_per_s(&self) -> f64 {
         per_second(self.frames.saturating_sub(1), self.covered_ns)
     }
 
-    /// Least and mean load of the whole windows that are over and from which no frame is missing, in per cent; `None`
-    /// without a bit rate or such a window.
+    /// Least and mean load of the whole, finished windows from which no frame is missing, in per cent; `None` without
+    /// a bit rate or such a window.
     pub fn window_least_and_mean_pct(&self) -> Option<(f64, f64)> {
         self.windows.least_and_mean_pct()
     }
 
-    /// Largest load of a whole window that is over, in per cent: a lower bound, if frames are missing from it.
+    /// Largest load of a whole, finished window, in per cent: a lower bound if frames are missing from it.
     pub fn window_largest_pct(&self) -> Option<f64> {
         self.windows.largest_pct()
     }
 
-    /// The busiest windows that are over, the busiest first.
+    /// The busiest finished windows, the busiest first.
     pub fn peaks(&self) -> impl Iterator<Item = &Window> {
         self.windows.peaks()
     }
 
-    /// The window that is running, as far as `now_ns`.
+    /// The current window, up to `now_ns`.
     pub fn running_window(&self, now_ns: i64) -> Window {
         self.windows.running(now_ns)
     }
 
-    /// What each identifier did, in order of appearance. At most [`MOST_IDS`](super::MOST_IDS).
+    /// Statistics of each identifier, in order of appearance. At most [`MOST_IDS`](super::MOST_IDS).
     pub fn ids(&self) -> impl Iterator<Item = &IdStatistics> {
         self.ids.iter()
     }
 
-    /// What one identifier did.
+    /// Statistics of one identifier.
     pub fn id(&self, id: Id) -> Option<&IdStatistics> {
         self.ids.get(id)
     }

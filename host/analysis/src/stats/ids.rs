@@ -1,12 +1,12 @@
-//! What each identifier does: how often it comes, how evenly, and how long it is.
+//! Statistics of identifiers: how often each comes, how evenly, and how long its frames are.
 
 use std::collections::HashMap;
 use std::hash::{BuildHasherDefault, Hasher};
 
 use cantap_trace::{Direction, Id, TraceFrame};
 
-/// Identifiers that are followed one by one on each channel. Random or hostile traffic may have half a
-/// billion; the frames of those beyond this number are counted together.
+/// How many identifiers are tracked individually on each channel. Random or hostile traffic may have half a
+/// billion; frames of identifiers beyond this number are counted together.
 pub const MOST_IDS: usize = 65_536;
 
 /// The intervals between one identifier's frames.
@@ -15,7 +15,8 @@ pub struct Period {
     count: u64,
     min_ns: i64,
     max_ns: i64,
-    /// The first interval. Deviations are summed relative to it, or their squares would cancel.
+    /// The first interval. Deviations are summed relative to it, because their squares would otherwise
+    /// cancel.
     base_ns: i64,
     sum: f64,
     squares: f64,
@@ -37,7 +38,7 @@ impl Period {
         self.squares += deviation * deviation;
     }
 
-    /// How many intervals were measured.
+    /// The number of intervals measured.
     pub fn count(&self) -> u64 {
         self.count
     }
@@ -67,7 +68,7 @@ impl Period {
     }
 }
 
-/// What one identifier did on one channel.
+/// Statistics of one identifier on one channel.
 #[derive(Clone, Copy, Debug)]
 pub struct IdStatistics {
     /// The identifier.
@@ -76,9 +77,9 @@ pub struct IdStatistics {
     pub frames: u64,
     /// Its remote frames.
     pub remote: u64,
-    /// Its frames that the device sent itself.
+    /// Its frames sent by the device itself.
     pub sent: u64,
-    /// Bits that they took, with stuff bits and intermission.
+    /// Bits of its frames, with stuff bits and intermission.
     pub bits: u64,
     /// Intervals between its frames. An interval in which frames were lost on the channel is left out.
     pub period: Period,
@@ -88,11 +89,11 @@ pub struct IdStatistics {
     pub last_ns: i64,
     /// The last DLC, as on the bus.
     pub dlc: u8,
-    /// Bit n is set if DLC n was seen.
+    /// Bit n is set if DLC n occurred.
     pub dlcs_seen: u16,
     /// How often a frame's DLC differed from the one before.
     pub dlc_changes: u64,
-    /// Which gap of the channel came before its last frame.
+    /// The channel's number of gaps at its last frame.
     generation: u32,
 }
 
@@ -133,7 +134,7 @@ impl IdStatistics {
         self.dlcs_seen |= 1 << frame.dlc();
     }
 
-    /// The DLCs that were seen, in ascending order.
+    /// The DLCs that occurred, in ascending order.
     pub fn dlcs(&self) -> impl Iterator<Item = u8> + use<> {
         let seen = self.dlcs_seen;
         (0..16).filter(move |dlc| seen >> dlc & 1 != 0)
@@ -145,7 +146,7 @@ impl IdStatistics {
 pub(super) struct Ids {
     place_of: HashMap<u32, u32, BuildHasherDefault<IdHasher>>,
     listed: Vec<IdStatistics>,
-    /// Frames of identifiers that found no room.
+    /// Frames of identifiers for which there was no room.
     pub(super) unlisted_frames: u64,
 }
 
@@ -190,7 +191,7 @@ impl Ids {
     }
 }
 
-/// Hashes an identifier by one multiplication: the map is asked once per frame.
+/// Hashes an identifier by one multiplication: the map is accessed once per frame.
 #[derive(Clone, Copy, Debug, Default)]
 struct IdHasher(u64);
 
@@ -206,7 +207,8 @@ impl Hasher for IdHasher {
     }
 
     fn write_u32(&mut self, value: u32) {
-        // 2^64 divided by the golden ratio (Knuth); the fold brings the good high bits down to the table's index.
+        // 2^64 divided by the golden ratio (Knuth); the fold moves the well-mixed high bits down to the table's
+        // index.
         let product = (self.0 ^ u64::from(value)).wrapping_mul(0x9E37_79B9_7F4A_7C15);
         self.0 = product ^ product >> 32;
     }

@@ -1,5 +1,5 @@
-//! Statistics of a trace as it goes by: exact bus load, rates, periods, losses and errors, per channel and
-//! per identifier.
+//! Statistics of a trace as it passes: exact bus load, rates, periods, losses and errors, per channel and per
+//! identifier.
 //!
 //! Memory is bounded whatever the trace: nothing is kept per frame. Times must be the frames' ends, as
 //! every source of [`TraceRecord`] gives them. Nothing here is printed; `cantap stats` does that.
@@ -20,18 +20,18 @@ pub use summary::{ChannelSummary, ErrorSummary, IdSummary, LoadSummary, LossSumm
 pub use windows::{ERROR_FRAME_BITS, Window, shortest_window_ns};
 pub use work_load::WorkLoad;
 
-/// What to measure with.
+/// The parameters of measurement.
 #[derive(Clone, Debug)]
 pub struct Options {
-    /// Bit rate of the channels that [`Self::channel_bitrate_bps`] does not name; without one there is no load.
+    /// Bit rate of the channels not listed in [`Self::channel_bitrate_bps`]; without one there is no load.
     pub bitrate_bps: Option<u32>,
-    /// Bit rates of single channels: channel from 1, bit/s.
+    /// Bit rates of individual channels: channel from 1, bit/s.
     pub channel_bitrate_bps: Vec<(u8, u32)>,
-    /// Bit rate of the data phases of CAN FD frames, of the channels that [`Self::channel_data_bitrate_bps`] does not name.
+    /// Bit rate of the data phases of CAN FD frames, for the channels not listed in [`Self::channel_data_bitrate_bps`].
     pub data_bitrate_bps: Option<u32>,
-    /// The same of single channels: channel from 1, bit/s.
+    /// The same for individual channels: channel from 1, bit/s.
     pub channel_data_bitrate_bps: Vec<(u8, u32)>,
-    /// Channels, from 1, whose frames came without their data or times: they have no load, whatever their bit rate.
+    /// Channels, from 1, whose frames came without data or times: they have no load, whatever their bit rate.
     pub without_load: Vec<u8>,
     /// Length of a window.
     pub window: Duration,
@@ -71,14 +71,14 @@ fn of_channel(rates: &[(u8, u32)], channel: u8) -> Option<u32> {
     rates.iter().find(|(number, _)| *number == channel).map(|(_, bitrate)| *bitrate)
 }
 
-/// Why there can be no statistics with these options.
+/// Why these options cannot be used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum BadOptions {
     /// A bit rate of zero.
-    #[error("a bit rate of 0 bit/s is no bit rate; give one such as 500k")]
+    #[error("a bit rate of 0 bit/s is impossible; give one such as 500k")]
     ZeroBitrate,
-    /// A window that one frame outlasts.
+    /// A window that is shorter than a frame.
     #[error(
         "a window must be longer than the longest frame, at {bitrate_bps} bit/s {shortest_us} µs; give a longer one"
     )]
@@ -105,12 +105,13 @@ pub struct Statistics {
     last_ns: i64,
     /// In order of appearance; a trace has one or two.
     channels: Vec<ChannelStatistics>,
-    /// Place in `channels` of the record before, which is nearly always this record's or the other one.
+    /// Index in `channels` for the previous record, nearly always that of the current one or of the other
+    /// channel.
     latest: usize,
 }
 
 impl Statistics {
-    /// Nothing seen yet.
+    /// Nothing has been seen yet.
     pub fn new(options: Options) -> Result<Self, BadOptions> {
         let rates =
             options.channel_bitrate_bps.iter().map(|(_, bitrate)| *bitrate).chain(options.bitrate_bps);
@@ -128,7 +129,7 @@ impl Statistics {
         if slowest == Some(0) || data_rates.any(|bitrate| bitrate == 0) {
             return Err(BadOptions::ZeroBitrate);
         }
-        // Without any bit rate a window needs to be no longer than the fastest bus asks for.
+        // Without any bit rate, the minimum window is that of the fastest bus.
         let bitrate_bps = slowest.unwrap_or(cantap_wire::timing::MAX_BITRATE_BPS);
         let shortest_ns = match fastest_data {
             Some(_) => windows::shortest_fd_window_ns(bitrate_bps),
@@ -146,8 +147,8 @@ impl Statistics {
         self.push_with(record, |_| {});
     }
 
-    /// As [`Self::push`], and hands every window to `closed` when it is over. A window that is over
-    /// is reported when the next frame of its channel comes, or with [`Self::advance_with`].
+    /// Like [`Self::push`], but also passes every window to `closed` when it is finished. A finished window
+    /// is reported when the next frame of its channel comes, or by [`Self::advance_with`].
     #[inline]
     pub fn push_with(&mut self, record: &TraceRecord, mut closed: impl FnMut(&Window)) {
         let place = match self.channels.get(self.latest) {
@@ -159,14 +160,14 @@ impl Statistics {
         self.channels[place].push(record, &mut closed);
     }
 
-    /// The channel's place, new if it must be.
+    /// The channel's index; it is added if necessary.
     #[cold]
     fn find_channel(&mut self, record: &TraceRecord) -> usize {
         if let Some(place) = self.channels.iter().position(|channel| channel.number == record.channel) {
             return place;
         }
         let bitrate = self.options.bitrate_of(record.channel);
-        // Windows begin where the trace's first frame begins, on all channels alike.
+        // Windows begin at the trace's first frame, on all channels alike.
         let origin_ns = *self.first_ns.get_or_insert_with(|| match (record.frame(), bitrate) {
             (Some(frame), Some(bitrate)) => {
                 let bits = frame.bus_bits();
@@ -190,13 +191,13 @@ impl Statistics {
         self.channels.len() - 1
     }
 
-    /// Nothing is known about the time from here to a channel's next record, as while a device was gone: no interval
-    /// and no window that spans it counts for load, rate or period.
+    /// Nothing is known about the time from here to a channel's next record, for example because a device was gone:
+    /// no interval or window that spans it counts for load, rate or period.
     pub fn interrupt(&mut self) {
         self.channels.iter_mut().for_each(ChannelStatistics::suspend);
     }
 
-    /// Time has come to `now_ns` without a record: windows that are over by then are closed.
+    /// The time is now `now_ns`, without a record: closes windows that have finished.
     pub fn advance_with(&mut self, now_ns: i64, mut closed: impl FnMut(&Window)) {
         self.last_ns = if self.channels.is_empty() { self.last_ns } else { self.last_ns.max(now_ns) };
         for channel in &mut self.channels {
@@ -204,7 +205,7 @@ impl Statistics {
         }
     }
 
-    /// The trace is over: closes the last windows, cut short where it ends.
+    /// The trace has ended: closes the last windows, truncated at its end.
     pub fn finish_with(&mut self, mut closed: impl FnMut(&Window)) {
         let end = self.last_ns;
         for channel in &mut self.channels {
@@ -212,7 +213,7 @@ impl Statistics {
         }
     }
 
-    /// As [`Self::finish_with`], without looking at windows.
+    /// Like [`Self::finish_with`], ignoring windows.
     pub fn finish(&mut self) {
         self.finish_with(|_| {});
     }
@@ -222,7 +223,7 @@ impl Statistics {
         &self.channels
     }
 
-    /// One channel, if anything of it was seen.
+    /// One channel, if it had any record.
     pub fn channel(&self, number: u8) -> Option<&ChannelStatistics> {
         self.channels.iter().find(|channel| channel.number == number)
     }

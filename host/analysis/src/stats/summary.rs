@@ -18,11 +18,11 @@ pub struct Summary {
     pub first_s: Option<f64>,
     /// End of its last frame.
     pub last_s: Option<f64>,
-    /// As [`Self::first_s`], to the nanosecond.
+    /// Like [`Self::first_s`], to the nanosecond.
     pub first_ns: Option<i64>,
-    /// As [`Self::last_s`], to the nanosecond.
+    /// Like [`Self::last_s`], to the nanosecond.
     pub last_ns: Option<i64>,
-    /// Where the trace's windows begin: its first record, be it a frame or not.
+    /// Where the trace's windows begin: its first record, whether a frame or not.
     pub origin_s: Option<f64>,
     /// Between the first and the last frame, in seconds.
     pub duration_s: f64,
@@ -37,39 +37,39 @@ pub struct Summary {
 pub struct ChannelSummary {
     /// The channel, from 1.
     pub channel: u8,
-    /// Its bit rate in bit/s, if it was given.
+    /// Its bit rate in bit/s, if given.
     #[serde(rename = "bitrate_bps")]
     pub bitrate: Option<u32>,
-    /// The bit rate of its data phases in bit/s, if it was given.
+    /// The bit rate of its data phases in bit/s, if given.
     #[serde(rename = "data_bitrate_bps")]
     pub data_bitrate: Option<u32>,
     /// Frames, sent and received.
     pub frames: u64,
-    /// Those that were sent by the device.
+    /// Frames sent by the device.
     pub sent: u64,
-    /// Those with an 11-bit identifier.
+    /// Frames with an 11-bit identifier.
     pub standard: u64,
-    /// Those with a 29-bit identifier.
+    /// Frames with a 29-bit identifier.
     pub extended: u64,
     /// Remote frames.
     pub remote: u64,
     /// CAN FD frames.
     pub fd: u64,
-    /// CAN FD frames with a bit rate of its own in the data phase.
+    /// CAN FD frames with a separate bit rate in the data phase.
     pub brs: u64,
-    /// CAN FD frames of an error passive sender.
+    /// CAN FD frames from an error passive sender.
     pub esi: u64,
     /// Frames whose time is only an upper bound.
     pub late: u64,
-    /// Records that are older than the record before.
+    /// Records that are older than the previous record.
     pub out_of_order: u64,
-    /// What all stamps are multiples of, in seconds, if that is coarser than the frames: no period or window below it says anything.
+    /// The resolution of all stamps, in seconds, if it is coarser than the frames: periods and windows below it are meaningless.
     pub stamp_step_s: Option<f64>,
     /// End of the first frame, in seconds.
     pub first_s: Option<f64>,
     /// End of the last frame, in seconds.
     pub last_s: Option<f64>,
-    /// Between the two, in seconds; the sum of its parts where the clock was set back.
+    /// Between the two, in seconds; the sum of the parts if the clock was set back.
     pub duration_s: f64,
     /// Frames per second, from the first to the last.
     pub frames_per_s: f64,
@@ -91,11 +91,11 @@ pub struct ChannelSummary {
     pub state: Option<&'static str>,
     /// Its transmit and receive error counters.
     pub error_counters: Option<(u8, u8)>,
-    /// Frames that were to be sent and were not.
+    /// Frames that should have been sent but were not.
     pub transmit_failures: u64,
-    /// What each identifier did, in ascending order.
+    /// Statistics of each identifier, in ascending order.
     pub ids: Vec<IdSummary>,
-    /// Frames of identifiers that are not listed, because there were too many.
+    /// Frames of identifiers that are not listed because there were too many.
     pub unlisted_frames: u64,
 }
 
@@ -110,13 +110,13 @@ pub struct LoadSummary {
     pub mean_pct: Option<f64>,
     /// Load of the least busy window from which no frame is missing.
     pub window_min_pct: Option<f64>,
-    /// Mean over the windows from which no frame is missing, error frames counted.
+    /// Mean over the windows from which no frame is missing, including error frames.
     pub window_mean_pct: Option<f64>,
-    /// Load of the busiest window; a lower bound, if frames are missing from it.
+    /// Load of the busiest window; a lower bound if frames are missing from it.
     pub window_max_pct: Option<f64>,
 }
 
-/// A window of time, as it is printed.
+/// A window of time, as printed.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PeakSummary {
     /// The channel, from 1.
@@ -135,7 +135,7 @@ pub struct PeakSummary {
     pub bits_per_s: f64,
     /// Error frames.
     pub errors: u64,
-    /// Lost frames whose record stands in it.
+    /// Lost frames whose record is in it.
     pub lost: u64,
     /// Whether frames are missing from it, or may be: its figures are lower bounds.
     pub incomplete: bool,
@@ -183,7 +183,7 @@ pub struct IdSummary {
     pub count: u64,
     /// Its remote frames.
     pub remote: u64,
-    /// Its frames that the device sent.
+    /// Its frames sent by the device.
     pub sent: u64,
     /// End of its first frame, in seconds.
     pub first_s: f64,
@@ -209,14 +209,14 @@ pub struct IdSummary {
     pub share_pct: f64,
 }
 
-/// Nanoseconds as seconds, rounded once: a float has no room for the nanoseconds since 1970.
+/// Nanoseconds as seconds, rounded once: a float cannot hold the nanoseconds since 1970.
 fn seconds(ns: i64) -> f64 {
     (ns / 1_000_000_000) as f64 + (ns % 1_000_000_000) as f64 / 1e9
 }
 
 impl Statistics {
-    /// Everything as plain values, ready to be printed or serialised. [`Self::finish`] comes first
-    /// where the trace is over.
+    /// Everything as plain values, ready to be printed or serialised. If the trace has ended, call
+    /// [`Self::finish`] first.
     pub fn summary(&self) -> Summary {
         Summary::of(self)
     }
@@ -256,7 +256,7 @@ impl ChannelSummary {
         let mut ids: Vec<_> = channel.ids().collect();
         ids.sort_by_key(|id| (id.id.is_extended(), id.id.raw()));
         let step_ns = channel.coarse_step_ns();
-        // A window as short as the stamps' step has all of the step's frames, or none.
+        // A window as short as the resolution of stamps has all frames of a step, or none.
         let says_nothing = step_ns.is_some_and(|step| window_ns < step * 2);
         let windows = channel.window_least_and_mean_pct().filter(|_| !says_nothing);
         let load = channel.load.as_ref().map(|load| LoadSummary {
@@ -305,7 +305,7 @@ impl ChannelSummary {
     }
 }
 
-/// A fault confinement state in the words of the field.
+/// The usual name of a fault confinement state.
 fn state_name(state: ErrorState) -> &'static str {
     match state {
         ErrorState::Active => "error-active",

@@ -123,7 +123,7 @@ fn no_window_and_no_rate_spans_an_interruption() {
         second(&mut statistics, n, &mut windows);
     }
     statistics.interrupt();
-    // Time that passes meanwhile makes no empty windows.
+    // Time that passes while interrupted makes no empty windows.
     statistics.advance_with(50_000_000_000, |window| windows.push(*window));
     for n in 100..103 {
         second(&mut statistics, n, &mut windows);
@@ -133,7 +133,7 @@ fn no_window_and_no_rate_spans_an_interruption() {
     let channel = &statistics.channels()[0];
     assert!((channel.frames_per_s() - 10.0).abs() < 0.5, "{}", channel.frames_per_s());
     assert!(channel.window_least_and_mean_pct().unwrap().0 > 0.05);
-    // Interrupted for good.
+    // Interrupted and never resumed.
     statistics.interrupt();
     statistics.finish_with(|window| panic!("{window:?}"));
 }
@@ -151,7 +151,7 @@ fn time_that_comes_late_without_a_record_changes_nothing() {
     assert_eq!(windows, 8);
 }
 
-/// Files may say anything.
+/// Files may contain anything.
 #[test]
 fn no_time_however_wild_makes_it_panic() {
     let mut statistics = at_1_mbit();
@@ -200,7 +200,8 @@ fn a_channel_of_which_frames_are_not_wholly_known_has_a_bit_rate_and_no_load() {
     assert_eq!(known, [true, false]);
 }
 
-/// Whole seconds, as some loggers stamp: 100 frames share each, and of ten windows of a second's tenth nine are empty.
+/// Whole seconds, as some loggers stamp: 100 frames share each stamp, and of ten windows of a tenth of a second nine
+/// are empty.
 #[test]
 fn stamps_coarser_than_the_frames_are_noticed() {
     let of = |window: Duration, step_us: i64| {
@@ -215,7 +216,7 @@ fn stamps_coarser_than_the_frames_are_noticed() {
     assert_eq!(tenths.stamp_step_s, Some(1.0));
     let load = tenths.load.unwrap();
     assert_eq!((load.window_min_pct, load.window_mean_pct, load.window_max_pct), (None, None, None));
-    // Windows of several steps say what they always say.
+    // Windows of several steps are unaffected.
     let longer = of(Duration::from_secs(2), 1_000_000);
     assert_eq!(longer.stamp_step_s, Some(1.0));
     assert!(longer.load.unwrap().window_mean_pct.is_some());

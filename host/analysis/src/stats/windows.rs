@@ -1,6 +1,6 @@
 //! How busy a bus is in equal windows of time.
 //!
-//! Counts exact bits. A frame occupies the bus from its start of frame to the end of the intermission behind it; its time
+//! Counts exact bits. A frame occupies the bus from its start of frame to the end of the intermission after it; its time
 //! stamp is its end, before the intermission.
 
 use std::collections::VecDeque;
@@ -8,31 +8,31 @@ use std::collections::VecDeque;
 use cantap_trace::BusBits;
 use cantap_trace::bits::INTERMISSION_BITS;
 
-/// Bits that an error frame takes at least: a flag of six, a delimiter of eight, and the intermission. The
-/// flags of several nodes may stretch it by six, and what was sent of the frame it destroyed is unknown, so a
-/// load with errors is a lower bound.
+/// The least number of bits of an error frame: a flag of six, a delimiter of eight, and the intermission. The
+/// flags of several nodes may stretch it by six, and how much was sent of the destroyed frame is unknown, so
+/// a load with errors is a lower bound.
 pub const ERROR_FRAME_BITS: u32 = 6 + 8 + INTERMISSION_BITS;
 
-/// Bits of the longest classical frame, all stuff bits included, with its intermission.
+/// Bits of the longest classical frame, with stuff bits and intermission.
 const LONGEST_FRAME_BITS: u64 = 160;
 
-/// Bits of the longest CAN FD frame, all of them at the nominal rate: 41 of its head, 64 bytes, a stuff bit after every four of
-/// these, 4 of the stuff count, 21 of the CRC, 7 at fixed places, delimiter, end and intermission.
+/// Bits of the longest CAN FD frame, all at the nominal rate: 41 of its header, 64 bytes, a stuff bit after every four of these
+/// bits, 4 of the stuff count, 21 of the CRC, 7 in fixed places, delimiter, end and intermission.
 const LONGEST_FD_FRAME_BITS: u64 = (41 + 512) * 5 / 4 + 4 + 21 + 7 + 1 + 9 + 3;
 
-/// Nanoseconds that `bits` take, rounded to the nearest.
+/// The duration of `bits` in nanoseconds, rounded to the nearest.
 pub(super) fn bits_to_ns(bits: u64, bitrate_bps: u32) -> u64 {
     let bitrate = u64::from(bitrate_bps);
-    // A file may say anything about suppressed errors.
+    // A file may claim any number of suppressed errors.
     bits.saturating_mul(1_000_000_000).saturating_add(bitrate / 2) / bitrate
 }
 
-/// The shortest window that a frame cannot outlast at this bit rate, in nanoseconds.
+/// The shortest window at this bit rate that is longer than any frame, in nanoseconds.
 pub fn shortest_window_ns(bitrate_bps: u32) -> u64 {
     bits_to_ns(LONGEST_FRAME_BITS, bitrate_bps.max(1))
 }
 
-/// As [`shortest_window_ns`], where there may be CAN FD frames.
+/// Like [`shortest_window_ns`], if there may be CAN FD frames.
 pub(super) fn shortest_fd_window_ns(bitrate_bps: u32) -> u64 {
     bits_to_ns(LONGEST_FD_FRAME_BITS, bitrate_bps.max(1))
 }
@@ -44,22 +44,22 @@ pub struct Window {
     pub channel: u8,
     /// Where it begins, in nanoseconds as in [`cantap_trace::TraceRecord::time_ns`].
     pub start_ns: i64,
-    /// How long it is. The last window of a trace is cut short where the trace ends.
+    /// Its length. The last window of a trace is truncated at the trace's end.
     pub length_ns: u64,
-    /// Whether it is cut short.
+    /// Whether it is truncated.
     pub is_cut: bool,
     /// Frames that ended in it.
     pub frames: u64,
     /// Their bits, with stuff bits and intermission.
     pub bits: u64,
-    /// Error frames seen in it.
+    /// Error frames in it.
     pub errors: u64,
-    /// Lost frames whose record stands in it.
+    /// Lost frames whose record is in it.
     pub lost: u64,
     /// Whether frames are missing from it, or may be: its figures are lower bounds.
     pub incomplete: bool,
-    /// Load in per cent, frames that cross its borders in part, error frames with their least length; `None`
-    /// without a bit rate.
+    /// Load in per cent, including the parts of frames across its borders, and error frames with their
+    /// minimum length; `None` without a bit rate.
     pub load_pct: Option<f64>,
     busy_ns: u64,
 }
@@ -90,7 +90,7 @@ impl Window {
         per_second(self.frames, self.length_ns)
     }
 
-    /// Bits per second, with stuff bits and intermission, error frames left out.
+    /// Bits per second, with stuff bits and intermission, excluding error frames.
     pub fn bits_per_s(&self) -> f64 {
         per_second(self.bits, self.length_ns)
     }
@@ -101,21 +101,21 @@ pub(super) fn per_second(count: u64, length_ns: u64) -> f64 {
     if length_ns == 0 { 0.0 } else { count as f64 * 1e9 / length_ns as f64 }
 }
 
-/// Cuts one channel's time into equal windows and keeps the extremes of the whole ones.
+/// Divides one channel's time into equal windows and keeps the extremes of the whole ones.
 #[derive(Clone, Debug)]
 pub(super) struct Windows {
     length_ns: u64,
     bitrate_bps: Option<u32>,
     data_bitrate_bps: Option<u32>,
     current: Window,
-    /// What of a frame's intermission reaches into the next window.
+    /// The part of a frame's intermission that extends into the next window.
     carry_ns: u64,
-    /// A window that waits for a frame that may have begun in it.
+    /// A window that is held back for a frame that may have begun in it.
     pending: Option<Window>,
     peaks: Peaks,
-    /// Frames are missing from here to the next one.
+    /// Frames are missing between here and the next one.
     in_gap: bool,
-    /// Windows that are over and complete.
+    /// Number of windows that are finished and complete.
     whole: u64,
     load_min: f64,
     load_sum: f64,
@@ -148,7 +148,8 @@ impl Windows {
         }
     }
 
-    /// How long frames take is not known after all: there is no load, neither of this window nor of those before.
+    /// The duration of frames turned out to be unknown: there is no load, neither for this window nor for earlier
+    /// ones.
     pub(super) fn forget_load(&mut self) {
         self.bitrate_bps = None;
         let forget = |window: &mut Window| (window.load_pct, window.busy_ns) = (None, 0);
@@ -157,17 +158,17 @@ impl Windows {
         self.carry_ns = 0;
     }
 
-    /// From here to the next record nothing is known: the window that runs says nothing, and those until then are none.
+    /// Nothing is known from here to the next record: the current window is meaningless, and there are none until then.
     pub(super) fn suspend(&mut self) {
         self.suspended = true;
     }
 
-    /// Whether that is so, and no record has come since.
+    /// Whether it is suspended and no record has come since.
     pub(super) fn is_suspended(&self) -> bool {
         self.suspended
     }
 
-    /// Time has come to `now_ns`: closes every window that ended before.
+    /// The time is now `now_ns`: closes every window that ended before.
     #[inline]
     pub(super) fn advance(&mut self, now_ns: i64, closed: &mut impl FnMut(&Window)) {
         let ahead = now_ns.saturating_sub(self.current.start_ns);
@@ -180,7 +181,7 @@ impl Windows {
         }
     }
 
-    /// The trace's clock was set back, as where two logs were joined: the grid begins anew at `now_ns`.
+    /// The trace's clock was set back, as where two logs were joined: the grid restarts at `now_ns`.
     #[cold]
     fn start_over(&mut self, now_ns: i64, closed: &mut impl FnMut(&Window)) {
         self.close_pending(closed);
@@ -191,7 +192,7 @@ impl Windows {
         closed(&cut);
     }
 
-    /// The first record after [`Self::suspend`]: the grid begins anew at `now_ns`.
+    /// The first record after [`Self::suspend`]: the grid restarts at `now_ns`.
     #[cold]
     fn resume(&mut self, now_ns: i64, closed: &mut impl FnMut(&Window)) {
         self.close_pending(closed);
@@ -205,7 +206,7 @@ impl Windows {
         let length = self.length_ns as i64;
         let mut steps = now_ns.saturating_sub(self.current.start_ns) / length;
         while steps > 0 {
-            // Hours of silence are as many equal empty windows: counted, but not reported one by one.
+            // Hours of silence are many equal empty windows: count them, but do not report each.
             if steps > MOST_SILENT_WINDOWS && self.current.is_empty() {
                 let silent = steps - 1;
                 if !self.in_gap {
@@ -225,7 +226,7 @@ impl Windows {
         }
     }
 
-    /// A frame of `bits` that ended at `end_ns`. [`Self::advance`] to `end_ns` comes first.
+    /// A frame of `bits` that ended at `end_ns`. Call [`Self::advance`] with `end_ns` first.
     #[inline]
     pub(super) fn frame(&mut self, end_ns: i64, bits: BusBits, closed: &mut impl FnMut(&Window)) {
         self.in_gap = false;
@@ -242,7 +243,7 @@ impl Windows {
         };
         let start = end - bits_to_ns(u64::from(bits.nominal - INTERMISSION_BITS), bitrate) as i64 - data_ns;
         let stop = start + bits_to_ns(u64::from(bits.nominal), bitrate) as i64 + data_ns;
-        // A stamp from the past (traces that are merged badly) counts whole where it arrives.
+        // A stamp from the past (badly merged traces) is counted in full where it arrives.
         let before = if end < 0 { 0 } else { (-start).max(0) };
         let after = (stop - self.length_ns as i64).max(0);
         self.current.busy_ns += (stop - start - before - after) as u64;
@@ -253,7 +254,7 @@ impl Windows {
         self.close_pending(closed);
     }
 
-    /// Error frames that were seen.
+    /// Counts error frames.
     pub(super) fn errors(&mut self, count: u64) {
         self.current.errors += count;
         if let Some(bitrate) = self.bitrate_bps {
@@ -262,8 +263,8 @@ impl Windows {
         }
     }
 
-    /// Frames are missing between the last one and the next, wherever in this time they were.
-    /// [`Self::advance`] to the time at which that is known comes afterwards.
+    /// Frames are missing between the last one and the next, at unknown times. Call [`Self::advance`] for the
+    /// time at which this is known afterwards.
     pub(super) fn gap(&mut self) {
         self.in_gap = true;
         self.current.incomplete = true;
@@ -274,7 +275,7 @@ impl Windows {
         }
     }
 
-    /// Frames that were lost.
+    /// Counts lost frames.
     pub(super) fn lost(&mut self, count: u64) {
         self.current.lost += count;
     }
@@ -288,7 +289,7 @@ impl Windows {
         closed(&window);
     }
 
-    /// Takes a window into the extremes. How busy an incomplete one was at least may be a peak, and says nothing of the least
+    /// Includes a window in the extremes. An incomplete one may be a peak, as a lower bound, but does not count for the least
     /// or the mean.
     fn count(&mut self, window: &Window) {
         self.peaks.offer(window);
@@ -309,7 +310,7 @@ impl Windows {
             .map(|_| (window.busy_ns as f64 * 100.0 / window.length_ns as f64).min(100.0));
     }
 
-    /// The window that is still running, as far as `now_ns`.
+    /// The current window, up to `now_ns`.
     pub(super) fn running(&self, now_ns: i64) -> Window {
         let mut window = self.current;
         window.length_ns =
@@ -319,8 +320,8 @@ impl Windows {
         window
     }
 
-    /// The trace ends at `now_ns`: closes what is whole, and the rest, cut short, without counting it among
-    /// the extremes unless it is all there is.
+    /// The trace ends at `now_ns`: closes the whole windows and the truncated rest, which does not count for
+    /// the extremes unless there is nothing else.
     pub(super) fn finish(&mut self, now_ns: i64, closed: &mut impl FnMut(&Window)) {
         if self.suspended {
             return self.close_pending(closed);
@@ -331,7 +332,7 @@ impl Windows {
         if rest.frames + rest.errors + rest.lost == 0 {
             return;
         }
-        // Of a few frames alone the load would be near 100 %, whatever the bus was.
+        // With only a few frames, the load would be near 100 %, whatever the bus was doing.
         if self.whole == 0 && rest.length_ns >= self.length_ns / LEAST_PART {
             self.count(&rest);
         }
@@ -344,7 +345,7 @@ impl Windows {
             .then(|| (self.load_min, self.load_sum / self.whole as f64))
     }
 
-    /// Largest load of a whole window, in per cent: at least so much, if frames are missing from it.
+    /// Largest load of a whole window, in per cent: a lower bound if frames are missing from it.
     pub(super) fn largest_pct(&self) -> Option<f64> {
         self.peaks.best.front()?.load_pct
     }
@@ -355,13 +356,14 @@ impl Windows {
     }
 }
 
-/// A trace that is shorter than a window has none, but its own length if that is at least this part of one.
+/// A trace shorter than a window has none; its own length counts as one if it is at least this fraction of a
+/// window.
 const LEAST_PART: u64 = 10;
 
-/// Silent windows that are reported one by one; a longer silence is counted.
+/// How many silent windows are reported one by one; those of a longer silence are only counted.
 const MOST_SILENT_WINDOWS: i64 = 86_400;
 
-/// The busiest windows: by load, or by frames where no bit rate is known.
+/// The busiest windows: by load, or by frames if no bit rate is known.
 #[derive(Clone, Debug)]
 struct Peaks {
     most: usize,
@@ -423,7 +425,7 @@ mod tests {
     fn a_frame_across_a_border_counts_in_both_windows() {
         let mut windows = windows(1_000_000);
         let mut seen = Vec::new();
-        // 103 bits: 30 µs of it before the border, 70 behind, and 3 of intermission.
+        // 103 bits: 30 µs of it before the border, 70 after it, and 3 of intermission.
         windows.advance(1_070_000, &mut |window| seen.push(*window));
         windows.frame(1_070_000, classic(103), &mut |window| seen.push(*window));
         windows.finish(2_000_000, &mut |window| seen.push(*window));
@@ -433,7 +435,7 @@ mod tests {
         assert_eq!(seen[1].frames, 1);
     }
 
-    /// A single frame was 100 % in "windows of 1 s".
+    /// A single frame once was 100 % in "windows of 1 s".
     #[test]
     fn a_trace_far_shorter_than_a_window_has_none() {
         for (end, whole) in [(58_000, 0), (99_000, 0), (100_000, 1), (900_000, 1)] {

@@ -13,7 +13,7 @@ pub struct WorkLoad {
 }
 
 impl WorkLoad {
-    /// Nothing seen yet. `bitrate_bps` must not be zero; it is taken as 1 then.
+    /// Nothing has been seen yet. `bitrate_bps` must not be zero; zero is treated as 1.
     pub fn new(bitrate_bps: u32) -> Self {
         Self {
             bitrate_bps: bitrate_bps.max(1),
@@ -25,14 +25,14 @@ impl WorkLoad {
         }
     }
 
-    /// Takes a frame that ended at `end_ns` and takes this many bit times on the bus, intermission included: bits at the nominal rate,
-    /// and those of an FD frame's data phase by how many of the nominal rate last as long.
+    /// Takes a frame that ended at `end_ns` and lasted this many bit times, including intermission: bits at the nominal rate, and the
+    /// equivalent number of nominal bits for an FD frame's data phase.
     #[inline]
     pub fn frame(&mut self, end_ns: i64, bit_times: f64) {
         if let Some(previous) = self.previous_ns.replace(end_ns)
             && let Ok(interval) = u64::try_from(end_ns.saturating_sub(previous))
         {
-            // Where stamps are coarse, frames share one: together they took the interval before or behind them.
+            // If stamps are coarse, frames share one: together they took the interval before or after them.
             self.bits += bit_times;
             if interval == 0 {
                 return;
@@ -40,12 +40,12 @@ impl WorkLoad {
             let instant = self.share(bit_times, interval);
             self.instant_pct = Some(instant);
             self.instant_max_pct = Some(self.instant_max_pct.map_or(instant, |max| max.max(instant)));
-            // A file may say anything about times.
+            // A file may contain any times.
             self.span_ns = self.span_ns.saturating_add(interval);
         }
     }
 
-    /// Frames are missing here: the interval that spans them says nothing and is left out.
+    /// Frames are missing here: the interval that spans them is meaningless and left out.
     pub fn gap(&mut self) {
         self.previous_ns = None;
         self.instant_pct = None;
@@ -114,7 +114,7 @@ mod tests {
         assert_eq!(load.instant_pct(), None);
         load.frame(10_116_000, 58.0);
         assert_eq!(load.instant_pct(), Some(50.0));
-        // A stamp that does not advance has no interval of its own.
+        // A stamp that does not advance gives no interval.
         load.frame(10_116_000, 58.0);
         assert_eq!(load.instant_pct(), Some(50.0));
     }

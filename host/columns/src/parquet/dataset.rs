@@ -1,5 +1,5 @@
-//! Many files, in folders named by what their rows have in common: `vehicle=7/day=2026-03-01/channel=1/drive.parquet`. Engines
-//! read such a folder as one table, and leave out the files that a question is not about.
+//! Many files, in folders named after what their rows have in common: `vehicle=7/day=2026-03-01/channel=1/drive.parquet`.
+//! Engines read such a folder as one table, and skip the files that are irrelevant to a query.
 
 use std::fmt::{self, Write as _};
 use std::fs;
@@ -18,7 +18,7 @@ use crate::{FrameColumns, signals};
 /// What names a level of folders.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Key {
-    /// The same name and value for all rows, such as `vehicle=7`.
+    /// A fixed name and value for all rows, such as `vehicle=7`.
     Fixed(String, String),
     /// The day, in UTC: `day=2026-03-01`.
     Day,
@@ -26,7 +26,7 @@ pub enum Key {
     Channel,
 }
 
-/// Whether a dataset's tables have a column of this name already, or a folder may.
+/// Whether this name is already, or may be, a column of a dataset's tables or a folder.
 fn is_taken(name: &str) -> bool {
     let of_signals = signals::fields();
     name == "day"
@@ -34,7 +34,7 @@ fn is_taken(name: &str) -> bool {
         || of_signals.iter().any(|field| field.name() == name)
 }
 
-/// A text is no [`Key`].
+/// A text that is not a [`Key`].
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("'{0}' names no folders: write day, channel, or NAME=VALUE with a name that is no column's")]
 pub struct BadKey(String);
@@ -66,14 +66,14 @@ impl fmt::Display for Key {
     }
 }
 
-/// Files that are open at once; of more the one that was used longest ago is finished, and what comes for it later goes into
+/// How many files are open at once; if there are more, the one unused for longest is finished, and its later rows go into
 /// another file beside it.
 const OPEN: usize = 32;
 
-/// Day since 1970 and channel, as far as the keys ask for them.
+/// Day since 1970 and channel, as far as the keys need them.
 type Place = (Option<i32>, Option<u8>);
 
-/// A dataset that is being written. Columns that the folders' names say are not in the files.
+/// A dataset being written. Columns given by the folders' names are not in the files.
 pub struct Dataset<T, F> {
     folder: PathBuf,
     /// The files' name, without suffix.
@@ -81,7 +81,7 @@ pub struct Dataset<T, F> {
     keys: Vec<Key>,
     table: F,
     open: FxHashMap<Place, Open<T>>,
-    /// How many files each folder has.
+    /// The number of files in each folder.
     files: FxHashMap<Place, u32>,
     used: u64,
 }
@@ -92,15 +92,15 @@ struct Open<T> {
 }
 
 impl<T: Table, F: Fn() -> T> Dataset<T, F> {
-    /// A dataset in `folder`, which is made where it is missing. Its files are called `name`: the same trace written again takes the
-    /// place of what was written before. `table` makes an empty table.
+    /// A dataset in `folder`, which is created if it is missing. Its files are called `name`: writing the same trace again replaces
+    /// them. `table` makes an empty table.
     pub fn new(folder: impl Into<PathBuf>, name: impl Into<String>, keys: Vec<Key>, table: F) -> Self {
         let (folder, name) = (folder.into(), name.into());
         let (open, files) = (FxHashMap::default(), FxHashMap::default());
         Self { folder, name, keys, table, open, files, used: 0 }
     }
 
-    /// The table that this record belongs into. Rows are written as they become many.
+    /// The table for this record. Rows are written when there are many.
     pub fn table_of(&mut self, record: &TraceRecord) -> Result<&mut T, ParquetError> {
         let day = self.keys.contains(&Key::Day).then(|| day_of(record.time_ns));
         let place = (day, self.keys.contains(&Key::Channel).then_some(record.channel));
@@ -163,7 +163,8 @@ impl fmt::Display for Date {
     }
 }
 
-/// A value as part of a path, the way Hive writes it: what would end the name or mean something there is `%` and its number.
+/// A value as part of a path, as Hive writes it: characters that would end the name or have a meaning there become `%` and
+/// their number.
 fn escaped(value: &str) -> String {
     let mut text = String::new();
     for character in value.chars() {
@@ -176,6 +177,6 @@ fn escaped(value: &str) -> String {
             text.push(character);
         }
     }
-    // A folder of that name is this one or the one above.
+    // A folder with that name would be this one or the one above.
     if text.bytes().all(|byte| byte == b'.') { text.replace('.', "%2E") } else { text }
 }

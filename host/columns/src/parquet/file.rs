@@ -1,4 +1,4 @@
-//! One file.
+//! A single file.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter};
@@ -13,23 +13,24 @@ use parquet::file::properties::WriterProperties;
 use super::Table;
 use crate::BATCH_ROWS;
 
-/// Rows of a row group: what a reader that looks for an interval of time skips or takes as a whole.
+/// Rows in a row group: the unit that a reader looking for an interval of time skips or takes.
 const GROUP_ROWS: usize = 1 << 19;
-/// What zstd's own command takes unless told otherwise.
+/// The default of zstd's own command.
 const ZSTD_LEVEL: i32 = 3;
 
-/// A Parquet file that takes its name only when it is whole: an older one of that name stays as it is until then.
+/// A Parquet file that takes its name only when it is complete: an older file with that name stays unchanged
+/// until then.
 pub struct ParquetFile<T> {
-    /// What to put rows into; [`Self::flush`] them now and then.
+    /// Put rows into this, and call [`Self::flush`] now and then.
     pub table: T,
     writer: ArrowWriter<BufWriter<File>>,
-    /// The columns that are written.
+    /// The indexes of the columns written.
     columns: Vec<usize>,
     temporary: Temporary,
     path: PathBuf,
 }
 
-/// Removed if it is still there at the end.
+/// Removed on drop if it still exists.
 struct Temporary(PathBuf);
 
 impl Drop for Temporary {
@@ -39,12 +40,12 @@ impl Drop for Temporary {
 }
 
 impl<T: Table> ParquetFile<T> {
-    /// Begins a file, in a folder that is there.
+    /// Starts a file in an existing folder.
     pub fn create(path: &Path, table: T) -> Result<Self, ParquetError> {
         Self::create_without(path, table, &[])
     }
 
-    /// Begins a file that does not have these columns: where a folder's name says the same, some readers take neither.
+    /// Starts a file without these columns: some readers refuse files that repeat what a folder's name says.
     pub(super) fn create_without(path: &Path, table: T, left_out: &[&str]) -> Result<Self, ParquetError> {
         let name = path.file_name().ok_or_else(|| io::Error::from(io::ErrorKind::InvalidFilename))?;
         let mut temporary = std::ffi::OsString::from(format!(".cantap-{}-", std::process::id()));
@@ -64,7 +65,7 @@ impl<T: Table> ParquetFile<T> {
         Ok(Self { table, writer, columns, temporary, path: path.to_owned() })
     }
 
-    /// Writes the table's rows if they are worth a batch.
+    /// Writes the table's rows if there are enough for a batch.
     pub fn flush(&mut self) -> Result<(), ParquetError> {
         if self.table.waiting() < BATCH_ROWS { Ok(()) } else { self.write() }
     }
@@ -73,7 +74,7 @@ impl<T: Table> ParquetFile<T> {
         self.writer.write(&self.table.batch().project(&self.columns)?)
     }
 
-    /// Writes what is left, and puts the file in its place.
+    /// Writes the rest, and puts the file in its place.
     pub fn finish(mut self) -> Result<(), ParquetError> {
         if self.table.waiting() > 0 {
             self.write()?;

@@ -12,13 +12,13 @@ use arrow_schema::SchemaRef;
 
 use crate::{FrameColumns, MessageColumns, SignalColumns, WideColumns};
 
-/// Rows that become batches.
+/// Something that turns rows into batches.
 pub trait Table {
     /// The columns of every batch.
     fn columns(&self) -> SchemaRef;
-    /// Rows since the last batch.
+    /// The number of rows since the last batch.
     fn waiting(&self) -> usize;
-    /// The rows since the last batch, as one.
+    /// Returns the rows since the last batch as one.
     fn batch(&mut self) -> RecordBatch;
 }
 

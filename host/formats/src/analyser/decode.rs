@@ -1,4 +1,4 @@
-//! Rows of the table as records.
+//! Reads rows of the table as records.
 
 use cantap_wire::{Frame, Id};
 
@@ -15,19 +15,19 @@ use cantap_trace::{Direction, TraceEvent, TraceRecord};
 pub(crate) struct RowDecoder {
     separator: u8,
     start_ns: i64,
-    /// Of the date in a comment.
+    /// The zone of the date in a comment.
     zone: Zone,
-    /// The place of each of [`COLUMNS`] in this file.
+    /// The position of each of [`COLUMNS`] in this file.
     places: Vec<Option<usize>>,
 }
 
 impl RowDecoder {
-    /// With the zone of the file's date.
+    /// `zone` is the zone of the file's date.
     pub(crate) fn new(zone: &Zone) -> Self {
         Self { zone: zone.clone(), ..Self::default() }
     }
 
-    /// Looks at a line of CSV before the rows. True if it names the columns; a comment may name the date.
+    /// Takes a line of CSV before the rows. True if it names the columns; a comment may contain the date.
     pub(crate) fn head(&mut self, line: &[u8]) -> bool {
         if let Some([separator, ..]) = line.strip_prefix(b"Index") {
             self.separator = *separator;
@@ -49,15 +49,15 @@ impl RowDecoder {
         }
     }
 
-    /// Takes the names of the columns; false if they are not this table's.
+    /// Takes the names of the columns; false if they are not those of this table.
     pub(crate) fn name(&mut self, cells: &[&[u8]]) -> bool {
         let find = |name: &&str| cells.iter().position(|cell| cell.trim_ascii() == name.as_bytes());
         self.places = COLUMNS.iter().map(find).collect();
-        // Time, kind, format, ID and length there must be.
+        // Time, kind, format, ID and length are required.
         self.places[1..6].iter().all(Option::is_some)
     }
 
-    /// A line of CSV. Without its line end it must have all its cells.
+    /// A line of CSV. Without a line end it must still have all its cells.
     pub(crate) fn line(&self, line: &[u8], terminated: bool) -> Result<ReadRow, Fault> {
         if matches!(line.first(), Some(b'#' | b'/')) {
             return Ok(None);
@@ -115,7 +115,7 @@ impl RowDecoder {
         if !remote {
             for (at, slot) in data[..usize::from(dlc.min(8))].iter_mut().enumerate() {
                 let byte = cell(6 + at);
-                // Data can be left out of a capture to save bandwidth.
+                // A capture may leave out data to save bandwidth.
                 if byte.is_empty() && cell(18) == b"N" {
                     continue;
                 }

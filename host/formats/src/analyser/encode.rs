@@ -1,4 +1,4 @@
-//! Rows of the table out of records, and the writing that its two kinds of file share.
+//! Turns records into rows of the table, and does the writing that the two kinds of file have in common.
 
 use cantap_wire::Frame;
 use cantap_wire::record::BusErrorKind;
@@ -33,7 +33,7 @@ pub(crate) enum Cell {
     Text,
 }
 
-/// Makes rows of records. The last row is held back until it is known whether frames were lost behind it.
+/// Makes rows from records. The last row is held back until it is known whether frames were lost after it.
 #[derive(Default)]
 pub(crate) struct RowEncoder {
     start_ns: Option<i64>,
@@ -47,7 +47,7 @@ impl RowEncoder {
         *self.start_ns.get_or_insert_with(|| start_of_trace(first_ns))
     }
 
-    /// Takes a record; gives the row before it.
+    /// Takes a record; returns the row before it.
     pub(crate) fn add(&mut self, record: &TraceRecord, left_out: &mut LeftOut) -> Option<TableRow> {
         let offset_ns = record.time_ns.saturating_sub(self.start(record.time_ns));
         if record.channel != 1 {
@@ -102,14 +102,14 @@ impl RowEncoder {
         self.held.as_ref()
     }
 
-    /// Rows so far.
+    /// Number of rows so far.
     pub(crate) fn rows(&self) -> u64 {
         self.rows
     }
 }
 
 impl TableRow {
-    /// Gives each cell in turn.
+    /// Passes each cell in turn.
     pub(crate) fn cells(&self, decimal_mark: u8, mut emit: impl FnMut(Cell, &[u8])) {
         let mut cell = Vec::with_capacity(24);
         let mut number = |push: &dyn Fn(&mut Vec<u8>), kind: Cell| {
@@ -154,7 +154,7 @@ impl TableRow {
     }
 }
 
-/// The comment that names the start: `Date: 2014-09-14 17:14:42.622`.
+/// The comment with the start: `Date: 2014-09-14 17:14:42.622`.
 pub(crate) fn date_comment(start_ns: i64) -> String {
     let date = Date::of(start_ns);
     let (hour, minute, second, ns) = date.clock();
@@ -162,15 +162,15 @@ pub(crate) fn date_comment(start_ns: i64) -> String {
     format!("Date: {year:04}-{month:02}-{day:02} {hour:02}:{minute:02}:{second:02}.{:03}", ns / 1_000_000)
 }
 
-/// What a kind of file makes of the table.
+/// How a kind of file represents the table.
 pub(crate) trait Layout: Send {
-    /// Appends what stands before the rows, with the comment that names the start.
+    /// Appends everything before the rows, with the comment that names the start.
     fn head(&mut self, date: &str, out: &mut Vec<u8>);
 
     /// Appends a row.
     fn row(&self, row: &TableRow, out: &mut Vec<u8>);
 
-    /// Appends what stands behind the rows.
+    /// Appends everything after the rows.
     fn end(&self, _out: &mut Vec<u8>) {}
 
     /// What to change in the file after `rows` rows.
@@ -184,12 +184,12 @@ pub(crate) struct TableEncoder<L> {
     layout: L,
     rows: RowEncoder,
     started: bool,
-    /// Of the date.
+    /// The zone of the date.
     zone: Zone,
 }
 
 impl<L: Layout> TableEncoder<L> {
-    /// With the zone of the file's date.
+    /// `zone` is the zone of the file's date.
     pub(crate) fn new(layout: L, zone: &Zone) -> Self {
         Self { layout, rows: RowEncoder::default(), started: false, zone: zone.clone() }
     }

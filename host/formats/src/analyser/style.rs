@@ -10,22 +10,22 @@ pub enum LineEnd {
     Lf,
 }
 
-/// What `VECTORS` counts in a DIF file, and what follows a number in it.
+/// What `VECTORS` counts in a DIF file, and what follows a number.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum DifConvention {
     /// As DIF was defined: `VECTORS` are columns, `TUPLES` rows; `V` follows a number.
     #[default]
     Columns,
-    /// As some spreadsheets have it: `VECTORS` are rows, `TUPLES` columns; an empty line follows a number.
+    /// As in some spreadsheets: `VECTORS` are rows, `TUPLES` columns; an empty line follows a number.
     Rows,
 }
 
-/// How the analyser's tables are written. Reading finds out by itself.
+/// How the analyser's tables are written. Reading detects it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TableStyle {
     /// What separates columns of CSV.
     pub separator: u8,
-    /// What separates a fraction.
+    /// The decimal mark.
     pub decimal_mark: u8,
     /// How lines end.
     pub line_end: LineEnd,

@@ -25,12 +25,12 @@ pub(crate) struct Decoder {
     relative: bool,
     /// From the `date` line.
     date_ns: i64,
-    /// From the first trigger block, until the first time shows which of the dates counts.
+    /// From the first trigger block, until the first time shows which of the two dates applies.
     block_ns: Option<i64>,
     blocks: u32,
-    /// What times are added to: a date, or with relative times the last event.
+    /// What times are added to: a date or, with relative times, the last event.
     base_ns: Option<i64>,
-    /// Of the dates.
+    /// The zone of the dates.
     zone: Zone,
 }
 
@@ -39,13 +39,13 @@ fn begins(line: &[u8], word: &str) -> bool {
     line.get(..word.len()).is_some_and(|start| start.eq_ignore_ascii_case(word.as_bytes()))
 }
 
-/// Whether a line is empty or the end of a block, with which files end.
+/// Whether a line is empty or the end of a block, as at the end of files.
 fn is_footer(line: &[u8]) -> bool {
     line.is_empty() || begins(line, "end triggerblock")
 }
 
 impl Decoder {
-    /// With the zone of the file's dates.
+    /// `zone` is the zone of the file's dates.
     pub(crate) fn new(zone: &Zone) -> Self {
         Self { zone: zone.clone(), ..Self::default() }
     }
@@ -61,7 +61,7 @@ impl Decode for Decoder {
                 }
                 Ok(Content::Record(record)) => return Ok(Found::Record(record)),
                 Ok(Content::Request) => return Ok(Found::Note(REQUESTS_TO_SEND)),
-                // The beginning of an event can look like one of no interest.
+                // The beginning of an event can look like something to leave out.
                 Ok(Content::LeftOut(_)) if !line.terminated => return Ok(line.cut()),
                 Ok(Content::LeftOut(what)) => return Ok(Found::LeftOut(what)),
                 Ok(Content::Other) if !line.terminated && !is_footer(text) => return Ok(line.cut()),
@@ -82,7 +82,7 @@ impl Decoder {
         }
     }
 
-    /// A line that does not begin with a time.
+    /// Handles a line that does not begin with a time.
     fn head(&mut self, line: &[u8]) -> Result<(), Fault> {
         if begins(line, "date ") {
             self.date_ns = self.zone.utc_ns(date(&line[5..])?);
@@ -92,7 +92,7 @@ impl Decoder {
             self.decimal = has(b"base dec");
             self.relative = has(b"relative");
         } else if begins(line, "begin triggerblock") {
-            // Later blocks belong to the same measurement: its times go on.
+            // Later blocks belong to the same measurement: its times continue.
             self.blocks += 1;
             let stamp = line["begin triggerblock".len()..].trim_ascii();
             if self.blocks == 1 && !stamp.is_empty() {
@@ -123,9 +123,9 @@ impl Decoder {
         time_ns
     }
 
-    /// Decides between the dates of the head and of the trigger block. Vector's times run from the head's,
-    /// and the block's is about that of its first event. python-can's head tells when the file was
-    /// written, and times run from the block's.
+    /// Chooses between the dates of the header and of the trigger block. Vector's times start at the header's
+    /// date, and the block's is roughly that of its first event. python-can's header has the date when the
+    /// file was written, and times start at the block's.
     fn start(&mut self, offset_ns: i64) -> i64 {
         let base_ns = match self.block_ns {
             None => self.date_ns,
@@ -156,7 +156,7 @@ impl Decoder {
         Ok(found.on(time_ns, channel))
     }
 
-    /// An event on a classical channel, behind the channel's number.
+    /// An event on a classical channel, after the channel's number.
     #[inline]
     fn classical(&self, rest: &[u8]) -> Result<OnChannel, Fault> {
         let (id, rest) = text::word(rest);
@@ -169,10 +169,10 @@ impl Decoder {
             b"Rx" => Direction::Rx,
             b"Tx" => Direction::Tx,
             b"TxRq" => return Ok(OnChannel::Request),
-            _ => return Err(Fault::malformed("'Rx' or 'Tx' behind the identifier", word)),
+            _ => return Err(Fault::malformed("'Rx' or 'Tx' after the identifier", word)),
         };
         let id = if extended { Id::extended(raw) } else { Id::standard(raw) }.ok_or_else(|| {
-            Fault::malformed("an identifier up to 7FF, or up to 1FFFFFFF with x behind it", id)
+            Fault::malformed("an identifier up to 7FF, or up to 1FFFFFFF followed by x", id)
         })?;
         let (kind, rest) = text::word(rest);
         let (dlc, rest) = text::word(rest);
@@ -187,17 +187,17 @@ impl Decoder {
                 Frame::from_bus(id, false, dlc, data)
             }
             b"r" | b"R" => {
-                // Older files leave the length out, and others go on with further columns.
+                // Older files leave the length out, and others have further columns.
                 let dlc = if dlc.len() == 1 { self.dlc(dlc)? } else { 0 };
                 Frame::from_bus(id, true, dlc, [0; 8])
             }
-            other => return Err(Fault::malformed("'d' or 'r' behind the direction", other)),
+            other => return Err(Fault::malformed("'d' or 'r' after the direction", other)),
         };
         Ok(OnChannel::Event(TraceEvent::Frame { frame: frame.into(), direction, late: false }))
     }
 
-    /// A CAN FD frame among the classical ones, as earlier versions of python-can wrote it: with the number of its bytes, two digits,
-    /// in the place of the length code.
+    /// A CAN FD frame among the classical ones, as earlier versions of python-can wrote it: with its number of bytes, two digits, in
+    /// place of the length code.
     #[inline]
     fn long(&self, id: Id, len: &[u8], columns: &[u8]) -> Option<TraceFrame> {
         if len.len() != 2 {
@@ -215,8 +215,8 @@ impl Decoder {
         FdFrame::new(id, false, false, &data[..len]).map(TraceFrame::Fd)
     }
 
-    /// Whether a last line that looks whole, and has no line end, may have lost the end of what it says: all but a frame
-    /// whose bytes are all there.
+    /// Whether a last line that looks whole but has no line end may have lost its end: any but a frame with all its
+    /// bytes.
     fn may_be_cut(&self, line: &[u8], record: &TraceRecord) -> bool {
         match record.frame() {
             Some(frame) if frame.is_remote() => matches!(line.last(), Some(b'r' | b'R')),
@@ -233,7 +233,7 @@ impl Decoder {
             b"Rx" => Direction::Rx,
             b"Tx" => Direction::Tx,
             b"TxRq" => return Ok(OnChannel::Request),
-            other => return Err(Fault::malformed("'Rx' or 'Tx' behind the channel", other)),
+            other => return Err(Fault::malformed("'Rx' or 'Tx' after the channel", other)),
         };
         let word = next();
         if word.eq_ignore_ascii_case(b"ErrorFrame") {
@@ -243,7 +243,7 @@ impl Decoder {
         let id =
             parsed.and_then(|(raw, extended)| if extended { Id::extended(raw) } else { Id::standard(raw) });
         let id = id.ok_or_else(|| {
-            Fault::malformed("an identifier up to 7FF, or up to 1FFFFFFF with x behind it", word)
+            Fault::malformed("an identifier up to 7FF, or up to 1FFFFFFF followed by x", word)
         })?;
         // An optional symbolic name, then BRS, ESI, DLC, data length, data, duration, bits, flags.
         let flag = |word: &[u8]| match word {
@@ -255,7 +255,7 @@ impl Decoder {
         if flag(word).is_none() {
             word = next();
         }
-        let expected = "BRS and ESI as 0 or 1, a length code and a number of bytes behind the identifier";
+        let expected = "BRS and ESI as 0 or 1, a length code and a number of bytes after the identifier";
         let brs = flag(word).ok_or_else(|| Fault::malformed(expected, word))?;
         let word = next();
         let esi = flag(word).ok_or_else(|| Fault::malformed(expected, word))?;
@@ -272,14 +272,14 @@ impl Decoder {
         }
         let (_duration, _bits, word) = (next(), next(), next());
         let flags = text::hex(word).ok_or_else(|| Fault::malformed("flags in hexadecimal digits", word))?;
-        // There are programs that leave the flags out; what only an FD frame has says it too.
+        // Some programs leave the flags out; anything that only an FD frame has shows it too.
         let frame = if flags & FD_FORMAT != 0 || len > 8 || brs || esi {
             let frame = FdFrame::new(id, brs, esi, &data[..len]);
             frame.filter(|_| usize::from(FD_LENGTHS[usize::from(dlc)]) == len).map(TraceFrame::Fd)
         } else {
             let remote = flags & REMOTE != 0;
             let frame = data.first_chunk().map(|data| Frame::from_bus(id, remote, dlc, *data));
-            // A remote frame has no data, and the length is the one that it asks for or none.
+            // A remote frame has no data, and its length is the requested one or zero.
             frame.filter(|frame| remote || frame.data_len() == len).map(TraceFrame::Classic)
         };
         let frame = frame.ok_or_else(|| {
@@ -332,7 +332,7 @@ impl Decoder {
             *slot = self.byte(word).ok_or_else(fault)?;
             rest = after;
         }
-        // Further columns follow, but no byte: then the length would be wrong.
+        // Further columns may follow, but no byte: then the length would be wrong.
         let (word, _) = text::word(rest);
         if self.byte(word).is_some() {
             return Err(Fault::malformed(format!("{len} data bytes"), columns.trim_ascii()));
@@ -346,7 +346,7 @@ fn channel(word: &[u8]) -> Option<u8> {
     text::decimal(word).and_then(|channel| u8::try_from(channel).ok())
 }
 
-/// What stands behind `ErrorFrame`.
+/// The event for what follows `ErrorFrame`.
 fn error_frame(rest: &[u8]) -> TraceEvent {
     if let Some(event) = event_text::marked(rest) {
         return event;
@@ -376,7 +376,7 @@ fn status(rest: &[u8]) -> Result<OnChannel, Fault> {
     if status.contains("overrun") {
         return Ok(OnChannel::Event(TraceEvent::Lost { stage: None, count: 1, at_least: true }));
     }
-    // Files spell these in more than one way.
+    // Files spell these in several ways.
     let status = status.replace("busoff", "bus off").replace("warning level", "warning limit");
     let Some((state, _)) = STATES.iter().find(|(_, text)| status.starts_with(text)) else {
         return Ok(OnChannel::LeftOut("other states of the controller"));
@@ -413,7 +413,7 @@ fn date(text: &[u8]) -> Result<i64, Fault> {
     let minute = text::decimal(part()?).ok_or_else(fault)?;
     let second_ns = text::time_of_any_mark(part()?, NS_PER_S).filter(|ns| *ns >= 0).ok_or_else(fault)?;
     let hour = match half.map(str::to_ascii_lowercase).as_deref() {
-        // Twelve comes first on a clock of twelve hours. Some files write hours above twelve and pm.
+        // Twelve comes first on a 12-hour clock. Some files combine hours above twelve with pm.
         Some("am") => hour % 12,
         Some("pm") if hour < 12 => hour + 12,
         None | Some("pm") => hour,

@@ -15,15 +15,15 @@ use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
 /// Writes ASC.
 pub(crate) struct Encoder {
-    /// The time that the file's times count from; known with the first record.
+    /// The time that the file's times count from; known from the first record on.
     start_ns: Option<i64>,
     seconds: Seconds<SECONDS_WIDTH>,
-    /// Of the dates.
+    /// The zone of the dates.
     zone: Zone,
 }
 
 impl Encoder {
-    /// With the zone of the file's dates.
+    /// `zone` is the zone of the file's dates.
     pub(crate) fn new(zone: &Zone) -> Self {
         Self { start_ns: None, seconds: Seconds::new(), zone: zone.clone() }
     }
@@ -46,7 +46,7 @@ fn push_date(out: &mut Vec<u8>, time_ns: i64) {
 /// A file's last line.
 const END: &[u8] = b"End TriggerBlock\n";
 
-// Widths of the columns: a time, of it the whole seconds, and an identifier.
+// Widths of the columns: a time, its whole seconds, and an identifier.
 const TIME_WIDTH: usize = 11;
 const SECONDS_WIDTH: usize = TIME_WIDTH - 7;
 const ID_WIDTH: usize = 16;
@@ -135,7 +135,7 @@ impl Encode for Encoder {
     }
 }
 
-/// What stands behind the time of a frame.
+/// Writes what follows the time of a frame.
 #[inline]
 fn put_frame(line: &mut Line, channel: u8, frame: &Frame, direction: Direction) {
     line.put_small(channel);
@@ -158,7 +158,8 @@ fn put_frame(line: &mut Line, channel: u8, frame: &Frame, direction: Direction) 
     line.put(b"\n");
 }
 
-/// What stands behind the time of a CAN FD frame: Vector's columns, those that only an interface knows as 0.
+/// Writes what follows the time of a CAN FD frame: Vector's columns, with 0 in those that only an interface
+/// knows.
 fn push_fd(out: &mut Vec<u8>, channel: u8, frame: &FdFrame, direction: Direction) {
     let id = frame.id();
     let direction = if direction == Direction::Tx { "Tx" } else { "Rx" };

@@ -1,11 +1,11 @@
-//! What else stands in ASC files: other buses, and what the measuring program has to say. Everything known is counted by its
-//! kind; what is not known is an issue, for it may be a frame with a damaged line.
+//! Other content of ASC files: other buses, and messages of the measuring program. Everything known is counted by kind;
+//! everything unknown is an issue, for it may be a frame on a damaged line.
 
 use super::super::issue::Fault;
 use super::super::text;
 use super::content::{Content, OnChannel};
 
-/// Events by the word behind their time.
+/// Events by the word after their time.
 const KINDS: [(&[&str], &str); 11] = [
     (&["ETH"], "Ethernet frames and events"),
     (&["Fr", "FR", "FlexRay"], "FlexRay frames and events"),
@@ -20,7 +20,7 @@ const KINDS: [(&[&str], &str); 11] = [
     (&["WLAN", "GPS", "GPS:"], "WLAN and GPS events"),
 ];
 
-/// A line behind its time that belongs to no channel of CAN.
+/// Classifies a line, after its time, that belongs to no CAN channel.
 pub(super) fn kind(line: &[u8]) -> Result<Content, Fault> {
     let (first, rest) = text::word(line);
     if line.to_ascii_lowercase().starts_with(b"start of measurement") {
@@ -34,7 +34,7 @@ pub(super) fn kind(line: &[u8]) -> Result<Content, Fault> {
     {
         return Ok(Content::LeftOut(what));
     }
-    // Channels of LIN and MOST have their number behind the letters.
+    // LIN and MOST channels have their number after the letters.
     let numbered = |letters: &[u8]| {
         let number = first.strip_prefix(letters);
         number.is_some_and(|number| !number.is_empty() && number.iter().all(u8::is_ascii_digit))
@@ -49,11 +49,11 @@ pub(super) fn kind(line: &[u8]) -> Result<Content, Fault> {
     if text::word(rest).0 == b":=" {
         return Ok(Content::LeftOut("environment and system variables"));
     }
-    let expected = "a channel of 0 to 255, CAN, CANFD, or another event of ASC behind the time";
+    let expected = "a channel of 0 to 255, CAN, CANFD, or another event of ASC after the time";
     Err(Fault::malformed(expected, line))
 }
 
-/// A line on a channel of CAN that is neither a frame nor an error: `word` stands in the place of the identifier.
+/// A line on a CAN channel that is neither a frame nor an error: `word` is in the identifier's place.
 pub(super) fn on_channel(word: &[u8]) -> Result<OnChannel, Fault> {
     Ok(OnChannel::LeftOut(match word {
         b"Statistic:" | b"Statistic" => "CAN statistics",

@@ -1,4 +1,4 @@
-//! Reading BLF: the file, its containers, and the objects one after another.
+//! Reads BLF: the file, its containers, and the objects one after another.
 
 use std::io;
 
@@ -22,19 +22,19 @@ use cantap_trace::{Direction, Frame, Id, TraceEvent, TraceRecord};
 pub(crate) struct Decoder {
     started: bool,
     start_ns: i64,
-    /// Of the dates in the header.
+    /// The zone of the dates in the header.
     zone: Zone,
-    /// How long the header says that the file is.
+    /// The file's length according to the header.
     file_bytes: u64,
-    /// Decompressed objects; those before `at` are used up. One may go on in the next container.
+    /// Decompressed objects; those before `at` are used up. The last one may continue in the next container.
     objects: Vec<u8>,
     at: usize,
     decompressor: Decompress,
-    /// Something wrong with the container whose objects are being read; reported after them.
+    /// A fault in the container whose objects are being read; reported after them.
     fault: Option<(Place, Fault)>,
     /// Offset of the container.
     container: u64,
-    /// The last object was a comment that already said what a loss object would.
+    /// The last object was a comment that already reported the loss that a loss object would report.
     loss_told: bool,
 }
 
@@ -55,7 +55,7 @@ impl Default for Decoder {
     }
 }
 
-/// A Windows SYSTEMTIME; 0 in a trace without a date, `None` where it is no date.
+/// Reads a Windows SYSTEMTIME; 0 in a trace without a date, `None` if it is not a date.
 fn system_time(bytes: &[u8]) -> Option<i64> {
     let field = |at: usize| u16_at(bytes, 2 * at);
     if (0..8).all(|at| field(at) == 0) {
@@ -65,14 +65,14 @@ fn system_time(bytes: &[u8]) -> Option<i64> {
     let of_day_ns =
         Date::of_day(u64::from(hour), u64::from(minute), u64::from(second), i64::from(ms) * 1_000_000);
     let date = |of_day_ns| Date { year: i64::from(year), month: month as u8, day: day as u8, of_day_ns };
-    // Years and months are longer in the file.
+    // Years and months have more bits in the file.
     (month <= 12 && day <= 31).then_some(())?;
     date(of_day_ns?).time_ns()
 }
 
 const EXPECTED_OBJECT: &str = "an object that begins with LOBJ";
 
-/// What came out of looking for an object.
+/// The result of looking for an object.
 enum Object {
     Event(TraceRecord),
     Request,
@@ -84,7 +84,7 @@ enum Object {
 }
 
 impl Decoder {
-    /// With the zone of the file's dates.
+    /// `zone` is the zone of the file's dates.
     pub(crate) fn new(zone: &Zone) -> Self {
         Self { zone: zone.clone(), ..Self::default() }
     }
@@ -98,7 +98,7 @@ impl Decode for Decoder {
     fn batch(&mut self, input: &mut Input, records: &mut Vec<TraceRecord>) -> io::Result<Option<Found>> {
         loop {
             self.frames(records);
-            // Nothing that is there waits for what comes.
+            // Records that are there do not wait for more input.
             if records.len() >= BATCH || input.may_wait() && !records.is_empty() {
                 return Ok(None);
             }
@@ -128,7 +128,7 @@ impl Decode for Decoder {
                 Object::Issue(fault) => return Ok(Found::Issue(Place::Offset(self.container), fault)),
                 Object::Incomplete => {
                     if let Some((place, fault)) = self.fault.take() {
-                        // An object that would go on in the next container lost its rest here.
+                        // An object that should continue in the next container lost its rest here.
                         self.objects.clear();
                         self.at = 0;
                         return Ok(Found::Issue(place, fault));
@@ -143,7 +143,7 @@ impl Decode for Decoder {
 }
 
 impl Decoder {
-    /// The file's header. A file without it is still read, from the first object on.
+    /// Reads the file's header. A file without one is still read, from the first object on.
     fn head(&mut self, input: &mut Input) -> io::Result<Option<Fault>> {
         self.started = true;
         let head = input.peek(FILE_HEADER_BYTES)?;
@@ -158,7 +158,7 @@ impl Decoder {
             return Ok(Some(Fault::malformed("a BLF file, which begins with LOGG", found)));
         }
         let len = u32_at(head, 4) as usize;
-        // A cut is reported once.
+        // Report a cut only once.
         self.file_bytes = if cut { 0 } else { u64_at(head, FILE_BYTES_OFFSET) };
         let start = &head[START_OFFSET.min(head.len())..];
         let date = system_time(start);
@@ -172,7 +172,7 @@ impl Decoder {
         Ok(if cut { Some(Fault::Truncated("the file header")) } else { no_date })
     }
 
-    /// After the last container, `offset` bytes into the file.
+    /// Handles the end after the last container, `offset` bytes into the file.
     fn end(&mut self, offset: u64) -> Found {
         let rest = self.objects.len() - self.at;
         self.objects.clear();
@@ -189,7 +189,7 @@ impl Decoder {
         Found::End
     }
 
-    /// Takes the next container (or bare object) of the file into `objects`. False at the end.
+    /// Reads the next container (or bare object) of the file into `objects`. False at the end.
     fn container(&mut self, input: &mut Input) -> io::Result<bool> {
         loop {
             let offset = input.offset();
@@ -199,7 +199,7 @@ impl Decoder {
                 return Ok(false);
             }
             if !head.starts_with(OBJECT_MAGIC) {
-                // Padding first; else the file is damaged here.
+                // Skip padding; otherwise the file is damaged here.
                 let found = head[..head.len().min(4)].to_vec();
                 let padding = head.iter().take(4).take_while(|byte| **byte == 0).count();
                 if padding > 0 && (head.len() == padding || head[padding..].starts_with(&OBJECT_MAGIC[..1])) {
@@ -265,12 +265,12 @@ impl Decoder {
         }
     }
 
-    /// Appends classical frames, of which traces are full, up to the first object that is anything else or that there is anything to say
-    /// about: that is for [`Self::object`]. Without its checks one by one, and without copying a record more than once.
+    /// Appends classical frames, which are most of a trace, up to the first object that is anything else or needs a report, which is
+    /// left to [`Self::object`]. It skips that function's individual checks and does not copy a record more than once.
     fn frames(&mut self, records: &mut Vec<TraceRecord>) {
         const FIELDS_BYTES: usize = 16;
         const LEN: usize = HEADER_BYTES + FIELDS_BYTES;
-        /// Signature, header of 32 bytes in its first version, and length, as they stand in each of these objects.
+        /// Signature, a header of 32 bytes in its first version, and length, as in each of these objects.
         const HEAD: [u8; 12] = [b'L', b'O', b'B', b'J', HEADER_BYTES as u8, 0, 1, 0, LEN as u8, 0, 0, 0];
         if self.loss_told {
             return;
@@ -303,7 +303,7 @@ impl Decoder {
         }
     }
 
-    /// An object's time, of the unit that its flags tell.
+    /// An object's time, in the unit given by its flags.
     #[inline]
     fn time_ns(&self, flags: u32, time: u64) -> i64 {
         let offset_ns = if flags == TIME_IN_TEN_US { time.saturating_mul(10_000) } else { time };
@@ -331,7 +331,7 @@ impl Decoder {
         let Some(object) = rest.get(..len) else { return Object::Incomplete };
         let kind = u32_at(object, 12);
         self.at += len;
-        // Only with these headers is the time where it is looked for.
+        // Only these headers have the time in the expected place.
         if !matches!(version, 1 | 2) {
             let found = format!("version {version}");
             return Object::Issue(Fault::malformed("an object's header of version 1 or 2", found.as_bytes()));
@@ -354,7 +354,7 @@ impl Decoder {
         }
     }
 
-    /// Goes to the next object: over padding quietly, over anything else with an issue.
+    /// Goes to the next object: silently over padding, with an issue over anything else.
     fn resync(&mut self) -> Object {
         const MOST_PADDING: usize = 8;
         let rest = &self.objects[self.at..];
@@ -369,7 +369,7 @@ impl Decoder {
                 Object::Issue(Fault::malformed(EXPECTED_OBJECT, &found))
             }
             None if rest.len() < MOST_PADDING + OBJECT_MAGIC.len() => {
-                // What is left is padding, or the beginning of an object that goes on in the next container.
+                // The rest is padding, or the beginning of an object that continues in the next container.
                 let kept = (1..=OBJECT_MAGIC.len().min(rest.len()))
                     .rev()
                     .find(|kept| OBJECT_MAGIC.starts_with(&rest[rest.len() - kept..]))
@@ -386,7 +386,7 @@ impl Decoder {
     }
 }
 
-/// Goes on to the next LOBJ in the file, or to its end.
+/// Skips to the next LOBJ in the file, or to its end.
 fn skip_to_object(input: &mut Input) -> io::Result<()> {
     loop {
         let bytes = input.peek(OBJECT_MAGIC.len())?;
@@ -404,7 +404,7 @@ fn skip_to_object(input: &mut Input) -> io::Result<()> {
     }
 }
 
-/// Appends what a zlib stream decompresses to; false if it is damaged, cut or larger than anything real.
+/// Appends the decompressed content of a zlib stream; false if it is damaged, cut or implausibly large.
 fn inflate(decompressor: &mut Decompress, mut data: &[u8], expected_len: usize, out: &mut Vec<u8>) -> bool {
     const STEP_BYTES: usize = 256 * 1024;
     let limit = out.len() + MAX_ITEM_BYTES;

@@ -18,7 +18,7 @@ use super::{
 };
 use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
 
-/// Bytes of objects per container, as Vector's own writer has it.
+/// Bytes of objects per container, as in files by Vector's own writer.
 const CONTAINER_BYTES: usize = 128 * 1024;
 /// zlib's fastest: a capture must keep up with two buses.
 const LEVEL: u32 = 1;
@@ -32,9 +32,9 @@ pub(crate) struct Encoder {
     objects: Vec<u8>,
     compressor: Compress,
     object_count: u32,
-    /// Length of the file if nothing were compressed.
+    /// Length of the file without compression.
     uncompressed_bytes: u64,
-    /// Of the dates in the header.
+    /// The zone of the dates in the header.
     zone: Zone,
 }
 
@@ -54,13 +54,13 @@ impl Default for Encoder {
 }
 
 impl Encoder {
-    /// With the zone of the file's dates.
+    /// `zone` is the zone of the file's dates.
     pub(crate) fn new(zone: &Zone) -> Self {
         Self { zone: zone.clone(), ..Self::default() }
     }
 }
 
-/// A Windows SYSTEMTIME; zeros where the trace has no date.
+/// Writes a Windows SYSTEMTIME; zeros for a trace without a date.
 fn push_system_time(out: &mut Vec<u8>, time_ns: i64) {
     if (0..FIRST_DATE_NS).contains(&time_ns) {
         out.extend_from_slice(&[0; 16]);
@@ -78,9 +78,9 @@ fn push_system_time(out: &mut Vec<u8>, time_ns: i64) {
 }
 
 impl Encoder {
-    /// The file's header, as far as it is known by now.
+    /// The file's header, as far as it is known.
     fn file_header(&self, file_bytes: u64) -> Vec<u8> {
-        /// CANoe, the application that python-can claims to be too; others are refused by some readers.
+        /// CANoe, the application that python-can claims to be, too; some readers refuse others.
         const APPLICATION: u8 = 5;
         /// Version of the binary log format: 2.6.8.1.
         const FORMAT_VERSION: [u8; 4] = [2, 6, 8, 1];
@@ -121,18 +121,18 @@ impl Encoder {
         header[24..32].copy_from_slice(&offset_ns.to_le_bytes());
         self.objects.extend_from_slice(&header);
         self.objects.extend_from_slice(fields);
-        // As many bytes as the length is over a multiple of four: not what one expects, but what readers do.
+        // The padding is the length modulo four: unexpected, but what readers use.
         self.objects.resize(self.objects.len() + len % 4, 0);
         self.object_count = self.object_count.saturating_add(1);
     }
 
-    /// A comment that carries the whole event.
+    /// Adds a comment that carries the whole event.
     fn comment(&mut self, record: &TraceRecord, offset_ns: u64) {
         let mut text = Vec::new();
         event_text::push_marked(&mut text, &record.event);
-        // The channel stands in front: a comment belongs to none.
+        // The channel comes first, because comments belong to no channel.
         text.splice(..0, format!("CAN {} ", record.channel).into_bytes());
-        // Multiples of four need no padding, about which readers differ.
+        // Multiples of four need no padding, on which readers disagree.
         text.resize(text.len().next_multiple_of(4), b' ');
         let mut fields = vec![0; 16];
         fields[4..8].copy_from_slice(&(text.len() as u32).to_le_bytes());
@@ -148,7 +148,7 @@ impl Encoder {
         let at = out.len();
         let head = BASE_HEADER_BYTES + CONTAINER_FIELDS_BYTES;
         out.resize(at + head, 0);
-        // zlib adds at most 5 bytes per 16 KiB and its frame.
+        // zlib adds at most 5 bytes per 16 KiB, plus its header and trailer.
         out.reserve(self.objects.len() + self.objects.len() / 1024 + 64);
         self.compressor.reset();
         let mut done = 0;
@@ -158,7 +158,7 @@ impl Encoder {
             done += (self.compressor.total_in() - before) as usize;
             match status {
                 Ok(Status::Ok | Status::BufError) => out.reserve(CONTAINER_BYTES),
-                // Compression from memory to memory has no error.
+                // Compression in memory cannot fail.
                 Ok(Status::StreamEnd) | Err(_) => break,
             }
         }
@@ -190,7 +190,7 @@ impl Encode for Encoder {
         let channel = u16::from(record.channel).to_le_bytes();
         match &record.event {
             TraceEvent::Frame { frame: TraceFrame::Fd(frame), direction, .. } => {
-                // Behind the data are four bytes in reserve.
+                // The data are followed by four reserved bytes.
                 let mut fields = [0; 20 + 64 + 4];
                 let id = frame.id();
                 fields[..2].copy_from_slice(&channel);
@@ -268,7 +268,7 @@ impl Encode for Encoder {
     }
 
     fn whole(&self, _bytes: &[u8]) -> usize {
-        // Containers before this write are whole; of this one nobody knows.
+        // Containers before this write are whole; it is unknown whether this one is.
         0
     }
 }

@@ -1,8 +1,8 @@
-//! What else is in BLF files: the objects of other buses and of the measurement, by the group that a user knows.
+//! Other content of BLF files: the objects of other buses and of the measurement, by groups that users know.
 //!
 //! Numbers from Tobias Lorenz's vector_blf (`ObjectHeaderBase.h`).
 
-/// What an object is that is no part of a trace of CAN, in words.
+/// A description of an object that is not part of a CAN trace.
 pub(super) fn group(kind: u32) -> &'static str {
     match kind {
         3 => "CAN overload frames",
@@ -27,8 +27,8 @@ pub(super) fn group(kind: u32) -> &'static str {
     }
 }
 
-/// Objects that only say how the file or the measurement is made, of which none is missed: real-time clock, empty places,
-/// the beginning of a loss whose end tells how much was lost, settings, attributes.
+/// Objects that only describe how the file or the measurement is made, none of which is missed: real-time clock, empty
+/// places, the beginning of a loss whose end says how much was lost, settings, attributes.
 pub(super) const fn is_bookkeeping(kind: u32) -> bool {
     matches!(kind, 0 | 51 | 115 | 125 | 129 | 130 | 131 | 132)
 }

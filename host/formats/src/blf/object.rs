@@ -1,4 +1,4 @@
-//! What the objects of a BLF file say.
+//! The meaning of objects in a BLF file.
 
 use cantap_wire::record::BusErrorKind;
 use cantap_wire::{Frame, Id};
@@ -41,15 +41,15 @@ pub(super) fn u64_at(bytes: &[u8], at: usize) -> u64 {
     bytes.get(at..).and_then(<[u8]>::first_chunk).map_or(0, |field| u64::from_le_bytes(*field))
 }
 
-/// What an object's fields say.
+/// The meaning of an object's fields.
 pub(super) enum Content {
     /// A channel and what happened there.
     Event(u8, TraceEvent),
-    /// The mere request to send a frame.
+    /// Only the request to send a frame.
     Request,
-    /// Something that a trace of CAN does not hold, by kind.
+    /// Something that a CAN trace does not hold, by kind.
     LeftOut(&'static str),
-    /// Something that nobody misses.
+    /// Something that nobody would miss.
     Other,
 }
 
@@ -131,12 +131,12 @@ pub(super) fn event(kind: u32, fields: &[u8], loss_told: bool) -> Result<Content
     })
 }
 
-/// The first `len` bytes. Valid bytes may be more than there are: those missing are zero.
+/// The first `len` bytes. If there are fewer, the missing ones are zero.
 fn valid(data: &[u8], len: u8) -> &[u8] {
     &data[..data.len().min(usize::from(len))]
 }
 
-/// A frame's direction; `None` for the mere request to send one.
+/// A frame's direction; `None` if it is only the request to send one.
 #[inline]
 fn direction(flags: u8) -> Option<Direction> {
     match flags & DIRECTION {
@@ -160,7 +160,7 @@ fn id_and_dlc(id: u32, dlc: u8) -> Result<Id, Fault> {
     Ok(parsed)
 }
 
-/// A CAN FD frame; `None` for the mere request to send one.
+/// A CAN FD frame; `None` if it is only the request to send one.
 fn fd_frame(
     flags: u8,
     dlc: u8,
@@ -179,7 +179,7 @@ fn fd_frame(
     Ok(frame.map(|frame| TraceEvent::Frame { frame: TraceFrame::Fd(frame), direction, late: false }))
 }
 
-/// A classical frame; `None` for the mere request to send one.
+/// A classical frame; `None` if it is only the request to send one.
 #[inline]
 fn frame(flags: u8, dlc: u8, id: u32, data: &[u8]) -> Result<Option<TraceEvent>, Fault> {
     let Some(direction) = direction(flags) else { return Ok(None) };
@@ -191,7 +191,7 @@ fn frame(flags: u8, dlc: u8, id: u32, data: &[u8]) -> Result<Option<TraceEvent>,
     Ok(Some(TraceEvent::Frame { frame: frame.into(), direction, late: false }))
 }
 
-/// An error object: ours exactly, others as far as the controller's code tells.
+/// An error object: exact for our own, for others as far as the controller's code says.
 fn error_ext(fields: &[u8]) -> TraceEvent {
     if fields[10] == 0 && fields[24] == OWN_MARK {
         let kind = fields[25].checked_sub(1).and_then(|at| KINDS.get(usize::from(at)).copied());

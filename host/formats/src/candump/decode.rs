@@ -26,7 +26,7 @@ pub(crate) struct Decoder {
     lengths: Lengths,
     /// The last line looked whole and had no line end.
     end_missing: bool,
-    /// The last second's digits and time: most lines are in the same second as the one before.
+    /// The digits and time of the last second: most lines are in the same second as the one before.
     second: [u8; 10],
     second_ns: i64,
 }
@@ -61,7 +61,7 @@ impl Decode for Decoder {
         Ok(Found::End)
     }
 
-    /// Lines exactly as candump writes them are read where they are in the buffer; the others one by one.
+    /// Lines exactly as candump writes them are read in place in the buffer; the others one by one.
     fn batch(&mut self, input: &mut Input, records: &mut Vec<TraceRecord>) -> io::Result<Option<Found>> {
         loop {
             if self.error_frames.is_empty() {
@@ -89,8 +89,8 @@ impl Decode for Decoder {
 
 impl Decoder {
     /// The line that `text` begins with, if it is a data frame exactly as candump writes it, with ten digits of seconds,
-    /// as most lines are, and its length with its end. Everything is at its place, so nothing is searched for. `None` is
-    /// no verdict: [`Self::parse`] looks at the line then.
+    /// as most lines are; and its length including the line end. All positions are fixed, so nothing is searched for.
+    /// `None` is not a verdict: [`Self::parse`] then looks at the line.
     #[inline]
     pub(super) fn plain(&mut self, text: &[u8]) -> Option<(TraceRecord, usize)> {
         let (time, rest) = text.split_first_chunk::<20>()?;
@@ -127,7 +127,7 @@ impl Decoder {
             [b' ', b'R', rest @ ..] | rest => (Direction::Rx, rest),
         };
         let [b'\n', rest @ ..] = rest else { return None };
-        // Only now: a line that is refused must not name an interface.
+        // Only now: a refused line must not introduce an interface.
         let channel = self.interfaces.channel(interface);
         let frame = Frame::from_bus(id, false, len, data);
         self.lengths.note(id, len);
@@ -136,14 +136,15 @@ impl Decoder {
     }
 
     /// Whether a line without its end, which reads as `record`, lost a part of it. A complete log may lack the last line
-    /// end, and a cut line may look whole: what counts is whether the identifier had longer frames before.
+    /// end, and a cut line may look whole: what matters is whether the identifier had longer frames before.
     fn was_cut(&self, line: &[u8], record: &TraceRecord) -> bool {
         match record.frame() {
             Some(frame) if line.ends_with(b" ") || frame.is_remote() => {
                 !frame.is_remote() || line.ends_with(b" ")
             }
             Some(frame) if frame.dlc() == 8 && !frame.is_fd() => false,
-            // A file of one line was hardly cut; in others an identifier seldom comes for the first time in the last one.
+            // A file of a single line was hardly cut; in others an identifier rarely appears for the first time on the
+            // last line.
             Some(frame) => match self.lengths.of(frame.id()) {
                 Some(longest) => longest > frame.dlc(),
                 None => self.lengths.any,
@@ -152,7 +153,7 @@ impl Decoder {
         }
     }
 
-    /// One line's record, and a second event if it says two things.
+    /// One line's record, and a second event if it contains two.
     #[inline]
     pub(super) fn parse(&mut self, line: &[u8]) -> Result<(TraceRecord, Option<TraceEvent>), Fault> {
         let malformed = || Fault::malformed(EXPECTED, line);
@@ -166,7 +167,7 @@ impl Decoder {
         let direction = match rest.trim_ascii() {
             b"" | b"R" | b"r" => Direction::Rx,
             b"T" | b"t" => Direction::Tx,
-            other => return Err(Fault::malformed("'R', 'T' or nothing behind the frame", other)),
+            other => return Err(Fault::malformed("'R', 'T' or nothing after the frame", other)),
         };
         let raw = text::hex(id).ok_or_else(|| Fault::malformed("a hexadecimal identifier", id))?;
         let channel = self.interfaces.channel(interface);
@@ -194,7 +195,7 @@ impl Decoder {
     }
 }
 
-/// Whether a line has a CAN XL frame: three hexadecimal numbers with colons behind the first `#`, then the data.
+/// Whether a line has a CAN XL frame: three hexadecimal numbers with colons after the first `#`, then the data.
 fn is_xl(line: &[u8]) -> bool {
     let (_, rest) = text::word(line);
     let (frame, _) = text::word(text::word(rest).1);
@@ -207,7 +208,7 @@ fn is_xl(line: &[u8]) -> bool {
     text::hex(priority).is_some() && matches!(fields[..], [(2, Some(_)), (2, Some(_)), (8, Some(_))])
 }
 
-/// What stands before and after the first `byte`.
+/// The text before and after the first `byte`.
 #[inline]
 fn split_at_byte(text: &[u8], byte: u8) -> Option<(&[u8], &[u8])> {
     let at = text.iter().position(|&other| other == byte)?;
@@ -230,7 +231,7 @@ fn bytes(mut digits: &[u8]) -> Option<([u8; 8], u8)> {
     digits.is_empty().then_some((data, len as u8))
 }
 
-/// What follows the `##`: a digit of flags, then the data. `None` if it is not that.
+/// Parses what follows `##`: a digit of flags, then the data. `None` if it is something else.
 fn flexible(id: Id, text: &[u8]) -> Option<TraceFrame> {
     let (flags, mut digits) = text.split_first()?;
     let flags = text::hex_digit(*flags).filter(|flags| flags & !(FLAG_BRS | FLAG_ESI | FLAG_FDF) == 0)?;
@@ -250,13 +251,13 @@ fn flexible(id: Id, text: &[u8]) -> Option<TraceFrame> {
     FdFrame::new(id, flags & FLAG_BRS != 0, flags & FLAG_ESI != 0, &data[..len]).map(TraceFrame::Fd)
 }
 
-/// What follows the `#`.
+/// Parses what follows `#`.
 #[inline]
 fn payload(id: Id, digits: &[u8]) -> Result<Frame, Fault> {
     if let Some((data, len)) = bytes(digits) {
         return Ok(Frame::from_bus(id, false, len, data));
     }
-    // Remote frames and DLCs above 8 are rare: the frame's own text form understands them.
+    // Remote frames and DLCs above 8 are rare: the frame's own parser handles them.
     let text = format!("{id}#{}", String::from_utf8_lossy(digits));
     text.parse().map_err(|error: cantap_wire::frame::ParseFrameError| {
         Fault::malformed(format!("a frame such as 123#DEADBEEF ({error})"), text.as_bytes())

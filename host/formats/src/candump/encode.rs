@@ -46,7 +46,7 @@ impl Encode for Encoder {
                         put_id(&mut line, frame.id());
                         line.put(b"##");
                         line.put_hex(u32::from(frame.flags()));
-                        // Longer than a line that is built in place.
+                        // Longer than a line that fits the inline buffer.
                         std::mem::replace(&mut line, Line::new()).end(out);
                         frame.data().iter().for_each(|byte| text::push_hex_byte(out, *byte));
                     }
@@ -56,8 +56,8 @@ impl Encode for Encoder {
                 }
             }
             event => {
-                // Every event but a frame has an error frame. python-can takes one without this class for
-                // a frame on the bus; bus-off still stays as the kernel has it.
+                // Every event but a frame has an error frame. python-can takes one without this class for a
+                // frame on the bus; bus-off stays as in the kernel.
                 if let Some(ErrorFrame { classes, data }) = ErrorFrame::of(event) {
                     let is_bus_off = classes & cantap_trace::socketcan::BUS_OFF != 0;
                     let class = if is_bus_off { 0 } else { BUS_ERROR };

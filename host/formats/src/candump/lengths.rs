@@ -1,16 +1,16 @@
-//! How long an identifier's frames were, which tells a cut last line from a short frame.
+//! Remembers how long an identifier's frames were, which distinguishes a cut last line from a short frame.
 
 use cantap_wire::Id;
 
-/// How long the longest data frames of recent identifiers were.
+/// Lengths of the longest data frames of recent identifiers.
 pub(super) struct Lengths {
     places: Box<[(u32, u8); Self::PLACES]>,
-    /// There was a data frame.
+    /// Whether there was any data frame.
     pub(super) any: bool,
 }
 
 impl Lengths {
-    /// More identifiers than most buses have, and little enough for the processor's cache.
+    /// More identifiers than most buses have, but few enough for the processor's cache.
     const PLACES: usize = 512;
     const EXTENDED: u32 = 1 << 31;
 
@@ -39,7 +39,7 @@ impl Lengths {
 
 impl Default for Lengths {
     fn default() -> Self {
-        // No identifier has these bits.
+        // No identifier has this value.
         Self { places: Box::new([(u32::MAX, 0); Self::PLACES]), any: false }
     }
 }

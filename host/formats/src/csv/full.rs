@@ -1,4 +1,4 @@
-//! Our own dialect, for people and spreadsheets: everything.
+//! Our own dialect, complete, for people and spreadsheets.
 
 use cantap_wire::{Frame, Id};
 

@@ -1,5 +1,5 @@
-//! python-can's dialect: no place for channel and direction, and everything that is not a frame is an error row with SocketCAN's
-//! classes and bytes. Its SQLite tables have the same columns.
+//! python-can's dialect: it has no columns for channel and direction, and everything that is not a frame is an error row with
+//! SocketCAN's classes and bytes. Its SQLite tables have the same columns.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -18,7 +18,7 @@ use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 /// The names of the columns.
 pub(super) const HEAD: &str = "timestamp,arbitration_id,extended,remote,error,dlc,data";
 
-/// A column that says yes or no.
+/// Parses a yes-or-no column.
 fn flag(word: &[u8]) -> Result<bool, Fault> {
     match word {
         b"0" | b"False" | b"false" => Ok(false),
@@ -27,20 +27,21 @@ fn flag(word: &[u8]) -> Result<bool, Fault> {
     }
 }
 
-/// What a row says of a message beside its bytes.
+/// A message's columns other than its bytes.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Message {
     pub id: u32,
     pub extended: bool,
     pub remote: bool,
     pub error: bool,
-    /// The length as python-can has it: of a classical frame the code of the bus, of one of CAN FD the number of bytes.
+    /// The length as python-can has it: the bus's length code for a classical frame, the number of bytes for a CAN FD
+    /// one.
     pub len: u64,
 }
 
 impl Message {
-    /// What happened, and a second event that an error frame can tell. There is no column for FD: a frame of more than eight bytes is
-    /// one, and only that much is known of it.
+    /// The event, and a second one if an error frame contains two. There is no column for FD: a frame of more than eight bytes is
+    /// one, and nothing else is known about it.
     pub(crate) fn event(
         &self,
         bytes: &[u8],
@@ -98,7 +99,7 @@ pub(super) fn row(line: &[u8], error_frames: &mut ErrorFrames) -> Result<Row, Fa
     Ok(Some((TraceRecord { time_ns, channel: 1, event }, second)))
 }
 
-/// A time as Python writes a floating-point number: `1.5`, and for small ones `9.7e-05`.
+/// A time as Python writes a floating-point number: `1.5`, or for small numbers `9.7e-05`.
 pub(crate) fn time_ns(time: &[u8]) -> Option<i64> {
     if let Some(ns) = text::time(time, NS_PER_S, b'.') {
         return Some(ns);

@@ -1,4 +1,4 @@
-//! What the rows of both dialects have in common.
+//! What the rows of the dialects have in common.
 
 use super::super::issue::Fault;
 use super::super::text::{self, NS_PER_S};
@@ -16,7 +16,7 @@ pub(super) fn columns<const N: usize>(line: &[u8]) -> Result<[&[u8]; N], Fault> 
     if count == N { Ok(columns) } else { Err(Fault::malformed(format!("{N} columns"), line)) }
 }
 
-/// Microseconds, and nanoseconds only where there are any.
+/// Writes microseconds, or nanoseconds if there are any.
 pub(super) fn push_time(out: &mut Vec<u8>, time_ns: i64) {
     text::push_time(out, time_ns, NS_PER_S, if time_ns % 1000 == 0 { 6 } else { 9 }, b'.');
 }

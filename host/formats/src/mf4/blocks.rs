@@ -1,12 +1,13 @@
-//! The blocks that an MF4 file is made of.
+//! The blocks of an MF4 file.
 
 use super::super::issue::Fault;
 use super::super::whole::Whole;
 
-/// Longest block of the file's own description. Comments can be long; what is asked of them is short.
+/// Longest block of the file's own description. Comments can be long, but only short parts of them are
+/// needed.
 const MAX_BLOCK_BYTES: u64 = 1 << 20;
 
-/// A block begins with its name, four bytes of nothing, its length and the number of its links.
+/// A block begins with its name, four reserved bytes, its length and the number of its links.
 pub(super) const BLOCK_HEAD_BYTES: u64 = 24;
 
 /// A block: links to others, and its own fields.
@@ -16,7 +17,7 @@ pub(super) struct Block {
     pub data: Vec<u8>,
 }
 
-/// A block's head.
+/// A block's header.
 pub(super) struct Head {
     pub name: [u8; 4],
     /// Of the whole block.
@@ -24,7 +25,7 @@ pub(super) struct Head {
     pub links: u64,
 }
 
-/// The fields of a block, which are little-endian.
+/// Reads a block's fields, which are little-endian.
 pub(super) fn u16_at(bytes: &[u8], at: usize) -> u16 {
     bytes.get(at..).and_then(|rest| rest.first_chunk()).map_or(0, |chunk| u16::from_le_bytes(*chunk))
 }
@@ -38,7 +39,7 @@ pub(super) fn u64_at(bytes: &[u8], at: usize) -> u64 {
 }
 
 impl Whole {
-    /// The head of the block at a place.
+    /// The header of the block at an address.
     pub(super) fn head(&mut self, at: u64) -> Result<Head, Fault> {
         let bytes = self.read_at(at, BLOCK_HEAD_BYTES as usize)?;
         let damaged = || Fault::malformed(format!("a block of MDF at {at:#x}"), &bytes);
@@ -54,9 +55,9 @@ impl Whole {
         Ok(head)
     }
 
-    /// The block at a place, which must have this name.
+    /// The block at an address, which must have this name.
     pub(super) fn block(&mut self, at: u64, name: [u8; 4]) -> Result<Block, Fault> {
-        /// As many links as these have at least: one that is not there would say that there is nothing behind it.
+        /// The least number of links in these blocks: a missing one would look as if nothing followed.
         const LEAST_LINKS: [(&[u8; 4], usize); 4] = [(b"##HD", 6), (b"##DG", 4), (b"##CG", 6), (b"##CN", 8)];
         let block = self.any_block(at)?;
         let least = LEAST_LINKS.iter().find(|(of, _)| **of == name).map_or(0, |(_, least)| *least);
@@ -72,7 +73,7 @@ impl Whole {
         }
     }
 
-    /// The block at a place, whatever it is.
+    /// The block at an address, whatever its name.
     pub(super) fn any_block(&mut self, at: u64) -> Result<Block, Fault> {
         let head = self.head(at)?;
         if head.len > MAX_BLOCK_BYTES {
@@ -87,7 +88,7 @@ impl Whole {
         Ok(Block { name: head.name, links, data: data.to_vec() })
     }
 
-    /// The text of a block of text or of a comment; empty for the link 0.
+    /// The text of a text or comment block; empty for the link 0.
     pub(super) fn text(&mut self, at: u64) -> Result<String, Fault> {
         if at == 0 {
             return Ok(String::new());

@@ -18,33 +18,34 @@ use cantap_trace::TraceRecord;
 
 const MEASURED: &str = "groups of measured signals";
 
-/// What a file that was not finished has to be corrected in.
+/// Flags for what must be corrected in an unfinished file.
 pub(super) const OPEN_COUNTERS: u16 = 1;
 pub(super) const OPEN_LENGTH: u16 = 4;
 const OPEN_PLACES: u16 = 0x40;
 
-/// Records that wait for their bytes, and bytes that wait for their records: more apart than this is damage.
+/// Limit for records waiting for their bytes and bytes waiting for their records: if they are farther apart,
+/// the file is damaged.
 const MAX_APART: usize = 1 << 16;
 
-/// Longest value of a record of varying length; a frame has 64 bytes.
+/// Longest value of a variable-length record; a frame has 64 bytes.
 const MAX_VALUE_BYTES: usize = 1 << 20;
 
 /// Reads MF4.
 #[derive(Default)]
 pub(crate) struct Decoder {
     open: Option<Opened>,
-    /// What is to be reported before the records.
+    /// To be reported before the records.
     first: VecDeque<Found>,
 }
 
 struct Opened {
     file: Whole,
     parts: Vec<Part>,
-    /// The time of the next record of each part that has one.
+    /// The time of the next record, for each part that has one.
     next: BinaryHeap<Reverse<(i64, usize)>>,
 }
 
-/// What comes out of a part next.
+/// What a part yields next.
 enum Item {
     Record(TraceRecord),
     LeftOut(&'static str),
@@ -52,29 +53,29 @@ enum Item {
 }
 
 impl Item {
-    /// What the record at a place says, or what is wrong with it.
+    /// The content of the record at a place, or what is wrong with it.
     fn of(record: Result<TraceRecord, Fault>, place: u64) -> Self {
         record.map_or_else(|fault| Self::Fault(place, fault), Self::Record)
     }
 }
 
-/// One stream of records, of one group or of several.
+/// A stream of records, of one or several groups.
 struct Part {
     start_ns: i64,
-    /// Bytes in front of each record that say of which group it is.
+    /// Bytes before each record that identify its group.
     id_bytes: usize,
     groups: Vec<Group>,
     by_id: HashMap<u64, usize>,
-    /// Groups whose records are another group's bytes, by address.
+    /// Groups whose records are the bytes of another group's records, by address.
     values: HashMap<u64, Values>,
     by_order: bool,
     stream: Stream,
     at: u64,
-    /// Records of each group so far.
+    /// Number of records of each group so far.
     counts: Vec<u64>,
-    /// Sorted: how many there are.
+    /// If sorted: the number of records.
     records: u64,
-    /// Whether the file says how many records each group has.
+    /// Whether the file contains the number of records in each group.
     is_counted: bool,
     waiting: VecDeque<(usize, u64, Vec<u8>, u64)>,
     time_ns: i64,
@@ -82,13 +83,13 @@ struct Part {
     ended: bool,
 }
 
-/// Values by their place in the stream of all values of their group.
+/// Values by their position in the stream of all values of their group.
 #[derive(Default)]
 struct Values {
     kept: BTreeMap<u64, Vec<u8>>,
-    /// The place of the next one.
+    /// The position of the next one.
     end: u64,
-    /// Where places were not written: how many came, and how many were asked for.
+    /// If positions were not written: how many values came, and how many were requested.
     came: u64,
     asked: u64,
 }
@@ -125,7 +126,7 @@ impl Decode for Decoder {
     }
 }
 
-/// Errors of the system end the reading; others are reported.
+/// The system's errors end the reading; others are reported.
 fn own(fault: Fault) -> io::Result<Fault> {
     match fault {
         Fault::Io(error) => Err(error),
@@ -159,7 +160,7 @@ impl Opened {
     }
 }
 
-/// The streams of records in a file; with a fault, those before it.
+/// The streams of records in a file; if there is a fault, those before it.
 fn parts(
     file: &mut Whole,
     zone: &Zone,
@@ -227,7 +228,7 @@ fn collect(
 }
 
 impl Part {
-    /// What a group of data holds, if events of a bus are in it; and how many groups in it are signals.
+    /// The content of a data group, if it has bus events; and how many of its groups are signals.
     fn open(file: &mut Whole, block: &Block, open: u16, start_ns: i64) -> Result<(Option<Self>, u32), Fault> {
         let id_bytes = usize::from(block.data.first().copied().unwrap_or(0));
         let open_end = open & OPEN_LENGTH != 0;
@@ -279,7 +280,7 @@ impl Part {
         match self.step(file) {
             Ok(item) => Ok(item),
             Err(fault) => {
-                // Where one record ends and the next begins is not known any more.
+                // It is no longer known where one record ends and the next begins.
                 self.ended = true;
                 Ok(Some(Item::Fault(self.at, own(fault)?)))
             }
@@ -321,7 +322,7 @@ impl Part {
                         values.keep(value, self.by_order);
                     }
                 }
-                // Nothing waits, and the record has all that it is about: the most frequent case by far.
+                // Nothing is waiting, and the record is complete: by far the most frequent case.
                 Content::Bus(bus) if self.waiting.is_empty() && bus.is_complete() => {
                     let (len, number) = (self.groups[group].record_bytes, self.counts[group]);
                     let Some(record) = self.stream.at(file, self.at, len)? else {
@@ -351,7 +352,7 @@ impl Part {
         }
     }
 
-    /// What is wrong where no record follows.
+    /// What is wrong if no record follows.
     fn fault_of_end(&self) -> Option<Fault> {
         let rest = self.stream.len().saturating_sub(self.at);
         let is_sorted = self.records != u64::MAX;
@@ -359,7 +360,7 @@ impl Part {
         if self.stream.is_cut() || is_short || rest > 0 && !is_sorted {
             return Some(Fault::Truncated("a group of frames"));
         }
-        // The counter is damaged, or the file's writer had more room than records.
+        // The counter is damaged, or the file's writer reserved more space than it had records.
         if is_sorted && rest >= self.groups[0].record_bytes.max(1) as u64 {
             let expected = format!("no more data than the {} records that are counted", self.records);
             return Some(Fault::malformed(expected, format!("{rest} bytes more").as_bytes()));
@@ -367,7 +368,7 @@ impl Part {
         if is_sorted || !self.is_counted {
             return None;
         }
-        // What belongs to which group stands in front of each record, and may be damaged.
+        // The group's number before each record may be damaged.
         let counts = self.groups.iter().zip(&self.counts);
         let differs = |(group, count): &(&Group, &u64)| {
             !matches!(group.content, Content::Values) && group.records != **count
@@ -389,7 +390,7 @@ impl Part {
             return Ok(None);
         }
         if self.id_bytes == 0 {
-            // A record of no bytes would never end.
+            // A zero-length record would never end.
             let len = self.groups[0].record_bytes as u64;
             return Ok((len > 0 && self.at + len <= self.stream.len()).then_some(0));
         }
@@ -402,7 +403,7 @@ impl Part {
         Ok(Some(group))
     }
 
-    /// The record that has waited longest, if its bytes are there.
+    /// The record that has waited longest, if its bytes have arrived.
     fn of_waiting(&mut self, file: &mut Whole) -> Result<Option<Item>, Fault> {
         let Some((group, number, record, place)) = self.waiting.front() else { return Ok(None) };
         let place = *place;

@@ -1,5 +1,5 @@
-//! Writing MF4: one group of data, each record with the number of its group in front, so that a file is a stream but for
-//! the counts in its head. Until those are put in, the file is marked as one that was not finished, as the standard has it.
+//! Writes MF4: a single data group in which each record begins with its group's number, so that a file is a stream except
+//! for the counts in its header. Until those are filled in, the file is marked as unfinished, as the standard provides.
 
 use cantap_wire::record::BusErrorKind;
 
@@ -15,10 +15,10 @@ use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
 /// What a stream or a compressed file lacks.
 pub(crate) const COUNTS_UNTOLD: &str = "the numbers of records in its head, which only a plain file can be given afterwards; it is marked as unfinished";
 
-/// A block's name, nothing, its length, the number of its links.
+/// A block's name, reserved bytes, its length, and the number of its links.
 const BLOCK_HEAD_BYTES: usize = 24;
 
-/// Where in the identification stands what has to be corrected.
+/// Offset in the identification of the flags for what must be corrected.
 const UNFINISHED_AT: usize = 60;
 
 // Types of data.
@@ -30,7 +30,7 @@ const BYTES: u8 = 10;
 /// A field of a record: name, byte and bit, bits, type of data.
 pub(super) type Part = (&'static str, u32, u8, u32, u8);
 
-/// The words of an event; the longest have 58 characters.
+/// Length of an event's words; the longest have 58 characters.
 const WORDS_BYTES: usize = 64;
 
 const TIME_BYTES: u32 = 8;
@@ -40,10 +40,10 @@ const EDL: u8 = 1 << 1;
 const BRS: u8 = 1 << 2;
 const ESI: u8 = 1 << 3;
 
-/// What records of one kind consist of, behind their time.
+/// The fields of records of one kind, after their time.
 struct Kind {
     name: &'static str,
-    /// Of a record, with its time.
+    /// Length of a record including its time.
     bytes: u32,
     parts: &'static [Part],
 }
@@ -68,7 +68,7 @@ const FRAME_PARTS: [Part; 10] = [
     ("DataBytes", 16, 0, 0, BYTES),
 ];
 
-/// The kinds; the number of each in front of its records is one more than its place here.
+/// The kinds; the number before a kind's records is its index here plus one.
 const KINDS: [Kind; 5] = [
     Kind { name: "CAN_DataFrame", bytes: 16 + 8, parts: &with_bytes(8) },
     Kind { name: "CAN_DataFrame", bytes: 16 + 64, parts: &with_bytes(64) },
@@ -108,15 +108,15 @@ const EVENT: usize = 4;
 /// Writes MF4.
 #[derive(Default)]
 pub(crate) struct Encoder {
-    /// The file's head, up to the first record; empty before that.
+    /// The file's header, up to the first record; empty before that.
     head: Vec<u8>,
     start_ns: i64,
-    /// How many records of each kind there are, and where in the head that stands.
+    /// The number of records of each kind, and its position in the header.
     counts: [u64; KINDS.len()],
     count_places: [usize; KINDS.len()],
 }
 
-/// The blocks of a head, each behind those that it links to.
+/// The blocks of a header, each after those that it links to.
 pub(super) struct Blocks(pub(super) Vec<u8>);
 
 impl Blocks {
@@ -138,12 +138,12 @@ impl Blocks {
 
     pub(super) fn text(&mut self, name: [u8; 4], text: &str) -> u64 {
         let mut data = text.as_bytes().to_vec();
-        // A zero ends it, and zeros fill up the last word.
+        // It ends with a zero, and further zeros fill the last word.
         data.resize((data.len() + 1).next_multiple_of(8), 0);
         self.push(name, &[], &data)
     }
 
-    /// A channel: its type and what it counts, its field, the links that are not 0 in every channel.
+    /// A channel: its type and what it counts, its field, and the links that can be non-zero.
     pub(super) fn channel(
         &mut self,
         next: u64,
@@ -177,7 +177,7 @@ impl Encoder {
         const MASTER_OF_TIME: [u8; 2] = [2, 1];
         const HEADER_BYTES: usize = 104;
         const GROUP_BYTES: u64 = BLOCK_HEAD_BYTES as u64 + 4 * 8 + 8;
-        // A date before 1970 cannot be said; times before the start can.
+        // A date before 1970 cannot be expressed; times before the start can.
         self.start_ns = first_ns.max(0);
         let mut blocks = Blocks(vec![0; HEADER_AT as usize + HEADER_BYTES]);
         let bus = blocks.text(*b"##TX", "CAN");
@@ -202,7 +202,7 @@ impl Encoder {
             let frame = blocks.channel(0, name, [0, 0], &all, [next, 0, 0]);
             let stamp = ("", 0, 0, 8 * TIME_BYTES, SIGNED);
             let first = blocks.channel(frame, time, MASTER_OF_TIME, &stamp, [0, conversion, unit]);
-            // Number, count, flags, what separates names, size of a record.
+            // Number, count, flags, the separator in names, record size.
             let mut data = (at as u64 + 1).to_le_bytes().to_vec();
             data.extend_from_slice(&0_u64.to_le_bytes());
             data.extend_from_slice(&BUS_EVENTS.to_le_bytes());
@@ -225,7 +225,7 @@ impl Encoder {
         let mut date = self.start_ns.to_le_bytes().to_vec();
         date.extend_from_slice(&[0, 0, 0, 0, UTC, 0, 0, 0]);
         let history = blocks.push(*b"##FH", &[0, comment], &date);
-        // The data begins behind this block, which is the last but its own head.
+        // The data begin after this block, which is the last one except for the data's own header.
         let data_at = blocks.0.len() as u64 + GROUP_BYTES;
         let group = blocks.push(*b"##DG", &[0, next_group, data_at, 0], &[1, 0, 0, 0, 0, 0, 0, 0]);
         blocks.push(*b"##DT", &[], &[]);
@@ -342,7 +342,7 @@ mod tests {
     use proptest::prelude::*;
 
     proptest! {
-        /// Times go back and dates are before 1970; the file's order is not theirs.
+        /// Times go backwards and dates are before 1970; records need not be in time order.
         #[test]
         fn any_trace_round_trips(records in prop::collection::vec(record_or_fd(1), 0..20)) {
             prop_assert_eq!(tests::round_trip(Format::Mf4, &records), records);
@@ -366,7 +366,7 @@ mod tests {
         let (bytes, left_out) = tests::write_with(&options, &records);
         assert!(bytes.starts_with(b"UnFinMF 4.10"));
         assert_eq!(left_out.iter().count(), 1);
-        // Cut anywhere, everything before the cut is there.
+        // Wherever it is cut, everything before the cut is there.
         for keep in [bytes.len() - 1, bytes.len() - 26, bytes.len() / 2] {
             let (read, issues) = tests::read(Format::Mf4, &bytes[..keep]);
             assert_eq!(issues.len(), 1, "{issues:?}");

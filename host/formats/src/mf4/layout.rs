@@ -1,4 +1,5 @@
-//! What an MF4 file says of its groups: which carry events of a bus, and where in a record each field stands.
+//! What an MF4 file says about its groups: which of them carry bus events, and where each field is in a
+//! record.
 
 use super::super::issue::Fault;
 use super::super::whole::Whole;
@@ -9,14 +10,14 @@ use super::stream::Stream;
 const MAX_CHANNELS: usize = 1 << 16;
 const MAX_DEPTH: u32 = 8;
 
-/// In a group's flags: its records are of varying length, and belong to another group's channel.
+/// Group flag: its records have variable length and belong to another group's channel.
 const VARIABLE_LENGTH: u16 = 1;
 
 // Types of channels.
 const VARIABLE: u8 = 1;
 const MASTER: u8 = 2;
 const VIRTUAL_MASTER: u8 = 3;
-/// What a master counts.
+/// What a master channel counts.
 const TIME: u8 = 1;
 
 /// A field of a record.
@@ -51,12 +52,12 @@ impl Field {
         Self { at: u32_at(data, 4) as usize, bit, bits: u32_at(data, 8), kind }
     }
 
-    /// The bytes of a text or of an array of bytes.
+    /// The bytes of a text or of a byte array.
     pub(super) fn bytes<'a>(&self, record: &'a [u8]) -> Option<&'a [u8]> {
         record.get(self.at..)?.get(..self.bits as usize / 8)
     }
 
-    /// A number's bits, at most 64 of them; `None` for what is no integer or lies outside the record.
+    /// A number's bits, at most 64 of them; `None` if it is not an integer or lies outside the record.
     pub(super) fn unsigned(&self, record: &[u8]) -> Option<u64> {
         let Kind::Integer { big_endian, .. } = self.kind else { return None };
         self.bits_of(record, big_endian)
@@ -81,7 +82,7 @@ impl Field {
         Some((all >> self.bit) as u64 & mask)
     }
 
-    /// Whether a flag is set, or a text says what the flag stands for.
+    /// Whether a flag is set, or has the text that means it is set.
     pub(super) fn flag(&self, record: &[u8], text: &[u8]) -> bool {
         match self.kind {
             Kind::Text => self.bytes(record).is_some_and(|bytes| bytes.starts_with(text)),
@@ -110,14 +111,14 @@ impl Field {
     }
 }
 
-/// How a group tells the time of its records.
+/// How a group gives the time of its records.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Clock {
-    /// `None`: the number of the record.
+    /// If `None`, the number of the record.
     field: Option<Field>,
     offset_s: f64,
     factor_s: f64,
-    /// A counter of whole nanoseconds, or of a multiple, is exact; as a floating-point number it would not be.
+    /// A counter of whole nanoseconds, or of a multiple, is exact; a floating-point number would not be.
     step_ns: Option<i64>,
 }
 
@@ -146,25 +147,25 @@ impl Clock {
     }
 }
 
-/// Which events of a bus a group has.
+/// Which bus events a group has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Events {
     Frames,
     RemoteFrames,
     ErrorFrames,
-    /// Our own words for what has no form in the standard.
+    /// Our own words for events that the standard has no form for.
     Words,
     /// Something else, which is left out.
     Other(&'static str),
 }
 
-/// Where the bytes of frames are.
+/// Where the frames' bytes are.
 pub(super) enum Bytes {
     /// In the record.
     Here(Field),
-    /// In a stream of their own, at the place that the record names.
+    /// In a separate stream, at the position given in the record.
     Stream { place: Field, stream: Stream },
-    /// In the records of another group, which this is the address of.
+    /// In the records of another group, at this address.
     Group { place: Field, address: u64 },
 }
 
@@ -172,7 +173,7 @@ pub(super) enum Bytes {
 pub(super) struct BusGroup {
     pub events: Events,
     pub clock: Clock,
-    /// The channel that the group's source names, where its records do not.
+    /// The channel named by the group's source, if its records do not name one.
     pub bus: u8,
     pub bus_channel: Option<Field>,
     pub id: Option<Field>,
@@ -188,12 +189,12 @@ pub(super) struct BusGroup {
     pub words: Option<Field>,
 }
 
-/// What a group of channels is.
+/// What a channel group is.
 pub(super) enum Content {
     Bus(Box<BusGroup>),
     /// Records of varying length: values of another group's channel.
     Values,
-    /// Signals that were measured, and what is no event of a bus.
+    /// Measured signals, and anything else that is not a bus event.
     Signals,
 }
 
@@ -206,7 +207,7 @@ pub(super) struct Group {
     pub content: Content,
 }
 
-/// The fields by the last part of their names, but the first two; and what a group with them is.
+/// The fields by the last part of their names, except for the first two; and the kind of group that has them.
 const FRAMES: [(&str, Events); 10] = [
     ("CAN_DataFrame", Events::Frames),
     ("CAN_RemoteFrame", Events::RemoteFrames),
@@ -220,13 +221,13 @@ const FRAMES: [(&str, Events); 10] = [
     ("K_LINE", Events::Other("events of K-Line")),
 ];
 
-/// A channel with what it is made of, one after another.
+/// A channel and its components in sequence.
 struct Channel {
     name: String,
     block: Block,
 }
 
-/// The channels from a link on.
+/// The channels, starting at a link.
 fn channels(
     file: &mut Whole,
     first: u64,
@@ -245,7 +246,7 @@ fn channels(
         let name = if own.contains('.') || parent.is_empty() { own } else { format!("{parent}.{own}") };
         let composition = block.link(1);
         found.push(Channel { name: name.clone(), block });
-        // Arrays are composed too; the bytes of one are those of its channel.
+        // Arrays have components, too; a byte array's bytes are those of its channel.
         if composition != 0 && depth < MAX_DEPTH && &file.head(composition)?.name == b"##CN" {
             channels(file, composition, &name, depth + 1, found)?;
         }
@@ -253,7 +254,7 @@ fn channels(
     Ok(())
 }
 
-/// The clock of a group, by its channel of time.
+/// The clock of a group, from its time channel.
 fn clock(file: &mut Whole, channels: &[Channel]) -> Result<Option<Clock>, Fault> {
     let is_master = |channel: &&Channel| {
         matches!(channel.block.data.first(), Some(&(MASTER | VIRTUAL_MASTER)))
@@ -266,7 +267,7 @@ fn clock(file: &mut Whole, channels: &[Channel]) -> Result<Option<Clock>, Fault>
     if master.block.link(4) != 0 {
         const NO_CHANGE: u8 = 0;
         const LINEAR: u8 = 1;
-        /// Type, precision, flags, numbers of links and values, range: then come the values.
+        /// After type, precision, flags, numbers of links and values, and range come the values.
         const VALUES_AT: usize = 24;
         let conversion = file.block(master.block.link(4), *b"##CC")?;
         let value = |at: usize| f64::from_bits(u64_at(&conversion.data, VALUES_AT + 8 * at));
@@ -279,7 +280,7 @@ fn clock(file: &mut Whole, channels: &[Channel]) -> Result<Option<Clock>, Fault>
     Ok(Some(Clock::new(field, offset_s, factor_s)))
 }
 
-/// The number at the end of a name: 2 for `CAN2`, 1 where there is none.
+/// The number at the end of a name: 2 for `CAN2`, 1 if there is none.
 fn number_of(name: &str) -> u8 {
     let digits = name.len() - name.trim_end_matches(|c: char| c.is_ascii_digit()).len();
     name[name.len() - digits..].parse().unwrap_or(1)

@@ -1,4 +1,4 @@
-//! What a record of a group says.
+//! The content of a group's record.
 
 use super::super::event_text::EventText;
 use super::super::frame_fields::{FdFields, FrameFields, Payload, fd_len, identifier};
@@ -8,12 +8,12 @@ use super::layout::{BusGroup, Bytes, Events, Field};
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
 impl BusGroup {
-    /// Whether its records have the bytes of their frames themselves.
+    /// Whether its records contain the bytes of their frames.
     pub(super) fn is_complete(&self) -> bool {
         matches!(self.bytes, None | Some(Bytes::Here(_))) && !matches!(self.events, Events::Other(_))
     }
 
-    /// What a record says. `apart`: its frame's bytes, where they are not in it.
+    /// The content of a record. `apart`: its frame's bytes, if they are stored elsewhere.
     pub(super) fn record(
         &self,
         record: &[u8],
@@ -93,7 +93,7 @@ impl BusGroup {
             Fault::malformed(format!("up to {longest} data bytes"), found.as_bytes())
         };
         let data = data.ok_or_else(fault)?;
-        // A classical frame's code can say more than its eight bytes.
+        // A classical frame's length code can be above 8.
         let code = code.filter(|code| !is_fd && len == 8 && (9..=15).contains(code));
         fields(code.unwrap_or(len) as u8).event(&data)
     }

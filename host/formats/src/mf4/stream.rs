@@ -1,4 +1,4 @@
-//! The data of a group or of a channel: bytes that lie in one block or in many, plain or compressed.
+//! The data of a group or channel: bytes in one block or many, plain or compressed.
 
 use std::io::Read;
 
@@ -9,25 +9,26 @@ use super::blocks::{BLOCK_HEAD_BYTES, u32_at, u64_at};
 /// Plain data is read in pieces of this many bytes.
 const PIECE_BYTES: u64 = 1 << 20;
 
-/// The standard has at most 4 MiB in a compressed block; other programs write more. Larger is damage.
+/// The standard allows at most 4 MiB in a compressed block; other programs write more. Anything larger means
+/// damage.
 const MAX_UNPACKED_BYTES: u64 = 256 << 20;
 
-/// In the flags of a list of 4.2.
+/// Flag of a 4.2 list.
 const INVALID_APART: u32 = 1 << 31;
 
-/// Lists of lists no deeper than this.
+/// How deeply lists of lists may be nested.
 const MAX_DEPTH: u32 = 4;
 
-/// Fields of a compressed block in front of its data.
+/// Length of the fields of a compressed block before its data.
 const DZ_FIELDS_BYTES: u64 = 24;
 
-/// A piece of the stream that is in the file in one place.
+/// A contiguous piece of the stream in the file.
 #[derive(Clone, Copy, Debug)]
 struct Piece {
-    /// Where it begins in the stream, and how long it is there.
+    /// Where it begins in the stream, and its length there.
     start: u64,
     len: u64,
-    /// Where it is in the file.
+    /// Its position in the file.
     at: u64,
     packed: Option<Packed>,
 }
@@ -36,27 +37,27 @@ struct Piece {
 struct Packed {
     /// Bytes in the file.
     stored: u64,
-    /// 0 deflate, 2 zstd, 4 LZ4; the odd ones the same with rows and columns exchanged.
+    /// 0 deflate, 2 zstd, 4 LZ4; the odd numbers are the same, transposed.
     kind: u8,
-    /// How many columns were exchanged with rows.
+    /// Number of columns if transposed.
     columns: u32,
 }
 
-/// A stream of bytes, read at any place, quickly where that is behind the last one.
+/// A stream of bytes with random access, fast if the next position follows the last one.
 #[derive(Default)]
 pub(super) struct Stream {
     pieces: Vec<Piece>,
-    /// Bytes in all.
+    /// Length in bytes.
     len: u64,
     /// Whether bytes are missing at the end of the file.
     cut: bool,
-    /// What was read last, and where in the stream it begins.
+    /// What was read last, and its position in the stream.
     buffer: Vec<u8>,
     buffer_start: u64,
 }
 
 impl Stream {
-    /// The data behind a link. `open_end`: the last block's length was not written, and it goes to the end of the file.
+    /// The data at a link. `open_end`: the last block's length was not written, and it extends to the end of the file.
     pub(super) fn open(file: &mut Whole, link: u64, open_end: bool) -> Result<Self, Fault> {
         let mut stream = Self::default();
         if link != 0 {
@@ -65,7 +66,7 @@ impl Stream {
         Ok(stream)
     }
 
-    /// Bytes in all.
+    /// Length in bytes.
     pub(super) fn len(&self) -> u64 {
         self.len
     }
@@ -104,7 +105,7 @@ impl Stream {
                 }
                 let at = link + BLOCK_HEAD_BYTES + DZ_FIELDS_BYTES;
                 if at.saturating_add(stored) > file.len() {
-                    // What is left of it cannot be put in order, or ends in the middle of a record.
+                    // The rest of it cannot be put in order, or ends within a record.
                     self.cut = true;
                 } else {
                     self.push(unpacked, at, Some(Packed { stored, kind, columns }));
@@ -142,7 +143,7 @@ impl Stream {
         Ok(())
     }
 
-    /// `len` bytes from a place on; `None` if the stream has fewer there.
+    /// `len` bytes from a position on; `None` if the stream has fewer there.
     pub(super) fn at(&mut self, file: &mut Whole, at: u64, len: usize) -> Result<Option<&[u8]>, Fault> {
         let Some(end) = at.checked_add(len as u64).filter(|end| *end <= self.len) else { return Ok(None) };
         let is_held = |stream: &Self| {
@@ -155,7 +156,7 @@ impl Stream {
         Ok(self.buffer.get(from..from + len))
     }
 
-    /// Makes the buffer hold these bytes.
+    /// Loads these bytes into the buffer.
     fn load(&mut self, file: &mut Whole, at: u64, end: u64) -> Result<(), Fault> {
         let held_until = self.buffer_start + self.buffer.len() as u64;
         if at >= self.buffer_start && at <= held_until {
@@ -186,7 +187,7 @@ impl Stream {
     }
 }
 
-/// A compressed piece, whole.
+/// Decompresses a whole piece.
 fn unpack(file: &mut Whole, piece: Piece, packed: Packed) -> Result<Vec<u8>, Fault> {
     let stored = file.read_at(piece.at, packed.stored as usize)?;
     let len = piece.len as usize;
@@ -212,7 +213,7 @@ fn unpack(file: &mut Whole, piece: Piece, packed: Packed) -> Result<Vec<u8>, Fau
     Ok(bytes)
 }
 
-/// Columns one after another as rows. What is no whole row stands unchanged at the end.
+/// Turns columns one after another into rows. What is left of an incomplete row stays unchanged at the end.
 fn exchange(columns_first: &[u8], columns: usize) -> Vec<u8> {
     let rows = columns_first.len() / columns;
     let mut bytes = columns_first.to_vec();

@@ -1,4 +1,5 @@
-//! Files as other programs arrange them, made by hand: bytes apart from their records, data in lists, compressed.
+//! Files arranged like those of other programs, made by hand: bytes stored apart from their records, data in
+//! lists, compressed.
 
 use std::io::Write;
 
@@ -9,7 +10,7 @@ use crate::{Format, ReadOptions, TraceReader};
 
 const START_NS: u64 = 1_410_714_882_000_000_000;
 
-/// A record has a time, an identifier, a length code and the place of its bytes.
+/// A record has a time, an identifier, a length code and the position of its bytes.
 const RECORD_BYTES: usize = 21;
 const LINK_TO_DATA: usize = 24 + 5 * 8;
 
@@ -17,7 +18,7 @@ fn records() -> Vec<(u32, Vec<u8>)> {
     (0..100).map(|at| (0x100 + at, vec![at as u8; at as usize % 9])).collect()
 }
 
-/// What stands in the log of these.
+/// The expected log of these.
 fn log() -> String {
     let line = |(at, (id, bytes)): (usize, (u32, Vec<u8>))| {
         let data = bytes.iter().map(|byte| format!("{byte:02X}")).collect::<Vec<_>>().concat();
@@ -35,7 +36,8 @@ fn record(at: usize, id: u32, len: usize, place: u64) -> Vec<u8> {
     record
 }
 
-/// A file's blocks up to its group of frames, whose address and whose channel of bytes' are returned.
+/// A file's blocks up to its group of frames; also returns the addresses of that group and of its bytes
+/// channel.
 fn begin() -> (Blocks, u64, usize) {
     let mut blocks = Blocks(vec![0; HEADER_AT as usize + 104]);
     let mut names =
@@ -80,7 +82,7 @@ fn as_log(file: &[u8]) -> (String, Vec<String>) {
     (tests::write(Format::Candump, &records), issues)
 }
 
-/// A block of compressed data, rows and columns exchanged if there are columns.
+/// A block of compressed data, transposed if there are columns.
 fn packed(blocks: &mut Blocks, of: [u8; 2], bytes: &[u8], columns: usize) -> u64 {
     let mut stored = bytes.to_vec();
     let rows = bytes.len().checked_div(columns).unwrap_or(0);
@@ -98,7 +100,7 @@ fn packed(blocks: &mut Blocks, of: [u8; 2], bytes: &[u8], columns: usize) -> u64
     blocks.push(*b"##DZ", &[], &data)
 }
 
-/// A list of blocks, of which the last goes on in a second list.
+/// A list of blocks, the last of which continues in a second list.
 fn list(blocks: &mut Blocks, data: &[u64]) -> u64 {
     let (last, first) = data.split_last().unwrap();
     let second = blocks.push(*b"##DL", &[0, *last], &[0; 8]);
@@ -116,7 +118,7 @@ fn bytes_in_a_stream_of_their_own_and_data_in_lists_plain_and_compressed_are_rea
         values.extend((value.len() as u32).to_le_bytes());
         values.extend(value);
     }
-    // Records and values go on from block to block.
+    // Records and values continue across blocks.
     let (first, rest) = data.split_at(1000);
     let (second, third) = rest.split_at(500);
     let pieces = [
@@ -131,14 +133,14 @@ fn bytes_in_a_stream_of_their_own_and_data_in_lists_plain_and_compressed_are_rea
     blocks.0[bytes + LINK_TO_DATA..][..8].copy_from_slice(&values.to_le_bytes());
     let file = finish(blocks, group, data, 0, 0);
     assert_eq!(as_log(&file), (log(), Vec::new()));
-    // Cut before the group and the lists, nothing can be read, which is said.
+    // Cut before the group and the lists, nothing can be read, which is reported.
     for keep in [file.len() - 1, file.len() / 2, 200, 70, 3] {
         let (log, issues) = as_log(&file[..keep]);
         assert!(log.is_empty() && issues.len() == 1, "{keep}: {issues:?}");
     }
 }
 
-/// As asammdf writes groups in version 4.2 when it is told to: lists of another name, and blocks of values in them.
+/// As asammdf writes groups in version 4.2 on request: lists with another name, containing blocks of values.
 #[test]
 fn the_lists_of_4_2_are_read_and_values_that_are_marked_apart_are_named() {
     for flags in [0_u32, 1 << 31] {
@@ -171,7 +173,7 @@ fn the_lists_of_4_2_are_read_and_values_that_are_marked_apart_are_named() {
     }
 }
 
-/// Found with asammdf's files: a measurement was an empty trace, which looked like success.
+/// Found with asammdf's files: a measurement gave an empty trace, which looked like success.
 #[test]
 fn a_measurement_without_a_bus_is_nothing_that_could_be_read() {
     let (blocks, group, _) = begin();
@@ -188,13 +190,13 @@ fn a_measurement_without_a_bus_is_nothing_that_could_be_read() {
     assert!(nothing.ends_with("mf4 without traffic of CAN: groups of measured signals (1)"), "{nothing}");
 }
 
-/// A logger writes the bytes of a frame before or behind it, and does not finish the file.
+/// A logger writes the bytes of a frame before or after it, and does not finish the file.
 #[test]
 fn bytes_in_records_of_another_group_are_found_before_and_behind_also_by_their_order() {
     for by_order in [false, true] {
         let (mut blocks, frames, bytes) = begin();
         let values = group(&mut blocks, 2, 1, 0, [0; 3]);
-        // The group of values is the next one behind that of frames.
+        // The group of values follows that of frames.
         blocks.0[frames as usize + 24..][..8].copy_from_slice(&values.to_le_bytes());
         blocks.0[bytes + LINK_TO_DATA..][..8].copy_from_slice(&values.to_le_bytes());
         let (mut data, mut place) = (Vec::new(), 0);
@@ -220,7 +222,7 @@ fn bytes_in_records_of_another_group_are_found_before_and_behind_also_by_their_o
     }
 }
 
-/// Found by random damage: a cut behind the version's first digits ended the program.
+/// Found by random damage: a cut after the version's first digits crashed the program.
 #[test]
 fn a_file_cut_in_its_first_bytes_is_named() {
     for len in 8..64 {

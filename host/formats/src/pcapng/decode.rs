@@ -16,7 +16,7 @@ use super::{
 };
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
-/// Longest block of a trace; far above what a CAN packet takes.
+/// Longest block of a trace; far longer than a CAN packet.
 const MAX_BLOCK_BYTES: usize = MAX_ITEM_BYTES;
 /// Interfaces beyond this number are damage, not channels.
 const MAX_INTERFACES: usize = 4096;
@@ -28,15 +28,15 @@ pub(crate) struct Decoder {
     started: bool,
     interfaces: Vec<Interface>,
     names: Interfaces,
-    /// Of captures of any interface: those that the packets name.
+    /// For captures of the "any" interface: the interfaces that the packets name.
     cooked: Interfaces,
     packets: Packets,
 }
 
-/// What an interface description says.
+/// The content of an interface description.
 #[derive(Clone, Copy)]
 struct Interface {
-    /// `None` for what does not carry CAN.
+    /// `None` if it does not carry CAN.
     link: Option<Link>,
     channel: u8,
     /// Units per second.
@@ -73,7 +73,8 @@ impl<'a> Fields<'a> {
         Some(if self.big_endian { u64::from_be_bytes(bytes) } else { u64::from_le_bytes(bytes) })
     }
 
-    /// Where the list of codes and values from `at` on ends, which options are and names; `None` if it is none.
+    /// Where the list of codes and values from `at` on ends (options and names are such lists); `None` if it is
+    /// not one.
     fn end_of_list(self, mut at: usize) -> Option<usize> {
         while at < self.bytes.len() {
             let (code, len) = (self.u16(at)?, usize::from(self.u16(at + 2)?));
@@ -85,7 +86,7 @@ impl<'a> Fields<'a> {
         Some(at)
     }
 
-    /// Whether a block without a packet is filled by what it should have: another one's kind may be damaged.
+    /// Whether a block without a packet has valid content: its kind may be damaged.
     fn is_filled(self, kind: u32) -> bool {
         let options = match kind {
             INTERFACE_DESCRIPTION => Some(8),
@@ -193,7 +194,8 @@ impl Decoder {
         true
     }
 
-    /// Whether the last bytes of the file can be the beginning of a block, or a damaged length points beyond.
+    /// Whether the file's last bytes can be the beginning of a block, or a damaged length points beyond the
+    /// end.
     fn looks_cut(&self, rest: &[u8]) -> bool {
         (1..rest.len() / 4).all(|word| !self.is_block(&rest[4 * word..]))
     }
@@ -209,11 +211,11 @@ impl Decoder {
         (BLOCK_FRAME_BYTES..=4096).contains(&len) && fields.u32(len - 4) == Some(len as u32)
     }
 
-    /// Goes on to the next block that is whole, or to the end.
+    /// Skips to the next whole block, or to the end.
     fn resync(&self, input: &mut Input) -> io::Result<()> {
         input.consume(4);
         loop {
-            // Enough to see the whole of a packet's block.
+            // Enough to see a packet's whole block.
             let bytes = input.peek(8192)?;
             if bytes.len() < BLOCK_FRAME_BYTES {
                 let rest = bytes.len();
@@ -265,7 +267,7 @@ impl Decoder {
                     Err(not_filled())
                 }
             }
-            // A packet could have been in it.
+            // It could have contained a packet.
             _ => Ok(Some(Found::LeftOut("blocks of kinds that are not known"))),
         }
     }
@@ -328,7 +330,7 @@ impl Decoder {
                 if let TraceEvent::Frame { late, .. } = &mut event {
                     *late = is_late;
                 }
-                // Our own error frame for a loss has the same count, and says more.
+                // Our own error frame for a loss has the same count and contains more.
                 if dropped > 0 && !matches!(event, TraceEvent::Lost { .. }) {
                     self.packets.errors.keep([event].into_iter().chain(second).map(record));
                     return Ok(Found::Record(lost));
@@ -348,7 +350,7 @@ impl Decoder {
     }
 }
 
-/// What the flags of a packet's block say of its direction.
+/// The direction in the flags of a packet's block.
 fn direction(flags: u32) -> Option<Direction> {
     const INBOUND: u32 = 1;
     match flags & DIRECTION {
@@ -364,7 +366,7 @@ impl Interface {
     fn time_ns(&self, units: u64) -> i64 {
         let ns_per_s = i128::from(NS_PER_S);
         let ns = if self.resolution == NS_PER_S as u64 {
-            // Ours: before 1970 it wraps.
+            // Ours: times before 1970 wrap.
             i128::from(units.cast_signed())
         } else {
             i128::from(units) * ns_per_s / i128::from(self.resolution)

@@ -16,7 +16,7 @@ use cantap_trace::socketcan::{ERROR_FLAG, ErrorFrame};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 use cantap_wire::record::LossStage;
 
-/// Length of the statistics of one interface: number, time, three counts, the end of the options.
+/// Length of one interface's statistics: number, time, three counts, the end of the options.
 const STATISTICS_BYTES: usize = BLOCK_FRAME_BYTES + 12 + 3 * 12 + 4;
 
 /// Times are in nanoseconds: 10 to the power of minus this.
@@ -28,20 +28,20 @@ pub(crate) struct Encoder {
     started: bool,
     /// In the order of their descriptions in the file.
     interfaces: Vec<Interface>,
-    /// What is known of channels beforehand.
+    /// What is known of channels in advance.
     known: Vec<ChannelInfo>,
-    /// For somebody who reads meanwhile.
+    /// For anyone who reads meanwhile.
     statistics_every: Option<Duration>,
     /// When the statistics were last written.
     counted: Option<Instant>,
-    /// Of the last record.
+    /// The last record's time.
     latest_ns: Option<i64>,
 }
 
 /// A channel that has been described.
 struct Interface {
     channel: u8,
-    /// Frames written, and frames lost before they could be.
+    /// Number of frames written, and of frames lost before that.
     delivered: u64,
     lost: u64,
     /// For the next packet.
@@ -68,7 +68,7 @@ fn option(out: &mut Vec<u8>, code: u16, value: &[u8]) {
     out.resize(out.len() + value.len().wrapping_neg() % 4, 0);
 }
 
-/// A time, in two halves, as blocks have it.
+/// A time in two halves, as in blocks.
 fn halves(time_ns: i64) -> [u32; 2] {
     let time = time_ns.cast_unsigned();
     [(time >> 32) as u32, time as u32]
@@ -87,7 +87,7 @@ impl Encoder {
         self.started = true;
         block(out, SECTION_HEADER, |out| {
             out.extend_from_slice(&BYTE_ORDER_MAGIC.to_le_bytes());
-            // Version 1.0, and a section whose length is not known.
+            // Version 1.0, and a section of unknown length.
             out.extend_from_slice(&[1, 0, 0, 0]);
             out.extend_from_slice(&[0xFF; 8]);
             option(out, SHB_USERAPPL, b"cantap");
@@ -98,7 +98,7 @@ impl Encoder {
         }
     }
 
-    /// The number of a channel's interface, described before its first packet.
+    /// The number of a channel's interface, which is described before its first packet.
     #[inline]
     fn interface(&mut self, channel: u8, out: &mut Vec<u8>) -> usize {
         if let Some(at) = self.interfaces.iter().position(|interface| interface.channel == channel) {
@@ -113,7 +113,7 @@ impl Encoder {
         let known = self.known.iter().find(|known| known.channel == channel);
         block(out, INTERFACE_DESCRIPTION, |out| {
             out.extend_from_slice(&LINK_TYPE.to_le_bytes());
-            // Reserved, and no limit to a packet's length.
+            // Reserved, and no limit on a packet's length.
             out.extend_from_slice(&[0; 6]);
             option(out, IF_NAME, cantap_trace::Interface(channel).to_string().as_bytes());
             if let Some(known) = known {
@@ -127,7 +127,7 @@ impl Encoder {
         });
     }
 
-    /// What each channel had and lost until now. Wireshark adds up nothing: the last block of an interface counts.
+    /// The totals of each channel up to now. Wireshark adds up nothing: an interface's last block counts.
     fn statistics(&mut self, time_ns: i64, out: &mut Vec<u8>) {
         self.counted = Some(Instant::now());
         for (number, Interface { delivered, lost, .. }) in (0_u32..).zip(&self.interfaces) {
@@ -147,7 +147,7 @@ impl Encoder {
     }
 }
 
-/// As much of a text as an option surely holds.
+/// As much of a text as certainly fits an option.
 fn cut(text: &str) -> &str {
     const MOST: usize = 1024;
     let end = (0..=text.len().min(MOST)).rev().find(|end| text.is_char_boundary(*end));
@@ -160,7 +160,7 @@ fn now_ns() -> i64 {
     i64::try_from(since.as_nanos()).unwrap_or(i64::MAX)
 }
 
-/// What a loss is to whoever reads packets.
+/// Describes a loss for anyone who reads packets.
 fn loss(stage: Option<LossStage>, count: u32, at_least: bool) -> String {
     let place = match stage {
         Some(LossStage::Controller) => " in the CAN controller",
@@ -170,14 +170,14 @@ fn loss(stage: Option<LossStage>, count: u32, at_least: bool) -> String {
         None => "",
     };
     match (count, at_least) {
-        (0, true) => format!("frames were lost here{place}, nobody knows how many"),
+        (0, true) => format!("an unknown number of frames was lost here{place}"),
         (1, false) => format!("1 frame was lost here{place}"),
         (count, true) => format!("at least {count} frames were lost here{place}"),
         (count, false) => format!("{count} frames were lost here{place}"),
     }
 }
 
-/// A CAN FD frame as SocketCAN's packet, always of the full length: readers tell the two kinds by it.
+/// A CAN FD frame as SocketCAN's packet, always at full length, by which readers distinguish the two kinds.
 fn fd_packet(frame: &FdFrame) -> [u8; FD_PACKET_BYTES] {
     let mut packet = [0; FD_PACKET_BYTES];
     let extended = if frame.id().is_extended() { EXTENDED } else { 0 };
@@ -188,7 +188,7 @@ fn fd_packet(frame: &FdFrame) -> [u8; FD_PACKET_BYTES] {
     packet
 }
 
-/// A record as SocketCAN's packet; a CAN FD frame is [`fd_packet`]'s.
+/// A record as SocketCAN's packet; CAN FD frames are handled by [`fd_packet`].
 #[inline]
 fn packet(event: &TraceEvent) -> [u8; PACKET_BYTES] {
     let mut packet = [0; PACKET_BYTES];
@@ -292,7 +292,7 @@ impl Encode for Encoder {
         if !self.started {
             self.start(out);
         }
-        // Of a file, the end is where its last record is.
+        // A file's end is at its last record.
         let end_ns = if self.statistics_every.is_some() { Some(now_ns()) } else { self.latest_ns };
         if let Some(end_ns) = end_ns {
             self.statistics(end_ns, out);

@@ -29,22 +29,22 @@ pub(crate) struct Decoder {
     has_start: bool,
     has_rows: bool,
     layout: Layout,
-    /// The row before gave an event exactly; a row of the format's own for it follows.
+    /// The row before gave an event exactly; the format's own row for it follows.
     told: Option<TraceRecord>,
-    /// Of the dates.
+    /// The zone of the dates.
     zone: Zone,
 }
 
-/// What a row is.
+/// The kind of row.
 enum Row {
     Record(TraceRecord),
-    /// A known thing that is no part of a trace of CAN, by kind.
+    /// Something known that is not part of a CAN trace, by kind.
     LeftOut(&'static str),
-    /// Of the head, or given by the row before.
+    /// Part of the header, or covered by the row before.
     Nothing,
 }
 
-/// Which column has what, counted from 0.
+/// The content of each column, counted from 0.
 #[derive(Clone, Copy, Debug)]
 struct Layout {
     offset: usize,
@@ -53,13 +53,13 @@ struct Layout {
     id: usize,
     direction: Option<usize>,
     len: usize,
-    /// The length is a number of bytes, not the code of the bus.
+    /// The length is a number of bytes, not the bus's length code.
     len_is_bytes: bool,
     data: usize,
 }
 
 impl Layout {
-    /// The fixed columns of version 1, and those that 2.1 has unless the head says otherwise.
+    /// The fixed columns of version 1, and those of 2.1 unless the header says otherwise.
     fn of(version: TrcVersion) -> Self {
         let fixed = |kind, bus, id, len| {
             let direction = kind;
@@ -111,7 +111,7 @@ impl Default for Decoder {
 }
 
 impl Decoder {
-    /// With the zone of the file's dates.
+    /// `zone` is the zone of the file's dates.
     pub(crate) fn new(zone: &Zone) -> Self {
         Self { zone: zone.clone(), ..Self::default() }
     }
@@ -123,7 +123,8 @@ impl Decode for Decoder {
             let text = line.text.trim_ascii();
             let result = match text {
                 [] => Ok(Row::Nothing),
-                // Behind the head nobody looks for more of it: a row may have become a comment by damage.
+                // After the header, nothing more of it is expected: damage may have turned a row into a
+                // comment.
                 [b';', ..] if self.has_rows => Ok(Row::LeftOut("comments and texts")),
                 [b';', comment @ ..] => self.head(comment).map(|()| Row::Nothing),
                 _ => self.row(text),
@@ -153,14 +154,14 @@ impl Decode for Decoder {
 }
 
 impl Decoder {
-    /// Whether a row without its line end lost nothing. Nobody can tell what an event's row lost, and in version 1 whether
-    /// RTR would have followed a length of 0; any other frame that lost something is an error.
+    /// Whether a row without its line end is certainly complete. An event's row is not, and in version 1 RTR might have
+    /// followed a length of 0; any other truncated frame is an error.
     fn is_sure(&self, record: &TraceRecord) -> bool {
         let v1 = self.version < TrcVersion::V2_0;
         record.frame().is_some_and(|frame| frame.dlc() > 0 || frame.is_remote() || !v1)
     }
 
-    /// A line of the head, without the semicolon.
+    /// A line of the header, without the semicolon.
     fn head(&mut self, line: &[u8]) -> Result<(), Fault> {
         let value = |name: &[u8]| line.strip_prefix(name).map(<[u8]>::trim_ascii);
         if let Some(version) = value(b"$FILEVERSION=") {
@@ -269,7 +270,7 @@ impl Decoder {
         Ok(Row::Record(TraceRecord { time_ns, channel, event }))
     }
 
-    /// A row that is no frame. Those of no interest give nothing.
+    /// A row that is not a frame. Those without interest yield nothing.
     fn event(
         &mut self,
         row: &[u8],
@@ -324,7 +325,7 @@ impl Decoder {
     }
 }
 
-/// A CAN FD frame: `len` is the length's column, `rest` what stands behind it.
+/// A CAN FD frame: `len` is the length column, `rest` is what follows it.
 fn flexible(
     id: Id,
     brs: bool,
@@ -356,15 +357,15 @@ fn flexible(
     frame.map(TraceFrame::Fd).ok_or_else(|| Fault::malformed(expected, len))
 }
 
-/// The channel that an event's text names.
+/// The channel in an event's text.
 fn named_channel(row: &[u8]) -> u8 {
     let Some(at) = memchr::memmem::find(row, b"CAN ") else { return 1 };
     let number = text::decimal(text::word(&row[at + 4..]).0);
     number.and_then(|number| u8::try_from(number).ok()).unwrap_or(1)
 }
 
-/// The data bytes of a row that leaves columns empty, so that they cannot be counted: in version 2 the pairs of
-/// digits behind the direction, in version 1 those behind a length of 4.
+/// The data bytes of a row with empty columns, which therefore cannot be counted: in version 2 the pairs of
+/// digits after the direction, in version 1 those after a length of 4.
 fn data_bytes(row: &[u8], version_2: bool) -> Vec<u8> {
     let mut words = row.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
     let found = if version_2 {
@@ -392,7 +393,8 @@ fn identifier(digits: &[u8]) -> Result<Id, Fault> {
     id.ok_or_else(|| Fault::malformed("an identifier of 4 digits up to 07FF or 8 up to 1FFFFFFF", digits))
 }
 
-/// Days since 1899-12-30 as nanoseconds since the Unix epoch, to a microsecond: more the digits do not say.
+/// Days since 1899-12-30 as nanoseconds since the Unix epoch, to a microsecond, which is as exact as the
+/// digits are.
 fn time_of_days(days: &[u8]) -> Option<i64> {
     const NS_PER_US: i128 = 1000;
     // Decimal digits of a day, exactly: a float would be wrong by half a microsecond.
@@ -412,7 +414,7 @@ fn time_of_days(days: &[u8]) -> Option<i64> {
     i64::try_from(us * NS_PER_US).ok()
 }
 
-/// `18.12.2021 14:28:07.062`, with further digits or fields behind it.
+/// `18.12.2021 14:28:07.062`, followed by further digits or fields.
 fn date(text: &[u8]) -> Option<i64> {
     let text = std::str::from_utf8(text).ok()?;
     let (day, clock) = text.split_once(' ')?;
@@ -422,7 +424,7 @@ fn date(text: &[u8]) -> Option<i64> {
     let mut clock = clock.trim().splitn(3, ':');
     let hour = text::decimal(clock.next()?.as_bytes())?;
     let minute = text::decimal(clock.next()?.as_bytes())?;
-    // Tenths of a millisecond follow behind a second point.
+    // Tenths of a millisecond follow after a second point.
     let second: String = clock.next()?.splitn(3, '.').take(2).collect::<Vec<_>>().join(".");
     let second_ns = text::time_of_any_mark(second.as_bytes(), text::NS_PER_S).filter(|ns| *ns >= 0)?;
     let second = (second_ns / text::NS_PER_S) as u64;

@@ -1,7 +1,7 @@
-//! Other people's programs, which read our files and write some that we read.
+//! Other programs that read our files and write some that we read.
 //!
-//! python-can is in `CANTAP_PYTHON`, else `python3`. A peer that is missing is named and its test passes,
-//! unless `CANTAP_REQUIRE_PEERS=1`.
+//! python-can is in `CANTAP_PYTHON`, otherwise `python3`. If a peer is missing, it is named and its test
+//! passes, unless `CANTAP_REQUIRE_PEERS=1`.
 
 #![allow(dead_code, reason = "each test file uses some of them")]
 
@@ -19,7 +19,8 @@ pub fn peers_are_required() -> bool {
     std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1")
 }
 
-/// A program's output, or `None` after saying that it is missing. One that is there and fails is a failure.
+/// A program's output, or `None` after reporting that it is missing. If it is there and fails, the test
+/// fails.
 pub fn run(peer: &str, probe: &[&str], command: &mut Command) -> Option<String> {
     let there = Command::new(command.get_program()).args(probe).output();
     if !there.is_ok_and(|output| output.status.success() || probe.is_empty()) {
@@ -36,7 +37,7 @@ pub fn python_can(arguments: &[&Path], command: &str) -> Option<String> {
     run("python-can", &["-c", "import can"], Command::new(python()).arg(SCRIPT).arg(command).args(arguments))
 }
 
-/// What python-can reads from files, by file.
+/// What python-can reads from each file.
 pub fn python_can_reads(paths: &[PathBuf]) -> Option<BTreeMap<PathBuf, Vec<String>>> {
     let arguments: Vec<_> = paths.iter().map(PathBuf::as_path).collect();
     let text = python_can(&arguments, "dump")?;

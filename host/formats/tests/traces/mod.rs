@@ -1,5 +1,5 @@
-//! What the tests of trace files share: records to write, and files written and read as a program
-//! that uses the library does.
+//! What the tests of trace files have in common: records to write, and writing and reading files the way a
+//! program that uses the library does.
 
 #![allow(dead_code, reason = "each test file uses some of them")]
 
@@ -11,7 +11,7 @@ use cantap_trace::{TraceEvent, TraceRecord};
 /// A boat's bus (gpsd's test data): one channel, extended identifiers, microseconds.
 pub const REAL: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/nmea2000.log.gz");
 
-/// What is not an ordinary frame, on two channels, sent and received: short and long codes of length, remote
+/// Everything but ordinary frames, on two channels, sent and received: short and long length codes, remote
 /// frames, errors, states and losses.
 pub const ODD: &str = "(1410714882.000000) can0 000#\n\
     (1410714882.000100) can1 7FF#01 T\n\
@@ -25,7 +25,7 @@ pub const ODD: &str = "(1410714882.000000) can0 000#\n\
     (1410714884.000001) can0 20000040#0000000000000000\n\
     (1410714884.100000) can1 321#AA\n";
 
-/// A format's file name, so that reading finds the format by itself.
+/// A file name for a format, by which reading detects it.
 pub fn file_name(format: Format, compression: &str) -> String {
     let suffix = match format {
         Format::Candump | Format::Busmaster => "log",
@@ -46,7 +46,7 @@ pub fn file_name(format: Format, compression: &str) -> String {
     format!("{format}.{suffix}{compression}")
 }
 
-/// Writes a file and says what it could not carry.
+/// Writes a file and returns what it could not carry.
 pub fn write(path: &Path, format: Format, records: &[TraceRecord]) -> LeftOut {
     let options = WriteOptions { format: Some(format), ..WriteOptions::default() };
     let mut writer = create_writer(path, &options).unwrap();
@@ -61,7 +61,7 @@ pub fn read(path: impl AsRef<Path>) -> (Vec<TraceRecord>, Vec<String>) {
     split(open_reader(path, &ReadOptions::default()).unwrap())
 }
 
-/// Records and messages apart.
+/// Separates records from messages.
 pub fn split(
     items: impl Iterator<Item = Result<TraceRecord, cantap_formats::ReadIssue>>,
 ) -> (Vec<TraceRecord>, Vec<String>) {
@@ -80,7 +80,7 @@ pub fn real(count: usize) -> Vec<TraceRecord> {
     open_reader(REAL, &ReadOptions::default()).unwrap().take(count).map(Result::unwrap).collect()
 }
 
-/// The odd ones.
+/// The unusual records.
 pub fn odd(directory: &Path) -> Vec<TraceRecord> {
     let path = directory.join("odd.log");
     std::fs::write(&path, ODD).unwrap();
@@ -89,7 +89,7 @@ pub fn odd(directory: &Path) -> Vec<TraceRecord> {
     records
 }
 
-/// A directory of its own for each test.
+/// A separate directory for each test.
 pub fn directory(test: &str) -> PathBuf {
     let directory = Path::new(env!("CARGO_TARGET_TMPDIR")).join(test);
     std::fs::create_dir_all(&directory).unwrap();

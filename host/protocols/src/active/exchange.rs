@@ -1,7 +1,7 @@
 //! A diagnostic request and its answers: UDS (ISO 14229), KWP2000 and OBD-II, over ISO 15765-2.
 //!
-//! One server is asked by its own identifier, all of them by a functional one. A server that needs longer says so again and again
-//! (response pending); how long that may go on is bounded.
+//! One server is addressed by its own identifier, all of them by a functional one. A server that needs longer says so repeatedly
+//! (response pending); how long that may go on is limited.
 
 use std::collections::VecDeque;
 
@@ -19,42 +19,43 @@ const RESPONSE_PENDING: u8 = 0x78;
 /// How long servers may take.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ResponseTiming {
-    /// From the end of the request to the beginning of the answer (P2, with what the network takes).
+    /// From the end of the request to the beginning of the answer (P2, plus the network's delay).
     pub p2_ns: u64,
     /// The same after the server has said that the answer is pending (P2*).
     pub p2_star_ns: u64,
-    /// From the end of the request to the last answer, however often it is pending.
+    /// From the end of the request to the last answer, however often it was pending.
     pub patience_ns: u64,
 }
 
 impl Default for ResponseTiming {
-    /// A second, for servers have 50 ms and gateways take their time; five seconds; a minute.
+    /// One second, because servers have 50 ms and gateways add to that; five seconds; one minute.
     fn default() -> Self {
         Self { p2_ns: 1_000_000_000, p2_star_ns: 5_000_000_000, patience_ns: 60_000_000_000 }
     }
 }
 
-/// Who is to answer.
+/// Who should answer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Answerer {
-    /// One server; flow control goes where the request does, or, for a functional request, to its own identifier.
+    /// A single server. Flow control goes to the identifier of the request or, for a functional request, to the
+    /// server's own.
     One {
-        /// What it answers with.
+        /// Where its answer comes from.
         from: Endpoint,
-        /// What it is asked with.
+        /// Where flow control goes.
         flow_to: Endpoint,
     },
-    /// Whoever answers with 7E8 to 7EF (ISO 15765-4).
+    /// Anyone who answers with 7E8 to 7EF (ISO 15765-4).
     Any11Bit,
-    /// Whoever answers this tester with 18DA (ISO 15765-4).
+    /// Anyone who answers this tester with 18DA (ISO 15765-4).
     Any29Bit {
-        /// The tester's address, F1 as a rule.
+        /// The tester's address, usually F1.
         tester: u8,
     },
 }
 
 impl Answerer {
-    /// Where flow control for this sender goes, if it is one that is to answer.
+    /// Where flow control for this sender goes, if it is one that should answer.
     fn flow_to(self, id: Id, data: &[u8]) -> Option<(Endpoint, Endpoint)> {
         let plain = |id| Endpoint { id, address: None };
         match self {
@@ -76,7 +77,7 @@ impl Answerer {
         }
     }
 
-    /// Whether there can be several.
+    /// Whether there can be several answers.
     pub const fn is_many(self) -> bool {
         !matches!(self, Self::One { .. })
     }
@@ -85,16 +86,16 @@ impl Answerer {
 /// One server's answer.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ServerAnswer {
-    /// Who.
+    /// The server.
     pub from: Endpoint,
-    /// What; the first byte is the service's plus 40 (hexadecimal), or 7F.
+    /// The answer; its first byte is the service plus 40 (hexadecimal), or 7F.
     pub data: Vec<u8>,
-    /// How often it said before that the answer is pending.
+    /// How often it said beforehand that the answer is pending.
     pub pending: u32,
 }
 
 impl ServerAnswer {
-    /// The code of a refusal.
+    /// The code of a negative response.
     pub fn refusal(&self) -> Option<u8> {
         match self.data[..] {
             [NEGATIVE, _, code, ..] => Some(code),
@@ -103,61 +104,61 @@ impl ServerAnswer {
     }
 }
 
-/// Answers, and whose answers broke off.
+/// Answers, and the senders whose answers broke off.
 pub type Answers = (Vec<ServerAnswer>, Vec<(Endpoint, TransferError)>);
 
 /// Why there is no answer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum ExchangeError {
-    /// The request did not get through.
+    /// The request could not be sent completely.
     #[error("the request broke off: {0}")]
     Request(TransferError),
-    /// Nothing came.
+    /// No answer came.
     #[error("no answer within {after_ms} ms")]
     NoAnswer {
-        /// How long was waited.
+        /// How long we waited.
         after_ms: u64,
-        /// Messages of those asked that answer something else.
+        /// Other messages from the addressed servers.
         others: u32,
     },
-    /// The server said that the answer is pending, and then nothing.
+    /// The server said that the answer is pending, and then nothing more.
     #[error("the server said {times} times that its answer is pending, and then nothing for {after_ms} ms")]
     NothingAfterPending {
         /// How often.
         times: u32,
-        /// How long was waited.
+        /// How long we waited.
         after_ms: u64,
     },
-    /// The server goes on saying that its answer is pending.
+    /// The server keeps saying that its answer is pending.
     #[error("the server has said for {seconds} s that its answer is pending ({times} times)")]
     EndlessPending {
         /// How often.
         times: u32,
-        /// How long.
+        /// For how long.
         seconds: u64,
     },
     /// The answer broke off.
     #[error("the answer of {from} broke off: {error}")]
     Answer {
-        /// Whose.
+        /// The sender.
         from: Endpoint,
-        /// How.
+        /// The reason.
         error: TransferError,
     },
 }
 
-/// One that answers, or has begun to.
+/// A server that answers, or has begun to.
 #[derive(Debug)]
 struct Server {
     from: Endpoint,
     receiver: TransferReceiver,
     pending: u32,
-    /// An answer that was said to be pending is waited for until then.
+    /// An answer that is pending is awaited until this time.
     pending_until_ns: Option<u64>,
 }
 
-/// One request to one or to many.
+/// One request to one server or to many.
 #[derive(Debug)]
 pub struct Exchange {
     request: Vec<u8>,
@@ -170,9 +171,9 @@ pub struct Exchange {
     servers: Vec<Server>,
     answers: Vec<ServerAnswer>,
     broken: Vec<(Endpoint, TransferError)>,
-    /// Frames handed over that were not on the bus yet; whether each is of the request.
+    /// Frames handed over that have not been on the bus yet; true for those of the request.
     under_way: VecDeque<bool>,
-    /// When the request was on the bus.
+    /// When the request was complete on the bus.
     asked_ns: Option<u64>,
     others: u32,
     end: Option<Result<(), ExchangeError>>,
@@ -205,17 +206,17 @@ impl Exchange {
         }
     }
 
-    /// Ends as soon as so many servers have answered, where many are asked.
+    /// Ends as soon as this many servers have answered, if many are addressed.
     pub const fn expect(&mut self, servers: usize) {
         self.most_answers = Some(servers);
     }
 
-    /// The device sends the first flow control frame by itself: see [`TransferReceiver::new`].
+    /// The device sends the first flow control frame on its own: see [`TransferReceiver::new`].
     pub const fn flow_by_device(&mut self) {
         self.flow_by_device = true;
     }
 
-    /// What the device is to reply with then, if one server is asked.
+    /// The reply to configure in the device for that, if a single server is addressed.
     pub fn device_reply(&self) -> Option<(Endpoint, Frame)> {
         match self.answerer {
             Answerer::One { from, flow_to } => Some((from, TransferReceiver::go_on(flow_to, &self.settings))),
@@ -223,7 +224,7 @@ impl Exchange {
         }
     }
 
-    /// The answers, and those that broke off, if there is one that did not. To be called when it is done.
+    /// The answers, and those that broke off, if at least one did not. Call it when the exchange is done.
     pub fn finish(self) -> Result<Answers, ExchangeError> {
         match self.end {
             Some(Err(error)) => Err(error),
@@ -235,7 +236,7 @@ impl Exchange {
         self.end.get_or_insert(result);
     }
 
-    /// A server has said something whole.
+    /// A server has sent a complete message.
     fn answered(&mut self, now_ns: u64, place: usize, data: Vec<u8>) {
         if !is_answer(&self.request, &data) {
             self.others += 1;
@@ -264,7 +265,7 @@ impl Exchange {
         }
     }
 
-    /// What time alone decides.
+    /// Handles timeouts.
     fn expire(&mut self, now_ns: u64) {
         let Some(asked_ns) = self.asked_ns else { return };
         let pending: u32 = self.servers.iter().map(|server| server.pending).sum();
@@ -282,7 +283,7 @@ impl Exchange {
         if is_receiving {
             return;
         }
-        // One that was said to be pending and did not come.
+        // A pending answer that did not come.
         let p2_star_ms = self.timing.p2_star_ns / 1_000_000;
         let silent =
             |server: &&mut Server| server.pending_until_ns.is_some_and(|until_ns| now_ns >= until_ns);
@@ -344,7 +345,7 @@ impl Machine for Exchange {
 
     fn hear(&mut self, now_ns: u64, id: Id, data: &[u8]) {
         let Some((from, flow_to)) = self.answerer.flow_to(id, data) else { return };
-        // Nothing said before the request was can answer it.
+        // Nothing sent before the request was complete can answer it.
         if self.is_done()
             || self.under_way.is_empty() && self.asked_ns.is_none() && self.sender.due_ns().is_none()
         {
@@ -393,7 +394,7 @@ impl Machine for Exchange {
         let due = earlier(self.sender.due_ns(), receivers.min());
         let Some(asked_ns) = self.asked_ns else { return due };
         let (p2, patience) = (asked_ns + self.timing.p2_ns, asked_ns + self.timing.patience_ns);
-        // What has begun has its own deadlines.
+        // Answers that have begun have their own deadlines.
         if self.servers.iter().any(|server| server.receiver.is_receiving()) {
             return earlier(due, Some(patience));
         }
@@ -407,7 +408,7 @@ impl Machine for Exchange {
     }
 }
 
-/// Whether a message answers this request and no earlier one.
+/// Whether a message answers this request rather than an earlier one.
 fn is_answer(request: &[u8], data: &[u8]) -> bool {
     let (Some(&sid), Some(&first)) = (request.first(), data.first()) else { return false };
     if first == NEGATIVE {
@@ -418,7 +419,7 @@ fn is_answer(request: &[u8], data: &[u8]) -> bool {
     }
     let echoed = |from: usize, to: usize| match (request.get(from..to), data.get(from..to)) {
         (Some(asked), Some(said)) => asked == said,
-        // A request without it is none, and its answer need not have it.
+        // A request without it is invalid, and its answer need not have it.
         (None, _) => true,
         (Some(_), None) => false,
     };

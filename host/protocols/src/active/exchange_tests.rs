@@ -15,7 +15,7 @@ fn with(request: &[u8], settings: TransferSettings) -> Exchange {
     Exchange::new(to, answerer, request.to_vec(), settings, ResponseTiming::default())
 }
 
-/// A server of ISO 15765-2 by the book, and what it does beside it.
+/// A server that follows ISO 15765-2, and its side effects.
 struct Server {
     answers: Vec<Vec<u8>>,
     block_size: u8,
@@ -135,7 +135,7 @@ fn long(sid: u8, length: usize) -> Vec<u8> {
 #[test]
 fn requests_and_answers_of_any_length_arrive_whole() {
     for length in [3, 7, 8, 13, 14, 62, 200, 4095, 5000] {
-        // The server here knows short lengths only; what is longer is asked for.
+        // This server supports only short lengths; longer messages are requested from it.
         let (request, answer) = (long(0x2E, length.min(4095)), long(0x6E, length.min(4095)));
         for (block_size, separation) in [(0, 0), (1, 0), (8, 2), (3, 0xF5)] {
             let mut server = Server::new(&[&answer]);
@@ -235,7 +235,7 @@ fn all_who_answer_a_request_to_all_are_heard() {
     assert_eq!(flows, [(0x7E0, 0x30), (0x7E2, 0x30)]);
 }
 
-/// A peer that lies has an error for it, in bounded time.
+/// Every misbehaviour of a peer gives an error in bounded time.
 #[test]
 fn whatever_the_server_does_there_is_an_end() {
     let frame = |bytes: &[u8]| Frame::data_frame(Id::standard_truncated(0x7E8), bytes).unwrap();
@@ -250,7 +250,7 @@ fn whatever_the_server_does_there_is_an_end() {
         say.extend((0..100).map(|n| (n * 1000 * MS, frame(&[3, 0x7F, 0x22, 0x78]))));
     });
     assert!(seconds <= 61 && matches!(error, ExchangeError::EndlessPending { .. }), "{error}");
-    // Pending, and nothing more.
+    // Pending, and then nothing more.
     let (seconds, error) = fails(&[0x22, 0xF1, 0x90], &|_, say| say.push((0, frame(&[3, 0x7F, 0x22, 0x78]))));
     assert_eq!((seconds, error), (5, ExchangeError::NothingAfterPending { times: 1, after_ms: 5000 }));
     // Wait for ever, overflow, silence, nonsense.
@@ -268,7 +268,7 @@ fn whatever_the_server_does_there_is_an_end() {
     );
     let (_, error) = fails(&request, &|_, say| say.push((0, frame(&[0x35, 0, 0]))));
     assert!(matches!(error, ExchangeError::Answer { error: TransferError::Malformed(_), .. }), "{error}");
-    // Wrong numbers, an answer that stops, one that is too long to be true.
+    // Wrong numbers, an answer that stops, one with an implausible length.
     let begin = frame(&[0x10, 20, 0x62, 0xF1, 0x90, 1, 2, 3]);
     let (_, error) = fails(&[0x22, 0xF1, 0x90], &|data, say| match data[0] {
         3 => say.push((0, begin)),
@@ -301,7 +301,7 @@ fn a_loss_in_the_middle_of_an_answer_is_its_end() {
     assert!(matches!(error, ExchangeError::Answer { error: TransferError::FramesLost, .. }), "{error}");
 }
 
-/// Where the device has sent flow control, none is sent again; where its reply went to another frame, one is.
+/// If the device has sent flow control, it is not sent again; if its reply went to another frame, it is.
 #[test]
 fn flow_control_by_the_device_is_not_sent_twice() {
     let first = [0x10, 20, 0x62, 0xF1, 0x90, 1, 2, 3];
@@ -323,7 +323,7 @@ fn flow_control_by_the_device_is_not_sent_twice() {
     assert_eq!(exchange.next(4), Some(reply));
 }
 
-/// What is said to be whole is what was sent, whatever is dropped, doubled or swapped.
+/// A message reported as complete is what was sent, whatever is dropped, doubled or swapped.
 #[test]
 fn no_disturbance_makes_a_wrong_answer() {
     let mut random = fastrand::Rng::with_seed(16);

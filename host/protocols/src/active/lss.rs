@@ -1,4 +1,5 @@
-//! Layer setting services (CiA 305) as the master: finds nodes without a number, gives numbers and bit rates.
+//! Layer setting services (CiA 305) as the master: finds nodes without a number, and sets numbers and bit
+//! rates.
 
 use std::collections::VecDeque;
 
@@ -9,18 +10,18 @@ use super::Machine;
 
 /// The master's identifier.
 const REQUEST: Id = Id::standard_truncated(0x7E5);
-/// The slaves'.
+/// The slaves' identifier.
 const RESPONSE: Id = Id::standard_truncated(0x7E4);
-/// After an answer, for those of other slaves, which say the same.
+/// The time after an answer for other slaves to send the same one.
 const SETTLE_NS: u64 = 10_000_000;
 const IDENTIFIED: u8 = 0x4F;
 
-/// Who a node is: object 1018.
+/// A node's identity: object 1018.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct LssAddress {
-    /// CiA's number of the maker.
+    /// The manufacturer's number from CiA.
     pub vendor: u32,
-    /// The maker's number of the product.
+    /// The manufacturer's product number.
     pub product: u32,
     /// Its revision.
     pub revision: u32,
@@ -28,14 +29,14 @@ pub struct LssAddress {
     pub serial: u32,
 }
 
-/// Why nothing came of it.
+/// Why an operation failed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum LssError {
-    /// No node without a number.
+    /// There is no node without a number.
     #[error("no node without a number answers the fast scan")]
     Nobody,
-    /// It answered at the beginning, and then not when it should have.
+    /// It answered at first, but not when it should have.
     #[error(
         "the node answered the fast scan, and then did not confirm part {part} of its address; try again with a longer --timeout"
     )]
@@ -48,7 +49,7 @@ pub enum LssError {
     NoAnswer {
         /// The command specifier.
         command: u8,
-        /// How long was waited.
+        /// How long we waited.
         after_ms: u64,
     },
     /// The node refused.
@@ -56,7 +57,7 @@ pub enum LssError {
     Refused {
         /// The command specifier.
         command: u8,
-        /// Its reason.
+        /// Its error code.
         error: u8,
     },
 }
@@ -67,7 +68,7 @@ const fn refusal(command: u8, error: u8) -> &'static str {
         (0x13, 1) => "it has no such bit rate",
         (0x17, 1) => "it cannot store",
         (0x17, 2) => "it cannot reach its storage",
-        (_, 0xFF) => "a reason of its own",
+        (_, 0xFF) => "a reason specific to the manufacturer",
         _ => "a reserved reason",
     }
 }
@@ -76,26 +77,26 @@ fn frame(bytes: [u8; 8]) -> Frame {
     Frame::from_bus(REQUEST, false, 8, bytes)
 }
 
-/// A question that is being asked.
+/// The state of a question.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Asking {
-    /// Not yet.
+    /// Not sent yet.
     Pending,
     /// The frame was handed over.
     Sent,
-    /// Until then, an answer counts.
+    /// An answer counts until this time.
     Waits { until_ns: u64 },
-    /// It was answered; until then, others may answer the same.
+    /// It was answered; others may answer the same until this time.
     Settles { until_ns: u64 },
 }
 
-/// Finds one node that has no number, by halving (CiA 305).
+/// Finds one node without a number, by bisection (CiA 305).
 #[derive(Debug)]
 pub struct FastScan {
     timeout_ns: u64,
     asking: Asking,
     found: [u32; 4],
-    /// 128 is the question whether there is anybody; then 31 to 0; -1 confirms the part.
+    /// 128 asks whether there is any node; then 31 to 0; -1 confirms the part.
     bit: i16,
     part: u8,
     has_answer: bool,
@@ -103,7 +104,7 @@ pub struct FastScan {
 }
 
 impl FastScan {
-    /// Waits so long for the answer to each question. There are up to 133.
+    /// Waits this long for the answer to each question. There are up to 133.
     pub const fn new(timeout_ns: u64) -> Self {
         Self {
             timeout_ns,
@@ -116,7 +117,7 @@ impl FastScan {
         }
     }
 
-    /// Who was found; it waits for commands now, as the only one. To be called when it is done.
+    /// The node that was found; it is now the only one in configuration mode. Call it when the scan is done.
     pub fn finish(self) -> Result<LssAddress, LssError> {
         let [vendor, product, revision, serial] = self.found;
         self.end.unwrap_or(Err(LssError::Nobody)).map(|()| LssAddress { vendor, product, revision, serial })
@@ -131,7 +132,7 @@ impl FastScan {
         [0x51, a, b, c, d, bit, self.part, next]
     }
 
-    /// What the answer, or its absence, means.
+    /// Interprets the answer, or its absence.
     fn conclude(&mut self) {
         let answered = std::mem::take(&mut self.has_answer);
         self.asking = Asking::Pending;
@@ -181,7 +182,7 @@ impl Machine for FastScan {
     }
 
     fn gap(&mut self, _now_ns: u64) {
-        // An answer that was lost makes a wrong bit, which the part's confirmation finds.
+        // A lost answer gives a wrong bit, which the confirmation of the part detects.
     }
 
     fn due_ns(&self) -> Option<u64> {
@@ -196,18 +197,18 @@ impl Machine for FastScan {
     }
 }
 
-/// What to tell a node that waits for commands.
+/// A command to nodes in configuration mode, or to get there.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LssOrder {
-    /// All nodes: wait for commands (true), or work as usual.
+    /// All nodes: enter configuration mode (true), or work as usual.
     SwitchAll(bool),
-    /// The node of this address: wait for commands.
+    /// The node with this address: enter configuration mode.
     Switch(LssAddress),
-    /// Take this number, 1 to 127; 255 for none.
+    /// Use this number, 1 to 127; 255 for none.
     SetNode(u8),
-    /// Take this bit rate: its index in CiA's table.
+    /// Use this bit rate, by its index in CiA's table.
     SetBitRate(u8),
-    /// Keep both over a restart.
+    /// Keep both across a restart.
     Store,
 }
 
@@ -226,20 +227,20 @@ pub const fn bit_rate_index(bitrate_bps: u32) -> Option<u8> {
     })
 }
 
-/// Gives one order.
+/// Gives a single command.
 #[derive(Debug)]
 pub struct LssMaster {
     timeout_ns: u64,
     out: VecDeque<[u8; 8]>,
     under_way: usize,
-    /// The command specifier of the answer, if there is to be one.
+    /// The command specifier of the answer, if one is expected.
     answer: Option<u8>,
     until_ns: Option<u64>,
     end: Option<Result<(), LssError>>,
 }
 
 impl LssMaster {
-    /// Waits so long for the answer, where the order has one.
+    /// Waits this long for the answer, if the command has one.
     pub fn new(order: LssOrder, timeout_ns: u64) -> Self {
         let command = |command: u8, rest: [u8; 2]| [command, rest[0], rest[1], 0, 0, 0, 0, 0];
         let word = |command: u8, word: u32| {
@@ -259,7 +260,7 @@ impl LssMaster {
         Self { timeout_ns, out: out.into(), under_way: 0, answer, until_ns: None, end: None }
     }
 
-    /// How it went. To be called when it is done.
+    /// The result. Call it when it is done.
     pub fn finish(self) -> Result<(), LssError> {
         self.end.unwrap_or(Ok(()))
     }
@@ -318,7 +319,7 @@ mod tests {
 
     const MS: u64 = 1_000_000;
 
-    /// Slaves by CiA 305: each is where it has come to, or out of the scan.
+    /// Slaves according to CiA 305: each keeps its position in the scan, or has dropped out.
     fn slaves(addresses: &[[u32; 4]]) -> impl FnMut(Id, &[u8], &mut Say) {
         let mut slaves: Vec<([u32; 4], u8)> = addresses.iter().map(|address| (*address, 0)).collect();
         move |id, data, say| {
@@ -362,7 +363,7 @@ mod tests {
         assert_eq!(scan(&[]), Err(LssError::Nobody));
     }
 
-    /// An answer that is lost may not make another address.
+    /// A lost answer must not result in a different address.
     #[test]
     fn what_is_disturbed_is_not_found_wrong() {
         let mut random = fastrand::Rng::with_seed(305);
@@ -371,7 +372,7 @@ mod tests {
             let address = [random.u32(..), random.u32(..), random.u32(..), random.u32(..)];
             let mut scan = FastScan::new(50 * MS);
             let mut disturb = disturbed(&mut random, 40);
-            // Doubled and late answers come within the time that others have to say the same.
+            // Doubled and late answers arrive within the time in which others may send the same.
             let fate = || match disturb() {
                 Fate::Lost => Fate::Lost,
                 _ => Fate::Arrives,

@@ -1,8 +1,7 @@
-//! The half that speaks: clients of ISO-TP and diagnostics, CANopen and J1939.
+//! The active half: clients for ISO-TP and diagnostics, CANopen and J1939.
 //!
-//! Each is a [`Machine`] without input and output of its own: frames and the time go in, frames and the time of the next deadline come
-//! out. Whoever has a bus drives it; the `cantap` command does with a device. Every machine ends in bounded time, whatever the other
-//! side does.
+//! Each is a [`Machine`] without its own input and output: frames and the time go in, frames and the next deadline come out. Whoever
+//! has a bus drives it; the `cantap` command does so with a device. Every machine ends in bounded time, whatever the other side does.
 
 pub mod exchange;
 pub mod lss;
@@ -20,30 +19,31 @@ use std::collections::VecDeque;
 use cantap_trace::Id;
 use cantap_wire::Frame;
 
-/// A client that talks on one bus. Times are nanoseconds of a clock that never goes back, the same in all calls.
+/// A client that communicates on one bus. Times are nanoseconds of a clock that never goes back, the same one in
+/// all calls.
 pub trait Machine {
-    /// The frame that is to be sent now, if there is one. To be called again until there is none, after everything else here, and
-    /// when [`Self::due_ns`] has come.
+    /// The next frame to send now, if any. Call it repeatedly until there is none: after every other call, and when
+    /// [`Self::due_ns`] is reached.
     fn next(&mut self, now_ns: u64) -> Option<Frame>;
 
-    /// The frame that [`Self::next`] gave before any other that has not been confirmed was on the bus.
+    /// The earliest unconfirmed frame from [`Self::next`] was on the bus.
     fn sent(&mut self, now_ns: u64);
 
-    /// A data frame of somebody else was on the bus.
+    /// A data frame from another node was on the bus.
     fn hear(&mut self, now_ns: u64, id: Id, data: &[u8]);
 
-    /// Frames may be missing here. What numbers cannot prove to be whole is given up.
+    /// Frames may be missing here. Anything that cannot be proved complete by sequence numbers is abandoned.
     fn gap(&mut self, now_ns: u64);
 
-    /// When to call [`Self::next`] although nothing happens. There is none while its own frames are under way: whoever sends them knows
-    /// whether they leave.
+    /// When to call [`Self::next`] even if nothing happens. There is no such time while its own frames are in flight: whoever sends
+    /// them knows whether they leave.
     fn due_ns(&self) -> Option<u64>;
 
-    /// Whether it has ended, well or not.
+    /// Whether it has ended, successfully or not.
     fn is_done(&self) -> bool;
 }
 
-/// Frames that nobody has to answer: done when they were on the bus.
+/// Frames that need no answer: done when they have been on the bus.
 #[derive(Clone, Debug)]
 pub struct Announcement {
     frames: VecDeque<Frame>,
@@ -51,7 +51,7 @@ pub struct Announcement {
 }
 
 impl Announcement {
-    /// These frames, in this order.
+    /// Sends these frames in order.
     pub fn new(frames: impl IntoIterator<Item = Frame>) -> Self {
         Self { frames: frames.into_iter().collect(), under_way: 0 }
     }
@@ -81,7 +81,7 @@ impl Machine for Announcement {
     }
 }
 
-/// The earliest of two deadlines.
+/// The earlier of two deadlines.
 pub(crate) fn earlier(one: Option<u64>, other: Option<u64>) -> Option<u64> {
     one.into_iter().chain(other).min()
 }

@@ -1,4 +1,4 @@
-//! Which CANopen nodes are there: each is asked for its device type (1000), and heartbeats are heard meanwhile.
+//! Finds CANopen nodes: asks each for its device type (1000), and listens to heartbeats meanwhile.
 
 use std::collections::VecDeque;
 
@@ -8,7 +8,7 @@ use cantap_wire::Frame;
 use super::Machine;
 use super::sdo::SdoIds;
 
-/// Questions that wait in the sender's queue at the same time.
+/// How many questions may wait in the sender's queue at a time.
 const MOST_UNDER_WAY: usize = 8;
 /// Object 1000, device type.
 const DEVICE_TYPE: [u8; 3] = [0x00, 0x10, 0];
@@ -18,11 +18,11 @@ const DEVICE_TYPE: [u8; 3] = [0x00, 0x10, 0];
 pub struct FoundNode {
     /// Its number, 1 to 127.
     pub node: u8,
-    /// Whether it has answered by SDO, if only to refuse.
+    /// Whether it answered by SDO, even if only with a refusal.
     pub answers: bool,
-    /// Its device type, if it told it.
+    /// Its device type, if it answered with it.
     pub device_type: Option<u32>,
-    /// Its state as its heartbeat or boot-up message has it.
+    /// Its state according to its heartbeat or boot-up message.
     pub state: Option<u8>,
 }
 
@@ -30,7 +30,7 @@ pub struct FoundNode {
 #[derive(Debug)]
 pub struct NodeScan {
     to_ask: VecDeque<u8>,
-    /// Frames for nodes that began something longer.
+    /// Frames for nodes that began a longer transfer.
     aborts: VecDeque<Frame>,
     found: [FoundNode; 128],
     asked: [bool; 128],
@@ -41,7 +41,8 @@ pub struct NodeScan {
 }
 
 impl NodeScan {
-    /// Asks the nodes of a range, each 1 to 127, none if it is empty; hears heartbeats of all. Ends so long after the last question.
+    /// Asks the nodes of a range, each 1 to 127 (none if it is empty), and listens to heartbeats of all. Ends this long after the
+    /// last question.
     pub fn new(nodes: impl IntoIterator<Item = u8>, wait_ns: u64) -> Self {
         Self {
             to_ask: nodes.into_iter().filter(|node| (1..=127).contains(node)).collect(),
@@ -55,7 +56,7 @@ impl NodeScan {
         }
     }
 
-    /// Those that were found, by their numbers.
+    /// The nodes found, by number.
     pub fn found(&self) -> impl Iterator<Item = FoundNode> + '_ {
         let there = |node: &&FoundNode| node.answers || node.state.is_some();
         self.found.iter().filter(there).copied()
@@ -108,7 +109,7 @@ impl Machine for NodeScan {
                 match command {
                     0x43 | 0x42 => found.device_type = Some(u32::from_le_bytes([a, b, c, d])),
                     0x40 | 0x41 => {
-                        // It wants to send segments; nobody will ask for them.
+                        // It wants to send segments, which nobody will request.
                         let [low, high, sub] = DEVICE_TYPE;
                         let abort = [0x80, low, high, sub, 0, 0, 0, 8];
                         self.aborts.push_back(Frame::from_bus(SdoIds::of(node).request, false, 8, abort));
@@ -147,7 +148,7 @@ mod tests {
             (0x608, 0x80) => aborted = true,
             (0x601, _) => {
                 say.push((0, frame(0x70A, &[0x85])));
-                // Somebody else's answer to somebody else's question.
+                // Another node's answer to another client's question.
                 say.push((0, frame(0x590, &[0x43, 0, 0x20, 0, 0, 0, 0, 0])));
             }
             _ => {}

@@ -1,4 +1,4 @@
-//! Reading and writing a CANopen node's objects: expedited, in segments, in blocks (CiA 301, 7.2.4.3), as the client.
+//! Reads and writes a CANopen node's objects as the client: expedited, in segments, or in blocks (CiA 301, 7.2.4.3).
 
 use std::collections::VecDeque;
 
@@ -8,13 +8,13 @@ use cantap_wire::Frame;
 use super::Machine;
 use crate::canopen::{abort_text, crc_of};
 
-/// The longest object that is taken, in bytes.
+/// The longest object that is accepted, in bytes.
 const MOST_BYTES: usize = 1 << 24;
-/// Frames of a block that wait in the sender's queue at the same time.
+/// How many frames of a block may wait in the sender's queue at a time.
 const MOST_UNDER_WAY: usize = 16;
-/// How often in a transfer frames of a block are asked for again, or sent again.
+/// How often in a transfer frames of a block are requested or sent again.
 const MOST_RETRIES: u32 = 20;
-/// Frames in a block, as many as can be.
+/// Frames in a block: the maximum.
 const BLOCK: u8 = 127;
 const TIMED_OUT: u32 = 0x0504_0000;
 const BAD_COMMAND: u32 = 0x0504_0001;
@@ -25,24 +25,24 @@ const OUT_OF_MEMORY: u32 = 0x0504_0005;
 const BAD_LENGTH: u32 = 0x0607_0010;
 const GENERAL: u32 = 0x0800_0000;
 
-/// Identifiers of a node's SDO channel.
+/// The identifiers of a node's SDO channel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SdoIds {
-    /// With which the node is asked.
+    /// Identifier of the requests.
     pub request: Id,
-    /// With which it answers.
+    /// Identifier of the answers.
     pub response: Id,
 }
 
 impl SdoIds {
-    /// Those of a node's default SDO, 1 to 127.
+    /// Those of the default SDO of a node, 1 to 127.
     pub const fn of(node: u8) -> Self {
         let node = (node & 0x7F) as u32;
         Self { request: Id::standard_truncated(0x600 + node), response: Id::standard_truncated(0x580 + node) }
     }
 }
 
-/// What is to be done with an object.
+/// What to do with an object.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum SdoJob {
     /// Read it.
@@ -55,29 +55,29 @@ pub enum SdoJob {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum SdoError {
-    /// The node does not answer any more, or never did.
+    /// The node stopped answering, or never did.
     #[error("no answer within {after_ms} ms, after {done} bytes")]
     NoAnswer {
-        /// How long was waited.
+        /// How long we waited.
         after_ms: u64,
         /// Bytes transferred so far.
         done: usize,
     },
-    /// The node ended it.
+    /// The node aborted it.
     #[error("the node aborted it: {} ({code:08X})", abort_text(*code))]
     Aborted {
         /// Its reason (CiA 301, table 22).
         code: u32,
     },
-    /// The node's answer is not as the standard has it; it was told so.
+    /// The node's answer violates the standard; the transfer was aborted.
     #[error("the node's answer is wrong, after {done} bytes: {} ({code:08X})", abort_text(*code))]
     Wrong {
-        /// What it was told.
+        /// The abort code sent to it.
         code: u32,
         /// Bytes transferred so far.
         done: usize,
     },
-    /// Frames of the bus were lost on the way to this computer.
+    /// Frames from the bus were lost on the way to this computer.
     #[error(
         "frames were lost on the way to this computer, so the object may not be whole; the transfer was aborted"
     )]
@@ -89,24 +89,24 @@ enum Step {
     New,
     /// The first request was sent.
     Initiated,
-    /// A segment was asked for, or sent, with this toggle bit.
+    /// A segment was requested or sent with this toggle bit.
     Segment {
         toggle: u8,
     },
-    /// The node sends a block: the next number.
+    /// The node sends a block: the next sequence number.
     BlockIn {
         next: u8,
         is_gap: bool,
     },
-    /// The node is to end its blocks.
+    /// The node should end its block transfer.
     BlockInEnd,
-    /// A block was sent: frames in it.
+    /// A block was sent: the number of frames in it.
     BlockOut {
         frames: u8,
     },
     /// All blocks were sent.
     BlockOutEnd,
-    /// The last frame of ours.
+    /// Our last frame.
     Closing,
 }
 
@@ -131,7 +131,8 @@ pub struct SdoClient {
 }
 
 impl SdoClient {
-    /// For one object of a node. `by_blocks` asks for a block transfer, which not every node has. `timeout_ns` is for each answer.
+    /// For one object of a node. `by_blocks` requests a block transfer, which not every node supports. `timeout_ns` applies to
+    /// each answer.
     pub const fn new(
         ids: SdoIds,
         index: u16,
@@ -160,7 +161,7 @@ impl SdoClient {
         }
     }
 
-    /// What was read; nothing of a write. To be called when it is done.
+    /// The bytes read; empty for a write. Call it when the transfer is done.
     pub fn finish(self) -> Result<Vec<u8>, SdoError> {
         match self.end {
             Some(Err(error)) => Err(error),
@@ -177,7 +178,7 @@ impl SdoClient {
         self.out.push_back(frame);
     }
 
-    /// With the object's index.
+    /// A command with the object's index.
     fn command(&self, command: u8, rest: [u8; 4]) -> [u8; 8] {
         let [low, high, sub] = self.object;
         [command, low, high, sub, rest[0], rest[1], rest[2], rest[3]]
@@ -218,7 +219,7 @@ impl SdoClient {
     }
 
     fn time_out(&mut self) {
-        // The end of a block may be what is missing: the node is told where it was understood last.
+        // The end of a block may be what is missing: the node is told the last frame understood.
         if let Step::BlockIn { next, .. } = self.step
             && next > 1
             && self.retries < MOST_RETRIES
@@ -230,7 +231,7 @@ impl SdoClient {
         self.abort(TIMED_OUT, SdoError::NoAnswer { after_ms, done });
     }
 
-    /// Ends a block that came: the frames up to this number were understood.
+    /// Ends a received block: the frames up to this number were understood.
     fn acknowledge(&mut self, up_to: u8, is_last: bool) {
         if !is_last {
             self.retries += 1;
@@ -239,7 +240,7 @@ impl SdoClient {
         self.say([0xA2, up_to, BLOCK, 0, 0, 0, 0, 0]);
     }
 
-    /// Bytes that came; false if there are more than were announced.
+    /// Appends received bytes; false if there are more than announced.
     fn append(&mut self, bytes: &[u8]) -> bool {
         self.data.extend_from_slice(bytes);
         self.data.len() <= MOST_BYTES
@@ -282,7 +283,7 @@ impl SdoClient {
         }
         let used = 7 - usize::from(command >> 1 & 7);
         let is_last = command & 1 != 0;
-        // A node that sends nothing again and again would never end.
+        // A node that keeps sending empty segments would never end.
         if !self.append(&data[1..=used]) || used == 0 && !is_last {
             return self.wrong(BAD_LENGTH);
         }
@@ -342,7 +343,7 @@ impl SdoClient {
         self.end = Some(Ok(()));
     }
 
-    /// The next segment to write.
+    /// Sends the next segment.
     fn write_segment(&mut self, toggle: u8) {
         let SdoJob::Write(data) = &self.job else { return };
         let end = data.len().min(self.at + 7);
@@ -355,7 +356,7 @@ impl SdoClient {
         self.say(frame);
     }
 
-    /// The next block to write, of at most so many frames.
+    /// Sends the next block, of at most this many frames.
     fn write_block(&mut self, most: u8) {
         let SdoJob::Write(data) = &self.job else { return };
         let mut frames = Vec::new();
@@ -400,7 +401,7 @@ impl SdoClient {
         let SdoJob::Write(bytes) = &self.job else { return };
         let [low, high] = if self.has_crc { crc_of(bytes).to_le_bytes() } else { [0; 2] };
         let unused = ((7 - length % 7) % 7) as u8;
-        // An object without bytes takes a frame, too, with nothing in it.
+        // An object without bytes also takes one frame, with no content.
         let unused = if length == 0 { 7 } else { unused };
         self.step = Step::BlockOutEnd;
         self.say([0xC1 | unused << 2, low, high, 0, 0, 0, 0, 0]);
@@ -471,7 +472,7 @@ impl Machine for SdoClient {
             self.end = Some(Err(SdoError::Aborted { code }));
             return;
         }
-        // An answer to an earlier question is none to this one.
+        // An answer to an earlier question does not count here.
         if self.step == Step::Initiated && data[1..4] != self.object {
             return;
         }
@@ -488,7 +489,7 @@ impl Machine for SdoClient {
     }
 
     fn gap(&mut self, _now_ns: u64) {
-        // Frames of a block have numbers, of which none comes twice in it, and its bytes a check.
+        // Frames of a block have numbers, each of which occurs only once in it, and the data have a CRC.
         let numbered = matches!(self.step, Step::BlockIn { .. });
         if self.end.is_none() && self.step != Step::New && !numbered && self.until_ns.is_some() {
             self.abort(GENERAL, SdoError::FramesLost);

@@ -3,7 +3,7 @@ use crate::active::testing::{Peer, Say, arrives, disturbed, run};
 
 const MS: u64 = 1_000_000;
 
-/// A server by CiA 301, with one object for everything.
+/// A server according to CiA 301, with a single object.
 struct Server {
     object: Vec<u8>,
     has_blocks: bool,
@@ -14,7 +14,7 @@ struct Server {
     block_size: u8,
     next: u8,
     last_came: bool,
-    /// Frames of a written block that are lost on their way, from now on.
+    /// How many of the next frames of a written block are lost on their way.
     deaf: u32,
 }
 
@@ -64,7 +64,7 @@ impl Peer for Server {
             [command, data[1], data[2], data[3], rest[0], rest[1], rest[2], rest[3]]
         };
         if self.next > 0 && self.block_at == usize::MAX {
-            // Inside of a block that is written.
+            // Within a block being written.
             if self.deaf > 0 {
                 self.deaf -= 1;
                 if data[0] & 0x80 == 0 && data[0] & 0x7F < self.block_size {
@@ -173,7 +173,7 @@ fn transfer(mut client: SdoClient, server: &mut impl Peer) -> Result<Vec<u8>, Sd
 fn objects_of_any_length_are_read_and_written_in_every_way() {
     for length in [0, 1, 3, 4, 5, 7, 8, 14, 69, 70, 71, 889, 890, 2000] {
         for by_blocks in [false, true] {
-            // A block of nothing has no frame that could say so.
+            // An empty block has no frame that could say so.
             if length > 0 || !by_blocks {
                 let mut server = Server::new(&bytes(length));
                 assert_eq!(
@@ -206,7 +206,7 @@ fn a_node_that_refuses_is_understood_by_name() {
     assert!(error.to_string().contains("command specifier not valid or unknown (05040001)"), "{error}");
 }
 
-/// A node that lies has an error for it, in bounded time, and is told.
+/// Every misbehaviour of a node gives an error in bounded time, and the node is told.
 #[test]
 fn whatever_the_node_does_there_is_an_end() {
     let fails = |by_blocks: bool, job: SdoJob, lie: &dyn Fn(&[u8], &mut Say)| {
@@ -219,7 +219,7 @@ fn whatever_the_node_does_there_is_an_end() {
     let begin = |say: &mut Say, frame: [u8; 8]| say.push((MS, answer(frame)));
     let (error, last) = fails(false, SdoJob::Read, &|_, _| {});
     assert_eq!((error, last), (SdoError::NoAnswer { after_ms: 500, done: 0 }, 0x80));
-    // The same toggle for ever; empty segments for ever; more than was announced; a command out of place.
+    // The same toggle bit for ever; empty segments for ever; more than was announced; a command out of place.
     let segments = |frame: [u8; 8]| {
         move |data: &[u8], say: &mut Say| match data[0] {
             0x40 => begin(say, [0x41, 0, 0x20, 1, 20, 0, 0, 0]),
@@ -237,7 +237,7 @@ fn whatever_the_node_does_there_is_an_end() {
         assert!(matches!(error, SdoError::Wrong { code: is, .. } if is == code), "{frame:02X?}: {error}");
         assert_eq!(last, 0x80);
     }
-    // Block: the wrong numbers for ever, a wrong check.
+    // Blocks: the wrong numbers for ever, a wrong CRC.
     let (error, _) = fails(true, SdoJob::Read, &|data, say| match data[0] {
         0xA4 => begin(say, [0xC4, 0, 0x20, 1, 0, 0, 0, 0]),
         0x80 => {}
@@ -260,7 +260,7 @@ fn whatever_the_node_does_there_is_an_end() {
     assert!(matches!(error, SdoError::Wrong { code: BAD_SEQUENCE, .. }), "{error}");
 }
 
-/// What is said to be read is what is there, whatever is dropped, doubled or swapped.
+/// What is reported as read is what is there, whatever is dropped, doubled or swapped.
 #[test]
 fn no_disturbance_makes_a_wrong_value() {
     let mut random = fastrand::Rng::with_seed(301);

@@ -1,6 +1,7 @@
-//! A J1939 node that claims an address, asks for parameter groups, and sends messages of any length (J1939-21 and J1939-81).
+//! A J1939 node that claims an address, requests parameter groups, and sends messages of any length (J1939-21 and J1939-81).
 //!
-//! The address is defended as long as the station works. A message of many frames is taken and sent by RTS/CTS, and to all by BAM.
+//! The address is defended as long as the station runs. A message of many frames is received and sent by RTS/CTS, and to all by
+//! BAM.
 
 mod long_message;
 mod words;
@@ -16,27 +17,27 @@ use self::words::{CONTROL, DATA, GLOBAL, MS, frame, three};
 use super::{Machine, earlier};
 use crate::j1939::Header;
 
-/// Nobody may object to a claim any more after this time (J1939-81).
+/// After this time, nobody may object to a claim any more (J1939-81).
 const CLAIM_NS: u64 = 250 * MS;
-/// So long an answer is waited for: Tr is 200 ms, and T3 1250 ms.
+/// How long to wait for an answer: Tr is 200 ms, and T3 is 1250 ms.
 const ANSWER_NS: u64 = 1250 * MS;
-/// A message to all that has begun in time takes no longer: 255 frames, 50 ms each.
+/// The longest duration of a message to all that began in time: 255 frames, 50 ms each.
 const LONGEST_NS: u64 = 15_000 * MS;
 const NULL: u8 = 254;
 const REQUEST: u32 = 0xEA00;
 const ACKNOWLEDGE: u32 = 0xE800;
 const CLAIM: u32 = 0xEE00;
-/// Addresses that anybody may take (J1939-81).
+/// Addresses that any node may use (J1939-81).
 const FREE: std::ops::RangeInclusive<u8> = 128..=247;
-/// The NAME's bit that says so.
+/// The NAME's bit for "arbitrary address capable".
 const TAKES_ANY: u64 = 1 << 63;
 
-/// What a station is to do with its address.
+/// What a station should do with its address.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum StationJob {
-    /// Nothing but claim it.
+    /// Only claim it.
     Claim,
-    /// Ask for a parameter group.
+    /// Request a parameter group.
     Request {
         /// The group, 18 bits.
         pgn: u32,
@@ -47,7 +48,7 @@ pub enum StationJob {
     Send {
         /// The group, 18 bits.
         pgn: u32,
-        /// To whom; 255 for all.
+        /// The receiver; 255 for all.
         to: u8,
         /// 0, the highest, to 7.
         priority: u8,
@@ -68,17 +69,17 @@ pub struct GroupAnswer {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Phase {
     New,
-    /// The claim was sent; from its confirmation on, until then.
+    /// The claim was sent; after its confirmation, it is settled at this time.
     Claims {
         until_ns: Option<u64>,
     },
-    /// The address is ours; the job is yet to be begun.
+    /// The address is ours; the job has not begun.
     Begins,
     /// Waits for answers.
     Waits {
         until_ns: Option<u64>,
     },
-    /// Sends a message of one frame, or gives up an address.
+    /// Sends a message of one frame, or gives up its address.
     Closing,
     /// Sends a message of many frames.
     Sends,
@@ -92,7 +93,7 @@ pub struct Station {
     address: u8,
     job: StationJob,
     phase: Phase,
-    /// Frames to be sent, in front of what a long message wants.
+    /// Frames to send, before those of a long message.
     out: VecDeque<Frame>,
     under_way: VecDeque<bool>,
     taken: [bool; 256],
@@ -103,7 +104,7 @@ pub struct Station {
 }
 
 impl Station {
-    /// A node of this NAME that would like this address, 0 to 253.
+    /// A node with this NAME that would like this address, 0 to 253.
     pub const fn new(name: u64, address: u8, job: StationJob) -> Self {
         Self {
             name,
@@ -120,17 +121,17 @@ impl Station {
         }
     }
 
-    /// A node that has claimed its address already.
+    /// A node that has already claimed its address.
     pub fn with_address(name: u64, address: u8, job: StationJob) -> Self {
         Self { phase: Phase::Begins, ..Self::new(name, address, job) }
     }
 
-    /// The address that it has, or tries to get.
+    /// The address that it has or tries to get.
     pub const fn address(&self) -> u8 {
         self.address
     }
 
-    /// What was answered. To be called when it is done.
+    /// The answers. Call it when it is done.
     pub fn finish(self) -> Result<Vec<GroupAnswer>, StationError> {
         self.end.unwrap_or(Ok(())).map(|()| self.answers)
     }
@@ -155,7 +156,7 @@ impl Station {
         if by != self.address || matches!(self.phase, Phase::New | Phase::Done | Phase::Closing) {
             return;
         }
-        // The lower NAME goes first (J1939-81).
+        // The lower NAME wins (J1939-81).
         if self.name < name {
             return self.claim();
         }
@@ -166,7 +167,7 @@ impl Station {
         };
         self.out.clear();
         if let Some(next) = next {
-            // What was begun with the old address has nobody to come back to.
+            // Whatever was begun with the old address cannot be answered any more.
             self.incoming.clear();
             self.address = next;
             self.claim();
@@ -197,7 +198,7 @@ impl Station {
         }
     }
 
-    /// A whole message of somebody.
+    /// A complete message from another node.
     fn message(&mut self, header: Header, data: Vec<u8>) {
         let Phase::Waits { .. } = self.phase else { return };
         let StationJob::Request { pgn, to } = self.job else { return };
@@ -206,7 +207,7 @@ impl Station {
         }
         if header.pgn == ACKNOWLEDGE {
             let is_ours = data.len() >= 8 && data[5..8] == three(pgn) && data[0] > 0;
-            // Acknowledgements go to all; the fifth byte says whom they are for, where it is used.
+            // Acknowledgements go to all; the fifth byte says whom they are for, if it is used.
             if is_ours && to != GLOBAL && (data[4] == self.address || data[4] == 0xFF) {
                 self.fail(StationError::NotAcknowledged { from: header.source, control: data[0] });
             }
@@ -216,13 +217,13 @@ impl Station {
             return;
         }
         self.answers.push(GroupAnswer { from: header.source, data });
-        // Of all, whoever answers within the time; many say it again and again without being asked.
+        // If all were asked, everyone who answers in time; many send it repeatedly without being asked.
         if to != GLOBAL {
             self.done();
         }
     }
 
-    /// A frame of a connection that somebody else began, or of ours.
+    /// A frame of a connection that another node began, or of ours.
     fn control(&mut self, now_ns: u64, header: Header, data: [u8; 8]) {
         let pgn = u32::from_le_bytes([data[5], data[6], data[7], 0]);
         let from = header.source;
@@ -260,7 +261,7 @@ impl Station {
         }
     }
 
-    /// Whether a message answers what was asked.
+    /// Whether a message answers the request.
     fn wants(&self, pgn: u32, from: u8) -> bool {
         matches!(self.phase, Phase::Waits { .. })
             && matches!(self.job, StationJob::Request { pgn: asked, to } if asked == pgn && (to == GLOBAL || to == from))
@@ -283,7 +284,7 @@ impl Station {
         }
     }
 
-    /// What time alone decides of messages that come in.
+    /// Handles timeouts of incoming messages.
     fn sweep(&mut self, now_ns: u64) {
         let mut at = 0;
         while at < self.incoming.len() {
@@ -398,7 +399,8 @@ impl Machine for Station {
     }
 
     fn gap(&mut self, now_ns: u64) {
-        // Frames of a message are numbered from 1 to 255 without a turn, so a missing one shows; it is asked for again.
+        // A message's frames are numbered from 1 to 255 without wrapping, so a missing one is noticed and requested
+        // again.
         let _ = now_ns;
     }
 

@@ -1,4 +1,4 @@
-//! Machines against each other, on a bus whose every frame can be dropped, doubled or swapped.
+//! Runs machines against each other, on a bus on which every frame can be dropped, doubled or swapped.
 
 use std::collections::VecDeque;
 
@@ -7,17 +7,17 @@ use cantap_wire::Frame;
 
 use super::Machine;
 
-/// Frames that are said, each with how long after, in nanoseconds.
+/// Frames to send, each with its delay in nanoseconds.
 pub type Say = Vec<(u64, Frame)>;
 
-/// A frame takes this long.
+/// Duration of a frame.
 pub const FRAME_NS: u64 = 250_000;
-/// No machine may take longer, whatever happens on the bus.
+/// No machine may take longer than this, whatever happens on the bus.
 const LONGEST_NS: u64 = 600_000_000_000;
 
-/// The other side of the bus: takes frames, says frames.
+/// The other side of the bus: takes frames and sends frames.
 pub trait Peer {
-    /// A frame of the machine's; what is said is appended, each with how long after.
+    /// A frame from the machine; answers are appended, each with its delay.
     fn hear(&mut self, id: Id, data: &[u8], say: &mut Say);
 }
 
@@ -27,16 +27,16 @@ impl<F: FnMut(Id, &[u8], &mut Say)> Peer for F {
     }
 }
 
-/// What the bus does to the frames of the other side.
+/// What the bus does to the frames from the other side.
 pub enum Fate {
     Arrives,
     Lost,
     Doubled,
-    /// Comes after the next one.
+    /// Arrives after the next one.
     Late,
 }
 
-/// Runs a machine until it ends; returns the time that it took and everything that it sent.
+/// Runs a machine until it ends; returns how long it took and everything that it sent.
 pub fn run(
     machine: &mut (impl Machine + ?Sized),
     peer: &mut impl Peer,

@@ -8,7 +8,7 @@ use super::transfer::TransferSettings;
 use super::*;
 use crate::iso_tp::Pair;
 
-/// Frames that look right at their first bytes, for whichever machine asks.
+/// Frames whose first bytes look right, whichever machine asks.
 fn nonsense(random: &mut fastrand::Rng, asked: Id, asked_data: &[u8]) -> Frame {
     let id = if asked.is_extended() {
         let pgn = random.choice([0xEC00, 0xEB00, 0xE800, 0xEE00, 0xFECA, 0xEA00]).unwrap();
@@ -38,7 +38,7 @@ fn nonsense(random: &mut fastrand::Rng, asked: Id, asked_data: &[u8]) -> Frame {
     Frame::from_bus(id, false, random.choice([8, 8, 8, 8, 3, 0]).unwrap(), bytes)
 }
 
-/// No frame makes a panic, and every machine ends in bounded time, which `run` holds it to.
+/// No frame causes a panic, and every machine ends in bounded time, which `run` enforces.
 #[test]
 fn nonsense_ends_every_machine() {
     let mut random = fastrand::Rng::with_seed(29);
@@ -64,7 +64,7 @@ fn nonsense_ends_every_machine() {
         };
         let mut said = 0;
         let mut peer = |id: Id, data: &[u8], say: &mut Say| {
-            // Somebody who answers each answer for ever would never let it end.
+            // A peer that answered each answer for ever would never let it end.
             said += 1;
             if said < 400 {
                 for _ in 0..random.usize(0..4) {

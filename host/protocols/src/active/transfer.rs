@@ -1,35 +1,36 @@
-//! One message out or in by ISO 15765-2 on classical CAN, in normal, extended or mixed addressing.
+//! Sends or receives one message by ISO 15765-2 on classical CAN, in normal, extended or mixed addressing.
 
 use cantap_wire::Frame;
 
 use crate::iso_tp::{Endpoint, FlowStatus, Pci};
 
-/// Frames of a block that wait in the sender's queue at the same time, where no distance is asked for.
+/// How many frames of a block may wait in the sender's queue at a time, if no separation time is requested.
 const MOST_UNDER_WAY: u32 = 16;
-/// The longest message that is taken, in bytes.
+/// The longest message that is accepted, in bytes.
 const MOST_BYTES: u32 = 1 << 16;
-/// What a first frame can say in 12 bits.
+/// The longest length in the 12 bits of a first frame.
 const MOST_SHORT: usize = 0xFFF;
 
-/// How transfers go.
+/// Parameters of transfers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TransferSettings {
-    /// Fills frames up to eight bytes; without it they are as short as they can be.
+    /// Fills frames to eight bytes; without it, they are as short as possible.
     pub padding: Option<u8>,
-    /// Frames that the other side may send until it waits for flow control; 0 for all.
+    /// How many frames the other side may send before it waits for flow control; 0 for all.
     pub block_size: u8,
-    /// The least distance of the other side's frames, as flow control has it: 0 to 7F in milliseconds, F1 to F9 in 100 µs.
+    /// The minimum separation of the other side's frames, encoded as in flow control: 0 to 7F in milliseconds, F1 to F9 in
+    /// 100 µs.
     pub separation: u8,
-    /// How long flow control is waited for (N_Bs).
+    /// How long to wait for flow control (N_Bs).
     pub flow_timeout_ns: u64,
-    /// How long the next frame is waited for (N_Cr).
+    /// How long to wait for the next frame (N_Cr).
     pub next_timeout_ns: u64,
     /// How often in a row the other side may ask to wait (N_WFTmax).
     pub most_waits: u32,
 }
 
 impl Default for TransferSettings {
-    /// As ISO 15765-2 has it: a second each; everything at once; ten times to wait.
+    /// As in ISO 15765-2: a second each; everything at once; ten requests to wait.
     fn default() -> Self {
         Self {
             padding: Some(0xCC),
@@ -46,17 +47,17 @@ impl Default for TransferSettings {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum TransferError {
-    /// Nobody said how to go on.
+    /// No flow control came.
     #[error("no flow control came within {after_ms} ms, after {sent} of {length} bytes")]
     NoFlowControl {
-        /// How long was waited.
+        /// How long we waited.
         after_ms: u64,
         /// Bytes sent so far.
         sent: usize,
         /// Bytes of the message.
         length: usize,
     },
-    /// The other side asked to wait again and again.
+    /// The other side kept asking to wait.
     #[error("the receiver asked to wait {times} times in a row, after {sent} of {length} bytes")]
     EndlessWait {
         /// How often.
@@ -66,44 +67,44 @@ pub enum TransferError {
         /// Bytes of the message.
         length: usize,
     },
-    /// The receiver has no room for so long a message.
+    /// The receiver has no room for such a long message.
     #[error("the receiver has no room for a message of {length} bytes (flow control: overflow)")]
     Overflow {
         /// Bytes of the message.
         length: usize,
     },
-    /// The other side's frames do not follow each other.
+    /// The other side's frames are not consecutive.
     #[error("frame {got} came instead of {expected}, after {received} of {length} bytes")]
     Sequence {
-        /// The number that was due.
+        /// The expected sequence number.
         expected: u8,
-        /// The one that came.
+        /// The one received.
         got: u8,
         /// Bytes received so far.
         received: usize,
         /// Bytes of the message.
         length: usize,
     },
-    /// The other side went silent.
+    /// The other side fell silent.
     #[error("the next frame did not come within {after_ms} ms, after {received} of {length} bytes")]
     NextMissing {
-        /// How long was waited.
+        /// How long we waited.
         after_ms: u64,
         /// Bytes received so far.
         received: usize,
         /// Bytes of the message.
         length: usize,
     },
-    /// The other side announced more than is taken.
+    /// The other side announced more than is accepted.
     #[error("a message of {length} bytes is announced, and no more than {MOST_BYTES} are taken")]
     TooLong {
         /// Bytes announced.
         length: u32,
     },
-    /// The other side's frame is not as the standard has it.
+    /// The other side's frame violates the standard.
     #[error("the other side sent {0}")]
     Malformed(&'static str),
-    /// Frames of the bus were lost on the way to this computer: the numbers alone cannot prove that none of the message is missing.
+    /// Frames from the bus were lost on the way to this computer: sequence numbers alone cannot prove that the message is complete.
     #[error("frames were lost on the way to this computer, so the message may not be whole")]
     FramesLost,
 }
@@ -120,18 +121,18 @@ fn frame(to: Endpoint, content: &[&[u8]], padding: Option<u8>) -> Frame {
     Frame::from_bus(to.id, false, if padding.is_some() { 8 } else { length }, bytes)
 }
 
-/// Data bytes of a frame beside what is in front of them.
+/// How many data bytes of a frame are left after address and control information.
 fn room(to: Endpoint, control: usize) -> usize {
     8 - control - usize::from(to.address.is_some())
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Sending {
-    /// Nothing was sent.
+    /// Nothing has been sent.
     New,
-    /// The first frame, or a block, was handed over; from its confirmation on, there is a deadline.
+    /// The first frame, or a block, was handed over; the deadline starts with its confirmation.
     AwaitsFlow { until_ns: Option<u64> },
-    /// A block is sent: frames that may still follow, and when.
+    /// A block is being sent: how many frames may still follow, and when.
     Block { left: Option<u8>, gap_ns: u64, next_ns: u64 },
     /// Everything was handed over.
     Last,
@@ -168,7 +169,7 @@ impl TransferSender {
         self.state == Sending::Done
     }
 
-    /// When to look again.
+    /// When to call [`Self::next`] again.
     pub const fn due_ns(&self) -> Option<u64> {
         match self.state {
             Sending::AwaitsFlow { until_ns } => until_ns,
@@ -177,7 +178,7 @@ impl TransferSender {
         }
     }
 
-    /// The frame that is to be sent now; an error is the end.
+    /// The next frame to send now; an error ends the transfer.
     pub fn next(&mut self, now_ns: u64) -> Result<Option<Frame>, TransferError> {
         let (length, padding) = (self.data.len(), self.settings.padding);
         match self.state {
@@ -227,7 +228,7 @@ impl TransferSender {
         }
     }
 
-    /// A frame of its was on the bus.
+    /// A frame was on the bus.
     pub const fn sent(&mut self, now_ns: u64) {
         self.under_way = self.under_way.saturating_sub(1);
         match &mut self.state {
@@ -240,7 +241,8 @@ impl TransferSender {
         }
     }
 
-    /// Flow control came; an error is the end. What was not waited for is ignored, as ISO 15765-2 has it.
+    /// Takes flow control; an error ends the transfer. Unexpected flow control is ignored, as ISO 15765-2
+    /// requires.
     pub fn flow(
         &mut self,
         now_ns: u64,
@@ -271,7 +273,7 @@ impl TransferSender {
     }
 }
 
-/// A message that comes in.
+/// An incoming message.
 #[derive(Clone, Debug)]
 struct Receiving {
     data: Vec<u8>,
@@ -282,41 +284,41 @@ struct Receiving {
     until_ns: u64,
 }
 
-/// Receives messages of one sender, one after the other.
+/// Receives messages from one sender, one after the other.
 #[derive(Clone, Debug)]
 pub struct TransferReceiver {
     flow_to: Endpoint,
     settings: TransferSettings,
     receiving: Option<Receiving>,
-    /// The flow control frame that is to be sent.
+    /// The flow control frame to send.
     flow: Option<Frame>,
     /// The device itself sends flow control after the next frame.
     flow_by_device: bool,
 }
 
 impl TransferReceiver {
-    /// Receives from whoever takes flow control at an endpoint. With `flow_by_device`, the device sends the first flow control frame by
-    /// itself, as its reply to the sender's next frame.
+    /// Receives from a sender that takes flow control at an endpoint. With `flow_by_device`, the device sends the first flow control
+    /// frame on its own, as its reply to the sender's next frame.
     pub const fn new(flow_to: Endpoint, settings: TransferSettings, flow_by_device: bool) -> Self {
         Self { flow_to, settings, receiving: None, flow: None, flow_by_device }
     }
 
-    /// The flow control frame that lets a sender go on.
+    /// The flow control frame that lets a sender continue.
     pub fn go_on(flow_to: Endpoint, settings: &TransferSettings) -> Frame {
         frame(flow_to, &[&[0x30, settings.block_size, settings.separation]], settings.padding)
     }
 
-    /// Whether a message has begun and not ended.
+    /// Whether a message has begun but not ended.
     pub const fn is_receiving(&self) -> bool {
         self.receiving.is_some()
     }
 
-    /// When to look again.
+    /// When to call [`Self::next`] again.
     pub fn due_ns(&self) -> Option<u64> {
         self.receiving.as_ref().map(|receiving| receiving.until_ns)
     }
 
-    /// The flow control frame that is to be sent now; an error is the end of the message.
+    /// The flow control frame to send now; an error ends the message.
     pub fn next(&mut self, now_ns: u64) -> Result<Option<Frame>, TransferError> {
         if let Some(flow) = self.flow.take() {
             return Ok(Some(flow));
@@ -336,7 +338,7 @@ impl TransferReceiver {
         if self.receiving.take().is_some() { Err(TransferError::FramesLost) } else { Ok(()) }
     }
 
-    /// Takes a frame of the sender; returns the message that is whole with it.
+    /// Takes a frame from the sender; returns the message that it completes.
     pub fn take(&mut self, now_ns: u64, pci: Pci<'_>) -> Result<Option<Vec<u8>>, TransferError> {
         let by_device = std::mem::take(&mut self.flow_by_device);
         let until_ns = now_ns + self.settings.next_timeout_ns;

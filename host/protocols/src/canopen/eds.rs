@@ -1,23 +1,24 @@
-//! Electronic data sheets and device configuration files (CiA 306): every object of the file, or the reason why not.
+//! Electronic data sheets and device configuration files (CiA 306): every object of the file, or the reason why it
+//! is missing.
 
 use std::collections::BTreeMap;
 
-/// What a file says of a device.
+/// A file's description of a device.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Eds {
     /// The device's name.
     pub product: String,
-    /// Its maker.
+    /// Its manufacturer.
     pub vendor: String,
-    /// The node's number, where the file is of one node (DCF).
+    /// The node's number, if the file is for a single node (DCF).
     pub node: Option<u8>,
-    /// By index.
+    /// Objects by index.
     pub objects: BTreeMap<u16, Object>,
-    /// What of the file was not understood, each with its line where there is one.
+    /// What was not understood in the file, with the line if there is one.
     pub issues: Vec<String>,
 }
 
-/// An object: a variable, or one with entries.
+/// An object: a variable, or one with several entries.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Object {
     /// Its name.
@@ -35,9 +36,9 @@ pub struct Entry {
     pub name: String,
     /// Its data type (CiA 301, table 44).
     pub data_type: Option<u16>,
-    /// As `ro`, `rw`, `wo`, `const`.
+    /// One of `ro`, `rw`, `wo`, `const`.
     pub access: String,
-    /// The value set for this node (DCF), else the default.
+    /// The value set for this node (DCF), otherwise the default.
     pub value: String,
     /// Whether a PDO may carry it.
     pub mappable: bool,
@@ -60,7 +61,7 @@ impl Section {
     }
 }
 
-/// Decimal, hexadecimal with 0x, octal with a 0 in front; `$NODEID` may be added.
+/// Decimal, hexadecimal with 0x, or octal with a leading 0; `$NODEID` may be added.
 pub fn number(text: &str, node: u8) -> Option<i64> {
     text.split('+').try_fold(0_i64, |sum, part| {
         let part = part.trim();
@@ -81,7 +82,7 @@ pub fn number(text: &str, node: u8) -> Option<i64> {
 }
 
 impl Eds {
-    /// Reads a file's text. It may be in any 8-bit coding: what is not ASCII stands in names only.
+    /// Parses a file's text. It may be in any 8-bit encoding: only names contain non-ASCII characters.
     pub fn parse(bytes: &[u8]) -> Self {
         let mut eds = Self::default();
         let text = String::from_utf8_lossy(bytes);
@@ -156,7 +157,7 @@ impl Eds {
     fn entry(&mut self, name: &str, section: &Section) -> Entry {
         let data_type = section.number("datatype").and_then(|kind| u16::try_from(kind).ok());
         if data_type.is_none() && section.keys.contains_key("datatype") {
-            self.issues.push(format!("line {}: the data type of [{name}] is no number", section.line));
+            self.issues.push(format!("line {}: the data type of [{name}] is not a number", section.line));
         }
         let set = section.keys.get("parametervalue").filter(|value| !value.is_empty());
         Entry {
@@ -175,7 +176,8 @@ impl Eds {
         let mut object = Object { name: section.text("parametername"), code, ..Object::default() };
         let compact = section.number("compactsubobj").unwrap_or(0);
         if compact > 0 {
-            // An array in one section: all entries are alike, named and set in sections of their own (CiA 306, 6.3.3).
+            // An array in one section: all entries are alike, with names and values in separate sections (CiA 306,
+            // 6.3.3).
             let model = self.entry(name, section);
             let names = sections.get(&format!("{name}name"));
             let values = sections.get(&format!("{name}value"));
@@ -198,7 +200,7 @@ impl Eds {
                 object.entries.insert(sub, entry);
             }
         } else if matches!(code, 8 | 9) {
-            // Its entries are in sections of their own.
+            // Its entries are in separate sections.
         } else {
             let entry = self.entry(name, section);
             object.entries.insert(0, entry);
@@ -211,7 +213,7 @@ impl Eds {
         let Some((object, sub)) = name.split_once("sub") else { return };
         let Some(index) = index(object) else { return };
         let Ok(sub) = u8::from_str_radix(sub, 16) else {
-            self.issues.push(format!("line {}: [{name}] is no sub-index", section.line));
+            self.issues.push(format!("line {}: [{name}] is not a sub-index", section.line));
             return;
         };
         let entry = self.entry(name, section);
@@ -225,7 +227,7 @@ impl Eds {
         }
     }
 
-    /// Entries that an object says it has, and that have no section.
+    /// Checks for entries that an object claims to have but that have no section.
     fn check_entries(&mut self, name: &str, section: &Section) {
         let Some(object) = index(name).and_then(|index| self.objects.get(&index)) else { return };
         let compact = section.number("compactsubobj").unwrap_or(0) > 0;
@@ -239,7 +241,7 @@ impl Eds {
         }
     }
 
-    /// What the lists of objects promise must be there.
+    /// Checks that everything in the lists of objects exists.
     fn check_list(&mut self, list: &str, section: Option<&Section>) {
         let Some(section) = section else { return };
         let count = section.number("supportedobjects").unwrap_or(0);
@@ -250,7 +252,7 @@ impl Eds {
             match number(value, 0).and_then(|index| u16::try_from(index).ok()) {
                 Some(index) if self.objects.contains_key(&index) => {}
                 Some(index) => self.issues.push(format!("[{list}] names {index:04X}, which has no section")),
-                None => self.issues.push(format!("[{list}] names '{value}', which is no index")),
+                None => self.issues.push(format!("[{list}] names '{value}', which is not an index")),
             }
         }
         if count != found {
@@ -258,7 +260,7 @@ impl Eds {
         }
     }
 
-    /// The entry of an object.
+    /// An object's entry.
     pub fn entry_of(&self, index: u16, sub: u8) -> Option<&Entry> {
         self.objects.get(&index)?.entries.get(&sub)
     }
@@ -269,13 +271,13 @@ impl Eds {
     }
 }
 
-/// CiA 306 has comments in lines of their own; many tools also write them behind a value and a blank.
+/// CiA 306 has comments on separate lines; many tools also write them after a value and a blank.
 fn without_comment(value: &str) -> &str {
     let mark = value.match_indices(';').map(|(at, _)| at).find(|&at| value[..at].ends_with([' ', '\t']));
     mark.map_or(value, |at| &value[..at])
 }
 
-/// Four hexadecimal digits and nothing else.
+/// Exactly four hexadecimal digits.
 fn index(name: &str) -> Option<u16> {
     (name.len() == 4 && name.bytes().all(|byte| byte.is_ascii_hexdigit()))
         .then(|| u16::from_str_radix(name, 16).ok())

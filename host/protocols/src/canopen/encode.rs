@@ -1,18 +1,18 @@
-//! Values as text to their bytes (CiA 301, table 44).
+//! Converts text to the bytes of values (CiA 301, table 44).
 
-/// A text is no value of the type.
+/// A text that is not a value of the type.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("'{text}' is no {name}; write {advice}")]
+#[error("'{text}' is not a valid {name}; write {advice}")]
 pub struct BadValue {
-    /// What was given.
+    /// The text.
     pub text: String,
     /// The type.
     pub name: String,
-    /// What would be right.
+    /// What would be valid.
     pub advice: &'static str,
 }
 
-/// Types by the names that are written.
+/// Types by their written names.
 const NAMES: [(&str, u16); 17] = [
     ("bool", 0x01),
     ("i8", 0x02),
@@ -33,12 +33,12 @@ const NAMES: [(&str, u16); 17] = [
     ("domain", 0x0F),
 ];
 
-/// The number of a type that is written as `u16`, `i8`, `f32`, `text`, `hex` and so on.
+/// The number of the type written as `u16`, `i8`, `f32`, `text`, `hex` and so on.
 pub fn type_named(name: &str) -> Option<u16> {
     NAMES.iter().find(|(known, _)| *known == name).map(|(_, number)| *number)
 }
 
-/// The bytes of a value: whole numbers in decimal or as 0x1F, texts as they are, anything else in hexadecimal.
+/// The bytes of a value: integers in decimal or as 0x1F, texts as they are, anything else in hexadecimal.
 pub fn encode(data_type: u16, text: &str) -> Result<Vec<u8>, BadValue> {
     let name = NAMES.iter().find(|(_, number)| *number == data_type);
     let name = name.map_or_else(|| format!("type {data_type:04X}"), |(name, _)| (*name).to_owned());
@@ -110,7 +110,7 @@ mod tests {
     use crate::canopen::types::value;
     use crate::{Field, Value};
 
-    /// What is written is read back by the same type.
+    /// What is written reads back as the same type.
     #[test]
     fn every_type_comes_back() {
         for (name, text, shown) in [
@@ -152,7 +152,7 @@ mod tests {
         }
         assert_eq!(
             encode(0x05, "256").unwrap_err().to_string(),
-            "'256' is no u8; write a number within the type's range"
+            "'256' is not a valid u8; write a number within the type's range"
         );
         assert_eq!(type_named("byte"), None);
     }

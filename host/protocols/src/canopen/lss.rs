@@ -43,12 +43,12 @@ const fn title(service: u8) -> Option<&'static str> {
 }
 
 impl Lss {
-    /// Frames of the channel are missing.
+    /// Frames on the channel are missing.
     pub const fn interrupt(&mut self) {
         self.frames_lost = true;
     }
 
-    /// Takes a frame of the master (7E5) or a slave (7E4).
+    /// Takes a frame from the master (7E5) or a slave (7E4).
     pub fn take(&mut self, record: &TraceRecord, from_master: bool, data: &[u8]) -> Option<Event> {
         let (&service, rest) = data.split_first()?;
         let kind = if from_master { "lss" } else { "lss_answer" };

@@ -1,7 +1,7 @@
 //! CANopen (CiA 301): network management, boot-up, heartbeat and guarding, SYNC, TIME, EMCY, SDO, PDO, LSS (CiA 305).
 //!
-//! What comes again and again is reported when it changes: a node's state, a heartbeat that stops and comes back, the first SYNC and a
-//! counter that jumps. PDOs have names and values where an EDS or SDO transfers that were heard say what they carry.
+//! Whatever repeats is reported only when it changes: a node's state, a heartbeat that stops or resumes, the first SYNC, a counter
+//! that jumps. PDOs have names and values if an EDS or observed SDO transfers define their content.
 //!
 //! Memory: for each node of each channel one SDO transfer of at most 64 KiB for each of its SDO servers, and the mappings of 512 PDOs.
 
@@ -41,26 +41,26 @@ use self::transfers::{SdoFrame, transfer_event};
 use crate::{Assembler, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
 const SWEEP_NS: i64 = 50_000_000;
-/// A heartbeat is missed after this many of its periods.
+/// A heartbeat counts as missing after this many of its periods.
 const MISSED_PERIODS: f64 = 2.5;
-/// How long a node may take to answer a guard.
+/// How long a node may take to answer a guarding request.
 const GUARD_NS: i64 = 500_000_000;
 
-/// A node's own sheet.
+/// A node's data sheet.
 #[derive(Clone, Debug)]
 pub struct Sheet {
-    /// The node's number; all nodes that have no sheet of their own without it.
+    /// The node's number; `None` if it is for all nodes without a sheet of their own.
     pub node: Option<u8>,
-    /// What it says.
+    /// Its content.
     pub eds: Arc<Eds>,
 }
 
-/// Reads a CANopen bus.
+/// Decodes a CANopen bus.
 #[derive(Default)]
 pub struct CanOpen {
     buses: FxHashMap<u8, Bus>,
     sheets: Vec<Sheet>,
-    /// Identifiers of PDOs that the sheets say, where they are not the predefined ones.
+    /// Identifiers of PDOs according to the sheets, if they are not the predefined ones.
     sheet_ids: FxHashMap<u16, (u8, u16)>,
     /// And SDO channels beyond the first.
     sheet_channels: SdoChannels,
@@ -68,7 +68,7 @@ pub struct CanOpen {
 }
 
 impl CanOpen {
-    /// With the nodes' sheets, where there are some.
+    /// With the nodes' sheets, if any.
     pub fn new(sheets: Vec<Sheet>) -> Self {
         let (mut sheet_ids, mut sheet_channels) = (FxHashMap::default(), SdoChannels::default());
         for sheet in &sheets {
@@ -130,7 +130,7 @@ impl CanOpen {
                     event.fields.push(Field::hex("code", code, 4).meaning(Some(names::emergency(code))));
                     event.fields.push(Field::hex("register", register, 2).meaning(register_text(register)));
                     event.fields.push(Field::bytes("manufacturer", rest));
-                    // As long as it should be, or else what is there.
+                    // Of the required length, or else what is there.
                     event.trouble =
                         (rest.len() != 5).then_some(Trouble::Malformed("an emergency has 8 bytes"));
                     events.push(event);
@@ -160,7 +160,7 @@ impl CanOpen {
             }
             0x701..=0x77F => heartbeat(bus, record, node, data, events),
             0x180..=0x57F => {
-                // Four PDOs each way have identifiers of their own.
+                // Four PDOs in each direction have their own identifiers.
                 let (node, number) = bus.pdo_ids.get(&id).copied().unwrap_or((node, id & 0x780));
                 let entry = bus.nodes.entry(node).or_default();
                 let sheet = Self::sheet(sheets, node);
@@ -175,7 +175,7 @@ impl CanOpen {
         }
     }
 
-    /// Says what has not come.
+    /// Reports what has not come.
     fn sweep(&mut self, now_ns: i64, events: &mut Vec<Event>) {
         self.sweep_ns = now_ns.saturating_add(SWEEP_NS);
         let from = events.len();
@@ -282,7 +282,7 @@ impl Assembler for CanOpen {
                 for node in bus.nodes.values_mut() {
                     node.frames_lost = true;
                     node.toggle = None;
-                    // Heartbeats may be among what was lost.
+                    // The lost frames may have included heartbeats.
                     node.beat_ns = None;
                     for (_, sdo) in node.sdos() {
                         if let Some(open) = &mut sdo.open {

@@ -1,4 +1,4 @@
-//! CiA 301's numbers and what they are called.
+//! Names for CiA 301's numbers.
 
 /// Network management commands.
 pub const fn command(command: u8) -> Option<&'static str> {
@@ -61,7 +61,7 @@ pub const fn abort(code: u32) -> &'static str {
     }
 }
 
-/// Emergency error codes (CiA 301, table 26), by the most that is known of them.
+/// Emergency error codes (CiA 301, table 26), as specifically as they are known.
 pub const fn emergency(code: u16) -> &'static str {
     match code {
         0x0000..=0x00FF => "no error, or reset",

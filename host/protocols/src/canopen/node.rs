@@ -13,18 +13,18 @@ const MOST_SERVERS: usize = 127;
 #[derive(Default)]
 pub struct Node {
     pub state: Option<u8>,
-    /// The last heartbeat, and the time between it and the one before, or what was set.
+    /// The last heartbeat, and its period: measured, or as configured.
     pub beat_ns: Option<i64>,
     pub period_ns: Option<i64>,
     pub is_period_set: bool,
     pub is_missing: bool,
-    /// How long others wait for its heartbeat, as somebody was told by object 1016; the shortest.
+    /// The shortest time for which others wait for its heartbeat, as configured in their object 1016.
     pub consumer_ns: Option<i64>,
-    /// Objects 100C and 100D, as they were set: milliseconds and how many of them.
+    /// Objects 100C and 100D as configured: guard time in milliseconds, and life time factor.
     pub life: (i64, i64),
-    /// When it was last guarded, until that has stopped for longer than its life time.
+    /// When it was last guarded; `None` once that has stopped for longer than its life time.
     pub guarded_ns: Option<i64>,
-    /// A guard that waits for its answer.
+    /// A guarding request that waits for its answer.
     pub guard_ns: Option<i64>,
     pub toggle: Option<bool>,
     pub sdo: Sdo,
@@ -60,7 +60,7 @@ impl Node {
         self.sdo.open.iter().chain(self.further.iter().filter_map(|(_, sdo)| sdo.open.as_ref()))
     }
 
-    /// Takes what an SDO transfer that was written says of timeouts; of another node's, who it is and how long in nanoseconds.
+    /// Takes timeouts from an SDO transfer that wrote them; returns those of another node, with its number and in nanoseconds.
     pub fn learn_timeouts(&mut self, transfer: &SdoTransfer) -> Option<(u8, i64)> {
         if transfer.trouble.is_some() || !transfer.is_write {
             return None;
@@ -82,7 +82,7 @@ impl Node {
 #[derive(Default)]
 pub struct Bus {
     pub nodes: FxHashMap<u8, Node>,
-    /// Which node's PDO an identifier is, where that is not the predefined one.
+    /// Which node's PDO an identifier is, if it is not the predefined one.
     pub pdo_ids: FxHashMap<u16, (u8, u16)>,
     /// SDO channels beyond the first of each node.
     pub channels: SdoChannels,
@@ -91,7 +91,7 @@ pub struct Bus {
     pub sync_counter: Option<u8>,
 }
 
-/// The number in at most four bytes, the lowest first.
+/// The number in at most four bytes, least significant first.
 pub fn number_of(bytes: &[u8]) -> u32 {
     bytes.iter().take(4).rev().fold(0, |number, byte| number << 8 | u32::from(*byte))
 }

@@ -1,4 +1,4 @@
-//! What PDOs carry: by an EDS, or by what was written to or read from their mapping parameters.
+//! The content of PDOs: from an EDS, or from what was written to or read from their mapping parameters.
 
 use rustc_hash::FxHashMap;
 
@@ -7,12 +7,12 @@ use super::{names, sdo, types};
 use crate::{Event, Field, Party, Protocol, Trouble};
 use cantap_trace::TraceRecord;
 
-/// Mapping parameters of a node that are kept: 512 PDOs with eight entries each.
+/// How many mapping parameters of a node are kept: 512 PDOs with eight entries each.
 const MOST_ENTRIES: usize = 512 * 9;
 
-/// The identifier that a communication parameter of a node sets, where it is not the predefined one.
+/// The identifier in a node's communication parameter, if it is not the predefined one.
 fn own_id(value: u32, index: u16, node: u8) -> Option<u16> {
-    // Bit 31: it does not exist; bit 29: an extended identifier.
+    // Bit 31: the PDO does not exist; bit 29: an extended identifier.
     let id = (value & 0x7FF) as u16;
     let place = index & 0x1FF;
     let predefined =
@@ -20,8 +20,8 @@ fn own_id(value: u32, index: u16, node: u8) -> Option<u16> {
     (value & 0xA000_0000 == 0 && id != 0 && Some(id) != predefined).then_some(id)
 }
 
-/// Identifiers that a sheet gives a node's PDOs, each with its communication parameter. Where the sheet is `of_the_node`, all of them; else
-/// those that the node's number is a part of.
+/// The identifiers that a sheet assigns to a node's PDOs, each with its communication parameter. If the sheet is `of_the_node`, all of
+/// them; otherwise those that depend on the node's number.
 pub fn sheet_ids(eds: &Eds, node: u8, of_the_node: bool) -> impl Iterator<Item = (u16, u16)> + '_ {
     let parameters =
         [0x1400..=0x15FF, 0x1800..=0x19FF].into_iter().flat_map(|range| eds.objects.range(range));
@@ -37,20 +37,20 @@ pub fn sheet_ids(eds: &Eds, node: u8, of_the_node: bool) -> impl Iterator<Item =
 /// One node's PDOs.
 #[derive(Default)]
 pub struct Pdos {
-    /// Mapping parameters that were heard, by index (1600 to 17FF, 1A00 to 1BFF) and sub-index.
+    /// Observed mapping parameters, by index (1600 to 17FF, 1A00 to 1BFF) and sub-index.
     mapped: FxHashMap<(u16, u8), u32>,
-    /// Identifiers that were set, by communication parameter (1400 to 15FF, 1800 to 19FF).
+    /// Identifiers that were configured, by communication parameter (1400 to 15FF, 1800 to 19FF).
     ids: FxHashMap<u16, u16>,
 }
 
-/// The communication parameter of the PDO that has one of the predefined identifiers.
+/// The communication parameter of the PDO with a predefined identifier.
 const fn parameter(number: u16) -> u16 {
     let place = (number >> 7) - 3;
     if place.is_multiple_of(2) { 0x1800 + place / 2 } else { 0x1400 + place / 2 }
 }
 
 impl Pdos {
-    /// Takes what an SDO transfer says; whether identifiers have changed.
+    /// Learns from an SDO transfer; returns whether identifiers have changed.
     pub fn learn(&mut self, node: u8, transfer: &sdo::SdoTransfer) -> bool {
         let Ok(bytes) = <[u8; 4]>::try_from(transfer.data.as_slice()) else {
             if let (0x1600..=0x17FF | 0x1A00..=0x1BFF, 0, [count]) =
@@ -130,7 +130,7 @@ impl Pdos {
             }
             let bytes = cut(data, at, bits);
             at += bits;
-            // Below 20h it is a type: room that nothing is in.
+            // Below 20h it is a type: a placeholder for unused bytes.
             if index < 0x20 {
                 continue;
             }
@@ -145,7 +145,7 @@ impl Pdos {
         if at == 0 {
             event.fields.push(Field::bytes("data", data));
         } else if at < data.len() * 8 {
-            // From the bit on that nothing is mapped to.
+            // Starting at the first bit that is not mapped.
             event.fields.push(Field::bytes("rest", &cut(data, at, data.len() * 8 - at)));
         }
         if is_short {
@@ -155,7 +155,7 @@ impl Pdos {
     }
 }
 
-/// Bits from anywhere, as bytes that begin with the lowest.
+/// Extracts bits from any position as bytes, least significant first.
 fn cut(data: &[u8], at: usize, bits: usize) -> Vec<u8> {
     let mut bytes: Vec<u8> = (0..bits.div_ceil(8))
         .map(|number| {

@@ -6,7 +6,7 @@ use cantap_trace::{TraceEvent, TraceRecord};
 
 use crate::{Event, Field, Protocol, Trouble};
 
-/// A record of no frame, for events that no frame makes.
+/// A record without a frame, for events that no frame causes.
 pub const fn nothing(channel: u8) -> TraceRecord {
     TraceRecord { time_ns: 0, channel, event: TraceEvent::GAP }
 }
@@ -15,7 +15,7 @@ pub fn event(record: &TraceRecord, kind: &'static str, title: impl Into<Cow<'sta
     Event::new(Protocol::CanOpen, record, kind, title)
 }
 
-/// An event of what is not as the protocol has it.
+/// An event for something that violates the protocol.
 pub fn malformed(
     record: &TraceRecord,
     kind: &'static str,

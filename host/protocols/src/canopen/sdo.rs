@@ -1,10 +1,10 @@
-//! SDO transfers: expedited, in segments, in blocks (CiA 301, 7.2.4.3).
+//! SDO transfers: expedited, in segments, or in blocks (CiA 301, 7.2.4.3).
 //!
-//! Memory: one transfer for each of 127 nodes on each channel, with at most 64 KiB.
+//! Memory: one transfer for each of 127 nodes on each channel, of at most 64 KiB.
 
 use crate::Trouble;
 
-/// How long either side may take. CiA 301 names no time; masters use 0.3 to 2 s.
+/// How long either side may take. CiA 301 gives no time; masters use 0.3 to 2 s.
 pub const TIMEOUT_NS: i64 = 2_000_000_000;
 const MOST_BYTES: usize = 1 << 16;
 
@@ -15,12 +15,12 @@ pub enum Mode {
     Expedited,
     /// Frame by frame, each confirmed.
     Segmented,
-    /// Up to 127 frames for one confirmation.
+    /// Up to 127 frames per confirmation.
     Block,
 }
 
 impl Mode {
-    /// For people.
+    /// The name for display.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Expedited => "expedited",
@@ -30,7 +30,7 @@ impl Mode {
     }
 }
 
-/// A transfer, whole or as far as it came.
+/// A transfer, complete or as far as it got.
 #[derive(Clone, Debug)]
 pub struct SdoTransfer {
     pub start_ns: i64,
@@ -40,7 +40,7 @@ pub struct SdoTransfer {
     pub is_write: bool,
     pub mode: Mode,
     pub data: Vec<u8>,
-    /// How many bytes there should be, where that was said.
+    /// The expected number of bytes, if known.
     pub size: Option<u32>,
     pub frames: u32,
     /// From the request to the first answer, in nanoseconds.
@@ -50,14 +50,14 @@ pub struct SdoTransfer {
     pub frames_lost: bool,
 }
 
-/// What the bytes of a frame are just now.
+/// The meaning of the bytes in the current frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Phase {
     /// Commands.
     Command,
-    /// Segments of a block that the client sends.
+    /// Segments of a block from the client.
     FromClient,
-    /// Segments of a block that the server sends.
+    /// Segments of a block from the server.
     FromServer,
 }
 
@@ -67,13 +67,14 @@ pub struct Sdo {
     pub open: Option<SdoTransfer>,
     phase: Phase,
     toggle: bool,
-    /// Bytes before the block under way, the frames of it that came in order, and whether one did not.
+    /// Number of bytes before the current block, number of its frames received in order, and whether one was
+    /// out of order.
     block_start: usize,
     block_next: u8,
     last_segment: bool,
-    /// What comes belongs to a transfer that has ended or was not heard, which was said.
+    /// What follows belongs to a transfer that has ended or was not observed, which was reported.
     is_orphan: bool,
-    /// Both sides have said that they check a CRC.
+    /// Whether each side supports a CRC.
     crc: [bool; 2],
 }
 
@@ -93,7 +94,7 @@ impl Default for Sdo {
 }
 
 impl Sdo {
-    /// Takes a frame of the client or the server; returns what it ends: a transfer that it leaves behind, and one that is done.
+    /// Takes a frame from the client or the server; returns what it ends: an abandoned transfer, and a completed one.
     pub fn take(&mut self, time_ns: i64, from_client: bool, data: &[u8]) -> [Option<SdoTransfer>; 2] {
         let &[b0, low, high, sub, c, d, e, f] = data else {
             return [None, Some(headless(time_ns, data, Trouble::Malformed("an SDO frame has 8 bytes")))];
@@ -106,7 +107,8 @@ impl Sdo {
             6 => matches!(b0 & 1, 0),
             _ => false,
         };
-        // While a block comes from the server, a client that begins anew has left it.
+        // If the client starts a new transfer while a block comes from the server, it has abandoned the
+        // block.
         let begins = from_client && self.phase != Phase::FromClient && initiates;
         if begins {
             behind = self.end(Trouble::Overlapped);
@@ -136,11 +138,11 @@ impl Sdo {
         self.open.as_ref().is_some_and(|open| (open.index, open.sub) == object)
     }
 
-    /// Gives up what is under way.
+    /// Ends the current transfer.
     pub fn end(&mut self, trouble: Trouble) -> Option<SdoTransfer> {
         let open = self.open.take()?;
         self.phase = Phase::Command;
-        // What still comes of it was said with it.
+        // Whatever still arrives of it has been reported with it.
         self.is_orphan = true;
         Some(SdoTransfer { trouble: open.trouble.or(Some(trouble)), ..open })
     }
@@ -174,7 +176,7 @@ impl Sdo {
                 None
             }
             0 => {
-                // A segment, which its confirmation completes.
+                // A segment, which is completed by its confirmation.
                 let Some(open) =
                     self.open.as_mut().filter(|open| open.is_write && open.mode == Mode::Segmented)
                 else {
@@ -237,13 +239,13 @@ impl Sdo {
     fn server(&mut self, time_ns: i64, bytes: [u8; 8]) -> Option<SdoTransfer> {
         let b0 = bytes[0];
         let Some(open) = &mut self.open else {
-            // An answer to nobody that was heard.
+            // An answer to an unobserved request.
             let mut transfer = fresh(time_ns, bytes, b0 >> 5 == 3, Mode::Expedited);
             if b0 >> 5 == 2 && b0 & 2 != 0 {
                 first_bytes(&mut transfer, b0, true, b0 & 1 != 0, bytes);
             }
             let transfer = SdoTransfer { trouble: Some(Trouble::Headless), ..transfer };
-            // Segments and their confirmations name no object.
+            // Segments and their confirmations do not name an object.
             return if matches!(b0 >> 5, 0 | 1) { self.orphan(transfer) } else { Some(transfer) };
         };
         match b0 >> 5 {
@@ -251,7 +253,7 @@ impl Sdo {
             2 => {
                 let (expedited, sized) = (b0 & 2 != 0, b0 & 1 != 0);
                 open.mode = if expedited { Mode::Expedited } else { Mode::Segmented };
-                // Also in answer to a request for blocks, which a server need not speak.
+                // Also in answer to a request for blocks, which a server need not support.
                 self.toggle = false;
                 first_bytes(open, b0, expedited, sized, bytes);
                 if expedited { self.done() } else { None }
@@ -302,7 +304,7 @@ impl Sdo {
         }
     }
 
-    /// Segments of a transfer that is not under way are said once.
+    /// Segments of a transfer that is not in progress are reported once.
     fn orphan(&mut self, transfer: SdoTransfer) -> Option<SdoTransfer> {
         (!std::mem::replace(&mut self.is_orphan, true)).then_some(transfer)
     }
@@ -315,7 +317,7 @@ impl Sdo {
     fn block_segment(&mut self, bytes: [u8; 8]) -> Option<SdoTransfer> {
         let number = bytes[0] & 0x7F;
         let open = self.open.as_mut()?;
-        // What is out of order the receiver does not take either, and asks for it again.
+        // The receiver also rejects frames that are out of order, and requests them again.
         if number == self.block_next {
             self.block_next += 1;
             append(open, &bytes[1..]);
@@ -329,7 +331,7 @@ impl Sdo {
         None
     }
 
-    /// The receiver has taken this many frames of the block.
+    /// The receiver has accepted this many frames of the block.
     fn confirm_block(&mut self, taken: u8) {
         self.phase = Phase::Command;
         let ours = self.block_next - 1;
@@ -382,7 +384,7 @@ fn append(open: &mut SdoTransfer, bytes: &[u8]) {
     open.data.extend_from_slice(&bytes[..bytes.len().min(room)]);
 }
 
-/// What the frame that begins a transfer has of it.
+/// The data in the frame that begins a transfer.
 fn first_bytes(transfer: &mut SdoTransfer, b0: u8, expedited: bool, sized: bool, bytes: [u8; 8]) {
     if expedited {
         let unused = if sized { usize::from(b0 >> 2 & 3) } else { 0 };

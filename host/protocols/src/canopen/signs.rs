@@ -1,4 +1,4 @@
-//! What only a CANopen bus would do.
+//! Signs that are specific to a CANopen bus.
 
 use cantap_trace::TraceFrame;
 
@@ -48,7 +48,7 @@ impl CanOpenSigns {
         }
     }
 
-    /// How many messages show it; none if others speak against it.
+    /// The number of messages that indicate it; zero if others contradict it.
     pub fn count(&self) -> u32 {
         if self.other > self.heartbeats { 0 } else { self.heartbeats + self.exchanges }
     }

@@ -15,7 +15,7 @@ pub fn sync(bus: &mut Bus, record: &TraceRecord, data: &[u8], events: &mut Vec<E
         event.fields.extend(counter.map(|counter| Field::number("counter", counter)));
         events.push(event);
     } else if let (Some(before), Some(counter)) = (before, counter)
-        // After its highest value, which is set in each node, it begins with 1.
+        // After its highest value, which is configured in each node, it restarts at 1.
         && counter != 1
         && counter != before.wrapping_add(1)
     {
@@ -38,7 +38,7 @@ pub fn guard(bus: &mut Bus, record: &TraceRecord, node: u8, events: &mut Vec<Eve
     }
 }
 
-/// A heartbeat, a boot-up, or the answer to a guard.
+/// A heartbeat, a boot-up message, or the answer to a guarding request.
 pub fn heartbeat(bus: &mut Bus, record: &TraceRecord, node: u8, data: &[u8], events: &mut Vec<Event>) {
     let known = if let &[byte] = data { names::state(byte & 0x7F).map(|title| (byte, title)) } else { None };
     let Some((byte, title)) = known else {
@@ -66,7 +66,7 @@ pub fn heartbeat(bus: &mut Bus, record: &TraceRecord, node: u8, data: &[u8], eve
         return;
     }
     if state == 0 {
-        // A node that has just started: its heartbeat and its toggle bit begin anew.
+        // A node that has just started: its heartbeat and its toggle bit start over.
         (entry.beat_ns, entry.toggle, entry.is_missing) = (None, None, false);
         if !entry.is_period_set {
             entry.period_ns = None;
@@ -81,7 +81,7 @@ pub fn heartbeat(bus: &mut Bus, record: &TraceRecord, node: u8, data: &[u8], eve
         && !was_missing
     {
         let period_ns = record.time_ns.saturating_sub(beat_ns);
-        // The longest that was seen: a shorter one would miss what only jitters.
+        // The longest one seen: with a shorter one, jitter would be reported as missing.
         entry.period_ns = Some(entry.period_ns.map_or(period_ns, |known| known.max(period_ns)));
     }
     if was_missing {

@@ -54,11 +54,11 @@ fn a_heartbeat_that_stops_and_comes_back_is_said() {
         .map(|line| (*line).to_owned())
         .collect::<Vec<_>>()
     );
-    // Set by SDO, it is known before the second beat.
+    // Configured by SDO, it is known before the second heartbeat.
     let set =
         [(0.0, "605#2B17100032000000"), (1.0, "585#6017100000000000"), (2.0, "705#05"), (500.0, "200#")];
     assert_eq!(said(&set)[2], "canopen 5 heartbeat missing: period_ms 50 ms; nothing came for 125 ms");
-    // Where frames were lost, beats may be among them.
+    // If frames were lost, heartbeats may be among them.
     let records =
         [at(0.0, "705#05"), at(100.0, "705#05"), lost(150.0), at(900.0, "705#05"), at(1000.0, "705#05")];
     let events = testing::events(CanOpen::default(), &records);
@@ -129,7 +129,7 @@ fn sdo_transfers_of_every_kind_are_one_event() {
     }
 }
 
-/// A segment that is missing, or comes twice, shows by its toggle bit.
+/// The toggle bit reveals a segment that is missing or comes twice.
 #[test]
 fn a_missing_segment_is_said() {
     let said = said(&[
@@ -153,7 +153,7 @@ fn blocks_are_put_together_with_what_is_sent_again() {
     for number in 1..=4_u8 {
         frames.push(segment(number, false, usize::from(number - 1) * 7));
     }
-    // The fourth was not received and is sent again in a block of three.
+    // The fourth was not received, and is sent again in a block of three.
     frames.push("585#A203030000000000".to_owned());
     frames.extend([segment(1, false, 21), segment(2, false, 28), segment(3, true, 35)]);
     frames.push("585#A203040000000000".to_owned());
@@ -214,7 +214,7 @@ fn layer_settings_and_sync_counters() {
     );
 }
 
-/// Any frames: no panic.
+/// Any frames are accepted without a panic.
 #[test]
 fn any_frames_are_taken() {
     let mut random = fastrand::Rng::with_seed(301);
@@ -234,7 +234,7 @@ fn any_frames_are_taken() {
     assembler.finish(&mut events);
 }
 
-/// How long others wait is what they were told; a node whose life time has passed is no longer guarded.
+/// Nodes wait as long as they were configured to; a node whose life time has passed is no longer guarded.
 #[test]
 fn timeouts_are_those_that_were_set() {
     let told = said(&[
@@ -264,7 +264,7 @@ fn timeouts_are_those_that_were_set() {
     assert!(stopped[0].ends_with("nothing came for 300 ms"), "{guarded:?}");
 }
 
-/// A drive whose sheet has identifiers of its own, for its number (first) and for any (second).
+/// A drive whose sheet has its own identifiers, for its number (first) and for any number (second).
 #[test]
 fn a_sheet_says_which_identifiers_pdos_have() {
     const SHEET: &str = "[DeviceInfo]\n[1800]\nParameterName=T\nObjectType=9\n[1800sub1]\nDataType=7\nDefaultValue=$NODEID+0x400001A0\n\
@@ -313,7 +313,7 @@ fn what_is_not_as_the_protocol_has_it_is_said() {
 
 #[test]
 fn a_transfer_that_another_one_leaves_behind_is_said() {
-    // A block is being read when the client asks for something else.
+    // A block is being read when the client requests something else.
     let all = said(&[
         (0.0, "605#A408100014000000"),
         (1.0, "585#C608100014000000"),
@@ -328,7 +328,7 @@ fn a_transfer_that_another_one_leaves_behind_is_said() {
         "{all:?}"
     );
     assert!(all[1].contains("value 0x00000191"), "{all:?}");
-    // Segments without a beginning are said once.
+    // Segments without a beginning are reported once.
     let orphans = said(&[
         (0.0, "605#0041414141414141"),
         (1.0, "585#2000000000000000"),
@@ -336,7 +336,7 @@ fn a_transfer_that_another_one_leaves_behind_is_said() {
         (3.0, "585#3000000000000000"),
     ]);
     assert_eq!(orphans.len(), 1, "{orphans:?}");
-    // A server that does not speak blocks answers otherwise.
+    // A server that does not support blocks answers differently.
     let without = said(&[
         (0.0, "605#A408100014000000"),
         (1.0, "585#4108100009000000"),

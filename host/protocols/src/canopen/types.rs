@@ -2,7 +2,7 @@
 
 use crate::Value;
 
-/// A value of a type; bytes where the type is not known or does not suit them.
+/// A value of a type; bytes if the type is unknown or does not fit.
 pub fn value(data_type: Option<u16>, bytes: &[u8]) -> Value {
     let length = bytes.len();
     let unsigned = || bytes.iter().take(8).rev().fold(0_u64, |number, byte| number << 8 | u64::from(*byte));
@@ -25,7 +25,7 @@ pub fn value(data_type: Option<u16>, bytes: &[u8]) -> Value {
             let text: String = char::decode_utf16(units).map(|letter| letter.unwrap_or('\u{FFFD}')).collect();
             Value::Text(text.into())
         }
-        // Without a type, what fits a register is a number, and what is letters a text.
+        // Without a type, data that fit in a register are a number, and letters are a text.
         (None, 1..=4) => Value::Hex(unsigned(), 2 * length as u8),
         (None, _)
             if !bytes.is_empty() && bytes.iter().all(|byte| byte.is_ascii_graphic() || *byte == b' ') =>

@@ -1,17 +1,17 @@
-//! What an identifier says, by the predefined master/slave connection set.
+//! The meaning of an identifier in the predefined master/slave connection set.
 
-/// What an identifier is.
+/// The use of an identifier.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Use {
-    /// I/O of the slave with this MAC ID: what it is, and whether the slave sends it.
+    /// I/O of the slave with this MAC ID: its kind, and whether the slave sends it.
     Io(u8, &'static str, bool),
     /// An explicit request to this slave.
     Request(u8),
-    /// An explicit response of this slave.
+    /// An explicit response from this slave.
     Response(u8),
-    /// An explicit message of group 3 of this node.
+    /// An explicit message of group 3 from this node.
     Peer(u8),
-    /// Is there another with my MAC ID?
+    /// A check whether another node has this MAC ID.
     DuplicateCheck(u8),
     /// Group 4, by message.
     Offline(u8),

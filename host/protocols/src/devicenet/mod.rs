@@ -1,10 +1,11 @@
-//! DeviceNet: message groups, explicit messages with their fragments, I/O of the predefined master/slave connections, the check for
-//! duplicate MAC IDs.
+//! DeviceNet: message groups, explicit messages with their fragmentation, I/O of the predefined master/slave connections, the check
+//! for duplicate MAC IDs.
 //!
 //! An explicit request and its response are one event. Identifiers are those of the predefined connection set; connections that
-//! nodes agree on by themselves (UCMM) are read as explicit messages of group 3.
+//! nodes negotiate (UCMM) are decoded as explicit messages of group 3.
 //!
-//! Memory: for each channel and each of 64 nodes one message of at most 4 KiB each way, and one request that waits.
+//! Memory: for each channel and each of 64 nodes, one message of at most 4 KiB in each direction, and one waiting
+//! request.
 
 mod identifiers;
 mod names;
@@ -25,14 +26,14 @@ const RESPONSE_NS: i64 = 2_500_000_000;
 const SWEEP_NS: i64 = 100_000_000;
 const MOST_BYTES: usize = 4096;
 
-/// A message as it is put together.
+/// A message being reassembled.
 #[derive(Clone, Debug)]
 struct Message {
     start_ns: i64,
     time_ns: i64,
-    /// The other side's MAC ID, of the header.
+    /// The other side's MAC ID, from the header.
     other: u8,
-    /// Service and what follows it.
+    /// The service and what follows it.
     body: Vec<u8>,
     next: u8,
     frames: u32,
@@ -43,12 +44,12 @@ struct Message {
 /// A node's explicit messages.
 #[derive(Default)]
 struct Node {
-    /// To it and from it.
+    /// Messages in progress to and from it.
     open: [Option<Message>; 2],
     waiting: Option<Message>,
 }
 
-/// Reads a DeviceNet bus.
+/// Decodes a DeviceNet bus.
 #[derive(Default)]
 pub struct DeviceNet {
     nodes: FxHashMap<(u8, u8), Node>,
@@ -56,7 +57,7 @@ pub struct DeviceNet {
 }
 
 impl DeviceNet {
-    /// Nothing heard so far.
+    /// Nothing has been heard yet.
     pub fn new() -> Self {
         Self::default()
     }
@@ -78,7 +79,7 @@ impl DeviceNet {
             Some(Use::Request(node)) => self.explicit(record, node, None, false, data, events),
             Some(Use::Response(node)) => self.explicit(record, node, None, true, data, events),
             Some(Use::Peer(node)) => {
-                // The sender is in the identifier: whether it asks or answers says the service's highest bit.
+                // The identifier names the sender; the service's highest bit says whether it asks or answers.
                 let Some(&header) = data.first() else { return };
                 let service = if header & 0x80 == 0 { data.get(1) } else { data.get(2) };
                 let other = header & 0x3F;
@@ -124,7 +125,7 @@ impl DeviceNet {
         }
     }
 
-    /// A frame of an explicit message, to or from a node that serves.
+    /// A frame of an explicit message, to or from a node that is a server.
     fn explicit(
         &mut self,
         record: &TraceRecord,
@@ -163,7 +164,7 @@ impl DeviceNet {
         }
         let (kind, count) = (second >> 6, second & 0x3F);
         if kind == 3 {
-            // The receiver acknowledges each fragment on its own way; only what it does not take is worth a word.
+            // The receiver acknowledges each fragment on its own connection; only a rejection is reported.
             if rest.first().is_some_and(|status| *status != 0) {
                 let refused = node.open[1 - place].take().map(|open| (open, Trouble::Overflow));
                 self.broken(record, server, !answers, refused, events);
@@ -205,7 +206,7 @@ impl DeviceNet {
         }
     }
 
-    /// A message that did not become whole.
+    /// A message that remained incomplete.
     #[expect(clippy::unused_self, reason = "beside its siblings")]
     fn broken(
         &self,
@@ -300,7 +301,7 @@ fn event(record: &TraceRecord, kind: &'static str, title: &'static str) -> Event
     Event::new(Protocol::DeviceNet, record, kind, title)
 }
 
-/// A service; a request says which object it is for, in 8-bit class and instance, as slaves of the predefined set take it.
+/// A service; a request names its object by 8-bit class and instance, as slaves of the predefined set use.
 fn service_event(record: &TraceRecord, kind: &'static str, body: &[u8], is_request: bool) -> Event {
     let service = body.first().copied().unwrap_or_default() & 0x7F;
     let class = if is_request { body.get(1).map(|class| u16::from(*class)) } else { None };
@@ -333,7 +334,7 @@ fn service_event(record: &TraceRecord, kind: &'static str, body: &[u8], is_reque
     event
 }
 
-/// The connections that a master takes of a slave.
+/// The connections that a master allocates in a slave.
 fn allocation(choice: u8) -> String {
     const BITS: [&str; 7] = [
         "explicit",

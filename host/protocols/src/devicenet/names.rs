@@ -1,6 +1,6 @@
-//! DeviceNet's and CIP's numbers and what they are called, as far as they are public.
+//! Names for DeviceNet's and CIP's numbers, as far as they are public.
 
-/// Services; those from 4B on depend on whom they are for.
+/// Services; from 4B on they depend on the class.
 pub const fn service(service: u8, class: Option<u16>) -> Option<&'static str> {
     Some(match (service, class) {
         (0x01, _) => "Get_Attributes_All",

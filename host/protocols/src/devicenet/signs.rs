@@ -1,4 +1,4 @@
-//! What only a DeviceNet bus would do.
+//! Signs that are specific to a DeviceNet bus.
 
 use cantap_trace::TraceFrame;
 
@@ -9,7 +9,7 @@ use super::identifiers::{Use, use_of};
 pub(crate) struct DeviceNetSigns {
     checks: u32,
     exchanges: u32,
-    /// Frames with an identifier that has another use: no check has another length than seven.
+    /// Frames with an identifier used otherwise: a duplicate check always has seven bytes.
     other: u32,
     /// The last explicit request: node, client and service.
     asked: Option<(u8, u8, u8)>,
@@ -40,7 +40,7 @@ impl DeviceNetSigns {
         }
     }
 
-    /// How many messages show it; none if others speak against it.
+    /// The number of messages that indicate it; zero if others contradict it.
     pub fn count(&self) -> u32 {
         let enough = self.checks + self.exchanges > 1;
         if enough && self.other <= self.checks { self.checks + self.exchanges } else { 0 }

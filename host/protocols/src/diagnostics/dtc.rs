@@ -13,13 +13,13 @@ impl fmt::Display for Dtc {
     }
 }
 
-/// Codes of two bytes, with commas; zeros fill up and are none.
+/// Codes of two bytes, separated by commas; zeros are padding.
 pub fn list(bytes: &[u8]) -> String {
     let codes = bytes.chunks_exact(2).map(|code| u16::from_be_bytes([code[0], code[1]]));
     codes.filter(|code| *code != 0).map(|code| Dtc(code).to_string()).collect::<Vec<_>>().join(", ")
 }
 
-/// Codes of three bytes with a byte of status each, as UDS reports them: `P0123-11 (confirmed)`.
+/// Codes of three bytes, each with a status byte, as UDS reports them: `P0123-11 (confirmed)`.
 pub fn list_with_status(bytes: &[u8]) -> String {
     let codes = bytes.chunks_exact(4).map(|code| {
         let name = Dtc(u16::from_be_bytes([code[0], code[1]]));

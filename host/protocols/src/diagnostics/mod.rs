@@ -1,9 +1,9 @@
 //! Diagnostics: UDS (ISO 14229), KWP2000 services (ISO 14230-3) and OBD-II (SAE J1979), over ISO 15765-2.
 //!
-//! A request and its response are one event. What nobody answers, what nobody asked for, and transfers that break are events of
-//! their own.
+//! A request and its response are one event. Unanswered requests, unrequested responses and broken transfers are separate
+//! events.
 //!
-//! Memory: that of [`crate::iso_tp`], and 256 requests that wait for their responses.
+//! Memory: that of [`crate::iso_tp`], and 256 requests waiting for their responses.
 
 mod dtc;
 mod monitors;
@@ -31,55 +31,55 @@ use rustc_hash::FxHashSet;
 use crate::iso_tp::{Endpoint, Pair, Transfer, Transport};
 use crate::{Assembler, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
-/// Requests that wait for a response at the same time.
+/// How many requests may wait for a response at a time.
 const MOST_WAITING: usize = 256;
-/// How long a response is waited for. ISO 14229-2 has 50 ms for the server and as much again for the network as a client grants; this is
-/// what no client exceeds.
+/// How long to wait for a response. ISO 14229-2 has 50 ms for the server, plus the same again for the network, as far as a client
+/// allows; no client waits longer than this.
 const RESPONSE_NS: i64 = 2_000_000_000;
-/// And after the server has said that the response is pending: P2* is 5 s by default.
+/// The same after the server has said that the response is pending: P2* is 5 s by default.
 const PENDING_NS: i64 = 10_000_000_000;
 const RESPONSE_PENDING: u8 = 0x78;
-/// Senders that are known to speak KWP2000.
+/// How many senders known to use KWP2000 are kept.
 const MOST_KWP: usize = 1024;
 
-/// Servers that have said to one request that their response is pending.
+/// How many servers may have said, for one request, that their response is pending.
 const MOST_PENDING: usize = 64;
 
-/// A request that waits.
+/// A waiting request.
 #[derive(Clone, Debug)]
 struct Waiting {
     request: Transfer,
-    /// A positive response was asked for. One that was not still brings refusals, and responses that were pending.
+    /// A positive response was requested. If not, negative responses and pending ones still come.
     is_wanted: bool,
-    /// Who said that the response is pending and has not answered since, and how often.
+    /// The servers that said that the response is pending and have not answered since, and how often.
     pending: Vec<(Endpoint, u32)>,
     until_ns: i64,
-    /// Responses so far; a request to all may have several.
+    /// Number of responses so far; a request to all may have several.
     answers: u32,
     frames_lost: bool,
 }
 
-/// A request as it was when this response came.
+/// A request's state when this response came.
 struct Answered {
     request: Transfer,
     pending: u32,
     frames_lost: bool,
 }
 
-/// Turns transfers into requests with their responses.
+/// Combines transfers into requests with their responses.
 #[derive(Clone, Debug, Default)]
 pub struct Diagnostics {
     transport: Transport,
     waiting: VecDeque<Waiting>,
-    /// No request has waited for too long before this time.
+    /// No request times out before this time.
     due_ns: i64,
-    /// Both sides of those who used a service that only KWP2000 has.
+    /// Both sides of pairs that used a service that only KWP2000 has.
     speaks_kwp: FxHashSet<(u8, Endpoint)>,
     transfers: Vec<Transfer>,
 }
 
 impl Diagnostics {
-    /// With pairs that are known on all channels; `finds` looks for others.
+    /// With pairs that are known on all channels; `finds` enables the search for others.
     pub fn new(pairs: &[Pair], finds: bool) -> Self {
         Self { transport: Transport::new(pairs, finds), ..Self::default() }
     }
@@ -100,7 +100,7 @@ impl Diagnostics {
         }
     }
 
-    /// The protocol and name of a service on this transfer's pair.
+    /// The protocol and name of a service for the pair of this transfer.
     fn service(&self, transfer: &Transfer, sid: u8) -> Option<(Protocol, Cow<'static, str>)> {
         if names::obd_service(sid).is_some() {
             return Some((Protocol::Obd, obd::title(sid).into()));
@@ -122,7 +122,7 @@ impl Diagnostics {
         }
         transfer.to = transfer.to.or_else(|| self.transport.partner(transfer.channel, transfer.from));
         let is_uds = self.service(&transfer, sid).is_some_and(|(protocol, _)| protocol == Protocol::Uds);
-        // KWP2000 has a value of its own for it (ISO 14230-3, 6.4).
+        // KWP2000 has a separate value for it (ISO 14230-3, 6.4).
         let is_wanted =
             !(is_uds && uds::is_response_suppressed(&transfer.data) || transfer.data == [0x3E, 0x02]);
         if !is_wanted {
@@ -130,7 +130,8 @@ impl Diagnostics {
             event.fields.push(Field::text("response", "not wanted"));
             events.push(event);
         }
-        // Who asks again does not wait for the first answer any longer. What wants no response is said in between.
+        // A client that asks again no longer waits for the first answer. Requests that want no response may come
+        // in between.
         let same = |waiting: &Waiting| {
             let before = &waiting.request;
             (before.channel, before.from, before.to) == (transfer.channel, transfer.from, transfer.to)
@@ -157,7 +158,7 @@ impl Diagnostics {
         });
     }
 
-    /// The request that a response to `sid` is for.
+    /// The request that a response to `sid` belongs to.
     fn asked(&self, response: &Transfer, sid: u8) -> Option<usize> {
         let of_channel = |waiting: &Waiting| {
             waiting.request.channel == response.channel && waiting.request.data.first() == Some(&sid)
@@ -168,7 +169,7 @@ impl Diagnostics {
                 && waiting.request.to.is_none()
                 && waiting.request.from.id.is_extended() == response.from.id.is_extended()
         };
-        // The last one of its kind: one that wanted no response may still be there before it.
+        // The last one of its kind: an earlier one that wanted no response may still be there.
         self.waiting.iter().rposition(physical).or_else(|| self.waiting.iter().rposition(functional))
     }
 
@@ -182,7 +183,7 @@ impl Diagnostics {
         }
     }
 
-    /// The request as it was until now; one to a single server waits no longer.
+    /// The request's state until now; one to a single server stops waiting.
     fn answered(&mut self, place: usize, by: Endpoint) -> Answered {
         let waiting = &mut self.waiting[place];
         waiting.answers += 1;
@@ -219,7 +220,7 @@ impl Diagnostics {
         events.push(event);
     }
 
-    /// A response whose request was not heard.
+    /// A response whose request was not observed.
     fn unasked(&self, transfer: &Transfer) -> Event {
         let mut event = self.event(transfer, None, "response");
         event.fields.push(Field::text("request", "not heard"));
@@ -235,7 +236,7 @@ impl Diagnostics {
         let mut fields = vec![Field::hex("sid", sid, 2)];
         let is_request = first.data[0] & 0x40 == 0;
         if is_request {
-            // What an OBD response repeats of the request is shown once.
+            // Parts of the request that an OBD response repeats are shown once.
             let positive = response.is_some_and(|(response, _)| !refused(&response.data));
             match protocol {
                 Protocol::Obd if positive && matches!(sid, 1 | 2 | 6 | 9) => {}
@@ -280,7 +281,7 @@ impl Diagnostics {
             if answered.pending > 0 {
                 event.fields.push(Field::number("pending", answered.pending).unit("times"));
             }
-            // To all: who answered is what matters.
+            // To all: the important party is the one that answered.
             if first.to.is_none() {
                 event.to = response.from.into();
                 event.fields.push(Field::text("asked", "all"));
@@ -294,10 +295,10 @@ impl Diagnostics {
         event
     }
 
-    /// Nobody answers the request at this place any more.
+    /// The request at this index remains unanswered.
     fn give_up(&mut self, place: usize, trouble: Trouble, events: &mut Vec<Event>) {
         let Some(mut waiting) = self.waiting.remove(place) else { return };
-        // Who said that the response is pending owes one, whatever others have answered.
+        // A server that said that the response is pending owes one, whatever others have answered.
         let mut silent: Vec<_> = waiting.pending.drain(..).map(|(by, times)| (Some(by), times)).collect();
         if silent.is_empty() && waiting.is_wanted && waiting.answers == 0 {
             silent.push((None, 0));

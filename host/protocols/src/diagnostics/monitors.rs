@@ -3,7 +3,7 @@
 use super::values::supported;
 use crate::Field;
 
-/// How a test's values are to be read: `raw * scale + offset` (SAE J1979-DA, unit and scaling identifiers).
+/// How to interpret a test's values: `raw * scale + offset` (SAE J1979-DA, unit and scaling identifiers).
 struct Scaling {
     id: u8,
     unit: &'static str,
@@ -15,7 +15,7 @@ const fn scaling(id: u8, unit: &'static str, scale: f64) -> Scaling {
     Scaling { id, unit, scale, offset: 0.0 }
 }
 
-/// From 80 on, values have a sign.
+/// From 80 on, values are signed.
 const SCALINGS: [Scaling; 92] = [
     scaling(0x01, "", 1.0),
     scaling(0x02, "", 0.1),
@@ -135,7 +135,7 @@ pub fn name(mid: u8) -> Option<&'static str> {
     })
 }
 
-/// What a response of service 06 says: supported monitors, or test results of nine bytes each.
+/// The content of a response of service 06: supported monitors, or test results of nine bytes each.
 pub fn results(bytes: &[u8], fields: &mut Vec<Field>) {
     let Some(&mid) = bytes.first() else { return };
     if mid.is_multiple_of(0x20) && bytes.len().is_multiple_of(5) {
@@ -170,7 +170,7 @@ pub fn results(bytes: &[u8], fields: &mut Vec<Field>) {
     }
 }
 
-/// The monitors that are there and not complete, by the four bytes of parameters 01 and 41.
+/// The supported monitors that are not complete, from the four bytes of parameters 01 and 41.
 pub fn not_complete(bytes: &[u8]) -> String {
     const CONTINUOUS: [&str; 3] = ["misfire", "fuel system", "components"];
     const SPARK: [&str; 8] = [

@@ -1,4 +1,4 @@
-//! Numbers and what they are called: services, sub-functions, identifiers, reasons.
+//! Names for numbers: services, sub-functions, identifiers, reasons.
 
 /// Services of ISO 14229-1:2020, table 2, and 27.
 const UDS_SERVICES: [(u8, &str); 27] = [
@@ -24,7 +24,7 @@ const UDS_SERVICES: [(u8, &str); 27] = [
     (0x38, "RequestFileTransfer"),
     (0x3D, "WriteMemoryByAddress"),
     (0x3E, "TesterPresent"),
-    // Until ISO 14229-1:2013.
+    // Up to ISO 14229-1:2013.
     (0x83, "AccessTimingParameter"),
     (0x84, "SecuredDataTransmission"),
     (0x85, "ControlDTCSetting"),
@@ -32,7 +32,7 @@ const UDS_SERVICES: [(u8, &str); 27] = [
     (0x87, "LinkControl"),
 ];
 
-/// Services of ISO 14230-3 that ISO 14229 does not have.
+/// Services of ISO 14230-3 that are not in ISO 14229.
 const KWP_SERVICES: [(u8, &str); 14] = [
     (0x12, "readFreezeFrameData"),
     (0x13, "readDiagnosticTroubleCodes"),
@@ -50,7 +50,7 @@ const KWP_SERVICES: [(u8, &str); 14] = [
     (0x82, "stopCommunication"),
 ];
 
-/// Services that both have, by their names in ISO 14230-3 where those differ.
+/// Services in both, with their names in ISO 14230-3 where those differ.
 const KWP_SHARED: [(u8, &str); 9] = [
     (0x10, "startDiagnosticSession"),
     (0x14, "clearDiagnosticInformation"),
@@ -77,7 +77,7 @@ const OBD_SERVICES: [(u8, &str); 10] = [
     (0x0A, "permanent trouble codes"),
 ];
 
-/// Negative response codes: ISO 14229-1:2020, table A.1; those of ISO 14230-3 agree where both have them.
+/// Negative response codes: ISO 14229-1:2020, table A.1; those of ISO 14230-3 agree where they are in both.
 const REASONS: [(u8, &str); 58] = [
     (0x10, "generalReject"),
     (0x11, "serviceNotSupported"),
@@ -139,7 +139,7 @@ const REASONS: [(u8, &str); 58] = [
     (0x91, "torqueConverterClutchLocked"),
 ];
 
-/// Identifiers that ISO 14229-1 gives a meaning (table C.1).
+/// Identifiers defined in ISO 14229-1 (table C.1).
 const DATA_IDENTIFIERS: [(u16, &str); 34] = [
     (0xF180, "boot software identification"),
     (0xF181, "application software identification"),
@@ -287,7 +287,7 @@ pub fn obd_service(sid: u8) -> Option<&'static str> {
     find(&OBD_SERVICES, &sid)
 }
 
-/// Why a request is refused.
+/// Why a request was refused.
 pub fn reason(nrc: u8) -> &'static str {
     find(&REASONS, &nrc).unwrap_or(match nrc {
         0x38..=0x4F => "reserved for extended data link security",

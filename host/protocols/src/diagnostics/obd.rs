@@ -1,11 +1,11 @@
-//! OBD-II: what the services of SAE J1979 carry, with values in their units.
+//! OBD-II: the content of the services of SAE J1979, with values in their units.
 
 use super::parameters::{length, name, values};
 use super::values::{number, supported};
 use super::{dtc, monitors, names};
 use crate::Field;
 
-/// What a request asks for, behind the service byte.
+/// The content of a request after the service byte.
 pub fn request(sid: u8, rest: &[u8], fields: &mut Vec<Field>) {
     match sid {
         1 | 2 => {
@@ -61,7 +61,7 @@ const fn info_name(pid: u8) -> Option<&'static str> {
     })
 }
 
-/// What a response says, behind the service byte; the request has no fields of its own then.
+/// The content of a response after the service byte; the request then has no fields of its own.
 pub fn response(sid: u8, mut rest: &[u8], fields: &mut Vec<Field>) {
     match sid {
         1 | 2 => {
@@ -115,7 +115,7 @@ pub fn response(sid: u8, mut rest: &[u8], fields: &mut Vec<Field>) {
                 0x0A => "ecu_name",
                 _ => "value",
             };
-            // Each of several has the same length.
+            // If there are several, all have the same length.
             let each = match pid {
                 0x04 => 16,
                 0x06 => 4,
@@ -147,14 +147,14 @@ pub fn response(sid: u8, mut rest: &[u8], fields: &mut Vec<Field>) {
     }
 }
 
-/// What is printed of the bytes.
+/// The printable characters in the bytes.
 fn letters(bytes: &[u8]) -> String {
     let shown = bytes.iter().filter(|byte| byte.is_ascii_graphic() || **byte == b' ');
     let shown: String = shown.map(|byte| char::from(*byte)).collect();
     shown.trim().to_owned()
 }
 
-/// The service's name for people: `current data`.
+/// The service's name for display: `current data`.
 pub fn title(sid: u8) -> &'static str {
     names::obd_service(sid).unwrap_or("unknown service")
 }

@@ -4,7 +4,7 @@ use super::values::{number, supported};
 use super::{dtc, monitors};
 use crate::Field;
 
-/// A parameter whose value is a line: `(raw * scale) + offset`.
+/// A parameter with a linear value: `(raw * scale) + offset`.
 struct Line {
     pid: u8,
     bytes: u8,
@@ -22,7 +22,7 @@ const fn line(pid: u8, bytes: u8, name: &'static str, unit: &'static str, scale:
     Line { pid, bytes, name, unit, scale, offset, signed: false }
 }
 
-/// SAE J1979-DA, by the formulas that are public.
+/// SAE J1979-DA, by publicly known formulas.
 const LINES: [Line; 68] = [
     line(0x04, 1, "calculated_load", "%", PERCENT, 0.0),
     line(0x05, 1, "coolant_temperature", "°C", 1.0, -40.0),
@@ -94,7 +94,7 @@ const LINES: [Line; 68] = [
     line(0x1E, 1, "auxiliary_input", "", 1.0, 0.0),
 ];
 
-/// Parameters of several values, of which the first byte says which are there: the length, the name, and each value's bit, place,
+/// Parameters with several values, whose first byte says which are present: the length, the name, and each value's bit, position,
 /// bytes, name, unit, scale and offset.
 struct Group {
     pid: u8,
@@ -174,7 +174,7 @@ const EXHAUST_TEMPERATURES: [(u8, u8, u8, &str, &str, f64, f64); 4] = [
     (3, 7, 2, "exhaust_gas_temperature_4", "°C", 0.1, -40.0),
 ];
 
-/// Parameters that are named and shown as bytes; each is the rest of its response.
+/// Parameters that have a name and are shown as bytes; each extends to the end of its response.
 const NAMED: [(u8, &str); 40] = [
     (0x65, "auxiliary_inputs_and_outputs"),
     (0x68, "intake_air_temperature_sensors"),
@@ -272,7 +272,7 @@ const STANDARDS: [&str; 14] = [
     "JOBD, EOBD and OBD II",
 ];
 
-/// Data bytes of a parameter of service 01; `None` if it is not known here.
+/// Number of data bytes of a parameter of service 01; `None` if it is unknown.
 pub fn length(pid: u8) -> Option<usize> {
     if pid.is_multiple_of(0x20) {
         return Some(4);
@@ -291,7 +291,7 @@ fn group(pid: u8) -> Option<&'static Group> {
     GROUPS.iter().find(|group| group.pid == pid)
 }
 
-/// What a parameter is called.
+/// A parameter's name.
 pub fn name(pid: u8) -> Option<&'static str> {
     let known = LINES.iter().find(|line| line.pid == pid).map(|line| line.name);
     let known = known.or_else(|| group(pid).map(|group| group.name));
@@ -319,7 +319,7 @@ pub fn values(pid: u8, bytes: &[u8], fields: &mut Vec<Field>) {
     if let Some(line) = LINES.iter().find(|line| line.pid == pid) {
         let raw = number(bytes);
         let value = if line.signed { f64::from(raw as u16 as i16) } else { raw as f64 };
-        // As the standard has it: added before nothing else is done to the number.
+        // As the standard defines it: the offset is added before anything else is done to the number.
         let text = match pid {
             0x51 => FUELS.get(raw as usize).copied(),
             0x1C => STANDARDS.get(raw as usize).copied().filter(|text| !text.is_empty()),

@@ -1,4 +1,4 @@
-//! ReadDTCInformation: what its requests and responses carry, by sub-function (ISO 14229-1:2020, 12.3).
+//! ReadDTCInformation: the content of its requests and responses, by sub-function (ISO 14229-1:2020, 12.3).
 
 use super::dtc::{self, Dtc};
 use crate::Field;
@@ -18,7 +18,7 @@ fn rest(name: &'static str, bytes: &[u8], fields: &mut Vec<Field>) {
     }
 }
 
-/// How codes are to be read (ISO 14229-1:2020, table 328).
+/// The format of the codes (ISO 14229-1:2020, table 328).
 fn format(byte: u8) -> Field {
     let text =
         ["SAE J2012-DA, format 00", "ISO 14229-1", "SAE J1939-73", "ISO 11992-4", "SAE J2012-DA, format 04"];
@@ -40,7 +40,8 @@ fn record_number(byte: u8, all: u8) -> Field {
     Field::hex("record_number", byte, 2).meaning((byte == all).then_some("all"))
 }
 
-/// What a request says behind the sub-function, which is without the bit that suppresses the response.
+/// The content of a request after the sub-function, which does not include the bit that suppresses the
+/// response.
 pub fn request(sub: u8, data: &[u8], fields: &mut Vec<Field>) {
     let left: &[u8] = match (sub, data) {
         (0x01 | 0x02 | 0x0F | 0x11..=0x13, [mask, left @ ..]) => {
@@ -97,7 +98,7 @@ fn severity_mask(byte: u8) -> Field {
     Field::hex("severity_mask", byte, 2).meaning(severity(byte))
 }
 
-/// The three highest bits; the lower ones are classes of WWH-OBD (ISO 14229-1:2020, D.3).
+/// The three highest bits; the lower ones are WWH-OBD classes (ISO 14229-1:2020, D.3).
 fn severity(byte: u8) -> Option<String> {
     const BITS: [(u8, &str); 8] = [
         (0x80, "check immediately"),
@@ -113,13 +114,13 @@ fn severity(byte: u8) -> Option<String> {
     (!set.is_empty()).then(|| set.join(" + "))
 }
 
-/// Codes of four bytes, `P1234-56 (confirmed)`, and how many.
+/// Codes of four bytes, `P1234-56 (confirmed)`, and their number.
 fn with_status(codes: &[u8], fields: &mut Vec<Field>) {
     fields.push(Field::number("trouble_codes", (codes.len() / CODE_AND_STATUS) as i64));
     fields.push(Field::text("codes", dtc::list_with_status(codes)));
 }
 
-/// Codes behind bytes of their own, each in words.
+/// Codes after some other bytes, each in words.
 fn each(codes: &[u8], length: usize, words: impl Fn(&[u8]) -> String, fields: &mut Vec<Field>) {
     let listed: Vec<_> = codes.chunks_exact(length).map(words).collect();
     fields.push(Field::number("trouble_codes", listed.len() as i64));
@@ -134,7 +135,8 @@ fn with_severity(bytes: &[u8]) -> String {
     format!("{} [{words}{unit}]", dtc::list_with_status(code))
 }
 
-/// What a positive response says behind the sub-function. What it repeats of a request that was `heard` is left out.
+/// The content of a positive response after the sub-function. Anything repeated from a request that was `heard` is
+/// left out.
 pub fn response(heard: bool, sub: u8, data: &[u8], fields: &mut Vec<Field>) {
     let again = |field: Field| (!heard).then_some(field);
     let mask = |mask: u8| Field::hex("available_mask", mask, 2);
@@ -166,7 +168,7 @@ pub fn response(heard: bool, sub: u8, data: &[u8], fields: &mut Vec<Field>) {
             each(codes, 6, with_severity, fields);
         }
         (0x14, codes) if codes.len() % 4 == 0 => {
-            // The counter has a sign: it goes down while the test passes.
+            // The counter is signed: it goes down while the test passes.
             each(codes, 4, |one| format!("{} (counter {})", code(one), one[3] as i8), fields);
         }
         (0x17, [memory, available, codes @ ..]) if codes.len() % CODE_AND_STATUS == 0 => {
@@ -247,7 +249,7 @@ mod tests {
                 behind(&[0x33, 0xFF, 4]),
                 format!("functional_group 0x33 (emissions), available_mask 0xFF, format 0x04 (SAE J2012-DA, format 04), {listed}"),
             ),
-            // What does not suit stays as it is.
+            // What does not fit stays unchanged.
             (0x02, vec![0xFF, 1, 2], "value FF 01 02".to_owned()),
         ] {
             assert_eq!(said(|sub, data, fields| response(false, sub, data, fields), sub, &bytes), expected, "{sub:02X}");

@@ -96,7 +96,7 @@ fn silence_is_said_and_a_loss_meanwhile_too() {
     assert_eq!(events(&[at(0.0, "7E0#023E00")])[0].trouble, Some(Trouble::Unfinished));
 }
 
-/// Whatever comes, nothing panics and nothing grows.
+/// Whatever the bytes, nothing panics and memory does not grow.
 #[test]
 fn any_bytes_are_taken() {
     let mut random = fastrand::Rng::with_seed(14_229);
@@ -132,7 +132,7 @@ fn what_wanted_no_response_may_still_be_refused() {
     let pending = said(&[(0.0, "7E0#021083"), (1.0, "7E8#037F1078"), (2.0, "7E8#065003003201F4")]);
     assert_eq!(pending.len(), 2, "{pending:?}");
     assert!(pending[1].contains("p2_ms 50") && pending[1].contains("pending 1 times"), "{pending:?}");
-    // It does not end what waits for its response meanwhile.
+    // It does not end a request that is waiting for its response meanwhile.
     let between = said(&[
         (0.0, "7E0#0431010203"),
         (1.0, "7E8#037F3178"),
@@ -142,14 +142,14 @@ fn what_wanted_no_response_may_still_be_refused() {
     ]);
     assert_eq!(between.len(), 3, "{between:?}");
     assert!(between[2].contains("RoutineControl") && between[2].contains("status 00"), "{between:?}");
-    // KWP2000 says it otherwise.
+    // KWP2000 expresses it differently.
     assert_eq!(
         said(&[(0.0, "7E0#021A90"), (1.0, "7E8#065A9041424344"), (2.0, "7E0#023E02"), (4000.0, "100#")])[1],
         "kwp2000 7E0 > 7E8 testerPresent: sid 0x3E, parameters 02, response \"not wanted\""
     );
 }
 
-/// Of several that are asked at once, each is said by itself.
+/// If several servers are asked at once, each is reported separately.
 #[test]
 fn who_said_pending_and_fell_silent_is_named() {
     let said = said(&[
@@ -169,7 +169,7 @@ fn who_said_pending_and_fell_silent_is_named() {
     );
 }
 
-/// An address of four and a size of eight bytes: the first byte of the two lengths is above 127.
+/// An address of four bytes and a size of eight: the byte with the two lengths is above 127.
 #[test]
 fn memory_has_addresses_and_sizes_of_any_length() {
     for lengths in 0..=0xFF {
@@ -212,7 +212,7 @@ fn services_have_their_own_fields() {
     }
 }
 
-/// Bytes that chance sends through ISO 15765-2 rarely get as far as a service's own fields.
+/// Random bytes sent through ISO 15765-2 rarely get as far as a service's own fields.
 #[test]
 fn requests_and_responses_of_any_bytes_are_taken() {
     let seed = fastrand::u64(..);

@@ -1,4 +1,4 @@
-//! UDS and KWP2000: what requests and responses carry.
+//! UDS and KWP2000: the content of requests and responses.
 
 use std::fmt::Write as _;
 
@@ -40,7 +40,7 @@ fn value(bytes: &[u8], fields: &mut Vec<Field>) {
     }
 }
 
-/// What a UDS request says.
+/// The content of a UDS request.
 pub fn request(bytes: &[u8], fields: &mut Vec<Field>) {
     let Some((&sid, after)) = bytes.split_first() else { return };
     match (sid, after) {
@@ -128,7 +128,7 @@ pub fn request(bytes: &[u8], fields: &mut Vec<Field>) {
     }
 }
 
-/// Routines that ISO 14229-1:2020 gives a meaning (table F.1).
+/// Routines defined in ISO 14229-1:2020 (table F.1).
 fn routine(high: u8, low: u8) -> Field {
     let routine = u16::from_be_bytes([high, low]);
     let text = match routine {
@@ -141,7 +141,7 @@ fn routine(high: u8, low: u8) -> Field {
     Field::hex("routine", routine, 4).meaning(text)
 }
 
-/// A file's name behind its length of two bytes, and what follows it (ISO 14229-1:2020, 14.6).
+/// A file name after its two-byte length, and what follows it (ISO 14229-1:2020, 14.6).
 fn file(data: &[u8], fields: &mut Vec<Field>) {
     let named = data
         .split_first_chunk::<2>()
@@ -154,7 +154,7 @@ fn file(data: &[u8], fields: &mut Vec<Field>) {
     rest("parameters", left, fields);
 }
 
-/// Address and size behind a byte with their lengths (ISO 14229-1:2020, H.1).
+/// Address and size after a byte with their lengths (ISO 14229-1:2020, H.1).
 fn memory(lengths: u8, data: &[u8], fields: &mut Vec<Field>) {
     let (address, size) = (usize::from(lengths & 15), usize::from(lengths >> 4));
     if address == 0 || address > 8 || size > 8 || data.len() < address + size {
@@ -167,7 +167,8 @@ fn memory(lengths: u8, data: &[u8], fields: &mut Vec<Field>) {
     rest("parameters", &data[address + size..], fields);
 }
 
-/// What a positive UDS response says. `request` is what it answers, where that was heard; its fields stand in front already.
+/// The content of a positive UDS response. `request` is the one it answers, if it was observed; its fields have already been
+/// added.
 pub fn response(request: Option<&[u8]>, bytes: &[u8], fields: &mut Vec<Field>) {
     let Some((&first, after)) = bytes.split_first() else { return };
     let sid = first & !0x40;
@@ -214,7 +215,7 @@ pub fn response(request: Option<&[u8]>, bytes: &[u8], fields: &mut Vec<Field>) {
             }
             rest("status", data, fields);
         }
-        // What the request said already.
+        // The request already said this.
         (0x28, [_]) | (0x2C, [_, _, _]) if heard => {}
         (0x31, [sub, high, low, data @ ..]) => {
             if !heard {
@@ -246,8 +247,8 @@ pub fn response(request: Option<&[u8]>, bytes: &[u8], fields: &mut Vec<Field>) {
     }
 }
 
-/// Values of several identifiers, whose lengths nobody says: each ends where the next identifier that was asked for stands, if that
-/// is at one place only.
+/// Values of several identifiers, whose lengths are unknown: each ends where the next requested identifier appears, if that is in
+/// only one place.
 fn several(asked: &[u8], answer: &[u8], fields: &mut Vec<Field>) {
     let dids: Vec<&[u8]> = asked.chunks_exact(2).collect();
     let mut at = 2;
@@ -276,7 +277,7 @@ fn several(asked: &[u8], answer: &[u8], fields: &mut Vec<Field>) {
     }
 }
 
-/// What a KWP2000 request says.
+/// The content of a KWP2000 request.
 pub fn kwp_request(bytes: &[u8], fields: &mut Vec<Field>) {
     match bytes {
         [0x1A | 0x21 | 0x30 | 0x31 | 0x32 | 0x33 | 0x3B, local, data @ ..] => {
@@ -293,7 +294,7 @@ pub fn kwp_request(bytes: &[u8], fields: &mut Vec<Field>) {
     }
 }
 
-/// What a positive KWP2000 response says.
+/// The content of a positive KWP2000 response.
 pub fn kwp_response(heard: bool, bytes: &[u8], fields: &mut Vec<Field>) {
     match bytes {
         [0x5A | 0x61, local, data @ ..] => {

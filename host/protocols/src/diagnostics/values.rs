@@ -1,4 +1,4 @@
-//! What several services carry in one form: numbers, sets of numbers, texts.
+//! Forms that several services have in common: numbers, sets of numbers, texts.
 
 use std::fmt::Write as _;
 
@@ -22,7 +22,7 @@ pub fn supported(first: u8, bytes: &[u8]) -> String {
     text
 }
 
-/// Bytes as a text if they are one, else as they are.
+/// Bytes as text if they are text, otherwise unchanged.
 pub fn text_or_bytes(bytes: &[u8]) -> Value {
     let end =
         bytes.iter().rposition(|byte| *byte != 0 && *byte != b' ' && *byte != 0xFF).map_or(0, |at| at + 1);

@@ -1,7 +1,8 @@
-//! Finds pairs by what they do: a first frame, a flow control frame of somebody else, and the first consecutive frame.
+//! Finds pairs by their behaviour: a first frame, a flow control frame from the other side, and the first consecutive
+//! frame.
 //!
-//! Every frame of a bus comes by here whose identifier belongs to no pair, and most are no part of any transfer. So what can be
-//! told from a frame alone is, before the candidates are looked at, and a candidate takes no memory of its own.
+//! Every frame on a bus whose identifier belongs to no pair passes through here, and most are not part of any transfer. So
+//! whatever a frame shows on its own is checked before the candidates, and a candidate allocates no memory.
 
 use cantap_trace::Id;
 use cantap_trace::fd::FD_MAX_BYTES;
@@ -12,27 +13,27 @@ use super::transfer::Transfer;
 
 /// How long the sender waits for flow control: N_Bs (ISO 15765-2:2016, table 21).
 const FLOW_TIMEOUT_NS: i64 = 1_000_000_000;
-/// First frames that wait for their flow control, on all channels.
+/// How many first frames may wait for their flow control, on all channels together.
 const MOST_CANDIDATES: usize = 64;
 
-/// A frame that may be a first one.
+/// A frame that may be a first frame.
 #[derive(Clone, Debug)]
 struct Candidate {
     channel: u8,
     from: Endpoint,
     time_ns: i64,
     length: u32,
-    /// The first bytes, and how many.
+    /// The first bytes, and their number.
     data: ([u8; FD_MAX_BYTES], u8),
     flow: Option<(Endpoint, u8, u32)>,
 }
 
-/// Marks of the candidates' senders: an identifier without its mark is no candidate's.
+/// Marks for the candidates' senders: an identifier without its mark is not a candidate's.
 #[derive(Clone, Copy, Debug, Default)]
 struct Marks([u64; 16]);
 
 impl Marks {
-    /// Word and bit. Neighbouring identifiers, as most buses have, fall on different marks.
+    /// Word and bit. Neighbouring identifiers, common on most buses, have different marks.
     const fn place(id: Id) -> (usize, u64) {
         let mark = id.raw() ^ id.raw() >> 10 ^ id.raw() >> 20;
         ((mark >> 6 & 15) as usize, 1 << (mark & 63))
@@ -49,7 +50,7 @@ impl Marks {
     }
 }
 
-/// Looks for pairs among identifiers that belong to none.
+/// Looks for pairs among the identifiers that belong to none.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Finder {
     candidates: Vec<Candidate>,
@@ -57,10 +58,10 @@ pub(super) struct Finder {
 }
 
 impl Finder {
-    /// Takes a frame; returns the pair and the transfer that has begun when this frame is its first consecutive one, which is still
-    /// to be taken as such.
+    /// Takes a frame; if it is the first consecutive frame, returns the pair and the transfer that has begun, which must then still
+    /// take this frame.
     pub fn take(&mut self, channel: u8, id: Id, bytes: &[u8], time_ns: i64) -> Option<(Pair, Transfer)> {
-        // Who sends anything else before its first consecutive frame sends no transfer.
+        // A sender that sends anything else before its first consecutive frame is not sending a transfer.
         if self.marks.may_have(id) {
             let goes_on = |candidate: &Candidate| {
                 let place = usize::from(candidate.from.address.is_some());
@@ -74,7 +75,7 @@ impl Finder {
                 self.mark();
             }
         }
-        // The address may be in front of it or not.
+        // There may or may not be an address before it.
         for offset in [0, 1] {
             let Some(&first) = bytes.get(offset) else { continue };
             match first >> 4 {
@@ -87,7 +88,7 @@ impl Finder {
             match pci {
                 Pci::First { length, data } if length <= 4095 => {
                     if self.candidates.len() == MOST_CANDIDATES {
-                        // The oldest, which is the first to be too old.
+                        // The oldest one, which is the first to become too old.
                         self.candidates.swap_remove(self.oldest());
                     }
                     let mut kept = [0; FD_MAX_BYTES];
@@ -99,7 +100,7 @@ impl Finder {
                 Pci::Flow { status: FlowStatus::Go, block_size, separation_us }
                     if is_padded(&bytes[offset + 3..]) =>
                 {
-                    // The last one before the first consecutive frame counts: that frame follows at once.
+                    // The last one before the first consecutive frame counts: that frame follows immediately.
                     for candidate in &mut self.candidates {
                         if candidate.channel == channel
                             && candidate.from.id != id
@@ -141,7 +142,7 @@ impl Finder {
         None
     }
 
-    /// Frames of the channel are missing: what comes next may belong to others.
+    /// Frames on the channel are missing: what comes next may belong to others.
     pub fn interrupt(&mut self, channel: u8) {
         self.candidates.retain(|candidate| candidate.channel != channel);
         self.mark();
@@ -152,14 +153,14 @@ impl Finder {
         times.min().map_or(0, |(_, place)| place)
     }
 
-    /// Marks those that are left.
+    /// Sets the marks of the remaining candidates.
     fn mark(&mut self) {
         self.marks = Marks::default();
         self.candidates.iter().for_each(|candidate| self.marks.set(candidate.from.id));
     }
 }
 
-/// What fills a frame up is the same byte throughout.
+/// Padding consists of equal bytes.
 fn is_padded(rest: &[u8]) -> bool {
     rest.windows(2).all(|two| two[0] == two[1])
 }

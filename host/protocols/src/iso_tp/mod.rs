@@ -1,10 +1,10 @@
 //! Transfers of many frames: ISO 15765-2 in normal, extended and mixed addressing, on classical CAN and CAN FD.
 //!
-//! Which identifiers take part is known of those that the standards set aside (7DF, 7E0 to 7EF, 18DAxxyy, 18DBxxyy, 18CExxyy,
-//! 18CDxxyy), of the pairs that are given, and of those that [`Transport`] finds by what they do.
+//! The identifiers that take part are those reserved by the standards (7DF, 7E0 to 7EF, 18DAxxyy, 18DBxxyy, 18CExxyy,
+//! 18CDxxyy), those of the given pairs, and those that [`Transport`] finds by their behaviour.
 //!
-//! Memory: at most 256 transfers under way, each with at most 64 KiB, and 1024 pairs that were found. A transfer holds only the
-//! bytes that arrived, so that first frames without followers cost next to nothing.
+//! Memory: at most 256 transfers in progress, each of at most 64 KiB, and 1024 pairs that were found. A transfer holds only the
+//! bytes that arrived, so first frames without successors cost next to nothing.
 
 mod finder;
 mod pairs;
@@ -26,42 +26,45 @@ use crate::{Assembler, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap}
 
 /// How long the receiver waits for the next frame: N_Cr.
 const NEXT_TIMEOUT_NS: i64 = 1_000_000_000;
-/// Between two looks for what has timed out.
+/// How often to check for timeouts.
 const SWEEP_NS: i64 = 100_000_000;
-/// Transfers under way at the same time.
+/// How many transfers may be in progress at a time.
 const MOST_OPEN: usize = 256;
-/// Bytes that are kept of one.
+/// How many bytes of a transfer are kept.
 const MOST_BYTES: usize = 1 << 16;
-/// A transfer of a pair that was only just found is reported as broken from this many frames on; before, it was none.
+/// A transfer of a pair that was only just found is reported as broken only from this many frames on; with fewer, it
+/// was probably not a transfer.
 const FRAMES_THAT_CONVINCE: u32 = 4;
 
-/// A transfer under way.
+/// A transfer in progress.
 #[derive(Clone, Debug)]
 struct Open {
     transfer: Transfer,
     /// The next sequence number.
     next: u8,
-    /// Its pair was found by this very transfer.
+    /// Its pair was found through this very transfer.
     is_new: bool,
-    /// Bytes of the first frame with its address and control information: those that follow are as long, but for the last one.
+    /// Length of the first frame including address and control information: the following ones have the same length, except
+    /// for the last one.
     frame_bytes: usize,
-    /// When the last consecutive frame came; frames of one block have a least distance.
+    /// When the last consecutive frame came; frames of one block have a minimum separation.
     last_ns: Option<i64>,
 }
 
-/// Puts transfers together.
+/// Reassembles transfers.
 #[derive(Clone, Debug, Default)]
 pub struct Transport {
     pairs: Pairs,
     finder: Option<Finder>,
     open: FxHashMap<(u8, Endpoint), Open>,
-    /// Runs of consecutive frames without a first one: the last number of each, so that a run is reported once.
+    /// Runs of consecutive frames without a first frame: the last number of each, so that a run is reported
+    /// once.
     headless: FxHashMap<(u8, Endpoint), u8>,
     sweep_ns: i64,
 }
 
 impl Transport {
-    /// With pairs that are known on all channels; `finds` looks for others.
+    /// With pairs that are known on all channels; `finds` enables the search for others.
     pub fn new(pairs: &[Pair], finds: bool) -> Self {
         let mut transport = Self { finder: finds.then(Finder::default), ..Self::default() };
         for pair in pairs {
@@ -70,12 +73,12 @@ impl Transport {
         transport
     }
 
-    /// The other side of a sender, where it is known and only one.
+    /// The other side of a sender, if it is known and unique.
     pub fn partner(&self, channel: u8, from: Endpoint) -> Option<Endpoint> {
         self.pairs.partner(channel, from)
     }
 
-    /// Takes the next record, and hands out the transfers that end with it, whole or not.
+    /// Takes the next record, and passes on the transfers that end with it, complete or not.
     pub fn take(&mut self, record: &TraceRecord, out: &mut impl FnMut(Transfer)) {
         if !self.open.is_empty() && record.time_ns >= self.sweep_ns {
             self.sweep(record.time_ns, out);
@@ -96,7 +99,7 @@ impl Transport {
             let Some((pair, transfer)) = found else { return };
             if self.pairs.add(channel, pair) {
                 let offset = usize::from(pair.a.address.is_some());
-                // Of a transfer that was just found, the first frame is not at hand any more.
+                // For a transfer that was only just found, the first frame is no longer available.
                 let frame_bytes = first_frame_bytes(&transfer, offset);
                 self.begin(Open { transfer, next: 1, is_new: true, frame_bytes, last_ns: None }, out);
                 self.frame(record, offset, bytes, out);
@@ -106,7 +109,7 @@ impl Transport {
         self.frame(record, offset, bytes, out);
     }
 
-    /// The trace has ended: hands out what was under way.
+    /// The trace has ended: passes on whatever was in progress.
     pub fn finish(&mut self, out: &mut impl FnMut(Transfer)) {
         let mut open: Vec<_> = self.open.drain().map(|(_, open)| open).collect();
         open.sort_by_key(|open| open.transfer.start_ns);
@@ -116,7 +119,7 @@ impl Transport {
         self.headless.clear();
     }
 
-    /// Appends the transfers under way.
+    /// Appends the transfers in progress.
     pub fn under_way(&self, out: &mut Vec<UnderWay>) {
         out.extend(self.open.values().map(|Open { transfer, .. }| UnderWay {
             channel: transfer.channel,
@@ -129,7 +132,7 @@ impl Transport {
         }));
     }
 
-    /// Frames of the channel are missing.
+    /// Frames on the channel are missing.
     fn interrupt(&mut self, channel: u8) {
         for open in self.open.values_mut().filter(|open| open.transfer.channel == channel) {
             open.transfer.frames_lost = true;
@@ -139,7 +142,7 @@ impl Transport {
         }
     }
 
-    /// Ends what has waited for too long.
+    /// Ends whatever has timed out.
     fn sweep(&mut self, now_ns: i64, out: &mut impl FnMut(Transfer)) {
         self.sweep_ns = now_ns.saturating_add(SWEEP_NS);
         let over = |open: &Open| now_ns.saturating_sub(open.transfer.time_ns) > NEXT_TIMEOUT_NS;
@@ -230,7 +233,7 @@ impl Transport {
         }
     }
 
-    /// The same sender begins something new.
+    /// The same sender begins a new transfer.
     fn overlap(&mut self, key: (u8, Endpoint), out: &mut impl FnMut(Transfer)) {
         if !self.headless.is_empty() {
             self.headless.remove(&key);
@@ -253,7 +256,8 @@ impl Transport {
         out: &mut impl FnMut(Transfer),
     ) {
         let Some(open) = self.open.get_mut(&key) else {
-            // The rest of a transfer that has ended already, or whose beginning was not heard, is reported once.
+            // The rest of a transfer that has already ended, or whose beginning was not observed, is reported
+            // once.
             if self.headless.len() >= MOST_OPEN {
                 self.headless.clear();
             }
@@ -266,7 +270,8 @@ impl Transport {
         let transfer = &mut open.transfer;
         transfer.frames += 1;
         if let (Some(last_ns), Some(separation_us)) = (open.last_ns, transfer.separation_us) {
-            // From the end of one frame to the beginning of the next: between two stamps lies one frame more.
+            // From the end of one frame to the beginning of the next: between two stamps there is also one
+            // frame.
             let least_ns = i64::from(separation_us) * 1000;
             transfer.too_early += u32::from(fresh.time_ns.saturating_sub(last_ns) < least_ns);
         }
@@ -275,7 +280,7 @@ impl Transport {
         if number != open.next {
             let trouble = Trouble::Sequence { expected: open.next.into(), got: number.into() };
             if let Some(open) = self.open.remove(&key) {
-                // What follows it belongs to what has just been reported.
+                // What follows belongs to what has just been reported.
                 self.headless.insert(key, number);
                 end(open, trouble, out);
             }
@@ -306,13 +311,13 @@ impl Transport {
     }
 }
 
-/// How long the first frame was, by what it brought of the message. The control information has two bytes; only what is longer than
-/// 4095 bytes has more, and is not looked for.
+/// The length of the first frame, derived from how much of the message it contained. The control information has two bytes; only
+/// messages longer than 4095 bytes have more, which is not checked.
 fn first_frame_bytes(transfer: &Transfer, offset: usize) -> usize {
     offset + 2 + transfer.data.len()
 }
 
-/// Hands out what did not become whole.
+/// Passes on an incomplete transfer.
 fn end(open: Open, trouble: Trouble, out: &mut impl FnMut(Transfer)) {
     let mut transfer = open.transfer;
     if !open.is_new || transfer.frames >= FRAMES_THAT_CONVINCE {
@@ -321,14 +326,14 @@ fn end(open: Open, trouble: Trouble, out: &mut impl FnMut(Transfer)) {
     }
 }
 
-/// Transfers as events, without their meaning.
+/// Transfers as events, without interpreting them.
 #[derive(Clone, Debug, Default)]
 pub struct IsoTp {
     transport: Transport,
 }
 
 impl IsoTp {
-    /// With pairs that are known on all channels; `finds` looks for others.
+    /// With pairs that are known on all channels; `finds` enables the search for others.
     pub fn new(pairs: &[Pair], finds: bool) -> Self {
         Self { transport: Transport::new(pairs, finds) }
     }

@@ -1,4 +1,4 @@
-//! Who answers whom.
+//! Pairs of senders that answer each other.
 
 use std::fmt;
 use std::str::FromStr;
@@ -8,31 +8,31 @@ use rustc_hash::FxHashMap;
 
 use crate::Party;
 
-/// Found pairs kept for all channels together; more are not looked for.
+/// How many pairs that were found are kept for all channels together.
 const MOST_FOUND: usize = 1024;
 
 /// A sender: its identifier and, in extended and mixed addressing, the first data byte.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Endpoint {
-    /// The identifier that it sends with.
+    /// The identifier of its frames.
     pub id: Id,
     /// The first data byte of its frames: the receiver's address (extended addressing) or the address extension (mixed).
     pub address: Option<u8>,
 }
 
-/// Two that talk to each other: each one's flow control is for the other's transfers.
+/// Two senders that talk to each other: each one's flow control is for the other's transfers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Pair {
-    /// One of them, as a rule the one who asks.
+    /// One of them, usually the one that asks.
     pub a: Endpoint,
     /// The other.
     pub b: Endpoint,
 }
 
-/// A text is no pair.
+/// A text that is not a pair.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "'{0}' is no pair; write two identifiers, as 7E0:7E8, or 6F1/12:612/F1 where the first data byte is an address"
+    "'{0}' is not a pair; write two identifiers, as 7E0:7E8, or 6F1/12:612/F1 where the first data byte is an address"
 )]
 pub struct BadPair(String);
 
@@ -71,34 +71,34 @@ impl FromStr for Pair {
             Some(Endpoint { id: id.parse().ok()?, address })
         };
         let pair = text.split_once(':').and_then(|(a, b)| Some(Self { a: endpoint(a)?, b: endpoint(b)? }));
-        // An address is in all frames of both or in none.
+        // Either all frames of both have an address, or none.
         let pair =
             pair.filter(|pair| pair.a.address.is_some() == pair.b.address.is_some() && pair.a != pair.b);
         pair.ok_or_else(|| BadPair(text.to_owned()))
     }
 }
 
-/// Identifiers that take part, and who is the other side.
+/// The identifiers that take part, and their other sides.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Pairs {
-    /// Address bytes before the control information, by channel (0 for all) and identifier.
+    /// Number of address bytes before the control information, by channel (0 for all) and identifier.
     offsets: FxHashMap<(u8, Id), u8>,
     partners: FxHashMap<(u8, Endpoint), Endpoint>,
 }
 
-/// The identifiers that ISO 15765-4 and ISO 15765-2 set aside.
+/// The identifiers reserved by ISO 15765-4 and ISO 15765-2.
 pub(super) enum Fixed {
     /// 7E0 to 7EF, 18DAxxyy.
     Physical(Id),
     /// 7DF, 18DBxxyy: to all.
     Functional,
-    /// 18CExxyy: as 18DAxxyy, with an address extension.
+    /// 18CExxyy: like 18DAxxyy, with an address extension.
     MixedPhysical(Id),
     /// 18CDxxyy.
     MixedFunctional,
 }
 
-/// Which of them an identifier is.
+/// The reserved use of an identifier, if any.
 pub(super) fn fixed(id: Id) -> Option<Fixed> {
     let raw = id.raw();
     if !id.is_extended() {
@@ -120,7 +120,7 @@ pub(super) fn fixed(id: Id) -> Option<Fixed> {
 }
 
 impl Pairs {
-    /// Adds a pair for a channel, or for all (0); false if no more are kept.
+    /// Adds a pair for a channel, or for all (0); false if the limit is reached.
     pub fn add(&mut self, channel: u8, pair: Pair) -> bool {
         if channel != 0 && self.offsets.len() >= 2 * MOST_FOUND {
             return false;
@@ -132,7 +132,7 @@ impl Pairs {
         true
     }
 
-    /// How many address bytes the identifier's frames have; `None` if it takes part in no transfers.
+    /// The number of address bytes in the identifier's frames; `None` if it takes part in no transfers.
     pub fn offset(&self, channel: u8, id: Id) -> Option<usize> {
         if !self.offsets.is_empty() {
             let known = self.offsets.get(&(channel, id)).or_else(|| self.offsets.get(&(0, id)));

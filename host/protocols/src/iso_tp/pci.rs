@@ -1,39 +1,39 @@
 //! The protocol control information at the beginning of each frame (ISO 15765-2:2016, clause 9.6).
 
-/// What a frame is in a transfer.
+/// The role of a frame in a transfer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pci<'a> {
-    /// A whole message.
+    /// A complete message.
     Single(&'a [u8]),
-    /// The first frame of several.
+    /// The first of several frames.
     First {
-        /// Bytes of the whole message.
+        /// Length of the whole message in bytes.
         length: u32,
-        /// The first of them.
+        /// The first part of it.
         data: &'a [u8],
     },
-    /// One of the following.
+    /// A consecutive frame.
     Consecutive {
         /// Its sequence number, 0 to 15.
         number: u8,
-        /// Its bytes, padding behind the last message byte included.
+        /// Its bytes, including padding after the last message byte.
         data: &'a [u8],
     },
-    /// The receiver's word on how to go on.
+    /// Flow control from the receiver.
     Flow {
-        /// Go on, wait, or do not.
+        /// Whether to continue, wait, or stop.
         status: FlowStatus,
-        /// How many frames until the next flow control; 0 for all.
+        /// The number of frames until the next flow control; 0 for all.
         block_size: u8,
-        /// Least time between two frames in microseconds.
+        /// Minimum time between two frames, in microseconds.
         separation_us: u32,
     },
 }
 
-/// What a flow control frame says.
+/// The status in a flow control frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FlowStatus {
-    /// Continue to send.
+    /// Continue sending.
     Go,
     /// Wait for another flow control frame.
     Wait,
@@ -41,14 +41,14 @@ pub enum FlowStatus {
     Overflow,
 }
 
-/// Reads what follows the address, if there is one, of a frame. `offset` is the number of address bytes, 0 or 1. The error is what is
-/// wrong, and `None` is no frame of this protocol.
+/// Parses a frame after the address, if there is one. `offset` is the number of address bytes, 0 or 1. An error says what is wrong;
+/// `None` means that the frame does not belong to this protocol.
 pub fn parse(bytes: &[u8], offset: usize) -> Result<Option<Pci<'_>>, &'static str> {
     let Some((&first, rest)) = bytes.get(offset..).and_then(<[u8]>::split_first) else { return Ok(None) };
     let low = first & 15;
     Ok(Some(match first >> 4 {
         0 if bytes.len() > 8 => {
-            // An FD frame has its length in the second byte, above what fits into a classical one.
+            // An FD frame has its length in the second byte if it exceeds what fits in a classical frame.
             let (0, Some((&length, data))) = (low, rest.split_first()) else {
                 return Err("a single frame of more than 8 bytes has its length in the second byte");
             };
@@ -96,7 +96,7 @@ fn single(length: u8, data: &[u8]) -> Result<&[u8], &'static str> {
     }
 }
 
-/// Reserved values stand for the longest time (clause 9.6.5.5).
+/// Reserved values mean the longest time (clause 9.6.5.5).
 fn separation_us(byte: u8) -> u32 {
     match byte {
         0..=0x7F => u32::from(byte) * 1000,

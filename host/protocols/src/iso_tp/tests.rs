@@ -101,7 +101,7 @@ fn flow_control_is_kept_to_or_said() {
 
 #[test]
 fn pairs_are_found_by_what_they_do_in_every_addressing() {
-    // Beside them, frames of others that look like parts of a transfer.
+    // In between, other frames that look like parts of a transfer.
     let noise = [at(0.1, "111#1008AABBCCDDEEFF"), at(0.2, "222#3000"), at(1.5, "333#2100")];
     for frames in [
         ["6A0#1009010203040506", "6B0#300000", "6A0#21070809", "6B0#027E00"],
@@ -157,7 +157,7 @@ fn fd_frames_carry_more() {
     assert_eq!(all[1].data, vec![7; 5000]);
 }
 
-/// Memory stays bounded, and what is given up is said.
+/// Memory stays bounded, and whatever is abandoned is reported.
 #[test]
 fn a_flood_of_first_frames_is_given_up_one_by_one() {
     let mut transport = Transport::new(&[], true);
@@ -172,7 +172,8 @@ fn a_flood_of_first_frames_is_given_up_one_by_one() {
     assert_eq!(given_up, 100_000 - MOST_OPEN as u32);
 }
 
-/// Senders at once, with frames dropped, repeated and swapped: what is whole is what was sent, and the rest is said.
+/// Several senders at once, with frames dropped, repeated and swapped: what is complete is what was sent, and the
+/// rest is reported.
 #[test]
 fn transfers_at_random_are_whole_and_right_or_said_to_be_broken() {
     let mut random = fastrand::Rng::with_seed(15_765);
@@ -228,7 +229,7 @@ fn transfers_at_random_are_whole_and_right_or_said_to_be_broken() {
     }
 }
 
-/// Its bytes would end up in the wrong places.
+/// Its bytes would end up in the wrong position.
 #[test]
 fn a_short_frame_in_the_middle_is_not_glued_over() {
     let frames =
@@ -237,7 +238,7 @@ fn a_short_frame_in_the_middle_is_not_glued_over() {
     let all = transfers(&[], &records);
     assert_eq!(all.len(), 1, "{all:?}");
     assert!(matches!(all[0].trouble, Some(Trouble::Malformed(_))), "{all:?}");
-    // In CAN FD, the last one alone may be shorter, and the first one says how long the others are.
+    // In CAN FD, only the last one may be shorter, and the first one shows how long the others are.
     let fd = |ms: i64, bytes: Vec<u8>| {
         let frame = FdFrame::new(Id::standard_truncated(0x7E8), true, false, &bytes).unwrap();
         let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };

@@ -1,12 +1,12 @@
-//! What a transfer was.
+//! A transfer.
 
 use super::pairs::Endpoint;
 use crate::Trouble;
 
-/// A message of one or many frames, or as much of it as there was.
+/// A message of one or many frames, or as much of it as arrived.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Transfer {
-    /// The stamp of the last frame, or when it was given up, in nanoseconds.
+    /// The stamp of the last frame, or when it was abandoned, in nanoseconds.
     pub time_ns: i64,
     /// The stamp of the first frame.
     pub start_ns: i64,
@@ -14,30 +14,30 @@ pub struct Transfer {
     pub channel: u8,
     /// The sender.
     pub from: Endpoint,
-    /// The receiver, where it is known and only one.
+    /// The receiver, if it is known and unique.
     pub to: Option<Endpoint>,
     /// The bytes.
     pub data: Vec<u8>,
-    /// How many there should be.
+    /// The expected number of bytes.
     pub length: u32,
-    /// The frames that it took, flow control included.
+    /// Number of frames, including flow control.
     pub frames: u32,
-    /// What the receiver asked for last: frames until the next flow control.
+    /// From the receiver's last flow control: frames until the next one.
     pub block_size: Option<u8>,
-    /// What the receiver asked for last: microseconds between two frames.
+    /// From the receiver's last flow control: microseconds between two frames.
     pub separation_us: Option<u32>,
     /// Flow control frames that asked to wait.
     pub waits: u32,
-    /// Frames that came earlier than the receiver had asked for.
+    /// Frames that came earlier than the receiver had requested.
     pub too_early: u32,
     /// What went wrong.
     pub trouble: Option<Trouble>,
-    /// Frames of the channel were lost meanwhile.
+    /// Frames on the channel were lost meanwhile.
     pub frames_lost: bool,
 }
 
 impl Transfer {
-    /// Whether all of it is there.
+    /// Whether it is complete.
     pub fn is_whole(&self) -> bool {
         self.trouble.is_none()
     }

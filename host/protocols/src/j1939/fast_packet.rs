@@ -1,6 +1,6 @@
 //! NMEA 2000's fast packets: up to 223 bytes in up to 32 frames.
 //!
-//! Memory: at most 256 under way, each with at most 223 bytes.
+//! Memory: at most 256 in progress, each of at most 223 bytes.
 
 use rustc_hash::FxHashMap;
 
@@ -8,39 +8,39 @@ use super::header::Header;
 use super::transport::{Assembled, Way};
 use crate::Trouble;
 
-/// Between two frames of a packet.
+/// Maximum time between two frames of a packet.
 const NEXT_NS: i64 = 750_000_000;
 const SWEEP_NS: i64 = 100_000_000;
 const MOST_OPEN: usize = 256;
 const MOST_BYTES: u8 = 223;
 
-/// Channel, sender, receiver, group and the counter of the packet.
+/// Channel, sender, receiver, group and sequence counter of the packet.
 type Key = (u8, u8, u8, u32, u8);
 
-/// Puts fast packets together.
+/// Reassembles fast packets.
 #[derive(Clone, Debug, Default)]
 pub struct FastPackets {
-    /// With the number of the next frame.
+    /// Each with the number of the next frame.
     open: FxHashMap<Key, (Assembled, u8)>,
-    /// Packets that ended early, or whose beginning was not heard: the rest of each is reported once.
+    /// Packets that ended early, or whose beginning was not observed: the rest of each is reported once.
     headless: FxHashMap<Key, u8>,
     sweep_ns: i64,
 }
 
 impl FastPackets {
-    /// Frames of the channel are missing.
+    /// Frames on the channel are missing.
     pub fn interrupt(&mut self, channel: u8) {
         for (message, _) in self.open.values_mut().filter(|(message, _)| message.channel == channel) {
             message.frames_lost = true;
         }
     }
 
-    /// Those under way.
+    /// Those in progress.
     pub fn open(&self) -> impl Iterator<Item = &Assembled> {
         self.open.values().map(|(message, _)| message)
     }
 
-    /// Ends what has waited for too long.
+    /// Ends whatever has timed out.
     pub fn advance(&mut self, now_ns: i64, out: &mut impl FnMut(Assembled)) {
         if self.open.is_empty() || now_ns < self.sweep_ns {
             return;

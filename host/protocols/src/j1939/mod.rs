@@ -1,6 +1,8 @@
-//! SAE J1939: parameter groups, messages of many frames, address claims, requests, trouble codes; signals by a database.
+//! SAE J1939: parameter groups, messages of many frames, address claims, requests, trouble codes; and signals from a
+//! database.
 //!
-//! Memory: 256 messages of many frames under way, each with at most 64 KiB, 64 requests that wait, and a NAME for each of 254 addresses on each channel.
+//! Memory: 256 messages of many frames in progress, each of at most 64 KiB, 64 waiting requests, and a NAME for each of 254 addresses on each
+//! channel.
 
 mod fast_packet;
 mod header;
@@ -48,12 +50,12 @@ struct Request {
     answered: bool,
 }
 
-/// Reads a J1939 bus, or one of NMEA 2000, which is J1939 with fast packets and its own parameter groups.
+/// Decodes a J1939 bus, or an NMEA 2000 bus, which is J1939 plus fast packets and its own parameter groups.
 #[derive(Default)]
 pub struct J1939 {
-    /// NMEA 2000's part.
+    /// The part for NMEA 2000.
     marine: Option<FastPackets>,
-    /// Both are on this bus: what only NMEA 2000 gives a meaning is its own, the rest J1939's.
+    /// Both are on this bus: groups defined only by NMEA 2000 belong to it, the rest to J1939.
     tells_apart: bool,
     transport: LongMessages,
     requests: VecDeque<Request>,
@@ -63,12 +65,12 @@ pub struct J1939 {
 }
 
 impl J1939 {
-    /// With a database's signals, where there is one.
+    /// With a database's signals, if any.
     pub fn new(decoder: Option<Arc<Decoder>>) -> Self {
         Self { decoder, ..Self::default() }
     }
 
-    /// For NMEA 2000. A database's signals go before those that are known.
+    /// For NMEA 2000. A database's signals take precedence over built-in ones.
     pub fn nmea2000(decoder: Option<Arc<Decoder>>) -> Self {
         Self { marine: Some(FastPackets::default()), ..Self::new(decoder) }
     }
@@ -103,7 +105,7 @@ impl J1939 {
                 if self.transport.data(channel, time_ns, header, data, &mut out) {
                     Ok(())
                 } else {
-                    // Told once for each message: the rest of it says no more.
+                    // Reported once for each message: the rest of it adds nothing.
                     let mut event = self.event(record, header, "broken");
                     event.trouble = Some(Trouble::Headless);
                     events.push(event);
@@ -233,7 +235,7 @@ impl J1939 {
         events.push(event);
     }
 
-    /// A database's signals; false if it does not know the group.
+    /// Adds a database's signals; false if it does not have the group.
     fn signals(&self, channel: u8, header: Header, data: &[u8], event: &mut Event) -> bool {
         let Some(decoder) = &self.decoder else { return false };
         let Some(reference) = decoder.find(channel, header.id()) else { return false };
@@ -253,7 +255,7 @@ impl J1939 {
         true
     }
 
-    /// What NMEA 2000 has of it; false if it is not known.
+    /// Adds the fields from NMEA 2000; false if it does not have the group.
     fn marine_fields(&self, header: Header, data: &[u8], event: &mut Event) -> bool {
         if self.marine.is_none() {
             return false;
@@ -300,7 +302,7 @@ impl J1939 {
         });
     }
 
-    /// Whether the message is what somebody asked for, and how long ago.
+    /// Whether the message answers a request, and how long ago that was.
     fn answer(&mut self, channel: u8, header: Header, pgn: u32, event: &mut Event) {
         if self.requests.is_empty() {
             return;
@@ -323,7 +325,7 @@ impl J1939 {
         }
     }
 
-    /// To all there need not be an answer.
+    /// A request to all need not be answered.
     fn unanswered(&self, request: Request, trouble: Trouble, record: &TraceRecord, events: &mut Vec<Event>) {
         if request.answered || request.to == GLOBAL {
             return;
@@ -345,7 +347,7 @@ impl J1939 {
     }
 }
 
-/// Whether the group is one that J1939 gives a meaning and that diagnostics by ISO 15765 do not use.
+/// Whether J1939 defines the group and diagnostics over ISO 15765 do not use it.
 pub(crate) fn is_known(pgn: u32) -> bool {
     !matches!(pgn, 0xDA00 | 0xDB00) && pgn < 0xFF00 && names::group(pgn).is_some()
 }
@@ -418,7 +420,7 @@ impl Assembler for J1939 {
 }
 
 impl Party {
-    /// The node's address, if it is one.
+    /// The node's address, if it has one.
     pub const fn node(self) -> Option<u8> {
         match self {
             Self::Node(node) => Some(node),

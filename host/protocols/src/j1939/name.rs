@@ -1,4 +1,4 @@
-//! The 64-bit NAME that a node claims its address with (SAE J1939-81, 4.1).
+//! The 64-bit NAME with which a node claims its address (SAE J1939-81, 4.1).
 
 use crate::Field;
 
@@ -31,7 +31,7 @@ const fn industry_group(group: i64) -> Option<&'static str> {
     })
 }
 
-/// Functions below 128 mean the same in each industry.
+/// Functions below 128 have the same meaning in every industry.
 const fn function(function: i64) -> Option<&'static str> {
     Some(match function {
         0 => "engine",

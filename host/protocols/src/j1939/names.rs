@@ -1,6 +1,6 @@
 //! Parameter groups and failure modes by name.
 
-/// Names of groups that a bus is likely to carry (SAE J1939-71 and -73 by their public acronyms).
+/// Names of groups that are likely to be on a bus (SAE J1939-71 and -73, by their public acronyms).
 const GROUPS: [(u32, &str); 98] = [
     (0x0000, "TSC1 torque/speed control"),
     (0x0100, "TC1 transmission control"),
@@ -112,7 +112,7 @@ pub fn group(pgn: u32) -> Option<&'static str> {
     })
 }
 
-/// The table is by the low 16 bits, so that pages stand together.
+/// The table is sorted by the low 16 bits, so that pages are together.
 const fn order(pgn: u32) -> u32 {
     (pgn & 0xFFFF) << 2 | pgn >> 16
 }

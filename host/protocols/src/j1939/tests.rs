@@ -53,7 +53,7 @@ fn connections_are_followed_with_their_times() {
         (5.0, "18EC0021#110201FFFFEBFE00"),
         (10.0, "18EB2100#0141424344454647"),
         (11.0, "18EB2100#0248494A4B4C4D4E"),
-        // The second one is asked for again.
+        // The second one is requested again.
         (12.0, "18EC0021#110302FFFFEBFE00"),
         (13.0, "18EB2100#0248494A4B4C4D4E"),
         (14.0, "18EB2100#034F505152535455"),
@@ -65,7 +65,7 @@ fn connections_are_followed_with_their_times() {
     let expected = "j1939 0 > 33 CI component identification: pgn 65259, priority 6, transport \"RTS/CTS\", length 23 bytes, \
                     rts_to_cts_ms 5 ms, text \"ABCDEFGHIJKLMNOPQRSTUVW\"";
     assert_eq!(said(&frames), [expected]);
-    // Without the repetition the frame that is missing is said at the acknowledgement.
+    // Without the repetition, the missing frame is reported at the acknowledgement.
     let without: Vec<_> = [&frames[..3], &frames[7..]].concat();
     assert!(said(&without)[0].ends_with("frame 4 came instead of 2"), "{:?}", said(&without));
     let aborted = said(&[frames[0], (1.0, "18EC0021#FF01FFFFFFEBFE00")]);
@@ -148,7 +148,7 @@ fn a_database_gives_signals_of_one_and_of_many_frames() {
     );
 }
 
-/// Frames of many senders, some dropped, repeated or swapped: what is whole is what was sent.
+/// Frames from many senders, some dropped, repeated or swapped: what is complete is what was sent.
 #[test]
 fn messages_at_random_are_whole_and_right_or_said_to_be_broken() {
     let mut random = fastrand::Rng::with_seed(1939);
@@ -221,7 +221,7 @@ fn any_frames_are_taken() {
     assembler.finish(&mut events);
 }
 
-/// The receiver asks again for what it missed, although it was heard here.
+/// The receiver requests what it missed again, although it was received here.
 #[test]
 fn frames_that_come_again_behind_the_last_one_are_no_fault() {
     let frames = [
@@ -236,12 +236,12 @@ fn frames_that_come_again_behind_the_last_one_are_no_fault() {
     let all = said(&frames);
     assert_eq!(all.len(), 1, "{all:?}");
     assert!(all[0].contains("text \"ABCDEFGHIJKLMN\""), "{all:?}");
-    // What comes long after belongs to nothing.
+    // What comes long afterwards belongs to nothing.
     let late = said(&[frames[0], frames[1], frames[2], frames[3], (9000.0, frames[5].1)]);
     assert!(late[1].ends_with("its beginning was not heard"), "{late:?}");
 }
 
-/// Two nodes send to each other at once; one of them gives up.
+/// Two nodes send to each other at the same time; one of them aborts.
 #[test]
 fn an_abort_ends_the_message_that_it_names() {
     let all = said(&[

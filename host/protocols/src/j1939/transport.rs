@@ -1,6 +1,6 @@
 //! Messages of many frames: SAE J1939-21's transport protocol, and ISO 11783-3's extended one.
 //!
-//! Memory: at most 256 under way, each with at most 64 KiB.
+//! Memory: at most 256 in progress, each of at most 64 KiB.
 
 use rustc_hash::FxHashMap;
 
@@ -13,9 +13,9 @@ pub const DATA: u32 = 0xEB00;
 pub const EXTENDED_CONTROL: u32 = 0xC800;
 pub const EXTENDED_DATA: u32 = 0xC700;
 
-/// Between two frames of a broadcast: T1 (J1939-21, 5.10.2.4).
+/// Maximum time between two frames of a broadcast: T1 (J1939-21, 5.10.2.4).
 const BROADCAST_NS: i64 = 750_000_000;
-/// While one side waits for the other: T2 and T3.
+/// Maximum time that one side waits for the other: T2 and T3.
 const PEER_NS: i64 = 1_250_000_000;
 const SWEEP_NS: i64 = 100_000_000;
 const MOST_OPEN: usize = 256;
@@ -26,7 +26,7 @@ const MOST_BYTES: usize = 1 << 16;
 pub enum Way {
     /// To all, without an answer.
     Broadcast,
-    /// To one, who says when to send.
+    /// To one receiver, which says when to send.
     Connection,
     /// The same for more than 1785 bytes.
     Extended,
@@ -35,7 +35,7 @@ pub enum Way {
 }
 
 impl Way {
-    /// For people.
+    /// The name for display.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Broadcast => "BAM",
@@ -46,44 +46,46 @@ impl Way {
     }
 }
 
-/// A message, whole or as far as it came.
+/// A message, complete or as far as it got.
 #[derive(Clone, Debug)]
 pub struct Assembled {
     pub time_ns: i64,
     pub start_ns: i64,
     pub channel: u8,
-    /// Of the message itself.
+    /// The header of the message itself.
     pub header: Header,
     pub way: Way,
     pub data: Vec<u8>,
-    /// How many bytes there should be.
+    /// The expected number of bytes.
     pub size: u32,
     pub frames: u32,
-    /// From the request to send to the first clear to send, in nanoseconds.
+    /// Time from the request to send to the first clear to send, in nanoseconds.
     pub cleared_ns: Option<i64>,
     pub trouble: Option<Trouble>,
     pub frames_lost: bool,
 }
 
-/// One under way.
+/// A message in progress.
 #[derive(Clone, Debug)]
 pub(super) struct Open {
     pub message: Assembled,
     /// The next frame, from 1 (of the whole message).
     pub next: u32,
-    /// Frames that were announced before the window of an extended transfer.
+    /// Number of frames before the window of an extended transfer.
     offset: u32,
-    /// A frame came out of order, and the receiver has not asked for it again so far.
+    /// A frame came out of order, and the receiver has not requested it again so far.
     gap: Option<Trouble>,
 }
 
-/// Puts messages together.
+/// Reassembles messages.
 #[derive(Clone, Debug, Default)]
 pub struct LongMessages {
     open: FxHashMap<(u8, u8, u8, bool), Open>,
-    /// Messages that ended early, or whose beginning was not heard: the last frame of each, so that its rest is reported once.
+    /// Messages that ended early, or whose beginning was not observed: the last frame of each, so that the rest is reported
+    /// once.
     headless: FxHashMap<(u8, u8, u8, bool), u8>,
-    /// Connections whose last frame was heard and that the receiver has not acknowledged: it may ask for frames again that we have.
+    /// Connections whose last frame was received but that the receiver has not acknowledged: it may request frames again that we
+    /// have.
     delivered: FxHashMap<(u8, u8, u8, bool), i64>,
     sweep_ns: i64,
 }
@@ -112,19 +114,19 @@ fn reason(code: u8) -> &'static str {
 }
 
 impl LongMessages {
-    /// Frames of the channel are missing.
+    /// Frames on the channel are missing.
     pub fn interrupt(&mut self, channel: u8) {
         for open in self.open.values_mut().filter(|open| open.message.channel == channel) {
             open.message.frames_lost = true;
         }
     }
 
-    /// Those under way.
+    /// Those in progress.
     pub fn open(&self) -> impl Iterator<Item = &Assembled> {
         self.open.values().map(|open| &open.message)
     }
 
-    /// Ends what has waited for too long.
+    /// Ends whatever has timed out.
     pub fn advance(&mut self, now_ns: i64, out: &mut impl FnMut(Assembled)) {
         if self.open.is_empty() || now_ns < self.sweep_ns {
             return;
@@ -187,7 +189,7 @@ impl LongMessages {
         };
         let (source, destination) = (header.source, header.destination);
         let of = Header { pgn: pgn([e, f, g]), ..header };
-        // What the receiver says is about the message that goes the other way.
+        // A message from the receiver is about the transfer in the other direction.
         let back = (channel, destination, source, extended);
         let message = Assembled {
             time_ns,
@@ -223,7 +225,7 @@ impl LongMessages {
                 (message.time_ns, message.frames) = (time_ns, message.frames + 1);
                 message.cleared_ns.get_or_insert(time_ns.saturating_sub(message.start_ns));
                 let next = if extended { u32::from_le_bytes([b, c, d, 0]) } else { u32::from(b) };
-                // The receiver may want frames again; a pause (0 frames) names none.
+                // The receiver may want frames again; a pause (0 frames) does not name any.
                 if a > 0 && (1..open.next).contains(&next) {
                     open.next = next;
                     message.data.truncate((next as usize - 1) * 7);
@@ -241,7 +243,8 @@ impl LongMessages {
             }
             (19 | 23, _) => {
                 self.delivered.remove(&back);
-                // All that had arrived was handed out with its last frame; what is still here was not heard whole.
+                // Everything received completely was passed on with its last frame; what is still here is
+                // incomplete.
                 if let Some(mut open) = self.open.remove(&back) {
                     open.message.time_ns = time_ns;
                     let got = open.message.data.len().div_ceil(7) as u32 + 1;
@@ -251,7 +254,7 @@ impl LongMessages {
             }
             (255, _) => {
                 let forward = (channel, source, destination, extended);
-                // Both may send to each other at the same time: the group says which message is meant.
+                // Both may send to each other at the same time: the group shows which message is meant.
                 let means = |key| self.open.get(key).is_some_and(|open| open.message.header.pgn == of.pgn);
                 let key = if means(&forward) && !means(&back) { forward } else { back };
                 self.delivered.remove(&back);
@@ -269,7 +272,7 @@ impl LongMessages {
         Ok(())
     }
 
-    /// Takes a data frame; false if it is the first of those that belong to nothing under way.
+    /// Takes a data frame; false if it is the first of those that belong to nothing in progress.
     pub fn data(
         &mut self,
         channel: u8,
@@ -281,7 +284,7 @@ impl LongMessages {
         let key = (channel, header.source, header.destination, header.pgn == EXTENDED_DATA);
         let Some((&sequence, bytes)) = data.split_first() else { return true };
         let Some(open) = self.open.get_mut(&key) else {
-            // Sent again for a receiver that missed what was heard here.
+            // Sent again for a receiver that missed what was received here.
             if let Some(last_ns) = self.delivered.get_mut(&key) {
                 let age_ns = time_ns.saturating_sub(*last_ns);
                 *last_ns = time_ns;
@@ -307,7 +310,7 @@ impl LongMessages {
                     end(open, trouble, out);
                 }
             } else {
-                // A receiver that misses it too asks for it again.
+                // A receiver that also misses it requests it again.
                 open.gap.get_or_insert(trouble);
             }
             return true;

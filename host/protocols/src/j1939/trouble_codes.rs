@@ -5,12 +5,12 @@ use std::fmt::Write as _;
 use super::names::failure_mode;
 use crate::Field;
 
-/// Whether the group carries lamps and codes as DM1 does.
+/// Whether the group contains lamps and codes like DM1.
 pub const fn carries(pgn: u32) -> bool {
     matches!(pgn, 0xFECA | 0xFECB | 0xFECF | 0xFED4 | 0xFDB5 | 0xFD80 | 0xFD82)
 }
 
-/// Lamps, then codes.
+/// Adds lamps, then codes.
 pub fn fields(data: &[u8], fields: &mut Vec<Field>) {
     let &[lamps, flashing, ref codes @ ..] = data else { return };
     for (shift, name) in
@@ -38,7 +38,7 @@ pub fn fields(data: &[u8], fields: &mut Vec<Field>) {
             let _ = write!(text, " {times} times");
         }
         if code[3] & 0x80 != 0 {
-            // The first two of the four ways to write a number are not told from the third by anything in the message.
+            // Nothing in the message distinguishes the first two of the four number formats from the third.
             let [a, b, c] = [code[0], code[1], code[2] >> 5].map(u32::from);
             let (first, second) = (a << 11 | b << 3 | c, b << 11 | a << 3 | c);
             let _ = write!(text, " in an old conversion: SPN {first} by version 1, {second} by version 2");

@@ -6,24 +6,24 @@ use std::sync::OnceLock;
 use rustc_hash::FxHashMap;
 use serde::Deserialize;
 
-/// The database as its project publishes it.
+/// The database as published by its project.
 const COMPRESSED: &[u8] = include_bytes!("../../data/canboat.json.gz");
 
-/// All groups and the tables that their fields refer to.
+/// All groups and the tables to which their fields refer.
 #[derive(Debug, Default)]
 pub struct Database {
-    /// By number, then in the order of the file.
+    /// Sorted by number, then in the order of the file.
     groups: Vec<Group>,
-    /// Where those of a number are, and how many.
+    /// The index of the first group with a number, and how many there are.
     places: FxHashMap<u32, (usize, usize)>,
-    /// The places of those that stand for a range of numbers, by the first of it.
+    /// The indexes of the groups for ranges of numbers, by first number.
     fallbacks: Vec<usize>,
     pub lookups: FxHashMap<String, FxHashMap<u64, String>>,
     pub bits: FxHashMap<String, FxHashMap<u64, String>>,
-    /// By the other field's value and this one's.
+    /// By the value of the other field and that of this one.
     pub indirect: FxHashMap<String, FxHashMap<(u64, u64), String>>,
     pub kinds: FxHashMap<String, FxHashMap<u64, Key>>,
-    /// How many entries of the file there were.
+    /// Number of entries in the file.
     #[cfg(test)]
     pub entries: usize,
 }
@@ -54,7 +54,7 @@ pub struct Group {
     pub set_2_count: usize,
 }
 
-/// How a field's bits are to be read.
+/// How to interpret a field's bits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "SCREAMING_SNAKE_CASE")]
 pub enum Kind {
@@ -113,7 +113,7 @@ pub struct FieldKind {
     pub lookup_field_type_enumeration: Option<String>,
 }
 
-/// What a key of a key and its value stands for.
+/// The meaning of a key in a key-value pair.
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "PascalCase")]
 pub struct Key {
@@ -164,8 +164,7 @@ struct Entry {
 }
 
 impl Database {
-    /// The database, read when it is first asked for. Nothing is in it if the file that this crate was built with cannot be read, which a
-    /// test excludes.
+    /// The database, parsed when first used. It is empty if the built-in file cannot be parsed, which a test rules out.
     pub fn get() -> &'static Self {
         static DATABASE: OnceLock<Database> = OnceLock::new();
         DATABASE.get_or_init(|| Self::read().unwrap_or_default())
@@ -220,12 +219,12 @@ impl Database {
         })
     }
 
-    /// Those that share a number.
+    /// The groups with this number.
     pub fn groups(&self, pgn: u32) -> &[Group] {
         self.places.get(&pgn).map_or(&[], |&(first, count)| &self.groups[first..first + count])
     }
 
-    /// The one that stands for a range of numbers whose meaning is not known.
+    /// The group for a range of numbers without a known meaning.
     pub fn fallback(&self, pgn: u32) -> Option<&Group> {
         let before = self.fallbacks.partition_point(|&place| self.groups[place].pgn <= pgn);
         self.fallbacks[..before].last().map(|&place| &self.groups[place])

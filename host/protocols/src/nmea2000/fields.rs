@@ -1,14 +1,14 @@
-//! A group's bytes as named values, by CANboat's database.
+//! A group's bytes as named values, according to CANboat's database.
 
 use std::borrow::Cow;
 
 use super::database::{Database, FieldKind, Group, Kind};
 use crate::{Field, Value};
 
-/// The most values of one message: what repeats is bounded by the data, this bounds what is empty.
+/// Limit for the values of one message: repeated sets are limited by the data, but empty ones would not be.
 const MOST_FIELDS: usize = 2048;
 
-/// Bits from the lowest of the first byte on; `None` if the data ends before them.
+/// Bits counted from the lowest of the first byte; `None` if the data are too short.
 fn bits(data: &[u8], offset: usize, length: usize) -> Option<u64> {
     if length > 64 || offset + length > data.len() * 8 {
         return None;
@@ -25,7 +25,7 @@ const fn mask(length: usize) -> u64 {
     if length >= 64 { u64::MAX } else { (1 << length) - 1 }
 }
 
-/// The group whose fixed fields are as in the data.
+/// The group whose fixed fields match the data.
 pub fn group(pgn: u32, data: &[u8]) -> Option<&'static Group> {
     let database = Database::get();
     let suits = |group: &&Group| {
@@ -39,13 +39,13 @@ pub fn group(pgn: u32, data: &[u8]) -> Option<&'static Group> {
     of_number.next().or_else(|| database.fallback(pgn))
 }
 
-/// What a field refers to in those before it.
+/// What a field may refer to in the ones before it.
 #[derive(Default)]
 struct Reader<'a> {
     data: &'a [u8],
     /// In bits.
     at: usize,
-    /// The group that a list of parameters is about, and the parameter that was named last.
+    /// The group that a list of parameters is about, and the last parameter named.
     about: Option<u32>,
     parameter: Option<usize>,
     key: Option<&'static super::database::Key>,
@@ -78,7 +78,7 @@ pub fn read(group: &'static Group, data: &[u8], fields: &mut Vec<Field>) {
             continue;
         };
         let (size, start, count_field) = sets[set];
-        // Without a count, until the data ends.
+        // Without a count, until the end of the data.
         let count = if count_field == 0 { u64::MAX } else { reader.counts[set].unwrap_or(0) };
         let mut done = 0;
         while done < count && reader.at < data.len() * 8 && fields.len() < MOST_FIELDS {
@@ -133,7 +133,7 @@ impl Reader<'_> {
         }
     }
 
-    /// Whole bytes, from the next one on.
+    /// Whole bytes, starting at the next byte boundary.
     fn bytes(&mut self, length: usize) -> Vec<u8> {
         let first = self.at.div_ceil(8).min(self.data.len());
         let end = (first + length).min(self.data.len());
@@ -141,7 +141,7 @@ impl Reader<'_> {
         self.data[first..end].to_vec()
     }
 
-    /// Bits that need not begin with a byte.
+    /// Bits that need not start at a byte boundary.
     fn loose_bytes(&mut self, length: usize) -> Vec<u8> {
         let (offset, end) = (self.at, self.at + length);
         self.at = end;
@@ -156,14 +156,14 @@ impl Reader<'_> {
             let fixed = kind.bit_length / 8;
             let bytes = self.bytes(usize::from(length));
             if kind.bit_length > 0 {
-                // Its place is as long as the longest text.
+                // It always takes as much space as the longest text.
                 self.at += fixed.saturating_sub(usize::from(length) + 1) * 8;
             } else if self.data.get(self.at / 8) == Some(&0) {
                 self.at += 8;
             }
             String::from_utf8_lossy(&bytes).into_owned()
         } else {
-            // The length counts itself and the byte that says how letters are coded.
+            // The length includes itself and the byte with the text encoding.
             let coding = self.bytes(1).first().copied().unwrap_or(1);
             let bytes = self.bytes(usize::from(length).saturating_sub(2));
             if coding == 0 {
@@ -199,7 +199,7 @@ impl Reader<'_> {
                 let table =
                     kind.lookup_enumeration.as_ref().and_then(|name| Database::get().lookups.get(name));
                 let text = table.and_then(|table| table.get(&raw)).map(String::as_str);
-                // The highest values say that there is none, unless the table knows better.
+                // The highest values mean that there is none, unless the table defines them.
                 let none = text.is_none() && length > 1 && raw == mask(length);
                 fields.push(if none {
                     Field::missing(name)
@@ -256,12 +256,13 @@ impl Reader<'_> {
         }
     }
 
-    /// A value of the parameter that was named before, as long as that parameter is in its own group.
+    /// A value of the parameter named before, with that parameter's length in its own group.
     fn parameter_value(&mut self, name: &'static str, fields: &mut Vec<Field>) {
         let of = self.about.zip(self.parameter).and_then(|(pgn, order)| {
             let mut groups = Database::get().groups(pgn).iter().filter(|group| !group.fallback);
             let (group, other) = (groups.next()?, groups.next());
-            // Several groups of one number: their first fields, which tell them apart, are alike.
+            // If there are several groups with one number, their first fields, which distinguish them, are
+            // alike.
             let group = other.map_or(group, |_| group);
             Some((group, group.fields.get(order.checked_sub(1)?)?))
         });
@@ -341,7 +342,7 @@ fn signed(raw: u64, length: usize) -> f64 {
     ((raw << shift) as i64 >> shift) as f64
 }
 
-/// A number with its resolution and unit; the highest ones of its bits say that there is none.
+/// A number with its resolution and unit; the highest values of its bits mean that there is none.
 fn physical(name: &'static str, kind: &'static FieldKind, raw: u64) -> Field {
     let length = kind.bit_length;
     if kind.field_type == Kind::Float {
@@ -358,7 +359,7 @@ fn physical(name: &'static str, kind: &'static FieldKind, raw: u64) -> Field {
     }
     let resolution = kind.resolution.unwrap_or(1.0);
     let number = if kind.signed { signed(raw, length) } else { raw as f64 };
-    // The second highest says that there was an error, where that many values are set aside.
+    // The second highest means an error, if that many values are reserved.
     let most = kind.range_max.map_or(f64::INFINITY, |most| (most - kind.offset) / resolution);
     if length > 3 && raw == none - 1 && number > most + 0.5 {
         return Field::missing(name).meaning(Some("error"));
@@ -374,7 +375,7 @@ fn physical(name: &'static str, kind: &'static FieldKind, raw: u64) -> Field {
 
 /// Days since 1970 as a date.
 fn date(days: i64) -> Cow<'static, str> {
-    // Howard Hinnant's days_from_civil, backwards: years that begin in March have their leap day at the end.
+    // Howard Hinnant's days_from_civil, reversed: years starting in March have their leap day at the end.
     let shifted = days + 719_468;
     let era = shifted.div_euclid(146_097);
     let day_of_era = shifted.rem_euclid(146_097);

@@ -1,6 +1,7 @@
-//! NMEA 2000: J1939 with fast packets, by CANboat's database of parameter groups.
+//! NMEA 2000: J1939 with fast packets, according to CANboat's database of parameter groups.
 //!
-//! The database is read when the first assembler is made: some ten milliseconds, and a few megabytes that stay.
+//! The database is parsed when the first assembler is made: this takes some ten milliseconds, and a few
+//! megabytes that stay allocated.
 
 mod database;
 mod fields;
@@ -12,9 +13,9 @@ use std::borrow::Cow;
 use crate::Field;
 use database::Database;
 
-/// Whether the group comes as a fast packet.
+/// Whether the group is sent as a fast packet.
 pub(crate) fn is_fast(pgn: u32) -> bool {
-    // Below lie those of J1939, and single frames.
+    // Lower numbers are groups of J1939 and single frames.
     if pgn < 0x1_0000 {
         return false;
     }
@@ -24,27 +25,27 @@ pub(crate) fn is_fast(pgn: u32) -> bool {
     }
 }
 
-/// The group's name, where it has one of its own, and its values.
+/// The group's name, if it has its own, and its values.
 pub(crate) fn describe(pgn: u32, data: &[u8], fields: &mut Vec<Field>) -> Option<Cow<'static, str>> {
     let group = fields::group(pgn, data)?;
     fields::read(group, data, fields);
-    // A range's name says less than its number.
+    // The name of a range says less than its number.
     (!group.fallback).then_some(Cow::Borrowed(group.description.as_str()))
 }
 
-/// The name of a group whose number is only its own.
+/// The name of a group with a unique number.
 pub(crate) fn name(pgn: u32) -> Option<&'static str> {
     let mut own = Database::get().groups(pgn).iter().filter(|group| !group.fallback);
     own.next().filter(|_| own.next().is_none()).map(|group| group.description.as_str())
 }
 
-/// Whether a bus that has both means NMEA 2000's group by this number.
+/// Whether a group with this number is NMEA 2000's on a bus that has both.
 pub(crate) fn is_own(pgn: u32) -> bool {
     (0x1_F000..0x2_0000).contains(&pgn) || is_fast(pgn)
 }
 
-/// Whether the group is one that only NMEA 2000 gives a meaning.
+/// Whether only NMEA 2000 defines the group.
 pub(crate) fn is_known(pgn: u32) -> bool {
-    // The second page, but for what is the manufacturers'.
+    // The second page, excluding proprietary groups.
     (0x1_F000..0x1_FF00).contains(&pgn) && Database::get().groups(pgn).iter().any(|group| !group.fallback)
 }

@@ -72,7 +72,7 @@ fn a_missing_frame_of_a_packet_is_said_once() {
     assert!(said[0].ends_with("received 6 bytes; frame 2 came instead of 1"), "{said:?}");
 }
 
-/// Every group of the database with random bytes: no panic, and no field that reads beyond the data.
+/// Every group of the database with random bytes: no panic, and no field reads beyond the data.
 #[test]
 fn any_bytes_are_taken() {
     let mut random = fastrand::Rng::with_seed(2000);
@@ -90,7 +90,7 @@ fn any_bytes_are_taken() {
     }
 }
 
-/// Packets of several senders at once, some frames dropped, repeated or swapped.
+/// Packets from several senders at the same time, with some frames dropped, repeated or swapped.
 #[test]
 fn packets_at_random_are_whole_and_right_or_said_to_be_broken() {
     let mut random = fastrand::Rng::with_seed(2001);

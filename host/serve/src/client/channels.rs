@@ -1,4 +1,5 @@
-//! A client's channels: opened, shared with others who have them open, and given up. Its filters, and what it stores.
+//! A client's channels: opening, sharing with others who have them open, and closing. Also its filters, and what it
+//! stores.
 
 use std::time::Duration;
 
@@ -9,18 +10,18 @@ use super::Client;
 use crate::shared::only_listens;
 use crate::state::{State, Then, for_all};
 
-/// A channel that the board closes has said its last word by then.
+/// A channel being closed has delivered its last record by this time.
 const STOP_TIMEOUT: Duration = Duration::from_secs(1);
-/// What a board has captured when it is asked for its time has arrived by then.
+/// What a board captured before it was asked for its time has arrived by this time.
 const SETTLE_TIMEOUT: Duration = Duration::from_millis(30);
 
-/// How a channel comes to be a client's.
+/// How a client can get a channel.
 enum Way {
     /// It is open as the client wants it.
     Attach(ChannelConfig),
     /// It is closed.
     Open,
-    /// It is open, and may be opened anew.
+    /// It is open, and may be opened again.
     Reopen(ChannelConfig),
 }
 
@@ -64,7 +65,7 @@ impl Client {
         Ok(Reply::Opened(wanted))
     }
 
-    /// How the channel can come to be as the client wants it, if it may.
+    /// How the client can get the channel as it wants it, if it may.
     fn way(&self, channel: Channel, wanted: &ChannelConfig) -> Result<Way, Refusal> {
         let mut state = self.shared.state();
         let (any_other, other_sends) = state.others_on(self.id, channel);
@@ -75,7 +76,7 @@ impl Client {
         }
         let Some(current) = current else {
             if !is_base || !only_listens(wanted) {
-                // Whoever may only listen takes the bit rate that there is.
+                // A client that may only listen accepts the existing bit rate.
                 let other = base.is_some() && only_listens(wanted) && self.role < Role::Configure;
                 state
                     .hold(self.id)
@@ -87,7 +88,7 @@ impl Client {
         if is_same && (only_listens(wanted) || for_all(*wanted) == current) {
             return Ok(Way::Attach(current));
         }
-        // Others' stamps and loads are made with the timing that they know; senders count on their mode.
+        // Others' stamps and loads are computed with the timing they know, and senders rely on their mode.
         if (any_other && !is_same) || other_sends {
             return Err(Refusal::OtherSettings);
         }
@@ -95,30 +96,31 @@ impl Client {
         Ok(Way::Reopen(current))
     }
 
-    /// Closes a channel on the board and waits for all that it had to say.
+    /// Closes a channel on the board and waits for everything it had to report.
     fn close_on_board(&self, channel: Channel) -> Result<(), Refusal> {
         let stopped = |state: &State| state.stopped[channel.index()];
         let before = stopped(&self.shared.state());
         self.shared.ask(Command::Close { channel }, Then::Nothing)?;
-        // If it never says so, the link has lost it.
+        // If it never reports that, the link has lost the record.
         self.shared.wait_for(STOP_TIMEOUT, |state| stopped(state) != before || state.hello.is_none());
         self.shared.state().open[channel.index()] = None;
         Ok(())
     }
 
-    /// Opens a channel for those who have it open, who miss what was on the bus meanwhile.
+    /// Opens a channel again for those who have it open; they miss what was on the bus meanwhile.
     fn reopen(&self, channel: Channel, config: ChannelConfig) -> Result<(), Refusal> {
         let opened = self
             .shared
             .ask(Command::Open { channel, config: Some(config) }, Then::Opened { client: None, channel });
         if opened.is_err() {
-            // They must not believe in a quiet bus.
+            // They must not believe that the bus is quiet.
             self.shared.state().must_end = true;
         }
         opened.map(|_| ())
     }
 
-    /// Gives a channel up. The board closes it if nobody else has it open, and only listens if nobody else sends.
+    /// Closes a channel for this client. If nobody else has it open, the board closes it; if nobody else sends,
+    /// it only listens.
     pub(super) fn close(&self, channel: Channel) -> Result<(), Refusal> {
         if !self.is_open(channel) {
             return Ok(());
@@ -147,7 +149,7 @@ impl Client {
         closed
     }
 
-    /// Waits for what the board has captured until now.
+    /// Waits for everything that the board has captured so far.
     fn settle(&self) -> Result<(), Refusal> {
         if let Reply::Time(ticks) = self.shared.ask(Command::Time, Then::Nothing)? {
             self.shared.wait_for(SETTLE_TIMEOUT, |state| state.latest_ticks >= ticks);
@@ -155,7 +157,7 @@ impl Client {
         Ok(())
     }
 
-    /// Filters are the server's: each client has its own, and the board hears for all.
+    /// Filters are applied by the server: each client has its own, and the board receives for all.
     pub(super) fn set_filters(&self, channel: Channel, filters: &[Filter]) -> Result<Reply, Refusal> {
         if !filters.iter().all(Filter::is_valid) {
             return Err(Refusal::BadId);
@@ -171,7 +173,7 @@ impl Client {
         Ok(Reply::Filters { banks_used: banks_of(filters).min(banks_total), banks_total })
     }
 
-    /// Stores what the client has configured, its filters among it, which the board does not have otherwise.
+    /// Stores the client's configuration, including its filters, which the board otherwise does not have.
     pub(super) fn save_defaults(&self) -> Result<Reply, Refusal> {
         let _setup = self.setup();
         self.shared.state().hold(self.id)?;

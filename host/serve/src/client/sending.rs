@@ -1,4 +1,4 @@
-//! What a client sends: frames, periodic entries, replies. Each client has its own numbers for them, and takes them along when it leaves.
+//! What a client sends: frames, periodic entries, replies. Each client has its own numbers for them, and they go with it when it leaves.
 
 use std::time::{Duration, Instant};
 
@@ -8,13 +8,14 @@ use cantap_wire::{Channel, Command, Refusal, Reply};
 use super::Client;
 use crate::state::{Table, Then, clears};
 
-/// Frames that are given up have been reported by then.
+/// Withdrawn frames have been reported by this time.
 const WITHDRAW_TIMEOUT: Duration = Duration::from_millis(500);
-/// A client whose frames find the board's queue full, perhaps of another's, waits this long before it is refused.
+/// How long a client whose frames find the board's queue full, perhaps with another client's, waits before it is
+/// refused.
 const ROOM_TIMEOUT: Duration = Duration::from_millis(800);
 
 impl Client {
-    /// Whether the client may send, and has the channel open for it.
+    /// Checks that the client may send, and has the channel open for it.
     pub(super) fn may_transmit_on(&self, channel: Channel) -> Result<(), Refusal> {
         self.must_be(Role::Send)?;
         self.with(|_, member| {
@@ -50,7 +51,7 @@ impl Client {
                 }
             }
             match result {
-                // Perhaps by another's frames: they leave.
+                // Perhaps it is full with another client's frames: they will leave.
                 Err(Refusal::QueueFull { .. }) if Instant::now() < deadline && !self.outbox.is_closed() => {
                     std::thread::sleep(Duration::from_millis(2));
                 }
@@ -59,7 +60,7 @@ impl Client {
         }
     }
 
-    /// Takes the client's frames out of the board's queue. What others have in it is still sent.
+    /// Takes the client's frames out of the board's queue. Those of others are still sent.
     pub(super) fn withdraw(&self, channel: Channel, is_closed: bool) -> Result<(), Refusal> {
         {
             let mut state = self.shared.state();
@@ -81,7 +82,7 @@ impl Client {
     pub(super) fn clear_entries(&self, channel: Channel) {
         let entries = self.shared.state().entries[channel.index()].of(self.id);
         for (table, entry) in entries {
-            // If the board does not follow, its thread notices.
+            // If the board does not respond, its thread notices.
             let _ = self.shared.ask(clears(table, channel, entry), Then::Nothing);
             self.shared.state().entries[channel.index()].free(table, entry);
         }
@@ -134,7 +135,7 @@ impl Client {
             let had = entries.find(table, self.id, slot);
             (had, entries.take(table, self.id, slot, slots))
         };
-        // All of the board's are in use, the other clients' among them.
+        // All of the board's entries are in use, including those of other clients.
         let taken = taken.ok_or(Refusal::QueueFull { free: 0 })?;
         let result = self.shared.ask(command(taken, Some(entry)), Then::Nothing);
         if result.is_err() && had.is_none() {

@@ -1,59 +1,59 @@
-//! What a client of socketcand says: `< send 123 2 11 22 >`.
+//! The commands of a socketcand client: `< send 123 2 11 22 >`.
 
 use cantap_wire::{Frame, Id};
 
-/// A command. Identifiers, times and data are as the protocol has them.
+/// A command. Identifiers, times and data are as in the protocol.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Command {
     /// Open a bus by its name.
     Open(String),
-    /// The bit rate that a bus is to be opened with.
+    /// The bit rate with which to open a bus.
     Bitrate(String, u32),
-    /// How a bus is to be opened.
+    /// How to open a bus.
     ControlMode { bus: String, listen_only: bool, loopback: bool, triple: bool },
-    /// Every frame of the bus.
+    /// Raw mode: every frame of the bus.
     RawMode,
-    /// What was subscribed to.
+    /// BCM mode: subscribed frames.
     BcmMode,
-    /// Statistics alone.
+    /// Only statistics.
     StatisticsMode,
-    /// Send at once.
+    /// Send once, immediately.
     Send(Frame),
-    /// Send again and again, a period in microseconds apart.
+    /// Send repeatedly, with a period in microseconds.
     Add(u64, Frame),
-    /// Change what is sent again and again.
+    /// Change a frame that is sent repeatedly.
     Update(Frame),
-    /// Send it no more.
+    /// Stop sending it.
     Delete(Id),
-    /// Hear an identifier; at most one frame in this many microseconds.
+    /// Receive an identifier; at most one frame in this many microseconds.
     Subscribe(u64, Id),
-    /// Hear an identifier when bits of its data change that count.
+    /// Receive an identifier when the masked bits of its data change.
     Filter(u64, Id, Vec<u8>),
-    /// The same, by the multiplexer's value: its mask, then value and bits that count.
+    /// The same by the multiplexer's value: its mask, then values and masks.
     MuxFilter(u64, Id, Vec<[u8; 8]>),
-    /// Hear an identifier no more.
+    /// Stop receiving an identifier.
     Unsubscribe(Id),
-    /// Statistics once in this many milliseconds; 0 for none.
+    /// Statistics at this interval in milliseconds; 0 for none.
     Statistics(u64),
-    /// Answer.
+    /// Request an echo.
     Echo,
 }
 
-/// Why a text is no command.
+/// Why a text is not a command.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum BadCommand {
     /// There is no such command.
     Unknown,
-    /// Something of it is wrong.
+    /// A part of it is wrong.
     Syntax(&'static str),
 }
 
-/// Longest command: a filter by a multiplexer with 257 times eight bytes.
+/// The longest command: a multiplexer filter of 257 times eight bytes.
 pub const LONGEST: usize = 8 * 1024;
-/// Of one multiplexer's filter.
+/// Values in one multiplexer filter.
 const MOST_MUX: usize = 257;
 
-/// Reads what stands between `<` and `>`.
+/// Parses the text between `<` and `>`.
 pub fn parse(text: &str) -> Result<Command, BadCommand> {
     let words: Vec<&str> = text.split_ascii_whitespace().collect();
     let Some((&name, rest)) = words.split_first() else { return Err(BadCommand::Unknown) };
@@ -125,8 +125,8 @@ fn interval(seconds: &str, micros: &str) -> Result<u64, BadCommand> {
     seconds.and_then(|us| us.checked_add(number(micros).ok()?)).ok_or(BadCommand::Syntax("the interval"))
 }
 
-/// An identifier of eight digits has 29 bits, as the server of that name has it, and so has one that needs them, which
-/// SavvyCAN writes as it comes, and with its sign extended.
+/// An identifier of eight digits has 29 bits, as in the original server, and so has one that needs them, which
+/// SavvyCAN writes without leading zeros, or sign-extended.
 fn id(text: &str) -> Result<Id, BadCommand> {
     let bad = BadCommand::Syntax("the identifier");
     let raw = u64::from_str_radix(text, 16).map_err(|_| bad.clone())?;
@@ -139,14 +139,14 @@ fn id(text: &str) -> Result<Id, BadCommand> {
     id.ok_or(bad)
 }
 
-/// A byte; SavvyCAN extends the sign of those from 80 up.
+/// A byte; SavvyCAN sign-extends those from 80 up.
 fn byte(text: &str) -> Result<u8, BadCommand> {
     let value = u64::from_str_radix(text, 16).map_err(|_| BadCommand::Syntax("a byte"))?;
     let is_signed = value >= u64::MAX - 0x7F || (0xFFFF_FF80..=0xFFFF_FFFF).contains(&value);
     if value > 0xFF && !is_signed { Err(BadCommand::Syntax("a byte")) } else { Ok(value as u8) }
 }
 
-/// So many bytes as a number before them says.
+/// As many bytes as the number before them says.
 fn counted(len: &str, bytes: &[&str]) -> Result<Vec<u8>, BadCommand> {
     if number(len)? != bytes.len() as u64 || bytes.len() > 8 {
         return Err(BadCommand::Syntax("the number of bytes"));
@@ -160,15 +160,15 @@ fn data_frame(words: &[&str]) -> Result<Frame, BadCommand> {
     Frame::data_frame(self::id(id)?, &bytes).ok_or(BadCommand::Syntax("the number of bytes"))
 }
 
-/// Finds commands in what a client sends. Holds at most one.
+/// Finds commands in what a client sends. It holds at most one.
 #[derive(Default)]
 pub struct Finder {
-    /// Behind a `<`.
+    /// The text after a `<`.
     text: Option<String>,
 }
 
 impl Finder {
-    /// Takes any piece and reports each whole command's text.
+    /// Takes any piece of the stream and reports each complete command's text.
     pub fn push(&mut self, bytes: &[u8], mut report: impl FnMut(&str)) {
         for &byte in bytes {
             match (byte, &mut self.text) {
@@ -179,7 +179,7 @@ impl Finder {
                     }
                 }
                 (byte, Some(text)) if text.len() < LONGEST => text.push(char::from(byte)),
-                // Longer than anything.
+                // Longer than any command.
                 (_, text) => *text = None,
             }
         }

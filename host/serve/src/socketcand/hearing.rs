@@ -1,4 +1,4 @@
-//! Which records one client is given, and what it counts.
+//! Which records a client receives, and what it counts.
 
 use std::collections::HashMap;
 use std::fmt::Write;
@@ -10,28 +10,28 @@ use cantap_wire::{Frame, Id};
 use super::subscriptions::Subscriptions;
 use super::told::{now_ns, put_error, put_frame};
 
-/// What a client hears, by its mode.
+/// What a client receives, by its mode.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Hears {
-    /// In BCM mode, which every bus is opened in.
+    /// BCM mode, in which every bus is opened.
     #[default]
     Subscribed,
-    /// In raw mode.
+    /// Raw mode.
     All,
-    /// In control mode.
+    /// Control mode.
     Nothing,
 }
 
-/// What a client hears.
+/// What a client receives.
 #[derive(Default)]
 pub struct Hearing {
     pub hears: Hears,
-    /// Not before.
+    /// Nothing before this time.
     from: Option<Instant>,
     pub subscriptions: Subscriptions,
-    /// What it has sent, by tag, until it is on the bus: a client does not hear itself.
+    /// Frames it has sent, by tag, until they are on the bus: a client does not receive its own frames.
     pub own_frames: HashMap<u32, Frame>,
-    /// What is sent for it again and again.
+    /// Frames sent for it repeatedly.
     pub own_entries: HashMap<Id, Frame>,
     /// It was off the bus for a moment.
     pub has_gap: bool,
@@ -49,26 +49,26 @@ struct Statistics {
 }
 
 impl Hearing {
-    /// Changes the mode. What was subscribed to in BCM mode is over with it.
+    /// Changes the mode. This ends the subscriptions of BCM mode.
     pub fn begin(&mut self, hears: Hears, from: Instant) {
         self.hears = hears;
         self.from = Some(from);
         self.subscriptions.clear();
     }
 
-    /// Tells statistics so often from now on; never, if it is zero.
+    /// Sends statistics at this interval from now on; never if it is zero.
     pub fn statistics_every(&mut self, every: Duration) {
         self.statistics.every = every;
         self.statistics.told_at = Some(Instant::now());
     }
 
-    /// How long nothing may be passed on.
+    /// For how long nothing may be passed on.
     pub fn wait(&self) -> Option<Duration> {
         let wait = self.from?.saturating_duration_since(Instant::now());
         (!wait.is_zero()).then_some(wait)
     }
 
-    /// Takes records, and adds what the client is given.
+    /// Takes records, and adds what the client receives.
     pub fn take(&mut self, records: &[TraceRecord], out: &mut String) {
         for record in records {
             if std::mem::take(&mut self.has_gap) && self.hears != Hears::Nothing {
@@ -76,7 +76,7 @@ impl Hearing {
             }
             self.take_one(record, out);
         }
-        // On a bus that fell silent, no record says what time it is.
+        // On a bus that has fallen silent, no record gives the time.
         if self.hears == Hears::Subscribed {
             self.put_ripe(now_ns(), out);
         }
@@ -118,14 +118,14 @@ impl Hearing {
         }
     }
 
-    /// Adds what an interval held back until `now_ns`.
+    /// Adds what intervals held back until `now_ns`.
     fn put_ripe(&mut self, now_ns: i64, out: &mut String) {
         for (time_ns, frame) in self.subscriptions.ripe(now_ns) {
             put_frame(out, time_ns, &frame, false);
         }
     }
 
-    /// Whether the client has sent a frame itself, which is then over.
+    /// Whether the client sent this frame itself; if so, that is now complete.
     fn is_own(&mut self, frame: &Frame) -> bool {
         if self.own_entries.get(&frame.id()) == Some(frame) {
             return true;

@@ -1,9 +1,9 @@
 //! The socketcand protocol (<https://github.com/linux-can/socketcand>, doc/protocol.md), for SavvyCAN, Kayak, python-can and
-//! whatever else speaks it: raw, BCM and control mode, and the beacon. ISO-TP mode is not there.
+//! other clients: raw, BCM and control mode, and the beacon. ISO-TP mode is not supported.
 //!
-//! The page leaves some things open, and clients differ: `told` says how frames are written, `command` how they are read. The bus is only
-//! listened to until a client that may send does so; its frames then come back to the others, and not to itself. What is sent again and
-//! again (`add`) the board sends, at its own clock's times.
+//! The protocol page leaves some things open, and clients differ: `told` defines how frames are written, `command` how they are read. The
+//! bus is only listened to until a client that may send does so; its frames are then passed on to the others, but not to itself. Frames
+//! sent repeatedly (`add`) are sent by the board, timed by its own clock.
 
 mod command;
 mod hearing;
@@ -30,30 +30,30 @@ use command::{BadCommand, Command, Finder};
 use hearing::{Hearing, Hears};
 use subscriptions::{MOST, Wanted};
 
-/// The port of the server of that name.
+/// The port of the original server.
 pub const PORT: u16 = 29_536;
-/// Where beacons are listened for.
+/// The port for beacons.
 const BEACON_PORT: u16 = 42_000;
-/// At least every three seconds, the page says.
+/// The page requires one at least every three seconds.
 const BEACON_EVERY: Duration = Duration::from_secs(2);
-/// Clients compare what one read returns with one answer, so two are not sent at once.
+/// Clients compare the result of one read with one answer, so two are not sent together.
 const BETWEEN_ANSWERS: Duration = Duration::from_millis(20);
-/// And no frame right behind the answer to `rawmode`.
+/// For the same reason, no frame right after the answer to `rawmode`.
 const BEFORE_FRAMES: Duration = Duration::from_millis(100);
-/// SavvyCAN connects anew after ten seconds in which it was told nothing, which loses what is on the bus meanwhile.
+/// SavvyCAN reconnects after ten seconds without receiving anything, which loses what is on the bus meanwhile.
 const KEEP_ALIVE_EVERY: Duration = Duration::from_secs(7);
-/// What a client is told then: the protocol's own word for "still here". SavvyCAN and Kayak pass over it; python-can does too, with a
-/// warning in its log. No client tells which it is, and a frame that SavvyCAN misses is worse than a warning.
+/// What is then sent to the client: the protocol's own word for "still here". SavvyCAN and Kayak ignore it; so does python-can, with
+/// a warning in its log. No client identifies itself, and a frame that SavvyCAN misses is worse than a warning.
 const KEEP_ALIVE: &str = "< echo >";
-/// A client that has not opened a bus by then is let go.
+/// A client that has not opened a bus by this time is dropped.
 const OPEN_TIMEOUT: Duration = Duration::from_secs(30);
-/// A client that takes nothing for this long is gone.
+/// A client that takes nothing for this long is considered gone.
 const PATIENCE: Duration = Duration::from_secs(30);
-/// Connections at a time, those that have not opened a bus among them.
+/// Limit for connections at a time, including those that have not opened a bus.
 const MOST_CONNECTIONS: usize = 32;
 
-/// Lets clients in. The buses are the boards' channels, `can0` the first board's first, as in every trace. There is no authentication in the
-/// protocol: at an address that is not this machine's own (loopback) clients may only listen.
+/// Admits clients. The buses are the boards' channels, `can0` being the first board's first, as in every trace. The protocol has no
+/// authentication: at an address that is not this machine's own (loopback), clients may only listen.
 pub fn listen(boards: &[Arc<Board>], address: SocketAddr, role: Role) -> io::Result<Listening> {
     let role = if address.ip().is_loopback() { role } else { Role::Listen };
     let (listener, address) = bind(address)?;
@@ -86,7 +86,7 @@ pub fn listen(boards: &[Arc<Board>], address: SocketAddr, role: Role) -> io::Res
         let (buses, counted) = (Arc::clone(&buses), Arc::clone(&connections));
         std::thread::Builder::new().name("cantap-socketcand-client".to_owned()).spawn(move || {
             if let Ok(connection) = Connection::new(stream, name, buses, role) {
-                // An error is a connection that is gone.
+                // An error means that the connection is gone.
                 let _ = connection.serve();
             }
             drop(counted);
@@ -102,7 +102,7 @@ struct Bus {
     channel: Channel,
 }
 
-/// Says where the server is.
+/// Announces where the server is.
 struct Beacon {
     socket: UdpSocket,
     to: SocketAddr,
@@ -141,12 +141,12 @@ struct Connection {
     buses: Arc<[Bus]>,
     role: Role,
     hearing: Mutex<Hearing>,
-    /// When it was last told something.
+    /// When something was last sent to it.
     told_at: Mutex<Instant>,
     is_over: AtomicBool,
 }
 
-/// What a client has chosen before it opens a bus.
+/// A client's choices before it opens a bus.
 #[derive(Default)]
 struct Setup {
     bitrates_bps: HashMap<String, u32>,
@@ -154,20 +154,20 @@ struct Setup {
     loopback: bool,
 }
 
-/// A bus that is open.
+/// An open bus.
 struct Opened {
     device: Arc<Device>,
     channel: Channel,
     config: ChannelConfig,
-    /// In which mode it is sent, if it may be.
+    /// The mode for sending, if it may send.
     sends_in: Option<Mode>,
     next_tag: u32,
-    /// What is sent again and again, by entry.
+    /// Frames sent repeatedly, by entry.
     periodic: HashMap<Id, (u8, u64)>,
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Every holder leaves the state whole.
+    // Every holder leaves the state consistent.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -186,7 +186,7 @@ impl Connection {
         }))
     }
 
-    /// Does what the client says until either side ends.
+    /// Carries out the client's commands until either side ends.
     fn serve(self: &Arc<Self>) -> io::Result<()> {
         self.write("< hi >")?;
         let mut finder = Finder::default();
@@ -238,7 +238,7 @@ impl Connection {
         write_patiently(&mut *lock(&self.output), text.as_bytes(), PATIENCE)
     }
 
-    /// Does one thing. Returns what there is to say.
+    /// Carries out one command. Returns what to answer.
     fn perform(
         self: &Arc<Self>,
         command: Command,
@@ -255,7 +255,7 @@ impl Connection {
                     }
                     Err(reason) => {
                         self.refused(&reason);
-                        // As the page has it: the connection ends.
+                        // As the page defines it, the connection ends.
                         self.is_over.store(true, Ordering::Relaxed);
                         Some("< error could not open bus >".to_owned())
                     }
@@ -317,19 +317,19 @@ impl Connection {
                     let us = *us;
                     self.add(bus, us, frame)
                 }
-                None => Err(format!("nothing is sent again and again as {}", frame.id())),
+                None => Err(format!("nothing is sent periodically as {}", frame.id())),
             },
             Command::Delete(id) => match bus.periodic.remove(&id) {
                 Some((slot, _)) => {
                     lock(&self.hearing).own_entries.remove(&id);
                     bus.device.set_periodic(bus.channel, slot, None).map_err(|error| error.to_string())
                 }
-                None => Err(format!("nothing is sent again and again as {id}")),
+                None => Err(format!("nothing is sent periodically as {id}")),
             },
         };
         let reason = done.err()?;
         self.refused(&reason);
-        // In raw mode clients read frames alone.
+        // In raw mode, clients read nothing but frames.
         if lock(&self.hearing).hears == Hears::All {
             return Some(told::not_sent());
         }
@@ -367,12 +367,12 @@ impl Connection {
         Ok(Opened { device, channel, config, sends_in, next_tag: 0, periodic: HashMap::new() })
     }
 
-    /// Tells the client what is heard, until either side ends.
+    /// Sends the client what is received, until either side ends.
     fn hear(&self, device: &Device) {
         let mut records = device.records();
         let mut out = String::new();
         while !self.is_over.load(Ordering::Relaxed) {
-            // The board or the server is gone: so is the connection.
+            // The board or the server is gone, so the connection is, too.
             let Ok(Some(batch)) = records.next_batch(Duration::from_millis(20)) else { break };
             loop {
                 let mut hearing = lock(&self.hearing);
@@ -395,7 +395,7 @@ impl Connection {
         self.is_over.store(true, Ordering::Relaxed);
     }
 
-    /// Whether a client that reads frames alone has been told nothing for too long.
+    /// Whether nothing has been sent for too long to a client that reads only frames.
     fn must_be_told(&self) -> bool {
         lock(&self.told_at).elapsed() >= KEEP_ALIVE_EVERY && lock(&self.hearing).hears == Hears::All
     }
@@ -408,7 +408,7 @@ impl Connection {
         }
     }
 
-    /// Opens the bus for sending, which a client that sends asks for.
+    /// Opens the bus for sending, when a client sends.
     fn may_send(&self, bus: &mut Opened) -> Result<(), String> {
         let Some(mode) = bus.sends_in else { return Err("the bus was opened to listen only".to_owned()) };
         if bus.config.mode == mode {
@@ -421,7 +421,7 @@ impl Connection {
         if opened.is_err() {
             bus.device.open_channel(bus.channel, Some(bus.config)).map_err(said)?;
         }
-        // What was on the bus meanwhile the client has not heard.
+        // The client has missed what was on the bus meanwhile.
         lock(&self.hearing).has_gap = true;
         bus.config = opened.map_err(said)?;
         Ok(())
@@ -440,7 +440,7 @@ impl Connection {
         Ok(())
     }
 
-    /// Has the board send a frame again and again; one of the same identifier is replaced.
+    /// Has the board send a frame repeatedly; one with the same identifier is replaced.
     fn add(&self, bus: &mut Opened, us: u64, frame: Frame) -> Result<(), String> {
         self.may_send(bus)?;
         let hello = bus.device.hello();
@@ -456,7 +456,7 @@ impl Connection {
             None => (0..hello.periodic_slots)
                 .find(|slot| bus.periodic.values().all(|(taken, _)| taken != slot))
                 .ok_or_else(|| {
-                    format!("the board sends {} frames again and again at most", hello.periodic_slots)
+                    format!("the board sends at most {} frames periodically", hello.periodic_slots)
                 })?,
         };
         let entry = Periodic { frame, period_ticks, count: 0, modifiers: heapless::Vec::new() };
@@ -474,7 +474,7 @@ impl Connection {
     }
 }
 
-/// Nothing that a client could take for the end of an answer.
+/// Removes what a client could mistake for the end of an answer.
 fn plain(text: &str) -> String {
     text.chars().filter(|letter| !matches!(letter, '<' | '>') && !letter.is_control()).take(200).collect()
 }

@@ -1,4 +1,4 @@
-//! What a client in BCM mode hears: each identifier as it subscribed to it, as Linux' broadcast manager has it.
+//! What a client in BCM mode receives: each identifier as it subscribed to it, like Linux's broadcast manager.
 
 use std::collections::HashMap;
 
@@ -9,35 +9,35 @@ use cantap_wire::{Frame, Id};
 pub enum Wanted {
     /// All.
     All,
-    /// When bits change that are set here.
+    /// When bits change that are set in this mask.
     Changes([u8; 8]),
-    /// The same, for each value of a multiplexer: its mask; then value and bits that count.
+    /// The same for each value of a multiplexer: its mask, then values and masks.
     Multiplexed([u8; 8], Vec<[u8; 8]>),
 }
 
 /// One identifier.
 struct Subscription {
     wanted: Wanted,
-    /// Nanoseconds that are between two frames at least.
+    /// Minimum time between two frames in nanoseconds.
     interval_ns: i64,
     told_ns: Option<i64>,
-    /// The last data, for each value of the multiplexer; one without any.
+    /// The last data for each value of the multiplexer; a single one without a multiplexer.
     last: Vec<Option<[u8; 8]>>,
-    /// Held back by the interval: the latest.
+    /// The latest frame held back by the interval.
     held: Option<(i64, Frame)>,
 }
 
-/// All of a client's.
+/// All subscriptions of a client.
 #[derive(Default)]
 pub struct Subscriptions {
     by_id: HashMap<Id, Subscription>,
 }
 
-/// More identifiers than this no client may subscribe to: as many as there are standard ones, and some.
+/// Limit for a client's subscriptions: as many as there are standard identifiers, and more.
 pub const MOST: usize = 4096;
 
 impl Subscriptions {
-    /// Adds one, or replaces that of the same identifier. Returns whether there is room.
+    /// Adds one, or replaces the one with the same identifier. Returns whether there is room.
     pub fn add(&mut self, id: Id, wanted: Wanted, interval_us: u64) -> bool {
         if self.by_id.len() >= MOST && !self.by_id.contains_key(&id) {
             return false;
@@ -58,11 +58,11 @@ impl Subscriptions {
         self.by_id.clear();
     }
 
-    /// Takes a frame. Returns it if it is passed on now.
+    /// Takes a frame. Returns it if it should be passed on now.
     pub fn take(&mut self, time_ns: i64, frame: &Frame) -> Option<(i64, Frame)> {
         let subscription = self.by_id.get_mut(&frame.id())?;
         if frame.is_remote() {
-            // It has no content that could be asked about.
+            // It has no content to compare.
             return (subscription.wanted == Wanted::All).then_some((time_ns, *frame));
         }
         if !subscription.changes(frame.padded_data()) {
@@ -79,7 +79,7 @@ impl Subscriptions {
         Some((time_ns, *frame))
     }
 
-    /// What was held back long enough, at a time in the stream.
+    /// What has been held back long enough, at a time in the stream.
     pub fn ripe(&mut self, now_ns: i64) -> Vec<(i64, Frame)> {
         let mut ripe = Vec::new();
         for subscription in self.by_id.values_mut() {
@@ -97,7 +97,7 @@ impl Subscriptions {
 }
 
 impl Subscription {
-    /// Whether what counts of the data is other than before.
+    /// Whether the masked data differ from before.
     fn changes(&mut self, data: [u8; 8]) -> bool {
         let (place, mask) = match &self.wanted {
             Wanted::All => return true,
@@ -105,7 +105,7 @@ impl Subscription {
             Wanted::Multiplexed(selector, values) => {
                 let selects = |value: &[u8; 8]| masked(*value, *selector) == masked(data, *selector);
                 let Some(place) = values.iter().position(selects) else { return false };
-                // Where the multiplexer's value stands, nothing counts.
+                // The multiplexer's own bits are not compared.
                 let bits = std::array::from_fn(|at| values[place][at] & !selector[at]);
                 (place, bits)
             }

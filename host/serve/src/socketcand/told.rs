@@ -1,8 +1,8 @@
-//! What a client is told: `< frame 123 23.424242 11223344 >`.
+//! The messages to a client: `< frame 123 23.424242 11223344 >`.
 //!
-//! The page has blanks between the bytes. The server of that name writes them without in raw mode, which is what python-can and SavvyCAN read, and
-//! with them in BCM mode. A frame without data has two blanks before its `>` in either. An identifier with 11 bits has three digits, one with
-//! 29 has eight: python-can tells them apart by that.
+//! The page has blanks between the bytes. The original server writes them without blanks in raw mode, which is what python-can and SavvyCAN read,
+//! and with blanks in BCM mode. A frame without data has two blanks before its `>` in either mode. An identifier with 11 bits has three digits,
+//! one with 29 has eight: python-can distinguishes them by that.
 
 use std::fmt::Write;
 
@@ -12,7 +12,7 @@ use cantap_wire::record::TransmitFailure;
 
 use crate::text::{Seconds, error_frame, put_bytes};
 
-/// Adds a frame. Without `is_raw`, as in BCM mode.
+/// Adds a frame. `is_raw` is false in BCM mode.
 pub fn put_frame(out: &mut String, time_ns: i64, frame: &Frame, is_raw: bool) {
     let (id, time) = (frame.id(), Seconds(time_ns));
     // Writing to memory cannot fail.
@@ -25,7 +25,7 @@ pub fn put_frame(out: &mut String, time_ns: i64, frame: &Frame, is_raw: bool) {
     out.push_str(" >");
 }
 
-/// Adds an error or a loss, as an error frame of SocketCAN: its classes as an identifier with the flag, the time, the data.
+/// Adds an error or a loss as a SocketCAN error frame: its classes as an identifier including the flag, the time, the data.
 pub fn put_error(out: &mut String, time_ns: i64, event: &TraceEvent) {
     let Some((id, data)) = error_frame(event) else { return };
     let _ = write!(out, "< error {id:08X} {} ", Seconds(time_ns));
@@ -33,13 +33,13 @@ pub fn put_error(out: &mut String, time_ns: i64, event: &TraceEvent) {
     out.push_str(" >");
 }
 
-/// The time of this computer, in UTC nanoseconds since the Unix epoch.
+/// The computer's time, in UTC nanoseconds since the Unix epoch.
 pub fn now_ns() -> i64 {
     let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
     now.map_or(0, |since| since.as_nanos() as i64)
 }
 
-/// A frame was refused, which raw mode has no words for.
+/// The message for a refused frame, for which raw mode has none.
 pub fn not_sent() -> String {
     let mut out = String::new();
     put_error(&mut out, now_ns(), &TraceEvent::TransmitFailed { tag: 0, reason: TransmitFailure::Aborted });

@@ -1,4 +1,4 @@
-//! A small authority for one server and its clients: `cantap serve keygen`.
+//! A small certificate authority for one server and its clients: `cantap serve keygen`.
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -12,43 +12,43 @@ use rcgen::{
 
 use super::{Files, name_of};
 
-/// How long certificates are good for.
+/// How long certificates are valid.
 const YEARS: i32 = 10;
-/// The server's files are called so.
+/// The name of the server's files.
 const SERVER: &str = "server";
-/// The authority's.
+/// The name of the authority's files.
 const AUTHORITY: &str = "ca";
 
-/// Why keys cannot be made.
+/// Why keys could not be made.
 #[derive(Debug, thiserror::Error)]
 pub enum KeysError {
-    /// Names of files, and of nothing else.
-    #[error("'{0}' is no name for a key; use letters, digits, - and _")]
+    /// The name cannot be used for files.
+    #[error("'{0}' is not a name for a key; use letters, digits, - and _")]
     Name(String),
-    /// Nothing is overwritten.
-    #[error("'{}' is there already; choose another name, or another folder", .0.display())]
+    /// The file exists; nothing is overwritten.
+    #[error("'{}' already exists; choose another name, or another folder", .0.display())]
     There(PathBuf),
-    /// A file cannot be written or read.
+    /// A file could not be written or read.
     #[error("'{}': {source}", path.display())]
     File {
-        /// Which.
+        /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: io::Error,
     },
-    /// The key or certificate cannot be made.
+    /// The key or certificate could not be made.
     #[error("a certificate cannot be made: {0}")]
     Certificate(#[from] rcgen::Error),
 }
 
-/// A folder with an authority's key, a server's, and those of clients.
+/// A folder with the key of an authority, that of a server, and those of clients.
 pub struct Keys {
     folder: PathBuf,
     key: KeyPair,
 }
 
 impl Keys {
-    /// The authority in a folder, which is made if there is none. Its key is what makes clients: it is best kept elsewhere.
+    /// The authority in a folder, created if there is none. Its key can make new clients, so it is best kept elsewhere.
     pub fn in_folder(folder: &Path) -> Result<Self, KeysError> {
         let failed = |source| KeysError::File { path: folder.to_owned(), source };
         std::fs::create_dir_all(folder).map_err(failed)?;
@@ -64,12 +64,12 @@ impl Keys {
         Ok(keys)
     }
 
-    /// Makes the server's certificate, for every name and address by which clients reach it.
+    /// Makes the server's certificate, for all names and addresses by which clients reach it.
     pub fn add_server(&self, hosts: &[String]) -> Result<Files, KeysError> {
         self.add(SERVER, hosts.to_vec(), ExtendedKeyUsagePurpose::ServerAuth)
     }
 
-    /// Makes a client's certificate, which says what it may do at most.
+    /// Makes a client's certificate, which contains its maximum role.
     pub fn add_client(&self, name: &str, role: Role) -> Result<Files, KeysError> {
         let is_plain = |letter: char| letter.is_ascii_alphanumeric() || matches!(letter, '-' | '_');
         if name.is_empty() || !name.chars().all(is_plain) || name.ends_with("-key") {
@@ -78,7 +78,7 @@ impl Keys {
         self.add(name, vec![name_of(role)], ExtendedKeyUsagePurpose::ClientAuth)
     }
 
-    /// The files of one, as they are named here, beside its authority's certificate.
+    /// The files with a name, together with the authority's certificate.
     pub fn files(folder: &Path, name: &str) -> Files {
         Files {
             certificate: folder.join(format!("{name}.pem")),
@@ -117,7 +117,7 @@ impl Keys {
     }
 }
 
-/// The same each time it is asked for: what it signs names it by this, and by its key.
+/// The same every time: certificates refer to it by this, and by its key.
 fn authority() -> CertificateParams {
     let mut params = lasting(CertificateParams::default(), "authority");
     params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
@@ -127,7 +127,7 @@ fn authority() -> CertificateParams {
 
 fn lasting(mut params: CertificateParams, name: &str) -> CertificateParams {
     let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
-    // Whole years are enough, and one before is for clocks that are behind.
+    // Whole years are enough, and one extra at the beginning allows for clocks that are behind.
     let year = 1970 + (since.as_secs() / (365 * 86_400 + 86_400 / 4)) as i32;
     params.not_before = date_time_ymd(year - 1, 1, 1);
     params.not_after = date_time_ymd(year + YEARS, 1, 1);
@@ -137,7 +137,7 @@ fn lasting(mut params: CertificateParams, name: &str) -> CertificateParams {
     params
 }
 
-/// Writes a file that must not be there yet; a secret one for this user alone.
+/// Writes a file that must not exist yet; a secret one is readable only by this user.
 fn create(path: &Path, text: &str, is_secret: bool) -> io::Result<()> {
     let mut options = std::fs::OpenOptions::new();
     options.write(true).create_new(true);

@@ -1,4 +1,4 @@
-//! Clients from other computers: each side shows a certificate of one authority, and a client's says what it may do at most.
+//! Clients on other computers: each side shows a certificate from one authority, and a client's contains its maximum role.
 
 mod keys;
 mod stream;
@@ -25,25 +25,25 @@ use crate::{Board, News};
 pub use keys::{Keys, KeysError};
 use stream::{Secured, shake_hands};
 
-/// A peer that has not shown its certificate by then is let go.
+/// A peer that has not shown its certificate by this time is dropped.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
-/// A server that lets a client in gives it tickets at once.
+/// A server that admits a client sends it tickets immediately.
 const VERDICT_TIMEOUT: Duration = Duration::from_secs(1);
-/// Peers at a time that have not.
+/// Limit for peers that have not shown theirs, at a time.
 const MOST_HANDSHAKES: usize = 16;
 
-/// Why TLS cannot be set up, or a peer was not believed.
+/// Why TLS could not be set up, or a peer was not trusted.
 #[derive(Debug, thiserror::Error)]
 pub enum TlsError {
-    /// A file is not there or is not what it should be.
+    /// A file is missing or is not what it should be.
     #[error("'{}' cannot be used: {reason}", path.display())]
     File {
-        /// Which.
+        /// The file.
         path: PathBuf,
         /// What is wrong with it.
         reason: String,
     },
-    /// The certificate and its key do not go together, or the like.
+    /// The certificate does not match its key, or similar.
     #[error("TLS cannot be set up: {0}")]
     Setup(String),
     /// The other side cannot be reached, or has gone.
@@ -58,11 +58,11 @@ pub struct Files {
     pub certificate: PathBuf,
     /// Its private key.
     pub key: PathBuf,
-    /// The certificate of the authority that the other side's must be of.
+    /// The certificate of the authority that must have signed the other side's.
     pub authority: PathBuf,
 }
 
-/// Who a side is and whom it believes, read from files.
+/// A side's identity and whom it trusts, read from files.
 struct Credentials {
     chain: Vec<CertificateDer<'static>>,
     key: PrivateKeyDer<'static>,
@@ -100,12 +100,12 @@ fn setup(error: impl std::fmt::Display) -> TlsError {
     TlsError::Setup(error.to_string())
 }
 
-/// A server that asks each client for its certificate.
+/// A server that requires a certificate from each client.
 #[derive(Clone)]
 pub struct Server(Arc<ServerConfig>);
 
 impl Server {
-    /// Reads the files; the authority is the clients'.
+    /// Reads the files; the authority is that of the clients.
     pub fn new(files: &Files) -> Result<Self, TlsError> {
         let Credentials { chain, key, authority } = files.read()?;
         let clients =
@@ -120,8 +120,8 @@ impl Server {
     }
 }
 
-/// Lets clients in at any address of this computer. Each may do what its certificate says, and `most` at most. Whoever has
-/// none that the authority signed hears nothing.
+/// Admits clients at any address of this computer. Each may do what its certificate says, limited to `most`. A client
+/// without a certificate signed by the authority receives nothing.
 pub fn listen(board: &Arc<Board>, address: SocketAddr, most: Role, server: &Server) -> io::Result<Listening> {
     let (listener, address) = bind(address)?;
     let (board, config) = (Arc::clone(board), Arc::clone(&server.0));
@@ -130,7 +130,7 @@ pub fn listen(board: &Arc<Board>, address: SocketAddr, most: Role, server: &Serv
         let (stream, peer) = accept(&listener)?;
         let name = format!("client {peer}");
         if Arc::strong_count(&handshakes) > MOST_HANDSHAKES {
-            // Told to nobody: a flood would be a flood of messages.
+            // This is not reported: a flood of connections would be a flood of messages.
             return Ok(());
         }
         let (board, config, counted) = (Arc::clone(&board), Arc::clone(&config), Arc::clone(&handshakes));
@@ -157,12 +157,12 @@ fn welcome(stream: TcpStream, config: Arc<ServerConfig>) -> io::Result<(Role, Se
     Ok((role, secured))
 }
 
-/// The name that a client's certificate has for a role: one that no computer has.
+/// The name for a role in a client's certificate: one that no computer has.
 fn name_of(role: Role) -> String {
     format!("{role}.role.cantap.invalid")
 }
 
-/// What a client's certificate, which the authority has signed, lets it do.
+/// The role in a client's certificate, which the authority has signed.
 fn role_of(certificate: &CertificateDer<'_>) -> Option<Role> {
     let certificate = webpki::EndEntityCert::try_from(certificate).ok()?;
     Role::ALL.into_iter().rev().find(|role| {
@@ -172,7 +172,7 @@ fn role_of(certificate: &CertificateDer<'_>) -> Option<Role> {
     })
 }
 
-/// Connects to a server at `HOST:PORT`, whose certificate must be for that host.
+/// Connects to a server at `HOST:PORT`, whose certificate must be valid for that host.
 pub fn connect(address: &str, files: &Files) -> Result<Link, TlsError> {
     let Credentials { chain, key, authority } = files.read()?;
     let config = ClientConfig::builder_with_provider(provider())

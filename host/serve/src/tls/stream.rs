@@ -1,4 +1,5 @@
-//! One encrypted stream for two threads: one reads, the other writes, and neither waits for the other's socket.
+//! One encrypted stream for two threads: one reads and the other writes, and neither waits for the other's
+//! socket.
 
 use std::collections::VecDeque;
 use std::io::{self, Read, Write};
@@ -10,34 +11,35 @@ use cantap::device::is_idle;
 use rustls::Connection;
 use rustls::pki_types::CertificateDer;
 
-/// Encrypted at a time.
+/// Bytes encrypted at a time.
 const PIECE: usize = 16 * 1024;
 /// A flush that takes longer is left to the next write.
 const FLUSH_TIMEOUT: Duration = Duration::from_secs(2);
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Every holder leaves the state whole.
+    // Every holder leaves the state consistent.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// A stream whose handshake is over.
+/// A stream after its handshake.
 pub struct Secured(Arc<Shared>);
 
 struct Shared {
-    /// Held for computing alone.
+    /// Held only while computing.
     connection: Mutex<Connection>,
     /// Held while writing to the socket.
     output: Mutex<Output>,
     stream: TcpStream,
 }
 
-/// Encrypted, and not taken by the socket yet.
+/// Encrypted but not yet accepted by the socket.
 #[derive(Default)]
 struct Output {
     unsent: Vec<u8>,
 }
 
-/// Does the handshake on a socket that returns within a fraction of a second. Nothing of ours is said before it is over.
+/// Does the handshake on a socket that returns within a fraction of a second. No data of ours is sent before it is
+/// complete.
 pub fn shake_hands(stream: TcpStream, mut connection: Connection, deadline: Instant) -> io::Result<Secured> {
     let mut result = Ok(());
     while result.is_ok() && connection.is_handshaking() {
@@ -46,7 +48,7 @@ pub fn shake_hands(stream: TcpStream, mut connection: Connection, deadline: Inst
             return Err(io::Error::new(io::ErrorKind::TimedOut, "it did not say who it is in time"));
         }
     }
-    // The last of the handshake, or why it failed.
+    // The end of the handshake, or why it failed.
     while connection.wants_write() && Instant::now() < deadline {
         match connection.write_tls(&mut &stream) {
             Err(error) if is_idle(&error) => {}
@@ -78,8 +80,9 @@ fn step(mut stream: &TcpStream, connection: &mut Connection) -> io::Result<()> {
 }
 
 impl Secured {
-    /// Waits for the first thing that the other side says after the handshake. In TLS 1.3 a client is through before the server has
-    /// looked at its certificate: an error says that it did not like it. A server that says nothing may do so.
+    /// Waits for the first message from the other side after the handshake. In TLS 1.3, the handshake is over for a client before
+    /// the server has checked its certificate: an error shows that the server rejected it. A server need not say
+    /// anything.
     pub fn wait_for_verdict(&self, deadline: Instant) -> io::Result<()> {
         let mut raw = vec![0; PIECE];
         while Instant::now() < deadline {
@@ -112,14 +115,14 @@ impl Secured {
     }
 }
 
-/// From the other side.
+/// The direction from the other side.
 pub struct Reader {
     shared: Arc<Shared>,
     plain: VecDeque<u8>,
     raw: Vec<u8>,
 }
 
-/// To the other side.
+/// The direction to the other side.
 pub struct Writer(Arc<Shared>);
 
 impl Read for Reader {
@@ -137,7 +140,7 @@ impl Read for Reader {
                 return Ok(0);
             }
             if self.plain.is_empty() {
-                // Part of a message, or one of TLS' own.
+                // A part of a message, or one of TLS's own.
                 return Err(io::ErrorKind::WouldBlock.into());
             }
         }
@@ -146,7 +149,7 @@ impl Read for Reader {
 }
 
 impl Reader {
-    /// Takes bytes of the socket. Returns whether the other side has said that nothing follows.
+    /// Takes bytes from the socket. Returns whether the other side has said that nothing follows.
     fn decrypt(&mut self, mut raw: &[u8]) -> io::Result<bool> {
         let mut connection = lock(&self.shared.connection);
         loop {
@@ -183,7 +186,7 @@ impl Write for Writer {
         }
         drop(connection);
         match output.send(stream) {
-            // It is ours to send, from here on.
+            // From here on, sending it is up to us.
             Err(error) if !is_idle(&error) => Err(error),
             _ => Ok(piece.len()),
         }
@@ -214,7 +217,7 @@ impl Output {
 }
 
 impl Drop for Writer {
-    /// Says that nothing follows, which tells a whole end from a cut.
+    /// Says that nothing follows, which distinguishes a proper end from a cut.
     fn drop(&mut self) {
         let mut output = lock(&self.0.output);
         let mut connection = lock(&self.0.connection);
@@ -225,7 +228,7 @@ impl Drop for Writer {
             }
         }
         drop(connection);
-        // Whoever does not read does not hear it.
+        // A peer that does not read does not get it.
         let _ = output.send(&self.0.stream);
     }
 }

@@ -1,4 +1,4 @@
-//! Binds a condition's names to what they stand for: parts of the frame, signals of databases, what a listener knows.
+//! Binds a condition's names to their meaning: parts of the frame, signals of databases, or what a listener knows.
 
 use crate::{Decoder, MessageRef, Signal, Suggestion};
 
@@ -11,13 +11,13 @@ use super::syntax::{Kind, Node, Operator};
 pub(super) struct Bound {
     pub(super) expression: Expression,
     pub(super) slots: Vec<Slot>,
-    /// Whether it speaks of the frame itself.
+    /// Whether it refers to the frame itself.
     pub(super) about_frames: bool,
     /// The listener's names in it.
     pub(super) names: Vec<String>,
 }
 
-/// Where in the text the fault is, and which.
+/// The position of a fault in the text, and the fault.
 pub(super) type Fault = (usize, ConditionFault);
 
 /// Binds a whole condition.
@@ -37,7 +37,7 @@ struct Binder<'a> {
 }
 
 impl Binder<'_> {
-    /// What is asked whether it is true: there a listener's name alone asks whether it was said.
+    /// Binds something whose truth is asked: there, a listener's name alone asks whether it has a value.
     fn truth(&mut self, node: &Node) -> Result<Expression, Fault> {
         Ok(match self.bind(node)? {
             Expression::Said(name) => Expression::IsSaid(name),
@@ -74,7 +74,7 @@ impl Binder<'_> {
         })
     }
 
-    /// Of what was said several times, one is enough.
+    /// If there are several values, one that satisfies the comparison is enough.
     fn comparison(&mut self, operator: Operator, left: &Node, right: &Node) -> Result<Expression, Fault> {
         let (left, right) = (self.bind(left)?, self.bind(right)?);
         let compares = matches!(
@@ -116,7 +116,7 @@ impl Binder<'_> {
         Err((at, ConditionFault::UnknownName { name: name.to_owned(), near }))
     }
 
-    /// The slot of a signal, if there is one of that name. Parts of the frame go before signals.
+    /// The slot of a signal, if there is one of that name. Parts of the frame take precedence over signals.
     fn slot(&mut self, name: &str) -> Option<usize> {
         if let Some(slot) = self.slots.iter().position(|slot| slot.name == name) {
             return Some(slot);
@@ -140,7 +140,7 @@ impl Binder<'_> {
         Some(self.slots.len() - 1)
     }
 
-    /// The place of a listener's name, if it is one.
+    /// The index of a listener's name, if it is one.
     fn said(&mut self, name: &str) -> Option<usize> {
         let known = self.names.iter().position(|known| known == name);
         known.or_else(|| {
@@ -162,7 +162,7 @@ impl Binder<'_> {
             let Kind::Name(name) = &signal.kind else { continue };
             let slot = self.slot(name);
             let said = if slot.is_none() && part(name).is_none() { self.said(name) } else { None };
-            // Without quotes it may also be another signal, or nothing at all.
+            // Without quotes it may also be another signal, or not exist at all.
             let is_value =
                 self.slot(wanted).is_some() || part(wanted).is_some() || self.said(wanted).is_some();
             if slot.is_none() && said.is_none() || !quoted && is_value {

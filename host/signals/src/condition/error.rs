@@ -1,10 +1,10 @@
-//! What is wrong with a condition, with a mark under the place.
+//! What is wrong with a condition, with the place marked.
 
 use std::fmt;
 
 use crate::Suggestion;
 
-/// Why a text is no condition.
+/// Why a text is not a condition.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ConditionError {
     /// The condition.
@@ -19,12 +19,12 @@ pub struct ConditionError {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum ConditionFault {
-    /// Something else should stand here.
+    /// Something else should be here.
     #[error("expected {expected}, found {found}")]
     Unexpected {
-        /// What should.
+        /// What was expected.
         expected: &'static str,
-        /// What does.
+        /// What was found.
         found: String,
     },
     /// A character that no part of a condition starts with.
@@ -34,24 +34,24 @@ pub enum ConditionFault {
     #[error("this text has no closing quote")]
     OpenText,
     /// Not a number.
-    #[error("{0:?} is no number")]
+    #[error("{0:?} is not a number")]
     Number(String),
     /// `a < b < c`.
     #[error("comparisons cannot be chained; write \"a < b and b < c\"")]
     Chained,
-    /// No place of a data byte.
+    /// Not the index of a data byte.
     #[error("a frame has no byte {0}; bytes are counted from 0 to 7, in CAN FD to 63")]
     ByteIndex(String),
-    /// A name of nothing.
+    /// An unknown name.
     #[error("there is no signal {name:?}{near}")]
     UnknownName {
         /// The name.
         name: String,
-        /// A name like it.
+        /// A similar name.
         near: Suggestion,
     },
-    /// A name of nothing, because nothing was loaded.
-    #[error("{0:?} is no part of a frame, and without a database there are no signals")]
+    /// An unknown name, because no database was loaded.
+    #[error("{0:?} is not part of a frame, and without a database there are no signals")]
     NoDatabase(String),
     /// A text where it cannot be compared.
     #[error("a text can only be compared with a signal, by == or !=")]
@@ -63,13 +63,13 @@ pub enum ConditionFault {
         signal: String,
         /// The text.
         text: String,
-        /// The texts it has, ready to be printed.
+        /// The texts it has, ready for printing.
         choices: String,
     },
     /// Too long.
     #[error("a condition may have {0} characters at most")]
     TooLong(usize),
-    /// Too many parentheses.
+    /// Parentheses are nested too deeply.
     #[error("parentheses are nested deeper than {0}")]
     TooDeep(usize),
 }
@@ -78,7 +78,8 @@ impl fmt::Display for ConditionError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let before = self.text.get(..self.at).unwrap_or(&self.text);
         writeln!(f, "{}", self.fault)?;
-        // A condition can come from a file with line ends and tabs: one line, one column each.
+        // A condition from a file can contain line ends and tabs: show it on one line, one column per
+        // character.
         writeln!(f, "  {}", self.text.replace(char::is_control, " "))?;
         write!(f, "  {}^", " ".repeat(before.chars().count()))
     }

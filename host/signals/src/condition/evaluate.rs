@@ -9,28 +9,28 @@ use super::expression::{Expression, Part, Slot, binary, byte_index, part_of, tru
 use super::listener::{Deaf, Listener, Listening, Said};
 use super::syntax::{self, Operator};
 
-/// A condition, with the last values of the signals it speaks of.
+/// A condition, with the last values of the signals that it uses.
 #[derive(Clone, Debug)]
 pub struct Condition {
     expression: Expression,
-    /// Knows the condition's signals only.
+    /// Knows only the condition's signals.
     decoder: Decoder,
     slots: Vec<Slot>,
-    /// Whether it speaks of the frame itself.
+    /// Whether it refers to the frame itself.
     about_frames: bool,
     values: Vec<SignalValue>,
     concerned: bool,
-    /// For names that a listener knows; none without them.
+    /// For names that a listener knows; `None` if there are none.
     listening: Option<Listening>,
 }
 
 impl Condition {
-    /// Parses a condition; its signals are those of the decoder's databases.
+    /// Parses a condition; its signals come from the decoder's databases.
     pub fn new(text: &str, decoder: &Decoder) -> Result<Self, ConditionError> {
         Self::with_listener(text, decoder, Box::new(Deaf))
     }
 
-    /// The same, with the listener's names beside signals, which go before them.
+    /// The same, also with the listener's names. Signals take precedence over them.
     pub fn with_listener(
         text: &str,
         decoder: &Decoder,
@@ -48,14 +48,13 @@ impl Condition {
         own.retain(|message, index, _| {
             slots.iter().any(|slot| slot.candidates.contains(&(message, index as u32)))
         });
-        // A condition without names is looked at for every record.
+        // A condition without names is evaluated for every record.
         let about_frames = about_frames || slots.is_empty() && listening.is_none();
         let (values, concerned) = (Vec::new(), false);
         Ok(Self { expression, decoder: own, slots, about_frames, values, concerned, listening })
     }
 
-    /// Takes a record and says whether the condition holds now, as far as this record has to do
-    /// with it.
+    /// Takes a record and returns whether the condition holds now, as far as this record is relevant to it.
     pub fn holds(&mut self, record: &TraceRecord) -> bool {
         self.concerned = self.update(record) || self.about_frames;
         let holds = self.concerned && self.is_true(record, None);
@@ -83,29 +82,30 @@ impl Condition {
         truth(self.evaluate(&self.expression, record, said)) == Some(true)
     }
 
-    /// Whether it speaks of the frame itself, or of what frames say together, and not of signals alone.
+    /// Whether it refers to the frame itself, or to what frames say together, rather than to signals alone.
     pub fn is_about_frames(&self) -> bool {
         self.about_frames || self.listening.is_some()
     }
 
-    /// What was said with the record that [`Self::holds`] took last, and made the condition hold; a line each.
+    /// The listener's events of the last record taken by [`Self::holds`] that made the condition hold; one
+    /// line each.
     pub fn said(&self) -> &[String] {
         self.listening.as_ref().map_or(&[], |listening| &listening.matched)
     }
 
-    /// The listener's names in the condition that no event had so far: perhaps there are none such.
+    /// The listener's names in the condition that no event has had so far: perhaps they do not exist.
     pub fn unheard(&self) -> impl Iterator<Item = &str> {
         let names = self.listening.iter().flat_map(|listening| &listening.names);
         names.filter(|(_, was_heard)| !was_heard).map(|(name, _)| name.as_str())
     }
 
-    /// Whether the record that [`Self::holds`] took last has to do with the condition: it carries one of
-    /// its signals, or the condition speaks of the frame itself.
+    /// Whether the last record taken by [`Self::holds`] is relevant to the condition: it carries one of its
+    /// signals, or the condition refers to the frame itself.
     pub fn was_concerned(&self) -> bool {
         self.concerned
     }
 
-    /// Remembers the record's signals; whether there were any.
+    /// Remembers the record's signals; returns whether there were any.
     fn update(&mut self, record: &TraceRecord) -> bool {
         let Some(frame) = record.frame().filter(|_| !self.slots.is_empty()) else { return false };
         let Some(message) = self.decoder.decode(record.channel, frame, &mut self.values) else {
@@ -133,7 +133,7 @@ impl Condition {
             Expression::Number(value) => Some(*value),
             Expression::Part(part) => match said {
                 Some(heard) if matches!(part, Part::Channel) => Some(heard.said.channel().into()),
-                // What ends because nothing came is said with a frame that it has nothing to do with.
+                // An event that ends because nothing came is reported with an unrelated frame.
                 Some(heard) if !heard.said.is_completed_by(record) => None,
                 _ => part_of(*part, record),
             },
@@ -169,7 +169,7 @@ impl Condition {
             Expression::Negative(inner) => self.evaluate(inner, record, said).map(|value| -value),
             Expression::Binary(operator, left, right) => {
                 let left = self.evaluate(left, record, said);
-                // One side may decide alone, whatever the other is.
+                // One side may decide the result on its own.
                 match (operator, truth(left)) {
                     (Operator::And, Some(false)) => return boolean(false),
                     (Operator::Or, Some(true)) => return boolean(true),
@@ -187,7 +187,7 @@ impl Condition {
     }
 }
 
-/// An event, by the places of the condition's names.
+/// An event's values, in the order of the condition's names.
 struct Heard<'a> {
     said: &'a dyn Said,
     names: &'a [(String, bool)],
@@ -232,7 +232,7 @@ mod tests {
         record(TraceEvent::Frame { frame: text.parse().unwrap(), direction: Direction::Rx, late: false })
     }
 
-    /// At which of the frames the condition holds.
+    /// The frames at which the condition holds.
     fn hits(condition: &str, frames: &[&str]) -> Vec<usize> {
         let mut condition = Condition::new(condition, &decoder()).unwrap();
         (0..frames.len()).filter(|&at| condition.holds(&frame(frames[at]))).collect()

@@ -1,4 +1,4 @@
-//! What a condition is made of once its names are bound, and its arithmetic.
+//! A condition with its names bound, and its arithmetic.
 
 use crate::MessageRef;
 use cantap_trace::fd::FD_MAX_BYTES;
@@ -6,7 +6,7 @@ use cantap_trace::{TraceEvent, TraceRecord};
 
 use super::syntax::Operator;
 
-/// A signal that the condition names. The same name may stand for signals of several messages.
+/// A signal in the condition. The name may refer to signals of several messages.
 #[derive(Clone, Debug)]
 pub(super) struct Slot {
     pub(super) name: String,
@@ -21,13 +21,13 @@ pub(super) enum Expression {
     Part(Part),
     Byte(Box<Expression>),
     Signal(usize),
-    /// Whether a signal's value has a text: for each candidate the raw values with that text.
+    /// Whether a signal's value has a text: for each candidate, the raw values with that text.
     HasText(usize, Vec<Vec<i64>>),
-    /// The first value of a listener's name, by its place among the names.
+    /// The first value of a listener's name, by its index among the names.
     Said(usize),
-    /// Whether there is a value of it.
+    /// Whether it has a value.
     IsSaid(usize),
-    /// Whether one of its values compares so with the other side; `true` if the name is on the left.
+    /// Whether one of its values compares like this with the other side; `true` if the name is on the left.
     AnySaid(usize, Operator, Box<Expression>, bool),
     /// Whether one of its values is this text.
     SaidText(usize, String),
@@ -81,7 +81,7 @@ pub(super) fn part_of(part: Part, record: &TraceRecord) -> Option<f64> {
     }
 }
 
-/// The value of what depends on no record.
+/// The value of an expression that depends on no record.
 pub(super) fn constant(expression: &Expression) -> Option<f64> {
     match expression {
         Expression::Number(value) => Some(*value),
@@ -91,13 +91,13 @@ pub(super) fn constant(expression: &Expression) -> Option<f64> {
     }
 }
 
-/// The place of a data byte, if there can be a byte at it.
+/// The index of a data byte, if it is a possible one.
 pub(super) fn byte_index(value: f64) -> Option<usize> {
     const MOST: f64 = (FD_MAX_BYTES - 1) as f64;
     (value.fract() == 0.0 && (0.0..=MOST).contains(&value)).then_some(value as usize)
 }
 
-/// Not-a-number is as unknown as nothing at all.
+/// Not-a-number is as unknown as no value at all.
 pub(super) fn truth(value: Option<f64>) -> Option<bool> {
     value.filter(|value| !value.is_nan()).map(|value| value != 0.0)
 }
@@ -109,7 +109,7 @@ pub(super) fn binary(operator: Operator, left: f64, right: f64) -> Option<f64> {
     }
     let boolean = |truth: bool| Some(f64::from(u8::from(truth)));
     match operator {
-        // Decided before, unless both are true or both are false.
+        // Already decided unless both are true or both are false.
         Operator::And => boolean(true),
         Operator::Or => boolean(false),
         Operator::Equal => boolean(left == right),

@@ -1,50 +1,49 @@
-//! Names whose values no single frame has: what several frames say together, such as `uds.sid` of a request and its response.
+//! Names whose values come from several frames together, such as `uds.sid` for a request and its response.
 //!
-//! Whoever puts frames together hands in a [`Listener`]. The condition is then looked at for each of its events as well.
+//! Code that puts frames together provides a [`Listener`]. The condition is then also evaluated for each of its events.
 
 use std::fmt;
 
 use cantap_trace::TraceRecord;
 
-/// One event, as a condition asks about it. `None` where it has no such name.
+/// One event, as a condition queries it. `None` if it has no such name.
 pub trait Said {
-    /// The channel that it was said on, from 1.
+    /// The event's channel, from 1.
     fn channel(&self) -> u8;
 
-    /// Whether the frame of this record is what completed it.
+    /// Whether this record's frame completed it.
     fn is_completed_by(&self, record: &TraceRecord) -> bool;
 
-    /// Whether it has a value of this name, if it is one of those that could have.
+    /// Whether it has a value of this name, if the name is one that it could have.
     fn has(&self, name: &str) -> Option<bool>;
 
-    /// Hands out the numbers of this name: several if it was said several times.
+    /// Passes the numbers of this name: several if it occurs several times.
     fn numbers(&self, name: &str, out: &mut dyn FnMut(f64));
 
-    /// Whether one of the values of this name is this text, or stands for it; whatever the case of its letters.
+    /// Whether one of the values of this name is this text, or has it as a name, ignoring case.
     fn is_text(&self, name: &str, text: &str) -> Option<bool>;
 
-    /// In a line, for people.
+    /// A description on one line, for people.
     fn describe(&self) -> String;
 }
 
 /// Puts frames together.
 pub trait Listener: fmt::Debug + Send + Sync {
-    /// Whether the name is one of those that its events may have. It will be asked for all that the condition has before it takes a
-    /// record.
+    /// Whether the name is one that its events may have. It is called for all names of the condition before any record is taken.
     fn knows(&mut self, name: &str) -> bool;
 
-    /// Takes a record, and hands out the events that end with it.
+    /// Takes a record and passes on the events that end with it.
     fn take(&mut self, record: &TraceRecord, said: &mut dyn FnMut(&dyn Said));
 
-    /// One that knows the same names and has heard nothing.
+    /// A new listener for the same names that has heard nothing yet.
     fn fresh(&self) -> Box<dyn Listener>;
 }
 
-/// A listener with what became of it.
+/// A listener and its results.
 #[derive(Debug)]
 pub(super) struct Listening {
     pub listener: Box<dyn Listener>,
-    /// The names that the condition has of it, and whether any event had them.
+    /// The condition's names that belong to it, and whether any event has had them.
     pub names: Vec<(String, bool)>,
     /// The events of the last record for which the condition held.
     pub matched: Vec<String>,
@@ -56,7 +55,7 @@ impl Clone for Listening {
     }
 }
 
-/// A listener that knows nothing: for conditions about frames and signals alone.
+/// A listener without any names: for conditions about frames and signals alone.
 #[derive(Debug)]
 pub(super) struct Deaf;
 

@@ -12,8 +12,8 @@
 //! | `12`, `0x1F`, `0b101`, `1.5e3` | numbers |
 //! | `+ - * / % & \|`, `== != < <= > >=`, `not and or`, `( )` | as usual; `&` and `\|` bind tighter than comparisons |
 //!
-//! What is not known makes a comparison neither true nor false: a signal before its first frame, a
-//! byte beyond the data, a division by zero. A condition about signals alone is looked at when one of them arrives.
+//! Unknown values make a comparison neither true nor false: a signal before its first frame, a byte beyond the
+//! data, a division by zero. A condition about signals alone is evaluated when one of them arrives.
 
 mod bind;
 mod error;

@@ -1,14 +1,14 @@
-//! The text of a condition as a tree.
+//! Parses the text of a condition into a tree.
 
 use super::error::{ConditionError, ConditionFault};
 
-/// Nobody types more; and it bounds the tree's depth, on which evaluation recurses.
+/// Nobody types more; and it bounds the depth of the tree, on which evaluation recurses.
 const MAX_CHARACTERS: usize = 2000;
 
-/// Parentheses, `not` and signs inside each other.
+/// Limit for nested parentheses, `not` and signs.
 const MAX_DEPTH: usize = 50;
 
-/// A part of a condition and where it starts.
+/// A part of a condition and its position.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Node {
     pub at: usize,
@@ -19,7 +19,7 @@ pub struct Node {
 pub enum Kind {
     Number(f64),
     Text(String),
-    /// A signal, a part of the frame or a text: only databases tell.
+    /// A signal, a part of the frame or a text: only databases can decide which.
     Name(String),
     Byte(Box<Node>),
     Not(Box<Node>),
@@ -47,7 +47,7 @@ pub enum Operator {
 }
 
 impl Operator {
-    /// From loose to tight; comparisons are 3.
+    /// From loose to tight; comparisons have 3.
     fn binding(self) -> u8 {
         match self {
             Self::Or => 1,
@@ -67,9 +67,9 @@ impl Operator {
 }
 
 const COMPARISON: u8 = 3;
-/// `not` takes a comparison, but neither `and` nor `or`.
+/// `not` applies to a comparison, but not to `and` or `or`.
 const NOT: u8 = COMPARISON;
-/// A sign takes the next value only.
+/// A sign applies only to the next value.
 const SIGN: u8 = 8;
 
 #[derive(Clone, Debug, PartialEq)]
@@ -196,7 +196,7 @@ fn symbol(rest: &str) -> Option<(Token, usize)> {
 
 struct Parser<'a> {
     text: &'a str,
-    /// The last one is the end.
+    /// The last one is the end of the text.
     tokens: Vec<(usize, Token)>,
     next: usize,
     depth: usize,
@@ -211,7 +211,7 @@ impl Parser<'_> {
         self.tokens[self.next].0
     }
 
-    /// The next token; the end stays.
+    /// Takes the next token, except for the end, which stays.
     fn take(&mut self) -> Token {
         let token = self.peek().clone();
         self.next = (self.next + 1).min(self.tokens.len() - 1);
@@ -236,7 +236,7 @@ impl Parser<'_> {
         Ok(())
     }
 
-    /// Everything that binds tighter than `floor`.
+    /// Parses everything that binds tighter than `floor`.
     fn expression(&mut self, floor: u8) -> Result<Node, Fault> {
         self.depth += 1;
         if self.depth > MAX_DEPTH {
@@ -287,7 +287,7 @@ impl Parser<'_> {
             }
             Token::Not => {
                 self.take();
-                // One below its own binding: "not not a" and "not a == b" work.
+                // One below its own binding, so that "not not a" and "not a == b" work.
                 Kind::Not(self.expression(NOT - 1)?.into())
             }
             Token::Operator(Operator::Subtract) => {
@@ -346,8 +346,8 @@ mod tests {
             ("a b", 2, "expected and, or, or the end, found \"b\""),
             ("1 < a < 3", 6, "comparisons cannot be chained; write \"a < b and b < c\""),
             ("a == 'x", 5, "this text has no closing quote"),
-            ("a == 0xZZ", 5, "\"0xZZ\" is no number"),
-            ("a == 1e999", 5, "\"1e999\" is no number"),
+            ("a == 0xZZ", 5, "\"0xZZ\" is not a number"),
+            ("a == 1e999", 5, "\"1e999\" is not a number"),
             ("a # b", 2, "'#' has no meaning here"),
             ("", 0, "expected a number, a signal, a part of the frame or \"(\", found the end"),
         ] {

@@ -1,13 +1,13 @@
-//! Why values make no frame, with what to write in their place.
+//! Why values cannot be encoded, with what to write instead.
 
 use crate::select::Suggestion;
 
-/// Why values make no frame.
+/// Why values cannot be encoded.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum EncodeError {
-    /// The text has another form.
-    #[error("{text:?} is no message with values; write it as Message:Signal=value,Signal=value")]
+    /// The text does not have the expected form.
+    #[error("{text:?} is not a message with values; write it as Message:Signal=value,Signal=value")]
     Form {
         /// The text.
         text: String,
@@ -17,7 +17,7 @@ pub enum EncodeError {
     UnknownMessage {
         /// The name.
         name: String,
-        /// A name like it.
+        /// A similar name.
         near: Suggestion,
     },
     /// Databases of different channels have it.
@@ -37,20 +37,20 @@ pub enum EncodeError {
         message: String,
         /// The name.
         name: String,
-        /// A name like it.
+        /// A similar name.
         near: Suggestion,
     },
     /// The signal is given twice.
     #[error("signal {0} is given twice")]
     Twice(String),
-    /// The text is no number and not in the value table.
-    #[error("{text:?} is no value for {signal}; it takes a number{choices}")]
+    /// The text is not a number and not in the value table.
+    #[error("{text:?} is not a value for {signal}; it takes a number{choices}")]
     UnknownText {
         /// The signal.
         signal: String,
         /// The text.
         text: String,
-        /// The texts that it takes, ready to be printed.
+        /// The texts that it accepts, ready for printing.
         choices: String,
     },
     /// The text stands for several raw values.
@@ -60,17 +60,17 @@ pub enum EncodeError {
         signal: String,
         /// The text.
         text: String,
-        /// The values, ready to be written in the text's place.
+        /// The values, ready to be written instead of the text.
         choices: String,
     },
-    /// A fraction for a signal whose values are states.
+    /// A fraction was given for a signal whose values are states.
     #[error("{signal} has states and none between them, such as {value}; it takes a whole number{choices}")]
     Fraction {
         /// The signal.
         signal: String,
         /// The value.
         value: String,
-        /// The texts that it takes, ready to be printed.
+        /// The texts that it accepts, ready for printing.
         choices: String,
     },
     /// The signal has too few bits for the value.
@@ -87,7 +87,7 @@ pub enum EncodeError {
     },
     /// The database forbids the value.
     #[error(
-        "the database allows {signal} from {low} to {high}, not {value}; write raw:{raw} to send it all the same"
+        "the database allows {signal} from {low} to {high}, not {value}; write raw:{raw} to send it anyway"
     )]
     Limits {
         /// The signal.
@@ -101,19 +101,19 @@ pub enum EncodeError {
         /// The bits that would be sent.
         raw: u64,
     },
-    /// The multiplexer has another value.
+    /// The signal is not present, because the multiplexer has another value.
     #[error("{signal} is only there when {switch} is {needed}, and it is {actual}")]
     Absent {
         /// The signal.
         signal: String,
         /// Its multiplexer.
         switch: String,
-        /// The values under which the signal is there.
+        /// The values for which the signal is present.
         needed: String,
         /// The value that was given.
         actual: u64,
     },
-    /// No value of the multiplexer suits all the signals given.
+    /// No value of the multiplexer suits all given signals.
     #[error("{first} and {second} are never in the same frame ({switch} chooses between them)")]
     Exclusive {
         /// One signal.
@@ -130,7 +130,7 @@ pub enum EncodeError {
         what: String,
         /// Bytes it needs.
         bytes: u32,
-        /// How many there are, in words.
+        /// A description of how much room there is.
         room: &'static str,
     },
 }

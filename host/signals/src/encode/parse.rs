@@ -1,4 +1,4 @@
-//! From `Message:Signal=value,…` to names and values.
+//! Parses `Message:Signal=value,…` into names and values.
 
 use super::error::EncodeError;
 
@@ -15,7 +15,7 @@ pub enum Input {
     Text(String),
 }
 
-/// Splits `Message:Signal=value,…`. A value in double quotes is a text, whatever is in it.
+/// Splits `Message:Signal=value,…`. A value in double quotes is a text, whatever it contains.
 pub fn parse(text: &str) -> Result<(String, Vec<(String, Input)>), EncodeError> {
     let form = || EncodeError::Form { text: text.to_owned() };
     let (name, rest) = text.split_once(':').unwrap_or((text, ""));
@@ -56,7 +56,7 @@ fn input(text: &str) -> Input {
     }
     match (integer(text), text.parse::<f64>()) {
         (Some(integer), _) => Input::Integer(integer),
-        // Rust also reads "inf" and "nan", which may well be texts of a value table.
+        // Rust also accepts "inf" and "nan", which may well be texts of a value table.
         (_, Ok(real)) if text.contains(|c: char| c.is_ascii_digit()) => Input::Real(real),
         _ => Input::Text(text.to_owned()),
     }
@@ -69,6 +69,6 @@ fn integer(text: &str) -> Option<i128> {
         _ if digits.starts_with('+') => return None,
         _ => digits.parse().ok()?,
     };
-    // A 64-bit value times any factor that makes sense; and nothing below can overflow.
+    // A 64-bit value times any sensible factor; nothing below can overflow.
     i128::try_from(magnitude).ok().filter(|magnitude| *magnitude < 1 << 120).map(|magnitude| sign * magnitude)
 }

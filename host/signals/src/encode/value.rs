@@ -1,4 +1,4 @@
-//! From a value to the bits of its signal.
+//! Converts a value to the bits of its signal.
 
 use super::error::EncodeError;
 use super::parse::Input;
@@ -40,11 +40,11 @@ pub(super) fn raw(message: &Message, signal: &Signal, input: &Input) -> Result<u
     Ok(raw)
 }
 
-/// Share of a step between two raw values that calculating with floats may cost.
+/// The fraction of a step between two raw values that may be lost to floating-point errors.
 const STEP_ERROR: f64 = 1e-6;
 
-/// Whether a value is between limits, which a file gives in decimals that neither a factor nor a short float may be able to meet
-/// exactly: 204.70000000000002 is 204.7, and so is a float of 32 bits that is nearest to it.
+/// Whether a value is within limits. A file gives them in decimal, which neither a factor nor a short float may be able to
+/// represent exactly: 204.70000000000002 counts as 204.7, and so does the nearest 32-bit float.
 fn is_within(signal: &Signal, physical: f64, low: f64, high: f64) -> bool {
     let nearest = |limit: f64| match signal.integer(0) {
         Some(_) => None,
@@ -56,7 +56,7 @@ fn is_within(signal: &Signal, physical: f64, low: f64, high: f64) -> bool {
     (low..=high).contains(&physical)
 }
 
-/// The bits for a text of the value table, or for what J1939 says in place of a value. The database's limits do not apply.
+/// The bits for a text of the value table, or for what J1939 sends instead of a value. The database's limits do not apply.
 fn raw_of_text(message: &Message, signal: &Signal, text: &str) -> Result<u64, EncodeError> {
     let values = signal.values.values(text);
     let raws: Vec<_> = values
@@ -87,9 +87,9 @@ fn unknown_text(signal: &Signal, text: &str) -> EncodeError {
     EncodeError::UnknownText { signal: signal.name.clone(), text: text.to_owned(), choices }
 }
 
-/// The texts that a signal takes, as the end of a sentence; each once.
+/// The texts that a signal accepts, each once, as the end of a sentence.
 fn choices(signal: &Signal) -> String {
-    /// A longer list hides the message.
+    /// A longer list would hide the message.
     const SHOWN: usize = 12;
     let mut texts: Vec<&str> = Vec::new();
     for (_, text) in signal.values.iter() {
@@ -125,7 +125,7 @@ fn range_error(signal: &Signal, value: String) -> EncodeError {
     EncodeError::Range { signal: signal.name.clone(), value, low: low.to_string(), high: high.to_string() }
 }
 
-/// Undoes factor and offset, exactly where that can be done.
+/// Reverses factor and offset, exactly where possible.
 fn unscaled_integer(signal: &Signal, value: i128, physical: f64) -> i128 {
     let (factor, offset) = (signal.factor as i128, signal.offset as i128);
     let whole = signal.factor.fract() == 0.0 && signal.offset.fract() == 0.0 && factor != 0;
@@ -146,7 +146,7 @@ fn raw_of_integer(signal: &Signal, value: i128) -> Option<u64> {
         ValueKind::OnesComplement if value < 0 => (value - 1) as u64 & mask,
         _ => value as u64 & mask,
     };
-    // Whatever does not read back as the value does not fit.
+    // If it does not read back as the same value, it does not fit.
     (signal.integer(raw)? == value).then_some(raw)
 }
 

@@ -4,7 +4,7 @@ use super::{Conversion, MessagePlan, Payload, SignalPlan, SignalValue};
 use crate::layout::ByteOrder;
 use crate::model::Message;
 
-/// Frames of one message that are decoded together. [`super::super::Decoder::rows`] makes it.
+/// Frames of one message that are decoded together, made by [`super::super::Decoder::rows`].
 #[derive(Clone, Debug)]
 pub struct MessageRows {
     message: Message,
@@ -23,11 +23,11 @@ pub struct MessageRows {
 pub struct SignalRows<'a> {
     /// The signal's index in [`Message::signals`].
     pub signal: u32,
-    /// As [`SignalValue::raw`]; without meaning where the signal is not there.
+    /// Like [`SignalValue::raw`]; meaningless where the signal is not present.
     pub raw: &'a [u64],
-    /// As [`SignalValue::value`]; without meaning where the signal is not there.
+    /// Like [`SignalValue::value`]; meaningless where the signal is not present.
     pub value: &'a [f64],
-    /// Which frames have the signal; `None` if all have.
+    /// Which frames have the signal; `None` if all do.
     pub there: Option<&'a [bool]>,
 }
 
@@ -42,17 +42,17 @@ impl MessageRows {
         &self.message
     }
 
-    /// How many frames wait to be decoded.
+    /// The number of frames waiting to be decoded.
     pub fn len(&self) -> usize {
         self.words.len()
     }
 
-    /// Whether no frame waits.
+    /// Whether no frame is waiting.
     pub fn is_empty(&self) -> bool {
         self.words.is_empty()
     }
 
-    /// Adds a frame's data. Returns false, and adds nothing, if it has more than eight bytes: that is for [`Self::one`].
+    /// Adds a frame's data. Returns false and adds nothing if it has more than eight bytes: use [`Self::one`] for those.
     #[inline]
     pub fn push(&mut self, data: &[u8]) -> bool {
         let mut padded = [0; 8];
@@ -70,14 +70,14 @@ impl MessageRows {
         self.plan.decode(&self.message, data, values);
     }
 
-    /// Whether data of this length has one of the chosen signals, whatever its bytes are.
+    /// Whether data of this length always contain one of the chosen signals, whatever the bytes.
     pub fn is_certain(&self, len: usize) -> bool {
         let fits = |plan: &SignalPlan| usize::from(plan.field.needed) <= len && plan.field.needed < u8::MAX;
         self.plan.groups.iter().any(|group| group.conditions.is_empty() && group.signals.iter().any(fits))
     }
 
-    /// Decodes the frames that wait and forgets them. `each` gets the signals that were chosen, each once; where a frame has none of a
-    /// signal, [`SignalRows::there`] says so.
+    /// Decodes the waiting frames and forgets them. `each` gets each of the chosen signals once; if some frames do not have it,
+    /// [`SignalRows::there`] says which do.
     pub fn decode(&mut self, mut each: impl FnMut(&Message, SignalRows<'_>)) {
         if self.is_empty() {
             return;
@@ -111,7 +111,7 @@ impl MessageRows {
 }
 
 impl SignalPlan {
-    /// Decodes it out of frames that all have it; false, with nothing appended, for the rare kinds.
+    /// Decodes it from frames that all have it; false, with nothing appended, for the rare kinds.
     fn column(&self, words: &[u64], raw: &mut Vec<u64>, value: &mut Vec<f64>) -> bool {
         let (shift, mask) = (self.field.shift, self.field.mask);
         if matches!(self.conversion, Conversion::Other) {
@@ -123,7 +123,7 @@ impl SignalPlan {
         }
         let scale = self.scale;
         match self.conversion {
-            // What fits into a signed number is converted in one instruction.
+            // Values that fit in a signed number are converted by a single instruction.
             Conversion::Unsigned if i64::try_from(mask).is_ok() => {
                 scale.apply_all(raw.iter().map(|raw| *raw as i64 as f64), value);
             }

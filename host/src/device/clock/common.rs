@@ -1,40 +1,41 @@
-//! Two devices on one clock: that of the USB host controller which both hang on.
+//! Puts two devices on one clock: that of the USB host controller that both are connected to.
 //!
-//! Every device on a controller hears the same frames with the same numbers at the same moments. So a tick of one device is a frame
-//! time, and that is a tick of the other: two marks' jitter, a tenth of a microsecond, and no round trip is in it. What must be
-//! found out is which turn of the frame number, of 2.048 s, each device counts from, and whether they are on one controller at all. UTC
-//! tells both: at one moment of it, the devices' frame times must differ by whole turns, to the millisecond or less that UTC is
-//! known to. On two controllers the numbers have nothing to do with one another, and are that close by chance once in a thousand.
+//! Every device on a controller hears the same frames with the same numbers at the same moments. So a tick of one device corresponds to
+//! a frame time, and that to a tick of the other, with no error but the jitter of two marks (a tenth of a microsecond): no round trip
+//! is involved. What has to be found out is from which wrap of the frame number (every 2.048 s) each device counts, and whether they
+//! are on one controller at all. UTC answers both: at one UTC, the devices' frame times must differ by whole wraps, to within the
+//! millisecond or less to which UTC is known. On two controllers the numbers are unrelated, and agree that closely by chance once in a
+//! thousand.
 
 use super::units::{FrameNs, Ticks};
 use super::{ClockMap, FrameClock, FrameDoubt};
 
-/// Nanoseconds of a turn of the frame number: 2¹¹ frames.
+/// Nanoseconds until the frame number wraps: 2¹¹ frames.
 const TURN_NS: i64 = 2_048_000_000;
-/// What two devices' frame times may differ by at one UTC beside what UTC is known to.
+/// How far apart two devices' frame times may be at one UTC, in addition to the uncertainty of UTC.
 const MARGIN_NS: i64 = 500_000;
-/// Moments that are compared: marks of the first device, about one a second.
+/// How many moments are compared: marks of the first device, about one a second.
 const MOMENTS: usize = 256;
-/// The newest of them, which are judged by themselves too: frames that have run apart are to be noticed within seconds.
+/// The newest of them, which are also judged on their own: frames that drift apart should be noticed within seconds.
 const NEWEST: usize = 5;
 
 /// Why two devices have no clock in common.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum NotCommon {
-    /// A device's marks are not to be built on.
+    /// A device's marks cannot be relied on.
     #[error("{0}")]
     Doubt(FrameDoubt),
-    /// They were not marked at the same time.
+    /// The devices were not marked at the same time.
     #[error("the devices have not marked USB frames at the same time")]
     Apart,
-    /// At one moment, the frames of one are numbered differently from those of the other.
+    /// At one moment, the two devices number their frames differently.
     #[error(
         "the devices are on different USB host controllers: their frames are {off_us} us apart, and UTC is known to {known_us} us"
     )]
     Controllers {
         /// How far apart, in microseconds.
         off_us: i64,
-        /// How far apart they could be, by what is known of UTC.
+        /// How far apart they could be, given the uncertainty of UTC.
         known_us: i64,
     },
 }
@@ -42,7 +43,7 @@ pub enum NotCommon {
 /// Maps one device's ticks to another's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct CommonClock {
-    /// The second device's frame time less the first's: whole turns.
+    /// The second device's frame time minus the first's: whole wraps.
     turns_ns: i64,
     disagreement_ns: i64,
     outliers: usize,
@@ -51,16 +52,16 @@ pub struct CommonClock {
 /// A device's mark with its UTC.
 struct Dated {
     utc: i64,
-    /// How far off that may be.
+    /// The uncertainty of that UTC.
     unsure_ns: i64,
     frame: FrameNs,
 }
 
-/// Two devices' frame times at one UTC.
+/// Both devices' frame times at one UTC.
 #[derive(Clone, Copy)]
 struct Moment {
     difference_ns: i64,
-    /// What they may differ by beside whole turns.
+    /// How far apart they may be, apart from whole wraps.
     known_ns: i64,
 }
 
@@ -71,12 +72,12 @@ impl Moment {
 }
 
 impl CommonClock {
-    /// Of two devices whose maps have marks and round trips of the same minutes.
+    /// Relates two devices whose maps have marks and round trips from the same minutes.
     ///
-    /// Each of the last marks is a moment that is compared, by what was known of UTC then. What most of them say is so, and
-    /// what most of the newest say: a mark or an answer that was late once is counted ([`Self::outliers`]) and decides nothing,
-    /// and frames that run apart are noticed within seconds. To be repeated after a device's marks were interrupted, since it may
-    /// then count from another turn.
+    /// Each of the last marks is compared, with what was known of UTC at that time. The majority of them decides, and the
+    /// majority of the newest: a single late mark or answer is counted ([`Self::outliers`]) and decides nothing, and frames that
+    /// drift apart are noticed within seconds. Repeat this after a device's marks were interrupted, since it may then count from
+    /// another wrap.
     pub fn between(first: &ClockMap, second: &ClockMap) -> Result<Self, NotCommon> {
         for frames in [first.frames(), second.frames()] {
             let last = frames.marks().next_back().map_or(Ticks(0), |(at, _)| at);
@@ -116,7 +117,7 @@ impl CommonClock {
         })
     }
 
-    /// The second device's time when the first one's is `ticks`. `None` if either has too few marks to tell.
+    /// The second device's time when the first one's is `ticks`. `None` if either has too few marks for this.
     pub fn to_second(&self, first: &FrameClock, ticks: Ticks, second: &FrameClock) -> Option<Ticks> {
         second.ticks_at(first.at(ticks)?.plus(self.turns_ns))
     }
@@ -126,26 +127,27 @@ impl CommonClock {
         first.ticks_at(second.at(ticks)?.plus(-self.turns_ns))
     }
 
-    /// The most that the two devices' UTC, each by its own round trips, was apart from what the frames say, in nanoseconds: what
-    /// [`Self::between`] found out by, and what a common clock saves. Late marks and answers are in it.
+    /// The largest difference between the devices' UTC, each from its own round trips, and what the frames say, in nanoseconds:
+    /// the error that a common clock avoids. It includes late marks and answers.
     pub const fn disagreement_ns(&self) -> i64 {
         self.disagreement_ns
     }
 
-    /// How many of the moments compared were farther apart than what was known of UTC then allows: late marks, late answers.
+    /// How many of the compared moments were farther apart than the uncertainty of UTC then allowed: late marks or late
+    /// answers.
     pub const fn outliers(&self) -> usize {
         self.outliers
     }
 }
 
-/// The middle one of some values; `None` of none.
+/// The median of a value; `None` if there are no moments.
 fn middle(moments: &[Moment], value: impl Fn(&Moment) -> i64) -> Option<i64> {
     let mut values: Vec<i64> = moments.iter().map(value).collect();
     values.sort_unstable();
     values.get(values.len() / 2).copied()
 }
 
-/// The frame time at a UTC time between two marks, and how far off that UTC may be.
+/// The frame time at a UTC between two marks, and the uncertainty of that UTC.
 fn interpolated(marks: &[Dated], utc: i64) -> Option<(FrameNs, i64)> {
     let next = marks.partition_point(|mark| mark.utc <= utc);
     let (from, to) = (marks.get(next.checked_sub(1)?)?, marks.get(next)?);

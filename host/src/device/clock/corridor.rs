@@ -1,48 +1,49 @@
-//! UTC by round trips, against a ruler: a line through gates.
+//! Finds UTC from round trips: a line through gates.
 //!
-//! A device read its clock somewhere between question and answer. So each round trip is a gate that the true line, UTC over
-//! the device's time, went through: no earlier than the question and no later than the answer. No assumption is made of where
-//! in it. Of the lines that pass all gates, the one is taken that keeps farthest from their posts; quick round trips are narrow gates and
-//! decide by themselves, slow ones do no harm. What the other lines would say is the uncertainty.
+//! A device read its clock somewhere between question and answer. So each round trip is a gate through which the true line (UTC over the
+//! device's time) passed: no earlier than the question and no later than the answer. Nothing is assumed about where in the gate. Of the
+//! lines that pass all gates, the one that keeps farthest from the gate posts is taken; quick round trips are narrow gates and decide the
+//! result, slow ones do no harm. The spread of the other lines is the uncertainty.
 //!
-//! If answers always take longer than questions, the middle is off by half of the difference, and nothing on this side can tell.
+//! If answers always take longer than questions, the middle is off by half of the difference, and nothing on this side can
+//! detect it.
 
-/// Rates are looked for in this range, as parts of one: a device outside it does not run in real time.
+/// Rates are searched in this range, as a fraction: a device outside it does not run in real time.
 const MOST_RATE: f64 = 1e-3;
-/// What is known of a rate before anything was measured: crystals are off by some tens of parts per million.
+/// What is known of a rate before anything was measured: crystals are off by tens of parts per million.
 const PRIOR_RATE: f64 = 30e-6;
-/// Thirds of [`MOST_RATE`] until nothing is left that matters: (2/3)⁵⁰ of it.
+/// Each step keeps two thirds of [`MOST_RATE`]: after this many, nothing that matters is left, (2/3)⁵⁰.
 const STEPS: usize = 50;
 
-/// A round trip, seen from the present.
+/// A round trip, relative to the present.
 #[expect(clippy::struct_field_names, reason = "units")]
 #[derive(Clone, Copy, Debug)]
 pub struct Gate {
-    /// When the device read its clock, by the ruler: nanoseconds after the present, so negative.
+    /// When the device read its clock, on the ruler: nanoseconds after the present, so negative.
     pub at_ns: f64,
-    /// UTC of the question, less `at_ns` and what stands for the present.
+    /// UTC of the question, minus `at_ns` and the reference value for the present.
     pub asked_ns: f64,
-    /// UTC of the answer, likewise.
+    /// UTC of the answer, minus the same.
     pub answered_ns: f64,
 }
 
-/// The line at the present.
+/// The line, at the present.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Line {
-    /// UTC less what stands for the present.
+    /// UTC minus the reference value for the present.
     pub now_ns: f64,
-    /// UTC per ruler, less one.
+    /// UTC per ruler time, minus one.
     pub rate: f64,
-    /// The lowest and the highest that any line passes the present at.
+    /// The lowest and the highest value at the present of any line that passes.
     pub range_ns: (f64, f64),
-    /// How far rates that pass may lie from `rate`.
+    /// How far other rates that pass may be from `rate`.
     pub rate_doubt: f64,
 }
 
-/// The line through the gates, whose posts stand apart by `wander` of their age more than they were seen: neither
-/// clock keeps its rate for ever. `None` if no line passes them all.
+/// The line through the gates. Each gate's posts are moved apart by `wander` times its age, because neither clock
+/// keeps its rate for ever. `None` if no line passes them all.
 pub fn line(gates: &[Gate], wander: f64) -> Option<Line> {
-    // The lowest and the highest way through, at the present, of lines of this rate.
+    // The lowest and the highest value at the present of lines with this rate.
     let passage = |rate: f64| {
         let start = (f64::NEG_INFINITY, f64::INFINITY);
         gates.iter().fold(start, |(low, high): (f64, f64), gate| {
@@ -61,8 +62,8 @@ pub fn line(gates: &[Gate], wander: f64) -> Option<Line> {
     }
     let slowest = edge(best, -MOST_RATE, |rate| width(rate) >= 0.0);
     let fastest = edge(best, MOST_RATE, |rate| width(rate) >= 0.0);
-    // A few gates close to one another leave nearly any rate: then what crystals usually are, nothing off, counts for more, as far as
-    // it passes. The rates that pass spread over a range of four standard deviations or so.
+    // A few gates close to one another allow nearly any rate: then the usual error of crystals, around zero, counts for more, as far
+    // as it passes. The rates that pass cover about four standard deviations.
     let usual = 0.0_f64.clamp(slowest, fastest);
     let spread = (fastest - slowest) / 4.0;
     let weight = PRIOR_RATE * PRIOR_RATE / (PRIOR_RATE * PRIOR_RATE + spread * spread);
@@ -78,7 +79,7 @@ pub fn line(gates: &[Gate], wander: f64) -> Option<Line> {
     })
 }
 
-/// Where a function with one peak has it.
+/// The position of the maximum of a function with a single peak.
 fn peak(mut from: f64, mut to: f64, value: impl Fn(f64) -> f64) -> f64 {
     for _ in 0..STEPS {
         let third = (to - from) / 3.0;
@@ -91,7 +92,7 @@ fn peak(mut from: f64, mut to: f64, value: impl Fn(f64) -> f64) -> f64 {
     f64::midpoint(from, to)
 }
 
-/// How far from `inside` towards `to` a condition still holds.
+/// How far a condition still holds from `inside` towards `to`.
 fn edge(mut inside: f64, mut to: f64, holds: impl Fn(f64) -> bool) -> f64 {
     for _ in 0..STEPS {
         let middle = f64::midpoint(inside, to);
@@ -108,7 +109,8 @@ fn edge(mut inside: f64, mut to: f64, holds: impl Fn(f64) -> bool) -> f64 {
 mod tests {
     use super::*;
 
-    /// Gates of a line with this rate, at seconds before now, with delays of question and answer in nanoseconds.
+    /// Gates for a line with this rate: seconds before now, and the delays of question and answer in
+    /// nanoseconds.
     fn gates(rate: f64, delays: &[(f64, f64, f64)]) -> Vec<Gate> {
         let gate = |&(ago_s, to_ns, back_ns): &(f64, f64, f64)| {
             let at_ns = -ago_s * 1e9;

@@ -1,9 +1,9 @@
-//! The second of two devices that capture at the same time, put on the first one's clock record by record.
+//! Puts the second of two devices that capture at the same time on the first one's clock, record by record.
 //!
-//! [`CommonClock`] relates two devices' times when there are marks of both. A capture begins before that, and records that are
-//! handed out cannot be moved any more. So the second device's times begin where its own round trips put them, move to
-//! where the frames say so slowly that no interval suffers, and stay there. While nothing can be said (a bus that was suspended,
-//! a device that is away), what was known last goes on.
+//! [`CommonClock`] relates two devices' times once there are marks of both. A capture begins before that, and records that were
+//! handed out cannot be moved any more. So the second device's times begin where its own round trips put them, move to where the
+//! frames say, slowly enough to distort no interval, and stay there. While the relation is unknown (a suspended bus, an absent
+//! device), the last known one continues.
 
 use std::sync::Arc;
 
@@ -11,21 +11,23 @@ use super::common::{CommonClock, NotCommon};
 use super::units::UtcNs;
 use super::{ClockMap, FrameDoubt};
 
-/// Times are moved no faster than this: an interval is right to a two-thousandth, and the two devices' own maps, which may each
-/// move by 100 ppm while they settle, are overtaken.
+/// Times are moved no faster than this: intervals stay right to within a two-thousandth, and it is faster than the two devices'
+/// own maps, which may each move by 100 ppm while they settle.
 const MAX_PACE: f64 = 500e-6;
 
-/// Nearer than this to where the frames say is there: what marks and ticks leave open anyway, in nanoseconds.
+/// Within this distance of where the frames say, in nanoseconds, a time counts as there: marks and ticks are
+/// no more exact.
 const THERE_NS: f64 = 1_000.0;
 
-/// How well a device's times are on the first one's clock.
+/// How well a device's times match the first one's clock.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FollowerReport {
-    /// Why not by USB frames, if so: then each device's times are as good as its own round trips.
+    /// If USB frames cannot relate the devices, the reason: then each device's times are as good as its own
+    /// round trips.
     pub common: Result<(), NotCommon>,
-    /// From when on they have been where the frames say, in UTC nanoseconds since the Unix epoch; `None` while they are not.
+    /// Since when they have been where the frames say, in UTC nanoseconds since the Unix epoch; `None` while they are not.
     pub since_ns: Option<i64>,
-    /// How far the device's times were moved, in nanoseconds: what its own round trips were wrong by.
+    /// How far the device's times were moved, in nanoseconds: the error of its own round trips.
     pub moved_ns: i64,
 }
 
@@ -35,7 +37,7 @@ pub struct Follower {
     maps: Option<(Arc<ClockMap>, Arc<ClockMap>)>,
     common: Result<CommonClock, NotCommon>,
     moved_ns: f64,
-    /// The latest time placed so far in this session; none yet, and nothing must be moved slowly.
+    /// The latest time placed so far in this session; `None` if there is none, when times may jump.
     latest: Option<UtcNs>,
     since: Option<UtcNs>,
 }
@@ -54,7 +56,7 @@ impl Default for Follower {
 }
 
 impl Follower {
-    /// Takes the two devices' maps as they are now. To be called before the records that they have mapped are placed.
+    /// Takes the two devices' current maps. Call it before placing the records that were mapped with them.
     pub fn update(&mut self, first: Arc<ClockMap>, second: Arc<ClockMap>) {
         let is_known = self
             .maps
@@ -66,19 +68,19 @@ impl Follower {
         }
     }
 
-    /// The second device begins a new session: behind a gap nothing need be moved slowly.
+    /// The second device begins a new session: after a gap, times may jump.
     pub fn begin_session(&mut self) {
         *self = Self { moved_ns: self.moved_ns, ..Self::default() };
     }
 
-    /// The first device's time, in UTC nanoseconds, of what the second one's own map puts at `utc_ns`. Never earlier than for an
-    /// earlier one.
+    /// Converts a time from the second device's own map to the first device's time, in UTC nanoseconds. The result never goes
+    /// back when `utc_ns` does not.
     pub fn place(&mut self, utc_ns: i64) -> i64 {
         let utc = UtcNs(utc_ns);
         let passed_ns = self.latest.map(|latest| utc.since(latest).max(0) as f64);
         let off_ns = match self.target_ns(utc) {
             Some(target_ns) => target_ns - self.moved_ns,
-            // Not on one controller: there is nothing to be moved to but the device's own time.
+            // Not on one controller: only the device's own time is available.
             None if matches!(self.common, Err(NotCommon::Controllers { .. })) => -self.moved_ns,
             None => 0.0,
         };
@@ -93,7 +95,7 @@ impl Follower {
         utc_ns + self.moved_ns.round() as i64
     }
 
-    /// How well times are on the first device's clock.
+    /// How well the times match the first device's clock.
     pub fn report(&self) -> FollowerReport {
         FollowerReport {
             common: self.common.map(|_| ()),
@@ -102,7 +104,7 @@ impl Follower {
         }
     }
 
-    /// How far a time is to be moved, by the frames that both devices have marked; `None` where they do not tell.
+    /// How far a time should be moved, according to frames that both devices have marked; `None` if unknown.
     fn target_ns(&self, utc: UtcNs) -> Option<f64> {
         let (first, second) = self.maps.as_ref()?;
         let common = self.common.as_ref().ok()?;

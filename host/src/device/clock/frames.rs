@@ -1,45 +1,46 @@
-//! A device's time by the frames of its USB host controller.
+//! A device's time measured by the frames of its USB host controller.
 //!
-//! A mark says at which tick a frame of a certain number started, as the hardware latched it: no interrupt, no
-//! driver and no round trip is in it. What remains is the tick (83 ns) and the controller's own jitter, which a line through a few marks
-//! evens out. So the frames are a ruler without noise, and the same one for every device on the controller.
+//! A mark gives the tick at which a frame of a certain number started, latched by the hardware: it is free of interrupt, driver and
+//! round-trip delays. What remains is the tick (83 ns) and the controller's own jitter, which a line through a few marks evens out. So
+//! the frames are a ruler without noise, and the same ruler for every device on the controller.
 //!
 //! Frame numbers have 11 bits. How many frames lie between two marks is known from the device's time, to a fraction of a frame; the
-//! frame number must then agree. Marks that do not are left out, and after a few in a row nothing of the past is held
-//! to any more: a bus that was suspended, a chip or host that makes two SOFs in a millisecond, a device with a new host.
+//! frame number must then agree. Marks that do not agree are left out, and after a few in a row the past is given up: the bus was
+//! suspended, a chip or host makes two SOFs in a millisecond, or the device has a new host.
 
 use std::collections::VecDeque;
 
 use super::units::{FrameNs, Ticks};
 
-/// Marks that are kept: 17 minutes of them.
+/// How many marks are kept: those of 17 minutes.
 const KNOTS: usize = 1024;
-/// Frame numbers before they begin again: 11 bits (USB 2.0, 8.4.3).
+/// Frame numbers until they wrap: 11 bits (USB 2.0, 8.4.3).
 const NUMBERS: i64 = 2048;
-/// Nanoseconds of a frame by the controller's own clock.
+/// Nanoseconds of a frame, by the controller's own clock.
 const FRAME_NS: i64 = 1_000_000;
-/// Marks on each side that a line is laid through. A crystal's rate moves by a few hundredths of a part per million in a second, so
-/// that two seconds are straight to some tens of nanoseconds.
+/// Marks on each side used to fit a line. A crystal's rate changes by a few hundredths of a part per million per second, so two
+/// seconds are straight to within tens of nanoseconds.
 const REACH: usize = 2;
 /// Marks that must agree before they are trusted: two intervals.
 const ENOUGH: usize = 3;
-/// Marks in a row that do not agree with those before, until those are given up.
+/// Marks in a row that may disagree with those before; after that, the old ones are given up.
 const MOST_STRIKES: u32 = 3;
-/// Of about a thousand milliseconds between two marks, those with more than one SOF. A few have, where the device's and the host's
-/// milliseconds pass one another.
+/// Limit on the milliseconds with more than one SOF, out of about a thousand between two marks. A few occur where the device's and
+/// the host's milliseconds drift past one another.
 const MOST_DOUBLED: u16 = 500;
-/// What a mark may be off by itself, in nanoseconds: USB allows a host 500 from frame to frame (2.0, 7.1.12), hubs add to it.
+/// How far off a single mark may be, in nanoseconds: USB allows a host 500 from frame to frame (2.0, 7.1.12), and hubs add to
+/// it.
 const JITTER_NS: f64 = 5_000.0;
-/// How far two crystals may be apart: 500 ppm for the host (USB 2.0, 7.1.12), and ours.
+/// How far apart two crystals may be: 500 ppm for the host (USB 2.0, 7.1.12), and ours.
 const UNKNOWN_RATE: f64 = 1e-3;
-/// How far a rate may have moved, once it is known.
+/// How much a known rate may have changed.
 const KNOWN_RATE: f64 = 10e-6;
-/// No mark for this long: the next frame numbers may begin anywhere.
+/// After this long without a mark, the next frame numbers may begin anywhere.
 const SILENCE_NS: f64 = 3e9;
-/// After this long, nothing is held to what was before: by then any frame number would do.
+/// After this long, nothing is compared with earlier marks: any frame number would be possible.
 const FORGET_NS: f64 = 30e9;
 
-/// A device's word on when a frame started.
+/// A device's report of when a frame started.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SofMark {
     /// The frame's number: 11 bits.
@@ -59,7 +60,7 @@ pub enum FrameDoubt {
     /// It has sent too few to check them.
     #[error("too few USB frames are marked so far")]
     TooFew,
-    /// Two in each millisecond: half of them are no frame's start.
+    /// Each millisecond has two, so half of them are not the start of a frame.
     #[error("the device sees two starts of a USB frame in each millisecond")]
     Doubled,
     /// They do not fit the device's own time.
@@ -70,11 +71,11 @@ pub enum FrameDoubt {
     Silent,
 }
 
-/// A mark in its place.
+/// A mark, placed.
 #[derive(Clone, Copy, Debug)]
 struct Knot {
     at: Ticks,
-    /// Its number without wraps.
+    /// Its number, without wrapping.
     frame: i64,
     /// The line through it and its neighbours: nanoseconds above the mark, and frame time per nominal time.
     above_ns: f64,
@@ -94,7 +95,7 @@ pub struct FrameClock {
     ns_per_tick: f64,
     knots: VecDeque<Knot>,
     strikes: u32,
-    /// Why there are too few.
+    /// Why there are too few marks.
     doubt: FrameDoubt,
 }
 
@@ -109,7 +110,7 @@ impl FrameClock {
         }
     }
 
-    /// Takes the next mark, in the order of the stream.
+    /// Takes the next mark, in stream order.
     pub fn add(&mut self, mark: SofMark) {
         if mark.doubled > MOST_DOUBLED {
             self.knots.clear();
@@ -154,7 +155,7 @@ impl FrameClock {
         }
     }
 
-    /// The mark's frame number without wraps, if it agrees with the time since the last one.
+    /// The mark's frame number without wrapping, if it agrees with the time since the last one.
     fn unwrapped(&self, mark: SofMark, last: &Knot, elapsed_ns: f64) -> Option<i64> {
         if elapsed_ns <= 0.0 || elapsed_ns > FORGET_NS {
             return None;
@@ -169,12 +170,12 @@ impl FrameClock {
         (frames > 0 && off_ns <= JITTER_NS + elapsed_ns * doubt).then_some(last.frame + frames)
     }
 
-    /// The straight line through a mark and its neighbours, by least squares: how far above the mark it passes, and its slope.
+    /// The straight line through a mark and its neighbours, by least squares: its height above the mark and its slope.
     fn line(&self, index: usize) -> (f64, f64) {
         let knot = &self.knots[index];
         let first = index.saturating_sub(REACH);
         let last = (index + REACH).min(self.knots.len() - 1);
-        // At the end there are neighbours on one side only: as many of them.
+        // At the end there are neighbours on one side only: use as many of them.
         let first = first.min(last.saturating_sub(2 * REACH));
         let points = self.knots.range(first..=last).map(|near| {
             let x = near.at.since(knot.at) as f64 * self.ns_per_tick;
@@ -194,7 +195,7 @@ impl FrameClock {
         (mean_y - rate * mean_x, rate)
     }
 
-    /// Whether the marks can be built on at this time, or why not.
+    /// Whether the marks can be relied on at this time, or why not.
     pub fn trust(&self, now: Ticks) -> Result<(), FrameDoubt> {
         match self.knots.back() {
             Some(last) if self.knots.len() >= ENOUGH => {
@@ -205,7 +206,8 @@ impl FrameClock {
         }
     }
 
-    /// The frame time of a device time. Beyond the first and the last mark, the rate there goes on. `None` without two marks.
+    /// The frame time of a device time. Beyond the first and the last mark, the line continues at its rate. `None` without
+    /// two marks.
     pub fn at(&self, ticks: Ticks) -> Option<FrameNs> {
         let (from, to) = self.around(self.knots.partition_point(|knot| knot.at <= ticks))?;
         let ahead_ns = ticks.since(from.at) as f64 * self.ns_per_tick;
@@ -220,7 +222,7 @@ impl FrameClock {
         Some(from.raw().plus(above_ns.round() as i64))
     }
 
-    /// The device time of a frame time, to the nearest tick: [`Self::at`] backwards.
+    /// The device time of a frame time, to the nearest tick: the inverse of [`Self::at`].
     pub fn ticks_at(&self, time: FrameNs) -> Option<Ticks> {
         let (from, to) = self.around(self.knots.partition_point(|knot| knot.raw() <= time))?;
         let ahead = time.since(from.raw()) as f64 - from.above_ns;
@@ -235,7 +237,7 @@ impl FrameClock {
         Some(from.at.plus((nominal_ns / self.ns_per_tick).round() as i64))
     }
 
-    /// The marks before and behind place `next`; only one where there is nothing on the other side.
+    /// The marks before and after place `next`; only one if there is none on the other side.
     fn around(&self, next: usize) -> Option<(&Knot, Option<&Knot>)> {
         if self.knots.len() < 2 {
             return None;
@@ -246,19 +248,19 @@ impl FrameClock {
         }
     }
 
-    /// Frame time per nominal device time at the last mark: above 1 where the device's crystal is slower than the controller's.
+    /// Frame time per nominal device time at the last mark: above 1 if the device's crystal is slower than the controller's.
     pub fn rate(&self) -> f64 {
         self.knots.back().map_or(1.0, |last| last.rate)
     }
 
-    /// How far the marks lie from the lines through them, as the root of the mean square: what the controller's jitter and the tick
-    /// do to one mark. In nanoseconds.
+    /// The root mean square distance of the marks from the lines through them, in nanoseconds: what the controller's jitter and the
+    /// tick do to one mark.
     pub fn scatter_ns(&self) -> f64 {
         let squares: f64 = self.knots.iter().map(|knot| knot.above_ns * knot.above_ns).sum();
         (squares / self.knots.len().max(1) as f64).sqrt()
     }
 
-    /// The marks that were kept: device time, and the start of the frame by frame time.
+    /// The marks that are kept: device time, and the frame time at which the frame started.
     pub fn marks(&self) -> impl DoubleEndedIterator<Item = (Ticks, FrameNs)> {
         self.knots.iter().map(|knot| (knot.at, knot.raw()))
     }

@@ -1,14 +1,14 @@
-//! Device time to UTC.
+//! Maps device time to UTC.
 //!
-//! The host asks for the device's time now and then, and lays a line through the round trips ([`corridor`]). What
-//! it measures the device's time with in between is a ruler: the frames of the USB host controller where the device marks them
-//! ([`FrameClock`]), else the device's own crystal. Neither of them is UTC. But crystals wander by some parts per million
-//! with temperature, so that a line over the device's ticks is straight for a minute or so; the frames show every wandering of the device
-//! against the controller. Where the computer's clock runs by the same crystal as its controller, or one as steady, the line against the
-//! frames is straight for many minutes, and ten minutes of round trips say where it is.
+//! The host asks for the device's time now and then, and fits a line to the round trips ([`corridor`]). In between, a ruler measures the
+//! device's time: the frames of the USB host controller if the device marks them ([`FrameClock`]), otherwise the device's own crystal.
+//! Neither is UTC. But crystals wander by some parts per million with temperature, so a line over the device's ticks is straight for a
+//! minute or so; the frames reveal all wander of the device against the controller. If the computer's clock runs from the same crystal as
+//! its controller, or from one as steady, the line against the frames is straight for many minutes, and ten minutes of round trips locate
+//! it.
 //!
-//! An operating system does not tell programs which frame it is. So what the frames are in UTC comes from the round trips, too, and what these
-//! cannot say, frames do not either: whether the way there takes as long as the way back.
+//! An operating system does not tell programs which frame it is. So the relation of frames to UTC comes from the round trips, too, and frames
+//! cannot reveal what these cannot: whether the way there takes as long as the way back.
 //!
 //! Records are mapped by a line that bends at every round trip and never runs backwards: it meets the best estimate some seconds later.
 
@@ -27,49 +27,50 @@ pub use units::{FrameNs, Ticks, UtcClock, UtcNs};
 
 use corridor::Gate;
 
-/// Round trips that are kept: ten minutes, at one a second.
+/// How many round trips are kept: ten minutes' worth, at one a second.
 const GATES: usize = 600;
-/// Bends that are kept, so that a time can be mapped again: 17 minutes.
+/// How many bends are kept, so that a time can be mapped again: 17 minutes' worth.
 const BENDS: usize = 1024;
-/// How far the rate between ruler and UTC may move in the time that round trips are kept. For a crystal in a box that warms up, a part per
-/// million; the system's clock against the frames is moved by whoever disciplines it, if at all.
+/// How much the rate between ruler and UTC may change during the time for which round trips are kept. For a crystal in a box that warms
+/// up, a part per million; against the frames, the system's clock changes only if something disciplines it.
 const CRYSTAL_WANDER: f64 = 1e-6;
 const FRAMES_WANDER: f64 = 0.1e-6;
-/// Drift is reported when the round trips leave no more doubt of it, in parts per million.
+/// Drift is reported once the round trips leave no more doubt than this, in parts per million.
 const MAX_DOUBT_PPM: f64 = 20.0;
-/// An error of the mapping is worked off over this time.
+/// An error of the mapping is corrected over this time.
 const CATCH_UP_NS: f64 = 10e9;
-/// But never so fast that intervals would suffer: what frames are apart matters more than what time it is.
+/// But never so fast that intervals would suffer: the distance between frames matters more than the time of
+/// day.
 const MAX_CATCH_UP: f64 = 100e-6;
 
-/// What device time is measured with between two round trips.
+/// What measures device time between two round trips.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ClockSource {
     /// USB's start of frame.
     Frames,
-    /// The device's crystal, since its marks are not to be had or not trusted.
+    /// The device's crystal, because its marks are missing or not trusted.
     RoundTrips(FrameDoubt),
 }
 
 /// What is known about the device's clock.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ClockReport {
-    /// What times are measured with.
+    /// What measures the times.
     pub source: ClockSource,
-    /// How much faster than the computer's the device's clock runs, in parts per million; `None` before
-    /// it could be measured, and for a device that does not run in real time.
+    /// How much faster than the computer's the device's clock runs, in parts per million; `None` until it has
+    /// been measured, and for a device that does not run in real time.
     pub drift_ppm: Option<f64>,
-    /// How much faster than the computer's clock the USB host controller's frames are, likewise.
+    /// How much faster the USB host controller's frames are than the computer's clock, likewise.
     pub frames_ppm: Option<f64>,
-    /// How far off a device time's UTC may be, in nanoseconds. A bound, as far as clocks keep their rates; usually it is much nearer.
-    /// `None` for a device that does not run in real time.
+    /// The uncertainty of a device time's UTC, in nanoseconds. It is a bound as long as clocks keep their rates; the error is usually
+    /// much smaller. `None` for a device that does not run in real time.
     pub uncertainty_ns: Option<i64>,
     /// The quickest round trip, in nanoseconds.
     pub round_trip_ns: i64,
 }
 
 impl Default for ClockReport {
-    /// Before anything is known.
+    /// Nothing is known yet.
     fn default() -> Self {
         Self {
             source: ClockSource::RoundTrips(FrameDoubt::NoMarks),
@@ -89,13 +90,13 @@ struct RoundTrip {
     answered: UtcNs,
 }
 
-/// A piece of the line: from here on, this slope.
+/// A piece of the line: from here on, it has this slope.
 #[derive(Clone, Copy, Debug)]
 struct Bend {
     at: Ticks,
     utc: UtcNs,
     ns_per_tick: f64,
-    /// How far off it may have been then.
+    /// Its uncertainty at that time.
     unsure_ns: i64,
 }
 
@@ -111,7 +112,7 @@ pub struct ClockMap {
     nominal_ns_per_tick: f64,
     round_trips: VecDeque<RoundTrip>,
     frames: FrameClock,
-    /// Never empty; the last one counts from now on.
+    /// Never empty; the last one applies from its start on.
     bends: VecDeque<Bend>,
     report: ClockReport,
 }
@@ -134,14 +135,14 @@ impl ClockMap {
         }
     }
 
-    /// The UTC time of a device time. For one in the past it is what it was then, for the last 17 minutes.
+    /// The UTC time of a device time. A past time keeps the UTC it had then, for the last 17 minutes.
     #[inline]
     pub fn utc(&self, ticks: Ticks) -> UtcNs {
         self.bend_at(ticks).utc(ticks)
     }
 
-    /// The same with how far off it may be, in nanoseconds, as was known then: the line of the past stays as it was, and what is known
-    /// better now does not make it better. 0 for a device that does not run in real time.
+    /// The same with its uncertainty in nanoseconds, as known at that time: past parts of the line do not change, so later knowledge
+    /// does not improve them. 0 for a device that does not run in real time.
     pub fn utc_within(&self, ticks: Ticks) -> (UtcNs, i64) {
         let bend = self.bend_at(ticks);
         (bend.utc(ticks), bend.unsure_ns)
@@ -156,7 +157,7 @@ impl ClockMap {
         &self.bends[self.bends.partition_point(|bend| bend.at <= ticks).saturating_sub(1)]
     }
 
-    /// The device time of a UTC time: [`Self::utc`] backwards, to the nearest tick.
+    /// The device time of a UTC time, to the nearest tick: the inverse of [`Self::utc`].
     pub fn ticks(&self, utc: UtcNs) -> Ticks {
         let bend = self.bends[self.bends.partition_point(|bend| bend.utc <= utc).saturating_sub(1)];
         bend.at.plus((utc.since(bend.utc) as f64 / bend.ns_per_tick).round() as i64)
@@ -188,7 +189,7 @@ impl ClockMap {
         self.bend(at, CATCH_UP_NS);
     }
 
-    /// Before anything was mapped: lies exactly on the best estimate.
+    /// Moves the line exactly onto the best estimate. Only before anything was mapped.
     pub fn settle(&mut self) {
         if let Some(last) = self.round_trips.back() {
             let at = last.at;
@@ -197,12 +198,13 @@ impl ClockMap {
         }
     }
 
-    /// What is known.
+    /// What is known about the clock.
     pub const fn report(&self) -> ClockReport {
         self.report
     }
 
-    /// Continues the line from `now` towards the best estimate, which it meets after `catch_up_ns`; at once if that is 0.
+    /// Continues the line from `now` towards the best estimate, which it meets after `catch_up_ns`; immediately if that
+    /// is 0.
     fn bend(&mut self, now: Ticks, catch_up_ns: f64) {
         let trust = self.frames.trust(now);
         let (wander, rate) = match trust {
@@ -214,7 +216,7 @@ impl ClockMap {
             let gates = self.gates(now, at, trust.is_ok());
             match corridor::line(&gates, wander) {
                 Some(line) => break Some(line),
-                // One of the clocks was moved: the newer half knows of it.
+                // One of the clocks was set: the newer half has the change behind it.
                 None if gates.len() > 2 => drop(self.round_trips.drain(..gates.len() / 2)),
                 None => break None,
             }
@@ -244,7 +246,7 @@ impl ClockMap {
 
     fn push(&mut self, bend: Bend) {
         if self.bends.back().is_some_and(|last| last.at >= bend.at) {
-            // A second one at the same time takes the first one's place.
+            // A second one at the same time replaces the first.
             self.bends.pop_back();
         } else if self.bends.len() == BENDS {
             self.bends.pop_front();
@@ -252,7 +254,7 @@ impl ClockMap {
         self.bends.push_back(bend);
     }
 
-    /// The round trips as gates, seen from `now`, which the present line has at `at`.
+    /// The round trips as gates relative to `now`, which the present line maps to `at`.
     fn gates(&self, now: Ticks, at: UtcNs, by_frames: bool) -> Vec<Gate> {
         let frames_now = self.frames.at(now).filter(|_| by_frames);
         let gate = |trip: &RoundTrip| {

@@ -11,7 +11,7 @@ fn utc(after_start_ns: i64) -> UtcNs {
     UtcNs(START_NS + after_start_ns)
 }
 
-/// A number from 0 to 1 that looks random.
+/// A pseudo-random number from 0 to 1.
 fn even(number: i64) -> f64 {
     let bits = (number as u64 + 1).wrapping_mul(0x9E37_79B9_7F4A_7C15);
     ((bits ^ bits >> 32).wrapping_mul(0xD6E8_FEB8_6659_FD93) >> 11) as f64 / (1_u64 << 53) as f64
@@ -20,14 +20,14 @@ fn even(number: i64) -> f64 {
 /// A device on a USB host controller.
 #[derive(Clone, Copy)]
 struct Simulated {
-    /// How much too fast its crystal is, in parts per million, and how much faster it becomes in a minute or so.
+    /// How much too fast its crystal is, in parts per million, and how much that increases over a minute or so.
     ppm: f64,
     warm_up_ppm: f64,
     /// How much too fast the controller's frames are.
     frames_ppm: f64,
     /// Frame 0 of the controller started this long after the start.
     frames_from_ns: i64,
-    /// A SOF is early or late by up to this.
+    /// A SOF is early or late by at most this.
     jitter_ns: f64,
 }
 
@@ -39,7 +39,7 @@ impl Simulated {
     fn ticks(&self, ns: i64) -> Ticks {
         const MINUTE_S: f64 = 60.0;
         let seconds = ns as f64 / 1e9;
-        // What a rate that nears its end exponentially has added up to.
+        // The integral of a rate that approaches its end value exponentially.
         let warmed_us = self.warm_up_ppm * (seconds - MINUTE_S * (1.0 - (-seconds / MINUTE_S).exp()));
         let ahead_us = self.ppm * seconds + warmed_us;
         Ticks((i128::from(ns) * 12 / 1000) as u64 + 5_000_000).plus((ahead_us * 12.0).floor() as i64)
@@ -62,8 +62,8 @@ impl Simulated {
     }
 }
 
-/// A map of a device, asked once a second for this many seconds; questions and answers take as long as `delays` says for each
-/// second. `marks` says what becomes of each second's mark. With the worst error in microseconds after the first minute, and whether time ran backwards.
+/// A device's map, updated once a second for this many seconds; `delays` gives the duration of question and answer for each second, and `marks`
+/// decides what happens to each second's mark. Also returns the worst error in microseconds after the first minute, and whether time ran backwards.
 fn follow(
     device: &Simulated,
     seconds: i64,
@@ -109,7 +109,7 @@ fn all_marks(_: i64, mark: SofMark) -> Option<SofMark> {
     Some(mark)
 }
 
-/// What becomes of the mark of each second.
+/// What happens to the mark of each second.
 type Marking = fn(i64, SofMark) -> Option<SofMark>;
 
 #[test]
@@ -141,7 +141,7 @@ fn frames_follow_a_crystal_that_warms_up() {
     let report = by_frames.report();
     assert!((report.frames_ppm.unwrap() + 25.0).abs() < 0.2, "{report:?}");
     assert!((report.drift_ppm.unwrap() - 48.0).abs() < 0.3, "{report:?}");
-    // A bound that holds, and is not just any.
+    // The bound must hold and must also be tight.
     let (by_frames_ns, alone_ns) =
         (report.uncertainty_ns.unwrap(), by_round_trips.report().uncertainty_ns.unwrap());
     assert!(
@@ -152,7 +152,7 @@ fn frames_follow_a_crystal_that_warms_up() {
 
 #[test]
 fn a_busy_computer_does_not_stretch_the_time_between_frames() {
-    // The answer takes up to 300 ms, and the device reads its clock anywhere in that.
+    // The answer takes up to 300 ms, and the device reads its clock anywhere during that time.
     let delays = |second: i64| {
         let delay = 1_000_000 + (second * 7919 % 13) * 23_000_000;
         let to = delay * (second * 31 % 11) / 11;
@@ -180,7 +180,7 @@ fn a_device_in_its_own_time_keeps_its_spacing() {
 
 #[test]
 fn a_clock_that_is_moved_is_followed_again() {
-    // The computer sleeps for 40 ms that its clock does not count, and the device does.
+    // The computer sleeps for 40 ms, which the device's clock counts and its own does not.
     let mut map = ClockMap::new(TICK_HZ, utc(0));
     for second in 0..200 {
         let slept = if second < 100 { 0 } else { 40_000_000 };
@@ -189,7 +189,7 @@ fn a_clock_that_is_moved_is_followed_again() {
         let at = EXACT.ticks(asked_ns + to_ns + slept);
         map.add(at, utc(asked_ns), utc(asked_ns + to_ns + back_ns));
     }
-    // 100 ppm for 100 s can make up for 10 ms; it goes on.
+    // 100 ppm for 100 s can make up for 10 ms; then it continues.
     let truth_ns = 200 * S;
     let left_ns = map.utc(EXACT.ticks(truth_ns + 40_000_000)).since(utc(truth_ns)).abs();
     assert!(left_ns < 31_000_000, "{left_ns} ns off");
@@ -210,12 +210,12 @@ fn a_time_can_be_mapped_back() {
     }
 }
 
-/// What becomes of marks that are not what they say.
+/// What happens to marks that cannot be true.
 #[test]
 fn marks_that_cannot_be_are_not_built_on() {
     let cases: [(&str, Marking, FrameDoubt); 4] = [
         ("twice a millisecond", |_, mark| Some(SofMark { doubled: 990, ..mark }), FrameDoubt::Doubled),
-        // Half a frame late every other time: two SOFs in a frame that nobody has counted.
+        // Every other mark is half a frame late: two SOFs per frame that nobody counted.
         (
             "half a frame off",
             |second, mark| Some(SofMark { at: mark.at.plus(second % 2 * 6_000), ..mark }),
@@ -243,7 +243,7 @@ fn a_suspended_bus_is_noticed_and_what_follows_begins_anew() {
     let before = |second: i64| second < 50;
     let (map, ..) = follow(&device, 70, usual, |second, mark| before(second).then_some(mark));
     assert_eq!(map.report().source, ClockSource::RoundTrips(FrameDoubt::Silent));
-    // The controller counts from elsewhere when it is back.
+    // The controller counts from a different number when it is back.
     let marks = |second: i64, mark: SofMark| match second {
         0..50 => Some(mark),
         50..60 => None,
@@ -264,7 +264,7 @@ fn a_single_wrong_mark_is_left_out() {
     assert!(worst_us < 20.0, "{worst_us} us");
 }
 
-/// The acceptance of the common clock: 80 ppm apart, each with a warm-up of its own, marked at different frames.
+/// The acceptance of the common clock: 80 ppm apart, each warming up differently, marked at different frames.
 #[test]
 fn two_devices_on_a_controller_are_on_one_clock_to_a_microsecond() {
     let controller = Simulated { frames_ppm: 35.0, jitter_ns: 100.0, ..EXACT };
@@ -274,7 +274,7 @@ fn two_devices_on_a_controller_are_on_one_clock_to_a_microsecond() {
         let marks = move |n: i64, mark: SofMark| (n >= from).then_some(mark);
         follow(device, 400, |n| (100_000 + (even(n * from) * 400_000.0) as i64, 200_000), marks).0
     };
-    // One began to mark some turns of the frame number after the other.
+    // One began to mark some wraps of the frame number after the other.
     let (first_map, second_map) = (late(&first, 1), late(&second, 14));
     let common = CommonClock::between(&first_map, &second_map).unwrap();
     let mut worst_ns = 0;
@@ -308,8 +308,8 @@ fn devices_on_two_controllers_are_not_put_on_one_clock() {
     assert_eq!(CommonClock::between(&here, &silent), Err(NotCommon::Doubt(FrameDoubt::NoMarks)));
 }
 
-/// A computer that was busy in the first seconds did not know UTC well then. What it knows minutes later does not make the times of
-/// then better, and they must not be held against it.
+/// A computer that was busy in the first seconds did not know UTC well at that time. What it learns minutes later does not improve
+/// those times, and they must not be compared with it.
 #[test]
 fn a_bad_beginning_does_not_put_two_devices_on_two_controllers() {
     let controller = Simulated { frames_ppm: 35.0, jitter_ns: 100.0, ..EXACT };
@@ -324,8 +324,8 @@ fn a_bad_beginning_does_not_put_two_devices_on_two_controllers() {
     assert_eq!(common.outliers(), 0, "{common:?}");
 }
 
-/// One device's UTC was wrong for three seconds, as after an answer that was late in a way that nobody could know of, and one mark was as
-/// late as marks are taken. They are counted, and do not undo what minutes say.
+/// One device's UTC was wrong for three seconds, as after an answer that was late undetectably, and one mark was as late as marks may be.
+/// Both are counted and do not undo what minutes have shown.
 #[test]
 fn a_time_that_is_wrong_once_is_counted_and_decides_nothing() {
     let controller = Simulated { frames_ppm: 35.0, jitter_ns: 100.0, ..EXACT };
@@ -347,7 +347,8 @@ fn a_time_that_is_wrong_once_is_counted_and_decides_nothing() {
     assert!(common.disagreement_ns() >= 4_000_000, "{common:?}: not hidden");
 }
 
-/// Two controllers that happened to count alike: their crystals part them, and the last seconds tell, not the minutes before.
+/// Two controllers that happen to count alike: their crystals drift apart, and the last seconds decide, not the minutes
+/// before.
 #[test]
 fn frames_that_run_apart_are_noticed_within_seconds() {
     let first = Simulated { ppm: 40.0, ..EXACT };

@@ -1,4 +1,4 @@
-//! Times by different clocks are different types: a device's, UTC, and that of a USB host controller.
+//! A type for each clock's time: a device's, UTC, and that of a USB host controller.
 
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
@@ -7,12 +7,12 @@ use std::time::{Instant, SystemTime, UNIX_EPOCH};
 pub struct Ticks(pub u64);
 
 impl Ticks {
-    /// Ticks from another time to this one.
+    /// Ticks from `other` to this time.
     pub const fn since(self, other: Self) -> i64 {
         self.0.wrapping_sub(other.0) as i64
     }
 
-    /// This time, and this many ticks.
+    /// This time plus a number of ticks.
     #[must_use]
     pub const fn plus(self, ticks: i64) -> Self {
         Self(self.0.wrapping_add_signed(ticks))
@@ -24,39 +24,39 @@ impl Ticks {
 pub struct UtcNs(pub i64);
 
 impl UtcNs {
-    /// Nanoseconds from another time to this one.
+    /// Nanoseconds from `other` to this time.
     pub const fn since(self, other: Self) -> i64 {
         self.0 - other.0
     }
 
-    /// This time, and this many nanoseconds.
+    /// This time plus a number of nanoseconds.
     #[must_use]
     pub const fn plus(self, ns: i64) -> Self {
         Self(self.0 + ns)
     }
 }
 
-/// Time by the frames of a USB host controller: each frame is 10⁶ nanoseconds, whatever it lasts by another clock, and starts at
-/// the multiple of 10⁶ that has its frame number, modulo 2048 of them. From which turn of the frame number it counts is
-/// arbitrary, and different for each device ([`super::CommonClock`] finds the difference).
+/// Time by the frames of a USB host controller: each frame lasts 10⁶ nanoseconds, whatever other clocks say, and starts at the
+/// multiple of 10⁶ that equals its frame number, modulo 2048 of them. The wrap from which it counts is arbitrary and different
+/// for each device ([`super::CommonClock`] finds the difference).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct FrameNs(pub i64);
 
 impl FrameNs {
-    /// Nanoseconds from another time to this one.
+    /// Nanoseconds from `other` to this time.
     pub const fn since(self, other: Self) -> i64 {
         self.0 - other.0
     }
 
-    /// This time, and this many nanoseconds.
+    /// This time plus a number of nanoseconds.
     #[must_use]
     pub const fn plus(self, ns: i64) -> Self {
         Self(self.0 + ns)
     }
 }
 
-/// The computer's UTC clock, read once and continued with the monotonic one: a step of the system's
-/// clock in mid-capture moves no frame.
+/// The computer's UTC clock, read once and continued with the monotonic one: if the system's clock is set
+/// during a capture, no frame moves.
 #[derive(Clone, Copy, Debug)]
 pub struct UtcClock {
     instant: Instant,
@@ -70,7 +70,7 @@ impl UtcClock {
         Self { instant: Instant::now(), utc: UtcNs(utc_ns) }
     }
 
-    /// What it shows at a moment.
+    /// UTC at a moment.
     pub fn at(&self, instant: Instant) -> UtcNs {
         self.utc.plus(instant.saturating_duration_since(self.instant).as_nanos() as i64)
     }

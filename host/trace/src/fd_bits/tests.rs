@@ -2,7 +2,7 @@ use super::*;
 use crate::testing::fd_frame;
 use proptest::prelude::*;
 
-/// The same by the book: the levels on the bus one after the other, each with its rate.
+/// The same in the obvious way: the levels on the bus one after the other, each with its rate.
 fn bit_by_bit(frame: &FdFrame) -> (FdBits, Vec<bool>) {
     let field = |value: u32, width: u32| (0..width).rev().map(move |bit| value >> bit & 1 == 1);
     let mut head: Vec<bool> = vec![false];
@@ -22,7 +22,7 @@ fn bit_by_bit(frame: &FdFrame) -> (FdBits, Vec<bool>) {
     head.extend(field(u32::from(frame.dlc()), 4));
     frame.data().iter().for_each(|byte| head.extend(field(u32::from(*byte), 8)));
 
-    // Behind the last bit stands a fixed stuff bit, whatever the levels.
+    // After the last bit comes a fixed stuff bit, whatever the levels.
     let (mut line, mut nominal, mut stuff, mut run) = (Vec::new(), 0, 0, 0);
     for (at, bit) in head.iter().enumerate() {
         run = if line.last() == Some(bit) { run + 1 } else { 1 };
@@ -41,7 +41,7 @@ fn bit_by_bit(frame: &FdFrame) -> (FdBits, Vec<bool>) {
     let count: Vec<bool> = field(gray << 1 | parity, 4).collect();
     covered.extend(&count);
     let (width, polynomial) = if frame.data_len() > 16 { (21, 0x30_2899_u64) } else { (17, 0x3_685B) };
-    // Division of the whole message by the polynomial; the register begins with its highest bit set.
+    // Division of the whole message by the polynomial; the register starts with its highest bit set.
     let mut register = 1_u64 << (width - 1);
     for bit in &covered {
         register = register << 1 ^ if *bit { 1 << width } else { 0 };
@@ -59,7 +59,7 @@ fn bit_by_bit(frame: &FdFrame) -> (FdBits, Vec<bool>) {
         }
         line.push(bit);
     }
-    // Four bits that end the CRC have a stuff bit behind them too; 21 and 25 are no multiples of four.
+    // The last bits of the CRC are followed by a stuff bit too; 21 and 25 are not multiples of four.
     line.push(true);
     let data = line.len() as u32 - nominal;
     let tail = [false, true].into_iter().chain([true; 10]);
@@ -73,13 +73,13 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(5_000))]
     #[test]
     fn any_frame_agrees_with_the_bit_by_bit_model(frame in fd_frame(), sparse: bool) {
-        // Sparse data make many stuff bits.
+        // Sparse data cause many stuff bits.
         let data: Vec<u8> = frame.data().iter().map(|byte| if sparse { byte & 0x81 } else { *byte }).collect();
         let frame = FdFrame::new(frame.id(), frame.brs(), frame.esi(), &data).unwrap();
         let (bits, line) = bit_by_bit(&frame);
         prop_assert_eq!(FdBits::of(&frame), bits);
         prop_assert_eq!(line.len() as u32, bits.total());
-        // The law of the bus: nowhere six equal levels, up to the CRC delimiter.
+        // The rule of the bus: never six equal levels, up to the CRC delimiter.
         let stuffed = &line[..line.len() - 12];
         prop_assert!(stuffed.windows(6).all(|six| six.iter().any(|bit| *bit != six[0])));
     }
@@ -89,7 +89,7 @@ fn frame(text: &str) -> FdFrame {
     *text.parse::<crate::TraceFrame>().unwrap().fd().unwrap()
 }
 
-/// Both CRCs have published check values, of the text "123456789" and a register that begins with zeros (the catalogue of
+/// Both CRCs have published check values, of the text "123456789" and a register that starts at zero (the catalogue of
 /// parametrised CRC algorithms, CRC-17/CAN-FD and CRC-21/CAN-FD).
 #[test]
 fn the_polynomials_have_their_published_check_values() {
@@ -103,7 +103,7 @@ fn the_polynomials_have_their_published_check_values() {
 }
 
 /// Linux counts the same fields in `include/linux/can/length.h`: 67 bits with CRC-17 for a standard frame without data and
-/// stuff bits, 86 for an extended one, of which CRC-17 needs five fewer than CRC-21 with its fixed stuff bit.
+/// stuff bits, 86 for an extended one, where CRC-17 needs five fewer than CRC-21 with its fixed stuff bit.
 #[test]
 fn fields_add_up_as_in_linux() {
     let without_stuff = |text: &str| {

@@ -1,4 +1,4 @@
-//! A node's object dictionary, made of its sheet (CiA 306).
+//! A node's object dictionary, made from its sheet (CiA 306).
 
 use std::collections::BTreeMap;
 
@@ -12,11 +12,11 @@ pub mod abort {
     pub const TIMEOUT: u32 = 0x0504_0000;
     /// There is no such command.
     pub const COMMAND: u32 = 0x0504_0001;
-    /// A block of no frames, or of more than 127.
+    /// A block of no frames or more than 127.
     pub const BLOCK_SIZE: u32 = 0x0504_0002;
-    /// A frame's number.
+    /// A frame has the wrong number.
     pub const SEQUENCE: u32 = 0x0504_0003;
-    /// The CRC of a block transfer.
+    /// The CRC of a block transfer is wrong.
     pub const CRC: u32 = 0x0504_0004;
     /// More than there is room for.
     pub const MEMORY: u32 = 0x0504_0005;
@@ -30,22 +30,22 @@ pub mod abort {
     pub const NOT_MAPPABLE: u32 = 0x0604_0041;
     /// More than eight bytes are mapped.
     pub const PDO_LENGTH: u32 = 0x0604_0042;
-    /// The length of the value.
+    /// The value has the wrong length.
     pub const LENGTH: u32 = 0x0607_0010;
     /// There is no such entry.
     pub const NO_ENTRY: u32 = 0x0609_0011;
-    /// The value.
+    /// The value is invalid.
     pub const VALUE: u32 = 0x0609_0030;
-    /// Not in this state.
+    /// Not possible in this state.
     pub const STATE: u32 = 0x0800_0022;
 }
 
-/// Longest value that is taken, in bytes.
+/// Longest value that is accepted, in bytes.
 pub const MOST_BYTES: usize = 1 << 16;
 
 #[derive(Clone, Debug)]
 struct Entry {
-    /// Bytes of a value, unless it may have any number of them.
+    /// Length of a value in bytes; `None` if it may have any.
     length: Option<usize>,
     can_read: bool,
     can_write: bool,
@@ -53,7 +53,7 @@ struct Entry {
     value: Vec<u8>,
 }
 
-/// Everything that the node has.
+/// All of the node's objects.
 #[derive(Clone, Debug, Default)]
 pub struct Dictionary {
     entries: BTreeMap<(u16, u8), Entry>,
@@ -71,7 +71,7 @@ const fn length(data_type: u16) -> Option<usize> {
 }
 
 impl Dictionary {
-    /// With the sheet's values for a node of this number.
+    /// The sheet's values, for a node with this number.
     pub fn new(sheet: &Eds, node: u8) -> Self {
         let mut entries = BTreeMap::new();
         for (&index, object) in &sheet.objects {
@@ -101,13 +101,13 @@ impl Dictionary {
         self.entries.get(&(index, sub)).ok_or_else(missing)
     }
 
-    /// What a client reads.
+    /// A client reads.
     pub fn read(&self, index: u16, sub: u8) -> Result<&[u8], u32> {
         let entry = self.entry(index, sub)?;
         if entry.can_read { Ok(&entry.value) } else { Err(abort::WRITE_ONLY) }
     }
 
-    /// Whether a client may write this many bytes, or any number where it does not say.
+    /// Whether a client may write this many bytes, or any number if it does not say.
     pub fn may_write(&self, index: u16, sub: u8, bytes: Option<usize>) -> Result<(), u32> {
         let entry = self.entry(index, sub)?;
         if !entry.can_write {
@@ -120,7 +120,7 @@ impl Dictionary {
         }
     }
 
-    /// What a client writes.
+    /// A client writes.
     pub fn write(&mut self, index: u16, sub: u8, value: &[u8]) -> Result<(), u32> {
         self.may_write(index, sub, Some(value.len()))?;
         let number = value.iter().take(4).rev().fold(0_u32, |number, byte| number << 8 | u32::from(*byte));
@@ -128,7 +128,7 @@ impl Dictionary {
             // The history can only be cleared.
             (0x1003, 0) if number != 0 => return Err(abort::VALUE),
             (0x1600..=0x17FF | 0x1A00..=0x1BFF, 0) => self.check_mapping(index, number)?,
-            // CiA 301, 7.5.2.36: first no object is mapped, then others are, then so many.
+            // CiA 301, 7.5.2.36: first set the number to zero, then map objects, then set their number.
             (0x1600..=0x17FF | 0x1A00..=0x1BFF, 1..) if self.number(index, 0) != 0 => {
                 return Err(abort::STATE);
             }
@@ -144,7 +144,7 @@ impl Dictionary {
         for sub in 1..=u8::try_from(count).map_err(|_| abort::VALUE)? {
             let mapped = self.entry(index, sub).map_err(|_| abort::VALUE).map(|_| self.number(index, sub))?;
             let (object, of) = ((mapped >> 16) as u16, (mapped >> 8) as u8);
-            // Below 20h it is a type: room that nothing is in.
+            // Below 20h it is a type: a placeholder for unused bytes.
             if object >= 0x20 && !self.entry(object, of)?.mappable {
                 return Err(abort::NOT_MAPPABLE);
             }
@@ -153,14 +153,14 @@ impl Dictionary {
         if bits > 64 { Err(abort::PDO_LENGTH) } else { Ok(()) }
     }
 
-    /// The node's own value; what there is no entry for is left out.
+    /// Sets the node's own value; without an entry, nothing happens.
     pub fn set(&mut self, index: u16, sub: u8, value: &[u8]) {
         if let Some(entry) = self.entries.get_mut(&(index, sub)) {
             entry.value = value.to_vec();
         }
     }
 
-    /// A value as a number, 0 where there is none.
+    /// A value as a number; 0 if there is none.
     pub fn number(&self, index: u16, sub: u8) -> u32 {
         let value = self.entries.get(&(index, sub)).map_or(&[][..], |entry| &entry.value);
         value.iter().take(4).rev().fold(0, |number, byte| number << 8 | u32::from(*byte))

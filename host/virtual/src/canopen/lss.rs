@@ -1,28 +1,28 @@
 //! A slave of the layer setting services (CiA 305).
 
-/// No number so far.
+/// The node has no number so far.
 pub const NO_NODE: u8 = 255;
 
-/// What the master's word changes.
+/// What a command from the master changes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Change {
     /// The node takes part with its new number.
     Node,
 }
 
-/// The slave's part.
+/// The slave.
 #[derive(Debug)]
 pub struct Slave {
     /// Vendor, product, revision, serial number.
     identity: [u32; 4],
-    /// The number that it has, and the one that it will have.
+    /// Its current number, and the one it will have.
     pub node: u8,
     pending: u8,
     configured: bool,
-    /// How many of the four parts the master has named rightly, one after the other.
+    /// How many of the four parts the master has named correctly, one after the other.
     selected: usize,
     identified: usize,
-    /// Where the fast scan stands.
+    /// How far the fast scan has got.
     scanned: u8,
 }
 
@@ -36,13 +36,13 @@ impl Slave {
         Self { identity, node, pending: node, configured: false, selected: 0, identified: 0, scanned: 0 }
     }
 
-    /// Takes a frame of the master; returns the answer and what it changes.
+    /// Takes a frame from the master; returns the answer and what changes.
     pub fn take(&mut self, bytes: [u8; 8]) -> (Option<[u8; 8]>, Option<Change>) {
         let value = u32::from_le_bytes([bytes[1], bytes[2], bytes[3], bytes[4]]);
         let said = match bytes[0] {
             0x04 => {
                 self.configured = bytes[1] == 1;
-                // A node without a number begins to take part when it is let go with one.
+                // A node without a number takes part once it is released with one.
                 if !self.configured && self.node == NO_NODE && self.pending != NO_NODE {
                     self.node = self.pending;
                     return (None, Some(Change::Node));
@@ -114,7 +114,7 @@ impl Slave {
         Some(answer(0x4F, [0; 4]))
     }
 
-    /// The new number counts from the next reset on.
+    /// The new number applies from the next reset.
     pub const fn reset(&mut self) {
         self.node = self.pending;
         self.configured = false;

@@ -1,7 +1,7 @@
-//! `virtual:canopen`: a CANopen drive on the first bus, and another one that has no number so far.
+//! `virtual:canopen`: a CANopen drive on the first bus, and another one that has no node number yet.
 //!
-//! Both are what their sheet, [`SHEET`], says, and the server, the slave and the state machine here: no frame is scripted. What the sheet has
-//! no object for the nodes do not do: they send no SYNC and no TIME, and keep nothing when they are reset.
+//! Both follow from their sheet, [`SHEET`], and from the server, the slave and the state machine in this module: no frame is scripted. The
+//! nodes do nothing for which the sheet has no object: they send neither SYNC nor TIME, and keep nothing across a reset.
 
 mod dictionary;
 mod lss;
@@ -24,16 +24,16 @@ pub const NODE: u8 = 5;
 /// The nodes' serial numbers.
 const SERIALS: [u32; 2] = [1001, 1002];
 
-/// The nodes of the bus.
+/// The nodes on the bus.
 #[derive(Debug)]
 pub struct CanOpenBus {
     nodes: Vec<CanOpenNode>,
-    /// Whose frame is on the bus.
+    /// The node whose frame is on the bus.
     sending: usize,
 }
 
 impl CanOpenBus {
-    /// Both nodes, as they are when somebody begins to listen.
+    /// Both nodes, as they are when somebody starts to listen.
     pub fn in_use() -> Self {
         let sheet = Eds::parse(SHEET.as_bytes());
         let numbers = [NODE, NO_NODE].into_iter().zip(SERIALS);
@@ -45,7 +45,7 @@ impl CanOpenBus {
         self.nodes.iter_mut().for_each(|node| node.advance(now_ns));
     }
 
-    /// Whose frame has the lowest identifier of those that are due.
+    /// Of the frames that are due, the one with the lowest identifier, with its node.
     fn first(&mut self, now_ns: u64) -> Option<(usize, Frame)> {
         self.advance(now_ns);
         let wishes = self.nodes.iter().enumerate().filter_map(|(place, node)| {

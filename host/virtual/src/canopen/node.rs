@@ -1,4 +1,4 @@
-//! One node: its state, its heartbeat, its PDOs and emergencies, and the drive behind them.
+//! One node: its state, its heartbeat, its PDOs and emergencies, and its drive.
 
 use std::collections::VecDeque;
 
@@ -10,18 +10,18 @@ use super::lss::{Change, NO_NODE, Slave};
 use super::sdo::Server;
 
 const MS_NS: u64 = 1_000_000;
-/// The node takes this long to answer, and to boot.
+/// How long the node takes to answer, and to boot.
 const THINKS_NS: u64 = 300_000;
 const BOOT_NS: u64 = 100 * MS_NS;
-/// The first heartbeat of a node that was there before anybody listened.
+/// The first heartbeat of a node that was running before anybody listened.
 const FIRST_BEAT_NS: u64 = 150 * MS_NS;
-/// Between two segments of a block.
+/// Time between two segments of a block.
 const SEGMENT_GAP_NS: u64 = 100_000;
-/// Frames that wait to be sent; more are not made, as a node whose bus is full makes none.
+/// How many frames may wait to be sent; beyond that, none are made, like a node on a bus without room.
 const MOST_WAITING: usize = 512;
-/// How fast the drive's speed follows, in increments per second and second.
+/// How fast the drive's speed changes, in increments per second squared.
 const RAMP: i64 = 2000;
-/// What the drive does is worked out this often.
+/// How often the drive's movement is computed.
 const STEP_NS: u64 = 10 * MS_NS;
 
 const SYNC: u32 = 0x80;
@@ -31,7 +31,7 @@ const LSS_SLAVE: u32 = 0x7E4;
 /// States as heartbeats say them (CiA 301, table 31).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum State {
-    /// Without a number, or about to boot.
+    /// Without a node number, or about to boot.
     Silent,
     Stopped,
     Operational,
@@ -64,7 +64,7 @@ pub struct CanOpenNode {
     /// When each TPDO with a timer is due, and how many SYNCs have passed since each was sent.
     timers_ns: [u64; 2],
     syncs: [u8; 2],
-    /// The drive's position times a thousand, and until when it was worked out.
+    /// A thousand times the drive's position, and the time for which it was computed.
     position_milli: i64,
     moved_ns: u64,
     waiting: VecDeque<(u64, Frame)>,
@@ -77,7 +77,7 @@ fn frame(id: u32, bytes: &[u8]) -> Frame {
 }
 
 impl CanOpenNode {
-    /// A node of this number, or without one ([`NO_NODE`]), that has booted before.
+    /// A node with this number, or without one ([`NO_NODE`]), that has booted before.
     pub fn new(sheet: &Eds, node: u8, serial: u32) -> Self {
         let mut made = Self {
             sheet: sheet.clone(),
@@ -101,7 +101,7 @@ impl CanOpenNode {
         made
     }
 
-    /// Everything as the sheet has it.
+    /// Sets everything according to the sheet.
     fn load(&mut self) {
         self.dictionary = Dictionary::new(&self.sheet, self.slave.node);
         self.dictionary.set(0x1018, 4, &self.serial.to_le_bytes());
@@ -120,22 +120,22 @@ impl CanOpenNode {
         }
     }
 
-    /// Sent again as soon as the bus is free.
+    /// Sends a frame again as soon as the bus is free.
     pub fn send_again(&mut self, frame: Frame) {
         self.waiting.push_front((0, frame));
     }
 
-    /// The frame that is to be sent next, and from when on.
+    /// The next frame to send, and the earliest time for it.
     pub fn wish(&self) -> Option<(u64, Frame)> {
         self.waiting.front().copied()
     }
 
-    /// It is on the bus.
+    /// The frame is on the bus.
     pub fn sent(&mut self) {
         self.waiting.pop_front();
     }
 
-    /// When the node next does something by itself.
+    /// When the node next does something on its own.
     pub fn due(&self) -> u64 {
         let mut due_ns = self.boots_ns.unwrap_or(u64::MAX);
         due_ns = due_ns.min(self.server.due().unwrap_or(u64::MAX));
@@ -154,7 +154,7 @@ impl CanOpenNode {
         u64::from(self.dictionary.number(0x1017, 0)) * MS_NS
     }
 
-    /// How often a TPDO is sent by its timer.
+    /// The interval at which a timer sends a TPDO.
     fn timer_ns(&self, place: usize) -> Option<u64> {
         let parameter = 0x1800 + place as u16;
         let period_ns = u64::from(self.dictionary.number(parameter, 5)) * MS_NS;
@@ -177,7 +177,7 @@ impl CanOpenNode {
         let period_ns = self.beat_period_ns();
         if self.state != State::Silent && period_ns > 0 && self.beat_ns <= now_ns {
             self.send(now_ns, frame(0x700 + self.node(), &[self.state.code()]));
-            // Those whose time passed while the bus was busy are left out.
+            // Those due while the bus was busy are left out.
             self.beat_ns += period_ns * ((now_ns - self.beat_ns) / period_ns + 1);
         }
         self.drive(now_ns);
@@ -199,14 +199,14 @@ impl CanOpenNode {
         self.state = state;
     }
 
-    /// The speed follows its target, and the position the speed.
+    /// Moves the speed towards its target, and the position with the speed.
     fn drive(&mut self, now_ns: u64) {
         if self.state != State::Operational {
             self.moved_ns = now_ns;
             return;
         }
         while self.moved_ns + STEP_NS <= now_ns {
-            // Not worth working out in steps what nobody has seen.
+            // After a long time unobserved, computing each step is not worth it.
             if now_ns - self.moved_ns > 1000 * STEP_NS {
                 self.moved_ns = now_ns - 1000 * STEP_NS;
             }
@@ -223,7 +223,7 @@ impl CanOpenNode {
         }
     }
 
-    /// The controlword's first four bits (CiA 402, state machine), as far as this drive has them.
+    /// The controlword's first four bits (CiA 402, state machine), as far as this drive supports them.
     fn control(&mut self) {
         let status: u16 = match self.dictionary.number(0x6040, 0) & 0xF {
             0x6 => 0x0231,
@@ -236,7 +236,7 @@ impl CanOpenNode {
 
     fn send_pdo(&mut self, place: usize, now_ns: u64) {
         let id = self.dictionary.number(0x1800 + place as u16, 1);
-        // Bit 31: it does not exist.
+        // Bit 31: the PDO does not exist.
         if id & 0x8000_0000 != 0 || self.state != State::Operational {
             return;
         }
@@ -268,7 +268,7 @@ impl CanOpenNode {
         self.control();
     }
 
-    /// Code 0: there is no error any more.
+    /// Code 0: the error is gone.
     fn emergency(&mut self, code: u16, now_ns: u64) {
         let register = u8::from(code != 0);
         self.dictionary.set(0x1001, 0, &[register]);
@@ -281,14 +281,14 @@ impl CanOpenNode {
         self.send(now_ns, frame(id, &[low, high, register, 0, 0, 0, 0, 0]));
     }
 
-    /// Takes a frame of the bus.
+    /// Takes a frame from the bus.
     pub fn hear(&mut self, heard: &Frame, now_ns: u64) {
         if heard.id().is_extended() {
             return;
         }
         let (id, node, at_ns) = (heard.id().raw(), self.node(), now_ns + THINKS_NS);
         if heard.is_remote() {
-            // Guarding, where there is no heartbeat.
+            // Node guarding, if there is no heartbeat.
             if id == 0x700 + node && self.state != State::Silent && self.beat_period_ns() == 0 {
                 let said = self.state.code() | u8::from(self.toggle) << 7;
                 self.toggle = !self.toggle;
@@ -374,7 +374,7 @@ impl CanOpenNode {
         }
     }
 
-    /// A client has written an object: what that does.
+    /// Reacts to an object that a client has written.
     fn written(&mut self, object: (u16, u8), now_ns: u64) {
         match object {
             (0x1003, 0) => self.dictionary.set(0x1003, 1, &[0; 4]),

@@ -1,4 +1,4 @@
-//! The SDO server: expedited, in segments and in blocks, both ways (CiA 301, 7.2.4.3).
+//! The SDO server: expedited, in segments and in blocks, in both directions (CiA 301, 7.2.4.3).
 
 use cantap_protocols::canopen::crc_of;
 
@@ -6,12 +6,12 @@ use super::dictionary::{Dictionary, MOST_BYTES, abort};
 
 /// Bytes of a segment.
 const SEGMENT: usize = 7;
-/// Frames of a block that is written. Few, so that a short transfer shows several.
+/// Frames in a block that is written: few, so that a short transfer has several blocks.
 const BLOCK: u8 = 16;
-/// The client's silence ends a transfer.
+/// After this silence of the client, a transfer ends.
 const PATIENCE_NS: u64 = 3_000_000_000;
 
-/// A transfer under way.
+/// The current transfer.
 #[derive(Debug)]
 enum State {
     Idle,
@@ -25,7 +25,8 @@ enum State {
         size: Option<usize>,
         toggle: bool,
     },
-    /// A block is about to be sent, or was; from where on, with how many frames, and how many of those were sent.
+    /// A block is about to be sent or was sent: where it starts, how many frames it has, and how many of them
+    /// were sent.
     ReadBlocks {
         data: Vec<u8>,
         at: usize,
@@ -43,17 +44,17 @@ enum State {
     },
 }
 
-/// One node's server, for one client at a time.
+/// A node's server, for one client at a time.
 #[derive(Debug)]
 pub struct Server {
     state: State,
     object: (u16, u8),
     until_ns: u64,
-    /// The segment of the next block that is lost on purpose; 0 for none.
+    /// The segment of the next block to lose on purpose; 0 for none.
     pub loses: u8,
 }
 
-/// Frames to be sent, and what was written.
+/// Frames to send, and what was written.
 #[derive(Debug, Default)]
 pub struct Said {
     pub frames: Vec<[u8; 8]>,
@@ -67,7 +68,7 @@ impl Default for Server {
 }
 
 impl Server {
-    /// When the client's silence ends the transfer under way.
+    /// When silence of the client ends the current transfer.
     pub fn due(&self) -> Option<u64> {
         (!matches!(self.state, State::Idle)).then_some(self.until_ns)
     }
@@ -88,7 +89,7 @@ impl Server {
         [command, low, high, sub, a, b, c, d]
     }
 
-    /// Takes a frame of the client.
+    /// Takes a frame from the client.
     pub fn take(&mut self, bytes: [u8; 8], dictionary: &mut Dictionary, now_ns: u64) -> Said {
         self.until_ns = now_ns + PATIENCE_NS;
         let mut said = Said::default();
@@ -239,7 +240,7 @@ impl Server {
         Ok(())
     }
 
-    /// Sends a block from where the last one was confirmed.
+    /// Sends a block, from where the last one was confirmed.
     fn send_block(&mut self, said: &mut Said) {
         let loses = std::mem::take(&mut self.loses);
         let State::ReadBlocks { data, at, block, sent, ends } = &mut self.state else { return };

@@ -9,10 +9,10 @@ use cantap_wire::Id;
 use super::*;
 
 const MS_NS: u64 = 1_000_000;
-/// Of a frame, whatever its length.
+/// Duration of a frame, whatever its length.
 const FRAME_NS: u64 = 200_000;
 
-/// The nodes, a master, and a listener that is not of this crate.
+/// The nodes, a master, and a listener that is not part of this crate.
 struct Bus {
     nodes: CanOpenBus,
     now_ns: u64,
@@ -59,7 +59,7 @@ impl Bus {
         self.note(&frame);
     }
 
-    /// What is said to a frame.
+    /// Sends a frame and returns the answers.
     fn ask(&mut self, frame: &str) -> Vec<String> {
         self.heard.clear();
         self.send(frame);
@@ -105,7 +105,7 @@ fn a_node_boots_beats_and_follows_its_master() {
     // TPDO 2 by its timer, TPDO 1 by SYNC.
     assert!(bus.heard.iter().filter(|frame| frame.starts_with("285#")).count() >= 4, "{:?}", bus.heard);
     assert!(bus.ask("080#").iter().any(|frame| frame == "185#500200000000"));
-    // On, with a target: it turns.
+    // Switched on, with a target: it turns.
     bus.send("205#0F00E8030000");
     bus.pass(2000);
     let turned = bus.ask("080#");
@@ -181,7 +181,7 @@ fn blocks_go_both_ways_with_what_is_lost_sent_again() {
     assert_eq!((rest.len(), rest[3].as_str()), (4, "585#841D1E0000000000"));
     assert_eq!(bus.ask("605#A204040000000000"), [format!("585#D5{low:02X}{high:02X}0000000000")]);
     bus.ask("605#A100000000000000");
-    // The listener has both, whole.
+    // The listener has both, complete.
     let events = bus.events();
     let blocks: Vec<_> = events.iter().filter(|event| event.data == bytes).collect();
     assert_eq!(blocks.iter().map(|event| event.kind).collect::<Vec<_>>(), ["sdo_write", "sdo_read"]);
@@ -210,7 +210,7 @@ fn a_node_without_a_number_is_given_one() {
     assert_eq!(bus.ask("609#4018100400000000"), ["589#43181004EA030000"]);
 }
 
-/// Whatever is said to them, nodes answer and go on.
+/// Whatever they receive, nodes answer and keep running.
 #[test]
 fn nodes_bear_any_frames() {
     let seed = fastrand::u64(..);

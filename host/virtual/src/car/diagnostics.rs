@@ -1,23 +1,23 @@
-//! What the engine's and the gearbox's ECUs answer to testers: OBD-II (SAE J1979) and some services of UDS (ISO 14229-1).
+//! Answers of the engine's and the gearbox's ECUs to testers: OBD-II (SAE J1979) and some services of UDS (ISO 14229-1).
 
 use super::values::VIN;
 use super::vehicle::Vehicle;
 
-/// UDS's and OBD's word for "no".
+/// The negative response of UDS and OBD.
 const NEGATIVE: u8 = 0x7F;
 const SERVICE_NOT_SUPPORTED: u8 = 0x11;
 const SUB_FUNCTION_NOT_SUPPORTED: u8 = 0x12;
 const WRONG_LENGTH: u8 = 0x13;
 const OUT_OF_RANGE: u8 = 0x31;
-/// Asks for no positive answer, in a sub-function.
+/// In a sub-function: suppress the positive response.
 const SUPPRESS: u8 = 0x80;
-/// P0128, the coolant does not get warm: three bytes in UDS, the first two in OBD.
+/// P0128, coolant does not reach its temperature: three bytes in UDS, the first two in OBD.
 const TROUBLE: [u8; 3] = [0x01, 0x28, 0x00];
 /// Test failed since it was cleared, confirmed, and failed in this cycle (ISO 14229-1:2020, annex D.2).
 const TROUBLE_STATUS: u8 = 0x2A;
 const SUPPORTED_STATUS: u8 = 0x7F;
 
-/// Which ECU is asked.
+/// The addressed ECU.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Who {
     Engine,
@@ -51,18 +51,18 @@ impl Who {
 #[derive(Debug)]
 pub struct Diagnostics {
     who: Who,
-    /// It has stored its trouble code.
+    /// Whether it has stored its trouble code.
     pub faulty: bool,
     session: u8,
 }
 
 impl Diagnostics {
-    /// As delivered: the engine's ECU has a trouble code.
+    /// As initially: the engine's ECU has a trouble code.
     pub const fn new(who: Who) -> Self {
         Self { who, faulty: matches!(who, Who::Engine), session: 1 }
     }
 
-    /// The answer to a request; `None` if there is to be none. To a request to all ECUs nobody says that he does not know it.
+    /// The answer to a request; `None` if there is none. To a request to all ECUs, none answers that it does not know it.
     pub fn answer(&mut self, request: &[u8], to_all: bool, car: &Vehicle) -> Option<Vec<u8>> {
         let (&service, rest) = request.split_first()?;
         let result = match service {
@@ -81,7 +81,7 @@ impl Diagnostics {
             0x3E => tester_present(rest),
             _ => Err(SERVICE_NOT_SUPPORTED),
         };
-        // OBD's own services stay silent about what they do not have.
+        // OBD's own services stay silent about what is not supported.
         let silent = to_all || service < 0x10;
         match result {
             Ok(answer) if answer.is_empty() => None,
@@ -91,7 +91,7 @@ impl Diagnostics {
         }
     }
 
-    /// Service 01: up to six values of now.
+    /// Service 01: up to six current values.
     fn current(&self, pids: &[u8], car: &Vehicle) -> Result<Vec<u8>, u8> {
         let mut answer = vec![0x41];
         for &pid in pids.iter().take(6) {
@@ -102,7 +102,7 @@ impl Diagnostics {
                     let there = supported(next) || n == 0x20 && (next..=0x60).any(supported);
                     bits << 1 | u32::from(there)
                 });
-                // The first list is always there.
+                // The first list is always present.
                 (bits > 0 || pid == 0).then(|| bits.to_be_bytes().to_vec())
             } else {
                 self.pid(pid, car)
@@ -115,7 +115,7 @@ impl Diagnostics {
         if answer.len() > 1 { Ok(answer) } else { Err(OUT_OF_RANGE) }
     }
 
-    /// A value of service 01, coded as SAE J1979-DA has it.
+    /// A value of service 01, encoded as in SAE J1979-DA.
     fn pid(&self, pid: u8, car: &Vehicle) -> Option<Vec<u8>> {
         let percent = |value: f64| vec![(value.clamp(0.0, 100.0) * 2.55).round() as u8];
         let degrees = |value: f64| vec![(value.clamp(-40.0, 215.0) + 40.0).round() as u8];
@@ -163,7 +163,7 @@ impl Diagnostics {
         }
     }
 
-    /// Service 09: who the car and its ECUs are.
+    /// Service 09: identification of the car and its ECUs.
     fn information(&self, rest: &[u8]) -> Result<Vec<u8>, u8> {
         let &[kind] = rest else { return Err(WRONG_LENGTH) };
         let text = |text: &[u8]| Ok([&[0x49, kind, 1], text].concat());
@@ -189,7 +189,7 @@ impl Diagnostics {
         Ok(if kind & SUPPRESS == 0 { vec![0x50, session, 0x00, 0x32, 0x01, 0xF4] } else { Vec::new() })
     }
 
-    /// Service 19: how many trouble codes, and which.
+    /// Service 19: number and list of trouble codes.
     fn read_trouble(&self, rest: &[u8]) -> Result<Vec<u8>, u8> {
         let stored = |mask: u8| self.faulty && TROUBLE_STATUS & mask != 0;
         match *rest {
@@ -211,7 +211,7 @@ impl Diagnostics {
         }
     }
 
-    /// Service 22: values by identifier, several at once.
+    /// Service 22: values by identifier, several at a time.
     fn read_data(&self, rest: &[u8], car: &Vehicle) -> Result<Vec<u8>, u8> {
         let (pairs, []) = rest.as_chunks::<2>() else { return Err(WRONG_LENGTH) };
         if pairs.is_empty() {
@@ -233,7 +233,7 @@ impl Diagnostics {
             answer.extend(pair);
             answer.extend(value);
         }
-        // Those that it does not have are left out, unless it has none.
+        // Unknown ones are left out, unless all of them are.
         if answer.len() > 1 { Ok(answer) } else { Err(OUT_OF_RANGE) }
     }
 }

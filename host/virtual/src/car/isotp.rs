@@ -1,19 +1,20 @@
-//! ISO 15765-2 at an ECU's end: requests of one frame or several, answers alike, with flow control both ways.
+//! ISO 15765-2 at an ECU's end: requests and answers of one frame or several, with flow control in both
+//! directions.
 
 use std::collections::VecDeque;
 
 use cantap_wire::{Frame, Id};
 
-/// Longest request that is taken, in bytes. Longer ones are answered that there is no room.
+/// Longest request that is accepted, in bytes. For longer ones, flow control reports an overflow.
 const MAX_REQUEST: usize = 512;
-/// The other side's silence ends a transfer after this long (N_Bs, N_Cr).
+/// A transfer ends after this much silence from the other side (N_Bs, N_Cr).
 const PATIENCE_NS: u64 = 1_000_000_000;
-/// An ECU takes this time to answer.
+/// How long an ECU takes to answer.
 const THINKS_NS: u64 = 4_000_000;
-/// And this one to the next frame of an answer, if it may.
+/// The time until the next frame of an answer, if allowed.
 const NEXT_NS: u64 = 400_000;
 const MS_NS: u64 = 1_000_000;
-/// Fills frames up to eight bytes.
+/// Fills frames to eight bytes.
 const PADDING: u8 = 0xAA;
 
 /// An answer of several frames.
@@ -22,10 +23,10 @@ struct Sending {
     data: Vec<u8>,
     at: usize,
     number: u8,
-    /// Consecutive frames until the next flow control; `None`: there will be none.
+    /// Consecutive frames until the next flow control; `None` if there will be none.
     block: Option<u8>,
     gap_ns: u64,
-    /// Waits for flow control until then.
+    /// Waits for flow control until this time.
     waits: bool,
     until_ns: u64,
     next_ns: u64,
@@ -50,7 +51,7 @@ pub struct IsoTp {
 }
 
 impl IsoTp {
-    /// Answers with this identifier.
+    /// A connection whose answers have this identifier.
     pub const fn new(answers_with: Id) -> Self {
         Self { answers_with, ready: VecDeque::new(), sending: None, receiving: None }
     }
@@ -61,7 +62,8 @@ impl IsoTp {
         Frame::from_bus(self.answers_with, false, 8, data)
     }
 
-    /// A frame to this ECU. Returns a request that is whole. To all ECUs at once only single frames are sent.
+    /// Takes a frame to this ECU. Returns a complete request. Only single frames are sent to all ECUs at
+    /// once.
     pub fn hear(&mut self, frame: &Frame, to_all: bool, now_ns: u64) -> Option<Vec<u8>> {
         let data = frame.data();
         let (&first, rest) = data.split_first()?;
@@ -74,7 +76,7 @@ impl IsoTp {
             }
             1 if !to_all => {
                 let length = usize::from(first & 15) << 8 | usize::from(*rest.first()?);
-                // It would have fitted a single frame.
+                // It would have fitted in a single frame.
                 if length < 8 || data.len() < 8 {
                     return None;
                 }
@@ -134,7 +136,7 @@ impl IsoTp {
         }
     }
 
-    /// Answers. What was still under way before is given up.
+    /// Sends an answer. An unfinished earlier one is abandoned.
     pub fn answer(&mut self, data: Vec<u8>, now_ns: u64) {
         self.sending = None;
         self.ready.clear();
@@ -168,7 +170,7 @@ impl IsoTp {
         ready.or(next)
     }
 
-    /// The frame that is due, which is on the bus now.
+    /// Takes the frame that is due, which is now on the bus.
     pub fn take(&mut self, now_ns: u64) -> Option<Frame> {
         if let Some((_, frame)) = self.ready.pop_front() {
             return Some(frame);

@@ -1,4 +1,4 @@
-//! The database's messages as frames of the car.
+//! The database's messages as frames from the car.
 
 use cantap_firmware::bus::checksum::checksum;
 use cantap_signals::encode::{Input, encode_message};
@@ -9,18 +9,18 @@ use cantap_wire::message::Checksum;
 use super::values::{self, Context};
 use super::vehicle::Vehicle;
 
-/// One message, and what is the same in each of its frames.
+/// One message, and what all its frames have in common.
 #[derive(Debug)]
 pub struct Layout {
     message: Message,
-    /// Bits that no signal has: 1 in J1939, "not available"; else 0.
+    /// Bits without a signal: 1 in J1939, meaning "not available"; otherwise 0.
     fill: Vec<u8>,
     checksum: Option<(usize, Checksum)>,
     counter: Option<usize>,
 }
 
 impl Layout {
-    /// As the database has it.
+    /// From the database's message.
     pub fn new(message: &Message) -> Self {
         let ending = |end: &str| message.signals.iter().position(|signal| signal.name.ends_with(end));
         let checksum = ending("Checksum").map(|at| {
@@ -38,7 +38,7 @@ impl Layout {
         &self.message
     }
 
-    /// The message's data for the car as it is.
+    /// The message's data for the current state of the car.
     pub fn data(&self, car: &Vehicle, context: Context) -> Vec<u8> {
         let inputs: Vec<_> = (self.message.signals.iter().enumerate())
             .filter(|(at, signal)| {
@@ -53,7 +53,8 @@ impl Layout {
                 Some((signal.name.clone(), Input::Raw(raw(signal, value))))
             })
             .collect();
-        // Cannot fail: a test sends every message of the database, and the values are within their signals.
+        // This cannot fail: a test sends every message of the database, and the values are within their
+        // signals' ranges.
         let mut data = encode_message(&self.message, &inputs).unwrap_or_default();
         for (byte, fill) in data.iter_mut().zip(&self.fill) {
             *byte |= fill;
@@ -75,7 +76,7 @@ impl Layout {
     }
 }
 
-/// A physical value's bits, as near as the signal comes to it.
+/// The bits for a physical value, rounded to the signal's resolution.
 fn raw(signal: &Signal, value: f64) -> u64 {
     let value = value.clamp(signal.min.unwrap_or(f64::MIN), signal.max.unwrap_or(f64::MAX));
     let steps = ((value - signal.offset) / signal.factor).round() as i64;
@@ -84,7 +85,7 @@ fn raw(signal: &Signal, value: f64) -> u64 {
     steps as u64 & all
 }
 
-/// Ones where no signal is.
+/// A mask with ones where there is no signal.
 fn unused(message: &Message) -> Vec<u8> {
     let mut unused = vec![0xFF_u8; message.length.into()];
     for signal in &message.signals {

@@ -1,11 +1,11 @@
-//! `virtual:car`: a vehicle on the simulated buses, with a database of its own.
+//! `virtual:car`: a vehicle on the simulated buses, with its own database.
 //!
 //! Channel 1 is the drive train (500 kbit/s) with a J1939 part and two ECUs that answer testers, channel 2 the body (125 kbit/s).
-//! Each ECU sends on its own clock, at its own times give or take a little, and tries again when a frame of it is destroyed. One
-//! whose frames are destroyed again and again is bus-off for a while.
+//! Each ECU sends by its own clock, with a little jitter, and retries when its frame is destroyed. An ECU whose frames are
+//! destroyed again and again goes bus-off for a while.
 //!
-//! The messages are those of [`DATABASE`]: layout and cycle are nowhere else. What it says of the car is in `values.rs`, how the car
-//! moves in `vehicle.rs`.
+//! The messages are those of [`DATABASE`], the only place with layouts and cycles. `values.rs` maps the car's state to signals, and
+//! `vehicle.rs` moves the car.
 
 mod diagnostics;
 mod isotp;
@@ -29,27 +29,27 @@ use crate::simbus::{Senders, arbitration_field};
 
 /// The car's database, a DBC file.
 pub const DATABASE: &str = include_str!("car.dbc");
-/// What the database is called where a file's name is expected.
+/// The database's name where a file name is expected.
 pub const DATABASE_NAME: &str = "virtual:car";
-/// What the device calls its board, so that whoever meets it at a serial port knows whose signals it has.
+/// The device's board name, by which programs that see it on a serial port know whose signals it has.
 pub const BOARD: &str = "virtual-car";
 /// The buses' bit rates: drive train, body.
 pub const BITRATES_BPS: [u32; 2] = [500_000, 125_000];
 
-/// Messages of these ECUs are on the second bus.
+/// The messages of these ECUs are on the second bus.
 const BODY: [&str; 4] = ["BCM", "GW", "HVAC", "TPM"];
-/// Sent at once when something in them changes.
+/// Sent immediately when something in them changes.
 const ON_CHANGE: [&str; 4] = ["BCM_Doors", "BCM_Lights", "BCM_Key", "SWM_Buttons"];
 const CYLINDERS: u8 = 4;
-/// The long message's packets follow each other (SAE J1939-21: 50 to 200 ms).
+/// Time between the packets of the long message (SAE J1939-21: 50 to 200 ms).
 const PACKET_GAP_NS: u64 = 60 * MS_NS;
-/// The car begins to send when its ECUs have started.
+/// When the car begins to send, after its ECUs have started.
 const START_NS: u64 = 120 * MS_NS;
 const MS_NS: u64 = 1_000_000;
-/// How much of a cycle an ECU's times are off, at most, and by no more than [`MAX_JITTER_NS`].
+/// How far an ECU's times are off, as a part of a cycle, limited to [`MAX_JITTER_NS`].
 const JITTER_PER_MILLE: u64 = 15;
 const MAX_JITTER_NS: u64 = 900_000;
-/// Error counts (ISO 11898-1:2015, 12.1.4) and how long an ECU stays away when it is bus-off.
+/// Error counts (ISO 11898-1:2015, 12.1.4), and how long an ECU stays away when it is bus-off.
 const ERROR_COUNT: u16 = 8;
 const BUS_OFF: u16 = 256;
 const BUS_OFF_NS: u64 = 250 * MS_NS;
@@ -61,7 +61,7 @@ const TO_ALL: u32 = 0x7DF;
 const TESTED: [(Who, &str, u32, u32); 2] =
     [(Who::Engine, "ECM", 0x7E0, 0x7E8), (Who::Transmission, "TCM", 0x7E1, 0x7E9)];
 
-/// The database, read.
+/// The database, parsed.
 pub fn database() -> Result<Database, DatabaseError> {
     dbc::parse(DATABASE_NAME, DATABASE.as_bytes())
 }
@@ -71,12 +71,12 @@ pub fn database() -> Result<Database, DatabaseError> {
 struct Entry {
     layout: Layout,
     ecu: usize,
-    /// `None`: only when something changes.
+    /// `None` if it is sent only when something changes.
     period_ns: Option<u64>,
     phase_ns: u64,
     due_ns: u64,
     on_change: bool,
-    /// What was seen last, of those that are sent when it changes.
+    /// The data seen last, for messages that are sent when they change.
     shown: Vec<u8>,
     sent: u32,
     part: u8,
@@ -105,7 +105,7 @@ struct Tested {
     memory: Diagnostics,
 }
 
-/// Where the frame comes from that is next.
+/// The source of the next frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Origin {
     Again,
@@ -113,7 +113,7 @@ enum Origin {
     Tested(usize),
 }
 
-/// One of the car's buses: everybody on it but the analyser.
+/// One of the car's buses: every node on it except the analyser.
 #[derive(Debug)]
 pub struct CarBus {
     car: Vehicle,
@@ -130,7 +130,7 @@ pub struct CarBus {
 impl CarBus {
     /// Bus 0 is the drive train, 1 the body.
     pub fn new(bus: usize, seed: u64) -> Self {
-        // Cannot fail: a test reads it.
+        // This cannot fail: a test parses it.
         let database = database().unwrap_or_default();
         let mut made = Self {
             car: Vehicle::new(seed),
@@ -151,7 +151,8 @@ impl CarBus {
             for packet in 0..packets {
                 let period_ns = message.cycle_ms.filter(|ms| *ms > 0).map(|ms| u64::from(ms) * MS_NS);
                 let number = made.entries.len() as u64;
-                // Spread, so that not everything is due at once; a long message's packets follow its announcement.
+                // Spread out, so that not everything is due at the same time; a long message's packets follow its
+                // announcement.
                 let phase_ns = match message.name.as_str() {
                     "BBM_TPCM" => START_NS + 2000 * MS_NS,
                     "BBM_TPDT" => START_NS + 2000 * MS_NS + PACKET_GAP_NS * (u64::from(packet) + 1),
@@ -194,7 +195,7 @@ impl CarBus {
         Context { sent: entry.sent, part: entry.part, faulty }
     }
 
-    /// Sees what has changed; returns which messages show it.
+    /// Checks what has changed; returns the messages that show it.
     fn look(&mut self) -> Vec<usize> {
         let mut changed = Vec::new();
         for at in 0..self.entries.len() {
@@ -211,7 +212,7 @@ impl CarBus {
         changed
     }
 
-    /// The car moves on.
+    /// Moves the car forward.
     fn advance(&mut self, now_ns: u64) {
         if !self.car.advance(now_ns) {
             return;
@@ -225,7 +226,7 @@ impl CarBus {
         self.ecus[ecu].health.away_until_ns
     }
 
-    /// Shows everything that wants to be sent, with the time from which on.
+    /// Passes everything waiting to be sent, with its earliest time.
     fn each_wish(&mut self, now_ns: u64, mut show: impl FnMut(&Self, u64, Origin)) {
         if !self.again.is_empty() {
             show(self, 0, Origin::Again);
@@ -253,7 +254,7 @@ impl CarBus {
         }
     }
 
-    /// What arbitration compares of a frame that is wanted.
+    /// The value that arbitration compares for a frame.
     fn rank(&self, origin: Origin) -> u32 {
         match origin {
             Origin::Entry(at) => arbitration_field(self.entries[at].layout.message().id, false),
@@ -263,7 +264,7 @@ impl CarBus {
         }
     }
 
-    /// Which of those that are due has the lowest identifier, and since when it is due.
+    /// Of those that are due, the one with the lowest identifier, and since when it has been due.
     fn first(&mut self, now_ns: u64) -> Option<(u64, Origin)> {
         self.advance(now_ns);
         let mut first: Option<(u32, u64, Origin)> = None;
@@ -350,7 +351,7 @@ impl Senders for CarBus {
 }
 
 impl Entry {
-    /// The next transmission after one that begins now. Cycles that have passed meanwhile are left out.
+    /// Plans the next transmission after one that begins now. Cycles that have been missed are left out.
     fn plan(&mut self, number: u64, seed: u64, now_ns: u64) {
         let Some(period_ns) = self.period_ns else {
             self.due_ns = NEVER;
@@ -362,7 +363,7 @@ impl Entry {
             let most = (period_ns * JITTER_PER_MILLE / 1000).min(MAX_JITTER_NS);
             let jitter = hash(seed ^ number << 48 ^ cycle) % (most + 1);
             self.due_ns = self.phase_ns + cycle * period_ns + jitter;
-            // One that was sent for a change, or late, is not sent again at once.
+            // If it was just sent because of a change, or late, it is not sent again immediately.
             if self.due_ns > now_ns + period_ns / 4 {
                 return;
             }

@@ -1,4 +1,4 @@
-//! The car as its database says it, over two drive cycles and in simulated time.
+//! The car, checked against its database over two drive cycles in simulated time.
 
 use std::collections::BTreeMap;
 
@@ -75,7 +75,7 @@ impl Rig {
     fn run(&mut self, until_ns: u64) {
         loop {
             let next = self.bus.next_event_ns(self.analyser.now_ns, &[&mut self.analyser]);
-            // As the virtual device does, which looks several times in a millisecond.
+            // Like the virtual device, which looks several times per millisecond.
             let look = self.analyser.now_ns / (MS_NS / 4) * (MS_NS / 4) + MS_NS / 4;
             let next = next.min(look).max(self.analyser.now_ns);
             if next > until_ns {
@@ -86,7 +86,7 @@ impl Rig {
         }
     }
 
-    /// Everything that was heard with this identifier from some moment on.
+    /// Everything received with this identifier since a given time.
     fn with_id(&self, id: u32, from_ns: u64) -> Vec<Vec<u8>> {
         let heard = self.analyser.heard.iter().filter(|(at_ns, _)| *at_ns >= from_ns);
         heard.filter(|(_, frame)| frame.id().raw() == id).map(|(_, frame)| frame.data().to_vec()).collect()
@@ -142,7 +142,7 @@ fn the_database_has_no_fault_and_every_signal_a_value() {
     }
 }
 
-/// Every message of the database comes, in its cycle, give or take a little; and everything that comes is in range.
+/// Every message of the database comes in its cycle, within the jitter; and everything that comes is in range.
 #[test]
 fn messages_come_in_their_cycles_with_a_little_jitter() {
     let decoder = decoder();
@@ -183,7 +183,7 @@ fn messages_come_in_their_cycles_with_a_little_jitter() {
     }
 }
 
-/// A receiver's check: each counter goes on by one, each checksum is right.
+/// A receiver's check: each counter increments by one, and each checksum is right.
 #[test]
 fn counters_and_checksums_hold() {
     let decoder = decoder();
@@ -213,7 +213,7 @@ fn counters_and_checksums_hold() {
     assert!(checked.values().all(|count| *count > 2000), "{checked:?}");
 }
 
-/// How fast a signal may change, in its unit per second, beyond one step of its resolution.
+/// How fast a signal may change, in its unit per second, on top of one step of its resolution.
 const LIMITS: [(&str, f64); 26] = [
     ("EngineSpeed", 4000.0),
     ("EngineTorque", 4000.0),
@@ -259,7 +259,7 @@ fn signals_move_as_things_do() {
             });
             assert_eq!(jump, None, "{name} jumps, seed {seed}");
         }
-        // Somebody who looks for a minute sees them move.
+        // Anyone watching for a minute sees them move.
         let range = |name: &str| {
             let minute = all[name].iter().filter(|(at_s, _)| *at_s < 60.0).map(|(_, value)| *value);
             minute.fold((f64::MAX, f64::MIN), |(low, high), value| (low.min(value), high.max(value)))
@@ -280,7 +280,7 @@ fn signals_move_as_things_do() {
             let (low, high) = range(name);
             assert!(high - low >= least, "{name} goes from {low} to {high}, seed {seed}");
         }
-        // The engine turns as the wheels do, where a gear is in and nothing slips.
+        // The engine turns in proportion to the wheels when a gear is in and nothing slips.
         assert!(all["VehicleSpeed"].iter().all(|(_, kmh)| *kmh < 110.0));
     }
 }
@@ -296,7 +296,7 @@ fn the_same_seed_is_the_same_car_and_another_is_not() {
     assert_ne!(heard(1), heard(2));
 }
 
-/// A channel that is opened late finds the car where it is by then, without a burst of what nobody heard.
+/// A channel that is opened late finds the car where it is by then, without a burst of unheard frames.
 #[test]
 fn who_comes_late_finds_the_car_on_its_way() {
     let mut rig = Rig::new(0, 1);
@@ -306,7 +306,7 @@ fn who_comes_late_finds_the_car_on_its_way() {
     assert!(signals(&rig.analyser.heard)["Odometer"].iter().all(|(_, km)| *km > 48_230.0));
 }
 
-/// Destroyed frames come again, and an ECU that has no luck at all stays away for a while.
+/// Destroyed frames are sent again, and an ECU whose frames all fail stays away for a while.
 #[test]
 fn a_disturbed_car_suffers_and_recovers() {
     let mut rig = Rig::new(0, 1);
@@ -337,7 +337,7 @@ fn tester(bytes: &str) -> Frame {
 fn a_tester_reads_values_and_an_answer_of_several_frames() {
     let mut rig = Rig::new(0, 1);
     rig.run(30 * SECOND_NS);
-    // Engine speed and coolant temperature, from all: only the engine's ECU knows them.
+    // Engine speed and coolant temperature, requested from all: only the engine's ECU knows them.
     rig.analyser.to_send.push_back(tester("7DF#03010C0500000000"));
     rig.run(30 * SECOND_NS + 50 * MS_NS);
     let answers = rig.with_id(0x7E8, 0);
@@ -381,14 +381,15 @@ fn frames_of_an_answer_keep_the_gap_that_the_tester_asked_for() {
 fn a_long_request_is_taken_with_flow_control_and_silence_ends_an_answer() {
     let mut rig = Rig::new(0, 1);
     rig.run(SECOND_NS);
-    // Read part number, serial number, rpm and the gear, which this ECU has not: 9 bytes in two frames.
+    // Part number, serial number, rpm and the gear, which this ECU does not have: a request of 9 bytes in two
+    // frames.
     rig.analyser.to_send.push_back(tester("7E0#100922F187F18C01"));
     rig.run(SECOND_NS + 20 * MS_NS);
     assert_eq!(rig.with_id(0x7E8, 0), [[0x30, 0, 0, 0xAA, 0xAA, 0xAA, 0xAA, 0xAA].to_vec()]);
     rig.analyser.to_send.push_back(tester("7E0#2100020000000000"));
     rig.run(SECOND_NS + 60 * MS_NS);
     let answers = rig.with_id(0x7E8, 0);
-    // 62, F187 and 13 bytes, F18C and 10, 0100 and 2; 0200 is the gearbox's.
+    // 62, F187 and 13 bytes, F18C and 10, 0100 and 2; 0200 belongs to the gearbox.
     assert_eq!(answers[1][..3], [0x10, 1 + 15 + 12 + 4, 0x62]);
     assert_eq!(answers.len(), 2);
     rig.run(4 * SECOND_NS);
@@ -452,7 +453,7 @@ fn what_is_said_to_be_supported_is_answered() {
     }
 }
 
-/// Packets of a long J1939 message: the identification is whole.
+/// Packets of a long J1939 message: the identification is complete.
 #[test]
 fn the_broadcast_identification_is_whole() {
     let mut rig = Rig::new(0, 1);

@@ -1,27 +1,27 @@
-//! What each signal of the database shows of the car.
+//! The value of each of the database's signals, from the car's state.
 
 use super::vehicle::Vehicle;
 
-/// What a message needs beside the car itself.
+/// What a message needs besides the car itself.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Context {
     /// How often the message has been sent.
     pub sent: u32,
-    /// Which part of several this is: a cylinder, a packet of a long message.
+    /// Which of several parts this is: a cylinder, a packet of a long message.
     pub part: u8,
     /// Whether the engine's ECU has a trouble code.
     pub faulty: bool,
 }
 
-/// The car's identification number: made up, with a check digit that is right.
+/// The car's identification number: fictitious, with a correct check digit.
 pub const VIN: &[u8; 17] = b"WCTCANTA4P0000001";
-/// Bytes of the identification as J1939 sends it: an asterisk ends it.
+/// Length of the identification as J1939 sends it, ending with an asterisk.
 const J1939_VIN_BYTES: usize = VIN.len() + 1;
-/// Packets of seven bytes.
+/// Number of packets of seven bytes.
 pub const J1939_VIN_PACKETS: u8 = J1939_VIN_BYTES.div_ceil(7) as u8;
 /// Vehicle identification.
 const J1939_VIN_PGN: u32 = 65_260;
-/// The trouble code P0128 as J1939 has it: SPN 110, coolant temperature, FMI 17, below normal.
+/// The trouble code P0128 in J1939: SPN 110, coolant temperature, FMI 17, below normal.
 const J1939_FAULT: (f64, f64) = (110.0, 17.0);
 /// The clock at the start: 2026-06-01, 8:00:00.
 const CLOCK_START_S: u64 = 8 * 3600;
@@ -42,7 +42,8 @@ const MONTHS: [(u64, u64, u64); 12] = [
     (5, 31, 2027),
 ];
 
-/// A signal's physical value; `None` if there is no such signal. Counters count what was sent; checksums come later.
+/// A signal's physical value; `None` if there is no such signal. Counters count transmissions; checksums are added
+/// later.
 pub fn value(signal: &str, car: &Vehicle, context: Context) -> Option<f64> {
     let flag = |on: bool| f64::from(u8::from(on));
     let kmh = car.speed * 3.6;
@@ -95,7 +96,7 @@ pub fn value(signal: &str, car: &Vehicle, context: Context) -> Option<f64> {
         "WheelSpeedRL" => car.wheel(2),
         "WheelSpeedRR" => car.wheel(3),
         "VehicleSpeed" | "GwVehicleSpeed" | "J1939WheelSpeed" => kmh,
-        // As the law wants it: never less than it is.
+        // As the law requires, it is never below the actual speed.
         "DisplayedSpeed" => {
             if moving {
                 kmh * 1.02 + 1.0
@@ -241,7 +242,7 @@ pub fn value(signal: &str, car: &Vehicle, context: Context) -> Option<f64> {
     })
 }
 
-/// A byte of the identification, in the packet of that number.
+/// A byte of the identification in the packet with that number.
 fn vin_byte(signal: &str, packet: u8) -> u8 {
     let place = signal.bytes().last().map_or(0, |digit| usize::from(digit - b'1'));
     let at = usize::from(packet) * 7 + place;
@@ -256,7 +257,7 @@ fn clock(car: &Vehicle) -> u64 {
     CLOCK_START_S + car.seconds() as u64
 }
 
-/// Day, month, year. After a year the calendar begins again.
+/// Day, month, year. The calendar repeats after a year.
 fn date(car: &Vehicle) -> (f64, f64, f64) {
     let mut day = clock(car) / DAY_S % 365;
     for (month, days, year) in MONTHS {

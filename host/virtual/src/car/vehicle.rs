@@ -1,16 +1,17 @@
 //! The car's physics: a driver who follows a drive cycle, an engine, a gearbox, wheels, temperatures, a body.
 //!
-//! All of it moves in steps of 10 ms, so that it is the same whoever looks at it, and when. Nothing here knows frames.
+//! Everything moves in steps of 10 ms, so it is the same for every reader at any time. This module knows
+//! nothing about frames.
 
 use std::f64::consts::PI;
 
 /// A step, in seconds.
 const DT: f64 = 0.01;
-/// The same in nanoseconds.
+/// The same, in nanoseconds.
 pub const STEP_NS: u64 = 10_000_000;
 /// The drive repeats after this many seconds.
 pub const CYCLE_S: f64 = 120.0;
-/// Where the drive cycle's speed has corners: seconds, km/h.
+/// The corners of the drive cycle's speed: seconds, km/h.
 const DRIVE: [(f64, f64); 14] = [
     (0.0, 0.0),
     (4.0, 0.0),
@@ -36,11 +37,11 @@ const WHEELBASE_M: f64 = 2.7;
 const TRACK_M: f64 = 1.5;
 const STEERING_RATIO: f64 = 16.0;
 const GRAVITY: f64 = 9.81;
-/// Gear ratios, the final drive included.
+/// Gear ratios, including the final drive.
 const RATIOS: [f64; 6] = [14.0, 8.2, 5.5, 3.9, 3.1, 2.53];
-/// Above this many km/h the next gear is taken.
+/// Above this many km/h it shifts to the next gear.
 const SHIFT_UP_KMH: [f64; 5] = [18.0, 34.0, 50.0, 68.0, 86.0];
-/// Below this many km/h less than that the gear is left again.
+/// It shifts down this many km/h below the speed for shifting up.
 const SHIFT_HYSTERESIS_KMH: f64 = 5.0;
 const SHIFT_S: f64 = 0.35;
 /// Cranking, after the ignition is switched on.
@@ -48,24 +49,24 @@ const CRANK_FROM_S: f64 = 0.8;
 const CRANK_TO_S: f64 = 1.5;
 const CRANK_RPM: f64 = 250.0;
 const MAX_TORQUE_NM: f64 = 230.0;
-/// What the engine takes when it is dragged along.
+/// Torque of the engine when it is dragged along.
 const DRAG_TORQUE_NM: f64 = -25.0;
-/// Crankshaft and tyres: speed cannot jump.
+/// Limit given by crankshaft and tyres: speed cannot jump.
 const MAX_RPM_PER_S: f64 = 4000.0;
 const MAX_STEERING_DEG_PER_S: f64 = 220.0;
 const TANK_L: f64 = 55.0;
-/// When so little is left, it is filled at the next stop.
+/// With this little left, it is refuelled at the next stop.
 const RESERVE_L: f64 = 8.0;
 const FILLING_L_PER_S: f64 = 0.8;
 const AMBIENT_C: f64 = 18.5;
-/// What the odometer showed at the start, in metres.
+/// The odometer's initial value, in metres.
 const ODOMETER_M: f64 = 48_213_470.0;
 
-/// Everything that a sensor could see, in SI units where not said otherwise.
+/// Everything that a sensor could measure, in SI units unless stated otherwise.
 #[derive(Clone, Debug)]
 pub struct Vehicle {
     steps: u64,
-    /// Makes another car: it drives a little faster or slower, and its temperatures differ.
+    /// Distinguishes cars: each drives a little faster or slower, with different temperatures.
     character: f64,
     /// m/s.
     pub speed: f64,
@@ -105,25 +106,25 @@ pub struct Vehicle {
     pub steering_rate: f64,
     /// V.
     pub battery: f64,
-    /// Per cent that the driver's window is open.
+    /// How far the driver's window is open, in per cent.
     pub window: f64,
     /// degrees.
     pub wiper: f64,
     wiper_phase: f64,
 }
 
-/// Towards a value, as a first-order lag.
+/// Moves towards a value with a first-order lag.
 fn lag(value: &mut f64, target: f64, seconds: f64) {
     *value += (target - *value) * DT / seconds;
 }
 
-/// Towards a value, by so much a second at most.
+/// Moves towards a value by at most this much per second.
 fn approach(value: &mut f64, target: f64, per_second: f64) {
     *value += (target - *value).clamp(-per_second * DT, per_second * DT);
 }
 
 impl Vehicle {
-    /// The ignition is switched on, the engine is cold.
+    /// The ignition has just been switched on, and the engine is cold.
     pub fn new(seed: u64) -> Self {
         let character =
             (seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40) as f64 / f64::from(1_u32 << 24) - 0.5;
@@ -190,7 +191,7 @@ impl Vehicle {
         self.body();
     }
 
-    /// What the cycle wants at a time, in m/s.
+    /// The speed that the cycle demands at a time, in m/s.
     fn wanted(&self, in_cycle: f64) -> f64 {
         let corners = DRIVE.windows(2).find(|pair| in_cycle < pair[1].0);
         let kmh = corners.map_or(0.0, |pair| {
@@ -200,7 +201,7 @@ impl Vehicle {
         kmh / 3.6 * (1.0 + 0.06 * self.character)
     }
 
-    /// Follows the cycle, and says with how much acceleration.
+    /// Follows the cycle, and returns the acceleration for it.
     fn driver(&mut self) -> f64 {
         let now = self.in_cycle();
         let wanted = self.wanted(now);
@@ -209,7 +210,7 @@ impl Vehicle {
         lag(&mut self.acceleration, demand, 0.25);
         let stands = wanted == 0.0 && self.speed < 0.3;
         if stands {
-            // The last of it is the brake's, gently.
+            // The brake does the last part, gently.
             approach(&mut self.speed, 0.0, 1.0);
             approach(&mut self.acceleration, 0.0, 6.0);
         } else {
@@ -220,14 +221,14 @@ impl Vehicle {
         demand
     }
 
-    /// The force that moves the car, in N; below zero something holds it back.
+    /// The force that moves the car, in N; negative if something holds it back.
     fn force(&self) -> f64 {
         let air = 0.5 * 1.2 * 0.65 * self.speed * self.speed;
         let rolling = if self.speed > 0.1 { 0.011 * MASS_KG * GRAVITY } else { 0.0 };
         MASS_KG * self.acceleration + air + rolling
     }
 
-    /// Whether the engine runs by itself.
+    /// Whether the engine runs on its own.
     pub fn runs(&self) -> bool {
         self.seconds() >= CRANK_TO_S
     }
@@ -237,7 +238,7 @@ impl Vehicle {
         (CRANK_FROM_S..CRANK_TO_S).contains(&self.seconds())
     }
 
-    /// What the engine gives of what it could, per cent.
+    /// The engine's load, as a percentage of what it could deliver.
     pub fn load(&self) -> f64 {
         let own_needs = if self.runs() { 12.0 } else { 0.0 };
         (self.torque.max(0.0) / MAX_TORQUE_NM * 100.0).max(own_needs)
@@ -248,12 +249,12 @@ impl Vehicle {
         if self.runs() { 28.0 + 0.72 * self.load() } else { 100.0 }
     }
 
-    /// Degrees before the upper dead centre.
+    /// Ignition angle in degrees before top dead centre.
     pub fn ignition(&self) -> f64 {
         if self.runs() { 12.0 + self.rpm / 300.0 - self.load() * 0.12 } else { 0.0 }
     }
 
-    /// Torque in per cent of the most that there is.
+    /// Torque as a percentage of the maximum.
     pub fn torque_percent(&self) -> f64 {
         self.torque / MAX_TORQUE_NM * 100.0
     }
@@ -331,7 +332,7 @@ impl Vehicle {
         lag(&mut self.brake_pressure, brake.max(holding), 0.12);
     }
 
-    /// What the wheels turn the gearbox's input by, in a gear.
+    /// The gearbox's input speed if the wheels turn it in this gear.
     fn turbine_rpm(&self, gear: u8) -> f64 {
         match gear {
             0 => 0.0,
@@ -400,7 +401,7 @@ impl Vehicle {
         let target = if (14.0..24.0).contains(&self.in_cycle()) { 60.0 } else { 0.0 };
         approach(&mut self.window, target, 25.0);
         let turning = 2.0 * PI * DT / if self.wipes_fast() { 0.8 } else { 1.3 };
-        // What has begun is ended: the wiper does not stop in the middle.
+        // The wiper does not stop half-way.
         if self.wipes() || self.wiper_phase > 0.0 {
             self.wiper_phase += turning;
             if self.wiper_phase >= 2.0 * PI {
@@ -410,7 +411,7 @@ impl Vehicle {
         self.wiper = 55.0 * (1.0 - self.wiper_phase.cos());
     }
 
-    /// Whether it rains.
+    /// Whether it is raining.
     pub fn wipes(&self) -> bool {
         (50.0..66.0).contains(&self.in_cycle())
     }
@@ -429,12 +430,12 @@ impl Vehicle {
         (85.5..89.0).contains(&self.in_cycle())
     }
 
-    /// Whether somebody sits beside the driver.
+    /// Whether somebody sits next to the driver.
     pub fn passenger(&self) -> bool {
         (87.0..CYCLE_S).contains(&self.in_cycle()) || self.seconds() > CYCLE_S && self.in_cycle() < 86.0
     }
 
-    /// Locked while it drives.
+    /// Locked while driving.
     pub fn is_locked(&self) -> bool {
         let now = self.in_cycle();
         self.seconds() > 6.0 && !(84.5..94.5).contains(&now)
@@ -452,7 +453,7 @@ impl Vehicle {
         self.seconds() < 3.4 || (85.0..92.0).contains(&self.in_cycle())
     }
 
-    /// Whether the lamps of a side are lit at this moment of their blinking.
+    /// Whether the lamps on a side are lit at this moment while blinking.
     fn blinks(&self, turns_left: bool) -> bool {
         let soon = |(from, to, angle): &(f64, f64, f64)| {
             (*angle > 0.0) == turns_left && (*from - 3.0..*to - 0.5).contains(&self.in_cycle())

@@ -7,12 +7,12 @@ use super::Traffic;
 use super::waveform::{Edge, Waveform};
 use cantap_trace::bits::{FrameBits, INTERMISSION_BITS};
 
-/// From an error to the next chance to send: six to twelve bits of error flags, eight of delimiter, three of
-/// intermission (ISO 11898-1:2015, 10.4.4). Taken as the middle.
+/// Bits from an error to the next chance to send: six to twelve bits of error flags, eight of delimiter,
+/// three of intermission (ISO 11898-1:2015, 10.4.4). This is the middle.
 const ERROR_FRAME_BITS: u64 = 9 + 8 + 3;
-/// Bits of a frame behind the ACK slot: its delimiter and the end of frame.
+/// Bits of a frame after the ACK slot: its delimiter and the end of frame.
 const AFTER_ACK_BITS: u32 = 1 + 7;
-/// The bit rate of a bus that has none of its own, while it is only watched.
+/// The bit rate of a bus without a fixed one while it is only watched.
 const WATCHED_BPS: u32 = 500_000;
 /// "Never", for times.
 const NEVER: u64 = u64::MAX;
@@ -21,54 +21,54 @@ const NEVER: u64 = u64::MAX;
 pub trait Node {
     /// Its bit rate in bit/s, while it takes part in the bus.
     fn bitrate_bps(&self) -> Option<u32>;
-    /// The frame that it wants to send.
+    /// The frame that it wants to send, if any.
     fn bid(&self) -> Option<Frame>;
-    /// Whether it acknowledges others' frames.
+    /// Whether it acknowledges other nodes' frames.
     fn acknowledges(&self) -> bool;
-    /// Whether others' frames are destroyed by its error flags when it cannot read them.
+    /// Whether its error flags destroy other nodes' frames that it cannot read.
     fn destroys(&self) -> bool;
-    /// Its bid has won the bus: from now on it cannot be withdrawn.
+    /// Its frame has won arbitration: it cannot be withdrawn any more.
     fn on_start(&mut self);
-    /// Its bid has lost to a lower identifier.
+    /// Its frame has lost to a lower identifier.
     fn on_lost(&mut self);
-    /// A frame has ended well. `own` if it was this node's bid.
+    /// A frame has ended well. `own` if this node sent it.
     fn on_frame(&mut self, frame: &Frame, own: bool);
-    /// A frame was destroyed. `own` if it was this node's bid.
+    /// A frame was destroyed. `own` if this node sent it.
     fn on_error(&mut self, kind: BusErrorKind, own: bool);
-    /// No frame is on the bus: whoever waits to join or leave may do so.
+    /// No frame is on the bus: nodes waiting to join or leave may do so.
     fn on_boundary(&mut self);
 }
 
 #[derive(Clone, Copy, Debug)]
 enum Phase {
-    /// Free since then, or from then on.
+    /// Free since this time, or from this time on.
     Free { from_ns: u64 },
-    /// A frame that ends well or with this error.
+    /// Busy with a frame that ends well or with this error.
     Busy { frame: Frame, sender: Option<usize>, error: Option<BusErrorKind>, end_ns: u64, free_ns: u64 },
 }
 
-/// A bus with simulated nodes that send [`Traffic`], and others that are given to each call.
+/// A bus with simulated nodes that send [`Traffic`], and other nodes that are passed to each call.
 pub struct SimBus {
-    /// `None`: that of the first controller that joins.
+    /// `None` for that of the first controller that joins.
     bitrate_bps: Option<u32>,
     traffic: Traffic,
     /// Whether the simulated nodes acknowledge.
     others_acknowledge: bool,
-    /// Share of the simulated nodes' frames that are destroyed, in per cent.
+    /// Percentage of the simulated nodes' frames that are destroyed.
     error_percent: f64,
-    /// How many of the controllers' next frames are destroyed.
+    /// How many of the controllers' next frames to destroy.
     disturbed: u32,
     random: fastrand::Rng,
     phase: Phase,
-    /// Since then nobody listens, and the simulated nodes are silent.
+    /// Since when nobody has listened, so that the simulated nodes are silent.
     silent_from_ns: Option<u64>,
-    /// Somebody watches the level, which no controller needs to be on the bus for.
+    /// Somebody watches the level, for which no controller needs to be on the bus.
     watched: bool,
     waveform: Waveform,
 }
 
 impl SimBus {
-    /// A bus at a bit rate, or, without one, at that of the controller that joins it.
+    /// A bus with a fixed bit rate or, without one, with that of the controller that joins it.
     pub fn new(bitrate_bps: Option<u32>, traffic: Traffic, seed: u64) -> Self {
         Self {
             bitrate_bps,
@@ -84,7 +84,7 @@ impl SimBus {
         }
     }
 
-    /// Whether somebody watches the level: [`Self::pass_edge`] is then called often.
+    /// Sets whether the level is watched: [`Self::pass_edge`] is then called often.
     pub fn watch(&mut self, watched: bool) {
         if self.watched != watched {
             self.watched = watched;
@@ -92,25 +92,25 @@ impl SimBus {
         }
     }
 
-    /// The next edge whose time has come; each is handed out once.
+    /// The next edge whose time has come; each is returned once.
     pub fn pass_edge(&mut self, now_ns: u64) -> Option<Edge> {
         self.waveform.pass(now_ns)
     }
 
-    /// Whether the simulated nodes acknowledge what others send. They do unless told otherwise.
+    /// Sets whether the simulated nodes acknowledge others' frames. The default is that they do.
     #[must_use]
     pub fn acknowledging(self, others_acknowledge: bool) -> Self {
         Self { others_acknowledge, ..self }
     }
 
-    /// Destroys a share of the simulated nodes' frames, in per cent; they are sent again.
+    /// Destroys a percentage of the simulated nodes' frames; they are sent again.
     #[must_use]
     pub fn with_errors(self, error_percent: f64) -> Self {
         Self { error_percent, ..self }
     }
 
-    /// Destroys the first frames of the controllers that are given to each call, each time that they send one: this many bit
-    /// errors. 32 in a row make a controller bus-off.
+    /// Destroys this many frames of the controllers passed to each call, starting with the first, counting retries: that
+    /// many bit errors. 32 in a row make a controller bus-off.
     #[must_use]
     pub fn disturbing(self, frames: u32) -> Self {
         Self { disturbed: frames, ..self }
@@ -137,7 +137,7 @@ impl SimBus {
         }
     }
 
-    /// Lets happen what is due at `now_ns`.
+    /// Does what is due at `now_ns`.
     pub fn step(&mut self, now_ns: u64, nodes: &mut [&mut dyn Node]) {
         match self.phase {
             Phase::Busy { frame, sender, error, end_ns, free_ns } if end_ns <= now_ns => {
@@ -202,7 +202,7 @@ impl SimBus {
         self.phase = Phase::Busy { frame, sender, error, end_ns: at(end), free_ns: at(free) };
     }
 
-    /// What will become of a frame.
+    /// Decides how a frame will end.
     fn fate(
         &mut self,
         sender: Option<usize>,
@@ -254,11 +254,11 @@ impl SimBus {
             match (node.bitrate_bps(), bitrate_bps) {
                 (Some(own_rate), Some(rate)) if own || same_rate(own_rate, rate) => match error {
                     None => node.on_frame(frame, own),
-                    // A receiver sees the sender's error flag where the end of frame should be.
+                    // A receiver sees the sender's error flag in place of the end of frame.
                     Some(BusErrorKind::Acknowledgment) if !own => node.on_error(BusErrorKind::Form, false),
                     Some(kind) => node.on_error(kind, own),
                 },
-                // Bits of another length look like stuff errors.
+                // Bits of a different length look like stuff errors.
                 (Some(_), Some(_)) => node.on_error(BusErrorKind::Stuff, false),
                 _ => {}
             }
@@ -272,12 +272,12 @@ fn join_and_leave(nodes: &mut [&mut dyn Node]) {
     }
 }
 
-/// Within the tolerance of any two controllers: 1 %.
+/// Whether the rates are within the tolerance of any two controllers: 1 %.
 fn same_rate(a: u32, b: u32) -> bool {
     u64::from(a.abs_diff(b)) * 100 <= u64::from(b)
 }
 
-/// What arbitration compares, bit by bit; 0 wins.
+/// The value that arbitration compares, bit by bit; 0 wins.
 pub(crate) fn arbitration_field(id: Id, remote: bool) -> u32 {
     let remote = u32::from(remote);
     let raw = id.raw();
@@ -372,7 +372,8 @@ mod tests {
         assert!((percent - 37.0).abs() < 0.01, "{percent} %");
     }
 
-    /// What had been due meanwhile came back to back, so that a bus of 30 % was one of 100 % for as long as it had slept.
+    /// Frames that had become due meanwhile once came back to back, so that a bus with a load of 30 % had one of 100 %
+    /// for as long as it had slept.
     #[test]
     fn who_comes_back_after_a_while_finds_the_bus_as_it_was() {
         let traffic = [
@@ -388,7 +389,7 @@ mod tests {
             let mut node = FakeNode { bitrate_bps: 500_000, ..FakeNode::new(None) };
             run(&mut bus, 1_000_000_000, &mut [&mut node]);
             let before = node.seen.len();
-            // The frame that is on the bus ends, and then there is nobody.
+            // The frame on the bus ends, and then there is nobody.
             let end_ns = bus.next_event_ns(1_000_000_000, &[]);
             bus.step(end_ns, &mut []);
             assert_eq!(bus.next_event_ns(1_001_000_000, &[]), NEVER);

@@ -1,4 +1,4 @@
-//! Which frames simulated nodes send: an endless sequence, the same for the same seed.
+//! The frames that simulated nodes send: an endless sequence, the same for the same seed.
 
 use std::fmt;
 use std::str::FromStr;
@@ -9,12 +9,12 @@ use cantap_trace::bits::bits_on_bus;
 
 /// Length of the shortest standard data frame: without data and with a single stuff bit.
 const SHORTEST_STANDARD_BITS: u32 = 48;
-/// A step through the identifiers that visits each before any comes again: prime, and larger than any count of them.
+/// A step through the identifiers that visits each before repeating any: prime, and larger than their number.
 const STRIDE: u64 = 2053;
 /// The same for 29-bit identifiers.
 const EXTENDED_STRIDE: u64 = 0x0A5A_5A5B;
 
-/// A kind of frames.
+/// A kind of frame.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Frames {
     /// Standard without data, 48 bits each: the most frames that a bus can carry.
@@ -50,7 +50,7 @@ impl fmt::Display for Frames {
     }
 }
 
-/// A text names no kind of frames.
+/// A text is not the name of a kind of frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("choose one of std0, std8, ext0, ext8, rtr, mix")]
 pub struct UnknownFrames;
@@ -64,7 +64,7 @@ impl FromStr for Frames {
     }
 }
 
-/// The sequence. Neighbours differ, so that a missing or swapped frame shows.
+/// The sequence. Neighbours differ, so that a missing or swapped frame is noticed.
 #[derive(Clone, Debug)]
 pub struct FrameSource {
     frames: Frames,
@@ -75,7 +75,7 @@ pub struct FrameSource {
 }
 
 impl FrameSource {
-    /// The sequence of a kind and a seed.
+    /// The sequence for a kind and a seed.
     pub fn new(frames: Frames, seed: u64) -> Self {
         let shortest = match frames {
             Frames::Std0 => shortest_identifiers(),

@@ -1,7 +1,7 @@
-//! A simulated CAN bus with exact bit lengths, in a time of its own.
+//! A simulated CAN bus with exact bit lengths, in its own time.
 //!
-//! It knows arbitration, acknowledgement, retransmission and bit rates, at the resolution of whole frames; not
-//! single bits, so no two nodes ever disturb each other in mid-frame. Its edges are made from the frames, for who watches a pin. Everything is deterministic by seed.
+//! It models arbitration, acknowledgement, retransmission and bit rates with the resolution of whole frames, not single bits, so no two nodes ever
+//! disturb each other in mid-frame. Its edges are derived from the frames, for watching a pin. A seed makes everything deterministic.
 
 mod bus;
 mod frames;

@@ -8,13 +8,14 @@ use cantap_wire::Frame;
 use super::frames::FrameSource;
 use cantap_trace::bits::FrameBits;
 
-/// Simulated nodes with a mind of their own: several want to send at once, and they hear what others send.
+/// Simulated nodes that decide for themselves: several may want to send at the same time, and they hear what
+/// others send.
 ///
 /// Times are the simulation's, in nanoseconds.
 pub trait Senders: Debug {
     /// When one of them wants to send next.
     fn due(&mut self, now_ns: u64) -> Option<u64>;
-    /// Of the frames that they want to send by now, the one with the lowest identifier.
+    /// Of the frames that they want to send at this time, the one with the lowest identifier.
     fn bid(&mut self, now_ns: u64) -> Option<Frame>;
     /// That frame is on the bus.
     fn take(&mut self, now_ns: u64);
@@ -29,30 +30,30 @@ pub trait Senders: Debug {
 /// When the next frame is due.
 #[derive(Debug)]
 pub enum Schedule {
-    /// Nobody sends.
+    /// Nothing is sent.
     Silent,
-    /// The bus is busy for this share of the time, in per cent; from 100 on frames stand back to back.
+    /// The bus is busy for this percentage of the time; from 100 on, frames are back to back.
     Load {
-        /// Which frames.
+        /// The frames.
         source: FrameSource,
-        /// Share of the time.
+        /// Percentage of the time.
         percent: f64,
     },
     /// Frames back to back, then a pause.
     Bursts {
-        /// Which frames.
+        /// The frames.
         source: FrameSource,
-        /// Frames in a burst.
+        /// Number of frames in a burst.
         length: u32,
         /// From the start of a burst to the start of the next, in nanoseconds.
         period_ns: u64,
     },
-    /// Frames at their own times.
+    /// Frames with their own timing.
     Log {
         /// Nanoseconds since the log's start, in order, with the frame.
         entries: std::vec::IntoIter<(u64, Frame)>,
     },
-    /// Nodes decide.
+    /// Nodes decide for themselves.
     Nodes(Box<dyn Senders>),
 }
 
@@ -61,9 +62,9 @@ pub enum Schedule {
 pub struct Traffic {
     schedule: Schedule,
     next: Option<(u64, Frame)>,
-    /// Planned, and overtaken by a frame that must be sent again.
+    /// Planned, but overtaken by a frame that must be sent again.
     waiting: VecDeque<(u64, Frame)>,
-    /// Frames given out, for bursts.
+    /// Number of frames handed out, for bursts.
     count: u64,
     /// Fractions of a nanosecond carried over, so that a load is met exactly.
     due_ns: f64,
@@ -73,7 +74,7 @@ pub struct Traffic {
 }
 
 impl Traffic {
-    /// Traffic that begins when it is first asked for.
+    /// Traffic that begins when it is first queried.
     pub const fn new(schedule: Schedule) -> Self {
         Self {
             schedule,
@@ -86,7 +87,7 @@ impl Traffic {
         }
     }
 
-    /// When the next frame may start at the earliest, as [`Self::peek`] says it.
+    /// The earliest time at which the next frame may start, as from [`Self::peek`].
     pub fn due(&mut self, now_ns: u64, bitrate_bps: u32) -> Option<u64> {
         match &mut self.schedule {
             Schedule::Nodes(nodes) => nodes.due(now_ns),
@@ -94,7 +95,7 @@ impl Traffic {
         }
     }
 
-    /// The frame that is next, and when it may start at the earliest. `now_ns` is when the bus became free.
+    /// The next frame, and the earliest time at which it may start. `now_ns` is when the bus became free.
     pub fn peek(&mut self, now_ns: u64, bitrate_bps: u32) -> Option<(u64, Frame)> {
         if let Schedule::Nodes(nodes) = &mut self.schedule {
             return nodes.bid(now_ns).map(|frame| (now_ns, frame));
@@ -110,7 +111,8 @@ impl Traffic {
         self.next
     }
 
-    /// Nobody listened for so long, and nobody sent: what was planned comes so much later, and not all at once.
+    /// Nobody listened for this long, so nobody sent: everything planned is postponed, so that it does not come
+    /// all at once.
     pub fn postpone(&mut self, by_ns: u64) {
         self.start_ns += by_ns;
         self.due_ns += by_ns as f64;
@@ -134,7 +136,7 @@ impl Traffic {
         }
     }
 
-    /// Somebody else's frame has ended well.
+    /// Another node's frame has ended well.
     pub fn hear(&mut self, frame: &Frame, now_ns: u64) {
         if let Schedule::Nodes(nodes) = &mut self.schedule {
             nodes.hear(frame, now_ns);
@@ -153,7 +155,7 @@ impl Traffic {
 
     fn plan(&mut self, now_ns: u64, bitrate_bps: u32) -> Option<(u64, Frame)> {
         match &mut self.schedule {
-            // Nodes are asked each time.
+            // Nodes are queried each time.
             Schedule::Silent | Schedule::Nodes(_) => None,
             Schedule::Load { source, percent } => {
                 let frame = source.next()?;

@@ -1,4 +1,4 @@
-//! The level of a simulated bus over time, for who watches a receive pin.
+//! The level of a simulated bus over time, for watching a receive pin.
 
 use std::collections::VecDeque;
 
@@ -8,16 +8,16 @@ use cantap_wire::record::BusErrorKind;
 
 /// Dominant bits of an error flag.
 const FLAG_BITS: u64 = 6;
-/// An edge to recessive comes so much later than one to dominant: a bus is driven to dominant, and left to itself for the other. A
-/// transceiver and a short line make about this.
+/// How much later an edge to recessive comes than one to dominant: a bus is actively driven only to dominant. This is about the
+/// delay of a transceiver and a short line.
 const SLOW_RECESSIVE_NS: u64 = 60;
 
-/// A change of the bus's level.
+/// A change in the bus's level.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Edge {
-    /// When.
+    /// The time.
     pub at_ns: u64,
-    /// The level behind it.
+    /// The level after it.
     pub dominant: bool,
 }
 
@@ -25,12 +25,12 @@ pub struct Edge {
 #[derive(Debug, Default)]
 pub struct Waveform {
     edges: VecDeque<Edge>,
-    /// The level behind the last edge, taken or not.
+    /// The level after the last edge, whether taken or not.
     dominant: bool,
 }
 
 impl Waveform {
-    /// Puts a frame on the bus that starts at `start_ns` and ends well, or with an error behind this many of its bits.
+    /// Puts a frame on the bus that starts at `start_ns` and ends well, or with an error after this many of its bits.
     pub fn frame(
         &mut self,
         frame: &Frame,
@@ -44,7 +44,7 @@ impl Waveform {
                 let ack = bits.len() - ACK_SLOT_FROM_END;
                 bits[ack] = false;
             }
-            // Whoever saw it says so to all.
+            // A node that saw the error signals it to all.
             Some((_, after)) => {
                 bits.truncate(after as usize);
                 bits.extend([false; FLAG_BITS as usize]);

@@ -1,7 +1,7 @@
-"""The columns of the datasets: `cantap`'s own, in types that Spark has.
+"""The columns of the datasets: `cantap`'s own, in Spark's types.
 
-Spark has neither unsigned integers nor nanoseconds: numbers take the next wider type, and beside `time`, in microseconds, there is
-`time_ns`.
+Spark has neither unsigned integers nor nanoseconds: numbers have the next wider type, and in addition to `time`, in microseconds,
+there is `time_ns`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ SIGNALS = COMMON | {
     "unit": "string",
 }
 FOLDERS = ["vehicle", "day", "channel"]
-#: A task hands over rows of both, and its part of the ledger, in one stream: `part` says which.
+#: A task delivers rows of both, and its part of the ledger, in one stream, marked by `part`.
 STREAM = {"part": "string"} | FRAMES | SIGNALS | {"entry": "string"}
 
 _ARROW: dict[str, pa.DataType] = {
@@ -65,12 +65,12 @@ _ARROW: dict[str, pa.DataType] = {
 
 
 def ddl(columns: dict[str, str]) -> str:
-    """The columns as Spark takes them."""
+    """The columns for Spark."""
     return ", ".join(f"`{name}` {kind}" for name, kind in columns.items())
 
 
 def schema(columns: dict[str, str]) -> pa.Schema:
-    """The columns as Arrow has them."""
+    """The columns for Arrow."""
     return pa.schema([(name, _ARROW[kind]) for name, kind in columns.items()])
 
 
@@ -78,7 +78,7 @@ STREAM_SCHEMA = schema(STREAM)
 
 
 def rows_of(batch: pa.RecordBatch, part: str, vehicle: str, trace: str, first_row: int) -> pa.RecordBatch:
-    """A batch of `cantap.scan` as rows of the stream; `first_row` is the number of its first within the trace."""
+    """A batch of `cantap.scan` as rows of the stream; `first_row` is the number of its first row within the trace."""
     rows = batch.num_rows
     time = batch.column("time")
     known: dict[str, pa.Array] = {

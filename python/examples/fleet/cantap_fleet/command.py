@@ -26,7 +26,7 @@ _UNITS = {"": 1, "k": 1 << 10, "m": 1 << 20, "g": 1 << 30}
 def _bytes(text: str) -> int:
     found = re.fullmatch(r"(\d+)([kmg]?)", text.lower())
     if not found or int(found[1]) == 0:
-        raise argparse.ArgumentTypeError(f"'{text}' is no size; write 64M or 2G")
+        raise argparse.ArgumentTypeError(f"'{text}' is not a size; write 64M or 2G")
     return int(found[1]) * _UNITS[found[2]]
 
 
@@ -36,7 +36,7 @@ def _seconds(text: str) -> float:
     except ValueError:
         seconds = 0.0
     if not 0 < seconds < 1e9:
-        raise argparse.ArgumentTypeError(f"'{text}' is no time; give seconds, more than 0")
+        raise argparse.ArgumentTypeError(f"'{text}' is not a time; give seconds, more than 0")
     return seconds
 
 
@@ -47,7 +47,7 @@ def _number(text: str) -> tuple[str, float]:
     try:
         return name, float(value)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is no number; write {name}=80") from None
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number; write {name}=80") from None
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -74,12 +74,12 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def ship(spark: SparkSession) -> None:
-    """Sends this package to the workers, wherever it comes from; a session that has it keeps it."""
+    """Sends this package to the workers, wherever it comes from; a session that already has it keeps it."""
     name = f"{__package__}.zip"
     if any(file.endswith(name) for file in spark.sparkContext.listFiles):
         return
     folder = tempfile.mkdtemp(prefix="cantap-fleet-")
-    # Spark serves the file from where it lies, as long as the driver runs.
+    # Spark serves the file from its place, as long as the driver runs.
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     with zipfile.ZipFile(Path(folder) / name, "w") as archive:
         for part in sorted(resources.files(__package__).iterdir(), key=lambda part: part.name):
@@ -95,7 +95,7 @@ def _decode(spark: SparkSession, arguments: argparse.Namespace) -> int:
     states = dataset.write(spark, work, settings, arguments.output, arguments.task_bytes)
     words = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
     print(f"{states.total()} traces: {words}. What is wrong with them stands in {arguments.output}/ledger")
-    # A job that got nothing out of anything is no success.
+    # A job that could not decode anything is not a success.
     return 1 if states[REFUSED] + states[FAILED] == states.total() else 0
 
 
@@ -115,7 +115,7 @@ def _ask(spark: SparkSession, arguments: argparse.Namespace) -> int:
 
 
 def run(spark: SparkSession, arguments: list[str] | None = None) -> int:
-    """Runs the job on a session that is there; the exit code is 1 for failure, and a wrong command line ends the program with 2."""
+    """Runs the job in an existing session; the exit code is 1 for failure, and a wrong command line ends the program with 2."""
     return _run(spark, _chosen(arguments))
 
 
@@ -139,8 +139,8 @@ def _run(spark: SparkSession, chosen: argparse.Namespace) -> int:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """What `spark-submit` runs."""
-    # A wrong command line is said before Spark begins.
+    """The entry point for `spark-submit`."""
+    # A wrong command line is reported before Spark starts.
     chosen = _chosen(arguments)
     spark = SparkSession.builder.appName("cantap-fleet").getOrCreate()
     try:

@@ -1,9 +1,9 @@
-"""The dataset: written once, with proof that all of it is there.
+"""The dataset: written once, with proof that it is complete.
 
     OUTPUT/frames/vehicle=7/day=2026-03-01/channel=1/….parquet    a row per frame, loss, bus error
     OUTPUT/signals/vehicle=7/day=2026-03-01/channel=1/….parquet   a row per value, and the same losses and errors
     OUTPUT/vehicles/                                              what is known about each vehicle's buses
-    OUTPUT/ledger/                                                what became of each input; written last
+    OUTPUT/ledger/                                                the result for each input; written last
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from . import columns, inputs, ledger
 from .inputs import Bus, File, InputError
 from .worker import TRACES, Settings, decoder, local_path
 
-#: Files that Spark hands over as a value; Java's arrays end there.
+#: The largest file that Spark can pass as a value: the limit of Java's arrays.
 _LARGEST_VALUE = (1 << 31) - 16
 _VEHICLES = "vehicle string, channel smallint, bitrate bigint, data_bitrate bigint"
 
 
 class AccountError(Exception):
-    """What was written is not what was read, in words where."""
+    """What was written differs from what was read; the message says where."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Plan:
 
 
 def plan(spark: SparkSession, folder: str, vehicles: str | None) -> Plan:
-    """Finds the traces, and reads the vehicles' table and the databases that it names."""
+    """Finds the traces, and reads the vehicles' table and its databases."""
     files = inputs.files_of(spark, folder)
     if vehicles is None:
         tables = [file.url for file in files if file.name == "vehicles.csv"]
@@ -68,13 +68,13 @@ def plan(spark: SparkSession, folder: str, vehicles: str | None) -> Plan:
 def write(
     spark: SparkSession, work: Plan, settings: Settings, output: str, task_bytes: int
 ) -> Counter[str]:
-    """Decodes all traces and writes the dataset; returns how many there are of each state."""
+    """Decodes all traces and writes the dataset; returns the number of traces in each state."""
     refuse_existing(spark, output)
     databases = spark.sparkContext.broadcast(work.databases)
     traces = _traces(spark, work, task_bytes)
     rows = traces.mapInArrow(decoder(settings, databases), columns.ddl(columns.STREAM))
-    # One way through the traces gives frames, signals and ledger. What a worker has done stays on its disk until all three are written;
-    # what is lost with a worker is done again.
+    # A single pass over the traces gives frames, signals and ledger. A worker's results stay on its disk until all three are written;
+    # results lost with a worker are computed again.
     rows = rows.persist(StorageLevel.DISK_ONLY)
     try:
         _write_part(rows, "frames", columns.FRAMES, output)
@@ -94,7 +94,7 @@ def write(
 
 
 def refuse_existing(spark: SparkSession, output: str) -> None:
-    """A dataset is never written over: whoever asks it meanwhile would get half of two."""
+    """A dataset is never overwritten: a query in the meantime would get parts of both."""
     java = spark.sparkContext._jvm
     assert java is not None
     path = java.org.apache.hadoop.fs.Path(output)
@@ -104,12 +104,12 @@ def refuse_existing(spark: SparkSession, output: str) -> None:
 
 
 def _traces(spark: SparkSession, work: Plan, task_bytes: int) -> DataFrame:
-    """A row for each trace that lies in a vehicle's folder, in partitions that are tasks."""
+    """A row for each trace in a vehicle's folder, in partitions that become tasks."""
     at_home = [file for file in work.traces if file.vehicle is not None]
     near = [file for file in at_home if local_path(file.url) is not None]
     if len(near) == len(at_home):
         return _in_tasks(spark, [_row(file, work) for file in near], task_bytes)
-    # Workers have no file system of Hadoop's: what they cannot open themselves, Spark reads for them, file by file.
+    # Workers have no access to Hadoop file systems: Spark reads what they cannot open themselves, file by file.
     spark.conf.set("spark.sql.execution.arrow.maxRecordsPerBatch", 1)
     rows = spark.createDataFrame([_row(file, work) for file in at_home], TRACES).drop("content")
     folders = sorted({file.url[: -len(file.name)] for file in at_home})
@@ -167,7 +167,7 @@ def _homeless(file: File) -> dict[str, Any]:
 def check(
     spark: SparkSession, entries: Iterable[dict[str, Any]], traces: Iterable[str], output: str
 ) -> None:
-    """Each input has one entry, and each entry's rows are there once: numbered from 0 without a gap."""
+    """Checks that each input has one entry, and each entry's rows exist once: numbered from 0 without a gap."""
     entries = list(entries)
     times = Counter(str(entry["trace"]) for entry in entries)
     for trace in traces:
@@ -191,5 +191,5 @@ def check(
 
 
 def read(spark: SparkSession, output: str, part: str, wanted: dict[str, str]) -> DataFrame:
-    """A part of the dataset. The schema is given: Spark would take a vehicle that is called 007 for 7."""
+    """A part of the dataset. The schema is given: Spark would read a vehicle called 007 as 7."""
     return spark.read.schema(columns.ddl(wanted)).parquet(f"{output}/{part}")

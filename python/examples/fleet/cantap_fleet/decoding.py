@@ -1,7 +1,7 @@
-"""A process that decodes one trace after the other, so that a trace that hangs or kills it costs nobody else anything.
+"""A process that decodes one trace after the other, so that a trace that hangs or kills it affects nothing else.
 
-It reads requests from standard input, a line of JSON each, and answers with a line of JSON. Rows go into a file, out of which they are
-handed on only when the whole trace is done. With whoever started it, it ends.
+It reads requests from standard input, a line of JSON each, and answers with a line of JSON. Rows go into a file, from which they
+are passed on only when the whole trace is done. It ends together with the process that started it.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ class Request(TypedDict):
     trace: str
     vehicle: str
     bytes: int
-    #: The channel that a database is for, none for all, and where it lies.
+    #: A database's channel (`None` for all), and its path.
     databases: list[tuple[int | None, str]]
-    #: Their names for the ledger.
+    #: Their names in the ledger.
     database_names: list[str]
     j1939: bool
-    #: Only these signals; all if there are none.
+    #: Only these signals; all if empty.
     signals: list[str]
     zone: str | None
     #: Where rows go.
@@ -65,7 +65,7 @@ def _batches(scan: cantap.Scan) -> Iterator[pa.RecordBatch]:
 
 
 def _write(writer: Any, scan: cantap.Scan, part: str, request: Request) -> int:
-    """Writes all rows, and returns how many there were."""
+    """Writes all rows, and returns their number."""
     rows = 0
     for batch in _batches(scan):
         writer.write(columns.rows_of(batch, part, request["vehicle"], request["trace"], rows))
@@ -74,7 +74,7 @@ def _write(writer: Any, scan: cantap.Scan, part: str, request: Request) -> int:
 
 
 def decode(request: Request) -> Entry:
-    """Decodes a trace into the file of rows; without any where the state is refused or failed."""
+    """Decodes a trace into the file of rows; without rows if the state is refused or failed."""
     entry = Entry(request["trace"], request["vehicle"], request["bytes"], databases=request["database_names"])
     path, zone = request["path"], request["zone"]
     try:
@@ -112,7 +112,7 @@ def decode(request: Request) -> Entry:
 def _state(report: cantap.Report) -> str:
     if report.is_whole:
         return READ if report.records_read or report.left_out else EMPTY
-    # Where compressed data ends too early, so does what is in them: two places, one cause.
+    # If compressed data ends too early, so does its content: two places, one cause.
     causes = 2 if report.issues == 2 and "inside the compressed data" in report.faults[-1] else 1
     return CUT if report.is_cut and report.issues == causes else DAMAGED
 
@@ -122,7 +122,7 @@ def _in_words(error: Exception, request: Request) -> str:
 
 
 def _without_folders(text: str, request: Request) -> str:
-    """The ledger names inputs as the user does: folders of this machine are nobody's business, and differ from run to run."""
+    """The ledger names inputs as the user does: this machine's folders are irrelevant, and differ from run to run."""
     text = text.replace(request["path"], request["trace"])
     for (_, path), name in zip(request["databases"], request["database_names"], strict=True):
         text = text.replace(path, name)
@@ -130,7 +130,7 @@ def _without_folders(text: str, request: Request) -> str:
 
 
 def _requests(scratch: str) -> Iterator[Request]:
-    """The requests, until whoever asks is gone: then this ends at once, whatever it is about."""
+    """The requests, until the requesting process is gone: then this ends immediately, whatever it is doing."""
     waiting: queue.Queue[Request] = queue.Queue()
 
     def listen() -> None:
@@ -145,8 +145,8 @@ def _requests(scratch: str) -> Iterator[Request]:
 
 
 def main() -> None:
-    """Answers requests. The argument is the folder of whoever asks, which is removed at the end."""
-    # What is wrong with a trace stands in the ledger.
+    """Answers requests. The argument is the folder of the requesting process, which is removed at the end."""
+    # Faults in a trace are in the ledger.
     warnings.simplefilter("ignore", cantap.CantapWarning)
     for request in _requests(sys.argv[1]):
         print(json.dumps(decode(request).to_dict()), flush=True)

@@ -1,4 +1,4 @@
-"""What there is to decode: the traces under a folder, and what is known about each vehicle."""
+"""The input: the traces under a folder, and what is known about each vehicle."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from typing import Any
 
 from pyspark.sql import SparkSession
 
-#: What stands under this name counts for vehicles that have no line of their own.
+#: Lines with this name are for vehicles without a line of their own.
 ANY_VEHICLE = "*"
 _FIELDS = ["vehicle", "channel", "databases", "bitrate", "data_bitrate", "j1939"]
 
 
 class InputError(Exception):
-    """The job cannot begin, in words why."""
+    """The job cannot begin; the message says why."""
 
 
 @dataclass(frozen=True)
 class File:
     """A file of the input folder."""
 
-    #: As Hadoop writes it: with its scheme, nothing escaped.
+    #: As Hadoop writes it: with its scheme, and unescaped.
     url: str
     #: Under the input folder, with `/`.
     name: str
@@ -31,7 +31,7 @@ class File:
 
     @property
     def vehicle(self) -> str | None:
-        """The first folder of its name; none for a file that lies in no folder."""
+        """The first folder in its name; `None` for a file that is in no folder."""
         first, slash, _ = self.name.partition("/")
         return first if slash else None
 
@@ -41,19 +41,19 @@ class Bus:
     """What is known about a vehicle's channel, or all its channels."""
 
     vehicle: str
-    #: From 1; `None` for all that have no line of their own.
+    #: From 1; `None` for all channels without a line of their own.
     channel: int | None
     #: Names under the input folder.
     databases: tuple[str, ...]
-    #: Bits per second; `None` where nobody has said.
+    #: Bits per second; `None` if unknown.
     bitrate: int | None
     data_bitrate: int | None
     j1939: bool
 
 
 def files_of(spark: SparkSession, folder: str) -> list[File]:
-    """All files under a folder of any of Hadoop's file systems, by name; hidden ones too."""
-    # Spark's own sources pass over names with `_` or `.` in front, in silence.
+    """All files under a folder in any of Hadoop's file systems, by name, including hidden ones."""
+    # Spark's own sources silently skip names that begin with `_` or `.`.
     java = spark.sparkContext._jvm
     configuration = spark.sparkContext._jsc.hadoopConfiguration()
     assert java is not None
@@ -133,7 +133,7 @@ def _number(text: str, what: str, most: int) -> int | None:
 
 
 def buses_by_vehicle(buses: Iterable[Bus], vehicles: Iterable[str]) -> dict[str, list[Bus]]:
-    """The lines of each vehicle: its own, or else those for any."""
+    """The lines for each vehicle: its own, otherwise those for any vehicle."""
     named: dict[str, list[Bus]] = {}
     for bus in buses:
         named.setdefault(bus.vehicle, []).append(bus)

@@ -1,4 +1,4 @@
-"""Work handed to a process of its own, which may hang or die."""
+"""Passes work to a separate process, which may hang or die."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any, cast
 
-#: How often a request is tried whose process dies: memory that was short may be there the next time.
+#: How often to try a request whose process dies: if memory was short, it may be available the next time.
 ATTEMPTS = 2
 
 
 class Failed(Exception):
-    """There is no answer, in words why."""
+    """There is no answer; the message says why."""
 
 
 class Process:
-    """A process that answers lines of JSON with lines of JSON. It is started when it is needed, and again when it has died."""
+    """A process that answers lines of JSON with lines of JSON. It is started on demand, and restarted if it has died."""
 
     def __init__(self, command: Sequence[str], timeout_s: float) -> None:
         self._command = list(command)
@@ -38,7 +38,7 @@ class Process:
         self._end()
 
     def ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """The answer; `Failed` if there is none in time, or the process dies of it as often as it is tried."""
+        """The answer; raises `Failed` if there is none in time, or if the process dies at every attempt."""
         attempt = 1
         while True:
             try:
@@ -70,7 +70,7 @@ class Process:
         return cast("dict[str, Any]", json.loads(answer))
 
     def _start(self) -> subprocess.Popen[bytes]:
-        # Modules that Spark has brought here are found there as well.
+        # Modules that Spark has shipped to this machine are found there as well.
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         self._running = subprocess.Popen(
             self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment

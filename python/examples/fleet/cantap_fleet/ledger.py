@@ -1,4 +1,4 @@
-"""The ledger: what became of each input."""
+"""The ledger: the result for each input."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import Any
 
 #: All of it was read.
 READ = "read"
-#: It ends in the middle of something; all that is before is there.
+#: It ends in the middle of something; everything before that is there.
 CUT = "cut"
 #: Places in it could not be read; the rest is there.
 DAMAGED = "damaged"
-#: It was read to its end, and has nothing in it.
+#: It was read to its end, and is empty.
 EMPTY = "empty"
-#: It is no trace, or its vehicle's databases cannot be used. It has no rows.
+#: It is not a trace, or its vehicle's databases cannot be used. It has no rows.
 REFUSED = "refused"
 #: The system did not deliver it, reading it took too long, or the process that read it died, twice. It has no rows.
 FAILED = "failed"
@@ -21,32 +21,32 @@ FAILED = "failed"
 
 @dataclass
 class Entry:
-    """What became of one input. No times and no machines: running the job again gives the same."""
+    """The result for one input. It contains no times or machines: running the job again gives the same."""
 
     trace: str
     vehicle: str
     bytes: int
     state: str = READ
-    #: In words, what is wrong; of several places the first.
+    #: A description of what is wrong; if there are several places, of the first.
     problem: str | None = None
     format: str | None = None
     #: Rows among the frames: frames, losses, bus errors, states.
     records: int = 0
     frames: int = 0
-    #: Frames that the trace says are missing in it, or more.
+    #: Frames that are missing according to the trace; there may be more.
     lost: int = 0
     lost_at_least: bool = False
     bus_errors: int = 0
-    #: Frames that the databases have a message for.
+    #: Frames for which the databases have a message.
     decoded: int = 0
     #: Rows among the signals.
     signal_rows: int = 0
-    #: Places that could not be read, and the first of them in words.
+    #: Places that could not be read, and a description of the first.
     issues: int = 0
     faults: list[str] = field(default_factory=list)
-    #: What is well-formed and no part of a CAN trace, by kind.
+    #: What is well-formed but not part of a CAN trace, by kind.
     left_out: dict[str, int] = field(default_factory=dict)
-    #: What is nothing wrong and should be known, by kind.
+    #: What is not wrong but should be known, by kind.
     notes: dict[str, int] = field(default_factory=dict)
     databases: list[str] = field(default_factory=list)
 
@@ -55,7 +55,7 @@ class Entry:
         return asdict(self)
 
 
-#: The same, as Spark has it.
+#: The same, as a Spark type.
 DDL = (
     "trace string, vehicle string, bytes bigint, state string, problem string, format string, records bigint, frames bigint, "
     "lost bigint, lost_at_least boolean, bus_errors bigint, decoded bigint, signal_rows bigint, issues bigint, "

@@ -10,7 +10,7 @@ from pyspark.sql import DataFrame, SparkSession
 from . import columns, dataset, ledger
 from .inputs import InputError
 
-#: The questions, and the numbers in them that can be set.
+#: The questions, and their adjustable parameters.
 QUESTIONS: dict[str, dict[str, float]] = {
     "period_jitter": {},
     "condition": {"speed": 120.0, "pressure": 50.0},
@@ -19,11 +19,11 @@ QUESTIONS: dict[str, dict[str, float]] = {
 
 
 def open_dataset(spark: SparkSession, output: str) -> None:
-    """Makes `frames`, `signals`, `vehicles` and `ledger` tables for SQL."""
+    """Makes `frames`, `signals`, `vehicles` and `ledger` available as SQL tables."""
     try:
         ledger_table = spark.read.schema(ledger.DDL).parquet(f"{output}/ledger")
     except Exception as error:
-        # Spark has one class for all that it finds wrong with a query.
+        # Spark has a single class for all errors in a query.
         if "PATH_NOT_FOUND" not in str(error):
             raise
         raise InputError(f"{output} has no ledger: its job did not end; delete it and run that again") from None
@@ -34,7 +34,7 @@ def open_dataset(spark: SparkSession, output: str) -> None:
 
 
 def ask(spark: SparkSession, question: str, numbers: Mapping[str, float] | None = None) -> DataFrame:
-    """The answer to one of the questions, of a dataset that was opened."""
+    """The answer to one of the questions, for an open dataset."""
     text = resources.files(__package__).joinpath("sql", f"{question}.sql").read_text()
     known = QUESTIONS[question]
     chosen = {name: number for name, number in (numbers or {}).items() if name in known}

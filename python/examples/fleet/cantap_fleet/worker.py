@@ -22,13 +22,13 @@ from .ledger import FAILED, REFUSED, Entry
 if TYPE_CHECKING:
     from pyspark import Broadcast
 
-#: The traces as workers get them. `setup` is JSON: the databases, each with its channel, and whether they are J1939.
+#: A trace, as passed to workers. `setup` is JSON: the databases, each with its channel, and whether they are J1939.
 TRACES = "url string, trace string, vehicle string, bytes bigint, setup string, content binary"
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What is the same for all traces."""
+    """Settings that are the same for all traces."""
 
     signals: tuple[str, ...]
     zone: str | None
@@ -36,7 +36,7 @@ class Settings:
 
 
 class _Workplace:
-    """A folder for what is in work, and the process that decodes."""
+    """A folder for work in progress, and the process that decodes."""
 
     def __init__(self, settings: Settings, databases: dict[str, bytes]) -> None:
         self._settings = settings
@@ -50,7 +50,7 @@ class _Workplace:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def decode(self, row: dict[str, Any]) -> Iterator[pa.RecordBatch]:
-        """A trace's rows, and its entry behind them."""
+        """A trace's rows, followed by its entry."""
         trace, vehicle = row["trace"], row["vehicle"]
         rows = self._folder / "rows.arrow"
         try:
@@ -82,12 +82,12 @@ class _Workplace:
         }
 
     def _local(self, row: dict[str, Any]) -> str:
-        """Where the trace lies for this machine's programs."""
+        """The trace's path for this machine's programs."""
         if (path := local_path(row["url"])) is not None:
             return path
         if row["content"] is None:
             raise Failed("Spark does not hand out files of 2 GiB or more, or whose names begin with _ or .")
-        # Its own name: the suffix says the format.
+        # Keep its name: the suffix determines the format.
         fetched = self._folder / "trace" / PurePosixPath(row["trace"]).name
         shutil.rmtree(fetched.parent, ignore_errors=True)
         fetched.parent.mkdir()
@@ -103,7 +103,7 @@ class _Workplace:
 
 
 def local_path(url: str) -> str | None:
-    """The path of a file in a file system that every worker has mounted at the same place; none for other systems."""
+    """The path of a file in a file system that every worker has mounted in the same place; `None` for other file systems."""
     if not url.startswith("file:"):
         return None
     path = url.removeprefix("file:")

@@ -1,5 +1,5 @@
-//! A frame as the bits that cross the bus, one by one (ISO 11898-1, bit by bit and on purpose without
-//! any of the firmware's or the host's shortcuts: this is what theirs are compared with).
+//! A frame as the bits that cross the bus, one by one (ISO 11898-1). It works bit by bit, deliberately
+//! without any of the shortcuts of the firmware and the host, which are compared with it.
 
 use cantap_can::{Frame, Id};
 
@@ -16,7 +16,7 @@ const CRC_POLYNOMIAL: u16 = 0x4599;
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct FrameBits {
     bits: Vec<bool>,
-    /// One entry for each bit up to the CRC's end: whether it is a stuff bit.
+    /// One entry per bit up to the end of the CRC: whether it is a stuff bit.
     stuff: Vec<bool>,
     arbitration_end: usize,
 }
@@ -65,7 +65,7 @@ impl FrameBits {
         &self.bits
     }
 
-    /// Stuff bits in it.
+    /// How many of them are stuff bits.
     pub fn stuff_bits(&self) -> usize {
         self.stuff.iter().filter(|stuff| **stuff).count()
     }
@@ -90,8 +90,8 @@ impl FrameBits {
         self.crc_delimiter() + 2
     }
 
-    /// Bits a receiver needs to have seen without error to take the frame: all but the last of the end
-    /// of frame (ISO 11898-1, "message validation"; RM0090 Rev 21 §32.7.3).
+    /// Bits that a receiver must have seen without error to accept the frame: all but the last of the
+    /// end of frame (ISO 11898-1, "message validation"; RM0090 Rev 21 §32.7.3).
     pub fn valid_after(&self) -> usize {
         self.bits.len() - 1
     }
@@ -107,8 +107,8 @@ pub fn bus_bits(frame: &Frame) -> u32 {
     (FrameBits::new(frame).len() + INTERMISSION) as u32
 }
 
-/// The unstuffed bits from the start of frame to the end of the data, and the length of the part that
-/// arbitrates.
+/// The unstuffed bits from the start of frame to the end of the data, and the length of the
+/// arbitration field.
 fn fields(frame: &Frame) -> (Vec<bool>, usize) {
     let mut bits = Vec::with_capacity(110);
     let mut put = |value: u32, count: u32| bits.extend((0..count).rev().map(|bit| value >> bit & 1 != 0));

@@ -1,8 +1,8 @@
 //! A CAN bus at bit granularity in time: the emulated controllers and simulated nodes on it, arbitration,
 //! acknowledgement, errors, and the true list of everything that crossed it.
 //!
-//! A frame's fate is worked out when it starts ([`outcome`]) and happens at the right bits. What it
-//! leaves out: overload frames, and two senders of different bit rates that start at the same instant
+//! A frame's fate is worked out when it starts ([`outcome`]) and happens at the right bits. Not
+//! modelled: overload frames, and two senders of different bit rates that start at the same instant
 //! (the second waits).
 
 pub mod bits;
@@ -26,11 +26,11 @@ pub use outcome::Disturbance;
 pub use waveform::Edge;
 use waveform::Waveform;
 
-/// Recessive bits after which a node may take part, and of which bus-off needs 128 sequences.
+/// Recessive bits after which a node may take part. Recovery from bus-off takes 128 such sequences.
 const SYNC_BITS: u64 = 11;
 /// Bits that a simulated node in bus-off waits.
 const RECOVERY_BITS: u64 = 128 * SYNC_BITS;
-/// Bits that an error-passive node leaves before it sends again.
+/// Bits that an error-passive node waits before it sends again.
 const SUSPEND_BITS: u64 = 8;
 
 /// Who sent a frame.
@@ -61,7 +61,7 @@ pub struct BusFrame {
     pub taken_by: u8,
 }
 
-/// Something due at a moment of the frame under way.
+/// Something due at a certain moment of the frame under way.
 #[derive(Clone, Copy, Debug)]
 enum Step {
     LoseArbitration(Member),
@@ -92,14 +92,14 @@ pub struct Wire {
     attached: Vec<usize>,
     nodes: Vec<Node>,
     now: u64,
-    /// From when on a frame may start.
+    /// The cycle from which a frame may start.
     free: u64,
-    /// Since when the bus is recessive, frames under way aside.
+    /// The cycle since which the bus has been recessive, apart from a frame under way.
     recessive: u64,
     flight: Option<Flight>,
     stuck: Option<Stuck>,
     disturbances: VecDeque<(u64, Disturbance)>,
-    /// Share of the frames that are destroyed, 0 to 1, and what decides which.
+    /// Share of the frames that are destroyed, 0 to 1, and the random numbers that decide which.
     noise: (f64, Rng),
     started: u64,
     history: Vec<BusFrame>,
@@ -162,33 +162,33 @@ impl Wire {
         std::mem::take(&mut self.history)
     }
 
-    /// Makes edges to recessive come this many core cycles later than they should, as on a bus with much capacitance.
+    /// Makes edges to recessive come this many core cycles late, as on a bus with high capacitance.
     pub fn slow_recessive(&mut self, cycles: u64) {
         self.waveform.slow_recessive = cycles;
     }
 
-    /// When the level changes next, as far as that is known.
+    /// When the level next changes, if that is known.
     pub fn next_edge(&self) -> Option<u64> {
         self.waveform.next().map(|edge| edge.at)
     }
 
-    /// The next edge whose time has come; each is handed out once.
+    /// The next edge whose time has come; each is returned once.
     pub fn pass_edge(&mut self, now: u64) -> Option<Edge> {
         self.waveform.pass(now)
     }
 
-    /// Destroys a share of all frames from now on, 0 to 1, each at a bit that `seed` decides.
+    /// Destroys a share of all frames from now on, 0 to 1, each at a bit determined by `seed`.
     pub fn make_noise(&mut self, share: f64, seed: u64) {
         self.noise = (share, Rng::with_seed(seed));
     }
 
-    /// Disturbs the frame that starts after `frames` more.
+    /// Disturbs one frame, after `frames` more have passed.
     pub fn disturb(&mut self, frames: u64, disturbance: Disturbance) {
         self.disturbances.push_back((self.started + frames, disturbance));
         self.disturbances.make_contiguous().sort_by_key(|(frame, _)| *frame);
     }
 
-    /// Holds the bus dominant, or lets go of it. A frame under way is destroyed.
+    /// Holds the bus dominant, or releases it. A frame under way is destroyed.
     pub fn hold_dominant(&mut self, hold: bool, can: &mut CanPair) {
         let bit = self.listener_bit(can);
         if hold && self.stuck.is_none() {
@@ -196,7 +196,8 @@ impl Wire {
             self.waveform.hold(self.now, true);
             // Six dominant bits are a stuff error.
             self.stuck = Some(Stuck { next_error: self.now + bit.cycles(6) });
-            // An error frame ends with eight recessive bits: until then a controller is busy, and leaves the bus for no request.
+            // An error frame ends with eight recessive bits: until then a controller is busy and does not leave the bus on
+            // request.
             for n in &self.attached {
                 can.controllers[*n].bus_stuck();
             }
@@ -223,7 +224,7 @@ impl Wire {
         waking.chain(sending).min()
     }
 
-    /// Lets everything happen that is due at or before `now`.
+    /// Processes everything that is due at or before `now`.
     pub fn advance(&mut self, now: u64, can: &mut CanPair) {
         while let Some(due) = self.next_event(can).filter(|due| *due <= now) {
             self.now = self.now.max(due);
@@ -243,7 +244,7 @@ impl Wire {
         controllers.chain((0..self.nodes.len()).map(Member::Node))
     }
 
-    /// When a controller that waits for eleven recessive bits, or for its bus-off to end, has them.
+    /// When a controller that waits for eleven recessive bits, or for the end of bus-off, has seen them.
     fn waking(&self, n: usize, can: &CanPair) -> Option<u64> {
         let controller = &can.controllers[n];
         let bit = controller.timing().bit();
@@ -256,7 +257,7 @@ impl Wire {
         }
     }
 
-    /// Lets controllers take part whose time has come; whether there was one.
+    /// Lets the controllers whose time has come take part; returns whether there was one.
     fn wake(&mut self, can: &mut CanPair) -> bool {
         let mut woke = false;
         for n in self.attached.clone() {
@@ -299,7 +300,7 @@ impl Wire {
         }
     }
 
-    /// The bit time of the bus as seen by whoever listens, for when nobody sends. Any, where there is nobody.
+    /// The bit time of the bus as a listener sees it, for when nobody sends. Any value if there is no listener.
     fn listener_bit(&self, can: &CanPair) -> BitTime {
         let controller = self.attached.iter().find(|n| can.controllers[**n].listens());
         match controller {

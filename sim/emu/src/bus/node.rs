@@ -1,4 +1,4 @@
-//! A simulated node on the bus: a sender with a clock of its own, a receiver that acknowledges, or both.
+//! A simulated node on the bus: a sender with its own clock, a receiver that acknowledges, or both.
 
 use std::collections::VecDeque;
 
@@ -22,7 +22,7 @@ pub struct BitTime {
 }
 
 impl BitTime {
-    /// Bits at a rate in bit/s.
+    /// The bit time of a rate in bit/s.
     pub fn of_rate(bitrate_bps: u32, clock: Clock) -> Self {
         Self { cycles: clock.hz(), divisor: bitrate_bps.into() }
     }
@@ -33,7 +33,7 @@ impl BitTime {
         Self { cycles: clock.hz() * 1_000_000, divisor }
     }
 
-    /// Bits of a whole number of core cycles.
+    /// A bit time of a whole number of core cycles.
     pub fn of_cycles(cycles: u64) -> Self {
         Self { cycles, divisor: 1 }
     }
@@ -43,7 +43,7 @@ impl BitTime {
         (u128::from(bits) * u128::from(self.cycles) / u128::from(self.divisor)) as u64
     }
 
-    /// Whether two nodes with these bit times can understand each other beyond doubt: within 0.5 %.
+    /// Whether two nodes with these bit times can reliably understand each other: within 0.5 %.
     pub fn agrees_with(&self, other: &Self) -> bool {
         let (a, b) = (self.cycles(1_000_000), other.cycles(1_000_000));
         a.abs_diff(b) * 200 <= a.min(b)
@@ -82,18 +82,18 @@ impl Node {
         Self { acknowledges: false, ..self }
     }
 
-    /// Whether it acknowledges, from now on.
+    /// Sets whether it acknowledges from now on.
     pub fn acknowledge(&mut self, acknowledge: bool) {
         self.acknowledges = acknowledge;
     }
 
-    /// With frames from `source` whenever its queue is empty.
+    /// The same, with frames from `source` whenever its queue is empty.
     #[must_use]
     pub fn with_source(self, source: impl Source + 'static) -> Self {
         Self { source: Some(Box::new(source)), ..self }
     }
 
-    /// Goes on with another bit time and other frames.
+    /// Continues with another bit time and other frames.
     pub fn restart(&mut self, bit: BitTime, source: Option<Box<dyn Source>>) {
         self.bit = bit;
         self.queue.clear();
@@ -122,7 +122,7 @@ impl Node {
         self.counters
     }
 
-    /// The frame it wants to send and when at the earliest.
+    /// The frame it wants to send, and the earliest time for it.
     pub(super) fn wanted(&self) -> Option<(u64, Frame)> {
         self.queue.front().map(|(at, frame)| ((*at).max(self.not_before), *frame))
     }

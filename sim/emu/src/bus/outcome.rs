@@ -49,7 +49,7 @@ pub struct Detection {
     pub who: usize,
     /// At the end of which bit.
     pub bit: usize,
-    /// What it takes it for.
+    /// What it takes the error for.
     pub kind: BusErrorKind,
     /// Whether other nodes' dominant bits followed its own error flag.
     pub first: bool,
@@ -90,7 +90,8 @@ impl FrameEnd {
             let flagged = seen.iter().zip(participants).filter(|(_, participant)| participant.flags);
             flagged.filter_map(|(seen, _)| Some((*seen)?.0 + 1)).min()
         };
-        // A receiver that sees no error before the ACK slot acknowledges, unless a flag already runs.
+        // A receiver that sees no error before the ACK slot acknowledges, unless an error flag has
+        // already begun.
         let early_flag = first_flag(&seen).is_some_and(|flag| flag <= bits.ack_slot());
         let crc_seen = |seen: &Option<(usize, BusErrorKind)>| matches!(seen, Some((_, BusErrorKind::Crc)));
         let acknowledged_by: Vec<usize> = (0..participants.len())
@@ -117,7 +118,8 @@ impl FrameEnd {
         if let Some(aborted) = aborted
             && aborted <= bits.crc_delimiter()
         {
-            // The sender falls silent: without a dominant flag, six recessive bits break the stuffing.
+            // The sender falls silent: even without a dominant flag, six recessive bits violate the
+            // stuffing rule.
             for (own, _) in seen.iter_mut().zip(participants).filter(|(_, participant)| !participant.sender) {
                 *own = earliest(*own, Some((aborted + FLAG - 1, BusErrorKind::Stuff)));
             }
@@ -150,18 +152,18 @@ impl FrameEnd {
         Self { detections, acknowledged_by, recessive_from, free_after }
     }
 
-    /// What participant `who` saw, if it saw an error.
+    /// The error that participant `who` saw, if any.
     pub fn of_participant(&self, who: usize) -> Option<&Detection> {
         self.detections.iter().find(|detection| detection.who == who)
     }
 }
 
-/// What a node that saw nothing wrong yet makes of a dominant flag that begins at bit `flag`.
+/// How a node that has not seen an error yet interprets a dominant flag that begins at bit `flag`.
 fn answer(bits: &FrameBits, flag: usize, sender: bool) -> Option<(usize, BusErrorKind)> {
     let last = bits.len() - 1;
     if flag >= bits.crc_delimiter() {
         let bit = if flag == bits.ack_slot() { flag + 1 } else { flag };
-        // For a receiver a dominant last bit is an overload request, not an error.
+        // To a receiver, a dominant last bit is an overload request, not an error.
         let harmless = bit > last || bit == last && !sender;
         return (!harmless).then_some((bit, BusErrorKind::Form));
     }
@@ -209,7 +211,7 @@ mod tests {
         assert_eq!(outcome.free_after, bits().len() + 3);
     }
 
-    /// A listen-only node beside a lone sender: the sender flags the missing acknowledgement, which the
+    /// A listen-only node and a lone sender: the sender flags the missing acknowledgement, which the
     /// listener sees as a form error.
     #[test]
     fn nobody_acknowledges_for_a_listener() {

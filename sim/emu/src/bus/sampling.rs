@@ -1,28 +1,28 @@
 //! A receiver whose bit rate is not the sender's: it samples the real waveform at its own pace,
-//! resynchronises on edges as ISO 11898-1 has it, and finds out by itself that nothing fits. It now and
-//! then receives a frame from a near neighbour's bit rate, as real controllers do.
+//! resynchronises on edges as ISO 11898-1 requires, and so finds that nothing fits. Now and then it
+//! does receive a frame at a nearly equal bit rate, as real controllers do.
 
 use cantap_can::BusErrorKind;
 
 use super::bits::{END_OF_FRAME, crc15};
 use crate::can::BitTiming;
 
-/// What such a receiver makes of a frame.
+/// How such a receiver sees a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Heard {
     /// It received it.
     Frame,
     /// It saw an error, this many core cycles after the start of frame.
     Error {
-        /// When it knew.
+        /// When it noticed.
         after: u64,
-        /// What it takes it for.
+        /// What it takes the error for.
         kind: BusErrorKind,
     },
 }
 
 /// Listens with `timing` to bits of `bit_cycles(n)` core cycles from the start of frame to bit `n`'s
-/// start. After the last the bus is recessive.
+/// start. After the last bit the bus is recessive.
 pub fn listen(levels: &[bool], bit_start: impl Fn(usize) -> u64, timing: &BitTiming) -> Heard {
     let mut bus = Waveform { levels, bit_start, at: 0 };
     let mut parser = Parser::default();
@@ -50,7 +50,7 @@ pub fn listen(levels: &[bool], bit_start: impl Fn(usize) -> u64, timing: &BitTim
     }
 }
 
-/// The bus over time, read forwards.
+/// The bus level over time, read forwards.
 struct Waveform<'a, F> {
     levels: &'a [bool],
     bit_start: F,

@@ -1,5 +1,5 @@
-//! The start of a frame: who sends, who wins, who takes part, and from that everything that is going to
-//! happen until the bus is free again.
+//! The start of a frame: who sends, who wins, who takes part; from that follows everything that happens
+//! until the bus is free again.
 
 use cantap_can::BusErrorKind;
 use cantap_can::Frame;
@@ -18,9 +18,9 @@ struct Contest {
     bit: BitTime,
     /// Members that send the very same frame.
     twins: Vec<Member>,
-    /// Members that lose arbitration, each at which bit.
+    /// Members that lose arbitration, with the bit at which each does.
     losers: Vec<(Member, usize)>,
-    /// Members with the same identifier and other contents, and the first bit that differs.
+    /// Members with the same identifier but different contents, and the first bit that differs.
     collided: Vec<(Member, usize)>,
 }
 
@@ -49,7 +49,7 @@ impl Wire {
             can.controllers[n].start_of_frame(contest.sends(own), start);
         }
 
-        // Everybody who listens takes part: the sender, its twins, those who collide with it, receivers.
+        // Every member that listens takes part: the sender, its twins, those who collide with it, receivers.
         let mut members = vec![sender];
         members.extend(twins);
         let senders = members.len();
@@ -152,8 +152,8 @@ impl Wire {
         Some(contest)
     }
 
-    /// Simulated nodes of another bit rate than the frame's are left out of it: only the emulated controllers are
-    /// shown what a wrong bit rate looks like.
+    /// Simulated nodes of another bit rate than the frame's are left out of it: only the emulated controllers get
+    /// to see what a wrong bit rate looks like.
     fn understands(&self, member: Member, bit: BitTime) -> bool {
         match member {
             Member::Controller(_) => true,
@@ -176,7 +176,7 @@ impl Wire {
         }
     }
 
-    /// The error that a receiver of another bit rate sees, and at which bit of the sender's.
+    /// The error that a receiver of another bit rate sees, and the sender's bit at which it sees it.
     fn misheard(
         &self,
         member: Member,
@@ -232,7 +232,7 @@ fn first_difference(one: &FrameBits, other: &FrameBits) -> Option<usize> {
     (0..length).find(|bit| one.levels().get(*bit) != other.levels().get(*bit))
 }
 
-/// Whether the first bit in which they differ is dominant in `one`.
+/// Whether `one` is dominant in the first bit that differs.
 fn beats(one: &FrameBits, other: &FrameBits) -> bool {
     first_difference(one, other).is_some_and(|bit| one.levels().get(bit) == Some(&false))
 }

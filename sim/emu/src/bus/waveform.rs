@@ -1,4 +1,4 @@
-//! The level of a bus over time: what a receive pin shows, and what no controller's registers tell.
+//! The level of a bus over time: what a receive pin shows and no controller register reveals.
 
 use std::collections::VecDeque;
 
@@ -11,7 +11,7 @@ use super::outcome::{FLAG, FrameEnd, Participant};
 pub struct Edge {
     /// Core cycle.
     pub at: u64,
-    /// The level behind it.
+    /// The level after it.
     pub dominant: bool,
 }
 
@@ -20,8 +20,7 @@ pub struct Edge {
 pub struct Waveform {
     edges: VecDeque<Edge>,
     dominant: bool,
-    /// Core cycles by which an edge to recessive comes later than it should: the bus is driven to dominant, and left to itself for the
-    /// other.
+    /// Core cycles by which edges to recessive are late: a bus is actively driven dominant, but only drifts back to recessive.
     pub(super) slow_recessive: u64,
 }
 
@@ -38,7 +37,7 @@ impl Waveform {
         Some(edge)
     }
 
-    /// The level from now on, in place of all that was to come.
+    /// Fixes the level from now on, in place of all pending edges.
     pub(super) fn hold(&mut self, now: u64, dominant: bool) {
         while self.edges.back().is_some_and(|edge| edge.at > now) {
             self.edges.pop_back();
@@ -46,7 +45,7 @@ impl Waveform {
         self.push(now, dominant);
     }
 
-    /// What a frame that starts at `start` and ends like this puts on the bus.
+    /// Adds the edges that a frame puts on the bus if it starts at `start` and ends like this.
     pub(super) fn frame(
         &mut self,
         start: u64,

@@ -33,7 +33,7 @@ mod msr {
 
 mod ier {
     pub const TMEIE: u32 = 1;
-    /// FMPIE0, FFIE0, FOVIE0; those of FIFO 1 are three bits up.
+    /// FMPIE0, FFIE0, FOVIE0; those of FIFO 1 are three bits higher.
     pub const FIFO0: u32 = 1;
     pub const EWGIE: u32 = 1 << 8;
     pub const EPVIE: u32 = 1 << 9;
@@ -56,25 +56,25 @@ mod btr {
 /// Sequences of eleven recessive bits that a controller waits for in bus-off.
 const RECOVERY_SEQUENCES: u32 = 128;
 
-/// Clocks of the controller from a master reset (MCR.RESET) to its acknowledgement by SLAK: 20 µs at 36 MHz. The manual says nothing; Linux's driver
-/// (`drivers/net/can/bxcan.c`) polls every 10 ms. Long enough for a firmware that does not wait to be found out.
+/// Clocks of the controller from a master reset (MCR.RESET) to its acknowledgement by SLAK: 20 µs at 36 MHz. The manual gives no time; Linux's
+/// driver (`drivers/net/can/bxcan.c`) polls every 10 ms. This is long enough to expose a firmware that does not wait.
 const RESET_CLOCKS: u64 = 720;
 
-/// What a master reset takes with it. RM0090 Rev 21 §32.9.2 (CAN_MCR, RESET) only says that the receive FIFOs are empty and MCR
-/// has its reset value after it; Linux's driver sets everything up again. A firmware must live with both.
+/// What a master reset clears. RM0090 Rev 21 §32.9.2 (CAN_MCR, RESET) only says that afterwards the receive FIFOs are empty and
+/// MCR has its reset value; Linux's driver sets everything up again. A firmware must live with both.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum MasterReset {
-    /// What the manual says: frames in the transmit mailboxes are sent when the controller is on a bus again.
+    /// Only what the manual says: frames in the transmit mailboxes are sent once the controller is back on a bus.
     Least,
     /// All registers; CAN1's reset also clears the filter banks, which are CAN2's too.
     #[default]
     Most,
 }
 
-/// Where the controller stands in its handshakes.
+/// The controller's mode, as far as its handshakes have got.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Mode {
-    /// A master reset is under way. What is written to MCR is lost.
+    /// A master reset is under way. Writes to MCR are lost.
     Resetting {
         /// It ends, in sleep mode, at this cycle.
         until: u64,
@@ -83,15 +83,15 @@ pub enum Mode {
     Sleep,
     /// Set-up; nothing is sent or received.
     Initialisation,
-    /// Asked to take part, waiting for eleven recessive bits since this cycle.
+    /// Asked to take part; waiting since this cycle for eleven recessive bits.
     Synchronising {
         /// When it was asked.
         since: u64,
     },
     /// Takes part.
     Normal,
-    /// Off the bus, waiting for this many sequences of eleven recessive bits; for none if software
-    /// has to start the recovery.
+    /// Off the bus, waiting for this many sequences of eleven recessive bits; `None` if software
+    /// must start the recovery.
     BusOff {
         /// Sequences still to come.
         left: Option<u32>,
@@ -124,7 +124,7 @@ impl BitTiming {
 #[derive(Clone, Debug)]
 pub struct Controller {
     mode: Mode,
-    /// Initialisation was asked for while a frame is under way.
+    /// Initialisation was requested while a frame is under way.
     init_pending: bool,
     mcr: u32,
     msr_flags: u32,
@@ -142,7 +142,7 @@ pub struct Controller {
     loopback_from: u64,
     cycles_per_clock: u64,
     dominant_bits: u64,
-    /// What a master reset takes with it.
+    /// What a master reset clears.
     pub(super) master_reset: MasterReset,
 }
 
@@ -194,7 +194,7 @@ impl Controller {
         })
     }
 
-    /// Writes a register; `None` where there is none, or where the hardware would not take it.
+    /// Writes a register; `None` where there is none, or if the hardware would not accept it.
     pub(super) fn write(&mut self, offset: u32, value: u32, now: u64) -> Option<()> {
         match offset {
             0x00 => self.write_mcr(value, now),
@@ -254,7 +254,7 @@ impl Controller {
             Mode::Synchronising { since: now }
         };
         if self.loops_back() {
-            // Nothing comes in from the pin: the bus is always recessive for it.
+            // Nothing comes in from the pin, so it always sees a recessive bus.
             self.mode = Mode::Normal;
             self.loopback_from = now + 11 * self.timing().bit();
         }
@@ -263,7 +263,7 @@ impl Controller {
     fn msr(&self) -> u32 {
         let mode = match self.mode {
             Mode::Sleep => msr::SLAK,
-            // The acknowledgement stands until the controller has synchronised.
+            // The acknowledgement stays until the controller has synchronised.
             Mode::Initialisation | Mode::Synchronising { .. } if self.mcr & mcr::SLEEP == 0 => msr::INAK,
             _ => 0,
         };
@@ -317,7 +317,7 @@ impl Controller {
         after
     }
 
-    /// A controller as after a reset, with what does not belong to its registers kept.
+    /// A controller in its reset state; everything that is not a register is kept.
     pub(super) fn after_reset(&self) -> Self {
         Self {
             cycles_per_clock: self.cycles_per_clock,
@@ -328,7 +328,7 @@ impl Controller {
     }
 }
 
-/// Which mailbox and which of its four registers an offset names.
+/// The mailbox, and which of its four registers, that an offset names.
 fn place(offset: u32) -> (usize, usize) {
     ((offset / 0x10) as usize, (offset / 4 % 4) as usize)
 }

@@ -3,13 +3,13 @@
 
 use cantap_can::BusErrorKind;
 
-/// A counter at which the warning flag stands.
+/// Counter value from which the warning flag is set.
 const WARNING: u16 = 96;
-/// A counter above which the node is error-passive.
+/// Counter value above which a node is error-passive.
 const PASSIVE: u16 = 127;
-/// A transmit counter above which the node is off the bus.
+/// Transmit counter value above which a node is bus-off.
 const BUS_OFF: u16 = 255;
-/// What a receive counter above [`PASSIVE`] becomes with a good frame.
+/// What a receive counter above [`PASSIVE`] becomes after a good frame.
 const AFTER_GOOD_FRAME: u16 = 120;
 
 /// A node's two error counters.
@@ -46,8 +46,8 @@ impl ErrorCounters {
     }
 
     /// A transmission failed. `flag_seen`: another node's dominant bits were seen during the error flag.
-    /// An error-passive sender that only misses an acknowledgement counts no further, so that a
-    /// lone node never goes bus-off.
+    /// An error-passive sender that only misses an acknowledgement does not count further, so a lone
+    /// node never goes bus-off.
     pub fn transmit_error(&mut self, kind: BusErrorKind, flag_seen: bool) {
         if kind == BusErrorKind::Acknowledgment && self.passive() && !flag_seen {
             return;
@@ -55,8 +55,8 @@ impl ErrorCounters {
         self.transmit = (self.transmit + 8).min(BUS_OFF + 1);
     }
 
-    /// A receiver saw an error. `first`: it saw it before others, so that the first bit after its
-    /// error flag was dominant, which costs eight more. An error-passive receiver stops counting.
+    /// A receiver saw an error. `first`: it saw it before others, so that the first bit after its error
+    /// flag was dominant, which adds eight. An error-passive receiver stops counting.
     pub fn receive_error(&mut self, first: bool) {
         for step in [1, if first { 8 } else { 0 }] {
             if self.receive <= PASSIVE {

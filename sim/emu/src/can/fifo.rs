@@ -30,7 +30,7 @@ pub struct Fifo {
 }
 
 impl Fifo {
-    /// A frame passed the filters. With `locked` (RFLM) a full FIFO drops it, without it replaces the
+    /// A frame passed the filters. If `locked` (RFLM), a full FIFO drops it; otherwise it replaces the
     /// newest. Returns whether a frame was lost.
     pub fn put(&mut self, frame: Frame, filter: u8, locked: bool) -> bool {
         let entry = Entry { frame, filter };
@@ -78,7 +78,7 @@ impl Fifo {
     }
 
     /// RIxR, RDTxR, RDLxR or RDHxR (0 to 3) of the oldest frame; zero if there is none. There is no time
-    /// stamp: the time-triggered mode is not to be used on these chips.
+    /// stamp: the time-triggered mode must not be used on these chips.
     pub fn mailbox(&self, register: u32) -> u32 {
         let Some(Entry { frame, filter }) = self.entries.front() else { return 0 };
         let data = frame.padded_data();

@@ -55,7 +55,7 @@ impl Filters {
         })
     }
 
-    /// Writes a register; `None` where there is none, or where the hardware would not take it.
+    /// Writes a register; `None` where there is none, or if the hardware would not accept it.
     pub fn write(&mut self, offset: u32, value: u32) -> Option<()> {
         let init = self.fmr & FINIT != 0;
         match offset {

@@ -55,7 +55,7 @@ impl Mailbox {
         Frame::from_bus(id, remote, length as u8, data)
     }
 
-    /// Lower is sent first: the bits as they arbitrate on the bus.
+    /// The lowest is sent first: these are the bits in arbitration order.
     fn rank(&self) -> u64 {
         let id = self.registers[0];
         let (base, low) = (u64::from(id >> 21), u64::from(id >> 3 & 0x3_FFFF));
@@ -71,7 +71,7 @@ impl Mailbox {
     }
 }
 
-/// All three, and the order in which they send.
+/// All three mailboxes and the order in which they are sent.
 #[derive(Clone, Debug, Default)]
 pub struct Mailboxes {
     boxes: [Mailbox; MAILBOXES],
@@ -97,8 +97,8 @@ impl Mailboxes {
         tsr | (code as u32) << 24
     }
 
-    /// A write to TSR: clears flags, asks for aborts. Only an empty or pending mailbox can be aborted at
-    /// once; one on the bus is when its attempt fails.
+    /// A write to TSR: clears flags, requests aborts. Only an empty or pending mailbox can be aborted at
+    /// once; one on the bus is aborted when its attempt fails.
     pub fn control(&mut self, value: u32) {
         for (n, mailbox) in self.boxes.iter_mut().enumerate() {
             let bits = value >> (8 * n);
@@ -123,7 +123,8 @@ impl Mailboxes {
         mailbox.registers[register] | if requested { TXRQ } else { 0 }
     }
 
-    /// Writes one of them; `None` if the mailbox is not empty, when the hardware would not take it.
+    /// Writes one of them; `None` if the mailbox is not empty, since the hardware then would not accept
+    /// it.
     pub fn write(&mut self, n: usize, register: usize, value: u32) -> Option<()> {
         let mailbox = &mut self.boxes[n];
         if mailbox.phase != Phase::Empty {
@@ -157,8 +158,8 @@ impl Mailboxes {
         }
     }
 
-    /// The attempt of mailbox `n` ended. Without success it waits for the next, unless `once` (NART) or an
-    /// abort is waiting.
+    /// The attempt of mailbox `n` ended. If it failed, the frame waits for the next attempt, unless `once`
+    /// (NART) is set or an abort was requested.
     pub fn finish(&mut self, n: usize, attempt: Attempt, once: bool) {
         let mailbox = &mut self.boxes[n];
         let Phase::Sending(request) = mailbox.phase else { return };
@@ -175,7 +176,7 @@ impl Mailboxes {
         }
     }
 
-    /// The controller was reset in the middle of an attempt: the frame waits for the next.
+    /// The controller was reset in the middle of an attempt: the frame waits for the next attempt.
     pub fn cut_off(&mut self) {
         for mailbox in &mut self.boxes {
             mailbox.abort = false;
@@ -185,7 +186,7 @@ impl Mailboxes {
         }
     }
 
-    /// Whether a request was completed and its flag not cleared.
+    /// Whether a request has completed and its flag has not been cleared.
     pub fn irq(&self) -> bool {
         self.boxes.iter().any(|mailbox| mailbox.status & RQCP != 0)
     }

@@ -2,8 +2,8 @@
 //! ([`crate::bus`]) sees of each as a node.
 //!
 //! Not modelled: the time-triggered mode (the errata of these chips say that its stamps are unusable; its
-//! registers read 0). In loop-back mode a controller sends to itself only: its dominant bits are
-//! counted, but no other node sees them.
+//! registers read 0). In loop-back mode a controller sends only to itself: its dominant bits are counted,
+//! but no other node sees them.
 
 mod controller;
 pub mod fault;
@@ -45,7 +45,7 @@ impl CanPair {
         }
     }
 
-    /// Writes a register; `None` where there is none, or where the hardware would not take it.
+    /// Writes a register; `None` where there is none, or if the hardware would not accept it.
     pub fn write(&mut self, offset: u32, value: u32, now: u64) -> Option<()> {
         self.advance(now);
         if offset == MCR && value & MCR_RESET != 0 && self.controllers[0].master_reset == MasterReset::Most {
@@ -58,7 +58,7 @@ impl CanPair {
         }
     }
 
-    /// Decides what a master reset takes with it.
+    /// Sets what a master reset clears.
     pub fn set_master_reset(&mut self, scope: MasterReset) {
         for controller in &mut self.controllers {
             controller.master_reset = scope;
@@ -76,7 +76,7 @@ impl CanPair {
         self.controllers[n].irqs()
     }
 
-    /// When [`Self::advance`] must be called next: only loop-back needs it.
+    /// When [`Self::advance`] must be called next: needed only for loop-back.
     pub fn next_event(&self) -> Option<u64> {
         self.controllers.iter().filter_map(Controller::loopback_event).min()
     }

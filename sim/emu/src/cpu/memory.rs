@@ -7,7 +7,7 @@ use rsemu::core::space::RamStore;
 use crate::memory_map as map;
 use crate::rom;
 
-/// A memory of the chip, shared with whoever must change it behind the core's back.
+/// A memory of the chip, shared with code that must change it behind the core's back.
 #[derive(Clone, Debug)]
 pub struct Memory {
     pub(super) base: u32,

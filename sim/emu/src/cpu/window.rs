@@ -1,4 +1,4 @@
-//! What the core's address space is made of: memories that answer at once, memories that are waited for, and
+//! What the core's address space is made of: memories that answer at once, memories with wait states, and
 //! windows to the bus.
 
 use std::fmt;
@@ -27,7 +27,7 @@ pub(super) struct Shared {
 }
 
 impl Shared {
-    /// The delays, if there are any. One thread only: the lock is never waited for.
+    /// The delays, if there are any. There is only one thread, so the lock never blocks.
     pub fn delays(&self) -> Option<MutexGuard<'_, Delays>> {
         let delays = self.delays.as_ref()?;
         Some(delays.lock().unwrap_or_else(PoisonError::into_inner))
@@ -41,7 +41,7 @@ impl Shared {
         }
     }
 
-    /// A bus fault would come when the instruction is long done; no model reports one.
+    /// A bus fault would come long after the instruction; no model reports one.
     fn write(&self, address: u32, size: u8, value: u32, at: u64) -> Option<()> {
         self.touched.store(true, Ordering::Relaxed);
         let done = self.bus.write(address, size, value, at);
@@ -67,7 +67,7 @@ impl fmt::Debug for Window {
 }
 
 impl Window {
-    /// What is behind this window is part of flash, read through the D-bus.
+    /// Whether this window leads to a part of flash, read through the D-bus.
     fn is_flash(&self) -> bool {
         self.base < map::SRAM.start
     }
@@ -81,7 +81,7 @@ impl MemOps for Window {
         let address = self.base + offset as u32;
         let shared = &self.shared;
         shared.complete_write();
-        // The access is to be followed by a look at the interrupt lines.
+        // After the access the interrupt lines must be checked.
         shared.touched.store(true, Ordering::Relaxed);
         let now = match shared.delays() {
             None => shared.clock.load(Ordering::Relaxed),
@@ -118,7 +118,7 @@ impl MemOps for Window {
     }
 }
 
-/// Which memory it is, as far as waiting for it goes.
+/// Which memory it is, as far as timing is concerned.
 #[derive(Clone, Copy, Debug)]
 enum Behind {
     /// Instructions come through the I-bus, data through the D-bus.

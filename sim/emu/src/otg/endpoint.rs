@@ -1,8 +1,8 @@
-//! One endpoint's registers, with the side effects that writing them has.
+//! One endpoint's registers, with the side effects of writing them.
 
 use super::registers::{epctl, epint, eptsiz};
 
-/// An IN or OUT endpoint. Which of the two it is decides only the OTG core.
+/// An IN or OUT endpoint; only the OTG core knows which.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Endpoint {
     /// DIEPCTLx or DOEPCTLx.
@@ -14,12 +14,12 @@ pub struct Endpoint {
 }
 
 impl Endpoint {
-    /// Endpoint 0 out of reset: always active, answers NAK.
+    /// Endpoint 0 after a reset: always active, answers NAK.
     pub const fn control_pipe() -> Self {
         Self { control: epctl::USBAEP, interrupt: 0, size: 0 }
     }
 
-    /// Bytes of the largest packet. Endpoint 0 has a code in place of the number.
+    /// Bytes of the largest packet. Endpoint 0 uses a code instead of the number.
     pub fn max_packet(&self, number: usize) -> usize {
         let field = self.control & epctl::MPSIZ;
         if number == 0 { 64 >> (field & 3) } else { field as usize }
@@ -65,27 +65,27 @@ impl Endpoint {
         (self.size & eptsiz::PKTCNT) >> eptsiz::PKTCNT_SHIFT
     }
 
-    /// Takes a packet of `bytes` bytes off the transfer.
+    /// Deducts a packet of `bytes` bytes from the transfer.
     pub fn count_packet(&mut self, bytes: usize) {
         let left = self.transfer_left().saturating_sub(bytes) as u32;
         let packets = self.packets_left().saturating_sub(1);
         self.size = self.size & !(eptsiz::XFRSIZ | eptsiz::PKTCNT) | left | packets << eptsiz::PKTCNT_SHIFT;
     }
 
-    /// Ends the transfer: disabled, answers NAK. The interrupt flag is the caller's business.
+    /// Ends the transfer: disabled, answers NAK. Setting the interrupt flag is left to the caller.
     pub fn finish(&mut self) {
         self.control = self.control & !epctl::EPENA | epctl::NAKSTS;
     }
 
     /// A write to the control register.
     ///
-    /// EPENA can only be set by software and EPDIS only be requested; writing zeros to them changes
-    /// nothing. That is what makes a transfer survive a driver that writes the register whole.
+    /// Software can only set EPENA and only request EPDIS; writing zeros to them changes nothing. So a
+    /// transfer survives a driver that writes the whole register.
     pub fn write_control(&mut self, number: usize, value: u32) {
         let mut stored = epctl::EPTYP | epctl::SNPM | epctl::STALL | epctl::TXFNUM | epctl::MPSIZ;
         if number == 0 {
-            // Endpoint 0 is always active and a control endpoint, and its STALL is cleared by the next
-            // SETUP only.
+            // Endpoint 0 is always active and a control endpoint, and only the next SETUP clears its
+            // STALL.
             stored &= !epctl::EPTYP;
             let stall = self.control & epctl::STALL;
             self.control = self.control & !stored | value & stored | stall;
@@ -110,16 +110,16 @@ impl Endpoint {
         if value & epctl::EPENA != 0 {
             self.control |= epctl::EPENA;
         }
-        // Only where a transfer is armed; on endpoint 0 OUT it cannot be disabled, which the core
-        // checks before it calls.
+        // Only if a transfer is armed. Endpoint 0 OUT cannot be disabled, which the core checks before
+        // the call.
         if value & epctl::EPDIS != 0 && self.enabled() {
             self.control &= !epctl::EPENA;
             self.interrupt |= epint::EPDISD;
         }
     }
 
-    /// What a USB reset does to the endpoint: it is not active any more (endpoint 0 stays). A transfer
-    /// that was armed stays armed, until software disables it.
+    /// What a USB reset does to the endpoint: it is no longer active (endpoint 0 stays active). An
+    /// armed transfer stays armed until software disables it.
     pub fn bus_reset(&mut self, number: usize) {
         if number != 0 {
             self.control &= !epctl::USBAEP;

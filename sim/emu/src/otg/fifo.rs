@@ -1,10 +1,10 @@
-//! The FIFOs of OTG_FS: words, not packets. What a driver leaves behind in one stays there, in the
-//! way of what follows, as in the chip.
+//! The FIFOs of OTG_FS: words, not packets. What a driver leaves behind in one stays there and gets
+//! in the way of what follows, as in the chip.
 
 use std::collections::VecDeque;
 
-/// One word of the receive FIFO. The chip tells status words from data by their place only; the
-/// model marks them, so that it can tell when a driver reads one as the other.
+/// One word of the receive FIFO. The chip distinguishes status words from data only by their
+/// position; the model marks them, so that it notices when a driver takes one for the other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum RxWord {
     Status(u32),
@@ -24,7 +24,7 @@ impl RxFifo {
         self.words.len()
     }
 
-    /// Whether a packet's status waits.
+    /// Whether a packet's status is waiting.
     pub fn has_status(&self) -> bool {
         self.statuses > 0
     }
@@ -41,7 +41,7 @@ impl RxFifo {
         }
     }
 
-    /// The status at the front, which stays.
+    /// The status at the front, without removing it.
     pub fn peek_status(&self) -> Option<u32> {
         match self.words.front() {
             Some(RxWord::Status(status)) => Some(*status),

@@ -1,9 +1,9 @@
 //! The chip's USB controller, OTG_FS, as a full-speed device: its registers, its FIFOs and its
-//! interrupt line on one side ([`Otg::read`], [`Otg::write`], [`Otg::irq`]), the cable on the
-//! other (`wire.rs`). Written after RM0090, "USB on-the-go full-speed", for what drivers do with it;
-//! it has no host mode, no isochronous endpoints and no DMA.
+//! interrupt line on one side ([`Otg::read`], [`Otg::write`], [`Otg::irq`]), the cable on the other
+//! (`wire.rs`). It follows RM0090, "USB on-the-go full-speed", as far as device drivers use it; it
+//! has no host mode, no isochronous endpoints and no DMA.
 //!
-//! It has no time of its own: whoever holds the other end of the cable calls.
+//! It has no time of its own: it acts when the other end of the cable calls.
 
 mod endpoint;
 mod fifo;
@@ -30,7 +30,7 @@ const CORE_ID: u32 = 0x1200;
 /// The controller.
 #[derive(Debug)]
 pub struct Otg {
-    /// Registers that only keep what is written, by offset.
+    /// Registers that only store what is written, by offset.
     plain: BTreeMap<u32, u32>,
     ahb: u32,
     interrupts: u32,
@@ -53,9 +53,9 @@ pub struct Otg {
     ins: [Endpoint; ENDPOINTS],
     outs: [Endpoint; ENDPOINTS],
     rx: RxFifo,
-    /// The status that was looked at last and not taken since.
+    /// The status that was last peeked at and has not been taken since.
     peeked: Option<u32>,
-    /// Ends of OUT transfers that wait in the receive FIFO, by endpoint.
+    /// Ends of OUT transfers waiting in the receive FIFO, by endpoint.
     completing: [u32; ENDPOINTS],
     txs: [TxFifo; ENDPOINTS],
     /// The interrupt line, recomputed after every change.
@@ -63,7 +63,7 @@ pub struct Otg {
     misuse: Misuse,
 }
 
-/// What a driver did that the chip does not forgive. A test can ask that none of it happened.
+/// What a driver did that the chip does not forgive. A test can assert that none of it happened.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Misuse {
     /// Words written to a full transmit FIFO.
@@ -74,8 +74,8 @@ pub struct Misuse {
     pub unknown_registers: u64,
     /// FIFOs that overlap, pass the end of the RAM or are too small when endpoints are in use.
     pub bad_fifo_layout: u64,
-    /// An OUT endpoint's NAK taken back while the end of its transfer waits in the receive FIFO and the driver has not seen it: cores of
-    /// this family lose four bytes of a packet then (libopencm3 #600, #672, #873).
+    /// An OUT endpoint's NAK cleared while the end of its transfer waits in the receive FIFO, unseen by the driver: cores of this family
+    /// then lose four bytes of a packet (libopencm3 #600, #672, #873).
     pub early_cnaks: u64,
     /// IN endpoints disabled before their NAK was effective, or FIFOs flushed under a transfer (RM0090, "IN endpoint disable",
     /// GRSTCTL).
@@ -84,14 +84,14 @@ pub struct Misuse {
     pub resized_transfers: u64,
 }
 
-/// The least words of the receive FIFO: 5 · 1 + 8 for SETUP packets, 1 for global OUT NAK, a packet of 64 bytes with its status, two for
-/// each of two OUT endpoints (RM0090, "Receive data FIFO").
+/// The minimum size of the receive FIFO in words: 5 · 1 + 8 for SETUP packets, 1 for global OUT NAK, a packet of 64 bytes with its
+/// status, two for each of two OUT endpoints (RM0090, "Receive data FIFO").
 const LEAST_RX_WORDS: u32 = 5 + 8 + 1 + 16 + 1 + 2 * 2;
-/// The least words of a transmit FIFO (RM0090, DIEPTXFx).
+/// The minimum size of a transmit FIFO in words (RM0090, DIEPTXFx).
 const LEAST_TX_WORDS: u32 = 16;
 
 impl Otg {
-    /// Out of reset.
+    /// The state after a reset.
     pub fn new() -> Self {
         let plain = BTreeMap::from([
             (global::GOTGCTL, 0x0000_0800),
@@ -145,7 +145,7 @@ impl Otg {
         self.misuse
     }
 
-    /// Reads a whole register; reads of the receive queue and the FIFOs take what they read.
+    /// Reads a whole register; reading the receive queue or a FIFO removes what was read.
     pub fn read(&mut self, offset: u32) -> u32 {
         match offset {
             global::GAHBCFG => self.ahb,
@@ -245,7 +245,7 @@ impl Otg {
         self.line = self.ahb & gahbcfg::GINT != 0 && self.gintsts() & self.interrupt_mask != 0;
     }
 
-    /// GINTSTS: what is latched, and what follows the FIFOs and endpoints.
+    /// GINTSTS: the latched flags, and those that follow the FIFOs and endpoints.
     fn gintsts(&self) -> u32 {
         let mut status = self.interrupts | gint::NPTXFE;
         if self.rx.has_status() {
@@ -434,7 +434,7 @@ impl Otg {
         }
     }
 
-    /// Counts what a driver must not write to an endpoint as it stands.
+    /// Counts writes that a driver must not make to an endpoint in its present state.
     fn judge(&mut self, input: bool, number: usize, register: u32, value: u32) {
         let endpoint = if input { &self.ins[number] } else { &self.outs[number] };
         match register {
@@ -480,8 +480,8 @@ impl Otg {
         }
     }
 
-    /// Whether the pull-up on D+ tells a host that a device is there: the transceiver is on, the
-    /// device is not soft-disconnected, and VBUS is either there or not looked at.
+    /// Whether the pull-up on D+ shows a host that a device is there: the transceiver is on, the
+    /// device is not soft-disconnected, and VBUS is either present or not sensed.
     pub fn pulled_up(&self, vbus: bool) -> bool {
         let sees_vbus = self.gccfg & gccfg::NOVBUSSENS != 0 || self.gccfg & gccfg::VBUSBSEN != 0 && vbus;
         self.gccfg & gccfg::PWRDWN != 0 && self.dctl & dctl::SDIS == 0 && sees_vbus

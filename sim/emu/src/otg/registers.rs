@@ -84,7 +84,7 @@ pub mod gint {
     pub const OEPINT: u32 = 1 << 19;
     pub const SRQINT: u32 = 1 << 30;
     pub const WKUPINT: u32 = 1 << 31;
-    /// Flags that are cleared by writing 1; the others follow what they report.
+    /// Flags that are cleared by writing 1; the others follow the condition they report.
     pub const WRITE_CLEARS: u32 = SOF
         | ESUSP
         | USBSUSP
@@ -121,7 +121,7 @@ pub mod dctl {
     pub const CGINAK: u32 = 1 << 8;
     pub const SGONAK: u32 = 1 << 9;
     pub const CGONAK: u32 = 1 << 10;
-    /// Bits that keep what is written.
+    /// Bits that store what is written.
     pub const STORED: u32 = 1 << 0 | SDIS | 7 << 4 | 1 << 11;
 }
 

@@ -1,5 +1,5 @@
-//! The controller driven with the register sequences of synopsys-usb-otg 0.4, a driver that is not the firmware's: what it does
-//! and the chip does not forgive must be seen here.
+//! The controller driven with the register sequences of synopsys-usb-otg 0.4, a driver other than the firmware's: whatever it
+//! does that the chip does not forgive must show here.
 
 use super::registers::{
     dcfg, dctl, device, epctl, epint, eptsiz, gahbcfg, gccfg, gint, global, grstctl, pktsts,
@@ -59,7 +59,7 @@ fn modify(otg: &mut Otg, register: u32, set: u32) {
     otg.write(register, value);
 }
 
-/// The driver's `poll` where it sees a reset: everything is taken out of use.
+/// The driver's `poll` when it sees a reset: everything is taken out of use.
 fn poll_reset(otg: &mut Otg) {
     assert_ne!(otg.read(global::GINTSTS) & gint::USBRST, 0);
     otg.write(global::GINTSTS, gint::USBRST);
@@ -75,7 +75,7 @@ fn poll_reset(otg: &mut Otg) {
     otg.write(global::GRSTCTL, grstctl::RXFFLSH);
 }
 
-/// The driver's `write`: whether it found room.
+/// The driver's `write`; returns whether there was room.
 fn write_packet(otg: &mut Otg, number: u32, bytes: &[u8]) -> bool {
     let control = at(IN, number, device::EPCTL);
     if number != 0 && otg.read(control) & epctl::EPENA != 0 {
@@ -177,13 +177,13 @@ fn out_packets_queue_with_their_completion_and_hold_off_the_next() {
     let mut otg = running();
     assert_eq!(otg.out(0, 1, false, b"hello"), OutReply::Ack);
     assert!(otg.irq());
-    // Not armed again before the completion was taken.
+    // It is not armed again until the completion has been taken.
     assert_eq!(otg.out(0, 1, true, b"world"), OutReply::Nak);
     assert_eq!(receive(&mut otg), (1, pktsts::OUT_DATA, b"hello".to_vec()));
     assert_eq!(otg.out(0, 1, true, b"world"), OutReply::Nak);
     assert_eq!(receive(&mut otg), (1, pktsts::OUT_COMPLETE, vec![]));
     assert!(!otg.irq());
-    // The host missed our handshake and repeats: acknowledged, not delivered.
+    // The host missed our handshake and repeats the packet: acknowledged, not delivered.
     assert_eq!(otg.out(0, 1, false, b"hello"), OutReply::Ack);
     assert!(!otg.irq());
     assert_eq!(otg.out(0, 1, true, b"world"), OutReply::Ack);
@@ -236,9 +236,9 @@ fn a_reset_takes_endpoints_out_of_use_and_leaves_transfers_armed() {
     assert_eq!(otg.read(at(IN, 2, device::EPCTL)) & epctl::EPENA, 0);
 }
 
-/// synopsys-usb-otg 0.4: what is written between reset and enumeration done arms a transfer whose bytes
-/// the driver's own configuration then flushes. EPENA cannot be cleared by writing 0, so the endpoint
-/// is dead until something disables it.
+/// synopsys-usb-otg 0.4: a write between reset and enumeration done arms a transfer whose bytes the
+/// driver's own configuration then flushes. EPENA cannot be cleared by writing 0, so the endpoint is
+/// dead until something disables it.
 #[test]
 fn a_write_between_reset_and_enumeration_done_kills_the_endpoint() {
     let mut otg = running();
@@ -249,7 +249,7 @@ fn a_write_between_reset_and_enumeration_done_kills_the_endpoint() {
     configure(&mut otg);
     assert!(!write_packet(&mut otg, 2, &[2; 64]));
     assert_eq!(otg.in_token(0, 2, true), InReply::Nak);
-    // What a firmware can do about it.
+    // What firmware can do about it.
     modify(&mut otg, at(IN, 2, device::EPCTL), epctl::EPDIS);
     assert!(write_packet(&mut otg, 2, &[2; 64]));
     assert_eq!(otg.in_token(0, 2, true), data(false, &[2; 64]));
@@ -294,7 +294,7 @@ fn a_transfer_of_several_packets_leaves_packet_by_packet_and_ends_once() {
     assert_eq!((bytes.len(), bytes[4], otg.irq()), (64, 1, false));
     let InReply::Data { data1: true, bytes } = otg.in_token(0, 2, true) else { panic!() };
     assert_eq!((bytes.len(), bytes[0], otg.irq()), (64, 16, false));
-    // A third of the way from its end, what is left can be read.
+    // A third before its end, what is left can be read.
     assert_eq!(otg.read(at(IN, 2, device::EPTSIZ)) >> eptsiz::PKTCNT_SHIFT, 1);
     assert_eq!(otg.in_token(0, 2, true), data(false, &[32, 32]));
     assert!(otg.irq());
@@ -353,7 +353,7 @@ fn a_toggle_that_is_not_expected_is_acknowledged_and_dropped_until_it_is_reset()
     assert_eq!(otg.out(0, 1, false, b"one"), OutReply::Ack);
     assert_eq!(receive(&mut otg).2, b"one");
     receive(&mut otg);
-    // The host begins anew, and the device does not: the packet is lost.
+    // The host starts over and the device does not: the packet is lost.
     assert_eq!(otg.out(0, 1, false, b"two"), OutReply::Ack);
     assert!(!otg.irq());
     modify(&mut otg, at(OUT, 1, device::EPCTL), epctl::SD0PID);

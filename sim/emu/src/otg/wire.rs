@@ -1,4 +1,4 @@
-//! The cable's end of OTG_FS: what a host's tokens, resets and silences do to it.
+//! The cable's end of OTG_FS: what a host's tokens, resets and silence do to it.
 
 use super::registers::{dcfg, dctl, epctl, epint, gint, pktsts};
 use super::{ENDPOINTS, Endpoint, Otg};
@@ -30,7 +30,7 @@ pub enum OutReply {
     Nak,
     /// The endpoint is halted, or the request is not supported.
     Stall,
-    /// Taken, or a repetition that was taken before.
+    /// Taken, or a repetition of one taken before.
     Ack,
 }
 
@@ -42,8 +42,8 @@ impl Otg {
     /// The host begins to drive a reset.
     ///
     /// The core raises USBRST and takes the endpoints out of use. It disables no transfer, flushes no FIFO
-    /// and keeps the device address: that is the driver's business (RM0090, "Endpoint initialization on
-    /// USB reset").
+    /// and keeps the device address: that is left to the driver (RM0090, "Endpoint initialization on USB
+    /// reset").
     pub fn bus_reset(&mut self) {
         self.suspended = false;
         self.in_control_transfer = false;
@@ -54,7 +54,7 @@ impl Otg {
         self.raise(gint::USBRST);
     }
 
-    /// The host ends the reset, and the speed is known.
+    /// The host ends the reset; the speed is now known.
     pub fn enumeration_done(&mut self) {
         self.raise(gint::ENUMDNE);
     }
@@ -65,7 +65,7 @@ impl Otg {
         self.raise(gint::EOPF | gint::SOF);
     }
 
-    /// The bus has been silent for 3 ms. Nothing if the device is suspended already.
+    /// The bus has been silent for 3 ms. Does nothing if the device is already suspended.
     pub fn bus_idle(&mut self) {
         if !self.suspended {
             self.suspended = true;
@@ -95,16 +95,16 @@ impl Otg {
         self.address == address
     }
 
-    /// DCFG was written. An address that comes in mid-transfer is that of SET_ADDRESS and counts from
-    /// the end of the transfer's status stage on, which drivers rely on.
+    /// DCFG was written. An address written during a transfer is that of SET_ADDRESS and takes effect at
+    /// the end of the transfer's status stage, which drivers rely on.
     pub(super) fn take_address(&mut self) {
         if !self.in_control_transfer {
             self.address = ((self.dcfg & dcfg::DAD) >> dcfg::DAD_SHIFT) as u8;
         }
     }
 
-    /// A SETUP packet. The device must take it whatever its endpoint 0 is doing, unless the receive
-    /// FIFO is full.
+    /// A SETUP packet. The device must accept it whatever its endpoint 0 is doing, unless the receive FIFO
+    /// is full.
     pub fn setup(&mut self, address: u8, packet: [u8; 8]) -> OutReply {
         if !self.addressed(address) || self.rx.len() + 4 > self.rx_size as usize {
             return OutReply::Silence;
@@ -143,11 +143,12 @@ impl Otg {
             return OutReply::Nak;
         }
         if data1 != out.toggle() {
-            // The host did not see our ACK and repeats: acknowledged and thrown away.
+            // The host did not see our ACK and repeats the packet: acknowledged and thrown away.
             return OutReply::Ack;
         }
         out.set_toggle(!data1);
-        // Drivers differ in whether they program a transfer size; without one, a packet is a transfer.
+        // Drivers differ in whether they program a transfer size; if they do not, each packet is a
+        // transfer.
         out.count_packet(bytes.len());
         let complete = out.packets_left() == 0 || bytes.len() < out.max_packet(number);
         if complete {
@@ -162,8 +163,8 @@ impl Otg {
         OutReply::Ack
     }
 
-    /// An IN token. With `acknowledged`, the host receives the packet and says so; without, the packet
-    /// or the host's ACK is lost on the cable and the device will send it again.
+    /// An IN token. If `acknowledged`, the host receives the packet and acknowledges it; otherwise the
+    /// packet or the host's ACK is lost on the cable, and the device will send it again.
     pub fn in_token(&mut self, address: u8, endpoint: u8, acknowledged: bool) -> InReply {
         let number = usize::from(endpoint);
         if !self.addressed(address) || number >= ENDPOINTS || !self.ins[number].active() {
@@ -196,7 +197,7 @@ impl Otg {
     }
 }
 
-/// A packet of the transfer is through.
+/// A packet of the transfer was sent.
 fn sent(input: &mut Endpoint, bytes: usize) {
     input.set_toggle(!input.toggle());
     input.count_packet(bytes);

@@ -17,13 +17,13 @@ const GPIO_BASE: u32 = 0x4002_0000;
 /// A peripheral's registers are in a block of this size, or a multiple.
 const BLOCK: u32 = 0x400;
 
-/// How many cycles of the slower bus a peripheral cannot be reached for after its clock was switched on: one for the store to
-/// arrive, and what ES0182 gives for APB, one and the bus's divider.
+/// For how many cycles of the slower bus a peripheral cannot be reached after its clock was switched on: one until the store
+/// arrives, plus what ES0182 gives for APB, one and the bus's divider.
 const CLOCK_ENABLE_CYCLES: u64 = 4;
 
 impl Board {
-    /// The enable bit of the peripheral at `address`, as register offset and bit; none if it needs no
-    /// clock or is not known.
+    /// The enable bit of the peripheral at `address`, as register offset and bit; `None` if it needs
+    /// no clock or is not known.
     fn clock_gate(address: u32) -> Option<(u32, u32)> {
         match address {
             0x4000_0000..0x4000_1800 => Some((0x40, (address - 0x4000_0000) / BLOCK)),
@@ -47,7 +47,7 @@ impl Board {
         self.rcc.enabled(register, bit) && !comes
     }
 
-    /// After a write to the clock controller: which clocks it switched on.
+    /// After a write to the clock controller: notes which clocks it switched on.
     fn await_clocks(&mut self, register: u32, before: u32, now: u64) {
         let bits = self.rcc.read(register).unwrap_or(0) & !before;
         if Rcc::is_enable_register(register) && bits != 0 {
@@ -157,7 +157,7 @@ impl Board {
         }
     }
 
-    /// Whether flash has the wait states that the core's clock wants, after an access that may have changed either.
+    /// Checks whether flash has the wait states that the core's clock needs, after an access that may have changed either.
     fn check_wait_states(&mut self, register: u32, write: bool) {
         if self.flash.access().wait_states < flash::least_wait_states(self.rcc.clocks().hclk_hz) {
             self.note(Oddity::TooFast, register, write);
@@ -186,7 +186,7 @@ impl Board {
             GPIO_BASE..=0x4002_2000 => self.ports[block(address, GPIO_BASE)].write(offset, value),
             0x4002_3000 => self.crc.write(offset, value),
             0x4002_3800 => {
-                // What runs from the old clocks runs until now.
+                // What runs from the old clocks has run until now.
                 self.advance(now);
                 let before = self.rcc.read(offset).unwrap_or(0);
                 self.rcc.write(offset, value, now)?;

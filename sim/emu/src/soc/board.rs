@@ -21,7 +21,7 @@ use crate::{Clock, Peripheral};
 pub(super) const PORTS: usize = 9;
 /// TIM2 to TIM7: bits of the counter and interrupt number (RM0090 Rev 21 Table 61).
 pub(super) const TIMERS: [(u32, u16); 6] = [(32, 28), (16, 29), (16, 30), (32, 50), (16, 54), (16, 55)];
-/// Where the buses arrive unless it is said otherwise: PB8 and PB12.
+/// The default receive pins of the buses: PB8 and PB12.
 pub const RECEIVE_PINS: [(usize, u32); 2] = [(1, 8), (1, 12)];
 /// Interrupt numbers of CAN1 and CAN2: transmit, FIFO 0, FIFO 1, status change and error.
 pub const CAN_IRQS: [[u16; 4]; 2] = [[19, 20, 21, 22], [63, 64, 65, 66]];
@@ -36,13 +36,13 @@ pub(super) struct Device {
 }
 
 impl Device {
-    /// A peer that panicked while it held the lock leaves a state that is as good as any other.
+    /// If another holder of the lock panicked, the state it left is as good as any other.
     pub(super) fn lock(&self) -> MutexGuard<'_, dyn Peripheral + Send + 'static> {
         self.model.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// Everything on the chip but core and memories, and what is wired to it.
+/// Everything on the chip except core and memories, and what is wired to it.
 pub struct Board {
     /// Reset and clock control.
     pub rcc: Rcc,
@@ -58,19 +58,19 @@ pub struct Board {
     pub(super) power: Storage,
     pub(super) syscfg: Storage,
     pub(super) exti: Exti,
-    /// Where each bus arrives: port (0 for A) and pin.
+    /// The receive pin of each bus: port (0 for A) and pin.
     pub(super) receive_pins: [(usize, u32); 2],
     pub(super) crc: Crc,
     pub(super) dbgmcu: Storage,
     pub(super) devices: Vec<Device>,
-    /// Interrupt of the attached device that was last reached, until it is asked for.
+    /// Interrupt of the attached device that was last accessed, until it is taken.
     pub(super) reached: Option<u16>,
     pub(super) odd: BTreeMap<(Oddity, u32, bool), u64>,
     pub(super) clock: Clock,
     pub(super) crystal: Crystal,
-    /// What the boot pins tell SYSCFG_MEMRMP after a reset of SYSCFG.
+    /// What the boot pins put into SYSCFG_MEMRMP on a reset of SYSCFG.
     pub(super) boot_mode: u32,
-    /// A peripheral whose clock was just switched on, and is not there yet.
+    /// A peripheral whose clock was just switched on and that does not respond yet.
     pub(super) awaited: Option<Awaited>,
 }
 
@@ -80,7 +80,7 @@ pub(super) struct Awaited {
     /// The enable register's offset, and the bits that were set.
     pub(super) register: u32,
     pub(super) bits: u32,
-    /// When the peripherals can be reached, if nobody waits for it properly before: by a barrier, or by reading back.
+    /// When the peripherals can be reached, unless the program waits properly before then: by a barrier, or by reading back.
     pub(super) until: u64,
 }
 
@@ -112,12 +112,12 @@ impl Board {
         }
     }
 
-    /// What cycles are.
+    /// How long a cycle is.
     pub fn clock(&self) -> Clock {
         self.clock
     }
 
-    /// Connects the buses to other pins than [`RECEIVE_PINS`]: port (0 for A) and pin of each controller's RX.
+    /// Connects the buses to pins other than [`RECEIVE_PINS`]: port (0 for A) and pin of each controller's RX.
     pub fn receive_at(&mut self, pins: [(usize, u32); 2]) {
         self.receive_pins = pins;
     }
@@ -128,13 +128,13 @@ impl Board {
         self.exti.watches(pin) && self.exti_port(pin) == port
     }
 
-    /// The port that a line of EXTI is led to.
+    /// The port that an EXTI line is connected to.
     fn exti_port(&self, line: u32) -> usize {
         let sources = self.syscfg.read(8 + line / 4 * 4).unwrap_or(0);
         (sources >> (line % 4 * 4) & 0xF) as usize
     }
 
-    /// Lets the buses' edges up to now reach the pins, and what is behind those.
+    /// Lets the buses' edges up to now reach the pins and what is connected to them.
     fn advance_pins(&mut self, now: u64) {
         for wire in 0..self.wires.len() {
             while let Some(edge) = self.wires[wire].pass_edge(now) {
@@ -155,12 +155,12 @@ impl Board {
         self.devices.push(Device { range, irq, model });
     }
 
-    /// A system reset: everything but memories and the buses, whose nodes go on.
+    /// A system reset: everything except the memories and the buses, whose nodes continue.
     pub fn reset(&mut self, cause: ResetCause, now: u64) {
         self.advance(now);
         self.rcc = Rcc::new(self.clock, self.crystal, cause);
         self.awaited = None;
-        // The jumper for the ROM bootloader, if there was one, is out.
+        // The jumper for the ROM bootloader, if any, has been removed.
         self.boot_mode = rom::FLASH;
         self.ports.iter_mut().for_each(Gpio::reset);
         self.flash = self.flash.after_reset();
@@ -187,7 +187,7 @@ impl Board {
         self.ports.get(port)?.output(pin)
     }
 
-    /// A GPIO port's registers as they read: port 0 is A. For how pins are set up.
+    /// A GPIO port's registers as they read: port 0 is A. Shows how pins are set up.
     pub fn port(&self, port: usize) -> Option<&Gpio> {
         self.ports.get(port)
     }
@@ -202,7 +202,8 @@ impl Board {
         self.dbgmcu.read(4).unwrap_or(0)
     }
 
-    /// Whether it matters if the core executes a barrier: a peripheral's clock was just switched on, or a store to flash is on its way.
+    /// Whether a barrier executed by the core matters now: a peripheral's clock was just switched on, or a store to flash is on its
+    /// way.
     pub fn awaits_barrier(&self) -> bool {
         self.awaited.is_some() || self.flash.next_event().is_some()
     }
@@ -213,12 +214,12 @@ impl Board {
         self.flash.arrive();
     }
 
-    /// Leaves an error in the flash interface that nobody has cleared.
+    /// Leaves an uncleared error in the flash interface.
     pub fn leave_flash_error(&mut self) {
         self.flash.leave_error(flash::PGSERR);
     }
 
-    /// The interrupt of the attached device that the core has reached since this was last asked.
+    /// The interrupt of the attached device that the core has accessed since the last call.
     pub fn take_reached(&mut self) -> Option<u16> {
         self.reached.take()
     }
@@ -228,12 +229,12 @@ impl Board {
         self.watchdog.deadline()
     }
 
-    /// The core cycle at which TIM2 stood at zero, if it has counted without being written or stopped since.
+    /// The core cycle at which TIM2 was at zero, if it has counted since without being written or stopped.
     pub fn tim2_origin(&mut self, now: u64) -> u64 {
         self.timers[0].origin(now)
     }
 
-    /// Every access that was odd, with how often.
+    /// Every odd access, with how often it happened.
     pub fn odd_accesses(&self) -> Vec<OddAccess> {
         let access = |(key, count): (&(Oddity, u32, bool), &u64)| OddAccess {
             oddity: key.0,
@@ -244,14 +245,14 @@ impl Board {
         self.odd.iter().map(access).collect()
     }
 
-    /// Holds both buses dominant, or lets go of them.
+    /// Holds both buses dominant, or releases them.
     pub fn hold_buses_dominant(&mut self, hold: bool) {
         for wire in &mut self.wires {
             wire.hold_dominant(hold, &mut self.can);
         }
     }
 
-    /// What the program has set up that the core's times depend on.
+    /// The settings made by the program that affect the core's timing.
     pub fn speeds(&self) -> Speeds {
         let clocks = self.rcc.clocks();
         let access = self.flash.access();
@@ -265,7 +266,7 @@ impl Board {
         }
     }
 
-    /// Core cycles for which the core must stand still now.
+    /// Core cycles for which the core must now stall.
     pub fn take_stall(&mut self) -> u64 {
         self.flash.take_stall()
     }
@@ -293,7 +294,7 @@ impl Board {
         let wires = self.wires.iter().filter_map(|wire| wire.next_event(&self.can));
         let timers = self.timers.iter().filter_map(Timer::next_event);
         let devices = self.devices.iter().filter_map(|device| device.lock().next_event());
-        // Where nobody watches, edges need not be on time.
+        // If nobody is watching, edges need not be on time.
         let watched = |wire: &&Wire| wire.controllers().iter().any(|n| self.watches(*n));
         let edges = self.wires.iter().filter(watched).filter_map(Wire::next_edge);
         wires
@@ -306,7 +307,7 @@ impl Board {
             .min()
     }
 
-    /// Lets everything happen that is due at or before `now`.
+    /// Processes everything that is due at or before `now`.
     pub fn advance(&mut self, now: u64) {
         self.advance_buses(now);
         self.flash.advance(now);
@@ -324,7 +325,7 @@ impl Board {
         self.trigger(trigger, now);
     }
 
-    /// A device's trigger output pulsed at a cycle that is not later than `now`.
+    /// A device's trigger output pulsed at a cycle no later than `now`.
     pub(super) fn trigger(&mut self, at: Option<u64>, now: u64) {
         if let Some(at) = at {
             self.timers[0].remapped_trigger(OTG_FS_SOF, at, now);
@@ -339,7 +340,7 @@ impl Board {
         self.advance_pins(now);
     }
 
-    /// Passes the clock tree on to those whose time depends on it.
+    /// Passes the clock tree on to the peripherals whose timing depends on it.
     pub(super) fn follow_clocks(&mut self, now: u64) {
         let clocks = self.rcc.clocks();
         for controller in &mut self.can.controllers {
@@ -356,7 +357,7 @@ pub(super) fn power() -> Storage {
     Storage::new(2, &[(1, 1 << 14)])
 }
 
-/// System configuration: MEMRMP tells what the boot pins chose (RM0090, SYSCFG_MEMRMP).
+/// System configuration: MEMRMP shows what the boot pins selected (RM0090, SYSCFG_MEMRMP).
 pub(super) fn syscfg(boot_mode: u32) -> Storage {
     let mut syscfg = Storage::new(9, &[]);
     syscfg.write(0, boot_mode).expect("there are nine registers");

@@ -1,10 +1,10 @@
-//! The chip as the ROM bootloader leaves it when it starts the program that it was given (`dfu-util -s …:leave`).
+//! The chip as the ROM bootloader leaves it when it starts a program (`dfu-util -s …:leave`).
 //!
 //! The bootloader undoes next to nothing: "the Jump to application works only if the user application sets the vector table
-//! correctly" (AN3156). What it sets up is in AN2606, "STM32F40xxx/41xxx devices": HSE and PLL for USB, the pins of
-//! both USARTs, CAN2 and USB, SysTick and a timer to measure the crystal. That it leaves VTOR is what candleLight_fw's pull
-//! request 319 mends, that it leaves the PLL running numworks/epsilon's 329. The PLL's factors are not published: here they give
-//! USB its 48 MHz and the core the 60 MHz that AN2606 gives. What a real chip leaves may be less than this.
+//! correctly" (AN3156). What it sets up is in AN2606, "STM32F40xxx/41xxx devices": HSE and PLL for USB, the pins of both USARTs,
+//! CAN2 and USB, SysTick and a timer to measure the crystal. candleLight_fw's pull request 319 deals with the VTOR it leaves,
+//! numworks/epsilon's 329 with the PLL it leaves running. The PLL's factors are not published: here they give USB its 48 MHz and
+//! the core the 60 MHz that AN2606 gives. What a real chip leaves may be less than this.
 
 use super::rcc::CRYSTAL_START_US;
 use super::{Board, flash};
@@ -31,7 +31,7 @@ const OTG_GINTMSK: u32 = map::OTG_FS.start + 0x18;
 const OTG_DCTL: u32 = map::OTG_FS.start + 0x804;
 
 impl Board {
-    /// Does what the bootloader did, as it did it: by writing registers. Returns how long it took at least.
+    /// Does what the bootloader does, in the same way: by writing registers. Returns the least time that takes.
     fn run_bootloader(&mut self) -> u64 {
         self.boot_mode = SYSTEM_MEMORY;
         self.syscfg = super::board::syscfg(SYSTEM_MEMORY);
@@ -41,7 +41,7 @@ impl Board {
         self.put(&mut now, PLLCFGR, mhz | 240 << 6 | 1 << 16 | 1 << 22 | 5 << 24, 0);
         // HSI, HSE and the PLL, watched by the clock security system.
         self.put(&mut now, CR, 0x83 | 1 << 16 | 1 << 19 | 1 << 24, 2 * self.clock().us(CRYSTAL_START_US));
-        // One wait state, which 60 MHz want (RM0090 Rev 21, Table 11).
+        // One wait state, as 60 MHz require (RM0090 Rev 21, Table 11).
         self.put(&mut now, FLASH_INTERFACE, 1, 0);
         self.put(&mut now, CFGR, 2 | 4 << 10, 1);
         self.put(&mut now, AHB1ENR, 0x0010_0000 | 0b111, 0);
@@ -78,7 +78,7 @@ impl Board {
     }
 }
 
-/// Brings board and core to where the bootloader starts the program, which is in flash.
+/// Brings board and core to the point at which the bootloader starts the program in flash.
 pub fn leave(board: &mut Board, cpu: &mut Cpu) {
     let took = board.run_bootloader();
     cpu.leave_bootloader();

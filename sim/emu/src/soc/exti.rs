@@ -1,7 +1,7 @@
-//! The external interrupts (RM0090 Rev 21 §12): a line for each pin number, led to one port's pin by SYSCFG_EXTICR, that becomes pending
-//! on the edges that are asked for, masked or not.
+//! The external interrupts (RM0090 Rev 21 §12): a line for each pin number, connected to one port's pin by SYSCFG_EXTICR. It becomes
+//! pending on the selected edges, whether masked or not.
 
-/// Interrupt numbers of the lines of pins: 0 to 4 have their own, 5 to 9 and 10 to 15 share one (RM0090 Rev 21 Table 61).
+/// Interrupt numbers of the pins' lines: 0 to 4 have their own, 5 to 9 and 10 to 15 share one (RM0090 Rev 21 Table 61).
 const IRQS: [(u32, u16); 7] =
     [(1, 6), (1 << 1, 7), (1 << 2, 8), (1 << 3, 9), (1 << 4, 10), (0x3E0, 23), (0xFC00, 40)];
 /// Lines 0 to 22.
@@ -44,7 +44,7 @@ impl Exti {
                 self.pending |= value & !self.software & self.interrupts;
                 self.software |= value;
             }
-            // Cleared by writing 1, and with it what software had set.
+            // Cleared by writing 1, which also clears what software had set.
             0x14 => {
                 self.pending &= !value;
                 self.software &= !value;
@@ -54,7 +54,7 @@ impl Exti {
         Some(())
     }
 
-    /// The level of the pin that a line is led to has changed.
+    /// The level of the pin connected to a line has changed.
     pub fn edge(&mut self, line: u32, rising: bool) {
         self.pending |= if rising { self.rising } else { self.falling } & 1 << line;
     }

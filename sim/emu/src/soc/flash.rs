@@ -1,6 +1,5 @@
 //! The flash interface (RM0090 Rev 21 §3): key unlock, sector erase and programming, with the times they
-//! take (DS8626 Rev 10 Table 40, typical values), during which the core cannot fetch and so stands
-//! still.
+//! take (DS8626 Rev 10 Table 40, typical values), during which the core cannot fetch and so stalls.
 
 use std::ops::Range;
 
@@ -23,11 +22,11 @@ pub const PGSERR: u32 = 1 << 7;
 /// Every error: operation, write protection, alignment and those two.
 const ERRORS: u32 = 1 << 1 | 1 << 4 | 1 << 5 | PGPERR | PGSERR;
 const PROGRAM_US: u64 = 16;
-/// Core cycles that a store to flash is on its way, unless the core waits for it at a barrier. The core's buffer and the bus give no bound;
-/// this is more than a program without a barrier takes to look at the status and to lock the interface.
+/// Core cycles that a store to flash is on its way, unless the core waits for it at a barrier. The core's buffer and the bus have no
+/// documented bound; this is longer than a program without a barrier takes to read the status and lock the interface.
 const STORE_CYCLES: u64 = 48;
 
-/// The sectors: four of 16 KiB, one of 64, seven of 128, with the time their erasure takes in ms.
+/// The sectors: four of 16 KiB, one of 64, seven of 128, with the time that erasing takes, in ms.
 fn sector(number: u32) -> Option<(Range<u32>, u64)> {
     let (offset, kib, ms) = match number {
         0..=3 => (number * 16, 16, 250),
@@ -39,8 +38,8 @@ fn sector(number: u32) -> Option<(Range<u32>, u64)> {
     Some((start..start + kib * 1024, ms))
 }
 
-/// The wait states that a core clock asks for at 2.7 to 3.6 V (RM0090 Rev 21 Table 11): one for each 30 MHz begun
-/// beyond the first.
+/// The wait states that a core clock requires at 2.7 to 3.6 V (RM0090 Rev 21 Table 11): one for each started 30
+/// MHz beyond the first.
 pub fn least_wait_states(hclk_hz: u64) -> u64 {
     hclk_hz.div_ceil(30_000_000).saturating_sub(1)
 }
@@ -68,9 +67,9 @@ pub struct FlashInterface {
     status: u32,
     control: u32,
     options: u32,
-    /// Core cycles for which the core now stands still.
+    /// Core cycles for which the core now stalls.
     stall: u64,
-    /// A store that has not arrived: the interface knows nothing of it, and is not busy.
+    /// A store that has not arrived: the interface does not know of it yet and is not busy.
     under_way: Option<Store>,
 }
 
@@ -153,8 +152,8 @@ impl FlashInterface {
         Some(())
     }
 
-    /// A wrong key, or one that is not wanted, locks the register until the next reset (RM0090,
-    /// "Unlocking the Flash control register").
+    /// A wrong or unexpected key locks the register until the next reset (RM0090, "Unlocking the
+    /// Flash control register").
     fn take_key(&mut self, key: u32) {
         if self.control & LOCK == 0 {
             self.control |= LOCK;
@@ -169,8 +168,8 @@ impl FlashInterface {
         }
     }
 
-    /// Whether an error that nobody has cleared keeps the interface from working. The manual does not say so; users of the chip
-    /// report it, and ST's own drivers clear the flags first.
+    /// Whether an error that nobody has cleared keeps the interface from working. The manual does not mention this; users of
+    /// the chip report it, and ST's own drivers clear the flags first.
     fn is_stuck(&self) -> bool {
         self.status & ERRORS != 0
     }
@@ -203,7 +202,7 @@ impl FlashInterface {
         self.status |= EOP;
     }
 
-    /// The core stores to flash. It arrives later; one before it has arrived by then.
+    /// The core stores to flash. The store arrives later; any earlier one has arrived by now.
     pub fn store(&mut self, address: u32, size: u8, value: u32, now: u64) {
         self.arrive();
         self.under_way = Some(Store { address, size, value, at: now + STORE_CYCLES });
@@ -214,7 +213,7 @@ impl FlashInterface {
         self.under_way.map(|store| store.at)
     }
 
-    /// Lets a store arrive whose time has come.
+    /// Lets a store arrive if its time has come.
     pub fn advance(&mut self, now: u64) {
         if self.next_event().is_some_and(|at| at <= now) {
             self.arrive();
@@ -250,7 +249,7 @@ impl FlashInterface {
         self.status |= EOP;
     }
 
-    /// Takes the core cycles for which the core is to stand still.
+    /// Takes the number of core cycles for which the core is to stall.
     pub fn take_stall(&mut self) -> u64 {
         std::mem::take(&mut self.stall)
     }

@@ -1,5 +1,5 @@
-//! The chip around the core: its peripherals, interrupt lines, and the two CAN buses connected to it. How the core reaches them is
-//! `access.rs`'s; an access to a register that no model knows is noted, never silently swallowed.
+//! The chip around the core: its peripherals, interrupt lines, and the two CAN buses connected to it. `access.rs` says how the
+//! core reaches them; an access to a register that no model knows is noted, never silently swallowed.
 
 pub mod access;
 mod board;

@@ -9,13 +9,13 @@ pub enum Oddity {
     Unknown,
     /// The peripheral's clock is off: reads are 0, writes are lost.
     Unclocked,
-    /// The hardware would not take the write in its present state.
+    /// The hardware would not accept the write in its present state.
     Refused,
-    /// It leaves flash fewer wait states than the core's clock wants.
+    /// It leaves flash with fewer wait states than the core's clock needs.
     TooFast,
 }
 
-/// An odd access, as often as it happened.
+/// An odd access, and how often it happened.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct OddAccess {
     /// What is odd.
@@ -34,7 +34,7 @@ impl fmt::Display for OddAccess {
         let reason = match self.oddity {
             Oddity::Unknown => "no model knows it",
             Oddity::Unclocked => "its peripheral's clock is off",
-            Oddity::Refused => "the hardware does not take it now",
+            Oddity::Refused => "the hardware does not accept it now",
             Oddity::TooFast => "flash has too few wait states for the clock",
         };
         write!(f, "{kind} of {:#010x}, {} times: {reason}", self.address, self.count)

@@ -1,5 +1,5 @@
-//! Reset and clock control (RM0090 Rev 21 §7): the crystal and the PLL take their time, what is in use cannot be
-//! switched off or changed, and the clock tree is worked out from what the firmware sets.
+//! Reset and clock control (RM0090 Rev 21 §7): the crystal and the PLL take time to start, what is in use cannot
+//! be switched off or changed, and the clock tree is worked out from what the firmware sets.
 
 use crate::Clock;
 
@@ -20,7 +20,7 @@ const AHB1ENR: usize = 0x30;
 const APB2ENR: usize = 0x44;
 const BDCR: usize = 0x70;
 const CSR: usize = 0x74;
-/// Bytes up to and with PLLI2SCFGR.
+/// Bytes up to and including PLLI2SCFGR.
 const LEN: usize = 0x88;
 
 /// CR: each oscillator's enable bit, with its ready bit one above.
@@ -31,7 +31,7 @@ const PLLI2SON: u32 = 1 << 26;
 const CR_ENABLES: u32 = HSION | HSEON | PLLON | PLLI2SON;
 /// PLLCFGR: the PLL runs from the crystal.
 const PLLSRC: u32 = 1 << 22;
-/// CFGR: the system clock's source as asked for, and as it is two bits above: 0 HSI, 1 HSE, 2 PLL.
+/// CFGR: the requested source of the system clock; two bits above it, the actual one: 0 HSI, 1 HSE, 2 PLL.
 const SW: u32 = 3;
 const SWS: u32 = SW << 2;
 /// CSR: the software reset flag, the independent watchdog's, and the one that clears them all.
@@ -93,7 +93,7 @@ pub struct Rcc {
 }
 
 impl Rcc {
-    /// After `cause`, with the board's crystal.
+    /// The state after a reset by `cause`, with the board's crystal.
     pub fn new(clock: Clock, crystal: Crystal, cause: ResetCause) -> Self {
         let mut registers = [0; LEN / 4];
         registers[CR / 4] = 0x83;
@@ -108,13 +108,13 @@ impl Rcc {
         Self { registers, clock, crystal, hse_ready_at: None, pll_ready_at: None }
     }
 
-    /// Reads a register; `None` where there is none. It shows what was so at the last [`Self::settle`].
+    /// Reads a register; `None` where there is none. It shows the state at the last [`Self::settle`].
     pub fn read(&self, offset: u32) -> Option<u32> {
         self.registers.get(offset as usize / 4).copied()
     }
 
-    /// Lets oscillators that have become ready by `now` show it, and the switch go over to them. Returns whether the system
-    /// clock changed.
+    /// Updates the flags of oscillators that are ready by `now`, and switches over to them if requested. Returns whether
+    /// the system clock changed.
     pub fn settle(&mut self, now: u64) -> bool {
         let cr = self.registers[CR / 4];
         let ready = |at: Option<u64>| at.is_some_and(|at| at <= now);
@@ -131,7 +131,7 @@ impl Rcc {
         true
     }
 
-    /// What of CR's enables the system clock hangs on: it cannot be switched off (RCC_CR).
+    /// The enable bits in CR that the system clock depends on: these cannot be cleared (RCC_CR).
     fn in_use(&self) -> u32 {
         let source = if self.registers[PLLCFGR / 4] & PLLSRC == 0 { HSION } else { HSEON };
         match self.registers[CFGR / 4] >> 2 & SW {
@@ -156,11 +156,11 @@ impl Rcc {
             let source_at = if from_crystal { self.hse_ready_at } else { Some(now) };
             self.pll_ready_at = source_at.map(|at| at.max(now) + self.clock.us(PLL_LOCK_US));
         }
-        // The calibration is the factory's.
+        // The calibration is set by the factory.
         self.registers[CR / 4] = value & !0xFF00 | before & 0xFF00;
     }
 
-    /// Writes a register; `None` where there is none, or where it does not take the value now.
+    /// Writes a register; `None` where there is none, or if it does not accept the value now.
     pub fn write(&mut self, offset: u32, value: u32, now: u64) -> Option<()> {
         self.settle(now);
         let at = offset as usize;
@@ -203,7 +203,7 @@ impl Rcc {
         (AHB1RSTR..=APB2RSTR).contains(&(offset as usize))
     }
 
-    /// The clock tree as it is set.
+    /// The clock tree as currently set.
     pub fn clocks(&self) -> Clocks {
         let pll = self.registers[PLLCFGR / 4];
         let field = |at: u32, bits: u32| u64::from(pll >> at & ((1 << bits) - 1));

@@ -1,5 +1,5 @@
 //! The small peripherals: GPIO ports, the independent watchdog, the ADC as far as temperature and
-//! supply voltage need it, the factory values, and blocks of which only storage is needed.
+//! supply voltage need it, the factory values, and blocks that only need storage.
 
 use crate::Clock;
 
@@ -25,7 +25,7 @@ impl Gpio {
         gpio
     }
 
-    /// The registers as after reset; what is applied to the pins stays.
+    /// Resets the registers; the levels applied to the pins stay.
     pub fn reset(&mut self) {
         self.registers = [0; 10];
         self.registers[MODER] = [0xA800_0000, 0x280].get(self.port).copied().unwrap_or(0);
@@ -118,7 +118,7 @@ pub struct Watchdog {
 }
 
 impl Watchdog {
-    /// Not started.
+    /// A watchdog that has not been started.
     pub fn new(clock: Clock) -> Self {
         Self { clock, prescaler: 0, reload: 0xFFF, unlocked: false, deadline: None }
     }
@@ -148,7 +148,7 @@ impl Watchdog {
         self.unlocked = false;
     }
 
-    /// When it resets the chip unless it is fed; `None` if it was never started.
+    /// When it will reset the chip unless fed; `None` if it was never started.
     pub fn deadline(&self) -> Option<u64> {
         self.deadline
     }
@@ -232,7 +232,7 @@ impl Adc {
     }
 }
 
-/// A block whose registers only have to hold what was written, with bits that always read as 1.
+/// A block whose registers only store what was written, with bits that always read as 1.
 #[derive(Clone, Debug)]
 pub struct Storage {
     registers: Vec<u32>,

@@ -34,7 +34,7 @@ pub struct Timer {
     reload: u32,
     next_reload: u32,
     compare: [u32; 4],
-    /// TIMx_OR: what the internal triggers and inputs come from.
+    /// TIMx_OR: the sources of the internal triggers and inputs.
     options: u32,
 }
 
@@ -62,7 +62,7 @@ impl Timer {
         }
     }
 
-    /// Core cycles of the clock that drives it; the count goes on from where it is.
+    /// Sets the core cycles per clock of the timer; the count continues from where it is.
     pub fn set_cycles_per_clock(&mut self, cycles: u64, now: u64) {
         if cycles != self.cycles_per_clock {
             self.advance(now);
@@ -152,7 +152,7 @@ impl Timer {
         Some(())
     }
 
-    /// A pulse of the peripheral with number `source` in ITR1_RMP, at the core cycle `at`, which may be a little past.
+    /// A pulse from the peripheral with number `source` in ITR1_RMP, at core cycle `at`, which may be slightly in the past.
     pub fn remapped_trigger(&mut self, source: u32, at: u64, now: u64) {
         if self.options >> 10 & 3 != source || self.slave >> TS_SHIFT & 7 != 1 {
             return;
@@ -164,30 +164,30 @@ impl Timer {
         for channel in 0..4 {
             if self.input(channel) == TRC && self.modes[2] >> (4 * channel) & 1 != 0 {
                 let flag = UIF << (1 + channel);
-                // Over what nobody has read: CCxOF.
+                // Overwrites a value that nobody has read: CCxOF.
                 self.flags |= if self.flags & flag == 0 { flag } else { flag << 8 };
                 self.compare[channel] = count;
             }
         }
     }
 
-    /// CCxS: 0 for an output, which compares; else where the input comes from.
+    /// CCxS: 0 for an output, which compares; otherwise the source of the input.
     fn input(&self, channel: usize) -> u32 {
         self.modes[channel / 2] >> (8 * (channel % 2)) & 3
     }
 
-    /// The core cycle at which the count was zero, were it to have run at its present rate all the time.
+    /// The core cycle at which the count would have been zero, had it always run at its present rate.
     pub fn origin(&mut self, now: u64) -> u64 {
         self.advance(now);
         self.since.saturating_sub(u64::from(self.count) * self.tick())
     }
 
-    /// Whether an enabled flag stands.
+    /// Whether an enabled flag is set.
     pub fn irq(&self) -> bool {
         self.flags & self.interrupts & 0x1F != 0
     }
 
-    /// When the next enabled flag comes that does not stand yet.
+    /// When the next enabled flag that is not set yet will be set.
     pub fn next_event(&self) -> Option<u64> {
         let wanted = self.interrupts & !self.flags & 0x1F;
         if self.control & CEN == 0 || wanted == 0 {
@@ -247,12 +247,12 @@ impl Timer {
     }
 
     fn ticks_to_update(&self) -> u64 {
-        // A count beyond the reload value goes on to the top.
+        // A count beyond the reload value continues to the maximum.
         let top = if self.count > self.reload { self.max } else { self.reload };
         u64::from(top - self.count) + 1
     }
 
-    /// Ticks until the count becomes `value`, within this turn or by the turn's reload.
+    /// Ticks until the count becomes `value`, within this period or at its reload.
     fn ticks_to(&self, value: u32) -> Option<u64> {
         if value > self.count && (value <= self.reload || self.count > self.reload) {
             Some(u64::from(value - self.count))
@@ -310,11 +310,11 @@ mod tests {
         assert!(timer.irq());
         timer.write(0x10, !(UIF << 1), 1300).unwrap();
         assert!(!timer.irq());
-        // The same value again a whole turn later.
+        // The same value recurs a whole turn later.
         assert_eq!(timer.next_event(), Some((100 + (1 << 32)) * 12));
     }
 
-    /// The stamp timer with channel 4 latching OTG_FS's start of frame.
+    /// The stamp timer, with channel 4 latching OTG_FS's start of frame.
     fn latching() -> Timer {
         let mut timer = stamp_timer();
         timer.write(0x50, 2 << 10, 0).unwrap();

@@ -1,9 +1,9 @@
 //! Reading flash through the accelerator (RM0090 Rev 21 §3.5.2): one line of 128 bits at a time, the line in use,
 //! the next one read ahead, and two caches.
 //!
-//! What the manual leaves open is taken from the slow side: a read that has begun is not broken off, whoever wants
-//! the next one; there is one read at a time; and a jump away from a line's end waits for the next line, which the core
-//! had asked for by then.
+//! Where the manual leaves something open, the slower possibility is assumed: a read that has begun is not aborted, no
+//! matter what is requested next; there is one read at a time; and a jump from the end of a line waits for the next
+//! line, which the core has already requested.
 
 use super::speeds::Speeds;
 
@@ -11,7 +11,8 @@ use super::speeds::Speeds;
 const LINE_BYTES: u32 = 16;
 const INSTRUCTION_LINES: usize = 64;
 const DATA_LINES: usize = 8;
-/// The core fetches whole words, ahead of what it executes: by two, which fill decode and fetch of its three stages.
+/// The core fetches whole words, two ahead of what it executes: they fill the decode and fetch stages of its
+/// three-stage pipeline.
 const AHEAD_BYTES: u32 = 8;
 
 /// The lines that a cache holds, the least recently used first.
@@ -32,7 +33,7 @@ impl<const N: usize> Lines<N> {
         self.lines[..self.used].contains(&line)
     }
 
-    /// Whether it is there; it is the most recently used one then.
+    /// Whether the cache holds the line; if so, it becomes the most recently used one.
     fn touch(&mut self, line: u32) -> bool {
         let found = self.lines[..self.used].iter().rposition(|held| *held == line);
         if let Some(at) = found {
@@ -54,9 +55,9 @@ impl<const N: usize> Lines<N> {
 /// The read interface of flash.
 #[derive(Debug, Default)]
 pub struct FlashReads {
-    /// The line that instructions are taken from.
+    /// The line from which instructions are taken.
     current: Option<u32>,
-    /// The line that is or was read ahead.
+    /// The line that is being or was read ahead.
     ahead: Option<u32>,
     /// The offset fetched last.
     last: u32,
@@ -67,7 +68,7 @@ pub struct FlashReads {
 }
 
 impl FlashReads {
-    /// Half a word of instructions at `offset`: cycles until it is there.
+    /// Fetches half a word of instructions at `offset`; returns the cycles until it arrives.
     pub fn fetch(&mut self, offset: u32, jump: bool, now: u64, speeds: &Speeds) -> u64 {
         let line = offset / LINE_BYTES;
         let from = std::mem::replace(&mut self.last, offset);
@@ -90,13 +91,13 @@ impl FlashReads {
         let cached = speeds.instruction_cache && self.instructions.holds(next);
         self.ahead = (speeds.prefetch && !cached).then_some(next);
         if self.ahead.is_some() {
-            // From the cycle in which the first word is handed on.
+            // Starting from the cycle in which the first word is passed on.
             self.busy_until = ready.max(self.busy_until) + speeds.wait_states + 1;
         }
         ready - now
     }
 
-    /// Data at `offset`: cycles until it is there.
+    /// Reads data at `offset`; returns the cycles until it arrives.
     pub fn read(&mut self, offset: u32, now: u64, speeds: &Speeds) -> u64 {
         let line = offset / LINE_BYTES;
         if speeds.data_cache && self.data.touch(line) {
@@ -108,12 +109,12 @@ impl FlashReads {
         self.read_uncached(now, speeds)
     }
 
-    /// Something that no cache holds: cycles until it is there.
+    /// Reads something that is never cached; returns the cycles until it arrives.
     pub fn read_uncached(&mut self, now: u64, speeds: &Speeds) -> u64 {
         self.read_line(now, speeds) - now
     }
 
-    /// A read of one line; returns when it is there.
+    /// Reads one line; returns when it arrives.
     fn read_line(&mut self, now: u64, speeds: &Speeds) -> u64 {
         self.busy_until = now.max(self.busy_until) + speeds.wait_states;
         self.busy_until
@@ -133,7 +134,7 @@ mod tests {
         apb2: 2,
     };
 
-    /// Straight code of 32-bit instructions, a cycle each; what each of them waits.
+    /// How long each instruction waits in straight code of 32-bit instructions of one cycle each.
     fn straight(flash: &mut FlashReads, speeds: &Speeds, words: u32) -> Vec<u64> {
         let mut now = 1000;
         (0..words)
@@ -164,13 +165,13 @@ mod tests {
     fn a_jump_misses_once_and_hits_afterwards() {
         let mut flash = FlashReads::default();
         assert_eq!(flash.fetch(0x400, true, 0, &FOUR), 4);
-        // The line behind is being read until cycle 9, and the jump's line after that.
+        // The following line is being read until cycle 9, and the jump's line after that.
         assert_eq!(flash.fetch(0x800, true, 5, &FOUR), 4 + 4);
         assert_eq!(flash.fetch(0x400, true, 100, &FOUR), 0);
         assert_eq!(
             flash.fetch(0x800, true, 101, &FOUR),
             0,
-            "from the start of a line nothing beyond was asked for"
+            "from the start of a line nothing beyond it was requested"
         );
         let off = Speeds { instruction_cache: false, ..FOUR };
         assert_eq!(flash.fetch(0x400, true, 200, &off), 4);
@@ -182,7 +183,7 @@ mod tests {
         flash.fetch(0x800, true, 0, &FOUR);
         flash.fetch(0x400, true, 100, &FOUR);
         flash.fetch(0x40E, false, 105, &FOUR);
-        // The line behind is read from 104 to 109.
+        // The following line is read from 104 to 109.
         assert_eq!(flash.fetch(0x800, true, 106, &FOUR), 3);
     }
 
@@ -197,7 +198,7 @@ mod tests {
         assert!(waited(1, 103_000), "it had to go");
     }
 
-    /// The data cache has eight lines, and without it each access waits.
+    /// The data cache has eight lines; without it, each access waits.
     #[test]
     fn literals_are_cached_by_eights() {
         let mut flash = FlashReads::default();

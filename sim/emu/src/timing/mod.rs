@@ -1,9 +1,9 @@
-//! What the core waits for beside its own work: flash, the bridges to the peripherals, the pipeline. It knows
-//! addresses and times of accesses and nothing of the program that makes them.
+//! What the core waits for in addition to its own work: flash, the bridges to the peripherals, the pipeline.
+//! This module knows addresses and times of accesses, and nothing about the program that makes them.
 //!
-//! Two bounds, because nobody has published all that a real chip does. [`Bound::Best`] is a core that never
-//! waits. [`Bound::Worst`] charges what the manuals say, and where they leave something open, the most that they
-//! allow; `docs/emulator.md` lists each figure with its source. A real chip lies between the two.
+//! There are two bounds, because not everything that a real chip does has been published. [`Bound::Best`] is a
+//! core that never waits. [`Bound::Worst`] charges what the manuals say, and where they leave something open,
+//! the most they allow; `docs/emulator.md` lists each figure with its source. A real chip lies between the two.
 
 mod flash;
 mod speeds;
@@ -35,7 +35,7 @@ pub enum Bound {
 }
 
 impl Bound {
-    /// Both, the better first.
+    /// Both, the best first.
     pub const ALL: [Self; 2] = [Self::Best, Self::Worst];
 }
 
@@ -62,9 +62,9 @@ impl FromStr for Bound {
 pub struct Waits {
     /// For instructions and vectors from flash.
     pub fetch: u64,
-    /// For data from flash, literals above all.
+    /// For data from flash, mostly literals.
     pub data: u64,
-    /// For peripherals and for writes to them that were under way.
+    /// For peripherals, and for writes to them still under way.
     pub bus: u64,
     /// For the pipeline after a branch.
     pub refill: u64,
@@ -77,7 +77,7 @@ impl Waits {
     }
 }
 
-/// A write that the core is done with and the peripheral has not seen yet.
+/// A write that the core has finished but the peripheral has not seen yet.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Posted {
     /// When it reaches the peripheral.
@@ -90,8 +90,8 @@ pub struct Posted {
     pub value: u32,
 }
 
-/// The state of [`Bound::Worst`]: what is where at which cycle. A step of the core is framed by [`Self::begin`] and
-/// [`Self::end`]; accesses in between are reported as they happen.
+/// The state of [`Bound::Worst`]: which cycle everything has reached. [`Self::begin`] and [`Self::end`] enclose a
+/// step of the core; accesses in between are reported as they happen.
 #[derive(Debug, Default)]
 pub struct Delays {
     speeds: Speeds,
@@ -101,19 +101,19 @@ pub struct Delays {
     /// When the step began.
     from: u64,
     waits: Waits,
-    /// The address behind the last instruction; none where no fetch is a jump.
+    /// The address after the last instruction; `None` where no fetch counts as a jump.
     next: Option<u32>,
     /// The last halfword fetched.
     halfword: u16,
 }
 
 impl Delays {
-    /// As after reset.
+    /// The state after reset.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Takes over what the program has set up.
+    /// Adopts the program's settings.
     pub fn set_speeds(&mut self, speeds: Speeds) {
         self.speeds = speeds;
     }
@@ -164,7 +164,7 @@ impl Delays {
     }
 
     /// Exception entry is a memory barrier (DDI 0439D §3.5). Vector and handler are fetched while registers are stacked
-    /// (§3.9.1), but how far that hides the wait states is nowhere said: not at all here.
+    /// (§3.9.1), but it is not documented how far that hides the wait states: here, not at all.
     fn fetch_vector(&mut self) {
         self.drain();
         self.waits.fetch += self.flash.read_uncached(self.now(), &self.speeds);
@@ -184,8 +184,8 @@ impl Delays {
         self.waits.bus += self.bus.write(address, now, &self.speeds).accepted - now;
     }
 
-    /// The core writes to a peripheral. The write is kept until [`Self::take_posted`]; the one before must have been
-    /// taken.
+    /// The core writes to a peripheral. The write is kept until [`Self::take_posted`]; the previous one must have
+    /// been taken.
     pub fn write_peripheral(&mut self, address: u32, size: u8, value: u32) {
         let now = self.now();
         let write = self.bus.write(address, now, &self.speeds);
@@ -218,7 +218,7 @@ mod tests {
         assert_eq!("fast".parse::<Bound>(), Err("give best or worst".to_owned()));
     }
 
-    /// What is not to be waited for is not: the reset state of the chip, with its bridges at the core's clock.
+    /// In the chip's reset state, with its bridges at the core's clock, nothing waits.
     #[test]
     fn code_without_wait_states_does_not_wait() {
         let mut delays = Delays::new();

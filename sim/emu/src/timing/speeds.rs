@@ -1,6 +1,6 @@
-//! What waiting times depend on.
+//! The settings that waiting times depend on.
 
-/// What the program has set up that the times depend on.
+/// The settings made by the program that affect timing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Speeds {
     /// Wait states of flash (FLASH_ACR.LATENCY).

@@ -2,14 +2,14 @@
 //! write buffer.
 //!
 //! A bridge is synchronous (RM0090 Rev 21 §2.1.11), so an access waits for an edge of the slower clock; then every
-//! transfer takes two of its cycles, set-up and access (AMBA APB). ARM's own bridge adds a cycle of the faster clock where
-//! data is registered, as it is by default; ST does not say, so it is charged.
+//! transfer takes two of its cycles, set-up and access (AMBA APB). ARM's own bridge adds a cycle of the faster clock if
+//! data is registered, which is the default; ST does not say, so that cycle is charged.
 
 use super::speeds::Speeds;
 
-/// Nobody has published what an access to AHB1's registers costs beyond the core's own two cycles.
+/// What an access to AHB1's registers costs beyond the core's own two cycles has not been published.
 const AHB1: u64 = 2;
-/// Nor to the USB core's, whose FIFOs share one memory with the other side.
+/// Neither has it for the USB core's, whose FIFOs share a memory with the USB side.
 const AHB2: u64 = 4;
 /// A registered word in the bridge.
 const REGISTERED: u64 = 1;
@@ -17,14 +17,14 @@ const REGISTERED: u64 = 1;
 enum Slave {
     /// No wait states (RM0090 Rev 21 §2.3.1).
     Sram,
-    /// So many cycles for each access.
+    /// This many cycles for each access.
     Ahb(u64),
     /// Behind a bridge, whose clock takes this many cycles.
     Apb(u64),
 }
 
 impl Slave {
-    /// Who answers to an address (RM0090 Rev 21 Table 1).
+    /// The slave that answers at an address (RM0090 Rev 21 Table 1).
     fn at(address: u32, speeds: &Speeds) -> Self {
         match address {
             0x4000_0000..0x4001_0000 => Self::Apb(speeds.apb1),
@@ -36,15 +36,15 @@ impl Slave {
     }
 }
 
-/// When a write leaves the core's hands and when it is made.
+/// When the core is done with a write, and when the write is done.
 pub struct Write {
-    /// The core goes on.
+    /// The core continues.
     pub accepted: u64,
-    /// The slave has it.
+    /// The slave has received it.
     pub done: u64,
 }
 
-/// The bus, and with it the core's write buffer, which has one place (DDI 0439D §3.5): whatever comes next on this bus
+/// The bus, and with it the core's write buffer, which has one place (DDI 0439D §3.5): the next access on this bus
 /// waits until it is empty.
 #[derive(Debug, Default)]
 pub struct SystemBus {
@@ -57,19 +57,19 @@ impl SystemBus {
         self.free_at
     }
 
-    /// A read from `now` on; returns when it is done.
+    /// A read that begins at `now`; returns when it is done.
     pub fn read(&mut self, address: u32, now: u64, speeds: &Speeds) -> u64 {
         let start = now.max(self.free_at);
         self.free_at = match Slave::at(address, speeds) {
             Slave::Sram => start,
             Slave::Ahb(cycles) => start + cycles,
-            // The cycle in which the bridge hands on its register is the core's own second one.
+            // The cycle in which the bridge passes on its register is the second of the core's own two.
             Slave::Apb(clock) => start.next_multiple_of(clock) + 2 * clock,
         };
         self.free_at
     }
 
-    /// A write from `now` on.
+    /// A write that begins at `now`.
     pub fn write(&mut self, address: u32, now: u64, speeds: &Speeds) -> Write {
         let accepted = now.max(self.free_at);
         self.free_at = match Slave::at(address, speeds) {

@@ -70,7 +70,7 @@ impl Request {
         Self::new(0x82, GET_STATUS, 0, endpoint.into(), 2)
     }
 
-    /// Whether pipes begin with DATA0 after it, on both sides.
+    /// Whether pipes begin with DATA0 afterwards, on both sides.
     pub fn restarts_pipes(&self) -> bool {
         matches!(
             (self.kind, self.request),
@@ -106,7 +106,7 @@ pub enum Outcome {
     Failed(&'static str),
 }
 
-/// What is to be put on the bus next.
+/// What to put on the bus next.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Step {
     /// A SETUP packet.
@@ -129,7 +129,7 @@ enum Stage {
     Status,
 }
 
-/// Attempts at a transaction that is not answered (USB 2.0, 10.2.6).
+/// Attempts at a transaction that gets no answer (USB 2.0, 10.2.6).
 const ATTEMPTS: u32 = 3;
 
 /// A transfer on its way.
@@ -149,7 +149,7 @@ impl Transfer {
         Self { request, stage: Stage::Setup, data1: true, moved: Vec::new(), sent: 0, silences: 0 }
     }
 
-    /// What it asks.
+    /// The request.
     pub fn request(&self) -> &Request {
         &self.request
     }
@@ -215,7 +215,7 @@ impl Transfer {
             });
         }
         if data1 != self.data1 {
-            // A repetition of a packet that was taken before.
+            // A repetition of a packet that has already been taken.
             return None;
         }
         self.data1 = !data1;

@@ -11,11 +11,11 @@ pub struct Counters {
     pub out_packets: u64,
     /// Packets on the notification pipe.
     pub notifications: u64,
-    /// Data packets with the toggle of the one before: repetitions after a lost handshake.
+    /// Data packets with the same toggle as the one before: repetitions after a lost handshake.
     pub repeated: u64,
     /// Transactions on configured pipes that the device left unanswered.
     pub silences: u64,
-    /// STALLs of configured pipes.
+    /// STALLs on configured pipes.
     pub stalls: u64,
     /// Handshakes dropped on request.
     pub dropped_handshakes: u64,

@@ -1,5 +1,5 @@
-//! Reads a device's descriptors and checks them as the CDC-ACM drivers of real hosts do (USB 2.0,
-//! section 9.6; CDC 1.2, section 5.2; PSTN 1.2, section 5.3). What a driver would stumble over is an error here, not a
+//! Reads a device's descriptors and checks them as the CDC-ACM drivers of real hosts do (USB 2.0, section 9.6; CDC
+//! 1.2, section 5.2; PSTN 1.2, section 5.3). Anything that a driver would stumble over is an error here, not a
 //! warning.
 
 use super::enumeration_error::EnumerationError;
@@ -44,7 +44,7 @@ pub struct Device {
 pub struct CdcAcm {
     /// bConfigurationValue.
     pub configuration: u8,
-    /// The communication interface, which class requests go to.
+    /// The communication interface, to which class requests go.
     pub control_interface: u8,
     /// The data interface.
     pub data_interface: u8,
@@ -67,7 +67,7 @@ pub struct Pipe {
     pub interval: u8,
 }
 
-/// Why descriptors are not good enough.
+/// An error about descriptors that are not good enough.
 fn bad(what: impl Into<String>) -> EnumerationError {
     EnumerationError::Descriptor(what.into())
 }
@@ -98,7 +98,7 @@ pub fn device(bytes: &[u8]) -> Result<Device, EnumerationError> {
     })
 }
 
-/// The total length that a configuration descriptor's first nine bytes tell.
+/// The total length given in a configuration descriptor's first nine bytes.
 pub fn configuration_length(bytes: &[u8]) -> Result<u16, EnumerationError> {
     check(bytes.len() == 9 && bytes[0] == 9, "the configuration descriptor is not 9 bytes long")?;
     check(bytes[1] == CONFIGURATION, "the configuration descriptor has another type")?;
@@ -107,7 +107,7 @@ pub fn configuration_length(bytes: &[u8]) -> Result<u16, EnumerationError> {
     Ok(total)
 }
 
-/// One interface while it is read.
+/// One interface while it is being read.
 #[derive(Default)]
 struct Interface {
     number: u8,
@@ -186,7 +186,7 @@ pub fn cdc_acm(bytes: &[u8]) -> Result<CdcAcm, EnumerationError> {
     Ok(acm)
 }
 
-/// Walks the descriptors behind the configuration header.
+/// Walks the descriptors after the configuration header.
 #[allow(clippy::type_complexity, reason = "the pair is taken apart at its one caller")]
 fn interfaces(mut bytes: &[u8]) -> Result<(Vec<Interface>, Option<(u8, u8)>), EnumerationError> {
     let mut interfaces: Vec<Interface> = Vec::new();
@@ -233,7 +233,7 @@ fn interfaces(mut bytes: &[u8]) -> Result<(Vec<Interface>, Option<(u8, u8)>), En
             (_, _) => return Err(bad(format!("a descriptor of type {kind:#04x} is out of place"))),
         }
     }
-    check(bytes.is_empty(), "a single byte is left behind the last descriptor")?;
+    check(bytes.is_empty(), "a single byte is left after the last descriptor")?;
     for interface in &interfaces {
         check(
             usize::from(interface.endpoints_told) == interface.endpoints.len(),
@@ -293,7 +293,7 @@ mod tests {
 
     #[test]
     fn what_a_driver_stumbles_over_is_refused() {
-        // Offset into the configuration, the byte put there, and what is said of it.
+        // Offset into the configuration, the byte put there, and the expected message.
         for (at, byte, what) in [
             (2, 66, "wTotalLength"),
             (4, 1, "bNumInterfaces"),

@@ -1,5 +1,5 @@
-//! What the operating system does with a device: enumerates it in the order that Linux does
-//! (a look at 64 bytes, a second reset, the address, descriptors, strings), then drives it as a CDC-ACM
+//! What the operating system does with a device: enumerates it in the order that Linux does (a first
+//! look at 64 bytes, a second reset, the address, descriptors, strings), then drives it as a CDC-ACM
 //! serial port. It only chooses transactions and judges answers; the bus is `mod.rs`'s.
 
 use std::collections::VecDeque;
@@ -16,10 +16,10 @@ mod purpose;
 
 use purpose::Purpose;
 
-/// Bytes that the driver keeps for an application that does not read; then it stops asking.
+/// Bytes that the driver buffers for an application that does not read; then it stops requesting more.
 const INPUT_LIMIT: usize = 64 * 1024;
 
-/// The line coding that the driver sets: 115200 8N1, which the device only has to remember.
+/// The line coding that the driver sets: 115200 8N1, which the device only needs to remember.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LineCoding(pub [u8; 7]);
 
@@ -30,7 +30,7 @@ impl Default for LineCoding {
     }
 }
 
-/// What a device said of itself.
+/// What a device reported about itself.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Identity {
     /// The device descriptor.
@@ -70,13 +70,13 @@ pub struct Driver {
     reset_request: bool,
     pause: Option<u64>,
     port_wanted: bool,
-    /// What the request on its way says of DTR.
+    /// The state of DTR in the request under way.
     lines_sent: bool,
     coding_set: bool,
     port_open: bool,
-    /// A new configuration leaves the port to whoever has it open, and nobody is told.
+    /// A new configuration leaves the port to the program that has it open, without notice.
     pub(super) keeps_port: bool,
-    /// The device has a configuration, and the driver its interfaces.
+    /// The device is configured, and the driver has its interfaces.
     bound: bool,
     /// A bulk pipe that was found halted, by its address.
     stalled: Option<u8>,
@@ -84,7 +84,7 @@ pub struct Driver {
     out_data1: bool,
     notify_data1: bool,
     notify_in: u32,
-    /// Pipes that said NAK in this round: control, bulk IN, bulk OUT.
+    /// Pipes that answered NAK in this round: control, bulk IN, bulk OUT.
     deferred: [bool; 3],
     out_turn: bool,
     partial: Vec<u8>,
@@ -171,7 +171,7 @@ impl Driver {
         self.user.push_back(request);
     }
 
-    /// Begins the control transfer that is due on a configured device, if any is.
+    /// Begins the control transfer that is due on a configured device, if any.
     fn begin_next(&mut self) {
         if !self.configured || self.pending.is_some() {
             return;
@@ -213,7 +213,7 @@ impl HostDriver for Driver {
         self.pause.take()
     }
 
-    /// The port's reset is over: the first look, or what follows the second.
+    /// The port's reset is over: what follows is the first look, or, after the second reset, the rest.
     fn after_reset(&mut self, second_wanted: bool) {
         self.resets += 1;
         self.second_wanted = second_wanted;

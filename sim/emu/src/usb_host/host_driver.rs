@@ -1,5 +1,5 @@
-//! What the bus needs of the driver of the device: the emulator's own operating system ([`super::CdcDriver`]), or
-//! somebody else's, such as a kernel's behind a socket.
+//! What the bus needs from the device's driver: the emulator's own operating system ([`super::CdcDriver`]), or
+//! another, such as a real kernel's behind a socket.
 
 use super::counters::Counters;
 use crate::otg::{InReply, OutReply};
@@ -11,14 +11,14 @@ pub enum Token {
     Setup([u8; 8]),
     /// An IN token.
     In {
-        /// Whom it asks.
+        /// The endpoint it addresses.
         endpoint: u8,
         /// On a bulk pipe.
         bulk: bool,
     },
     /// An OUT packet.
     Out {
-        /// Who it is for.
+        /// The endpoint it is for.
         endpoint: u8,
         /// DATA1 rather than DATA0.
         data1: bool,
@@ -27,29 +27,30 @@ pub enum Token {
     },
 }
 
-/// Chooses transactions and judges answers. When they are on the bus, and whether they fit, is the bus's business.
+/// Chooses transactions and judges answers. The bus decides when they take place and whether they fit.
 pub trait HostDriver {
-    /// The device is gone: everything that ran ends. What was delivered stays readable.
+    /// The device is gone: everything under way ends. What was delivered stays readable.
     fn detach(&mut self);
-    /// The address that transactions go to.
+    /// The device address that transactions go to.
     fn address(&self) -> u8;
     /// The port's reset is over. `second_wanted` is [`super::Timing::second_reset`].
     fn after_reset(&mut self, second_wanted: bool);
-    /// Frames begin again after a silence, which is nobody's delay.
+    /// Frames begin again after a silence, which must not count as a delay.
     fn restart_clock(&mut self) {}
     /// A frame begins.
     fn start_frame(&mut self);
     /// The next transaction. `room` says whether the frame may carry another data packet on the bulk pipes.
     fn choose(&mut self, room: bool) -> Option<Token>;
-    /// A pipe said NAK: the others first.
+    /// A pipe answered NAK: the others go first.
     fn defer(&mut self, endpoint: u8, input: bool);
-    /// Whether there is anything to be tried again.
+    /// Whether there is anything to try again.
     fn any_deferred(&self) -> bool;
-    /// All pipes have their turn again.
+    /// All pipes get their turn again.
     fn clear_deferred(&mut self);
-    /// The answer to the SETUP or OUT packet that [`Self::choose`] wanted last; `pipe` is the length of a bulk packet.
+    /// The answer to the SETUP or OUT packet that [`Self::choose`] last returned; `pipe` is the length of a bulk
+    /// packet.
     fn answered_out(&mut self, pipe: Option<usize>, reply: OutReply, counters: &mut Counters);
-    /// The answer to the IN token that [`Self::choose`] wanted last. `read_bytes` is [`super::Timing::read_bytes`].
+    /// The answer to the IN token that [`Self::choose`] last returned. `read_bytes` is [`super::Timing::read_bytes`].
     fn answered_in(
         &mut self,
         endpoint: u8,
@@ -58,9 +59,9 @@ pub trait HostDriver {
         read_bytes: usize,
         counters: &mut Counters,
     );
-    /// Whether the device is to be reset. Asked once.
+    /// Whether the device is to be reset. Cleared by the call.
     fn take_reset_request(&mut self) -> bool;
-    /// Milliseconds of silence that are wanted. Asked once.
+    /// The milliseconds of silence requested. Cleared by the call.
     fn take_pause(&mut self) -> Option<u64>;
     /// Ends a transfer that takes longer than `limit` cycles.
     fn check_time(&mut self, _now: u64, _limit: u64) {}

@@ -3,8 +3,8 @@
 //! which a host can misbehave, at any instant.
 //!
 //! Time is core cycles; one transaction is one event. A data packet takes the bus time that USB 2.0
-//! gives it (5.8.4: 19 packets of 64 bytes fit a frame), and a pipe that was answered with NAK is tried
-//! again after [`Timing::retry`].
+//! specifies (5.8.4: 19 packets of 64 bytes fit into a frame), and a pipe that was answered with NAK is
+//! tried again after [`Timing::retry`].
 
 pub mod control;
 mod counters;
@@ -26,21 +26,21 @@ use crate::otg::{InReply, Otg, OutReply};
 
 /// The bits of a frame number in a SOF token (USB 2.0, 8.4.3).
 const FRAME_NUMBER: u32 = 0x7FF;
-/// Bytes of bus time that a transaction takes beside its data (USB 2.0, 5.8.4, full-speed bulk).
+/// Bytes of bus time that a transaction takes in addition to its data (USB 2.0, 5.8.4, full-speed bulk).
 const OVERHEAD_BYTES: u64 = 13;
-/// Bytes of bus time of a token that is answered with NAK: token, handshake, two turnarounds.
+/// Bytes of bus time of a token answered with NAK: token, handshake, two turnarounds.
 const NAK_BYTES: u64 = 6;
 /// Silence after which a device must suspend (USB 2.0, 7.1.7.6).
 const IDLE_MS: u64 = 3;
 
-/// What the port does.
+/// What the port is doing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Bus {
-    /// No cable, no power, or a host that is dead. Idle since then.
+    /// No cable, no power, or a dead host; the bus is idle.
     Off,
     /// Waiting for a pull-up.
     Empty,
-    /// A pull-up was seen.
+    /// A pull-up was detected.
     Debounce { until: u64 },
     /// Driving reset.
     Reset { until: u64 },
@@ -52,7 +52,7 @@ enum Bus {
     Resuming { until: u64 },
 }
 
-/// How far the host has come with the device.
+/// How far the host has got with the device.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Status {
     /// There is nothing on the port, or the port is off.
@@ -86,15 +86,15 @@ pub struct UsbHost<D = CdcDriver> {
     /// When the device will have seen 3 ms of silence.
     idle_at: Option<u64>,
     frame_at: u64,
-    /// Of the frame that starts then.
+    /// The number of the frame that starts then.
     frame: u64,
-    /// When the last frame started, until it is asked for.
+    /// When the last frame started; cleared when read.
     sof: Option<u64>,
     packets_this_frame: u32,
     flight: Option<Flight>,
     next_transaction: u64,
     driver: D,
-    /// Lose the handshake of every n-th IN packet.
+    /// The handshake of every n-th IN packet is lost.
     drop_handshake_every: Option<u64>,
     counters: Counters,
     now: u64,
@@ -122,7 +122,7 @@ impl<D: HostDriver> UsbHost<D> {
         }
     }
 
-    /// How it keeps time; may be changed at any time.
+    /// Its timing, which may be changed at any time.
     pub fn timing_mut(&mut self) -> &mut Timing {
         &mut self.timing
     }
@@ -151,7 +151,7 @@ impl<D: HostDriver> UsbHost<D> {
         self.rest();
     }
 
-    /// Whatever ran is over; the bus is silent from now on.
+    /// Everything under way ends; the bus is silent from now on.
     fn rest(&mut self) {
         self.driver.detach();
         self.flight = None;
@@ -185,7 +185,7 @@ impl<D: HostDriver> UsbHost<D> {
         }
     }
 
-    /// Wakes the device; traffic goes on where it was.
+    /// Wakes the device; traffic continues where it stopped.
     pub fn resume(&mut self, otg: &mut Otg) {
         if self.bus == Bus::Suspended {
             self.idle_at = None;
@@ -194,17 +194,17 @@ impl<D: HostDriver> UsbHost<D> {
         }
     }
 
-    /// Loses the handshake of every `n`-th bulk IN packet, so that the device sends it again.
+    /// Drops the handshake of every `n`-th bulk IN packet, so that the device sends it again.
     pub fn drop_handshake_every(&mut self, n: Option<u64>) {
         self.drop_handshake_every = n;
     }
 
-    /// Who chooses the transactions.
+    /// The driver, which chooses the transactions.
     pub fn driver(&mut self) -> &mut D {
         &mut self.driver
     }
 
-    /// Takes back the transaction that is on the bus, as though it had not begun.
+    /// Withdraws the transaction on the bus, as if it had never begun.
     pub fn abandon_transaction(&mut self) {
         self.flight = None;
     }
@@ -226,12 +226,13 @@ impl UsbHost {
         self.driver.close_port();
     }
 
-    /// Whether the application reads. Where it does not, the driver leaves the pipe alone.
+    /// Sets whether the application reads. If it does not, the driver leaves the pipe alone.
     pub fn read(&mut self, reading: bool) {
         self.driver.reading = reading;
     }
 
-    /// Whether a new configuration leaves the port to whoever has it open, who is told nothing. Otherwise the driver opens it again.
+    /// Sets whether a new configuration leaves the port to the program that has it open, without notice. Otherwise the driver opens
+    /// it again.
     pub fn keep_port(&mut self, keep: bool) {
         self.driver.keeps_port = keep;
     }
@@ -241,7 +242,7 @@ impl UsbHost {
         self.driver.output.extend(bytes);
     }
 
-    /// Bytes that were queued and not sent yet.
+    /// Bytes queued but not sent yet.
     pub fn unsent(&self) -> usize {
         self.driver.output.len()
     }
@@ -251,13 +252,13 @@ impl UsbHost {
         std::mem::take(&mut self.driver.input)
     }
 
-    /// Bytes that wait for [`Self::receive`].
+    /// Bytes waiting for [`Self::receive`].
     pub fn received(&self) -> usize {
         self.driver.input.len()
     }
 
-    /// Puts a request on endpoint 0 when the device is configured; its end comes through
-    /// [`Self::control_outcome`].
+    /// Sends a request to endpoint 0 once the device is configured; [`Self::control_outcome`]
+    /// returns how it ended.
     pub fn control(&mut self, request: Request) {
         self.driver.control(request);
     }
@@ -267,7 +268,7 @@ impl UsbHost {
         self.driver.outcomes.pop_front()
     }
 
-    /// How far it has come.
+    /// How far the host has got with the device.
     pub fn status(&self) -> Status {
         match (self.bus, self.driver.failure()) {
             (Bus::Off | Bus::Empty, _) => Status::NoDevice,
@@ -283,7 +284,7 @@ impl UsbHost {
         self.bus == Bus::Running && self.driver.port_ready()
     }
 
-    /// What the device said of itself at its last enumeration.
+    /// What the device reported about itself at its last enumeration.
     pub fn identity(&self) -> Option<&Identity> {
         self.driver.identity()
     }
@@ -300,7 +301,7 @@ impl<D: HostDriver> UsbHost<D> {
         self.counters
     }
 
-    /// When [`Self::advance`] is to be called next.
+    /// When [`Self::advance`] must be called next.
     pub fn next_event(&self, otg: &Otg) -> Option<u64> {
         let bus = match self.bus {
             Bus::Off | Bus::Suspended => None,
@@ -317,7 +318,7 @@ impl<D: HostDriver> UsbHost<D> {
         [bus, self.idle_at].into_iter().flatten().min()
     }
 
-    /// Does everything that is due at or before `now`.
+    /// Processes everything that is due at or before `now`.
     pub fn advance(&mut self, otg: &mut Otg, now: u64) {
         while let Some(at) = self.next_event(otg).filter(|at| *at <= now) {
             self.now = self.now.max(at);
@@ -366,7 +367,7 @@ impl<D: HostDriver> UsbHost<D> {
 
     fn start_frame(&mut self, otg: &mut Otg) {
         if !otg.pulled_up(true) {
-            // The device went away by itself (reset, bootloader): the port sees a disconnection.
+            // The device went away on its own (reset, bootloader): the port sees a disconnection.
             self.rest();
             return;
         }
@@ -390,15 +391,15 @@ impl<D: HostDriver> UsbHost<D> {
             if self.obey_driver(otg) {
                 return;
             }
-            // Pipes that said NAK are tried again soon; without any, there is nothing to do in this
-            // frame.
+            // Pipes that answered NAK are tried again soon; without any, there is nothing to do in
+            // this frame.
             let retry = budget_left && self.driver.any_deferred();
             self.driver.clear_deferred();
             self.next_transaction =
                 if retry { (self.now + self.timing.retry).min(self.frame_at) } else { self.frame_at };
             return;
         };
-        // What an IN token finds is decided now; what an OUT packet finds, when it has arrived.
+        // The outcome of an IN token is decided now, that of an OUT packet when it has arrived.
         let bytes = match &token {
             Token::In { endpoint, .. } => match otg.in_token(self.driver.address(), *endpoint, false) {
                 InReply::Data { bytes, .. } => OVERHEAD_BYTES + bytes.len() as u64,
@@ -438,7 +439,7 @@ impl<D: HostDriver> UsbHost<D> {
             Token::In { endpoint, bulk } => {
                 let nth = self.counters.in_packets + self.counters.dropped_handshakes + 1;
                 let lost = bulk && self.drop_handshake_every.is_some_and(|n| nth.is_multiple_of(n));
-                // The host has the packet; only its handshake does not arrive.
+                // The host has received the packet; only its handshake gets lost.
                 let reply = otg.in_token(address, endpoint, !lost);
                 let data = matches!(reply, InReply::Data { .. });
                 self.packets_this_frame += u32::from(data);
@@ -451,7 +452,7 @@ impl<D: HostDriver> UsbHost<D> {
         self.driver.check_time(self.now, self.timing.control_timeout);
     }
 
-    /// Resets the device or is silent for a while, if the driver wants that; whether it did.
+    /// Resets the device or stays silent for a while, if the driver requests it; returns whether it did.
     fn obey_driver(&mut self, otg: &mut Otg) -> bool {
         if self.driver.take_reset_request() {
             self.begin_reset(otg);
@@ -463,7 +464,7 @@ impl<D: HostDriver> UsbHost<D> {
         true
     }
 
-    /// A pipe that said NAK waits until the others had their turn.
+    /// A pipe that answered NAK waits until the others have had their turn.
     fn back_off(&mut self, endpoint: u8, input: bool, nak: bool) {
         if nak {
             self.driver.defer(endpoint, input);

@@ -5,7 +5,7 @@ use crate::Clock;
 /// How a host keeps time.
 #[derive(Clone, Copy, Debug)]
 pub struct Timing {
-    /// What cycles are.
+    /// How long a cycle is.
     pub clock: Clock,
     /// From pull-up to reset, in cycles (USB 2.0, TATTDB: at least 100 ms).
     pub debounce: u64,
@@ -19,27 +19,28 @@ pub struct Timing {
     pub retry: u64,
     /// How long a control transfer may be answered with NAK (USB 2.0, 9.2.6.1 allows 5 s).
     pub control_timeout: u64,
-    /// Reset a second time after the first look at the device, as Linux does. Hosts that do not leave a device with
+    /// Reset a second time after the first look at the device, as Linux does. Hosts that do not give a device only
     /// one chance to get its endpoints right.
     pub second_reset: bool,
-    /// Data packets in one frame at most, over all pipes: up to 19 of 64 bytes.
+    /// Most data packets in one frame, over all pipes: up to 19 of 64 bytes.
     pub packets_per_frame: u32,
-    /// Bytes that a read of the bulk IN pipe asks for: it completes when they are there or with a
-    /// packet that is not full. Linux asks for 128 (cdc-acm: two packets), Windows for up to 4096.
+    /// Bytes that a read of the bulk IN pipe asks for: it completes when they have arrived, or with
+    /// a packet that is not full. Linux asks for 128 (cdc-acm: two packets), Windows for up to
+    /// 4096.
     pub read_bytes: usize,
-    /// How much faster the board's crystal runs than this host's, in parts per million: its frames then have so much more of the
-    /// board's cycles.
+    /// How much faster the board's crystal runs than this host's, in parts per million: its frames are then longer by that much
+    /// in board cycles.
     pub board_ppm: f64,
-    /// How far a start of frame may be from its place, in board cycles; the same for the same frame, whatever the board. USB 2.0
+    /// How far a start of frame may be from its ideal time, in board cycles; the same for the same frame on every board. USB 2.0
     /// (7.1.12) allows a full-speed host ±500 ns from one to the next.
     pub sof_jitter: u64,
     /// Behind a high-speed hub: the least time from one control or bulk transaction to the next. There a transaction is split into
-    /// what begins it and what fetches its result, in different microframes. 0 on a root port.
+    /// one part that starts it and one that fetches its result, in different microframes. 0 on a root port.
     pub split: u64,
 }
 
 impl Timing {
-    /// As patient as Linux is.
+    /// As patient as Linux.
     pub fn new(clock: Clock) -> Self {
         Self {
             clock,
@@ -58,7 +59,7 @@ impl Timing {
         }
     }
 
-    /// The board cycle at which frame `number` starts. Frame 0 starts with the board's power-on, on every board, so that
+    /// The board cycle at which frame `number` starts. Frame 0 starts with the board's power-on, on every board, so
     /// boards that are switched on together are on one controller.
     pub fn frame_start(&self, number: u64) -> u64 {
         let place = number as f64 * self.frame_cycles();
@@ -66,7 +67,7 @@ impl Timing {
         (place + jitter).max(0.0) as u64
     }
 
-    /// The first frame that has its place at or after a board cycle.
+    /// The first frame whose ideal start is at or after a board cycle.
     pub fn frame_after(&self, cycle: u64) -> u64 {
         (cycle as f64 / self.frame_cycles()).ceil() as u64
     }
@@ -76,19 +77,19 @@ impl Timing {
         self.clock.usb_frame() as f64 * self.board_rate()
     }
 
-    /// Board cycles in the time of one cycle of a board whose crystal is exact.
+    /// Board cycles during one cycle of a board with an exact crystal.
     pub fn board_rate(&self) -> f64 {
         1.0 + self.board_ppm * 1e-6
     }
 
-    /// The shortest times that the standard allows, and debouncing cut short: for tests that plug a
-    /// device in hundreds of times.
+    /// The shortest times that the standard allows, with debouncing cut short: for tests that plug
+    /// in a device hundreds of times.
     pub fn hasty(clock: Clock) -> Self {
         Self { debounce: clock.ms(5), reset: clock.ms(10), recovery: clock.ms(1), ..Self::new(clock) }
     }
 
-    /// Behind a high-speed hub, with a host that begins a transaction when it has fetched the one before, so that each
-    /// takes this many microframes. Hubs have room for more than one; a host that uses it is faster.
+    /// Behind a high-speed hub, with a host that begins a transaction only once it has fetched the previous one, so
+    /// that each takes this many microframes. Hubs have room for more than one; a host that uses it is faster.
     #[must_use]
     pub fn behind_hub(self, microframes: u32) -> Self {
         Self { split: u64::from(microframes) * (self.clock.usb_frame() / 8), ..self }

@@ -1,5 +1,5 @@
 #![allow(dead_code, reason = "each test uses its part")]
-//! A few Thumb instructions by hand, for programs too small to need a compiler.
+//! A few hand-assembled Thumb instructions, for programs too small to need a compiler.
 
 use cantap_emu::memory_map::{FLASH, SRAM};
 use cantap_emu::{Image, Peripheral};
@@ -32,12 +32,12 @@ impl Program {
         FLASH.start + 4 * self.vectors.len() as u32 + 2 * self.code.len() as u32
     }
 
-    /// Code from here on handles exception `number`; 1 is reset, 16 + n interrupt n.
+    /// The code that follows handles exception `number`; 1 is reset, 16 + n interrupt n.
     pub fn handler(&mut self, number: usize) {
         self.vectors[number] = self.here() | 1;
     }
 
-    /// Instructions.
+    /// Appends instructions.
     pub fn put(&mut self, instructions: &[u16]) {
         self.code.extend(instructions);
     }
@@ -146,14 +146,14 @@ pub const fn udf() -> u16 {
     0xDE00
 }
 
-/// A device that asserts its interrupt from a moment on until it is written to.
+/// A device that asserts its interrupt from a certain cycle until it is written to.
 pub struct Alarm {
     at: Option<u64>,
     asserted: bool,
 }
 
 impl Alarm {
-    /// Asserts it at core cycle `at`, if ever.
+    /// A device that asserts it at core cycle `at`, or never.
     pub fn new(at: Option<u64>) -> Self {
         Self { at, asserted: false }
     }

@@ -1,11 +1,11 @@
 #!/bin/sh
 # shellcheck shell=dash
-# `cantap bridge`: both channels at interfaces of the kernel's own, under can-utils and python-can.
+# `cantap bridge`: both channels on interfaces of the kernel's own, used by can-utils and python-can.
 
 has_port || attach
 modprobe -a vcan vxcan
 
-# bridge OPTION...: in the background, as $BRIDGE, until programs may use it.
+# bridge OPTION...: starts it in the background, as $BRIDGE, and waits until programs can use it.
 bridge() {
   "$CANTAP" bridge -d "$PORT" -b 1M "$@" > bridge.out 2> bridge.err &
   BRIDGE=$!
@@ -26,7 +26,7 @@ listen() {
   done
   sleep 0.5
 }
-# quiet: waits until no frame crosses any more. (A session has bytes on the wire all the time.)
+# quiet: waits until no more frames cross. (A session has bytes on the wire all the time.)
 quiet() {
   _before=none
   while _now="$(both taken) $(both sent)" && [ "$_before" != "$_now" ]; do
@@ -34,7 +34,7 @@ quiet() {
     sleep 1
   done
 }
-# heard: waits until nothing more comes.
+# heard: waits until nothing more arrives.
 heard() {
   quiet
   sleep 0.5
@@ -54,13 +54,13 @@ errors() { awk '{ print $3 }' "$1" | grep -c '^2[0-9A-F]\{7\}#'; }
 [ $? = 1 ] && grep -q "ip link add bus0 type vcan && ip link set bus0 up" bridge.err
 verdict $? "bridge: without an interface, the line for root is there"
 
-# The line itself, with the program that knows of CAN.
+# The line itself, with the `ip` program that knows about CAN.
 for _bus in bus0 bus1; do
   iproute2 link add $_bus type vcan && ip link set $_bus up
 done
 
-# The bridge is ended before candump: what was captured is all handed on by then, however far behind the guest is. What is missing must be
-# counted, by the bridge or by candump, whose socket may overflow.
+# The bridge is ended before candump: by then it has handed on everything captured, however far behind the guest is. What is missing must
+# be counted, by the bridge or by candump, whose socket may overflow.
 crossed() { [ "$(both taken)" = "$_frames $_frames" ]; }
 grown() { wc -c bus0.txt bus1.txt | tail -n 1; }
 for _job in "100 mix 4000" "100 std0 20000"; do
@@ -98,7 +98,7 @@ for _job in "100 mix 4000" "100 std0 20000"; do
   done
 done
 
-# Who only listens sends nothing, and is told so.
+# While the bridge only listens, what programs write is not sent, and the bridge says so.
 board traffic 0 mix
 bridge bus0
 listen bus0
@@ -153,7 +153,7 @@ cat > program.py << 'PROGRAM'
 import can, sys
 bus = can.Bus(interface="socketcan", channel="bus0")
 print("ready", flush=True)
-# As many as fit its socket.
+# As many as fit into its socket.
 frames = [bus.recv(30) for _ in range(150)]
 assert all(frame is not None and not frame.is_error_frame for frame in frames), len([frame for frame in frames if frame])
 assert any(frame.is_extended_id for frame in frames) and any(frame.dlc == 0 for frame in frames)
@@ -180,7 +180,7 @@ else
 fi
 end_bridge
 
-# A pair: programs are at its other end, in whatever network namespace. Their frames come back once: by the kernel, or as the confirmation.
+# A pair: programs use its other end, in any network namespace. Their frames come back once: from the kernel, or as the confirmation.
 iproute2 link add bus2 type vxcan peer name app2 && ip link set bus2 up && ip link set app2 up
 bridge --mode normal bus2
 listen app2

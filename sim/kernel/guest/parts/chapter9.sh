@@ -13,7 +13,7 @@ configured_anew() {
   wait_until has_port
 }
 
-# How many packets went out before says which toggle would be next, so several numbers are tried. `info` sends 12 when none is lost.
+# The number of packets sent before decides which toggle is next, so several numbers are tried. `info` sends 12 when none is lost.
 _bad=0
 _seen=
 for _i in 1 2 3 4; do

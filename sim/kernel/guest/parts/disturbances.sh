@@ -1,7 +1,7 @@
 #!/bin/sh
 # shellcheck shell=dash
-# Whatever may happen to a client, the driver and the cable in mid-stream: the client says so and goes on when the device is back, and the next
-# capture is exact.
+# Anything that may happen to a client, the driver or the cable in mid-stream: the client reports it and continues when the device is back,
+# and the next capture is exact.
 
 has_port || attach
 DEVICE=$(device)
@@ -9,7 +9,7 @@ ID=$(device_id)
 INTERFACE=$(basename "$DEVICE"):1.0
 board traffic 100 mix
 
-# after_a_while TENTHS: sleeps 0.3 s and up to so many tenths more.
+# after_a_while TENTHS: sleeps for 0.3 s and up to this many tenths more.
 after_a_while() { sleep "$(awk -v n="$(random "$1")" 'BEGIN { print 0.3 + n / 10 }')"; }
 
 _bad=0
@@ -70,7 +70,8 @@ wait_until has_no_port
 attach
 check "the device works after its own restart" info
 
-# away_and_back COMMAND...: takes the device away at some time of a client's life, and gives it back. One that had not begun yet ends with 1.
+# away_and_back COMMAND...: takes the device away at some point of a client's life, and gives it back. A client that had not begun yet ends
+# with 1.
 away_and_back() {
   start -t 60
   after_a_while 12

@@ -1,6 +1,6 @@
 #!/bin/sh
 # shellcheck shell=dash
-# Behind a high-speed hub, with hosts that leave 250 us or more from one packet to the next: 0.26 MB/s, and half of it.
+# Behind a high-speed hub, with hosts that leave at least 250 us from one packet to the next: 0.26 MB/s, and half of that.
 
 has_port || attach
 board pace real

@@ -1,6 +1,7 @@
 #!/bin/sh
 # shellcheck shell=dash
-# ModemManager looks at every new serial port. It must do no harm: no channel opened, not one dominant bit, and what follows works.
+# ModemManager probes every new serial port. It must do no harm: no channel is opened, not a single dominant bit is sent, and what follows
+# works.
 
 has_port || attach
 
@@ -37,13 +38,13 @@ modem_manager() {
   wait $_manager 2> /dev/null
 }
 
-# It knows by the interface's protocol that nobody understands AT there.
+# The interface's protocol tells it that nothing there understands AT commands.
 modem_manager "" "ttyACM[0-9].*port filtered"
 check "ModemManager as Debian ships it leaves the port alone" grep "ttyACM[0-9].*port filtered" /share/mm.txt
 check "ModemManager as Debian ships it: the bus is silent" no_harm
 capture_is_exact "a capture after ModemManager"
 
-# The same where somebody has told it to try every protocol it knows.
+# The same when it is configured to try every protocol it knows.
 modem_manager 'SUBSYSTEMS=="usb", ATTRS{manufacturer}=="cantap", ENV{ID_MM_DEVICE_PROCESS}="1"' "task 0: finished"
 grep -E "ttyACM[0-9]/[a-z]+\] (-->|<--)" /share/mm.txt
 check "ModemManager probes the port where it is told to" grep -q "ttyACM[0-9]/at.*--> 'AT<CR>'" /share/mm.txt

@@ -1,6 +1,6 @@
 #!/bin/sh
 # shellcheck shell=dash
-# `cantap serve` on the board: a capture through it is exact, and a server that is killed leaves a silent board and clients that know it.
+# `cantap serve` on the board: a capture through it is exact, and a killed server leaves a silent board, and clients that know about it.
 
 has_port || attach
 board traffic 50 mix
@@ -11,7 +11,7 @@ serve() {
   SERVER=$!
   wait_until grep -q "Ctrl-C ends it" serve.err || { cat serve.err; return 1; }
 }
-# A client that acknowledges, so that the board is not silent by itself.
+# A client that acknowledges, so that the board is not silent anyway.
 client() {
   rm -f capture.log capture.json
   "$CANTAP" capture -d unix:/work/serve.sock -b 1M --mode normal -o capture.log --json "$@" > capture.json 2> capture.err &

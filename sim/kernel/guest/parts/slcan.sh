@@ -1,6 +1,6 @@
 #!/bin/sh
 # shellcheck shell=dash
-# The kernel's slcan driver, set up by slcand and by ip, with can-utils on top.
+# The kernel's slcan driver, set up by slcand and by ip, with can-utils on top of it.
 
 has_port || attach
 
@@ -10,7 +10,8 @@ listen() {
   CANDUMP=$!
   sleep 0.5
 }
-# heard: waits until nothing more comes, and leaves in heard.txt what candump had, without the DLC of remote frames.
+# heard: waits until nothing more arrives, and leaves in heard.txt what candump printed, without the DLC of remote
+# frames.
 heard() {
   settled
   sleep 0.3

@@ -24,7 +24,8 @@ board noise 0
 [ "$(counter rx_errors)" -gt 0 ] && [ "$(counter rx_over_errors)" = 0 ]
 verdict $? "slcan's reports: bus errors reach the interface's counters" "$(counter rx_errors) errors"
 
-# A frame that nobody acknowledges makes the sender error passive (ISO 11898-1, fault confinement), and it stays so.
+# A frame that nobody acknowledges makes the sender error passive (ISO 11898-1, fault confinement), and it stays
+# that way.
 board acknowledge no
 cansend can0 123#11
 check "slcan's reports: a frame that nobody acknowledges makes the interface error passive" wait_until is_in_state ERROR-PASSIVE
@@ -34,7 +35,7 @@ board acknowledge yes
 cangen -g 5 -n 60 -I 124 -L 0 -p 10 can0
 check "slcan's reports: error active again when frames are acknowledged" wait_until is_in_state ERROR-ACTIVE
 
-# A host that fetches a packet in 4 ms does not carry a full bus; the queue holds about a second of it.
+# A host that fetches a packet every 4 ms cannot keep up with a full bus; the queue holds about a second of it.
 _errors=$(counter rx_errors)
 _packets=$(counter rx_packets)
 board pace real
@@ -55,7 +56,7 @@ ip link set can0 down
 killall ldattach
 sleep 1
 
-# slcand sends no `K1`; what was saved counts.
+# slcand sends no `K1`; the saved setting applies.
 board traffic 0 mix
 saves() {
   stty -F "$PORT" raw -echo && (

@@ -12,12 +12,13 @@ is_active() { [ "$(cat "$DEVICE/power/runtime_status")" = active ]; }
 echo 0 > "$DEVICE/power/autosuspend_delay_ms"
 echo auto > "$DEVICE/power/control"
 check "the kernel suspends it while its port is closed" wait_until is_suspended
-# The kernel's virtual controller tells its far end nothing of this.
+# The kernel's virtual controller does not tell its far end about this.
 board suspend
 sleep 0.2
 capture_is_exact "a capture wakes it"
 
-# A driver whose port is open keeps the device awake, as long as nobody can wake it remotely.
+# A driver keeps the device awake while its port is open, as long as the device cannot wake the
+# host.
 stream -t 3
 check "an open port keeps it awake" is_active
 wait "$CAPTURE"

@@ -1,7 +1,7 @@
 #!/bin/sh
 # shellcheck shell=dash
 # The same device on a host controller that QEMU emulates, xHCI, by usbredir: the kernel's driver for it, with its resets, addresses and
-# halts. Only once in a guest's life: QEMU does not connect again.
+# halts. Only once per boot of the guest: QEMU does not reconnect.
 
 quiet_on_xhci() {
   ! dmesg | grep -E "usb [0-9]+-[0-9]+|xhci" | grep -iE "error|unable|invalid|fail|warning|not respond"

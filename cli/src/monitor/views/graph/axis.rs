@@ -1,18 +1,18 @@
-//! The graph's ticks: values at the left, times of day below.
+//! The graph's ticks: values on the left, times of day below.
 
 use cantap_analysis::plot::scale::{label, ticks, time_ticks};
 
 use super::super::super::times::clock;
 use super::curve::Time;
 
-/// Columns for the values at the left, the tick's own included.
+/// Columns for the values on the left, including the tick itself.
 pub const GUTTER: u16 = 10;
-/// Columns that a time needs beside its neighbours.
+/// Columns needed for a time, including the distance to its neighbours.
 const TIME_COLUMNS: usize = 16;
-/// Rows between values.
+/// Number of rows between values.
 const VALUE_ROWS: usize = 3;
 
-/// The labels of values, each with its row, of a pane with this many rows.
+/// The labels of values, each with its row, for a pane with this many rows.
 pub fn values([low, high]: [f64; 2], rows: u16) -> Vec<(u16, String)> {
     if rows == 0 || high.total_cmp(&low).is_le() {
         return Vec::new();
@@ -31,11 +31,11 @@ pub fn values([low, high]: [f64; 2], rows: u16) -> Vec<(u16, String)> {
     labels
 }
 
-/// The line below the curves: times of day where they are.
+/// The line below the curves: times of day at their positions.
 pub fn times(time: Time, tick: char) -> String {
     const DAY_NS: i64 = 86_400_000_000_000;
     let mut line = vec![' '; time.columns];
-    // Counted from midnight, so that ticks stand at round times of day.
+    // Counted from midnight, so that ticks are at round times of day.
     let midnight = time.from_ns.div_euclid(DAY_NS).saturating_mul(DAY_NS);
     let from = time.from_ns.saturating_sub(midnight) as f64 / 1e9;
     let range = (from, from + time.span_ns as f64 / 1e9);

@@ -1,34 +1,34 @@
-//! One curve, dot by dot: in each column of dots from the smallest to the largest of the values that fall into it.
+//! One curve, dot by dot: each column of dots extends from the smallest to the largest value in it.
 
 use ratatui::style::Color;
 use ratatui::widgets::canvas::{Painter, Shape};
 
 use super::super::super::model::{Column, Point, Series};
 
-/// A stretch of time in columns of the same length.
+/// A stretch of time in columns of equal length.
 #[derive(Clone, Copy, Debug)]
 pub struct Time {
-    /// Where it begins, in nanoseconds as in a record.
+    /// Its beginning, in nanoseconds as in a record.
     pub from_ns: i64,
     /// Its length, in nanoseconds.
     pub span_ns: i64,
-    /// Its columns.
+    /// Number of columns.
     pub columns: usize,
 }
 
 impl Time {
-    /// When a column begins; the one behind the last is the end.
+    /// The beginning of a column; for the one after the last, the end.
     fn start(&self, column: usize) -> i64 {
         let ahead = i128::from(self.span_ns) * column as i128 / self.columns.max(1) as i128;
         self.from_ns.saturating_add(ahead as i64)
     }
 
-    /// The column that a time is in, as a number with a fraction; outside of the stretch, too.
+    /// The column of a time, as a number with a fraction; also outside the stretch.
     fn column(&self, time_ns: i64) -> f64 {
         (time_ns as f64 - self.from_ns as f64) / self.span_ns.max(1) as f64 * self.columns as f64
     }
 
-    /// The column that a time is in, if it is one of these; the end is in the last.
+    /// The column of a time, if it is one of these; the end belongs to the last.
     pub fn place(&self, time_ns: i64) -> Option<usize> {
         let ahead = i128::from(time_ns) - i128::from(self.from_ns);
         let is_in = (0..=i128::from(self.span_ns)).contains(&ahead) && self.columns > 0;
@@ -37,19 +37,19 @@ impl Time {
     }
 }
 
-/// What a signal did in a stretch of time.
+/// A signal's course in a stretch of time.
 pub struct Trail {
     time: Time,
-    /// For each column, what falls into it.
+    /// The content of each column.
     columns: Vec<Option<Column>>,
     before: Option<Point>,
     after: Option<Point>,
 }
 
 impl Trail {
-    /// Looks into a signal's values.
+    /// Evaluates a signal's values.
     pub fn new(series: &Series, time: Time) -> Self {
-        // The end itself belongs to the last column: there the newest value is.
+        // The end itself belongs to the last column, where the newest value is.
         let end = |column| time.start(column + 1).saturating_add(i64::from(column + 1 == time.columns));
         let columns = (0..time.columns).map(|column| series.column(time.start(column), end(column)));
         let until = time.start(time.columns).saturating_add(1);
@@ -61,22 +61,23 @@ impl Trail {
         }
     }
 
-    /// For each column, what falls into it.
+    /// The content of each column.
     pub fn columns(&self) -> &[Option<Column>] {
         &self.columns
     }
 
-    /// The value at the beginning, if one came before.
+    /// The value at the beginning, if there was one before.
     pub fn before(&self) -> Option<f64> {
         self.before.map(|point| point.value)
     }
 
-    /// Whether a value before the stretch or after it continues what is in it.
+    /// Whether a value before or after the stretch continues its content.
     pub const fn goes_on(&self) -> bool {
         self.after.is_some()
     }
 
-    /// The smallest and the largest value in sight, of what is held from before or, with lines, leads out, too.
+    /// The smallest and the largest visible value, including one held from before or, with lines, one that
+    /// leads out.
     pub fn extremes(&self, lines: bool) -> Option<(f64, f64)> {
         let mut inside = self.columns.iter().flatten();
         let held = self.before.filter(|_| inside.clone().next().is_none_or(|first| !first.after_gap));
@@ -87,17 +88,17 @@ impl Trail {
     }
 }
 
-/// A curve to be painted.
+/// A curve to be drawn.
 pub struct Curve<'a> {
-    /// What it is of.
+    /// The signal's course.
     pub trail: &'a Trail,
-    /// The values at the lower and the upper edge.
+    /// The values at the lower and upper edge.
     pub range: [f64; 2],
-    /// Rows of dots.
+    /// Number of rows of dots.
     pub rows: usize,
     /// Its colour.
     pub colour: Color,
-    /// Straight lines between values, in place of steps.
+    /// Straight lines between values instead of steps.
     pub lines: bool,
 }
 
@@ -113,7 +114,7 @@ impl Curve<'_> {
         (top..=bottom).for_each(|row| painter.paint(column, row, self.colour));
     }
 
-    /// From one value to the next one, whose columns may lie outside.
+    /// Joins one value to the next, whose columns may lie outside.
     fn join(&self, painter: &mut Painter<'_, '_>, from: Point, to: Point) {
         let time = &self.trail.time;
         let (start, end) = (time.column(from.time_ns), time.column(to.time_ns));
@@ -151,7 +152,7 @@ impl Shape for Curve<'_> {
             from = (!column.before_gap).then_some(column.last);
         }
         if let (Some(from), Some(to)) = (from, after) {
-            // Up to the edge; where nothing comes after it, the curve ends with its last value.
+            // Up to the edge; if nothing comes after it, the curve ends with its last value.
             let to = if self.lines { *to } else { Point { value: from.value, ..*to } };
             self.join(painter, from, to);
         }

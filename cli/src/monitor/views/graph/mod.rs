@@ -1,4 +1,5 @@
-//! Curves of the chosen signals: analogue ones by unit, digital ones below each other, over the same time, with two cursors.
+//! Curves of the chosen signals: analogue ones by unit, digital ones below each other, on the same time axis, with two
+//! cursors.
 
 mod axis;
 mod curve;
@@ -21,7 +22,7 @@ use super::signals::short;
 use axis::GUTTER;
 use curve::{Curve, Time, Trail};
 
-/// Where there are fewer columns, values have no place at the left.
+/// With fewer columns, there is no room for values on the left.
 const LEAST_WITH_GUTTER: u16 = 50;
 /// The cursors' names.
 const CURSORS: [char; 2] = ['A', 'B'];
@@ -34,22 +35,22 @@ struct Chosen<'a> {
     colour: usize,
 }
 
-/// What all panes share.
+/// What all panes have in common.
 struct Page<'a> {
     app: &'a App,
     seen: &'a Seen,
-    /// Where the curves are; the rows of each pane its own.
+    /// The columns of the curves; each pane has its own rows.
     columns: Rect,
     from_ns: i64,
 }
 
-/// Signals with two states are drawn as such.
+/// Whether a signal has two states and is drawn as such.
 fn is_digital(row: &SignalRow, seen: &Seen) -> bool {
     let signal = seen.signals.signal(row);
     signal.digital.is_some() || signal.length == 1
 }
 
-/// The signal's name; with its channel where another chosen one has the same.
+/// The signal's name, with its channel if another chosen one has the same name.
 fn name(row: &SignalRow, seen: &Seen) -> String {
     let own = &seen.signals.signal(row).name;
     let others =
@@ -83,7 +84,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
     let mut heights: Vec<_> = panes.iter().map(|_| Constraint::Fill(1)).collect();
     heights.extend(lanes.iter().map(|_| Constraint::Length(2)));
     if panes.is_empty() {
-        // Lanes stand at the top.
+        // Lanes are at the top.
         heights.push(Constraint::Fill(1));
     }
     heights.extend([Constraint::Length(1), Constraint::Length(1)]);
@@ -115,7 +116,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
     }
 }
 
-/// Said where the window begins before the oldest value.
+/// Shown if the window begins before the oldest value.
 fn not_kept_before(oldest_ns: i64) -> String {
     format!("before {} nothing is kept (--history)", clock(oldest_ns, 0))
 }
@@ -130,10 +131,10 @@ impl Page<'_> {
         CURSORS.into_iter().zip(self.app.graph.cursors).filter_map(|(name, at)| Some((name, at?)))
     }
 
-    /// A signal's value; its values at the cursors and their difference, where there are any.
+    /// A signal's value; its values at the cursors and their difference, if there are any.
     fn values(&self, chosen: Chosen<'_>, text: impl Fn(f64) -> String) -> String {
         let at: Vec<_> = self.cursors().map(|(name, time_ns)| (name, chosen.series.at(time_ns))).collect();
-        // At a cursor there may have been no value yet.
+        // There may have been no value yet at a cursor.
         let said = |value: Option<f64>| value.map_or("–".to_owned(), &text);
         match at[..] {
             [] => text(chosen.row.value),
@@ -149,7 +150,7 @@ impl Page<'_> {
     fn analogue(&self, frame: &mut Frame<'_>, area: Rect, label: &str, rows: &[Chosen<'_>]) {
         let theme = self.app.theme;
         let graph = &self.app.graph;
-        // A cell of Braille is two dots wide and four high.
+        // A Braille cell is two dots wide and four high.
         let dots = if theme.unicode { (2, 4) } else { (1, 1) };
         let time = self.time(usize::from(self.columns.width) * dots.0);
         let trails: Vec<_> = rows.iter().map(|chosen| Trail::new(chosen.series, time)).collect();
@@ -209,7 +210,7 @@ impl Page<'_> {
         frame.render_widget(canvas, place);
     }
 
-    /// A digital signal: its name, and high or low per column, or both.
+    /// A digital signal: its name, and for each column high, low, or both.
     fn lane(&self, frame: &mut Frame<'_>, area: Rect, chosen: Chosen<'_>) {
         let theme = self.app.theme;
         let signal = self.seen.signals.signal(chosen.row);
@@ -261,8 +262,8 @@ impl Page<'_> {
         frame.render_widget(Paragraph::new(text), area);
     }
 
-    /// Times of day below the curves, and the cursors' names where they stand. Where nothing is kept any more, that is said in place of
-    /// times, if there is room; returns whether it was.
+    /// Times of day below the curves, and the cursors' names at their positions. If older values have been dropped, that is shown
+    /// instead of times if there is room; returns whether it was.
     fn times(&self, frame: &mut Frame<'_>, area: Rect, not_kept: Option<i64>) -> bool {
         let time = self.time(usize::from(self.columns.width));
         let tick = if self.app.theme.unicode { '╵' } else { '|' };
@@ -290,7 +291,7 @@ impl Page<'_> {
         is_said
     }
 
-    /// The window's length, where the cursors are, and what is not in sight.
+    /// The window's length, the cursors' positions, and what is out of sight.
     fn said(&self, not_kept: Option<i64>) -> Line<'static> {
         let theme = self.app.theme;
         let graph = &self.app.graph;

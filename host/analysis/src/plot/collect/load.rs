@@ -16,7 +16,7 @@ pub struct LoadCollector {
 }
 
 impl LoadCollector {
-    /// Nothing collected yet. Without a bit rate it shows frames per second.
+    /// Nothing has been collected yet. Without a bit rate it shows frames per second.
     pub fn new(options: Options) -> Result<Self, BadOptions> {
         let in_per_cent = options.bitrate_bps.is_some() || !options.channel_bitrate_bps.is_empty();
         Ok(Self {
@@ -46,7 +46,7 @@ impl LoadCollector {
         let curves: Vec<_> = self.channels.into_iter().map(|(_, curve)| curve).collect();
         let points = curves.iter().flat_map(|curve| curve.series.points());
         let most = points.map(|point| point.y).fold(0.0, f64::max);
-        // From zero, so that heights compare; a quiet bus should not be a line at the bottom.
+        // From zero, so that heights can be compared; a quiet bus should not be a line at the bottom.
         let top = [5.0, 10.0, 20.0, 50.0, 100.0].into_iter().find(|top| *top >= most).unwrap_or(100.0);
         let (label, range) = if in_per_cent { ("load %", Some((0.0, top))) } else { ("frames/s", None) };
         let pane = Pane { label: label.to_owned(), range, content: Content::Analogue(curves) };
@@ -61,7 +61,7 @@ fn add_window(window: &Window, axis: &mut TimeAxis, channels: &mut Vec<(u8, Curv
         channels.len() - 1
     });
     let y = match window.load_pct {
-        // All its frames are missing: nothing is known. One that lacks some is drawn, as the lower bound that it is.
+        // If all its frames are missing, nothing is known. If only some are, it is drawn as a lower bound.
         _ if window.incomplete && window.frames == 0 => f64::NAN,
         Some(load) if in_per_cent => load,
         _ if in_per_cent => f64::NAN,

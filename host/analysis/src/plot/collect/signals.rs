@@ -9,10 +9,10 @@ use crate::Cadence;
 use cantap_signals::{Decoder, MessageRef, Signal, SignalValue};
 use cantap_trace::TraceRecord;
 
-/// Curves in one picture, unless more are asked for: they could hardly be told apart.
+/// The default limit of curves in one picture: more could hardly be told apart.
 pub const MOST_CURVES: usize = 24;
 
-/// Collects the curves of the signals that a decoder has selected.
+/// Collects the curves of the signals selected in a decoder.
 pub struct SignalCollector<'a> {
     decoder: &'a Decoder,
     axis: TimeAxis,
@@ -37,7 +37,7 @@ struct Collected {
 }
 
 impl<'a> SignalCollector<'a> {
-    /// Nothing collected yet.
+    /// Nothing has been collected yet.
     pub fn new(decoder: &'a Decoder) -> Self {
         Self {
             decoder,
@@ -52,7 +52,7 @@ impl<'a> SignalCollector<'a> {
         }
     }
 
-    /// Draws up to this many curves, in place of [`MOST_CURVES`].
+    /// Draws up to this many curves instead of [`MOST_CURVES`].
     #[must_use]
     pub fn with_most_curves(self, most_curves: usize) -> Self {
         Self { most_curves, ..self }
@@ -105,7 +105,7 @@ impl<'a> SignalCollector<'a> {
             }
         };
         let collected = &mut curves[place];
-        // Nobody knows what it was while it was silent: a line would say so.
+        // Its value while it was silent is unknown: a line would suggest otherwise.
         if collected.cadence.arrive(record.time_ns) {
             collected.curve.series.interrupt();
         }
@@ -123,22 +123,23 @@ impl<'a> SignalCollector<'a> {
         collected.curve.series.push(x, y);
     }
 
-    /// Values of signals that found no room among the most curves.
+    /// The number of values of signals beyond the limit of curves.
     pub fn left_out(&self) -> u64 {
         self.left_out
     }
 
-    /// Whether any signal was seen.
+    /// Whether there are no curves.
     pub fn is_empty(&self) -> bool {
         self.curves.is_empty()
     }
 
-    /// The picture: a pane per unit (and per this many curves as there are colours), one per signal without a unit, and a last one for digital signals.
+    /// The picture: a pane per unit (and per this many curves as there are colours), one per signal without a unit, and a last one for digital
+    /// signals.
     pub fn finish(mut self, title: String) -> Plot {
         self.name_curves();
         let mut panes: Vec<Pane> = Vec::new();
         let mut digital = Vec::new();
-        // Signals come in the order of their first frames; by message and place they are easier to find.
+        // Signals come in the order of their first frames, but are easier to find by message and position.
         self.curves.sort_by_key(|collected| (collected.channel, collected.message, collected.signal));
         for collected in self.curves {
             let signal = &self.decoder.message(collected.message).signals[collected.signal as usize];
@@ -168,7 +169,7 @@ impl<'a> SignalCollector<'a> {
         Plot { title, axis: self.axis.axis(), panes, gaps: self.gaps.finish(self.end) }
     }
 
-    /// The signal's name; with its message and channel where it would not be the only one.
+    /// Names curves by signal, adding message and channel where the name would be ambiguous.
     fn name_curves(&mut self) {
         let names: Vec<_> = self
             .curves
@@ -193,7 +194,7 @@ impl<'a> SignalCollector<'a> {
     }
 }
 
-/// Panes of one unit show the same range, so that their heights compare.
+/// Gives panes with the same unit the same range, so that their heights can be compared.
 fn share_scales(panes: &mut [Pane]) {
     for first in 0..panes.len() {
         let label = panes[first].label.clone();
@@ -211,7 +212,7 @@ fn share_scales(panes: &mut [Pane]) {
     }
 }
 
-/// Most values of a table that an axis names.
+/// Limit on the texts of a table on an axis.
 const MOST_TEXTS: usize = 64;
 
 fn curve_of(signal: &Signal) -> Curve {
@@ -221,7 +222,7 @@ fn curve_of(signal: &Signal) -> Curve {
         texts: texts.map(|(raw, text)| (value(raw), text.to_owned())).collect(),
         whole: signal.integer(0).is_some() && signal.factor.fract() == 0.0 && signal.offset.fract() == 0.0,
         colour: signal.colour.map(|colour| [colour.red, colour.green, colour.blue]),
-        // A gear or a state has nothing between its values.
+        // A gear or state has no values in between.
         stepped: !signal.values.is_empty() || signal.digital.is_some() || signal.length == 1,
         alarm_below: signal.alarms.min,
         alarm_above: signal.alarms.max,
@@ -278,7 +279,7 @@ mod tests {
         assert_eq!(states, [0.0, 1.0, 1.0]);
     }
 
-    /// Twenty-five minutes without a frame are not a straight line.
+    /// Twenty-five minutes without a frame must not become a straight line.
     #[test]
     fn silence_interrupts_a_curve() {
         let decoder = decoder();

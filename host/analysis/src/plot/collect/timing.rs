@@ -1,12 +1,12 @@
-//! How long an identifier's periods are.
+//! The lengths of an identifier's periods.
 
 use super::super::{Axis, Content, Histogram, Pane, Plot};
 use cantap_trace::{Id, TraceEvent, TraceRecord};
 
-/// Bars of a histogram.
+/// Number of bars in a histogram.
 const HISTOGRAM_BARS: usize = 80;
 
-/// Collects how long the intervals between an identifier's frames are.
+/// Collects the lengths of the intervals between an identifier's frames.
 pub struct TimingCollector {
     id: Id,
     channels: Vec<ChannelTiming>,
@@ -19,7 +19,7 @@ struct ChannelTiming {
 }
 
 impl TimingCollector {
-    /// Nothing collected yet.
+    /// Nothing has been collected yet.
     pub fn new(id: Id) -> Self {
         Self { id, channels: Vec::new() }
     }
@@ -48,7 +48,7 @@ impl TimingCollector {
         }
     }
 
-    /// The picture, a pane per channel; empty where there are not two frames.
+    /// The picture, with a pane per channel; empty if there are not two frames.
     pub fn finish(mut self, title: String) -> Plot {
         self.channels.sort_by_key(|timing| timing.channel);
         let mut outside_all = 0;

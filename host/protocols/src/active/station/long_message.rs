@@ -1,23 +1,23 @@
-//! Messages of many frames, in and out (J1939-21, 5.10).
+//! Messages of many frames, incoming and outgoing (J1939-21, 5.10).
 
 use cantap_wire::Frame;
 
 use super::words::{CONTROL, DATA, GLOBAL, MOST_BYTES, MS, StationError, frame, three};
 use crate::j1939::Header;
 
-/// Between the frames of a message to all: 50 to 200 ms.
+/// Time between the frames of a message to all: 50 to 200 ms.
 const BROADCAST_GAP_NS: u64 = 50 * MS;
-/// The next frame of a message (T1).
+/// Timeout for the next frame of a message (T1).
 const NEXT_NS: u64 = 750 * MS;
-/// The first frame after clear to send (T2), and clear to send after the last frame (T3).
+/// Timeout for the first frame after clear to send (T2), and for clear to send after the last frame (T3).
 const PEER_NS: u64 = 1250 * MS;
-/// While the receiver holds the connection open (T4).
+/// Timeout while the receiver holds the connection open (T4).
 const HOLD_NS: u64 = 1050 * MS;
-/// Frames for one clear to send.
+/// Frames per clear to send.
 const BLOCK: u8 = 16;
-/// How often frames of one message are asked for again.
+/// How often frames of one message may be requested again.
 const MOST_RETRIES: u32 = 5;
-/// How often in a row a receiver may say to wait.
+/// How often in a row a receiver may ask to wait.
 const MOST_HOLDS: u32 = 60;
 
 fn frames_of(length: usize) -> u8 {
@@ -30,18 +30,18 @@ pub(super) fn abort(from: u8, to: u8, pgn: u32, reason: u8) -> Frame {
     frame(7, CONTROL, from, to, &[255, reason, 255, 255, 255, a, b, c])
 }
 
-/// A message that comes in.
+/// An incoming message.
 #[derive(Debug)]
 pub(super) struct Incoming {
     header: Header,
     pgn: u32,
     length: usize,
     total: u8,
-    /// The most frames for one clear to send.
+    /// The most frames per clear to send.
     most: u8,
     data: Vec<u8>,
     next: u8,
-    /// The last frame that was asked for.
+    /// The last frame that was requested.
     asked: u8,
     is_asked: bool,
     until_ns: u64,
@@ -99,12 +99,12 @@ impl Incoming {
         self.data
     }
 
-    /// At once while clear to send is to be said.
+    /// Immediately if clear to send must be sent.
     pub const fn due_ns(&self) -> u64 {
         if self.is_asked { self.until_ns } else { 0 }
     }
 
-    /// Asks for the next frames, or gives up, with the last word to the sender.
+    /// Requests the next frames, or gives up, with a final frame for the sender.
     pub fn next(&mut self, now_ns: u64, own: u8) -> Result<Option<Frame>, (StationError, Option<Frame>)> {
         if self.is_asked && now_ns >= self.until_ns {
             let after_ms = (if self.next == 1 && !self.to_all() { PEER_NS } else { NEXT_NS }) / MS;
@@ -129,12 +129,12 @@ impl Incoming {
         Ok(Some(frame(7, CONTROL, own, self.from(), &[17, count, self.next, 255, 255, a, b, c])))
     }
 
-    /// Takes a frame; whether the message is whole.
+    /// Takes a frame; returns whether the message is complete.
     pub fn take(&mut self, now_ns: u64, data: [u8; 8]) -> bool {
         if !self.is_asked {
             return false;
         }
-        // What does not follow is asked for again when the time is over, or when the last one of those asked for has come.
+        // Missing frames are requested again after the timeout, or when the last of those requested has arrived.
         if data[0] == self.next {
             self.data.extend_from_slice(&data[1..]);
             self.until_ns = now_ns + NEXT_NS;
@@ -151,7 +151,7 @@ impl Incoming {
         false
     }
 
-    /// What the sender is told of a message that is whole.
+    /// The final frame to the sender of a complete message.
     pub fn last_word(&self, own: u8) -> Option<Frame> {
         let [low, high] = (self.length as u16).to_le_bytes();
         let [a, b, c] = three(self.pgn);
@@ -163,23 +163,23 @@ impl Incoming {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum State {
     New,
-    /// Announced to all, or frames of it sent: when the next may be.
+    /// Announced to all, or frames sent: when the next may follow.
     Gap {
         next_ns: Option<u64>,
     },
-    /// The receiver is to say something, from the last confirmation on.
+    /// Waiting for the receiver, since the last confirmation.
     Awaits {
         timeout_ns: u64,
         until_ns: Option<u64>,
     },
-    /// Frames up to this one were asked for.
+    /// Frames up to this one were requested.
     Sends {
         up_to: u8,
     },
     Done,
 }
 
-/// A message that goes out.
+/// An outgoing message.
 #[derive(Debug)]
 pub(super) struct Outgoing {
     own: u8,
@@ -187,7 +187,7 @@ pub(super) struct Outgoing {
     pgn: u32,
     data: Vec<u8>,
     next: u8,
-    /// The highest number that was sent.
+    /// The highest sequence number sent.
     reached: u8,
     state: State,
     under_way: u32,
@@ -238,7 +238,7 @@ impl Outgoing {
         frame(7, DATA, self.own, self.to, &bytes)
     }
 
-    /// The frame to be sent now. The error has a last word to the receiver.
+    /// The next frame to send now. The error includes a final frame to the receiver.
     pub fn next(&mut self, now_ns: u64) -> Result<Option<Frame>, (StationError, Frame)> {
         let total = frames_of(self.data.len());
         let [low, high] = (self.data.len() as u16).to_le_bytes();
@@ -291,7 +291,7 @@ impl Outgoing {
         }
     }
 
-    /// The receiver has said something.
+    /// Takes a control frame from the receiver.
     pub fn control(&mut self, now_ns: u64, data: [u8; 8]) -> Result<(), StationError> {
         let total = frames_of(self.data.len());
         match data[0] {
@@ -304,7 +304,8 @@ impl Outgoing {
                 }
                 self.state = State::Awaits { timeout_ns: HOLD_NS, until_ns: Some(now_ns + HOLD_NS) };
             }
-            // Clear to send while frames are under way is not to be (J1939-21); they are confirmed soon.
+            // Clear to send is not allowed while frames are in flight (J1939-21); they will be confirmed
+            // soon.
             17 => {
                 let (count, next) = (data[1], data[2]);
                 let is_again = next <= self.reached;

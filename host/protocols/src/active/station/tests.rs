@@ -8,7 +8,7 @@ fn bytes(length: usize) -> Vec<u8> {
     (0..length).map(|at| (at * 3 + 1) as u8).collect()
 }
 
-/// Says frames.
+/// A frame of a message.
 fn of(source: u8, pgn: u32, to: u8, data: &[u8]) -> Frame {
     frame(6, pgn, source, to, data)
 }
@@ -26,7 +26,7 @@ fn an_address_is_claimed_for_a_quarter_of_a_second() {
     assert_eq!((station.address(), station.finish()), (0x80, Ok(vec![])));
 }
 
-/// The lower NAME goes first; who can takes another address; who cannot gives up, and says so to all.
+/// The lower NAME wins; a node that can takes another address; one that cannot gives up, and announces it.
 #[test]
 fn an_address_that_is_taken_is_given_up() {
     let claims = |own: u64, other: u64| {
@@ -38,7 +38,7 @@ fn an_address_that_is_taken_is_given_up() {
         };
         let mut once = 0;
         let mut station = Station::new(own, 0x80, StationJob::Claim);
-        // A peer that objects again and again would be one that has not understood.
+        // A peer that objected repeatedly would be misbehaving.
         let mut peer = |id: Id, data: &[u8], say: &mut Say| {
             once += 1;
             if once == 1 {
@@ -77,7 +77,7 @@ fn a_group_is_asked_for_and_answered_in_every_way() {
         say.push((3 * MS, of(3, 0xFECA, GLOBAL, &data)));
     });
     assert_eq!(answers, Ok(vec![one(3)]));
-    // From all: as many as there are.
+    // From all: as many answers as there are.
     let (answers, _) = request(GLOBAL, |say| {
         say.push((MS, of(4, 0xFECA, GLOBAL, &data)));
         say.push((3 * MS, of(3, 0xFECA, GLOBAL, &data)));
@@ -101,12 +101,12 @@ fn a_group_is_asked_for_and_answered_in_every_way() {
         }
     });
     assert_eq!(answers, Ok(vec![GroupAnswer { from: 3, data: long }]));
-    // Who says it every second by himself is heard for as long as anybody else.
+    // A node that sends it every second on its own is heard for as long as the others.
     let (answers, _) = request(GLOBAL, |say| {
         say.extend((0..200).map(|at| (at * 1000 * MS, of(4, 0xFECA, GLOBAL, &data))));
     });
     assert_eq!(answers, Ok(vec![one(4), one(4)]));
-    // One that stops in the middle.
+    // An answer that stops in the middle.
     let (answers, _) = request(3, |say| {
         say.push((MS, of(3, CONTROL, GLOBAL, &[32, 20, 0, 3, 255, 0xCA, 0xFE, 0])));
         say.push((2 * MS, of(3, DATA, GLOBAL, &[1; 8])));
@@ -114,7 +114,8 @@ fn a_group_is_asked_for_and_answered_in_every_way() {
     assert_eq!(answers, Err(StationError::Silent { from: 3, after_ms: 750, done: 1, total: 3 }));
 }
 
-/// Two stations: one sends, the other asks for the frames. What arrives is what was sent, whatever is dropped, doubled or swapped.
+/// Two stations: one sends, the other requests the frames. Whatever arrives is what was sent, no matter what is dropped, doubled
+/// or swapped.
 #[test]
 fn long_messages_arrive_whole_or_not_at_all() {
     let mut random = fastrand::Rng::with_seed(1939);
@@ -179,7 +180,7 @@ fn a_message_to_all_keeps_its_distances() {
     assert!(took_ns >= 150 * MS, "{took_ns}");
 }
 
-/// A receiver that lies has an error for it, in bounded time.
+/// Every misbehaviour of a receiver gives an error in bounded time.
 #[test]
 fn whatever_the_receiver_does_there_is_an_end() {
     let send = |lie: &dyn Fn(u8, &mut Say)| {
@@ -199,7 +200,7 @@ fn whatever_the_receiver_does_there_is_an_end() {
         }),
         StationError::Aborted { from: 3, reason: 2 }
     );
-    // Waits for ever, asks for the same for ever, asks for what there is not.
+    // Waits for ever, requests the same for ever, requests frames that do not exist.
     let holds = |first: u8, say: &mut Say| {
         if first == 16 {
             say.extend((0..200).map(|at| (at * 500 * MS, control([17, 0, 255]))));
@@ -212,7 +213,7 @@ fn whatever_the_receiver_does_there_is_an_end() {
     assert!(matches!(send(&beyond), StationError::Endless { .. }));
 }
 
-/// Who asks who is there is told.
+/// A request for address claims is answered.
 #[test]
 fn the_address_is_told_to_who_asks_for_it() {
     let mut station = Station::with_address(NAME, 0x80, StationJob::Request { pgn: 0xFECA, to: 3 });

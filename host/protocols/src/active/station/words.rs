@@ -1,4 +1,4 @@
-//! What a station and its long messages share.
+//! What a station and its long messages have in common.
 
 use cantap_wire::Frame;
 
@@ -15,54 +15,55 @@ pub(super) const MOST_BYTES: usize = 1785;
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum StationError {
-    /// Another node has the address, and a NAME that goes first.
+    /// Another node has the address, with a NAME of higher priority.
     #[error(
         "the address {address} is taken by the node with the NAME {name:016X}, and there is none left to take"
     )]
     AddressTaken {
         /// The address that was tried last.
         address: u8,
-        /// The NAME of who has it.
+        /// The NAME of the node that has it.
         name: u64,
     },
     /// Nobody answered the request.
     #[error("no answer within {after_ms} ms")]
     NoAnswer {
-        /// How long was waited.
+        /// How long we waited.
         after_ms: u64,
     },
-    /// The request was answered that there will be none.
+    /// The request was answered with a refusal.
     #[error("node {from} answers: {}", acknowledgement(*control))]
     NotAcknowledged {
-        /// Who.
+        /// The node.
         from: u8,
-        /// Why, from 1.
+        /// The reason, from 1.
         control: u8,
     },
-    /// The other side ended a message of many frames.
+    /// The other side aborted a message of many frames.
     #[error("node {from} aborted the message: {}", abort_reason(*reason))]
     Aborted {
-        /// Who.
+        /// The node.
         from: u8,
-        /// Why.
+        /// The reason.
         reason: u8,
     },
-    /// The other side of a message of many frames went silent.
+    /// The other side of a message of many frames fell silent.
     #[error("nothing came from node {from} for {after_ms} ms, after {done} of {total} frames of the message")]
     Silent {
-        /// Who.
+        /// The node.
         from: u8,
-        /// How long was waited.
+        /// How long we waited.
         after_ms: u64,
         /// Frames so far.
         done: u8,
         /// Frames of the message.
         total: u8,
     },
-    /// The other side of a message of many frames asks for what there is not, or again and again for the same.
+    /// The other side of a message of many frames requests frames that do not exist, or the same ones
+    /// repeatedly.
     #[error("node {from} does not get on with the message: it has asked for frames again {times} times")]
     Endless {
-        /// Who.
+        /// The node.
         from: u8,
         /// How often.
         times: u32,
@@ -101,7 +102,7 @@ pub(super) fn frame(priority: u8, pgn: u32, source: u8, destination: u8, data: &
     Frame::from_bus(Header { priority, pgn, source, destination }.id(), false, length as u8, bytes)
 }
 
-/// A group's number as requests have it.
+/// A group's number as in requests.
 pub(super) fn three(pgn: u32) -> [u8; 3] {
     let [low, middle, high, _] = pgn.to_le_bytes();
     [low, middle, high]

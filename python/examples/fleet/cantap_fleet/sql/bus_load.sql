@@ -1,11 +1,11 @@
 -- Bus load per vehicle, channel and hour.
 --
--- How many stuff bits a frame has depends on its bits, so there are two figures: without any, and with as many as there can be. The true
--- load lies between (`cantap stats` says it exactly). Time counts as far as a trace goes: from its first to its last frame of the hour.
+-- How many stuff bits a frame has depends on its bits, so there are two figures: without any, and with the maximum. The true
+-- load lies between them (`cantap stats` gives it exactly). Only the time covered by a trace counts: from its first to its last frame of the hour.
 -- Frames that were lost and error frames are in neither figure. Without a bit rate in vehicles.csv there is no load.
 WITH lengths AS (
-    -- ISO 11898-1: a frame from its start to the end of the intermission. `head` is what is stuffed at the nominal bit rate, `body` at that of
-    -- the data, `plain` and `fast` are what is never stuffed, CAN FD's fixed stuff bits among it.
+    -- ISO 11898-1: a frame from its start to the end of the intermission. `head` is the stuffed part at the nominal bit rate, `body` that at
+    -- the data bit rate; `plain` and `fast` are the parts that are never stuffed, including CAN FD's fixed stuff bits.
     SELECT
         vehicle, channel, trace, time, time_ns, fd, brs,
         CASE
@@ -45,7 +45,7 @@ per_trace AS (
         vehicle, channel, trace, date_trunc('HOUR', time) AS hour,
         count(*) AS frames,
         (max(time_ns) - min(time_ns)) / 1e9 AS recorded_s,
-        -- A sum passes over what is not known; one frame without a rate is enough for not knowing.
+        -- A sum skips unknown values, but a single frame without a rate makes the load unknown.
         CASE WHEN count(least_s) = count(*) THEN sum(least_s) END AS least_s,
         CASE WHEN count(most_s) = count(*) THEN sum(most_s) END AS most_s
     FROM timed

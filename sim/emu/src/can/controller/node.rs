@@ -1,4 +1,4 @@
-//! A controller as a node of the bus: what it sends, receives and counts.
+//! A controller as a node on the bus: what it sends, receives and counts.
 
 use cantap_can::BusErrorKind;
 use cantap_can::Frame;
@@ -11,17 +11,17 @@ use crate::can::filter::Match;
 use crate::can::mailbox::Attempt;
 
 impl Controller {
-    /// Where it stands.
+    /// Its mode.
     pub fn mode(&self) -> Mode {
         self.mode
     }
 
-    /// Core cycles of a controller clock, which the clock tree decides.
+    /// Sets the core cycles per controller clock, which follow from the clock tree.
     pub fn set_cycles_per_clock(&mut self, cycles: u64) {
         self.cycles_per_clock = cycles;
     }
 
-    /// The bit timing that BTR says.
+    /// The bit timing in BTR.
     pub fn timing(&self) -> BitTiming {
         let field = |at: u32, bits: u32| u64::from(self.btr >> at & ((1 << bits) - 1)) + 1;
         BitTiming {
@@ -52,7 +52,7 @@ impl Controller {
         self.counters
     }
 
-    /// Silent mode: never dominant, never a frame of its own.
+    /// Whether it is in silent mode: never dominant, sends nothing.
     pub fn silent(&self) -> bool {
         self.btr & btr::SILM != 0
     }
@@ -100,7 +100,7 @@ impl Controller {
         }
     }
 
-    /// It lost arbitration and goes on as a receiver.
+    /// It lost arbitration and continues as a receiver.
     pub(crate) fn lost_arbitration(&mut self) {
         self.end_attempt(Attempt::LostArbitration);
         self.receiving = true;
@@ -119,7 +119,7 @@ impl Controller {
         }
     }
 
-    /// A frame was received without error; `found` says whether and where the filters want it.
+    /// A frame was received without error; `found` says whether the filters pass it, and where to.
     pub(in crate::can) fn received(&mut self, frame: &Frame, found: Option<Match>) {
         self.counters.received();
         self.last_error = 0;
@@ -171,7 +171,7 @@ impl Controller {
         self.dominant_bits += dominant_bits;
     }
 
-    /// The bus is held dominant: what was under way does not end.
+    /// The bus is held dominant: the frame under way never ends.
     pub(crate) fn bus_stuck(&mut self) {
         self.receiving |= self.listens();
     }
@@ -187,7 +187,7 @@ impl Controller {
         }
     }
 
-    /// Eleven recessive bits since it asked.
+    /// Eleven recessive bits have passed since its request.
     pub(crate) fn synchronised(&mut self) {
         if matches!(self.mode, Mode::Synchronising { .. }) {
             self.mode = Mode::Normal;

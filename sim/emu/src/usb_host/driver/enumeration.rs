@@ -1,4 +1,4 @@
-//! The control transfers: which there are, and which follows which.
+//! The control transfers: which there are, and in what order.
 
 use super::super::control::{
     CLEAR_FEATURE, ENDPOINT_HALT, Outcome, Request, SET_CONFIGURATION, SET_INTERFACE, Transfer,
@@ -102,7 +102,7 @@ impl Driver {
         }
         let result = match outcome {
             Outcome::Done(bytes) => self.advance(purpose, &bytes),
-            // A full-speed device has no other speed to qualify.
+            // A full-speed device has no other speed to describe.
             Outcome::Stalled if purpose == Purpose::Qualifier => {
                 self.after_device_descriptor();
                 Ok(())
@@ -121,7 +121,7 @@ impl Driver {
         self.begin(if self.usb_version > 0x0200 { Purpose::ObjectStore } else { Purpose::ConfigurationHead });
     }
 
-    /// Uses what a control transfer brought and begins the next.
+    /// Uses the result of a control transfer and begins the next.
     fn advance(&mut self, purpose: Purpose, bytes: &[u8]) -> Result<(), EnumerationError> {
         let short = |what: &str| Err(EnumerationError::Descriptor(what.to_owned()));
         match purpose {
@@ -183,15 +183,15 @@ impl Driver {
         Ok(())
     }
 
-    /// The next string that the device has, or what follows them.
+    /// Requests the device's next string, or continues after the last.
     fn begin_text(&mut self, from: usize) {
         let strings = self.device.map_or([0; 3], |device| device.strings);
         let next = (from..strings.len()).find(|which| strings[*which] != 0);
         self.begin(next.map_or(Purpose::Configure, Purpose::Text));
     }
 
-    /// What a request that was carried out means for the host's side of the pipes: where the device begins with DATA0, so does the
-    /// host (USB 2.0, 9.1.1.5 and 9.4.5), and a configuration takes the port from whoever had it open, unless the driver keeps it.
+    /// Applies a completed request to the host's side of the pipes: where the device begins with DATA0, so does the host (USB 2.0,
+    /// 9.1.1.5 and 9.4.5), and a configuration closes a port that a program had open, unless the driver keeps it.
     fn follow(&mut self, request: &Request) {
         let Some(acm) = self.acm else { return };
         match (request.kind, request.request) {

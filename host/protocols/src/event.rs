@@ -289,33 +289,8 @@ pub(crate) fn hex(bytes: &[u8]) -> String {
     text
 }
 
-/// Below this, a value's product with ten million is exact to a quarter of a thousandth.
-const MOST_IN_WHOLE_NUMBERS: f64 = 109_951.0;
-
 /// At most seven decimals, as positions have, without trailing zeros.
 fn write_real(f: &mut fmt::Formatter<'_>, value: f64) -> fmt::Result {
-    // Whole numbers are faster than the digits of a float. Values near a half go the slow way, so that rounding is the same.
-    let scaled = value.abs() * 1e7;
-    let from_half = (scaled.fract() - 0.5).abs();
-    if value.abs() < MOST_IN_WHOLE_NUMBERS && scaled >= 1.0 && from_half > 1e-3 {
-        let all = scaled.round() as u64;
-        let (whole, mut decimals, mut width) = (all / 10_000_000, all % 10_000_000, 7);
-        if value < 0.0 {
-            f.write_str("-")?;
-        }
-        if decimals == 0 {
-            return write!(f, "{whole}");
-        }
-        while decimals.is_multiple_of(10) {
-            (decimals, width) = (decimals / 10, width - 1);
-        }
-        return write!(f, "{whole}.{decimals:0width$}");
-    }
-    write_digits(f, value)
-}
-
-/// The same for any value.
-fn write_digits(f: &mut fmt::Formatter<'_>, value: f64) -> fmt::Result {
     if value.abs() >= 1e15 {
         return write!(f, "{value:e}");
     }
@@ -358,54 +333,5 @@ impl fmt::Display for Event {
             write!(f, "; {trouble}")?;
         }
         if self.frames_lost { f.write_str("; frames were lost meanwhile") } else { Ok(()) }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// A value in one of the two ways.
-    struct Real(f64, bool);
-
-    impl fmt::Display for Real {
-        fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-            if self.1 { write_real(f, self.0) } else { write_digits(f, self.0) }
-        }
-    }
-
-    #[test]
-    fn numbers_are_written_as_their_digits_are() {
-        let seed = fastrand::u64(..);
-        let mut random = fastrand::Rng::with_seed(seed);
-        let mut some = vec![
-            0.0,
-            -0.0,
-            0.5,
-            -1.0,
-            0.1,
-            1.0 / 3.0,
-            109_951.5,
-            1e-7,
-            1.5e-7,
-            2.5e-7,
-            1e15,
-            0.000_000_05,
-            f64::NAN,
-        ];
-        some.extend((0..20_000).map(|_| (random.f64() - 0.5) * 10_f64.powi(random.i32(-9..9))));
-        // Of few digits, as most are, and just between two.
-        some.extend(
-            (0..20_000).map(|_| random.i64(-1_000_000..1_000_000) as f64 / 10_f64.powi(random.i32(0..9))),
-        );
-        some.extend((0..20_000).map(|_| (random.u32(..) as f64 + 0.5) / 1e7));
-        for value in some {
-            assert_eq!(
-                Real(value, true).to_string(),
-                Real(value, false).to_string(),
-                "{value:?}, seed {seed}"
-            );
-        }
-        assert_eq!(Real(-37.922_053_4, true).to_string(), "-37.9220534");
     }
 }

@@ -1,6 +1,7 @@
 """Nodes of other programs on a board shared by `cantap serve`, for nodes.rs: they connect through socketcand.
 
-uds, canopen, j1939 HOST PORT     serves until standard input ends; prints "ready" when it does
+uds, ecus, obd, obd_29, canopen, j1939 HOST PORT     serves until standard input ends; prints "ready" when it does
+tester HOST PORT                                     prints "ready", and then what udsoncan has read of the ECU that is asked with 7E0
 """
 
 import sys
@@ -58,6 +59,120 @@ def serve_uds(host, port):
     over.set()
     server.join()
     stack.stop()
+
+
+VIN = b"WVWZZZ1KZAW00000"
+
+
+def serve_four(host, port, lengths, answers):
+    """Four ECUs on can-isotp, each with its own flow control; `answers` of each by request."""
+    import isotp
+
+    channel = bus(host, port)
+    notifier = can.Notifier(channel, [], 0.02)
+    over = threading.Event()
+    threads, stacks, asked = [], [], []
+
+    def serve(stack, own, functional):
+        while not over.is_set():
+            request = functional.pop(0) if functional else bytes(stack.recv(block=True, timeout=0.02) or b"")
+            request = request.hex().upper()
+            known = [f"7601{len(request) // 2:04X}"] if request.startswith("36") else own.get(request, [])
+            for answer in known:
+                if answer.startswith("7F") and answer.endswith("78"):
+                    stack.send(bytes.fromhex(answer))
+                    time.sleep(0.15)
+                else:
+                    stack.send(bytes.fromhex(answer))
+
+    for extended in lengths:
+        for number, own in enumerate(answers):
+            if extended:
+                mode, ids = isotp.AddressingMode.NormalFixed_29bits, {"source_address": 0x10 + number, "target_address": 0xF1}
+            else:
+                mode, ids = isotp.AddressingMode.Normal_11bits, {"rxid": 0x7E0 + number, "txid": 0x7E8 + number}
+            parameters = {"blocksize": 1 + number, "stmin": number}
+            stack = isotp.NotifierBasedCanStack(channel, notifier, address=isotp.Address(mode, **ids), params=parameters)
+            stack.start()
+            functional = []
+            asked.append((0x18DB33F1 if extended else 0x7DF, functional))
+            threads.append(threading.Thread(target=serve, args=(stack, own, functional)))
+            stacks.append(stack)
+
+    def all_are_asked(message):
+        for identifier, functional in asked:
+            if message.arbitration_id == identifier and message.data[0] >> 4 == 0:
+                functional.append(bytes(message.data[1 : 1 + message.data[0]]))
+
+    notifier.add_listener(all_are_asked)
+    for thread in threads:
+        thread.start()
+    wait()
+    over.set()
+    for thread in threads:
+        thread.join()
+    for stack in stacks:
+        stack.stop()
+    notifier.stop()
+
+
+def serve_ecus(host, port):
+    """Asked for F190, each in its own way."""
+    vin = lambda number: "62F190" + (VIN + number).hex()
+    answers = [[vin(b"1")], ["7F2278", "7F2278", vin(b"2")], ["7F2231"], ["62F190" + b"F4".hex()]]
+    serve_four(host, port, [False, True], [{"22F190": known} for known in answers])
+
+
+def serve_obd(host, port, extended=False):
+    vin = lambda number: "490201" + (VIN + number).hex()
+    none = {"03": ["4300"], "07": ["4700"], "0A": ["4A00"]}
+    engine = {
+        "0100": ["410000180000"], "010C": ["410C1AF8"], "010D": ["410D32"], "0900": ["490040000000"], "0902": [vin(b"1")], **none, "03": ["43010133"],
+    }
+    gearbox = {
+        "0100": ["7F0178", "410000080000"], "010D": ["410D31"], "0900": ["490040000000"], "0902": ["7F0978", vin(b"2")], **none,
+        "03": ["43040301030203034155"],
+    }
+    serve_four(host, port, [extended], [engine, gearbox, {"0100": ["7F0112"]}, {}])
+
+
+def serve_obd_29(host, port):
+    serve_obd(host, port, True)
+
+
+def serve_tester(host, port):
+    """udsoncan's client, over can-isotp."""
+    import json
+
+    import isotp
+    import udsoncan
+    from udsoncan.client import Client
+    from udsoncan.connections import PythonIsoTpConnection
+
+    channel = bus(host, port)
+    address = isotp.Address(isotp.AddressingMode.Normal_11bits, txid=0x7E0, rxid=0x7E8)
+    stack = isotp.CanStack(channel, address=address, params={"blocksize": 2, "stmin": 3, "tx_padding": 0xAA})
+    text = udsoncan.AsciiCodec
+    config = dict(udsoncan.configs.default_client_config, data_identifiers={0xF190: text(17), 0xF187: text(13), 0xF18C: text(10)})
+    print("ready", flush=True)
+    said = {}
+    with Client(PythonIsoTpConnection(stack), config=config, request_timeout=5) as client:
+        client.change_session(3)
+        client.tester_present()
+        for did in config["data_identifiers"]:
+            said[f"{did:04X}"] = client.read_data_by_identifier(did).service_data.values[did]
+        codes = client.get_dtc_by_status_mask(0xFF).service_data.dtcs
+        said["codes"] = [[code.id, code.status.get_byte_as_int()] for code in codes]
+        try:
+            client.routine_control(0xFF00, 1)
+        except udsoncan.NegativeResponseException as refusal:
+            said["refused"] = refusal.response.code
+        # Flow control, padding and timing of theirs, on the longest there is.
+        client.clear_dtc()
+        said["after"] = len(client.get_dtc_by_status_mask(0xFF).service_data.dtcs)
+    print(json.dumps(said), flush=True)
+    sys.stdin.read()
+    channel.shutdown()
 
 
 SHEET = """[DeviceInfo]

@@ -9,36 +9,40 @@
 mod schema;
 
 use std::io::{BufRead, BufReader};
-use std::process::{Child, Command, Output, Stdio};
+use std::process::{Child, ChildStdout, Command, Output, Stdio};
 
 use schema::Schema;
 use serde_json::Value;
 
+/// A bus on which nobody but the peer says anything.
+const NO_NODE: &str = "virtual:load=0";
 const CANTAP: &str = env!("CARGO_BIN_EXE_cantap");
 
 /// A shared board and a node on its bus.
 struct Rig {
     server: Child,
     peer: Child,
+    /// What the peer prints from now on.
+    said: BufReader<ChildStdout>,
     at: String,
     folder: tempfile::TempDir,
 }
 
 impl Rig {
-    /// `None` without the peer.
-    fn new(package: &str, kind: &str) -> Option<Self> {
+    /// A device, and what `node_peer.py` calls `kind` on its bus; `None` without the Python `packages` for it.
+    fn new(device: &str, packages: &str, kind: &str) -> Option<Self> {
         let python = std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned());
-        let there = Command::new(&python).args(["-c", &format!("import can, {package}")]).output();
+        let there = Command::new(&python).args(["-c", &format!("import can, {packages}")]).output();
         if !there.is_ok_and(|output| output.status.success()) {
             let required = std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1");
-            assert!(!required, "{package} is required and does not run");
-            eprintln!("SKIPPED: {package} is not installed, so nothing was said to its nodes");
+            assert!(!required, "{packages} is required and does not run");
+            eprintln!("SKIPPED: {packages} is not installed, so nothing was said to its nodes");
             return None;
         }
         let folder = tempfile::tempdir().unwrap();
         let socket = folder.path().join("cantap.sock").display().to_string();
         let mut server = Command::new(CANTAP)
-            .args(["serve", "-d", "virtual:load=0", "-b", "500k", "--unix", &socket])
+            .args(["serve", "-d", device, "-b", "500k", "--unix", &socket])
             .args(["--socketcand", "127.0.0.1:0", "--allow", "send"])
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
@@ -54,9 +58,11 @@ impl Rig {
             .stdout(Stdio::piped())
             .spawn()
             .unwrap();
-        let ready = BufReader::new(peer.stdout.take().unwrap()).lines().next();
-        let rig = Self { server, peer, at, folder };
-        assert_eq!(ready.and_then(Result::ok).as_deref(), Some("ready"));
+        let mut said = BufReader::new(peer.stdout.take().unwrap());
+        let mut ready = String::new();
+        let _ = said.read_line(&mut ready);
+        let rig = Self { server, peer, said, at, folder };
+        assert_eq!(ready.trim_end(), "ready");
         Some(rig)
     }
 
@@ -98,7 +104,7 @@ impl Drop for Rig {
 
 #[test]
 fn an_ecu_on_can_isotp_is_asked_unlocked_and_given_long_requests() {
-    let Some(rig) = Rig::new("isotp", "uds") else { return };
+    let Some(rig) = Rig::new(NO_NODE, "isotp", "uds") else { return };
     let read = rig.json("uds read F190 F18C", "conversations");
     assert_eq!(read[0]["fields"]["value"], "WVWZZZ1KZAW000001");
     assert_eq!(
@@ -132,7 +138,7 @@ fn an_ecu_on_can_isotp_is_asked_unlocked_and_given_long_requests() {
 
 #[test]
 fn a_node_on_python_canopen_is_found_read_written_and_commanded() {
-    let Some(rig) = Rig::new("canopen", "canopen") else { return };
+    let Some(rig) = Rig::new(NO_NODE, "canopen", "canopen") else { return };
     let scan = &rig.json("canopen scan", "canopen_scan")[0];
     assert_eq!(scan["nodes"].as_array().unwrap().len(), 1, "{scan}");
     let node = &scan["nodes"][0];
@@ -192,7 +198,7 @@ fn a_node_on_python_canopen_is_found_read_written_and_commanded() {
 
 #[test]
 fn a_node_on_can_j1939_is_seen_asked_and_told() {
-    let Some(rig) = Rig::new("j1939", "j1939") else { return };
+    let Some(rig) = Rig::new(NO_NODE, "j1939", "j1939") else { return };
     let claims = rig.json("j1939 claim", "conversations");
     let from = |address: &str| claims.iter().find(|claim| claim["from"] == address);
     assert_eq!(from("129").unwrap()["fields"]["manufacturer"], 666, "{claims:?}");
@@ -218,4 +224,78 @@ fn a_node_on_can_j1939_is_seen_asked_and_told() {
     assert!(code == Some(0) && err.contains("the address 129 is taken"), "{out}{err}");
     let (code, _, err) = rig.run("j1939 claim --address 129 --name 7FFFFFFFFFFFFFFF");
     assert!(code == Some(1) && err.contains("there is none left to take"), "{err}");
+}
+
+/// Who answered, and with what, in the order of the senders.
+fn answers(events: &[Value]) -> Vec<(String, String)> {
+    let text = |event: &Value, key: &str| event[key].as_str().unwrap_or_default().to_owned();
+    let mut answers: Vec<_> = events.iter().map(|event| (text(event, "to"), text(event, "data"))).collect();
+    answers.sort();
+    answers
+}
+
+/// Four ECUs that are asked at once: one has a long answer, one says first that its answer is pending, one refuses, one answers at once. Two of the
+/// long ones come at the same time.
+#[test]
+fn several_ecus_are_asked_at_once_with_identifiers_of_both_lengths() {
+    let Some(rig) = Rig::new(NO_NODE, "isotp", "ecus") else { return };
+    let hex = |text: &str| text.bytes().map(|byte| format!("{byte:02X}")).collect::<Vec<_>>().concat();
+    let vin = |number: u8| format!("62F190{}", hex(&format!("WVWZZZ1KZAW00000{number}")));
+    for (line, ids) in [
+        ("uds --functional", ["7E8", "7E9", "7EA", "7EB"]),
+        ("uds --functional --pair 18DA10F1:18DAF110", ["18DAF110", "18DAF111", "18DAF112", "18DAF113"]),
+    ] {
+        let (code, out, err) = rig.run(&format!("{line} --p2 500ms --json read F190"));
+        // One of them refuses, and the others' answers are there all the same.
+        assert_eq!(code, Some(1), "{out}{err}");
+        assert!(err.contains(&format!("{} refused ReadDataByIdentifier", ids[2])), "{err}");
+        let events: Vec<Value> = out.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+        let expected = [vin(1), vin(2), "7F2231".to_owned(), "62F1904634".to_owned()];
+        let expected: Vec<_> = ids.map(str::to_owned).into_iter().zip(expected).collect();
+        assert_eq!(answers(&events), expected, "{out}");
+        let pending = events.iter().find(|event| event["to"] == ids[1]).unwrap();
+        assert_eq!(pending["fields"]["pending"], 2, "{pending}");
+        // One of them by itself, with a request in many frames, for which it has flow control of its own.
+        let pair = if ids[0] == "7E8" { "7E1:7E9" } else { "18DA11F1:18DAF111" };
+        let said = rig.json(&format!("uds --pair {pair} raw {}", "36".repeat(100)), "conversations");
+        assert_eq!(said[0]["data"], "76010064", "{}", said[0]);
+    }
+}
+
+/// The same four as a scan tool finds them, first with 7DF, and where that is nobody's, with 18DB33F1.
+#[test]
+fn a_vehicle_of_several_ecus_is_asked_with_identifiers_of_both_lengths() {
+    for (kind, ids) in [("obd", ["7E8", "7E9"]), ("obd_29", ["18DAF110", "18DAF111"])] {
+        let Some(rig) = Rig::new(NO_NODE, "isotp", kind) else { return };
+        let out = rig.well("obd supported");
+        let has = |pid: &str, who: &str| out.lines().any(|line| line.starts_with(pid) && line.ends_with(who));
+        assert!(has("0C", ids[0]) && has("0D", &ids.join(", ")), "{out}");
+        let live = rig.json("obd live 0C 0D -n 1", "conversations");
+        assert_eq!(
+            answers(&live),
+            [(ids[0], "410C1AF8"), (ids[0], "410D32"), (ids[1], "410D31")]
+                .map(|(id, data)| (id.to_owned(), data.to_owned()))
+        );
+        // Four codes are more than one frame has.
+        let out = rig.well("obd codes");
+        assert!(out.contains("P0133") && out.contains("P0301, P0302, P0303, C0155"), "{out}");
+        let out = rig.well("obd vin");
+        assert!(out.contains("WVWZZZ1KZAW000001") && out.contains("WVWZZZ1KZAW000002"), "{out}");
+    }
+}
+
+/// The other way round: a tester of theirs, on our car.
+#[test]
+fn udsoncan_over_can_isotp_reads_what_we_read() {
+    let Some(mut rig) = Rig::new("virtual:car", "isotp, udsoncan", "tester") else { return };
+    let mut line = String::new();
+    rig.said.read_line(&mut line).unwrap();
+    let said: Value = serde_json::from_str(&line).unwrap();
+    let ours = rig.json("uds --session extended read F190 F187 F18C", "conversations");
+    for (at, did) in [(1, "F190"), (2, "F187"), (3, "F18C")] {
+        assert_eq!(ours[at]["fields"]["value"], said[did], "{said}");
+    }
+    assert_eq!(said["codes"], serde_json::json!([[0x01_2800, 0x2A]]), "{said}");
+    assert_eq!((&said["refused"], &said["after"]), (&0x11.into(), &0.into()), "{said}");
+    assert_eq!(rig.json("uds dtc", "conversations")[0]["fields"]["trouble_codes"], 0);
 }

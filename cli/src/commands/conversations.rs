@@ -1,9 +1,11 @@
 //! `cantap conversations`: what the frames mean.
 
 mod json;
+mod lines;
 mod summary;
 
-use std::io::{BufWriter, Write};
+use std::fmt;
+use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -11,6 +13,7 @@ use std::sync::Arc;
 use cantap_protocols::{Event, Options, Protocol};
 use cantap_trace::Interface;
 
+use self::lines::Lines;
 use self::summary::Summary;
 use super::decode::Seconds;
 use crate::databases::DatabaseArgs;
@@ -68,7 +71,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let options = Options { protocols: args.protocols.clone(), ..args.help.options(args.quiet)? };
     let mut reading = Reading::new(options, decoder, args.quiet);
     let mut records = args.read.open_either(args.input.as_ref(), &args.live)?;
-    let mut out = BufWriter::with_capacity(1 << 16, std::io::stdout().lock());
+    let mut lines = Lines::new(args.json)?;
     let mut summary = Summary::default();
     let mut batch = Vec::new();
     loop {
@@ -78,21 +81,21 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         }
         reading.take(&batch, more, |event| {
             summary.event(&event);
-            if !args.faults || event.is_fault() { write(&mut out, &event, args.json) } else { Ok(()) }
+            if !args.faults || event.is_fault() { lines.write(event) } else { Ok(()) }
         })?;
         if !more {
             break;
         }
         if records.may_wait() {
-            out.flush()?;
+            lines.flush()?;
         }
     }
+    lines.finish()?;
     if args.json && !args.quiet {
         let mut object = summary.object();
         records.missing().put_into(&mut object);
-        writeln!(out, "{}", serde_json::json!({ "summary": object }))?;
+        writeln!(std::io::stdout(), "{}", serde_json::json!({ "summary": object }))?;
     }
-    out.flush()?;
     if !args.quiet {
         summary.tell();
     }
@@ -102,8 +105,15 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 
 /// Writes an event as a line.
 pub fn write(out: &mut impl Write, event: &Event, json: bool) -> std::io::Result<()> {
-    if json {
-        return json::write(out, event);
+    if json { json::write(out, event) } else { writeln!(out, "{}", Line(event)) }
+}
+
+/// An event as a line of text, without its end.
+struct Line<'a>(&'a Event);
+
+impl fmt::Display for Line<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self(event) = self;
+        write!(f, "({}) {} {event}", Seconds(event.time_ns), Interface(event.channel))
     }
-    writeln!(out, "({}) {} {event}", Seconds(event.time_ns), Interface(event.channel))
 }

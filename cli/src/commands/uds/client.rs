@@ -134,8 +134,8 @@ impl TransferArgs {
     }
 }
 
-/// A refusal, described in words.
-pub fn refusal_text(request: &[u8], code: u8) -> String {
+/// A refusal in words; `who` is `the ECU`, or one of several.
+fn refusal_text(who: &str, request: &[u8], code: u8) -> String {
     let sid = request.first().copied().unwrap_or_default();
     let service = uds_service(sid).map_or_else(|| format!("service {sid:02X}"), str::to_owned);
     let advice = match code {
@@ -151,7 +151,7 @@ pub fn refusal_text(request: &[u8], code: u8) -> String {
         0x21 => "; try again",
         _ => "",
     };
-    format!("the ECU refused {service}: {} ({code:02X}){advice}", reason(code))
+    format!("{who} refused {service}: {} ({code:02X}){advice}", reason(code))
 }
 
 /// Sends requests.
@@ -230,9 +230,10 @@ impl<'d> Client<'d> {
         for (from, error) in broken {
             eprintln!("cantap: the answer of {from} broke off: {error}");
         }
-        let refusal = answers.iter().find_map(ServerAnswer::refusal);
-        if let Some(code) = refusal {
-            self.refused.get_or_insert_with(|| anyhow!(refusal_text(request, code)));
+        let refusal = answers.iter().find_map(|answer| Some((answer.from, answer.refusal()?)));
+        if let Some((from, code)) = refusal {
+            let who = if self.args.answerer().is_many() { from.to_string() } else { "the ECU".to_owned() };
+            self.refused.get_or_insert_with(|| anyhow!(refusal_text(&who, request, code)));
         }
         Ok(answers)
     }

@@ -347,3 +347,55 @@ fn a_transfer_that_another_one_leaves_behind_is_said() {
     ]);
     assert!(without.len() == 1 && without[0].contains("value \"ABCDEFGHI\""), "{without:?}");
 }
+
+/// Written to a node, read from it, or told by its sheet: frames on its second channel are SDO and nothing else.
+#[test]
+fn sdo_servers_beyond_the_first_are_followed() {
+    let set = [
+        (0.0, "605#2301120145060000"),
+        (1.0, "585#6001120100000000"),
+        (2.0, "605#23011202C5050000"),
+        (3.0, "585#6001120200000000"),
+    ];
+    let talk = [
+        // Both channels at once: each has its own transfer.
+        (10.0, "645#4008100000000000"),
+        (10.5, "605#4018100100000000"),
+        (11.0, "5C5#4108100009000000"),
+        (11.5, "585#4318100178563412"),
+        (12.0, "645#6000000000000000"),
+        (13.0, "5C5#0041207365636F6E"),
+        (14.0, "645#7000000000000000"),
+        (15.0, "5C5#1B64210000000000"),
+        (16.0, "645#4000300000000000"),
+        (17.0, "5C5#8000300000000206"),
+        (18.0, "645#4000300000000000"),
+        (5000.0, "123#"),
+    ];
+    let lines = said(&[&set[..], &talk].concat());
+    let on_second: Vec<_> = lines.iter().filter(|line| line.contains("cob_id 0x645")).collect();
+    assert_eq!(on_second.len(), 3, "{lines:?}");
+    assert!(on_second[0].contains("transport \"segmented\", value \"A second!\""), "{lines:?}");
+    assert!(on_second[1].contains("abort 0x06020000"), "{lines:?}");
+    assert!(on_second[2].contains("nothing came for 2000 ms"), "{lines:?}");
+    assert!(
+        lines.iter().any(|line| line.contains("SDO read 1018:01") && !line.contains("cob_id")),
+        "{lines:?}"
+    );
+    let sheet = "[1201]\nParameterName=Second\nObjectType=0x9\nSubNumber=3\n\
+        [1201sub1]\nParameterName=In\nObjectType=0x7\nDataType=0x0007\nAccessType=rw\nDefaultValue=$NODEID+0x640\n\
+        [1201sub2]\nParameterName=Out\nObjectType=0x7\nDataType=0x0007\nAccessType=rw\nDefaultValue=$NODEID+0x5C0\n";
+    let eds = Arc::new(Eds::parse(sheet.as_bytes()));
+    for node in [None, Some(5)] {
+        let canopen = CanOpen::new(vec![Sheet { node, eds: eds.clone() }]);
+        let lines = testing::said(canopen, &talk);
+        assert_eq!(
+            lines
+                .iter()
+                .filter(|line| line.contains("> 5 SDO read") && line.contains("cob_id 0x645"))
+                .count(),
+            3,
+            "{lines:?}"
+        );
+    }
+}

@@ -36,7 +36,7 @@ fn functional_group(byte: u8) -> Field {
     Field::hex("functional_group", byte, 2).meaning(text)
 }
 
-fn number(byte: u8, all: u8) -> Field {
+fn record_number(byte: u8, all: u8) -> Field {
     Field::hex("record_number", byte, 2).meaning((byte == all).then_some("all"))
 }
 
@@ -49,7 +49,7 @@ pub fn request(sub: u8, data: &[u8], fields: &mut Vec<Field>) {
             left
         }
         (0x04 | 0x06 | 0x10, [a, b, c, of, left @ ..]) => {
-            fields.extend([Field::text("code", code(&[*a, *b, *c])), number(*of, 0xFF)]);
+            fields.extend([Field::text("code", code(&[*a, *b, *c])), record_number(*of, 0xFF)]);
             left
         }
         (0x03 | 0x04 | 0x06 | 0x09 | 0x10, [a, b, c, left @ ..]) => {
@@ -57,7 +57,7 @@ pub fn request(sub: u8, data: &[u8], fields: &mut Vec<Field>) {
             left
         }
         (0x05 | 0x16 | 0x1A, [of, left @ ..]) => {
-            fields.push(number(*of, 0xFF));
+            fields.push(record_number(*of, 0xFF));
             left
         }
         (0x07 | 0x08, [severity, mask, left @ ..]) => {
@@ -69,7 +69,7 @@ pub fn request(sub: u8, data: &[u8], fields: &mut Vec<Field>) {
             left
         }
         (0x18 | 0x19, [a, b, c, of, memory, left @ ..]) => {
-            fields.extend([Field::text("code", code(&[*a, *b, *c])), number(*of, 0xFF)]);
+            fields.extend([Field::text("code", code(&[*a, *b, *c])), record_number(*of, 0xFF)]);
             fields.push(Field::hex("memory", *memory, 2));
             left
         }
@@ -159,7 +159,7 @@ pub fn response(heard: bool, sub: u8, data: &[u8], fields: &mut Vec<Field>) {
         }
         (0x05 | 0x16, [of, codes @ ..]) if codes.len() >= CODE_AND_STATUS => {
             let (one, record) = codes.split_at(CODE_AND_STATUS);
-            fields.extend(again(number(*of, 0xFF)));
+            fields.extend(again(record_number(*of, 0xFF)));
             fields.push(Field::text("codes", dtc::list_with_status(one)));
             rest("record", record, fields);
         }
@@ -184,7 +184,7 @@ pub fn response(heard: bool, sub: u8, data: &[u8], fields: &mut Vec<Field>) {
         }
         (0x1A, [available, of, codes @ ..]) if codes.len() % CODE_AND_STATUS == 0 => {
             fields.push(mask(*available));
-            fields.extend(again(number(*of, 0xFF)));
+            fields.extend(again(record_number(*of, 0xFF)));
             with_status(codes, fields);
         }
         (0x42, [group, available, severity, as_what, codes @ ..]) if codes.len() % 5 == 0 => {

@@ -8,6 +8,7 @@ use cantap_address::Address;
 
 use crate::channel_args::ChannelArgs;
 use crate::channel_bitrate::ChannelBitrate;
+use crate::timing_args::TimingArgs;
 
 /// Which devices, and how to take part in their buses.
 #[derive(Clone, Debug)]
@@ -33,13 +34,15 @@ impl Plan {
         plan
     }
 
-    /// The same with other devices. If their number differs, so do the channels.
+    /// The same with other devices. Their buses are different ones, and bit rates given before say nothing about them: what is saved on the
+    /// device counts, or what is heard.
     pub fn at(&self, addresses: Vec<Address>) -> Self {
-        let is_as_many = addresses.len() == self.addresses.len();
-        let mut plan = Self { addresses, ..self.clone() };
-        if !is_as_many {
-            plan.choose_channels();
+        if addresses == self.addresses {
+            return self.clone();
         }
+        let mut plan = Self { addresses, ..self.clone() };
+        plan.open.timing = TimingArgs::default();
+        plan.choose_channels();
         plan
     }
 

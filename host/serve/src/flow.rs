@@ -251,7 +251,7 @@ mod tests {
     fn little_is_on_its_way_on_a_slow_line_and_a_fast_one_is_used() {
         for (bytes_per_s, round_trip_ms) in [(10_000, 40), (60_000, 5), (100_000, 100), (200_000, 150)] {
             let (worst, through) = over_line(bytes_per_s, Duration::from_millis(round_trip_ms), 20);
-            assert!(worst < Duration::from_millis(1000), "{worst:?} at {bytes_per_s} B/s");
+            assert!(worst < Duration::from_secs(1), "{worst:?} at {bytes_per_s} B/s");
             assert!(through > bytes_per_s * 85 / 100, "{through} of {bytes_per_s} B/s");
         }
         let (_, through) = over_line(10_000_000, Duration::from_millis(50), 20);
@@ -309,12 +309,11 @@ mod tests {
         let mut requests = 0;
         for message in taken.split(|byte| *byte == 0).filter(|message| !message.is_empty()) {
             let mut out = [0; 64];
-            match cantap_wire::framing::unseal(message, &mut out) {
-                Ok(message) => acks.push(read_ack(message).unwrap()),
-                Err(_) => {
-                    assert_eq!(message, &request[..7]);
-                    requests += 1;
-                }
+            if let Ok(message) = cantap_wire::framing::unseal(message, &mut out) {
+                acks.push(read_ack(message).unwrap());
+            } else {
+                assert_eq!(message, &request[..7]);
+                requests += 1;
             }
         }
         assert_eq!(requests, 20);

@@ -24,14 +24,18 @@ const LATENESS_NS: i64 = 1_000_000_000;
 impl Source<'_> {
     pub(super) fn run_device(&mut self, mut plan: Plan) {
         let mut reconnects = vec![0; plan.addresses.len()];
-        if Self::lacks_bit_rates(&plan) {
-            match self.find_bit_rates(&mut plan) {
-                Then::GoOn | Then::Autobaud => {}
-                Then::Reopen(other) => plan = other,
-                Then::Quit => return,
-            }
-        }
+        let mut is_new = true;
         loop {
+            if std::mem::take(&mut is_new) && Self::lacks_bit_rates(&plan) {
+                match self.find_bit_rates(&mut plan) {
+                    Then::GoOn | Then::Autobaud => {}
+                    Then::Reopen(other) => {
+                        (plan, is_new) = (other, true);
+                        continue;
+                    }
+                    Then::Quit => return,
+                }
+            }
             let mut lines = open_as(&plan);
             reconnects.resize(plan.addresses.len(), 0);
             lock(self.model).hearing = Hearing::default();
@@ -50,7 +54,7 @@ impl Source<'_> {
                 Then::GoOn => {}
                 Then::Autobaud => match self.autobaud(&mut plan) {
                     Then::Quit => return,
-                    Then::Reopen(other) => plan = other,
+                    Then::Reopen(other) => (plan, is_new) = (other, true),
                     Then::GoOn | Then::Autobaud => {}
                 },
                 Then::Reopen(other) => {
@@ -59,6 +63,7 @@ impl Source<'_> {
                         let mut model = lock(self.model);
                         model.begin_statistics();
                         model.seen.devices.clear();
+                        is_new = true;
                     }
                     plan = other;
                 }

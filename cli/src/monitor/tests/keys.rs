@@ -310,3 +310,27 @@ fn nothing_takes_part_in_a_bus_that_was_not_asked_for_just_now() {
     press(&mut app, &mut model, "m");
     assert_eq!(modes(), [Mode::ListenOnly]);
 }
+
+/// A vehicle at 500 kbit/s is mute at the bit rate of the board before.
+#[test]
+fn another_device_is_not_opened_at_the_bit_rates_of_the_one_before() {
+    let mut model = model();
+    let (mut app, orders) = app(View::Fixed);
+    let opened = || match orders.try_recv() {
+        Ok(Order::Open(plan)) => plan,
+        other => panic!("{other:?}"),
+    };
+    press(&mut app, &mut model, "b");
+    app.key(KeyEvent::new(KeyCode::Char('u'), KeyModifiers::CONTROL), &mut model);
+    press(&mut app, &mut model, "1:250k\n");
+    assert_eq!(opened().channels, [1]);
+    // The same device keeps them.
+    press(&mut app, &mut model, "D\n");
+    assert!(opened().open.timing.is_given());
+    press(&mut app, &mut model, "D");
+    app.key(KeyEvent::new(KeyCode::Char('u'), KeyModifiers::CONTROL), &mut model);
+    press(&mut app, &mut model, "virtual:car\n");
+    let plan = opened();
+    assert!(!plan.open.timing.is_given() && plan.mode() == Mode::ListenOnly, "{plan:?}");
+    assert_eq!(plan.channels, [1, 2]);
+}

@@ -199,7 +199,7 @@ proptest! {
             let id = if extended { Id::extended(id) } else { Id::standard(id) }.unwrap();
             signals.iter_mut().enumerate().for_each(|(at, signal)| signal.name = format!("S{at}"));
             let (name, description, j1939) = (format!("M{at}"), String::new(), extended);
-            Message { id, name, description, length: 8, cycle_ms: None, j1939, signals, line: 0 }
+            Message { id, name, description, length: 8, cycle_ms: None, j1939, signals, container: None, line: 0 }
         });
         let database = Database { messages: messages.collect(), ..Database::default() };
         let mut decoder = Decoder::new(vec![Source { channel: None, database }]);

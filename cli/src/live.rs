@@ -258,7 +258,7 @@ impl LiveRecords {
             let seconds = self.give_up_after.unwrap_or_default().as_secs_f64();
             let _ = self.lines.stop();
             self.stopped = Some(Err(anyhow!(
-                "the device has been away for {seconds} s and is not waited for any longer; what was captured before is there"
+                "the device has been away for {seconds} s, giving up; everything captured before that is kept"
             )));
         }
         let (board, happening) = self.lines.next(LOOK_EVERY);
@@ -272,10 +272,10 @@ impl LiveRecords {
                 let reason = advice::sentence(&error);
                 let rest = match self.give_up_after {
                     Some(time) => format!(
-                        "it goes on when the device is back within {} s, and Ctrl-C ends it",
+                        "it continues when the device is back within {} s; Ctrl-C ends it",
                         time.as_secs_f64()
                     ),
-                    None => "it goes on when the device is back, and Ctrl-C ends it".to_owned(),
+                    None => "it continues when the device is back; Ctrl-C ends it".to_owned(),
                 };
                 self.report(&format!("{reason}; {rest}"));
             }

@@ -105,7 +105,7 @@ fn a_capture_of_so_many_frames_gives_up_on_a_device_that_stays_away() {
     let killed = Instant::now();
     let (code, out, err) = capture.join().unwrap();
     assert_eq!(code, Some(1), "{err}");
-    assert!(err.contains("is not waited for any longer"), "{err}");
+    assert!(err.contains("giving up"), "{err}");
     assert!(killed.elapsed() < Duration::from_secs(20), "it took {:?}", killed.elapsed());
     let summary: serde_json::Value = serde_json::from_str(&out).unwrap();
     assert!(summary["channels"][0]["frames"].as_u64() > Some(0) && summary["gaps"]["count"] == 1, "{out}");

@@ -204,7 +204,7 @@ fn a_capture_goes_on_when_a_device_that_fell_silent_answers_again() {
         let mut capture =
             Running::start(&format!("capture -d {port} -b 500k --mode normal -o {}", file.display()));
         let gone = capture.wait_for(words);
-        assert!(gone.contains("it goes on when the device is back, and Ctrl-C ends it"), "{gone}");
+        assert!(gone.contains("it continues when the device is back; Ctrl-C ends it"), "{gone}");
         capture.wait_for("the device is back after ");
         wait_for_frames(&file, 3 * BEFORE as usize);
         capture.signal_twice();

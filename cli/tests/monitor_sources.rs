@@ -103,7 +103,7 @@ fn a_recording_on_a_condition_has_what_is_around_the_events_only() {
     view.wait_for("71 records are in");
     // A recording is not overwritten by accident.
     view.keys(&format!("r{}\r", recording.display()));
-    view.wait_for("exists already; choose another name");
+    view.wait_for("already exists; choose another name");
     view.keys("\x1b");
     // Escape immediately followed by a letter would be Alt and that letter.
     view.wait_until("no prompt", |screen| !screen.contains(" > /"));

@@ -57,7 +57,9 @@ fn on_virtual_device(options: &str, program: &[&str]) -> Option<String> {
             std::env::var_os("CANTAP_REQUIRE_PEERS").is_none(),
             "{python} has no python-can with pyserial"
         );
-        eprintln!("SKIPPED: {python} has no python-can with pyserial; name one that has in CANTAP_PYTHON");
+        eprintln!(
+            "SKIPPED: {python} has no python-can with pyserial; name one that has them in CANTAP_PYTHON"
+        );
         return None;
     }
     let mut device = Command::new(env!("CARGO_BIN_EXE_cantap"))

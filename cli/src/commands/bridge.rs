@@ -131,7 +131,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 if !address.may_come_back() {
                     return Err(error);
                 }
-                eprintln!("cantap: {reason}; it goes on when the device is back, and Ctrl-C ends it");
+                eprintln!("cantap: {reason}; it continues when the device is back; Ctrl-C ends it");
             }
             Happening::Back(back) => {
                 sender.use_device(device());

@@ -37,7 +37,7 @@ use crate::{args, beside};
     cantap monitor trace.blf -b 500k --db car.dbc\n  \
     cantap monitor -p car.toml\n\n\
 h shows the keys. Without a device and a file, the board that is connected is listened to. Without a bit rate, given or\n\
-saved on the device, it is looked for by listening.")]
+saved on the device, it is found by listening.")]
 pub struct Args {
     /// A trace to play back, or a device's address.
     #[arg(value_name = "FILE|DEVICE", conflicts_with = "devices")]

@@ -30,7 +30,7 @@ use crate::protocols::{Known, ProtocolArgs};
     cantap stats -d virtual -b 1M -t 10\n  \
     cantap stats workshop.log --protocols\n\n\
 A frame's load is its exact length, stuff bits and intermission included, over the time since the frame\n\
-before. Windows also count error frames, with their least length. Where frames were lost, the load is a\n\
+before. Windows also count error frames, with their minimum length. Where frames were lost, the load is a\n\
 lower bound and says so.")]
 pub struct Args {
     /// The trace; - for standard input.

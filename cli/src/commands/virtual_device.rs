@@ -16,7 +16,7 @@ use crate::interrupt;
                         canopen          CANopen nodes on channel 1, one of them without a number; --print-eds prints their sheet;\n                   \
                         it does not go with load, frames, burst and log\n  load=PCT         bus load, 0 to 100 (50)\n  \
                         frames=KIND      std0, std8, ext0, ext8, rtr, mix (mix)\n  \
-                        bitrate=RATE     of the bus (that of whoever opens the channel)\n  \
+                        bitrate=RATE     of the bus (default: the rate it is opened at)\n  \
                         burst=N/PERIOD   N frames back to back every PERIOD, in place of a load\n  \
                         errors=PCT       share of the frames that are destroyed (0)\n  \
                         disturb=N        the first N frames that the device sends are destroyed: 32 make it bus-off (0)\n  \

@@ -126,7 +126,7 @@ pub enum Trouble {
     #[error("malformed: {0}")]
     Malformed(&'static str),
     /// Its beginning was not observed.
-    #[error("its beginning was not heard")]
+    #[error("its beginning is missing")]
     Headless,
 }
 

@@ -388,7 +388,7 @@ fn python_can_finds_hears_and_sends() {
     let imports = Command::new(&python).args(["-c", "import can"]).output();
     if !imports.is_ok_and(|output| output.status.success()) {
         assert!(std::env::var_os("CANTAP_REQUIRE_PEERS").is_none(), "{python} has no python-can");
-        eprintln!("SKIPPED: {python} has no python-can; name one that has in CANTAP_PYTHON");
+        eprintln!("SKIPPED: {python} has no python-can; name one that has it in CANTAP_PYTHON");
         return;
     }
     let board = board("load=30");

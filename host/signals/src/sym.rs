@@ -196,7 +196,7 @@ impl Reader {
 
     fn entry(&mut self, key: &str, rest: &str, line: u32, comment: &str) -> Result<(), FaultKind> {
         let words = words(rest);
-        let bad = |what: &str| FaultKind::Syntax(format!("{key}={rest} is no {what}"));
+        let bad = |what: &str| FaultKind::Syntax(format!("{key}={rest} is not a valid {what}"));
         let first = words.first().map_or("", String::as_str);
         if !self.in_block {
             if key.eq_ignore_ascii_case("Sig") {

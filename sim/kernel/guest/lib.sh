@@ -140,7 +140,7 @@ has_told() { grep -q "$1" capture.err; }
 
 # survived: the capture has reported that the device went away and came back, and ends as if nothing had happened.
 survived() {
-  wait_until has_told "goes on when the device is back" &&
+  wait_until has_told "continues when the device is back" &&
     wait_until has_told "the device is back after" &&
     kill -INT "$CAPTURE" && ended 0 && return
   kill -9 "$CAPTURE" 2> /dev/null

@@ -75,7 +75,7 @@ impl App {
         let (path, _) = recorder::parts(text);
         if path.exists() {
             let path = path.display();
-            return Err(format!("{path} exists already; choose another name, or remove it first"));
+            return Err(format!("{path} already exists; choose another name, or remove it first"));
         }
         self.order(Order::Record(text.to_owned()));
         Ok(())

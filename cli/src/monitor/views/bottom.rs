@@ -21,7 +21,7 @@ pub fn draw(frame: &mut Frame<'_>, body: Rect, bottom: Rect, app: &App, model: &
         match said(app, model) {
             Some(said) if said.chars().count() + 1 > width => {
                 over(frame, body, &said);
-                Line::from(" any key goes on, h helps")
+                Line::from(" any key continues, h helps")
             }
             Some(said) => Line::from(format!(" {said}")),
             None => Line::from(format!(" {}", keys(app, model, width.saturating_sub(1)))),

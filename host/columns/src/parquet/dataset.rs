@@ -36,7 +36,7 @@ fn is_taken(name: &str) -> bool {
 
 /// A text that is not a [`Key`].
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("'{0}' names no folders: write day, channel, or NAME=VALUE with a name that is no column's")]
+#[error("'{0}' is not a partition: write day, channel, or NAME=VALUE with a NAME that no column has")]
 pub struct BadKey(String);
 
 impl FromStr for Key {

@@ -94,7 +94,7 @@ def _decode(spark: SparkSession, arguments: argparse.Namespace) -> int:
     settings = Settings(tuple(arguments.signal), arguments.zone, arguments.timeout)
     states = dataset.write(spark, work, settings, arguments.output, arguments.task_bytes)
     words = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
-    print(f"{states.total()} traces: {words}. What is wrong with them stands in {arguments.output}/ledger")
+    print(f"{states.total()} traces: {words}. Problems are listed in {arguments.output}/ledger")
     # A job that could not decode anything is not a success.
     return 1 if states[REFUSED] + states[FAILED] == states.total() else 0
 

@@ -84,10 +84,10 @@ has_outcome() { ! is_capturing || has_told "the device is back after"; }
 
 _bad=0
 for _ in $(seq 6); do away_and_back detach || _bad=$((_bad + 1)); done
-verdict $_bad "6 detachments at random times: each client goes on when the device is back" "$_bad do not"
+verdict $_bad "6 detachments at random times: each client continues when the device is back" "$_bad do not"
 capture_is_exact "a capture after detachments"
 
 _bad=0
 for _ in 1 2 3; do away_and_back board unplug || _bad=$((_bad + 1)); done
-verdict $_bad "the cable is pulled 3 times: each client goes on when the device is back" "$_bad do not"
+verdict $_bad "the cable is pulled 3 times: each client continues when the device is back" "$_bad do not"
 capture_is_exact "a capture after pulled cables"

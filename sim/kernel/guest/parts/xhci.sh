@@ -23,7 +23,7 @@ wait_until has_port
 capture_is_exact "xHCI: a capture after a reset"
 stream -t 60
 board unplug
-check "xHCI: a client whose cable is pulled says so" wait_until has_told "goes on when the device is back"
+check "xHCI: a client whose cable is pulled says so" wait_until has_told "continues when the device is back"
 kill -INT "$CAPTURE"
 wait "$CAPTURE"
 wait_until has_no_port

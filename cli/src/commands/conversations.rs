@@ -1,21 +1,20 @@
 //! `cantap conversations`: what the frames mean.
 
 mod json;
+mod line;
 mod lines;
 mod summary;
 
-use std::fmt;
 use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
 
-use cantap_protocols::{Event, Options, Protocol};
-use cantap_trace::Interface;
+use cantap_protocols::{Options, Protocol};
 
+pub use self::line::write;
 use self::lines::Lines;
 use self::summary::Summary;
-use super::decode::Seconds;
 use crate::databases::DatabaseArgs;
 use crate::input::ReadArgs;
 use crate::live::LiveArgs;
@@ -101,19 +100,4 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     records.judge()?;
     Ok(ExitCode::SUCCESS)
-}
-
-/// Writes an event as a line.
-pub fn write(out: &mut impl Write, event: &Event, json: bool) -> std::io::Result<()> {
-    if json { json::write(out, event) } else { writeln!(out, "{}", Line(event)) }
-}
-
-/// An event as a line of text, without its end.
-struct Line<'a>(&'a Event);
-
-impl fmt::Display for Line<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self(event) = self;
-        write!(f, "({}) {} {event}", Seconds(event.time_ns), Interface(event.channel))
-    }
 }

@@ -3,7 +3,7 @@
 //! A frame's identifier is where a CAN channel sends it, its signals are in the PDUs mapped into it, and how their bits become values is in yet
 //! other places, all named by paths. Of a secured PDU, the payload is read and what follows it: freshness value and authenticator.
 
-mod container;
+mod containers;
 
 use std::collections::{HashMap, HashSet};
 

@@ -7,7 +7,8 @@ use std::thread::{self, JoinHandle};
 
 use cantap_protocols::Event;
 
-use super::{Line, json};
+use super::json;
+use super::line::Line;
 
 /// Events that go to the thread together.
 const BATCH: usize = 2048;

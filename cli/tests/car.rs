@@ -4,6 +4,9 @@
 //! cantools is in `CANTAP_PYTHON`, otherwise `python3`. If it is missing, the test says so and passes, unless
 //! `CANTAP_REQUIRE_PEERS=1`.
 
+#[path = "../../tests/peers/mod.rs"]
+mod peers;
+
 use std::process::{Command, Output};
 
 fn cantap(arguments: &[&str]) -> (String, String) {
@@ -16,14 +19,7 @@ fn cantap(arguments: &[&str]) -> (String, String) {
 
 #[test]
 fn cantools_reads_the_database_and_finds_every_frame_in_range() {
-    let python = std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned());
-    let there = Command::new(&python).args(["-c", "import cantools"]).output();
-    if !there.is_ok_and(|output| output.status.success()) {
-        let required = std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1");
-        assert!(!required, "cantools is required and does not run");
-        eprintln!("SKIPPED: cantools is not installed, so the car's database was not read by it");
-        return;
-    }
+    let Some(python) = peers::python_with("cantools") else { return };
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name).display().to_string();
     std::fs::write(path("car.dbc"), cantap(&["virtual", "car", "--dbc"]).0).unwrap();

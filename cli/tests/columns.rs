@@ -4,6 +4,9 @@
 //! unless `CANTAP_REQUIRE_PEERS=1`.
 #![cfg(feature = "parquet")]
 
+#[path = "../../tests/peers/mod.rs"]
+mod peers;
+
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
@@ -40,16 +43,7 @@ fn drive(folder: &Path) {
 
 #[test]
 fn engines_read_what_the_trace_has() {
-    let python = std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned());
-    let there = Command::new(&python).args(["-c", "import duckdb, pandas, polars, pyarrow"]).output();
-    if !there.is_ok_and(|output| output.status.success()) {
-        let required = std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1");
-        assert!(!required, "pyarrow, DuckDB, Polars and pandas are required and do not run");
-        eprintln!(
-            "SKIPPED: pyarrow, DuckDB, Polars or pandas is not installed, so no Parquet file was read by them"
-        );
-        return;
-    }
+    let Some(python) = peers::python_with("duckdb, pandas, polars, pyarrow") else { return };
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     drive(folder);

@@ -3,6 +3,8 @@
 #![cfg(unix)]
 
 mod firmware;
+#[path = "../../tests/peers/mod.rs"]
+mod peers;
 mod port;
 
 use std::fs::{File, OpenOptions};
@@ -288,11 +290,7 @@ struct Tshark(tempfile::TempDir);
 impl Tshark {
     fn install() -> Option<Self> {
         let tshark = Self(tempfile::tempdir().unwrap());
-        let there = tshark.command("tshark").arg("--version").output();
-        if !there.is_ok_and(|output| output.status.success()) {
-            let required = std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1");
-            assert!(!required, "tshark is required and does not run");
-            eprintln!("SKIPPED: tshark is not installed, so it captured nothing");
+        if !peers::has(tshark.command("tshark").arg("--version"), "tshark") {
             return None;
         }
         let (code, out, err) = said(&tshark.command(CANTAP).args(["extcap", "install"]).output().unwrap());

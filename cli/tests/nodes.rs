@@ -5,14 +5,18 @@
 //! `CANTAP_REQUIRE_PEERS=1`.
 #![cfg(unix)]
 
+#[path = "../../tests/peers/mod.rs"]
+mod peers;
 #[expect(dead_code, reason = "the types one by one are for another test")]
 mod schema;
+mod served;
 
 use std::io::{BufRead, BufReader};
 use std::process::{Child, ChildStdout, Command, Output, Stdio};
 
 use schema::Schema;
 use serde_json::Value;
+use served::Served;
 
 /// A bus on which nobody but the peer says anything.
 const NO_NODE: &str = "virtual:load=0";
@@ -20,38 +24,18 @@ const CANTAP: &str = env!("CARGO_BIN_EXE_cantap");
 
 /// A shared board and a node on its bus.
 struct Rig {
-    server: Child,
+    served: Served,
     peer: Child,
     /// What the peer prints from now on.
     said: BufReader<ChildStdout>,
-    at: String,
-    folder: tempfile::TempDir,
 }
 
 impl Rig {
     /// A device, and what `node_peer.py` calls `kind` on its bus; `None` without the Python `packages` for it.
     fn new(device: &str, packages: &str, kind: &str) -> Option<Self> {
-        let python = std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned());
-        let there = Command::new(&python).args(["-c", &format!("import can, {packages}")]).output();
-        if !there.is_ok_and(|output| output.status.success()) {
-            let required = std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1");
-            assert!(!required, "{packages} is required and does not run");
-            eprintln!("SKIPPED: {packages} is not installed, so nothing was said to its nodes");
-            return None;
-        }
-        let folder = tempfile::tempdir().unwrap();
-        let socket = folder.path().join("cantap.sock").display().to_string();
-        let mut server = Command::new(CANTAP)
-            .args(["serve", "-d", device, "-b", "500k", "--unix", &socket])
-            .args(["--socketcand", "127.0.0.1:0", "--allow", "send"])
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let mut lines = BufReader::new(server.stdout.take().unwrap()).lines();
-        let at = lines.next().unwrap().unwrap();
-        let way = lines.next().unwrap().unwrap();
-        let (host, port) = way.strip_prefix("can://").unwrap().split_once(':').unwrap();
+        let python = peers::python_with(&format!("can, {packages}"))?;
+        let served = Served::start(device, Stdio::inherit());
+        let [host, port] = &served.socketcand;
         let mut peer = Command::new(python)
             .args([concat!(env!("CARGO_MANIFEST_DIR"), "/tests/node_peer.py"), kind, host, port])
             .stdin(Stdio::piped())
@@ -61,7 +45,7 @@ impl Rig {
         let mut said = BufReader::new(peer.stdout.take().unwrap());
         let mut ready = String::new();
         let _ = said.read_line(&mut ready);
-        let rig = Self { server, peer, said, at, folder };
+        let rig = Self { served, peer, said };
         assert_eq!(ready.trim_end(), "ready");
         Some(rig)
     }
@@ -69,8 +53,9 @@ impl Rig {
     fn run(&self, line: &str) -> (Option<i32>, String, String) {
         let mut words = line.split(' ');
         let mut command = Command::new(CANTAP);
-        command.arg(words.next().unwrap()).args(["-d", &self.at, "-b", "500k"]).args(words);
-        let Output { status, stdout, stderr } = command.current_dir(self.folder.path()).output().unwrap();
+        command.arg(words.next().unwrap()).args(["-d", &self.served.at, "-b", "500k"]).args(words);
+        let Output { status, stdout, stderr } =
+            command.current_dir(self.served.folder.path()).output().unwrap();
         (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
     }
 
@@ -95,10 +80,8 @@ impl Rig {
 
 impl Drop for Rig {
     fn drop(&mut self) {
-        for child in [&mut self.peer, &mut self.server] {
-            let _ = child.kill();
-            let _ = child.wait();
-        }
+        let _ = self.peer.kill();
+        let _ = self.peer.wait();
     }
 }
 
@@ -156,16 +139,16 @@ fn a_node_on_python_canopen_is_found_read_written_and_commanded() {
     assert!(rig.well("canopen read 5 2000 --block").contains("written_in_more_than_one_frame"));
     rig.well("canopen read 5 2000 -o object.bin");
     assert_eq!(
-        std::fs::read(rig.folder.path().join("object.bin")).unwrap(),
+        std::fs::read(rig.served.folder.path().join("object.bin")).unwrap(),
         b"written_in_more_than_one_frame"
     );
     let (code, _, err) = rig.run("canopen read 5 2000 -o object.bin");
     assert!(code == Some(1) && err.contains("nothing there is overwritten"), "{err}");
     assert_eq!(rig.run("canopen read 5 3000 -o nothing.bin").0, Some(1));
-    assert!(!rig.folder.path().join("nothing.bin").exists());
+    assert!(!rig.served.folder.path().join("nothing.bin").exists());
     // A sheet provides types and names.
     let sheet = "[DeviceInfo]\nProductName=Node\n[2001]\nParameterName=Counter\nObjectType=0x7\nDataType=0x0007\nAccessType=rw\n";
-    std::fs::write(rig.folder.path().join("node.eds"), sheet).unwrap();
+    std::fs::write(rig.served.folder.path().join("node.eds"), sheet).unwrap();
     rig.well("canopen write 5 2001 0 123456 --eds 5:node.eds");
     let out = rig.well("canopen read 5 2001 --eds 5:node.eds");
     assert!(out.contains("Counter") && out.contains("value 123456"), "{out}");

@@ -1,6 +1,9 @@
 //! python-can's slcan interface, unmodified, on the virtual device's pseudo-terminal.
 #![cfg(unix)]
 
+#[path = "../../tests/peers/mod.rs"]
+mod peers;
+
 use std::io::{BufRead, BufReader};
 use std::process::{Command, Stdio};
 
@@ -50,18 +53,7 @@ fn python_can_talks_to_the_virtual_device() {
 
 /// The output of a program that gets the virtual device's port and these arguments; `None` without python-can.
 fn on_virtual_device(options: &str, program: &[&str]) -> Option<String> {
-    let python = std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned());
-    let imports = Command::new(&python).args(["-c", "import can, serial"]).output();
-    if !imports.is_ok_and(|output| output.status.success()) {
-        assert!(
-            std::env::var_os("CANTAP_REQUIRE_PEERS").is_none(),
-            "{python} has no python-can with pyserial"
-        );
-        eprintln!(
-            "SKIPPED: {python} has no python-can with pyserial; name one that has them in CANTAP_PYTHON"
-        );
-        return None;
-    }
+    let python = peers::python_with("can, serial")?;
     let mut device = Command::new(env!("CARGO_BIN_EXE_cantap"))
         .args(["virtual", options])
         .stdout(Stdio::piped())

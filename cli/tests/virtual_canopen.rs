@@ -6,57 +6,37 @@
 //! `CANTAP_REQUIRE_PEERS=1`.
 #![cfg(unix)]
 
+#[path = "../../tests/peers/mod.rs"]
+mod peers;
+mod served;
+
 use std::io::{BufRead, BufReader};
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use serde_json::{Value, json};
+use served::Served;
 
 const CANTAP: &str = env!("CARGO_BIN_EXE_cantap");
 
-fn has_peer(python: &str) -> bool {
-    let there = Command::new(python).args(["-c", "import can, canopen"]).output();
-    let there = there.is_ok_and(|output| output.status.success());
-    if !there {
-        let required = std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1");
-        assert!(!required, "canopen is required and does not run");
-        eprintln!("SKIPPED: canopen is not installed, so it was not the nodes' master");
-    }
-    there
-}
-
 #[test]
 fn python_canopen_masters_the_nodes_and_a_listener_hears_the_same() {
-    let python = std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned());
-    if !has_peer(&python) {
-        return;
-    }
-    let folder = tempfile::tempdir().unwrap();
-    let socket = folder.path().join("cantap.sock").display().to_string();
-    let sheet = folder.path().join("node.eds");
+    let Some(python) = peers::python_with("can, canopen") else { return };
+    let mut served = Served::start("virtual:canopen", Stdio::piped());
+    let folder = served.folder.path().to_owned();
+    let sheet = folder.join("node.eds");
     let printed = Command::new(CANTAP).args(["virtual", "--print-eds"]).output().unwrap();
     std::fs::write(&sheet, &printed.stdout).unwrap();
-    let mut server = Command::new(CANTAP)
-        .args(["serve", "-d", "virtual:canopen", "-b", "500k", "--unix", &socket])
-        .args(["--socketcand", "127.0.0.1:0", "--allow", "send"])
-        .stdin(Stdio::null())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
-    let mut lines = BufReader::new(server.stdout.take().unwrap()).lines();
-    let at = lines.next().unwrap().unwrap();
-    let way = lines.next().unwrap().unwrap();
-    let (host, port) = way.strip_prefix("can://").unwrap().split_once(':').unwrap();
-    let heard = folder.path().join("heard.log");
+    let [host, port] = &served.socketcand;
+    let heard = folder.join("heard.log");
     let mut listener = Command::new(CANTAP)
-        .args(["capture", "-d", &at, "-b", "500k", "-t", "2m", "-o"])
+        .args(["capture", "-d", &served.at, "-b", "500k", "-t", "2m", "-o"])
         .arg(&heard)
         .stdin(Stdio::null())
         .spawn()
         .unwrap();
     // The server reports that it is ready.
-    let mut words = BufReader::new(server.stderr.take().unwrap()).lines();
+    let mut words = BufReader::new(served.server.stderr.take().unwrap()).lines();
     assert!(words.any(|line| line.unwrap().contains("is in and may")));
     let rest = std::thread::spawn(move || words.count());
     std::thread::sleep(Duration::from_millis(500));
@@ -66,8 +46,8 @@ fn python_canopen_masters_the_nodes_and_a_listener_hears_the_same() {
     // Ended as by Ctrl-C, so that the file is complete.
     Command::new("kill").args(["-INT", &listener.id().to_string()]).status().unwrap();
     listener.wait().unwrap();
-    server.kill().unwrap();
-    server.wait().unwrap();
+    served.server.kill().unwrap();
+    served.server.wait().unwrap();
     rest.join().unwrap();
     assert!(output.status.success(), "{text}");
     let said: Value = serde_json::from_slice(&output.stdout).unwrap();

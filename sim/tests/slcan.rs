@@ -2,6 +2,9 @@
 //! python-can.
 
 mod common;
+#[cfg(unix)]
+#[path = "../../tests/peers/mod.rs"]
+mod peers;
 
 use cantap_emu::bus::{BitTime, Disturbance, Node};
 use cantap_emu::soc::CAN_IRQS;
@@ -212,7 +215,7 @@ fn an_overrun_sets_the_data_overrun_flag_once() {
 }
 
 #[cfg(unix)]
-mod peers {
+mod python_can {
     use super::*;
 
     use std::process::Command;
@@ -264,25 +267,10 @@ print("done")
         }
     }
 
-    /// A Python with python-can: `CANTAP_PYTHON`, the one made by `cargo xtask test`, or the system's.
-    fn python() -> Option<String> {
-        let made = concat!(env!("CARGO_MANIFEST_DIR"), "/../target/peers/bin/python");
-        let named = std::env::var("CANTAP_PYTHON").ok();
-        for python in named.into_iter().chain([made.to_owned(), "python3".to_owned()]) {
-            let imports = Command::new(&python).args(["-c", "import can, serial"]).output();
-            if imports.is_ok_and(|output| output.status.success()) {
-                return Some(python);
-            }
-        }
-        assert!(std::env::var_os("CANTAP_REQUIRE_PEERS").is_none(), "no Python with python-can and pyserial");
-        eprintln!("SKIPPED: no Python with python-can and pyserial; name one that has them in CANTAP_PYTHON");
-        None
-    }
-
     #[test]
     #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
     fn python_can_sends_and_receives_through_the_elf() {
-        let (image, Some(python)) = (common::firmware(), python()) else { return };
+        let (image, Some(python)) = (common::firmware(), peers::python_with("can, serial")) else { return };
         let load = Load::Frames { kind: Kind::Std8, percent: 5.0 };
         let options = Options { load, bound: common::bound(), ..Options::default() };
         let manner = Manner { witness: true, ..Manner::default() };

@@ -5,6 +5,9 @@
 //! The Python that has them is `CANTAP_PYTHON`, otherwise `python3`. If a peer is missing, it is named and its test passes,
 //! unless `CANTAP_REQUIRE_PEERS=1`.
 
+#[path = "../../../tests/peers/mod.rs"]
+mod peers;
+
 use std::io::Read;
 use std::process::Command;
 
@@ -17,14 +20,7 @@ const BOAT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../formats/tests/data/n
 
 /// The output of the script, or `None` after reporting that a module is missing.
 fn peer(module: &str, arguments: &[&str]) -> Option<String> {
-    let python = std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned());
-    let probe = Command::new(&python).args(["-c", &format!("import can, {module}")]).output();
-    if !probe.is_ok_and(|output| output.status.success()) {
-        let required = std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1");
-        assert!(!required, "{module} is required and is not there");
-        eprintln!("SKIPPED: {module} is not installed, so nothing was compared with it");
-        return None;
-    }
+    let python = peers::python_with(&format!("can, {module}"))?;
     let output = Command::new(python).arg(SCRIPT).args(arguments).output().unwrap();
     assert!(output.status.success(), "{module}: {}", String::from_utf8_lossy(&output.stderr));
     Some(String::from_utf8(output.stdout).unwrap())

@@ -4,6 +4,9 @@
 //! Python is `CANTAP_PYTHON`, otherwise `python3`; without python-can the test says that it was skipped, unless
 //! `CANTAP_REQUIRE_PEERS=1`.
 
+#[path = "../../../tests/peers/mod.rs"]
+mod peers;
+
 use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::process::Command;
@@ -384,13 +387,7 @@ print("done")
 
 #[test]
 fn python_can_finds_hears_and_sends() {
-    let python = std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned());
-    let imports = Command::new(&python).args(["-c", "import can"]).output();
-    if !imports.is_ok_and(|output| output.status.success()) {
-        assert!(std::env::var_os("CANTAP_REQUIRE_PEERS").is_none(), "{python} has no python-can");
-        eprintln!("SKIPPED: {python} has no python-can; name one that has it in CANTAP_PYTHON");
-        return;
-    }
+    let Some(python) = peers::python_with("can") else { return };
     let board = board("load=30");
     let server = listen(&board, Role::Send);
     let listener = Device::over(board.link("listener", Role::Listen).unwrap(), "listener").unwrap();

@@ -4,6 +4,9 @@
 //! Needs a Python with cantools (`CANTAP_PYTHON`, otherwise `python3`). Without it, the test says so
 //! and passes, unless `CANTAP_REQUIRE_PEERS=1`.
 
+#[path = "../../../tests/peers/mod.rs"]
+mod peers;
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -100,16 +103,7 @@ fn peer(arguments: &[&Path], payloads: u32) -> Result<String, String> {
 
 /// The script's output, or `None` after reporting that the peer is missing.
 fn peer_or_skip(arguments: &[&Path], payloads: u32) -> Option<String> {
-    match peer(arguments, payloads) {
-        Ok(text) => Some(text),
-        Err(reason) if std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1") => {
-            panic!("cantools is required and does not run: {reason}")
-        }
-        Err(reason) => {
-            eprintln!("SKIPPED: no comparison with cantools: {reason}");
-            None
-        }
-    }
+    peer(arguments, payloads).map_err(|reason| peers::skip(&format!("cantools does not run: {reason}"))).ok()
 }
 
 fn own_files() -> Vec<PathBuf> {

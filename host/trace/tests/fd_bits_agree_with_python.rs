@@ -4,6 +4,9 @@
 //! The interpreter is `CANTAP_PYTHON`, otherwise `python3`. Without one, the test says so and passes, unless
 //! `CANTAP_REQUIRE_PEERS=1`.
 
+#[path = "../../../tests/peers/mod.rs"]
+mod peers;
+
 use std::io::Write;
 use std::process::{Command, Stdio};
 
@@ -33,16 +36,8 @@ fn frames() -> Vec<FdFrame> {
 
 #[test]
 fn lengths_and_crcs_are_those_of_the_model() {
-    let python = std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned());
-    let model = Command::new(python).arg(MODEL).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn();
-    let Ok(mut model) = model else {
-        assert!(
-            std::env::var_os("CANTAP_REQUIRE_PEERS").is_none_or(|value| value != "1"),
-            "Python is required"
-        );
-        eprintln!("SKIPPED: Python is not installed, so nothing was compared with the model");
-        return;
-    };
+    let model = Command::new(peers::python()).arg(MODEL).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn();
+    let Ok(mut model) = model else { return peers::skip("Python is not installed") };
     let frames = frames();
     let mut stdin = model.stdin.take().unwrap();
     let lines: Vec<String> = frames

@@ -5,6 +5,9 @@
 //! unless `CANTAP_REQUIRE_PEERS=1`.
 #![cfg(unix)]
 
+#[path = "../../../tests/peers/mod.rs"]
+mod peers;
+
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -23,28 +26,14 @@ struct Client {
     _directory: Option<tempfile::TempDir>,
 }
 
-fn is_missing(program: &str, name: &str) -> bool {
-    let missing =
-        !Command::new(program).arg("--version").output().is_ok_and(|output| output.status.success());
-    if missing {
-        let required = std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1");
-        assert!(!required, "{program} is required and does not run");
-        eprintln!("SKIPPED: {program} is not installed, so the client in {name} was not tried");
-    }
-    missing
-}
-
 fn python() -> Option<Client> {
-    let python = std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned());
-    if is_missing(&python, "Python") {
-        return None;
-    }
+    let python = peers::python_with("os")?;
     let command = vec![python, "-u".to_owned(), format!("{CLIENTS}/cantap_client.py")];
     Some(Client { name: "Python", command, _directory: None })
 }
 
 fn c() -> Option<Client> {
-    if is_missing("cc", "C") {
+    if !peers::has(Command::new("cc").arg("--version"), "cc") {
         return None;
     }
     let directory = tempfile::tempdir().unwrap();

@@ -1,31 +1,26 @@
 //! Other programs that read our files and write some that we read.
 //!
-//! python-can is in `CANTAP_PYTHON`, otherwise `python3`. If a peer is missing, it is named and its test
-//! passes, unless `CANTAP_REQUIRE_PEERS=1`.
+//! What is the same for all crates' peers is in [`shared`].
 
 #![allow(dead_code, reason = "each test file uses some of them")]
+
+#[path = "../../../../tests/peers/mod.rs"]
+mod shared;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+pub use shared::{python, skip};
+
 const SCRIPT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/trace_peer.py");
-
-pub fn python() -> String {
-    std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned())
-}
-
-pub fn peers_are_required() -> bool {
-    std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1")
-}
 
 /// A program's output, or `None` after reporting that it is missing. If it is there and fails, the test
 /// fails.
 pub fn run(peer: &str, probe: &[&str], command: &mut Command) -> Option<String> {
     let there = Command::new(command.get_program()).args(probe).output();
     if !there.is_ok_and(|output| output.status.success() || probe.is_empty()) {
-        assert!(!peers_are_required(), "{peer} is required and does not run");
-        eprintln!("SKIPPED: {peer} is not installed, so nothing was compared with it");
+        skip(&format!("{peer} is not installed"));
         return None;
     }
     let output = command.env("TZ", "UTC").output().unwrap();

@@ -1,0 +1,42 @@
+//! A board that `cantap serve` shares, for programs of other people that connect through python-can's socketcand.
+
+use std::io::{BufRead, BufReader};
+use std::process::{Child, Command, Stdio};
+
+/// A running server. It ends when this is dropped.
+pub struct Served {
+    pub server: Child,
+    /// Its address for `-d`.
+    pub at: String,
+    /// Host and port of its socketcand.
+    pub socketcand: [String; 2],
+    pub folder: tempfile::TempDir,
+}
+
+impl Served {
+    /// Shares a device at 500 kbit/s; clients may send. `stderr` is where its remarks go.
+    pub fn start(device: &str, stderr: Stdio) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let socket = folder.path().join("cantap.sock").display().to_string();
+        let mut server = Command::new(env!("CARGO_BIN_EXE_cantap"))
+            .args(["serve", "-d", device, "-b", "500k", "--unix", &socket])
+            .args(["--socketcand", "127.0.0.1:0", "--allow", "send"])
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(stderr)
+            .spawn()
+            .unwrap();
+        let mut lines = BufReader::new(server.stdout.take().unwrap()).lines();
+        let at = lines.next().unwrap().unwrap();
+        let way = lines.next().unwrap().unwrap();
+        let (host, port) = way.strip_prefix("can://").unwrap().split_once(':').unwrap();
+        Self { server, at, socketcand: [host.to_owned(), port.to_owned()], folder }
+    }
+}
+
+impl Drop for Served {
+    fn drop(&mut self) {
+        let _ = self.server.kill();
+        let _ = self.server.wait();
+    }
+}

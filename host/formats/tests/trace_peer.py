@@ -2,7 +2,7 @@
 
 dump FILE...             prints "file PATH", then one line for each message
 write LINES FILE...      writes the messages of such lines into each file, format by suffix
-columns LINES FILE...    writes its data frames with asammdf in columns, as MDF 4.2 has them
+asammdf LINES FILE...    writes its data frames with asammdf, as each name says: VERSION_COMPRESSION_GROUPS_LAYOUT.mf4, layout rows or columns
 
 A line is: microseconds, channel from 1 (0 where the format has none), Rx or Tx, data, remote, error or fd,
 identifier in hexadecimal, x if it is extended, length, bytes in hexadecimal; of CAN FD the flags: 1 for a switched
@@ -102,7 +102,7 @@ def write(lines, paths):
                 message.channel = number
 
 
-def columns(lines, paths):
+def by_asammdf(lines, paths):
     import datetime
 
     import asammdf
@@ -128,22 +128,28 @@ def columns(lines, paths):
     times = numpy.array([message.timestamp - start.timestamp() for message in messages])
     source = SourceInformation(source_type=2, bus_type=2)
     for path in paths:
-        mdf = asammdf.MDF(version="4.20")
-        # No option of the class that makes new files turns it on, and blocks would be larger than these files.
+        version, compression, groups, layout = Path(path).stem.split("_")
+        mdf = asammdf.MDF(version=version)
+        # No option of the class that makes new files turns columns on, and blocks would be larger than these files.
         inner = getattr(mdf, "_mdf", mdf)
-        inner._column_storage, inner._write_fragment_size = True, 4096
+        inner._column_storage, inner._write_fragment_size = layout == "columns", 4096
         mdf.header.start_time = start
-        frames = Signal(name="CAN_DataFrame", samples=records, timestamps=times, source=source)
-        speed = Signal(name="Speed", samples=times, timestamps=times)
-        mdf.append([frames, speed], acq_source=source)
-        mdf.save(path, compression=int(Path(path).stem[-1]), overwrite=True)
+        for group in range(int(groups)):
+            # With two groups, one for each of two buses.
+            chosen = records["CAN_DataFrame.BusChannel"] % int(groups) == group
+            frames = Signal(name="CAN_DataFrame", samples=records[chosen], timestamps=times[chosen], source=source)
+            beside = [Signal(name="Speed", samples=times[chosen], timestamps=times[chosen])] if layout == "columns" else []
+            mdf.append([frames, *beside], acq_source=source)
+        if layout == "rows":
+            mdf.append([Signal(name="Speed", samples=times, timestamps=times)])
+        mdf.save(path, compression=int(compression), overwrite=True)
 
 
 if __name__ == "__main__":
     command, *arguments = sys.argv[1:]
     if command == "dump":
         dump(arguments)
-    elif command == "columns":
-        columns(arguments[0], arguments[1:])
+    elif command == "asammdf":
+        by_asammdf(arguments[0], arguments[1:])
     else:
         write(arguments[0], arguments[1:])

@@ -211,8 +211,10 @@ fn we_read_what_asammdf_writes() {
     };
     let rows =
         ["4.00", "4.10", "4.11", "4.20", "4.30"].into_iter().flat_map(|version| packed(version, "rows"));
-    let names: Vec<_> = rows.chain(packed("4.20", "columns")).collect();
-    let paths: Vec<_> = names.iter().map(|name| directory.join(name)).collect();
+    let names = rows.chain(packed("4.20", "columns"));
+    // Version 4.00 has no compressed blocks.
+    let names = names.filter(|name| !name.starts_with("4.00") || name.starts_with("4.00_0"));
+    let paths: Vec<_> = names.map(|name| directory.join(name)).collect();
     let arguments: Vec<_> = std::iter::once(&source).chain(&paths).map(PathBuf::as_path).collect();
     if python_can(&arguments, "asammdf").is_none() {
         return;
@@ -314,8 +316,7 @@ fn we_read_the_captures_that_editcap_makes_of_ours() {
     let ours = directory.join("ours.pcapng");
     write(&ours, Format::Pcapng, &records);
     let plain = Carries { channel: Some(1), direction: false, ..EVERYTHING };
-    for (kind, carries) in [("pcap", plain), ("nsecpcap", plain), ("modpcap", plain), ("pcapng", EVERYTHING)]
-    {
+    for (kind, carries) in [("pcap", plain), ("nsecpcap", plain), ("pcapng", EVERYTHING)] {
         let theirs = directory.join(format!("theirs.{kind}"));
         let mut command = Command::new("editcap");
         if run("editcap", &["--version"], command.args(["-F", kind]).args([&ours, &theirs])).is_none() {

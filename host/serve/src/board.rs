@@ -393,12 +393,7 @@ fn take(state: &mut State, decoder: &mut Decoder, piece: &[u8], heard: &mut Hear
             let _ = answer.try_send(result.clone());
         }
         Decoded::Ended { reason, .. } => {
-            heard.end = Some(match reason {
-                EndReason::Configured => SessionOver::Configured,
-                EndReason::Suspended | EndReason::BoardLost | EndReason::ServerEnded => {
-                    SessionOver::Suspended
-                }
-            });
+            heard.end = Some(reason.into());
         }
         Decoded::Corrupt(Corruption::OutOfOrder { .. }) => heard.end = Some(SessionOver::StreamWentBack),
         Decoded::Corrupt(_) | Decoded::OtherProtocol(_) => {}

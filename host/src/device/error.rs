@@ -3,7 +3,7 @@
 use std::time::Duration;
 use std::{fmt, io};
 
-use cantap_wire::message::{MAX_FILTERS, MAX_SEND, Mode, Refusal};
+use cantap_wire::message::{EndReason, MAX_FILTERS, MAX_SEND, Mode, Refusal};
 use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS, NoTiming};
 use cantap_wire::{Channel, PROTOCOL_VERSION};
 
@@ -181,6 +181,17 @@ pub enum SessionOver {
     BoardLost,
     /// The board's server has ended.
     ServerEnded,
+}
+
+impl From<EndReason> for SessionOver {
+    fn from(reason: EndReason) -> Self {
+        match reason {
+            EndReason::Suspended => Self::Suspended,
+            EndReason::BoardLost => Self::BoardLost,
+            EndReason::ServerEnded => Self::ServerEnded,
+            EndReason::Configured => Self::Configured,
+        }
+    }
 }
 
 impl DeviceError {

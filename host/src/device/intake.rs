@@ -178,7 +178,6 @@ impl Intake {
             disorder_ticks,
         } = self;
         let mut last_ticks = None;
-        let mut disagree = false;
         let mut ended = None;
         counters.bytes += bytes.len() as u64;
         decoder.push(bytes, |decoded| match decoded {
@@ -224,11 +223,6 @@ impl Intake {
                     *last_ns = i64::MIN;
                     *clock = ClockMap::new(answer.tick_hz, utc.at(Instant::now()));
                 }
-                // Everything before it had already happened.
-                if let (Ok(Reply::Time(now)), true) = (&response.result, *in_session) {
-                    let latest = last_ticks.unwrap_or(0).max(*latest_ticks);
-                    disagree |= latest.saturating_sub(*now) > *disorder_ticks;
-                }
                 notice(Notice::Response(response.clone()));
             }
             Decoded::Ended { ticks, reason } if *in_session => {
@@ -247,11 +241,9 @@ impl Intake {
         let went_back = last_ticks.is_some_and(|last| latest_ticks.saturating_sub(last) > *disorder_ticks);
         if went_back {
             self.withhold();
+            notice(Notice::TimesDisagree);
         } else {
             *latest_ticks = (*latest_ticks).max(last_ticks.unwrap_or(0));
-        }
-        if went_back || disagree {
-            notice(Notice::TimesDisagree);
         }
         self.place_in_time();
         if let Some((ticks, reason)) = ended {
@@ -308,9 +300,16 @@ impl Intake {
         self.records.sort_by_key(|record| record.time_ns);
     }
 
-    /// Adds a round trip of the clock.
-    pub fn add_time(&mut self, ticks: Ticks, asked: Instant, answered: Instant) {
-        self.clock.add(ticks, self.utc.at(asked), self.utc.at(answered));
+    /// Adds a round trip of the clock. `latest_ticks`: the time of the latest record when the device was asked; what had been heard by then
+    /// had happened. (Records heard since may be later than the answer: a server passes them on without waiting for its answers.)
+    /// Returns false if the answer is earlier than that, which is impossible.
+    #[must_use]
+    pub fn add_time(&mut self, ticks: Ticks, latest_ticks: u64, asked: Instant, answered: Instant) -> bool {
+        let is_possible = latest_ticks.saturating_sub(ticks.0) <= self.disorder_ticks;
+        if is_possible {
+            self.clock.add(ticks, self.utc.at(asked), self.utc.at(answered));
+        }
+        is_possible
     }
 
     /// The clock's map, for reading or settling.

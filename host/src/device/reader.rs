@@ -9,7 +9,6 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use cantap_wire::framing::{self, CRC_LEN, MAX_REQUEST, max_encoded_len};
-use cantap_wire::message::EndReason;
 use cantap_wire::record::LossStage;
 use cantap_wire::{CHANNELS, Channel, Command, Refusal, Reply, Request, Response};
 
@@ -114,6 +113,15 @@ pub fn write_patiently(
     Ok(())
 }
 
+/// A request for the device's time.
+#[derive(Clone, Copy)]
+struct ClockRequest {
+    id: u16,
+    at: Instant,
+    /// Device time of the latest record that had been heard by then.
+    latest_ticks: u64,
+}
+
 #[derive(Default)]
 struct Pending {
     /// Our first request number.
@@ -121,7 +129,7 @@ struct Pending {
     next_id: u16,
     waiting: HashMap<u16, SyncSender<Answer>>,
     /// A request for the device's time that is in flight.
-    clock: Option<(u16, Instant)>,
+    clock: Option<ClockRequest>,
     subscriber: Option<SyncSender<Transmission>>,
     gone: Option<Gone>,
 }
@@ -200,7 +208,8 @@ impl Shared {
         };
         let bytes = encode(&Request { id, command })?;
         if is_clock {
-            lock(&self.pending).clock = Some((id, Instant::now()));
+            let latest_ticks = lock(&self.published).latest_ticks;
+            lock(&self.pending).clock = Some(ClockRequest { id, at: Instant::now(), latest_ticks });
         }
         if let Err(error) = self.write(&bytes) {
             self.forget(id);
@@ -231,9 +240,10 @@ impl Shared {
     /// The reader's own request for the time; nothing waits for it, and it waits for nothing.
     fn ask_time(&self) {
         let Ok(mut output) = self.output.try_lock() else { return };
+        let latest_ticks = lock(&self.published).latest_ticks;
         let mut pending = lock(&self.pending);
         let id = pending.take_id();
-        pending.clock = Some((id, Instant::now()));
+        pending.clock = Some(ClockRequest { id, at: Instant::now(), latest_ticks });
         drop(pending);
         if let Ok(bytes) = encode(&Request { id, command: Command::Time }) {
             // If it fails, reading fails too and says why, or the missing answer is noticed.
@@ -289,12 +299,7 @@ pub(super) fn run(mut port: Box<dyn Read + Send>, shared: &Arc<Shared>, orders: 
                 Notice::TimesDisagree => heard.end = heard.end.or(Some(SessionOver::TimesDisagree)),
                 Notice::Ended { time_ns, reason } => {
                     published.ended_ns = Some(time_ns);
-                    heard.end = Some(match reason {
-                        EndReason::Suspended => SessionOver::Suspended,
-                        EndReason::BoardLost => SessionOver::BoardLost,
-                        EndReason::ServerEnded => SessionOver::ServerEnded,
-                        EndReason::Configured => SessionOver::Configured,
-                    });
+                    heard.end = Some(reason.into());
                 }
             });
             if !records.is_empty() || heard.answered {
@@ -303,7 +308,9 @@ pub(super) fn run(mut port: Box<dyn Read + Send>, shared: &Arc<Shared>, orders: 
             let lost = shared.buffer.push(records);
             intake.count_host_losses(lost);
             if let Some((ticks, asked)) = times {
-                intake.add_time(ticks, asked, answered);
+                if !intake.add_time(ticks, asked.latest_ticks, asked.at, answered) {
+                    heard.end = heard.end.or(Some(SessionOver::TimesDisagree));
+                }
                 *lock(&shared.clock_map) = Some(Arc::new(intake.clock().clone()));
             }
         }
@@ -374,12 +381,11 @@ fn follow(orders: &Receiver<Order>, intake: &mut Intake, shared: &Shared) -> boo
     false
 }
 
-/// Passes an answer to the caller that asked. If it is the device's time, returns that and when it was asked
-/// for.
-fn answer(shared: &Shared, response: Response) -> Option<(Ticks, Instant)> {
+/// Passes an answer to the caller that asked. If it is the device's time, returns that and its request.
+fn answer(shared: &Shared, response: Response) -> Option<(Ticks, ClockRequest)> {
     let mut pending = lock(&shared.pending);
     let time = match (&response.result, pending.clock) {
-        (Ok(Reply::Time(ticks)), Some((id, asked))) if id == response.id => Some((Ticks(*ticks), asked)),
+        (Ok(Reply::Time(ticks)), Some(asked)) if asked.id == response.id => Some((Ticks(*ticks), asked)),
         _ => None,
     };
     if let Some(waiting) = pending.waiting.remove(&response.id) {

@@ -47,6 +47,8 @@ pub enum Fault {
     Garbage,
     /// Every answer takes 300 ms.
     Slow,
+    /// Records overtake its answers about its time, as in a server that was kept waiting between the two.
+    Overtaken,
     /// The record that ends a channel never comes.
     NeverStops,
     /// Its clock was set back by a second.
@@ -363,7 +365,13 @@ impl FakeDevice {
                     if fault == Fault::Configured && !greeted && !std::mem::replace(&mut told, true) {
                         self.end_session(EndReason::Configured);
                     }
-                    if greeted {
+                    if fault == Fault::Overtaken && command == Command::Time {
+                        let then = self.ticks();
+                        std::thread::sleep(Duration::from_millis(300));
+                        self.hear_frames();
+                        self.flush();
+                        self.answer(id, Ok(Reply::Time(then)));
+                    } else if greeted {
                         self.handle(id, &command, fault != Fault::NeverStops);
                     } else {
                         self.answer(id, Err(Refusal::NoSession));

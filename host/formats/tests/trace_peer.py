@@ -130,9 +130,10 @@ def by_asammdf(lines, paths):
     for path in paths:
         version, compression, groups, layout = Path(path).stem.split("_")
         mdf = asammdf.MDF(version=version)
-        # No option of the class that makes new files turns columns on, and blocks would be larger than these files.
-        inner = getattr(mdf, "_mdf", mdf)
-        inner._column_storage, inner._write_fragment_size = layout == "columns", 4096
+        if layout == "columns":
+            # No option of the class that makes new files turns them on, and blocks would be larger than these files.
+            inner = getattr(mdf, "_mdf", mdf)
+            inner._column_storage, inner._write_fragment_size = True, 4096
         mdf.header.start_time = start
         for group in range(int(groups)):
             # With two groups, one for each of two buses.

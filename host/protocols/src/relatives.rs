@@ -1,5 +1,5 @@
-//! Related old protocols that are recognised but not decoded: OSEK network management, CAN Kingdom and CAL, by their identifiers and
-//! what their frames look like.
+//! Related old protocols that are recognised but not decoded: OSEK network management, CAN Kingdom and CAL, by their
+//! identifiers and what their frames look like.
 
 use std::fmt;
 
@@ -37,7 +37,8 @@ impl fmt::Display for Relative {
 
 /// How often a sign must have been seen: a token passed on by the node it was meant for, a toggle bit that toggled.
 const ENOUGH: u32 = 4;
-/// How many identifiers a ring may have. The standard leaves it open; Volkswagen's have fewer than 256 (public implementation: revag-nm).
+/// How many identifiers a ring may have. The standard leaves it open; Volkswagen's have fewer than 256 (public
+/// implementation: revag-nm).
 const RINGS: [u32; 3] = [0x100, 0x40, 0x20];
 /// All identifiers of 11 bits.
 const IDENTIFIERS: u32 = 0x800;
@@ -162,8 +163,8 @@ impl Ring {
 }
 
 impl King {
-    /// City, page, and the content of the page. The pages are those that public implementations have: Kvaser's, and that of the rover of the
-    /// CAN education project.
+    /// City, page, and the content of the page. The pages are those that public implementations have: Kvaser's, and
+    /// that of the rover of the CAN education project.
     fn take(&mut self, id: u32, data: &[u8]) {
         match (id, data) {
             (0, [_, page @ (0..=5 | 8 | 9 | 16 | 17), ..]) if data.len() == 8 => self.pages |= 1 << page,
@@ -263,5 +264,20 @@ mod tests {
         assert_eq!(found(&unasked), []);
         let canopen: Vec<_> = guarded.iter().map(|frame| frame.replace("6E1", "701")).collect();
         assert_eq!(found(&canopen.iter().map(String::as_str).collect::<Vec<_>>()), []);
+    }
+
+    #[test]
+    fn other_traffic_is_none_of_them() {
+        let mut random = fastrand::Rng::with_seed(1);
+        // Bytes as they come, and a second byte that is a code of network management all the time.
+        for code in [None, Some(1), Some(2)] {
+            let mut relatives = Relatives::default();
+            for _ in 0..20_000 {
+                let (id, first) = (random.u16(1..0x800), random.u8(..));
+                let second = code.unwrap_or_else(|| random.u8(..));
+                relatives.take(&format!("{id:03X}#{first:02X}{second:02X}000000000000").parse().unwrap());
+            }
+            assert_eq!(relatives.found(), []);
+        }
     }
 }

@@ -62,7 +62,8 @@ const FUELS: [&str; 33] = [
     "heavy fuel oil",
 ];
 
-/// Parameter 1C: as in Wireshark, and where it has nothing, as in OBDb/SAEJ1979. 33 is "HD EOBD-IV" in Wireshark, but stands for Euro VI.
+/// Parameter 1C: as in Wireshark, and where it has nothing, as in OBDb/SAEJ1979. 33 is "HD EOBD-IV" in Wireshark, but
+/// stands for Euro VI.
 const STANDARDS: [&str; 60] = [
     "",
     "OBD II (CARB)",

@@ -119,7 +119,8 @@ const SCALINGS: [Scaling; 100] = [
     scaling(0xFE, "Pa", 0.25),
 ];
 
-/// A monitor's name, with its bank and sensor: as in BMW's OBD description for EDIABAS (its table OBDMID_NAME), python-OBD and scapy.
+/// A monitor's name, with its bank and sensor: as in BMW's OBD description for EDIABAS (its table OBDMID_NAME),
+/// python-OBD and scapy.
 ///
 /// For B0 and B1 these differ: SAE J1979 gave them to PM filters first, and later to misfires of two more cylinders.
 pub fn name(mid: u8) -> Option<String> {

@@ -37,8 +37,8 @@ pub fn request(sid: u8, rest: &[u8], fields: &mut Vec<Field>) {
     }
 }
 
-/// Tests and actions of service 08. Test 01 is the only one that has a public description: carmakers' repair manuals ("Diagnostic Mode 08,
-/// TID $01", Audi and Volkswagen from 2006 on).
+/// Tests and actions of service 08. Test 01 is the only one that has a public description: carmakers' repair manuals
+/// ("Diagnostic Mode 08, TID $01", Audi and Volkswagen from 2006 on).
 fn test_name(tid: u8) -> Option<&'static str> {
     match tid {
         _ if tid.is_multiple_of(0x20) => Some("supported"),

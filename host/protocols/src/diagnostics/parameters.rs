@@ -22,8 +22,8 @@ const fn line(pid: u8, bytes: u8, name: &'static str, unit: &'static str, scale:
     Line { pid, bytes, name, unit, scale, offset, signed: false }
 }
 
-/// SAE J1979-DA, by publicly known formulas: those of Wireshark's dissector, of the signal set OBDb/SAEJ1979, and of Wikipedia's "OBD-II
-/// PIDs". scapy gives parameter 10 (air flow) one byte; all three of them, and cars, give it two.
+/// SAE J1979-DA, by publicly known formulas: those of Wireshark's dissector, of the signal set OBDb/SAEJ1979, and of Wikipedia's
+/// "OBD-II PIDs". All three give parameter 10 (air flow) two bytes; scapy 2.8 gives it one.
 const LINES: [Line; 68] = [
     line(0x04, 1, "calculated_load", "%", PERCENT, 0.0),
     line(0x05, 1, "coolant_temperature", "°C", 1.0, -40.0),
@@ -194,8 +194,9 @@ const MORE_EXHAUST_TEMPERATURES: [(u8, u8, u8, &str, &str, f64, f64); 4] = [
     (3, 7, 2, "exhaust_gas_temperature_8", "°C", 0.1, -40.0),
 ];
 
-/// Parameters that have a name and are shown as bytes; each extends to the end of its response. Names up to 87 as in Wireshark, the
-/// others as in scapy, Wikipedia's "OBD-II PIDs", and the tables of BMW's OBD description for EDIABAS, which agree.
+/// Parameters that have a name and are shown as bytes; each extends to the end of its response. Names up to 87 as in
+/// Wireshark, the others as in Wikipedia's "OBD-II PIDs" and, up to A6, in scapy; what 8F, 91 and 9C contain, by
+/// BMW's OBD description for EDIABAS.
 const NAMED: [(u8, &str); 46] = [
     (0x65, "auxiliary_inputs_and_outputs"),
     (0x68, "intake_air_temperature_sensors"),

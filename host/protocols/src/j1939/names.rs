@@ -2,9 +2,9 @@
 
 /// Names of groups that are likely to be on a bus, by the acronyms of SAE J1939-71 and the numbers of SAE J1939-73.
 ///
-/// Witnesses: canmatrix' j1939.dbc (acronyms) and can-j1939 (DM numbers), both by a test (`protocols_agree_with_peers.rs`); the list of
-/// groups in isoxml-js (`src/PGNs.ts`), which has the name of each in words; Wireshark's isobus dissector for those of ISO 11783. The number
-/// of DM9 is the one between DM8 and DM10.
+/// Witnesses: canmatrix' j1939.dbc (acronyms) and can-j1939 (DM numbers), both by a test
+/// (`protocols_agree_with_peers.rs`); the list of groups in isoxml-js (`src/PGNs.ts`), which has the name of each in
+/// words; Wireshark's isobus dissector for those of ISO 11783. The number of DM9 is the one between DM8 and DM10.
 const GROUPS: [(u32, &str); 123] = [
     (0x0000, "TSC1 torque/speed control"),
     (0x0100, "TC1 transmission control"),
@@ -146,8 +146,8 @@ const fn order(pgn: u32) -> u32 {
     (pgn & 0xFFFF) << 2 | pgn >> 16
 }
 
-/// Failure mode identifiers (SAE J1939-73, appendix A), as listed publicly in the J1939 library of CODESYS (its enumeration FMI), and in
-/// engine makers' manuals.
+/// Failure mode identifiers (SAE J1939-73, appendix A), as listed publicly in the J1939 library of CODESYS (its
+/// enumeration FMI), and in engine makers' manuals.
 pub const fn failure_mode(fmi: u8) -> &'static str {
     match fmi {
         0 => "above normal range, most severe",

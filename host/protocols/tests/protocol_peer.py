@@ -2,6 +2,7 @@
 
 isotp, uds, canopen, j1939     two nodes talk; prints each frame as "MILLISECONDS ID#DATA", and what was said as "= JSON"
 nmea2000 LOG                   prints canboat's reading of a candump log, one JSON object per message
+groups                         prints "PGN NAME" of every parameter group that canmatrix' J1939 database or can-j1939 has
 eds FILE...                    prints "file PATH", then "INDEX SUB NAME" of every entry that python-canopen has
 """
 
@@ -318,11 +319,29 @@ def read_eds(paths):
                     print(f"{index:04X} {sub} {variable.name}")
 
 
+def read_groups():
+    import pathlib
+    import re
+
+    import canmatrix
+    import j1939
+
+    database = (pathlib.Path(canmatrix.__file__).parent / "j1939.dbc").read_text("latin-1")
+    for identifier, name in re.findall(r"^BO_ (\d+) (\w+):", database, re.MULTILINE):
+        group = int(identifier) >> 8 & 0x3FFFF
+        print(group if group & 0xFF00 >= 0xF000 else group & 0x3FF00, name)
+    for name, group in vars(j1939.ParameterGroupNumber.PGN).items():
+        if name.startswith("DM"):
+            print(group, f"DM{int(name[2:])}")
+
+
 if __name__ == "__main__":
     what = sys.argv[1]
     if what == "nmea2000":
         read_nmea2000(sys.argv[2])
     elif what == "eds":
         read_eds(sys.argv[2:])
+    elif what == "groups":
+        read_groups()
     else:
         recorded(globals()[f"talk_{what}"])

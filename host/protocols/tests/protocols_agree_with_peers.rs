@@ -1,6 +1,6 @@
 //! Nodes of other programs talk on a simulated bus and our events match what they said: can-isotp, udsoncan, python-canopen,
 //! can-j1939. Canboat's own decoder, from the package nmea2000, reads the same recorded boat as we do; python-canopen reads the same
-//! sheets.
+//! sheets; canmatrix and can-j1939 name the same parameter groups.
 //!
 //! The Python that has them is `CANTAP_PYTHON`, otherwise `python3`. If a peer is missing, it is named and its test passes,
 //! unless `CANTAP_REQUIRE_PEERS=1`.
@@ -262,4 +262,42 @@ fn sheets_have_every_entry_that_python_canopen_has() {
         entries += 1;
     }
     assert!(entries > 100, "{entries}");
+}
+
+/// Our name of a parameter group, from the title of one of its messages.
+fn group_name(pgn: u32) -> Option<String> {
+    let receiver = if pgn & 0xFF00 < 0xF000 { 0xFF } else { 0 };
+    let frame = format!("{:08X}#FFFFFFFFFFFFFFFF", 6 << 26 | (pgn | receiver) << 8 | 5);
+    let events = events(&[record(0, &frame)], &[Protocol::J1939]);
+    let [event] = &events[..] else { panic!("{pgn:05X}: {events:?}") };
+    (!event.title.starts_with("PGN ")).then(|| event.title.to_string())
+}
+
+/// An acronym of SAE J1939-71, or the number of a diagnostic message.
+#[test]
+fn parameter_groups_have_the_names_that_canmatrix_and_can_j1939_give_them() {
+    // canmatrix' edition is older: these groups were given another acronym, most when they got a sister.
+    const RENAMED: [(&str, &str); 4] = [("CCVS", "CCVS1"), ("DD", "DD1"), ("LFE", "LFE1"), ("TI1", "AT1T1I")];
+    let Some(text) = peer("canmatrix, j1939", &["groups"]) else { return };
+    let (mut acronyms, mut messages, mut wrong) = (0, 0, Vec::new());
+    for line in text.lines() {
+        let (pgn, theirs) = line.split_once(' ').unwrap();
+        let pgn = pgn.parse().unwrap();
+        let theirs = RENAMED.iter().find(|(old, _)| *old == theirs).map_or(theirs, |(_, new)| new);
+        let is_message = theirs.starts_with("DM");
+        let Some(ours) = group_name(pgn) else {
+            // canmatrix has many groups that we show by number, but no diagnostic message is without its name.
+            if is_message {
+                wrong.push(format!("{pgn:05X}: {theirs} has no name"));
+            }
+            continue;
+        };
+        *(if is_message { &mut messages } else { &mut acronyms }) += 1;
+        if ours.split(' ').next().map(|first| first.replace('/', "_")).as_deref() != Some(theirs) {
+            wrong.push(format!("{pgn:05X}: {ours}, theirs is {theirs}"));
+        }
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+    // All of ours: DM1 to DM57 without DM9, which can-j1939 does not have; the others without those of the protocol itself.
+    assert_eq!((acronyms, messages), (52, 56));
 }

@@ -20,9 +20,14 @@ const BOAT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../formats/tests/data/n
 /// A frame's fields by name, as far as it has them.
 type Row = HashMap<String, String>;
 
+/// Whether there is a tshark; reports its absence.
+fn is_there() -> bool {
+    peers::has(Command::new("tshark").arg("--version"), "tshark")
+}
+
 /// tshark's output for each frame, one per millisecond; `None` after reporting that it is missing.
 fn tshark(test: &str, frames: &[TraceFrame], decode_as: &[&str], fields: &[&str]) -> Option<Vec<Row>> {
-    if !peers::has(Command::new("tshark").arg("--version"), "tshark") {
+    if !is_there() {
         return None;
     }
     // pcap with SocketCAN's link type, 227.
@@ -290,6 +295,54 @@ fn obd_parameters() {
         }
     }
     assert!(wrong.is_empty() && compared == 200, "{compared}\n{}", wrong.join("\n"));
+}
+
+/// What a value of a parameter stands for, in our words.
+fn meaning(pid: u8, name: &str, value: u8) -> Option<String> {
+    let response = frame("7E8", &[3, 0x41, pid, value]);
+    let [_, event] = &events(&[frame("7DF", &[2, 1, pid]), response], Protocol::Obd)[..] else { return None };
+    let text = event.first()?.field(name)?.text.as_deref()?;
+    // What follows is an explanation that Wireshark does not have.
+    Some(text.split(':').next().unwrap_or(text).to_owned())
+}
+
+/// Texts without what is only spelt differently.
+fn plain(text: &str) -> String {
+    let text =
+        text.to_lowercase().replace("as defined by the", "").replace("gasoline", "petrol").replace("and", "");
+    text.chars().filter(char::is_ascii_alphanumeric).collect()
+}
+
+#[test]
+fn obd_standards_and_fuels_stand_for_the_same() {
+    if !is_there() {
+        return;
+    }
+    let output = Command::new("tshark").args(["-G", "values"]).output().unwrap();
+    let text = String::from_utf8_lossy(&output.stdout);
+    let (mut compared, mut wrong) = ([0, 0], Vec::new());
+    for line in text.lines() {
+        let parts: Vec<_> = line.split('\t').collect();
+        let [_, field, value, theirs] = parts[..] else { continue };
+        let (pid, name, count) = match field {
+            "obd-ii.mode01_obd_standards" => (0x1C, "obd_standard", 0),
+            "obd-ii.mode01_fuel_type" => (0x51, "fuel_type", 1),
+            _ => continue,
+        };
+        // Assigned since, except for 22.
+        if theirs == "Reserved" {
+            continue;
+        }
+        compared[count] += 1;
+        let ours = meaning(pid, name, value.parse().unwrap());
+        // Theirs stands for Euro VI, and is a misprint.
+        let theirs = if theirs == "HD EOBD-IV" { "HD EOBD-VI" } else { theirs };
+        if ours.as_deref().map(plain) != Some(plain(theirs)) {
+            wrong.push(format!("{field} {value}: {ours:?}, theirs is {theirs}"));
+        }
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+    assert_eq!(compared, [28, 24]);
 }
 
 #[test]

@@ -181,6 +181,7 @@ fn check(name: &str, bus: &Bus) {
         survey.take(record);
     }
     let found = survey.found();
+    assert_eq!(survey.relatives(), []);
     let mut text = String::new();
     for evidence in &found {
         writeln!(text, "# speaks {}", evidence.protocol).unwrap();

@@ -6,6 +6,7 @@
 //! Memory: that of [`crate::iso_tp`], and 256 requests waiting for their responses.
 
 mod dtc;
+mod meanings;
 mod monitors;
 mod names;
 mod obd;

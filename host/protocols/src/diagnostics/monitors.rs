@@ -16,7 +16,7 @@ const fn scaling(id: u8, unit: &'static str, scale: f64) -> Scaling {
 }
 
 /// From 80 on, values are signed.
-const SCALINGS: [Scaling; 92] = [
+const SCALINGS: [Scaling; 100] = [
     scaling(0x01, "", 1.0),
     scaling(0x02, "", 0.1),
     scaling(0x03, "", 0.01),
@@ -82,6 +82,8 @@ const SCALINGS: [Scaling; 92] = [
     scaling(0x3F, "L", 0.01),
     scaling(0x40, "ppm", 1.0),
     scaling(0x41, "µA", 0.01),
+    scaling(0x42, "kJ", 0.1),
+    scaling(0x43, "g/kWh", 0.000_244_14),
     scaling(0x81, "", 1.0),
     scaling(0x82, "", 0.1),
     scaling(0x83, "", 0.01),
@@ -94,8 +96,13 @@ const SCALINGS: [Scaling; 92] = [
     scaling(0x8C, "V", 0.01),
     scaling(0x8D, "mA", 0.003_906_25),
     scaling(0x8E, "A", 0.001),
+    scaling(0x8F, "µs", 1.0),
     scaling(0x90, "ms", 1.0),
+    scaling(0x91, "ms", 100.0),
+    scaling(0x92, "Nm", 0.1),
     scaling(0x96, "°C", 0.1),
+    scaling(0x97, "°C", 0.01),
+    scaling(0x98, "mg", 1.0),
     scaling(0x99, "kPa", 0.1),
     scaling(0x9C, "°", 0.01),
     scaling(0x9D, "°", 0.5),
@@ -106,31 +113,46 @@ const SCALINGS: [Scaling; 92] = [
     scaling(0xAF, "%", 0.01),
     scaling(0xB0, "%", 0.003_052),
     scaling(0xB1, "mV/s", 2.0),
+    scaling(0xFB, "kPa", 10.0),
     scaling(0xFC, "kPa", 0.01),
     scaling(0xFD, "kPa", 0.001),
     scaling(0xFE, "Pa", 0.25),
 ];
 
-/// A monitor's name.
-pub fn name(mid: u8) -> Option<&'static str> {
+/// A monitor's name, with its bank and sensor: as in BMW's OBD description for EDIABAS (its table OBDMID_NAME),
+/// python-OBD and scapy.
+///
+/// For B0 and B1 these differ: SAE J1979 gave them to PM filters first, and later to misfires of two more cylinders.
+pub fn name(mid: u8) -> Option<String> {
+    let bank = |what: &str, first: u8| format!("{what}, bank {}", mid - first + 1);
+    let sensor = |what: &str, first: u8| {
+        format!("{what}, bank {}, sensor {}", (mid - first) / 4 + 1, (mid - first) % 4 + 1)
+    };
     Some(match mid {
-        _ if mid.is_multiple_of(0x20) => "supported",
-        0x01..=0x10 => "oxygen sensor",
-        0x21..=0x24 => "catalyst",
-        0x31..=0x34 => "EGR",
-        0x35..=0x38 => "variable valve timing",
-        0x39..=0x3D => "evaporative system",
-        0x41..=0x50 => "oxygen sensor heater",
-        0x61..=0x64 => "heated catalyst",
-        0x71..=0x74 => "secondary air",
-        0x81..=0x84 => "fuel system",
-        0x85 | 0x86 => "boost pressure",
-        0x90 | 0x91 => "NOx adsorber",
-        0x98 | 0x99 => "NOx catalyst",
-        0xA1 => "misfire",
-        0xA2..=0xAD => "misfire of a cylinder",
-        0xB0..=0xB3 => "PM filter",
-        0xE1..=0xFF => "defined by the manufacturer",
+        _ if mid.is_multiple_of(0x20) => "supported".to_owned(),
+        0x01..=0x10 => sensor("exhaust gas sensor", 0x01),
+        0x11 | 0x12 => bank("exhaust gas sensor 5", 0x11),
+        0x21..=0x24 => bank("catalyst", 0x21),
+        0x31..=0x34 => bank("EGR", 0x31),
+        0x35..=0x38 => bank("variable valve timing", 0x35),
+        0x39 => "evaporative system, cap off or leak of 0.150 inches".to_owned(),
+        0x3A => "evaporative system, leak of 0.090 inches".to_owned(),
+        0x3B => "evaporative system, leak of 0.040 inches".to_owned(),
+        0x3C => "evaporative system, leak of 0.020 inches".to_owned(),
+        0x3D => "purge flow".to_owned(),
+        0x41..=0x50 => sensor("exhaust gas sensor heater", 0x41),
+        0x51 | 0x52 => bank("exhaust gas sensor heater 5", 0x51),
+        0x61..=0x64 => bank("heated catalyst", 0x61),
+        0x71..=0x74 => format!("secondary air {}", mid - 0x70),
+        0x81..=0x84 => bank("fuel system", 0x81),
+        0x85 | 0x86 => bank("boost pressure", 0x85),
+        0x90 | 0x91 => bank("NOx adsorber", 0x90),
+        0x98 | 0x99 => bank("NOx or SCR catalyst", 0x98),
+        0xA1 => "misfire".to_owned(),
+        0xA2..=0xAF => format!("misfire, cylinder {}", mid - 0xA1),
+        0xB0 | 0xB1 => format!("misfire, cylinder {}, or {}", mid - 0xA1, bank("PM filter", 0xB0)),
+        0xB2 | 0xB3 => bank("PM filter", 0xB2),
+        0xE1..=0xFF => "defined by the manufacturer".to_owned(),
         _ => return None,
     })
 }
@@ -178,7 +200,8 @@ pub fn not_complete(bytes: &[u8]) -> String {
         "heated catalyst",
         "evaporative system",
         "secondary air",
-        "gasoline particulate filter",
+        // The first until it was removed from SAE J1979, the second since.
+        "A/C refrigerant or gasoline particulate filter",
         "oxygen sensor",
         "oxygen sensor heater",
         "EGR or VVT",
@@ -215,15 +238,37 @@ mod tests {
     fn test_results_have_their_limits_and_whether_they_are_kept() {
         assert_eq!(
             said(&[0x01, 0x80, 0x0A, 0x0B, 0xB0, 0x0B, 0xB0, 0x0B, 0xB0]),
-            "mid 0x01 (oxygen sensor), tid 0x80, scaling 0x0A, value 365.024 mV, minimum 365.024 mV, maximum 365.024 mV, \
+            "mid 0x01 (exhaust gas sensor, bank 1, sensor 1), tid 0x80, scaling 0x0A, value 365.024 mV, minimum 365.024 mV, maximum 365.024 mV, \
              result \"passed\""
         );
         assert_eq!(
             said(&[0x21, 0x01, 0x96, 0xFF, 0xF6, 0, 0, 0, 10]),
-            "mid 0x21 (catalyst), tid 0x01, scaling 0x96, value -1 °C, minimum 0 °C, maximum 1 °C, result \"failed\""
+            "mid 0x21 (catalyst, bank 1), tid 0x01, scaling 0x96, value -1 °C, minimum 0 °C, maximum 1 °C, result \"failed\""
         );
         assert_eq!(said(&[0x00, 0xC0, 0, 0, 1]), "mid 0x00 (supported), supported \"01 02 20\"");
         assert_eq!(said(&[0xA1, 1, 2]), "mid 0xA1 (misfire), value 01 02");
+    }
+
+    #[test]
+    fn monitors_are_named_with_their_bank_and_sensor() {
+        for (mid, expected) in [
+            (0x02, "exhaust gas sensor, bank 1, sensor 2"),
+            (0x10, "exhaust gas sensor, bank 4, sensor 4"),
+            (0x12, "exhaust gas sensor 5, bank 2"),
+            (0x34, "EGR, bank 4"),
+            (0x3D, "purge flow"),
+            (0x46, "exhaust gas sensor heater, bank 2, sensor 2"),
+            (0x74, "secondary air 4"),
+            (0x86, "boost pressure, bank 2"),
+            (0xA2, "misfire, cylinder 1"),
+            (0xAD, "misfire, cylinder 12"),
+            (0xB1, "misfire, cylinder 16, or PM filter, bank 2"),
+            (0xB3, "PM filter, bank 2"),
+            (0xE0, "supported"),
+        ] {
+            assert_eq!(name(mid).as_deref(), Some(expected), "{mid:02X}");
+        }
+        assert_eq!([0x13, 0x30, 0x3E, 0x87, 0xB4, 0xDF].map(name), [const { None::<String> }; 6]);
     }
 
     #[test]
@@ -234,6 +279,7 @@ mod tests {
         );
         assert_eq!(not_complete(&[0, 0x11, 0, 0xFF]), "misfire");
         assert_eq!(not_complete(&[0, 0x08, 0x40, 0x40]), "PM filter");
+        assert_eq!(not_complete(&[0, 0x00, 0x10, 0x10]), "A/C refrigerant or gasoline particulate filter");
         assert_eq!(not_complete(&[0, 0x07, 0xFF, 0]), "");
     }
 

@@ -37,7 +37,8 @@ pub fn request(sid: u8, rest: &[u8], fields: &mut Vec<Field>) {
     }
 }
 
-/// Tests and actions of service 08.
+/// Tests and actions of service 08. Test 01 is the only one that has a public description: carmakers' repair manuals
+/// ("Diagnostic Mode 08, TID $01", Audi and Volkswagen from 2006 on).
 fn test_name(tid: u8) -> Option<&'static str> {
     match tid {
         _ if tid.is_multiple_of(0x20) => Some("supported"),
@@ -57,6 +58,9 @@ const fn info_name(pid: u8) -> Option<&'static str> {
         0x0B => "in-use performance, compression ignition",
         0x0D => "engine serial number",
         0x0F => "exhaust regulation or type approval number",
+        0x11 => "WWH-OBD GTR number",
+        0x12 => "ignition cycles with the engine running on fuel",
+        0x14 => "distance since the decision of the evaporative monitor",
         _ => return None,
     })
 }
@@ -109,7 +113,7 @@ pub fn response(sid: u8, mut rest: &[u8], fields: &mut Vec<Field>) {
                 return;
             }
             let Some((&count, items)) = after.split_first() else { return };
-            let text = matches!(pid, 0x02 | 0x04 | 0x0A | 0x0D | 0x0F);
+            let text = matches!(pid, 0x02 | 0x04 | 0x0A | 0x0D | 0x0F | 0x11);
             let name = match pid {
                 2 => "vin",
                 0x0A => "ecu_name",
@@ -201,8 +205,29 @@ mod tests {
             (&[0x83, 1, 2, 3], "pid 0x83 (nox_sensors), value 01 02 03"),
             (
                 &[0x03, 2, 0],
-                "pid 0x03 (fuel_system_status), fuel_system_1 0x02 (closed loop), fuel_system_2 0x00 (not there)",
+                "pid 0x03 (fuel_system_status), fuel_system_1 0x02 (closed loop), fuel_system_2 0x00 (off or not there)",
             ),
+            (&[0x10, 0x01, 0xF4], "pid 0x10 (air_flow), air_flow 5 g/s"),
+            (
+                &[0x12, 4],
+                "pid 0x12 (secondary_air_status), secondary_air_status 4 (to the atmosphere or off)",
+            ),
+            (&[0x1C, 33], "pid 0x1C (obd_standard), obd_standard 33 (HD EOBD-VI: heavy duty, Euro VI)"),
+            (&[0x1C, 22], "pid 0x1C (obd_standard), obd_standard 22"),
+            (&[0x51, 32], "pid 0x51 (fuel_type), fuel_type 32 (heavy fuel oil)"),
+            (&[0x5F, 0x11], "pid 0x5F (emission_requirements), emission_requirements 17 (Euro VI)"),
+            (
+                &[0x58, 0x80, 0],
+                "pid 0x58 (long_term_secondary_trim_bank_2), long_term_secondary_trim_bank_2 0 %, \
+                 long_term_secondary_trim_bank_4 -100 %",
+            ),
+            (
+                &[0x98, 1, 1, 0xF4, 0, 0, 0, 0, 0, 0],
+                "pid 0x98 (exhaust_gas_temperatures_5_to_8_bank_1), exhaust_gas_temperature_5 10 °C, \
+                 exhaust_gas_temperature_6 not available, exhaust_gas_temperature_7 not available, \
+                 exhaust_gas_temperature_8 not available",
+            ),
+            (&[0xA9, 1, 0, 0, 0], "pid 0xA9 (abs_disable_switch), value 01 00 00 00"),
             (&[0xF0, 1], "pid 0xF0, value 01"),
             (&[0x0C, 1], "pid 0x0C (engine_speed), value 01"),
         ] {

@@ -1,7 +1,7 @@
 //! OBD-II's parameters (PIDs): their names, and their values with units.
 
 use super::values::{number, supported};
-use super::{dtc, monitors};
+use super::{dtc, meanings, monitors};
 use crate::Field;
 
 /// A parameter with a linear value: `(raw * scale) + offset`.
@@ -22,7 +22,8 @@ const fn line(pid: u8, bytes: u8, name: &'static str, unit: &'static str, scale:
     Line { pid, bytes, name, unit, scale, offset, signed: false }
 }
 
-/// SAE J1979-DA, by publicly known formulas.
+/// SAE J1979-DA, by publicly known formulas: those of Wireshark's dissector, of the signal set OBDb/SAEJ1979, and of Wikipedia's
+/// "OBD-II PIDs". All three give parameter 10 (air flow) two bytes; scapy 2.8 gives it one.
 const LINES: [Line; 68] = [
     line(0x04, 1, "calculated_load", "%", PERCENT, 0.0),
     line(0x05, 1, "coolant_temperature", "°C", 1.0, -40.0),
@@ -103,7 +104,7 @@ struct Group {
     values: &'static [(u8, u8, u8, &'static str, &'static str, f64, f64)],
 }
 
-const GROUPS: [Group; 9] = [
+const GROUPS: [Group; 11] = [
     Group {
         pid: 0x66,
         bytes: 5,
@@ -154,6 +155,18 @@ const GROUPS: [Group; 9] = [
         ],
     },
     Group {
+        pid: 0x98,
+        bytes: 9,
+        name: "exhaust_gas_temperatures_5_to_8_bank_1",
+        values: &MORE_EXHAUST_TEMPERATURES,
+    },
+    Group {
+        pid: 0x99,
+        bytes: 9,
+        name: "exhaust_gas_temperatures_5_to_8_bank_2",
+        values: &MORE_EXHAUST_TEMPERATURES,
+    },
+    Group {
         pid: 0xA4,
         bytes: 4,
         name: "transmission_gear",
@@ -174,8 +187,17 @@ const EXHAUST_TEMPERATURES: [(u8, u8, u8, &str, &str, f64, f64); 4] = [
     (3, 7, 2, "exhaust_gas_temperature_4", "°C", 0.1, -40.0),
 ];
 
-/// Parameters that have a name and are shown as bytes; each extends to the end of its response.
-const NAMED: [(u8, &str); 40] = [
+const MORE_EXHAUST_TEMPERATURES: [(u8, u8, u8, &str, &str, f64, f64); 4] = [
+    (0, 1, 2, "exhaust_gas_temperature_5", "°C", 0.1, -40.0),
+    (1, 3, 2, "exhaust_gas_temperature_6", "°C", 0.1, -40.0),
+    (2, 5, 2, "exhaust_gas_temperature_7", "°C", 0.1, -40.0),
+    (3, 7, 2, "exhaust_gas_temperature_8", "°C", 0.1, -40.0),
+];
+
+/// Parameters that have a name and are shown as bytes; each extends to the end of its response. Names up to 87 as in
+/// Wireshark, the others as in Wikipedia's "OBD-II PIDs" and, up to A6, in scapy; what 8F, 91 and 9C contain, by
+/// BMW's OBD description for EDIABAS.
+const NAMED: [(u8, &str); 46] = [
     (0x65, "auxiliary_inputs_and_outputs"),
     (0x68, "intake_air_temperature_sensors"),
     (0x69, "egr_commanded_and_actual"),
@@ -210,66 +232,26 @@ const NAMED: [(u8, &str); 40] = [
     (0x8F, "pm_sensor_output"),
     (0x90, "wwh_obd_vehicle_information"),
     (0x91, "wwh_obd_ecu_information"),
+    (0x92, "fuel_system_control"),
     (0x93, "wwh_obd_counters"),
     (0x94, "nox_warning_and_inducement"),
-    (0x98, "exhaust_gas_temperature_sensors_bank_1"),
-    (0x99, "exhaust_gas_temperature_sensors_bank_2"),
     (0x9A, "hybrid_vehicle_battery"),
     (0x9B, "exhaust_fluid_sensor"),
+    (0x9C, "wide_range_oxygen_sensors_3_and_4"),
+    (0x9F, "fuel_system_percentage_use"),
+    (0xA1, "nox_sensors_corrected"),
+    (0xA3, "evaporative_system_pressures"),
+    (0xA7, "nox_sensors_3_and_4"),
+    (0xA8, "nox_sensors_3_and_4_corrected"),
+    (0xA9, "abs_disable_switch"),
 ];
 
-/// Fuel system status (parameter 03), one bit each.
-const FUEL_SYSTEM: [(u8, &str); 6] = [
-    (0x00, "not there"),
-    (0x01, "open loop, not warm enough"),
-    (0x02, "closed loop"),
-    (0x04, "open loop by load or deceleration"),
-    (0x08, "open loop by a failure"),
-    (0x10, "closed loop with a fault"),
-];
-
-const FUELS: [&str; 24] = [
-    "not available",
-    "petrol",
-    "methanol",
-    "ethanol",
-    "diesel",
-    "LPG",
-    "CNG",
-    "propane",
-    "electric",
-    "bifuel running petrol",
-    "bifuel running methanol",
-    "bifuel running ethanol",
-    "bifuel running LPG",
-    "bifuel running CNG",
-    "bifuel running propane",
-    "bifuel running electricity",
-    "bifuel running electric and combustion engine",
-    "hybrid petrol",
-    "hybrid ethanol",
-    "hybrid diesel",
-    "hybrid electric",
-    "hybrid running electric and combustion engine",
-    "hybrid regenerative",
-    "bifuel running diesel",
-];
-
-const STANDARDS: [&str; 14] = [
-    "",
-    "OBD II (CARB)",
-    "OBD (EPA)",
-    "OBD and OBD II",
-    "OBD I",
-    "not OBD compliant",
-    "EOBD",
-    "EOBD and OBD II",
-    "EOBD and OBD",
-    "EOBD, OBD and OBD II",
-    "JOBD",
-    "JOBD and OBD II",
-    "JOBD and EOBD",
-    "JOBD, EOBD and OBD II",
+/// Parameters 55 to 58: the name, and that of the second byte. A bank shares its parameter with the next but one.
+const SECONDARY_TRIMS: [(&str, &str); 4] = [
+    ("short_term_secondary_trim_bank_1", "short_term_secondary_trim_bank_3"),
+    ("long_term_secondary_trim_bank_1", "long_term_secondary_trim_bank_3"),
+    ("short_term_secondary_trim_bank_2", "short_term_secondary_trim_bank_4"),
+    ("long_term_secondary_trim_bank_2", "long_term_secondary_trim_bank_4"),
 ];
 
 /// Number of data bytes of a parameter of service 01; `None` if it is unknown.
@@ -308,7 +290,7 @@ pub fn name(pid: u8) -> Option<&'static str> {
         0x41 => Some("monitor_status_this_cycle"),
         0x4F => Some("maximum_values"),
         0x50 => Some("maximum_air_flow"),
-        0x55..=0x58 => Some("secondary_oxygen_sensor_trim"),
+        0x55..=0x58 => Some(SECONDARY_TRIMS[usize::from(pid - 0x55)].0),
         0x64 => Some("torque_data"),
         _ => None,
     })
@@ -320,12 +302,10 @@ pub fn values(pid: u8, bytes: &[u8], fields: &mut Vec<Field>) {
         let raw = number(bytes);
         let value = if line.signed { f64::from(raw as u16 as i16) } else { raw as f64 };
         // As the standard defines it: the offset is added before anything else is done to the number.
-        let text = match pid {
-            0x51 => FUELS.get(raw as usize).copied(),
-            0x1C => STANDARDS.get(raw as usize).copied().filter(|text| !text.is_empty()),
-            _ => None,
-        };
-        fields.push(Field::real(line.name, value * line.scale + line.offset, line.unit).meaning(text));
+        fields.push(
+            Field::real(line.name, value * line.scale + line.offset, line.unit)
+                .meaning(meanings::of(pid, raw)),
+        );
         return;
     }
     if let Some(group) = group(pid) {
@@ -353,8 +333,7 @@ pub fn values(pid: u8, bytes: &[u8], fields: &mut Vec<Field>) {
         0x02 => fields.push(Field::text("freeze_frame_code", dtc::list(bytes))),
         0x03 => {
             for (name, byte) in ["fuel_system_1", "fuel_system_2"].into_iter().zip(bytes) {
-                let text = FUEL_SYSTEM.iter().find(|(bit, _)| bit == byte).map(|(_, text)| *text);
-                fields.push(Field::hex(name, *byte, 2).meaning(text));
+                fields.push(Field::hex(name, *byte, 2).meaning(meanings::of(pid, (*byte).into())));
             }
         }
         0x9D => {
@@ -388,8 +367,8 @@ pub fn values(pid: u8, bytes: &[u8], fields: &mut Vec<Field>) {
         }
         0x50 => fields.push(Field::real("maximum_air_flow", byte(0) * 10.0, "g/s")),
         0x55..=0x58 => {
-            for (at, bank) in ["a", "b"].into_iter().enumerate() {
-                let name = format!("secondary_oxygen_sensor_trim_{bank}");
+            let (first, second) = SECONDARY_TRIMS[usize::from(pid - 0x55)];
+            for (at, name) in [first, second].into_iter().enumerate() {
                 fields.push(Field::real(name, byte(at) * TRIM - 100.0, "%"));
             }
         }

@@ -1,13 +1,18 @@
 //! Parameter groups and failure modes by name.
 
-/// Names of groups that are likely to be on a bus (SAE J1939-71 and -73, by their public acronyms).
-const GROUPS: [(u32, &str); 98] = [
+/// Names of groups that are likely to be on a bus, by the acronyms of SAE J1939-71 and the numbers of SAE J1939-73.
+///
+/// Witnesses: canmatrix' j1939.dbc (acronyms) and can-j1939 (DM numbers), both by a test
+/// (`protocols_agree_with_peers.rs`); the list of groups in isoxml-js (`src/PGNs.ts`), which has the name of each in
+/// words; Wireshark's isobus dissector for those of ISO 11783. The number of DM9 is the one between DM8 and DM10.
+const GROUPS: [(u32, &str); 123] = [
     (0x0000, "TSC1 torque/speed control"),
     (0x0100, "TC1 transmission control"),
     (0x9E00, "DM29 number of trouble codes"),
     (0x9F00, "DM35 immediate fault status"),
     (0xA000, "DM34 not-to-exceed status"),
     (0xA100, "DM33 emission increasing device active time"),
+    (0xA200, "DM32 regulated exhaust emission level exceedance"),
     (0xA300, "DM31 trouble code to lamp association"),
     (0xA400, "DM30 scaled test results"),
     (0xC100, "DM21 diagnostic readiness 2"),
@@ -18,6 +23,8 @@ const GROUPS: [(u32, &str); 98] = [
     (0xC900, "request 2"),
     (0xCA00, "transfer"),
     (0xD300, "DM19 calibration information"),
+    (0xD400, "DM18 data security"),
+    (0xD600, "DM17 boot load data"),
     (0xD700, "DM16 binary data transfer"),
     (0xD800, "DM15 memory access response"),
     (0xD900, "DM14 memory access request"),
@@ -41,6 +48,28 @@ const GROUPS: [(u32, &str); 98] = [
     (0xF006, "EAC1 axle"),
     (0xF009, "VDC2 vehicle dynamics"),
     (0xF00A, "EGF1 engine gas flow rate"),
+    (0xFCC6, "DM57 OBD information"),
+    (0xFCC7, "DM56 model year and certification engine family"),
+    (0xFCD1, "DM53 active service only trouble codes"),
+    (0xFCD2, "DM54 previously active service only trouble codes"),
+    (0xFCD3, "DM55 clear service only trouble codes"),
+    (0xFD54, "DM52 class C trouble codes, previously active"),
+    (0xFD55, "DM51 class C trouble codes, confirmed and active"),
+    (0xFD56, "DM50 class C trouble codes, pending"),
+    (0xFD57, "DM49 class B2 trouble codes, previously active"),
+    (0xFD58, "DM48 class B2 trouble codes, confirmed and active"),
+    (0xFD59, "DM47 class B2 trouble codes, pending"),
+    (0xFD5A, "DM46 class B1 trouble codes, previously active"),
+    (0xFD5B, "DM45 class B1 trouble codes, confirmed and active"),
+    (0xFD5C, "DM44 class B1 trouble codes, pending"),
+    (0xFD5D, "DM43 class A trouble codes, previously active"),
+    (0xFD5E, "DM42 class A trouble codes, confirmed and active"),
+    (0xFD5F, "DM41 class A trouble codes, pending"),
+    (0xFD60, "DM40 harmonized B1 failure counts"),
+    (0xFD61, "DM39 harmonized cumulative malfunction indicator time"),
+    (0xFD62, "DM38 harmonized global regulation description"),
+    (0xFD63, "DM37 harmonized roadworthiness, system"),
+    (0xFD64, "DM36 harmonized roadworthiness, vehicle"),
     (0xFD7C, "DPFC1 particulate filter control"),
     (0xFD80, "DM28 permanent trouble codes"),
     (0xFD82, "DM27 all pending trouble codes"),
@@ -48,15 +77,15 @@ const GROUPS: [(u32, &str); 98] = [
     (0xFDB6, "DM24 SPN support"),
     (0xFDB7, "DM25 expanded freeze frame"),
     (0xFDB8, "DM26 diagnostic readiness 3"),
-    (0xFDC5, "ECU identification"),
-    (0xFE4E, "door control 1"),
+    (0xFDC5, "ECUID identification of the control unit"),
+    (0xFE4E, "DC1 door control 1"),
     (0xFE4F, "VDC1 vehicle dynamics stability control"),
     (0xFE56, "AT1T1I aftertreatment tank"),
     (0xFE6C, "TCO1 tachograph"),
     (0xFE70, "CVW combination vehicle weight"),
     (0xFEAE, "AIR1 air supply pressure"),
     (0xFEAF, "GFC fuel consumption, gaseous"),
-    (0xFEB0, "engine hours, revolutions, idle"),
+    (0xFEB0, "TTI2 trip time information 2"),
     (0xFEBD, "FD fan drive"),
     (0xFEBF, "EBC2 wheel speeds"),
     (0xFEC0, "SERV service"),
@@ -117,7 +146,8 @@ const fn order(pgn: u32) -> u32 {
     (pgn & 0xFFFF) << 2 | pgn >> 16
 }
 
-/// Failure mode identifiers (SAE J1939-73, appendix A).
+/// Failure mode identifiers (SAE J1939-73, appendix A), as listed publicly in the J1939 library of CODESYS (its
+/// enumeration FMI), and in engine makers' manuals.
 pub const fn failure_mode(fmi: u8) -> &'static str {
     match fmi {
         0 => "above normal range, most severe",

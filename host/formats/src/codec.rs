@@ -43,16 +43,33 @@ pub(crate) trait Decode: Send {
         }
     }
 
-    /// As [`Self::batch`], but data frames at its beginning may be in `frames` instead. Formats have their own where a frame can be
-    /// taken out of the file without becoming a record in between.
+    /// Appends the data frames that are next and can be taken out of the file without becoming records in between. Returns whether the
+    /// format has such frames at all.
+    fn plain_frames(&mut self, _frames: &mut Vec<PlainFrame>) -> io::Result<bool> {
+        Ok(false)
+    }
+
+    /// As [`Self::batch`], but data frames at its beginning may be in `frames` instead.
     fn mixed(
         &mut self,
         input: &mut Input,
         frames: &mut Vec<PlainFrame>,
         records: &mut Vec<TraceRecord>,
     ) -> io::Result<Option<Found>> {
-        let _ = frames;
-        self.batch(input, records)
+        if !self.plain_frames(frames)? {
+            return self.batch(input, records);
+        }
+        if !frames.is_empty() {
+            return Ok(None);
+        }
+        // One alone, because plain frames may follow it.
+        match self.next(input)? {
+            Found::Record(record) => {
+                records.push(record);
+                Ok(None)
+            }
+            other => Ok(Some(other)),
+        }
     }
 }
 

@@ -126,24 +126,9 @@ impl Decode for Decoder {
         }
     }
 
-    fn mixed(
-        &mut self,
-        input: &mut Input,
-        frames: &mut Vec<PlainFrame>,
-        records: &mut Vec<TraceRecord>,
-    ) -> io::Result<Option<Found>> {
-        self.plain_frames(frames);
-        if !frames.is_empty() {
-            return Ok(None);
-        }
-        // One alone, because plain frames may follow it.
-        match self.next(input)? {
-            Found::Record(record) => {
-                records.push(record);
-                Ok(None)
-            }
-            other => Ok(Some(other)),
-        }
+    fn plain_frames(&mut self, frames: &mut Vec<PlainFrame>) -> io::Result<bool> {
+        self.take_plain(frames);
+        Ok(true)
     }
 
     #[inline]
@@ -314,7 +299,7 @@ impl Decoder {
     }
 
     /// The same for data frames alone.
-    fn plain_frames(&mut self, frames: &mut Vec<PlainFrame>) {
+    fn take_plain(&mut self, frames: &mut Vec<PlainFrame>) {
         frames.reserve(PLAIN_BATCH);
         let plain = self.classical().take_while(|frame| !frame.remote).take(PLAIN_BATCH);
         let plain =

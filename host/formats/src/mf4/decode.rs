@@ -105,26 +105,11 @@ impl Decode for Decoder {
         false
     }
 
-    fn mixed(
-        &mut self,
-        input: &mut Input,
-        frames: &mut Vec<PlainFrame>,
-        records: &mut Vec<TraceRecord>,
-    ) -> io::Result<Option<Found>> {
+    fn plain_frames(&mut self, frames: &mut Vec<PlainFrame>) -> io::Result<bool> {
         if let Some(open) = self.open.as_mut().filter(|_| self.first.is_empty()) {
             open.plain_frames(frames)?;
         }
-        if !frames.is_empty() {
-            return Ok(None);
-        }
-        // One alone, because plain frames may follow it.
-        match self.next(input)? {
-            Found::Record(record) => {
-                records.push(record);
-                Ok(None)
-            }
-            other => Ok(Some(other)),
-        }
+        Ok(true)
     }
 
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {

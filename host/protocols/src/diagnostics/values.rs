@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use crate::Value;
+use crate::{Bytes, Value};
 
 pub fn number(bytes: &[u8]) -> u64 {
     bytes.iter().fold(0, |number, byte| number << 8 | u64::from(*byte))
@@ -30,6 +30,6 @@ pub fn text_or_bytes(bytes: &[u8]) -> Value {
     if shown.len() >= 3 && shown.iter().all(|byte| byte.is_ascii_graphic() || *byte == b' ') {
         Value::Text(String::from_utf8_lossy(shown).into_owned().into())
     } else {
-        Value::Bytes(bytes.to_vec())
+        Value::Bytes(Bytes::from_slice(bytes))
     }
 }

@@ -17,6 +17,9 @@ const FLOW_TIMEOUT_NS: i64 = 1_000_000_000;
 /// How many first frames may wait for their flow control, on all channels together.
 const MOST_CANDIDATES: usize = 64;
 
+/// The longest message whose first frame is taken for one, in bytes: lengths of four bytes are more often other data.
+const MOST_LENGTH: u32 = 1 << 24;
+
 /// A frame that may be a first frame.
 #[derive(Clone, Debug)]
 struct Candidate {
@@ -87,7 +90,7 @@ impl Finder {
             let Ok(Some(pci)) = pci::parse(bytes, offset) else { continue };
             let from = Endpoint { id, address: (offset == 1).then(|| bytes[0]) };
             match pci {
-                Pci::First { length, data } if length <= 4095 => {
+                Pci::First { length, data } if length <= MOST_LENGTH => {
                     if self.candidates.len() == MOST_CANDIDATES {
                         // The oldest one, which is the first to become too old.
                         self.candidates.swap_remove(self.oldest());

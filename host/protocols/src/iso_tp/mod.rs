@@ -78,6 +78,17 @@ impl Transport {
         self.pairs.partner(channel, from)
     }
 
+    /// Whether such a sender has begun a message in this time and not completed it.
+    pub fn has_begun(
+        &self,
+        channel: u8,
+        time_ns: std::ops::RangeInclusive<i64>,
+        is_sender: impl Fn(Endpoint) -> bool,
+    ) -> bool {
+        let mut open = self.open.values().map(|open| &open.transfer);
+        open.any(|open| open.channel == channel && time_ns.contains(&open.start_ns) && is_sender(open.from))
+    }
+
     /// Takes the next record, and passes on the transfers that end with it, complete or not.
     pub fn take(&mut self, record: &TraceRecord, out: &mut impl FnMut(Transfer)) {
         if !self.open.is_empty() && record.time_ns >= self.sweep_ns {
@@ -315,10 +326,10 @@ impl Transport {
     }
 }
 
-/// The length of the first frame, derived from how much of the message it contained. The control information has two bytes; only
-/// messages longer than 4095 bytes have more, which is not checked.
+/// The length of the first frame, derived from how much of the message it contained.
 fn first_frame_bytes(transfer: &Transfer, offset: usize) -> usize {
-    offset + 2 + transfer.data.len()
+    let control = if transfer.length > 4095 { 6 } else { 2 };
+    offset + control + transfer.data.len()
 }
 
 /// Passes on an incomplete transfer.

@@ -254,3 +254,23 @@ fn a_short_frame_in_the_middle_is_not_glued_over() {
         transfers(&[], &[fd(0, first), fd(1, [&[0x21][..], &[2; 7]].concat()), fd(2, vec![0x22; 48])]);
     assert!(matches!(short[0].trouble, Some(Trouble::Malformed(_))), "{short:?}");
 }
+
+/// CAN FD has messages of more than 4095 bytes, on any identifiers.
+#[test]
+fn a_pair_is_found_by_a_message_of_any_length() {
+    let data: Vec<u8> = (0..5000_u32).map(|byte| byte as u8).collect();
+    let frame = |number: usize, id: &str, control: &[u8], part: &[u8]| {
+        let mut bytes = [control, part].concat();
+        let full = [8, 12, 16, 20, 24, 32, 48, 64].into_iter().find(|full| *full >= bytes.len()).unwrap();
+        bytes.resize(full, 0xCC);
+        at(number as f64, &format!("{id}##1{}", hex(&bytes)))
+    };
+    let mut frames =
+        vec![frame(0, "123", &[0x10, 0, 0, 0, 0x13, 0x88], &data[..58]), frame(1, "321", &[0x30, 0, 0], &[])];
+    for (number, part) in (1..).zip(data[58..].chunks(63)) {
+        frames.push(frame(number + 1, "123", &[0x20 | number as u8 & 15], part));
+    }
+    let found = transfers(&[], &frames);
+    assert_eq!(found.len(), 1, "{found:?}");
+    assert!(found[0].is_whole() && found[0].data == data, "{found:?}");
+}

@@ -272,5 +272,5 @@ fn a_pair_is_found_by_a_message_of_any_length() {
     }
     let found = transfers(&[], &frames);
     assert_eq!(found.len(), 1, "{found:?}");
-    assert!(found[0].is_whole() && found[0].data == data, "{found:?}");
+    assert!(found[0].is_whole() && found[0].data[..] == data[..], "{found:?}");
 }

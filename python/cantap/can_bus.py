@@ -124,6 +124,7 @@ class CantapBus(can.BusABC):
         self._waiting: collections.deque[can.Message] = collections.deque()
         # As of the last call: asking for each message would take as long as everything else here.
         self._is_logged = False
+        self._is_over = False
         self._is_extended = type(self)._recv_internal is not CantapBus._recv_internal
         super().__init__(channel=channel, can_filters=can_filters)
 
@@ -183,8 +184,7 @@ class CantapBus(can.BusABC):
 
     def _fetch(self, timeout: float | None) -> bool:
         """Makes messages of what the device has received; false if there is nothing within the time."""
-        if self._is_shutdown:
-            raise can.CanOperationError(f"{self.channel_info} is shut down")
+        self._expect_open()
         try:
             more = self._records._messages(timeout)
         except DeviceError as error:
@@ -193,6 +193,11 @@ class CantapBus(can.BusABC):
         # In place: another thread may have added some at the same time.
         self._waiting.extend(itertools.starmap(can.Message, more))
         return bool(more)
+
+    def _expect_open(self) -> None:
+        """The device may still be open for other Bus objects."""
+        if self._is_over:
+            raise can.CanOperationError(f"{self.channel_info} is shut down")
 
     def _apply_filters(self, filters: Any) -> None:
         self._records._filter(_filter_texts(filters), not self._own)
@@ -216,6 +221,7 @@ class CantapBus(can.BusABC):
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Passes a message to the device; with `timeout` (seconds), waits until it was on the bus."""
+        self._expect_open()
         frame = _frame(msg)
         wait = timeout if timeout is not None and timeout > 0 else None
         try:
@@ -235,6 +241,7 @@ class CantapBus(can.BusABC):
         autostart: bool = True,
         modifier_callback: Callable[[can.Message], None] | None = None,
     ) -> CyclicSendTaskABC:
+        self._expect_open()
         messages = CyclicSendTaskABC._check_and_convert_messages(msgs)
         if len(messages) == 1 and modifier_callback is None:
             try:
@@ -272,6 +279,8 @@ class CantapBus(can.BusABC):
         if self._is_shutdown:
             return
         super().shutdown()
+        # Not before: until then threads still send what is periodic.
+        self._is_over = True
         with _lock:
             session = self._session
             left = session.users[self._number] - 1

@@ -208,11 +208,13 @@ def test_a_bus_that_is_shut_down_gives_nothing(pair):
         first.send(message(identifier), timeout=1)
     assert bus.recv(1).arbitration_id == 0x100
     bus.shutdown()
-    # Not even what was already here.
+    # Not even what was already here; and nothing is sent by it, although another Bus object has the channel.
     with pytest.raises(can.CanOperationError):
         bus.recv(0)
     with pytest.raises(can.CanOperationError):
         bus.send(message())
+    with pytest.raises(can.CanOperationError):
+        bus.send_periodic(message(), 0.1)
 
 
 def test_a_derived_class_may_have_its_own_way_to_receive(pair):

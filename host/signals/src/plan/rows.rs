@@ -127,7 +127,7 @@ impl MessageRows {
                     }
                     indicators.clear();
                     if let Some(first) = signal.first_indicator
-                        && raw.iter().fold(false, |any, raw| any | (*raw >= first))
+                        && raw.iter().any(|raw| *raw >= first)
                     {
                         let of = &message.signals[signal.index as usize];
                         indicators

@@ -187,7 +187,7 @@ fn the_frames_of_a_sorted_group_whose_times_are_floats_are_plain_ones() {
         record_bytes: 32,
         time: (0, 0, 64, 4),
         step_s: None,
-        id: (8, 0, 29, 0),
+        id: (8, 0, 11, 0),
         bytes: (16, 0, 64, 10),
         others: vec![("IDE", (12, 7, 1, 0)), ("DLC", (13, 0, 4, 0)), ("BusChannel", (14, 0, 8, 0))],
         more: 0,
@@ -196,12 +196,13 @@ fn the_frames_of_a_sorted_group_whose_times_are_floats_are_plain_ones() {
     // A number that is the same in all bytes is a time, an identifier and a length at once.
     layout.records = (0..5000).map(|at| (0, [(at % 9) as u8; 12])).collect();
     let (records, issues) = tests::read(Format::Mf4, layout.file());
-    assert_eq!((records.len(), issues), (5000, Vec::new()));
+    assert_eq!((records.len(), issues.first()), (5000, None));
     let source = std::io::Cursor::new(layout.file());
     let mut reader = TraceReader::from_source("a.mf4", source, Format::Mf4, &ReadOptions::default()).unwrap();
     let (mut frames, mut records, mut plain) = (Vec::new(), Vec::new(), 0);
     while reader.next_mixed(&mut frames, &mut records).is_some() {
         plain += frames.len();
     }
-    assert_eq!(plain, 5000);
+    // All but the last, which nothing follows.
+    assert_eq!(plain, 4999);
 }

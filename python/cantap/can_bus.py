@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import itertools
 import logging
 import math
 import threading
@@ -119,10 +120,12 @@ class CantapBus(can.BusABC):
             session.users[self._number] = session.users.get(self._number, 0) + 1
             _sessions[self._address] = session
         self._session = session
-        # What came from the device in one call, as arguments of `can.Message`.
-        self._waiting: collections.deque[
-            tuple[float, int, bool, bool, bool, int, int, bytearray, bool, bool]
-        ] = collections.deque()
+        # What came from the device in one call.
+        self._waiting: collections.deque[can.Message] = collections.deque()
+        # As of the last call: asking for each message would take as long as everything else here.
+        self._is_logged = False
+        self._is_over = False
+        self._is_extended = type(self)._recv_internal is not CantapBus._recv_internal
         super().__init__(channel=channel, can_filters=can_filters)
 
     def _segments(self, timing: can.BitTiming | None) -> tuple[int, int, int, int] | None:
@@ -155,10 +158,11 @@ class CantapBus(can.BusABC):
     # Receiving
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """Like python-can's, which filters each message again: here filters have already been applied."""
-        # Through this method, because derived classes may override it.
-        message, _ = self._recv_internal(timeout)
-        if message is not None and LOG.isEnabledFor(self.RECV_LOGGING_LEVEL):
+        """Like python-can's, without its loop: filters have already been applied."""
+        if self._is_extended:
+            return super().recv(timeout)
+        message = self._next(timeout)
+        if self._is_logged and message is not None:
             LOG.log(self.RECV_LOGGING_LEVEL, "Received: %s", message)
         return message
 
@@ -166,25 +170,34 @@ class CantapBus(can.BusABC):
         return self._next(timeout), True
 
     def _next(self, timeout: float | None) -> can.Message | None:
-        if self._is_shutdown:
-            raise can.CanOperationError(f"{self.channel_info} is shut down")
         waiting = self._waiting
         while True:
             try:
-                found = waiting.popleft()
+                message = waiting.popleft()
             except IndexError:
-                try:
-                    more = self._records._messages(timeout)
-                except DeviceError as error:
-                    raise can.CanOperationError(str(error)) from error
-                if not more:
+                if not self._fetch(timeout):
                     return None
-                # In place: another thread may have added some at the same time.
-                waiting.extend(more)
                 continue
             if not waiting:
                 self._records._used_up()
-            return can.Message(*found)
+            return message
+
+    def _fetch(self, timeout: float | None) -> bool:
+        """Makes messages of what the device has received; false if there is nothing within the time."""
+        self._expect_open()
+        try:
+            more = self._records._messages(timeout)
+        except DeviceError as error:
+            raise can.CanOperationError(str(error)) from error
+        self._is_logged = LOG.isEnabledFor(self.RECV_LOGGING_LEVEL)
+        # In place: another thread may have added some at the same time.
+        self._waiting.extend(itertools.starmap(can.Message, more))
+        return bool(more)
+
+    def _expect_open(self) -> None:
+        """The device may still be open for other Bus objects."""
+        if self._is_over:
+            raise can.CanOperationError(f"{self.channel_info} is shut down")
 
     def _apply_filters(self, filters: Any) -> None:
         self._records._filter(_filter_texts(filters), not self._own)
@@ -208,6 +221,7 @@ class CantapBus(can.BusABC):
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Passes a message to the device; with `timeout` (seconds), waits until it was on the bus."""
+        self._expect_open()
         frame = _frame(msg)
         wait = timeout if timeout is not None and timeout > 0 else None
         try:
@@ -227,6 +241,7 @@ class CantapBus(can.BusABC):
         autostart: bool = True,
         modifier_callback: Callable[[can.Message], None] | None = None,
     ) -> CyclicSendTaskABC:
+        self._expect_open()
         messages = CyclicSendTaskABC._check_and_convert_messages(msgs)
         if len(messages) == 1 and modifier_callback is None:
             try:
@@ -264,6 +279,8 @@ class CantapBus(can.BusABC):
         if self._is_shutdown:
             return
         super().shutdown()
+        # Not before: until then threads still send what is periodic.
+        self._is_over = True
         with _lock:
             session = self._session
             left = session.users[self._number] - 1
@@ -272,6 +289,7 @@ class CantapBus(can.BusABC):
             else:
                 del session.users[self._number]
             self._records.close()
+            self._waiting.clear()
             try:
                 if not session.users:
                     session.device.close()

@@ -201,10 +201,49 @@ def test_what_cannot_be_opened_or_sent_is_an_error_of_python_can(pair):
             first.send(wrong)
 
 
-def test_a_bus_that_is_shut_down_gives_nothing():
-    bus = can.Bus(interface="cantap", channel=QUIET, bitrate=500_000)
+def test_a_bus_that_is_shut_down_gives_nothing(pair):
+    first, _ = pair
+    bus = can.Bus(interface="cantap", channel=f"{QUIET}:2", bitrate=500_000)
+    for identifier in (0x100, 0x101, 0x102):
+        first.send(message(identifier), timeout=1)
+    assert bus.recv(1).arbitration_id == 0x100
     bus.shutdown()
+    # Not even what was already here; and nothing is sent by it, although another Bus object has the channel.
     with pytest.raises(can.CanOperationError):
         bus.recv(0)
     with pytest.raises(can.CanOperationError):
         bus.send(message())
+    with pytest.raises(can.CanOperationError):
+        bus.send_periodic(message(), 0.1)
+
+
+def test_a_derived_class_may_have_its_own_way_to_receive(pair):
+    """As python-can documents it: what `_recv_internal` has not filtered is filtered by `recv`, which waits for the rest of its time."""
+    from cantap.can_bus import CantapBus
+
+    class Answers(CantapBus):
+        def _recv_internal(self, timeout):
+            message, _ = super()._recv_internal(timeout)
+            if message is not None:
+                message.arbitration_id ^= 1
+            return message, False
+
+    first, _ = pair
+    with Answers(f"{QUIET}:2", bitrate=500_000) as bus:
+        bus._filters = [{"can_id": 0x122, "can_mask": 0x7FF}]
+        for identifier in (0x122, 0x123):
+            first.send(message(identifier), timeout=1)
+        assert bus.recv(1).arbitration_id == 0x122
+        begin = time.monotonic()
+        assert bus.recv(0.2) is None
+        assert 0.15 < time.monotonic() - begin < 2
+
+
+def test_received_messages_are_logged_as_python_can_logs_them(pair, caplog):
+    first, second = pair
+    first.send(message(0x100), timeout=1)
+    assert second.recv(1).arbitration_id == 0x100 and not caplog.records
+    second.RECV_LOGGING_LEVEL = 30
+    first.send(message(0x101), timeout=1)
+    assert second.recv(1).arbitration_id == 0x101
+    assert [record.getMessage()[:9] for record in caplog.records] == ["Received:"]

@@ -7,7 +7,7 @@ use arrow_array::builder::{ArrayBuilder as _, Float64Builder};
 use arrow_array::types::Int32Type;
 use arrow_array::{ArrayRef, RecordBatch, TimestampNanosecondArray, UInt8Array, UInt32Array};
 use arrow_schema::{DataType, Field, Schema, SchemaRef};
-use cantap_signals::{Decoder, Message, MessageRef, MessageRows, Signal, SignalRows, SignalValue};
+use cantap_signals::{Decoder, MessageRef, MessageRows, Signal, SignalRows, SignalValue};
 use cantap_trace::{Id, PlainFrame, TraceRecord};
 use rustc_hash::FxHashMap;
 
@@ -24,12 +24,18 @@ pub struct MessageColumns {
     channel: Vec<u8>,
     id: Vec<u32>,
     signals: Vec<Column>,
-    /// The last rows' frames, of which there are no values in the columns yet: those are made together, when it is known how many
-    /// there are, for a column that grows is copied again and again.
-    waiting: MessageRows,
+    /// The last rows' frames, which are not in the columns yet: those are made together, when it is known how many there are, for a
+    /// column that grows is copied again and again. So are these, which is why they are kept in blocks.
+    full: Vec<Vec<PlainFrame>>,
+    full_rows: usize,
+    last: Vec<PlainFrame>,
+    rows: MessageRows,
     values: u64,
     scratch: Scratch,
 }
+
+/// How many frames stand in a block: as many as [`MessageRows`] decodes at once.
+const BLOCK_FRAMES: usize = 512;
 
 struct Column {
     value: Float64Builder,
@@ -66,6 +72,16 @@ impl Keys {
         }
         let place = |raw| signal.table_key(raw).and_then(|key| places.get(&key)).copied();
         Self::ByBits((0..1 << signal.length).map(|raw| place(raw).unwrap_or(NO_TEXT)).collect())
+    }
+
+    /// Appends those of several values.
+    fn get_all(&self, signal: &Signal, raw: &[u64], keys: &mut Vec<i32>) {
+        match self {
+            Self::ByBits(places) => {
+                keys.extend(raw.iter().map(|raw| places.get(*raw as usize).copied().unwrap_or(NO_TEXT)));
+            }
+            Self::ByValue(_) => keys.extend(raw.iter().map(|raw| self.get(signal, *raw))),
+        }
     }
 
     fn get(&self, signal: &Signal, raw: u64) -> i32 {
@@ -108,7 +124,10 @@ impl MessageColumns {
             channel: Vec::new(),
             id: Vec::new(),
             signals,
-            waiting: decoder.rows(reference),
+            full: Vec::new(),
+            full_rows: 0,
+            last: Vec::new(),
+            rows: decoder.rows(reference),
             values: 0,
             scratch: Scratch::default(),
         }
@@ -121,38 +140,68 @@ impl MessageColumns {
 
     /// Whether a frame of so many bytes has a value for the table, whatever they are: chosen signals may be there in some frames only.
     pub fn has_value(&self, data_len: usize) -> bool {
-        self.waiting.is_certain(data_len)
+        self.rows.is_certain(data_len)
     }
 
     /// Appends a row for a data frame of the message, decoding it; nothing for another record.
     #[inline]
     pub fn push(&mut self, record: &TraceRecord) {
         let Some(frame) = record.frame() else { return };
-        if !self.waiting.push(frame.data()) {
-            let mut values = std::mem::take(&mut self.scratch.values);
-            values.clear();
-            self.waiting.one(frame.data(), &mut values);
-            self.push_values(record, &values);
-            self.scratch.values = values;
-            return;
+        match PlainFrame::of(record) {
+            Some(frame) => self.push_frame(&frame),
+            None => self.push_one(record.time_ns, record.channel, frame.id(), frame.data()),
         }
-        self.begin_row(record.time_ns, record.channel, frame.id());
     }
 
     /// Appends a row for a frame of the message, as [`Self::push`] does for its record.
     #[inline]
     pub fn push_frame(&mut self, frame: &PlainFrame) {
-        self.waiting.push_word(frame.data, frame.len);
-        self.begin_row(frame.time_ns, frame.channel, frame.id);
+        if self.last.len() < self.last.capacity() {
+            self.last.push(*frame);
+        } else {
+            self.push_beyond(frame);
+        }
+    }
+
+    /// A frame that begins a block, or must not be in one.
+    #[cold]
+    #[inline(never)]
+    fn push_beyond(&mut self, frame: &PlainFrame) {
+        if self.rows.message().container.is_some() {
+            let bytes = frame.data.to_le_bytes();
+            self.push_one(frame.time_ns, frame.channel, frame.id, &bytes[..usize::from(frame.len)]);
+            return;
+        }
+        let full = std::mem::replace(&mut self.last, Vec::with_capacity(BLOCK_FRAMES));
+        if !full.is_empty() {
+            self.full_rows += full.len();
+            self.full.push(full);
+        }
+        self.last.push(*frame);
+    }
+
+    /// Appends a row for a frame that cannot be decoded together with others.
+    fn push_one(&mut self, time_ns: i64, channel: u8, id: Id, data: &[u8]) {
+        let mut values = std::mem::take(&mut self.scratch.values);
+        values.clear();
+        self.rows.one(data, &mut values);
+        self.push_row(time_ns, channel, id, &values);
+        self.scratch.values = values;
     }
 
     /// Appends a row for a frame of the message, with the values decoded from it; nothing for another record.
     pub fn push_values(&mut self, record: &TraceRecord, values: &[SignalValue]) {
         let Some(frame) = record.frame() else { return };
+        self.push_row(record.time_ns, record.channel, frame.id(), values);
+    }
+
+    fn push_row(&mut self, time_ns: i64, channel: u8, id: Id, values: &[SignalValue]) {
         self.decode();
-        self.begin_row(record.time_ns, record.channel, frame.id());
+        self.time_ns.push(time_ns);
+        self.channel.push(channel);
+        self.id.push(id.raw());
         self.values += values.len() as u64;
-        let message = self.waiting.message();
+        let message = self.rows.message();
         for value in values {
             let signal = &message.signals[value.signal as usize];
             let column = &mut self.signals[value.signal as usize];
@@ -165,34 +214,42 @@ impl MessageColumns {
         self.fill();
     }
 
-    #[inline]
-    fn begin_row(&mut self, time_ns: i64, channel: u8, id: Id) {
-        self.time_ns.push(time_ns);
-        self.channel.push(channel);
-        self.id.push(id.raw());
+    fn waiting_rows(&self) -> usize {
+        self.full_rows + self.last.len()
     }
 
     /// How many values at most the frames have that wait for being decoded.
     pub(crate) fn waiting_cells(&self) -> usize {
-        self.waiting.len() * self.signals.len()
+        self.waiting_rows() * self.signals.len()
     }
 
     /// Decodes the frames that wait for it.
     pub(crate) fn decode(&mut self) {
-        if self.waiting.is_empty() {
+        let count = self.waiting_rows();
+        if count == 0 {
             return;
         }
-        let Self { signals, waiting, values, scratch, .. } = self;
-        let rows = waiting.len();
-        waiting.decode(|message, found| {
-            let signal = &message.signals[found.signal as usize];
-            let column = &mut signals[found.signal as usize];
-            column.expect(rows);
-            column.push(message, signal, &found, scratch);
-            *values +=
-                found.there.map_or(found.raw.len(), |there| there.iter().filter(|there| **there).count())
-                    as u64;
-        });
+        let Self { time_ns, channel, id, signals, full, full_rows, last, rows, values, scratch, .. } = self;
+        time_ns.reserve(count);
+        channel.reserve(count);
+        id.reserve(count);
+        for mut block in full.drain(..).chain([std::mem::take(last)]) {
+            time_ns.extend(block.iter().map(|frame| frame.time_ns));
+            channel.extend(block.iter().map(|frame| frame.channel));
+            id.extend(block.iter().map(|frame| frame.id.raw()));
+            rows.push_words(block.iter().map(|frame| (frame.data, frame.len)));
+            rows.decode(|message, found| {
+                let signal = &message.signals[found.signal as usize];
+                let column = &mut signals[found.signal as usize];
+                column.expect(count);
+                column.push(signal, &found, scratch);
+                let there = |there: &[bool]| there.iter().filter(|there| **there).count();
+                *values += found.there.map_or(found.raw.len(), there) as u64;
+            });
+            block.clear();
+            *last = block;
+        }
+        *full_rows = 0;
         self.fill();
     }
 
@@ -212,7 +269,7 @@ impl MessageColumns {
 
     /// The number of rows so far.
     pub fn rows(&self) -> usize {
-        self.time_ns.len()
+        self.time_ns.len() + self.waiting_rows()
     }
 
     /// The number of values decoded so far, including those that only say that there is none.
@@ -250,20 +307,21 @@ impl Column {
     }
 
     /// Appends a signal's values in several frames.
-    fn push(&mut self, message: &Message, signal: &Signal, rows: &SignalRows, scratch: &mut Scratch) {
+    fn push(&mut self, signal: &Signal, rows: &SignalRows, scratch: &mut Scratch) {
         let is_there = |at: usize| rows.there.is_none_or(|there| there[at]);
-        if rows.there.is_none() && !message.j1939 {
-            self.value.append_slice(rows.value);
-        } else {
-            let is_value =
-                |(at, raw): (usize, &u64)| is_there(at) && message.indicator(signal, *raw).is_none();
-            scratch.is_value.clear();
-            scratch.is_value.extend(rows.raw.iter().enumerate().map(is_value));
-            self.value.append_values(rows.value, &scratch.is_value);
+        match (rows.there, rows.indicators) {
+            (None, None) => self.value.append_slice(rows.value),
+            (Some(there), None) => self.value.append_values(rows.value, there),
+            (_, Some(indicators)) => {
+                let is_value = |(at, is_indicator): (usize, &bool)| !is_indicator && is_there(at);
+                scratch.is_value.clear();
+                scratch.is_value.extend(indicators.iter().enumerate().map(is_value));
+                self.value.append_values(rows.value, &scratch.is_value);
+            }
         }
         if let Some((texts, keys)) = &mut self.text {
             scratch.keys.clear();
-            scratch.keys.extend(rows.raw.iter().map(|raw| keys.get(signal, *raw)));
+            keys.get_all(signal, rows.raw, &mut scratch.keys);
             if rows.there.is_none() && !scratch.keys.contains(&NO_TEXT) {
                 texts.push_slice(&scratch.keys);
                 return;

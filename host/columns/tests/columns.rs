@@ -141,6 +141,22 @@ prop_compose! {
     }
 }
 
+/// The frame says what is in it: it cannot be decoded together with others.
+#[test]
+fn a_plain_frame_that_contains_pdus_has_their_values() {
+    let file = include_bytes!("../../signals/tests/data/container.arxml");
+    let database = cantap_signals::arxml::parse("container.arxml", file).unwrap();
+    let decoder = Arc::new(Decoder::new(vec![Source { channel: None, database }]));
+    let record = frame(1_000, "123#07010203030801F4");
+    let mut tables = [(); 2].map(|()| MessageTables::new(Arc::clone(&decoder), false));
+    tables[0].push(&record);
+    tables[1].push_frames(&[PlainFrame::of(&record).unwrap()]);
+    // Counter=7 Engine.Counter=8 Engine.Speed=500
+    assert_eq!(tables.each_mut().map(MessageTables::counts), [(1, 3); 2]);
+    let [mut of_record, mut of_frame] = tables.map(|tables| tables.finish().0.remove(0).1);
+    assert_eq!(of_record.take(), of_frame.take());
+}
+
 proptest! {
     /// Frames decoded together have the same values as when decoded one by one: whatever the signals, J1939 or not, chosen or not,
     /// in short frames and in CAN FD frames.

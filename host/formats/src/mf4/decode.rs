@@ -425,32 +425,40 @@ impl Part {
         if self.ended || !self.waiting.is_empty() {
             return;
         }
+        let room = PLAIN_BATCH.saturating_sub(frames.len());
+        let Self { stream, at, plain, record_bytes, counts, records, .. } = self;
+        if self.id_bytes == 0 {
+            let Some(plain) = &plain[0] else { return };
+            let most = usize::try_from(records.saturating_sub(counts[0])).map_or(room, |left| left.min(room));
+            let found = plain.frames(stream.held(*at), counts[0], most, is_next, frames);
+            *at += (found * record_bytes[0]) as u64;
+            counts[0] += found as u64;
+            if let Some(last) = frames.last().filter(|_| found > 0) {
+                self.time_ns = last.time_ns;
+            }
+            return;
+        }
         // Records of one group follow each other: it is looked up once.
         let mut last: Option<(u64, usize)> = None;
-        while frames.len() < PLAIN_BATCH {
-            let mut bytes = self.stream.held(self.at);
-            let mut group = 0;
-            if self.id_bytes > 0 {
-                let Some((id, rest)) = bytes.split_at_checked(self.id_bytes) else { return };
-                let id = id.iter().rev().fold(0, |id: u64, byte| id << 8 | u64::from(*byte));
-                group = match last {
-                    Some((known, group)) if known == id => group,
-                    _ => match self.by_id.get(&id) {
-                        Some(group) => *group,
-                        None => return,
-                    },
-                };
-                last = Some((id, group));
-                bytes = rest;
-            }
-            let Some(plain) = &self.plain[group] else { return };
-            let is_over = self.counts[0] >= self.records;
-            let Some(frame) = plain.frame(bytes, self.counts[group]).filter(|_| !is_over) else { return };
-            if !is_next(frame.time_ns) {
+        let mut rest = stream.held(*at);
+        for _ in 0..room {
+            let Some((id, bytes)) = rest.split_at_checked(self.id_bytes) else { return };
+            let id = id.iter().rev().fold(0, |id: u64, byte| id << 8 | u64::from(*byte));
+            let group = match last {
+                Some((known, group)) if known == id => group,
+                _ => match self.by_id.get(&id) {
+                    Some(group) => *group,
+                    None => return,
+                },
+            };
+            last = Some((id, group));
+            let Some(plain) = &plain[group] else { return };
+            let Some(frame) = plain.frame(bytes, counts[group]).filter(|frame| is_next(frame.time_ns)) else {
                 return;
-            }
-            self.at += (self.id_bytes + self.record_bytes[group]) as u64;
-            self.counts[group] += 1;
+            };
+            rest = &bytes[record_bytes[group]..];
+            *at += (self.id_bytes + record_bytes[group]) as u64;
+            counts[group] += 1;
             self.time_ns = frame.time_ns;
             frames.push(frame);
         }

@@ -133,7 +133,7 @@ class Device:
         return self._records.read(timeout)
 
     def batch(self, seconds: float | None = None, rows: int = 65_536) -> Table:
-        """Records of the next `seconds`, at most `rows`, as a table."""
+        """Records of the next `seconds`, at most `rows`, as a table; without `seconds` it waits until there are so many."""
         return self._records.batch(seconds, rows)
 
     def batches(self, seconds: float = 0.1, rows: int = 65_536) -> Iterator[Table]:

@@ -1,5 +1,6 @@
 //! Frames and records, for Python.
 
+use cantap_columns::FrameColumns;
 use cantap_trace::names::{self, BUS_ERRORS, ERROR_STATES, LOSS_STAGES, OVERTAKEN, TRANSMIT_FAILURES};
 use cantap_trace::{Direction, Frame as ClassicFrame, Id, TraceEvent, TraceFrame, TraceRecord};
 use cantap_wire::record::TransmitFailure;
@@ -9,6 +10,7 @@ use pyo3::types::PyBytes;
 
 use crate::error::Error;
 use crate::number::Whole;
+use crate::table::Table;
 
 /// A classical CAN frame.
 #[pyclass(module = "cantap", frozen, eq, hash)]
@@ -269,6 +271,21 @@ impl Record {
     #[getter]
     fn late(&self) -> bool {
         matches!(self.0.event, TraceEvent::Frame { late: true, .. })
+    }
+
+    /// Through a table of one row, which has all of it.
+    fn __reduce__(&self, py: Python<'_>) -> PyResult<(Py<PyAny>, (Table,))> {
+        let mut columns = FrameColumns::default();
+        columns.push(&self.0);
+        let make = py.get_type::<Self>().getattr("_of_table")?.unbind();
+        Ok((make, (Table::of_batch(columns.take()),)))
+    }
+
+    #[staticmethod]
+    fn _of_table(table: &Table) -> PyResult<Self> {
+        let found = cantap_columns::records(&table.one_batch()?).map_err(Error::from)?;
+        let first = found.first().ok_or_else(|| PyValueError::new_err("the table has no record"))?;
+        Ok(Self(*first))
     }
 
     fn __repr__(&self) -> String {

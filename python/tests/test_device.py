@@ -333,6 +333,24 @@ def test_a_time_that_is_over_means_at_once_and_one_beyond_the_timeout_is_refused
         assert device.read(0) is None or device.status["channels"][0]["tx_pending"] == 0
 
 
+def test_records_are_values_that_other_processes_take():
+    with cantap.open("virtual:errors=20", 500_000) as device:
+        records = [device.read(1) for _ in range(200)]
+    assert {"frame", "bus-error"} <= {record.event for record in records}
+    for record in records:
+        again = pickle.loads(pickle.dumps(record))
+        assert again == record and hash(again) == hash(record) and repr(again) == repr(record)
+
+
+def test_what_a_closed_device_sent_on_its_own_does_not_run():
+    with cantap.open("virtual:load=0,wire=joined", 500_000, mode="normal") as device:
+        tasks = [device.send_periodic(1, "100#00", 0.01), device.reply(2, 0x7DF, "7E8#00")]
+        assert all(task.is_running for task in tasks)
+    assert not any(task.is_running for task in tasks)
+    for task in tasks:
+        task.stop()
+
+
 def test_ctrl_c_ends_waiting():
     code = """
         import cantap

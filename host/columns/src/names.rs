@@ -24,9 +24,9 @@ impl ColumnNames {
         let with_message = format!("{message}.{signal}");
         let numbered = (2..).map(|number| format!("{with_message}_{number}"));
         let mut names = [signal.to_owned(), with_message.clone()].into_iter().chain(numbered);
-        let is_free =
-            |name: &String| !self.0.contains(name) && !(has_texts && self.0.contains(&text_column(name)));
-        let name = names.find(is_free).unwrap_or_default();
+        let is_taken =
+            |name: &String| self.0.contains(name) || has_texts && self.0.contains(&text_column(name));
+        let name = names.find(|name| !is_taken(name)).unwrap_or_default();
         if has_texts {
             self.0.insert(text_column(&name));
         }

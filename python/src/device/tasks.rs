@@ -56,6 +56,11 @@ impl Entry {
         Ok(Self { session: Arc::downgrade(session), table, channel, slot: Mutex::new(Some(slot)) })
     }
 
+    /// Whether it is in the device's table.
+    fn is_running(&self) -> bool {
+        lock(&self.slot).is_some() && self.session.upgrade().is_some_and(|session| session.device().is_ok())
+    }
+
     /// Ends it, unless it has already ended.
     fn clear(&self) -> Result<(), Error> {
         let Some(slot) = lock(&self.slot).take() else { return Ok(()) };
@@ -123,7 +128,7 @@ impl PeriodicFrame {
     /// Whether it is still active, apart from any limit to its count.
     #[getter]
     fn is_running(&self) -> bool {
-        lock(&self.entry.slot).is_some()
+        self.entry.is_running()
     }
 
     /// Sends another frame from now on; its period starts over.
@@ -178,7 +183,7 @@ impl Reply {
     /// Whether it is still active, apart from any limit to its count.
     #[getter]
     fn is_running(&self) -> bool {
-        lock(&self.entry.slot).is_some()
+        self.entry.is_running()
     }
 
     /// Stops it.

@@ -9,7 +9,10 @@ use crate::diagnostics::Diagnostics;
 use crate::j1939::{self, Header};
 use crate::nmea2000;
 use crate::relatives::{Relative, Relatives};
-use crate::{Assembler, Event, Protocol};
+use crate::{Assembler, Event, Protocol, UnderWay};
+
+/// Bytes of a message under way that show ISO 15765-2 even if it is not complete: three frames.
+const CONVINCING_BYTES: u32 = 20;
 
 /// Examines the first records of a trace or a bus.
 #[derive(Clone, Debug, Default)]
@@ -85,6 +88,16 @@ impl Survey {
             .iter()
             .map(|(&(channel, protocol), &messages)| Evidence { channel, protocol, messages })
             .collect();
+        // A trace may end before any message is complete.
+        let mut open = Vec::new();
+        self.diagnostics.under_way(&mut open);
+        for UnderWay { channel, protocol, .. } in
+            open.into_iter().filter(|open| open.received >= CONVINCING_BYTES)
+        {
+            if !found.iter().any(|found: &Evidence| found.channel == channel) {
+                found.push(Evidence { channel, protocol, messages: 1 });
+            }
+        }
         for (&channel, &[marine, vehicle, all]) in &self.extended {
             // Other 29-bit traffic occasionally matches a known number.
             let enough = |known: u32| known > 1 && known > all / 10;

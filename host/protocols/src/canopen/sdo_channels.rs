@@ -3,6 +3,8 @@
 //! Objects 1200 to 127F say with which identifiers a node serves, 1280 to 12FF with which it asks which other (CiA 301, 7.5.2.33 and
 //! 7.5.2.34).
 
+use std::collections::BTreeMap;
+
 use rustc_hash::FxHashMap;
 
 use super::eds::Eds;
@@ -25,8 +27,8 @@ pub struct SdoChannel {
 /// Those of one bus.
 #[derive(Clone, Debug, Default)]
 pub struct SdoChannels {
-    /// Sub-indices 1 to 3, by the node that has the object, and its index.
-    parameters: FxHashMap<(u8, u16), [Option<u32>; 3]>,
+    /// Sub-indices 1 to 3, by the object's index and the node that has it: servers first, since they know their own identifiers.
+    parameters: BTreeMap<(u16, u8), [Option<u32>; 3]>,
     by_id: FxHashMap<u16, SdoChannel>,
 }
 
@@ -65,7 +67,7 @@ impl SdoChannels {
     }
 
     fn keep(&mut self, node: u8, index: u16, sub: u8, value: u32) {
-        let key = (node, index);
+        let key = (index, node);
         if self.parameters.len() < MOST_PARAMETERS || self.parameters.contains_key(&key) {
             self.parameters.entry(key).or_default()[usize::from(sub) - 1] = Some(value);
         }
@@ -73,7 +75,7 @@ impl SdoChannels {
 
     fn renew(&mut self) {
         self.by_id.clear();
-        for (&(holder, index), &parameter) in &self.parameters {
+        for (&(index, holder), &parameter) in &self.parameters {
             let [Some(request), Some(response), server] = parameter else { continue };
             let node = if index < 0x1280 { u32::from(holder) } else { server.unwrap_or_default() };
             if (request | response) & NOT_STANDARD != 0 || !(1..=127).contains(&node) {
@@ -86,7 +88,8 @@ impl SdoChannels {
                 continue;
             }
             for (id, from_client) in [(request, true), (response, false)] {
-                self.by_id.insert(id, SdoChannel { node: node as u8, request, from_client });
+                // Of two that claim one identifier, the first has it.
+                self.by_id.entry(id).or_insert(SdoChannel { node: node as u8, request, from_client });
             }
         }
     }
@@ -116,5 +119,30 @@ mod tests {
         channels.learn(9, 0x1281, 2, &0x586_u32.to_le_bytes());
         channels.learn(9, 0x1281, 3, &[6]);
         assert_eq!(channels.find(0x606), None);
+    }
+
+    /// In whatever order they were heard: servers before clients, lower indices and nodes first.
+    #[test]
+    fn of_two_that_claim_one_identifier_the_same_one_always_has_it() {
+        let claims = [
+            (9, 0x1280, Some(6)),
+            (7, 0x1201, None),
+            (5, 0x1201, None),
+            (4, 0x1202, None),
+            (3, 0x1281, Some(2)),
+        ];
+        for first in 0..claims.len() {
+            let mut channels = SdoChannels::default();
+            for (node, index, server) in claims.iter().cycle().skip(first).take(claims.len()) {
+                // The responses are their own.
+                let response = 0x5C0 + u32::from(*node);
+                channels.learn(*node, *index, 1, &0x645_u32.to_le_bytes());
+                channels.learn(*node, *index, 2, &response.to_le_bytes());
+                if let Some(server) = server {
+                    channels.learn(*node, *index, 3, &[*server]);
+                }
+            }
+            assert_eq!(channels.find(0x645).map(|channel| channel.node), Some(5), "{first}");
+        }
     }
 }

@@ -3,15 +3,25 @@
 //! A request and its response are one event. Unanswered requests, unrequested responses and broken transfers are separate
 //! events.
 //!
-//! Memory: that of [`crate::iso_tp`], and 256 requests waiting for their responses.
+//! A positive response repeats parts of its request. One that repeats something else is not the response, and is shown as one
+//! whose request was not heard; the request goes on waiting, as its sender does.
+//!
+//! Memory: that of [`crate::iso_tp`], 256 requests waiting for their responses, and 64 that no longer do.
 
+mod authentication;
 mod dtc;
+mod echo;
+mod events;
+mod files;
 mod meanings;
 mod monitors;
 mod names;
 mod obd;
 mod parameters;
+mod periodic;
+mod reader;
 mod reports;
+mod scaling;
 #[cfg(test)]
 mod tests;
 mod uds;
@@ -29,6 +39,7 @@ use std::collections::VecDeque;
 use cantap_trace::TraceRecord;
 use rustc_hash::FxHashSet;
 
+use self::periodic::Periodic;
 use crate::iso_tp::{Endpoint, Pair, Transfer, Transport};
 use crate::{Assembler, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
@@ -40,6 +51,11 @@ const RESPONSE_NS: i64 = 2_000_000_000;
 /// The same after the server has said that the response is pending: P2* is 5 s by default.
 const PENDING_NS: i64 = 10_000_000_000;
 const RESPONSE_PENDING: u8 = 0x78;
+/// How many requests that were given up are kept, and how long, in case that their responses come after all.
+const MOST_LATE: usize = 64;
+const LATE_NS: i64 = 60_000_000_000;
+/// How long after its last frame a response may still be under way: longer than [`crate::iso_tp`] waits for the next frame.
+const UNDER_WAY_NS: i64 = 1_200_000_000;
 /// How many senders known to use KWP2000 are kept.
 const MOST_KWP: usize = 1024;
 
@@ -72,6 +88,9 @@ struct Answered {
 pub struct Diagnostics {
     transport: Transport,
     waiting: VecDeque<Waiting>,
+    /// Requests that were given up.
+    late: VecDeque<Transfer>,
+    periodic: Periodic,
     /// No request times out before this time.
     due_ns: i64,
     /// Both sides of pairs that used a service that only KWP2000 has.
@@ -90,7 +109,12 @@ impl Diagnostics {
             events.push(transfer.into());
             return;
         };
-        if sid == 0x7F && transfer.data.len() >= 3 {
+        if let Some((did, data)) = self.periodic.data(&transfer)
+            && (sid & 0x40 == 0 || self.asked(&transfer, sid & !0x40).is_none())
+            && (sid != 0x7F || transfer.data.len() != 3)
+        {
+            events.push(periodic_event(&transfer, did, data));
+        } else if sid == 0x7F && transfer.data.len() >= 3 {
             self.refusal(&transfer, events);
         } else if sid & 0x40 == 0 && self.service(&transfer, sid).is_some() {
             self.request(transfer, events);
@@ -115,17 +139,24 @@ impl Diagnostics {
         names::uds_service(sid).map(|name| (Protocol::Uds, name.into()))
     }
 
-    fn request(&mut self, mut transfer: Transfer, events: &mut Vec<Event>) {
-        let sid = transfer.data[0];
-        if names::kwp_only_service(sid).is_some() && self.speaks_kwp.len() < MOST_KWP {
+    /// Both sides of this transfer use KWP2000.
+    fn is_kwp(&mut self, transfer: &Transfer) {
+        if self.speaks_kwp.len() < MOST_KWP {
             self.speaks_kwp.insert((transfer.channel, transfer.from));
             self.speaks_kwp.extend(transfer.to.map(|to| (transfer.channel, to)));
+        }
+    }
+
+    fn request(&mut self, mut transfer: Transfer, events: &mut Vec<Event>) {
+        let sid = transfer.data[0];
+        if names::kwp_only_service(sid).is_some() {
+            self.is_kwp(&transfer);
         }
         transfer.to = transfer.to.or_else(|| self.transport.partner(transfer.channel, transfer.from));
         let is_uds = self.service(&transfer, sid).is_some_and(|(protocol, _)| protocol == Protocol::Uds);
         // KWP2000 has a separate value for it (ISO 14230-3, 6.4).
         let is_wanted =
-            !(is_uds && uds::is_response_suppressed(&transfer.data) || transfer.data == [0x3E, 0x02]);
+            !(is_uds && uds::is_response_suppressed(&transfer.data) || transfer.data[..] == [0x3E, 0x02]);
         if !is_wanted {
             let mut event = self.event(&transfer, None, "request");
             event.fields.push(Field::text("response", "not wanted"));
@@ -161,9 +192,7 @@ impl Diagnostics {
 
     /// The request that a response to `sid` belongs to.
     fn asked(&self, response: &Transfer, sid: u8) -> Option<usize> {
-        let of_channel = |waiting: &Waiting| {
-            waiting.request.channel == response.channel && waiting.request.data.first() == Some(&sid)
-        };
+        let of_channel = |waiting: &Waiting| self.is_answer(&waiting.request, response, sid);
         let physical = |waiting: &Waiting| of_channel(waiting) && waiting.request.to == Some(response.from);
         let functional = |waiting: &Waiting| {
             of_channel(waiting)
@@ -174,14 +203,30 @@ impl Diagnostics {
         self.waiting.iter().rposition(physical).or_else(|| self.waiting.iter().rposition(functional))
     }
 
+    /// Whether a response to `sid` may be one to this request, by service and content.
+    fn is_answer(&self, request: &Transfer, response: &Transfer, sid: u8) -> bool {
+        request.channel == response.channel
+            && request.data.first() == Some(&sid)
+            && (response.data[0] == 0x7F || {
+                let is_kwp = self.speaks_kwp.contains(&(request.channel, request.from));
+                echo::is_answer(is_kwp, &request.data, &response.data)
+            })
+    }
+
     fn response(&mut self, transfer: &Transfer, events: &mut Vec<Event>) {
-        match self.asked(transfer, transfer.data[0] & !0x40) {
-            Some(place) => {
-                let answered = self.answered(place, transfer.from);
-                events.push(self.event(&answered.request, Some((transfer, &answered)), "exchange"));
-            }
-            None => events.push(self.unasked(transfer)),
+        let sid = transfer.data[0] & !0x40;
+        let Some(place) = self.asked(transfer, sid) else {
+            let event = self.unasked(transfer, sid);
+            events.push(event);
+            return;
+        };
+        let answered = self.answered(place, transfer.from);
+        if matches!(transfer.data[..], [0x50, 0x80..=0xFF, ..]) {
+            // Sessions of KWP2000 have numbers above 80; UDS has a bit there that responses do not repeat.
+            self.is_kwp(&Transfer { to: Some(transfer.from), ..answered.request.clone() });
         }
+        self.periodic.learn(transfer.channel, transfer.from, &answered.request.data);
+        events.push(self.event(&answered.request, Some((transfer, &answered)), "exchange"));
     }
 
     /// The request's state until now; one to a single server stops waiting.
@@ -202,7 +247,8 @@ impl Diagnostics {
     fn refusal(&mut self, transfer: &Transfer, events: &mut Vec<Event>) {
         let (sid, nrc) = (transfer.data[1], transfer.data[2]);
         let Some(place) = self.asked(transfer, sid) else {
-            events.push(self.unasked(transfer));
+            let event = self.unasked(transfer, sid);
+            events.push(event);
             return;
         };
         if nrc == RESPONSE_PENDING {
@@ -221,10 +267,21 @@ impl Diagnostics {
         events.push(event);
     }
 
-    /// A response whose request was not observed.
-    fn unasked(&self, transfer: &Transfer) -> Event {
+    /// A response whose request was not observed, or no longer waits for it.
+    fn unasked(&mut self, transfer: &Transfer, sid: u8) -> Event {
         let mut event = self.event(transfer, None, "response");
-        event.fields.push(Field::text("request", "not heard"));
+        let late = self.late.iter().position(|request| {
+            transfer.start_ns.saturating_sub(request.time_ns) <= LATE_NS
+                && request.to.is_none_or(|to| to == transfer.from)
+                && request.from.id.is_extended() == transfer.from.id.is_extended()
+                && self.is_answer(request, transfer, sid)
+        });
+        // Several may answer a request to all.
+        if let Some(place) = late.filter(|place| self.late[*place].to.is_some()) {
+            self.late.remove(place);
+        }
+        let heard = if late.is_some() { "given up before" } else { "not heard" };
+        event.fields.push(Field::text("request", heard));
         event
     }
 
@@ -299,6 +356,12 @@ impl Diagnostics {
     /// The request at this index remains unanswered.
     fn give_up(&mut self, place: usize, trouble: Trouble, events: &mut Vec<Event>) {
         let Some(mut waiting) = self.waiting.remove(place) else { return };
+        if waiting.is_wanted && matches!(trouble, Trouble::Timeout { .. } | Trouble::Overlapped) {
+            if self.late.len() == MOST_LATE {
+                self.late.pop_front();
+            }
+            self.late.push_back(waiting.request.clone());
+        }
         // A server that said that the response is pending owes one, whatever others have answered.
         let mut silent: Vec<_> = waiting.pending.drain(..).map(|(by, times)| (Some(by), times)).collect();
         if silent.is_empty() && waiting.is_wanted && waiting.answers == 0 {
@@ -323,14 +386,40 @@ impl Diagnostics {
         }
     }
 
+    /// Whether a message that began in time is on its way from whom the request was to.
+    fn is_being_answered(&self, waiting: &Waiting) -> bool {
+        let Waiting { request, until_ns, .. } = waiting;
+        self.transport.has_begun(request.channel, request.time_ns..=*until_ns, |from| match request.to {
+            Some(to) => to == from,
+            None => request.from.id.is_extended() == from.id.is_extended() && request.from != from,
+        })
+    }
+
     fn expire(&mut self, now_ns: i64, events: &mut Vec<Event>) {
         while let Some(place) = self.waiting.iter().position(|waiting| waiting.until_ns < now_ns) {
             let waiting = &self.waiting[place];
+            if self.is_being_answered(waiting) {
+                self.waiting[place].until_ns = now_ns.saturating_add(UNDER_WAY_NS);
+                continue;
+            }
             let waited = if waiting.pending.is_empty() { RESPONSE_NS } else { PENDING_NS };
             self.give_up(place, Trouble::Timeout { after_ms: (waited / 1_000_000) as u32 }, events);
         }
         self.due_ns = self.waiting.iter().map(|waiting| waiting.until_ns).min().unwrap_or(i64::MAX);
     }
+}
+
+/// Data that a server sends by itself.
+fn periodic_event(transfer: &Transfer, did: u16, data: &[u8]) -> Event {
+    let mut event = Event::from(transfer.clone());
+    event.protocol = Protocol::Uds;
+    event.kind = "periodic";
+    event.title = "periodic data".into();
+    event.fields = vec![Field::hex("did", did, 4).meaning(names::data_identifier(did))];
+    if !data.is_empty() {
+        event.fields.push(Field::bytes("value", data));
+    }
+    event
 }
 
 impl Assembler for Diagnostics {

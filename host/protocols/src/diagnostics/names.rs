@@ -178,7 +178,7 @@ const DATA_IDENTIFIERS: [(u16, &str); 34] = [
 ];
 
 /// Sub-functions by service.
-const SUB_FUNCTIONS: [(u8, u8, &str); 82] = [
+const SUB_FUNCTIONS: [(u8, u8, &str); 85] = [
     (0x10, 1, "default"),
     (0x10, 2, "programming"),
     (0x10, 3, "extended"),
@@ -258,6 +258,9 @@ const SUB_FUNCTIONS: [(u8, u8, &str); 82] = [
     (0x86, 4, "report activated events"),
     (0x86, 5, "start"),
     (0x86, 6, "clear"),
+    (0x86, 7, "on comparison of values"),
+    (0x86, 8, "report most recent DTC on status change"),
+    (0x86, 9, "report DTC record on status change"),
     (0x87, 1, "verify mode transition with fixed parameter"),
     (0x87, 2, "verify mode transition with specific parameter"),
     (0x87, 3, "transition mode"),
@@ -311,10 +314,26 @@ pub fn data_identifier(did: u16) -> Option<&'static str> {
     })
 }
 
+/// Events that are stored.
+const STORED_EVENTS: [&str; 10] = [
+    "stop, stored",
+    "on DTC status change, stored",
+    "on timer interrupt, stored",
+    "on change of data identifier, stored",
+    "report activated events, stored",
+    "start, stored",
+    "clear, stored",
+    "on comparison of values, stored",
+    "report most recent DTC on status change, stored",
+    "report DTC record on status change, stored",
+];
+
 /// A service's sub-function, without the bit that suppresses the response.
 pub fn sub_function(sid: u8, sub: u8) -> Option<&'static str> {
     let named = SUB_FUNCTIONS.iter().find(|(of, number, _)| (*of, *number) == (sid, sub));
     named.map(|(.., name)| *name).or(match (sid, sub) {
+        // A bit says that the event outlasts a reset.
+        (0x86, 0x40..=0x7F) => return STORED_EVENTS.get(usize::from(sub & 0x3F)).copied(),
         (0x27, 1..=0x7E) if sub % 2 == 1 => Some("request seed"),
         (0x27, 1..=0x7E) => Some("send key"),
         _ => None,

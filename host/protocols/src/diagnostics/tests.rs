@@ -202,7 +202,41 @@ fn services_have_their_own_fields() {
             ["7E0#028301", "7E8#02C301"],
             "uds 7E0 > 7E8 AccessTimingParameter: sid 0x83, sub_function 0x01 (read extended timing)",
         ),
-        (["", "7E8#056FF1900355"], "did 0xF190 (VIN), status 55"),
+        (["", "7E8#056FF1900355"], "did 0xF190 (VIN), control 0x03 (short term adjustment), status 55"),
+        (["7E0#042701AABB", "7E8#0467011122"], "(request seed), parameters AA BB, seed 11 22, after"),
+        (["7E0#04270233CC", "7E8#026702"], "(send key), key 33 CC, after"),
+        (["7E0#021104", "7E8#0351040F"], "(enable rapid power shutdown), power_down_time 15 s, after"),
+        (["", "7E8#035104FF"], "(enable rapid power shutdown), power_down_time not available, request"),
+        (
+            ["7E0#0528041200AA", "7E8#026804"],
+            "communication_type 0x12 (network management, on subnet 1), node 0x00AA, after",
+        ),
+        (
+            ["7E0#0387 01 12", "7E8#02C701"],
+            "(verify mode transition with fixed parameter), link_mode 0x12 (500 kbit/s), after",
+        ),
+        (["7E0#05870207A120", "7E8#02C702"], "bit_rate 500000 bit/s, after"),
+        (
+            ["7E0#078643 02 F190 22F1", "7E8#05C643010201"],
+            "sub_function 0x43 (on change of data identifier, stored), event_window 0x02 (infinite), did 0xF190 (VIN), \
+             response_service 0x22 (ReadDataByIdentifier), parameters F1, identified_events 1, after",
+        ),
+        (["7E0#028604", "7E8#07C604010102 0E 19"], "activated_events 1, value 01 02 0E 19, after"),
+        (["", "7E8#066C02F2001234"], "did 0xF200 (periodic), value 12 34, request"),
+        (
+            ["7E0#072C02F2001220 00", "7E8#046C02F200"],
+            "(define by memory address), did 0xF200 (periodic), lengths 0x12, parameters 20 00, after",
+        ),
+        (["", "7E8#057D 12 2000 08"], "address 0x2000, size 8 bytes, request"),
+        (
+            ["", "7E8#0664F19001A130"],
+            "did 0xF190 (VIN), scaling 0x01 (unsigned, 1 bytes), scaling 0xA1 (unit or format), unit 0x30 (km/h), request",
+        ),
+        (["", "7E8#0678010200F011"], "(add file), block_length 240 bytes, data_format 0x11, request"),
+        (
+            ["", "7E8#0469 04 13 AA"],
+            "(transmit certificate), result 0x13 (certificate verified), value AA, request",
+        ),
     ] {
         let frames = frames.iter().enumerate().filter(|(_, frame)| !frame.is_empty());
         let frames: Vec<_> = frames.map(|(at, frame)| (at as f64, frame.replace(' ', ""))).collect();
@@ -231,4 +265,107 @@ fn requests_and_responses_of_any_bytes_are_taken() {
         obd::response(round as u8 & 15, &bytes, &mut fields);
         assert!(fields.iter().all(|field| !field.to_string().is_empty()));
     }
+}
+
+/// A response says what it is to; the one that came next is not necessarily the right one.
+#[test]
+fn a_response_to_something_else_is_not_the_response() {
+    assert_eq!(
+        said(&[
+            (0.0, "7E0#0322F190"),
+            (1.0, "7E8#0562F1914142"),
+            (2.0, "7E8#0562F1904344"),
+            (9000.0, "123#")
+        ]),
+        [
+            "uds 7E8 > 7E0 ReadDataByIdentifier: sid 0x22, did 0xF191 (ECU hardware number), value 41 42, request \"not heard\"",
+            "uds 7E0 > 7E8 ReadDataByIdentifier: sid 0x22, did 0xF190 (VIN), value 43 44, after 2 ms",
+        ]
+    );
+    // One that comes after its request was given up.
+    let late = said(&[
+        (0.0, "7E0#0322F190"),
+        (500.0, "7E0#0322F191"),
+        (510.0, "7E8#0562F1904142"),
+        (520.0, "7E8#0562F1914344"),
+    ]);
+    assert_eq!(late.len(), 3, "{late:?}");
+    assert!(late[1].ends_with("did 0xF190 (VIN), value 41 42, request \"given up before\""), "{late:?}");
+    assert!(late[2].ends_with("did 0xF191 (ECU hardware number), value 43 44, after 20 ms"), "{late:?}");
+    let late = said(&[(0.0, "7E0#021003"), (2500.0, "7E8#065003003201F4"), (2600.0, "7E8#065003003201F4")]);
+    assert!(late[0].ends_with("nothing came for 2000 ms"), "{late:?}");
+    assert!(
+        late[1].ends_with("request \"given up before\"") && late[2].ends_with("\"not heard\""),
+        "{late:?}"
+    );
+    let late = said(&[(0.0, "7E0#0322F190"), (2500.0, "7E8#037F2210")]);
+    assert!(late[1].ends_with("nrc 0x10 (generalReject), request \"given up before\""), "{late:?}");
+}
+
+/// Of several identifiers a server answers those that it has.
+#[test]
+fn values_belong_to_the_identifiers_that_came() {
+    let said = said(&[(0.0, "7E0#0722F190F18CF191"), (1.0, "7E8#0762F18C41F19142")]);
+    assert!(said[0].contains("value_F18C 41, value_F191 42, after 1 ms"), "{said:?}");
+}
+
+/// With a separation of 127 ms, 200 bytes take longer than a response may.
+#[test]
+fn a_response_that_has_begun_is_waited_for() {
+    let mut frames = vec![(0.0, "7E0#03221234".to_owned()), (10.0, "7E8#10C8621234000000".to_owned())];
+    frames.push((11.0, "7E0#30007F".to_owned()));
+    for number in 1..=28 {
+        frames.push((11.0 + f64::from(number) * 127.0, format!("7E8#2{:X}01020304050607", number & 15)));
+    }
+    let frames: Vec<_> = frames.iter().map(|(at, frame)| (*at, frame.as_str())).collect();
+    let whole = said(&frames);
+    assert_eq!(whole.len(), 1, "{whole:?}");
+    assert!(whole[0].ends_with("after 10 ms"), "{whole:?}");
+    // Of one that breaks off, both are said.
+    let broken = said(&[&frames[..20], &[(9000.0, "123#")]].concat());
+    assert_eq!(broken.len(), 2, "{broken:?}");
+    // To all, too.
+    let mut to_all = frames.clone();
+    to_all[0].1 = "7DF#03221234";
+    let whole = said(&to_all);
+    assert_eq!(whole.len(), 1, "{whole:?}");
+}
+
+/// Their first byte is no service: 01 would be OBD-II's current data.
+#[test]
+fn periodic_data_are_known_by_what_was_asked() {
+    let frames = [
+        (0.0, "7E0#042A0101E3"),
+        (1.0, "7E8#016A"),
+        (100.0, "7E8#0401AABBCC"),
+        (150.0, "7E8#03E31234"),
+        (160.0, "7E0#0201E3"),
+        (161.0, "7E8#0341E300"),
+        (200.0, "7E0#032A04E3"),
+        (201.0, "7E8#016A"),
+        (250.0, "7E8#0401AABBCD"),
+        (260.0, "7E8#03E31234"),
+    ];
+    let said = said(&frames);
+    assert_eq!(
+        said[1..3],
+        [
+            "uds 7E8 > 7E0 periodic data: did 0xF201 (periodic), value AA BB CC",
+            "uds 7E8 > 7E0 periodic data: did 0xF2E3 (periodic), value 12 34",
+        ]
+    );
+    assert!(said[3].starts_with("obd 7E0 > 7E8 current data"), "{said:?}");
+    assert_eq!(said[5], "uds 7E8 > 7E0 periodic data: did 0xF201 (periodic), value AA BB CD");
+    assert!(said[6].starts_with("isotp"), "{said:?}");
+}
+
+/// Only the response to a session says that its highest bit was part of the number.
+#[test]
+fn a_session_above_80_is_one_of_kwp2000() {
+    let said = said(&[(0.0, "7E0#021089"), (1.0, "7E8#025089"), (2.0, "7E0#013E"), (3.0, "7E8#017E")]);
+    assert_eq!(
+        said[1],
+        "kwp2000 7E0 > 7E8 startDiagnosticSession: sid 0x10, mode 0x89, value 89, after 1 ms"
+    );
+    assert!(said[2].starts_with("kwp2000 7E0 > 7E8 testerPresent"), "{said:?}");
 }

@@ -2,8 +2,9 @@
 
 use std::fmt::Write as _;
 
-use super::values::number;
-use super::{dtc, names, reports, values};
+use super::reader::Reader;
+use super::values::{number, unsigned};
+use super::{authentication, dtc, events, files, names, reports, scaling, values};
 use crate::Field;
 
 /// The bit of a sub-function that suppresses the positive response.
@@ -56,14 +57,7 @@ pub fn request(bytes: &[u8], fields: &mut Vec<Field>) {
             value(data, fields);
         }
         (0x2F, [_, _, control, data @ ..]) => {
-            fields.push(did(after));
-            let what = [
-                "return control to ECU",
-                "reset to default",
-                "freeze current state",
-                "short term adjustment",
-            ];
-            fields.push(Field::hex("control", *control, 2).meaning(what.get(usize::from(*control)).copied()));
+            fields.extend([did(after), io_control(*control)]);
             rest("parameters", data, fields);
         }
         (0x31, [sub, high, low, data @ ..]) => {
@@ -87,14 +81,15 @@ pub fn request(bytes: &[u8], fields: &mut Vec<Field>) {
         }
         (0x38, [operation, data @ ..]) => {
             fields.push(sub_function(sid, *operation));
-            file(data, fields);
+            read(data, "parameters", fields, |reader| files::request(*operation, reader));
         }
         (0x28, [sub, kind, data @ ..]) => {
             fields.push(sub_function(sid, *sub));
-            let text = ["", "normal", "network management", "normal and network management"];
-            let text = text.get(usize::from(kind & 3)).copied().filter(|text| !text.is_empty());
-            fields.push(Field::hex("communication_type", *kind, 2).meaning(text));
-            rest("parameters", data, fields);
+            fields.push(Field::hex("communication_type", *kind, 2).meaning(communication(*kind)));
+            read(data, "parameters", fields, |reader| match sub & !SUPPRESS {
+                4 | 5 => reader.hex("node", 2).map(drop),
+                _ => None,
+            });
         }
         (0x2A, [mode, data @ ..]) => {
             let text = ["", "slow", "medium", "fast", "stop"];
@@ -112,9 +107,32 @@ pub fn request(bytes: &[u8], fields: &mut Vec<Field>) {
                     fields.push(Field::number("position", source[2]));
                     fields.push(Field::number("size", source[3]).unit("bytes"));
                 }
+            } else if let (2, Some((lengths, data))) = (sub & !SUPPRESS, data.split_first()) {
+                memories(*lengths, data, fields);
             } else {
                 rest("parameters", data, fields);
             }
+        }
+        (0x27, [sub, key @ ..]) if sub & 1 == 0 => {
+            fields.push(sub_function(sid, *sub));
+            rest("key", key, fields);
+        }
+        (0x29, [sub, data @ ..]) => {
+            fields.push(sub_function(sid, *sub));
+            read(data, "parameters", fields, |reader| authentication::request(sub & !SUPPRESS, reader));
+        }
+        (0x84, data) => read(data, "parameters", fields, secured),
+        (0x86, [sub, data @ ..]) => {
+            fields.push(sub_function(sid, *sub));
+            read(data, "parameters", fields, |reader| events::request(sub & !SUPPRESS, reader));
+        }
+        (0x87, [sub, data @ ..]) => {
+            fields.push(sub_function(sid, *sub));
+            read(data, "parameters", fields, |reader| match sub & !SUPPRESS {
+                1 => reader.byte("link_mode", link_mode).map(drop),
+                2 => reader.number("bit_rate", 3, "bit/s"),
+                _ => None,
+            });
         }
         (0x19, [sub, data @ ..]) => {
             fields.push(sub_function(sid, *sub));
@@ -126,6 +144,12 @@ pub fn request(bytes: &[u8], fields: &mut Vec<Field>) {
         }
         _ => rest("parameters", after, fields),
     }
+}
+
+/// What becomes of an input or output.
+fn io_control(control: u8) -> Field {
+    let what = ["return control to ECU", "reset to default", "freeze current state", "short term adjustment"];
+    Field::hex("control", control, 2).meaning(what.get(usize::from(control)).copied())
 }
 
 /// Routines defined in ISO 14229-1:2020 (table F.1).
@@ -141,17 +165,75 @@ fn routine(high: u8, low: u8) -> Field {
     Field::hex("routine", routine, 4).meaning(text)
 }
 
-/// A file name after its two-byte length, and what follows it (ISO 14229-1:2020, 14.6).
-fn file(data: &[u8], fields: &mut Vec<Field>) {
-    let named = data
-        .split_first_chunk::<2>()
-        .and_then(|(length, left)| left.split_at_checked(usize::from(u16::from_be_bytes(*length))));
-    let Some((name, left)) = named else {
+/// Fields by a service's own rules; what these do not cover is named `left`.
+fn read(
+    data: &[u8],
+    left: &'static str,
+    fields: &mut Vec<Field>,
+    rules: impl FnOnce(&mut Reader<'_, '_>) -> Option<()>,
+) {
+    let mut reader = Reader::new(data, fields);
+    // Bytes that do not suffice for a field are shown as they are.
+    let _ = rules(&mut reader);
+    reader.finish(left);
+}
+
+/// What a communication control is for: messages, in the low bits, and networks, in the high ones.
+fn communication(kind: u8) -> Option<String> {
+    let messages = match kind & 3 {
+        1 => "normal",
+        2 => "network management",
+        3 => "normal and network management",
+        _ => return None,
+    };
+    Some(match kind >> 4 {
+        0 => messages.to_owned(),
+        15 => format!("{messages}, on the network of the request"),
+        subnet => format!("{messages}, on subnet {subnet}"),
+    })
+}
+
+/// Modes of a link, as py-uds and udsoncan have them.
+fn link_mode(mode: u8) -> Option<&'static str> {
+    Some(match mode {
+        0x01 => "9600 baud",
+        0x02 => "19200 baud",
+        0x03 => "38400 baud",
+        0x04 => "57600 baud",
+        0x05 => "115200 baud",
+        0x10 => "125 kbit/s",
+        0x11 => "250 kbit/s",
+        0x12 => "500 kbit/s",
+        0x13 => "1 Mbit/s",
+        0x20 => "programming",
+        _ => return None,
+    })
+}
+
+/// A secured message, as py-uds and scapy read it: a service in an envelope.
+fn secured(reader: &mut Reader<'_, '_>) -> Option<()> {
+    const ENCRYPTED: u64 = 1 << 4;
+    let how = reader.hex("administrative", 2)?;
+    reader.hex("signature_encryption", 1)?;
+    let signature = usize::try_from(reader.hex("signature_length", 2)?).ok()?;
+    reader.hex("anti_replay_counter", 2)?;
+    if how & ENCRYPTED != 0 {
+        return None;
+    }
+    reader.byte("service", |sid| names::uds_service(sid & !0x40))?;
+    reader.bytes("parameters", reader.left().checked_sub(signature)?)?;
+    reader.bytes("signature", signature)
+}
+
+/// Several addresses and sizes after a byte with their lengths.
+fn memories(lengths: u8, data: &[u8], fields: &mut Vec<Field>) {
+    let each = usize::from(lengths & 15) + usize::from(lengths >> 4);
+    if each == 0 || data.is_empty() || !data.len().is_multiple_of(each) {
+        fields.push(Field::hex("lengths", lengths, 2));
         rest("parameters", data, fields);
         return;
-    };
-    fields.push(Field::text("file", String::from_utf8_lossy(name).into_owned()));
-    rest("parameters", left, fields);
+    }
+    data.chunks_exact(each).for_each(|one| memory(lengths, one, fields));
 }
 
 /// Address and size after a byte with their lengths (ISO 14229-1:2020, H.1).
@@ -163,7 +245,7 @@ fn memory(lengths: u8, data: &[u8], fields: &mut Vec<Field>) {
         return;
     }
     fields.push(Field::hex("address", number(&data[..address]), 2 * address as u8));
-    fields.push(Field::number("size", number(&data[address..address + size]) as i64).unit("bytes"));
+    fields.push(unsigned("size", number(&data[address..address + size])).unit("bytes"));
     rest("parameters", &data[address + size..], fields);
 }
 
@@ -206,17 +288,57 @@ pub fn response(request: Option<&[u8]>, bytes: &[u8], fields: &mut Vec<Field>) {
             if !heard {
                 fields.push(sub_function(sid, *sub));
             }
-            rest("seed", data, fields);
+            rest(if sub & 1 == 1 { "seed" } else { "value" }, data, fields);
         }
-        (0x2E, [_, _]) if !heard => fields.push(did(after)),
-        (0x2F, [_, _, _, data @ ..]) => {
+        (0x11, [sub @ 4, seconds]) => {
+            if !heard {
+                fields.push(sub_function(sid, *sub));
+            }
+            fields.push(match seconds {
+                0xFF => Field::missing("power_down_time"),
+                _ => Field::number("power_down_time", *seconds).unit("s"),
+            });
+        }
+        (0x24, [_, _, data @ ..]) => {
             if !heard {
                 fields.push(did(after));
             }
+            read(data, "value", fields, scaling::response);
+        }
+        (0x29, [sub, data @ ..]) => {
+            if !heard {
+                fields.push(sub_function(sid, *sub));
+            }
+            read(data, "value", fields, |reader| authentication::response(*sub, reader));
+        }
+        (0x2E, [_, _]) if !heard => fields.push(did(after)),
+        (0x2F, [_, _, control, data @ ..]) => {
+            if !heard {
+                fields.extend([did(after), io_control(*control)]);
+            }
             rest("status", data, fields);
+        }
+        (0x38, [mode, data @ ..]) => {
+            if !heard {
+                fields.push(sub_function(sid, *mode));
+            }
+            read(data, "value", fields, |reader| files::response(*mode, reader));
+        }
+        (0x84, data) => read(data, "value", fields, secured),
+        (0x86, [sub, data @ ..]) => {
+            if !heard {
+                fields.push(sub_function(sid, *sub));
+            }
+            read(data, "value", fields, |reader| events::response(heard, *sub, reader));
         }
         // The request already said this.
         (0x28, [_]) | (0x2C, [_, _, _]) if heard => {}
+        (0x3D, _) if request.is_some_and(|request| request[1..].starts_with(after)) => {}
+        (0x3D, [lengths, data @ ..]) => memory(*lengths, data, fields),
+        (0x2C, [sub, high, low, data @ ..]) if !heard => {
+            fields.extend([sub_function(sid, *sub), did(&[*high, *low])]);
+            rest("value", data, fields);
+        }
         (0x31, [sub, high, low, data @ ..]) => {
             if !heard {
                 fields.push(sub_function(sid, *sub));
@@ -224,11 +346,12 @@ pub fn response(request: Option<&[u8]>, bytes: &[u8], fields: &mut Vec<Field>) {
             }
             rest("status", data, fields);
         }
-        (0x34 | 0x35, [format, data @ ..]) if data.len() >= usize::from(format >> 4) => {
-            let most = data[..usize::from(format >> 4)]
-                .iter()
-                .fold(0_i64, |number, byte| number << 8 | i64::from(*byte));
-            fields.push(Field::number("block_length", most).unit("bytes"));
+        (0x34 | 0x35, [format, data @ ..])
+            if data.len() >= usize::from(format >> 4) && (1..=8).contains(&(format >> 4)) =>
+        {
+            let (most, left) = data.split_at(usize::from(format >> 4));
+            fields.push(unsigned("block_length", number(most)).unit("bytes"));
+            rest("value", left, fields);
         }
         (0x36, [block, data @ ..]) => {
             if !heard {
@@ -250,7 +373,8 @@ pub fn response(request: Option<&[u8]>, bytes: &[u8], fields: &mut Vec<Field>) {
 /// Values of several identifiers, whose lengths are unknown: each ends where the next requested identifier appears, if that is in
 /// only one place.
 fn several(asked: &[u8], answer: &[u8], fields: &mut Vec<Field>) {
-    let dids: Vec<&[u8]> = asked.chunks_exact(2).collect();
+    // The server leaves out those that it does not have.
+    let dids: Vec<&[u8]> = asked.chunks_exact(2).skip_while(|did| !answer.starts_with(did)).collect();
     let mut at = 2;
     let mut parts = Vec::new();
     for next in dids.iter().skip(1) {

@@ -10,11 +10,15 @@ use cantap_trace::fd::FD_MAX_BYTES;
 use super::pairs::{Endpoint, Pair};
 use super::pci::{self, FlowStatus, Pci};
 use super::transfer::Transfer;
+use crate::Bytes;
 
 /// How long the sender waits for flow control: N_Bs (ISO 15765-2:2016, table 21).
 const FLOW_TIMEOUT_NS: i64 = 1_000_000_000;
 /// How many first frames may wait for their flow control, on all channels together.
 const MOST_CANDIDATES: usize = 64;
+
+/// The longest message whose first frame is taken for one, in bytes: lengths of four bytes are more often other data.
+const MOST_LENGTH: u32 = 1 << 24;
 
 /// A frame that may be a first frame.
 #[derive(Clone, Debug)]
@@ -86,7 +90,7 @@ impl Finder {
             let Ok(Some(pci)) = pci::parse(bytes, offset) else { continue };
             let from = Endpoint { id, address: (offset == 1).then(|| bytes[0]) };
             match pci {
-                Pci::First { length, data } if length <= 4095 => {
+                Pci::First { length, data } if length <= MOST_LENGTH => {
                     if self.candidates.len() == MOST_CANDIDATES {
                         // The oldest one, which is the first to become too old.
                         self.candidates.swap_remove(self.oldest());
@@ -126,7 +130,7 @@ impl Finder {
                             channel,
                             from,
                             to: Some(to),
-                            data: found.data.0[..usize::from(found.data.1)].to_vec(),
+                            data: Bytes::from_slice(&found.data.0[..usize::from(found.data.1)]),
                             length: found.length,
                             frames: 2,
                             block_size: Some(block_size),

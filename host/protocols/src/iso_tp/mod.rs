@@ -22,7 +22,7 @@ use rustc_hash::FxHashMap;
 
 use self::finder::Finder;
 use self::pairs::Pairs;
-use crate::{Assembler, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
+use crate::{Assembler, Bytes, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
 /// How long the receiver waits for the next frame: N_Cr.
 const NEXT_TIMEOUT_NS: i64 = 1_000_000_000;
@@ -76,6 +76,17 @@ impl Transport {
     /// The other side of a sender, if it is known and unique.
     pub fn partner(&self, channel: u8, from: Endpoint) -> Option<Endpoint> {
         self.pairs.partner(channel, from)
+    }
+
+    /// Whether such a sender has begun a message in this time and not completed it.
+    pub fn has_begun(
+        &self,
+        channel: u8,
+        time_ns: std::ops::RangeInclusive<i64>,
+        is_sender: impl Fn(Endpoint) -> bool,
+    ) -> bool {
+        let mut open = self.open.values().map(|open| &open.transfer);
+        open.any(|open| open.channel == channel && time_ns.contains(&open.start_ns) && is_sender(open.from))
     }
 
     /// Takes the next record, and passes on the transfers that end with it, complete or not.
@@ -190,7 +201,7 @@ impl Transport {
             Ok(Some(pci)) => pci,
             Ok(None) => return,
             Err(fault) => {
-                let data = bytes[offset..].to_vec();
+                let data = Bytes::from_slice(&bytes[offset..]);
                 out(Transfer { data, trouble: Some(Trouble::Malformed(fault)), ..fresh });
                 return;
             }
@@ -198,11 +209,11 @@ impl Transport {
         match pci {
             Pci::Single(data) => {
                 self.overlap(key, out);
-                out(Transfer { data: data.to_vec(), length: data.len() as u32, ..fresh });
+                out(Transfer { data: Bytes::from_slice(data), length: data.len() as u32, ..fresh });
             }
             Pci::First { length, data } => {
                 self.overlap(key, out);
-                let transfer = Transfer { data: data.to_vec(), length, ..fresh };
+                let transfer = Transfer { data: Bytes::from_slice(data), length, ..fresh };
                 let frame_bytes = bytes.len();
                 self.begin(Open { transfer, next: 1, is_new: false, frame_bytes, last_ns: None }, out);
             }
@@ -263,7 +274,11 @@ impl Transport {
             }
             let before = self.headless.insert(key, number);
             if before.is_none_or(|before| (before + 1) & 15 != number) {
-                out(Transfer { data: data.to_vec(), trouble: Some(Trouble::Headless), ..fresh.clone() });
+                out(Transfer {
+                    data: Bytes::from_slice(data),
+                    trouble: Some(Trouble::Headless),
+                    ..fresh.clone()
+                });
             }
             return;
         };
@@ -311,10 +326,10 @@ impl Transport {
     }
 }
 
-/// The length of the first frame, derived from how much of the message it contained. The control information has two bytes; only
-/// messages longer than 4095 bytes have more, which is not checked.
+/// The length of the first frame, derived from how much of the message it contained.
 fn first_frame_bytes(transfer: &Transfer, offset: usize) -> usize {
-    offset + 2 + transfer.data.len()
+    let control = if transfer.length > 4095 { 6 } else { 2 };
+    offset + control + transfer.data.len()
 }
 
 /// Passes on an incomplete transfer.

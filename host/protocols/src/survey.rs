@@ -20,6 +20,8 @@ pub struct Survey {
     diagnostics: Diagnostics,
     events: Vec<Event>,
     seen: FxHashMap<(u8, Protocol), u32>,
+    /// Requests and responses of UDS that did not find each other, and all that ISO 15765-2 was found in.
+    alone: FxHashMap<u8, [u32; 2]>,
     /// Numbers of extended frames: those of NMEA 2000's groups, those of J1939's, and all.
     extended: FxHashMap<u8, [u32; 3]>,
     canopen: FxHashMap<u8, canopen::CanOpenSigns>,
@@ -65,6 +67,12 @@ impl Survey {
                 Protocol::IsoTp => event.kind == "transfer" && event.frames > 2,
                 _ => matches!(event.kind, "exchange" | "refusal"),
             };
+            let [alone, all] = self.alone.entry(event.channel).or_default();
+            *all += 1;
+            *alone += u32::from(
+                event.protocol == Protocol::Uds
+                    && matches!(event.kind, "response" | "no_response" | "request"),
+            );
             if convinces {
                 *self.seen.entry((event.channel, event.protocol)).or_default() += 1;
             }
@@ -88,6 +96,13 @@ impl Survey {
             .iter()
             .map(|(&(channel, protocol), &messages)| Evidence { channel, protocol, messages })
             .collect();
+        // A server that does not answer, or answers something else: other traffic with these identifiers rarely looks like that.
+        for (&channel, &[alone, all]) in &self.alone {
+            let is_speaking = found.iter().any(|found| found.channel == channel);
+            if !is_speaking && alone > 1 && alone * 5 >= all * 4 {
+                found.push(Evidence { channel, protocol: Protocol::Uds, messages: alone });
+            }
+        }
         // A trace may end before any message is complete.
         let mut open = Vec::new();
         self.diagnostics.under_way(&mut open);

@@ -3,7 +3,7 @@
 isotp, uds, canopen, j1939     two nodes talk; prints each frame as "MILLISECONDS ID#DATA", and what was said as "= JSON"
 nmea2000 LOG                   prints canboat's reading of a candump log, one JSON object per message
 groups                         prints "PGN NAME" of every parameter group that canmatrix' J1939 database or can-j1939 has
-eds FILE...                    prints "file PATH", then "INDEX SUB NAME" of every entry that python-canopen has
+eds FILE...                    prints "file PATH", then one JSON object for every entry that python-canopen has
 """
 
 import gzip
@@ -312,11 +312,22 @@ def read_eds(paths):
             # Lower numbers are data types, which are mapped to unused space in a PDO.
             if index < 0x20:
                 continue
-            if isinstance(thing, canopen.objectdictionary.ODVariable):
-                print(f"{index:04X} 0 {thing.name}")
-            else:
-                for sub, variable in sorted(thing.subindices.items()):
-                    print(f"{index:04X} {sub} {variable.name}")
+            is_variable = isinstance(thing, canopen.objectdictionary.ODVariable)
+            for sub, variable in {0: thing}.items() if is_variable else sorted(thing.subindices.items()):
+                values = [getattr(variable, name, None) for name in ("value", "default")]
+                numbers = [value for value in values if isinstance(value, (int, float))]
+                entry = {
+                    "index": index,
+                    "sub": sub,
+                    "name": variable.name,
+                    "type": variable.data_type,
+                    "access": variable.access_type,
+                    "mappable": variable.pdo_mappable,
+                    "value": numbers[0] if numbers else None,
+                    "low": variable.min,
+                    "high": variable.max,
+                }
+                print(json.dumps(entry))
 
 
 def read_groups():

@@ -11,7 +11,7 @@ mod peers;
 use std::io::Read;
 use std::process::Command;
 
-use cantap_protocols::canopen::eds::Eds;
+use cantap_protocols::canopen::eds::{self, Eds};
 use cantap_protocols::{Conversations, Event, Evidence, Options, Party, Protocol, Survey, Value};
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
@@ -236,32 +236,80 @@ fn differences(our: &Event, their: &serde_json::Value, fields: &mut usize) -> Ve
     wrong
 }
 
-/// Compares python-canopen's own sheets, if its source is available.
+/// A number of a sheet for node 16 (as in `strange.eds`); hexadecimal ones of signed types are the bits.
+fn number_of(text: &str, data_type: Option<u16>) -> Option<f64> {
+    let Some(number) = eds::number(text, 16) else { return text.parse().ok() };
+    let bits = match data_type {
+        Some(2) => 8,
+        Some(3) => 16,
+        Some(4) => 32,
+        Some(0x15) => 64,
+        _ => return Some(number as f64),
+    };
+    Some(((number << (128 - bits)) >> (128 - bits)) as f64)
+}
+
+/// Compares python-canopen's own sheets, and one of ours with what is seldom seen: names, types, access, values, limits.
 #[test]
 fn sheets_have_every_entry_that_python_canopen_has() {
     let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data");
-    let sheets = ["sample", "datatypes", "e35"].map(|name| format!("{folder}/{name}.eds"));
+    let sheets = ["sample", "datatypes", "e35", "strange"].map(|name| format!("{folder}/{name}.eds"));
     let arguments: Vec<_> = std::iter::once("eds").chain(sheets.iter().map(String::as_str)).collect();
     let Some(text) = peer("canopen", &arguments) else { return };
-    let (mut eds, mut entries) = (Eds::default(), 0);
+    let (mut eds, mut entries, mut wrong) = (Eds::default(), 0, Vec::new());
     for line in text.lines() {
         if let Some(path) = line.strip_prefix("file ") {
             eds = Eds::parse(&std::fs::read(path).unwrap());
             continue;
         }
-        let mut parts = line.splitn(3, ' ');
-        let index = u16::from_str_radix(parts.next().unwrap(), 16).unwrap();
-        let sub = parts.next().unwrap().parse().unwrap();
+        let their: serde_json::Value = serde_json::from_str(line).unwrap();
+        let (index, sub) = (their["index"].as_u64().unwrap() as u16, their["sub"].as_u64().unwrap() as u8);
         let entry = eds.entry_of(index, sub).unwrap_or_else(|| panic!("no {index:04X}:{sub}"));
-        let name = parts.next().unwrap();
-        assert!(
-            entry.name == name || name.ends_with(&entry.name) || entry.name.starts_with(name) || sub == 0,
-            "{line}: {}",
-            entry.name
-        );
         entries += 1;
+        // Compact arrays have no section for their number of entries; theirs is writable.
+        let is_made_up =
+            sub == 0 && their["name"] == "Number of entries" && entry.name != "Number of entries";
+        if is_made_up {
+            continue;
+        }
+        let name = their["name"].as_str().unwrap();
+        let number = |text: &str| number_of(text, entry.data_type);
+        for (what, is_same) in [
+            ("name", entry.name == name || name.ends_with(&entry.name) || entry.name.starts_with(name)),
+            // A type of the maker's own is a domain to them.
+            (
+                "type",
+                entry.data_type.map(u64::from) == their["type"].as_u64()
+                    || their["type"] == 15 && entry.data_type >= Some(0x40),
+            ),
+            ("access", their["access"] == entry.access),
+            ("mapping", their["mappable"] == entry.mappable),
+            (
+                "value",
+                their["value"].is_null()
+                    || number_as(&their["value"], entry.data_type) == number(&entry.value),
+            ),
+            ("low limit", their["low"].is_null() || their["low"].as_f64() == number(&entry.low_limit)),
+            ("high limit", their["high"].is_null() || their["high"].as_f64() == number(&entry.high_limit)),
+        ] {
+            if !is_same {
+                wrong.push(format!("{what} of {line}: {entry:?}"));
+            }
+        }
     }
-    assert!(entries > 100, "{entries}");
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+    assert!(entries > 130, "{entries}");
+    let strange = Eds::parse(&std::fs::read(&sheets[3]).unwrap());
+    assert_eq!(strange.issues, [""; 0]);
+    // They are made when they are asked for, there; the names are the sheet's.
+    let names: Vec<_> = strange.objects[&0x1003].entries.values().map(|entry| entry.name.as_str()).collect();
+    assert_eq!(names[1..], ["The first", "The second", "The third"]);
+    assert_eq!(strange.objects[&0x2006].entries.len(), 17);
+}
+
+/// Their value: they keep the bits of a negative number as they are written.
+fn number_as(their: &serde_json::Value, data_type: Option<u16>) -> Option<f64> {
+    number_of(&their.to_string(), data_type)
 }
 
 /// Our name of a parameter group, from the title of one of its messages.

@@ -10,7 +10,7 @@ use cantap_wire::Frame;
 
 use super::transfer::{TransferError, TransferReceiver, TransferSender, TransferSettings};
 use super::{Machine, earlier};
-use crate::diagnostics::{has_sub_function, is_response_suppressed};
+use crate::diagnostics::{is_response_suppressed, repeats_its_request};
 use crate::iso_tp::{Endpoint, Pci, parse};
 
 const NEGATIVE: u8 = 0x7F;
@@ -427,27 +427,7 @@ fn is_answer(request: &[u8], data: &[u8]) -> bool {
     if first == NEGATIVE {
         return data.get(1) == Some(&sid) && data.len() >= 3;
     }
-    if first != sid | 0x40 {
-        return false;
-    }
-    let echoed = |from: usize, to: usize| match (request.get(from..to), data.get(from..to)) {
-        (Some(asked), Some(said)) => asked == said,
-        // A request without it is invalid, and its answer need not have it.
-        (None, _) => true,
-        (Some(_), None) => false,
-    };
-    match sid {
-        // The answer to several may leave some out.
-        0x01 => data.get(1).is_some_and(|pid| request[1..].contains(pid)),
-        0x02 | 0x09 => echoed(1, 2),
-        0x22 | 0x24 | 0x2E | 0x2F => echoed(1, 3),
-        0x31 => echoed(1, 4),
-        sid if has_sub_function(sid) => match (request.get(1), data.get(1)) {
-            (Some(asked), Some(said)) => said & 0x7F == asked & 0x7F,
-            (asked, _) => asked.is_none(),
-        },
-        _ => true,
-    }
+    first == sid | 0x40 && repeats_its_request(false, request, data) == Some(true)
 }
 
 #[cfg(test)]

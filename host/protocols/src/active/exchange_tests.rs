@@ -314,6 +314,18 @@ fn flow_control_by_the_device_is_not_sent_twice() {
     exchange.sent(1);
     exchange.hear(2, server, &first);
     assert_eq!(exchange.next(3), None);
+    // Nothing follows: the device has not sent it, and there is still time until the server gives up.
+    let due_ns = exchange.due_ns().unwrap();
+    assert!(due_ns <= 200_000_000, "{due_ns}");
+    assert_eq!(exchange.next(due_ns), Some(reply));
+    assert_eq!(exchange.next(due_ns + 1), None);
+    let mut exchange = physical(&[0x22, 0xF1, 0x90]);
+    exchange.flow_by_device(from);
+    assert!(exchange.next(0).is_some());
+    exchange.sent(1);
+    exchange.hear(2, server, &first);
+    exchange.hear(3, server, &[0x21, 4, 5, 6, 7, 8, 9, 10]);
+    assert_eq!(exchange.next(due_ns), None, "it has begun to come");
     let mut exchange = physical(&[0x22, 0xF1, 0x90]);
     exchange.flow_by_device(from);
     assert!(exchange.next(0).is_some());

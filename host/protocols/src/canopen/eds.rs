@@ -42,6 +42,10 @@ pub struct Entry {
     pub value: String,
     /// Whether a PDO may carry it.
     pub mappable: bool,
+    /// The least value, in the file's words; empty if there is none.
+    pub low_limit: String,
+    /// The greatest value.
+    pub high_limit: String,
 }
 
 /// A section of the file: its line and its keys.
@@ -56,24 +60,24 @@ impl Section {
         self.keys.get(key).cloned().unwrap_or_default()
     }
 
-    fn number(&self, key: &str) -> Option<i64> {
+    fn number(&self, key: &str) -> Option<i128> {
         number(self.keys.get(key)?, 0)
     }
 }
 
-/// Decimal, hexadecimal with 0x, or octal with a leading 0; `$NODEID` may be added.
-pub fn number(text: &str, node: u8) -> Option<i64> {
-    text.split('+').try_fold(0_i64, |sum, part| {
+/// Decimal, hexadecimal with 0x, or octal with a leading 0; `$NODEID` may be added. Objects have up to 64 bits, signed or not.
+pub fn number(text: &str, node: u8) -> Option<i128> {
+    text.split('+').try_fold(0_i128, |sum, part| {
         let part = part.trim();
         let value = if part.eq_ignore_ascii_case("$NODEID") {
             node.into()
         } else if let Some(digits) = part.strip_prefix("0x").or_else(|| part.strip_prefix("0X")) {
-            i64::try_from(u64::from_str_radix(digits, 16).ok()?).ok()?
+            u64::from_str_radix(digits, 16).ok()?.into()
         } else if part.len() > 1
             && part.starts_with('0')
             && part.bytes().all(|byte| (b'0'..=b'7').contains(&byte))
         {
-            i64::from_str_radix(part, 8).ok()?
+            i128::from_str_radix(part, 8).ok()?
         } else {
             part.parse().ok()?
         };
@@ -82,10 +86,11 @@ pub fn number(text: &str, node: u8) -> Option<i64> {
 }
 
 impl Eds {
-    /// Parses a file's text. It may be in any 8-bit encoding: only names contain non-ASCII characters.
+    /// Parses a file's text, in UTF-8 or else Latin-1: only names contain non-ASCII characters.
     pub fn parse(bytes: &[u8]) -> Self {
         let mut eds = Self::default();
-        let text = String::from_utf8_lossy(bytes);
+        let latin = || bytes.iter().map(|byte| char::from(*byte)).collect();
+        let text = str::from_utf8(bytes).map_or_else(|_| latin(), str::to_owned);
         let sections = eds.sections(text.trim_start_matches('\u{FEFF}'));
         if let Some(info) = sections.get("deviceinfo") {
             (eds.product, eds.vendor) = (info.text("productname"), info.text("vendorname"));
@@ -166,6 +171,8 @@ impl Eds {
             access: section.text("accesstype").to_ascii_lowercase(),
             value: set.cloned().unwrap_or_else(|| section.text("defaultvalue")),
             mappable: section.number("pdomapping") == Some(1),
+            low_limit: section.text("lowlimit"),
+            high_limit: section.text("highlimit"),
         }
     }
 
@@ -233,7 +240,7 @@ impl Eds {
         let compact = section.number("compactsubobj").unwrap_or(0) > 0;
         if let Some(promised) =
             section.number("subnumber").filter(|_| !compact && matches!(object.code, 6 | 8 | 9))
-            && promised != object.entries.len() as i64
+            && promised != object.entries.len() as i128
         {
             let found = object.entries.len();
             self.issues
@@ -246,7 +253,7 @@ impl Eds {
         let Some(section) = section else { return };
         let count = section.number("supportedobjects").unwrap_or(0);
         let listed = section.keys.iter().filter(|(key, _)| key.parse::<u32>().is_ok());
-        let mut found = 0;
+        let mut found: i128 = 0;
         for (_, value) in listed {
             found += 1;
             match number(value, 0).and_then(|index| u16::try_from(index).ok()) {
@@ -319,6 +326,14 @@ mod tests {
     }
 
     #[test]
+    fn names_may_be_in_latin_1_and_lines_end_in_every_way() {
+        let sheet = b"[DeviceInfo]\r\nProductName=Temp\xE9rature \xB0C\r\nVendorName=V\n";
+        let eds = Eds::parse(sheet);
+        assert_eq!((eds.product.as_str(), eds.vendor.as_str()), ("Temp\u{E9}rature \u{B0}C", "V"));
+        assert_eq!(Eds::parse("[DeviceInfo]\nProductName=\u{E9}".as_bytes()).product, "\u{E9}");
+    }
+
+    #[test]
     fn numbers_are_written_in_every_way() {
         for (text, expected) in [
             ("10", Some(10)),
@@ -331,6 +346,9 @@ mod tests {
             ("0", Some(0)),
             ("-5", Some(-5)),
             ("09", Some(9)),
+            ("0xFFFFFFFFFFFFFFFF", Some(u64::MAX.into())),
+            ("-9223372036854775808", Some(i64::MIN.into())),
+            ("18446744073709551615", Some(u64::MAX.into())),
         ] {
             assert_eq!(number(text, 5), expected, "{text}");
         }

@@ -28,7 +28,7 @@ mod uds;
 mod values;
 
 pub use dtc::Dtc;
-pub(crate) use names::has_sub_function;
+pub(crate) use echo::repeats_its_request;
 pub use names::{data_identifier, reason, uds_service};
 pub use parameters::name as parameter_name;
 pub(crate) use uds::is_response_suppressed;
@@ -209,7 +209,7 @@ impl Diagnostics {
             && request.data.first() == Some(&sid)
             && (response.data[0] == 0x7F || {
                 let is_kwp = self.speaks_kwp.contains(&(request.channel, request.from));
-                echo::is_answer(is_kwp, &request.data, &response.data)
+                repeats_its_request(is_kwp, &request.data, &response.data) != Some(false)
             })
     }
 

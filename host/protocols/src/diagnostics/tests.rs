@@ -369,3 +369,27 @@ fn a_session_above_80_is_one_of_kwp2000() {
     );
     assert!(said[2].starts_with("kwp2000 7E0 > 7E8 testerPresent"), "{said:?}");
 }
+
+/// Somebody whose ECU is silent wants to see just that.
+#[test]
+fn requests_without_answers_show_what_is_spoken() {
+    let found = |frames: &[&str]| {
+        let mut survey = crate::Survey::new();
+        for (number, frame) in (0_u32..).zip(frames) {
+            survey.take(&at(f64::from(number) * 100.0, frame));
+        }
+        survey.found().into_iter().map(|found| found.protocol).collect::<Vec<_>>()
+    };
+    assert_eq!(found(&["7E0#0322F190", "7E0#0322F190", "7E0#023E00", "100#00"]), [Protocol::Uds]);
+    assert_eq!(
+        found(&["7E0#0322F190", "7E8#0462F19141", "7E0#021003", "7E8#065001003201F4"]),
+        [Protocol::Uds]
+    );
+    // Layer setting services of CANopen, and anything.
+    assert_eq!(found(&["7E5#0401000000000000", "7E4#0401000000000000", "7E5#0400000000000000"]), []);
+    assert_eq!(
+        found(&["7E1#0822F19000000000", "7E1#0922F190FF", "7E1#0322F190", "7E1#0322F191", "7E1#0422"]),
+        []
+    );
+    assert_eq!(found(&["7E0#023E00", "100#0322F190"]), []);
+}

@@ -27,19 +27,11 @@ fn each_kind_is_reported_with_the_counters() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::opened(&queue, Mode::Normal);
     bench.board.traffic[0].counters = (8, 3);
-    let kinds = [
-        BusErrorKind::Stuff,
-        BusErrorKind::Form,
-        BusErrorKind::Acknowledgment,
-        BusErrorKind::BitRecessive,
-        BusErrorKind::BitDominant,
-        BusErrorKind::Crc,
-    ];
-    for kind in kinds {
+    for kind in BusErrorKind::ALL {
         error(&mut bench, kind);
     }
     bench.millisecond();
-    let expected = kinds.map(|kind| Event::BusError { channel: CAN1, kind, tec: 8, rec: 3 });
+    let expected = BusErrorKind::ALL.map(|kind| Event::BusError { channel: CAN1, kind, tec: 8, rec: 3 });
     bench.millisecond();
     assert_eq!(bench.events(), expected);
 }

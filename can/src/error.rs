@@ -18,6 +18,12 @@ pub enum BusErrorKind {
     Crc,
 }
 
+impl BusErrorKind {
+    /// All of them.
+    pub const ALL: [Self; 6] =
+        [Self::Stuff, Self::Form, Self::Acknowledgment, Self::BitRecessive, Self::BitDominant, Self::Crc];
+}
+
 /// The state of a controller's fault confinement (ISO 11898-1).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]

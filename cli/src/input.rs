@@ -4,9 +4,10 @@ use std::path::{Path, PathBuf};
 
 use anyhow::bail;
 use cantap::TraceRecord;
-use cantap_formats::{Format, LeftOut, ReadOptions, TraceReader, Zone, open_reader};
+use cantap_formats::{Format, LeftOut, ReadOptions, Zone, open_reader};
 use cantap_trace::filter::Filter;
 
+use crate::ahead::{Ahead, Step};
 use crate::completion;
 use crate::interrupt;
 use crate::live::{LiveArgs, LiveRecords};
@@ -45,10 +46,9 @@ pub struct Records {
     at: usize,
 }
 
-#[expect(clippy::large_enum_variant, reason = "a command has one")]
 enum Source {
     /// A file, and whether it may grow.
-    File(TraceReader, bool),
+    File(Ahead, bool),
     Device(LiveRecords),
 }
 
@@ -73,7 +73,7 @@ impl ReadArgs {
             reader.end_when(interrupt::requested);
         }
         let grows = self.follow || path.as_os_str() == "-";
-        Ok(self.records(Source::File(reader, grows)))
+        Ok(self.records(Source::File(Ahead::new(reader), grows)))
     }
 
     /// Opens the device if given, otherwise the file.
@@ -93,10 +93,10 @@ impl ReadArgs {
 
 impl Records {
     /// Whether the next record may take a while, so that results should not be buffered.
-    pub fn may_wait(&self) -> bool {
+    pub fn may_wait(&mut self) -> bool {
         self.at == self.batch.len()
-            && match &self.source {
-                Source::File(reader, grows) => *grows && reader.would_wait(),
+            && match &mut self.source {
+                Source::File(reader, _) => reader.would_wait(),
                 Source::Device(_) => true,
             }
     }
@@ -123,7 +123,7 @@ impl Records {
     /// What is missing from the records that were read.
     pub fn missing(&self) -> Missing {
         match &self.source {
-            Source::File(reader, _) => Missing::of(reader),
+            Source::File(reader, _) => reader.missing(),
             Source::Device(_) => Missing::default(),
         }
     }
@@ -173,27 +173,23 @@ impl Records {
 }
 
 /// The next records; reports faults on the way, and their number at the end.
-fn batch_of_file(
-    reader: &mut TraceReader,
-    strict: bool,
-    records: &mut Vec<TraceRecord>,
-) -> anyhow::Result<bool> {
-    loop {
-        match reader.next_batch(records) {
-            None => break,
-            Some(Ok(())) => return Ok(true),
-            Some(Err(issue)) if strict => bail!(issue),
-            Some(Err(issue)) if reader.issues() <= ISSUES_SHOWN => eprintln!("cantap: {issue}"),
-            Some(Err(_)) => {}
+fn batch_of_file(reader: &mut Ahead, strict: bool, records: &mut Vec<TraceRecord>) -> anyhow::Result<bool> {
+    let nothing = loop {
+        match reader.next(records)? {
+            Step::Records => return Ok(true),
+            Step::Issue(issue, _) if strict => bail!(issue),
+            Step::Issue(issue, number) if number <= ISSUES_SHOWN => eprintln!("cantap: {issue}"),
+            Step::Issue(..) => {}
+            Step::End(nothing) => break nothing,
         }
-    }
-    if let Some(nothing) = reader.nothing_read() {
+    };
+    if let Some(nothing) = nothing {
         bail!(nothing);
     }
     for (what, count) in reader.notes().iter() {
         eprintln!("cantap: note: {what} ({count})");
     }
-    if let Some(words) = Missing::of(reader).in_words() {
+    if let Some(words) = reader.missing().in_words() {
         eprintln!("cantap: {words}");
     }
     Ok(false)

@@ -22,6 +22,7 @@ macro_rules! eprint {
 }
 
 mod advice;
+mod ahead;
 mod args;
 mod beside;
 mod boards;

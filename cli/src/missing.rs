@@ -9,7 +9,7 @@ pub fn by_kind(counts: &LeftOut) -> Map<String, Value> {
 }
 
 /// What is missing from the records of a file.
-#[derive(Default)]
+#[derive(Clone, Default)]
 pub struct Missing {
     /// Places that could not be read.
     pub issues: u64,

@@ -47,8 +47,8 @@ def serve_uds(host, port):
             request = bytes(stack.recv(block=True, timeout=0.1) or b"").hex().upper()
             known = answers.get(request) or next((answers[key] for key in ("2702", "36") if request.startswith(key)), [])
             if request.startswith("36"):
-                # As many bytes as came, in two.
-                known = ["7601" + f"{len(request) // 2:04X}"]
+                # The block's number, and as many bytes as came, in two.
+                known = [f"76{request[2:4]}{len(request) // 2:04X}"]
             for answer in known:
                 stack.send(bytes.fromhex(answer))
                 time.sleep(0.02)
@@ -77,7 +77,7 @@ def serve_four(host, port, lengths, answers):
         while not over.is_set():
             request = functional.pop(0) if functional else bytes(stack.recv(block=True, timeout=0.02) or b"")
             request = request.hex().upper()
-            known = [f"7601{len(request) // 2:04X}"] if request.startswith("36") else own.get(request, [])
+            known = [f"76{request[2:4]}{len(request) // 2:04X}"] if request.startswith("36") else own.get(request, [])
             for answer in known:
                 if answer.startswith("7F") and answer.endswith("78"):
                     stack.send(bytes.fromhex(answer))

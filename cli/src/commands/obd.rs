@@ -158,6 +158,7 @@ impl Vehicle<'_> {
                 }
             }
             if !self.servers.is_empty() {
+                self.client.set_servers(self.servers.iter().map(|server| server.answers_with).collect());
                 return Ok(());
             }
         }

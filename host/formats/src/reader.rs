@@ -214,9 +214,11 @@ impl TraceReader {
         self.input.end_when(Box::new(stop));
     }
 
-    /// Whether the next record may have to be waited for: everything read before is used up.
+    /// Whether the next record may have to be waited for: everything read before is used up, and this is a pipe, or a file
+    /// that is followed.
     pub fn would_wait(&self) -> bool {
-        self.at == self.batch.len()
+        self.input.may_wait()
+            && self.at == self.batch.len()
             && self.after.is_none()
             && !(self.decoder.needs_one_line() && self.input.has_line())
     }

@@ -46,15 +46,7 @@ fn every_kind() -> Vec<TraceRecord> {
             push(channel, frame(text, Direction::Rx));
             push(channel, frame(text, Direction::Tx));
         }
-        let kinds = [
-            BusErrorKind::Stuff,
-            BusErrorKind::Form,
-            BusErrorKind::Acknowledgment,
-            BusErrorKind::BitRecessive,
-            BusErrorKind::BitDominant,
-            BusErrorKind::Crc,
-        ];
-        for kind in kinds.into_iter().map(Some).chain([None]) {
+        for kind in BusErrorKind::ALL.into_iter().map(Some).chain([None]) {
             for counters in [None, Some((8, 0)), Some((255, 127))] {
                 push(channel, TraceEvent::BusError { kind, counters });
             }

@@ -88,14 +88,7 @@ fn row(format: Format) -> String {
         Some(TraceEvent::Frame { frame, .. }) if frame.is_fd() => "without flags",
         _ => "–",
     };
-    let kinds = [
-        BusErrorKind::Stuff,
-        BusErrorKind::Form,
-        BusErrorKind::Acknowledgment,
-        BusErrorKind::BitRecessive,
-        BusErrorKind::BitDominant,
-        BusErrorKind::Crc,
-    ];
+    let kinds = BusErrorKind::ALL;
     let errors = kinds.map(|kind| event(TraceEvent::BusError { kind: Some(kind), counters: Some((8, 0)) }));
     let exact = errors
         .iter()

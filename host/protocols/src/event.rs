@@ -1,11 +1,14 @@
 //! The output of an assembler.
 
 use std::borrow::Cow;
-use std::fmt;
 
 use cantap_trace::{Id, TraceRecord};
+use smallvec::SmallVec;
 
 use crate::Protocol;
+
+/// Bytes of a message; those of one frame, which most are, without an allocation of their own.
+pub type Bytes = SmallVec<[u8; 16]>;
 
 /// Something said on a bus: a message, an exchange, or a failed one.
 #[derive(Clone, Debug, PartialEq)]
@@ -30,7 +33,7 @@ pub struct Event {
     /// The content, in order.
     pub fields: Vec<Field>,
     /// The underlying bytes, as far as they are known.
-    pub data: Vec<u8>,
+    pub data: Bytes,
     /// From the end of a request to the first frame of its response, in nanoseconds.
     pub response_ns: Option<i64>,
     /// Number of frames.
@@ -81,7 +84,7 @@ pub enum Value {
     /// A text.
     Text(Cow<'static, str>),
     /// Bytes whose meaning is unknown.
-    Bytes(Vec<u8>),
+    Bytes(Bytes),
     /// There is no value: not available, or unreadable.
     Missing,
 }
@@ -175,7 +178,7 @@ impl Field {
 
     /// Bytes whose meaning is unknown.
     pub fn bytes(name: impl Into<Cow<'static, str>>, value: &[u8]) -> Self {
-        Self::new(name, Value::Bytes(value.to_vec()))
+        Self::new(name, Value::Bytes(Bytes::from_slice(value)))
     }
 
     /// Without a value.
@@ -228,7 +231,7 @@ impl Event {
             kind,
             title: title.into(),
             fields: Vec::new(),
-            data: record.frame().map_or_else(Vec::new, |frame| frame.data().to_vec()),
+            data: record.frame().map_or_else(Bytes::new, |frame| Bytes::from_slice(frame.data())),
             response_ns: None,
             frames: 1,
             trouble: None,
@@ -245,93 +248,5 @@ impl Event {
 impl From<Id> for Party {
     fn from(id: Id) -> Self {
         Self::Id(id)
-    }
-}
-
-impl fmt::Display for Party {
-    /// `7E0`, `6F1/12`, `5`, `all`; `?` if unknown.
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Unknown => f.write_str("?"),
-            Self::Everyone => f.write_str("all"),
-            Self::Id(id) => write!(f, "{id}"),
-            Self::Addressed(id, address) => write!(f, "{id}/{address:02X}"),
-            Self::Node(node) => write!(f, "{node}"),
-        }
-    }
-}
-
-impl fmt::Display for Value {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Number(value) => write!(f, "{value}"),
-            Self::Hex(value, digits) => write!(f, "0x{value:0width$X}", width = usize::from(*digits)),
-            Self::Real(value) => write_real(f, *value),
-            Self::Text(text) => write!(f, "\"{}\"", text.escape_debug()),
-            Self::Bytes(bytes) if bytes.is_empty() => f.write_str("nothing"),
-            Self::Bytes(bytes) => f.write_str(&hex(bytes)),
-            Self::Missing => f.write_str("not available"),
-        }
-    }
-}
-
-/// `62 F1 90`.
-pub(crate) fn hex(bytes: &[u8]) -> String {
-    const DIGITS: &[u8; 16] = b"0123456789ABCDEF";
-    let mut text = String::with_capacity(bytes.len() * 3);
-    for (at, byte) in bytes.iter().enumerate() {
-        if at > 0 {
-            text.push(' ');
-        }
-        text.push(char::from(DIGITS[usize::from(byte >> 4)]));
-        text.push(char::from(DIGITS[usize::from(byte & 15)]));
-    }
-    text
-}
-
-/// At most seven decimals, as positions have, without trailing zeros.
-fn write_real(f: &mut fmt::Formatter<'_>, value: f64) -> fmt::Result {
-    if value.abs() >= 1e15 {
-        return write!(f, "{value:e}");
-    }
-    let text = format!("{value:.7}");
-    let text = text.trim_end_matches('0').trim_end_matches('.');
-    if text.trim_start_matches('-') == "0" && value != 0.0 {
-        return write!(f, "{value:e}");
-    }
-    f.write_str(if text == "-0" { "0" } else { text })
-}
-
-impl fmt::Display for Field {
-    /// `did 0xF190 (VIN)`.
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} {}", self.name, self.value)?;
-        if !self.unit.is_empty() && self.value != Value::Missing {
-            write!(f, " {}", self.unit)?;
-        }
-        self.text.as_ref().map_or(Ok(()), |text| write!(f, " ({text})"))
-    }
-}
-
-impl fmt::Display for Event {
-    /// Without time and channel: `uds 7E0 > 7E8 ReadDataByIdentifier: did 0xF190 (VIN), value "…"`.
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} {}", self.protocol, self.from)?;
-        if self.to != Party::Unknown {
-            write!(f, " > {}", self.to)?;
-        }
-        write!(f, " {}", self.title)?;
-        for (at, field) in self.fields.iter().enumerate() {
-            write!(f, "{} {field}", if at == 0 { ":" } else { "," })?;
-        }
-        if let Some(response_ns) = self.response_ns {
-            f.write_str(if self.fields.is_empty() { ": after " } else { ", after " })?;
-            write_real(f, response_ns as f64 / 1e6)?;
-            f.write_str(" ms")?;
-        }
-        if let Some(trouble) = &self.trouble {
-            write!(f, "; {trouble}")?;
-        }
-        if self.frames_lost { f.write_str("; frames were lost meanwhile") } else { Ok(()) }
     }
 }

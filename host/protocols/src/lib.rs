@@ -23,11 +23,12 @@ mod relatives;
 mod survey;
 #[cfg(test)]
 mod testing;
+mod text;
 
 pub use assembler::{Assembler, UnderWay, is_gap};
 pub use condition::condition;
 pub use conversations::{Conversations, Options};
-pub use event::{Event, Field, Party, Trouble, Value};
+pub use event::{Bytes, Event, Field, Party, Trouble, Value};
 pub use overview::{Histogram, KnownNode, KnownObject, Overview, ServiceFigures};
 pub use protocol::{Protocol, UnknownProtocol};
 pub use relatives::Relative;

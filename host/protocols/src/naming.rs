@@ -158,7 +158,7 @@ impl Said for Event {
                 text.as_deref().is_some_and(same)
                     || match value {
                         Value::Text(value) => same(value),
-                        Value::Bytes(bytes) => same(&crate::event::hex(bytes)),
+                        Value::Bytes(bytes) => same(&crate::text::hex(bytes)),
                         _ => false,
                     }
             }

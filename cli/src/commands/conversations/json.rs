@@ -1,95 +1,175 @@
 //! For programs: one object per event.
 
-use std::io::{self, Write};
+use std::borrow::Cow;
+use std::fmt::Write as _;
 
 use cantap_protocols::{Event, Field, Party, Value};
 
 use crate::commands::decode::Seconds;
 
-/// Writes the object.
-pub(super) fn write(out: &mut impl Write, event: &Event) -> io::Result<()> {
-    // Written by hand, as in decode, so that times keep every digit.
-    write!(
+/// Appends the object and the end of its line.
+pub(super) fn push(out: &mut String, event: &Event) {
+    // Written by hand, as in decode, so that times keep every digit. Writing to a String cannot fail.
+    let _ = write!(
         out,
         "{{\"time_s\":{},\"start_s\":{},\"channel\":{},\"protocol\":\"{}\",\"kind\":\"{}\"",
         Seconds(event.time_ns),
         Seconds(event.start_ns),
         event.channel,
-        event.protocol,
+        event.protocol.name(),
         event.kind
-    )?;
-    for (key, party) in [("from", event.from), ("to", event.to)] {
-        match party {
-            Party::Unknown => write!(out, ",\"{key}\":null")?,
-            party => write!(out, ",\"{key}\":\"{party}\"")?,
-        }
+    );
+    push_party(out, ",\"from\":", event.from);
+    push_party(out, ",\"to\":", event.to);
+    out.push_str(",\"title\":");
+    push_text(out, &event.title);
+    out.push_str(",\"fields\":{");
+    push_members(out, &event.fields, |field| Some(&field.value), push_value);
+    out.push('}');
+    if event.fields.iter().any(|field| field.text.is_some()) {
+        out.push_str(",\"texts\":{");
+        push_members(out, &event.fields, |field| field.text.as_deref(), push_text);
+        out.push('}');
     }
-    out.write_all(b",\"title\":")?;
-    serde_json::to_writer(&mut *out, &event.title)?;
-    out.write_all(b",\"fields\":{")?;
-    members(out, &event.fields, |out, field| value(out, &field.value))?;
-    out.write_all(b"}")?;
-    let with_text: Vec<_> = event.fields.iter().filter(|field| field.text.is_some()).cloned().collect();
-    if !with_text.is_empty() {
-        out.write_all(b",\"texts\":{")?;
-        members(out, &with_text, |out, field| {
-            Ok(serde_json::to_writer(out, field.text.as_deref().unwrap_or_default())?)
-        })?;
-        out.write_all(b"}")?;
-    }
-    let with_unit: Vec<_> = event.fields.iter().filter(|field| !field.unit.is_empty()).cloned().collect();
-    if !with_unit.is_empty() {
-        out.write_all(b",\"units\":{")?;
-        members(out, &with_unit, |out, field| Ok(serde_json::to_writer(out, field.unit.as_ref())?))?;
-        out.write_all(b"}")?;
+    let unit = |field: &Field| !field.unit.is_empty();
+    if event.fields.iter().any(unit) {
+        out.push_str(",\"units\":{");
+        push_members(out, &event.fields, |field| unit(field).then_some(&*field.unit), push_text);
+        out.push('}');
     }
     if let Some(response_ns) = event.response_ns {
-        write!(out, ",\"response_ms\":{}", response_ns as f64 / 1e6)?;
+        out.push_str(",\"response_ms\":");
+        push_real(out, response_ns as f64 / 1e6);
     }
-    out.write_all(b",\"data\":\"")?;
-    event.data.iter().try_for_each(|byte| write!(out, "{byte:02X}"))?;
-    write!(out, "\",\"frames\":{}", event.frames)?;
+    out.push_str(",\"data\":");
+    push_bytes(out, &event.data);
+    let _ = write!(out, ",\"frames\":{}", event.frames);
     if let Some(trouble) = &event.trouble {
-        write!(out, ",\"trouble\":\"{}\",\"trouble_text\":", trouble.code())?;
-        serde_json::to_writer(&mut *out, &trouble.to_string())?;
+        let _ = write!(out, ",\"trouble\":\"{}\",\"trouble_text\":", trouble.code());
+        push_text(out, &trouble.to_string());
     }
     if event.frames_lost {
-        out.write_all(b",\"frames_lost\":true")?;
+        out.push_str(",\"frames_lost\":true");
     }
-    out.write_all(b"}\n")
+    out.push_str("}\n");
 }
 
-/// Members of an object; the second and later ones with the same name have a number appended: `did`, `did_2`.
-fn members<W: Write>(
-    out: &mut W,
-    fields: &[Field],
-    mut write_value: impl FnMut(&mut W, &Field) -> io::Result<()>,
-) -> io::Result<()> {
+/// Members of an object, for the fields that have such a value; the second and later fields of a name have a number
+/// appended: `did`, `did_2`.
+fn push_members<'e, T: ?Sized + 'e>(
+    out: &mut String,
+    fields: &'e [Field],
+    value_of: impl Fn(&'e Field) -> Option<&'e T>,
+    push: impl Fn(&mut String, &T),
+) {
+    let mut comma = "";
     for (at, field) in fields.iter().enumerate() {
-        if at > 0 {
-            out.write_all(b",")?;
-        }
-        match fields[..at].iter().filter(|earlier| earlier.name == field.name).count() {
-            0 => serde_json::to_writer(&mut *out, &field.name)?,
-            before => serde_json::to_writer(&mut *out, &format!("{}_{}", field.name, before + 1))?,
-        }
-        out.write_all(b":")?;
-        write_value(out, field)?;
+        let Some(value) = value_of(field) else { continue };
+        out.push_str(comma);
+        comma = ",";
+        let name: Cow<'_, str> =
+            match fields[..at].iter().filter(|earlier| earlier.name == field.name).count() {
+                0 => (&*field.name).into(),
+                before => format!("{}_{}", field.name, before + 1).into(),
+            };
+        push_text(out, &name);
+        out.push(':');
+        push(out, value);
     }
-    Ok(())
 }
 
-fn value<W: Write>(out: &mut W, value: &Value) -> io::Result<()> {
+fn push_party(out: &mut String, key: &str, party: Party) {
+    out.push_str(key);
+    if party == Party::Unknown {
+        out.push_str("null");
+    } else {
+        out.push('"');
+        party.push_to(out);
+        out.push('"');
+    }
+}
+
+fn push_value(out: &mut String, value: &Value) {
     match value {
-        Value::Number(number) => write!(out, "{number}"),
-        Value::Hex(number, _) => write!(out, "{number}"),
-        Value::Real(number) if number.is_finite() => write!(out, "{number}"),
-        Value::Real(_) | Value::Missing => out.write_all(b"null"),
-        Value::Text(text) => Ok(serde_json::to_writer(out, text)?),
-        Value::Bytes(bytes) => {
-            out.write_all(b"\"")?;
-            bytes.iter().try_for_each(|byte| write!(out, "{byte:02X}"))?;
-            out.write_all(b"\"")
+        Value::Number(number) => out.push_str(itoa::Buffer::new().format(*number)),
+        Value::Hex(number, _) => out.push_str(itoa::Buffer::new().format(*number)),
+        Value::Real(number) if number.is_finite() => push_real(out, *number),
+        Value::Real(_) | Value::Missing => out.push_str("null"),
+        Value::Text(text) => push_text(out, text),
+        Value::Bytes(bytes) => push_bytes(out, bytes),
+    }
+}
+
+/// With the fewest digits from which the same number is read again.
+fn push_real(out: &mut String, value: f64) {
+    if value.fract() == 0.0 && value.abs() < 1e15 && !(value == 0.0 && value.is_sign_negative()) {
+        out.push_str(itoa::Buffer::new().format(value as i64));
+    } else {
+        let _ = write!(out, "{value}");
+    }
+}
+
+fn push_bytes(out: &mut String, bytes: &[u8]) {
+    const DIGITS: &[u8; 16] = b"0123456789ABCDEF";
+    out.push('"');
+    for byte in bytes {
+        out.push(char::from(DIGITS[usize::from(byte >> 4)]));
+        out.push(char::from(DIGITS[usize::from(byte & 15)]));
+    }
+    out.push('"');
+}
+
+fn push_text(out: &mut String, text: &str) {
+    if text.bytes().all(|byte| byte >= b' ' && byte != b'"' && byte != b'\\') {
+        out.push('"');
+        out.push_str(text);
+        out.push('"');
+    } else {
+        let _ = write!(out, "{}", serde_json::Value::from(text));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use cantap_protocols::Protocol;
+    use cantap_trace::{TraceEvent, TraceRecord};
+
+    use super::*;
+
+    fn object(fields: Vec<Field>) -> serde_json::Value {
+        let record = TraceRecord { time_ns: 1_500_000_000, channel: 1, event: TraceEvent::GAP };
+        let mut event = Event::new(Protocol::Uds, &record, "exchange", "a \"title\"\n");
+        event.fields = fields;
+        let mut line = String::new();
+        push(&mut line, &event);
+        serde_json::from_str(&line).unwrap()
+    }
+
+    /// Of two fields with one name, only the second has a text: it is the second's.
+    #[test]
+    fn texts_and_units_are_those_of_their_field() {
+        let object = object(vec![
+            Field::number("spn", 1),
+            Field::number("spn", 2).meaning(Some("engine \u{1}")),
+            Field::real("level", 0.1, "%"),
+            Field::real("level", -3.0, ""),
+            Field::missing("level").unit("%"),
+        ]);
+        assert_eq!(object["title"], "a \"title\"\n");
+        assert_eq!(object["time_s"], 1.5);
+        assert_eq!(object["texts"], serde_json::json!({ "spn_2": "engine \u{1}" }));
+        assert_eq!(object["units"], serde_json::json!({ "level": "%", "level_3": "%" }));
+        let fields =
+            serde_json::json!({ "spn": 1, "spn_2": 2, "level": 0.1, "level_2": -3, "level_3": null });
+        assert_eq!(object["fields"], fields);
+    }
+
+    #[test]
+    fn numbers_are_read_as_they_were() {
+        for value in [0.0, -0.0, 1e15, -1e14, 1e300, 5e-324, 0.1 + 0.2, 100.0] {
+            let mut text = String::new();
+            push_real(&mut text, value);
+            assert_eq!(text.parse::<f64>().map(f64::to_bits), Ok(value.to_bits()), "{text}");
         }
     }
 }

@@ -1,6 +1,6 @@
 //! An event as a line of text or of JSON.
 
-use std::fmt;
+use std::fmt::Write as _;
 use std::io::Write;
 
 use cantap_protocols::Event;
@@ -11,15 +11,18 @@ use super::json;
 
 /// Writes an event as a line.
 pub fn write(out: &mut impl Write, event: &Event, json: bool) -> std::io::Result<()> {
-    if json { json::write(out, event) } else { writeln!(out, "{}", Line(event)) }
+    let mut line = String::new();
+    push(&mut line, event, json);
+    out.write_all(line.as_bytes())
 }
 
-/// An event as a line of text, without its end.
-pub(super) struct Line<'a>(pub(super) &'a Event);
-
-impl fmt::Display for Line<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self(event) = self;
-        write!(f, "({}) {} {event}", Seconds(event.time_ns), Interface(event.channel))
+/// Appends an event as a line, of text or of JSON.
+pub(super) fn push(out: &mut String, event: &Event, json: bool) {
+    if json {
+        return json::push(out, event);
     }
+    // Writing to a String cannot fail.
+    let _ = write!(out, "({}) {} ", Seconds(event.time_ns), Interface(event.channel));
+    event.push_to(out);
+    out.push('\n');
 }

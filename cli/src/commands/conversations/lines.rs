@@ -1,14 +1,12 @@
 //! Events become lines in a thread of their own: making them takes as long as reading the frames that they are of.
 
-use std::fmt::Write as _;
 use std::io::{self, Write as _};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::{self, JoinHandle};
 
 use cantap_protocols::Event;
 
-use super::json;
-use super::line::Line;
+use super::line;
 
 /// Events that go to the thread together.
 const BATCH: usize = 2048;
@@ -77,21 +75,14 @@ impl Drop for Lines {
 /// The thread: each batch leaves as a whole.
 fn run(batches: &Receiver<Vec<Event>>, json: bool) -> io::Result<()> {
     let mut out = io::stdout().lock();
-    let (mut text, mut bytes) = (String::new(), Vec::new());
+    let mut text = String::new();
     for batch in batches {
         for event in &batch {
-            if json {
-                json::write(&mut bytes, event)?;
-            } else {
-                // Writing to a String cannot fail.
-                let _ = writeln!(text, "{}", Line(event));
-            }
+            line::push(&mut text, event, json);
         }
         out.write_all(text.as_bytes())?;
-        out.write_all(&bytes)?;
         out.flush()?;
         text.clear();
-        bytes.clear();
     }
     Ok(())
 }

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use anyhow::{anyhow, bail};
+use cantap::DeviceError;
 use cantap::wire::message::{Filter, FrameKind, Trigger};
 use cantap::{Channel, Id};
 use cantap_protocols::active::exchange::{Answerer, Exchange, ExchangeError, ResponseTiming, ServerAnswer};
@@ -14,8 +15,8 @@ use crate::args;
 use crate::speaking::Speaking;
 use crate::words::counted;
 
-/// The device's reply slot for flow control.
-const FLOW_SLOT: u8 = 0;
+/// The device's reply slots, from 0 on, that may be used for flow control: all of them.
+const FLOW_SLOTS: usize = 8;
 
 /// Whom to ask, and the parameters of transfers; commands flatten this into their arguments.
 #[derive(clap::Args, Clone, Copy)]
@@ -44,15 +45,18 @@ pub struct TransferArgs {
     /// The byte that pads frames to eight bytes, in hexadecimal; none keeps them as short as possible.
     #[arg(long, value_name = "HEX|none", default_value = "CC", value_parser = padding, global = true)]
     padding: Padding,
-    /// Who sends the first flow control frame of an answer: this computer, once it has seen that one is needed, or the device, within
-    /// microseconds, after the ECU's next frame of any kind.
-    #[arg(long, value_enum, default_value = "host", global = true)]
+    /// Who sends the first flow control frame of an answer.
+    #[arg(long, value_enum, default_value = "auto", global = true)]
     flow_control: FlowBy,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum FlowBy {
+    /// The device if the answer is longer than a frame by the standards, as a VIN; otherwise this computer.
+    Auto,
+    /// This computer, once it has seen that one is needed.
     Host,
+    /// The device, within microseconds, after the ECU's next frame of any kind.
     Device,
 }
 
@@ -91,7 +95,7 @@ impl TransferArgs {
             separation: 0,
             block_size: 0,
             padding: Padding(Some(0)),
-            flow_control: FlowBy::Host,
+            flow_control: FlowBy::Auto,
         }
     }
 
@@ -159,6 +163,8 @@ fn refusal_text(who: &str, request: &[u8], code: u8) -> String {
 pub struct Client<'d> {
     pub speaking: Speaking<'d>,
     args: TransferArgs,
+    /// Who answers requests to all, as far as known.
+    servers: Vec<Endpoint>,
     /// The first refusal, if refusals do not end everything.
     refused: Option<anyhow::Error>,
 }
@@ -166,7 +172,12 @@ pub struct Client<'d> {
 impl<'d> Client<'d> {
     /// Over a device whose channel is open.
     pub const fn new(speaking: Speaking<'d>, args: TransferArgs) -> Self {
-        Self { speaking, args, refused: None }
+        Self { speaking, args, servers: Vec::new(), refused: None }
+    }
+
+    /// Who answers requests to all.
+    pub fn set_servers(&mut self, servers: Vec<Endpoint>) {
+        self.servers = servers;
     }
 
     /// Addresses other ECUs, or uses other parameters.
@@ -209,21 +220,10 @@ impl<'d> Client<'d> {
         if let Some(servers) = servers {
             exchange.expect(servers);
         }
-        let reply = exchange.device_reply().filter(|_| self.args.flow_control == FlowBy::Device);
-        if let Some((from, reply)) = reply {
-            let extended = from.id.is_extended();
-            let mask = if extended { Id::MAX_EXTENDED } else { Id::MAX_STANDARD };
-            let filter = Filter { extended, kind: FrameKind::Data, id: from.id.raw(), mask };
-            let entry = Some(Trigger { filter, reply, count: 1 });
-            self.speaking
-                .device()
-                .set_trigger(self.channel(), FLOW_SLOT, entry)
-                .map_err(|error| Failure::Other(error.into()))?;
-            exchange.flow_by_device();
-        }
+        let slots = self.flow_by_device(&mut exchange)?;
         let ran = self.speaking.run(&mut exchange);
-        if reply.is_some() {
-            let cleared = self.speaking.device().set_trigger(self.channel(), FLOW_SLOT, None);
+        for slot in 0..slots {
+            let cleared = self.speaking.device().set_trigger(self.channel(), slot, None);
             cleared.map_err(|error| Failure::Other(error.into()))?;
         }
         ran.map_err(Failure::Other)?;
@@ -237,6 +237,31 @@ impl<'d> Client<'d> {
             self.refused.get_or_insert_with(|| anyhow!(refusal_text(&who, request, code)));
         }
         Ok(answers)
+    }
+
+    /// Has the device send flow control, if that is wanted. Returns how many of its reply slots are set.
+    fn flow_by_device(&self, exchange: &mut Exchange) -> Result<u8, Failure> {
+        let replies = match self.args.flow_control {
+            FlowBy::Host => Vec::new(),
+            // Of an ECU behind an address, others may be listening to the same identifier.
+            FlowBy::Auto if !exchange.has_long_answer() || self.args.pair.b.address.is_some() => Vec::new(),
+            _ => exchange.device_replies(&self.servers),
+        };
+        let mut slots = 0;
+        for (from, reply) in replies.into_iter().take(FLOW_SLOTS) {
+            let extended = from.id.is_extended();
+            let mask = if extended { Id::MAX_EXTENDED } else { Id::MAX_STANDARD };
+            let filter = Filter { extended, kind: FrameKind::Data, id: from.id.raw(), mask };
+            let entry = Some(Trigger { filter, reply, count: 1 });
+            match self.speaking.device().set_trigger(self.channel(), slots, entry) {
+                Ok(()) => exchange.flow_by_device(from),
+                // Others who use the device may have all of its slots.
+                Err(DeviceError::Refused { .. }) if self.args.flow_control == FlowBy::Auto => break,
+                Err(error) => return Err(Failure::Other(error.into())),
+            }
+            slots += 1;
+        }
+        Ok(slots)
     }
 
     /// An error if anything was refused.

@@ -18,15 +18,6 @@ use crate::words::{error_name, state_name};
 /// Number of columns of the gauge on a narrow and on a wide screen.
 const GAUGE_COLUMNS: [usize; 2] = [12, 40];
 
-const KINDS: [BusErrorKind; 6] = [
-    BusErrorKind::Stuff,
-    BusErrorKind::Form,
-    BusErrorKind::Acknowledgment,
-    BusErrorKind::BitRecessive,
-    BusErrorKind::BitDominant,
-    BusErrorKind::Crc,
-];
-
 /// Draws the page.
 pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, seen: &Seen) {
     let mut lines = Vec::new();
@@ -92,7 +83,7 @@ fn channel_lines(
         channel.frames,
         channel.id_count()
     )));
-    let kinds = KINDS.into_iter().filter_map(|kind| {
+    let kinds = BusErrorKind::ALL.into_iter().filter_map(|kind| {
         let count = channel.errors.of(kind);
         (count > 0).then(|| format!("{count} {}", error_name(kind)))
     });

@@ -166,7 +166,8 @@ pub struct Exchange {
     answerer: Answerer,
     settings: TransferSettings,
     timing: ResponseTiming,
-    flow_by_device: bool,
+    /// Servers whose first flow control frame the device sends on its own.
+    flow_by_device: Vec<Endpoint>,
     most_answers: Option<usize>,
     servers: Vec<Server>,
     answers: Vec<ServerAnswer>,
@@ -194,7 +195,7 @@ impl Exchange {
             answerer,
             settings,
             timing,
-            flow_by_device: false,
+            flow_by_device: Vec::new(),
             most_answers: None,
             servers: Vec::new(),
             answers: Vec::new(),
@@ -211,16 +212,28 @@ impl Exchange {
         self.most_answers = Some(servers);
     }
 
-    /// The device sends the first flow control frame on its own: see [`TransferReceiver::new`].
-    pub const fn flow_by_device(&mut self) {
-        self.flow_by_device = true;
+    /// Whether a positive answer is too long for one frame of classical CAN by the standards, whatever the server: the vehicle and
+    /// engine numbers, calibrations and names of SAE J1979's service 09, the VIN of ISO 14229-1, or three data identifiers.
+    pub fn has_long_answer(&self) -> bool {
+        match self.request[..] {
+            [0x09, 0x02 | 0x04 | 0x0A | 0x0D] => true,
+            [0x22, ref dids @ ..] => dids.len() >= 6 || dids == [0xF1, 0x90],
+            _ => false,
+        }
     }
 
-    /// The reply to configure in the device for that, if a single server is addressed.
-    pub fn device_reply(&self) -> Option<(Endpoint, Frame)> {
+    /// The device sends the first flow control frame to this server on its own: see [`TransferReceiver::new`].
+    pub fn flow_by_device(&mut self, from: Endpoint) {
+        self.flow_by_device.push(from);
+    }
+
+    /// The replies to configure in the device for that: for the addressed server or, if many are addressed, for those of `servers` that
+    /// should answer.
+    pub fn device_replies(&self, servers: &[Endpoint]) -> Vec<(Endpoint, Frame)> {
+        let reply = |(from, flow_to)| (from, TransferReceiver::go_on(flow_to, &self.settings));
         match self.answerer {
-            Answerer::One { from, flow_to } => Some((from, TransferReceiver::go_on(flow_to, &self.settings))),
-            _ => None,
+            Answerer::One { from, flow_to } => vec![reply((from, flow_to))],
+            many => servers.iter().filter_map(|server| many.flow_to(server.id, &[])).map(reply).collect(),
         }
     }
 
@@ -370,7 +383,7 @@ impl Machine for Exchange {
             return;
         }
         let place = self.servers.iter().position(|server| server.from == from).unwrap_or_else(|| {
-            let receiver = TransferReceiver::new(flow_to, self.settings, self.flow_by_device);
+            let receiver = TransferReceiver::new(flow_to, self.settings, self.flow_by_device.contains(&from));
             self.servers.push(Server { from, receiver, pending: 0, pending_until_ns: None });
             self.servers.len() - 1
         });

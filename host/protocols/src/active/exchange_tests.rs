@@ -307,20 +307,70 @@ fn flow_control_by_the_device_is_not_sent_twice() {
     let first = [0x10, 20, 0x62, 0xF1, 0x90, 1, 2, 3];
     let server = Id::standard_truncated(0x7E8);
     let mut exchange = physical(&[0x22, 0xF1, 0x90]);
-    exchange.flow_by_device();
-    let (from, reply) = exchange.device_reply().unwrap();
+    let [(from, reply)] = exchange.device_replies(&[])[..] else { panic!("one server, one reply") };
+    exchange.flow_by_device(from);
     assert_eq!((from.id, reply.to_string()), (server, "7E0#300000CCCCCCCCCC".to_owned()));
     assert!(exchange.next(0).is_some());
     exchange.sent(1);
     exchange.hear(2, server, &first);
     assert_eq!(exchange.next(3), None);
+    // Nothing follows: the device has not sent it, and there is still time until the server gives up.
+    let due_ns = exchange.due_ns().unwrap();
+    assert!(due_ns <= 200_000_000, "{due_ns}");
+    assert_eq!(exchange.next(due_ns), Some(reply));
+    assert_eq!(exchange.next(due_ns + 1), None);
     let mut exchange = physical(&[0x22, 0xF1, 0x90]);
-    exchange.flow_by_device();
+    exchange.flow_by_device(from);
+    assert!(exchange.next(0).is_some());
+    exchange.sent(1);
+    exchange.hear(2, server, &first);
+    exchange.hear(3, server, &[0x21, 4, 5, 6, 7, 8, 9, 10]);
+    assert_eq!(exchange.next(due_ns), None, "it has begun to come");
+    let mut exchange = physical(&[0x22, 0xF1, 0x90]);
+    exchange.flow_by_device(from);
     assert!(exchange.next(0).is_some());
     exchange.sent(1);
     exchange.hear(2, server, &[3, 0x7F, 0x22, 0x78]);
     exchange.hear(3, server, &first);
     assert_eq!(exchange.next(4), Some(reply));
+}
+
+/// If many are asked, each server that the device answers has a reply of its own; the others are answered from here.
+#[test]
+fn the_device_sends_flow_control_to_several_servers() {
+    let plain = |id| Endpoint { id: Id::standard_truncated(id), address: None };
+    let settings = TransferSettings { padding: None, ..TransferSettings::default() };
+    let to = plain(0x7DF);
+    let mut exchange = Exchange::new(to, Answerer::Any11Bit, vec![9, 2], settings, ResponseTiming::default());
+    assert!(exchange.has_long_answer());
+    let replies = exchange.device_replies(&[plain(0x7E8), plain(0x7EA), plain(0x123)]);
+    let said: Vec<_> = replies.iter().map(|(from, reply)| format!("{} {reply}", from.id)).collect();
+    assert_eq!(said, ["7E8 7E0#300000", "7EA 7E2#300000"]);
+    for (from, _) in &replies {
+        exchange.flow_by_device(*from);
+    }
+    assert!(exchange.next(0).is_some());
+    exchange.sent(1);
+    let first = [0x10, 20, 0x49, 2, 1, 1, 2, 3];
+    exchange.hear(2, Id::standard_truncated(0x7E8), &first);
+    exchange.hear(3, Id::standard_truncated(0x7EA), &first);
+    assert_eq!(exchange.next(4), None);
+    exchange.hear(5, Id::standard_truncated(0x7E9), &first);
+    assert_eq!(exchange.next(6).map(|frame| frame.to_string()), Some("7E1#300000".to_owned()));
+}
+
+/// Replies are set where one is sure to be needed.
+#[test]
+fn only_what_is_long_by_the_standards_has_a_long_answer() {
+    let is_long = |request: &[u8]| physical(request).has_long_answer();
+    for request in [&[9, 2][..], &[9, 0x0A], &[0x22, 0xF1, 0x90], &[0x22, 1, 2, 3, 4, 5, 6]] {
+        assert!(is_long(request), "{request:02X?}");
+    }
+    for request in
+        [&[9, 0][..], &[9, 6], &[1, 0x0C], &[3], &[0x22, 0xF1, 0x8C], &[0x22, 1, 2, 3, 4], &[0x19, 2, 0xFF]]
+    {
+        assert!(!is_long(request), "{request:02X?}");
+    }
 }
 
 /// A message reported as complete is what was sent, whatever is dropped, doubled or swapped.

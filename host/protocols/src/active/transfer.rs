@@ -6,6 +6,9 @@ use crate::iso_tp::{Endpoint, FlowStatus, Pci};
 
 /// How many frames of a block may wait in the sender's queue at a time, if no separation time is requested.
 const MOST_UNDER_WAY: u32 = 16;
+/// If the frame after the first one has not come by then, the device has not sent flow control. Servers begin within some
+/// milliseconds, and wait for it for a second (N_Bs); a second flow control frame is ignored.
+const FLOW_MISSING_NS: u64 = 100_000_000;
 /// The longest message that is accepted, in bytes.
 const MOST_BYTES: u32 = 1 << 16;
 /// The longest length in the 12 bits of a first frame.
@@ -294,13 +297,16 @@ pub struct TransferReceiver {
     flow: Option<Frame>,
     /// The device itself sends flow control after the next frame.
     flow_by_device: bool,
+    /// If the next frame has not come by then, the device has not sent it.
+    flow_missing_ns: Option<u64>,
 }
 
 impl TransferReceiver {
     /// Receives from a sender that takes flow control at an endpoint. With `flow_by_device`, the device sends the first flow control
-    /// frame on its own, as its reply to the sender's next frame.
+    /// frame on its own, as its reply to the sender's next frame. It does not if that frame did not come over the bus but from another
+    /// program that uses the device; so if nothing follows the first frame, flow control is sent here after all.
     pub const fn new(flow_to: Endpoint, settings: TransferSettings, flow_by_device: bool) -> Self {
-        Self { flow_to, settings, receiving: None, flow: None, flow_by_device }
+        Self { flow_to, settings, receiving: None, flow: None, flow_by_device, flow_missing_ns: None }
     }
 
     /// The flow control frame that lets a sender continue.
@@ -315,13 +321,17 @@ impl TransferReceiver {
 
     /// When to call [`Self::next`] again.
     pub fn due_ns(&self) -> Option<u64> {
-        self.receiving.as_ref().map(|receiving| receiving.until_ns)
+        let receiving = self.receiving.as_ref()?;
+        Some(self.flow_missing_ns.map_or(receiving.until_ns, |missing_ns| missing_ns.min(receiving.until_ns)))
     }
 
     /// The flow control frame to send now; an error ends the message.
     pub fn next(&mut self, now_ns: u64) -> Result<Option<Frame>, TransferError> {
         if let Some(flow) = self.flow.take() {
             return Ok(Some(flow));
+        }
+        if self.is_receiving() && self.flow_missing_ns.take_if(|missing_ns| now_ns >= *missing_ns).is_some() {
+            return Ok(Some(Self::go_on(self.flow_to, &self.settings)));
         }
         match self.receiving.take_if(|receiving| now_ns >= receiving.until_ns) {
             None => Ok(None),
@@ -341,6 +351,7 @@ impl TransferReceiver {
     /// Takes a frame from the sender; returns the message that it completes.
     pub fn take(&mut self, now_ns: u64, pci: Pci<'_>) -> Result<Option<Vec<u8>>, TransferError> {
         let by_device = std::mem::take(&mut self.flow_by_device);
+        self.flow_missing_ns = None;
         let until_ns = now_ns + self.settings.next_timeout_ns;
         match pci {
             Pci::Single(data) => {
@@ -353,7 +364,11 @@ impl TransferReceiver {
                 Err(TransferError::TooLong { length })
             }
             Pci::First { length, data } => {
-                self.flow = (!by_device).then(|| Self::go_on(self.flow_to, &self.settings));
+                if by_device {
+                    self.flow_missing_ns = Some(now_ns + FLOW_MISSING_NS);
+                } else {
+                    self.flow = Some(Self::go_on(self.flow_to, &self.settings));
+                }
                 self.receiving = Some(Receiving {
                     data: data.to_vec(),
                     length: length as usize,

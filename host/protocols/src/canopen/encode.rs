@@ -129,7 +129,7 @@ mod tests {
             ("f64", "-0.25", Value::Real(-0.25)),
             ("text", "drive 1", Value::Text("drive 1".into())),
             ("utf16", "grün", Value::Text("grün".into())),
-            ("hex", "0A 1B", Value::Bytes(vec![0x0A, 0x1B])),
+            ("hex", "0A 1B", Value::Bytes(vec![0x0A, 0x1B].into())),
         ] {
             let number = type_named(name).unwrap();
             let bytes = encode(number, text).unwrap();

@@ -4,7 +4,7 @@ use rustc_hash::FxHashMap;
 
 use super::eds::Eds;
 use super::{names, sdo, types};
-use crate::{Event, Field, Party, Protocol, Trouble};
+use crate::{Bytes, Event, Field, Party, Protocol, Trouble};
 use cantap_trace::TraceRecord;
 
 /// How many mapping parameters of a node are kept: 512 PDOs with eight entries each.
@@ -156,8 +156,8 @@ impl Pdos {
 }
 
 /// Extracts bits from any position as bytes, least significant first.
-fn cut(data: &[u8], at: usize, bits: usize) -> Vec<u8> {
-    let mut bytes: Vec<u8> = (0..bits.div_ceil(8))
+fn cut(data: &[u8], at: usize, bits: usize) -> Bytes {
+    let mut bytes: Bytes = (0..bits.div_ceil(8))
         .map(|number| {
             let first = at + number * 8;
             let byte = |place: usize| u16::from(data.get(place).copied().unwrap_or(0));

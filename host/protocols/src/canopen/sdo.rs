@@ -2,7 +2,7 @@
 //!
 //! Memory: one transfer for each of 127 nodes on each channel, of at most 64 KiB.
 
-use crate::Trouble;
+use crate::{Bytes, Trouble};
 
 /// How long either side may take. CiA 301 gives no time; masters use 0.3 to 2 s.
 pub const TIMEOUT_NS: i64 = 2_000_000_000;
@@ -39,7 +39,7 @@ pub struct SdoTransfer {
     pub sub: u8,
     pub is_write: bool,
     pub mode: Mode,
-    pub data: Vec<u8>,
+    pub data: Bytes,
     /// The expected number of bytes, if known.
     pub size: Option<u32>,
     pub frames: u32,
@@ -377,7 +377,7 @@ impl Sdo {
 
 fn headless(time_ns: i64, data: &[u8], trouble: Trouble) -> SdoTransfer {
     SdoTransfer {
-        data: data.to_vec(),
+        data: Bytes::from_slice(data),
         trouble: Some(trouble),
         ..fresh(time_ns, [0; 8], false, Mode::Expedited)
     }
@@ -409,7 +409,7 @@ fn append(open: &mut SdoTransfer, bytes: &[u8]) {
 fn first_bytes(transfer: &mut SdoTransfer, b0: u8, expedited: bool, sized: bool, bytes: [u8; 8]) {
     if expedited {
         let unused = if sized { usize::from(b0 >> 2 & 3) } else { 0 };
-        transfer.data = bytes[4..8 - unused].to_vec();
+        transfer.data = Bytes::from_slice(&bytes[4..8 - unused]);
     } else if sized {
         transfer.size = Some(u32::from_le_bytes([bytes[4], bytes[5], bytes[6], bytes[7]]));
     }
@@ -423,7 +423,7 @@ fn fresh(time_ns: i64, bytes: [u8; 8], is_write: bool, mode: Mode) -> SdoTransfe
         sub: bytes[3],
         is_write,
         mode,
-        data: Vec::new(),
+        data: Bytes::new(),
         size: None,
         frames: 1,
         response_ns: None,

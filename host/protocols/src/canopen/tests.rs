@@ -163,7 +163,7 @@ fn blocks_are_put_together_with_what_is_sent_again() {
     let records: Vec<_> = frames.iter().enumerate().map(|(ms, frame)| at(ms as f64, frame)).collect();
     let events = testing::events(CanOpen::default(), &records);
     assert_eq!(events.len(), 1, "{:?}", events.iter().map(ToString::to_string).collect::<Vec<_>>());
-    assert_eq!(events[0].data, data);
+    assert_eq!(events[0].data[..], data);
     let text = events[0].to_string();
     assert!(text.contains("\"block\"") && events[0].trouble.is_none(), "{text}");
 }

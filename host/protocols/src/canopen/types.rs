@@ -1,6 +1,6 @@
 //! Values by their data type (CiA 301, table 44).
 
-use crate::Value;
+use crate::{Bytes, Value};
 
 /// A value of a type; bytes if the type is unknown or does not fit.
 pub fn value(data_type: Option<u16>, bytes: &[u8]) -> Value {
@@ -32,7 +32,7 @@ pub fn value(data_type: Option<u16>, bytes: &[u8]) -> Value {
         {
             Value::Text(String::from_utf8_lossy(bytes).into_owned().into())
         }
-        _ => Value::Bytes(bytes.to_vec()),
+        _ => Value::Bytes(Bytes::from_slice(bytes)),
     }
 }
 

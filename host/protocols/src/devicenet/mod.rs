@@ -19,7 +19,7 @@ pub(crate) use self::signs::DeviceNetSigns;
 use cantap_trace::TraceRecord;
 use rustc_hash::FxHashMap;
 
-use crate::{Assembler, Event, Field, Party, Protocol, Trouble, is_gap};
+use crate::{Assembler, Bytes, Event, Field, Party, Protocol, Trouble, is_gap};
 
 /// How long a response may take; the default of a connection's expected packet rate is 2.5 s.
 const RESPONSE_NS: i64 = 2_500_000_000;
@@ -34,7 +34,7 @@ struct Message {
     /// The other side's MAC ID, from the header.
     other: u8,
     /// The service and what follows it.
-    body: Vec<u8>,
+    body: Bytes,
     next: u8,
     frames: u32,
     trouble: Option<Trouble>,
@@ -143,7 +143,7 @@ impl DeviceNet {
         };
         let time_ns = record.time_ns;
         let other = client.unwrap_or(header & 0x3F);
-        let fresh = |body: Vec<u8>| Message {
+        let fresh = |body: Bytes| Message {
             start_ns: time_ns,
             time_ns,
             other,
@@ -172,12 +172,12 @@ impl DeviceNet {
             return;
         }
         if kind == 0 {
-            let before = node.open[place].replace(fresh(rest.to_vec()));
+            let before = node.open[place].replace(fresh(Bytes::from_slice(rest)));
             self.broken(record, server, answers, before.map(|before| (before, Trouble::Overlapped)), events);
             return;
         }
         let Some(open) = &mut node.open[place] else {
-            let headless = (fresh(rest.to_vec()), Trouble::Headless);
+            let headless = (fresh(Bytes::from_slice(rest)), Trouble::Headless);
             self.broken(record, server, answers, Some(headless), events);
             return;
         };

@@ -156,7 +156,7 @@ impl Diagnostics {
         let is_uds = self.service(&transfer, sid).is_some_and(|(protocol, _)| protocol == Protocol::Uds);
         // KWP2000 has a separate value for it (ISO 14230-3, 6.4).
         let is_wanted =
-            !(is_uds && uds::is_response_suppressed(&transfer.data) || transfer.data == [0x3E, 0x02]);
+            !(is_uds && uds::is_response_suppressed(&transfer.data) || transfer.data[..] == [0x3E, 0x02]);
         if !is_wanted {
             let mut event = self.event(&transfer, None, "request");
             event.fields.push(Field::text("response", "not wanted"));

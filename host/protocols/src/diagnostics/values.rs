@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use crate::{Field, Value};
+use crate::{Bytes, Field, Value};
 
 /// An integer that is shown in decimal where that is possible: fields have 63 bits for it.
 pub fn unsigned(name: &'static str, value: u64) -> Field {
@@ -35,6 +35,6 @@ pub fn text_or_bytes(bytes: &[u8]) -> Value {
     if shown.len() >= 3 && shown.iter().all(|byte| byte.is_ascii_graphic() || *byte == b' ') {
         Value::Text(String::from_utf8_lossy(shown).into_owned().into())
     } else {
-        Value::Bytes(bytes.to_vec())
+        Value::Bytes(Bytes::from_slice(bytes))
     }
 }

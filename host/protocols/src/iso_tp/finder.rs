@@ -10,6 +10,7 @@ use cantap_trace::fd::FD_MAX_BYTES;
 use super::pairs::{Endpoint, Pair};
 use super::pci::{self, FlowStatus, Pci};
 use super::transfer::Transfer;
+use crate::Bytes;
 
 /// How long the sender waits for flow control: N_Bs (ISO 15765-2:2016, table 21).
 const FLOW_TIMEOUT_NS: i64 = 1_000_000_000;
@@ -129,7 +130,7 @@ impl Finder {
                             channel,
                             from,
                             to: Some(to),
-                            data: found.data.0[..usize::from(found.data.1)].to_vec(),
+                            data: Bytes::from_slice(&found.data.0[..usize::from(found.data.1)]),
                             length: found.length,
                             frames: 2,
                             block_size: Some(block_size),

@@ -22,7 +22,7 @@ use rustc_hash::FxHashMap;
 
 use self::finder::Finder;
 use self::pairs::Pairs;
-use crate::{Assembler, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
+use crate::{Assembler, Bytes, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
 /// How long the receiver waits for the next frame: N_Cr.
 const NEXT_TIMEOUT_NS: i64 = 1_000_000_000;
@@ -201,7 +201,7 @@ impl Transport {
             Ok(Some(pci)) => pci,
             Ok(None) => return,
             Err(fault) => {
-                let data = bytes[offset..].to_vec();
+                let data = Bytes::from_slice(&bytes[offset..]);
                 out(Transfer { data, trouble: Some(Trouble::Malformed(fault)), ..fresh });
                 return;
             }
@@ -209,11 +209,11 @@ impl Transport {
         match pci {
             Pci::Single(data) => {
                 self.overlap(key, out);
-                out(Transfer { data: data.to_vec(), length: data.len() as u32, ..fresh });
+                out(Transfer { data: Bytes::from_slice(data), length: data.len() as u32, ..fresh });
             }
             Pci::First { length, data } => {
                 self.overlap(key, out);
-                let transfer = Transfer { data: data.to_vec(), length, ..fresh };
+                let transfer = Transfer { data: Bytes::from_slice(data), length, ..fresh };
                 let frame_bytes = bytes.len();
                 self.begin(Open { transfer, next: 1, is_new: false, frame_bytes, last_ns: None }, out);
             }
@@ -274,7 +274,11 @@ impl Transport {
             }
             let before = self.headless.insert(key, number);
             if before.is_none_or(|before| (before + 1) & 15 != number) {
-                out(Transfer { data: data.to_vec(), trouble: Some(Trouble::Headless), ..fresh.clone() });
+                out(Transfer {
+                    data: Bytes::from_slice(data),
+                    trouble: Some(Trouble::Headless),
+                    ..fresh.clone()
+                });
             }
             return;
         };

@@ -1,7 +1,7 @@
 //! A transfer.
 
 use super::pairs::Endpoint;
-use crate::Trouble;
+use crate::{Bytes, Trouble};
 
 /// A message of one or many frames, or as much of it as arrived.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -17,7 +17,7 @@ pub struct Transfer {
     /// The receiver, if it is known and unique.
     pub to: Option<Endpoint>,
     /// The bytes.
-    pub data: Vec<u8>,
+    pub data: Bytes,
     /// The expected number of bytes.
     pub length: u32,
     /// Number of frames, including flow control.
@@ -43,7 +43,7 @@ impl Transfer {
     }
 
     /// Of no frames.
-    pub(super) const fn empty() -> Self {
+    pub(super) fn empty() -> Self {
         let id = cantap_trace::Id::standard_truncated(0);
         Self {
             time_ns: 0,
@@ -51,7 +51,7 @@ impl Transfer {
             channel: 0,
             from: Endpoint { id, address: None },
             to: None,
-            data: Vec::new(),
+            data: Bytes::new(),
             length: 0,
             frames: 0,
             block_size: None,

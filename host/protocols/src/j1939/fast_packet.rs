@@ -6,7 +6,7 @@ use rustc_hash::FxHashMap;
 
 use super::header::Header;
 use super::transport::{Assembled, Way};
-use crate::Trouble;
+use crate::{Bytes, Trouble};
 
 /// Maximum time between two frames of a packet.
 const NEXT_NS: i64 = 750_000_000;
@@ -84,7 +84,7 @@ impl FastPackets {
             channel,
             header,
             way: Way::FastPacket,
-            data: Vec::new(),
+            data: Bytes::new(),
             size: 0,
             frames: 1,
             cleared_ns: None,
@@ -100,10 +100,14 @@ impl FastPackets {
             }
             let Some((&size, bytes)) = rest.split_first().filter(|(size, _)| **size <= MOST_BYTES) else {
                 let fault = "a fast packet has at most 223 bytes";
-                out(Assembled { data: data.to_vec(), trouble: Some(Trouble::Malformed(fault)), ..fresh() });
+                out(Assembled {
+                    data: Bytes::from_slice(data),
+                    trouble: Some(Trouble::Malformed(fault)),
+                    ..fresh()
+                });
                 return;
             };
-            let data = bytes[..bytes.len().min(usize::from(size))].to_vec();
+            let data = Bytes::from_slice(&bytes[..bytes.len().min(usize::from(size))]);
             let message = Assembled { size: size.into(), data, ..fresh() };
             self.go_on(key, message, 1, out);
             return;
@@ -113,7 +117,7 @@ impl FastPackets {
                 self.headless.clear();
             }
             if self.headless.insert(key, number).is_none_or(|before| before + 1 != number) {
-                out(Assembled { data: rest.to_vec(), trouble: Some(Trouble::Headless), ..fresh() });
+                out(Assembled { data: Bytes::from_slice(rest), trouble: Some(Trouble::Headless), ..fresh() });
             }
             return;
         };

@@ -27,7 +27,7 @@ use self::fast_packet::FastPackets;
 use self::header::{GLOBAL, NULL, party};
 use self::transport::{Assembled, LongMessages};
 use crate::nmea2000;
-use crate::{Assembler, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
+use crate::{Assembler, Bytes, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
 const REQUEST: u32 = 0xEA00;
 const ACKNOWLEDGEMENT: u32 = 0xE800;
@@ -166,7 +166,7 @@ impl J1939 {
             event.frames = long.frames;
             event.frames_lost = long.frames_lost;
             event.trouble = long.trouble;
-            event.data = data.to_vec();
+            event.data = Bytes::from_slice(data);
             event.fields.push(Field::text("transport", long.way.name()));
             event.fields.push(Field::number("length", long.size).unit("bytes"));
             if let Some(cleared_ns) = long.cleared_ns {

@@ -90,7 +90,7 @@ fn long_messages_come_by_the_extended_protocol() {
     let records: Vec<_> = frames.iter().enumerate().map(|(ms, frame)| at(ms as f64, frame)).collect();
     let events = testing::events(J1939::default(), &records);
     assert_eq!(events.len(), 1, "{:?}", events.iter().map(ToString::to_string).collect::<Vec<_>>());
-    assert_eq!((&events[0].data, events[0].trouble), (&data, None));
+    assert_eq!((&events[0].data[..], events[0].trouble), (&data[..], None));
 }
 
 #[test]
@@ -187,7 +187,7 @@ fn messages_at_random_are_whole_and_right_or_said_to_be_broken() {
         let whole: Vec<_> = events.iter().filter(|event| event.kind == "message").collect();
         for event in &whole {
             let source = event.from.node().unwrap();
-            assert!(sent.contains(&(source, event.data.clone())), "round {round}: never sent: {event}");
+            assert!(sent.contains(&(source, event.data.to_vec())), "round {round}: never sent: {event}");
         }
         let broken = events.iter().filter(|event| event.trouble.is_some()).count();
         assert!(

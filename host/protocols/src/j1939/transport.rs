@@ -5,7 +5,7 @@
 use rustc_hash::FxHashMap;
 
 use super::header::{GLOBAL, Header, pgn};
-use crate::Trouble;
+use crate::{Bytes, Trouble};
 
 /// TP.CM, TP.DT, ETP.CM, ETP.DT.
 pub const CONTROL: u32 = 0xEC00;
@@ -55,7 +55,7 @@ pub struct Assembled {
     /// The header of the message itself.
     pub header: Header,
     pub way: Way,
-    pub data: Vec<u8>,
+    pub data: Bytes,
     /// The expected number of bytes.
     pub size: u32,
     pub frames: u32,
@@ -197,7 +197,7 @@ impl LongMessages {
             channel,
             header: of,
             way: Way::Connection,
-            data: Vec::new(),
+            data: Bytes::new(),
             size: u32::from(u16::from_le_bytes([a, b])),
             frames: 1,
             cleared_ns: None,

@@ -128,7 +128,7 @@ fn packets_at_random_are_whole_and_right_or_said_to_be_broken() {
         let whole: Vec<_> = events.iter().filter(|event| event.trouble.is_none()).collect();
         for event in &whole {
             let source = event.from.node().unwrap();
-            assert!(sent.contains(&(source, event.data.clone())), "round {round}: never sent: {event}");
+            assert!(sent.contains(&(source, event.data.to_vec())), "round {round}: never sent: {event}");
         }
         assert!(
             if disturbed { whole.len() >= 10 } else { events.len() == 20 && whole.len() == 20 },

@@ -183,7 +183,7 @@ fn blocks_go_both_ways_with_what_is_lost_sent_again() {
     bus.ask("605#A100000000000000");
     // The listener has both, complete.
     let events = bus.events();
-    let blocks: Vec<_> = events.iter().filter(|event| event.data == bytes).collect();
+    let blocks: Vec<_> = events.iter().filter(|event| event.data[..] == bytes[..]).collect();
     assert_eq!(blocks.iter().map(|event| event.kind).collect::<Vec<_>>(), ["sdo_write", "sdo_read"]);
     assert!(blocks.iter().all(|event| event.trouble.is_none()), "{blocks:?}");
     // A wrong CRC is refused.

@@ -27,6 +27,8 @@ use crate::{args, interrupt};
 
 /// The longest time between two checks of what is being sent, and of Ctrl-C.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
+/// How long the last frame of a conversation that is ended by Ctrl-C may take: a block of SDO frames may be before it.
+const FAREWELL: Duration = Duration::from_millis(200);
 /// The device's slot for repeated frames.
 const REPEAT_SLOT: u8 = 0;
 
@@ -161,6 +163,28 @@ impl Speaking<'_> {
     /// Runs a client until it ends. An error means that frames are stuck, the device is gone, or Ctrl-C; the client itself has
     /// its result.
     pub fn run(&mut self, machine: &mut dyn Machine) -> anyhow::Result<()> {
+        let result = self.run_to_its_end(machine);
+        if result.is_err() && interrupt::requested() {
+            // Whether it still arrives changes nothing here.
+            let _ = self.cancel(machine);
+        }
+        result
+    }
+
+    /// Tells the other side that this is over, if it would otherwise go on.
+    fn cancel(&mut self, machine: &mut dyn Machine) -> anyhow::Result<()> {
+        let Some(frame) = machine.cancel() else { return Ok(()) };
+        self.under_way.push_back(frame);
+        self.stream.push(self.channel, frame, None, |_| false)?;
+        self.stream.flush()?;
+        let until = Instant::now() + FAREWELL;
+        while self.under_way.contains(&frame) && Instant::now() < until {
+            self.take_records(LOOK_EVERY, None)?;
+        }
+        Ok(())
+    }
+
+    fn run_to_its_end(&mut self, machine: &mut dyn Machine) -> anyhow::Result<()> {
         self.heard = Heard { since: Some(Instant::now()), ..Heard::default() };
         self.take_records(Duration::ZERO, None)?;
         loop {

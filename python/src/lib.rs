@@ -7,6 +7,7 @@ mod database;
 mod device;
 mod error;
 mod frame;
+mod number;
 mod numpy;
 mod report;
 mod scan;

@@ -182,13 +182,17 @@ fn nmt(speak: &SpeakArgs, node: u8, command: Command, sheets: Vec<Sheet>) -> any
     // Show the result, if nodes report their states.
     speaking.listen(OBEYS)?;
     let events = speaking.take_events();
-    let is_heard = events.iter().any(|event| matches!(event.kind, "boot_up" | "state"));
+    // Zero is for all nodes.
+    let is_heard = events.iter().any(|event| {
+        matches!(event.kind, "boot_up" | "state") && (node == 0 || event.from.node() == Some(node))
+    });
     speaking.put_back(events);
     speaking.tell(said)?;
     if !is_heard {
         let state = state_name(becomes).unwrap_or_default();
         eprintln!(
-            "cantap: the command was sent and acknowledged; no node reported a new state within {} s, so it is unknown whether it is {state}",
+            "cantap: the command was sent and acknowledged; {} reported a new state within {} s, so it is unknown whether it is {state}",
+            if node == 0 { "no node".to_owned() } else { format!("node {node} has not") },
             OBEYS.as_secs()
         );
     }

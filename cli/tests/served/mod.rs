@@ -9,6 +9,7 @@ pub struct Served {
     /// Its address for `-d`.
     pub at: String,
     /// Host and port of its socketcand.
+    #[allow(dead_code, reason = "not every test has a program of other people")]
     pub socketcand: [String; 2],
     pub folder: tempfile::TempDir,
 }

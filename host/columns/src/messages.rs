@@ -12,11 +12,12 @@ use cantap_trace::{Id, PlainFrame, TraceRecord};
 use rustc_hash::FxHashMap;
 
 use crate::events;
-use crate::texts::Texts;
+use crate::names::{ColumnNames, text_column};
+use crate::texts::{Interned, Texts};
 
 /// One message's frames as columns: `time`, `channel`, `id`, then for each signal its physical value as float64 under its own name,
-/// null if the frame does not have it; for a signal with a value table also `NAME.text`. Unit, description, range and cycle time
-/// are in the metadata of the columns and the table.
+/// null if the frame does not have it; for a signal with a value table also `NAME.text`. A signal whose name another column has
+/// already is called `MESSAGE.NAME`. Unit, description, range and cycle time are in the metadata of the columns and the table.
 pub struct MessageColumns {
     schema: SchemaRef,
     /// Columns that every row has.
@@ -64,9 +65,17 @@ impl Keys {
     /// Longer signals have a table by value rather than by bits.
     const MOST_BITS: u16 = 8;
 
-    fn of(signal: &Signal) -> Self {
-        let places = signal.values.iter().enumerate().map(|(place, (value, _))| (value, place as i32));
-        let places: FxHashMap<i64, i32> = places.collect();
+    /// The column for a signal's texts, and their indexes in it.
+    fn of(signal: &Signal) -> (Texts<Int32Type>, Self) {
+        // Two values may have the same text, which is in the column's texts once: programs that read it demand that.
+        let mut texts = Interned::default();
+        let places: FxHashMap<i64, i32> =
+            signal.values.iter().map(|(value, text)| (value, texts.place(text))).collect();
+        let keys = Self::by_places(signal, places);
+        (Texts::new(texts.into_texts()), keys)
+    }
+
+    fn by_places(signal: &Signal, places: FxHashMap<i64, i32>) -> Self {
         if !(1..=Self::MOST_BITS).contains(&signal.length) {
             return Self::ByValue(places);
         }
@@ -100,13 +109,15 @@ impl MessageColumns {
         let mut fields = events::fields();
         fields.truncate(2);
         fields.push(Field::new("id", DataType::UInt32, false));
+        let mut names = ColumnNames::of(&fields);
         let mut signals = Vec::new();
         for signal in &message.signals {
-            let label = signal.label();
-            fields.push(Field::new(&*label, DataType::Float64, true).with_metadata(metadata(signal)));
-            let text = (!signal.values.is_empty()).then(|| {
-                fields.push(Field::new(format!("{label}.text"), Texts::<Int32Type>::data_type(), true));
-                (Texts::new(signal.values.iter().map(|(_, text)| text)), Keys::of(signal))
+            let has_texts = !signal.values.is_empty();
+            let name = names.choose(&signal.label(), &message.name, has_texts);
+            fields.push(Field::new(&*name, DataType::Float64, true).with_metadata(metadata(signal)));
+            let text = has_texts.then(|| {
+                fields.push(Field::new(text_column(&name), Texts::<Int32Type>::data_type(), true));
+                Keys::of(signal)
             });
             signals.push(Column { value: Float64Builder::new(), text });
         }

@@ -13,6 +13,7 @@ use cantap_protocols::iso_tp::{Endpoint, Pair};
 
 use crate::args;
 use crate::speaking::Speaking;
+use crate::words::counted;
 
 /// The device's reply slots, from 0 on, that may be used for flow control: all of them.
 const FLOW_SLOTS: usize = 8;
@@ -278,7 +279,9 @@ impl<'d> Client<'d> {
             ExchangeError::NoAnswer { others, .. } => {
                 let others = match others {
                     0 => String::new(),
-                    others => format!("; {others} messages came that answer something else"),
+                    others => {
+                        format!("; {} came that answer something else", counted(others as usize, "message"))
+                    }
                 };
                 anyhow!(
                     "{asked}: {error}; {}{others}; check that the ECU is awake (ignition), the bit rate, and --pair",

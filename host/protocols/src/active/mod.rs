@@ -41,6 +41,11 @@ pub trait Machine {
 
     /// Whether it has ended, successfully or not.
     fn is_done(&self) -> bool;
+
+    /// It is ended from outside: what to send last, if the other side would otherwise wait or go on. Send that and nothing more.
+    fn cancel(&mut self) -> Option<Frame> {
+        None
+    }
 }
 
 /// Frames that need no answer: done when they have been on the bus.

@@ -77,6 +77,12 @@ pub enum SdoError {
         /// Bytes transferred so far.
         done: usize,
     },
+    /// It was ended from outside; the node was told.
+    #[error("ended before it was complete, after {done} bytes")]
+    Cancelled {
+        /// Bytes transferred so far.
+        done: usize,
+    },
     /// Frames from the bus were lost on the way to this computer.
     #[error(
         "frames were lost on the way to this computer, so the object may not be whole; the transfer was aborted"
@@ -240,10 +246,16 @@ impl SdoClient {
         self.say([0xA2, up_to, BLOCK, 0, 0, 0, 0, 0]);
     }
 
-    /// Appends received bytes; false if there are more than announced.
+    /// Appends received bytes; false if there are more than announced. Only the end of a block transfer says how many of its last
+    /// seven count.
     fn append(&mut self, bytes: &[u8]) -> bool {
         self.data.extend_from_slice(bytes);
-        self.data.len() <= MOST_BYTES
+        self.data.len() <= self.size.map_or(MOST_BYTES, |size| size + 6)
+    }
+
+    /// The reason for too many bytes.
+    const fn too_many(&self) -> u32 {
+        if self.size.is_some() { BAD_LENGTH } else { OUT_OF_MEMORY }
     }
 
     fn read_begins(&mut self, data: [u8; 8]) {
@@ -284,8 +296,11 @@ impl SdoClient {
         let used = 7 - usize::from(command >> 1 & 7);
         let is_last = command & 1 != 0;
         // A node that keeps sending empty segments would never end.
-        if !self.append(&data[1..=used]) || used == 0 && !is_last {
+        if used == 0 && !is_last {
             return self.wrong(BAD_LENGTH);
+        }
+        if !self.append(&data[1..=used]) {
+            return self.wrong(self.too_many());
         }
         if !is_last {
             let toggle = toggle ^ 1;
@@ -305,7 +320,7 @@ impl SdoClient {
         }
         let follows = number == next && !is_gap;
         if follows && !self.append(&data[1..8]) {
-            return self.wrong(OUT_OF_MEMORY);
+            return self.wrong(self.too_many());
         }
         let next = if follows { next + 1 } else { next };
         let is_gap = !follows && number >= next || is_gap;
@@ -464,7 +479,7 @@ impl Machine for SdoClient {
         if id != self.ids.response || self.end.is_some() || self.step == Step::New {
             return;
         }
-        let Ok(data) = <[u8; 8]>::try_from(data) else { return };
+        let Ok(data) = <[u8; 8]>::try_from(data) else { return self.wrong(BAD_LENGTH) };
         if data[0] == 0x80 {
             self.out.clear();
             self.until_ns = None;
@@ -502,6 +517,16 @@ impl Machine for SdoClient {
 
     fn is_done(&self) -> bool {
         self.end.is_some() && self.out.is_empty()
+    }
+
+    fn cancel(&mut self) -> Option<Frame> {
+        if self.step == Step::New || self.end.is_some() {
+            return None;
+        }
+        self.out.clear();
+        let done = self.done();
+        self.end = Some(Err(SdoError::Cancelled { done }));
+        Some(Frame::from_bus(self.ids.request, false, 8, self.command(0x80, GENERAL.to_le_bytes())))
     }
 }
 

@@ -290,3 +290,51 @@ fn a_loss_ends_segments() {
     assert_eq!(client.next(3).unwrap().data()[0], 0x80);
     assert_eq!(client.finish(), Err(SdoError::FramesLost));
 }
+
+/// Not when 16 MiB have come.
+#[test]
+fn a_node_that_sends_more_than_it_announced_is_stopped_at_once() {
+    for by_blocks in [false, true] {
+        let mut client = client(SdoJob::Read, by_blocks);
+        let mut node = |_: Id, data: &[u8], say: &mut Say| match data[0] {
+            0x40 => say.push((MS, answer([0x41, 0, 0x20, 1, 10, 0, 0, 0]))),
+            0xA4 => say.push((MS, answer([0xC6, 0, 0x20, 1, 10, 0, 0, 0]))),
+            0x60 | 0x70 => say.push((MS, answer([data[0] & 0x10, 1, 2, 3, 4, 5, 6, 7]))),
+            0xA3 => say.extend(
+                (1..127).map(|number| (MS * u64::from(number), answer([number, 1, 2, 3, 4, 5, 6, 7]))),
+            ),
+            _ => {}
+        };
+        let (_, sent) = run(&mut client, &mut node, arrives);
+        assert!(sent.len() < 6 && sent.last().unwrap().data()[0] == 0x80, "{sent:?}");
+        assert!(matches!(client.finish(), Err(SdoError::Wrong { code: BAD_LENGTH, done: 14..=21 })));
+    }
+}
+
+#[test]
+fn an_answer_of_less_than_8_bytes_is_no_answer() {
+    let mut client = client(SdoJob::Read, false);
+    let short = Frame::data_frame(Id::standard_truncated(0x585), &[0x43, 0, 0x20, 1, 9]).unwrap();
+    let mut node = |_: Id, data: &[u8], say: &mut Say| {
+        if data[0] == 0x40 {
+            say.push((MS, short));
+        }
+    };
+    let (_, sent) = run(&mut client, &mut node, arrives);
+    assert_eq!(sent.last().unwrap().data(), [0x80, 0, 0x20, 1, 0x10, 0, 7, 6]);
+    assert_eq!(client.finish(), Err(SdoError::Wrong { code: BAD_LENGTH, done: 0 }));
+}
+
+/// Otherwise its server would be busy for as long as it waits.
+#[test]
+fn a_node_is_told_when_a_transfer_is_cancelled() {
+    let mut new = client(SdoJob::Read, true);
+    assert_eq!(new.cancel(), None);
+    assert!(new.next(0).is_some());
+    new.sent(1);
+    new.hear(2, Id::standard_truncated(0x585), &[0xC4, 0, 0x20, 1, 0, 0, 0, 0]);
+    assert!(new.next(3).is_some());
+    assert_eq!(new.cancel().unwrap().data(), [0x80, 0, 0x20, 1, 0, 0, 0, 8]);
+    assert!(new.is_done() && new.cancel().is_none() && new.next(4).is_none());
+    assert_eq!(new.finish(), Err(SdoError::Cancelled { done: 0 }));
+}

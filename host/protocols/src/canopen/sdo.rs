@@ -115,6 +115,21 @@ impl Sdo {
             self.phase = Phase::Command;
             self.is_orphan = false;
         }
+        // The first answer names the object. One that names another is not to this request.
+        let answers_by_name = match b0 >> 5 {
+            2 | 3 => true,
+            5 => matches!(b0 & 3, 0),
+            6 => matches!(b0 & 1, 0),
+            _ => false,
+        };
+        if !from_client
+            && answers_by_name
+            && self.phase == Phase::Command
+            && self.open.is_some()
+            && !self.names(low, high, sub)
+        {
+            return [None, Some(unasked(time_ns, bytes))];
+        }
         if let Some(open) = &mut self.open {
             open.time_ns = time_ns;
             open.frames += 1;
@@ -240,11 +255,7 @@ impl Sdo {
         let b0 = bytes[0];
         let Some(open) = &mut self.open else {
             // An answer to an unobserved request.
-            let mut transfer = fresh(time_ns, bytes, b0 >> 5 == 3, Mode::Expedited);
-            if b0 >> 5 == 2 && b0 & 2 != 0 {
-                first_bytes(&mut transfer, b0, true, b0 & 1 != 0, bytes);
-            }
-            let transfer = SdoTransfer { trouble: Some(Trouble::Headless), ..transfer };
+            let transfer = unasked(time_ns, bytes);
             // Segments and their confirmations do not name an object.
             return if matches!(b0 >> 5, 0 | 1) { self.orphan(transfer) } else { Some(transfer) };
         };
@@ -370,6 +381,16 @@ fn headless(time_ns: i64, data: &[u8], trouble: Trouble) -> SdoTransfer {
         trouble: Some(trouble),
         ..fresh(time_ns, [0; 8], false, Mode::Expedited)
     }
+}
+
+/// A server's answer to a request that was not observed.
+fn unasked(time_ns: i64, bytes: [u8; 8]) -> SdoTransfer {
+    let b0 = bytes[0];
+    let mut transfer = fresh(time_ns, bytes, b0 >> 5 == 3, Mode::Expedited);
+    if b0 >> 5 == 2 && b0 & 2 != 0 {
+        first_bytes(&mut transfer, b0, true, b0 & 1 != 0, bytes);
+    }
+    SdoTransfer { trouble: Some(Trouble::Headless), ..transfer }
 }
 
 fn wrong_toggle(expected: bool) -> Trouble {

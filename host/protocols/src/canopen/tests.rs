@@ -399,3 +399,27 @@ fn sdo_servers_beyond_the_first_are_followed() {
         );
     }
 }
+
+/// Nothing that was said about one object is shown as the value of another.
+#[test]
+fn an_answer_about_another_object_is_not_the_answer() {
+    let said = said(&[
+        (0.0, "605#4000100000000000"),
+        (1.0, "585#4308100001020304"),
+        (2.0, "585#4300100092010200"),
+        (3.0, "605#2B171000E8030000"),
+        (4.0, "585#6018100000000000"),
+        (5.0, "585#6017100000000000"),
+    ]);
+    assert_eq!(said.len(), 4, "{said:?}");
+    assert!(
+        said[0].contains("SDO read 1008:00") && said[0].ends_with("its beginning is missing"),
+        "{said:?}"
+    );
+    assert!(said[1].contains("1000:00") && said[1].ends_with("value 0x00020192, after 2 ms"), "{said:?}");
+    assert!(
+        said[2].contains("SDO write 1018:00") && said[2].ends_with("its beginning is missing"),
+        "{said:?}"
+    );
+    assert!(said[3].contains("1017:00") && said[3].ends_with("value 1000, after 2 ms"), "{said:?}");
+}

@@ -23,12 +23,10 @@ pub fn repeats_its_request(is_kwp: bool, request: &[u8], response: &[u8]) -> Opt
         Some(asked.chunks(step).any(|one| one.get(..width) == Some(first)))
     };
     match sid {
-        // OBD-II.
         0x01 | 0x06 | 0x09 => one_of(1, 1),
         0x02 => one_of(1, 2),
-        0x05 | 0x08 => same(0, 1),
-        // KWP2000 alone.
-        0x1A | 0x21 | 0x30 | 0x32 | 0x33 | 0x3B => same(0, 1),
+        // OBD-II, and what KWP2000 alone has.
+        0x05 | 0x08 | 0x1A | 0x21 | 0x30 | 0x32 | 0x33 | 0x3B => same(0, 1),
         // Its other services repeat less than those of UDS.
         _ if is_kwp => match sid {
             0x10 => same_sub(),

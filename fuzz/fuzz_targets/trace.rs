@@ -1,14 +1,21 @@
 //! What the targets of all trace readers share. Seeds: `host/formats/tests/data/nmea2000.log.gz` converted to each
 //! format.
 
+#[path = "../../host/formats/tests/traces/mixed.rs"]
+mod mixed;
+
 use std::io::Cursor;
 
 use cantap_formats::{Format, ReadOptions, TraceReader};
 
-/// Reads a file in every way: it must not panic, must come to an end, and must find no more than the file can hold.
+/// Reads a file in every way: it must not panic, must come to an end, must find no more than the file can hold, and the same with plain
+/// frames as without them.
 pub fn read(format: Format, bytes: &[u8]) {
     let strict = ReadOptions { strict: true, ..ReadOptions::default() };
     let lenient = ReadOptions::default();
+    for options in [&strict, &lenient] {
+        mixed::assert_mixed_is_the_same(format, options, bytes);
+    }
     let [strict, lenient] = [strict, lenient]
         .map(|options| TraceReader::from_source("fuzz", Cursor::new(bytes.to_vec()), format, &options).ok());
     let (Some(strict), Some(lenient)) = (strict, lenient) else { return };

@@ -17,7 +17,7 @@ def to_numpy(table: Table) -> dict[str, Any]:
 def _column(table: Table, name: str) -> Any:
     kind, raw, missing, texts, width = table._parts(name)
     values: Any = np.frombuffer(raw, dtype=kind)
-    if name == "data":
+    if kind == "uint8" and name == "data":
         values = values.reshape(len(table), width)
     if texts is not None:
         # A placeholder for rows without a text: they are masked.

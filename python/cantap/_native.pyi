@@ -289,7 +289,7 @@ class Records(Iterator[Record]):
     def read(self, timeout: float | None = None) -> Record | None:
         """The next record; `None` if there is none within `timeout` seconds, or after the last."""
     def batch(self, seconds: float | None = None, rows: int = 65_536) -> Table:
-        """Records of the next `seconds`, at most `rows`, as a table."""
+        """Records of the next `seconds`, at most `rows`, as a table; without `seconds` it waits until there are so many."""
     @property
     def lost(self) -> tuple[int, int]:
         """Frames lost here because this program did not take them, on channels 1 and 2."""

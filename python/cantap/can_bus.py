@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import collections
+import contextlib
+import itertools
 import logging
 import math
+import os
 import threading
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import can
@@ -18,7 +22,7 @@ from can.broadcastmanager import (
 )
 
 from . import _native
-from ._native import DeviceError, PeriodicFrame
+from ._native import CantapWarning, DeviceError, PeriodicFrame
 from .device import CAPACITY, Device, Mode, boards
 
 LOG = logging.getLogger("can.bus")
@@ -26,6 +30,8 @@ LOG = logging.getLogger("can.bus")
 
 ALL_ERRORS = "#1FFFFFFF"
 EXTENDED = 0x8000_0000
+OF_OTHERS = {"fd", "data_bitrate", "interface", "ignore_config", "config_context"}
+"""Arguments that python-can's own programs pass to every interface."""
 QUEUE_TIMEOUT = 10.0
 """How long a frame waits for room in the device's queue, in seconds, if no other time is given."""
 
@@ -42,12 +48,42 @@ _sessions: dict[str, _Session] = {}
 _lock = threading.RLock()
 
 
+def _forget_sessions() -> None:
+    """In a forked process they are still the other one's: here each device is opened anew."""
+    global _lock
+    _sessions.clear()
+    # Another thread may have held it in that instant.
+    _lock = threading.RLock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_sessions)
+
+
+@contextlib.contextmanager
+def _as_can_errors() -> Iterator[None]:
+    """Errors of the device as those of python-can."""
+    try:
+        yield
+    except DeviceError as error:
+        raise can.CanOperationError(str(error)) from error
+
+
 def _split(channel: str) -> tuple[str, int]:
     """`/dev/ttyACM0:2` is channel 2 of that device; without a number it is channel 1."""
     address, colon, number = channel.rpartition(":")
     if colon and number in ("1", "2"):
         return address, int(number)
     return channel, 1
+
+
+def _flag(argument: str, value: Any) -> bool:
+    """A yes or no; in a configuration file it is a word, of which python-can itself knows only true and false."""
+    known = {"yes": True, "on": True, "true": True, "1": True, "no": False, "off": False, "false": False, "0": False}
+    found = known.get(str(value).lower())
+    if found is None:
+        raise can.CanInitializationError(f"{argument} is true or false, not {value!r}")
+    return found
 
 
 class CantapBus(can.BusABC):
@@ -81,17 +117,26 @@ class CantapBus(can.BusABC):
     ) -> None:
         if isinstance(timing, can.BitTimingFd) or kwargs.get("fd"):
             raise can.CanInitializationError("the analyser has no CAN FD; open the channel without it")
+        if timing is not None and not isinstance(timing, can.BitTiming):
+            raise TypeError(f"timing is a can.BitTiming, not {type(timing).__name__}")
+        if state is can.BusState.ERROR:
+            raise can.CanInitializationError("a bus does not begin in the state ERROR; choose ACTIVE or PASSIVE")
+        # A configuration file may have more for other interfaces. But a slip in `listen_only` must not remain unseen.
+        for unknown in sorted(kwargs.keys() - OF_OTHERS):
+            warnings.warn(f"the interface cantap has no argument {unknown}; it does nothing", CantapWarning, stacklevel=3)
         self._address, self._number = _split(str(channel))
-        self._own = receive_own_messages
+        self._own = _flag("receive_own_messages", receive_own_messages)
         self._options: dict[str, Any] = {
+            # From a configuration file it is a text.
             "bitrate": int(bitrate) if bitrate is not None else None,
             "sample_point": None,
             "sjw": None,
             "segments": None,
-            "one_shot": one_shot,
-            "manual_recovery": manual_recovery,
+            "one_shot": _flag("one_shot", one_shot),
+            "manual_recovery": _flag("manual_recovery", manual_recovery),
         }
-        mode: Mode = "listen-only" if listen_only or state is can.BusState.PASSIVE else "normal"
+        is_quiet = _flag("listen_only", listen_only) or state is can.BusState.PASSIVE
+        mode: Mode = "listen-only" if is_quiet else "normal"
         self.channel_info = f"cantap {self._address} channel {self._number}"
         self._can_protocol = can.CanProtocol.CAN_20
         texts = _filter_texts(can_filters)
@@ -119,10 +164,12 @@ class CantapBus(can.BusABC):
             session.users[self._number] = session.users.get(self._number, 0) + 1
             _sessions[self._address] = session
         self._session = session
-        # What came from the device in one call, as arguments of `can.Message`.
-        self._waiting: collections.deque[
-            tuple[float, int, bool, bool, bool, int, int, bytearray, bool, bool]
-        ] = collections.deque()
+        # What came from the device in one call.
+        self._waiting: collections.deque[can.Message] = collections.deque()
+        # As of the last call: asking for each message would take as long as everything else here.
+        self._is_logged = False
+        self._is_over = False
+        self._is_extended = type(self)._recv_internal is not CantapBus._recv_internal
         super().__init__(channel=channel, can_filters=can_filters)
 
     def _segments(self, timing: can.BitTiming | None) -> tuple[int, int, int, int] | None:
@@ -155,10 +202,11 @@ class CantapBus(can.BusABC):
     # Receiving
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """Like python-can's, which filters each message again: here filters have already been applied."""
-        # Through this method, because derived classes may override it.
-        message, _ = self._recv_internal(timeout)
-        if message is not None and LOG.isEnabledFor(self.RECV_LOGGING_LEVEL):
+        """Like python-can's, without its loop: filters have already been applied."""
+        if self._is_extended:
+            return super().recv(timeout)
+        message = self._next(timeout)
+        if self._is_logged and message is not None:
             LOG.log(self.RECV_LOGGING_LEVEL, "Received: %s", message)
         return message
 
@@ -166,28 +214,36 @@ class CantapBus(can.BusABC):
         return self._next(timeout), True
 
     def _next(self, timeout: float | None) -> can.Message | None:
-        if self._is_shutdown:
-            raise can.CanOperationError(f"{self.channel_info} is shut down")
         waiting = self._waiting
         while True:
             try:
-                found = waiting.popleft()
+                message = waiting.popleft()
             except IndexError:
-                try:
-                    more = self._records._messages(timeout)
-                except DeviceError as error:
-                    raise can.CanOperationError(str(error)) from error
-                if not more:
+                if not self._fetch(timeout):
                     return None
-                # In place: another thread may have added some at the same time.
-                waiting.extend(more)
                 continue
             if not waiting:
                 self._records._used_up()
-            return can.Message(*found)
+            return message
+
+    def _fetch(self, timeout: float | None) -> bool:
+        """Makes messages of what the device has received; false if there is nothing within the time."""
+        self._expect_open()
+        with _as_can_errors():
+            more = self._records._messages(timeout)
+        self._is_logged = LOG.isEnabledFor(self.RECV_LOGGING_LEVEL)
+        # In place: another thread may have added some at the same time.
+        self._waiting.extend(itertools.starmap(can.Message, more))
+        return bool(more)
+
+    def _expect_open(self) -> None:
+        """The device may still be open for other Bus objects."""
+        if self._is_over:
+            raise can.CanOperationError(f"{self.channel_info} is shut down")
 
     def _apply_filters(self, filters: Any) -> None:
-        self._records._filter(_filter_texts(filters), not self._own)
+        with _as_can_errors():
+            self._records._filter(_filter_texts(filters), not self._own)
 
     def losses(self) -> dict[str, int]:
         """Frames of this channel that were received and lost since the session began, by stage; `bus` is this object.
@@ -195,29 +251,33 @@ class CantapBus(can.BusABC):
         Where frames are missing, :meth:`recv` returns an error frame with the class "controller problem" and the detail "RX buffer overflow",
         whose bytes 2 to 5 contain their number.
         """
-        counts = dict(self._device.losses[self._number])
-        counts["bus"] = self._records.lost[self._number - 1]
+        self._expect_open()
+        with _as_can_errors():
+            counts = dict(self._device.losses[self._number])
+            counts["bus"] = self._records.lost[self._number - 1]
         counts["lost"] += counts["bus"]
         return counts
 
     def fileno(self) -> int:
         """A file descriptor that is readable while a message is waiting: for `asyncio` and `select`."""
-        return self._records.fileno()
+        with _as_can_errors():
+            return self._records.fileno()
 
     # Sending
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Passes a message to the device; with `timeout` (seconds), waits until it was on the bus."""
+        self._expect_open()
         frame = _frame(msg)
         wait = timeout if timeout is not None and timeout > 0 else None
-        try:
+        with _as_can_errors():
             self._device._native.send(self._number, [frame], wait, None, QUEUE_TIMEOUT)
-        except DeviceError as error:
-            raise can.CanOperationError(str(error)) from error
 
     def flush_tx_buffer(self) -> None:
         """Withdraws what has not been sent yet."""
-        self._device.abort(self._number)
+        self._expect_open()
+        with _as_can_errors():
+            self._device.abort(self._number)
 
     def _send_periodic_internal(
         self,
@@ -227,6 +287,10 @@ class CantapBus(can.BusABC):
         autostart: bool = True,
         modifier_callback: Callable[[can.Message], None] | None = None,
     ) -> CyclicSendTaskABC:
+        self._expect_open()
+        # python-can's thread would send without a pause.
+        if not 0 < period < math.inf:
+            raise ValueError(f"a period of {period} s is impossible")
         messages = CyclicSendTaskABC._check_and_convert_messages(msgs)
         if len(messages) == 1 and modifier_callback is None:
             try:
@@ -240,7 +304,9 @@ class CantapBus(can.BusABC):
     @property
     def state(self) -> can.BusState:
         """ERROR: bus-off. PASSIVE: it only listens, or is error passive. ACTIVE otherwise."""
-        channel = self._device.status["channels"][self._number - 1]
+        self._expect_open()
+        with _as_can_errors():
+            channel = self._device.status["channels"][self._number - 1]
         if channel["state"] == "bus-off":
             return can.BusState.ERROR
         if channel["mode"] == "listen-only" or channel["state"] == "passive":
@@ -251,19 +317,25 @@ class CantapBus(can.BusABC):
     def state(self, new_state: can.BusState) -> None:
         if new_state is can.BusState.ERROR:
             raise ValueError("a bus is not put into the state ERROR; choose ACTIVE or PASSIVE")
+        self._expect_open()
         mode: Mode = "listen-only" if new_state is can.BusState.PASSIVE else "normal"
-        self._device.close_channel(self._number)
-        self._open(mode, _filter_texts(self._filters))
+        with _as_can_errors():
+            self._device.close_channel(self._number)
+            self._open(mode, _filter_texts(self._filters))
 
     def recover(self) -> None:
         """Comes back from bus-off if recovery is manual."""
-        self._device.recover(self._number)
+        self._expect_open()
+        with _as_can_errors():
+            self._device.recover(self._number)
 
     def shutdown(self) -> None:
         """Stops periodic messages, and closes the channel if no other Bus object uses it."""
         if self._is_shutdown:
             return
         super().shutdown()
+        # Not before: until then threads still send what is periodic.
+        self._is_over = True
         with _lock:
             session = self._session
             left = session.users[self._number] - 1
@@ -272,6 +344,7 @@ class CantapBus(can.BusABC):
             else:
                 del session.users[self._number]
             self._records.close()
+            self._waiting.clear()
             try:
                 if not session.users:
                     session.device.close()

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import atexit
 import datetime
+import numbers
 import weakref
 from collections.abc import Iterable, Iterator
 from types import TracebackType
 from typing import Any, Literal, TypeAlias
 
 from . import _native
+from ._arguments import channels as _channels
+from ._arguments import words as _words
 from ._native import Frame, PeriodicFrame, Record, Records, Reply, Table
 
 Mode: TypeAlias = Literal["listen-only", "normal", "loopback", "silent-loopback"]
@@ -101,7 +104,7 @@ class Device:
                 "segments": segments,
                 "one_shot": one_shot,
                 "manual_recovery": manual_recovery,
-                "filters": [filter] if isinstance(filter, str) else list(filter),
+                "filters": _words(filter, "filter"),
             },
         )
         return rate
@@ -130,7 +133,7 @@ class Device:
         return self._records.read(timeout)
 
     def batch(self, seconds: float | None = None, rows: int = 65_536) -> Table:
-        """Records of the next `seconds`, at most `rows`, as a table."""
+        """Records of the next `seconds`, at most `rows`, as a table; without `seconds` it waits until there are so many."""
         return self._records.batch(seconds, rows)
 
     def batches(self, seconds: float = 0.1, rows: int = 65_536) -> Iterator[Table]:
@@ -152,7 +155,7 @@ class Device:
 
         If they are not taken, frames are lost once `capacity` records are waiting: they are counted, and a loss takes their place.
         """
-        filters = [filter] if isinstance(filter, str) else list(filter)
+        filters = _words(filter, "filter")
         return self._native.records(channel, filters, only_received, capacity)
 
     # Sending
@@ -169,17 +172,13 @@ class Device:
 
         If they are not sent within `timeout` seconds, they are withdrawn, with everything else that the channel still had to send,
         and `DeviceError` is raised. With `timeout=None` the frames are only passed to the device.
-        `at`: not before this time, in seconds since 1970 or a date with a time zone. The device does the timing, and `timeout`
-        includes the time until then.
+        `at`: not before this time, in seconds since 1970 or a date with a time zone; at once if it is over. The device does the
+        timing, and `timeout` includes the time until then.
         """
-        all_frames = [frames] if isinstance(frames, (Frame, str)) else list(frames)
-        at_ns = None
-        if isinstance(at, datetime.datetime):
-            if at.tzinfo is None:
-                raise ValueError(f"{at} has no time zone; give it one")
-            at_ns = int(at.timestamp() * 1e9)
-        elif at is not None:
-            at_ns = int(at * 1e9)
+        # What is neither is refused there.
+        one = isinstance(frames, (Frame, str, bytes)) or not isinstance(frames, Iterable)
+        all_frames: list[Any] = [frames] if one else list(frames)  # type: ignore[arg-type]
+        at_ns = None if at is None else _ns(at)
         return [time_ns / 1e9 for time_ns in self._native.send(channel, all_frames, timeout, at_ns)]
 
     def abort(self, channel: int) -> None:
@@ -199,7 +198,14 @@ class Device:
 
         `modifiers` change its data before each transmission, in this order: `[Counter(0, bits=4), Checksum(7)]`.
         """
-        words = [modifier.words for modifier in modifiers]
+        one = isinstance(modifiers, (Counter, Checksum, RandomByte))
+        if one or not isinstance(modifiers, Iterable):
+            raise TypeError("modifiers are several: put them into a list, such as [Counter(0)]")
+        words = []
+        for modifier in modifiers:
+            if not isinstance(modifier, (Counter, Checksum, RandomByte)):
+                raise TypeError(f"a modifier is a Counter, Checksum or RandomByte, not {type(modifier).__name__}")
+            words.append(modifier.words)
         return self._native.periodic(channel, frame, period, count, words)
 
     def reply(
@@ -263,6 +269,22 @@ class Device:
         raise TypeError("a device cannot be pickled; open it where it is used")
 
 
+def _ns(at: float | datetime.datetime) -> int:
+    """Nanoseconds since 1970."""
+    if isinstance(at, datetime.datetime):
+        if at.tzinfo is None:
+            raise ValueError(f"{at} has no time zone; give it one")
+        # Exact, other than its `timestamp`.
+        since = at - datetime.datetime(1970, 1, 1, tzinfo=datetime.timezone.utc)
+        return since // datetime.timedelta(microseconds=1) * 1000
+    if not isinstance(at, numbers.Real):
+        raise TypeError(f"a send time is a number or a datetime, not {type(at).__name__}")
+    # Year 2242; nobody plans that far ahead, and later ones do not fit.
+    if not -8.6e9 < at < 8.6e9:
+        raise ValueError(f"{at} is not a send time; give seconds since 1970")
+    return round(at * 1e9)
+
+
 @atexit.register
 def _close_all() -> None:
     """A program that ends leaves its buses in order."""
@@ -277,7 +299,7 @@ def open(
     address: str,
     bitrate: int | None = None,
     *,
-    channels: Iterable[int] = (1, 2),
+    channels: int | Iterable[int] = (1, 2),
     mode: Mode = "listen-only",
     filter: str | Iterable[str] = (),
     capacity: int = CAPACITY,
@@ -294,9 +316,9 @@ def open(
     """
     device = Device(address, capacity=capacity)
     if bitrate is not None:
-        filters = [filter] if isinstance(filter, str) else list(filter)
         try:
-            for channel in channels:
+            filters = _words(filter, "filter")
+            for channel in _channels(channels):
                 device.open_channel(channel, bitrate, mode=mode, filter=filters)
         except BaseException:
             device.close()

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import datetime
+import numbers
+import operator
 import os
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, SupportsIndex, TypeAlias
 
 from . import _native
+from ._arguments import channels, words
 from ._native import CantapWarning, Database, Report, Scan, Table
 
 if TYPE_CHECKING:
@@ -16,7 +19,7 @@ if TYPE_CHECKING:
 
 Path: TypeAlias = "str | os.PathLike[str]"
 Databases: TypeAlias = "Path | Database | Iterable[Path] | Mapping[int, Path]"
-Time: TypeAlias = "float | str | datetime.timedelta | datetime.datetime"
+Time: TypeAlias = "float | str | datetime.timedelta | datetime.datetime | datetime.date"
 Words: TypeAlias = "str | Iterable[str]"
 
 BATCH_ROWS = 65_536
@@ -70,7 +73,8 @@ def scan(
 
     `signals`: only these, such as `Speed` or `Engine.Speed`, with the wildcards `*`, `?` and `[a-z]`.
     `filter`: only these frames, in candump's syntax, such as `123` or `can0,120:7F0`; if several are given, any may match.
-    `start`, `end`: seconds from the first record or since 1970, `"10m"`, a date, a `timedelta`; the end is exclusive.
+    `start`, `end`: seconds from the first record or since 1970, `"10m"`, a date, a `timedelta`, a time of NumPy or pandas; the end is
+    exclusive. What has no time zone is UTC if it is a text, a date or NumPy's; a `datetime` must name its own.
     `format`: if neither content nor name show it. `zone`: for dates in files that do not name one, such as `Europe/Berlin`.
     `strict`: anything wrong in the file raises `FormatError` instead of causing a `CantapWarning`.
 
@@ -100,7 +104,8 @@ def read(
 class Messages(Mapping[str, Table]):
     """A decoded trace: for each message's name, a table with the columns `time`, `channel`, `id` and one for each signal.
 
-    A signal with texts has two: `Gear` and `Gear.text`. If a frame does not have a signal, there is no value.
+    A signal with texts has two: `Gear` and `Gear.text`. If a frame does not have a signal, there is no value. A signal whose name is
+    taken, such as one called `time`, is a column with the message's name in front: `Engine.time`.
     """
 
     def __init__(self, tables: dict[str, Table], events: Table, report: Report | None) -> None:
@@ -140,6 +145,9 @@ def decode(
 
     `source` is a file, or a table of records, such as a device's batches: from this package, or anything else that exports Arrow.
     The other arguments are those of `scan`; for a table, only `signals` is allowed.
+
+    If a file's frames are all unknown to the databases, there is a `CantapWarning`. Of two messages with one name, the later has its
+    identifier behind it, as in `Engine-1A0`.
     """
     if isinstance(source, (str, os.PathLike)):
         options = _options(source, db, signals, filter, channel, start, end, format, zone, strict)
@@ -147,7 +155,7 @@ def decode(
         return Messages(dict(tables), events, report)
     if filter or channel != () or (start, end, format, zone) != (None,) * 4 or strict:
         raise ValueError("of a table only signals can be chosen; choose its rows before")
-    tables, events = _native.decode_table(_with_our_types(source), _database(db), _words(signals))
+    tables, events = _native.decode_table(_with_our_types(source), _database(db), words(signals, "signals"))
     return Messages(dict(tables), events, None)
 
 
@@ -173,7 +181,7 @@ def search(
     several may match. `data`: bytes from the first on, `"11 ?? 3?"`, with `*` for any number; any of several may match.
     """
     options = _options(path, db, (), filter, channel, start, end, format, zone, strict)
-    return _native.search(options, condition, _words(id), _words(data), max_count)
+    return _native.search(options, condition, words(id, "id"), words(data, "data"), max_count)
 
 
 def stats(
@@ -202,8 +210,8 @@ def stats(
 def _rates(rates: int | Mapping[int, int] | None) -> list[tuple[int | None, int]]:
     if rates is None:
         return []
-    if isinstance(rates, int):
-        return [(None, rates)]
+    if isinstance(rates, SupportsIndex):
+        return [(None, operator.index(rates))]
     if isinstance(rates, Mapping):
         return list(rates.items())
     raise TypeError(f"a bit rate is a number, or one for each channel in a mapping, not {type(rates).__name__}")
@@ -271,14 +279,14 @@ def _options(
     return {
         "path": path,
         "db": None if db is None else _database(db),
-        "signals": _words(signals),
-        "filters": _words(filter),
-        "channels": _channels(channel),
+        "signals": words(signals, "signals"),
+        "filters": words(filter, "filter"),
+        "channels": channels(channel),
         "start": _time(start),
         "end": _time(end),
         "format": format,
         "zone": zone,
-        "strict": strict,
+        "strict": bool(strict),
     }
 
 
@@ -286,22 +294,18 @@ def _database(db: Databases) -> Database:
     return db if isinstance(db, Database) else load_database(db)
 
 
-def _channels(channel: int | Iterable[int]) -> list[int]:
-    channels = [channel] if isinstance(channel, int) else list(channel)
-    for number in channels:
-        if not 1 <= number <= 255:
-            raise ValueError(f"there is no channel {number}; they count from 1 to 255")
-    return channels
-
-
-def _words(words: Words) -> list[str]:
-    return [words] if isinstance(words, str) else list(words)
-
-
 def _time(time: Time | None) -> str | None:
     """A time in the command's syntax."""
     if time is None or isinstance(time, str):
         return time
+    kind = getattr(getattr(time, "dtype", None), "kind", None)
+    if kind in ("M", "m"):
+        numpy_time: Any = time
+        ns = int(numpy_time.astype(f"{kind}8[ns]").astype("int64"))
+        # This is NumPy's NaT, as far as it can be told without importing it.
+        if ns == -(2**63):
+            raise ValueError(f"{time} is not a time")
+        return _date_text(_EPOCH, ns) if kind == "M" else f"{'-' if ns < 0 else ''}{abs(ns) // 10**9}.{abs(ns) % 10**9:09}s"
     if isinstance(time, datetime.timedelta):
         # The letter keeps a long one from being mistaken for a date.
         return f"{time.total_seconds():.9f}s"
@@ -310,12 +314,23 @@ def _time(time: Time | None) -> str | None:
             raise ValueError(
                 f"{time} has no time zone; give it one, as with replace(tzinfo=datetime.timezone.utc)"
             )
-        since = time - datetime.datetime(1970, 1, 1, tzinfo=datetime.timezone.utc)
-        whole = since // datetime.timedelta(seconds=1)
-        return f"{whole}.{(since - datetime.timedelta(seconds=whole)).microseconds:06}"
-    if isinstance(time, (int, float)):
-        return f"{time:.9f}"
-    raise TypeError(f"a time is a number, a text, a timedelta or a datetime, not {type(time).__name__}")
+        # pandas' have nanoseconds, too.
+        return _date_text(time, getattr(time, "nanosecond", 0))
+    if isinstance(time, datetime.date):
+        return time.isoformat()
+    if isinstance(time, numbers.Real):
+        return f"{float(time):.9f}"
+    raise TypeError(f"a time is a number, a text, a timedelta, a date or a datetime, not {type(time).__name__}")
+
+
+_EPOCH = datetime.datetime(1970, 1, 1, tzinfo=datetime.timezone.utc)
+
+
+def _date_text(time: datetime.datetime, more_ns: int) -> str:
+    """A date in UTC, so many nanoseconds later. As a number it would count from the trace's first record if it is an early one."""
+    seconds, ns = divmod(more_ns, 10**9)
+    utc = time.astimezone(datetime.timezone.utc) + datetime.timedelta(seconds=seconds)
+    return f"{utc:%Y-%m-%dT%H:%M:%S}.{utc.microsecond * 1000 + ns:09}"
 
 
 __all__ = [

@@ -8,6 +8,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::error::Error;
+use crate::number::OfTrace;
 
 /// Compiled databases: loaded once, used for any number of traces, devices and frames, in any thread.
 #[pyclass(module = "cantap", frozen)]
@@ -34,13 +35,15 @@ impl Database {
 #[pymethods]
 impl Database {
     #[new]
-    fn new(files: Vec<(Option<u8>, PathBuf)>, j1939: bool) -> PyResult<Self> {
+    fn new(files: Vec<(Option<OfTrace>, PathBuf)>, j1939: bool) -> PyResult<Self> {
+        let files: Vec<_> =
+            files.into_iter().map(|(channel, path)| (channel.map(|channel| channel.0), path)).collect();
+        if files.is_empty() {
+            return Err(Error::argument("no database is given; name at least one file").into());
+        }
         let mut sources = Vec::new();
         let mut warnings = Vec::new();
         for (channel, path) in &files {
-            if *channel == Some(0) {
-                return Err(Error::argument("channels count from 1").into());
-            }
             let database = cantap_signals::load(path).map_err(Error::from)?;
             warnings.extend(database.warnings.iter().map(|fault| format!("{}: {fault}", database.file)));
             sources.push(Source { channel: *channel, database });
@@ -100,7 +103,8 @@ impl Database {
 
     fn __repr__(&self) -> String {
         let files: Vec<_> = self.files.iter().map(|(_, path)| path.display().to_string()).collect();
-        format!("<cantap.Database of {}: {} messages>", files.join(", "), self.decoder.messages().count())
+        let files = if files.is_empty() { "the virtual car".to_owned() } else { files.join(", ") };
+        format!("<cantap.Database of {files}: {} messages>", self.decoder.messages().count())
     }
 
     #[expect(clippy::type_complexity, reason = "what pickle wants")]

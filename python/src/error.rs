@@ -73,6 +73,13 @@ impl Error {
         Self::Io(error, path.display().to_string())
     }
 
+    /// A device that another process opened.
+    pub fn other_process(address: &str) -> Self {
+        Self::Address(format!(
+            "'{address}' was opened by another process, before a fork; open it in the process that uses it"
+        ))
+    }
+
     /// A wrong argument, described in words.
     pub fn argument(words: impl ToString) -> Self {
         Self::Argument(words.to_string())

@@ -1,13 +1,16 @@
 //! Frames and records, for Python.
 
+use cantap_columns::FrameColumns;
 use cantap_trace::names::{self, BUS_ERRORS, ERROR_STATES, LOSS_STAGES, OVERTAKEN, TRANSMIT_FAILURES};
 use cantap_trace::{Direction, Frame as ClassicFrame, Id, TraceEvent, TraceFrame, TraceRecord};
 use cantap_wire::record::TransmitFailure;
-use pyo3::exceptions::{PyTypeError, PyValueError};
+use pyo3::exceptions::{PyOverflowError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
 use crate::error::Error;
+use crate::number::Whole;
+use crate::table::Table;
 
 /// A classical CAN frame.
 #[pyclass(module = "cantap", frozen, eq, hash)]
@@ -29,14 +32,15 @@ impl Frame {
     #[new]
     #[pyo3(signature = (id, data=None, *, extended=None, remote=false, dlc=None))]
     fn new(
-        id: u32,
-        data: Option<Vec<u8>>,
+        id: Whole<u32>,
+        data: Option<Bytes>,
         extended: Option<bool>,
         remote: bool,
-        dlc: Option<u8>,
+        dlc: Option<Whole<u8>>,
     ) -> PyResult<Self> {
-        let id = identifier(id, extended)?;
-        let data = data.unwrap_or_default();
+        let id = identifier(id.0, extended)?;
+        let dlc = dlc.map(|dlc| dlc.0);
+        let data = data.map(|data| data.0).unwrap_or_default();
         let wrong = |words: &str| Err(PyValueError::new_err(words.to_owned()));
         let frame = if remote {
             if !data.is_empty() {
@@ -101,7 +105,31 @@ impl Frame {
     #[staticmethod]
     fn parse(text: &str) -> PyResult<Self> {
         let frame = text.parse::<ClassicFrame>();
-        frame.map(Self).map_err(|error| PyValueError::new_err(format!("'{text}' is not a frame: {error}")))
+        frame.map(Self).map_err(|error| {
+            // Somebody may have passed a whole file.
+            let end = text.char_indices().nth(40).map_or(text.len(), |(at, _)| at);
+            let more = if end < text.len() { "…" } else { "" };
+            PyValueError::new_err(format!("'{}{more}' is not a frame: {error}", &text[..end]))
+        })
+    }
+}
+
+/// Data bytes.
+struct Bytes(Vec<u8>);
+
+impl<'py> FromPyObject<'_, 'py> for Bytes {
+    type Error = PyErr;
+
+    fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
+        object.extract::<Vec<u8>>().map(Self).map_err(|error| {
+            let py = object.py();
+            if error.is_instance_of::<PyOverflowError>(py) {
+                PyValueError::new_err("a byte of the data is out of range: give 0 to 255")
+            } else {
+                let kind = object.get_type().name().map(|name| name.to_string()).unwrap_or_default();
+                PyTypeError::new_err(format!("the data are bytes, or numbers from 0 to 255, not {kind}"))
+            }
+        })
     }
 }
 
@@ -243,6 +271,21 @@ impl Record {
     #[getter]
     fn late(&self) -> bool {
         matches!(self.0.event, TraceEvent::Frame { late: true, .. })
+    }
+
+    /// Through a table of one row, which has all of it.
+    fn __reduce__(&self, py: Python<'_>) -> PyResult<(Py<PyAny>, (Table,))> {
+        let mut columns = FrameColumns::default();
+        columns.push(&self.0);
+        let make = py.get_type::<Self>().getattr("_of_table")?.unbind();
+        Ok((make, (Table::of_batch(columns.take()),)))
+    }
+
+    #[staticmethod]
+    fn _of_table(table: &Table) -> PyResult<Self> {
+        let found = cantap_columns::records(&table.one_batch()?).map_err(Error::from)?;
+        let first = found.first().ok_or_else(|| PyValueError::new_err("the table has no record"))?;
+        Ok(Self(*first))
     }
 
     fn __repr__(&self) -> String {

@@ -90,6 +90,18 @@ impl Counts {
     }
 }
 
+impl Counts {
+    /// That none of the frames was decoded, in words; `None` if one was, or if there are none.
+    pub fn nothing_decoded(&self) -> Option<String> {
+        (self.frames > 0 && self.decoded == 0).then(|| {
+            format!(
+                "{}: none of its {} frames could be decoded with the database; is it the right one?",
+                self.file, self.frames
+            )
+        })
+    }
+}
+
 /// Descriptions and counts.
 pub fn by_kind(counts: &LeftOut) -> BTreeMap<String, u64> {
     counts.iter().map(|(what, count)| (what.to_owned(), count)).collect()

@@ -12,6 +12,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyCapsule, PyTuple};
 
 use crate::error::{CantapWarning, Error};
+use crate::number::Whole;
 use crate::report::{Counts, Report};
 use crate::source::{Options, TraceSource};
 use crate::table::{Table, stream_capsule};
@@ -130,6 +131,8 @@ impl Pipeline {
 #[pyclass(module = "cantap", frozen)]
 pub struct Scan {
     schema: SchemaRef,
+    /// With a database.
+    decodes: bool,
     report: Py<Report>,
     state: Mutex<State>,
 }
@@ -146,9 +149,24 @@ enum State {
 
 /// Reports what could not be read, as a Python warning.
 pub fn warn(py: Python<'_>, report: &Report) -> PyResult<()> {
-    let Some(text) = report.now().warning() else { return Ok(()) };
+    match report.now().warning() {
+        Some(text) => warning(py, &text),
+        None => Ok(()),
+    }
+}
+
+/// Issues a Python warning for the caller of the function in Python's half.
+pub fn warning(py: Python<'_>, text: &str) -> PyResult<()> {
     let text = std::ffi::CString::new(text.replace('\0', " "))?;
     PyErr::warn(py, &py.get_type::<CantapWarning>(), &text, 2)
+}
+
+/// Reports that a database has none of the frames, as a Python warning: it is likely to be another bus's.
+pub fn warn_if_nothing_decoded(py: Python<'_>, report: &Report) -> PyResult<()> {
+    match report.now().nothing_decoded() {
+        Some(text) => warning(py, &text),
+        None => Ok(()),
+    }
 }
 
 impl Scan {
@@ -181,6 +199,9 @@ impl Scan {
         })?;
         if batch.is_none() {
             warn(py, self.report.get())?;
+            if self.decodes {
+                warn_if_nothing_decoded(py, self.report.get())?;
+            }
         }
         Ok(batch)
     }
@@ -189,12 +210,18 @@ impl Scan {
 #[pymethods]
 impl Scan {
     #[new]
-    fn new(py: Python<'_>, options: Options, batch_rows: usize) -> PyResult<Self> {
+    fn new(py: Python<'_>, options: Options, batch_rows: Whole<usize>) -> PyResult<Self> {
         let report = Report::default();
         let for_pipeline = report.clone();
-        let pipeline = py.detach(|| Pipeline::open(&options, batch_rows, for_pipeline))?;
+        let pipeline = py.detach(|| Pipeline::open(&options, batch_rows.0, for_pipeline))?;
         let schema = pipeline.columns.schema();
-        Ok(Self { schema, report: Py::new(py, report)?, state: Mutex::new(State::Ready(Box::new(pipeline))) })
+        let decodes = options.db.is_some();
+        Ok(Self {
+            schema,
+            decodes,
+            report: Py::new(py, report)?,
+            state: Mutex::new(State::Ready(Box::new(pipeline))),
+        })
     }
 
     /// What was read so far, and what could not be read.
@@ -264,13 +291,22 @@ impl Scan {
             return Err(PyRuntimeError::new_err("this scan is at its end, or was taken; begin another one"));
         };
         self.put_back(State::Ended);
-        stream_capsule(py, Box::new(Stream { pipeline, schema: Arc::clone(&self.schema), ended: false }))
+        stream_capsule(
+            py,
+            Box::new(Stream {
+                pipeline,
+                decodes: self.decodes,
+                schema: Arc::clone(&self.schema),
+                ended: false,
+            }),
+        )
     }
 }
 
 /// The rest of a scan, handed over to a consumer.
 struct Stream {
     pipeline: Box<Pipeline>,
+    decodes: bool,
     schema: SchemaRef,
     ended: bool,
 }
@@ -287,7 +323,9 @@ impl Iterator for Stream {
             Ok(None) => {
                 self.ended = true;
                 // The caller may not hold Python's lock, so a Python warning is impossible.
-                if let Some(text) = self.pipeline.source.counts.warning() {
+                let counts = &self.pipeline.source.counts;
+                let nothing = self.decodes.then(|| counts.nothing_decoded()).flatten();
+                for text in counts.warning().into_iter().chain(nothing) {
                     eprintln!("cantap: {text}");
                 }
                 None

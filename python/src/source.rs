@@ -12,11 +12,10 @@ use pyo3::prelude::*;
 
 use crate::database::Database;
 use crate::error::Error;
+use crate::number::{OfTrace, entry};
 use crate::report::{Counts, Report};
 
 /// What to read from a file, as passed by the Python half.
-#[derive(FromPyObject)]
-#[pyo3(from_item_all)]
 pub struct Options {
     pub path: PathBuf,
     pub format: Option<String>,
@@ -28,6 +27,26 @@ pub struct Options {
     pub end: Option<String>,
     pub db: Option<Py<Database>>,
     pub signals: Vec<String>,
+}
+
+impl<'py> FromPyObject<'_, 'py> for Options {
+    type Error = PyErr;
+
+    fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
+        let channels: Vec<OfTrace> = entry(object, "channels", "channel")?;
+        Ok(Self {
+            path: entry(object, "path", "path")?,
+            format: entry(object, "format", "format")?,
+            zone: entry(object, "zone", "zone")?,
+            strict: entry(object, "strict", "strict")?,
+            filters: entry(object, "filters", "filter")?,
+            channels: channels.into_iter().map(|channel| channel.0).collect(),
+            start: entry(object, "start", "start")?,
+            end: entry(object, "end", "end")?,
+            db: entry(object, "db", "db")?,
+            signals: entry(object, "signals", "signals")?,
+        })
+    }
 }
 
 impl Options {
@@ -73,11 +92,16 @@ impl TraceSource {
         let point = |text: &Option<String>| text.as_deref().map(str::parse::<TimePoint>).transpose();
         let start = point(&options.start).map_err(Error::argument)?;
         let end = point(&options.end).map_err(Error::argument)?;
-        if options.channels.contains(&0) {
-            return Err(Error::argument("channels count from 1"));
-        }
         let filters = filters.map_err(Error::argument)?;
-        let reader = open_reader(&options.path, &read)?;
+        let reader = open_reader(&options.path, &read).map_err(|error| {
+            let is_parquet = options.path.extension().is_some_and(|suffix| suffix.eq_ignore_ascii_case("parquet"));
+            match Error::from(error) {
+                Error::Format(words) if is_parquet => Error::Format(format!(
+                    "{words}; Parquet is only written here: read it with pandas, Polars or DuckDB, and pass on what they return"
+                )),
+                error => error,
+            }
+        })?;
         let counts = Counts {
             file: options.path.display().to_string(),
             format: reader.format().to_string(),

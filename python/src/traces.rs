@@ -1,6 +1,5 @@
 //! Operations on a whole trace.
 
-use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -20,8 +19,9 @@ use pyo3::prelude::*;
 use crate::ahead::Ahead;
 use crate::database::Database;
 use crate::error::Error;
+use crate::number::{OfTrace, Whole};
 use crate::report::{Report, by_kind, from_json};
-use crate::scan::warn;
+use crate::scan::{warn, warn_if_nothing_decoded};
 use crate::source::{Options, TraceSource};
 use crate::table::{Table, batches_of};
 
@@ -51,15 +51,15 @@ fn walk(
 pub fn stats(
     py: Python<'_>,
     options: Options,
-    bitrates: Vec<(Option<u8>, u32)>,
-    data_bitrates: Vec<(Option<u8>, u32)>,
+    bitrates: Vec<(Option<OfTrace>, Whole<u32>)>,
+    data_bitrates: Vec<(Option<OfTrace>, Whole<u32>)>,
     window_s: f64,
 ) -> PyResult<Bound<'_, PyAny>> {
-    let all = |rates: &[(Option<u8>, u32)]| {
-        rates.iter().find(|(channel, _)| channel.is_none()).map(|(_, rate)| *rate)
+    let all = |rates: &[(Option<OfTrace>, Whole<u32>)]| {
+        rates.iter().find(|(channel, _)| channel.is_none()).map(|(_, rate)| rate.0)
     };
-    let of_channels = |rates: &[(Option<u8>, u32)]| {
-        rates.iter().filter_map(|(channel, rate)| Some(((*channel)?, *rate))).collect::<Vec<_>>()
+    let of_channels = |rates: &[(Option<OfTrace>, Whole<u32>)]| {
+        rates.iter().filter_map(|(channel, rate)| Some(((*channel)?.0, rate.0))).collect::<Vec<_>>()
     };
     let window = Duration::try_from_secs_f64(window_s);
     let window = window.map_err(|_| Error::argument(format!("{window_s} s is not a valid window length")))?;
@@ -116,6 +116,7 @@ pub fn decode(py: Python<'_>, options: Options) -> PyResult<(Tables, Py<Report>)
     }
     warn(py, &report)?;
     report.set_decoded(py.detach(|| tables.counts()));
+    warn_if_nothing_decoded(py, &report)?;
     Ok((finish(&decoder, tables, chosen.as_ref()), Py::new(py, report)?))
 }
 
@@ -164,16 +165,16 @@ fn finish(decoder: &Decoder, tables: MessageTables, chosen: Option<&Selection>) 
 
 /// The columns for time, channel and identifier, and those of the chosen signals.
 fn only(batch: &RecordBatch, message: &Message, chosen: &Selection) -> RecordBatch {
-    let left_out: HashSet<_> = message
-        .signals
-        .iter()
-        .filter(|signal| !chosen.matches(message, signal))
-        .flat_map(|signal| [signal.label().into_owned(), format!("{}.text", signal.label())])
-        .collect();
-    let schema = batch.schema();
-    let kept: Vec<_> = (0..schema.fields().len())
-        .filter(|at| *at < 3 || !left_out.contains(schema.field(*at).name()))
-        .collect();
+    // Three for every frame; then one for each signal, and one for its texts if it has any.
+    let mut at = 3;
+    let mut kept: Vec<_> = (0..at).collect();
+    for signal in &message.signals {
+        let columns = at..at + if signal.values.is_empty() { 1 } else { 2 };
+        at = columns.end;
+        if chosen.matches(message, signal) {
+            kept.extend(columns);
+        }
+    }
     // This cannot fail: all of these exist.
     batch.project(&kept).unwrap_or_else(|_| batch.clone())
 }
@@ -186,7 +187,7 @@ pub fn search(
     condition: Option<String>,
     ids: Vec<String>,
     data: Vec<String>,
-    max_count: Option<u64>,
+    max_count: Option<Whole<u64>>,
 ) -> PyResult<Table> {
     let decoder = options.decoder()?.unwrap_or_else(|| Arc::new(Decoder::new(Vec::new())));
     let condition = condition.map(|text| Condition::new(&text, &decoder)).transpose().map_err(Error::from)?;
@@ -205,7 +206,7 @@ pub fn search(
     let mut place = 0_u64;
     let report = Report::default();
     walk(py, &options, &report, |record| {
-        let is_wanted = max_count.is_none_or(|most| (places.len() as u64) < most);
+        let is_wanted = max_count.is_none_or(|most| (places.len() as u64) < most.0);
         if search.finds(record) && is_wanted {
             found.push(record);
             places.push(place);

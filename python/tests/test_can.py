@@ -1,10 +1,16 @@
 """The interface `cantap` of python-can."""
 
 import asyncio
+import os
 import struct
+import subprocess
+import sys
+import textwrap
 import time
 
 import pytest
+
+import cantap
 
 can = pytest.importorskip("can")
 
@@ -182,6 +188,56 @@ def test_asyncio_waits_for_the_file_descriptor(pair):
     assert asyncio.run(run()) == list(range(300))
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+def test_a_forked_process_opens_its_own_session():
+    code = f"""
+        import os, can, warnings
+        warnings.simplefilter("ignore", DeprecationWarning)
+        bus = can.Bus(interface="cantap", channel="{QUIET}:1", bitrate=500_000)
+        child = os.fork()
+        if child == 0:
+            try:
+                bus.recv(0.1)
+            except can.CanOperationError as error:
+                print("fork" if "fork" in str(error) else error, flush=True)
+            with can.Bus(interface="cantap", channel="{QUIET}:1", bitrate=500_000) as own:
+                own.send(can.Message(arbitration_id=1), timeout=1)
+                print("own", flush=True)
+            os._exit(0)
+        assert os.waitpid(child, 0)[1] == 0
+        bus.send(can.Message(arbitration_id=1), timeout=1)
+        bus.shutdown()
+    """
+    result = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=60)
+    assert result.stdout.split() == ["fork", "own"] and result.returncode == 0, result.stderr
+
+
+def test_an_argument_with_a_slip_is_not_silence():
+    with pytest.warns(cantap.CantapWarning, match="listen_olny"):
+        can.Bus(interface="cantap", channel=QUIET, bitrate=500_000, listen_olny=True).shutdown()
+    with pytest.raises(can.CanInitializationError, match="ERROR"):
+        can.Bus(interface="cantap", channel=QUIET, bitrate=500_000, state=can.BusState.ERROR)
+
+
+def test_a_configuration_file_may_say_yes_and_no(tmp_path, monkeypatch):
+    lines = ["[default]", "interface = cantap", f"channel = {QUIET}:2", "bitrate = 500000", "listen_only = yes", "one_shot = no"]
+    monkeypatch.setattr(can.util, "CONFIG_FILES", [str(tmp_path / "can.conf")])
+    (tmp_path / "can.conf").write_text("\n".join([*lines, "receive_own_messages = off", "rx_capacity = 1000"]))
+    with can.Bus() as bus:
+        assert bus.device.channels == {2: {"bitrate": 500_000, "mode": "listen-only"}}
+    (tmp_path / "can.conf").write_text("\n".join([*lines, "manual_recovery = perhaps"]))
+    with pytest.raises(can.CanInitializationError, match="manual_recovery"):
+        can.Bus()
+
+
+def test_a_period_that_is_none_is_an_error_and_no_flood(pair):
+    first, second = pair
+    for period in (0, -1, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="period"):
+            first.send_periodic(message(), period)
+    assert second.recv(0.1) is None
+
+
 def test_boards_are_detected():
     assert isinstance(can.detect_available_configs("cantap"), list)
 
@@ -201,10 +257,54 @@ def test_what_cannot_be_opened_or_sent_is_an_error_of_python_can(pair):
             first.send(wrong)
 
 
-def test_a_bus_that_is_shut_down_gives_nothing():
-    bus = can.Bus(interface="cantap", channel=QUIET, bitrate=500_000)
+def test_a_bus_that_is_shut_down_gives_nothing(pair):
+    first, _ = pair
+    bus = can.Bus(interface="cantap", channel=f"{QUIET}:2", bitrate=500_000)
+    for identifier in (0x100, 0x101, 0x102):
+        first.send(message(identifier), timeout=1)
+    assert bus.recv(1).arbitration_id == 0x100
     bus.shutdown()
-    with pytest.raises(can.CanOperationError):
-        bus.recv(0)
-    with pytest.raises(can.CanOperationError):
-        bus.send(message())
+    # Not even what was already here; and nothing is sent or withdrawn by it, although another Bus object has the device.
+    for call in (
+        lambda: bus.recv(0),
+        lambda: bus.send(message()),
+        lambda: bus.send_periodic(message(), 0.1),
+        lambda: bus.state,
+        lambda: bus.losses(),
+        lambda: bus.flush_tx_buffer(),
+        lambda: bus.recover(),
+    ):
+        with pytest.raises(can.CanOperationError):
+            call()
+
+
+def test_a_derived_class_may_have_its_own_way_to_receive(pair):
+    """As python-can documents it: what `_recv_internal` has not filtered is filtered by `recv`, which waits for the rest of its time."""
+    from cantap.can_bus import CantapBus
+
+    class Answers(CantapBus):
+        def _recv_internal(self, timeout):
+            message, _ = super()._recv_internal(timeout)
+            if message is not None:
+                message.arbitration_id ^= 1
+            return message, False
+
+    first, _ = pair
+    with Answers(f"{QUIET}:2", bitrate=500_000) as bus:
+        bus._filters = [{"can_id": 0x122, "can_mask": 0x7FF}]
+        for identifier in (0x122, 0x123):
+            first.send(message(identifier), timeout=1)
+        assert bus.recv(1).arbitration_id == 0x122
+        begin = time.monotonic()
+        assert bus.recv(0.2) is None
+        assert 0.15 < time.monotonic() - begin < 2
+
+
+def test_received_messages_are_logged_as_python_can_logs_them(pair, caplog):
+    first, second = pair
+    first.send(message(0x100), timeout=1)
+    assert second.recv(1).arbitration_id == 0x100 and not caplog.records
+    second.RECV_LOGGING_LEVEL = 30
+    first.send(message(0x101), timeout=1)
+    assert second.recv(1).arbitration_id == 0x101
+    assert [record.getMessage()[:9] for record in caplog.records] == ["Received:"]

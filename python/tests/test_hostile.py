@@ -1,8 +1,10 @@
 """What a program does wrong, or what happens to it: always a Python exception, never an abort or a hang."""
 
 import copy
+import gzip
 import os
 import pickle
+import random
 import signal
 import subprocess
 import sys
@@ -33,7 +35,7 @@ def dbc(tmp_path):
 
 WRONG = [None, 5, -1, 2**70, 1.5, float("nan"), b"\xff\x00", "", "no such thing", [], [None], {}, {1: None}, {0: "x"}, object(), [[]]]
 """Objects that may be passed by mistake."""
-CLEAN = (TypeError, ValueError, OverflowError, OSError, cantap.CantapError)
+CLEAN = (TypeError, ValueError, OSError, cantap.CantapError)
 """The exceptions that this may raise."""
 
 
@@ -78,6 +80,38 @@ def test_a_wrong_value_is_an_error_that_programs_expect(log, dbc, call):
             if isinstance(result, cantap.Device):
                 result.close()
     assert len(cantap.read(log)) == 2000
+
+
+@pytest.mark.parametrize("suffix", ["blf", "mf4", "pcapng", "asc", "log.gz", "log.xz", "log.zst", "blf.lz4"])
+@pytest.mark.filterwarnings("ignore::cantap.CantapWarning")
+def test_damage_to_a_file_is_never_an_error_of_the_system(log, dbc, tmp_path, suffix):
+    path = tmp_path / f"drive.{suffix}"
+    cantap.write(cantap.read(log), path)
+    whole = path.read_bytes()
+    numbers = random.Random(suffix)
+    for _ in range(40):
+        damaged = bytearray(whole)
+        for _ in range(3):
+            # Heads, with their addresses and lengths, are near the beginning.
+            damaged[numbers.randrange(numbers.choice([len(whole), min(len(whole), 2000)]))] = numbers.randrange(256)
+        path.write_bytes(damaged)
+        for call in (cantap.read, lambda path: cantap.decode(path, dbc)):
+            try:
+                assert call(path).report.file == str(path)
+            except cantap.FormatError as error:
+                assert str(path) in str(error)
+
+
+def test_what_was_read_before_the_damage_of_a_compressed_file_is_there(log, tmp_path):
+    path = tmp_path / "drive.log.gz"
+    text = log.read_bytes()
+    damaged = bytearray(gzip.compress(text[: len(text) // 2]) + gzip.compress(text[len(text) // 2 :]))
+    damaged[-8:-4] = b"\0\0\0\0"
+    path.write_bytes(damaged)
+    with pytest.warns(cantap.CantapWarning, match="undamaged compressed data"):
+        table = cantap.read(path)
+    assert len(table) >= 1000 and table.report.issues and not table.report.is_whole
+    assert cantap.read(log).to_pyarrow().slice(0, 1000).equals(table.to_pyarrow().slice(0, 1000))
 
 
 def test_what_spark_sends_between_processes_arrives(log, dbc):

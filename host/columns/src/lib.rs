@@ -4,6 +4,7 @@
 mod events;
 mod frames;
 mod messages;
+mod names;
 #[cfg(feature = "parquet")]
 pub mod parquet;
 mod records;

@@ -7,16 +7,17 @@ use arrow_array::builder::{ArrayBuilder as _, Float64Builder};
 use arrow_array::types::Int32Type;
 use arrow_array::{ArrayRef, RecordBatch, TimestampNanosecondArray, UInt8Array, UInt32Array};
 use arrow_schema::{DataType, Field, Schema, SchemaRef};
-use cantap_signals::{Decoder, Message, MessageRef, MessageRows, Signal, SignalRows, SignalValue};
+use cantap_signals::{Decoder, MessageRef, MessageRows, Signal, SignalRows, SignalValue};
 use cantap_trace::{Id, PlainFrame, TraceRecord};
 use rustc_hash::FxHashMap;
 
 use crate::events;
-use crate::texts::Texts;
+use crate::names::{ColumnNames, text_column};
+use crate::texts::{Interned, Texts};
 
 /// One message's frames as columns: `time`, `channel`, `id`, then for each signal its physical value as float64 under its own name,
-/// null if the frame does not have it; for a signal with a value table also `NAME.text`. Unit, description, range and cycle time
-/// are in the metadata of the columns and the table.
+/// null if the frame does not have it; for a signal with a value table also `NAME.text`. A signal whose name another column has
+/// already is called `MESSAGE.NAME`. Unit, description, range and cycle time are in the metadata of the columns and the table.
 pub struct MessageColumns {
     schema: SchemaRef,
     /// Columns that every row has.
@@ -24,12 +25,18 @@ pub struct MessageColumns {
     channel: Vec<u8>,
     id: Vec<u32>,
     signals: Vec<Column>,
-    /// The last rows' frames, of which there are no values in the columns yet: those are made together, when it is known how many
-    /// there are, for a column that grows is copied again and again.
-    waiting: MessageRows,
+    /// The last rows' frames, which are not in the columns yet: those are made together, when it is known how many there are, for a
+    /// column that grows is copied again and again. So are these, which is why they are kept in blocks.
+    full: Vec<Vec<PlainFrame>>,
+    full_rows: usize,
+    last: Vec<PlainFrame>,
+    rows: MessageRows,
     values: u64,
     scratch: Scratch,
 }
+
+/// How many frames stand in a block: as many as [`MessageRows`] decodes at once.
+const BLOCK_FRAMES: usize = 512;
 
 struct Column {
     value: Float64Builder,
@@ -58,14 +65,32 @@ impl Keys {
     /// Longer signals have a table by value rather than by bits.
     const MOST_BITS: u16 = 8;
 
-    fn of(signal: &Signal) -> Self {
-        let places = signal.values.iter().enumerate().map(|(place, (value, _))| (value, place as i32));
-        let places: FxHashMap<i64, i32> = places.collect();
+    /// The column for a signal's texts, and their indexes in it.
+    fn of(signal: &Signal) -> (Texts<Int32Type>, Self) {
+        // Two values may have the same text, which is in the column's texts once: programs that read it demand that.
+        let mut texts = Interned::default();
+        let places: FxHashMap<i64, i32> =
+            signal.values.iter().map(|(value, text)| (value, texts.place(text))).collect();
+        let keys = Self::by_places(signal, places);
+        (Texts::new(texts.into_texts()), keys)
+    }
+
+    fn by_places(signal: &Signal, places: FxHashMap<i64, i32>) -> Self {
         if !(1..=Self::MOST_BITS).contains(&signal.length) {
             return Self::ByValue(places);
         }
         let place = |raw| signal.table_key(raw).and_then(|key| places.get(&key)).copied();
         Self::ByBits((0..1 << signal.length).map(|raw| place(raw).unwrap_or(NO_TEXT)).collect())
+    }
+
+    /// Appends those of several values.
+    fn get_all(&self, signal: &Signal, raw: &[u64], keys: &mut Vec<i32>) {
+        match self {
+            Self::ByBits(places) => {
+                keys.extend(raw.iter().map(|raw| places.get(*raw as usize).copied().unwrap_or(NO_TEXT)));
+            }
+            Self::ByValue(_) => keys.extend(raw.iter().map(|raw| self.get(signal, *raw))),
+        }
     }
 
     fn get(&self, signal: &Signal, raw: u64) -> i32 {
@@ -84,13 +109,15 @@ impl MessageColumns {
         let mut fields = events::fields();
         fields.truncate(2);
         fields.push(Field::new("id", DataType::UInt32, false));
+        let mut names = ColumnNames::of(&fields);
         let mut signals = Vec::new();
         for signal in &message.signals {
-            let label = signal.label();
-            fields.push(Field::new(&*label, DataType::Float64, true).with_metadata(metadata(signal)));
-            let text = (!signal.values.is_empty()).then(|| {
-                fields.push(Field::new(format!("{label}.text"), Texts::<Int32Type>::data_type(), true));
-                (Texts::new(signal.values.iter().map(|(_, text)| text)), Keys::of(signal))
+            let has_texts = !signal.values.is_empty();
+            let name = names.choose(&signal.label(), &message.name, has_texts);
+            fields.push(Field::new(&*name, DataType::Float64, true).with_metadata(metadata(signal)));
+            let text = has_texts.then(|| {
+                fields.push(Field::new(text_column(&name), Texts::<Int32Type>::data_type(), true));
+                Keys::of(signal)
             });
             signals.push(Column { value: Float64Builder::new(), text });
         }
@@ -108,7 +135,10 @@ impl MessageColumns {
             channel: Vec::new(),
             id: Vec::new(),
             signals,
-            waiting: decoder.rows(reference),
+            full: Vec::new(),
+            full_rows: 0,
+            last: Vec::new(),
+            rows: decoder.rows(reference),
             values: 0,
             scratch: Scratch::default(),
         }
@@ -121,38 +151,68 @@ impl MessageColumns {
 
     /// Whether a frame of so many bytes has a value for the table, whatever they are: chosen signals may be there in some frames only.
     pub fn has_value(&self, data_len: usize) -> bool {
-        self.waiting.is_certain(data_len)
+        self.rows.is_certain(data_len)
     }
 
     /// Appends a row for a data frame of the message, decoding it; nothing for another record.
     #[inline]
     pub fn push(&mut self, record: &TraceRecord) {
         let Some(frame) = record.frame() else { return };
-        if !self.waiting.push(frame.data()) {
-            let mut values = std::mem::take(&mut self.scratch.values);
-            values.clear();
-            self.waiting.one(frame.data(), &mut values);
-            self.push_values(record, &values);
-            self.scratch.values = values;
-            return;
+        match PlainFrame::of(record) {
+            Some(frame) => self.push_frame(&frame),
+            None => self.push_one(record.time_ns, record.channel, frame.id(), frame.data()),
         }
-        self.begin_row(record.time_ns, record.channel, frame.id());
     }
 
     /// Appends a row for a frame of the message, as [`Self::push`] does for its record.
     #[inline]
     pub fn push_frame(&mut self, frame: &PlainFrame) {
-        self.waiting.push_word(frame.data, frame.len);
-        self.begin_row(frame.time_ns, frame.channel, frame.id);
+        if self.last.len() < self.last.capacity() {
+            self.last.push(*frame);
+        } else {
+            self.push_beyond(frame);
+        }
+    }
+
+    /// A frame that begins a block, or must not be in one.
+    #[cold]
+    #[inline(never)]
+    fn push_beyond(&mut self, frame: &PlainFrame) {
+        if self.rows.message().container.is_some() {
+            let bytes = frame.data.to_le_bytes();
+            self.push_one(frame.time_ns, frame.channel, frame.id, &bytes[..usize::from(frame.len)]);
+            return;
+        }
+        let full = std::mem::replace(&mut self.last, Vec::with_capacity(BLOCK_FRAMES));
+        if !full.is_empty() {
+            self.full_rows += full.len();
+            self.full.push(full);
+        }
+        self.last.push(*frame);
+    }
+
+    /// Appends a row for a frame that cannot be decoded together with others.
+    fn push_one(&mut self, time_ns: i64, channel: u8, id: Id, data: &[u8]) {
+        let mut values = std::mem::take(&mut self.scratch.values);
+        values.clear();
+        self.rows.one(data, &mut values);
+        self.push_row(time_ns, channel, id, &values);
+        self.scratch.values = values;
     }
 
     /// Appends a row for a frame of the message, with the values decoded from it; nothing for another record.
     pub fn push_values(&mut self, record: &TraceRecord, values: &[SignalValue]) {
         let Some(frame) = record.frame() else { return };
+        self.push_row(record.time_ns, record.channel, frame.id(), values);
+    }
+
+    fn push_row(&mut self, time_ns: i64, channel: u8, id: Id, values: &[SignalValue]) {
         self.decode();
-        self.begin_row(record.time_ns, record.channel, frame.id());
+        self.time_ns.push(time_ns);
+        self.channel.push(channel);
+        self.id.push(id.raw());
         self.values += values.len() as u64;
-        let message = self.waiting.message();
+        let message = self.rows.message();
         for value in values {
             let signal = &message.signals[value.signal as usize];
             let column = &mut self.signals[value.signal as usize];
@@ -165,34 +225,42 @@ impl MessageColumns {
         self.fill();
     }
 
-    #[inline]
-    fn begin_row(&mut self, time_ns: i64, channel: u8, id: Id) {
-        self.time_ns.push(time_ns);
-        self.channel.push(channel);
-        self.id.push(id.raw());
+    fn waiting_rows(&self) -> usize {
+        self.full_rows + self.last.len()
     }
 
     /// How many values at most the frames have that wait for being decoded.
     pub(crate) fn waiting_cells(&self) -> usize {
-        self.waiting.len() * self.signals.len()
+        self.waiting_rows() * self.signals.len()
     }
 
     /// Decodes the frames that wait for it.
     pub(crate) fn decode(&mut self) {
-        if self.waiting.is_empty() {
+        let count = self.waiting_rows();
+        if count == 0 {
             return;
         }
-        let Self { signals, waiting, values, scratch, .. } = self;
-        let rows = waiting.len();
-        waiting.decode(|message, found| {
-            let signal = &message.signals[found.signal as usize];
-            let column = &mut signals[found.signal as usize];
-            column.expect(rows);
-            column.push(message, signal, &found, scratch);
-            *values +=
-                found.there.map_or(found.raw.len(), |there| there.iter().filter(|there| **there).count())
-                    as u64;
-        });
+        let Self { time_ns, channel, id, signals, full, full_rows, last, rows, values, scratch, .. } = self;
+        time_ns.reserve(count);
+        channel.reserve(count);
+        id.reserve(count);
+        for mut block in full.drain(..).chain([std::mem::take(last)]) {
+            time_ns.extend(block.iter().map(|frame| frame.time_ns));
+            channel.extend(block.iter().map(|frame| frame.channel));
+            id.extend(block.iter().map(|frame| frame.id.raw()));
+            rows.push_words(block.iter().map(|frame| (frame.data, frame.len)));
+            rows.decode(|message, found| {
+                let signal = &message.signals[found.signal as usize];
+                let column = &mut signals[found.signal as usize];
+                column.expect(count);
+                column.push(signal, &found, scratch);
+                let there = |there: &[bool]| there.iter().filter(|there| **there).count();
+                *values += found.there.map_or(found.raw.len(), there) as u64;
+            });
+            block.clear();
+            *last = block;
+        }
+        *full_rows = 0;
         self.fill();
     }
 
@@ -212,7 +280,7 @@ impl MessageColumns {
 
     /// The number of rows so far.
     pub fn rows(&self) -> usize {
-        self.time_ns.len()
+        self.time_ns.len() + self.waiting_rows()
     }
 
     /// The number of values decoded so far, including those that only say that there is none.
@@ -250,20 +318,21 @@ impl Column {
     }
 
     /// Appends a signal's values in several frames.
-    fn push(&mut self, message: &Message, signal: &Signal, rows: &SignalRows, scratch: &mut Scratch) {
+    fn push(&mut self, signal: &Signal, rows: &SignalRows, scratch: &mut Scratch) {
         let is_there = |at: usize| rows.there.is_none_or(|there| there[at]);
-        if rows.there.is_none() && !message.j1939 {
-            self.value.append_slice(rows.value);
-        } else {
-            let is_value =
-                |(at, raw): (usize, &u64)| is_there(at) && message.indicator(signal, *raw).is_none();
-            scratch.is_value.clear();
-            scratch.is_value.extend(rows.raw.iter().enumerate().map(is_value));
-            self.value.append_values(rows.value, &scratch.is_value);
+        match (rows.there, rows.indicators) {
+            (None, None) => self.value.append_slice(rows.value),
+            (Some(there), None) => self.value.append_values(rows.value, there),
+            (_, Some(indicators)) => {
+                let is_value = |(at, is_indicator): (usize, &bool)| !is_indicator && is_there(at);
+                scratch.is_value.clear();
+                scratch.is_value.extend(indicators.iter().enumerate().map(is_value));
+                self.value.append_values(rows.value, &scratch.is_value);
+            }
         }
         if let Some((texts, keys)) = &mut self.text {
             scratch.keys.clear();
-            scratch.keys.extend(rows.raw.iter().map(|raw| keys.get(signal, *raw)));
+            keys.get_all(signal, rows.raw, &mut scratch.keys);
             if rows.there.is_none() && !scratch.keys.contains(&NO_TEXT) {
                 texts.push_slice(&scratch.keys);
                 return;

@@ -1,6 +1,5 @@
 //! A table with a row per decoded value.
 
-use std::collections::HashMap;
 use std::sync::Arc;
 
 use arrow_array::RecordBatch;
@@ -12,7 +11,7 @@ use cantap_trace::{TraceEvent, TraceRecord};
 use rustc_hash::FxHashMap;
 
 use crate::events::{self, Events};
-use crate::texts::Texts;
+use crate::texts::{Interned, Texts};
 
 /// Decoded values as columns, in the trace's order. Events other than frames have rows too, so that a gap in a series is
 /// explained.
@@ -57,25 +56,6 @@ struct SignalKeys {
     texts: FxHashMap<i64, i32>,
 }
 
-/// Texts without duplicates, in the order in which they came.
-#[derive(Default)]
-struct Interned {
-    texts: Vec<String>,
-    places: HashMap<String, i32>,
-}
-
-impl Interned {
-    fn place(&mut self, text: &str) -> i32 {
-        if let Some(place) = self.places.get(text) {
-            return *place;
-        }
-        let place = self.texts.len() as i32;
-        self.texts.push(text.to_owned());
-        self.places.insert(text.to_owned(), place);
-        place
-    }
-}
-
 /// The columns' names and types.
 pub fn fields() -> Vec<Field> {
     let mut fields = events::fields();
@@ -113,12 +93,12 @@ impl SignalColumns {
             events: Events::new(VALUE),
             id: UInt32Builder::new(),
             extended: BooleanBuilder::new(),
-            message: Texts::new(messages.texts),
-            signal: Texts::new(signals.texts),
+            message: Texts::new(messages.into_texts()),
+            signal: Texts::new(signals.into_texts()),
             value: Float64Builder::new(),
             raw: UInt64Builder::new(),
-            text: Texts::new(texts.texts),
-            unit: Texts::new(units.texts),
+            text: Texts::new(texts.into_texts()),
+            unit: Texts::new(units.into_texts()),
             keys,
             indicators,
         }

@@ -1,5 +1,6 @@
 //! Columns of texts from a set known in advance: an index per row, and each text once.
 
+use std::collections::HashMap;
 use std::sync::Arc;
 
 use arrow_array::builder::PrimitiveBuilder;
@@ -14,7 +15,7 @@ pub struct Texts<K: ArrowDictionaryKeyType> {
 }
 
 impl<K: ArrowDictionaryKeyType> Texts<K> {
-    /// A column of these texts; there must be fewer than the index type can count.
+    /// A column of these texts, all of them different; there must be fewer than the index type can count.
     pub fn new<T: AsRef<str>>(texts: impl IntoIterator<Item = T>) -> Self {
         Self { texts: Arc::new(StringArray::from_iter_values(texts)), keys: PrimitiveBuilder::new() }
     }
@@ -68,5 +69,30 @@ impl<K: ArrowDictionaryKeyType> Texts<K> {
     pub fn take(&mut self) -> ArrayRef {
         let texts = Arc::clone(&self.texts) as ArrayRef;
         Arc::new(DictionaryArray::new(self.keys.finish(), texts))
+    }
+}
+
+/// Texts without duplicates, in the order in which they came.
+#[derive(Default)]
+pub struct Interned {
+    texts: Vec<String>,
+    places: HashMap<String, i32>,
+}
+
+impl Interned {
+    /// A text's place, which is a new one if it was not there.
+    pub fn place(&mut self, text: &str) -> i32 {
+        if let Some(place) = self.places.get(text) {
+            return *place;
+        }
+        let place = self.texts.len() as i32;
+        self.texts.push(text.to_owned());
+        self.places.insert(text.to_owned(), place);
+        place
+    }
+
+    /// All of them.
+    pub fn into_texts(self) -> Vec<String> {
+        self.texts
     }
 }

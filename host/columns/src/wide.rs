@@ -8,8 +8,10 @@ use arrow_array::{ArrayRef, RecordBatch};
 use arrow_schema::{DataType, Field, Schema, SchemaRef};
 
 use crate::events;
+use crate::names::ColumnNames;
 
-/// Signals side by side: `time`, then a float64 for each name, null if there is no value at that time.
+/// Signals side by side: `time`, then a float64 for each name, null if there is no value at that time. A signal called `time` has
+/// the column `signal.time`.
 pub struct WideColumns {
     schema: SchemaRef,
     time: TimestampNanosecondBuilder,
@@ -21,8 +23,9 @@ impl WideColumns {
     pub fn new<'a>(names_and_units: impl IntoIterator<Item = (&'a str, &'a str)>) -> Self {
         let mut fields = events::fields();
         fields.truncate(1);
+        let mut names = ColumnNames::of(&fields);
         fields.extend(names_and_units.into_iter().map(|(name, unit)| {
-            let field = Field::new(name, DataType::Float64, true);
+            let field = Field::new(names.choose(name, "signal", false), DataType::Float64, true);
             if unit.is_empty() {
                 field
             } else {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use arrow_array::RecordBatch;
 use arrow_array::cast::AsArray;
 use arrow_array::types::{Float64Type, Int32Type, UInt64Type};
-use cantap_columns::{FrameColumns, MessageColumns, MessageTables, SignalColumns, records};
+use cantap_columns::{FrameColumns, MessageColumns, MessageTables, SignalColumns, WideColumns, records};
 use cantap_signals::{
     ByteOrder, Database, Decoder, Message, Multiplexed, Signal, Source, ValueKind, ValueTable, dbc,
 };
@@ -141,6 +141,22 @@ prop_compose! {
     }
 }
 
+/// The frame says what is in it: it cannot be decoded together with others.
+#[test]
+fn a_plain_frame_that_contains_pdus_has_their_values() {
+    let file = include_bytes!("../../signals/tests/data/container.arxml");
+    let database = cantap_signals::arxml::parse("container.arxml", file).unwrap();
+    let decoder = Arc::new(Decoder::new(vec![Source { channel: None, database }]));
+    let record = frame(1_000, "123#07010203030801F4");
+    let mut tables = [(); 2].map(|()| MessageTables::new(Arc::clone(&decoder), false));
+    tables[0].push(&record);
+    tables[1].push_frames(&[PlainFrame::of(&record).unwrap()]);
+    // Counter=7 Engine.Counter=8 Engine.Speed=500
+    assert_eq!(tables.each_mut().map(MessageTables::counts), [(1, 3); 2]);
+    let [mut of_record, mut of_frame] = tables.map(|tables| tables.finish().0.remove(0).1);
+    assert_eq!(of_record.take(), of_frame.take());
+}
+
 proptest! {
     /// Frames decoded together have the same values as when decoded one by one: whatever the signals, J1939 or not, chosen or not,
     /// in short frames and in CAN FD frames.
@@ -248,4 +264,37 @@ proptest! {
             prop_assert_eq!(beside.take(), events.clone());
         }
     }
+}
+
+#[test]
+fn no_two_columns_have_one_name_and_no_text_is_there_twice() {
+    let text = br#"VERSION ""
+BU_: ECU
+BO_ 256 Gear: 8 ECU
+ SG_ time : 0|8@1+ (1,0) [0|4] ""  ECU
+ SG_ Other : 8|8@1+ (1,0) [0|4] ""  ECU
+ SG_ Lever : 16|8@1+ (1,0) [0|4] ""  ECU
+VAL_ 256 Lever 0 "Park" 3 "Drive" 4 "Drive" ;
+"#;
+    let mut database = dbc::parse("gear.dbc", text).unwrap();
+    // Other kinds of databases have names with a point.
+    "Lever.text".clone_into(&mut database.messages[0].signals[1].name);
+    let decoder = Decoder::new(vec![Source { channel: None, database }]);
+    let (reference, ..) = decoder.messages().next().unwrap();
+    let mut columns = MessageColumns::new(&decoder, reference);
+    for data in ["100#010203", "100#010204", "100#010200", "100#010205"] {
+        columns.push(&frame(0, data));
+    }
+    let batch = columns.take();
+    let schema = batch.schema();
+    let names: Vec<_> = schema.fields().iter().map(|field| field.name().as_str()).collect();
+    assert_eq!(names, ["time", "channel", "id", "Gear.time", "Lever.text", "Gear.Lever", "Gear.Lever.text"]);
+    let texts = batch.column(6).as_dictionary::<Int32Type>();
+    assert_eq!(texts.values().as_string::<i32>().iter().flatten().collect::<Vec<_>>(), ["Park", "Drive"]);
+    let keys: Vec<_> = texts.keys().iter().collect();
+    assert_eq!(keys, [Some(1), Some(1), Some(0), None]);
+    let wide = WideColumns::new([("time", "s"), ("Speed", ""), ("Speed", "")]);
+    let schema = wide.schema();
+    let names: Vec<_> = schema.fields().iter().map(|field| field.name().as_str()).collect();
+    assert_eq!(names, ["time", "signal.time", "Speed", "signal.Speed"]);
 }

@@ -72,6 +72,8 @@ const OWN_MARK: u8 = b'c';
 
 #[cfg(test)]
 mod tests {
+    use std::io::Write;
+
     use super::super::tests;
     use crate::{Format, WriteOptions};
     use cantap_trace::TraceRecord;
@@ -91,11 +93,94 @@ mod tests {
         }
     }
 
-    /// A file with a single object.
-    fn object(kind: u32, header_version: u16, fields: &[u8]) -> Vec<u8> {
+    /// The file's head, without objects.
+    fn head() -> Vec<u8> {
         let mut bytes = file(&[]);
         bytes.truncate(super::FILE_HEADER_BYTES);
         bytes[16..24].fill(0);
+        bytes
+    }
+
+    /// A container of these bytes, compressed or not.
+    fn container(bytes: &[u8], is_compressed: bool) -> Vec<u8> {
+        let method = if is_compressed { super::COMPRESSION_ZLIB } else { super::COMPRESSION_NONE };
+        let mut data = bytes.to_vec();
+        if is_compressed {
+            let mut encoder = flate2::write::ZlibEncoder::new(Vec::new(), flate2::Compression::fast());
+            encoder.write_all(bytes).unwrap();
+            data = encoder.finish().unwrap();
+        }
+        let mut container = super::OBJECT_MAGIC.to_vec();
+        let len = super::BASE_HEADER_BYTES + super::CONTAINER_FIELDS_BYTES + data.len();
+        container.extend([super::BASE_HEADER_BYTES as u8, 0, 1, 0]);
+        container.extend((len as u32).to_le_bytes());
+        container.extend(super::LOG_CONTAINER.to_le_bytes());
+        container.extend(method.to_le_bytes());
+        container.extend([0; 6]);
+        container.extend((bytes.len() as u32).to_le_bytes());
+        container.extend([0; 4]);
+        container.extend(data);
+        container
+    }
+
+    /// Objects of every kind that is read, mostly frames about which there is nothing else to say, with numbers that are mostly small.
+    fn any_object() -> impl Strategy<Value = Vec<u8>> {
+        let kind = prop::sample::select(vec![1_u32, 1, 1, 86, 86, 2, 73, 92, 100, 101, 104, 126, 10, 115]);
+        let number = prop::sample::select(vec![0_u8, 0, 0, 0, 0, 1, 2, 8, 9, 0x80, 0xFF]);
+        let flags = prop::sample::select(vec![0_u8, 1, 2, 2]);
+        let version = prop::sample::select(vec![1_u16, 1, 1, 1, 2, 9]);
+        let len = prop::sample::select(vec![16_usize, 16, 16, 16, 24, 72, 0]);
+        (kind, version, prop::collection::vec(number, 72), flags, len, 0..4_usize).prop_map(
+            |(kind, version, fields, flags, len, padding)| {
+                let mut bytes = object(kind, version, &fields[..len]).split_off(super::FILE_HEADER_BYTES);
+                bytes[16] = flags;
+                bytes[24..28].copy_from_slice(&fields[..4]);
+                bytes.extend(vec![0; if padding == 3 { len % 4 } else { padding }]);
+                bytes
+            },
+        )
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(1000))]
+
+        /// Objects that continue in the next container, with and without compression, whole and damaged: plain frames are the records,
+        /// which [`tests::read`] checks.
+        #[test]
+        fn plain_frames_are_the_records_whatever_the_objects_and_the_damage(
+            objects in prop::collection::vec(any_object(), 0..40),
+            containers in prop::collection::vec((any::<prop::sample::Index>(), any::<bool>()), 0..4),
+            damage in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>(), any::<bool>()), 0..4),
+            keep in prop::option::weighted(0.2, any::<prop::sample::Index>()),
+        ) {
+            let mut objects = objects.concat();
+            // Damage to what is compressed, and to the file.
+            let count = objects.len();
+            for (at, value, _) in damage.iter().filter(|(.., inside)| *inside && count > 0) {
+                objects[at.index(count)] = *value;
+            }
+            let mut bytes = head();
+            let mut ends: Vec<_> = containers.iter().map(|(end, _)| end.index(objects.len() + 1)).collect();
+            ends.sort_unstable();
+            let mut from = 0;
+            for (end, (_, is_compressed)) in ends.into_iter().zip(&containers) {
+                bytes.extend(container(&objects[from..end], *is_compressed));
+                from = end;
+            }
+            // The rest without a container.
+            bytes.extend(&objects[from..]);
+            for (at, value, _) in damage.iter().filter(|(.., inside)| !inside) {
+                let at = at.index(bytes.len());
+                bytes[at] = *value;
+            }
+            bytes.truncate(keep.map_or(bytes.len(), |keep| keep.index(bytes.len())));
+            tests::read(Format::Blf, &bytes);
+        }
+    }
+
+    /// A file with a single object.
+    fn object(kind: u32, header_version: u16, fields: &[u8]) -> Vec<u8> {
+        let mut bytes = head();
         let len = (super::HEADER_BYTES + fields.len()) as u32;
         let mut header = [0; super::HEADER_BYTES];
         header[..4].copy_from_slice(super::OBJECT_MAGIC);

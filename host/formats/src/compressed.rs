@@ -242,4 +242,54 @@ mod tests {
             assert!(read.len() >= least, "{percent} %: {} of {}", read.len(), text.len());
         }
     }
+
+    /// What can be unpacked is read; the rest is an issue with the file and no error of the system.
+    #[test]
+    fn a_damaged_file_gives_what_comes_before_the_damage_and_says_where_it_ends() {
+        let directory = tempfile::tempdir().unwrap();
+        let text = &text()[..500_000];
+        let frames = |bytes: &[u8]| {
+            let path = directory.path().join("a.log");
+            std::fs::write(&path, bytes).unwrap();
+            let (mut frames, mut issues) = (Vec::new(), Vec::new());
+            for found in crate::open_reader(&path, &crate::ReadOptions::default()).unwrap() {
+                match found {
+                    Ok(record) => frames.push(record),
+                    Err(issue) => issues.push(issue),
+                }
+            }
+            (frames, issues)
+        };
+        let (whole, _) = frames(text);
+        for compression in [
+            Compression::Gzip,
+            #[cfg(feature = "zstd")]
+            Compression::Zstd,
+            Compression::Lz4,
+            Compression::Xz,
+        ] {
+            let path = directory.path().join("a");
+            let mut compressed = Compressed::new(File::create(&path).unwrap(), compression).unwrap();
+            // As when something is captured: in several streams.
+            for piece in text.chunks(100_000) {
+                compressed.write(piece).unwrap();
+                compressed.flush().unwrap();
+            }
+            compressed.finish().unwrap();
+            let mut damaged = std::fs::read(&path).unwrap();
+            let at = damaged.len() * 3 / 4;
+            damaged[at..at + 8].fill(0xA5);
+            let (found, issues) = frames(&damaged);
+            assert!(issues.iter().all(|issue| !matches!(issue.fault, crate::Fault::Io(_))), "{issues:?}");
+            let told = issues.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n");
+            assert!(told.contains("undamaged compressed data"), "{compression:?}: {told}");
+            // Three of five streams are intact.
+            let intact = whole.len() * 3 / 5 - 1;
+            assert!(
+                found.len() > intact && found[..intact] == whole[..intact],
+                "{compression:?}: {}",
+                found.len()
+            );
+        }
+    }
 }

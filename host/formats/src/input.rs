@@ -41,6 +41,7 @@ pub(crate) struct Input {
     may_wait: bool,
     ended: bool,
     cut: bool,
+    damage: Option<String>,
     stop: Box<dyn Fn() -> bool + Send>,
     /// The same file again, if it is a plain one: for formats read with random access.
     file: Option<File>,
@@ -94,6 +95,7 @@ impl Input {
             may_wait: true,
             ended: false,
             cut: false,
+            damage: None,
             stop: Box::new(|| false),
             file: None,
             is_as_it_is: true,
@@ -129,17 +131,20 @@ impl Input {
             input.is_as_it_is = false;
         }
         if let Some(order) = Utf16::of_content(input.peek(utf16::HEAD_BYTES)?) {
-            let follow = input.follow;
-            input = Self::new(Box::new(ToUtf8::new(input.into_rest(), order, follow)), follow);
-            input.is_as_it_is = false;
+            input = input.converted(|rest, follow| Box::new(ToUtf8::new(rest, order, follow)));
         }
         // Only what is there is looked at: more may be long in coming.
         if carriage_return::ends_lines(input.buffered()) {
-            let follow = input.follow;
-            input = Self::new(Box::new(ToLineFeed(input.into_rest())), follow);
-            input.is_as_it_is = false;
+            input = input.converted(|rest, _| Box::new(ToLineFeed(rest)));
         }
         input.without_byte_order_mark()
+    }
+
+    /// The same, passed through something that is told whether the end only means "not yet". What is known about unpacking stays.
+    fn converted(mut self, through: impl FnOnce(Box<dyn Read + Send>, bool) -> Box<dyn Read + Send>) -> Self {
+        let (follow, cut, damage) = (self.follow, self.cut, self.damage.take());
+        let source = through(Box::new(self.into_rest()), follow);
+        Self { cut, damage, is_as_it_is: false, ..Self::new(source, follow) }
     }
 
     /// Skips UTF-8's byte order mark, which some editors put at the beginning of a text.
@@ -215,6 +220,11 @@ impl Input {
         self.cut
     }
 
+    /// Why compressed data could not be unpacked to their end, if they are damaged.
+    pub(crate) fn damage(&self) -> Option<&str> {
+        self.damage.as_deref()
+    }
+
     /// Offset of the next byte in the decompressed file.
     pub(crate) fn offset(&self) -> u64 {
         self.offset
@@ -259,6 +269,12 @@ impl Input {
                 Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => {
                     self.ended = true;
                     self.cut = true;
+                    return Ok(false);
+                }
+                // The system's errors have a number. Everything else comes from what unpacks the file, and is its damage.
+                Err(error) if !self.is_as_it_is && error.raw_os_error().is_none() => {
+                    self.ended = true;
+                    self.damage = Some(error.to_string());
                     return Ok(false);
                 }
                 Err(error) => return Err(error),

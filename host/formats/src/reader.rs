@@ -275,6 +275,10 @@ impl TraceReader {
             Ok(Found::Issue(place, fault)) => Beyond::Issue(self.issue(place, fault)),
             Ok(Found::End) => {
                 self.ended = true;
+                if let Some(damage) = self.input.damage() {
+                    let fault = Fault::malformed("undamaged compressed data to the end", damage.as_bytes());
+                    return Beyond::Issue(self.issue(Place::Offset(self.input.offset()), fault));
+                }
                 let is_empty = self.head.is_empty() && self.input.offset() == 0 && self.issues == 0;
                 if is_empty && !self.input.follows() {
                     if self.format.has_head() {

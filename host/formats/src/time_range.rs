@@ -18,7 +18,7 @@ pub enum TimePoint {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
     "'{0}' is not a time; write seconds from the first record (12.5, or 90s, 10m, 2h), seconds since 1970 \
-     (1410714882.5), or a date in UTC (2014-09-14T17:14:42)"
+     (1410714882.5), or a date in UTC (2014-09-14 or 2014-09-14T17:14:42)"
 )]
 pub struct BadTime(String);
 
@@ -30,7 +30,8 @@ impl FromStr for TimePoint {
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let bad = || BadTime(text.to_owned());
-        if let Some(time_ns) = date_time_ns(text.trim_end_matches('Z')) {
+        let day_only = || date_time_ns(&format!("{text}T00:00:00"));
+        if let Some(time_ns) = date_time_ns(text.trim_end_matches('Z')).or_else(day_only) {
             return Ok(Self::At(time_ns));
         }
         let (number, factor) = match text.as_bytes().last() {
@@ -102,10 +103,11 @@ mod tests {
             ("1410714882.5", TimePoint::At(1_410_714_882_500_000_000)),
             ("2014-09-14T17:14:42.5Z", TimePoint::At(1_410_714_882_500_000_000)),
             ("2014-09-14 17:14:42", TimePoint::At(1_410_714_882_000_000_000)),
+            ("2014-09-14", TimePoint::At(1_410_652_800_000_000_000)),
         ] {
             assert_eq!(text.parse(), Ok(point), "{text}");
         }
-        for bad in ["", "s", "noon", "1e5", "2014-13-01T00:00:00", "5d"] {
+        for bad in ["", "s", "noon", "1e5", "2014-13-01T00:00:00", "2014-13-01", "2014-09", "5d"] {
             assert!(bad.parse::<TimePoint>().is_err(), "{bad}");
         }
     }

@@ -39,6 +39,10 @@ impl Whole {
     /// The same, appended.
     pub(crate) fn append_at(&mut self, at: u64, len: usize, bytes: &mut Vec<u8>) -> io::Result<()> {
         let there = self.len.saturating_sub(at).min(len as u64);
+        // In a damaged file an address may be beyond what the system can seek to.
+        if there == 0 {
+            return Ok(());
+        }
         bytes.reserve(there as usize);
         self.source.seek(SeekFrom::Start(at))?;
         let read = self.source.by_ref().take(there).read_to_end(bytes)?;

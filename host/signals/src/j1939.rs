@@ -56,6 +56,19 @@ pub(super) fn raw_of(signal: &Signal, indicator: Indicator) -> Option<u64> {
 }
 
 impl Signal {
+    /// The least bits that may be an indicator in J1939; `None` if none are.
+    pub(super) fn first_indicator(&self) -> Option<u64> {
+        let mask = layout::mask(self.length);
+        match (self.kind, self.length) {
+            _ if self.is_switch => None,
+            (ValueKind::Unsigned, 8 | 16 | 24 | 32) => Some(0xFE << (self.length - 8)),
+            (ValueKind::Unsigned, 2) => Some(2),
+            (ValueKind::Unsigned, 3..) => Some(mask),
+            (ValueKind::Signed, 16..) => Some((mask >> 1) - 1),
+            _ => None,
+        }
+    }
+
     /// Like [`Message::indicator`], for a signal of J1939.
     pub(super) fn indicator(&self, raw: u64) -> Option<Indicator> {
         if self.is_switch {
@@ -127,6 +140,30 @@ mod tests {
             (signed(32), 0xFFFF_FFFF, None),
         ] {
             assert_eq!(signal.indicator(raw), expected, "{} bits, {raw:X}", signal.length);
+        }
+    }
+
+    #[test]
+    fn nothing_below_the_first_indicator_is_one() {
+        let kinds =
+            [ValueKind::Unsigned, ValueKind::Signed, ValueKind::SignMagnitude, ValueKind::OnesComplement];
+        for (kind, length) in kinds.into_iter().flat_map(|kind| (1..=18).map(move |length| (kind, length))) {
+            for is_switch in [false, true] {
+                let signal = Signal { kind, is_switch, ..Signal::new("S", 0, length) };
+                let first = (0..1 << length).find(|raw| signal.indicator(*raw).is_some());
+                assert_eq!(signal.first_indicator(), first, "{kind:?} of {length} bits");
+            }
+        }
+        let longer = |kind, length| Signal { kind, ..Signal::new("S", 0, length) };
+        for (kind, length, first) in [
+            (ValueKind::Unsigned, 24, 0xFE_0000),
+            (ValueKind::Unsigned, 32, 0xFE00_0000),
+            (ValueKind::Unsigned, 64, u64::MAX),
+            (ValueKind::Signed, 64, u64::MAX / 2 - 1),
+        ] {
+            let signal = longer(kind, length);
+            assert_eq!(signal.first_indicator(), Some(first));
+            assert_eq!((signal.indicator(first - 1), signal.indicator(first).is_some()), (None, true));
         }
     }
 

@@ -69,8 +69,8 @@ struct SignalPlan {
     conversion: Conversion,
     index: u32,
     scale: Scale,
-    /// Whether some of its bits may mean that there is no value.
-    indicates: bool,
+    /// The least bits that may mean that there is no value.
+    first_indicator: Option<u64>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -146,8 +146,9 @@ impl MessagePlan {
                 | ValueKind::SignMagnitude
                 | ValueKind::OnesComplement => Conversion::Other,
             };
-            let (scale, indicates) = (signal.scale(), message.j1939);
-            let plan = SignalPlan { field, conversion, index: index as u32, scale, indicates };
+            let first_indicator = if message.j1939 { signal.first_indicator() } else { None };
+            let (index, scale) = (index as u32, signal.scale());
+            let plan = SignalPlan { field, conversion, index, scale, first_indicator };
             let groups = match &signal.contained {
                 None => &mut own,
                 Some(pdu) => match contained.get_mut(pdu.place) {
@@ -220,7 +221,8 @@ impl SignalPlan {
             Conversion::Double(left) => f64::from_bits(raw << left),
             Conversion::Other => message.signals[self.index as usize].raw_to_f64(raw),
         };
-        let no_value = self.indicates && message.signals[self.index as usize].indicator(raw).is_some();
+        let may_indicate = self.first_indicator.is_some_and(|first| raw >= first);
+        let no_value = may_indicate && message.signals[self.index as usize].indicator(raw).is_some();
         let value = if no_value { f64::NAN } else { self.scale.apply(unscaled) };
         Some(SignalValue { signal: self.index, raw, value })
     }

@@ -73,7 +73,7 @@ pub enum PatternError {
     Id(String),
     /// Not data.
     #[error(
-        "{0:?} is not a byte; write hexadecimal digits in pairs such as 1F, 3? or ??, and * for any number of bytes"
+        "{0:?} is not a pattern of bytes; write hexadecimal digits in pairs such as 1F, 3? or ??, and between them * for any number of bytes"
     )]
     Data(String),
 }

@@ -39,10 +39,19 @@ impl PlainFrame {
     /// A frame of the first `len` of these bytes; 8 if there are said to be more.
     #[inline]
     pub const fn new(time_ns: i64, channel: u8, id: Id, len: u8, bytes: [u8; 8]) -> Self {
+        const USED: [u64; 9] = [
+            0,
+            0xFF,
+            0xFFFF,
+            0xFF_FFFF,
+            0xFFFF_FFFF,
+            0xFF_FFFF_FFFF,
+            0xFFFF_FFFF_FFFF,
+            0xFF_FFFF_FFFF_FFFF,
+            u64::MAX,
+        ];
         let len = if len > 8 { 8 } else { len };
-        // In two shifts, because one by 64 is none.
-        let unused = 4 * (8 - len as u32);
-        let data = u64::from_le_bytes(bytes) << unused << unused >> unused >> unused;
+        let data = u64::from_le_bytes(bytes) & USED[len as usize];
         Self { time_ns, data, id, channel, len }
     }
 }

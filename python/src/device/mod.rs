@@ -6,7 +6,7 @@ mod session;
 mod tasks;
 
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use cantap::bit_timing::TimingRequest;
 use cantap::device::{ClockSource, Transmission};
@@ -27,6 +27,7 @@ use self::session::Session;
 use self::tasks::{PeriodicFrame, Reply};
 use crate::error::{DeviceError, Error};
 use crate::frame::{AnyFrame, failure};
+use crate::number::{OfDevice, Whole, entry};
 use crate::report::from_json;
 
 /// Modes by name.
@@ -46,8 +47,6 @@ pub struct Device {
 }
 
 /// How to open a channel, as passed by the Python half.
-#[derive(FromPyObject)]
-#[pyo3(from_item_all)]
 pub struct ChannelOptions {
     bitrate: Option<u32>,
     mode: String,
@@ -60,12 +59,34 @@ pub struct ChannelOptions {
     filters: Vec<String>,
 }
 
-/// A channel from its number.
-pub fn channel(number: u8) -> Result<Channel, Error> {
-    Channel::ALL
-        .into_iter()
-        .find(|channel| channel.number() == number)
-        .ok_or_else(|| Error::argument(format!("there is no channel {number}; a device has 1 and 2")))
+/// Prescaler, segment 1, segment 2, jump width.
+type Segments = (Whole<u16>, Whole<u8>, Whole<u8>, Whole<u8>);
+
+impl<'py> FromPyObject<'_, 'py> for ChannelOptions {
+    type Error = PyErr;
+
+    fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
+        let bitrate: Option<Whole<u32>> = entry(object, "bitrate", "bitrate")?;
+        let sjw: Option<Whole<u8>> = entry(object, "sjw", "sjw")?;
+        let segments: Option<Segments> = entry(object, "segments", "segments")?;
+        Ok(Self {
+            bitrate: bitrate.map(|bitrate| bitrate.0),
+            mode: entry(object, "mode", "mode")?,
+            sample_point: entry(object, "sample_point", "sample_point")?,
+            sjw: sjw.map(|sjw| sjw.0),
+            segments: segments
+                .map(|(prescaler, first, second, jump)| (prescaler.0, first.0, second.0, jump.0)),
+            one_shot: entry(object, "one_shot", "one_shot")?,
+            manual_recovery: entry(object, "manual_recovery", "manual_recovery")?,
+            filters: entry(object, "filters", "filter")?,
+        })
+    }
+}
+
+/// This computer's UTC in nanoseconds since 1970.
+fn utc_ns() -> i64 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    since.as_nanos() as i64
 }
 
 /// Lets Python handle signals.
@@ -151,11 +172,11 @@ impl Device {
     fn open_channel(
         &self,
         py: Python<'_>,
-        number: u8,
+        number: OfDevice,
         options: ChannelOptions,
     ) -> PyResult<(u32, Option<String>)> {
+        let channel = number.0;
         let session = self.session()?;
-        let channel = channel(number)?;
         let opened = py.detach(|| -> Result<_, Error> {
             let device = session.device()?;
             let found = MODES.iter().find(|(_, name)| *name == options.mode);
@@ -185,7 +206,8 @@ impl Device {
                 saved.config.timing
             } else {
                 return Err(Error::argument(format!(
-                    "nothing is saved on the device for channel {number}; give bitrate=, such as 500_000"
+                    "nothing is saved on the device for channel {}; give bitrate=, such as 500_000",
+                    channel.number()
                 )));
             };
             let config = ChannelConfig {
@@ -201,8 +223,8 @@ impl Device {
     }
 
     /// Closes a channel, after everything it captured has arrived.
-    fn close_channel(&self, py: Python<'_>, number: u8) -> PyResult<()> {
-        let channel = channel(number)?;
+    fn close_channel(&self, py: Python<'_>, number: OfDevice) -> PyResult<()> {
+        let channel = number.0;
         self.ask(py, |device| device.close_channel(channel))
     }
 
@@ -221,23 +243,20 @@ impl Device {
     }
 
     /// Starts listening; at most `capacity` records wait.
-    #[pyo3(signature = (channel_number=None, filters=vec![], only_received=false, capacity=1 << 20))]
+    #[pyo3(signature = (channel_number=None, filters=vec![], only_received=false, capacity=Whole(1 << 20)))]
     fn records(
         slf: &Bound<'_, Self>,
-        channel_number: Option<u8>,
+        channel_number: Option<OfDevice>,
         filters: Vec<String>,
         only_received: bool,
-        capacity: usize,
+        capacity: Whole<usize>,
     ) -> PyResult<Records> {
         let session = slf.get().session()?;
         let filters = filters.iter().map(|text| text.parse()).collect::<Result<Vec<Filter>, _>>();
         let filters = filters.map_err(Error::argument)?;
-        if let Some(number) = channel_number {
-            channel(number)?;
-        }
-        let listener =
-            session.fanout.listen(Wanted { channel: channel_number, filters, only_received }, capacity);
-        Ok(Records::new(slf.clone().unbind(), listener))
+        let channel = channel_number.map(|channel| channel.0.number());
+        let listener = session.fanout.listen(Wanted { channel, filters, only_received }, capacity.0);
+        Ok(Records::new(slf.clone().unbind(), session.address.clone(), listener))
     }
 
     /// Sends frames and returns when each was on the bus, in nanoseconds since 1970; without `timeout` they are only passed to the device.
@@ -245,19 +264,28 @@ impl Device {
     fn send(
         &self,
         py: Python<'_>,
-        number: u8,
+        number: OfDevice,
         frames: Vec<AnyFrame>,
         timeout: Option<f64>,
         at_ns: Option<i64>,
         queue_timeout: f64,
     ) -> PyResult<Vec<i64>> {
+        let channel = number.0;
         let session = self.session()?;
-        let channel = channel(number)?;
         let frames: Vec<ClassicFrame> = frames.into_iter().map(|frame| frame.0).collect();
         let seconds = timeout.unwrap_or(queue_timeout);
         let patience = Duration::try_from_secs_f64(seconds)
             .map_err(|_| PyValueError::new_err(format!("{seconds} s is not a valid time to wait")))?
             .min(MOST_TIME);
+        if let (Some(_), Some(at_ns)) = (timeout, at_ns) {
+            let ahead_s = at_ns.saturating_sub(utc_ns()) as f64 / 1e9;
+            if ahead_s > patience.as_secs_f64() {
+                return Err(Error::argument(format!(
+                    "the send time is {ahead_s:.3} s ahead, and timeout= includes the time until then: give more than {seconds} s"
+                ))
+                .into());
+            }
+        }
         let ended = py.detach(|| -> Result<_, Error> {
             let device = session.device()?;
             let at_ticks = at_ns.map(|at_ns| device.clock_map().ticks(cantap::device::UtcNs(at_ns)).0);
@@ -272,7 +300,8 @@ impl Device {
         })?;
         let Some(ended) = ended else {
             return Err(DeviceError::new_err(format!(
-                "not sent on channel {number} within {} s, and taken back; does another node acknowledge, at the same bit rate?",
+                "not sent on channel {} within {} s, and taken back; does another node acknowledge, at the same bit rate?",
+                channel.number(),
                 patience.as_secs_f64()
             )));
         };
@@ -285,8 +314,8 @@ impl Device {
     }
 
     /// Withdraws what a channel still has to send.
-    fn abort(&self, py: Python<'_>, number: u8) -> PyResult<()> {
-        let channel = channel(number)?;
+    fn abort(&self, py: Python<'_>, number: OfDevice) -> PyResult<()> {
+        let channel = number.0;
         self.ask(py, |device| device.abort(channel))
     }
 
@@ -294,29 +323,29 @@ impl Device {
     fn periodic(
         &self,
         py: Python<'_>,
-        number: u8,
+        number: OfDevice,
         frame: AnyFrame,
         period_s: f64,
-        count: u32,
+        count: Whole<u32>,
         modifiers: Vec<tasks::ModifierWords>,
     ) -> PyResult<PeriodicFrame> {
+        let channel = number.0;
         let session = self.session()?;
-        let channel = channel(number)?;
-        Ok(py.detach(|| PeriodicFrame::begin(session, channel, frame.0, period_s, count, &modifiers))?)
+        Ok(py.detach(|| PeriodicFrame::begin(session, channel, frame.0, period_s, count.0, &modifiers))?)
     }
 
     /// Starts a reply.
     fn reply(
         &self,
         py: Python<'_>,
-        number: u8,
+        number: OfDevice,
         to: tasks::Match,
         frame: AnyFrame,
-        count: u32,
+        count: Whole<u32>,
     ) -> PyResult<Reply> {
+        let channel = number.0;
         let session = self.session()?;
-        let channel = channel(number)?;
-        Ok(py.detach(|| Reply::begin(session, channel, to, frame.0, count))?)
+        Ok(py.detach(|| Reply::begin(session, channel, to, frame.0, count.0))?)
     }
 
     /// The status of the device and its channels.
@@ -392,14 +421,14 @@ impl Device {
     }
 
     /// Brings a channel that was opened with manual recovery back from bus-off.
-    fn recover(&self, py: Python<'_>, number: u8) -> PyResult<()> {
-        let channel = channel(number)?;
+    fn recover(&self, py: Python<'_>, number: OfDevice) -> PyResult<()> {
+        let channel = number.0;
         self.ask(py, |device| device.recover(channel))
     }
 
     /// Shows an LED pattern, to find the device among others.
-    fn identify(&self, py: Python<'_>, seconds: u8) -> PyResult<()> {
-        self.ask(py, |device| device.identify(seconds))
+    fn identify(&self, py: Python<'_>, seconds: Whole<u8>) -> PyResult<()> {
+        self.ask(py, |device| device.identify(seconds.0))
     }
 
     /// Closes the channels and ends the session; records already received can still be read.

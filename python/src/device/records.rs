@@ -15,6 +15,7 @@ use super::Device;
 use super::fanout::{Listener, lock};
 use crate::error::{DeviceError, Error};
 use crate::frame::Record;
+use crate::number::Whole;
 use crate::table::Table;
 
 /// The longest delay for Python's signals.
@@ -26,6 +27,9 @@ pub const SLICE: Duration = Duration::from_millis(50);
 pub struct Records {
     /// Kept so that a device that nobody closes stays open as long as somebody listens.
     _device: Py<Device>,
+    /// The device's address, and the process in which it was opened.
+    address: String,
+    process: u32,
     listener: Arc<Listener>,
     waiting: Mutex<std::vec::IntoIter<TraceRecord>>,
     /// The plugin has messages that it has not delivered yet.
@@ -43,7 +47,8 @@ impl Until {
     /// From seconds; `None` for ever.
     pub fn of(timeout: Option<f64>) -> Result<Self, Error> {
         let Some(seconds) = timeout else { return Ok(Self(None)) };
-        let time = Duration::try_from_secs_f64(seconds.max(0.0));
+        // `max` alone would make 0 of what is not a number.
+        let time = Duration::try_from_secs_f64(if seconds < 0.0 { 0.0 } else { seconds });
         let time = time.map_err(|_| Error::argument(format!("{seconds} s is not a valid time to wait")))?;
         Ok(Self(Instant::now().checked_add(time)))
     }
@@ -64,8 +69,15 @@ enum Next {
 }
 
 impl Records {
-    pub fn new(device: Py<Device>, listener: Arc<Listener>) -> Self {
-        Self { _device: device, listener, waiting: Mutex::default(), is_handed_out: AtomicBool::new(false) }
+    pub fn new(device: Py<Device>, address: String, listener: Arc<Listener>) -> Self {
+        Self {
+            _device: device,
+            address,
+            process: std::process::id(),
+            listener,
+            waiting: Mutex::default(),
+            is_handed_out: AtomicBool::new(false),
+        }
     }
 
     /// A record that is already there.
@@ -78,7 +90,14 @@ impl Records {
         next
     }
 
+    /// That this process may take records: after a fork, the thread that brings them is in the other one, which may have held any
+    /// lock in that instant.
+    fn check_process(&self) -> Result<(), Error> {
+        if self.process == std::process::id() { Ok(()) } else { Err(Error::other_process(&self.address)) }
+    }
+
     fn next(&self, py: Python<'_>, until: Until) -> PyResult<Next> {
+        self.check_process()?;
         if let Some(record) = self.at_hand() {
             return Ok(Next::One(record));
         }
@@ -148,8 +167,9 @@ impl Records {
     }
 
     /// Records of up to `seconds`, at most `rows`, as a table; fewer once the device has been closed.
-    #[pyo3(signature = (seconds=None, rows=65_536))]
-    fn batch(&self, py: Python<'_>, seconds: Option<f64>, rows: usize) -> PyResult<Table> {
+    #[pyo3(signature = (seconds=None, rows=Whole(65_536)), text_signature = "($self, seconds=None, rows=65536)")]
+    fn batch(&self, py: Python<'_>, seconds: Option<f64>, rows: Whole<usize>) -> PyResult<Table> {
+        let rows = rows.0;
         if rows == 0 {
             return Err(Error::argument("a batch has at least one row").into());
         }
@@ -200,6 +220,7 @@ impl Records {
 
     /// For the plugin: sets what is received from now on.
     fn _filter(&self, filters: Vec<String>, only_received: bool) -> PyResult<()> {
+        self.check_process()?;
         let filters = filters.iter().map(|text| text.parse()).collect::<Result<Vec<_>, _>>();
         let filters = filters.map_err(Error::argument)?;
         self.listener.want(|wanted| {
@@ -218,13 +239,15 @@ impl Records {
 
     /// Frames lost here because this program did not take them, on channels 1 and 2.
     #[getter]
-    fn lost(&self) -> (u64, u64) {
+    fn lost(&self) -> PyResult<(u64, u64)> {
+        self.check_process()?;
         let [first, second] = self.listener.lost();
-        (first, second)
+        Ok((first, second))
     }
 
     /// A file descriptor that is readable while a record is waiting.
     fn fileno(&self) -> PyResult<i32> {
+        self.check_process()?;
         let is_waiting =
             self.is_handed_out.load(Ordering::Relaxed) || !lock(&self.waiting).as_slice().is_empty();
         self.listener.signal(is_waiting)?;
@@ -237,6 +260,9 @@ impl Records {
 
     /// Stops listening; waiting records can still be read.
     fn close(&self) {
-        self.listener.end(None);
+        // In another process nobody listens any more.
+        if self.check_process().is_ok() {
+            self.listener.end(None);
+        }
     }
 }

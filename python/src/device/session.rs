@@ -73,10 +73,7 @@ impl Session {
         if self.process == std::process::id() {
             Ok(&self.device)
         } else {
-            Err(Error::Address(format!(
-                "'{}' was opened by another process, before a fork; open it in the process that uses it",
-                self.address
-            )))
+            Err(Error::other_process(&self.address))
         }
     }
 

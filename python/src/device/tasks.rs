@@ -13,17 +13,18 @@ use super::fanout::lock;
 use super::session::{Session, Table};
 use crate::error::Error;
 use crate::frame::{AnyFrame, identifier};
+use crate::number::Whole;
 
 /// A modifier as it comes from Python: its kind, the byte, and two numbers or a name.
-pub type ModifierWords = (String, u8, u8, u8, String);
+pub type ModifierWords = (String, Whole<u8>, Whole<u8>, Whole<u8>, String);
 
 /// What to reply to: identifier, mask, whether it has 29 bits.
-pub type Match = (u32, Option<u32>, Option<bool>);
+pub type Match = (Whole<u32>, Option<Whole<u32>>, Option<bool>);
 
 fn modifier((kind, byte, low_bit, bits, algorithm): &ModifierWords) -> Result<Modifier, Error> {
-    let byte = *byte;
+    let byte = byte.0;
     Ok(match kind.as_str() {
-        "counter" => Modifier::Counter { byte, low_bit: *low_bit, bits: *bits },
+        "counter" => Modifier::Counter { byte, low_bit: low_bit.0, bits: bits.0 },
         "random" => Modifier::Random { byte },
         _ => {
             let algorithm = match algorithm.as_str() {
@@ -53,6 +54,11 @@ impl Entry {
     fn take(session: &Arc<Session>, table: Table, channel: Channel) -> Result<Self, Error> {
         let slot = session.take_slot(table, channel)?;
         Ok(Self { session: Arc::downgrade(session), table, channel, slot: Mutex::new(Some(slot)) })
+    }
+
+    /// Whether it is in the device's table.
+    fn is_running(&self) -> bool {
+        lock(&self.slot).is_some() && self.session.upgrade().is_some_and(|session| session.device().is_ok())
     }
 
     /// Ends it, unless it has already ended.
@@ -122,7 +128,7 @@ impl PeriodicFrame {
     /// Whether it is still active, apart from any limit to its count.
     #[getter]
     fn is_running(&self) -> bool {
-        lock(&self.entry.slot).is_some()
+        self.entry.is_running()
     }
 
     /// Sends another frame from now on; its period starts over.
@@ -156,9 +162,9 @@ impl Reply {
         reply: Frame,
         count: u32,
     ) -> Result<Self, Error> {
-        let id = identifier(id, extended)?;
+        let id = identifier(id.0, extended)?;
         let widest = if id.is_extended() { Id::MAX_EXTENDED } else { Id::MAX_STANDARD };
-        let mask = mask.unwrap_or(widest);
+        let mask = mask.map_or(widest, |mask| mask.0);
         if mask > widest {
             return Err(Error::argument(format!(
                 "the mask {mask:#X} has more bits than the identifier, {widest:#X}"
@@ -177,7 +183,7 @@ impl Reply {
     /// Whether it is still active, apart from any limit to its count.
     #[getter]
     fn is_running(&self) -> bool {
-        lock(&self.entry.slot).is_some()
+        self.entry.is_running()
     }
 
     /// Stops it.

@@ -189,6 +189,21 @@ impl Clock {
         Some((field.place(record_bytes).filter(|_| !is_signed || field.bits == 64)?, self.step_ns?))
     }
 
+    /// Where a floating-point number of eight bytes is that counts; [`Self::ns_of`] says what it means.
+    pub(super) fn float(&self, record_bytes: usize) -> Option<usize> {
+        let field = self.field.as_ref()?;
+        let is_float = field.kind == Kind::Float { big_endian: false } && field.bits == 64 && field.bit == 0;
+        let (at, _) = field.span(record_bytes).filter(|_| is_float)?;
+        Some(at)
+    }
+
+    /// Nanoseconds since the start of the measurement, from a number that is not counted exactly.
+    #[inline]
+    pub(super) fn ns_of(&self, raw: f64) -> Option<i64> {
+        let ns = (raw * self.factor_s + self.offset_s) * NS_PER_S;
+        (ns.abs() < 9e18).then(|| rounded(ns))
+    }
+
     /// Nanoseconds since the start of the measurement.
     pub(super) fn ns(&self, record: &[u8], number: u64) -> Option<i64> {
         let integer = match &self.field {
@@ -198,10 +213,16 @@ impl Clock {
         if let (Some(integer), Some(step_ns)) = (integer, self.step_ns) {
             return integer.checked_mul(step_ns);
         }
-        let raw = integer.map(|integer| integer as f64).or_else(|| self.field?.float(record))?;
-        let ns = (raw * self.factor_s + self.offset_s) * NS_PER_S;
-        (ns.abs() < 9e18).then(|| ns.round() as i64)
+        self.ns_of(integer.map(|integer| integer as f64).or_else(|| self.field?.float(record))?)
     }
+}
+
+/// As [`f64::round`], which is a call where not every processor of the kind has an instruction for it.
+#[inline]
+fn rounded(number: f64) -> i64 {
+    let whole = number as i64;
+    let rest = number - whole as f64;
+    whole + i64::from(rest >= 0.5) - i64::from(rest <= -0.5)
 }
 
 /// Which bus events a group has.
@@ -494,5 +515,39 @@ impl BusGroup {
             error_type: field("ErrorType"),
             words: field("Words"),
         }))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::rounded;
+    use proptest::prelude::*;
+
+    #[test]
+    fn halves_are_rounded_away_from_zero() {
+        for number in [
+            0.0,
+            -0.0,
+            0.5,
+            -0.5,
+            0.499_999_999_999_999_94,
+            -0.499_999_999_999_999_94,
+            1.5,
+            2.5,
+            -2.5,
+            8.9e18,
+            -8.9e18,
+        ] {
+            assert_eq!(rounded(number), number.round() as i64, "{number}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn it_is_what_round_gives(number in -9e18..9e18, small in -1e6..1e6, of_halves in -1_000_000_i64..1_000_000) {
+            for number in [number, small, of_halves as f64 / 2.0] {
+                prop_assert_eq!(rounded(number), number.round() as i64);
+            }
+        }
     }
 }

@@ -4,11 +4,20 @@ use super::layout::{BusGroup, Bytes, Clock, Events, Place};
 use cantap_trace::PlainFrame;
 use cantap_wire::Id;
 
+/// Where a record says its time.
+enum Time {
+    /// A mere counter, and what it counts, in nanoseconds.
+    Counter(Place, i64),
+    /// A floating-point number at this byte.
+    Float(usize),
+    /// [`Clock::ns`] knows.
+    Other,
+}
+
 /// Where a group has what a plain frame is made of. What [`BusGroup::record`] says of a record, in a few instructions.
 pub(super) struct Plain {
     clock: Clock,
-    /// Where the clock is a mere counter, and what it counts, in nanoseconds.
-    counter: Option<(Place, i64)>,
+    time: Time,
     start_ns: i64,
     bus: u8,
     bus_channel: Option<Place>,
@@ -35,7 +44,11 @@ impl Plain {
         let (bytes_at, most_bytes) = bytes.span(record_bytes)?;
         let plain = Self {
             clock: bus.clock,
-            counter: bus.clock.counter(record_bytes),
+            time: match (bus.clock.counter(record_bytes), bus.clock.float(record_bytes)) {
+                (Some((place, step_ns)), _) => Time::Counter(place, step_ns),
+                (None, Some(at)) => Time::Float(at),
+                (None, None) => Time::Other,
+            },
             start_ns,
             bus: bus.bus,
             bus_channel: place(&bus.bus_channel)?,
@@ -50,6 +63,26 @@ impl Plain {
             reach: record_bytes + Place::BYTES,
         };
         (bus.events == Events::Frames && bus.is_complete()).then_some(plain)
+    }
+
+    /// Appends the frames of the records that `bytes` begin with, which follow each other, at most `most`: as long as there is no more to say
+    /// about them, enough follows them, and it is their turn by `is_next`. `number` is the first one's. Returns how many there were.
+    pub(super) fn frames(
+        &self,
+        bytes: &[u8],
+        number: u64,
+        most: usize,
+        is_next: impl Fn(i64) -> bool,
+        frames: &mut Vec<PlainFrame>,
+    ) -> usize {
+        let before = frames.len();
+        let mut rest = bytes;
+        frames.extend((number..).take(most).map_while(|number| {
+            let frame = self.frame(rest, number).filter(|frame| is_next(frame.time_ns))?;
+            rest = &rest[self.record_bytes..];
+            Some(frame)
+        }));
+        frames.len() - before
     }
 
     /// The frame in a record that `bytes` begin with; `None` if there is more to say about it, or if not enough follows it.
@@ -74,11 +107,15 @@ impl Plain {
             return None;
         }
         let data = bytes.get(self.bytes_at..)?.first_chunk()?;
-        let counted = self.counter.as_ref().and_then(|(place, step_ns)| {
+        let offset_ns = match &self.time {
             // With its highest bit set it may be negative or too large.
-            i64::try_from(place.get(bytes)).ok()?.checked_mul(*step_ns)
-        });
-        let offset_ns = counted.or_else(|| self.clock.ns(&bytes[..self.record_bytes], number))?;
+            Time::Counter(place, step_ns) => {
+                i64::try_from(place.get(bytes)).ok().and_then(|count| count.checked_mul(*step_ns))
+            }
+            Time::Float(at) => self.clock.ns_of(f64::from_le_bytes(*bytes.get(*at..)?.first_chunk()?)),
+            Time::Other => None,
+        };
+        let offset_ns = offset_ns.or_else(|| self.clock.ns(&bytes[..self.record_bytes], number))?;
         let time_ns = self.start_ns.saturating_add(offset_ns);
         Some(PlainFrame::new(time_ns, channel, id, len as u8, *data))
     }

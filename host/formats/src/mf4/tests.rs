@@ -1,6 +1,8 @@
 //! Files arranged like those of other programs, made by hand: bytes stored apart from their records, data in
 //! lists, compressed.
 
+mod any_layout;
+
 use std::io::Write;
 
 use super::super::tests;

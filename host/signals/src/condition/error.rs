@@ -76,6 +76,9 @@ pub enum ConditionFault {
 
 impl fmt::Display for ConditionError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if matches!(self.fault, ConditionFault::TooLong(_)) {
+            return write!(f, "{}", self.fault);
+        }
         let before = self.text.get(..self.at).unwrap_or(&self.text);
         writeln!(f, "{}", self.fault)?;
         // A condition from a file can contain line ends and tabs: show it on one line, one column per

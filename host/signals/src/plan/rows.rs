@@ -18,7 +18,10 @@ pub struct MessageRows {
     lens: Vec<u8>,
     raw: Vec<u64>,
     value: Vec<f64>,
+    /// Of a group: in which frames its signals are.
+    holds: Vec<bool>,
     there: Vec<bool>,
+    indicators: Vec<bool>,
 }
 
 /// A signal in the frames of a [`MessageRows`], in their order.
@@ -32,12 +35,16 @@ pub struct SignalRows<'a> {
     pub value: &'a [f64],
     /// Which frames have the signal; `None` if all do.
     pub there: Option<&'a [bool]>,
+    /// In which frames its bits say that there is no value, as [`Message::indicator`] does; `None` if in none. Meaningless where
+    /// the signal is not present.
+    pub indicators: Option<&'a [bool]>,
 }
 
 impl MessageRows {
     pub(crate) fn new(message: Message, plan: MessagePlan) -> Self {
-        let (words, lens, raw, value, there) = (vec![], vec![], vec![], vec![], vec![]);
-        Self { message, plan, words, lens, raw, value, there }
+        let (words, lens, raw, value) = (vec![], vec![], vec![], vec![]);
+        let (holds, there, indicators) = (vec![], vec![], vec![]);
+        Self { message, plan, words, lens, raw, value, holds, there, indicators }
     }
 
     /// The message.
@@ -64,15 +71,16 @@ impl MessageRows {
         let mut padded = [0; 8];
         let Some(bytes) = padded.get_mut(..data.len()) else { return false };
         bytes.copy_from_slice(data);
-        self.push_word(u64::from_le_bytes(padded), data.len() as u8);
+        self.words.push(u64::from_le_bytes(padded));
+        self.lens.push(data.len() as u8);
         true
     }
 
-    /// Adds a frame's data: the first byte lowest, zeros beyond the length of at most eight.
+    /// Adds the data of frames that contain no PDUs: the first byte lowest, zeros beyond the length of at most eight; and the length.
     #[inline]
-    pub fn push_word(&mut self, word: u64, len: u8) {
-        self.words.push(word);
-        self.lens.push(len);
+    pub fn push_words(&mut self, frames: impl ExactSizeIterator<Item = (u64, u8)> + Clone) {
+        self.words.extend(frames.clone().map(|(word, _)| word));
+        self.lens.extend(frames.map(|(_, len)| len));
     }
 
     /// Decodes a single frame's data of any length, appending to `values`.
@@ -89,28 +97,48 @@ impl MessageRows {
     /// Decodes the frames that wait and forgets them. `each` gets the signals that were chosen, some frames at a time, in their
     /// order; where a frame has none of a signal, [`SignalRows::there`] says so.
     pub fn decode(&mut self, mut each: impl FnMut(&Message, SignalRows<'_>)) {
-        let Self { message, plan, words, lens, raw, value, there } = self;
+        let Self { message, plan, words, lens, raw, value, holds, there, indicators } = self;
+        let payload =
+            |(word, len): (&u64, &u8)| Payload::Frame { little: *word, big: word.swap_bytes(), len: *len };
         for (words, lens) in words.chunks(ROWS_AT_ONCE).zip(lens.chunks(ROWS_AT_ONCE)) {
             let shortest = lens.iter().copied().min().unwrap_or(0);
             for group in &plan.groups {
+                let is_in_all = group.conditions.is_empty();
+                if !is_in_all {
+                    holds.clear();
+                    holds.extend(words.iter().zip(lens).map(|frame| group.holds(payload(frame))));
+                }
                 for signal in &group.signals {
                     raw.clear();
                     value.clear();
-                    let is_always_there =
-                        group.conditions.is_empty() && signal.field.needed <= shortest && !signal.indicates;
-                    if is_always_there && signal.column(words, raw, value) {
-                        each(message, SignalRows { signal: signal.index, raw, value, there: None });
-                        continue;
+                    if !signal.column(words, raw, value) {
+                        for frame in words.iter().zip(lens) {
+                            let found = signal.decode(message, payload(frame));
+                            raw.push(found.map_or(0, |found| found.raw));
+                            value.push(found.map_or(f64::NAN, |found| found.value));
+                        }
                     }
+                    let needed = signal.field.needed;
                     there.clear();
-                    for (word, len) in words.iter().zip(lens) {
-                        let payload = Payload::Frame { little: *word, big: word.swap_bytes(), len: *len };
-                        let found = if group.holds(payload) { signal.decode(message, payload) } else { None };
-                        raw.push(found.map_or(0, |found| found.raw));
-                        value.push(found.map_or(f64::NAN, |found| found.value));
-                        there.push(found.is_some());
+                    if !is_in_all {
+                        there.extend(holds.iter().zip(lens).map(|(holds, len)| *holds && needed <= *len));
+                    } else if needed > shortest {
+                        there.extend(lens.iter().map(|len| needed <= *len));
                     }
-                    each(message, SignalRows { signal: signal.index, raw, value, there: Some(there) });
+                    indicators.clear();
+                    if let Some(first) = signal.first_indicator
+                        && raw.iter().any(|raw| *raw >= first)
+                    {
+                        let of = &message.signals[signal.index as usize];
+                        indicators
+                            .extend(raw.iter().map(|raw| *raw >= first && of.indicator(*raw).is_some()));
+                        for (value, _) in value.iter_mut().zip(&*indicators).filter(|(_, is)| **is) {
+                            *value = f64::NAN;
+                        }
+                    }
+                    let there = Some(&**there).filter(|there| !there.is_empty());
+                    let indicators = Some(&**indicators).filter(|indicators| !indicators.is_empty());
+                    each(message, SignalRows { signal: signal.index, raw, value, there, indicators });
                 }
             }
         }

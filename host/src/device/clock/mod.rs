@@ -157,10 +157,11 @@ impl ClockMap {
         &self.bends[self.bends.partition_point(|bend| bend.at <= ticks).saturating_sub(1)]
     }
 
-    /// The device time of a UTC time, to the nearest tick: the inverse of [`Self::utc`].
+    /// The device time of a UTC time, to the nearest tick: the inverse of [`Self::utc`]. What was before the device started is tick 0.
     pub fn ticks(&self, utc: UtcNs) -> Ticks {
         let bend = self.bends[self.bends.partition_point(|bend| bend.utc <= utc).saturating_sub(1)];
-        bend.at.plus((utc.since(bend.utc) as f64 / bend.ns_per_tick).round() as i64)
+        let since = (utc.since(bend.utc) as f64 / bend.ns_per_tick).round() as i64;
+        Ticks(bend.at.0.saturating_add_signed(since))
     }
 
     /// The device's time by USB frames.

@@ -1,0 +1,29 @@
+"""Arguments that may be one thing or several."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterable
+from typing import Any
+
+
+def channels(channel: int | Iterable[int]) -> list[int]:
+    """One channel or several."""
+    one: Any = channel
+    try:
+        # NumPy's numbers are no `int`, but can be used as one. So could its arrays, by their type.
+        return [operator.index(one)]
+    except TypeError:
+        pass
+    return _several(channel, "channel", "a number or several numbers")
+
+
+def words(words: str | Iterable[str], argument: str) -> list[str]:
+    """One text or several; `argument` is what they are called."""
+    return [words] if isinstance(words, str) else _several(words, argument, "a text or several texts")
+
+
+def _several(values: Any, argument: str, wanted: str) -> list[Any]:
+    if isinstance(values, (str, bytes)) or not isinstance(values, Iterable):
+        raise TypeError(f"{argument} is {wanted}, not {type(values).__name__}")
+    return list(values)

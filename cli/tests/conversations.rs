@@ -54,6 +54,27 @@ fn frames_are_shown_as_what_they_say() {
     );
 }
 
+/// A tester that is plugged in, and a machine that is switched on, long after the first frames: both are read, and this is said.
+#[test]
+fn what_begins_later_is_not_left_out() {
+    let car = (0..1000).map(|at| {
+        format!("({}.{:03}000) can0 {:03X}#1122334455667788\n", at / 100, at % 100 * 10, 0x100 + at % 5)
+    });
+    let tester = "(10.500000) can0 7E0#0322F18C\n(10.501000) can0 7E8#0462F18C41\n".to_owned();
+    let machine = (0..40).map(|at| format!("(11.{at:02}0000) can1 705#05\n(11.{at:02}5000) can1 185#0102\n"));
+    let log: String = car.chain([tester]).chain(machine).collect();
+    let (code, out, err) = cantap("conversations_later", &log, &[]);
+    assert_eq!(code, Some(0), "{err}");
+    assert!(out.contains("(10.501000) can0 uds 7E0 > 7E8 ReadDataByIdentifier"), "{out}");
+    assert!(err.contains("cantap: channel 1 speaks uds from 10.500000 on\n"), "{err}");
+    let pdos = out.lines().filter(|line| line.contains("can1 canopen") && line.contains("PDO")).count();
+    assert!((20..40).contains(&pdos), "{out}");
+    let said = "channel 2 speaks canopen; it was silent at first, and is read from 11.100000 on; --protocol canopen reads";
+    assert!(err.contains(said), "{err}");
+    let (_, out, err) = cantap("conversations_later", &log, &["--quiet"]);
+    assert!(out.contains("can1 canopen") && !err.contains("speaks"), "{err}");
+}
+
 #[test]
 fn one_protocol_or_only_faults_can_be_asked_for() {
     let lines = |arguments: &[&str]| cantap("conversations_choice", WORKSHOP, arguments).1.lines().count();

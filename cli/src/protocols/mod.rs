@@ -2,6 +2,7 @@
 //! protocols.
 
 mod known;
+mod later;
 mod reading;
 mod sheet;
 mod surveyed;

@@ -7,6 +7,7 @@ use cantap::TraceRecord;
 use cantap_protocols::{Conversations, Event, Options, UnderWay};
 use cantap_signals::Decoder;
 
+use super::later::{self, Later};
 use super::surveyed::{self, Surveyed};
 
 /// Reads records by the requested protocols, or by those found in the first records of each channel.
@@ -14,6 +15,7 @@ pub struct Reading {
     options: Options,
     surveyed: Surveyed,
     conversations: Option<Conversations>,
+    silent: Option<Later>,
     events: Vec<Event>,
     quiet: bool,
     /// Channels of which it was said that they have diagnostics.
@@ -25,7 +27,15 @@ impl Reading {
     pub fn new(options: Options, decoder: Option<Arc<Decoder>>, quiet: bool) -> Self {
         let surveyed = Surveyed::new(options.protocols.is_empty());
         let options = Options { decoder, ..options };
-        Self { options, surveyed, conversations: None, events: Vec::new(), quiet, told: BTreeSet::new() }
+        Self {
+            options,
+            surveyed,
+            conversations: None,
+            silent: None,
+            events: Vec::new(),
+            quiet,
+            told: BTreeSet::new(),
+        }
     }
 
     /// The transfers in progress.
@@ -53,7 +63,7 @@ impl Reading {
         more: bool,
         mut read: impl FnMut(Read<'_>) -> Result<(), E>,
     ) -> Result<(), E> {
-        let Self { options, surveyed, conversations, events, quiet, told } = self;
+        let Self { options, surveyed, conversations, silent, events, quiet, told } = self;
         let waited;
         let mut records = records;
         if conversations.is_none() {
@@ -64,8 +74,9 @@ impl Reading {
             if !*quiet {
                 surveyed::tell(found.as_deref(), &surveyed.relatives());
             }
-            let diagnostics = found.iter().flatten().filter(|found| surveyed::is_diagnostics(found.protocol));
+            let diagnostics = found.iter().flatten().filter(|found| later::is_diagnostics(found.protocol));
             told.extend(diagnostics.map(|found| found.channel));
+            *silent = surveyed.later();
             options.spoken = found;
             waited = surveyed.release();
             records = &waited;
@@ -73,9 +84,12 @@ impl Reading {
         let conversations = conversations.get_or_insert_with(|| Conversations::new(options));
         for record in records {
             read(Read::Record(record))?;
+            for evidence in silent.as_mut().map_or_else(Vec::new, |silent| silent.take(record, *quiet)) {
+                conversations.also(options, &evidence);
+            }
             conversations.take(record, events);
             if !*quiet && options.spoken.is_some() {
-                surveyed::tell_later(events, told);
+                later::tell_diagnostics(events, told);
             }
             // One by one: what is freed immediately is available for the next.
             events.drain(..).try_for_each(|event| read(Read::Event(event)))?;

@@ -1,17 +1,15 @@
 //! The first records show which protocols a bus uses. They wait until then, and are then read like all
 //! others.
 
-use std::collections::BTreeSet;
-
 use cantap::TraceRecord;
-use cantap_protocols::{Event, Evidence, Protocol, Relative, Survey};
+use cantap_protocols::{Evidence, Relative, Survey};
 
-use crate::commands::decode::Seconds;
+use super::later::Later;
 
 /// A survey examines no more records than this.
 const MOST_RECORDS: usize = 200_000;
 /// Nor more than this time of the bus, in nanoseconds.
-const LONGEST_NS: i64 = 3_000_000_000;
+pub(super) const LONGEST_NS: i64 = 3_000_000_000;
 
 /// Records waiting for the survey.
 pub(super) struct Surveyed {
@@ -42,6 +40,11 @@ impl Surveyed {
         !more || self.waiting.len() >= MOST_RECORDS || spans >= LONGEST_NS
     }
 
+    /// What becomes of channels that are silent so far; `None` without a survey.
+    pub fn later(&self) -> Option<Later> {
+        self.survey.as_ref().map(Later::new)
+    }
+
     /// The protocols of each channel; `None` without a survey.
     pub fn found(&self) -> Option<Vec<Evidence>> {
         self.survey.as_ref().map(Survey::found)
@@ -55,20 +58,6 @@ impl Surveyed {
     /// The records that waited.
     pub fn release(&mut self) -> Vec<TraceRecord> {
         std::mem::take(&mut self.waiting)
-    }
-}
-
-/// Whether it is found at any time, and not only in the first frames.
-pub(super) const fn is_diagnostics(protocol: Protocol) -> bool {
-    matches!(protocol, Protocol::IsoTp | Protocol::Uds | Protocol::Kwp2000 | Protocol::Obd)
-}
-
-/// Reports what was not in the first frames, once for each channel.
-pub(super) fn tell_later(events: &[Event], told: &mut BTreeSet<u8>) {
-    for Event { channel, protocol, start_ns, .. } in events {
-        if is_diagnostics(*protocol) && told.insert(*channel) {
-            eprintln!("cantap: channel {channel} speaks {protocol} from {} on", Seconds(*start_ns));
-        }
     }
 }
 

@@ -34,8 +34,11 @@ pub struct Options {
 
 /// Takes records and returns the events of all protocols, in the order of completion.
 pub struct Conversations {
-    readers: Vec<Box<dyn Assembler + Send + Sync>>,
-    /// Which of them decode each channel, one bit each.
+    /// Those that a channel needs, or has needed.
+    readers: [Option<Box<dyn Assembler + Send + Sync>>; 6],
+    /// The protocols of each channel.
+    spoken: Box<[u16; 256]>,
+    /// Which of the readers decode each channel, one bit each.
     of_channel: Box<[u8; 256]>,
     wanted: u16,
     /// Channels that do not, or not yet, have diagnostics.
@@ -57,6 +60,29 @@ const DIAGNOSTICS: u16 =
 /// Both use the same frames: a single decoder distinguishes them by their groups.
 const VEHICLE_AND_BOAT: u16 = Protocol::J1939.bit() | Protocol::Nmea2000.bit();
 
+/// The readers' bits.
+const OF_DIAGNOSTICS: u8 = 1;
+const OF_VEHICLE: u8 = 2;
+const OF_BOAT: u8 = 4;
+const OF_BOTH: u8 = 8;
+const OF_CANOPEN: u8 = 16;
+const OF_DEVICENET: u8 = 32;
+
+/// The readers that a channel with these protocols needs.
+fn readers_of(spoken: u16) -> u8 {
+    let has = |protocols: u16, reader: u8| if spoken & protocols == 0 { 0 } else { reader };
+    let family = match spoken & VEHICLE_AND_BOAT {
+        0 => 0,
+        VEHICLE_AND_BOAT => OF_BOTH,
+        family if family == Protocol::J1939.bit() => OF_VEHICLE,
+        _ => OF_BOAT,
+    };
+    has(DIAGNOSTICS, OF_DIAGNOSTICS)
+        | family
+        | has(Protocol::CanOpen.bit(), OF_CANOPEN)
+        | has(Protocol::DeviceNet.bit(), OF_DEVICENET)
+}
+
 impl Conversations {
     /// Sets up decoding according to the options.
     pub fn new(options: &Options) -> Self {
@@ -77,53 +103,43 @@ impl Conversations {
                 doubts.remove(&evidence.channel);
             }
         }
-        let mut this = Self { readers: Vec::new(), of_channel: Box::new([0; 256]), wanted, doubts };
-        let decoder = || options.decoder.clone();
-        this.add(
-            &spoken,
-            |spoken| spoken & DIAGNOSTICS != 0,
-            || {
-                if wanted == Protocol::IsoTp.bit() {
-                    Box::new(IsoTp::new(&options.pairs, true))
-                } else {
-                    Box::new(Diagnostics::new(&options.pairs, true))
-                }
-            },
-        );
-        let family = |spoken: u16| spoken & VEHICLE_AND_BOAT;
-        this.add(
-            &spoken,
-            |spoken| family(spoken) == Protocol::J1939.bit(),
-            || Box::new(J1939::new(decoder())),
-        );
-        let is_boat = |spoken| family(spoken) == Protocol::Nmea2000.bit();
-        this.add(&spoken, is_boat, || Box::new(J1939::nmea2000(decoder())));
-        let is_both = |spoken| family(spoken) == VEHICLE_AND_BOAT;
-        this.add(&spoken, is_both, || Box::new(J1939::with_nmea2000(decoder())));
-        let canopen = |spoken: u16| spoken & Protocol::CanOpen.bit() != 0;
-        this.add(&spoken, canopen, || Box::new(CanOpen::new(options.sheets.clone())));
-        let devicenet = |spoken: u16| spoken & Protocol::DeviceNet.bit() != 0;
-        this.add(&spoken, devicenet, || Box::new(DeviceNet::new()));
+        let mut this = Self {
+            readers: Default::default(),
+            spoken: Box::new(spoken),
+            of_channel: Box::new([0; 256]),
+            wanted,
+            doubts,
+        };
+        this.assign(options);
         this
     }
 
-    /// Adds a decoder for the channels that need it, if there are any.
-    fn add(
-        &mut self,
-        spoken: &[u16; 256],
-        needs: impl Fn(u16) -> bool,
-        make: impl FnOnce() -> Box<dyn Assembler + Send + Sync>,
-    ) {
-        let bit = 1 << self.readers.len();
-        let mut is_needed = false;
-        for (readers, spoken) in self.of_channel.iter_mut().zip(spoken) {
-            if needs(*spoken) {
-                *readers |= bit;
-                is_needed = true;
+    /// From now on, decodes this as well.
+    pub fn also(&mut self, options: &Options, evidence: &Evidence) {
+        self.spoken[usize::from(evidence.channel)] |= evidence.protocol.bit() & self.wanted;
+        self.assign(options);
+    }
+
+    /// Gives each channel the decoders that it needs.
+    fn assign(&mut self, options: &Options) {
+        *self.of_channel = self.spoken.map(readers_of);
+        let needed = self.of_channel.iter().fold(0, |all, readers| all | readers);
+        let decoder = || options.decoder.clone();
+        for (number, reader) in self.readers.iter_mut().enumerate() {
+            if needed & 1 << number == 0 || reader.is_some() {
+                continue;
             }
-        }
-        if is_needed {
-            self.readers.push(make());
+            *reader = Some(match 1 << number {
+                OF_DIAGNOSTICS if self.wanted == Protocol::IsoTp.bit() => {
+                    Box::new(IsoTp::new(&options.pairs, true))
+                }
+                OF_DIAGNOSTICS => Box::new(Diagnostics::new(&options.pairs, true)),
+                OF_VEHICLE => Box::new(J1939::new(decoder())),
+                OF_BOAT => Box::new(J1939::nmea2000(decoder())),
+                OF_BOTH => Box::new(J1939::with_nmea2000(decoder())),
+                OF_CANOPEN => Box::new(CanOpen::new(options.sheets.clone())),
+                _ => Box::new(DeviceNet::new()),
+            });
         }
     }
 
@@ -132,7 +148,9 @@ impl Conversations {
         let mut readers = self.of_channel[usize::from(record.channel)];
         let before = events.len();
         while readers != 0 {
-            self.readers[readers.trailing_zeros() as usize].take(record, events);
+            if let Some(reader) = &mut self.readers[readers.trailing_zeros() as usize] {
+                reader.take(record, events);
+            }
             readers &= readers - 1;
         }
         if events.len() > before {
@@ -144,7 +162,7 @@ impl Conversations {
     /// The trace has ended: appends whatever was in progress.
     pub fn finish(&mut self, events: &mut Vec<Event>) {
         let before = events.len();
-        for reader in &mut self.readers {
+        for reader in self.readers.iter_mut().flatten() {
             reader.finish(events);
         }
         self.keep_wanted(before, events);
@@ -154,7 +172,7 @@ impl Conversations {
     /// The transfers in progress, in the order in which they began.
     pub fn under_way(&self) -> Vec<UnderWay> {
         let mut under_way = Vec::new();
-        self.readers.iter().for_each(|reader| reader.under_way(&mut under_way));
+        self.readers.iter().flatten().for_each(|reader| reader.under_way(&mut under_way));
         under_way.retain(|transfer| {
             transfer.protocol.bit() & DIAGNOSTICS == 0 || !self.doubts.contains_key(&transfer.channel)
         });

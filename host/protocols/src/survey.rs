@@ -16,10 +16,11 @@ use crate::{Assembler, Event, Protocol, UnderWay};
 /// Bytes of a message under way that show ISO 15765-2 even if it is not complete: three frames.
 const CONVINCING_BYTES: u32 = 20;
 
-/// Examines the first records of a trace or a bus.
+/// Examines the first records of a trace or a bus. The default one does not look for ISO 15765-2 and the protocols on top of it, which
+/// [`crate::Conversations`] finds by itself.
 #[derive(Clone, Debug, Default)]
 pub struct Survey {
-    diagnostics: Diagnostics,
+    diagnostics: Option<Diagnostics>,
     events: Vec<Event>,
     diagnostics_signs: FxHashMap<u8, DiagnosticsSigns>,
     /// Numbers of extended frames: those of NMEA 2000's groups, those of J1939's, and all.
@@ -77,14 +78,16 @@ pub struct Evidence {
 }
 
 impl Survey {
-    /// Nothing has been seen yet.
+    /// For all protocols.
     pub fn new() -> Self {
-        Self { diagnostics: Diagnostics::new(&[], true), ..Self::default() }
+        Self { diagnostics: Some(Diagnostics::new(&[], true)), ..Self::default() }
     }
 
     /// Takes the next record.
     pub fn take(&mut self, record: &TraceRecord) {
-        self.diagnostics.take(record, &mut self.events);
+        if let Some(diagnostics) = &mut self.diagnostics {
+            diagnostics.take(record, &mut self.events);
+        }
         if let Some(frame) = record.frame() {
             self.canopen.entry(record.channel).or_default().take(frame);
             self.devicenet.entry(record.channel).or_default().take(frame);
@@ -101,6 +104,11 @@ impl Survey {
         for event in self.events.drain(..) {
             self.diagnostics_signs.entry(event.channel).or_default().take(&event);
         }
+    }
+
+    /// Whether the channel has had a frame.
+    pub fn has_heard(&self, channel: u8) -> bool {
+        self.canopen.contains_key(&channel)
     }
 
     /// Protocols that are recognised but not decoded, by channel.
@@ -124,7 +132,9 @@ impl Survey {
             .collect();
         // A trace may end before any message is complete.
         let mut open = Vec::new();
-        self.diagnostics.under_way(&mut open);
+        if let Some(diagnostics) = &self.diagnostics {
+            diagnostics.under_way(&mut open);
+        }
         for UnderWay { channel, protocol, .. } in
             open.into_iter().filter(|open| open.received >= CONVINCING_BYTES)
         {

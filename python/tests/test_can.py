@@ -213,8 +213,8 @@ def test_a_forked_process_opens_its_own_session():
 
 
 def test_an_argument_with_a_slip_is_not_silence():
-    with pytest.warns(cantap.CantapWarning, match="listen_olny"):
-        can.Bus(interface="cantap", channel=QUIET, bitrate=500_000, listen_olny=True).shutdown()
+    with pytest.warns(cantap.CantapWarning, match="listen_onlyy"):
+        can.Bus(interface="cantap", channel=QUIET, bitrate=500_000, listen_onlyy=True).shutdown()
     with pytest.raises(can.CanInitializationError, match="ERROR"):
         can.Bus(interface="cantap", channel=QUIET, bitrate=500_000, state=can.BusState.ERROR)
 

@@ -1,5 +1,6 @@
 //! Reads records by their bus's protocols.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use cantap::TraceRecord;
@@ -15,6 +16,8 @@ pub struct Reading {
     conversations: Option<Conversations>,
     events: Vec<Event>,
     quiet: bool,
+    /// Channels of which it was said that they have diagnostics.
+    told: BTreeSet<u8>,
 }
 
 impl Reading {
@@ -22,7 +25,7 @@ impl Reading {
     pub fn new(options: Options, decoder: Option<Arc<Decoder>>, quiet: bool) -> Self {
         let surveyed = Surveyed::new(options.protocols.is_empty());
         let options = Options { decoder, ..options };
-        Self { options, surveyed, conversations: None, events: Vec::new(), quiet }
+        Self { options, surveyed, conversations: None, events: Vec::new(), quiet, told: BTreeSet::new() }
     }
 
     /// The transfers in progress.
@@ -50,7 +53,7 @@ impl Reading {
         more: bool,
         mut read: impl FnMut(Read<'_>) -> Result<(), E>,
     ) -> Result<(), E> {
-        let Self { options, surveyed, conversations, events, quiet } = self;
+        let Self { options, surveyed, conversations, events, quiet, told } = self;
         let waited;
         let mut records = records;
         if conversations.is_none() {
@@ -61,6 +64,8 @@ impl Reading {
             if !*quiet {
                 surveyed::tell(found.as_deref(), &surveyed.relatives());
             }
+            let diagnostics = found.iter().flatten().filter(|found| surveyed::is_diagnostics(found.protocol));
+            told.extend(diagnostics.map(|found| found.channel));
             options.spoken = found;
             waited = surveyed.release();
             records = &waited;
@@ -69,6 +74,9 @@ impl Reading {
         for record in records {
             read(Read::Record(record))?;
             conversations.take(record, events);
+            if !*quiet && options.spoken.is_some() {
+                surveyed::tell_later(events, told);
+            }
             // One by one: what is freed immediately is available for the next.
             events.drain(..).try_for_each(|event| read(Read::Event(event)))?;
         }

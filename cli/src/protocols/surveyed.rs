@@ -1,8 +1,12 @@
 //! The first records show which protocols a bus uses. They wait until then, and are then read like all
 //! others.
 
+use std::collections::BTreeSet;
+
 use cantap::TraceRecord;
-use cantap_protocols::{Evidence, Relative, Survey};
+use cantap_protocols::{Event, Evidence, Protocol, Relative, Survey};
+
+use crate::commands::decode::Seconds;
 
 /// A survey examines no more records than this.
 const MOST_RECORDS: usize = 200_000;
@@ -51,6 +55,20 @@ impl Surveyed {
     /// The records that waited.
     pub fn release(&mut self) -> Vec<TraceRecord> {
         std::mem::take(&mut self.waiting)
+    }
+}
+
+/// Whether it is found at any time, and not only in the first frames.
+pub(super) const fn is_diagnostics(protocol: Protocol) -> bool {
+    matches!(protocol, Protocol::IsoTp | Protocol::Uds | Protocol::Kwp2000 | Protocol::Obd)
+}
+
+/// Reports what was not in the first frames, once for each channel.
+pub(super) fn tell_later(events: &[Event], told: &mut BTreeSet<u8>) {
+    for Event { channel, protocol, start_ns, .. } in events {
+        if is_diagnostics(*protocol) && told.insert(*channel) {
+            eprintln!("cantap: channel {channel} speaks {protocol} from {} on", Seconds(*start_ns));
+        }
     }
 }
 

@@ -9,6 +9,7 @@ mod blocks;
 mod decode;
 mod encode;
 mod layout;
+mod part;
 mod plain;
 mod record;
 mod stream;

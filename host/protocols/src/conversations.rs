@@ -1,15 +1,18 @@
 //! Decodes several protocols at once.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 
 use cantap_signals::Decoder;
 use cantap_trace::TraceRecord;
+use rustc_hash::FxHashMap;
 
 use crate::canopen::{CanOpen, Sheet};
 use crate::devicenet::DeviceNet;
 use crate::diagnostics::Diagnostics;
 use crate::iso_tp::{IsoTp, Pair};
 use crate::j1939::J1939;
+use crate::survey::DiagnosticsSigns;
 use crate::{Assembler, Event, Evidence, Protocol, UnderWay};
 
 /// What to decode.
@@ -18,7 +21,8 @@ pub struct Options {
     /// Only these protocols; all if empty. `isotp` alone shows every transfer as it is.
     pub protocols: Vec<Protocol>,
     /// What each channel speaks, according to a survey. Without one, channels are decoded by the protocols above; if those are
-    /// empty too, by ISO 15765-2 and the protocols on top of it, which need no survey.
+    /// empty too, by ISO 15765-2 and the protocols on top of it. These are looked for on every channel, since a tester may come at any
+    /// time: where a survey has not found them, what looks like them is held back until an exchange shows that it is them.
     pub spoken: Option<Vec<Evidence>>,
     /// Pairs of identifiers that communicate by ISO 15765-2, in addition to those of the standards.
     pub pairs: Vec<Pair>,
@@ -34,7 +38,19 @@ pub struct Conversations {
     /// Which of them decode each channel, one bit each.
     of_channel: Box<[u8; 256]>,
     wanted: u16,
+    /// Channels that do not, or not yet, have diagnostics.
+    doubts: FxHashMap<u8, Doubt>,
 }
+
+/// What looks like diagnostics on a channel, but may be other traffic.
+#[derive(Default)]
+struct Doubt {
+    signs: DiagnosticsSigns,
+    held: VecDeque<Event>,
+}
+
+/// How many events of a channel are held back.
+const MOST_HELD: usize = 64;
 
 const DIAGNOSTICS: u16 =
     Protocol::IsoTp.bit() | Protocol::Uds.bit() | Protocol::Kwp2000.bit() | Protocol::Obd.bit();
@@ -48,15 +64,20 @@ impl Conversations {
         let wanted = if options.protocols.is_empty() { u16::MAX } else { bits(&options.protocols) };
         // Without a survey or a choice, frames that fit two protocols would be decoded twice.
         let everywhere = match (&options.spoken, options.protocols.is_empty()) {
-            (Some(_), _) => 0,
-            (None, true) => DIAGNOSTICS,
+            (Some(_), _) | (None, true) => DIAGNOSTICS & wanted,
             (None, false) => wanted,
         };
-        let mut spoken = [everywhere; 256];
+        let (mut spoken, mut doubts) = ([everywhere; 256], FxHashMap::default());
+        if options.spoken.is_some() {
+            doubts.extend((0..=u8::MAX).map(|channel| (channel, Doubt::default())));
+        }
         for evidence in options.spoken.iter().flatten() {
             spoken[usize::from(evidence.channel)] |= evidence.protocol.bit() & wanted;
+            if evidence.protocol.bit() & DIAGNOSTICS != 0 {
+                doubts.remove(&evidence.channel);
+            }
         }
-        let mut this = Self { readers: Vec::new(), of_channel: Box::new([0; 256]), wanted };
+        let mut this = Self { readers: Vec::new(), of_channel: Box::new([0; 256]), wanted, doubts };
         let decoder = || options.decoder.clone();
         this.add(
             &spoken,
@@ -116,6 +137,7 @@ impl Conversations {
         }
         if events.len() > before {
             self.keep_wanted(before, events);
+            self.hold_back(before, events);
         }
     }
 
@@ -126,14 +148,43 @@ impl Conversations {
             reader.finish(events);
         }
         self.keep_wanted(before, events);
+        self.hold_back(before, events);
     }
 
     /// The transfers in progress, in the order in which they began.
     pub fn under_way(&self) -> Vec<UnderWay> {
         let mut under_way = Vec::new();
         self.readers.iter().for_each(|reader| reader.under_way(&mut under_way));
+        under_way.retain(|transfer| {
+            transfer.protocol.bit() & DIAGNOSTICS == 0 || !self.doubts.contains_key(&transfer.channel)
+        });
         under_way.sort_by_key(|transfer| transfer.start_ns);
         under_way
+    }
+
+    /// Holds back new events of diagnostics on channels where nothing has shown yet that it is them.
+    fn hold_back(&mut self, before: usize, events: &mut Vec<Event>) {
+        let is_doubtful = |event: &Event| event.protocol.bit() & DIAGNOSTICS != 0;
+        if self.doubts.is_empty() || !events[before..].iter().any(is_doubtful) {
+            return;
+        }
+        for event in events.split_off(before) {
+            let channel = event.channel;
+            let Some(doubt) = self.doubts.get_mut(&channel).filter(|_| is_doubtful(&event)) else {
+                events.push(event);
+                continue;
+            };
+            doubt.signs.take(&event);
+            if doubt.held.len() == MOST_HELD {
+                doubt.held.pop_front();
+            }
+            doubt.held.push_back(event);
+            if doubt.signs.found().next().is_some()
+                && let Some(doubt) = self.doubts.remove(&channel)
+            {
+                events.extend(doubt.held);
+            }
+        }
     }
 
     /// Removes the events of protocols that were not requested.
@@ -182,6 +233,30 @@ mod tests {
         assert_eq!(said_uds.len(), 2, "{said_uds:?}");
         assert!(said_uds[0].ends_with("refused by the receiver: too long for it"), "{said_uds:?}");
         assert_eq!(said(Protocol::J1939, &frames), [""; 0]);
+    }
+
+    /// A tester is plugged in long after a survey of the first frames: its requests are shown, those without a response among them, but
+    /// not what only looks like them.
+    #[test]
+    fn a_tester_may_come_at_any_time() {
+        let options = Options { spoken: Some(Vec::new()), ..Options::default() };
+        let (mut conversations, mut events) = (Conversations::new(&options), Vec::new());
+        for (ms, frame) in
+            [(0.0, "7E8#0150000000000000"), (1.0, "7E3#1122334455667788"), (3000.0, "7E0#023E00")]
+        {
+            conversations.take(&at(ms, frame), &mut events);
+        }
+        conversations.take(&at(9000.0, "7E0#0322F190"), &mut events);
+        assert_eq!(events, []);
+        conversations.take(&at(9001.0, "7E8#0462F19041"), &mut events);
+        let said: Vec<_> = events.iter().map(|event| (event.kind, event.time_ns / 1_000_000)).collect();
+        assert_eq!(said.last(), Some(&("exchange", 9001)));
+        assert!(said.iter().any(|(kind, _)| *kind == "no_response"), "{said:?}");
+        let before = events.len();
+        conversations.take(&at(9002.0, "7E0#0210"), &mut events);
+        conversations.take(&at(9003.0, "7E8#037F1012"), &mut events);
+        conversations.finish(&mut events);
+        assert!(events.len() > before && conversations.under_way().is_empty());
     }
 
     #[test]

@@ -1,5 +1,7 @@
 //! Finds out which protocols are used on a bus, by signs that are specific to them.
 
+use std::collections::BTreeMap;
+
 use cantap_trace::TraceRecord;
 use rustc_hash::FxHashMap;
 
@@ -19,14 +21,48 @@ const CONVINCING_BYTES: u32 = 20;
 pub struct Survey {
     diagnostics: Diagnostics,
     events: Vec<Event>,
-    seen: FxHashMap<(u8, Protocol), u32>,
-    /// Requests and responses of UDS that did not find each other, and all that ISO 15765-2 was found in.
-    alone: FxHashMap<u8, [u32; 2]>,
+    diagnostics_signs: FxHashMap<u8, DiagnosticsSigns>,
     /// Numbers of extended frames: those of NMEA 2000's groups, those of J1939's, and all.
     extended: FxHashMap<u8, [u32; 3]>,
     canopen: FxHashMap<u8, canopen::CanOpenSigns>,
     devicenet: FxHashMap<u8, devicenet::DeviceNetSigns>,
     relatives: FxHashMap<u8, Relatives>,
+}
+
+/// What on a channel looks like ISO 15765-2 and the protocols on top of it.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct DiagnosticsSigns {
+    /// Messages that convince.
+    seen: BTreeMap<Protocol, u32>,
+    /// Requests and responses of UDS that did not find each other.
+    alone: u32,
+    all: u32,
+}
+
+impl DiagnosticsSigns {
+    /// Takes what was found on the channel.
+    pub fn take(&mut self, event: &Event) {
+        let convinces = match event.protocol {
+            Protocol::IsoTp => event.kind == "transfer" && event.frames > 2,
+            _ => matches!(event.kind, "exchange" | "refusal"),
+        };
+        let is_alone =
+            event.protocol == Protocol::Uds && matches!(event.kind, "response" | "no_response" | "request");
+        self.all += 1;
+        self.alone += u32::from(is_alone);
+        if convinces {
+            *self.seen.entry(event.protocol).or_default() += 1;
+        }
+    }
+
+    /// The protocols, with the number of messages that indicate them.
+    pub fn found(&self) -> impl Iterator<Item = (Protocol, u32)> {
+        // A server that does not answer, or answers something else: other traffic with these identifiers rarely looks like that.
+        let is_silent =
+            self.seen.is_empty() && self.alone > 1 && u64::from(self.alone) * 5 >= u64::from(self.all) * 4;
+        let silent = is_silent.then_some((Protocol::Uds, self.alone));
+        self.seen.iter().map(|(protocol, count)| (*protocol, *count)).chain(silent)
+    }
 }
 
 /// Evidence that a channel uses a protocol.
@@ -63,19 +99,7 @@ impl Survey {
             *vehicle += u32::from(j1939::is_known(header.pgn));
         }
         for event in self.events.drain(..) {
-            let convinces = match event.protocol {
-                Protocol::IsoTp => event.kind == "transfer" && event.frames > 2,
-                _ => matches!(event.kind, "exchange" | "refusal"),
-            };
-            let [alone, all] = self.alone.entry(event.channel).or_default();
-            *all += 1;
-            *alone += u32::from(
-                event.protocol == Protocol::Uds
-                    && matches!(event.kind, "response" | "no_response" | "request"),
-            );
-            if convinces {
-                *self.seen.entry((event.channel, event.protocol)).or_default() += 1;
-            }
+            self.diagnostics_signs.entry(event.channel).or_default().take(&event);
         }
     }
 
@@ -92,17 +116,12 @@ impl Survey {
     /// The protocols found, by channel.
     pub fn found(&self) -> Vec<Evidence> {
         let mut found: Vec<_> = self
-            .seen
+            .diagnostics_signs
             .iter()
-            .map(|(&(channel, protocol), &messages)| Evidence { channel, protocol, messages })
+            .flat_map(|(&channel, signs)| {
+                signs.found().map(move |(protocol, messages)| Evidence { channel, protocol, messages })
+            })
             .collect();
-        // A server that does not answer, or answers something else: other traffic with these identifiers rarely looks like that.
-        for (&channel, &[alone, all]) in &self.alone {
-            let is_speaking = found.iter().any(|found| found.channel == channel);
-            if !is_speaking && alone > 1 && alone * 5 >= all * 4 {
-                found.push(Evidence { channel, protocol: Protocol::Uds, messages: alone });
-            }
-        }
         // A trace may end before any message is complete.
         let mut open = Vec::new();
         self.diagnostics.under_way(&mut open);

@@ -7,7 +7,7 @@ use super::super::codec::Encode;
 use super::super::event_text::EventText;
 use super::super::left_out::LeftOut;
 use super::super::output::Patch;
-use super::decode::{OPEN_COUNTERS, OPEN_LENGTH};
+use super::part::{OPEN_COUNTERS, OPEN_LENGTH};
 use super::{BIT_ERROR, ERROR_TYPES, FILE_MAGIC, HEADER_AT, UNFINISHED_MAGIC, WORDS};
 use cantap_trace::fd::FD_MAX_BYTES;
 use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};

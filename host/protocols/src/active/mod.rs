@@ -7,6 +7,7 @@ pub mod exchange;
 pub mod lss;
 pub mod node_scan;
 pub mod sdo;
+mod sdo_job;
 pub mod station;
 #[cfg(test)]
 mod testing;

@@ -1,12 +1,14 @@
 //! Reads and writes a CANopen node's objects as the client: expedited, in segments, or in blocks (CiA 301, 7.2.4.3).
 
+pub use super::sdo_job::{SdoError, SdoIds, SdoJob};
+
 use std::collections::VecDeque;
 
 use cantap_trace::Id;
 use cantap_wire::Frame;
 
 use super::Machine;
-use crate::canopen::{abort_text, crc_of};
+use crate::canopen::crc_of;
 
 /// The longest object that is accepted, in bytes.
 const MOST_BYTES: usize = 1 << 24;
@@ -24,71 +26,6 @@ const BAD_SEQUENCE: u32 = 0x0504_0003;
 const OUT_OF_MEMORY: u32 = 0x0504_0005;
 const BAD_LENGTH: u32 = 0x0607_0010;
 const GENERAL: u32 = 0x0800_0000;
-
-/// The identifiers of a node's SDO channel.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct SdoIds {
-    /// Identifier of the requests.
-    pub request: Id,
-    /// Identifier of the answers.
-    pub response: Id,
-}
-
-impl SdoIds {
-    /// Those of the default SDO of a node, 1 to 127.
-    pub const fn of(node: u8) -> Self {
-        let node = (node & 0x7F) as u32;
-        Self { request: Id::standard_truncated(0x600 + node), response: Id::standard_truncated(0x580 + node) }
-    }
-}
-
-/// What to do with an object.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum SdoJob {
-    /// Read it.
-    Read,
-    /// Write these bytes.
-    Write(Vec<u8>),
-}
-
-/// Why a transfer failed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[non_exhaustive]
-pub enum SdoError {
-    /// The node stopped answering, or never did.
-    #[error("no answer within {after_ms} ms, after {done} bytes")]
-    NoAnswer {
-        /// How long we waited.
-        after_ms: u64,
-        /// Bytes transferred so far.
-        done: usize,
-    },
-    /// The node aborted it.
-    #[error("the node aborted it: {} ({code:08X})", abort_text(*code))]
-    Aborted {
-        /// Its reason (CiA 301, table 22).
-        code: u32,
-    },
-    /// The node's answer violates the standard; the transfer was aborted.
-    #[error("the node's answer is wrong, after {done} bytes: {} ({code:08X})", abort_text(*code))]
-    Wrong {
-        /// The abort code sent to it.
-        code: u32,
-        /// Bytes transferred so far.
-        done: usize,
-    },
-    /// It was ended from outside; the node was told.
-    #[error("ended before it was complete, after {done} bytes")]
-    Cancelled {
-        /// Bytes transferred so far.
-        done: usize,
-    },
-    /// Frames from the bus were lost on the way to this computer.
-    #[error(
-        "frames were lost on the way to this computer, so the object may not be whole; the transfer was aborted"
-    )]
-    FramesLost,
-}
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Step {

@@ -1,0 +1,409 @@
+//! One stream of records in an MF4 file: those of one group, or of several in turn.
+
+use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::io;
+
+use cantap_trace::{PlainFrame, TraceRecord};
+
+use super::super::codec::PLAIN_BATCH;
+use super::super::issue::Fault;
+use super::super::whole::Whole;
+use super::blocks::{BLOCK_HEAD_BYTES, Block, u32_at};
+use super::layout::{Alone, Bytes, Content, Events, Group, RecordBytes, Times};
+use super::plain::Plain;
+use super::stream::Stream;
+
+const INVALID: &str = "records that are marked as invalid";
+
+/// Flags for what must be corrected in an unfinished file.
+pub(super) const OPEN_COUNTERS: u16 = 1;
+pub(super) const OPEN_LENGTH: u16 = 4;
+const OPEN_PLACES: u16 = 0x40;
+
+/// Limit for records waiting for their bytes and bytes waiting for their records: if they are farther apart,
+/// the file is damaged.
+const MAX_APART: usize = 1 << 16;
+
+/// Longest value of a variable-length record; a frame has 64 bytes.
+const MAX_VALUE_BYTES: usize = 1 << 20;
+
+/// What a part yields next.
+pub(super) enum Item {
+    Record(TraceRecord),
+    LeftOut(&'static str),
+    Fault(u64, Fault),
+}
+
+impl Item {
+    /// The content of the record at a place, or what is wrong with it.
+    fn of(record: Result<TraceRecord, Fault>, place: u64) -> Self {
+        record.map_or_else(|fault| Self::Fault(place, fault), Self::Record)
+    }
+}
+
+/// A stream of records, of one or several groups.
+pub(super) struct Part {
+    start_ns: i64,
+    /// Bytes before each record that identify its group.
+    id_bytes: usize,
+    groups: Vec<Group>,
+    /// For those whose records are plain frames at fixed places.
+    plain: Vec<Option<Plain>>,
+    /// Bytes of a record of each group in the stream.
+    record_bytes: Vec<usize>,
+    by_id: HashMap<u64, usize>,
+    /// Groups whose records are the bytes of another group's records, by address.
+    values: HashMap<u64, Values>,
+    by_order: bool,
+    stream: Stream,
+    at: u64,
+    /// Number of records of each group so far.
+    counts: Vec<u64>,
+    /// If sorted: the number of records.
+    records: u64,
+    /// Whether the file contains the number of records in each group.
+    is_counted: bool,
+    waiting: VecDeque<(usize, u64, Vec<u8>, u64)>,
+    /// That of the last record that has one.
+    pub time_ns: i64,
+    pub next: Option<Item>,
+    ended: bool,
+}
+
+/// Values by their position in the stream of all values of their group.
+#[derive(Default)]
+struct Values {
+    kept: BTreeMap<u64, Vec<u8>>,
+    /// The position of the next one.
+    end: u64,
+    /// If positions were not written: how many values came, and how many were requested.
+    came: u64,
+    asked: u64,
+}
+
+/// The system's errors end the reading; others are reported.
+pub(super) fn own(fault: Fault) -> io::Result<Fault> {
+    match fault {
+        Fault::Io(error) => Err(error),
+        other => Ok(other),
+    }
+}
+
+impl Part {
+    /// The content of a data group, if it has bus events; and how many of its groups are signals.
+    pub fn open(
+        file: &mut Whole,
+        block: &Block,
+        open: u16,
+        start_ns: i64,
+        alone: &Alone,
+    ) -> Result<(Option<Self>, u32), Fault> {
+        let id_bytes = usize::from(block.data.first().copied().unwrap_or(0));
+        let open_end = open & OPEN_LENGTH != 0;
+        let (mut groups, mut next) = (Vec::new(), block.link(1));
+        while next != 0 {
+            let (group, behind) = Group::open(file, next, open_end, alone)?;
+            groups.push(group);
+            next = behind;
+            if groups.len() as u64 * BLOCK_HEAD_BYTES > file.len() {
+                return Err(Fault::malformed("a list of groups that ends", b"a circle of links"));
+            }
+        }
+        let signals = groups.iter().filter(|group| matches!(group.content, Content::Signals)).count() as u32;
+        if !groups.iter().any(|group| matches!(group.content, Content::Bus(_))) {
+            return Ok((None, signals));
+        }
+        if groups.len() > 1 && ![1, 2, 4, 8].contains(&id_bytes) {
+            let found = format!("{id_bytes} bytes");
+            return Err(Fault::malformed("records that say of which group they are", found.as_bytes()));
+        }
+        let by_id = groups.iter().enumerate().map(|(at, group)| (group.record_id, at)).collect();
+        let values = groups.iter().filter(|group| matches!(group.content, Content::Values));
+        let values = values.map(|group| (group.address, Values::default())).collect();
+        let is_sorted = groups.len() == 1 && id_bytes == 0;
+        let row = if is_sorted { groups[0].record_bytes } else { RecordBytes::default() };
+        let mut stream = Stream::of_records(file, block.link(2), open_end, row.values, row.invalid)?;
+        let record_bytes = groups.iter().map(|group| group.record_bytes.all()).collect::<Vec<_>>();
+        let record_bytes = if stream.invalid().is_some() { vec![row.values] } else { record_bytes };
+        let plain = groups.iter().zip(&record_bytes).map(|(group, len)| match &group.content {
+            Content::Bus(bus) => Plain::of(bus, *len, start_ns),
+            Content::Values | Content::Signals | Content::Times => None,
+        });
+        let plain = plain.collect();
+        let is_counted = open & OPEN_COUNTERS == 0;
+        let records = if is_sorted && is_counted { groups[0].records } else { u64::MAX };
+        let part = Self {
+            start_ns,
+            id_bytes,
+            counts: vec![0; groups.len()],
+            record_bytes,
+            groups,
+            plain,
+            by_id,
+            values,
+            by_order: open & OPEN_PLACES != 0,
+            stream,
+            at: 0,
+            records,
+            is_counted,
+            waiting: VecDeque::new(),
+            time_ns: start_ns,
+            next: None,
+            ended: false,
+        };
+        Ok((Some(part), signals))
+    }
+
+    pub fn advance(&mut self, file: &mut Whole) -> io::Result<Option<Item>> {
+        match self.step(file) {
+            Ok(item) => Ok(item),
+            Err(fault) => {
+                // It is no longer known where one record ends and the next begins.
+                self.ended = true;
+                // What waits would meet the same fault for ever.
+                self.waiting.clear();
+                Ok(Some(Item::Fault(self.at, own(fault)?)))
+            }
+        }
+    }
+
+    fn step(&mut self, file: &mut Whole) -> Result<Option<Item>, Fault> {
+        loop {
+            if let Some(item) = self.of_waiting(file)? {
+                return Ok(Some(item));
+            }
+            if self.ended {
+                return Ok(None);
+            }
+            let place = self.at;
+            let Some(group) = self.group(file)? else {
+                self.ended = true;
+                if let Some((_, _, _, place)) = self.waiting.pop_front() {
+                    let rest = std::mem::take(&mut self.waiting).len() + 1;
+                    let found = format!("{rest} frames without theirs");
+                    let fault = Fault::malformed("the bytes of each frame", found.as_bytes());
+                    return Ok(Some(Item::Fault(place, fault)));
+                }
+                return Ok(self.fault_of_end().map(|fault| Item::Fault(self.at, fault)));
+            };
+            match &self.groups[group].content {
+                Content::Values => {
+                    let Some(head) = self.stream.at(file, self.at, 4)? else { return Ok(Some(self.cut())) };
+                    let len = u32_at(head, 0) as usize;
+                    if len > MAX_VALUE_BYTES {
+                        return Err(Fault::malformed("a value of up to 1 MiB", len.to_string().as_bytes()));
+                    }
+                    let Some(value) = self.stream.at(file, self.at + 4, len)? else {
+                        return Ok(Some(self.cut()));
+                    };
+                    let value = value.to_vec();
+                    self.at += 4 + len as u64;
+                    if let Some(values) = self.values.get_mut(&self.groups[group].address) {
+                        values.keep(value, self.by_order);
+                    }
+                }
+                // Nothing is waiting, and the record is complete: by far the most frequent case.
+                Content::Bus(bus) if self.waiting.is_empty() && bus.is_complete() => {
+                    let (len, number) = (self.record_bytes[group], self.counts[group]);
+                    let Some(record) = self.stream.at(file, self.at, len)? else {
+                        return Ok(Some(self.cut()));
+                    };
+                    self.at += len as u64;
+                    self.counts[group] += 1;
+                    return Ok(Some(Item::of(
+                        bus.record(record, record, number, None, self.start_ns),
+                        place,
+                    )));
+                }
+                Content::Signals | Content::Times | Content::Bus(_) => {
+                    let len = self.record_bytes[group];
+                    let Some(record) = self.stream.at(file, self.at, len)? else {
+                        return Ok(Some(self.cut()));
+                    };
+                    let record = record.to_vec();
+                    self.at += len as u64;
+                    let number = self.counts[group];
+                    self.counts[group] += 1;
+                    if matches!(self.groups[group].content, Content::Bus(_)) {
+                        if self.waiting.len() >= MAX_APART {
+                            return Err(Fault::malformed("the bytes of a frame near it", b"none"));
+                        }
+                        self.waiting.push_back((group, number, record, place));
+                    }
+                }
+            }
+        }
+    }
+
+    /// Appends the plain frames that follow and are at hand, as long as it is their turn; what comes then is for [`Self::advance`].
+    pub fn plain_frames(&mut self, frames: &mut Vec<PlainFrame>, is_next: impl Fn(i64) -> bool) {
+        if self.ended || !self.waiting.is_empty() {
+            return;
+        }
+        let room = PLAIN_BATCH.saturating_sub(frames.len());
+        let Self { stream, at, plain, record_bytes, counts, records, .. } = self;
+        if self.id_bytes == 0 {
+            let Some(plain) = &plain[0] else { return };
+            let most = usize::try_from(records.saturating_sub(counts[0])).map_or(room, |left| left.min(room));
+            let found = plain.frames(stream.held(*at), counts[0], most, is_next, frames);
+            *at += (found * record_bytes[0]) as u64;
+            counts[0] += found as u64;
+            if let Some(last) = frames.last().filter(|_| found > 0) {
+                self.time_ns = last.time_ns;
+            }
+            return;
+        }
+        // Records of one group follow each other: it is looked up once.
+        let mut last: Option<(u64, usize)> = None;
+        let mut rest = stream.held(*at);
+        for _ in 0..room {
+            let Some((id, bytes)) = rest.split_at_checked(self.id_bytes) else { return };
+            let id = id.iter().rev().fold(0, |id: u64, byte| id << 8 | u64::from(*byte));
+            let group = match last {
+                Some((known, group)) if known == id => group,
+                _ => match self.by_id.get(&id) {
+                    Some(group) => *group,
+                    None => return,
+                },
+            };
+            last = Some((id, group));
+            let Some(plain) = &plain[group] else { return };
+            let Some(frame) = plain.frame(bytes, counts[group]).filter(|frame| is_next(frame.time_ns)) else {
+                return;
+            };
+            rest = &bytes[record_bytes[group]..];
+            *at += (self.id_bytes + record_bytes[group]) as u64;
+            counts[group] += 1;
+            self.time_ns = frame.time_ns;
+            frames.push(frame);
+        }
+    }
+
+    /// What is wrong where no record follows.
+    fn fault_of_end(&self) -> Option<Fault> {
+        let rest = self.stream.len().saturating_sub(self.at);
+        let is_sorted = self.records != u64::MAX;
+        let is_short = is_sorted && self.counts[0] < self.records;
+        if self.stream.is_cut() || is_short || rest > 0 && !is_sorted {
+            return Some(Fault::Truncated("a group of frames"));
+        }
+        // The counter is damaged, or the file's writer reserved more space than it had records.
+        if is_sorted && rest >= self.record_bytes[0].max(1) as u64 {
+            let expected = format!("no more data than the {} records that are counted", self.records);
+            return Some(Fault::malformed(expected, format!("{rest} bytes more").as_bytes()));
+        }
+        if is_sorted || !self.is_counted {
+            return None;
+        }
+        // The group's number before each record may be damaged.
+        let counts = self.groups.iter().zip(&self.counts);
+        let differs = |(group, count): &(&Group, &u64)| {
+            !matches!(group.content, Content::Values) && group.records != **count
+        };
+        let (group, count) = counts.into_iter().find(differs)?;
+        let expected = format!("{} records of a group, as are counted", group.records);
+        Some(Fault::malformed(expected, count.to_string().as_bytes()))
+    }
+
+    fn cut(&mut self) -> Item {
+        self.ended = true;
+        Item::Fault(self.at, Fault::Truncated("a record"))
+    }
+
+    /// The group of the next record; `None` at the end.
+    fn group(&mut self, file: &mut Whole) -> Result<Option<usize>, Fault> {
+        let is_over = self.counts.first().is_some_and(|count| *count >= self.records);
+        if self.at >= self.stream.len() || is_over {
+            return Ok(None);
+        }
+        if self.id_bytes == 0 {
+            // A zero-length record would never end.
+            let len = self.record_bytes[0] as u64;
+            return Ok((len > 0 && self.at + len <= self.stream.len()).then_some(0));
+        }
+        let Some(id) = self.stream.at(file, self.at, self.id_bytes)? else { return Ok(None) };
+        let id = id.iter().rev().fold(0, |id: u64, byte| id << 8 | u64::from(*byte));
+        self.at += self.id_bytes as u64;
+        let group = self.by_id.get(&id).copied();
+        let group =
+            group.ok_or_else(|| Fault::malformed("a record of a known group", id.to_string().as_bytes()))?;
+        Ok(Some(group))
+    }
+
+    /// The record that has waited longest, if its bytes have arrived.
+    fn of_waiting(&mut self, file: &mut Whole) -> Result<Option<Item>, Fault> {
+        let Some((group, number, record, place)) = self.waiting.front() else { return Ok(None) };
+        let place = *place;
+        if let Content::Bus(bus) = &self.groups[*group].content
+            && let Events::Other(what) = bus.events
+        {
+            self.waiting.pop_front();
+            return Ok(Some(Item::LeftOut(what)));
+        }
+        let Content::Bus(bus) = &mut self.groups[*group].content else { return Ok(None) };
+        let apart = match &mut bus.bytes {
+            None | Some(Bytes::Here(_)) => None,
+            Some(Bytes::Stream { place, stream }) => {
+                let at = place.unsigned(record).unwrap_or(u64::MAX);
+                let len = stream.at(file, at, 4)?.map_or(0, |head| u32_at(head, 0));
+                Some(stream.at(file, at.saturating_add(4), len as usize)?.unwrap_or_default().to_vec())
+            }
+            Some(Bytes::Group { place, address }) => {
+                let Some(values) = self.values.get_mut(address) else {
+                    return Err(Fault::malformed("the group that has the bytes of frames", b"none"));
+                };
+                let at = place.unsigned(record).unwrap_or(u64::MAX);
+                match values.take(at, self.by_order) {
+                    Some(value) => Some(value),
+                    None => return Ok(None),
+                }
+            }
+        };
+        let invalid_bytes = self.groups[*group].record_bytes.invalid;
+        let Content::Bus(bus) = &mut self.groups[*group].content else { return Ok(None) };
+        let bits = match self.stream.invalid() {
+            Some(stream) => {
+                let at = number.saturating_mul(invalid_bytes as u64);
+                stream
+                    .at(file, at, invalid_bytes)?
+                    .ok_or(Fault::Truncated("the bits that say what is valid"))?
+            }
+            None => record.get(record.len().saturating_sub(invalid_bytes)..).unwrap_or_default(),
+        };
+        let item = if bus.is_invalid(bits) {
+            Item::LeftOut(INVALID)
+        } else {
+            let time = match &mut bus.times {
+                None => None,
+                Some(Times { stream, record_bytes }) => {
+                    let at = number.saturating_mul(*record_bytes as u64);
+                    let time = stream.at(file, at, *record_bytes)?;
+                    Some(time.ok_or(Fault::Truncated("the times of a group of frames"))?.to_vec())
+                }
+            };
+            let time = time.as_deref().unwrap_or(record);
+            Item::of(bus.record(record, time, *number, apart.as_deref(), self.start_ns), place)
+        };
+        self.waiting.pop_front();
+        Ok(Some(item))
+    }
+}
+
+impl Values {
+    fn keep(&mut self, value: Vec<u8>, by_order: bool) {
+        let place = if by_order { self.came } else { self.end };
+        self.came += 1;
+        self.end += 4 + value.len() as u64;
+        self.kept.insert(place, value);
+        if self.kept.len() > MAX_APART {
+            self.kept.pop_first();
+        }
+    }
+
+    fn take(&mut self, place: u64, by_order: bool) -> Option<Vec<u8>> {
+        let place = if by_order { self.asked } else { place };
+        let value = self.kept.remove(&place)?;
+        self.asked += 1;
+        Some(value)
+    }
+}

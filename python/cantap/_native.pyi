@@ -15,6 +15,7 @@ __all__ = [
     "FormatError",
     "Frame",
     "PeriodicFrame",
+    "Reading",
     "Record",
     "Records",
     "Reply",
@@ -22,7 +23,6 @@ __all__ = [
     "Scan",
     "Table",
     "__version__",
-    "decode",
     "decode_table",
     "list_boards",
     "no_records",
@@ -385,7 +385,16 @@ def stats(
     data_bitrates: list[tuple[int | None, int]],
     window_s: float,
 ) -> dict[str, Any]: ...
-def decode(options: Options) -> tuple[tuple[list[tuple[str, Table]], Table], Report]: ...
+@final
+class Reading:
+    """A trace that a thread reads ahead, to be decoded."""
+
+    def __new__(cls, options: Options) -> Reading: ...
+    def decode(
+        self, db: Database, signals: list[str]
+    ) -> tuple[tuple[list[tuple[str, Table]], Table], Report]:
+        """A table for each message, and one for events other than frames; once."""
+
 def decode_table(
     table: Any, db: Database, signals: list[str]
 ) -> tuple[list[tuple[str, Table]], Table]: ...

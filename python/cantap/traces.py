@@ -150,8 +150,13 @@ def decode(
     identifier behind it, as in `Engine-1A0`.
     """
     if isinstance(source, (str, os.PathLike)):
-        options = _options(source, db, signals, filter, channel, start, end, format, zone, strict)
-        (tables, events), report = _native.decode(options)
+        if db is None:
+            raise ValueError("a database decodes; give one with db=")
+        chosen = words(signals, "signals")
+        options = _options(source, None, (), filter, channel, start, end, format, zone, strict)
+        # It is read while the database is loaded.
+        reading = _native.Reading(options)
+        (tables, events), report = reading.decode(_database(db), chosen)
         return Messages(dict(tables), events, report)
     if filter or channel != () or (start, end, format, zone) != (None,) * 4 or strict:
         raise ValueError("of a table only signals can be chosen; choose its rows before")

@@ -9,8 +9,8 @@ use cantap_trace::{PlainFrame, TraceRecord};
 use crate::error::Error;
 use crate::source::TraceSource;
 
-/// More would be memory for nothing: reading takes longer than what is done with the batches, or the other way round.
-const BATCHES: usize = 8;
+/// As many as are read while a database is loaded: three megabytes of frames.
+const BATCHES: usize = 32;
 
 /// What is read at a time: frames first, then records.
 #[derive(Default)]

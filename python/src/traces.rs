@@ -1,7 +1,7 @@
 //! Operations on a whole trace.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use std::{fs, io};
 
@@ -94,30 +94,50 @@ fn selection(signals: &[String]) -> Result<Option<Selection>, Error> {
     Ok(if signals.is_empty() { None } else { Some(Selection::new(signals)?) })
 }
 
-/// A trace as a table for each message, and one for events other than frames.
-#[pyfunction]
-pub fn decode(py: Python<'_>, options: Options) -> PyResult<(Tables, Py<Report>)> {
-    let decoder =
-        options.decoder()?.ok_or_else(|| Error::argument("a database decodes; give one with db="))?;
-    let chosen = selection(&options.signals)?;
-    let mut tables = MessageTables::new(Arc::clone(&decoder), chosen.is_some());
-    let report = Report::default();
-    let for_source = report.clone();
-    let mut ahead = py.detach(|| Ahead::read(TraceSource::open(&options, for_source)?))?;
-    let mut next = || -> Result<bool, Error> {
-        let Some(batch) = ahead.next()? else { return Ok(false) };
-        tables.push_frames(&batch.frames);
-        batch.records.iter().for_each(|record| tables.push(record));
-        ahead.give_back(batch);
-        Ok(true)
-    };
-    while py.detach(&mut next)? {
-        py.check_signals()?;
+/// A trace that a thread reads ahead, to be decoded: it begins before the database is loaded, which takes as long as many frames.
+#[pyclass(module = "cantap", frozen)]
+pub struct Reading {
+    ahead: Mutex<Option<Ahead>>,
+    report: Report,
+}
+
+#[pymethods]
+impl Reading {
+    #[new]
+    fn new(py: Python<'_>, options: Options) -> PyResult<Self> {
+        let report = Report::default();
+        let for_source = report.clone();
+        let ahead = py.detach(|| Ahead::read(TraceSource::open(&options, for_source)?))?;
+        Ok(Self { ahead: Mutex::new(Some(ahead)), report })
     }
-    warn(py, &report)?;
-    report.set_decoded(py.detach(|| tables.counts()));
-    warn_if_nothing_decoded(py, &report)?;
-    Ok((finish(&decoder, tables, chosen.as_ref()), Py::new(py, report)?))
+
+    /// The trace as a table for each message, and one for events other than frames; once.
+    fn decode(
+        &self,
+        py: Python<'_>,
+        db: Py<Database>,
+        signals: Vec<String>,
+    ) -> PyResult<(Tables, Py<Report>)> {
+        let decoder = db.get().selecting(&signals)?;
+        let chosen = selection(&signals)?;
+        let ahead = self.ahead.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let mut ahead = ahead.ok_or_else(|| Error::argument("this trace has been decoded already"))?;
+        let mut tables = MessageTables::new(Arc::clone(&decoder), chosen.is_some());
+        let mut next = || -> Result<bool, Error> {
+            let Some(batch) = ahead.next()? else { return Ok(false) };
+            tables.push_frames(&batch.frames);
+            batch.records.iter().for_each(|record| tables.push(record));
+            ahead.give_back(batch);
+            Ok(true)
+        };
+        while py.detach(&mut next)? {
+            py.check_signals()?;
+        }
+        warn(py, &self.report)?;
+        self.report.set_decoded(py.detach(|| tables.counts()));
+        warn_if_nothing_decoded(py, &self.report)?;
+        Ok((finish(&decoder, tables, chosen.as_ref()), Py::new(py, self.report.clone())?))
+    }
 }
 
 /// The same for a table of records.
@@ -334,7 +354,7 @@ impl Drop for Temporary {
 
 /// Adds the functions to the module.
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_function(wrap_pyfunction!(decode, module)?)?;
+    module.add_class::<Reading>()?;
     module.add_function(wrap_pyfunction!(decode_table, module)?)?;
     module.add_function(wrap_pyfunction!(no_records, module)?)?;
     module.add_function(wrap_pyfunction!(search, module)?)?;

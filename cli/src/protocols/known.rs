@@ -91,8 +91,8 @@ impl Known {
                 "response_max_ms": max,
             })
         });
-        let nodes = self.overview.nodes().map(|(key, known)| {
-            let mut node = named(key);
+        let nodes = self.overview.nodes().map(|((channel, protocol, node), known)| {
+            let mut node = named((channel, protocol, &node));
             let about = json!({
                 "first_s": known.first_ns as f64 / 1e9, "last_s": known.last_ns as f64 / 1e9, "events": known.events,
                 "faults": known.faults, "state": known.state, "missed": known.missed, "period_ms": known.period_ms,

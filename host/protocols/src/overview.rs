@@ -4,10 +4,16 @@
 //! Memory is limited by the numbers of nodes, services and objects in the constants here; anything beyond is
 //! counted.
 
+mod object;
+
+use std::borrow::Cow;
 use std::collections::BTreeMap;
+use std::hash::Hash;
 
 use hdrhistogram::Histogram as Counts;
+use rustc_hash::FxHashMap;
 
+use self::object::ObjectKey;
 use crate::{Event, Party, Protocol, Trouble, Value};
 
 const MOST_NODES: usize = 1024;
@@ -21,9 +27,10 @@ const MOST_TEXT: usize = 256;
 /// Collects figures from events.
 #[derive(Clone, Debug, Default)]
 pub struct Overview {
-    services: BTreeMap<(u8, Protocol, String), ServiceFigures>,
-    nodes: BTreeMap<(u8, Protocol, String), KnownNode>,
-    objects: BTreeMap<(u8, Protocol, String, String), KnownObject>,
+    services: FxHashMap<(u8, Protocol, Cow<'static, str>), ServiceFigures>,
+    nodes: FxHashMap<(u8, Protocol, Party), KnownNode>,
+    /// With the object in words.
+    objects: FxHashMap<(u8, Protocol, Party, ObjectKey), (String, KnownObject)>,
     left_out: u64,
 }
 
@@ -126,28 +133,31 @@ impl Overview {
     pub fn take(&mut self, event: &Event) {
         self.service(event);
         let Some(of) = subject(event) else { return };
-        let of = of.to_string();
-        self.node(event, &of);
+        self.node(event, of);
         self.object(event, of);
     }
 
     /// By channel, protocol and name of the service.
     pub fn services(&self) -> impl Iterator<Item = ((u8, Protocol, &str), &ServiceFigures)> {
-        self.services
-            .iter()
-            .map(|((channel, protocol, title), figures)| ((*channel, *protocol, &**title), figures))
+        let services = self.services.iter();
+        sorted(
+            services.map(|((channel, protocol, title), figures)| ((*channel, *protocol, &**title), figures)),
+        )
     }
 
     /// By channel, protocol and number or identifier.
-    pub fn nodes(&self) -> impl Iterator<Item = ((u8, Protocol, &str), &KnownNode)> {
-        self.nodes.iter().map(|((channel, protocol, node), known)| ((*channel, *protocol, &**node), known))
+    pub fn nodes(&self) -> impl Iterator<Item = ((u8, Protocol, String), &KnownNode)> {
+        let nodes = self.nodes.iter();
+        sorted(
+            nodes.map(|((channel, protocol, node), known)| ((*channel, *protocol, node.to_string()), known)),
+        )
     }
 
     /// By channel, protocol, node and number of the object.
-    pub fn objects(&self) -> impl Iterator<Item = ((u8, Protocol, &str, &str), &KnownObject)> {
-        self.objects.iter().map(|((channel, protocol, node, object), known)| {
-            ((*channel, *protocol, &**node, &**object), known)
-        })
+    pub fn objects(&self) -> impl Iterator<Item = ((u8, Protocol, String, &str), &KnownObject)> {
+        sorted(self.objects.iter().map(|((channel, protocol, node, _), (object, known))| {
+            ((*channel, *protocol, node.to_string(), &**object), known)
+        }))
     }
 
     /// The number of items not counted because there were too many.
@@ -174,8 +184,8 @@ impl Overview {
         }
     }
 
-    fn node(&mut self, event: &Event, of: &str) {
-        let key = (event.channel, event.protocol, of.to_owned());
+    fn node(&mut self, event: &Event, of: Party) {
+        let key = (event.channel, event.protocol, of);
         let is_new = !self.nodes.contains_key(&key);
         let Some(node) = entry(&mut self.nodes, key, MOST_NODES) else {
             self.left_out += 1;
@@ -219,24 +229,35 @@ impl Overview {
         }
     }
 
-    fn object(&mut self, event: &Event, of: String) {
-        let Some((object, name, value)) = object(event) else { return };
-        let key = (event.channel, event.protocol, of, object);
-        let Some(known) = entry(&mut self.objects, key, MOST_OBJECTS) else {
+    fn object(&mut self, event: &Event, of: Party) {
+        let Some(key) = object::key_of(event) else { return };
+        let key = (event.channel, event.protocol, of, key);
+        let Some((words, known)) = entry(&mut self.objects, key, MOST_OBJECTS) else {
             self.left_out += 1;
             return;
         };
+        if known.count == 0 {
+            *words = object::in_words(event);
+        }
         known.count += 1;
-        known.name = known.name.take().or(name);
-        if let Some(value) = value {
+        if known.name.is_none() {
+            known.name = object::name_of(event);
+        }
+        if let Some(value) = object::value_of(event) {
             known.varies |= known.value.as_ref().is_some_and(|before| *before != value);
             known.value = Some(value);
         }
     }
 }
 
+fn sorted<K: Ord, V>(entries: impl Iterator<Item = (K, V)>) -> impl Iterator<Item = (K, V)> {
+    let mut entries: Vec<_> = entries.collect();
+    entries.sort_by(|(a, _), (b, _)| a.cmp(b));
+    entries.into_iter()
+}
+
 /// The entry, created if there is room.
-fn entry<K: Ord, V: Default>(map: &mut BTreeMap<K, V>, key: K, most: usize) -> Option<&mut V> {
+fn entry<K: Eq + Hash, V: Default>(map: &mut FxHashMap<K, V>, key: K, most: usize) -> Option<&mut V> {
     if map.len() >= most && !map.contains_key(&key) {
         return None;
     }
@@ -269,12 +290,12 @@ fn text(field: &crate::Field) -> Option<String> {
 }
 
 /// Services as people would count them: those of SDO by what they do, not by object.
-fn service_name(event: &Event) -> String {
+fn service_name(event: &Event) -> Cow<'static, str> {
     match event.kind {
-        "sdo_read" => "SDO read".to_owned(),
-        "sdo_write" => "SDO write".to_owned(),
-        "state" | "guard" => "guarding".to_owned(),
-        _ => event.title.to_string(),
+        "sdo_read" => "SDO read".into(),
+        "sdo_write" => "SDO write".into(),
+        "state" | "guard" => "guarding".into(),
+        _ => event.title.clone(),
     }
 }
 
@@ -306,51 +327,6 @@ fn identity(event: &Event) -> String {
     };
     let parts = ["function", "manufacturer", "identity"].into_iter().filter_map(part);
     parts.collect::<Vec<_>>().join(", ")
-}
-
-/// The object that an event is about: its number, its name, and its value if it is of a kind that need not
-/// change.
-fn object(event: &Event) -> Option<(String, Option<String>, Option<String>)> {
-    let field = |name: &str| event.field(name);
-    let meaning = |name: &str| field(name).and_then(|field| field.text.as_ref()).map(ToString::to_string);
-    let value = || {
-        let value = field("value").map(|field| short(field.value.to_string()));
-        value.filter(|_| event.trouble.is_none())
-    };
-    Some(match event.protocol {
-        Protocol::Uds => match (field("did"), field("routine")) {
-            (Some(did), _) => {
-                let one = event.fields.iter().filter(|field| field.name == "did").count() == 1;
-                (format!("did {}", did.value), meaning("did"), value().filter(|_| one))
-            }
-            (_, Some(routine)) => (format!("routine {}", routine.value), meaning("routine"), None),
-            _ => return None,
-        },
-        Protocol::Kwp2000 => (format!("identifier {}", field("local_identifier")?.value), None, value()),
-        Protocol::Obd => {
-            (format!("pid {} of service {}", field("pid")?.value, field("sid")?.value), meaning("pid"), None)
-        }
-        Protocol::CanOpen => match event.kind {
-            "sdo_read" | "sdo_write" => {
-                let number = |name: &str| number(event, name);
-                let object = format!("{:04X}:{:02X}", number("index")? as u32, number("sub")? as u32);
-                (object, meaning("index"), value())
-            }
-            "pdo" => (event.title.to_string(), None, None),
-            _ => return None,
-        },
-        Protocol::J1939 | Protocol::Nmea2000 => match event.kind {
-            "request" | "no_response" | "acknowledgement" => return None,
-            _ => (format!("pgn {}", field("pgn")?.value), Some(event.title.to_string()), None),
-        },
-        Protocol::DeviceNet if event.kind == "io" => (event.title.to_string(), None, None),
-        Protocol::DeviceNet => {
-            let class = format!("class {} instance {}", field("class")?.value, field("instance")?.value);
-            let attribute = field("attribute").map(|field| format!(" attribute {}", field.value));
-            (class + attribute.as_deref().unwrap_or_default(), meaning("class"), value())
-        }
-        Protocol::IsoTp => return None,
-    })
 }
 
 #[cfg(test)]
@@ -427,7 +403,7 @@ mod tests {
             ],
         );
         let (key, node) = truck.nodes().next().unwrap();
-        assert_eq!(key, (1, Protocol::J1939, "0"));
+        assert_eq!(key, (1, Protocol::J1939, "0".to_owned()));
         assert_eq!(node.identity.as_deref(), Some("engine, manufacturer 1, identity 1"));
         assert!(node.codes["DM1 active trouble codes"].starts_with("SPN 422 FMI 3"), "{:?}", node.codes);
         assert_eq!(truck.objects().count(), 2);

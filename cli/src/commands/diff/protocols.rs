@@ -23,8 +23,8 @@ pub(super) struct Protocols {
 
 impl Protocols {
     pub fn new([a, b]: [&Overview; 2], ignore_channels: bool) -> Self {
-        let key = |(channel, protocol, node): (u8, Protocol, &str)| {
-            (if ignore_channels { 0 } else { channel }, protocol, node.to_owned())
+        let key = |(channel, protocol, node): (u8, Protocol, String)| {
+            (if ignore_channels { 0 } else { channel }, protocol, node)
         };
         let nodes =
             [a, b].map(|overview| overview.nodes().map(|(node, _)| key(node)).collect::<BTreeSet<_>>());

@@ -1,0 +1,91 @@
+//! What an event is about: a data identifier, an entry of an object dictionary, a parameter group.
+
+use std::borrow::Cow;
+
+use super::{number, short};
+use crate::{Event, Protocol};
+
+/// What an event is about, without words: most are about something that is known already.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub(super) enum ObjectKey {
+    /// A kind of object, and the bits of its numbers.
+    Numbered(&'static str, [Option<u64>; 3]),
+    Titled(Cow<'static, str>),
+}
+
+/// The object that an event is about.
+pub(super) fn key_of(event: &Event) -> Option<ObjectKey> {
+    let bits = |name: &str| number(event, name).map(f64::to_bits);
+    let one =
+        |kind, name: &str| bits(name).map(|number| ObjectKey::Numbered(kind, [Some(number), None, None]));
+    match event.protocol {
+        Protocol::Uds => one("did", "did").or_else(|| one("routine", "routine")),
+        Protocol::Kwp2000 => one("identifier", "local_identifier"),
+        Protocol::Obd => Some(ObjectKey::Numbered("pid", [Some(bits("pid")?), Some(bits("sid")?), None])),
+        Protocol::CanOpen => match event.kind {
+            "sdo_read" | "sdo_write" => {
+                Some(ObjectKey::Numbered("object", [Some(bits("index")?), Some(bits("sub")?), None]))
+            }
+            "pdo" => Some(ObjectKey::Titled(event.title.clone())),
+            _ => None,
+        },
+        Protocol::J1939 | Protocol::Nmea2000 => match event.kind {
+            "request" | "no_response" | "acknowledgement" => None,
+            _ => one("pgn", "pgn"),
+        },
+        Protocol::DeviceNet if event.kind == "io" => Some(ObjectKey::Titled(event.title.clone())),
+        Protocol::DeviceNet => {
+            let numbers = [Some(bits("class")?), Some(bits("instance")?), bits("attribute")];
+            Some(ObjectKey::Numbered("class", numbers))
+        }
+        Protocol::IsoTp => None,
+    }
+}
+
+/// The object in words: its kind and number.
+pub(super) fn in_words(event: &Event) -> String {
+    let value = |name: &str| event.field(name).map_or_else(String::new, |field| field.value.to_string());
+    match event.protocol {
+        Protocol::Uds if event.field("did").is_some() => format!("did {}", value("did")),
+        Protocol::Uds => format!("routine {}", value("routine")),
+        Protocol::Kwp2000 => format!("identifier {}", value("local_identifier")),
+        Protocol::Obd => format!("pid {} of service {}", value("pid"), value("sid")),
+        Protocol::CanOpen if event.kind != "pdo" => {
+            let number = |name: &str| number(event, name).unwrap_or_default();
+            format!("{:04X}:{:02X}", number("index") as u32, number("sub") as u32)
+        }
+        Protocol::J1939 | Protocol::Nmea2000 => format!("pgn {}", value("pgn")),
+        Protocol::DeviceNet if event.kind != "io" => {
+            let attribute = event.field("attribute").map(|field| format!(" attribute {}", field.value));
+            let class = format!("class {} instance {}", value("class"), value("instance"));
+            class + attribute.as_deref().unwrap_or_default()
+        }
+        _ => event.title.to_string(),
+    }
+}
+
+/// The object's name, if the event has it.
+pub(super) fn name_of(event: &Event) -> Option<String> {
+    let meaning = |name: &str| event.field(name)?.text.as_ref().map(ToString::to_string);
+    match event.protocol {
+        Protocol::Uds => meaning(if event.field("did").is_some() { "did" } else { "routine" }),
+        Protocol::Obd => meaning("pid"),
+        Protocol::CanOpen => meaning("index"),
+        Protocol::J1939 | Protocol::Nmea2000 => Some(event.title.to_string()),
+        Protocol::DeviceNet => meaning("class"),
+        Protocol::Kwp2000 | Protocol::IsoTp => None,
+    }
+}
+
+/// The object's value as text, if it is of a kind that need not change.
+pub(super) fn value_of(event: &Event) -> Option<String> {
+    let has_value = match event.protocol {
+        Protocol::Uds => event.fields.iter().filter(|field| field.name == "did").count() == 1,
+        Protocol::Kwp2000 => true,
+        Protocol::CanOpen => event.kind != "pdo",
+        Protocol::DeviceNet => event.kind != "io",
+        _ => false,
+    };
+    let value = event.field("value").filter(|_| has_value && event.trouble.is_none())?;
+    Some(short(value.value.to_string()))
+}

@@ -76,7 +76,7 @@ impl Reading {
             }
             let diagnostics = found.iter().flatten().filter(|found| later::is_diagnostics(found.protocol));
             told.extend(diagnostics.map(|found| found.channel));
-            *silent = surveyed.later();
+            *silent = surveyed.survey().map(Later::new);
             options.spoken = found;
             waited = surveyed.release();
             records = &waited;

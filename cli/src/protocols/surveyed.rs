@@ -4,8 +4,6 @@
 use cantap::TraceRecord;
 use cantap_protocols::{Evidence, Relative, Survey};
 
-use super::later::Later;
-
 /// A survey examines no more records than this.
 const MOST_RECORDS: usize = 200_000;
 /// Nor more than this time of the bus, in nanoseconds.
@@ -40,9 +38,9 @@ impl Surveyed {
         !more || self.waiting.len() >= MOST_RECORDS || spans >= LONGEST_NS
     }
 
-    /// What becomes of channels that are silent so far; `None` without a survey.
-    pub fn later(&self) -> Option<Later> {
-        self.survey.as_ref().map(Later::new)
+    /// The survey, if there is one.
+    pub const fn survey(&self) -> Option<&Survey> {
+        self.survey.as_ref()
     }
 
     /// The protocols of each channel; `None` without a survey.

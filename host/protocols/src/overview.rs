@@ -13,7 +13,7 @@ use std::hash::Hash;
 use hdrhistogram::Histogram as Counts;
 use rustc_hash::FxHashMap;
 
-use self::object::ObjectKey;
+use self::object::{ObjectKey, number, short};
 use crate::{Event, Party, Protocol, Trouble, Value};
 
 const MOST_NODES: usize = 1024;
@@ -21,9 +21,6 @@ const MOST_SERVICES: usize = 256;
 const MOST_OBJECTS: usize = 8192;
 /// Number of trouble code lists per node: confirmed, pending, previously active.
 const MOST_LISTS: usize = 8;
-/// How many characters of a value are kept.
-const MOST_TEXT: usize = 256;
-
 /// Collects figures from events.
 #[derive(Clone, Debug, Default)]
 pub struct Overview {
@@ -268,18 +265,6 @@ fn keep(lists: &mut BTreeMap<String, String>, list: &str, codes: String) {
     if lists.len() < MOST_LISTS || lists.contains_key(list) {
         lists.insert(list.to_owned(), short(codes));
     }
-}
-
-fn short(text: String) -> String {
-    if text.chars().count() <= MOST_TEXT {
-        text
-    } else {
-        text.chars().take(MOST_TEXT).chain(['…']).collect()
-    }
-}
-
-fn number(event: &Event, name: &str) -> Option<f64> {
-    event.field(name)?.value.as_number()
 }
 
 fn text(field: &crate::Field) -> Option<String> {

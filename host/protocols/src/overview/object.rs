@@ -2,8 +2,10 @@
 
 use std::borrow::Cow;
 
-use super::{number, short};
 use crate::{Event, Protocol};
+
+/// How many characters of a value are kept.
+const MOST_TEXT: usize = 256;
 
 /// What an event is about, without words: most are about something that is known already.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
@@ -88,4 +90,18 @@ pub(super) fn value_of(event: &Event) -> Option<String> {
     };
     let value = event.field("value").filter(|_| has_value && event.trouble.is_none())?;
     Some(short(value.value.to_string()))
+}
+
+/// The field as a number, if it is one.
+pub(super) fn number(event: &Event, name: &str) -> Option<f64> {
+    event.field(name)?.value.as_number()
+}
+
+/// The text, cut to what is kept.
+pub(super) fn short(text: String) -> String {
+    if text.chars().count() <= MOST_TEXT {
+        text
+    } else {
+        text.chars().take(MOST_TEXT).chain(['…']).collect()
+    }
 }

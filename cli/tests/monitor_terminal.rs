@@ -49,6 +49,24 @@ fn any_size_is_drawn_or_said_to_be_too_small_and_a_change_shows_at_once() {
 }
 
 #[test]
+fn a_key_pressed_while_the_size_changes_is_obeyed() {
+    let mut view = Terminal::start(BUSY, (300, 100));
+    view.wait_for("2▸Fixed");
+    for round in 0..40_u64 {
+        let columns = if round % 2 == 0 { 290 } else { 300 };
+        let (key, page) = if round % 2 == 0 { ("1", "1▸Trace") } else { ("2", "2▸Fixed") };
+        // The first change makes it draw; it finds the second one and the key together when it is done.
+        view.resize((columns, 100));
+        std::thread::sleep(Duration::from_millis(round / 2));
+        view.resize((columns - 1, 100));
+        view.keys(key);
+        view.wait_for(page);
+    }
+    view.keys("q");
+    assert_eq!(view.end(), 0);
+}
+
+#[test]
 fn without_utf8_and_without_colours_the_drawing_is_plain() {
     let environment = [("LC_ALL", Some("C")), ("LANG", Some("C")), ("NO_COLOR", Some("1"))];
     let mut view = Terminal::start_with(BUSY, (100, 30), &environment);

@@ -52,7 +52,8 @@ impl Keyboard {
         if terminal[0].revents().intersects(PollFlags::HUP | PollFlags::ERR | PollFlags::NVAL) {
             return Ok(Waited::Gone);
         }
-        Ok(if event::poll(Duration::ZERO)? { Waited::Event } else { Waited::Nothing })
+        // Its events may already be in crossterm's queue. With a wait of zero it does not look at all.
+        Ok(if event::poll(Duration::from_millis(1))? { Waited::Event } else { Waited::Nothing })
     }
 
     /// The only one.

@@ -19,6 +19,8 @@ pub(crate) struct Signs {
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct ExtendedSigns {
     all: u32,
+    /// Those with the bit that both reserve.
+    reserved: u32,
     /// Those of the second page, where NMEA 2000's groups are.
     second: u32,
     /// With a group that only NMEA 2000 has.
@@ -94,6 +96,7 @@ impl ExtendedSigns {
     fn take(&mut self, frame: &TraceFrame, wanted: u16) -> u16 {
         let Some(header) = Header::of(frame.id()) else { return 0 };
         self.all += 1;
+        self.reserved += header.pgn >> 17;
         let mut of = 0;
         if header.pgn >= 0x1_0000 {
             self.second += 1;
@@ -111,6 +114,10 @@ impl ExtendedSigns {
 
     /// The numbers of messages that indicate NMEA 2000 and J1939; zero for what is not there.
     fn found(&self, known: u16) -> [u32; 2] {
+        // Identifiers without any rule have that bit half the time.
+        if self.reserved > self.all / 4 {
+            return [0, 0];
+        }
         // Other 29-bit traffic occasionally matches a known number.
         let enough = |some: u32, all: u32| if some > 1 && some > all / 10 { some } else { 0 };
         // Beside one of the two, the other may be rare.

@@ -8,8 +8,8 @@ pub(crate) struct CanOpenSigns {
     /// What the frames with the identifiers of each node's heartbeat are. Node 0 stands for network management.
     nodes: [Beats; 128],
     exchanges: u32,
-    /// The last request of an SDO client: node, index and sub-index.
-    asked: Option<(u8, [u8; 3])>,
+    /// The last request of an SDO client: node, command, index and sub-index.
+    asked: Option<(u8, [u8; 4])>,
 }
 
 /// The frames of one identifier.
@@ -26,6 +26,20 @@ struct Beats {
 impl Default for CanOpenSigns {
     fn default() -> Self {
         Self { nodes: [Beats::default(); 128], exchanges: 0, asked: None }
+    }
+}
+
+/// Whether the first byte of an SDO request may have this one for an answer.
+const fn is_answered_by(request: u8, answer: u8) -> bool {
+    const ABORT: u8 = 0x80;
+    match request {
+        // Reading: with a size or without, expedited or in segments.
+        0x40 => matches!(answer, 0x41 | 0x42 | 0x43 | 0x47 | 0x4B | 0x4F | ABORT),
+        0x20..=0x23 | 0x27 | 0x2B | 0x2F => matches!(answer, 0x60 | ABORT),
+        // Blocks, both ways; a node without them falls back to reading in segments.
+        0xA0 | 0xA4 => matches!(answer, 0x41 | 0x43 | 0x47 | 0x4B | 0x4F | 0xC0 | 0xC2 | 0xC4 | 0xC6 | ABORT),
+        0xC0 | 0xC2 | 0xC4 | 0xC6 => matches!(answer, 0xA0 | 0xA4 | ABORT),
+        _ => false,
     }
 }
 
@@ -70,16 +84,16 @@ impl CanOpenSigns {
                 if let &[command, low, high, sub, ..] = data
                     && data.len() == 8
                     && high >= 0x10
-                    && matches!(command >> 5, 1 | 2)
                 {
-                    self.asked = Some((node, [low, high, sub]));
+                    self.asked = Some((node, [command, low, high, sub]));
                 }
             }
             0x581..=0x5FF => {
                 if let &[command, low, high, sub, ..] = data
                     && data.len() == 8
-                    && matches!(command >> 5, 2..=4)
-                    && self.asked == Some((node, [low, high, sub]))
+                    && let Some((asked, [request, object @ ..])) = self.asked
+                    && (asked, object) == (node, [low, high, sub])
+                    && is_answered_by(request, command)
                 {
                     self.asked = None;
                     self.exchanges += 1;

@@ -191,6 +191,10 @@ mod tests {
                 "pid 0x01 (monitor_status), mil \"on\", trouble_codes 2, monitors 01 02 03, not_complete \"heated catalyst\"",
             ),
             (
+                &[0x41, 0, 1, 2, 3],
+                "pid 0x41 (monitor_status_this_cycle), monitors 01 02 03, not_complete \"heated catalyst\"",
+            ),
+            (
                 &[0x66, 1, 1, 0, 2, 0],
                 "pid 0x66 (air_flow_sensors), air_flow_a 8 g/s, air_flow_b not available",
             ),

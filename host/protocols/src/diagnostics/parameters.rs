@@ -324,8 +324,11 @@ pub fn values(pid: u8, bytes: &[u8], fields: &mut Vec<Field>) {
     match pid {
         _ if pid.is_multiple_of(0x20) => fields.push(Field::text("supported", supported(pid, bytes))),
         0x01 | 0x41 => {
-            fields.push(Field::text("mil", if bytes[0] & 0x80 == 0 { "off" } else { "on" }));
-            fields.push(Field::number("trouble_codes", bytes[0] & 0x7F));
+            // Of this driving cycle, the first byte is reserved: zero there does not mean that there are no codes.
+            if pid == 0x01 {
+                fields.push(Field::text("mil", if bytes[0] & 0x80 == 0 { "off" } else { "on" }));
+                fields.push(Field::number("trouble_codes", bytes[0] & 0x7F));
+            }
             fields.push(Field::bytes("monitors", &bytes[1..]));
             let open = monitors::not_complete(bytes);
             fields.push(Field::text("not_complete", if open.is_empty() { "none".to_owned() } else { open }));

@@ -85,6 +85,16 @@ pub enum Kind {
     Unknown,
 }
 
+/// When a field is there.
+#[derive(Clone, Copy, Debug, Deserialize, PartialEq, Eq)]
+pub enum Condition {
+    /// If the group that was named before is a manufacturer's own.
+    #[serde(rename = "PGNIsProprietary")]
+    PgnIsProprietary,
+    #[serde(other)]
+    Unknown,
+}
+
 /// A field of a group.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(rename_all = "PascalCase")]
@@ -101,7 +111,9 @@ pub struct FieldKind {
     pub signed: bool,
     #[serde(default)]
     pub offset: f64,
+    pub range_min: Option<f64>,
     pub range_max: Option<f64>,
+    pub condition: Option<Condition>,
     #[serde(default)]
     pub unit: String,
     #[serde(rename = "Match")]

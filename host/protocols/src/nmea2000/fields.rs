@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use super::database::{Database, FieldKind, Group, Kind};
+use super::database::{Condition, Database, FieldKind, Group, Kind};
 use crate::{Field, Value};
 
 /// Limit for the values of one message: repeated sets are limited by the data, but empty ones would not be.
@@ -100,7 +100,9 @@ impl Reader<'_> {
         let Some(kind) = group.fields.get(order - 1) else { return };
         let name = kind.name.as_str();
         let left = (self.data.len() * 8).saturating_sub(self.at);
-        if left == 0 {
+        let is_absent = kind.condition == Some(Condition::PgnIsProprietary)
+            && !self.about.is_some_and(super::is_proprietary);
+        if left == 0 || is_absent {
             return;
         }
         match kind.field_type {
@@ -354,13 +356,16 @@ fn physical(name: &'static str, kind: &'static FieldKind, raw: u64) -> Field {
         };
     }
     let none = if kind.signed { mask(length) >> 1 } else { mask(length) };
-    if length > 1 && raw == none {
-        return Field::missing(name);
-    }
     let resolution = kind.resolution.unwrap_or(1.0);
     let number = if kind.signed { signed(raw, length) } else { raw as f64 };
+    let in_steps = |value: f64| (value - kind.offset) / resolution;
+    let most = kind.range_max.map_or(f64::INFINITY, in_steps);
+    // Some small fields use their highest value, too.
+    let is_value = length == 1 || (length <= 3 && kind.range_max.is_some() && number <= most + 0.5);
+    if raw == none && !is_value {
+        return Field::missing(name);
+    }
     // The second highest means an error, if that many values are reserved.
-    let most = kind.range_max.map_or(f64::INFINITY, |most| (most - kind.offset) / resolution);
     if length > 3 && raw == none - 1 && number > most + 0.5 {
         return Field::missing(name).meaning(Some("error"));
     }
@@ -369,7 +374,11 @@ fn physical(name: &'static str, kind: &'static FieldKind, raw: u64) -> Field {
         Kind::Date => Field::real(name, value, "").unit("d").meaning(Some(date(raw as i64))),
         Kind::Time => Field::real(name, value, kind.unit.as_str()).meaning(Some(time(value))),
         Kind::Mmsi => Field::number(name, raw as i64),
-        _ => Field::real(name, value, kind.unit.as_str()),
+        _ => {
+            let least = kind.range_min.map_or(f64::NEG_INFINITY, in_steps);
+            let is_in_range = (least - 0.5..=most + 0.5).contains(&number);
+            Field::real(name, value, kind.unit.as_str()).meaning((!is_in_range).then_some("out of range"))
+        }
     }
 }
 

@@ -1,4 +1,4 @@
-use super::database::{Database, Kind};
+use super::database::{Condition, Database, Kind};
 use super::*;
 use crate::Event;
 use crate::j1939::J1939;
@@ -16,6 +16,7 @@ fn the_database_is_whole_and_all_of_it_is_understood() {
         assert!(["Single", "Fast", "ISO", "Mixed"].contains(&group.kind.as_str()), "{}", group.kind);
         for field in &group.fields {
             assert_ne!(field.field_type, Kind::Unknown, "{}: {}", group.pgn, field.name);
+            assert_ne!(field.condition, Some(Condition::Unknown), "{}: {}", group.pgn, field.name);
             let known =
                 |name: &Option<String>, there: &dyn Fn(&str) -> bool| name.as_deref().is_none_or(there);
             assert!(
@@ -59,6 +60,34 @@ fn single_frames_and_fast_packets_have_their_values() {
         said[0].contains("GNSS Position Data") && said[0].contains("Date 15543 d (2012-07-22)"),
         "{said:?}"
     );
+}
+
+/// A manufacturer's code is there only if the group is a manufacturer's own; canboatjs reads the same.
+#[test]
+fn fields_that_are_not_always_there_are_read_where_they_are() {
+    let said = |data: &[u8]| {
+        let mut fields = Vec::new();
+        describe(126_208, data, &mut fields);
+        fields.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
+    };
+    // Reading fields of a position: unique number 7, no selection, one parameter.
+    let position = said(&[3, 0x01, 0xF8, 0x01, 7, 0, 1, 2]);
+    assert!(position.contains("Unique ID 7, Number of Selection Pairs 0, Number of Parameters 1"), "{position}");
+    assert!(!position.contains("Manufacturer Code"), "{position}");
+    let own = said(&[3, 0x00, 0xFF, 0x01, 0x89, 0x98, 7, 0, 1, 2]);
+    assert!(own.contains("Manufacturer Code 137 (Maretron)") && own.contains("Unique ID 7, "), "{own}");
+}
+
+/// A heading of more than a whole turn, and a number of two bits whose highest value is one.
+#[test]
+fn values_are_said_to_be_out_of_their_range() {
+    let said = marine(&[(0.0, "09F11203#00FEFEFF7FFF7FFC"), (1.0, "09F11203#00FFFFFF7FFF7FFC")]);
+    assert!(said[0].contains("Heading 6.5278 rad (out of range)"), "{said:?}");
+    assert!(said[1].contains("Heading not available"), "{said:?}");
+    let mut fields = Vec::new();
+    describe(129_795, &[6, 0x15, 0xCD, 0x5B, 0x07, 0xC0, 0, 0, 0, 0, 0], &mut fields);
+    let sequence = fields.iter().find(|field| field.name == "Sequence Number").unwrap();
+    assert_eq!(sequence.value.as_number(), Some(3.0), "{fields:?}");
 }
 
 #[test]

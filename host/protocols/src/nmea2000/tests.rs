@@ -72,7 +72,10 @@ fn fields_that_are_not_always_there_are_read_where_they_are() {
     };
     // Reading fields of a position: unique number 7, no selection, one parameter.
     let position = said(&[3, 0x01, 0xF8, 0x01, 7, 0, 1, 2]);
-    assert!(position.contains("Unique ID 7, Number of Selection Pairs 0, Number of Parameters 1"), "{position}");
+    assert!(
+        position.contains("Unique ID 7, Number of Selection Pairs 0, Number of Parameters 1"),
+        "{position}"
+    );
     assert!(!position.contains("Manufacturer Code"), "{position}");
     let own = said(&[3, 0x00, 0xFF, 0x01, 0x89, 0x98, 7, 0, 1, 2]);
     assert!(own.contains("Manufacturer Code 137 (Maretron)") && own.contains("Unique ID 7, "), "{own}");

@@ -6,6 +6,7 @@
 pub mod exchange;
 pub mod lss;
 pub mod node_scan;
+mod rivals;
 pub mod sdo;
 mod sdo_job;
 pub mod station;

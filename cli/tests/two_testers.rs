@@ -71,7 +71,11 @@ fn a_channel_or_an_address_that_another_uses_ends_it() {
             "canopen read 5 2000",
             "another client uses this SDO channel at the same time",
         ),
-        ("605#4018100100000000", "canopen write 5 2001 0 1", "run this again while the other is silent"),
+        (
+            "605#4018100100000000",
+            "canopen write 5 2001 0 1 --type i16",
+            "run this again while the other is silent",
+        ),
         ("7E5#5E00000000000000", "canopen lss", "another LSS master sends commands"),
         ("18EAFFC8#ECFE00", "j1939 request 65260 --address 200", "another node sends from the address 200"),
     ] {

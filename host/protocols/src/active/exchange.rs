@@ -8,13 +8,13 @@ use std::collections::VecDeque;
 use cantap_trace::Id;
 use cantap_wire::Frame;
 
+use super::answer::{NEGATIVE, is_answer};
 use super::rivals::Rivals;
 use super::transfer::{TransferError, TransferReceiver, TransferSender, TransferSettings};
 use super::{Machine, earlier};
-use crate::diagnostics::{is_response_suppressed, repeats_its_request};
+use crate::diagnostics::is_response_suppressed;
 use crate::iso_tp::{Endpoint, Pci, parse};
 
-const NEGATIVE: u8 = 0x7F;
 const RESPONSE_PENDING: u8 = 0x78;
 
 /// How long servers may take.
@@ -470,15 +470,6 @@ impl Machine for Exchange {
     fn is_done(&self) -> bool {
         self.end.is_some()
     }
-}
-
-/// Whether a message answers this request rather than an earlier one.
-pub(super) fn is_answer(request: &[u8], data: &[u8]) -> bool {
-    let (Some(&sid), Some(&first)) = (request.first(), data.first()) else { return false };
-    if first == NEGATIVE {
-        return data.get(1) == Some(&sid) && data.len() >= 3;
-    }
-    first == sid | 0x40 && repeats_its_request(false, request, data) == Some(true)
 }
 
 #[cfg(test)]

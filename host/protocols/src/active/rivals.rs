@@ -2,7 +2,7 @@
 
 use cantap_trace::Id;
 
-use super::exchange::is_answer;
+use super::answer::is_answer;
 use crate::iso_tp::{Endpoint, Pci, parse};
 
 /// Most requests of others that are kept for comparison with the answers.

@@ -332,9 +332,9 @@ impl Station {
         self.out.extend(open.map(|(with, pgn)| long_message::abort(self.address, with, pgn, TIMED_OUT)));
         let has_some = !self.answers.is_empty();
         if has_some {
-            self.done()
+            self.done();
         } else {
-            self.fail(StationError::TooSlow { after_ms: self.timing.patience_ns / MS })
+            self.fail(StationError::TooSlow { after_ms: self.timing.patience_ns / MS });
         }
     }
 
@@ -430,10 +430,10 @@ impl Machine for Station {
         match &mut self.phase {
             // A claim that is defended is not begun again: who objects for ever must not hold us up for ever.
             Phase::Claims { until_ns: until_ns @ None } if self.out.is_empty() => {
-                *until_ns = Some(now_ns + CLAIM_NS)
+                *until_ns = Some(now_ns + CLAIM_NS);
             }
             Phase::Waits { until_ns: until_ns @ None } => {
-                *until_ns = Some(now_ns.saturating_add(self.timing.answer_ns))
+                *until_ns = Some(now_ns.saturating_add(self.timing.answer_ns));
             }
             Phase::Closing if self.out.is_empty() => self.done(),
             _ => {}

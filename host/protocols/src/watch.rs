@@ -303,4 +303,53 @@ mod tests {
             assert_eq!(said(&records).1, [], "{frames:?} from the beginning");
         }
     }
+
+    /// Traffic of every shape that is nobody's protocol, from the beginning and later: identifiers of 11 bits, of 29, and of both, with
+    /// contents that are random, constant, zero, or count.
+    #[test]
+    fn random_traffic_is_not_taken_for_a_protocol() {
+        let mut random = fastrand::Rng::with_seed(16);
+        for round in 0..48_u32 {
+            let (size, kind) = ([20, 100, 500][random.usize(0..3)], round % 4);
+            let ids: Vec<_> = (0..size)
+                .map(|_| {
+                    let is_extended = round % 3 == 1 || round % 3 == 2 && random.bool();
+                    // None of diagnostics, which servers that never answer may have.
+                    let id = if is_extended {
+                        format!("{:08X}", random.u32(..1 << 29))
+                    } else {
+                        format!("{:03X}", random.u32(..0x7C0))
+                    };
+                    (id, random.usize(0..9), random.u8(..))
+                })
+                .collect();
+            let from_ms = if round % 8 < 4 { 0.0 } else { 20_000.0 };
+            let mut records = if from_ms > 0.0 { then(&["123#00"], 0, &[]) } else { Vec::new() };
+            for number in 0..8000_u32 {
+                let (id, length, own) = &ids[random.usize(0..size)];
+                let data: Vec<u8> = match kind {
+                    0 => (0..*length).map(|_| random.u8(..)).collect(),
+                    1 => vec![*own; *length],
+                    2 => vec![0; *length],
+                    _ => vec![number as u8; *length],
+                };
+                let frame = format!("{id}#{}", crate::testing::hex(&data));
+                records.push(at(from_ms + f64::from(number), &frame));
+            }
+            let (_, begun) = said(&records);
+            let found: Vec<_> = {
+                let mut survey = Survey::new();
+                records
+                    .iter()
+                    .filter(|record| record.time_ns < WINDOW_NS)
+                    .for_each(|record| survey.take(record));
+                let found = survey.found().into_iter();
+                found.filter(|found| WATCHED & found.protocol.bit() != 0).collect()
+            };
+            assert!(
+                begun.is_empty() && found.is_empty(),
+                "round {round}, {size}, {kind}: {begun:?} {found:?}"
+            );
+        }
+    }
 }

@@ -39,6 +39,11 @@ pub fn group(pgn: u32, data: &[u8]) -> Option<&'static Group> {
     of_number.next().or_else(|| database.fallback(pgn))
 }
 
+/// Whether the group is one of those that manufacturers define.
+const fn is_proprietary(pgn: u32) -> bool {
+    matches!(pgn, 0xEF00 | 0x1_EF00 | 0xFF00..=0xFFFF | 0x1_FF00..=0x1_FFFF)
+}
+
 /// What a field may refer to in the ones before it.
 #[derive(Default)]
 struct Reader<'a> {
@@ -100,8 +105,8 @@ impl Reader<'_> {
         let Some(kind) = group.fields.get(order - 1) else { return };
         let name = kind.name.as_str();
         let left = (self.data.len() * 8).saturating_sub(self.at);
-        let is_absent = kind.condition == Some(Condition::PgnIsProprietary)
-            && !self.about.is_some_and(super::is_proprietary);
+        let is_absent =
+            kind.condition == Some(Condition::PgnIsProprietary) && !self.about.is_some_and(is_proprietary);
         if left == 0 || is_absent {
             return;
         }

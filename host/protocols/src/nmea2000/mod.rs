@@ -49,11 +49,6 @@ pub(crate) fn has(pgn: u32) -> bool {
     Database::get().groups(pgn).iter().any(|group| !group.fallback)
 }
 
-/// Whether the group is one of those that manufacturers define.
-fn is_proprietary(pgn: u32) -> bool {
-    matches!(pgn, 0xEF00 | 0x1_EF00 | 0xFF00..=0xFFFF | 0x1_FF00..=0x1_FFFF)
-}
-
 /// Whether only NMEA 2000 defines the group.
 pub(crate) fn is_known(pgn: u32) -> bool {
     // The second page, excluding proprietary groups.

@@ -46,6 +46,13 @@ class _Session:
         self.device = Device(address, capacity=0)
         self.users: dict[int, int] = {}
 
+    def is_gone(self) -> bool:
+        """Whether the device was closed, or has vanished: then a new Bus object needs a new session, although others may still have this one."""
+        try:
+            return self.device.closed or not self.device.status
+        except DeviceError:
+            return True
+
 
 _sessions: dict[str, _Session] = {}
 _lock = threading.RLock()
@@ -146,7 +153,7 @@ class CantapBus(can.BusABC):
         with _lock:
             session = _sessions.get(self._address)
             try:
-                if session is None or session.device.closed:
+                if session is None or session.is_gone():
                     session = _Session(self._address)
                 self._device = session.device
                 self._options["segments"] = self._segments(timing)

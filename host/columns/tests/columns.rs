@@ -48,7 +48,7 @@ fn time_identifier_and_data_are_enough() {
         RecordBatch::try_from_iter(columns).unwrap()
     };
     // The shortest decimal number counts, and what is finer than nanoseconds is rounded.
-    let times = vec![1_700_000_000.123456, -0.5, 0.1, 1e-9, 1.000_000_000_6, 5e-324, 1e9];
+    let times = vec![1_700_000_000.123_456, -0.5, 0.1, 1e-9, 1.000_000_000_6, 5e-324, 1e9];
     let found = records(&batch(times)).unwrap();
     let ns: Vec<_> = found.iter().map(|record| record.time_ns).collect();
     assert_eq!(

@@ -57,8 +57,8 @@ def serving(*arguments):
 def test_an_address_of_ipv6_is_one_like_any_other():
     server, address = serving("--tcp", "[::1]:0")
     try:
-        zone = "::1%" + socket.if_indextoname(1)
-        for other in (address, address.replace("::1", zone)):
+        # With a zone as well: the loopback's number, as the system takes names for addresses of a link only.
+        for other in (address, address.replace("::1", "::1%1")):
             with cantap.open(other, 500_000) as device:
                 assert len(device.batch(seconds=10, rows=100)) == 100
         with pytest.raises(ValueError, match="brackets"):

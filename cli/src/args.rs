@@ -62,6 +62,11 @@ pub fn positive_duration(text: &str) -> Result<Duration, String> {
     if duration.is_zero() { Err("give a time longer than zero".to_owned()) } else { Ok(duration) }
 }
 
+/// In nanoseconds, bounded so that deadlines can be added to it.
+pub fn nanoseconds(time: Duration) -> u64 {
+    u64::try_from(time.as_nanos()).unwrap_or(u64::MAX).min(u64::MAX / 4)
+}
+
 /// A percentage, above 0 and up to 100.
 pub fn percent(text: &str) -> Result<f64, String> {
     let number = text.trim_end_matches('%').trim_end().parse::<f64>().ok();

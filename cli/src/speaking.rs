@@ -10,6 +10,7 @@ use anyhow::{anyhow, bail};
 use cantap::device::Records;
 use cantap::transmit::Stream;
 use cantap::wire::message::{Mode, Periodic};
+use cantap::wire::record::ErrorState;
 use cantap::{Channel, Frame, TraceEvent, TraceRecord, periodic};
 use cantap_address::{Address, OpenDevice};
 use cantap_protocols::active::Machine;
@@ -20,6 +21,7 @@ use crate::channel_args::ChannelArgs;
 use crate::channel_bitrate::ChannelBitrate;
 use crate::commands::conversations;
 use crate::completion;
+use crate::hearing::{self, Hearing};
 use crate::sending::Sending;
 use crate::words::{counted, state_name};
 use crate::wrong::wrong;
@@ -94,18 +96,25 @@ impl SpeakArgs {
             witness,
             events: Vec::new(),
             heard: Heard::default(),
+            hearing: Hearing::default(),
+            has_heard: false,
+            is_off: false,
             json: self.json,
         }
     }
 }
 
-/// What else was on the bus besides our own frames, since the last request.
+/// What was on the bus since the last request.
 #[derive(Clone, Copy, Debug, Default)]
 struct Heard {
     since: Option<Instant>,
+    /// Our own frames, which a node acknowledged.
+    own: u64,
+    /// Frames of others.
     frames: u64,
     bits: u64,
     lost: u64,
+    errors: u64,
 }
 
 /// Talks on one channel.
@@ -123,6 +132,11 @@ pub struct Speaking<'d> {
     witness: Box<dyn Assembler>,
     events: Vec<Event>,
     heard: Heard,
+    hearing: Hearing,
+    /// Any frame of others, since the beginning.
+    has_heard: bool,
+    /// The channel went bus-off.
+    is_off: bool,
     json: bool,
 }
 
@@ -173,7 +187,11 @@ impl Speaking<'_> {
 
     /// Tells the other side that this is over, if it would otherwise go on.
     fn cancel(&mut self, machine: &mut dyn Machine) -> anyhow::Result<()> {
-        let Some(frame) = machine.cancel() else { return Ok(()) };
+        machine.cancel().map_or(Ok(()), |frame| self.last_word(frame))
+    }
+
+    /// Sends a frame after the end, so that a node does not wait or stay as it is, and waits a moment until it was on the bus.
+    pub fn last_word(&mut self, frame: Frame) -> anyhow::Result<()> {
         self.under_way.push_back(frame);
         self.stream.push(self.channel, frame, None, |_| false)?;
         self.stream.flush()?;
@@ -187,6 +205,10 @@ impl Speaking<'_> {
     fn run_to_its_end(&mut self, machine: &mut dyn Machine) -> anyhow::Result<()> {
         self.heard = Heard { since: Some(Instant::now()), ..Heard::default() };
         self.take_records(Duration::ZERO, None)?;
+        // Nothing new begins after Ctrl-C.
+        if interrupt::requested() {
+            return Err(self.stopped());
+        }
         loop {
             let mut any = false;
             while let Some(frame) = machine.next(self.now_ns()) {
@@ -208,35 +230,48 @@ impl Speaking<'_> {
     }
 
     /// Has the device send frames periodically by its own clock, until the requested number, the end of the time, or Ctrl-C. Returns
-    /// how many were sent.
+    /// how many were sent, and an error in their place if some that were due were not.
     pub fn repeat(
         &mut self,
         frame: Frame,
         period: Duration,
         count: Option<u32>,
         time: Option<Duration>,
-    ) -> anyhow::Result<u64> {
+    ) -> anyhow::Result<(u64, anyhow::Result<()>)> {
         let period_ticks = periodic::period_ticks(period, self.device.hello().tick_hz)
             .map_err(|error| wrong(error.to_string()))?;
         let entry =
             Periodic { frame, period_ticks, count: count.unwrap_or(0), modifiers: heapless::Vec::new() };
-        let started = Instant::now();
-        let before = self.sending.sent();
         self.device.set_periodic(self.channel, REPEAT_SLOT, Some(entry))?;
+        let over = self.repeats(count, time);
+        // Periods that passed without a frame, while the device still counts them.
+        let missed = over.is_ok().then(|| self.sending.periods_missed(self.channel)).transpose();
+        // However it ended, the device's clock must not go on by itself.
+        let ended = self.device.set_periodic(self.channel, REPEAT_SLOT, None);
+        over?;
+        ended?;
+        let sent = self.sending.ended();
+        let due = sent + missed?.unwrap_or_default();
+        let asked = count.map_or(due, |count| u64::from(count).min(due));
+        Ok((self.sending.sent(), self.sending.outcome(asked)?.verdict()))
+    }
+
+    /// Watches repeated frames until their end.
+    fn repeats(&mut self, count: Option<u32>, time: Option<Duration>) -> anyhow::Result<()> {
+        let started = Instant::now();
         loop {
             self.take_records(LOOK_EVERY, None)?;
             self.stream.wait(Duration::ZERO)?;
             let ends = self.stream.take_ended();
             let goes_on = self.sending.device_goes_on(&ends);
-            let sent = self.sending.sent() - before;
+            let sent = self.sending.sent();
             let is_over = interrupt::requested()
                 || time.is_some_and(|time| started.elapsed() >= time)
                 || count.is_some_and(|count| sent >= u64::from(count));
-            if is_over {
-                self.device.set_periodic(self.channel, REPEAT_SLOT, None)?;
-                return Ok(sent);
+            if is_over && !self.is_off {
+                return Ok(());
             }
-            if !goes_on {
+            if !goes_on || self.is_off {
                 self.pushed = self.sending.ended() + 1;
                 return Err(self.stopped());
             }
@@ -256,6 +291,9 @@ impl Speaking<'_> {
     }
 
     fn send(&mut self, frame: Frame) -> anyhow::Result<()> {
+        if self.is_off {
+            return Err(self.stopped());
+        }
         self.under_way.push_back(frame);
         self.pushed += 1;
         let sending = &mut self.sending;
@@ -273,6 +311,7 @@ impl Speaking<'_> {
             bail!("the device ended the session");
         };
         self.sending.take(&batch);
+        self.hearing.take(&batch, Instant::now());
         for record in &batch {
             if record.channel == self.channel.number() {
                 let machine = machine.as_mut().map(|machine| &mut **machine as &mut dyn Machine);
@@ -291,12 +330,14 @@ impl Speaking<'_> {
                 // On a shared board, other programs' frames are also sent from here.
                 if let Some(place) = self.under_way.iter().position(|own| frame == *own) {
                     self.under_way.remove(place);
+                    self.heard.own += 1;
                     if let Some(machine) = machine {
                         machine.sent(now_ns);
                     }
                     return;
                 }
                 self.heard.frames += 1;
+                self.has_heard = true;
                 self.heard.bits += u64::from(frame.bus_bits().total());
                 if let Some(machine) = machine.filter(|_| !frame.is_remote()) {
                     machine.hear(now_ns, frame.id(), frame.data());
@@ -308,6 +349,9 @@ impl Speaking<'_> {
                     machine.gap(now_ns);
                 }
             }
+            TraceEvent::BusError { .. } => self.heard.errors += 1,
+            TraceEvent::ErrorsSuppressed { count } => self.heard.errors += u64::from(count),
+            TraceEvent::State { state: ErrorState::BusOff, .. } => self.is_off = true,
             _ => {}
         }
     }
@@ -316,13 +360,25 @@ impl Speaking<'_> {
     fn look(&mut self) -> anyhow::Result<()> {
         self.stream.wait(Duration::ZERO)?;
         let goes_on = self.sending.goes_on(&self.stream.take_ended(), self.stream.oldest_due());
-        if goes_on && self.sending.ended() == self.sending.sent() { Ok(()) } else { Err(self.stopped()) }
+        if goes_on && !self.is_off && self.sending.ended() == self.sending.sent() {
+            Ok(())
+        } else {
+            Err(self.stopped())
+        }
     }
 
     /// Why nothing more is sent.
     fn stopped(&mut self) -> anyhow::Error {
         if interrupt::requested() {
             return anyhow!("ended by Ctrl-C before it was complete");
+        }
+        // By then it may be back, and send what was waiting, which nobody expects any more.
+        if self.is_off {
+            return anyhow!(
+                "channel {} went bus-off: errors destroyed what it sent; check bit rate, wiring and termination, then run this again; \
+                 nothing more is sent",
+                self.channel.number()
+            );
         }
         match self.sending.outcome(self.pushed) {
             Ok(outcome) => {
@@ -335,18 +391,25 @@ impl Speaking<'_> {
     /// What is known of the bus when a node does not answer: whether the last request was acknowledged, and what else there
     /// was.
     pub fn circumstances(&self) -> String {
-        let Heard { since, frames, bits, lost } = self.heard;
+        let Heard { since, own, frames, bits, lost, errors } = self.heard;
         let seconds = since.map_or(0.0, |since| since.elapsed().as_secs_f64()).max(1e-3);
         let load_pct = (bits as f64 / (f64::from(self.bitrate_bps) * seconds) * 100.0).min(100.0);
-        let mut text = "what was sent was acknowledged by a node".to_owned();
+        let count = |number, noun| counted(usize::try_from(number).unwrap_or(usize::MAX), noun);
+        let mut text = match own {
+            0 => "nothing was sent".to_owned(),
+            _ => "what was sent was acknowledged by a node".to_owned(),
+        };
         let _ = match frames {
             0 => write!(text, "; no other frame was heard in {seconds:.1} s"),
             frames => write!(
                 text,
                 "; {} of others in {seconds:.1} s (load {load_pct:.0} %)",
-                counted(usize::try_from(frames).unwrap_or(usize::MAX), "frame")
+                count(frames, "frame")
             ),
         };
+        if errors > 0 {
+            let _ = write!(text, "; {}", count(errors, "bus error"));
+        }
         if let Ok(status) = self.device.status() {
             let _ = write!(
                 text,
@@ -358,5 +421,19 @@ impl Speaking<'_> {
             let _ = write!(text, "; {lost} frames or more were lost on the way to this computer");
         }
         text
+    }
+
+    /// An error if there were errors and not one frame, since that must not look like a silent bus.
+    pub fn judge(&self) -> anyhow::Result<()> {
+        let is_deaf = self.hearing.deaf().any(|number| number == self.channel.number());
+        if is_deaf {
+            bail!(hearing::meaning(self.channel.number(), self.device.name(), self.channel.number()));
+        }
+        Ok(())
+    }
+
+    /// Whether any frame of others was heard since the beginning.
+    pub const fn has_heard(&self) -> bool {
+        self.has_heard
     }
 }

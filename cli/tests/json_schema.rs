@@ -103,7 +103,7 @@ const LINES: [(&str, i32, &[&str]); 65] = [
     ("uds reset -d virtual:car soft", 0, &["conversations"]),
     ("uds dtc -d virtual:car", 0, &["conversations"]),
     ("uds raw -d virtual:car 22F190", 0, &["conversations"]),
-    ("canopen scan -d virtual:load=0 -b 500k 1-5", 0, &["canopen_scan"]),
+    ("canopen scan -d virtual:load=0 -b 500k 1-5", 1, &["canopen_scan"]),
     ("canopen nmt -d virtual:load=0 -b 500k 5 start", 0, &["conversations"]),
     ("canopen sync -d virtual:load=0 -b 500k --period 10ms -n 3", 0, &["conversations"]),
     ("canopen heartbeat -d virtual:load=0 -b 500k 5 --period 10ms -n 3", 0, &["conversations"]),

@@ -108,6 +108,12 @@ fn an_ecu_on_can_isotp_is_asked_unlocked_and_given_long_requests() {
     assert!(code == Some(1) && err.contains("invalidKey (35)") && err.contains("--key-command"), "{err}");
     let (code, _, err) = rig.run("uds --security 1 --key-command false tester-present");
     assert!(code == Some(1) && err.contains("no key was sent"), "{err}");
+    // A key that does not come must not keep the command for ever.
+    let asked = std::time::Instant::now();
+    let (code, _, err) =
+        rig.run("uds --security 1 --key-command exec${IFS}sleep${IFS}100 --patience 1500ms tester-present");
+    assert!(code == Some(1) && err.contains("did not end within 1.5 s") && err.contains("no key"), "{err}");
+    assert!(asked.elapsed() < std::time::Duration::from_secs(30));
     // 200 bytes, in blocks of three with a minimum separation.
     let request = "36".repeat(200);
     let said = rig.json(&format!("uds raw {request}"), "conversations");

@@ -16,6 +16,7 @@ use cantap_protocols::canopen::{CanOpen, Sheet, state_name};
 use crate::args;
 use crate::protocols::SheetPath;
 use crate::speaking::SpeakArgs;
+use crate::words::counted;
 use crate::wrong::wrong;
 
 /// The command line.
@@ -38,6 +39,9 @@ pub struct Args {
     /// How long to wait for each answer; default 1s, or 100ms for LSS.
     #[arg(long, value_name = "TIME", value_parser = args::positive_duration, global = true)]
     timeout: Option<Duration>,
+    /// Maximum time for reading or writing one object, however well it gets on.
+    #[arg(long, value_name = "TIME", default_value = "10m", value_parser = args::positive_duration, global = true)]
+    patience: Duration,
     #[command(subcommand)]
     what: What,
 }
@@ -136,12 +140,13 @@ const ANSWER: Duration = Duration::from_secs(1);
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let sheets =
         args.sheets.iter().map(|path| path.load(args.speak.json)).collect::<anyhow::Result<Vec<_>>>()?;
-    let ns =
-        |default: Duration| args.timeout.unwrap_or(default).as_nanos().min(u128::from(u64::MAX / 4)) as u64;
+    let ns = |default: Duration| args::nanoseconds(args.timeout.unwrap_or(default));
+    let times =
+        |default| objects::Times { timeout_ns: ns(default), patience_ns: args::nanoseconds(args.patience) };
     match &args.what {
         What::Scan(scan) => scan::run(&args.speak, scan, ns(Duration::from_millis(250)), sheets)?,
-        What::Read(read) => objects::read(&args.speak, read, ns(ANSWER), sheets)?,
-        What::Write(write) => objects::write(&args.speak, write, ns(ANSWER), sheets)?,
+        What::Read(read) => objects::read(&args.speak, read, times(ANSWER), sheets)?,
+        What::Write(write) => objects::write(&args.speak, write, times(ANSWER), sheets)?,
         What::Nmt { node, command } => nmt(&args.speak, *node, *command, sheets)?,
         What::Monitor { time } => monitor(&args.speak, *time, sheets)?,
         What::Sync { cyclic, cob_id } => {
@@ -213,9 +218,21 @@ fn monitor(speak: &SpeakArgs, time: Option<Duration>, sheets: Vec<Sheet>) -> any
         speaking.listen(left.unwrap_or(Duration::MAX).min(Duration::from_millis(50)))?;
         speaking.tell(|_| true)?;
     }
+    // A silent bus is not a failure, but it is said; errors alone are one.
+    let deaf = speaking.judge();
+    if deaf.is_ok() && !speaking.has_heard() {
+        let seconds = started.elapsed().as_secs_f64();
+        eprintln!("cantap: no frame was heard in {seconds:.1} s; check the bit rate and that the bus is on");
+    }
     drop(speaking);
     device.stop()?;
-    Ok(())
+    deaf
+}
+
+/// `1 frame was`, `2 frames were`.
+fn were(frames: u64) -> String {
+    let number = usize::try_from(frames).unwrap_or(usize::MAX);
+    format!("{} {}", counted(number, "frame"), if frames == 1 { "was" } else { "were" })
 }
 
 fn repeat(speak: &SpeakArgs, frame: Frame, cyclic: &Cyclic) -> anyhow::Result<()> {
@@ -227,11 +244,11 @@ fn repeat(speak: &SpeakArgs, frame: Frame, cyclic: &Cyclic) -> anyhow::Result<()
     }
     let device = speak.open()?;
     let mut speaking = speak.speak(&device, Box::new(CanOpen::new(Vec::new())));
-    let sent = speaking.repeat(frame, cyclic.period, cyclic.count, cyclic.time)?;
+    let (sent, verdict) = speaking.repeat(frame, cyclic.period, cyclic.count, cyclic.time)?;
     let own = |event: &Event| matches!(event.kind, "sync" | "state" | "heartbeat");
     speaking.tell(own)?;
-    eprintln!("cantap: {sent} frames were sent");
+    eprintln!("cantap: {} sent", were(sent));
     drop(speaking);
     device.stop()?;
-    Ok(())
+    verdict
 }

@@ -1,13 +1,15 @@
 //! `cantap j1939`: acts as a node.
 
 use std::process::ExitCode;
+use std::time::Duration;
 
-use anyhow::anyhow;
-use cantap_protocols::active::station::{Station, StationError, StationJob};
+use anyhow::{anyhow, bail};
+use cantap_protocols::active::station::{Station, StationError, StationJob, StationTiming};
 use cantap_protocols::j1939::J1939;
 use cantap_protocols::{Event, Party};
 
 use super::uds::hex::{self, Hex};
+use crate::args;
 use crate::databases::DatabaseArgs;
 use crate::speaking::{SpeakArgs, Speaking};
 use crate::wrong::wrong;
@@ -43,6 +45,12 @@ pub struct Args {
     /// The NAME to claim it with, 16 hexadecimal digits; without it, that of a diagnostic tool with a random number.
     #[arg(long, value_name = "HEX", value_parser = name, global = true)]
     name: Option<u64>,
+    /// How long to wait for the beginning of an answer (T3).
+    #[arg(long, value_name = "TIME", default_value = "1250ms", value_parser = args::positive_duration, global = true)]
+    timeout: Duration,
+    /// Maximum time for an answer or a message of many frames, however often the other node asks to wait (T4) or for frames again.
+    #[arg(long, value_name = "TIME", default_value = "60s", value_parser = args::positive_duration, global = true)]
+    patience: Duration,
     #[command(subcommand)]
     what: What,
 }
@@ -144,6 +152,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let device = args.speak.open()?;
     let mut speaking = args.speak.speak(&device, Box::new(J1939::new(decoder)));
     let mut station = Station::new(name, args.address, job.clone());
+    station.set_timing(StationTiming {
+        answer_ns: args::nanoseconds(args.timeout),
+        patience_ns: args::nanoseconds(args.patience),
+    });
     speaking.run(&mut station)?;
     let own = station.address();
     if own != args.address {
@@ -156,8 +168,16 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         What::Dm1 { to } => is_answer(event, DM1, *to, own),
     };
     speaking.tell(shown)?;
-    let ended = station.finish();
-    finish(&speaking, ended, args)?;
+    let imposters = station.imposters();
+    let ended = finish(&speaking, station.finish(), args);
+    if imposters > 0 {
+        let ended = ended.map_or_else(|error| format!("{error}; "), |()| String::new());
+        bail!(
+            "{ended}another node sends from the address {own}, too, without having claimed it, so an answer may be to its request; \
+             choose another with --address"
+        );
+    }
+    ended?;
     drop(speaking);
     device.stop()?;
     Ok(ExitCode::SUCCESS)
@@ -183,6 +203,7 @@ fn finish<T>(speaking: &Speaking<'_>, ended: Result<T, StationError>, args: &Arg
         Err(error @ StationError::AddressTaken { .. }) => {
             Err(anyhow!("{error}; choose another with --address, or a NAME that takes any address"))
         }
+        Err(error @ StationError::TooSlow { .. }) => Err(anyhow!("{error}; --patience gives it more time")),
         Err(error) => Err(anyhow!(error)),
     }
 }

@@ -92,7 +92,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         None => vehicle.everything()?,
         Some(What::Supported) => {
             vehicle.lists()?;
-            vehicle.client.speaking.tell(|event| args.speak.json && is_answer(event))?;
+            vehicle.client.tell_if(|event| args.speak.json && is_answer(event))?;
             if !args.speak.json {
                 vehicle.show_lists()?;
             }
@@ -102,7 +102,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         Some(What::Vin) => vehicle.identification()?,
         Some(What::Clear { .. }) => {
             let answers = vehicle.client.ask_whoever(&[0x04], None)?;
-            vehicle.client.speaking.tell(is_answer)?;
+            vehicle.client.tell_if(is_answer)?;
             vehicle.client.all_agreed()?;
             if answers.is_empty() {
                 bail!(
@@ -243,7 +243,7 @@ impl Vehicle<'_> {
                 return Ok(());
             }
             let answers = asked?.len();
-            self.client.speaking.tell(is_answer)?;
+            self.client.tell_if(is_answer)?;
             if answers < servers {
                 eprintln!("cantap: {pid:02X}: {answers} of {servers} ECUs answered");
             }
@@ -254,7 +254,7 @@ impl Vehicle<'_> {
     fn codes(&mut self) -> anyhow::Result<()> {
         for service in [0x03, 0x07, 0x0A] {
             let answers = self.client.ask_whoever(&[service], Some(self.servers.len()))?;
-            self.client.speaking.tell(|event| {
+            self.client.tell_if(|event| {
                 is_answer(event)
                     && event.field("sid").is_some_and(|sid| sid.value.as_number() == Some(f64::from(service)))
             })?;
@@ -271,7 +271,7 @@ impl Vehicle<'_> {
         for kind in [0x02, 0x0A, 0x04] {
             any |= !self.client.ask_whoever(&[0x09, kind], None)?.is_empty();
         }
-        self.client.speaking.tell(|event| {
+        self.client.tell_if(|event| {
             is_answer(event) && event.field("sid").is_some_and(|sid| sid.value.as_number() == Some(9.0))
         })?;
         if !any {

@@ -7,7 +7,6 @@ mod key;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use cantap_protocols::Event;
 use cantap_protocols::diagnostics::Diagnostics;
 
 pub use self::client::{Client, TransferArgs};
@@ -132,11 +131,6 @@ fn session(text: &str) -> Result<u8, String> {
     }
 }
 
-/// Whether an event in our own conversation is a result.
-fn is_ours(event: &Event) -> bool {
-    matches!(event.kind, "exchange" | "refusal" | "request" | "broken")
-}
-
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let requests = args.requests()?;
@@ -147,17 +141,17 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut client = Client::new(speaking, args.transfer);
     if let Some(session) = args.session {
         client.ask(&[0x10, session])?;
-        client.speaking.tell(is_ours)?;
+        client.tell()?;
         client.all_agreed()?;
     }
     args.key.unlock(&mut client)?;
-    client.speaking.tell(is_ours)?;
+    client.tell()?;
     if let What::TesterPresent { period: Some(period), count, time } = args.what {
         stay(&mut client, period, count, time)?;
     } else {
         for request in &requests {
             let asked = client.ask(request);
-            client.speaking.tell(is_ours)?;
+            client.tell()?;
             asked?;
         }
         client.all_agreed()?;
@@ -177,9 +171,16 @@ fn stay(
     let started = Instant::now();
     let mut said = 0;
     loop {
-        client.tell_only(&[0x3E, 0x80])?;
+        let told = client.tell_only(&[0x3E, 0x80]);
+        client.tell()?;
+        // Ctrl-C is its usual end, also between the request and what might answer it.
+        if interrupt::requested() {
+            return Ok(());
+        }
+        told?;
+        // No answer is wanted, but a refusal means that the session is not kept.
+        client.all_agreed()?;
         said += 1;
-        client.speaking.tell(is_ours)?;
         let is_enough = count.is_some_and(|count| said >= count)
             || time.is_some_and(|time| started.elapsed() + period > time);
         if is_enough {
@@ -187,6 +188,7 @@ fn stay(
         }
         let next = period * said;
         client.speaking.listen(next.saturating_sub(started.elapsed()))?;
+        client.tell()?;
         if interrupt::requested() {
             return Ok(());
         }

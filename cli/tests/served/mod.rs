@@ -11,6 +11,7 @@ pub struct Served {
     /// Host and port of its socketcand.
     #[allow(dead_code, reason = "not every test has a program of other people")]
     pub socketcand: [String; 2],
+    #[allow(dead_code, reason = "not every test has files")]
     pub folder: tempfile::TempDir,
 }
 

@@ -3,13 +3,14 @@
 use std::io::Write as _;
 
 use anyhow::anyhow;
+use cantap_protocols::active::Machine as _;
 use cantap_protocols::active::lss::{FastScan, LssAddress, LssError, LssMaster, LssOrder, bit_rate_index};
 use cantap_protocols::canopen::CanOpen;
 use serde_json::json;
 
-use crate::args;
 use crate::speaking::{SpeakArgs, Speaking};
 use crate::wrong::wrong;
+use crate::{args, interrupt};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -50,28 +51,14 @@ pub(super) fn run(speak: &SpeakArgs, args: &LssArgs, timeout_ns: u64) -> anyhow:
     let mut speaking = speak.speak(&device, Box::new(CanOpen::new(Vec::new())));
     // No other node may take the orders.
     order(&mut speaking, LssOrder::SwitchAll(false), timeout_ns)?;
-    let found = match args.identity {
-        Some(address) => {
-            order(&mut speaking, LssOrder::Switch(address), timeout_ns)?;
-            address
-        }
-        None => scan(&mut speaking, timeout_ns)?,
+    let configured = configure(&mut speaking, args, index, timeout_ns);
+    // Whatever happened, no node must stay in configuration mode.
+    let released = match LssMaster::new(LssOrder::SwitchAll(false), timeout_ns).next(0) {
+        Some(frame) if interrupt::requested() => speaking.last_word(frame),
+        _ => order(&mut speaking, LssOrder::SwitchAll(false), timeout_ns),
     };
-    let orders = [
-        args.node.map(LssOrder::SetNode),
-        index.map(LssOrder::SetBitRate),
-        args.store.then_some(LssOrder::Store),
-    ];
-    let mut given = Ok(());
-    for wanted in orders.into_iter().flatten() {
-        given = order(&mut speaking, wanted, timeout_ns);
-        if given.is_err() {
-            break;
-        }
-    }
-    // Whatever happened, the node must not stay in configuration mode.
-    order(&mut speaking, LssOrder::SwitchAll(false), timeout_ns)?;
-    given?;
+    let found = configured?;
+    released?;
     let LssAddress { vendor, product, revision, serial } = found;
     let mut out = std::io::stdout().lock();
     if speak.json {
@@ -102,6 +89,31 @@ pub(super) fn run(speak: &SpeakArgs, args: &LssArgs, timeout_ns: u64) -> anyhow:
     drop(speaking);
     device.stop()?;
     Ok(())
+}
+
+/// Finds the node, and gives it what was asked for.
+fn configure(
+    speaking: &mut Speaking<'_>,
+    args: &LssArgs,
+    bit_rate: Option<u8>,
+    timeout_ns: u64,
+) -> anyhow::Result<LssAddress> {
+    let found = match args.identity {
+        Some(address) => {
+            order(speaking, LssOrder::Switch(address), timeout_ns)?;
+            address
+        }
+        None => scan(speaking, timeout_ns)?,
+    };
+    let orders = [
+        args.node.map(LssOrder::SetNode),
+        bit_rate.map(LssOrder::SetBitRate),
+        args.store.then_some(LssOrder::Store),
+    ];
+    for wanted in orders.into_iter().flatten() {
+        order(speaking, wanted, timeout_ns)?;
+    }
+    Ok(found)
 }
 
 fn scan(speaking: &mut Speaking<'_>, timeout_ns: u64) -> anyhow::Result<LssAddress> {

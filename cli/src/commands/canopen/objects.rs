@@ -6,11 +6,20 @@ use anyhow::{Context, anyhow};
 use cantap::{TraceEvent, TraceRecord};
 use cantap_protocols::active::sdo::{SdoClient, SdoError, SdoIds, SdoJob};
 use cantap_protocols::canopen::{CanOpen, Sheet, encode, known_type, type_named};
-use cantap_protocols::iso_tp::Pair;
+use cantap_protocols::iso_tp::{BadPair, Pair};
 use cantap_protocols::{Assembler, Event};
 
 use crate::speaking::{SpeakArgs, Speaking};
 use crate::wrong::wrong;
+
+/// How long to wait.
+#[derive(Clone, Copy)]
+pub(super) struct Times {
+    /// For each answer.
+    pub timeout_ns: u64,
+    /// For all of it.
+    pub patience_ns: u64,
+}
 
 /// Which object, and how.
 #[derive(clap::Args)]
@@ -25,7 +34,7 @@ struct Place {
     #[arg(long)]
     block: bool,
     /// The identifiers of the SDO channel, if not the node's usual ones: the request's and the answer's, as 605:585.
-    #[arg(long, value_name = "ID:ID")]
+    #[arg(long, value_name = "ID:ID", value_parser = channel)]
     sdo: Option<Pair>,
 }
 
@@ -56,6 +65,15 @@ pub(super) struct WriteObject {
     /// Its type, if no sheet gives it: bool, u8 to u64, i8 to i64, f32, f64, text, utf16, hex.
     #[arg(long = "type", value_name = "TYPE")]
     data_type: Option<String>,
+}
+
+/// The identifiers of an SDO channel.
+fn channel(text: &str) -> Result<Pair, String> {
+    let pair: Pair = text.parse().map_err(|error: BadPair| error.to_string())?;
+    if pair.a.address.is_some() || pair.b.address.is_some() || pair.a.id == pair.b.id {
+        return Err("write two different identifiers, as 605:585".to_owned());
+    }
+    Ok(pair)
 }
 
 fn index(text: &str) -> Result<u16, String> {
@@ -95,9 +113,10 @@ impl Place {
         speaking: &mut Speaking<'_>,
         sub: u8,
         job: SdoJob,
-        timeout_ns: u64,
+        times: Times,
     ) -> anyhow::Result<Vec<u8>> {
-        let mut client = SdoClient::new(self.ids(), self.index, sub, job, self.block, timeout_ns);
+        let mut client = SdoClient::new(self.ids(), self.index, sub, job, self.block, times.timeout_ns);
+        client.set_patience(times.patience_ns);
         speaking.run(&mut client)?;
         speaking.tell(|event| self.is_ours(event))?;
         client.finish().map_err(|error| {
@@ -111,6 +130,8 @@ impl Place {
                     anyhow!("{object}: {error}; the node may not have block transfers: leave --block away")
                 }
                 SdoError::NoAnswer { .. } => anyhow!("{object}: {error}; {}", speaking.circumstances()),
+                SdoError::OtherClient { .. } => anyhow!("{object}: {error}; run this again while the other is silent"),
+                SdoError::TooSlow { .. } => anyhow!("{object}: {error}; --patience gives it more time"),
                 _ => anyhow!("{object}: {error}"),
             }
         })
@@ -149,7 +170,7 @@ impl Assembler for Renamed {
 pub(super) fn read(
     speak: &SpeakArgs,
     args: &ReadObject,
-    timeout_ns: u64,
+    times: Times,
     sheets: Vec<Sheet>,
 ) -> anyhow::Result<()> {
     // Create this first: if the object cannot be stored, it need not be read.
@@ -160,7 +181,7 @@ pub(super) fn read(
     let output = output.transpose()?;
     let device = speak.open()?;
     let mut speaking = speak.speak(&device, args.place.witness(sheets));
-    let read = args.place.transfer(&mut speaking, args.sub, SdoJob::Read, timeout_ns);
+    let read = args.place.transfer(&mut speaking, args.sub, SdoJob::Read, times);
     if let (Err(_), Some(path)) = (&read, &args.output) {
         // It is empty, and did not exist before.
         let _ = std::fs::remove_file(path);
@@ -178,14 +199,14 @@ pub(super) fn read(
 pub(super) fn write(
     speak: &SpeakArgs,
     args: &WriteObject,
-    timeout_ns: u64,
+    times: Times,
     sheets: Vec<Sheet>,
 ) -> anyhow::Result<()> {
     // Everything is checked before anything is sent.
     let data = args.bytes(&sheets)?;
     let device = speak.open()?;
     let mut speaking = speak.speak(&device, args.place.witness(sheets));
-    args.place.transfer(&mut speaking, args.sub, SdoJob::Write(data), timeout_ns)?;
+    args.place.transfer(&mut speaking, args.sub, SdoJob::Write(data), times)?;
     drop(speaking);
     device.stop()?;
     Ok(())

@@ -2,8 +2,9 @@
 
 use std::io::Write as _;
 
+use anyhow::anyhow;
 use cantap_protocols::active::node_scan::{FoundNode, NodeScan};
-use cantap_protocols::active::sdo::{SdoClient, SdoIds, SdoJob};
+use cantap_protocols::active::sdo::{SdoClient, SdoError, SdoIds, SdoJob};
 use cantap_protocols::canopen::{CanOpen, Sheet, state_name};
 use serde_json::{Value, json};
 
@@ -38,7 +39,7 @@ const IDENTITY: [(&str, u16, u8); 5] = [
     ("name", 0x1008, 0),
 ];
 
-/// Scans, asks the nodes that answer for their identity, and shows them.
+/// Scans, asks the nodes that answer for their identity, and shows them; an error if there is none.
 pub(super) fn run(
     speak: &SpeakArgs,
     args: &ScanArgs,
@@ -49,7 +50,7 @@ pub(super) fn run(
     let mut speaking = speak.speak(&device, Box::new(CanOpen::new(sheets)));
     let (first, last) = args.nodes;
     let mut scan = match args.listen {
-        Some(time) => NodeScan::new([], time.as_nanos().min(u128::from(u64::MAX / 4)) as u64),
+        Some(time) => NodeScan::new([], args::nanoseconds(time)),
         None => NodeScan::new(first..=last, wait_ns),
     };
     speaking.run(&mut scan)?;
@@ -64,13 +65,21 @@ pub(super) fn run(
         for node in &found {
             writeln!(out, "{}", line(node))?;
         }
-        if found.is_empty() {
-            eprintln!("cantap: no node: {}", speaking.circumstances());
-        }
     }
+    // Nothing found is not what was asked for.
+    let nobody = found.is_empty().then(|| match args.listen {
+        Some(_) => format!("no node sent a heartbeat; {}; without --listen, nodes are asked", speaking.circumstances()),
+        None => format!(
+            "no node answered or sent a heartbeat; {}; check the bit rate, and that the nodes are on; a node without a number is found by \
+             `cantap canopen lss`",
+            speaking.circumstances()
+        ),
+    });
+    let deaf = speaking.judge();
     drop(speaking);
     device.stop()?;
-    Ok(())
+    deaf?;
+    nobody.map_or(Ok(()), |nobody| Err(anyhow!(nobody)))
 }
 
 fn describe(speaking: &mut Speaking<'_>, node: FoundNode, wait_ns: u64) -> anyhow::Result<Value> {
@@ -86,11 +95,15 @@ fn describe(speaking: &mut Speaking<'_>, node: FoundNode, wait_ns: u64) -> anyho
             let mut client = SdoClient::new(SdoIds::of(node.node), index, sub, SdoJob::Read, false, wait_ns);
             speaking.run(&mut client)?;
             // A node need not answer for an object that it does not have.
-            if let Ok(data) = client.finish() {
-                value = match <[u8; 4]>::try_from(&data[..]) {
-                    Ok(word) if index == 0x1018 => u32::from_le_bytes(word).into(),
-                    _ => String::from_utf8_lossy(&data).trim_end_matches('\0').into(),
-                };
+            match client.finish() {
+                Ok(data) => {
+                    value = match <[u8; 4]>::try_from(&data[..]) {
+                        Ok(word) if index == 0x1018 => u32::from_le_bytes(word).into(),
+                        _ => String::from_utf8_lossy(&data).trim_end_matches('\0').into(),
+                    };
+                }
+                Err(SdoError::Aborted { .. } | SdoError::NoAnswer { .. }) => {}
+                Err(error) => eprintln!("cantap: node {}, object {index:04X}:{sub:X}: {error}", node.node),
             }
         }
         object[name] = value;

@@ -10,6 +10,7 @@ use cantap_protocols::active::exchange::{Answerer, Exchange, ExchangeError, Resp
 use cantap_protocols::active::transfer::TransferSettings;
 use cantap_protocols::diagnostics::{reason, uds_service};
 use cantap_protocols::iso_tp::{Endpoint, Pair};
+use cantap_protocols::{Event, Party};
 
 use crate::args;
 use crate::speaking::Speaking;
@@ -33,9 +34,15 @@ pub struct TransferArgs {
     /// The same after the ECU has said that its answer is pending (P2*).
     #[arg(long, value_name = "TIME", default_value = "5s", value_parser = args::positive_duration, global = true)]
     p2_star: Duration,
-    /// Maximum time to wait for one answer, however often it is pending.
+    /// Maximum time to wait for one answer, however often it is pending; also for sending a long request, and for --key-command.
     #[arg(long, value_name = "TIME", default_value = "60s", value_parser = args::positive_duration, global = true)]
     patience: Duration,
+    /// How long to wait for the next frame of an answer (N_Cr), and for flow control (N_Bs).
+    #[arg(long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration, global = true)]
+    frame_timeout: Duration,
+    /// How often in a row the ECU's flow control may ask to wait (N_WFTmax).
+    #[arg(long, value_name = "N", default_value_t = 10, global = true)]
+    max_waits: u32,
     /// Minimum separation of an answer's frames (STmin): up to 127ms, or 100us to 900us.
     #[arg(long, value_name = "STMIN", default_value = "0ms", value_parser = separation, global = true)]
     separation: u8,
@@ -92,6 +99,8 @@ impl TransferArgs {
             p2,
             p2_star: Duration::from_secs(5),
             patience: Duration::from_secs(30),
+            frame_timeout: Duration::from_secs(1),
+            max_waits: 10,
             separation: 0,
             block_size: 0,
             padding: Padding(Some(0)),
@@ -121,14 +130,28 @@ impl TransferArgs {
         }
     }
 
+    /// Whether an event is from our conversation: others may ask other ECUs meanwhile.
+    pub fn is_ours(&self, event: &Event) -> bool {
+        let is = |party: Party, endpoint: Endpoint| party == endpoint.into();
+        match event.kind {
+            "exchange" | "refusal" | "request" => is(event.from, self.to()),
+            // A broken transfer is shown from its sender.
+            "broken" if self.functional => true,
+            "broken" => is(event.from, self.pair.a) || is(event.from, self.pair.b),
+            _ => false,
+        }
+    }
+
     /// The client for a request.
     fn exchange(&self, request: &[u8]) -> Exchange {
-        let ns = |time: Duration| u64::try_from(time.as_nanos()).unwrap_or(u64::MAX / 4).min(u64::MAX / 4);
+        let ns = args::nanoseconds;
         let settings = TransferSettings {
             padding: self.padding.0,
             block_size: self.block_size,
             separation: self.separation,
-            ..TransferSettings::default()
+            flow_timeout_ns: ns(self.frame_timeout),
+            next_timeout_ns: ns(self.frame_timeout),
+            most_waits: self.max_waits,
         };
         let timing = ResponseTiming {
             p2_ns: ns(self.p2),
@@ -165,14 +188,16 @@ pub struct Client<'d> {
     args: TransferArgs,
     /// Who answers requests to all, as far as known.
     servers: Vec<Endpoint>,
-    /// The first refusal, if refusals do not end everything.
+    /// The first refusal, or the first answer that may be somebody else's, if these do not end everything.
     refused: Option<anyhow::Error>,
+    /// It was said that there is another tester.
+    has_rival: bool,
 }
 
 impl<'d> Client<'d> {
     /// Over a device whose channel is open.
     pub const fn new(speaking: Speaking<'d>, args: TransferArgs) -> Self {
-        Self { speaking, args, servers: Vec::new(), refused: None }
+        Self { speaking, args, servers: Vec::new(), refused: None, has_rival: false }
     }
 
     /// Who answers requests to all.
@@ -180,9 +205,25 @@ impl<'d> Client<'d> {
         self.servers = servers;
     }
 
+    /// Prints what was said in our conversation since the last call.
+    pub fn tell(&mut self) -> anyhow::Result<()> {
+        self.tell_if(|_| true)
+    }
+
+    /// The same, if it is also wanted.
+    pub fn tell_if(&mut self, mut is_wanted: impl FnMut(&Event) -> bool) -> anyhow::Result<()> {
+        let args = self.args;
+        self.speaking.tell(|event| args.is_ours(event) && is_wanted(event))
+    }
+
     /// Addresses other ECUs, or uses other parameters.
     pub const fn set_transfer(&mut self, args: TransferArgs) {
         self.args = args;
+    }
+
+    /// How long anything that an ECU waits for may take.
+    pub const fn patience(&self) -> Duration {
+        self.args.patience
     }
 
     fn channel(&self) -> Channel {
@@ -227,6 +268,7 @@ impl<'d> Client<'d> {
             cleared.map_err(|error| Failure::Other(error.into()))?;
         }
         ran.map_err(Failure::Other)?;
+        self.look_for_rivals(&exchange);
         let (answers, broken) = exchange.finish().map_err(Failure::Exchange)?;
         for (from, error) in broken {
             eprintln!("cantap: the answer of {from} broke off: {error}");
@@ -237,6 +279,24 @@ impl<'d> Client<'d> {
             self.refused.get_or_insert_with(|| anyhow!(refusal_text(&who, request, code)));
         }
         Ok(answers)
+    }
+
+    /// Says that another tester asks the same ECU; its answers must not be taken for ours in silence.
+    fn look_for_rivals(&mut self, exchange: &Exchange) {
+        let asked = self.args.to();
+        if exchange.rivals() > 0 && !std::mem::replace(&mut self.has_rival, true) {
+            eprintln!(
+                "cantap: another tester asks the same ECU as {asked} at the same time; answers are compared with both requests"
+            );
+        }
+        if exchange.doubtful() > 0 {
+            self.refused.get_or_insert_with(|| {
+                anyhow!(
+                    "{asked}: the answer may be to the request of another tester, which asked the same meanwhile; run this again \
+                     while the other is silent"
+                )
+            });
+        }
     }
 
     /// Has the device send flow control, if that is wanted. Returns how many of its reply slots are set.

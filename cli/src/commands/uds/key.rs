@@ -1,13 +1,18 @@
 //! Security access: the ECU's seed goes to the user's command, and the command's key to the ECU.
 
 use std::fmt::Write as _;
-use std::io::Write as _;
-use std::process::{Command, Stdio};
+use std::io::{Read as _, Write as _};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 
 use super::client::{Client, first};
 use super::hex::{Hex, byte, bytes};
+use crate::interrupt;
+
+/// How often to check whether the command has ended.
+const LOOK_EVERY: Duration = Duration::from_millis(5);
 
 /// How to unlock the ECU; commands flatten this into their arguments.
 #[derive(clap::Args, Clone)]
@@ -37,13 +42,13 @@ impl KeyArgs {
         if seed.iter().all(|byte| *byte == 0) {
             return Ok(());
         }
-        let key = key(command, seed)?;
+        let key = key(command, seed, client.patience())?;
         client.ask(&[&[0x27, level + 1][..], &key].concat())?;
         client.all_agreed()
     }
 }
 
-fn key(command: &str, seed: &[u8]) -> anyhow::Result<Vec<u8>> {
+fn key(command: &str, seed: &[u8], patience: Duration) -> anyhow::Result<Vec<u8>> {
     let seed = seed.iter().fold(String::new(), |mut text, byte| {
         let _ = write!(text, "{byte:02X}");
         text
@@ -56,9 +61,15 @@ fn key(command: &str, seed: &[u8]) -> anyhow::Result<Vec<u8>> {
         // A command that takes the seed from its arguments may not read it.
         let _ = writeln!(stdin, "{seed}");
     }
-    let output = child.wait_with_output().context("cannot read from --key-command")?;
-    ensure!(output.status.success(), "--key-command '{command}' failed: {}; no key was sent", output.status);
-    let text = String::from_utf8_lossy(&output.stdout);
+    let mut stdout = child.stdout.take().context("cannot read from --key-command")?;
+    let printed = std::thread::spawn(move || {
+        let mut text = Vec::new();
+        stdout.read_to_end(&mut text).map(|_| text)
+    });
+    let status = end_of(&mut child, command, patience)?;
+    ensure!(status.success(), "--key-command '{command}' failed: {status}; no key was sent");
+    let printed = printed.join().ok().and_then(Result::ok).context("cannot read from --key-command")?;
+    let text = String::from_utf8_lossy(&printed);
     match bytes(text.trim()) {
         Ok(Hex(key)) => Ok(key),
         Err(_) => {
@@ -67,5 +78,27 @@ fn key(command: &str, seed: &[u8]) -> anyhow::Result<Vec<u8>> {
                 text.trim()
             )
         }
+    }
+}
+
+/// Waits for the command, which is ended by Ctrl-C or when it takes too long: the ECU does not wait for ever either.
+fn end_of(child: &mut Child, command: &str, patience: Duration) -> anyhow::Result<ExitStatus> {
+    let started = Instant::now();
+    loop {
+        if let Some(status) = child.try_wait().context("cannot wait for --key-command")? {
+            return Ok(status);
+        }
+        let is_late = started.elapsed() >= patience;
+        if is_late || interrupt::requested() {
+            let _ = child.kill();
+            let _ = child.wait();
+        }
+        ensure!(!interrupt::requested(), "ended by Ctrl-C during --key-command; no key was sent");
+        ensure!(
+            !is_late,
+            "--key-command '{command}' did not end within {} s and was stopped; no key was sent; --patience gives it more time",
+            patience.as_secs_f64()
+        );
+        std::thread::sleep(LOOK_EVERY);
     }
 }

@@ -8,12 +8,13 @@ use std::collections::VecDeque;
 use cantap_trace::Id;
 use cantap_wire::Frame;
 
+use super::answer::{NEGATIVE, is_answer};
+use super::rivals::Rivals;
 use super::transfer::{TransferError, TransferReceiver, TransferSender, TransferSettings};
 use super::{Machine, earlier};
-use crate::diagnostics::{is_response_suppressed, repeats_its_request};
+use crate::diagnostics::is_response_suppressed;
 use crate::iso_tp::{Endpoint, Pci, parse};
 
-const NEGATIVE: u8 = 0x7F;
 const RESPONSE_PENDING: u8 = 0x78;
 
 /// How long servers may take.
@@ -23,7 +24,8 @@ pub struct ResponseTiming {
     pub p2_ns: u64,
     /// The same after the server has said that the answer is pending (P2*).
     pub p2_star_ns: u64,
-    /// From the end of the request to the last answer, however often it was pending.
+    /// From the end of the request to the last answer, however often it was pending; and before that, for sending the request, however
+    /// often the server asks to wait.
     pub patience_ns: u64,
 }
 
@@ -114,6 +116,12 @@ pub enum ExchangeError {
     /// The request could not be sent completely.
     #[error("the request broke off: {0}")]
     Request(TransferError),
+    /// The request could not be sent completely in time, since the server took its frames too slowly.
+    #[error("the request was not taken completely within {after_ms} ms")]
+    RequestTooSlow {
+        /// How long we tried.
+        after_ms: u64,
+    },
     /// No answer came.
     #[error("no answer within {after_ms} ms")]
     NoAnswer {
@@ -131,12 +139,18 @@ pub enum ExchangeError {
         after_ms: u64,
     },
     /// The server keeps saying that its answer is pending.
-    #[error("the server has said for {seconds} s that its answer is pending ({times} times)")]
+    #[error("the server has said for {after_ms} ms that its answer is pending ({times} times)")]
     EndlessPending {
         /// How often.
         times: u32,
         /// For how long.
-        seconds: u64,
+        after_ms: u64,
+    },
+    /// An answer began, and was not complete in time.
+    #[error("the answer was not complete within {after_ms} ms")]
+    TooSlow {
+        /// How long we waited.
+        after_ms: u64,
     },
     /// The answer broke off.
     #[error("the answer of {from} broke off: {error}")]
@@ -174,9 +188,13 @@ pub struct Exchange {
     broken: Vec<(Endpoint, TransferError)>,
     /// Frames handed over that have not been on the bus yet; true for those of the request.
     under_way: VecDeque<bool>,
+    /// When the request was begun.
+    begun_ns: Option<u64>,
     /// When the request was complete on the bus.
     asked_ns: Option<u64>,
     others: u32,
+    to: Endpoint,
+    rivals: Rivals,
     end: Option<Result<(), ExchangeError>>,
 }
 
@@ -201,8 +219,11 @@ impl Exchange {
             answers: Vec::new(),
             broken: Vec::new(),
             under_way: VecDeque::new(),
+            begun_ns: None,
             asked_ns: None,
             others: 0,
+            to,
+            rivals: Rivals::default(),
             end: None,
         }
     }
@@ -245,6 +266,16 @@ impl Exchange {
         }
     }
 
+    /// How many requests of other testers to the same servers were heard meanwhile.
+    pub const fn rivals(&self) -> u32 {
+        self.rivals.count()
+    }
+
+    /// How many of the answers may be to another tester's request.
+    pub const fn doubtful(&self) -> u32 {
+        self.rivals.doubtful()
+    }
+
     fn end(&mut self, result: Result<(), ExchangeError>) {
         self.end.get_or_insert(result);
     }
@@ -262,6 +293,7 @@ impl Exchange {
             return;
         }
         server.pending_until_ns = None;
+        self.rivals.judge(&self.request, &data);
         self.answers.push(ServerAnswer { from: server.from, data, pending: server.pending });
         if !self.answerer.is_many() || self.most_answers.is_some_and(|most| self.answers.len() >= most) {
             self.end(Ok(()));
@@ -280,16 +312,24 @@ impl Exchange {
 
     /// Handles timeouts.
     fn expire(&mut self, now_ns: u64) {
-        let Some(asked_ns) = self.asked_ns else { return };
+        let after_ms = self.timing.patience_ns / 1_000_000;
+        let Some(asked_ns) = self.asked_ns else {
+            if self
+                .begun_ns
+                .is_some_and(|begun_ns| now_ns >= begun_ns.saturating_add(self.timing.patience_ns))
+            {
+                self.end(Err(ExchangeError::RequestTooSlow { after_ms }));
+            }
+            return;
+        };
         let pending: u32 = self.servers.iter().map(|server| server.pending).sum();
         let is_receiving = self.servers.iter().any(|server| server.receiver.is_receiving());
         if now_ns >= asked_ns + self.timing.patience_ns {
-            let seconds = self.timing.patience_ns / 1_000_000_000;
-            let has_some = !self.answers.is_empty();
-            self.end(if has_some {
-                Ok(())
-            } else {
-                Err(ExchangeError::EndlessPending { times: pending, seconds })
+            self.end(match (self.answers.is_empty(), is_receiving, pending) {
+                (false, ..) => Ok(()),
+                (true, false, times @ 1..) => Err(ExchangeError::EndlessPending { times, after_ms }),
+                (true, false, 0) => Err(ExchangeError::NoAnswer { after_ms, others: self.others }),
+                (true, true, _) => Err(ExchangeError::TooSlow { after_ms }),
             });
             return;
         }
@@ -335,6 +375,12 @@ impl Machine for Exchange {
         if self.is_done() {
             return None;
         }
+        self.begun_ns.get_or_insert(now_ns);
+        // A server that takes frame after frame slowly must not be sent more after the end of our patience.
+        self.expire(now_ns);
+        if self.is_done() {
+            return None;
+        }
         match self.sender.next(now_ns) {
             Ok(Some(frame)) => {
                 self.under_way.push_back(true);
@@ -343,7 +389,6 @@ impl Machine for Exchange {
             Ok(None) => {}
             Err(error) => self.end(Err(ExchangeError::Request(error))),
         }
-        self.expire(now_ns);
         None
     }
 
@@ -357,6 +402,9 @@ impl Machine for Exchange {
     }
 
     fn hear(&mut self, now_ns: u64, id: Id, data: &[u8]) {
+        if self.begun_ns.is_some() && !self.is_done() && self.rivals.hear(self.to, id, data) {
+            return;
+        }
         let Some((from, flow_to)) = self.answerer.flow_to(id, data) else { return };
         // Nothing sent before the request was complete can answer it.
         if self.is_done()
@@ -405,7 +453,10 @@ impl Machine for Exchange {
     fn due_ns(&self) -> Option<u64> {
         let receivers = self.servers.iter().filter_map(|server| server.receiver.due_ns());
         let due = earlier(self.sender.due_ns(), receivers.min());
-        let Some(asked_ns) = self.asked_ns else { return due };
+        let Some(asked_ns) = self.asked_ns else {
+            let patience = |begun_ns: u64| begun_ns.saturating_add(self.timing.patience_ns);
+            return if self.under_way.is_empty() { earlier(due, self.begun_ns.map(patience)) } else { due };
+        };
         let (p2, patience) = (asked_ns + self.timing.p2_ns, asked_ns + self.timing.patience_ns);
         // Answers that have begun have their own deadlines.
         if self.servers.iter().any(|server| server.receiver.is_receiving()) {
@@ -419,15 +470,6 @@ impl Machine for Exchange {
     fn is_done(&self) -> bool {
         self.end.is_some()
     }
-}
-
-/// Whether a message answers this request rather than an earlier one.
-fn is_answer(request: &[u8], data: &[u8]) -> bool {
-    let (Some(&sid), Some(&first)) = (request.first(), data.first()) else { return false };
-    if first == NEGATIVE {
-        return data.get(1) == Some(&sid) && data.len() >= 3;
-    }
-    first == sid | 0x40 && repeats_its_request(false, request, data) == Some(true)
 }
 
 #[cfg(test)]

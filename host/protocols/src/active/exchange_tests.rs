@@ -250,6 +250,22 @@ fn whatever_the_server_does_there_is_an_end() {
         say.extend((0..100).map(|n| (n * 1000 * MS, frame(&[3, 0x7F, 0x22, 0x78]))));
     });
     assert!(seconds <= 61 && matches!(error, ExchangeError::EndlessPending { .. }), "{error}");
+    // An answer that goes on for ever, a block at a time, is not called pending.
+    let (seconds, error) = fails(&[0x22, 0xF1, 0x90], &|data, say| {
+        if data[0] == 3 {
+            say.push((0, frame(&[0x1F, 0xFF, 0x62, 0xF1, 0x90, 1, 2, 3])));
+            say.extend(
+                (1..500).map(|n| (n * 900 * MS, frame(&[0x20 | (n & 15) as u8, 0, 0, 0, 0, 0, 0, 0]))),
+            );
+        }
+    });
+    assert_eq!((seconds, error), (60, ExchangeError::TooSlow { after_ms: 60_000 }));
+    // A request that is taken a frame at a time, after as many waits as may be each time.
+    let (seconds, error) = fails(&long(0x2E, 4095), &|_, say| {
+        say.extend((0..10).map(|n| (n * 900 * MS, frame(&[0x31, 0, 0]))));
+        say.push((9000 * MS, frame(&[0x30, 1, 0])));
+    });
+    assert_eq!((seconds, error), (60, ExchangeError::RequestTooSlow { after_ms: 60_000 }));
     // Pending, and then nothing more.
     let (seconds, error) = fails(&[0x22, 0xF1, 0x90], &|_, say| say.push((0, frame(&[3, 0x7F, 0x22, 0x78]))));
     assert_eq!((seconds, error), (5, ExchangeError::NothingAfterPending { times: 1, after_ms: 5000 }));
@@ -288,6 +304,26 @@ fn whatever_the_server_does_there_is_an_end() {
     let (_, error) =
         fails(&[0x22, 0xF1, 0x90], &|_, say| say.push((0, frame(&[0x10, 0, 0xFF, 0xFF, 0xFF, 0xFF, 1, 2]))));
     assert!(matches!(error, ExchangeError::Answer { error: TransferError::TooLong { .. }, .. }), "{error}");
+}
+
+/// What another tester asked the same ECU may have been answered, and not our request.
+#[test]
+fn another_tester_is_noticed() {
+    let heard = |theirs: &[u8], answer: &[u8]| {
+        let mut exchange = physical(&[0x22, 0xF1, 0x90]);
+        assert!(exchange.next(0).is_some());
+        exchange.sent(1);
+        exchange.hear(2, Id::standard_truncated(0x7E0), theirs);
+        // Their flow control, and what is not theirs.
+        exchange.hear(3, Id::standard_truncated(0x7E0), &[0x30, 0, 0]);
+        exchange.hear(3, Id::standard_truncated(0x7E1), theirs);
+        exchange.hear(4, Id::standard_truncated(0x7E8), answer);
+        assert!(exchange.is_done());
+        (exchange.rivals(), exchange.doubtful())
+    };
+    assert_eq!(heard(&[2, 0x3E, 0], &[4, 0x62, 0xF1, 0x90, 1]), (1, 0));
+    assert_eq!(heard(&[3, 0x22, 1, 2], &[3, 0x7F, 0x22, 0x31]), (1, 1));
+    assert_eq!(heard(&[0x30, 0, 0], &[3, 0x7F, 0x22, 0x31]), (0, 0));
 }
 
 #[test]

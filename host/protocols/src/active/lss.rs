@@ -44,6 +44,9 @@ pub enum LssError {
         /// Which of vendor, product, revision, serial number, from 1.
         part: u8,
     },
+    /// Another master is at work, so answers may be to its commands.
+    #[error("another LSS master sends commands at the same time; there must be only one")]
+    OtherMaster,
     /// No answer to a command.
     #[error("no answer to the command {command:02X} within {after_ms} ms")]
     NoAnswer {
@@ -174,6 +177,9 @@ impl Machine for FastScan {
     }
 
     fn hear(&mut self, now_ns: u64, id: Id, data: &[u8]) {
+        if id == REQUEST && (self.asking != Asking::Pending || self.bit != 128) {
+            self.end.get_or_insert(Err(LssError::OtherMaster));
+        }
         if id == RESPONSE && data.first() == Some(&IDENTIFIED) && matches!(self.asking, Asking::Waits { .. })
         {
             self.has_answer = true;
@@ -293,6 +299,9 @@ impl Machine for LssMaster {
     }
 
     fn hear(&mut self, _now_ns: u64, id: Id, data: &[u8]) {
+        if id == REQUEST && (self.under_way > 0 || self.until_ns.is_some()) {
+            self.end.get_or_insert(Err(LssError::OtherMaster));
+        }
         let Some(command) = self.answer.filter(|answer| id == RESPONSE && data.first() == Some(answer))
         else {
             return;
@@ -386,6 +395,22 @@ mod tests {
             }
         }
         assert!((20..190).contains(&failed), "{failed}");
+    }
+
+    #[test]
+    fn another_master_ends_it() {
+        let theirs = [0x04, 1, 0, 0, 0, 0, 0, 0];
+        let mut scan = FastScan::new(50 * MS);
+        scan.hear(0, REQUEST, &theirs);
+        assert!(scan.next(1).is_some() && !scan.is_done());
+        scan.sent(2);
+        scan.hear(3, REQUEST, &theirs);
+        assert_eq!((scan.next(4), scan.finish()), (None, Err(LssError::OtherMaster)));
+        let mut master = LssMaster::new(LssOrder::SetNode(5), 50 * MS);
+        assert!(master.next(1).is_some());
+        master.sent(2);
+        master.hear(3, REQUEST, &theirs);
+        assert_eq!(master.finish(), Err(LssError::OtherMaster));
     }
 
     #[test]

@@ -3,9 +3,11 @@
 //! Each is a [`Machine`] without its own input and output: frames and the time go in, frames and the next deadline come out. Whoever
 //! has a bus drives it; the `cantap` command does so with a device. Every machine ends in bounded time, whatever the other side does.
 
+mod answer;
 pub mod exchange;
 pub mod lss;
 pub mod node_scan;
+mod rivals;
 pub mod sdo;
 mod sdo_job;
 pub mod station;

@@ -34,6 +34,8 @@ pub struct NodeScan {
     aborts: VecDeque<Frame>,
     found: [FoundNode; 128],
     asked: [bool; 128],
+    /// Nodes that were told not to go on: once, whatever they send.
+    aborted: [bool; 128],
     under_way: usize,
     wait_ns: u64,
     until_ns: Option<u64>,
@@ -49,6 +51,7 @@ impl NodeScan {
             aborts: VecDeque::new(),
             found: [FoundNode::default(); 128],
             asked: [false; 128],
+            aborted: [false; 128],
             under_way: 0,
             wait_ns,
             until_ns: None,
@@ -108,7 +111,7 @@ impl Machine for NodeScan {
                 let [a, b, c, d] = rest.first_chunk().copied().unwrap_or_default();
                 match command {
                     0x43 | 0x42 => found.device_type = Some(u32::from_le_bytes([a, b, c, d])),
-                    0x40 | 0x41 => {
+                    0x40 | 0x41 if !std::mem::replace(&mut self.aborted[place], true) => {
                         // It wants to send segments, which nobody will request.
                         let [low, high, sub] = DEVICE_TYPE;
                         let abort = [0x80, low, high, sub, 0, 0, 0, 8];
@@ -167,6 +170,20 @@ mod tests {
             ]
         );
         assert!(aborted);
+    }
+
+    /// A node that answers an abort with the same again.
+    #[test]
+    fn a_node_is_told_once_not_to_go_on() {
+        let mut aborts = 0;
+        let mut peer = |id: Id, data: &[u8], say: &mut Say| {
+            aborts += u32::from(data[0] == 0x80);
+            let answer = [0x41, 0, 0x10, 0, 9, 0, 0, 0];
+            say.push((1000, Frame::data_frame(Id::standard_truncated(id.raw() - 0x80), &answer).unwrap()));
+        };
+        let mut scan = NodeScan::new(8..=8, 100_000_000);
+        run(&mut scan, &mut peer, arrives);
+        assert_eq!((scan.found().count(), aborts), (1, 1));
     }
 
     #[test]

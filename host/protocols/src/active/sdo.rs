@@ -16,6 +16,10 @@ const MOST_BYTES: usize = 1 << 24;
 const MOST_UNDER_WAY: usize = 16;
 /// How often in a transfer frames of a block are requested or sent again.
 const MOST_RETRIES: u32 = 20;
+/// For how many answers' time a node may send without continuing the object.
+const MOST_STALLED: u64 = 5;
+/// How long a transfer may take altogether, unless said otherwise.
+const PATIENCE_NS: u64 = 600_000_000_000;
 /// Frames in a block: the maximum.
 const BLOCK: u8 = 127;
 const TIMED_OUT: u32 = 0x0504_0000;
@@ -70,6 +74,10 @@ pub struct SdoClient {
     size: Option<usize>,
     has_crc: bool,
     retries: u32,
+    patience_ns: u64,
+    begun_ns: Option<u64>,
+    /// When received bytes last continued the object, and how many there were.
+    grown: (u64, usize),
     end: Option<Result<(), SdoError>>,
 }
 
@@ -100,8 +108,16 @@ impl SdoClient {
             size: None,
             has_crc: false,
             retries: 0,
+            patience_ns: PATIENCE_NS,
+            begun_ns: None,
+            grown: (0, 0),
             end: None,
         }
+    }
+
+    /// How long it may take altogether, however well it gets on; without this, ten minutes.
+    pub const fn set_patience(&mut self, patience_ns: u64) {
+        self.patience_ns = patience_ns;
     }
 
     /// The bytes read; empty for a write. Call it when the transfer is done.
@@ -172,6 +188,25 @@ impl SdoClient {
         }
         let (after_ms, done) = (self.timeout_ns / 1_000_000, self.done());
         self.abort(TIMED_OUT, SdoError::NoAnswer { after_ms, done });
+    }
+
+    /// Ends what takes too long although answers come.
+    fn hurry(&mut self, now_ns: u64) {
+        if self.end.is_some() {
+            return;
+        }
+        let begun_ns = *self.begun_ns.get_or_insert(now_ns);
+        let done = self.done();
+        let is_receiving = matches!(self.step, Step::BlockIn { .. });
+        if self.data.len() != self.grown.1 || !is_receiving {
+            self.grown = (now_ns, self.data.len());
+        }
+        let stalled_ns = self.timeout_ns.saturating_mul(MOST_STALLED);
+        if now_ns >= begun_ns.saturating_add(self.patience_ns) {
+            self.abort(TIMED_OUT, SdoError::TooSlow { after_s: self.patience_ns / 1_000_000_000, done });
+        } else if now_ns >= self.grown.0.saturating_add(stalled_ns) {
+            self.abort(TIMED_OUT, SdoError::Stalled { after_ms: stalled_ns / 1_000_000, done });
+        }
     }
 
     /// Ends a received block: the frames up to this number were understood.
@@ -397,6 +432,7 @@ impl Machine for SdoClient {
             self.until_ns = None;
             self.time_out();
         }
+        self.hurry(now_ns);
         if self.under_way >= MOST_UNDER_WAY {
             return None;
         }
@@ -413,7 +449,17 @@ impl Machine for SdoClient {
     }
 
     fn hear(&mut self, now_ns: u64, id: Id, data: &[u8]) {
-        if id != self.ids.response || self.end.is_some() || self.step == Step::New {
+        if self.end.is_some() || self.step == Step::New {
+            return;
+        }
+        // Only one client may use a channel (CiA 301), and ours was confirmed by name.
+        if id == self.ids.request {
+            self.out.clear();
+            self.until_ns = None;
+            self.end = Some(Err(SdoError::OtherClient { done: self.done() }));
+            return;
+        }
+        if id != self.ids.response {
             return;
         }
         let Ok(data) = <[u8; 8]>::try_from(data) else { return self.wrong(BAD_LENGTH) };

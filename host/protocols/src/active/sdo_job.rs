@@ -56,6 +56,33 @@ pub enum SdoError {
         /// Bytes transferred so far.
         done: usize,
     },
+    /// The node keeps sending, but nothing that continues the object; the transfer was aborted.
+    #[error(
+        "the node has sent nothing that continues the object for {after_ms} ms, after {done} bytes; the transfer was aborted"
+    )]
+    Stalled {
+        /// For how long.
+        after_ms: u64,
+        /// Bytes transferred so far.
+        done: usize,
+    },
+    /// It took too long altogether; the transfer was aborted.
+    #[error("it was not complete within {after_s} s, after {done} bytes; the transfer was aborted")]
+    TooSlow {
+        /// How long we tried.
+        after_s: u64,
+        /// Bytes transferred so far.
+        done: usize,
+    },
+    /// Another client uses the same channel, so the node's answers may be to its requests. Nothing more was sent: an abort would
+    /// end its transfer.
+    #[error(
+        "another client uses this SDO channel at the same time, after {done} bytes; the answers may be to its requests"
+    )]
+    OtherClient {
+        /// Bytes transferred so far.
+        done: usize,
+    },
     /// It was ended from outside; the node was told.
     #[error("ended before it was complete, after {done} bytes")]
     Cancelled {

@@ -338,3 +338,73 @@ fn a_node_is_told_when_a_transfer_is_cancelled() {
     assert!(new.is_done() && new.cancel().is_none() && new.next(4).is_none());
     assert_eq!(new.finish(), Err(SdoError::Cancelled { done: 0 }));
 }
+
+/// A node that sends frames for ever, none of which continues the block.
+#[test]
+fn a_block_that_does_not_go_on_is_given_up_in_time() {
+    for number in [1, 5, 127] {
+        let mut client = SdoClient::new(SdoIds::of(5), 0x2000, 1, SdoJob::Read, true, 1000 * MS);
+        let mut peer = |_: Id, data: &[u8], say: &mut Say| match data[0] {
+            0xA4 => say.push((MS, answer([0xC2, data[1], data[2], data[3], 100, 0, 0, 0]))),
+            0xA3 => {
+                // The first one continues it, and then never another.
+                say.extend((0..3000).map(|at| (at * 10 * MS, answer([number, 1, 2, 3, 4, 5, 6, 7]))));
+            }
+            _ => {}
+        };
+        let (took_ns, sent) = run(&mut client, &mut peer, arrives);
+        let error = client.finish().unwrap_err();
+        assert!(matches!(error, SdoError::Stalled { .. } | SdoError::Wrong { .. }), "{number}: {error}");
+        assert!(took_ns < 6000 * MS, "{number}: {took_ns}");
+        assert_eq!(sent.last().unwrap().data()[0], 0x80, "{number}");
+    }
+}
+
+/// The end of a block that is missing again and again: fewer tries than the number allows, if each takes long.
+#[test]
+fn a_block_without_an_end_is_asked_for_again_for_a_bounded_time() {
+    let mut client = SdoClient::new(SdoIds::of(5), 0x2000, 1, SdoJob::Read, true, 1000 * MS);
+    let mut peer = |_: Id, data: &[u8], say: &mut Say| match data[0] {
+        0xA4 => say.push((MS, answer([0xC2, data[1], data[2], data[3], 100, 0, 0, 0]))),
+        0xA3 => say.push((MS, answer([1, 1, 2, 3, 4, 5, 6, 7]))),
+        _ => {}
+    };
+    let (took_ns, _) = run(&mut client, &mut peer, arrives);
+    assert!(matches!(client.finish(), Err(SdoError::NoAnswer { .. } | SdoError::Stalled { .. })));
+    assert!(took_ns < 6000 * MS, "{took_ns}");
+}
+
+/// A node that answers each request just in time.
+#[test]
+fn a_transfer_ends_when_patience_does() {
+    let mut client = SdoClient::new(SdoIds::of(5), 0x2000, 1, SdoJob::Read, false, 1000 * MS);
+    client.set_patience(60_000 * MS);
+    let mut toggle = 0x10;
+    let mut peer = |_: Id, data: &[u8], say: &mut Say| match data[0] {
+        0x40 => say.push((900 * MS, answer([0x40, data[1], data[2], data[3], 0, 0, 0, 0]))),
+        0x80 => {}
+        _ => {
+            toggle ^= 0x10;
+            say.push((900 * MS, answer([toggle, 1, 2, 3, 4, 5, 6, 7])));
+        }
+    };
+    let (took_ns, sent) = run(&mut client, &mut peer, arrives);
+    assert!((60_000 * MS..62_000 * MS).contains(&took_ns), "{took_ns}");
+    assert!(matches!(client.finish(), Err(SdoError::TooSlow { after_s: 60, done: 455.. })));
+    assert_eq!(sent.last().unwrap().data()[0], 0x80);
+}
+
+/// Two clients on one channel: what the node answers may be for the other, and an abort would end its transfer.
+#[test]
+fn another_client_of_the_same_channel_ends_it() {
+    let mut client = SdoClient::new(SdoIds::of(5), 0x2000, 1, SdoJob::Read, false, 1000 * MS);
+    client.hear(0, SdoIds::of(5).request, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]);
+    assert!(client.next(1).is_some() && !client.is_done());
+    client.sent(2);
+    client.hear(3, SdoIds::of(6).request, &[0x40, 0, 0x20, 1, 0, 0, 0, 0]);
+    assert!(!client.is_done());
+    client.hear(3, SdoIds::of(5).request, &[0x40, 0, 0x20, 1, 0, 0, 0, 0]);
+    assert!(client.is_done());
+    assert_eq!(client.next(4), None);
+    assert_eq!(client.finish(), Err(SdoError::OtherClient { done: 0 }));
+}

@@ -19,8 +19,6 @@ use crate::j1939::Header;
 
 /// After this time, nobody may object to a claim any more (J1939-81).
 const CLAIM_NS: u64 = 250 * MS;
-/// How long to wait for an answer: Tr is 200 ms, and T3 is 1250 ms.
-const ANSWER_NS: u64 = 1250 * MS;
 /// The longest duration of a message to all that began in time: 255 frames, 50 ms each.
 const LONGEST_NS: u64 = 15_000 * MS;
 const NULL: u8 = 254;
@@ -29,8 +27,28 @@ const ACKNOWLEDGE: u32 = 0xE800;
 const CLAIM: u32 = 0xEE00;
 /// Addresses that any node may use (J1939-81).
 const FREE: std::ops::RangeInclusive<u8> = 128..=247;
+/// Why a connection is aborted that is ended from outside: "resources were needed for another task" (J1939-21, 5.10.2.3).
+const RESOURCES_NEEDED: u8 = 2;
+/// Why one is aborted that takes too long: "a timeout occurred".
+const TIMED_OUT: u8 = 3;
 /// The NAME's bit for "arbitrary address capable".
 const TAKES_ANY: u64 = 1 << 63;
+
+/// How long a station may take.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct StationTiming {
+    /// How long to wait for the beginning of an answer to a request.
+    pub answer_ns: u64,
+    /// For everything after the address was claimed, however often the other side asks to wait (T4) or for frames again.
+    pub patience_ns: u64,
+}
+
+impl Default for StationTiming {
+    /// 1250 ms, which is T3 of J1939-21 (Tr is 200 ms); one minute.
+    fn default() -> Self {
+        Self { answer_ns: 1250 * MS, patience_ns: 60_000 * MS }
+    }
+}
 
 /// What a station should do with its address.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -100,6 +118,11 @@ pub struct Station {
     incoming: Vec<Incoming>,
     outgoing: Option<Outgoing>,
     answers: Vec<GroupAnswer>,
+    timing: StationTiming,
+    /// When the job was begun first.
+    begun_ns: Option<u64>,
+    /// Frames that another node sent from our address.
+    imposters: u32,
     end: Option<Result<(), StationError>>,
 }
 
@@ -117,6 +140,9 @@ impl Station {
             incoming: Vec::new(),
             outgoing: None,
             answers: Vec::new(),
+            timing: StationTiming { answer_ns: 1250 * MS, patience_ns: 60_000 * MS },
+            begun_ns: None,
+            imposters: 0,
             end: None,
         }
     }
@@ -124,6 +150,16 @@ impl Station {
     /// A node that has already claimed its address.
     pub fn with_address(name: u64, address: u8, job: StationJob) -> Self {
         Self { phase: Phase::Begins, ..Self::new(name, address, job) }
+    }
+
+    /// Uses these times.
+    pub const fn set_timing(&mut self, timing: StationTiming) {
+        self.timing = timing;
+    }
+
+    /// How many frames another node has sent from our address: what it is answered is not for us.
+    pub const fn imposters(&self) -> u32 {
+        self.imposters
     }
 
     /// The address that it has or tries to get.
@@ -284,6 +320,31 @@ impl Station {
         }
     }
 
+    /// Whether it has taken too long altogether.
+    fn is_late(&self, now_ns: u64) -> bool {
+        self.begun_ns.is_some_and(|begun_ns| now_ns >= begun_ns.saturating_add(self.timing.patience_ns))
+    }
+
+    /// Ends what takes too long, and tells the other side.
+    fn give_up(&mut self) {
+        let open = self.open_connection();
+        self.out.clear();
+        self.out.extend(open.map(|(with, pgn)| long_message::abort(self.address, with, pgn, TIMED_OUT)));
+        let has_some = !self.answers.is_empty();
+        if has_some {
+            self.done();
+        } else {
+            self.fail(StationError::TooSlow { after_ms: self.timing.patience_ns / MS });
+        }
+    }
+
+    /// The node and the group of a message of many frames that is under way.
+    fn open_connection(&self) -> Option<(u8, u32)> {
+        let sending =
+            self.outgoing.as_ref().filter(|_| self.phase == Phase::Sends).and_then(Outgoing::connection);
+        sending.or_else(|| self.incoming.iter().find_map(Incoming::open_connection))
+    }
+
     /// Handles timeouts of incoming messages.
     fn sweep(&mut self, now_ns: u64) {
         let mut at = 0;
@@ -318,11 +379,12 @@ impl Machine for Station {
                 self.phase = Phase::Claims { until_ns: None };
             }
             Phase::Claims { until_ns: Some(until_ns) } if now_ns >= until_ns => self.phase = Phase::Begins,
+            Phase::Waits { .. } | Phase::Sends if self.is_late(now_ns) => self.give_up(),
             Phase::Waits { until_ns: Some(until_ns) }
                 if now_ns >= until_ns && (self.incoming.is_empty() || now_ns >= until_ns + LONGEST_NS) =>
             {
                 if self.answers.is_empty() {
-                    self.fail(StationError::NoAnswer { after_ms: ANSWER_NS / MS });
+                    self.fail(StationError::NoAnswer { after_ms: self.timing.answer_ns / MS });
                 } else {
                     self.done();
                 }
@@ -330,6 +392,7 @@ impl Machine for Station {
             _ => {}
         }
         if self.phase == Phase::Begins {
+            self.begun_ns.get_or_insert(now_ns);
             self.begin();
         }
         if let Some(frame) = self.out.pop_front() {
@@ -365,8 +428,13 @@ impl Machine for Station {
             return;
         }
         match &mut self.phase {
-            Phase::Claims { until_ns } if self.out.is_empty() => *until_ns = Some(now_ns + CLAIM_NS),
-            Phase::Waits { until_ns: until_ns @ None } => *until_ns = Some(now_ns + ANSWER_NS),
+            // A claim that is defended is not begun again: who objects for ever must not hold us up for ever.
+            Phase::Claims { until_ns: until_ns @ None } if self.out.is_empty() => {
+                *until_ns = Some(now_ns + CLAIM_NS);
+            }
+            Phase::Waits { until_ns: until_ns @ None } => {
+                *until_ns = Some(now_ns.saturating_add(self.timing.answer_ns));
+            }
             Phase::Closing if self.out.is_empty() => self.done(),
             _ => {}
         }
@@ -375,6 +443,17 @@ impl Machine for Station {
     fn hear(&mut self, now_ns: u64, id: Id, data: &[u8]) {
         let Some(header) = Header::of(id) else { return };
         if self.is_done() {
+            return;
+        }
+        // Our own frames do not come here.
+        let is_ours =
+            matches!(self.phase, Phase::Begins | Phase::Waits { .. } | Phase::Sends | Phase::Closing);
+        if is_ours && header.source == self.address && header.pgn != CLAIM {
+            self.imposters += 1;
+            // A node that uses an address without having claimed it is told whose it is (J1939-81).
+            if self.imposters == 1 && self.phase != Phase::Closing {
+                self.claim();
+            }
             return;
         }
         match (header.pgn, <[u8; 8]>::try_from(data)) {
@@ -414,11 +493,26 @@ impl Machine for Station {
             Phase::Sends => self.outgoing.as_ref().and_then(Outgoing::due_ns),
             _ => None,
         };
+        let late = self.begun_ns.map(|begun_ns| begun_ns.saturating_add(self.timing.patience_ns));
+        let own = earlier(own, late.filter(|_| matches!(self.phase, Phase::Waits { .. } | Phase::Sends)));
         earlier(own, self.incoming.iter().map(Incoming::due_ns).min())
     }
 
     fn is_done(&self) -> bool {
         self.phase == Phase::Done && self.out.is_empty()
+    }
+
+    fn cancel(&mut self) -> Option<Frame> {
+        if self.is_done() {
+            return None;
+        }
+        let sending =
+            self.outgoing.as_ref().filter(|_| self.phase == Phase::Sends).and_then(Outgoing::connection);
+        let receiving = || self.incoming.iter().find_map(Incoming::open_connection);
+        let (with, pgn) = sending.or_else(receiving)?;
+        self.out.clear();
+        self.fail(StationError::Cancelled);
+        Some(long_message::abort(self.address, with, pgn, RESOURCES_NEEDED))
     }
 }
 

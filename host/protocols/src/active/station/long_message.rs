@@ -94,6 +94,11 @@ impl Incoming {
         self.header.source
     }
 
+    /// The sender and the group, if it is waiting for us.
+    pub fn open_connection(&self) -> Option<(u8, u32)> {
+        (!self.to_all()).then_some((self.from(), self.pgn))
+    }
+
     pub fn into_data(mut self) -> Vec<u8> {
         self.data.truncate(self.length);
         self.data
@@ -213,6 +218,11 @@ impl Outgoing {
 
     pub fn is_done(&self) -> bool {
         self.state == State::Done
+    }
+
+    /// The receiver and the group, if it is waiting for us.
+    pub fn connection(&self) -> Option<(u8, u32)> {
+        (self.to != GLOBAL && self.state != State::New && !self.is_done()).then_some((self.to, self.pgn))
     }
 
     pub const fn is_with(&self, from: u8, pgn: u32) -> bool {

@@ -207,6 +207,12 @@ fn whatever_the_receiver_does_there_is_an_end() {
         }
     };
     assert!(matches!(send(&holds), StationError::Endless { .. }));
+    // A frame, then as many holds as may be, then the next frame: seldom enough to be allowed, and never done.
+    let slow = |_: u8, say: &mut Say| {
+        say.extend((0..50).map(|at| (at * 1000 * MS, control([17, 0, 255]))));
+        say.push((50_000 * MS, control([17, 1, 1])));
+    };
+    assert_eq!(send(&slow), StationError::TooSlow { after_ms: 60_000 });
     let same = |_: u8, say: &mut Say| say.push((MS, control([17, 1, 1])));
     assert!(matches!(send(&same), StationError::Endless { .. }));
     let beyond = |_: u8, say: &mut Say| say.push((MS, control([17, 1, 99])));
@@ -221,4 +227,50 @@ fn the_address_is_told_to_who_asks_for_it() {
     station.sent(1);
     station.hear(2, of(9, REQUEST, GLOBAL, &three(CLAIM)).id(), &three(CLAIM));
     assert_eq!(station.next(3).unwrap().to_string(), "18EEFF80#0500000000000080");
+}
+
+/// Who objects for ever, with a NAME that does not win, holds nothing up.
+#[test]
+fn an_objection_that_does_not_end_is_answered_and_outlasted() {
+    let mut station = Station::new(NAME, 0x80, StationJob::Claim);
+    let mut peer = |id: Id, _: &[u8], say: &mut Say| {
+        if Header::of(id).unwrap().pgn == CLAIM {
+            say.push((100 * MS, of(0x80, CLAIM, GLOBAL, &(NAME + 1).to_le_bytes())));
+        }
+    };
+    let (took_ns, sent) = run(&mut station, &mut peer, arrives);
+    assert!((250 * MS..300 * MS).contains(&took_ns), "{took_ns}");
+    assert_eq!((sent.len(), station.finish()), (3, Ok(vec![])));
+}
+
+/// A node that never claimed the address uses it: it is told once, and whoever asked is told, too.
+#[test]
+fn a_node_with_our_address_is_noticed() {
+    let mut station = Station::with_address(NAME, 0x80, StationJob::Request { pgn: 0xFECA, to: 3 });
+    assert!(station.next(0).is_some());
+    station.sent(1);
+    for at in 2..5 {
+        station.hear(at, of(0x80, REQUEST, 3, &three(0xFECA)).id(), &three(0xFECA));
+    }
+    assert_eq!(station.next(5).unwrap().to_string(), "18EEFF80#0500000000000080");
+    assert_eq!((station.next(6), station.imposters()), (None, 3));
+}
+
+/// The other side of a message of many frames does not wait for the rest.
+#[test]
+fn a_connection_that_is_ended_from_outside_is_aborted() {
+    let job = StationJob::Send { pgn: 0xD000, to: 3, priority: 6, data: bytes(100) };
+    let mut station = Station::with_address(NAME, 0x80, job);
+    assert_eq!(station.cancel(), None);
+    assert!(station.next(0).is_some());
+    station.sent(1);
+    assert_eq!(station.cancel().unwrap().to_string(), "1CEC0380#FF02FFFFFF00D000");
+    assert_eq!((station.next(2), station.finish()), (None, Err(StationError::Cancelled)));
+    let mut station = Station::with_address(NAME, 0x80, StationJob::Request { pgn: 0xFECA, to: 3 });
+    assert!(station.next(0).is_some());
+    station.sent(1);
+    assert_eq!(station.cancel(), None);
+    let asks = of(3, CONTROL, 0x80, &[16, 20, 0, 3, 255, 0xCA, 0xFE, 0]);
+    station.hear(2, asks.id(), asks.data());
+    assert_eq!(station.cancel().unwrap().to_string(), "1CEC0380#FF02FFFFFFCAFE00");
 }

@@ -60,14 +60,25 @@ pub enum StationError {
         total: u8,
     },
     /// The other side of a message of many frames requests frames that do not exist, or the same ones
-    /// repeatedly.
-    #[error("node {from} does not get on with the message: it has asked for frames again {times} times")]
+    /// repeatedly, or keeps asking to wait.
+    #[error(
+        "node {from} does not get on with the message: it has asked to wait, or for frames again, {times} times"
+    )]
     Endless {
         /// The node.
         from: u8,
         /// How often.
         times: u32,
     },
+    /// It took too long altogether.
+    #[error("it was not complete within {after_ms} ms")]
+    TooSlow {
+        /// How long we tried.
+        after_ms: u64,
+    },
+    /// It was ended from outside; the other side of a message of many frames was told.
+    #[error("ended before it was complete")]
+    Cancelled,
 }
 
 const fn acknowledgement(control: u8) -> &'static str {

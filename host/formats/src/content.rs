@@ -34,6 +34,9 @@ pub(crate) fn looks_like(head: &[u8], read_as: Format) -> String {
     }
     let line = text.split(|byte| matches!(byte, b'\n' | b'\r')).next().unwrap_or_default();
     if line.iter().any(|byte| *byte < b' ' && *byte != b'\t') {
+        if Format::of_content(head).is_some() {
+            return format!("a file of the format {read_as} that is damaged or has nothing usual in it");
+        }
         let bytes: Vec<_> = head.iter().take(8).map(|byte| format!("{byte:02X}")).collect();
         return format!("binary data that begins with {}", bytes.join(" "));
     }
@@ -59,6 +62,8 @@ mod tests {
         ] {
             assert_eq!(looks_like(head, Format::Asc), words);
         }
+        let words = "a file of the format blf that is damaged or has nothing usual in it";
+        assert_eq!(looks_like(b"LOGG\x90\0\0\0", Format::Blf), words);
         assert_eq!(looks_like(b"date nonsense", Format::Asc), "text that begins with 'date nonsense'");
     }
 }

@@ -14,9 +14,10 @@ pub fn build(shell: &Shell) -> Result<()> {
     Ok(cargo_test(shell)?.arg("--no-run").run()?)
 }
 
-/// Runs them; those on the emulated board use the default board's firmware. If there are peers, none may be skipped.
+/// Runs them all, even if one fails; those on the emulated board use the default board's firmware. If there are peers, none may be
+/// skipped.
 pub fn run(shell: &Shell, peers: Option<&Peers>) -> Result<()> {
-    let mut test = cargo_test(shell)?;
+    let mut test = cargo_test(shell)?.arg("--no-fail-fast");
     if let Some(peers) = peers {
         test = test.env("CANTAP_PYTHON", &peers.python).env("CANTAP_REQUIRE_PEERS", "1");
     }

@@ -29,9 +29,8 @@ use crate::protocols::{ProtocolArgs, Reading};
     cantap conversations plant.log --eds 5:drive.eds --eds 6:io.dcf\n  \
     cantap conversations workshop.log --pair 6F1/12:612/F1\n  \
     cantap conversations -d /dev/ttyACM0 -b 500k\n\n\
-Without --protocol, each channel is read by the protocols that its first frames show, and by those of\n\
-diagnostics as soon as an exchange shows; they are named on standard error. A line is: time, interface,\n\
-protocol, sender > receiver, what was said, and for a response how long it took. Where frames were lost, what\n\
+Without --protocol, each channel is read by the protocols that its first frames show, and by others as\n\
+soon as they show; they are named on standard error. A line is: time, interface, protocol, sender > receiver, what was said, and for a response how long it took. Where frames were lost, what\n\
 was under way says so. With --json each line is an object:\n\
 {\"time_s\", \"start_s\", \"channel\", \"protocol\", \"kind\", \"from\", \"to\", \"title\", \"fields\", …}, see docs/protocols.md. The last line is {\"summary\"}.")]
 pub struct Args {

@@ -4,10 +4,10 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use cantap::TraceRecord;
-use cantap_protocols::{Conversations, Event, Options, UnderWay};
+use cantap_protocols::{Begun, Conversations, Event, Options, UnderWay, Watch};
 use cantap_signals::Decoder;
 
-use super::later::{self, Later};
+use super::later;
 use super::surveyed::{self, Surveyed};
 
 /// Reads records by the requested protocols, or by those found in the first records of each channel.
@@ -15,7 +15,7 @@ pub struct Reading {
     options: Options,
     surveyed: Surveyed,
     conversations: Option<Conversations>,
-    silent: Option<Later>,
+    watch: Option<Watch>,
     events: Vec<Event>,
     quiet: bool,
     /// Channels of which it was said that they have diagnostics.
@@ -31,7 +31,7 @@ impl Reading {
             options,
             surveyed,
             conversations: None,
-            silent: None,
+            watch: None,
             events: Vec::new(),
             quiet,
             told: BTreeSet::new(),
@@ -63,7 +63,7 @@ impl Reading {
         more: bool,
         mut read: impl FnMut(Read<'_>) -> Result<(), E>,
     ) -> Result<(), E> {
-        let Self { options, surveyed, conversations, silent, events, quiet, told } = self;
+        let Self { options, surveyed, conversations, watch, events, quiet, told } = self;
         let waited;
         let mut records = records;
         if conversations.is_none() {
@@ -76,7 +76,7 @@ impl Reading {
             }
             let diagnostics = found.iter().flatten().filter(|found| later::is_diagnostics(found.protocol));
             told.extend(diagnostics.map(|found| found.channel));
-            *silent = surveyed.survey().map(Later::new);
+            *watch = surveyed.survey().map(Watch::new);
             options.spoken = found;
             waited = surveyed.release();
             records = &waited;
@@ -84,9 +84,8 @@ impl Reading {
         let conversations = conversations.get_or_insert_with(|| Conversations::new(options));
         for record in records {
             read(Read::Record(record))?;
-            for evidence in silent.as_mut().map_or_else(Vec::new, |silent| silent.take(record, *quiet)) {
-                conversations.also(options, &evidence);
-            }
+            let begun = watch.as_mut().map_or_else(Vec::new, |watch| watch.take(record));
+            begin(conversations, options, &begun, *quiet, events);
             conversations.take(record, events);
             if !*quiet && options.spoken.is_some() {
                 later::tell_diagnostics(events, told);
@@ -95,10 +94,28 @@ impl Reading {
             events.drain(..).try_for_each(|event| read(Read::Event(event)))?;
         }
         if !more {
+            let begun = watch.as_mut().map_or_else(Vec::new, Watch::finish);
+            begin(conversations, options, &begun, *quiet, events);
             conversations.finish(events);
             events.drain(..).try_for_each(|event| read(Read::Event(event)))?;
         }
         Ok(())
+    }
+}
+
+/// Reads by these as well, and says so.
+fn begin(
+    conversations: &mut Conversations,
+    options: &Options,
+    begun: &[Begun],
+    quiet: bool,
+    events: &mut Vec<Event>,
+) {
+    for begun in begun {
+        if !quiet {
+            later::tell_begun(begun);
+        }
+        conversations.also(options, begun, events);
     }
 }
 

@@ -7,7 +7,7 @@ use cantap_protocols::{Evidence, Relative, Survey};
 /// A survey examines no more records than this.
 const MOST_RECORDS: usize = 200_000;
 /// Nor more than this time of the bus, in nanoseconds.
-pub(super) const LONGEST_NS: i64 = 3_000_000_000;
+const LONGEST_NS: i64 = 3_000_000_000;
 
 /// Records waiting for the survey.
 pub(super) struct Surveyed {

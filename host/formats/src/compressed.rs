@@ -179,6 +179,14 @@ mod tests {
     use super::*;
     use std::io::Read;
 
+    const WRITTEN: &[Compression] = &[
+        Compression::Gzip,
+        #[cfg(feature = "zstd")]
+        Compression::Zstd,
+        Compression::Lz4,
+        Compression::Xz,
+    ];
+
     /// Text like that of a log, with no two lines equal.
     fn text() -> Vec<u8> {
         let line = |at: u32| {
@@ -197,13 +205,7 @@ mod tests {
     fn damage_to_a_compressed_file_is_noticed() {
         let directory = tempfile::tempdir().unwrap();
         let text = &text()[..50_000];
-        for compression in [
-            Compression::Gzip,
-            #[cfg(feature = "zstd")]
-            Compression::Zstd,
-            Compression::Lz4,
-            Compression::Xz,
-        ] {
+        for &compression in WRITTEN {
             let path = directory.path().join("a");
             let mut compressed = Compressed::new(File::create(&path).unwrap(), compression).unwrap();
             compressed.write(text).unwrap();
@@ -261,13 +263,7 @@ mod tests {
             (frames, issues)
         };
         let (whole, _) = frames(text);
-        for compression in [
-            Compression::Gzip,
-            #[cfg(feature = "zstd")]
-            Compression::Zstd,
-            Compression::Lz4,
-            Compression::Xz,
-        ] {
+        for &compression in WRITTEN {
             let path = directory.path().join("a");
             let mut compressed = Compressed::new(File::create(&path).unwrap(), compression).unwrap();
             // As when something is captured: in several streams.

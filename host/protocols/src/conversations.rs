@@ -11,9 +11,10 @@ use crate::canopen::{CanOpen, Sheet};
 use crate::devicenet::DeviceNet;
 use crate::diagnostics::Diagnostics;
 use crate::iso_tp::{IsoTp, Pair};
-use crate::j1939::J1939;
+use crate::j1939::{Groups, J1939};
+use crate::signs::FAMILY;
 use crate::survey::DiagnosticsSigns;
-use crate::{Assembler, Event, Evidence, Protocol, UnderWay};
+use crate::{Assembler, Begun, Event, Evidence, Protocol, UnderWay};
 
 /// What to decode.
 #[derive(Clone, Debug, Default)]
@@ -35,7 +36,9 @@ pub struct Options {
 /// Takes records and returns the events of all protocols, in the order of completion.
 pub struct Conversations {
     /// Those that a channel needs, or has needed.
-    readers: [Option<Box<dyn Assembler + Send + Sync>>; 6],
+    readers: [Option<Box<dyn Assembler + Send + Sync>>; 3],
+    /// J1939 and NMEA 2000: a channel may have one of them, and the other later.
+    family: Option<Box<J1939>>,
     /// The protocols of each channel.
     spoken: Box<[u16; 256]>,
     /// Which of the readers decode each channel, one bit each.
@@ -57,30 +60,28 @@ const MOST_HELD: usize = 64;
 
 const DIAGNOSTICS: u16 =
     Protocol::IsoTp.bit() | Protocol::Uds.bit() | Protocol::Kwp2000.bit() | Protocol::Obd.bit();
-/// Both use the same frames: a single decoder distinguishes them by their groups.
-const VEHICLE_AND_BOAT: u16 = Protocol::J1939.bit() | Protocol::Nmea2000.bit();
-
 /// The readers' bits.
 const OF_DIAGNOSTICS: u8 = 1;
-const OF_VEHICLE: u8 = 2;
-const OF_BOAT: u8 = 4;
-const OF_BOTH: u8 = 8;
-const OF_CANOPEN: u8 = 16;
-const OF_DEVICENET: u8 = 32;
+const OF_CANOPEN: u8 = 2;
+const OF_DEVICENET: u8 = 4;
+const OF_FAMILY: u8 = 8;
 
 /// The readers that a channel with these protocols needs.
 fn readers_of(spoken: u16) -> u8 {
     let has = |protocols: u16, reader: u8| if spoken & protocols == 0 { 0 } else { reader };
-    let family = match spoken & VEHICLE_AND_BOAT {
-        0 => 0,
-        VEHICLE_AND_BOAT => OF_BOTH,
-        family if family == Protocol::J1939.bit() => OF_VEHICLE,
-        _ => OF_BOAT,
-    };
     has(DIAGNOSTICS, OF_DIAGNOSTICS)
-        | family
+        | has(FAMILY, OF_FAMILY)
         | has(Protocol::CanOpen.bit(), OF_CANOPEN)
         | has(Protocol::DeviceNet.bit(), OF_DEVICENET)
+}
+
+/// Whose groups a channel with these protocols has.
+const fn groups_of(spoken: u16) -> Groups {
+    match spoken & FAMILY {
+        FAMILY => Groups::Both,
+        family if family == Protocol::Nmea2000.bit() => Groups::Boat,
+        _ => Groups::Vehicle,
+    }
 }
 
 impl Conversations {
@@ -105,6 +106,7 @@ impl Conversations {
         }
         let mut this = Self {
             readers: Default::default(),
+            family: None,
             spoken: Box::new(spoken),
             of_channel: Box::new([0; 256]),
             wanted,
@@ -114,17 +116,27 @@ impl Conversations {
         this
     }
 
-    /// From now on, decodes this as well.
-    pub fn also(&mut self, options: &Options, evidence: &Evidence) {
-        self.spoken[usize::from(evidence.channel)] |= evidence.protocol.bit() & self.wanted;
+    /// From now on, decodes this as well, beginning with the records that showed it.
+    pub fn also(&mut self, options: &Options, begun: &Begun, events: &mut Vec<Event>) {
+        let Evidence { channel, protocol, .. } = begun.evidence;
+        let channel = usize::from(channel);
+        let before = self.of_channel[channel];
+        self.spoken[channel] |= protocol.bit() & self.wanted;
         self.assign(options);
+        let readers = self.of_channel[channel] & !before;
+        begun.held.iter().for_each(|record| self.read(record, readers, events));
     }
 
     /// Gives each channel the decoders that it needs.
     fn assign(&mut self, options: &Options) {
         *self.of_channel = self.spoken.map(readers_of);
         let needed = self.of_channel.iter().fold(0, |all, readers| all | readers);
-        let decoder = || options.decoder.clone();
+        if needed & OF_FAMILY != 0 {
+            let family = self.family.get_or_insert_with(|| Box::new(J1939::new(options.decoder.clone())));
+            for (channel, spoken) in (0..=u8::MAX).zip(self.spoken.iter()) {
+                family.assign(channel, groups_of(*spoken));
+            }
+        }
         for (number, reader) in self.readers.iter_mut().enumerate() {
             if needed & 1 << number == 0 || reader.is_some() {
                 continue;
@@ -134,9 +146,6 @@ impl Conversations {
                     Box::new(IsoTp::new(&options.pairs, true))
                 }
                 OF_DIAGNOSTICS => Box::new(Diagnostics::new(&options.pairs, true)),
-                OF_VEHICLE => Box::new(J1939::new(decoder())),
-                OF_BOAT => Box::new(J1939::nmea2000(decoder())),
-                OF_BOTH => Box::new(J1939::with_nmea2000(decoder())),
                 OF_CANOPEN => Box::new(CanOpen::new(options.sheets.clone())),
                 _ => Box::new(DeviceNet::new()),
             });
@@ -145,17 +154,27 @@ impl Conversations {
 
     /// Takes the next record and appends what it completes.
     pub fn take(&mut self, record: &TraceRecord, events: &mut Vec<Event>) {
-        let mut readers = self.of_channel[usize::from(record.channel)];
+        let readers = self.of_channel[usize::from(record.channel)];
         let before = events.len();
+        self.read(record, readers, events);
+        if events.len() > before {
+            self.keep_wanted(before, events);
+            self.hold_back(before, events);
+        }
+    }
+
+    fn read(&mut self, record: &TraceRecord, readers: u8, events: &mut Vec<Event>) {
+        if readers & OF_FAMILY != 0
+            && let Some(family) = &mut self.family
+        {
+            family.take(record, events);
+        }
+        let mut readers = readers & !OF_FAMILY;
         while readers != 0 {
             if let Some(reader) = &mut self.readers[readers.trailing_zeros() as usize] {
                 reader.take(record, events);
             }
             readers &= readers - 1;
-        }
-        if events.len() > before {
-            self.keep_wanted(before, events);
-            self.hold_back(before, events);
         }
     }
 
@@ -165,6 +184,9 @@ impl Conversations {
         for reader in self.readers.iter_mut().flatten() {
             reader.finish(events);
         }
+        if let Some(family) = &mut self.family {
+            family.finish(events);
+        }
         self.keep_wanted(before, events);
         self.hold_back(before, events);
     }
@@ -173,6 +195,7 @@ impl Conversations {
     pub fn under_way(&self) -> Vec<UnderWay> {
         let mut under_way = Vec::new();
         self.readers.iter().flatten().for_each(|reader| reader.under_way(&mut under_way));
+        self.family.iter().for_each(|family| family.under_way(&mut under_way));
         under_way.retain(|transfer| {
             transfer.protocol.bit() & DIAGNOSTICS == 0 || !self.doubts.contains_key(&transfer.channel)
         });

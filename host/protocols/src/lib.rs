@@ -1,7 +1,7 @@
 #![doc = include_str!("../README.md")]
 //!
 //! An [`Assembler`] takes records and returns [`Event`]s. [`Conversations`] runs the assemblers of several protocols; a [`Survey`]
-//! finds out which of them are used on a bus.
+//! finds out which of them are used on a bus, and a [`Watch`] which begin later.
 
 #![forbid(unsafe_code)]
 
@@ -20,10 +20,12 @@ pub mod nmea2000;
 mod overview;
 mod protocol;
 mod relatives;
+mod signs;
 mod survey;
 #[cfg(test)]
 mod testing;
 mod text;
+mod watch;
 
 pub use assembler::{Assembler, UnderWay, is_gap};
 pub use condition::condition;
@@ -33,3 +35,4 @@ pub use overview::{Histogram, KnownNode, KnownObject, Overview, ServiceFigures};
 pub use protocol::{Protocol, UnknownProtocol};
 pub use relatives::Relative;
 pub use survey::{Evidence, Survey};
+pub use watch::{Begun, Watch};

@@ -5,29 +5,21 @@ use std::collections::BTreeMap;
 use cantap_trace::TraceRecord;
 use rustc_hash::FxHashMap;
 
-use crate::canopen;
-use crate::devicenet;
 use crate::diagnostics::Diagnostics;
-use crate::j1939::{self, Header};
-use crate::nmea2000;
 use crate::relatives::{Relative, Relatives};
+use crate::signs::Signs;
 use crate::{Assembler, Event, Protocol, UnderWay};
 
 /// Bytes of a message under way that show ISO 15765-2 even if it is not complete: three frames.
 const CONVINCING_BYTES: u32 = 20;
 
-/// Examines the first records of a trace or a bus. The default one does not look for ISO 15765-2 and the protocols on top of it, which
-/// [`crate::Conversations`] finds by itself.
+/// Examines the first records of a trace or a bus.
 #[derive(Clone, Debug, Default)]
 pub struct Survey {
     diagnostics: Option<Diagnostics>,
     events: Vec<Event>,
     diagnostics_signs: FxHashMap<u8, DiagnosticsSigns>,
-    /// Numbers of extended frames: those of NMEA 2000's groups, those of J1939's, and all.
-    extended: FxHashMap<u8, [u32; 3]>,
-    canopen: FxHashMap<u8, canopen::CanOpenSigns>,
-    devicenet: FxHashMap<u8, devicenet::DeviceNetSigns>,
-    relatives: FxHashMap<u8, Relatives>,
+    channels: FxHashMap<u8, (Signs, Relatives)>,
 }
 
 /// What on a channel looks like ISO 15765-2 and the protocols on top of it.
@@ -89,17 +81,9 @@ impl Survey {
             diagnostics.take(record, &mut self.events);
         }
         if let Some(frame) = record.frame() {
-            self.canopen.entry(record.channel).or_default().take(frame);
-            self.devicenet.entry(record.channel).or_default().take(frame);
-            self.relatives.entry(record.channel).or_default().take(frame);
-        }
-        let header =
-            record.frame().filter(|frame| !frame.is_remote()).and_then(|frame| Header::of(frame.id()));
-        if let Some(header) = header {
-            let [marine, vehicle, all] = self.extended.entry(record.channel).or_default();
-            *all += 1;
-            *marine += u32::from(nmea2000::is_known(header.pgn));
-            *vehicle += u32::from(j1939::is_known(header.pgn));
+            let (signs, relatives) = self.channels.entry(record.channel).or_default();
+            signs.take(record, u16::MAX);
+            relatives.take(frame);
         }
         for event in self.events.drain(..) {
             self.diagnostics_signs.entry(event.channel).or_default().take(&event);
@@ -107,13 +91,13 @@ impl Survey {
     }
 
     /// Whether the channel has had a frame.
-    pub fn has_heard(&self, channel: u8) -> bool {
-        self.canopen.contains_key(&channel)
+    pub(crate) fn has_heard(&self, channel: u8) -> bool {
+        self.channels.contains_key(&channel)
     }
 
     /// Protocols that are recognised but not decoded, by channel.
     pub fn relatives(&self) -> Vec<(u8, Relative)> {
-        let found = self.relatives.iter().flat_map(|(channel, relatives)| {
+        let found = self.channels.iter().flat_map(|(channel, (_, relatives))| {
             relatives.found().into_iter().map(|relative| (*channel, relative))
         });
         let mut found: Vec<_> = found.collect();
@@ -142,29 +126,8 @@ impl Survey {
                 found.push(Evidence { channel, protocol, messages: 1 });
             }
         }
-        for (&channel, &[marine, vehicle, all]) in &self.extended {
-            // Other 29-bit traffic occasionally matches a known number.
-            let enough = |known: u32| known > 1 && known > all / 10;
-            let protocol = match (enough(marine), enough(vehicle)) {
-                (true, _) => Protocol::Nmea2000,
-                (_, true) => Protocol::J1939,
-                _ => continue,
-            };
-            found.push(Evidence { channel, protocol, messages: marine.max(vehicle) });
-        }
-        for (&channel, signs) in &self.canopen {
-            let messages = signs.count();
-            if messages > 0 {
-                found.push(Evidence { channel, protocol: Protocol::CanOpen, messages });
-            }
-        }
-        for (&channel, signs) in &self.devicenet {
-            let messages = signs.count();
-            // CANopen's SDO servers use identifiers that also occur in DeviceNet.
-            let is_canopen = self.canopen.get(&channel).is_some_and(|signs| signs.count() > 0);
-            if messages > 0 && !is_canopen {
-                found.push(Evidence { channel, protocol: Protocol::DeviceNet, messages });
-            }
+        for (&channel, (signs, _)) in &self.channels {
+            found.extend(signs.found(0).map(|(protocol, messages)| Evidence { channel, protocol, messages }));
         }
         found.sort_unstable();
         found

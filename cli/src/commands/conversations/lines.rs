@@ -1,7 +1,7 @@
 //! Events become lines in a thread of their own: making them takes as long as reading the frames that they are of.
 
 use std::io::{self, Write as _};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
 use std::thread::{self, JoinHandle};
 
 use cantap_protocols::Event;
@@ -9,7 +9,7 @@ use cantap_protocols::Event;
 use super::line;
 
 /// Events that go to the thread together.
-const BATCH: usize = 2048;
+const BATCH: usize = 256;
 /// Batches that may wait there. A reader of a pipe that is slow makes all else wait, and memory stays as it is.
 const MOST_WAITING: usize = 4;
 
@@ -18,6 +18,8 @@ type Writer = JoinHandle<io::Result<()>>;
 /// Writes events to standard output, in order.
 pub(super) struct Lines {
     batch: Vec<Event>,
+    /// Batches that were written. What events own goes back where it was taken: between threads, an allocator takes locks.
+    written: Receiver<Vec<Event>>,
     /// Taken when it ends.
     thread: Option<(SyncSender<Vec<Event>>, Writer)>,
 }
@@ -26,8 +28,10 @@ impl Lines {
     /// As text or as JSON. The error is that there is no thread to be had.
     pub fn new(json: bool) -> io::Result<Self> {
         let (sender, receiver) = sync_channel(MOST_WAITING);
-        let handle = thread::Builder::new().name("lines".to_owned()).spawn(move || run(&receiver, json))?;
-        Ok(Self { batch: Vec::with_capacity(BATCH), thread: Some((sender, handle)) })
+        let (done, written) = channel();
+        let thread = thread::Builder::new().name("lines".to_owned());
+        let handle = thread.spawn(move || run(&receiver, &done, json))?;
+        Ok(Self { batch: Vec::with_capacity(BATCH), written, thread: Some((sender, handle)) })
     }
 
     /// Writes one. The error may be that of an earlier one.
@@ -41,7 +45,9 @@ impl Lines {
         let Some((sender, _)) = self.thread.as_ref().filter(|_| !self.batch.is_empty()) else {
             return Ok(());
         };
-        let batch = std::mem::replace(&mut self.batch, Vec::with_capacity(BATCH));
+        let mut next = self.written.try_recv().unwrap_or_else(|_| Vec::with_capacity(BATCH));
+        next.clear();
+        let batch = std::mem::replace(&mut self.batch, next);
         // Nobody takes it any more where writing has failed: why, the thread says.
         sender.send(batch).or_else(|_| self.end())
     }
@@ -73,7 +79,7 @@ impl Drop for Lines {
 }
 
 /// The thread: each batch leaves as a whole.
-fn run(batches: &Receiver<Vec<Event>>, json: bool) -> io::Result<()> {
+fn run(batches: &Receiver<Vec<Event>>, done: &Sender<Vec<Event>>, json: bool) -> io::Result<()> {
     let mut out = io::stdout().lock();
     let mut text = String::new();
     for batch in batches {
@@ -83,6 +89,8 @@ fn run(batches: &Receiver<Vec<Event>>, json: bool) -> io::Result<()> {
         out.write_all(text.as_bytes())?;
         out.flush()?;
         text.clear();
+        // At the end nobody wants it.
+        let _ = done.send(batch);
     }
     Ok(())
 }

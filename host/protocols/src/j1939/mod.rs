@@ -50,13 +50,26 @@ struct Request {
     answered: bool,
 }
 
+/// Whose parameter groups a channel has.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) enum Groups {
+    /// J1939's.
+    #[default]
+    Vehicle,
+    /// NMEA 2000's.
+    Boat,
+    /// Both: groups defined only by NMEA 2000 belong to it, the rest to J1939.
+    Both,
+}
+
 /// Decodes a J1939 bus, or an NMEA 2000 bus, which is J1939 plus fast packets and its own parameter groups.
 #[derive(Default)]
 pub struct J1939 {
+    /// Those of all channels, unless each has its own.
+    groups: Groups,
+    of_channel: Vec<Groups>,
     /// The part for NMEA 2000.
-    marine: Option<FastPackets>,
-    /// Both are on this bus: groups defined only by NMEA 2000 belong to it, the rest to J1939.
-    tells_apart: bool,
+    marine: FastPackets,
     transport: LongMessages,
     requests: VecDeque<Request>,
     names: FxHashMap<(u8, u8), u64>,
@@ -72,25 +85,41 @@ impl J1939 {
 
     /// For NMEA 2000. A database's signals take precedence over built-in ones.
     pub fn nmea2000(decoder: Option<Arc<Decoder>>) -> Self {
-        Self { marine: Some(FastPackets::default()), ..Self::new(decoder) }
+        Self { groups: Groups::Boat, ..Self::new(decoder) }
     }
 
     /// For a bus that has both.
     pub fn with_nmea2000(decoder: Option<Arc<Decoder>>) -> Self {
-        Self { tells_apart: true, ..Self::nmea2000(decoder) }
+        Self { groups: Groups::Both, ..Self::new(decoder) }
     }
 
-    fn protocol(&self, pgn: u32) -> Protocol {
-        match &self.marine {
-            None => Protocol::J1939,
-            Some(_) if self.tells_apart && !nmea2000::is_own(pgn) => Protocol::J1939,
-            Some(_) => Protocol::Nmea2000,
+    /// From now on, the channel has these groups. What is under way goes on.
+    pub(crate) fn assign(&mut self, channel: u8, groups: Groups) {
+        if self.of_channel.is_empty() {
+            self.of_channel.resize(256, self.groups);
+        }
+        self.of_channel[usize::from(channel)] = groups;
+    }
+
+    fn groups(&self, channel: u8) -> Groups {
+        self.of_channel.get(usize::from(channel)).copied().unwrap_or(self.groups)
+    }
+
+    fn protocol(&self, channel: u8, pgn: u32) -> Protocol {
+        match self.groups(channel) {
+            Groups::Vehicle => Protocol::J1939,
+            Groups::Both if !nmea2000::is_own(pgn) => Protocol::J1939,
+            Groups::Both | Groups::Boat => Protocol::Nmea2000,
         }
     }
 
+    fn is_marine(&self, channel: u8) -> bool {
+        self.groups(channel) != Groups::Vehicle
+    }
+
     /// A group's name.
-    fn group(&self, pgn: u32) -> Option<&'static str> {
-        names::group(pgn).or_else(|| self.marine.as_ref().and_then(|_| nmea2000::name(pgn)))
+    fn group(&self, channel: u8, pgn: u32) -> Option<&'static str> {
+        names::group(pgn).or_else(|| self.is_marine(channel).then(|| nmea2000::name(pgn)).flatten())
     }
 
     fn frame(&mut self, record: &TraceRecord, header: Header, data: &[u8], events: &mut Vec<Event>) {
@@ -113,11 +142,10 @@ impl J1939 {
                 }
             }
             _ => {
-                match &mut self.marine {
-                    Some(packets) if nmea2000::is_fast(header.pgn) => {
-                        packets.take(channel, time_ns, header, data, &mut out);
-                    }
-                    _ => self.message(record, header, data, None, events),
+                if self.is_marine(channel) && nmea2000::is_fast(header.pgn) {
+                    self.marine.take(channel, time_ns, header, data, &mut out);
+                } else {
+                    self.message(record, header, data, None, events);
                 }
                 Ok(())
             }
@@ -143,7 +171,7 @@ impl J1939 {
     fn event(&self, record: &TraceRecord, header: Header, kind: &'static str) -> Event {
         let title =
             names::group(header.pgn).map_or_else(|| format!("PGN {}", header.pgn).into(), Cow::Borrowed);
-        let mut event = Event::new(self.protocol(header.pgn), record, kind, title);
+        let mut event = Event::new(self.protocol(record.channel, header.pgn), record, kind, title);
         (event.from, event.to) = (party(header.source), party(header.destination));
         event.fields.reserve(4);
         event.fields.push(Field::number("pgn", header.pgn));
@@ -174,7 +202,7 @@ impl J1939 {
             }
             if long.trouble.is_some() {
                 event.kind = "broken";
-                if let Some(name) = self.group(header.pgn) {
+                if let Some(name) = self.group(record.channel, header.pgn) {
                     event.title = name.into();
                 }
                 event.fields.push(Field::number("received", data.len() as i64).unit("bytes"));
@@ -186,7 +214,7 @@ impl J1939 {
             (REQUEST, [a, b, c, ..]) => {
                 let pgn = header::pgn([*a, *b, *c]);
                 event.kind = "request";
-                event.fields.push(Field::number("requested", pgn).meaning(self.group(pgn)));
+                event.fields.push(Field::number("requested", pgn).meaning(self.group(record.channel, pgn)));
                 self.ask(record, header, pgn, events);
             }
             (ACKNOWLEDGEMENT, [control, function, _, _, address, a, b, c]) => {
@@ -196,7 +224,7 @@ impl J1939 {
                 let said = said.get(usize::from(*control)).copied();
                 event.fields.push(Field::number("control", *control).meaning(said));
                 event.fields.push(Field::number("group_function", *function));
-                event.fields.push(Field::number("requested", pgn).meaning(self.group(pgn)));
+                event.fields.push(Field::number("requested", pgn).meaning(self.group(record.channel, pgn)));
                 if *address < NULL {
                     event.fields.push(Field::number("of", *address));
                 }
@@ -225,7 +253,7 @@ impl J1939 {
             }
             (_, data) => {
                 if !self.signals(record.channel, header, data, &mut event)
-                    && !self.marine_fields(header, data, &mut event)
+                    && !self.marine_fields(record.channel, header, data, &mut event)
                 {
                     event.fields.push(Field::bytes("data", data));
                 }
@@ -256,8 +284,8 @@ impl J1939 {
     }
 
     /// Adds the fields from NMEA 2000; false if it does not have the group.
-    fn marine_fields(&self, header: Header, data: &[u8], event: &mut Event) -> bool {
-        if self.marine.is_none() {
+    fn marine_fields(&self, channel: u8, header: Header, data: &[u8], event: &mut Event) -> bool {
+        if !self.is_marine(channel) {
             return false;
         }
         let before = event.fields.len();
@@ -331,15 +359,17 @@ impl J1939 {
             return;
         }
         let header = Header { priority: 6, pgn: REQUEST, source: request.from, destination: request.to };
+        let record = &TraceRecord { channel: request.channel, ..*record };
         let mut event = self.event(record, header, "no_response");
         event.fields.pop();
-        event.channel = request.channel;
         event.start_ns = request.time_ns;
         if let Trouble::Timeout { .. } = trouble {
             event.time_ns = request.time_ns.saturating_add(ANSWER_NS);
         }
         event.data.clear();
-        event.fields.push(Field::number("requested", request.pgn).meaning(self.group(request.pgn)));
+        event
+            .fields
+            .push(Field::number("requested", request.pgn).meaning(self.group(request.channel, request.pgn)));
         event.fields.push(Field::text("response", "none"));
         event.trouble = Some(trouble);
         event.frames_lost = request.frames_lost;
@@ -347,9 +377,12 @@ impl J1939 {
     }
 }
 
-/// Whether J1939 defines the group and diagnostics over ISO 15765 do not use it.
-pub(crate) fn is_known(pgn: u32) -> bool {
-    !matches!(pgn, 0xDA00 | 0xDB00) && pgn < 0xFF00 && names::group(pgn).is_some()
+/// Whether a frame with this group and length indicates J1939: the group is J1939's, and diagnostics over ISO 15765 do not use it.
+pub(crate) fn is_known(pgn: u32, length: usize) -> bool {
+    // Frames are filled up to eight bytes; a request has three. The first two groups, which have the number 0 for a
+    // format, are what other makers' 29-bit identifiers look like, and never alone on a bus.
+    let fits = if pgn == REQUEST { length == 3 || length == 8 } else { length == 8 };
+    fits && !matches!(pgn, 0 | 0x100 | 0xDA00 | 0xDB00) && pgn < 0xFF00 && names::group(pgn).is_some()
 }
 
 fn u64_of(bytes: &[u8]) -> u64 {
@@ -368,18 +401,14 @@ impl Assembler for J1939 {
         }
         let mut messages = std::mem::take(&mut self.messages);
         self.transport.advance(record.time_ns, &mut |message| messages.push(message));
-        if let Some(packets) = &mut self.marine {
-            packets.advance(record.time_ns, &mut |message| messages.push(message));
-        }
+        self.marine.advance(record.time_ns, &mut |message| messages.push(message));
         for message in messages.drain(..) {
             self.assembled(record, message, events);
         }
         self.messages = messages;
         if is_gap(&record.event) {
             self.transport.interrupt(record.channel);
-            if let Some(packets) = &mut self.marine {
-                packets.interrupt(record.channel);
-            }
+            self.marine.interrupt(record.channel);
             for request in self.requests.iter_mut().filter(|request| request.channel == record.channel) {
                 request.frames_lost = true;
             }
@@ -392,9 +421,7 @@ impl Assembler for J1939 {
     fn finish(&mut self, events: &mut Vec<Event>) {
         let mut messages = Vec::new();
         self.transport.finish(&mut |message| messages.push(message));
-        if let Some(packets) = &mut self.marine {
-            packets.finish(&mut |message| messages.push(message));
-        }
+        self.marine.finish(&mut |message| messages.push(message));
         let record = TraceRecord { time_ns: 0, channel: 1, event: cantap_trace::TraceEvent::GAP };
         for message in messages {
             self.assembled(&record, message, events);
@@ -406,10 +433,10 @@ impl Assembler for J1939 {
     }
 
     fn under_way(&self, out: &mut Vec<UnderWay>) {
-        let messages = self.transport.open().chain(self.marine.iter().flat_map(FastPackets::open));
+        let messages = self.transport.open().chain(self.marine.open());
         out.extend(messages.map(|message| UnderWay {
             channel: message.channel,
-            protocol: self.protocol(message.header.pgn),
+            protocol: self.protocol(message.channel, message.header.pgn),
             from: party(message.header.source),
             to: party(message.header.destination),
             start_ns: message.start_ns,

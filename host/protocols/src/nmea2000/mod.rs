@@ -44,8 +44,13 @@ pub(crate) fn is_own(pgn: u32) -> bool {
     (0x1_F000..0x2_0000).contains(&pgn) || is_fast(pgn)
 }
 
+/// Whether the database has the group.
+pub(crate) fn has(pgn: u32) -> bool {
+    Database::get().groups(pgn).iter().any(|group| !group.fallback)
+}
+
 /// Whether only NMEA 2000 defines the group.
 pub(crate) fn is_known(pgn: u32) -> bool {
     // The second page, excluding proprietary groups.
-    (0x1_F000..0x1_FF00).contains(&pgn) && Database::get().groups(pgn).iter().any(|group| !group.fallback)
+    (0x1_F000..0x1_FF00).contains(&pgn) && has(pgn)
 }

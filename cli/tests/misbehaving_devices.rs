@@ -285,7 +285,6 @@ fn commands_that_speak_end_with_the_reason() {
         (Fault::Suspended, "this computer put the device to sleep"),
         (Fault::SessionLost, "session"),
         (Fault::Deaf, "has answered nothing for"),
-        (Fault::Vanishes, "vanished"),
     ] {
         let lines = [
             "canopen monitor",

@@ -25,7 +25,6 @@ __all__ = [
     "__version__",
     "decode_table",
     "list_boards",
-    "no_records",
     "search",
     "stats",
     "write",
@@ -401,7 +400,6 @@ def decode_table(
 def search(
     options: Options, condition: str | None, ids: list[str], data: list[str], max_count: int | None
 ) -> Table: ...
-def no_records() -> Table: ...
 def write(
     table: Any, path: str | os.PathLike[str], format: str | None, zone: str | None
 ) -> dict[str, int]: ...

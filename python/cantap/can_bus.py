@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import inspect
 import itertools
 import logging
 import math
 import os
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import can
@@ -30,8 +31,10 @@ LOG = logging.getLogger("can.bus")
 
 ALL_ERRORS = "#1FFFFFFF"
 EXTENDED = 0x8000_0000
-OF_OTHERS = {"fd", "data_bitrate", "interface", "ignore_config", "config_context"}
+OF_OTHERS = {"fd", "data_bitrate", "interface", "ignore_config", "config_context", "single_handle"}
 """Arguments that python-can's own programs pass to every interface."""
+HAS_AUTOSTART = "autostart" in inspect.signature(can.BusABC._send_periodic_internal).parameters
+"""Whether python-can can make a periodic task without starting it: since 4.5."""
 QUEUE_TIMEOUT = 10.0
 """How long a frame waits for room in the device's queue, in seconds, if no other time is given."""
 
@@ -42,6 +45,13 @@ class _Session:
     def __init__(self, address: str) -> None:
         self.device = Device(address, capacity=0)
         self.users: dict[int, int] = {}
+
+    def is_gone(self) -> bool:
+        """Whether the device was closed, or has vanished: then a new Bus object needs a new session, although others may still have this one."""
+        try:
+            return self.device.closed or not self.device.status
+        except DeviceError:
+            return True
 
 
 _sessions: dict[str, _Session] = {}
@@ -143,7 +153,7 @@ class CantapBus(can.BusABC):
         with _lock:
             session = _sessions.get(self._address)
             try:
-                if session is None or session.device.closed:
+                if session is None or session.is_gone():
                     session = _Session(self._address)
                 self._device = session.device
                 self._options["segments"] = self._segments(timing)
@@ -219,12 +229,14 @@ class CantapBus(can.BusABC):
             try:
                 message = waiting.popleft()
             except IndexError:
-                if not self._fetch(timeout):
-                    return None
-                continue
-            if not waiting:
-                self._records._used_up()
-            return message
+                pass
+            else:
+                if not waiting:
+                    self._records._used_up()
+                return message
+            # Not within `except`: an error would seem to have come of the empty queue.
+            if not self._fetch(timeout):
+                return None
 
     def _fetch(self, timeout: float | None) -> bool:
         """Makes messages of what the device has received; false if there is nothing within the time."""
@@ -284,10 +296,15 @@ class CantapBus(can.BusABC):
         msgs: can.Message | Sequence[can.Message],
         period: float,
         duration: float | None = None,
-        autostart: bool = True,
-        modifier_callback: Callable[[can.Message], None] | None = None,
+        *others: Any,
+        **named: Any,
     ) -> CyclicSendTaskABC:
         self._expect_open()
+        # Before python-can 4.5 there was only the callback; since then `autostart` is in front of it.
+        names = ("autostart", "modifier_callback") if HAS_AUTOSTART else ("modifier_callback",)
+        options = {**dict(zip(names, others)), **named}
+        autostart = options.get("autostart", True)
+        modifier_callback = options.get("modifier_callback")
         # python-can's thread would send without a pause.
         if not 0 < period < math.inf:
             raise ValueError(f"a period of {period} s is impossible")
@@ -297,7 +314,7 @@ class CantapBus(can.BusABC):
                 return DeviceCyclicTask(self, messages, period, duration, autostart)
             except (ValueError, DeviceError):
                 pass  # The device cannot do this, or has no room for it: use a Python thread.
-        return super()._send_periodic_internal(msgs, period, duration, autostart, modifier_callback)
+        return super()._send_periodic_internal(msgs, period, duration, *others, **named)
 
     # State
 

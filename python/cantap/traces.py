@@ -160,7 +160,7 @@ def decode(
         return Messages(dict(tables), events, report)
     if filter or channel != () or (start, end, format, zone) != (None,) * 4 or strict:
         raise ValueError("of a table only signals can be chosen; choose its rows before")
-    tables, events = _native.decode_table(_with_our_types(source), _database(db), words(signals, "signals"))
+    tables, events = _native.decode_table(_arrow(source), _database(db), words(signals, "signals"))
     return Messages(dict(tables), events, None)
 
 
@@ -227,46 +227,29 @@ def write(
 ) -> dict[str, int]:
     """Writes a table of records as a trace, in the format of the file's name or in `format`; `.parquet` works, too.
 
-    `table` comes from this package, or anything else that exports Arrow, with the columns of `read`. An older file with that name
-    stays unchanged until the new one is complete. Returns what the format could not carry, by kind; anything at all also causes
-    a `CantapWarning`.
+    `table` comes from this package, or anything else that exports Arrow, such as pandas and Polars. Of the columns of `read` only
+    `time`, `id` and `data` must be there; docs/python.md says what stands for the others, and which types are taken.
+
+    An older file with that name stays unchanged until the new one is complete. Returns what the file does not carry, by kind: also
+    columns that no trace has. Anything at all also causes a `CantapWarning`.
     """
-    left_out = _native.write(_with_our_types(table), path, format, zone)
+    left_out = _native.write(_arrow(table), path, format, zone)
     for what, count in left_out.items():
         warnings.warn(f"{path} does not carry {what} ({count})", CantapWarning, stacklevel=2)
     return left_out
 
 
-def _with_our_types(table: Any) -> Any:
-    """Other programs have their own types for texts and bytes; pyarrow, if it is installed, casts them."""
-    if isinstance(table, (Table, Scan)) or not hasattr(table, "__arrow_c_stream__"):
+def _arrow(table: Any) -> Any:
+    """The same, from versions of other programs that do not export Arrow themselves yet: pandas before 2.2, Polars before 1.3."""
+    if hasattr(table, "__arrow_c_stream__"):
         return table
-    try:
+    if hasattr(table, "to_arrow"):
+        return table.to_arrow()
+    if type(table).__module__.partition(".")[0] == "pandas" and hasattr(table, "columns"):
         import pyarrow as pa
-    except ImportError:
-        return table
-    theirs = pa.table(table)
-    columns = {}
-    try:
-        for field in pa.schema(_native.no_records()):
-            if field.name in theirs.column_names:
-                column = theirs[field.name]
-                if pa.types.is_dictionary(column.type):
-                    column = pa.chunked_array([_plain(chunk) for chunk in column.chunks], pa.string())
-                # Texts may stay as they are.
-                to = pa.string() if pa.types.is_dictionary(field.type) else field.type
-                columns[field.name] = column.cast(to)
-    except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
-        raise _native.FormatError(f"the table is not a trace: {error}") from error
-    return pa.table(columns)
 
-
-def _plain(chunk: Any) -> Any:
-    """The texts of a dictionary. Their type may be one from which pyarrow cannot take texts."""
-    import pyarrow as pa
-
-    texts = chunk.dictionary.cast(pa.string())
-    return texts.take(chunk.indices)
+        return pa.Table.from_pandas(table)
+    return table
 
 
 def _options(

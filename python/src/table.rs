@@ -124,7 +124,14 @@ impl Table {
 
     /// The same table for Polars.
     fn to_polars<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
-        slf.py().import("polars")?.call_method1("DataFrame", (slf,))
+        let polars = slf.py().import("polars")?;
+        match polars.call_method1("DataFrame", (slf,)) {
+            // Before 1.3 it takes pyarrow's tables only.
+            Err(error) if error.is_instance_of::<PyTypeError>(slf.py()) => {
+                polars.call_method1("from_arrow", (Self::to_pyarrow(slf)?,))
+            }
+            made => made,
+        }
     }
 
     fn __len__(&self) -> usize {

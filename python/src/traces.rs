@@ -9,7 +9,7 @@ use arrow_array::{ArrayRef, RecordBatch, RecordBatchReader, UInt64Array};
 use arrow_schema::{DataType, Field, Schema};
 use cantap_analysis::stats::{Options as StatOptions, Statistics};
 use cantap_columns::parquet::ParquetFile;
-use cantap_columns::{FrameColumns, MessageTables};
+use cantap_columns::{BATCH_ROWS, FrameColumns, MessageTables};
 use cantap_formats::{LeftOut, TraceWriter, WriteOptions, create_writer};
 use cantap_signals::condition::Condition;
 use cantap_signals::search::{DataPattern, IdPattern, Search};
@@ -151,12 +151,13 @@ pub fn decode_table(
     let decoder = db.get().selecting(&signals)?;
     let chosen = selection(&signals)?;
     let mut tables = MessageTables::new(Arc::clone(&decoder), chosen.is_some());
+    let mut rows = 0;
     for batch in batches_of(table)? {
-        py.detach(|| -> Result<(), Error> {
-            for record in records_of(batch)? {
-                tables.push(&record);
-            }
-            Ok(())
+        py.detach(|| {
+            each_record(batch, &mut rows, |record| {
+                tables.push(record);
+                Ok(())
+            })
         })?;
         py.check_signals()?;
     }
@@ -245,12 +246,6 @@ pub fn search(
     Ok(Table::new(schema, vec![batch], Some(Py::new(py, report)?)))
 }
 
-/// The columns of a table of records, without rows.
-#[pyfunction]
-pub fn no_records() -> Table {
-    Table::of_batch(FrameColumns::default().take())
-}
-
 /// Writes a table of records as a trace. An older file with its name stays unchanged until this one is
 /// complete.
 #[pyfunction]
@@ -262,10 +257,11 @@ pub fn write<'py>(
     zone: Option<String>,
 ) -> PyResult<Bound<'py, PyAny>> {
     let batches = batches_of(table)?;
+    let schema = batches.schema();
     // Check this before creating anything; a table without rows must also be one of records.
-    cantap_columns::records(&RecordBatch::new_empty(batches.schema())).map_err(Error::from)?;
+    cantap_columns::records(&RecordBatch::new_empty(Arc::clone(&schema))).map_err(Error::from)?;
     let is_parquet = path.extension().is_some_and(|suffix| suffix.eq_ignore_ascii_case("parquet"));
-    let left_out = py.detach(|| -> Result<_, Error> {
+    let (left_out, rows) = py.detach(|| -> Result<_, Error> {
         if is_parquet && format.is_none() {
             return write_parquet(batches, &path);
         }
@@ -276,34 +272,55 @@ pub fn write<'py>(
         };
         write_trace(batches, &path, options)
     })?;
-    let counts = serde_json::to_string(&by_kind(&left_out)).unwrap_or_default();
-    from_json(py, &counts)
-}
-
-fn records_of(
-    batch: Result<RecordBatch, arrow_schema::ArrowError>,
-) -> Result<Vec<cantap::TraceRecord>, Error> {
-    let batch = batch.map_err(|error| Error::Format(error.to_string()))?;
-    Ok(cantap_columns::records(&batch)?)
-}
-
-fn write_parquet(batches: Box<dyn RecordBatchReader + Send>, path: &Path) -> Result<LeftOut, Error> {
-    let mut file = ParquetFile::create(path, FrameColumns::default())?;
-    for batch in batches {
-        for record in records_of(batch)? {
-            file.table.push(&record);
+    let mut counts = serde_json::to_value(by_kind(&left_out)).unwrap_or_default();
+    for column in schema.fields().iter().map(|field| field.name()) {
+        if FrameColumns::schema().column_with_name(column).is_none() && !is_about_rows(column) {
+            counts[format!("the column '{column}'")] = rows.into();
         }
+    }
+    from_json(py, &counts.to_string())
+}
+
+/// Whether a column says where rows came from: that of `search`, and the index of pandas.
+fn is_about_rows(column: &str) -> bool {
+    column == "place" || column.starts_with("__index_level_")
+}
+
+/// Converts a batch back to records, a part at a time: other programs make batches of any size. `rows` counts those of all batches.
+fn each_record(
+    batch: Result<RecordBatch, arrow_schema::ArrowError>,
+    rows: &mut usize,
+    mut each: impl FnMut(&cantap::TraceRecord) -> Result<(), Error>,
+) -> Result<(), Error> {
+    let batch = batch.map_err(|error| Error::Format(error.to_string()))?;
+    for at in (0..batch.num_rows()).step_by(BATCH_ROWS) {
+        let part = batch.slice(at, BATCH_ROWS.min(batch.num_rows() - at));
+        let records = cantap_columns::records(&part).map_err(|error| error.after(*rows))?;
+        records.iter().try_for_each(&mut each)?;
+        *rows += records.len();
+    }
+    Ok(())
+}
+
+fn write_parquet(batches: Box<dyn RecordBatchReader + Send>, path: &Path) -> Result<(LeftOut, usize), Error> {
+    let mut file = ParquetFile::create(path, FrameColumns::default())?;
+    let mut rows = 0;
+    for batch in batches {
+        each_record(batch, &mut rows, |record| {
+            file.table.push(record);
+            Ok(())
+        })?;
         file.flush()?;
     }
     file.finish()?;
-    Ok(LeftOut::default())
+    Ok((LeftOut::default(), rows))
 }
 
 fn write_trace(
     batches: Box<dyn RecordBatchReader + Send>,
     path: &Path,
     mut options: WriteOptions,
-) -> Result<LeftOut, Error> {
+) -> Result<(LeftOut, usize), Error> {
     let failed = |error: io::Error| match error.kind() {
         // The name indicates no format, or one that can only be read.
         io::ErrorKind::InvalidInput | io::ErrorKind::Unsupported => Error::Format(error.to_string()),
@@ -318,10 +335,9 @@ fn write_trace(
     let temporary = if is_file { Temporary::beside(path).map_err(failed)? } else { None };
     let written = temporary.as_ref().map_or(path, |temporary| &temporary.0);
     let mut writer: Box<dyn TraceWriter> = create_writer(written, &options).map_err(failed)?;
+    let mut rows = 0;
     for batch in batches {
-        for record in records_of(batch)? {
-            writer.write(&record).map_err(failed)?;
-        }
+        each_record(batch, &mut rows, |record| writer.write(record).map_err(failed))?;
     }
     let left_out = writer.finish().map_err(failed)?;
     if let Some(temporary) = &temporary {
@@ -329,7 +345,7 @@ fn write_trace(
         let place = path.canonicalize().unwrap_or_else(|_| path.to_owned());
         fs::rename(&temporary.0, place).map_err(failed)?;
     }
-    Ok(left_out)
+    Ok((left_out, rows))
 }
 
 /// A file that is removed on drop if it still exists. Its suffix is that of the final file, which determines format and
@@ -356,7 +372,6 @@ impl Drop for Temporary {
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Reading>()?;
     module.add_function(wrap_pyfunction!(decode_table, module)?)?;
-    module.add_function(wrap_pyfunction!(no_records, module)?)?;
     module.add_function(wrap_pyfunction!(search, module)?)?;
     module.add_function(wrap_pyfunction!(stats, module)?)?;
     module.add_function(wrap_pyfunction!(write, module)?)

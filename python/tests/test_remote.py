@@ -1,9 +1,11 @@
 """Analysers on other computers: through a real ssh, and over TLS. The server is the command `cantap`, named by `CANTAP_COMMAND`."""
 
+import contextlib
 import os
 import pathlib
 import socket
 import subprocess
+import threading
 import time
 
 import pytest
@@ -36,6 +38,101 @@ def keys(tmp_path):
     folder = tmp_path / "keys"
     run(COMMAND, "serve", "keygen", folder, "--host", "127.0.0.1", "--client", "alice:send", "--client", "bob:listen")
     return folder
+
+
+def serving(*arguments):
+    """Starts a server; it and its address."""
+    command = [COMMAND, "serve", "-d", "virtual:load=50,wire=joined", "-b", "500k", "--allow", "send", *arguments]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True)
+    heard = []
+    for line in process.stderr:
+        heard.append(line)
+        words = [word.rstrip(".,;:") for word in line.split() if word.startswith(("tls://", "tcp://"))]
+        if words:
+            return process, words[0]
+    process.wait(timeout=30)
+    pytest.skip("the server tells no address: " + "".join(heard))
+
+
+def test_an_address_of_ipv6_is_one_like_any_other():
+    server, address = serving("--tcp", "[::1]:0")
+    try:
+        # With a zone as well: the loopback's number, as the system takes names for addresses of a link only.
+        for other in (address, address.replace("::1", "::1%1")):
+            with cantap.open(other, 500_000) as device:
+                assert len(device.batch(seconds=10, rows=100)) == 100
+        with pytest.raises(ValueError, match="brackets"):
+            cantap.open(address.replace("[", "").replace("]", ""))
+    finally:
+        server.kill()
+        server.communicate(timeout=30)
+
+
+def test_a_server_that_is_started_again_is_reached_again():
+    can = pytest.importorskip("can")
+    server, address = serving("--tcp", "127.0.0.1:0")
+    device = cantap.open(address, 500_000)
+    bus = can.Bus(interface="cantap", channel=f"{address}:1", bitrate=500_000)
+    assert bus.recv(10) is not None and device.read(10) is not None
+    server.kill()
+    server.communicate(timeout=30)
+    with pytest.raises(cantap.DeviceError, match="vanished"):
+        for _ in device:
+            pass
+    with pytest.raises(can.CanOperationError, match="vanished"):
+        while bus.recv(10):
+            pass
+    server, _ = serving("--tcp", address.removeprefix("tcp://"))
+    try:
+        # Although the old object is still there.
+        with can.Bus(interface="cantap", channel=f"{address}:1", bitrate=500_000) as other:
+            assert other.recv(10) is not None
+        bus.shutdown()
+        device.close()
+        with cantap.open(address, 500_000) as device:
+            assert device.read(10) is not None
+    finally:
+        server.kill()
+        server.communicate(timeout=30)
+
+
+def test_a_connection_that_is_cut_anywhere_is_an_error():
+    server, address = serving("--tcp", "127.0.0.1:0")
+    there = ("127.0.0.1", int(address.rpartition(":")[2]))
+
+    def pump(source, target, limit):
+        try:
+            while limit > 0 and (data := source.recv(min(limit, 4096))):
+                target.sendall(data)
+                limit -= len(data)
+        except OSError:
+            pass
+        for end in (source, target):
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+    try:
+        for limit in (0, 1, 10, 50, 200, 1000, 3000):
+            with socket.create_server(("127.0.0.1", 0)) as proxy:
+                def serve_once():
+                    client, _ = proxy.accept()
+                    with client, socket.create_connection(there) as upstream:
+                        up = threading.Thread(target=pump, args=(client, upstream, 2**40))
+                        up.start()
+                        pump(upstream, client, limit)
+                        up.join(timeout=30)
+
+                thread = threading.Thread(target=serve_once)
+                thread.start()
+                with pytest.raises(cantap.DeviceError):
+                    with cantap.open(f"tcp://127.0.0.1:{proxy.getsockname()[1]}", 500_000) as device:
+                        for _ in device:
+                            pass
+                thread.join(timeout=30)
+                assert not thread.is_alive()
+    finally:
+        server.kill()
+        server.communicate(timeout=30)
 
 
 @pytest.fixture

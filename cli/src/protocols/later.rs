@@ -3,7 +3,7 @@
 
 use std::collections::BTreeSet;
 
-use cantap_protocols::{Begun, Event, Evidence, Protocol};
+use cantap_protocols::{Begun, Event, Evidence};
 
 use crate::commands::decode::Seconds;
 
@@ -18,15 +18,10 @@ pub(super) fn tell_begun(begun: &Begun) {
     eprintln!("cantap: channel {channel} speaks {protocol} from {} on{before}", Seconds(*from_ns));
 }
 
-/// Whether it is found at any time, and not only in the first frames.
-pub(super) const fn is_diagnostics(protocol: Protocol) -> bool {
-    matches!(protocol, Protocol::IsoTp | Protocol::Uds | Protocol::Kwp2000 | Protocol::Obd)
-}
-
 /// Reports what was not in the first frames, once for each channel.
 pub(super) fn tell_diagnostics(events: &[Event], told: &mut BTreeSet<u8>) {
     for Event { channel, protocol, start_ns, .. } in events {
-        if is_diagnostics(*protocol) && told.insert(*channel) {
+        if protocol.is_diagnostics() && told.insert(*channel) {
             eprintln!("cantap: channel {channel} speaks {protocol} from {} on", Seconds(*start_ns));
         }
     }

@@ -74,7 +74,7 @@ impl Reading {
             if !*quiet {
                 surveyed::tell(found.as_deref(), &surveyed.relatives());
             }
-            let diagnostics = found.iter().flatten().filter(|found| later::is_diagnostics(found.protocol));
+            let diagnostics = found.iter().flatten().filter(|found| found.protocol.is_diagnostics());
             told.extend(diagnostics.map(|found| found.channel));
             *watch = surveyed.survey().map(Watch::new);
             options.spoken = found;

@@ -1,7 +1,9 @@
 #![doc = include_str!("../README.md")]
 #![forbid(unsafe_code)]
 
+mod bad;
 mod events;
+mod foreign;
 mod frames;
 mod messages;
 mod names;
@@ -13,9 +15,10 @@ mod tables;
 mod texts;
 mod wide;
 
+pub use bad::BadColumns;
 pub use frames::FrameColumns;
 pub use messages::MessageColumns;
-pub use records::{BadColumns, records};
+pub use records::records;
 pub use signals::SignalColumns;
 pub use tables::MessageTables;
 pub use wide::WideColumns;

@@ -5,46 +5,43 @@ use arrow_array::types::{
     ArrowPrimitiveType, Int8Type, Int16Type, Int32Type, TimestampNanosecondType, UInt8Type, UInt32Type,
 };
 use arrow_array::{Array, BinaryArray, BooleanArray, PrimitiveArray, RecordBatch, StringArray};
-use arrow_schema::{ArrowError, DataType};
+use arrow_schema::DataType;
 use cantap_trace::names::{BUS_ERRORS, ERROR_STATES, LOSS_STAGES, OVERTAKEN, TRANSMIT_FAILURES, item};
 use cantap_trace::{Direction, FdFrame, Frame, Id, TraceEvent, TraceFrame, TraceRecord};
 use cantap_wire::record::TransmitFailure;
 
+use crate::bad::BadColumns;
 use crate::events::{BUS_ERROR, LOST, STATE, SUPPRESSED, TRANSMIT_FAILED};
+use crate::foreign::with_our_columns;
 use crate::frames::{FRAME, RX, TX};
+use crate::signals::VALUE;
 
-/// Why columns are not a trace.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum BadColumns {
-    /// A column is missing or has another type.
-    #[error("a trace has a column '{column}' of type {wanted}; {found}")]
-    Column {
-        /// Its name.
-        column: &'static str,
-        /// The required type.
-        wanted: &'static str,
-        /// What was found instead.
-        found: String,
-    },
-    /// A row contains something that a trace cannot hold.
-    #[error("row {row} is not {what}")]
-    Row {
-        /// The row's index in its batch, from 0.
-        row: usize,
-        /// What was expected.
-        what: &'static str,
-    },
-    /// The file cannot be read.
-    #[error(transparent)]
-    Arrow(#[from] ArrowError),
-}
-
-/// The records of a batch that has the columns of [`crate::FrameColumns`], in any order and possibly among others.
-/// Texts may be dictionaries or plain.
+/// The records of a batch that has the columns of [`crate::FrameColumns`], in any order and possibly among others, or columns that other
+/// programs made.
+///
+/// `time`, `id` and `data` must be there, the last two only if there is no `event`. Other columns may be missing:
+///
+/// | without, or null | is |
+/// |---|---|
+/// | `channel` | 1; it must not be null |
+/// | `event` | `frame`; it must not be null |
+/// | `extended` | whether `id` is above 7FF |
+/// | `fd` | whether there are more than 8 bytes |
+/// | `remote`, `brs`, `esi`, `late`, `at_least` | false |
+/// | `direction` | `rx` |
+/// | `dlc` | what belongs to the length of `data`; 0 for a remote frame |
+///
+/// Numbers may have any width, and be floating-point if they are whole. `time` may be a timestamp of any unit, a duration, or float64
+/// seconds; without a zone it is UTC. `data` may be binary, a list of numbers, or text with pairs of hexadecimal digits. `id` may be
+/// text that begins with `0x`. Texts may be dictionaries.
+///
+/// # Errors
+/// What cannot be taken without a guess or a loss.
 pub fn records(batch: &RecordBatch) -> Result<Vec<TraceRecord>, BadColumns> {
-    let columns = Columns::of(batch)?;
-    (0..batch.num_rows()).map(|row| columns.record(row)).collect()
+    let batch = with_our_columns(batch)?;
+    let columns = Columns::of(&batch)?;
+    let record = |row| columns.record(row).map_err(|what| BadColumns::Row { row, what: what.to_owned() });
+    (0..batch.num_rows()).map(record).collect()
 }
 
 struct Columns<'a> {
@@ -113,10 +110,18 @@ impl<'a> Columns<'a> {
             cast: impl FnOnce(&'a dyn Array) -> Option<T>,
         ) -> Result<T, BadColumns> {
             let Some(array) = batch.column_by_name(column) else {
-                return Err(BadColumns::Column { column, wanted, found: "there is none".to_owned() });
+                return Err(BadColumns::Column {
+                    column: column.to_owned(),
+                    wanted,
+                    found: "there is none".to_owned(),
+                });
             };
             let found = || format!("this one is {}", array.data_type());
-            cast(array.as_ref()).ok_or_else(|| BadColumns::Column { column, wanted, found: found() })
+            cast(array.as_ref()).ok_or_else(|| BadColumns::Column {
+                column: column.to_owned(),
+                wanted,
+                found: found(),
+            })
         }
         let time = |array: &'a dyn Array| array.as_primitive_opt();
         let u8 = |array: &'a dyn Array| array.as_primitive_opt();
@@ -146,30 +151,37 @@ impl<'a> Columns<'a> {
         })
     }
 
-    fn record(&self, row: usize) -> Result<TraceRecord, BadColumns> {
-        let bad = |what| BadColumns::Row { row, what };
+    fn record(&self, row: usize) -> Result<TraceRecord, &'static str> {
         if self.time.is_null(row) || self.channel.is_null(row) {
-            return Err(bad("a valid record: it has no time or no channel"));
+            return Err("it has no time or no channel");
         }
-        let event = self.event.at(row).ok_or(bad("a valid record: it does not say what happened"))?;
+        if self.channel.value(row) == 0 {
+            return Err("there is no channel 0; they count from 1");
+        }
+        let event = self.event.at(row).ok_or("its event is missing")?;
         let detail = self.detail.at(row);
         let count = self.count.is_valid(row).then(|| self.count.value(row));
         let event = match event {
-            FRAME => self.frame(row).ok_or(bad("a valid frame"))?,
+            FRAME => self.frame(row)?,
             LOST => {
-                let stage =
-                    detail.map(|detail| item(&LOSS_STAGES, detail).ok_or(bad("a known place of a loss")));
+                let stage = detail.map(|detail| {
+                    item(&LOSS_STAGES, detail).ok_or("its detail is not a known place of a loss")
+                });
                 let at_least = self.at_least.is_valid(row) && self.at_least.value(row);
                 TraceEvent::Lost { stage: stage.transpose()?, count: count.unwrap_or(0), at_least }
             }
             BUS_ERROR => {
-                let kind = detail.map(|detail| item(&BUS_ERRORS, detail).ok_or(bad("a known bus error")));
+                let kind = detail
+                    .map(|detail| item(&BUS_ERRORS, detail).ok_or("its detail is not a known bus error"));
                 TraceEvent::BusError { kind: kind.transpose()?, counters: self.counters(row) }
             }
             SUPPRESSED => TraceEvent::ErrorsSuppressed { count: count.unwrap_or(0) },
             STATE => {
                 let state = detail.and_then(|detail| item(&ERROR_STATES, detail));
-                TraceEvent::State { state: state.ok_or(bad("a known state"))?, counters: self.counters(row) }
+                TraceEvent::State {
+                    state: state.ok_or("its detail is not a known state")?,
+                    counters: self.counters(row),
+                }
             }
             TRANSMIT_FAILED => {
                 let tag = if self.tag.is_valid(row) { self.tag.value(row) } else { 0 };
@@ -177,9 +189,10 @@ impl<'a> Columns<'a> {
                     Some(OVERTAKEN) => Some(TransmitFailure::Overtaken { periods: count.unwrap_or(1) }),
                     detail => detail.and_then(|detail| item(&TRANSMIT_FAILURES, detail)),
                 };
-                TraceEvent::TransmitFailed { tag, reason: reason.ok_or(bad("a known failure"))? }
+                TraceEvent::TransmitFailed { tag, reason: reason.ok_or("its detail is not a known failure")? }
             }
-            _ => return Err(bad("a known kind of record")),
+            VALUE => return Err("it is a decoded value; records are what `read` gives without a database"),
+            _ => return Err("its event is not of a known kind"),
         };
         Ok(TraceRecord { time_ns: self.time.value(row), channel: self.channel.value(row), event })
     }
@@ -189,31 +202,57 @@ impl<'a> Columns<'a> {
         known.then(|| (self.tx_errors.value(row), self.rx_errors.value(row)))
     }
 
-    fn frame(&self, row: usize) -> Option<TraceEvent> {
-        let is = |flag: &BooleanArray| flag.is_valid(row) && flag.value(row);
+    fn frame(&self, row: usize) -> Result<TraceEvent, &'static str> {
+        let flag = |flag: &BooleanArray| flag.is_valid(row).then(|| flag.value(row));
+        let is = |column: &BooleanArray| flag(column).unwrap_or(false);
         if self.id.is_null(row) {
-            return None;
+            return Err("the frame has no identifier");
         }
         let raw = self.id.value(row);
-        let id = if is(self.extended) { Id::extended(raw) } else { Id::standard(raw) }?;
-        let bytes = if self.data.is_valid(row) { self.data.value(row) } else { &[] };
-        let frame: TraceFrame = if is(self.fd) {
-            FdFrame::new(id, is(self.brs), is(self.esi), bytes)?.into()
+        let id = if flag(self.extended).unwrap_or(raw > MAX_STANDARD) {
+            Id::extended(raw).ok_or("the identifier has more than 29 bits")?
+        } else {
+            Id::standard(raw).ok_or("a standard identifier is at most 7FF")?
+        };
+        let remote = is(self.remote);
+        let dlc = self.dlc.is_valid(row).then(|| self.dlc.value(row));
+        let bytes = self.data.is_valid(row).then(|| self.data.value(row));
+        if bytes.is_none() && !remote && dlc != Some(0) {
+            return Err("the frame has no data; give it, even if there are no bytes");
+        }
+        let bytes = bytes.unwrap_or_default();
+        let frame: TraceFrame = if flag(self.fd).unwrap_or(bytes.len() > 8) {
+            if remote {
+                return Err("CAN FD has no remote frames");
+            }
+            FdFrame::new(id, is(self.brs), is(self.esi), bytes)
+                .ok_or("CAN FD has frames of 0 to 8, 12, 16, 20, 24, 32, 48 and 64 bytes")?
+                .into()
         } else {
             let mut data = [0; 8];
-            data.get_mut(..bytes.len())?.copy_from_slice(bytes);
-            let remote = is(self.remote);
-            let dlc = if self.dlc.is_valid(row) { self.dlc.value(row) } else { bytes.len() as u8 };
-            if dlc > 15 || !remote && usize::from(dlc.min(8)) != bytes.len() {
-                return None;
+            let whole = data.get_mut(..bytes.len()).ok_or("a frame other than CAN FD has at most 8 bytes")?;
+            whole.copy_from_slice(bytes);
+            if remote && !bytes.is_empty() {
+                return Err("a remote frame has no data");
+            }
+            let dlc = dlc.unwrap_or(bytes.len() as u8);
+            if dlc > 15 {
+                return Err("a length code is at most 15");
             }
             Frame::from_bus(id, remote, dlc, data).into()
         };
+        if frame.data().len() != bytes.len() || dlc.is_some_and(|dlc| dlc != frame.dlc()) {
+            return Err("dlc does not fit the data; it is the code on the bus, such as 9 for 12 bytes");
+        }
         let direction = match self.direction.at(row) {
-            Some(TX) => Direction::Tx,
-            Some(RX) | None => Direction::Rx,
-            Some(_) => return None,
+            None => Direction::Rx,
+            Some(text) if text.eq_ignore_ascii_case(RX) => Direction::Rx,
+            Some(text) if text.eq_ignore_ascii_case(TX) => Direction::Tx,
+            Some(_) => return Err("a direction is rx or tx"),
         };
-        Some(TraceEvent::Frame { frame, direction, late: is(self.late) })
+        Ok(TraceEvent::Frame { frame, direction, late: is(self.late) })
     }
 }
+
+/// The largest identifier of 11 bits.
+const MAX_STANDARD: u32 = 0x7FF;

@@ -42,7 +42,7 @@ pub struct SignalColumns {
 }
 
 /// The value of the column `event` in rows with a value.
-const VALUE: &str = "value";
+pub const VALUE: &str = "value";
 
 /// The indexes of a message's texts in the columns.
 struct MessageKeys {

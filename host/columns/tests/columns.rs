@@ -2,9 +2,9 @@
 
 use std::sync::Arc;
 
-use arrow_array::RecordBatch;
 use arrow_array::cast::AsArray;
 use arrow_array::types::{Float64Type, Int32Type, UInt64Type};
+use arrow_array::{ArrayRef, Float64Array, Int64Array, RecordBatch, StringArray};
 use cantap_columns::{FrameColumns, MessageColumns, MessageTables, SignalColumns, WideColumns, records};
 use cantap_signals::{
     ByteOrder, Database, Decoder, Message, Multiplexed, Signal, Source, ValueKind, ValueTable, dbc,
@@ -29,9 +29,47 @@ proptest! {
 #[test]
 fn a_table_that_is_no_trace_says_which_column_it_lacks() {
     let mut columns = FrameColumns::default();
-    let batch = columns.take().project(&[0, 1, 2]).unwrap();
+    let batch = columns.take().project(&[1, 2]).unwrap();
     let error = records(&batch).unwrap_err().to_string();
-    assert_eq!(error, "a trace has a column 'detail' of type text; there is none");
+    assert_eq!(
+        error,
+        "a trace has a column 'time' (a timestamp, or float64 with seconds); there is none among channel, event"
+    );
+}
+
+/// More about the types of other programs is in `python/tests/test_tables_of_others.py`.
+#[test]
+fn time_identifier_and_data_are_enough() {
+    let batch = |times: Vec<f64>| {
+        let ids = Int64Array::from_iter_values((0..times.len() as i64).map(|at| 0x7FF + at));
+        let data = StringArray::from_iter_values(times.iter().map(|_| "11 2233"));
+        let columns: [(&str, ArrayRef); 3] =
+            [("time", Arc::new(Float64Array::from(times))), ("id", Arc::new(ids)), ("data", Arc::new(data))];
+        RecordBatch::try_from_iter(columns).unwrap()
+    };
+    // The shortest decimal number counts, and what is finer than nanoseconds is rounded.
+    let times = vec![1_700_000_000.123_456, -0.5, 0.1, 1e-9, 1.000_000_000_6, 5e-324, 1e9];
+    let found = records(&batch(times)).unwrap();
+    let ns: Vec<_> = found.iter().map(|record| record.time_ns).collect();
+    assert_eq!(
+        ns,
+        [
+            1_700_000_000_123_456_000,
+            -500_000_000,
+            100_000_000,
+            1,
+            1_000_000_001,
+            0,
+            1_000_000_000_000_000_000
+        ]
+    );
+    let frames: Vec<_> = found[..2].iter().map(|record| record.frame().unwrap().to_string()).collect();
+    assert_eq!(frames, ["7FF#112233", "00000800#112233"]);
+    assert!(found.iter().all(|record| record.channel == 1));
+    for wrong in [f64::INFINITY, 1e10, -1e300] {
+        let error = records(&batch(vec![0.0, wrong])).unwrap_err().after(10).to_string();
+        assert_eq!(error, format!("row 11: time: {wrong} s is out of range; seconds are wanted"));
+    }
 }
 
 const DBC: &[u8] = br#"VERSION ""

@@ -58,8 +58,6 @@ struct Doubt {
 /// How many events of a channel are held back.
 const MOST_HELD: usize = 64;
 
-const DIAGNOSTICS: u16 =
-    Protocol::IsoTp.bit() | Protocol::Uds.bit() | Protocol::Kwp2000.bit() | Protocol::Obd.bit();
 /// The readers' bits.
 const OF_DIAGNOSTICS: u8 = 1;
 const OF_CANOPEN: u8 = 2;
@@ -69,7 +67,7 @@ const OF_FAMILY: u8 = 8;
 /// The readers that a channel with these protocols needs.
 fn readers_of(spoken: u16) -> u8 {
     let has = |protocols: u16, reader: u8| if spoken & protocols == 0 { 0 } else { reader };
-    has(DIAGNOSTICS, OF_DIAGNOSTICS)
+    has(Protocol::DIAGNOSTICS, OF_DIAGNOSTICS)
         | has(FAMILY, OF_FAMILY)
         | has(Protocol::CanOpen.bit(), OF_CANOPEN)
         | has(Protocol::DeviceNet.bit(), OF_DEVICENET)
@@ -91,7 +89,7 @@ impl Conversations {
         let wanted = if options.protocols.is_empty() { u16::MAX } else { bits(&options.protocols) };
         // Without a survey or a choice, frames that fit two protocols would be decoded twice.
         let everywhere = match (&options.spoken, options.protocols.is_empty()) {
-            (Some(_), _) | (None, true) => DIAGNOSTICS & wanted,
+            (Some(_), _) | (None, true) => Protocol::DIAGNOSTICS & wanted,
             (None, false) => wanted,
         };
         let (mut spoken, mut doubts) = ([everywhere; 256], FxHashMap::default());
@@ -100,7 +98,7 @@ impl Conversations {
         }
         for evidence in options.spoken.iter().flatten() {
             spoken[usize::from(evidence.channel)] |= evidence.protocol.bit() & wanted;
-            if evidence.protocol.bit() & DIAGNOSTICS != 0 {
+            if evidence.protocol.is_diagnostics() {
                 doubts.remove(&evidence.channel);
             }
         }
@@ -197,7 +195,7 @@ impl Conversations {
         self.readers.iter().flatten().for_each(|reader| reader.under_way(&mut under_way));
         self.family.iter().for_each(|family| family.under_way(&mut under_way));
         under_way.retain(|transfer| {
-            transfer.protocol.bit() & DIAGNOSTICS == 0 || !self.doubts.contains_key(&transfer.channel)
+            !transfer.protocol.is_diagnostics() || !self.doubts.contains_key(&transfer.channel)
         });
         under_way.sort_by_key(|transfer| transfer.start_ns);
         under_way
@@ -205,7 +203,7 @@ impl Conversations {
 
     /// Holds back new events of diagnostics on channels where nothing has shown yet that it is them.
     fn hold_back(&mut self, before: usize, events: &mut Vec<Event>) {
-        let is_doubtful = |event: &Event| event.protocol.bit() & DIAGNOSTICS != 0;
+        let is_doubtful = |event: &Event| event.protocol.is_diagnostics();
         if self.doubts.is_empty() || !events[before..].iter().any(is_doubtful) {
             return;
         }
@@ -235,7 +233,7 @@ impl Conversations {
         }
         // Only new events: the caller may keep all events of a long trace in the same vector.
         let mut end = before;
-        let diagnostics = self.wanted & DIAGNOSTICS != 0;
+        let diagnostics = self.wanted & Protocol::DIAGNOSTICS != 0;
         for at in before..events.len() {
             let Event { protocol, trouble, .. } = &events[at];
             // A broken transfer may have been a request, or its response: nobody can tell which.

@@ -52,6 +52,15 @@ impl Protocol {
         }
     }
 
+    /// Whether it is ISO 15765-2 or on top of it: a tester's, which may come at any time.
+    pub const fn is_diagnostics(self) -> bool {
+        self.bit() & Self::DIAGNOSTICS != 0
+    }
+
+    /// The set of those.
+    pub(crate) const DIAGNOSTICS: u16 =
+        Self::IsoTp.bit() | Self::Uds.bit() | Self::Kwp2000.bit() | Self::Obd.bit();
+
     /// Its bit in a set.
     pub(crate) const fn bit(self) -> u16 {
         1 << self as u16

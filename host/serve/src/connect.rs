@@ -1,7 +1,7 @@
 //! Links to a server, from which a client makes a device.
 
 use std::io::{self, Read};
-use std::net::{TcpStream, ToSocketAddrs};
+use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
 #[cfg(unix)]
 use std::os::unix::net::UnixStream;
 #[cfg(unix)]
@@ -54,7 +54,7 @@ pub fn tcp(address: &str) -> io::Result<Link> {
 /// A socket that returns within a fraction of a second.
 pub(crate) fn dial(address: &str) -> io::Result<TcpStream> {
     let mut failed = io::Error::new(io::ErrorKind::NotFound, "the name has no address");
-    for address in address.to_socket_addrs()? {
+    for address in resolve(address)? {
         match TcpStream::connect_timeout(&address, CONNECT_TIMEOUT) {
             Ok(stream) => {
                 prepare(&stream)?;
@@ -64,6 +64,17 @@ pub(crate) fn dial(address: &str) -> io::Result<TcpStream> {
         }
     }
     Err(failed)
+}
+
+/// The addresses of `HOST:PORT`. The standard library takes no zone in brackets, as in `[fe80::1%eth0]:29537`, but the system does without
+/// them.
+fn resolve(address: &str) -> io::Result<Vec<SocketAddr>> {
+    let in_brackets = address.strip_prefix('[').and_then(|rest| rest.rsplit_once("]:"));
+    let with_zone = in_brackets.filter(|(host, _)| host.contains('%'));
+    Ok(match with_zone.and_then(|(host, port)| Some((host, port.parse::<u16>().ok()?))) {
+        Some(with_zone) => with_zone.to_socket_addrs()?.collect(),
+        None => address.to_socket_addrs()?.collect(),
+    })
 }
 
 pub(crate) fn prepare(stream: &TcpStream) -> io::Result<()> {

@@ -183,6 +183,8 @@ pub fn connect(address: &str, files: &Files) -> Result<Link, TlsError> {
         .with_client_auth_cert(chain, key)
         .map_err(setup)?;
     let host = address.rsplit_once(':').map_or(address, |(host, _)| host).trim_matches(['[', ']']);
+    // A zone is this computer's way there, and no part of the server's address.
+    let host = host.split_once('%').map_or(host, |(host, _)| host);
     let host = ServerName::try_from(host.to_owned()).map_err(setup)?;
     let connection = ClientConnection::new(Arc::new(config), host).map_err(setup)?;
     let stream = dial(address)?;

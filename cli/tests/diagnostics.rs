@@ -110,6 +110,39 @@ fn silence_is_explained() {
     );
 }
 
+/// The longest request with a short length, the first with a long one, identifiers at their limits, times beyond any clock.
+#[test]
+fn values_at_the_limits_are_taken() {
+    for (length, words) in [(4095, "after 6 of 4095 bytes"), (4096, "after 2 of 4096 bytes")] {
+        let line = format!("uds -d virtual:load=0 -b 500k --frame-timeout 100ms raw {}", "22".repeat(length));
+        let (code, said) = badly(&line);
+        assert!(
+            code == Some(1) && said.contains("no flow control came within 100 ms") && said.contains(words),
+            "{said}"
+        );
+    }
+    for (pair, patience) in [("7FF:7FE", "100ms"), ("1FFFFFFF:1FFFFFFE", "100ms"), ("000:7FF", "50ms")] {
+        let line = format!(
+            "uds -d virtual:load=0 -b 500k --pair {pair} --p2 999999999h --patience {patience} read FFFF"
+        );
+        let (code, said) = badly(&line);
+        assert!(
+            code == Some(1) && said.contains(&format!("no answer within {}", &patience.replace("ms", " ms"))),
+            "{said}"
+        );
+    }
+    for line in [
+        "canopen -d virtual:canopen -b 500k --timeout 999999999h --patience 999999999h read 5 1000",
+        "canopen -d virtual:canopen -b 500k sync --period 10ms -n 2 --cob-id 1FFFFFFF",
+        "canopen -d virtual:canopen -b 500k heartbeat 127 --period 47us -n 2",
+        "canopen -d virtual:canopen -b 500k write 5 2000 0 @/dev/null",
+        "j1939 -d virtual:load=0 -b 250k claim --address 253 --name FFFFFFFFFFFFFFFF",
+    ] {
+        let (code, said) = badly(line);
+        assert_eq!(code, Some(0), "{line}: {said}");
+    }
+}
+
 #[test]
 fn wrong_words_are_exit_code_2() {
     for line in [
@@ -118,6 +151,28 @@ fn wrong_words_are_exit_code_2() {
         "uds -d virtual:car --pair 7E0 read F190",
         "uds -d virtual:car --separation 1500us read F190",
         "uds -d virtual:car --security 2 --key-command true read F190",
+        "uds -d virtual:car tester-present --period 9ms",
+        "uds -d virtual:car --pair 800:801 read F190",
+        "uds -d virtual:car --pair 20000000:7E8 read F190",
+        "uds -d virtual:car --pair 7E0:7E0 read F190",
+        "uds -d virtual:car --p2 0ms read F190",
+        "uds -d virtual:car --max-waits 4294967296 read F190",
+        "uds -d virtual:car read 10000",
+        "canopen -d virtual:canopen read 5 1000 --sdo 605:605",
+        "canopen -d virtual:canopen read 5 1000 --sdo 605/1:585/2",
+        "canopen -d virtual:canopen read 128 1000",
+        "canopen -d virtual:canopen read 5 10000",
+        "canopen -d virtual:canopen read 5 1000 100",
+        "canopen -d virtual:canopen scan 0-5",
+        "canopen -d virtual:canopen sync --period 10ms --cob-id 800",
+        "canopen -d virtual:canopen sync --period 10ms --cob-id 20000000",
+        "canopen -d virtual:canopen lss --identity 1:2:3",
+        "j1939 -d virtual:load=0 request 262144",
+        "j1939 -d virtual:load=0 request 65260 --to 254",
+        "j1939 -d virtual:load=0 claim --address 254",
+        "j1939 -d virtual:load=0 claim --name 10000000000000000",
+        "j1939 -d virtual:load=0 send 0xFEEC 0",
+        "j1939 -d virtual:load=0 --timeout 0s request 65260",
         "obd -d virtual:car live GG",
     ] {
         assert_eq!(badly(line).0, Some(2), "{line}");

@@ -278,6 +278,39 @@ fn what_is_sent_ends_with_the_reason_and_does_not_begin_again() {
     assert_eq!((log.opened.len(), log.sent), (1, 1));
 }
 
+/// What speaks does not wait for a device that comes back: what it asked is long forgotten then.
+#[test]
+fn commands_that_speak_end_with_the_reason() {
+    for (fault, words) in [
+        (Fault::Suspended, "this computer put the device to sleep"),
+        (Fault::SessionLost, "session"),
+        (Fault::Deaf, "has answered nothing for"),
+    ] {
+        let lines = [
+            "canopen monitor",
+            "canopen scan --listen 50s",
+            "canopen sync --period 10ms",
+            "j1939 request 65260",
+        ];
+        let running: Vec<_> = lines
+            .map(|line| {
+                let (port, log) = device(&[fault]);
+                (line, Running::start(&format!("{line} -d {port} -b 500k")), log)
+            })
+            .into_iter()
+            .collect();
+        for (line, running, log) in running {
+            let (code, _, said) = running.end();
+            let said = said.join("\n");
+            // A fake device never confirms a frame, which may be noticed first.
+            assert_eq!(code, Some(1), "{fault:?}, {line}: {said}");
+            let is_stuck = line.starts_with("j1939") && said.contains("were not sent");
+            assert!(said.contains(words) || is_stuck, "{fault:?}, {line}: {said}");
+            assert_eq!(log.lock().unwrap().opened.len(), 1, "{fault:?}, {line}");
+        }
+    }
+}
+
 #[test]
 fn a_capture_ends_whole_whatever_the_device_keeps_back() {
     let folder = tempfile::tempdir().unwrap();

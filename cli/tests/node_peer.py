@@ -315,6 +315,24 @@ def serve_j1939(host, port):
     node.subscribe_request(node.on_request)
     node.start()
 
+    class Second(j1939.ControllerApplication):
+        """Several codes, which are more than a frame has; its NAME is the highest, so it has to give up an address that others claim."""
+
+        def on_request(self, src, dest, pgn):
+            if pgn == 0xFECA:
+                self.send_pgn(0, 0xFE, 0xCA, 6, [0x10, 0xFF] + [part for spn in (100, 110, 190) for part in (spn, 0x00, 0x04, 0x02)])
+
+    second = Second(
+        j1939.Name(
+            arbitrary_address_capable=1, industry_group=7, vehicle_system_instance=15, vehicle_system=127, function=255,
+            function_instance=31, ecu_instance=7, manufacturer_code=2047, identity_number=2097151,
+        ),
+        130,
+    )
+    ecu.add_ca(controller_application=second)
+    second.subscribe_request(second.on_request)
+    second.start()
+
     def echo(priority, pgn, source, timestamp, data):
         if pgn >> 8 == 0xD0 and len(data) > 8:
             node.send_pgn(0, 0xFF, 0x01, 6, list(len(data).to_bytes(2, "little")) + [sum(data) & 0xFF])

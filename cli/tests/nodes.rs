@@ -198,7 +198,13 @@ fn a_node_on_can_j1939_is_seen_asked_and_told() {
     assert!(rig.well("j1939 request 65260 --to 129").contains("WVWZZZ1KZAW000001"));
     assert_eq!(data("j1939 request 0xEF00 --to 129").len(), 200);
     assert!(rig.well("j1939 dm1 --to 129").contains("SPN 100 FMI 3"));
-    assert_eq!(data("j1939 dm1"), "04FF64000305FFFF");
+    let all = rig.json("j1939 dm1", "conversations");
+    let of =
+        |address: &str| all.iter().find(|event| event["from"] == address).unwrap()["data"].as_str().unwrap();
+    assert_eq!(of("129"), "04FF64000305FFFF");
+    // Several codes, by BAM.
+    assert_eq!(of("130"), "10FF640004026E000402BE000402");
+    assert!(rig.well("j1939 dm1 --to 130").contains("SPN 110 FMI 4"));
     // A long message to it: what it reports about that is received by another program.
     let message = "01".repeat(150);
     let sent = rig.json(&format!("j1939 send 0xD000 {message} --to 129"), "conversations");
@@ -208,6 +214,9 @@ fn a_node_on_can_j1939_is_seen_asked_and_told() {
         code == Some(1) && err.contains("no answer within 1250 ms") && err.contains("j1939 claim"),
         "{err}"
     );
+    // The second one's NAME is higher than any: it has to leave its address to us.
+    let (code, out, err) = rig.run("j1939 claim --address 130");
+    assert!(code == Some(0) && !err.contains("is taken"), "{out}{err}");
     // Its NAME is lower than ours, so it keeps the address.
     let (code, out, err) = rig.run("j1939 claim --address 129");
     assert!(code == Some(0) && err.contains("the address 129 is taken"), "{out}{err}");

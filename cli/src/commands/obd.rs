@@ -16,8 +16,6 @@ use crate::speaking::SpeakArgs;
 use crate::wrong::wrong;
 use crate::{args, interrupt};
 
-/// How long all ECUs have to answer, if their number is unknown. ISO 15765-4 has 50 ms.
-const ALL_ANSWER: Duration = Duration::from_millis(200);
 /// Bits of a list of supported parameters.
 const LIST: u8 = 0x20;
 
@@ -34,6 +32,10 @@ asked for here and nothing else.")]
 pub struct Args {
     #[command(flatten)]
     speak: SpeakArgs,
+    /// How long to wait for the beginning of an answer, and for all ECUs to answer as long as their number is unknown. ISO 15765-4 has 50 ms; gateways
+    /// add to that.
+    #[arg(long, value_name = "TIME", default_value = "200ms", value_parser = args::positive_duration, global = true)]
+    p2: Duration,
     #[command(subcommand)]
     what: Option<What>,
 }
@@ -86,7 +88,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let device = args.speak.open()?;
     let speaking = args.speak.speak(&device, Box::new(Diagnostics::new(&[], false)));
-    let mut vehicle = Vehicle { client: Client::new(speaking, transfer(false)), servers: Vec::new() };
+    let mut vehicle =
+        Vehicle { client: Client::new(speaking, transfer(false, args.p2)), p2: args.p2, servers: Vec::new() };
     vehicle.find()?;
     match &args.what {
         None => vehicle.everything()?,
@@ -117,14 +120,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 }
 
 /// How to address all ECUs.
-fn transfer(extended: bool) -> TransferArgs {
+fn transfer(extended: bool, p2: Duration) -> TransferArgs {
     let endpoint = |id| Endpoint { id, address: None };
     let (a, b) = if extended {
         (Id::extended_truncated(0x18DA_10F1), Id::extended_truncated(0x18DA_F110))
     } else {
         (Id::standard_truncated(0x7E0), Id::standard_truncated(0x7E8))
     };
-    TransferArgs::of_obd(Pair { a: endpoint(a), b: endpoint(b) }, ALL_ANSWER, true)
+    TransferArgs::of_obd(Pair { a: endpoint(a), b: endpoint(b) }, p2, true)
 }
 
 /// Whether it is an answer, or a broken one.
@@ -143,6 +146,7 @@ fn listed(base: u8, bits: &[u8]) -> Vec<u8> {
 
 struct Vehicle<'d> {
     client: Client<'d>,
+    p2: Duration,
     servers: Vec<Server>,
 }
 
@@ -150,7 +154,7 @@ impl Vehicle<'_> {
     /// Finds out which ECUs answer.
     fn find(&mut self) -> anyhow::Result<()> {
         for extended in [false, true] {
-            self.client.set_transfer(transfer(extended));
+            self.client.set_transfer(transfer(extended, self.p2));
             let answers = self.client.ask_whoever(&[0x01, 0x00], None)?;
             for answer in answers {
                 if let [0x41, 0x00, bits @ ..] = &answer.data[..] {
@@ -164,7 +168,7 @@ impl Vehicle<'_> {
         }
         Err(anyhow!(
             "no ECU answers, neither to 7DF nor to 18DB33F1; {}; check that the ignition is on, and the bit rate: vehicles have 500k \
-             or 250k",
+             or 250k; --p2 waits longer",
             self.client.speaking.circumstances()
         ))
     }
@@ -217,12 +221,19 @@ impl Vehicle<'_> {
         }
         let started = Instant::now();
         let mut rounds = 0;
+        let mut silent = pids.clone();
         while count.is_none_or(|count| rounds < count) && !interrupt::requested() {
-            self.values(&pids)?;
+            let answered = self.values(&pids)?;
+            silent.retain(|pid| !answered.contains(pid));
             rounds += 1;
             if count.is_none_or(|count| rounds < count) {
                 self.client.speaking.listen((period * rounds).saturating_sub(started.elapsed()))?;
             }
+        }
+        // Before the end of the first round, Ctrl-C is why.
+        if rounds > 0 && !silent.is_empty() && !(rounds == 1 && interrupt::requested()) {
+            let silent: Vec<_> = silent.iter().map(|pid| format!("{pid:02X}")).collect();
+            bail!("no ECU has ever answered {}; {}", silent.join(", "), self.client.speaking.circumstances());
         }
         Ok(())
     }
@@ -235,33 +246,43 @@ impl Vehicle<'_> {
         pids
     }
 
-    fn values(&mut self, pids: &[u8]) -> anyhow::Result<()> {
+    /// Shows values, and returns those parameters for which there was an answer.
+    fn values(&mut self, pids: &[u8]) -> anyhow::Result<Vec<u8>> {
+        let mut answered = Vec::new();
         for pid in pids {
             let servers = self.having(*pid);
             let asked = self.client.ask_whoever(&[0x01, *pid], Some(servers));
             if interrupt::requested() {
-                return Ok(());
+                return Ok(answered);
             }
             let answers = asked?.len();
+            if answers > 0 {
+                answered.push(*pid);
+            }
             self.client.tell_if(is_answer)?;
             if answers < servers {
                 eprintln!("cantap: {pid:02X}: {answers} of {servers} ECUs answered");
             }
         }
-        Ok(())
+        Ok(answered)
     }
 
     fn codes(&mut self) -> anyhow::Result<()> {
+        let mut any = false;
         for service in [0x03, 0x07, 0x0A] {
             let answers = self.client.ask_whoever(&[service], Some(self.servers.len()))?;
             self.client.tell_if(|event| {
                 is_answer(event)
                     && event.field("sid").is_some_and(|sid| sid.value.as_number() == Some(f64::from(service)))
             })?;
+            any |= !answers.is_empty();
             if answers.is_empty() {
                 let kind = ["stored", "pending", "permanent"][usize::from(service / 4)];
                 eprintln!("cantap: no ECU tells {kind} codes");
             }
+        }
+        if !any {
+            bail!("no ECU tells any codes; {}", self.client.speaking.circumstances());
         }
         Ok(())
     }
@@ -288,6 +309,6 @@ impl Vehicle<'_> {
         self.lists()?;
         self.client.speaking.take_events();
         let pids = self.all_pids();
-        self.values(&pids)
+        self.values(&pids).map(|_| ())
     }
 }

@@ -119,6 +119,11 @@ enum ResetKind {
     Soft,
 }
 
+/// How long to wait for the refusal of a request that wants no answer: P2 of ISO 14229-2.
+const REFUSAL: Duration = Duration::from_millis(50);
+/// The shortest time between two "tester present", which this computer sends one by one.
+const SHORTEST_PERIOD: Duration = Duration::from_millis(10);
+
 fn session(text: &str) -> Result<u8, String> {
     match text {
         "default" => Ok(1),
@@ -171,7 +176,8 @@ fn stay(
     let started = Instant::now();
     let mut said = 0;
     loop {
-        let told = client.tell_only(&[0x3E, 0x80]);
+        // A refusal comes within P2; the next period begins in time all the same.
+        let told = client.tell_only(&[0x3E, 0x80], REFUSAL.min(period / 2));
         client.tell()?;
         // Ctrl-C is its usual end, also between the request and what might answer it.
         if interrupt::requested() {
@@ -213,6 +219,9 @@ impl Args {
                 vec![[&[0x31, action][..], &routine.to_be_bytes(), option].concat()]
             }
             What::TesterPresent { count, period, .. } => {
+                if period.is_some_and(|period| period < SHORTEST_PERIOD) {
+                    return Err(wrong(format!("a period is at least {} ms", SHORTEST_PERIOD.as_millis())));
+                }
                 if period.is_none() && count.is_some_and(|count| count > 1) {
                     return Err(wrong("say how often with --period, as --period 2s"));
                 }

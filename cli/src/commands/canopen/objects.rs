@@ -2,11 +2,11 @@
 
 use std::io::Write as _;
 
-use anyhow::{Context, anyhow};
+use anyhow::{Context, anyhow, ensure};
 use cantap::{TraceEvent, TraceRecord};
 use cantap_protocols::active::sdo::{SdoClient, SdoError, SdoIds, SdoJob};
 use cantap_protocols::canopen::{CanOpen, Sheet, encode, known_type, type_named};
-use cantap_protocols::iso_tp::{BadPair, Pair};
+use cantap_protocols::iso_tp::Pair;
 use cantap_protocols::{Assembler, Event};
 
 use crate::speaking::{SpeakArgs, Speaking};
@@ -69,11 +69,9 @@ pub(super) struct WriteObject {
 
 /// The identifiers of an SDO channel.
 fn channel(text: &str) -> Result<Pair, String> {
-    let pair: Pair = text.parse().map_err(|error: BadPair| error.to_string())?;
-    if pair.a.address.is_some() || pair.b.address.is_some() || pair.a.id == pair.b.id {
-        return Err("write two different identifiers, as 605:585".to_owned());
-    }
-    Ok(pair)
+    let pair: Option<Pair> = text.parse().ok();
+    let is_plain = |pair: &Pair| pair.a.address.is_none() && pair.b.address.is_none();
+    pair.filter(is_plain).ok_or_else(|| "write two different identifiers, as 605:585".to_owned())
 }
 
 fn index(text: &str) -> Result<u16, String> {
@@ -215,7 +213,13 @@ pub(super) fn write(
 impl WriteObject {
     fn bytes(&self, sheets: &[Sheet]) -> anyhow::Result<Vec<u8>> {
         if let Some(path) = self.value.strip_prefix('@') {
-            return std::fs::read(path).with_context(|| format!("cannot read {path}"));
+            let bytes = std::fs::read(path).with_context(|| format!("cannot read {path}"))?;
+            // A transfer announces its length in 32 bits.
+            ensure!(
+                u32::try_from(bytes.len()).is_ok(),
+                "{path} is too long for an object: it may have up to 4 GiB"
+            );
+            return Ok(bytes);
         }
         let (Place { node, index, .. }, sub) = (&self.place, self.sub);
         let (node, index) = (*node, *index);

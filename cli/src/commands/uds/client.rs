@@ -248,9 +248,9 @@ impl<'d> Client<'d> {
         }
     }
 
-    /// Sends a request that wants no answer, and does not wait for a refusal.
-    pub fn tell_only(&mut self, request: &[u8]) -> anyhow::Result<()> {
-        let p2 = std::mem::replace(&mut self.args.p2, Duration::from_millis(50));
+    /// Sends a request that wants no answer, and waits this long for a refusal.
+    pub fn tell_only(&mut self, request: &[u8], wait: Duration) -> anyhow::Result<()> {
+        let p2 = std::mem::replace(&mut self.args.p2, wait);
         let told = self.ask(request);
         self.args.p2 = p2;
         told.map(|_| ())

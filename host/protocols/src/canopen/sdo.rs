@@ -96,10 +96,32 @@ impl Default for Sdo {
 impl Sdo {
     /// Takes a frame from the client or the server; returns what it ends: an abandoned transfer, and a completed one.
     pub fn take(&mut self, time_ns: i64, from_client: bool, data: &[u8]) -> [Option<SdoTransfer>; 2] {
-        let &[b0, low, high, sub, c, d, e, f] = data else {
-            return [None, Some(headless(time_ns, data, Trouble::Malformed("an SDO frame has 8 bytes")))];
+        let short = Trouble::Malformed("an SDO frame has 8 bytes");
+        let Some(bytes) = self.padded(from_client, data) else {
+            return [None, Some(headless(time_ns, data, short))];
         };
-        let bytes = [b0, low, high, sub, c, d, e, f];
+        let mut ended = self.take_whole(time_ns, from_client, bytes);
+        if data.len() < bytes.len()
+            && let Some(transfer) = ended[1].as_mut().or(self.open.as_mut())
+        {
+            transfer.trouble.get_or_insert(short);
+        }
+        ended
+    }
+
+    /// With the unused bytes, which some devices leave out. `None` if others are missing, or there are too many.
+    fn padded(&self, from_client: bool, data: &[u8]) -> Option<[u8; 8]> {
+        let mut bytes = [0; 8];
+        bytes.get_mut(..data.len())?.copy_from_slice(data);
+        let used = match (self.phase, from_client) {
+            (Phase::FromClient, true) | (Phase::FromServer, false) => 8,
+            _ => used(bytes[0], from_client),
+        };
+        (!data.is_empty() && data.len() >= used).then_some(bytes)
+    }
+
+    fn take_whole(&mut self, time_ns: i64, from_client: bool, bytes: [u8; 8]) -> [Option<SdoTransfer>; 2] {
+        let [b0, low, high, sub, ..] = bytes;
         let mut behind = None;
         let initiates = match b0 >> 5 {
             1 | 2 => true,
@@ -403,6 +425,24 @@ fn append(open: &mut SdoTransfer, bytes: &[u8]) {
         open.trouble.get_or_insert(Trouble::Cut);
     }
     open.data.extend_from_slice(&bytes[..bytes.len().min(room)]);
+}
+
+/// How many bytes of a command's frame count.
+fn used(b0: u8, from_client: bool) -> usize {
+    match (b0 >> 5, from_client) {
+        // A segment.
+        (0, _) => 8 - usize::from(b0 >> 1 & 7),
+        // The begin of a transfer, with its bytes or how many they are.
+        (1, true) | (2, false) => match b0 & 3 {
+            0 => 4,
+            3 => 8 - usize::from(b0 >> 2 & 3),
+            _ => 8,
+        },
+        // A request for a segment, or the confirmation of one.
+        (1, false) | (3, true) => 1,
+        (2, true) | (3, false) => 4,
+        _ => 8,
+    }
 }
 
 /// The data in the frame that begins a transfer.

@@ -423,3 +423,31 @@ fn an_answer_about_another_object_is_not_the_answer() {
     );
     assert!(said[3].contains("1017:00") && said[3].ends_with("value 1000, after 2 ms"), "{said:?}");
 }
+
+#[test]
+fn an_sdo_frame_without_its_unused_bytes_is_read_and_reported() {
+    // As in python-canopen's tests, from a device.
+    for (frames, expected) in [
+        (
+            &[(0.0, "602#4000140200000000"), (1.0, "582#4F001402FE")][..],
+            "canopen ? > 2 SDO read 1400:02: index 0x1400 (RPDO communication parameter), sub 0x02, transport \"expedited\", \
+             value 254, after 1 ms; malformed: an SDO frame has 8 bytes",
+        ),
+        (
+            &[(0.0, "602#2B171000A00F"), (1.0, "582#60171000")],
+            "canopen ? > 2 SDO write 1017:00: index 0x1017 (producer heartbeat time), sub 0x00, transport \"expedited\", \
+             value 4000, after 1 ms; malformed: an SDO frame has 8 bytes",
+        ),
+        (
+            &[(0.0, "602#40081000"), (1.0, "582#4108100002000000"), (2.0, "602#60"), (3.0, "582#0B4142")],
+            "canopen ? > 2 SDO read 1008:00: index 0x1008 (manufacturer device name), sub 0x00, transport \"segmented\", \
+             value \"AB\", after 1 ms; malformed: an SDO frame has 8 bytes",
+        ),
+    ] {
+        assert_eq!(said(frames), [expected]);
+    }
+    // What lacks used bytes is not read.
+    let said = said(&[(0.0, "602#4000140200000000"), (1.0, "582#43001402FE")]);
+    assert!(said[0].contains("malformed: an SDO frame has 8 bytes"), "{said:?}");
+    assert!(said[1].contains("SDO read 1400:02") && said[1].contains("the trace ends here"), "{said:?}");
+}

@@ -6,7 +6,11 @@
 //! A positive response repeats parts of its request. One that repeats something else is not the response, and is shown as one
 //! whose request was not heard; the request goes on waiting, as its sender does.
 //!
-//! Memory: that of [`crate::iso_tp`], 256 requests waiting for their responses, and 64 that no longer do.
+//! A message of a service that no standard names may be anything, and is shown as a transfer. If it is refused, as in a scan of all
+//! services, it was a request.
+//!
+//! Memory: that of [`crate::iso_tp`], 256 requests waiting for their responses, 64 that no longer do, and 64 messages that may have
+//! been requests.
 
 mod authentication;
 mod dtc;
@@ -56,6 +60,8 @@ const MOST_LATE: usize = 64;
 const LATE_NS: i64 = 60_000_000_000;
 /// How long after its last frame a response may still be under way: longer than [`crate::iso_tp`] waits for the next frame.
 const UNDER_WAY_NS: i64 = 1_200_000_000;
+/// How many messages of unnamed services are kept.
+const MOST_UNNAMED: usize = 64;
 /// How many senders known to use KWP2000 are kept.
 const MOST_KWP: usize = 1024;
 
@@ -90,6 +96,8 @@ pub struct Diagnostics {
     waiting: VecDeque<Waiting>,
     /// Requests that were given up.
     late: VecDeque<Transfer>,
+    /// The last message of each sender, of a service that no standard names.
+    unnamed: VecDeque<Transfer>,
     periodic: Periodic,
     /// No request times out before this time.
     due_ns: i64,
@@ -118,9 +126,15 @@ impl Diagnostics {
             self.refusal(&transfer, events);
         } else if sid & 0x40 == 0 && self.service(&transfer, sid).is_some() {
             self.request(transfer, events);
-        } else if sid & 0x40 != 0 && self.service(&transfer, sid & !0x40).is_some() {
+        } else if sid & 0x40 != 0
+            && (self.service(&transfer, sid & !0x40).is_some()
+                || self.asked(&transfer, sid & !0x40).is_some())
+        {
             self.response(&transfer, events);
         } else {
+            if sid & 0x40 == 0 {
+                self.keep_unnamed(&transfer);
+            }
             events.push(transfer.into());
         }
     }
@@ -173,21 +187,43 @@ impl Diagnostics {
         if let Some(place) = self.waiting.iter().position(same) {
             self.give_up(place, Trouble::Overlapped, events);
         }
+        self.wait_for(transfer, is_wanted, events);
+    }
+
+    fn wait_for(&mut self, request: Transfer, is_wanted: bool, events: &mut Vec<Event>) {
         if self.waiting.len() == MOST_WAITING {
             self.give_up(0, Trouble::GivenUp, events);
         }
-        let until_ns = transfer.time_ns.saturating_add(RESPONSE_NS);
+        let until_ns = request.time_ns.saturating_add(RESPONSE_NS);
         self.due_ns = self.due_ns.min(until_ns);
-        let frames_lost = transfer.frames_lost;
+        let frames_lost = request.frames_lost;
         let pending = Vec::new();
-        self.waiting.push_back(Waiting {
-            request: transfer,
-            is_wanted,
-            pending,
-            until_ns,
-            answers: 0,
-            frames_lost,
-        });
+        self.waiting.push_back(Waiting { request, is_wanted, pending, until_ns, answers: 0, frames_lost });
+    }
+
+    /// Keeps a message that turns out to be a request if it is refused.
+    fn keep_unnamed(&mut self, transfer: &Transfer) {
+        self.unnamed.retain(|before| (before.channel, before.from) != (transfer.channel, transfer.from));
+        if self.unnamed.len() == MOST_UNNAMED {
+            self.unnamed.pop_front();
+        }
+        let to = transfer.to.or_else(|| self.transport.partner(transfer.channel, transfer.from));
+        self.unnamed.push_back(Transfer { to, ..transfer.clone() });
+    }
+
+    /// The message of an unnamed service that is refused here, from now on among those that wait.
+    fn refused_unnamed(&mut self, response: &Transfer, sid: u8, events: &mut Vec<Event>) -> Option<usize> {
+        let place = self.unnamed.iter().rposition(|request| {
+            self.is_answer(request, response, sid)
+                && response.start_ns.saturating_sub(request.time_ns) <= RESPONSE_NS
+                && match request.to {
+                    Some(to) => to == response.from,
+                    None => request.from.id.is_extended() == response.from.id.is_extended(),
+                }
+        })?;
+        let request = self.unnamed.remove(place)?;
+        self.wait_for(request, true, events);
+        self.waiting.len().checked_sub(1)
     }
 
     /// The request that a response to `sid` belongs to.
@@ -246,7 +282,8 @@ impl Diagnostics {
 
     fn refusal(&mut self, transfer: &Transfer, events: &mut Vec<Event>) {
         let (sid, nrc) = (transfer.data[1], transfer.data[2]);
-        let Some(place) = self.asked(transfer, sid) else {
+        let asked = self.asked(transfer, sid);
+        let Some(place) = asked.or_else(|| self.refused_unnamed(transfer, sid, events)) else {
             let event = self.unasked(transfer, sid);
             events.push(event);
             return;
@@ -431,6 +468,9 @@ impl Assembler for Diagnostics {
             for waiting in self.waiting.iter_mut().filter(|waiting| waiting.request.channel == record.channel)
             {
                 waiting.frames_lost = true;
+            }
+            for request in self.unnamed.iter_mut().filter(|request| request.channel == record.channel) {
+                request.frames_lost = true;
             }
         }
         let mut transfers = std::mem::take(&mut self.transfers);

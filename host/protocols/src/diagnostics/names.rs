@@ -1,7 +1,7 @@
 //! Names for numbers: services, sub-functions, identifiers, reasons.
 
 /// Services of ISO 14229-1:2020, table 2, and 27.
-const UDS_SERVICES: [(u8, &str); 27] = [
+const UDS_SERVICES: [(u8, &str); 32] = [
     (0x10, "DiagnosticSessionControl"),
     (0x11, "ECUReset"),
     (0x14, "ClearDiagnosticInformation"),
@@ -30,7 +30,15 @@ const UDS_SERVICES: [(u8, &str); 27] = [
     (0x85, "ControlDTCSetting"),
     (0x86, "ResponseOnEvent"),
     (0x87, "LinkControl"),
+    // Reserved for whom builds the ECU.
+    (0xBA, SUPPLIER),
+    (0xBB, SUPPLIER),
+    (0xBC, SUPPLIER),
+    (0xBD, SUPPLIER),
+    (0xBE, SUPPLIER),
 ];
+
+const SUPPLIER: &str = "system supplier specific";
 
 /// Services of ISO 14230-3 that are not in ISO 14229.
 const KWP_SERVICES: [(u8, &str); 14] = [

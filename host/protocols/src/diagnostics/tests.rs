@@ -393,3 +393,46 @@ fn requests_without_answers_show_what_is_spoken() {
     );
     assert_eq!(found(&["7E0#023E00", "100#0322F190"]), []);
 }
+
+#[test]
+fn a_service_that_no_standard_names_is_refused_as_it_was_asked_for() {
+    // As a scan of all services goes.
+    assert_eq!(
+        said(&[(0.0, "7E0#02BF01"), (1.0, "7E8#037FBF11"), (10.0, "7E0#013F"), (11.0, "7E8#037F3F11")]),
+        [
+            "isotp 7E0 > 7E8 transfer: length 2 bytes, data BF 01",
+            "uds 7E0 > 7E8 service BF: sid 0xBF, parameters 01, nrc 0x11 (serviceNotSupported), after 1 ms",
+            "isotp 7E0 > 7E8 transfer: length 1 bytes, data 3F",
+            "uds 7E0 > 7E8 service 3F: sid 0x3F, nrc 0x11 (serviceNotSupported), after 1 ms",
+        ]
+    );
+    // One that asks for time first, and answers.
+    assert_eq!(
+        said(&[(0.0, "7E0#02A501"), (1.0, "7E8#037FA578"), (3000.0, "7E8#02E501")]),
+        [
+            "isotp 7E0 > 7E8 transfer: length 2 bytes, data A5 01",
+            "uds 7E0 > 7E8 service A5: sid 0xA5, parameters 01, value 01, pending 1 times, after 3000 ms",
+        ]
+    );
+    // Too late, another service, or another server: its request was not heard.
+    for (frames, heard) in [
+        (&[(0.0, "7E0#02BF01"), (2001.0, "7E8#037FBF11")][..], false),
+        (&[(0.0, "7E0#02BF01"), (1.0, "7E8#037FB911")], false),
+        (&[(0.0, "7E0#02BF01"), (1.0, "7E9#037FBF11")], false),
+        (&[(0.0, "7DF#02BF01"), (1.0, "7E9#037FBF11")], true),
+    ] {
+        let said = said(frames);
+        assert_eq!(!said[1].contains("not heard"), heard, "{said:?}");
+    }
+}
+
+#[test]
+fn services_of_the_system_supplier_are_requests_too() {
+    assert_eq!(
+        said(&[(0.0, "7E0#03BA1205"), (1.0, "7E8#02FA05"), (10.0, "7E0#02BE01"), (11.0, "7E8#037FBE31")]),
+        [
+            "uds 7E0 > 7E8 system supplier specific: sid 0xBA, parameters 12 05, value 05, after 1 ms",
+            "uds 7E0 > 7E8 system supplier specific: sid 0xBE, parameters 01, nrc 0x31 (requestOutOfRange), after 1 ms",
+        ]
+    );
+}

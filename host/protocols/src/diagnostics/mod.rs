@@ -29,6 +29,7 @@ mod scaling;
 #[cfg(test)]
 mod tests;
 mod uds;
+mod unnamed;
 mod values;
 
 pub use dtc::Dtc;
@@ -41,9 +42,10 @@ use std::borrow::Cow;
 use std::collections::VecDeque;
 
 use cantap_trace::TraceRecord;
-use rustc_hash::FxHashSet;
+use rustc_hash::FxHashMap;
 
 use self::periodic::Periodic;
+use self::unnamed::Unnamed;
 use crate::iso_tp::{Endpoint, Pair, Transfer, Transport};
 use crate::{Assembler, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
@@ -55,13 +57,13 @@ const RESPONSE_NS: i64 = 2_000_000_000;
 /// The same after the server has said that the response is pending: P2* is 5 s by default.
 const PENDING_NS: i64 = 10_000_000_000;
 const RESPONSE_PENDING: u8 = 0x78;
+/// The service is not supported, or not in this session.
+const UNKNOWN_SERVICE: [u8; 2] = [0x11, 0x7F];
 /// How many requests that were given up are kept, and how long, in case that their responses come after all.
 const MOST_LATE: usize = 64;
 const LATE_NS: i64 = 60_000_000_000;
 /// How long after its last frame a response may still be under way: longer than [`crate::iso_tp`] waits for the next frame.
 const UNDER_WAY_NS: i64 = 1_200_000_000;
-/// How many messages of unnamed services are kept.
-const MOST_UNNAMED: usize = 64;
 /// How many senders known to use KWP2000 are kept.
 const MOST_KWP: usize = 1024;
 
@@ -96,13 +98,12 @@ pub struct Diagnostics {
     waiting: VecDeque<Waiting>,
     /// Requests that were given up.
     late: VecDeque<Transfer>,
-    /// The last message of each sender, of a service that no standard names.
-    unnamed: VecDeque<Transfer>,
+    unnamed: Unnamed,
     periodic: Periodic,
     /// No request times out before this time.
     due_ns: i64,
-    /// Both sides of pairs that used a service that only KWP2000 has.
-    speaks_kwp: FxHashSet<(u8, Endpoint)>,
+    /// Both sides of pairs that used a service that only KWP2000 has, and whether it was answered.
+    speaks_kwp: FxHashMap<(u8, Endpoint), bool>,
     transfers: Vec<Transfer>,
 }
 
@@ -133,7 +134,8 @@ impl Diagnostics {
             self.response(&transfer, events);
         } else {
             if sid & 0x40 == 0 {
-                self.keep_unnamed(&transfer);
+                let to = transfer.to.or_else(|| self.transport.partner(transfer.channel, transfer.from));
+                self.unnamed.keep(Transfer { to, ..transfer.clone() });
             }
             events.push(transfer.into());
         }
@@ -147,24 +149,34 @@ impl Diagnostics {
         if let Some(name) = names::kwp_only_service(sid) {
             return Some((Protocol::Kwp2000, name.into()));
         }
-        if !self.speaks_kwp.is_empty() && self.speaks_kwp.contains(&(transfer.channel, transfer.from)) {
+        if !self.speaks_kwp.is_empty() && self.speaks_kwp.contains_key(&(transfer.channel, transfer.from)) {
             return names::kwp_service(sid).map(|name| (Protocol::Kwp2000, name.into()));
         }
         names::uds_service(sid).map(|name| (Protocol::Uds, name.into()))
     }
 
-    /// Both sides of this transfer use KWP2000.
-    fn is_kwp(&mut self, transfer: &Transfer) {
-        if self.speaks_kwp.len() < MOST_KWP {
-            self.speaks_kwp.insert((transfer.channel, transfer.from));
-            self.speaks_kwp.extend(transfer.to.map(|to| (transfer.channel, to)));
+    /// Both sides of this transfer use KWP2000, which the server's answer shows or not yet.
+    fn is_kwp(&mut self, transfer: &Transfer, is_answered: bool) {
+        for side in [Some(transfer.from), transfer.to].into_iter().flatten() {
+            if self.speaks_kwp.len() < MOST_KWP {
+                *self.speaks_kwp.entry((transfer.channel, side)).or_default() |= is_answered;
+            }
+        }
+    }
+
+    /// This server does not have the service, as in a scan of all services: that it was asked for does not make it KWP2000.
+    fn is_not_kwp(&mut self, refusal: &Transfer, request: &Transfer) {
+        for side in [refusal.from, request.from] {
+            if self.speaks_kwp.get(&(refusal.channel, side)) == Some(&false) {
+                self.speaks_kwp.remove(&(refusal.channel, side));
+            }
         }
     }
 
     fn request(&mut self, mut transfer: Transfer, events: &mut Vec<Event>) {
         let sid = transfer.data[0];
         if names::kwp_only_service(sid).is_some() {
-            self.is_kwp(&transfer);
+            self.is_kwp(&transfer, false);
         }
         transfer.to = transfer.to.or_else(|| self.transport.partner(transfer.channel, transfer.from));
         let is_uds = self.service(&transfer, sid).is_some_and(|(protocol, _)| protocol == Protocol::Uds);
@@ -201,27 +213,9 @@ impl Diagnostics {
         self.waiting.push_back(Waiting { request, is_wanted, pending, until_ns, answers: 0, frames_lost });
     }
 
-    /// Keeps a message that turns out to be a request if it is refused.
-    fn keep_unnamed(&mut self, transfer: &Transfer) {
-        self.unnamed.retain(|before| (before.channel, before.from) != (transfer.channel, transfer.from));
-        if self.unnamed.len() == MOST_UNNAMED {
-            self.unnamed.pop_front();
-        }
-        let to = transfer.to.or_else(|| self.transport.partner(transfer.channel, transfer.from));
-        self.unnamed.push_back(Transfer { to, ..transfer.clone() });
-    }
-
     /// The message of an unnamed service that is refused here, from now on among those that wait.
     fn refused_unnamed(&mut self, response: &Transfer, sid: u8, events: &mut Vec<Event>) -> Option<usize> {
-        let place = self.unnamed.iter().rposition(|request| {
-            self.is_answer(request, response, sid)
-                && response.start_ns.saturating_sub(request.time_ns) <= RESPONSE_NS
-                && match request.to {
-                    Some(to) => to == response.from,
-                    None => request.from.id.is_extended() == response.from.id.is_extended(),
-                }
-        })?;
-        let request = self.unnamed.remove(place)?;
+        let request = self.unnamed.take(response, sid)?;
         self.wait_for(request, true, events);
         self.waiting.len().checked_sub(1)
     }
@@ -244,7 +238,7 @@ impl Diagnostics {
         request.channel == response.channel
             && request.data.first() == Some(&sid)
             && (response.data[0] == 0x7F || {
-                let is_kwp = self.speaks_kwp.contains(&(request.channel, request.from));
+                let is_kwp = self.speaks_kwp.contains_key(&(request.channel, request.from));
                 repeats_its_request(is_kwp, &request.data, &response.data) != Some(false)
             })
     }
@@ -257,9 +251,9 @@ impl Diagnostics {
             return;
         };
         let answered = self.answered(place, transfer.from);
-        if matches!(transfer.data[..], [0x50, 0x80..=0xFF, ..]) {
-            // Sessions of KWP2000 have numbers above 80; UDS has a bit there that responses do not repeat.
-            self.is_kwp(&Transfer { to: Some(transfer.from), ..answered.request.clone() });
+        // Sessions of KWP2000 have numbers above 80; UDS has a bit there that responses do not repeat.
+        if names::kwp_only_service(sid).is_some() || matches!(transfer.data[..], [0x50, 0x80..=0xFF, ..]) {
+            self.is_kwp(&Transfer { to: Some(transfer.from), ..answered.request.clone() }, true);
         }
         self.periodic.learn(transfer.channel, transfer.from, &answered.request.data);
         events.push(self.event(&answered.request, Some((transfer, &answered)), "exchange"));
@@ -302,6 +296,9 @@ impl Diagnostics {
         let mut event = self.event(&answered.request, Some((transfer, &answered)), "exchange");
         event.kind = "refusal";
         events.push(event);
+        if names::kwp_only_service(sid).is_some() && UNKNOWN_SERVICE.contains(&nrc) {
+            self.is_not_kwp(transfer, &answered.request);
+        }
     }
 
     /// A response whose request was not observed, or no longer waits for it.
@@ -469,9 +466,7 @@ impl Assembler for Diagnostics {
             {
                 waiting.frames_lost = true;
             }
-            for request in self.unnamed.iter_mut().filter(|request| request.channel == record.channel) {
-                request.frames_lost = true;
-            }
+            self.unnamed.frames_lost(record.channel);
         }
         let mut transfers = std::mem::take(&mut self.transfers);
         self.transport.take(record, &mut |transfer| transfers.push(transfer));

@@ -139,7 +139,13 @@ pub fn response(sid: u8, mut rest: &[u8], fields: &mut Vec<Field>) {
                 }
                 return;
             }
-            if text && count > 0 {
+            // A VIN has 17 characters, and may be filled up with zeros in front.
+            let filled = items.iter().take_while(|byte| **byte == 0).count();
+            if pid == 0x02 && count > 0 && items.len() - filled > 17 {
+                let (vin, after) = items[filled..].split_at(17);
+                fields.push(Field::text(name, letters(vin)));
+                fields.push(Field::bytes("rest", after));
+            } else if text && count > 0 {
                 fields.push(Field::text(name, letters(items)));
             } else {
                 fields.push(Field::number("items", count));
@@ -255,6 +261,13 @@ mod tests {
             "pid 0x08 (in-use performance, spark ignition), count 5, count 256"
         );
         assert_eq!(said(8, &[0, 0xC0, 0, 0, 0]), "tid 0x00 (supported), supported \"01 02\"");
-        assert_eq!(said(9, b"\x02\x01WVWZZZ1KZAW000001"), "pid 0x02 (VIN), vin \"WVWZZZ1KZAW000001\"");
+        for vin in [&b"\x02\x01WVWZZZ1KZAW000001"[..], b"\x02\x01\0\0\0WVWZZZ1KZAW000001"] {
+            assert_eq!(said(9, vin), "pid 0x02 (VIN), vin \"WVWZZZ1KZAW000001\"");
+        }
+        // With another item behind it, which J1979 does not allow, but scapy's tests have.
+        assert_eq!(
+            said(9, b"\x02\x01ABCDEFGHIJKLMNOPQ\x04\x01AB"),
+            "pid 0x02 (VIN), vin \"ABCDEFGHIJKLMNOPQ\", rest 04 01 41 42"
+        );
     }
 }

@@ -436,3 +436,30 @@ fn services_of_the_system_supplier_are_requests_too() {
         ]
     );
 }
+
+#[test]
+fn a_scan_of_all_services_does_not_make_a_server_one_of_kwp2000() {
+    let read = (20.0, "7E0#0322F190");
+    let value = (21.0, "7E8#0562F1904142");
+    for (answer, expected) in [
+        ("7E8#037F2111", "uds 7E0 > 7E8 ReadDataByIdentifier"),
+        ("7E8#037F217F", "uds 7E0 > 7E8 ReadDataByIdentifier"),
+        // It has the service.
+        ("7E8#037F2131", "kwp2000 7E0 > 7E8 readDataByCommonIdentifier"),
+        ("7E8#03610141", "kwp2000 7E0 > 7E8 readDataByCommonIdentifier"),
+    ] {
+        let said = said(&[(0.0, "7E0#022101"), (1.0, answer), read, value]);
+        assert!(said[0].starts_with("kwp2000 7E0 > 7E8 readDataByLocalIdentifier"), "{said:?}");
+        assert!(said[1].starts_with(expected), "{said:?}");
+    }
+    // Nor does a refusal make a server of KWP2000 one of UDS.
+    let said = said(&[
+        (0.0, "7E0#021A90"),
+        (1.0, "7E8#035A9041"),
+        (10.0, "7E0#022101"),
+        (11.0, "7E8#037F2111"),
+        read,
+        value,
+    ]);
+    assert!(said[2].starts_with("kwp2000"), "{said:?}");
+}

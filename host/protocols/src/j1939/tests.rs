@@ -25,7 +25,7 @@ fn a_broadcast_of_trouble_codes_is_one_message() {
             "j1939 0 > all DM1 active trouble codes: pgn 65226, priority 7, transport \"BAM\", length 10 bytes, \
           malfunction_lamp \"off\", red_stop_lamp \"off\", amber_warning_lamp \"on\", protect_lamp \"off\", trouble_codes 2, \
           codes \"SPN 2750 FMI 3 (voltage above normal or shorted high) 2 times in an old conversion: SPN 389200 by version 1, 22000 by version 2, \
-          SPN 7969 FMI 3 (voltage above normal or shorted high)\", spn 2750, fmi 3, occurrences 2, spn 7969, fmi 3"
+          SPN 7969 FMI 3 (voltage above normal or shorted high)\", spn 2750, fmi 3, occurrences 2, spn 7969, fmi 3, occurrences not available"
         ]
     );
 }

@@ -45,9 +45,12 @@ pub fn fields(data: &[u8], fields: &mut Vec<Field>) {
         }
         each.push(Field::number("spn", spn));
         each.push(Field::number("fmi", fmi));
-        if times != 0x7F {
-            each.push(Field::number("occurrences", times));
-        }
+        // Also without a value, so that the same number of each belongs to one code.
+        each.push(if times == 0x7F {
+            Field::missing("occurrences")
+        } else {
+            Field::number("occurrences", times)
+        });
         count += 1;
     }
     fields.push(Field::number("trouble_codes", count));

@@ -128,7 +128,7 @@ impl Pdos {
                 is_short = true;
                 break;
             }
-            let bytes = cut(data, at, bits);
+            let mut bytes = cut(data, at, bits);
             at += bits;
             // Below 20h it is a type: a placeholder for unused bytes.
             if index < 0x20 {
@@ -139,19 +139,35 @@ impl Pdos {
             let name = name.or_else(|| names::object(index).map(str::to_owned));
             let mut field = Field::bytes(name.unwrap_or_else(|| format!("{index:04X}:{of:02X}")), &[]);
             let data_type = known.and_then(|entry| entry.data_type).or_else(|| types::known(index, of));
+            if types::is_signed(data_type) {
+                extend_sign(&mut bytes, bits);
+            }
             field.value = types::value(data_type, &bytes);
             event.fields.push(field);
         }
+        let rest = cut(data, at, data.len() * 8 - at);
+        // Fewer than eight bits fill up the last byte.
+        let is_filling = data.len() * 8 - at < 8 && rest[..] == [0];
         if at == 0 {
             event.fields.push(Field::bytes("data", data));
-        } else if at < data.len() * 8 {
+        } else if !rest.is_empty() && !is_filling {
             // Starting at the first bit that is not mapped.
-            event.fields.push(Field::bytes("rest", &cut(data, at, data.len() * 8 - at)));
+            event.fields.push(Field::bytes("rest", &rest));
         }
         if is_short {
             event.trouble = Some(Trouble::Malformed("shorter than what is mapped to it"));
         }
         event
+    }
+}
+
+/// Repeats the sign of an integer of this many bits in the last byte's other ones.
+fn extend_sign(bytes: &mut Bytes, bits: usize) {
+    if !bits.is_multiple_of(8)
+        && let Some(last) = bytes.last_mut()
+        && *last >> (bits % 8 - 1) & 1 == 1
+    {
+        *last |= 0xFF << (bits % 8);
     }
 }
 

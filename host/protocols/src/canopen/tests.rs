@@ -451,3 +451,23 @@ fn an_sdo_frame_without_its_unused_bytes_is_read_and_reported() {
     assert!(said[0].contains("malformed: an SDO frame has 8 bytes"), "{said:?}");
     assert!(said[1].contains("SDO read 1400:02") && said[1].contains("the trace ends here"), "{said:?}");
 }
+
+#[test]
+fn a_signed_integer_of_a_few_bits_keeps_its_sign() {
+    // The PDO of python-canopen's tests.
+    const SHEET: &str = "[DeviceInfo]\n[1A00]\nObjectType=9\n[1A00sub0]\nDefaultValue=6\n[1A00sub1]\nDefaultValue=0x20010010\n\
+        [1A00sub2]\nDefaultValue=0x20020004\n[1A00sub3]\nDefaultValue=0x20030004\n[1A00sub4]\nDefaultValue=0x20040020\n\
+        [1A00sub5]\nDefaultValue=0x20050001\n[1A00sub6]\nDefaultValue=0x20060001\n[2001]\nParameterName=A\nDataType=3\n\
+        [2002]\nParameterName=B\nDataType=5\n[2003]\nParameterName=C\nDataType=2\n[2004]\nParameterName=D\nDataType=4\n\
+        [2005]\nParameterName=E\nDataType=1\n[2006]\nParameterName=F\nDataType=1\n";
+    let said = |frame| {
+        let sheet = Sheet { node: Some(1), eds: Eds::parse(SHEET.as_bytes()).into() };
+        testing::said(CanOpen::new(vec![sheet]), &[(0.0, frame)])
+    };
+    assert_eq!(said("181#FDFFEF0403020102"), ["canopen 1 TPDO1: A -3, B 15, C -2, D 16909060, E 0, F 1"]);
+    // What is left is shown unless it only fills up the last byte.
+    assert_eq!(
+        said("181#FDFF7F0403020106"),
+        ["canopen 1 TPDO1: A -3, B 15, C 7, D 16909060, E 0, F 1, rest 01"]
+    );
+}

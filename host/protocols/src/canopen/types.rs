@@ -36,6 +36,11 @@ pub fn value(data_type: Option<u16>, bytes: &[u8]) -> Value {
     }
 }
 
+/// Whether the type is an integer with a sign.
+pub const fn is_signed(data_type: Option<u16>) -> bool {
+    matches!(data_type, Some(0x02 | 0x03 | 0x04 | 0x10 | 0x12..=0x15))
+}
+
 /// The types of the communication profile's objects, for buses without an EDS.
 pub const fn known(index: u16, sub: u8) -> Option<u16> {
     Some(match (index, sub) {

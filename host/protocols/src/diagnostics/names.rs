@@ -41,7 +41,7 @@ const UDS_SERVICES: [(u8, &str); 32] = [
 const SUPPLIER: &str = "system supplier specific";
 
 /// Services of ISO 14230-3 that are not in ISO 14229.
-const KWP_SERVICES: [(u8, &str); 14] = [
+const KWP_SERVICES: [(u8, &str); 16] = [
     (0x12, "readFreezeFrameData"),
     (0x13, "readDiagnosticTroubleCodes"),
     (0x17, "readStatusOfDiagnosticTroubleCodes"),
@@ -53,18 +53,24 @@ const KWP_SERVICES: [(u8, &str); 14] = [
     (0x30, "inputOutputControlByLocalIdentifier"),
     (0x32, "stopRoutineByLocalIdentifier"),
     (0x33, "requestRoutineResultsByLocalIdentifier"),
+    (0x39, "stopRoutineByAddress"),
+    (0x3A, "requestRoutineResultsByAddress"),
     (0x3B, "writeDataByLocalIdentifier"),
     (0x81, "startCommunication"),
     (0x82, "stopCommunication"),
 ];
 
-/// Services in both, with their names in ISO 14230-3 where those differ.
-const KWP_SHARED: [(u8, &str); 9] = [
+/// Services in both, with their names in ISO 14230-3 where those differ. 28 and 29 are from the draft of KWP2000 on CAN.
+const KWP_SHARED: [(u8, &str); 13] = [
     (0x10, "startDiagnosticSession"),
     (0x14, "clearDiagnosticInformation"),
     (0x22, "readDataByCommonIdentifier"),
     (0x27, "securityAccess"),
+    (0x28, "disableNormalMessageTransmission"),
+    (0x29, "enableNormalMessageTransmission"),
+    (0x2C, "dynamicallyDefineLocalIdentifier"),
     (0x2E, "writeDataByCommonIdentifier"),
+    (0x2F, "inputOutputControlByCommonIdentifier"),
     (0x31, "startRoutineByLocalIdentifier"),
     (0x38, "startRoutineByAddress"),
     (0x3E, "testerPresent"),

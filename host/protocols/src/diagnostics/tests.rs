@@ -463,3 +463,25 @@ fn a_scan_of_all_services_does_not_make_a_server_one_of_kwp2000() {
     ]);
     assert!(said[2].starts_with("kwp2000"), "{said:?}");
 }
+
+#[test]
+fn services_of_kwp2000_have_its_names_where_uds_has_others() {
+    let mut frames = vec![(0.0, "7E0#021A90".to_owned()), (1.0, "7E8#035A9041".to_owned())];
+    let names = [
+        (0x28, "disableNormalMessageTransmission"),
+        (0x29, "enableNormalMessageTransmission"),
+        (0x2C, "dynamicallyDefineLocalIdentifier"),
+        (0x3A, "requestRoutineResultsByAddress"),
+    ];
+    for (number, (sid, _)) in names.iter().enumerate() {
+        let time = 10.0 * (number + 1) as f64;
+        frames.push((time, format!("7E0#02{sid:02X}01")));
+        frames.push((time + 1.0, format!("7E8#02{:02X}01", sid | 0x40)));
+    }
+    let frames: Vec<_> = frames.iter().map(|(time, frame)| (*time, frame.as_str())).collect();
+    let said = said(&frames);
+    for (event, (_, name)) in said[1..].iter().zip(names) {
+        assert!(event.starts_with(&format!("kwp2000 7E0 > 7E8 {name}: ")), "{said:?}");
+    }
+    assert_eq!(said.len(), 5);
+}

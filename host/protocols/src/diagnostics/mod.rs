@@ -215,7 +215,7 @@ impl Diagnostics {
 
     /// The message of an unnamed service that is refused here, from now on among those that wait.
     fn refused_unnamed(&mut self, response: &Transfer, sid: u8, events: &mut Vec<Event>) -> Option<usize> {
-        let request = self.unnamed.take(response, sid)?;
+        let request = self.unnamed.take(response, sid, RESPONSE_NS)?;
         self.wait_for(request, true, events);
         self.waiting.len().checked_sub(1)
     }

@@ -2,7 +2,6 @@
 
 use std::collections::VecDeque;
 
-use super::RESPONSE_NS;
 use crate::iso_tp::Transfer;
 
 /// How many messages are kept.
@@ -21,12 +20,12 @@ impl Unnamed {
         self.0.push_back(transfer);
     }
 
-    /// Takes out the request for `sid` that this refuses.
-    pub fn take(&mut self, refusal: &Transfer, sid: u8) -> Option<Transfer> {
+    /// Takes out the request for `sid` that this refuses, if it came at most so many nanoseconds before.
+    pub fn take(&mut self, refusal: &Transfer, sid: u8, within_ns: i64) -> Option<Transfer> {
         let place = self.0.iter().rposition(|request| {
             request.channel == refusal.channel
                 && request.data.first() == Some(&sid)
-                && refusal.start_ns.saturating_sub(request.time_ns) <= RESPONSE_NS
+                && refusal.start_ns.saturating_sub(request.time_ns) <= within_ns
                 && match request.to {
                     Some(to) => to == refusal.from,
                     None => request.from.id.is_extended() == refusal.from.id.is_extended(),

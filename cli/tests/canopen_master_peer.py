@@ -88,8 +88,11 @@ def main(host, port, sheet):
     said["emergency"] = [node.emcy.log[-1].code, node.emcy.log[-1].register]
 
     # The node without a number.
-    network.lss.RESPONSE_TIMEOUT = 0.15
-    found, identity = network.lss.fast_scan()
+    # Silence is an answer here, so a short wait finds a busy computer's node nowhere, and a long one takes minutes.
+    for network.lss.RESPONSE_TIMEOUT in (0.15, 0.5, 1.5):
+        found, identity = network.lss.fast_scan()
+        if found:
+            break
     said["found"], said["identity"] = found, list(identity)
     network.lss.RESPONSE_TIMEOUT = 5.0
     said["inquired"] = network.lss.inquire_lss_address(0x5D)

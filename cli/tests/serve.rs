@@ -318,9 +318,7 @@ fn a_capture_over_a_real_ssh_is_one_made_beside_it() {
     let folder = tempfile::tempdir().unwrap();
     let sshd = match sshd(folder.path()) {
         Ok(sshd) => sshd,
-        Err(reason) => {
-            return peers::skip(&reason);
-        }
+        Err(reason) => return peers::skip_without("ssh", &reason),
     };
     let path = socket(folder.path());
     let server = Server::start(&format!("-d virtual:load=70 -b 500k --unix {path} --allow send"), 1);

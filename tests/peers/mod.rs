@@ -1,7 +1,7 @@
 //! Other people's programs that tests run as witnesses.
 //!
 //! Python is `CANTAP_PYTHON`, otherwise `python3`. If a program is missing, its test says so and passes, unless
-//! `CANTAP_REQUIRE_PEERS=1`.
+//! `CANTAP_REQUIRE_PEERS=1`. Even then `CANTAP_WITHOUT_PEERS` may name some that were left out on purpose.
 
 #![allow(dead_code, reason = "each test uses some of it")]
 
@@ -31,4 +31,14 @@ pub fn skip(reason: &str) {
     let is_required = std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1");
     assert!(!is_required, "peers are required, but {reason}");
     eprintln!("SKIPPED: {reason}");
+}
+
+/// The same for a peer that may have been left out on purpose, which is then not required.
+pub fn skip_without(peer: &str, reason: &str) {
+    let left_out = std::env::var("CANTAP_WITHOUT_PEERS").unwrap_or_default();
+    if left_out.split_whitespace().any(|name| name == peer) {
+        eprintln!("SKIPPED: {reason}");
+    } else {
+        skip(reason);
+    }
 }

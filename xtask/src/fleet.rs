@@ -16,9 +16,8 @@ const JAVA: &str = "openjdk-17-jre-headless";
 pub fn check(shell: &Shell, wheel: &Path) -> Result<()> {
     if !toolchain::is_installed("java") {
         if !toolchain::can_install() {
-            let is_wanted = std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1");
             ensure!(
-                !is_wanted,
+                !peers::are_required(),
                 "Spark needs Java 17: run `apt-get install {JAVA}` or your system's equivalent"
             );
             println!("the fleet's job was not run: run `apt-get install {JAVA}` or your system's equivalent");

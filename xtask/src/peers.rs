@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use anyhow::Result;
+use anyhow::{Result, ensure};
 use xshell::{Shell, cmd};
 
 use crate::toolchain::{self, is_installed};
@@ -10,9 +10,9 @@ use crate::workspace;
 
 /// Programs from Debian's packages: a program, and the package that has it.
 const PROGRAMS: [(&str, &str); 2] = [("log2asc", "can-utils"), ("tshark", "tshark")];
-/// Installed only where no peer may be skipped: its package starts a server that other computers can reach, which nobody wants
-/// except on a test machine.
-const SSH_SERVER: (&str, &str) = ("/usr/sbin/sshd", "openssh-server");
+/// The server, the client, and the package that brings both. Installed only in CI, or if no peer may be skipped: the package starts
+/// a server that other computers can reach, which nobody wants except on a test machine.
+const SSH: ([&str; 2], &str) = (["/usr/sbin/sshd", "ssh"], "openssh-server");
 /// Python packages, with their versions.
 pub const REQUIREMENTS: &str = "xtask/peers.txt";
 
@@ -20,19 +20,28 @@ pub const REQUIREMENTS: &str = "xtask/peers.txt";
 pub struct Peers {
     /// A Python that has all the modules.
     pub python: PathBuf,
+    /// Those that were not installed on purpose, by the names that tests use (`peers::skip_without`).
+    pub left_out: Vec<&'static str>,
 }
 
 impl Peers {
     /// Finds the peers, and installs what is missing if possible. If not, prints what to run and
     /// returns `None`: the tests that need the peers then say that they were skipped.
     pub fn find_or_install(shell: &Shell) -> Result<Option<Self>> {
-        let must_not_skip = std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1");
-        let missing: Vec<&str> = PROGRAMS
+        let mut missing: Vec<&str> = PROGRAMS
             .iter()
-            .chain(must_not_skip.then_some(&SSH_SERVER))
             .filter(|(program, _)| !is_installed(program))
             .map(|(_, package)| *package)
             .collect();
+        let mut left_out = Vec::new();
+        if !SSH.0.iter().all(|program| is_installed(program)) {
+            if are_required() || std::env::var_os("CI").is_some() {
+                missing.push(SSH.1);
+            } else {
+                println!("not compared with a real ssh: run `apt-get install {}` for that", SSH.1);
+                left_out.push("ssh");
+            }
+        }
         if !missing.is_empty() {
             let packages = missing.join(" ");
             if !toolchain::can_install() {
@@ -43,8 +52,33 @@ impl Peers {
             }
             toolchain::install(shell, &missing)?;
         }
-        Ok(Some(Peers { python: venv(shell)?.join("bin/python") }))
+        if !has_venv(shell)? {
+            println!("not compared with Python's packages: {NO_VENV}");
+            return Ok(None);
+        }
+        Ok(Some(Peers { python: venv(shell)?.join("bin/python"), left_out }))
     }
+}
+
+/// What to do where there are no Python environments.
+pub const NO_VENV: &str = "run `apt-get install python3-venv` or your system's equivalent";
+
+/// Whether a missing peer is a failure.
+pub fn are_required() -> bool {
+    std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1")
+}
+
+/// Whether Python environments can be made here. On Debian, what that takes is in a separate package, which is installed if possible.
+pub fn has_venv(shell: &Shell) -> Result<bool> {
+    let works = || cmd!(shell, "python3 -c 'import ensurepip'").quiet().ignore_stderr().run().is_ok();
+    if is_installed("python3") && works() {
+        return Ok(true);
+    }
+    if !toolchain::can_install() {
+        return Ok(false);
+    }
+    toolchain::install(shell, &["python3-venv"])?;
+    Ok(true)
 }
 
 /// A Python environment with the packages of `peers.txt`.
@@ -60,12 +94,7 @@ pub fn environment(shell: &Shell, name: &str, requirements: &str) -> Result<Path
     if shell.read_file(&installed).is_ok_and(|text| text == wanted) {
         return Ok(venv);
     }
-    // On Debian, what a venv needs is in a separate package.
-    if cmd!(shell, "python3 -c 'import ensurepip'").quiet().ignore_stderr().run().is_err()
-        && toolchain::can_install()
-    {
-        toolchain::install(shell, &["python3-venv"])?;
-    }
+    ensure!(has_venv(shell)?, "no Python environments: {NO_VENV}");
     cmd!(shell, "python3 -m venv --clear {venv}").run()?;
     let python = venv.join("bin/python");
     cmd!(shell, "{python} -m pip install --quiet --retries 10 -r {requirements}").run()?;

@@ -15,11 +15,14 @@ pub fn build(shell: &Shell) -> Result<()> {
 }
 
 /// Runs them all, even if one fails; those on the emulated board use the default board's firmware. If there are peers, none may be
-/// skipped.
+/// skipped but those left out on purpose.
 pub fn run(shell: &Shell, peers: Option<&Peers>) -> Result<()> {
     let mut test = cargo_test(shell)?.arg("--no-fail-fast");
     if let Some(peers) = peers {
-        test = test.env("CANTAP_PYTHON", &peers.python).env("CANTAP_REQUIRE_PEERS", "1");
+        test = test
+            .env("CANTAP_PYTHON", &peers.python)
+            .env("CANTAP_REQUIRE_PEERS", "1")
+            .env("CANTAP_WITHOUT_PEERS", peers.left_out.join(" "));
     }
     Ok(test.run()?)
 }

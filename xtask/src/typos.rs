@@ -4,14 +4,12 @@ use anyhow::Result;
 use xshell::{Shell, cmd};
 
 use crate::outcome::Outcome;
-use crate::{peers, toolchain};
+use crate::peers;
 
 /// Checks every file that belongs to the source.
 pub fn check(shell: &Shell) -> Result<Outcome> {
-    if !toolchain::is_installed("python3") {
-        return Ok(Outcome::Skipped(
-            "typos is installed by Python's pip, and there is no python3".to_owned(),
-        ));
+    if !peers::has_venv(shell)? {
+        return Ok(Outcome::Skipped(format!("typos is installed by Python's pip: {}", peers::NO_VENV)));
     }
     let typos = peers::venv(shell)?.join("bin/typos");
     cmd!(shell, "{typos} --format brief").run()?;

@@ -7,6 +7,8 @@ use cantap::wire::CHANNELS;
 
 use crate::wrong::wrong;
 
+pub use cantap_work::{duration, positive_duration};
+
 /// The most channels that a command supports, over all its devices.
 pub const MOST_CHANNELS: u8 = 32;
 
@@ -36,43 +38,9 @@ pub fn per_second(text: &str) -> Option<u32> {
     (1.0..=f64::from(u32::MAX)).contains(&value).then_some(value as u32)
 }
 
-/// A time: `400ms`, `3s`, `250us`, `2m`, `1h`, or a number of seconds.
-pub fn duration(text: &str) -> Result<Duration, String> {
-    let unit_at = text.find(|symbol: char| symbol.is_ascii_alphabetic()).unwrap_or(text.len());
-    let (number, unit) = text.split_at(unit_at);
-    let seconds = match unit {
-        "us" => 1e-6,
-        "ms" => 1e-3,
-        "" | "s" => 1.0,
-        "m" | "min" => 60.0,
-        "h" => 3600.0,
-        _ => return Err("write a time with its unit, such as 400ms, 3s or 2m".to_owned()),
-    };
-    number
-        .trim_end()
-        .parse::<f64>()
-        .ok()
-        .and_then(|value| Duration::try_from_secs_f64(value * seconds).ok())
-        .ok_or_else(|| "write a time as a number and a unit, such as 400ms, 3s or 2m".to_owned())
-}
-
-/// Like [`duration`], but greater than zero.
-pub fn positive_duration(text: &str) -> Result<Duration, String> {
-    let duration = duration(text)?;
-    if duration.is_zero() { Err("give a time longer than zero".to_owned()) } else { Ok(duration) }
-}
-
 /// In nanoseconds, bounded so that deadlines can be added to it.
 pub fn nanoseconds(time: Duration) -> u64 {
     u64::try_from(time.as_nanos()).unwrap_or(u64::MAX).min(u64::MAX / 4)
-}
-
-/// A percentage, above 0 and up to 100.
-pub fn percent(text: &str) -> Result<f64, String> {
-    let number = text.trim_end_matches('%').trim_end().parse::<f64>().ok();
-    number
-        .filter(|number| *number > 0.0 && *number <= 100.0)
-        .ok_or_else(|| "give per cent, above 0 and up to 100".to_owned())
 }
 
 /// Channels, as `1`, `2`, several separated by commas, or `both`, which means all.

@@ -4,7 +4,7 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use crate::interrupt;
+use cantap_work::interrupt;
 
 /// A temporary file beside the one to be written. It has the same suffix, so that it has the same format and compression.
 pub struct Beside {

@@ -9,9 +9,9 @@ use cantap_trace::filter::Filter;
 
 use crate::ahead::{Ahead, Step};
 use crate::completion;
-use crate::interrupt;
 use crate::live::{LiveArgs, LiveRecords};
 use crate::missing::Missing;
+use cantap_work::interrupt;
 
 /// How to read a trace; commands flatten this into their arguments.
 #[derive(clap::Args)]

@@ -16,7 +16,8 @@ use crate::channel_args::{self, ChannelArgs};
 use crate::channel_bitrate::ChannelBitrate;
 use crate::completion;
 use crate::hearing::{self, Hearing};
-use crate::{advice, args, interrupt, stderr};
+use crate::{advice, args, stderr};
+use cantap_work::interrupt;
 
 /// Which devices, and how; commands flatten this into their arguments, in addition to an input file.
 #[derive(clap::Args)]

@@ -7,7 +7,7 @@ use cantap::recovery::Recovery;
 use cantap::wire::record::TransmitFailure;
 use cantap::{Device, DeviceError};
 
-use crate::interrupt;
+use cantap_work::interrupt;
 
 /// How often [`Rescue::wait`] checks.
 const WAIT_EVERY: Duration = Duration::from_millis(5);

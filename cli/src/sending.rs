@@ -14,9 +14,9 @@ use cantap::wire::record::TransmitFailure;
 use cantap::wire::{CHANNELS, Channel};
 use cantap::{Device, TraceRecord};
 
-use crate::interrupt;
 use crate::rescue::Rescue;
 use crate::words::failure_name;
+use cantap_work::interrupt;
 
 /// How often to check whether to continue.
 pub const LOOK_EVERY: Duration = Duration::from_millis(20);

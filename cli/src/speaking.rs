@@ -16,6 +16,7 @@ use cantap_address::{Address, OpenDevice};
 use cantap_protocols::active::Machine;
 use cantap_protocols::{Assembler, Event};
 
+use crate::args;
 use crate::boards::the_one_connected;
 use crate::channel_args::ChannelArgs;
 use crate::channel_bitrate::ChannelBitrate;
@@ -25,7 +26,7 @@ use crate::hearing::{self, Hearing};
 use crate::sending::Sending;
 use crate::words::{counted, state_name};
 use crate::wrong::wrong;
-use crate::{args, interrupt};
+use cantap_work::interrupt;
 
 /// The longest time between two checks of what is being sent, and of Ctrl-C.
 const LOOK_EVERY: Duration = Duration::from_millis(20);

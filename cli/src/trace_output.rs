@@ -117,11 +117,25 @@ impl TraceOutput {
 /// The options with the format of the file's name, if no other is given.
 pub fn named(mut options: WriteOptions, path: &Path) -> anyhow::Result<WriteOptions> {
     if options.format.is_none() && path.as_os_str() != "-" {
+        #[cfg(not(feature = "parquet"))]
+        refuse_parquet(path)?;
         let format = Format::of_path(path);
         let format = format.map_err(|error| io::Error::new(io::ErrorKind::InvalidInput, error));
         options.format = Some(format.with_context(|| failed(path))?);
     }
     Ok(options)
+}
+
+/// A build from the source tree omits what takes longest to compile.
+#[cfg(not(feature = "parquet"))]
+pub fn refuse_parquet(path: &Path) -> anyhow::Result<()> {
+    if path.extension().is_some_and(|suffix| suffix.eq_ignore_ascii_case("parquet")) {
+        bail!(
+            "this build has no Parquet; add `--features parquet` to its command line, or install the command with \
+             `cargo install --locked --path cli`"
+        );
+    }
+    Ok(())
 }
 
 /// Refuses to overwrite what a bus said once and will not say again.
@@ -147,4 +161,20 @@ pub fn report(left_out: &LeftOut, path: &Path) {
 /// The message if it cannot be written.
 pub fn failed(path: &Path) -> String {
     format!("cannot write {}", shown(path))
+}
+
+/// The trace of `cantap demo`.
+pub fn of_demo(path: &Path, format: Option<Format>) -> anyhow::Result<Box<dyn cantap_demo::Output>> {
+    let options = WriteOptions { format, ..WriteOptions::default() };
+    Ok(Box::new(TraceOutput::create(path, &options, false)?))
+}
+
+impl cantap_demo::Output for TraceOutput {
+    fn write(&mut self, record: &TraceRecord) -> anyhow::Result<()> {
+        self.write(record)
+    }
+
+    fn finish(self: Box<Self>) -> anyhow::Result<()> {
+        TraceOutput::finish(*self).map(drop)
+    }
 }

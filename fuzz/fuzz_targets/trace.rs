@@ -1,7 +1,7 @@
 //! What the targets of all trace readers share. Seeds: `host/formats/tests/data/nmea2000.log.gz` converted to each
 //! format.
 
-#[path = "../../host/formats/tests/traces/mixed.rs"]
+#[path = "../../host/formats/tests/it/traces/mixed.rs"]
 mod mixed;
 
 use std::io::Cursor;

@@ -1,4 +1,4 @@
-"""python-can's own tests, unchanged, on the analyser. They are fetched, not copied: `cargo xtask test --only python` does that."""
+"""python-can's own tests, unchanged, on the analyser. They are fetched, not copied: `cargo xtask ci --only python` does that."""
 
 import os
 import pathlib

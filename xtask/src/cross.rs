@@ -66,10 +66,10 @@ pub const SYSTEMS: &[Check] = &[
 ];
 
 /// Runs the checks, for each target that has a standard library here.
-pub fn check(shell: &Shell, toolchain: Toolchain, checks: &[Check]) -> Result<Outcome> {
+pub fn check(shell: &Shell, chip: Option<Toolchain>, checks: &[Check]) -> Result<Outcome> {
     let mut skipped = Vec::new();
     for Check { target, arguments, needs } in checks {
-        let Some(toolchain) = toolchain.with_std(shell, target)? else {
+        let Some(toolchain) = Toolchain::with_std(chip, shell, target)? else {
             skipped.push(format!("no standard library for {target}; run `rustup target add {target}`"));
             continue;
         };

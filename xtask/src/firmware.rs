@@ -6,6 +6,7 @@ use anyhow::Result;
 use xshell::Shell;
 
 use crate::board::Board;
+use crate::size;
 use crate::toolchain::{TARGET, Toolchain};
 use crate::workspace;
 
@@ -37,6 +38,12 @@ pub fn build_all(shell: &Shell, toolchain: Toolchain, boards: &[Board]) -> Resul
         println!("{}", board.elf().display());
     }
     Ok(())
+}
+
+/// The same, and holds their memory against the budget.
+pub fn build_checked(shell: &Shell, toolchain: Toolchain, boards: &[Board]) -> Result<()> {
+    build_all(shell, toolchain, boards)?;
+    size::run(boards)
 }
 
 /// Builds for one board with its own target directory and returns cargo's ELF.

@@ -1,4 +1,4 @@
-//! `cargo xtask test --only kernel`: the firmware on the emulated board, driven by a stock Linux kernel under QEMU. The scripts are in
+//! `cargo xtask ci --only kernel`: the firmware on the emulated board, driven by a stock Linux kernel under QEMU. The scripts are in
 //! `sim/kernel/`.
 
 use anyhow::{Result, bail, ensure};
@@ -50,7 +50,7 @@ pub fn run(shell: &Shell) -> Result<Outcome> {
 
 /// Not run, for a reason; this is a failure if peers are required.
 fn skip(reason: String) -> Result<Outcome> {
-    if std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1") {
+    if crate::peers::are_required() {
         bail!("{reason}");
     }
     Ok(Outcome::Skipped(reason))

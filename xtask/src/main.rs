@@ -1,4 +1,4 @@
-//! The project's own build steps: `cargo xtask firmware | test | circles | links | size | bench | soak | dist`.
+//! The project's own build steps: `cargo xtask firmware | test | ci | circles | links | size | bench | soak | dist`.
 //!
 //! Kept light, because `cargo fw` builds it first: what only measurements and checks need is optional, behind
 //! features.
@@ -20,6 +20,7 @@ mod fleet;
 mod kernel;
 #[cfg(feature = "check")]
 mod links;
+mod machine;
 mod metadata;
 mod outcome;
 mod package;
@@ -28,6 +29,7 @@ mod python;
 mod reproducible;
 mod size;
 mod soak;
+mod steps;
 mod test;
 mod tests;
 mod toolchain;
@@ -50,8 +52,10 @@ struct Cli {
 enum Task {
     /// Builds the firmware into `target/firmware/cantap-BOARD.elf` (also `cargo fw`).
     Firmware(firmware::Args),
-    /// Checks everything that must hold before a change lands, from a fresh clone on.
+    /// Checks what a change needs before it is sent in, from a fresh clone on.
     Test(test::Args),
+    /// Checks everything that must hold before a change lands, from a fresh clone on.
+    Ci(test::Args),
     /// Finds files of one crate that import each other in a circle, and public types of one crate that share a name.
     Circles,
     /// Finds broken links in the pages, and files named there that do not exist.
@@ -70,9 +74,10 @@ fn main() -> ExitCode {
     let result = match Cli::parse().task {
         Task::Firmware(args) => firmware::run(&args),
         Task::Test(args) => test::run(&args),
+        Task::Ci(args) => test::ci(&args),
         Task::Circles => check::circles(),
         Task::Links => check::links(),
-        Task::Size => size::run(),
+        Task::Size => size::run(&board::Board::ALL),
         Task::Bench(args) => bench::run(&args),
         Task::Soak(args) => soak::run(&args),
         Task::Dist(args) => dist::run(&args),

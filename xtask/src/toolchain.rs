@@ -48,16 +48,16 @@ impl Toolchain {
         )
     }
 
-    /// Like [`Self::find`], but on Debian, as root, installs what is missing.
-    pub fn find_or_install(shell: &Shell) -> Result<Self> {
+    /// Like [`Self::find`], but on Debian, as root, installs what is missing. If that is not possible, returns what to do.
+    pub fn find_or_install(shell: &Shell) -> Result<Result<Self, String>> {
         match Self::find(shell) {
-            Ok(toolchain) => Ok(toolchain),
+            Ok(toolchain) => Ok(Ok(toolchain)),
             Err(error) if can_install() => {
                 eprintln!("{error}; installing Debian's");
                 install(shell, &DEBIAN_PACKAGES)?;
-                Self::find(shell)
+                Self::find(shell).map(Ok)
             }
-            Err(error) => Err(error),
+            Err(error) => Ok(Err(error.to_string())),
         }
     }
 
@@ -70,11 +70,11 @@ impl Toolchain {
     }
 
     /// The toolchain that has a standard library for a target, preferably rustup's; `None` if neither has one.
-    pub fn with_std(self, shell: &Shell, target: &str) -> Result<Option<Self>> {
+    pub fn with_std(chip: Option<Self>, shell: &Shell, target: &str) -> Result<Option<Self>> {
         if has_std(shell, target)? {
             return Ok(Some(Toolchain::Rustup));
         }
-        Ok((self == Toolchain::Debian).then_some(self))
+        Ok(chip.filter(|toolchain| *toolchain == Toolchain::Debian))
     }
 
     /// `cargo SUBCOMMAND` for a target; `parts` are the parts of the standard library to build if there is none.

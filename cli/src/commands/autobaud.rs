@@ -8,9 +8,10 @@ use anyhow::bail;
 use cantap::Channel;
 use cantap::autobaud::{self, Limits, Outcome, Progress};
 
+use crate::args;
 use crate::boards::OneBoard;
 use crate::completion;
-use crate::{args, interrupt};
+use cantap_work::interrupt;
 
 /// The command line.
 #[derive(clap::Args)]

@@ -27,7 +27,8 @@ use crate::boards::OneBoard;
 use crate::channel_args::ChannelArgs;
 use crate::hearing::{self, Hearing};
 use crate::wrong::wrong;
-use crate::{advice, args, interrupt, live, stderr};
+use crate::{advice, args, live, stderr};
+use cantap_work::interrupt;
 
 /// The command line.
 #[derive(clap::Args)]

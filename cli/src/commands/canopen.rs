@@ -210,7 +210,7 @@ fn monitor(speak: &SpeakArgs, time: Option<Duration>, sheets: Vec<Sheet>) -> any
     let device = speak.listen()?;
     let mut speaking = speak.speak(&device, Box::new(CanOpen::new(sheets)));
     let started = std::time::Instant::now();
-    while !crate::interrupt::requested() {
+    while !cantap_work::interrupt::requested() {
         let left = time.map(|time| time.saturating_sub(started.elapsed()));
         if left.is_some_and(|left| left.is_zero()) {
             break;

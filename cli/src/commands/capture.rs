@@ -21,11 +21,11 @@ use crate::boards::Boards;
 use crate::channel_args::ChannelArgs;
 use crate::completion;
 use crate::live::LiveRecords;
-use crate::meter::Meter;
 use crate::progress::Progress;
 use crate::trace_output::refuse_older;
 use crate::trigger_args::TriggerArgs;
 use crate::wrong::wrong;
+use cantap_work::Meter;
 
 /// The command line.
 #[derive(clap::Args)]

@@ -15,9 +15,9 @@ use crate::args;
 use crate::columns;
 use crate::completion;
 use crate::input::ReadArgs;
-use crate::interrupt;
 use crate::missing::by_kind;
 use crate::trace_output::{TraceOutput, named};
+use cantap_work::interrupt;
 
 /// The command line.
 #[derive(clap::Args)]

@@ -16,10 +16,10 @@ use crate::args;
 use crate::boards::OneBoard;
 use crate::channel_args::ChannelArgs;
 use crate::completion;
-use crate::interrupt;
-use crate::meter::rounded;
 use crate::sending::Sending;
 use crate::wrong::wrong;
+use cantap_work::interrupt;
+use cantap_work::rounded;
 
 /// The command line.
 #[derive(clap::Args)]

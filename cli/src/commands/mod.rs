@@ -14,7 +14,6 @@ pub mod convert;
 pub mod db;
 pub mod decode;
 pub mod defaults;
-pub mod demo;
 pub mod diff;
 pub mod extcap;
 pub mod r#gen;
@@ -83,7 +82,7 @@ pub enum Command {
     /// Show a trace as signals, using a database.
     Decode(decode::Args),
     /// Capture the worst possible traffic, without a board, and check that nothing is lost silently.
-    Demo(demo::Args),
+    Demo(cantap_demo::Args),
     /// Describe a device.
     Info(info::Args),
     /// List connected boards.
@@ -143,7 +142,7 @@ impl Command {
             Self::Man(args) => man::run(&args, line),
             Self::Db(args) => db::run(&args),
             Self::Decode(args) => decode::run(&args),
-            Self::Demo(args) => demo::run(&args),
+            Self::Demo(args) => cantap_demo::run(&args, &crate::trace_output::of_demo),
             Self::Info(args) => info::run(&args),
             Self::List(args) => list::run(&args),
             #[cfg(unix)]

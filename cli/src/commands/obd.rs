@@ -12,9 +12,10 @@ use cantap_protocols::diagnostics::{Diagnostics, parameter_name};
 use cantap_protocols::iso_tp::{Endpoint, Pair};
 
 use super::uds::{Client, TransferArgs};
+use crate::args;
 use crate::speaking::SpeakArgs;
 use crate::wrong::wrong;
-use crate::{args, interrupt};
+use cantap_work::interrupt;
 
 /// Bits of a list of supported parameters.
 const LIST: u8 = 0x20;

@@ -11,14 +11,15 @@ use cantap::wire::CHANNELS;
 use cantap::wire::message::{ChannelConfig, Mode};
 use cantap::{Channel, Device, TraceEvent, TraceFrame};
 
+use crate::args;
 use crate::boards::OneBoard;
 use crate::channel_args::ChannelArgs;
 use crate::input::ReadArgs;
-use crate::meter::rounded;
 use crate::missing::Missing;
 use crate::sending::Sending;
 use crate::wrong::wrong;
-use crate::{args, interrupt};
+use cantap_work::interrupt;
+use cantap_work::rounded;
 
 /// The command line.
 #[derive(clap::Args)]

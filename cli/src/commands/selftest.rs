@@ -17,7 +17,8 @@ use cantap_address::{Address, OpenDevice};
 
 use self::report::{Outcome, Report};
 use crate::boards::OneBoard;
-use crate::{args, beside, exit, interrupt};
+use crate::{args, beside, exit};
+use cantap_work::interrupt;
 
 /// The command line.
 #[derive(clap::Args)]

@@ -16,14 +16,15 @@ use cantap::{Channel, Device, Frame, Id, hw_filter};
 use cantap_trace::filter::Filter;
 use modifiers::Modifiers;
 
+use crate::args;
 use crate::boards::OneBoard;
 use crate::channel_args::ChannelArgs;
 use crate::completion;
 use crate::databases::DatabaseArgs;
-use crate::meter::rounded;
 use crate::sending::{LOOK_EVERY, Sending};
 use crate::wrong::wrong;
-use crate::{args, interrupt};
+use cantap_work::interrupt;
+use cantap_work::rounded;
 
 /// The command line.
 #[derive(clap::Args)]

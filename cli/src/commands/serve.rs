@@ -25,9 +25,10 @@ use cantap_serve::{Board, BoardError, News, Role, Settings, connect, lines, sock
 use crate::args::Channels;
 use crate::boards::Boards;
 use crate::channel_bitrate::ChannelBitrate;
+use crate::stderr;
 use crate::timing_args::TimingArgs;
 use crate::wrong::wrong;
-use crate::{interrupt, stderr};
+use cantap_work::interrupt;
 
 /// The command line.
 #[derive(clap::Args)]

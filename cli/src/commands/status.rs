@@ -13,7 +13,8 @@ use crate::boards::OneBoard;
 use crate::channel_args::{ChannelArgs, mode_name};
 use crate::completion;
 use crate::wrong::wrong;
-use crate::{args, clock, interrupt};
+use crate::{args, clock};
+use cantap_work::interrupt;
 
 /// The command line.
 #[derive(clap::Args)]

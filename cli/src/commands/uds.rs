@@ -12,9 +12,10 @@ use cantap_protocols::diagnostics::Diagnostics;
 pub use self::client::{Client, TransferArgs};
 use self::hex::{Hex, byte, bytes, number, word};
 use self::key::KeyArgs;
+use crate::args;
 use crate::speaking::SpeakArgs;
 use crate::wrong::wrong;
-use crate::{args, interrupt};
+use cantap_work::interrupt;
 
 /// The command line.
 #[derive(clap::Args)]

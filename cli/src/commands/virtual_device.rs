@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use cantap_virtual::{Options, canopen, car, open_terminal};
 
-use crate::interrupt;
+use cantap_work::interrupt;
 
 /// The command line.
 #[derive(clap::Args)]

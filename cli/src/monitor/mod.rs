@@ -28,8 +28,8 @@ use ratatui::backend::TestBackend;
 use ratatui::buffer::Buffer;
 use ratatui::crossterm::event::{self, Event, KeyEventKind};
 
-use crate::interrupt;
 use app::{App, Flow, Wish};
+use cantap_work::interrupt;
 use keyboard::{Keyboard, Waited};
 use model::{Model, Playing, SourceState};
 use order::Order;

@@ -122,7 +122,7 @@ impl FromStr for Address {
             }
             _ => Place::Serial,
         };
-        Ok(Self { text: text.strip_suffix("virtual:").map_or(text, |_| "virtual").to_owned(), place })
+        Ok(Self { text: if text == "virtual:" { "virtual" } else { text }.to_owned(), place })
     }
 }
 

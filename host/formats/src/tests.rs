@@ -1,6 +1,6 @@
 //! What the tests of all formats have in common: files in memory.
 
-#[path = "../tests/traces/mixed.rs"]
+#[path = "../tests/it/traces/mixed.rs"]
 mod mixed;
 
 use std::io;

@@ -4,8 +4,7 @@
 //! The interpreter is `CANTAP_PYTHON`, otherwise `python3`. Without one, the test says so and passes, unless
 //! `CANTAP_REQUIRE_PEERS=1`.
 
-#[path = "../../../tests/peers/mod.rs"]
-mod peers;
+use cantap_testing::peers;
 
 use std::io::Write;
 use std::process::{Command, Stdio};

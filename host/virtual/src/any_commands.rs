@@ -5,7 +5,7 @@
 //! again. The sequences contain possible and impossible commands, repeated greetings, resets, the bootloader, garbage, a
 //! port that closes and opens, slcan lines, and a host that does not read for a while.
 
-#[path = "../../../tests/arbitrary/mod.rs"]
+#[path = "../../../tests/it/arbitrary/mod.rs"]
 mod arbitrary;
 
 use std::io::Write;

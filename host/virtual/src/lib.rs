@@ -13,14 +13,25 @@
 #[cfg(test)]
 mod any_commands;
 mod board;
+#[cfg(feature = "nodes")]
 pub mod canopen;
+#[cfg(feature = "nodes")]
 pub mod car;
 mod check;
 mod controller;
 mod edges;
 mod flash;
+#[cfg(feature = "nodes")]
+mod log;
+#[cfg(not(feature = "nodes"))]
+#[path = "no_log.rs"]
 mod log;
 mod machine;
+#[cfg(feature = "nodes")]
+mod nodes;
+#[cfg(not(feature = "nodes"))]
+#[path = "no_nodes.rs"]
+mod nodes;
 mod options;
 #[cfg(unix)]
 mod pty;

@@ -17,10 +17,10 @@ use heapless::String;
 use super::board::{
     Ending, FRAME_NS, Filters, ModelClock, TICK_PHASE_NS, VirtualBoard, VirtualChip, VirtualPort,
 };
-use super::car;
 use super::controller::{ControlSide, Controller, TrafficSide};
 use super::edges::VirtualMeter;
 use super::flash::Flash;
+use super::nodes;
 use super::options::Options;
 use crate::simbus::{Node, Schedule, SimBus, Traffic};
 
@@ -99,7 +99,7 @@ impl World {
             flash: Flash::new(options.settings.clone()),
             // This cannot fail: longer ones are refused.
             serial: String::try_from(options.serial.as_str()).unwrap_or_default(),
-            name: if options.car { car::BOARD } else { "virtual" },
+            name: nodes::board(options.car),
             crystal_ppm: options.crystal_ppm,
             now_ns: 0,
         }

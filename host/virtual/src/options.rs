@@ -8,8 +8,7 @@ use std::time::Duration;
 use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
 use cantap_wire::{CHANNELS, Frame};
 
-use crate::canopen::CanOpenBus;
-use crate::car::{self, CarBus};
+use crate::nodes;
 use crate::simbus::{FrameSource, Frames, Schedule, SimBus, Traffic};
 
 /// The largest error of a crystal; a USB host's frames have the same limit (USB 2.0, 7.1.12: 500 ppm).
@@ -182,9 +181,13 @@ impl Options {
                 .ok_or_else(|| bad(&"give per cent, 0 to 100"))
         };
         match key {
-            "car" if value.is_empty() => self.car = true,
-            "canopen" if value.is_empty() => self.canopen = true,
-            "car" | "canopen" => return Err(bad(&"it stands alone")),
+            "car" | "canopen" if !value.is_empty() => return Err(bad(&"it stands alone")),
+            "car" | "canopen" => {
+                if let Some(reason) = nodes::MISSING {
+                    return Err(bad(&reason));
+                }
+                *(if key == "car" { &mut self.car } else { &mut self.canopen }) = true;
+            }
             "load" => self.load_percent = percent()?,
             "errors" => self.error_percent = percent()?,
             "frames" => self.frames = value.parse().map_err(|error| bad(&error))?,
@@ -237,7 +240,7 @@ impl Options {
 
     /// The bit rate of a channel's bus in bit/s, if it is fixed.
     pub fn bitrate_of_bus(&self, channel: usize) -> Option<u32> {
-        if self.car { car::BITRATES_BPS.get(channel).copied() } else { self.bitrate_bps }
+        if self.car { nodes::bitrate_in_car(channel) } else { self.bitrate_bps }
     }
 
     /// A channel's bus.
@@ -245,9 +248,8 @@ impl Options {
         let log = self.log.as_mut().map(|log| std::mem::take(&mut log[channel]));
         let schedule = match (log, self.burst) {
             _ if !self.traffic_on[channel] => Schedule::Silent,
-            _ if self.car => Schedule::Nodes(Box::new(CarBus::new(channel, self.seed))),
-            _ if self.canopen && channel == 0 => Schedule::Nodes(Box::new(CanOpenBus::in_use())),
-            _ if self.canopen => Schedule::Silent,
+            _ if self.car => nodes::car(channel, self.seed),
+            _ if self.canopen => nodes::canopen(channel),
             (Some(entries), _) => Schedule::Log { entries: entries.into_iter() },
             (None, Some((length, period))) => {
                 Schedule::Bursts { source: self.source(channel), length, period_ns: period.as_nanos() as u64 }

@@ -7,7 +7,7 @@ use cantap_sim::firmware;
 use crate::board::Board;
 
 // The test measures the same, for a shorter time.
-#[path = "../../../cli/tests/emulated_clock/measure.rs"]
+#[path = "../../../cli/tests/it/emulated_clock/measure.rs"]
 mod measure;
 
 use measure::Errors;

@@ -1,7 +1,7 @@
 //! One board and eight clients on two saturated channels: what the server consumes, how much delay it adds, and whether each client gets
 //! everything or has its losses counted.
 
-#[path = "../../../host/serve/tests/line/mod.rs"]
+#[path = "../../../host/serve/tests/it/line/mod.rs"]
 mod line;
 
 use std::io::{BufRead, BufReader};

@@ -8,9 +8,10 @@ use cantap_protocols::active::lss::{FastScan, LssAddress, LssError, LssMaster, L
 use cantap_protocols::canopen::CanOpen;
 use serde_json::json;
 
+use crate::args;
 use crate::speaking::{SpeakArgs, Speaking};
 use crate::wrong::wrong;
-use crate::{args, interrupt};
+use cantap_work::interrupt;
 
 /// The command line.
 #[derive(clap::Args)]

@@ -9,8 +9,8 @@ use cantap_signals::trigger::{Trigger, TriggerCounts};
 
 use crate::boards::Boards;
 use crate::live::{Line, LiveRecords};
-use crate::losses::Losses;
-use crate::meter::{Meter, rounded};
+use cantap_work::Losses;
+use cantap_work::{Meter, rounded};
 
 /// A channel in the JSON object.
 #[derive(serde::Serialize)]

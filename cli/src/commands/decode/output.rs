@@ -48,8 +48,10 @@ impl Form {
             // Lines of text in a file named like a spreadsheet or a trace would be mistaken for one.
             Some(_) => {
                 let name = args.output.as_deref().unwrap_or(Path::new("-"));
+                #[cfg(not(feature = "parquet"))]
+                crate::trace_output::refuse_parquet(name)?;
                 return Err(wrong(format!(
-                    "the name '{}' does not tell the form; let it end in .txt, .csv, .json{}, or add --csv or --json",
+                    "the name '{}' does not say which form to write; end it in .txt, .csv, .json{}, or add --csv or --json",
                     name.display(),
                     if cfg!(feature = "parquet") { " or .parquet" } else { "" },
                 )));

@@ -8,8 +8,9 @@ use cantap::autobaud::{self, Limits, Outcome};
 use cantap_address::Address;
 
 use super::super::autobaud::failure;
+use crate::args;
 use crate::channel_bitrate::ChannelBitrate;
-use crate::{args, interrupt};
+use cantap_work::interrupt;
 
 /// The ones offered in a list; any other can be given, too.
 pub const OFFERED: [(&str, &str); 12] = [

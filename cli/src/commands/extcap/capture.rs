@@ -19,8 +19,9 @@ use super::traffic::Traffic;
 use crate::boards::Boards;
 use crate::channel_args::{self, ChannelArgs};
 use crate::live::{Line, LiveRecords};
-use crate::losses::Losses;
-use crate::{advice, args, exit, interrupt};
+use crate::{advice, args, exit};
+use cantap_work::Losses;
+use cantap_work::interrupt;
 
 /// The longest delay of captured records while there are more; on a quiet bus they are passed on immediately. Two saturated channels
 /// have 208 frames in this time.

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 
-use crate::interrupt;
+use cantap_work::interrupt;
 
 /// How often to check whether to continue.
 const LOOK_EVERY: Duration = Duration::from_millis(20);

@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 
 use super::report::Outcome;
 use super::traffic::{Amount, Flow, STAMP_TOLERANCE_US, exchange, forget, load_together_pct};
-use crate::meter::rounded;
+use cantap_work::rounded;
 
 /// Bit rate of the steps that need only one.
 const BITRATE_BPS: u32 = 500_000;

@@ -94,7 +94,7 @@ impl Report {
 
     /// Prints the result.
     pub fn finish(&mut self) {
-        self.seconds = crate::meter::rounded(self.started.elapsed().as_secs_f64(), 1);
+        self.seconds = cantap_work::rounded(self.started.elapsed().as_secs_f64(), 1);
         self.passed = self.count("FAIL") == 0;
         self.show(&self.tail());
     }

@@ -9,7 +9,7 @@ use cantap_address::{Address, OpenDevice};
 use serde_json::{Value, json};
 
 use super::report::Outcome;
-use crate::meter::rounded;
+use cantap_work::rounded;
 
 /// Number of requests for the device's time.
 const ROUND_TRIPS: usize = 500;

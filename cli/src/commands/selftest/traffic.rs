@@ -8,8 +8,8 @@ use cantap::transmit::Stream;
 use cantap::{Channel, Device, Direction, Frame, Id, TraceEvent, TraceFrame, TraceRecord, bits_on_bus};
 use serde_json::{Value, json};
 
-use crate::interrupt;
-use crate::meter::rounded;
+use cantap_work::interrupt;
+use cantap_work::rounded;
 
 /// If no frame has ended for this long, sending is stuck.
 const PATIENCE: Duration = Duration::from_secs(3);

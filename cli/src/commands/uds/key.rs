@@ -9,7 +9,7 @@ use anyhow::{Context, bail, ensure};
 
 use super::client::{Client, first};
 use super::hex::{Hex, byte, bytes};
-use crate::interrupt;
+use cantap_work::interrupt;
 
 /// How often to check whether the command has ended.
 const LOOK_EVERY: Duration = Duration::from_millis(5);

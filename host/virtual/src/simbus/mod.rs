@@ -8,6 +8,7 @@ mod frames;
 mod traffic;
 mod waveform;
 
+#[cfg(feature = "nodes")]
 pub(crate) use bus::arbitration_field;
 pub use bus::{Node, SimBus};
 pub use frames::{FrameSource, Frames, UnknownFrames};

@@ -1,0 +1,57 @@
+//! Every integration test of this crate, in one program: each program is linked on its own.
+
+mod align;
+mod analysis;
+mod boards;
+mod bus_commands;
+mod canopen_ends;
+mod capture_and_demo;
+mod capture_rotates;
+mod car;
+mod columns;
+#[cfg(feature = "emu")]
+#[path = "../../../sim/tests/it/common/mod.rs"]
+mod common;
+mod completion;
+mod conversations;
+mod convert;
+mod db;
+mod decode;
+mod defaults;
+mod device_care;
+mod diagnostics;
+mod emulated;
+mod emulated_autobaud;
+mod emulated_clock;
+mod extcap;
+#[allow(dead_code, reason = "the library's tests use the rest of it")]
+#[path = "../../../host/tests/it/fake_device/mod.rs"]
+mod fake_device;
+mod firmware;
+mod follow;
+mod json_schema;
+mod misbehaving_devices;
+mod monitor_replug;
+mod monitor_screens;
+mod monitor_sources;
+mod monitor_terminal;
+mod nodes;
+mod nothing_read;
+mod outputs;
+mod port;
+mod protocols;
+mod python_can;
+mod schema;
+mod search_and_diff;
+mod selftest;
+mod send_signals;
+mod serve;
+mod served;
+mod speaking_ends;
+mod terminal;
+mod timing;
+mod trigger;
+mod two_testers;
+mod unsent;
+mod virtual_canopen;
+mod vocabulary;

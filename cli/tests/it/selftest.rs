@@ -1,0 +1,104 @@
+//! `cantap selftest` on good devices, and on a faulty one; `gen --saturate`.
+
+use crate::firmware;
+
+use std::process::{Command, Output, Stdio};
+
+use serde_json::Value;
+
+fn cantap(arguments: &str) -> (Option<i32>, String, String) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
+    command.args(arguments.split_whitespace()).stdin(Stdio::null());
+    let Output { status, stdout, stderr } = command.output().unwrap();
+    (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
+}
+
+fn outcomes(object: &Value) -> Vec<(&str, &str)> {
+    let steps = object["steps"].as_array().unwrap();
+    steps.iter().map(|step| (step["name"].as_str().unwrap(), step["outcome"].as_str().unwrap())).collect()
+}
+
+#[test]
+fn a_good_device_passes_alone_and_the_report_has_lines_and_object() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("board.txt");
+    let line = format!("selftest -d virtual:load=0 --load-time 300ms --report {}", file.display());
+    let (code, out, err) = cantap(&line);
+    assert_eq!((code, err.as_str()), (Some(0), ""), "{out}");
+    assert!(
+        out.contains("\npass  channel 2 by itself, 1000000 bit/s: 2 to 2: 100 sent, 100 heard, 0 lost,"),
+        "{out}"
+    );
+    assert!(
+        out.contains("\nskip  channel 1 to channel 2: they are not said to be wired to each other"),
+        "{out}"
+    );
+    assert!(out.contains(" passed, 0 failed, "), "{out}");
+    let report = std::fs::read_to_string(&file).unwrap();
+    assert!(report.starts_with(&out), "{report}");
+    let object: Value = serde_json::from_str(&report[report.find('{').unwrap()..]).unwrap();
+    assert_eq!((&object["board"], &object["passed"]), (&Value::from("virtual"), &Value::from(true)));
+    let saturated =
+        outcomes(&object).iter().position(|(name, _)| name.starts_with("both channels saturated")).unwrap();
+    for flow in object["steps"][saturated]["measured"]["flows"].as_array().unwrap() {
+        assert!(flow["sent"].as_u64() > Some(500) && flow["sent"] == flow["heard"], "{flow}");
+        assert!(flow["bus_load_pct"].as_f64() > Some(80.0), "{flow}");
+    }
+}
+
+#[test]
+fn two_channels_on_one_wire_pass_the_loop() {
+    let (code, out, _) =
+        cantap("selftest -d virtual:load=0,wire=joined,ack=no --loop --load-time 300ms --json");
+    let object: Value = serde_json::from_str(&out).unwrap();
+    assert_eq!(code, Some(0), "{:#}", object["steps"]);
+    let outcomes = outcomes(&object);
+    for name in [
+        "channel 1 to channel 2 and back, 1000000 bit/s",
+        "channel 1 to channel 2 and back, 125000 bit/s",
+        "channel 1 without an acknowledgement",
+        "channel 2 without an acknowledgement",
+        "both channels saturate one bus",
+        "saved settings untouched",
+    ] {
+        assert!(outcomes.contains(&(name, "pass")), "{name}: {outcomes:?}");
+    }
+}
+
+#[test]
+fn a_loop_that_is_not_there_fails_and_says_what_to_look_at() {
+    let (code, out, _) = cantap("selftest -d virtual:load=0,ack=no --loop --load-time 300ms");
+    assert_eq!(code, Some(3), "{out}");
+    let line =
+        out.lines().find(|line| line.starts_with("FAIL  channel 1 to channel 2 and back, 500000")).unwrap();
+    assert!(line.contains("nothing arrived: are the channels wired to each other"), "{line}");
+    // Unrelated steps are still tested.
+    assert!(out.lines().any(|line| line.starts_with("pass  saved settings untouched")), "{out}");
+}
+
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn the_emulated_board_passes() {
+    let elf = firmware::elf();
+    let line = format!(
+        "selftest -d emu:{},load=0,wire=joined,ack=no --loop --load-time 500ms --json",
+        elf.display()
+    );
+    let (code, out, err) = cantap(&line);
+    let object: Value = serde_json::from_str(&out).unwrap_or_else(|_| panic!("{err}"));
+    assert_eq!(code, Some(0), "{:#}", object["steps"]);
+}
+
+#[test]
+fn a_generator_fills_both_buses_and_says_how_full_they_were() {
+    let _turn = cantap_testing::process::turn();
+    let (code, _, err) = cantap("gen -d virtual:load=0 both -b 1M --saturate -n 20000");
+    assert_eq!(code, Some(0), "{err}");
+    assert!(err.contains("20000 frames sent"), "{err}");
+    for channel in 1..=2 {
+        let line =
+            err.lines().find(|line| line.starts_with(&format!("cantap: channel {channel}: "))).unwrap();
+        let load: f64 = line.split_once("bus load ").unwrap().1.trim_end_matches(" %").parse().unwrap();
+        assert!(load > 80.0, "{line}");
+    }
+}

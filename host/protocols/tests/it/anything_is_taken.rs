@@ -1,0 +1,199 @@
+//! The properties checked by the fuzz targets, with random bytes: nothing panics, every event can be written, and memory stays flat
+//! under a flood of messages that are never finished.
+
+use cantap_protocols::canopen::Sheet;
+use cantap_protocols::canopen::eds::Eds;
+use cantap_protocols::{Conversations, Event, Options, Overview, Protocol, Survey};
+use cantap_trace::{Direction, FdFrame, Frame, Id, TraceEvent, TraceRecord};
+
+fn record(time_ns: i64, id: Id, data: &[u8]) -> TraceRecord {
+    let frame = Frame::data_frame(id, data).map(Into::into);
+    let frame = frame.or_else(|| FdFrame::new(id, false, false, data).map(Into::into));
+    let event = match frame {
+        Some(frame) => TraceEvent::Frame { frame, direction: Direction::Rx, late: false },
+        None => TraceEvent::GAP,
+    };
+    TraceRecord { time_ns, channel: 1, event }
+}
+
+/// Identifiers that protocols use, few of each, so that frames collide.
+fn known_id(random: &mut fastrand::Rng) -> Id {
+    let node = random.u32(0..4);
+    match random.u8(0..8) {
+        0 => Id::standard_truncated(0x7E0 | node | random.u32(0..2) << 3),
+        1 => Id::standard_truncated(random.u32(0..16) << 7 | node),
+        2 => Id::standard_truncated(0x400 | node << 3 | random.u32(0..8)),
+        3 => Id::extended_truncated(
+            0x18EC_0000 | random.u32(0..2) << 16 ^ 0x1_0000 | node << 8 | random.u32(0..4),
+        ),
+        4 => Id::extended_truncated(0x0DF8_0000 | random.u32(..0x1_0000) & 0xFF00 | node),
+        5 => Id::extended_truncated(0x18DA_0000 | node << 8 | random.u32(0..4)),
+        6 => Id::standard_truncated(random.u32(..)),
+        _ => Id::extended_truncated(random.u32(..)),
+    }
+}
+
+#[test]
+fn any_frames_are_taken_by_every_protocol_and_each_event_can_be_written() {
+    let seed = fastrand::u64(..);
+    eprintln!("seed {seed}");
+    let mut random = fastrand::Rng::with_seed(seed);
+    for protocols in std::iter::once(Protocol::ALL.to_vec()).chain(Protocol::ALL.map(|one| vec![one])) {
+        let sheet: Vec<u8> = (0..random.usize(0..300)).map(|_| random.u8(..)).collect();
+        let sheets = vec![Sheet { node: None, eds: Eds::parse(&sheet).into() }];
+        let options = Options { protocols: protocols.clone(), sheets, ..Options::default() };
+        let (mut conversations, mut survey) = (Conversations::new(&options), Survey::new());
+        let (mut overview, mut events) = (Overview::default(), Vec::<Event>::new());
+        let mut time_ns = 0_i64;
+        for _ in 0..20_000 {
+            time_ns += random.i64(0..3_000_000);
+            let mut data: Vec<u8> = (0..random.usize(0..9)).map(|_| random.u8(..)).collect();
+            // Frames that begin, continue and end transfers.
+            if let Some(first) = data.first_mut().filter(|_| random.bool()) {
+                *first = [0x10, 0x20, 0x21, 0x22, 0x30, 0x03, 0x40, 0x43, 0x60, 0x80][random.usize(0..10)];
+            }
+            let mut record = record(time_ns, known_id(&mut random), &data);
+            if random.u8(..) == 0 {
+                record.event = TraceEvent::GAP;
+            }
+            survey.take(&record);
+            conversations.take(&record, &mut events);
+            for event in events.drain(..) {
+                let broke = event.protocol == Protocol::IsoTp && event.trouble.is_some();
+                assert!(protocols.contains(&event.protocol) || broke, "{event}");
+                assert!(event.start_ns <= event.time_ns && event.channel == 1, "{event:?}");
+                overview.take(&event);
+                let _ = event.to_string();
+            }
+        }
+        let _ = (conversations.under_way(), survey.found());
+        conversations.finish(&mut events);
+        for event in &events {
+            overview.take(event);
+        }
+        assert!(overview.nodes().count() > 0 || protocols.len() == 1, "{protocols:?}");
+    }
+}
+
+#[test]
+fn any_text_is_taken_as_a_sheet() {
+    let mut random = fastrand::Rng::with_seed(1);
+    let good = include_bytes!("../data/sample.eds");
+    for _ in 0..300 {
+        let mut bytes = good.to_vec();
+        for _ in 0..random.usize(1..30) {
+            let place = random.usize(..bytes.len());
+            match random.u8(0..3) {
+                0 => bytes[place] = random.u8(..),
+                1 => drop(bytes.drain(place..(place + random.usize(0..50)).min(bytes.len()))),
+                _ => bytes.insert(place, b"=[]x0F\n$"[random.usize(0..8)]),
+            }
+        }
+        let eds = Eds::parse(&bytes);
+        for (index, object) in &eds.objects {
+            object.entries.keys().for_each(|sub| assert!(eds.entry_of(*index, *sub).is_some()));
+        }
+    }
+}
+
+/// This process's memory in use, in bytes.
+#[cfg(target_os = "linux")]
+fn resident() -> usize {
+    let text = std::fs::read_to_string("/proc/self/statm").unwrap();
+    text.split(' ').nth(1).unwrap().parse::<usize>().unwrap() * 4096
+}
+
+/// Begins a message of a protocol, numbered by a count: as many senders as the protocol has, none of which completes it.
+#[cfg(target_os = "linux")]
+type Beginning = fn(u32) -> (Id, Vec<u8>);
+
+#[cfg(target_os = "linux")]
+const BEGINNINGS: [(&str, &[Protocol], Beginning); 9] = [
+    ("ISO-TP, 11 bits", &[Protocol::IsoTp], |at| {
+        (Id::standard_truncated(at), vec![0x1F, 0xFF, 0x62, 1, 2, 3, 4, 5])
+    }),
+    ("UDS, 29 bits", &[Protocol::Uds], |at| {
+        (Id::extended_truncated(0x18DA_0000 | at & 0xFFFF), vec![0x1F, 0xFF, 0x62, 1, 2, 3, 4, 5])
+    }),
+    // Requests that nobody answers, by a service that only KWP2000 has.
+    ("KWP2000", &[Protocol::Kwp2000], |at| {
+        (Id::extended_truncated(0x18DA_0000 | at & 0xFFFF), vec![0x02, 0x1A, at as u8, 0, 0, 0, 0, 0])
+    }),
+    // To all, and from each to one other: two at a time for each of 254 senders.
+    ("J1939 TP", &[Protocol::J1939], |at| {
+        let (sender, to) = (at / 2 % 254, if at.is_multiple_of(2) { 0xFF } else { at / 508 % 254 });
+        let control = if to == 0xFF { 0x20 } else { 0x10 };
+        let id = Id::extended_truncated(0x18EC_0000 | to << 8 | sender);
+        (id, vec![control, 0xF9, 6, 255, 255, 0xCA, 0xFE, 0])
+    }),
+    // Of 16 MiB each, with frames that go on.
+    ("J1939 ETP", &[Protocol::J1939], |at| {
+        let sender = at / 4 % 254;
+        let group = if at.is_multiple_of(4) { 0x18C8_0000 } else { 0x18C7_0000 };
+        let id = Id::extended_truncated(group | (sender ^ 1) << 8 | sender);
+        let bytes =
+            if at.is_multiple_of(4) { vec![20, 0, 0, 0, 1, 0, 0xEF, 0] } else { vec![(at % 4) as u8; 8] };
+        (id, bytes)
+    }),
+    ("fast packets", &[Protocol::Nmea2000], |at| {
+        (Id::extended_truncated(0x0DF8_0500 | at & 0xFF), vec![(at >> 8 << 5) as u8, 223, 1, 2, 3, 4, 5, 6])
+    }),
+    ("SDO segments", &[Protocol::CanOpen], |at| {
+        let node = at / 64 % 127 + 1;
+        // A write that never ends, restarted after 63 segments.
+        let bytes = if at.is_multiple_of(64) { vec![0x20, 0, 0x20, 1, 0, 0, 0, 0] } else { vec![0; 8] };
+        (Id::standard_truncated(0x600 + node), bytes)
+    }),
+    // Each write gives a node another SDO channel, on which a transfer begins.
+    ("SDO channels", &[Protocol::CanOpen], |at| {
+        let (node, index, place) = (at / 10 % 127 + 1, 0x1201 + (at / 1270 % 126) as u16, at % 10);
+        let [low, high] = index.to_le_bytes();
+        let request = 0x680 + at / 10 % 0x80;
+        let [id_low, id_high] = (request as u16).to_le_bytes();
+        match place {
+            0 => (Id::standard_truncated(0x600 + node), vec![0x23, low, high, 1, id_low, id_high, 0, 0]),
+            1 => (Id::standard_truncated(0x580 + node), vec![0x60, low, high, 1, 0, 0, 0, 0]),
+            2 => (Id::standard_truncated(0x600 + node), vec![0x23, low, high, 2, id_low, 5, 0, 0]),
+            3 => (Id::standard_truncated(0x580 + node), vec![0x60, low, high, 2, 0, 0, 0, 0]),
+            4 => (Id::standard_truncated(request), vec![0x20, 0, 0x20, 1, 0, 0, 0, 0]),
+            _ => (Id::standard_truncated(request), vec![0; 8]),
+        }
+    }),
+    // The first fragment and those in the middle, without a last one.
+    ("DeviceNet fragments", &[Protocol::DeviceNet], |at| {
+        let (node, count) = (at / 64 % 64, (at % 64) as u8);
+        let second = if count == 0 { 0 } else { 0x40 | count };
+        (Id::standard_truncated(0x404 | node << 3), vec![0x80 | 1, second, 0x10, 1, 2, 3, 4, 5])
+    }),
+];
+
+#[cfg(target_os = "linux")]
+#[test]
+fn memory_is_flat_under_a_flood_of_messages_that_are_never_finished() {
+    let everything = Protocol::ALL;
+    for (name, protocols, begin) in BEGINNINGS {
+        // By its own reader, and with every other one beside it.
+        for protocols in [protocols, &everything[..]] {
+            let options = Options { protocols: protocols.to_vec(), ..Options::default() };
+            let mut conversations = Conversations::new(&options);
+            let mut events = Vec::new();
+            let mut said = 0_u64;
+            let mut flood = |frames: std::ops::Range<u32>| {
+                for at in frames {
+                    let (id, data) = begin(at);
+                    conversations.take(&record(i64::from(at) * 50_000, id, &data), &mut events);
+                    said += events.iter().filter(|event| event.trouble.is_some()).count() as u64;
+                    events.clear();
+                }
+                conversations.under_way().len()
+            };
+            flood(0..70_000);
+            let before = resident();
+            let under_way = flood(70_000..200_000);
+            let grown = resident().saturating_sub(before);
+            assert!(grown < 2 << 20, "{name}: {grown} bytes more");
+            assert!(under_way <= 1024, "{name}: {under_way}");
+            assert!(said > 500, "{name}: what was given up is said: {said}");
+        }
+    }
+}

@@ -1,0 +1,9 @@
+//! Every integration test of this crate, in one program: each program is linked on its own.
+
+mod eight_clients;
+mod line;
+mod reconnects;
+mod sharing;
+mod slow_line;
+mod socketcand;
+mod tls;

@@ -1,0 +1,85 @@
+//! Runs each of the examples against the virtual device.
+
+#![allow(dead_code, reason = "their `main` and what it needs")]
+#![allow(clippy::duplicate_mod, reason = "each example is a program of its own")]
+
+use std::time::Duration;
+
+use cantap::Device;
+use cantap_formats::{ReadOptions, open_reader};
+
+#[path = "../../examples/capture_to_file.rs"]
+mod capture_to_file;
+#[path = "../../examples/live_signals.rs"]
+mod live_signals;
+#[path = "../../examples/periodic.rs"]
+mod periodic;
+#[path = "../../examples/replay.rs"]
+mod replay;
+#[path = "../../examples/reply.rs"]
+mod reply;
+#[path = "../../examples/statistics_of_a_file.rs"]
+mod statistics_of_a_file;
+
+const LOG: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/data/engine.log");
+
+fn virtual_device(options: &str) -> Device {
+    cantap_virtual::open(options.parse().unwrap()).unwrap()
+}
+
+#[test]
+fn a_capture_has_every_frame_of_both_channels_in_its_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("capture.blf");
+    let device = virtual_device("load=30,bitrate=500k");
+    let (frames, lost) = capture_to_file::capture(&device, &file, Duration::from_millis(300)).unwrap();
+    let read = open_reader(&file, &ReadOptions::default()).unwrap();
+    let read = read.filter(|record| record.as_ref().unwrap().frame().is_some()).count();
+    assert!(frames > 100 && lost == 0 && read as u64 == frames, "{frames} {lost} {read}");
+}
+
+#[test]
+fn signals_are_shown_as_they_were_sent() {
+    let device = virtual_device(&format!("bitrate=500k,log={LOG}"));
+    let last = live_signals::show(&device, 40).unwrap();
+    assert_eq!(last, "Speed 98 km/h, EngineSpeed 2850 rpm, Ignition on");
+}
+
+#[test]
+fn periodic_frames_count_and_bear_their_checksum() {
+    let sent = periodic::repeat(&virtual_device("load=0,bitrate=500k"), 18).unwrap();
+    let counters: Vec<u8> = sent.iter().map(|frame| frame.data()[0]).collect();
+    assert_eq!(counters, (0..18).map(|count| count % 16).collect::<Vec<_>>());
+    for frame in sent {
+        let (checksum, data) = frame.data().split_last().unwrap();
+        assert_eq!(*checksum, crc8_j1850(data), "{frame}");
+    }
+}
+
+/// As defined, one bit at a time: polynomial 0x1D, initial value and final exclusive-or 0xFF.
+fn crc8_j1850(data: &[u8]) -> u8 {
+    let crc = data.iter().fold(0xFF, |crc: u8, byte| {
+        (0..8).fold(crc ^ byte, |crc, _| if crc & 0x80 == 0 { crc << 1 } else { crc << 1 ^ 0x1D })
+    });
+    crc ^ 0xFF
+}
+
+#[test]
+fn a_question_is_answered() {
+    let answer = reply::ask(&virtual_device("load=0,bitrate=500k,wire=joined")).unwrap();
+    assert_eq!(answer.to_string(), "7E8#0462F19001");
+}
+
+#[test]
+fn a_replay_keeps_the_files_times() {
+    let accuracy = replay::replay(&virtual_device("load=0,bitrate=500k"), LOG).unwrap();
+    assert_eq!(accuracy.frames, 40);
+    assert!(accuracy.late_us < 1.0 && accuracy.early_us < 1.0, "{accuracy:?}");
+}
+
+#[test]
+fn a_files_statistics_name_its_identifier() {
+    let summary = statistics_of_a_file::summary(LOG, 500_000).unwrap();
+    assert_eq!((summary.frames, summary.lost), (40, 0));
+    assert_eq!(summary.channels[0].ids[0].count, 40);
+}

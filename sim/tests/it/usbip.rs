@@ -1,0 +1,308 @@
+//! The USB/IP server, with this file in place of the kernel: what `cargo xtask ci --only kernel` shows with a real one, but in a
+//! second.
+#![cfg(unix)]
+
+use crate::common;
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
+use std::process::{Child, Command};
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+/// The server, and its ports.
+struct Server {
+    process: Child,
+    folder: tempfile::TempDir,
+    usbip: u16,
+    control: u16,
+}
+
+impl Server {
+    fn start() -> Self {
+        let elf = common::elf();
+        let folder = tempfile::tempdir().unwrap();
+        let mut process = Command::new(env!("CARGO_BIN_EXE_cantap-sim"));
+        let mut process = process.arg("usbip").arg(elf).arg(folder.path()).spawn().unwrap();
+        let ports = wait_for(|| {
+            assert!(process.try_wait().unwrap().is_none(), "the server ended before it began");
+            let text = std::fs::read_to_string(folder.path().join("ports")).ok()?;
+            let ports: Option<Vec<u16>> =
+                text.lines().map(|line| line.split_once('=')?.1.parse().ok()).collect();
+            ports.filter(|ports| ports.len() == 3)
+        });
+        Self { process, folder, usbip: ports[0], control: ports[2] }
+    }
+
+    /// Sends a line and returns the answer.
+    fn say(&self, line: &str) -> String {
+        let mut stream = TcpStream::connect(("127.0.0.1", self.control)).unwrap();
+        writeln!(stream, "{line}").unwrap();
+        let mut answer = String::new();
+        BufReader::new(stream).read_line(&mut answer).unwrap();
+        answer
+    }
+
+    fn figure(&self, name: &str) -> Value {
+        serde_json::from_str::<Value>(&self.say("status")).unwrap()[name].clone()
+    }
+
+    /// Like `usbip attach`: asks for the device by its bus ID.
+    fn import(&self, name: &[u8]) -> Kernel {
+        let mut stream = TcpStream::connect(("127.0.0.1", self.usbip)).unwrap();
+        stream.set_read_timeout(Some(Duration::from_mins(1))).unwrap();
+        let mut opening = vec![1, 0x11, 0x80, 3, 0, 0, 0, 0];
+        opening.extend(name);
+        opening.resize(40, 0);
+        stream.write_all(&opening).unwrap();
+        Kernel { stream, seq: 0, input: 0, output: 0 }
+    }
+
+    /// Attached, enumerated and configured, as Linux does it.
+    fn attach(&self) -> Kernel {
+        let mut kernel = self.import(b"1-1");
+        let reply = kernel.read(320);
+        assert_eq!(reply[..8], [1, 0x11, 0, 3, 0, 0, 0, 0]);
+        assert_eq!(reply[8 + 300..8 + 304], [0x12, 0x09, 0, 1], "vendor and product");
+        let (status, device) = kernel.control([0x80, 6, 0, 1, 0, 0, 64, 0], &[]);
+        // One packet: Linux wants to know its size.
+        assert!(status == 0 && device.len() >= 8, "{device:02x?}");
+        let (_, whole) = kernel.control([0x80, 6, 0, 1, 0, 0, 18, 0], &[]);
+        assert!(whole.len() == 18 && whole.starts_with(&device), "{whole:02x?}");
+        let (_, configuration) = kernel.control([0x80, 6, 0, 2, 0, 0, 255, 0], &[]);
+        (kernel.input, kernel.output) = (bulk(&configuration, 0x80), bulk(&configuration, 0));
+        assert_eq!(kernel.control([0, 9, 1, 0, 0, 0, 0, 0], &[]), (0, vec![]));
+        kernel
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        if !std::thread::panicking() {
+            self.say("quit");
+            assert!(self.process.wait().unwrap().success());
+        }
+        let _ = self.process.kill();
+    }
+}
+
+/// A connection that has the device.
+struct Kernel {
+    stream: TcpStream,
+    seq: u32,
+    /// The serial port's endpoints.
+    input: u32,
+    output: u32,
+}
+
+/// The number of the bulk endpoint of a direction.
+fn bulk(configuration: &[u8], direction: u8) -> u32 {
+    let mut rest = configuration;
+    while let [length, kind, ..] = *rest {
+        if kind == 5 && rest[3] == 2 && rest[2] & 0x80 == direction {
+            return (rest[2] & 15).into();
+        }
+        rest = &rest[length.into()..];
+    }
+    panic!("no bulk endpoint");
+}
+
+impl Kernel {
+    fn read(&mut self, length: usize) -> Vec<u8> {
+        let mut bytes = vec![0; length];
+        self.stream.read_exact(&mut bytes).unwrap();
+        bytes
+    }
+
+    /// Submits a transfer and returns its number.
+    fn submit(&mut self, endpoint: u32, input: bool, length: u32, setup: [u8; 8], data: &[u8]) -> u32 {
+        self.seq += 1;
+        let head = [1, self.seq, 0x1_0002, input.into(), endpoint, 0, length, 0, 0, 0];
+        let mut bytes: Vec<u8> = head.iter().flat_map(|word| word.to_be_bytes()).collect();
+        bytes.extend(setup);
+        bytes.extend(data);
+        self.stream.write_all(&bytes).unwrap();
+        self.seq
+    }
+
+    /// The next completed transfer: its number, its status, and its data if that came in.
+    fn end(&mut self, input: bool) -> (u32, i32, Vec<u8>) {
+        let head = self.read(48);
+        let word = |n: usize| u32::from_be_bytes(head[4 * n..4 * n + 4].try_into().unwrap());
+        let data = if input && word(0) == 3 { self.read(word(6) as usize) } else { Vec::new() };
+        (word(1), word(5) as i32, data)
+    }
+
+    /// Withdraws a transfer.
+    fn take_back(&mut self, seq: u32, victim: u32) {
+        let head = [2, seq, 0x1_0002, 0, 0, victim, 0, 0, 0, 0, 0, 0];
+        let bytes: Vec<u8> = head.iter().flat_map(|word: &u32| word.to_be_bytes()).collect();
+        self.stream.write_all(&bytes).unwrap();
+    }
+
+    fn control(&mut self, setup: [u8; 8], data: &[u8]) -> (i32, Vec<u8>) {
+        let input = setup[0] & 0x80 != 0;
+        let length = u16::from_le_bytes([setup[6], setup[7]]).into();
+        let seq = self.submit(0, input, length, setup, data);
+        let (ended, status, data) = self.end(input);
+        assert_eq!(ended, seq);
+        (status, data)
+    }
+
+    fn set_lines(&mut self, dtr: bool) {
+        assert_eq!(self.control([0x21, 0x22, dtr.into(), 0, 0, 0, 0, 0], &[]).0, 0);
+    }
+
+    /// Writes to the serial port.
+    fn write(&mut self, bytes: &[u8]) {
+        let seq = self.submit(self.output, false, bytes.len() as u32, [0; 8], bytes);
+        assert_eq!(self.end(false), (seq, 0, vec![]));
+    }
+
+    /// Begins to read from it.
+    fn begin_read(&mut self) -> u32 {
+        self.submit(self.input, true, 128, [0; 8], &[])
+    }
+
+    /// Reads until the bytes end like this.
+    fn read_until(&mut self, end: &str) -> String {
+        let mut text = Vec::new();
+        while !text.ends_with(end.as_bytes()) {
+            let seq = self.begin_read();
+            let (ended, status, data) = self.end(true);
+            assert_eq!((ended, status), (seq, 0));
+            text.extend(data);
+        }
+        String::from_utf8(text).unwrap()
+    }
+
+    /// Sends slcan lines and reads their answers.
+    fn converse(&mut self, conversation: &[(&str, &str)]) {
+        for (line, answer) in conversation {
+            self.write(format!("{line}\r").as_bytes());
+            assert_eq!(self.read_until(answer), *answer, "the answer to {line}");
+        }
+    }
+}
+
+fn wait_for<T>(mut what: impl FnMut() -> Option<T>) -> T {
+    let until = Instant::now() + Duration::from_mins(1);
+    loop {
+        if let Some(found) = what() {
+            return found;
+        }
+        assert!(Instant::now() < until, "waited for a minute");
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
+const ECONNRESET: i32 = -104;
+const EPIPE: i32 = -32;
+
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn a_kernel_enumerates_it_and_talks_through_its_port() {
+    let server = Server::start();
+    let mut kernel = server.attach();
+    kernel.set_lines(true);
+    kernel.converse(&[("S8", "\r"), ("O", "\r"), ("F", "F00\r")]);
+    server.say("send 1 123#DEADBEEF");
+    assert_eq!(kernel.read_until("\r"), "t1234DEADBEEF\r");
+    kernel.converse(&[("t4561AA", "z\r")]);
+    assert_eq!((server.figure("taken")[0].clone(), server.figure("sent")[0].clone()), (1.into(), 1.into()));
+    server.say("dump books");
+    assert_eq!(std::fs::read_to_string(server.folder.path().join("books.sent1")).unwrap(), "456#AA\n");
+}
+
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn a_read_is_taken_back_and_what_it_would_have_brought_comes_with_the_next() {
+    let server = Server::start();
+    let mut kernel = server.attach();
+    kernel.set_lines(true);
+    let victim = kernel.begin_read();
+    kernel.seq += 1;
+    kernel.take_back(kernel.seq, victim);
+    assert_eq!(kernel.end(false), (kernel.seq, ECONNRESET, vec![]));
+    kernel.converse(&[("V", "V1001\r")]);
+}
+
+/// Linux's virtual controller may send the withdrawal of a transfer before the transfer itself. If the answer were that it has ended,
+/// and the transfer were then carried out, the kernel would give up the device.
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn a_transfer_that_is_taken_back_before_it_comes_is_not_carried_out() {
+    let server = Server::start();
+    let mut kernel = server.attach();
+    let (seq, victim) = (kernel.seq + 2, kernel.seq + 1);
+    kernel.take_back(seq, victim);
+    assert_eq!(kernel.end(false), (seq, ECONNRESET, vec![]));
+    assert_eq!(kernel.submit(0, true, 1, [0x80, 8, 0, 0, 0, 0, 1, 0], &[]), victim);
+    kernel.seq = seq;
+    assert_eq!(kernel.control([0x80, 8, 0, 0, 0, 0, 1, 0], &[]), (0, vec![1]));
+}
+
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn a_request_that_the_device_refuses_ends_with_a_stall() {
+    let server = Server::start();
+    let mut kernel = server.attach();
+    assert_eq!(kernel.control([0xC0, 1, 0, 0, 0, 0, 8, 0], &[]), (EPIPE, vec![]));
+    assert_eq!(kernel.control([0x80, 8, 0, 0, 0, 0, 1, 0], &[]), (0, vec![1]));
+}
+
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn one_kernel_has_the_device_and_another_may_when_it_is_gone() {
+    let server = Server::start();
+    let kernel = server.attach();
+    assert_eq!(server.import(b"1-1").read(8)[4..], [0, 0, 0, 1], "somebody has it");
+    drop(kernel);
+    // The end of a connection is noticed a moment later.
+    wait_for(|| (server.import(b"1-1").read(8)[4..] == [0; 4]).then_some(()));
+    assert_eq!(server.import(b"7-7").read(8)[4..], [0, 0, 0, 1], "there is no such device");
+}
+
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn a_pulled_cable_ends_the_connection_without_answers() {
+    let server = Server::start();
+    let mut kernel = server.attach();
+    kernel.set_lines(true);
+    kernel.begin_read();
+    server.say("unplug");
+    let mut rest = Vec::new();
+    kernel.stream.read_to_end(&mut rest).unwrap();
+    assert!(rest.is_empty(), "{rest:?}");
+    server.attach();
+}
+
+/// A slow client does not lose frames while it sets the pace, since time stands still; in real time the device's queue fills.
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn time_stands_still_while_the_kernel_owes_reads() {
+    let server = Server::start();
+    let mut kernel = server.attach();
+    server.say("traffic 50 std0");
+    kernel.set_lines(true);
+    kernel.converse(&[("S8", "\r"), ("L", "\r")]);
+    kernel.read_until("\r");
+    let before = server.figure("emulated_s");
+    std::thread::sleep(Duration::from_millis(200));
+    assert_eq!(server.figure("emulated_s"), before);
+    server.say("pace real");
+    wait_for(|| (server.figure("emulated_s") != before).then_some(()));
+}
+
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn lines_that_make_no_sense_are_refused() {
+    let server = Server::start();
+    for line in
+        ["", "plug", "traffic", "traffic 10 wild", "send 3 123#", "send 1 123", "halt xx", "play 1 10 mix"]
+    {
+        assert!(server.say(line).starts_with("error: "), "{line}");
+    }
+    assert!(server.say("status").starts_with('{'));
+}

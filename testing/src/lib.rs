@@ -1,0 +1,6 @@
+//! What the tests of several crates share. It belongs to no release.
+
+#![forbid(unsafe_code)]
+
+pub mod peers;
+pub mod process;

@@ -1,0 +1,125 @@
+//! What is checked before a change lands, one step each.
+
+use anyhow::Result;
+use xshell::cmd;
+
+use crate::board::Board;
+use crate::machine::Machine;
+use crate::outcome::Outcome;
+use crate::toolchain::Toolchain;
+use crate::{
+    check, compiler, cross, dependencies, features, firmware, kernel, package, python, reproducible, tests,
+    typos, workspace,
+};
+
+/// One thing that is checked, in the order of the run. What [`TEST`](Step::TEST) names comes first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Step {
+    /// Formatting.
+    Fmt,
+    /// Spelling.
+    Typos,
+    /// Files of one crate that import each other in a circle, and public types of one crate that share a name.
+    Circles,
+    /// Links in the pages, and files named there.
+    Links,
+    /// Lints of everything for the host.
+    Clippy,
+    /// The firmware of the default board, and its memory against the budget.
+    Firmware,
+    /// Every test, including those that run the firmware's ELF on the emulated board.
+    Tests,
+    /// Other people's crates: licences, duplicates, sources.
+    Dependencies,
+    /// The oldest compiler that the packages promise to build with.
+    OldestCompiler,
+    /// Each crate without features, and with each one alone.
+    Features,
+    /// The fuzz targets compile.
+    Fuzz,
+    /// The documentation of public items, with every link checked.
+    Doc,
+    /// The libraries without ports and threads compile for WebAssembly.
+    Wasm,
+    /// Windows and macOS, as far as they can be checked here.
+    Systems,
+    /// The firmware of every board, and its memory against the budget.
+    Boards,
+    /// Lints of the firmware for each board.
+    ClippyFirmware,
+    /// A second build in another place gives the same bytes.
+    Reproducible,
+    /// A stock Linux kernel under QEMU drives the firmware on the emulated board.
+    Kernel,
+    /// The package for Python: wheel, types, tests, python-can's own tests, notebooks.
+    Python,
+    /// The command that a newcomer runs first: both channels at full load, nothing lost.
+    Demo,
+    /// The crates as they would be published: each packs.
+    Package,
+}
+
+impl Step {
+    /// What `cargo xtask test` runs.
+    pub const TEST: [Self; 7] =
+        [Self::Fmt, Self::Typos, Self::Circles, Self::Links, Self::Clippy, Self::Firmware, Self::Tests];
+
+    /// Runs it.
+    pub fn run(self, machine: &Machine) -> Result<Outcome> {
+        let shell = &machine.shell;
+        match self {
+            Step::Fmt => cmd!(shell, "cargo fmt --all --check").run()?,
+            Step::Typos => return typos::check(shell),
+            Step::Circles => check::circles()?,
+            Step::Links => check::links()?,
+            Step::Clippy => {
+                cmd!(shell, "cargo clippy --locked --workspace --all-targets --all-features -- -D warnings")
+                    .run()?;
+            }
+            Step::Firmware => {
+                return with_chip(machine, |chip| firmware::build_checked(shell, chip, &Board::ALL[..1]));
+            }
+            // Without a compiler for the chip those on the emulated board are ignored, and say so.
+            Step::Tests => tests::run(shell, machine.peers()?)?,
+            Step::Dependencies => dependencies::check(shell)?,
+            Step::OldestCompiler => return compiler::check(shell),
+            Step::Features => features::check(shell)?,
+            Step::Fuzz => {
+                let target = workspace::target().join("fuzz");
+                // A separate workspace, but with the same versions.
+                shell.copy_file("Cargo.lock", "fuzz/Cargo.lock")?;
+                cmd!(shell, "cargo check --manifest-path fuzz/Cargo.toml --target-dir {target}").run()?;
+            }
+            Step::Doc => {
+                cmd!(shell, "cargo doc --locked --workspace --lib --no-deps --all-features")
+                    .env("RUSTDOCFLAGS", "-D warnings")
+                    .run()?;
+            }
+            Step::Wasm => return cross::check(shell, machine.chip()?.ok(), cross::WASM),
+            Step::Systems => return cross::check(shell, machine.chip()?.ok(), cross::SYSTEMS),
+            Step::Boards => {
+                return with_chip(machine, |chip| firmware::build_checked(shell, chip, &Board::ALL));
+            }
+            Step::ClippyFirmware => return with_chip(machine, |chip| firmware::clippy(shell, chip)),
+            Step::Reproducible => return with_chip(machine, |chip| reproducible::check(shell, chip)),
+            Step::Kernel => {
+                return match machine.chip()? {
+                    Ok(_) => kernel::run(shell),
+                    Err(reason) => Ok(Outcome::Skipped(reason)),
+                };
+            }
+            Step::Python => return python::check(shell, machine.peers()?),
+            Step::Demo => cmd!(shell, "cargo demo --time 3s").run()?,
+            Step::Package => package::check(shell)?,
+        }
+        Ok(Outcome::Passed)
+    }
+}
+
+/// Does what needs a compiler for the chip; without one, says what to do to get it.
+fn with_chip(machine: &Machine, run: impl FnOnce(Toolchain) -> Result<()>) -> Result<Outcome> {
+    match machine.chip()? {
+        Ok(chip) => run(chip).map(|()| Outcome::Passed),
+        Err(reason) => Ok(Outcome::Skipped(reason)),
+    }
+}

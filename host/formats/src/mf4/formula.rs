@@ -11,7 +11,8 @@ pub(super) enum Formula {
     Variable,
     Number(f64),
     Two(char, Box<Formula>, Box<Formula>),
-    Function(Function, Box<Formula>),
+    /// By its index in [`FUNCTIONS`].
+    Function(usize, Box<Formula>),
 }
 
 type Function = fn(f64) -> f64;
@@ -47,7 +48,7 @@ impl Formula {
         match self {
             Self::Variable => x,
             Self::Number(number) => *number,
-            Self::Function(function, of) => function(of.value(x)),
+            Self::Function(at, of) => FUNCTIONS[*at].1(of.value(x)),
             Self::Two(operator, left, right) => {
                 let (left, right) = (left.value(x), right.value(x));
                 match operator {
@@ -154,9 +155,9 @@ impl Parser<'_> {
                 "x" | "x1" => Ok(Formula::Variable),
                 "pi" => Ok(Formula::Number(std::f64::consts::PI)),
                 _ => {
-                    let known = FUNCTIONS.iter().find(|(known, _)| *known == name).ok_or(())?;
+                    let known = FUNCTIONS.iter().position(|(known, _)| *known == name).ok_or(())?;
                     self.one_of(&['(']).ok_or(())?;
-                    Ok(Formula::Function(known.1, Box::new(self.bracket()?)))
+                    Ok(Formula::Function(known, Box::new(self.bracket()?)))
                 }
             };
         }

@@ -202,7 +202,10 @@ mod tests {
     fn bytes_with_0x_in_front_are_read() {
         let file = "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2\n1,0x123,false,Rx,0,2,0x11,0xFF\n2,0x123,false,Rx,0,1,0x1,\n";
         let (records, issues) = tests::read(CSV, file);
-        assert_eq!(tests::write(Format::Candump, &records), "(0.000001) can0 123#11FF\n(0.000002) can0 123#01\n");
+        assert_eq!(
+            tests::write(Format::Candump, &records),
+            "(0.000001) can0 123#11FF\n(0.000002) can0 123#01\n"
+        );
         assert_eq!(issues, Vec::<String>::new());
     }
 

@@ -19,9 +19,9 @@ mod part;
 mod plain;
 mod record;
 mod stream;
-mod value;
 #[cfg(test)]
 mod tests;
+mod value;
 
 pub(crate) use decode::Decoder;
 #[cfg(test)]

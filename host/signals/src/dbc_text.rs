@@ -87,8 +87,13 @@ fn is_shift_jis(bytes: &[u8]) -> bool {
             (0..=0x7F, _) => {}
             (0x81..=0x9F | 0xE0..=0xFC, [second @ (0x40..=0x7E | 0x80..=0xFC), behind @ ..]) => {
                 // In the other code page these are two marks, or a mark and a letter with an accent.
-                let is_clear = *first <= 0x9F && *second >= 0x80 || matches!(first, 0x81 | 0x8D | 0x8F | 0x90 | 0x9D);
-                if is_clear { pairs += 1 } else { others += usize::from(*first > 0x9F) }
+                let is_clear =
+                    *first <= 0x9F && *second >= 0x80 || matches!(first, 0x81 | 0x8D | 0x8F | 0x90 | 0x9D);
+                if is_clear {
+                    pairs += 1
+                } else {
+                    others += usize::from(*first > 0x9F)
+                }
                 rest = behind;
             }
             _ => others += 1,
@@ -272,12 +277,22 @@ mod tests {
         ] {
             assert_eq!(decode(&bytes), (text.into(), Some(encoding)));
         }
-        for japanese in ["温度", "車速 [km/h]", "エンジン回転数", "℃", "ﾄﾞｱ 開閉状態"] {
+        for japanese in ["温度", "車速 [km/h]", "エンジン回転数", "℃", "ﾄﾞｱ 開閉状態"]
+        {
             let text = format!("CM_ SG_ 5 One \"{japanese}\";\n");
             let bytes = encodings::SHIFT_JIS.encode(&text).0;
             assert_eq!(decode(&bytes), (text.as_str().into(), Some("Shift_JIS")));
         }
-        for western in ["Öltemperatur in °C", "don’t", "“quoted” – naïve", "Größe änderbar", "déjà été", "½ µm²", "ÄÖÜäöüß", "20 €"] {
+        for western in [
+            "Öltemperatur in °C",
+            "don’t",
+            "“quoted” – naïve",
+            "Größe änderbar",
+            "déjà été",
+            "½ µm²",
+            "ÄÖÜäöüß",
+            "20 €",
+        ] {
             let text = format!("CM_ SG_ 5 One \"{western}\";\n");
             let bytes = encodings::WINDOWS_1252.encode(&text).0;
             assert_eq!(decode(&bytes), (text.as_str().into(), None), "{western}");
@@ -288,9 +303,11 @@ mod tests {
     fn signals_without_a_receiver_get_one_and_nothing_else_changes() {
         let text = "BO_ 5 First: 8 A\n SG_ One : 0|8@1+ (1,0) [0|0] \"\"  \n SG_ Two : 8|8@1+ (1,0) [0|0] \"km/h\"\r\n\
                     \x20SG_ Three : 16|8@1+ (1,0) [0|0] \"\" A\nCM_ \"\n SG_ Four : 0|8@1+ (1,0) [0|0] \"\"\n";
-        let expected = text
-            .replacen("[0|0] \"\"  \n", "[0|0] \"\" Vector__XXX  \n", 1)
-            .replacen("\"km/h\"\r", "\"km/h\" Vector__XXX\r", 1);
+        let expected = text.replacen("[0|0] \"\"  \n", "[0|0] \"\" Vector__XXX  \n", 1).replacen(
+            "\"km/h\"\r",
+            "\"km/h\" Vector__XXX\r",
+            1,
+        );
         assert_eq!(with_receivers(text), expected);
         assert!(matches!(with_receivers(TEXT), Cow::Borrowed(_)));
     }

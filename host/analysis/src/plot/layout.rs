@@ -33,7 +33,14 @@ pub(super) fn lay_out(plot: &Plot, width: u32) -> Scene {
         Scene { width: width as f32, height: 0.0, shapes: Vec::new(), panes: Vec::new(), span: plot.span() };
     let mut top = 12.0;
     if !plot.title.is_empty() {
-        fitted(&mut scene, (LEFT, 26.0), 17.0, Anchor::Start, INK, (&plot.title, width as f32 - LEFT - RIGHT));
+        fitted(
+            &mut scene,
+            (LEFT, 26.0),
+            17.0,
+            Anchor::Start,
+            INK,
+            (&plot.title, width as f32 - LEFT - RIGHT),
+        );
         top = TITLE_HEIGHT;
     }
     let mut first_curve = 0;
@@ -377,7 +384,11 @@ fn lay_out_axis(plot: &Plot, top: f32, scene: &mut Scene) {
     let note = format!("{lost} frames lost here");
     let note_width = note.chars().count() as f32 * CHARACTER_WIDTH + 18.0;
     // Both are in one line, the label in its middle.
-    let room = if plot.gaps.is_empty() { area.right - area.left } else { area.right - area.left - 2.0 * (note_width + 8.0) };
+    let room = if plot.gaps.is_empty() {
+        area.right - area.left
+    } else {
+        area.right - area.left - 2.0 * (note_width + 8.0)
+    };
     fitted(scene, (middle, top + 38.0), TEXT_SIZE, Anchor::Middle, SOFT_INK, (&label, room.max(80.0)));
     if !plot.gaps.is_empty() {
         let x = area.right - note_width;

@@ -154,7 +154,10 @@ impl Plot {
     pub fn is_empty(&self) -> bool {
         self.panes.iter().all(|pane| match &pane.content {
             Content::Bars(bars) => bars.iter().all(|bar| bar.count == 0),
-            content => content.curves().iter().all(|curve| curve.series.points().iter().all(|point| point.y.is_nan())),
+            content => content
+                .curves()
+                .iter()
+                .all(|curve| curve.series.points().iter().all(|point| point.y.is_nan())),
         })
     }
 

@@ -68,7 +68,11 @@ fn numbers(word: &[u8]) -> Option<Vec<u64>> {
 impl Parts {
     /// `None` if a word contradicts what a date can have.
     fn word(&mut self, word: &[u8]) -> Option<()> {
-        let letters: String = word.iter().filter(|byte| byte.is_ascii_alphabetic()).map(|byte| char::from(byte.to_ascii_lowercase())).collect();
+        let letters: String = word
+            .iter()
+            .filter(|byte| byte.is_ascii_alphabetic())
+            .map(|byte| char::from(byte.to_ascii_lowercase()))
+            .collect();
         if has(word, MORNING) || has(word, AFTERNOON) {
             self.afternoon = Some(has(word, AFTERNOON));
         } else if letters.starts_with("gmt") || letters.starts_with("utc") {
@@ -90,7 +94,9 @@ impl Parts {
                 [year, month, day] if year > 31 && word.contains(&b'-') => {
                     self.numbers(Some(year), Some(month), Some(day))
                 }
-                [day, month, year] if word.contains(&b'.') => self.numbers(Some(year), Some(month), Some(day)),
+                [day, month, year] if word.contains(&b'.') => {
+                    self.numbers(Some(year), Some(month), Some(day))
+                }
                 // What is the month in 9/10/2017 depends on the country.
                 _ => None,
             };
@@ -193,12 +199,19 @@ mod tests {
         ] {
             assert_eq!(date(text, &Zone::default()).unwrap(), NS, "{}", String::from_utf8_lossy(text));
             // By the clock there.
-            assert_eq!(date(text, &berlin).unwrap(), NS - 7_200_000_000_000, "{}", String::from_utf8_lossy(text));
+            assert_eq!(
+                date(text, &berlin).unwrap(),
+                NS - 7_200_000_000_000,
+                "{}",
+                String::from_utf8_lossy(text)
+            );
         }
         // What says its zone is the same everywhere.
-        for text in
-            ["Sat Sep 30 15:06:13.191 GMT 2017", "Sat, 30 Sep 2017 17:06:13.191 GMT+0200", "Sat Sep 30 10:06:13.191 UTC-05:00 2017"]
-        {
+        for text in [
+            "Sat Sep 30 15:06:13.191 GMT 2017",
+            "Sat, 30 Sep 2017 17:06:13.191 GMT+0200",
+            "Sat Sep 30 10:06:13.191 UTC-05:00 2017",
+        ] {
             assert_eq!(date(text.as_bytes(), &berlin).unwrap(), NS, "{text}");
         }
         let first = |text: &[u8]| date(text, &Zone::default()).unwrap() / 86_400_000_000_000;
@@ -213,8 +226,17 @@ mod tests {
     #[test]
     fn what_is_no_date_or_could_be_two_is_refused() {
         for text in [
-            "", "Sat", "Sat Sep 30 2017", "Sat Sep 30 15:06:13", "Sat Sep 31x 15:06 2017", "9/10/2017 15:06:13", "Sat Foo 30 15:06:13 2017",
-            "Sat Sep 30 25:06:13 2017", "Sat Sep 30 15:06:13 2017 2018", "Sat Sep 30 15:06:13 15:06:13 2017", "Sat Sep 32 15:06:13 2017",
+            "",
+            "Sat",
+            "Sat Sep 30 2017",
+            "Sat Sep 30 15:06:13",
+            "Sat Sep 31x 15:06 2017",
+            "9/10/2017 15:06:13",
+            "Sat Foo 30 15:06:13 2017",
+            "Sat Sep 30 25:06:13 2017",
+            "Sat Sep 30 15:06:13 2017 2018",
+            "Sat Sep 30 15:06:13 15:06:13 2017",
+            "Sat Sep 32 15:06:13 2017",
             "Sat Sep 30 15:06:13 GMT+99 2017",
         ] {
             assert!(date(text.as_bytes(), &Zone::default()).is_err(), "{text}");

@@ -183,7 +183,8 @@ fn a_hole_of_nul_bytes_is_an_issue_wherever_it_begins_and_ends() {
     };
     for (format, whole, head) in texts.chain([table]) {
         let found = |bytes: Vec<u8>| {
-            let reader = TraceReader::from_source("hole", Cursor::new(bytes), format, &ReadOptions::default());
+            let reader =
+                TraceReader::from_source("hole", Cursor::new(bytes), format, &ReadOptions::default());
             reader.unwrap().filter_map(Result::err).map(|issue| issue.to_string()).collect::<Vec<_>>()
         };
         assert_eq!(found(whole.clone()), Vec::<String>::new(), "{format}");
@@ -206,7 +207,8 @@ fn a_hole_of_nul_bytes_is_an_issue_wherever_it_begins_and_ends() {
 fn comments_alone_are_not_a_trace_that_was_read() {
     let of = |text: &str| {
         let source = Cursor::new(text.to_owned());
-        let mut reader = TraceReader::from_source("a.log", source, Format::Candump, &ReadOptions::default()).unwrap();
+        let mut reader =
+            TraceReader::from_source("a.log", source, Format::Candump, &ReadOptions::default()).unwrap();
         assert_eq!(reader.by_ref().count(), 0);
         reader.nothing_read().map(|nothing| nothing.to_string())
     };

@@ -67,7 +67,8 @@ impl LoadCollector {
         let top = [5.0, 10.0, 20.0, 50.0, 100.0].into_iter().find(|top| *top >= most).unwrap_or(100.0);
         let (label, range) = if in_per_cent { ("load %", Some((0.0, top))) } else { ("frames/s", None) };
         let pane = Pane { label: label.to_owned(), range, content: Content::Analogue(curves) };
-        let plot = Plot { title, axis: self.axis.axis(), panes: vec![pane], gaps: self.gaps.finish(self.end) };
+        let plot =
+            Plot { title, axis: self.axis.axis(), panes: vec![pane], gaps: self.gaps.finish(self.end) };
         (plot, unknown)
     }
 }

@@ -14,6 +14,7 @@ pub mod board;
 pub mod capture;
 pub mod drive;
 pub mod firmware;
+pub mod hostile;
 pub mod link;
 #[cfg(unix)]
 pub mod pty;

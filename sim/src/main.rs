@@ -15,6 +15,7 @@ use cantap_emu::usb_host::Timing;
 use cantap_sim::CYCLES_PER_SECOND;
 use cantap_sim::board::CLOCK;
 use cantap_sim::firmware::{self, FirmwareError};
+use cantap_sim::hostile;
 use cantap_sim::run::{self, Load, Options, Report};
 use cantap_wire::Channel;
 use clap::{Parser, Subcommand};
@@ -110,6 +111,13 @@ pub struct Args {
     /// Print where the core's cycles go, by interrupt and function.
     #[arg(long, conflicts_with = "json")]
     profile: bool,
+    /// Make the silicon late, wrong or silent and the host misbehave, as this seed says, in place of a capture; then check that the
+    /// device is back, silent unless asked, and has delivered or counted every frame.
+    #[arg(long, value_name = "SEED", conflicts_with_all = ["stall", "replay", "trace", "profile", "pty"])]
+    hostile: Option<u64>,
+    /// With --hostile: try this many seeds, one after the other.
+    #[arg(long, value_name = "COUNT", default_value = "1", requires = "hostile")]
+    trials: u64,
     /// Serve the device on a pseudo-terminal, whose name is printed, rather than capture from it. Time stands
     /// still while the client does not read.
     #[arg(long, conflicts_with_all = ["stall", "json", "trace", "profile"])]
@@ -188,6 +196,9 @@ fn run(args: &Args) -> anyhow::Result<ExitCode> {
         serve::pty(image, options, args.seconds, args.real_time)?;
         return Ok(ExitCode::SUCCESS);
     }
+    if let Some(seed) = args.hostile {
+        return trials(&image, seed, args.trials, args.json);
+    }
     // Before the run, so that a file that cannot be written does not waste it.
     let trace_file = args.trace.as_deref().map(create).transpose()?;
     let (report, picture) = run::run(image, &options)?;
@@ -202,6 +213,34 @@ fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // If the pipe is closed, its reader has seen enough.
     printed.or_else(|error| if error.kind() == io::ErrorKind::BrokenPipe { Ok(()) } else { Err(error) })?;
     Ok(if report.ok { ExitCode::SUCCESS } else { ExitCode::from(CHECK_FAILED) })
+}
+
+/// Runs hostile trials and prints those that failed; of a single one, everything that happened.
+fn trials(image: &Image, first: u64, count: u64, json: bool) -> anyhow::Result<ExitCode> {
+    let (mut failed, mut delivered, mut lost) = (0, 0, 0);
+    for seed in first..first.saturating_add(count) {
+        let trial = hostile::try_seed(image.clone(), seed);
+        delivered += trial.delivered;
+        lost += trial.lost;
+        failed += u64::from(!trial.faults.is_empty());
+        if json || count > 1 && trial.faults.is_empty() {
+            continue;
+        }
+        println!("seed {seed}: {}", if trial.faults.is_empty() { "every check held" } else { "FAILED" });
+        if count == 1 {
+            trial.story.iter().for_each(|event| println!("  {event}"));
+        }
+        trial.faults.iter().for_each(|fault| println!("  FAULT: {fault}"));
+    }
+    if json {
+        let sum = serde_json::json!({ "seed": first, "trials": count, "failed": failed, "delivered": delivered, "lost": lost });
+        println!("{sum}");
+    } else {
+        println!(
+            "{count} trials from seed {first}: {failed} failed; {delivered} frames delivered, {lost} counted lost"
+        );
+    }
+    Ok(if failed == 0 { ExitCode::SUCCESS } else { ExitCode::from(CHECK_FAILED) })
 }
 
 fn create(path: &Path) -> anyhow::Result<BufWriter<File>> {

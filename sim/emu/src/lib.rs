@@ -11,6 +11,7 @@ pub mod can;
 mod clock;
 pub mod cpu;
 pub mod elf;
+pub mod hostile;
 pub mod machine;
 pub mod memory_map;
 pub mod otg;
@@ -28,6 +29,7 @@ pub mod usb_host;
 
 pub use clock::Clock;
 pub use elf::{ElfError, Image};
+pub use hostile::Hostile;
 pub use machine::{Machine, Setup};
 pub use peripheral::Peripheral;
 pub use stop::{Reason, Stopped};

@@ -17,7 +17,7 @@ use crate::soc::{Board, RECEIVE_PINS, bootloader};
 use crate::stop::{Reason, Stopped};
 use crate::timing::Bound;
 use crate::trace::Trace;
-use crate::{Clock, Peripheral};
+use crate::{Clock, Hostile, Peripheral};
 
 /// How often, in steps, to check for what the core does not report: a reset request, a lock-up.
 const LOOK_EVERY: u32 = 1024;
@@ -51,6 +51,8 @@ pub struct Setup {
     pub bound: Bound,
     /// What a CAN controller's master reset clears.
     pub master_reset: MasterReset,
+    /// What the chip does late, wrongly or never. What is attached from outside is its owner's.
+    pub hostile: Option<Hostile>,
 }
 
 impl Setup {
@@ -69,6 +71,7 @@ impl Setup {
             survive_failures: false,
             bound: Bound::Best,
             master_reset: MasterReset::default(),
+            hostile: None,
         }
     }
 }
@@ -109,6 +112,9 @@ impl Machine {
         let mut board = Board::new(&memories, setup.clock, setup.crystal);
         board.can.set_master_reset(setup.master_reset);
         board.receive_at(setup.receive_pins);
+        if let Some(hostile) = &setup.hostile {
+            board.set_hostile(hostile);
+        }
         if setup.joined {
             board.wires = [Wire::new(&[0, 1]), Wire::new(&[])];
         }
@@ -403,6 +409,30 @@ impl Machine {
         self.watched_priority = None;
         self.resets += 1;
         self.refresh();
+    }
+
+    /// The supply fails for a moment: a power-on reset at whatever instruction this is. What `seed` decides of the memories is lost, and
+    /// an operation of the flash is left half done.
+    pub fn brown_out(&mut self, seed: u64) {
+        /// Memory is lost in pieces.
+        const PIECE: usize = 64;
+        let mut random = fastrand::Rng::with_seed(seed);
+        if self.cpu.now() < self.stalled_until {
+            lock(&self.board).cut_flash_short(|| random.u32(..));
+            self.stalled_until = 0;
+        }
+        let lost_percent = [0, 10, 100][random.usize(..3)];
+        for range in [map::SRAM, map::CCM] {
+            let Some(memory) = self.cpu.memory(range.start) else { continue };
+            for piece in range.step_by(PIECE) {
+                if random.u32(..100) < lost_percent {
+                    let mut bytes = [0; PIECE];
+                    random.fill(&mut bytes);
+                    memory.write(piece, &bytes);
+                }
+            }
+        }
+        self.restart(ResetCause::PowerOn);
     }
 
     /// Queries everything for its interrupt line and next event.

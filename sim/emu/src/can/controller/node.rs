@@ -73,7 +73,7 @@ impl Controller {
 
     /// The frame it wants to send now.
     pub(crate) fn next_frame(&self) -> Option<Frame> {
-        if !self.answers() || self.init_pending {
+        if !self.answers() || self.init_pending || self.init_at.is_some() {
             return None;
         }
         Some(self.mailboxes.next(self.mcr & mcr::TXFP != 0)?.1)
@@ -181,7 +181,7 @@ impl Controller {
         self.receiving = false;
         if self.init_pending {
             self.init_pending = false;
-            self.mode = Mode::Initialisation;
+            self.enter_initialisation();
         } else if self.mode == Mode::Normal && self.mcr & mcr::SLEEP != 0 {
             self.fall_asleep();
         }

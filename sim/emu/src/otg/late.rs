@@ -44,9 +44,9 @@ impl Late {
         }
     }
 
-    /// Whether a driver may disable an IN endpoint that does not report its NAK: it cannot do more than wait.
+    /// Whether a driver may disable an IN endpoint that does not report its NAK: it has waited long enough.
     pub fn excuses(&self, endpoint: &Endpoint) -> bool {
-        endpoint.nak_at.is_some() || self.faults.silent_nak && endpoint.naks()
+        endpoint.nak_at == Some(u64::MAX) || self.faults.silent_nak && endpoint.naks()
     }
 
     /// When what a write to an endpoint's control register asks for takes effect.

@@ -76,6 +76,7 @@ pub struct Board {
     pub(super) awaited: Option<Awaited>,
     /// What a controller's TX pin may do.
     pub(super) transmit_pins: TransmitPins,
+    frames_cut: u64,
 }
 
 /// A clock that was just switched on (ES0182, "Delay after an RCC peripheral clock enabling").
@@ -114,6 +115,7 @@ impl Board {
             boot_mode: rom::FLASH,
             awaited: None,
             transmit_pins: TransmitPins::default(),
+            frames_cut: 0,
         }
     }
 
@@ -141,6 +143,11 @@ impl Board {
                 wire.hold_dominant(held, &mut self.can);
             }
         }
+    }
+
+    /// Frames that were on a bus when the chip was reset. In the model they end all the same; a real one would be an error on the bus.
+    pub fn frames_cut(&self) -> u64 {
+        self.frames_cut
     }
 
     /// How long a cycle is.
@@ -189,6 +196,7 @@ impl Board {
     /// A system reset: everything except the memories and the buses, whose nodes continue.
     pub fn reset(&mut self, cause: ResetCause, now: u64) {
         self.advance(now);
+        self.frames_cut += self.can.controllers.iter().filter(|one| one.is_sending()).count() as u64;
         self.rcc = Rcc::new(self.clock, self.crystal, cause);
         self.awaited = None;
         // The jumper for the ROM bootloader, if any, has been removed.

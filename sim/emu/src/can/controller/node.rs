@@ -11,6 +11,11 @@ use crate::can::filter::Match;
 use crate::can::mailbox::Attempt;
 
 impl Controller {
+    /// Whether a frame of its own is on the bus.
+    pub fn is_sending(&self) -> bool {
+        self.sending.is_some()
+    }
+
     /// Its mode.
     pub fn mode(&self) -> Mode {
         self.mode

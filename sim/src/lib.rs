@@ -20,6 +20,7 @@ pub mod link;
 pub mod pty;
 pub mod rig;
 pub mod run;
+pub mod soak;
 pub mod stream;
 pub mod usbip;
 

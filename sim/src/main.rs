@@ -17,6 +17,7 @@ use cantap_sim::board::CLOCK;
 use cantap_sim::firmware::{self, FirmwareError};
 use cantap_sim::hostile;
 use cantap_sim::run::{self, Load, Options, Report};
+use cantap_sim::soak;
 use cantap_wire::Channel;
 use clap::{Parser, Subcommand};
 
@@ -41,8 +42,23 @@ struct Cli {
 enum Command {
     /// Put traffic on the buses, capture it over USB and check every frame.
     Run(Args),
+    /// Capture for hours: both channels full, with stalls, requests and replays in turn; reports memory, stamps and the device's clock.
+    Soak(SoakArgs),
     /// Serve the board to a kernel as a USB device, by USB/IP or usbredir.
     Usbip(UsbipArgs),
+}
+
+/// The command line of `soak`.
+#[derive(clap::Args)]
+struct SoakArgs {
+    /// The firmware's ELF, as `cargo xtask firmware` makes it.
+    firmware: PathBuf,
+    /// Emulated time; the round of turns under way is finished.
+    #[arg(long, default_value = "3600s", value_parser = some_seconds)]
+    seconds: Duration,
+    /// Seed of the traffic.
+    #[arg(long, default_value = "1")]
+    seed: u64,
 }
 
 /// The command line of `usbip`.
@@ -166,6 +182,7 @@ fn percent(text: &str) -> Result<f64, String> {
 fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Run(args) => run(&args),
+        Command::Soak(args) => soak(&args),
         Command::Usbip(args) => usbip(&args),
     };
     match result {
@@ -187,6 +204,13 @@ fn open(firmware: &Path) -> anyhow::Result<Image> {
 fn usbip(args: &UsbipArgs) -> anyhow::Result<ExitCode> {
     cantap_sim::usbip::serve(open(&args.firmware)?, &args.folder)?;
     Ok(ExitCode::SUCCESS)
+}
+
+fn soak(args: &SoakArgs) -> anyhow::Result<ExitCode> {
+    let image = open(&args.firmware)?;
+    let soak = soak::run(image, args.seconds.as_secs_f64(), args.seed, |line| eprintln!("{line}"))?;
+    println!("{}", soak.to_json());
+    Ok(if soak.faults.is_empty() { ExitCode::SUCCESS } else { ExitCode::from(CHECK_FAILED) })
 }
 
 fn run(args: &Args) -> anyhow::Result<ExitCode> {

@@ -14,6 +14,7 @@ use cantap_emu::elf::Image;
 use cantap_emu::machine::{Machine, Setup};
 use cantap_emu::memory_map as map;
 use cantap_emu::otg::Otg;
+use cantap_emu::soc::rcc::Crystal;
 use cantap_emu::stop::Stopped;
 use cantap_emu::usb::UsbPort;
 use cantap_emu::usb_host::{self, EnumerationError, Timing, UsbHost};
@@ -105,7 +106,11 @@ pub struct Rig {
 impl Rig {
     /// A board with `image` and the cable out.
     pub fn new(image: Image, setup: Setup, timing: Timing) -> Self {
-        let mut machine = Machine::new(image, setup);
+        Self::on(Machine::new(image, setup), setup, timing)
+    }
+
+    /// The same with a machine that was made with this `setup`.
+    pub fn on(mut machine: Machine, setup: Setup, timing: Timing) -> Self {
         let mut usb = UsbPort::new(timing);
         if let Some(hostile) = &setup.hostile {
             usb.otg_mut().set_hostile(hostile, CLOCK);
@@ -149,6 +154,13 @@ impl Rig {
     pub fn calm(&mut self) {
         self.machine.board().calm();
         self.with_host(|_, otg| otg.calm());
+    }
+
+    /// The board's crystal stops, or starts again: see [`Machine::set_crystal`].
+    pub fn set_crystal(&mut self, crystal: Crystal) {
+        if self.machine.set_crystal(crystal) {
+            self.with_host(|_, otg| otg.die());
+        }
     }
 
     /// Waits for answers to requests for at most `cycles` from now on.
@@ -422,6 +434,11 @@ impl Rig {
     /// Events that the device reported, with their device times.
     pub fn events(&self) -> &[(u64, Event)] {
         &self.events
+    }
+
+    /// Takes the events reported so far.
+    pub fn take_events(&mut self) -> Vec<(u64, Event)> {
+        std::mem::take(&mut self.events)
     }
 
     /// When, by its own clock, the device ended the session on its own, and why.

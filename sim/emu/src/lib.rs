@@ -18,6 +18,7 @@ pub mod otg;
 pub mod peripheral;
 pub mod probe;
 pub mod profile;
+pub mod recording;
 pub mod rom;
 pub mod soc;
 pub mod stop;

@@ -6,6 +6,7 @@ use crate::common;
 use cantap_emu::hostile::{CanFaults, Hostile, ReleaseInInit, Tardy, UsbFaults};
 use cantap_emu::machine::Setup;
 use cantap_emu::otg::Misuse;
+use cantap_emu::soc::rcc::Crystal;
 use cantap_emu::traffic::{Kind, Traffic};
 use cantap_emu::usb_host::{Request, Timing};
 use cantap_sim::board::CLOCK;
@@ -201,7 +202,8 @@ fn a_reset_that_was_asked_for_cuts_no_frame() {
             rig.open(channel, config).unwrap();
             let frame = "7FF#FFFFFFFFFFFFFFFF".parse().unwrap();
             // On the bus for two thirds of the time.
-            let entry = Periodic { frame, period_ticks: 200 * 12, count: 0, modifiers: [].into_iter().collect() };
+            let entry =
+                Periodic { frame, period_ticks: 200 * 12, count: 0, modifiers: [].into_iter().collect() };
             rig.ask(Command::SetPeriodic { channel, slot: 0, entry: Some(entry) }).unwrap();
         }
         rig.ask(command).unwrap();
@@ -268,7 +270,7 @@ fn a_transfer_has_completed_when_its_endpoint_says_so() {
     // Control requests complete while a transfer of data is under way.
     rig.with_host(|host, _| host.read(false));
     for _ in 0..20 {
-        rig.with_host(|host, _| host.control(Request::get_status()));
+        rig.with_host(|host, _| host.control(Request::endpoint_status(0)));
         rig.run_for(MS).unwrap();
     }
     rig.with_host(|host, _| host.read(true));
@@ -299,6 +301,32 @@ fn a_flash_that_stays_busy_is_given_up() {
         capture(&mut rig);
     }
     check(&mut rig);
+}
+
+/// The watchdog has its own oscillator: the chip restarts without a crystal, waits for it, and is back. A frame of ours that was on the
+/// bus is cut off, and its last bit stays there until then.
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn a_board_whose_crystal_stops_is_back_when_it_starts_again() {
+    let setup = Setup { survive_watchdog: true, ..common::setup() };
+    let mut rig = Rig::new(common::firmware(), setup, Timing::hasty(CLOCK));
+    rig.connect().unwrap();
+    let config = ChannelConfig { mode: Mode::Normal, ..ChannelConfig::listen_only(timing(MEGABIT).unwrap()) };
+    rig.open(Channel::Can1, config).unwrap();
+    rig.set_crystal(Crystal { start_us: None, ..setup.crystal });
+    let restarted = rig.run_while(6_000 * MS, |rig| rig.machine.resets() == 0).unwrap();
+    assert!(restarted);
+    let driven = rig.dominant_bits(Channel::Can1);
+    rig.set_crystal(setup.crystal);
+    rig.cut();
+    rig.wait_for_port().unwrap();
+    for channel in Channel::ALL {
+        let traffic = Traffic::new(Kind::Mix, 1, LOAD_PERCENT, rig.now(), u64::MAX);
+        rig.add_traffic(channel, MEGABIT, traffic);
+    }
+    capture(&mut rig);
+    assert!(rig.ledger.holds(), "{:?}", rig.ledger.faults());
+    assert_eq!(rig.dominant_bits(Channel::Can1), driven);
 }
 
 /// Everything at once, decided by seeds. `cantap-sim run FIRMWARE.elf --hostile SEED` tells what happened in one.

@@ -22,6 +22,11 @@ impl Otg {
         self.end_setup_stage(true);
     }
 
+    /// The controller has lost its clock: it answers nothing until a reset of the chip.
+    pub fn die(&mut self) {
+        self.late.is_dead = true;
+    }
+
     /// Time has come to `now`.
     pub fn settle(&mut self, now: u64) {
         self.late.now = now;

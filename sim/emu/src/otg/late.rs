@@ -14,6 +14,8 @@ pub struct Late {
     /// Whether anything was ever to come late.
     pub is_hostile: bool,
     pub dice: Dice,
+    /// The controller has no clock.
+    pub is_dead: bool,
     pub now: u64,
     /// When the core soft reset under way ends.
     pub reset_at: Option<u64>,

@@ -92,7 +92,7 @@ impl Otg {
     }
 
     fn addressed(&self, address: u8) -> bool {
-        self.address == address
+        self.address == address && !self.late.is_dead
     }
 
     /// DCFG was written. An address written during a transfer is that of SET_ADDRESS and takes effect at

@@ -134,6 +134,26 @@ impl Board {
         self.follow_transmit_pins();
     }
 
+    /// The crystal stops, or starts again. Returns whether the chip has lost its clock by that: the controllers are deaf and silent then,
+    /// apart from a bit that stays on the bus, until a reset puts the chip on its own oscillator. The clock security system, which would
+    /// do so at once, is not modelled.
+    pub fn set_crystal(&mut self, crystal: Crystal, now: u64) -> bool {
+        self.advance(now);
+        let stands_still = crystal.start_us.is_none() && self.rcc.needs_crystal();
+        self.crystal = crystal;
+        self.rcc.exchange_crystal(crystal, now);
+        if stands_still {
+            for controller in 0..2 {
+                if self.can.controllers[controller].is_sending() {
+                    self.transmit_pins.clock_stops(controller);
+                }
+                self.can.reset(controller);
+            }
+            self.follow_transmit_pins();
+        }
+        stands_still
+    }
+
     /// Lets the buses follow the TX pins, after a change of the pins, the clocks or the controllers.
     pub(super) fn follow_transmit_pins(&mut self) {
         for (controller, held) in self.transmit_pins.follow(&self.ports, &self.rcc).into_iter().enumerate() {

@@ -49,6 +49,12 @@ impl TransmitPins {
             is_connected(controller, ports) && self.dice.hits(self.faults.reset_sticks_percent);
     }
 
+    /// A controller's clock stops in the middle of a frame of its own: whatever bit is on the pin stays there. Here it is a dominant one.
+    pub fn clock_stops(&mut self, controller: usize) {
+        self.is_hostile = true;
+        self.stuck[controller] = true;
+    }
+
     /// Follows a change of the pins, the clocks or the controllers. Returns which controllers' buses are now held, or released.
     pub fn follow(&mut self, ports: &[Gpio], rcc: &Rcc) -> [Option<bool>; 2] {
         if !self.is_hostile {

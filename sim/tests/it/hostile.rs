@@ -294,12 +294,13 @@ fn a_flash_that_is_busy_for_long_is_waited_for() {
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_flash_that_stays_busy_is_given_up() {
     let mut rig = board(Hostile { flash_busy: Tardy::NEVER, ..Hostile::default() });
-    rig.connect().unwrap();
+    rig.plug_in().unwrap();
     for _ in 0..2 {
+        capture(&mut rig);
         let response = rig.request(Command::SaveDefaults).unwrap();
         assert_eq!(response.result, Err(Refusal::Hardware));
-        capture(&mut rig);
     }
+    capture(&mut rig);
     check(&mut rig);
 }
 

@@ -15,6 +15,7 @@ pub mod capture;
 pub mod drive;
 pub mod firmware;
 pub mod link;
+pub mod locks;
 #[cfg(unix)]
 pub mod pty;
 pub mod rig;

@@ -16,6 +16,7 @@ pub mod drive;
 pub mod firmware;
 pub mod hostile;
 pub mod link;
+pub mod locks;
 #[cfg(unix)]
 pub mod pty;
 pub mod rig;

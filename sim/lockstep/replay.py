@@ -25,9 +25,9 @@ SECTOR, SECTOR_BYTES = 0x080E_0000, 0x2_0000
 RECORDED = ((0x1FFF_0000, 0x1_0000), (0x4000_0000, 0x10_0000), (0x5000_0000, 0x4_0000), (0xE004_2000, 0x1000))
 # The aliases of the peripherals' bits: each access is one, or two, of the word.
 BITS, BITS_BYTES = 0x4200_0000, 0x200_0000
-# The core's own registers, which the recording does not have: storage.
+# The core's own registers, which the recording does not have: storage, apart from CPUID and AIRCR as they are after a reset.
 SYSTEM, SYSTEM_BYTES = 0xE000_0000, 0x4_0000
-AIRCR, AIRCR_READS = 0xE000_ED0C, 0xFA05_0000
+AFTER_RESET = {0xE000_ED00: 0x410F_C241, 0xE000_ED0C: 0xFA05_0000}
 # N, Z, C, V, Q and GE.
 FLAGS = 0xF80F_0000
 REGISTERS = [
@@ -52,7 +52,8 @@ class Replay:
         for segment in elf.iter_segments():
             if segment["p_type"] == "PT_LOAD" and segment["p_filesz"] and FLASH <= segment["p_paddr"] < FLASH + FLASH_BYTES:
                 uc.mem_write(segment["p_paddr"], segment.data())
-        uc.mem_write(AIRCR, struct.pack("<I", AIRCR_READS))
+        for address, value in AFTER_RESET.items():
+            uc.mem_write(address, struct.pack("<I", value))
         for base, size in RECORDED:
             uc.mmio_map(base, size, self.read, base, self.write, base)
         uc.mmio_map(BITS, BITS_BYTES, self.read_bit, None, self.write_bit, None)

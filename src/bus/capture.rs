@@ -4,6 +4,7 @@
 //! raised the interrupt, so its stamp is its end plus the interrupt's latency. Frames queued behind another, or that arrive
 //! while the FIFO is being drained, ended at some unknown earlier time: their stamps say so, and the host tightens them.
 
+mod gaps;
 mod orders;
 
 pub use orders::Closing;
@@ -11,6 +12,7 @@ pub use orders::Closing;
 use cantap_wire::message::ChannelConfig;
 use cantap_wire::record::{ErrorState, LossStage, Stamp, TransmitFailure};
 use cantap_wire::{CHANNELS, Channel, Event, Received};
+use gaps::{Gap, Gaps};
 
 use crate::QUEUE_BYTES;
 use crate::bus::errors::ErrorMonitor;
@@ -43,6 +45,8 @@ struct ChannelState<'q> {
     abort_reason: TransmitFailure,
     frames: u32,
     overruns: u32,
+    /// Where in the FIFO frames were lost.
+    gaps: Gaps,
     /// The channel was asked to leave its bus. Its FIFO is left alone until it has, since what a release does in between is not known.
     closing: bool,
     /// Since the channel left its bus: frames in its FIFO that have not been taken yet.
@@ -74,6 +78,7 @@ impl<'q, const N: usize> Capture<'q, N> {
                 abort_reason: TransmitFailure::Aborted,
                 frames: 0,
                 overruns: 0,
+                gaps: Gaps::new(),
                 closing: false,
                 left: None,
                 held: false,
@@ -117,9 +122,20 @@ impl<'q, const N: usize> Capture<'q, N> {
         let now = self.recorder.time(clock.now());
         let state = &mut self.channels[channel.index()];
         if state.held && state.closing && traffic.take_overrun() {
-            Self::lose(state, &mut self.recorder, channel, 1, now);
+            state.gaps.overrun(traffic);
+            Self::record_gap(state, &mut self.recorder, channel, now);
         }
         state.held && !state.closing && self.drain(channel, traffic, clock, None)
+    }
+
+    /// Records that frames are missing before the next one in the FIFO, if they are.
+    #[inline]
+    fn record_gap(state: &mut ChannelState<'_>, recorder: &mut Recorder<'_, N>, channel: Channel, at: u64) {
+        match state.gaps.here() {
+            Gap::None => {}
+            Gap::Certain => Self::lose(state, recorder, channel, 1, at),
+            Gap::Possible => Self::lose(state, recorder, channel, 0, at),
+        }
     }
 
     /// Records that a controller lost this many frames, or more.
@@ -168,9 +184,15 @@ impl<'q, const N: usize> Capture<'q, N> {
                 _ => (clock.now(), Stamp::UpperBound),
             };
             let at = self.recorder.time(stamp);
+            if overrun {
+                state.gaps.overrun(traffic);
+                Self::record_gap(state, &mut self.recorder, channel, at);
+            }
+            let mut taken = 0;
             for _ in 0..u32::from(pending).min(room) {
                 let Some(frame) = traffic.receive() else { break };
                 room -= 1;
+                taken += 1;
                 state.frames = state.frames.wrapping_add(1);
                 reply |= state.transmitter.on_frame(&frame);
                 let received = Received {
@@ -180,13 +202,15 @@ impl<'q, const N: usize> Capture<'q, N> {
                     data_omitted: omit_data,
                 };
                 self.recorder.frame(&received, at);
+                state.gaps.taken();
+                Self::record_gap(state, &mut self.recorder, channel, at);
             }
-            if overrun {
-                // The FIFO keeps the frames it holds and drops those that follow.
-                Self::lose(state, &mut self.recorder, channel, 1, at);
-            }
+            state.gaps.looked(pending, taken, traffic);
         }
         state.held = !emptied;
+        if emptied {
+            state.gaps.emptied();
+        }
         if !emptied {
             state.drains_given_up = state.drains_given_up.wrapping_add(1);
         }

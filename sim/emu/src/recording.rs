@@ -21,8 +21,9 @@ use crate::timing::Speeds;
 const PICTURE_EVERY: u64 = 1_000_000;
 /// The last sector of flash, which programs use for storage (RM0090 Rev 21 Table 5).
 const LAST_SECTOR: std::ops::Range<u32> = 0x080E_0000..0x0810_0000;
-/// The flash interface's control register.
+/// The flash interface's control register, and the bit that begins to erase.
 const FLASH_CR: u32 = 0x4002_3C10;
+const FLASH_START: u32 = 1 << 16;
 /// xPSR: the active exception.
 const EXCEPTION: u32 = 0x1FF;
 const WFE: u16 = 0xBF20;
@@ -128,6 +129,10 @@ impl Recording {
     pub fn step(&mut self, cpu: &Cpu) {
         self.steps += 1;
         let before = std::mem::replace(&mut self.last, cpu.registers());
+        if cpu.asleep() && before == self.last && !self.resets {
+            // It was asleep already.
+            return;
+        }
         let jumped = (before.xpsr ^ self.last.xpsr) & EXCEPTION != 0;
         let sleeps = || {
             let address = before.r[15];
@@ -144,7 +149,9 @@ impl Recording {
             return;
         }
         self.executed += u32::from(before.executes());
-        let erases = lock(&self.accesses).last().is_some_and(|last| last.writes && last.address == FLASH_CR);
+        let erases = lock(&self.accesses).last().is_some_and(|last| {
+            last.writes && last.address == FLASH_CR && last.value & FLASH_START != 0
+        });
         self.picture_due |= self.steps.is_multiple_of(PICTURE_EVERY) || erases;
         if self.picture_due && !self.last.is_in_it_block() {
             self.end_stretch();

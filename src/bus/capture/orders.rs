@@ -4,6 +4,7 @@ use cantap_wire::message::{ChannelConfig, ChannelStatus, Registers};
 use cantap_wire::record::{LossStage, Stamp, TransmitFailure};
 use cantap_wire::{Channel, Event, Received};
 
+use super::gaps::{Gap, Gaps};
 use super::{Capture, LOOKS_PER_DRAIN};
 use crate::bus::errors::ErrorMonitor;
 use crate::bus::transmit::{Transmitter, forget_finished};
@@ -31,6 +32,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         for state in &mut self.channels {
             state.frames = 0;
             state.overruns = 0;
+            state.gaps = Gaps::new();
             state.errors = ErrorMonitor::new(state.errors.channel());
             state.transmitter.clear();
             state.transmitter.reset_counters();
@@ -44,7 +46,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         let state = &mut self.channels[channel.index()];
         state.open = Some(config);
         state.abort_reason = TransmitFailure::Aborted;
-        (state.closing, state.left) = (false, None);
+        (state.closing, state.left, state.gaps) = (false, None, Gaps::new());
         state.errors.restart();
         self.recorder.event(&Event::Started { channel }, now);
     }
@@ -78,6 +80,10 @@ impl<'q, const N: usize> Capture<'q, N> {
         let now = self.now(clock);
         let state = &mut self.channels[channel.index()];
         let mut left = state.left.unwrap_or_else(|| traffic.pending());
+        if traffic.take_overrun() {
+            state.gaps.overrun(traffic);
+        }
+        Self::record_gap(state, &mut self.recorder, channel, now);
         let (omit_data, omit_stamps) =
             state.open.map_or((false, false), |config| (config.omit_data, config.omit_stamps));
         while left > 0 && traffic.pending() <= left {
@@ -86,11 +92,10 @@ impl<'q, const N: usize> Capture<'q, N> {
             state.frames = state.frames.wrapping_add(1);
             let stamp = if omit_stamps { Stamp::Omitted } else { Stamp::UpperBound };
             self.recorder.frame(&Received { channel, frame, stamp, data_omitted: omit_data }, now);
+            state.gaps.taken();
+            Self::record_gap(state, &mut self.recorder, channel, now);
         }
         state.left = Some(left);
-        if traffic.take_overrun() {
-            Self::lose(state, &mut self.recorder, channel, 1, now);
-        }
         left == 0 && traffic.pending() == 0
     }
 
@@ -100,8 +105,10 @@ impl<'q, const N: usize> Capture<'q, N> {
         let now = self.now(clock);
         let state = &mut self.channels[channel.index()];
         let left = state.left.replace(0).unwrap_or(0);
-        if left > 0 {
-            Self::lose(state, &mut self.recorder, channel, left.into(), now);
+        let gap = state.gaps.rest();
+        if left > 0 || gap != Gap::None {
+            let count = left + u8::from(gap == Gap::Certain);
+            Self::lose(state, &mut self.recorder, channel, count.into(), now);
         }
     }
 

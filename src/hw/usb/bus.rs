@@ -91,6 +91,8 @@ impl Core {
         registers.write(GRSTCTL, grstctl::CSRST);
         registers.wait_until(|registers| registers.read(GRSTCTL) & grstctl::CSRST == 0);
         registers.wait_until(|registers| registers.read(GRSTCTL) & grstctl::AHBIDL != 0);
+        // Before a host can see the device: what it does from then on is not to be forgotten.
+        registers.write(GINTSTS, !0);
         // After the reset, as in ST's driver, because it is not said to keep this.
         registers.modify(GUSBCFG, 0, gusbcfg::FDMOD);
         let vbus = if board::SENSES_VBUS { gccfg::VBUSBSEN } else { gccfg::NOVBUSSENS };
@@ -104,7 +106,6 @@ impl Core {
         // The receive FIFO's status reports what arrives.
         registers.write(DOEPMSK, 0);
         registers.write(DAINTMSK, 1 | 1 << BULK_IN);
-        registers.write(GINTSTS, !0);
         let wanted = [gint::USBRST, gint::ENUMDNE, gint::USBSUSP, gint::WKUPINT, gint::IEPINT, gint::RXFLVL];
         let session = if board::SENSES_VBUS { gint::OTGINT } else { 0 };
         registers.write(GINTMSK, wanted.iter().fold(session, |mask, flag| mask | flag));

@@ -11,7 +11,6 @@ use serde_json::{Value, json};
 use super::patience::{check, pause};
 use super::report::Outcome;
 use super::traffic::{Amount, Flow, STAMP_TOLERANCE_US, exchange, forget, load_together_pct};
-use crate::words::state_name;
 use cantap_work::rounded;
 
 /// Bit rate of the steps that need only one.
@@ -232,7 +231,7 @@ pub fn unacknowledged(device: &Device, sender: Channel) -> Result {
         "{who}: TEC {}, REC {}, {}; opened again: TEC {}, REC {}",
         seen.tec,
         seen.rec,
-        state_name(seen.state),
+        seen.state.name(),
         again.tec,
         again.rec
     );

@@ -15,7 +15,7 @@ use cantap::wire::{CHANNELS, Channel};
 use cantap::{Device, TraceRecord};
 
 use crate::rescue::Rescue;
-use crate::words::failure_name;
+use crate::words::failure_text;
 use cantap_work::interrupt;
 
 /// How often to check whether to continue.
@@ -107,7 +107,7 @@ impl<'d> Sending<'d> {
                 Err(TransmitFailure::Overtaken { periods }) => self.overtaken += u64::from(periods),
                 Err(reason) => {
                     self.failed += 1;
-                    *self.failures.entry(failure_name(reason)).or_default() += 1;
+                    *self.failures.entry(failure_text(reason)).or_default() += 1;
                 }
             }
         }

@@ -65,6 +65,8 @@ pub struct Otg {
     line: bool,
     misuse: Misuse,
     late: Late,
+    /// OUT packets that were acknowledged and thrown away because of their toggle.
+    thrown_away: u64,
 }
 
 /// What a driver did that the chip does not forgive. A test can assert that none of it happened.
@@ -134,6 +136,7 @@ impl Otg {
             line: false,
             misuse: Misuse::default(),
             late: Late::default(),
+            thrown_away: 0,
         };
         otg.ins[0] = Endpoint::control_pipe();
         otg.outs[0] = Endpoint::control_pipe();
@@ -153,6 +156,12 @@ impl Otg {
     /// What a driver did wrong so far.
     pub fn misuse(&self) -> Misuse {
         self.misuse
+    }
+
+    /// OUT packets that were acknowledged and thrown away because of their toggle: repetitions, if the host missed a handshake; otherwise
+    /// one of the two sides has not begun anew with DATA0, and the packet is lost.
+    pub fn thrown_away(&self) -> u64 {
+        self.thrown_away
     }
 
     /// Reads a whole register; reading the receive queue or a FIFO removes what was read.
@@ -334,6 +343,7 @@ impl Otg {
         self.frame = old.frame;
         self.misuse = old.misuse;
         self.late = old.late;
+        self.thrown_away = old.thrown_away;
     }
 
     fn write_dctl(&mut self, value: u32) {

@@ -55,6 +55,40 @@ fn a_fifo_that_is_late_is_drained_by_the_tick_with_stamps_that_say_so() {
     assert_eq!(bench.records.last().unwrap().1, received(numbered(2), Stamp::Exact));
 }
 
+/// The overrun is noticed while frames that came before it are still in the FIFO, and recorded behind them; also if the channel is closed
+/// meanwhile.
+#[test]
+fn a_loss_stands_behind_the_frames_that_were_there_before_it() {
+    for closes in [false, true] {
+        let queue = Queue::new();
+        let mut bench = Bench::opened(&queue, Mode::ListenOnly);
+        bench.board.traffic[0].stubborn = Some(Stubborn::Slow);
+        bench.board.traffic[0].arrive(numbered(0));
+        bench.board.traffic[0].arrive(numbered(1));
+        bench.receive(CAN1, numbered(2));
+        bench.board.traffic[0].arrive(numbered(3));
+        bench.millisecond();
+        if closes {
+            bench.board.traffic[0].stubborn = None;
+            bench.board.traffic[0].release();
+            assert_eq!(bench.ask(Command::Close { channel: CAN1 }), Ok(Reply::Done));
+        } else {
+            bench.board.traffic[0].release();
+            bench.board.traffic[0].arrive(numbered(4));
+            for _ in 0..4 {
+                bench.millisecond();
+                bench.board.traffic[0].release();
+            }
+        }
+        bench.millisecond();
+        bench.millisecond();
+        let frames: &[u32] = if closes { &[0, 1, 2] } else { &[0, 1, 2, 4] };
+        assert_eq!(bench.frames(CAN1), frames.iter().map(|n| numbered(*n)).collect::<Vec<_>>());
+        let lost = Event::Lost { channel: CAN1, stage: LossStage::Controller, count: 1, at_least: true };
+        assert_eq!(bench.records[3].1, Record::Event(lost), "{closes}: {:?}", bench.records);
+    }
+}
+
 /// What an unreleased FIFO cannot take in is an overrun like any other.
 #[test]
 fn frames_that_a_stubborn_fifo_drops_are_counted() {

@@ -149,9 +149,9 @@ impl Recording {
             return;
         }
         self.executed += u32::from(before.executes());
-        let erases = lock(&self.accesses).last().is_some_and(|last| {
-            last.writes && last.address == FLASH_CR && last.value & FLASH_START != 0
-        });
+        let erases = lock(&self.accesses)
+            .last()
+            .is_some_and(|last| last.writes && last.address == FLASH_CR && last.value & FLASH_START != 0);
         self.picture_due |= self.steps.is_multiple_of(PICTURE_EVERY) || erases;
         if self.picture_due && !self.last.is_in_it_block() {
             self.end_stretch();

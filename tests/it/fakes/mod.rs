@@ -62,6 +62,8 @@ pub struct FakeTraffic {
     pub fifo: VecDeque<Frame>,
     /// The FIFO does not release its frames, or shows the same frame again and again.
     pub stubborn: Option<Stubborn>,
+    /// The frame in front has been taken and is being released.
+    pub releasing: bool,
     /// Frames taken from the FIFO.
     pub received: usize,
     /// A mailbox that says for ever that it has finished.
@@ -89,6 +91,8 @@ pub enum Stubborn {
     Keeps,
     /// RFOM is cleared, but the frame stays.
     Repeats,
+    /// A frame that was taken stays in the way until [`FakeTraffic::release`].
+    Slow,
 }
 
 /// More calls than any single interrupt makes: a loop that makes them has no end.
@@ -98,6 +102,13 @@ impl FakeTraffic {
     /// A frame comes off the bus.
     pub fn arrive(&mut self, frame: Frame) {
         if self.fifo.len() < 3 { self.fifo.push_back(frame) } else { self.overrun = true }
+    }
+
+    /// A slow FIFO releases the frame that was taken.
+    pub fn release(&mut self) {
+        if std::mem::take(&mut self.releasing) {
+            self.fifo.pop_front();
+        }
     }
 
     /// The bus takes the oldest mailbox's frame.
@@ -111,7 +122,11 @@ impl FakeTraffic {
 
 impl Traffic for FakeTraffic {
     fn pending(&self) -> u8 {
-        self.fifo.len() as u8
+        self.fifo.len() as u8 - u8::from(self.releasing)
+    }
+
+    fn look(&mut self) -> (u8, bool) {
+        (self.fifo.len() as u8, self.take_overrun())
     }
 
     fn receive(&mut self) -> Option<Frame> {
@@ -121,6 +136,11 @@ impl Traffic for FakeTraffic {
             None => self.fifo.pop_front(),
             Some(Stubborn::Keeps) => None,
             Some(Stubborn::Repeats) => self.fifo.front().copied(),
+            Some(Stubborn::Slow) if self.releasing => None,
+            Some(Stubborn::Slow) => {
+                self.releasing = !self.fifo.is_empty();
+                self.fifo.front().copied()
+            }
         }
     }
 

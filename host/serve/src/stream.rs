@@ -82,8 +82,10 @@ pub fn shown(entry: &Entry, client: ClientId, views: &Views) -> Option<Record> {
                     | Event::BusError { channel, .. }
                     | Event::ErrorsSuppressed { channel, .. }
                     | Event::State { channel, .. } => is_open(channel).then_some(event),
-                    // Each client's channels start and stop on their own.
-                    Event::Started { .. } | Event::Stopped { .. } => None,
+                    // The end of a gap.
+                    Event::Started { channel } => is_open(channel).then_some(event),
+                    // Each client's channels stop on their own.
+                    Event::Stopped { .. } => None,
                 };
             event.map(Record::Event)
         }
@@ -217,7 +219,7 @@ fn merge(kept: &mut Event, next: &Event) -> bool {
         (
             Event::Lost { channel, stage, count, at_least },
             Event::Lost { channel: next, stage: next_stage, count: more, at_least: next_at_least },
-        ) if channel == next && stage == next_stage => {
+        ) if channel == next && stage == next_stage && (*count == 0) == (*more == 0) => {
             *count = count.saturating_add(*more);
             *at_least |= next_at_least;
             true

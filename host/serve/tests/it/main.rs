@@ -6,4 +6,5 @@ mod reconnects;
 mod sharing;
 mod slow_line;
 mod socketcand;
+mod strangers;
 mod tls;

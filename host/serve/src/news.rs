@@ -73,13 +73,15 @@ impl fmt::Display for News {
             }
             Self::OffBus { client: Some(client), channel, others } => write!(
                 f,
-                "channel {} was off its bus for a moment, because {client} may send on it; {others} others see a gap",
-                channel.number()
+                "channel {} was off its bus for a moment, because {client} may send on it; {} a gap",
+                channel.number(),
+                if *others == 1 { "1 other client sees".to_owned() } else { format!("{others} other clients see") }
             ),
             Self::OffBus { client: None, channel, others } => write!(
                 f,
-                "channel {} was off its bus for a moment, and only listens again; {others} clients see a gap",
-                channel.number()
+                "channel {} was off its bus for a moment, and only listens again; {} a gap",
+                channel.number(),
+                if *others == 1 { "1 client sees".to_owned() } else { format!("{others} clients see") }
             ),
             // The reason names the board.
             Self::BoardLost { board, reason } if reason.contains(board.as_str()) => {

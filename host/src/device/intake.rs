@@ -34,8 +34,8 @@ pub struct ChannelCounters {
     /// How often the device was off the bus while the channel was open, because another client of its server changed the mode: an unknown
     /// number of frames is missing each time.
     pub off_bus: u64,
-    /// For how long in total, in ticks of the device; as far as its return was seen.
-    pub off_bus_ticks: u64,
+    /// For how long in total, in nanoseconds of the device's clock; as far as its return was seen.
+    pub off_bus_ns: u64,
 }
 
 impl ChannelCounters {
@@ -72,7 +72,7 @@ impl Add for ChannelCounters {
             lost_link: self.lost_link + other.lost_link,
             lost_host: self.lost_host + other.lost_host,
             off_bus: self.off_bus + other.off_bus,
-            off_bus_ticks: self.off_bus_ticks + other.off_bus_ticks,
+            off_bus_ns: self.off_bus_ns + other.off_bus_ns,
         }
     }
 }
@@ -145,6 +145,8 @@ pub struct Intake {
     latest_ticks: u64,
     /// Device time since when it is off each bus, in ticks, if it is.
     off_bus_since: [Option<u64>; CHANNELS],
+    /// Ticks per second of the device's times.
+    tick_hz: u32,
     /// How far a time may be before that of the preceding record, in ticks.
     disorder_ticks: u64,
     /// Whether `Hello` was answered; anything earlier belongs to another program's session.
@@ -166,6 +168,7 @@ impl Intake {
             counters: Counters::default(),
             latest_ticks: 0,
             off_bus_since: [None; CHANNELS],
+            tick_hz: cantap_tick_hz_before_hello(),
             disorder_ticks: u64::MAX,
             in_session: false,
         }
@@ -186,6 +189,7 @@ impl Intake {
             utc,
             latest_ticks,
             off_bus_since,
+            tick_hz,
             disorder_ticks,
         } = self;
         let mut last_ticks = None;
@@ -208,7 +212,7 @@ impl Intake {
             }
             Decoded::Record { ticks, record: Record::Event(event) } => {
                 last_ticks = Some(ticks);
-                follow_bus(event, ticks, off_bus_since, counters);
+                follow_bus(event, ticks, *tick_hz, off_bus_since, counters);
                 on_event(event, Ticks(ticks), counters, clock, stamped, &mut notice);
             }
             Decoded::BatchesLost { frames, .. } => {
@@ -229,6 +233,7 @@ impl Intake {
                     records.clear();
                     last_ticks = None;
                     *latest_ticks = 0;
+                    *tick_hz = answer.tick_hz.max(1);
                     *disorder_ticks = u64::from(answer.tick_hz) / DISORDER_PER_S;
                     *counters = Counters::default();
                     *off_bus_since = [None; CHANNELS];
@@ -389,7 +394,13 @@ fn lost(channel: Channel, at: Ticks, stage: LossStage, count: u32, at_least: boo
 }
 
 /// Counts when the device leaves a bus and comes back while the channel is open: a loss of an unknown number, and the channel's next start.
-fn follow_bus(event: Event, ticks: u64, since: &mut [Option<u64>; CHANNELS], counters: &mut Counters) {
+fn follow_bus(
+    event: Event,
+    ticks: u64,
+    tick_hz: u32,
+    since: &mut [Option<u64>; CHANNELS],
+    counters: &mut Counters,
+) {
     match event {
         Event::Lost { channel, stage: LossStage::Link, count: 0, at_least: true } => {
             counters.channels[channel.index()].off_bus += 1;
@@ -397,7 +408,9 @@ fn follow_bus(event: Event, ticks: u64, since: &mut [Option<u64>; CHANNELS], cou
         }
         Event::Started { channel } => {
             let away = since[channel.index()].take().map_or(0, |since| ticks.saturating_sub(since));
-            counters.channels[channel.index()].off_bus_ticks += away;
+            let away_ns = u128::from(away) * 1_000_000_000 / u128::from(tick_hz);
+            let sum = &mut counters.channels[channel.index()].off_bus_ns;
+            *sum = sum.saturating_add(u64::try_from(away_ns).unwrap_or(u64::MAX));
         }
         Event::Stopped { channel } => since[channel.index()] = None,
         _ => {}

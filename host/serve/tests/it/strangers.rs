@@ -278,17 +278,18 @@ fn what_a_silent_client_sends_periodically_stops() {
         vec![Command::Open { channel, config: Some(normal()) }, Command::SetPeriodic { channel, slot: 3, entry: Some(entry) }];
     let _silent = says_no_more(&server, commands);
     wait_until("it is told", || told.try_iter().any(|news| matches!(news, News::DeadMan { .. })));
+    // Its connection is still there. What was sent is followed by nothing.
     let mut records = listener.records();
-    let is_sent = |record: &cantap::TraceRecord| record.frame().is_some();
-    assert!(records.any(|record| record.as_ref().is_ok_and(is_sent)));
-    // From here on nothing is sent: the status shows how much was.
-    let sent = || listener.status().unwrap().channels[0].frames;
-    let _ = sent();
-    std::thread::sleep(Duration::from_millis(50));
-    listener.stop().unwrap();
-    let times: Vec<i64> = records.map(Result::unwrap).filter(is_sent).map(|record| record.time_ns).collect();
-    let at = |of: Option<&i64>| of.copied().unwrap_or_default();
-    assert!(at(times.last()) - at(times.first()) < 5_000_000_000, "it was sent for too long");
+    let mut sent = 0;
+    loop {
+        let batch = records.next_batch(Duration::from_millis(300)).unwrap().unwrap();
+        if batch.is_empty() {
+            break;
+        }
+        sent += batch.iter().filter(|record| record.frame().is_some()).count();
+        assert!(sent < 1000, "it is sent for ever");
+    }
+    assert!(sent >= 2, "{sent}");
 }
 
 /// One client's change of mode costs the others frames: that is never a zero, and happens once.
@@ -301,8 +302,6 @@ fn a_change_of_mode_is_a_counted_gap_and_the_mode_is_kept() {
     for number in 0..5 {
         let mut stream = dial(&server);
         stream.write_all(format!("< open can0 >< send 7A1 1 0{number} >").as_bytes()).unwrap();
-        let before = listener.counters();
-        drop(before);
         let mut records = listener.records();
         let own = format!("7A1#0{number}");
         let mut is_own = |record: Result<cantap::TraceRecord, _>| {
@@ -313,7 +312,7 @@ fn a_change_of_mode_is_a_counted_gap_and_the_mode_is_kept() {
     listener.stop().unwrap();
     let counters = listener.counters();
     assert_eq!(counters.channels[0].off_bus, 1, "{counters:?}");
-    assert!(counters.channels[0].off_bus_ticks > 0, "{counters:?}");
+    assert!(counters.channels[0].off_bus_ns > 0, "{counters:?}");
     assert_eq!((counters.channels[1].off_bus, counters.channels[0].lost()), (0, 0), "{counters:?}");
 }
 

@@ -215,7 +215,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 accuracy.early_us, accuracy.late_us
             );
         }
-        eprintln!();
+        eprintln!("");
     }
     outcome.verdict()?;
     Ok(ExitCode::SUCCESS)

@@ -291,7 +291,10 @@ impl Session {
             }
         }
         let hello = match hello.ok_or_else(not_cantap)? {
-            Ok(Reply::Hello(hello)) => hello,
+            Ok(Reply::Hello(mut hello)) => {
+                cantap::device::clean(&mut hello);
+                hello
+            }
             Ok(_) => return Err(DeviceError::WrongReply),
             Err(Refusal::Protocol { device }) => return Err(DeviceError::Protocol { device }),
             Err(refusal) => return Err(DeviceError::Refused { refusal }),

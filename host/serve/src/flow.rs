@@ -205,7 +205,7 @@ impl AckReader {
         Err(match text.strip_prefix(REFUSAL) {
             Some(reason) => {
                 let reason = String::from_utf8_lossy(reason);
-                let shown: String = reason.trim_end().chars().filter(|shown| !shown.is_control()).collect();
+                let shown = cantap_trace::clean::line(reason.trim_end());
                 io::Error::new(io::ErrorKind::ConnectionRefused, format!("its server refuses: {shown}"))
             }
             None => io::Error::new(io::ErrorKind::InvalidData, "what is there is no server of cantap's"),

@@ -7,7 +7,7 @@ use std::str::FromStr;
 
 use cantap_wire::Id;
 
-use super::clean;
+use cantap_trace::clean;
 use super::container::{Container, InPdu};
 use super::fault::Fault;
 use super::layout::{self, ByteOrder};

@@ -2,7 +2,7 @@
 
 use std::collections::{HashMap, HashSet};
 
-use super::clean;
+use cantap_trace::clean;
 use super::fault::{DatabaseError, Fault, FaultKind, MAX_SWITCHES};
 use super::model::{Database, Message, Signal, ValueKind};
 

@@ -542,5 +542,6 @@ impl Connection {
 
 /// Removes what a client could mistake for the end of an answer.
 fn plain(text: &str) -> String {
-    text.chars().filter(|letter| !matches!(letter, '<' | '>') && !letter.is_control()).take(200).collect()
+    let is_plain = |letter: &char| !matches!(letter, '<' | '>') && !cantap_trace::clean::is_harmful(*letter);
+    text.chars().filter(is_plain).take(200).collect()
 }

@@ -207,7 +207,7 @@ fn run(shared: &Arc<Shared>, mut connect: Connect, first: Sender<Result<(), Boar
         });
         let session = connected.and_then(|link| Ok(Session::begin(shared, link)?));
         match session {
-            Ok(session) => {
+            Ok(mut session) => {
                 serial = Some(session.hello.serial.as_str().to_owned());
                 told = None;
                 session.publish(shared);
@@ -320,7 +320,10 @@ impl Session {
     }
 
     /// From now on, clients may send requests.
-    fn publish(&self, shared: &Shared) {
+    fn publish(&mut self, shared: &Shared) {
+        // First of all: a request that finds the board and no way to it would end the session.
+        let writer = std::mem::replace(&mut self.link.writer, Box::new(std::io::sink()));
+        *lock(&shared.port) = Some(writer);
         let mut state = shared.state();
         state.base = self.base;
         state.latest_ticks = self.ticks;
@@ -329,9 +332,8 @@ impl Session {
 
     /// Reads until the board is gone. Returns the reason, or `None` if the server should end.
     fn run(self, shared: &Arc<Shared>) -> Option<DeviceError> {
-        let Link { mut reader, writer, keep_alive } = self.link;
+        let Link { mut reader, writer: _, keep_alive } = self.link;
         let mut decoder = self.decoder;
-        *lock(&shared.port) = Some(writer);
         let name = || shared.name.clone();
         let vanished = |reason: String| Some(DeviceError::Vanished { address: name(), reason });
         let mut bytes = vec![0; READ_BYTES];

@@ -1,6 +1,8 @@
 //! Every integration test of this crate, in one program: each program is linked on its own.
 
+mod browser;
 mod eight_clients;
+mod hostile;
 mod line;
 mod reconnects;
 mod sharing;

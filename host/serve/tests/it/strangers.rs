@@ -14,9 +14,9 @@ use cantap::{Channel, Device, DeviceError, Direction, TraceEvent};
 use cantap_serve::listen::{self, Listening};
 use cantap_serve::{Board, News, Settings, connect, lines, socketcand};
 
-const BITRATE_BPS: u32 = 500_000;
+pub const BITRATE_BPS: u32 = 500_000;
 
-fn board_at(settings: Settings) -> (Arc<Board>, Receiver<News>) {
+pub fn board_at(settings: Settings) -> (Arc<Board>, Receiver<News>) {
     let options: cantap_virtual::Options = "load=0".parse().unwrap();
     let connect = Box::new(move |_: Option<&str>| Ok(cantap_virtual::start(options.clone())?.into_link()));
     let (news, told) = channel();
@@ -24,11 +24,11 @@ fn board_at(settings: Settings) -> (Arc<Board>, Receiver<News>) {
     (Arc::new(board), told)
 }
 
-fn any_port() -> SocketAddr {
+pub fn any_port() -> SocketAddr {
     "127.0.0.1:0".parse().unwrap()
 }
 
-fn client(board: &Board, name: &str, role: Role) -> Device {
+pub fn client(board: &Board, name: &str, role: Role) -> Device {
     Device::over(board.link(name, role).unwrap(), name).unwrap()
 }
 
@@ -65,7 +65,7 @@ fn wait_until(what: &str, mut holds: impl FnMut() -> bool) {
 }
 
 /// A greeting, and requests to open a channel for sending and to send, as a web page would put them into a request's body.
-fn speaks() -> Vec<u8> {
+pub fn speaks() -> Vec<u8> {
     let timing = BitTiming::choose(36_000_000, BITRATE_BPS, None).unwrap();
     let config = Some(ChannelConfig { mode: Mode::Normal, ..ChannelConfig::listen_only(timing) });
     let channel = Channel::Can1;

@@ -183,7 +183,8 @@ impl<'d> Sending<'d> {
         let mut left_out = self.failures.clone();
         let never_left = not_sent.saturating_sub(self.failed);
         if never_left > 0 {
-            let reason = if error.is_some() { "unknown, since the device is gone" } else { "never left the device" };
+            let reason =
+                if error.is_some() { "unknown, since the device is gone" } else { "never left the device" };
             left_out.insert(reason.into(), never_left);
         }
         let (overtaken, is_one_shot) = (self.overtaken, self.failed > 0);

@@ -13,7 +13,11 @@ pub fn is_coloured() -> bool {
 /// Prints what must not be overlooked: in red, if there are colours.
 pub fn warn(text: &str) {
     let text = clean::lines(text);
-    if is_coloured() { write(&format!("\x1b[1;31mcantap: {text}\x1b[0m\n")) } else { write(&format!("cantap: {text}\n")) }
+    if is_coloured() {
+        write(&format!("\x1b[1;31mcantap: {text}\x1b[0m\n"))
+    } else {
+        write(&format!("cantap: {text}\n"))
+    }
 }
 
 /// Prints a text, without what a terminal would obey.

@@ -136,7 +136,9 @@ struct Allowed {
 }
 
 fn allowed(text: &str) -> Result<Allowed, String> {
-    let Some((door, text)) = text.split_once(':') else { return Ok(Allowed { door: None, role: role(text)? }) };
+    let Some((door, text)) = text.split_once(':') else {
+        return Ok(Allowed { door: None, role: role(text)? });
+    };
     let door = match door {
         "unix" => Door::Unix,
         "tcp" => Door::Tcp,
@@ -149,7 +151,9 @@ fn allowed(text: &str) -> Result<Allowed, String> {
 /// The maximum role at a door; the last one given applies. Whoever reaches socketcand's port is not asked who it is, so what is allowed
 /// everywhere is not allowed there.
 fn allow(all: &[Allowed], door: Door) -> Role {
-    let of = |door: Option<Door>| all.iter().rev().find(|allowed| allowed.door == door).map(|allowed| allowed.role);
+    let of = |door: Option<Door>| {
+        all.iter().rev().find(|allowed| allowed.door == door).map(|allowed| allowed.role)
+    };
     let everywhere = if door == Door::Socketcand { None } else { of(None) };
     of(Some(door)).or(everywhere).unwrap_or(Role::Listen)
 }
@@ -233,7 +237,9 @@ fn start(args: &Args, number: usize, address: &Address) -> anyhow::Result<Board>
 /// Whoever runs the server sees who comes and goes; what must not be overlooked stands out.
 fn tell(news: News) {
     match news {
-        News::BoardLost { .. } | News::Refused { .. } | News::DeadMan { .. } => stderr::warn(&news.to_string()),
+        News::BoardLost { .. } | News::Refused { .. } | News::DeadMan { .. } => {
+            stderr::warn(&news.to_string())
+        }
         news => eprintln!("cantap: {news}"),
     }
 }

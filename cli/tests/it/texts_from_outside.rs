@@ -112,7 +112,8 @@ fn a_server_s_texts_move_no_cursor() {
     for (command, shows) in commands {
         for at in [&hostile, &refusing] {
             let said = said(&format!("{command} -d {at}"));
-            let harmful = said.chars().find(|shown| *shown != '\n' && cantap_trace::clean::is_harmful(*shown));
+            let harmful =
+                said.chars().find(|shown| *shown != '\n' && cantap_trace::clean::is_harmful(*shown));
             assert_eq!(harmful, None, "{command}: {said:?}");
             assert!(!said.is_empty(), "{command}");
             if at == &hostile {
@@ -147,9 +148,26 @@ fn no_print_goes_round_the_place_that_cleans() {
     }
     let rules: [(&str, &[&str]); 4] = [
         // The live view draws on standard output, and update asks a question there without foreign text.
-        ("io::stderr()", &["cli/src/stderr.rs", "cli/src/progress.rs", "cli/src/commands/autobaud.rs", "cli/src/commands/update.rs"]),
+        (
+            "io::stderr()",
+            &[
+                "cli/src/stderr.rs",
+                "cli/src/progress.rs",
+                "cli/src/commands/autobaud.rs",
+                "cli/src/commands/update.rs",
+            ],
+        ),
         ("std::eprint", &[]),
-        ("\\x1b[", &["cli/src/stderr.rs", "cli/src/monitor/", "host/trace/src/clean.rs", "cli/src/commands/stats/live.rs", "host/analysis/src/plot/text.rs"]),
+        (
+            "\\x1b[",
+            &[
+                "cli/src/stderr.rs",
+                "cli/src/monitor/",
+                "host/trace/src/clean.rs",
+                "cli/src/commands/stats/live.rs",
+                "host/analysis/src/plot/text.rs",
+            ],
+        ),
         // A folder's name, where more is harmful than on a terminal.
         ("is_control()", &["host/trace/src/clean.rs", "host/columns/src/parquet/dataset.rs"]),
     ];
@@ -161,7 +179,9 @@ fn no_print_goes_round_the_place_that_cleans() {
         }
         let text = std::fs::read_to_string(path).unwrap();
         let text = text.split("#[cfg(test)]\nmod tests").next().unwrap();
-        for (number, line) in text.lines().enumerate().filter(|(_, line)| !line.trim_start().starts_with("//")) {
+        for (number, line) in
+            text.lines().enumerate().filter(|(_, line)| !line.trim_start().starts_with("//"))
+        {
             for (what, allowed) in rules {
                 let is_allowed = allowed.iter().any(|allowed| name.starts_with(allowed));
                 // Whether a terminal is there is asked anywhere.
@@ -172,5 +192,9 @@ fn no_print_goes_round_the_place_that_cleans() {
         }
     }
     assert!(files.len() > 300, "{}", files.len());
-    assert!(found.is_empty(), "these go round cantap_trace::clean or cli/src/stderr.rs:\n{}", found.join("\n"));
+    assert!(
+        found.is_empty(),
+        "these go round cantap_trace::clean or cli/src/stderr.rs:\n{}",
+        found.join("\n")
+    );
 }

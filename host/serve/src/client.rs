@@ -4,8 +4,8 @@ mod channels;
 mod sending;
 
 use std::io::{Read, Write};
-use std::sync::{Arc, Mutex, MutexGuard};
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 use cantap::device::is_idle;
@@ -162,7 +162,8 @@ impl Client {
                 !self.has_greeted() && (foreign::protocol(first).is_some() || inbox.is_overlong())
             };
             if !self.has_greeted() && first.len() < foreign::ENOUGH {
-                let zeros = if first.is_empty() { bytes.iter().take_while(|byte| **byte == 0).count() } else { 0 };
+                let zeros =
+                    if first.is_empty() { bytes.iter().take_while(|byte| **byte == 0).count() } else { 0 };
                 first.extend(bytes.iter().skip(zeros).take(foreign::ENOUGH));
             }
             let mut goes_on = !is_stranger(&first, &inbox);
@@ -176,7 +177,10 @@ impl Client {
             }
             let silent = silence.pass(len > 0);
             if silent >= SENDER_TIMEOUT && self.with(|_, member| member.views.iter().any(View::transmits)) {
-                self.let_go(format!("it said nothing for {} s, and might have sent", SENDER_TIMEOUT.as_secs()));
+                self.let_go(format!(
+                    "it said nothing for {} s, and might have sent",
+                    SENDER_TIMEOUT.as_secs()
+                ));
                 return;
             }
             if let Some(after) = self.dead_man.filter(|after| silent >= *after) {

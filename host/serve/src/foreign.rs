@@ -6,8 +6,18 @@ pub const ENOUGH: usize = 16;
 
 /// The protocol that a connection begins with, if it is one that is met often at a wrong port.
 pub fn protocol(first: &[u8]) -> Option<&'static str> {
-    const HTTP: [&str; 10] =
-        ["GET ", "POST ", "HEAD ", "PUT ", "DELETE ", "OPTIONS ", "CONNECT ", "TRACE ", "PATCH ", "PRI * HTTP/2"];
+    const HTTP: [&str; 10] = [
+        "GET ",
+        "POST ",
+        "HEAD ",
+        "PUT ",
+        "DELETE ",
+        "OPTIONS ",
+        "CONNECT ",
+        "TRACE ",
+        "PATCH ",
+        "PRI * HTTP/2",
+    ];
     const MAIL: [&str; 4] = ["EHLO ", "HELO ", "MAIL FROM:", "RCPT TO:"];
     let begins = |with: &&str| first.starts_with(with.as_bytes());
     if HTTP.iter().any(|with| begins(&with)) {

@@ -104,7 +104,12 @@ pub fn unix(board: &Arc<Board>, path: &Path, role: Role) -> Result<Listening, So
             Ok(place) => {
                 let output = stream.try_clone()?;
                 let place = Some(place);
-                admit(&board, stream, output, Guest { name, role, place, is_counted: false, is_remote: false });
+                admit(
+                    &board,
+                    stream,
+                    output,
+                    Guest { name, role, place, is_counted: false, is_remote: false },
+                );
             }
             Err(full) => turn_away(&board, &mut stream, name, &full),
         }
@@ -128,7 +133,12 @@ pub fn tcp(board: &Arc<Board>, address: SocketAddr, role: Role) -> io::Result<Li
                 let output = stream.try_clone()?;
                 let place = Some(place);
                 // A tunnel may end here.
-                admit(&board, stream, output, Guest { name, role, place, is_counted: false, is_remote: true });
+                admit(
+                    &board,
+                    stream,
+                    output,
+                    Guest { name, role, place, is_counted: false, is_remote: true },
+                );
             }
             Err(full) => turn_away(&board, &mut stream, name, &full),
         }

@@ -23,8 +23,7 @@ impl Shared {
     pub fn on_board(&self, channel: Channel, wanted: ChannelConfig) -> ChannelConfig {
         let config = for_all(wanted);
         // At another bit rate it would destroy frames.
-        let is_base =
-            self.state().base[channel.index()].is_some_and(|base| base.timing == wanted.timing);
+        let is_base = self.state().base[channel.index()].is_some_and(|base| base.timing == wanted.timing);
         let joins = self.settings.always_acknowledges && is_base && only_listens(&config);
         if joins { ChannelConfig { mode: Mode::Normal, ..config } } else { config }
     }

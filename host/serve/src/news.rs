@@ -69,13 +69,21 @@ impl fmt::Display for News {
             Self::ClientLeft { client, reason: Some(reason) } => write!(f, "{client} was let go: {reason}"),
             Self::Refused { client, reason } => write!(f, "{client} was not let in: {reason}"),
             Self::DeadMan { client, after } => {
-                write!(f, "{client} said nothing for {} s: what it has sent periodically is stopped", after.as_secs_f64())
+                write!(
+                    f,
+                    "{client} said nothing for {} s: what it has sent periodically is stopped",
+                    after.as_secs_f64()
+                )
             }
             Self::OffBus { client: Some(client), channel, others } => write!(
                 f,
                 "channel {} was off its bus for a moment, because {client} may send on it; {} a gap",
                 channel.number(),
-                if *others == 1 { "1 other client sees".to_owned() } else { format!("{others} other clients see") }
+                if *others == 1 {
+                    "1 other client sees".to_owned()
+                } else {
+                    format!("{others} other clients see")
+                }
             ),
             Self::OffBus { client: None, channel, others } => write!(
                 f,

@@ -189,7 +189,8 @@ impl Outbox {
 
     /// Adds an answer behind everything that waits. Returns whether anybody takes it.
     pub fn answer_in_turn(&self, bytes: Vec<u8>) -> bool {
-        let waiting = |queue: &Queue| queue.items.iter().filter(|item| matches!(item, Item::Answer(_))).count();
+        let waiting =
+            |queue: &Queue| queue.items.iter().filter(|item| matches!(item, Item::Answer(_))).count();
         let full = |queue: &mut Queue| waiting(queue) >= MOST_ANSWERS && !queue.is_abandoned;
         let waited = self.changed.wait_while(self.lock(), full);
         let mut queue = waited.unwrap_or_else(PoisonError::into_inner);

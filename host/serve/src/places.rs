@@ -75,9 +75,8 @@ impl Places {
         let is_crowded = same.is_some()
             && table.seats.iter().filter(|seat| seat.from == same).count() >= self.most_from_one;
         if is_crowded || table.seats.len() >= self.most {
-            let may_go = |seat: &&Seat| {
-                seat.standing < Standing::Served && (!is_crowded || seat.from == same)
-            };
+            let may_go =
+                |seat: &&Seat| seat.standing < Standing::Served && (!is_crowded || seat.from == same);
             let least = table.seats.iter().filter(may_go).min_by_key(|seat| (seat.standing, seat.number));
             let Some(number) = least.map(|seat| seat.number) else {
                 return Err(if is_crowded {

@@ -147,8 +147,8 @@ fn abandoned(path: &Path, there: &Metadata) -> Result<Identity, SocketError> {
         return Err(SocketError::Foreign("another user's socket"));
     }
     // A server that is stopped accepts nobody, and is there nevertheless: so do not wait for it.
-    let probe: OwnedFd = socket(AddressFamily::Unix, SockType::Stream, SockFlag::empty(), None)
-        .map_err(io::Error::from)?;
+    let probe: OwnedFd =
+        socket(AddressFamily::Unix, SockType::Stream, SockFlag::empty(), None).map_err(io::Error::from)?;
     let probe = UnixStream::from(probe);
     probe.set_nonblocking(true)?;
     let address = UnixAddr::new(path).map_err(io::Error::from)?;
@@ -227,7 +227,14 @@ mod tests {
         std::os::unix::fs::symlink(at("notes.txt"), at("link")).unwrap();
         std::os::unix::fs::symlink(at("nowhere"), at("dangling")).unwrap();
         std::fs::create_dir(at("folder")).unwrap();
-        rustix::fs::mknodat(rustix::fs::CWD, at("fifo"), rustix::fs::FileType::Fifo, rustix::fs::Mode::RUSR, 0).unwrap();
+        rustix::fs::mknodat(
+            rustix::fs::CWD,
+            at("fifo"),
+            rustix::fs::FileType::Fifo,
+            rustix::fs::Mode::RUSR,
+            0,
+        )
+        .unwrap();
         let _datagram = UnixDatagram::bind(at("datagram")).unwrap();
         for (name, what) in [
             ("notes.txt", "there is a file, which is left as it is"),

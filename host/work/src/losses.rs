@@ -60,7 +60,10 @@ impl Losses {
             return stages;
         }
         let times = if *off_bus == 1 { "once".to_owned() } else { format!("{off_bus} times") };
-        format!("{stages}, off the bus an unknown number, {times}, {:.1} ms in total", *off_bus_us as f64 / 1e3)
+        format!(
+            "{stages}, off the bus an unknown number, {times}, {:.1} ms in total",
+            *off_bus_us as f64 / 1e3
+        )
     }
 }
 

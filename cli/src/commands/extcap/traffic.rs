@@ -93,7 +93,6 @@ impl Traffic {
     }
 }
 
-
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -80,7 +80,9 @@ impl Client {
         // A client that may only listen accepts the existing bit rate. Only one that chooses another configures.
         let hold = |state: &mut State| {
             let other = base.is_some() && self.role < Role::Configure;
-            state.hold(self.id, &[channel]).map_err(|refusal| if other { Refusal::OtherSettings } else { refusal })
+            state
+                .hold(self.id, &[channel])
+                .map_err(|refusal| if other { Refusal::OtherSettings } else { refusal })
         };
         let Some(current) = current else {
             if !is_base {

@@ -18,8 +18,8 @@ use rustls::{
     ClientConfig, ClientConnection, Connection, RootCertStore, ServerConfig, ServerConnection, crypto,
 };
 
-use crate::connect::dial;
 use crate::client::Guest;
+use crate::connect::dial;
 use crate::flow::acknowledging;
 use crate::listen::{Listening, accept, admit, bind, turn_away};
 use crate::places::{Places, ends};
@@ -149,7 +149,12 @@ pub fn listen(board: &Arc<Board>, address: SocketAddr, most: Role, server: &Serv
                 Ok(((role, secured), Ok(place))) => {
                     let (input, output) = secured.split();
                     let (role, place) = (role.min(most), Some(place));
-                    admit(&board, input, output, Guest { name, role, place, is_counted: false, is_remote: true });
+                    admit(
+                        &board,
+                        input,
+                        output,
+                        Guest { name, role, place, is_counted: false, is_remote: true },
+                    );
                 }
                 Ok(((_, secured), Err(full))) => turn_away(&board, &mut secured.split().1, name, &full),
                 Err(error) => board.tell(News::Refused { client: name, reason: error.to_string() }),
@@ -170,11 +175,7 @@ fn has_spoken(stream: &TcpStream, deadline: Instant) -> bool {
     false
 }
 
-fn welcome(
-    stream: TcpStream,
-    config: Arc<ServerConfig>,
-    deadline: Instant,
-) -> io::Result<(Role, Secured)> {
+fn welcome(stream: TcpStream, config: Arc<ServerConfig>, deadline: Instant) -> io::Result<(Role, Secured)> {
     let connection = ServerConnection::new(config).map_err(io::Error::other)?;
     let secured = shake_hands(stream, Connection::Server(connection), deadline)?;
     let role = secured.peer_certificate().and_then(|certificate| role_of(&certificate));

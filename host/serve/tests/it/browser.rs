@@ -84,7 +84,13 @@ fn a_web_page_makes_no_bus_speak() {
     std::thread::spawn(move || serve(&server, &page, &asked));
     let profile = tempfile::tempdir().unwrap();
     let mut browser = Command::new(chromium)
-        .args(["--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run"])
+        .args([
+            "--headless=new",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--disable-dev-shm-usage",
+            "--no-first-run",
+        ])
         .arg(format!("--user-data-dir={}", profile.path().display()))
         .arg(format!("http://{at}/"))
         .stdin(Stdio::null())
@@ -106,13 +112,19 @@ fn a_web_page_makes_no_bus_speak() {
     let sent: Vec<_> = listener
         .records()
         .map(Result::unwrap)
-        .filter(|record| matches!(record.event, TraceEvent::Frame { direction: Direction::Tx, .. } | TraceEvent::Lost { .. }))
+        .filter(|record| {
+            matches!(
+                record.event,
+                TraceEvent::Frame { direction: Direction::Tx, .. } | TraceEvent::Lost { .. }
+            )
+        })
         .collect();
     assert!(sent.is_empty(), "{sent:?}");
     // It did try, at both.
     let said: Vec<String> = told.try_iter().map(|news| news.to_string()).collect();
     for name in ["client 127.", "socketcand client 127."] {
-        let tries = said.iter().filter(|line| line.starts_with(name) && line.contains("it speaks HTTP")).count();
+        let tries =
+            said.iter().filter(|line| line.starts_with(name) && line.contains("it speaks HTTP")).count();
         assert!(tries >= 2, "{name}: {said:#?}");
     }
 }

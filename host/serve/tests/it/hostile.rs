@@ -98,7 +98,9 @@ fn board() -> Arc<Board> {
 fn native(random: &mut Random) -> Vec<u8> {
     let mut out = vec![0];
     if random.below(5) > 0 {
-        out.extend(encode(&Request { id: 1, command: Command::Hello { protocol: PROTOCOL_VERSION } }).unwrap());
+        out.extend(
+            encode(&Request { id: 1, command: Command::Hello { protocol: PROTOCOL_VERSION } }).unwrap(),
+        );
     }
     for id in 2..random.below(20) as u16 + 2 {
         let channel = Channel::ALL[random.below(2)];
@@ -129,8 +131,30 @@ fn native(random: &mut Random) -> Vec<u8> {
 /// What a hostile client of socketcand sends.
 fn text(random: &mut Random) -> Vec<u8> {
     const WORDS: [&str; 24] = [
-        "open", "can0", "can1", "rawmode", "bcmmode", "controlmode", "send", "sendrtr", "add", "update", "delete", "filter",
-        "muxfilter", "subscribe", "statistics", "echo", "0", "8", "-80", "7fffffffffffffffffff", "0x", "123", "B", "\u{202e}\u{9b}",
+        "open",
+        "can0",
+        "can1",
+        "rawmode",
+        "bcmmode",
+        "controlmode",
+        "send",
+        "sendrtr",
+        "add",
+        "update",
+        "delete",
+        "filter",
+        "muxfilter",
+        "subscribe",
+        "statistics",
+        "echo",
+        "0",
+        "8",
+        "-80",
+        "7fffffffffffffffffff",
+        "0x",
+        "123",
+        "B",
+        "\u{202e}\u{9b}",
     ];
     let mut out = if random.below(3) > 0 { b"< open can0 >".to_vec() } else { Vec::new() };
     for _ in 0..random.below(40) {
@@ -197,7 +221,10 @@ fn whatever_clients_send_the_next_one_is_served() {
     assert!(next.records().next().unwrap().is_ok());
     good.stop().unwrap();
     let counters = good.counters();
-    assert!(counters.channels.iter().all(|channel| channel.received > 0 && channel.lost() == 0), "{counters:?}");
+    assert!(
+        counters.channels.iter().all(|channel| channel.received > 0 && channel.lost() == 0),
+        "{counters:?}"
+    );
     assert_eq!(panics.load(Ordering::Relaxed), 0);
 }
 

@@ -275,7 +275,8 @@ fn a_sender_is_confirmed_others_see_the_frame_and_the_board_listens_again_when_i
     // It was off the bus for a moment, twice: when the first sender came and when the last one had left.
     assert_eq!(heard.iter().filter(|record| record.event == TraceEvent::GAP).count(), 2, "{heard:?}");
     assert_eq!(listener.counters().channels[0].off_bus, 2);
-    let said: Vec<String> = told.try_iter().map(|news| news.to_string()).filter(|said| said.contains("gap")).collect();
+    let said: Vec<String> =
+        told.try_iter().map(|news| news.to_string()).filter(|said| said.contains("gap")).collect();
     assert_eq!(
         said,
         [

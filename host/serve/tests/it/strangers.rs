@@ -84,8 +84,11 @@ pub fn speaks() -> Vec<u8> {
 /// What browsers, and other programs at a wrong port, put in front of a body.
 fn headers(body: &[u8]) -> Vec<Vec<u8>> {
     let http = |first: &str| {
-        format!("{first}Host: 127.0.0.1:29537\r\nOrigin: http://evil.example\r\nContent-Length: {}\r\n\r\n", body.len())
-            .into_bytes()
+        format!(
+            "{first}Host: 127.0.0.1:29537\r\nOrigin: http://evil.example\r\nContent-Length: {}\r\n\r\n",
+            body.len()
+        )
+        .into_bytes()
     };
     vec![
         http("POST / HTTP/1.1\r\n"),
@@ -131,7 +134,9 @@ fn nothing_behind_anything_else_than_a_greeting_is_carried_out() {
     // The same without anything in front is carried out.
     let mut stream = dial(&native);
     stream.write_all(&speaks()).unwrap();
-    let is_sent = |record: &cantap::TraceRecord| matches!(record.event, TraceEvent::Frame { direction: Direction::Tx, .. });
+    let is_sent = |record: &cantap::TraceRecord| {
+        matches!(record.event, TraceEvent::Frame { direction: Direction::Tx, .. })
+    };
     let mut records = listener.records();
     let sent = records.find(|record| record.as_ref().is_ok_and(is_sent)).unwrap().unwrap();
     assert_eq!(sent.frame().unwrap().to_string(), "6A5#BEEF");
@@ -140,7 +145,9 @@ fn nothing_behind_anything_else_than_a_greeting_is_carried_out() {
     assert_eq!(records.filter(|record| record.as_ref().is_ok_and(is_sent)).count(), 0);
     let said: Vec<String> = told.try_iter().map(|news| news.to_string()).collect();
     for protocol in ["HTTP, as a web browser does", "SSH", "SMTP", "TLS"] {
-        let is_named = |line: &&String| line.contains("was not let in") && line.ends_with(&format!("it speaks {protocol}"));
+        let is_named = |line: &&String| {
+            line.contains("was not let in") && line.ends_with(&format!("it speaks {protocol}"))
+        };
         assert!(said.iter().filter(is_named).count() >= 2, "{protocol}: {said:#?}");
     }
 }
@@ -258,7 +265,9 @@ fn a_client_that_could_send_and_says_nothing_is_let_go_and_the_board_only_listen
     wait_until("it is open for sending", || !listens_only(&listener));
     wait_until("it only listens", || listens_only(&listener));
     wait_until("it is told", || {
-        told.try_iter().any(|news| news.to_string().ends_with("was let go: it said nothing for 5 s, and might have sent"))
+        told.try_iter().any(|news| {
+            news.to_string().ends_with("was let go: it said nothing for 5 s, and might have sent")
+        })
     });
     drop(stopped);
 }
@@ -274,8 +283,10 @@ fn what_a_silent_client_sends_periodically_stops() {
     let channel = Channel::Can1;
     let modifiers = [].into_iter().collect();
     let entry = Periodic { frame: "123#11".parse().unwrap(), period_ticks: 120_000, count: 0, modifiers };
-    let commands =
-        vec![Command::Open { channel, config: Some(normal()) }, Command::SetPeriodic { channel, slot: 3, entry: Some(entry) }];
+    let commands = vec![
+        Command::Open { channel, config: Some(normal()) },
+        Command::SetPeriodic { channel, slot: 3, entry: Some(entry) },
+    ];
     let _silent = says_no_more(&server, commands);
     wait_until("it is told", || told.try_iter().any(|news| matches!(news, News::DeadMan { .. })));
     // Its connection is still there. What was sent is followed by nothing.

@@ -201,7 +201,9 @@ mod tests {
         fs::write(&place, batch(Path::new("x"))).unwrap();
         assert!(is_ours(&place).unwrap());
         #[cfg(unix)]
-        for (to, is_from_here) in [("/usr/bin/cantap", true), ("/gone/cantap", true), ("/home/me/own-tool", false)] {
+        for (to, is_from_here) in
+            [("/usr/bin/cantap", true), ("/gone/cantap", true), ("/home/me/own-tool", false)]
+        {
             fs::remove_file(&place).unwrap();
             std::os::unix::fs::symlink(to, &place).unwrap();
             assert_eq!(is_ours(&place).is_ok(), is_from_here, "{to}");

@@ -19,12 +19,12 @@ pub fn protocol(first: &[u8]) -> Option<&'static str> {
         "PRI * HTTP/2",
     ];
     const MAIL: [&str; 4] = ["EHLO ", "HELO ", "MAIL FROM:", "RCPT TO:"];
-    let begins = |with: &&str| first.starts_with(with.as_bytes());
-    if HTTP.iter().any(|with| begins(&with)) {
+    let begins = |with: &str| first.starts_with(with.as_bytes());
+    if HTTP.iter().any(|with| begins(with)) {
         Some("HTTP, as a web browser does")
     } else if first.starts_with(b"SSH-") {
         Some("SSH")
-    } else if MAIL.iter().any(|with| begins(&with)) {
+    } else if MAIL.iter().any(|with| begins(with)) {
         Some("SMTP")
     } else if matches!(first, [0x16, 3, ..]) {
         Some("TLS")

@@ -96,7 +96,9 @@ const NOBODY: ClientId = 0;
 /// The body of a thread that ends with the board's.
 pub fn run(shared: &Arc<Shared>) {
     while !shared.quit.load(Ordering::Relaxed) {
-        Channel::ALL.into_iter().for_each(|channel| shared.listen_again(channel));
+        for channel in Channel::ALL {
+            shared.listen_again(channel);
+        }
         std::thread::sleep(LOOK_EVERY);
     }
 }

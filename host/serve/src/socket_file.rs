@@ -198,13 +198,14 @@ impl Turn {
         let deadline = Instant::now() + TURN_TIMEOUT;
         loop {
             match flock(&folder, FlockOperation::NonBlockingLockExclusive) {
-                Ok(()) => return Ok(Self(folder)),
                 Err(rustix::io::Errno::WOULDBLOCK | rustix::io::Errno::INTR) if Instant::now() < deadline => {
                     std::thread::sleep(TRY_EVERY);
                 }
-                Err(rustix::io::Errno::WOULDBLOCK) => return Err(SocketError::InUse),
-                // A file system that has no locks.
-                Err(_) => return Ok(Self(folder)),
+                Err(rustix::io::Errno::WOULDBLOCK | rustix::io::Errno::INTR) => {
+                    return Err(SocketError::InUse);
+                }
+                // There are file systems without locks.
+                Ok(()) | Err(_) => return Ok(Self(folder)),
             }
         }
     }

@@ -220,7 +220,9 @@ impl State {
         if !channels.iter().all(is_free) {
             return Err(Refusal::Held);
         }
-        channels.iter().for_each(|channel| self.holders[channel.index()] = Some(client));
+        for channel in channels {
+            self.holders[channel.index()] = Some(client);
+        }
         Ok(())
     }
 

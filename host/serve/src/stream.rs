@@ -69,8 +69,7 @@ pub fn shown(entry: &Entry, client: ClientId, views: &Views) -> Option<Record> {
             Some(Record::Received(received))
         }
         Record::Event(event) => {
-            let event =
-                match event {
+            let event = match event {
                     Event::SofMark { .. } => Some(event),
                     Event::Transmitted { channel, frame, .. } => is_open(channel)
                         .then(|| Event::Transmitted { channel, tag: own_tag.unwrap_or(OTHERS_TAG), frame }),
@@ -81,9 +80,9 @@ pub fn shown(entry: &Entry, client: ClientId, views: &Views) -> Option<Record> {
                     Event::Lost { channel, .. }
                     | Event::BusError { channel, .. }
                     | Event::ErrorsSuppressed { channel, .. }
-                    | Event::State { channel, .. } => is_open(channel).then_some(event),
+                    | Event::State { channel, .. }
                     // The end of a gap.
-                    Event::Started { channel } => is_open(channel).then_some(event),
+                    | Event::Started { channel } => is_open(channel).then_some(event),
                     // Each client's channels stop on their own.
                     Event::Stopped { .. } => None,
                 };

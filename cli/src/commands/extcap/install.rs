@@ -127,8 +127,9 @@ fn is_ours(place: &Path) -> anyhow::Result<bool> {
     // A link to a program of this name, which may be gone or another version.
     let is_link = || fs::read_link(place).is_ok_and(|to| to.file_stem().is_some_and(|name| name == "cantap"));
     let is_batch = || fs::read_to_string(place).is_ok_and(|text| text.starts_with(MARK));
+    let is_ours = if there.is_symlink() { is_link() } else { is_batch() };
     anyhow::ensure!(
-        if there.is_symlink() { is_link() } else { is_batch() },
+        is_ours,
         "'{}' is there and is neither a link to cantap nor from here; move it away and try again",
         place.display()
     );

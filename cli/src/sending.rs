@@ -16,7 +16,7 @@ use cantap::{Device, TraceRecord};
 
 use crate::advice::sentence;
 use crate::rescue::Rescue;
-use crate::words::failure_name;
+use crate::words::failure_text;
 use cantap_work::interrupt;
 
 /// How often to check whether to continue.
@@ -108,7 +108,7 @@ impl<'d> Sending<'d> {
                 Err(TransmitFailure::Overtaken { periods }) => self.overtaken += u64::from(periods),
                 Err(reason) => {
                     self.failed += 1;
-                    *self.failures.entry(failure_name(reason)).or_default() += 1;
+                    *self.failures.entry(failure_text(reason)).or_default() += 1;
                 }
             }
         }

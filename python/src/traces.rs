@@ -358,7 +358,10 @@ impl Temporary {
         let Some(name) = place.file_name() else { return Ok(None) };
         let mut temporary = std::ffi::OsString::from(format!(".cantap-{}-", std::process::id()));
         temporary.push(name);
-        Ok(Some(Self(place.with_file_name(temporary))))
+        let temporary = place.with_file_name(temporary);
+        // In a common folder a stranger may have put a link there, which must be neither followed nor removed.
+        fs::File::create_new(&temporary)?;
+        Ok(Some(Self(temporary)))
     }
 }
 

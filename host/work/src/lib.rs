@@ -7,6 +7,6 @@ mod losses;
 mod meter;
 mod time;
 
-pub use losses::Losses;
+pub use losses::{Losses, lost_frames};
 pub use meter::{Meter, rounded};
 pub use time::{duration, positive_duration};

@@ -372,7 +372,8 @@ impl Device {
         from_json(py, &object.to_string())
     }
 
-    /// Frames received and lost since the session began, by channel and stage.
+    /// Frames received and lost since the session began, by channel and stage. `off_bus` is how often the device was off the bus because
+    /// another client of its server changed the mode, `off_bus_ns` for how long: an unknown number of frames is missing each time.
     fn losses<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let session = self.session()?;
         let counters = session.device()?.counters();
@@ -385,6 +386,8 @@ impl Device {
             counts.set_item("queue", of.lost_queue)?;
             counts.set_item("link", of.lost_link)?;
             counts.set_item("host", of.lost_host)?;
+            counts.set_item("off_bus", of.off_bus)?;
+            counts.set_item("off_bus_ns", of.off_bus_ns)?;
             counts.set_item("lost", of.lost())?;
             all.set_item(channel.number(), counts)?;
         }

@@ -23,7 +23,7 @@ pub fn write_values(out: &mut impl Write, message: &Message, values: &[SignalVal
         write!(out, "{comma} {} = ", reading.label)?;
         match (reading.number, reading.indicator) {
             (Some(number), _) => {
-                write!(out, "{}", number.for_people())?;
+                write!(out, "{}", reading.signal.for_people(number))?;
                 if !reading.signal.unit.is_empty() {
                     write!(out, " {}", reading.signal.unit)?;
                 }

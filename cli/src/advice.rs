@@ -89,7 +89,7 @@ fn of_timing(error: &TimingError) -> Option<String> {
         TimingError::JumpWidth { .. } => "; give a smaller --sjw",
         TimingError::Rate(_) => ", see `cantap timing -b RATE` for what reaches a rate",
         TimingError::Register(_) => ", and choose loopback or silent with --mode",
-        TimingError::TripleSampling => ": leave --triple away",
+        TimingError::TripleSampling => ": omit --triple",
         _ => return None,
     };
     Some(advice.to_owned())
@@ -150,12 +150,12 @@ mod tests {
         assert_eq!(told(&error), "the device refused: it cannot do that; `cantap info` shows what it can");
         let error = anyhow::Error::from(TimingError::TripleSampling).context("channel 1");
         assert!(sentence(&error).starts_with("channel 1: this controller"), "{}", sentence(&error));
-        assert!(sentence(&error).ends_with("in it: leave --triple away"), "{}", sentence(&error));
+        assert!(sentence(&error).ends_with("in it: omit --triple"), "{}", sentence(&error));
     }
 
     #[test]
     fn a_name_without_a_format_is_explained_for_reading_and_writing() {
-        let expected = "the name 'a.xyz' does not tell the format; name it with one of ";
+        let expected = "the name 'a.xyz' does not show the format; name it with one of ";
         let unknown = || UnknownFormat::Suffix("a.xyz".to_owned());
         let (read, written) = (OpenError::from(unknown()), io::Error::other(unknown()));
         for (told, option) in [(told(&read), "--from"), (told(&written), "--format")] {

@@ -360,7 +360,7 @@ impl Outcome {
             ));
         }
         let were_not = format!("{not_sent} of {asked} frames were not sent");
-        let again = if self.is_one_shot { ", or leave --one-shot away to try again until sent" } else { "" };
+        let again = if self.is_one_shot { ", or omit --one-shot to try again until sent" } else { "" };
         Some(match self.cause? {
             Cause::Unacknowledged => format!(
                 "nobody acknowledged {not_sent} of {asked} frames; check that another node is on the bus, at this bit rate, \
@@ -381,7 +381,7 @@ impl Outcome {
                 "{were_not}: the controller went bus-off; check bit rate, wiring and termination, and see --recovery"
             ),
             Cause::ArbitrationLost => {
-                format!("{were_not}: arbitration was lost; leave --one-shot away to try again until sent")
+                format!("{were_not}: arbitration was lost; omit --one-shot to try again until sent")
             }
             Cause::Overtaken if *not_sent == 0 => format!(
                 "all {asked} frames were sent, but {overtaken} periods passed without one: their period is shorter than the \

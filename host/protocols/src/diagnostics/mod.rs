@@ -155,7 +155,7 @@ impl Diagnostics {
         names::uds_service(sid).map(|name| (Protocol::Uds, name.into()))
     }
 
-    /// Both sides of this transfer use KWP2000, which the server's answer shows or not yet.
+    /// Notes that both sides of this transfer use KWP2000; `is_answered` if the server has confirmed it.
     fn is_kwp(&mut self, transfer: &Transfer, is_answered: bool) {
         for side in [Some(transfer.from), transfer.to].into_iter().flatten() {
             if self.speaks_kwp.len() < MOST_KWP {

@@ -10,8 +10,8 @@ use cantap::wire::Refusal;
 use cantap_formats::{Format, NothingRead, OpenError, UnknownFormat};
 use cantap_signals::condition::{ConditionError, ConditionFault};
 
-use cantap_address::LinkError;
 use cantap_address::server::Server;
+use cantap_address::{Address, LinkError};
 
 /// For when nothing could be read.
 const NAME_THE_FORMAT: &str = "; if it is a trace, name its format with --from";
@@ -67,6 +67,9 @@ fn of_device(error: &DeviceError) -> Option<String> {
         DeviceError::Vanished { .. } => "; plug it in again",
         DeviceError::Silent { address, .. } if Server::is_meant(address) => {
             "; the line to its server may be too slow or interrupted, or the server hangs"
+        }
+        DeviceError::Silent { address, .. } if Address::is_no_port(address) => {
+            "; it is part of this program, so this computer is too busy: close other programs, or give the device less to do"
         }
         DeviceError::Silent { .. } => "; if that stays so, unplug it and plug it in again",
         DeviceError::NoChannel { .. } => "; choose one it has with -c",
@@ -146,6 +149,13 @@ mod tests {
         // Nobody is to be sent to a cable that is on another computer.
         let error = DeviceError::Silent { address: "ssh://car".to_owned(), seconds: 1.4 };
         assert!(told(&error).contains("the line to its server"), "{}", told(&error));
+        // Nor to one that does not exist.
+        for address in ["virtual", "virtual:load=100", "emu:board.elf"] {
+            let error = DeviceError::Silent { address: address.to_owned(), seconds: 1.4 };
+            assert!(told(&error).contains("this computer is too busy"), "{}", told(&error));
+        }
+        let error = DeviceError::Silent { address: "/dev/ttyACM0".to_owned(), seconds: 1.4 };
+        assert!(told(&error).contains("unplug it"), "{}", told(&error));
         let error = DeviceError::Refused { refusal: Refusal::Unsupported };
         assert_eq!(told(&error), "the device refused: it cannot do that; `cantap info` shows what it can");
         let error = anyhow::Error::from(TimingError::TripleSampling).context("channel 1");

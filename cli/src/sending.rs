@@ -16,7 +16,7 @@ use cantap::wire::{CHANNELS, Channel};
 use cantap::{Device, TraceRecord};
 
 use crate::rescue::Rescue;
-use crate::words::failure_name;
+use crate::words::failure_text;
 use cantap_work::interrupt;
 
 /// A kind of frames that were not sent.
@@ -123,7 +123,7 @@ impl<'d> Sending<'d> {
                 Err(TransmitFailure::Overtaken { periods }) => self.overtaken += u64::from(periods),
                 Err(reason) => {
                     self.failed += 1;
-                    *self.failures.entry(failure_name(reason)).or_default() += 1;
+                    *self.failures.entry(failure_text(reason)).or_default() += 1;
                 }
             }
         }

@@ -5,7 +5,7 @@ use std::fmt;
 use std::ops::RangeInclusive;
 use std::str::FromStr;
 
-use cantap_wire::Id;
+use cantap_can::Id;
 
 use super::clean;
 use super::container::{Container, InPdu};

@@ -3,6 +3,7 @@
 #![deny(unsafe_op_in_unsafe_fn)]
 
 mod ahead;
+mod channels;
 mod database;
 mod device;
 mod error;

@@ -15,6 +15,7 @@ mod scan;
 mod source;
 mod table;
 mod traces;
+mod values;
 
 use mimalloc::MiMalloc;
 use pyo3::prelude::*;

@@ -8,6 +8,7 @@ use std::{fs, io};
 use arrow_array::{ArrayRef, RecordBatch, RecordBatchReader, UInt64Array};
 use arrow_schema::{DataType, Field, Schema};
 use cantap_analysis::stats::{Options as StatOptions, Statistics};
+#[cfg(feature = "parquet")]
 use cantap_columns::parquet::ParquetFile;
 use cantap_columns::{BATCH_ROWS, FrameColumns, MessageTables};
 use cantap_formats::{LeftOut, TraceWriter, WriteOptions, create_writer};
@@ -318,6 +319,16 @@ fn each_record(
     Ok(())
 }
 
+#[cfg(not(feature = "parquet"))]
+fn write_parquet(_: Box<dyn RecordBatchReader + Send>, path: &Path) -> Result<(LeftOut, usize), Error> {
+    Err(Error::Format(format!(
+        "{}: this build of cantap writes no Parquet; build it with the feature 'parquet', or pass the table's to_pyarrow() to \
+         pyarrow.parquet.write_table",
+        path.display()
+    )))
+}
+
+#[cfg(feature = "parquet")]
 fn write_parquet(batches: Box<dyn RecordBatchReader + Send>, path: &Path) -> Result<(LeftOut, usize), Error> {
     let mut file = ParquetFile::create(path, FrameColumns::default())?;
     let mut rows = 0;

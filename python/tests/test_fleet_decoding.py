@@ -81,5 +81,5 @@ def test_a_database_that_cannot_be_used_costs_signals_only(decode, database, sig
 def test_what_is_wrong_with_the_trace_comes_before_what_is_wrong_with_its_database(decode):
     entry, frames, signals = decode((None, DBC.format(id=0x321)), cut=10)
     assert (entry.state, entry.coverage) == ("cut", 0) and frames == FRAMES - 1 and signals == 0
-    first, second = entry.problem.split("; ")
+    first, _, second = entry.problem.rpartition("; ")
     assert "ends inside a line" in first and second.startswith("no signals: ")

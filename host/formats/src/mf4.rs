@@ -15,6 +15,7 @@ mod record;
 mod stream;
 #[cfg(test)]
 mod tests;
+mod unpack;
 
 pub(crate) use decode::Decoder;
 #[cfg(test)]

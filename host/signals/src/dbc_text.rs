@@ -1,4 +1,4 @@
-//! Handles the text of a DBC file before it is parsed: its encoding, and which line contains what.
+//! Handles the text of a DBC file before it is parsed: which line contains what.
 //!
 //! can-dbc's result has no positions, so the lines of messages and signals are found here. A
 //! statement starts on a new line; a string may span several.
@@ -45,14 +45,27 @@ const NEEDLESS: &[&str] = &[
 /// Statements that do.
 const NEEDED: &[&str] = &["BO_", "SG_", "VAL_", "SIG_VALTYPE_", "SG_MUL_VAL_"];
 
-/// DBC files are in Windows' Western code page; newer tools write UTF-8. Lines that end with a carriage return alone get a line feed.
-pub fn decode(bytes: &[u8]) -> Cow<'_, str> {
-    let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
-    let text = match str::from_utf8(bytes) {
-        Ok(text) => Cow::Borrowed(text),
-        Err(_) => can_dbc::encodings::WINDOWS_1252.decode_without_bom_handling(bytes).0,
+/// The text with a receiver in each `SG_` that has none, which can-dbc's grammar requires and some tools do not write.
+pub fn with_receivers(text: &str) -> Cow<'_, str> {
+    let lacks_receiver = |line: &str| {
+        let line = line.trim();
+        line.starts_with("SG_ ") && line.len() > 4 && line.ends_with('"') && line.matches('"').count() == 2
     };
-    if text.contains('\r') && !text.contains('\n') { text.replace('\r', "\n").into() } else { text }
+    if !text.lines().any(lacks_receiver) {
+        return Cow::Borrowed(text);
+    }
+    let mut all = String::with_capacity(text.len() + 64);
+    for line in text.split_inclusive('\n') {
+        if lacks_receiver(line) {
+            let end = line.trim_end();
+            all.push_str(end);
+            all.push_str(" Vector__XXX");
+            all.push_str(&line[end.len()..]);
+        } else {
+            all.push_str(line);
+        }
+    }
+    all.into()
 }
 
 /// A statement's place in the text.

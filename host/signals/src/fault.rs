@@ -159,6 +159,9 @@ pub enum FaultKind {
     /// usable.
     #[error("{0}; the message is left out")]
     LeftOut(Box<FaultKind>),
+    /// The text is neither UTF-8 nor in Windows' Western code page.
+    #[error("the text is read as {0}; if its names and units look wrong, save it as UTF-8")]
+    Encoding(&'static str),
     /// A float with a length that most programs refuse.
     #[error("a float of {0} bits is unusual; it is read as the upper bits of the next longer one")]
     OddFloat(u16),
@@ -180,6 +183,7 @@ impl FaultKind {
                 | Self::Ignored(_)
                 | Self::LeftOut(_)
                 | Self::OddFloat(_)
+                | Self::Encoding(_)
         )
     }
 }

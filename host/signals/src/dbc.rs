@@ -16,15 +16,16 @@ use super::dbc_text::{self, Index};
 use super::fault::{DatabaseError, Fault, FaultKind};
 use super::layout::ByteOrder;
 use super::model::{Database, Message, Multiplexed, Signal, ValueKind, ValueTable};
-use super::{encoding, layout, validate};
+use super::{layout, validate};
 
 /// Parses a DBC file's content; `file` is its name for messages to the user.
 ///
 /// A message with a fault that would make values wrong is left out, with a warning. It is an error if nothing is left.
 pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
-    let mut faults = Vec::new();
-    let text = encoding::decode(bytes, &mut faults);
+    let (text, encoding) = dbc_text::decode(bytes);
     let text = dbc_text::with_receivers(&text);
+    let unusual = encoding.map(|name| FaultKind::Encoding(name).of_whole_file());
+    let mut faults: Vec<_> = unusual.into_iter().collect();
     let Some((dbc, index)) = dbc_parse::parse(&text, &mut faults) else {
         faults.retain(|fault| !fault.kind.is_warning());
         return Err(DatabaseError::Faulty { file: file.to_owned(), faults });

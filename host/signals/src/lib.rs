@@ -17,7 +17,6 @@ mod dbc_parse;
 mod dbc_text;
 mod decoder;
 pub mod encode;
-mod encoding;
 mod fault;
 pub mod file;
 mod j1939;

@@ -316,12 +316,3 @@ fn lines_may_end_with_a_carriage_return_alone_and_a_file_that_is_not_understood_
     // Without anything wrong it may be empty.
     assert!(dbc::parse("a.dbc", b"VERSION \"\"\nBU_: A\n").unwrap().messages.is_empty());
 }
-
-/// Some tools write no receiver; the message was left out for that.
-#[test]
-fn a_signal_without_a_receiver_is_read() {
-    let text = "BO_ 256 M: 2 A\n SG_ S : 0|8@1+ (1,0) [0|0] \"km/h\"\n SG_ T : 8|8@1+ (1,0) [0|0] \"\"  \r\n SG_ U : 8|8@1+ (1,0) [0|0] \"\" B\n";
-    let database = dbc::parse("a.dbc", text.as_bytes()).unwrap();
-    assert_eq!(database.warnings, []);
-    assert_eq!(decode(&decoder(database), 1, "100#0102").unwrap(), "S=1 T=2 U=2");
-}

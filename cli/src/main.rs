@@ -4,23 +4,19 @@
 // They panic when nobody reads standard output any more.
 #![cfg_attr(not(test), deny(clippy::print_stdout))]
 
-/// Standard error may be closed or full, in which case std's macro panics. Anyone who does not read the message still gets the exit
-/// code.
+/// Prints a message; what a terminal would obey, from a device, a server or a file, is replaced. Standard error may be closed or full, in
+/// which case std's macro panics. Anyone who does not read the message still gets the exit code.
 macro_rules! eprintln {
-    ($($part:tt)*) => {{
-        use std::io::Write as _;
-        $crate::progress::aside(|| {
-            let _ = writeln!(std::io::stderr(), $($part)*);
-        });
-    }};
+    ($($part:tt)*) => {
+        $crate::stderr::tell(&format!("{}\n", format_args!($($part)*)))
+    };
 }
 
-/// Like `eprintln`.
+/// Like `eprintln`, without ending the line.
 macro_rules! eprint {
-    ($($part:tt)*) => {{
-        use std::io::Write as _;
-        let _ = write!(std::io::stderr(), $($part)*);
-    }};
+    ($($part:tt)*) => {
+        $crate::stderr::tell(&format!($($part)*))
+    };
 }
 
 mod advice;

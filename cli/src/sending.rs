@@ -15,12 +15,15 @@ use cantap::wire::record::TransmitFailure;
 use cantap::wire::{CHANNELS, Channel};
 use cantap::{Device, TraceRecord};
 
+use crate::advice::sentence;
 use crate::rescue::Rescue;
 use crate::words::failure_text;
 use cantap_work::interrupt;
 
 /// A kind of frames that were not sent.
 const NEVER_LEFT: &str = "never left the device";
+/// The same if the device cannot be asked any more.
+const UNKNOWN: &str = "unknown, since the device is gone";
 /// How often to check whether to continue.
 pub const LOOK_EVERY: Duration = Duration::from_millis(20);
 
@@ -162,6 +165,17 @@ impl<'d> Sending<'d> {
         self.or_stop(goes_on)
     }
 
+    /// Whether an error has ended it.
+    pub const fn has_failed(&self) -> bool {
+        self.error.is_some()
+    }
+
+    /// Notes an error that ends it; the first one counts.
+    pub fn fail(&mut self, error: impl Into<anyhow::Error>) {
+        let error = error.into();
+        self.error.get_or_insert(error);
+    }
+
     fn or_stop(&mut self, goes_on: anyhow::Result<bool>) -> bool {
         goes_on.unwrap_or_else(|error| {
             self.error = Some(error);
@@ -229,11 +243,11 @@ impl<'d> Sending<'d> {
 
     /// The fate of as many frames as were requested; fewer if the user ended it. Call it before the channels are closed.
     pub fn outcome(&mut self, asked: u64) -> anyhow::Result<Outcome> {
-        if let Some(error) = self.error.take() {
-            return Err(error);
-        }
+        let error = self.error.take();
         let not_sent = asked.saturating_sub(self.sent);
         let cause = match (not_sent, self.overtaken) {
+            // What the device would say is not known any more.
+            _ if error.is_some() => None,
             (0, 0) => None,
             (0, _) => Some(Cause::Overtaken),
             _ => Some(self.watch.cause()?),
@@ -241,10 +255,11 @@ impl<'d> Sending<'d> {
         let mut left_out = self.failures.clone();
         let never_left = not_sent.saturating_sub(self.failed);
         if never_left > 0 {
-            left_out.insert(NEVER_LEFT.into(), never_left);
+            let reason = if error.is_some() { UNKNOWN } else { NEVER_LEFT };
+            left_out.insert(reason.into(), never_left);
         }
         let (overtaken, is_one_shot) = (self.overtaken, self.failed > 0);
-        Ok(Outcome { asked, not_sent, left_out, overtaken, merged: 0, is_one_shot, cause })
+        Ok(Outcome { asked, not_sent, left_out, overtaken, merged: 0, is_one_shot, cause, error })
     }
 
     /// The fate of replies, of which `merged` were not sent because the one before was still waiting.
@@ -347,12 +362,17 @@ pub struct Outcome {
     is_one_shot: bool,
     /// The cause, if anything went wrong.
     cause: Option<Cause>,
+    /// Why it ended early, if the device is gone or refused something.
+    error: Option<anyhow::Error>,
 }
 
 impl Outcome {
     /// The reason in a sentence, with what to do; `None` if all is well.
     pub fn reason(&self) -> Option<String> {
         let Self { asked, not_sent, overtaken, merged, .. } = self;
+        if let Some(error) = &self.error {
+            return Some(sentence(error));
+        }
         if *merged > 0 && merged == not_sent {
             return Some(format!(
                 "{merged} of {asked} frames that match got no reply of their own: the one before was still waiting for the bus; \
@@ -411,10 +431,16 @@ impl Outcome {
     }
 
     /// An error with the reason if anything went wrong.
-    pub fn verdict(&self) -> anyhow::Result<()> {
-        match self.reason() {
-            Some(reason) => bail!(reason),
-            None => Ok(()),
+    pub fn verdict(self) -> anyhow::Result<()> {
+        match (self.reason(), self.error) {
+            (_, Some(error)) => Err(error),
+            (Some(reason), None) => bail!(reason),
+            (None, None) => Ok(()),
         }
+    }
+
+    /// Whether it ended early because the device is gone or refused something: then there is nothing to be closed properly.
+    pub const fn is_cut_short(&self) -> bool {
+        self.error.is_some()
     }
 }

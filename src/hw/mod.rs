@@ -105,23 +105,24 @@ pub fn start(
     if found.usb_was_connected {
         clocks::wait_ms(DISCONNECTED_MS, clocks::SYSCLK_HZ);
     }
-    let leds = board::connect(ports, &mut rcc);
+    let board::Connected { leds, transmit } = board::connect(ports, &mut rcc);
     let usb = (device.OTG_FS_GLOBAL, device.OTG_FS_DEVICE, device.OTG_FS_PWRCLK);
     let serial = chip::serial_number();
     let sensors = sensors::Sensors::start(device.ADC1, &device.ADC_COMMON, &mut rcc);
     stay_in_reach_of_a_debugger(&device.DBGMCU);
     let alarm = stamp::StampTimer::start(device.TIM2, &mut rcc);
-    let (meter, catcher) = edges::PinMeter::new(device.EXTI, device.SYSCFG, alarm.timer(), &mut rcc);
+    let timer = alarm.timer();
+    let (meter, catcher) = edges::PinMeter::new(device.EXTI, device.SYSCFG, timer, &mut rcc);
     Hardware {
-        can: can::Controllers::new(device.CAN1, device.CAN2, &mut rcc, sent_at),
-        sof: sof::SofLatch::start(alarm.timer()),
+        can: can::Controllers::new((device.CAN1, device.CAN2), transmit, &mut rcc, sent_at),
+        sof: sof::SofLatch::start(timer),
         alarm,
         tick: tick::Tick::start(device.TIM7, &mut rcc),
         crc: crc::CrcUnit::start(device.CRC, &mut rcc),
         meter,
         catcher,
-        usb: usb::UsbPort::new(usb, &mut rcc, &serial, usb_memory),
-        chip: chip::BoardChip::new(sensors, flash::LastSector::new(device.FLASH), leds),
+        usb: usb::UsbPort::new(usb, timer, &mut rcc, &serial, usb_memory),
+        chip: chip::BoardChip::new(sensors, flash::LastSector::new(device.FLASH, timer), leds),
         watchdog,
         identity: Identity { board: board::NAME, serial },
         restarted_after_failure,

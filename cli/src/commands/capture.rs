@@ -25,7 +25,7 @@ use crate::progress::Progress;
 use crate::trace_output::refuse_older;
 use crate::trigger_args::TriggerArgs;
 use crate::wrong::wrong;
-use cantap_work::Meter;
+use cantap_work::{Meter, lost_frames};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -278,7 +278,10 @@ impl View {
                 format!("{number}: {} frames{rate}{load}", meter.frames())
             });
             let channels = channels.collect::<Vec<_>>().join("  ");
-            let lost: u64 = meters.channels.iter().map(|(_, meter)| meter.lost()).sum();
+            let of = |meter: &Meter| (meter.lost(), meter.lost_at_least());
+            let lost = meters.channels.iter().map(|(_, meter)| of(meter));
+            let (lost, at_least) = lost.fold((0, false), |sum, of| (sum.0 + of.0, sum.1 | of.1));
+            let lost = lost_frames(lost, at_least);
             let size = std::fs::metadata(&*path).map_or(0, |metadata| metadata.len());
             format!(
                 "{:.0} s  {channels}  lost {lost}  {:.1} MB  Ctrl-C ends it",

@@ -314,16 +314,29 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             filled.add(&ends);
             sending.goes_on(&ends, replay.oldest_due())
         };
-        if !goes_on(&mut replay) || !replay.push(0, *channel, frame, goes_on)? {
+        if !goes_on(&mut replay) {
             break;
         }
+        match replay.push(0, *channel, frame, goes_on) {
+            Ok(true) => {}
+            Ok(false) => break,
+            Err(error) => {
+                sending.fail(error);
+                break;
+            }
+        }
     }
-    if !sending.stands_still() {
-        sending.finish(&mut replay)?;
+    if !sending.stands_still()
+        && !sending.has_failed()
+        && let Err(error) = sending.finish(&mut replay)
+    {
+        sending.fail(error);
     }
     let asked = if sending.stands_still() { args.frames.unwrap_or(generator.count) } else { sending.ended() };
     let outcome = sending.outcome(asked)?;
-    device.stop()?;
+    if !outcome.is_cut_short() {
+        device.stop()?;
+    }
     if args.json {
         let mut object = outcome.object();
         object["sent"] = sending.sent().into();

@@ -172,7 +172,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         args.play(&source, &mut replay, &mut sending, &mut buses)?;
     let seconds = started.elapsed().as_secs_f64();
     let outcome = sending.outcome(asked)?;
-    device.stop()?;
+    if !outcome.is_cut_short() {
+        device.stop()?;
+    }
     let accuracy = replay.accuracy();
     if args.json {
         let mut object = outcome.object();
@@ -205,7 +207,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 accuracy.early_us, accuracy.late_us
             );
         }
-        eprintln!();
+        eprintln!("");
     }
     outcome.verdict()?;
     Ok(ExitCode::SUCCESS)

@@ -145,7 +145,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         }
     };
     let seconds = started.elapsed().as_secs_f64();
-    device.stop()?;
+    if !outcome.is_cut_short() {
+        device.stop()?;
+    }
     if args.json {
         let mut object = outcome.object();
         object["channel"] = args.channel.number().into();

@@ -143,7 +143,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let requests = args.requests()?;
     let pair = args.transfer.pair();
     let device = args.speak.open()?;
-    let witness = || Box::new(Diagnostics::new(&[pair], false));
+    let witness = || Box::new(Diagnostics::new(&[pair.into()], false));
     let speaking = args.speak.speak(&device, witness());
     let mut client = Client::new(speaking, args.transfer);
     if let Some(session) = args.session {

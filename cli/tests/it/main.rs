@@ -52,6 +52,7 @@ mod serve;
 mod served;
 mod speaking_ends;
 mod terminal;
+mod texts_from_outside;
 mod timing;
 mod trigger;
 mod two_testers;

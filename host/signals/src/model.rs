@@ -7,12 +7,12 @@ use std::str::FromStr;
 
 use cantap_can::Id;
 
-use super::clean;
 use super::container::{Container, InPdu};
 use super::fault::Fault;
 use super::layout::{self, ByteOrder};
 use super::number::Number;
 use super::scale::Scale;
+use cantap_trace::clean;
 
 /// A set of messages, from one file.
 #[derive(Clone, Debug, Default, PartialEq)]

@@ -6,6 +6,7 @@
 
 #![forbid(unsafe_code)]
 
+pub mod clean;
 pub mod diff;
 pub mod fd;
 mod fd_bits;

@@ -9,5 +9,5 @@ mod losses;
 mod meter;
 
 pub use cantap_trace::grammar::{duration, positive_duration};
-pub use losses::Losses;
+pub use losses::{Losses, lost_frames};
 pub use meter::{Meter, rounded};

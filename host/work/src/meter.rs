@@ -8,6 +8,7 @@ use cantap_analysis::stats::WorkLoad;
 pub struct Meter {
     frames: u64,
     lost: u64,
+    lost_at_least: bool,
     bus_errors: u64,
     /// Time of the last frame, if nothing lies between it and the next.
     latest_ns: Option<i64>,
@@ -28,6 +29,7 @@ impl Meter {
         Self {
             frames: 0,
             lost: 0,
+            lost_at_least: false,
             bus_errors: 0,
             latest_ns: None,
             covered_ns: 0,
@@ -79,11 +81,13 @@ impl Meter {
                 self.pass_by(record);
             }
             event if *event == TraceEvent::GAP => {
+                self.lost_at_least = true;
                 self.latest_ns = None;
                 self.load.gap();
             }
-            TraceEvent::Lost { count, .. } => {
+            TraceEvent::Lost { count, at_least, .. } => {
                 self.lost += u64::from(*count);
+                self.lost_at_least |= at_least;
                 // The rate is over the same time as the load.
                 self.latest_ns = None;
                 self.load.gap();
@@ -102,6 +106,11 @@ impl Meter {
     /// Frames lost.
     pub const fn lost(&self) -> u64 {
         self.lost
+    }
+
+    /// Whether there may be more: an overrun of the controller cannot be counted, nor what is on the bus while the device is not.
+    pub const fn lost_at_least(&self) -> bool {
+        self.lost_at_least
     }
 
     /// Bus errors, including those only counted.

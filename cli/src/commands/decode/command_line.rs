@@ -56,6 +56,9 @@ pub struct Args {
     /// One line of CSV per signal.
     #[arg(long, conflicts_with = "json")]
     pub csv: bool,
+    /// In CSV: an apostrophe in front of names and texts that begin with = + - @, which a spreadsheet would take for formulas.
+    #[arg(long, conflicts_with = "json")]
+    pub text_cells: bool,
     /// In CSV and Parquet: a column per signal and a line per frame. Written at the end of the trace.
     #[arg(long)]
     pub wide: bool,

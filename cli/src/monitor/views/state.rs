@@ -112,8 +112,12 @@ fn line(app: &App, model: &Model, detail: Detail, most_address: usize) -> Vec<Sp
     }
     let (lost, or_more) = model.seen.lost();
     if lost > 0 || or_more {
-        let more = if or_more { "+" } else { "" };
-        spans.push(Span::styled(format!("  lost {lost}{more}"), theme.loss()));
+        let lost = match (lost, or_more) {
+            // As while the device was off the bus.
+            (0, _) => "?".to_owned(),
+            (lost, or_more) => format!("{lost}{}", if or_more { "+" } else { "" }),
+        };
+        spans.push(Span::styled(format!("  lost {lost}"), theme.loss()));
     }
     if let Some(recording) = &model.recording {
         spans.push(match &recording.condition {

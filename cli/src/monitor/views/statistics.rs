@@ -92,10 +92,14 @@ fn channel_lines(
     lines.push(Line::styled(format!("Errors    {errors:>10}   {}", kinds.join(", ")), style));
     let losses = &channel.losses;
     let stages = LossStage::ALL.map(|stage| format!("{} {}", stage.name(), losses.of(stage)));
-    let style = if losses.total() > 0 { theme.loss() } else { theme.label() };
+    let style = if losses.gaps > 0 { theme.loss() } else { theme.label() };
     let least = if losses.at_least { " at least" } else { "" };
+    let uncounted = match losses.uncounted {
+        0 => String::new(),
+        uncounted => format!("; an unknown number at {uncounted} places"),
+    };
     lines.push(Line::styled(
-        format!("Lost      {:>10}{least}   {}", losses.total(), stages.join(", ")),
+        format!("Lost      {:>10}{least}   {}{uncounted}", losses.total(), stages.join(", ")),
         style,
     ));
     if let Some(windows) = windows.filter(|windows| windows.iter().any(|window| window.load_pct.is_some())) {

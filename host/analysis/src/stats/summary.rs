@@ -12,6 +12,8 @@ pub struct Summary {
     pub frames: u64,
     /// Frames known to be missing on all channels.
     pub lost: u64,
+    /// Whether there may be more on one of them.
+    pub lost_at_least: bool,
     /// Errors on all channels.
     pub errors: u64,
     /// End of the trace's first frame, in seconds since the Unix epoch, or since the trace's start.
@@ -170,6 +172,8 @@ pub struct LossSummary {
     pub unknown: u64,
     /// Places in the trace where frames are missing.
     pub gaps: u64,
+    /// Those of them at which it is unknown how many: the device was not on the bus, or not there.
+    pub uncounted: u64,
     /// Whether there may be more.
     pub at_least: bool,
 }
@@ -243,6 +247,7 @@ impl Summary {
         Self {
             frames: channels.iter().map(|channel| channel.frames).sum(),
             lost: channels.iter().map(|channel| channel.lost.total).sum(),
+            lost_at_least: channels.iter().any(|channel| channel.lost.at_least),
             errors: channels.iter().map(|channel| channel.errors.total).sum(),
             first_s: first.map(seconds),
             last_s: last.map(seconds),
@@ -362,6 +367,7 @@ impl LossSummary {
             host: losses.of(LossStage::Host),
             unknown: losses.unknown,
             gaps: losses.gaps,
+            uncounted: losses.uncounted,
             at_least: losses.at_least,
         }
     }

@@ -191,7 +191,7 @@ fn what_was_sent_is_what_left_however_it_ended() {
     .enumerate()
     {
         let log = served.folder.path().join(format!("{number}.log"));
-        let witness = spawn(&format!("capture -d {at} -b 500k --mode normal -o {}", log.display()));
+        let witness = spawn(&format!("capture -d {at} -c 1 -b 500k --mode normal -o {}", log.display()));
         // It listens once there is something in its file.
         let deadline = std::time::Instant::now() + std::time::Duration::from_mins(1);
         while std::fs::metadata(&log).map_or(0, |file| file.len()) == 0 {

@@ -56,7 +56,7 @@ mod wrong;
 use std::error::Error;
 use std::process::ExitCode;
 
-use clap::{CommandFactory, Parser};
+use clap::{CommandFactory, FromArgMatches, Parser};
 use clap_complete::CompleteEnv;
 
 /// Captures, understands and drives CAN buses with a cantap analyser.
@@ -64,6 +64,7 @@ use clap_complete::CompleteEnv;
 #[command(
     name = "cantap",
     version,
+    disable_help_subcommand = true,
     after_help = "Exit codes: 0 success, 1 failure, 2 wrong command line, 3 a check did not hold."
 )]
 struct Cli {
@@ -75,8 +76,11 @@ fn main() -> ExitCode {
     // For completion by a shell, the program ends here.
     CompleteEnv::with_factory(Cli::command).var(shells::VARIABLE).shells(shells::ALL).complete();
     let arguments = commands::extcap::arguments(std::env::args_os());
-    let cli = Cli::try_parse_from(arguments).unwrap_or_else(|error| leave(&error));
-    match cli.command.run(Cli::command()) {
+    let line = commands::help::grouped(Cli::command());
+    let parsed = line.clone().try_get_matches_from(arguments);
+    let cli =
+        parsed.and_then(|matches| Cli::from_arg_matches(&matches)).unwrap_or_else(|error| leave(&error));
+    match cli.command.run(line) {
         Ok(code) => code,
         // `cantap … | head` has read enough.
         Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,

@@ -8,7 +8,7 @@ import numbers
 import weakref
 from collections.abc import Iterable, Iterator
 from types import TracebackType
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, SupportsIndex, TypeAlias
 
 from . import _native
 from ._arguments import channels as _channels
@@ -301,7 +301,7 @@ def open(
     address: str,
     bitrate: int | None = None,
     *,
-    channels: int | Iterable[int] = (1, 2),
+    channels: SupportsIndex | Iterable[SupportsIndex] = (1, 2),
     mode: Mode = "listen-only",
     filter: str | Iterable[str] = (),
     capacity: int = CAPACITY,

@@ -36,16 +36,18 @@ use cantap_work::interrupt;
 #[derive(clap::Args)]
 #[command(
     args_conflicts_with_subcommands = true,
-    after_help = "Clients take -d unix:PATH, -d tcp://HOST:PORT or -d ssh://[USER@]HOST[/DEVICE] in place of a port, in every command. A \
-                  second device is\nat the same path with -2 behind its name, and at the next port.\n\n\
-                  Nothing is sent and nothing acknowledged while no client that may send has asked for it.\n\n\
-                  Examples:\n  cantap serve -d /dev/ttyACM0 -b 500k\n  \
-                  cantap capture -d unix: -o drive.log\n  \
-                  cantap serve -d /dev/ttyACM0 -b 500k -b 2:250k --tcp --allow send\n  \
-                  cantap monitor -d tcp://127.0.0.1\n  \
-                  cantap capture -d ssh://me@vehicle/dev/ttyACM0 -b 500k -o drive.log\n  \
-                  cantap serve keygen keys --host vehicle --client alice:send\n  \
-                  cantap serve -d /dev/ttyACM0 -b 500k --tcp 192.0.2.7 --tls keys/server.pem,keys/server-key.pem --clients keys/ca.pem"
+    after_help = "Clients take -d unix:PATH, -d tcp://HOST:PORT or -d ssh://[USER@]HOST[/DEVICE] in place of a port, in \
+                every command. A second device is at the same path with -2 behind its name, and at the next port.\n\n\
+                Nothing is sent and nothing acknowledged while no client that may send has asked for it.\n\n\
+                Examples:\n  \
+                cantap serve -d /dev/ttyACM0 -b 500k\n  \
+                cantap capture -d unix: -o drive.log\n  \
+                cantap serve -d /dev/ttyACM0 -b 500k -b 2:250k --tcp --allow send\n  \
+                cantap monitor -d tcp://127.0.0.1\n  \
+                cantap capture -d ssh://me@vehicle/dev/ttyACM0 -b 500k -o drive.log\n  \
+                cantap serve keygen keys --host vehicle --client alice:send\n  \
+                cantap serve -d /dev/ttyACM0 -b 500k --tcp 192.0.2.7 --tls keys/server.pem,keys/server-key.pem \\\n      \
+                --clients keys/ca.pem"
 )]
 pub struct Args {
     #[cfg(feature = "tls")]

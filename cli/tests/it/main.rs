@@ -32,6 +32,7 @@ mod firmware;
 mod follow;
 mod json_schema;
 mod misbehaving_devices;
+mod monitor_keys;
 mod monitor_replug;
 mod monitor_screens;
 mod monitor_sources;

@@ -6,15 +6,23 @@
 //! of 4.2); and unfinished files. Measured signals are counted.
 
 mod blocks;
+mod channel;
+mod clock;
+mod conversion;
 mod decode;
 mod encode;
+mod field;
+mod formula;
+mod joined;
 mod layout;
 mod part;
 mod plain;
 mod record;
 mod stream;
+mod value;
 #[cfg(test)]
 mod tests;
+mod unpack;
 
 pub(crate) use decode::Decoder;
 #[cfg(test)]

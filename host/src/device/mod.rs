@@ -237,6 +237,11 @@ impl Device {
         self.settings.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Whether a channel's filters keep frames back from this session.
+    pub fn is_filtered(&self, channel: Channel) -> bool {
+        self.settings().filters[channel.index()].as_ref().is_some_and(|filters| !filters.is_empty())
+    }
+
     /// The open channels, with their configurations.
     pub fn open_channels(&self) -> Vec<(Channel, ChannelConfig)> {
         let open = self.settings().open;

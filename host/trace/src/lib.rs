@@ -12,6 +12,7 @@ pub mod fd;
 mod fd_bits;
 pub mod filter;
 mod frame;
+pub mod grammar;
 mod interface;
 mod length;
 pub mod levels;

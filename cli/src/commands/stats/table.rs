@@ -77,6 +77,10 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
             out,
             "  load      unknown: frames switch to a data bit rate, which --data-bitrate gives (such as 2M)",
         );
+    } else if let (Some(_), None, Some(reason)) =
+        (channel.bitrate, &channel.load, channel.no_bus_load_because)
+    {
+        let _ = writeln!(out, "  load      –: {reason}");
     }
     if let Some(load) = &channel.load {
         let percent = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.3} %"));

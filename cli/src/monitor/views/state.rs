@@ -10,9 +10,9 @@ use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::style::Style;
 use ratatui::text::{Line, Span};
-use ratatui::widgets::Paragraph;
 
 use super::super::app::{App, View};
+use super::super::cut::draw_lines;
 use super::super::model::{Model, Playing, SourceState};
 use super::super::theme::Theme;
 use super::super::times::duration;
@@ -53,7 +53,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
             app.bar = Some(Rect { x: area.x + start as u16, width: columns as u16, ..area });
         }
     }
-    frame.render_widget(Paragraph::new(Line::from(spans)), area);
+    draw_lines(frame, area, vec![Line::from(spans)]);
 }
 
 fn width(spans: &[Span<'_>]) -> usize {
@@ -120,7 +120,10 @@ fn line(app: &App, model: &Model, detail: Detail, most_address: usize) -> Vec<Sp
         spans.push(Span::styled(format!("  lost {lost}"), theme.loss()));
     }
     if let Some(recording) = &model.recording {
-        spans.push(Span::styled(format!("  REC {}", bytes(recording.bytes)), theme.error()));
+        spans.push(match &recording.condition {
+            Some(_) if recording.events == 0 => Span::styled("  ARMED", theme.loss()),
+            _ => Span::styled(format!("  REC {}", bytes(recording.bytes)), theme.error()),
+        });
     }
     if app.frozen.is_some() {
         spans.push(Span::styled("  PAUSED", Theme::heading()));

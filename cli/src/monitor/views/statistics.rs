@@ -7,9 +7,9 @@ use cantap_analysis::stats::ChannelStatistics;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::text::{Line, Span};
-use ratatui::widgets::Paragraph;
 
 use super::super::app::App;
+use super::super::cut::draw_lines;
 use super::super::model::{DeviceFigures, Model, Seen};
 use super::super::theme::Theme;
 use super::list::bytes;
@@ -53,7 +53,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
     let most = lines.len().saturating_sub(app.page_rows);
     app.selected = app.selected.min(most);
     let first = app.selected;
-    frame.render_widget(Paragraph::new(lines.split_off(first)), area);
+    draw_lines(frame, area, lines.split_off(first));
 }
 
 fn channel_lines(

@@ -92,7 +92,7 @@ impl Otg {
     }
 
     fn addressed(&self, address: u8) -> bool {
-        self.address == address
+        self.address == address && !self.late.is_dead
     }
 
     /// DCFG was written. An address written during a transfer is that of SET_ADDRESS and takes effect at
@@ -114,11 +114,14 @@ impl Otg {
             // The data and status stages begin with DATA1.
             endpoint.set_toggle(true);
         }
-        self.outs[0].control &= !epctl::EPENA;
+        if !self.late.faults.setup_complete_disarms {
+            self.outs[0].control &= !epctl::EPENA;
+        }
         // A request without a data stage, or one that carries data out, ends with an IN packet.
         self.in_control_transfer = packet[0] & 0x80 == 0;
+        self.precede_by_bogus();
         self.rx.push(0, pktsts::SETUP_DATA, false, &packet);
-        self.rx.push(0, pktsts::SETUP_COMPLETE, false, &[]);
+        self.begin_setup_stage();
         self.update();
         OutReply::Ack
     }
@@ -128,6 +131,9 @@ impl Otg {
         let number = usize::from(endpoint);
         if !self.addressed(address) || number >= ENDPOINTS || !self.outs[number].active() {
             return OutReply::Silence;
+        }
+        if number == 0 && self.end_setup_stage(true) {
+            return OutReply::Nak;
         }
         let room = self.rx.len() + bytes.len().div_ceil(4) + 2 + SETUP_RESERVE_WORDS <= self.rx_size as usize;
         let held_off = self.dctl & dctl::GONSTS != 0;
@@ -155,6 +161,7 @@ impl Otg {
         if complete {
             out.finish();
         }
+        self.precede_by_bogus();
         self.rx.push(endpoint, pktsts::OUT_DATA, data1, bytes);
         if complete {
             self.completing[number] += 1;
@@ -170,6 +177,9 @@ impl Otg {
         let number = usize::from(endpoint);
         if !self.addressed(address) || number >= ENDPOINTS || !self.ins[number].active() {
             return InReply::Silence;
+        }
+        if number == 0 && self.end_setup_stage(true) {
+            return InReply::Nak;
         }
         let fifo = self.fifo_of(number);
         let held_off = self.dctl & dctl::GINSTS != 0;

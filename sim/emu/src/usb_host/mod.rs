@@ -322,6 +322,7 @@ impl<D: HostDriver> UsbHost<D> {
     pub fn advance(&mut self, otg: &mut Otg, now: u64) {
         while let Some(at) = self.next_event(otg).filter(|at| *at <= now) {
             self.now = self.now.max(at);
+            otg.settle(self.now);
             self.step(otg);
         }
         self.now = self.now.max(now);

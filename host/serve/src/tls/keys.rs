@@ -75,7 +75,79 @@ impl Keys {
 
     /// The certificates made from now on are valid for so many days.
     #[must_use]
-    pub fn lasting(mut params: CertificateParams, name: &str, days: u32) -> CertificateParams {
+    pub fn lasting(self, days: u32) -> Self {
+        Self { days, ..self }
+    }
+
+    /// Makes the server's certificate, for all names and addresses by which clients reach it. Wildcards are refused.
+    pub fn add_server(&self, hosts: &[String]) -> Result<Files, KeysError> {
+        if let Some(bad) = hosts.iter().find(|host| host.is_empty() || host.contains(['*', ' ', ','])) {
+            return Err(KeysError::Host(bad.clone()));
+        }
+        self.add(SERVER, hosts.to_vec(), ExtendedKeyUsagePurpose::ServerAuth)
+    }
+
+    /// Makes a client's certificate, which contains its maximum role.
+    pub fn add_client(&self, name: &str, role: Role) -> Result<Files, KeysError> {
+        let is_plain = |letter: char| letter.is_ascii_alphanumeric() || matches!(letter, '-' | '_');
+        if name.is_empty() || !name.chars().all(is_plain) || name.ends_with("-key") {
+            return Err(KeysError::Name(name.to_owned()));
+        }
+        self.add(name, vec![name_of(role)], ExtendedKeyUsagePurpose::ClientAuth)
+    }
+
+    /// The files with a name, together with the authority's certificate.
+    pub fn files(folder: &Path, name: &str) -> Files {
+        Files {
+            certificate: folder.join(format!("{name}.pem")),
+            key: folder.join(format!("{name}-key.pem")),
+            authority: folder.join(format!("{AUTHORITY}.pem")),
+        }
+    }
+
+    fn add(
+        &self,
+        name: &str,
+        hosts: Vec<String>,
+        purpose: ExtendedKeyUsagePurpose,
+    ) -> Result<Files, KeysError> {
+        let key = KeyPair::generate()?;
+        let mut params = lasting(CertificateParams::new(hosts)?, name, self.days);
+        params.extended_key_usages = vec![purpose];
+        params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
+        params.use_authority_key_identifier_extension = true;
+        let certificate = params.signed_by(&key, &Issuer::from_params(&authority(), &self.key))?;
+        self.write(name, &certificate.pem(), &key)?;
+        Ok(Self::files(&self.folder, name))
+    }
+
+    fn write(&self, name: &str, certificate: &str, key: &KeyPair) -> Result<(), KeysError> {
+        let files = Self::files(&self.folder, name);
+        // Neither of the two is left alone.
+        if let Some(there) = [&files.key, &files.certificate].into_iter().find(|path| path.exists()) {
+            return Err(KeysError::There(there.clone()));
+        }
+        for (path, text, is_secret) in
+            [(files.key, key.serialize_pem(), true), (files.certificate, certificate.to_owned(), false)]
+        {
+            create(&path, &text, is_secret).map_err(|source| match source.kind() {
+                io::ErrorKind::AlreadyExists => KeysError::There(path),
+                _ => KeysError::File { path, source },
+            })?;
+        }
+        Ok(())
+    }
+}
+
+/// The same every time: certificates refer to it by this, and by its key.
+fn authority() -> CertificateParams {
+    let mut params = lasting(CertificateParams::default(), "authority", AUTHORITY_DAYS);
+    params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
+    params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
+    params
+}
+
+fn lasting(mut params: CertificateParams, name: &str, days: u32) -> CertificateParams {
     let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     let at = |seconds: u64| date_time_ymd(1970, 1, 1) + Duration::from_secs(seconds);
     params.not_before = at(now.as_secs().saturating_sub(ALLOWANCE_S));

@@ -292,6 +292,8 @@ mod app {
         let otg_fs::SharedResources { tap, session, usb, controls, .. } = cx.shared;
         usb.poll();
         session.poll(usb, &mut Access { tap, controls });
+        // The last store may have been to USB (Cortex-M4 erratum 838869, see `Bells::open_receive`).
+        cortex_m::asm::dsb();
     }
 
     /// Once a millisecond: flushes batches, keeps time, handles what no interrupt reports, feeds the watchdog.
@@ -346,6 +348,8 @@ mod app {
         let mut access = Access { tap, controls };
         session.tick(&mut access);
         session.poll(usb, &mut access);
+        // As in `otg_fs`.
+        cortex_m::asm::dsb();
     }
 
     /// Sleeps until the next interrupt.

@@ -207,7 +207,7 @@ impl Core {
                 return PollResult::Suspend;
             }
         }
-        if flags & gint::OTGINT != 0 && self.take_session_end() {
+        if board::SENSES_VBUS && flags & gint::OTGINT != 0 && self.take_session_end() {
             return PollResult::Suspend;
         }
         let received = self.receive();

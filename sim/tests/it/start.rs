@@ -168,7 +168,7 @@ fn edges_of_the_can_tx_pins_are_fast_on_every_board() {
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_tx_pin_is_connected_only_to_a_controller_that_has_been_stopped() {
-    for (name, hz, pins) in BOARDS {
+    for (name, hz, pins) in common::boards() {
         let mut rig = connected(name, Setup { crystal: crystal(hz), ..board::setup() });
         // Mode, pull resistor, and whether the controller's clock and initialisation mode are on.
         let look = |rig: &Rig, channel: Channel| {
@@ -204,7 +204,7 @@ fn a_tx_pin_is_connected_only_to_a_controller_that_has_been_stopped() {
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_board_that_can_sense_vbus_shows_itself_only_when_it_is_there() {
-    for (name, hz, _) in BOARDS {
+    for (name, hz, _) in common::boards() {
         let mut rig = connected(name, Setup { crystal: crystal(hz), ..board::setup() });
         let shown = rig.with_host(|_, otg| [true, false].map(|vbus| otg.pulled_up(vbus)));
         assert_eq!(shown, [true, name != "stm32f4-discovery"], "{name}");

@@ -90,7 +90,7 @@ impl SpeakArgs {
             bitrate_bps: open.map_or(1, |(_, config)| config.timing.bitrate_bps(clock_hz)),
             records: device.records(),
             stream: Stream::new(device),
-            sending: Sending::fed(device, self.channel_args().rescue()),
+            sending: Sending::fed(device, self.channel_args().rescue(), true),
             started: Instant::now(),
             pushed: 0,
             under_way: VecDeque::new(),

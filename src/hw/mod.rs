@@ -27,6 +27,7 @@ use core::sync::atomic::AtomicU32;
 use cantap_firmware::lights;
 use cantap_firmware::port::command::Identity;
 use cantap_wire::CHANNELS;
+use cantap_wire::image::ImageInfo;
 use stm32f4xx_hal::pac;
 use stm32f4xx_hal::prelude::*;
 
@@ -46,6 +47,12 @@ static CANTAP_RECEIVE_PINS: [[u8; 2]; CHANNELS] = {
     let [one, two] = board::RECEIVE_PINS;
     [[one.port as u8, one.pin], [two.port as u8, two.pin]]
 };
+
+/// What the image says about itself, for the command that writes it ([`cantap_wire::image`]).
+// SAFETY: as above.
+#[used]
+#[unsafe(no_mangle)]
+static CANTAP_IMAGE: ImageInfo = ImageInfo::new(board::NAME, cantap_firmware::port::command::VERSION);
 
 /// Everything that the tasks need, set up and running; both controllers are off the bus.
 pub struct Hardware {

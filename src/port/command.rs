@@ -589,7 +589,7 @@ fn check(config: &ChannelConfig) -> Result<(), Refusal> {
 }
 
 /// This firmware's version.
-const VERSION: [u16; 3] = [
+pub const VERSION: [u16; 3] = [
     parse(env!("CARGO_PKG_VERSION_MAJOR")),
     parse(env!("CARGO_PKG_VERSION_MINOR")),
     parse(env!("CARGO_PKG_VERSION_PATCH")),

@@ -8,6 +8,7 @@
 pub mod batch;
 pub mod decoder;
 pub mod framing;
+pub mod image;
 pub mod message;
 mod packed;
 pub mod record;

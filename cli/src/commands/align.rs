@@ -182,8 +182,7 @@ struct Merged<'a> {
 impl<'a> Merged<'a> {
     fn open(args: &Args, alignments: Vec<Alignment>, offsets: &'a [u8]) -> anyhow::Result<Self> {
         let zone = args.write.zone.clone();
-        let read =
-            ReadArgs { format: args.from, follow: false, strict: args.strict, filter: Vec::new(), zone };
+        let read = ReadArgs { format: args.from, strict: args.strict, filter: Vec::new(), zone };
         let sources = args.traces.iter().map(|path| read.open(path)).collect::<anyhow::Result<Vec<_>>>()?;
         let others = alignments
             .into_iter()

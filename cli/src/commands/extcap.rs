@@ -30,12 +30,13 @@ use crate::wrong::wrong;
 #[derive(clap::Args)]
 #[command(
     args_conflicts_with_subcommands = true,
-    after_help = "`cantap extcap install` once, and Wireshark and tshark show each connected board as an interface, with both channels: \
-                        \n`tshark -i cantap-virtual` tries it. Channels only listen, unless the interface's options or the toolbar say otherwise.\n\
-                        Capture filters are candump's, several apart by blanks: can0,123:7FF can1,#FF\n\n\
-                        Wireshark gives every other option; each can also be given by hand:\n  \
-                        cantap extcap --extcap-interfaces\n  \
-                        tshark -i cantap-address -o extcap.cantap_address.device:unix:"
+    after_help = "`cantap extcap install` once, and Wireshark and tshark show each connected board as an interface, with \
+                both channels: \n\
+                `tshark -i cantap-virtual` tries it. Channels only listen, unless the interface's options or the \
+                toolbar say otherwise. Capture filters are candump's, several apart by blanks: can0,123:7FF can1,#FF\n\n\
+                Wireshark gives every other option; each can also be given by hand:\n  \
+                cantap extcap --extcap-interfaces\n  \
+                tshark -i cantap-address -o extcap.cantap_address.device:unix:"
 )]
 pub struct Args {
     #[command(subcommand)]

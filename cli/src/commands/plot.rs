@@ -13,6 +13,7 @@ use cantap_analysis::plot::{
 };
 use cantap_analysis::stats::Options;
 use cantap_formats::time_range::{TimePoint, TimeRange, date_text};
+use cantap_trace::grammar;
 
 use crate::channel_bitrate::ChannelBitrate;
 use crate::completion;
@@ -27,11 +28,12 @@ use serde_json::json;
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
-    cantap plot trace.log --db car.dbc --signal Speed --signal 'Engine.*' -o drive.svg\n  \
-    cantap plot trace.log --bus-load -b 500k --window 100ms -o load.png\n  \
-    cantap plot trace.log --timing 123\n\n\
-Without -o the picture is drawn in the terminal. Where frames were lost, curves are interrupted and the\n\
-place is shaded.")]
+                cantap plot trace.log --db car.dbc --signal Speed --signal 'Engine.*' \\\n      \
+                -o drive.svg\n  \
+                cantap plot trace.log --bus-load -b 500k --window 100ms -o load.png\n  \
+                cantap plot trace.log --timing 123\n\n\
+                Without -o the picture is drawn in the terminal. Where frames were lost, curves are interrupted and the \
+                place is shaded.")]
 pub struct Args {
     /// The trace; - for standard input.
     #[arg(value_name = "IN")]
@@ -44,12 +46,16 @@ pub struct Args {
     /// Draw the bus load over time, or frames/s if no bit rate is given.
     #[arg(long, conflicts_with_all = ["signals", "timing"])]
     bus_load: bool,
-    /// Draw a histogram of this identifier's periods: 3 hexadecimal digits, or 8 for 29 bits.
-    #[arg(long, value_name = "ID", conflicts_with = "signals", add = completion::identifiers())]
+    /// Draw a histogram of this identifier's periods.
+    #[arg(long, value_name = "ID", conflicts_with = "signals", value_parser = grammar::identifier, add = completion::identifiers())]
     timing: Option<Id>,
     /// The bit rate for the load, such as 500k, or 2:250k for one channel.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", requires = "bus_load", add = completion::bit_rates())]
     bitrates: Vec<ChannelBitrate>,
+    /// The bit rate of the data phase of CAN FD frames that switch, such as 2M, or 2:5M for one channel. Without it, the load of windows with
+    /// such frames is not known.
+    #[arg(long = "data-bitrate", value_name = "[CHANNEL:]RATE", requires = "bitrates", add = completion::bit_rates())]
+    data_bitrates: Vec<ChannelBitrate>,
     /// Length of the load's windows.
     #[arg(short, long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration)]
     window: Duration,
@@ -131,10 +137,37 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
     let name = args.input.file_name().map_or("-".into(), |name| name.to_string_lossy());
     let title = |what: &str| args.title.clone().unwrap_or_else(|| format!("{name}: {what}"));
     if args.bus_load {
-        let options = Options { window: args.window, ..ChannelBitrate::options(&args.bitrates) };
+        if args.read.hides_frames() {
+            return Err(wrong(
+                "a filter hides part of the bus's load; leave -f out, or give only a channel, as -f can0",
+            ));
+        }
+        let data = ChannelBitrate::options(&args.data_bitrates);
+        let options = Options {
+            window: args.window,
+            data_bitrate_bps: data.bitrate_bps,
+            channel_data_bitrate_bps: data.channel_bitrate_bps,
+            ..ChannelBitrate::options(&args.bitrates)
+        };
         let mut collector = LoadCollector::new(options)?;
         let read = for_each(args, |record| collector.push(record))?;
-        return Ok((dated(collector.finish(title("bus load")), read.first_ns), read));
+        let (plot, unknown) = collector.finish_counting(title("bus load"));
+        if plot.is_empty() && unknown > 0 {
+            bail!(
+                "the load of none of the {unknown} windows is known: there are CAN FD frames that switch their bit rate; give it with \
+                 --data-bitrate, such as --data-bitrate 2M"
+            );
+        }
+        if plot.is_empty() {
+            bail!("there is nothing to draw in {name}{}", within(args));
+        }
+        if unknown > 0 {
+            eprintln!(
+                "cantap: {unknown} windows are not drawn: they have CAN FD frames that switch their bit rate, or the channel has no bit rate; \
+                 give them with --data-bitrate and -b"
+            );
+        }
+        return Ok((dated(plot, read.first_ns), read));
     }
     if let Some(id) = args.timing {
         let mut collector = TimingCollector::new(id);
@@ -154,7 +187,7 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
     let mut collector = SignalCollector::new(&decoder).with_most_curves(args.curves);
     let mut read = for_each(args, |record| collector.push(record))?;
     if collector.is_empty() {
-        bail!("none of the signals is in {name}; `cantap decode` shows what is");
+        bail!("none of the signals is in {name}{}; `cantap decode` shows what is", within(args));
     }
     read.not_drawn = collector.left_out();
     if read.not_drawn > 0 {
@@ -164,6 +197,11 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
         );
     }
     Ok((dated(collector.finish(title("signals")), read.first_ns), read))
+}
+
+/// Where nothing was found, if that is only a part of the trace.
+fn within(args: &Args) -> &'static str {
+    if args.start.is_some() || args.end.is_some() { " between --start and --end" } else { "" }
 }
 
 /// Reads the part of the trace to be drawn.

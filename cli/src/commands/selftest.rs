@@ -24,13 +24,15 @@ use cantap_work::interrupt;
 /// The command line.
 #[derive(clap::Args)]
 #[command(
-    after_help = "Without --loop no channel puts a dominant bit on its bus, whatever is connected: channels only listen, or play with \
-                        themselves inside the controller.\nWith --loop both channels send, so that nothing else may be connected: channel 1 \
-                        to channel 2, CANH to CANH, CANL to CANL, and 120 ohms at each end.\nA step passes, fails, or is skipped with the \
-                        reason. Exit code 3 if one fails. What to do by hand besides is in docs/bring-up.md. Ctrl-C ends the \
-                        test with what was tried so far.\n\n\
-                        Examples:\n  cantap selftest -d /dev/ttyACM0 --report board.txt\n  cantap selftest -d COM5 --loop --load-time 1m\n  \
-                        cantap selftest -d virtual:wire=joined,load=0,ack=no --loop --json"
+    after_help = "Without --loop no channel puts a dominant bit on its bus, whatever is connected: channels only listen, \
+                or play with themselves inside the controller. With --loop both channels send, so that nothing else may \
+                be connected: channel 1 to channel 2, CANH to CANH, CANL to CANL, and 120 ohms at each end. A step \
+                passes, fails, or is skipped with the reason. Exit code 3 if one fails. What to do by hand besides is \
+                in docs/bring-up.md. Ctrl-C ends the test with what was tried so far.\n\n\
+                Examples:\n  \
+                cantap selftest -d /dev/ttyACM0 --report board.txt\n  \
+                cantap selftest -d COM5 --loop --load-time 1m\n  \
+                cantap selftest -d virtual:wire=joined,load=0,ack=no --loop --json"
 )]
 pub struct Args {
     #[command(flatten)]

@@ -19,11 +19,13 @@ use cantap_work::interrupt;
 /// The command line.
 #[derive(clap::Args)]
 #[command(
-    after_help = "Connecting begins a session: it closes both channels and sets the counters to zero. So to learn something of a \
-                        bus, listen to it for a while first, with --time.\nWith --json, mode and bitrate_bps of a channel are null \
-                        while it is closed; modes have the names that --mode takes.\n\n\
-                        Examples:\n  cantap status -d /dev/ttyACM0\n  cantap status -d /dev/ttyACM0 -b 500k --time 2s\n  \
-                        cantap status -d virtual --registers --json"
+    after_help = "Connecting begins a session: it closes both channels and sets the counters to zero. So to learn \
+                something of a bus, listen to it for a while first, with --time. With --json, mode and bitrate_bps of a \
+                channel are null while it is closed; modes have the names that --mode takes.\n\n\
+                Examples:\n  \
+                cantap status -d /dev/ttyACM0\n  \
+                cantap status -d /dev/ttyACM0 -b 500k --time 2s\n  \
+                cantap status -d virtual --registers --json"
 )]
 pub struct Args {
     #[command(flatten)]

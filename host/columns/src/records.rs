@@ -156,9 +156,6 @@ impl<'a> Columns<'a> {
         if self.time.is_null(row) || self.channel.is_null(row) {
             return Err("it has no time or no channel");
         }
-        if self.channel.value(row) == 0 {
-            return Err("there is no channel 0; they count from 1");
-        }
         let event = self.event.at(row).ok_or("its event is missing")?;
         let detail = self.detail.at(row);
         let count = self.count.is_valid(row).then(|| self.count.value(row));

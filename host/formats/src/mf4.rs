@@ -6,8 +6,14 @@
 //! of 4.2); and unfinished files. Measured signals are counted.
 
 mod blocks;
+mod channel;
+mod clock;
+mod conversion;
 mod decode;
 mod encode;
+mod field;
+mod formula;
+mod joined;
 mod layout;
 mod part;
 mod plain;
@@ -15,6 +21,8 @@ mod record;
 mod stream;
 #[cfg(test)]
 mod tests;
+mod unpack;
+mod value;
 
 pub(crate) use decode::Decoder;
 #[cfg(test)]

@@ -10,7 +10,6 @@
 
 pub mod arxml;
 mod buses;
-mod clean;
 pub mod condition;
 mod container;
 pub mod dbc;

@@ -56,7 +56,7 @@ impl fmt::Display for Reading<'_> {
         write!(f, "{} = ", self.label)?;
         match self.number {
             Some(number) => {
-                write!(f, "{}", number.for_people())?;
+                write!(f, "{}", self.signal.for_people(number))?;
                 if !self.signal.unit.is_empty() {
                     write!(f, " {}", self.signal.unit)?;
                 }

@@ -6,11 +6,14 @@
 
 #![forbid(unsafe_code)]
 
+pub mod clean;
 pub mod diff;
 pub mod fd;
 mod fd_bits;
 pub mod filter;
 mod frame;
+pub mod grammar;
+mod id_filter;
 mod interface;
 mod length;
 pub mod levels;

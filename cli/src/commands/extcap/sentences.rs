@@ -12,7 +12,8 @@ const LINK_TYPE: u16 = 227;
 
 /// Makes a text safe for a sentence: braces and line ends would end it.
 fn clean(text: &str) -> String {
-    text.chars().map(|char| if matches!(char, '{' | '}') || char.is_control() { ' ' } else { char }).collect()
+    let ends = |char| matches!(char, '{' | '}') || cantap_trace::clean::is_harmful(char);
+    text.chars().map(|char| if ends(char) { ' ' } else { char }).collect()
 }
 
 /// The interfaces, and the toolbar that they share.

@@ -209,7 +209,11 @@ pub fn exchange(
     take(&mut stream, records, &mut flows, &mut moved);
     let after = device.counters();
     for flow in &mut flows {
-        let lost = |counters: &cantap::device::Counters| counters.channels[flow.to.index()].lost();
+        // Nothing is proved for the time in which the device was off the bus.
+        let lost = |counters: &cantap::device::Counters| {
+            let of = &counters.channels[flow.to.index()];
+            of.lost() + of.off_bus
+        };
         flow.lost = lost(&after) - lost(&before);
         flow.failed += number.saturating_sub(flow.sent + flow.failed);
     }

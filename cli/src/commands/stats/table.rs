@@ -6,6 +6,7 @@ use std::fmt::Write as _;
 use cantap_analysis::stats::{ChannelSummary, IdSummary, PeakSummary, Summary};
 
 use crate::missing::Missing;
+use cantap_work::lost_frames;
 
 /// The whole text, for a terminal of at least eighty columns.
 pub(super) fn text(summary: &Summary, missing: &Missing, per_id: bool) -> String {
@@ -18,7 +19,7 @@ pub(super) fn text(summary: &Summary, missing: &Missing, per_id: bool) -> String
         summary.duration_s,
         summary.channels.len(),
         if summary.channels.len() == 1 { "channel" } else { "channels" },
-        summary.lost,
+        lost_frames(summary.lost, summary.lost_at_least),
         summary.errors,
     );
     if let Some(words) = missing.in_words() {
@@ -76,6 +77,10 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
             out,
             "  load      unknown: frames switch to a data bit rate, which --data-bitrate gives (such as 2M)",
         );
+    } else if let (Some(_), None, Some(reason)) =
+        (channel.bitrate, &channel.load, channel.no_bus_load_because)
+    {
+        let _ = writeln!(out, "  load      –: {reason}");
     }
     if let Some(load) = &channel.load {
         let percent = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.3} %"));
@@ -132,7 +137,14 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
         let _ = match (lost.total, lost.at_least) {
             // For example while a device was gone.
             (0, _) => writeln!(out, "  lost      an unknown number at {places}"),
-            (total, true) => writeln!(out, "  lost      at least {total} at {places}: {}", listed(&stages)),
+            (total, true) => {
+                let _ = write!(out, "  lost      at least {total} at {places}: {}", listed(&stages));
+                match lost.uncounted {
+                    0 => writeln!(out),
+                    1 => writeln!(out, ", and an unknown number at one of them"),
+                    uncounted => writeln!(out, ", and an unknown number at {uncounted} of them"),
+                }
+            }
             (total, false) => writeln!(out, "  lost      {total} at {places}: {}", listed(&stages)),
         };
     }

@@ -7,9 +7,9 @@ use cantap_analysis::stats::ChannelStatistics;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::text::{Line, Span};
-use ratatui::widgets::Paragraph;
 
 use super::super::app::App;
+use super::super::cut::draw_lines;
 use super::super::model::{DeviceFigures, Model, Seen};
 use super::super::theme::Theme;
 use super::list::bytes;
@@ -53,7 +53,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
     let most = lines.len().saturating_sub(app.page_rows);
     app.selected = app.selected.min(most);
     let first = app.selected;
-    frame.render_widget(Paragraph::new(lines.split_off(first)), area);
+    draw_lines(frame, area, lines.split_off(first));
 }
 
 fn channel_lines(
@@ -92,10 +92,14 @@ fn channel_lines(
     lines.push(Line::styled(format!("Errors    {errors:>10}   {}", kinds.join(", ")), style));
     let losses = &channel.losses;
     let stages = LossStage::ALL.map(|stage| format!("{} {}", stage.name(), losses.of(stage)));
-    let style = if losses.total() > 0 { theme.loss() } else { theme.label() };
+    let style = if losses.gaps > 0 { theme.loss() } else { theme.label() };
     let least = if losses.at_least { " at least" } else { "" };
+    let uncounted = match losses.uncounted {
+        0 => String::new(),
+        uncounted => format!("; an unknown number at {uncounted} places"),
+    };
     lines.push(Line::styled(
-        format!("Lost      {:>10}{least}   {}", losses.total(), stages.join(", ")),
+        format!("Lost      {:>10}{least}   {}{uncounted}", losses.total(), stages.join(", ")),
         style,
     ));
     if let Some(windows) = windows.filter(|windows| windows.iter().any(|window| window.load_pct.is_some())) {

@@ -49,15 +49,18 @@ fn shape_to(shape: &Shape, out: &mut String) {
             belongs(*curve),
             paint("fill", *colour)
         ),
-        Shape::Text { x, y, size, anchor, colour, text, curve } => {
+        Shape::Text { x, y, size, anchor, colour, text, full, curve } => {
             let anchor = match anchor {
                 Anchor::Start => "start",
                 Anchor::Middle => "middle",
                 Anchor::End => "end",
             };
+            // Shown where the pointer is.
+            let full = full.as_ref().filter(|full| *full != text);
+            let full = full.map_or(String::new(), |full| format!("<title>{}</title>", escaped(full)));
             writeln!(
                 out,
-                r#"<text{} x="{x:.1}" y="{y:.1}" font-size="{size}" text-anchor="{anchor}" {}>{}</text>"#,
+                r#"<text{} x="{x:.1}" y="{y:.1}" font-size="{size}" text-anchor="{anchor}" {}>{full}{}</text>"#,
                 belongs(*curve),
                 paint("fill", *colour),
                 escaped(text)
@@ -88,7 +91,7 @@ pub(super) fn escaped(text: &str) -> String {
             '>' => out.push_str("&gt;"),
             '"' => out.push_str("&quot;"),
             '\'' => out.push_str("&#39;"),
-            character if character.is_control() => {}
+            character if cantap_trace::clean::is_harmful(character) => {}
             character => out.push(character),
         }
     }

@@ -11,6 +11,7 @@ const MAX_BLOCK_BYTES: u64 = 1 << 20;
 pub(super) const BLOCK_HEAD_BYTES: u64 = 24;
 
 /// A block: links to others, and its own fields.
+#[derive(Clone, Debug)]
 pub(super) struct Block {
     pub name: [u8; 4],
     pub links: Vec<u64>,

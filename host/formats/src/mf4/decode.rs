@@ -11,8 +11,9 @@ use super::super::issue::{Fault, Place};
 use super::super::whole::Whole;
 use super::super::zone::Zone;
 use super::blocks::{BLOCK_HEAD_BYTES, u16_at, u64_at};
+use super::joined::{after_blocks, joined};
 use super::layout::Alone;
-use super::part::{Item, Part, own};
+use super::part::{Item, OPEN_LENGTH, Part, own};
 use super::{FILE_MAGIC, HEADER_AT, UNFINISHED_MAGIC};
 use cantap_trace::PlainFrame;
 
@@ -173,13 +174,19 @@ fn collect(
             return Err(Fault::malformed("a list of groups that ends", b"a circle of links"));
         }
         match Part::open(file, &group, open, start_ns, &alone) {
-            Ok((part, signals)) => {
+            Ok((part, signals, faults)) => {
+                first.extend(faults.into_iter().map(|fault| Found::Issue(Place::Offset(next), fault)));
                 first.extend((0..signals).map(|_| Found::LeftOut(MEASURED)));
                 parts.extend(part);
             }
             Err(Fault::Io(error)) => return Err(error.into()),
             Err(fault) => first.push_back(Found::Issue(Place::Offset(next), fault)),
         }
+    }
+    if open & OPEN_LENGTH == 0
+        && let Some(at) = after_blocks(file)?
+    {
+        first.push_back(Found::Issue(Place::Offset(at), joined(at)));
     }
     Ok(())
 }

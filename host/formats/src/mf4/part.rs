@@ -9,7 +9,9 @@ use super::super::codec::PLAIN_BATCH;
 use super::super::issue::Fault;
 use super::super::whole::Whole;
 use super::blocks::{BLOCK_HEAD_BYTES, Block, u32_at};
-use super::layout::{Alone, Bytes, Content, Events, Group, RecordBytes, Times};
+use super::channel::Row;
+use super::joined::joined;
+use super::layout::{Alone, Apart, Content, Elsewhere, Group, RecordBytes, Times};
 use super::plain::Plain;
 use super::stream::Stream;
 
@@ -63,11 +65,27 @@ pub(super) struct Part {
     records: u64,
     /// Whether the file contains the number of records in each group.
     is_counted: bool,
-    waiting: VecDeque<(usize, u64, Vec<u8>, u64)>,
+    waiting: VecDeque<Waiting>,
+    /// How many records were dropped because their values never came, and where the first was.
+    without_values: u64,
+    first_without: u64,
+    /// Whether the file ends inside a record, which has been said.
+    is_cut: bool,
+    is_end_checked: bool,
     /// That of the last record that has one.
     pub time_ns: i64,
     pub next: Option<Item>,
     ended: bool,
+}
+
+/// A record whose values may be elsewhere.
+struct Waiting {
+    group: usize,
+    /// Its number in its group.
+    number: u64,
+    record: Vec<u8>,
+    /// Where it is in the stream.
+    at: u64,
 }
 
 /// Values by their position in the stream of all values of their group.
@@ -90,28 +108,30 @@ pub(super) fn own(fault: Fault) -> io::Result<Fault> {
 }
 
 impl Part {
-    /// The content of a data group, if it has bus events; and how many of its groups are signals.
+    /// The content of a data group, if it has bus events; how many of its groups are signals; and what is wrong with groups that cannot be
+    /// read.
     pub fn open(
         file: &mut Whole,
         block: &Block,
         open: u16,
         start_ns: i64,
         alone: &Alone,
-    ) -> Result<(Option<Self>, u32), Fault> {
+    ) -> Result<(Option<Self>, u32, Vec<Fault>), Fault> {
         let id_bytes = usize::from(block.data.first().copied().unwrap_or(0));
         let open_end = open & OPEN_LENGTH != 0;
-        let (mut groups, mut next) = (Vec::new(), block.link(1));
+        let (mut groups, mut faults, mut next) = (Vec::new(), Vec::new(), block.link(1));
         while next != 0 {
-            let (group, behind) = Group::open(file, next, open_end, alone)?;
+            let (group, behind, fault) = Group::open(file, next, open_end, alone)?;
             groups.push(group);
+            faults.extend(fault);
             next = behind;
             if groups.len() as u64 * BLOCK_HEAD_BYTES > file.len() {
                 return Err(Fault::malformed("a list of groups that ends", b"a circle of links"));
             }
         }
         let signals = groups.iter().filter(|group| matches!(group.content, Content::Signals)).count() as u32;
-        if !groups.iter().any(|group| matches!(group.content, Content::Bus(_))) {
-            return Ok((None, signals));
+        if !groups.iter().any(|group| matches!(group.content, Content::Bus(_) | Content::Other(_))) {
+            return Ok((None, signals, faults));
         }
         if groups.len() > 1 && ![1, 2, 4, 8].contains(&id_bytes) {
             let found = format!("{id_bytes} bytes");
@@ -127,7 +147,7 @@ impl Part {
         let record_bytes = if stream.invalid().is_some() { vec![row.values] } else { record_bytes };
         let plain = groups.iter().zip(&record_bytes).map(|(group, len)| match &group.content {
             Content::Bus(bus) => Plain::of(bus, *len, start_ns),
-            Content::Values | Content::Signals | Content::Times => None,
+            Content::Other(_) | Content::Values | Content::Signals | Content::Times => None,
         });
         let plain = plain.collect();
         let is_counted = open & OPEN_COUNTERS == 0;
@@ -147,11 +167,15 @@ impl Part {
             records,
             is_counted,
             waiting: VecDeque::new(),
+            without_values: 0,
+            first_without: 0,
+            is_cut: false,
+            is_end_checked: false,
             time_ns: start_ns,
             next: None,
             ended: false,
         };
-        Ok((Some(part), signals))
+        Ok((Some(part), signals, faults))
     }
 
     pub fn advance(&mut self, file: &mut Whole) -> io::Result<Option<Item>> {
@@ -173,18 +197,13 @@ impl Part {
                 return Ok(Some(item));
             }
             if self.ended {
-                return Ok(None);
+                return Ok(self.fault_of_end().map(|fault| Item::Fault(self.at, fault)));
             }
             let place = self.at;
             let Some(group) = self.group(file)? else {
                 self.ended = true;
-                if let Some((_, _, _, place)) = self.waiting.pop_front() {
-                    let rest = std::mem::take(&mut self.waiting).len() + 1;
-                    let found = format!("{rest} frames without theirs");
-                    let fault = Fault::malformed("the bytes of each frame", found.as_bytes());
-                    return Ok(Some(Item::Fault(place, fault)));
-                }
-                return Ok(self.fault_of_end().map(|fault| Item::Fault(self.at, fault)));
+                // What waits and has its values comes first.
+                continue;
             };
             match &self.groups[group].content {
                 Content::Values => {
@@ -203,33 +222,37 @@ impl Part {
                     }
                 }
                 // Nothing is waiting, and the record is complete: by far the most frequent case.
-                Content::Bus(bus) if self.waiting.is_empty() && bus.is_complete() => {
+                Content::Bus(bus) if self.waiting.is_empty() && bus.is_complete => {
                     let (len, number) = (self.record_bytes[group], self.counts[group]);
                     let Some(record) = self.stream.at(file, self.at, len)? else {
                         return Ok(Some(self.cut()));
                     };
                     self.at += len as u64;
                     self.counts[group] += 1;
-                    return Ok(Some(Item::of(
-                        bus.record(record, record, number, None, self.start_ns),
-                        place,
-                    )));
+                    let row = Row { record, number, apart: &[], invalid: &[] };
+                    return Ok(Some(Item::of(bus.record(&row, record, self.start_ns), place)));
                 }
-                Content::Signals | Content::Times | Content::Bus(_) => {
+                Content::Signals | Content::Times | Content::Other(_) | Content::Bus(_) => {
                     let len = self.record_bytes[group];
                     let Some(record) = self.stream.at(file, self.at, len)? else {
                         return Ok(Some(self.cut()));
                     };
-                    let record = record.to_vec();
-                    self.at += len as u64;
                     let number = self.counts[group];
-                    self.counts[group] += 1;
-                    if matches!(self.groups[group].content, Content::Bus(_)) {
-                        if self.waiting.len() >= MAX_APART {
-                            return Err(Fault::malformed("the bytes of a frame near it", b"none"));
+                    match &self.groups[group].content {
+                        Content::Bus(_) => {
+                            let record = record.to_vec();
+                            self.waiting.push_back(Waiting { group, number, record, at: place });
                         }
-                        self.waiting.push_back((group, number, record, place));
+                        Content::Other(what) => {
+                            let what = *what;
+                            self.at += len as u64;
+                            self.counts[group] += 1;
+                            return Ok(Some(Item::LeftOut(what)));
+                        }
+                        Content::Signals | Content::Times | Content::Values => {}
                     }
+                    self.at += len as u64;
+                    self.counts[group] += 1;
                 }
             }
         }
@@ -279,8 +302,24 @@ impl Part {
         }
     }
 
-    /// What is wrong where no record follows.
-    fn fault_of_end(&self) -> Option<Fault> {
+    /// What is wrong where no record follows; one thing after the other.
+    fn fault_of_end(&mut self) -> Option<Fault> {
+        if self.is_end_checked {
+            return None;
+        }
+        let without = std::mem::take(&mut self.without_values);
+        // Where the file is cut, one may lack its values, which is said.
+        if without > u64::from(self.is_cut) {
+            let found = format!("{without} frames without theirs, the first at {:#x}", self.first_without);
+            return Some(Fault::malformed("the bytes of each frame", found.as_bytes()));
+        }
+        self.is_end_checked = true;
+        if let Some(at) = self.stream.next_file() {
+            return Some(joined(at));
+        }
+        if self.is_cut {
+            return None;
+        }
         let rest = self.stream.len().saturating_sub(self.at);
         let is_sorted = self.records != u64::MAX;
         let is_short = is_sorted && self.counts[0] < self.records;
@@ -307,6 +346,7 @@ impl Part {
 
     fn cut(&mut self) -> Item {
         self.ended = true;
+        self.is_cut = true;
         Item::Fault(self.at, Fault::Truncated("a record"))
     }
 
@@ -330,38 +370,37 @@ impl Part {
         Ok(Some(group))
     }
 
-    /// The record that has waited longest, if its bytes have arrived.
+    /// The record that has waited longest, if its values have arrived. Those whose values will not come are dropped and counted.
     fn of_waiting(&mut self, file: &mut Whole) -> Result<Option<Item>, Fault> {
-        let Some((group, number, record, place)) = self.waiting.front() else { return Ok(None) };
-        let place = *place;
-        if let Content::Bus(bus) = &self.groups[*group].content
-            && let Events::Other(what) = bus.events
-        {
-            self.waiting.pop_front();
-            return Ok(Some(Item::LeftOut(what)));
-        }
-        let Content::Bus(bus) = &mut self.groups[*group].content else { return Ok(None) };
-        let apart = match &mut bus.bytes {
-            None | Some(Bytes::Here(_)) => None,
-            Some(Bytes::Stream { place, stream }) => {
-                let at = place.unsigned(record).unwrap_or(u64::MAX);
-                let len = stream.at(file, at, 4)?.map_or(0, |head| u32_at(head, 0));
-                Some(stream.at(file, at.saturating_add(4), len as usize)?.unwrap_or_default().to_vec())
-            }
-            Some(Bytes::Group { place, address }) => {
-                let Some(values) = self.values.get_mut(address) else {
-                    return Err(Fault::malformed("the group that has the bytes of frames", b"none"));
-                };
-                let at = place.unsigned(record).unwrap_or(u64::MAX);
-                match values.take(at, self.by_order) {
-                    Some(value) => Some(value),
-                    None => return Ok(None),
+        loop {
+            let Some(waiting) = self.waiting.front() else { return Ok(None) };
+            let group = waiting.group;
+            let Content::Bus(bus) = &mut self.groups[group].content else { return Ok(None) };
+            if !has_arrived(&bus.apart, &self.values, &waiting.record, self.by_order)? {
+                if !self.ended && self.waiting.len() < MAX_APART {
+                    return Ok(None);
                 }
+                if self.without_values == 0 {
+                    self.first_without = waiting.at;
+                }
+                self.without_values += 1;
+                self.waiting.pop_front();
+                continue;
             }
-        };
+            let Some(waiting) = self.waiting.pop_front() else { return Ok(None) };
+            let mut apart = Vec::with_capacity(bus.apart.len());
+            for values in &mut bus.apart {
+                apart.push(values.take(file, &mut self.values, &waiting.record, self.by_order)?);
+            }
+            return self.item(file, &waiting, &apart).map(Some);
+        }
+    }
+
+    /// What a record is whose values are all there.
+    fn item(&mut self, file: &mut Whole, waiting: &Waiting, apart: &[Vec<u8>]) -> Result<Item, Fault> {
+        let Waiting { group, number, record, at } = waiting;
         let invalid_bytes = self.groups[*group].record_bytes.invalid;
-        let Content::Bus(bus) = &mut self.groups[*group].content else { return Ok(None) };
-        let bits = match self.stream.invalid() {
+        let invalid = match self.stream.invalid() {
             Some(stream) => {
                 let at = number.saturating_mul(invalid_bytes as u64);
                 stream
@@ -370,22 +409,61 @@ impl Part {
             }
             None => record.get(record.len().saturating_sub(invalid_bytes)..).unwrap_or_default(),
         };
-        let item = if bus.is_invalid(bits) {
-            Item::LeftOut(INVALID)
-        } else {
-            let time = match &mut bus.times {
-                None => None,
-                Some(Times { stream, record_bytes }) => {
-                    let at = number.saturating_mul(*record_bytes as u64);
-                    let time = stream.at(file, at, *record_bytes)?;
-                    Some(time.ok_or(Fault::Truncated("the times of a group of frames"))?.to_vec())
-                }
-            };
-            let time = time.as_deref().unwrap_or(record);
-            Item::of(bus.record(record, time, *number, apart.as_deref(), self.start_ns), place)
+        let Content::Bus(bus) = &mut self.groups[*group].content else { return Ok(Item::LeftOut(INVALID)) };
+        if bus.is_invalid(invalid) {
+            return Ok(Item::LeftOut(INVALID));
+        }
+        let time = match &mut bus.times {
+            None => None,
+            Some(Times { stream, record_bytes }) => {
+                let at = number.saturating_mul(*record_bytes as u64);
+                let time = stream.at(file, at, *record_bytes)?;
+                Some(time.ok_or(Fault::Truncated("the times of a group of frames"))?.to_vec())
+            }
         };
-        self.waiting.pop_front();
-        Ok(Some(item))
+        let time = time.as_deref().unwrap_or(record);
+        let row = Row { record, number: *number, apart, invalid };
+        Ok(Item::of(bus.record(&row, time, self.start_ns), *at))
+    }
+}
+
+/// Whether all values of a record that are in other groups have been read.
+fn has_arrived(
+    apart: &[Apart],
+    values: &HashMap<u64, Values>,
+    record: &[u8],
+    by_order: bool,
+) -> Result<bool, Fault> {
+    for Apart { place, values: at } in apart {
+        let Elsewhere::Group(address) = at else { continue };
+        let Some(values) = values.get(address) else {
+            return Err(Fault::malformed("the group that has the bytes of frames", b"none"));
+        };
+        if !values.has(place.unsigned(record).unwrap_or(u64::MAX), by_order) {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
+impl Apart {
+    /// The value of a record, which has arrived.
+    fn take(
+        &mut self,
+        file: &mut Whole,
+        values: &mut HashMap<u64, Values>,
+        record: &[u8],
+        by_order: bool,
+    ) -> Result<Vec<u8>, Fault> {
+        let at = self.place.unsigned(record).unwrap_or(u64::MAX);
+        let value = match &mut self.values {
+            Elsewhere::Stream(stream) => {
+                let len = stream.at(file, at, 4)?.map_or(0, |head| u32_at(head, 0));
+                stream.at(file, at.saturating_add(4), len as usize)?.map(<[u8]>::to_vec)
+            }
+            Elsewhere::Group(address) => values.get_mut(address).and_then(|values| values.take(at, by_order)),
+        };
+        Ok(value.unwrap_or_default())
     }
 }
 
@@ -398,6 +476,10 @@ impl Values {
         if self.kept.len() > MAX_APART {
             self.kept.pop_first();
         }
+    }
+
+    fn has(&self, place: u64, by_order: bool) -> bool {
+        self.kept.contains_key(&if by_order { self.asked } else { place })
     }
 
     fn take(&mut self, place: u64, by_order: bool) -> Option<Vec<u8>> {

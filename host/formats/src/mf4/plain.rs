@@ -1,6 +1,9 @@
 //! Data frames out of records whose fields stand at fixed places: most records of most files are such.
 
-use super::layout::{BusGroup, Bytes, Clock, Events, Place};
+use super::channel::{Number, PlainNumber};
+use super::clock::Clock;
+use super::field::Place;
+use super::layout::{BusGroup, Bytes, Events};
 use cantap_can::Id;
 use cantap_trace::PlainFrame;
 
@@ -20,12 +23,12 @@ pub(super) struct Plain {
     time: Time,
     start_ns: i64,
     bus: u8,
-    bus_channel: Option<Place>,
-    id: Place,
-    ide: Option<Place>,
-    edl: Option<Place>,
-    dlc: Option<Place>,
-    data_length: Option<Place>,
+    bus_channel: Option<PlainNumber>,
+    id: PlainNumber,
+    ide: Option<PlainNumber>,
+    edl: Option<PlainNumber>,
+    dlc: Option<PlainNumber>,
+    data_length: Option<PlainNumber>,
     bytes_at: usize,
     most_bytes: u64,
     record_bytes: usize,
@@ -36,14 +39,14 @@ pub(super) struct Plain {
 impl Plain {
     /// `None` for groups of other events, and of fields of which there is more to say.
     pub(super) fn of(bus: &BusGroup, record_bytes: usize, start_ns: i64) -> Option<Self> {
-        let place = |field: &Option<super::layout::Field>| match field {
+        let place = |number: &Option<Number>| match number {
             None => Some(None),
-            Some(field) => field.place(record_bytes).map(Some),
+            Some(number) => number.plain(record_bytes).map(Some),
         };
-        let Some(Bytes::Here(bytes)) = &bus.bytes else { return None };
+        let Some(Bytes::Here(bytes, None)) = &bus.bytes else { return None };
         let (bytes_at, most_bytes) = bytes.span(record_bytes)?;
         let plain = Self {
-            clock: bus.clock,
+            clock: bus.clock.clone(),
             time: match (bus.clock.counter(record_bytes), bus.clock.float(record_bytes)) {
                 (Some((place, step_ns)), _) => Time::Counter(place, step_ns),
                 (None, Some(at)) => Time::Float(at),
@@ -62,7 +65,7 @@ impl Plain {
             record_bytes,
             reach: record_bytes + Place::BYTES,
         };
-        (bus.events == Events::Frames && bus.is_complete()).then_some(plain)
+        (bus.events == Events::Frames && bus.is_complete).then_some(plain)
     }
 
     /// Appends the frames of the records that `bytes` begin with, which follow each other, at most `most`: as long as there is no more to say
@@ -91,18 +94,24 @@ impl Plain {
         const EXTENDED: u64 = 1 << 31;
         const IDENTIFIER: u64 = (1 << 29) - 1;
         let bytes = bytes.get(..self.reach)?;
-        let get = |place: &Option<Place>| place.as_ref().map(|place| place.get(bytes));
-        if get(&self.edl).is_some_and(|is_fd| is_fd != 0) {
+        // What is there but no number, there is more to say about.
+        let get = |number: &Option<PlainNumber>| match number {
+            None => Some(None),
+            Some(number) => number.get(bytes).map(Some),
+        };
+        if get(&self.edl)?.is_some_and(|is_fd| is_fd != 0) {
             return None;
         }
-        let channel = get(&self.bus_channel).map_or(Some(self.bus), |channel| u8::try_from(channel).ok())?;
-        let raw = self.id.get(bytes);
+        let channel = get(&self.bus_channel)?.map_or(Some(self.bus), |channel| u8::try_from(channel).ok())?;
+        let raw = self.id.get(bytes)?;
         let extended =
-            get(&self.ide).map_or(raw & EXTENDED != 0 || raw & IDENTIFIER > 0x7FF, |flag| flag != 0);
+            get(&self.ide)?.map_or(raw & EXTENDED != 0 || raw & IDENTIFIER > 0x7FF, |flag| flag != 0);
         let id = (raw & IDENTIFIER) as u32;
         let id = if extended { Id::extended(id) } else { Id::standard(id) }?;
-        let len = get(&self.data_length).or_else(|| get(&self.dlc).map(|code| code.min(8)));
-        let len = len.unwrap_or(self.most_bytes);
+        let len = match get(&self.data_length)? {
+            Some(len) => len,
+            None => get(&self.dlc)?.map_or(self.most_bytes, |code| code.min(8)),
+        };
         if len > self.most_bytes.min(8) {
             return None;
         }

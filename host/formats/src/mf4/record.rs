@@ -4,58 +4,53 @@ use super::super::event_text::EventText;
 use super::super::frame_fields::{FdFields, FrameFields, Payload, fd_len, identifier};
 use super::super::issue::Fault;
 use super::ERROR_TYPES;
-use super::layout::{BusGroup, Bytes, Events, Field};
+use super::channel::{Number, Row, Validity};
+use super::layout::{BusGroup, Bytes, Events};
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
 impl BusGroup {
-    /// Whether its records alone say everything about their frames.
-    pub(super) fn is_complete(&self) -> bool {
-        matches!(self.bytes, None | Some(Bytes::Here(_)))
-            && !matches!(self.events, Events::Other(_))
+    /// Whether its records alone say everything about their events.
+    pub(super) fn says_everything(&self) -> bool {
+        let parts =
+            [&self.bus_channel, &self.ide, &self.dir, &self.edl, &self.brs, &self.esi, &self.error_type];
+        let parts = parts.into_iter().flatten().map(Number::validity);
+        let mut validities = parts.chain(self.needed.iter().chain(&self.lengths).copied());
+        self.apart.is_empty()
             && self.times.is_none()
-            && self.invalid_bits.is_empty()
-            && !self.all_invalid
+            && validities.all(|validity| validity == Validity::Always)
     }
 
-    /// Whether one of the bits after a record's values marks it as invalid.
-    pub(super) fn is_invalid(&self, bits: &[u8]) -> bool {
-        let is_set = |bit: &u32| bits.get(*bit as usize / 8).is_some_and(|byte| byte >> (bit % 8) & 1 == 1);
-        self.all_invalid || self.invalid_bits.iter().any(is_set)
+    /// Whether the bits behind a record's values say that there is no event in it.
+    pub(super) fn is_invalid(&self, invalid: &[u8]) -> bool {
+        let holds = |validity: &Validity| validity.holds(invalid);
+        !self.needed.iter().all(holds) || !self.lengths.is_empty() && !self.lengths.iter().any(holds)
     }
 
-    /// The content of a record. `time`: the record with its time, which may be itself. `apart`: its frame's bytes, if they are stored elsewhere.
-    pub(super) fn record(
-        &self,
-        record: &[u8],
-        time: &[u8],
-        number: u64,
-        apart: Option<&[u8]>,
-        start_ns: i64,
-    ) -> Result<TraceRecord, Fault> {
-        let offset_ns = self.clock.ns(time, number);
+    /// The content of a record. `time`: the record with its time, which may be itself.
+    pub(super) fn record(&self, row: &Row<'_>, time: &[u8], start_ns: i64) -> Result<TraceRecord, Fault> {
+        let offset_ns = self.clock.ns(time, row.number);
         let offset_ns = offset_ns.ok_or_else(|| Fault::malformed("a time within 292 years", b"another"))?;
         let time_ns = start_ns.saturating_add(offset_ns);
         let channel = match &self.bus_channel {
-            None => self.bus,
-            Some(field) => {
-                let channel = field.unsigned(record);
+            Some(number) if number.is_valid(row) => {
+                let channel = number.get(row);
                 let fault = || Fault::malformed("a channel of 0 to 255", format!("{channel:?}").as_bytes());
                 channel.and_then(|channel| u8::try_from(channel).ok()).ok_or_else(fault)?
             }
+            _ => self.bus,
         };
         let event = match self.events {
-            Events::Frames => self.frame(record, apart, false)?,
-            Events::RemoteFrames => self.frame(record, None, true)?,
-            Events::ErrorFrames => self.words(record).unwrap_or_else(|| {
-                let number = self.error_type.and_then(|field| field.unsigned(record));
+            Events::Frames => self.frame(row, false)?,
+            Events::RemoteFrames => self.frame(row, true)?,
+            Events::ErrorFrames => self.words(row.record).unwrap_or_else(|| {
+                let number = self.error_type.as_ref().and_then(|number| number.get(row));
                 let known = ERROR_TYPES.iter().find(|(known, _)| Some(*known) == number);
                 TraceEvent::BusError { kind: known.map(|(_, kind)| *kind), counters: None }
             }),
             Events::Words => {
                 let fault = || Fault::malformed("an event such as 'lost 5 queue'", b"other words");
-                self.words(record).ok_or_else(fault)?
+                self.words(row.record).ok_or_else(fault)?
             }
-            Events::Other(_) => return Err(Fault::malformed("an event of CAN", b"another")),
         };
         Ok(TraceRecord { time_ns, channel, event })
     }
@@ -67,23 +62,39 @@ impl BusGroup {
         Some(event)
     }
 
-    fn frame(&self, record: &[u8], apart: Option<&[u8]>, remote: bool) -> Result<TraceEvent, Fault> {
+    /// The bytes of a frame, as many as are stored for it.
+    fn bytes<'a>(&self, row: &Row<'a>) -> &'a [u8] {
+        let bytes = match &self.bytes {
+            Some(Bytes::Here(field, size)) => {
+                let size = size.as_ref().and_then(|size| size.get(row));
+                let size = size.map_or(usize::MAX, |size| usize::try_from(size).unwrap_or(usize::MAX));
+                field.bytes(row.record).map(|bytes| &bytes[..bytes.len().min(size)])
+            }
+            Some(Bytes::Apart(at)) => row.apart.get(*at).map(Vec::as_slice),
+            None => None,
+        };
+        bytes.unwrap_or_default()
+    }
+
+    fn frame(&self, row: &Row<'_>, remote: bool) -> Result<TraceEvent, Fault> {
         const EXTENDED: u64 = 1 << 31;
         const IDENTIFIER: u64 = (1 << 29) - 1;
-        let number = |field: &Option<Field>| field.and_then(|field| field.unsigned(record));
-        let flag = |field: &Option<Field>, text: &[u8]| field.is_some_and(|field| field.flag(record, text));
+        let number = |number: &Option<Number>| number.as_ref().and_then(|number| number.get(row));
+        let flag = |flag: &Option<Number>| number(flag).is_some_and(|flag| flag != 0);
         let raw = number(&self.id).ok_or_else(|| Fault::malformed("a frame's identifier", b"none"))?;
-        let extended = match &self.ide {
-            Some(_) => flag(&self.ide, b"E"),
-            None => raw & EXTENDED != 0 || raw & IDENTIFIER > 0x7FF,
-        };
+        let extended =
+            number(&self.ide).map_or(raw & EXTENDED != 0 || raw & IDENTIFIER > 0x7FF, |flag| flag != 0);
         let id = (raw & IDENTIFIER) as u32;
         let id = identifier(id, extended, b"")
             .or_else(|_| identifier(id, extended, format!("{id:X}").as_bytes()))?;
-        let is_fd = flag(&self.edl, b"1");
         let code = number(&self.dlc);
-        let fd = is_fd.then(|| FdFields { brs: flag(&self.brs, b"1"), esi: flag(&self.esi, b"1") });
-        let direction = if flag(&self.dir, b"T") { Direction::Tx } else { Direction::Rx };
+        let data_length = number(&self.data_length);
+        let here = self.bytes(row);
+        // No classical frame has more, and there is nothing else that says which it is.
+        let is_longer = |len: u64| len > 8 && len <= here.len() as u64;
+        let is_fd = number(&self.edl).map_or(data_length.is_some_and(is_longer), |flag| flag != 0);
+        let fd = is_fd.then(|| FdFields { brs: flag(&self.brs), esi: flag(&self.esi) });
+        let direction = if flag(&self.dir) { Direction::Tx } else { Direction::Rx };
         let longest = if is_fd { 64 } else { 8 };
         let of_code = |code: u64| if is_fd { u64::from(fd_len(code as u8)) } else { code.min(8) };
         let fields = |len| FrameFields { id, remote, direction, len, fd };
@@ -92,20 +103,19 @@ impl BusGroup {
             let code = code.ok_or_else(|| Fault::malformed("a data length code of 0 to 15", b"another"))?;
             return fields(code as u8).event(&Payload::EMPTY);
         }
-        let here = match &self.bytes {
-            Some(Bytes::Here(field)) => field.bytes(record),
-            _ => apart,
+        // A classical frame's length code can be above 8: its length is 8, which some tables of lengths do not say.
+        let code_above_8 = code.filter(|code| !is_fd && (9..=15).contains(code));
+        let len = match (code_above_8, data_length) {
+            (Some(_), Some(len)) => len.min(8),
+            (_, len) => len.or(code.map(of_code)).unwrap_or(here.len() as u64),
         };
-        let here = here.unwrap_or_default();
-        let len = number(&self.data_length).or(code.map(of_code)).unwrap_or(here.len() as u64);
         let data = here.get(..len as usize).filter(|_| len <= longest).and_then(Payload::of);
         let fault = || {
             let found = format!("{len} of {}", here.len());
             Fault::malformed(format!("up to {longest} data bytes"), found.as_bytes())
         };
         let data = data.ok_or_else(fault)?;
-        // A classical frame's length code can be above 8.
-        let code = code.filter(|code| !is_fd && len == 8 && (9..=15).contains(code));
+        let code = code_above_8.filter(|_| len == 8);
         fields(code.unwrap_or(len) as u8).event(&data)
     }
 }

@@ -1,10 +1,10 @@
 //! The data of a group or channel: bytes in one block or many, plain or compressed.
 
-use std::io::Read;
-
 use super::super::issue::Fault;
 use super::super::whole::Whole;
 use super::blocks::{BLOCK_HEAD_BYTES, Block, u32_at, u64_at};
+use super::joined::{BEGIN_BYTES, begin};
+use super::unpack::{Packed, Unpacker};
 
 /// Plain data is read in pieces of this many bytes: they stay in the processor's cache until they have been gone through.
 const PIECE_BYTES: u64 = 1 << 18;
@@ -34,16 +34,8 @@ struct Piece {
     /// Its position in the file.
     at: u64,
     packed: Option<Packed>,
-}
-
-#[derive(Clone, Copy, Debug)]
-struct Packed {
-    /// Bytes in the file.
-    stored: u64,
-    /// 0 deflate, 2 zstd, 4 LZ4; the odd numbers are the same, transposed.
-    kind: u8,
-    /// Number of columns if transposed.
-    columns: u32,
+    /// Whether it extends to the end of the file for want of a length.
+    is_open: bool,
 }
 
 /// A stream of bytes with random access, fast if the next position follows the last one.
@@ -54,6 +46,10 @@ pub(super) struct Stream {
     len: u64,
     /// Whether bytes are missing at the end of the file.
     cut: bool,
+    /// How many bytes behind those asked for must have been looked at, because another file may begin among them.
+    ahead: u64,
+    /// Where in the file another one begins.
+    next_file: Option<u64>,
     /// Bytes of a record's values, and of the bits that say which of them are none.
     row_bytes: (u64, u64),
     /// These bits, where they lie apart (4.2).
@@ -61,6 +57,7 @@ pub(super) struct Stream {
     /// What was read last, and its position in the stream.
     buffer: Vec<u8>,
     buffer_start: u64,
+    unpacker: Unpacker,
 }
 
 impl Stream {
@@ -103,9 +100,14 @@ impl Stream {
         self.cut
     }
 
+    /// Where in the file another one begins, as far as the stream was read.
+    pub(super) fn next_file(&self) -> Option<u64> {
+        self.next_file
+    }
+
     fn push(&mut self, len: u64, at: u64, packed: Option<Packed>) {
         if len > 0 {
-            self.pieces.push(Piece { start: self.len, len, at, packed });
+            self.pieces.push(Piece { start: self.len, len, at, packed, is_open: false });
             self.len += len;
         }
     }
@@ -120,6 +122,12 @@ impl Stream {
                 let len = if open_end && says == 0 { there } else { says };
                 self.cut |= len > there;
                 self.push(len.min(there), begin, None);
+                if open_end && says == 0 && len > 0 {
+                    self.ahead = BEGIN_BYTES as u64;
+                    if let Some(last) = self.pieces.last_mut() {
+                        last.is_open = true;
+                    }
+                }
             }
             b"##DZ" => {
                 let fields = file.read_at(link + BLOCK_HEAD_BYTES, DZ_FIELDS_BYTES as usize)?;
@@ -204,11 +212,12 @@ impl Stream {
     /// `len` bytes from a position on; `None` if the stream has fewer there.
     pub(super) fn at(&mut self, file: &mut Whole, at: u64, len: usize) -> Result<Option<&[u8]>, Fault> {
         let Some(end) = at.checked_add(len as u64).filter(|end| *end <= self.len) else { return Ok(None) };
-        let is_held = |stream: &Self| {
-            at >= stream.buffer_start && end <= stream.buffer_start + stream.buffer.len() as u64
-        };
-        if !is_held(self) {
-            self.load(file, at, end)?;
+        let looked_at = end.saturating_add(self.ahead).min(self.len);
+        if at < self.buffer_start || looked_at > self.buffer_start + self.buffer.len() as u64 {
+            self.load(file, at, looked_at)?;
+            if end > self.len {
+                return Ok(None);
+            }
         }
         let from = (at - self.buffer_start) as usize;
         Ok(self.buffer.get(from..from + len))
@@ -218,7 +227,10 @@ impl Stream {
     #[inline]
     pub(super) fn held(&self, at: u64) -> &[u8] {
         let from = at.checked_sub(self.buffer_start).and_then(|from| usize::try_from(from).ok());
-        from.and_then(|from| self.buffer.get(from..)).unwrap_or_default()
+        let is_last = self.buffer_start + self.buffer.len() as u64 >= self.len;
+        let ahead = if is_last { 0 } else { self.ahead as usize };
+        let to = self.buffer.len().saturating_sub(ahead);
+        from.and_then(|from| self.buffer.get(from..to)).unwrap_or_default()
     }
 
     /// Makes the buffer hold these bytes.
@@ -235,13 +247,22 @@ impl Stream {
         }
         loop {
             let loaded = self.buffer_start + self.buffer.len() as u64;
-            if loaded >= end {
+            if loaded >= end.min(self.len) {
                 return Ok(());
             }
             let holds = self.pieces.partition_point(|piece| piece.start + piece.len <= loaded);
             let Some(piece) = self.pieces.get(holds).copied() else { return Ok(()) };
-            if let Some(packed) = piece.packed {
-                self.buffer.extend_from_slice(&unpack(file, piece, packed)?);
+            if piece.packed.is_some() {
+                let pieces = &self.pieces;
+                let block = |index: usize| {
+                    pieces.get(index).and_then(|piece| Some((piece.at, piece.len, piece.packed?)))
+                };
+                let bytes = self.unpacker.take(file, holds, block)?;
+                if self.buffer.is_empty() {
+                    self.buffer = bytes;
+                } else {
+                    self.buffer.extend_from_slice(&bytes);
+                }
             } else {
                 let within = loaded - piece.start;
                 let len = (piece.len - within).min(PIECE_BYTES);
@@ -250,47 +271,20 @@ impl Stream {
                 } else {
                     file.append_at(piece.at + within, len as usize, &mut self.buffer)?;
                 }
+                if piece.is_open {
+                    self.look_for_file(piece, within);
+                }
             }
         }
     }
-}
 
-/// Decompresses a whole piece.
-fn unpack(file: &mut Whole, piece: Piece, packed: Packed) -> Result<Vec<u8>, Fault> {
-    let stored = file.read_at(piece.at, packed.stored as usize)?;
-    let len = piece.len as usize;
-    let mut bytes = Vec::with_capacity(len.min(stored.len().saturating_mul(64)));
-    let source: Box<dyn Read> = match packed.kind & !1 {
-        0 => Box::new(flate2::read::ZlibDecoder::new(&stored[..])),
-        #[cfg(feature = "zstd")]
-        2 => Box::new(zstd::stream::read::Decoder::new(&stored[..])?),
-        #[cfg(not(feature = "zstd"))]
-        2 => return Err(crate::compression::without_zstd().into()),
-        _ => Box::new(lz4_flex::frame::FrameDecoder::new(&stored[..])),
-    };
-    let result = source.take(piece.len + 1).read_to_end(&mut bytes);
-    if result.is_err() || bytes.len() != len {
-        let found = format!("{} of {len} bytes", bytes.len());
-        let expected = format!("compressed data at {:#x}", piece.at);
-        return Err(Fault::malformed(expected, found.as_bytes()));
+    /// Ends the stream where another file begins in what the buffer has had since this place of a piece.
+    fn look_for_file(&mut self, piece: Piece, within: u64) {
+        let held = (piece.start + within).saturating_sub(self.buffer_start) as usize;
+        let from = held.saturating_sub(BEGIN_BYTES);
+        let Some(begin) = self.buffer.get(from..).and_then(begin) else { return };
+        self.buffer.truncate(from + begin);
+        self.len = self.buffer_start + self.buffer.len() as u64;
+        self.next_file = Some(piece.at + (self.len - piece.start));
     }
-    let columns = packed.columns as usize;
-    if packed.kind & 1 == 1 && columns > 1 {
-        bytes = exchange(&bytes, columns);
-    }
-    Ok(bytes)
-}
-
-/// Turns columns one after another into rows. What is left of an incomplete row stays unchanged at the end.
-fn exchange(columns_first: &[u8], columns: usize) -> Vec<u8> {
-    let rows = columns_first.len() / columns;
-    let mut bytes = columns_first.to_vec();
-    if rows > 0 {
-        for (column, values) in columns_first[..rows * columns].chunks_exact(rows).enumerate() {
-            for (row, value) in values.iter().enumerate() {
-                bytes[row * columns + column] = *value;
-            }
-        }
-    }
-    bytes
 }

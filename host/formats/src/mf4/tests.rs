@@ -2,6 +2,7 @@
 //! lists, compressed.
 
 mod any_layout;
+mod canedge;
 
 use std::io::Write;
 

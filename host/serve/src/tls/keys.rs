@@ -105,6 +105,10 @@ impl Keys {
 
     fn write(&self, name: &str, certificate: &str, key: &KeyPair) -> Result<(), KeysError> {
         let files = Self::files(&self.folder, name);
+        // Neither of the two is left alone.
+        if let Some(there) = [&files.key, &files.certificate].into_iter().find(|path| path.exists()) {
+            return Err(KeysError::There(there.clone()));
+        }
         for (path, text, is_secret) in
             [(files.key, key.serialize_pem(), true), (files.certificate, certificate.to_owned(), false)]
         {

@@ -17,7 +17,7 @@ pub fn decode(bytes: &[u8]) -> Cow<'_, str> {
     match bytes {
         [0xFF, 0xFE, ..] => String::from_utf16_lossy(&units(u16::from_le_bytes)).into(),
         [0xFE, 0xFF, ..] => String::from_utf16_lossy(&units(u16::from_be_bytes)).into(),
-        _ => super::dbc_text::decode(bytes),
+        _ => super::dbc_text::decode(bytes).0,
     }
 }
 

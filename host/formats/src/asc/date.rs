@@ -145,7 +145,7 @@ impl Parts {
             _ => hour,
         };
         let (month, day) = match (self.month, &self.small[..]) {
-            (Some(month), [day]) | (None, [month, day]) => (*month, *day),
+            (Some(month), &[day]) | (None, &[month, day]) => (month, day),
             _ => return None,
         };
         let second = (second_ns / NS_PER_S) as u64;

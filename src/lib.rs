@@ -11,8 +11,10 @@
 pub mod bus;
 pub mod failures;
 pub mod lights;
+pub mod oddities;
 pub mod port;
 pub mod ports;
+pub mod revision;
 pub mod saved;
 
 /// Rate of the stamp timer and of every time on the wire: 12 ticks per microsecond.

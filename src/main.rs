@@ -30,11 +30,12 @@ fn main() {
 mod app {
     use core::sync::atomic::{AtomicU32, Ordering};
 
-    use cantap_firmware::bus::capture::Capture;
+    use cantap_firmware::bus::capture::{CALLS_PER_TICK, Capture};
     use cantap_firmware::bus::filters::Layout;
     use cantap_firmware::bus::queue::RecordQueue;
     use cantap_firmware::bus::transmit::TxQueue;
     use cantap_firmware::lights::Activity;
+    use cantap_firmware::oddities::{Oddities, Watch};
     use cantap_firmware::port::session::{self, Session};
     use cantap_firmware::ports::{FilterBanks, Traffic};
     use cantap_wire::{CHANNELS, Channel};
@@ -166,10 +167,12 @@ mod app {
     #[task(binds = CAN1_RX1, priority = 4, shared = [tap, &can1_bells, &can1_entered])]
     fn can1_drain(mut cx: can1_drain::Context) {
         let entered = cx.shared.can1_entered.load(Ordering::Relaxed);
-        cx.shared.tap.lock(|Tap { capture, traffic: [can1, _], alarm }| {
-            capture.on_receive(Channel::Can1, can1, alarm, entered);
+        let emptied = cx.shared.tap.lock(|Tap { capture, traffic: [can1, _], alarm }| {
+            capture.on_receive(Channel::Can1, can1, alarm, entered)
         });
-        cx.shared.can1_bells.open_receive();
+        if emptied {
+            cx.shared.can1_bells.open_receive();
+        }
     }
 
     /// Same as [`can1_drain`], for CAN2. DMA is not used, and the interrupt of its first stream raises this task: the vector of CAN2's own
@@ -177,10 +180,12 @@ mod app {
     #[task(binds = DMA1_STREAM0, priority = 4, shared = [tap, &can2_bells, &can2_entered])]
     fn can2_drain(mut cx: can2_drain::Context) {
         let entered = cx.shared.can2_entered.load(Ordering::Relaxed);
-        cx.shared.tap.lock(|Tap { capture, traffic: [_, can2], alarm }| {
-            capture.on_receive(Channel::Can2, can2, alarm, entered);
+        let emptied = cx.shared.tap.lock(|Tap { capture, traffic: [_, can2], alarm }| {
+            capture.on_receive(Channel::Can2, can2, alarm, entered)
         });
-        cx.shared.can2_bells.open_receive();
+        if emptied {
+            cx.shared.can2_bells.open_receive();
+        }
     }
 
     /// Stamps the end of a transmission on CAN1, and leaves the mailbox to [`can1_sent`].
@@ -287,35 +292,64 @@ mod app {
         let otg_fs::SharedResources { tap, session, usb, controls, .. } = cx.shared;
         usb.poll();
         session.poll(usb, &mut Access { tap, controls });
+        // The last store may have been to USB (Cortex-M4 erratum 838869, see `Bells::open_receive`).
+        cortex_m::asm::dsb();
     }
 
     /// Once a millisecond: flushes batches, keeps time, handles what no interrupt reports, feeds the watchdog.
     ///
     /// Priority 2, with USB, because it talks to the host too. A tick some milliseconds late delays a batch; one four
     /// seconds late restarts the chip.
-    #[task(binds = TIM7, priority = 2, local = [tick, watchdog], shared = [tap, session, usb, controls])]
+    #[task(
+        binds = TIM7,
+        priority = 2,
+        local = [tick, watchdog, watch: Watch = Watch::new()],
+        shared = [tap, session, usb, controls, &can1_bells, &can2_bells],
+    )]
     fn tim7(cx: tim7::Context) {
-        let tim7::SharedResources { mut tap, session, usb, controls, .. } = cx.shared;
+        let tim7::SharedResources { mut tap, session, usb, controls, can1_bells, can2_bells, .. } = cx.shared;
         cx.local.tick.acknowledge();
         cx.local.watchdog.feed();
         // Short locks, so that the transmission alarm can come between them: it fires 14 µs early, and a lock, a drain and its
         // own work have to fit into that.
         for channel in Channel::ALL {
+            let emptied = tap.lock(|Tap { capture, traffic, alarm }| {
+                capture.on_tick_receive(channel, &mut traffic[channel.index()], alarm)
+            });
+            match channel {
+                _ if !emptied => {}
+                Channel::Can1 => can1_bells.open_receive(),
+                Channel::Can2 => can2_bells.open_receive(),
+            }
             let is_open = tap.lock(|Tap { capture, traffic, alarm }| {
                 capture.on_tick_errors(channel, &mut traffic[channel.index()], alarm)
             });
-            if is_open {
-                tap.lock(|Tap { capture, traffic, alarm }| {
-                    capture.on_tick_queues(channel, &mut traffic[channel.index()], alarm);
-                });
-                tap.lock(|Tap { capture, alarm, .. }| capture.arm(alarm));
+            if !is_open {
+                continue;
             }
+            for _ in 0..CALLS_PER_TICK {
+                let more = tap.lock(|Tap { capture, traffic, alarm }| {
+                    capture.on_tick_queues(channel, &mut traffic[channel.index()], alarm)
+                });
+                if !more {
+                    break;
+                }
+            }
+            tap.lock(|Tap { capture, alarm, .. }| capture.on_tick_losses(channel, alarm));
         }
-        let activity = tap.lock(|Tap { capture, .. }| capture.take_activity());
+        usb.tick();
+        let (activity, channels) =
+            tap.lock(|Tap { capture, .. }| (capture.take_activity(), capture.oddities()));
         controls.chip.tick(activity);
+        let oddities = Oddities { channels, usb: usb.oddities() };
+        if cx.local.watch.is_due(oddities, controls.stamp.now()) {
+            controls.chip.record(&oddities);
+        }
         let mut access = Access { tap, controls };
         session.tick(&mut access);
         session.poll(usb, &mut access);
+        // As in `otg_fs`.
+        cortex_m::asm::dsb();
     }
 
     /// Sleeps until the next interrupt.

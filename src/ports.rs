@@ -52,14 +52,14 @@ pub struct ErrorStatus {
 
 /// A controller's traffic side. No method waits.
 pub trait Traffic {
-    /// Frames waiting in the receive FIFO: 0 to 3.
+    /// Frames waiting in the receive FIFO: 0 to 3, without one that has been taken and is being released.
     fn pending(&self) -> u8;
-    /// Takes the oldest frame out of the receive FIFO.
+    /// Takes the oldest frame out of the receive FIFO; `None` if there is none, or if the last one taken has not been released yet.
     fn receive(&mut self) -> Option<Frame>;
     /// Whether the FIFO dropped frames since the last call. The FIFO is locked when full: it keeps the
     /// oldest and drops the newest.
     fn take_overrun(&mut self) -> bool;
-    /// [`Self::pending`] and [`Self::take_overrun`] in one read.
+    /// [`Self::pending`] and [`Self::take_overrun`] in one read. A frame being released may still count.
     fn look(&mut self) -> (u8, bool) {
         (self.pending(), self.take_overrun())
     }

@@ -4,38 +4,25 @@ use std::time::Duration;
 
 use cantap::Channel;
 use cantap::wire::CHANNELS;
+use cantap_trace::grammar;
 
 use crate::wrong::wrong;
 
-pub use cantap_work::{duration, positive_duration};
+pub use cantap_trace::grammar::{bit_rate as bitrate, duration, per_second, positive_duration};
 
 /// The most channels that a command supports, over all its devices.
 pub const MOST_CHANNELS: u8 = 32;
 
-/// Below this, in bit/s, the k was probably forgotten. Controllers start at 5000.
-const LEAST_BITRATE_BPS: f64 = 1_500.0;
-
-/// A bit rate in bit/s: `500000`, `500k`, `83.333k`, `1M`.
-pub fn bitrate(text: &str) -> Result<u32, String> {
-    let bps = per_second(text).ok_or("write a bit rate in bit/s, such as 500000, 500k or 1M")?;
-    if f64::from(bps) < LEAST_BITRATE_BPS {
-        return Err(format!("{text} bit/s is slower than any CAN bus; write {text}k for {text} kbit/s"));
-    }
-    Ok(bps)
-}
-
-/// A number per second, at least one: bits or clock cycles.
-pub fn per_second(text: &str) -> Option<u32> {
-    let (number, factor) = match text.as_bytes().last() {
-        Some(b'k' | b'K') => (&text[..text.len() - 1], 1_000.0),
-        Some(b'm' | b'M') => (&text[..text.len() - 1], 1_000_000.0),
-        _ => (text, 1.0),
+/// In milliseconds: a plain number as in can-utils, or a time with its unit.
+pub fn milliseconds(text: &str) -> Result<f64, String> {
+    let plain = text.bytes().all(|byte| byte.is_ascii_digit() || byte == b'.');
+    let value = match text.parse::<f64>() {
+        Ok(ms) if plain => Some(ms),
+        _ => duration(text).ok().map(|time| time.as_secs_f64() * 1e3),
     };
-    if !number.bytes().all(|byte| byte.is_ascii_digit() || byte == b'.') {
-        return None;
-    }
-    let value = (number.parse::<f64>().ok()? * factor).round();
-    (1.0..=f64::from(u32::MAX)).contains(&value).then_some(value as u32)
+    value.filter(|ms| (0.0..=3_600_000.0).contains(ms)).ok_or_else(|| {
+        "write milliseconds, such as 200 or 0.5, or a time with its unit, such as 1ms or 2s".to_owned()
+    })
 }
 
 /// In nanoseconds, bounded so that deadlines can be added to it.
@@ -102,18 +89,14 @@ pub fn channels_of_one(text: &str) -> Result<Channels, String> {
 
 /// A channel of a trace, which may have more channels than any device: as `1`, or as an interface, `can0`.
 pub fn channel_of_trace(text: &str) -> Result<u8, String> {
-    let number = match text.strip_prefix("can") {
-        Some(index) => index.parse::<u8>().ok().and_then(|index| index.checked_add(1)),
-        None => text.parse().ok(),
-    };
-    number.ok_or_else(|| {
+    grammar::channel(text).ok_or_else(|| {
         "a trace's channels are 1, 2 and so on up to 255, several as 1,3; can0 is channel 1".to_owned()
     })
 }
 
-/// The number of a channel, from 1: as `1`, or as its interface in traces, `can0`.
+/// The number of a device's channel, from 1.
 fn channel_number(text: &str) -> Option<u8> {
-    channel_of_trace(text).ok().filter(|number| (1..=MOST_CHANNELS).contains(number))
+    grammar::channel(text).filter(|number| *number <= MOST_CHANNELS)
 }
 
 /// One channel of a device, as `1`, `2`, or as an interface: `can0` is channel 1, as in every trace.
@@ -139,12 +122,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn times_need_a_known_unit() {
-        assert_eq!(duration("400ms"), Ok(Duration::from_millis(400)));
-        assert_eq!(duration("1.5"), Ok(Duration::from_millis(1500)));
-        assert_eq!(duration("2m"), Ok(Duration::from_mins(2)));
-        for text in ["", "ms", "-1s", "3 weeks", "1e400", "nan"] {
-            assert!(duration(text).is_err(), "{text}");
+    fn gaps_are_milliseconds_unless_they_have_a_unit() {
+        for (text, ms) in
+            [("200", 200.0), ("0.5", 0.5), ("1ms", 1.0), ("2s", 2000.0), ("100us", 0.1), ("0", 0.0)]
+        {
+            assert!((milliseconds(text).unwrap() - ms).abs() < 1e-9, "{text}");
+        }
+        for text in ["", "-1", "fast", "inf", "2h"] {
+            assert!(milliseconds(text).is_err(), "{text}");
         }
     }
 
@@ -157,24 +142,11 @@ mod tests {
         assert_eq!(numbers("1,2"), Ok(vec![1, 2]));
         assert_eq!(numbers("can1"), Ok(vec![2]));
         assert_eq!(numbers("3"), Err("a device has channels 1 and 2, and no channel 3".to_owned()));
-        for text in ["", "0", "1,", "33", "vcan0", "can", "-1"] {
+        assert_eq!(numbers("vcan1"), Ok(vec![2]));
+        for text in ["", "0", "1,", "33", "xcan0", "can", "-1"] {
             assert!(channels(text).unwrap_err().starts_with("channels are 1, 2"), "{text}");
         }
         assert_eq!((channel("1"), channel("can1")), (Ok(Channel::Can1), Ok(Channel::Can2)));
         assert!(channel("3").is_err() && channel("can2").is_err());
-    }
-
-    #[test]
-    fn bit_rates_take_can_users_units() {
-        for (text, bps) in [("500000", 500_000), ("500k", 500_000), ("83.333k", 83_333), ("1M", 1_000_000)] {
-            assert_eq!(bitrate(text), Ok(bps), "{text}");
-        }
-        assert_eq!(
-            bitrate("500").unwrap_err(),
-            "500 bit/s is slower than any CAN bus; write 500k for 500 kbit/s"
-        );
-        for text in ["", "0", "fast", "-5", "1e3", "5G", "k", "1.2.3", "inf", "83.333"] {
-            assert!(bitrate(text).is_err(), "{text}");
-        }
     }
 }

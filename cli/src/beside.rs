@@ -24,13 +24,12 @@ impl Beside {
         let path = if path.exists() { path.canonicalize().ok()? } else { path.to_owned() };
         let name = path.file_name()?.to_str()?;
         let temporary = path.with_file_name(format!(".cantap-{}-{name}", std::process::id()));
+        // In a common folder a stranger may have put a link there, which must be neither followed nor removed.
+        let file = fs::File::create_new(&temporary).ok()?;
         interrupt::unfinished(&temporary);
-        let made = fs::File::create(&temporary).and_then(|file| match fs::metadata(&path) {
-            Ok(old) => file.set_permissions(old.permissions()),
-            Err(_) => Ok(()),
-        });
         let beside = Self { temporary, path };
-        made.is_ok().then_some(beside)
+        let kept = fs::metadata(&beside.path).map_or(Ok(()), |old| file.set_permissions(old.permissions()));
+        kept.is_ok().then_some(beside)
     }
 
     /// Moves the complete file to its place.
@@ -52,5 +51,28 @@ pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
     match Beside::of(path) {
         Some(beside) => fs::write(&beside.temporary, bytes).and_then(|()| beside.put_in_place()),
         None => fs::write(path, bytes),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[cfg(unix)]
+    #[test]
+    fn what_stands_at_the_temporary_name_is_neither_written_nor_removed() {
+        let folder = tempfile::tempdir().unwrap();
+        let (path, victim) = (folder.path().join("out.log"), folder.path().join("victim"));
+        fs::write(&victim, "mine").unwrap();
+        let temporary = folder.path().join(format!(".cantap-{}-out.log", std::process::id()));
+        std::os::unix::fs::symlink(&victim, &temporary).unwrap();
+        assert!(Beside::of(&path).is_none());
+        write(&path, b"new").unwrap();
+        assert_eq!(fs::read_to_string(&victim).unwrap(), "mine");
+        assert!(temporary.is_symlink());
+        assert_eq!(fs::read_to_string(&path).unwrap(), "new");
+        fs::remove_file(&temporary).unwrap();
+        write(&path, b"newer").unwrap();
+        assert_eq!(fs::read_to_string(&path).unwrap(), "newer");
     }
 }

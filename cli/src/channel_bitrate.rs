@@ -3,6 +3,7 @@
 use std::str::FromStr;
 
 use cantap_analysis::stats::Options;
+use cantap_trace::grammar;
 
 use crate::args;
 
@@ -22,9 +23,9 @@ impl FromStr for ChannelBitrate {
         let Some((channel, bitrate)) = text.split_once(':') else {
             return Ok(Self { channel: None, bitrate_bps: args::bitrate(text)? });
         };
-        match channel.parse() {
-            Ok(channel @ 1..) => Ok(Self { channel: Some(channel), bitrate_bps: args::bitrate(bitrate)? }),
-            _ => Err("write it as BITRATE or CHANNEL:BITRATE, such as 500k or 2:250k".to_owned()),
+        match grammar::channel(channel) {
+            Some(channel) => Ok(Self { channel: Some(channel), bitrate_bps: args::bitrate(bitrate)? }),
+            None => Err("write it as BITRATE or CHANNEL:BITRATE, such as 500k or 2:250k".to_owned()),
         }
     }
 }
@@ -56,6 +57,7 @@ mod tests {
         let parse = |text: &str| text.parse::<ChannelBitrate>().map(|rate| (rate.channel, rate.bitrate_bps));
         assert_eq!(parse("500k"), Ok((None, 500_000)));
         assert_eq!(parse("2:83.333k"), Ok((Some(2), 83_333)));
+        assert_eq!(parse("can1:1M"), Ok((Some(2), 1_000_000)));
         for wrong in ["0:500k", "2:", "x:500k", "300:1M", "2:fast"] {
             assert!(parse(wrong).is_err(), "{wrong}");
         }

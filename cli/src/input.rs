@@ -1,5 +1,6 @@
 //! The trace that a command reads: which file, and how to deal with faults in it.
 
+use std::ops::Deref;
 use std::path::{Path, PathBuf};
 
 use anyhow::bail;
@@ -19,9 +20,6 @@ pub struct ReadArgs {
     /// The trace's format, if neither its content nor its name show it, or show the wrong one.
     #[arg(long = "from", value_name = "FORMAT", add = completion::formats())]
     pub format: Option<Format>,
-    /// Wait for more at the end of the file, until Ctrl-C.
-    #[arg(long)]
-    pub follow: bool,
     /// Stop at the first fault instead of leaving it out.
     #[arg(long)]
     pub strict: bool,
@@ -31,6 +29,40 @@ pub struct ReadArgs {
     /// The time zone of dates in files that do not name one, such as ASC, TRC and BLF: Europe/Berlin, +02:00.
     #[arg(long, value_name = "ZONE", default_value_t)]
     pub zone: Zone,
+}
+
+/// The same for a command that shows a trace while it grows.
+#[derive(clap::Args)]
+pub struct FollowArgs {
+    #[command(flatten)]
+    pub read: ReadArgs,
+    /// Wait for more at the end of the file, until Ctrl-C.
+    #[arg(long)]
+    pub follow: bool,
+}
+
+impl Deref for FollowArgs {
+    type Target = ReadArgs;
+
+    fn deref(&self) -> &ReadArgs {
+        &self.read
+    }
+}
+
+impl FollowArgs {
+    /// Opens the file, or standard input for `-`.
+    pub fn open(&self, path: &Path) -> anyhow::Result<Records> {
+        self.read.open_as(path, self.follow)
+    }
+
+    /// Opens the device if given, otherwise the file.
+    pub fn open_either(&self, path: Option<&PathBuf>, live: &LiveArgs) -> anyhow::Result<Records> {
+        match (live.open(path)?, path) {
+            (Some(live), _) => Ok(self.read.records(Source::Device(live))),
+            (None, Some(path)) => self.open(path),
+            (None, None) => bail!("give a trace to read, or a device with -d"),
+        }
+    }
 }
 
 /// Broken lines are reported individually until it is clear that the whole file is broken.
@@ -53,14 +85,27 @@ enum Source {
 }
 
 impl ReadArgs {
+    /// Whether the filters hide frames of a channel rather than whole channels: what is left is not the channel's load.
+    pub fn hides_frames(&self) -> bool {
+        !self.filtered().is_empty()
+    }
+
+    /// The channels, from 1, of which the filters hide frames.
+    pub fn filtered(&self) -> Vec<u8> {
+        let accepts_all = |channel: &u8| self.filter.iter().any(|filter| filter.accepts_all_of(*channel));
+        let accepts_some =
+            |channel: &u8| self.filter.iter().any(|filter| filter.channel.is_none_or(|own| own == *channel));
+        (0..=u8::MAX).filter(|channel| accepts_some(channel) && !accepts_all(channel)).collect()
+    }
+
     /// Opens the file, or standard input for `-`.
     pub fn open(&self, path: &Path) -> anyhow::Result<Records> {
-        let options = ReadOptions {
-            format: self.format,
-            follow: self.follow,
-            strict: self.strict,
-            zone: self.zone.clone(),
-        };
+        self.open_as(path, false)
+    }
+
+    fn open_as(&self, path: &Path, follow: bool) -> anyhow::Result<Records> {
+        let options =
+            ReadOptions { format: self.format, follow, strict: self.strict, zone: self.zone.clone() };
         let mut reader = open_reader(path, &options)?;
         if let Some(named) = reader.named_otherwise() {
             let (name, format) = (path.display(), reader.format());
@@ -68,21 +113,12 @@ impl ReadArgs {
                 "cantap: note: {name} is read as {format}, which its content is, and not as {named}; --from overrides"
             );
         }
-        if self.follow {
+        if follow {
             interrupt::watch()?;
             reader.end_when(interrupt::requested);
         }
-        let grows = self.follow || path.as_os_str() == "-";
+        let grows = follow || path.as_os_str() == "-";
         Ok(self.records(Source::File(Ahead::new(reader), grows)))
-    }
-
-    /// Opens the device if given, otherwise the file.
-    pub fn open_either(&self, path: Option<&PathBuf>, live: &LiveArgs) -> anyhow::Result<Records> {
-        match (live.open(path)?, path) {
-            (Some(live), _) => Ok(self.records(Source::Device(live))),
-            (None, Some(path)) => self.open(path),
-            (None, None) => bail!("give a trace to read, or a device with -d"),
-        }
     }
 
     fn records(&self, source: Source) -> Records {

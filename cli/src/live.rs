@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use anyhow::{anyhow, bail};
-use cantap::TraceRecord;
 use cantap::device::{Happening, Reconnecting, Return, Several, channel_number};
 use cantap::wire::message::{ChannelConfig, Mode};
+use cantap::{Channel, TraceRecord};
 use cantap_address::{Address, OpenDevice};
 use cantap_formats::ChannelInfo;
 
@@ -122,7 +122,7 @@ impl LiveRecords {
         // Up to here, Ctrl-C ends the program: nothing has been captured.
         lines.connect()?;
         interrupt::watch()?;
-        Ok(Self {
+        let mut live = Self {
             lines,
             addresses: boards.addresses().to_vec(),
             ends: time.map(|time| Instant::now() + time),
@@ -131,7 +131,9 @@ impl LiveRecords {
             hearing: Hearing::default(),
             is_filtered: !filters.is_empty(),
             reporter: None,
-        })
+        };
+        live.is_filtered |= !live.filtered().is_empty();
+        Ok(live)
     }
 
     /// Reports events of devices and channels there, instead of on standard error.
@@ -170,6 +172,15 @@ impl LiveRecords {
             let opened = device.open_channels().into_iter();
             opened.map(move |(channel, config)| (channel_number(board, channel), config, clock_hz))
         })
+    }
+
+    /// The open channels, by number, of which the device's filters keep frames back, whether given now or saved.
+    pub fn filtered(&self) -> Vec<u8> {
+        let filtered = |(board, device): (usize, &cantap::Device)| {
+            let of_device = Channel::ALL.into_iter().filter(|channel| device.is_filtered(*channel));
+            of_device.map(|channel| channel_number(board, channel)).collect::<Vec<_>>()
+        };
+        self.lines.devices().flat_map(filtered).collect()
     }
 
     /// The open channels, described for files.

@@ -1,24 +1,22 @@
 //! The `cantap` command. Each subcommand is a file in `commands/`; this one only selects.
 
 #![forbid(unsafe_code)]
+// They panic when nobody reads standard output any more.
+#![cfg_attr(not(test), deny(clippy::print_stdout))]
 
-/// Standard error may be closed or full, in which case std's macro panics. Anyone who does not read the message still gets the exit
-/// code.
+/// Prints a message; what a terminal would obey, from a device, a server or a file, is replaced. Standard error may be closed or full, in
+/// which case std's macro panics. Anyone who does not read the message still gets the exit code.
 macro_rules! eprintln {
-    ($($part:tt)*) => {{
-        use std::io::Write as _;
-        $crate::progress::aside(|| {
-            let _ = writeln!(std::io::stderr(), $($part)*);
-        });
-    }};
+    ($($part:tt)*) => {
+        $crate::stderr::tell(&format!("{}\n", format_args!($($part)*)))
+    };
 }
 
-/// Like `eprintln`.
+/// Like `eprintln`, without ending the line.
 macro_rules! eprint {
-    ($($part:tt)*) => {{
-        use std::io::Write as _;
-        let _ = write!(std::io::stderr(), $($part)*);
-    }};
+    ($($part:tt)*) => {
+        $crate::stderr::tell(&format!($($part)*))
+    };
 }
 
 mod advice;
@@ -58,7 +56,7 @@ mod wrong;
 use std::error::Error;
 use std::process::ExitCode;
 
-use clap::{CommandFactory, Parser};
+use clap::{CommandFactory, FromArgMatches, Parser};
 use clap_complete::CompleteEnv;
 
 /// Captures, understands and drives CAN buses with a cantap analyser.
@@ -66,6 +64,7 @@ use clap_complete::CompleteEnv;
 #[command(
     name = "cantap",
     version,
+    disable_help_subcommand = true,
     after_help = "Exit codes: 0 success, 1 failure, 2 wrong command line, 3 a check did not hold."
 )]
 struct Cli {
@@ -77,8 +76,11 @@ fn main() -> ExitCode {
     // For completion by a shell, the program ends here.
     CompleteEnv::with_factory(Cli::command).var(shells::VARIABLE).shells(shells::ALL).complete();
     let arguments = commands::extcap::arguments(std::env::args_os());
-    let cli = Cli::try_parse_from(arguments).unwrap_or_else(|error| leave(&error));
-    match cli.command.run(Cli::command()) {
+    let line = commands::help::grouped(Cli::command());
+    let parsed = line.clone().try_get_matches_from(arguments);
+    let cli =
+        parsed.and_then(|matches| Cli::from_arg_matches(&matches)).unwrap_or_else(|error| leave(&error));
+    match cli.command.run(line) {
         Ok(code) => code,
         // `cantap … | head` has read enough.
         Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,

@@ -24,7 +24,7 @@ use crate::commands::conversations;
 use crate::completion;
 use crate::hearing::{self, Hearing};
 use crate::sending::Sending;
-use crate::words::{counted, state_name};
+use crate::words::counted;
 use crate::wrong::wrong;
 use cantap_work::interrupt;
 
@@ -90,7 +90,7 @@ impl SpeakArgs {
             bitrate_bps: open.map_or(1, |(_, config)| config.timing.bitrate_bps(clock_hz)),
             records: device.records(),
             stream: Stream::new(device),
-            sending: Sending::fed(device, self.channel_args().rescue()),
+            sending: Sending::fed(device, self.channel_args().rescue(), true),
             started: Instant::now(),
             pushed: 0,
             under_way: VecDeque::new(),
@@ -412,11 +412,8 @@ impl Speaking<'_> {
             let _ = write!(text, "; {}", count(errors, "bus error"));
         }
         if let Ok(status) = self.device.status() {
-            let _ = write!(
-                text,
-                "; the controller is {}",
-                state_name(status.channels[self.channel.index()].state)
-            );
+            let _ =
+                write!(text, "; the controller is {}", status.channels[self.channel.index()].state.name());
         }
         if lost > 0 {
             let _ = write!(text, "; {lost} frames or more were lost on the way to this computer");

@@ -108,14 +108,91 @@ fn every_time_is_written_as_the_others() {
             let parser = Command::new("x").arg(line);
             parser.try_get_matches_from(["x", "--time", text]).map(|_| ())
         };
-        for good in ["2", "2s"] {
+        for good in ["2", "2s", "1s1000ms", "0:02"] {
             assert!(parse(good).is_ok(), "{command} {argument}: {good}: {}", parse(good).unwrap_err());
         }
-        for bad in ["fast", "-1", "2 parsecs"] {
+        for bad in ["fast", "-1", "2 parsecs", "inf", "1s1m"] {
             assert!(parse(bad).is_err(), "{command} {argument}: {bad}");
         }
     });
     assert!(seen > 15, "{seen}");
+}
+
+/// What may and may not be written where an option has this value, in every command: `docs/grammar.md`.
+const GRAMMAR: [(&str, &[&str], &[&str]); 5] = [
+    (
+        "FILTER",
+        &[
+            "C0",
+            "F0",
+            "CAFE0",
+            "FEF1",
+            "123",
+            "0x123",
+            "09F80102",
+            "18FEF1??",
+            "100-1FF",
+            "pgn:61444",
+            "123:7FF",
+            "can0",
+            "vcan0,123",
+            "can1,400~7F0,#FF,j",
+        ],
+        &["12g", "ca0", "800", "200-100", "pgn:x", "100-1FF,j", "can0,", "x"],
+    ),
+    ("ID", &["C0", "CAFE0", "123", "0x123", "09F80102", "1"], &["12g", "ca0", "800", "", "123456789"]),
+    ("RATE", &["500000", "500k", "83.333k", "0.5M", "500kbit/s"], &["500", "fast", "1e6", "-1", ""]),
+    ("[CHANNEL:]RATE", &["500k", "2:250k", "can1:1M", "0.5M"], &["500", "0:500k", "x:1M", "2:", "2:fast"]),
+    ("CHANNEL", &["1", "can0", "vcan0", "slcan1"], &["0", "x", "can", "", "-1"]),
+];
+
+/// A fault in a value is found by the command line, so it has the same exit code everywhere.
+#[test]
+fn every_identifier_filter_rate_and_channel_is_written_as_the_others() {
+    let mut seen = BTreeMap::new();
+    let mut wrong = Vec::new();
+    each(&Cli::command(), "", &mut |command, argument| {
+        let Some(name) = argument.get_value_names().and_then(<[_]>::first) else { return };
+        // What makes identifiers, and two endpoints of a conversation, are other things; so is an option of Wireshark's.
+        let is_other =
+            matches!(command, "gen" | "extcap") || matches!(argument.get_long(), Some("load" | "format"));
+        let Some((kind, good, bad)) = GRAMMAR.iter().find(|(kind, ..)| name == kind).filter(|_| !is_other)
+        else {
+            return;
+        };
+        *seen.entry(*kind).or_insert(0) += 1;
+        let parse = |text: &str| {
+            let line = Arg::new("value").long("value").value_parser(argument.get_value_parser().clone());
+            let parser = Command::new("x").arg(line.allow_hyphen_values(true));
+            parser.try_get_matches_from(["x", "--value", text]).map(|_| ())
+        };
+        for text in *good {
+            if let Err(error) = parse(text) {
+                wrong.push(format!("{command} {argument}: {text}: {error}"));
+            }
+        }
+        for text in *bad {
+            match parse(text) {
+                Ok(()) => wrong.push(format!("{command} {argument}: {text} is taken")),
+                Err(error) if error.exit_code() != 2 => {
+                    wrong.push(format!("{command} {argument}: {text}: another code"))
+                }
+                Err(_) => {}
+            }
+        }
+    });
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+    assert!(seen["FILTER"] > 8 && seen["[CHANNEL:]RATE"] > 8 && seen.len() == GRAMMAR.len(), "{seen:?}");
+}
+
+/// The page has every example of the table.
+#[test]
+fn the_page_on_the_grammar_has_what_is_tested() {
+    let page = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/grammar.md");
+    let page = std::fs::read_to_string(page).unwrap();
+    for text in GRAMMAR.iter().flat_map(|(_, good, _)| *good) {
+        assert!(page.contains(&format!("`{text}`")), "{text}");
+    }
 }
 
 /// `docs/interoperability.md` names what is shown, and by which test: that test must exist.
@@ -152,8 +229,18 @@ fn what_measures_or_tells_has_json() {
     // Exists on only one system.
     without.retain(|name| name != "bridge");
     // They write scripts or files, act, serve, or show a screen.
-    let expected =
-        ["completions", "extcap", "identify", "man", "monitor", "reset", "serve", "update", "virtual"]
-            .map(str::to_owned);
+    let expected = [
+        "completions",
+        "extcap",
+        "help",
+        "identify",
+        "man",
+        "monitor",
+        "reset",
+        "serve",
+        "update",
+        "virtual",
+    ]
+    .map(str::to_owned);
     assert_eq!(without, expected);
 }

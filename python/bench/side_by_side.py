@@ -3,11 +3,16 @@
 Prints a table for docs/benchmarks.md. Times are the process's processor seconds, of all its threads, which say the same whatever else the machine
 does, and seconds of the wall's clock, which users wait: the best of a few runs each, in turns, after one that nobody counts. python-can, cantools
 and asammdf have one thread, cantap as many as it takes.
+
+Decoding is measured with a small database (the virtual car's, and its traffic) and with a large one (generated: 600 messages of 12 signals, all of them in
+the trace), each with the database loaded anew in every run, as a script does it, and loaded once before, as a long-running program does it. The least of all
+ratios is printed last.
 """
 
 import argparse
 import os
 import pathlib
+import random
 import tempfile
 import time
 
@@ -34,22 +39,54 @@ def beside(theirs, ours, runs):
     ]
 
 
-def make(folder, frames):
-    """Five seconds of the virtual car, repeated, as BLF and as MF4."""
+def frames_of_car():
+    """Five seconds of the virtual car: identifier, whether it is extended, data."""
     with cantap.open("virtual:car") as device:
         device.open_channel(1)
         device.open_channel(2)
         recording = device.batch(seconds=5).to_pyarrow().to_pylist()
     heard = [record for record in recording if record["event"] == "frame" and not record["remote"]]
-    text = folder / "drive.log"
+    return [(record["id"], record["extended"], record["data"]) for record in heard]
+
+
+def make_large(path, messages=600):
+    """Writes a database of messages that have twelve signals each, in both byte orders, signed and not, one of them with texts; returns frames of them."""
+    chance = random.Random(7)
+    lines, texts, frames = ['VERSION ""', "BU_: ECU"], [], []
+    for number in range(messages):
+        extended = number % 3 == 0
+        identifier = 0x18F00000 + number * 0x101 if extended else 0x100 + number
+        lines.append(f"BO_ {identifier | (extended << 31)} Message{number}: 8 ECU")
+        for at in range(8):
+            # Two of four bits in each second byte, one of eight in the others.
+            for half in range(2 if at % 2 else 1):
+                length, start = (4, 8 * at + 4 * half) if at % 2 else (8, 8 * at)
+                motorola, signed = chance.random() < 0.3, "-" if chance.random() < 0.3 else "+"
+                start = start + length - 1 if motorola else start
+                factor = chance.choice([1, 0.5, 0.01, 0.125])
+                lines.append(
+                    f' SG_ Signal{number}x{at}x{half} : {start}|{length}@{int(not motorola)}{signed} ({factor},{chance.choice([0, -40])}) [0|0] "u" ECU'
+                )
+        texts.append(f'VAL_ {identifier | (extended << 31)} Signal{number}x1x0 0 "off" 1 "on" 2 "fault" ;')
+        frames += [(identifier, extended, chance.randbytes(8)) for _ in range(5)]
+    path.write_text("\n".join([*lines, *texts, ""]))
+    chance.shuffle(frames)
+    return frames
+
+
+def make(folder, name, heard, frames):
+    """So many of these frames, repeated, as BLF and as MF4."""
+    text = folder / f"{name}.log"
     with text.open("w") as out:
         for at in range(frames):
-            record = heard[at % len(heard)]
-            identifier = f"{record['id']:08X}" if record["extended"] else f"{record['id']:03X}"
-            out.write(f"({1.7e9 + at * 1e-4:.6f}) can0 {identifier}#{record['data'].hex().upper()}\n")
+            number, extended, data = heard[at % len(heard)]
+            identifier = f"{number:08X}" if extended else f"{number:03X}"
+            out.write(f"({1.7e9 + at * 1e-4:.6f}) can0 {identifier}#{data.hex().upper()}\n")
     table = cantap.read(text)
-    cantap.write(table, folder / "drive.blf")
-    cantap.write(table, folder / "drive.mf4")
+    blf, mf4 = folder / f"{name}.blf", folder / f"{name}.mf4"
+    cantap.write(table, blf)
+    cantap.write(table, mf4)
+    return blf, mf4
 
 
 def read_with_python_can(path):
@@ -57,8 +94,10 @@ def read_with_python_can(path):
         return sum(1 for _ in reader)
 
 
-def decode_with_cantools(path):
-    database = cantools.database.load_file(CAR)
+def decode_with_cantools(path, database):
+    """`database` is a file, or one that is loaded."""
+    if isinstance(database, pathlib.Path):
+        database = cantools.database.load_file(database)
     columns = {}
     with can.BLFReader(path) as reader:
         for message in reader:
@@ -71,14 +110,14 @@ def decode_with_cantools(path):
     return sum(map(len, columns.values()))
 
 
-def decode_with_asammdf(path):
-    with MDF(path) as file, file.extract_bus_logging({"CAN": [(str(CAR), 0)]}) as extracted:
+def decode_with_asammdf(path, database):
+    with MDF(path) as file, file.extract_bus_logging({"CAN": [(database, 0)]}) as extracted:
         return sum(len(group.channels) - 1 for group in extracted.groups)
 
 
-def values_with_asammdf(path):
+def values_with_asammdf(path, database):
     """The same, and of each channel the physical values, as `cantap.decode` has them: before, they are the frames' raw numbers."""
-    with MDF(path) as file, file.extract_bus_logging({"CAN": [(str(CAR), 0)]}) as extracted:
+    with MDF(path) as file, file.extract_bus_logging({"CAN": [(database, 0)]}) as extracted:
         return sum(
             len(extracted.get(group=at, index=index).samples)
             for at, group in enumerate(extracted.groups)
@@ -86,10 +125,10 @@ def values_with_asammdf(path):
         )
 
 
-def sorted_by_asammdf(path):
-    """A file whose frames are in a group of their own, as most loggers write them."""
+def by_asammdf(path, name, compression):
+    """A file whose frames are in a group of their own, as most loggers write them; zipped if there is a compression (2: transposed before)."""
     with MDF(path) as file:
-        return file.save(path.with_stem("sorted"), overwrite=True)
+        return file.save(path.with_stem(f"{path.stem} {name}"), overwrite=True, compression=compression)
 
 
 def recv_loop(messages):
@@ -167,61 +206,115 @@ def capture(seconds):
         return records / passed, lost
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=200_000)
-    parser.add_argument("--runs", type=int, default=3)
-    arguments = parser.parse_args()
-    frames, runs = arguments.frames, arguments.runs
-    with tempfile.TemporaryDirectory() as folder:
-        folder = pathlib.Path(folder)
-        make(folder, frames)
-        blf, mf4 = folder / "drive.blf", folder / "drive.mf4"
-        of_group = sorted_by_asammdf(mf4)
+class Rows:
+    """The table of times."""
 
-        def row(what, theirs, by_theirs, by_ours, runs):
-            """Reads the database in each run, as the others do."""
-            (its_cpu, its_wall, counted), (cpu, wall, made) = beside(by_theirs, by_ours, runs)
-            print(
-                f"| {what} | {theirs} | {its_cpu:.3f} | {cpu:.4f} | {its_cpu / cpu:.1f} × "
-                f"| {its_wall:.3f} | {wall:.4f} | {its_wall / wall:.1f} × |",
-                flush=True,
-            )
-            return counted, made
+    def __init__(self):
+        self.least = {}
+        print("| what | database | beside | its processor s | cantap's | | its s | cantap's | |")
+        print("|---|---|---|---|---|---|---|---|---|")
 
-        print(f"{frames} frames, {os.cpu_count()} cores\n")
-        print("| what | beside | its processor s | cantap's | | its s | cantap's | |")
-        print("|---|---|---|---|---|---|---|---|")
-        counted, table = row(
-            "read BLF", "python-can", lambda: read_with_python_can(blf), lambda: cantap.read(blf), runs
+    def measure(self, kind, what, database, theirs, by_theirs, by_ours, runs):
+        """Prints a row, and returns both results. `kind`: of these the least is printed."""
+        (its_cpu, its_wall, counted), (cpu, wall, made) = beside(by_theirs, by_ours, runs)
+        print(
+            f"| {what} | {database} | {theirs} | {its_cpu:.3f} | {cpu:.4f} | {its_cpu / cpu:.1f} × "
+            f"| {its_wall:.3f} | {wall:.4f} | {its_wall / wall:.1f} × |",
+            flush=True,
         )
-        if counted != len(table) or counted != frames:
-            raise RuntimeError("not the same frames")
-        both = "python-can + cantools"
-        values, decoded = row(
-            "BLF to a column per signal", both, lambda: decode_with_cantools(blf), lambda: cantap.decode(blf, CAR), runs
+        ratios = its_wall / wall, its_cpu / cpu
+        self.least[kind] = tuple(map(min, self.least.get(kind, ratios), ratios))
+        return counted, made
+
+    def print_least(self):
+        print("\n| the least | by the clock | by the processor |\n|---|---|---|")
+        for kind, (wall, cpu) in self.least.items():
+            print(f"| {kind} | {wall:.1f} × | {cpu:.1f} × |")
+
+
+def compare(rows, folder, words, heard, file, frames, runs):
+    """All that is decoded with one database."""
+    blf, mf4 = make(folder, words, heard, frames)
+    counted, table = rows.measure(
+        "read BLF", "read BLF", "", "python-can", lambda: read_with_python_can(blf), lambda: cantap.read(blf), runs
+    )
+    if counted != len(table) or counted != frames:
+        raise RuntimeError("not the same frames")
+    both = "python-can + cantools"
+    theirs_loaded, loaded = cantools.database.load_file(file), cantap.load_database(file)
+    for how, their_database, database in (("", file, file), (", loaded before", theirs_loaded, loaded)):
+        values, decoded = rows.measure(
+            "decode BLF",
+            "BLF to a column per signal",
+            words + how,
+            both,
+            lambda: decode_with_cantools(blf, their_database),
+            lambda: cantap.decode(blf, database),
+            runs,
         )
         if decoded.report.values != values:
             raise RuntimeError(f"{decoded.report.values} values here, {values} there")
-        row("BLF to a row per value", both, lambda: decode_with_cantools(blf), lambda: cantap.read(blf, db=CAR), 1)
-        for file, words in ((mf4, "MF4"), (of_group, "MF4 as asammdf sorts it")):
-            its = "asammdf `extract_bus_logging`"
-            more = 3 * runs
+    rows.measure(
+        "BLF to rows", "BLF to a row per value", words, both, lambda: decode_with_cantools(blf, file), lambda: cantap.read(blf, db=file), 1
+    )
+    # asammdf takes a loaded database too, but only of canmatrix's kind.
+    from asammdf.blocks.utils import load_can_database
 
-            def ours(file=file):
-                return cantap.decode(file, CAR)
-
-            channels, decoded = row(
-                f"{words} to a column per signal", its, lambda file=file: decode_with_asammdf(file), ours, more
+    their_loaded = load_can_database(file)
+    files = (
+        ("decode MF4", mf4, "MF4"),
+        ("decode MF4", by_asammdf(mf4, "sorted", 0), "MF4 as asammdf sorts it"),
+        ("decode zipped MF4", by_asammdf(mf4, "zipped", 1), "MF4 as asammdf zips it"),
+        ("decode zipped MF4", by_asammdf(mf4, "transposed", 2), "MF4 as asammdf zips it, transposed"),
+    )
+    its = "asammdf `extract_bus_logging`"
+    for kind, mdf, what in files:
+        for how, their_database, database in (("", str(file), file), (", loaded before", their_loaded, loaded)):
+            channels, decoded = rows.measure(
+                kind,
+                f"{what} to a column per signal",
+                words + how,
+                its,
+                lambda: decode_with_asammdf(mdf, their_database),
+                lambda: cantap.decode(mdf, database),
+                3 * runs,
             )
             columns = sum(len([name for name in table.column_names[3:] if not name.endswith(".text")]) for table in decoded.values())
             if columns != channels:
                 raise RuntimeError(f"{columns} signals here, {channels} there")
-            its_values, decoded = row(
-                f"{words} to physical values", f"{its} and `get`", lambda file=file: values_with_asammdf(file), ours, more
-            )
-            if its_values != decoded.report.values or its_values != values:
-                raise RuntimeError(f"{decoded.report.values} values here, {its_values} there")
+        its_values, decoded = rows.measure(
+            f"{kind} and values",
+            f"{what} to physical values",
+            words,
+            f"{its} and `get`",
+            lambda: values_with_asammdf(mdf, str(file)),
+            lambda: cantap.decode(mdf, file),
+            runs,
+        )
+        if its_values != decoded.report.values or its_values != values:
+            raise RuntimeError(f"{decoded.report.values} values here, {its_values} there")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--frames", type=int, default=200_000)
+    parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--databases", nargs="+", default=["small", "large"], choices=["small", "large"])
+    parser.add_argument("--only-decode", action="store_true")
+    arguments = parser.parse_args()
+    frames, runs = arguments.frames, arguments.runs
+    with tempfile.TemporaryDirectory() as folder:
+        folder = pathlib.Path(folder)
+        print(f"{frames} frames, {os.cpu_count()} cores\n")
+        rows = Rows()
+        if "small" in arguments.databases:
+            compare(rows, folder, "small", frames_of_car(), CAR, frames, runs)
+        if "large" in arguments.databases:
+            large = folder / "large.dbc"
+            compare(rows, folder, "large", make_large(large), large, frames, runs)
+        rows.print_least()
+    if arguments.only_decode:
+        return
     loops = {
         "`can.Bus.recv`, cantap": recv_loop,
         "`can.Bus.recv` as python-can has it, of a message made of constants": constant_loop,

@@ -4,6 +4,7 @@
 database, return decoded signals.
 """
 
+from ._columns import Column, Schema
 from ._native import (
     CantapError,
     CantapWarning,
@@ -27,6 +28,7 @@ __all__ = [
     "CantapError",
     "CantapWarning",
     "Checksum",
+    "Column",
     "Counter",
     "Database",
     "DatabaseError",
@@ -42,6 +44,7 @@ __all__ = [
     "Reply",
     "Report",
     "Scan",
+    "Schema",
     "Table",
     "__version__",
     "boards",

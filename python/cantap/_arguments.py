@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, SupportsIndex
 
 
-def channels(channel: int | Iterable[int]) -> list[int]:
+def channels(channel: SupportsIndex | Iterable[SupportsIndex]) -> list[int]:
     """One channel or several."""
     one: Any = channel
     try:

@@ -3,7 +3,14 @@
 import os
 from collections.abc import Iterator
 from types import TracebackType
-from typing import Any, TypedDict, final, type_check_only
+from typing import Any, TypedDict, final, overload, type_check_only
+
+import numpy as np
+import pandas as pd
+import polars as pl
+import pyarrow as pa
+
+from ._columns import Column, Schema
 
 __all__ = [
     "CantapError",
@@ -91,6 +98,9 @@ class Report:
     def records_read(self) -> int:
         """Records in the file, before any filter."""
     @property
+    def channels(self) -> list[int]:
+        """The channels that the file has, before any filter."""
+    @property
     def records(self) -> int:
         """Records that passed the filters."""
     @property
@@ -155,17 +165,26 @@ class Table:
         """Metadata of a column: its unit, its description."""
     def batches(self) -> list[Table]:
         """The pieces in which the table is held in memory."""
-    def to_numpy(self) -> dict[str, Any]:
+    def to_numpy(self) -> dict[str, np.ndarray[Any, Any]]:
         """The columns as NumPy arrays: times as datetime64, texts as objects, data bytes as a row of numbers for each frame.
 
         Missing values are masked.
         """
-    def to_pyarrow(self) -> Any:
+    def to_pyarrow(self) -> pa.Table:
         """The same table for pyarrow."""
-    def to_pandas(self) -> Any:
+    def to_pandas(self) -> pd.DataFrame:
         """The same table for pandas."""
-    def to_polars(self) -> Any:
+    def to_polars(self) -> pl.DataFrame:
         """The same table for Polars."""
+    @property
+    def schema(self) -> Schema:
+        """The columns by name, each with its type."""
+    @overload
+    def __getitem__(self, key: str, /) -> Column: ...
+    @overload
+    def __getitem__(self, key: slice | list[str], /) -> Table: ...
+    def _repr_html_(self) -> str: ...
+    def _values(self, name: str) -> list[Any]: ...
     def _parts(self, name: str) -> tuple[str, bytes, bytes | None, list[str] | None, int]: ...
     def __len__(self) -> int: ...
     def __arrow_c_schema__(self) -> object: ...
@@ -300,7 +319,7 @@ class Records(Iterator[Record]):
         self, timeout: float | None
     ) -> list[tuple[float, int, bool, bool, bool, int, int, bytearray, bool, bool]]: ...
     def _used_up(self) -> None: ...
-    def _filter(self, filters: list[str], only_received: bool) -> None: ...
+    def _filter(self, filters: list[str]) -> None: ...
 
 @final
 class PeriodicFrame:
@@ -343,6 +362,7 @@ class Device:
         filters: list[str] = ...,
         only_received: bool = False,
         capacity: int = ...,
+        node: int | None = None,
     ) -> Records: ...
     def send(
         self,
@@ -351,7 +371,10 @@ class Device:
         timeout: float | None,
         at_ns: int | None = None,
         queue_timeout: float = 1.0,
+        node: int = ...,
     ) -> list[int]: ...
+    def send_now(self, number: int, frame: Frame | str, node: int) -> bool: ...
+    def reopen(self, number: int, filters: list[str]) -> None: ...
     def abort(self, number: int) -> None: ...
     def periodic(
         self,
@@ -360,6 +383,7 @@ class Device:
         period_s: float,
         count: int,
         modifiers: list[tuple[str, int, int, int, str]],
+        node: int = ...,
     ) -> PeriodicFrame: ...
     def reply(
         self,

@@ -24,6 +24,7 @@ from can.broadcastmanager import (
 
 from . import _native
 from ._native import CantapWarning, DeviceError, PeriodicFrame
+from ._periodic import HostCyclicTask, Scheduler
 from .device import CAPACITY, Device, Mode, boards
 
 LOG = logging.getLogger("can.bus")
@@ -44,7 +45,10 @@ class _Session:
 
     def __init__(self, address: str) -> None:
         self.device = Device(address, capacity=0)
-        self.users: dict[int, int] = {}
+        self.users: dict[int, dict[int, Any]] = {}
+        """For each channel, its Bus objects by their numbers, and what each of them wants to receive."""
+        self.passed: dict[int, Any] = {}
+        """What each open channel's hardware passes."""
 
     def is_gone(self) -> bool:
         """Whether the device was closed, or has vanished: then a new Bus object needs a new session, although others may still have this one."""
@@ -53,8 +57,30 @@ class _Session:
         except DeviceError:
             return True
 
+    def wanted(self, channel: int) -> Any:
+        """Filters that pass whatever any of a channel's Bus objects wants; `None` for everything."""
+        wanted = self.users[channel].values()
+        return [one for filters in wanted for one in filters] if all(wanted) else None
+
+    def open(self, channel: int, mode: Mode, options: dict[str, Any]) -> None:
+        """Opens a channel. A node of the bus receives everything, since it could not leave the bus whenever a program changes a filter: only
+        where the device merely listens does its hardware filter."""
+        passed = self.wanted(channel) if mode == "listen-only" else None
+        filters = _filter_texts(passed)
+        self.device._native.open_channel(channel, {**options, "mode": mode, "filters": filters})
+        self.passed[channel] = passed
+
+    def widen(self, channel: int) -> None:
+        """Opens a channel anew if its hardware drops what a Bus object wants. What is missed meanwhile is a loss in everyone's stream."""
+        wanted, passed = self.wanted(channel), self.passed.get(channel)
+        if passed and not (wanted and all(any(_covers(wide, one) for wide in passed) for one in wanted)):
+            self.device._native.reopen(channel, _filter_texts(wanted))
+            self.passed[channel] = wanted
+
 
 _sessions: dict[str, _Session] = {}
+_numbers = itertools.count(1)
+"""Of Bus objects: by these the records of their frames are told apart."""
 _lock = threading.RLock()
 
 
@@ -145,11 +171,11 @@ class CantapBus(can.BusABC):
             "one_shot": _flag("one_shot", one_shot),
             "manual_recovery": _flag("manual_recovery", manual_recovery),
         }
+        self._me = next(_numbers)
         is_quiet = _flag("listen_only", listen_only) or state is can.BusState.PASSIVE
         mode: Mode = "listen-only" if is_quiet else "normal"
         self.channel_info = f"cantap {self._address} channel {self._number}"
         self._can_protocol = can.CanProtocol.CAN_20
-        texts = _filter_texts(can_filters)
         with _lock:
             session = _sessions.get(self._address)
             try:
@@ -157,21 +183,28 @@ class CantapBus(can.BusABC):
                     session = _Session(self._address)
                 self._device = session.device
                 self._options["segments"] = self._segments(timing)
-                # Before the first frame can arrive.
-                self._records = self._device.records(
-                    self._number, filter=texts, only_received=not self._own, capacity=rx_capacity
+                # Before the first frame can arrive. Messages of other Bus objects come as if from another node.
+                self._records = self._device._native.records(
+                    self._number, _filter_texts(can_filters), not self._own, rx_capacity, self._me
                 )
-                if session.users.get(self._number, 0) == 0:
-                    self._open(mode, texts)
-                else:
-                    self._join(mode)
+                users = session.users.setdefault(self._number, {})
+                is_first = not users
+                users[self._me] = can_filters or None
+                try:
+                    if is_first:
+                        session.open(self._number, mode, self._options)
+                    else:
+                        self._join(mode)
+                        session.widen(self._number)
+                except BaseException:
+                    self._leave(session)
+                    raise
             except BaseException as error:
                 if session is not None and not session.users:
                     session.device.close()
                 if isinstance(error, (DeviceError, ValueError)):
                     raise can.CanInitializationError(str(error)) from error
                 raise
-            session.users[self._number] = session.users.get(self._number, 0) + 1
             _sessions[self._address] = session
         self._session = session
         # What came from the device in one call.
@@ -179,6 +212,7 @@ class CantapBus(can.BusABC):
         # As of the last call: asking for each message would take as long as everything else here.
         self._is_logged = False
         self._is_over = False
+        self._scheduler = Scheduler(self._send_due, f"cantap {self._address}:{self._number}")
         self._is_extended = type(self)._recv_internal is not CantapBus._recv_internal
         super().__init__(channel=channel, can_filters=can_filters)
 
@@ -190,10 +224,14 @@ class CantapBus(can.BusABC):
             timing = timing.recreate_with_f_clock(clock)
         return timing.brp, timing.tseg1, timing.tseg2, timing.sjw
 
-    def _open(self, mode: Mode, texts: list[str]) -> None:
-        self._device._native.open_channel(
-            self._number, {**self._options, "mode": mode, "filters": texts}
-        )
+    def _leave(self, session: _Session) -> bool:
+        """Returns whether another Bus object has the channel open."""
+        users = session.users[self._number]
+        users.pop(self._me, None)
+        if not users:
+            del session.users[self._number]
+            session.passed.pop(self._number, None)
+        return bool(users)
 
     def _join(self, mode: Mode) -> None:
         """Another Bus object has the channel open: its settings stay as they are."""
@@ -254,8 +292,21 @@ class CantapBus(can.BusABC):
             raise can.CanOperationError(f"{self.channel_info} is shut down")
 
     def _apply_filters(self, filters: Any) -> None:
-        with _as_can_errors():
-            self._records._filter(_filter_texts(filters), not self._own)
+        with _lock, _as_can_errors():
+            users = self._session.users.get(self._number, {})
+            # In another process, after a fork, and after the end it is not one of them.
+            if self._me in users:
+                users[self._me] = filters
+                self._session.widen(self._number)
+            self._records._filter(_filter_texts(filters))
+            # As in python-can's own interface, what is waiting must pass as well.
+            for _ in range(len(self._waiting)):
+                with contextlib.suppress(IndexError):
+                    message = self._waiting.popleft()
+                    if message.is_error_frame or self._matches_filters(message):
+                        self._waiting.append(message)
+            if not self._waiting:
+                self._records._used_up()
 
     def losses(self) -> dict[str, int]:
         """Frames of this channel that were received and lost since the session began, by stage; `bus` is this object.
@@ -283,7 +334,17 @@ class CantapBus(can.BusABC):
         frame = _frame(msg)
         wait = timeout if timeout is not None and timeout > 0 else None
         with _as_can_errors():
-            self._device._native.send(self._number, [frame], wait, None, QUEUE_TIMEOUT)
+            self._device._native.send(self._number, [frame], wait, None, QUEUE_TIMEOUT, self._me)
+
+    def _send_due(self, msg: can.Message) -> None:
+        """Sends a periodic message. It is left out while the device's queue is full: its next one comes anyway, and others are waiting."""
+        self._expect_open()
+        if type(self).send is not CantapBus.send:
+            self.send(msg)
+            return
+        frame = _frame(msg)
+        with _as_can_errors():
+            self._device._native.send_now(self._number, frame, self._me)
 
     def flush_tx_buffer(self) -> None:
         """Withdraws what has not been sent yet."""
@@ -305,7 +366,7 @@ class CantapBus(can.BusABC):
         options = {**dict(zip(names, others)), **named}
         autostart = options.get("autostart", True)
         modifier_callback = options.get("modifier_callback")
-        # python-can's thread would send without a pause.
+        # It would be sent without a pause.
         if not 0 < period < math.inf:
             raise ValueError(f"a period of {period} s is impossible")
         messages = CyclicSendTaskABC._check_and_convert_messages(msgs)
@@ -313,8 +374,8 @@ class CantapBus(can.BusABC):
             try:
                 return DeviceCyclicTask(self, messages, period, duration, autostart)
             except (ValueError, DeviceError):
-                pass  # The device cannot do this, or has no room for it: use a Python thread.
-        return super()._send_periodic_internal(msgs, period, duration, *others, **named)
+                pass  # The device cannot do this, or has no room for it: this computer does it.
+        return HostCyclicTask(self._scheduler, messages, period, duration, autostart, modifier_callback)
 
     # State
 
@@ -336,9 +397,9 @@ class CantapBus(can.BusABC):
             raise ValueError("a bus is not put into the state ERROR; choose ACTIVE or PASSIVE")
         self._expect_open()
         mode: Mode = "listen-only" if new_state is can.BusState.PASSIVE else "normal"
-        with _as_can_errors():
+        with _lock, _as_can_errors():
             self._device.close_channel(self._number)
-            self._open(mode, _filter_texts(self._filters))
+            self._session.open(self._number, mode, self._options)
 
     def recover(self) -> None:
         """Comes back from bus-off if recovery is manual."""
@@ -351,21 +412,18 @@ class CantapBus(can.BusABC):
         if self._is_shutdown:
             return
         super().shutdown()
-        # Not before: until then threads still send what is periodic.
+        # Before the channel is closed: nothing may be under way.
+        self._scheduler.close()
         self._is_over = True
         with _lock:
             session = self._session
-            left = session.users[self._number] - 1
-            if left:
-                session.users[self._number] = left
-            else:
-                del session.users[self._number]
+            is_used = self._leave(session)
             self._records.close()
             self._waiting.clear()
             try:
                 if not session.users:
                     session.device.close()
-                elif not left:
+                elif not is_used:
                     session.device.close_channel(self._number)
             except DeviceError as error:
                 raise can.CanOperationError(str(error)) from error
@@ -407,8 +465,8 @@ class DeviceCyclicTask(
         # Not `stop`, which the bus has wrapped so as to forget the task.
         self._end()
         count = 0 if self.duration is None else max(1, math.ceil(self.duration / self.period))
-        self._task = self._bus.device.send_periodic(
-            self._bus._number, _frame(self.messages[0]), self.period, count=count
+        self._task = self._bus.device._native.periodic(
+            self._bus._number, _frame(self.messages[0]), self.period, count, [], self._bus._me
         )
 
     def stop(self) -> None:
@@ -438,6 +496,13 @@ def _frame(msg: can.Message) -> _native.Frame:
         return _native.Frame(msg.arbitration_id, bytes(msg.data), extended=msg.is_extended_id)
     except (ValueError, OverflowError) as error:
         raise can.CanOperationError(str(error)) from error
+
+
+def _covers(wide: Any, narrow: Any) -> bool:
+    """Whether one of python-can's filters passes everything that the other one passes."""
+    mask = wide["can_mask"]
+    is_same_kind = wide.get("extended") in (None, narrow.get("extended"))
+    return is_same_kind and mask & ~narrow["can_mask"] == 0 and (wide["can_id"] ^ narrow["can_id"]) & mask == 0
 
 
 def _filter_texts(filters: Any) -> list[str]:

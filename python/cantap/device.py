@@ -8,7 +8,7 @@ import numbers
 import weakref
 from collections.abc import Iterable, Iterator
 from types import TracebackType
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, SupportsIndex, TypeAlias
 
 from . import _native
 from ._arguments import channels as _channels
@@ -232,7 +232,9 @@ class Device:
     def losses(self) -> dict[int, dict[str, int]]:
         """Frames received and lost since the session began, by channel: at the controller, in the queue, on the link, here.
 
-        `host` is what this session's own reader lost; the losses of a stream of records are in `Records.lost`.
+        `host` is what this session's own reader lost; the losses of a stream of records are in `Records.lost`. `off_bus` is how often the
+        device was off the bus because another client of its server changed the mode, and `off_bus_ns` for how long: each time an unknown
+        number of frames is missing, which `lost` does not contain.
         """
         return self._native.losses()
 
@@ -299,7 +301,7 @@ def open(
     address: str,
     bitrate: int | None = None,
     *,
-    channels: int | Iterable[int] = (1, 2),
+    channels: SupportsIndex | Iterable[SupportsIndex] = (1, 2),
     mode: Mode = "listen-only",
     filter: str | Iterable[str] = (),
     capacity: int = CAPACITY,

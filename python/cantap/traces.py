@@ -15,23 +15,27 @@ from ._arguments import channels, words
 from ._native import CantapWarning, Database, Report, Scan, Table
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from ._native import Options
 
 Path: TypeAlias = "str | os.PathLike[str]"
-Databases: TypeAlias = "Path | Database | Iterable[Path] | Mapping[int, Path]"
-Time: TypeAlias = "float | str | datetime.timedelta | datetime.datetime | datetime.date"
+Channels: TypeAlias = "SupportsIndex | Iterable[SupportsIndex]"
+Rates: TypeAlias = "SupportsIndex | Mapping[Any, SupportsIndex]"
+Databases: TypeAlias = "Path | Database | Iterable[Path] | Mapping[Any, Path]"
+Time: TypeAlias = "float | str | datetime.timedelta | datetime.date | np.datetime64 | np.timedelta64 | np.floating[Any] | np.integer[Any]"
 Words: TypeAlias = "str | Iterable[str]"
 
 BATCH_ROWS = 65_536
 
 
 def load_database(
-    files: Path | Iterable[Path] | Mapping[int, Path], *, j1939: bool = False
+    files: Path | Iterable[Path] | Mapping[Any, Path], *, j1939: bool = False
 ) -> Database:
     """Reads signal databases: DBC, KCD, SYM, ARXML, or cantap's own .toml.
 
-    Several files are combined; if two have the same message, the later one is used. A mapping gives each channel (from 1) its
-    own database. With `j1939` all 29-bit messages are treated as J1939 parameter groups.
+    Several files are combined; if two have the same message, the later one is used. A mapping gives each channel its own
+    database; channels are what the trace calls them. With `j1939` all 29-bit messages are treated as J1939 parameter groups.
 
     What is wrong with a usable file is in `Database.warnings`, and causes a `CantapWarning`.
     """
@@ -55,7 +59,7 @@ def scan(
     db: Databases | None = None,
     signals: Words = (),
     filter: Words = (),
-    channel: int | Iterable[int] = (),
+    channel: Channels = (),
     start: Time | None = None,
     end: Time | None = None,
     format: str | None = None,
@@ -89,7 +93,7 @@ def read(
     db: Databases | None = None,
     signals: Words = (),
     filter: Words = (),
-    channel: int | Iterable[int] = (),
+    channel: Channels = (),
     start: Time | None = None,
     end: Time | None = None,
     format: str | None = None,
@@ -134,7 +138,7 @@ def decode(
     *,
     signals: Words = (),
     filter: Words = (),
-    channel: int | Iterable[int] = (),
+    channel: Channels = (),
     start: Time | None = None,
     end: Time | None = None,
     format: str | None = None,
@@ -173,7 +177,7 @@ def search(
     max_count: int | None = None,
     db: Databases | None = None,
     filter: Words = (),
-    channel: int | Iterable[int] = (),
+    channel: Channels = (),
     start: Time | None = None,
     end: Time | None = None,
     format: str | None = None,
@@ -191,12 +195,12 @@ def search(
 
 def stats(
     path: Path,
-    bitrate: int | Mapping[int, int] | None = None,
+    bitrate: Rates | None = None,
     *,
-    data_bitrate: int | Mapping[int, int] | None = None,
+    data_bitrate: Rates | None = None,
     window: float = 1.0,
     filter: Words = (),
-    channel: int | Iterable[int] = (),
+    channel: Channels = (),
     start: Time | None = None,
     end: Time | None = None,
     format: str | None = None,
@@ -212,13 +216,13 @@ def stats(
     return _native.stats(options, _rates(bitrate), _rates(data_bitrate), window)
 
 
-def _rates(rates: int | Mapping[int, int] | None) -> list[tuple[int | None, int]]:
+def _rates(rates: Rates | None) -> list[tuple[int | None, int]]:
     if rates is None:
         return []
     if isinstance(rates, SupportsIndex):
         return [(None, operator.index(rates))]
     if isinstance(rates, Mapping):
-        return list(rates.items())
+        return [(channel, operator.index(rate)) for channel, rate in rates.items()]
     raise TypeError(f"a bit rate is a number, or one for each channel in a mapping, not {type(rates).__name__}")
 
 
@@ -257,7 +261,7 @@ def _options(
     db: Databases | None,
     signals: Words,
     filter: Words,
-    channel: int | Iterable[int],
+    channel: Channels,
     start: Time | None,
     end: Time | None,
     format: str | None,

@@ -7,6 +7,7 @@ use cantap_signals::{Decoder, Selection, Source};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
+use crate::channels::Named;
 use crate::error::Error;
 use crate::number::OfTrace;
 
@@ -21,6 +22,11 @@ pub struct Database {
 }
 
 impl Database {
+    /// The channels that have a database of their own.
+    pub fn named_channels(&self) -> Option<Named> {
+        Named::by("db", self.files.iter().filter_map(|(channel, _)| *channel))
+    }
+
     /// A decoder for these signals only; for all if there are no patterns.
     pub fn selecting(&self, patterns: &[String]) -> Result<Arc<Decoder>, Error> {
         if patterns.is_empty() {

@@ -7,6 +7,7 @@ use std::path::Path;
 use cantap::DeviceError as DeviceFault;
 use cantap_address::LinkError;
 use cantap_columns::BadColumns;
+#[cfg(feature = "parquet")]
 use cantap_columns::parquet::ParquetError;
 use cantap_formats::{Fault, NothingRead, OpenError, ReadIssue};
 use cantap_signals::condition::ConditionError;
@@ -134,6 +135,7 @@ impl From<BadColumns> for Error {
     }
 }
 
+#[cfg(feature = "parquet")]
 impl From<ParquetError> for Error {
     fn from(error: ParquetError) -> Self {
         Self::Format(error.to_string())

@@ -3,6 +3,7 @@
 #![deny(unsafe_op_in_unsafe_fn)]
 
 mod ahead;
+mod channels;
 mod database;
 mod device;
 mod error;
@@ -14,6 +15,7 @@ mod scan;
 mod source;
 mod table;
 mod traces;
+mod values;
 
 use mimalloc::MiMalloc;
 use pyo3::prelude::*;

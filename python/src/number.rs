@@ -65,7 +65,7 @@ impl<'py> FromPyObject<'_, 'py> for OfDevice {
     }
 }
 
-/// A channel of a trace, by its number: from 1 to 255.
+/// A channel of a trace, by its number: most count from 1, but some formats have a channel 0.
 #[derive(Clone, Copy)]
 pub struct OfTrace(pub u8);
 
@@ -74,10 +74,11 @@ impl<'py> FromPyObject<'_, 'py> for OfTrace {
 
     fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
         match object.extract::<u8>() {
-            Ok(number @ 1..) => Ok(Self(number)),
+            Ok(number) => Ok(Self(number)),
             Err(error) if !error.is_instance_of::<PyOverflowError>(object.py()) => Err(error),
             _ => {
-                let words = format!("there is no channel {}; they count from 1 to 255", short(object));
+                let words =
+                    format!("there is no channel {}; a trace's have numbers from 0 to 255", short(object));
                 Err(PyValueError::new_err(words))
             }
         }

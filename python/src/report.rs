@@ -8,6 +8,8 @@ use cantap_trace::{TraceEvent, TraceRecord};
 use pyo3::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use crate::channels::Channels;
+
 /// How many faults are kept as text.
 const FAULTS_KEPT: usize = 20;
 
@@ -30,6 +32,9 @@ pub struct Counts {
     pub left_out: BTreeMap<String, u64>,
     pub notes: BTreeMap<String, u64>,
     pub is_whole: bool,
+    /// All channels in the file, before any filter.
+    #[serde(default)]
+    pub channels: Channels,
 }
 
 impl Counts {
@@ -150,6 +155,12 @@ impl Report {
         self.now().records_read
     }
 
+    /// The channels that the file has, before any filter.
+    #[getter]
+    fn channels(&self) -> Vec<u16> {
+        self.now().channels.iter().map(u16::from).collect()
+    }
+
     /// Records that passed the filters.
     #[getter]
     fn records(&self) -> u64 {
@@ -241,6 +252,7 @@ impl Report {
         let mut object = serde_json::to_value(&counts).unwrap_or_default();
         object["missing_pct"] = counts.missing_pct().into();
         object["is_whole"] = self.is_whole().into();
+        object["channels"] = self.channels().into();
         from_json(py, &object.to_string())
     }
 

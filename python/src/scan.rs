@@ -11,6 +11,7 @@ use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use pyo3::types::{PyCapsule, PyTuple};
 
+use crate::channels::Named;
 use crate::error::{CantapWarning, Error};
 use crate::number::Whole;
 use crate::report::{Counts, Report};
@@ -134,6 +135,7 @@ pub struct Scan {
     /// With a database.
     decodes: bool,
     report: Py<Report>,
+    named: Vec<Named>,
     state: Mutex<State>,
 }
 
@@ -147,12 +149,14 @@ enum State {
     Ended,
 }
 
-/// Reports what could not be read, as a Python warning.
-pub fn warn(py: Python<'_>, report: &Report) -> PyResult<()> {
-    match report.now().warning() {
-        Some(text) => warning(py, &text),
-        None => Ok(()),
-    }
+/// Reports what could not be read, and channels that were named although the file does not have them, as Python warnings.
+pub fn warn(py: Python<'_>, report: &Report, named: &[Named]) -> PyResult<()> {
+    warnings(&report.now(), named).try_for_each(|text| warning(py, &text))
+}
+
+fn warnings(counts: &Counts, named: &[Named]) -> impl Iterator<Item = String> {
+    let missing = |named: &Named| named.missing_in(&counts.file, &counts.channels);
+    counts.warning().into_iter().chain(named.iter().filter_map(missing))
 }
 
 /// Issues a Python warning for the caller of the function in Python's half.
@@ -198,7 +202,7 @@ impl Scan {
             batch
         })?;
         if batch.is_none() {
-            warn(py, self.report.get())?;
+            warn(py, self.report.get(), &self.named)?;
             if self.decodes {
                 warn_if_nothing_decoded(py, self.report.get())?;
             }
@@ -220,6 +224,7 @@ impl Scan {
             schema,
             decodes,
             report: Py::new(py, report)?,
+            named: options.named_channels(),
             state: Mutex::new(State::Ready(Box::new(pipeline))),
         })
     }
@@ -297,6 +302,7 @@ impl Scan {
                 pipeline,
                 decodes: self.decodes,
                 schema: Arc::clone(&self.schema),
+                named: self.named.clone(),
                 ended: false,
             }),
         )
@@ -308,6 +314,7 @@ struct Stream {
     pipeline: Box<Pipeline>,
     decodes: bool,
     schema: SchemaRef,
+    named: Vec<Named>,
     ended: bool,
 }
 
@@ -325,7 +332,7 @@ impl Iterator for Stream {
                 // The caller may not hold Python's lock, so a Python warning is impossible.
                 let counts = &self.pipeline.source.counts;
                 let nothing = self.decodes.then(|| counts.nothing_decoded()).flatten();
-                for text in counts.warning().into_iter().chain(nothing) {
+                for text in warnings(counts, &self.named).chain(nothing) {
                     eprintln!("cantap: {text}");
                 }
                 None

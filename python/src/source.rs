@@ -10,6 +10,7 @@ use cantap_trace::filter::Filter;
 use cantap_trace::{PlainFrame, TraceRecord};
 use pyo3::prelude::*;
 
+use crate::channels::Named;
 use crate::database::Database;
 use crate::error::Error;
 use crate::number::{OfTrace, entry};
@@ -57,6 +58,12 @@ impl Options {
             None if self.signals.is_empty() => Ok(None),
             None => Err(Error::argument("signals are chosen out of a database; give one with db=")),
         }
+    }
+
+    /// The channels that they name.
+    pub fn named_channels(&self) -> Vec<Named> {
+        let database = self.db.as_ref().and_then(|database| database.get().named_channels());
+        Named::by("channel", self.channels.iter().copied()).into_iter().chain(database).collect()
     }
 
     fn read(&self) -> Result<ReadOptions, Error> {
@@ -144,7 +151,11 @@ impl TraceSource {
             match read {
                 None => break,
                 Some(Ok(())) => {
-                    self.counts.count_frames(frames.as_ref().map_or(0, |frames| frames.len() as u64));
+                    if let Some(frames) = &frames {
+                        self.counts.count_frames(frames.len() as u64);
+                        self.counts.channels.extend(frames.iter().map(|frame| frame.channel));
+                    }
+                    self.counts.channels.extend(records.iter().map(|record| record.channel));
                     self.choose(records);
                     for record in records.iter() {
                         self.counts.count(record);

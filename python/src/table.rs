@@ -13,11 +13,12 @@ use arrow_ipc::writer::StreamWriter;
 use arrow_schema::{ArrowError, SchemaRef};
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::{PyBytes, PyCapsule, PyDict, PyTuple};
+use pyo3::types::{PyBytes, PyCapsule, PyDict, PyList, PySlice, PyTuple};
 
 use crate::error::FormatError;
 use crate::numpy::{self, Parts};
 use crate::report::Report;
+use crate::values;
 
 const STREAM: &CStr = c"arrow_array_stream";
 const SCHEMA: &CStr = c"arrow_schema";
@@ -104,6 +105,50 @@ impl Table {
         let batch = self.one_batch()?;
         let column = batch.column_by_name(name).ok_or_else(|| self.no_column(name))?;
         Ok(numpy::parts(py, column.as_ref())?)
+    }
+
+    /// A column's values as a list, for the Python half.
+    fn _values<'py>(&self, py: Python<'py>, name: &str) -> PyResult<Bound<'py, PyList>> {
+        let batch = self.one_batch()?;
+        let column = batch.column_by_name(name).ok_or_else(|| self.no_column(name))?;
+        values::values(py, column.as_ref())
+    }
+
+    /// The columns by name, each with its type.
+    #[getter]
+    fn schema<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        let types = PyDict::new(slf.py());
+        for field in slf.get().schema.fields() {
+            types.set_item(field.name(), values::type_name(field.data_type()))?;
+        }
+        slf.py().import("cantap._columns")?.call_method1("Schema", (slf, types))
+    }
+
+    /// A column by its name; rows by a slice; several columns by a list of names.
+    fn __getitem__<'py>(slf: &Bound<'py, Self>, key: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
+        let (py, table) = (slf.py(), slf.get());
+        if let Ok(name) = key.extract::<String>() {
+            let column = Bound::new(py, table.select(std::slice::from_ref(&name))?)?;
+            return py.import("cantap._columns")?.call_method1("Column", (column, name));
+        }
+        if let Ok(rows) = key.cast::<PySlice>() {
+            let rows = rows.indices(table.rows().cast_signed())?;
+            if rows.step != 1 {
+                return Err(PyValueError::new_err(
+                    "rows are taken in order, each of them: for others, use to_pyarrow() or to_polars()",
+                ));
+            }
+            let (start, count) = (rows.start.unsigned_abs(), rows.slicelength);
+            return Ok(Bound::new(py, table.slice(start, count))?.into_any());
+        }
+        let names: Vec<String> = key.extract().map_err(|_| {
+            PyTypeError::new_err("a table is asked for a column by its name, for columns by a list of names, and for rows by a slice")
+        })?;
+        Ok(Bound::new(py, table.select(&names)?)?.into_any())
+    }
+
+    fn _repr_html_<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        slf.py().import("cantap._columns")?.call_method1("to_html", (slf,))
     }
 
     /// The columns as NumPy arrays, by name: times as datetime64, texts as objects, data bytes as a row of numbers for each frame.
@@ -193,6 +238,31 @@ impl Table {
 }
 
 impl Table {
+    /// Some of its columns, in this order.
+    fn select(&self, names: &[String]) -> PyResult<Self> {
+        let places = names.iter().map(|name| self.schema.index_of(name).map_err(|_| self.no_column(name)));
+        let places = places.collect::<PyResult<Vec<_>>>()?;
+        let schema = Arc::new(self.schema.project(&places).map_err(arrow_error)?);
+        let batches = self.batches.iter().map(|batch| batch.project(&places));
+        let batches = batches.collect::<Result<_, _>>().map_err(arrow_error)?;
+        Ok(Self { schema, batches, report: None })
+    }
+
+    /// Some of its rows. Nothing is copied.
+    fn slice(&self, mut start: usize, mut count: usize) -> Self {
+        let mut batches = Vec::new();
+        for batch in &self.batches {
+            let rows = batch.num_rows();
+            let here = rows.saturating_sub(start).min(count);
+            if here > 0 {
+                batches.push(batch.slice(start, here));
+            }
+            start = start.saturating_sub(rows);
+            count -= here;
+        }
+        Self { schema: Arc::clone(&self.schema), batches, report: None }
+    }
+
     fn no_column(&self, name: &str) -> PyErr {
         let names: Vec<_> = self.schema.fields().iter().map(|field| field.name().as_str()).collect();
         PyValueError::new_err(format!("there is no column '{name}'; there are {}", names.join(", ")))

@@ -8,6 +8,7 @@ use std::{fs, io};
 use arrow_array::{ArrayRef, RecordBatch, RecordBatchReader, UInt64Array};
 use arrow_schema::{DataType, Field, Schema};
 use cantap_analysis::stats::{Options as StatOptions, Statistics};
+#[cfg(feature = "parquet")]
 use cantap_columns::parquet::ParquetFile;
 use cantap_columns::{BATCH_ROWS, FrameColumns, MessageTables};
 use cantap_formats::{LeftOut, TraceWriter, WriteOptions, create_writer};
@@ -17,11 +18,12 @@ use cantap_signals::{Decoder, Message, Selection};
 use pyo3::prelude::*;
 
 use crate::ahead::Ahead;
+use crate::channels::{Channels, Named};
 use crate::database::Database;
 use crate::error::Error;
 use crate::number::{OfTrace, Whole};
 use crate::report::{Report, by_kind, from_json};
-use crate::scan::{warn, warn_if_nothing_decoded};
+use crate::scan::{warn, warn_if_nothing_decoded, warning};
 use crate::source::{Options, TraceSource};
 use crate::table::{Table, batches_of};
 
@@ -43,7 +45,7 @@ fn walk(
         py.check_signals()?;
     }
     source.tell();
-    warn(py, report)
+    warn(py, report, &options.named_channels())
 }
 
 /// Statistics of a trace, as from `cantap stats --json`.
@@ -78,8 +80,16 @@ pub fn stats(
         Ok(())
     })?;
     statistics.finish();
-    let mut summary = serde_json::to_value(statistics.summary()).unwrap_or_default();
+    let rates = [("bitrate", &bitrates), ("data_bitrate", &data_bitrates)];
+    let named = rates
+        .map(|(argument, rates)| Named::by(argument, of_channels(rates).iter().map(|(channel, _)| *channel)));
     let counts = report.now();
+    for named in named.iter().flatten() {
+        if let Some(text) = named.missing_in(&counts.file, &counts.channels) {
+            warning(py, &text)?;
+        }
+    }
+    let mut summary = serde_json::to_value(statistics.summary()).unwrap_or_default();
     summary["issues"] = counts.issues.into();
     summary["left_out"] = serde_json::to_value(&counts.left_out).unwrap_or_default();
     summary["missing_pct"] = counts.missing_pct().into();
@@ -99,6 +109,7 @@ fn selection(signals: &[String]) -> Result<Option<Selection>, Error> {
 pub struct Reading {
     ahead: Mutex<Option<Ahead>>,
     report: Report,
+    named: Vec<Named>,
 }
 
 #[pymethods]
@@ -108,7 +119,7 @@ impl Reading {
         let report = Report::default();
         let for_source = report.clone();
         let ahead = py.detach(|| Ahead::read(TraceSource::open(&options, for_source)?))?;
-        Ok(Self { ahead: Mutex::new(Some(ahead)), report })
+        Ok(Self { ahead: Mutex::new(Some(ahead)), report, named: options.named_channels() })
     }
 
     /// The trace as a table for each message, and one for events other than frames; once.
@@ -133,7 +144,8 @@ impl Reading {
         while py.detach(&mut next)? {
             py.check_signals()?;
         }
-        warn(py, &self.report)?;
+        let named: Vec<_> = self.named.iter().cloned().chain(db.get().named_channels()).collect();
+        warn(py, &self.report, &named)?;
         self.report.set_decoded(py.detach(|| tables.counts()));
         warn_if_nothing_decoded(py, &self.report)?;
         Ok((finish(&decoder, tables, chosen.as_ref()), Py::new(py, self.report.clone())?))
@@ -152,14 +164,19 @@ pub fn decode_table(
     let chosen = selection(&signals)?;
     let mut tables = MessageTables::new(Arc::clone(&decoder), chosen.is_some());
     let mut rows = 0;
+    let mut channels = Channels::default();
     for batch in batches_of(table)? {
         py.detach(|| {
             each_record(batch, &mut rows, |record| {
+                channels.insert(record.channel);
                 tables.push(record);
                 Ok(())
             })
         })?;
         py.check_signals()?;
+    }
+    if let Some(text) = db.get().named_channels().and_then(|named| named.missing_in("the table", &channels)) {
+        warning(py, &text)?;
     }
     Ok(finish(&decoder, tables, chosen.as_ref()))
 }
@@ -302,6 +319,16 @@ fn each_record(
     Ok(())
 }
 
+#[cfg(not(feature = "parquet"))]
+fn write_parquet(_: Box<dyn RecordBatchReader + Send>, path: &Path) -> Result<(LeftOut, usize), Error> {
+    Err(Error::Format(format!(
+        "{}: this build of cantap writes no Parquet; build it with the feature 'parquet', or pass the table's to_pyarrow() to \
+         pyarrow.parquet.write_table",
+        path.display()
+    )))
+}
+
+#[cfg(feature = "parquet")]
 fn write_parquet(batches: Box<dyn RecordBatchReader + Send>, path: &Path) -> Result<(LeftOut, usize), Error> {
     let mut file = ParquetFile::create(path, FrameColumns::default())?;
     let mut rows = 0;
@@ -358,7 +385,10 @@ impl Temporary {
         let Some(name) = place.file_name() else { return Ok(None) };
         let mut temporary = std::ffi::OsString::from(format!(".cantap-{}-", std::process::id()));
         temporary.push(name);
-        Ok(Some(Self(place.with_file_name(temporary))))
+        let temporary = place.with_file_name(temporary);
+        // In a common folder a stranger may have put a link there, which must be neither followed nor removed.
+        fs::File::create_new(&temporary)?;
+        Ok(Some(Self(temporary)))
     }
 }
 

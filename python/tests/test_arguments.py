@@ -44,8 +44,8 @@ def first_data(table):
         ({"filter": [1]}, TypeError, "filter: 'int'"),
         ({"channel": "1"}, TypeError, "channel is a number or several numbers, not str"),
         ({"channel": 1.5}, TypeError, "channel is a number or several numbers, not float"),
-        ({"channel": 2**70}, ValueError, "there is no channel 1180591620717411303424; they count from 1 to 255"),
-        ({"channel": [-1]}, ValueError, "there is no channel -1; they count from 1 to 255"),
+        ({"channel": 2**70}, ValueError, "there is no channel 1180591620717411303424; a trace's have numbers from 0 to 255"),
+        ({"channel": [-1]}, ValueError, "there is no channel -1; a trace's have numbers from 0 to 255"),
         ({"start": np.datetime64("NaT")}, ValueError, "NaT"),
     ],
 )
@@ -63,7 +63,7 @@ def test_an_error_says_which_argument_it_was(log, wrong, error, said):
         lambda log: cantap.stats(log, -1),
         lambda log: cantap.stats(log, {1: 2**40}),
         lambda log: cantap.stats(log, {300: 500_000}),
-        lambda log: cantap.stats(log, {0: 500_000}),
+        lambda log: cantap.stats(log, {256: 500_000}),
         lambda log: cantap.load_database({300: log}),
         lambda log: cantap.load_database([]),
         lambda log: cantap.load_database({}),
@@ -151,3 +151,58 @@ def test_parquet_is_not_read_and_the_error_says_what_does(log, tmp_path):
     cantap.write(cantap.read(log), path)
     with pytest.raises(cantap.FormatError, match="pandas, Polars or DuckDB"):
         cantap.read(path)
+
+
+DBC = """\
+VERSION ""
+BU_: A
+BO_ 291 Engine: 1 A
+ SG_ {name} : 0|8@1+ (1,0) [0|255] "" A
+"""
+
+
+@pytest.fixture
+def two_channels(tmp_path):
+    """A trace that counts its channels from 0, and a database for each of them."""
+    log = tmp_path / "two.log"
+    log.write_text("".join(f"(0.{at:06}) {('channel0', 'can0')[at % 2]} 123#{at:02X}\n" for at in range(20)))
+    databases = [tmp_path / "first.dbc", tmp_path / "second.dbc", tmp_path / "third.dbc"]
+    for database, name in zip(databases, ("First", "Second", "Third")):
+        database.write_text(DBC.format(name=name))
+    return log, databases
+
+
+@pytest.mark.filterwarnings("error")
+def test_channels_are_what_the_trace_calls_them(two_channels, tmp_path):
+    log, (first, second, _) = two_channels
+    table = cantap.read(log)
+    assert set(table.to_numpy()["channel"]) == {0, 1} and table.report.channels == [0, 1]
+    assert set(cantap.read(log, channel=0).to_numpy()["channel"]) == {0}
+    assert len(cantap.read(log, channel=[0, 1])) == 20
+    both = {0: first, 1: second}
+    assert cantap.decode(log, both).report.decoded == 20
+    signals = cantap.read(log, db=both).to_pyarrow().select(["channel", "signal"]).to_pylist()
+    assert {(row["channel"], row["signal"]) for row in signals} == {(0, "First"), (1, "Second")}
+    assert len(cantap.search(log, "First > 4 or Second > 4", db=both)) == 15
+    assert {name for one in cantap.decode(table, both).values() for name in one.column_names[3:]} == {"First", "Second"}
+    assert {channel["channel"] for channel in cantap.stats(log, {0: 500_000, 1: 500_000})["channels"]} == {0, 1}
+    # And back into a trace.
+    cantap.write(table, tmp_path / "again.log")
+    assert cantap.read(tmp_path / "again.log").to_pyarrow() == table.to_pyarrow()
+
+
+def test_a_channel_that_the_trace_does_not_have_is_named_in_a_warning(two_channels):
+    log, (first, second, third) = two_channels
+    missing = {1: first, 2: second}
+    with pytest.warns(cantap.CantapWarning, match="two.log: db= names channel 2, which it does not have; it has 0 and 1"):
+        assert cantap.decode(log, missing).report.decoded == 10
+    with pytest.warns(cantap.CantapWarning, match="db= names channel 2, "):
+        cantap.read(log, db=missing)
+    with pytest.warns(cantap.CantapWarning, match="the table: db= names channel 2, "):
+        cantap.decode(cantap.read(log), missing)
+    with pytest.warns(cantap.CantapWarning, match="db= names channels 2 and 3, "):
+        cantap.search(log, "First > 3", db={1: first, 2: second, 3: third})
+    with pytest.warns(cantap.CantapWarning, match="channel= names channel 7, "):
+        assert len(cantap.read(log, channel=[0, 7])) == 10
+    with pytest.warns(cantap.CantapWarning, match="bitrate= names channel 2, "):
+        cantap.stats(log, {2: 500_000})

@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 
 import pytest
@@ -84,6 +85,102 @@ def test_filters_hold_from_the_first_message_on_and_can_be_changed(pair):
         assert bus.recv(10).arbitration_id == 0x321
 
 
+ONE = [{"can_id": 0x100, "can_mask": 0x7FF, "extended": False}]
+OTHER = [{"can_id": 0x200, "can_mask": 0x7FF, "extended": False}]
+
+
+def identifiers(bus):
+    """Of all messages that wait, or arrive within a moment."""
+    return [found.arbitration_id for found in iter(lambda: bus.recv(0.2), None) if not found.is_error_frame]
+
+
+@pytest.mark.parametrize("listen_only", [True, False])
+def test_filters_can_be_widened(pair, listen_only):
+    first, second = pair
+    second.shutdown()
+    options = {"channel": f"{QUIET}:2", "bitrate": 500_000, "listen_only": listen_only}
+    with can.Bus(interface="cantap", can_filters=ONE, **options) as bus:
+        for wanted, passing in ((ONE, [0x100]), (ONE + OTHER, [0x100, 0x200]), (None, [0x100, 0x200, 0x300]), (OTHER, [0x200])):
+            bus.set_filters(wanted)
+            for identifier in (0x100, 0x200, 0x300):
+                first.send(message(identifier))
+            assert identifiers(bus) == passing
+
+
+@pytest.mark.parametrize("listen_only", [True, False])
+def test_each_bus_object_of_a_channel_has_its_own_filters(pair, listen_only):
+    first, second = pair
+    second.shutdown()
+    options = {"interface": "cantap", "channel": f"{QUIET}:2", "bitrate": 500_000, "listen_only": listen_only}
+    with (
+        can.Bus(can_filters=ONE, **options) as narrow,
+        can.Bus(can_filters=OTHER, **options) as other,
+        can.Bus(**options) as wide,
+    ):
+        for identifier in (0x100, 0x200, 0x300):
+            first.send(message(identifier))
+        assert identifiers(narrow) == [0x100] and identifiers(other) == [0x200]
+        assert identifiers(wide) == [0x100, 0x200, 0x300]
+        # Narrowing one, or its end, takes nothing from the others.
+        narrow.set_filters(OTHER)
+        other.shutdown()
+        for identifier in (0x100, 0x200, 0x300):
+            first.send(message(identifier))
+        assert identifiers(narrow) == [0x200] and identifiers(wide) == [0x100, 0x200, 0x300]
+
+
+def test_opening_a_channel_anew_for_a_wider_filter_is_a_loss_in_every_stream(pair):
+    """The hardware cannot be given other filters while a channel is open, so a moment of the bus is missed."""
+    _, second = pair
+    second.shutdown()
+    options = {"interface": "cantap", "channel": f"{QUIET}:2", "bitrate": 500_000, "listen_only": True}
+    with can.Bus(can_filters=ONE, **options) as bus, can.Bus(can_filters=ONE, **options) as narrower:
+        assert narrower.recv(0.2) is None and bus.recv(0) is None
+        narrower.set_filters(None)
+        for one in (bus, narrower):
+            lost = one.recv(10)
+            assert lost.is_error_frame and lost.arbitration_id & 0x04 and lost.data[1] == 0x01
+        # It is wide now.
+        bus.set_filters(OTHER)
+        assert bus.recv(0.2) is None and narrower.recv(0) is None
+
+
+def test_what_waits_must_pass_new_filters_as_well(pair):
+    first, second = pair
+    for identifier in (0x100, 0x200, 0x300):
+        first.send(message(identifier), timeout=10)
+    # The others have come with it.
+    assert second.recv(10).arbitration_id == 0x100
+    second.set_filters([{"can_id": 0x300, "can_mask": 0x7FF}])
+    assert identifiers(second) == [0x300]
+
+
+def hears(open_bus):
+    """What each of three Bus objects on one channel receives of messages that the first two send, and whether as received."""
+    with open_bus() as first, open_bus(receive_own_messages=True) as second, open_bus(can_filters=ONE) as third:
+        first.send(message(0x100))
+        first.send(message(0x300))
+        second.send(message(0x200))
+        task = first.send_periodic(message(0x100, b"\x07"), 0.01, duration=0.03)
+        time.sleep(0.3)
+        task.stop()
+        found = []
+        for bus in (first, second, third):
+            heard = list(iter(lambda bus=bus: bus.recv(0.2), None))
+            found.append(sorted((one.arbitration_id, bytes(one.data), one.is_rx) for one in heard))
+    return found
+
+
+def test_bus_objects_on_one_channel_hear_each_other_as_on_python_cans_virtual_interface():
+    with can.Bus(interface="cantap", channel=f"{QUIET}:2", bitrate=500_000):
+        ours = hears(lambda **options: can.Bus(interface="cantap", channel=f"{QUIET}:1", bitrate=500_000, **options))
+    theirs = hears(lambda **options: can.Bus(interface="virtual", channel="hears", **options))
+    assert [sorted(set(one)) for one in ours] == [sorted(set(one)) for one in theirs]
+    assert ours[0] == [(0x200, b"\x01\x02", True)]
+    assert (0x200, b"\x01\x02", False) in ours[1] and (0x100, b"\x01\x02", True) in ours[1]
+    assert ours[2] == [(0x100, b"\x01\x02", True)] + 3 * [(0x100, b"\x07", True)]
+
+
 def test_a_filter_that_no_identifier_passes_lets_none_pass(pair):
     first, second = pair
     second.set_filters([{"can_id": 0x10000, "can_mask": 0x1FFFFFFF, "extended": False}])
@@ -155,12 +252,67 @@ def test_python_can_before_4_5_starts_periodic_messages_too(pair, monkeypatch):
 def test_what_the_device_cannot_repeat_a_thread_does(pair):
     first, second = pair
     task = first.send_periodic([message(data=b"\x01"), message(data=b"\x02")], 0.01)
-    assert isinstance(task, can.broadcastmanager.ThreadBasedCyclicSendTask)
+    assert type(task).__name__ == "HostCyclicTask"
     assert {bytes(second.recv(10).data) for _ in range(6)} == {b"\x01", b"\x02"}
     task.stop()
     many = [first.send_periodic(message(), 10) for _ in range(40)]
     kinds = {type(one).__name__ for one in many}
-    assert kinds == {"DeviceCyclicTask", "ThreadBasedCyclicSendTask"}
+    assert kinds == {"DeviceCyclicTask", "HostCyclicTask"}
+
+
+def test_more_periodic_messages_than_the_device_has_room_for_take_one_thread_and_end_in_silence(caplog, capfd):
+    with (
+        can.Bus(interface="cantap", channel=f"{QUIET}:1", bitrate=500_000) as first,
+        can.Bus(interface="cantap", channel=f"{QUIET}:2", bitrate=500_000) as second,
+    ):
+        threads = threading.active_count()
+        for number in range(60):
+            first.send_periodic(message(0x200 + number), 0.02)
+        turns = first.send_periodic([message(0x100, b"\x01"), message(0x100, b"\x02")], 0.02)
+        changed = first.send_periodic(message(0x101, b"\x00"), 0.02, modifier_callback=count_up)
+        assert threading.active_count() == threads + 1
+        wanted = {0x200 + number for number in range(60)} | {0x100, 0x101}
+        heard, data = set(), {0x100: [], 0x101: []}
+        while heard != wanted or any(len(of) < 4 for of in data.values()):
+            found = second.recv(10)
+            heard.add(found.arbitration_id)
+            data.get(found.arbitration_id, []).append(found.data[0])
+        assert data[0x100][:4] == [1, 2, 1, 2] and data[0x101][:4] == [1, 2, 3, 4]
+        turns.modify_data([message(0x100, b"\x03"), message(0x100, b"\x04")])
+        assert any(found.data[0] == 4 for found in iter(lambda: second.recv(10), None) if found.arbitration_id == 0x100)
+        changed.stop()
+        first.shutdown()
+        assert threading.active_count() == threads
+        # What was on its way, and then nothing.
+        assert any(second.recv(0.3) is None for _ in range(10_000))
+    assert not caplog.records and "Traceback" not in "".join(capfd.readouterr())
+
+
+def count_up(found):
+    found.data[0] += 1
+
+
+def test_a_periodic_message_that_cannot_be_sent_stops_alone(pair, caplog):
+    first, second = pair
+
+    def fails(found):
+        raise RuntimeError("no more of it")
+
+    first.send_periodic(message(0x100), 0.01, modifier_callback=fails)
+    going = first.send_periodic([message(0x101)] * 2, 0.01)
+    assert all(second.recv(10).arbitration_id == 0x101 for _ in range(10))
+    assert [record.getMessage() for record in caplog.records] == ["periodic message 100 stopped: no more of it"]
+    going.stop()
+
+
+def test_a_full_queue_leaves_periodic_messages_out_instead_of_stopping_them():
+    with can.Bus(interface="cantap", channel="virtual:load=0,ack=no", bitrate=500_000) as bus:
+        bus.send_periodic([message(0x100), message(0x100)], 0.0005)
+        time.sleep(0.5)
+        begin = time.monotonic()
+        bus.shutdown()
+        # Not after the time for which a message waits for room.
+        assert time.monotonic() - begin < 5
 
 
 def test_the_state_is_the_controllers():

@@ -53,6 +53,12 @@ BO_ 417 Motion: 8 ABS
 BO_ 2566834689 Climate: 8 ABS
  SG_ Cabin : 0|8@1+ (0.5,-40) [-40|85] "degC" ABS
 """
+OTHER_DBC = """\
+VERSION ""
+BU_: ABS
+BO_ 418 Nothing: 8 ABS
+ SG_ Unseen : 0|8@1+ (1,0) [0|255] "" ABS
+"""
 FACTORS = {"a": 0.01, "b": 0.05}
 
 
@@ -147,7 +153,8 @@ def fleet(tmp_path_factory):
             frames = frames_of(vehicle, number)
             write(path, frames)
             whole[f"{name}/{path.name}"] = frames
-    table.append("baddb,,databases/broken.dbc,500000")
+    (folder / "databases" / "other.dbc").write_text(OTHER_DBC)
+    table += ["baddb,,databases/broken.dbc,500000", "wrongdb,,databases/other.dbc,500000"]
     (folder / "vehicles.csv").write_text("\n".join(table) + "\n")
     broken = break_some(folder)
     # We see it, although Spark's own sources would hide it.
@@ -160,6 +167,7 @@ def break_some(folder: Path) -> dict[str, tuple[str, int | None]]:
     """Traces that are cut, damaged, refused, empty, or never end."""
     (folder / "odd").mkdir()
     (folder / "baddb").mkdir()
+    (folder / "wrongdb").mkdir()
     frames = frames_of(1, 0)
     text = candump(frames)
     lines = text.splitlines(keepends=True)
@@ -183,7 +191,11 @@ def break_some(folder: Path) -> dict[str, tuple[str, int | None]]:
     put("odd/README.txt", b"Nobody should have put this here.\n", "refused", 0)
     put("odd/empty.log", b"", "empty", 0)
     put("in no folder.log", text.encode(), "refused", 0)
-    put("baddb/drive.log", text.encode(), "refused", 0)
+    # Databases that cannot be used, or are another vehicle's, cost signals only.
+    put("baddb/drive.log", text.encode(), "undecoded", len(frames))
+    put("wrongdb/drive.log", text.encode(), "undecoded", len(frames))
+    cut = "".join(lines[:100]).encode() + lines[100].encode()[:22]
+    put("wrongdb/cut.log", cut, "cut", 100)
     # Opening it waits for somebody to write.
     os.mkfifo(folder / "odd" / "hangs.log")
     broken["odd/hangs.log"] = ("failed", 0)
@@ -253,6 +265,12 @@ def test_each_input_has_an_entry_that_says_what_became_of_it(fleet, output):
             assert entry["frames"] == frames, entry
     assert ledger["odd/damaged.log"]["issues"] == 3
     assert "databases/broken.dbc" in ledger["baddb/drive.log"]["problem"]
+    assert "other.dbc has a message for none of its frames" in ledger["wrongdb/drive.log"]["problem"]
+    assert "other.dbc" in ledger["wrongdb/cut.log"]["problem"]
+    for trace in ("baddb/drive.log", "wrongdb/drive.log", "wrongdb/cut.log"):
+        assert (ledger[trace]["coverage"], ledger[trace]["decoded"], ledger[trace]["signal_rows"]) == (0, 0, 0)
+    assert {ledger[trace]["coverage"] for trace in fleet.whole if not trace.startswith("odd/")} == {0.6}
+    assert ledger["odd/_begins with a line.log"]["coverage"] is None
     assert "within 10 s" in ledger["odd/hangs.log"]["problem"]
     # Names as the user gave them, without a worker's folders.
     assert all(str(fleet.folder) not in str(entry) and "/tmp" not in str(entry) for entry in ledger.values())

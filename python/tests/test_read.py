@@ -200,7 +200,7 @@ def test_what_cannot_be_read_is_an_error(tmp_path, log, dbc):
         {"zone": "Mars/Olympus"},
         {"filter": "xyz:"},
         {"start": "noon"},
-        {"channel": 0},
+        {"channel": -1},
         {"channel": 300},
     ],
 )

@@ -5,6 +5,7 @@ import os
 import pathlib
 import socket
 import subprocess
+import sys
 import threading
 import time
 
@@ -40,9 +41,9 @@ def keys(tmp_path):
     return folder
 
 
-def serving(*arguments):
+def serving(*arguments, device="virtual:load=50,wire=joined"):
     """Starts a server; it and its address."""
-    command = [COMMAND, "serve", "-d", "virtual:load=50,wire=joined", "-b", "500k", "--allow", "send", *arguments]
+    command = [COMMAND, "serve", "-d", device, "-b", "500k", "--allow", "send", *arguments]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True)
     heard = []
     for line in process.stderr:
@@ -82,6 +83,13 @@ def test_a_server_that_is_started_again_is_reached_again():
     with pytest.raises(can.CanOperationError, match="vanished"):
         while bus.recv(10):
             pass
+    # Not only once: whoever iterates again would wait for ever, or take it for the end.
+    for again in (lambda: device.read(1), lambda: next(iter(device)), lambda: list(device), lambda: device.batch(1)):
+        with pytest.raises(cantap.DeviceError, match="vanished"):
+            again()
+    for again in (lambda: bus.recv(1), lambda: next(iter(bus))):
+        with pytest.raises(can.CanOperationError, match="vanished"):
+            again()
     server, _ = serving("--tcp", address.removeprefix("tcp://"))
     try:
         # Although the old object is still there.
@@ -91,6 +99,39 @@ def test_a_server_that_is_started_again_is_reached_again():
         device.close()
         with cantap.open(address, 500_000) as device:
             assert device.read(10) is not None
+    finally:
+        server.kill()
+        server.communicate(timeout=30)
+
+
+def test_bus_objects_of_several_programs_hear_each_other_through_a_server():
+    can = pytest.importorskip("can")
+    server, address = serving("--tcp", "127.0.0.1:0", device="virtual:load=0,wire=joined")
+    hears = """if True:
+        import can, sys
+        with can.Bus(interface="cantap", channel=sys.argv[1], bitrate=500_000,
+                     can_filters=[{"can_id": 0x100, "can_mask": 0x7FF}]) as bus:
+            print("ready", flush=True)
+            for _ in range(2):
+                heard = bus.recv(30)
+                print(f"{heard.arbitration_id:X}", heard.is_rx, flush=True)
+            bus.send(can.Message(arbitration_id=0x555, is_extended_id=False), timeout=10)
+    """
+    try:
+        command = [sys.executable, "-c", hears, f"{address}:1"]
+        with (
+            can.Bus(interface="cantap", channel=f"{address}:1", bitrate=500_000) as first,
+            can.Bus(interface="cantap", channel=f"{address}:1", bitrate=500_000) as second,
+            subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other,
+        ):
+            assert other.stdout.readline() == "ready\n"
+            for identifier in (0x100, 0x200):
+                first.send(can.Message(arbitration_id=identifier, is_extended_id=False), timeout=10)
+            second.send(can.Message(arbitration_id=0x100, is_extended_id=False), timeout=10)
+            assert other.communicate(timeout=60)[0] == "100 True\n100 True\n"
+            assert [first.recv(10).arbitration_id for _ in range(2)] == [0x100, 0x555]
+            heard = [second.recv(10) for _ in range(3)]
+            assert [one.arbitration_id for one in heard] == [0x100, 0x200, 0x555] and all(one.is_rx for one in heard)
     finally:
         server.kill()
         server.communicate(timeout=30)

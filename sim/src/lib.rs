@@ -14,11 +14,14 @@ pub mod board;
 pub mod capture;
 pub mod drive;
 pub mod firmware;
+pub mod hostile;
 pub mod link;
+pub mod locks;
 #[cfg(unix)]
 pub mod pty;
 pub mod rig;
 pub mod run;
+pub mod soak;
 pub mod stream;
 pub mod usbip;
 

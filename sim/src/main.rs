@@ -15,7 +15,9 @@ use cantap_emu::usb_host::Timing;
 use cantap_sim::CYCLES_PER_SECOND;
 use cantap_sim::board::CLOCK;
 use cantap_sim::firmware::{self, FirmwareError};
+use cantap_sim::hostile;
 use cantap_sim::run::{self, Load, Options, Report};
+use cantap_sim::soak;
 use cantap_wire::Channel;
 use clap::{Parser, Subcommand};
 
@@ -40,8 +42,23 @@ struct Cli {
 enum Command {
     /// Put traffic on the buses, capture it over USB and check every frame.
     Run(Args),
+    /// Capture for hours: both channels full, with stalls, requests and replays in turn; reports memory, stamps and the device's clock.
+    Soak(SoakArgs),
     /// Serve the board to a kernel as a USB device, by USB/IP or usbredir.
     Usbip(UsbipArgs),
+}
+
+/// The command line of `soak`.
+#[derive(clap::Args)]
+struct SoakArgs {
+    /// The firmware's ELF, as `cargo xtask firmware` makes it.
+    firmware: PathBuf,
+    /// Emulated time; the round of turns under way is finished.
+    #[arg(long, default_value = "3600s", value_parser = some_seconds)]
+    seconds: Duration,
+    /// Seed of the traffic.
+    #[arg(long, default_value = "1")]
+    seed: u64,
 }
 
 /// The command line of `usbip`.
@@ -110,6 +127,13 @@ pub struct Args {
     /// Print where the core's cycles go, by interrupt and function.
     #[arg(long, conflicts_with = "json")]
     profile: bool,
+    /// Make the silicon late, wrong or silent and the host misbehave, as this seed says, in place of a capture; then check that the
+    /// device is back, silent unless asked, and has delivered or counted every frame.
+    #[arg(long, value_name = "SEED", conflicts_with_all = ["stall", "replay", "trace", "profile", "pty"])]
+    hostile: Option<u64>,
+    /// With --hostile: try this many seeds, one after the other.
+    #[arg(long, value_name = "COUNT", default_value = "1", requires = "hostile")]
+    trials: u64,
     /// Serve the device on a pseudo-terminal, whose name is printed, rather than capture from it. Time stands
     /// still while the client does not read.
     #[arg(long, conflicts_with_all = ["stall", "json", "trace", "profile"])]
@@ -158,6 +182,7 @@ fn percent(text: &str) -> Result<f64, String> {
 fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Run(args) => run(&args),
+        Command::Soak(args) => soak(&args),
         Command::Usbip(args) => usbip(&args),
     };
     match result {
@@ -181,12 +206,22 @@ fn usbip(args: &UsbipArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
+fn soak(args: &SoakArgs) -> anyhow::Result<ExitCode> {
+    let image = open(&args.firmware)?;
+    let soak = soak::run(image, args.seconds.as_secs_f64(), args.seed, |line| eprintln!("{line}"))?;
+    println!("{}", soak.to_json());
+    Ok(if soak.faults.is_empty() { ExitCode::SUCCESS } else { ExitCode::from(CHECK_FAILED) })
+}
+
 fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let image = open(&args.firmware)?;
     let options = options(args)?;
     if args.pty {
         serve::pty(image, options, args.seconds, args.real_time)?;
         return Ok(ExitCode::SUCCESS);
+    }
+    if let Some(seed) = args.hostile {
+        return trials(&image, seed, args.trials, args.json);
     }
     // Before the run, so that a file that cannot be written does not waste it.
     let trace_file = args.trace.as_deref().map(create).transpose()?;
@@ -202,6 +237,34 @@ fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // If the pipe is closed, its reader has seen enough.
     printed.or_else(|error| if error.kind() == io::ErrorKind::BrokenPipe { Ok(()) } else { Err(error) })?;
     Ok(if report.ok { ExitCode::SUCCESS } else { ExitCode::from(CHECK_FAILED) })
+}
+
+/// Runs hostile trials and prints those that failed; of a single one, everything that happened.
+fn trials(image: &Image, first: u64, count: u64, json: bool) -> anyhow::Result<ExitCode> {
+    let (mut failed, mut delivered, mut lost) = (0, 0, 0);
+    for seed in first..first.saturating_add(count) {
+        let trial = hostile::try_seed(image.clone(), seed);
+        delivered += trial.delivered;
+        lost += trial.lost;
+        failed += u64::from(!trial.faults.is_empty());
+        if json || count > 1 && trial.faults.is_empty() {
+            continue;
+        }
+        println!("seed {seed}: {}", if trial.faults.is_empty() { "every check held" } else { "FAILED" });
+        if count == 1 {
+            trial.story.iter().for_each(|event| println!("  {event}"));
+        }
+        trial.faults.iter().for_each(|fault| println!("  FAULT: {fault}"));
+    }
+    if json {
+        let sum = serde_json::json!({ "seed": first, "trials": count, "failed": failed, "delivered": delivered, "lost": lost });
+        println!("{sum}");
+    } else {
+        println!(
+            "{count} trials from seed {first}: {failed} failed; {delivered} frames delivered, {lost} counted lost"
+        );
+    }
+    Ok(if failed == 0 { ExitCode::SUCCESS } else { ExitCode::from(CHECK_FAILED) })
 }
 
 fn create(path: &Path) -> anyhow::Result<BufWriter<File>> {

@@ -14,6 +14,7 @@ use cantap_emu::elf::Image;
 use cantap_emu::machine::{Machine, Setup};
 use cantap_emu::memory_map as map;
 use cantap_emu::otg::Otg;
+use cantap_emu::soc::rcc::Crystal;
 use cantap_emu::stop::Stopped;
 use cantap_emu::usb::UsbPort;
 use cantap_emu::usb_host::{self, EnumerationError, Timing, UsbHost};
@@ -22,7 +23,7 @@ use cantap_emu::usb_host::{self, EnumerationError, Timing, UsbHost};
 pub const MS: u64 = 1000 * CYCLES_PER_US;
 /// How long a device may take from plugging in to a configured port.
 const ENUMERATION_TIMEOUT: u64 = 3 * CYCLES_PER_SECOND;
-/// How long a request may take.
+/// How long a request may take, unless [`Rig::be_patient_for`] says otherwise.
 const REQUEST_TIMEOUT: u64 = CYCLES_PER_SECOND;
 /// A stream that has been silent for this long has ended.
 const SILENCE: u64 = 20 * MS;
@@ -98,13 +99,23 @@ pub struct Rig {
     /// Bits of frames on each bus, with intermission, while it was booked.
     bus_bits: [u64; CHANNELS],
     recording: Option<Vec<u8>>,
+    /// How long a request may take.
+    patience: u64,
 }
 
 impl Rig {
     /// A board with `image` and the cable out.
     pub fn new(image: Image, setup: Setup, timing: Timing) -> Self {
-        let mut machine = Machine::new(image, setup);
-        let usb = Arc::new(Mutex::new(UsbPort::new(timing)));
+        Self::on(Machine::new(image, setup), setup, timing)
+    }
+
+    /// The same with a machine that was made with this `setup`.
+    pub fn on(mut machine: Machine, setup: Setup, timing: Timing) -> Self {
+        let mut usb = UsbPort::new(timing);
+        if let Some(hostile) = &setup.hostile {
+            usb.otg_mut().set_hostile(hostile, CLOCK);
+        }
+        let usb = Arc::new(Mutex::new(usb));
         machine.attach(map::OTG_FS, map::OTG_FS_IRQ, Arc::clone(&usb) as _);
         Self {
             machine,
@@ -121,6 +132,7 @@ impl Rig {
             watched: None,
             bus_bits: [0; CHANNELS],
             recording: None,
+            patience: REQUEST_TIMEOUT,
         }
     }
 
@@ -136,6 +148,24 @@ impl Rig {
         let mut usb = self.usb.lock().unwrap_or_else(PoisonError::into_inner);
         let (host, otg) = usb.host(now);
         action(host, otg)
+    }
+
+    /// Ends what `Setup::hostile` began: from now on the chip is prompt and true.
+    pub fn calm(&mut self) {
+        self.machine.board().calm();
+        self.with_host(|_, otg| otg.calm());
+    }
+
+    /// The board's crystal stops, or starts again: see [`Machine::set_crystal`].
+    pub fn set_crystal(&mut self, crystal: Crystal) {
+        if self.machine.set_crystal(crystal) {
+            self.with_host(|_, otg| otg.die());
+        }
+    }
+
+    /// Waits for answers to requests for at most `cycles` from now on.
+    pub fn be_patient_for(&mut self, cycles: u64) {
+        self.patience = cycles;
     }
 
     /// Runs for `cycles`, and collects what the buses carried and the device sent.
@@ -282,13 +312,13 @@ impl Rig {
         let (id, bytes) = self.session.request(command);
         self.with_host(|host, _| host.send(&bytes));
         let mut response = None;
-        self.run_while(REQUEST_TIMEOUT, |rig| {
+        self.run_while(self.patience, |rig| {
             response = rig.session.response(id);
             response.is_none()
         })?;
         response.ok_or_else(|| RigError::NoAnswer {
             command: name,
-            millis: REQUEST_TIMEOUT / MS,
+            millis: self.patience / MS,
             silent_ms: (self.now() - self.last_bytes_at) / MS,
         })
     }
@@ -404,6 +434,11 @@ impl Rig {
     /// Events that the device reported, with their device times.
     pub fn events(&self) -> &[(u64, Event)] {
         &self.events
+    }
+
+    /// Takes the events reported so far.
+    pub fn take_events(&mut self) -> Vec<(u64, Event)> {
+        std::mem::take(&mut self.events)
     }
 
     /// When, by its own clock, the device ended the session on its own, and why.

@@ -14,7 +14,7 @@
 use stm32f4xx_hal::gpio::{GpioExt, PC1, PinState};
 use stm32f4xx_hal::rcc::Rcc;
 
-use super::{Led, Leds, Port, Ports, ReceivePin, fast};
+use super::{Connected, Led, Leds, Port, Ports, ReceivePin, TransmitPin};
 
 /// Name of the board, as in `Hello`.
 pub const NAME: &str = "feather-f405";
@@ -25,8 +25,11 @@ pub const HSE_MHZ: u32 = 12;
 pub const RECEIVE_PINS: [ReceivePin; 2] =
     [ReceivePin { port: Port::B, pin: 8 }, ReceivePin { port: Port::B, pin: 12 }];
 
-/// Connects pins and peripherals.
-pub fn connect(ports: Ports, rcc: &mut Rcc) -> Leds {
+/// Whether USB's VBUS is on PA9, according to the sources: no.
+pub const SENSES_VBUS: bool = false;
+
+/// Connects pins and peripherals. Each channel's TX is left to its controller.
+pub fn connect(ports: Ports, rcc: &mut Rcc) -> Connected {
     let a = ports.a.split(rcc);
     let b = ports.b.split(rcc);
     let c = ports.c.split(rcc);
@@ -35,11 +38,15 @@ pub fn connect(ports: Ports, rcc: &mut Rcc) -> Leds {
     a.pa12.into_alternate::<10>();
     // The pull-ups make an input without a transceiver read recessive.
     b.pb8.into_alternate::<9>().internal_pull_up(true);
-    fast(b.pb9.into_alternate::<9>());
     b.pb12.into_alternate::<9>().internal_pull_up(true);
-    fast(b.pb13.into_alternate::<9>());
 
-    led(c.pc1)
+    Connected {
+        leds: led(c.pc1),
+        transmit: [
+            TransmitPin::B9(b.pb9.into_pull_up_input()),
+            TransmitPin::B13(b.pb13.into_pull_up_input()),
+        ],
+    }
 }
 
 /// Connects the LED only.

@@ -9,16 +9,16 @@ mod olimex_p405;
 mod stm32f4_discovery;
 
 #[cfg(feature = "feather-f405")]
-pub use feather_f405::{HSE_MHZ, NAME, RECEIVE_PINS, connect, leds};
+pub use feather_f405::{HSE_MHZ, NAME, RECEIVE_PINS, SENSES_VBUS, connect, leds};
 #[cfg(feature = "olimex-p405")]
-pub use olimex_p405::{HSE_MHZ, NAME, RECEIVE_PINS, connect, leds};
+pub use olimex_p405::{HSE_MHZ, NAME, RECEIVE_PINS, SENSES_VBUS, connect, leds};
 #[cfg(feature = "stm32f4-discovery")]
-pub use stm32f4_discovery::{HSE_MHZ, NAME, RECEIVE_PINS, connect, leds};
+pub use stm32f4_discovery::{HSE_MHZ, NAME, RECEIVE_PINS, SENSES_VBUS, connect, leds};
 
 #[cfg(not(any(feature = "olimex-p405", feature = "feather-f405", feature = "stm32f4-discovery")))]
 compile_error!("choose a board: --features olimex-p405, feather-f405 or stm32f4-discovery");
 
-use stm32f4xx_hal::gpio::{AnyPin, Output, PinSpeed, PinState, Speed};
+use stm32f4xx_hal::gpio::{self, AnyPin, Output, PinSpeed, PinState, Speed};
 use stm32f4xx_hal::pac;
 
 /// The chip's ports that boards use.
@@ -54,10 +54,61 @@ pub struct ReceivePin {
     pub pin: u8,
 }
 
-/// A CAN controller's TX pin, whose edges must take next to nothing of the shortest bit, 1 µs: at the lowest speed, the default
-/// after a reset, an edge may take 100 ns (STM32F405 data sheet, "I/O AC characteristics"), and rising and falling edges differ.
+/// A CAN controller's TX pin that is not connected to it yet: an input with a pull-up, which the transceiver reads as recessive.
+///
+/// On a live bus, what a controller does while it is reset or has no clock must not reach the pin. On an STM32F107, TX was seen to be stuck
+/// dominant after about one in ten resets by RCC in silent mode (libcyphal, pull request 69).
+pub enum TransmitPin {
+    /// PB6.
+    #[cfg(feature = "olimex-p405")]
+    B6(gpio::PB6),
+    /// PB9.
+    #[cfg(any(feature = "olimex-p405", feature = "feather-f405"))]
+    B9(gpio::PB9),
+    /// PB13.
+    #[cfg(any(feature = "feather-f405", feature = "stm32f4-discovery"))]
+    B13(gpio::PB13),
+    /// PD1.
+    #[cfg(feature = "stm32f4-discovery")]
+    D1(gpio::PD1),
+}
+
+impl TransmitPin {
+    /// Connects it to its controller, which must be in initialisation mode: TX is recessive then (RM0090, "Initialization mode").
+    pub fn connect(self) {
+        match self {
+            #[cfg(feature = "olimex-p405")]
+            Self::B6(pin) => {
+                fast(pin.into_alternate::<9>());
+            }
+            #[cfg(any(feature = "olimex-p405", feature = "feather-f405"))]
+            Self::B9(pin) => {
+                fast(pin.into_alternate::<9>());
+            }
+            #[cfg(any(feature = "feather-f405", feature = "stm32f4-discovery"))]
+            Self::B13(pin) => {
+                fast(pin.into_alternate::<9>());
+            }
+            #[cfg(feature = "stm32f4-discovery")]
+            Self::D1(pin) => {
+                fast(pin.into_alternate::<9>());
+            }
+        }
+    }
+}
+
+/// The edges of a TX pin must take next to nothing of the shortest bit, 1 µs: at the lowest speed, the default after a reset, an
+/// edge may take 100 ns (STM32F405 data sheet, "I/O AC characteristics"), and rising and falling edges differ.
 fn fast<P: PinSpeed>(pin: P) -> P {
     pin.speed(Speed::High)
+}
+
+/// What a board's pins lead to.
+pub struct Connected {
+    /// The LEDs.
+    pub leds: Leds,
+    /// Each channel's TX.
+    pub transmit: [TransmitPin; 2],
 }
 
 /// An LED and the level that lights it.

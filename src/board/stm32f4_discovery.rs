@@ -10,12 +10,13 @@
 //!   channel 2's TX here, too.
 //! - NuttX `boards/arm/stm32/stm32f4discovery/src/stm32f4discovery.h`: PC0 switches on 5 V to the USB connector, for
 //!   use as a host; ST's generated code for the board sets it high, which is off.
+//! - MicroPython `ports/stm32/boards/STM32F4DISC/mpconfigboard.h`: PA9 detects USB's VBUS.
 //! - stm32f4xx-hal 0.23 `src/gpio/alt/f4.rs`: AF9 is CAN1 on PD0/PD1 and CAN2 on PB12/PB13.
 
 use stm32f4xx_hal::gpio::{GpioExt, PD12, PD13, PD14, PinState};
 use stm32f4xx_hal::rcc::Rcc;
 
-use super::{Led, Leds, Port, Ports, ReceivePin, fast};
+use super::{Connected, Led, Leds, Port, Ports, ReceivePin, TransmitPin};
 
 /// Name of the board, as in `Hello`.
 pub const NAME: &str = "stm32f4-discovery";
@@ -26,8 +27,12 @@ pub const HSE_MHZ: u32 = 8;
 pub const RECEIVE_PINS: [ReceivePin; 2] =
     [ReceivePin { port: Port::D, pin: 0 }, ReceivePin { port: Port::B, pin: 12 }];
 
-/// Connects pins and peripherals.
-pub fn connect(ports: Ports, rcc: &mut Rcc) -> Leds {
+/// Whether USB's VBUS is on PA9, which is left an input as after a reset: yes, and it is sensed. The board is powered by its other connector, the debugger's: without
+/// sensing it would pull the USB line up with no host there (USB 2.0, 7.1.5: not before VBUS is present).
+pub const SENSES_VBUS: bool = true;
+
+/// Connects pins and peripherals. Each channel's TX is left to its controller.
+pub fn connect(ports: Ports, rcc: &mut Rcc) -> Connected {
     let a = ports.a.split(rcc);
     let b = ports.b.split(rcc);
     let c = ports.c.split(rcc);
@@ -37,13 +42,17 @@ pub fn connect(ports: Ports, rcc: &mut Rcc) -> Leds {
     a.pa12.into_alternate::<10>();
     // The pull-ups make an input without a transceiver read recessive.
     d.pd0.into_alternate::<9>().internal_pull_up(true);
-    fast(d.pd1.into_alternate::<9>());
     b.pb12.into_alternate::<9>().internal_pull_up(true);
-    fast(b.pb13.into_alternate::<9>());
     // The host powers the board, not the other way round.
     c.pc0.into_push_pull_output_in_state(PinState::High);
 
-    three(d.pd12, d.pd13, d.pd14)
+    Connected {
+        leds: three(d.pd12, d.pd13, d.pd14),
+        transmit: [
+            TransmitPin::D1(d.pd1.into_pull_up_input()),
+            TransmitPin::B13(b.pb13.into_pull_up_input()),
+        ],
+    }
 }
 
 /// Connects the LEDs only.

@@ -4,11 +4,15 @@
 //! raised the interrupt, so its stamp is its end plus the interrupt's latency. Frames queued behind another, or that arrive
 //! while the FIFO is being drained, ended at some unknown earlier time: their stamps say so, and the host tightens them.
 
+mod gaps;
 mod orders;
+
+pub use orders::Closing;
 
 use cantap_wire::message::ChannelConfig;
 use cantap_wire::record::{ErrorState, LossStage, Stamp, TransmitFailure};
 use cantap_wire::{CHANNELS, Channel, Event, Received};
+use gaps::{Gap, Gaps};
 
 use crate::QUEUE_BYTES;
 use crate::bus::errors::ErrorMonitor;
@@ -18,7 +22,18 @@ use crate::bus::sof::SofMark;
 use crate::bus::time::NEVER;
 use crate::bus::transmit::{Transmitter, TxQueue};
 use crate::lights::Activity;
+use crate::oddities::ChannelOddities;
 use crate::ports::{Clock, Traffic};
+
+/// Times that a drain looks at its FIFO. Two suffice for the three frames of a FIFO and one that arrives meanwhile; as many again, because
+/// the last frame may still be counted while it is being released; and as many again for nothing.
+const LOOKS_PER_DRAIN: usize = 8;
+/// Frames that a drain takes: a FIFO's three, and as many again. More cannot have arrived meanwhile: three more take 141 µs, and no drain is
+/// as long. A FIFO that has more repeats itself.
+const FRAMES_PER_DRAIN: u32 = 6;
+
+/// How often a tick calls [`Capture::on_tick_queues`], each time under a lock of its own: 16 frames that are given up in a millisecond.
+pub const CALLS_PER_TICK: usize = 4;
 
 /// An alarm is never set farther ahead than this, a quarter of the timer's range. When it fires, the next one is set.
 const ALARM_AHEAD_TICKS: u64 = 1 << 30;
@@ -30,6 +45,16 @@ struct ChannelState<'q> {
     abort_reason: TransmitFailure,
     frames: u32,
     overruns: u32,
+    /// Where in the FIFO frames were lost.
+    gaps: Gaps,
+    /// The channel was asked to leave its bus. Its FIFO is left alone until it has, since what a release does in between is not known.
+    closing: bool,
+    /// Since the channel left its bus: frames in its FIFO that have not been taken yet.
+    left: Option<u8>,
+    /// The last drain was given up: the receive interrupt stays silent until the next millisecond.
+    held: bool,
+    /// How often a drain was given up, since the start.
+    drains_given_up: u32,
     errors: ErrorMonitor,
     transmitter: Transmitter<'q>,
 }
@@ -53,6 +78,11 @@ impl<'q, const N: usize> Capture<'q, N> {
                 abort_reason: TransmitFailure::Aborted,
                 frames: 0,
                 overruns: 0,
+                gaps: Gaps::new(),
+                closing: false,
+                left: None,
+                held: false,
+                drains_given_up: 0,
                 errors: ErrorMonitor::new(channel),
                 transmitter: Transmitter::new(channel, queue),
             }
@@ -67,6 +97,9 @@ impl<'q, const N: usize> Capture<'q, N> {
     }
 
     /// Drains the FIFO. `entered` is the clock, read by the receive interrupt before anything else.
+    ///
+    /// Returns whether the FIFO is empty, so that the interrupt may come again. If the FIFO does not release its frames, or repeats them, the
+    /// interrupt would come at once and for ever, and nothing below it would run: it must stay silent until [`Self::on_tick_receive`].
     #[inline]
     pub fn on_receive(
         &mut self,
@@ -74,30 +107,94 @@ impl<'q, const N: usize> Capture<'q, N> {
         traffic: &mut impl Traffic,
         clock: &impl Clock,
         entered: u32,
-    ) {
+    ) -> bool {
+        self.drain(channel, traffic, clock, Some(entered))
+    }
+
+    /// Part of [`Self::on_tick`]: drains a FIFO whose last drain was given up. Returns whether the receive interrupt, which was left silent
+    /// then, may come again.
+    pub fn on_tick_receive(
+        &mut self,
+        channel: Channel,
+        traffic: &mut impl Traffic,
+        clock: &impl Clock,
+    ) -> bool {
+        let now = self.recorder.time(clock.now());
         let state = &mut self.channels[channel.index()];
+        if state.held && state.closing && traffic.take_overrun() {
+            state.gaps.overrun(traffic);
+            Self::record_gap(state, &mut self.recorder, channel, now);
+        }
+        state.held && !state.closing && self.drain(channel, traffic, clock, None)
+    }
+
+    /// Records that frames are missing before the next one in the FIFO, if they are.
+    #[inline]
+    fn record_gap(state: &mut ChannelState<'_>, recorder: &mut Recorder<'_, N>, channel: Channel, at: u64) {
+        match state.gaps.here() {
+            Gap::None => {}
+            Gap::Certain => Self::lose(state, recorder, channel, 1, at),
+            Gap::Possible => Self::lose(state, recorder, channel, 0, at),
+        }
+    }
+
+    /// Records that a controller lost this many frames, or more.
+    fn lose(
+        state: &mut ChannelState<'_>,
+        recorder: &mut Recorder<'_, N>,
+        channel: Channel,
+        count: u32,
+        at: u64,
+    ) {
+        state.overruns = state.overruns.wrapping_add(count);
+        recorder.event(&Event::Lost { channel, stage: LossStage::Controller, count, at_least: true }, at);
+    }
+
+    /// Drains the FIFO; without `entered`, nothing is known about when its frames ended. Returns whether it is empty.
+    #[inline]
+    fn drain(
+        &mut self,
+        channel: Channel,
+        traffic: &mut impl Traffic,
+        clock: &impl Clock,
+        entered: Option<u32>,
+    ) -> bool {
+        let state = &mut self.channels[channel.index()];
+        if state.closing {
+            state.held = true;
+            return false;
+        }
         let (omit_data, omit_stamps) = match &state.open {
             Some(config) => (config.omit_data, config.omit_stamps),
             None => (false, false),
         };
-        let mut stamp = entered;
-        let mut first = true;
+        let mut entered = entered;
         let mut reply = false;
-        loop {
+        let mut emptied = false;
+        let mut room = FRAMES_PER_DRAIN;
+        for _ in 0..LOOKS_PER_DRAIN {
             let (pending, overrun) = traffic.look();
             if pending == 0 && !overrun {
+                emptied = true;
                 break;
             }
-            let mut quality = Stamp::Exact;
-            if pending > 1 || !first {
+            let (stamp, quality) = match entered.take() {
+                Some(entered) if pending <= 1 => (entered, Stamp::Exact),
                 // The last frame may have ended after the interrupt was entered.
-                stamp = clock.now();
-                quality = Stamp::UpperBound;
-            }
-            first = false;
+                _ => (clock.now(), Stamp::UpperBound),
+            };
             let at = self.recorder.time(stamp);
-            for _ in 0..pending {
+            if overrun {
+                state.gaps.overrun(traffic);
+                Self::record_gap(state, &mut self.recorder, channel, at);
+            }
+            let is_new = state.gaps.may_be_releasing();
+            let mut taken = 0;
+            for _ in 0..u32::from(pending).min(room) {
                 let Some(frame) = traffic.receive() else { break };
+                room -= 1;
+                taken += 1;
+                let at = if is_new { self.recorder.time(clock.now()) } else { at };
                 state.frames = state.frames.wrapping_add(1);
                 reply |= state.transmitter.on_frame(&frame);
                 let received = Received {
@@ -107,18 +204,23 @@ impl<'q, const N: usize> Capture<'q, N> {
                     data_omitted: omit_data,
                 };
                 self.recorder.frame(&received, at);
+                state.gaps.taken();
+                Self::record_gap(state, &mut self.recorder, channel, at);
             }
-            if overrun {
-                // The FIFO keeps the frames it holds and drops those that follow.
-                state.overruns = state.overruns.wrapping_add(1);
-                let lost = Event::Lost { channel, stage: LossStage::Controller, count: 1, at_least: true };
-                self.recorder.event(&lost, at);
-            }
+            state.gaps.looked(pending, taken, traffic);
+        }
+        state.held = !emptied;
+        if emptied {
+            state.gaps.emptied();
+        }
+        if !emptied {
+            state.drains_given_up = state.drains_given_up.wrapping_add(1);
         }
         if reply {
             let now = self.recorder.time(clock.now());
             state.transmitter.service(traffic, &mut self.recorder, now);
         }
+        emptied
     }
 
     /// A mailbox has finished. `entered` is the clock, read by the transmit interrupt before anything else; `None` if another task of
@@ -275,7 +377,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         let now = self.recorder.time(entered);
         let state = &mut self.channels[channel.index()];
         state.errors.update(traffic, &mut self.recorder, now);
-        Self::give_up_when_off(state, traffic, &mut self.recorder, now);
+        Self::give_up_when_off(state, traffic);
     }
 
     /// The alarm: something is due for transmission.
@@ -305,9 +407,15 @@ impl<'q, const N: usize> Capture<'q, N> {
     /// Once a millisecond: keeps time, reads what no interrupt reports, retries what had no room.
     pub fn on_tick<T: Traffic>(&mut self, traffic: &mut [T; CHANNELS], clock: &impl Clock) {
         for channel in Channel::ALL {
-            if self.on_tick_errors(channel, &mut traffic[channel.index()], clock) {
-                self.on_tick_queues(channel, &mut traffic[channel.index()], clock);
-                self.arm(clock);
+            let traffic = &mut traffic[channel.index()];
+            self.on_tick_receive(channel, traffic, clock);
+            if self.on_tick_errors(channel, traffic, clock) {
+                for _ in 0..CALLS_PER_TICK {
+                    if !self.on_tick_queues(channel, traffic, clock) {
+                        break;
+                    }
+                }
+                self.on_tick_losses(channel, clock);
             }
         }
     }
@@ -319,7 +427,7 @@ impl<'q, const N: usize> Capture<'q, N> {
     }
 
     /// Part of [`Self::on_tick`], for callers that must let the alarm in between the parts: handles a channel's errors. Returns whether
-    /// the channel is open; if it is not, the other part has nothing to do.
+    /// the channel is open; if it is not, the parts that follow have nothing to do.
     pub fn on_tick_errors(
         &mut self,
         channel: Channel,
@@ -333,34 +441,41 @@ impl<'q, const N: usize> Capture<'q, N> {
         }
         state.errors.update(traffic, &mut self.recorder, now);
         state.errors.tick(&mut self.recorder, now);
-        Self::give_up_when_off(state, traffic, &mut self.recorder, now);
+        Self::give_up_when_off(state, traffic);
         true
     }
 
-    /// Part of [`Self::on_tick`]: what a channel sends, and what was lost. Call [`Self::arm`] afterwards.
-    pub fn on_tick_queues(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) {
+    /// Part of [`Self::on_tick`]: what a channel sends. Returns whether to call it again, at most [`CALLS_PER_TICK`] times in all.
+    pub fn on_tick_queues(
+        &mut self,
+        channel: Channel,
+        traffic: &mut impl Traffic,
+        clock: &impl Clock,
+    ) -> bool {
         let now = self.recorder.time(clock.now());
         let state = &mut self.channels[channel.index()];
+        state.transmitter.retry_mailboxes(traffic);
         // Mailboxes that finish meanwhile are left to the interrupt, which knows when they did.
-        state.transmitter.service(traffic, &mut self.recorder, now);
-        state.transmitter.tick(&mut self.recorder, now);
-        self.recorder.tick(now);
+        state.transmitter.service(traffic, &mut self.recorder, now)
     }
 
-    /// A controller that stays bus-off sends nothing more: its queue is given up, frame by frame, and periodic frames wait.
-    fn give_up_when_off(
-        state: &mut ChannelState<'_>,
-        traffic: &mut impl Traffic,
-        recorder: &mut Recorder<'_, N>,
-        now: u64,
-    ) {
+    /// Last part of [`Self::on_tick`]: periods that passed without a frame, and what was lost; sets the alarm.
+    pub fn on_tick_losses(&mut self, channel: Channel, clock: &impl Clock) {
+        let now = self.recorder.time(clock.now());
+        self.channels[channel.index()].transmitter.tick(&mut self.recorder, now);
+        self.recorder.tick(now);
+        self.arm(clock);
+    }
+
+    /// A controller that stays bus-off sends nothing more: its queue is given up, frame by frame, and periodic frames wait. The
+    /// next tick begins with the records.
+    fn give_up_when_off(state: &mut ChannelState<'_>, traffic: &mut impl Traffic) {
         let off = state.errors.status().state == ErrorState::BusOff
             && state.open.is_some_and(|config| config.manual_recovery);
         state.transmitter.set_off(off);
         if off && state.transmitter.pending() > 0 {
             state.abort_reason = TransmitFailure::BusOff;
             state.transmitter.drop_all(TransmitFailure::BusOff, traffic);
-            state.transmitter.on_finished(traffic, recorder, now, state.abort_reason);
         }
     }
 
@@ -413,6 +528,14 @@ impl<'q, const N: usize> Capture<'q, N> {
         let activity = Activity { traffic: new(|seen| seen.0), error: bus_off || new(|seen| seen.1) };
         self.seen = seen;
         activity
+    }
+
+    /// How often each channel's hardware did not do as it should, since the start.
+    pub fn oddities(&self) -> [ChannelOddities; CHANNELS] {
+        self.channels.each_ref().map(|state| ChannelOddities {
+            drains_given_up: state.drains_given_up,
+            mailboxes_stuck: state.transmitter.mailboxes_stuck(),
+        })
     }
 
     /// Bytes in the queue, and the most there ever were.

@@ -12,7 +12,7 @@ use cantap_wire::{Channel, Event, Frame};
 use heapless::Deque;
 
 use crate::bus::checksum::checksum;
-use crate::bus::recorder::Recorder;
+use crate::bus::recorder::{RECORDS_PER_CALL, Recorder};
 use crate::bus::time::NEVER;
 use crate::{TICK_HZ, TICKS_PER_US};
 
@@ -25,8 +25,6 @@ pub const MIN_PERIOD_TICKS: u32 = 47 * TICKS_PER_US;
 const LOOK_EVERY_TICKS: u64 = 20 * TICKS_PER_US as u64;
 /// For each entry, the number of periods that passed without a frame is reported no more often than this.
 const TELL_EVERY_TICKS: u64 = TICK_HZ as u64 / 10;
-/// How many of those records one call writes when a channel closes: 8 take 20 µs, see `docs/architecture.md`.
-const TOLD_PER_CALL: usize = 8;
 
 struct PeriodicState {
     entry: Periodic,
@@ -232,25 +230,30 @@ impl PeriodicTable {
         }
     }
 
-    /// Reports what is left, a few records per call; returns whether nothing is left.
-    pub fn tell_rest<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) -> bool {
-        self.telling = self.owed;
-        self.tell(recorder, now, TOLD_PER_CALL);
-        self.owed == 0
+    /// Whether there are periods that no record has reported yet.
+    pub const fn owes(&self) -> bool {
+        self.owed != 0
     }
 
-    /// Writes up to `most` of the records that are due now, if there is room.
-    fn tell<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64, most: usize) {
+    /// Reports what is left, a few records per call; returns whether there was room for these.
+    pub fn tell_rest<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) -> bool {
+        self.telling = self.owed;
+        self.tell(recorder, now, RECORDS_PER_CALL)
+    }
+
+    /// Writes up to `most` of the records that are due now; returns whether there was room.
+    fn tell<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64, most: usize) -> bool {
         for slot in slots(self.telling).take(most) {
             let tag = DEVICE_TAG + slot as u32;
             let reason = TransmitFailure::Overtaken { periods: self.untold[slot] };
             if !recorder.event(&Event::TransmitFailed { channel: self.channel, tag, reason }, now) {
-                return;
+                return false;
             }
             self.untold[slot] = 0;
             self.owed &= !(1 << slot);
             self.telling &= !(1 << slot);
         }
+        true
     }
 
     /// Periods of an entry passed without a frame.

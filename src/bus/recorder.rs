@@ -8,6 +8,10 @@ use crate::QUEUE_BYTES;
 use crate::bus::queue::{Kind, Producer};
 use crate::bus::time::Timebase;
 
+/// Records that one call of anything that writes many of them writes at most. Most such calls hold the lock, and the transmission alarm is
+/// only 14 µs early (`docs/architecture.md`, "Capture is never the victim of transmission").
+pub const RECORDS_PER_CALL: usize = 4;
+
 /// The only writer of the queue. Belongs to the tasks of priority 4.
 pub struct Recorder<'q, const N: usize = QUEUE_BYTES> {
     producer: Producer<'q, N>,

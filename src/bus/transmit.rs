@@ -4,7 +4,7 @@
 //! reply goes first, then a periodic frame that is due ([`crate::bus::periodic`]), then the head of the queue once its time has come.
 //!
 //! Each call does a bounded amount of work: it fills the free mailboxes, three at most, and writes at most
-//! `GIVEN_UP_PER_CALL` records of frames that are given up. `docs/architecture.md` says how long this takes.
+//! [`RECORDS_PER_CALL`] records of frames that are given up. `docs/architecture.md` says how long this takes.
 
 use cantap_wire::message::{Periodic, TRIGGER_TAG, Trigger, TxFrame};
 use cantap_wire::record::TransmitFailure;
@@ -13,7 +13,7 @@ use heapless::Deque;
 
 use crate::bus::mailboxes::{MAILBOXES, Mailboxes};
 use crate::bus::periodic::PeriodicTable;
-use crate::bus::recorder::Recorder;
+use crate::bus::recorder::{RECORDS_PER_CALL, Recorder};
 use crate::bus::time::NEVER;
 use crate::ports::{Outcome, Traffic};
 
@@ -21,9 +21,6 @@ use crate::ports::{Outcome, Traffic};
 pub const TX_QUEUE: usize = 256;
 /// Replies.
 pub const TRIGGER_SLOTS: usize = 8;
-
-/// Queued frames that one call gives up: a whole queue at once would take longer than a receive FIFO can wait.
-const GIVEN_UP_PER_CALL: usize = 16;
 
 #[derive(Clone, Copy)]
 struct Queued {
@@ -82,6 +79,12 @@ pub struct Transmitter<'q> {
     off: bool,
     sent: u32,
     failed: u32,
+    /// A mailbox goes on saying that it has finished: the transmit interrupt stays silent until the next millisecond.
+    held: bool,
+    /// The controller took no frame although it should have a free mailbox. The next tick tries again, or what finishes before it.
+    refused: bool,
+    /// How often a mailbox stayed finished, since the start.
+    mailboxes_stuck: u32,
 }
 
 impl<'q> Transmitter<'q> {
@@ -100,6 +103,9 @@ impl<'q> Transmitter<'q> {
             off: false,
             sent: 0,
             failed: 0,
+            held: false,
+            refused: false,
+            mailboxes_stuck: 0,
         }
     }
 
@@ -198,7 +204,12 @@ impl<'q> Transmitter<'q> {
             self.mailboxes.take(mailbox);
         }
         // Their end has just been recorded.
-        while traffic.take_finished().is_some() {}
+        forget_finished(traffic);
+    }
+
+    /// Whether all that is left is in mailboxes.
+    pub fn waits_for_mailboxes(&self) -> bool {
+        self.queue.is_empty() && self.unconfirmed.is_empty() && self.mailboxes.len() > 0
     }
 
     /// Forgets the periodic entries and the replies.
@@ -228,7 +239,12 @@ impl<'q> Transmitter<'q> {
         self.periodic.tick(recorder, now);
     }
 
-    /// The channel is closed: records what [`Self::tick`] has not recorded yet, a little per call. Returns whether nothing is left.
+    /// Whether periods that passed without a frame are still to be recorded.
+    pub const fn owes(&self) -> bool {
+        self.periodic.owes()
+    }
+
+    /// The channel is closed: records what [`Self::tick`] has not recorded yet, a little per call. Returns whether there was room.
     pub fn tell_rest<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) -> bool {
         self.periodic.tell_rest(recorder, now)
     }
@@ -251,16 +267,17 @@ impl<'q> Transmitter<'q> {
         self.replies_waiting > 0
     }
 
-    /// Mailboxes may have finished: records how, and fills them again. `reason` says why frames were aborted, if they were.
+    /// Mailboxes may have finished: records how, and fills them again. `reason` says why frames were aborted, if they were. Returns what
+    /// [`Self::service`] does.
     pub fn on_finished<const N: usize>(
         &mut self,
         traffic: &mut impl Traffic,
         recorder: &mut Recorder<'_, N>,
         now: u64,
         reason: TransmitFailure,
-    ) {
+    ) -> bool {
         self.collect(traffic, reason, now, || now);
-        self.service(traffic, recorder, now);
+        self.service(traffic, recorder, now)
     }
 
     /// First part of [`Self::on_finished`]: empties the mailboxes that have finished. [`Self::prepare_head`] may follow before
@@ -274,9 +291,20 @@ impl<'q> Transmitter<'q> {
         ended: u64,
         mut now: impl FnMut() -> u64,
     ) {
-        let mut first = true;
-        while !self.unconfirmed.is_full() {
-            let Some((mailbox, outcome)) = traffic.take_finished() else { break };
+        self.refused = false;
+        // With the interrupt held, its stamp is an old one.
+        let mut first = !self.held;
+        // A mailbox finishes once until it is filled again, so after as many as there are, nothing is left.
+        let mut stuck = true;
+        for _ in 0..=MAILBOXES {
+            if self.unconfirmed.is_full() {
+                stuck = false;
+                break;
+            }
+            let Some((mailbox, outcome)) = traffic.take_finished() else {
+                stuck = false;
+                break;
+            };
             let Some((tag, frame)) = self.mailboxes.take(mailbox) else { continue };
             let failure = match outcome {
                 Outcome::Sent => None,
@@ -291,8 +319,27 @@ impl<'q> Transmitter<'q> {
             // Cannot fail: checked above.
             let _ = self.unconfirmed.push_back(Ended { tag, frame, failure, at });
         }
+        self.held = stuck;
+        if stuck {
+            // The interrupt would come at once and for ever, and nothing below it would run.
+            self.mailboxes_stuck = self.mailboxes_stuck.wrapping_add(1);
+            return;
+        }
         // No matter which task collects: a stamp that stays would be mistaken for the next transmission's.
         traffic.await_finished();
+    }
+
+    /// Once a millisecond: lets the transmit interrupt come again, if a mailbox that would not be emptied has kept it silent.
+    pub fn retry_mailboxes(&mut self, traffic: &mut impl Traffic) {
+        self.refused = false;
+        if self.held {
+            traffic.await_finished();
+        }
+    }
+
+    /// How often a mailbox went on saying that it had finished, since the start.
+    pub const fn mailboxes_stuck(&self) -> u32 {
+        self.mailboxes_stuck
     }
 
     /// Whether anything but queued frames is waiting for [`Self::service`].
@@ -303,9 +350,11 @@ impl<'q> Transmitter<'q> {
 
     /// Fills free mailboxes with the queue's frames that are due, unless something else goes first.
     pub fn load_due(&mut self, traffic: &mut impl Traffic, now: u64) {
-        while self.head_due() <= now
-            && let Some(mailbox) = self.prepare_head(traffic, now)
-        {
+        for _ in 0..MAILBOXES {
+            if self.head_due() > now {
+                return;
+            }
+            let Some(mailbox) = self.prepare_head(traffic, now) else { return };
             traffic.request(mailbox);
             self.requested(mailbox);
         }
@@ -320,7 +369,9 @@ impl<'q> Transmitter<'q> {
         if kept >= self.unconfirmed.capacity() || self.off || self.has_more(at) {
             return None;
         }
-        traffic.prepare(&self.queue.front()?.frame)
+        let mailbox = traffic.prepare(&self.queue.front()?.frame);
+        self.refused = mailbox.is_none() && !self.mailboxes.are_full();
+        mailbox
     }
 
     /// The queue's head is in this mailbox, and its transmission was requested.
@@ -333,8 +384,18 @@ impl<'q> Transmitter<'q> {
 
     /// Records what has finished, each at its time; false if the record queue has no room for all of them.
     pub fn record<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>) -> bool {
+        let mut all = usize::MAX;
+        self.record_some(recorder, &mut all)
+    }
+
+    /// As [`Self::record`], but at most as many as there is `room` for, from which they are deducted.
+    #[inline]
+    fn record_some<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, room: &mut usize) -> bool {
         let channel = self.channel;
         while let Some(&Ended { tag, frame, failure, at }) = self.unconfirmed.front() {
+            if *room == 0 {
+                return false;
+            }
             let event = match failure {
                 None => Event::Transmitted { channel, tag, frame },
                 Some(reason) => Event::TransmitFailed { channel, tag, reason },
@@ -343,34 +404,43 @@ impl<'q> Transmitter<'q> {
                 return false;
             }
             self.unconfirmed.pop_front();
+            *room -= 1;
         }
         true
     }
 
-    /// Fills free mailboxes with what is due.
+    /// Records what has finished or is given up, [`RECORDS_PER_CALL`] at most, and fills free mailboxes with what is due. Returns whether
+    /// there are more records, and room for them: then it is to be called again.
     pub fn service<const N: usize>(
         &mut self,
         traffic: &mut impl Traffic,
         recorder: &mut Recorder<'_, N>,
         now: u64,
-    ) {
-        if !self.record(recorder) {
-            return;
+    ) -> bool {
+        let mut room = RECORDS_PER_CALL;
+        if !self.record_some(recorder, &mut room) {
+            return room == 0;
         }
         if let Some(reason) = self.dropping {
-            for _ in 0..GIVEN_UP_PER_CALL {
-                let Some(&Queued { tag, .. }) = self.queue.front() else { break };
+            while let Some(&Queued { tag, .. }) = self.queue.front() {
+                if room == 0 {
+                    return true;
+                }
                 if !recorder.event(&Event::TransmitFailed { channel: self.channel, tag, reason }, now) {
-                    return;
+                    return false;
                 }
                 self.failed = self.failed.wrapping_add(1);
                 self.queue.pop_front();
-            }
-            if !self.queue.is_empty() {
-                return;
+                room -= 1;
             }
             self.dropping = None;
         }
+        self.fill(traffic, now);
+        false
+    }
+
+    /// Fills free mailboxes with what is due: at most eight replies and as many frames as there are mailboxes.
+    fn fill(&mut self, traffic: &mut impl Traffic, now: u64) {
         if self.off {
             return;
         }
@@ -391,11 +461,15 @@ impl<'q> Transmitter<'q> {
     }
 
     /// Whether a frame that becomes due can leave. Otherwise it waits for something other than time: for a mailbox, which an
-    /// interrupt announces, or for room in the record queue, which is tried every millisecond. An alarm for it would fire again
+    /// interrupt announces, or for room in the record queue or a controller that takes frames, which are tried every millisecond. An alarm for it would fire again
     /// and again, and keep USB, which makes the room, from running.
     #[inline]
     fn can_load(&self) -> bool {
-        !self.mailboxes.are_full() && self.unconfirmed.is_empty() && self.dropping.is_none() && !self.off
+        !self.mailboxes.are_full()
+            && self.unconfirmed.is_empty()
+            && self.dropping.is_none()
+            && !self.off
+            && !self.refused
     }
 
     /// When the queue's head is due, if there is one and a mailbox is free: a frame that is already due waits for a mailbox, not
@@ -426,7 +500,10 @@ impl<'q> Transmitter<'q> {
     }
 
     fn load(&mut self, tag: u32, frame: &Frame, traffic: &mut impl Traffic) -> bool {
-        let Some(mailbox) = traffic.prepare(frame) else { return false };
+        let Some(mailbox) = traffic.prepare(frame) else {
+            self.refused = !self.mailboxes.are_full();
+            return false;
+        };
         traffic.request(mailbox);
         self.mailboxes.put(mailbox, tag, *frame);
         true
@@ -461,5 +538,14 @@ impl<'q> Transmitter<'q> {
             self.periodic.loaded(now);
         }
         loaded
+    }
+}
+
+/// Takes finished transmissions that nobody waits for: one for each mailbox, so that one that goes on reporting cannot hold up the caller.
+pub fn forget_finished(traffic: &mut impl Traffic) {
+    for _ in 0..MAILBOXES {
+        if traffic.take_finished().is_none() {
+            return;
+        }
     }
 }

@@ -16,13 +16,15 @@ use core::sync::atomic::AtomicU32;
 use cantap_firmware::ports::Control;
 use cantap_wire::CHANNELS;
 use stm32f4xx_hal::pac::{CAN1, CAN2};
-use stm32f4xx_hal::rcc::{Enable, Rcc, Reset};
+use stm32f4xx_hal::rcc::{Enable, Rcc};
 
 pub use bells::Bells;
 pub use control::CanControl;
 pub use filters::CanFilters;
 use registers::Registers;
 pub use traffic::CanTraffic;
+
+use crate::board::TransmitPin;
 
 /// Both controllers' halves, and the filters.
 pub struct Controllers {
@@ -37,14 +39,19 @@ pub struct Controllers {
 }
 
 impl Controllers {
-    /// Switches both controllers on; they stay off the bus and let no frame pass.
-    pub fn new(_: CAN1, _: CAN2, rcc: &mut Rcc, sent_at: &'static [AtomicU32; CHANNELS]) -> Self {
+    /// Switches both controllers on; they stay off the bus and let no frame pass. Each is connected to its TX pin only when it has
+    /// acknowledged initialisation mode, before it first joins its bus. Neither is reset here: `entry` did that, with all pins inputs.
+    pub fn new(
+        _: (CAN1, CAN2),
+        transmit: [TransmitPin; CHANNELS],
+        rcc: &mut Rcc,
+        sent_at: &'static [AtomicU32; CHANNELS],
+    ) -> Self {
         CAN1::enable(rcc);
         CAN2::enable(rcc);
-        CAN1::reset(rcc);
-        CAN2::reset(rcc);
         let blocks = [Registers::of(CAN1::ptr()), Registers::of(CAN2::ptr())];
-        let mut control = blocks.map(CanControl::new);
+        let [first, second] = transmit;
+        let mut control = [CanControl::new(blocks[0], first), CanControl::new(blocks[1], second)];
         // After a reset a controller sleeps.
         control.iter_mut().for_each(Control::stop);
         Self {

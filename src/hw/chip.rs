@@ -3,6 +3,7 @@
 use core::fmt::Write;
 
 use cantap_firmware::lights::{Activity, Lights};
+use cantap_firmware::oddities::Oddities;
 use cantap_firmware::ports::Chip;
 use cantap_firmware::saved;
 use cantap_wire::message::Failures;
@@ -46,6 +47,15 @@ impl BoardChip {
     pub fn tick(&mut self, activity: Activity) {
         let lit = self.lights.tick(activity);
         self.leds.show(lit);
+    }
+
+    /// Records among the failures what the hardware did.
+    #[expect(
+        clippy::unused_self,
+        reason = "the chip's owner is the only one who records while the firmware runs"
+    )]
+    pub fn record(&mut self, oddities: &Oddities) {
+        failure::record(format_args!("{oddities}"));
     }
 }
 

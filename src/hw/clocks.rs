@@ -6,6 +6,8 @@
 //! is checked.
 
 use cantap_firmware::CAN_CLOCK_HZ;
+use cantap_firmware::revision::reads_flash_uncached;
+use cortex_m::peripheral::CPUID;
 use stm32f4xx_hal::pac;
 use stm32f4xx_hal::prelude::*;
 use stm32f4xx_hal::rcc::{Config, Rcc};
@@ -84,8 +86,21 @@ pub fn run(rcc: Rcc) -> Rcc {
         .require_pll48clk();
     let rcc = rcc.freeze(config);
     wait_until(|| rcc.cfgr().read().sws().is_pll());
+    spare_the_caches();
     check(&rcc);
     rcc
+}
+
+/// The HAL has switched the caches and the prefetch on; some chips must go without.
+fn spare_the_caches() {
+    // SAFETY: reads registers that have no effect on being read.
+    let (idcode, cpuid) =
+        unsafe { ((*pac::DBGMCU::ptr()).idcode().read().bits(), (*CPUID::PTR).base.read()) };
+    if reads_flash_uncached(idcode, cpuid) {
+        // SAFETY: nothing else uses the register while the clocks are set up.
+        let acr = unsafe { (*pac::FLASH::ptr()).acr() };
+        acr.modify(|_, w| w.prften().clear_bit().icen().clear_bit().dcen().clear_bit());
+    }
 }
 
 /// Wrong clocks would give wrong bit rates and wrong times: what counts is what the registers hold, not what was

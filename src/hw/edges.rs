@@ -128,6 +128,8 @@ fn unmask(line: u32, on: bool) {
         // SAFETY: one bit for each line.
         unsafe { w.bits(if on { others | line } else { others }) }
     });
+    // The interrupt may return directly afterwards (Cortex-M4 erratum 838869, see `Bells::open_receive`).
+    cortex_m::asm::dsb();
 }
 
 /// Clears what is pending on a line.

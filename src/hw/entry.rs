@@ -92,6 +92,7 @@ pub fn restore(rcc: &pac::RCC, syscfg: &pac::SYSCFG, flash: &pac::FLASH) -> Foun
 
 /// Resets every peripheral and switches their clocks off.
 fn reset_peripherals(rcc: &pac::RCC) {
+    // The ports first: no CAN controller may be reset while a pin connects it to a bus.
     // SAFETY: these are bits that the registers have; what they reset is not in use yet.
     unsafe {
         rcc.ahb1rstr().write(|w| w.bits(AHB1));

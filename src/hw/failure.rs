@@ -26,7 +26,8 @@ fn load() -> FailureLog {
 pub fn record(what: fmt::Arguments) {
     let mut log = load();
     log.add(what);
-    // SAFETY: as in `load`; the writer either never returns to what it interrupted, or runs before anything else.
+    // SAFETY: as in `load`; the writer runs before anything else, or at priority 2, or never returns to what it interrupted. A failure that
+    // interrupts the second of these in the middle finds the log as it was or damaged, in which case it begins anew.
     unsafe { addr_of_mut!(LOG).cast::<FailureLog>().write_volatile(log) }
 }
 

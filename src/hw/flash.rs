@@ -8,8 +8,12 @@
 //! An error flag stays until it is cleared, and while one is set the interface accepts nothing: users of the chip report
 //! this, and ST's drivers clear the flags before each operation. So does this one, no matter what set them.
 
+use cantap_firmware::TICKS_PER_MS;
 use cantap_firmware::saved::Sector;
 use stm32f4xx_hal::pac::FLASH;
+
+use super::clocks;
+use super::stamp::StampTimer;
 
 /// Sector 11: the last of the first mebibyte. `memory.x` leaves it out of the firmware's memory.
 const SECTOR: u8 = 11;
@@ -18,15 +22,24 @@ const WORDS: usize = 128 * 1024 / 4;
 /// RM0090, "Unlocking the Flash control register".
 const KEYS: [u32; 2] = [0x4567_0123, 0xCDEF_89AB];
 
+/// Longest operation: erasing the sector, 2 s (data sheet, as above). A flash that is busy for longer does not end, and must be given up
+/// before the watchdog bites.
+const MOST_TICKS: u32 = 2_200 * TICKS_PER_MS;
+/// The same as a number of reads at 16 MHz, each with its loop at least 5 cycles: before there is a timer.
+const MOST_READS: u32 = 2_200 * (clocks::HSI_HZ / 1_000 / 5);
+
 /// Locks the control register, which another program may have left open, and clears any error flags left behind.
 pub fn lock(flash: &FLASH) {
-    wait(flash);
+    let mut reads = MOST_READS;
+    while is_busy(flash) && reads > 0 {
+        reads -= 1;
+    }
     clear_flags(flash);
     flash.cr().write(|w| w.lock().set_bit());
 }
 
-fn wait(flash: &FLASH) {
-    while flash.sr().read().bsy().bit() {}
+fn is_busy(flash: &FLASH) -> bool {
+    flash.sr().read().bsy().bit()
 }
 
 fn clear_flags(flash: &FLASH) {
@@ -46,34 +59,51 @@ fn went_well(flash: &FLASH) -> bool {
 }
 
 /// The sector.
-pub struct LastSector(FLASH);
+pub struct LastSector(FLASH, StampTimer);
 
 impl LastSector {
     /// Takes the flash interface, which the clock setup no longer needs.
-    pub const fn new(flash: FLASH) -> Self {
-        Self(flash)
+    pub const fn new(flash: FLASH, timer: StampTimer) -> Self {
+        Self(flash, timer)
+    }
+
+    /// Waits for the end of an operation; returns whether it came.
+    fn wait(&self) -> bool {
+        let from = self.1.now();
+        while is_busy(&self.0) {
+            if self.1.now().wrapping_sub(from) > MOST_TICKS {
+                return false;
+            }
+        }
+        true
     }
 
     /// Unlocks the flash, runs `act`, waits until it is done, locks the flash. Returns whether it succeeded.
     fn unlocked(&mut self, act: impl FnOnce(&FLASH)) -> bool {
-        wait(&self.0);
-        // Keys written when the register is not locked would lock it until the next reset. It is locked: by `lock` at the
-        // start, and at the end of this function.
-        for key in KEYS {
-            // SAFETY: the two keys, in their order.
-            self.0.keyr().write(|w| unsafe { w.bits(key) });
+        // Every operation is waited for, so this is one that was given up.
+        if is_busy(&self.0) {
+            return false;
+        }
+        // Keys written when the register is not locked would lock it until the next reset. It is locked by `lock` at the start, and at
+        // the end of this function, unless the flash was busy then.
+        if self.0.cr().read().lock().bit() {
+            for key in KEYS {
+                // SAFETY: the two keys, in their order.
+                self.0.keyr().write(|w| unsafe { w.bits(key) });
+            }
         }
         clear_flags(&self.0);
         act(&self.0);
         // A store may still be on its way, and the flash not busy yet.
         cortex_m::asm::dsb();
-        wait(&self.0);
-        let went_well = went_well(&self.0);
+        let went_well = self.wait() && went_well(&self.0);
         self.0.cr().modify(|_, w| w.pg().clear_bit().ser().clear_bit().lock().set_bit());
-        // The data cache may hold what was there before.
-        self.0.acr().modify(|_, w| w.dcen().clear_bit());
-        self.0.acr().modify(|_, w| w.dcrst().set_bit());
-        self.0.acr().modify(|_, w| w.dcrst().clear_bit().dcen().set_bit());
+        // The data cache, where it is used (`clocks`), may hold what was there before.
+        if self.0.acr().read().dcen().bit() {
+            self.0.acr().modify(|_, w| w.dcen().clear_bit());
+            self.0.acr().modify(|_, w| w.dcrst().set_bit());
+            self.0.acr().modify(|_, w| w.dcrst().clear_bit().dcen().set_bit());
+        }
         went_well
     }
 }

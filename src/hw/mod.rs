@@ -27,6 +27,7 @@ use core::sync::atomic::AtomicU32;
 use cantap_firmware::lights;
 use cantap_firmware::port::command::Identity;
 use cantap_wire::CHANNELS;
+use cantap_wire::image::ImageInfo;
 use stm32f4xx_hal::pac;
 use stm32f4xx_hal::prelude::*;
 
@@ -46,6 +47,12 @@ static CANTAP_RECEIVE_PINS: [[u8; 2]; CHANNELS] = {
     let [one, two] = board::RECEIVE_PINS;
     [[one.port as u8, one.pin], [two.port as u8, two.pin]]
 };
+
+/// What the image says about itself, for the command that writes it ([`cantap_wire::image`]).
+// SAFETY: as above.
+#[used]
+#[unsafe(no_mangle)]
+static CANTAP_IMAGE: ImageInfo = ImageInfo::new(board::NAME, cantap_firmware::port::command::VERSION);
 
 /// Everything that the tasks need, set up and running; both controllers are off the bus.
 pub struct Hardware {
@@ -98,23 +105,24 @@ pub fn start(
     if found.usb_was_connected {
         clocks::wait_ms(DISCONNECTED_MS, clocks::SYSCLK_HZ);
     }
-    let leds = board::connect(ports, &mut rcc);
+    let board::Connected { leds, transmit } = board::connect(ports, &mut rcc);
     let usb = (device.OTG_FS_GLOBAL, device.OTG_FS_DEVICE, device.OTG_FS_PWRCLK);
     let serial = chip::serial_number();
     let sensors = sensors::Sensors::start(device.ADC1, &device.ADC_COMMON, &mut rcc);
     stay_in_reach_of_a_debugger(&device.DBGMCU);
     let alarm = stamp::StampTimer::start(device.TIM2, &mut rcc);
-    let (meter, catcher) = edges::PinMeter::new(device.EXTI, device.SYSCFG, alarm.timer(), &mut rcc);
+    let timer = alarm.timer();
+    let (meter, catcher) = edges::PinMeter::new(device.EXTI, device.SYSCFG, timer, &mut rcc);
     Hardware {
-        can: can::Controllers::new(device.CAN1, device.CAN2, &mut rcc, sent_at),
-        sof: sof::SofLatch::start(alarm.timer()),
+        can: can::Controllers::new((device.CAN1, device.CAN2), transmit, &mut rcc, sent_at),
+        sof: sof::SofLatch::start(timer),
         alarm,
         tick: tick::Tick::start(device.TIM7, &mut rcc),
         crc: crc::CrcUnit::start(device.CRC, &mut rcc),
         meter,
         catcher,
-        usb: usb::UsbPort::new(usb, &mut rcc, &serial, usb_memory),
-        chip: chip::BoardChip::new(sensors, flash::LastSector::new(device.FLASH), leds),
+        usb: usb::UsbPort::new(usb, timer, &mut rcc, &serial, usb_memory),
+        chip: chip::BoardChip::new(sensors, flash::LastSector::new(device.FLASH, timer), leds),
         watchdog,
         identity: Identity { board: board::NAME, serial },
         restarted_after_failure,

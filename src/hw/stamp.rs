@@ -66,7 +66,8 @@ impl Clock for StampAlarm {
 
     #[inline]
     fn wait_until(&self, at: u32) {
-        // Bounded: the caller has made sure that the time is at most 1.5 ALARM_EARLY_TICKS ahead.
+        // Bounded: the caller has made sure that the time is at most 1.5 ALARM_EARLY_TICKS ahead, and the timer counts as long as the
+        // processor does, from the same clock.
         while (at.wrapping_sub(self.now()) as i32) > 0 {}
     }
 
@@ -80,6 +81,7 @@ impl Clock for StampAlarm {
         let Some(at) = at else {
             timer.dier().modify(|_, w| w.cc1ie().disabled());
             self.acknowledge();
+            cortex_m::asm::dsb();
             return;
         };
         // SAFETY: every value is a time.
@@ -91,5 +93,7 @@ impl Clock for StampAlarm {
         if at.wrapping_sub(self.now()) as i32 <= 0 {
             timer.egr().write(|w| w.cc1g().set_bit());
         }
+        // Often the last thing that a task does (Cortex-M4 erratum 838869, see `Bells::open_receive`).
+        cortex_m::asm::dsb();
     }
 }

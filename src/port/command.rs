@@ -6,6 +6,7 @@ use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
 use cantap_wire::{CHANNELS, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply};
 use heapless::{String, Vec};
 
+use crate::bus::capture::Closing;
 use crate::bus::filters::{BANKS, Layout};
 use crate::bus::periodic::PERIODIC_SLOTS;
 use crate::bus::transmit::{TRIGGER_SLOTS, TX_QUEUE};
@@ -29,6 +30,10 @@ const STOP_WITHIN_TICKS: u32 = 100 * TICKS_PER_MS;
 /// A controller that is made to leave takes a moment (Linux's driver, `drivers/net/can/bxcan.c`, checks every 10 ms). If it takes
 /// longer than this, it has no clock or is broken.
 const HALT_WITHIN_TICKS: u32 = 100 * TICKS_PER_MS;
+/// A frame is released from a FIFO within a few clocks. After this long it is not, and the controller's reset is to empty the FIFO.
+const RELEASE_WITHIN_TICKS: u32 = 2 * TICKS_PER_MS;
+/// Steps of closing a channel that one poll takes: 32 records, each step under a lock of its own.
+const STEPS_PER_POLL: usize = 8;
 /// Time for the answer to reach the host before the device restarts.
 const LEAVE_AFTER_TICKS: u32 = 50 * TICKS_PER_MS;
 
@@ -60,6 +65,17 @@ pub enum Work {
     Bootloader,
 }
 
+/// A FIFO that does not become empty after its channel has left the bus.
+#[derive(Clone, Copy, Debug)]
+enum Emptying {
+    /// It has not been found so.
+    No,
+    /// It was found so at this time.
+    Since(u32),
+    /// The controller's reset, which empties it, was requested at this time.
+    Reset(u32),
+}
+
 /// The immediate result of a command.
 #[expect(clippy::large_enum_variant, reason = "no allocation on the device")]
 pub enum Step {
@@ -76,6 +92,8 @@ pub struct Commands {
     settings: [ChannelSettings; CHANNELS],
     /// Which controllers are being made to leave their bus.
     halting: [bool; CHANNELS],
+    /// How far the work under way has come with each channel's FIFO.
+    emptying: [Emptying; CHANNELS],
     /// The measurement of a receive pin under way, if any.
     measuring: Option<Measuring>,
     /// When the work under way began.
@@ -93,6 +111,7 @@ impl Commands {
             layout: Layout::open(),
             settings: [NOTHING; CHANNELS],
             halting: [false; CHANNELS],
+            emptying: [Emptying::No; CHANNELS],
             measuring: None,
             begun: 0,
             bad_requests: 0,
@@ -177,9 +196,11 @@ impl Commands {
     /// Begins work, which the session then advances.
     pub fn begin<'q, const N: usize>(&mut self, work: Work, board: &mut impl Board<'q, N>) -> Step {
         self.begun = board.now();
+        self.emptying = [Emptying::No; CHANNELS];
         self.end_measurement(work, board);
         match work {
-            Work::Silence => {
+            // A restart in the middle of a frame would destroy it for everyone on the bus.
+            Work::Silence | Work::Restart | Work::Bootloader => {
                 for channel in Channel::ALL {
                     board.with_capture(|capture, traffic, _| {
                         capture.begin_abandon(channel, &mut traffic[channel.index()]);
@@ -198,7 +219,6 @@ impl Commands {
             Work::Open(channel, _) | Work::Close(channel) | Work::Recover(channel) => {
                 board.control(channel).stop();
             }
-            Work::Restart | Work::Bootloader => {}
         }
         Step::Begun(work)
     }
@@ -226,7 +246,7 @@ impl Commands {
             Work::Silence => {
                 // Handle both, even if one of them does not respond.
                 let leave = Channel::ALL.map(|channel| self.leave(channel, waited, board));
-                if leave.iter().any(Option::is_none) {
+                if leave.iter().any(Option::is_none) || !self.abandon(board) {
                     return None;
                 }
                 self.forget(board);
@@ -266,7 +286,9 @@ impl Commands {
                 Some(Ok(Reply::Done))
             }
             Work::Restart | Work::Bootloader => {
-                if waited < LEAVE_AFTER_TICKS {
+                // A controller that does not respond is left alone in the end.
+                let leave = Channel::ALL.map(|channel| self.leave(channel, waited, board));
+                if waited < LEAVE_AFTER_TICKS || leave.iter().any(Option::is_none) {
                     return None;
                 }
                 if matches!(work, Work::Bootloader) {
@@ -287,7 +309,7 @@ impl Commands {
         board: &mut impl Board<'q, N>,
     ) -> Option<Result<(), Refusal>> {
         let halting = &mut self.halting[channel.index()];
-        if !board.control(channel).is_stopped() && waited > STOP_WITHIN_TICKS {
+        if !board.control(channel).is_stopped() && (waited > STOP_WITHIN_TICKS || *halting) {
             board.control(channel).halt();
             // Right after the reset, because the other channel may hear nothing until then.
             if !core::mem::replace(halting, true) {
@@ -331,21 +353,70 @@ impl Commands {
         if let Err(refusal) = self.leave(channel, waited, board)? {
             return Some(Err(refusal));
         }
-        let closed = !board.is_open(channel)
-            || board.with_capture(|capture, traffic, clock| {
-                let overdue = waited > STOP_WITHIN_TICKS;
+        if !board.is_open(channel) {
+            return Some(Ok(()));
+        }
+        let emptied = board.with_capture(|capture, traffic, clock| {
+            capture.close_fifo(channel, &mut traffic[channel.index()], clock)
+        });
+        if !emptied {
+            return self.empty(channel, true, board).then_some(Err(Refusal::Hardware));
+        }
+        let overdue = waited > STOP_WITHIN_TICKS;
+        for _ in 0..STEPS_PER_POLL {
+            let closing = board.with_capture(|capture, traffic, clock| {
                 capture.finish_close(channel, &mut traffic[channel.index()], clock, overdue)
             });
-        closed.then_some(Ok(()))
+            match closing {
+                Closing::Done => return Some(Ok(())),
+                Closing::Continue => {}
+                Closing::Wait => break,
+            }
+        }
+        None
+    }
+
+    /// A channel that has left the bus still has frames in its FIFO, which would turn up in the next session. After a while the
+    /// controller's own reset, which empties it (RM0090, CAN_MCR, RESET), is requested, and if `told`, what it holds is recorded as
+    /// lost. [`Self::leave`] sees the reset through. Returns whether even that has not helped in time.
+    fn empty<'q, const N: usize>(
+        &mut self,
+        channel: Channel,
+        told: bool,
+        board: &mut impl Board<'q, N>,
+    ) -> bool {
+        let index = channel.index();
+        let now = board.now();
+        match self.emptying[index] {
+            Emptying::No => self.emptying[index] = Emptying::Since(now),
+            Emptying::Since(at) if now.wrapping_sub(at) > RELEASE_WITHIN_TICKS => {
+                if told {
+                    board.with_capture(|capture, _, clock| capture.lose_fifo(channel, clock));
+                }
+                board.control(channel).halt();
+                self.halting[index] = true;
+                self.emptying[index] = Emptying::Reset(now);
+                self.restore_filters(channel, board);
+            }
+            Emptying::Reset(at) => return now.wrapping_sub(at) > HALT_WITHIN_TICKS,
+            Emptying::Since(_) => {}
+        }
+        false
+    }
+
+    /// Both channels have left the bus, and nobody listens. Returns whether their FIFOs are empty, too, or nothing helps.
+    fn abandon<'q, const N: usize>(&mut self, board: &mut impl Board<'q, N>) -> bool {
+        let done = Channel::ALL.map(|channel| {
+            let index = channel.index();
+            let emptied =
+                board.with_capture(|capture, traffic, _| capture.abandon(channel, &mut traffic[index]));
+            emptied || self.empty(channel, false, board)
+        });
+        done == [true; CHANNELS]
     }
 
     /// Both channels have left the bus: nothing of the last session remains.
     fn forget<'q, const N: usize>(&mut self, board: &mut impl Board<'q, N>) {
-        for channel in Channel::ALL {
-            board.with_capture(|capture, traffic, _| {
-                capture.abandon(channel, &mut traffic[channel.index()]);
-            });
-        }
         for settings in &mut self.settings {
             settings.filters.clear();
             settings.config = None;
@@ -518,7 +589,7 @@ fn check(config: &ChannelConfig) -> Result<(), Refusal> {
 }
 
 /// This firmware's version.
-const VERSION: [u16; 3] = [
+pub const VERSION: [u16; 3] = [
     parse(env!("CARGO_PKG_VERSION_MAJOR")),
     parse(env!("CARGO_PKG_VERSION_MINOR")),
     parse(env!("CARGO_PKG_VERSION_PATCH")),

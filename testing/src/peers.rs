@@ -16,6 +16,17 @@ pub fn python_with(modules: &str) -> Option<String> {
     has(Command::new(&python).args(["-c", &format!("import {modules}")]), modules).then_some(python)
 }
 
+/// Chromium, which Debian packages, if it is installed.
+pub fn chromium() -> Option<&'static str> {
+    let probe = Command::new("chromium").arg("--version").output();
+    if probe.is_ok_and(|output| output.status.success()) {
+        return Some("chromium");
+    }
+    // It is large, and the same is shown without it.
+    eprintln!("SKIPPED: chromium is not installed");
+    None
+}
+
 /// Whether this command succeeds; if not, `peer` is reported as missing.
 pub fn has(probe: &mut Command, peer: &str) -> bool {
     let is_there = probe.output().is_ok_and(|output| output.status.success());

@@ -14,4 +14,5 @@ mod refusals;
 mod session;
 mod slcan;
 mod sof;
+mod stubborn;
 mod transmit;

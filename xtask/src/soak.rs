@@ -1,10 +1,10 @@
-//! `cargo xtask soak`: the real firmware on the emulated board, hour after hour, never with the same traffic
-//! twice.
+//! `cargo xtask soak`: the real firmware on the emulated board, for long: one session for an emulated hour, or run after run, never with the
+//! same traffic twice.
 
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, ensure};
-use xshell::cmd;
+use xshell::{Shell, cmd};
 
 use crate::board::Board;
 use crate::workspace;
@@ -12,13 +12,17 @@ use crate::workspace;
 /// The arguments of `cargo xtask soak`.
 #[derive(clap::Args)]
 pub struct Args {
-    /// How long, in minutes. The run under way at that time is still finished.
-    #[arg(long)]
-    minutes: u64,
+    /// Runs for so many minutes, one after the other, each with traffic of its own. The run under way at that time is still finished.
+    #[arg(long, conflicts_with = "emulated_seconds")]
+    minutes: Option<u64>,
+    /// Without --minutes: emulated seconds of one session at full load on both channels, undisturbed and with stalls, requests and
+    /// replays in turn. An emulated hour takes several.
+    #[arg(long, default_value_t = 3_600)]
+    emulated_seconds: u64,
     /// Seed of the first run; each further run takes the next number.
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Emulated seconds per run.
+    /// With --minutes: emulated seconds per run.
     #[arg(long, default_value_t = 2)]
     seconds: u64,
 }
@@ -29,8 +33,24 @@ pub fn run(args: &Args) -> Result<()> {
     let elf = Board::ALL[0].elf();
     ensure!(elf.exists(), "there is no {}; run `cargo xtask firmware`", elf.display());
     cmd!(shell, "cargo build --release -p cantap-sim").run()?;
-    let simulator = workspace::target().join("release/cantap-sim");
-    let until = Instant::now() + Duration::from_mins(args.minutes);
+    match args.minutes {
+        Some(minutes) => runs(&shell, args, minutes),
+        None => session(&shell, args),
+    }
+}
+
+/// One session.
+fn session(shell: &Shell, args: &Args) -> Result<()> {
+    let (simulator, elf) = (workspace::target().join("release/cantap-sim"), Board::ALL[0].elf());
+    let (seconds, seed) = (args.emulated_seconds.to_string(), args.seed.to_string());
+    cmd!(shell, "{simulator} soak {elf} --seconds {seconds} --seed {seed}").run()?;
+    Ok(())
+}
+
+/// Run after run.
+fn runs(shell: &Shell, args: &Args, minutes: u64) -> Result<()> {
+    let (simulator, elf) = (workspace::target().join("release/cantap-sim"), Board::ALL[0].elf());
+    let until = Instant::now() + Duration::from_mins(minutes);
     let seconds = args.seconds.to_string();
     let mut runs = 0;
     while Instant::now() < until {

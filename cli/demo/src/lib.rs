@@ -19,12 +19,14 @@ use indicatif::{ProgressBar, ProgressStyle};
 /// The command line.
 #[derive(clap::Args)]
 #[command(
-    after_help = "Both channels of a virtual device run at 1 Mbit/s in real time. By default they carry standard \
-                        frames without\ndata at 100 % load, 20833 frames/s each: more frames than any other traffic.\n\
-                        Exit code 0 means that every frame sent was received in order or counted lost.\n\n\
-                        Examples:\n  cantap demo\n  cantap demo --stall 400ms     the device's queue bridges it\n  \
-                        cantap demo --stall 3s        frames are lost, and every one is counted\n  \
-                        cantap demo --kind ext8 --load 80 --time 20s --json"
+    after_help = "Both channels of a virtual device run at 1 Mbit/s in real time. By default they carry standard frames \
+                without data at 100 % load, 20833 frames/s each: more frames than any other traffic. Exit code 0 means \
+                that every frame sent was received in order or counted lost.\n\n\
+                Examples:\n  \
+                cantap demo\n  \
+                cantap demo --stall 400ms     the device's queue bridges it\n  \
+                cantap demo --stall 3s        frames are lost, and every one is counted\n  \
+                cantap demo --kind ext8 --load 80 --time 20s --json"
 )]
 pub struct Args {
     /// How long to capture, as 10, 500ms or 2m.

@@ -11,6 +11,7 @@ use cantap::autobaud::{self, Limits, Outcome, Progress};
 use crate::args;
 use crate::boards::OneBoard;
 use crate::completion;
+use crate::stderr;
 use cantap_work::interrupt;
 
 /// The command line.
@@ -49,7 +50,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let limits = Limits { silence: args.time };
     let outcome = autobaud::search(&device, args.channel, &limits, &mut progress)?;
     if shown {
-        eprint!("\r\x1b[K");
+        stderr::replace_line("");
     }
     let seconds = started.elapsed().as_secs_f64();
     match outcome {
@@ -121,10 +122,10 @@ pub fn failure(outcome: Outcome, channel: Channel, seconds: f64) -> String {
 
 fn show(progress: Progress) {
     match progress {
-        Progress::Measuring { edges: 0 } => eprint!("\r\x1b[Kwaiting for traffic"),
-        Progress::Measuring { edges } => eprint!("\r\x1b[Kmeasuring bits, {edges} edges"),
+        Progress::Measuring { edges: 0 } => stderr::replace_line("waiting for traffic"),
+        Progress::Measuring { edges } => stderr::replace_line(&format!("measuring bits, {edges} edges")),
         Progress::Confirming { bitrate_bps, frames } => {
-            eprint!("\r\x1b[K{bitrate_bps} bit/s measured; good frames at it: {frames}");
+            stderr::replace_line(&format!("{bitrate_bps} bit/s measured; good frames at it: {frames}"));
         }
     }
 }

@@ -33,13 +33,14 @@ use cantap_work::interrupt;
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "The interfaces are virtual ones, which root makes once:\n  \
-                  ip link add can0 type vcan && ip link set can0 up\n\n\
-                  Channels only listen, unless --mode says otherwise: what programs write is refused then, with an error frame for each. What \
-                  the buses\nrefuse, errors, states and losses are error frames (candump -e shows them). A frame's time is that of its arrival at the \
-                  interface.\n\n\
-                  Examples:\n  cantap bridge -d /dev/ttyACM0 -b 500k can0 can1\n  \
-                  cantap bridge -d /dev/ttyACM0 -b 500k --mode normal can0\n  \
-                  cantap bridge -d unix: 2:can1")]
+                ip link add can0 type vcan && ip link set can0 up\n\n\
+                Channels only listen, unless --mode says otherwise: what programs write is refused then, with an error \
+                frame for each. What the buses refuse, errors, states and losses are error frames (candump -e shows \
+                them). A frame's time is that of its arrival at the interface.\n\n\
+                Examples:\n  \
+                cantap bridge -d /dev/ttyACM0 -b 500k can0 can1\n  \
+                cantap bridge -d /dev/ttyACM0 -b 500k --mode normal can0\n  \
+                cantap bridge -d unix: 2:can1")]
 pub struct Args {
     #[command(flatten)]
     board: OneBoard,

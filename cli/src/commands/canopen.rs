@@ -12,6 +12,7 @@ use cantap::{Frame, Id};
 use cantap_protocols::Event;
 use cantap_protocols::active::Announcement;
 use cantap_protocols::canopen::{CanOpen, Sheet, state_name};
+use cantap_trace::grammar;
 
 use crate::args;
 use crate::protocols::SheetPath;
@@ -22,14 +23,14 @@ use crate::wrong::wrong;
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
-    cantap canopen -d /dev/ttyACM0 -b 500k scan\n  \
-    cantap canopen -d COM5 -b 250k read 5 1018 4\n  \
-    cantap canopen -d COM5 -b 250k write 5 1017 0 500 --type u16\n  \
-    cantap canopen -d COM5 -b 250k --eds 5:drive.eds read 5 6041\n  \
-    cantap canopen -d COM5 -b 250k nmt 5 start\n  \
-    cantap canopen -d COM5 -b 125k lss --node 12 --store\n\n\
-It takes part in the bus: it acknowledges, and sends what it is asked for here and nothing else. What was said is\n\
-shown as `cantap conversations` does.")]
+                cantap canopen -d /dev/ttyACM0 -b 500k scan\n  \
+                cantap canopen -d COM5 -b 250k read 5 1018 4\n  \
+                cantap canopen -d COM5 -b 250k write 5 1017 0 500 --type u16\n  \
+                cantap canopen -d COM5 -b 250k --eds 5:drive.eds read 5 6041\n  \
+                cantap canopen -d COM5 -b 250k nmt 5 start\n  \
+                cantap canopen -d COM5 -b 125k lss --node 12 --store\n\n\
+                It takes part in the bus: it acknowledges, and sends what it is asked for here and nothing else. What \
+                was said is shown as `cantap conversations` does.")]
 pub struct Args {
     #[command(flatten)]
     speak: SpeakArgs,
@@ -74,7 +75,7 @@ enum What {
         #[command(flatten)]
         cyclic: Cyclic,
         /// Its identifier in hexadecimal.
-        #[arg(long, value_name = "ID", default_value = "080")]
+        #[arg(long, value_name = "ID", default_value = "080", value_parser = grammar::identifier)]
         cob_id: Id,
     },
     /// Send a node's heartbeat periodically, timed by the device's clock.

@@ -25,21 +25,23 @@ use crate::progress::Progress;
 use crate::trace_output::refuse_older;
 use crate::trigger_args::TriggerArgs;
 use crate::wrong::wrong;
-use cantap_work::Meter;
+use cantap_work::{Meter, lost_frames};
 
 /// The command line.
 #[derive(clap::Args)]
 #[command(
-    after_help = "Channels only listen, unless --mode says otherwise: nothing is sent and nothing acknowledged.\n\
-                        Without -o the trace goes to standard output, unless --json is given.\n\n\
-                        The summary counts a channel's bus errors whatever the filters, those reported and those only counted. With \
-                        --no-stamps\nit has no frames/s and no bus load, with --no-data no bus load where data was left out \
-                        (null with --json): they are not known.\n\n\
-                        Examples:\n  cantap capture -d /dev/ttyACM0 -b 500k -o drive.log\n  \
-                        cantap capture -d virtual -b 1M -n 1000\n  \
-                        cantap capture -d COM5 -c 2 -b 250k -t 60s -o trace.blf --json\n  \
-                        cantap capture -d /dev/ttyACM0 -d /dev/ttyACM1 -b 500k -b 3:250k -o both.blf\n  \
-                        cantap capture -d /dev/ttyACM0 -b 500k --db car.dbc --trigger 'Speed > 80' --pre 2s --post 5s -o fast.log"
+    after_help = "Channels only listen, unless --mode says otherwise: nothing is sent and nothing acknowledged. Without \
+                -o the trace goes to standard output, unless --json is given.\n\n\
+                The summary counts a channel's bus errors whatever the filters, those reported and those only counted. \
+                What is not known is – with its reason (null with --json): frames/s and bus load with --no-stamps, the \
+                bus load where --no-data left data out, and where the device's filters keep frames back.\n\n\
+                Examples:\n  \
+                cantap capture -d /dev/ttyACM0 -b 500k -o drive.log\n  \
+                cantap capture -d virtual -b 1M -n 1000\n  \
+                cantap capture -d COM5 -c 2 -b 250k -t 60s -o trace.blf --json\n  \
+                cantap capture -d /dev/ttyACM0 -d /dev/ttyACM1 -b 500k -b 3:250k -o both.blf\n  \
+                cantap capture -d /dev/ttyACM0 -b 500k --db car.dbc --trigger 'Speed > 80' \\\n      \
+                --pre 2s --post 5s -o fast.log"
 )]
 pub struct Args {
     /// Where the device is: a serial port, or virtual. Repeat for several boards in one trace: the second one's channels are 3 and
@@ -125,7 +127,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             sink.omits_data.push(number);
         }
     }
-    let mut meters = Meters { channels };
+    let filtered = live.filtered();
+    let channels = channels
+        .into_iter()
+        .map(|(number, meter)| (number, if filtered.contains(&number) { meter.filtered() } else { meter }));
+    let mut meters = Meters { channels: channels.collect() };
     let end = write_all(args, &mut live, &mut sink, &mut meters);
     let seconds = started.elapsed().as_secs_f64();
     let trigger = sink.trigger.as_ref().map(TriggerSummary::of);
@@ -172,9 +178,10 @@ struct Meters {
 }
 
 impl Meters {
-    fn push(&mut self, record: &TraceRecord) {
+    /// Takes a record; one that does not count still loads its bus.
+    fn push(&mut self, record: &TraceRecord, counts: bool) {
         if let Some((_, meter)) = self.channels.iter_mut().find(|(number, _)| *number == record.channel) {
-            meter.push(record);
+            if counts { meter.push(record) } else { meter.pass_by(record) }
         }
     }
 
@@ -210,8 +217,8 @@ fn write_all(
     let mut view = View::of(args);
     let mut batch = Vec::new();
     while live.next_batch(&mut batch)? {
-        for record in batch.iter().filter(|record| args.counts(record)) {
-            meters.push(record);
+        for record in &batch {
+            meters.push(record, args.counts(record));
             if !args.accepts(record) {
                 continue;
             }
@@ -271,7 +278,10 @@ impl View {
                 format!("{number}: {} frames{rate}{load}", meter.frames())
             });
             let channels = channels.collect::<Vec<_>>().join("  ");
-            let lost: u64 = meters.channels.iter().map(|(_, meter)| meter.lost()).sum();
+            let of = |meter: &Meter| (meter.lost(), meter.lost_at_least());
+            let lost = meters.channels.iter().map(|(_, meter)| of(meter));
+            let (lost, at_least) = lost.fold((0, false), |sum, of| (sum.0 + of.0, sum.1 | of.1));
+            let lost = lost_frames(lost, at_least);
             let size = std::fs::metadata(&*path).map_or(0, |metadata| metadata.len());
             format!(
                 "{:.0} s  {channels}  lost {lost}  {:.1} MB  Ctrl-C ends it",

@@ -16,23 +16,25 @@ pub use self::line::write;
 use self::lines::Lines;
 use self::summary::Summary;
 use crate::databases::DatabaseArgs;
-use crate::input::ReadArgs;
+use crate::input::FollowArgs;
 use crate::live::LiveArgs;
 use crate::protocols::{ProtocolArgs, Reading};
 
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
-    cantap conversations drive.log\n  \
-    cantap conversations drive.blf --protocol uds --protocol obd --json\n  \
-    cantap conversations tractor.asc --db machine.dbc\n  \
-    cantap conversations plant.log --eds 5:drive.eds --eds 6:io.dcf\n  \
-    cantap conversations workshop.log --pair 6F1/12:612/F1\n  \
-    cantap conversations -d /dev/ttyACM0 -b 500k\n\n\
-Without --protocol, each channel is read by the protocols that its first frames show, and by others as\n\
-soon as they show; they are named on standard error. A line is: time, interface, protocol, sender > receiver, what was said, and for a response how long it took. Where frames were lost, what\n\
-was under way says so. With --json each line is an object:\n\
-{\"time_s\", \"start_s\", \"channel\", \"protocol\", \"kind\", \"from\", \"to\", \"title\", \"fields\", …}, see docs/protocols.md. The last line is {\"summary\"}.")]
+                cantap conversations drive.log\n  \
+                cantap conversations drive.blf --protocol uds --protocol obd --json\n  \
+                cantap conversations tractor.asc --db machine.dbc\n  \
+                cantap conversations plant.log --eds 5:drive.eds --eds 6:io.dcf\n  \
+                cantap conversations workshop.log --pair 6F1/12:612/F1\n  \
+                cantap conversations -d /dev/ttyACM0 -b 500k\n\n\
+                Without --protocol, each channel is read by the protocols that its first frames show, and by others as \
+                soon as they show; they are named on standard error. A line is: time, interface, protocol, sender > \
+                receiver, what was said, and for a response how long it took. Where frames were lost, what was under \
+                way says so. With --json each line is an object:\n\
+                {\"time_s\", \"start_s\", \"channel\", \"protocol\", \"kind\", \"from\", \"to\", \"title\", \"fields\", \
+                …}, see docs/protocols.md. The last line is {\"summary\"}.")]
 pub struct Args {
     /// The trace; - for standard input.
     #[arg(value_name = "FILE")]
@@ -57,7 +59,7 @@ pub struct Args {
     #[arg(short, long)]
     quiet: bool,
     #[command(flatten)]
-    read: ReadArgs,
+    read: FollowArgs,
 }
 
 /// Runs it.

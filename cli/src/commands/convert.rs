@@ -14,7 +14,7 @@ use crate::args;
 #[cfg(feature = "parquet")]
 use crate::columns;
 use crate::completion;
-use crate::input::ReadArgs;
+use crate::input::{FollowArgs, ReadArgs};
 use crate::missing::by_kind;
 use crate::trace_output::{TraceOutput, named};
 use cantap_work::interrupt;
@@ -173,7 +173,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let filter = args.filters.iter().chain(&args.filter_options).cloned().collect();
     let zone = args.write.zone.clone();
-    let read = ReadArgs { format: args.from, follow: args.follow, strict: args.strict, filter, zone };
+    let read = ReadArgs { format: args.from, strict: args.strict, filter, zone };
+    let read = FollowArgs { read, follow: args.follow };
     let mut records = read.open(&args.input)?;
     let grows = records.end_when(interrupt::requested);
     if grows {

@@ -17,11 +17,11 @@ use crate::words::counted;
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
-    cantap db car.dbc\n  \
-    cantap db car.dbc --message EngineData --message 'Body*'\n  \
-    cantap db car.dbc --coverage trace.log\n\n\
-In a layout the highest bit is on the left; < is a signal's most significant bit, x its least significant one,\n\
-X a bit that several signals have.")]
+                cantap db car.dbc\n  \
+                cantap db car.dbc --message EngineData --message 'Body*'\n  \
+                cantap db car.dbc --coverage trace.log\n\n\
+                In a layout the highest bit is on the left; < is a signal's most significant bit, x its least \
+                significant one, X a bit that several signals have.")]
 pub struct Args {
     /// The databases.
     #[arg(required = true, value_name = "FILE", add = completion::databases())]

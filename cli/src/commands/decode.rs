@@ -35,6 +35,8 @@ struct Count {
     decoded: u64,
     values: u64,
     lost: u64,
+    /// Whether there may be more, as while the device was off the bus.
+    lost_at_least: bool,
     /// What frames with containers have besides these values.
     #[serde(skip)]
     not_decoded: NotDecoded,
@@ -70,7 +72,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let left_out = output.left_out();
     output.finish(&summary)?;
-    let Count { frames, decoded, values, lost, not_decoded, events } = count;
+    let Count { frames, decoded, values, lost, lost_at_least, not_decoded, events } = count;
     let said = if args.protocols { format!(", {events} events of protocols") } else { String::new() };
     eprintln!("cantap: decoded {decoded} of {frames} frames, {values} values{said}");
     if left_out > 0 {
@@ -81,8 +83,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     for (what, count) in not_decoded.iter() {
         eprintln!("cantap: not decoded: {what} ({count})");
     }
-    if lost > 0 {
-        eprintln!("cantap: {lost} frames or more are missing in the trace");
+    match (lost, lost_at_least) {
+        (0, false) => {}
+        (0, true) => eprintln!("cantap: an unknown number of frames is missing in the trace"),
+        _ => eprintln!("cantap: {lost} frames or more are missing in the trace"),
     }
     records.judge()?;
     Ok(ExitCode::SUCCESS)
@@ -136,8 +140,9 @@ fn one(
     count: &mut Count,
     output: &mut Output,
 ) -> anyhow::Result<()> {
-    if let TraceEvent::Lost { count: lost, .. } = record.event {
+    if let TraceEvent::Lost { count: lost, at_least, .. } = record.event {
         count.lost += u64::from(lost);
+        count.lost_at_least |= at_least;
     }
     let Some(frame) = record.frame() else { return output.push_event(record) };
     count.frames += 1;

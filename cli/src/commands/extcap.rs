@@ -30,12 +30,13 @@ use crate::wrong::wrong;
 #[derive(clap::Args)]
 #[command(
     args_conflicts_with_subcommands = true,
-    after_help = "`cantap extcap install` once, and Wireshark and tshark show each connected board as an interface, with both channels: \
-                        \n`tshark -i cantap-virtual` tries it. Channels only listen, unless the interface's options or the toolbar say otherwise.\n\
-                        Capture filters are candump's, several apart by blanks: can0,123:7FF can1,#FF\n\n\
-                        Wireshark gives every other option; each can also be given by hand:\n  \
-                        cantap extcap --extcap-interfaces\n  \
-                        tshark -i cantap-address -o extcap.cantap_address.device:unix:"
+    after_help = "`cantap extcap install` once, and Wireshark and tshark show each connected board as an interface, with \
+                both channels: \n\
+                `tshark -i cantap-virtual` tries it. Channels only listen, unless the interface's options or the \
+                toolbar say otherwise. Capture filters are candump's, several apart by blanks: can0,123:7FF can1,#FF\n\n\
+                Wireshark gives every other option; each can also be given by hand:\n  \
+                cantap extcap --extcap-interfaces\n  \
+                tshark -i cantap-address -o extcap.cantap_address.device:unix:"
 )]
 pub struct Args {
     #[command(subcommand)]
@@ -87,7 +88,7 @@ pub struct Args {
     #[arg(long, value_name = "RATE", default_value = "auto", help_heading = OPTIONS)]
     bitrate2: BitRate,
     /// How to take part in the buses.
-    #[arg(long, value_enum, default_value = "listen", help_heading = OPTIONS)]
+    #[arg(long, value_enum, default_value = "listen-only", help_heading = OPTIONS)]
     mode: ModeArg,
 }
 
@@ -103,7 +104,8 @@ enum Action {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum ModeArg {
     /// Send nothing, acknowledge nothing.
-    Listen,
+    #[value(name = "listen-only", alias = "listen")]
+    ListenOnly,
     /// Acknowledge frames.
     Normal,
 }
@@ -166,7 +168,7 @@ pub fn run(args: Args) -> anyhow::Result<ExitCode> {
         address: place.address(args.device.as_ref()),
         bit_rates: [args.bitrate1, args.bitrate2],
         mode: match args.mode {
-            ModeArg::Listen => Mode::ListenOnly,
+            ModeArg::ListenOnly => Mode::ListenOnly,
             ModeArg::Normal => Mode::Normal,
         },
         filters: args.extcap_capture_filter.map(|Filters(filters)| filters).unwrap_or_default(),

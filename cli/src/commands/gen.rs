@@ -38,8 +38,8 @@ pub struct Args {
     channel: Channels,
     #[command(flatten)]
     open: ChannelArgs,
-    /// Time from one frame to the next in milliseconds; 0 for as fast as the bus can take them.
-    #[arg(short, long, value_name = "MS", default_value_t = 200.0, value_parser = gap)]
+    /// Time from one frame to the next, in milliseconds, or with a unit, as 1ms or 2s; 0 for as fast as the bus can take them.
+    #[arg(short, long, value_name = "MS", default_value_t = 200.0, value_parser = args::milliseconds)]
     gap: f64,
     /// Fill the bus: no gap, and frames without data (the most that a bus can carry), unless -L or -D says otherwise.
     /// Reports at the end how full it was.
@@ -73,7 +73,7 @@ pub struct Args {
     #[arg(short = '8', long)]
     raw_dlc: bool,
     /// Accepted for compatibility with cangen: a full queue is always waited for.
-    #[arg(short = 'p', value_name = "MS", hide = true, value_parser = gap)]
+    #[arg(short = 'p', value_name = "MS", hide = true, value_parser = args::milliseconds)]
     poll: Option<f64>,
     /// Accepted for compatibility with cangen: a full queue is not an error here.
     #[arg(short = 'i', hide = true)]
@@ -137,6 +137,7 @@ fn mode(text: &str) -> Option<Values> {
 }
 
 fn identifier(text: &str) -> Result<Values, String> {
+    let text = text.strip_prefix("0x").unwrap_or(text);
     let hex = text.bytes().all(|digit| digit.is_ascii_hexdigit());
     let number = || u32::from_str_radix(text, 16).ok().filter(|id| hex && *id <= Id::MAX_EXTENDED);
     mode(text)
@@ -160,11 +161,6 @@ fn data(text: &str) -> Result<Data, String> {
     frame
         .map(|frame| Data::Fixed(frame.data().to_vec()))
         .ok_or_else(|| "write r, i, e, o or up to 8 bytes in hexadecimal".to_owned())
-}
-
-fn gap(text: &str) -> Result<f64, String> {
-    let value = text.parse().ok().filter(|ms| (0.0..=3_600_000.0).contains(ms));
-    value.ok_or_else(|| "write milliseconds, such as 200 or 0.5".to_owned())
 }
 
 /// Generates the frames.
@@ -288,7 +284,7 @@ impl Filled {
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.fd || args.fd_error_state {
-        bail!("the device is a classical CAN controller, without CAN FD; leave -f and -E away");
+        bail!("the device is a classical CAN controller, without CAN FD; omit -f and -E");
     }
     if matches!(args.length, Some(Values::Fixed(9..))) && !args.raw_dlc {
         let reason = "a frame carries 0 to 8 bytes; -8 allows lengths up to 15, which say eight";
@@ -318,16 +314,29 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             filled.add(&ends);
             sending.goes_on(&ends, replay.oldest_due())
         };
-        if !goes_on(&mut replay) || !replay.push(0, *channel, frame, goes_on)? {
+        if !goes_on(&mut replay) {
             break;
         }
+        match replay.push(0, *channel, frame, goes_on) {
+            Ok(true) => {}
+            Ok(false) => break,
+            Err(error) => {
+                sending.fail(error);
+                break;
+            }
+        }
     }
-    if !sending.stands_still() {
-        sending.finish_replay(&mut replay)?;
+    if !sending.stands_still()
+        && !sending.has_failed()
+        && let Err(error) = sending.finish(&mut replay)
+    {
+        sending.fail(error);
     }
     let asked = if sending.stands_still() { args.frames.unwrap_or(generator.count) } else { sending.ended() };
     let outcome = sending.outcome(asked)?;
-    device.stop()?;
+    if !outcome.is_cut_short() {
+        device.stop()?;
+    }
     if args.json {
         let mut object = outcome.object();
         object["sent"] = sending.sent().into();

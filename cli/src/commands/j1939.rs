@@ -7,6 +7,7 @@ use anyhow::{anyhow, bail};
 use cantap_protocols::active::station::{Station, StationError, StationJob, StationTiming};
 use cantap_protocols::j1939::J1939;
 use cantap_protocols::{Event, Party};
+use cantap_trace::grammar;
 
 use super::uds::hex::{self, Hex};
 use crate::args;
@@ -28,12 +29,13 @@ const MOST_BYTES: usize = 1785;
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
-    cantap j1939 -d /dev/ttyACM0 -b 250k claim\n  \
-    cantap j1939 -d COM5 -b 250k request 65260 --to 0\n  \
-    cantap j1939 -d COM5 -b 250k dm1\n  \
-    cantap j1939 -d COM5 -b 250k send 0xEF00 0102030405060708090A --to 3\n\n\
-It claims an address first, which takes a quarter of a second, and another one where a node with a lower NAME has it. It\n\
-takes part in the bus: it acknowledges, and sends what it is asked for here and what its address demands.")]
+                cantap j1939 -d /dev/ttyACM0 -b 250k claim\n  \
+                cantap j1939 -d COM5 -b 250k request 65260 --to 0\n  \
+                cantap j1939 -d COM5 -b 250k dm1\n  \
+                cantap j1939 -d COM5 -b 250k send 0xEF00 0102030405060708090A --to 3\n\n\
+                It claims an address first, which takes a quarter of a second, and another one where a node with a \
+                lower NAME has it. It takes part in the bus: it acknowledges, and sends what it is asked for here and \
+                what its address demands.")]
 pub struct Args {
     #[command(flatten)]
     speak: SpeakArgs,
@@ -104,12 +106,8 @@ fn bytes(text: &str) -> Result<Bytes, String> {
 }
 
 fn pgn(text: &str) -> Result<u32, String> {
-    let number = match text.strip_prefix("0x") {
-        Some(digits) => u32::from_str_radix(digits, 16).ok(),
-        None => text.parse().ok(),
-    };
     let advice = || "write a group's number up to 262143, as 65260 or 0xFEEC".to_owned();
-    let pgn = number.filter(|number| *number <= 0x3_FFFF).ok_or_else(advice)?;
+    let pgn = grammar::parameter_group(text).ok_or_else(advice)?;
     if pgn >> 8 & 0xFF < 240 && pgn & 0xFF != 0 {
         return Err(
             "groups below 0xF000 end in 00: the last byte is the address, which --to gives".to_owned()
@@ -144,7 +142,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         What::Dm1 { to } => StationJob::Request { pgn: DM1, to: *to },
         What::Send { pgn, data, to, priority } => {
             if *to != GLOBAL && pgn >> 8 & 0xFF >= 240 {
-                return Err(wrong(format!("the group {pgn} goes to all; leave --to away")));
+                return Err(wrong(format!("the group {pgn} goes to all; omit --to")));
             }
             StationJob::Send { pgn: *pgn, to: *to, priority: *priority, data: data.0.clone() }
         }

@@ -6,9 +6,11 @@ use std::process::ExitCode;
 /// The command line.
 #[derive(clap::Args)]
 #[command(
-    after_help = "Boards are found by their USB IDs. Until cantap has a product ID of its own these are \
-                        pid.codes' test IDs,\nso another project's board may be listed too; `cantap info` tells.\n\n\
-                        Examples:\n  cantap list\n  cantap list --json"
+    after_help = "Boards are found by their USB IDs. Until cantap has a product ID of its own these are pid.codes' test \
+                IDs, so another project's board may be listed too; `cantap info` tells.\n\n\
+                Examples:\n  \
+                cantap list\n  \
+                cantap list --json"
 )]
 pub struct Args {
     /// Print one JSON object.

@@ -17,6 +17,7 @@ pub mod defaults;
 pub mod diff;
 pub mod extcap;
 pub mod r#gen;
+pub mod help;
 pub mod info;
 pub mod j1939;
 pub mod list;
@@ -72,6 +73,8 @@ pub enum Command {
     Canopen(Box<canopen::Args>),
     /// Talk to J1939 nodes: claim an address, request parameter groups and trouble codes, send messages.
     J1939(Box<j1939::Args>),
+    /// Explain a command, or a topic: wiring, filters, conditions, times.
+    Help(help::Args),
     /// Print the completion script of a shell.
     Completions(completions::Args),
     /// Write the manual pages.
@@ -138,6 +141,7 @@ impl Command {
             Self::Uds(args) => uds::run(&args),
             Self::Canopen(args) => canopen::run(&args),
             Self::J1939(args) => j1939::run(&args),
+            Self::Help(args) => help::run(&args, line),
             Self::Completions(args) => completions::run(&args),
             Self::Man(args) => man::run(&args, line),
             Self::Db(args) => db::run(&args),

@@ -32,12 +32,12 @@ use crate::{args, beside};
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
-    cantap monitor virtual:car\n  \
-    cantap monitor -d /dev/ttyACM0 -b 500k -b 2:250k --db car.dbc\n  \
-    cantap monitor trace.blf -b 500k --db car.dbc\n  \
-    cantap monitor -p car.toml\n\n\
-h shows the keys. Without a device and a file, the board that is connected is listened to. Without a bit rate, given or\n\
-saved on the device, it is found by listening.")]
+                cantap monitor virtual:car\n  \
+                cantap monitor -d /dev/ttyACM0 -b 500k -b 2:250k --db car.dbc\n  \
+                cantap monitor trace.blf -b 500k --db car.dbc\n  \
+                cantap monitor -p car.toml\n\n\
+                h shows the keys. Without a device and a file, the board that is connected is listened to. Without a \
+                bit rate, given or saved on the device, it is found by listening.")]
 pub struct Args {
     /// A trace to play back, or a device's address.
     #[arg(value_name = "FILE|DEVICE", conflicts_with = "devices")]

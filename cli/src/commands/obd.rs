@@ -23,13 +23,13 @@ const LIST: u8 = 0x20;
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
-    cantap obd -d virtual:car\n  \
-    cantap obd -d virtual:car live 0C 0D --period 500ms\n  \
-    cantap obd -d /dev/ttyACM0 -b 500k codes\n  \
-    cantap obd -d COM5 -b 500k clear --yes\n\n\
-Without a command: VIN, trouble codes, and every value once. All ECUs are asked at once (7DF), and where none\n\
-answers, with identifiers of 29 bits (18DB33F1). It takes part in the bus: it acknowledges, and sends what it is\n\
-asked for here and nothing else.")]
+                cantap obd -d virtual:car\n  \
+                cantap obd -d virtual:car live 0C 0D --period 500ms\n  \
+                cantap obd -d /dev/ttyACM0 -b 500k codes\n  \
+                cantap obd -d COM5 -b 500k clear --yes\n\n\
+                Without a command: VIN, trouble codes, and every value once. All ECUs are asked at once (7DF), and \
+                where none answers, with identifiers of 29 bits (18DB33F1). It takes part in the bus: it acknowledges, \
+                and sends what it is asked for here and nothing else.")]
 pub struct Args {
     #[command(flatten)]
     speak: SpeakArgs,

@@ -13,6 +13,7 @@ use cantap_analysis::plot::{
 };
 use cantap_analysis::stats::Options;
 use cantap_formats::time_range::{TimePoint, TimeRange, date_text};
+use cantap_trace::grammar;
 
 use crate::channel_bitrate::ChannelBitrate;
 use crate::completion;
@@ -27,11 +28,12 @@ use serde_json::json;
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
-    cantap plot trace.log --db car.dbc --signal Speed --signal 'Engine.*' -o drive.svg\n  \
-    cantap plot trace.log --bus-load -b 500k --window 100ms -o load.png\n  \
-    cantap plot trace.log --timing 123\n\n\
-Without -o the picture is drawn in the terminal. Where frames were lost, curves are interrupted and the\n\
-place is shaded.")]
+                cantap plot trace.log --db car.dbc --signal Speed --signal 'Engine.*' \\\n      \
+                -o drive.svg\n  \
+                cantap plot trace.log --bus-load -b 500k --window 100ms -o load.png\n  \
+                cantap plot trace.log --timing 123\n\n\
+                Without -o the picture is drawn in the terminal. Where frames were lost, curves are interrupted and the \
+                place is shaded.")]
 pub struct Args {
     /// The trace; - for standard input.
     #[arg(value_name = "IN")]
@@ -44,8 +46,8 @@ pub struct Args {
     /// Draw the bus load over time, or frames/s if no bit rate is given.
     #[arg(long, conflicts_with_all = ["signals", "timing"])]
     bus_load: bool,
-    /// Draw a histogram of this identifier's periods: 3 hexadecimal digits, or 8 for 29 bits.
-    #[arg(long, value_name = "ID", conflicts_with = "signals", add = completion::identifiers())]
+    /// Draw a histogram of this identifier's periods.
+    #[arg(long, value_name = "ID", conflicts_with = "signals", value_parser = grammar::identifier, add = completion::identifiers())]
     timing: Option<Id>,
     /// The bit rate for the load, such as 500k, or 2:250k for one channel.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", requires = "bus_load", add = completion::bit_rates())]
@@ -135,6 +137,11 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
     let name = args.input.file_name().map_or("-".into(), |name| name.to_string_lossy());
     let title = |what: &str| args.title.clone().unwrap_or_else(|| format!("{name}: {what}"));
     if args.bus_load {
+        if args.read.hides_frames() {
+            return Err(wrong(
+                "a filter hides part of the bus's load; leave -f out, or give only a channel, as -f can0",
+            ));
+        }
         let data = ChannelBitrate::options(&args.data_bitrates);
         let options = Options {
             window: args.window,

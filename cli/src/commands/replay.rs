@@ -14,10 +14,11 @@ use cantap::{Channel, Device, TraceEvent, TraceFrame};
 use crate::args;
 use crate::boards::OneBoard;
 use crate::channel_args::ChannelArgs;
-use crate::input::ReadArgs;
+use crate::input::FollowArgs;
 use crate::missing::Missing;
 use crate::sending::Sending;
 use crate::wrong::wrong;
+use cantap_trace::grammar;
 use cantap_work::interrupt;
 use cantap_work::rounded;
 
@@ -45,7 +46,7 @@ pub struct Args {
     #[command(flatten)]
     open: ChannelArgs,
     #[command(flatten)]
-    read: ReadArgs,
+    read: FollowArgs,
     /// Play this many times, or i for ever.
     #[arg(short = 'l', long = "loop", value_name = "N|i", default_value = "1", value_parser = rounds)]
     rounds: Rounds,
@@ -53,7 +54,7 @@ pub struct Args {
     #[arg(short, long, value_name = "TIME", value_parser = args::duration)]
     skip: Option<Duration>,
     /// Minimum time between two frames, in milliseconds.
-    #[arg(short, long, value_name = "MS", default_value_t = 0.0, value_parser = milliseconds)]
+    #[arg(short, long, value_name = "MS", default_value_t = 0.0, value_parser = args::milliseconds)]
     gap: f64,
     /// Ignore the trace's times: as fast as the bus can take it. --gap, --skip and --speed then have no effect.
     #[arg(short = 't', long, conflicts_with_all = ["gap", "skip", "speed"])]
@@ -102,19 +103,10 @@ fn speed(text: &str) -> Result<f64, String> {
     value.ok_or_else(|| "write a factor from 0.001 to 1000; 2 is twice as fast".to_owned())
 }
 
-fn milliseconds(text: &str) -> Result<f64, String> {
-    let value = text.parse().ok().filter(|ms| (0.0..=3_600_000.0).contains(ms));
-    value.ok_or_else(|| "write milliseconds, such as 1 or 0.5".to_owned())
-}
-
 fn mapping(text: &str) -> Result<(Channel, u8), String> {
     let wrong = || "write TO=FROM, such as can1=can0".to_owned();
     let (to, from) = text.split_once('=').ok_or_else(wrong)?;
-    let from = from.strip_prefix("can").map_or_else(
-        || from.parse::<u8>().ok(),
-        |interface| interface.parse::<u8>().ok().and_then(|interface| interface.checked_add(1)),
-    );
-    Ok((args::channel(to)?, from.filter(|from| *from > 0).ok_or_else(wrong)?))
+    Ok((args::channel(to)?, grammar::channel(from).ok_or_else(wrong)?))
 }
 
 /// The device's channels. A channel on which nothing is sent is never opened: it would acknowledge on a bus that has
@@ -180,7 +172,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         args.play(&source, &mut replay, &mut sending, &mut buses)?;
     let seconds = started.elapsed().as_secs_f64();
     let outcome = sending.outcome(asked)?;
-    device.stop()?;
+    if !outcome.is_cut_short() {
+        device.stop()?;
+    }
     let accuracy = replay.accuracy();
     if args.json {
         let mut object = outcome.object();
@@ -213,7 +207,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 accuracy.early_us, accuracy.late_us
             );
         }
-        eprintln!();
+        eprintln!("");
     }
     outcome.verdict()?;
     Ok(ExitCode::SUCCESS)
@@ -360,7 +354,7 @@ impl Args {
                 played.asked += u64::from(rounds - round) * (played.asked - before);
             }
         }
-        sending.finish_replay(replay)?;
+        sending.finish(replay)?;
         played.asked = match self.frames {
             _ if !sending.stands_still() => sending.ended(),
             Some(frames) => played.asked.min(frames),

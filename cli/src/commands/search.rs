@@ -17,28 +17,29 @@ use super::decode;
 use crate::completion;
 use crate::databases::DatabaseArgs;
 use crate::exit;
-use crate::input::{ReadArgs, Records};
+use crate::input::{FollowArgs, Records};
 use crate::live::LiveArgs;
 use crate::missing::Missing;
 use crate::protocols::{self, ProtocolArgs};
 use crate::trace_output::TraceOutput;
-use crate::words::{error_name, failure_name, state_name};
+use crate::words::failure_text;
 use crate::wrong::wrong;
 
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
-    cantap search trace.log --id 123 --data '11 ?? 3?'\n  \
-    cantap search trace.log --db car.dbc 'Speed > 80 and Gear == Drive' -C 5\n  \
-    cantap search trace.blf --data '* DE AD' -o found.asc\n  \
-    cantap search trace.log 'id == 0x123 and byte[0] & 0x80 != 0' --count\n  \
-    cantap search -d /dev/ttyACM0 -b 500k -e 'error or id == 0x7DF' -m 1\n  \
-    cantap search workshop.log 'uds.sid == 0x22 and uds.nrc'\n\n\
-    A condition knows: signals (Speed, Engine.Speed; the last value received), texts of value tables, id,\n\
-    dlc, len, ch (from 1), ext, rtr, byte[N], error, lost, numbers (12, 0x1F), + - * / % & |, == != < <= > >=,\n\
-    not, and, or, parentheses; and what frames say together: uds.nrc, j1939.spn == 110, canopen.node == 5 and\n\
-    canopen.fault (docs/protocols.md). Of such, the frame is shown that completes it, and behind it what it says.\n\n\
-    Exit codes: 0 something was found, 1 nothing was found or a failure, 2 wrong command line.")]
+                cantap search trace.log --id 123 --data '11 ?? 3?'\n  \
+                cantap search trace.log --db car.dbc 'Speed > 80 and Gear == Drive' -C 5\n  \
+                cantap search trace.blf --data '* DE AD' -o found.asc\n  \
+                cantap search trace.log 'id == 0x123 and byte[0] & 0x80 != 0' --count\n  \
+                cantap search -d /dev/ttyACM0 -b 500k -e 'error or id == 0x7DF' -m 1\n  \
+                cantap search workshop.log 'uds.sid == 0x22 and uds.nrc'\n\n\
+                A condition knows: signals (Speed, Engine.Speed; the last value received), texts of value tables, id, \
+                dlc, len, ch (from 1), ext, rtr, byte[N], error, lost, numbers (12, 0x1F), + - * / % & |, == != < <= > \
+                >=, not, and, or, parentheses; and what frames say together: uds.nrc, j1939.spn == 110, canopen.node == \
+                5 and canopen.fault (docs/protocols.md). Of such, the frame is shown that completes it, and behind it \
+                what it says.\n\n\
+                Exit codes: 0 something was found, 1 nothing was found or a failure, 2 wrong command line.")]
 pub struct Args {
     /// The trace; - for standard input.
     #[arg(value_name = "FILE")]
@@ -89,7 +90,7 @@ pub struct Args {
     #[arg(short, long)]
     quiet: bool,
     #[command(flatten)]
-    read: ReadArgs,
+    read: FollowArgs,
 }
 
 /// More context than anyone would look at only takes memory.
@@ -276,12 +277,12 @@ impl Sink {
 fn describe(event: &TraceEvent) -> String {
     match event {
         TraceEvent::Frame { frame, .. } => frame.to_string(),
-        TraceEvent::BusError { kind: Some(kind), .. } => format!("bus error: {}", error_name(*kind)),
+        TraceEvent::BusError { kind: Some(kind), .. } => format!("bus error: {}", kind.name()),
         TraceEvent::BusError { kind: None, .. } => "bus error".to_owned(),
         TraceEvent::ErrorsSuppressed { count } => format!("{count} more bus errors"),
-        TraceEvent::State { state, .. } => format!("controller: {}", state_name(*state)),
+        TraceEvent::State { state, .. } => format!("controller: {}", state.name()),
         TraceEvent::Lost { count, at_least: true, .. } => format!("at least {count} frames lost"),
         TraceEvent::Lost { count, .. } => format!("{count} frames lost"),
-        TraceEvent::TransmitFailed { reason, .. } => format!("not sent: {}", failure_name(*reason)),
+        TraceEvent::TransmitFailed { reason, .. } => format!("not sent: {}", failure_text(*reason)),
     }
 }

@@ -1,6 +1,7 @@
 //! `cantap send`: sends frames now, periodically, or as replies.
 
 mod modifiers;
+mod replies;
 
 use std::io::Write;
 use std::process::ExitCode;
@@ -9,12 +10,12 @@ use std::time::{Duration, Instant};
 use anyhow::bail;
 use cantap::periodic::{self, BadPeriodic, SHORTEST_PERIOD};
 use cantap::transmit::Stream;
-use cantap::wire::message::{
-    DEVICE_TAG, Filter as HardwareFilter, FrameKind, Mode, Periodic, TRIGGER_TAG, Trigger,
-};
+use cantap::wire::message::{DEVICE_TAG, Filter as HardwareFilter, FrameKind, Mode, Periodic, Trigger};
 use cantap::{Channel, Device, Frame, Id, hw_filter};
 use cantap_trace::filter::Filter;
+use cantap_trace::grammar;
 use modifiers::Modifiers;
+use replies::{Counts, Replies};
 
 use crate::args;
 use crate::boards::OneBoard;
@@ -29,11 +30,13 @@ use cantap_work::rounded;
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Frames are written as 123#DEADBEEF, 5A1#11.22.33, 123#R3, 1F334455#1122, or as \
-                  Message:Signal=value,Signal=value with --db.\nEach frame that was sent is printed with the time at \
-                  which it ended on the bus. When none leaves for a second, it ends and says why.\n\nExamples:\n  cantap send -d /dev/ttyACM0 -b 500k can0 123#DEADBEEF\n  \
-                  cantap send -d virtual can1 123#00 --period 10ms --count 100 --counter 0\n  \
-                  cantap send -d COM5 -b 250k can0 7E8#0341 --on-rx 7E0:7FF\n  \
-                  cantap send -d COM5 -b 250k can0 'Dashboard:Speed=88' --db car.dbc")]
+                Message:Signal=value,Signal=value with --db. Each frame that was sent is printed with the time at which \
+                it ended on the bus. When none leaves for a second, it ends and says why.\n\n\
+                Examples:\n  \
+                cantap send -d /dev/ttyACM0 -b 500k can0 123#DEADBEEF\n  \
+                cantap send -d virtual can1 123#00 --period 10ms --count 100 --counter 0\n  \
+                cantap send -d COM5 -b 250k can0 7E8#0341 --on-rx 7E0:7FF\n  \
+                cantap send -d COM5 -b 250k can0 'Dashboard:Speed=88' --db car.dbc")]
 pub struct Args {
     #[command(flatten)]
     device: OneBoard,
@@ -92,19 +95,28 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
     let device = args.device.open()?;
     args.open.open(&device, [args.channel].into_iter(), Mode::Normal, None)?;
-    let mut sending = Sending::new(&device, args.open.rescue(), args.quiet || args.json);
+    let quiet = args.quiet || args.json;
     let started = Instant::now();
-    let asked = match (triggers, periodic) {
+    let mut replies = None;
+    let mut sending = if triggers.is_some() {
+        Sending::fed(&device, args.open.rescue(), quiet)
+    } else {
+        Sending::new(&device, args.open.rescue(), quiet)
+    };
+    let outcome = match (triggers, periodic) {
         (Some(triggers), _) => {
             let slots = device.hello().trigger_slots;
             if triggers.len() > usize::from(slots) {
                 bail!("that takes {} of the device's {slots} replies; give fewer frames", triggers.len());
             }
-            let stream = Stream::new(&device);
-            for (slot, trigger) in (0..).zip(triggers) {
-                device.set_trigger(args.channel, slot, Some(trigger))?;
-            }
-            args.watch(stream, TRIGGER_TAG, &mut sending, args.count.map(u64::from))?
+            let wanted = args.count.map(|count| u64::from(count) * frames.len() as u64);
+            let mut waited = Replies::set(&device, args.channel, triggers)?;
+            waited.watch(&mut sending, |sending| {
+                args.is_over(started) || wanted.is_some_and(|wanted| sending.ended() >= wanted)
+            })?;
+            let Counts { asked, merged } = waited.counts();
+            replies = Some(waited);
+            sending.outcome_of_replies(asked, merged)?
         }
         (None, Some((period, modifiers))) => {
             let period_ticks = periodic::period_ticks(period, device.hello().tick_hz)
@@ -124,20 +136,30 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 device.set_periodic(args.channel, slot, Some(entry))?;
             }
             let wanted = args.count.map(|count| u64::from(count) * frames.len() as u64);
-            args.watch(stream, DEVICE_TAG, &mut sending, wanted)?
+            let asked = args.watch_periodic(stream, &device, frames.len(), &mut sending, wanted)?;
+            sending.outcome(asked)?
         }
-        (None, None) => args.send_now(&device, &frames, &mut sending)?,
+        (None, None) => {
+            let asked = args.send_now(&device, &frames, &mut sending)?;
+            sending.outcome(asked)?
+        }
     };
-    let outcome = sending.outcome(asked)?;
     let seconds = started.elapsed().as_secs_f64();
-    device.stop()?;
+    if !outcome.is_cut_short() {
+        device.stop()?;
+    }
     if args.json {
         let mut object = outcome.object();
         object["channel"] = args.channel.number().into();
         object["sent"] = sending.sent().into();
         object["seconds"] = rounded(seconds, 3).into();
         object["issues"] = faults.into();
+        if let Some(replies) = &replies {
+            object["replies"] = replies.objects();
+        }
         writeln!(std::io::stdout().lock(), "{object}")?;
+    } else if let Some(replies) = replies.filter(|_| !args.quiet) {
+        replies.tell();
     }
     outcome.verdict()?;
     Ok(ExitCode::SUCCESS)
@@ -154,7 +176,7 @@ impl Args {
             if is_message(text) {
                 Ok(cantap_signals::encode::encode(&database, Some(self.channel.number()), text)?.frame)
             } else {
-                let frame = text.parse::<Frame>();
+                let frame = grammar::frame(text);
                 Ok(frame.map_err(|error| wrong(format!("'{text}' is not a frame: {error}")))?)
             }
         };
@@ -187,13 +209,13 @@ impl Args {
             return Ok(Some(frames.iter().map(answer).collect()));
         }
         let Some(text) = &self.on_rx else { return Ok(None) };
-        let filters = if let Ok(id) = text.parse::<Id>() {
-            vec![exactly(id, FrameKind::Any)]
-        } else {
+        let filters = {
             let filter = text.parse::<Filter>().map_err(|error| wrong(error.to_string()))?;
             let compiled = hw_filter::compile(&[filter], self.channel);
             if let Some(remainder) = compiled.remainder {
-                bail!("'{text}' cannot start a reply: {remainder}, which is too late for it");
+                return Err(wrong(format!(
+                    "'{text}' cannot start a reply: {remainder}, which is too late for it"
+                )));
             }
             if compiled.hardware.is_empty() {
                 let all = |extended| HardwareFilter { extended, kind: FrameKind::Any, id: 0, mask: 0 };
@@ -233,25 +255,33 @@ impl Args {
         Ok(if sending.stands_still() { all } else { sending.ended() })
     }
 
-    /// Watches what the device sends on its own, with tags from `first_tag`, until the requested number has ended. Returns
-    /// how many were requested.
-    fn watch(
+    /// Watches the periodic frames in the first `entries` slots until the requested number has ended, then clears them. Returns how many
+    /// frames were requested.
+    fn watch_periodic(
         &self,
         mut stream: Stream<'_>,
-        first_tag: u32,
+        device: &Device,
+        entries: usize,
         sending: &mut Sending<'_>,
         wanted: Option<u64>,
     ) -> anyhow::Result<u64> {
         let started = Instant::now();
-        while !self.is_over(started) && wanted.is_none_or(|wanted| sending.ended() < wanted) {
-            stream.wait(LOOK_EVERY)?;
+        let mut next = |wait: Duration| -> anyhow::Result<_> {
+            stream.wait(wait)?;
             let mut ends = stream.take_ended();
-            ends.retain(|end| end.tag >= first_tag);
-            if !sending.device_goes_on(&ends) {
+            ends.retain(|end| end.tag >= DEVICE_TAG);
+            Ok(ends)
+        };
+        while !self.is_over(started) && wanted.is_none_or(|wanted| sending.ended() < wanted) {
+            if !sending.device_goes_on(&next(LOOK_EVERY)?) {
                 break;
             }
         }
-        let missed = if self.period.is_some() { sending.periods_missed(self.channel)? } else { 0 };
+        sending.check()?;
+        for slot in (0..).take(entries) {
+            device.set_periodic(self.channel, slot, None)?;
+        }
+        let missed = sending.settle(self.channel, |_| next(LOOK_EVERY))?;
         Ok(match wanted {
             Some(wanted) if sending.stands_still() => wanted,
             // Ended by time or Ctrl-C: count what was due until then.

@@ -20,9 +20,11 @@ use cantap::wire::CHANNELS;
 use cantap_address::server::{PORT, role};
 use cantap_address::{Address, LinkError};
 use cantap_serve::listen::{self, Listening};
+#[cfg(unix)]
+use cantap_serve::socket_file::{self, SocketError};
 use cantap_serve::{Board, BoardError, News, Role, Settings, connect, lines, socketcand};
 
-use crate::args::Channels;
+use crate::args::{self, Channels};
 use crate::boards::Boards;
 use crate::channel_bitrate::ChannelBitrate;
 use crate::stderr;
@@ -34,16 +36,18 @@ use cantap_work::interrupt;
 #[derive(clap::Args)]
 #[command(
     args_conflicts_with_subcommands = true,
-    after_help = "Clients take -d unix:PATH, -d tcp://HOST:PORT or -d ssh://[USER@]HOST[/DEVICE] in place of a port, in every command. A \
-                  second device is\nat the same path with -2 behind its name, and at the next port.\n\n\
-                  Nothing is sent and nothing acknowledged while no client that may send has asked for it.\n\n\
-                  Examples:\n  cantap serve -d /dev/ttyACM0 -b 500k\n  \
-                  cantap capture -d unix: -o drive.log\n  \
-                  cantap serve -d /dev/ttyACM0 -b 500k -b 2:250k --tcp --allow send\n  \
-                  cantap monitor -d tcp://127.0.0.1\n  \
-                  cantap capture -d ssh://me@vehicle/dev/ttyACM0 -b 500k -o drive.log\n  \
-                  cantap serve keygen keys --host vehicle --client alice:send\n  \
-                  cantap serve -d /dev/ttyACM0 -b 500k --tcp 192.0.2.7 --tls keys/server.pem,keys/server-key.pem --clients keys/ca.pem"
+    after_help = "Clients take -d unix:PATH, -d tcp://HOST:PORT or -d ssh://[USER@]HOST[/DEVICE] in place of a port, in \
+                every command. A second device is at the same path with -2 behind its name, and at the next port.\n\n\
+                Nothing is sent and nothing acknowledged while no client that may send has asked for it.\n\n\
+                Examples:\n  \
+                cantap serve -d /dev/ttyACM0 -b 500k\n  \
+                cantap capture -d unix: -o drive.log\n  \
+                cantap serve -d /dev/ttyACM0 -b 500k -b 2:250k --tcp --allow send\n  \
+                cantap monitor -d tcp://127.0.0.1\n  \
+                cantap capture -d ssh://me@vehicle/dev/ttyACM0 -b 500k -o drive.log\n  \
+                cantap serve keygen keys --host vehicle --client alice:send\n  \
+                cantap serve -d /dev/ttyACM0 -b 500k --tcp 192.0.2.7 --tls keys/server.pem,keys/server-key.pem \\\n      \
+                --clients keys/ca.pem"
 )]
 pub struct Args {
     #[cfg(feature = "tls")]
@@ -56,10 +60,18 @@ pub struct Args {
     /// repeated. Without it, the one saved on the device.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE")]
     bitrates: Vec<ChannelBitrate>,
-    /// The maximum role of clients: listen; configure, which allows choosing bit rates and storing settings, one client at a time;
-    /// send, which includes acknowledging.
-    #[arg(long, value_name = "ROLE", value_parser = role, default_value = "listen")]
-    allow: Role,
+    /// The maximum role of clients: listen (the default); configure, which allows choosing bit rates and storing settings, one client at a
+    /// time for each channel; send, which includes acknowledging. With a listener before it (unix:send, tcp:send, socketcand:send), only
+    /// for that one. Can be repeated. Socketcand's clients only listen unless it is named.
+    #[arg(long = "allow", value_name = "[LISTENER:]ROLE", value_parser = allowed)]
+    allowed: Vec<Allowed>,
+    /// normal: the board acknowledges on its buses from the first listener on, so that no client that sends takes it off its bus for a
+    /// moment.
+    #[arg(long, value_name = "MODE", value_enum, default_value = "listen")]
+    mode: Listeners,
+    /// Periodic frames and replies of a client at --tcp or ssh that has said nothing for this long are stopped, as 2s; 0 for never.
+    #[arg(long, value_name = "TIME", value_parser = dead_man, default_value = "2s")]
+    dead_man: DeadMan,
     /// Listen on a UNIX socket that only this user can reach; the default, at a path in the user's own
     /// folder.
     #[cfg(unix)]
@@ -89,6 +101,65 @@ pub struct Args {
     stdio: bool,
 }
 
+/// How channels are opened for clients that only listen.
+#[derive(Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Listeners {
+    /// The board is not seen on the bus.
+    Listen,
+    /// The board acknowledges.
+    Normal,
+}
+
+/// The silence after which what a client sends on its own is stopped.
+#[derive(Clone, Copy)]
+struct DeadMan(Option<Duration>);
+
+fn dead_man(text: &str) -> Result<DeadMan, String> {
+    if matches!(text, "0" | "0s") {
+        return Ok(DeadMan(None));
+    }
+    args::positive_duration(text).map(|after| DeadMan(Some(after)))
+}
+
+/// A way in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Door {
+    Unix,
+    Tcp,
+    Socketcand,
+    Stdio,
+}
+
+/// What `--allow` allows, everywhere or at one door.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Allowed {
+    door: Option<Door>,
+    role: Role,
+}
+
+fn allowed(text: &str) -> Result<Allowed, String> {
+    let Some((door, text)) = text.split_once(':') else {
+        return Ok(Allowed { door: None, role: role(text)? });
+    };
+    let door = match door {
+        "unix" => Door::Unix,
+        "tcp" => Door::Tcp,
+        "socketcand" => Door::Socketcand,
+        _ => return Err("a listener is unix, tcp or socketcand".to_owned()),
+    };
+    Ok(Allowed { door: Some(door), role: role(text)? })
+}
+
+/// The maximum role at a door; the last one given applies. Whoever reaches socketcand's port is not asked who it is, so what is allowed
+/// everywhere is not allowed there.
+fn allow(all: &[Allowed], door: Door) -> Role {
+    let of = |door: Option<Door>| {
+        all.iter().rev().find(|allowed| allowed.door == door).map(|allowed| allowed.role)
+    };
+    let everywhere = if door == Door::Socketcand { None } else { of(None) };
+    of(Some(door)).or(everywhere).unwrap_or(Role::Listen)
+}
+
 /// How often to check whether to end.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
 /// The default port of `--lines`.
@@ -105,7 +176,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let addresses = Boards::new(&args.devices, &Channels::all())?;
     let addresses = addresses.addresses();
     if args.stdio && addresses.len() > 1 {
-        return Err(wrong("--stdio serves one device; leave the others away"));
+        return Err(wrong("--stdio serves one device; omit the others"));
     }
     let mut timing = TimingArgs::default();
     timing.set_bit_rates(args.bitrates.clone());
@@ -130,7 +201,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         boards.push(Arc::new(board));
     }
     if args.stdio {
-        return serve_stdio(&boards[0], args.allow);
+        return serve_stdio(&boards[0], allow(&args.allowed, Door::Stdio));
     }
     let listening = listen(args, tcp.map(|tcp| (tcp, way)).as_ref(), &beside, &boards)?;
     while !interrupt::requested() {
@@ -146,7 +217,12 @@ fn start(args: &Args, number: usize, address: &Address) -> anyhow::Result<Board>
     let bitrates_bps: [Option<u32>; CHANNELS] = Channel::ALL.map(|channel| {
         ChannelBitrate::of(&args.bitrates, channel_number(number, channel)).or(of_buses[channel.index()])
     });
-    let settings = Settings { bitrates_bps, ..Settings::default() };
+    let settings = Settings {
+        bitrates_bps,
+        always_acknowledges: args.mode == Listeners::Normal,
+        dead_man: args.dead_man.0,
+        ..Settings::default()
+    };
     let at = address.clone();
     let connect = Box::new(move |serial: Option<&str>| {
         at.link(serial).map_err(|error| match error {
@@ -163,14 +239,17 @@ fn start(args: &Args, number: usize, address: &Address) -> anyhow::Result<Board>
 /// Whoever runs the server sees who comes and goes; what must not be overlooked stands out.
 fn tell(news: News) {
     match news {
-        News::BoardLost { .. } | News::Refused { .. } => stderr::warn(&news.to_string()),
+        News::BoardLost { .. } | News::Refused { .. } | News::DeadMan { .. } => {
+            stderr::warn(&news.to_string())
+        }
         news => eprintln!("cantap: {news}"),
     }
 }
 
 /// If nobody may choose a bit rate, there has to be one.
 fn check_bitrates(args: &Args, number: usize, board: &Board) -> anyhow::Result<()> {
-    if args.allow >= Role::Configure {
+    let doors = [Door::Unix, Door::Tcp, Door::Socketcand, Door::Stdio];
+    if doors.into_iter().any(|door| allow(&args.allowed, door) >= Role::Configure) {
         return Ok(());
     }
     let rates = board.bitrates_bps();
@@ -238,20 +317,24 @@ fn listen(
     #[cfg(not(unix))]
     let tcp = tcp.or(Some(&loopback));
     for (number, board) in boards.iter().enumerate() {
-        let mut names = Vec::new();
+        let (mut names, mut roles) = (Vec::new(), Vec::new());
         #[cfg(unix)]
         if tcp.is_none() || args.unix.is_some() {
             let path = numbered(&args.unix.clone().unwrap_or_else(connect::default_socket), number);
-            let way = listen::unix(board, &path, args.allow).map_err(|error| match error.kind() {
-                io::ErrorKind::AddrInUse => anyhow::anyhow!(
+            let role = allow(&args.allowed, Door::Unix);
+            let folder = args.unix.is_none().then(connect::default_folder);
+            let ready = folder.map_or(Ok(()), |folder| socket_file::private_folder(&folder));
+            let way = ready.and_then(|()| listen::unix(board, &path, role)).map_err(|error| match error {
+                SocketError::InUse => anyhow::anyhow!(
                     "another server is at '{}' already; end it, or give another path with --unix",
                     path.display()
                 ),
-                _ => anyhow::anyhow!(
+                error => anyhow::anyhow!(
                     "no socket can be made at '{}': {error}; give another path with --unix",
                     path.display()
                 ),
             })?;
+            roles.push(role);
             names.push(format!("unix:{}", path.display()));
             ways.push(way);
         }
@@ -263,16 +346,17 @@ fn listen(
             let address = SocketAddr::new(first.ip(), port);
             let scheme = way.scheme();
             let way = way
-                .listen(board, address, args.allow)
+                .listen(board, address, allow(&args.allowed, Door::Tcp))
                 .with_context(|| format!("nobody can listen at {address}; give another port with --tcp"))?;
             names.push(format!("{scheme}://{}", way.address().unwrap_or(address)));
+            roles.push(allow(&args.allowed, Door::Tcp));
             ways.push(way);
         }
-        said.push((board.name(), names));
+        said.push((board.name(), names, roles));
     }
-    let other = beside.listen(args.allow, boards)?;
+    let other = beside.listen(&args.allowed, boards)?;
     let mut out = io::stdout().lock();
-    for (_, names) in &said {
+    for (_, names, _) in &said {
         for name in names {
             writeln!(out, "{name}")?;
         }
@@ -282,12 +366,17 @@ fn listen(
         ways.push(way);
     }
     out.flush()?;
-    for (board, names) in &said {
-        eprintln!(
-            "cantap: '{board}' is shared at {}; clients may {}; Ctrl-C ends it",
-            names.join(" and "),
-            args.allow
-        );
+    for (board, names, roles) in &said {
+        // One role for all is said once.
+        let first = roles.first().copied().unwrap_or(Role::Listen);
+        let is_one = roles.iter().all(|role| *role == first);
+        let ways: Vec<String> = names
+            .iter()
+            .zip(roles)
+            .map(|(name, role)| if is_one { name.clone() } else { format!("{name} ({role})") })
+            .collect();
+        let may = if is_one { format!("clients may {first}; ") } else { String::new() };
+        eprintln!("cantap: '{board}' is shared at {}; {may}Ctrl-C ends it", ways.join(" and "));
     }
     Ok(ways)
 }
@@ -340,9 +429,10 @@ struct Beside {
 
 impl Beside {
     /// Opens them. Returns their names.
-    fn listen(&self, role: Role, boards: &[Arc<Board>]) -> anyhow::Result<Vec<(String, Listening)>> {
+    fn listen(&self, all: &[Allowed], boards: &[Arc<Board>]) -> anyhow::Result<Vec<(String, Listening)>> {
         let mut ways = Vec::new();
         if let Some(address) = self.socketcand {
+            let role = allow(all, Door::Socketcand);
             let way = socketcand::listen(boards, address, role).with_context(|| {
                 format!("nobody can listen at {address}; give another port with --socketcand")
             })?;
@@ -351,6 +441,14 @@ impl Beside {
                 stderr::warn(&format!(
                     "anyone who reaches {address} can listen to the buses; nobody can send there"
                 ));
+            } else if role >= Role::Send {
+                stderr::warn(&format!(
+                    "every user and program of this computer can send on the buses at {address}: the protocol does not ask who they are"
+                ));
+            } else if allow(all, Door::Tcp) > role {
+                eprintln!(
+                    "cantap: clients at {address} may only listen; --allow socketcand:send lets every program of this computer send there"
+                );
             }
             ways.push((format!("can://{address}"), way));
         }
@@ -391,7 +489,7 @@ fn serve_stdio(board: &Board, role: Role) -> anyhow::Result<ExitCode> {
     // The client has been waiting for this, since getting here may have taken a while.
     stdout.write_all(&connect::READY)?;
     stdout.flush()?;
-    board.admit(input, stdout, "the client", role)?;
+    board.admit_remote(input, stdout, "the client", role)?;
     while board.clients() > 0 && !interrupt::requested() {
         std::thread::sleep(LOOK_EVERY);
     }
@@ -410,6 +508,22 @@ mod tests {
         assert_eq!(at("[::1]:5000").unwrap(), "[::1]:5000");
         for wrong in ["0.0.0.0", "192.168.0.1:5000", "[::]:1", "car", ""] {
             assert!(loopback(wrong, PORT).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn what_is_allowed_everywhere_is_not_allowed_to_socketcand() {
+        let roles = |texts: &[&str]| {
+            let all: Vec<Allowed> = texts.iter().map(|text| allowed(text).unwrap()).collect();
+            [Door::Unix, Door::Tcp, Door::Socketcand, Door::Stdio].map(|door| allow(&all, door))
+        };
+        let (listen, send) = (Role::Listen, Role::Send);
+        assert_eq!(roles(&[]), [listen; 4]);
+        assert_eq!(roles(&["send"]), [send, send, listen, send]);
+        assert_eq!(roles(&["socketcand:send"]), [listen, listen, send, listen]);
+        assert_eq!(roles(&["send", "tcp:configure"]), [send, Role::Configure, listen, send]);
+        for text in ["all", "udp:send", "unix:", ":send"] {
+            assert!(allowed(text).is_err(), "{text}");
         }
     }
 

@@ -11,27 +11,27 @@ use std::time::Duration;
 
 use anyhow::Context;
 use cantap_address::Address;
-use cantap_analysis::stats::{Options, PeakSummary, Statistics, Summary};
+use cantap_analysis::stats::{Options, Statistics, Summary};
 
 use self::windows::Windows;
 use crate::args;
 use crate::channel_bitrate::ChannelBitrate;
 use crate::completion;
-use crate::input::ReadArgs;
+use crate::input::FollowArgs;
 use crate::missing::{Missing, by_kind};
 use crate::protocols::{Known, ProtocolArgs};
 
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
-    cantap stats trace.log -b 500k\n  \
-    cantap stats trace.blf -b 1M -b 2:250k --window 100ms --per-id\n  \
-    cantap stats fd.asc -b 500k --data-bitrate 2M\n  \
-    cantap stats -d virtual -b 1M -t 10\n  \
-    cantap stats workshop.log --protocols\n\n\
-A frame's load is its exact length, stuff bits and intermission included, over the time since the frame\n\
-before. Windows also count error frames, with their minimum length. Where frames were lost, the load is a\n\
-lower bound and says so.")]
+                cantap stats trace.log -b 500k\n  \
+                cantap stats trace.blf -b 1M -b 2:250k --window 100ms --per-id\n  \
+                cantap stats fd.asc -b 500k --data-bitrate 2M\n  \
+                cantap stats -d virtual -b 1M -t 10\n  \
+                cantap stats workshop.log --protocols\n\n\
+                A frame's load is its exact length, stuff bits and intermission included, over the time since the frame \
+                before. Windows also count error frames, with their minimum length. Where frames were lost, the load is \
+                a lower bound and says so.")]
 pub struct Args {
     /// The trace; - for standard input.
     #[arg(value_name = "FILE")]
@@ -78,7 +78,7 @@ pub struct Args {
     #[arg(long)]
     json: bool,
     #[command(flatten)]
-    read: ReadArgs,
+    read: FollowArgs,
 }
 
 impl Args {
@@ -103,14 +103,17 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut options = args.options();
     if let Some(live) = &live {
         options.channel_bitrate_bps = live.bit_rates();
+        options.filtered = live.filtered();
     }
+    options.filtered.extend(args.read.filtered());
     let mut statistics = Statistics::new(options)?;
     let mut windows = args.windows.then(Windows::new).transpose()?;
     let mut known = args.protocols.then(|| args.protocol.known(args.json)).transpose()?;
     let mut ended = Ok(());
     let mut missing = Missing::default();
     if let Some(mut live) = live {
-        ended = live::run(!args.json, &mut live, &mut statistics, &mut windows, &mut known);
+        ended =
+            live::run(!args.json, &args.read.filter, &mut live, &mut statistics, &mut windows, &mut known);
         // What was received is shown, but it is a failure if there were only errors.
         ended = ended.and_then(|()| live.judge());
     } else if let Some(path) = &args.input {
@@ -178,7 +181,10 @@ fn write_json(
     let Some(windows) = windows else { return Ok(writeln!(out, "{members}}}")?) };
     write!(out, "{members},\"windows\":[")?;
     let mut comma = "";
-    windows.for_each(|window| Ok(write!(out, "{}{window}", std::mem::replace(&mut comma, ","))?))?;
+    windows.for_each(|window| {
+        let window = serde_json::to_string(window)?;
+        Ok(write!(out, "{}{window}", std::mem::replace(&mut comma, ","))?)
+    })?;
     Ok(writeln!(out, "]}}")?)
 }
 
@@ -186,8 +192,7 @@ fn write_windows(summary: &Summary, windows: Windows, out: &mut impl Write) -> a
     let zero_s = summary.origin_s.unwrap_or(0.0);
     let mut head = "\nWindows\n";
     windows.for_each(|window| {
-        let window: PeakSummary = serde_json::from_str(window)?;
-        let line = table::window_line(&window, zero_s);
+        let line = table::window_line(window, zero_s);
         Ok(writeln!(out, "{}{line}", std::mem::take(&mut head))?)
     })
 }

@@ -20,13 +20,14 @@ use cantap_work::interrupt;
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
-    cantap uds -d virtual:car read F190 F18C\n  \
-    cantap uds -d /dev/ttyACM0 -b 500k --session extended read F190\n  \
-    cantap uds -d COM5 -b 500k --pair 18DA10F1:18DAF110 dtc\n  \
-    cantap uds -d COM5 -b 500k --session extended --security 1 --key-command './key' routine start FF00\n  \
-    cantap uds -d COM5 -b 500k raw '22 F1 90'\n\n\
-It takes part in the bus: it acknowledges, and sends what it is asked for here and nothing else. What was said is\n\
-shown as `cantap conversations` does. A refusal is exit code 1.")]
+                cantap uds -d virtual:car read F190 F18C\n  \
+                cantap uds -d /dev/ttyACM0 -b 500k --session extended read F190\n  \
+                cantap uds -d COM5 -b 500k --pair 18DA10F1:18DAF110 dtc\n  \
+                cantap uds -d COM5 -b 500k --session extended --security 1 \\\n      \
+                --key-command './key' routine start FF00\n  \
+                cantap uds -d COM5 -b 500k raw '22 F1 90'\n\n\
+                It takes part in the bus: it acknowledges, and sends what it is asked for here and nothing else. What \
+                was said is shown as `cantap conversations` does. A refusal is exit code 1.")]
 pub struct Args {
     #[command(flatten)]
     speak: SpeakArgs,
@@ -142,7 +143,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let requests = args.requests()?;
     let pair = args.transfer.pair();
     let device = args.speak.open()?;
-    let witness = || Box::new(Diagnostics::new(&[pair], false));
+    let witness = || Box::new(Diagnostics::new(&[pair.into()], false));
     let speaking = args.speak.speak(&device, witness());
     let mut client = Client::new(speaking, args.transfer);
     if let Some(session) = args.session {

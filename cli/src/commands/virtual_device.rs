@@ -11,15 +11,18 @@ use cantap_work::interrupt;
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Options, separated by commas:\n  \
-                        car              a vehicle: 500k on channel 1, 125k on channel 2, its database is printed by --dbc;\n                   \
-                        it goes with errors, disturb, ack, channels, seed, settings, pace, ppm and serial\n  \
-                        canopen          CANopen nodes on channel 1, one of them without a number; --print-eds prints their sheet;\n                   \
-                        it does not go with load, frames, burst and log\n  load=PCT         bus load, 0 to 100 (50)\n  \
+                        car              a vehicle: 500k on channel 1, 125k on channel 2; --dbc prints\n                   \
+                        its database. It goes with errors, disturb, ack, channels,\n                   \
+                        seed, settings, pace, ppm and serial\n  \
+                        canopen          CANopen nodes on channel 1, one of them without a number;\n                   \
+                        --print-eds prints their sheet. It does not go with load,\n                   \
+                        frames, burst and log\n  load=PCT         bus load, 0 to 100 (50)\n  \
                         frames=KIND      std0, std8, ext0, ext8, rtr, mix (mix)\n  \
                         bitrate=RATE     of the bus (default: the rate it is opened at)\n  \
                         burst=N/PERIOD   N frames back to back every PERIOD, in place of a load\n  \
                         errors=PCT       share of the frames that are destroyed (0)\n  \
-                        disturb=N        the first N frames that the device sends are destroyed: 32 make it bus-off (0)\n  \
+                        disturb=N        the first N frames that the device sends are destroyed:\n                   \
+                        32 make it bus-off (0)\n  \
                         ack=yes|no       whether simulated nodes acknowledge (yes)\n  \
                         wire=apart|joined  a bus for each channel, or one for both (apart)\n  \
                         channels=1|2|both  which buses have traffic (both)\n  \

@@ -2,6 +2,7 @@
 //! neither.
 
 pub mod app;
+mod cut;
 mod event_text;
 mod keyboard;
 pub mod model;

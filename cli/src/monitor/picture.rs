@@ -1,9 +1,13 @@
 //! A screen as an SVG picture with its colours, for documents.
 
+mod shape;
+
 use std::fmt::Write;
 
 use ratatui::buffer::{Buffer, Cell};
 use ratatui::style::{Color, Modifier};
+
+use shape::Place;
 
 /// A character's size, in the picture's units.
 const CHARACTER: (f64, f64) = (8.4, 18.0);
@@ -50,22 +54,22 @@ pub fn svg(buffer: &Buffer) -> String {
         while column < buffer.area.width {
             let look = Look::of(&buffer[(column, row)]);
             let start = column;
-            let mut text = String::new();
+            let mut symbols = Vec::new();
             while column < buffer.area.width && Look::of(&buffer[(column, row)]) == look {
-                text.push_str(buffer[(column, row)].symbol());
+                symbols.push(buffer[(column, row)].symbol());
                 column += 1;
             }
-            run(&mut out, &text, &look, (start, column - start), row);
+            run(&mut out, &symbols, &look, (start, row));
         }
     }
     out.push_str("</svg>\n");
     out
 }
 
-/// Draws a run of characters; `span` is their first column and their number.
-fn run(out: &mut String, text: &str, look: &Look, span: (u16, u16), row: u16) {
-    let x = MARGIN + f64::from(span.0) * CHARACTER.0;
-    let (y, width) = (MARGIN + f64::from(row) * CHARACTER.1, f64::from(span.1) * CHARACTER.0);
+/// Draws the symbols of a run of cells that begins in this column and row.
+fn run(out: &mut String, symbols: &[&str], look: &Look, (column, row): (u16, u16)) {
+    let x = MARGIN + f64::from(column) * CHARACTER.0;
+    let (y, width) = (MARGIN + f64::from(row) * CHARACTER.1, symbols.len() as f64 * CHARACTER.0);
     // Writing to a String cannot fail.
     if let Some(background) = &look.background {
         let height = CHARACTER.1;
@@ -74,14 +78,6 @@ fn run(out: &mut String, text: &str, look: &Look, span: (u16, u16), row: u16) {
             "<rect x=\"{x:.1}\" y=\"{y:.1}\" width=\"{width:.1}\" height=\"{height}\" fill=\"{background}\"/>"
         );
     }
-    // Blanks at the ends are left out: not every renderer counts them.
-    let visible = text.trim();
-    if visible.is_empty() {
-        return;
-    }
-    let indent = text.chars().take_while(|character| character.is_whitespace()).count();
-    let x = x + indent as f64 * CHARACTER.0;
-    let width = visible.chars().count() as f64 * CHARACTER.0;
     let mut style = String::new();
     for (modifier, attribute) in [
         (Modifier::BOLD, " font-weight=\"bold\""),
@@ -93,15 +89,41 @@ fn run(out: &mut String, text: &str, look: &Look, span: (u16, u16), row: u16) {
             style.push_str(attribute);
         }
     }
-    let baseline = y + CHARACTER.1 - DESCENT;
-    // The length keeps columns aligned, whatever the reader's font.
-    let _ = writeln!(
-        out,
-        "<text x=\"{x:.1}\" y=\"{baseline:.1}\" textLength=\"{width:.1}\" fill=\"{}\"{style}>{}</text>",
-        look.foreground,
-        // Browsers fold ordinary spaces into one, whatever xml:space says.
-        visible.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace(' ', "\u{a0}")
-    );
+    // Each character has its own place, so that columns are aligned whatever the reader's font. Blanks are left out.
+    let (mut path, mut places, mut written) = (String::new(), String::new(), String::new());
+    for (column, symbol) in symbols.iter().enumerate() {
+        let x = x + column as f64 * CHARACTER.0;
+        let mut characters = symbol.chars();
+        let place = Place { x, y, width: CHARACTER.0, height: CHARACTER.1 };
+        if let (Some(character), None) = (characters.next(), characters.next())
+            && shape::append(&mut path, character, place)
+        {
+            continue;
+        }
+        if symbol.trim().is_empty() {
+            continue;
+        }
+        for character in symbol.chars() {
+            let _ = write!(places, "{}{x:.1}", if places.is_empty() { "" } else { " " });
+            match character {
+                '&' => written.push_str("&amp;"),
+                '<' => written.push_str("&lt;"),
+                '>' => written.push_str("&gt;"),
+                character => written.push(character),
+            }
+        }
+    }
+    let foreground = &look.foreground;
+    if !path.is_empty() {
+        let _ = writeln!(out, "<path d=\"{path}\" fill=\"{foreground}\"{style}/>");
+    }
+    if !written.is_empty() {
+        let baseline = y + CHARACTER.1 - DESCENT;
+        let _ = writeln!(
+            out,
+            "<text x=\"{places}\" y=\"{baseline:.1}\" fill=\"{foreground}\"{style}>{written}</text>"
+        );
+    }
 }
 
 /// As terminals usually show it; `None` is the terminal's own colour.
@@ -146,12 +168,19 @@ mod tests {
         assert_eq!(
             texts,
             [
-                "<text x=\"10.0\" y=\"23.0\" textLength=\"25.2\" fill=\"#ff6b68\" font-weight=\"bold\">a&lt;b</text>",
-                "<text x=\"26.8\" y=\"41.0\" textLength=\"25.2\" fill=\"#14181d\">bar</text>",
+                "<text x=\"10.0 18.4 26.8\" y=\"23.0\" fill=\"#ff6b68\" font-weight=\"bold\">a&lt;b</text>",
+                "<text x=\"26.8 35.2 43.6\" y=\"41.0\" fill=\"#14181d\">bar</text>",
             ]
         );
         assert!(
             picture.contains("<rect x=\"26.8\" y=\"28.0\" width=\"25.2\" height=\"18\" fill=\"#d4d4d4\"/>")
+        );
+        // What makes up a picture does not depend on a font.
+        buffer.set_string(5, 0, "⣿ ┤", Style::new());
+        let picture = svg(&buffer);
+        assert!(
+            !picture.contains(['⣿', '┤']) && picture.matches("<path d=\"M52.9 11.1").count() == 1,
+            "{picture}"
         );
         assert!(picture.starts_with("<svg ") && picture.ends_with("</svg>\n"));
     }

@@ -8,7 +8,7 @@ mod sheet;
 mod surveyed;
 
 use cantap_protocols::Options;
-use cantap_protocols::iso_tp::Pair;
+use cantap_protocols::iso_tp::{KnownPairs, Maker};
 use cantap_signals::Decoder;
 use cantap_signals::condition::{Condition, ConditionError};
 
@@ -19,14 +19,20 @@ pub use self::sheet::SheetPath;
 /// What helps to understand a bus; commands flatten this into their arguments.
 #[derive(Clone, Debug, Default, clap::Args)]
 pub struct ProtocolArgs {
-    /// Two identifiers that talk to each other by ISO 15765-2, as 7E0:7E8; with an address in the first data byte as
-    /// 6F1/12:612/F1. Can be repeated. Others are found by their behaviour.
-    #[arg(long = "pair", value_name = "ID:ID")]
-    pairs: Vec<Pair>,
+    #[arg(long = "pair", value_name = "ID:ID|MAKER", help = pair_help())]
+    pairs: Vec<KnownPairs>,
     /// The sheet (EDS or DCF) of CANopen nodes; with a node's number before it (5:drive.eds), only for that node. Can be
     /// repeated.
     #[arg(long = "eds", value_name = "[NODE:]FILE")]
     sheets: Vec<SheetPath>,
+}
+
+fn pair_help() -> String {
+    format!(
+        "Two identifiers that talk to each other by ISO 15765-2, as 7E0:7E8; with an address in the first data byte as 6F1/12:612/F1; or \
+         all of a maker: {}. Can be repeated. Others are found by their behaviour",
+        Maker::names()
+    )
 }
 
 impl ProtocolArgs {

@@ -133,7 +133,7 @@ fn status_tells_of_a_bus_that_it_listened_to() {
         );
         assert!(channel["frames"].as_u64() > Some(50) && channel["bus_errors"].as_u64() > Some(20), "{out}");
         assert!(channel["last_error"].is_string(), "{out}");
-        assert_eq!((&channel["mode"], &channel["bitrate_bps"]), (&"listen".into(), &500_000.into()));
+        assert_eq!((&channel["mode"], &channel["bitrate_bps"]), (&"listen-only".into(), &500_000.into()));
     }
     // In normal mode its counters count, and the registers at the last error are known.
     let line =
@@ -290,7 +290,7 @@ fn errors_are_captured_by_kind_and_a_broken_bus_does_not_flood_the_link() {
         (details(" 20000288#"), details(" 20000080#"))
     };
     let (destroyed, _) = capture("errors=50,load=80");
-    for (kind, part) in [("stuff", "00000400"), ("form", "00000200"), ("CRC", "00000008")] {
+    for (kind, part) in [("stuff", "00000400"), ("form", "00000200"), ("crc", "00000008")] {
         assert!(destroyed.iter().any(|data| data.starts_with(part)), "no {kind} error in {destroyed:?}");
     }
     // An unacknowledged frame ends in the sender's error flag, repeatedly.

@@ -8,6 +8,7 @@ mod canopen_ends;
 mod capture_and_demo;
 mod capture_rotates;
 mod car;
+mod closed_output;
 mod columns;
 #[cfg(feature = "emu")]
 #[path = "../../../sim/tests/it/common/mod.rs"]
@@ -29,8 +30,10 @@ mod extcap;
 mod fake_device;
 mod firmware;
 mod follow;
+mod help;
 mod json_schema;
 mod misbehaving_devices;
+mod monitor_keys;
 mod monitor_replug;
 mod monitor_screens;
 mod monitor_sources;
@@ -49,6 +52,7 @@ mod serve;
 mod served;
 mod speaking_ends;
 mod terminal;
+mod texts_from_outside;
 mod timing;
 mod trigger;
 mod two_testers;

@@ -266,7 +266,7 @@ fn the_emulated_board_is_watched_sent_with_and_recorded() {
     view.wait_for("Channel 2: 500000 bit/s");
     view.wait_for("Device olimex-p405");
     // Onto the bus with a mode, then with a frame.
-    view.keys("my\r");
+    view.keys("my");
     view.wait_for("NORMAL: running");
     view.keys("6a6F7#DEADBEEF\r\r1f6F7:7FF\r");
     view.wait_for("T      6F7 D 4 DE AD BE EF");

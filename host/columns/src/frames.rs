@@ -21,12 +21,12 @@ pub const TX: &str = "tx";
 /// | column | type | of |
 /// |---|---|---|
 /// | `time` | timestamp\[ns, UTC\] | every row; since 1970, or since the trace's start where no date is known |
-/// | `channel` | uint8, from 1 | every row |
+/// | `channel` | uint8, as the trace counts them: from 1 in most formats, from 0 in some | every row |
 /// | `event` | text: `frame`, `lost`, `bus-error`, `errors-suppressed`, `state`, `transmit-failed` | every row |
 /// | `detail` | text: where frames were lost, which error, which state, why not sent | events that say it |
 /// | `count` | uint32: frames lost, errors suppressed, periods overtaken | these |
 /// | `at_least` | bool: there may have been more | losses |
-/// | `tx_errors`, `rx_errors` | uint8: the controller's counters | errors and states that say it |
+/// | `tec`, `rec` | uint8: the controller's counters | errors and states that say it |
 /// | `tag` | uint32: the request | frames that were not sent |
 /// | `id` | uint32 | frames |
 /// | `extended`, `remote`, `fd`, `late` | bool; `late`: the frame ended then or earlier | frames |

@@ -5,6 +5,7 @@
 //! anything without its own kind of object. A container that is on the disk can be read whatever happens
 //! afterwards: the header's totals are only informative.
 
+mod containers;
 mod decode;
 mod encode;
 mod kinds;

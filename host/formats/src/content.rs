@@ -41,7 +41,8 @@ pub(crate) fn looks_like(head: &[u8], read_as: Format) -> String {
         return format!("binary data that begins with {}", bytes.join(" "));
     }
     let line = String::from_utf8_lossy(line);
-    let shown: String = line.chars().filter(|character| !character.is_control()).take(60).collect();
+    let shown: String =
+        line.chars().filter(|character| !cantap_trace::clean::is_harmful(*character)).take(60).collect();
     let more = if shown.len() < line.len() { "…" } else { "" };
     format!("text that begins with '{shown}{more}'")
 }

@@ -55,7 +55,7 @@ impl Fault {
     pub(crate) fn malformed(expected: impl Into<Cow<'static, str>>, found: &[u8]) -> Self {
         const SHOWN: usize = 60;
         let mut shown = String::from_utf8_lossy(&found[..found.len().min(SHOWN)]).into_owned();
-        shown.retain(|character| !character.is_control());
+        shown.retain(|character| !cantap_trace::clean::is_harmful(character));
         let found = match (found.len(), shown.is_empty()) {
             (0, _) => "nothing".to_owned(),
             (_, true) => "unprintable bytes".to_owned(),

@@ -24,6 +24,7 @@ mod codec;
 mod compressed;
 mod compression;
 mod content;
+mod cores;
 mod create;
 mod crtd;
 mod csv;

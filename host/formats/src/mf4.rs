@@ -21,6 +21,7 @@ mod record;
 mod stream;
 #[cfg(test)]
 mod tests;
+mod unpack;
 mod value;
 
 pub(crate) use decode::Decoder;
@@ -28,7 +29,7 @@ pub(crate) use decode::Decoder;
 pub(crate) use encode::COUNTS_UNTOLD;
 pub(crate) use encode::Encoder;
 
-use cantap_wire::record::BusErrorKind;
+use cantap_can::BusErrorKind;
 
 /// The first bytes of a file, finished or not.
 pub(crate) const FILE_MAGIC: &[u8] = b"MDF     ";

@@ -3,7 +3,7 @@
 use std::str::FromStr;
 
 use crate::{calendar, date_time_ns, decimal_seconds_ns};
-use cantap_trace::TraceRecord;
+use cantap_trace::{TraceRecord, grammar};
 
 /// A point in a trace.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -34,15 +34,17 @@ impl FromStr for TimePoint {
         if let Some(time_ns) = date_time_ns(text.trim_end_matches('Z')).or_else(day_only) {
             return Ok(Self::At(time_ns));
         }
-        let (number, factor) = match text.as_bytes().last() {
-            Some(b's') => (&text[..text.len() - 1], 1),
-            Some(b'm') => (&text[..text.len() - 1], 60),
-            Some(b'h') => (&text[..text.len() - 1], 3600),
-            _ => (text, 1),
-        };
-        let value_ns = decimal_seconds_ns(number).and_then(|ns| ns.checked_mul(factor)).ok_or_else(bad)?;
-        let absolute = value_ns >= FIRST_EPOCH_NS && number.len() == text.len();
-        Ok(if absolute { Self::At(value_ns) } else { Self::AfterFirst(value_ns) })
+        // A plain number to the nanosecond: seconds since 1970 have more digits than a float.
+        if let Some(value_ns) = decimal_seconds_ns(text) {
+            return Ok(if value_ns >= FIRST_EPOCH_NS {
+                Self::At(value_ns)
+            } else {
+                Self::AfterFirst(value_ns)
+            });
+        }
+        let (text, sign) = text.strip_prefix('-').map_or((text, 1), |text| (text, -1));
+        let time = grammar::duration(text).map_err(|_| bad())?;
+        Ok(Self::AfterFirst(sign * i64::try_from(time.as_nanos()).map_err(|_| bad())?))
     }
 }
 

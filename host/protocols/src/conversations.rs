@@ -10,7 +10,7 @@ use rustc_hash::FxHashMap;
 use crate::canopen::{CanOpen, Sheet};
 use crate::devicenet::DeviceNet;
 use crate::diagnostics::Diagnostics;
-use crate::iso_tp::{IsoTp, Pair};
+use crate::iso_tp::{IsoTp, KnownPairs};
 use crate::j1939::{Groups, J1939};
 use crate::signs::FAMILY;
 use crate::survey::DiagnosticsSigns;
@@ -26,7 +26,7 @@ pub struct Options {
     /// time: where a survey has not found them, what looks like them is held back until an exchange shows that it is them.
     pub spoken: Option<Vec<Evidence>>,
     /// Pairs of identifiers that communicate by ISO 15765-2, in addition to those of the standards.
-    pub pairs: Vec<Pair>,
+    pub pairs: Vec<KnownPairs>,
     /// Signals for the messages of J1939 and NMEA 2000.
     pub decoder: Option<Arc<Decoder>>,
     /// The sheets of CANopen nodes.

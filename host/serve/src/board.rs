@@ -12,13 +12,14 @@ use cantap::device::{
     Link, Next, PIECE_BYTES, SessionOver, SilenceWatch, encode, is_idle, pipe, write_patiently,
 };
 use cantap_wire::message::{ChannelConfig, EndReason, Role};
-use cantap_wire::record::LossStage;
+use cantap_wire::record::{LossStage, Record};
 use cantap_wire::{
     BitTiming, CHANNELS, Channel, Command, Corruption, Decoded, Decoder, Event, Hello, PROTOCOL_VERSION,
     Refusal, Reply, Request, Response,
 };
 
-use crate::client;
+use crate::client::{self, Guest};
+use crate::modes;
 use crate::news::News;
 use crate::outbox::Item;
 use crate::shared::{Refused, Settings, Shared, WRITE_PATIENCE, lock};
@@ -57,7 +58,7 @@ const PIPE_BYTES: usize = 64 * 1024;
 /// A shared board. Dropping it ends every session, and the board leaves its buses.
 pub struct Board {
     shared: Arc<Shared>,
-    thread: Option<JoinHandle<()>>,
+    threads: Vec<JoinHandle<()>>,
 }
 
 impl Board {
@@ -86,9 +87,14 @@ impl Board {
             .name("cantap-board".to_owned())
             .spawn(move || run(&for_thread, connect, first))
             .map_err(DeviceError::Thread)?;
-        let board = Self { shared, thread: Some(thread) };
+        let mut board = Self { shared, threads: vec![thread] };
         match began.recv() {
-            Ok(Ok(())) => Ok(board),
+            Ok(Ok(())) => {
+                let shared = Arc::clone(&board.shared);
+                let modes = std::thread::Builder::new().name("cantap-modes".to_owned());
+                board.threads.push(modes.spawn(move || modes::run(&shared)).map_err(DeviceError::Thread)?);
+                Ok(board)
+            }
             Ok(Err(error)) => Err(error),
             Err(_) => Err(DeviceError::WrongReply.into()),
         }
@@ -129,22 +135,59 @@ impl Board {
         name: &str,
         role: Role,
     ) -> Result<(), Refused> {
-        client::admit(&self.shared, Box::new(input), Box::new(output), name, role)
+        let guest = Guest { name: name.to_owned(), role, place: None, is_counted: true, is_remote: false };
+        self.admit_guest(input, output, guest)
+    }
+
+    /// Admits a client at the other end of a line that can break without notice, for which the dead-man time applies
+    /// ([`Settings::dead_man`]).
+    pub fn admit_remote(
+        &self,
+        input: impl Read + Send + 'static,
+        output: impl Write + Send + 'static,
+        name: &str,
+        role: Role,
+    ) -> Result<(), Refused> {
+        let guest = Guest { name: name.to_owned(), role, place: None, is_counted: true, is_remote: true };
+        self.admit_guest(input, output, guest)
+    }
+
+    pub(crate) fn admit_guest(
+        &self,
+        input: impl Read + Send + 'static,
+        output: impl Write + Send + 'static,
+        guest: Guest,
+    ) -> Result<(), Refused> {
+        client::admit(&self.shared, Box::new(input), Box::new(output), guest)
     }
 
     /// Admits a client in this process, which makes a device from this link.
     pub fn link(&self, name: &str, role: Role) -> Result<Link, Refused> {
+        self.link_of(Guest { name: name.to_owned(), role, place: None, is_counted: true, is_remote: false })
+    }
+
+    /// The same for a client that has its place at a listener already.
+    pub(crate) fn link_placed(&self, name: &str, role: Role) -> Result<Link, Refused> {
+        self.link_of(Guest { name: name.to_owned(), role, place: None, is_counted: false, is_remote: false })
+    }
+
+    fn link_of(&self, guest: Guest) -> Result<Link, Refused> {
         let (reader, output) = pipe(PIPE_BYTES);
         let (input, writer) = pipe(PIPE_BYTES);
-        self.admit(input, output, name, role)?;
+        self.admit_guest(input, output, guest)?;
         Ok(Link::new(reader, writer))
+    }
+
+    /// Limit for clients at one listener.
+    pub(crate) fn most_clients(&self) -> usize {
+        self.shared.settings.most_clients
     }
 }
 
 impl Drop for Board {
     fn drop(&mut self) {
         self.shared.quit.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
+        for thread in self.threads.drain(..) {
             let _ = thread.join();
         }
         // Clients that are still reading learn that it is over.
@@ -164,7 +207,7 @@ fn run(shared: &Arc<Shared>, mut connect: Connect, first: Sender<Result<(), Boar
         });
         let session = connected.and_then(|link| Ok(Session::begin(shared, link)?));
         match session {
-            Ok(session) => {
+            Ok(mut session) => {
                 serial = Some(session.hello.serial.as_str().to_owned());
                 told = None;
                 session.publish(shared);
@@ -248,7 +291,10 @@ impl Session {
             }
         }
         let hello = match hello.ok_or_else(not_cantap)? {
-            Ok(Reply::Hello(hello)) => hello,
+            Ok(Reply::Hello(mut hello)) => {
+                cantap::device::clean(&mut hello);
+                hello
+            }
             Ok(_) => return Err(DeviceError::WrongReply),
             Err(Refusal::Protocol { device }) => return Err(DeviceError::Protocol { device }),
             Err(refusal) => return Err(DeviceError::Refused { refusal }),
@@ -274,7 +320,10 @@ impl Session {
     }
 
     /// From now on, clients may send requests.
-    fn publish(&self, shared: &Shared) {
+    fn publish(&mut self, shared: &Shared) {
+        // First of all: a request that finds the board and no way to it would end the session.
+        let writer = std::mem::replace(&mut self.link.writer, Box::new(std::io::sink()));
+        *lock(&shared.port) = Some(writer);
         let mut state = shared.state();
         state.base = self.base;
         state.latest_ticks = self.ticks;
@@ -283,9 +332,8 @@ impl Session {
 
     /// Reads until the board is gone. Returns the reason, or `None` if the server should end.
     fn run(self, shared: &Arc<Shared>) -> Option<DeviceError> {
-        let Link { mut reader, writer, keep_alive } = self.link;
+        let Link { mut reader, writer: _, keep_alive } = self.link;
         let mut decoder = self.decoder;
-        *lock(&shared.port) = Some(writer);
         let name = || shared.name.clone();
         let vanished = |reason: String| Some(DeviceError::Vanished { address: name(), reason });
         let mut bytes = vec![0; READ_BYTES];
@@ -359,6 +407,10 @@ struct Heard {
 fn take(state: &mut State, decoder: &mut Decoder, piece: &[u8], heard: &mut Heard) {
     let mut chunk: Vec<Entry> = Vec::new();
     decoder.push(piece, |decoded| match decoded {
+        Decoded::Record { ticks, record: Record::Event(Event::Stopped { channel }) } => {
+            state.deliver(&mut chunk);
+            state.stopped(channel, ticks);
+        }
         Decoded::Record { ticks, record } => chunk.extend(state.take(ticks, record)),
         Decoded::BatchesLost { frames, .. } => {
             for (channel, count) in Channel::ALL.into_iter().zip(frames).filter(|(_, count)| *count > 0) {

@@ -4,8 +4,8 @@ mod channels;
 mod sending;
 
 use std::io::{Read, Write};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 use cantap::device::is_idle;
@@ -13,25 +13,44 @@ use cantap_wire::framing::{CRC_LEN, MAX_ENCODED, MAX_MESSAGE, seal};
 use cantap_wire::message::{Defaults, Role, capability, write_response};
 use cantap_wire::{Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply, Request};
 
+use crate::foreign;
 use crate::inbox::{Heard, Inbox};
 use crate::news::News;
 use crate::outbox::Outbox;
-use crate::shared::{Refused, Shared};
+use crate::places::{GREETING_TIMEOUT, Place};
+use crate::shared::{Refused, Shared, lock};
 use crate::state::{Member, State, Then};
-use crate::stream::{ClientId, Views};
+use crate::stream::{ClientId, View, Views};
 use crate::writer;
 
-/// A client that has not greeted by this time is dropped.
-const GREETING_TIMEOUT: Duration = Duration::from_secs(5);
+/// A client that may send and says nothing for this long is let go, because the board acknowledges for it. Programs of ours say something
+/// twice a second.
+const SENDER_TIMEOUT: Duration = Duration::from_secs(5);
+/// A read takes 50 ms. During the rest of a longer pass, the computer was too busy to listen, for which a client is not to blame.
+const LONGEST_PASS: Duration = Duration::from_millis(100);
+
+/// Who comes.
+pub struct Guest {
+    /// Its name in messages.
+    pub name: String,
+    /// The most that it may do.
+    pub role: Role,
+    /// Its place at its listener, to be given back when it leaves.
+    pub place: Option<Place>,
+    /// It takes one of the board's places, because it has none at a listener.
+    pub is_counted: bool,
+    /// It is at the other end of a line that can break without notice.
+    pub is_remote: bool,
+}
 
 /// Admits a client. Two separate threads serve it until either side ends.
 pub fn admit(
     shared: &Arc<Shared>,
     mut input: Box<dyn Read + Send>,
     mut output: Box<dyn Write + Send>,
-    name: &str,
-    role: Role,
+    guest: Guest,
 ) -> Result<(), Refused> {
+    let Guest { name, role, place, is_counted, is_remote } = guest;
     let id = shared.next_client();
     let outbox = Arc::new(Outbox::new(shared.settings.most_records));
     {
@@ -39,10 +58,12 @@ pub fn admit(
         if state.is_over {
             return Err(Refused::Over);
         }
-        if state.clients.len() >= shared.settings.most_clients {
-            return Err(Refused::TooMany(state.clients.len()));
+        let counted = state.clients.values().filter(|member| member.is_counted).count();
+        if is_counted && counted >= shared.settings.most_clients {
+            return Err(Refused::TooMany(counted));
         }
         let member = Member {
+            is_counted,
             role,
             outbox: Arc::clone(&outbox),
             in_session: false,
@@ -57,23 +78,30 @@ pub fn admit(
         shared: Arc::clone(shared),
         id,
         role,
-        name: name.to_owned(),
+        name: name.clone(),
+        dead_man: shared.settings.dead_man.filter(|_| is_remote),
+        place,
         has_greeted: Arc::clone(&has_greeted),
+        let_go: Arc::default(),
         outbox: Arc::clone(&outbox),
     };
+    let let_go = Arc::clone(&client.let_go);
     let leave = |error| {
         shared.state().clients.remove(&id);
         Refused::Thread(error)
     };
-    let (told, name) = (Arc::clone(shared), name.to_owned());
+    let told = Arc::clone(shared);
     let for_writer = Arc::clone(&outbox);
     std::thread::Builder::new()
         .name("cantap-to-client".to_owned())
         .spawn(move || {
-            let reason = writer::run(&for_writer, &mut *output, id).err();
+            let failed = writer::run(&for_writer, &mut *output, id).err();
             for_writer.abandon();
+            let reason = lock(&let_go).take();
             if has_greeted.load(Ordering::Relaxed) {
-                told.tell(News::ClientLeft { client: name, reason });
+                told.tell(News::ClientLeft { client: name, reason: reason.or(failed) });
+            } else if let Some(reason) = reason {
+                told.tell(News::Refused { client: name, reason });
             }
             told.has_written();
         })
@@ -100,8 +128,12 @@ struct Client {
     id: ClientId,
     role: Role,
     name: String,
-    /// Clients that connect without greeting are not reported.
+    /// After this silence, what it sends on its own is stopped.
+    dead_man: Option<Duration>,
+    place: Option<Place>,
     has_greeted: Arc<AtomicBool>,
+    /// Why it was let go. Clients that connect and say nothing are not reported.
+    let_go: Arc<Mutex<Option<String>>>,
     outbox: Arc<Outbox>,
 }
 
@@ -110,6 +142,8 @@ impl Client {
     fn serve(&self, input: &mut dyn Read) {
         let came = Instant::now();
         let mut inbox = Inbox::default();
+        let mut first = Vec::new();
+        let mut silence = Silence::default();
         let mut bytes = [0; 4096];
         while !self.outbox.is_closed() {
             let len = match input.read(&mut bytes) {
@@ -118,29 +152,69 @@ impl Client {
                 Err(error) if is_idle(&error) => 0,
                 Err(_) => return,
             };
-            let mut is_there = true;
-            inbox.push(&bytes[..len], |heard| {
-                is_there = is_there
-                    && match heard {
-                        Heard::Request(Request { id, command: Command::Hello { protocol } }) => {
-                            self.greet(id, protocol)
-                        }
-                        Heard::Request(Request { id, command }) => {
-                            let result = self.perform(command);
-                            self.answer(id, &result)
-                        }
-                        Heard::Unreadable(id, refusal) => self.answer(id, &Err(refusal)),
-                        Heard::Read(bytes) => {
-                            self.outbox.acknowledge(bytes);
-                            true
-                        }
-                        Heard::Damaged => true,
-                    };
-            });
-            if !is_there || !self.has_greeted.load(Ordering::Relaxed) && came.elapsed() > GREETING_TIMEOUT {
+            let bytes = &bytes[..len];
+            if len > 0
+                && let Some(place) = &self.place
+            {
+                place.spoke();
+            }
+            let is_stranger = |first: &[u8], inbox: &Inbox| {
+                !self.has_greeted() && (foreign::protocol(first).is_some() || inbox.is_overlong())
+            };
+            if !self.has_greeted() && first.len() < foreign::ENOUGH {
+                let zeros =
+                    if first.is_empty() { bytes.iter().take_while(|byte| **byte == 0).count() } else { 0 };
+                first.extend(bytes.iter().skip(zeros).take(foreign::ENOUGH));
+            }
+            let mut goes_on = !is_stranger(&first, &inbox);
+            inbox.push(bytes, |heard| goes_on = goes_on && self.take(heard));
+            if !self.has_greeted() && !first.is_empty() && (!goes_on || is_stranger(&first, &inbox)) {
+                self.let_go(foreign::reason(&first));
                 return;
             }
+            if !goes_on || !self.has_greeted() && came.elapsed() > GREETING_TIMEOUT {
+                return;
+            }
+            let silent = silence.pass(len > 0);
+            if silent >= SENDER_TIMEOUT && self.with(|_, member| member.views.iter().any(View::transmits)) {
+                self.let_go(format!(
+                    "it said nothing for {} s, and might have sent",
+                    SENDER_TIMEOUT.as_secs()
+                ));
+                return;
+            }
+            if let Some(after) = self.dead_man.filter(|after| silent >= *after) {
+                self.stop_entries(after);
+            }
         }
+    }
+
+    /// Takes what it said. Returns whether it may go on.
+    fn take(&self, heard: Heard) -> bool {
+        match heard {
+            Heard::Request(Request { id, command: Command::Hello { protocol } }) => self.greet(id, protocol),
+            Heard::Read(bytes) => {
+                self.outbox.acknowledge(bytes);
+                true
+            }
+            // Whoever does not begin with a greeting is no client.
+            _ if !self.has_greeted() => false,
+            Heard::Request(Request { id, command }) => {
+                let result = self.perform(command);
+                self.answer(id, &result)
+            }
+            Heard::Unreadable(id, refusal) => self.answer(id, &Err(refusal)),
+            Heard::Damaged => true,
+        }
+    }
+
+    fn has_greeted(&self) -> bool {
+        self.has_greeted.load(Ordering::Relaxed)
+    }
+
+    /// Notes why it is let go.
+    fn let_go(&self, reason: String) {
+        *lock(&self.let_go) = Some(reason);
     }
 
     /// Gives back everything it had.
@@ -160,9 +234,7 @@ impl Client {
         }
         drop(setup);
         let mut state = self.shared.state();
-        if state.holder == Some(self.id) {
-            state.holder = None;
-        }
+        state.release(self.id);
         if let Some(member) = state.clients.get_mut(&self.id) {
             member.in_session = false;
             member.views = Views::default();
@@ -170,12 +242,16 @@ impl Client {
         }
     }
 
-    fn setup(&self) -> std::sync::MutexGuard<'_, ()> {
-        self.shared.setup.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+    fn setup(&self) -> MutexGuard<'_, ()> {
+        lock(&self.shared.setup)
     }
 
     fn answer(&self, id: u16, result: &Result<Reply, Refusal>) -> bool {
-        self.outbox.answer(encoded(id, result))
+        match result {
+            // That the session is over, and why, comes first.
+            Err(Refusal::NoSession) => self.outbox.answer_in_turn(encoded(id, result)),
+            _ => self.outbox.answer(encoded(id, result)),
+        }
     }
 
     /// Begins a session. Returns whether the client is still there.
@@ -184,6 +260,9 @@ impl Client {
             return self.answer(id, &Err(Refusal::Protocol { device: PROTOCOL_VERSION }));
         }
         if !self.has_greeted.swap(true, Ordering::Relaxed) {
+            if let Some(place) = &self.place {
+                place.is_served();
+            }
             self.shared.tell(News::ClientCame { client: self.name.clone(), role: self.role });
         }
         self.end_session();
@@ -252,19 +331,24 @@ impl Client {
                     None => self.shared.ask(command, Then::Nothing),
                 }
             }
-            // A measurement's edges go to a single client: the one with the right to configure. It ends when
-            // a channel opens.
-            Command::Configure { .. }
-            | Command::ClearDefaults
-            | Command::MeasureEdges { .. }
-            | Command::Edges => {
-                self.shared.state().hold(self.id)?;
+            // A measurement's edges go to a single client: the one with the right to configure the channel. It ends when a
+            // channel opens.
+            Command::Configure { channel, .. } | Command::MeasureEdges { channel: Some(channel) } => {
+                self.shared.state().hold(self.id, &[channel])?;
+                self.shared.ask(command, Then::Nothing)
+            }
+            Command::ClearDefaults => {
+                self.shared.state().hold(self.id, &Channel::ALL)?;
+                self.shared.ask(command, Then::Nothing)
+            }
+            Command::MeasureEdges { channel: None } | Command::Edges => {
+                self.shared.state().must_hold_any(self.id)?;
                 self.shared.ask(command, Then::Nothing)
             }
             Command::SaveDefaults => self.save_defaults(),
             Command::Reset => {
                 let mut state = self.shared.state();
-                state.hold(self.id)?;
+                state.hold(self.id, &Channel::ALL)?;
                 if Channel::ALL.into_iter().any(|channel| state.others_on(self.id, channel).0) {
                     return Err(Refusal::OtherSettings);
                 }
@@ -304,6 +388,23 @@ impl Client {
             of_channel.tx_pending = state.under_way(self.id, channel) as u16;
         }
         Ok(Reply::Status(status))
+    }
+}
+
+/// For how long a client has said nothing while it was listened to.
+#[derive(Default)]
+struct Silence {
+    since: Duration,
+    passed_at: Option<Instant>,
+}
+
+impl Silence {
+    /// One pass is over, in which it said something or not. Returns its silence.
+    fn pass(&mut self, spoke: bool) -> Duration {
+        let now = Instant::now();
+        let passed = self.passed_at.replace(now).map_or(Duration::ZERO, |at| now - at);
+        self.since = if spoke { Duration::ZERO } else { self.since + passed.min(LONGEST_PASS) };
+        self.since
     }
 }
 

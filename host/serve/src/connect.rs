@@ -25,19 +25,32 @@ pub const READY: [u8; 1] = [0];
 /// Maximum number of bytes of a program's output that wait.
 const PIPE_BYTES: usize = 256 * 1024;
 
-/// The default path of a server's socket: in the user's runtime directory, if the system has one.
+/// The folder of a server's socket, if no path is given: the user's runtime folder, if the system has one; else one of the user's own in the
+/// common folder for temporary files, where a stranger may have made it first: see [`private_folder`](crate::socket_file::private_folder).
 #[cfg(unix)]
-pub fn default_socket() -> PathBuf {
-    match std::env::var_os("XDG_RUNTIME_DIR").filter(|folder| !folder.is_empty()) {
-        Some(folder) => Path::new(&folder).join("cantap.sock"),
-        None => std::env::temp_dir().join(format!("cantap-{}.sock", rustix::process::getuid().as_raw())),
-    }
+pub fn default_folder() -> PathBuf {
+    use std::os::unix::fs::MetadataExt;
+    let own = rustix::process::geteuid().as_raw();
+    // After `sudo`, it may be another user's.
+    let is_own = |folder: &PathBuf| folder.metadata().is_ok_and(|there| there.uid() == own);
+    let runtime = std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from);
+    runtime
+        .filter(|folder| folder.is_absolute() && is_own(folder))
+        .unwrap_or_else(|| std::env::temp_dir().join(format!("cantap-{own}")))
 }
 
-/// Connects to a server on this machine.
+/// The default path of a server's socket.
+#[cfg(unix)]
+pub fn default_socket() -> PathBuf {
+    default_folder().join("cantap.sock")
+}
+
+/// Connects to a server on this machine, which must be run by this user or by root;
+/// [`PermissionDenied`](io::ErrorKind::PermissionDenied) if it is somebody else's.
 #[cfg(unix)]
 pub fn unix(path: &Path) -> io::Result<Link> {
     let reader = UnixStream::connect(path)?;
+    crate::peer::check(&reader)?;
     reader.set_read_timeout(Some(SOCKET_TIMEOUT))?;
     reader.set_write_timeout(Some(SOCKET_TIMEOUT))?;
     let writer = reader.try_clone()?;

@@ -13,6 +13,8 @@ use std::time::{Duration, Instant};
 use cantap::device::Link;
 use cantap_wire::framing::{CRC_LEN, max_encoded_len, seal};
 
+use crate::places::REFUSAL;
+
 /// What begins an acknowledgement: no request does, for no number of 16 bits is written so. A server that does not know it takes it for
 /// garbage, which is not answered.
 const MARK: [u8; 3] = [0xFF; 3];
@@ -121,7 +123,14 @@ pub fn acknowledging(link: Link) -> Link {
     let Link { reader, writer, keep_alive } = link;
     let output = Output { writer, unsent: Vec::new(), in_message: false };
     let output = Arc::new(Mutex::new(output));
-    let reader = AckReader { reader, output: Arc::clone(&output), read: 0, told: 0, told_at: Instant::now() };
+    let reader = AckReader {
+        reader,
+        output: Arc::clone(&output),
+        read: 0,
+        told: 0,
+        told_at: Instant::now(),
+        refusal: None,
+    };
     Link { reader: Box::new(reader), writer: Box::new(AckWriter(output)), keep_alive }
 }
 
@@ -157,11 +166,21 @@ struct AckReader {
     read: u64,
     told: u64,
     told_at: Instant,
+    /// Why the server does not serve, as far as it has arrived.
+    refusal: Option<Vec<u8>>,
 }
+
+/// The longest reason that a server may give, in bytes.
+const LONGEST_REFUSAL: usize = 300;
 
 impl Read for AckReader {
     fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
         let result = self.reader.read(out);
+        // Our own protocol begins with a zero.
+        let begins_refusal = self.read == 0 && matches!(&result, Ok(1..) if out[0] == REFUSAL[0]);
+        if begins_refusal || self.refusal.is_some() {
+            return self.read_refusal(result, out);
+        }
         if let Ok(len) = &result {
             self.read += *len as u64;
         }
@@ -174,6 +193,25 @@ impl Read for AckReader {
 }
 
 impl AckReader {
+    /// Collects the text in which a server says why it does not serve, and fails with it.
+    fn read_refusal(&mut self, result: io::Result<usize>, out: &[u8]) -> io::Result<usize> {
+        let len = result?;
+        let text = self.refusal.get_or_insert_default();
+        text.extend(&out[..len]);
+        if len > 0 && text.len() < LONGEST_REFUSAL && !text.contains(&b'\n') {
+            return Err(io::ErrorKind::WouldBlock.into());
+        }
+        text.truncate(LONGEST_REFUSAL);
+        Err(match text.strip_prefix(REFUSAL) {
+            Some(reason) => {
+                let reason = String::from_utf8_lossy(reason);
+                let shown = cantap_trace::clean::line(reason.trim_end());
+                io::Error::new(io::ErrorKind::ConnectionRefused, format!("its server refuses: {shown}"))
+            }
+            None => io::Error::new(io::ErrorKind::InvalidData, "what is there is no server of cantap's"),
+        })
+    }
+
     fn tell(&mut self) {
         // While somebody writes, the next read tells.
         let Ok(mut output) = self.output.try_lock() else { return };

@@ -31,6 +31,11 @@ pub struct Inbox {
 }
 
 impl Inbox {
+    /// Whether what is coming is longer than any request.
+    pub const fn is_overlong(&self) -> bool {
+        self.is_overlong
+    }
+
     /// Takes any piece of the stream and reports what is complete.
     pub fn push(&mut self, bytes: &[u8], mut report: impl FnMut(Heard)) {
         for &byte in bytes {

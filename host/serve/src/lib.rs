@@ -10,12 +10,19 @@ mod board;
 mod client;
 pub mod connect;
 mod flow;
+mod foreign;
 mod inbox;
 pub mod lines;
 pub mod listen;
+mod modes;
 mod news;
 mod outbox;
+#[cfg(unix)]
+mod peer;
+mod places;
 mod shared;
+#[cfg(unix)]
+pub mod socket_file;
 pub mod socketcand;
 mod state;
 mod stream;

@@ -11,7 +11,9 @@ use cantap::device::{Records, channel_number, is_idle, write_patiently};
 use cantap_wire::message::Role;
 use cantap_wire::{Channel, Refusal};
 
-use crate::listen::{Listening, accept, bind_loopback};
+use crate::foreign;
+use crate::listen::{Listening, accept, bind_loopback, turn_away};
+use crate::places::{Places, ends};
 use crate::{Board, News};
 
 /// Limit for records waiting for one client, in addition to those in the server's queue.
@@ -26,26 +28,40 @@ const WAIT: Duration = Duration::from_millis(10);
 pub fn listen(boards: &[Arc<Board>], address: SocketAddr) -> io::Result<Listening> {
     let (listener, address) = bind_loopback(address)?;
     let boards = boards.to_vec();
+    let places = Places::new(boards.first().map_or(0, |board| board.most_clients()));
     Listening::start("cantap-lines", Some(address), move || {
-        let (stream, peer) = accept(&listener)?;
+        let (mut stream, peer) = accept(&listener)?;
+        let name = format!("line reader {peer}");
+        let place = match places.enter(Some(peer.ip()), ends(&stream)?) {
+            Ok(place) => place,
+            Err(full) => {
+                turn_away(&boards[0], &mut stream, name, &full);
+                return Ok(());
+            }
+        };
+        // It need not say anything.
+        place.is_served();
         let boards = boards.clone();
         std::thread::Builder::new().name("cantap-lines-client".to_owned()).spawn(move || {
-            let name = format!("line reader {peer}");
             if let Err(reason) = serve(&boards, stream, &name) {
                 boards[0].tell(News::Refused { client: name, reason });
             }
+            drop(place);
         })?;
         Ok(())
     })
 }
 
-/// A device for a board of this process.
+/// A device for a board of this process, for a client that has its place at a listener.
 pub(crate) fn device_of(board: &Board, name: &str, role: Role) -> Result<Device, String> {
-    let link = board.link(name, role).map_err(|refused| refused.to_string())?;
+    let link = board.link_placed(name, role).map_err(|refused| refused.to_string())?;
     Device::over_holding(link, name, HELD_RECORDS).map_err(|error| error.to_string())
 }
 
 fn serve(boards: &[Arc<Board>], mut stream: TcpStream, name: &str) -> Result<(), String> {
+    if is_over(&stream)? {
+        return Ok(());
+    }
     let mut heard: Vec<(usize, Device, Records)> = Vec::new();
     for (number, board) in boards.iter().enumerate() {
         let device = device_of(board, name, Role::Listen)?;
@@ -69,7 +85,7 @@ fn serve(boards: &[Arc<Board>], mut stream: TcpStream, name: &str) -> Result<(),
                 crate::text::put_line(&mut out, channel_number(*number, channel), record);
             }
         }
-        if out.is_empty() && is_closed(&stream) {
+        if out.is_empty() && is_over(&stream)? {
             return Ok(());
         }
         if write_patiently(&mut stream, out.as_bytes(), PATIENCE).is_err() {
@@ -79,11 +95,14 @@ fn serve(boards: &[Arc<Board>], mut stream: TcpStream, name: &str) -> Result<(),
     }
 }
 
-/// Whether the other end has closed, as far as that shows without sending.
-fn is_closed(stream: &TcpStream) -> bool {
-    match stream.peek(&mut [0]) {
-        Ok(0) => true,
-        Ok(_) => false,
-        Err(error) => !is_idle(&error),
+/// Whether the other end has closed, as far as that shows without sending. An error says what a client that speaks another protocol speaks:
+/// a browser that a web page has sent here, for example.
+fn is_over(stream: &TcpStream) -> Result<bool, String> {
+    let mut first = [0; foreign::ENOUGH];
+    match stream.peek(&mut first) {
+        Ok(0) => Ok(true),
+        Ok(len) if foreign::protocol(&first[..len]).is_some() => Err(foreign::reason(&first[..len])),
+        Ok(_) => Ok(false),
+        Err(error) => Ok(!is_idle(&error)),
     }
 }

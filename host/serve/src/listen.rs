@@ -3,9 +3,7 @@
 use std::io::{self, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 #[cfg(unix)]
-use std::os::unix::net::{UnixListener, UnixStream};
-#[cfg(unix)]
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
@@ -13,7 +11,15 @@ use std::time::Duration;
 
 use cantap_wire::message::Role;
 
-use crate::connect::{SOCKET_TIMEOUT, prepare};
+use crate::client::Guest;
+#[cfg(unix)]
+use crate::connect::SOCKET_TIMEOUT;
+use crate::connect::prepare;
+#[cfg(unix)]
+use crate::peer;
+use crate::places::{Places, ends, refuse};
+#[cfg(unix)]
+use crate::socket_file::{self, SocketError, SocketFile};
 use crate::{Board, News};
 
 /// How often to check for new connections.
@@ -25,7 +31,7 @@ pub struct Listening {
     thread: Option<JoinHandle<()>>,
     /// To be removed at the end.
     #[cfg(unix)]
-    path: Option<PathBuf>,
+    file: Option<SocketFile>,
     address: Option<SocketAddr>,
 }
 
@@ -55,7 +61,7 @@ impl Listening {
             quit,
             thread: Some(thread),
             #[cfg(unix)]
-            path: None,
+            file: None,
             address,
         })
     }
@@ -68,42 +74,48 @@ impl Drop for Listening {
             let _ = thread.join();
         }
         #[cfg(unix)]
-        if let Some(path) = &self.path {
-            let _ = std::fs::remove_file(path);
-        }
+        drop(self.file.take());
     }
 }
 
-/// Admits clients of this user on this machine only: nobody else can open the socket at `path`. A socket left behind by a server is
-/// replaced; [`AddrInUse`](io::ErrorKind::AddrInUse) if a server is still listening on it.
+/// Admits clients of this user on this machine only: nobody else can open the socket at `path`, and the system is asked who each client
+/// is. A socket left behind by a server is replaced, and nothing else.
 #[cfg(unix)]
-pub fn unix(board: &Arc<Board>, path: &Path, role: Role) -> io::Result<Listening> {
-    if path.exists() {
-        match UnixStream::connect(path) {
-            Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => std::fs::remove_file(path)?,
-            _ => return Err(io::ErrorKind::AddrInUse.into()),
-        }
-    }
-    // This must apply from the beginning: setting the mode afterwards would be too late.
-    let before = rustix::process::umask(rustix::fs::Mode::from_raw_mode(0o177));
-    let bound = UnixListener::bind(path);
-    rustix::process::umask(before);
-    let listener = bound?;
-    listener.set_nonblocking(true)?;
+pub fn unix(board: &Arc<Board>, path: &Path, role: Role) -> Result<Listening, SocketError> {
+    let (listener, file) = socket_file::bind(path)?;
     let board = Arc::clone(board);
+    let places = Places::new(board.most_clients());
     let mut count = 0;
     let mut listening = Listening::start("cantap-unix", None, move || {
-        let (stream, _) = listener.accept()?;
+        let (mut stream, _) = listener.accept()?;
         count += 1;
+        let name = format!("local client {count}");
+        if let Err(stranger) = peer::check(&stream) {
+            board.tell(News::Refused { client: name, reason: stranger.to_string() });
+            return Ok(());
+        }
         stream.set_nonblocking(false)?;
         stream.set_read_timeout(Some(SOCKET_TIMEOUT))?;
         stream.set_write_timeout(Some(SOCKET_TIMEOUT))?;
         keep_little(&stream)?;
-        let output = stream.try_clone()?;
-        admit(&board, stream, output, &format!("local client {count}"), role);
+        let ended = stream.try_clone()?;
+        let end = move || drop(ended.shutdown(std::net::Shutdown::Both));
+        match places.enter(None, end) {
+            Ok(place) => {
+                let output = stream.try_clone()?;
+                let place = Some(place);
+                admit(
+                    &board,
+                    stream,
+                    output,
+                    Guest { name, role, place, is_counted: false, is_remote: false },
+                );
+            }
+            Err(full) => turn_away(&board, &mut stream, name, &full),
+        }
         Ok(())
     })?;
-    listening.path = Some(path.to_owned());
+    listening.file = Some(file);
     Ok(listening)
 }
 
@@ -112,12 +124,37 @@ pub fn unix(board: &Arc<Board>, path: &Path, role: Role) -> io::Result<Listening
 pub fn tcp(board: &Arc<Board>, address: SocketAddr, role: Role) -> io::Result<Listening> {
     let (listener, address) = bind_loopback(address)?;
     let board = Arc::clone(board);
+    let places = Places::new(board.most_clients());
     Listening::start("cantap-tcp", Some(address), move || {
-        let (stream, peer) = accept(&listener)?;
-        let output = stream.try_clone()?;
-        admit(&board, stream, output, &format!("client {peer}"), role);
+        let (mut stream, peer) = accept(&listener)?;
+        let name = format!("client {peer}");
+        match places.enter(Some(peer.ip()), ends(&stream)?) {
+            Ok(place) => {
+                let output = stream.try_clone()?;
+                let place = Some(place);
+                // A tunnel may end here.
+                admit(
+                    &board,
+                    stream,
+                    output,
+                    Guest { name, role, place, is_counted: false, is_remote: true },
+                );
+            }
+            Err(full) => turn_away(&board, &mut stream, name, &full),
+        }
         Ok(())
     })
+}
+
+/// Tells a client of our own protocol, and whoever runs the server, why it is not served.
+pub(crate) fn turn_away(
+    board: &Board,
+    output: &mut impl Write,
+    client: String,
+    reason: &impl std::fmt::Display,
+) {
+    refuse(output, &reason.to_string());
+    board.tell(News::Refused { client, reason: reason.to_string() });
 }
 
 /// A socket that can only be reached from this machine.
@@ -162,10 +199,10 @@ pub(crate) fn admit(
     board: &Board,
     input: impl Read + Send + 'static,
     output: impl Write + Send + 'static,
-    name: &str,
-    role: Role,
+    guest: Guest,
 ) {
-    if let Err(refused) = board.admit(input, output, name, role) {
-        board.tell(News::Refused { client: name.to_owned(), reason: refused.to_string() });
+    let client = guest.name.clone();
+    if let Err(refused) = board.admit_guest(input, output, guest) {
+        board.tell(News::Refused { client, reason: refused.to_string() });
     }
 }

@@ -1,7 +1,9 @@
 //! What a server reports to the program that runs it.
 
 use std::fmt;
+use std::time::Duration;
 
+use cantap_wire::Channel;
 use cantap_wire::message::Role;
 
 /// Something happened.
@@ -29,6 +31,22 @@ pub enum News {
         /// The reason.
         reason: String,
     },
+    /// A client said nothing for the dead-man time: what it has sent on its own is stopped.
+    DeadMan {
+        /// Its name.
+        client: String,
+        /// The time.
+        after: Duration,
+    },
+    /// A channel was off its bus because its mode had to change, which clients that had it open see as a gap.
+    OffBus {
+        /// Who asked for it; `None` if the server went back to listening.
+        client: Option<String>,
+        /// The channel.
+        channel: Channel,
+        /// How many others had it open.
+        others: usize,
+    },
     /// The board is gone. The server keeps trying it.
     BoardLost {
         /// Its name.
@@ -50,6 +68,29 @@ impl fmt::Display for News {
             Self::ClientLeft { client, reason: None } => write!(f, "{client} has left"),
             Self::ClientLeft { client, reason: Some(reason) } => write!(f, "{client} was let go: {reason}"),
             Self::Refused { client, reason } => write!(f, "{client} was not let in: {reason}"),
+            Self::DeadMan { client, after } => {
+                write!(
+                    f,
+                    "{client} said nothing for {} s: what it has sent periodically is stopped",
+                    after.as_secs_f64()
+                )
+            }
+            Self::OffBus { client: Some(client), channel, others } => write!(
+                f,
+                "channel {} was off its bus for a moment, because {client} may send on it; {} a gap",
+                channel.number(),
+                if *others == 1 {
+                    "1 other client sees".to_owned()
+                } else {
+                    format!("{others} other clients see")
+                }
+            ),
+            Self::OffBus { client: None, channel, others } => write!(
+                f,
+                "channel {} was off its bus for a moment, and only listens again; {} a gap",
+                channel.number(),
+                if *others == 1 { "1 client sees".to_owned() } else { format!("{others} clients see") }
+            ),
             // The reason names the board.
             Self::BoardLost { board, reason } if reason.contains(board.as_str()) => {
                 write!(f, "{reason}; it is tried again")

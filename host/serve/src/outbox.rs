@@ -36,6 +36,8 @@ pub enum Item {
     Chunk(Arc<[Entry]>),
     /// Records for which there was no room.
     Gap(Gap),
+    /// An encoded answer that must not overtake what is in front of it.
+    Answer(Vec<u8>),
     /// The session is over.
     Ended(EndReason, u64),
 }
@@ -179,6 +181,20 @@ impl Outbox {
         let waited = self.changed.wait_while(self.lock(), full);
         let mut queue = waited.unwrap_or_else(PoisonError::into_inner);
         queue.answers.push_back(bytes);
+        let is_there = !queue.is_abandoned;
+        drop(queue);
+        self.changed.notify_all();
+        is_there
+    }
+
+    /// Adds an answer behind everything that waits. Returns whether anybody takes it.
+    pub fn answer_in_turn(&self, bytes: Vec<u8>) -> bool {
+        let waiting =
+            |queue: &Queue| queue.items.iter().filter(|item| matches!(item, Item::Answer(_))).count();
+        let full = |queue: &mut Queue| waiting(queue) >= MOST_ANSWERS && !queue.is_abandoned;
+        let waited = self.changed.wait_while(self.lock(), full);
+        let mut queue = waited.unwrap_or_else(PoisonError::into_inner);
+        queue.push(Item::Answer(bytes));
         let is_there = !queue.is_abandoned;
         drop(queue);
         self.changed.notify_all();

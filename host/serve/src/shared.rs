@@ -28,8 +28,16 @@ pub struct Settings {
     pub bitrates_bps: [Option<u32>; CHANNELS],
     /// Limit for records waiting for a slow client.
     pub most_records: usize,
-    /// Limit for clients at a time.
+    /// Limit for clients at a time, at each listener and of this process.
     pub most_clients: usize,
+    /// A channel that was opened for sending stays so for this long after the last client that may send on it has left, if others have
+    /// it open: each change of mode costs them some frames.
+    pub keep_mode: Duration,
+    /// How channels are opened for clients that only listen: with `true`, so that the board acknowledges, and no client that sends takes
+    /// it off the bus.
+    pub always_acknowledges: bool,
+    /// Periodic frames and replies of a client on another computer that has said nothing for this long are stopped; `None` for never.
+    pub dead_man: Option<Duration>,
 }
 
 impl Settings {
@@ -41,7 +49,14 @@ impl Settings {
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { bitrates_bps: [None; CHANNELS], most_records: MOST_RECORDS, most_clients: 32 }
+        Self {
+            bitrates_bps: [None; CHANNELS],
+            most_records: MOST_RECORDS,
+            most_clients: 32,
+            keep_mode: Duration::from_secs(10),
+            always_acknowledges: false,
+            dead_man: Some(Duration::from_secs(2)),
+        }
     }
 }
 

@@ -4,6 +4,7 @@
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use std::sync::mpsc::SyncSender;
+use std::time::Instant;
 
 use cantap_wire::message::{ChannelConfig, DEVICE_TAG, Mode, Role, TRIGGER_TAG, TxFrame};
 use cantap_wire::record::{ErrorState, LossStage, Record, TransmitFailure};
@@ -17,6 +18,8 @@ const TAGS: u32 = 1 << 30;
 
 /// One client.
 pub struct Member {
+    /// It takes one of the board's places, because it has none at a listener.
+    pub is_counted: bool,
     pub role: Role,
     pub outbox: Arc<Outbox>,
     /// It has greeted, and its session is not over.
@@ -62,7 +65,7 @@ pub enum Table {
 
 impl Table {
     /// The first tag of its entries.
-    const fn tag(self) -> u32 {
+    pub const fn tag(self) -> u32 {
         match self {
             Self::Periodic => DEVICE_TAG,
             Self::Triggers => TRIGGER_TAG,
@@ -107,12 +110,12 @@ impl Entries {
         self.table(table).remove(&entry);
     }
 
-    /// Every entry of a client.
-    pub fn of(&mut self, client: ClientId) -> Vec<(Table, u8)> {
+    /// Every entry of a client, with its own number for it.
+    pub fn of(&mut self, client: ClientId) -> Vec<(Table, u8, u8)> {
         let mut all = Vec::new();
         for table in [Table::Periodic, Table::Triggers] {
             let owned = self.table(table).iter().filter(|(_, (owner, _))| *owner == client);
-            all.extend(owned.map(|(entry, _)| (table, *entry)));
+            all.extend(owned.map(|(entry, (_, slot))| (table, *entry, *slot)));
         }
         all
     }
@@ -146,10 +149,14 @@ pub struct State {
     /// Device time of the latest record.
     pub latest_ticks: u64,
     /// How often each channel has stopped.
-    pub stopped: [u32; CHANNELS],
+    pub stops: [u32; CHANNELS],
     pub clients: BTreeMap<ClientId, Member>,
-    /// The client with the right to configure.
-    pub holder: Option<ClientId>,
+    /// The client with the right to configure each channel.
+    holders: [Option<ClientId>; CHANNELS],
+    /// Who is closing a channel that the board closes: it sees no gap behind its end.
+    pub closing: [Option<ClientId>; CHANNELS],
+    /// Since when each channel is open for sending though nobody may send on it any more.
+    pub kept: [Option<Instant>; CHANNELS],
     pub sent: HashMap<u32, Sent>,
     next_tag: u32,
     pub entries: [Entries; CHANNELS],
@@ -197,19 +204,39 @@ impl State {
             })
     }
 
-    /// Gives a client the right to configure, if it may have it.
-    pub fn hold(&mut self, client: ClientId) -> Result<(), Refusal> {
+    /// How many others have a channel open.
+    pub fn listeners(&self, client: ClientId, channel: Channel) -> usize {
+        let others = self.clients.iter().filter(|(id, _)| **id != client);
+        others.filter(|(_, member)| member.views[channel.index()].config.is_some()).count()
+    }
+
+    /// Gives a client the right to configure channels, if it may have it: all of them or none.
+    pub fn hold(&mut self, client: ClientId, channels: &[Channel]) -> Result<(), Refusal> {
         let role = self.clients.get(&client).map_or(Role::Listen, |member| member.role);
         if role < Role::Configure {
             return Err(Refusal::NotGranted { needs: Role::Configure });
         }
-        match self.holder {
-            Some(holder) if holder != client => Err(Refusal::Held),
-            _ => {
-                self.holder = Some(client);
-                Ok(())
-            }
+        let is_free = |channel: &Channel| self.holders[channel.index()].is_none_or(|holder| holder == client);
+        if !channels.iter().all(is_free) {
+            return Err(Refusal::Held);
         }
+        for channel in channels {
+            self.holders[channel.index()] = Some(client);
+        }
+        Ok(())
+    }
+
+    /// Checks that a client has the right to configure a channel, whichever.
+    pub fn must_hold_any(&mut self, client: ClientId) -> Result<(), Refusal> {
+        if self.holders.contains(&Some(client)) {
+            return Ok(());
+        }
+        self.hold(client, &Channel::ALL)
+    }
+
+    /// Takes the right to configure from a client.
+    pub fn release(&mut self, client: ClientId) {
+        self.holders.iter_mut().filter(|holder| **holder == Some(client)).for_each(|holder| *holder = None);
     }
 
     /// Takes a record from the board. Returns how it is passed on to the clients, if it is.
@@ -219,11 +246,7 @@ impl State {
         let mut entry = Entry { ticks, record, owner: None };
         let Record::Event(event) = record else { return Some(entry) };
         match event {
-            Event::Started { .. } => return None,
-            Event::Stopped { channel } => {
-                self.stopped[channel.index()] += 1;
-                return None;
-            }
+            Event::Stopped { .. } => return None,
             Event::State { channel, state, tec, rec } => {
                 self.controller[channel.index()] = Some((state, tec, rec));
             }
@@ -262,6 +285,18 @@ impl State {
         Some(entry)
     }
 
+    /// The board has left a channel's bus. Whoever has it open, and is not the one who closes it, misses what is on the bus from here until
+    /// it is opened again: a gap.
+    pub fn stopped(&mut self, channel: Channel, ticks: u64) {
+        self.latest_ticks = self.latest_ticks.max(ticks);
+        self.stops[channel.index()] += 1;
+        if let Some(client) = self.closing[channel.index()].take() {
+            self.detach(client, channel);
+        }
+        let gap = Event::Lost { channel, stage: LossStage::Link, count: 0, at_least: true };
+        self.deliver(&mut vec![Entry::event(ticks, gap)]);
+    }
+
     /// Passes records to every client. Nobody waits.
     pub fn deliver(&mut self, chunk: &mut Vec<Entry>) {
         if chunk.is_empty() {
@@ -279,10 +314,8 @@ impl State {
     pub fn opened(&mut self, channel: Channel, config: ChannelConfig) {
         self.open[channel.index()] = Some(config);
         self.controller[channel.index()] = None;
+        self.kept[channel.index()] = None;
         self.entries[channel.index()].clear();
-        // Clients that had it open have missed something.
-        let gap = Event::Lost { channel, stage: LossStage::Link, count: 0, at_least: true };
-        self.deliver(&mut vec![Entry::event(self.latest_ticks, gap)]);
     }
 
     /// A client has a channel from here on.
@@ -314,7 +347,9 @@ impl State {
         self.hello = None;
         self.open = [None; CHANNELS];
         self.controller = [None; CHANNELS];
-        self.holder = None;
+        self.holders = [None; CHANNELS];
+        self.closing = [None; CHANNELS];
+        self.kept = [None; CHANNELS];
         self.sent.clear();
         self.again.clear();
         self.entries = Default::default();

@@ -69,8 +69,7 @@ pub fn shown(entry: &Entry, client: ClientId, views: &Views) -> Option<Record> {
             Some(Record::Received(received))
         }
         Record::Event(event) => {
-            let event =
-                match event {
+            let event = match event {
                     Event::SofMark { .. } => Some(event),
                     Event::Transmitted { channel, frame, .. } => is_open(channel)
                         .then(|| Event::Transmitted { channel, tag: own_tag.unwrap_or(OTHERS_TAG), frame }),
@@ -81,9 +80,11 @@ pub fn shown(entry: &Entry, client: ClientId, views: &Views) -> Option<Record> {
                     Event::Lost { channel, .. }
                     | Event::BusError { channel, .. }
                     | Event::ErrorsSuppressed { channel, .. }
-                    | Event::State { channel, .. } => is_open(channel).then_some(event),
-                    // Each client's channels start and stop on their own.
-                    Event::Started { .. } | Event::Stopped { .. } => None,
+                    | Event::State { channel, .. }
+                    // The end of a gap.
+                    | Event::Started { channel } => is_open(channel).then_some(event),
+                    // Each client's channels stop on their own.
+                    Event::Stopped { .. } => None,
                 };
             event.map(Record::Event)
         }
@@ -217,7 +218,7 @@ fn merge(kept: &mut Event, next: &Event) -> bool {
         (
             Event::Lost { channel, stage, count, at_least },
             Event::Lost { channel: next, stage: next_stage, count: more, at_least: next_at_least },
-        ) if channel == next && stage == next_stage => {
+        ) if channel == next && stage == next_stage && (*count == 0) == (*more == 0) => {
             *count = count.saturating_add(*more);
             *at_least |= next_at_least;
             true

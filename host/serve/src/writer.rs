@@ -127,6 +127,11 @@ impl Encoder {
                     self.event(ticks, event);
                 }
             }
+            Item::Answer(answer) => {
+                self.finish();
+                self.out.push(0);
+                self.out.extend_from_slice(&answer);
+            }
             Item::Ended(reason, ticks) => self.end(reason, ticks),
         }
     }

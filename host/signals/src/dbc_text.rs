@@ -87,8 +87,8 @@ fn is_shift_jis(bytes: &[u8]) -> bool {
             (0..=0x7F, _) => {}
             (0x81..=0x9F | 0xE0..=0xFC, [second @ (0x40..=0x7E | 0x80..=0xFC), behind @ ..]) => {
                 // In the other code page these are two marks, or a mark and a letter with an accent.
-                let is_clear =
-                    *first <= 0x9F && *second >= 0x80 || matches!(first, 0x81 | 0x8D | 0x8F | 0x90 | 0x9D);
+                let is_clear = *first <= 0x9F && *second >= 0x80
+                    || matches!(first, 0x81 | 0x83 | 0x8D | 0x8F | 0x90 | 0x9D);
                 if is_clear {
                     pairs += 1
                 } else {
@@ -334,5 +334,23 @@ mod tests {
             (12, 9, 13)
         );
         assert_eq!(index.place_at(11), Some(5));
+    }
+
+    #[test]
+    fn kana_alone_are_known_and_western_words_stay() {
+        let bytes = encodings::SHIFT_JIS.encode("VAL_ 1 S 0 \"オフ\" ;").0;
+        assert_eq!(decode(&bytes), ("VAL_ 1 S 0 \"オフ\" ;".into(), Some("Shift_JIS")));
+        for text in [
+            "Fläche größer Öl",
+            "°C",
+            "don’t",
+            "“quoted” text – and more",
+            "température élevée à l’arrêt",
+            "µ ± ² ½",
+            "€ 5",
+        ] {
+            assert_eq!(decode(&encodings::WINDOWS_1252.encode(text).0), (text.into(), None));
+            assert_eq!(decode(text.as_bytes()), (text.into(), None));
+        }
     }
 }

@@ -5,14 +5,14 @@ use std::fmt;
 use std::ops::RangeInclusive;
 use std::str::FromStr;
 
-use cantap_wire::Id;
+use cantap_can::Id;
 
-use super::clean;
 use super::container::{Container, InPdu};
 use super::fault::Fault;
 use super::layout::{self, ByteOrder};
 use super::number::Number;
 use super::scale::Scale;
+use cantap_trace::clean;
 
 /// A set of messages, from one file.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -42,7 +42,7 @@ pub struct Message {
     pub cycle_ms: Option<u32>,
     /// Whether it is a J1939 parameter group: priority and source address are ignored when matching.
     pub j1939: bool,
-    /// What of it says anew in each frame which PDUs are in it, if something does.
+    /// Its part that holds PDUs, if each frame says itself which PDUs it contains.
     pub container: Option<Container>,
     /// Its signals, in the file's order.
     pub signals: Vec<Signal>,
@@ -389,6 +389,23 @@ impl Signal {
         }
     }
 
+    /// A physical value of this signal for display: for floats of 32 and of 16 bits, with as few digits as tell them apart, since 0.1 on
+    /// the bus is 0.10000000149011612 as a double; otherwise as [`Number::for_people`].
+    pub fn for_people(&self, number: Number) -> Number {
+        let Number::Real(value) = number else { return number };
+        let shortest = match self.kind {
+            ValueKind::Single => (value as f32).to_string().parse().ok(),
+            ValueKind::Half => (0..5).find_map(|digits| {
+                let shorter: f64 = format!("{value:.digits$e}").parse().ok()?;
+                (half::f16::from_f64(shorter) == half::f16::from_f64(value)).then_some(shorter)
+            }),
+            _ => None,
+        };
+        // A factor may lead out of the small float's range.
+        let is_near = |shortest: &f64| (shortest - value).abs() <= value.abs() / 1e3;
+        shortest.filter(is_near).map_or(number.for_people(), Number::Real)
+    }
+
     /// The key of the raw bits in the value table: the integer that they represent, before factor and offset.
     pub fn table_key(&self, raw: u64) -> Option<i64> {
         let value = self.integer(raw).or_else(|| {
@@ -441,6 +458,32 @@ mod tests {
         assert_eq!(whole.number(0xBFC0_0000), Number::Real(-1.5));
         let double = Signal { kind: ValueKind::Double, ..Signal::new("D", 0, 24) };
         assert_eq!(double.number(0xBF_F800), Number::Real(-1.5));
+    }
+
+    #[test]
+    fn small_floats_have_no_digits_that_they_cannot_tell() {
+        let single = Signal { kind: ValueKind::Single, ..Signal::new("F", 0, 32) };
+        let half = Signal { kind: ValueKind::Half, ..Signal::new("H", 0, 16) };
+        let shown = |signal: &Signal, value: f32| {
+            let raw = match signal.kind {
+                ValueKind::Half => half::f16::from_f32(value).to_bits().into(),
+                _ => value.to_bits().into(),
+            };
+            signal.for_people(signal.number(raw)).to_string()
+        };
+        for value in [0.1, 3.3, -12.75, 1e-8, 1e30, 16_777_216.0, f32::MIN_POSITIVE] {
+            let text = shown(&single, value);
+            assert_eq!(text.parse::<f32>().unwrap(), value, "{text}");
+            assert!(text.len() <= 12, "{text}");
+        }
+        assert_eq!([0.1, 3.3, f32::NAN].map(|value| shown(&single, value)), ["0.1", "3.3", "NaN"]);
+        assert_eq!([0.1, 3.3, 65504.0, 0.0].map(|value| shown(&half, value)), ["0.1", "3.3", "65504", "0"]);
+        let scaled = Signal { factor: 0.01, offset: 40.0, ..single.clone() };
+        assert_eq!(shown(&scaled, 0.1), "40.001");
+        let far = Signal { factor: 1e300, ..single };
+        assert!(shown(&far, 0.1).ends_with("e299"));
+        let double = Signal { kind: ValueKind::Double, ..Signal::new("D", 0, 64) };
+        assert_eq!(double.for_people(Number::Real(0.123_456_789_012)).to_string(), "0.123456789012");
     }
 
     #[test]

@@ -3,10 +3,10 @@
 use std::fmt;
 use std::str::FromStr;
 
-use cantap_wire::Id;
-
 use crate::condition::Condition;
 use cantap_trace::{TraceFrame, TraceRecord};
+
+pub use cantap_trace::grammar::IdPattern;
 
 /// What to look for. Every given criterion must match.
 #[derive(Clone, Debug, Default)]
@@ -38,39 +38,10 @@ impl Search {
     }
 }
 
-/// An identifier, `123` or `12345678` (29 bits), with `?` for any digit, or `LOW-HIGH`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct IdPattern {
-    extended: bool,
-    kind: IdKind,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum IdKind {
-    Digits { value: u32, mask: u32 },
-    Range { low: u32, high: u32 },
-}
-
-impl IdPattern {
-    /// Whether an identifier matches.
-    pub fn matches(self, id: Id) -> bool {
-        id.is_extended() == self.extended
-            && match self.kind {
-                IdKind::Digits { value, mask } => id.raw() & mask == value,
-                IdKind::Range { low, high } => (low..=high).contains(&id.raw()),
-            }
-    }
-}
-
 /// Why a text is not a pattern.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum PatternError {
-    /// Not an identifier.
-    #[error(
-        "{0:?} is not an identifier; write up to 3 hexadecimal digits, or up to 8 (29 bits), with ? for any digit, or LOW-HIGH"
-    )]
-    Id(String),
     /// Not data.
     #[error(
         "{0:?} is not a pattern of bytes; write hexadecimal digits in pairs such as 1F, 3? or ??, and between them * for any number of bytes"
@@ -78,48 +49,12 @@ pub enum PatternError {
     Data(String),
 }
 
-/// Value and mask of hexadecimal digits, where `?` means any.
-fn digits(text: &str) -> Option<(u32, u32)> {
-    let mut both = (0u32, 0u32);
-    for digit in text.chars() {
-        let (value, mask) = match digit {
-            '?' => (0, 0),
-            _ => (digit.to_digit(16)?, 15),
-        };
-        both = (both.0 << 4 | value, both.1 << 4 | mask);
-    }
-    (!text.is_empty() && text.len() <= 8).then_some(both)
-}
-
-impl FromStr for IdPattern {
-    type Err = PatternError;
-
-    fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let wrong = || PatternError::Id(text.to_owned());
-        let plain = text.strip_prefix("0x").unwrap_or(text);
-        if let Some((low, high)) = plain.split_once('-') {
-            let parse =
-                |text: &str| text.strip_prefix("0x").unwrap_or(text).parse::<Id>().map_err(|_| wrong());
-            let (low, high) = (parse(low)?, parse(high)?);
-            if low.is_extended() != high.is_extended() || low.raw() > high.raw() {
-                return Err(wrong());
-            }
-            let kind = IdKind::Range { low: low.raw(), high: high.raw() };
-            return Ok(Self { extended: low.is_extended(), kind });
-        }
-        let (value, mask) = digits(plain).ok_or_else(wrong)?;
-        let (extended, largest) = match plain.len() {
-            1..=3 => (false, Id::MAX_STANDARD),
-            // Too long for a standard identifier: leading zeros may be left out.
-            4..=8 => (true, Id::MAX_EXTENDED),
-            _ => return Err(wrong()),
-        };
-        if value > largest {
-            return Err(wrong());
-        }
-        let mask = mask | u32::MAX.checked_shl(4 * plain.len() as u32).unwrap_or(0);
-        Ok(Self { extended, kind: IdKind::Digits { value, mask } })
-    }
+/// Value and mask of a byte's two hexadecimal digits, where `?` means any.
+fn digits(pair: &str) -> Option<(u8, u8)> {
+    pair.chars().try_fold((0, 0), |(value, mask), digit| match digit {
+        '?' => Some((value << 4, mask << 4)),
+        _ => Some((value << 4 | digit.to_digit(16)? as u8, mask << 4 | 0xF)),
+    })
 }
 
 /// Data bytes from the first on, such as `11 ?? 3?`; the bytes after them may be anything. A leading `*`
@@ -172,7 +107,7 @@ impl FromStr for DataPattern {
             for pair in word.as_bytes().chunks(2) {
                 let pair = str::from_utf8(pair).map_err(|_| wrong())?;
                 let (value, mask) = digits(pair).ok_or_else(wrong)?;
-                pieces.last_mut().ok_or_else(wrong)?.push((value as u8, mask as u8));
+                pieces.last_mut().ok_or_else(wrong)?.push((value, mask));
             }
         }
         pieces.retain(|piece| !piece.is_empty());

@@ -2,9 +2,9 @@
 
 use std::collections::{HashMap, HashSet};
 
-use super::clean;
 use super::fault::{DatabaseError, Fault, FaultKind, MAX_SWITCHES};
 use super::model::{Database, Message, Signal, ValueKind};
+use cantap_trace::clean;
 
 /// The longest message: J1939's transport protocol carries 1785 bytes.
 pub const MAX_BYTES: u16 = 1785;

@@ -9,7 +9,7 @@ use super::fault::{DatabaseError, Fault, FaultKind};
 /// A range of values with one text is expanded up to this many values.
 pub const MOST_TEXTS: i64 = 4096;
 
-/// The text of an XML file, in the encodings that a DBC file may have.
+/// The text of an XML file: UTF-8, UTF-16, or otherwise Windows' Western code page.
 pub fn decode(bytes: &[u8]) -> Cow<'_, str> {
     super::dbc_text::decode(bytes).0
 }

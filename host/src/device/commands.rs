@@ -5,6 +5,7 @@ use cantap_wire::message::{
 };
 use cantap_wire::{Channel, Command, Refusal, Reply};
 
+use super::clean::printable;
 use super::{Device, DeviceError};
 
 impl Device {
@@ -19,7 +20,10 @@ impl Device {
     /// How often the firmware has failed since the device was powered, and the reason for the last failure.
     pub fn failures(&self) -> Result<Failures, DeviceError> {
         match self.request(Command::Failures)? {
-            Reply::Failures(failures) => Ok(failures),
+            Reply::Failures(mut failures) => {
+                printable(&mut failures.last);
+                Ok(failures)
+            }
             _ => Err(DeviceError::WrongReply),
         }
     }

@@ -31,6 +31,11 @@ pub struct ChannelCounters {
     pub lost_link: u64,
     /// Frames that arrived but that a slow consumer lost.
     pub lost_host: u64,
+    /// How often the device was off the bus while the channel was open, because another client of its server changed the mode: an unknown
+    /// number of frames is missing each time.
+    pub off_bus: u64,
+    /// For how long in total, in nanoseconds of the device's clock; as far as its return was seen.
+    pub off_bus_ns: u64,
 }
 
 impl ChannelCounters {
@@ -39,7 +44,7 @@ impl ChannelCounters {
         self.received - self.lost_host
     }
 
-    /// Frames lost at any stage.
+    /// Frames lost at any stage that can count them. While the device was off the bus, none can: see [`Self::off_bus`].
     pub const fn lost(&self) -> u64 {
         self.lost_controller + self.lost_queue + self.lost_link + self.lost_host
     }
@@ -66,6 +71,8 @@ impl Add for ChannelCounters {
             lost_queue: self.lost_queue + other.lost_queue,
             lost_link: self.lost_link + other.lost_link,
             lost_host: self.lost_host + other.lost_host,
+            off_bus: self.off_bus + other.off_bus,
+            off_bus_ns: self.off_bus_ns + other.off_bus_ns,
         }
     }
 }
@@ -136,6 +143,10 @@ pub struct Intake {
     counters: Counters,
     /// Device time of the latest record, in ticks.
     latest_ticks: u64,
+    /// Device time since when it is off each bus, in ticks, if it is.
+    off_bus_since: [Option<u64>; CHANNELS],
+    /// Ticks per second of the device's times.
+    tick_hz: u32,
     /// How far a time may be before that of the preceding record, in ticks.
     disorder_ticks: u64,
     /// Whether `Hello` was answered; anything earlier belongs to another program's session.
@@ -156,6 +167,8 @@ impl Intake {
             last_ns: i64::MIN,
             counters: Counters::default(),
             latest_ticks: 0,
+            off_bus_since: [None; CHANNELS],
+            tick_hz: cantap_tick_hz_before_hello(),
             disorder_ticks: u64::MAX,
             in_session: false,
         }
@@ -175,6 +188,8 @@ impl Intake {
             last_ns,
             utc,
             latest_ticks,
+            off_bus_since,
+            tick_hz,
             disorder_ticks,
         } = self;
         let mut last_ticks = None;
@@ -197,6 +212,7 @@ impl Intake {
             }
             Decoded::Record { ticks, record: Record::Event(event) } => {
                 last_ticks = Some(ticks);
+                follow_bus(event, ticks, *tick_hz, off_bus_since, counters);
                 on_event(event, Ticks(ticks), counters, clock, stamped, &mut notice);
             }
             Decoded::BatchesLost { frames, .. } => {
@@ -217,8 +233,10 @@ impl Intake {
                     records.clear();
                     last_ticks = None;
                     *latest_ticks = 0;
+                    *tick_hz = answer.tick_hz.max(1);
                     *disorder_ticks = u64::from(answer.tick_hz) / DISORDER_PER_S;
                     *counters = Counters::default();
+                    *off_bus_since = [None; CHANNELS];
                     *lengths = BitLengths::default();
                     *last_ns = i64::MIN;
                     *clock = ClockMap::new(answer.tick_hz, utc.at(Instant::now()));
@@ -373,6 +391,30 @@ const fn cantap_tick_hz_before_hello() -> u32 {
 fn lost(channel: Channel, at: Ticks, stage: LossStage, count: u32, at_least: bool) -> Option<Stamped> {
     let event = TraceEvent::Lost { stage: Some(stage), count, at_least };
     (count > 0).then_some(Stamped { at, channel: channel.number(), event })
+}
+
+/// Counts when the device leaves a bus and comes back while the channel is open: a loss of an unknown number, and the channel's next start.
+fn follow_bus(
+    event: Event,
+    ticks: u64,
+    tick_hz: u32,
+    since: &mut [Option<u64>; CHANNELS],
+    counters: &mut Counters,
+) {
+    match event {
+        Event::Lost { channel, stage: LossStage::Link, count: 0, at_least: true } => {
+            counters.channels[channel.index()].off_bus += 1;
+            since[channel.index()] = Some(ticks);
+        }
+        Event::Started { channel } => {
+            let away = since[channel.index()].take().map_or(0, |since| ticks.saturating_sub(since));
+            let away_ns = u128::from(away) * 1_000_000_000 / u128::from(tick_hz);
+            let sum = &mut counters.channels[channel.index()].off_bus_ns;
+            *sum = sum.saturating_add(u64::try_from(away_ns).unwrap_or(u64::MAX));
+        }
+        Event::Stopped { channel } => since[channel.index()] = None,
+        _ => {}
+    }
 }
 
 /// Everything that is not a received frame.

@@ -5,6 +5,7 @@
 //! nothing as long as the buffer lasts, and after that is shown exactly what it lost.
 
 mod buffer;
+mod clean;
 mod clock;
 mod commands;
 mod error;
@@ -31,6 +32,7 @@ use cantap_wire::record::LossStage;
 use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply};
 
 pub use buffer::Buffer;
+pub use clean::clean;
 pub use clock::{
     ClockMap, ClockReport, ClockSource, CommonClock, Follower, FollowerReport, FrameClock, FrameDoubt,
     FrameNs, NotCommon, SofMark, Ticks, UtcClock, UtcNs,
@@ -124,7 +126,10 @@ impl Device {
             // The zero byte ends anything left in the device's input and selects our protocol over slcan.
             self.shared.write(&[0])?;
             match self.request_within(Command::Hello { protocol: PROTOCOL_VERSION }, HELLO_TIMEOUT) {
-                Ok(Reply::Hello(hello)) => return Ok(hello),
+                Ok(Reply::Hello(mut hello)) => {
+                    clean(&mut hello);
+                    return Ok(hello);
+                }
                 Ok(_) => return Err(DeviceError::WrongReply),
                 Err(DeviceError::Timeout { .. }) => {}
                 Err(error) => return Err(error),
@@ -230,6 +235,11 @@ impl Device {
 
     fn settings(&self) -> MutexGuard<'_, Settings> {
         self.settings.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Whether a channel's filters keep frames back from this session.
+    pub fn is_filtered(&self, channel: Channel) -> bool {
+        self.settings().filters[channel.index()].as_ref().is_some_and(|filters| !filters.is_empty())
     }
 
     /// The open channels, with their configurations.

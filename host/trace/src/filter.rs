@@ -3,32 +3,15 @@
 //! An interface, then comma-separated items: `ID:MASK` accepts frames with `id & MASK == ID & MASK`, `ID~MASK`
 //! all other frames, `#MASK` error frames of these SocketCAN classes, and `j` requires all items to match
 //! instead of any. All numbers are hexadecimal; an ID of eight digits is a 29-bit one. As on Linux, a mask
-//! without the flag bits (80000000 extended, 40000000 remote) ignores them.
+//! without the flag bits (80000000 extended, 40000000 remote) ignores them. Identifiers without a mask are those of
+//! [`crate::grammar`], with ranges and parameter groups.
 
 use std::fmt;
 use std::str::FromStr;
 
+use crate::grammar::{self, IdError, IdPattern};
+pub use crate::id_filter::{EXTENDED, IdFilter, REMOTE};
 use crate::{CHANNEL_0, Interface, TraceEvent, TraceFrame, TraceRecord};
-
-/// The flag for an extended identifier, as on Linux.
-pub const EXTENDED: u32 = 1 << 31;
-/// The flag for a remote frame, as on Linux.
-pub const REMOTE: u32 = 1 << 30;
-/// Bit 29 is reserved by the kernel: it marks inverse filters and error frames.
-const RESERVED: u32 = 1 << 29;
-const STANDARD_BITS: u32 = 0x7FF;
-const EXTENDED_BITS: u32 = 0x1FFF_FFFF;
-
-/// One `ID:MASK` or `ID~MASK`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub struct IdFilter {
-    /// The identifier, with [`EXTENDED`] and [`REMOTE`].
-    pub id: u32,
-    /// The bits that are compared.
-    pub mask: u32,
-    /// Accepts whatever does not match.
-    pub inverse: bool,
-}
 
 /// Which records to accept, by channel, ID and kind of error.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Hash)]
@@ -61,28 +44,25 @@ pub enum ParseFilterError {
     /// A number.
     #[error("'{0}' is not a hexadecimal number of up to 8 digits")]
     Number(String),
-}
-
-impl IdFilter {
-    /// The mask as the kernel applies it: a standard ID compared with its format has no bits above the
-    /// eleventh.
-    pub const fn effective_mask(&self) -> u32 {
-        if self.mask & EXTENDED != 0 && self.id & EXTENDED == 0 {
-            self.mask & (STANDARD_BITS | EXTENDED | REMOTE)
-        } else {
-            self.mask
-        }
-    }
-
-    fn accepts(&self, id: u32) -> bool {
-        ((id ^ self.id) & self.effective_mask() == 0) != self.inverse
-    }
+    /// An identifier that there cannot be.
+    #[error(transparent)]
+    Id(IdError),
+    /// A range consists of several filters, which cannot all match.
+    #[error(
+        "'{0}' is several filters, and with j all of them must match; write it without j, or with a mask"
+    )]
+    JoinedRange(String),
 }
 
 impl Filter {
     /// A filter that accepts everything on one channel.
     pub fn on_channel(channel: u8) -> Self {
         Self { channel: Some(channel), ..Self::default() }
+    }
+
+    /// Whether every frame of a channel passes.
+    pub fn accepts_all_of(&self, channel: u8) -> bool {
+        self.channel.is_none_or(|own| own == channel) && self.ids.is_empty()
     }
 
     /// Whether a frame passes, on whichever channel.
@@ -120,66 +100,69 @@ impl Filter {
 }
 
 fn number(text: &str) -> Result<u32, ParseFilterError> {
-    let digits = text.bytes().all(|byte| byte.is_ascii_hexdigit()) && text.len() <= 8;
-    u32::from_str_radix(text, 16)
-        .ok()
-        .filter(|_| digits)
-        .ok_or_else(|| ParseFilterError::Number(text.to_owned()))
+    grammar::hex(text).ok_or_else(|| ParseFilterError::Number(text.to_owned()))
 }
 
-/// `can0` is channel 1; any letters may precede the number, as in `vcan0`.
-fn interface(text: &str) -> Result<Option<u8>, ParseFilterError> {
+/// `can0` is channel 1, and so is `vcan0`; so may any name be that no identifier can look like.
+fn interface(text: &str) -> Option<Option<u8>> {
     if text.is_empty() || text == "any" {
-        return Ok(None);
+        return Some(None);
     }
     if text == CHANNEL_0 {
-        return Ok(Some(0));
+        return Some(Some(0));
+    }
+    if let Some(channel) = grammar::interface(text) {
+        return Some(Some(channel));
     }
     let letters = text.trim_end_matches(|c: char| c.is_ascii_digit());
-    let channel = text[letters.len()..].parse::<u8>().ok().and_then(|number| number.checked_add(1));
-    match channel {
-        Some(channel) if letters.starts_with(|c: char| c.is_ascii_alphabetic()) => Ok(Some(channel)),
-        _ => Err(ParseFilterError::Interface(text.to_owned())),
-    }
-}
-
-/// An identifier without a mask matches exactly: up to three digits are a standard one, more are one of 29 bits. candump requires
-/// the mask, but everybody forgets it.
-fn lone_id(text: &str) -> Option<IdFilter> {
-    let id = number(text).ok()?;
-    let (id, bits) = match text.len() {
-        ..=3 => (id, STANDARD_BITS),
-        _ => (id | EXTENDED, EXTENDED_BITS),
-    };
-    (id & !EXTENDED <= bits).then_some(IdFilter { id, mask: bits | EXTENDED, inverse: false })
+    let is_name = letters.starts_with(|c: char| c.is_ascii_alphabetic())
+        && letters.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
+        && !text.bytes().all(|byte| byte.is_ascii_hexdigit())
+        && !text.starts_with("0x");
+    let channel = text[letters.len()..].parse::<u8>().ok()?.checked_add(1)?;
+    is_name.then_some(Some(channel))
 }
 
 impl FromStr for Filter {
     type Err = ParseFilterError;
 
     /// The interface may be left out: `123:7FF` applies to every channel. So may the mask: `123` is that identifier
-    /// alone.
+    /// alone. Identifiers are those of [`grammar::IdPattern`].
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let mut filter = Self::default();
+        let mut has_several = None;
         for (at, part) in text.split(',').enumerate() {
             if let Some(mask) = part.strip_prefix('#') {
                 filter.errors = Some(filter.errors.unwrap_or(0) | number(mask)?);
-            } else if let Some((id, mask)) = part.split_once([':', '~']) {
-                let extended = if id.len() == 8 { EXTENDED } else { 0 };
-                let inverse = part.as_bytes()[id.len()] == b'~';
-                let id = number(id)? & !RESERVED | extended;
-                filter.ids.push(IdFilter { id, mask: number(mask)? & !RESERVED, inverse });
-            } else if let Some(id) = lone_id(part).filter(|_| at > 0 || interface(part).is_err()) {
-                filter.ids.push(id);
-            } else if at == 0 {
-                filter.channel = interface(part)?;
+            } else if let Some((id, mask)) = part.split_once('~') {
+                // It is clear which of the two is no number.
+                (number(id)?, number(mask)?);
+                filter.ids.extend(grammar::masked(id, mask, true));
+            } else if let Some(channel) = interface(part).filter(|_| at == 0) {
+                filter.channel = channel;
             } else if part.eq_ignore_ascii_case("j") {
                 filter.join = true;
             } else {
-                return Err(ParseFilterError::Element(part.to_owned()));
+                if let Some((id, mask)) =
+                    part.split_once(':').filter(|(id, _)| !id.eq_ignore_ascii_case("pgn"))
+                {
+                    (number(id)?, number(mask)?);
+                }
+                let pattern = part.parse::<IdPattern>().map_err(|error| match error {
+                    IdError::Unknown(part) if at == 0 => ParseFilterError::Interface(part),
+                    IdError::Unknown(part) => ParseFilterError::Element(part),
+                    error => ParseFilterError::Id(error),
+                })?;
+                if pattern.filters().len() > 1 {
+                    has_several = Some(part);
+                }
+                filter.ids.extend(pattern.filters());
             }
         }
-        Ok(filter)
+        match has_several.filter(|_| filter.join) {
+            Some(range) => Err(ParseFilterError::JoinedRange(range.to_owned())),
+            None => Ok(filter),
+        }
     }
 }
 
@@ -208,7 +191,7 @@ impl fmt::Display for Filter {
 mod tests {
     use super::*;
     use crate::Direction;
-    use cantap_wire::record::{BusErrorKind, ErrorState};
+    use cantap_can::{BusErrorKind, ErrorState};
 
     fn accepts(filter: &str, frame: &str) -> bool {
         filter.parse::<Filter>().unwrap().accepts_frame(&frame.parse().unwrap())
@@ -220,8 +203,25 @@ mod tests {
         assert!(!accepts("123", "124#") && !accepts("123", "00000123#"));
         assert!(accepts("9F80102", "09F80102#") && accepts("09F80102", "09F80102#11"));
         assert!(!accepts("9F80102", "09F80103#") && accepts("can0,100,200", "200#"));
-        // Letters followed by a number are tried as an interface first.
-        assert_eq!("ca0".parse::<Filter>().unwrap().channel, Some(1));
+        // Letters followed by a number are an identifier wherever they can be one.
+        assert!(
+            accepts("C0", "0C0#")
+                && accepts("F0", "0F0#")
+                && accepts("CAFE0", "000CAFE0#")
+                && accepts("FEF1", "0000FEF1#")
+        );
+        for text in ["C0", "F0", "CAFE0", "FEF1", "123", "0x7E8"] {
+            assert_eq!(text.parse::<Filter>().unwrap().channel, None, "{text}");
+        }
+        for text in ["can0", "vcan0", "slcan0", "eth0", "can0,123"] {
+            assert_eq!(text.parse::<Filter>().unwrap().channel, Some(1), "{text}");
+        }
+        let doubtful = "ca0".parse::<Filter>().unwrap_err().to_string();
+        assert!(doubtful.contains("00000CA0") && doubtful.contains("can0"), "{doubtful}");
+        assert!(accepts("0x123", "123#") && accepts("100-1FF", "17A#") && !accepts("100-1FF", "200#"));
+        assert!(accepts("pgn:61444", "0CF00400#") && accepts("can0,18FEF1??", "18FEF1AA#"));
+        assert!(accepts("0x120:0x7F0", "12A#") && !accepts("can0,100-1FF,200", "201#"));
+        assert!("100-1FF,j".parse::<Filter>().is_err());
         for text in ["800", "3FFFFFFF", "123456789", "12g", ","] {
             assert!(text.parse::<Filter>().is_err() || text == ",", "{text}");
         }

@@ -6,15 +6,17 @@
 
 #![forbid(unsafe_code)]
 
+pub mod clean;
 pub mod diff;
 pub mod fd;
 mod fd_bits;
 pub mod filter;
 mod frame;
+pub mod grammar;
+mod id_filter;
 mod interface;
 mod length;
 pub mod levels;
-pub mod names;
 mod plain;
 pub mod playback;
 mod record;
@@ -22,8 +24,9 @@ pub mod socketcan;
 #[cfg(any(test, feature = "proptest"))]
 pub mod testing;
 
-pub use cantap_can::{Frame, FrameBits, Id, bits, bits_on_bus};
-pub use cantap_wire::Channel;
+pub use cantap_can::{
+    BusErrorKind, Channel, ErrorState, Frame, FrameBits, Id, LossStage, TransmitFailure, bits, bits_on_bus,
+};
 pub use fd::FdFrame;
 pub use fd_bits::FdBits;
 pub use frame::{ParseTraceFrameError, TraceFrame};

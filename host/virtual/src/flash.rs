@@ -1,6 +1,6 @@
 //! The chip's storage: the firmware's own log of settings, in a sector that a file can keep.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use cantap_firmware::saved::{self, ERASED, Sector};
 
@@ -27,12 +27,20 @@ impl Flash {
         Self { words, file }
     }
 
+    /// Whether the file may be written: there is none, it is empty, or it is as long as such a file is. Anything else was not written here.
+    fn may_write(file: &Path) -> bool {
+        match file.metadata() {
+            Ok(there) => there.is_file() && [0, (WORDS * 4) as u64].contains(&there.len()),
+            Err(error) => error.kind() == std::io::ErrorKind::NotFound,
+        }
+    }
+
     /// Saves like the board. Returns whether it worked and, if there is a file, whether it was written.
     pub fn save(&mut self, bytes: &[u8]) -> bool {
         let saved = saved::save(self, bytes);
         let kept = self.file.as_ref().is_none_or(|file| {
             let image: Vec<u8> = self.words.iter().flat_map(|word| word.to_le_bytes()).collect();
-            std::fs::write(file, image).is_ok()
+            Self::may_write(file) && std::fs::write(file, image).is_ok()
         });
         saved && kept
     }
@@ -57,5 +65,25 @@ impl Sector for Flash {
     fn erase(&mut self) -> bool {
         self.words.fill(ERASED);
         true
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// An address may name any file.
+    #[test]
+    fn a_file_that_was_not_written_here_is_not_overwritten() {
+        let folder = tempfile::tempdir().unwrap();
+        let (notes, settings) = (folder.path().join("notes.txt"), folder.path().join("settings.bin"));
+        std::fs::write(&notes, "mine").unwrap();
+        assert!(!Flash::new(Some(notes.clone())).save(&[1, 2, 3, 4]));
+        assert_eq!(std::fs::read_to_string(&notes).unwrap(), "mine");
+        for bytes in [[1, 2, 3, 4], [5, 6, 7, 8]] {
+            assert!(Flash::new(Some(settings.clone())).save(&bytes));
+            let mut out = [0; 4];
+            assert_eq!((Flash::new(Some(settings.clone())).load(&mut out), out), (4, bytes));
+        }
     }
 }

@@ -2,11 +2,12 @@
 
 #![forbid(unsafe_code)]
 
+#[cfg(feature = "dfu")]
+pub mod dfu;
 pub mod interrupt;
 mod losses;
 mod meter;
-mod time;
 
-pub use losses::Losses;
+pub use cantap_trace::grammar::{duration, positive_duration};
+pub use losses::{Losses, lost_frames};
 pub use meter::{Meter, rounded};
-pub use time::{duration, positive_duration};

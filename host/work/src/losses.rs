@@ -13,6 +13,10 @@ pub struct Losses {
     pub link: u64,
     /// In the host.
     pub host: u64,
+    /// How often the device was off a bus, because another client of its server changed the mode: an unknown number of frames each time.
+    pub off_bus: u64,
+    /// For how long in total, in microseconds.
+    pub off_bus_us: u64,
 }
 
 impl Losses {
@@ -24,6 +28,8 @@ impl Losses {
             losses.queue += channel.lost_queue;
             losses.link += channel.lost_link;
             losses.host += channel.lost_host;
+            losses.off_bus += channel.off_bus;
+            losses.off_bus_us += channel.off_bus_ns / 1000;
         }
         losses
     }
@@ -36,17 +42,55 @@ impl Losses {
             queue: self.queue + other.queue,
             link: self.link + other.link,
             host: self.host + other.host,
+            off_bus: self.off_bus + other.off_bus,
+            off_bus_us: self.off_bus_us + other.off_bus_us,
         }
     }
 
-    /// The total of all stages.
+    /// The total of all stages that can count.
     pub const fn total(&self) -> u64 {
         self.controller + self.queue + self.link + self.host
     }
 
     /// One line.
     pub fn line(&self) -> String {
-        let Self { controller, queue, link, host } = self;
-        format!("controller {controller}, queue {queue}, link {link}, host {host}")
+        let Self { controller, queue, link, host, off_bus, off_bus_us } = self;
+        let stages = format!("controller {controller}, queue {queue}, link {link}, host {host}");
+        if *off_bus == 0 {
+            return stages;
+        }
+        let times = if *off_bus == 1 { "once".to_owned() } else { format!("{off_bus} times") };
+        format!(
+            "{stages}, off the bus an unknown number, {times}, {:.1} ms in total",
+            *off_bus_us as f64 / 1e3
+        )
+    }
+}
+
+/// A number of lost frames, which may not be all of them.
+pub fn lost_frames(count: u64, at_least: bool) -> String {
+    match (count, at_least) {
+        (0, true) => "an unknown number".to_owned(),
+        (count, true) => format!("at least {count}"),
+        (count, false) => count.to_string(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_was_off_the_bus_is_never_part_of_a_zero() {
+        let none = Losses::default();
+        assert_eq!(none.line(), "controller 0, queue 0, link 0, host 0");
+        let some = Losses { off_bus: 30, off_bus_us: 4900, ..none };
+        assert_eq!(
+            some.plus(none).line(),
+            "controller 0, queue 0, link 0, host 0, off the bus an unknown number, 30 times, 4.9 ms in total"
+        );
+        assert_eq!(lost_frames(0, false), "0");
+        assert_eq!(lost_frames(0, true), "an unknown number");
+        assert_eq!(lost_frames(7, true), "at least 7");
     }
 }

@@ -8,6 +8,7 @@ use cantap_analysis::stats::WorkLoad;
 pub struct Meter {
     frames: u64,
     lost: u64,
+    lost_at_least: bool,
     bus_errors: u64,
     /// Time of the last frame, if nothing lies between it and the next.
     latest_ns: Option<i64>,
@@ -18,6 +19,8 @@ pub struct Meter {
     omits_data: bool,
     omits_stamps: bool,
     without_data: u64,
+    /// A filter keeps frames back in the device.
+    is_filtered: bool,
 }
 
 impl Meter {
@@ -26,6 +29,7 @@ impl Meter {
         Self {
             frames: 0,
             lost: 0,
+            lost_at_least: false,
             bus_errors: 0,
             latest_ns: None,
             covered_ns: 0,
@@ -34,6 +38,7 @@ impl Meter {
             omits_data: false,
             omits_stamps: false,
             without_data: 0,
+            is_filtered: false,
         }
     }
 
@@ -46,24 +51,45 @@ impl Meter {
         }
     }
 
+    /// Of a channel of which only some frames arrive, because the device has a filter: what they are of the bus's load is not its load.
+    #[must_use]
+    pub fn filtered(self) -> Self {
+        Self { is_filtered: true, ..self }
+    }
+
+    /// Takes the channel's next record, if it is not wanted: it loads the bus all the same.
+    pub fn pass_by(&mut self, record: &TraceRecord) {
+        match &record.event {
+            TraceEvent::Frame { frame, .. } => {
+                self.without_data += u64::from(self.omits_data && frame.data_len() > 0);
+                self.load.frame(record.time_ns, f64::from(frame.bus_bits().total()));
+            }
+            TraceEvent::Lost { .. } => self.load.gap(),
+            _ => {}
+        }
+    }
+
     /// Takes the channel's next record.
     pub fn push(&mut self, record: &TraceRecord) {
         match &record.event {
-            TraceEvent::Frame { frame, .. } => {
+            TraceEvent::Frame { .. } => {
                 self.frames += 1;
                 if let Some(latest_ns) = self.latest_ns.replace(record.time_ns) {
                     self.covered_ns += record.time_ns - latest_ns;
                     self.intervals += 1;
                 }
-                self.without_data += u64::from(self.omits_data && frame.data_len() > 0);
-                self.load.frame(record.time_ns, f64::from(frame.bus_bits().total()));
+                self.pass_by(record);
             }
             event if *event == TraceEvent::GAP => {
+                self.lost_at_least = true;
                 self.latest_ns = None;
                 self.load.gap();
             }
-            TraceEvent::Lost { count, .. } => {
+            TraceEvent::Lost { count, at_least, .. } => {
                 self.lost += u64::from(*count);
+                self.lost_at_least |= at_least;
+                // The rate is over the same time as the load.
+                self.latest_ns = None;
                 self.load.gap();
             }
             TraceEvent::BusError { .. } => self.bus_errors += 1,
@@ -82,12 +108,17 @@ impl Meter {
         self.lost
     }
 
+    /// Whether there may be more: an overrun of the controller cannot be counted, nor what is on the bus while the device is not.
+    pub const fn lost_at_least(&self) -> bool {
+        self.lost_at_least
+    }
+
     /// Bus errors, including those only counted.
     pub const fn bus_errors(&self) -> u64 {
         self.bus_errors
     }
 
-    /// From the first frame to the last, in seconds, excluding times when the device was not there.
+    /// From the first frame to the last, in seconds, excluding times from which frames are missing.
     pub fn seconds(&self) -> f64 {
         self.covered_ns as f64 / 1e9
     }
@@ -99,11 +130,23 @@ impl Meter {
         (!self.omits_stamps).then_some(rate)
     }
 
-    /// Bus load in per cent, from exact lengths, over the intervals without a loss; `None` if times or data, and therefore
-    /// stuff bits, are unknown.
+    /// Bus load in per cent, from exact lengths, over the intervals without a loss; `None` if it is unknown.
     pub fn bus_load_pct(&self) -> Option<f64> {
-        let is_known = !self.omits_stamps && self.without_data == 0;
-        is_known.then(|| self.load.mean_pct().unwrap_or(0.0))
+        self.no_bus_load_because().is_none().then(|| self.load.mean_pct().unwrap_or(0.0))
+    }
+
+    /// Why the bus load is unknown, if it is.
+    pub const fn no_bus_load_because(&self) -> Option<&'static str> {
+        if self.is_filtered {
+            Some("the device's filters keep frames back")
+        } else if self.omits_stamps {
+            Some("frames come without times")
+        } else if self.without_data > 0 {
+            // Stuff bits depend on them.
+            Some("frames come without data")
+        } else {
+            None
+        }
     }
 }
 
@@ -156,6 +199,39 @@ mod tests {
         // A channel without data does not lack them.
         let without = meter(|config| config.omit_data = true, &data[1..]);
         assert!(without.without_data == 0 && without.bus_load_pct() > Some(0.0));
+    }
+
+    /// A stopped computer, for example: the bus was not empty meanwhile.
+    #[test]
+    fn rate_and_load_are_over_the_same_time_where_frames_were_lost() {
+        let mut meter = meter(|_| {}, &["123#0011", "123#0011", "123#0011"]);
+        let before = (meter.frames_per_s(), meter.bus_load_pct());
+        let record = |time_ns, event| TraceRecord { time_ns, channel: 1, event };
+        meter.push(&record(60_000_000_000, TraceEvent::Lost { stage: None, count: 60_000, at_least: false }));
+        for ms in [60_000, 60_001] {
+            let frame: Frame = "123#0011".parse().unwrap();
+            let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };
+            meter.push(&record(ms * 1_000_000, event));
+        }
+        assert_eq!((meter.frames(), meter.lost()), (5, 60_000));
+        assert_eq!((meter.frames_per_s(), meter.bus_load_pct()), before);
+    }
+
+    #[test]
+    fn the_load_is_the_bus_s_whatever_is_wanted_of_it() {
+        let all = meter(|_| {}, &["123#0011"; 8]);
+        let mut some = meter(|_| {}, &[]);
+        for at in 0..8 {
+            let frame: Frame = "123#0011".parse().unwrap();
+            let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };
+            let record = TraceRecord { time_ns: at * 1_000_000, channel: 1, event };
+            if at % 4 == 0 { some.push(&record) } else { some.pass_by(&record) }
+        }
+        assert_eq!((some.frames(), some.frames_per_s()), (2, Some(250.0)));
+        assert_eq!(some.bus_load_pct(), all.bus_load_pct());
+        let filtered = some.filtered();
+        assert_eq!(filtered.bus_load_pct(), None);
+        assert_eq!(filtered.no_bus_load_because(), Some("the device's filters keep frames back"));
     }
 
     #[test]

@@ -3,16 +3,19 @@
 //! A thread without Python takes them from the device and gives each listener its own copy. A listener that does not keep up loses
 //! records: they are counted, and a loss takes their place.
 
-use std::collections::HashMap;
 use std::io::{self, PipeReader, PipeWriter, Read, Write};
-use std::sync::mpsc::{Receiver, SyncSender};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, Weak};
 use std::time::Duration;
 
-use cantap::device::{Buffer, Records, Transmission};
+use cantap::device::{Buffer, Records};
+use cantap::wire::record::LossStage;
 use cantap::wire::{CHANNELS, Channel};
 use cantap::{Direction, TraceEvent, TraceRecord};
 use cantap_trace::filter::Filter;
+
+use super::lock::lock;
+use super::transmissions::{NOBODY, SenderId, Transmissions};
 
 /// How often to check whether to go on.
 pub const LOOK_EVERY: Duration = Duration::from_millis(100);
@@ -24,16 +27,46 @@ pub struct Wanted {
     pub channel: Option<u8>,
     /// Only these frames; a frame need match only one of several.
     pub filters: Vec<Filter>,
-    /// Not the frames sent by this device.
-    pub only_received: bool,
+    /// Which frames that were sent, rather than received.
+    pub sent: SentFrames,
+}
+
+/// Which of the frames that were sent a listener receives: by this session, or by another client of its server.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum SentFrames {
+    /// All.
+    #[default]
+    All,
+    /// None.
+    No,
+    /// Another node's view of the bus: what others have sent has been received, and what `me` has sent is there if `own`.
+    AsNode {
+        /// Who listens.
+        me: SenderId,
+        /// Also the frames that it sends.
+        own: bool,
+    },
 }
 
 impl Wanted {
-    fn accepts(&self, record: &TraceRecord) -> bool {
-        let is_sent = matches!(record.event, TraceEvent::Frame { direction: Direction::Tx, .. });
-        (self.channel.is_none() || self.channel == Some(record.channel))
-            && !(self.only_received && is_sent)
-            && passes(&self.filters, record)
+    /// The record as the listener receives it, if it does. `sender` is who had it sent.
+    fn taken(&self, record: &TraceRecord, sender: SenderId) -> Option<TraceRecord> {
+        let mut taken = *record;
+        if let TraceEvent::Frame { direction: direction @ Direction::Tx, .. } = &mut taken.event {
+            match self.sent {
+                SentFrames::All => {}
+                SentFrames::No => return None,
+                SentFrames::AsNode { me, own } if me == sender => {
+                    if !own {
+                        return None;
+                    }
+                }
+                SentFrames::AsNode { .. } => *direction = Direction::Rx,
+            }
+        }
+        let is_wanted =
+            (self.channel.is_none() || self.channel == Some(record.channel)) && passes(&self.filters, record);
+        is_wanted.then_some(taken)
     }
 }
 
@@ -42,14 +75,12 @@ fn passes(filters: &[Filter], record: &TraceRecord) -> bool {
     filters.is_empty() || filters.iter().any(|filter| filter.accepts(record))
 }
 
-pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 /// A listener.
 pub struct Listener {
     buffer: Buffer,
     wanted: Mutex<Wanted>,
+    /// What is waiting may have come before other filters were set.
+    is_refiltered: AtomicBool,
     /// Readable while something is waiting; created on demand.
     signal: Mutex<Option<Signal>>,
     lost: Mutex<[u64; CHANNELS]>,
@@ -83,16 +114,19 @@ impl Listener {
         Self {
             buffer: Buffer::new(capacity),
             wanted: Mutex::new(wanted),
+            is_refiltered: AtomicBool::new(false),
             signal: Mutex::new(None),
             lost: Mutex::new([0; CHANNELS]),
             failure: Mutex::new(None),
         }
     }
 
-    fn push(&self, batch: &[TraceRecord]) {
+    /// `senders`: who had each frame sent, if any of them was.
+    fn push(&self, batch: &[TraceRecord], senders: &[SenderId]) {
         let wanted = lock(&self.wanted);
+        let senders = senders.iter().copied().chain(std::iter::repeat(NOBODY));
         let mut chosen: Vec<TraceRecord> =
-            batch.iter().filter(|record| wanted.accepts(record)).copied().collect();
+            batch.iter().zip(senders).filter_map(|(record, sender)| wanted.taken(record, sender)).collect();
         drop(wanted);
         if chosen.is_empty() {
             return;
@@ -121,12 +155,22 @@ impl Listener {
     pub fn pop(&self, timeout: Duration) -> Option<Vec<TraceRecord>> {
         // A listener's buffer ends without an error; the reason is kept separately, so that each listener
         // gets it.
-        self.buffer.pop(Some(timeout)).unwrap_or(None)
+        let mut batch = self.buffer.pop(Some(timeout)).unwrap_or(None)?;
+        if self.is_refiltered.load(Ordering::Relaxed) {
+            self.refilter(&mut batch);
+        }
+        Some(batch)
     }
 
-    /// Why nothing more follows, unless that was requested. Returned once.
+    /// Drops what the filters that hold now do not accept.
+    pub fn refilter(&self, records: &mut Vec<TraceRecord>) {
+        let wanted = lock(&self.wanted);
+        records.retain(|record| passes(&wanted.filters, record));
+    }
+
+    /// Why nothing more follows, unless that was requested.
     pub fn failure(&self) -> Option<String> {
-        lock(&self.failure).take()
+        lock(&self.failure).clone()
     }
 
     /// Call it when everything that was popped is used up: from then on, the pipe shows whether there is more.
@@ -160,9 +204,10 @@ impl Listener {
         lock(&self.signal).as_ref().map(|signal| signal.reader.as_raw_fd())
     }
 
-    /// Changes what is received from now on.
-    pub fn want(&self, change: impl FnOnce(&mut Wanted)) {
-        change(&mut lock(&self.wanted));
+    /// Changes the filters: also what is waiting must pass them.
+    pub fn set_filters(&self, filters: Vec<Filter>) {
+        lock(&self.wanted).filters = filters;
+        self.is_refiltered.store(true, Ordering::Relaxed);
     }
 
     /// Frames lost here because nobody took them, per channel.
@@ -171,14 +216,14 @@ impl Listener {
     }
 }
 
-/// The listeners of a device, and those waiting for confirmations.
+/// The listeners of a device.
 #[derive(Default)]
 pub struct Fanout {
     listeners: Mutex<Listeners>,
-    /// By tag.
-    waiting: Mutex<HashMap<u32, SyncSender<Transmission>>>,
     /// The filters with which a channel was opened; its hardware may pass more.
     filters: Mutex<[Vec<Filter>; CHANNELS]>,
+    /// Losses that are known here alone, to be put in their places.
+    gaps: Mutex<Vec<TraceRecord>>,
 }
 
 #[derive(Default)]
@@ -208,11 +253,36 @@ impl Fanout {
         lock(&self.filters)[channel.index()] = filters;
     }
 
-    /// Distributes a device's records until they end. It needs a thread of its own.
-    pub fn pump(&self, mut records: Records) {
+    /// From a time (UTC nanoseconds) on, a channel received nothing for a moment: a loss says so.
+    pub fn add_gap(&self, channel: Channel, time_ns: i64) {
+        let event = TraceEvent::Lost { stage: Some(LossStage::Controller), count: 0, at_least: true };
+        lock(&self.gaps).push(TraceRecord { time_ns, channel: channel.number(), event });
+    }
+
+    /// Puts gaps in their places. One that is later than everything in a batch belongs to the next one.
+    fn place_gaps(&self, batch: &mut Vec<TraceRecord>) {
+        let mut gaps = lock(&self.gaps);
+        if gaps.is_empty() {
+            return;
+        }
+        let last_ns = batch.last().map_or(i64::MAX, |last| last.time_ns);
+        gaps.retain(|gap| {
+            let is_later = gap.time_ns > last_ns;
+            if !is_later {
+                let place = batch.partition_point(|record| record.time_ns <= gap.time_ns);
+                batch.insert(place, *gap);
+            }
+            is_later
+        });
+    }
+
+    /// Distributes a device's records until they end, and reports how transmissions do. It needs a thread of its own.
+    pub fn pump(&self, mut records: Records, transmissions: &Transmissions) {
         let failure = loop {
             match records.next_batch(LOOK_EVERY) {
                 Ok(Some(mut batch)) => {
+                    // The end of a transmission is known before its record is handed over.
+                    transmissions.report();
                     let filters = lock(&self.filters).clone();
                     if filters.iter().any(|filters| !filters.is_empty()) {
                         batch.retain(|record| {
@@ -220,8 +290,10 @@ impl Fanout {
                             filters.is_none_or(|filters| passes(filters, record))
                         });
                     }
+                    self.place_gaps(&mut batch);
+                    let senders = transmissions.senders(&batch);
                     lock(&self.listeners).all.retain(|listener| {
-                        listener.upgrade().inspect(|listener| listener.push(&batch)).is_some()
+                        listener.upgrade().inspect(|listener| listener.push(&batch, &senders)).is_some()
                     });
                     records.recycle(batch);
                 }
@@ -229,6 +301,7 @@ impl Fanout {
                 Err(error) => break Some(error.to_string()),
             }
         };
+        transmissions.end();
         self.end(failure);
     }
 
@@ -239,30 +312,5 @@ impl Fanout {
         }
         listeners.has_ended = true;
         listeners.failure = failure;
-    }
-
-    /// Reports how transmissions end, until there are no more. It needs a thread of its own.
-    pub fn report(&self, ends: &Receiver<Transmission>) {
-        while let Ok(end) = ends.recv() {
-            if let Some(waiting) = lock(&self.waiting).remove(&end.tag) {
-                // It does not matter if nobody waits any more.
-                let _ = waiting.try_send(end);
-            }
-        }
-        // Everyone waiting learns that nothing comes.
-        lock(&self.waiting).clear();
-    }
-
-    /// Has the end of a transmission reported to a channel.
-    pub fn wait_for(&self, tag: u32, told: SyncSender<Transmission>) {
-        lock(&self.waiting).insert(tag, told);
-    }
-
-    /// Nobody waits for these any more.
-    pub fn forget(&self, tags: &[u32]) {
-        let mut waiting = lock(&self.waiting);
-        for tag in tags {
-            waiting.remove(tag);
-        }
     }
 }

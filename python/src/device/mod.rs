@@ -1,9 +1,11 @@
 //! A device, for Python. Every waiting call lets other Python threads run, and Ctrl-C through.
 
 mod fanout;
+mod lock;
 mod records;
 mod session;
 mod tasks;
+mod transmissions;
 
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
@@ -12,31 +14,26 @@ use cantap::bit_timing::TimingRequest;
 use cantap::device::{ClockSource, Transmission};
 use cantap::wire::message::capability;
 use cantap::wire::message::{ChannelConfig, Mode};
-use cantap::wire::{BitTiming, Channel};
+use cantap::wire::{BitTiming, Channel, Refusal};
 use cantap::{DeviceError as DeviceFault, Frame as ClassicFrame};
 use cantap_trace::filter::Filter;
-use cantap_trace::names::{BUS_ERRORS, ERROR_STATES, name};
+use cantap_trace::{BusErrorKind, TransmitFailure};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde_json::json;
 
-use self::fanout::{Wanted, lock};
+use self::fanout::{SentFrames, Wanted};
+use self::lock::lock;
 use self::records::{Records, SLICE};
-use self::session::Session;
+use self::session::{HowToSend, Session};
 use self::tasks::{PeriodicFrame, Reply};
+use self::transmissions::{NOBODY, SenderId};
 use crate::error::{DeviceError, Error};
-use crate::frame::{AnyFrame, failure};
+use crate::frame::AnyFrame;
 use crate::number::{OfDevice, Whole, entry};
 use crate::report::from_json;
 
-/// Modes by name.
-const MODES: [(Mode, &str); 4] = [
-    (Mode::ListenOnly, "listen-only"),
-    (Mode::Normal, "normal"),
-    (Mode::Loopback, "loopback"),
-    (Mode::SilentLoopback, "silent-loopback"),
-];
 /// A frame that has not ended after this time will not end on its own.
 const MOST_TIME: Duration = Duration::from_hours(24);
 
@@ -97,7 +94,7 @@ pub fn signals() -> Result<(), Error> {
 
 /// The error for a frame that was not sent.
 fn not_sent(end: &Transmission, frame: &ClassicFrame) -> Error {
-    let reason = end.result.err().map_or("", failure);
+    let reason = end.result.err().map_or("", TransmitFailure::name);
     Error::Address(format!("{frame} was not sent on channel {}: {reason}", end.channel.number()))
 }
 
@@ -179,8 +176,7 @@ impl Device {
         let session = self.session()?;
         let opened = py.detach(|| -> Result<_, Error> {
             let device = session.device()?;
-            let found = MODES.iter().find(|(_, name)| *name == options.mode);
-            let Some((mode, _)) = found else {
+            let Some(mode) = Mode::from_name(&options.mode) else {
                 let words = format!(
                     "'{}' is not a mode; there are listen-only, normal, loopback and silent-loopback",
                     options.mode
@@ -211,7 +207,7 @@ impl Device {
                 )));
             };
             let config = ChannelConfig {
-                mode: *mode,
+                mode,
                 one_shot: options.one_shot,
                 manual_recovery: options.manual_recovery,
                 ..ChannelConfig::listen_only(timing)
@@ -236,31 +232,39 @@ impl Device {
         for (channel, config) in device.open_channels() {
             let about = PyDict::new(py);
             about.set_item("bitrate", config.timing.bitrate_bps(device.hello().can_clock_hz))?;
-            about.set_item("mode", name(&MODES, &config.mode))?;
+            about.set_item("mode", config.mode.name())?;
             open.set_item(channel.number(), about)?;
         }
         Ok(open)
     }
 
-    /// Starts listening; at most `capacity` records wait.
-    #[pyo3(signature = (channel_number=None, filters=vec![], only_received=false, capacity=Whole(1 << 20)))]
+    /// Starts listening; at most `capacity` records wait. With a `node`, what others have sent was received: see [`SentFrames::AsNode`].
+    #[pyo3(signature = (channel_number=None, filters=vec![], only_received=false, capacity=Whole(1 << 20), node=None))]
     fn records(
         slf: &Bound<'_, Self>,
         channel_number: Option<OfDevice>,
         filters: Vec<String>,
         only_received: bool,
         capacity: Whole<usize>,
+        node: Option<SenderId>,
     ) -> PyResult<Records> {
         let session = slf.get().session()?;
         let filters = filters.iter().map(|text| text.parse()).collect::<Result<Vec<Filter>, _>>();
         let filters = filters.map_err(Error::argument)?;
         let channel = channel_number.map(|channel| channel.0.number());
-        let listener = session.fanout.listen(Wanted { channel, filters, only_received }, capacity.0);
+        let sent = match (node, only_received) {
+            (Some(me), _) => SentFrames::AsNode { me, own: !only_received },
+            (None, true) => SentFrames::No,
+            (None, false) => SentFrames::All,
+        };
+        let listener = session.fanout.listen(Wanted { channel, filters, sent }, capacity.0);
         Ok(Records::new(slf.clone().unbind(), session.address.clone(), listener))
     }
 
     /// Sends frames and returns when each was on the bus, in nanoseconds since 1970; without `timeout` they are only passed to the device.
-    #[pyo3(signature = (number, frames, timeout, at_ns=None, queue_timeout=1.0))]
+    /// `node`: who sends them, see [`Self::records`].
+    #[expect(clippy::too_many_arguments, reason = "what Python's half passes, each by its name")]
+    #[pyo3(signature = (number, frames, timeout, at_ns=None, queue_timeout=1.0, node=NOBODY))]
     fn send(
         &self,
         py: Python<'_>,
@@ -269,6 +273,7 @@ impl Device {
         timeout: Option<f64>,
         at_ns: Option<i64>,
         queue_timeout: f64,
+        node: SenderId,
     ) -> PyResult<Vec<i64>> {
         let channel = number.0;
         let session = self.session()?;
@@ -290,7 +295,8 @@ impl Device {
             let device = session.device()?;
             let at_ticks = at_ns.map(|at_ns| device.clock_map().ticks(cantap::device::UtcNs(at_ns)).0);
             let deadline = Instant::now() + patience;
-            let sending = session.send(channel, &frames, at_ticks, timeout.is_some(), deadline, signals)?;
+            let how = HowToSend { sender: node, at_ticks, is_told: timeout.is_some(), deadline };
+            let sending = session.send(channel, &frames, how, signals)?;
             let ended = sending.wait(deadline, SLICE, signals);
             // It must not surprise anyone by being sent later.
             if timeout.is_some() && !matches!(ended, Ok(Some(_))) {
@@ -319,7 +325,30 @@ impl Device {
         self.ask(py, |device| device.abort(channel))
     }
 
+    /// Passes a frame to the device, unless its queue is full: then this returns false.
+    fn send_now(&self, py: Python<'_>, number: OfDevice, frame: AnyFrame, node: SenderId) -> PyResult<bool> {
+        let session = self.session()?;
+        let sent = py.detach(|| {
+            let how = HowToSend { sender: node, at_ticks: None, is_told: false, deadline: Instant::now() };
+            session.send(number.0, &[frame.0], how, || Ok(())).map(drop)
+        });
+        match sent {
+            Err(Error::Device(DeviceFault::Refused { refusal: Refusal::QueueFull { .. } })) => Ok(false),
+            sent => Ok(sent.map(|()| true)?),
+        }
+    }
+
+    /// Opens a channel anew with other filters; what it misses meanwhile is a loss.
+    fn reopen(&self, py: Python<'_>, number: OfDevice, filters: Vec<String>) -> PyResult<()> {
+        let session = self.session()?;
+        let filters = filters.iter().map(|text| text.parse()).collect::<Result<Vec<Filter>, _>>();
+        let filters = filters.map_err(Error::argument)?;
+        Ok(py.detach(|| session.reopen(number.0, &filters))?)
+    }
+
     /// Starts a periodic frame.
+    #[expect(clippy::too_many_arguments, reason = "what Python's half passes, each by its name")]
+    #[pyo3(signature = (number, frame, period_s, count, modifiers, node=NOBODY))]
     fn periodic(
         &self,
         py: Python<'_>,
@@ -328,10 +357,12 @@ impl Device {
         period_s: f64,
         count: Whole<u32>,
         modifiers: Vec<tasks::ModifierWords>,
+        node: SenderId,
     ) -> PyResult<PeriodicFrame> {
         let channel = number.0;
         let session = self.session()?;
-        Ok(py.detach(|| PeriodicFrame::begin(session, channel, frame.0, period_s, count.0, &modifiers))?)
+        let begin = || PeriodicFrame::begin(session, channel, frame.0, period_s, count.0, &modifiers, node);
+        Ok(py.detach(begin)?)
     }
 
     /// Starts a reply.
@@ -356,11 +387,11 @@ impl Device {
             json!({
                 "channel": channel.number(),
                 "is_open": state.open.is_some(),
-                "mode": state.open.map(|config| name(&MODES, &config.mode)),
-                "state": name(&ERROR_STATES, &state.state),
-                "tx_errors": state.tec,
-                "rx_errors": state.rec,
-                "last_error": state.last_error.map(|kind| name(&BUS_ERRORS, &kind)),
+                "mode": state.open.map(|config| config.mode.name()),
+                "state": state.state.name(),
+                "tec": state.tec,
+                "rec": state.rec,
+                "last_error": state.last_error.map(BusErrorKind::name),
                 "frames": state.frames,
                 "lost_controller": state.lost_controller,
                 "lost_queue": state.lost_queue,
@@ -380,7 +411,8 @@ impl Device {
         from_json(py, &object.to_string())
     }
 
-    /// Frames received and lost since the session began, by channel and stage.
+    /// Frames received and lost since the session began, by channel and stage. `off_bus` is how often the device was off the bus because
+    /// another client of its server changed the mode, `off_bus_ns` for how long: an unknown number of frames is missing each time.
     fn losses<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let session = self.session()?;
         let counters = session.device()?.counters();
@@ -393,6 +425,8 @@ impl Device {
             counts.set_item("queue", of.lost_queue)?;
             counts.set_item("link", of.lost_link)?;
             counts.set_item("host", of.lost_host)?;
+            counts.set_item("off_bus", of.off_bus)?;
+            counts.set_item("off_bus_ns", of.off_bus_ns)?;
             counts.set_item("lost", of.lost())?;
             all.set_item(channel.number(), counts)?;
         }

@@ -12,7 +12,8 @@ use pyo3::prelude::*;
 use pyo3::types::PyByteArray;
 
 use super::Device;
-use super::fanout::{Listener, lock};
+use super::fanout::Listener;
+use super::lock::lock;
 use crate::error::{DeviceError, Error};
 use crate::frame::Record;
 use crate::number::Whole;
@@ -218,23 +219,17 @@ impl Records {
         }
     }
 
-    /// For the plugin: sets what is received from now on.
-    fn _filter(&self, filters: Vec<String>, only_received: bool) -> PyResult<()> {
+    /// For the plugin: sets which frames are received from now on; what is waiting must pass as well.
+    fn _filter(&self, filters: Vec<String>) -> PyResult<()> {
         self.check_process()?;
         let filters = filters.iter().map(|text| text.parse()).collect::<Result<Vec<_>, _>>();
         let filters = filters.map_err(Error::argument)?;
-        self.listener.want(|wanted| {
-            wanted.filters = filters;
-            wanted.only_received = only_received;
-        });
+        self.listener.set_filters(filters);
+        let mut waiting = lock(&self.waiting);
+        let mut rest: Vec<_> = std::mem::take(&mut *waiting).collect();
+        self.listener.refilter(&mut rest);
+        *waiting = rest.into_iter();
         Ok(())
-    }
-
-    /// For the plugin: discards what is waiting.
-    fn _clear(&self) {
-        *lock(&self.waiting) = Vec::new().into_iter();
-        while self.listener.pop(Duration::ZERO).is_some_and(|batch| !batch.is_empty()) {}
-        self.listener.used_up();
     }
 
     /// Frames lost here because this program did not take them, on channels 1 and 2.

@@ -7,7 +7,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use cantap::device::Transmission;
+use cantap::device::{Ticks, Transmission};
 use cantap::hw_filter::{self, Remainder};
 use cantap::wire::Refusal;
 use cantap::wire::message::{ChannelConfig, MAX_SEND, TxFrame};
@@ -15,7 +15,9 @@ use cantap::{Channel, Device, DeviceError, Frame};
 use cantap_address::{Address, OpenDevice};
 use cantap_trace::filter::Filter;
 
-use super::fanout::{Fanout, lock};
+use super::fanout::Fanout;
+use super::lock::lock;
+use super::transmissions::{NOBODY, SenderId, Transmissions};
 use crate::error::Error;
 
 /// Tags wrap here: a device reserves those from `DEVICE_TAG` up for itself.
@@ -31,9 +33,23 @@ pub struct Session {
     pub is_car: bool,
     process: u32,
     pub fanout: Arc<Fanout>,
+    pub transmissions: Arc<Transmissions>,
     next_tag: AtomicU32,
     /// Entries in use in the device's tables.
     slots: Mutex<HashMap<(Table, Channel), Vec<bool>>>,
+}
+
+/// How frames are sent.
+#[derive(Clone, Copy)]
+pub struct HowToSend {
+    /// Who has them sent.
+    pub sender: SenderId,
+    /// Not before this device time.
+    pub at_ticks: Option<u64>,
+    /// Whether the end of each can be awaited.
+    pub is_told: bool,
+    /// Until when to wait while the device's queue is full.
+    pub deadline: Instant,
 }
 
 /// A table of what a device sends on its own.
@@ -51,17 +67,17 @@ impl Session {
         let place = address.parse::<Address>().map_err(Error::argument)?;
         let device = place.open()?;
         let fanout = Arc::new(Fanout::default());
-        let (records, ends) = (device.records(), device.transmissions());
-        let for_records = Arc::clone(&fanout);
-        spawn("cantap-records", move || for_records.pump(records))?;
-        let for_ends = Arc::clone(&fanout);
-        spawn("cantap-ends", move || for_ends.report(&ends))?;
+        let transmissions = Arc::new(Transmissions::new(device.transmissions()));
+        let records = device.records();
+        let (for_records, for_ends) = (Arc::clone(&fanout), Arc::clone(&transmissions));
+        spawn("cantap-records", move || for_records.pump(records, &for_ends))?;
         Ok(Self {
             device: ManuallyDrop::new(device),
             address: address.to_owned(),
             is_car: place.is_car(),
             process: std::process::id(),
             fanout,
+            transmissions,
             next_tag: AtomicU32::new(1),
             slots: Mutex::default(),
         })
@@ -97,34 +113,49 @@ impl Session {
         Ok(compiled.remainder)
     }
 
-    /// Passes frames to the device, to be sent no earlier than a device time. With `told`, the end of each can be awaited.
-    /// While the device's queue is full, it waits until `deadline`, as long as `go_on` returns true.
+    /// Closes a channel and opens it as it was, with other filters: its hardware cannot be given others while it is open. What was on
+    /// the bus in between is missing, and a loss says so.
+    pub fn reopen(&self, channel: Channel, filters: &[Filter]) -> Result<(), Error> {
+        let device = self.device()?;
+        let open = device.open_channels().into_iter().find(|(open, _)| *open == channel);
+        let Some((_, config)) = open else {
+            return Err(Error::Address(format!("channel {} is not open", channel.number())));
+        };
+        device.close_channel(channel)?;
+        let closed_at = device.time()?;
+        self.fanout.add_gap(channel, device.clock_map().utc(Ticks(closed_at)).0);
+        self.open_channel(channel, config, filters)?;
+        Ok(())
+    }
+
+    /// Passes frames to the device. While its queue is full, it waits until the deadline, as long as `go_on` returns no error.
     pub fn send(
         &self,
         channel: Channel,
         frames: &[Frame],
-        at_ticks: Option<u64>,
-        is_told: bool,
-        deadline: Instant,
+        how: HowToSend,
         mut go_on: impl FnMut() -> Result<(), Error>,
     ) -> Result<Sending, Error> {
+        let HowToSend { sender, at_ticks, is_told, deadline } = how;
         let device = self.device()?;
-        let mut sending = Sending { fanout: Arc::clone(&self.fanout), ends: Vec::new() };
+        let mut sending = Sending { transmissions: Arc::clone(&self.transmissions), ends: Vec::new() };
         for chunk in frames.chunks(MAX_SEND) {
             let mut batch = heapless::Vec::<TxFrame, MAX_SEND>::new();
             for frame in chunk {
                 let tag = self.next_tag.fetch_add(1, Ordering::Relaxed) % TAGS;
                 if is_told {
                     let (told, end) = sync_channel(1);
-                    self.fanout.wait_for(tag, told);
+                    self.transmissions.wait_for(tag, told);
                     sending.ends.push((tag, end));
                 }
+                self.transmissions.requested(channel, tag, sender);
                 // This cannot fail: a chunk is no longer.
                 let _ = batch.push(TxFrame { tag, frame: *frame, at_ticks });
             }
             while let Err(error) = device.send(channel, &batch) {
                 let is_full = matches!(error, DeviceError::Refused { refusal: Refusal::QueueFull { .. } });
                 if !is_full || Instant::now() >= deadline {
+                    batch.iter().for_each(|sent| self.transmissions.requested(channel, sent.tag, NOBODY));
                     return Err(error.into());
                 }
                 go_on()?;
@@ -178,7 +209,7 @@ impl Drop for Session {
 
 /// Frames passed to the device.
 pub struct Sending {
-    fanout: Arc<Fanout>,
+    transmissions: Arc<Transmissions>,
     /// In the order in which they were passed.
     ends: Vec<(u32, Receiver<Transmission>)>,
 }
@@ -216,6 +247,6 @@ impl Sending {
 
 impl Drop for Sending {
     fn drop(&mut self) {
-        self.fanout.forget(&self.ends.iter().map(|(tag, _)| *tag).collect::<Vec<_>>());
+        self.transmissions.forget(&self.ends.iter().map(|(tag, _)| *tag).collect::<Vec<_>>());
     }
 }

@@ -5,12 +5,15 @@ use std::sync::{Arc, Mutex, Weak};
 use std::time::Duration;
 
 use cantap::periodic::{check_modifiers, period_ticks};
-use cantap::wire::message::{Checksum, Filter, FrameKind, MAX_MODIFIERS, Modifier, Periodic, Trigger};
+use cantap::wire::message::{
+    Checksum, DEVICE_TAG, Filter, FrameKind, MAX_MODIFIERS, Modifier, Periodic, TRIGGER_TAG, Trigger,
+};
 use cantap::{Channel, Frame, Id};
 use pyo3::prelude::*;
 
-use super::fanout::lock;
+use super::lock::lock;
 use super::session::{Session, Table};
+use super::transmissions::{NOBODY, SenderId};
 use crate::error::Error;
 use crate::frame::{AnyFrame, identifier};
 use crate::number::Whole;
@@ -51,8 +54,11 @@ struct Entry {
 }
 
 impl Entry {
-    fn take(session: &Arc<Session>, table: Table, channel: Channel) -> Result<Self, Error> {
+    /// `sender`: who has its frames sent.
+    fn take(session: &Arc<Session>, table: Table, channel: Channel, sender: SenderId) -> Result<Self, Error> {
         let slot = session.take_slot(table, channel)?;
+        let first = if table == Table::Periodic { DEVICE_TAG } else { TRIGGER_TAG };
+        session.transmissions.requested(channel, first + u32::from(slot), sender);
         Ok(Self { session: Arc::downgrade(session), table, channel, slot: Mutex::new(Some(slot)) })
     }
 
@@ -97,6 +103,7 @@ impl PeriodicFrame {
         period_s: f64,
         count: u32,
         modifiers: &[ModifierWords],
+        sender: SenderId,
     ) -> Result<Self, Error> {
         let period = Duration::try_from_secs_f64(period_s)
             .map_err(|_| Error::argument(format!("{period_s} s is not a valid period")))?;
@@ -107,7 +114,7 @@ impl PeriodicFrame {
             Error::argument(format!("a periodic frame has at most {MAX_MODIFIERS} modifiers"))
         })?;
         let set = Periodic { frame, period_ticks: ticks, count, modifiers };
-        let entry = Entry::take(&session, Table::Periodic, channel)?;
+        let entry = Entry::take(&session, Table::Periodic, channel, sender)?;
         let task = Self { entry, set: Mutex::new(set) };
         task.apply()?;
         Ok(task)
@@ -171,7 +178,7 @@ impl Reply {
             )));
         }
         let filter = Filter { extended: id.is_extended(), kind: FrameKind::Any, id: id.raw() & mask, mask };
-        let entry = Entry::take(&session, Table::Replies, channel)?;
+        let entry = Entry::take(&session, Table::Replies, channel, NOBODY)?;
         let slot = lock(&entry.slot).unwrap_or_default();
         session.device()?.set_trigger(channel, slot, Some(Trigger { filter, reply, count }))?;
         Ok(Self { entry })

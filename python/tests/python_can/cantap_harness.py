@@ -1,18 +1,20 @@
 """Lets python-can's own tests run on the analyser: a pytest plugin that replaces python-can's virtual interface with it.
 
-Those tests open two buses with the same name, which see each other: here they are the two channels of a virtual device on one bus. Each
-name is a device. The tests use details of python-can's virtual interface and its threads, which are added here and are not part of the
+Those tests open two buses with the same name, which see each other: here they are the two channels of a virtual device on one bus, or, with
+`CANTAP_ON` set to `one channel`, Bus objects of the same channel. A third one is on the first channel. Each name is a device. The tests use details of python-can's virtual interface and its threads, which are added here and are not part of the
 plugin: the number of waiting messages (`queue`), and the thread of a periodic task (`thread`).
 """
 
 import collections
+import os
 import threading
 
 import can
 from cantap.can_bus import CantapBus, DeviceCyclicTask
 
-_in_use = collections.defaultdict(set)
+_in_use = collections.defaultdict(list)
 _lock = threading.Lock()
+CHANNELS = [1] if os.environ.get("CANTAP_ON") == "one channel" else [1, 2]
 
 
 class Queue:
@@ -40,8 +42,9 @@ class Bus(CantapBus):
         self.waiting = collections.deque()
         self.queue = Queue(self)
         with _lock:
-            self.taken = next(number for number in (1, 2) if number not in _in_use[channel])
-            _in_use[channel].add(self.taken)
+            free = [number for number in CHANNELS if number not in _in_use[channel]]
+            self.taken = next(iter(free), 1)
+            _in_use[channel].append(self.taken)
         serial = "".join(letter for letter in str(channel) if letter.isalnum())
         # Set this before anything can fail.
         self._periodic_tasks = []
@@ -69,7 +72,7 @@ class Bus(CantapBus):
         if not self._is_shutdown:
             super().shutdown()
             with _lock:
-                _in_use[self.name].discard(self.taken)
+                _in_use[self.name].remove(self.taken)
 
 
 can.interfaces.BACKENDS["virtual"] = (__name__, "Bus")

@@ -7,6 +7,7 @@
 
 mod bus;
 mod memory;
+mod registers;
 mod window;
 
 use std::sync::Arc;
@@ -20,6 +21,7 @@ use crate::memory_map as map;
 use crate::timing::{Bound, Delays, Waits};
 pub use bus::Bus;
 pub use memory::{Memories, Memory};
+pub use registers::Registers;
 use window::{Shared, Window};
 
 /// A table of 64 KiB pages finds memories and peripherals faster than a search; only the few above
@@ -220,6 +222,11 @@ impl Cpu {
     /// The registers before the next step.
     pub fn state(&self) -> &State {
         &self.state
+    }
+
+    /// All registers before the next step.
+    pub fn registers(&self) -> Registers {
+        self.core.regs().into()
     }
 
     /// Whether the core sleeps in WFI or WFE. This may be noticed a cycle late.

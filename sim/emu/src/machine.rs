@@ -1,6 +1,7 @@
 //! The machine: core, chip and buses on one timeline.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::io::Write;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crate::bus::Wire;
@@ -10,6 +11,7 @@ use crate::elf::Image;
 use crate::memory_map as map;
 use crate::probe::{Change, Probe, Task};
 use crate::profile::Profile;
+use crate::recording::Recording;
 use crate::rom::{self, Start};
 use crate::soc::access::SharedBoard;
 use crate::soc::rcc::{CRYSTAL_START_US, Crystal, ResetCause};
@@ -17,7 +19,7 @@ use crate::soc::{Board, RECEIVE_PINS, bootloader};
 use crate::stop::{Reason, Stopped};
 use crate::timing::Bound;
 use crate::trace::Trace;
-use crate::{Clock, Peripheral};
+use crate::{Clock, Hostile, Peripheral};
 
 /// How often, in steps, to check for what the core does not report: a reset request, a lock-up.
 const LOOK_EVERY: u32 = 1024;
@@ -51,6 +53,8 @@ pub struct Setup {
     pub bound: Bound,
     /// What a CAN controller's master reset clears.
     pub master_reset: MasterReset,
+    /// What the chip does late, wrongly or never. What is attached from outside is its owner's.
+    pub hostile: Option<Hostile>,
 }
 
 impl Setup {
@@ -69,6 +73,7 @@ impl Setup {
             survive_failures: false,
             bound: Bound::Best,
             master_reset: MasterReset::default(),
+            hostile: None,
         }
     }
 }
@@ -82,6 +87,7 @@ pub struct Machine {
     probe: Probe,
     trace: Option<Trace>,
     profile: Option<Profile>,
+    recording: Option<Recording>,
     panics: Vec<u32>,
     held_lines: u128,
     lines: u128,
@@ -102,6 +108,11 @@ pub struct Machine {
 impl Machine {
     /// A machine at power-on, with `image` in flash.
     pub fn new(image: Image, setup: Setup) -> Self {
+        Self::with_recording(image, setup, None)
+    }
+
+    /// The same, with everything that the core executes recorded to `out`, if it is given; see [`crate::recording`].
+    pub fn with_recording(image: Image, setup: Setup, out: Option<Box<dyn Write + Send>>) -> Self {
         let memories = Memories::new();
         for (address, bytes) in image.segments() {
             memories.flash.write(address, bytes);
@@ -109,11 +120,18 @@ impl Machine {
         let mut board = Board::new(&memories, setup.clock, setup.crystal);
         board.can.set_master_reset(setup.master_reset);
         board.receive_at(setup.receive_pins);
+        if let Some(hostile) = &setup.hostile {
+            board.set_hostile(hostile);
+        }
         if setup.joined {
             board.wires = [Wire::new(&[0, 1]), Wire::new(&[])];
         }
         let board = Arc::new(Mutex::new(board));
         let bus: Arc<dyn Bus> = Arc::new(SharedBoard(Arc::clone(&board)));
+        let (recording, bus) = match out.map(|out| Recording::new(out, Arc::clone(&bus))) {
+            Some((recording, recorded)) => (Some(recording), recorded),
+            None => (None, bus),
+        };
         let cpu = Cpu::new(memories, &bus, setup.bound);
         let panics = PANIC_FUNCTIONS.iter().filter_map(|name| image.address_of(name)).collect();
         Self {
@@ -124,6 +142,7 @@ impl Machine {
             probe: Probe::default(),
             trace: None,
             profile: None,
+            recording,
             panics,
             held_lines: 0,
             lines: 0,
@@ -215,6 +234,16 @@ impl Machine {
         self.profile.take()
     }
 
+    /// The recording under way.
+    pub fn recording(&self) -> Option<&Recording> {
+        self.recording.as_ref()
+    }
+
+    /// Ends recording and returns it.
+    pub fn take_recording(&mut self) -> Option<Recording> {
+        self.recording.take()
+    }
+
     /// The exceptions that ran since the probe was reset, `span` cycles ago.
     pub fn tasks(&self, span: u64) -> Vec<Task> {
         let probe = self.probe();
@@ -291,6 +320,9 @@ impl Machine {
         }
         let cycles = self.cpu.step();
         let after = *self.cpu.state();
+        if let Some(recording) = &mut self.recording {
+            recording.step(&self.cpu);
+        }
         let change = self.probe.step(&before, &after, cycles);
         if let Some(profile) = &mut self.profile {
             profile.step(&before, &after, cycles, self.cpu.waits());
@@ -398,11 +430,48 @@ impl Machine {
     }
 
     fn restart(&mut self, cause: ResetCause) {
+        self.stalled_until = 0;
         lock(&self.board).reset(cause, self.cpu.now());
         self.cpu.reset();
+        if let Some(recording) = &mut self.recording {
+            recording.reset();
+        }
         self.watched_priority = None;
         self.resets += 1;
         self.refresh();
+    }
+
+    /// Exchanges the board's crystal: for one that has stopped, or one that starts again. A chip that runs from it stands still until the
+    /// watchdog, which has its own oscillator, resets it. Returns whether it does.
+    pub fn set_crystal(&mut self, crystal: Crystal) -> bool {
+        let stands_still = lock(&self.board).set_crystal(crystal, self.cpu.now());
+        if stands_still {
+            self.stalled_until = u64::MAX;
+        }
+        stands_still
+    }
+
+    /// The supply fails for a moment: a power-on reset at whatever instruction this is. What `seed` decides of the memories is lost, and
+    /// an operation of the flash is left half done.
+    pub fn brown_out(&mut self, seed: u64) {
+        /// Memory is lost in pieces.
+        const PIECE: usize = 64;
+        let mut random = fastrand::Rng::with_seed(seed);
+        if self.cpu.now() < self.stalled_until {
+            lock(&self.board).cut_flash_short(|| random.u32(..));
+        }
+        let lost_percent = [0, 10, 100][random.usize(..3)];
+        for range in [map::SRAM, map::CCM] {
+            let Some(memory) = self.cpu.memory(range.start) else { continue };
+            for piece in range.step_by(PIECE) {
+                if random.u32(..100) < lost_percent {
+                    let mut bytes = [0; PIECE];
+                    random.fill(&mut bytes);
+                    memory.write(piece, &bytes);
+                }
+            }
+        }
+        self.restart(ResetCause::PowerOn);
     }
 
     /// Queries everything for its interrupt line and next event.

@@ -31,6 +31,11 @@ impl<D: HostDriver> UsbPort<D> {
         (&mut self.host, &mut self.otg)
     }
 
+    /// The controller, to make it hostile or calm.
+    pub fn otg_mut(&mut self) -> &mut Otg {
+        &mut self.otg
+    }
+
     /// The controller.
     pub fn otg(&self) -> &Otg {
         &self.otg
@@ -40,6 +45,7 @@ impl<D: HostDriver> UsbPort<D> {
 impl<D: HostDriver> Peripheral for UsbPort<D> {
     fn read(&mut self, offset: u32, size: u8, now: u64) -> u32 {
         self.host.advance(&mut self.otg, now);
+        self.otg.settle(now);
         let word = self.otg.read(offset & !3);
         if size == 4 { word } else { word >> (8 * (offset & 3)) & ((1 << (8 * size)) - 1) }
     }
@@ -48,6 +54,7 @@ impl<D: HostDriver> Peripheral for UsbPort<D> {
         // The core's bus interface accepts only whole words (RM0090, "CSR memory map"), as drivers
         // know.
         self.host.advance(&mut self.otg, now);
+        self.otg.settle(now);
         self.otg.write(offset & !3, value);
     }
 
@@ -70,6 +77,6 @@ impl<D: HostDriver> Peripheral for UsbPort<D> {
     fn reset(&mut self, now: u64) {
         // The reset of the registers removes the pull-up; the host notices at its next frame.
         self.host.advance(&mut self.otg, now);
-        self.otg = Otg::new();
+        self.otg = self.otg.after_reset();
     }
 }

@@ -11,6 +11,7 @@ use cantap_emu::timing::Bound::{self, Best, Worst};
 use cantap_emu::traffic::{Kind, Traffic};
 use cantap_emu::usb_host::Timing;
 use cantap_sim::board::{self, CLOCK};
+use cantap_sim::locks::{self, Lock};
 use cantap_sim::rig::{MS, Rig, timing};
 use cantap_wire::message::{ChannelConfig, Filter, FrameKind, Mode, Periodic, Trigger, TxFrame};
 use cantap_wire::record::TransmitFailure;
@@ -30,6 +31,9 @@ const PRIORITY_4: [&str; 7] =
     ["CAN1_RX1", "DMA1_STREAM0", "USART2", "USART3", "TIM2", "CAN1_SCE", "CAN2_SCE"];
 /// The longest call of these: a FIFO can wait 141 µs, minus the other channel's drain.
 const LONGEST_CALL_US: f64 = 120.0;
+
+/// The longest lock.
+const LONGEST_LOCK_US: f64 = 14.0;
 
 fn connected(bound: Bound) -> Rig {
     let setup = Setup { bound, ..board::setup() };
@@ -249,6 +253,18 @@ fn frames_that_are_due_one_after_the_other_hold_up_no_drain_for_long() {
                 eprintln!("{spacing_us} us: {name} at most {longest_us:.1} us");
                 assert!(longest_us <= LONGEST_CALL_US, "{spacing_us} us: {name} took {longest_us:.1} us");
             }
+        }
+    }
+}
+
+/// The alarm is 14 us early. A lock, a drain of 6 us and its own work have to fit into that.
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn no_lock_is_as_long_as_the_alarm_is_early() {
+    for bound in Bound::ALL {
+        for Lock { during, longest_us, pc } in locks::longest(&common::firmware(), bound).unwrap() {
+            eprintln!("{bound:?}: {during}: {longest_us:.2} us, until {pc:08X}");
+            assert!(longest_us <= LONGEST_LOCK_US, "{bound:?}: {during}: {longest_us:.2} us, until {pc:08X}");
         }
     }
 }

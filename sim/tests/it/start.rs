@@ -5,6 +5,7 @@ use crate::assembly;
 use crate::common;
 
 use assembly::{Program, ldr, movs, str};
+use cantap_emu::can::Mode;
 use cantap_emu::machine::{Machine, Setup};
 use cantap_emu::memory_map::{FLASH, SRAM};
 use cantap_emu::rom::{self, Start};
@@ -16,10 +17,15 @@ use cantap_sim::board::{self, CLOCK};
 use cantap_sim::rig::{MS, Rig, RigError};
 use cantap_wire::message::{ChannelConfig, Failures};
 use cantap_wire::{Channel, Command, Reply};
-use common::BOARDS;
 
 /// GPIO registers.
+const MODER: u32 = 0x00;
 const OSPEEDR: u32 = 0x08;
+const PUPDR: u32 = 0x0C;
+/// Their values.
+const INPUT: u32 = 0b00;
+const ALTERNATE: u32 = 0b10;
+const PULL_UP: u32 = 0b01;
 const AFRL: u32 = 0x20;
 /// The alternate function of the CAN controllers.
 const AF_CAN: u32 = 9;
@@ -42,7 +48,7 @@ fn connected(name: &str, setup: Setup) -> Rig {
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn every_board_starts_behind_the_rom_bootloader() {
-    for (name, hz, _) in BOARDS {
+    for (name, hz, _) in common::boards() {
         let rig = connected(name, behind_the_bootloader(hz));
         let board = rig.machine.board();
         let clocks = board.rcc.clocks();
@@ -141,10 +147,12 @@ fn a_peripheral_is_there_only_some_cycles_after_its_clock_was_switched_on() {
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn edges_of_the_can_tx_pins_are_fast_on_every_board() {
-    for (name, hz, pins) in BOARDS {
+    for (name, hz, pins) in common::boards() {
         let setup = Setup { crystal: crystal(hz), ..board::setup() };
         let mut rig = connected(name, setup);
-        rig.run_for(MS).unwrap();
+        for channel in Channel::ALL {
+            rig.listen(channel, 500_000).unwrap();
+        }
         for (port, pin) in pins {
             let board = rig.machine.board();
             let gpio = board.port(port).unwrap();
@@ -152,6 +160,54 @@ fn edges_of_the_can_tx_pins_are_fast_on_every_board() {
             let speed = gpio.read(OSPEEDR).unwrap() >> (2 * pin) & 3;
             assert_eq!((function, speed), (AF_CAN, 0b10), "{name}, port {port}, pin {pin}");
         }
+    }
+}
+
+/// On a live bus, TX must not show what a controller does while it is reset or has no clock. Until it is connected, a pull-up keeps it
+/// recessive.
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn a_tx_pin_is_connected_only_to_a_controller_that_has_been_stopped() {
+    for (name, hz, pins) in common::boards() {
+        let mut rig = connected(name, Setup { crystal: crystal(hz), ..board::setup() });
+        // Mode, pull resistor, and whether the controller's clock and initialisation mode are on.
+        let look = |rig: &Rig, channel: Channel| {
+            let (port, pin) = pins[channel.index()];
+            let board = rig.machine.board();
+            let gpio = board.port(port).unwrap();
+            let two_bits = |register: u32| gpio.read(register).unwrap() >> (2 * pin) & 3;
+            (two_bits(MODER), two_bits(PUPDR), board.can.controllers[channel.index()].mode())
+        };
+        for channel in Channel::ALL {
+            let (mode, pull, _) = look(&rig, channel);
+            assert_eq!((mode, pull), (INPUT, PULL_UP), "{name}, {channel:?}");
+        }
+        let config = ChannelConfig::listen_only(cantap_sim::rig::timing(500_000).unwrap());
+        let (_, open) = rig.session.request(Command::Open { channel: Channel::Can1, config: Some(config) });
+        rig.with_host(|host, _| host.send(&open));
+        let connected = |rig: &Rig| look(rig, Channel::Can1).0 == ALTERNATE;
+        let came = (0..20_000).find(|_| {
+            rig.run_for(CYCLES_PER_US / 8).unwrap();
+            connected(&rig)
+        });
+        assert!(came.is_some(), "{name}");
+        let (_, _, mode) = look(&rig, Channel::Can1);
+        assert!(
+            matches!(mode, Mode::Initialisation | Mode::Synchronising { .. }),
+            "{name}: connected while the controller was in {mode:?}"
+        );
+        assert_eq!(look(&rig, Channel::Can2).0, INPUT, "{name}: the other channel was not asked for");
+    }
+}
+
+/// Powered by its other connector, a board that pulls the USB line up with no host there feeds a host that is off.
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn a_board_that_can_sense_vbus_shows_itself_only_when_it_is_there() {
+    for (name, hz, _) in common::boards() {
+        let mut rig = connected(name, Setup { crystal: crystal(hz), ..board::setup() });
+        let shown = rig.with_host(|_, otg| [true, false].map(|vbus| otg.pulled_up(vbus)));
+        assert_eq!(shown, [true, name != "stm32f4-discovery"], "{name}");
     }
 }
 

@@ -1,14 +1,25 @@
 //! What commands ask of the capture: sessions, channels on and off their buses, counters.
 
-use cantap_wire::Channel;
-use cantap_wire::Event;
 use cantap_wire::message::{ChannelConfig, ChannelStatus, Registers};
-use cantap_wire::record::{LossStage, TransmitFailure};
+use cantap_wire::record::{LossStage, Stamp, TransmitFailure};
+use cantap_wire::{Channel, Event, Received};
 
-use super::Capture;
+use super::gaps::{Gap, Gaps};
+use super::{Capture, LOOKS_PER_DRAIN};
 use crate::bus::errors::ErrorMonitor;
-use crate::bus::transmit::Transmitter;
+use crate::bus::transmit::{Transmitter, forget_finished};
 use crate::ports::{Clock, Traffic};
+
+/// How far a step of [`Capture::finish_close`] has come.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Closing {
+    /// The channel is closed, and its last record is written.
+    Done,
+    /// There is more to record, and room for it: the next step may follow at once.
+    Continue,
+    /// The queue has no room, or a mailbox has not yet reported its end.
+    Wait,
+}
 
 impl<'q, const N: usize> Capture<'q, N> {
     /// Starts a session: counters at zero. Both channels are closed and the queue is empty.
@@ -21,6 +32,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         for state in &mut self.channels {
             state.frames = 0;
             state.overruns = 0;
+            state.gaps = Gaps::new();
             state.errors = ErrorMonitor::new(state.errors.channel());
             state.transmitter.clear();
             state.transmitter.reset_counters();
@@ -34,6 +46,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         let state = &mut self.channels[channel.index()];
         state.open = Some(config);
         state.abort_reason = TransmitFailure::Aborted;
+        (state.closing, state.left, state.gaps) = (false, None, Gaps::new());
         state.errors.restart();
         self.recorder.event(&Event::Started { channel }, now);
     }
@@ -45,62 +58,118 @@ impl<'q, const N: usize> Capture<'q, N> {
         self.recorder.event(&lost, now);
     }
 
-    /// First half of closing: aborts transmissions. The channel is still on the bus.
+    /// First part of closing: drains the FIFO for the last time before the channel has left, and aborts transmissions. The channel is still
+    /// on the bus.
     pub fn begin_close(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) {
+        self.drain(channel, traffic, clock, None);
         let now = self.now(clock);
         let state = &mut self.channels[channel.index()];
+        state.closing = true;
         state.abort_reason = TransmitFailure::Closed;
         state.transmitter.clear_entries(now);
         state.transmitter.drop_all(TransmitFailure::Closed, traffic);
         state.transmitter.on_finished(traffic, &mut self.recorder, now, state.abort_reason);
     }
 
-    /// Second half of closing: the channel has left the bus. Records the rest and returns true; or false if
-    /// the queue has no room for it yet, or a mailbox has not yet reported its abort. If `overdue`, mailboxes
-    /// are no longer waited for.
+    /// Second part of closing: the channel has left the bus. Takes what is still in its FIFO, and returns whether that is empty now. Call
+    /// it until it is.
+    ///
+    /// No manual promises that a frame can be released in initialisation mode. But none arrives any more, so their number says
+    /// whether the frame in front is another one: none is taken twice.
+    pub fn close_fifo(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) -> bool {
+        let now = self.now(clock);
+        let state = &mut self.channels[channel.index()];
+        let mut left = state.left.unwrap_or_else(|| traffic.pending());
+        if traffic.take_overrun() {
+            state.gaps.overrun(traffic);
+        }
+        Self::record_gap(state, &mut self.recorder, channel, now);
+        let (omit_data, omit_stamps) =
+            state.open.map_or((false, false), |config| (config.omit_data, config.omit_stamps));
+        while left > 0 && traffic.pending() <= left {
+            let Some(frame) = traffic.receive() else { break };
+            left -= 1;
+            state.frames = state.frames.wrapping_add(1);
+            let stamp = if omit_stamps { Stamp::Omitted } else { Stamp::UpperBound };
+            self.recorder.frame(&Received { channel, frame, stamp, data_omitted: omit_data }, now);
+            state.gaps.taken();
+            Self::record_gap(state, &mut self.recorder, channel, now);
+        }
+        state.left = Some(left);
+        left == 0 && traffic.pending() == 0
+    }
+
+    /// The FIFO of a channel that has left the bus does not release its frames, and the controller's reset is about to empty it: records
+    /// those that were not taken as lost.
+    pub fn lose_fifo(&mut self, channel: Channel, clock: &impl Clock) {
+        let now = self.now(clock);
+        let state = &mut self.channels[channel.index()];
+        let left = state.left.replace(0).unwrap_or(0);
+        let gap = state.gaps.rest();
+        if left > 0 || gap != Gap::None {
+            let count = left + u8::from(gap == Gap::Certain);
+            Self::lose(state, &mut self.recorder, channel, count.into(), now);
+        }
+    }
+
+    /// Last part of closing, in steps, each with as few records as one lock allows: records what is left of the channel, and its end. If
+    /// `overdue`, mailboxes are no longer waited for.
     pub fn finish_close(
         &mut self,
         channel: Channel,
         traffic: &mut impl Traffic,
         clock: &impl Clock,
         overdue: bool,
-    ) -> bool {
-        let entered = clock.now();
-        self.on_receive(channel, traffic, clock, entered);
+    ) -> Closing {
         let now = self.now(clock);
         let state = &mut self.channels[channel.index()];
-        state.transmitter.on_finished(traffic, &mut self.recorder, now, state.abort_reason);
-        if overdue {
-            state.transmitter.give_up_mailboxes(traffic, &mut self.recorder, now, state.abort_reason);
+        let transmitter = &mut state.transmitter;
+        let go_on = |has_room: bool| if has_room { Closing::Continue } else { Closing::Wait };
+        if !transmitter.is_idle() {
+            if transmitter.waits_for_mailboxes() && overdue {
+                transmitter.give_up_mailboxes(traffic, &mut self.recorder, now, state.abort_reason);
+                return go_on(transmitter.is_idle());
+            }
+            let more = transmitter.on_finished(traffic, &mut self.recorder, now, state.abort_reason);
+            return go_on(more || transmitter.is_idle() || transmitter.waits_for_mailboxes() && overdue);
         }
-        let all_told = state.transmitter.tell_rest(&mut self.recorder, now);
+        if transmitter.owes() {
+            return go_on(transmitter.tell_rest(&mut self.recorder, now));
+        }
         state.errors.flush(&mut self.recorder, now);
         self.recorder.flush_losses(now);
-        if !all_told || !state.transmitter.is_idle() || !self.recorder.event(&Event::Stopped { channel }, now)
-        {
-            return false;
+        if !self.recorder.event(&Event::Stopped { channel }, now) {
+            return Closing::Wait;
         }
         state.open = None;
         self.arm(clock);
-        true
+        Closing::Done
     }
 
     /// Nobody listens any more: nothing more is sent. The channel is still on the bus.
     pub fn begin_abandon(&mut self, channel: Channel, traffic: &mut impl Traffic) {
-        self.channels[channel.index()].transmitter.clear();
+        let state = &mut self.channels[channel.index()];
+        state.closing = true;
+        state.transmitter.clear();
         traffic.abort();
     }
 
-    /// The channel has left the bus and nobody listens: forgets it, unrecorded.
-    pub fn abandon(&mut self, channel: Channel, traffic: &mut impl Traffic) {
+    /// The channel has left the bus and nobody listens: forgets it, unrecorded. Returns whether its FIFO is empty now.
+    pub fn abandon(&mut self, channel: Channel, traffic: &mut impl Traffic) -> bool {
         // What is still in a mailbox would otherwise be sent in the next session.
         traffic.abort();
-        while traffic.receive().is_some() {}
+        // Of a FIFO's three frames, the last may still be on its way out.
+        for _ in 0..LOOKS_PER_DRAIN {
+            if traffic.receive().is_none() && traffic.pending() == 0 {
+                break;
+            }
+        }
         traffic.take_overrun();
-        while traffic.take_finished().is_some() {}
+        forget_finished(traffic);
         let state = &mut self.channels[channel.index()];
         state.transmitter.clear();
         state.open = None;
+        traffic.pending() == 0
     }
 
     /// The configuration the channel was opened with; `None` if it is closed.

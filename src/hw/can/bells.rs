@@ -45,9 +45,14 @@ impl<const CAN: usize> Bells<CAN> {
     }
 
     /// Enables the receive interrupt again; it comes at once if a frame is waiting.
+    ///
+    /// The last thing that the draining tasks do. A store that is still on its way to a slow bus when an exception returns may have the
+    /// wrong handler entered next (Cortex-M4 erratum 838869, "Store immediate overlapping exception return operation might vector to
+    /// incorrect interrupt", whose workaround this barrier is).
     #[inline]
     pub fn open_receive(&self) {
         switch(Self::registers(), FMPIE0, true);
+        cortex_m::asm::dsb();
     }
 
     /// Ends the transmit interrupt although a mailbox has finished, until [`Traffic::await_finished`].

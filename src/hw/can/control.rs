@@ -4,6 +4,7 @@ use cantap_firmware::ports::Control;
 use cantap_wire::message::{ChannelConfig, Mode};
 
 use super::registers::Registers;
+use crate::board::TransmitPin;
 
 /// How far [`Control::halt`] has come.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -19,11 +20,13 @@ enum Halt {
 pub struct CanControl {
     can: Registers,
     halt: Halt,
+    /// Until the controller is connected to it.
+    transmit: Option<TransmitPin>,
 }
 
 impl CanControl {
-    pub(super) const fn new(can: Registers) -> Self {
-        Self { can, halt: Halt::None }
+    pub(super) const fn new(can: Registers, transmit: TransmitPin) -> Self {
+        Self { can, halt: Halt::None, transmit: Some(transmit) }
     }
 
     /// Leaves sleep and enters initialisation mode with one write: without INRQ a controller would first wait for eleven recessive
@@ -90,6 +93,10 @@ impl Control for CanControl {
             w.errie().set_bit().lecie().set_bit();
             w.ewgie().set_bit().epvie().set_bit().bofie().set_bit()
         });
+        // Only now: the controller has acknowledged initialisation mode.
+        if let Some(pin) = self.transmit.take() {
+            pin.connect();
+        }
         self.resume();
     }
 

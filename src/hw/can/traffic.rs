@@ -78,9 +78,9 @@ impl CanTraffic {
 }
 
 impl Traffic for CanTraffic {
-    #[inline]
     fn pending(&self) -> u8 {
-        self.can.rf0r().read().fmp().bits()
+        let status = self.can.rf0r().read();
+        status.fmp().bits().saturating_sub(status.rfom().bit().into())
     }
 
     #[inline]
@@ -89,7 +89,11 @@ impl Traffic for CanTraffic {
         // While a frame is being released, the mailbox still shows it.
         let mut status = fifo.read();
         let mut reads = RELEASE_READS;
-        while status.rfom().bit() && reads > 0 {
+        while status.rfom().bit() {
+            if reads == 0 {
+                // It would be the same frame again.
+                return None;
+            }
             status = fifo.read();
             reads -= 1;
         }

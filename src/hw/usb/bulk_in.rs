@@ -23,13 +23,26 @@ pub struct BulkIn {
     start: usize,
     end: usize,
     under_way: bool,
+    /// The controller has the transfer under way.
+    armed: bool,
     active: bool,
     halted: bool,
+    /// For how many milliseconds the controller has not been able to take a transfer.
+    blocked_ms: u32,
 }
 
 impl BulkIn {
     pub const fn new() -> Self {
-        Self { bytes: [0; TRANSFER], start: 0, end: 0, under_way: false, active: false, halted: false }
+        Self {
+            bytes: [0; TRANSFER],
+            start: 0,
+            end: 0,
+            under_way: false,
+            armed: false,
+            active: false,
+            halted: false,
+            blocked_ms: 0,
+        }
     }
 
     /// Puts the endpoint into or out of use: empty, with DATA0 and not halted (USB 2.0, 9.1.1.5).
@@ -37,14 +50,21 @@ impl BulkIn {
         registers.disable_input(BULK_IN);
         registers.write(ENDPOINT.int(), epint::XFRC);
         registers.write(ENDPOINT.ctl(), epctl::SNAK | if active { ACTIVE } else { 0 });
+        self.forget(active);
+    }
+
+    /// Forgets the transfer under way.
+    pub const fn forget(&mut self, active: bool) {
         self.under_way = false;
+        self.armed = false;
         self.halted = false;
         self.active = active;
+        self.blocked_ms = 0;
     }
 
     /// Begins a transfer with as many bytes as fit into one and returns how many; `None` if the last one is still under way.
     pub fn write(&mut self, registers: &mut Registers, bytes: &[u8]) -> Option<usize> {
-        if !self.active || self.under_way {
+        if !self.active || self.under_way || !registers.is_free(ENDPOINT) {
             return None;
         }
         let len = bytes.len().min(TRANSFER);
@@ -61,7 +81,12 @@ impl BulkIn {
         (self.end - self.start).div_ceil(PACKET).max(1)
     }
 
-    fn arm(&self, registers: &mut Registers) {
+    /// Gives the transfer to the controller, if that can take it now; otherwise [`Self::tick`] does.
+    fn arm(&mut self, registers: &mut Registers) {
+        if !registers.is_free(ENDPOINT) {
+            return;
+        }
+        self.armed = true;
         let bytes = &self.bytes[self.start..self.end];
         let size = (self.packets() as u32) << eptsiz::PKTCNT_SHIFT | bytes.len() as u32;
         registers.write(ENDPOINT.tsiz(), size);
@@ -72,13 +97,30 @@ impl BulkIn {
     /// The transfer has completed.
     pub fn done(&mut self) {
         self.under_way = false;
+        self.armed = false;
+    }
+
+    /// Once a millisecond: gives the controller what it could not take before. Returns for how many milliseconds it has not been able to
+    /// take anything.
+    pub fn tick(&mut self, registers: &mut Registers) -> u32 {
+        if !self.active || self.halted || self.armed {
+            self.blocked_ms = 0;
+            return 0;
+        }
+        if self.under_way {
+            self.arm(registers);
+        }
+        let is_blocked = !self.armed && !registers.is_free(ENDPOINT);
+        self.blocked_ms = if is_blocked { self.blocked_ms + 1 } else { 0 };
+        self.blocked_ms
     }
 
     /// Takes the transfer under way out of the controller and keeps what the host has not received.
     fn take_back(&mut self, registers: &mut Registers) {
-        if !self.under_way || self.halted {
+        if !self.armed {
             return;
         }
+        self.armed = false;
         registers.disable_input(BULK_IN);
         let left = (registers.read(ENDPOINT.tsiz()) & eptsiz::PKTCNT) >> eptsiz::PKTCNT_SHIFT;
         let gone = self.packets().saturating_sub(left as usize);

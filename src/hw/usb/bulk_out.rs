@@ -21,6 +21,8 @@ pub struct BulkOut {
     taken: usize,
     read: usize,
     armed: bool,
+    /// A bus reset has left it answering NAK, perhaps with a transfer armed.
+    muted: bool,
     active: bool,
     held: bool,
     halted: bool,
@@ -34,33 +36,43 @@ impl BulkOut {
             taken: 0,
             read: 0,
             armed: false,
+            muted: false,
             active: false,
             held: false,
             halted: false,
         }
     }
 
-    /// After a bus reset: out of use, and nothing waits. The receive FIFO is empty.
+    /// After a bus reset: out of use, and nothing waits. The receive FIFO is about to be emptied.
+    ///
+    /// An armed transfer is not disabled: that would take global OUT NAK first (RM0090, "Disabling an OUT endpoint"), which has to
+    /// pass through the receive FIFO. Answering NAK is enough, as in TinyUSB: the transfer is used again, with the packets that it has left.
     pub fn reset(&mut self, registers: &mut Registers) {
-        if registers.is_armed(ENDPOINT) {
-            registers.control(ENDPOINT, epctl::USBAEP, epctl::SNAK | epctl::EPDIS);
-            registers.wait_until(ENDPOINT.ctl(), |value| value & epctl::EPENA == 0);
-        }
-        *self = Self { held: self.held, ..Self::new() };
+        registers.control(ENDPOINT, epctl::USBAEP, epctl::SNAK);
+        let armed = registers.is_armed(ENDPOINT);
+        *self = Self { held: self.held, armed, muted: true, ..Self::new() };
     }
 
     /// Puts the endpoint into or out of use, with DATA0 and not halted (USB 2.0, 9.1.1.5). What has been received stays, and
-    /// so does an armed transfer, which is still empty.
+    /// so does an armed transfer.
     pub fn configure(&mut self, registers: &mut Registers, active: bool) {
         self.active = active;
         self.halted = false;
-        registers.write(ENDPOINT.ctl(), if active { ACTIVE } else { 0 });
+        let mut ctl = if active { ACTIVE } else { 0 };
+        if active && core::mem::take(&mut self.muted) && self.armed {
+            ctl |= epctl::CNAK;
+        }
+        registers.write(ENDPOINT.ctl(), ctl);
         self.arm(registers);
     }
 
-    /// Lets packets in, if there is room for as many as may come.
+    /// Lets packets in, if there is room for as many as may come. Call it again and again.
     pub fn arm(&mut self, registers: &mut Registers) {
         if !self.active || self.armed || self.held || self.read < self.taken {
+            return;
+        }
+        // The controller takes a moment to end a transfer whose end it has reported, or has reported what was not so.
+        if registers.is_armed(ENDPOINT) {
             return;
         }
         (self.taken, self.read) = (0, 0);

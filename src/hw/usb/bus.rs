@@ -2,6 +2,7 @@
 
 use core::cell::UnsafeCell;
 
+use cantap_firmware::oddities::UsbOddities;
 use cantap_firmware::ports::{PACKET, PortHistory};
 use usb_device::bus::PollResult;
 use usb_device::endpoint::{EndpointAddress, EndpointType};
@@ -11,11 +12,12 @@ use super::bulk_in::BulkIn;
 use super::bulk_out::BulkOut;
 use super::control::Control;
 use super::registers::{
-    DAINT, DAINTMSK, DCFG, DCTL, DIEPMSK, DOEPMSK, DSTS, Endpoint, GAHBCFG, GCCFG, GINTMSK, GINTSTS, GRSTCTL,
-    GRXSTSP, GUSBCFG, PCGCCTL, Registers, dcfg, dctl, dsts, epctl, epint, gahbcfg, gccfg, gint, grstctl,
-    gusbcfg, pktsts,
+    DAINT, DAINTMSK, DCFG, DCTL, DIEPMSK, DOEPMSK, DSTS, Endpoint, GAHBCFG, GCCFG, GINTMSK, GINTSTS, GOTGINT,
+    GRSTCTL, GRXSTSP, GUSBCFG, PCGCCTL, Registers, dcfg, dctl, dsts, epctl, epint, gahbcfg, gccfg, gint,
+    gotgint, grstctl, gusbcfg, pktsts,
 };
 use super::{BULK_IN, BULK_OUT, NOTIFY_IN, fifo};
+use crate::board;
 
 /// TRDT, the answer time in clocks of PHY and AHB, for AHB clocks from 32 MHz up (RM0090, "TRDT values").
 const TURNAROUND: u32 = 6;
@@ -27,6 +29,13 @@ const NOTIFY_ACTIVE: u32 = epctl::USBAEP
     | epctl::SD0PID;
 /// The notification endpoint's packets, as usbd-serial describes them.
 const NOTIFY_PACKET: u16 = 8;
+/// Words of the receive FIFO that one poll looks at: twice what it holds of the shortest packets. A FIFO that goes on has its interrupt
+/// again, and the tick comes in between.
+const WORDS_PER_POLL: usize = 64;
+/// A controller that has not taken a packet after this time, in ms, will not: the transfer before does not end.
+const BLOCKED_MS: u32 = 100;
+/// How long the device then stays away from the bus, in ms, so that a host notices (as `hw::start` does).
+const AWAY_MS: u32 = 10;
 
 /// Whether the host has the port open.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -51,6 +60,10 @@ pub struct Core {
     history: PortHistory,
     /// Whether usb-device takes the bus for suspended.
     suspended: bool,
+    /// Words of the receive FIFO that say what cannot be; wraps.
+    words_dropped: u32,
+    /// Away from the bus for so many more milliseconds.
+    away_ms: Option<u32>,
 }
 
 impl Core {
@@ -66,29 +79,36 @@ impl Core {
             line: Line::Down,
             history: PortHistory { opened: 0, configured: 0 },
             suspended: false,
+            words_dropped: 0,
+            away_ms: None,
         }
     }
 
     /// Connects to the bus (RM0090, "Core initialization" and "Device initialization").
     fn enable(&mut self) {
         let registers = &mut self.registers;
-        registers.wait_until(GRSTCTL, |value| value & grstctl::AHBIDL != 0);
-        registers.modify(GUSBCFG, 0, gusbcfg::FDMOD);
+        registers.wait_until(|registers| registers.read(GRSTCTL) & grstctl::AHBIDL != 0);
         registers.write(GRSTCTL, grstctl::CSRST);
-        registers.wait_until(GRSTCTL, |value| value & grstctl::CSRST == 0);
-        registers.wait_until(GRSTCTL, |value| value & grstctl::AHBIDL != 0);
-        // None of our boards measures VBUS.
-        registers.write(GCCFG, gccfg::PWRDWN | gccfg::NOVBUSSENS);
+        registers.wait_until(|registers| registers.read(GRSTCTL) & grstctl::CSRST == 0);
+        registers.wait_until(|registers| registers.read(GRSTCTL) & grstctl::AHBIDL != 0);
+        // Before a host can see the device: what it does from then on is not to be forgotten.
+        registers.write(GINTSTS, !0);
+        // After the reset, as in ST's driver, because it is not said to keep this.
+        registers.modify(GUSBCFG, 0, gusbcfg::FDMOD);
+        let vbus = if board::SENSES_VBUS { gccfg::VBUSBSEN } else { gccfg::NOVBUSSENS };
+        registers.write(GCCFG, gccfg::PWRDWN | vbus);
         registers.write(PCGCCTL, 0);
         registers.modify(DCTL, 0, dctl::SDIS);
+        // What follows are a device's registers.
+        registers.wait_for_device_mode();
         registers.modify(DCFG, 0, dcfg::DSPD_FULL);
         registers.write(DIEPMSK, epint::XFRC);
         // The receive FIFO's status reports what arrives.
         registers.write(DOEPMSK, 0);
         registers.write(DAINTMSK, 1 | 1 << BULK_IN);
-        registers.write(GINTSTS, !0);
         let wanted = [gint::USBRST, gint::ENUMDNE, gint::USBSUSP, gint::WKUPINT, gint::IEPINT, gint::RXFLVL];
-        registers.write(GINTMSK, wanted.iter().fold(0, |mask, flag| mask | flag));
+        let session = if board::SENSES_VBUS { gint::OTGINT } else { 0 };
+        registers.write(GINTMSK, wanted.iter().fold(session, |mask, flag| mask | flag));
         registers.modify(GAHBCFG, 0, gahbcfg::GINT);
         registers.modify(DCTL, dctl::SDIS, 0);
     }
@@ -187,8 +207,12 @@ impl Core {
                 return PollResult::Suspend;
             }
         }
+        if board::SENSES_VBUS && flags & gint::OTGINT != 0 && self.take_session_end() {
+            return PollResult::Suspend;
+        }
         let received = self.receive();
-        let sent = if flags & gint::IEPINT == 0 { 0 } else { self.sent() };
+        // After the FIFO: a SETUP packet there ends whatever was being sent.
+        let sent = self.sent();
         let (setup, packet) = self.control.waits();
         // usb-device needs the data endpoints' events only as a sign that the bus is alive.
         let data = if self.suspended { received | sent & !1 } else { 0 };
@@ -202,25 +226,51 @@ impl Core {
         PollResult::None
     }
 
+    /// VBUS is gone: to the device that is a suspended bus, as it is where nothing senses VBUS. Returns whether it is so.
+    fn take_session_end(&mut self) -> bool {
+        let flags = self.registers.read(GOTGINT);
+        self.registers.write(GOTGINT, flags);
+        flags & gotgint::SEDET != 0
+    }
+
     /// Empties the receive FIFO. Returns the bulk endpoint's bit if there was something for it.
+    ///
+    /// Controllers of this family have been seen to deliver words that cannot be (libopencm3, issue 672; Klipper drops them, too). Only
+    /// what fits this device is believed; of anything else, the word is dropped and counted, and no data is read for it.
     fn receive(&mut self) -> u16 {
         let Self { registers, control, bulk_out, .. } = self;
         let mut bulk = 0;
-        while registers.read(GINTSTS) & gint::RXFLVL != 0 {
+        for _ in 0..WORDS_PER_POLL {
+            if registers.read(GINTSTS) & gint::RXFLVL == 0 {
+                break;
+            }
             let status = registers.read(GRXSTSP);
             let number = (status & 0xF) as usize;
             let len = (status >> 4 & 0x7FF) as usize;
-            match (status >> 17 & 0xF, number) {
-                (pktsts::SETUP_DATA, _) => control.take_setup(registers, len),
-                (pktsts::SETUP_COMPLETE, _) => control.setup_done(registers),
-                (pktsts::OUT_DATA, 0) => control.take_packet(registers, len),
+            let believed = match (status >> 17 & 0xF, number) {
+                (pktsts::SETUP_DATA, 0) if len == 8 => {
+                    control.take_setup(registers, len);
+                    true
+                }
+                (pktsts::SETUP_COMPLETE, 0) => control.setup_done(registers),
+                (pktsts::OUT_DATA, 0) if len <= PACKET => {
+                    control.take_packet(registers, len);
+                    true
+                }
                 (pktsts::OUT_COMPLETE, 0) => control.packet_done(),
-                (pktsts::OUT_DATA, _) => {
+                (pktsts::OUT_DATA, BULK_OUT) if len <= PACKET => {
                     bulk_out.take_packet(registers, len);
                     bulk = 1 << BULK_OUT;
+                    true
                 }
-                (pktsts::OUT_COMPLETE, _) => bulk_out.transfer_done(),
-                _ => {}
+                (pktsts::OUT_COMPLETE, BULK_OUT) => {
+                    bulk_out.transfer_done();
+                    true
+                }
+                _ => false,
+            };
+            if !believed {
+                self.words_dropped = self.words_dropped.wrapping_add(1);
             }
         }
         bulk_out.arm(registers);
@@ -230,16 +280,47 @@ impl Core {
     /// Handles the IN endpoints whose transfer has completed; returns a bit for each.
     fn sent(&mut self) -> u16 {
         let Self { registers, bulk_in, .. } = self;
-        let ended = registers.read(DAINT) & (1 | 1 << BULK_IN);
+        let mut ended = 0;
+        // DAINT only says where to look: other flags of DIEPINT are set as well.
+        let reported = registers.read(DAINT);
         for number in [0, BULK_IN] {
-            if ended >> number & 1 != 0 {
-                registers.write(Endpoint::input(number).int(), epint::XFRC);
+            let int = Endpoint::input(number).int();
+            if reported >> number & 1 != 0 && registers.read(int) & epint::XFRC != 0 {
+                registers.write(int, epint::XFRC);
+                ended |= 1 << number;
             }
         }
         if ended >> BULK_IN & 1 != 0 {
             bulk_in.done();
         }
-        ended as u16
+        ended
+    }
+
+    /// Once a millisecond: gives the controller what it could not take before. If it takes nothing at all any more, the device goes
+    /// away from the bus and begins anew, as if it had been unplugged.
+    pub fn tick(&mut self) {
+        match self.away_ms {
+            Some(0) => {
+                self.away_ms = None;
+                self.enable();
+            }
+            Some(left) => self.away_ms = Some(left - 1),
+            None => {
+                let Self { registers, control, bulk_in, bulk_out, .. } = self;
+                let blocked_ms = control.tick(registers).max(bulk_in.tick(registers));
+                bulk_out.arm(registers);
+                if blocked_ms > BLOCKED_MS {
+                    bulk_in.forget(false);
+                    registers.modify(DCTL, 0, dctl::SDIS);
+                    self.away_ms = Some(AWAY_MS);
+                }
+            }
+        }
+    }
+
+    /// What the controller did that it should not.
+    pub const fn oddities(&self) -> UsbOddities {
+        UsbOddities { words_dropped: self.words_dropped, waits_given_up: self.registers.waits_given_up() }
     }
 
     /// SET_CONTROL_LINE_STATE.
@@ -349,7 +430,7 @@ impl usb_device::bus::UsbBus for Bus {
 
     fn write(&self, address: EndpointAddress, bytes: &[u8]) -> Result<usize> {
         self.core.with(|core| match (address.is_in(), address.index()) {
-            (true, 0) => Control::write(&mut core.registers, bytes),
+            (true, 0) => core.control.write(&mut core.registers, bytes),
             (true, BULK_IN) => core.write_bulk(bytes).ok_or(UsbError::WouldBlock),
             _ => Err(UsbError::InvalidEndpoint),
         })

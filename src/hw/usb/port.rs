@@ -1,9 +1,11 @@
 //! The virtual COM port: usb-device and usbd-serial answer the host's control requests, data goes to the bus directly.
 
+use cantap_firmware::oddities::UsbOddities;
 use cantap_firmware::ports::{PACKET, Port, PortHistory};
 use cantap_wire::{USB_PID, USB_VID};
+use cortex_m::peripheral::NVIC;
 use heapless::String;
-use stm32f4xx_hal::pac::{OTG_FS_DEVICE, OTG_FS_GLOBAL, OTG_FS_PWRCLK};
+use stm32f4xx_hal::pac::{Interrupt, OTG_FS_DEVICE, OTG_FS_GLOBAL, OTG_FS_PWRCLK};
 use stm32f4xx_hal::rcc::{Enable, Rcc, Reset};
 use usb_device::bus::UsbBusAllocator;
 use usb_device::device::{StringDescriptors, UsbDevice, UsbDeviceBuilder, UsbDeviceState, UsbRev, UsbVidPid};
@@ -12,9 +14,13 @@ use usbd_serial::{CdcAcmClass, USB_CLASS_CDC};
 use super::bus::{Bus, Core, Line, Shared};
 use super::registers::Registers;
 use super::requests::Requests;
+use crate::hw::stamp::StampTimer;
 
 /// Current requested from the bus, in mA: what a bus-powered hub has for a device (USB 2.0, 7.2.1: one unit load).
 const MAX_POWER_MA: usize = 100;
+
+/// Turns of usb-device in one poll: a request of endpoint 0 has three stages.
+const TURNS_PER_POLL: usize = 16;
 
 /// The peripheral.
 type Peripheral = (OTG_FS_GLOBAL, OTG_FS_DEVICE, OTG_FS_PWRCLK);
@@ -43,11 +49,17 @@ impl Memory {
 
 impl UsbPort {
     /// Connects to the bus; a host enumerates the device from now on.
-    pub fn new(usb: Peripheral, rcc: &mut Rcc, serial: &String<24>, memory: &'static mut Memory) -> Self {
+    pub fn new(
+        usb: Peripheral,
+        timer: StampTimer,
+        rcc: &mut Rcc,
+        serial: &String<24>,
+        memory: &'static mut Memory,
+    ) -> Self {
         OTG_FS_GLOBAL::enable(rcc);
         OTG_FS_GLOBAL::reset(rcc);
         memory.serial.clone_from(serial);
-        let core: &'static Shared = memory.core.insert(Shared::new(Core::new(Registers::new(usb))));
+        let core: &'static Shared = memory.core.insert(Shared::new(Core::new(Registers::new(usb, timer))));
         let bus: &'static _ = memory.bus.insert(UsbBusAllocator::new(Bus::new(core)));
         let class = CdcAcmClass::new(bus, PACKET as u16);
         let strings = StringDescriptors::default()
@@ -71,7 +83,23 @@ impl UsbPort {
     /// Services the bus: resets, control requests, packets received and sent.
     pub fn poll(&mut self) {
         // Each turn handles something that is waiting.
-        while self.device.poll(&mut [&mut self.requests, &mut self.class]) {}
+        for _ in 0..TURNS_PER_POLL {
+            if !self.device.poll(&mut [&mut self.requests, &mut self.class]) {
+                return;
+            }
+        }
+        // Something goes on reporting: the tick must have its turn.
+        NVIC::pend(Interrupt::OTG_FS);
+    }
+
+    /// Once a millisecond: what the controller could not take before.
+    pub fn tick(&mut self) {
+        self.core.with(Core::tick);
+    }
+
+    /// What the controller did that it should not.
+    pub fn oddities(&self) -> UsbOddities {
+        self.core.with(|core| core.oddities())
     }
 }
 

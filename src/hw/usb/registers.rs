@@ -1,8 +1,12 @@
 //! OTG_FS's registers in device mode (RM0090, "OTG_FS control and status registers"): offsets, bits, and the only access to
 //! them. The names are the manual's.
 
+use cantap_firmware::TICKS_PER_MS;
 use stm32f4xx_hal::pac::{OTG_FS_DEVICE, OTG_FS_GLOBAL, OTG_FS_PWRCLK};
 
+use crate::hw::stamp::StampTimer;
+
+pub const GOTGINT: usize = 0x004;
 pub const GAHBCFG: usize = 0x008;
 pub const GUSBCFG: usize = 0x00C;
 pub const GRSTCTL: usize = 0x010;
@@ -25,6 +29,11 @@ pub const PCGCCTL: usize = 0xE00;
 /// FIFO n is written through the 4 KiB from `FIFO + n * FIFO_STRIDE`; the receive FIFO is read through any of them.
 pub const FIFO: usize = 0x1000;
 pub const FIFO_STRIDE: usize = 0x1000;
+
+/// Bits of GOTGINT.
+pub mod gotgint {
+    pub const SEDET: u32 = 1 << 2;
+}
 
 /// Bits of GAHBCFG.
 pub mod gahbcfg {
@@ -51,6 +60,8 @@ pub mod grstctl {
 
 /// Bits of GINTSTS and GINTMSK.
 pub mod gint {
+    pub const CMOD: u32 = 1 << 0;
+    pub const OTGINT: u32 = 1 << 2;
     pub const RXFLVL: u32 = 1 << 4;
     pub const USBSUSP: u32 = 1 << 11;
     pub const USBRST: u32 = 1 << 12;
@@ -70,6 +81,7 @@ pub mod pktsts {
 /// Bits of GCCFG.
 pub mod gccfg {
     pub const PWRDWN: u32 = 1 << 16;
+    pub const VBUSBSEN: u32 = 1 << 19;
     pub const NOVBUSSENS: u32 = 1 << 21;
 }
 
@@ -94,6 +106,7 @@ pub mod dsts {
 /// Bits of DIEPCTLx and DOEPCTLx.
 pub mod epctl {
     pub const USBAEP: u32 = 1 << 15;
+    pub const NAKSTS: u32 = 1 << 17;
     pub const EPTYP_SHIFT: u32 = 18;
     pub const STALL: u32 = 1 << 21;
     pub const TXFNUM_SHIFT: u32 = 22;
@@ -107,10 +120,11 @@ pub mod epctl {
     pub const ACTIONS: u32 = CNAK | SNAK | SD0PID | 1 << 29 | EPDIS | EPENA;
 }
 
-/// Bits of DIEPINTx.
+/// Bits of DIEPINTx and DOEPINTx.
 pub mod epint {
     pub const XFRC: u32 = 1 << 0;
     pub const EPDISD: u32 = 1 << 1;
+    pub const STUP: u32 = 1 << 3;
     pub const INEPNE: u32 = 1 << 6;
 }
 
@@ -153,18 +167,24 @@ impl Endpoint {
     }
 }
 
-/// A flag of the controller follows within a few clocks of USB; this many reads take longer than that, and end the wait for
-/// hardware that does not answer.
-const MOST_READS: u32 = 1_000;
+/// How long to wait for a flag of the controller, in ticks: 1 ms. It follows within some clocks of USB as a rule, and within a frame where
+/// a packet has to end first.
+const MOST_TICKS: u32 = TICKS_PER_MS;
+/// How long the core may take to become a device, in ticks: 50 ms. The manual asks for 25 (RM0090, GUSBCFG, FDMOD), and NuttX waits for 50.
+const MODE_TICKS: u32 = 50 * TICKS_PER_MS;
 
 /// The controller. Only the owner of this value touches it.
-pub struct Registers(());
+pub struct Registers {
+    timer: StampTimer,
+    /// Flags that were waited for and did not come in time; wraps.
+    waits_given_up: u32,
+}
 
 #[expect(clippy::unused_self, reason = "having it is the right to touch the controller")]
 impl Registers {
     /// Made from the peripheral itself, which nobody else can then have.
-    pub fn new(_peripheral: (OTG_FS_GLOBAL, OTG_FS_DEVICE, OTG_FS_PWRCLK)) -> Self {
-        Self(())
+    pub const fn new(_: (OTG_FS_GLOBAL, OTG_FS_DEVICE, OTG_FS_PWRCLK), timer: StampTimer) -> Self {
+        Self { timer, waits_given_up: 0 }
     }
 
     fn at(offset: usize) -> *mut u32 {
@@ -201,38 +221,82 @@ impl Registers {
         self.read(endpoint.ctl()) & epctl::EPENA != 0
     }
 
-    /// Waits until `wanted` accepts the register's value, but not for ever.
-    pub fn wait_until(&self, offset: usize, wanted: impl Fn(u32) -> bool) {
-        let mut reads = MOST_READS;
-        while reads > 0 && !wanted(self.read(offset)) {
-            reads -= 1;
+    /// Waits until `done`, but not for ever; returns whether it was.
+    pub fn wait_until(&mut self, done: impl Fn(&Self) -> bool) -> bool {
+        self.wait(MOST_TICKS, done)
+    }
+
+    /// Waits until the core is a device.
+    pub fn wait_for_device_mode(&mut self) {
+        self.wait(MODE_TICKS, |registers| registers.read(GINTSTS) & gint::CMOD == 0);
+    }
+
+    fn wait(&mut self, most_ticks: u32, done: impl Fn(&Self) -> bool) -> bool {
+        let from = self.timer.now();
+        loop {
+            // Before the flag: if something of a higher priority runs in between, the flag counts.
+            let late = self.timer.now().wrapping_sub(from) > most_ticks;
+            if done(self) {
+                return true;
+            }
+            if late {
+                self.waits_given_up = self.waits_given_up.wrapping_add(1);
+                return false;
+            }
         }
     }
 
+    /// Flags that were waited for and did not come in time, since the start.
+    pub const fn waits_given_up(&self) -> u32 {
+        self.waits_given_up
+    }
+
     /// Ends an IN endpoint's transfer in the manual's order: NAK, disable, and flush the FIFO of the same number (RM0090, "IN
-    /// endpoint disable").
+    /// endpoint disable"). If there is no transfer, the FIFO is left alone: a flush has no place in the middle of a transaction
+    /// (RM0090, GRSTCTL, TXFFLSH), and other drivers, too, flush only if EPENA (TinyUSB, Klipper) or PKTCNT (libopencm3, embassy) says
+    /// that something is there.
     pub fn disable_input(&mut self, number: usize) {
         let endpoint = Endpoint::input(number);
         if self.is_armed(endpoint) {
             self.write(endpoint.int(), epint::INEPNE | epint::EPDISD);
             self.control(endpoint, 0, epctl::SNAK);
-            self.wait_until(endpoint.int(), |flags| flags & epint::INEPNE != 0);
-            self.control(endpoint, 0, epctl::EPDIS | epctl::SNAK);
-            self.wait_until(endpoint.int(), |flags| flags & epint::EPDISD != 0);
-            self.write(endpoint.int(), epint::EPDISD);
+            // INEPNE does not come if the answer was NAK already (Zephyr, issue 73142), and not if the transfer has just ended.
+            self.wait_until(|registers| {
+                let ctl = registers.read(endpoint.ctl());
+                registers.read(endpoint.int()) & epint::INEPNE != 0
+                    || ctl & epctl::NAKSTS != 0
+                    || ctl & epctl::EPENA == 0
+            });
+            if self.is_armed(endpoint) {
+                self.control(endpoint, 0, epctl::EPDIS | epctl::SNAK);
+                self.wait_until(|registers| {
+                    registers.read(endpoint.int()) & epint::EPDISD != 0 || !registers.is_armed(endpoint)
+                });
+            }
+            self.write(endpoint.int(), epint::INEPNE | epint::EPDISD);
+            self.flush_tx(number as u32);
+        } else if self.read(endpoint.tsiz()) & eptsiz::PKTCNT != 0 {
+            self.flush_tx(number as u32);
         }
-        self.flush_tx(number as u32);
     }
 
-    /// Empties a transmit FIFO, or all of them.
+    /// Whether a new transfer may be written to an IN endpoint: the last one is over, and no FIFO is being flushed.
+    pub fn is_free(&self, endpoint: Endpoint) -> bool {
+        !self.is_armed(endpoint) && self.read(GRSTCTL) & grstctl::TXFFLSH == 0
+    }
+
+    /// Empties a transmit FIFO, or all of them. If that takes too long, [`Self::is_free`] says when it has ended.
     pub fn flush_tx(&mut self, number: u32) {
-        self.write(GRSTCTL, grstctl::TXFFLSH | number << grstctl::TXFNUM_SHIFT);
-        self.wait_until(GRSTCTL, |value| value & grstctl::TXFFLSH == 0);
+        let idle = |value: u32| value & (grstctl::AHBIDL | grstctl::TXFFLSH) == grstctl::AHBIDL;
+        if self.wait_until(|registers| idle(registers.read(GRSTCTL))) {
+            self.write(GRSTCTL, grstctl::TXFFLSH | number << grstctl::TXFNUM_SHIFT);
+            self.wait_until(|registers| registers.read(GRSTCTL) & grstctl::TXFFLSH == 0);
+        }
     }
 
     /// Empties the receive FIFO.
     pub fn flush_rx(&mut self) {
         self.write(GRSTCTL, grstctl::RXFFLSH);
-        self.wait_until(GRSTCTL, |value| value & grstctl::RXFFLSH == 0);
+        self.wait_until(|registers| registers.read(GRSTCTL) & grstctl::RXFFLSH == 0);
     }
 }

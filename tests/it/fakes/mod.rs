@@ -60,6 +60,18 @@ impl Clock for FakeClock {
 #[derive(Default)]
 pub struct FakeTraffic {
     pub fifo: VecDeque<Frame>,
+    /// The FIFO does not release its frames, or shows the same frame again and again.
+    pub stubborn: Option<Stubborn>,
+    /// The frame in front has been taken and is being released.
+    pub releasing: bool,
+    /// Frames taken from the FIFO.
+    pub received: usize,
+    /// A mailbox that says for ever that it has finished.
+    pub never_emptied: Option<u8>,
+    /// The controller shows no free mailbox.
+    pub blocked: bool,
+    /// How often the transmit interrupt was let in again.
+    pub awaited: usize,
     pub overrun: bool,
     pub mailboxes: [Option<Frame>; 3],
     pub prepared: Option<Frame>,
@@ -72,10 +84,31 @@ pub struct FakeTraffic {
     pub counters: (u8, u8),
 }
 
+/// How a FIFO misbehaves.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stubborn {
+    /// RFOM is never cleared: the first frame is not released.
+    Keeps,
+    /// RFOM is cleared, but the frame stays.
+    Repeats,
+    /// A frame that was taken stays in the way until [`FakeTraffic::release`].
+    Slow,
+}
+
+/// More calls than any single interrupt makes: a loop that makes them has no end.
+const ENDLESS: usize = 100_000;
+
 impl FakeTraffic {
     /// A frame comes off the bus.
     pub fn arrive(&mut self, frame: Frame) {
         if self.fifo.len() < 3 { self.fifo.push_back(frame) } else { self.overrun = true }
+    }
+
+    /// A slow FIFO releases the frame that was taken.
+    pub fn release(&mut self) {
+        if std::mem::take(&mut self.releasing) {
+            self.fifo.pop_front();
+        }
     }
 
     /// The bus takes the oldest mailbox's frame.
@@ -89,11 +122,26 @@ impl FakeTraffic {
 
 impl Traffic for FakeTraffic {
     fn pending(&self) -> u8 {
-        self.fifo.len() as u8
+        self.fifo.len() as u8 - u8::from(self.releasing)
+    }
+
+    fn look(&mut self) -> (u8, bool) {
+        (self.fifo.len() as u8, self.take_overrun())
     }
 
     fn receive(&mut self) -> Option<Frame> {
-        self.fifo.pop_front()
+        self.received += 1;
+        assert!(self.received < ENDLESS, "the drain does not end");
+        match self.stubborn {
+            None => self.fifo.pop_front(),
+            Some(Stubborn::Keeps) => None,
+            Some(Stubborn::Repeats) => self.fifo.front().copied(),
+            Some(Stubborn::Slow) if self.releasing => None,
+            Some(Stubborn::Slow) => {
+                self.releasing = !self.fifo.is_empty();
+                self.fifo.front().copied()
+            }
+        }
     }
 
     fn take_overrun(&mut self) -> bool {
@@ -101,6 +149,9 @@ impl Traffic for FakeTraffic {
     }
 
     fn prepare(&mut self, frame: &Frame) -> Option<u8> {
+        if self.blocked {
+            return None;
+        }
         let free = self.mailboxes.iter().position(Option::is_none)?;
         // As on the chip, a mailbox is free for the next frame only once its outcome was taken.
         if self.finished.iter().any(|(mailbox, _)| *mailbox as usize == free) {
@@ -115,7 +166,16 @@ impl Traffic for FakeTraffic {
         self.order.push_back(mailbox);
     }
 
+    fn await_finished(&mut self) {
+        self.awaited += 1;
+    }
+
     fn take_finished(&mut self) -> Option<(u8, Outcome)> {
+        if let Some(mailbox) = self.never_emptied {
+            self.received += 1;
+            assert!(self.received < ENDLESS, "the mailboxes are collected for ever");
+            return Some((mailbox, Outcome::Sent));
+        }
         self.finished.pop_front()
     }
 
@@ -328,6 +388,10 @@ pub struct FakeBoard<'q, const N: usize> {
     /// What the next reading of the SOF latch finds.
     pub sof: Option<SofReading>,
     pub meter: FakeMeter,
+    /// A controller's reset ends its FIFO's stubbornness.
+    pub reset_empties: bool,
+    /// The frame that is on CAN1's bus when its controller is asked to leave. It is received, and cannot be released any more.
+    pub last_frame: Option<Frame>,
 }
 
 impl<'q, const N: usize> Board<'q, N> for FakeBoard<'q, N> {
@@ -354,6 +418,17 @@ impl<'q, const N: usize> Board<'q, N> for FakeBoard<'q, N> {
     }
 
     fn control(&mut self, channel: Channel) -> &mut FakeControl {
+        if !self.control[0].running
+            && let Some(frame) = self.last_frame.take()
+        {
+            self.traffic[0].arrive(frame);
+            self.traffic[0].stubborn = Some(Stubborn::Repeats);
+        }
+        if self.reset_empties && self.control[channel.index()].halts > 0 {
+            let traffic = &mut self.traffic[channel.index()];
+            traffic.stubborn = None;
+            traffic.fifo.clear();
+        }
         &mut self.control[channel.index()]
     }
 
@@ -401,6 +476,8 @@ impl<'q, const N: usize> Bench<'q, N> {
                 chip: FakeChip::default(),
                 sof: None,
                 meter: FakeMeter::default(),
+                reset_empties: false,
+                last_frame: None,
             },
             session: Session::new(consumer, identity, Box::leak(Box::default())),
             port: FakePort { open: true, takes: usize::MAX, ..Default::default() },

@@ -58,7 +58,8 @@ pub struct ChannelStatus {
 /// Longest text of a failure, in bytes: a panic's place and a sentence.
 pub const MAX_FAILURE_TEXT: usize = 200;
 
-/// Starts that followed a failure of the firmware: a panic, a fault, the watchdog, a clock that did not come up.
+/// Failures of the firmware, each of which it started anew after: a panic, a fault, the watchdog, a clock that did not come up. And hardware that did not
+/// do as its manual says, which the firmware lives with: recorded at most once a second.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Failures {
     /// How many since power-on.

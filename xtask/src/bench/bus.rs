@@ -88,6 +88,7 @@ pub fn run(extent: &Extent) -> Result<()> {
                 Ok(())
             },
         )?;
+        tasks::print_locks(rig(Other::Joined, Bound::Best)?.machine.image())?;
     }
     Ok(())
 }

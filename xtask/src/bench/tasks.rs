@@ -1,9 +1,11 @@
-//! Where the processor's time goes while the emulated board does something: by interrupt, and by function.
+//! Where the processor's time goes while the emulated board does something: by interrupt, and by function; and the longest locks.
 
 use anyhow::{Context, Result};
+use cantap_emu::elf::Image;
 use cantap_emu::probe::Task;
 use cantap_emu::profile::Table;
 use cantap_emu::timing::Bound;
+use cantap_sim::locks::{self, Lock};
 use cantap_sim::rig::Rig;
 
 /// Functions with a smaller share of the processor's time are not listed.
@@ -42,5 +44,17 @@ pub fn print(
     }
     println!("at worst by function: its own, and waiting for instructions, data in flash, buses, branches");
     print!("{functions}");
+    Ok(())
+}
+
+/// Prints how long commands and the tick hold up what sends and drains, in each situation: at best and at worst.
+pub fn print_locks(image: &Image) -> Result<()> {
+    println!("longest lock over the tasks of priority 4, at best / at worst, us");
+    let [best, worst] = Bound::ALL.map(|bound| locks::longest(image, bound));
+    for (Lock { during, longest_us: best, .. }, Lock { longest_us: worst, pc, .. }) in
+        best?.into_iter().zip(worst?)
+    {
+        println!("  {during:<24} {best:>6.2} / {worst:>5.2}  (until {pc:08X})");
+    }
     Ok(())
 }

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use anyhow::{Context, Result, ensure};
+use cantap_wire::image;
 use object::read::elf::{ElfFile32, FileHeader, ProgramHeader};
 use object::{Endianness, elf};
 use xshell::Shell;
@@ -21,8 +22,17 @@ pub fn pack(shell: &Shell, dist: &Path) -> Result<()> {
         let content = staging(shell, dist, &name)?;
         let elf = content.join(format!("{name}.elf"));
         shell.copy_file(board.elf(), &elf)?;
-        shell
-            .write_file(content.join(format!("{name}.bin")), flash_image(&shell.read_binary_file(&elf)?)?)?;
+        let mut image = flash_image(&shell.read_binary_file(&elf)?)?;
+        // What `cantap update` compares with the board, and with what is there of the file.
+        image::finish(&mut image)?;
+        let described = image::read(&image)?;
+        ensure!(
+            described.board == board.name(),
+            "the image for {} says that it is for {}",
+            board.name(),
+            described.board
+        );
+        shell.write_file(content.join(format!("{name}.bin")), image)?;
         let selection = [
             "-p",
             "cantap-firmware",

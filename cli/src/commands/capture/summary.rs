@@ -9,8 +9,7 @@ use cantap_signals::trigger::{Trigger, TriggerCounts};
 
 use crate::boards::Boards;
 use crate::live::{Line, LiveRecords};
-use cantap_work::Losses;
-use cantap_work::{Meter, rounded};
+use cantap_work::{Losses, Meter, lost_frames, rounded};
 
 /// A channel in the JSON object.
 #[derive(serde::Serialize)]
@@ -18,11 +17,15 @@ pub struct ChannelSummary {
     pub channel: u8,
     pub frames: u64,
     lost: u64,
+    /// Whether there may be more, as where the device was not on the bus.
+    lost_at_least: bool,
     /// Those reported and those suppressed, whatever the filters.
     pub bus_errors: u64,
     /// `null` if the device left out what is needed for it, like the next one.
     frames_per_s: Option<f64>,
     bus_load_pct: Option<f64>,
+    /// If it is not known, the reason.
+    no_bus_load_because: Option<&'static str>,
 }
 
 /// The JSON object.
@@ -205,17 +208,24 @@ impl ChannelSummary {
             channel,
             frames: meter.frames(),
             lost: meter.lost(),
+            lost_at_least: meter.lost_at_least(),
             bus_errors: meter.bus_errors(),
             frames_per_s: meter.frames_per_s().map(|rate| rounded(rate, 1)),
             bus_load_pct: meter.bus_load_pct().map(|load| rounded(load, 2)),
+            no_bus_load_because: meter.no_bus_load_because(),
         }
     }
 
-    /// One line, leaving out what is unknown.
+    /// One line; what is unknown has its reason.
     fn line(&self) -> String {
-        let Self { channel, frames, lost, bus_errors, frames_per_s, bus_load_pct } = self;
+        let Self { channel, frames, lost, bus_errors, frames_per_s, bus_load_pct, .. } = self;
+        let lost = lost_frames(*lost, self.lost_at_least);
         let rate = frames_per_s.map_or_else(String::new, |rate| format!(", {rate} frames/s"));
-        let load = bus_load_pct.map_or_else(String::new, |load| format!(", bus load {load} %"));
+        let load = match (bus_load_pct, self.no_bus_load_because) {
+            (Some(load), _) => format!(", bus load {load} %"),
+            (None, Some(reason)) => format!(", bus load – ({reason})"),
+            (None, None) => String::new(),
+        };
         format!("channel {channel}: {frames} frames{rate}{load}, {lost} lost, {bus_errors} bus errors")
     }
 }

@@ -9,25 +9,27 @@ use cantap_columns::parquet::Key;
 use crate::args;
 use crate::completion;
 use crate::databases::DatabaseArgs;
-use crate::input::ReadArgs;
+use crate::input::FollowArgs;
 use crate::live::LiveArgs;
 use crate::protocols::ProtocolArgs;
 
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
-    cantap decode --db car.dbc trace.log\n  \
-    cantap decode --db car.dbc --db 2:body.toml trace.asc --signal '*Speed' --signal 'Engine.*' --csv\n  \
-    candump -L can0 | cantap decode --db car.dbc - --json\n  \
-    cantap decode --db car.dbc trace.log --resample 100ms -o drive.csv\n  \
-    cantap decode --db car.dbc trace.log -o drive.parquet\n  \
-    cantap decode --db car.dbc -d /dev/ttyACM0 -b 500k\n  \
-    cantap decode workshop.log --protocols --csv\n\n\
-JSON lines are {\"time_s\", \"channel\", \"id\", \"message\", \"signals\": {NAME: NUMBER}}:\nseconds, channel from 1, \
-    identifier in hexadecimal (3 or 8 digits),\nphysical values (null where there is none: a float that is not a number, or J1939's error or not available).\n\
-With --details each signal is {\"value\", \"unit\", \"text\", \"raw\"}, without those that it does not have.\n\
-With --protocols, what was said has also protocol, from and to.\n\
-The last line is {\"summary\"}: how much there was, was decoded, and could not be read.")]
+                cantap decode --db car.dbc trace.log\n  \
+                cantap decode --db car.dbc --db 2:body.toml trace.asc --signal '*Speed' \\\n      \
+                --signal 'Engine.*' --csv\n  \
+                candump -L can0 | cantap decode --db car.dbc - --json\n  \
+                cantap decode --db car.dbc trace.log --resample 100ms -o drive.csv\n  \
+                cantap decode --db car.dbc trace.log -o drive.parquet\n  \
+                cantap decode --db car.dbc -d /dev/ttyACM0 -b 500k\n  \
+                cantap decode workshop.log --protocols --csv\n\n\
+                JSON lines are {\"time_s\", \"channel\", \"id\", \"message\", \"signals\": {NAME: NUMBER}}:\n\
+                seconds, channel from 1, identifier in hexadecimal (3 or 8 digits), physical values (null where there \
+                is none: a float that is not a number, or J1939's error or not available). With --details each signal \
+                is {\"value\", \"unit\", \"text\", \"raw\"}, without those that it does not have. With --protocols, \
+                what was said has also protocol, from and to. The last line is {\"summary\"}: how much there was, was \
+                decoded, and could not be read.")]
 pub struct Args {
     #[command(flatten)]
     pub databases: DatabaseArgs,
@@ -54,6 +56,9 @@ pub struct Args {
     /// One line of CSV per signal.
     #[arg(long, conflicts_with = "json")]
     pub csv: bool,
+    /// In CSV: an apostrophe in front of names and texts that begin with = + - @, which a spreadsheet would take for formulas.
+    #[arg(long, conflicts_with = "json")]
+    pub text_cells: bool,
     /// In CSV and Parquet: a column per signal and a line per frame. Written at the end of the trace.
     #[arg(long)]
     pub wide: bool,
@@ -81,5 +86,5 @@ pub struct Args {
     #[arg(short, long)]
     pub quiet: bool,
     #[command(flatten)]
-    pub read: ReadArgs,
+    pub read: FollowArgs,
 }

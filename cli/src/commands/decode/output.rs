@@ -12,6 +12,7 @@ use cantap_signals::Decoder;
 #[cfg(feature = "parquet")]
 use super::columns::{Long, PerMessage, WideFile};
 use super::command_line::Args;
+use super::csv::Cells;
 use super::decoded::Decoded;
 use super::wide::{Csv, Wide};
 use super::{csv, json, said, text};
@@ -86,7 +87,7 @@ enum To {
         json: bool,
         details: bool,
     },
-    Csv(Lines),
+    Csv(Lines, Cells),
     Wide(Box<Wide>, WideTo),
     #[cfg(feature = "parquet")]
     Long(Box<Long>),
@@ -95,7 +96,7 @@ enum To {
 }
 
 enum WideTo {
-    Csv(Lines),
+    Csv(Lines, Cells),
     #[cfg(feature = "parquet")]
     Parquet(WideFile),
 }
@@ -133,12 +134,15 @@ impl<'a> Output<'a> {
         let path = args.output.as_deref();
         let step_ns = args.resample.map(|step| i64::try_from(step.as_nanos()).unwrap_or(i64::MAX));
         let is_wide = args.wide || step_ns.is_some();
+        let cells = Cells { are_texts: args.text_cells };
         let to = match form {
-            Form::Csv if is_wide => To::Wide(Box::new(Wide::new(step_ns)?), WideTo::Csv(Lines::open(path)?)),
+            Form::Csv if is_wide => {
+                To::Wide(Box::new(Wide::new(step_ns)?), WideTo::Csv(Lines::open(path)?, cells))
+            }
             Form::Csv => {
                 let mut lines = Lines::open(path)?;
                 csv::write_header(&mut lines.out)?;
-                To::Csv(lines)
+                To::Csv(lines, cells)
             }
             Form::Text | Form::Json => {
                 To::Lines { lines: Lines::open(path)?, json: form == Form::Json, details: args.details }
@@ -167,7 +171,7 @@ impl<'a> Output<'a> {
         match &mut self.to {
             To::Lines { lines, json: true, details } => json::write(&mut lines.out, decoded, *details)?,
             To::Lines { lines, .. } => text::write(&mut lines.out, decoded)?,
-            To::Csv(lines) => csv::write(&mut lines.out, decoded)?,
+            To::Csv(lines, cells) => csv::write(&mut lines.out, decoded, *cells)?,
             To::Wide(wide, _) => wide.push(decoded)?,
             #[cfg(feature = "parquet")]
             To::Long(long) => long.push(self.decoder, decoded)?,
@@ -182,7 +186,7 @@ impl<'a> Output<'a> {
         match &mut self.to {
             To::Lines { lines, json: true, details } => said::json(&mut lines.out, event, *details)?,
             To::Lines { lines, .. } => said::text(&mut lines.out, event)?,
-            To::Csv(lines) => said::csv(&mut lines.out, event)?,
+            To::Csv(lines, cells) => said::csv(&mut lines.out, event, *cells)?,
             To::Wide(wide, _) => wide.push_said(event)?,
             #[cfg(feature = "parquet")]
             // Refused on the command line.
@@ -214,7 +218,7 @@ impl<'a> Output<'a> {
     /// Writes out what is waiting, if somebody may be reading along.
     pub fn flush(&mut self) -> anyhow::Result<()> {
         match &mut self.to {
-            To::Lines { lines, .. } | To::Csv(lines) => Ok(lines.out.flush()?),
+            To::Lines { lines, .. } | To::Csv(lines, _) => Ok(lines.out.flush()?),
             _ => Ok(()),
         }
     }
@@ -228,9 +232,9 @@ impl<'a> Output<'a> {
                 }
                 lines.finish()
             }
-            To::Csv(lines) => lines.finish(),
-            To::Wide(wide, WideTo::Csv(mut lines)) => {
-                wide.finish(&mut Csv(&mut lines.out))?;
+            To::Csv(lines, _) => lines.finish(),
+            To::Wide(wide, WideTo::Csv(mut lines, cells)) => {
+                wide.finish(&mut Csv(&mut lines.out, cells))?;
                 lines.finish()
             }
             #[cfg(feature = "parquet")]

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use cantap_protocols::{Event, Party, Value, naming};
 use cantap_trace::Interface;
 
-use super::csv::field as quoted;
+use super::csv::Cells;
 use super::decoded::Seconds;
 
 /// Whether a name is `name`, or `name_2` and so on: `spn_version` is not the second `spn`.
@@ -67,7 +67,7 @@ pub fn text(out: &mut impl Write, event: &Event) -> io::Result<()> {
 }
 
 /// A line per field; texts are in the last column.
-pub fn csv(out: &mut impl Write, event: &Event) -> io::Result<()> {
+pub fn csv(out: &mut impl Write, event: &Event, cells: Cells) -> io::Result<()> {
     for (name, value, unit, text) in fields(event) {
         let (number, own) = match &value {
             Value::Number(_) | Value::Real(_) => (value.to_string(), None),
@@ -82,10 +82,10 @@ pub fn csv(out: &mut impl Write, event: &Event) -> io::Result<()> {
             Seconds(event.time_ns),
             event.channel,
             sender(event),
-            quoted(&event.title),
+            cells.field(&event.title),
             event.protocol,
-            quoted(&unit),
-            quoted(&text.or(own).unwrap_or_default())
+            cells.field(&unit),
+            cells.field(&text.or(own).unwrap_or_default())
         )?;
     }
     Ok(())

@@ -9,10 +9,10 @@ use std::io::{self, BufRead, BufReader, BufWriter, Seek, Write};
 use anyhow::Context;
 use cantap_analysis::Cadence;
 use cantap_protocols::Event;
-use cantap_signals::MessageRef;
+use cantap_signals::{MessageRef, Reading};
 
-use super::csv::field;
-use super::decoded::{Decoded, Reading, Seconds};
+use super::csv::Cells;
+use super::decoded::{Decoded, Seconds};
 use super::said;
 
 /// Separates cells of a waiting line: it occurs in no number and no time.
@@ -218,14 +218,14 @@ pub trait Rows {
 }
 
 /// A table as CSV.
-pub struct Csv<W>(pub W);
+pub struct Csv<W>(pub W, pub Cells);
 
 impl<W: Write> Rows for Csv<W> {
     fn begin(&mut self, names_and_units: &[(String, String)]) -> anyhow::Result<()> {
         write!(self.0, "time")?;
         for (name, unit) in names_and_units {
             let unit = if unit.is_empty() { String::new() } else { format!(" [{unit}]") };
-            write!(self.0, ",{}", field(&format!("{name}{unit}")))?;
+            write!(self.0, ",{}", self.1.field(&format!("{name}{unit}")))?;
         }
         Ok(write!(self.0, "\r\n")?)
     }

@@ -134,7 +134,7 @@ impl Capture<'_> {
         let copied = self.copy();
         let counters = self.live.lines().lines().map(Line::counters);
         let lost = counters.map(|counters| Losses::of(&counters)).fold(Losses::default(), Losses::plus);
-        if lost.total() > 0 {
+        if lost.total() > 0 || lost.off_bus > 0 {
             // Wireshark shows these messages when the capture has ended.
             eprintln!("cantap: frames were lost, which is marked where they are missing: {}", lost.line());
         }

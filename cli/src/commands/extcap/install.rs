@@ -37,7 +37,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         (Some(folder), _) => folder.clone(),
         (None, Some(tshark)) => ask(tshark)?,
         (None, None) => bail!(
-            "tshark is not here to ask where Wireshark looks; install it, or name the folder with --folder \
+            "Wireshark's folder is unknown, since there is no tshark to query; install it, or name the folder with --folder \
              (in Wireshark: Help, About Wireshark, Folders, Personal Extcap path)"
         ),
     };
@@ -124,10 +124,13 @@ fn sees(tshark: &Path) -> Option<bool> {
 /// Whether the existing file is ours; an error if it is somebody else's.
 fn is_ours(place: &Path) -> anyhow::Result<bool> {
     let Ok(there) = place.symlink_metadata() else { return Ok(false) };
-    let is_ours = there.is_symlink() || fs::read_to_string(place).is_ok_and(|text| text.starts_with(MARK));
+    // A link to a program of this name, which may be gone or another version.
+    let is_link = || fs::read_link(place).is_ok_and(|to| to.file_stem().is_some_and(|name| name == "cantap"));
+    let is_batch = || fs::read_to_string(place).is_ok_and(|text| text.starts_with(MARK));
+    let is_ours = if there.is_symlink() { is_link() } else { is_batch() };
     anyhow::ensure!(
         is_ours,
-        "'{}' is there and is neither a link nor from here; move it away and try again",
+        "'{}' is there and is neither a link to cantap nor from here; move it away and try again",
         place.display()
     );
     Ok(true)
@@ -198,5 +201,13 @@ mod tests {
         assert!(is_ours(&place).unwrap_err().to_string().contains("move it away"));
         fs::write(&place, batch(Path::new("x"))).unwrap();
         assert!(is_ours(&place).unwrap());
+        #[cfg(unix)]
+        for (to, is_from_here) in
+            [("/usr/bin/cantap", true), ("/gone/cantap", true), ("/home/me/own-tool", false)]
+        {
+            fs::remove_file(&place).unwrap();
+            std::os::unix::fs::symlink(to, &place).unwrap();
+            assert_eq!(is_ours(&place).is_ok(), is_from_here, "{to}");
+        }
     }
 }

@@ -12,7 +12,8 @@ const LINK_TYPE: u16 = 227;
 
 /// Makes a text safe for a sentence: braces and line ends would end it.
 fn clean(text: &str) -> String {
-    text.chars().map(|char| if matches!(char, '{' | '}') || char.is_control() { ' ' } else { char }).collect()
+    let ends = |char| matches!(char, '{' | '}') || cantap_trace::clean::is_harmful(char);
+    text.chars().map(|char| if ends(char) { ' ' } else { char }).collect()
 }
 
 /// The interfaces, and the toolbar that they share.
@@ -121,8 +122,8 @@ mod tests {
         assert!(said.contains("dlt {number=227}{name=CAN_SOCKETCAN}"));
         // Only if somebody has to give the address.
         assert_eq!(said.matches("call=--device").count(), 1);
-        assert!(
-            said.contains("{value=listen}{display=listen only: send and acknowledge nothing}{default=true}")
-        );
+        assert!(said.contains(
+            "{value=listen-only}{display=listen only: send and acknowledge nothing}{default=true}"
+        ));
     }
 }

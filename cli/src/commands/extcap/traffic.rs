@@ -4,9 +4,10 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use cantap::{TraceEvent, TraceRecord};
-use cantap_trace::names::{LOSS_STAGES, name};
+use cantap_trace::LossStage;
 
 use super::toolbar::{Control, Screen};
+use cantap_work::lost_frames;
 
 /// The traffic, by channel number.
 #[derive(Default)]
@@ -45,8 +46,8 @@ impl Traffic {
                 channel.lost += u64::from(count);
                 channel.is_at_least |= at_least;
                 if channel.losses.len() < MOST_LISTED {
-                    let place = stage.map_or("", |stage| name(&LOSS_STAGES, &stage));
-                    let count = amount(u64::from(count), at_least);
+                    let place = stage.map_or("", LossStage::name);
+                    let count = lost_frames(u64::from(count), at_least);
                     channel.losses.push(format!("{count} lost ({place})"));
                 } else {
                     channel.unlisted += u64::from(count);
@@ -86,14 +87,10 @@ impl Traffic {
 
     fn lost(&self) -> String {
         let lost = |(number, channel): (&u8, &OfChannel)| {
-            format!("{number}: {}", amount(channel.lost, channel.is_at_least))
+            format!("{number}: {}", lost_frames(channel.lost, channel.is_at_least))
         };
         self.channels.iter().map(lost).collect::<Vec<_>>().join("  ")
     }
-}
-
-fn amount(count: u64, is_at_least: bool) -> String {
-    if is_at_least { format!("at least {count}") } else { count.to_string() }
 }
 
 #[cfg(test)]
@@ -122,6 +119,9 @@ mod tests {
         traffic.push(&record(TraceEvent::GAP));
         assert_eq!(traffic.load(Duration::from_secs(1)), "1: 0 %  2: 0 %");
         assert_eq!(traffic.lost(), "1: at least 5  2: 0");
+        let mut gap = Traffic::default();
+        gap.push(&record(TraceEvent::GAP));
+        assert_eq!(gap.lost(), "1: an unknown number");
     }
 
     fn frame_bits(event: &TraceEvent) -> u32 {

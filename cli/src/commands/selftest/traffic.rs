@@ -2,12 +2,12 @@
 
 use std::time::{Duration, Instant};
 
-use anyhow::bail;
 use cantap::device::Records;
 use cantap::transmit::Stream;
 use cantap::{Channel, Device, Direction, Frame, Id, TraceEvent, TraceFrame, TraceRecord, bits_on_bus};
 use serde_json::{Value, json};
 
+use super::patience::check;
 use cantap_work::interrupt;
 use cantap_work::rounded;
 
@@ -196,13 +196,12 @@ pub fn exchange(
         number += 1;
         take(&mut stream, records, &mut flows, &mut moved);
     }
+    check()?;
     stream.flush()?;
     while stream.under_way() > 0 && moved.elapsed() < PATIENCE {
+        check()?;
         stream.wait(Duration::from_millis(20))?;
         take(&mut stream, records, &mut flows, &mut moved);
-    }
-    if interrupt::requested() {
-        bail!("it was ended from outside");
     }
     for channel in Channel::ALL {
         device.close_channel(channel)?;
@@ -210,7 +209,11 @@ pub fn exchange(
     take(&mut stream, records, &mut flows, &mut moved);
     let after = device.counters();
     for flow in &mut flows {
-        let lost = |counters: &cantap::device::Counters| counters.channels[flow.to.index()].lost();
+        // Nothing is proved for the time in which the device was off the bus.
+        let lost = |counters: &cantap::device::Counters| {
+            let of = &counters.channels[flow.to.index()];
+            of.lost() + of.off_bus
+        };
         flow.lost = lost(&after) - lost(&before);
         flow.failed += number.saturating_sub(flow.sent + flow.failed);
     }

@@ -5,6 +5,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use cantap_address::Address;
 use cantap_analysis::stats::{Statistics, Window};
+use cantap_trace::filter::Filter;
 
 use super::table::remarks;
 use super::windows::Windows;
@@ -36,6 +37,7 @@ pub(super) fn open(
 /// fails.
 pub(super) fn run(
     shown: bool,
+    filters: &[Filter],
     live: &mut LiveRecords,
     statistics: &mut Statistics,
     windows: &mut Option<Windows>,
@@ -48,12 +50,13 @@ pub(super) fn run(
             windows.push(window);
         }
     };
-    let ended = listen(live, statistics, known, &mut keep);
+    let ended = listen(filters, live, statistics, known, &mut keep);
     statistics.finish_with(&mut keep);
     ended
 }
 
 fn listen(
+    filters: &[Filter],
     live: &mut LiveRecords,
     statistics: &mut Statistics,
     known: &mut Option<Known>,
@@ -61,6 +64,9 @@ fn listen(
 ) -> anyhow::Result<()> {
     let mut batch = Vec::new();
     while live.next_batch(&mut batch)? {
+        if !filters.is_empty() {
+            batch.retain(|record| filters.iter().any(|filter| filter.accepts(record)));
+        }
         for record in &batch {
             statistics.push_with(record, &mut *keep);
         }
@@ -106,7 +112,16 @@ impl Lines {
 }
 
 fn line(window: &Window, colour: bool) -> String {
-    let load = window.load_pct.unwrap_or(0.0);
+    let figures = format!(
+        "channel {} {:>7.0} frames/s {:>8.0} bit/s",
+        window.channel,
+        window.frames_per_s(),
+        window.bits_per_s(),
+    );
+    let remarks = remarks(window.errors, window.lost, window.incomplete);
+    let Some(load) = window.load_pct else {
+        return format!("{figures} {:>5} %{remarks}", '–');
+    };
     let filled = (load * BAR_COLUMNS as f64 / 100.0).round() as usize;
     let bar: String = "X".repeat(filled.min(BAR_COLUMNS));
     let (on, off) = match load {
@@ -115,11 +130,5 @@ fn line(window: &Window, colour: bool) -> String {
         50.0.. => ("\x1b[33m", "\x1b[0m"),
         _ => ("\x1b[32m", "\x1b[0m"),
     };
-    let text = format!(
-        "channel {} {:>7.0} frames/s {:>8.0} bit/s {load:>5.1} % |{on}{bar:.<BAR_COLUMNS$}{off}|",
-        window.channel,
-        window.frames_per_s(),
-        window.bits_per_s(),
-    );
-    text + &remarks(window.errors, window.lost, window.incomplete)
+    format!("{figures} {load:>5.1} % |{on}{bar:.<BAR_COLUMNS$}{off}|{remarks}")
 }

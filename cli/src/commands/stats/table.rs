@@ -1,10 +1,12 @@
 //! Statistics as text for people.
 
+use cantap_trace::{BusErrorKind, LossStage};
 use std::fmt::Write as _;
 
 use cantap_analysis::stats::{ChannelSummary, IdSummary, PeakSummary, Summary};
 
 use crate::missing::Missing;
+use cantap_work::lost_frames;
 
 /// The whole text, for a terminal of at least eighty columns.
 pub(super) fn text(summary: &Summary, missing: &Missing, per_id: bool) -> String {
@@ -17,7 +19,7 @@ pub(super) fn text(summary: &Summary, missing: &Missing, per_id: bool) -> String
         summary.duration_s,
         summary.channels.len(),
         if summary.channels.len() == 1 { "channel" } else { "channels" },
-        summary.lost,
+        lost_frames(summary.lost, summary.lost_at_least),
         summary.errors,
     );
     if let Some(words) = missing.in_words() {
@@ -75,6 +77,10 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
             out,
             "  load      unknown: frames switch to a data bit rate, which --data-bitrate gives (such as 2M)",
         );
+    } else if let (Some(_), None, Some(reason)) =
+        (channel.bitrate, &channel.load, channel.no_bus_load_because)
+    {
+        let _ = writeln!(out, "  load      –: {reason}");
     }
     if let Some(load) = &channel.load {
         let percent = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.3} %"));
@@ -107,13 +113,13 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
     let errors = &channel.errors;
     if errors.total > 0 {
         let kinds = [
-            (errors.stuff, "stuff"),
-            (errors.form, "form"),
-            (errors.acknowledgment, "acknowledgment"),
-            (errors.bit_recessive, "bit recessive"),
-            (errors.bit_dominant, "bit dominant"),
-            (errors.crc, "CRC"),
-            (errors.unknown, "of unknown kind"),
+            (errors.stuff, BusErrorKind::Stuff.name()),
+            (errors.form, BusErrorKind::Form.name()),
+            (errors.acknowledgment, BusErrorKind::Acknowledgment.name()),
+            (errors.bit_recessive, BusErrorKind::BitRecessive.name()),
+            (errors.bit_dominant, BusErrorKind::BitDominant.name()),
+            (errors.crc, BusErrorKind::Crc.name()),
+            (errors.unknown, "unknown"),
             (errors.suppressed, "not reported one by one"),
         ];
         let _ = writeln!(out, "  errors    {}: {}", errors.total, listed(&kinds));
@@ -121,17 +127,24 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
     let lost = &channel.lost;
     if lost.gaps > 0 {
         let stages = [
-            (lost.controller, "in the controller"),
-            (lost.queue, "in the device's queue"),
-            (lost.link, "on the way to the host"),
-            (lost.host, "in the host"),
-            (lost.unknown, "somewhere"),
+            (lost.controller, LossStage::Controller.name()),
+            (lost.queue, LossStage::Queue.name()),
+            (lost.link, LossStage::Link.name()),
+            (lost.host, LossStage::Host.name()),
+            (lost.unknown, "unknown"),
         ];
         let places = if lost.gaps == 1 { "1 place".to_owned() } else { format!("{} places", lost.gaps) };
         let _ = match (lost.total, lost.at_least) {
             // For example while a device was gone.
             (0, _) => writeln!(out, "  lost      an unknown number at {places}"),
-            (total, true) => writeln!(out, "  lost      at least {total} at {places}: {}", listed(&stages)),
+            (total, true) => {
+                let _ = write!(out, "  lost      at least {total} at {places}: {}", listed(&stages));
+                match lost.uncounted {
+                    0 => writeln!(out),
+                    1 => writeln!(out, ", and an unknown number at one of them"),
+                    uncounted => writeln!(out, ", and an unknown number at {uncounted} of them"),
+                }
+            }
             (total, false) => writeln!(out, "  lost      {total} at {places}: {}", listed(&stages)),
         };
     }

@@ -3,12 +3,14 @@
 use cantap::wire::message::Mode;
 use cantap_address::{Address, AddressError};
 use cantap_analysis::stats::Statistics;
+use ratatui::crossterm::event::KeyCode;
 
 use super::super::model::{LOAD_WINDOW, Model};
 use super::super::order::Order;
 use super::super::plan::Plan;
 use super::line::PromptKind;
 use super::state::App;
+use crate::advice;
 use crate::channel_bitrate::ChannelBitrate;
 
 impl App {
@@ -21,12 +23,18 @@ impl App {
         }
     }
 
-    /// The answer to whether to take part: only a clear yes counts.
-    pub(super) fn answer_normal(&mut self, text: &str) {
-        if matches!(text.to_ascii_lowercase().as_str(), "y" | "yes") {
-            self.set_mode(Mode::Normal);
-        } else {
-            "it stays listen-only".clone_into(&mut self.message);
+    /// The answer to whether to take part: one key. Only a clear yes counts, and what is neither yes nor no is asked again.
+    pub(super) fn answer_normal(&mut self, code: KeyCode) {
+        match code {
+            KeyCode::Char('y' | 'Y') => {
+                self.prompt = None;
+                self.set_mode(Mode::Normal);
+            }
+            KeyCode::Char('n' | 'N') | KeyCode::Esc | KeyCode::Enter => {
+                self.prompt = None;
+                "it stays listen-only".clone_into(&mut self.message);
+            }
+            _ => {}
         }
     }
 
@@ -62,6 +70,16 @@ impl App {
         let mut plan = plan.clone();
         plan.set_bit_rates(rates);
         plan.open.timing.check_channels(plan.addresses.len()).map_err(|error| error.to_string())?;
+        // A device that runs is not given up for what it would refuse.
+        for (board, device) in model.seen.devices.iter().enumerate() {
+            let timing = plan.open.timing.on_board(board);
+            for channel in plan.channels_of(board) {
+                let request = timing.request(channel).map_err(|error| error.to_string())?;
+                if let (Some(request), Some(can_clock_hz)) = (request, device.can_clock_hz) {
+                    request.resolve(can_clock_hz).map_err(|error| advice::told(&error))?;
+                }
+            }
+        }
         self.open(plan, model)
     }
 

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use cantap::Frame;
 use cantap_signals::encode;
+use cantap_trace::grammar;
 
 use super::super::model::Model;
 use crate::args::MOST_CHANNELS;
@@ -35,15 +36,14 @@ pub fn parse_entry(text: &str, model: &Model) -> Result<SendEntry, String> {
         return Err("a period must be longer than nothing, such as 100ms".to_owned());
     }
     let (channel, what) = match what.split_once(':') {
-        Some((number, what))
-            if number.parse().is_ok_and(|number: u8| (1..=MOST_CHANNELS).contains(&number)) =>
-        {
-            (number.parse().ok(), what)
-        }
-        _ => (None, what),
+        Some((number, rest)) => match grammar::channel(number).filter(|number| *number <= MOST_CHANNELS) {
+            Some(number) => (Some(number), rest),
+            None => (None, what),
+        },
+        None => (None, what),
     };
     let (frame, of_database) = if what.contains('#') {
-        (what.parse::<Frame>().map_err(|error| error.to_string())?, None)
+        (grammar::frame(what)?, None)
     } else {
         let encoded =
             encode::encode(model.seen.signals.decoder(), channel, what).map_err(|error| error.to_string())?;

@@ -19,6 +19,8 @@ const WHEEL_ROWS: usize = 3;
 impl App {
     /// Handles a key.
     pub fn key(&mut self, key: KeyEvent, model: &mut Model) -> Flow {
+        // A message that promised it only ends with any key; a key pressed for that must do nothing else.
+        let only_ends = std::mem::take(&mut self.any_key_continues) || self.search.is_some();
         self.message.clear();
         self.search = None;
         // Anyone who presses a key has read it.
@@ -28,11 +30,18 @@ impl App {
             (KeyCode::Char('j'), KeyModifiers::CONTROL) => KeyEvent::from(KeyCode::Enter),
             _ => key,
         };
-        if key.modifiers.intersects(KeyModifiers::CONTROL | KeyModifiers::ALT) {
+        if key.modifiers.contains(KeyModifiers::CONTROL) {
             return self.key_with_control(key);
+        }
+        // On a slow line, Escape and a key typed after it look the same as that key with Alt. Neither is any command's key.
+        if key.modifiers.contains(KeyModifiers::ALT) {
+            return Flow::GoOn;
         }
         if self.prompt.is_some() {
             self.prompt_key(key.code, model);
+            return Flow::GoOn;
+        }
+        if only_ends && !matches!(key.code, KeyCode::Char('h')) {
             return Flow::GoOn;
         }
         if self.help {
@@ -42,12 +51,10 @@ impl App {
                 KeyCode::Down => self.help_first += 1,
                 KeyCode::PageUp => self.help_first = self.help_first.saturating_sub(page),
                 KeyCode::PageDown => self.help_first += page,
+                // It says that any key closes it: none does more.
                 _ => self.help = false,
             }
-            if self.help {
-                return Flow::GoOn;
-            }
-            return if key.code == KeyCode::Char('q') { Flow::Quit } else { Flow::GoOn };
+            return Flow::GoOn;
         }
         match key.code {
             KeyCode::Char('q') => return Flow::Quit,
@@ -106,7 +113,7 @@ impl App {
         match (key.code, &mut self.prompt) {
             (KeyCode::Char('c'), _) => return Flow::Quit,
             (KeyCode::Char('z'), _) => return Flow::Suspend,
-            (KeyCode::Char('u'), Some(prompt)) => prompt.line.clear(),
+            (KeyCode::Char('u'), Some(prompt)) if prompt.kind != PromptKind::Normal => prompt.line.clear(),
             _ => {}
         }
         Flow::GoOn

@@ -7,13 +7,25 @@ use ratatui::crossterm::event::KeyCode;
 pub struct Line {
     text: Vec<char>,
     place: usize,
+    /// The whole text was suggested, and nothing was typed yet: the first character replaces it.
+    suggested: bool,
 }
 
 impl Line {
     /// This text, with the cursor at its end.
     pub fn new(text: &str) -> Self {
         let text: Vec<char> = text.chars().collect();
-        Self { place: text.len(), text }
+        Self { place: text.len(), text, suggested: false }
+    }
+
+    /// This text as a suggestion: Enter takes it, a character replaces it, and moving the cursor makes it text to edit.
+    pub fn suggested(text: &str) -> Self {
+        Self { suggested: !text.is_empty(), ..Self::new(text) }
+    }
+
+    /// Whether the next character replaces the whole text.
+    pub const fn is_suggested(&self) -> bool {
+        self.suggested
     }
 
     /// The whole text.
@@ -30,6 +42,7 @@ impl Line {
     /// Replaces the text before the cursor.
     pub fn replace_before(&mut self, text: &str) {
         let behind = self.text.split_off(self.place);
+        self.suggested = false;
         self.text = text.chars().collect();
         self.place = self.text.len();
         self.text.extend(behind);
@@ -42,6 +55,10 @@ impl Line {
 
     /// Handles an editing key; others do nothing.
     pub fn key(&mut self, code: KeyCode) {
+        let replaces = matches!(code, KeyCode::Char(_) | KeyCode::Backspace | KeyCode::Delete);
+        if std::mem::take(&mut self.suggested) && replaces {
+            self.clear();
+        }
         match code {
             KeyCode::Char(character) => {
                 self.text.insert(self.place, character);
@@ -120,5 +137,20 @@ mod tests {
         assert_eq!(line.text(), "23#11!");
         line.clear();
         assert_eq!(line, Line::default());
+    }
+
+    #[test]
+    fn what_is_suggested_is_replaced_by_typing_and_kept_by_moving() {
+        let after = |codes: &[KeyCode]| {
+            let mut line = Line::suggested("1:500000");
+            codes.iter().for_each(|code| line.key(*code));
+            line.text()
+        };
+        assert_eq!(after(&[]), "1:500000");
+        assert_eq!(after(&[KeyCode::Char('2'), KeyCode::Char('5')]), "25");
+        assert_eq!(after(&[KeyCode::Backspace]), "");
+        assert_eq!(after(&[KeyCode::Delete, KeyCode::Char('x')]), "x");
+        assert_eq!(after(&[KeyCode::End, KeyCode::Char('1')]), "1:5000001");
+        assert_eq!(after(&[KeyCode::Left, KeyCode::Backspace]), "1:50000");
     }
 }

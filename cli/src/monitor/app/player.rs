@@ -113,18 +113,8 @@ impl App {
 fn since_start(text: &str) -> Result<i64, String> {
     const FORM: &str =
         "write a time since the beginning, such as 90s, 1:30 or 1:02:03, or a share, such as 50%";
-    let parts: Vec<_> = text.split(':').collect();
-    let [whole @ .., last] = &parts[..] else { return Err(FORM.to_owned()) };
-    if whole.is_empty() {
-        let duration = args::duration(last).map_err(|_| FORM.to_owned())?;
-        return Ok(i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX));
-    }
-    let number = |text: &str| text.parse::<f64>().ok().filter(|number| (0.0..1e6).contains(number));
-    let mut seconds = 0.0;
-    for part in parts.iter().take(3) {
-        seconds = seconds * 60.0 + number(part).ok_or_else(|| FORM.to_owned())?;
-    }
-    if parts.len() > 3 { Err(FORM.to_owned()) } else { Ok((seconds * 1e9) as i64) }
+    let duration = args::duration(text).map_err(|_| FORM.to_owned())?;
+    Ok(i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX))
 }
 
 #[cfg(test)]

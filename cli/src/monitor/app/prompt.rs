@@ -17,6 +17,7 @@ use super::state::{App, Direction, View};
 impl App {
     pub(super) fn prompt_key(&mut self, code: KeyCode, model: &mut Model) {
         match (code, &mut self.prompt) {
+            (code, Some(Prompt { kind: PromptKind::Normal, .. })) => self.answer_normal(code),
             (KeyCode::Esc, _) => self.prompt = None,
             (KeyCode::Tab, Some(Prompt { kind: PromptKind::Send, line, .. })) => {
                 let (before, _) = line.halves();
@@ -60,10 +61,8 @@ impl App {
             PromptKind::Send => parse_entry(text, model).map(|entry| self.put_entry(prompt.entry, entry)),
             PromptKind::BitRate => self.set_bit_rates(text, model),
             PromptKind::Device => self.set_device(text, model),
-            PromptKind::Normal => {
-                self.answer_normal(text);
-                Ok(())
-            }
+            // It is answered by one key.
+            PromptKind::Normal => Ok(()),
         };
         if let Err(reason) = result {
             self.message = reason;

@@ -156,6 +156,8 @@ pub struct App {
     pub prompt: Option<Prompt>,
     /// A message to show once, such as an error in what was typed.
     pub message: String,
+    /// The message as last drawn is longer than its line, lies over the page, and says that any key continues.
+    pub any_key_continues: bool,
     /// Times to return to, in order.
     pub bookmarks: Vec<i64>,
     /// The position of the file's bar, as last drawn.
@@ -237,6 +239,7 @@ impl App {
             help_first: 0,
             prompt: None,
             message: String::new(),
+            any_key_continues: false,
             bookmarks: Vec::new(),
             bar: None,
             file: None,
@@ -264,7 +267,7 @@ impl App {
     }
 
     pub(super) fn ask(&mut self, kind: PromptKind, text: &str) {
-        self.prompt = Some(Prompt { kind, line: Line::new(text), entry: None });
+        self.prompt = Some(Prompt { kind, line: Line::suggested(text), entry: None });
     }
 
     /// Pauses the display, or resumes it.

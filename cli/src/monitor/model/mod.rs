@@ -70,10 +70,14 @@ pub struct Playing {
 }
 
 /// A recording in progress.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Recording {
-    /// The file.
+    /// The file. It does not exist while a condition has not come true.
     pub path: String,
+    /// The condition around whose events records are written, if that is not all of them.
+    pub condition: Option<String>,
+    /// How often the condition came true.
+    pub events: u64,
     /// Records written.
     pub records: u64,
     /// Size of the file according to the system, in bytes.
@@ -97,6 +101,8 @@ pub struct DeviceFigures {
     pub name: String,
     /// How often it was opened again after an absence.
     pub reconnects: u32,
+    /// The clock from which its bit timing is made, in hertz; `None` before its first session.
+    pub can_clock_hz: Option<u32>,
 }
 
 /// What the pages show besides the trace. While the display is paused, they show a copy of it.

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use cantap::{Direction, TraceEvent, TraceFrame, TraceRecord};
 use cantap_signals::{Alarm, Decoder, MessageRef, Selection, SelectionError, Signal, SignalValue};
 
+use super::super::cut::cut;
 use super::series::{BLOCK_BYTES, Series};
 
 /// Limit for rows; more than fit on any screen.
@@ -280,7 +281,7 @@ impl SignalTable {
         if let Some(indicator) = message.indicator(signal, raw) {
             return signal.text(raw).unwrap_or(indicator.name()).to_owned();
         }
-        let number = signal.number(raw).for_people();
+        let number = signal.for_people(signal.number(raw));
         match signal.text(raw) {
             Some(text) => format!("{number} ({text})"),
             None => format!("{number} {}", signal.unit).trim_end().to_owned(),
@@ -313,13 +314,13 @@ impl SignalTable {
             || signal.text(row.raw).is_some()
             || row.value.is_nan()
         {
-            return text.chars().take(columns).collect();
+            return cut(&text, columns);
         }
         let room = columns.saturating_sub(signal.unit.chars().count() + 1);
         let fits = |text: &String| text.chars().count() <= room;
         let rounded = (0..=6).rev().map(|decimals| format!("{:.decimals$}", row.value)).find(fits);
         let number = rounded.unwrap_or_else(|| format!("{:.1e}", row.value));
-        format!("{number} {}", signal.unit).chars().take(columns).collect()
+        cut(&format!("{number} {}", signal.unit), columns)
     }
 
     /// The alarm that a row's value raises, if any.

@@ -209,6 +209,7 @@ impl Source<'_> {
             queue_bytes: hello.queue_bytes,
             name,
             reconnects: reconnects + line.gaps().count,
+            can_clock_hz: Some(hello.can_clock_hz),
             ..DeviceFigures::default()
         };
         model.source = SourceState::Running;

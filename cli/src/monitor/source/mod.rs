@@ -18,6 +18,7 @@ use super::model::Model;
 use super::order::Order;
 use super::plan::Plan;
 use super::recorder::Recorder;
+use crate::advice;
 
 /// The model, shared by the source thread and the display.
 pub type Shared = Arc<Mutex<Model>>;
@@ -86,8 +87,16 @@ impl Source<'_> {
         match Recorder::create(path, &decoder) {
             Ok(recorder) => {
                 self.recorder = Some(recorder);
-                self.notice(format!("recording to {}", path.display()));
                 self.show_recording();
+                let armed = lock(self.model)
+                    .recording
+                    .as_ref()
+                    .is_some_and(|recording| recording.condition.is_some());
+                self.notice(if armed {
+                    format!("armed: {}", path.display())
+                } else {
+                    format!("recording to {}", path.display())
+                });
             }
             Err(error) => self.notice(error.to_string()),
         }
@@ -102,9 +111,12 @@ impl Source<'_> {
         }
     }
 
-    fn recording_failed(&mut self, error: &std::io::Error) {
+    fn recording_failed(&mut self, error: &anyhow::Error) {
         self.stop_recording();
-        self.notice(format!("recording ended: {error}; check the disk's free space"));
+        self.notice(match error.downcast_ref::<std::io::Error>() {
+            Some(error) => format!("recording ended: {error}; check the disk's free space"),
+            None => format!("recording ended: {}", advice::sentence(error)),
+        });
     }
 
     fn show_recording(&mut self) {
@@ -113,7 +125,7 @@ impl Source<'_> {
         };
         match recorder.state() {
             Ok(state) => lock(self.model).recording = Some(state),
-            Err(error) => self.recording_failed(&error),
+            Err(error) => self.recording_failed(&error.into()),
         }
     }
 

@@ -80,12 +80,13 @@ fn a_long_search_goes_on_between_drawings_and_can_be_stopped() {
     for _ in 0..5 {
         app.catch_up(&mut model);
     }
-    assert_eq!((app.cursor, app.message.as_str()), (Some(1001), ""));
+    // It stopped, and did nothing else.
+    assert_eq!((app.cursor, app.message.as_str()), (Some(1000), ""));
     press(&mut app, &mut model, "N");
     for _ in 0..5 {
         app.catch_up(&mut model);
     }
-    assert_eq!((app.cursor, app.message.as_str()), (Some(1001), "'7AB' was not found"));
+    assert_eq!((app.cursor, app.message.as_str()), (Some(1000), "'7AB' was not found"));
 }
 
 #[test]
@@ -95,7 +96,7 @@ fn nothing_is_sent_while_listening_only_and_the_way_out_is_shown() {
     press(&mut app, &mut model, "a123#11 100ms\n\n ");
     assert_eq!(app.message, "listen-only: nothing is sent; press m to take part in the bus");
     assert!(orders.try_recv().is_err());
-    press(&mut app, &mut model, "my\n");
+    press(&mut app, &mut model, "my");
     assert!(matches!(orders.try_recv().unwrap(), Order::Open(plan) if plan.mode() == Mode::Normal));
     press(&mut app, &mut model, "\n");
     assert!(matches!(orders.try_recv().unwrap(), Order::Send(1, _)));
@@ -240,7 +241,7 @@ fn while_the_display_stands_still_rows_can_be_hidden_and_values_do_not_move() {
 fn an_entry_that_is_edited_while_it_is_sent_changes_on_the_bus() {
     let mut model = model();
     let (mut app, orders) = app(View::Send);
-    press(&mut app, &mut model, "my\na123#11 100ms\n ");
+    press(&mut app, &mut model, "mya123#11 100ms\n ");
     assert!(matches!(orders.try_recv().unwrap(), Order::Open(_)));
     assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(1, 0, Some(_))));
     // To the other channel: it must end on the first one.
@@ -276,6 +277,12 @@ fn a_letter_with_control_is_not_that_letter() {
         assert_eq!(flow == Flow::Quit, letter == 'c');
     }
     assert!(app.prompt.is_none() && orders.try_recv().is_err());
+    // On a slow line, Escape and a letter arrive like this.
+    let taken = model.seen.taken;
+    for letter in ['q', 'c', 'm', 'r', 'A', 'd', 'z'] {
+        assert_eq!(app.key(KeyEvent::new(KeyCode::Char(letter), KeyModifiers::ALT), &mut model), Flow::GoOn);
+    }
+    assert!(app.prompt.is_none() && orders.try_recv().is_err() && model.seen.taken == taken);
     let z = KeyEvent::new(KeyCode::Char('z'), KeyModifiers::CONTROL);
     assert_eq!(app.key(z, &mut model), Flow::Suspend);
 }
@@ -292,18 +299,18 @@ fn nothing_takes_part_in_a_bus_that_was_not_asked_for_just_now() {
         orders.try_iter().map(plan).collect()
     };
     // It asks, and anything but a yes is a no.
-    for no in ["mn\n", "m\n", "mm\n"] {
+    for no in ["mn", "m\n", "mm\n", "mxn"] {
         press(&mut app, &mut model, no);
         assert_eq!((modes(), app.message.as_str()), (Vec::new(), "it stays listen-only"), "{no}");
     }
-    press(&mut app, &mut model, "my\n");
+    press(&mut app, &mut model, "my");
     assert_eq!(modes(), [Mode::Normal]);
     // With other bit rates or another device, it only listens, and says so.
     for other in ["b", "D"] {
         press(&mut app, &mut model, &format!("{other}\n"));
         assert_eq!(modes(), [Mode::ListenOnly], "{other}");
         assert!(app.message.starts_with("listen-only now"), "{}", app.message);
-        press(&mut app, &mut model, "my\n");
+        press(&mut app, &mut model, "my");
         assert_eq!(modes(), [Mode::Normal]);
     }
     // Leaving the bus needs no confirmation.
@@ -333,4 +340,45 @@ fn another_device_is_not_opened_at_the_bit_rates_of_the_one_before() {
     let plan = opened();
     assert!(!plan.open.timing.is_given() && plan.mode() == Mode::ListenOnly, "{plan:?}");
     assert_eq!(plan.channels, [1, 2]);
+}
+
+/// The device knows its clock: what it would refuse is refused before it is left.
+#[test]
+fn an_impossible_bit_rate_does_not_give_up_a_device_that_runs() {
+    let mut model = model();
+    model.seen.devices = vec![super::DeviceFigures { can_clock_hz: Some(36_000_000), ..Default::default() }];
+    let (mut app, orders) = app(View::Fixed);
+    press(&mut app, &mut model, "b1:999999\n");
+    assert!(app.message.contains("947368 and 1000000"), "{}", app.message);
+    assert_eq!(app.prompt.as_ref().unwrap().line.text(), "1:999999");
+    assert!(orders.try_recv().is_err());
+    app.key(KeyEvent::new(KeyCode::Char('u'), KeyModifiers::CONTROL), &mut model);
+    press(&mut app, &mut model, "1:125k\n");
+    assert!(matches!(orders.try_recv().unwrap(), Order::Open(_)));
+}
+
+#[test]
+fn a_key_that_was_pressed_to_continue_does_nothing_else() {
+    let mut model = model();
+    let (mut app, orders) = app(View::Trace);
+    app.message = "a message that is far too long for one line of this screen ".repeat(2);
+    let text = screen_text(&mut app, &model, (60, 20)).unwrap();
+    assert!(text.contains("any key continues"), "{text}");
+    assert_eq!(app.key(KeyEvent::from(KeyCode::Char('q')), &mut model), Flow::GoOn);
+    assert!(!screen_text(&mut app, &model, (60, 20)).unwrap().contains("any key continues"));
+    // A short one has made no promise.
+    app.message = "short".to_owned();
+    screen_text(&mut app, &model, (60, 20)).unwrap();
+    press(&mut app, &mut model, "3");
+    assert_eq!(app.view, View::Signals);
+    press(&mut app, &mut model, "hq");
+    assert!(!app.help && orders.try_recv().is_err());
+    // What stays as long as it is true takes no key.
+    model.source = super::SourceState::Gone(
+        "the device is gone for a reason that needs more room than there is".to_owned(),
+    );
+    let text = screen_text(&mut app, &model, (60, 20)).unwrap();
+    assert!(!text.contains("any key continues"), "{text}");
+    press(&mut app, &mut model, "1");
+    assert_eq!(app.view, View::Trace);
 }

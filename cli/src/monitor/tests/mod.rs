@@ -203,6 +203,7 @@ fn check_page(view: View) {
             records: 6002,
             bytes: 48_213,
             since_ns: model.first_ns.unwrap(),
+            ..Recording::default()
         });
     }
     for size in SIZES {

@@ -158,7 +158,7 @@ fn absolute_times_are_times_of_day() {
 fn the_second_line_tells_mode_rates_errors_and_bus_off_as_far_as_there_is_room() {
     let mut model = model();
     let (mut app, _orders) = app(View::Fixed);
-    press(&mut app, &mut model, "my\n");
+    press(&mut app, &mut model, "my");
     let state = TraceEvent::State { state: ErrorState::BusOff, counters: None };
     model.take(&[TraceRecord { time_ns: model.seen.now_ns, channel: 1, event: state }]);
     let wide = screen(&mut app, &model, (160, 24)).unwrap();

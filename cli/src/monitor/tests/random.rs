@@ -128,8 +128,13 @@ fn happen(random: &mut fastrand::Rng, model: &mut Model, now_ns: &mut i64) {
         8 => {
             let path = "x".repeat(random.usize(..300));
             let since_ns = random.i64(..);
-            model.recording =
-                random.bool().then(|| Recording { path, records: 1, bytes: random.u64(..), since_ns });
+            model.recording = random.bool().then(|| Recording {
+                path,
+                records: 1,
+                bytes: random.u64(..),
+                since_ns,
+                ..Recording::default()
+            });
         }
         _ => model.advance(now_ns.saturating_sub(random.i64(..2_000_000_000))),
     }

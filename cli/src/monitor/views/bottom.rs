@@ -7,11 +7,13 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::{Clear, Paragraph};
 
 use super::super::app::{App, Prompt, PromptKind, View};
+use super::super::cut::cut_line;
 use super::super::model::{Model, SourceState};
 use super::super::theme::Theme;
 
 /// Draws it, and any text too long for it over the end of `body`.
-pub fn draw(frame: &mut Frame<'_>, body: Rect, bottom: Rect, app: &App, model: &Model) {
+pub fn draw(frame: &mut Frame<'_>, body: Rect, bottom: Rect, app: &mut App, model: &Model) {
+    app.any_key_continues = false;
     let width = usize::from(bottom.width);
     let line = if let Some(prompt) = &app.prompt {
         let hint = if app.message.is_empty() { question(prompt.kind) } else { app.message.as_str() };
@@ -19,15 +21,16 @@ pub fn draw(frame: &mut Frame<'_>, body: Rect, bottom: Rect, app: &App, model: &
         input(prompt, width)
     } else {
         match said(app, model) {
-            Some(said) if said.chars().count() + 1 > width => {
-                over(frame, body, &said);
-                Line::from(" any key continues, h helps")
+            Some(Said { text, passes }) if text.chars().count() + 1 > width => {
+                over(frame, body, &text);
+                app.any_key_continues = passes;
+                Line::from(if passes { " any key continues, h helps" } else { " h help  q quit" })
             }
-            Some(said) => Line::from(format!(" {said}")),
+            Some(Said { text, .. }) => Line::from(format!(" {text}")),
             None => Line::from(format!(" {}", keys(app, model, width.saturating_sub(1)))),
         }
     };
-    frame.render_widget(Paragraph::new(line).style(Theme::bar()), bottom);
+    frame.render_widget(Paragraph::new(cut_line(line, width)).style(Theme::bar()), bottom);
 }
 
 /// Draws a text over the page's last lines, using as many as it needs.
@@ -77,13 +80,20 @@ fn wrapped(text: &str, width: usize) -> Vec<String> {
 /// The input line, scrolled so that its cursor is visible.
 fn input(prompt: &Prompt, width: usize) -> Line<'static> {
     let (before, behind) = prompt.line.halves();
+    // As selected text looks elsewhere.
+    let before_style = if prompt.line.is_suggested() {
+        Style::new().remove_modifier(Modifier::REVERSED)
+    } else {
+        Style::new()
+    };
     let hidden = (before.chars().count() + 4).saturating_sub(width);
     let before: String = before.chars().skip(hidden).collect();
     let mut behind = behind.chars();
     // The cursor is a block, or an underscore at the end.
     let cursor = behind.next().map_or("_".to_owned(), String::from);
     Line::from(vec![
-        Span::raw(format!(" > {before}")),
+        Span::raw(" > "),
+        Span::styled(before, before_style),
         Span::styled(cursor, Style::new().add_modifier(Modifier::UNDERLINED | Modifier::BOLD)),
         Span::raw(behind.collect::<String>()),
     ])
@@ -116,21 +126,27 @@ fn question(kind: PromptKind) -> &'static str {
     }
 }
 
+/// A message.
+struct Said {
+    text: String,
+    /// Whether the next key removes it; otherwise it stays as long as it is true.
+    passes: bool,
+}
+
 /// The message to show, if any.
-fn said(app: &App, model: &Model) -> Option<String> {
-    if !app.message.is_empty() {
-        return Some(app.message.clone());
-    }
-    match (&model.source, &model.unread) {
-        (SourceState::Gone(reason), _) if model.notice.is_empty() => Some(reason.clone()),
-        (SourceState::Gone(reason), _) => Some(format!("{}; {reason}", model.notice)),
-        _ if !model.notice.is_empty() => Some(model.notice.clone()),
+fn said(app: &App, model: &Model) -> Option<Said> {
+    let (text, passes) = match (&model.source, &model.unread) {
+        _ if !app.message.is_empty() => (app.message.clone(), true),
+        (SourceState::Gone(reason), _) if model.notice.is_empty() => (reason.clone(), false),
+        (SourceState::Gone(reason), _) => (format!("{}; {reason}", model.notice), false),
+        _ if !model.notice.is_empty() => (model.notice.clone(), true),
         (_, Some((count, first))) if app.view == View::Statistics => {
             let places = if *count == 1 { "place" } else { "places" };
-            Some(format!("{count} {places} could not be read and are left out, the first: {first}"))
+            (format!("{count} {places} could not be read and are left out, the first: {first}"), false)
         }
-        _ => None,
-    }
+        _ => return None,
+    };
+    Some(Said { text, passes })
 }
 
 /// As many of the page's keys, which are two blanks apart, as fit.

@@ -1,6 +1,7 @@
 //! One row per identifier, with what changes highlighted.
 
 use std::collections::HashSet;
+use std::fmt::Write as _;
 
 use cantap_signals::MessageRef;
 use ratatui::Frame;
@@ -15,21 +16,44 @@ use super::super::theme::Theme;
 use super::list::list;
 use super::signals::{alarm, in_line};
 
-/// With at least this many columns, there is room for the characters and the rows' signals beside the data.
-const LEAST_WITH_CHARACTERS: u16 = 100;
 /// With at least this many columns, there is room for the rows' signals beside the data.
 const LEAST_WITH_SIGNALS: u16 = 120;
-/// The columns' headings, with their sort column, their width, and whether they are left-aligned.
-const COLUMNS: [(&str, Option<Column>, usize, bool); 9] = [
-    ("C", None, 1, true),
-    ("ID", Some(Column::Id), 9, false),
-    ("Count", Some(Column::Count), 9, false),
-    ("Period ms", Some(Column::Period), 10, false),
-    ("Jitter", Some(Column::Jitter), 9, false),
-    ("L", None, 1, true),
-    ("Data", Some(Column::Time), 23, true),
-    ("ASCII", None, 8, true),
-    ("Name", Some(Column::Name), usize::MAX, true),
+/// A column of the page.
+struct Heading {
+    title: &'static str,
+    /// The column by which a click sorts.
+    sorts: Option<Column>,
+    /// Number of characters; the last column takes the rest.
+    width: usize,
+    left: bool,
+    /// It is shown if the screen has at least this many columns. On a narrow one, the data are more important than the rest.
+    from: u16,
+}
+
+impl Heading {
+    const fn new(title: &'static str, sorts: Option<Column>, width: usize, from: u16) -> Self {
+        Self { title, sorts, width, left: false, from }
+    }
+
+    const fn left(title: &'static str, sorts: Option<Column>, width: usize, from: u16) -> Self {
+        Self { title, sorts, width, left: true, from }
+    }
+}
+
+const COUNT: Heading = Heading::new("Count", Some(Column::Count), 9, 50);
+const PERIOD: Heading = Heading::new("Period ms", Some(Column::Period), 10, 60);
+const JITTER: Heading = Heading::new("Jitter", Some(Column::Jitter), 9, 70);
+const CHARACTERS: Heading = Heading::left("ASCII", None, 8, 100);
+const COLUMNS: [Heading; 9] = [
+    Heading::left("C", None, 1, 0),
+    Heading::new("ID", Some(Column::Id), 9, 0),
+    COUNT,
+    PERIOD,
+    JITTER,
+    Heading::left("L", None, 1, 0),
+    Heading::left("Data", Some(Column::Time), 23, 0),
+    CHARACTERS,
+    Heading::left("Name", Some(Column::Name), usize::MAX, 0),
 ];
 
 /// A line of the page.
@@ -44,8 +68,6 @@ enum Entry<'a> {
 pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, seen: &Seen) {
     let rows = sorted(app, model, seen);
     let hidden = seen.table.rows().len() - rows.len();
-    let ascii = area.width >= LEAST_WITH_CHARACTERS;
-    let beside = area.width >= LEAST_WITH_SIGNALS;
     let mut entries = Vec::with_capacity(rows.len());
     app.fixed_order.clear();
     for row in rows {
@@ -58,18 +80,20 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
             entries.extend(signals.into_iter().map(Entry::Signal));
         }
     }
-    let heading = heading(app, seen, ascii, hidden);
+    let heading = heading(app, seen, area.width, hidden);
     list(frame, area, app, heading, entries.len(), |index, app| match &entries[index] {
-        Entry::Row(row) => line(row, ascii, beside, app, seen),
+        Entry::Row(row) => line(row, area.width, app, seen),
         Entry::Signal(signal) => signal_line(signal, app.theme),
     });
 }
 
 /// The headings; the positions of those that sort are recorded for clicks.
-fn heading(app: &mut App, seen: &Seen, ascii: bool, hidden: usize) -> Line<'static> {
+fn heading(app: &mut App, seen: &Seen, screen: u16, hidden: usize) -> Line<'static> {
     let mut text = String::new();
     app.sort_columns.clear();
-    for (title, sorts, width, left) in COLUMNS.into_iter().filter(|(title, ..)| ascii || *title != "ASCII") {
+    for Heading { title, sorts, width, left, .. } in
+        COLUMNS.into_iter().filter(|column| screen >= column.from)
+    {
         let title = format!("{title}{}", arrow(app, sorts));
         let start = text.chars().count();
         let width = if width == usize::MAX { title.chars().count() } else { width };
@@ -164,21 +188,20 @@ fn name<'a>(row: &Row, seen: &'a Seen) -> &'a str {
     decoder.find(row.channel, row.frame.id()).map_or("", |message| &decoder.message(message).name)
 }
 
-fn line(row: &Row, ascii: bool, beside: bool, app: &App, seen: &Seen) -> Line<'static> {
+fn line(row: &Row, screen: u16, app: &App, seen: &Seen) -> Line<'static> {
     let theme = app.theme;
     let base = if row.mark > 0 { theme.series(usize::from(row.mark) - 1) } else { Style::new() };
     let period = row.period_ns.map_or("–".to_owned(), |ns| format!("{:.3}", ns / 1e6));
     let jitter = row.period_ns.map_or(String::new(), |_| format!("{:.3}", row.jitter_ns / 1e6));
-    let mut spans = vec![Span::styled(
-        format!(
-            "{} {:>9} {:>9} {period:>10} {jitter:>9} {} ",
-            row.channel,
-            row.frame.id().to_string(),
-            row.count,
-            if row.frame.is_remote() { "R".to_owned() } else { row.frame.dlc().to_string() },
-        ),
-        base,
-    )];
+    let mut start = format!("{} {:>9} ", row.channel, row.frame.id().to_string());
+    for (column, text) in [(COUNT, row.count.to_string()), (PERIOD, period), (JITTER, jitter)] {
+        if screen >= column.from {
+            // Writing to a String cannot fail.
+            let _ = write!(start, "{text:>width$} ", width = column.width);
+        }
+    }
+    let length = if row.frame.is_remote() { "R".to_owned() } else { row.frame.dlc().to_string() };
+    let mut spans = vec![Span::styled(format!("{start}{length} "), base)];
     let data = row.frame.data();
     for (index, byte) in data.iter().enumerate() {
         for (digit, value) in [(2 * index, byte >> 4), (2 * index + 1, byte & 0xF)] {
@@ -192,10 +215,11 @@ fn line(row: &Row, ascii: bool, beside: bool, app: &App, seen: &Seen) -> Line<'s
         spans.push(Span::raw(" "));
     }
     let room = 3 * 8_usize.saturating_sub(data.len());
-    let characters = if ascii { format!("{:<8} ", printable(data)) } else { String::new() };
+    let characters =
+        if screen >= CHARACTERS.from { format!("{:<8} ", printable(data)) } else { String::new() };
     spans.push(Span::raw(format!("{:room$}{characters}", "")));
     spans.push(Span::styled(name(row, seen).to_owned(), base));
-    if beside {
+    if screen >= LEAST_WITH_SIGNALS {
         spans.extend(in_line(&seen.signals.in_frame(row.channel, &row.frame), theme));
     }
     Line::from(spans)

@@ -3,9 +3,10 @@
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::text::Line;
-use ratatui::widgets::{Block, Clear, Paragraph};
+use ratatui::widgets::{Block, Clear};
 
 use super::super::app::App;
+use super::super::cut::draw_lines;
 use super::super::theme::Theme;
 
 /// Every key; `tests/help.rs` checks these against the keys that are handled.
@@ -51,5 +52,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App) {
     let title =
         if hidden > 0 { " Keys; ↑ ↓ show more, any key closes " } else { " Keys, any key closes " };
     let block = Block::bordered().title(title).title_style(Theme::heading());
-    frame.render_widget(Paragraph::new(lines).block(block), place);
+    let inner = block.inner(place);
+    frame.render_widget(block, place);
+    draw_lines(frame, inner, lines);
 }

@@ -3,9 +3,9 @@
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::text::Line;
-use ratatui::widgets::Paragraph;
 
 use super::super::app::{App, first_row};
+use super::super::cut::draw_lines;
 use super::super::theme::Theme;
 
 /// A number of bytes for display.
@@ -36,5 +36,5 @@ pub fn list(
         let line = row(index, app);
         lines.push(if index == app.selected { line.style(Theme::bar()) } else { line });
     }
-    frame.render_widget(Paragraph::new(lines), area);
+    draw_lines(frame, area, lines);
 }

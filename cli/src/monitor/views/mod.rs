@@ -21,6 +21,7 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::{Paragraph, Wrap};
 
 use super::app::{App, View};
+use super::cut::cut_line;
 use super::model::Model;
 use super::theme::Theme;
 
@@ -42,7 +43,7 @@ pub fn draw(frame: &mut Frame<'_>, app: &mut App, model: &Model) {
         Constraint::Length(1),
     ])
     .areas(area);
-    frame.render_widget(Paragraph::new(tabs(app)).style(Theme::bar()), top);
+    frame.render_widget(Paragraph::new(cut_line(tabs(app), top.width.into())).style(Theme::bar()), top);
     state::draw(frame, state, app, model);
     // While the display is paused, the pages show what had been seen then.
     let frozen = app.frozen.take();
@@ -85,7 +86,8 @@ fn make_ascii(buffer: &mut Buffer) {
             "↓" => "v",
             "×" => "x",
             "µ" => "u",
-            "…" => ".",
+            // A point after a digit would be a decimal one.
+            "…" => "~",
             "•" => "*",
             _ => "?",
         };

@@ -3,9 +3,9 @@
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::text::Line;
-use ratatui::widgets::Paragraph;
 
 use super::super::app::App;
+use super::super::cut::draw_lines;
 use super::super::model::{Model, Seen};
 use super::super::theme::Theme;
 use crate::protocols::about;
@@ -50,5 +50,5 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
     lines.extend(tail);
     let most = lines.len().saturating_sub(rows);
     app.selected = app.selected.min(most);
-    frame.render_widget(Paragraph::new(lines.split_off(app.selected)), area);
+    draw_lines(frame, area, lines.split_off(app.selected));
 }

@@ -6,6 +6,7 @@ use ratatui::text::Line;
 use ratatui::widgets::{Paragraph, Wrap};
 
 use super::super::app::App;
+use super::super::cut::draw_lines;
 use super::super::model::Seen;
 use super::list::list;
 
@@ -22,7 +23,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
             app.theme.label(),
         ),
     };
-    frame.render_widget(Paragraph::new(Line::styled(text, style)), state);
+    draw_lines(frame, state, vec![Line::styled(text, style)]);
     if app.send.is_empty() {
         let database = if seen.signals.has_database() { ", or Message:Signal=value,…" } else { "" };
         let text = format!("The list is empty. a adds a frame, such as 123#DEADBEEF 100ms{database}.");

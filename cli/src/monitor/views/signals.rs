@@ -1,6 +1,6 @@
 //! Live values of decoded signals, with extremes, alarms and the recent past.
 
-use cantap_signals::Alarm;
+use cantap_signals::{Alarm, Number};
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::style::Style;
@@ -8,6 +8,7 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::{Paragraph, Wrap};
 
 use super::super::app::{App, SignalColumn};
+use super::super::cut::cut;
 use super::super::model::{Decoded, Model, Seen, SignalRow};
 use super::super::theme::Theme;
 use super::list::list;
@@ -32,7 +33,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
     if places.is_empty() {
         app.signal_order.clear();
         let text = if !app.signals.filter.text().is_empty() && !rows.is_empty() {
-            "No signal is as the condition says; F changes it."
+            "No signal matches the condition; F changes it."
         } else if !rows.is_empty() {
             "The filter hides all signals; f changes it."
         } else if seen.signals.has_database() {
@@ -156,13 +157,14 @@ fn line(row: &SignalRow, name_columns: usize, app: &App, seen: &Seen) -> Line<'s
     let full = seen.signals.full_name(row);
     let name =
         if app.signals.grouped || full.chars().count() > name_columns { label.into_owned() } else { full };
-    let name: String = name.chars().take(name_columns).collect();
+    let name = cut(&name, name_columns);
     let value = seen.signals.short_text(row, 21);
+    let extreme = |value: f64| short(signal.for_people(Number::Real(value)).as_f64());
     Line::from(vec![
         Span::raw(if row.series.is_some() { "* " } else { "  " }),
         Span::raw(format!("{} {name:<name_columns$} ", row.channel)),
         Span::styled(format!("{value:>21}{arrow}"), style),
-        Span::styled(format!(" {:>10} {:>10} ", short(row.min), short(row.max)), theme.label()),
+        Span::styled(format!(" {:>10} {:>10} ", extreme(row.min), extreme(row.max)), theme.label()),
         Span::styled(spark(row, seen.now_ns, theme.unicode), theme.series(0)),
     ])
 }

@@ -10,9 +10,9 @@ use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::style::Style;
 use ratatui::text::{Line, Span};
-use ratatui::widgets::Paragraph;
 
 use super::super::app::{App, View};
+use super::super::cut::draw_lines;
 use super::super::model::{Model, Playing, SourceState};
 use super::super::theme::Theme;
 use super::super::times::duration;
@@ -53,7 +53,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
             app.bar = Some(Rect { x: area.x + start as u16, width: columns as u16, ..area });
         }
     }
-    frame.render_widget(Paragraph::new(Line::from(spans)), area);
+    draw_lines(frame, area, vec![Line::from(spans)]);
 }
 
 fn width(spans: &[Span<'_>]) -> usize {
@@ -112,11 +112,18 @@ fn line(app: &App, model: &Model, detail: Detail, most_address: usize) -> Vec<Sp
     }
     let (lost, or_more) = model.seen.lost();
     if lost > 0 || or_more {
-        let more = if or_more { "+" } else { "" };
-        spans.push(Span::styled(format!("  lost {lost}{more}"), theme.loss()));
+        let lost = match (lost, or_more) {
+            // As while the device was off the bus.
+            (0, _) => "?".to_owned(),
+            (lost, or_more) => format!("{lost}{}", if or_more { "+" } else { "" }),
+        };
+        spans.push(Span::styled(format!("  lost {lost}"), theme.loss()));
     }
     if let Some(recording) = &model.recording {
-        spans.push(Span::styled(format!("  REC {}", bytes(recording.bytes)), theme.error()));
+        spans.push(match &recording.condition {
+            Some(_) if recording.events == 0 => Span::styled("  ARMED", theme.loss()),
+            _ => Span::styled(format!("  REC {}", bytes(recording.bytes)), theme.error()),
+        });
     }
     if app.frozen.is_some() {
         spans.push(Span::styled("  PAUSED", Theme::heading()));

@@ -8,9 +8,9 @@ use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout, Rect};
 use ratatui::style::Style;
 use ratatui::text::{Line, Span};
-use ratatui::widgets::Paragraph;
 
 use super::super::app::{App, TimeMode};
+use super::super::cut::draw_lines;
 use super::super::event_text::{event_text, hex, lost, printable};
 use super::super::model::Model;
 use super::super::theme::Theme;
@@ -49,18 +49,23 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
     let top = bottom.saturating_sub(rows).max(first);
     let (used, most) = history.memory();
     let width = usize::from(area.width);
-    let columns =
-        format!("{:>17} C   {:>8} T L {:<23} {:<8} Name", time_heading(app.time_mode), "ID", "Data", "ASCII");
+    let columns = Columns::of(width);
+    let heading = match columns.time {
+        0 => String::new(),
+        time => format!("{:>time$} ", time_heading(app.time_mode)),
+    };
+    let characters = if columns.characters { format!("{:<8} ", "ASCII") } else { String::new() };
+    let heading = format!("{heading}C   {:>8} T L {:<23} {characters}Name", "ID", "Data");
     let memory = format!("{} of {}", bytes(used as u64), bytes(most as u64));
-    let room = width.saturating_sub(columns.chars().count() + memory.chars().count());
-    let heading = if room > 1 { format!("{columns}{:room$}{memory}", "") } else { columns };
+    let room = width.saturating_sub(heading.chars().count() + memory.chars().count());
+    let heading = if room > 1 { format!("{heading}{:room$}{memory}", "") } else { heading };
     let mut lines = vec![Line::styled(heading, Theme::heading())];
     for number in top..bottom {
         let Some(record) = history.get(number) else {
             continue;
         };
         let before = number.checked_sub(1).and_then(|number| history.get(number));
-        let mut line = line(&record, before.as_ref(), app, model);
+        let mut line = line(&record, before.as_ref(), columns, app, model);
         if area.width >= LEAST_WITH_SIGNALS
             && let Some(frame) = record.frame()
         {
@@ -68,7 +73,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
         }
         lines.push(if app.cursor == Some(number) { line.style(Theme::bar()) } else { line });
     }
-    frame.render_widget(Paragraph::new(lines), area);
+    draw_lines(frame, area, lines);
 }
 
 /// The signals of the selected record, or of the newest, below the page; returns the rest of the area.
@@ -80,7 +85,7 @@ fn opened(frame: &mut Frame<'_>, area: Rect, app: &App, model: &Model) -> Rect {
         match (&of_frame, record) {
             (Some((record, frame)), _) => {
                 let name = model.seen.signals.name_of(record).unwrap_or("in no database");
-                Line::from(format!("{} {}  {name}", record.channel, frame.id()))
+                Line::from(format!("{} {}  {name}  {}", record.channel, frame.id(), clock(record.time_ns, 6)))
             }
             (None, Some(record)) => Line::from(event_text(&record.event)),
             (None, None) => Line::from("nothing is selected"),
@@ -99,8 +104,40 @@ fn opened(frame: &mut Frame<'_>, area: Rect, app: &App, model: &Model) -> Rect {
     }
     let height = (lines.len() as u16).min(area.height / 2);
     let [rest, place] = Layout::vertical([Constraint::Min(1), Constraint::Length(height)]).areas(area);
-    frame.render_widget(Paragraph::new(lines), place);
+    draw_lines(frame, place, lines);
     rest
+}
+
+/// What there is room for: on a narrow screen the data are more important than the time.
+#[derive(Clone, Copy)]
+struct Columns {
+    /// For times; none if it is 0.
+    time: usize,
+    /// Whether data are also shown as characters.
+    characters: bool,
+}
+
+impl Columns {
+    /// Columns up to the end of eight data bytes, without a time.
+    const WITH_DATA: usize = 40;
+    /// Columns for a time with microseconds, and with milliseconds.
+    const TIMES: [usize; 2] = [17, 10];
+
+    fn of(width: usize) -> Self {
+        let time = Self::TIMES.into_iter().find(|time| width > Self::WITH_DATA + time).unwrap_or(0);
+        Self { time, characters: width >= Self::WITH_DATA + Self::TIMES[0] + 10 }
+    }
+
+    /// A time with a blank after it.
+    fn time_text(self, time: &str) -> String {
+        let columns = self.time;
+        match columns {
+            0 => String::new(),
+            _ if columns == Self::TIMES[0] => format!("{time:>columns$} "),
+            // Without the microseconds.
+            _ => format!("{:>columns$} ", &time[..time.len() - 3]),
+        }
+    }
 }
 
 fn time_heading(mode: TimeMode) -> &'static str {
@@ -111,7 +148,13 @@ fn time_heading(mode: TimeMode) -> &'static str {
     }
 }
 
-fn line(record: &TraceRecord, before: Option<&TraceRecord>, app: &App, model: &Model) -> Line<'static> {
+fn line(
+    record: &TraceRecord,
+    before: Option<&TraceRecord>,
+    columns: Columns,
+    app: &App,
+    model: &Model,
+) -> Line<'static> {
     let theme = app.theme;
     let since = |ns: i64| seconds(record.time_ns.saturating_sub(ns));
     let time = match app.time_mode {
@@ -119,21 +162,23 @@ fn line(record: &TraceRecord, before: Option<&TraceRecord>, app: &App, model: &M
         TimeMode::Relative => since(model.first_ns.unwrap_or(0)),
         TimeMode::Delta => since(before.map_or(record.time_ns, |before| before.time_ns)),
     };
-    let start = format!("{time:>17} {} ", record.channel);
+    let start = format!("{}{} ", columns.time_text(&time), record.channel);
     let TraceEvent::Frame { frame, direction, late } = record.event else {
         let text = format!("{start}{}", event_text(&record.event));
         return Line::styled(text, event_style(&record.event, theme));
     };
     let sent = direction == cantap::Direction::Tx;
     let mut text = format!(
-        "{start}{} {:>8} {} {} {:<23} {:<8} ",
+        "{start}{} {:>8} {} {} {:<23} ",
         if sent { 'T' } else { 'R' },
         frame.id().to_string(),
         if frame.is_remote() { 'R' } else { 'D' },
         frame.dlc(),
         hex(frame.data()),
-        printable(frame.data()),
     );
+    if columns.characters {
+        let _ = write!(text, "{:<8} ", printable(frame.data()));
+    }
     text.push_str(model.seen.signals.name_of(record).unwrap_or_default());
     if late {
         text.push_str(" (or earlier)");

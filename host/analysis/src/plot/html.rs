@@ -68,7 +68,7 @@ fn quoted(text: &str) -> String {
             '"' | '\\' | '<' | '>' | '&' | '\u{2028}' | '\u{2029}' => {
                 let _ = write!(out, "\\u{:04x}", character as u32);
             }
-            character if character.is_control() => {}
+            character if cantap_trace::clean::is_harmful(character) => {}
             character => out.push(character),
         }
     }

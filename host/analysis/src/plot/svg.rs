@@ -91,7 +91,7 @@ pub(super) fn escaped(text: &str) -> String {
             '>' => out.push_str("&gt;"),
             '"' => out.push_str("&quot;"),
             '\'' => out.push_str("&#39;"),
-            character if character.is_control() => {}
+            character if cantap_trace::clean::is_harmful(character) => {}
             character => out.push(character),
         }
     }

@@ -1,6 +1,6 @@
 //! Statistics of one channel.
 
-use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
+use cantap_can::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 
 use super::ids::{IdStatistics, Ids};
 use super::windows::{Window, Windows, per_second};
@@ -100,6 +100,8 @@ pub struct Losses {
     pub unknown: u64,
     /// Places in the trace where frames are missing.
     pub gaps: u64,
+    /// Those of them at which it is unknown how many, because the device was not on the bus, or not there.
+    pub uncounted: u64,
     /// Whether there may be more: hardware cannot count the frames lost in an overrun.
     pub at_least: bool,
 }
@@ -203,6 +205,7 @@ impl ChannelStatistics {
                     None => self.losses.unknown += u64::from(count),
                 }
                 self.losses.gaps += 1;
+                self.losses.uncounted += u64::from(count == 0 && at_least);
                 self.losses.at_least |= at_least;
                 self.windows.lost(u64::from(count));
             }

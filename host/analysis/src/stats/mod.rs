@@ -33,6 +33,8 @@ pub struct Options {
     pub channel_data_bitrate_bps: Vec<(u8, u32)>,
     /// Channels, from 1, whose frames came without data or times: they have no load, whatever their bit rate.
     pub without_load: Vec<u8>,
+    /// Channels, from 1, of which only some frames came, because a filter in the device kept the others back: they have no load either.
+    pub filtered: Vec<u8>,
     /// Length of a window.
     pub window: Duration,
     /// How many of the busiest windows are kept.
@@ -48,6 +50,7 @@ impl Default for Options {
             data_bitrate_bps: None,
             channel_data_bitrate_bps: Vec::new(),
             without_load: Vec::new(),
+            filtered: Vec::new(),
             window: SECOND,
             peaks: 5,
         }
@@ -58,6 +61,14 @@ impl Options {
     /// The bit rate of a channel, if known.
     pub fn bitrate_of(&self, channel: u8) -> Option<u32> {
         of_channel(&self.channel_bitrate_bps, channel).or(self.bitrate_bps)
+    }
+
+    /// Why a channel has no load whatever its bit rate, if so.
+    pub(super) fn why_without_load(&self, channel: u8) -> Option<&'static str> {
+        if self.filtered.contains(&channel) {
+            return Some("a filter kept frames back");
+        }
+        self.without_load.contains(&channel).then_some("frames came without data or without times")
     }
 
     /// The bit rate of a channel's data phases, if known.
@@ -130,7 +141,7 @@ impl Statistics {
             return Err(BadOptions::ZeroBitrate);
         }
         // Without any bit rate, the minimum window is that of the fastest bus.
-        let bitrate_bps = slowest.unwrap_or(cantap_wire::timing::MAX_BITRATE_BPS);
+        let bitrate_bps = slowest.unwrap_or(cantap_can::timing::MAX_BITRATE_BPS);
         let shortest_ns = match fastest_data {
             Some(_) => windows::shortest_fd_window_ns(bitrate_bps),
             None => shortest_window_ns(bitrate_bps),
@@ -183,7 +194,7 @@ impl Statistics {
             record.channel,
             bitrate,
             self.options.data_bitrate_of(record.channel),
-            !self.options.without_load.contains(&record.channel),
+            self.options.why_without_load(record.channel).is_none(),
             origin_ns,
             self.window_ns,
             self.options.peaks,

@@ -1,6 +1,6 @@
 //! Statistics as plain values: what `cantap stats --json` prints.
 
-use cantap_wire::record::{BusErrorKind, ErrorState, LossStage};
+use cantap_can::{BusErrorKind, ErrorState, LossStage};
 use serde::{Deserialize, Serialize};
 
 use super::{ChannelStatistics, IdStatistics, Statistics, Window};
@@ -12,6 +12,8 @@ pub struct Summary {
     pub frames: u64,
     /// Frames known to be missing on all channels.
     pub lost: u64,
+    /// Whether there may be more on one of them.
+    pub lost_at_least: bool,
     /// Errors on all channels.
     pub errors: u64,
     /// End of the trace's first frame, in seconds since the Unix epoch, or since the trace's start.
@@ -79,6 +81,8 @@ pub struct ChannelSummary {
     pub bits_per_s: f64,
     /// Mean work load in per cent.
     pub bus_load_pct: Option<f64>,
+    /// If it is not known, the reason.
+    pub no_bus_load_because: Option<&'static str>,
     /// More about the load; `None` without a bit rate.
     pub load: Option<LoadSummary>,
     /// The busiest windows, the busiest first.
@@ -168,6 +172,8 @@ pub struct LossSummary {
     pub unknown: u64,
     /// Places in the trace where frames are missing.
     pub gaps: u64,
+    /// Those of them at which it is unknown how many: the device was not on the bus, or not there.
+    pub uncounted: u64,
     /// Whether there may be more.
     pub at_least: bool,
 }
@@ -227,7 +233,10 @@ impl Summary {
         let mut channels: Vec<_> = statistics
             .channels()
             .iter()
-            .map(|channel| ChannelSummary::of(channel, statistics.window_ns))
+            .map(|channel| {
+                let why_without_load = statistics.options.why_without_load(channel.number);
+                ChannelSummary::of(channel, statistics.window_ns, why_without_load)
+            })
             .collect();
         channels.sort_by_key(|channel| channel.channel);
         let spans = || statistics.channels().iter().filter_map(|channel| channel.span_ns);
@@ -238,6 +247,7 @@ impl Summary {
         Self {
             frames: channels.iter().map(|channel| channel.frames).sum(),
             lost: channels.iter().map(|channel| channel.lost.total).sum(),
+            lost_at_least: channels.iter().any(|channel| channel.lost.at_least),
             errors: channels.iter().map(|channel| channel.errors.total).sum(),
             first_s: first.map(seconds),
             last_s: last.map(seconds),
@@ -252,7 +262,7 @@ impl Summary {
 }
 
 impl ChannelSummary {
-    fn of(channel: &ChannelStatistics, window_ns: u64) -> Self {
+    fn of(channel: &ChannelStatistics, window_ns: u64, why_without_load: Option<&'static str>) -> Self {
         let mut ids: Vec<_> = channel.ids().collect();
         ids.sort_by_key(|id| (id.id.is_extended(), id.id.raw()));
         let step_ns = channel.coarse_step_ns();
@@ -292,26 +302,24 @@ impl ChannelSummary {
             bits: channel.bits,
             bits_per_s,
             bus_load_pct: load.and_then(|load| load.mean_pct),
+            no_bus_load_because: why_without_load.or_else(|| match (channel.bitrate_bps, load) {
+                (None, _) => Some("the bit rate is not known"),
+                (Some(_), None) => Some("frames switch to a data bit rate that is not known"),
+                (Some(_), Some(load)) => load
+                    .mean_pct
+                    .is_none()
+                    .then_some("there are no two frames between which nothing is missing"),
+            }),
             load,
             peaks: channel.peaks().map(PeakSummary::of).collect(),
             errors: ErrorSummary::of(&channel.errors),
             lost: LossSummary::of(&channel.losses),
-            state: channel.state.map(state_name),
+            state: channel.state.map(ErrorState::name),
             error_counters: channel.counters,
             transmit_failures: channel.transmit_failures,
             ids: ids.into_iter().map(|id| IdSummary::of(id, channel.bits)).collect(),
             unlisted_frames: channel.unlisted_frames(),
         }
-    }
-}
-
-/// The usual name of a fault confinement state.
-fn state_name(state: ErrorState) -> &'static str {
-    match state {
-        ErrorState::Active => "error-active",
-        ErrorState::Warning => "error-warning",
-        ErrorState::Passive => "error-passive",
-        ErrorState::BusOff => "bus-off",
     }
 }
 
@@ -359,6 +367,7 @@ impl LossSummary {
             host: losses.of(LossStage::Host),
             unknown: losses.unknown,
             gaps: losses.gaps,
+            uncounted: losses.uncounted,
             at_least: losses.at_least,
         }
     }

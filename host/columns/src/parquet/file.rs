@@ -50,8 +50,10 @@ impl<T: Table> ParquetFile<T> {
         let name = path.file_name().ok_or_else(|| io::Error::from(io::ErrorKind::InvalidFilename))?;
         let mut temporary = std::ffi::OsString::from(format!(".cantap-{}-", std::process::id()));
         temporary.push(name);
-        let temporary = Temporary(path.with_file_name(temporary));
-        let file = BufWriter::new(File::create(&temporary.0)?);
+        let temporary = path.with_file_name(temporary);
+        // In a common folder a stranger may have put a link there, which must be neither followed nor removed.
+        let file = BufWriter::new(File::create_new(&temporary)?);
+        let temporary = Temporary(temporary);
         let properties = WriterProperties::builder()
             .set_compression(Compression::ZSTD(ZstdLevel::try_new(ZSTD_LEVEL)?))
             .set_max_row_group_row_count(Some(GROUP_ROWS))

@@ -10,6 +10,7 @@ use super::super::found::Found;
 use super::super::input::{Input, MAX_ITEM_BYTES};
 use super::super::issue::{Fault, Place};
 use super::super::zone::Zone;
+use super::containers::{AHEAD_BYTES, Containers};
 use super::object::{Content, event, u16_at, u32_at, u64_at};
 use super::{
     BASE_HEADER_BYTES, CAN_MESSAGE, CAN_MESSAGE2, COMPRESSION_NONE, COMPRESSION_ZLIB, CONTAINER_FIELDS_BYTES,
@@ -30,6 +31,8 @@ pub(crate) struct Decoder {
     objects: Vec<u8>,
     at: usize,
     decompressor: Decompress,
+    /// What other cores have unpacked already.
+    ahead: Containers,
     /// A fault in the container whose objects are being read; reported after them.
     fault: Option<(Place, Fault)>,
     /// Offset of the container.
@@ -48,6 +51,7 @@ impl Default for Decoder {
             objects: Vec::new(),
             at: 0,
             decompressor: Decompress::new(true),
+            ahead: Containers::default(),
             fault: None,
             container: 0,
             loss_told: false,
@@ -246,6 +250,9 @@ impl Decoder {
                 self.fault = Some((place, Fault::malformed(expected, len.to_string().as_bytes())));
                 return Ok(true);
             }
+            if kind == LOG_CONTAINER && !input.may_wait() && self.ahead.is_due(offset) {
+                self.ahead.unpack(input.peek(AHEAD_BYTES)?, offset);
+            }
             let object = input.peek(len)?;
             let cut = object.len() < len;
             let object = &object[..object.len().min(len)];
@@ -259,12 +266,18 @@ impl Decoder {
                 let data = fields.get(CONTAINER_FIELDS_BYTES..).unwrap_or_default();
                 match u16_at(fields, 0) {
                     COMPRESSION_NONE => self.objects.extend_from_slice(data),
-                    COMPRESSION_ZLIB => {
-                        let expected_len = u32_at(fields, 8) as usize;
-                        if !inflate(&mut self.decompressor, data, expected_len, &mut self.objects) && !cut {
-                            fault = Some(Fault::malformed("a whole zlib stream", b"damaged bytes"));
+                    COMPRESSION_ZLIB => match self.ahead.take(offset) {
+                        Some(objects) if self.objects.is_empty() => self.objects = objects,
+                        Some(objects) => self.objects.extend_from_slice(&objects),
+                        None => {
+                            let expected_len = u32_at(fields, 8) as usize;
+                            let is_whole =
+                                inflate(&mut self.decompressor, data, expected_len, &mut self.objects);
+                            if !is_whole && !cut {
+                                fault = Some(Fault::malformed("a whole zlib stream", b"damaged bytes"));
+                            }
                         }
-                    }
+                    },
                     other => {
                         fault = Some(Fault::Unsupported(format!("compression method {other}").into()));
                     }

@@ -4,8 +4,8 @@ use super::channel::{Number, PlainNumber};
 use super::clock::Clock;
 use super::field::Place;
 use super::layout::{BusGroup, Bytes, Events};
+use cantap_can::Id;
 use cantap_trace::PlainFrame;
-use cantap_wire::Id;
 
 /// Where a record says its time.
 enum Time {

@@ -1,11 +1,10 @@
 //! The data of a group or channel: bytes in one block or many, plain or compressed.
 
-use std::io::Read;
-
 use super::super::issue::Fault;
 use super::super::whole::Whole;
 use super::blocks::{BLOCK_HEAD_BYTES, Block, u32_at, u64_at};
 use super::joined::{BEGIN_BYTES, begin};
+use super::unpack::{Packed, Unpacker};
 
 /// Plain data is read in pieces of this many bytes: they stay in the processor's cache until they have been gone through.
 const PIECE_BYTES: u64 = 1 << 18;
@@ -39,16 +38,6 @@ struct Piece {
     is_open: bool,
 }
 
-#[derive(Clone, Copy, Debug)]
-struct Packed {
-    /// Bytes in the file.
-    stored: u64,
-    /// 0 deflate, 2 zstd, 4 LZ4; the odd numbers are the same, transposed.
-    kind: u8,
-    /// Number of columns if transposed.
-    columns: u32,
-}
-
 /// A stream of bytes with random access, fast if the next position follows the last one.
 #[derive(Default)]
 pub(super) struct Stream {
@@ -68,6 +57,7 @@ pub(super) struct Stream {
     /// What was read last, and its position in the stream.
     buffer: Vec<u8>,
     buffer_start: u64,
+    unpacker: Unpacker,
 }
 
 impl Stream {
@@ -262,8 +252,17 @@ impl Stream {
             }
             let holds = self.pieces.partition_point(|piece| piece.start + piece.len <= loaded);
             let Some(piece) = self.pieces.get(holds).copied() else { return Ok(()) };
-            if let Some(packed) = piece.packed {
-                self.buffer.extend_from_slice(&unpack(file, piece, packed)?);
+            if piece.packed.is_some() {
+                let pieces = &self.pieces;
+                let block = |index: usize| {
+                    pieces.get(index).and_then(|piece| Some((piece.at, piece.len, piece.packed?)))
+                };
+                let bytes = self.unpacker.take(file, holds, block)?;
+                if self.buffer.is_empty() {
+                    self.buffer = bytes;
+                } else {
+                    self.buffer.extend_from_slice(&bytes);
+                }
             } else {
                 let within = loaded - piece.start;
                 let len = (piece.len - within).min(PIECE_BYTES);
@@ -288,44 +287,4 @@ impl Stream {
         self.len = self.buffer_start + self.buffer.len() as u64;
         self.next_file = Some(piece.at + (self.len - piece.start));
     }
-}
-
-/// Decompresses a whole piece.
-fn unpack(file: &mut Whole, piece: Piece, packed: Packed) -> Result<Vec<u8>, Fault> {
-    let stored = file.read_at(piece.at, packed.stored as usize)?;
-    let len = piece.len as usize;
-    let mut bytes = Vec::with_capacity(len.min(stored.len().saturating_mul(64)));
-    let source: Box<dyn Read> = match packed.kind & !1 {
-        0 => Box::new(flate2::read::ZlibDecoder::new(&stored[..])),
-        #[cfg(feature = "zstd")]
-        2 => Box::new(zstd::stream::read::Decoder::new(&stored[..])?),
-        #[cfg(not(feature = "zstd"))]
-        2 => return Err(crate::compression::without_zstd().into()),
-        _ => Box::new(lz4_flex::frame::FrameDecoder::new(&stored[..])),
-    };
-    let result = source.take(piece.len + 1).read_to_end(&mut bytes);
-    if result.is_err() || bytes.len() != len {
-        let found = format!("{} of {len} bytes", bytes.len());
-        let expected = format!("compressed data at {:#x}", piece.at);
-        return Err(Fault::malformed(expected, found.as_bytes()));
-    }
-    let columns = packed.columns as usize;
-    if packed.kind & 1 == 1 && columns > 1 {
-        bytes = exchange(&bytes, columns);
-    }
-    Ok(bytes)
-}
-
-/// Turns columns one after another into rows. What is left of an incomplete row stays unchanged at the end.
-fn exchange(columns_first: &[u8], columns: usize) -> Vec<u8> {
-    let rows = columns_first.len() / columns;
-    let mut bytes = columns_first.to_vec();
-    if rows > 0 {
-        for (column, values) in columns_first[..rows * columns].chunks_exact(rows).enumerate() {
-            for (row, value) in values.iter().enumerate() {
-                bytes[row * columns + column] = *value;
-            }
-        }
-    }
-    bytes
 }

@@ -160,6 +160,43 @@ fn nearly_all_frames_of_blf_and_mf4_are_plain_ones() {
     }
 }
 
+/// A file's containers are unpacked by all cores before they are needed, those of a pipe one after the other.
+#[test]
+fn a_file_gives_what_its_bytes_give_through_a_pipe_whole_and_damaged() {
+    let directory = directory("cores");
+    let path = directory.join("drive.blf");
+    write(&path, Format::Blf, &real(60_000));
+    let whole = fs::read(&path).unwrap();
+    let damaged = |places: &[usize]| {
+        let mut bytes = whole.clone();
+        for at in places {
+            bytes[*at] ^= 0x55;
+        }
+        bytes
+    };
+    let third = whole.len() / 3;
+    let files = [
+        whole.clone(),
+        damaged(&[third]),
+        damaged(&[third, third + 1, 2 * third, whole.len() - 1000]),
+        // A container's signature, its own length, and the length of its objects.
+        damaged(&[144]),
+        damaged(&[144 + 9]),
+        damaged(&[144 + 16 + 9]),
+        whole[..2 * third].to_vec(),
+        [&whole[..third], &whole[third + 77..]].concat(),
+    ];
+    for (number, bytes) in files.iter().enumerate() {
+        fs::write(&path, bytes).unwrap();
+        let (from_file, faults) = split(open_reader(&path, &ReadOptions::default()).unwrap());
+        let (from_pipe, others) = read_bytes(Format::Blf, bytes);
+        assert_eq!(faults.len(), others.len(), "{number}: {faults:?} {others:?}");
+        // Nobody needs the length of the objects.
+        assert_eq!(faults.is_empty(), matches!(number, 0 | 5), "{number}: {faults:?}");
+        assert!(from_file == from_pipe, "{number}: {} and {} records", from_file.len(), from_pipe.len());
+    }
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 

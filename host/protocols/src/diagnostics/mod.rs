@@ -13,13 +13,14 @@
 //! been requests.
 
 mod authentication;
+mod dialect;
 mod dtc;
-mod echo;
+pub(crate) mod echo;
 mod events;
 mod files;
 mod meanings;
 mod monitors;
-mod names;
+pub(crate) mod names;
 mod obd;
 mod parameters;
 mod periodic;
@@ -42,11 +43,11 @@ use std::borrow::Cow;
 use std::collections::VecDeque;
 
 use cantap_trace::TraceRecord;
-use rustc_hash::FxHashMap;
 
+use self::dialect::Dialects;
 use self::periodic::Periodic;
 use self::unnamed::Unnamed;
-use crate::iso_tp::{Endpoint, Pair, Transfer, Transport};
+use crate::iso_tp::{Endpoint, KnownPairs, Transfer, Transport};
 use crate::{Assembler, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
 /// How many requests may wait for a response at a time.
@@ -57,16 +58,13 @@ const RESPONSE_NS: i64 = 2_000_000_000;
 /// The same after the server has said that the response is pending: P2* is 5 s by default.
 const PENDING_NS: i64 = 10_000_000_000;
 const RESPONSE_PENDING: u8 = 0x78;
-/// The service is not supported, or not in this session.
-const UNKNOWN_SERVICE: [u8; 2] = [0x11, 0x7F];
 /// How many requests that were given up are kept, and how long, in case that their responses come after all.
 const MOST_LATE: usize = 64;
 const LATE_NS: i64 = 60_000_000_000;
+/// How many requests that had their answer are kept.
+const MOST_ANSWERED: usize = 8;
 /// How long after its last frame a response may still be under way: longer than [`crate::iso_tp`] waits for the next frame.
 const UNDER_WAY_NS: i64 = 1_200_000_000;
-/// How many senders known to use KWP2000 are kept.
-const MOST_KWP: usize = 1024;
-
 /// How many servers may have said, for one request, that their response is pending.
 const MOST_PENDING: usize = 64;
 
@@ -98,19 +96,36 @@ pub struct Diagnostics {
     waiting: VecDeque<Waiting>,
     /// Requests that were given up.
     late: VecDeque<Transfer>,
+    /// The last requests that had their answer, in case that others answer them as well.
+    answered: VecDeque<Transfer>,
     unnamed: Unnamed,
     periodic: Periodic,
     /// No request times out before this time.
     due_ns: i64,
-    /// Both sides of pairs that used a service that only KWP2000 has, and whether it was answered.
-    speaks_kwp: FxHashMap<(u8, Endpoint), bool>,
+    dialects: Dialects,
     transfers: Vec<Transfer>,
 }
 
 impl Diagnostics {
     /// With pairs that are known on all channels; `finds` enables the search for others.
-    pub fn new(pairs: &[Pair], finds: bool) -> Self {
+    pub fn new(pairs: &[KnownPairs], finds: bool) -> Self {
         Self { transport: Transport::new(pairs, finds), ..Self::default() }
+    }
+
+    /// Takes a transfer, which may have been heard before the last record.
+    fn heard(&mut self, transfer: Transfer, events: &mut Vec<Event>) {
+        if self.due_ns < transfer.start_ns {
+            self.expire(transfer.start_ns, events);
+        }
+        if transfer.after_loss {
+            let sides = [Some(transfer.from), transfer.to];
+            for waiting in &mut self.waiting {
+                let is_its = waiting.request.channel == transfer.channel
+                    && (sides.contains(&Some(waiting.request.from)) || sides.contains(&waiting.request.to));
+                waiting.frames_lost |= is_its;
+            }
+        }
+        self.transfer(transfer, events);
     }
 
     fn transfer(&mut self, transfer: Transfer, events: &mut Vec<Event>) {
@@ -143,41 +158,16 @@ impl Diagnostics {
 
     /// The protocol and name of a service for the pair of this transfer.
     fn service(&self, transfer: &Transfer, sid: u8) -> Option<(Protocol, Cow<'static, str>)> {
-        if names::obd_service(sid).is_some() {
-            return Some((Protocol::Obd, obd::title(sid).into()));
-        }
-        if let Some(name) = names::kwp_only_service(sid) {
-            return Some((Protocol::Kwp2000, name.into()));
-        }
-        if !self.speaks_kwp.is_empty() && self.speaks_kwp.contains_key(&(transfer.channel, transfer.from)) {
-            return names::kwp_service(sid).map(|name| (Protocol::Kwp2000, name.into()));
-        }
-        names::uds_service(sid).map(|name| (Protocol::Uds, name.into()))
+        service(self.is_kwp(transfer), sid)
     }
 
-    /// Both sides of this transfer use KWP2000, which the server's answer shows or not yet.
-    fn is_kwp(&mut self, transfer: &Transfer, is_answered: bool) {
-        for side in [Some(transfer.from), transfer.to].into_iter().flatten() {
-            if self.speaks_kwp.len() < MOST_KWP {
-                *self.speaks_kwp.entry((transfer.channel, side)).or_default() |= is_answered;
-            }
-        }
-    }
-
-    /// This server does not have the service, as in a scan of all services: that it was asked for does not make it KWP2000.
-    fn is_not_kwp(&mut self, refusal: &Transfer, request: &Transfer) {
-        for side in [refusal.from, request.from] {
-            if self.speaks_kwp.get(&(refusal.channel, side)) == Some(&false) {
-                self.speaks_kwp.remove(&(refusal.channel, side));
-            }
-        }
+    /// Whether the server of this transfer, its sender or its receiver, speaks KWP2000.
+    fn is_kwp(&self, transfer: &Transfer) -> bool {
+        self.dialects.is_kwp(transfer.channel, transfer.from, transfer.to)
     }
 
     fn request(&mut self, mut transfer: Transfer, events: &mut Vec<Event>) {
         let sid = transfer.data[0];
-        if names::kwp_only_service(sid).is_some() {
-            self.is_kwp(&transfer, false);
-        }
         transfer.to = transfer.to.or_else(|| self.transport.partner(transfer.channel, transfer.from));
         let is_uds = self.service(&transfer, sid).is_some_and(|(protocol, _)| protocol == Protocol::Uds);
         // KWP2000 has a separate value for it (ISO 14230-3, 6.4).
@@ -220,6 +210,28 @@ impl Diagnostics {
         self.waiting.len().checked_sub(1)
     }
 
+    /// A request that had an answer from the only server that was known to have it, until another one answered it: it was to all, and
+    /// waits again.
+    fn asked_of_others_too(
+        &mut self,
+        response: &Transfer,
+        sid: u8,
+        events: &mut Vec<Event>,
+    ) -> Option<usize> {
+        let place = self.answered.iter().rposition(|request| {
+            response.start_ns.saturating_sub(request.time_ns) <= RESPONSE_NS
+                && request.to.is_some_and(|to| to != response.from)
+                && self.is_answer(request, response, sid)
+                && self.transport.is_to_all(request.channel, request.from)
+        })?;
+        let request = Transfer { to: None, ..self.answered.remove(place)? };
+        self.wait_for(request, true, events);
+        if let Some(waiting) = self.waiting.back_mut() {
+            waiting.answers = 1;
+        }
+        self.waiting.len().checked_sub(1)
+    }
+
     /// The request that a response to `sid` belongs to.
     fn asked(&self, response: &Transfer, sid: u8) -> Option<usize> {
         let of_channel = |waiting: &Waiting| self.is_answer(&waiting.request, response, sid);
@@ -238,23 +250,21 @@ impl Diagnostics {
         request.channel == response.channel
             && request.data.first() == Some(&sid)
             && (response.data[0] == 0x7F || {
-                let is_kwp = self.speaks_kwp.contains_key(&(request.channel, request.from));
+                let is_kwp = self.dialects.is_kwp(request.channel, response.from, None);
                 repeats_its_request(is_kwp, &request.data, &response.data) != Some(false)
             })
     }
 
     fn response(&mut self, transfer: &Transfer, events: &mut Vec<Event>) {
         let sid = transfer.data[0] & !0x40;
-        let Some(place) = self.asked(transfer, sid) else {
+        let asked = self.asked(transfer, sid);
+        let Some(place) = asked.or_else(|| self.asked_of_others_too(transfer, sid, events)) else {
             let event = self.unasked(transfer, sid);
             events.push(event);
             return;
         };
         let answered = self.answered(place, transfer.from);
-        // Sessions of KWP2000 have numbers above 80; UDS has a bit there that responses do not repeat.
-        if names::kwp_only_service(sid).is_some() || matches!(transfer.data[..], [0x50, 0x80..=0xFF, ..]) {
-            self.is_kwp(&Transfer { to: Some(transfer.from), ..answered.request.clone() }, true);
-        }
+        self.dialects.learn(transfer.channel, transfer.from, &answered.request.data, &transfer.data);
         self.periodic.learn(transfer.channel, transfer.from, &answered.request.data);
         events.push(self.event(&answered.request, Some((transfer, &answered)), "exchange"));
     }
@@ -269,6 +279,10 @@ impl Diagnostics {
         if waiting.request.to.is_some()
             && let Some(waiting) = self.waiting.remove(place)
         {
+            if self.answered.len() == MOST_ANSWERED {
+                self.answered.pop_front();
+            }
+            self.answered.push_back(waiting.request.clone());
             return Answered { request: waiting.request, pending, frames_lost };
         }
         Answered { request: self.waiting[place].request.clone(), pending, frames_lost }
@@ -277,6 +291,7 @@ impl Diagnostics {
     fn refusal(&mut self, transfer: &Transfer, events: &mut Vec<Event>) {
         let (sid, nrc) = (transfer.data[1], transfer.data[2]);
         let asked = self.asked(transfer, sid);
+        let asked = asked.or_else(|| self.asked_of_others_too(transfer, sid, events));
         let Some(place) = asked.or_else(|| self.refused_unnamed(transfer, sid, events)) else {
             let event = self.unasked(transfer, sid);
             events.push(event);
@@ -296,9 +311,7 @@ impl Diagnostics {
         let mut event = self.event(&answered.request, Some((transfer, &answered)), "exchange");
         event.kind = "refusal";
         events.push(event);
-        if names::kwp_only_service(sid).is_some() && UNKNOWN_SERVICE.contains(&nrc) {
-            self.is_not_kwp(transfer, &answered.request);
-        }
+        self.dialects.learn(transfer.channel, transfer.from, &answered.request.data, &transfer.data);
     }
 
     /// A response whose request was not observed, or no longer waits for it.
@@ -323,8 +336,9 @@ impl Diagnostics {
     fn event(&self, first: &Transfer, response: Option<(&Transfer, &Answered)>, kind: &'static str) -> Event {
         let refused = |data: &[u8]| data[0] == 0x7F && data.len() >= 3;
         let sid = if refused(&first.data) { first.data[1] } else { first.data[0] & !0x40 };
+        let is_kwp = self.is_kwp(first) || response.is_some_and(|(response, _)| self.is_kwp(response));
         let (protocol, title) =
-            self.service(first, sid).unwrap_or_else(|| (Protocol::Uds, format!("service {sid:02X}").into()));
+            service(is_kwp, sid).unwrap_or_else(|| (Protocol::Uds, format!("service {sid:02X}").into()));
         let mut fields = vec![Field::hex("sid", sid, 2)];
         let is_request = first.data[0] & 0x40 == 0;
         if is_request {
@@ -443,6 +457,20 @@ impl Diagnostics {
     }
 }
 
+/// The protocol and name of a service.
+fn service(is_kwp: bool, sid: u8) -> Option<(Protocol, Cow<'static, str>)> {
+    if names::obd_service(sid).is_some() {
+        return Some((Protocol::Obd, obd::title(sid).into()));
+    }
+    if let Some(name) = names::kwp_only_service(sid) {
+        return Some((Protocol::Kwp2000, name.into()));
+    }
+    if is_kwp {
+        return names::kwp_service(sid).map(|name| (Protocol::Kwp2000, name.into()));
+    }
+    names::uds_service(sid).map(|name| (Protocol::Uds, name.into()))
+}
+
 /// Data that a server sends by itself.
 fn periodic_event(transfer: &Transfer, did: u16, data: &[u8]) -> Event {
     let mut event = Event::from(transfer.clone());
@@ -471,7 +499,7 @@ impl Assembler for Diagnostics {
         let mut transfers = std::mem::take(&mut self.transfers);
         self.transport.take(record, &mut |transfer| transfers.push(transfer));
         for transfer in transfers.drain(..) {
-            self.transfer(transfer, events);
+            self.heard(transfer, events);
         }
         self.transfers = transfers;
     }
@@ -480,7 +508,7 @@ impl Assembler for Diagnostics {
         let mut transfers = std::mem::take(&mut self.transfers);
         self.transport.finish(&mut |transfer| transfers.push(transfer));
         for transfer in transfers {
-            self.transfer(transfer, events);
+            self.heard(transfer, events);
         }
         while !self.waiting.is_empty() {
             self.give_up(0, Trouble::Unfinished, events);

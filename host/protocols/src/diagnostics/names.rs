@@ -304,6 +304,11 @@ pub fn obd_service(sid: u8) -> Option<&'static str> {
     find(&OBD_SERVICES, &sid)
 }
 
+/// Whether a standard has this reason for a refusal.
+pub fn is_reason(nrc: u8) -> bool {
+    find(&REASONS, &nrc).is_some()
+}
+
 /// Why a request was refused.
 pub fn reason(nrc: u8) -> &'static str {
     find(&REASONS, &nrc).unwrap_or(match nrc {

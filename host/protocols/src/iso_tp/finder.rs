@@ -4,9 +4,13 @@
 //! Every frame on a bus whose identifier belongs to no pair passes through here, and most are not part of any transfer. So
 //! whatever a frame shows on its own is checked before the candidates, and a candidate allocates no memory.
 
-use cantap_trace::Id;
-use cantap_trace::fd::FD_MAX_BYTES;
+use std::ops::RangeInclusive;
 
+use cantap_trace::fd::FD_MAX_BYTES;
+use cantap_trace::{Id, TraceRecord};
+
+use super::exchanges::{is_expected, is_padded};
+use super::marks::Marks;
 use super::pairs::{Endpoint, Pair};
 use super::pci::{self, FlowStatus, Pci};
 use super::transfer::Transfer;
@@ -32,28 +36,6 @@ struct Candidate {
     flow: Option<(Endpoint, u8, u32)>,
 }
 
-/// Marks for the candidates' senders: an identifier without its mark is not a candidate's.
-#[derive(Clone, Copy, Debug, Default)]
-struct Marks([u64; 16]);
-
-impl Marks {
-    /// Word and bit. Neighbouring identifiers, common on most buses, have different marks.
-    const fn place(id: Id) -> (usize, u64) {
-        let mark = id.raw() ^ id.raw() >> 10 ^ id.raw() >> 20;
-        ((mark >> 6 & 15) as usize, 1 << (mark & 63))
-    }
-
-    fn set(&mut self, id: Id) {
-        let (word, bit) = Self::place(id);
-        self.0[word] |= bit;
-    }
-
-    fn may_have(&self, id: Id) -> bool {
-        let (word, bit) = Self::place(id);
-        self.0[word] & bit != 0
-    }
-}
-
 /// Looks for pairs among the identifiers that belong to none.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Finder {
@@ -63,8 +45,15 @@ pub(super) struct Finder {
 
 impl Finder {
     /// Takes a frame; if it is the first consecutive frame, returns the pair and the transfer that has begun, which must then still
-    /// take this frame.
-    pub fn take(&mut self, channel: u8, id: Id, bytes: &[u8], time_ns: i64) -> Option<(Pair, Transfer)> {
+    /// take this frame. There are so many bytes of address, as far as that is known.
+    pub fn take(
+        &mut self,
+        record: &TraceRecord,
+        id: Id,
+        bytes: &[u8],
+        readings: RangeInclusive<usize>,
+    ) -> Option<(Pair, Transfer)> {
+        let (channel, time_ns) = (record.channel, record.time_ns);
         // A sender that sends anything else before its first consecutive frame is not sending a transfer.
         if self.marks.may_have(id) {
             let goes_on = |candidate: &Candidate| {
@@ -80,7 +69,7 @@ impl Finder {
             }
         }
         // There may or may not be an address before it.
-        for offset in [0, 1] {
+        for offset in readings {
             let Some(&first) = bytes.get(offset) else { continue };
             match first >> 4 {
                 1 | 3 => {}
@@ -112,7 +101,12 @@ impl Finder {
                             && candidate.from.address.is_some() == from.address.is_some()
                             && time_ns.saturating_sub(candidate.time_ns) <= FLOW_TIMEOUT_NS
                         {
-                            candidate.flow = Some((from, block_size, separation_us));
+                            let before =
+                                candidate.flow.map(|(before, ..)| is_expected(before, candidate.from));
+                            // Several may be under way: one that is expected is not replaced by another's.
+                            if before != Some(true) || is_expected(from, candidate.from) {
+                                candidate.flow = Some((from, block_size, separation_us));
+                            }
                         }
                     }
                 }
@@ -146,6 +140,12 @@ impl Finder {
         None
     }
 
+    /// This sender is one of a pair by now.
+    pub fn forget(&mut self, channel: u8, from: Endpoint) {
+        self.candidates.retain(|candidate| (candidate.channel, candidate.from) != (channel, from));
+        self.mark();
+    }
+
     /// Frames on the channel are missing: what comes next may belong to others.
     pub fn interrupt(&mut self, channel: u8) {
         self.candidates.retain(|candidate| candidate.channel != channel);
@@ -162,9 +162,4 @@ impl Finder {
         self.marks = Marks::default();
         self.candidates.iter().for_each(|candidate| self.marks.set(candidate.from.id));
     }
-}
-
-/// Padding consists of equal bytes.
-fn is_padded(rest: &[u8]) -> bool {
-    rest.windows(2).all(|two| two[0] == two[1])
 }

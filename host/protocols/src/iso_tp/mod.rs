@@ -1,27 +1,35 @@
 //! Transfers of many frames: ISO 15765-2 in normal, extended and mixed addressing, on classical CAN and CAN FD.
 //!
 //! The identifiers that take part are those reserved by the standards (7DF, 7E0 to 7EF, 18DAxxyy, 18DBxxyy, 18CExxyy,
-//! 18CDxxyy), those of the given pairs, and those that [`Transport`] finds by their behaviour.
+//! 18CDxxyy), those of the given pairs, and those that [`Transport`] finds by their behaviour: by transfers of many frames, and by
+//! requests of diagnostics with their answers. What was heard of a pair before it was found is read when it has been.
 //!
-//! Memory: at most 256 transfers in progress, each of at most 64 KiB, and 1024 pairs that were found. A transfer holds only the
-//! bytes that arrived, so first frames without successors cost next to nothing.
+//! Memory: at most 256 transfers in progress, each of at most 64 KiB, 1024 pairs that were found, and 4096 frames of senders that may
+//! turn out to be one of a pair. A transfer holds only the bytes that arrived, so first frames without successors cost next to nothing.
 
+mod exchanges;
 mod finder;
+mod makers;
+mod marks;
 mod pairs;
 mod pci;
 #[cfg(test)]
 mod tests;
 mod transfer;
 
+pub use makers::{BadPairs, KnownPairs, Maker};
 pub use pairs::{BadPair, Endpoint, Pair};
 pub use pci::{FlowStatus, Pci, parse};
 pub use transfer::Transfer;
 
-use cantap_trace::TraceRecord;
+use std::ops::RangeInclusive;
+
+use cantap_trace::{Id, TraceRecord};
 use rustc_hash::FxHashMap;
 
+use self::exchanges::{Exchanges, Found, is_expected};
 use self::finder::Finder;
-use self::pairs::Pairs;
+use self::pairs::{Pairs, Reading};
 use crate::{Assembler, Bytes, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
 /// How long the receiver waits for the next frame: N_Cr.
@@ -56,6 +64,9 @@ struct Open {
 pub struct Transport {
     pairs: Pairs,
     finder: Option<Finder>,
+    exchanges: Exchanges,
+    /// The next transfer comes after a loss that has not been reported.
+    after_loss: bool,
     open: FxHashMap<(u8, Endpoint), Open>,
     /// Runs of consecutive frames without a first frame: the last number of each, so that a run is reported
     /// once.
@@ -65,10 +76,15 @@ pub struct Transport {
 
 impl Transport {
     /// With pairs that are known on all channels; `finds` enables the search for others.
-    pub fn new(pairs: &[Pair], finds: bool) -> Self {
+    pub fn new(pairs: &[KnownPairs], finds: bool) -> Self {
         let mut transport = Self { finder: finds.then(Finder::default), ..Self::default() };
         for pair in pairs {
-            transport.pairs.add(0, *pair);
+            match pair {
+                KnownPairs::One(pair) => {
+                    transport.pairs.add(0, *pair);
+                }
+                KnownPairs::Of(maker) => transport.exchanges.give(makers::rules_of(*maker)),
+            }
         }
         transport
     }
@@ -76,6 +92,11 @@ impl Transport {
     /// The other side of a sender, if it is known and unique.
     pub fn partner(&self, channel: u8, from: Endpoint) -> Option<Endpoint> {
         self.pairs.partner(channel, from)
+    }
+
+    /// Whether a sender asks several others, or nobody knows whom.
+    pub fn is_to_all(&self, channel: u8, from: Endpoint) -> bool {
+        self.pairs.is_known(channel, from) && self.pairs.partner(channel, from).is_none()
     }
 
     /// Whether such a sender has begun a message in this time and not completed it.
@@ -104,24 +125,120 @@ impl Transport {
         if frame.is_remote() {
             return;
         }
-        let (id, bytes, time_ns) = (frame.id(), frame.data(), record.time_ns);
-        let Some(offset) = self.pairs.offset(channel, id) else {
-            let found = self.finder.as_mut().and_then(|finder| finder.take(channel, id, bytes, time_ns));
-            let Some((pair, transfer)) = found else { return };
-            if self.pairs.add(channel, pair) {
-                let offset = usize::from(pair.a.address.is_some());
-                // For a transfer that was only just found, the first frame is no longer available.
-                let frame_bytes = first_frame_bytes(&transfer, offset);
-                self.begin(Open { transfer, next: 1, is_new: true, frame_bytes, last_ns: None }, out);
+        let (id, bytes) = (frame.id(), frame.data());
+        if self.finder.is_some() {
+            self.read_unanswered(record.time_ns, out);
+        }
+        match self.pairs.reading(channel, id, bytes) {
+            Reading::Known(offset) => {
+                if self.finder.is_some() {
+                    let from = Endpoint { id, address: bytes.first().copied().filter(|_| offset == 1) };
+                    if let Some(found) = self.exchanges.take_known(record, from, bytes) {
+                        self.adopt(found, out);
+                    }
+                }
                 self.frame(record, offset, bytes, out);
             }
+            Reading::Unknown(readings) => self.find(record, id, bytes, readings, out),
+        }
+    }
+
+    /// Takes a frame whose sender is not known.
+    fn find(
+        &mut self,
+        record: &TraceRecord,
+        id: Id,
+        bytes: &[u8],
+        readings: RangeInclusive<usize>,
+        out: &mut impl FnMut(Transfer),
+    ) {
+        let Some(finder) = &mut self.finder else { return };
+        if let Some(found) = self.exchanges.take(record, id, bytes, readings.clone()) {
+            self.adopt(found, out);
             return;
-        };
+        }
+        let Some((pair, transfer)) = finder.take(record, id, bytes, readings) else { return };
+        let found = self.exchanges.found(record.channel, pair.a, Some(pair.b));
+        // For a transfer that was only just found, the first frame is no longer available. Of one that was asked for, that is no matter.
+        let is_new = found.held.is_empty();
+        self.adopt(found, out);
+        let Reading::Known(offset) = self.pairs.reading(record.channel, id, bytes) else { return };
+        let frame_bytes = first_frame_bytes(&transfer, offset);
+        self.begin(Open { transfer, next: 1, is_new, frame_bytes, last_ns: None }, out);
         self.frame(record, offset, bytes, out);
+    }
+
+    /// From now on, these two are a pair; reads what they have said.
+    fn adopt(&mut self, found: Found, out: &mut impl FnMut(Transfer)) {
+        let Found { channel, client, server, held } = found;
+        let is_added = match server {
+            None => self.pairs.add_alone(channel, client),
+            Some(server) => self.add(channel, client, server),
+        };
+        if !is_added {
+            return;
+        }
+        if let Some(finder) = &mut self.finder {
+            [Some(client), server].into_iter().flatten().for_each(|one| finder.forget(channel, one));
+        }
+        for (record, after_loss) in held {
+            self.after_loss |= after_loss;
+            let Some(frame) = record.frame() else { continue };
+            if !self.open.is_empty() && record.time_ns >= self.sweep_ns {
+                self.sweep(record.time_ns, out);
+            }
+            if let Reading::Known(offset) = self.pairs.reading(channel, frame.id(), frame.data()) {
+                self.frame(&record, offset, frame.data(), out);
+            }
+        }
+        self.after_loss = false;
+    }
+
+    /// Adds a pair, or one more server of a client that asks several at once.
+    fn add(&mut self, channel: u8, client: Endpoint, server: Endpoint) -> bool {
+        let other = |one| self.pairs.partner(channel, one);
+        let talks_to_another = |one, this| other(one).is_some_and(|other| other != this);
+        if self.pairs.is_known(channel, client) {
+            if talks_to_another(client, server) && !self.pairs.was_found(channel, client) {
+                // One of the standard's, or given: it has its server, and this one only says the same.
+                return self.pairs.add_alone(channel, server);
+            }
+            if other(client) != Some(server) {
+                return self.pairs.add_alone(channel, client) && self.pairs.add_alone(channel, server);
+            }
+            return true;
+        }
+        if makers::is_to_all(client) {
+            let is_known = self.pairs.is_known(channel, server);
+            return self.pairs.add_alone(channel, client)
+                && (is_known || self.pairs.add_alone(channel, server));
+        }
+        if self.pairs.is_known(channel, server)
+            && talks_to_another(server, client)
+            && !(self.pairs.was_found(channel, server) && is_expected(client, server))
+        {
+            return self.pairs.add_alone(channel, client);
+        }
+        self.pairs.add(channel, Pair { a: client, b: server })
+    }
+
+    /// Reads requests of known testers that nobody has answered: they may ask a server that is not there.
+    fn read_unanswered(&mut self, now_ns: i64, out: &mut impl FnMut(Transfer)) {
+        let pairs = &self.pairs;
+        let server = |channel, client| {
+            let partner = pairs.sibling_partner(channel, client)?;
+            Some(Some(partner).filter(|_| !makers::is_to_all(client)))
+        };
+        if let Some(found) = self.exchanges.unanswered(now_ns, server) {
+            self.adopt(found, out);
+        }
     }
 
     /// The trace has ended: passes on whatever was in progress.
     pub fn finish(&mut self, out: &mut impl FnMut(Transfer)) {
+        for _ in 0..exchanges::MOST_SENDERS {
+            self.read_unanswered(i64::MAX, out);
+        }
         let mut open: Vec<_> = self.open.drain().map(|(_, open)| open).collect();
         open.sort_by_key(|open| open.transfer.start_ns);
         for open in open {
@@ -151,6 +268,7 @@ impl Transport {
         if let Some(finder) = &mut self.finder {
             finder.interrupt(channel);
         }
+        self.exchanges.interrupt(channel);
     }
 
     /// Ends whatever has timed out.
@@ -195,8 +313,17 @@ impl Transport {
         let from = Endpoint { id, address };
         let key = (channel, from);
         let to = self.pairs.partner(channel, from);
-        let fresh =
-            Transfer { time_ns, start_ns: time_ns, channel, from, to, frames: 1, ..Transfer::empty() };
+        let after_loss = std::mem::take(&mut self.after_loss);
+        let fresh = Transfer {
+            time_ns,
+            start_ns: time_ns,
+            channel,
+            from,
+            to,
+            frames: 1,
+            after_loss,
+            ..Transfer::empty()
+        };
         let pci = match pci::parse(bytes, offset) {
             Ok(Some(pci)) => pci,
             Ok(None) => return,
@@ -349,7 +476,7 @@ pub struct IsoTp {
 
 impl IsoTp {
     /// With pairs that are known on all channels; `finds` enables the search for others.
-    pub fn new(pairs: &[Pair], finds: bool) -> Self {
+    pub fn new(pairs: &[KnownPairs], finds: bool) -> Self {
         Self { transport: Transport::new(pairs, finds) }
     }
 }

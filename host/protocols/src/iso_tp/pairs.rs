@@ -1,6 +1,7 @@
 //! Pairs of senders that answer each other.
 
 use std::fmt;
+use std::ops::RangeInclusive;
 use std::str::FromStr;
 
 use cantap_trace::Id;
@@ -83,7 +84,17 @@ impl FromStr for Pair {
 pub(super) struct Pairs {
     /// Number of address bytes before the control information, by channel (0 for all) and identifier.
     offsets: FxHashMap<(u8, Id), u8>,
-    partners: FxHashMap<(u8, Endpoint), Endpoint>,
+    /// `None` for those without a unique other side.
+    partners: FxHashMap<(u8, Endpoint), Option<Endpoint>>,
+}
+
+/// How to read the frames of an identifier.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Reading {
+    /// Their sender takes part in transfers; so many bytes of address come first.
+    Known(usize),
+    /// Nobody knows their sender, whose frames may have this many.
+    Unknown(RangeInclusive<usize>),
 }
 
 /// The identifiers reserved by ISO 15765-4 and ISO 15765-2.
@@ -122,38 +133,89 @@ pub(super) fn fixed(id: Id) -> Option<Fixed> {
 impl Pairs {
     /// Adds a pair for a channel, or for all (0); false if the limit is reached.
     pub fn add(&mut self, channel: u8, pair: Pair) -> bool {
-        if channel != 0 && self.offsets.len() >= 2 * MOST_FOUND {
+        self.insert(channel, pair.a, Some(pair.b)) && self.insert(channel, pair.b, Some(pair.a))
+    }
+
+    /// Adds somebody who talks to several others; false if the limit is reached.
+    pub fn add_alone(&mut self, channel: u8, one: Endpoint) -> bool {
+        self.insert(channel, one, None)
+    }
+
+    fn insert(&mut self, channel: u8, from: Endpoint, to: Option<Endpoint>) -> bool {
+        let is_full = self.partners.len() >= 2 * MOST_FOUND && !self.partners.contains_key(&(channel, from));
+        if channel != 0 && is_full {
             return false;
         }
-        for (from, to) in [(pair.a, pair.b), (pair.b, pair.a)] {
-            self.offsets.insert((channel, from.id), u8::from(from.address.is_some()));
-            self.partners.insert((channel, from), to);
-        }
+        self.offsets.insert((channel, from.id), u8::from(from.address.is_some()));
+        self.partners.insert((channel, from), to);
         true
     }
 
-    /// The number of address bytes in the identifier's frames; `None` if it takes part in no transfers.
-    pub fn offset(&self, channel: u8, id: Id) -> Option<usize> {
+    /// How to read the frames of an identifier. With an address, the two together are one side of a conversation: that another address
+    /// of the identifier is known says nothing about this one.
+    pub fn reading(&self, channel: u8, id: Id, bytes: &[u8]) -> Reading {
         if !self.offsets.is_empty() {
             let known = self.offsets.get(&(channel, id)).or_else(|| self.offsets.get(&(0, id)));
-            if let Some(offset) = known {
-                return Some(usize::from(*offset));
+            match known {
+                Some(0) => return Reading::Known(0),
+                Some(_) => {
+                    let from = Endpoint { id, address: bytes.first().copied() };
+                    let is_known = self.find(channel, from).is_some();
+                    return if is_known { Reading::Known(1) } else { Reading::Unknown(1..=1) };
+                }
+                None => {}
             }
         }
-        fixed(id).map(|fixed| usize::from(matches!(fixed, Fixed::MixedPhysical(_) | Fixed::MixedFunctional)))
+        match fixed(id) {
+            Some(Fixed::MixedPhysical(_) | Fixed::MixedFunctional) => Reading::Known(1),
+            Some(_) => Reading::Known(0),
+            None => Reading::Unknown(0..=1),
+        }
+    }
+
+    fn find(&self, channel: u8, from: Endpoint) -> Option<Option<Endpoint>> {
+        if self.partners.is_empty() {
+            return None;
+        }
+        self.partners.get(&(channel, from)).or_else(|| self.partners.get(&(0, from))).copied()
     }
 
     /// The other side.
     pub fn partner(&self, channel: u8, from: Endpoint) -> Option<Endpoint> {
-        if !self.partners.is_empty() {
-            let known = self.partners.get(&(channel, from)).or_else(|| self.partners.get(&(0, from)));
-            if known.is_some() {
-                return known.copied();
-            }
+        if let Some(known) = self.find(channel, from) {
+            return known;
         }
         match fixed(from.id)? {
             Fixed::Physical(id) | Fixed::MixedPhysical(id) => Some(Endpoint { id, address: from.address }),
             Fixed::Functional | Fixed::MixedFunctional => None,
         }
+    }
+
+    /// Whether the sender's other side was found on this channel, and may turn out to be one of several.
+    pub fn was_found(&self, channel: u8, from: Endpoint) -> bool {
+        self.partners.contains_key(&(channel, from))
+    }
+
+    /// Whether the sender is known, and on what channel ever.
+    pub fn is_known(&self, channel: u8, from: Endpoint) -> bool {
+        self.find(channel, from).is_some() || fixed(from.id).is_some()
+    }
+
+    /// Whom somebody with this identifier would talk to, by what another address of it shows.
+    pub fn sibling_partner(&self, channel: u8, from: Endpoint) -> Option<Endpoint> {
+        let address = from.address?;
+        self.partners.iter().find_map(|((of, sibling), partner)| {
+            let partner = (*partner)?;
+            if (*of != channel && *of != 0) || sibling.id != from.id {
+                return None;
+            }
+            if sibling.address == partner.address {
+                return Some(Endpoint { address: Some(address), ..partner });
+            }
+            let base = partner.id.raw().checked_sub(sibling.address?.into())?;
+            let is_own = partner.address == Some(from.id.raw() as u8) && base & 0xFF == 0;
+            let id = is_own.then(|| Id::standard(base + u32::from(address)))??;
+            Some(Endpoint { id, address: partner.address })
+        })
     }
 }

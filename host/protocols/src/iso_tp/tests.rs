@@ -4,7 +4,7 @@ use super::*;
 use crate::testing::{self, at, hex, lost};
 
 fn transfers(pairs: &[&str], records: &[TraceRecord]) -> Vec<Transfer> {
-    let pairs: Vec<Pair> = pairs.iter().map(|pair| pair.parse().unwrap()).collect();
+    let pairs: Vec<KnownPairs> = pairs.iter().map(|pair| pair.parse().unwrap()).collect();
     let mut transport = Transport::new(&pairs, true);
     let mut all = Vec::new();
     for record in records {

@@ -34,6 +34,8 @@ pub struct Transfer {
     pub trouble: Option<Trouble>,
     /// Frames on the channel were lost meanwhile.
     pub frames_lost: bool,
+    /// Frames on the channel were lost before it, which its reader has not been told: it was read later than it was heard.
+    pub after_loss: bool,
 }
 
 impl Transfer {
@@ -60,6 +62,7 @@ impl Transfer {
             too_early: 0,
             trouble: None,
             frames_lost: false,
+            after_loss: false,
         }
     }
 }

@@ -248,7 +248,7 @@ impl J1939 {
                     .iter()
                     .take_while(|byte| **byte != 0 && **byte != 0xFF)
                     .map(|byte| char::from(*byte));
-                let text: String = text.filter(|letter| !letter.is_control()).collect();
+                let text: String = text.filter(|letter| !cantap_trace::clean::is_harmful(*letter)).collect();
                 event.fields.push(Field::text(name, text.trim_end_matches('*').to_owned()));
             }
             (_, data) => {

@@ -259,3 +259,97 @@ fn an_abort_ends_the_message_that_it_names() {
     );
     assert!(all[1].contains("pgn 65259") && all[1].contains("text \"ABCDEFGHIJKLMN\""), "{all:?}");
 }
+
+/// A receiver that missed one frame inside a window asks for that one alone, and then goes on behind the window.
+#[test]
+fn one_frame_of_a_window_may_be_sent_again() {
+    let frames = [
+        (0.0, "1CEC375E#103100070500E700"),
+        (3.0, "1CEC5E37#110501FFFF00E700"),
+        (6.0, "1CEB375E#0101020304050607"),
+        (8.0, "1CEB375E#0208090A0B0C0D0E"),
+        (10.0, "1CEB375E#030F101112131415"),
+        (12.0, "1CEB375E#041617181920212F"),
+        (14.0, "1CEB375E#0522232425262728"),
+        (16.0, "1CEC5E37#110102FFFF00E700"),
+        (19.0, "1CEB375E#0208090A0B0C0D0E"),
+        (21.0, "1CEC5E37#110206FFFF00E700"),
+        (23.0, "1CEB375E#062930313233343F"),
+        (25.0, "1CEB375E#073536373839404F"),
+        (27.0, "1CEC5E37#13310007FF00E700"),
+    ];
+    let whole = said(&frames);
+    assert_eq!(whole.len(), 1, "{whole:?}");
+    assert!(whole[0].contains("length 49 bytes") && whole[0].contains("0E 0F 10 11"), "{whole:?}");
+    // The frame that the receiver missed may be one that was not captured the first time either.
+    let mut missed = frames.to_vec();
+    missed.remove(3);
+    let again = said(&missed);
+    assert_eq!(again[0].replace("1 frames", ""), whole[0].replace("1 frames", ""));
+    // It did not come again: the message ends with the receiver's acknowledgement, as far as it came.
+    missed.retain(|(_, frame)| !frame.starts_with("1CEB375E#02"));
+    let broken = said(&missed);
+    assert_eq!(broken.len(), 1, "{broken:?}");
+    assert!(
+        broken[0].contains("received 7 bytes") && broken[0].contains("frame 3 came instead of 2"),
+        "{broken:?}"
+    );
+}
+
+/// Three connections at a time with windows of every size, frames that are requested again in the middle, and some of them lost by
+/// the capture, too.
+#[test]
+fn connections_with_frames_sent_again_are_whole() {
+    let mut random = fastrand::Rng::with_seed(77_001);
+    for round in 0..400 {
+        let (mut frames, mut sent) = (Vec::new(), Vec::new());
+        for pair in 0..3_u8 {
+            let (from, to) = (pair + 1, pair + 101);
+            let data: Vec<u8> = (0..random.usize(9..300)).map(|_| random.u8(..)).collect();
+            let count = data.len().div_ceil(7);
+            let window = random.choice([1, 2, 5, 16, 255]).unwrap().min(count);
+            let mut now = f64::from(pair) * 0.7;
+            let mut frame = |group: u32, from: u8, to: u8, bytes: &[u8]| {
+                now += 3.0;
+                frames.push((now, format!("1C{group:02X}{to:02X}{from:02X}#{}", hex(bytes))));
+            };
+            let size = (data.len() as u16).to_le_bytes();
+            let packet = |number: usize| {
+                let mut bytes = vec![number as u8];
+                bytes.extend(&data[(number - 1) * 7..(number * 7).min(data.len())]);
+                bytes.resize(8, 0xFF);
+                bytes
+            };
+            frame(0xEC, from, to, &[16, size[0], size[1], count as u8, 255, 0, 0xEF, 0]);
+            let mut first = 1;
+            while first <= count {
+                let last = (first + window - 1).min(count);
+                let cleared = (last - first + 1) as u8;
+                frame(0xEC, to, from, &[17, cleared, first as u8, 255, 255, 0, 0xEF, 0]);
+                // What the receiver misses; half of it is missing in the capture as well, and none of it may be the last of all.
+                let missed =
+                    Some(random.usize(first..=last)).filter(|missed| random.bool() && *missed < count);
+                for number in first..=last {
+                    if missed != Some(number) || random.bool() {
+                        frame(0xEB, from, to, &packet(number));
+                    }
+                }
+                if let Some(missed) = missed {
+                    frame(0xEC, to, from, &[17, 1, missed as u8, 255, 255, 0, 0xEF, 0]);
+                    frame(0xEB, from, to, &packet(missed));
+                }
+                first = last + 1;
+            }
+            frame(0xEC, to, from, &[19, size[0], size[1], count as u8, 255, 0, 0xEF, 0]);
+            sent.push((from, data));
+        }
+        frames.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let records: Vec<_> = frames.iter().map(|(ms, frame)| at(*ms, frame)).collect();
+        let events = testing::events(J1939::default(), &records);
+        assert_eq!(events.len(), 3, "round {round}: {events:?}");
+        for event in &events {
+            let source = event.from.node().unwrap();
+            assert!(sent.contains(&(source, event.data.to_vec())), "round {round}: never sent: {event}");
+        }
+    }
+}

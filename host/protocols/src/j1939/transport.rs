@@ -2,7 +2,10 @@
 //!
 //! Memory: at most 256 in progress, each of at most 64 KiB.
 
+use std::collections::BTreeMap;
+
 use rustc_hash::FxHashMap;
+use smallvec::SmallVec;
 
 use super::header::{GLOBAL, Header, pgn};
 use crate::{Bytes, Trouble};
@@ -20,6 +23,10 @@ const PEER_NS: i64 = 1_250_000_000;
 const SWEEP_NS: i64 = 100_000_000;
 const MOST_OPEN: usize = 256;
 const MOST_BYTES: usize = 1 << 16;
+/// Bytes of the message in one frame.
+const FRAME_BYTES: usize = 7;
+/// The most frames that a receiver can clear at a time: of those that came before an earlier one, no more are kept.
+const MOST_AHEAD: u32 = 255;
 
 /// How a message of many frames was sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -68,13 +75,66 @@ pub struct Assembled {
 /// A message in progress.
 #[derive(Clone, Debug)]
 pub(super) struct Open {
+    /// The message; its data end where the first frame is missing.
     pub message: Assembled,
-    /// The next frame, from 1 (of the whole message).
+    /// The first frame that has not come, from 1 (of the whole message).
     pub next: u32,
+    /// Frames that came before it.
+    ahead: BTreeMap<u32, SmallVec<[u8; FRAME_BYTES]>>,
     /// Number of frames before the window of an extended transfer.
     offset: u32,
-    /// A frame came out of order, and the receiver has not requested it again so far.
+    /// Why a frame is missing, until it has come after all.
     gap: Option<Trouble>,
+}
+
+impl Open {
+    const fn new(message: Assembled) -> Self {
+        Self { message, next: 1, ahead: BTreeMap::new(), offset: 0, gap: None }
+    }
+
+    /// Number of frames of the whole message.
+    fn count(&self) -> u32 {
+        self.message.size.div_ceil(FRAME_BYTES as u32)
+    }
+
+    /// Takes the bytes of a frame, numbered from 1, in whatever order the receiver asks for them; some may come again. The error says
+    /// what is missing because of it.
+    fn put(&mut self, number: u32, bytes: &[u8]) -> Result<(), Trouble> {
+        let place = (number as usize).wrapping_sub(1).wrapping_mul(FRAME_BYTES);
+        let Some(missing) = (self.message.size as usize).checked_sub(place).filter(|left| *left > 0) else {
+            return Err(Trouble::Sequence { expected: self.next, got: number });
+        };
+        let Some(bytes) = bytes.get(..missing.min(FRAME_BYTES)) else {
+            return Err(Trouble::Malformed("a frame was shorter than its place"));
+        };
+        if number < self.next {
+            if let Some(before) = self.message.data.get_mut(place..place + bytes.len()) {
+                before.copy_from_slice(bytes);
+            }
+            return Ok(());
+        }
+        if number > self.next {
+            if number - self.next <= MOST_AHEAD {
+                self.ahead.insert(number, SmallVec::from_slice(bytes));
+            }
+            return Err(Trouble::Sequence { expected: self.next, got: number });
+        }
+        self.append(bytes);
+        while let Some(next) = self.ahead.remove(&self.next) {
+            self.append(&next);
+        }
+        if self.ahead.is_empty() {
+            self.gap = None;
+        }
+        Ok(())
+    }
+
+    /// The next frame's bytes.
+    fn append(&mut self, bytes: &[u8]) {
+        let room = MOST_BYTES.saturating_sub(self.message.data.len());
+        self.message.data.extend_from_slice(&bytes[..bytes.len().min(room)]);
+        self.next += 1;
+    }
 }
 
 /// Reassembles messages.
@@ -204,7 +264,6 @@ impl LongMessages {
             trouble: None,
             frames_lost: false,
         };
-        let open = |message| Open { message, next: 1, offset: 0, gap: None };
         match (control, extended) {
             (16 | 32, false) => {
                 if message.size == 0 || u32::from(c) != message.size.div_ceil(7) {
@@ -212,27 +271,22 @@ impl LongMessages {
                 }
                 let way = if control == 32 { Way::Broadcast } else { Way::Connection };
                 let destination = if control == 32 { GLOBAL } else { destination };
-                self.begin((channel, source, destination, false), open(Assembled { way, ..message }), out);
+                self.begin(
+                    (channel, source, destination, false),
+                    Open::new(Assembled { way, ..message }),
+                    out,
+                );
             }
             (20, true) => {
                 let size = u32::from_le_bytes([a, b, c, d]);
                 let message = Assembled { way: Way::Extended, size, ..message };
-                self.begin((channel, source, destination, true), open(message), out);
+                self.begin((channel, source, destination, true), Open::new(message), out);
             }
             (17 | 21, _) => {
                 let Some(open) = self.open.get_mut(&back) else { return Ok(()) };
                 let message = &mut open.message;
                 (message.time_ns, message.frames) = (time_ns, message.frames + 1);
                 message.cleared_ns.get_or_insert(time_ns.saturating_sub(message.start_ns));
-                let next = if extended { u32::from_le_bytes([b, c, d, 0]) } else { u32::from(b) };
-                // The receiver may want frames again; a pause (0 frames) does not name any.
-                if a > 0 && (1..open.next).contains(&next) {
-                    open.next = next;
-                    message.data.truncate((next as usize - 1) * 7);
-                }
-                if a > 0 {
-                    open.gap = None;
-                }
             }
             (22, true) => {
                 let forward = (channel, source, destination, true);
@@ -247,7 +301,7 @@ impl LongMessages {
                 // incomplete.
                 if let Some(mut open) = self.open.remove(&back) {
                     open.message.time_ns = time_ns;
-                    let got = open.message.data.len().div_ceil(7) as u32 + 1;
+                    let got = open.count().saturating_add(1);
                     let trouble = open.gap.unwrap_or(Trouble::Sequence { expected: open.next, got });
                     end(open, trouble, out);
                 }
@@ -301,10 +355,9 @@ impl LongMessages {
         };
         let message = &mut open.message;
         (message.time_ns, message.frames) = (time_ns, message.frames + 1);
-        let number = open.offset + u32::from(sequence);
-        if number != open.next {
-            let trouble = Trouble::Sequence { expected: open.next, got: number };
-            if message.way == Way::Broadcast {
+        let number = open.offset.saturating_add(sequence.into());
+        if let Err(trouble) = open.put(number, bytes) {
+            if open.message.way == Way::Broadcast {
                 if let Some(open) = self.open.remove(&key) {
                     self.headless.insert(key, sequence);
                     end(open, trouble, out);
@@ -315,27 +368,20 @@ impl LongMessages {
             }
             return true;
         }
-        open.next += 1;
-        let size = message.size as usize;
-        let missing = size.saturating_sub((number as usize - 1) * 7);
-        let room = MOST_BYTES.saturating_sub(message.data.len());
-        message.data.extend_from_slice(&bytes[..bytes.len().min(missing).min(room)]);
-        if number as usize >= size.div_ceil(7)
+        if open.next > open.count()
             && let Some(open) = self.open.remove(&key)
         {
-            if open.message.data.len() == size {
-                if open.message.way != Way::Broadcast {
-                    if self.delivered.len() >= MOST_OPEN {
-                        self.delivered.clear();
-                    }
-                    self.delivered.insert(key, time_ns);
-                }
-                out(open.message);
-            } else if size > MOST_BYTES {
+            if open.message.size as usize > MOST_BYTES {
                 end(open, Trouble::Cut, out);
-            } else {
-                end(open, Trouble::Malformed("a frame was shorter than its place"), out);
+                return true;
             }
+            if open.message.way != Way::Broadcast {
+                if self.delivered.len() >= MOST_OPEN {
+                    self.delivered.clear();
+                }
+                self.delivered.insert(key, time_ns);
+            }
+            out(open.message);
         }
         true
     }

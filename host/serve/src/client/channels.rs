@@ -1,17 +1,16 @@
 //! A client's channels: opening, sharing with others who have them open, and closing. Also its filters, and what it
 //! stores.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use cantap_wire::message::{ChannelConfig, Filter, FrameKind, Role};
+use cantap_wire::message::{ChannelConfig, Filter, FrameKind, Mode, Role};
 use cantap_wire::{Channel, Command, Refusal, Reply};
 
 use super::Client;
+use crate::News;
 use crate::shared::only_listens;
 use crate::state::{State, Then, for_all};
 
-/// A channel being closed has delivered its last record by this time.
-const STOP_TIMEOUT: Duration = Duration::from_secs(1);
 /// What a board captured before it was asked for its time has arrived by this time.
 const SETTLE_TIMEOUT: Duration = Duration::from_millis(30);
 
@@ -44,7 +43,7 @@ impl Client {
         };
         let way = self.way(channel, &wanted)?;
         let then = || Then::Opened { client: Some((self.id, wanted)), channel };
-        let config = Some(for_all(wanted));
+        let config = Some(self.shared.on_board(channel, wanted));
         match way {
             Way::Attach(current) => {
                 let given = ChannelConfig { timing: current.timing, ..wanted };
@@ -55,10 +54,14 @@ impl Client {
                 self.shared.ask(Command::Open { channel, config }, then())?;
             }
             Way::Reopen(before) => {
-                self.close_on_board(channel)?;
+                self.shared.close_channel(channel, None)?;
                 if let Err(refusal) = self.shared.ask(Command::Open { channel, config }, then()) {
-                    self.reopen(channel, before)?;
+                    self.shared.reopen_channel(channel, before)?;
                     return Err(refusal);
+                }
+                let others = self.shared.state().listeners(self.id, channel);
+                if others > 0 {
+                    self.shared.tell(News::OffBus { client: Some(self.name.clone()), channel, others });
                 }
             }
         }
@@ -74,13 +77,16 @@ impl Client {
         if !only_listens(wanted) {
             self.must_be(Role::Send)?;
         }
+        // A client that may only listen accepts the existing bit rate. Only one that chooses another configures.
+        let hold = |state: &mut State| {
+            let other = base.is_some() && self.role < Role::Configure;
+            state
+                .hold(self.id, &[channel])
+                .map_err(|refusal| if other { Refusal::OtherSettings } else { refusal })
+        };
         let Some(current) = current else {
-            if !is_base || !only_listens(wanted) {
-                // A client that may only listen accepts the existing bit rate.
-                let other = base.is_some() && only_listens(wanted) && self.role < Role::Configure;
-                state
-                    .hold(self.id)
-                    .map_err(|refusal| if other { Refusal::OtherSettings } else { refusal })?;
+            if !is_base {
+                hold(&mut state)?;
             }
             return Ok(Way::Open);
         };
@@ -92,35 +98,14 @@ impl Client {
         if (any_other && !is_same) || other_sends {
             return Err(Refusal::OtherSettings);
         }
-        state.hold(self.id)?;
+        if !is_same {
+            hold(&mut state)?;
+        }
         Ok(Way::Reopen(current))
     }
 
-    /// Closes a channel on the board and waits for everything it had to report.
-    fn close_on_board(&self, channel: Channel) -> Result<(), Refusal> {
-        let stopped = |state: &State| state.stopped[channel.index()];
-        let before = stopped(&self.shared.state());
-        self.shared.ask(Command::Close { channel }, Then::Nothing)?;
-        // If it never reports that, the link has lost the record.
-        self.shared.wait_for(STOP_TIMEOUT, |state| stopped(state) != before || state.hello.is_none());
-        self.shared.state().open[channel.index()] = None;
-        Ok(())
-    }
-
-    /// Opens a channel again for those who have it open; they miss what was on the bus meanwhile.
-    fn reopen(&self, channel: Channel, config: ChannelConfig) -> Result<(), Refusal> {
-        let opened = self
-            .shared
-            .ask(Command::Open { channel, config: Some(config) }, Then::Opened { client: None, channel });
-        if opened.is_err() {
-            // They must not believe that the bus is quiet.
-            self.shared.state().must_end = true;
-        }
-        opened.map(|_| ())
-    }
-
-    /// Closes a channel for this client. If nobody else has it open, the board closes it; if nobody else sends,
-    /// it only listens.
+    /// Closes a channel for this client. If nobody else has it open, the board closes it; if nobody else sends, it goes back to only
+    /// listening, after a while, because the next sender would take it off the bus again.
     pub(super) fn close(&self, channel: Channel) -> Result<(), Refusal> {
         if !self.is_open(channel) {
             return Ok(());
@@ -131,19 +116,25 @@ impl Client {
             self.clear_entries(channel);
             self.withdraw(channel, true)?;
         }
-        let closed = if !any_other {
-            self.close_on_board(channel)
-        } else if sends && !other_sends {
-            let current = self.shared.state().open[channel.index()];
-            self.close_on_board(channel).and_then(|()| match current {
-                Some(current) => {
+        let current = self.shared.state().open[channel.index()];
+        let closed = match current {
+            _ if !any_other => self.shared.close_channel(channel, Some(self.id)),
+            Some(current) if sends && !other_sends => {
+                let listening = self.shared.on_board(channel, ChannelConfig::listen_only(current.timing));
+                if listening == current {
+                    self.settle()
+                } else if current.mode == Mode::Normal && !self.shared.settings.keep_mode.is_zero() {
+                    let settled = self.settle();
+                    self.shared.state().kept[channel.index()] = Some(Instant::now());
+                    settled
+                } else {
+                    // In any other mode, those who listen do not hear the bus.
+                    let closed = self.shared.close_channel(channel, Some(self.id));
                     self.shared.state().detach(self.id, channel);
-                    self.reopen(channel, for_all(ChannelConfig::listen_only(current.timing)))
+                    closed.and_then(|()| self.shared.reopen_channel(channel, listening))
                 }
-                None => Ok(()),
-            })
-        } else {
-            self.settle()
+            }
+            _ => self.settle(),
         };
         self.shared.state().detach(self.id, channel);
         closed
@@ -176,7 +167,7 @@ impl Client {
     /// Stores the client's configuration, including its filters, which the board otherwise does not have.
     pub(super) fn save_defaults(&self) -> Result<Reply, Refusal> {
         let _setup = self.setup();
-        self.shared.state().hold(self.id)?;
+        self.shared.state().hold(self.id, &Channel::ALL)?;
         let filters = self.with(|_, member| Some(member.views.clone())).ok_or(Refusal::NoSession)?;
         for (channel, view) in Channel::ALL.into_iter().zip(&filters) {
             let filters = heapless::Vec::from_slice(&view.filters).map_err(|_| Refusal::Malformed)?;

@@ -3,10 +3,13 @@
 use std::time::{Duration, Instant};
 
 use cantap_wire::message::{Periodic, Role, Trigger, TxFrame};
-use cantap_wire::{Channel, Command, Refusal, Reply};
+use cantap_wire::record::TransmitFailure;
+use cantap_wire::{Channel, Command, Event, Refusal, Reply};
 
 use super::Client;
+use crate::News;
 use crate::state::{Table, Then, clears};
+use crate::stream::{Entry, Owner};
 
 /// Withdrawn frames have been reported by this time.
 const WITHDRAW_TIMEOUT: Duration = Duration::from_millis(500);
@@ -79,12 +82,35 @@ impl Client {
         Ok(())
     }
 
-    pub(super) fn clear_entries(&self, channel: Channel) {
+    /// Clears what it has in the board's tables. Returns each entry's tag.
+    pub(super) fn clear_entries(&self, channel: Channel) -> Vec<u32> {
         let entries = self.shared.state().entries[channel.index()].of(self.id);
-        for (table, entry) in entries {
+        for (table, entry, _) in &entries {
             // If the board does not respond, its thread notices.
-            let _ = self.shared.ask(clears(table, channel, entry), Then::Nothing);
-            self.shared.state().entries[channel.index()].free(table, entry);
+            let _ = self.shared.ask(clears(*table, channel, *entry), Then::Nothing);
+            self.shared.state().entries[channel.index()].free(*table, *entry);
+        }
+        entries.into_iter().map(|(table, _, slot)| table.tag() + u32::from(slot)).collect()
+    }
+
+    /// Stops what it has sent on its own, because it has said nothing for this long. It learns of it if it is still there.
+    pub(super) fn stop_entries(&self, after: Duration) {
+        let mut has_stopped = false;
+        for channel in Channel::ALL {
+            let setup = self.setup();
+            let tags = self.clear_entries(channel);
+            drop(setup);
+            let mut state = self.shared.state();
+            for tag in tags {
+                has_stopped = true;
+                let ended = Event::TransmitFailed { channel, tag, reason: TransmitFailure::Aborted };
+                let owner = Some(Owner { client: self.id, tag });
+                let ended = Entry { owner, ..Entry::event(state.latest_ticks, ended) };
+                state.deliver(&mut vec![ended]);
+            }
+        }
+        if has_stopped {
+            self.shared.tell(News::DeadMan { client: self.name.clone(), after });
         }
     }
 

@@ -125,25 +125,42 @@ fn interval(seconds: &str, micros: &str) -> Result<u64, BadCommand> {
     seconds.and_then(|us| us.checked_add(number(micros).ok()?)).ok_or(BadCommand::Syntax("the interval"))
 }
 
-/// An identifier of eight digits has 29 bits, as in the original server, and so has one that needs them, which
-/// SavvyCAN writes without leading zeros, or sign-extended.
-fn id(text: &str) -> Result<Id, BadCommand> {
-    let bad = BadCommand::Syntax("the identifier");
-    let raw = u64::from_str_radix(text, 16).map_err(|_| bad.clone())?;
-    let is_signed = text.len() > 8 && raw >> 31 == u64::from(u32::MAX) << 1 | 1;
-    if !is_signed && raw > u64::from(Id::MAX_EXTENDED) {
-        return Err(bad);
+/// Parses a number as `%x` of C's `sscanf` into 32 bits does, with which the original server reads: with a sign, with `0x`, and cut off at 32
+/// bits. Programs print negative numbers and 64 bits where they mean less. Also returns the number of digits.
+fn hexadecimal(text: &str) -> Option<(u32, usize)> {
+    let (is_negative, digits) = match text.as_bytes().first()? {
+        b'-' => (true, &text[1..]),
+        b'+' => (false, &text[1..]),
+        _ => (false, text),
+    };
+    let digits = digits.strip_prefix("0x").or_else(|| digits.strip_prefix("0X")).unwrap_or(digits);
+    // `from_str_radix` would take another sign.
+    if digits.is_empty() || !digits.bytes().all(|digit| digit.is_ascii_hexdigit()) {
+        return None;
     }
-    let raw = raw as u32 & Id::MAX_EXTENDED;
-    let id = if text.len() >= 8 || raw > Id::MAX_STANDARD { Id::extended(raw) } else { Id::standard(raw) };
-    id.ok_or(bad)
+    let value = u64::from_str_radix(digits, 16).ok()? as u32;
+    Some((if is_negative { value.wrapping_neg() } else { value }, digits.len()))
 }
 
-/// A byte; SavvyCAN sign-extends those from 80 up.
+/// The flag with which Linux marks an identifier of 29 bits.
+const EXTENDED_FLAG: u32 = 1 << 31;
+
+/// An identifier of eight digits has 29 bits, as in the original server, and so has one with Linux's flag, or one that needs them, which
+/// SavvyCAN writes without leading zeros. Linux's other flags (remote and error frames) are refused.
+fn id(text: &str) -> Result<Id, BadCommand> {
+    let bad = || BadCommand::Syntax("the identifier");
+    let (value, digits) = hexadecimal(text).ok_or_else(bad)?;
+    let raw = value & !EXTENDED_FLAG;
+    let is_extended = value != raw || digits >= 8 || raw > Id::MAX_STANDARD;
+    let id = if is_extended { Id::extended(raw) } else { Id::standard(raw) };
+    id.ok_or_else(bad)
+}
+
+/// A byte. SavvyCAN writes those from 80 up sign-extended, or as negative numbers.
 fn byte(text: &str) -> Result<u8, BadCommand> {
-    let value = u64::from_str_radix(text, 16).map_err(|_| BadCommand::Syntax("a byte"))?;
-    let is_signed = value >= u64::MAX - 0x7F || (0xFFFF_FF80..=0xFFFF_FFFF).contains(&value);
-    if value > 0xFF && !is_signed { Err(BadCommand::Syntax("a byte")) } else { Ok(value as u8) }
+    let value = hexadecimal(text).map(|(value, _)| value);
+    let value = value.filter(|value| *value <= 0xFF || *value >= 0xFFFF_FF80);
+    value.map(|value| value as u8).ok_or(BadCommand::Syntax("a byte"))
 }
 
 /// As many bytes as the number before them says.
@@ -165,11 +182,18 @@ fn data_frame(words: &[&str]) -> Result<Frame, BadCommand> {
 pub struct Finder {
     /// The text after a `<`.
     text: Option<String>,
+    has_begun: bool,
 }
 
 impl Finder {
-    /// Takes any piece of the stream and reports each complete command's text.
-    pub fn push(&mut self, bytes: &[u8], mut report: impl FnMut(&str)) {
+    /// Takes any piece of the stream and reports each complete command's text. Returns false if the stream does not begin with a `<`:
+    /// nothing is skipped in search of the first command.
+    #[must_use]
+    pub fn push(&mut self, bytes: &[u8], mut report: impl FnMut(&str)) -> bool {
+        if !self.has_begun && bytes.first().is_some_and(|first| *first != b'<') {
+            return false;
+        }
+        self.has_begun |= !bytes.is_empty();
         for &byte in bytes {
             match (byte, &mut self.text) {
                 (b'<', text) => *text = Some(String::new()),
@@ -183,6 +207,7 @@ impl Finder {
                 (_, text) => *text = None,
             }
         }
+        true
     }
 }
 
@@ -248,6 +273,11 @@ mod tests {
         assert_eq!(parse("send ffffffff9ABBCCDD 1 ffffffff"), Ok(Command::Send(frame("1ABBCCDD#FF"))));
         assert_eq!(parse("send 800 0"), Ok(Command::Send(frame("00000800#"))));
         assert_eq!(parse("send 00000123 0"), Ok(Command::Send(frame("00000123#"))));
+        // With Qt 6, and as the original server takes them.
+        assert_eq!(parse("send 123 3 -80 0x11 -1"), Ok(Command::Send(frame("123#8011FF"))));
+        assert_eq!(parse("send -7ffffedd 1 7f"), Ok(Command::Send(frame("00000123#7F"))));
+        assert_eq!(parse("send 80000123 0"), Ok(Command::Send(frame("00000123#"))));
+        assert_eq!(parse("send 0x7FF 1 +1"), Ok(Command::Send(frame("7FF#01"))));
     }
 
     #[test]
@@ -264,6 +294,12 @@ mod tests {
             "send 123 1 100",
             "send 20000000 0",
             "send -1 0",
+            "send 40000123 0",
+            "send 0x 0",
+            "send --1 0",
+            "send 123 1 0x-1",
+            "send 123 1 -81",
+            "send 11111111111111111 0",
             "add 1 123 0",
             "sendrtr 123 16",
             "filter 0 0 123 2 FF",
@@ -280,17 +316,26 @@ mod tests {
     #[test]
     fn commands_are_found_in_any_pieces() {
         let bytes = [
-            b"garbage < open can0 >< rawmode >\r\n<".to_vec(),
+            b"< open can0 >garbage< rawmode >\r\n<".to_vec(),
             vec![b'x'; 2 * LONGEST],
             b"> < echo >".to_vec(),
         ]
         .concat();
         for piece in [1, 7, bytes.len()] {
             let (mut finder, mut found) = (Finder::default(), Vec::new());
-            bytes
-                .chunks(piece)
-                .for_each(|bytes| finder.push(bytes, |text| found.push(text.trim().to_owned())));
+            for bytes in bytes.chunks(piece) {
+                assert!(finder.push(bytes, |text| found.push(text.trim().to_owned())));
+            }
             assert_eq!(found, ["open can0", "rawmode", "echo"]);
+        }
+    }
+
+    /// A web page's request has its headers in front of any body.
+    #[test]
+    fn nothing_is_skipped_in_search_of_the_first_command() {
+        for first in ["POST / HTTP/1.1\r\n\r\n< open can0 >", " < open can0 >", "\0< open can0 >", "-"] {
+            let mut finder = Finder::default();
+            assert!(!finder.push(first.as_bytes(), |text| panic!("{text}")), "{first}");
         }
     }
 }

@@ -35,6 +35,8 @@ pub struct Hearing {
     pub own_entries: HashMap<Id, Frame>,
     /// It was off the bus for a moment.
     pub has_gap: bool,
+    /// It has said what it wants since it opened its bus. Before that, it compares what it reads with an answer that it waits for.
+    pub has_chosen: bool,
     statistics: Statistics,
 }
 
@@ -53,6 +55,14 @@ impl Hearing {
     pub fn begin(&mut self, hears: Hears, from: Instant) {
         self.hears = hears;
         self.from = Some(from);
+        self.has_chosen = true;
+        self.subscriptions.clear();
+    }
+
+    /// Nothing more is told until the client has the answer to a change of mode.
+    pub fn hold(&mut self) {
+        self.has_chosen = false;
+        self.hears = Hears::Subscribed;
         self.subscriptions.clear();
     }
 
@@ -71,7 +81,7 @@ impl Hearing {
     /// Takes records, and adds what the client receives.
     pub fn take(&mut self, records: &[TraceRecord], out: &mut String) {
         for record in records {
-            if std::mem::take(&mut self.has_gap) && self.hears != Hears::Nothing {
+            if self.tells_errors() && std::mem::take(&mut self.has_gap) {
                 put_error(out, record.time_ns, &TraceEvent::GAP);
             }
             self.take_one(record, out);
@@ -111,11 +121,15 @@ impl Hearing {
                 if let TraceEvent::TransmitFailed { tag, .. } = event {
                     self.own_frames.remove(tag);
                 }
-                if self.hears != Hears::Nothing {
+                if self.tells_errors() {
                     put_error(out, time_ns, event);
                 }
             }
         }
+    }
+
+    fn tells_errors(&self) -> bool {
+        self.has_chosen && self.hears != Hears::Nothing
     }
 
     /// Adds what intervals held back until `now_ns`.

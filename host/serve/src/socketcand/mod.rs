@@ -11,7 +11,7 @@ mod subscriptions;
 mod told;
 
 use std::collections::HashMap;
-use std::io::{self, Read};
+use std::io::{self, Read, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpStream, UdpSocket};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -23,8 +23,10 @@ use cantap_trace::Interface;
 use cantap_wire::message::{ChannelConfig, Mode, Periodic, Role, TxFrame};
 use cantap_wire::{Channel, Frame, Id};
 
+use crate::foreign;
 use crate::lines::device_of;
 use crate::listen::{Listening, accept, bind};
+use crate::places::{Place, Places, ends};
 use crate::{Board, News};
 use command::{BadCommand, Command, Finder};
 use hearing::{Hearing, Hears};
@@ -70,7 +72,7 @@ pub fn listen(boards: &[Arc<Board>], address: SocketAddr, role: Role) -> io::Res
         .collect();
     let beacon = Beacon::new(address, &buses)?;
     let mut sent: Option<Instant> = None;
-    let connections = Arc::new(());
+    let places = Places::new(MOST_CONNECTIONS);
     Listening::start("cantap-socketcand", Some(address), move || {
         if sent.is_none_or(|sent| sent.elapsed() >= BEACON_EVERY) {
             beacon.send();
@@ -78,18 +80,21 @@ pub fn listen(boards: &[Arc<Board>], address: SocketAddr, role: Role) -> io::Res
         }
         let (stream, peer) = accept(&listener)?;
         let name = format!("socketcand client {peer}");
-        if Arc::strong_count(&connections) > MOST_CONNECTIONS {
-            let reason = format!("there are {MOST_CONNECTIONS} connections already");
-            buses[0].board.tell(News::Refused { client: name, reason });
-            return Ok(());
-        }
-        let (buses, counted) = (Arc::clone(&buses), Arc::clone(&connections));
+        let place = match places.enter(Some(peer.ip()), ends(&stream)?) {
+            Ok(place) => place,
+            Err(full) => {
+                let _ = (&stream).write(format!("< error {full} >").as_bytes());
+                buses[0].board.tell(News::Refused { client: name, reason: full.to_string() });
+                return Ok(());
+            }
+        };
+        let buses = Arc::clone(&buses);
         std::thread::Builder::new().name("cantap-socketcand-client".to_owned()).spawn(move || {
             if let Ok(connection) = Connection::new(stream, name, buses, role) {
                 // An error means that the connection is gone.
-                let _ = connection.serve();
+                let _ = connection.serve(&place);
             }
-            drop(counted);
+            drop(place);
         })?;
         Ok(())
     })
@@ -146,6 +151,17 @@ struct Connection {
     is_over: AtomicBool,
 }
 
+/// What a client receives after a command that changes that, on an open bus.
+const fn mode(command: &Command, is_open: bool) -> Option<Hears> {
+    match command {
+        _ if !is_open => None,
+        Command::RawMode => Some(Hears::All),
+        Command::BcmMode => Some(Hears::Subscribed),
+        Command::StatisticsMode => Some(Hears::Nothing),
+        _ => None,
+    }
+}
+
 /// A client's choices before it opens a bus.
 #[derive(Default)]
 struct Setup {
@@ -186,8 +202,9 @@ impl Connection {
         }))
     }
 
-    /// Carries out the client's commands until either side ends.
-    fn serve(self: &Arc<Self>) -> io::Result<()> {
+    /// Carries out the client's commands until either side ends. It has its place for itself once it has said what it wants to receive or
+    /// send.
+    fn serve(self: &Arc<Self>, place: &Place) -> io::Result<()> {
         self.write("< hi >")?;
         let mut finder = Finder::default();
         let (mut setup, mut opened) = (Setup::default(), None);
@@ -195,6 +212,7 @@ impl Connection {
         let came = Instant::now();
         let mut bytes = [0; 4096];
         let mut result = Ok(());
+        let mut has_spoken = false;
         while result.is_ok() && !self.is_over.load(Ordering::Relaxed) {
             let len = match lock(&self.input).read(&mut bytes) {
                 Ok(0) => break,
@@ -205,15 +223,25 @@ impl Connection {
                     break;
                 }
             };
-            finder.push(&bytes[..len], |text| {
-                if result.is_err() {
+            let bytes = &bytes[..len];
+            let is_socketcand = finder.push(bytes, |text| {
+                if result.is_err() || self.is_over.load(Ordering::Relaxed) {
                     return;
                 }
-                let answer = match command::parse(text) {
-                    Ok(command) => self.perform(command, &mut setup, &mut opened),
-                    Err(BadCommand::Unknown) => Some("< error unknown command >".to_owned()),
-                    Err(BadCommand::Syntax(what)) => {
-                        Some(format!("< error {what} is wrong in '{}' >", plain(text.trim())))
+                let command = command::parse(text);
+                let hears = command.as_ref().ok().and_then(|command| mode(command, opened.is_some()));
+                if hears.is_some() {
+                    lock(&self.hearing).hold();
+                }
+                let answer = match command {
+                    Ok(command) => {
+                        has_spoken = true;
+                        self.perform(command, &mut setup, &mut opened)
+                    }
+                    Err(bad) => {
+                        // Nothing is skipped in search of the first command.
+                        self.is_over.fetch_or(!has_spoken, Ordering::Relaxed);
+                        Some(self.misunderstood(&bad, text))
                     }
                 };
                 if let Some(answer) = answer {
@@ -221,13 +249,52 @@ impl Connection {
                     result = self.write(&answer);
                     answered_at = Instant::now();
                 }
+                // Only when the answer is on its way may anything else follow.
+                match hears {
+                    Some(Hears::All) => lock(&self.hearing).begin(Hears::All, answered_at + BEFORE_FRAMES),
+                    Some(hears) => lock(&self.hearing).begin(hears, answered_at),
+                    None => {}
+                }
             });
+            if !is_socketcand {
+                self.refused(&foreign::reason(bytes));
+                break;
+            }
+            if has_spoken {
+                place.spoke();
+            }
+            if lock(&self.hearing).has_chosen {
+                place.is_served();
+            }
             if opened.is_none() && came.elapsed() > OPEN_TIMEOUT {
                 break;
             }
         }
         self.is_over.store(true, Ordering::Relaxed);
         result
+    }
+
+    /// What is answered to a text that is no command.
+    fn misunderstood(&self, bad: &BadCommand, text: &str) -> String {
+        match bad {
+            BadCommand::Unknown => {
+                self.refused(&format!("there is no command '{}'", plain(text.trim())));
+                "< error unknown command >".to_owned()
+            }
+            BadCommand::Syntax(what) => {
+                let reason = format!("{what} is wrong in '{}'", plain(text.trim()));
+                self.refused(&reason);
+                self.refusal(&reason)
+            }
+        }
+    }
+
+    /// A reason as the client reads it: in raw mode, clients read nothing but frames.
+    fn refusal(&self, reason: &str) -> String {
+        if lock(&self.hearing).hears == Hears::All {
+            return told::not_sent();
+        }
+        format!("< error {} >", plain(reason))
     }
 
     fn write(&self, text: &str) -> io::Result<()> {
@@ -275,22 +342,25 @@ impl Connection {
                 _ => Some("< error open a bus first >".to_owned()),
             };
         };
+        let chooses = !matches!(
+            command,
+            Command::Open(_)
+                | Command::Bitrate(..)
+                | Command::ControlMode { .. }
+                | Command::Echo
+                | Command::RawMode
+                | Command::BcmMode
+                | Command::StatisticsMode
+        );
+        if chooses {
+            lock(&self.hearing).has_chosen = true;
+        }
         let done = match command {
             Command::Open(_) | Command::Bitrate(..) | Command::ControlMode { .. } => {
                 return Some("< error a bus is open already >".to_owned());
             }
-            Command::RawMode => {
-                lock(&self.hearing).begin(Hears::All, Instant::now() + BEFORE_FRAMES);
-                return ok();
-            }
-            Command::BcmMode => {
-                lock(&self.hearing).begin(Hears::Subscribed, Instant::now());
-                return ok();
-            }
-            Command::StatisticsMode => {
-                lock(&self.hearing).begin(Hears::Nothing, Instant::now());
-                return ok();
-            }
+            // The mode changes when the client has the answer.
+            Command::RawMode | Command::BcmMode | Command::StatisticsMode => return ok(),
             Command::Echo => return Some("< echo >".to_owned()),
             Command::Statistics(ms) => {
                 lock(&self.hearing).statistics_every(Duration::from_millis(ms));
@@ -329,11 +399,7 @@ impl Connection {
         };
         let reason = done.err()?;
         self.refused(&reason);
-        // In raw mode, clients read nothing but frames.
-        if lock(&self.hearing).hears == Hears::All {
-            return Some(told::not_sent());
-        }
-        Some(format!("< error {} >", plain(&reason)))
+        Some(self.refusal(&reason))
     }
 
     fn refused(&self, reason: &str) {
@@ -476,5 +542,6 @@ impl Connection {
 
 /// Removes what a client could mistake for the end of an answer.
 fn plain(text: &str) -> String {
-    text.chars().filter(|letter| !matches!(letter, '<' | '>') && !letter.is_control()).take(200).collect()
+    let is_plain = |letter: &char| !matches!(letter, '<' | '>') && !cantap_trace::clean::is_harmful(*letter);
+    text.chars().filter(is_plain).take(200).collect()
 }

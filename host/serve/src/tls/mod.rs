@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use cantap::device::Link;
+use cantap::device::{Link, is_idle};
 use cantap_wire::message::Role;
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, DnsName, PrivateKeyDer, ServerName};
@@ -18,20 +18,22 @@ use rustls::{
     ClientConfig, ClientConnection, Connection, RootCertStore, ServerConfig, ServerConnection, crypto,
 };
 
+use crate::client::Guest;
 use crate::connect::dial;
 use crate::flow::acknowledging;
-use crate::listen::{Listening, accept, admit, bind};
+use crate::listen::{Listening, accept, admit, bind, turn_away};
+use crate::places::{Places, ends};
 use crate::{Board, News};
 
-pub use keys::{Keys, KeysError};
+pub use keys::{Keys, KeysError, LIFETIME_DAYS};
 use stream::{Secured, shake_hands};
 
 /// A peer that has not shown its certificate by this time is dropped.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
 /// A server that admits a client sends it tickets immediately.
 const VERDICT_TIMEOUT: Duration = Duration::from_secs(1);
-/// Limit for peers that have not shown theirs, at a time.
-const MOST_HANDSHAKES: usize = 16;
+/// Limit for peers that have not shown theirs, at a time. So many must come within the time of a handshake to keep somebody out.
+const MOST_HANDSHAKES: usize = 64;
 
 /// Why TLS could not be set up, or a peer was not trusted.
 #[derive(Debug, thiserror::Error)]
@@ -84,6 +86,7 @@ impl Files {
         for certificate in certificates(&self.authority)? {
             authority.add(certificate).map_err(|error| bad(&self.authority, error.to_string()))?;
         }
+        private(&self.key)?;
         Ok(Credentials {
             chain: certificates(&self.certificate)?,
             key: PrivateKeyDer::from_pem_file(&self.key)
@@ -91,6 +94,28 @@ impl Files {
             authority: Arc::new(authority),
         })
     }
+}
+
+/// Refuses a key that other users can read or replace. A system's own may be readable to a group, if it belongs to root.
+#[cfg(unix)]
+fn private(key: &Path) -> Result<(), TlsError> {
+    use std::os::unix::fs::MetadataExt;
+    let bad = |reason: &str| TlsError::File { path: key.to_owned(), reason: reason.to_owned() };
+    let there = key.metadata().map_err(|error| bad(&error.to_string()))?;
+    let own = rustix::process::geteuid().as_raw();
+    let allowed = if there.uid() == 0 { 0o740 } else { 0o700 };
+    if there.uid() != own && there.uid() != 0 {
+        return Err(bad("it belongs to another user"));
+    }
+    if there.mode() & 0o777 & !allowed != 0 {
+        return Err(bad("other users can use it; `chmod 600` it"));
+    }
+    Ok(())
+}
+
+#[cfg(not(unix))]
+fn private(_: &Path) -> Result<(), TlsError> {
+    Ok(())
 }
 
 fn provider() -> Arc<crypto::CryptoProvider> {
@@ -126,23 +151,35 @@ impl Server {
 pub fn listen(board: &Arc<Board>, address: SocketAddr, most: Role, server: &Server) -> io::Result<Listening> {
     let (listener, address) = bind(address)?;
     let (board, config) = (Arc::clone(board), Arc::clone(&server.0));
-    let handshakes = Arc::new(());
+    let (handshakes, places) = (Places::new(MOST_HANDSHAKES), Places::new(board.most_clients()));
     Listening::start("cantap-tls", Some(address), move || {
         let (stream, peer) = accept(&listener)?;
         let name = format!("client {peer}");
-        if Arc::strong_count(&handshakes) > MOST_HANDSHAKES {
-            // This is not reported: a flood of connections would be a flood of messages.
-            return Ok(());
-        }
-        let (board, config, counted) = (Arc::clone(&board), Arc::clone(&config), Arc::clone(&handshakes));
+        // Who is let go is not reported: a flood of connections would be a flood of messages.
+        let Ok(handshake) = handshakes.enter(Some(peer.ip()), ends(&stream)?) else { return Ok(()) };
+        let (board, config, places) = (Arc::clone(&board), Arc::clone(&config), Arc::clone(&places));
         std::thread::Builder::new().name("cantap-tls-client".to_owned()).spawn(move || {
-            let secured = welcome(stream, config);
-            drop(counted);
+            let end = ends(&stream);
+            let deadline = Instant::now() + HANDSHAKE_TIMEOUT;
+            if !has_spoken(&stream, deadline) {
+                return;
+            }
+            handshake.spoke();
+            let secured = welcome(stream, config, deadline);
+            drop(handshake);
+            let secured = secured.and_then(|secured| Ok((secured, places.enter(Some(peer.ip()), end?))));
             match secured {
-                Ok((role, secured)) => {
+                Ok(((role, secured), Ok(place))) => {
                     let (input, output) = secured.split();
-                    admit(&board, input, output, &name, role.min(most));
+                    let (role, place) = (role.min(most), Some(place));
+                    admit(
+                        &board,
+                        input,
+                        output,
+                        Guest { name, role, place, is_counted: false, is_remote: true },
+                    );
                 }
+                Ok(((_, secured), Err(full))) => turn_away(&board, &mut secured.split().1, name, &full),
                 Err(error) => board.tell(News::Refused { client: name, reason: error.to_string() }),
             }
         })?;
@@ -150,9 +187,20 @@ pub fn listen(board: &Arc<Board>, address: SocketAddr, most: Role, server: &Serv
     })
 }
 
-fn welcome(stream: TcpStream, config: Arc<ServerConfig>) -> io::Result<(Role, Secured)> {
+/// Waits until a peer says something, which a client does at once. Returns whether it has.
+fn has_spoken(stream: &TcpStream, deadline: Instant) -> bool {
+    while Instant::now() < deadline {
+        match stream.peek(&mut [0]) {
+            Err(error) if is_idle(&error) => {}
+            said => return matches!(said, Ok(1..)),
+        }
+    }
+    false
+}
+
+fn welcome(stream: TcpStream, config: Arc<ServerConfig>, deadline: Instant) -> io::Result<(Role, Secured)> {
     let connection = ServerConnection::new(config).map_err(io::Error::other)?;
-    let secured = shake_hands(stream, Connection::Server(connection), Instant::now() + HANDSHAKE_TIMEOUT)?;
+    let secured = shake_hands(stream, Connection::Server(connection), deadline)?;
     let role = secured.peer_certificate().and_then(|certificate| role_of(&certificate));
     let role = role.ok_or_else(|| io::Error::other("its certificate says nothing of what it may do"))?;
     Ok((role, secured))

@@ -1,9 +1,12 @@
 //! Every integration test of this crate, in one program: each program is linked on its own.
 
+mod browser;
 mod eight_clients;
+mod hostile;
 mod line;
 mod reconnects;
 mod sharing;
 mod slow_line;
 mod socketcand;
+mod strangers;
 mod tls;

@@ -210,21 +210,23 @@ fn one_client_configures_at_a_time_and_nobody_changes_what_others_hear() {
         Refusal::NotGranted { needs: Role::Configure }
     );
     first.listen(Channel::Can1, BITRATE_BPS).unwrap();
-    assert_eq!(refusal(second.listen(Channel::Can2, BITRATE_BPS)), Refusal::Held);
+    second.listen(Channel::Can2, 250_000).unwrap();
     third.listen(Channel::Can1, BITRATE_BPS).unwrap();
     first.close_channel(Channel::Can1).unwrap();
     assert_eq!(refusal(first.listen(Channel::Can1, 125_000)), Refusal::OtherSettings);
     third.close_channel(Channel::Can1).unwrap();
+    assert_eq!(refusal(second.listen(Channel::Can1, 125_000)), Refusal::Held);
     first.listen(Channel::Can1, 125_000).unwrap();
     drop(first);
-    wait_until("the right is free", || second.listen(Channel::Can2, BITRATE_BPS).is_ok());
+    wait_until("the right is free", || second.listen(Channel::Can1, BITRATE_BPS).is_ok());
 }
 
 /// The sender gets the confirmation with its own tag, others the frame as sent by the board; the board acknowledges only while
 /// somebody may send.
 #[test]
 fn a_sender_is_confirmed_others_see_the_frame_and_the_board_listens_again_when_it_leaves() {
-    let board = board("load=0");
+    let settings = Settings { keep_mode: Duration::from_millis(20), ..Settings::at(BITRATE_BPS) };
+    let (board, told) = board_at("load=0", settings);
     let listener = client(&board, "listener", Role::Listen);
     listener.listen(Channel::Can1, BITRATE_BPS).unwrap();
     let sender = client(&board, "sender", Role::Send);
@@ -272,6 +274,16 @@ fn a_sender_is_confirmed_others_see_the_frame_and_the_board_listens_again_when_i
     assert_eq!(sent.count(), 7);
     // It was off the bus for a moment, twice: when the first sender came and when the last one had left.
     assert_eq!(heard.iter().filter(|record| record.event == TraceEvent::GAP).count(), 2, "{heard:?}");
+    assert_eq!(listener.counters().channels[0].off_bus, 2);
+    let said: Vec<String> =
+        told.try_iter().map(|news| news.to_string()).filter(|said| said.contains("gap")).collect();
+    assert_eq!(
+        said,
+        [
+            "channel 1 was off its bus for a moment, because sender may send on it; 1 other client sees a gap",
+            "channel 1 was off its bus for a moment, and only listens again; 1 client sees a gap",
+        ]
+    );
 }
 
 #[test]

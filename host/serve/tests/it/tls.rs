@@ -284,3 +284,55 @@ fn keys_are_secret_and_nothing_is_overwritten() {
     let missing = Keys::files(folder.path(), "nobody");
     assert!(tls::Server::new(&missing).err().unwrap().to_string().contains("nobody.pem' cannot be used"));
 }
+
+/// Peers that connect and say nothing, and come again whenever they are let go, keep nobody out.
+#[test]
+fn silent_peers_keep_nobody_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let served = serve(folder.path(), Role::Listen);
+    let files = Keys::in_folder(folder.path()).unwrap().add_client("good", Role::Listen).unwrap();
+    let address = served.listening.address().unwrap();
+    let is_over = Arc::new(std::sync::atomic::AtomicBool::new(false));
+    let strangers: Vec<_> = (0..100)
+        .map(|_| {
+            let is_over = Arc::clone(&is_over);
+            std::thread::spawn(move || {
+                while !is_over.load(std::sync::atomic::Ordering::Relaxed) {
+                    let Ok(mut stream) = TcpStream::connect(address) else { continue };
+                    let _ = stream.set_read_timeout(Some(Duration::from_millis(200)));
+                    while !is_over.load(std::sync::atomic::Ordering::Relaxed)
+                        && !matches!(stream.read(&mut [0]), Ok(0))
+                    {}
+                }
+            })
+        })
+        .collect();
+    std::thread::sleep(Duration::from_millis(300));
+    for _ in 0..5 {
+        served.connect("localhost", &files).unwrap();
+    }
+    is_over.store(true, std::sync::atomic::Ordering::Relaxed);
+    strangers.into_iter().for_each(|stranger| stranger.join().unwrap());
+}
+
+#[cfg(unix)]
+#[test]
+fn a_key_that_others_can_read_is_refused() {
+    use std::os::unix::fs::PermissionsExt;
+    let folder = tempfile::tempdir().unwrap();
+    let files = Keys::in_folder(folder.path()).unwrap().add_server(&["localhost".to_owned()]).unwrap();
+    assert!(tls::Server::new(&files).is_ok());
+    std::fs::set_permissions(&files.key, PermissionsExt::from_mode(0o644)).unwrap();
+    let refused = tls::Server::new(&files).err().unwrap().to_string();
+    assert!(refused.ends_with("other users can use it; `chmod 600` it"), "{refused}");
+}
+
+#[test]
+fn a_server_s_certificate_is_for_named_computers() {
+    let folder = tempfile::tempdir().unwrap();
+    let keys = Keys::in_folder(folder.path()).unwrap();
+    for host in ["*", "*.example", "", "a b"] {
+        let refused = keys.add_server(&["localhost".to_owned(), host.to_owned()]);
+        assert!(refused.is_err_and(|error| error.to_string().contains("one computer")), "{host}");
+    }
+}

@@ -83,7 +83,7 @@ impl fmt::Display for ConditionError {
         writeln!(f, "{}", self.fault)?;
         // A condition from a file can contain line ends and tabs: show it on one line, one column per
         // character.
-        writeln!(f, "  {}", self.text.replace(char::is_control, " "))?;
+        writeln!(f, "  {}", self.text.replace(cantap_trace::clean::is_harmful, " "))?;
         write!(f, "  {}^", " ".repeat(before.chars().count()))
     }
 }

@@ -256,6 +256,7 @@ mod tests {
         assert_eq!(hits("byte[1] != 0", FRAMES), [0], "a byte that is not there is neither equal nor not");
         assert_eq!(hits("len == 0 or byte[0] / 2 > 0x30", FRAMES), [2, 6]);
         assert_eq!(hits("ext or rtr", &["00000001#", "001#R", "001#"]), [0, 1]);
+        assert_eq!(hits("pgn == 61444", &["0CF00400#", "18F00427#", "0CF00500#", "004#"]), [0, 1]);
         assert_eq!(hits("dlc == 9", &["001#1122334455667788_9"]), [0]);
         assert_eq!(hits("byte[0 - len] == 1 or byte[len / 2] == 1", &["001#01"]), [] as [usize; 0]);
         assert_eq!(

@@ -2,6 +2,7 @@
 
 use crate::MessageRef;
 use cantap_trace::fd::FD_MAX_BYTES;
+use cantap_trace::grammar;
 use cantap_trace::{TraceEvent, TraceRecord};
 
 use super::syntax::Operator;
@@ -43,6 +44,7 @@ pub(super) enum Part {
     Dlc,
     Length,
     Extended,
+    Group,
     Remote,
     Error,
     Lost,
@@ -55,6 +57,7 @@ pub(super) fn part(name: &str) -> Option<Part> {
         "dlc" => Part::Dlc,
         "len" => Part::Length,
         "ext" => Part::Extended,
+        "pgn" => Part::Group,
         "rtr" => Part::Remote,
         "error" => Part::Error,
         "lost" => Part::Lost,
@@ -76,6 +79,7 @@ pub(super) fn part_of(part: Part, record: &TraceRecord) -> Option<f64> {
         Part::Dlc => Some(frame.dlc().into()),
         Part::Length => Some(frame.data_len() as f64),
         Part::Extended => flag(frame.id().is_extended()),
+        Part::Group => grammar::group_of(frame.id()).map(f64::from),
         Part::Remote => flag(frame.is_remote()),
         Part::Channel | Part::Error | Part::Lost => None,
     }

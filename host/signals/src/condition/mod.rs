@@ -6,6 +6,7 @@
 //! | `Gear == Drive`, `Gear == "Not available"` | a text of the signal's value table |
 //! | `id`, `dlc`, `len`, `ch` | the frame's identifier, length code, data bytes, channel (from 1) |
 //! | `ext`, `rtr` | 1 for a 29-bit identifier, for a remote frame |
+//! | `pgn` | the parameter group of a 29-bit identifier (J1939), without its destination |
 //! | `byte[0]` | a data byte, counted from 0 |
 //! | `error`, `lost` | 1 for a bus error, for a place where frames are missing |
 //! | `uds.sid`, `j1939.pgn` | a value of what several frames say together, where a [`Listener`] puts them together |

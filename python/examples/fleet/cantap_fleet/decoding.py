@@ -20,7 +20,7 @@ import cantap
 import pyarrow as pa
 
 from . import columns
-from .ledger import CUT, DAMAGED, EMPTY, FAILED, READ, REFUSED, Entry
+from .ledger import CUT, DAMAGED, EMPTY, FAILED, READ, REFUSED, UNDECODED, Entry
 
 
 class Request(TypedDict):
@@ -78,15 +78,15 @@ def decode(request: Request) -> Entry:
     entry = Entry(request["trace"], request["vehicle"], request["bytes"], databases=request["database_names"])
     path, zone = request["path"], request["zone"]
     try:
-        database = _databases(request)
         with pa.OSFile(request["rows"], "wb") as file, pa.ipc.new_stream(file, columns.STREAM_SCHEMA) as writer:
             scan = cantap.scan(path, zone=zone)
             records = _write(writer, scan, "frames", request)
             report = scan.report
-            if database is not None:
-                scan = cantap.scan(path, zone=zone, db=database, signals=request["signals"])
-                entry.signal_rows = _write(writer, scan, "signals", request)
-                entry.decoded = scan.report.decoded
+            decoding, unusable = _decoding(request)
+            if decoding is not None:
+                entry.signal_rows = _write(writer, decoding, "signals", request)
+                entry.decoded = decoding.report.decoded
+                scan = decoding
                 if (scan.report.records_read, scan.report.issues) != (report.records_read, report.issues):
                     raise OSError("it changed while it was read")
     except cantap.CantapError as error:
@@ -102,11 +102,35 @@ def decode(request: Request) -> Entry:
         entry.left_out, entry.notes = report.left_out, report.notes
         entry.problem = entry.faults[0] if entry.faults else None
         entry.state = _state(report)
+        if request["databases"] and report.frames:
+            entry.coverage = entry.decoded / report.frames
         if entry.state == EMPTY:
             entry.problem = "it has no record"
+        elif entry.coverage == 0:
+            # What is wrong with the trace itself comes first: rows are missing.
+            entry.problem = "; ".join(filter(None, [entry.problem, unusable or _none_decoded(request)]))
+            if entry.state == READ:
+                entry.state = UNDECODED
         return entry
     entry.signal_rows = entry.decoded = 0
     return entry
+
+
+def _decoding(request: Request) -> tuple[cantap.Scan | None, str | None]:
+    """The trace's signals, or the reason why its vehicle's databases have none: that does not affect its frames."""
+    try:
+        database = _databases(request)
+        if database is None:
+            return None, None
+        return cantap.scan(request["path"], zone=request["zone"], db=database, signals=request["signals"]), None
+    except cantap.DatabaseError as error:
+        return None, f"no signals: {_in_words(error, request)}"
+
+
+def _none_decoded(request: Request) -> str:
+    names = ", ".join(request["database_names"])
+    chosen = f" with the signals {', '.join(request['signals'])}" if request["signals"] else ""
+    return f"no signals: {names} has a message{chosen} for none of its frames"
 
 
 def _state(report: cantap.Report) -> str:

@@ -13,7 +13,9 @@ CUT = "cut"
 DAMAGED = "damaged"
 #: It was read to its end, and is empty.
 EMPTY = "empty"
-#: It is not a trace, or its vehicle's databases cannot be used. It has no rows.
+#: It was read to its end and its frames are there, but no signals: its vehicle's databases cannot be used, or know none of its frames.
+UNDECODED = "undecoded"
+#: It is not a trace, or not in a vehicle's folder. It has no rows.
 REFUSED = "refused"
 #: The system did not deliver it, reading it took too long, or the process that read it died, twice. It has no rows.
 FAILED = "failed"
@@ -39,6 +41,8 @@ class Entry:
     bus_errors: int = 0
     #: Frames for which the databases have a message.
     decoded: int = 0
+    #: Their share of all frames, from 0 to 1; `None` if the vehicle has no databases, or there are no frames.
+    coverage: float | None = None
     #: Rows among the signals.
     signal_rows: int = 0
     #: Places that could not be read, and a description of the first.
@@ -58,6 +62,6 @@ class Entry:
 #: The same, as a Spark type.
 DDL = (
     "trace string, vehicle string, bytes bigint, state string, problem string, format string, records bigint, frames bigint, "
-    "lost bigint, lost_at_least boolean, bus_errors bigint, decoded bigint, signal_rows bigint, issues bigint, "
+    "lost bigint, lost_at_least boolean, bus_errors bigint, decoded bigint, coverage double, signal_rows bigint, issues bigint, "
     "faults array<string>, left_out map<string, bigint>, notes map<string, bigint>, databases array<string>"
 )

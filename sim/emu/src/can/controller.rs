@@ -5,6 +5,7 @@ mod node;
 use super::fault::ErrorCounters;
 use super::fifo::Fifo;
 use super::mailbox::Mailboxes;
+use crate::hostile::{CanFaults, Dice, ReleaseInInit};
 
 mod mcr {
     pub const INRQ: u32 = 1;
@@ -29,6 +30,10 @@ mod msr {
     pub const RXM: u32 = 1 << 9;
     /// The receive pin: recessive.
     pub const RX: u32 = 1 << 11 | 1 << 10;
+}
+
+mod rfr {
+    pub const RELEASE: u32 = 1 << 5;
 }
 
 mod ier {
@@ -126,6 +131,10 @@ pub struct Controller {
     mode: Mode,
     /// Initialisation was requested while a frame is under way.
     init_pending: bool,
+    /// The cycle before which initialisation mode is not entered, for the request under way; 0 if at once.
+    init_due: u64,
+    /// When initialisation mode is entered, on a request that nothing but this delays.
+    init_at: Option<u64>,
     mcr: u32,
     msr_flags: u32,
     ier: u32,
@@ -144,6 +153,9 @@ pub struct Controller {
     dominant_bits: u64,
     /// What a master reset clears.
     pub(super) master_reset: MasterReset,
+    /// What may come late.
+    pub(super) faults: CanFaults,
+    pub(super) dice: Dice,
 }
 
 impl Default for Controller {
@@ -151,6 +163,8 @@ impl Default for Controller {
         Self {
             mode: Mode::Sleep,
             init_pending: false,
+            init_due: 0,
+            init_at: None,
             mcr: mcr::SLEEP | mcr::DBF,
             msr_flags: 0,
             ier: 0,
@@ -166,6 +180,8 @@ impl Default for Controller {
             cycles_per_clock: 1,
             dominant_bits: 0,
             master_reset: MasterReset::default(),
+            faults: CanFaults::default(),
+            dice: Dice::default(),
         }
     }
 }
@@ -200,8 +216,8 @@ impl Controller {
             0x00 => self.write_mcr(value, now),
             0x04 => self.msr_flags &= !(value & (msr::ERRI | msr::WKUI | msr::SLAKI)),
             0x08 => self.mailboxes.control(value),
-            0x0C => self.fifos[0].control(value),
-            0x10 => self.fifos[1].control(value),
+            0x0C => self.control_fifo(0, value, now),
+            0x10 => self.control_fifo(1, value, now),
             0x14 => self.ier = value & ier::WRITABLE,
             0x18 => self.last_error = value >> 4 & 7,
             // The bit timing can only be set in initialisation mode.
@@ -216,6 +232,18 @@ impl Controller {
         Some(())
     }
 
+    /// A write to RFxR.
+    fn control_fifo(&mut self, fifo: usize, value: u32, now: u64) {
+        let Self { faults, dice, mode, .. } = self;
+        let in_init =
+            if *mode == Mode::Initialisation { faults.release_in_init } else { ReleaseInInit::Works };
+        match in_init {
+            ReleaseInInit::Works => self.fifos[fifo].control(value, || dice.due(faults.release, now)),
+            ReleaseInInit::Waits => self.fifos[fifo].control(value, || u64::MAX),
+            ReleaseInInit::Ignored => self.fifos[fifo].control(value & !rfr::RELEASE, || 0),
+        }
+    }
+
     fn write_mcr(&mut self, value: u32, now: u64) {
         if value & mcr::RESET != 0 {
             *self = self.after_master_reset(now);
@@ -226,18 +254,36 @@ impl Controller {
         }
         self.mcr = value & mcr::WRITABLE;
         let (init, sleep) = (value & mcr::INRQ != 0, value & mcr::SLEEP != 0);
+        if !init {
+            self.init_at = None;
+        }
         let busy = self.sending.is_some() || self.receiving;
         match self.mode {
             Mode::Initialisation if !init && sleep => self.fall_asleep(),
             Mode::Initialisation if !init => self.leave_initialisation(now),
             Mode::Initialisation => {}
-            // A frame under way is completed first.
-            _ if init && busy => self.init_pending = true,
-            _ if init => self.mode = Mode::Initialisation,
+            _ if init => {
+                if !self.init_pending && self.init_at.is_none() {
+                    self.init_due = self.dice.due(self.faults.initialisation, now);
+                }
+                // A frame under way is completed first.
+                self.init_pending |= busy;
+                if !busy {
+                    self.enter_initialisation();
+                }
+            }
             Mode::Sleep if !sleep => self.mode = Mode::Synchronising { since: now },
             Mode::Normal | Mode::Synchronising { .. } if sleep && !busy => self.fall_asleep(),
             _ => {}
         }
+    }
+
+    /// Nothing on the bus is in the way of initialisation mode any more.
+    fn enter_initialisation(&mut self) {
+        (self.mode, self.init_at) = match self.init_due {
+            0 => (Mode::Initialisation, None),
+            due => (self.mode, Some(due)),
+        };
     }
 
     fn fall_asleep(&mut self) {
@@ -248,6 +294,7 @@ impl Controller {
     }
 
     fn leave_initialisation(&mut self, now: u64) {
+        self.fifos.iter_mut().for_each(Fifo::hasten);
         self.mode = if self.counters.bus_off() {
             Mode::BusOff { left: Some(RECOVERY_SEQUENCES), since: now }
         } else {
@@ -296,19 +343,39 @@ impl Controller {
         [on(ier::TMEIE) && self.mailboxes.irq(), fifo(0), fifo(1), change]
     }
 
-    /// Ends a master reset whose time has come.
-    pub(super) fn advance_reset(&mut self, now: u64) {
+    /// Ends what takes time and has had it: a master reset, and whatever comes late.
+    pub(super) fn advance_flags(&mut self, now: u64) {
         if let Mode::Resetting { until } = self.mode
-            && until <= now
+            && self.dice.has_come(until, now)
         {
             self.mode = Mode::Sleep;
         }
+        let Self { dice, fifos, .. } = self;
+        for fifo in fifos {
+            fifo.advance(|at| dice.has_come(at, now));
+        }
+        if self.init_at.is_some_and(|at| self.dice.has_come(at, now)) {
+            // Frames are completed, as for a request that has just been made.
+            self.init_due = 0;
+            self.init_at = None;
+            self.init_pending = self.sending.is_some() || self.receiving;
+            if !self.init_pending {
+                self.enter_initialisation();
+            }
+        }
+    }
+
+    /// When the next of them has had its time, if that is known and no access will find out.
+    pub(super) fn next_flag(&self) -> Option<u64> {
+        let late = self.fifos.iter().filter_map(Fifo::next_event).chain(self.init_at);
+        late.filter(|at| *at != u64::MAX).min()
     }
 
     /// A controller whose master reset begins.
     fn after_master_reset(&self, now: u64) -> Self {
         let mut after = self.after_reset();
-        after.mode = Mode::Resetting { until: now + RESET_CLOCKS * self.cycles_per_clock };
+        let least = now + RESET_CLOCKS * self.cycles_per_clock;
+        after.mode = Mode::Resetting { until: after.dice.due(self.faults.master_reset, least).max(least) };
         if self.master_reset == MasterReset::Least {
             (after.ier, after.btr) = (self.ier, self.btr);
             after.mailboxes = self.mailboxes.clone();
@@ -323,6 +390,8 @@ impl Controller {
             cycles_per_clock: self.cycles_per_clock,
             dominant_bits: self.dominant_bits,
             master_reset: self.master_reset,
+            faults: self.faults,
+            dice: self.dice.clone(),
             ..Self::default()
         }
     }

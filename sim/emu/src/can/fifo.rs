@@ -27,6 +27,8 @@ pub struct Fifo {
     full: bool,
     overrun: bool,
     lost: u64,
+    /// When the release under way is done: the oldest frame stays visible until then.
+    releasing: Option<u64>,
 }
 
 impl Fifo {
@@ -61,20 +63,42 @@ impl Fifo {
 
     /// RFxR.
     pub fn status(&self) -> u32 {
-        self.entries.len() as u32 | if self.full { FULL } else { 0 } | if self.overrun { OVERRUN } else { 0 }
+        self.entries.len() as u32
+            | if self.full { FULL } else { 0 }
+            | if self.overrun { OVERRUN } else { 0 }
+            | if self.releasing.is_some() { RELEASE } else { 0 }
     }
 
-    /// A write to RFxR: releases the oldest frame, clears flags.
-    pub fn control(&mut self, value: u32) {
+    /// A write to RFxR: releases the oldest frame, clears flags. `released_at` says when a release is done; 0 is at once.
+    pub fn control(&mut self, value: u32, released_at: impl FnOnce() -> u64) {
         if value & FULL != 0 {
             self.full = false;
         }
         if value & OVERRUN != 0 {
             self.overrun = false;
         }
-        if value & RELEASE != 0 {
+        if value & RELEASE != 0 && self.releasing.is_none() && !self.entries.is_empty() {
+            self.releasing = Some(released_at());
+            self.advance(|at| at == 0);
+        }
+    }
+
+    /// Ends the release under way if its time `has_come`.
+    pub fn advance(&mut self, has_come: impl FnOnce(u64) -> bool) {
+        if self.releasing.is_some_and(has_come) {
+            self.releasing = None;
             self.entries.pop_front();
         }
+    }
+
+    /// When the release under way is done.
+    pub fn next_event(&self) -> Option<u64> {
+        self.releasing
+    }
+
+    /// What kept a release from ending is over.
+    pub fn hasten(&mut self) {
+        self.releasing = self.releasing.map(|_| 0);
     }
 
     /// RIxR, RDTxR, RDLxR or RDHxR (0 to 3) of the oldest frame; zero if there is none. There is no time
@@ -114,7 +138,7 @@ mod tests {
         let mut ids = Vec::new();
         while fifo.fill() > 0 {
             ids.push(fifo.mailbox(0) >> 21);
-            fifo.control(RELEASE);
+            fifo.control(RELEASE, || 0);
         }
         ids
     }
@@ -130,6 +154,19 @@ mod tests {
     }
 
     #[test]
+    fn a_frame_stays_visible_and_in_the_way_until_its_release_is_done() {
+        let mut fifo = fill(true);
+        fifo.control(RELEASE | FULL | OVERRUN, || 100);
+        fifo.control(RELEASE, || unreachable!("one is under way"));
+        assert_eq!((fifo.status(), fifo.mailbox(0) >> 21), (3 | RELEASE, 1));
+        assert!(fifo.put("007#".parse().unwrap(), 0, true), "there is no room yet");
+        fifo.advance(|at| at <= 99);
+        assert_eq!(fifo.fill(), 3);
+        fifo.advance(|at| at <= 100);
+        assert_eq!((fifo.status(), fifo.mailbox(0) >> 21), (2 | FULL | OVERRUN, 2));
+    }
+
+    #[test]
     fn full_and_overrun_stay_until_cleared() {
         let mut fifo = fill(true);
         drain(&mut fifo);
@@ -137,9 +174,9 @@ mod tests {
         assert!(
             fifo.irq(false, true, false) && fifo.irq(false, false, true) && !fifo.irq(true, false, false)
         );
-        fifo.control(OVERRUN);
+        fifo.control(OVERRUN, || 0);
         assert_eq!(fifo.status(), FULL);
-        fifo.control(FULL);
+        fifo.control(FULL, || 0);
         assert_eq!(fifo.status(), 0);
     }
 }

@@ -14,6 +14,9 @@ pub mod mailbox;
 
 use cantap_can::Frame;
 
+use crate::Clock;
+use crate::hostile::{Dice, Hostile};
+
 pub use controller::{BitTiming, Controller, MasterReset, Mode};
 use filter::Filters;
 pub use identifier::identifier_word;
@@ -65,6 +68,19 @@ impl CanPair {
         }
     }
 
+    /// Makes both controllers as `hostile` has them.
+    pub fn set_hostile(&mut self, hostile: &Hostile, clock: Clock) {
+        for (controller, salt) in self.controllers.iter_mut().zip(1..) {
+            controller.faults = hostile.can;
+            controller.dice = Dice::new(hostile.seed, salt, clock);
+        }
+    }
+
+    /// Ends that: see [`Dice::calm`].
+    pub fn calm(&mut self) {
+        self.controllers.iter_mut().for_each(|controller| controller.dice.calm());
+    }
+
     /// A frame reached controller `n` without error.
     pub fn receive(&mut self, n: usize, frame: &Frame) {
         let found = self.filters.accept(n, identifier_word(frame));
@@ -76,15 +92,16 @@ impl CanPair {
         self.controllers[n].irqs()
     }
 
-    /// When [`Self::advance`] must be called next: needed only for loop-back.
+    /// When [`Self::advance`] must be called next: needed only for loop-back and for what comes late.
     pub fn next_event(&self) -> Option<u64> {
-        self.controllers.iter().filter_map(Controller::loopback_event).min()
+        let due = |one: &Controller| [one.loopback_event(), one.next_flag()].into_iter().flatten().min();
+        self.controllers.iter().filter_map(due).min()
     }
 
     /// Completes what loop-back sent until `now`.
     pub fn advance(&mut self, now: u64) {
         for n in 0..self.controllers.len() {
-            self.controllers[n].advance_reset(now);
+            self.controllers[n].advance_flags(now);
             while let Some(frame) = self.controllers[n].advance_loopback(now) {
                 self.receive(n, &frame);
             }

@@ -11,12 +11,26 @@ pub struct Endpoint {
     pub interrupt: u32,
     /// DIEPTSIZx or DOEPTSIZx.
     pub size: u32,
+    /// When a NAK that was asked for takes effect, and when a disable does.
+    pub nak_at: Option<u64>,
+    pub disabled_at: Option<u64>,
+}
+
+/// When what a write asks for takes effect; 0 is at once.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Due {
+    /// The NAK, for SNAK.
+    pub nak: u64,
+    /// Nothing reports a NAK that is in effect already.
+    pub silent_nak: bool,
+    /// The end of the transfer, for EPDIS.
+    pub disable: u64,
 }
 
 impl Endpoint {
     /// Endpoint 0 after a reset: always active, answers NAK.
     pub const fn control_pipe() -> Self {
-        Self { control: epctl::USBAEP, interrupt: 0, size: 0 }
+        Self { control: epctl::USBAEP, interrupt: 0, size: 0, nak_at: None, disabled_at: None }
     }
 
     /// Bytes of the largest packet. Endpoint 0 uses a code instead of the number.
@@ -77,11 +91,11 @@ impl Endpoint {
         self.control = self.control & !epctl::EPENA | epctl::NAKSTS;
     }
 
-    /// A write to the control register.
+    /// A write to the control register. `due` says when a NAK and a disable that it asks for take effect: 0 is at once.
     ///
     /// Software can only set EPENA and only request EPDIS; writing zeros to them changes nothing. So a
     /// transfer survives a driver that writes the whole register.
-    pub fn write_control(&mut self, number: usize, value: u32) {
+    pub fn write_control(&mut self, number: usize, value: u32, due: Due) {
         let mut stored = epctl::EPTYP | epctl::SNPM | epctl::STALL | epctl::TXFNUM | epctl::MPSIZ;
         if number == 0 {
             // Endpoint 0 is always active and a control endpoint, and only the next SETUP clears its
@@ -102,17 +116,31 @@ impl Endpoint {
         if value & epctl::CNAK != 0 {
             self.control &= !epctl::NAKSTS;
             self.interrupt &= !epint::INEPNE;
+            self.nak_at = None;
         }
-        if value & epctl::SNAK != 0 {
-            self.control |= epctl::NAKSTS;
-            self.interrupt |= epint::INEPNE;
+        if value & epctl::SNAK != 0 && !(due.silent_nak && self.naks()) {
+            self.nak_at = Some(due.nak);
         }
         if value & epctl::EPENA != 0 {
             self.control |= epctl::EPENA;
         }
         // Only if a transfer is armed. Endpoint 0 OUT cannot be disabled, which the core checks before
         // the call.
-        if value & epctl::EPDIS != 0 && self.enabled() {
+        if value & epctl::EPDIS != 0 && self.enabled() && self.disabled_at.is_none() {
+            self.disabled_at = Some(due.disable);
+        }
+        self.advance(|at| at == 0);
+    }
+
+    /// Lets what was asked for take effect if its time `has_come`.
+    pub fn advance(&mut self, has_come: impl Fn(u64) -> bool) {
+        if self.nak_at.is_some_and(&has_come) {
+            self.nak_at = None;
+            self.control |= epctl::NAKSTS;
+            self.interrupt |= epint::INEPNE;
+        }
+        if self.disabled_at.is_some_and(&has_come) {
+            self.disabled_at = None;
             self.control &= !epctl::EPENA;
             self.interrupt |= epint::EPDISD;
         }

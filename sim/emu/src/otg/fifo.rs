@@ -41,6 +41,12 @@ impl RxFifo {
         }
     }
 
+    /// Appends an impossible status, without data.
+    pub fn push_bogus(&mut self, status: u32) {
+        self.words.push_back(RxWord::Status(status));
+        self.statuses += 1;
+    }
+
     /// The status at the front, without removing it.
     pub fn peek_status(&self) -> Option<u32> {
         match self.words.front() {

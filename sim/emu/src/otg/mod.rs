@@ -3,10 +3,12 @@
 //! (`wire.rs`). It follows RM0090, "USB on-the-go full-speed", as far as device drivers use it; it
 //! has no host mode, no isochronous endpoints and no DMA.
 //!
-//! It has no time of its own: it acts when the other end of the cable calls.
+//! It acts when the other end of the cable calls. Only what may come late needs the time, which [`Otg::settle`] tells it.
 
 mod endpoint;
 mod fifo;
+mod hostility;
+mod late;
 mod registers;
 mod wire;
 
@@ -16,6 +18,7 @@ use std::collections::BTreeMap;
 
 use endpoint::Endpoint;
 use fifo::{RxFifo, TxFifo};
+use late::Late;
 use registers::{
     FIFO_STRIDE, FIFOS, dctl, device, dsts, epint, eptsiz, gahbcfg, gccfg, gint, global, grstctl,
 };
@@ -46,6 +49,8 @@ pub struct Otg {
     in_control_transfer: bool,
     frame: u32,
     suspended: bool,
+    /// A bus reset was seen since the controller's own.
+    reset_seen: bool,
     in_mask: u32,
     out_mask: u32,
     all_mask: u32,
@@ -61,6 +66,9 @@ pub struct Otg {
     /// The interrupt line, recomputed after every change.
     line: bool,
     misuse: Misuse,
+    late: Late,
+    /// OUT packets that were acknowledged and thrown away because of their toggle.
+    thrown_away: u64,
 }
 
 /// What a driver did that the chip does not forgive. A test can assert that none of it happened.
@@ -117,6 +125,7 @@ impl Otg {
             in_control_transfer: false,
             frame: 0,
             suspended: false,
+            reset_seen: false,
             in_mask: 0,
             out_mask: 0,
             all_mask: 0,
@@ -129,10 +138,17 @@ impl Otg {
             txs: Default::default(),
             line: false,
             misuse: Misuse::default(),
+            late: Late::default(),
+            thrown_away: 0,
         };
         otg.ins[0] = Endpoint::control_pipe();
         otg.outs[0] = Endpoint::control_pipe();
         otg
+    }
+
+    /// The state after a reset of a controller with the same faults.
+    pub fn after_reset(&self) -> Self {
+        Self { late: self.late.after_reset(), ..Self::new() }
     }
 
     /// The interrupt line.
@@ -145,12 +161,17 @@ impl Otg {
         self.misuse
     }
 
+    /// OUT packets that were acknowledged and thrown away because of their toggle: repetitions, if the host missed a handshake; otherwise
+    /// one of the two sides has not begun anew with DATA0, and the packet is lost.
+    pub fn thrown_away(&self) -> u64 {
+        self.thrown_away
+    }
+
     /// Reads a whole register; reading the receive queue or a FIFO removes what was read.
     pub fn read(&mut self, offset: u32) -> u32 {
         match offset {
             global::GAHBCFG => self.ahb,
-            // Every action of GRSTCTL is done at once; the bus is always idle.
-            global::GRSTCTL => grstctl::AHBIDL,
+            global::GRSTCTL => self.grstctl(),
             global::GINTSTS => self.gintsts(),
             global::GINTMSK => self.interrupt_mask,
             global::GRXSTSR => {
@@ -174,7 +195,7 @@ impl Otg {
             }
             device::DIEPMSK => self.in_mask,
             device::DOEPMSK => self.out_mask,
-            device::DAINT => self.daint(),
+            device::DAINT => self.daint() | self.unmasked_flags(),
             device::DAINTMSK => self.all_mask,
             device::DIEPEMPMSK => self.in_empty_mask,
             FIFOS.. => self.read_fifo(),
@@ -189,6 +210,9 @@ impl Otg {
 
     /// Writes a whole register or a FIFO word.
     pub fn write(&mut self, offset: u32, value: u32) {
+        if self.loses_write(offset, value) {
+            return;
+        }
         match offset {
             global::GAHBCFG => self.ahb = value & 0x181,
             global::GRSTCTL => self.write_grstctl(value),
@@ -247,7 +271,7 @@ impl Otg {
 
     /// GINTSTS: the latched flags, and those that follow the FIFOs and endpoints.
     fn gintsts(&self) -> u32 {
-        let mut status = self.interrupts | gint::NPTXFE;
+        let mut status = self.interrupts | gint::NPTXFE | self.mode_flag();
         if self.rx.has_status() {
             status |= gint::RXFLVL;
         }
@@ -283,7 +307,7 @@ impl Otg {
 
     fn write_grstctl(&mut self, value: u32) {
         if value & grstctl::CSRST != 0 {
-            self.core_soft_reset();
+            self.begin_core_reset();
         }
         if value & grstctl::RXFFLSH != 0 {
             self.rx.flush();
@@ -299,14 +323,16 @@ impl Otg {
                     && !self.ins[*number].naks()
             });
             self.misuse.unruly_disables += under_way.count() as u64;
-            match value >> grstctl::TXFNUM_SHIFT & 0x1F {
-                grstctl::TXFNUM_ALL => self.txs.iter_mut().for_each(TxFifo::flush),
-                one => {
-                    if let Some(fifo) = self.txs.get_mut(one as usize) {
-                        fifo.flush();
-                    }
-                }
-            }
+            self.begin_flush(flushed);
+        }
+    }
+
+    /// Empties a transmit FIFO, or all of them.
+    fn flush(&mut self, number: u32) {
+        if number == grstctl::TXFNUM_ALL {
+            self.txs.iter_mut().for_each(TxFifo::flush);
+        } else if let Some(fifo) = self.txs.get_mut(number as usize) {
+            fifo.flush();
         }
     }
 
@@ -319,9 +345,12 @@ impl Otg {
         self.dcfg = self.dcfg & !3 | old.dcfg & 3;
         self.frame = old.frame;
         self.misuse = old.misuse;
+        self.late = old.late;
+        self.thrown_away = old.thrown_away;
     }
 
     fn write_dctl(&mut self, value: u32) {
+        let value = self.without_global_out_nak(value);
         let mut status = self.dctl & (dctl::GINSTS | dctl::GONSTS);
         for (command, bit, set) in [
             (dctl::SGINAK, dctl::GINSTS, true),
@@ -343,14 +372,23 @@ impl Otg {
         let Some(status) = self.rx.pop_status() else {
             return self.misread();
         };
-        let out = &mut self.outs[(status & 0xF) as usize % ENDPOINTS];
+        let Some(out) = self.outs.get_mut((status & 0xF) as usize) else {
+            self.update();
+            return status;
+        };
         match status >> 17 & 0xF {
             registers::pktsts::OUT_COMPLETE => {
                 out.interrupt |= epint::XFRC;
                 let completing = &mut self.completing[(status & 0xF) as usize % ENDPOINTS];
                 *completing = completing.saturating_sub(1);
             }
-            registers::pktsts::SETUP_COMPLETE => out.interrupt |= epint::STUP,
+            registers::pktsts::SETUP_COMPLETE if status & 0xF == 0 => {
+                out.interrupt |= epint::STUP;
+                if self.late.faults.setup_complete_disarms {
+                    out.control = out.control & !registers::epctl::EPENA | registers::epctl::NAKSTS;
+                }
+            }
+            registers::pktsts::GLOBAL_OUT_NAK => self.dctl |= dctl::GONSTS,
             _ => {}
         }
         self.update();
@@ -410,19 +448,23 @@ impl Otg {
 
     fn write_endpoint(&mut self, input: bool, number: usize, register: u32, value: u32) {
         self.judge(input, number, register, value);
+        let (value, due) = self.as_it_takes(input, register, value);
         let endpoint = if input { &mut self.ins[number] } else { &mut self.outs[number] };
         match register {
             // Endpoint 0 OUT cannot be disabled (RM0090, DOEPCTL0).
             device::EPCTL if !input && number == 0 => {
-                endpoint.write_control(0, value & !registers::epctl::EPDIS);
+                endpoint.write_control(0, value & !registers::epctl::EPDIS, due);
             }
             device::EPCTL => {
-                endpoint.write_control(number, value);
+                endpoint.write_control(number, value, due);
                 if value & registers::epctl::EPENA != 0 {
                     self.check_layout();
                 }
             }
-            device::EPINT => endpoint.interrupt &= !value,
+            device::EPINT => {
+                endpoint.interrupt &= !value;
+                self.end_setup_stage(false);
+            }
             device::EPTSIZ if number == 0 && input => {
                 endpoint.size = value & (0x7F | 3 << eptsiz::PKTCNT_SHIFT);
             }
@@ -440,7 +482,8 @@ impl Otg {
         match register {
             device::EPCTL if input => {
                 let ends = value & registers::epctl::EPDIS != 0 && endpoint.enabled() && endpoint.active();
-                self.misuse.unruly_disables += u64::from(ends && endpoint.interrupt & epint::INEPNE == 0);
+                let waited = endpoint.interrupt & epint::INEPNE != 0 || self.late.excuses(endpoint);
+                self.misuse.unruly_disables += u64::from(ends && !waited);
             }
             device::EPCTL => {
                 let clears = value & registers::epctl::CNAK != 0;

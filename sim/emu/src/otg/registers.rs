@@ -58,6 +58,11 @@ pub mod gahbcfg {
     pub const TXFELVL: u32 = 1 << 7;
 }
 
+/// Bits of GUSBCFG.
+pub mod gusbcfg {
+    pub const FDMOD: u32 = 1 << 30;
+}
+
 /// Bits of GRSTCTL.
 pub mod grstctl {
     pub const CSRST: u32 = 1 << 0;
@@ -70,6 +75,8 @@ pub mod grstctl {
 
 /// Bits of GINTSTS and GINTMSK.
 pub mod gint {
+    /// Current mode: host.
+    pub const CMOD: u32 = 1 << 0;
     pub const SOF: u32 = 1 << 3;
     pub const RXFLVL: u32 = 1 << 4;
     pub const NPTXFE: u32 = 1 << 5;
@@ -174,6 +181,7 @@ pub mod eptsiz {
 
 /// Packet states in the receive status queue (GRXSTSR, PKTSTS).
 pub mod pktsts {
+    pub const GLOBAL_OUT_NAK: u32 = 1;
     pub const OUT_DATA: u32 = 2;
     pub const OUT_COMPLETE: u32 = 3;
     pub const SETUP_COMPLETE: u32 = 4;

@@ -46,6 +46,7 @@ impl Otg {
     /// reset").
     pub fn bus_reset(&mut self) {
         self.suspended = false;
+        self.reset_seen = true;
         self.in_control_transfer = false;
         for number in 0..ENDPOINTS {
             self.ins[number].bus_reset(number);
@@ -54,8 +55,11 @@ impl Otg {
         self.raise(gint::USBRST);
     }
 
-    /// The host ends the reset; the speed is now known.
+    /// The host ends the reset; the speed is now known. A controller that was itself reset meanwhile has seen the rest of it.
     pub fn enumeration_done(&mut self) {
+        if !self.reset_seen {
+            self.bus_reset();
+        }
         self.raise(gint::ENUMDNE);
     }
 
@@ -92,7 +96,7 @@ impl Otg {
     }
 
     fn addressed(&self, address: u8) -> bool {
-        self.address == address
+        self.address == address && !self.late.is_dead
     }
 
     /// DCFG was written. An address written during a transfer is that of SET_ADDRESS and takes effect at
@@ -114,11 +118,14 @@ impl Otg {
             // The data and status stages begin with DATA1.
             endpoint.set_toggle(true);
         }
-        self.outs[0].control &= !epctl::EPENA;
+        if !self.late.faults.setup_complete_disarms {
+            self.outs[0].control &= !epctl::EPENA;
+        }
         // A request without a data stage, or one that carries data out, ends with an IN packet.
         self.in_control_transfer = packet[0] & 0x80 == 0;
+        self.precede_by_bogus();
         self.rx.push(0, pktsts::SETUP_DATA, false, &packet);
-        self.rx.push(0, pktsts::SETUP_COMPLETE, false, &[]);
+        self.begin_setup_stage();
         self.update();
         OutReply::Ack
     }
@@ -128,6 +135,9 @@ impl Otg {
         let number = usize::from(endpoint);
         if !self.addressed(address) || number >= ENDPOINTS || !self.outs[number].active() {
             return OutReply::Silence;
+        }
+        if number == 0 && self.end_setup_stage(true) {
+            return OutReply::Nak;
         }
         let room = self.rx.len() + bytes.len().div_ceil(4) + 2 + SETUP_RESERVE_WORDS <= self.rx_size as usize;
         let held_off = self.dctl & dctl::GONSTS != 0;
@@ -144,6 +154,7 @@ impl Otg {
         }
         if data1 != out.toggle() {
             // The host did not see our ACK and repeats the packet: acknowledged and thrown away.
+            self.thrown_away += 1;
             return OutReply::Ack;
         }
         out.set_toggle(!data1);
@@ -154,6 +165,7 @@ impl Otg {
         if complete {
             out.finish();
         }
+        self.precede_by_bogus();
         self.rx.push(endpoint, pktsts::OUT_DATA, data1, bytes);
         if complete {
             self.completing[number] += 1;
@@ -169,6 +181,9 @@ impl Otg {
         let number = usize::from(endpoint);
         if !self.addressed(address) || number >= ENDPOINTS || !self.ins[number].active() {
             return InReply::Silence;
+        }
+        if number == 0 && self.end_setup_stage(true) {
+            return InReply::Nak;
         }
         let fifo = self.fifo_of(number);
         let held_off = self.dctl & dctl::GINSTS != 0;

@@ -183,7 +183,12 @@ impl Board {
                 self.advance_buses(now);
                 self.exti.write(offset, value)
             }
-            GPIO_BASE..=0x4002_2000 => self.ports[block(address, GPIO_BASE)].write(offset, value),
+            GPIO_BASE..=0x4002_2000 => {
+                let port = &mut self.ports[block(address, GPIO_BASE)];
+                let done = port.write(offset, value);
+                self.follow_transmit_pins();
+                done
+            }
             0x4002_3000 => self.crc.write(offset, value),
             0x4002_3800 => {
                 // What runs from the old clocks has run until now.
@@ -195,6 +200,7 @@ impl Board {
                 if Rcc::is_reset_register(offset) {
                     self.reset_peripherals(offset, value, now);
                 }
+                self.follow_transmit_pins();
                 Some(())
             }
             0x4002_3C00 => {
@@ -229,6 +235,7 @@ impl Board {
                     self.timers[timer] = self.timers[timer].after_reset();
                 }
                 for controller in (0..2).filter(|controller| set(25 + controller)) {
+                    self.transmit_pins.controller_reset(controller, &self.ports);
                     self.can.reset(controller);
                 }
             }

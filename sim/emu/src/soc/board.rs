@@ -10,9 +10,11 @@ use super::odd::{OddAccess, Oddity};
 use super::rcc::{Crystal, Rcc, ResetCause};
 use super::small::{Adc, Crc, Gpio, Storage, Watchdog};
 use super::timer::Timer;
+use super::transmit_pins::TransmitPins;
 use crate::bus::Wire;
 use crate::can::CanPair;
 use crate::cpu::Memories;
+use crate::hostile::{Dice, Hostile};
 use crate::rom;
 use crate::timing::Speeds;
 use crate::{Clock, Peripheral};
@@ -72,6 +74,9 @@ pub struct Board {
     pub(super) boot_mode: u32,
     /// A peripheral whose clock was just switched on and that does not respond yet.
     pub(super) awaited: Option<Awaited>,
+    /// What a controller's TX pin may do.
+    pub(super) transmit_pins: TransmitPins,
+    frames_cut: u64,
 }
 
 /// A clock that was just switched on (ES0182, "Delay after an RCC peripheral clock enabling").
@@ -109,7 +114,60 @@ impl Board {
             crystal,
             boot_mode: rom::FLASH,
             awaited: None,
+            transmit_pins: TransmitPins::default(),
+            frames_cut: 0,
         }
+    }
+
+    /// Makes the chip as `hostile` has it; attached devices are their owner's.
+    pub fn set_hostile(&mut self, hostile: &Hostile) {
+        self.can.set_hostile(hostile, self.clock);
+        self.transmit_pins.set_hostile(hostile, self.clock);
+        self.flash.set_lateness(hostile.flash_busy, Dice::new(hostile.seed, 3, self.clock));
+    }
+
+    /// From now on it is prompt and true.
+    pub fn calm(&mut self) {
+        self.can.calm();
+        self.flash.calm();
+        self.transmit_pins.calm();
+        self.follow_transmit_pins();
+    }
+
+    /// The crystal stops, or starts again. Returns whether the chip has lost its clock by that: the controllers are deaf and silent then,
+    /// apart from a bit that stays on the bus, until a reset puts the chip on its own oscillator. The clock security system, which would
+    /// do so at once, is not modelled.
+    pub fn set_crystal(&mut self, crystal: Crystal, now: u64) -> bool {
+        self.advance(now);
+        let stands_still = crystal.start_us.is_none() && self.rcc.needs_crystal();
+        self.crystal = crystal;
+        self.rcc.exchange_crystal(crystal, now);
+        if stands_still {
+            for controller in 0..2 {
+                if self.can.controllers[controller].is_sending() {
+                    self.transmit_pins.clock_stops(controller);
+                }
+                self.can.reset(controller);
+            }
+            self.follow_transmit_pins();
+        }
+        stands_still
+    }
+
+    /// Lets the buses follow the TX pins, after a change of the pins, the clocks or the controllers.
+    pub(super) fn follow_transmit_pins(&mut self) {
+        for (controller, held) in self.transmit_pins.follow(&self.ports, &self.rcc).into_iter().enumerate() {
+            let Some(held) = held else { continue };
+            self.can.controllers[controller].drove(held.into());
+            if let Some(wire) = self.wires.iter_mut().find(|wire| wire.controllers().contains(&controller)) {
+                wire.hold_dominant(held, &mut self.can);
+            }
+        }
+    }
+
+    /// Frames that were on a bus when the chip was reset. In the model they end all the same; a real one would be an error on the bus.
+    pub fn frames_cut(&self) -> u64 {
+        self.frames_cut
     }
 
     /// How long a cycle is.
@@ -158,6 +216,7 @@ impl Board {
     /// A system reset: everything except the memories and the buses, whose nodes continue.
     pub fn reset(&mut self, cause: ResetCause, now: u64) {
         self.advance(now);
+        self.frames_cut += self.can.controllers.iter().filter(|one| one.is_sending()).count() as u64;
         self.rcc = Rcc::new(self.clock, self.crystal, cause);
         self.awaited = None;
         // The jumper for the ROM bootloader, if any, has been removed.
@@ -180,6 +239,7 @@ impl Board {
             device.lock().reset(now);
         }
         self.follow_clocks(now);
+        self.follow_transmit_pins();
     }
 
     /// The level of pin `pin` of port `port` (0 for A) if it is an output. For LEDs.
@@ -212,6 +272,11 @@ impl Board {
     pub fn barrier(&mut self) {
         self.awaited = None;
         self.flash.arrive();
+    }
+
+    /// The supply fails while the flash is at work: see [`FlashInterface::cut_short`].
+    pub fn cut_flash_short(&mut self, word: impl FnMut() -> u32) {
+        self.flash.cut_short(word);
     }
 
     /// Leaves an uncleared error in the flash interface.

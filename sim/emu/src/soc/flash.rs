@@ -5,6 +5,7 @@ use std::ops::Range;
 
 use crate::Clock;
 use crate::cpu::Memory;
+use crate::hostile::{Dice, Tardy};
 use crate::memory_map::FLASH;
 
 /// What unlocks the control register.
@@ -15,6 +16,7 @@ const MER: u32 = 1 << 2;
 const STRT: u32 = 1 << 16;
 const LOCK: u32 = 1 << 31;
 const EOP: u32 = 1;
+const BSY: u32 = 1 << 16;
 /// Error of programming: a store of another width than was set up.
 pub const PGPERR: u32 = 1 << 6;
 /// Error of programming: a store that was not set up.
@@ -71,6 +73,13 @@ pub struct FlashInterface {
     stall: u64,
     /// A store that has not arrived: the interface does not know of it yet and is not busy.
     under_way: Option<Store>,
+    /// What the last operation changed, and whether it erased.
+    last: Option<(Range<u32>, bool)>,
+    now: u64,
+    /// Until when the interface is busy, beyond the time for which the core stalls.
+    busy_until: u64,
+    lateness: Tardy,
+    dice: Dice,
 }
 
 /// A store to flash.
@@ -97,13 +106,53 @@ impl FlashInterface {
             options,
             stall: 0,
             under_way: None,
+            last: None,
+            now: 0,
+            busy_until: 0,
+            lateness: Tardy::PROMPT,
+            dice: Dice::default(),
         }
     }
 
     /// The same memory after a reset.
     #[must_use]
     pub fn after_reset(&self) -> Self {
-        Self::new(self.clock, self.memory.clone())
+        Self {
+            lateness: self.lateness,
+            dice: self.dice.clone(),
+            ..Self::new(self.clock, self.memory.clone())
+        }
+    }
+
+    /// Makes the interface busy beyond its operations' time.
+    pub fn set_lateness(&mut self, lateness: Tardy, dice: Dice) {
+        (self.lateness, self.dice) = (lateness, dice);
+    }
+
+    /// Ends that: see [`Dice::calm`].
+    pub fn calm(&mut self) {
+        self.dice.calm();
+    }
+
+    /// BSY, beyond the time for which the core stalls.
+    fn is_busy(&self) -> bool {
+        !self.dice.has_come(self.busy_until, self.now)
+    }
+
+    /// An operation has begun that stalls the core for this long.
+    fn stall_for(&mut self, cycles: u64) {
+        self.stall += cycles;
+        self.busy_until = self.dice.due(self.lateness, self.now + self.stall);
+    }
+
+    /// The supply fails during the last operation: of the bits that it was to change, some have not. `word` gives random ones.
+    pub fn cut_short(&mut self, mut word: impl FnMut() -> u32) {
+        let Some((range, erases)) = self.last.take() else { return };
+        for address in range.step_by(4) {
+            let Some(now) = self.memory.word(address) else { continue };
+            let left = if erases { now & word() } else { now | word() };
+            self.memory.write(address, &left.to_le_bytes());
+        }
     }
 
     /// How the program has set up reading.
@@ -122,7 +171,7 @@ impl FlashInterface {
         Some(match offset {
             0x00 => self.access,
             0x04 | 0x08 => 0,
-            0x0C => self.status,
+            0x0C => self.status | if self.is_busy() { BSY } else { 0 },
             0x10 => self.control,
             0x14 => self.options,
             _ => return None,
@@ -136,7 +185,7 @@ impl FlashInterface {
             0x04 => self.take_key(value),
             0x08 => {}
             0x0C => self.status &= !(value & 0xF3),
-            0x10 if self.control & LOCK != 0 => {}
+            0x10 if self.control & LOCK != 0 || self.is_busy() => {}
             0x10 => {
                 self.control = value & !STRT;
                 if value & STRT != 0 {
@@ -197,13 +246,15 @@ impl FlashInterface {
                 return;
             };
             self.memory.write(range.start, &vec![0xFF; range.len()]);
-            self.stall += self.clock.ms(ms);
+            self.last = Some((range, true));
+            self.stall_for(self.clock.ms(ms));
         }
         self.status |= EOP;
     }
 
     /// The core stores to flash. The store arrives later; any earlier one has arrived by now.
     pub fn store(&mut self, address: u32, size: u8, value: u32, now: u64) {
+        self.now = now;
         self.arrive();
         self.under_way = Some(Store { address, size, value, at: now + STORE_CYCLES });
     }
@@ -215,6 +266,7 @@ impl FlashInterface {
 
     /// Lets a store arrive if its time has come.
     pub fn advance(&mut self, now: u64) {
+        self.now = now;
         if self.next_event().is_some_and(|at| at <= now) {
             self.arrive();
         }
@@ -230,7 +282,7 @@ impl FlashInterface {
     /// A store arrives: programs, if that was set up. Bits only go from 1 to 0.
     fn program(&mut self, address: u32, size: u8, value: u32) {
         let parallelism = 1 << (self.control >> 8 & 3);
-        if self.control & PG == 0 || self.control & LOCK != 0 || self.is_stuck() {
+        if self.control & PG == 0 || self.control & LOCK != 0 || self.is_stuck() || self.is_busy() {
             self.status |= PGSERR;
             return;
         }
@@ -245,7 +297,8 @@ impl FlashInterface {
             *byte &= new;
         }
         self.memory.write(address, bytes);
-        self.stall += self.clock.us(PROGRAM_US);
+        self.last = Some((address..address + u32::from(size), false));
+        self.stall_for(self.clock.us(PROGRAM_US));
         self.status |= EOP;
     }
 

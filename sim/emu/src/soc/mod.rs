@@ -10,6 +10,7 @@ mod odd;
 pub mod rcc;
 pub mod small;
 pub mod timer;
+mod transmit_pins;
 
 pub use board::{Board, CAN_IRQS, RECEIVE_PINS};
 pub use odd::{OddAccess, Oddity};

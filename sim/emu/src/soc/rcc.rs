@@ -141,6 +141,18 @@ impl Rcc {
         }
     }
 
+    /// Whether the system clock comes from the crystal.
+    pub fn needs_crystal(&self) -> bool {
+        self.in_use() & HSEON != 0
+    }
+
+    /// The crystal is another from now on: one that has stopped, or that starts again.
+    pub fn exchange_crystal(&mut self, crystal: Crystal, now: u64) {
+        self.crystal = crystal;
+        let wanted = self.registers[CR / 4] & HSEON != 0;
+        self.hse_ready_at = crystal.start_us.filter(|_| wanted).map(|us| now + self.clock.us(us));
+    }
+
     fn switch_oscillators(&mut self, value: u32, now: u64) {
         let before = self.registers[CR / 4];
         let value = value | before & self.in_use();

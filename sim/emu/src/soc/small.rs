@@ -16,6 +16,7 @@ const MODER: usize = 0;
 const IDR: usize = 4;
 const ODR: usize = 5;
 const BSRR: usize = 6;
+const AFRL: usize = 8;
 
 impl Gpio {
     /// Port 0 (A), 1 (B) and so on after reset: the debug port's pins are set up.
@@ -50,6 +51,13 @@ impl Gpio {
             at => *self.registers.get_mut(at)? = value,
         }
         Some(())
+    }
+
+    /// Whether a pin is connected to the peripheral of an alternate function.
+    pub fn is_connected(&self, pin: u32, function: u32) -> bool {
+        let [low, high] = [self.registers[AFRL], self.registers[AFRL + 1]];
+        let chosen = if pin < 8 { low >> (4 * pin) } else { high >> (4 * (pin - 8)) } & 0xF;
+        self.registers[MODER] >> (2 * pin) & 3 == 2 && chosen == function
     }
 
     /// A pin's level: what it drives if it is an output, what is applied otherwise.

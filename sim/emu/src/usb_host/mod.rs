@@ -322,6 +322,7 @@ impl<D: HostDriver> UsbHost<D> {
     pub fn advance(&mut self, otg: &mut Otg, now: u64) {
         while let Some(at) = self.next_event(otg).filter(|at| *at <= now) {
             self.now = self.now.max(at);
+            otg.settle(self.now);
             self.step(otg);
         }
         self.now = self.now.max(now);
@@ -338,6 +339,7 @@ impl<D: HostDriver> UsbHost<D> {
             Bus::Empty => self.bus = Bus::Debounce { until: self.now + self.timing.debounce },
             Bus::Debounce { .. } if !otg.pulled_up(true) => self.bus = Bus::Empty,
             Bus::Debounce { .. } => self.begin_reset(otg),
+            Bus::Reset { .. } if !otg.pulled_up(true) => self.rest(),
             Bus::Reset { .. } => {
                 otg.enumeration_done();
                 self.driver.after_reset(self.timing.second_reset);
@@ -430,7 +432,9 @@ impl<D: HostDriver> UsbHost<D> {
                 self.driver.answered_out(None, reply, &mut self.counters);
             }
             Token::Out { endpoint, data1, bytes } => {
+                let before = otg.thrown_away();
                 let reply = otg.out(address, endpoint, data1, &bytes);
+                self.counters.thrown_away += otg.thrown_away() - before;
                 self.packets_this_frame += 1;
                 self.back_off(endpoint, false, reply == OutReply::Nak);
                 let pipe = (endpoint != 0).then_some(bytes.len());

@@ -2,6 +2,7 @@
 
 use cantap_analysis::plot::scale::{label, ticks, time_ticks};
 
+use super::super::super::cut::cut;
 use super::super::super::times::clock;
 use super::curve::Time;
 
@@ -24,8 +25,10 @@ pub fn values([low, high]: [f64; 2], rows: u16) -> Vec<(u16, String)> {
     for value in places {
         let row = ((high - value) / (high - low) * last).round().clamp(0.0, last) as u16;
         if labels.iter().all(|(other, _)| *other != row) {
-            let text: String = label(value, step).chars().take(usize::from(GUTTER) - 1).collect();
-            labels.push((row, text));
+            let columns = usize::from(GUTTER) - 1;
+            let exact = label(value, step);
+            let text = if exact.chars().count() <= columns { exact } else { format!("{value:.2e}") };
+            labels.push((row, cut(&text, columns)));
         }
     }
     labels

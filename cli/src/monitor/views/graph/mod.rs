@@ -16,6 +16,7 @@ use ratatui::widgets::canvas::{Canvas, Line as Stroke};
 use ratatui::widgets::{Block, Borders, Paragraph, Wrap};
 
 use super::super::app::{App, Drawn};
+use super::super::cut::{cut_line, draw_lines};
 use super::super::model::{Seen, Series, SignalRow};
 use super::super::times::clock;
 use super::signals::short;
@@ -112,7 +113,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
             panes.iter().flat_map(|(_, rows)| rows).chain(&lanes).any(|chosen| chosen.series.is_cut());
         let not_kept = (is_cut && from_ns < oldest).then_some(oldest);
         let is_said = page.times(frame, times, not_kept);
-        frame.render_widget(Paragraph::new(page.said(not_kept.filter(|_| !is_said))), said);
+        draw_lines(frame, said, vec![page.said(not_kept.filter(|_| !is_said))]);
     }
 }
 
@@ -164,7 +165,7 @@ impl Page<'_> {
             let text = format!("{} {}  ", name(chosen.row, self.seen), self.values(*chosen, short));
             title.push(Span::styled(text, theme.series(chosen.colour)));
         }
-        let block = Block::new().borders(Borders::TOP).title(Line::from(title));
+        let block = Block::new().borders(Borders::TOP).title(cut_line(Line::from(title), area.width.into()));
         let inner = block.inner(area);
         frame.render_widget(block, area);
         let place = Rect { x: self.columns.x, width: self.columns.width, ..inner };
@@ -259,7 +260,7 @@ impl Page<'_> {
             Line::from(format!(" {} {value}", name(chosen.row, self.seen))).style(style),
             Line::from(format!("{:indent$}{line}", "")).style(style),
         ];
-        frame.render_widget(Paragraph::new(text), area);
+        draw_lines(frame, area, text);
     }
 
     /// Times of day below the curves, and the cursors' names at their positions. If older values have been dropped, that is shown

@@ -5,7 +5,7 @@
 WITH numbered AS (
     SELECT *, count_if(event = 'lost') OVER (PARTITION BY trace, channel ORDER BY row) AS losses
     FROM frames
-    WHERE trace IN (SELECT trace FROM ledger WHERE state IN ('read', 'cut'))
+    WHERE trace IN (SELECT trace FROM ledger WHERE state IN ('read', 'undecoded', 'cut'))
 ),
 periods AS (
     SELECT

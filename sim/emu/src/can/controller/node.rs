@@ -11,6 +11,11 @@ use crate::can::filter::Match;
 use crate::can::mailbox::Attempt;
 
 impl Controller {
+    /// Whether a frame of its own is on the bus.
+    pub fn is_sending(&self) -> bool {
+        self.sending.is_some()
+    }
+
     /// Its mode.
     pub fn mode(&self) -> Mode {
         self.mode
@@ -73,7 +78,7 @@ impl Controller {
 
     /// The frame it wants to send now.
     pub(crate) fn next_frame(&self) -> Option<Frame> {
-        if !self.answers() || self.init_pending {
+        if !self.answers() || self.init_pending || self.init_at.is_some() {
             return None;
         }
         Some(self.mailboxes.next(self.mcr & mcr::TXFP != 0)?.1)
@@ -181,7 +186,7 @@ impl Controller {
         self.receiving = false;
         if self.init_pending {
             self.init_pending = false;
-            self.mode = Mode::Initialisation;
+            self.enter_initialisation();
         } else if self.mode == Mode::Normal && self.mcr & mcr::SLEEP != 0 {
             self.fall_asleep();
         }

@@ -1,14 +1,14 @@
-//! Makes texts from files safe for a terminal.
+//! Makes texts that come from outside (a device, a server, a file, a database) safe for a terminal: the one place that decides what is.
 
 use std::borrow::Cow;
 
-/// Whether a character moves the cursor, starts an escape sequence, ends a line or changes the writing direction: none of
-/// that may come from somebody else's file.
-fn is_harmful(character: char) -> bool {
+/// Whether a character moves the cursor, starts an escape sequence (C0, DEL and C1), ends a line or changes the writing direction: none of
+/// that may come from somebody else.
+pub fn is_harmful(character: char) -> bool {
     character.is_control()
         || matches!(
             character,
-            '\u{2028}' | '\u{2029}' | '\u{200E}' | '\u{200F}' | '\u{202A}'..='\u{202E}' | '\u{2066}'..='\u{2069}'
+            '\u{061C}' | '\u{2028}' | '\u{2029}' | '\u{200E}' | '\u{200F}' | '\u{202A}'..='\u{202E}' | '\u{2066}'..='\u{2069}'
         )
 }
 

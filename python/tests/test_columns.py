@@ -1,0 +1,75 @@
+"""Tables by column and by row, and in a notebook."""
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+import cantap
+
+
+@pytest.fixture
+def table(tmp_path):
+    log = tmp_path / "drive.log"
+    log.write_text("".join(f"({at}.000000001) can0 123#{at:02X}{'00' * (at % 3)}\n" for at in range(20)))
+    database = tmp_path / "car.dbc"
+    database.write_text(
+        'VERSION ""\nBU_: A\nBO_ 291 Engine: 8 A\n SG_ Speed : 0|8@1+ (0.5,0) [0|255] "km/h" A\n SG_ Late : 8|8@1+ (1,0) [0|255] "" A\n'
+        ' SG_ Gear : 0|2@1+ (1,0) [0|3] "" A\nVAL_ 291 Gear 0 "<b>park" 1 "drive\x1b[2J" ;\n'
+    )
+    return cantap.decode(log, database)["Engine"]
+
+
+def test_a_column_is_taken_by_its_name(table):
+    speed = table["Speed"]
+    assert len(speed) == 20 and speed.name == "Speed" and speed.type == "float64" and speed.metadata["unit"] == "km/h"
+    assert list(speed) == speed.to_list() == [at * 0.5 for at in range(20)]
+    assert speed[3] == 1.5 and speed[-1] == 9.5 and speed[3:5].to_list() == [1.5, 2.0]
+    with pytest.raises(IndexError):
+        speed[20]
+    assert np.mean(speed) == 4.75 and (np.asarray(speed) == table.to_numpy()["Speed"]).all()
+    assert pa.chunked_array(speed).to_pylist() == speed.to_list() == speed.to_pyarrow().to_pylist()
+    assert table["time"][1] == 1_000_000_001 and np.asarray(table["time"])[1] == np.datetime64(1_000_000_001, "ns")
+    assert table["Gear.text"].to_list()[:4] == ["<b>park", "drive\N{REPLACEMENT CHARACTER}[2J", None, None]
+    # A missing value is none, and no number.
+    assert table["Late"].to_list()[:3] == [None, 0.0, 0.0] and np.isnan(np.asarray(table["Late"])[0])
+    with pytest.raises(ValueError, match="no column 'Sped'; there are time, "):
+        table["Sped"]
+
+
+def test_rows_are_taken_by_a_slice_and_columns_by_a_list(table):
+    assert table[2:4]["Speed"].to_list() == [1.0, 1.5] and len(table[100:]) == 0 and len(table[:]) == 20
+    assert table[-2:]["Speed"].to_list() == [9.0, 9.5] and table[2:4].column_names == table.column_names
+    two = table[["Speed", "time"]]
+    assert two.column_names == ("Speed", "time") and len(two) == 20
+    assert pa.table(two[5:7]).to_pydict()["Speed"] == [2.5, 3.0]
+    with pytest.raises(ValueError, match="in order"):
+        table[::2]
+    with pytest.raises(TypeError, match="by its name"):
+        table[3]
+
+
+def test_rows_across_batches_are_those_of_the_whole(tmp_path):
+    log = tmp_path / "long.log"
+    log.write_text("".join(f"({at // 1000}.{at % 1000:06}) can0 123#{at % 256:02X}\n" for at in range(150_000)))
+    table = cantap.read(log)
+    whole = table.to_pyarrow()
+    assert len(table.batches()) > 2
+    for rows in (slice(65_530, 65_545), slice(1, 140_000), slice(131_071, 131_073), slice(149_999, None)):
+        assert pa.table(table[rows]) == whole[rows]
+
+
+def test_a_schema_says_the_columns_types_as_the_documentation_does(table):
+    assert dict(table.schema) == {
+        "time": "timestamp[ns, UTC]", "channel": "uint8", "id": "uint32",
+        "Speed": "float64", "Late": "float64", "Gear": "float64", "Gear.text": "text",
+    }  # fmt: skip
+    assert str(table.schema).splitlines()[3] == "Speed: float64"
+    assert pa.schema(table.schema) == pa.table(table).schema
+
+
+def test_a_notebook_shows_the_first_and_the_last_rows_without_what_others_put_into_them(table):
+    shown = table._repr_html_()
+    assert "20 rows" in shown and shown.count("<tr>") == 1 + 5 + 1 + 5 and "1970-01-01 00:00:19.000000001" in shown
+    assert "&lt;b&gt;park" in shown and "<b>" not in shown and "\x1b" not in shown
+    short = table[:3]._repr_html_()
+    assert short.count("<tr>") == 4 and "…" not in short

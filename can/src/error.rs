@@ -22,6 +22,23 @@ impl BusErrorKind {
     /// All of them.
     pub const ALL: [Self; 6] =
         [Self::Stuff, Self::Form, Self::Acknowledgment, Self::BitRecessive, Self::BitDominant, Self::Crc];
+
+    /// Its name in texts, JSON and tables.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Stuff => "stuff",
+            Self::Form => "form",
+            Self::Acknowledgment => "acknowledgment",
+            Self::BitRecessive => "bit-recessive",
+            Self::BitDominant => "bit-dominant",
+            Self::Crc => "crc",
+        }
+    }
+
+    /// The error of that name.
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|kind| kind.name() == name)
+    }
 }
 
 /// The state of a controller's fault confinement (ISO 11898-1).
@@ -36,4 +53,40 @@ pub enum ErrorState {
     Passive,
     /// The transmit error counter passed 255; the controller is off the bus.
     BusOff,
+}
+
+impl ErrorState {
+    /// All of them, from the best to the worst.
+    pub const ALL: [Self; 4] = [Self::Active, Self::Warning, Self::Passive, Self::BusOff];
+
+    /// Its name in texts, JSON and tables.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Active => "active",
+            Self::Warning => "warning",
+            Self::Passive => "passive",
+            Self::BusOff => "bus-off",
+        }
+    }
+
+    /// The state of that name.
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|state| state.name() == name)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_name_is_that_of_one() {
+        for kind in BusErrorKind::ALL {
+            assert_eq!(BusErrorKind::from_name(kind.name()), Some(kind));
+        }
+        for state in ErrorState::ALL {
+            assert_eq!(ErrorState::from_name(state.name()), Some(state));
+        }
+        assert_eq!((BusErrorKind::from_name("bit"), ErrorState::from_name("error active")), (None, None));
+    }
 }

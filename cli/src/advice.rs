@@ -10,8 +10,8 @@ use cantap::wire::Refusal;
 use cantap_formats::{Format, NothingRead, OpenError, UnknownFormat};
 use cantap_signals::condition::{ConditionError, ConditionFault};
 
-use cantap_address::LinkError;
 use cantap_address::server::Server;
+use cantap_address::{Address, LinkError};
 
 /// For when nothing could be read.
 const NAME_THE_FORMAT: &str = "; if it is a trace, name its format with --from";
@@ -68,6 +68,9 @@ fn of_device(error: &DeviceError) -> Option<String> {
         DeviceError::Silent { address, .. } if Server::is_meant(address) => {
             "; the line to its server may be too slow or interrupted, or the server hangs"
         }
+        DeviceError::Silent { address, .. } if Address::is_no_port(address) => {
+            "; it is part of this program, so this computer is too busy: close other programs, or give the device less to do"
+        }
         DeviceError::Silent { .. } => "; if that stays so, unplug it and plug it in again",
         DeviceError::NoChannel { .. } => "; choose one it has with -c",
         DeviceError::Refused { refusal } => match refusal {
@@ -89,7 +92,7 @@ fn of_timing(error: &TimingError) -> Option<String> {
         TimingError::JumpWidth { .. } => "; give a smaller --sjw",
         TimingError::Rate(_) => ", see `cantap timing -b RATE` for what reaches a rate",
         TimingError::Register(_) => ", and choose loopback or silent with --mode",
-        TimingError::TripleSampling => ": leave --triple away",
+        TimingError::TripleSampling => ": omit --triple",
         _ => return None,
     };
     Some(advice.to_owned())
@@ -146,16 +149,23 @@ mod tests {
         // Nobody is to be sent to a cable that is on another computer.
         let error = DeviceError::Silent { address: "ssh://car".to_owned(), seconds: 1.4 };
         assert!(told(&error).contains("the line to its server"), "{}", told(&error));
+        // Nor to one that does not exist.
+        for address in ["virtual", "virtual:load=100", "emu:board.elf"] {
+            let error = DeviceError::Silent { address: address.to_owned(), seconds: 1.4 };
+            assert!(told(&error).contains("this computer is too busy"), "{}", told(&error));
+        }
+        let error = DeviceError::Silent { address: "/dev/ttyACM0".to_owned(), seconds: 1.4 };
+        assert!(told(&error).contains("unplug it"), "{}", told(&error));
         let error = DeviceError::Refused { refusal: Refusal::Unsupported };
         assert_eq!(told(&error), "the device refused: it cannot do that; `cantap info` shows what it can");
         let error = anyhow::Error::from(TimingError::TripleSampling).context("channel 1");
         assert!(sentence(&error).starts_with("channel 1: this controller"), "{}", sentence(&error));
-        assert!(sentence(&error).ends_with("in it: leave --triple away"), "{}", sentence(&error));
+        assert!(sentence(&error).ends_with("in it: omit --triple"), "{}", sentence(&error));
     }
 
     #[test]
     fn a_name_without_a_format_is_explained_for_reading_and_writing() {
-        let expected = "the name 'a.xyz' does not tell the format; name it with one of ";
+        let expected = "the name 'a.xyz' does not show the format; name it with one of ";
         let unknown = || UnknownFormat::Suffix("a.xyz".to_owned());
         let (read, written) = (OpenError::from(unknown()), io::Error::other(unknown()));
         for (told, option) in [(told(&read), "--from"), (told(&written), "--format")] {

@@ -45,7 +45,8 @@ pub struct ChannelArgs {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum ModeArg {
     /// Send nothing, acknowledge nothing.
-    Listen,
+    #[value(name = "listen-only", alias = "listen")]
+    ListenOnly,
     /// Acknowledge and send.
     Normal,
     /// Receive only what is sent from here; the bus sees it too.
@@ -112,7 +113,7 @@ impl ChannelArgs {
     /// The requested mode, if any.
     pub fn mode(&self) -> Option<Mode> {
         Some(match self.mode? {
-            ModeArg::Listen => Mode::ListenOnly,
+            ModeArg::ListenOnly => Mode::ListenOnly,
             ModeArg::Normal => Mode::Normal,
             ModeArg::Loopback => Mode::Loopback,
             ModeArg::SilentLoopback => Mode::SilentLoopback,
@@ -122,7 +123,7 @@ impl ChannelArgs {
     /// Requests another mode.
     pub fn set_mode(&mut self, mode: Mode) {
         self.mode = Some(match mode {
-            Mode::ListenOnly => ModeArg::Listen,
+            Mode::ListenOnly => ModeArg::ListenOnly,
             Mode::Normal => ModeArg::Normal,
             Mode::Loopback => ModeArg::Loopback,
             Mode::SilentLoopback => ModeArg::SilentLoopback,
@@ -263,14 +264,4 @@ pub fn description(config: &ChannelConfig, can_clock_hz: u32) -> String {
         Mode::SilentLoopback => "in silent loopback",
     };
     format!("{} bit/s, {mode}", config.timing.bitrate_bps(can_clock_hz))
-}
-
-/// The mode as written for `--mode`.
-pub const fn mode_name(mode: Mode) -> &'static str {
-    match mode {
-        Mode::ListenOnly => "listen",
-        Mode::Normal => "normal",
-        Mode::Loopback => "loopback",
-        Mode::SilentLoopback => "silent-loopback",
-    }
 }

@@ -1,6 +1,8 @@
 //! The `cantap` command. Each subcommand is a file in `commands/`; this one only selects.
 
 #![forbid(unsafe_code)]
+// They panic when nobody reads standard output any more.
+#![cfg_attr(not(test), deny(clippy::print_stdout))]
 
 /// Standard error may be closed or full, in which case std's macro panics. Anyone who does not read the message still gets the exit
 /// code.

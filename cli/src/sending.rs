@@ -15,7 +15,7 @@ use cantap::wire::{CHANNELS, Channel};
 use cantap::{Device, TraceRecord};
 
 use crate::rescue::Rescue;
-use crate::words::failure_name;
+use crate::words::failure_text;
 use cantap_work::interrupt;
 
 /// How often to check whether to continue.
@@ -107,7 +107,7 @@ impl<'d> Sending<'d> {
                 Err(TransmitFailure::Overtaken { periods }) => self.overtaken += u64::from(periods),
                 Err(reason) => {
                     self.failed += 1;
-                    *self.failures.entry(failure_name(reason)).or_default() += 1;
+                    *self.failures.entry(failure_text(reason)).or_default() += 1;
                 }
             }
         }
@@ -214,7 +214,7 @@ impl Outcome {
     pub fn reason(&self) -> Option<String> {
         let Self { asked, not_sent, overtaken, .. } = self;
         let were_not = format!("{not_sent} of {asked} frames were not sent");
-        let again = if self.is_one_shot { ", or leave --one-shot away to try again until sent" } else { "" };
+        let again = if self.is_one_shot { ", or omit --one-shot to try again until sent" } else { "" };
         Some(match self.cause? {
             Cause::Unacknowledged => format!(
                 "nobody acknowledged {not_sent} of {asked} frames; check that another node is on the bus, at this bit rate, \
@@ -235,7 +235,7 @@ impl Outcome {
                 "{were_not}: the controller went bus-off; check bit rate, wiring and termination, and see --recovery"
             ),
             Cause::ArbitrationLost => {
-                format!("{were_not}: arbitration was lost; leave --one-shot away to try again until sent")
+                format!("{were_not}: arbitration was lost; omit --one-shot to try again until sent")
             }
             Cause::Overtaken if *not_sent == 0 => format!(
                 "all {asked} frames were sent, but {overtaken} periods passed without one: their period is shorter than the \

@@ -24,7 +24,7 @@ use crate::commands::conversations;
 use crate::completion;
 use crate::hearing::{self, Hearing};
 use crate::sending::Sending;
-use crate::words::{counted, state_name};
+use crate::words::counted;
 use crate::wrong::wrong;
 use cantap_work::interrupt;
 
@@ -412,11 +412,8 @@ impl Speaking<'_> {
             let _ = write!(text, "; {}", count(errors, "bus error"));
         }
         if let Ok(status) = self.device.status() {
-            let _ = write!(
-                text,
-                "; the controller is {}",
-                state_name(status.channels[self.channel.index()].state)
-            );
+            let _ =
+                write!(text, "; the controller is {}", status.channels[self.channel.index()].state.name());
         }
         if lost > 0 {
             let _ = write!(text, "; {lost} frames or more were lost on the way to this computer");

@@ -15,23 +15,11 @@ pub fn show(device: &Device, messages: usize) -> Result<String, Box<dyn Error>> 
     let decoder = Decoder::new(vec![Source { channel: None, database }]);
     device.listen(Channel::Can1, 500_000)?;
     let mut shown = 0;
-    let mut values = Vec::new();
     for record in device.records() {
-        let record = record?;
-        let Some(found) = record.frame().and_then(|frame| decoder.decode(record.channel, frame, &mut values))
-        else {
-            continue;
-        };
-        let message = decoder.message(found);
-        let signals = values.iter().map(|value| {
-            let signal = &message.signals[value.signal as usize];
-            match signal.text(value.raw) {
-                Some(text) => format!("{} {text}", signal.name),
-                None => format!("{} {} {}", signal.name, signal.number(value.raw), signal.unit),
-            }
-        });
-        let line = signals.collect::<Vec<_>>().join(", ");
-        println!("{}: {line}", message.name);
+        let readings = decoder.readings(&record?);
+        let Some(first) = readings.first() else { continue };
+        let line = readings.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
+        println!("{}: {line}", first.message.name);
         shown += 1;
         if shown == messages {
             return Ok(line);

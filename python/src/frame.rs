@@ -1,9 +1,7 @@
 //! Frames and records, for Python.
 
 use cantap_columns::FrameColumns;
-use cantap_trace::names::{self, BUS_ERRORS, ERROR_STATES, LOSS_STAGES, OVERTAKEN, TRANSMIT_FAILURES};
-use cantap_trace::{Direction, Frame as ClassicFrame, Id, TraceEvent, TraceFrame, TraceRecord};
-use cantap_wire::record::TransmitFailure;
+use cantap_trace::{BusErrorKind, Direction, Frame as ClassicFrame, Id, LossStage, TraceEvent, TraceFrame, TraceRecord, TransmitFailure};
 use pyo3::exceptions::{PyOverflowError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
@@ -201,10 +199,10 @@ impl Record {
     #[getter]
     fn detail(&self) -> Option<&'static str> {
         match &self.0.event {
-            TraceEvent::Lost { stage, .. } => stage.map(|stage| names::name(&LOSS_STAGES, &stage)),
-            TraceEvent::BusError { kind, .. } => kind.map(|kind| names::name(&BUS_ERRORS, &kind)),
-            TraceEvent::State { state, .. } => Some(names::name(&ERROR_STATES, state)),
-            TraceEvent::TransmitFailed { reason, .. } => Some(failure(*reason)),
+            TraceEvent::Lost { stage, .. } => stage.map(LossStage::name),
+            TraceEvent::BusError { kind, .. } => kind.map(BusErrorKind::name),
+            TraceEvent::State { state, .. } => Some(state.name()),
+            TraceEvent::TransmitFailed { reason, .. } => Some(reason.name()),
             TraceEvent::Frame { .. } | TraceEvent::ErrorsSuppressed { .. } => None,
         }
     }
@@ -297,13 +295,5 @@ impl Record {
         let detail = self.detail().map_or_else(String::new, |detail| format!(" {detail}"));
         let count = self.count().map_or_else(String::new, |count| format!(" {count}"));
         format!("<cantap.Record {seconds} channel {channel} {}{detail}{count}>", self.event())
-    }
-}
-
-/// A reason's name.
-pub fn failure(reason: TransmitFailure) -> &'static str {
-    match reason {
-        TransmitFailure::Overtaken { .. } => OVERTAKEN,
-        reason => names::name(&TRANSMIT_FAILURES, &reason),
     }
 }

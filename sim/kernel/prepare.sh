@@ -1,14 +1,16 @@
 #!/bin/bash
-# prepare.sh CACHE: Debian's packages -> CACHE/vmlinux and CACHE/initrd. Needs apt-get, cpio, kmod and xz-utils. Ends with 75 if the
+# prepare.sh CACHE [KERNEL]: Debian's packages -> CACHE/vmlinux and CACHE/initrd. Needs apt-get, cpio, kmod, xz-utils and zstd. Ends with 75 if the
 # packages cannot be fetched.
-# The guest's packages are unpacked, never installed here. No version is pinned: it is the stock kernel of this Debian release.
+# The guest's packages are unpacked, never installed here. No version is pinned: it is the stock kernel of this Debian release, or another that it
+# has, named by its metapackage (linux-image-6.12-amd64).
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
+kernel=${2:-linux-image-amd64}
 mkdir -p "$1"
 cd "$1"
 
 # Nothing to do if what is there was made from the same recipe.
-recipe=$(cat "$here/prepare.sh" "$here/init" | sha256sum)
+recipe=$({ echo "$kernel" && cat "$here/prepare.sh" "$here/init"; } | sha256sum)
 if [ -f initrd ] && [ "$recipe" = "$(cat recipe 2>/dev/null)" ]; then
   exit 0
 fi
@@ -34,14 +36,15 @@ fetch() {
 
 # Only root may do this; others use what was last fetched.
 [ "$(id -u)" != 0 ] || fetch update
-image=$(apt-cache show --no-all-versions linux-image-amd64 | sed -n 's/^Depends: \(linux-image-[^ ]*\).*/\1/p')
+image=$(apt-cache show --no-all-versions "$kernel" | sed -n 's/^Depends: \(linux-image-[^ ]*\).*/\1/p')
+[ -n "$image" ] || { echo "Debian's packages here have no $kernel" >&2; exit 75; }
 # The interpreter has its version in its name.
 python="$python $(apt-cache depends python3-minimal | sed -n 's/^ *PreDepends: \(python3[^ ]*\)$/\1/p')"
 # The libraries that the programs need, and those that these need; but not packages that are only named as alternatives.
 # shellcheck disable=SC2086 # lists of words
 libraries=$(apt-cache depends --recurse --no-recommends --no-suggests --no-conflicts --no-breaks --no-replaces --no-enhances \
   $programs $modem_manager $python | grep -E '^(lib[a-z0-9+.-]+|zlib1g)$' | grep -vE 'perl|pam|elogind|installer|cryptsetup|systemd-shared' | sort -u)
-rm -rf packages root kernel
+rm -rf packages root kernel vmlinux
 mkdir packages root kernel
 # shellcheck disable=SC2086
 cd packages
@@ -78,10 +81,16 @@ depmod -b root "$version"
 # Not compressed: the emulated processor would have to unpack it.
 (cd root && find . | cpio -o -H newc --quiet) > initrd
 
-# Under emulation, a kernel that need not unpack itself boots in 5 s rather than 20. Its payload is one xz stream (found by its
-# magic number) with something after it, about which xz complains; a payload that is not an ELF is a failure.
-offset=$(LC_ALL=C grep -obUaP -m1 '\xfd7zXZ\x00' kernel/boot/vmlinuz-* | head -1 | cut -d: -f1)
-tail -c +$((offset + 1)) kernel/boot/vmlinuz-* | xz -dc --single-stream > vmlinux 2>/dev/null || true
+# Under emulation, a kernel that need not unpack itself boots in 5 s rather than 20. Its payload is one stream, xz or, since 6.12, zstd (found by
+# its magic number), with something after it, about which both programs complain; a payload that is not an ELF is a failure.
+unpack() {
+  offset=$(LC_ALL=C grep -obUaP -m1 "$1" kernel/boot/vmlinuz-* | head -1 | cut -d: -f1) || true
+  [ -n "$offset" ] || return 0
+  shift
+  tail -c +$((offset + 1)) kernel/boot/vmlinuz-* | "$@" > vmlinux 2>/dev/null || true
+}
+unpack '\xfd7zXZ\x00' xz -dc --single-stream
+[ -s vmlinux ] || unpack '\x28\xb5\x2f\xfd' zstd -dc
 [ "$(head -c 4 vmlinux | od -An -tx1)" = " 7f 45 4c 46" ] || { echo "the kernel's image holds no ELF" >&2; exit 1; }
 
 rm -rf packages root kernel wanted log

@@ -13,7 +13,7 @@ mod packed;
 pub mod record;
 mod varint;
 
-pub use cantap_can::{BitTiming, Frame, Id, frame, timing};
+pub use cantap_can::{BitTiming, CHANNELS, Channel, Frame, Id, frame, timing};
 pub use decoder::{Corruption, Decoded, Decoder};
 pub use message::{Command, Hello, Refusal, Reply, Request, Response};
 pub use record::{Event, Received, Record, Stamp};
@@ -35,39 +35,3 @@ pub const RECEIVE_PINS_SYMBOL: &str = "CANTAP_RECEIVE_PINS";
 pub const USB_VID: u16 = 0x1209;
 /// See [`USB_VID`].
 pub const USB_PID: u16 = 0x0001;
-
-/// One of the device's two CAN channels.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, serde::Serialize, serde::Deserialize)]
-pub enum Channel {
-    /// CAN1, called 1 in every user interface.
-    Can1,
-    /// CAN2, called 2 in every user interface.
-    Can2,
-}
-
-impl Channel {
-    /// Both channels, in order.
-    pub const ALL: [Channel; CHANNELS] = [Channel::Can1, Channel::Can2];
-
-    /// 0 or 1, for indexing.
-    pub const fn index(self) -> usize {
-        self as usize
-    }
-
-    /// 1 or 2, as users count.
-    pub const fn number(self) -> u8 {
-        self as u8 + 1
-    }
-
-    /// The channel that users call `number`.
-    pub const fn from_number(number: u8) -> Option<Self> {
-        match number {
-            1 => Some(Channel::Can1),
-            2 => Some(Channel::Can2),
-            _ => None,
-        }
-    }
-}
-
-/// Channels of a device.
-pub const CHANNELS: usize = 2;

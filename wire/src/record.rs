@@ -12,7 +12,7 @@
 //! a stamp may be computed back to a time before the other channel's last one, and wide because nothing bounds the time
 //! between two records: a host may open a channel hours after its greeting, or read nothing for hours.
 
-pub use cantap_can::{BusErrorKind, ErrorState};
+pub use cantap_can::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 use serde::{Deserialize, Serialize};
 
 use crate::packed::{put_packed, take_data};
@@ -58,39 +58,6 @@ pub struct Received {
     pub stamp: Stamp,
     /// Whether the data bytes were left out on request.
     pub data_omitted: bool,
-}
-
-/// Where frames were lost on their way.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
-pub enum LossStage {
-    /// The controller's hardware FIFO overran. It cannot tell how many frames it dropped.
-    Controller,
-    /// The device's record queue was full.
-    Queue,
-    /// Between device and host. Never in the stream: the host computes it from sequence numbers.
-    Link,
-    /// In the host: a consumer did not keep up. Never in the stream.
-    Host,
-}
-
-/// Why a frame was not sent.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
-pub enum TransmitFailure {
-    /// One-shot mode, and arbitration was lost.
-    ArbitrationLost,
-    /// One-shot mode, and an error hit the frame.
-    BusError,
-    /// The host asked for it.
-    Aborted,
-    /// The channel was closed.
-    Closed,
-    /// The controller went bus-off and recovery is manual.
-    BusOff,
-    /// A periodic frame's next periods began before the bus took it. The frame still waits, and its end is reported once.
-    Overtaken {
-        /// How many, since the entry's last such record.
-        periods: u32,
-    },
 }
 
 /// Everything in the stream that is not a received frame. The order of the variants is the wire

@@ -1,4 +1,4 @@
-//! The project's own build steps: `cargo xtask firmware | test | ci | circles | links | size | bench | soak | dist`.
+//! The project's own build steps: `cargo xtask firmware | test | ci | kernel | circles | links | size | bench | soak | dist`.
 //!
 //! Kept light, because `cargo fw` builds it first: what only measurements and checks need is optional, behind
 //! features.
@@ -22,6 +22,7 @@ mod kernel;
 mod links;
 mod machine;
 mod metadata;
+mod mutants;
 mod outcome;
 mod package;
 mod peers;
@@ -56,6 +57,8 @@ enum Task {
     Test(test::Args),
     /// Checks everything that must hold before a change lands, from a fresh clone on.
     Ci(test::Args),
+    /// Boots stock Linux kernels that drive the firmware on the emulated board, part by part or whole.
+    Kernel(kernel::Args),
     /// Finds files of one crate that import each other in a circle, and public types of one crate that share a name.
     Circles,
     /// Finds broken links in the pages, and files named there that do not exist.
@@ -75,6 +78,7 @@ fn main() -> ExitCode {
         Task::Firmware(args) => firmware::run(&args),
         Task::Test(args) => test::run(&args),
         Task::Ci(args) => test::ci(&args),
+        Task::Kernel(args) => kernel::main(&args),
         Task::Circles => check::circles(),
         Task::Links => check::links(),
         Task::Size => size::run(&board::Board::ALL),

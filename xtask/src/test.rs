@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use anyhow::Result;
 use clap::ValueEnum;
 
+use crate::board::Board;
 use crate::machine::Machine;
 use crate::outcome::Outcome;
 use crate::steps::Step;
@@ -21,18 +22,18 @@ pub struct Args {
     timings: bool,
 }
 
-/// What a change needs: the first steps.
+/// What a change needs: the first steps, with the default board's firmware.
 pub fn run(args: &Args) -> Result<()> {
-    run_steps(args, &Step::TEST)
+    run_steps(args, &Step::TEST, &Board::ALL[..1])
 }
 
-/// Every step.
+/// Every step, with every board's firmware.
 pub fn ci(args: &Args) -> Result<()> {
-    run_steps(args, Step::value_variants())
+    run_steps(args, Step::value_variants(), &Board::ALL)
 }
 
 /// Runs the steps one after the other and stops at the first that fails.
-fn run_steps(args: &Args, all: &[Step]) -> Result<()> {
+fn run_steps(args: &Args, all: &[Step], boards: &[Board]) -> Result<()> {
     let steps = if args.only.is_empty() { all } else { &args.only };
     let machine = Machine::new()?;
     let mut done: Vec<(String, Outcome, Duration)> = Vec::new();
@@ -40,7 +41,7 @@ fn run_steps(args: &Args, all: &[Step]) -> Result<()> {
         let name = step.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned());
         println!("\n--- {name}");
         let begin = Instant::now();
-        match step.run(&machine) {
+        match step.run(&machine, boards) {
             Ok(outcome) => done.push((name, outcome, begin.elapsed())),
             Err(error) => {
                 report(&done);

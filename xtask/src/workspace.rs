@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
-use xshell::Shell;
+use xshell::{Shell, cmd};
 
 /// The workspace's root directory.
 pub fn root() -> PathBuf {
@@ -26,4 +26,17 @@ pub fn shell() -> Result<Shell> {
     let shell = Shell::new().context("there is no current directory")?;
     shell.change_dir(root());
     Ok(shell)
+}
+
+/// Copies every file that belongs to the source: those that git tracks or does not ignore.
+pub fn copy_sources(shell: &Shell, to: &Path) -> Result<()> {
+    let files = cmd!(shell, "git ls-files --cached --others --exclude-standard").quiet().read()?;
+    for file in files.lines() {
+        // A file whose deletion is not yet committed is still listed.
+        if shell.path_exists(file) {
+            shell.create_dir(to.join(file).parent().unwrap_or(to))?;
+            shell.copy_file(file, to.join(file))?;
+        }
+    }
+    Ok(())
 }

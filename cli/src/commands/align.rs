@@ -1,5 +1,6 @@
 //! `cantap align`: puts traces of several recorders on the same bus into one trace with one clock.
 
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
@@ -98,11 +99,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             channel_offset,
         })
         .collect();
+    let mut out = io::stdout().lock();
     if args.json {
-        println!("{}", to_json(args, &found, &missing, &not_carried));
+        writeln!(out, "{}", to_json(args, &found, &missing, &not_carried))?;
     } else {
         for (path, found) in args.traces[1..].iter().zip(&found) {
-            print(&args.traces[0], path, found);
+            print(&mut out, &args.traces[0], path, found)?;
         }
     }
     let within =
@@ -219,34 +221,37 @@ impl<'a> Merged<'a> {
     }
 }
 
-fn print(first: &Path, path: &Path, found: &Found) {
+fn print(out: &mut impl Write, first: &Path, path: &Path, found: &Found) -> io::Result<()> {
     let (first, path) = (first.display(), path.display());
     let Found { alignment, agreement, channel_offset } = found;
     for (a, b) in &alignment.channels {
         let now = if *channel_offset == 0 { String::new() } else { format!(" (now {})", b + channel_offset) };
-        println!("channel {b} of {path}{now} is on the bus of channel {a} of {first}");
+        writeln!(out, "channel {b} of {path}{now} is on the bus of channel {a} of {first}")?;
     }
     let steps = match alignment.map.steps() {
         0 => String::new(),
         1 => ", and was set once meanwhile".to_owned(),
         steps => format!(", and was set {steps} times meanwhile"),
     };
-    println!(
+    writeln!(
+        out,
         "its clock was {:+.6} s from the first one's and gains {:+.3} ppm on it{steps}",
         -(alignment.map.ahead_ns() as f64) / 1e9,
         // Avoid a minus sign before zero.
         (-alignment.map.drift_ppm() * 1e3).round() / 1e3 + 0.0,
-    );
-    println!(
+    )?;
+    writeln!(
+        out,
         "{} frames in both; of the common time, {} only in {first}, {} only in {path}",
         agreement.both, agreement.only_first, agreement.only_second
-    );
-    println!(
+    )?;
+    writeln!(
+        out,
         "stamps of the same frame apart: {:.1} us half of them, {:.1} us 99 %, {:.1} us at most",
         us(agreement.median_ns),
         us(agreement.most_ns),
         us(agreement.worst_ns)
-    );
+    )
 }
 
 fn us(ns: u64) -> f64 {

@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 
 use crate::args;
 use crate::boards::OneBoard;
-use crate::channel_args::{ChannelArgs, mode_name};
+use crate::channel_args::ChannelArgs;
 use crate::completion;
 
 /// The command line.
@@ -134,7 +134,7 @@ fn line(channel: Channel, defaults: Option<&Defaults>, clock_hz: u32) -> String 
     let mut parts = vec![
         format!("{} bit/s", timing.bitrate_bps(clock_hz)),
         format!("sample point {:.1} %", f64::from(timing.sample_point_permille()) / 10.0),
-        mode_name(defaults.config.mode).to_owned(),
+        defaults.config.mode.name().to_owned(),
     ];
     parts.extend(flags(defaults).into_iter().map(str::to_owned));
     match filters(defaults) {
@@ -153,7 +153,7 @@ fn object(channel: Channel, defaults: Option<&Defaults>, clock_hz: u32) -> Value
             "segments": [u16::from(timing.segment1), u16::from(timing.segment2)],
             "prescaler": timing.prescaler,
             "sjw": timing.jump_width,
-            "mode": mode_name(defaults.config.mode),
+            "mode": defaults.config.mode.name(),
             "one_shot": defaults.config.one_shot,
             "manual_recovery": defaults.config.manual_recovery,
             "no_data": defaults.config.omit_data,

@@ -87,7 +87,7 @@ pub struct Args {
     #[arg(long, value_name = "RATE", default_value = "auto", help_heading = OPTIONS)]
     bitrate2: BitRate,
     /// How to take part in the buses.
-    #[arg(long, value_enum, default_value = "listen", help_heading = OPTIONS)]
+    #[arg(long, value_enum, default_value = "listen-only", help_heading = OPTIONS)]
     mode: ModeArg,
 }
 
@@ -103,7 +103,8 @@ enum Action {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum ModeArg {
     /// Send nothing, acknowledge nothing.
-    Listen,
+    #[value(name = "listen-only", alias = "listen")]
+    ListenOnly,
     /// Acknowledge frames.
     Normal,
 }
@@ -166,7 +167,7 @@ pub fn run(args: Args) -> anyhow::Result<ExitCode> {
         address: place.address(args.device.as_ref()),
         bit_rates: [args.bitrate1, args.bitrate2],
         mode: match args.mode {
-            ModeArg::Listen => Mode::ListenOnly,
+            ModeArg::ListenOnly => Mode::ListenOnly,
             ModeArg::Normal => Mode::Normal,
         },
         filters: args.extcap_capture_filter.map(|Filters(filters)| filters).unwrap_or_default(),

@@ -288,7 +288,7 @@ impl Filled {
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.fd || args.fd_error_state {
-        bail!("the device is a classical CAN controller, without CAN FD; leave -f and -E away");
+        bail!("the device is a classical CAN controller, without CAN FD; omit -f and -E");
     }
     if matches!(args.length, Some(Values::Fixed(9..))) && !args.raw_dlc {
         let reason = "a frame carries 0 to 8 bytes; -8 allows lengths up to 15, which say eight";

@@ -144,7 +144,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         What::Dm1 { to } => StationJob::Request { pgn: DM1, to: *to },
         What::Send { pgn, data, to, priority } => {
             if *to != GLOBAL && pgn >> 8 & 0xFF >= 240 {
-                return Err(wrong(format!("the group {pgn} goes to all; leave --to away")));
+                return Err(wrong(format!("the group {pgn} goes to all; omit --to")));
             }
             StationJob::Send { pgn: *pgn, to: *to, priority: *priority, data: data.0.clone() }
         }

@@ -22,7 +22,7 @@ use crate::live::LiveArgs;
 use crate::missing::Missing;
 use crate::protocols::{self, ProtocolArgs};
 use crate::trace_output::TraceOutput;
-use crate::words::{error_name, failure_name, state_name};
+use crate::words::failure_text;
 use crate::wrong::wrong;
 
 /// The command line.
@@ -276,12 +276,12 @@ impl Sink {
 fn describe(event: &TraceEvent) -> String {
     match event {
         TraceEvent::Frame { frame, .. } => frame.to_string(),
-        TraceEvent::BusError { kind: Some(kind), .. } => format!("bus error: {}", error_name(*kind)),
+        TraceEvent::BusError { kind: Some(kind), .. } => format!("bus error: {}", kind.name()),
         TraceEvent::BusError { kind: None, .. } => "bus error".to_owned(),
         TraceEvent::ErrorsSuppressed { count } => format!("{count} more bus errors"),
-        TraceEvent::State { state, .. } => format!("controller: {}", state_name(*state)),
+        TraceEvent::State { state, .. } => format!("controller: {}", state.name()),
         TraceEvent::Lost { count, at_least: true, .. } => format!("at least {count} frames lost"),
         TraceEvent::Lost { count, .. } => format!("{count} frames lost"),
-        TraceEvent::TransmitFailed { reason, .. } => format!("not sent: {}", failure_name(*reason)),
+        TraceEvent::TransmitFailed { reason, .. } => format!("not sent: {}", failure_text(*reason)),
     }
 }

@@ -2,6 +2,7 @@
 //! send in.
 
 mod buses;
+mod patience;
 mod report;
 mod steps;
 mod traffic;
@@ -15,7 +16,7 @@ use anyhow::Context;
 use cantap::{Channel, Device};
 use cantap_address::{Address, OpenDevice};
 
-use self::report::{Outcome, Report};
+use self::report::{Lines, Outcome, Report};
 use crate::boards::OneBoard;
 use crate::{args, beside, exit};
 use cantap_work::interrupt;
@@ -26,9 +27,10 @@ use cantap_work::interrupt;
     after_help = "Without --loop no channel puts a dominant bit on its bus, whatever is connected: channels only listen, or play with \
                         themselves inside the controller.\nWith --loop both channels send, so that nothing else may be connected: channel 1 \
                         to channel 2, CANH to CANH, CANL to CANL, and 120 ohms at each end.\nA step passes, fails, or is skipped with the \
-                        reason. Exit code 3 if one fails. What to do by hand besides is in docs/bring-up.md.\n\n\
+                        reason. Exit code 3 if one fails. What to do by hand besides is in docs/bring-up.md. Ctrl-C ends the \
+                        test with what was tried so far.\n\n\
                         Examples:\n  cantap selftest -d /dev/ttyACM0 --report board.txt\n  cantap selftest -d COM5 --loop --load-time 1m\n  \
-                        cantap selftest -d virtual:wire=joined,load=0 --loop --json"
+                        cantap selftest -d virtual:wire=joined,load=0,ack=no --loop --json"
 )]
 pub struct Args {
     #[command(flatten)]
@@ -58,7 +60,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
     let address = args.device.address()?;
     let device = address.open()?;
-    let mut report = Report::new(&address, &device, !args.json);
+    let lines = if args.json { Lines::Kept } else { Lines::Shown { is_kept: args.report.is_some() } };
+    let mut report = Report::new(&address, &device, lines);
     test(args, &address, &device, &mut report);
     let serial = device.hello().serial.as_str().to_owned();
     restart(args, &address, device, &serial, &mut report);
@@ -70,7 +73,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.json {
         writeln!(std::io::stdout(), "{}", serde_json::to_string(&report)?)?;
     }
-    Ok(if report.has_passed() { ExitCode::SUCCESS } else { ExitCode::from(exit::CHECK_FAILED) })
+    let code = match (report.has_passed(), report.was_cut_short()) {
+        (true, _) => ExitCode::SUCCESS,
+        (false, true) => ExitCode::from(interrupt::ENDED_BY_SIGNAL),
+        (false, false) => ExitCode::from(exit::CHECK_FAILED),
+    };
+    report.output_error().map_or(Ok(code), |error| Err(error.into()))
 }
 
 /// All steps except the restart.
@@ -110,7 +118,7 @@ fn test(args: &Args, address: &Address, device: &Device, report: &mut Report) {
             Ok(Outcome::Skip("they are not said to be wired to each other (--loop)".to_owned()))
         });
     }
-    report.step("clock", || Ok(steps::clock(device)));
+    report.step("clock", || steps::clock(device));
     report.step("saved settings untouched", || {
         let now = steps::saved(device)?;
         Ok(steps::compare_saved(&saved, &now))
@@ -149,7 +157,7 @@ mod tests {
         let witness = std::sync::Arc::clone(&connection.witness);
         let device = Device::over(connection.into_link(), "virtual").unwrap();
         let address = args.device.address().unwrap();
-        test(&args, &address, &device, &mut Report::new(&address, &device, false));
+        test(&args, &address, &device, &mut Report::new(&address, &device, Lines::Kept));
         witness.heard().driven
     }
 

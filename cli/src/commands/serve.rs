@@ -105,7 +105,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let addresses = Boards::new(&args.devices, &Channels::all())?;
     let addresses = addresses.addresses();
     if args.stdio && addresses.len() > 1 {
-        return Err(wrong("--stdio serves one device; leave the others away"));
+        return Err(wrong("--stdio serves one device; omit the others"));
     }
     let mut timing = TimingArgs::default();
     timing.set_bit_rates(args.bitrates.clone());

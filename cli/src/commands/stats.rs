@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use cantap_address::Address;
-use cantap_analysis::stats::{Options, PeakSummary, Statistics, Summary};
+use cantap_analysis::stats::{Options, Statistics, Summary};
 
 use self::windows::Windows;
 use crate::args;
@@ -178,7 +178,10 @@ fn write_json(
     let Some(windows) = windows else { return Ok(writeln!(out, "{members}}}")?) };
     write!(out, "{members},\"windows\":[")?;
     let mut comma = "";
-    windows.for_each(|window| Ok(write!(out, "{}{window}", std::mem::replace(&mut comma, ","))?))?;
+    windows.for_each(|window| {
+        let window = serde_json::to_string(window)?;
+        Ok(write!(out, "{}{window}", std::mem::replace(&mut comma, ","))?)
+    })?;
     Ok(writeln!(out, "]}}")?)
 }
 
@@ -186,8 +189,7 @@ fn write_windows(summary: &Summary, windows: Windows, out: &mut impl Write) -> a
     let zero_s = summary.origin_s.unwrap_or(0.0);
     let mut head = "\nWindows\n";
     windows.for_each(|window| {
-        let window: PeakSummary = serde_json::from_str(window)?;
-        let line = table::window_line(&window, zero_s);
+        let line = table::window_line(window, zero_s);
         Ok(writeln!(out, "{}{line}", std::mem::take(&mut head))?)
     })
 }

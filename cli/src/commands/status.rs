@@ -6,11 +6,11 @@ use std::time::{Duration, Instant};
 
 use cantap::Channel;
 use cantap::wire::message::{ChannelStatus, Failures, Hello, Mode, RegisterSet, Status};
-use cantap::wire::record::{BusErrorKind, ErrorState};
+use cantap_trace::BusErrorKind;
 use serde_json::{Value, json};
 
 use crate::boards::OneBoard;
-use crate::channel_args::{ChannelArgs, mode_name};
+use crate::channel_args::ChannelArgs;
 use crate::completion;
 use crate::wrong::wrong;
 use crate::{args, clock};
@@ -105,11 +105,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     for (channel, state) in Channel::ALL.into_iter().zip(&status.channels) {
         let open = state.open.map_or("closed".to_owned(), |config| {
             let bitrate = config.timing.bitrate_bps(device.hello().can_clock_hz);
-            format!("open, {}, {bitrate} bit/s", mode_name(config.mode))
+            format!("open, {}, {bitrate} bit/s", config.mode.name())
         });
         writeln!(out, "\nchannel {}    {open}", channel.number())?;
-        writeln!(out, "  state      {}, TEC {}, REC {}", name(state.state), state.tec, state.rec)?;
-        writeln!(out, "  last error {}", state.last_error.map_or("none", error_name))?;
+        writeln!(out, "  state      {}, TEC {}, REC {}", state.state.name(), state.tec, state.rec)?;
+        writeln!(out, "  last error {}", state.last_error.map_or("none", BusErrorKind::name))?;
         writeln!(
             out,
             "  received   {} frames; lost: controller at least {}, queue {}",
@@ -167,12 +167,12 @@ fn channel_object(channel: Channel, state: &ChannelStatus, can_clock_hz: u32) ->
     json!({
         "channel": channel.number(),
         "open": state.open.is_some(),
-        "mode": state.open.map(|config| mode_name(config.mode)),
+        "mode": state.open.map(|config| config.mode.name()),
         "bitrate_bps": state.open.map(|config| config.timing.bitrate_bps(can_clock_hz)),
-        "state": name(state.state),
+        "state": state.state.name(),
         "tec": state.tec,
         "rec": state.rec,
-        "last_error": state.last_error.map(error_name),
+        "last_error": state.last_error.map(BusErrorKind::name),
         "frames": state.frames,
         "lost_controller": state.lost_controller,
         "lost_queue": state.lost_queue,
@@ -201,26 +201,6 @@ fn register_object(set: &RegisterSet) -> Value {
         .map(|(name, value)| (name.to_lowercase(), Value::from(format!("0x{value:08X}"))))
         .collect::<serde_json::Map<_, _>>()
         .into()
-}
-
-const fn name(state: ErrorState) -> &'static str {
-    match state {
-        ErrorState::Active => "active",
-        ErrorState::Warning => "warning",
-        ErrorState::Passive => "passive",
-        ErrorState::BusOff => "bus-off",
-    }
-}
-
-const fn error_name(kind: BusErrorKind) -> &'static str {
-    match kind {
-        BusErrorKind::Stuff => "stuff",
-        BusErrorKind::Form => "form",
-        BusErrorKind::Acknowledgment => "acknowledgment",
-        BusErrorKind::BitRecessive => "bit recessive",
-        BusErrorKind::BitDominant => "bit dominant",
-        BusErrorKind::Crc => "CRC",
-    }
 }
 
 #[cfg(test)]

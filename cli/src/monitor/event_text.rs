@@ -2,12 +2,12 @@
 
 use std::fmt::Write as _;
 
-use cantap::wire::record::LossStage;
 use cantap::{TraceEvent, TraceRecord};
+use cantap_trace::{BusErrorKind, LossStage};
 
 use super::times::seconds;
 
-use crate::words::{error_name, failure_name, state_name};
+use crate::words::failure_text;
 
 /// The text for a record that is not a frame.
 pub fn event_text(event: &TraceEvent) -> String {
@@ -17,15 +17,16 @@ pub fn event_text(event: &TraceEvent) -> String {
     match *event {
         TraceEvent::Frame { .. } => String::new(),
         TraceEvent::BusError { kind, counters: at } => {
-            format!("E bus error: {}{}", kind.map_or("unknown", error_name), counters(at))
+            format!("E bus error: {}{}", kind.map_or("unknown", BusErrorKind::name), counters(at))
         }
         TraceEvent::ErrorsSuppressed { count } => format!("E {count} more bus errors"),
-        TraceEvent::State { state, counters: at } => format!("S {}{}", state_name(state), counters(at)),
+        TraceEvent::State { state, counters: at } => format!("S controller {}{}", state.name(), counters(at)),
         TraceEvent::Lost { stage, count, at_least } => {
-            format!("L {} frames lost {}", lost(count, at_least), stage.map_or("somewhere", stage_name))
+            let stage = stage.map_or("unknown", LossStage::name);
+            format!("L {} frames lost, stage {stage}", lost(count, at_least))
         }
         TraceEvent::TransmitFailed { tag, reason } => {
-            format!("F frame {tag} not sent: {}", failure_name(reason))
+            format!("F frame {tag} not sent: {}", failure_text(reason))
         }
     }
 }
@@ -37,15 +38,6 @@ pub fn lost(count: u32, at_least: bool) -> String {
         (0, true) => "an unknown number of".to_owned(),
         (count, true) => format!("at least {count}"),
         (count, false) => count.to_string(),
-    }
-}
-
-fn stage_name(stage: LossStage) -> &'static str {
-    match stage {
-        LossStage::Controller => "in the controller",
-        LossStage::Queue => "in the device's queue",
-        LossStage::Link => "on the way to the host",
-        LossStage::Host => "in the host",
     }
 }
 

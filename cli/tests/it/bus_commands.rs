@@ -133,7 +133,7 @@ fn status_tells_of_a_bus_that_it_listened_to() {
         );
         assert!(channel["frames"].as_u64() > Some(50) && channel["bus_errors"].as_u64() > Some(20), "{out}");
         assert!(channel["last_error"].is_string(), "{out}");
-        assert_eq!((&channel["mode"], &channel["bitrate_bps"]), (&"listen".into(), &500_000.into()));
+        assert_eq!((&channel["mode"], &channel["bitrate_bps"]), (&"listen-only".into(), &500_000.into()));
     }
     // In normal mode its counters count, and the registers at the last error are known.
     let line =

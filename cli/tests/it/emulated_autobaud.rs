@@ -74,7 +74,7 @@ fn search_on(channel: Channel, options: &str) -> Found {
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn every_board_hears_both_of_its_buses() {
-    for (name, ..) in common::BOARDS {
+    for (name, ..) in common::boards() {
         let elf = common::elf().with_file_name(format!("cantap-{name}.elf"));
         for channel in Channel::ALL {
             let options = "bitrate=125k,burst=1/20ms,speed=0.25";

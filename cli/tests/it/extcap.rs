@@ -85,7 +85,10 @@ fn wireshark_learns_of_interfaces_link_type_options_and_toolbar() {
     let (_, of_address, _) = run("--extcap-config --extcap-interface cantap-address");
     let (_, of_virtual, _) = run("--extcap-config --extcap-interface=cantap-virtual");
     assert!(of_address.contains("call=--device") && !of_virtual.contains("call=--device"), "{of_address}");
-    assert!(of_virtual.contains("{call=--mode}") && of_virtual.contains("{value=listen}"), "{of_virtual}");
+    assert!(
+        of_virtual.contains("{call=--mode}") && of_virtual.contains("{value=listen-only}"),
+        "{of_virtual}"
+    );
     assert_eq!(run("--extcap-interface cantap-virtual --extcap-cleanup-postkill").0, Some(0));
     assert_eq!(
         run("extcap --extcap-interface cantap-virtual --extcap-capture-filter can0,123:7FF").0,
@@ -259,7 +262,7 @@ fn the_toolbar_shows_the_load_and_changes_bit_rate_and_mode_of_a_running_capture
     wait(&message(1, 2, "95238\x0095238 bit/s"), &mut bytes);
     wait(&message(1, 1, "95238"), &mut bytes);
     wait(&message(0, 1, "500k"), &mut bytes);
-    wait(&message(2, 1, "listen"), &mut bytes);
+    wait(&message(2, 1, "listen-only"), &mut bytes);
     wait(&message(4, 1, "1: 0  2: 0"), &mut bytes);
     let text = wait(&[&message(3, 1, "1: 00 %  2: 00 %")[..6], b"1: "].concat(), &mut bytes);
     assert!(!text.contains("taking part"), "{text}");

@@ -16,7 +16,7 @@ fn schema() -> Schema {
 }
 
 /// A directory for each test, with traces and databases that cover everything.
-fn directory(test: &str) -> PathBuf {
+pub fn directory(test: &str) -> PathBuf {
     let directory = Path::new(env!("CARGO_TARGET_TMPDIR")).join("json_schema").join(test);
     fs::create_dir_all(&directory).unwrap();
     let line =
@@ -53,7 +53,7 @@ fn cantap(directory: &Path, line: &str) -> (Option<i32>, String, String) {
 }
 
 /// A command line without `--json`; its exit code; the type of its object, or of each of its lines but the last, and of the last.
-const LINES: [(&str, i32, &[&str]); 65] = [
+pub const LINES: [(&str, i32, &[&str]); 65] = [
     ("list", 0, &["list"]),
     ("info -d virtual", 0, &["info"]),
     ("status -d virtual --registers", 0, &["status"]),

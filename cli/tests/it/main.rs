@@ -8,6 +8,7 @@ mod canopen_ends;
 mod capture_and_demo;
 mod capture_rotates;
 mod car;
+mod closed_output;
 mod columns;
 #[cfg(feature = "emu")]
 #[path = "../../../sim/tests/it/common/mod.rs"]

@@ -160,7 +160,7 @@ fn a_node_on_python_canopen_is_found_read_written_and_commanded() {
     let (code, _, err) = rig.run("canopen read 5 3000");
     assert!(code == Some(1) && err.contains("object does not exist (06020000)"), "{err}");
     let (code, _, err) = rig.run("canopen write 5 2000 0 @object.bin --block");
-    assert!(code == Some(1) && err.contains("leave --block away"), "{err}");
+    assert!(code == Some(1) && err.contains("omit --block"), "{err}");
     let (code, _, err) = rig.run("canopen read 6 1000 --timeout 200ms");
     assert!(
         code == Some(1) && err.contains("no answer within 200 ms") && err.contains("cantap canopen scan"),

@@ -106,7 +106,7 @@ fn what_is_no_frame_is_told_in_words() {
         words,
         [
             "bus error: bit (recessive sent)",
-            "controller: error passive",
+            "controller: passive",
             "not sent: arbitration lost",
             "123#11"
         ]

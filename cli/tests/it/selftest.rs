@@ -77,6 +77,63 @@ fn a_loop_that_is_not_there_fails_and_says_what_to_look_at() {
 }
 
 #[test]
+fn its_own_example_passes() {
+    let (_, help, _) = cantap("selftest --help");
+    let example = help.lines().find(|line| line.contains("cantap selftest -d virtual")).unwrap();
+    let line = example.trim().strip_prefix("cantap ").unwrap();
+    let (code, out, _) = cantap(&format!("{line} --load-time 300ms"));
+    assert_eq!(code, Some(0), "{line}: {out}");
+}
+
+#[test]
+fn a_node_that_should_not_be_there_is_named() {
+    let (code, out, _) = cantap("selftest -d virtual:load=0,wire=joined --loop --load-time 100ms");
+    assert_eq!(code, Some(3), "{out}");
+    let step = "FAIL  channel 1 without an acknowledgement: ";
+    let line = out.lines().find_map(|line| line.strip_prefix(step)).unwrap_or_else(|| panic!("{out}"));
+    assert!(line.starts_with("somebody acknowledged: with --loop nothing but the two channels"), "{line}");
+}
+
+/// A report that goes to a file is whole, even if nobody reads the lines any more.
+#[test]
+fn a_reader_that_has_read_enough_ends_the_lines_and_not_the_report() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("board.txt");
+    for (options, is_whole) in [("", false), (&*format!("--report {}", file.display()), true)] {
+        let (reader, writer) = std::io::pipe().unwrap();
+        drop(reader);
+        let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
+        command.args("selftest -d virtual:load=0 --load-time 100ms".split_whitespace());
+        let Output { status, stderr, .. } =
+            command.args(options.split_whitespace()).stdout(writer).output().unwrap();
+        assert_eq!((status.code(), String::from_utf8(stderr).unwrap().as_str()), (Some(0), ""), "{options}");
+        assert_eq!(file.exists(), is_whole);
+    }
+    let report = std::fs::read_to_string(&file).unwrap();
+    assert!(report.contains(" passed, 0 failed, "), "{report}");
+}
+
+#[cfg(unix)]
+#[test]
+fn ctrl_c_ends_it_within_the_step_and_fails_nothing() {
+    use rustix::process::{Pid, Signal, kill_process};
+    use std::io::{BufRead, BufReader};
+
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
+    // The load would outlast this test.
+    command.args("selftest -d virtual:load=0 --load-time 60m".split_whitespace()).stdin(Stdio::null());
+    let mut child = command.stdout(Stdio::piped()).spawn().unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines().map(Result::unwrap);
+    assert!(lines.any(|line| line.contains("  channel 2 transmit queue: ")));
+    kill_process(Pid::from_child(&child), Signal::INT).unwrap();
+    let rest: Vec<String> = lines.collect();
+    assert_eq!(child.wait().unwrap().code(), Some(130), "{rest:#?}");
+    assert_eq!(rest.len(), 3, "{rest:#?}");
+    assert_eq!(rest[0], "skip  both channels saturated, each by itself: Ctrl-C ended it");
+    assert!(rest[2].ends_with("; Ctrl-C ended it, and not all steps were tried"), "{rest:#?}");
+}
+
+#[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn the_emulated_board_passes() {
     let elf = firmware::elf();

@@ -114,21 +114,21 @@ fn the_same_mistake_has_the_same_words_and_exit_code_everywhere() {
         ("stats -d virtual -b 500".to_owned(), "write 500k for 500 kbit/s"),
         (
             "capture -d virtual -b 500k -o x.foo".to_owned(),
-            "the name 'x.foo' does not tell the format; name it with",
+            "the name 'x.foo' does not show the format; name it with",
         ),
-        (format!("convert {TRACE} x.foo"), "the name 'x.foo' does not tell the format"),
+        (format!("convert {TRACE} x.foo"), "the name 'x.foo' does not show the format"),
         (
             format!("search {TRACE} --id 123 -o x.foo"),
-            "cannot write x.foo: the name 'x.foo' does not tell the format",
+            "cannot write x.foo: the name 'x.foo' does not show the format",
         ),
         (
             format!("align {TRACE} {TRACE} -o x.foo"),
-            "cannot write x.foo: the name 'x.foo' does not tell the format",
+            "cannot write x.foo: the name 'x.foo' does not show the format",
         ),
-        ("demo -t 100ms -o x.foo".to_owned(), "the name 'x.foo' does not tell the format"),
+        ("demo -t 100ms -o x.foo".to_owned(), "the name 'x.foo' does not show the format"),
         (
             "monitor -d virtual -b 500k --once -o x.foo".to_owned(),
-            "the name 'x.foo' does not tell the format",
+            "the name 'x.foo' does not show the format",
         ),
         (format!("plot {TRACE} --bus-load -o x.foo"), "'x.foo' names no picture format; let it end in .svg"),
         (format!("decode {TRACE}"), "no database to decode by; give one with --db FILE"),

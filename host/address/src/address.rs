@@ -89,6 +89,23 @@ pub enum LinkError {
     },
 }
 
+/// Why [`open`] gives no device.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum OpenError {
+    /// The text is no address.
+    #[error(transparent)]
+    Address(#[from] AddressError),
+    /// The device cannot be reached.
+    #[error(transparent)]
+    Link(#[from] LinkError),
+}
+
+/// Begins a session with the device at an address: `/dev/ttyACM0`, `virtual:load=50`, `tcp://HOST` and the others.
+pub fn open(address: &str) -> Result<OpenDevice, OpenError> {
+    Ok(address.parse::<Address>()?.open()?)
+}
+
 impl FromStr for Address {
     type Err = AddressError;
 

@@ -8,4 +8,4 @@
 mod address;
 pub mod server;
 
-pub use address::{Address, AddressError, LinkError, OpenDevice};
+pub use address::{Address, AddressError, LinkError, OpenDevice, OpenError, open};

@@ -6,9 +6,7 @@ use arrow_array::ArrayRef;
 use arrow_array::builder::{BooleanBuilder, TimestampNanosecondBuilder, UInt8Builder, UInt32Builder};
 use arrow_array::types::Int8Type;
 use arrow_schema::{DataType, Field, TimeUnit};
-use cantap_trace::names::{BUS_ERRORS, ERROR_STATES, LOSS_STAGES, OVERTAKEN, TRANSMIT_FAILURES, name};
-use cantap_trace::{TraceEvent, TraceRecord};
-use cantap_wire::record::TransmitFailure;
+use cantap_trace::{BusErrorKind, ErrorState, LossStage, TraceEvent, TraceRecord, TransmitFailure};
 
 use crate::texts::Texts;
 
@@ -34,8 +32,8 @@ pub fn fields() -> Vec<Field> {
         Field::new("detail", texts, true),
         Field::new("count", DataType::UInt32, true),
         Field::new("at_least", DataType::Boolean, true),
-        Field::new("tx_errors", DataType::UInt8, true),
-        Field::new("rx_errors", DataType::UInt8, true),
+        Field::new("tec", DataType::UInt8, true),
+        Field::new("rec", DataType::UInt8, true),
         Field::new("tag", DataType::UInt32, true),
     ]
 }
@@ -49,8 +47,8 @@ pub struct Events {
     details: Vec<&'static str>,
     count: UInt32Builder,
     at_least: BooleanBuilder,
-    tx_errors: UInt8Builder,
-    rx_errors: UInt8Builder,
+    tec: UInt8Builder,
+    rec: UInt8Builder,
     tag: UInt32Builder,
     /// Number of the table's own rows at the end for which only time and channel are in the columns so far: there is nothing else to
     /// add for them, and most rows are like that.
@@ -73,9 +71,10 @@ impl Events {
     /// For a table whose own rows are named `own`.
     pub fn new(own: &str) -> Self {
         let mut details = Vec::new();
-        let names = LOSS_STAGES.map(|(_, name)| name).into_iter();
-        let names = names.chain(BUS_ERRORS.map(|(_, name)| name)).chain(ERROR_STATES.map(|(_, name)| name));
-        for name in names.chain(TRANSMIT_FAILURES.map(|(_, name)| name)).chain([OVERTAKEN]) {
+        let names =
+            LossStage::ALL.map(LossStage::name).into_iter().chain(BusErrorKind::ALL.map(BusErrorKind::name));
+        let names = names.chain(ErrorState::ALL.map(ErrorState::name));
+        for name in names.chain(TransmitFailure::ALL.map(TransmitFailure::name)) {
             if !details.contains(&name) {
                 details.push(name);
             }
@@ -88,8 +87,8 @@ impl Events {
             details,
             count: UInt32Builder::new(),
             at_least: BooleanBuilder::new(),
-            tx_errors: UInt8Builder::new(),
-            rx_errors: UInt8Builder::new(),
+            tec: UInt8Builder::new(),
+            rec: UInt8Builder::new(),
             tag: UInt32Builder::new(),
             plain: 0,
         }
@@ -120,8 +119,8 @@ impl Events {
         self.detail.push_none(rows);
         self.count.append_nulls(rows);
         self.at_least.append_nulls(rows);
-        self.tx_errors.append_nulls(rows);
-        self.rx_errors.append_nulls(rows);
+        self.tec.append_nulls(rows);
+        self.rec.append_nulls(rows);
         self.tag.append_nulls(rows);
     }
 
@@ -136,8 +135,8 @@ impl Events {
         self.detail.push_option(detail);
         self.count.append_option(said.count);
         self.at_least.append_option(said.at_least);
-        self.tx_errors.append_option(said.counters.map(|(tx, _)| tx));
-        self.rx_errors.append_option(said.counters.map(|(_, rx)| rx));
+        self.tec.append_option(said.counters.map(|(tx, _)| tx));
+        self.rec.append_option(said.counters.map(|(_, rx)| rx));
         self.tag.append_option(said.tag);
     }
 
@@ -151,8 +150,8 @@ impl Events {
             self.detail.take(),
             Arc::new(self.count.finish()),
             Arc::new(self.at_least.finish()),
-            Arc::new(self.tx_errors.finish()),
-            Arc::new(self.rx_errors.finish()),
+            Arc::new(self.tec.finish()),
+            Arc::new(self.rec.finish()),
             Arc::new(self.tag.finish()),
         ]
     }
@@ -165,32 +164,29 @@ impl Said {
             TraceEvent::Frame { .. } => Self::default(),
             TraceEvent::Lost { stage, count, at_least } => Self {
                 event: kind(LOST),
-                detail: stage.map(|stage| name(&LOSS_STAGES, &stage)),
+                detail: stage.map(LossStage::name),
                 count: Some(count),
                 at_least: Some(at_least),
                 ..Self::default()
             },
             TraceEvent::BusError { kind: error, counters } => Self {
                 event: kind(BUS_ERROR),
-                detail: error.map(|error| name(&BUS_ERRORS, &error)),
+                detail: error.map(BusErrorKind::name),
                 counters,
                 ..Self::default()
             },
             TraceEvent::ErrorsSuppressed { count } => {
                 Self { event: kind(SUPPRESSED), count: Some(count), ..Self::default() }
             }
-            TraceEvent::State { state, counters } => Self {
-                event: kind(STATE),
-                detail: Some(name(&ERROR_STATES, &state)),
-                counters,
-                ..Self::default()
-            },
+            TraceEvent::State { state, counters } => {
+                Self { event: kind(STATE), detail: Some(state.name()), counters, ..Self::default() }
+            }
             TraceEvent::TransmitFailed { tag, reason } => {
-                let (detail, count) = match reason {
-                    TransmitFailure::Overtaken { periods } => (OVERTAKEN, Some(periods)),
-                    _ => (name(&TRANSMIT_FAILURES, &reason), None),
+                let count = match reason {
+                    TransmitFailure::Overtaken { periods } => Some(periods),
+                    _ => None,
                 };
-                let (detail, tag) = (Some(detail), Some(tag));
+                let (detail, tag) = (Some(reason.name()), Some(tag));
                 Self { event: kind(TRANSMIT_FAILED), detail, count, tag, ..Self::default() }
             }
         }

@@ -26,7 +26,7 @@ pub const TX: &str = "tx";
 /// | `detail` | text: where frames were lost, which error, which state, why not sent | events that say it |
 /// | `count` | uint32: frames lost, errors suppressed, periods overtaken | these |
 /// | `at_least` | bool: there may have been more | losses |
-/// | `tx_errors`, `rx_errors` | uint8: the controller's counters | errors and states that say it |
+/// | `tec`, `rec` | uint8: the controller's counters | errors and states that say it |
 /// | `tag` | uint32: the request | frames that were not sent |
 /// | `id` | uint32 | frames |
 /// | `extended`, `remote`, `fd`, `late` | bool; `late`: the frame ended then or earlier | frames |

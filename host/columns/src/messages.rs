@@ -25,8 +25,8 @@ pub struct MessageColumns {
     channel: Vec<u8>,
     id: Vec<u32>,
     signals: Vec<Column>,
-    /// The last rows' frames, which are not in the columns yet: those are made together, when it is known how many there are, for a
-    /// column that grows is copied again and again. So are these, which is why they are kept in blocks.
+    /// Frames that are not in the columns yet. Columns are built once the number of rows is known, because a column that grows is copied again and
+    /// again; for the same reason these frames are kept in blocks.
     full: Vec<Vec<PlainFrame>>,
     full_rows: usize,
     last: Vec<PlainFrame>,

@@ -6,9 +6,10 @@ use arrow_array::types::{
 };
 use arrow_array::{Array, BinaryArray, BooleanArray, PrimitiveArray, RecordBatch, StringArray};
 use arrow_schema::DataType;
-use cantap_trace::names::{BUS_ERRORS, ERROR_STATES, LOSS_STAGES, OVERTAKEN, TRANSMIT_FAILURES, item};
-use cantap_trace::{Direction, FdFrame, Frame, Id, TraceEvent, TraceFrame, TraceRecord};
-use cantap_wire::record::TransmitFailure;
+use cantap_trace::{
+    BusErrorKind, Direction, ErrorState, FdFrame, Frame, Id, LossStage, TraceEvent, TraceFrame, TraceRecord,
+    TransmitFailure,
+};
 
 use crate::bad::BadColumns;
 use crate::events::{BUS_ERROR, LOST, STATE, SUPPRESSED, TRANSMIT_FAILED};
@@ -51,8 +52,8 @@ struct Columns<'a> {
     detail: Text<'a>,
     count: &'a PrimitiveArray<UInt32Type>,
     at_least: &'a BooleanArray,
-    tx_errors: &'a PrimitiveArray<UInt8Type>,
-    rx_errors: &'a PrimitiveArray<UInt8Type>,
+    tec: &'a PrimitiveArray<UInt8Type>,
+    rec: &'a PrimitiveArray<UInt8Type>,
     tag: &'a PrimitiveArray<UInt32Type>,
     id: &'a PrimitiveArray<UInt32Type>,
     extended: &'a BooleanArray,
@@ -135,8 +136,8 @@ impl<'a> Columns<'a> {
             detail: text("detail")?,
             count: typed(batch, "count", "uint32", u32)?,
             at_least: flag("at_least")?,
-            tx_errors: typed(batch, "tx_errors", "uint8", u8)?,
-            rx_errors: typed(batch, "rx_errors", "uint8", u8)?,
+            tec: typed(batch, "tec", "uint8", u8)?,
+            rec: typed(batch, "rec", "uint8", u8)?,
             tag: typed(batch, "tag", "uint32", u32)?,
             id: typed(batch, "id", "uint32", u32)?,
             extended: flag("extended")?,
@@ -165,19 +166,20 @@ impl<'a> Columns<'a> {
             FRAME => self.frame(row)?,
             LOST => {
                 let stage = detail.map(|detail| {
-                    item(&LOSS_STAGES, detail).ok_or("its detail is not a known place of a loss")
+                    LossStage::from_name(detail).ok_or("its detail is not a known place of a loss")
                 });
                 let at_least = self.at_least.is_valid(row) && self.at_least.value(row);
                 TraceEvent::Lost { stage: stage.transpose()?, count: count.unwrap_or(0), at_least }
             }
             BUS_ERROR => {
-                let kind = detail
-                    .map(|detail| item(&BUS_ERRORS, detail).ok_or("its detail is not a known bus error"));
+                let kind = detail.map(|detail| {
+                    BusErrorKind::from_name(detail).ok_or("its detail is not a known bus error")
+                });
                 TraceEvent::BusError { kind: kind.transpose()?, counters: self.counters(row) }
             }
             SUPPRESSED => TraceEvent::ErrorsSuppressed { count: count.unwrap_or(0) },
             STATE => {
-                let state = detail.and_then(|detail| item(&ERROR_STATES, detail));
+                let state = detail.and_then(ErrorState::from_name);
                 TraceEvent::State {
                     state: state.ok_or("its detail is not a known state")?,
                     counters: self.counters(row),
@@ -185,10 +187,13 @@ impl<'a> Columns<'a> {
             }
             TRANSMIT_FAILED => {
                 let tag = if self.tag.is_valid(row) { self.tag.value(row) } else { 0 };
-                let reason = match detail {
-                    Some(OVERTAKEN) => Some(TransmitFailure::Overtaken { periods: count.unwrap_or(1) }),
-                    detail => detail.and_then(|detail| item(&TRANSMIT_FAILURES, detail)),
-                };
+                let overtaken = TransmitFailure::Overtaken { periods: count.unwrap_or(1) };
+                let reason = detail.and_then(|detail| {
+                    if detail == overtaken.name() {
+                        return Some(overtaken);
+                    }
+                    TransmitFailure::from_name(detail, None)
+                });
                 TraceEvent::TransmitFailed { tag, reason: reason.ok_or("its detail is not a known failure")? }
             }
             VALUE => return Err("it is a decoded value; records are what `read` gives without a database"),
@@ -198,8 +203,8 @@ impl<'a> Columns<'a> {
     }
 
     fn counters(&self, row: usize) -> Option<(u8, u8)> {
-        let known = self.tx_errors.is_valid(row) && self.rx_errors.is_valid(row);
-        known.then(|| (self.tx_errors.value(row), self.rx_errors.value(row)))
+        let known = self.tec.is_valid(row) && self.rec.is_valid(row);
+        known.then(|| (self.tec.value(row), self.rec.value(row)))
     }
 
     fn frame(&self, row: usize) -> Result<TraceEvent, &'static str> {

@@ -16,8 +16,8 @@ pub(crate) use decode::{RowDecoder, date};
 pub(crate) use encode::{Cell, Layout, TableEncoder, TableRow};
 pub use style::{DifConvention, LineEnd, TableStyle};
 
+use cantap_can::BusErrorKind;
 use cantap_trace::TraceEvent;
-use cantap_wire::record::BusErrorKind;
 
 /// The names of the columns.
 pub(crate) const COLUMNS: [&str; 23] = [

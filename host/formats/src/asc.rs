@@ -12,7 +12,7 @@ mod others;
 pub(crate) use decode::Decoder;
 pub(crate) use encode::Encoder;
 
-use cantap_wire::record::ErrorState;
+use cantap_can::ErrorState;
 
 // Flags at the end of an event on a CAN FD channel.
 const REMOTE: u32 = 1 << 4;

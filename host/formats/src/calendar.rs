@@ -1,7 +1,11 @@
 //! Dates in the headers of trace files. All are taken as UTC: the formats do not name a time zone, and a file
 //! must mean the same on every machine.
 
+use jiff::{ToSpan, civil};
+
 use super::text::NS_PER_S;
+
+const EPOCH: civil::Date = civil::date(1970, 1, 1);
 
 const S_PER_DAY: i64 = 86_400;
 
@@ -35,30 +39,17 @@ pub(crate) struct Date {
 impl Date {
     /// The date of a time since the Unix epoch.
     pub(crate) fn of(time_ns: i64) -> Self {
-        let (days, of_day_ns) = (time_ns.div_euclid(NS_PER_DAY), time_ns.rem_euclid(NS_PER_DAY));
-        // Days since 1 March of year 0: leap days come last. An era has 400 years.
-        let days = days + 719_468;
-        let (era, of_era) = (days.div_euclid(146_097), days.rem_euclid(146_097));
-        let year = (of_era - of_era / 1460 + of_era / 36_524 - of_era / 146_096) / 365;
-        let of_year = of_era - (365 * year + year / 4 - year / 100);
-        let month_from_march = (5 * of_year + 2) / 153;
-        let day = of_year - (153 * month_from_march + 2) / 5 + 1;
-        let month = if month_from_march < 10 { month_from_march + 3 } else { month_from_march - 9 };
-        let year = year + era * 400 + i64::from(month <= 2);
-        Self { year, month: month as u8, day: day as u8, of_day_ns }
+        let date = day_of(time_ns);
+        let (year, month, day) = (date.year().into(), date.month() as u8, date.day() as u8);
+        Self { year, month, day, of_day_ns: time_ns.rem_euclid(NS_PER_DAY) }
     }
 
     /// Nanoseconds since the Unix epoch; `None` if there is no such date or it is out of range.
     pub(crate) fn time_ns(&self) -> Option<i64> {
-        if !(1..=12).contains(&self.month) || !(1..=31).contains(&self.day) || self.year.abs() > 9999 {
-            return None;
-        }
-        let (month, day) = (i64::from(self.month), i64::from(self.day));
-        let year = self.year - i64::from(month <= 2);
-        let (era, of_era) = (year.div_euclid(400), year.rem_euclid(400));
-        let of_year = (153 * (month + if month > 2 { -3 } else { 9 }) + 2) / 5 + day - 1;
-        let days = era * 146_097 + of_era * 365 + of_era / 4 - of_era / 100 + of_year - 719_468;
-        days.checked_mul(NS_PER_DAY)?.checked_add(self.of_day_ns)
+        let (year, month, day) = (self.year.try_into().ok()?, self.month as i8, self.day as i8);
+        let date = civil::Date::new(year, month, day).ok()?;
+        let days = EPOCH.until(date).ok()?.get_days();
+        i64::from(days).checked_mul(NS_PER_DAY)?.checked_add(self.of_day_ns)
     }
 
     /// Hour, minute, second and remaining nanoseconds.
@@ -76,9 +67,13 @@ impl Date {
 
     /// 0 is Sunday.
     pub(crate) fn weekday(time_ns: i64) -> usize {
-        // 1 January 1970 was a Thursday.
-        (time_ns.div_euclid(NS_PER_DAY) + 4).rem_euclid(7) as usize
+        day_of(time_ns).weekday().to_sunday_zero_offset() as usize
     }
+}
+
+/// The day of a time since the Unix epoch. All that fit into 64 bits are between the years 1677 and 2262.
+fn day_of(time_ns: i64) -> civil::Date {
+    EPOCH.saturating_add(time_ns.div_euclid(NS_PER_DAY).days())
 }
 
 /// The start in a file's header for a trace beginning at `first_ns`: in whole milliseconds, the formats'
@@ -105,7 +100,10 @@ mod tests {
             Date { year: 1899, month: 12, day: 30, of_day_ns: 0 }.time_ns(),
             Some(-25_569 * NS_PER_DAY)
         );
-        assert_eq!(Date { year: 2024, month: 13, day: 1, of_day_ns: 0 }.time_ns(), None);
+        for (month, day) in [(13, 1), (0, 1), (2, 30), (4, 31), (1, 0)] {
+            assert_eq!(Date { year: 2024, month, day, of_day_ns: 0 }.time_ns(), None, "{month}-{day}");
+        }
+        assert_eq!(Date { year: 1 << 40, month: 1, day: 1, of_day_ns: 0 }.time_ns(), None);
     }
 
     proptest! {

@@ -5,9 +5,7 @@
 use std::fmt;
 use std::str::FromStr;
 
-use cantap_trace::TraceEvent;
-use cantap_trace::names::{BUS_ERRORS, ERROR_STATES, LOSS_STAGES, OVERTAKEN, TRANSMIT_FAILURES, item, name};
-use cantap_wire::record::TransmitFailure;
+use cantap_trace::{BusErrorKind, ErrorState, LossStage, TraceEvent, TransmitFailure};
 
 /// Marks such a text in a comment.
 pub(crate) const MARK: &str = "cantap: ";
@@ -23,23 +21,23 @@ impl fmt::Display for EventText {
             TraceEvent::Lost { stage, count, at_least } => {
                 write!(f, "lost {count}{}", if *at_least { "+" } else { "" })?;
                 if let Some(stage) = stage {
-                    write!(f, " {}", name(&LOSS_STAGES, stage))?;
+                    write!(f, " {}", stage.name())?;
                 }
             }
             TraceEvent::BusError { kind, .. } => {
                 f.write_str("bus-error")?;
                 if let Some(kind) = kind {
-                    write!(f, " {}", name(&BUS_ERRORS, kind))?;
+                    write!(f, " {}", kind.name())?;
                 }
             }
             TraceEvent::ErrorsSuppressed { count } => write!(f, "errors-suppressed {count}")?,
-            TraceEvent::State { state, .. } => write!(f, "state {}", name(&ERROR_STATES, state))?,
-            TraceEvent::TransmitFailed { tag, reason } => match reason {
-                TransmitFailure::Overtaken { periods } => {
-                    write!(f, "transmit-failed {OVERTAKEN} tag={tag} periods={periods}")?;
+            TraceEvent::State { state, .. } => write!(f, "state {}", state.name())?,
+            TraceEvent::TransmitFailed { tag, reason } => {
+                write!(f, "transmit-failed {} tag={tag}", reason.name())?;
+                if let TransmitFailure::Overtaken { periods } = reason {
+                    write!(f, " periods={periods}")?;
                 }
-                _ => write!(f, "transmit-failed {} tag={tag}", name(&TRANSMIT_FAILURES, reason))?,
-            },
+            }
         }
         if let TraceEvent::BusError { counters: Some((tec, rec)), .. }
         | TraceEvent::State { counters: Some((tec, rec)), .. } = &self.0
@@ -84,24 +82,23 @@ fn parse(text: &str) -> Option<TraceEvent> {
                 None => (count, false),
             };
             let stage = match stage {
-                Some(stage) => Some(item(&LOSS_STAGES, stage)?),
+                Some(stage) => Some(LossStage::from_name(stage)?),
                 None => None,
             };
             TraceEvent::Lost { stage, count: count.parse().ok()?, at_least }
         }
         ("bus-error", [None, None]) => TraceEvent::BusError { kind: None, counters },
         ("bus-error", [Some(kind), None]) => {
-            TraceEvent::BusError { kind: Some(item(&BUS_ERRORS, kind)?), counters }
+            TraceEvent::BusError { kind: Some(BusErrorKind::from_name(kind)?), counters }
         }
         ("errors-suppressed", [Some(count), None]) => {
             TraceEvent::ErrorsSuppressed { count: count.parse().ok()? }
         }
-        ("state", [Some(state), None]) => TraceEvent::State { state: item(&ERROR_STATES, state)?, counters },
-        ("transmit-failed", [Some(OVERTAKEN), None]) => {
-            TraceEvent::TransmitFailed { tag: tag?, reason: TransmitFailure::Overtaken { periods: periods? } }
+        ("state", [Some(state), None]) => {
+            TraceEvent::State { state: ErrorState::from_name(state)?, counters }
         }
         ("transmit-failed", [Some(reason), None]) => {
-            TraceEvent::TransmitFailed { tag: tag?, reason: item(&TRANSMIT_FAILURES, reason)? }
+            TraceEvent::TransmitFailed { tag: tag?, reason: TransmitFailure::from_name(reason, periods)? }
         }
         _ => return None,
     })

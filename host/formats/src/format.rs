@@ -96,7 +96,7 @@ pub enum UnknownFormat {
     #[error("'{0}' is not a trace format; the formats are {known}", known = Format::names())]
     Name(String),
     /// A file's suffix does not name a format.
-    #[error("the name '{0}' does not tell the format")]
+    #[error("the name '{0}' does not show the format")]
     Suffix(String),
 }
 

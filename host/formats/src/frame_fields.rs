@@ -1,6 +1,6 @@
 //! Turns the fields of a row into an event, for the formats with an identifier, a length and bytes side by side.
 
-use cantap_wire::{Frame, Id};
+use cantap_can::{Frame, Id};
 
 use super::issue::Fault;
 use super::text;

@@ -21,7 +21,7 @@ pub(crate) use decode::Decoder;
 pub(crate) use encode::COUNTS_UNTOLD;
 pub(crate) use encode::Encoder;
 
-use cantap_wire::record::BusErrorKind;
+use cantap_can::BusErrorKind;
 
 /// The first bytes of a file, finished or not.
 pub(crate) const FILE_MAGIC: &[u8] = b"MDF     ";

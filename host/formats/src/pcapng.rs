@@ -61,9 +61,9 @@ mod tests {
     use super::super::tests;
     use super::{ISB_IFDROP, ISB_IFRECV, ISB_USRDELIV, STATISTICS};
     use crate::{ChannelInfo, Format, ReadOptions, TraceReader, WriteOptions, create_stream_writer};
+    use cantap_can::LossStage;
     use cantap_trace::testing::{data_record, record_or_fd};
     use cantap_trace::{Direction, TraceEvent, TraceRecord};
-    use cantap_wire::record::LossStage;
     use proptest::prelude::*;
 
     proptest! {

@@ -1,7 +1,7 @@
 //! The error code capture register of Philips' SJA1000 controller (product specification of 2000-01-04, section 6.4.9 with
 //! table 21): in this form, Vector's and PEAK's files give the kind of a bus error.
 
-use cantap_wire::record::BusErrorKind;
+use cantap_can::BusErrorKind;
 
 /// The two upper bits: kind. Bit 5 is set while receiving. The lower five: the segment of the frame.
 const KIND_SHIFT: u32 = 6;

@@ -1,7 +1,7 @@
 //! Linux's CAN frames as packets of a capture: directly (link type 227), or after the header of a capture of the "any"
 //! interface (113 and 276, `tcpdump -i any`).
 
-use cantap_wire::{Frame, Id};
+use cantap_can::{Frame, Id};
 
 use super::error_frames::ErrorFrames;
 use super::issue::Fault;

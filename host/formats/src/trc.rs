@@ -10,7 +10,7 @@ mod encode;
 pub(crate) use decode::Decoder;
 pub(crate) use encode::Encoder;
 
-use cantap_wire::record::{BusErrorKind, ErrorState, LossStage};
+use cantap_can::{BusErrorKind, ErrorState, LossStage};
 
 use super::sja1000;
 use cantap_trace::TraceEvent;
@@ -143,9 +143,9 @@ mod tests {
     use super::super::tests;
     use super::*;
     use crate::{Format, LeftOut, WriteOptions};
+    use cantap_can::Frame;
     use cantap_trace::testing::record_or_fd;
     use cantap_trace::{Direction, TraceFrame, TraceRecord};
-    use cantap_wire::Frame;
     use proptest::prelude::*;
 
     const VERSIONS: [TrcVersion; 6] = [

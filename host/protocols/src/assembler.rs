@@ -1,8 +1,8 @@
 //! The interface of every protocol.
 
+use cantap_can::ErrorState;
 use cantap_trace::TraceEvent;
 use cantap_trace::TraceRecord;
-use cantap_wire::record::ErrorState;
 
 use crate::{Event, Party, Protocol};
 

@@ -2,8 +2,8 @@
 
 use std::fmt::Write as _;
 
+use cantap_can::LossStage;
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
-use cantap_wire::record::LossStage;
 
 use crate::{Assembler, Event};
 

@@ -7,7 +7,7 @@ mod containers;
 
 use std::collections::{HashMap, HashSet};
 
-use cantap_wire::Id;
+use cantap_can::Id;
 use roxmltree::{Document, Node};
 
 use super::container::Container;

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use cantap_wire::Id;
+use cantap_can::Id;
 
 use super::fault::{DatabaseError, Fault, FaultKind};
 use super::xml;

@@ -8,7 +8,7 @@ use std::collections::HashSet;
 use std::ops::Range;
 
 use can_dbc::{Dbc, DbcError};
-use cantap_wire::Id;
+use cantap_can::Id;
 use pest::error::{ErrorVariant, LineColLocation};
 
 use super::dbc_text::{Index, Statement};

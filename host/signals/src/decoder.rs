@@ -2,8 +2,8 @@
 
 use std::collections::HashMap;
 
+use cantap_can::Id;
 use cantap_trace::TraceFrame;
-use cantap_wire::Id;
 use rustc_hash::FxHashMap;
 
 use super::container::NotDecoded;

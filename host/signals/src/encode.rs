@@ -6,7 +6,7 @@ mod value;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use cantap_wire::Frame;
+use cantap_can::Frame;
 
 use super::decoder::{Decoder, MessageRef};
 use super::fault::MAX_SWITCHES;

@@ -5,7 +5,7 @@
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 
-use cantap_wire::Id;
+use cantap_can::Id;
 use serde::Deserialize;
 use toml::Spanned;
 

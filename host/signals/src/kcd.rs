@@ -3,7 +3,7 @@
 //! For big-endian signals, a bit offset counts from the highest bit of the first byte. The file does not say which of its buses a
 //! channel is.
 
-use cantap_wire::Id;
+use cantap_can::Id;
 use roxmltree::{Document, Node};
 
 use super::fault::{DatabaseError, Fault, FaultKind};

@@ -27,6 +27,7 @@ mod model;
 mod number;
 mod picture;
 mod plan;
+mod reading;
 mod scale;
 pub mod search;
 mod select;
@@ -48,6 +49,7 @@ pub use model::{
 };
 pub use number::Number;
 pub use plan::{MessageRows, SignalRows, SignalValue};
+pub use reading::Reading;
 pub use select::{Selection, SelectionError, Suggestion};
 
 /// Reads a database, by its suffix: `.dbc`, `.kcd`, `.sym`, `.arxml`, or `.toml` for cantap's own signal file. For a KCD or ARXML

@@ -5,7 +5,7 @@ use std::fmt;
 use std::ops::RangeInclusive;
 use std::str::FromStr;
 
-use cantap_wire::Id;
+use cantap_can::Id;
 
 use super::clean;
 use super::container::{Container, InPdu};
@@ -42,7 +42,7 @@ pub struct Message {
     pub cycle_ms: Option<u32>,
     /// Whether it is a J1939 parameter group: priority and source address are ignored when matching.
     pub j1939: bool,
-    /// What of it says anew in each frame which PDUs are in it, if something does.
+    /// Its part that holds PDUs, if each frame says itself which PDUs it contains.
     pub container: Option<Container>,
     /// Its signals, in the file's order.
     pub signals: Vec<Signal>,

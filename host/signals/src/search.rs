@@ -3,7 +3,7 @@
 use std::fmt;
 use std::str::FromStr;
 
-use cantap_wire::Id;
+use cantap_can::Id;
 
 use crate::condition::Condition;
 use cantap_trace::{TraceFrame, TraceRecord};

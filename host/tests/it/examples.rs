@@ -42,7 +42,7 @@ fn a_capture_has_every_frame_of_both_channels_in_its_file() {
 fn signals_are_shown_as_they_were_sent() {
     let device = virtual_device(&format!("bitrate=500k,log={LOG}"));
     let last = live_signals::show(&device, 40).unwrap();
-    assert_eq!(last, "Speed 98 km/h, EngineSpeed 2850 rpm, Ignition on");
+    assert_eq!(last, "Speed = 98 km/h, EngineSpeed = 2850 rpm, Ignition = 1 (on)");
 }
 
 #[test]

@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 
-use cantap_wire::Id;
+use cantap_can::Id;
 
 use crate::fd::FD_MAX_BYTES;
 use crate::{TraceFrame, TraceRecord};

@@ -208,7 +208,7 @@ impl fmt::Display for Filter {
 mod tests {
     use super::*;
     use crate::Direction;
-    use cantap_wire::record::{BusErrorKind, ErrorState};
+    use cantap_can::{BusErrorKind, ErrorState};
 
     fn accepts(filter: &str, frame: &str) -> bool {
         filter.parse::<Filter>().unwrap().accepts_frame(&frame.parse().unwrap())

@@ -14,7 +14,6 @@ mod frame;
 mod interface;
 mod length;
 pub mod levels;
-pub mod names;
 mod plain;
 pub mod playback;
 mod record;
@@ -22,8 +21,9 @@ pub mod socketcan;
 #[cfg(any(test, feature = "proptest"))]
 pub mod testing;
 
-pub use cantap_can::{Frame, FrameBits, Id, bits, bits_on_bus};
-pub use cantap_wire::Channel;
+pub use cantap_can::{
+    BusErrorKind, Channel, ErrorState, Frame, FrameBits, Id, LossStage, TransmitFailure, bits, bits_on_bus,
+};
 pub use fd::FdFrame;
 pub use fd_bits::FdBits;
 pub use frame::{ParseTraceFrameError, TraceFrame};

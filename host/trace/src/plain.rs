@@ -1,6 +1,6 @@
 //! Data frames in a form for programs that go through millions of them and look at identifier and bytes alone.
 
-use cantap_wire::Id;
+use cantap_can::Id;
 
 use crate::{TraceFrame, TraceRecord};
 

@@ -1,6 +1,6 @@
 //! One entry of a trace, wherever it comes from: a live device, a file, a simulated bus.
 
-use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
+use cantap_can::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 
 use crate::TraceFrame;
 

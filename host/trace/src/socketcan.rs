@@ -5,8 +5,7 @@
 //! Information without a place in SocketCAN (how many frames were lost, and where) goes into bytes that the
 //! classes in use leave free, so other programs see an ordinary error frame of the right class.
 
-use cantap_wire::message::DEVICE_TAG;
-use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
+use cantap_can::{BusErrorKind, DEVICE_TAG, ErrorState, LossStage, TransmitFailure};
 
 use crate::TraceEvent;
 

@@ -1,8 +1,7 @@
 //! Records for tests: random ones, and simple numbered ones.
 
-use cantap_wire::message::DEVICE_TAG;
-use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
-use cantap_wire::{Frame, Id};
+use cantap_can::{BusErrorKind, DEVICE_TAG, ErrorState, LossStage, TransmitFailure};
+use cantap_can::{Frame, Id};
 use proptest::prelude::*;
 
 use crate::fd::FD_LENGTHS;
@@ -31,33 +30,24 @@ pub fn fd_frame() -> impl Strategy<Value = FdFrame> {
 
 /// Any event but a frame.
 pub fn event() -> impl Strategy<Value = TraceEvent> {
-    use BusErrorKind as Kind;
-    let kinds =
-        [Kind::Stuff, Kind::Form, Kind::Acknowledgment, Kind::BitRecessive, Kind::BitDominant, Kind::Crc];
-    let stages = [LossStage::Controller, LossStage::Queue, LossStage::Link, LossStage::Host];
-    let states = [ErrorState::Active, ErrorState::Warning, ErrorState::Passive, ErrorState::BusOff];
-    let reasons = [
-        TransmitFailure::ArbitrationLost,
-        TransmitFailure::BusError,
-        TransmitFailure::Aborted,
-        TransmitFailure::Closed,
-        TransmitFailure::BusOff,
-    ];
+    let reasons = TransmitFailure::ALL
+        .into_iter()
+        .filter(|reason| !matches!(reason, TransmitFailure::Overtaken { .. }));
     // Only the device's own frames are overtaken.
     let overtaken = (DEVICE_TAG..=u32::MAX, any::<u32>()).prop_map(|(tag, periods)| {
         TraceEvent::TransmitFailed { tag, reason: TransmitFailure::Overtaken { periods } }
     });
     let counters = prop::option::of(any::<(u8, u8)>());
     prop_oneof![
-        (prop::option::of(prop::sample::select(stages.to_vec())), 1..=u32::MAX, any::<bool>())
+        (prop::option::of(prop::sample::select(LossStage::ALL.to_vec())), 1..=u32::MAX, any::<bool>())
             .prop_map(|(stage, count, at_least)| TraceEvent::Lost { stage, count, at_least }),
         Just(TraceEvent::GAP),
-        (prop::option::of(prop::sample::select(kinds.to_vec())), counters.clone())
+        (prop::option::of(prop::sample::select(BusErrorKind::ALL.to_vec())), counters.clone())
             .prop_map(|(kind, counters)| TraceEvent::BusError { kind, counters }),
         (1..=u32::MAX).prop_map(|count| TraceEvent::ErrorsSuppressed { count }),
-        (prop::sample::select(states.to_vec()), counters)
+        (prop::sample::select(ErrorState::ALL.to_vec()), counters)
             .prop_map(|(state, counters)| TraceEvent::State { state, counters }),
-        (any::<u32>(), prop::sample::select(reasons.to_vec()))
+        (any::<u32>(), prop::sample::select(reasons.collect::<Vec<_>>()))
             .prop_map(|(tag, reason)| TraceEvent::TransmitFailed { tag, reason }),
         overtaken,
     ]

@@ -6,7 +6,7 @@ use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
 /// The exit code that shells report for a program ended by Ctrl-C.
-const ENDED_BY_SIGNAL: i32 = 130;
+pub const ENDED_BY_SIGNAL: u8 = 130;
 /// A second signal this soon after the first is the same request: `timeout` and some shells signal the program and then
 /// its whole process group.
 const ECHO: Duration = Duration::from_secs(2);
@@ -56,7 +56,7 @@ fn handle() -> Result<(), ctrlc::Error> {
             for path in state.unfinished.drain(..) {
                 let _ = std::fs::remove_file(path);
             }
-            std::process::exit(ENDED_BY_SIGNAL);
+            std::process::exit(ENDED_BY_SIGNAL.into());
         }
     })
 }

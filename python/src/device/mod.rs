@@ -15,7 +15,7 @@ use cantap::wire::message::{ChannelConfig, Mode};
 use cantap::wire::{BitTiming, Channel};
 use cantap::{DeviceError as DeviceFault, Frame as ClassicFrame};
 use cantap_trace::filter::Filter;
-use cantap_trace::names::{BUS_ERRORS, ERROR_STATES, name};
+use cantap_trace::{BusErrorKind, TransmitFailure};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -26,17 +26,10 @@ use self::records::{Records, SLICE};
 use self::session::Session;
 use self::tasks::{PeriodicFrame, Reply};
 use crate::error::{DeviceError, Error};
-use crate::frame::{AnyFrame, failure};
+use crate::frame::AnyFrame;
 use crate::number::{OfDevice, Whole, entry};
 use crate::report::from_json;
 
-/// Modes by name.
-const MODES: [(Mode, &str); 4] = [
-    (Mode::ListenOnly, "listen-only"),
-    (Mode::Normal, "normal"),
-    (Mode::Loopback, "loopback"),
-    (Mode::SilentLoopback, "silent-loopback"),
-];
 /// A frame that has not ended after this time will not end on its own.
 const MOST_TIME: Duration = Duration::from_hours(24);
 
@@ -97,7 +90,7 @@ pub fn signals() -> Result<(), Error> {
 
 /// The error for a frame that was not sent.
 fn not_sent(end: &Transmission, frame: &ClassicFrame) -> Error {
-    let reason = end.result.err().map_or("", failure);
+    let reason = end.result.err().map_or("", TransmitFailure::name);
     Error::Address(format!("{frame} was not sent on channel {}: {reason}", end.channel.number()))
 }
 
@@ -179,8 +172,7 @@ impl Device {
         let session = self.session()?;
         let opened = py.detach(|| -> Result<_, Error> {
             let device = session.device()?;
-            let found = MODES.iter().find(|(_, name)| *name == options.mode);
-            let Some((mode, _)) = found else {
+            let Some(mode) = Mode::from_name(&options.mode) else {
                 let words = format!(
                     "'{}' is not a mode; there are listen-only, normal, loopback and silent-loopback",
                     options.mode
@@ -211,7 +203,7 @@ impl Device {
                 )));
             };
             let config = ChannelConfig {
-                mode: *mode,
+                mode,
                 one_shot: options.one_shot,
                 manual_recovery: options.manual_recovery,
                 ..ChannelConfig::listen_only(timing)
@@ -236,7 +228,7 @@ impl Device {
         for (channel, config) in device.open_channels() {
             let about = PyDict::new(py);
             about.set_item("bitrate", config.timing.bitrate_bps(device.hello().can_clock_hz))?;
-            about.set_item("mode", name(&MODES, &config.mode))?;
+            about.set_item("mode", config.mode.name())?;
             open.set_item(channel.number(), about)?;
         }
         Ok(open)
@@ -356,11 +348,11 @@ impl Device {
             json!({
                 "channel": channel.number(),
                 "is_open": state.open.is_some(),
-                "mode": state.open.map(|config| name(&MODES, &config.mode)),
-                "state": name(&ERROR_STATES, &state.state),
-                "tx_errors": state.tec,
-                "rx_errors": state.rec,
-                "last_error": state.last_error.map(|kind| name(&BUS_ERRORS, &kind)),
+                "mode": state.open.map(|config| config.mode.name()),
+                "state": state.state.name(),
+                "tec": state.tec,
+                "rec": state.rec,
+                "last_error": state.last_error.map(BusErrorKind::name),
                 "frames": state.frames,
                 "lost_controller": state.lost_controller,
                 "lost_queue": state.lost_queue,

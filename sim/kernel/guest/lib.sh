@@ -141,24 +141,76 @@ has_told() { grep -q "$1" capture.err; }
 # survived: the capture has reported that the device went away and came back, and ends as if nothing had happened.
 survived() {
   wait_until has_told "continues when the device is back" &&
-    wait_until has_told "the device is back after" &&
+    wait_until has_told "the device is back after" && sleep 0.3 &&
     kill -INT "$CAPTURE" && ended 0 && return
   kill -9 "$CAPTURE" 2> /dev/null
   cat capture.err
   return 1
 }
 
-# exact NAME: the capture holds every frame that the controllers received, in order, and there are many.
+# delivered N: the frames of channel N in the capture.
+delivered() { awk -v name=can$(($1 - 1)) '$2 == name { print $3 }' capture.log; }
+
+# stamps N: the times of channel N in the capture, against those of the frames on the bus: how many are not as far from the one before as they
+# should be, and the worst, in us. A stamp is late by the latency of an interrupt, which differs; a capture has whole microseconds; and the
+# clock may be moved towards UTC by 100 ppm (docs/architecture.md).
+stamps() {
+  awk -v name=can$(($1 - 1)) -v books="/share/capture.stamps$1" '
+    $2 == name {
+      split(substr($1, 2), part, ".")
+      if (!n++) first = part[1]
+      # Busybox takes digits after a zero for octal ones.
+      us = (part[1] - first) * 1e6 + ("1" part[2]) - 1e6
+      if ((getline valid < books) <= 0) { off++; next }
+      valid /= 1000
+      if (n > 1) {
+        error = (us - before) - (valid - was)
+        if (error < 0) error = -error
+        if (error > worst) worst = error
+        if (error > 4 + (valid - was) * 1e-4) off++
+      }
+      before = us
+      was = valid
+    }
+    END { printf "%d %.1f\n", off, worst }' capture.log
+}
+
+# exact NAME: the capture holds every frame that both controllers received, in order, and there are many; and their times are those of the bus.
 exact() {
   board dump capture
   _bad=0
   for _n in 1 2; do
-    awk -v name=can$((_n - 1)) '$2 == name { print $3 }' capture.log > got$_n
-    cmp -s got$_n /share/capture.taken$_n || _bad=1
+    delivered $_n > got$_n
+    cmp -s got$_n /share/capture.taken$_n && [ "$(wc -l < got$_n)" -gt 50 ] || _bad=1
+    stamps $_n > stamps$_n
+    [ "$(cut -d' ' -f1 stamps$_n)" = 0 ] || _bad=1
   done
-  [ "$(wc -l < got1)" -gt 50 ] || _bad=1
-  verdict $_bad "$1" "$(wc -l < got1) + $(wc -l < got2) frames"
-  [ $_bad = 0 ] || { wc -l /share/capture.taken?; cat capture.json capture.err; }
+  verdict $_bad "$1" "$(wc -l < got1) + $(wc -l < got2) frames, $(cut -d' ' -f1 stamps1) + $(cut -d' ' -f1 stamps2) stamps off, $(cut -d' ' -f2 stamps1) and $(cut -d' ' -f2 stamps2) us at most"
+  [ $_bad = 0 ] || { wc -l /share/capture.taken?; cp capture.log /share; cat capture.json capture.err; }
+}
+
+# holes N: at how many places the capture lacks frames that channel N's controller received; "disorder" if it has others. Error frames, which say
+# so, are not among them.
+holes() {
+  delivered "$1" | grep -v '^2[0-9A-F]\{7\}#' | awk '
+    NR == FNR { got[++n] = $0; next }
+    i < n && $0 == got[i + 1] { i++; hole = 0; next }
+    !hole { holes++; hole = 1 }
+    END { print (i < n) ? "disorder" : holes + 0 }' - "/share/capture.taken$1"
+}
+
+# gap_is_told: the capture went through one absence of the device: each channel's frames are there in order, up to some point and from another on,
+# and the summary has the gap.
+gap_is_told() {
+  board dump capture
+  for _n in 1 2; do
+    _holes=$(holes $_n)
+    case $_holes in
+      0 | 1) ;;
+      *) echo "channel $_n: $_holes holes, $(delivered $_n | wc -l) of $(wc -l < /share/capture.taken$_n)"; return 1 ;;
+    esac
+  done
+  grep -q '"gaps":{"count":1,' capture.json && delivered 1 | grep -q '^2[0-9A-F]\{7\}#' || { cat capture.json; return 1; }
 }
 
 # capture_is_exact NAME [SECONDS]: a complete capture from beginning to end.

@@ -11,7 +11,7 @@ use super::exported::Exported;
 use super::urbs::Urbs;
 use crate::rig::MS;
 use crate::run::DEFAULT_BITRATE_BPS;
-use cantap_emu::bus::{BitTime, Member, Node, Source};
+use cantap_emu::bus::{BitTime, BusFrame, Member, Node, Source};
 use cantap_emu::elf::Image;
 use cantap_emu::machine::Machine;
 use cantap_emu::memory_map as map;
@@ -50,6 +50,15 @@ impl Source for First {
     }
 }
 
+/// A frame that a controller received or sent.
+#[derive(Clone, Copy, Debug)]
+pub struct Crossed {
+    /// The frame.
+    pub frame: Frame,
+    /// When its receivers took it, in core cycles.
+    pub valid: u64,
+}
+
 /// All counters, since the board was made or since a mark.
 #[derive(Clone, Copy, Debug)]
 pub struct Figures {
@@ -82,8 +91,8 @@ pub struct Board {
     /// Cycles per bit of each open channel.
     open: [Option<u64>; CHANNELS],
     openings: [u64; CHANNELS],
-    taken: [Vec<Frame>; CHANNELS],
-    sent: [Vec<Frame>; CHANNELS],
+    taken: [Vec<Crossed>; CHANNELS],
+    sent: [Vec<Crossed>; CHANNELS],
     computing: Duration,
     starving: Duration,
     marked: Figures,
@@ -163,12 +172,13 @@ impl Board {
 
     fn keep_books(&mut self) {
         for (n, wire) in self.machine.board().wires.iter_mut().enumerate() {
-            for crossed in wire.take_history() {
-                if crossed.taken_by >> n & 1 != 0 {
-                    self.taken[n].push(crossed.frame);
+            for BusFrame { frame, valid, taken_by, sender, error, .. } in wire.take_history() {
+                let crossed = Crossed { frame, valid };
+                if taken_by >> n & 1 != 0 {
+                    self.taken[n].push(crossed);
                 }
-                if crossed.sender == Member::Controller(n) && crossed.error.is_none() {
-                    self.sent[n].push(crossed.frame);
+                if sender == Member::Controller(n) && error.is_none() {
+                    self.sent[n].push(crossed);
                 }
             }
         }
@@ -235,7 +245,7 @@ impl Board {
     }
 
     /// The frames that a channel's controller has received, and those it has sent, since the mark.
-    pub fn books(&self, n: usize) -> (&[Frame], &[Frame]) {
+    pub fn books(&self, n: usize) -> (&[Crossed], &[Crossed]) {
         (&self.taken[n], &self.sent[n])
     }
 

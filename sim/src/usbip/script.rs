@@ -7,8 +7,8 @@ use std::path::Path;
 use cantap_wire::{CHANNELS, Frame};
 use serde_json::json;
 
-use super::board::{Board, BusLoad};
-use crate::CYCLES_PER_SECOND;
+use super::board::{Board, BusLoad, Crossed};
+use crate::{CYCLES_PER_SECOND, CYCLES_PER_US};
 use cantap_emu::traffic::Kind;
 use cantap_emu::usb_host::Request;
 
@@ -76,7 +76,8 @@ pub fn obey(line: &str, board: &mut Board, folder: &Path) -> Result<Wish, String
         ["resume"] => board.with_host(cantap_emu::usb_host::UsbHost::resume),
         ["redirect"] => return Ok(Wish::Redirect),
         ["unplug"] => return Ok(Wish::Unplug),
-        // Writes what each controller received and sent, as FOLDER/NAME.taken1 and so on.
+        // Writes what each controller received and sent, as FOLDER/NAME.taken1 and so on; NAME.stamps1 has when each of the received
+        // frames was valid, in nanoseconds.
         ["dump", name] => dump(board, folder, name)?,
         ["quit"] => return Ok(Wish::Quit),
         _ => return Err(format!("no such line: {line}")),
@@ -100,8 +101,14 @@ fn index(channel: &str) -> Result<usize, String> {
 fn dump(board: &Board, folder: &Path, name: &str) -> Result<(), String> {
     for n in 0..CHANNELS {
         let (taken, sent) = board.books(n);
-        for (what, frames) in [("taken", taken), ("sent", sent)] {
-            let lines = frames.iter().fold(String::new(), |lines, frame| lines + &frame.to_string() + "\n");
+        let lines = |frames: &[Crossed], line: fn(&Crossed) -> String| {
+            frames.iter().fold(String::new(), |lines, crossed| lines + &line(crossed) + "\n")
+        };
+        let frame = |crossed: &Crossed| crossed.frame.to_string();
+        let stamp = |crossed: &Crossed| (crossed.valid * 1000 / CYCLES_PER_US).to_string();
+        for (what, lines) in
+            [("taken", lines(taken, frame)), ("stamps", lines(taken, stamp)), ("sent", lines(sent, frame))]
+        {
             let path = folder.join(format!("{name}.{what}{}", n + 1));
             fs::write(&path, lines).map_err(|error| format!("{}: {error}", path.display()))?;
         }
@@ -132,6 +139,8 @@ pub fn figures(board: &Board) -> String {
         "out_packets": count(|f| f.usb.out_packets),
         "notifications": count(|f| f.usb.notifications),
         "repeated": count(|f| f.usb.repeated),
+        "thrown_away": count(|f| f.usb.thrown_away),
+        "next_data1": board.with_urbs(|urbs| urbs.next_data1()).map(u8::from),
         "silences": count(|f| f.usb.silences),
         "stalls": count(|f| f.usb.stalls),
         "dropped_handshakes": count(|f| f.usb.dropped_handshakes),

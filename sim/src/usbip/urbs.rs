@@ -124,6 +124,15 @@ impl Urbs {
         self.present
     }
 
+    /// Whether the next packet of bulk IN, and that of bulk OUT, is DATA1.
+    pub fn next_data1(&self) -> [bool; 2] {
+        let next = |input: bool| {
+            let is_it = |pipe: &&Pipe| !pipe.interrupt && (pipe.endpoint.address & 0x80 != 0) == input;
+            self.pipes.iter().find(is_it).is_some_and(|pipe| pipe.data1)
+        };
+        [next(true), next(false)]
+    }
+
     /// Resets of the bus so far.
     pub fn resets(&self) -> u64 {
         self.resets

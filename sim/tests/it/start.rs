@@ -16,7 +16,6 @@ use cantap_sim::board::{self, CLOCK};
 use cantap_sim::rig::{MS, Rig, RigError};
 use cantap_wire::message::{ChannelConfig, Failures};
 use cantap_wire::{Channel, Command, Reply};
-use common::BOARDS;
 
 /// GPIO registers.
 const OSPEEDR: u32 = 0x08;
@@ -42,7 +41,7 @@ fn connected(name: &str, setup: Setup) -> Rig {
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn every_board_starts_behind_the_rom_bootloader() {
-    for (name, hz, _) in BOARDS {
+    for (name, hz, _) in common::boards() {
         let rig = connected(name, behind_the_bootloader(hz));
         let board = rig.machine.board();
         let clocks = board.rcc.clocks();
@@ -141,7 +140,7 @@ fn a_peripheral_is_there_only_some_cycles_after_its_clock_was_switched_on() {
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn edges_of_the_can_tx_pins_are_fast_on_every_board() {
-    for (name, hz, pins) in BOARDS {
+    for (name, hz, pins) in common::boards() {
         let setup = Setup { crystal: crystal(hz), ..board::setup() };
         let mut rig = connected(name, setup);
         rig.run_for(MS).unwrap();

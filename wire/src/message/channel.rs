@@ -18,6 +18,24 @@ pub enum Mode {
 }
 
 impl Mode {
+    /// All of them.
+    pub const ALL: [Self; 4] = [Self::ListenOnly, Self::Normal, Self::Loopback, Self::SilentLoopback];
+
+    /// Its name in texts and JSON, and on command lines.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::ListenOnly => "listen-only",
+            Self::Normal => "normal",
+            Self::Loopback => "loopback",
+            Self::SilentLoopback => "silent-loopback",
+        }
+    }
+
+    /// The mode of that name.
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|mode| mode.name() == name)
+    }
+
     /// Whether frames can be sent in this mode.
     pub const fn transmits(self) -> bool {
         !matches!(self, Mode::ListenOnly)

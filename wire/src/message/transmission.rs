@@ -6,12 +6,11 @@ use serde::{Deserialize, Serialize};
 use super::Filter;
 use crate::Frame;
 
+pub use cantap_can::DEVICE_TAG;
+
 /// Most modifiers of one periodic frame.
 pub const MAX_MODIFIERS: usize = 4;
-/// Tags from here up belong to frames that the device sends on its own: a periodic entry's slot, or
-/// [`TRIGGER_TAG`] plus a trigger's slot.
-pub const DEVICE_TAG: u32 = 0xFFFF_0000;
-/// See [`DEVICE_TAG`].
+/// What the tags from [`DEVICE_TAG`] up say: a periodic entry's slot; or, from this one up, a trigger's slot.
 pub const TRIGGER_TAG: u32 = 0xFFFF_8000;
 
 /// Never from a device: the tag of frames that another client of a shared board has sent.

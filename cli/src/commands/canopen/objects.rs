@@ -125,7 +125,7 @@ impl Place {
                     speaking.circumstances()
                 ),
                 SdoError::Aborted { code: 0x0504_0001 } if self.block => {
-                    anyhow!("{object}: {error}; the node may not have block transfers: leave --block away")
+                    anyhow!("{object}: {error}; the node may not have block transfers: omit --block")
                 }
                 SdoError::NoAnswer { .. } => anyhow!("{object}: {error}; {}", speaking.circumstances()),
                 SdoError::OtherClient { .. } => anyhow!("{object}: {error}; run this again while the other is silent"),

@@ -18,7 +18,7 @@ type Writer = JoinHandle<io::Result<()>>;
 /// Writes events to standard output, in order.
 pub(super) struct Lines {
     batch: Vec<Event>,
-    /// Batches that were written. What events own goes back where it was taken: between threads, an allocator takes locks.
+    /// Batches that were printed. They come back to be freed by the thread that allocated them: memory freed by another costs the allocator a lock.
     written: Receiver<Vec<Event>>,
     /// Taken when it ends.
     thread: Option<(SyncSender<Vec<Event>>, Writer)>,
@@ -40,7 +40,7 @@ impl Lines {
         if self.batch.len() < BATCH { Ok(()) } else { self.flush() }
     }
 
-    /// Has what was written leave, as soon as the thread comes to it.
+    /// Hands what was written to the thread, which prints it in its turn.
     pub fn flush(&mut self) -> io::Result<()> {
         let Some((sender, _)) = self.thread.as_ref().filter(|_| !self.batch.is_empty()) else {
             return Ok(());

@@ -3,7 +3,9 @@
 use std::borrow::Cow;
 use std::io::{self, Write};
 
-use super::decoded::{Decoded, Reading, Seconds};
+use cantap_signals::Reading;
+
+use super::decoded::{Decoded, Seconds};
 
 pub fn write_header(out: &mut impl Write) -> io::Result<()> {
     out.write_all(b"time,channel,id,message,signal,value,unit,text\r\n")
@@ -25,7 +27,12 @@ pub fn write(out: &mut impl Write, decoded: &Decoded) -> io::Result<()> {
         if let Some(number) = reading.number {
             write!(out, "{number}")?;
         }
-        write!(out, ",{},{}\r\n", field(&reading.signal.unit), field(reading.text().unwrap_or_default()))?;
+        write!(
+            out,
+            ",{},{}\r\n",
+            field(&reading.signal.unit),
+            field(reading.text_or_indicator().unwrap_or_default())
+        )?;
     }
     Ok(())
 }

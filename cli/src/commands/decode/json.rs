@@ -2,7 +2,9 @@
 
 use std::io::{self, Write};
 
-use super::decoded::{Decoded, Reading, Seconds};
+use cantap_signals::Reading;
+
+use super::decoded::{Decoded, Seconds};
 
 /// Writes the object; with `details` each signal is an object too, with its unit and text.
 pub fn write(out: &mut impl Write, decoded: &Decoded, details: bool) -> io::Result<()> {
@@ -32,7 +34,7 @@ pub fn write(out: &mut impl Write, decoded: &Decoded, details: bool) -> io::Resu
         }
         if details {
             let unit = Some(reading.signal.unit.as_str()).filter(|unit| !unit.is_empty());
-            for (key, text) in [("unit", unit), ("text", reading.text())] {
+            for (key, text) in [("unit", unit), ("text", reading.text_or_indicator())] {
                 if let Some(text) = text {
                     write!(out, ",\"{key}\":")?;
                     serde_json::to_writer(&mut *out, text)?;

@@ -9,10 +9,10 @@ use std::io::{self, BufRead, BufReader, BufWriter, Seek, Write};
 use anyhow::Context;
 use cantap_analysis::Cadence;
 use cantap_protocols::Event;
-use cantap_signals::MessageRef;
+use cantap_signals::{MessageRef, Reading};
 
 use super::csv::field;
-use super::decoded::{Decoded, Reading, Seconds};
+use super::decoded::{Decoded, Seconds};
 use super::said;
 
 /// Separates cells of a waiting line: it occurs in no number and no time.

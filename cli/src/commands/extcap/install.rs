@@ -37,7 +37,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         (Some(folder), _) => folder.clone(),
         (None, Some(tshark)) => ask(tshark)?,
         (None, None) => bail!(
-            "tshark is not here to ask where Wireshark looks; install it, or name the folder with --folder \
+            "Wireshark's folder is unknown, since there is no tshark to query; install it, or name the folder with --folder \
              (in Wireshark: Help, About Wireshark, Folders, Personal Extcap path)"
         ),
     };

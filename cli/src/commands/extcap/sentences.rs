@@ -121,8 +121,8 @@ mod tests {
         assert!(said.contains("dlt {number=227}{name=CAN_SOCKETCAN}"));
         // Only if somebody has to give the address.
         assert_eq!(said.matches("call=--device").count(), 1);
-        assert!(
-            said.contains("{value=listen}{display=listen only: send and acknowledge nothing}{default=true}")
-        );
+        assert!(said.contains(
+            "{value=listen-only}{display=listen only: send and acknowledge nothing}{default=true}"
+        ));
     }
 }

@@ -11,11 +11,12 @@ use cantap::wire::message::Mode;
 
 use super::bit_rates::OFFERED;
 use crate::args;
-use crate::channel_args::mode_name;
 
 /// How to take part in a bus.
-pub const MODES: [(&str, &str); 2] =
-    [("listen", "listen only: send and acknowledge nothing"), ("normal", "take part: acknowledge frames")];
+pub const MODES: [(&str, &str); 2] = [
+    ("listen-only", "listen only: send and acknowledge nothing"),
+    ("normal", "take part: acknowledge frames"),
+];
 
 // Commands.
 const INITIALIZED: u8 = 0;
@@ -163,7 +164,7 @@ impl Screen {
             self.send(control.number(), ADD, &format!("{bitrate_bps}\0{bitrate_bps} bit/s"));
             self.set(control, &bitrate_bps.to_string());
         }
-        self.set(Control::Mode, mode_name(mode));
+        self.set(Control::Mode, mode.name());
     }
 
     /// Shows a message in the status bar and in the log.
@@ -227,10 +228,9 @@ fn change(control: u8, value: &str) -> Option<Change> {
     match control {
         Control::BitRate1 => rate().map(|bitrate_bps| Change::BitRate(Channel::Can1, bitrate_bps)),
         Control::BitRate2 => rate().map(|bitrate_bps| Change::BitRate(Channel::Can2, bitrate_bps)),
-        Control::Mode => [Mode::ListenOnly, Mode::Normal]
-            .into_iter()
-            .find(|mode| mode_name(*mode) == value)
-            .map(Change::Mode),
+        Control::Mode => {
+            [Mode::ListenOnly, Mode::Normal].into_iter().find(|mode| mode.name() == value).map(Change::Mode)
+        }
         Control::Load | Control::Lost | Control::Log => None,
     }
 }

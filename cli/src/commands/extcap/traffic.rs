@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use cantap::{TraceEvent, TraceRecord};
-use cantap_trace::names::{LOSS_STAGES, name};
+use cantap_trace::LossStage;
 
 use super::toolbar::{Control, Screen};
 
@@ -45,7 +45,7 @@ impl Traffic {
                 channel.lost += u64::from(count);
                 channel.is_at_least |= at_least;
                 if channel.losses.len() < MOST_LISTED {
-                    let place = stage.map_or("", |stage| name(&LOSS_STAGES, &stage));
+                    let place = stage.map_or("", LossStage::name);
                     let count = amount(u64::from(count), at_least);
                     channel.losses.push(format!("{count} lost ({place})"));
                 } else {

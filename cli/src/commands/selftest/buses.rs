@@ -8,6 +8,7 @@ use cantap::wire::record::{ErrorState, TransmitFailure};
 use cantap::{Channel, Device, DeviceError, Frame};
 use serde_json::{Value, json};
 
+use super::patience::{check, pause};
 use super::report::Outcome;
 use super::traffic::{Amount, Flow, STAMP_TOLERANCE_US, exchange, forget, load_together_pct};
 use cantap_work::rounded;
@@ -26,6 +27,8 @@ const FULL_PCT: f64 = 90.0;
 const UNACKNOWLEDGED_TEC: u8 = 128;
 /// The longest wait; everything awaited comes sooner.
 const PATIENCE: Duration = Duration::from_secs(3);
+/// How long to wait at a time.
+const GLANCE: Duration = Duration::from_millis(20);
 
 type Result = anyhow::Result<Outcome>;
 
@@ -44,7 +47,7 @@ fn state(device: &Device, channel: Channel) -> anyhow::Result<ChannelStatus> {
 pub fn listen(device: &Device, channel: Channel) -> Result {
     open(device, channel, BITRATE_BPS, Mode::ListenOnly)?;
     let before = state(device, channel)?;
-    std::thread::sleep(LISTENING);
+    pause(LISTENING)?;
     let seen = state(device, channel)?;
     device.close_channel(channel)?;
     let ChannelStatus { frames, bus_errors, tec, rec, transmitted, .. } = seen;
@@ -113,7 +116,8 @@ pub fn fill_queue(device: &Device, channel: Channel) -> Result {
     let started = Instant::now();
     let mut told = 0;
     while told < queued && started.elapsed() < PATIENCE {
-        if let Ok(end) = ends.recv_timeout(PATIENCE) {
+        check()?;
+        if let Ok(end) = ends.recv_timeout(GLANCE) {
             told += u32::from(end.result == Err(TransmitFailure::Aborted) && end.tag == told);
         }
     }
@@ -202,8 +206,9 @@ pub fn unacknowledged(device: &Device, sender: Channel) -> Result {
     device.send(sender, &[TxFrame { tag: 1, frame: "123#55".parse()?, at_ticks: None }])?;
     let started = Instant::now();
     let seen = loop {
+        check()?;
         let seen = state(device, sender)?;
-        if seen.tec >= UNACKNOWLEDGED_TEC || started.elapsed() > PATIENCE {
+        if seen.tec >= UNACKNOWLEDGED_TEC || seen.transmitted != before || started.elapsed() > PATIENCE {
             break seen;
         }
     };
@@ -216,9 +221,19 @@ pub fn unacknowledged(device: &Device, sender: Channel) -> Result {
     }
     let transmitted = seen.transmitted.wrapping_sub(before);
     let holds = seen.tec == UNACKNOWLEDGED_TEC && seen.state == ErrorState::Passive && transmitted == 0;
+    let who = if transmitted == 0 {
+        "nobody acknowledged"
+    } else {
+        "somebody acknowledged: with --loop nothing but the two channels may be connected (the virtual and the emulated device \
+         have other nodes unless they are given ack=no)"
+    };
     let says = format!(
-        "nobody acknowledged: TEC {}, REC {}, {:?}; opened again: TEC {}, REC {}",
-        seen.tec, seen.rec, seen.state, again.tec, again.rec
+        "{who}: TEC {}, REC {}, {}; opened again: TEC {}, REC {}",
+        seen.tec,
+        seen.rec,
+        seen.state.name(),
+        again.tec,
+        again.rec
     );
     let measured = json!({
         "tec": seen.tec, "rec": seen.rec, "transmitted": transmitted,

@@ -8,6 +8,7 @@ use cantap::{Channel, Device};
 use cantap_address::{Address, OpenDevice};
 use serde_json::{Value, json};
 
+use super::patience::{check, pause};
 use super::report::Outcome;
 use cantap_work::rounded;
 
@@ -72,6 +73,7 @@ pub fn round_trips(device: &Device) -> Result {
     let mut last = device.time()?;
     let mut goes_on = true;
     for _ in 0..ROUND_TRIPS {
+        check()?;
         let asked = Instant::now();
         let ticks = device.time()?;
         times_us.push(asked.elapsed().as_secs_f64() * 1e6);
@@ -88,20 +90,20 @@ pub fn round_trips(device: &Device) -> Result {
 }
 
 /// How much faster the device's clock runs than this computer's.
-pub fn clock(device: &Device) -> Outcome {
+pub fn clock(device: &Device) -> Result {
     let started = Instant::now();
     let drift = || device.clock().drift_ppm;
     // A first figure from when this computer was busy does not last; that of a bad clock does.
     while drift().is_none_or(|ppm| ppm.abs() > MAX_DRIFT_PPM) && started.elapsed() < CLOCK_PATIENCE {
-        std::thread::sleep(Duration::from_millis(100));
+        pause(Duration::from_millis(100))?;
     }
     let Some(ppm) = drift().map(|ppm| rounded(ppm, 2)) else {
         let why =
             "it could not be measured: the device does not run in real time, or this computer is too busy";
-        return Outcome::Skip(why.to_owned());
+        return Ok(Outcome::Skip(why.to_owned()));
     };
     let says = format!("{ppm} ppm against this computer's");
-    Outcome::of(ppm.abs() <= MAX_DRIFT_PPM, says, json!({ "drift_ppm": ppm }))
+    Ok(Outcome::of(ppm.abs() <= MAX_DRIFT_PPM, says, json!({ "drift_ppm": ppm })))
 }
 
 /// What the device has stored for each channel.
@@ -129,12 +131,12 @@ pub fn restart(address: &Address, device: OpenDevice, serial: &str) -> Result {
     device.reset()?;
     drop(device);
     // The port remains for a moment.
-    std::thread::sleep(Duration::from_millis(500));
+    pause(Duration::from_millis(500))?;
     let device = loop {
         match address.open() {
             Ok(device) => break device,
             Err(error) if asked.elapsed() > RESTART_PATIENCE => return Err(error.into()),
-            Err(_) => std::thread::sleep(Duration::from_millis(100)),
+            Err(_) => pause(Duration::from_millis(100))?,
         }
     };
     let seconds = rounded(asked.elapsed().as_secs_f64(), 1);

@@ -2,12 +2,12 @@
 
 use std::time::{Duration, Instant};
 
-use anyhow::bail;
 use cantap::device::Records;
 use cantap::transmit::Stream;
 use cantap::{Channel, Device, Direction, Frame, Id, TraceEvent, TraceFrame, TraceRecord, bits_on_bus};
 use serde_json::{Value, json};
 
+use super::patience::check;
 use cantap_work::interrupt;
 use cantap_work::rounded;
 
@@ -196,13 +196,12 @@ pub fn exchange(
         number += 1;
         take(&mut stream, records, &mut flows, &mut moved);
     }
+    check()?;
     stream.flush()?;
     while stream.under_way() > 0 && moved.elapsed() < PATIENCE {
+        check()?;
         stream.wait(Duration::from_millis(20))?;
         take(&mut stream, records, &mut flows, &mut moved);
-    }
-    if interrupt::requested() {
-        bail!("it was ended from outside");
     }
     for channel in Channel::ALL {
         device.close_channel(channel)?;

@@ -1,5 +1,6 @@
 //! Statistics as text for people.
 
+use cantap_trace::{BusErrorKind, LossStage};
 use std::fmt::Write as _;
 
 use cantap_analysis::stats::{ChannelSummary, IdSummary, PeakSummary, Summary};
@@ -107,13 +108,13 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
     let errors = &channel.errors;
     if errors.total > 0 {
         let kinds = [
-            (errors.stuff, "stuff"),
-            (errors.form, "form"),
-            (errors.acknowledgment, "acknowledgment"),
-            (errors.bit_recessive, "bit recessive"),
-            (errors.bit_dominant, "bit dominant"),
-            (errors.crc, "CRC"),
-            (errors.unknown, "of unknown kind"),
+            (errors.stuff, BusErrorKind::Stuff.name()),
+            (errors.form, BusErrorKind::Form.name()),
+            (errors.acknowledgment, BusErrorKind::Acknowledgment.name()),
+            (errors.bit_recessive, BusErrorKind::BitRecessive.name()),
+            (errors.bit_dominant, BusErrorKind::BitDominant.name()),
+            (errors.crc, BusErrorKind::Crc.name()),
+            (errors.unknown, "unknown"),
             (errors.suppressed, "not reported one by one"),
         ];
         let _ = writeln!(out, "  errors    {}: {}", errors.total, listed(&kinds));
@@ -121,11 +122,11 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
     let lost = &channel.lost;
     if lost.gaps > 0 {
         let stages = [
-            (lost.controller, "in the controller"),
-            (lost.queue, "in the device's queue"),
-            (lost.link, "on the way to the host"),
-            (lost.host, "in the host"),
-            (lost.unknown, "somewhere"),
+            (lost.controller, LossStage::Controller.name()),
+            (lost.queue, LossStage::Queue.name()),
+            (lost.link, LossStage::Link.name()),
+            (lost.host, LossStage::Host.name()),
+            (lost.unknown, "unknown"),
         ];
         let places = if lost.gaps == 1 { "1 place".to_owned() } else { format!("{} places", lost.gaps) };
         let _ = match (lost.total, lost.at_least) {

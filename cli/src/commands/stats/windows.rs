@@ -2,14 +2,17 @@
 //! memory.
 
 use std::fs::File;
-use std::io::{self, BufRead, BufReader, BufWriter, Seek, Write};
+use std::io::{self, BufReader, BufWriter, Read, Seek, Write};
 
 use anyhow::Context;
 use cantap_analysis::stats::{PeakSummary, Window};
 
+/// The longest window in the file: a byte, six numbers of 8 bytes or 10, an optional one and a flag.
+const MOST_BYTES: usize = 128;
+
 /// Windows in the order in which they were closed.
 pub(super) struct Windows {
-    /// One JSON object per line.
+    /// Each with its length in front, in one byte.
     file: BufWriter<File>,
     /// The first error.
     result: io::Result<()>,
@@ -26,16 +29,33 @@ impl Windows {
     /// Adds a window.
     pub(super) fn push(&mut self, window: &Window) {
         if self.result.is_ok() {
-            let written = serde_json::to_writer(&mut self.file, &PeakSummary::of(window));
-            self.result = written.map_err(io::Error::from).and_then(|()| self.file.write_all(b"\n"));
+            let mut bytes = [0; MOST_BYTES];
+            let written = postcard::to_slice(&PeakSummary::of(window), &mut bytes);
+            self.result = written.map_err(io::Error::other).and_then(|bytes| {
+                self.file.write_all(&[bytes.len() as u8]).and_then(|()| self.file.write_all(bytes))
+            });
         }
     }
 
-    /// Passes on all windows, each as a JSON object.
-    pub(super) fn for_each(self, mut take: impl FnMut(&str) -> anyhow::Result<()>) -> anyhow::Result<()> {
+    /// Passes on all windows.
+    pub(super) fn for_each(
+        self,
+        mut take: impl FnMut(&PeakSummary) -> anyhow::Result<()>,
+    ) -> anyhow::Result<()> {
         self.result?;
         let mut file = self.file.into_inner().map_err(io::IntoInnerError::into_error)?;
+        let end = file.stream_position()?;
         file.rewind()?;
-        BufReader::new(file).lines().try_for_each(|line| take(&line?))
+        let mut file = BufReader::new(file.take(end));
+        let mut bytes = [0; MOST_BYTES];
+        loop {
+            let mut len = [0];
+            if file.read(&mut len)? == 0 {
+                return Ok(());
+            }
+            let bytes = &mut bytes[..usize::from(len[0])];
+            file.read_exact(bytes)?;
+            take(&postcard::from_bytes(bytes)?)?;
+        }
     }
 }

@@ -32,7 +32,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
     if places.is_empty() {
         app.signal_order.clear();
         let text = if !app.signals.filter.text().is_empty() && !rows.is_empty() {
-            "No signal is as the condition says; F changes it."
+            "No signal matches the condition; F changes it."
         } else if !rows.is_empty() {
             "The filter hides all signals; f changes it."
         } else if seen.signals.has_database() {

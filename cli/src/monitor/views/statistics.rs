@@ -13,7 +13,6 @@ use super::super::app::App;
 use super::super::model::{DeviceFigures, Model, Seen};
 use super::super::theme::Theme;
 use super::list::bytes;
-use crate::words::{error_name, state_name};
 
 /// Number of columns of the gauge on a narrow and on a wide screen.
 const GAUGE_COLUMNS: [usize; 2] = [12, 40];
@@ -66,7 +65,7 @@ fn channel_lines(
 ) {
     let theme = app.theme;
     let rate = channel.bitrate_bps.map_or("bit rate unknown (-b)".to_owned(), |rate| format!("{rate} bit/s"));
-    let state = channel.state.map_or(String::new(), |state| format!(", {}", state_name(state)));
+    let state = channel.state.map_or(String::new(), |state| format!(", {}", state.name()));
     let counters = channel.counters.map_or(String::new(), |(tec, rec)| format!(", counters {tec} / {rec}"));
     lines.push(
         Line::from(format!("Channel {}: {rate}{state}{counters}", channel.number)).style(Theme::heading()),
@@ -85,20 +84,14 @@ fn channel_lines(
     )));
     let kinds = BusErrorKind::ALL.into_iter().filter_map(|kind| {
         let count = channel.errors.of(kind);
-        (count > 0).then(|| format!("{count} {}", error_name(kind)))
+        (count > 0).then(|| format!("{count} {}", kind.name()))
     });
     let kinds: Vec<_> = kinds.collect();
     let errors = channel.errors.total();
     let style = if errors > 0 { theme.error() } else { theme.label() };
     lines.push(Line::styled(format!("Errors    {errors:>10}   {}", kinds.join(", ")), style));
     let losses = &channel.losses;
-    let stages = [
-        (LossStage::Controller, "controller"),
-        (LossStage::Queue, "queue"),
-        (LossStage::Link, "link"),
-        (LossStage::Host, "host"),
-    ];
-    let stages: Vec<_> = stages.iter().map(|(stage, name)| format!("{name} {}", losses.of(*stage))).collect();
+    let stages = LossStage::ALL.map(|stage| format!("{} {}", stage.name(), losses.of(stage)));
     let style = if losses.total() > 0 { theme.loss() } else { theme.label() };
     let least = if losses.at_least { " at least" } else { "" };
     lines.push(Line::styled(
@@ -164,7 +157,7 @@ fn device_lines(board: usize, device: &DeviceFigures, lines: &mut Vec<Line<'stat
             if channel.open.is_some() {
                 lines.push(Line::from(format!(
                     "Bus {number}     {}, counters {} / {}, sent {}, failed {}, waiting {}",
-                    state_name(channel.state),
+                    channel.state.name(),
                     channel.tec,
                     channel.rec,
                     channel.transmitted,

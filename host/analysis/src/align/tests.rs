@@ -1,4 +1,4 @@
-use cantap_wire::{Frame, Id};
+use cantap_can::{Frame, Id};
 use proptest::prelude::*;
 
 use super::*;

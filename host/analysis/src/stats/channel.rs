@@ -1,6 +1,6 @@
 //! Statistics of one channel.
 
-use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
+use cantap_can::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 
 use super::ids::{IdStatistics, Ids};
 use super::windows::{Window, Windows, per_second};

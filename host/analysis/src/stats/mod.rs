@@ -130,7 +130,7 @@ impl Statistics {
             return Err(BadOptions::ZeroBitrate);
         }
         // Without any bit rate, the minimum window is that of the fastest bus.
-        let bitrate_bps = slowest.unwrap_or(cantap_wire::timing::MAX_BITRATE_BPS);
+        let bitrate_bps = slowest.unwrap_or(cantap_can::timing::MAX_BITRATE_BPS);
         let shortest_ns = match fastest_data {
             Some(_) => windows::shortest_fd_window_ns(bitrate_bps),
             None => shortest_window_ns(bitrate_bps),

@@ -1,6 +1,6 @@
 //! Statistics as plain values: what `cantap stats --json` prints.
 
-use cantap_wire::record::{BusErrorKind, ErrorState, LossStage};
+use cantap_can::{BusErrorKind, ErrorState, LossStage};
 use serde::{Deserialize, Serialize};
 
 use super::{ChannelStatistics, IdStatistics, Statistics, Window};
@@ -296,22 +296,12 @@ impl ChannelSummary {
             peaks: channel.peaks().map(PeakSummary::of).collect(),
             errors: ErrorSummary::of(&channel.errors),
             lost: LossSummary::of(&channel.losses),
-            state: channel.state.map(state_name),
+            state: channel.state.map(ErrorState::name),
             error_counters: channel.counters,
             transmit_failures: channel.transmit_failures,
             ids: ids.into_iter().map(|id| IdSummary::of(id, channel.bits)).collect(),
             unlisted_frames: channel.unlisted_frames(),
         }
-    }
-}
-
-/// The usual name of a fault confinement state.
-fn state_name(state: ErrorState) -> &'static str {
-    match state {
-        ErrorState::Active => "error-active",
-        ErrorState::Warning => "error-warning",
-        ErrorState::Passive => "error-passive",
-        ErrorState::BusOff => "bus-off",
     }
 }
 

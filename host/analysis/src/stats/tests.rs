@@ -1,8 +1,8 @@
 //! The collector as a whole.
 
 use super::*;
+use cantap_can::{BusErrorKind, ErrorState, LossStage};
 use cantap_trace::{Direction, TraceEvent};
-use cantap_wire::record::{BusErrorKind, ErrorState, LossStage};
 
 fn at(time_us: i64, channel: u8, event: TraceEvent) -> TraceRecord {
     TraceRecord { time_ns: time_us * 1000, channel, event }
@@ -62,7 +62,7 @@ fn errors_and_states_are_counted_by_kind() {
     let summary = statistics.summary();
     let channel = &summary.channels[0];
     assert_eq!((channel.channel, channel.errors.total, channel.errors.stuff), (2, 42, 1));
-    assert_eq!((channel.state, channel.error_counters), (Some("error-passive"), Some((0, 9))));
+    assert_eq!((channel.state, channel.error_counters), (Some("passive"), Some((0, 9))));
     assert_eq!(channel.bus_load_pct, None);
 }
 

@@ -1,6 +1,6 @@
 //! Reads rows of the table as records.
 
-use cantap_wire::{Frame, Id};
+use cantap_can::{Frame, Id};
 
 use super::super::calendar::Date;
 use super::super::found::Row as ReadRow;

@@ -1,7 +1,7 @@
 //! Turns records into rows of the table, and does the writing that the two kinds of file have in common.
 
-use cantap_wire::Frame;
-use cantap_wire::record::BusErrorKind;
+use cantap_can::BusErrorKind;
+use cantap_can::Frame;
 
 use super::super::calendar::{Date, start_of_trace};
 use super::super::codec::Encode;

@@ -2,7 +2,7 @@
 
 use std::io;
 
-use cantap_wire::{Frame, Id};
+use cantap_can::{Frame, Id};
 
 use super::super::calendar::{Date, MONTHS};
 use super::super::codec::{Decode, REQUESTS_TO_SEND};

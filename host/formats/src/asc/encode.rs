@@ -1,6 +1,6 @@
 //! Writing ASC.
 
-use cantap_wire::Frame;
+use cantap_can::Frame;
 
 use super::super::calendar::{DAYS, Date, MONTHS, start_of_trace};
 use super::super::codec::Encode;

@@ -1,7 +1,7 @@
 //! The meaning of objects in a BLF file.
 
-use cantap_wire::record::BusErrorKind;
-use cantap_wire::{Frame, Id};
+use cantap_can::BusErrorKind;
+use cantap_can::{Frame, Id};
 
 use super::super::event_text;
 use super::super::issue::Fault;

@@ -2,7 +2,7 @@
 
 use std::io;
 
-use cantap_wire::{Frame, Id};
+use cantap_can::{Frame, Id};
 
 use super::super::codec::{BATCH, Decode};
 use super::super::error_frames::ErrorFrames;
@@ -259,7 +259,7 @@ fn payload(id: Id, digits: &[u8]) -> Result<Frame, Fault> {
     }
     // Remote frames and DLCs above 8 are rare: the frame's own parser handles them.
     let text = format!("{id}#{}", String::from_utf8_lossy(digits));
-    text.parse().map_err(|error: cantap_wire::frame::ParseFrameError| {
+    text.parse().map_err(|error: cantap_can::frame::ParseFrameError| {
         Fault::malformed(format!("a frame such as 123#DEADBEEF ({error})"), text.as_bytes())
     })
 }

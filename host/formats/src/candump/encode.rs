@@ -1,6 +1,6 @@
 //! Writing candump's log.
 
-use cantap_wire::{Frame, Id};
+use cantap_can::{Frame, Id};
 
 use super::super::codec::Encode;
 use super::super::left_out::LeftOut;

@@ -1,6 +1,6 @@
 //! Remembers how long an identifier's frames were, which distinguishes a cut last line from a short frame.
 
-use cantap_wire::Id;
+use cantap_can::Id;
 
 /// Lengths of the longest data frames of recent identifiers.
 pub(super) struct Lengths {

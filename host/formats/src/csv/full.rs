@@ -1,6 +1,6 @@
 //! Our own dialect, complete, for people and spreadsheets.
 
-use cantap_wire::{Frame, Id};
+use cantap_can::{Frame, Id};
 
 use super::super::codec::{Encode, HeadLine};
 use super::super::event_text::EventText;

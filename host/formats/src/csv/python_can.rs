@@ -3,7 +3,7 @@
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
-use cantap_wire::{Frame, Id};
+use cantap_can::{Frame, Id};
 
 use super::super::codec::{Encode, HeadLine};
 use super::super::error_frames::ErrorFrames;

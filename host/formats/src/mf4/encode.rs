@@ -1,7 +1,7 @@
 //! Writes MF4: a single data group in which each record begins with its group's number, so that a file is a stream except
 //! for the counts in its header. Until those are filled in, the file is marked as unfinished, as the standard provides.
 
-use cantap_wire::record::BusErrorKind;
+use cantap_can::BusErrorKind;
 
 use super::super::codec::Encode;
 use super::super::event_text::EventText;

@@ -1,8 +1,8 @@
 //! Data frames out of records whose fields stand at fixed places: most records of most files are such.
 
 use super::layout::{BusGroup, Bytes, Clock, Events, Place};
+use cantap_can::Id;
 use cantap_trace::PlainFrame;
-use cantap_wire::Id;
 
 /// Where a record says its time.
 enum Time {

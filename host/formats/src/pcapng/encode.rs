@@ -11,10 +11,10 @@ use super::{
     IF_DESCRIPTION, IF_NAME, IF_SPEED, IF_TSRESOL, INTERFACE_DESCRIPTION, ISB_IFDROP, ISB_IFRECV,
     ISB_USRDELIV, LATE, OUTBOUND, SECTION_HEADER, SHB_USERAPPL, STATISTICS,
 };
+use cantap_can::LossStage;
 use cantap_trace::fd::FLAG_FDF;
 use cantap_trace::socketcan::{ERROR_FLAG, ErrorFrame};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
-use cantap_wire::record::LossStage;
 
 /// Length of one interface's statistics: number, time, three counts, the end of the options.
 const STATISTICS_BYTES: usize = BLOCK_FRAME_BYTES + 12 + 3 * 12 + 4;

@@ -2,8 +2,8 @@
 
 use std::io;
 
-use cantap_wire::record::ErrorState;
-use cantap_wire::{Frame, Id};
+use cantap_can::ErrorState;
+use cantap_can::{Frame, Id};
 
 use super::super::calendar::{Date, NS_PER_DAY};
 use super::super::codec::Decode;

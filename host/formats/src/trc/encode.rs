@@ -182,7 +182,7 @@ impl Encoder {
     fn frame(
         &mut self,
         record: &TraceRecord,
-        frame: &cantap_wire::Frame,
+        frame: &cantap_can::Frame,
         direction: Direction,
         out: &mut Vec<u8>,
         left_out: &mut LeftOut,

@@ -7,9 +7,9 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::PathBuf;
 
+use cantap_can::{BusErrorKind, ErrorState, LossStage};
 use cantap_formats::{Format, LeftOut, ReadOptions, open_reader};
 use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
-use cantap_wire::record::{BusErrorKind, ErrorState, LossStage};
 use traces::{directory, file_name, read, split, write};
 
 /// Apart by more than any format's resolution, so that each is found again by its time.

@@ -6,9 +6,9 @@ use crate::traces;
 
 use std::path::Path;
 
+use cantap_can::{BusErrorKind, ErrorState, LossStage};
 use cantap_formats::{CsvDialect, Format};
 use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
-use cantap_wire::record::{BusErrorKind, ErrorState, LossStage};
 use traces::{directory, file_name, read, write};
 
 const PAGE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/formats.md");

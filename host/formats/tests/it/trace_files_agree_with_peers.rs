@@ -7,9 +7,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use cantap_can::{ErrorState, LossStage};
 use cantap_formats::{CsvDialect, Format, ReadOptions, TrcVersion, open_reader};
 use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
-use cantap_wire::record::{ErrorState, LossStage};
 use peers::{python, python_can, python_can_reads, run, skip};
 use traces::{directory, file_name, frames, odd, read, real, split, write};
 

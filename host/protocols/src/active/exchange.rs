@@ -5,8 +5,8 @@
 
 use std::collections::VecDeque;
 
+use cantap_can::Frame;
 use cantap_trace::Id;
-use cantap_wire::Frame;
 
 use super::answer::{NEGATIVE, is_answer};
 use super::rivals::Rivals;

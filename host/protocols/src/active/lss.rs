@@ -3,8 +3,8 @@
 
 use std::collections::VecDeque;
 
+use cantap_can::Frame;
 use cantap_trace::Id;
-use cantap_wire::Frame;
 
 use super::Machine;
 

@@ -19,8 +19,8 @@ pub mod transfer;
 
 use std::collections::VecDeque;
 
+use cantap_can::Frame;
 use cantap_trace::Id;
-use cantap_wire::Frame;
 
 /// A client that communicates on one bus. Times are nanoseconds of a clock that never goes back, the same one in
 /// all calls.

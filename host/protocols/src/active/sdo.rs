@@ -4,8 +4,8 @@ pub use super::sdo_job::{SdoError, SdoIds, SdoJob};
 
 use std::collections::VecDeque;
 
+use cantap_can::Frame;
 use cantap_trace::Id;
-use cantap_wire::Frame;
 
 use super::Machine;
 use crate::canopen::crc_of;

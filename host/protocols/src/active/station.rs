@@ -8,8 +8,8 @@ mod words;
 
 use std::collections::VecDeque;
 
+use cantap_can::Frame;
 use cantap_trace::Id;
-use cantap_wire::Frame;
 
 use self::long_message::{Incoming, Outgoing};
 pub use self::words::StationError;

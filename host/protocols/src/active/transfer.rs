@@ -1,6 +1,6 @@
 //! Sends or receives one message by ISO 15765-2 on classical CAN, in normal, extended or mixed addressing.
 
-use cantap_wire::Frame;
+use cantap_can::Frame;
 
 use crate::iso_tp::{Endpoint, FlowStatus, Pci};
 

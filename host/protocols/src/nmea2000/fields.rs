@@ -2,6 +2,8 @@
 
 use std::borrow::Cow;
 
+use jiff::{ToSpan, civil};
+
 use super::database::{Condition, Database, FieldKind, Group, Kind};
 use crate::{Field, Value};
 
@@ -389,17 +391,7 @@ fn physical(name: &'static str, kind: &'static FieldKind, raw: u64) -> Field {
 
 /// Days since 1970 as a date.
 fn date(days: i64) -> Cow<'static, str> {
-    // Howard Hinnant's days_from_civil, reversed: years starting in March have their leap day at the end.
-    let shifted = days + 719_468;
-    let era = shifted.div_euclid(146_097);
-    let day_of_era = shifted.rem_euclid(146_097);
-    let year_of_era = (day_of_era - day_of_era / 1460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
-    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
-    let month = (5 * day_of_year + 2) / 153;
-    let day = day_of_year - (153 * month + 2) / 5 + 1;
-    let month = if month < 10 { month + 3 } else { month - 9 };
-    let year = year_of_era + era * 400 + i64::from(month <= 2);
-    format!("{year:04}-{month:02}-{day:02}").into()
+    civil::date(1970, 1, 1).saturating_add(days.days()).to_string().into()
 }
 
 /// Seconds since midnight as a time of day.

@@ -61,6 +61,8 @@ pub struct Otg {
     /// The interrupt line, recomputed after every change.
     line: bool,
     misuse: Misuse,
+    /// OUT packets that were acknowledged and thrown away because of their toggle.
+    thrown_away: u64,
 }
 
 /// What a driver did that the chip does not forgive. A test can assert that none of it happened.
@@ -129,6 +131,7 @@ impl Otg {
             txs: Default::default(),
             line: false,
             misuse: Misuse::default(),
+            thrown_away: 0,
         };
         otg.ins[0] = Endpoint::control_pipe();
         otg.outs[0] = Endpoint::control_pipe();
@@ -143,6 +146,12 @@ impl Otg {
     /// What a driver did wrong so far.
     pub fn misuse(&self) -> Misuse {
         self.misuse
+    }
+
+    /// OUT packets that were acknowledged and thrown away because of their toggle: repetitions, if the host missed a handshake; otherwise
+    /// one of the two sides has not begun anew with DATA0, and the packet is lost.
+    pub fn thrown_away(&self) -> u64 {
+        self.thrown_away
     }
 
     /// Reads a whole register; reading the receive queue or a FIFO removes what was read.
@@ -319,6 +328,7 @@ impl Otg {
         self.dcfg = self.dcfg & !3 | old.dcfg & 3;
         self.frame = old.frame;
         self.misuse = old.misuse;
+        self.thrown_away = old.thrown_away;
     }
 
     fn write_dctl(&mut self, value: u32) {

@@ -356,6 +356,7 @@ fn a_toggle_that_is_not_expected_is_acknowledged_and_dropped_until_it_is_reset()
     // The host starts over and the device does not: the packet is lost.
     assert_eq!(otg.out(0, 1, false, b"two"), OutReply::Ack);
     assert!(!otg.irq());
+    assert_eq!(otg.thrown_away(), 1);
     modify(&mut otg, at(OUT, 1, device::EPCTL), epctl::SD0PID);
     assert_eq!(otg.out(0, 1, false, b"two"), OutReply::Ack);
     assert_eq!(receive(&mut otg).2, b"two");

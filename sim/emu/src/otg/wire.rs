@@ -144,6 +144,7 @@ impl Otg {
         }
         if data1 != out.toggle() {
             // The host did not see our ACK and repeats the packet: acknowledged and thrown away.
+            self.thrown_away += 1;
             return OutReply::Ack;
         }
         out.set_toggle(!data1);

@@ -13,6 +13,8 @@ pub struct Counters {
     pub notifications: u64,
     /// Data packets with the same toggle as the one before: repetitions after a lost handshake.
     pub repeated: u64,
+    /// OUT packets that the device acknowledged and threw away because of their toggle.
+    pub thrown_away: u64,
     /// Transactions on configured pipes that the device left unanswered.
     pub silences: u64,
     /// STALLs on configured pipes.

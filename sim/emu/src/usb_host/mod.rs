@@ -430,7 +430,9 @@ impl<D: HostDriver> UsbHost<D> {
                 self.driver.answered_out(None, reply, &mut self.counters);
             }
             Token::Out { endpoint, data1, bytes } => {
+                let before = otg.thrown_away();
                 let reply = otg.out(address, endpoint, data1, &bytes);
+                self.counters.thrown_away += otg.thrown_away() - before;
                 self.packets_this_frame += 1;
                 self.back_off(endpoint, false, reply == OutReply::Nak);
                 let pipe = (endpoint != 0).then_some(bytes.len());

@@ -17,11 +17,12 @@ end_bridge() {
   tail -n 2 bridge.err
 }
 
-# listen INTERFACE...: candump on each in the background, with room for a burst at full load, errors among the frames.
+# listen INTERFACE...: candump on each in the background, with room for all frames of a part (a frame takes less than a kilobyte, and the kernel
+# doubles the figure), errors among the frames.
 listen() {
   LISTENERS=
   for _interface in "$@"; do
-    candump -d -L -r 8000000 "$_interface,0:0,#FFFFFFFF" > "$_interface.txt" &
+    candump -d -L -r 32000000 "$_interface,0:0,#FFFFFFFF" > "$_interface.txt" &
     LISTENERS="$LISTENERS $!"
   done
   sleep 0.5
@@ -43,8 +44,19 @@ heard() {
   # shellcheck disable=SC2086
   wait $LISTENERS 2> /dev/null
 }
-# frames FILE: a candump log's frames, without errors, and without a DLC above 8, which not every version of candump prints.
-frames() { grep -v DROPCOUNT "$1" | awk '{ print $3 }' | grep -v '^2[0-9A-F]\{7\}#' | bare; }
+# The kernel tells what a socket dropped with the next frame that it takes: so one more is sent once nothing else comes, until it is there.
+LAST=7EF#4C415354
+is_last() { tail -n 1 "$1.txt" | grep -q "$LAST"; }
+last() {
+  _tries=60
+  until is_last "$1" || [ $_tries = 0 ]; do
+    cansend "$1" $LAST
+    sleep 0.5
+    _tries=$((_tries - 1))
+  done
+}
+# frames FILE: a candump log's frames, without the last, without errors, and without a DLC above 8, which not every version of candump prints.
+frames() { grep -v -e DROPCOUNT -e "$LAST" "$1" | awk '{ print $3 }' | grep -v '^2[0-9A-F]\{7\}#' | bare; }
 # dropped FILE: what its socket lost, as candump says.
 dropped() { sed -n 's/^DROPCOUNT: .*(total drops \([0-9]*\)).*/\1/p' "$1" | tail -n 1 | grep . || echo 0; }
 bare() { sed 's/#R.*$/#R/; s/_[0-9A-F]$//'; }
@@ -81,6 +93,7 @@ for _job in "100 mix 4000" "100 std0 20000"; do
     _before=$_now
     sleep 0.5
   done
+  for _bus in bus0 bus1; do last $_bus; done
   heard
   for _n in 1 2; do
     _bus=bus$((_n - 1))

@@ -17,12 +17,22 @@ pub fn firmware() -> Image {
 /// A board's name, its crystal's frequency in Hz, and where each channel's TX is: port (0 is A) and pin.
 pub type BoardFacts = (&'static str, u64, [(usize, u32); 2]);
 
-/// The boards.
-pub const BOARDS: [BoardFacts; 3] = [
+const BOARDS: [BoardFacts; 3] = [
     ("olimex-p405", 8_000_000, [(1, 9), (1, 6)]),
     ("feather-f405", 12_000_000, [(1, 9), (1, 13)]),
     ("stm32f4-discovery", 8_000_000, [(3, 1), (1, 13)]),
 ];
+
+/// The boards whose firmware was built for this run: those that `CANTAP_BOARDS` names, by default only the first. `cargo xtask ci` names all.
+pub fn boards() -> Vec<BoardFacts> {
+    let Ok(names) = std::env::var("CANTAP_BOARDS") else {
+        eprintln!("SKIPPED: all boards but {}: CANTAP_BOARDS does not name them", BOARDS[0].0);
+        return BOARDS[..1].to_vec();
+    };
+    let facts =
+        |name| *BOARDS.iter().find(|(known, ..)| *known == name).unwrap_or_else(|| panic!("no board {name}"));
+    names.split_whitespace().map(facts).collect()
+}
 
 /// A board's firmware, which is next to the default board's.
 pub fn board(name: &str) -> Image {

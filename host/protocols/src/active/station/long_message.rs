@@ -1,6 +1,6 @@
 //! Messages of many frames, incoming and outgoing (J1939-21, 5.10).
 
-use cantap_wire::Frame;
+use cantap_can::Frame;
 
 use super::words::{CONTROL, DATA, GLOBAL, MOST_BYTES, MS, StationError, frame, three};
 use crate::j1939::Header;

@@ -1,6 +1,6 @@
 //! What a station and its long messages have in common.
 
-use cantap_wire::Frame;
+use cantap_can::Frame;
 
 use crate::j1939::Header;
 

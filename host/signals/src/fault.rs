@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use super::clean;
+use cantap_trace::clean;
 
 /// Why a database could not be read.
 #[derive(Debug, thiserror::Error)]

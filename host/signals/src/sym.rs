@@ -5,7 +5,7 @@
 
 use std::collections::HashMap;
 
-use cantap_wire::Id;
+use cantap_can::Id;
 
 use super::dbc_text;
 use super::fault::{DatabaseError, Fault, FaultKind};

@@ -144,7 +144,7 @@ impl Parts {
             Some(true) if hour < 12 => hour + 12,
             _ => hour,
         };
-        let (month, day) = match (self.month, &self.small[..]) {
+        let (month, day) = match (self.month.as_ref(), &self.small[..]) {
             (Some(month), [day]) | (None, [month, day]) => (*month, *day),
             _ => return None,
         };

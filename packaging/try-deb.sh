@@ -16,7 +16,7 @@ for file in /usr/lib/udev/rules.d/60-cantap.rules /usr/share/bash-completion/com
     test -s "$file" || { echo "missing: $file"; exit 1; }
 done
 # A page for each subcommand that the help lists.
-for name in $(cantap --help | sed -n '/^Commands:/,/^$/s/^  \([a-z]*\) .*/\1/p' | grep -v '^help$'); do
+for name in $(cantap --help | sed -n '/^Look at/,/^Topics/s/^  \([a-z][a-z0-9]*\) .*/\1/p' | grep -v '^help$'); do
     test -s "/usr/share/man/man1/cantap-$name.1.gz" || { echo "missing: the page of cantap $name"; exit 1; }
 done
 gzip -t /usr/share/man/man1/cantap.1.gz

@@ -20,7 +20,8 @@ pub fn cut(text: &str, columns: usize) -> String {
 
 /// A line in at most this many columns.
 pub fn cut_line(line: Line<'static>, columns: usize) -> Line<'static> {
-    if line.width() <= columns {
+    // Blanks are not missed.
+    if line.width() <= columns || Line::from(line.to_string().trim_end()).width() <= columns {
         return line;
     }
     let mut spans: Vec<Span<'static>> = Vec::new();
@@ -54,6 +55,7 @@ mod tests {
         let line = Line::from(vec![Span::raw("Speed "), Span::raw("255")]);
         let cut = |columns| cut_line(line.clone(), columns).to_string();
         assert_eq!([cut(9), cut(8), cut(6), cut(1), cut(0)], ["Speed 255", "Speed 2…", "Speed…", "…", ""]);
+        assert_eq!(cut_line(Line::from("255  "), 3).to_string(), "255  ");
         // Characters that take two columns are not halved.
         assert_eq!(cut_line(Line::from("日本語"), 4).to_string(), "日…");
     }

@@ -187,8 +187,11 @@ fn no_command_with_json_is_left_out() {
     let directory = directory("all");
     let help = |line: &str| cantap(&directory, &format!("{line} --help")).1;
     let commands = |help: &str| -> Vec<String> {
-        let listed = help.lines().skip_while(|line| !line.starts_with("Commands:")).skip(1);
-        let listed = listed.take_while(|line| line.starts_with("  "));
+        // The command's own are in groups, those of a command are not.
+        let is_before = |line: &&str| !(line.starts_with("Commands:") || line.starts_with("Look at"));
+        let listed = help.lines().skip_while(is_before);
+        let listed = listed.take_while(|line| !(line.starts_with("Topics") || line.starts_with("Options:")));
+        let listed = listed.filter(|line| line.starts_with("  "));
         let names =
             listed.filter(|line| !line.starts_with("   ")).filter_map(|line| line.split_whitespace().next());
         names.filter(|name| *name != "help").map(str::to_owned).collect()

@@ -30,6 +30,7 @@ mod extcap;
 mod fake_device;
 mod firmware;
 mod follow;
+mod help;
 mod json_schema;
 mod misbehaving_devices;
 mod monitor_keys;

@@ -85,6 +85,7 @@ fn the_key_that_continues_after_a_message_does_nothing_else() {
     view.keys("O/no/such/file/anywhere/in/this/world/at/all.log\r");
     view.wait_for("there is no file");
     view.keys("\x1b");
+    view.wait_until("the prompt to go", |screen| !screen.contains("there is no file"));
     // A search that is not found has a long message here.
     view.keys("1/ZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZZ\r");
     view.wait_for("any key continues");

@@ -123,3 +123,102 @@ fn frames_that_wait_for_their_time_do_not_stand_still() {
     let (code, lines, err) = cantap(line);
     assert_eq!((code, lines.len()), (Some(0), 2), "{err}");
 }
+
+fn object(arguments: &str) -> (Option<i32>, serde_json::Value) {
+    let (code, lines, err) = cantap(arguments);
+    let line = lines.last().unwrap_or_else(|| panic!("{arguments}: {err}"));
+    (code, serde_json::from_str(line).unwrap())
+}
+
+/// A reply that never gets onto the bus was asked for all the same.
+#[test]
+fn replies_are_counted_with_the_frames_that_asked_for_them() {
+    let _turn = cantap_testing::process::turn();
+    // There are frames to reply to, and no room for a reply behind them.
+    let (code, sent) = object(&format!("send -d {FULL_BUS} can0 7FF#11 --on-rx 000:000 -t 500ms --json"));
+    assert_eq!((code, sent["sent"].as_u64()), (Some(1), Some(0)), "{sent}");
+    let matches = sent["replies"][0]["matches"].as_u64().unwrap();
+    assert!(matches > 100 && sent["asked"].as_u64() >= Some(matches), "{sent}");
+    assert!(sent["reason"].as_str().unwrap().contains("the bus is full"), "{sent}");
+    // With room, each is answered, or counted as one that is not.
+    let line = "send -d virtual:load=20,frames=std0,seed=5 -b 500k can0 000#11 --on-rx 100:700 -t 1s --json";
+    let (code, sent) = object(line);
+    let reply = &sent["replies"][0];
+    let count = |name: &str| reply[name].as_u64().unwrap();
+    assert!(count("matches") > 0 && count("sent") > 0, "{sent}");
+    assert_eq!(count("asked"), count("sent") + count("left_out") + count("withdrawn"), "{sent}");
+    assert!(count("asked") >= count("matches"), "{sent}");
+    assert_eq!(code, Some(i32::from(count("left_out") > 0)), "{sent}");
+    assert_eq!((reply["frame"].as_str(), reply["on"].as_str()), (Some("000#11"), Some("100:700")));
+    // Nothing asked for any.
+    let (code, sent) = object("send -d virtual:load=0 -b 500k can0 000#11 --on-rx 7FF -t 200ms --json");
+    assert_eq!((code, sent["asked"].as_u64(), &sent["replies"][0]["matches"]), (Some(0), Some(0), &0.into()));
+    // What the command line says wrongly has the code of that.
+    let (code, _, err) = cantap("send -d virtual -b 500k can0 000#11 --on-rx 100~700");
+    assert!(code == Some(2) && err.contains("cannot start a reply"), "{err}");
+}
+
+/// Nothing leaves that is not counted: by a witness on the same bus.
+#[cfg(unix)]
+#[test]
+fn what_was_sent_is_what_left_however_it_ended() {
+    let _turn = cantap_testing::process::turn();
+    let served = crate::served::Served::start(
+        "virtual:wire=joined,load=50,frames=std0,seed=5",
+        std::process::Stdio::null(),
+    );
+    let end = |child: std::process::Child| {
+        let process = child.id().to_string();
+        assert!(Command::new("kill").args(["-s", "INT", &process]).status().unwrap().success());
+        String::from_utf8(child.wait_with_output().unwrap().stdout).unwrap()
+    };
+    let spawn = |line: &str| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
+        command
+            .args(line.split_whitespace())
+            .stdout(std::process::Stdio::piped())
+            .stderr(std::process::Stdio::null());
+        command.spawn().unwrap()
+    };
+    let at = &served.at;
+    for (number, (what, ended_by)) in [
+        ("send 1 7F0#11 --on-rx 000:400", "-t 700ms"),
+        ("send 1 7F1#11 --period 1ms", "-t 700ms"),
+        ("send 1 7F2#11 -n 1000000", "a signal"),
+        ("gen 1 -I 7F3 -L 1 -g 0", "a signal"),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let log = served.folder.path().join(format!("{number}.log"));
+        let witness = spawn(&format!("capture -d {at} -c 1 -b 500k --mode normal -o {}", log.display()));
+        // It listens once there is something in its file.
+        let deadline = std::time::Instant::now() + std::time::Duration::from_mins(1);
+        while std::fs::metadata(&log).map_or(0, |file| file.len()) == 0 {
+            assert!(std::time::Instant::now() < deadline, "the witness hears nothing");
+            std::thread::sleep(std::time::Duration::from_millis(20));
+        }
+        let signal = ended_by == "a signal";
+        let (command, rest) = what.split_once(' ').unwrap();
+        let option = if signal { "" } else { ended_by };
+        let sender = spawn(&format!("{command} -d {at} -b 500k --mode normal {rest} {option} --json"));
+        let out = if signal {
+            std::thread::sleep(std::time::Duration::from_millis(700));
+            end(sender)
+        } else {
+            String::from_utf8(sender.wait_with_output().unwrap().stdout).unwrap()
+        };
+        // What left before is in the file before what comes now.
+        let mark = spawn(&format!("send -d {at} -b 500k --mode normal 1 7FE#0{number} --json"));
+        mark.wait_with_output().unwrap();
+        end(witness);
+        let sent: serde_json::Value = serde_json::from_str(out.lines().last().unwrap()).unwrap();
+        let id = format!(" 7F{number}#");
+        let text = std::fs::read_to_string(&log).unwrap();
+        let left = text.lines().filter(|line| line.starts_with('(') && line.contains(&id)).count() as u64;
+        let lost = text.contains(" lost ");
+        assert!(!lost, "the witness missed frames, and proves nothing");
+        assert_eq!(sent["sent"].as_u64(), Some(left), "{what}: {sent}");
+        assert!(left > 0, "{what}");
+    }
+}

@@ -64,7 +64,8 @@ pub fn check(shell: &Shell, peers: Option<&Peers>) -> Result<Outcome> {
         .run()?;
     let wheel = wheel(shell, &workspace::root(), Profile::Dev, &target().join("wheels"))?;
     let python = environment(shell, &wheel)?;
-    cmd!(shell, "{python} -m mypy --config-file python/pyproject.toml python/cantap python/tests/typed.py").run()?;
+    cmd!(shell, "{python} -m mypy --config-file python/pyproject.toml python/cantap python/tests/typed.py")
+        .run()?;
     cmd!(shell, "{python} -m mypy.stubtest --mypy-config-file python/pyproject.toml cantap._native").run()?;
     let suite = python_can(shell, &python)?;
     let pytest = python.with_file_name("python");

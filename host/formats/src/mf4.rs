@@ -19,10 +19,10 @@ mod part;
 mod plain;
 mod record;
 mod stream;
-mod value;
 #[cfg(test)]
 mod tests;
 mod unpack;
+mod value;
 
 pub(crate) use decode::Decoder;
 #[cfg(test)]

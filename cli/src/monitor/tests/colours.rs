@@ -35,14 +35,14 @@ fn errors_are_red_and_what_follows_a_loss_is_yellow_with_the_number() {
     let model = model();
     let (mut app, _orders) = app(View::Trace);
     let dark = buffer(&mut app, &model);
-    assert_eq!(style_of(&dark, "E bus error: CRC").0, Color::LightRed);
-    assert_eq!(style_of(&dark, "L 17 frames lost in the device's queue").0, Color::Yellow);
+    assert_eq!(style_of(&dark, "E bus error: crc").0, Color::LightRed);
+    assert_eq!(style_of(&dark, "L 17 frames lost, stage queue").0, Color::Yellow);
     assert_eq!(style_of(&dark, "17 lost before").0, Color::Yellow);
     app.theme.light = true;
-    assert_eq!(style_of(&buffer(&mut app, &model), "E bus error: CRC").0, Color::Red);
+    assert_eq!(style_of(&buffer(&mut app, &model), "E bus error: crc").0, Color::Red);
     app.theme.colour = false;
     let plain = buffer(&mut app, &model);
-    assert_eq!(style_of(&plain, "E bus error: CRC"), (Color::Reset, Modifier::BOLD));
+    assert_eq!(style_of(&plain, "E bus error: crc"), (Color::Reset, Modifier::BOLD));
     assert_eq!(style_of(&plain, "17 lost before"), (Color::Reset, Modifier::REVERSED));
     let coloured = plain.content.iter().filter(|cell| (cell.fg, cell.bg) != (Color::Reset, Color::Reset));
     assert_eq!(coloured.count(), 0);

@@ -70,7 +70,11 @@ enum Source {
     Constant(u64),
     /// What each raw value stands for.
     Table(Field, Box<[u64]>),
-    Any { raw: Raw, conversion: Conversion, meaning: Meaning },
+    Any {
+        raw: Raw,
+        conversion: Conversion,
+        meaning: Meaning,
+    },
 }
 
 /// Where a raw value is.
@@ -153,7 +157,8 @@ fn collect(
         let name = if own.contains('.') || parent.is_empty() { own } else { format!("{parent}.{own}") };
         let composition = block.link(1);
         let of_composition = if composition == 0 { *b"    " } else { file.head(composition)?.name };
-        let array_bits = if &of_composition == b"##CA" { array_bits(file, composition, &block)? } else { None };
+        let array_bits =
+            if &of_composition == b"##CA" { array_bits(file, composition, &block)? } else { None };
         found.push(Channel { name: name.clone(), block, array_bits });
         if depth < MAX_DEPTH && &of_composition == b"##CN" {
             collect(file, composition, &name, depth + 1, found)?;
@@ -212,7 +217,9 @@ impl Number {
                 let constant = meaning.of_converted(Value::Unsigned(0), &conversion);
                 constant.map_or_else(|| any(Raw::Number), Source::Constant)
             }
-            Raw::Field(field) if field.is_unsigned() && conversion == Conversion::None => Source::Field(field),
+            Raw::Field(field) if field.is_unsigned() && conversion == Conversion::None => {
+                Source::Field(field)
+            }
             Raw::Field(field) if field.is_unsigned() && (1..=TABLE_BITS).contains(&field.bits()) => {
                 let meanings = (0..1_u64 << field.bits())
                     .map(|raw| meaning.of_converted(Value::Unsigned(raw), &conversion).unwrap_or(NONE));

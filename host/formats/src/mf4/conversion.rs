@@ -21,18 +21,33 @@ const COMMON_LINKS: usize = 4;
 pub(super) enum Conversion {
     /// Themselves.
     None,
-    Linear { offset: f64, factor: f64 },
+    Linear {
+        offset: f64,
+        factor: f64,
+    },
     /// (a x² + b x + c) / (d x² + e x + f).
     Rational([f64; 6]),
     Formula(Box<Formula>),
     /// Pairs of a number and its meaning, in ascending order; between them, the nearest or what lies on a line.
-    Table { pairs: Vec<(f64, f64)>, interpolates: bool },
+    Table {
+        pairs: Vec<(f64, f64)>,
+        interpolates: bool,
+    },
     /// From, to, and what is between.
-    Ranges { ranges: Vec<(f64, f64, f64)>, otherwise: f64 },
+    Ranges {
+        ranges: Vec<(f64, f64, f64)>,
+        otherwise: f64,
+    },
     /// From, to, and what is between.
-    Texts { ranges: Vec<(f64, f64, Outcome)>, otherwise: Outcome },
+    Texts {
+        ranges: Vec<(f64, f64, Outcome)>,
+        otherwise: Outcome,
+    },
     /// What texts stand for.
-    Numbers { texts: Vec<(String, f64)>, otherwise: f64 },
+    Numbers {
+        texts: Vec<(String, f64)>,
+        otherwise: f64,
+    },
     /// Bits, and what they stand for.
     Bits(Vec<(u64, Outcome)>),
 }
@@ -58,7 +73,8 @@ impl Conversion {
         let block = file.block(link, *b"##CC")?;
         let count = usize::from(u16_at(&block.data, 6));
         let there = block.data.len().saturating_sub(VALUES_AT) / 8;
-        let values: Vec<_> = (0..count.min(there)).map(|at| u64_at(&block.data, VALUES_AT + 8 * at)).collect();
+        let values: Vec<_> =
+            (0..count.min(there)).map(|at| u64_at(&block.data, VALUES_AT + 8 * at)).collect();
         let refs = block.links.get(COMMON_LINKS..).unwrap_or_default();
         let number = |at: usize| values.get(at).map(|bits| f64::from_bits(*bits));
         let kind = block.data.first().copied().unwrap_or(0);
@@ -113,7 +129,10 @@ impl Conversion {
             10 => return Err(Fault::Unsupported("a conversion of texts to texts".into())),
             _ => {
                 let found = format!("type {kind}");
-                return Err(Fault::malformed(format!("a conversion of a known type at {link:#x}"), found.as_bytes()));
+                return Err(Fault::malformed(
+                    format!("a conversion of a known type at {link:#x}"),
+                    found.as_bytes(),
+                ));
             }
         })
     }
@@ -200,10 +219,11 @@ fn looked_up(pairs: &[(f64, f64)], x: f64, interpolates: bool) -> Option<f64> {
 
 /// The texts of all bits, as the standard joins them.
 fn joined(bits: &[(u64, Outcome)], number: u64) -> String {
-    let texts = bits.iter().filter_map(|(mask, outcome)| match outcome.apply(Value::Unsigned(number & mask))? {
-        Value::Text(text) if !text.is_empty() => Some(text),
-        _ => None,
-    });
+    let texts =
+        bits.iter().filter_map(|(mask, outcome)| match outcome.apply(Value::Unsigned(number & mask))? {
+            Value::Text(text) if !text.is_empty() => Some(text),
+            _ => None,
+        });
     texts.collect::<Vec<_>>().join("|")
 }
 
@@ -220,9 +240,14 @@ mod tests {
         let pairs = vec![(8.0, 8.0), (9.0, 12.0), (11.0, 20.0)];
         let nearest = Conversion::Table { pairs: pairs.clone(), interpolates: false };
         let line = Conversion::Table { pairs, interpolates: true };
-        for (x, near, on_line) in
-            [(0.0, 8.0, 8.0), (8.5, 8.0, 10.0), (8.6, 12.0, 10.4), (9.0, 12.0, 12.0), (10.5, 20.0, 18.0), (99.0, 20.0, 20.0)]
-        {
+        for (x, near, on_line) in [
+            (0.0, 8.0, 8.0),
+            (8.5, 8.0, 10.0),
+            (8.6, 12.0, 10.4),
+            (9.0, 12.0, 12.0),
+            (10.5, 20.0, 18.0),
+            (99.0, 20.0, 20.0),
+        ] {
             assert_eq!(of(&nearest, x), near, "{x}");
             assert!((of(&line, x) - on_line).abs() < 1e-9, "{x}");
         }

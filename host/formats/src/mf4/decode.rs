@@ -184,7 +184,8 @@ fn collect(
         }
     }
     if open & OPEN_LENGTH == 0
-        && let Some(at) = after_blocks(file)? {
+        && let Some(at) = after_blocks(file)?
+    {
         first.push_back(Found::Issue(Place::Offset(at), joined(at)));
     }
     Ok(())

@@ -14,11 +14,20 @@ pub(super) struct Field {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Kind {
-    Integer { big_endian: bool, signed: bool },
-    Float { big_endian: bool },
+    Integer {
+        big_endian: bool,
+        signed: bool,
+    },
+    Float {
+        big_endian: bool,
+    },
     /// ISO 8859-1 or UTF-8.
-    Text { is_latin: bool },
-    Utf16 { big_endian: bool },
+    Text {
+        is_latin: bool,
+    },
+    Utf16 {
+        big_endian: bool,
+    },
     Bytes,
 }
 
@@ -152,7 +161,9 @@ impl Field {
             Kind::Utf16 { big_endian } => {
                 let units = self.bytes(record)?.chunks_exact(2).filter_map(<[u8]>::first_chunk);
                 let units =
-                    units.map(|unit| if big_endian { u16::from_be_bytes(*unit) } else { u16::from_le_bytes(*unit) });
+                    units.map(
+                        |unit| if big_endian { u16::from_be_bytes(*unit) } else { u16::from_le_bytes(*unit) },
+                    );
                 let units: Vec<_> = units.take_while(|unit| *unit != 0).collect();
                 Some(Value::Text(String::from_utf16_lossy(&units)))
             }

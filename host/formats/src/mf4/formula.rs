@@ -213,7 +213,9 @@ mod tests {
     fn what_is_no_formula_or_too_deep_is_refused() {
         let deep = ["(".repeat(1000), "1".into(), ")".repeat(1000)].concat();
         let long = "1+".repeat(1000);
-        for text in ["", "X+", "(X", "X)", "foo(X)", "sin X", "1..2", "Y", "X X", &deep, &"-".repeat(1000), &long] {
+        for text in
+            ["", "X+", "(X", "X)", "foo(X)", "sin X", "1..2", "Y", "X X", &deep, &"-".repeat(1000), &long]
+        {
             assert_eq!(text.parse::<Formula>(), Err(()), "{text}");
         }
     }

@@ -57,6 +57,9 @@ pub(super) fn after_blocks(file: &mut Whole) -> io::Result<Option<u64>> {
 pub(super) fn joined(at: u64) -> Fault {
     Fault::Malformed {
         expected: "the end of the file".into(),
-        found: format!("another MDF file behind it, which is not read; `tail -c +{} FILE` gives it alone", at + 1),
+        found: format!(
+            "another MDF file behind it, which is not read; `tail -c +{} FILE` gives it alone",
+            at + 1
+        ),
     }
 }

@@ -11,10 +11,13 @@ use cantap_trace::{Direction, TraceEvent, TraceRecord};
 impl BusGroup {
     /// Whether its records alone say everything about their events.
     pub(super) fn says_everything(&self) -> bool {
-        let parts = [&self.bus_channel, &self.ide, &self.dir, &self.edl, &self.brs, &self.esi, &self.error_type];
+        let parts =
+            [&self.bus_channel, &self.ide, &self.dir, &self.edl, &self.brs, &self.esi, &self.error_type];
         let parts = parts.into_iter().flatten().map(Number::validity);
         let mut validities = parts.chain(self.needed.iter().chain(&self.lengths).copied());
-        self.apart.is_empty() && self.times.is_none() && validities.all(|validity| validity == Validity::Always)
+        self.apart.is_empty()
+            && self.times.is_none()
+            && validities.all(|validity| validity == Validity::Always)
     }
 
     /// Whether the bits behind a record's values say that there is no event in it.

@@ -56,7 +56,9 @@ impl Meaning {
         match (self, value) {
             (_, Value::Text(text)) => self.of_text(text.trim()),
             (Self::Number, value) => value.whole(),
-            (_, value) => value.number().filter(|number| !number.is_nan()).map(|number| u64::from(number != 0.0)),
+            (_, value) => {
+                value.number().filter(|number| !number.is_nan()).map(|number| u64::from(number != 0.0))
+            }
         }
     }
 

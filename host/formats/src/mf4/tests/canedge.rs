@@ -89,7 +89,10 @@ impl Frame {
             if data.starts_with('R') { Vec::new() } else { (0..data.len()).step_by(2).map(hex).collect() };
         let code = match data.strip_prefix('R') {
             Some(code) => code.parse().unwrap(),
-            None => cantap_trace::fd::FD_LENGTHS.iter().position(|len| usize::from(*len) == bytes.len()).unwrap() as u8,
+            None => {
+                cantap_trace::fd::FD_LENGTHS.iter().position(|len| usize::from(*len) == bytes.len()).unwrap()
+                    as u8
+            }
         };
         let (is_extended, is_remote) = (id.len() == 8, data.starts_with('R'));
         let id = u32::from_str_radix(id, 16).unwrap();
@@ -112,7 +115,12 @@ fn field(name: &'static str, byte: u32, bit: u8, bits: u32) -> Channel {
 /// numbers of nanoseconds.
 fn first_layout(blocks: &mut Blocks, frames: &[Frame]) -> Vec<Group> {
     let ns = conversion(blocks, 1, &[0.0, 1e-9]);
-    let bytes = |values| Channel { kind: VARIABLE, part: ("", 14, 0, 64, BYTES), values, ..field("DataBytes", 0, 0, 0) };
+    let bytes = |values| Channel {
+        kind: VARIABLE,
+        part: ("", 14, 0, 64, BYTES),
+        values,
+        ..field("DataBytes", 0, 0, 0)
+    };
     let group = |number, name: &str, bytes, channels| {
         let (time, data) = ((("", 0, 0, 64, FLOAT), ns), Vec::new());
         Group { number, name: name.into(), bytes, time, channels, records: 0, data, values: Vec::new() }
@@ -130,9 +138,11 @@ fn first_layout(blocks: &mut Blocks, frames: &[Frame]) -> Vec<Group> {
     let flags = [field("EDL", 13, 0, 1), field("ESI", 13, 2, 1), field("BRS", 13, 1, 1), bytes(2)];
     let mut data = group(1, "CAN_DataFrame", 22, parts().into_iter().chain(flags).collect());
     let mut remote = group(4, "CAN_RemoteFrame", 14, parts());
-    let mut errors = group(3, "CAN_ErrorFrame", 9, vec![field("BusChannel", 8, 0, 2), field("ErrorType", 8, 2, 6)]);
+    let mut errors =
+        group(3, "CAN_ErrorFrame", 9, vec![field("BusChannel", 8, 0, 2), field("ErrorType", 8, 2, 6)]);
     let lin_bytes = Channel { part: ("", 11, 0, 64, BYTES), ..field("DataBytes", 0, 0, 0) };
-    let mut lin = group(6, "LIN_Frame", 19, vec![field("BusChannel", 8, 0, 2), field("ID", 8, 2, 6), lin_bytes]);
+    let mut lin =
+        group(6, "LIN_Frame", 19, vec![field("BusChannel", 8, 0, 2), field("ID", 8, 2, 6), lin_bytes]);
     for frame in frames {
         let group = if frame.is_remote { &mut remote } else { &mut data };
         group.records += 1;
@@ -151,7 +161,10 @@ fn first_layout(blocks: &mut Blocks, frames: &[Frame]) -> Vec<Group> {
     errors.records = 1;
     errors.data = [&1_500_000_f64.to_le_bytes()[..], &[2 << 2 | 1]].concat();
     lin.records = 2;
-    lin.data = [1_600_000_f64, 1_700_000_f64].iter().flat_map(|time| [&time.to_le_bytes()[..], &[0xFD; 11]].concat()).collect();
+    lin.data = [1_600_000_f64, 1_700_000_f64]
+        .iter()
+        .flat_map(|time| [&time.to_le_bytes()[..], &[0xFD; 11]].concat())
+        .collect();
     vec![data, errors, remote, lin]
 }
 
@@ -196,11 +209,17 @@ fn second_layout(blocks: &mut Blocks, frames: &[Frame]) -> Vec<Group> {
                 "RTR" => bytes_at,
                 "FD_DLC_over_8" => {
                     let part = ("", bytes_at, 0, 32, BYTES);
-                    channels.push(Channel { kind: VARIABLE, part, values: number + 1, ..field("DataBytes", 0, 0, 0) });
+                    channels.push(Channel {
+                        kind: VARIABLE,
+                        part,
+                        values: number + 1,
+                        ..field("DataBytes", 0, 0, 0)
+                    });
                     bytes_at + 4
                 }
                 _ => {
-                    channels.push(Channel { part: ("", bytes_at, 0, 64, BYTES), ..field("DataBytes", 0, 0, 0) });
+                    channels
+                        .push(Channel { part: ("", bytes_at, 0, 64, BYTES), ..field("DataBytes", 0, 0, 0) });
                     bytes_at + 8
                 }
             };

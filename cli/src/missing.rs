@@ -17,18 +17,25 @@ pub struct Missing {
     pub left_out: LeftOut,
     /// Records that were read.
     pub entries: u64,
+    /// Whether compressed data end early or are damaged, so that nobody knows how much was in the rest.
+    pub unknown: bool,
 }
 
 impl Missing {
     /// For what has been read so far.
     pub fn of(reader: &TraceReader) -> Self {
-        Self { issues: reader.issues(), left_out: reader.left_out().clone(), entries: reader.records() }
+        Self {
+            issues: reader.issues(),
+            left_out: reader.left_out().clone(),
+            entries: reader.records(),
+            unknown: reader.is_of_unknown_length(),
+        }
     }
 
-    /// The percentage of the file's entries that is missing; an issue counts as one entry.
-    pub fn share_pct(&self) -> f64 {
+    /// The percentage of the file's entries that is missing; an issue counts as one entry. `None` if nobody can know.
+    pub fn share_pct(&self) -> Option<f64> {
         let missing = self.issues + self.left_out.total();
-        missing as f64 * 100.0 / (self.entries + missing).max(1) as f64
+        (!self.unknown).then(|| missing as f64 * 100.0 / (self.entries + missing).max(1) as f64)
     }
 
     /// Adds those of another file.
@@ -36,6 +43,7 @@ impl Missing {
         self.issues += other.issues;
         self.left_out.merge(&other.left_out);
         self.entries += other.entries;
+        self.unknown |= other.unknown;
     }
 
     /// Adds the members that every object with `--json` has about what was read.
@@ -55,11 +63,11 @@ impl Missing {
         let kinds: Vec<_> = self.left_out.iter().map(|(what, count)| format!("{what} ({count})")).collect();
         let kinds = (!kinds.is_empty()).then(|| format!("no part of a CAN trace: {}", kinds.join(", ")));
         let all: Vec<_> = places.into_iter().chain(kinds).collect();
-        let few = if self.share_pct() < 0.05 {
-            "less than 0.1".to_owned()
-        } else {
-            format!("{:.1}", self.share_pct())
+        let share = match self.share_pct() {
+            None => "its compressed data end early, so nobody knows how much is missing".to_owned(),
+            Some(share) if share < 0.05 => "less than 0.1 % of the file left out".to_owned(),
+            Some(share) => format!("{share:.1} % of the file left out"),
         };
-        (!all.is_empty()).then(|| format!("{}; {few} % of the file left out", all.join("; ")))
+        (!all.is_empty()).then(|| format!("{}; {share}", all.join("; ")))
     }
 }

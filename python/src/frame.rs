@@ -1,7 +1,10 @@
 //! Frames and records, for Python.
 
 use cantap_columns::FrameColumns;
-use cantap_trace::{BusErrorKind, Direction, Frame as ClassicFrame, Id, LossStage, TraceEvent, TraceFrame, TraceRecord, TransmitFailure};
+use cantap_trace::{
+    BusErrorKind, Direction, Frame as ClassicFrame, Id, LossStage, TraceEvent, TraceFrame, TraceRecord,
+    TransmitFailure,
+};
 use pyo3::exceptions::{PyOverflowError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;

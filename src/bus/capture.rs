@@ -188,11 +188,13 @@ impl<'q, const N: usize> Capture<'q, N> {
                 state.gaps.overrun(traffic);
                 Self::record_gap(state, &mut self.recorder, channel, at);
             }
+            let is_new = state.gaps.may_be_releasing();
             let mut taken = 0;
             for _ in 0..u32::from(pending).min(room) {
                 let Some(frame) = traffic.receive() else { break };
                 room -= 1;
                 taken += 1;
+                let at = if is_new { self.recorder.time(clock.now()) } else { at };
                 state.frames = state.frames.wrapping_add(1);
                 reply |= state.transmitter.on_frame(&frame);
                 let received = Received {

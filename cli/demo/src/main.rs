@@ -15,9 +15,15 @@ struct Cli {
 fn main() -> ExitCode {
     match cantap_demo::run(&Cli::parse().args, &cantap_demo::trace_file) {
         Ok(code) => code,
+        // `cargo demo | head` has read enough.
+        Err(error) if error.chain().any(is_broken_pipe) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("cantap: {error:#}");
             ExitCode::FAILURE
         }
     }
+}
+
+fn is_broken_pipe(cause: &(dyn std::error::Error + 'static)) -> bool {
+    cause.downcast_ref().is_some_and(|error: &std::io::Error| error.kind() == std::io::ErrorKind::BrokenPipe)
 }

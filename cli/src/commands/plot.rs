@@ -52,6 +52,10 @@ pub struct Args {
     /// The bit rate for the load, such as 500k, or 2:250k for one channel.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", requires = "bus_load", add = completion::bit_rates())]
     bitrates: Vec<ChannelBitrate>,
+    /// The bit rate of the data phase of CAN FD frames that switch, such as 2M, or 2:5M for one channel. Without it, the load of windows with
+    /// such frames is not known.
+    #[arg(long = "data-bitrate", value_name = "[CHANNEL:]RATE", requires = "bitrates", add = completion::bit_rates())]
+    data_bitrates: Vec<ChannelBitrate>,
     /// Length of the load's windows.
     #[arg(short, long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration)]
     window: Duration,
@@ -138,10 +142,32 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
                 "a filter hides part of the bus's load; leave -f out, or give only a channel, as -f can0",
             ));
         }
-        let options = Options { window: args.window, ..ChannelBitrate::options(&args.bitrates) };
+        let data = ChannelBitrate::options(&args.data_bitrates);
+        let options = Options {
+            window: args.window,
+            data_bitrate_bps: data.bitrate_bps,
+            channel_data_bitrate_bps: data.channel_bitrate_bps,
+            ..ChannelBitrate::options(&args.bitrates)
+        };
         let mut collector = LoadCollector::new(options)?;
         let read = for_each(args, |record| collector.push(record))?;
-        return Ok((dated(collector.finish(title("bus load")), read.first_ns), read));
+        let (plot, unknown) = collector.finish_counting(title("bus load"));
+        if plot.is_empty() && unknown > 0 {
+            bail!(
+                "the load of none of the {unknown} windows is known: there are CAN FD frames that switch their bit rate; give it with \
+                 --data-bitrate, such as --data-bitrate 2M"
+            );
+        }
+        if plot.is_empty() {
+            bail!("there is nothing to draw in {name}{}", within(args));
+        }
+        if unknown > 0 {
+            eprintln!(
+                "cantap: {unknown} windows are not drawn: they have CAN FD frames that switch their bit rate, or the channel has no bit rate; \
+                 give them with --data-bitrate and -b"
+            );
+        }
+        return Ok((dated(plot, read.first_ns), read));
     }
     if let Some(id) = args.timing {
         let mut collector = TimingCollector::new(id);
@@ -161,7 +187,7 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
     let mut collector = SignalCollector::new(&decoder).with_most_curves(args.curves);
     let mut read = for_each(args, |record| collector.push(record))?;
     if collector.is_empty() {
-        bail!("none of the signals is in {name}; `cantap decode` shows what is");
+        bail!("none of the signals is in {name}{}; `cantap decode` shows what is", within(args));
     }
     read.not_drawn = collector.left_out();
     if read.not_drawn > 0 {
@@ -171,6 +197,11 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
         );
     }
     Ok((dated(collector.finish(title("signals")), read.first_ns), read))
+}
+
+/// Where nothing was found, if that is only a part of the trace.
+fn within(args: &Args) -> &'static str {
+    if args.start.is_some() || args.end.is_some() { " between --start and --end" } else { "" }
 }
 
 /// Reads the part of the trace to be drawn.

@@ -174,7 +174,7 @@ fn write_json(
     let object = serde_json::to_string(summary)?;
     let members = object.strip_suffix('}').context("a summary is an object")?;
     let (issues, left_out) = (missing.issues, serde_json::to_string(&by_kind(&missing.left_out))?);
-    let share = missing.share_pct();
+    let share = missing.share_pct().map_or("null".to_owned(), |share| share.to_string());
     let members = format!("{members},\"issues\":{issues},\"left_out\":{left_out},\"missing_pct\":{share}");
     let protocols = known.map_or(String::new(), |known| format!(",\"protocols\":{}", known.object()));
     let members = members + &protocols;

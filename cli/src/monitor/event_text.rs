@@ -23,7 +23,7 @@ pub fn event_text(event: &TraceEvent) -> String {
         TraceEvent::State { state, counters: at } => format!("S controller {}{}", state.name(), counters(at)),
         TraceEvent::Lost { stage, count, at_least } => {
             let stage = stage.map_or("unknown", LossStage::name);
-            format!("L {} frames lost, stage {stage}", lost(count, at_least))
+            format!("L {} frames lost ({stage})", lost(count, at_least))
         }
         TraceEvent::TransmitFailed { tag, reason } => {
             format!("F frame {tag} not sent: {}", failure_text(reason))

@@ -290,7 +290,7 @@ fn errors_are_captured_by_kind_and_a_broken_bus_does_not_flood_the_link() {
         (details(" 20000288#"), details(" 20000080#"))
     };
     let (destroyed, _) = capture("errors=50,load=80");
-    for (kind, part) in [("stuff", "00000400"), ("form", "00000200"), ("CRC", "00000008")] {
+    for (kind, part) in [("stuff", "00000400"), ("form", "00000200"), ("crc", "00000008")] {
         assert!(destroyed.iter().any(|data| data.starts_with(part)), "no {kind} error in {destroyed:?}");
     }
     // An unacknowledged frame ends in the sender's error flag, repeatedly.

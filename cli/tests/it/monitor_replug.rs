@@ -41,7 +41,7 @@ fn an_unplugged_device_is_missed_and_goes_on_when_it_is_back() {
     view.keys("2");
     view.wait_for("Period ms");
     view.keys("1");
-    let trace = view.wait_for("an unknown number of frames lost on the way to the host");
+    let trace = view.wait_for("an unknown number of frames lost (link)");
     assert!(trace.contains("ttyACM0"), "{trace}");
     view.keys("5");
     std::thread::sleep(std::time::Duration::from_millis(1500));

@@ -158,7 +158,7 @@ fn a_replay_and_a_send_count_what_did_not_go_out_by_reason() {
     });
     assert_eq!((&replayed["left_out"], &replayed["issues"]), (&kinds, &0.into()));
     let sent = json("send -d virtual:load=0,ack=no 1 123#11 -n 2 --one-shot", 1);
-    assert_eq!((&sent["not_sent"], &sent["left_out"]["bus error"]), (&2.into(), &2.into()), "{sent}");
+    assert_eq!((&sent["not_sent"], &sent["left_out"]["bus-error"]), (&2.into(), &2.into()), "{sent}");
     let sent = json("send -d virtual:load=0,ack=no 1 123#11", 1);
     assert_eq!(
         (&sent["not_sent"], &sent["left_out"]["never left the device"]),

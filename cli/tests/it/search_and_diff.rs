@@ -104,7 +104,7 @@ fn what_is_no_frame_is_told_in_words() {
     let words: Vec<&str> = found.lines().map(|line| line.split_once("can0 ").unwrap().1).collect();
     assert_eq!(
         words,
-        ["bus error: bit (recessive sent)", "controller: passive", "not sent: arbitration lost", "123#11"]
+        ["bus error: bit-recessive", "controller: passive", "not sent: arbitration-lost", "123#11"]
     );
 }
 

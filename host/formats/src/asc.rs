@@ -5,6 +5,7 @@
 //! other buses, markers) is counted by kind. Dates are taken as UTC.
 
 mod content;
+mod date;
 mod decode;
 mod encode;
 mod others;
@@ -179,6 +180,35 @@ mod tests {
              (1506783974.191000) can0 123##0000102030405060708090A0B\n(1506783974.191000) can0 123##1\n"
         );
         assert_eq!(issues.len(), 2, "{issues:?}");
+    }
+
+    /// From real files: nothing behind the bytes, decimal codes of the length, remote frames whose sender was error passive.
+    #[test]
+    fn fd_lines_without_trailing_columns_and_with_decimal_codes_and_remote_frames_are_read() {
+        let (log, issues) = as_log(
+            "1.0 CANFD   1 Rx        124                                   0 0 2  2 33 44\n\
+             1.0 CANFD   1 Tx  456x 1 0 9 12 00 01 02 03 04 05 06 07 08 09 0A 0B\n\
+             1.0 CANFD 2 Rx 201 SomeMsg 0 0 2 2 AA BB\n1.0 CANFD 1 Rx 124 0 0 2 2 33 44 0 0\n\
+             1.0 CANFD 1 Rx 124 0 0 10 16 00 01 02 03 04 05 06 07 08 09 0A 0B 0C 0D 0E 0F 0 0 1000\n\
+             1.0 CANFD 3 Tx 50005x 0 1 5 0 140000 73 200050 7a60\n1.0 CANFD 1 Rx 124 0 0 3 2 33 44\n",
+        );
+        assert_eq!(
+            log,
+            "(1506783974.191000) can0 124##03344\n(1506783974.191000) can0 00000456##1000102030405060708090A0B T\n\
+             (1506783974.191000) can1 201##0AABB\n(1506783974.191000) can0 124##03344\n\
+             (1506783974.191000) can0 124##0000102030405060708090A0B0C0D0E0F\n(1506783974.191000) can2 00050005#R5 T\n"
+        );
+        assert_eq!(issues.len(), 1, "{issues:?}");
+        let head = HEAD.replace("base hex", "base dec");
+        let (records, issues) = tests::read(
+            Format::Asc,
+            format!("{head}1.0 CANFD 1 Rx 291 1 0 9 12 0 1 2 3 4 5 6 7 8 9 10 255 102203 133 303000\n"),
+        );
+        assert_eq!(issues, Vec::<String>::new());
+        assert_eq!(
+            tests::write(Format::Candump, &records),
+            "(1506783974.191000) can0 123##1000102030405060708090AFF\n"
+        );
     }
 
     #[test]

@@ -69,7 +69,14 @@ impl RowFormat for Decoder {
         let len = super::frame_fields::length_code(len)?;
         let fields = FrameFields { id, remote, direction, len, fd: None };
         let byte = if self.decimal { decimal_byte } else { hex_byte };
-        let data = Payload::exactly(words, fields.data_len(), byte)?;
+        let data = if remote {
+            // A few versions write the requested length as zeros, which nobody sent.
+            let written = words.clone().count().min(usize::from(len));
+            Payload::words(&mut words, written, byte)?;
+            Payload::exactly(words, 0, byte)?
+        } else {
+            Payload::exactly(words, fields.data_len(), byte)?
+        };
         Ok(Line::Record(TraceRecord { time_ns, channel, event: fields.event(&data)? }))
     }
 
@@ -188,6 +195,18 @@ mod tests {
             "(1407542399.942000) can0 023#40\n(1407542400.000100) can1 18DAF110#03E0 T\n\
              (1407542401.500000) can0 460#R4\n(1407542401.500000) can0 00000460#R\n"
         );
+    }
+
+    /// As real logs have them.
+    #[test]
+    fn bytes_behind_remote_frames_are_those_of_their_length_and_mean_nothing() {
+        let (log, issues) = as_log(&format!(
+            "{}23:59:59:1 Rx 1 0x103 xr 8 00 00 00 00 00 00 00 00 \n23:59:59:1 Rx 1 0x104 sr 2 00 00\n\
+             23:59:59:1 Rx 1 0x104 sr 2 00 00 00\n23:59:59:1 Rx 1 0x104 sr 2 0G 00\n",
+            head("***HEX***\n***SYSTEM MODE***\n")
+        ));
+        assert_eq!(log, "(1407542399.100000) can0 00000103#R8\n(1407542399.100000) can0 104#R2\n");
+        assert_eq!(issues.len(), 2, "{issues:#?}");
     }
 
     #[test]

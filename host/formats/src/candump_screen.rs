@@ -114,7 +114,8 @@ impl RowFormat for Decoder {
     fn line(&mut self, line: &[u8], zone: &Zone) -> Result<Line, Fault> {
         let line = plain(line);
         // The explanation of an error frame (-e) is on the lines below it.
-        if line.is_empty() || line.starts_with(b"\t") {
+        // Comments are those of the people who kept it.
+        if line.is_empty() || line.starts_with(b"\t") || line.starts_with(b"#") {
             return Ok(Line::Nothing);
         }
         let missing = || Fault::malformed("a line of candump such as 'can0  123   [2]  11 22'", &line);

@@ -218,7 +218,14 @@ impl Format {
         {
             Some(Self::Trc(TrcVersion::V2_1))
         } else {
-            None
+            // Comments of the people who kept it come before the log.
+            let mut lines = text.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii_end);
+            let first = lines.find(|line| !line.is_empty() && !line.starts_with(b"#"))?;
+            if candump_screen::is_line(first) {
+                Some(Self::CandumpScreen)
+            } else {
+                first.starts_with(b"(").then_some(Self::Candump)
+            }
         }
     }
 }
@@ -277,6 +284,8 @@ mod tests {
             (utf8("timestamp,arbitration_id,extended\n"), Format::Csv(CsvDialect::PythonCan)),
             (utf8("  can0  123   [8]  11 22 33 44 55 66 77 88\n"), Format::CandumpScreen),
             (utf8(" (000.000000)  can0  RX - -  12345678   [0]\n"), Format::CandumpScreen),
+            (utf8("# drive 3\n\n can0  123   [2]  11 22\n"), Format::CandumpScreen),
+            (utf8("# drive 3\n(1410714882.622188) can0 123#11\n"), Format::Candump),
             (utf8("***BUSMASTER Ver 2.4.0***\n"), Format::Busmaster),
             (utf8("1320745424.000 CXX OVMS converted log\n"), Format::Crtd),
             (utf8("123.431 2R11 27E 00\n"), Format::Crtd),

@@ -58,8 +58,11 @@ impl RowDecoder {
         let len = number.ok_or_else(|| Fault::malformed("a length of 0 to 64", len))? as u8;
         let fd = (len > 8).then(FdFields::default);
         let fields = FrameFields { id: identifier(raw, extended, id)?, remote: false, direction, len, fd };
-        // Some programs write 0x before bytes.
-        let byte = |cell: &[u8]| hex_byte(cell.strip_prefix(b"0x").unwrap_or(cell));
+        // Some programs write 0x before bytes, and some no zero before a single digit.
+        let byte = |cell: &[u8]| match cell.strip_prefix(b"0x").unwrap_or(cell) {
+            [digit] => text::hex_digit(*digit),
+            digits => hex_byte(digits),
+        };
         let data = Payload::words(cells, fields.data_len(), byte)?;
         Ok(Some((TraceRecord { time_ns, channel, event: fields.event(&data)? }, None)))
     }
@@ -199,8 +202,26 @@ mod tests {
     fn bytes_with_0x_in_front_are_read() {
         let file = "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2\n1,0x123,false,Rx,0,2,0x11,0xFF\n2,0x123,false,Rx,0,1,0x1,\n";
         let (records, issues) = tests::read(CSV, file);
-        assert_eq!(tests::write(Format::Candump, &records), "(0.000001) can0 123#11FF\n");
-        assert_eq!(issues, ["test, line 3: expected 1 data bytes, found '0x1'"]);
+        assert_eq!(
+            tests::write(Format::Candump, &records),
+            "(0.000001) can0 123#11FF\n(0.000002) can0 123#01\n"
+        );
+        assert_eq!(issues, Vec::<String>::new());
+    }
+
+    /// As two collections of real files have them, of which most lines were lost.
+    #[test]
+    fn bytes_without_a_leading_zero_are_read() {
+        let file = "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3\n1,123,false,Rx,0,3,3,E8,0,\n2,123,false,Rx,0,3,3,E8,G,\n3,123,false,Rx,0,3,3,E8,0";
+        let (records, issues) = tests::read(CSV, file);
+        assert_eq!(tests::write(Format::Candump, &records), "(0.000001) can0 123#03E800\n");
+        assert_eq!(
+            issues,
+            [
+                "test, line 3: expected 3 data bytes, found 'G'",
+                "test, line 4: the file ends inside a line; everything before it was read",
+            ]
+        );
     }
 
     #[test]

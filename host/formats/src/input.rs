@@ -1,6 +1,7 @@
 //! Where a reader's bytes come from: a file or standard input, plain or compressed, finished or
 //! still growing. One buffer of bounded size; lines are slices of it.
 
+use std::collections::VecDeque;
 use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
@@ -50,6 +51,10 @@ pub(crate) struct Input {
     zone: Zone,
     /// The beginning of a line too long to hold.
     long: Vec<u8>,
+    /// Whether a NUL byte was read, which no text has.
+    has_nul: bool,
+    /// The lines with one, until they are asked for.
+    nul_lines: VecDeque<u64>,
 }
 
 /// One line, without its end.
@@ -101,6 +106,8 @@ impl Input {
             is_as_it_is: true,
             zone: Zone::default(),
             long: Vec::new(),
+            has_nul: false,
+            nul_lines: VecDeque::new(),
         }
     }
 
@@ -215,6 +222,12 @@ impl Input {
         memchr::memchr(b'\n', &self.buffer[self.start..self.end]).is_some()
     }
 
+    /// The next line with a NUL byte that was handed out, once. A text has none: a part of the file was lost there, however well the rest of
+    /// the line reads.
+    pub(crate) fn nul_line(&mut self) -> Option<u64> {
+        self.nul_lines.pop_front()
+    }
+
     /// Whether compressed data ended before its own end mark.
     pub(crate) fn compressed_data_cut(&self) -> bool {
         self.cut
@@ -261,6 +274,9 @@ impl Input {
                     return Ok(false);
                 }
                 Ok(read) => {
+                    // In one go, because nearly no text has any.
+                    let new = &self.buffer[self.end..self.end + read];
+                    self.has_nul = self.has_nul || memchr::memchr(0, new).is_some();
                     self.end += read;
                     return Ok(true);
                 }
@@ -337,6 +353,9 @@ impl Input {
         if let [rest @ .., b'\r'] = text {
             text = rest;
         }
+        if self.has_nul && memchr::memchr(0, text).is_some() {
+            self.nul_lines.push_back(self.lines);
+        }
         Ok(Some(Line { text, number: self.lines, terminated, too_long: false }))
     }
 
@@ -354,6 +373,9 @@ impl Input {
             }
         };
         self.lines += 1;
+        if self.has_nul && self.long.contains(&0) {
+            self.nul_lines.push_back(self.lines);
+        }
         Ok(Line { text: &self.long, number: self.lines, terminated, too_long: true })
     }
 }

@@ -81,6 +81,11 @@ pub struct TraceReader {
     head: Vec<u8>,
 }
 
+/// What is wrong with a line of text that has NUL bytes, such as after a crash.
+fn nul() -> Fault {
+    Fault::Malformed { expected: "text".into(), found: "NUL bytes: a part of the file was lost here".into() }
+}
+
 /// What follows a batch of records.
 enum Beyond {
     Batch,
@@ -195,11 +200,15 @@ impl TraceReader {
 
     /// Whether nothing of the file could be read so far although it is not empty.
     pub fn nothing_read(&self) -> Option<NothingRead> {
-        let something = self.issues > 0 || !self.left_out.is_empty();
+        // Without a head, comments alone show nothing of a format.
+        let only_comments = !self.format.has_head() && !self.head.is_empty();
+        let something = self.issues > 0 || !self.left_out.is_empty() || only_comments;
         (self.records == 0 && something).then(|| NothingRead {
             file: self.name.clone(),
             format: self.format,
-            looks_like: if self.issues == 0 {
+            looks_like: if self.issues == 0 && self.left_out.is_empty() {
+                "a text without a single frame, such as comments".to_owned()
+            } else if self.issues == 0 {
                 let kinds: Vec<_> =
                     self.left_out.iter().map(|(what, count)| format!("{what} ({count})")).collect();
                 format!("{} without traffic of CAN: {}", self.format, kinds.join(", "))
@@ -221,6 +230,11 @@ impl TraceReader {
             && self.at == self.batch.len()
             && self.after.is_none()
             && !(self.decoder.needs_one_line() && self.input.has_line())
+    }
+
+    /// Whether the file's compressed data are damaged or end early, so that nobody can say how much of it is missing.
+    pub fn is_of_unknown_length(&self) -> bool {
+        self.input.compressed_data_cut() || self.input.damage().is_some()
     }
 
     /// Number of issues so far.
@@ -250,6 +264,11 @@ impl TraceReader {
         if self.ended {
             return Beyond::End;
         }
+        if self.after.is_none()
+            && let Some(line) = self.input.nul_line()
+        {
+            return Beyond::Issue(self.issue(Place::Line(line), nul()));
+        }
         let Some(after) = self.after.take() else {
             self.batch.clear();
             self.at = 0;
@@ -272,8 +291,22 @@ impl TraceReader {
                 self.left_out.note(what);
                 Beyond::Batch
             }
-            Ok(Found::Issue(place, fault)) => Beyond::Issue(self.issue(place, fault)),
+            Ok(Found::Issue(place, fault)) => {
+                // Those before it come first, and one is said to be wrong once.
+                match self.input.nul_line() {
+                    Some(line) if place == Place::Line(line) => Beyond::Issue(self.issue(place, nul())),
+                    Some(line) => {
+                        self.after = Some(Ok(Found::Issue(place, fault)));
+                        Beyond::Issue(self.issue(Place::Line(line), nul()))
+                    }
+                    None => Beyond::Issue(self.issue(place, fault)),
+                }
+            }
             Ok(Found::End) => {
+                if let Some(line) = self.input.nul_line() {
+                    self.after = Some(Ok(Found::End));
+                    return Beyond::Issue(self.issue(Place::Line(line), nul()));
+                }
                 self.ended = true;
                 if let Some(damage) = self.input.damage() {
                     let fault = Fault::malformed("undamaged compressed data to the end", damage.as_bytes());

@@ -151,8 +151,9 @@ impl Packets {
             (Says::Fd, _) => true,
             (Says::Classic, _) => false,
             _ if len > 8 => true,
-            (Says::Nothing, PACKET_BYTES) => false,
             (Says::Nothing, FD_PACKET_BYTES) => true,
+            // A classical frame is padded to eight bytes, but nobody pads eight.
+            (Says::Nothing, PACKET_BYTES) if len < 8 || self.dirty => false,
             (Says::Nothing, _) => {
                 let known = FLAG_BRS | FLAG_ESI | FLAG_FDF;
                 flags & FLAG_FDF != 0 && flags & !known == 0 && *padding == 0 && raw_dlc == 0
@@ -249,6 +250,11 @@ mod tests {
         long.truncate(PACKET_BYTES);
         long[5] = FLAG_FDF;
         assert_eq!(read(&mut packets, &long), "123#ABCD");
+        long[4] = 8;
+        assert_eq!(read(&mut packets, &long), "123##0ABCD000000000000", "nothing of it is padding");
+        long[7] = 9;
+        assert_eq!(read(&mut packets, &long), "123#ABCD000000000000", "nor a flag, where something else is");
+        long[7] = 0;
         long[4] = 12;
         long.resize(8 + 12, 0);
         assert_eq!(read(&mut packets, &long), "123##0ABCD00000000000000000000");

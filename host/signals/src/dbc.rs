@@ -22,8 +22,10 @@ use super::{layout, validate};
 ///
 /// A message with a fault that would make values wrong is left out, with a warning. It is an error if nothing is left.
 pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
-    let text = dbc_text::decode(bytes);
-    let mut faults = Vec::new();
+    let (text, encoding) = dbc_text::decode(bytes);
+    let text = dbc_text::with_receivers(&text);
+    let unusual = encoding.map(|name| FaultKind::Encoding(name).of_whole_file());
+    let mut faults: Vec<_> = unusual.into_iter().collect();
     let Some((dbc, index)) = dbc_parse::parse(&text, &mut faults) else {
         faults.retain(|fault| !fault.kind.is_warning());
         return Err(DatabaseError::Faulty { file: file.to_owned(), faults });

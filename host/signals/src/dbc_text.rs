@@ -7,6 +7,8 @@ use std::borrow::Cow;
 use std::collections::HashMap;
 use std::ops::Range;
 
+use can_dbc::encodings;
+
 /// Statements that do not affect how frames are decoded.
 const NEEDLESS: &[&str] = &[
     "VERSION",
@@ -45,14 +47,84 @@ const NEEDLESS: &[&str] = &[
 /// Statements that do.
 const NEEDED: &[&str] = &["BO_", "SG_", "VAL_", "SIG_VALTYPE_", "SG_MUL_VAL_"];
 
-/// DBC files are in Windows' Western code page; newer tools write UTF-8. Lines that end with a carriage return alone get a line feed.
-pub fn decode(bytes: &[u8]) -> Cow<'_, str> {
-    let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
-    let text = match str::from_utf8(bytes) {
-        Ok(text) => Cow::Borrowed(text),
-        Err(_) => can_dbc::encodings::WINDOWS_1252.decode_without_bom_handling(bytes).0,
+/// The text, and how it is encoded if that is neither of the usual ways: DBC files are in Windows' Western code page, and newer tools write UTF-8.
+/// Lines that end with a carriage return alone get a line feed.
+pub fn decode(bytes: &[u8]) -> (Cow<'_, str>, Option<&'static str>) {
+    let encoding = unusual(bytes);
+    let text = match encoding {
+        Some(encoding) => encoding.decode(bytes).0,
+        None => {
+            let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
+            match str::from_utf8(bytes) {
+                Ok(text) => Cow::Borrowed(text),
+                Err(_) => encodings::WINDOWS_1252.decode_without_bom_handling(bytes).0,
+            }
+        }
     };
-    if text.contains('\r') && !text.contains('\n') { text.replace('\r', "\n").into() } else { text }
+    let text =
+        if text.contains('\r') && !text.contains('\n') { text.replace('\r', "\n").into() } else { text };
+    (text, encoding.map(encodings::Encoding::name))
+}
+
+/// UTF-16 by its mark or by the zeros in its first characters, which are ASCII; and Shift-JIS.
+fn unusual(bytes: &[u8]) -> Option<&'static encodings::Encoding> {
+    match bytes {
+        [0xFF, 0xFE, ..] | [(1..=0xFF), 0, (1..=0xFF), 0, ..] => Some(encodings::UTF_16LE),
+        [0xFE, 0xFF, ..] | [0, (1..=0xFF), 0, (1..=0xFF), ..] => Some(encodings::UTF_16BE),
+        _ if str::from_utf8(bytes).is_err() && is_shift_jis(bytes) => Some(encodings::SHIFT_JIS),
+        _ => None,
+    }
+}
+
+/// Whether bytes that are not ASCII are pairs of Shift-JIS, as nearly all Japanese text is. Each of the Western code page could be one, too, but there
+/// letters with accents stand between others, and the bytes that begin most pairs are marks, which are rare.
+fn is_shift_jis(bytes: &[u8]) -> bool {
+    let (mut pairs, mut others) = (0, 0);
+    let mut rest = bytes;
+    while let [first, after @ ..] = rest {
+        rest = after;
+        match (first, after) {
+            (0..=0x7F, _) => {}
+            (0x81..=0x9F | 0xE0..=0xFC, [second @ (0x40..=0x7E | 0x80..=0xFC), behind @ ..]) => {
+                // In the other code page these are two marks, or a mark and a letter with an accent.
+                let is_clear = *first <= 0x9F && *second >= 0x80
+                    || matches!(first, 0x81 | 0x83 | 0x8D | 0x8F | 0x90 | 0x9D);
+                if is_clear {
+                    pairs += 1
+                } else {
+                    others += usize::from(*first > 0x9F)
+                }
+                rest = behind;
+            }
+            _ => others += 1,
+        }
+    }
+    pairs > 0
+        && pairs >= others
+        && encodings::SHIFT_JIS.decode_without_bom_handling_and_without_replacement(bytes).is_some()
+}
+
+/// The text with a receiver in each definition of a signal: some programs write none where nobody receives it, and can-dbc wants one.
+pub fn with_receivers(text: &str) -> Cow<'_, str> {
+    const NOBODY: &str = " Vector__XXX";
+    let mut out = String::new();
+    let (mut in_string, mut used, mut offset) = (false, 0, 0);
+    for line in text.split_inclusive('\n') {
+        let content = line.trim_end();
+        let is_definition = !in_string && content.trim_start().starts_with("SG_ ") && content.contains('@');
+        in_string = ends_in_string(line, in_string);
+        if is_definition && !in_string && content.ends_with('"') {
+            out.push_str(&text[used..offset + content.len()]);
+            out.push_str(NOBODY);
+            used = offset + content.len();
+        }
+        offset += line.len();
+    }
+    if used == 0 {
+        return Cow::Borrowed(text);
+    }
+    out.push_str(&text[used..]);
+    out.into()
 }
 
 /// A statement's place in the text.
@@ -193,6 +265,54 @@ mod tests {
                         CM_ BO_ 5 \"BO_ 6 \\\"No\\\"\nBO_ 7 Neither: 8 A\";\nBO_ 8 Last : 8 A\n SG_ One m0 : 0|8@1+ (1,0) [0|0] \"\" A\n";
 
     #[test]
+    fn utf_16_and_shift_jis_are_known_by_their_bytes_and_western_text_stays() {
+        let text = "BO_ 5 First: 8 A\r\n SG_ One : 0|8@1+ (1,0) [0|0] \"°C\" A\r\n";
+        let little: Vec<u8> = text.encode_utf16().flat_map(u16::to_le_bytes).collect();
+        let big: Vec<u8> = text.encode_utf16().flat_map(u16::to_be_bytes).collect();
+        for (bytes, encoding) in [
+            ([&[0xFF, 0xFE][..], &little].concat(), "UTF-16LE"),
+            ([&[0xFE, 0xFF][..], &big].concat(), "UTF-16BE"),
+            (little, "UTF-16LE"),
+            (big, "UTF-16BE"),
+        ] {
+            assert_eq!(decode(&bytes), (text.into(), Some(encoding)));
+        }
+        for japanese in ["温度", "車速 [km/h]", "エンジン回転数", "℃", "ﾄﾞｱ 開閉状態"]
+        {
+            let text = format!("CM_ SG_ 5 One \"{japanese}\";\n");
+            let bytes = encodings::SHIFT_JIS.encode(&text).0;
+            assert_eq!(decode(&bytes), (text.as_str().into(), Some("Shift_JIS")));
+        }
+        for western in [
+            "Öltemperatur in °C",
+            "don’t",
+            "“quoted” – naïve",
+            "Größe änderbar",
+            "déjà été",
+            "½ µm²",
+            "ÄÖÜäöüß",
+            "20 €",
+        ] {
+            let text = format!("CM_ SG_ 5 One \"{western}\";\n");
+            let bytes = encodings::WINDOWS_1252.encode(&text).0;
+            assert_eq!(decode(&bytes), (text.as_str().into(), None), "{western}");
+        }
+    }
+
+    #[test]
+    fn signals_without_a_receiver_get_one_and_nothing_else_changes() {
+        let text = "BO_ 5 First: 8 A\n SG_ One : 0|8@1+ (1,0) [0|0] \"\"  \n SG_ Two : 8|8@1+ (1,0) [0|0] \"km/h\"\r\n\
+                    \x20SG_ Three : 16|8@1+ (1,0) [0|0] \"\" A\nCM_ \"\n SG_ Four : 0|8@1+ (1,0) [0|0] \"\"\n";
+        let expected = text.replacen("[0|0] \"\"  \n", "[0|0] \"\" Vector__XXX  \n", 1).replacen(
+            "\"km/h\"\r",
+            "\"km/h\" Vector__XXX\r",
+            1,
+        );
+        assert_eq!(with_receivers(text), expected);
+        assert!(matches!(with_receivers(TEXT), Cow::Borrowed(_)));
+    }
+
+    #[test]
     fn statements_are_found_and_strings_are_not() {
         let index = Index::of(TEXT);
         let found: Vec<_> = index.statements.iter().map(|s| (s.line, s.symbol.as_str())).collect();
@@ -214,5 +334,23 @@ mod tests {
             (12, 9, 13)
         );
         assert_eq!(index.place_at(11), Some(5));
+    }
+
+    #[test]
+    fn kana_alone_are_known_and_western_words_stay() {
+        let bytes = encodings::SHIFT_JIS.encode("VAL_ 1 S 0 \"オフ\" ;").0;
+        assert_eq!(decode(&bytes), ("VAL_ 1 S 0 \"オフ\" ;".into(), Some("Shift_JIS")));
+        for text in [
+            "Fläche größer Öl",
+            "°C",
+            "don’t",
+            "“quoted” text – and more",
+            "température élevée à l’arrêt",
+            "µ ± ² ½",
+            "€ 5",
+        ] {
+            assert_eq!(decode(&encodings::WINDOWS_1252.encode(text).0), (text.into(), None));
+            assert_eq!(decode(text.as_bytes()), (text.into(), None));
+        }
     }
 }

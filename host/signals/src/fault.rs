@@ -159,6 +159,9 @@ pub enum FaultKind {
     /// usable.
     #[error("{0}; the message is left out")]
     LeftOut(Box<FaultKind>),
+    /// The file is not in one of the usual encodings; which one was taken.
+    #[error("the file is read as {0}; if texts look wrong, save it as UTF-8")]
+    Encoding(&'static str),
     /// A float with a length that most programs refuse.
     #[error("a float of {0} bits is unusual; it is read as the upper bits of the next longer one")]
     OddFloat(u16),
@@ -179,7 +182,13 @@ impl FaultKind {
                 | Self::UnknownSymbol
                 | Self::Ignored(_)
                 | Self::LeftOut(_)
+                | Self::Encoding(_)
                 | Self::OddFloat(_)
         )
+    }
+
+    /// The fault that has no line.
+    pub(super) fn of_whole_file(self) -> Fault {
+        Fault { line: 0, symbol: String::new(), kind: self }
     }
 }

@@ -15,7 +15,7 @@ use super::{layout, validate};
 
 /// Parses a SYM file's content; `file` is its name for messages to the user.
 pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
-    let text = dbc_text::decode(bytes);
+    let (text, encoding) = dbc_text::decode(bytes);
     let is_head = |line: &str| line.trim_start().starts_with("FormatVersion");
     if !text.lines().any(is_head) {
         let reason = if text.trim().is_empty() {
@@ -30,7 +30,8 @@ pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
     for (line, content) in statements(&text) {
         reader.statement(line, &content);
     }
-    let mut faults = std::mem::take(&mut reader.faults);
+    let unusual = encoding.map(|name| FaultKind::Encoding(name).of_whole_file());
+    let mut faults: Vec<_> = unusual.into_iter().chain(std::mem::take(&mut reader.faults)).collect();
     let messages = reader.messages(&mut faults);
     validate::finish(file, messages, faults)
 }

@@ -10,24 +10,8 @@ use std::fmt;
 use std::str::FromStr;
 
 use crate::grammar::{self, IdError, IdPattern};
+pub use crate::id_filter::{EXTENDED, IdFilter, REMOTE};
 use crate::{CHANNEL_0, Interface, TraceEvent, TraceFrame, TraceRecord};
-
-/// The flag for an extended identifier, as on Linux.
-pub const EXTENDED: u32 = 1 << 31;
-/// The flag for a remote frame, as on Linux.
-pub const REMOTE: u32 = 1 << 30;
-const STANDARD_BITS: u32 = 0x7FF;
-
-/// One `ID:MASK` or `ID~MASK`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub struct IdFilter {
-    /// The identifier, with [`EXTENDED`] and [`REMOTE`].
-    pub id: u32,
-    /// The bits that are compared.
-    pub mask: u32,
-    /// Accepts whatever does not match.
-    pub inverse: bool,
-}
 
 /// Which records to accept, by channel, ID and kind of error.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Hash)]
@@ -68,22 +52,6 @@ pub enum ParseFilterError {
         "'{0}' is several filters, and with j all of them must match; write it without j, or with a mask"
     )]
     JoinedRange(String),
-}
-
-impl IdFilter {
-    /// The mask as the kernel applies it: a standard ID compared with its format has no bits above the
-    /// eleventh.
-    pub const fn effective_mask(&self) -> u32 {
-        if self.mask & EXTENDED != 0 && self.id & EXTENDED == 0 {
-            self.mask & (STANDARD_BITS | EXTENDED | REMOTE)
-        } else {
-            self.mask
-        }
-    }
-
-    fn accepts(&self, id: u32) -> bool {
-        ((id ^ self.id) & self.effective_mask() == 0) != self.inverse
-    }
 }
 
 impl Filter {

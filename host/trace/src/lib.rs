@@ -13,6 +13,7 @@ mod fd_bits;
 pub mod filter;
 mod frame;
 pub mod grammar;
+mod id_filter;
 mod interface;
 mod length;
 pub mod levels;

@@ -62,6 +62,12 @@ impl Gaps {
         };
     }
 
+    /// Whether a frame may be on its way out: then one that is taken may have come after the last look.
+    #[inline]
+    pub fn may_be_releasing(&self) -> bool {
+        self.since != Since::Nothing
+    }
+
     /// What is missing before the next frame; forgets it.
     #[inline]
     pub const fn here(&mut self) -> Gap {

@@ -36,7 +36,7 @@ fn errors_are_red_and_what_follows_a_loss_is_yellow_with_the_number() {
     let (mut app, _orders) = app(View::Trace);
     let dark = buffer(&mut app, &model);
     assert_eq!(style_of(&dark, "E bus error: crc").0, Color::LightRed);
-    assert_eq!(style_of(&dark, "L 17 frames lost, stage queue").0, Color::Yellow);
+    assert_eq!(style_of(&dark, "L 17 frames lost (queue)").0, Color::Yellow);
     assert_eq!(style_of(&dark, "17 lost before").0, Color::Yellow);
     app.theme.light = true;
     assert_eq!(style_of(&buffer(&mut app, &model), "E bus error: crc").0, Color::Red);

@@ -33,7 +33,14 @@ pub(super) fn lay_out(plot: &Plot, width: u32) -> Scene {
         Scene { width: width as f32, height: 0.0, shapes: Vec::new(), panes: Vec::new(), span: plot.span() };
     let mut top = 12.0;
     if !plot.title.is_empty() {
-        text(&mut scene, (LEFT, 26.0), 17.0, Anchor::Start, INK, &plot.title);
+        fitted(
+            &mut scene,
+            (LEFT, 26.0),
+            17.0,
+            Anchor::Start,
+            INK,
+            (&plot.title, width as f32 - LEFT - RIGHT),
+        );
         top = TITLE_HEIGHT;
     }
     let mut first_curve = 0;
@@ -150,7 +157,8 @@ fn entry(scene: &mut Scene, (x, baseline): (f32, f32), curve: &Curve, number: us
         size: TEXT_SIZE,
         anchor: Anchor::Start,
         colour: INK,
-        text: curve.name.clone(),
+        text: fitting(&curve.name, scene.width - RIGHT - x - 24.0, TEXT_SIZE),
+        full: Some(curve.name.clone()),
         curve: Some(number),
     });
 }
@@ -175,8 +183,52 @@ impl Places {
     }
 
     fn y(&self, value: f64) -> f32 {
-        let share = ((value - self.y.0) / (self.y.1 - self.y.0)).clamp(0.0, 1.0) as f32;
+        self.beyond_y(value).clamp(self.area.top, self.area.bottom)
+    }
+
+    /// The same, also outside the pane.
+    fn beyond_y(&self, value: f64) -> f32 {
+        /// Farther out, positions would lose their precision.
+        const FAR: f64 = 100.0;
+        let share = ((value - self.y.0) / (self.y.1 - self.y.0)).clamp(-FAR, FAR) as f32;
         self.area.bottom - share * (self.area.bottom - self.area.top)
+    }
+
+    /// The stretches of a line that are inside the pane: what is beyond its range is cut off, not drawn along its edge.
+    fn clipped(&self, corners: &[(f32, f32)]) -> Vec<Vec<(f32, f32)>> {
+        let (top, bottom) = (self.area.top, self.area.bottom);
+        let mut stretches: Vec<Vec<(f32, f32)>> = Vec::new();
+        if let [(x, y)] = corners {
+            return if (top..=bottom).contains(y) { vec![vec![(*x, *y)]] } else { Vec::new() };
+        }
+        let mut goes_on = false;
+        for pair in corners.windows(2) {
+            let ((x0, y0), (x1, y1)) = (pair[0], pair[1]);
+            // Which part of this piece, from 0 to 1, is inside.
+            let (mut from, mut to) = (0.0_f32, 1.0_f32);
+            let delta = y1 - y0;
+            if delta == 0.0 {
+                if !(top..=bottom).contains(&y0) {
+                    goes_on = false;
+                    continue;
+                }
+            } else {
+                let (at_top, at_bottom) = ((top - y0) / delta, (bottom - y0) / delta);
+                from = from.max(at_top.min(at_bottom));
+                to = to.min(at_top.max(at_bottom));
+            }
+            if from > to {
+                goes_on = false;
+                continue;
+            }
+            let place = |part: f32| (x0 + part * (x1 - x0), (y0 + part * delta).clamp(top, bottom));
+            match stretches.last_mut() {
+                Some(stretch) if goes_on => stretch.push(place(to)),
+                _ => stretches.push(vec![place(from), place(to)]),
+            }
+            goes_on = to >= 1.0;
+        }
+        stretches
     }
 }
 
@@ -238,10 +290,10 @@ fn grid(plot: &Plot, pane: &Pane, places: &Places, scene: &mut Scene) {
                 let texts = &curve.texts;
                 let found =
                     texts.iter().find(|(of, _)| (of - value).abs() < 1e-9).map(|(_, text)| text.as_str());
-                fitting(found.unwrap_or(otherwise), left - 12.0, 11.0)
+                found.unwrap_or(otherwise).to_owned()
             };
             for (y, label) in [(top, named(1.0, "1")), (bottom, named(0.0, "0"))] {
-                text(scene, (left - 8.0, y + 4.0), 11.0, Anchor::End, SOFT_INK, &label);
+                fitted(scene, (left - 8.0, y + 4.0), 11.0, Anchor::End, SOFT_INK, (&label, left - 12.0));
             }
         }
         return;
@@ -249,8 +301,8 @@ fn grid(plot: &Plot, pane: &Pane, places: &Places, scene: &mut Scene) {
     for (tick, label) in pane.ticks(places.y, 5) {
         let y = places.y(tick);
         line(scene, vec![(area.left, y), (area.right, y)], GRID, 1.0, false, None);
-        let label = fitting(&label, area.left - 12.0, TEXT_SIZE);
-        text(scene, (area.left - 8.0, y + 4.5), TEXT_SIZE, Anchor::End, SOFT_INK, &label);
+        let room = (&label[..], area.left - 12.0);
+        fitted(scene, (area.left - 8.0, y + 4.5), TEXT_SIZE, Anchor::End, SOFT_INK, room);
     }
 }
 
@@ -277,11 +329,12 @@ fn draw_curve(curve: &Curve, number: usize, places: &Places, scene: &mut Scene) 
     let colour = Colour(colour_of(curve, number), 255);
     let points = curve.series.points();
     for stretch in points.split(|point| point.y.is_nan()).filter(|stretch| !stretch.is_empty()) {
-        let places_of_points = outline(stretch, curve.stepped, places);
-        if let [(x, y)] = places_of_points[..] {
-            scene.shapes.push(Shape::Dot { x, y, radius: 2.5, colour, curve: Some(number) });
-        } else {
-            line(scene, places_of_points, colour, 1.6, false, Some(number));
+        for stretch in places.clipped(&outline(stretch, curve.stepped, places)) {
+            if let [(x, y)] = stretch[..] {
+                scene.shapes.push(Shape::Dot { x, y, radius: 2.5, colour, curve: Some(number) });
+            } else {
+                line(scene, stretch, colour, 1.6, false, Some(number));
+            }
         }
     }
 }
@@ -297,7 +350,7 @@ fn outline(points: &[Point], stepped: bool, places: &Places) -> Vec<(f32, f32)> 
     };
     let column = |point: &Point| (places.x(point.x) * 2.0) as i32;
     for column in points.chunk_by(|a, b| column(a) == column(b)) {
-        let place = |point: &Point| (places.x(point.x), places.y(point.y));
+        let place = |point: &Point| (places.x(point.x), places.beyond_y(point.y));
         if column.len() <= 4 {
             for point in column {
                 corner(&mut out, place(point));
@@ -327,12 +380,18 @@ fn lay_out_axis(plot: &Plot, top: f32, scene: &mut Scene) {
     }
     let label = axis_label(plot, span);
     let middle = f32::midpoint(area.left, area.right);
-    text(scene, (middle, top + 38.0), TEXT_SIZE, Anchor::Middle, SOFT_INK, &label);
+    let lost: u64 = plot.gaps.iter().map(|gap| gap.frames).sum();
+    let note = format!("{lost} frames lost here");
+    let note_width = note.chars().count() as f32 * CHARACTER_WIDTH + 18.0;
+    // Both are in one line, the label in its middle.
+    let room = if plot.gaps.is_empty() {
+        area.right - area.left
+    } else {
+        area.right - area.left - 2.0 * (note_width + 8.0)
+    };
+    fitted(scene, (middle, top + 38.0), TEXT_SIZE, Anchor::Middle, SOFT_INK, (&label, room.max(80.0)));
     if !plot.gaps.is_empty() {
-        let lost: u64 = plot.gaps.iter().map(|gap| gap.frames).sum();
-        let note = format!("{lost} frames lost here");
-        let width = note.chars().count() as f32 * CHARACTER_WIDTH;
-        let x = area.right - width - 18.0;
+        let x = area.right - note_width;
         scene.shapes.push(Shape::Area { x, y: top + 28.0, width: 12.0, height: 12.0, colour: LOSS });
         text(scene, (x + 18.0, top + 38.0), TEXT_SIZE, Anchor::Start, SOFT_INK, &note);
     }
@@ -374,5 +433,19 @@ fn line(
 }
 
 fn text(scene: &mut Scene, (x, y): (f32, f32), size: f32, anchor: Anchor, colour: Colour, text: &str) {
-    scene.shapes.push(Shape::Text { x, y, size, anchor, colour, text: text.to_owned(), curve: None });
+    let (text, full) = (text.to_owned(), None);
+    scene.shapes.push(Shape::Text { x, y, size, anchor, colour, text, full, curve: None });
+}
+
+/// A text that must not be wider than so many units: what does not fit is cut off, and the whole of it is there for whoever points at it.
+fn fitted(
+    scene: &mut Scene,
+    (x, y): (f32, f32),
+    size: f32,
+    anchor: Anchor,
+    colour: Colour,
+    (whole, width): (&str, f32),
+) {
+    let (text, full) = (fitting(whole, width, size), Some(whole.to_owned()));
+    scene.shapes.push(Shape::Text { x, y, size, anchor, colour, text, full, curve: None });
 }

@@ -150,6 +150,17 @@ impl Pane {
 }
 
 impl Plot {
+    /// Whether there is not a single value in it.
+    pub fn is_empty(&self) -> bool {
+        self.panes.iter().all(|pane| match &pane.content {
+            Content::Bars(bars) => bars.iter().all(|bar| bar.count == 0),
+            content => content
+                .curves()
+                .iter()
+                .all(|curve| curve.series.points().iter().all(|point| point.y.is_nan())),
+        })
+    }
+
     /// The horizontal range of its whole content; zero to one if it is empty.
     pub(super) fn span(&self) -> (f64, f64) {
         let mut span = Range::default();

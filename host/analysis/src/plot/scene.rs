@@ -39,8 +39,36 @@ pub(super) enum Anchor {
 /// Something to draw. Coordinates are in pixels from the upper left corner.
 #[derive(Clone, Debug)]
 pub(super) enum Shape {
-    Area { x: f32, y: f32, width: f32, height: f32, colour: Colour },
-    Line { points: Vec<(f32, f32)>, colour: Colour, width: f32, dashed: bool, curve: Option<usize> },
-    Dot { x: f32, y: f32, radius: f32, colour: Colour, curve: Option<usize> },
-    Text { x: f32, y: f32, size: f32, anchor: Anchor, colour: Colour, text: String, curve: Option<usize> },
+    Area {
+        x: f32,
+        y: f32,
+        width: f32,
+        height: f32,
+        colour: Colour,
+    },
+    Line {
+        points: Vec<(f32, f32)>,
+        colour: Colour,
+        width: f32,
+        dashed: bool,
+        curve: Option<usize>,
+    },
+    Dot {
+        x: f32,
+        y: f32,
+        radius: f32,
+        colour: Colour,
+        curve: Option<usize>,
+    },
+    Text {
+        x: f32,
+        y: f32,
+        size: f32,
+        anchor: Anchor,
+        colour: Colour,
+        text: String,
+        /// The whole text, if this may be only its beginning.
+        full: Option<String>,
+        curve: Option<usize>,
+    },
 }

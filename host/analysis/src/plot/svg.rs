@@ -49,15 +49,18 @@ fn shape_to(shape: &Shape, out: &mut String) {
             belongs(*curve),
             paint("fill", *colour)
         ),
-        Shape::Text { x, y, size, anchor, colour, text, curve } => {
+        Shape::Text { x, y, size, anchor, colour, text, full, curve } => {
             let anchor = match anchor {
                 Anchor::Start => "start",
                 Anchor::Middle => "middle",
                 Anchor::End => "end",
             };
+            // Shown where the pointer is.
+            let full = full.as_ref().filter(|full| *full != text);
+            let full = full.map_or(String::new(), |full| format!("<title>{}</title>", escaped(full)));
             writeln!(
                 out,
-                r#"<text{} x="{x:.1}" y="{y:.1}" font-size="{size}" text-anchor="{anchor}" {}>{}</text>"#,
+                r#"<text{} x="{x:.1}" y="{y:.1}" font-size="{size}" text-anchor="{anchor}" {}>{full}{}</text>"#,
                 belongs(*curve),
                 paint("fill", *colour),
                 escaped(text)

@@ -71,6 +71,78 @@ fn an_svg_names_its_curves_and_escapes_them() {
     assert_eq!(svg.matches(r#"<polyline data-curve="0""#).count(), 3);
 }
 
+/// They were drawn as if they had the range's last value.
+#[test]
+fn values_beyond_the_range_are_cut_off() {
+    let mut curve = Curve::new("Speed");
+    for (t, y) in
+        [(0.0, 0.0), (1.0, 4.0), (2.0, 40.0), (3.0, 40.0), (4.0, 4.0), (5.0, -90.0), (6.0, -90.0), (7.0, 2.0)]
+    {
+        curve.series.push(t, y);
+    }
+    for stepped in [false, true] {
+        let curve = Curve { stepped, ..curve.clone() };
+        let pane =
+            Pane { label: String::new(), range: Some((0.0, 5.0)), content: Content::Analogue(vec![curve]) };
+        let plot = Plot { panes: vec![pane], ..Plot::default() };
+        let svg = String::from_utf8(plot.render(PictureFormat::Svg, 1000).unwrap()).unwrap();
+        let lines: Vec<Vec<(f32, f32)>> = svg
+            .split(r#"<polyline data-curve="0" points=""#)
+            .skip(1)
+            .map(|rest| {
+                let points = rest.split('"').next().unwrap().split(' ');
+                let number = |text: &str| text.parse().unwrap();
+                points
+                    .map(|point| point.split_once(',').map(|(x, y)| (number(x), number(y))).unwrap())
+                    .collect()
+            })
+            .collect();
+        // The legend's, and three stretches inside.
+        assert_eq!(lines.len(), 4, "{stepped}: {lines:?}");
+        let (low, high) = lines[1..]
+            .iter()
+            .flatten()
+            .fold((f32::MAX, f32::MIN), |(low, high), (_, y)| (low.min(*y), high.max(*y)));
+        assert!((high - low - 200.0).abs() < 0.2, "{low} {high}");
+        for pair in lines[1..].iter().flat_map(|line| line.windows(2)) {
+            let is_along = |edge: f32| (pair[0].1 - edge).abs() < 0.1 && (pair[1].1 - edge).abs() < 0.1;
+            assert!(
+                !is_along(low) && (stepped || !is_along(high)) || pair[0].0 == pair[1].0,
+                "{stepped}: {pair:?}"
+            );
+        }
+        let text = plot.to_text(&TextStyle::default());
+        let rows: Vec<_> = text.lines().filter(|line| line.contains(['│', '┤'])).collect();
+        let dots =
+            |row: &str| row.chars().filter(|symbol| ('\u{2801}'..='\u{28FF}').contains(symbol)).count();
+        assert!(dots(rows[0]) < 12 && dots(rows[rows.len() - 1]) < 24, "{text}");
+    }
+}
+
+/// The whole of them shows under the pointer.
+#[test]
+fn long_captions_and_texts_of_values_fit_and_are_whole_under_the_pointer() {
+    let long = "A caption that is far too long for the picture in which it is ".repeat(4);
+    let mut curve = Curve::new(long.trim());
+    curve.texts = vec![(0.0, "a text for zero that nobody can read".into()), (1.0, "on".into())];
+    (0..4).for_each(|n| curve.series.push(f64::from(n), f64::from(n % 2)));
+    let pane = Pane { label: String::new(), range: None, content: Content::Analogue(vec![curve]) };
+    let axis = Axis::Time { zero: long.trim().to_owned() };
+    let plot = Plot {
+        title: long.trim().to_owned(),
+        axis,
+        panes: vec![pane],
+        gaps: vec![Gap { from: 1.0, to: 2.0, frames: 9 }],
+    };
+    let svg = String::from_utf8(plot.render(PictureFormat::Svg, 600).unwrap()).unwrap();
+    for text in svg.split("<text").skip(1).map(|text| text.split("</text>").next().unwrap()) {
+        let shown = text.rsplit(['>']).next().unwrap();
+        assert!(shown.chars().count() <= 62, "{shown}");
+    }
+    assert_eq!(svg.matches(&format!("<title>{}</title>", long.trim())).count(), 2, "title and legend");
+    assert!(svg.contains("<title>a text for zero that nobody can read</title>"));
+}
+
 #[test]
 fn a_png_has_the_size_asked_for() {
     let png = drive().render(PictureFormat::Png, 800).unwrap();

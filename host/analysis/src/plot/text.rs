@@ -143,9 +143,21 @@ impl Canvas {
         ((1.0 - ((value - self.y.0) / (self.y.1 - self.y.0)).clamp(0.0, 1.0)) * last).round() as i64
     }
 
+    /// The same, also outside the canvas.
+    fn beyond_y(&self, value: f64) -> i64 {
+        const FAR: f64 = 100.0;
+        let last = (self.rows * 4 - 1) as f64;
+        ((1.0 - ((value - self.y.0) / (self.y.1 - self.y.0)).clamp(-FAR, FAR)) * last).round() as i64
+    }
+
+    /// Does nothing outside the canvas: what is beyond the range is not drawn along its edge.
     fn set(&mut self, x: i64, y: i64, colour: [u8; 3]) {
         const DOTS: [[u8; 2]; 4] = [[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]];
-        let (x, y) = (x as usize, y as usize);
+        let Ok(y) = usize::try_from(y) else { return };
+        let x = x as usize;
+        if y >= self.rows * 4 {
+            return;
+        }
         let cell = y / 4 * self.columns + x / 2;
         self.dots[cell] |= DOTS[y % 4][x % 2];
         self.colours[cell] = Some(colour);
@@ -167,7 +179,7 @@ impl Canvas {
                 before = None;
                 continue;
             }
-            let place = (self.dot_x(point.x), self.dot_y(point.y));
+            let place = (self.dot_x(point.x), self.beyond_y(point.y));
             match before {
                 Some(from) if curve.stepped => {
                     self.line(from, (place.0, from.1), colour);

@@ -4,7 +4,6 @@ use std::io;
 
 use cantap_can::{Frame, Id};
 
-use super::super::calendar::{Date, MONTHS};
 use super::super::codec::{Decode, REQUESTS_TO_SEND};
 use super::super::event_text;
 use super::super::found::Found;
@@ -14,6 +13,7 @@ use super::super::sja1000;
 use super::super::text::{self, NS_PER_S};
 use super::super::zone::Zone;
 use super::content::{Content, OnChannel};
+use super::date::date;
 use super::{FD_FORMAT, REMOTE, STATES, others};
 use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
@@ -85,7 +85,7 @@ impl Decoder {
     /// Handles a line that does not begin with a time.
     fn head(&mut self, line: &[u8]) -> Result<(), Fault> {
         if begins(line, "date ") {
-            self.date_ns = self.zone.utc_ns(date(&line[5..])?);
+            self.date_ns = date(&line[5..], &self.zone)?;
         } else if begins(line, "base ") {
             let words = line.to_ascii_lowercase();
             let has = |word| memchr::memmem::find(&words, word).is_some();
@@ -96,7 +96,7 @@ impl Decoder {
             self.blocks += 1;
             let stamp = line["begin triggerblock".len()..].trim_ascii();
             if self.blocks == 1 && !stamp.is_empty() {
-                self.block_ns = Some(self.zone.utc_ns(date(stamp)?));
+                self.block_ns = Some(date(stamp, &self.zone)?);
             }
         } else if !(line.is_empty()
             || line.starts_with(b"//")
@@ -260,8 +260,12 @@ impl Decoder {
         let word = next();
         let esi = flag(word).ok_or_else(|| Fault::malformed(expected, word))?;
         let word = next();
-        let dlc = text::hex(word).filter(|dlc| *dlc < 16);
-        let dlc = dlc.ok_or_else(|| Fault::malformed(expected, word))? as u8;
+        // Two digits are decimal ones, whatever the base.
+        let dlc = match word {
+            [digit] => text::hex_digit(*digit),
+            _ => text::decimal(word).filter(|dlc| (10..16).contains(dlc)).map(|dlc| dlc as u8),
+        };
+        let dlc = dlc.ok_or_else(|| Fault::malformed(expected, word))?;
         let word = next();
         let len = text::decimal(word).filter(|len| *len <= FD_MAX_BYTES as u64);
         let len = len.ok_or_else(|| Fault::malformed(expected, word))? as usize;
@@ -270,14 +274,18 @@ impl Decoder {
             let word = next();
             *slot = self.byte(word).ok_or_else(|| Fault::malformed(format!("{len} data bytes"), word))?;
         }
+        // Duration, bits, flags and more: some programs leave them out, and what the line says at its beginning counts.
         let (_duration, _bits, word) = (next(), next(), next());
-        let flags = text::hex(word).ok_or_else(|| Fault::malformed("flags in hexadecimal digits", word))?;
-        // Some programs leave the flags out; anything that only an FD frame has shows it too.
-        let frame = if flags & FD_FORMAT != 0 || len > 8 || brs || esi {
+        let flags = match word {
+            b"" => FD_FORMAT,
+            _ => text::hex(word).ok_or_else(|| Fault::malformed("flags in hexadecimal digits", word))?,
+        };
+        // Some have zeros there; anything that only an FD frame has shows it too. No FD frame is a remote one.
+        let remote = flags & (REMOTE | FD_FORMAT) == REMOTE;
+        let frame = if !remote && (flags & FD_FORMAT != 0 || len > 8 || brs || esi) {
             let frame = FdFrame::new(id, brs, esi, &data[..len]);
             frame.filter(|_| usize::from(FD_LENGTHS[usize::from(dlc)]) == len).map(TraceFrame::Fd)
         } else {
-            let remote = flags & REMOTE != 0;
             let frame = data.first_chunk().map(|data| Frame::from_bus(id, remote, dlc, *data));
             // A remote frame has no data, and its length is the requested one or zero.
             frame.filter(|frame| remote || frame.data_len() == len).map(TraceFrame::Classic)
@@ -387,41 +395,4 @@ fn status(rest: &[u8]) -> Result<OnChannel, Fault> {
     };
     let counters = counter("txerr:").zip(counter("rxerr:"));
     Ok(OnChannel::Event(TraceEvent::State { state: *state, counters }))
-}
-
-/// `Sat Sep 30 15:06:13.191 2017`, also with am or pm before the year, also in German.
-fn date(text: &[u8]) -> Result<i64, Fault> {
-    let fault = || Fault::malformed("a date such as Sat Sep 30 15:06:13.191 2017", text);
-    let text_utf8 = String::from_utf8_lossy(text);
-    let words: Vec<&str> = text_utf8.split_ascii_whitespace().collect();
-    let (month, day, clock, half, year) = match words[..] {
-        [_, month, day, clock, year] => (month, day, clock, None, year),
-        [_, month, day, clock, half, year] => (month, day, clock, Some(half), year),
-        _ => return Err(fault()),
-    };
-    let month = match month {
-        "Mär" | "Mrz" => "Mar",
-        "Mai" => "May",
-        "Okt" => "Oct",
-        "Dez" => "Dec",
-        other => other,
-    };
-    let month = MONTHS.iter().position(|known| known.eq_ignore_ascii_case(month)).ok_or_else(fault)?;
-    let mut parts = clock.splitn(3, ':');
-    let mut part = || parts.next().map(str::as_bytes).ok_or_else(fault);
-    let hour = text::decimal(part()?).ok_or_else(fault)?;
-    let minute = text::decimal(part()?).ok_or_else(fault)?;
-    let second_ns = text::time_of_any_mark(part()?, NS_PER_S).filter(|ns| *ns >= 0).ok_or_else(fault)?;
-    let hour = match half.map(str::to_ascii_lowercase).as_deref() {
-        // Twelve comes first on a 12-hour clock. Some files combine hours above twelve with pm.
-        Some("am") => hour % 12,
-        Some("pm") if hour < 12 => hour + 12,
-        None | Some("pm") => hour,
-        Some(_) => return Err(fault()),
-    };
-    let second = (second_ns / NS_PER_S) as u64;
-    let of_day_ns = Date::of_day(hour, minute, second, second_ns % NS_PER_S).ok_or_else(fault)?;
-    let year = year.parse().map_err(|_| fault())?;
-    let day = day.parse().map_err(|_| fault())?;
-    Date { year, month: month as u8 + 1, day, of_day_ns }.time_ns().ok_or_else(fault)
 }

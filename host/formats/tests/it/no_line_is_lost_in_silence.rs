@@ -146,23 +146,80 @@ fn foreign() -> Vec<Text> {
     ]
 }
 
+/// The formats that are written, and whether they carry CAN FD.
+const WRITTEN: [(Format, bool); 12] = [
+    (Format::Candump, true),
+    (Format::Asc, true),
+    (Format::Trc(TrcVersion::V2_1), true),
+    (Format::Trc(TrcVersion::V2_0), true),
+    (Format::Trc(TrcVersion::V1_3), false),
+    (Format::Trc(TrcVersion::V1_2), false),
+    (Format::Trc(TrcVersion::V1_1), false),
+    (Format::Trc(TrcVersion::V1_0), false),
+    (Format::Csv(CsvDialect::PythonCan), false),
+    (Format::Csv(CsvDialect::Full), true),
+    (Format::Csv(CsvDialect::Analyser), false),
+    (Format::Csv(CsvDialect::Gvret), true),
+];
+
+/// A block of a disk that was lost is zeros. Where the hole began in a column that nobody reads, the lines in it were lost in silence.
+#[test]
+fn a_hole_of_nul_bytes_is_an_issue_wherever_it_begins_and_ends() {
+    const HOLE: usize = 512;
+    let written = WRITTEN.into_iter().map(|(format, fd)| Text::written(format, fd));
+    let texts = written.chain(foreign()).map(|text| {
+        let rows: Vec<u8> = text.rows.iter().take(60).flatten().copied().collect();
+        (text.format, [&text.head[..], &rows].concat(), text.head.len())
+    });
+    let table = {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("whole.dif");
+        let mut writer = create_writer(&path, &WriteOptions::default()).unwrap();
+        records(false).iter().take(60).for_each(|record| writer.write(record).unwrap());
+        writer.finish().unwrap();
+        let bytes = std::fs::read(&path).unwrap();
+        let head = bytes.len() / 4;
+        (Format::Dif, bytes, head)
+    };
+    for (format, whole, head) in texts.chain([table]) {
+        let found = |bytes: Vec<u8>| {
+            let reader =
+                TraceReader::from_source("hole", Cursor::new(bytes), format, &ReadOptions::default());
+            reader.unwrap().filter_map(Result::err).map(|issue| issue.to_string()).collect::<Vec<_>>()
+        };
+        assert_eq!(found(whole.clone()), Vec::<String>::new(), "{format}");
+        for at in (head..whole.len() - HOLE).take(400) {
+            let mut holed = whole.clone();
+            holed[at..at + HOLE].fill(0);
+            let issues = found(holed);
+            assert!(!issues.is_empty(), "{format}: nothing said of a hole at {at}");
+            let is_said = issues.iter().any(|issue| issue.contains("NUL bytes"));
+            assert!(is_said, "{format}: {issues:?}");
+            let mut places: Vec<_> = issues.iter().map(|issue| issue.split(": ").next().unwrap()).collect();
+            places.dedup();
+            assert_eq!(places.len(), issues.len(), "{format}: one line is wrong once: {issues:?}");
+        }
+    }
+}
+
+/// They looked like an empty log that was read without a fault.
+#[test]
+fn comments_alone_are_not_a_trace_that_was_read() {
+    let of = |text: &str| {
+        let source = Cursor::new(text.to_owned());
+        let mut reader =
+            TraceReader::from_source("a.log", source, Format::Candump, &ReadOptions::default()).unwrap();
+        assert_eq!(reader.by_ref().count(), 0);
+        reader.nothing_read().map(|nothing| nothing.to_string())
+    };
+    let nothing = of("# drive 3\n# of two\n").unwrap();
+    assert!(nothing.contains("without a single frame"), "{nothing}");
+    assert_eq!(of(""), None);
+}
+
 #[test]
 fn with_one_byte_changed_in_every_line_none_is_lost_without_being_counted() {
-    let written = [
-        (Format::Candump, true),
-        (Format::Asc, true),
-        (Format::Trc(TrcVersion::V2_1), true),
-        (Format::Trc(TrcVersion::V2_0), true),
-        (Format::Trc(TrcVersion::V1_3), false),
-        (Format::Trc(TrcVersion::V1_2), false),
-        (Format::Trc(TrcVersion::V1_1), false),
-        (Format::Trc(TrcVersion::V1_0), false),
-        (Format::Csv(CsvDialect::PythonCan), false),
-        (Format::Csv(CsvDialect::Full), true),
-        (Format::Csv(CsvDialect::Analyser), false),
-        (Format::Csv(CsvDialect::Gvret), true),
-    ];
-    let written = written.into_iter().map(|(format, fd)| Text::written(format, fd));
+    let written = WRITTEN.into_iter().map(|(format, fd)| Text::written(format, fd));
     for text in written.chain(foreign()) {
         let (format, whole) = (text.format, &text.rows);
         let all: Vec<&[u8]> = whole.iter().map(Vec::as_slice).collect();

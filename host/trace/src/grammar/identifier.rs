@@ -3,7 +3,7 @@
 use std::fmt;
 use std::str::FromStr;
 
-use crate::filter::{EXTENDED, IdFilter, REMOTE};
+use crate::id_filter::{EXTENDED, IdFilter, REMOTE};
 use crate::{Frame, Id};
 
 /// Bit 29 is reserved by the kernel: it marks inverse filters and error frames.

@@ -13,6 +13,8 @@ pub struct LoadCollector {
     end: f64,
     channels: Vec<(u8, Curve)>,
     in_per_cent: bool,
+    /// Windows with frames whose load cannot be told.
+    unknown: u64,
 }
 
 impl LoadCollector {
@@ -26,6 +28,7 @@ impl LoadCollector {
             end: 0.0,
             channels: Vec::new(),
             in_per_cent,
+            unknown: 0,
         })
     }
 
@@ -35,13 +38,27 @@ impl LoadCollector {
         self.end = self.end.max(x);
         self.gaps.push(record, x);
         let (axis, channels, in_per_cent) = (&mut self.axis, &mut self.channels, self.in_per_cent);
-        self.statistics.push_with(record, |window| add_window(window, axis, channels, in_per_cent));
+        let unknown = &mut self.unknown;
+        self.statistics.push_with(record, |window| {
+            *unknown += u64::from(is_unknown(window, in_per_cent));
+            add_window(window, axis, channels, in_per_cent);
+        });
     }
 
     /// The picture.
-    pub fn finish(mut self, title: String) -> Plot {
+    pub fn finish(self, title: String) -> Plot {
+        self.finish_counting(title).0
+    }
+
+    /// The picture, and how many windows have frames but no known load: a bit rate is missing, in most cases that of the data phase of CAN FD.
+    pub fn finish_counting(mut self, title: String) -> (Plot, u64) {
         let (axis, channels, in_per_cent) = (&mut self.axis, &mut self.channels, self.in_per_cent);
-        self.statistics.finish_with(|window| add_window(window, axis, channels, in_per_cent));
+        let unknown = &mut self.unknown;
+        self.statistics.finish_with(|window| {
+            *unknown += u64::from(is_unknown(window, in_per_cent));
+            add_window(window, axis, channels, in_per_cent);
+        });
+        let unknown = self.unknown;
         self.channels.sort_by_key(|(channel, _)| *channel);
         let curves: Vec<_> = self.channels.into_iter().map(|(_, curve)| curve).collect();
         let points = curves.iter().flat_map(|curve| curve.series.points());
@@ -50,8 +67,15 @@ impl LoadCollector {
         let top = [5.0, 10.0, 20.0, 50.0, 100.0].into_iter().find(|top| *top >= most).unwrap_or(100.0);
         let (label, range) = if in_per_cent { ("load %", Some((0.0, top))) } else { ("frames/s", None) };
         let pane = Pane { label: label.to_owned(), range, content: Content::Analogue(curves) };
-        Plot { title, axis: self.axis.axis(), panes: vec![pane], gaps: self.gaps.finish(self.end) }
+        let plot =
+            Plot { title, axis: self.axis.axis(), panes: vec![pane], gaps: self.gaps.finish(self.end) };
+        (plot, unknown)
     }
+}
+
+/// Whether a window has frames whose load cannot be told.
+fn is_unknown(window: &Window, in_per_cent: bool) -> bool {
+    in_per_cent && window.frames > 0 && window.load_pct.is_none()
 }
 
 fn add_window(window: &Window, axis: &mut TimeAxis, channels: &mut Vec<(u8, Curve)>, in_per_cent: bool) {
@@ -93,6 +117,22 @@ mod tests {
         let points = plot.panes[0].content.curves()[0].series.points();
         assert!(points.iter().all(|point| (point.y - 50.0).abs() < 6.0), "{points:?}");
         assert!(matches!(plot.panes[0].range, Some((0.0, 50.0 | 100.0))));
+    }
+
+    /// It was an empty picture, and success.
+    #[test]
+    fn the_load_of_frames_that_switch_their_bit_rate_is_known_with_both_rates() {
+        let of = |data_bitrate_bps| {
+            let options = Options { bitrate_bps: Some(500_000), data_bitrate_bps, ..Options::default() };
+            let mut collector = LoadCollector::new(options).unwrap();
+            for n in 0..40 {
+                collector.push(&frame(n * 100, "123##1112233445566778899AABBCC"));
+            }
+            let (plot, unknown) = collector.finish_counting(String::new());
+            (plot.is_empty(), unknown)
+        };
+        assert_eq!(of(None), (true, 4));
+        assert_eq!(of(Some(2_000_000)), (false, 0));
     }
 
     #[test]

@@ -46,8 +46,8 @@ use cantap_work::interrupt;
                 cantap monitor -d tcp://127.0.0.1\n  \
                 cantap capture -d ssh://me@vehicle/dev/ttyACM0 -b 500k -o drive.log\n  \
                 cantap serve keygen keys --host vehicle --client alice:send\n  \
-                cantap serve -d /dev/ttyACM0 -b 500k --tcp 192.0.2.7 --tls keys/server.pem,keys/server-key.pem \\\n      \
-                --clients keys/ca.pem"
+                cantap serve -d /dev/ttyACM0 -b 500k --tcp 192.0.2.7 \\\n      \
+                --tls keys/server.pem,keys/server-key.pem --clients keys/ca.pem"
 )]
 pub struct Args {
     #[cfg(feature = "tls")]

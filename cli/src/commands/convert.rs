@@ -1,5 +1,6 @@
 //! `cantap convert`: from any trace format to any other.
 
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -225,7 +226,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             "left_out": by_kind(&left_out),
             "missing_pct": missing.share_pct(),
         });
-        if args.output.as_os_str() == "-" { eprintln!("{summary}") } else { println!("{summary}") }
+        if args.output.as_os_str() == "-" {
+            eprintln!("{summary}");
+        } else {
+            writeln!(std::io::stdout(), "{summary}")?;
+        }
     }
     Ok(ExitCode::SUCCESS)
 }

@@ -235,8 +235,7 @@ impl Bench {
     fn stack_bytes(&self) -> usize {
         let cpu = self.rig.machine.cpu();
         let start = cpu.word(map::FLASH.start).unwrap_or(0);
-        let mut stack =
-            vec![0; start.checked_sub(map::CCM.start).unwrap_or(0).min(map::CCM.len() as u32) as usize];
+        let mut stack = vec![0; start.saturating_sub(map::CCM.start).min(map::CCM.len() as u32) as usize];
         if let Some(memory) = cpu.memory(map::CCM.start) {
             memory.read(map::CCM.start, &mut stack);
         }

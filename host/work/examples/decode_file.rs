@@ -23,7 +23,9 @@ pub fn decode(file: &Path, database: &Path, out: &mut impl Write) -> Result<Stri
 fn main() -> Result<(), Box<dyn Error>> {
     let mut arguments = std::env::args_os().skip(1);
     let (file, database) = (arguments.next(), arguments.next());
-    let (Some(file), Some(database)) = (file, database) else { return Err("name a trace and a database".into()) };
+    let (Some(file), Some(database)) = (file, database) else {
+        return Err("name a trace and a database".into());
+    };
     let unread = decode(file.as_ref(), database.as_ref(), &mut std::io::stdout())?;
     eprint!("{unread}");
     Ok(())

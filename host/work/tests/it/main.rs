@@ -29,7 +29,10 @@ fn a_traces_signals_are_printed_with_their_names() {
     let unread = decode_file::decode(LOG.as_ref(), DATABASE.as_ref(), &mut out).unwrap();
     let text = String::from_utf8(out).unwrap();
     assert_eq!(unread, "");
-    assert!(text.trim_end().ends_with("Ignition = 1 (on)") && text.contains(": EngineSpeed = 2850 rpm"), "{text}");
+    assert!(
+        text.trim_end().ends_with("Ignition = 1 (on)") && text.contains(": EngineSpeed = 2850 rpm"),
+        "{text}"
+    );
 }
 
 #[test]
@@ -52,6 +55,9 @@ fn the_page_shows_the_programs() {
     let Ok(page) = std::fs::read_to_string(root.join("../../docs/library.md")) else { return };
     for name in ["print_frames", "decode_file", "statistics_of_a_file"] {
         let program = std::fs::read_to_string(root.join(format!("examples/{name}.rs"))).unwrap();
-        assert!(page.contains(&format!("```rust,ignore\n{program}```")), "docs/library.md does not show {name}.rs as it is");
+        assert!(
+            page.contains(&format!("```rust,ignore\n{program}```")),
+            "docs/library.md does not show {name}.rs as it is"
+        );
     }
 }

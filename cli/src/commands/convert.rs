@@ -1,5 +1,6 @@
 //! `cantap convert`: from any trace format to any other.
 
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -21,24 +22,7 @@ use cantap_work::interrupt;
 
 /// The command line.
 #[derive(clap::Args)]
-#[command(after_help = "Examples:\n  \
-    cantap convert trace.log trace.blf\n  \
-    cantap convert trace.asc.gz - --filter can0,123:7FF | canplayer\n  \
-    cantap convert day.blf part.csv --start 10m --end 20m --channel 1\n  \
-    cantap convert trace.pcapng old.trc --format trc1.1\n  \
-    cantap convert - days.log.zst --rotate 100M --keep 10\n  \
-    cantap convert drive.blf drive.parquet\n  \
-    cantap convert drive.blf fleet/ --partition vehicle=7,day,channel\n\n\
-    Names end in .log, .asc, .blf, .trc, .csv, .pcapng, .mf4 or .dif; .gz, .zst, .xz and .lz4 behind that compress. \
-    .parquet is a table for DuckDB, Polars, pandas and Spark, with a row for each record. \
-    Files of any other program are known by their beginning.\n\n\
-    Dates in ASC, TRC, BLF and some logs are the clock of the computer that wrote them: name its zone with --zone.\n\n\
-    Read and written: candump, asc, blf, trc (2.1; trc2.0 to trc1.0), csv (python-can's), csv-full, csv-analyser, \
-    csv-gvret (SavvyCAN's), pcapng, mf4, dif. Only read: pcap, candump-screen, busmaster, crtd, kvaser, canking, microchip, \
-    canhacker, printer and sqlite (python-can's).\n\n\
-    What OUT cannot carry is counted on standard error. Exit code 1: IN or OUT failed, nothing in IN could be read, or \
-    with --strict something in IN was wrong. An older OUT then stays as it is; what had come from a pipe is kept. \
-    Otherwise the new OUT takes its place: a conversion can be made again. A recording cannot, so capture asks for --force.")]
+#[command(after_help = after_help())]
 pub struct Args {
     /// The trace to read; - for standard input.
     #[arg(value_name = "IN")]
@@ -164,6 +148,31 @@ impl Args {
     }
 }
 
+/// Examples, and what the table of formats says.
+fn after_help() -> String {
+    let read: Vec<_> =
+        Format::all().filter(|format| !format.is_written()).map(|format| format.to_string()).collect();
+    let (read, written) = (read.join(", "), Format::written_names());
+    format!(
+        "Examples:\n  \
+    cantap convert trace.log trace.blf\n  \
+    cantap convert trace.asc.gz - --filter can0,123:7FF | canplayer\n  \
+    cantap convert day.blf part.csv --start 10m --end 20m --channel 1\n  \
+    cantap convert trace.pcapng old.trc --format trc1.1\n  \
+    cantap convert - days.log.zst --rotate 100M --keep 10\n  \
+    cantap convert drive.blf drive.parquet\n  \
+    cantap convert drive.blf fleet/ --partition vehicle=7,day,channel\n\n\
+    Names end in .log, .asc, .blf, .trc, .csv, .pcapng, .mf4 or .dif; .gz, .zst, .xz and .lz4 behind that compress. \
+    .parquet is a table for DuckDB, Polars, pandas and Spark, with a row for each record. \
+    Files of any other program are known by their beginning.\n\n\
+    Dates in ASC, TRC, BLF and some logs are the clock of the computer that wrote them: name its zone with --zone.\n\n\
+    Read and written: {written}. Only read: {read}. trc is version 2.1, csv and sqlite are python-can's, csv-gvret SavvyCAN's.\n\n\
+    What OUT cannot carry is counted on standard error. Exit code 1: IN or OUT failed, nothing in IN could be read, or \
+    with --strict something in IN was wrong. An older OUT then stays as it is; what had come from a pipe is kept. \
+    Otherwise the new OUT takes its place: a conversion can be made again. A recording cannot, so capture asks for --force."
+    )
+}
+
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     refuse_same_file(&args.input, &args.output)?;
@@ -225,7 +234,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             "left_out": by_kind(&left_out),
             "missing_pct": missing.share_pct(),
         });
-        if args.output.as_os_str() == "-" { eprintln!("{summary}") } else { println!("{summary}") }
+        if args.output.as_os_str() == "-" {
+            eprintln!("{summary}");
+        } else {
+            writeln!(std::io::stdout(), "{summary}")?;
+        }
     }
     Ok(ExitCode::SUCCESS)
 }

@@ -120,7 +120,7 @@ fn test(args: &Args, address: &Address, device: &Device, report: &mut Report) {
             Ok(Outcome::Skip("they are not said to be wired to each other (--loop)".to_owned()))
         });
     }
-    report.step("clock", || steps::clock(device));
+    report.step("clock", || steps::clock(address, device));
     report.step("saved settings untouched", || {
         let now = steps::saved(device)?;
         Ok(steps::compare_saved(&saved, &now))

@@ -107,6 +107,37 @@ fn what_cannot_be_measured_is_refused_with_the_reason() {
     run(cantap().arg("stats"), 2);
 }
 
+/// It was an empty picture, and success.
+#[test]
+fn a_load_that_needs_the_data_phases_bit_rate_is_asked_for_instead_of_an_empty_picture() {
+    let folder = tempfile::tempdir().unwrap();
+    let (log, load) = (folder.path().join("fd.log"), folder.path().join("load.svg"));
+    let lines: Vec<_> =
+        (0..30).map(|n| format!("(100.{n:02}0000) can0 123##100112233445566778899AABB\n")).collect();
+    std::fs::write(&log, lines.concat()).unwrap();
+    let mut plot = cantap();
+    plot.arg("plot").arg(&log).args(["--bus-load", "-b", "500k", "-o"]).arg(&load);
+    let reason = failure(&mut plot);
+    assert!(reason.contains("--data-bitrate 2M") && !load.exists(), "{reason}");
+    run(plot.args(["--data-bitrate", "2M"]), 0);
+    assert!(load.exists());
+    let reason = failure(cantap().arg("plot").arg(&log).args(["--bus-load", "-b", "500k", "--start", "1h"]));
+    assert!(reason.contains("nothing to draw in fd.log between --start and --end"), "{reason}");
+}
+
+/// Of a file cut in its middle it said that less than 0.1 % was missing.
+#[test]
+fn nobody_knows_how_much_of_a_cut_compressed_file_is_missing() {
+    let folder = tempfile::tempdir().unwrap();
+    let whole = std::fs::read(boat()).unwrap();
+    let cut = folder.path().join("cut.log.gz");
+    std::fs::write(&cut, &whole[..whole.len() / 2]).unwrap();
+    let (out, reason) = run(cantap().arg("stats").arg(&cut).arg("--json"), 0);
+    assert!(reason.contains("nobody knows how much is missing"), "{reason}");
+    let object: serde_json::Value = serde_json::from_str(&out).unwrap();
+    assert!(object["missing_pct"].is_null() && object["issues"] == 1, "{}", object["missing_pct"]);
+}
+
 #[test]
 fn pictures_are_written_in_the_format_of_their_suffix() {
     let folder = tempfile::tempdir().unwrap();

@@ -21,6 +21,16 @@ const FD_FORMAT: u32 = 1 << 12;
 const SWITCHED_BIT_RATE: u32 = 1 << 13;
 const PASSIVE_SENDER: u32 = 1 << 14;
 
+/// Whether a text begins like Vector's: with its date or the base of its numbers, possibly after comments.
+pub(crate) fn is_head(text: &[u8]) -> bool {
+    let lines = text.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii_start);
+    let mut lines = lines.skip_while(|line| line.is_empty() || line.starts_with(b"//"));
+    let first = lines.next().unwrap_or_default();
+    ["date ", "base hex", "base dec"]
+        .iter()
+        .any(|word| first.get(..word.len()).is_some_and(|start| start.eq_ignore_ascii_case(word.as_bytes())))
+}
+
 /// The controller's states as status lines name them.
 const STATES: [(ErrorState, &str); 4] = [
     (ErrorState::Passive, "chip status error passive"),

@@ -1,6 +1,7 @@
 //! candump's screen output: `(time) can0 123 [8] 11 22 33 44 55 66 77 88 '.."3DUfw'`, with any of its options for times
 //! (`-t a`, `-t d`, `-t z`, `-t A`), `-x` and `-a`, with or without colours.
 
+use super::battery_emulator;
 use super::date_time_ns;
 use super::error_frames::ErrorFrames;
 use super::frame_fields::{FdFields, FrameFields, Payload, hex_byte, identifier};
@@ -30,6 +31,9 @@ pub(crate) struct Decoder {
 /// Whether a line is in this format.
 pub(crate) fn is_line(line: &[u8]) -> bool {
     let line = plain(line);
+    if battery_emulator::is_line(&line) {
+        return false;
+    }
     let Some((_, rest)) = stamp(&line) else { return false };
     let mut words = rest.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
     let _interface = words.next();

@@ -6,7 +6,7 @@ use super::Format;
 pub(crate) const HEAD_BYTES: usize = 256;
 
 /// Other files that users mistake for traces, by their first bytes.
-const KNOWN: [(&[u8], &str); 11] = [
+const KNOWN: [(&[u8], &str); 12] = [
     (b"PK\x03\x04", "a ZIP archive or spreadsheet"),
     (b"%PDF", "a PDF document"),
     (b"\x7FELF", "a program"),
@@ -18,7 +18,17 @@ const KNOWN: [(&[u8], &str); 11] = [
     (b"{", "JSON"),
     (b"[", "JSON or settings"),
     (b"FormatVersion=", "a SYM database"),
+    (
+        b"Generic File",
+        "a compressed or encrypted file of a CANedge logger (.MFC, .MFE, .MFM): its maker's converters make an MF4 of it, which is read here",
+    ),
 ];
+
+/// What else than a trace a file with this beginning is, if that is known.
+pub(crate) fn known(head: &[u8]) -> Option<&'static str> {
+    let text = head.trim_ascii_start();
+    KNOWN.iter().find(|(begin, _)| text.starts_with(begin)).map(|(_, what)| *what)
+}
 
 /// What a file with this beginning looks like. `read_as` is the format it was taken for.
 pub(crate) fn looks_like(head: &[u8], read_as: Format) -> String {
@@ -29,8 +39,8 @@ pub(crate) fn looks_like(head: &[u8], read_as: Format) -> String {
     if let Some(format) = Format::of_content(head).filter(|format| !format.is_kind_of(read_as)) {
         return format!("a trace in the format {format}");
     }
-    if let Some((_, what)) = KNOWN.iter().find(|(begin, _)| text.starts_with(begin)) {
-        return (*what).to_owned();
+    if let Some(what) = known(head) {
+        return what.to_owned();
     }
     let line = text.split(|byte| matches!(byte, b'\n' | b'\r')).next().unwrap_or_default();
     if line.iter().any(|byte| *byte < b' ' && *byte != b'\t') {
@@ -56,6 +66,7 @@ mod tests {
         for (head, words) in [
             (&b""[..], "an empty file"),
             (b"PK\x03\x04....", "a ZIP archive or spreadsheet"),
+            (b"%PDF-1.7", "a PDF document"),
             (b"(1.0) can0 123#11\n", "a trace in the format candump"),
             (b"\0\x01\x02", "binary data that begins with 00 01 02"),
             (b"dear diary\ntoday", "text that begins with 'dear diary'"),

@@ -106,6 +106,11 @@ impl Decode for Decoder {
     }
 }
 
+/// Whether a text begins like a table of python-can, of ours or of the analyser.
+pub(crate) fn is_head(text: &[u8]) -> bool {
+    text.starts_with(b"timestamp,") || text.starts_with(b"time,") || text.starts_with(b"Index")
+}
+
 /// More lines than this before the header are not comments.
 const MAX_COMMENTS: usize = 100;
 

@@ -3,15 +3,12 @@
 use std::io::{self, Write};
 use std::path::Path;
 
-use super::analyser::{CsvLayout, TableEncoder};
+use super::Format;
 use super::codec::Encode;
-use super::csv::CsvDialect;
-use super::dif::DifLayout;
-use super::format::NotWritten;
 use super::left_out::LeftOut;
 use super::output::Output;
+use super::spec::{FormatSpec, NotWritten};
 use super::writer::{TraceWriter, WriteOptions};
-use super::{Format, asc, blf, candump, csv, gvret, mf4, pcapng, trc};
 use cantap_trace::{TraceEvent, TraceRecord};
 
 /// Bytes collected before they are passed to the system.
@@ -41,22 +38,8 @@ fn format_of(path: &Path, options: &WriteOptions) -> io::Result<Format> {
 
 /// The encoder of a format. For a format that can only be read, the error names those that can be written.
 fn encoder_of(format: Format, options: &WriteOptions) -> io::Result<Box<dyn Encode>> {
-    Ok(match format {
-        Format::Candump => Box::new(candump::Encoder::default()),
-        Format::Asc => Box::new(asc::Encoder::new(&options.zone)),
-        Format::Blf => Box::new(blf::Encoder::new(&options.zone)),
-        Format::Trc(version) => Box::new(trc::Encoder::new(version, &options.zone)),
-        Format::Csv(CsvDialect::PythonCan) => Box::new(csv::PythonCanEncoder::default()),
-        Format::Csv(CsvDialect::Full) => Box::new(csv::FullEncoder::default()),
-        Format::Csv(CsvDialect::Analyser) => {
-            Box::new(TableEncoder::new(CsvLayout(options.table), &options.zone))
-        }
-        Format::Csv(CsvDialect::Gvret) => Box::new(gvret::Encoder::default()),
-        Format::Pcapng => Box::new(pcapng::Encoder::new(options)),
-        Format::Dif => Box::new(TableEncoder::new(DifLayout::new(options.table), &options.zone)),
-        Format::Mf4 => Box::new(mf4::Encoder::default()),
-        read_only => return Err(io::Error::new(io::ErrorKind::Unsupported, NotWritten(read_only))),
-    })
+    let unwritten = || io::Error::new(io::ErrorKind::Unsupported, NotWritten(format));
+    FormatSpec::of(format).writer.map(|writer| writer(options)).ok_or_else(unwritten)
 }
 
 impl FileWriter {

@@ -12,11 +12,13 @@ extern crate self as cantap_formats;
 
 mod analyser;
 mod asc;
+mod battery_emulator;
 mod blf;
 mod busmaster;
 mod calendar;
 mod candump;
 mod candump_screen;
+mod canedge;
 mod canhacker;
 mod canking;
 mod carriage_return;
@@ -54,6 +56,7 @@ mod rotation;
 mod row_format;
 mod sja1000;
 mod socketcan_packet;
+mod spec;
 #[cfg(feature = "sqlite")]
 mod sqlite;
 #[cfg(test)]
@@ -61,6 +64,7 @@ mod tests;
 mod text;
 pub mod time_range;
 mod trc;
+mod unread;
 mod utf16;
 mod whole;
 mod writer;
@@ -70,12 +74,14 @@ pub(crate) use analyser::date as date_time_ns;
 pub use analyser::{DifConvention, LineEnd, TableStyle};
 pub use create::{create_stream_writer, create_writer};
 pub use csv::CsvDialect;
-pub use format::{Format, NotWritten, UnknownFormat};
+pub use format::Format;
 pub use issue::{Fault, Place, ReadIssue};
 pub use left_out::LeftOut;
 pub use reader::{NothingRead, OpenError, ReadOptions, TraceReader, open_reader};
 pub use rotation::{BadRotation, RotateAt, Rotation};
+pub use spec::{NotWritten, UnknownFormat};
 pub use trc::TrcVersion;
+pub use unread::{Readable, Unread};
 pub use writer::{ChannelInfo, TraceWriter, WriteOptions};
 pub use zone::{UnknownZone, Zone};
 

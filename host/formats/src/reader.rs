@@ -5,18 +5,15 @@ use std::io::{self, Read};
 use std::path::Path;
 use std::sync::Arc;
 
+use super::Format;
 use super::codec::{BATCH, Decode};
 use super::content;
 use super::found::Found;
 use super::input::Input;
 use super::issue::{Fault, Place, ReadIssue};
 use super::left_out::LeftOut;
-use super::row_format::Rows;
+use super::spec::{FormatSpec, UnknownFormat};
 use super::zone::Zone;
-use super::{
-    Format, UnknownFormat, asc, blf, busmaster, candump, candump_screen, canhacker, canking, crtd, csv, dif,
-    kvaser, mf4, microchip, pcap, pcapng, printer, trc,
-};
 use cantap_trace::{PlainFrame, TraceRecord};
 
 /// How to read.
@@ -114,7 +111,12 @@ pub fn open_reader(path: impl AsRef<Path>, options: &ReadOptions) -> Result<Trac
             }
             (Ok(format), _) | (Err(_), Some(format)) => format,
             (Err(_), None) if path.as_os_str() == "-" => Format::Candump,
-            (Err(unknown), None) => return Err(unknown.into()),
+            (Err(unknown), None) => {
+                let looks_like = content::known(head);
+                let no_trace =
+                    looks_like.map(|looks_like| UnknownFormat::NoTrace { file: name.clone(), looks_like });
+                return Err(no_trace.unwrap_or(unknown).into());
+            }
         }
     };
     input.set_zone(options.zone.clone());
@@ -124,31 +126,7 @@ pub fn open_reader(path: impl AsRef<Path>, options: &ReadOptions) -> Result<Trac
 
 impl TraceReader {
     fn new(name: Arc<str>, format: Format, input: Input, strict: bool) -> Self {
-        let decoder: Box<dyn Decode> = match format {
-            Format::Candump => Box::new(candump::Decoder::default()),
-            Format::Asc => Box::new(asc::Decoder::new(input.zone())),
-            Format::Blf => Box::new(blf::Decoder::new(input.zone())),
-            Format::Trc(_) => Box::new(trc::Decoder::new(input.zone())),
-            Format::Csv(_) => Box::new(csv::Decoder::new(input.zone())),
-            Format::Pcapng => Box::new(pcapng::Decoder::default()),
-            Format::Pcap => Box::new(pcap::Decoder::default()),
-            Format::Dif => Box::new(dif::Decoder::new(input.zone())),
-            Format::Mf4 => Box::new(mf4::Decoder::default()),
-            Format::CandumpScreen => Box::new(Rows::<candump_screen::Decoder>::default()),
-            Format::Busmaster => Box::new(Rows::<busmaster::Decoder>::default()),
-            Format::Crtd => Box::new(Rows::<crtd::Decoder>::default()),
-            Format::Kvaser => Box::new(Rows::<kvaser::Decoder>::default()),
-            Format::Microchip => Box::new(Rows::<microchip::Decoder>::default()),
-            Format::CanHacker => Box::new(Rows::<canhacker::Decoder>::default()),
-            Format::Printer => Box::new(Rows::<printer::Decoder>::default()),
-            Format::CanKing => Box::new(Rows::<canking::Decoder>::default()),
-            #[cfg(feature = "sqlite")]
-            Format::Sqlite => Box::new(super::sqlite::Decoder::default()),
-            #[cfg(not(feature = "sqlite"))]
-            Format::Sqlite => Box::new(super::codec::Missing(
-                "this build reads no SQLite; build it with the feature `sqlite`",
-            )),
-        };
+        let decoder = (FormatSpec::of(format).reader)(input.zone());
         let batch = Vec::with_capacity(BATCH);
         let head = input.buffered().iter().take(content::HEAD_BYTES).copied().collect();
         Self {
@@ -201,7 +179,7 @@ impl TraceReader {
     /// Whether nothing of the file could be read so far although it is not empty.
     pub fn nothing_read(&self) -> Option<NothingRead> {
         // Without a head, comments alone show nothing of a format.
-        let only_comments = !self.format.has_head() && !self.head.is_empty();
+        let only_comments = !FormatSpec::of(self.format).has_head && !self.head.is_empty();
         let something = self.issues > 0 || !self.left_out.is_empty() || only_comments;
         (self.records == 0 && something).then(|| NothingRead {
             file: self.name.clone(),
@@ -314,7 +292,7 @@ impl TraceReader {
                 }
                 let is_empty = self.head.is_empty() && self.input.offset() == 0 && self.issues == 0;
                 if is_empty && !self.input.follows() {
-                    if self.format.has_head() {
+                    if FormatSpec::of(self.format).has_head {
                         let fault = Fault::malformed(format!("the head of a file in {}", self.format), b"");
                         return Beyond::Issue(self.issue(Place::Offset(0), fault));
                     }

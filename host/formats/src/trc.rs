@@ -138,6 +138,13 @@ fn error_of(class: u32, position: u8, counters: (u8, u8)) -> TraceEvent {
     TraceEvent::BusError { kind, counters: Some(counters) }
 }
 
+/// Whether a text, and its first line, are those of such a file's head.
+pub(crate) fn is_head(text: &[u8], line: &[u8]) -> bool {
+    text.starts_with(b";$FILEVERSION")
+        || text.starts_with(b";####")
+        || line.starts_with(b";") && memchr::memmem::find(text, b"Start time:").is_some()
+}
+
 #[cfg(test)]
 mod tests {
     use super::super::tests;

@@ -35,7 +35,8 @@ impl TimeAxis {
         let zero = if first == 0 {
             String::new()
         } else {
-            format!("{}.{:06}", first.div_euclid(1_000_000_000), first.rem_euclid(1_000_000_000) / 1000)
+            let (sign, size) = (if first < 0 { "-" } else { "" }, first.unsigned_abs());
+            format!("{sign}{}.{:06}", size / 1_000_000_000, size % 1_000_000_000 / 1000)
         };
         Axis::Time { zero }
     }
@@ -94,6 +95,21 @@ impl Gaps {
             self.add(Gap { from, to: end, frames: channel.lost });
         }
         self.gaps
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Axis, TimeAxis};
+
+    /// The seconds were those of the second before.
+    #[test]
+    fn a_zero_before_the_epoch_is_the_time_in_the_file() {
+        for (first_ns, zero) in
+            [(-1_500_000_000, "-1.500000"), (-250_000_000, "-0.250000"), (1_250_000_000, "1.250000")]
+        {
+            assert_eq!(TimeAxis { first_ns: Some(first_ns) }.axis(), Axis::Time { zero: zero.to_owned() });
+        }
     }
 }
 

@@ -50,6 +50,10 @@ fn row(format: Format) -> String {
             Format::CanHacker => ["1 ms, no date, of a minute", "– | – | – | – | – | – | –"],
             Format::Printer => ["1 µs", "yes | yes | yes | yes | yes | yes | –"],
             Format::CanKing => ["as written, no date", "yes | yes | yes | yes | that there was one | – | –"],
+            Format::CanEdgeCsv => ["as written", "yes | yes | yes | yes | – | – | –"],
+            Format::BatteryEmulator => {
+                ["as written, no date", "yes | yes | – | without flags | – | – | that there was one"]
+            }
             Format::Sqlite => ["as written", "– | – | yes | without flags | yes | yes | yes"],
             new => panic!("{new} has no row here yet"),
         };

@@ -158,15 +158,34 @@ fn replies_are_counted_with_the_frames_that_asked_for_them() {
     assert!(code == Some(2) && err.contains("cannot start a reply"), "{err}");
 }
 
+/// Ends with the test.
+#[cfg(unix)]
+struct Server(std::process::Child);
+
+#[cfg(unix)]
+impl Drop for Server {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
 /// Nothing leaves that is not counted: by a witness on the same bus.
 #[cfg(unix)]
 #[test]
 fn what_was_sent_is_what_left_however_it_ended() {
     let _turn = cantap_testing::process::turn();
-    let served = crate::served::Served::start(
-        "virtual:wire=joined,load=50,frames=std0,seed=5",
-        std::process::Stdio::null(),
-    );
+    let folder = tempfile::tempdir().unwrap();
+    let socket = folder.path().join("cantap.sock").display().to_string();
+    let mut server = Command::new(env!("CARGO_BIN_EXE_cantap"));
+    server.args(["serve", "-d", "virtual:wire=joined,load=50,frames=std0,seed=5", "-b", "500k"]);
+    server.args(["--allow", "send", "--unix", &socket]).stdin(std::process::Stdio::null());
+    server.stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::null());
+    let mut server = Server(server.spawn().unwrap());
+    let mut first = String::new();
+    let stdout = server.0.stdout.take().unwrap();
+    std::io::BufRead::read_line(&mut std::io::BufReader::new(stdout), &mut first).unwrap();
+    let at = first.trim().to_owned();
     let end = |child: std::process::Child| {
         let process = child.id().to_string();
         assert!(Command::new("kill").args(["-s", "INT", &process]).status().unwrap().success());
@@ -180,7 +199,6 @@ fn what_was_sent_is_what_left_however_it_ended() {
             .stderr(std::process::Stdio::null());
         command.spawn().unwrap()
     };
-    let at = &served.at;
     for (number, (what, ended_by)) in [
         ("send 1 7F0#11 --on-rx 000:400", "-t 700ms"),
         ("send 1 7F1#11 --period 1ms", "-t 700ms"),
@@ -190,7 +208,7 @@ fn what_was_sent_is_what_left_however_it_ended() {
     .into_iter()
     .enumerate()
     {
-        let log = served.folder.path().join(format!("{number}.log"));
+        let log = folder.path().join(format!("{number}.log"));
         let witness = spawn(&format!("capture -d {at} -c 1 -b 500k --mode normal -o {}", log.display()));
         // It listens once there is something in its file.
         let deadline = std::time::Instant::now() + std::time::Duration::from_mins(1);

@@ -9,7 +9,7 @@ use super::analyser::{CsvLayout, TableEncoder};
 use super::codec::{Decode, Encode};
 use super::compression::Compression;
 use super::csv::CsvDialect;
-use super::dif::DifLayout;
+use super::dif::{self, DifLayout};
 use super::format::Format;
 use super::row_format::Rows;
 use super::trc::TrcVersion;

@@ -82,7 +82,11 @@ impl DatabaseArgs {
             if !quiet || strict {
                 warn(&database);
             }
-            if strict && !database.warnings.is_empty() {
+            // In which encoding a file is read is no fault of it.
+            let is_fault = |warning: &cantap_signals::Fault| {
+                !matches!(warning.kind, cantap_signals::FaultKind::Encoding(_))
+            };
+            if strict && database.warnings.iter().any(is_fault) {
                 bail!("{} has faults; see above", database.file);
             }
             sources.push(Source { channel: *channel, database });

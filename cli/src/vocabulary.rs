@@ -37,7 +37,8 @@ const LETTERS: [(char, &[&str]); 20] = [
 const OF_CAN_UTILS: [(&str, &str); 2] = [("gen", "DEILRcefgimpx8"), ("replay", "Igilstx")];
 
 /// Options whose values do not follow from their name alone, with the reason.
-const MANY_KINDS: [(&str, &str); 6] = [
+const MANY_KINDS: [(&str, &str); 7] = [
+    ("pair", "what asks an ECU has one pair; what reads a trace also knows makers' pairs"),
     ("count", "as in grep, search counts instead of printing; send's is a number"),
     ("id", "gen makes identifiers, search looks for them"),
     ("loop", "replay's number of rounds, as canplayer's; selftest's wiring"),
@@ -138,7 +139,7 @@ const GRAMMAR: [(&str, &[&str], &[&str]); 5] = [
             "vcan0,123",
             "can1,400~7F0,#FF,j",
         ],
-        &["12g", "ca0", "800", "200-100", "pgn:x", "100-1FF,j", "can0,", "x"],
+        &["12g", "ca0", "800", "200-100", "pgn:x", "100-1FE,j", "can0,", "x"],
     ),
     ("ID", &["C0", "CAFE0", "123", "0x123", "09F80102", "1"], &["12g", "ca0", "800", "", "123456789"]),
     ("RATE", &["500000", "500k", "83.333k", "0.5M", "500kbit/s"], &["500", "fast", "1e6", "-1", ""]),
@@ -161,6 +162,7 @@ fn every_identifier_filter_rate_and_channel_is_written_as_the_others() {
             return;
         };
         *seen.entry(*kind).or_insert(0) += 1;
+        let id = argument.get_id();
         let parse = |text: &str| {
             let line = Arg::new("value").long("value").value_parser(argument.get_value_parser().clone());
             let parser = Command::new("x").arg(line.allow_hyphen_values(true));
@@ -168,14 +170,14 @@ fn every_identifier_filter_rate_and_channel_is_written_as_the_others() {
         };
         for text in *good {
             if let Err(error) = parse(text) {
-                wrong.push(format!("{command} {argument}: {text}: {error}"));
+                wrong.push(format!("{command} {id}: {text}: {error}"));
             }
         }
         for text in *bad {
             match parse(text) {
-                Ok(()) => wrong.push(format!("{command} {argument}: {text} is taken")),
+                Ok(()) => wrong.push(format!("{command} {id}: {text} is taken")),
                 Err(error) if error.exit_code() != 2 => {
-                    wrong.push(format!("{command} {argument}: {text}: another code"))
+                    wrong.push(format!("{command} {id}: {text}: another code"))
                 }
                 Err(_) => {}
             }

@@ -299,7 +299,8 @@ impl<'d> Watch<'d> {
         self.take_records()?;
         let status = self.device.status()?;
         let clock_hz = self.device.hello().can_clock_hz;
-        let seen = self.channels.iter().zip(&status.channels);
+        // A closed channel has no frames, and explains none.
+        let seen = self.channels.iter().zip(&status.channels).filter(|(_, state)| state.open.is_some());
         let worst = seen.max_by_key(|(seen, _)| {
             (seen.stands_still, seen.failed() + seen.overtaken, seen.errors_since.cause().is_some())
         });

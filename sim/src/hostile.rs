@@ -94,6 +94,7 @@ pub fn try_seed(image: Image, seed: u64) -> Trial {
         may_send: [false; CHANNELS],
         resets: 0,
         resets_wanted: 0,
+        misuse: Misuse::default(),
         story: vec![format!("{hostile:?}")],
         faults: Vec::new(),
     };
@@ -120,6 +121,8 @@ struct Bench {
     /// Resets seen so far, and those that something else than the firmware's failure caused.
     resets: u64,
     resets_wanted: u64,
+    /// As last told. What the book demands of a driver is judged where the silicon keeps to it, or departs from it in one way only.
+    misuse: Misuse,
     story: Vec<String>,
     faults: Vec<String>,
 }
@@ -142,6 +145,11 @@ impl Bench {
     }
 
     fn tell(&mut self, what: impl std::fmt::Display) {
+        let misuse = self.rig.with_host(|_, otg| otg.misuse());
+        if misuse != self.misuse {
+            self.misuse = misuse;
+            self.story.push(format!("{misuse:?}"));
+        }
         let at_us = CLOCK.to_us(self.rig.now()) as u64;
         self.story.push(format!("{at_us} µs: {what}"));
     }
@@ -228,7 +236,9 @@ impl Bench {
     /// The session is over, whatever became of it; the port is closed.
     fn cut(&mut self) -> Result<(), RigError> {
         self.rig.with_host(|host, _| host.close_port());
-        self.rig.run_for(SILENT_WITHIN)?;
+        let takes_part = |rig: &mut Rig| Channel::ALL.into_iter().any(|channel| rig.takes_part(channel));
+        self.rig.run_while(SILENT_WITHIN, takes_part)?;
+        self.rig.run_for(5 * MS)?;
         self.rig.cut();
         self.in_session = false;
         self.may_send = [false; CHANNELS];
@@ -395,14 +405,11 @@ impl Bench {
             let unwanted = self.rig.machine.resets() - self.resets_wanted;
             self.fault(format_args!("{unwanted} resets by failures or the watchdog"));
         }
+        self.tell("the end");
         let Self { rig, faults, .. } = self;
         faults.extend(law(&rig.ledger));
         faults.extend(rig.session.corruptions().iter().map(|corruption| format!("on USB: {corruption:?}")));
         faults.extend(rig.machine.board().odd_accesses().iter().map(|odd| format!("odd access: {odd}")));
-        let misuse = rig.with_host(|_, otg| otg.misuse());
-        if misuse != Misuse::default() {
-            faults.push(format!("{misuse:?}"));
-        }
     }
 }
 

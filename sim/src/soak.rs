@@ -21,8 +21,6 @@ const MEGABIT: u32 = 1_000_000;
 const TURN: u64 = CYCLES_PER_SECOND;
 /// Fills memory that is yet unused.
 const PAINT: u8 = 0xA5;
-/// So many painted bytes below the stack have never been used.
-const UNUSED: usize = 256;
 /// Device ticks per microsecond.
 const TICKS_PER_US: u64 = 12;
 
@@ -233,14 +231,16 @@ impl Bench {
         Ok((ticks as i64 - most).max(0) + (ticks as i64 - least).min(0))
     }
 
-    /// Bytes of the stack, which is at the end of the core-coupled memory, that have ever been used.
+    /// Bytes of the stack that have ever been used, if it is at the beginning of the core-coupled memory and grows down in it.
     fn stack_bytes(&self) -> usize {
-        let mut ccm = vec![0; map::CCM.len()];
-        if let Some(memory) = self.rig.machine.cpu().memory(map::CCM.start) {
-            memory.read(map::CCM.start, &mut ccm);
+        let cpu = self.rig.machine.cpu();
+        let start = cpu.word(map::FLASH.start).unwrap_or(0);
+        let mut stack =
+            vec![0; start.checked_sub(map::CCM.start).unwrap_or(0).min(map::CCM.len() as u32) as usize];
+        if let Some(memory) = cpu.memory(map::CCM.start) {
+            memory.read(map::CCM.start, &mut stack);
         }
-        let unused = ccm.windows(UNUSED).rposition(|piece| piece.iter().all(|byte| *byte == PAINT));
-        unused.map_or(ccm.len(), |at| ccm.len() - at - UNUSED)
+        stack.iter().position(|byte| *byte != PAINT).map_or(0, |first| stack.len() - first)
     }
 }
 

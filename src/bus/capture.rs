@@ -129,7 +129,8 @@ impl<'q, const N: usize> Capture<'q, N> {
     }
 
     /// Records that frames are missing before the next one in the FIFO, if they are.
-    #[inline]
+    #[cold]
+    #[inline(never)]
     fn record_gap(state: &mut ChannelState<'_>, recorder: &mut Recorder<'_, N>, channel: Channel, at: u64) {
         match state.gaps.here() {
             Gap::None => {}
@@ -151,7 +152,6 @@ impl<'q, const N: usize> Capture<'q, N> {
     }
 
     /// Drains the FIFO; without `entered`, nothing is known about when its frames ended. Returns whether it is empty.
-    #[inline]
     fn drain(
         &mut self,
         channel: Channel,
@@ -178,19 +178,21 @@ impl<'q, const N: usize> Capture<'q, N> {
                 emptied = true;
                 break;
             }
-            let (stamp, quality) = match entered.take() {
-                Some(entered) if pending <= 1 => (entered, Stamp::Exact),
-                // The last frame may have ended after the interrupt was entered.
-                _ => (clock.now(), Stamp::UpperBound),
-            };
-            let at = self.recorder.time(stamp);
+            // A single frame raised the interrupt; of several, the last may have ended after it was entered.
+            let raised = entered.take().filter(|_| pending <= 1).map(|entered| self.recorder.time(entered));
             if overrun {
+                let at = raised.unwrap_or_else(|| self.recorder.time(clock.now()));
                 state.gaps.overrun(traffic);
                 Self::record_gap(state, &mut self.recorder, channel, at);
             }
             let mut taken = 0;
             for _ in 0..u32::from(pending).min(room) {
                 let Some(frame) = traffic.receive() else { break };
+                // Read only now: while the one before was being released, another may have ended.
+                let (at, quality) = match raised {
+                    Some(at) => (at, Stamp::Exact),
+                    None => (self.recorder.time(clock.now()), Stamp::UpperBound),
+                };
                 room -= 1;
                 taken += 1;
                 state.frames = state.frames.wrapping_add(1);
@@ -202,8 +204,9 @@ impl<'q, const N: usize> Capture<'q, N> {
                     data_omitted: omit_data,
                 };
                 self.recorder.frame(&received, at);
-                state.gaps.taken();
-                Self::record_gap(state, &mut self.recorder, channel, at);
+                if state.gaps.taken() {
+                    Self::record_gap(state, &mut self.recorder, channel, at);
+                }
             }
             state.gaps.looked(pending, taken, traffic);
         }

@@ -91,24 +91,34 @@ impl PeriodicTable {
         }
     }
 
-    /// Sets or clears an entry; its first transmission is due at `now`.
+    /// Sets or clears an entry; its first transmission is due at `now`. Touches no other entry: it is called with the lock held.
     pub fn set(&mut self, slot: usize, entry: Option<Periodic>, now: u64) {
-        self.count_overtaken(now);
         let Some(place) = self.entries.get_mut(slot) else { return };
+        let was_waiting = place.is_some() && self.idle >> slot & 1 == 0;
+        let begun = place.as_mut().map_or(0, |old| old.begin_periods(now));
+        let first_due = now.max(self.look_from);
         *place = entry.map(|entry| PeriodicState {
             left: (entry.count > 0).then_some(entry.count),
             entry,
             next_due: now,
             step: 0,
         });
-        self.idle = self.idle & !(1 << slot) | u32::from(place.is_some()) << slot;
-        for _ in 0..self.waiting.len() {
-            if let Some(other) = self.waiting.pop_front().filter(|&other| usize::from(other) != slot) {
-                // Cannot fail: it was there.
-                let _ = self.waiting.push_back(other);
+        let is_set = place.is_some();
+        // Of the periods that an idle entry has begun, one would have been waiting.
+        self.add_overtaken(slot, if was_waiting { begun } else { begun.saturating_sub(1) });
+        self.idle = self.idle & !(1 << slot) | u32::from(is_set) << slot;
+        if was_waiting {
+            for _ in 0..self.waiting.len() {
+                if let Some(other) = self.waiting.pop_front().filter(|&other| usize::from(other) != slot) {
+                    // Cannot fail: it was there.
+                    let _ = self.waiting.push_back(other);
+                }
             }
         }
-        self.find_due();
+        // If the entry that was due first is gone, the next look finds that.
+        if is_set {
+            self.due = self.due.min(first_due);
+        }
     }
 
     /// Forgets the entries; periods that passed until `now` are counted.
@@ -129,12 +139,6 @@ impl PeriodicTable {
         self.waiting.clear();
         self.idle = 0;
         self.due = NEVER;
-    }
-
-    fn find_due(&mut self) {
-        let idle = slots(self.idle).filter_map(|slot| self.entries[slot].as_ref());
-        let due = idle.map(|entry| entry.next_due).min();
-        self.due = due.map_or(NEVER, |due| due.max(self.look_from));
     }
 
     /// When [`Self::look`] must be called next; [`NEVER`] if all entries wait.

@@ -51,7 +51,8 @@ impl<'q, const N: usize> Recorder<'q, N> {
     }
 
     /// Writes a received frame, or counts it as lost.
-    #[inline]
+    #[inline(always)]
+    #[expect(clippy::inline_always, reason = "measured: a tenth of the time for a frame")]
     pub fn frame(&mut self, received: &Received, at: u64) {
         if self.unreported != [0; CHANNELS] {
             self.report_losses(at);

@@ -22,10 +22,11 @@ const WORDS: usize = 128 * 1024 / 4;
 /// RM0090, "Unlocking the Flash control register".
 const KEYS: [u32; 2] = [0x4567_0123, 0xCDEF_89AB];
 
-/// Longest operation: erasing the sector, 2 s (data sheet, as above). A flash that is busy for longer does not end, and must be given up
-/// before the watchdog bites.
-const MOST_TICKS: u32 = 2_200 * TICKS_PER_MS;
-/// The same as a number of reads at 16 MHz, each with its loop at least 5 cycles: before there is a timer.
+/// Erasing the sector takes 2 s at most, programming a word 100 µs (data sheet, as above). A flash that is busy for longer does not end, and
+/// must be given up before the watchdog bites.
+const ERASE_TICKS: u32 = 2_200 * TICKS_PER_MS;
+const PROGRAM_TICKS: u32 = 10 * TICKS_PER_MS;
+/// The first of these as a number of reads at 16 MHz, each with its loop at least 5 cycles: before there is a timer.
 const MOST_READS: u32 = 2_200 * (clocks::HSI_HZ / 1_000 / 5);
 
 /// Locks the control register, which another program may have left open, and clears any error flags left behind.
@@ -67,19 +68,19 @@ impl LastSector {
         Self(flash, timer)
     }
 
-    /// Waits for the end of an operation; returns whether it came.
-    fn wait(&self) -> bool {
+    /// Waits for the end of an operation; returns whether it came within this time.
+    fn wait(&self, most_ticks: u32) -> bool {
         let from = self.1.now();
         while is_busy(&self.0) {
-            if self.1.now().wrapping_sub(from) > MOST_TICKS {
+            if self.1.now().wrapping_sub(from) > most_ticks {
                 return false;
             }
         }
         true
     }
 
-    /// Unlocks the flash, runs `act`, waits until it is done, locks the flash. Returns whether it succeeded.
-    fn unlocked(&mut self, act: impl FnOnce(&FLASH)) -> bool {
+    /// Unlocks the flash, runs `act`, waits until it is done, locks the flash. Returns whether it succeeded within `most_ticks`.
+    fn unlocked(&mut self, most_ticks: u32, act: impl FnOnce(&FLASH)) -> bool {
         // Every operation is waited for, so this is one that was given up.
         if is_busy(&self.0) {
             return false;
@@ -96,7 +97,7 @@ impl LastSector {
         act(&self.0);
         // A store may still be on its way, and the flash not busy yet.
         cortex_m::asm::dsb();
-        let went_well = self.wait() && went_well(&self.0);
+        let went_well = self.wait(most_ticks) && went_well(&self.0);
         self.0.cr().modify(|_, w| w.pg().clear_bit().ser().clear_bit().lock().set_bit());
         // The data cache, where it is used (`clocks`), may hold what was there before.
         if self.0.acr().read().dcen().bit() {
@@ -119,7 +120,7 @@ impl Sector for LastSector {
         if index >= WORDS {
             return false;
         }
-        let went_well = self.unlocked(|flash| {
+        let went_well = self.unlocked(PROGRAM_TICKS, |flash| {
             flash.cr().modify(|_, w| w.psize().psize32().pg().set_bit());
             // SAFETY: inside the sector, which nobody holds a reference to, because `self` is exclusive.
             unsafe { START.cast_mut().add(index).write_volatile(word) };
@@ -129,7 +130,7 @@ impl Sector for LastSector {
     }
 
     fn erase(&mut self) -> bool {
-        let went_well = self.unlocked(|flash| {
+        let went_well = self.unlocked(ERASE_TICKS, |flash| {
             // SAFETY: the chip has this sector.
             flash.cr().modify(|_, w| unsafe { w.psize().psize32().ser().set_bit().snb().bits(SECTOR) });
             flash.cr().modify(|_, w| w.strt().set_bit());

@@ -62,6 +62,9 @@ pub fn check(shell: &Shell, peers: Option<&Peers>) -> Result<Outcome> {
     cmd!(shell, "cargo clippy --manifest-path {MANIFEST} -- -D warnings")
         .env("CARGO_TARGET_DIR", workspace::target())
         .run()?;
+    cmd!(shell, "cargo clippy --manifest-path {MANIFEST} --no-default-features -- -D warnings")
+        .env("CARGO_TARGET_DIR", workspace::target())
+        .run()?;
     let wheel = wheel(shell, &workspace::root(), Profile::Dev, &target().join("wheels"))?;
     let python = environment(shell, &wheel)?;
     cmd!(shell, "{python} -m mypy --config-file python/pyproject.toml python/cantap python/tests/typed.py")

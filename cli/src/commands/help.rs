@@ -172,7 +172,7 @@ mod tests {
             let lines: Vec<&str> = after.lines().collect();
             for pair in lines.windows(2) {
                 let is_text = |line: &str| !line.is_empty() && !line.starts_with(' ');
-                if is_text(pair[0]) && is_text(pair[1]) && !pair[0].ends_with(':') {
+                if is_text(pair[0]) && is_text(pair[1]) && !pair[0].trim_end().ends_with(':') {
                     wrong.push(format!("{name}: a sentence is broken after {:?}", pair[0]));
                 }
             }

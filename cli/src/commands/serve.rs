@@ -46,8 +46,8 @@ use cantap_work::interrupt;
                 cantap monitor -d tcp://127.0.0.1\n  \
                 cantap capture -d ssh://me@vehicle/dev/ttyACM0 -b 500k -o drive.log\n  \
                 cantap serve keygen keys --host vehicle --client alice:send\n  \
-                cantap serve -d /dev/ttyACM0 -b 500k --tcp 192.0.2.7 --tls keys/server.pem,keys/server-key.pem \\\n      \
-                --clients keys/ca.pem"
+                cantap serve -d /dev/ttyACM0 -b 500k --tcp 192.0.2.7 \\\n      \
+                --tls keys/server.pem,keys/server-key.pem --clients keys/ca.pem"
 )]
 pub struct Args {
     #[cfg(feature = "tls")]
@@ -67,7 +67,7 @@ pub struct Args {
     allowed: Vec<Allowed>,
     /// normal: the board acknowledges on its buses from the first listener on, so that no client that sends takes it off its bus for a
     /// moment.
-    #[arg(long, value_name = "MODE", value_enum, default_value = "listen")]
+    #[arg(long, value_name = "MODE", value_enum, default_value = "listen-only")]
     mode: Listeners,
     /// Periodic frames and replies of a client at --tcp or ssh that has said nothing for this long are stopped, as 2s; 0 for never.
     #[arg(long, value_name = "TIME", value_parser = dead_man, default_value = "2s")]
@@ -105,7 +105,8 @@ pub struct Args {
 #[derive(Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 enum Listeners {
     /// The board is not seen on the bus.
-    Listen,
+    #[value(name = "listen-only", alias = "listen")]
+    ListenOnly,
     /// The board acknowledges.
     Normal,
 }

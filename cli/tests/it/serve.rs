@@ -522,3 +522,68 @@ fn what_cannot_be_served_is_said_at_once() {
         assert!(err.contains(part), "{arguments}: {err}");
     }
 }
+
+/// A path may name anything.
+#[test]
+fn what_is_no_abandoned_socket_stays() {
+    let folder = tempfile::tempdir().unwrap();
+    let notes = folder.path().join("notes.txt");
+    std::fs::write(&notes, "mine").unwrap();
+    let (code, _, err) = run(&format!("serve -d virtual -b 500k --unix {}", notes.display()));
+    assert_eq!(code, Some(1), "{err}");
+    assert!(err.contains("there is a file, which is left as it is; give another path with --unix"), "{err}");
+    assert_eq!(std::fs::read_to_string(&notes).unwrap(), "mine");
+    let path = socket(folder.path());
+    let server = Server::start(&format!("-d virtual -b 500k --unix {path}"), 1);
+    let (code, _, err) = run(&format!("serve -d virtual -b 500k --unix {path}"));
+    assert_eq!(code, Some(1), "{err}");
+    assert!(err.contains("another server is at"), "{err}");
+    drop(server);
+}
+
+/// Other clients that come, send and go cost one gap, which the capture's own summary counts.
+#[test]
+fn a_change_of_mode_is_in_the_capture_s_summary_and_in_the_statistics() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = socket(folder.path());
+    let server = Server::start(&format!("-d virtual:load=30 -b 500k --unix {path} --allow send"), 1);
+    let file = folder.path().join("all.log");
+    let capture = capture(&server.at[0], &file, "-t 4s").spawn().unwrap();
+    let started = Instant::now();
+    while std::fs::metadata(&file).map_or(0, |file| file.len()) < 1000 {
+        assert!(started.elapsed() < Duration::from_secs(20), "nothing is captured");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    for _ in 0..3 {
+        let (code, _, err) = run(&format!("send -d unix:{path} 1 7A1#11"));
+        assert_eq!(code, Some(0), "{err}");
+    }
+    let (code, out, err) = said(&capture.wait_with_output().unwrap());
+    assert_eq!(code, Some(0), "{err}");
+    let summary: serde_json::Value = serde_json::from_str(&out).unwrap();
+    assert_eq!(summary["lost"]["off_bus"], 1, "{summary}");
+    assert!(summary["lost"]["off_bus_us"].as_u64() > Some(0), "{summary}");
+    assert_eq!(summary["channels"][0]["lost_at_least"], true, "{summary}");
+    assert_eq!(summary["channels"][1]["lost_at_least"], false, "{summary}");
+    let (code, out, err) = run(&format!("stats {} -b 500k", file.display()));
+    assert_eq!(code, Some(0), "{err}");
+    assert!(out.lines().next().unwrap().contains(", an unknown number lost, "), "{out}");
+}
+
+/// The server's end is what clients are told, and commands say what was done until then.
+#[test]
+fn what_was_sent_until_the_server_ended_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = socket(folder.path());
+    let mut server = Server::start(&format!("-d virtual:load=0 -b 500k --unix {path} --allow send"), 1);
+    let sends = cantap(&format!("gen -d unix:{path} can0 -g 5 --json")).spawn().unwrap();
+    let mut ears = capture(&server.at[0], &folder.path().join("x.log"), "-n 20").spawn().unwrap();
+    assert!(ears.wait().unwrap().success());
+    server.interrupt();
+    let (code, out, err) = said(&sends.wait_with_output().unwrap());
+    assert_eq!(code, Some(1), "{err}");
+    assert!(err.contains("its server has ended"), "{err}");
+    let object: serde_json::Value = serde_json::from_str(&out).unwrap();
+    assert!(object["sent"].as_u64() >= Some(19), "{object}");
+    assert!(object["reason"].as_str().unwrap().contains("its server has ended"), "{object}");
+}

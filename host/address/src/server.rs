@@ -31,6 +31,8 @@ pub enum Server {
 pub struct Ssh {
     /// As ssh takes it, including the user if given.
     host: String,
+    /// If `None`, ssh's own.
+    port: Option<u16>,
     /// If `None`, the board that is connected there.
     device: Option<String>,
     /// What this client may do.
@@ -222,14 +224,15 @@ impl Ssh {
             Some((host, device)) => (host, Some(device.to_owned())),
             None => (place, None),
         };
-        let name = host.rsplit_once('@').map_or(host, |(_, name)| name);
+        let (host, port) = ssh_port(host)?;
+        let name = host.rsplit_once('@').map_or(host.as_str(), |(_, name)| name);
         // ssh would take anything that begins with a dash as an option.
         if name.is_empty() || name.starts_with('-') || host.starts_with(['-', '@']) {
             return Err(format!(
-                "'{host}' is not the name of a computer; write it as ssh://[USER@]HOST[/DEVICE]"
+                "'{host}' is not the name of a computer; write it as ssh://[USER@]HOST[:PORT][/DEVICE]"
             ));
         }
-        Ok(Self { host: host.to_owned(), device, allow })
+        Ok(Self { host, port, device, allow })
     }
 
     /// ssh, or the program named by `CANTAP_SSH`.
@@ -238,7 +241,11 @@ impl Ssh {
         let mut command = Command::new(program);
         // ssh is kept out of the terminal's foreground, so that Ctrl-C does not end it before the capture; it therefore cannot ask
         // for anything.
-        command.args(["-T", "-oBatchMode=yes", "--", &self.host]);
+        command.args(["-T", "-oBatchMode=yes"]);
+        if let Some(port) = self.port {
+            command.arg(format!("-p{port}"));
+        }
+        command.args(["--", &self.host]);
         command.args(["cantap", "serve", "--stdio", "--allow", self.allow.name()]);
         if let Some(device) = &self.device {
             command.args(["-d", &quoted(device)]);
@@ -247,6 +254,26 @@ impl Ssh {
         std::os::unix::process::CommandExt::process_group(&mut command, 0);
         command
     }
+}
+
+/// Takes the port off `[USER@]HOST[:PORT]`, where an IPv6 address with a port is in brackets.
+fn ssh_port(place: &str) -> Result<(String, Option<u16>), String> {
+    let bad = || {
+        format!(
+            "'{place}' has no port number behind its colon; write it as ssh://[USER@]HOST[:PORT][/DEVICE]"
+        )
+    };
+    let (user, name) =
+        place.rsplit_once('@').map_or(("", place), |(user, name)| (&place[..=user.len()], name));
+    let (name, port) = match name.strip_prefix('[').and_then(|rest| rest.split_once(']')) {
+        Some((name, "")) => (name, None),
+        Some((name, rest)) => (name, Some(rest.strip_prefix(':').ok_or_else(bad)?)),
+        // Without brackets, several colons are an address.
+        None if name.matches(':').count() > 1 => (name, None),
+        None => name.split_once(':').map_or((name, None), |(name, port)| (name, Some(port))),
+    };
+    let port = port.map(|port| port.parse().map_err(|_| bad())).transpose()?;
+    Ok((format!("{user}{name}"), port))
 }
 
 /// Quotes text for the other computer's shell, to which ssh passes everything.
@@ -301,12 +328,35 @@ mod tests {
             [host, "cantap", "serve", "--stdio", "--allow", allow].map(str::to_owned).to_vec()
         };
         assert_eq!(command("ssh://me@car"), start("me@car", "configure"));
+        for (text, port, host) in [
+            ("ssh://car:2222/x", "-p2222", "car"),
+            ("ssh://me@car:2222", "-p2222", "me@car"),
+            ("ssh://me@[::1]:2222/x", "-p2222", "me@::1"),
+        ] {
+            let Ok(Server::Ssh(ssh)) = Server::parse(text) else { panic!("{text}") };
+            let arguments: Vec<_> =
+                ssh.command().get_args().map(|arg| arg.to_string_lossy().into_owned()).collect();
+            assert_eq!(arguments[2..5], [port, "--", host], "{text}");
+        }
+        assert_eq!(command("ssh://fe80::1/x")[0], "fe80::1");
         for device in ["ssh://car/dev/ttyACM0", "ssh://car//dev/ttyACM0"] {
             assert_eq!(command(device)[6..], ["-d", "'/dev/ttyACM0'"]);
         }
         assert_eq!(command("ssh://car/virtual:car?allow=send")[..6], start("car", "send"));
         assert_eq!(command("ssh://car/x'; reboot '")[7], r"'x'\''; reboot '\'''");
-        for wrong in ["ssh://-l/x", "ssh://a@-l", "ssh://@b", "ssh:///x", "ssh://a?allow=all"] {
+        for wrong in [
+            "ssh://-l/x",
+            "ssh://a@-l",
+            "ssh://@b",
+            "ssh:///x",
+            "ssh://a?allow=all",
+            "ssh://car:x",
+            "ssh://car:",
+            "ssh://car:70000/x",
+            "ssh://[::1]x",
+            "ssh://[-oX]:22",
+            "ssh://:22/x",
+        ] {
             assert!(Server::parse(wrong).is_err(), "{wrong}");
         }
     }

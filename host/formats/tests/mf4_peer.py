@@ -31,11 +31,13 @@ def frames(mdf):
                 for part, signal in parts.items()
             }
             data = bytes(parts["DataBytes"].samples[at])[: number["DataLength"]].hex().upper()
+            # numpy's texts lose their zeros at the end.
+            data = data.ljust(2 * number["DataLength"], "0")
             identifier = f"{number['ID']:08X}" if number["IDE"] else f"{number['ID']:03X}"
             flags = f"#{number['BRS'] + 2 * number['ESI']}" if number["EDL"] else ""
             micros = start_us + round(time * 1_000_000)
             direction = " T" if number["Dir"] else ""
-            yield f"({micros // 1_000_000}.{micros % 1_000_000:06}) can{number['BusChannel']} {identifier}#{flags}{data}{direction}"
+            yield f"({micros // 1_000_000}.{micros % 1_000_000:06}) can{number['BusChannel'] - 1} {identifier}#{flags}{data}{direction}"
 
 
 for name in sys.argv[1:]:

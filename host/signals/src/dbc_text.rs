@@ -84,7 +84,7 @@ fn is_shift_jis(bytes: &[u8]) -> bool {
     while let [first, after @ ..] = rest {
         rest = after;
         match (first, after) {
-            (0..0x80, _) => {}
+            (0..=0x7F, _) => {}
             (0x81..=0x9F | 0xE0..=0xFC, [second @ (0x40..=0x7E | 0x80..=0xFC), behind @ ..]) => {
                 // In the other code page these are two marks, or a mark and a letter with an accent.
                 let is_clear = *first <= 0x9F && *second >= 0x80

@@ -9,16 +9,9 @@ use super::fault::{DatabaseError, Fault, FaultKind};
 /// A range of values with one text is expanded up to this many values.
 pub const MOST_TEXTS: i64 = 4096;
 
-/// The text of an XML file: UTF-8, UTF-16 with its mark, or otherwise Windows' Western code page.
+/// The text of an XML file: UTF-8, UTF-16, or otherwise Windows' Western code page.
 pub fn decode(bytes: &[u8]) -> Cow<'_, str> {
-    let units = |order: fn([u8; 2]) -> u16| -> Vec<u16> {
-        bytes[2..].chunks_exact(2).map(|pair| order([pair[0], pair[1]])).collect()
-    };
-    match bytes {
-        [0xFF, 0xFE, ..] => String::from_utf16_lossy(&units(u16::from_le_bytes)).into(),
-        [0xFE, 0xFF, ..] => String::from_utf16_lossy(&units(u16::from_be_bytes)).into(),
-        _ => super::dbc_text::decode(bytes).0,
-    }
+    super::dbc_text::decode(bytes).0
 }
 
 /// Parses XML, or says where the text is not XML. A document type is skipped: nothing is fetched, and nothing expanded without

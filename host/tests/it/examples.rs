@@ -18,8 +18,6 @@ mod periodic;
 mod replay;
 #[path = "../../examples/reply.rs"]
 mod reply;
-#[path = "../../examples/statistics_of_a_file.rs"]
-mod statistics_of_a_file;
 
 const LOG: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/data/engine.log");
 
@@ -75,11 +73,4 @@ fn a_replay_keeps_the_files_times() {
     let accuracy = replay::replay(&virtual_device("load=0,bitrate=500k"), LOG).unwrap();
     assert_eq!(accuracy.frames, 40);
     assert!(accuracy.late_us < 1.0 && accuracy.early_us < 1.0, "{accuracy:?}");
-}
-
-#[test]
-fn a_files_statistics_name_its_identifier() {
-    let summary = statistics_of_a_file::summary(LOG, 500_000).unwrap();
-    assert_eq!((summary.frames, summary.lost), (40, 0));
-    assert_eq!(summary.channels[0].ids[0].count, 40);
 }

@@ -26,6 +26,8 @@ const FLASH_CR: u32 = 0x4002_3C10;
 const FLASH_START: u32 = 1 << 16;
 /// xPSR: the active exception.
 const EXCEPTION: u32 = 0x1FF;
+/// The least of the values that the link register has in a handler.
+const EXC_RETURN: u32 = 0xFFFF_FFE0;
 const WFE: u16 = 0xBF20;
 const WFI: u16 = 0xBF30;
 
@@ -49,6 +51,11 @@ struct RecordedBus {
 
 fn lock(accesses: &Accesses) -> MutexGuard<'_, Vec<Access>> {
     accesses.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// The first instruction of an exception's handler.
+fn handler(cpu: &Cpu, exception: u32) -> u32 {
+    cpu.word(cpu.vector_table() + 4 * exception).unwrap_or(0) & !1
 }
 
 impl Bus for RecordedBus {
@@ -133,7 +140,11 @@ impl Recording {
             // It was asleep already.
             return;
         }
-        let jumped = (before.xpsr ^ self.last.xpsr) & EXCEPTION != 0;
+        let exception = self.last.xpsr & EXCEPTION;
+        // An exception may follow itself without a return in between.
+        let begins_anew =
+            exception != 0 && self.last.r[14] >= EXC_RETURN && self.last.r[15] == handler(cpu, exception);
+        let jumped = (before.xpsr ^ self.last.xpsr) & EXCEPTION != 0 || begins_anew;
         let sleeps = || {
             let address = before.r[15];
             let word = cpu.word(address & !3).unwrap_or(0);
@@ -143,7 +154,7 @@ impl Recording {
             let after = std::mem::replace(&mut self.last, before);
             self.end_stretch();
             self.last = after;
-            let entered = jumped && self.last.xpsr & EXCEPTION != 0 && self.last.r[14] >= 0xFFFF_FFE0;
+            let entered = jumped && exception != 0 && self.last.r[14] >= EXC_RETURN;
             self.jump(cpu, entered && self.last.r[13] < before.r[13]);
             self.resets = false;
             return;

@@ -63,7 +63,6 @@ impl Gaps {
     }
 
     /// What is missing before the next frame; forgets it.
-    #[inline]
     pub const fn here(&mut self) -> Gap {
         if self.marks & (CERTAIN | POSSIBLE) == 0 {
             return Gap::None;
@@ -73,13 +72,15 @@ impl Gaps {
         if certain { Gap::Certain } else { Gap::Possible }
     }
 
-    /// A frame was taken out.
+    /// A frame was taken out. Returns whether to look what is missing before the next.
     #[inline]
-    pub const fn taken(&mut self) {
-        if self.marks != 0 {
-            // Bit 4 is not to become bit 3.
-            self.marks = self.marks >> 1 & !(1 << DEPTH);
+    pub const fn taken(&mut self) -> bool {
+        if self.marks == 0 {
+            return false;
         }
+        // Bit 4 is not to become bit 3.
+        self.marks = self.marks >> 1 & !(1 << DEPTH);
+        true
     }
 
     /// Of the `pending` frames that a look found, one being released included, so many were taken out.

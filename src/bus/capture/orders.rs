@@ -92,8 +92,9 @@ impl<'q, const N: usize> Capture<'q, N> {
             state.frames = state.frames.wrapping_add(1);
             let stamp = if omit_stamps { Stamp::Omitted } else { Stamp::UpperBound };
             self.recorder.frame(&Received { channel, frame, stamp, data_omitted: omit_data }, now);
-            state.gaps.taken();
-            Self::record_gap(state, &mut self.recorder, channel, now);
+            if state.gaps.taken() {
+                Self::record_gap(state, &mut self.recorder, channel, now);
+            }
         }
         state.left = Some(left);
         left == 0 && traffic.pending() == 0

@@ -93,14 +93,16 @@ impl Core {
         registers.wait_until(|registers| registers.read(GRSTCTL) & grstctl::AHBIDL != 0);
         // Before a host can see the device: what it does from then on is not to be forgotten.
         registers.write(GINTSTS, !0);
+        // The transceiver is on, but does not look for VBUS yet, so that no host sees the device before it is ready.
+        registers.write(GCCFG, gccfg::PWRDWN);
         // After the reset, as in ST's driver, because it is not said to keep this.
         registers.modify(GUSBCFG, 0, gusbcfg::FDMOD);
-        let vbus = if board::SENSES_VBUS { gccfg::VBUSBSEN } else { gccfg::NOVBUSSENS };
-        registers.write(GCCFG, gccfg::PWRDWN | vbus);
-        registers.write(PCGCCTL, 0);
-        registers.modify(DCTL, 0, dctl::SDIS);
         // What follows are a device's registers.
         registers.wait_for_device_mode();
+        registers.write(PCGCCTL, 0);
+        registers.modify(DCTL, 0, dctl::SDIS);
+        let vbus = if board::SENSES_VBUS { gccfg::VBUSBSEN } else { gccfg::NOVBUSSENS };
+        registers.write(GCCFG, gccfg::PWRDWN | vbus);
         registers.modify(DCFG, 0, dcfg::DSPD_FULL);
         registers.write(DIEPMSK, epint::XFRC);
         // The receive FIFO's status reports what arrives.
@@ -310,7 +312,10 @@ impl Core {
                 let blocked_ms = control.tick(registers).max(bulk_in.tick(registers));
                 bulk_out.arm(registers);
                 if blocked_ms > BLOCKED_MS {
+                    // Until the host resets the bus, the FIFOs are not divided up: nothing may be armed.
+                    control.forget();
                     bulk_in.forget(false);
+                    bulk_out.reset(registers);
                     registers.modify(DCTL, 0, dctl::SDIS);
                     self.away_ms = Some(AWAY_MS);
                 }

@@ -49,15 +49,20 @@ impl Control {
 
     /// After a bus reset: nothing is waiting, and only SETUP packets are answered. MPSIZ 0 means packets of 64 bytes.
     pub fn reset(&mut self, registers: &mut Registers) {
-        self.setup_waits = false;
-        self.setup_taken = false;
-        self.forget_packets();
+        self.forget();
         registers.disable_input(0);
         registers.write(IN.int(), epint::XFRC);
         registers.write(OUT.int(), epint::STUP);
         registers.write(IN.ctl(), epctl::SNAK);
         registers.write(OUT.ctl(), epctl::SNAK);
         registers.write(OUT.tsiz(), eptsiz::STUPCNT_3);
+    }
+
+    /// Forgets whatever is under way.
+    pub fn forget(&mut self) {
+        self.setup_waits = false;
+        self.setup_taken = false;
+        self.forget_packets();
     }
 
     fn forget_packets(&mut self) {

@@ -70,9 +70,12 @@ pub(super) fn set_periodic<'q, const N: usize>(
             return Err(Refusal::BadEntry);
         }
     }
-    board.with_capture(|capture, traffic, clock| {
+    // Two locks: each takes a while.
+    board.with_capture(|capture, _, clock| {
         let now = capture.now(clock);
         capture.transmitter(channel).set_periodic(slot as usize, entry, now);
+    });
+    board.with_capture(|capture, traffic, clock| {
         capture.kick(channel, &mut traffic[channel.index()], clock);
     });
     Ok(Reply::Done)

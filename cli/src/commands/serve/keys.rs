@@ -6,7 +6,7 @@ use std::process::ExitCode;
 
 use cantap_address::server::role;
 use cantap_serve::Role;
-use cantap_serve::tls::{Files, Keys, Server};
+use cantap_serve::tls::{Files, Keys, LIFETIME_DAYS, Server};
 
 use crate::wrong::wrong;
 
@@ -23,6 +23,9 @@ pub enum Command {
         /// A client and its maximum role: alice:listen, bob:send. Can be repeated.
         #[arg(long = "client", value_name = "NAME:ROLE", value_parser = named_role)]
         clients: Vec<(String, Role)>,
+        /// How long the certificates made now are valid, in days.
+        #[arg(long, value_name = "DAYS", default_value_t = LIFETIME_DAYS, value_parser = clap::value_parser!(u32).range(1..=3650))]
+        days: u32,
     },
 }
 
@@ -42,19 +45,19 @@ fn named_role(text: &str) -> Result<(String, Role), String> {
 impl Command {
     /// Makes keys and lists them.
     pub fn run(&self) -> anyhow::Result<ExitCode> {
-        let Self::Keygen { folder, hosts, clients } = self;
+        let Self::Keygen { folder, hosts, clients, days } = self;
         let has_server = Keys::files(folder, "server").certificate.exists();
         if !has_server && hosts.is_empty() {
             return Err(wrong(
                 "name the server's computer with --host, as clients will; repeat it for each name and address",
             ));
         }
-        make(folder, hosts, clients)
+        make(folder, hosts, clients, *days)
     }
 }
 
-fn make(folder: &Path, hosts: &[String], clients: &[(String, Role)]) -> anyhow::Result<ExitCode> {
-    let keys = Keys::in_folder(folder)?;
+fn make(folder: &Path, hosts: &[String], clients: &[(String, Role)], days: u32) -> anyhow::Result<ExitCode> {
+    let keys = Keys::in_folder(folder)?.lasting(days);
     let mut made = Vec::new();
     if !hosts.is_empty() {
         made.push(keys.add_server(hosts)?);
@@ -68,8 +71,8 @@ fn make(folder: &Path, hosts: &[String], clients: &[(String, Role)]) -> anyhow::
         writeln!(out, "{}", files.key.display())?;
     }
     eprintln!(
-        "cantap: give each client its two files and ca.pem; anyone who has ca-key.pem can make clients: keep it where nobody \
-         gets at it"
+        "cantap: they are valid for {days} days; give each client its two files and ca.pem; anyone who has ca-key.pem can make \
+         clients: keep it where nobody gets at it"
     );
     Ok(ExitCode::SUCCESS)
 }

@@ -87,7 +87,9 @@ fn signals_are_searched_grouped_sorted_and_narrowed() {
     assert_eq!(model.seen.signals.graph_memory().0, 0);
     press(&mut app, &mut model, "gFengine and > 50\n");
     assert_eq!(names(&mut app, &model), ["Engine.OilTemp"]);
-    press(&mut app, &mut model, "F and\n");
+    press(&mut app, &mut model, "F");
+    app.key(KeyEvent::from(KeyCode::End), &mut model);
+    press(&mut app, &mut model, " and\n");
     let text = screen_text(&mut app, &model, (110, 24)).unwrap();
     assert!(text.contains("engine and > 50"), "{text}");
 }

@@ -144,8 +144,8 @@ impl Parts {
             Some(true) if hour < 12 => hour + 12,
             _ => hour,
         };
-        let (month, day) = match (self.month, &self.small[..]) {
-            (Some(month), &[day]) | (None, &[month, day]) => (month, day),
+        let (month, day) = match (self.month.as_ref(), &self.small[..]) {
+            (Some(month), [day]) | (None, [month, day]) => (*month, *day),
             _ => return None,
         };
         let second = (second_ns / NS_PER_S) as u64;

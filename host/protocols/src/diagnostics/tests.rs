@@ -806,7 +806,7 @@ fn cyclic_traffic_makes_no_pair() {
         }
         diagnostics.finish(&mut events);
         let claimed: Vec<_> = events.iter().filter(|event| event.protocol != Protocol::IsoTp).collect();
-        let claimed: Vec<_> = claimed.iter().map(|event| event.to_string()).collect();
+        let claimed: Vec<_> = claimed.iter().map(ToString::to_string).collect();
         assert!(claimed.is_empty(), "round {round}: {claimed:?}");
     }
 }

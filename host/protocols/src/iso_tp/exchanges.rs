@@ -163,7 +163,6 @@ impl Exchanges {
         let (role, message, is_whole) = message(bytes, offset)?;
         match role {
             Role::Request if is_whole => self.ask(record.channel, from, record.time_ns, message, true),
-            Role::Request => {}
             Role::Answer if record.time_ns <= self.until_ns => {
                 let place = self.asked(record, from, message)?;
                 let Request { from: client, is_known, .. } = self.requests[place];
@@ -171,7 +170,7 @@ impl Exchanges {
                     return Some(self.found(record.channel, client, Some(from)));
                 }
             }
-            Role::Answer => {}
+            _ => {}
         }
         None
     }
@@ -314,14 +313,14 @@ impl Exchanges {
         }
         let links = self.sender(channel, from).map(|sender| std::mem::take(&mut sender.links));
         let mut links = links.unwrap_or_default();
-        let link = match links.iter().position(|link| link.client == client) {
-            Some(place) => &mut links[place],
-            None => {
-                let evidence = if is_expected { EXPECTED } else { 0 };
-                links.truncate(3);
-                links.insert(0, Link { client, evidence, last: Default::default(), answered_ns: None });
-                &mut links[0]
-            }
+        let place = links.iter().position(|link| link.client == client);
+        let link = if let Some(place) = place {
+            &mut links[place]
+        } else {
+            let evidence = if is_expected { EXPECTED } else { 0 };
+            links.truncate(3);
+            links.insert(0, Link { client, evidence, last: Default::default(), answered_ns: None });
+            &mut links[0]
         };
         if link.answered_ns == Some(asked_ns) {
             // Nobody answers twice; all of its links are gone with this.
@@ -416,7 +415,7 @@ fn message(bytes: &[u8], offset: usize) -> Option<(Role, &[u8], bool)> {
     let role = ROLES[usize::from(sid)]?;
     match pci::parse(bytes, offset) {
         Ok(Some(Pci::Single(data))) => {
-            let head = if bytes.len() > 8 && control & 15 == 0 { 2 } else { 1 };
+            let head = if bytes.len() > 8 && control.trailing_zeros() >= 4 { 2 } else { 1 };
             let is_padded = is_padded(&bytes[offset + head + data.len()..]);
             (is_padded && has_length(role, data)).then_some((role, data, true))
         }

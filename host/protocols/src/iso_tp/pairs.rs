@@ -84,8 +84,24 @@ impl FromStr for Pair {
 pub(super) struct Pairs {
     /// Number of address bytes before the control information, by channel (0 for all) and identifier.
     offsets: FxHashMap<(u8, Id), u8>,
-    /// `None` for those without a unique other side.
-    partners: FxHashMap<(u8, Endpoint), Option<Endpoint>>,
+    partners: FxHashMap<(u8, Endpoint), Partner>,
+}
+
+/// The other side of a sender.
+#[derive(Clone, Copy, Debug)]
+enum Partner {
+    One(Endpoint),
+    /// Several, or nobody knows which.
+    Several,
+}
+
+impl Partner {
+    const fn one(self) -> Option<Endpoint> {
+        match self {
+            Self::One(one) => Some(one),
+            Self::Several => None,
+        }
+    }
 }
 
 /// How to read the frames of an identifier.
@@ -133,15 +149,16 @@ pub(super) fn fixed(id: Id) -> Option<Fixed> {
 impl Pairs {
     /// Adds a pair for a channel, or for all (0); false if the limit is reached.
     pub fn add(&mut self, channel: u8, pair: Pair) -> bool {
-        self.insert(channel, pair.a, Some(pair.b)) && self.insert(channel, pair.b, Some(pair.a))
+        self.insert(channel, pair.a, Partner::One(pair.b))
+            && self.insert(channel, pair.b, Partner::One(pair.a))
     }
 
     /// Adds somebody who talks to several others; false if the limit is reached.
     pub fn add_alone(&mut self, channel: u8, one: Endpoint) -> bool {
-        self.insert(channel, one, None)
+        self.insert(channel, one, Partner::Several)
     }
 
-    fn insert(&mut self, channel: u8, from: Endpoint, to: Option<Endpoint>) -> bool {
+    fn insert(&mut self, channel: u8, from: Endpoint, to: Partner) -> bool {
         let is_full = self.partners.len() >= 2 * MOST_FOUND && !self.partners.contains_key(&(channel, from));
         if channel != 0 && is_full {
             return false;
@@ -173,7 +190,7 @@ impl Pairs {
         }
     }
 
-    fn find(&self, channel: u8, from: Endpoint) -> Option<Option<Endpoint>> {
+    fn find(&self, channel: u8, from: Endpoint) -> Option<Partner> {
         if self.partners.is_empty() {
             return None;
         }
@@ -183,7 +200,7 @@ impl Pairs {
     /// The other side.
     pub fn partner(&self, channel: u8, from: Endpoint) -> Option<Endpoint> {
         if let Some(known) = self.find(channel, from) {
-            return known;
+            return known.one();
         }
         match fixed(from.id)? {
             Fixed::Physical(id) | Fixed::MixedPhysical(id) => Some(Endpoint { id, address: from.address }),
@@ -205,7 +222,7 @@ impl Pairs {
     pub fn sibling_partner(&self, channel: u8, from: Endpoint) -> Option<Endpoint> {
         let address = from.address?;
         self.partners.iter().find_map(|((of, sibling), partner)| {
-            let partner = (*partner)?;
+            let partner = partner.one()?;
             if (*of != channel && *of != 0) || sibling.id != from.id {
                 return None;
             }
@@ -213,7 +230,7 @@ impl Pairs {
                 return Some(Endpoint { address: Some(address), ..partner });
             }
             let base = partner.id.raw().checked_sub(sibling.address?.into())?;
-            let is_own = partner.address == Some(from.id.raw() as u8) && base & 0xFF == 0;
+            let is_own = partner.address == Some(from.id.raw() as u8) && base.trailing_zeros() >= 8;
             let id = is_own.then(|| Id::standard(base + u32::from(address)))??;
             Some(Endpoint { id, address: partner.address })
         })

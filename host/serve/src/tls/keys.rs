@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use cantap_wire::message::Role;
 use rcgen::{
@@ -12,8 +12,12 @@ use rcgen::{
 
 use super::{Files, name_of};
 
-/// How long certificates are valid.
-const YEARS: i32 = 10;
+/// How long the authority's certificate is valid, in days.
+const AUTHORITY_DAYS: u32 = 10 * 365;
+/// How long other certificates are valid unless told otherwise, in days.
+pub const LIFETIME_DAYS: u32 = 365;
+/// A clock may be behind by this much, in seconds.
+const ALLOWANCE_S: u64 = 86_400;
 /// The name of the server's files.
 const SERVER: &str = "server";
 /// The name of the authority's files.
@@ -28,6 +32,9 @@ pub enum KeysError {
     /// The file exists; nothing is overwritten.
     #[error("'{}' already exists; choose another name, or another folder", .0.display())]
     There(PathBuf),
+    /// A server's certificate must be for a name, or whoever has it could stand in for all.
+    #[error("'{0}' is not the name or address of one computer; name each by which clients reach the server")]
+    Host(String),
     /// A file could not be written or read.
     #[error("'{}': {source}", path.display())]
     File {
@@ -45,6 +52,7 @@ pub enum KeysError {
 pub struct Keys {
     folder: PathBuf,
     key: KeyPair,
+    days: u32,
 }
 
 impl Keys {
@@ -56,16 +64,26 @@ impl Keys {
         if path.exists() {
             let text = std::fs::read_to_string(&path)
                 .map_err(|source| KeysError::File { path: path.clone(), source })?;
-            return Ok(Self { folder: folder.to_owned(), key: KeyPair::from_pem(&text)? });
+            let key = KeyPair::from_pem(&text)?;
+            return Ok(Self { folder: folder.to_owned(), key, days: LIFETIME_DAYS });
         }
-        let keys = Self { folder: folder.to_owned(), key: KeyPair::generate()? };
+        let keys = Self { folder: folder.to_owned(), key: KeyPair::generate()?, days: LIFETIME_DAYS };
         let certificate = authority().self_signed(&keys.key)?;
         keys.write(AUTHORITY, &certificate.pem(), &keys.key)?;
         Ok(keys)
     }
 
-    /// Makes the server's certificate, for all names and addresses by which clients reach it.
+    /// The certificates made from now on are valid for so many days.
+    #[must_use]
+    pub fn lasting(self, days: u32) -> Self {
+        Self { days, ..self }
+    }
+
+    /// Makes the server's certificate, for all names and addresses by which clients reach it. Wildcards are refused.
     pub fn add_server(&self, hosts: &[String]) -> Result<Files, KeysError> {
+        if let Some(bad) = hosts.iter().find(|host| host.is_empty() || host.contains(['*', ' ', ','])) {
+            return Err(KeysError::Host(bad.clone()));
+        }
         self.add(SERVER, hosts.to_vec(), ExtendedKeyUsagePurpose::ServerAuth)
     }
 
@@ -94,7 +112,7 @@ impl Keys {
         purpose: ExtendedKeyUsagePurpose,
     ) -> Result<Files, KeysError> {
         let key = KeyPair::generate()?;
-        let mut params = lasting(CertificateParams::new(hosts)?, name);
+        let mut params = lasting(CertificateParams::new(hosts)?, name, self.days);
         params.extended_key_usages = vec![purpose];
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
         params.use_authority_key_identifier_extension = true;
@@ -123,18 +141,17 @@ impl Keys {
 
 /// The same every time: certificates refer to it by this, and by its key.
 fn authority() -> CertificateParams {
-    let mut params = lasting(CertificateParams::default(), "authority");
+    let mut params = lasting(CertificateParams::default(), "authority", AUTHORITY_DAYS);
     params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
     params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
     params
 }
 
-fn lasting(mut params: CertificateParams, name: &str) -> CertificateParams {
-    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
-    // Whole years are enough, and one extra at the beginning allows for clocks that are behind.
-    let year = 1970 + (since.as_secs() / (365 * 86_400 + 86_400 / 4)) as i32;
-    params.not_before = date_time_ymd(year - 1, 1, 1);
-    params.not_after = date_time_ymd(year + YEARS, 1, 1);
+fn lasting(mut params: CertificateParams, name: &str, days: u32) -> CertificateParams {
+    let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    let at = |seconds: u64| date_time_ymd(1970, 1, 1) + Duration::from_secs(seconds);
+    params.not_before = at(now.as_secs().saturating_sub(ALLOWANCE_S));
+    params.not_after = at(now.as_secs() + u64::from(days) * 86_400);
     params.distinguished_name = rcgen::DistinguishedName::new();
     params.distinguished_name.push(DnType::OrganizationName, "cantap");
     params.distinguished_name.push(DnType::CommonName, name);

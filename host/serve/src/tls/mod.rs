@@ -25,7 +25,7 @@ use crate::listen::{Listening, accept, admit, bind, turn_away};
 use crate::places::{Places, ends};
 use crate::{Board, News};
 
-pub use keys::{Keys, KeysError};
+pub use keys::{Keys, KeysError, LIFETIME_DAYS};
 use stream::{Secured, shake_hands};
 
 /// A peer that has not shown its certificate by this time is dropped.
@@ -86,6 +86,7 @@ impl Files {
         for certificate in certificates(&self.authority)? {
             authority.add(certificate).map_err(|error| bad(&self.authority, error.to_string()))?;
         }
+        private(&self.key)?;
         Ok(Credentials {
             chain: certificates(&self.certificate)?,
             key: PrivateKeyDer::from_pem_file(&self.key)
@@ -93,6 +94,28 @@ impl Files {
             authority: Arc::new(authority),
         })
     }
+}
+
+/// Refuses a key that other users can read or replace. A system's own may be readable to a group, if it belongs to root.
+#[cfg(unix)]
+fn private(key: &Path) -> Result<(), TlsError> {
+    use std::os::unix::fs::MetadataExt;
+    let bad = |reason: &str| TlsError::File { path: key.to_owned(), reason: reason.to_owned() };
+    let there = key.metadata().map_err(|error| bad(&error.to_string()))?;
+    let own = rustix::process::geteuid().as_raw();
+    let allowed = if there.uid() == 0 { 0o740 } else { 0o700 };
+    if there.uid() != own && there.uid() != 0 {
+        return Err(bad("it belongs to another user"));
+    }
+    if there.mode() & 0o777 & !allowed != 0 {
+        return Err(bad("other users can use it; `chmod 600` it"));
+    }
+    Ok(())
+}
+
+#[cfg(not(unix))]
+fn private(_: &Path) -> Result<(), TlsError> {
+    Ok(())
 }
 
 fn provider() -> Arc<crypto::CryptoProvider> {

@@ -314,3 +314,25 @@ fn silent_peers_keep_nobody_out() {
     is_over.store(true, std::sync::atomic::Ordering::Relaxed);
     strangers.into_iter().for_each(|stranger| stranger.join().unwrap());
 }
+
+#[cfg(unix)]
+#[test]
+fn a_key_that_others_can_read_is_refused() {
+    use std::os::unix::fs::PermissionsExt;
+    let folder = tempfile::tempdir().unwrap();
+    let files = Keys::in_folder(folder.path()).unwrap().add_server(&["localhost".to_owned()]).unwrap();
+    assert!(tls::Server::new(&files).is_ok());
+    std::fs::set_permissions(&files.key, PermissionsExt::from_mode(0o644)).unwrap();
+    let refused = tls::Server::new(&files).err().unwrap().to_string();
+    assert!(refused.ends_with("other users can use it; `chmod 600` it"), "{refused}");
+}
+
+#[test]
+fn a_server_s_certificate_is_for_named_computers() {
+    let folder = tempfile::tempdir().unwrap();
+    let keys = Keys::in_folder(folder.path()).unwrap();
+    for host in ["*", "*.example", "", "a b"] {
+        let refused = keys.add_server(&["localhost".to_owned(), host.to_owned()]);
+        assert!(refused.is_err_and(|error| error.to_string().contains("one computer")), "{host}");
+    }
+}

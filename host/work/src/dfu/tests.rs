@@ -193,9 +193,9 @@ fn a_bootloader_left_in_the_middle_by_another_program_is_used_all_the_same() {
 
 #[test]
 fn what_was_not_written_is_never_started() {
-    let mut worn = Chip { stuck: Some(5_000), ..Chip::new() };
+    let mut worn = Chip { stuck: Some(5_001), ..Chip::new() };
     let error = write(&mut worn, FLASH, &image(), |_, _, _| {}).unwrap_err();
-    assert!(matches!(error, DfuError::Differs(0x0800_1388)) && !worn.started, "{error}");
+    assert!(matches!(error, DfuError::Differs(0x0800_1389)) && !worn.started, "{error}");
     let mut protected = Chip { protected: Some(FLASH + 0x4000), ..Chip::new() };
     let error = write(&mut protected, FLASH, &image(), |_, _, _| {}).unwrap_err().to_string();
     assert!(error.contains("refused to erase a sector: the flash is protected"), "{error}");

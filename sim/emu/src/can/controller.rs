@@ -156,6 +156,8 @@ pub struct Controller {
     /// What may come late.
     pub(super) faults: CanFaults,
     pub(super) dice: Dice,
+    /// Whether anything was ever to come late.
+    pub(super) is_hostile: bool,
 }
 
 impl Default for Controller {
@@ -182,6 +184,7 @@ impl Default for Controller {
             master_reset: MasterReset::default(),
             faults: CanFaults::default(),
             dice: Dice::default(),
+            is_hostile: false,
         }
     }
 }
@@ -350,6 +353,9 @@ impl Controller {
         {
             self.mode = Mode::Sleep;
         }
+        if !self.is_hostile {
+            return;
+        }
         let Self { dice, fifos, .. } = self;
         for fifo in fifos {
             fifo.advance(|at| dice.has_come(at, now));
@@ -367,6 +373,9 @@ impl Controller {
 
     /// When the next of them has had its time, if that is known and no access will find out.
     pub(super) fn next_flag(&self) -> Option<u64> {
+        if !self.is_hostile {
+            return None;
+        }
         let late = self.fifos.iter().filter_map(Fifo::next_event).chain(self.init_at);
         late.filter(|at| *at != u64::MAX).min()
     }
@@ -392,6 +401,7 @@ impl Controller {
             master_reset: self.master_reset,
             faults: self.faults,
             dice: self.dice.clone(),
+            is_hostile: self.is_hostile,
             ..Self::default()
         }
     }

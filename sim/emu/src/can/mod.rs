@@ -72,6 +72,7 @@ impl CanPair {
     pub fn set_hostile(&mut self, hostile: &Hostile, clock: Clock) {
         for (controller, salt) in self.controllers.iter_mut().zip(1..) {
             controller.faults = hostile.can;
+            controller.is_hostile = true;
             controller.dice = Dice::new(hostile.seed, salt, clock);
         }
     }

@@ -49,6 +49,8 @@ pub struct Otg {
     in_control_transfer: bool,
     frame: u32,
     suspended: bool,
+    /// A bus reset was seen since the controller's own.
+    reset_seen: bool,
     in_mask: u32,
     out_mask: u32,
     all_mask: u32,
@@ -123,6 +125,7 @@ impl Otg {
             in_control_transfer: false,
             frame: 0,
             suspended: false,
+            reset_seen: false,
             in_mask: 0,
             out_mask: 0,
             all_mask: 0,

@@ -46,6 +46,7 @@ impl Otg {
     /// reset").
     pub fn bus_reset(&mut self) {
         self.suspended = false;
+        self.reset_seen = true;
         self.in_control_transfer = false;
         for number in 0..ENDPOINTS {
             self.ins[number].bus_reset(number);
@@ -54,8 +55,11 @@ impl Otg {
         self.raise(gint::USBRST);
     }
 
-    /// The host ends the reset; the speed is now known.
+    /// The host ends the reset; the speed is now known. A controller that was itself reset meanwhile has seen the rest of it.
     pub fn enumeration_done(&mut self) {
+        if !self.reset_seen {
+            self.bus_reset();
+        }
         self.raise(gint::ENUMDNE);
     }
 

@@ -339,6 +339,7 @@ impl<D: HostDriver> UsbHost<D> {
             Bus::Empty => self.bus = Bus::Debounce { until: self.now + self.timing.debounce },
             Bus::Debounce { .. } if !otg.pulled_up(true) => self.bus = Bus::Empty,
             Bus::Debounce { .. } => self.begin_reset(otg),
+            Bus::Reset { .. } if !otg.pulled_up(true) => self.rest(),
             Bus::Reset { .. } => {
                 otg.enumeration_done();
                 self.driver.after_reset(self.timing.second_reset);

@@ -386,7 +386,7 @@ fn sorted(log: &str) -> Vec<String> {
 fn expected() -> Vec<String> {
     let line = |(us, bus, frame): (u64, u8, &str)| {
         let (frame, direction) = frame.strip_suffix(" T").map_or((frame, ""), |frame| (frame, " T"));
-        format!("(1410714882.{us:06}) can{} {frame}{direction}", bus)
+        format!("(1410714882.{us:06}) can{} {frame}{direction}", bus - 1)
     };
     sorted(&FRAMES.map(line).join("\n"))
 }
@@ -541,10 +541,10 @@ fn limited_values_and_conversions_into_texts_and_invalid_values_are_read_by_the_
     assert_eq!(
         frames,
         [
-            "(1410714882.000000) can3 102#0102 T",
-            "(1410714882.001000) can4 104#0102030405060708",
-            "(1410714882.002000) can3 106#",
-            "(1410714882.003000) can1 108#01",
+            "(1410714882.000000) can2 102#0102 T",
+            "(1410714882.001000) can3 104#0102030405060708",
+            "(1410714882.002000) can2 106#",
+            "(1410714882.003000) can0 108#01",
         ]
     );
     assert_eq!(left_out, [("records that are marked as invalid", 1)]);

@@ -59,8 +59,8 @@ pub const MUTANTS: [Mutant; 4] = [
         caught_by: "a capture at 50 %",
         edits: &[(
             "src/bus/capture.rs",
-            "let at = self.recorder.time(stamp);",
-            "let at = self.recorder.time(stamp.wrapping_sub(if state.frames.is_multiple_of(512) { 240 } else { 0 }));",
+            ".map(|entered| self.recorder.time(entered));",
+            ".map(|entered| self.recorder.time(entered.wrapping_sub(if state.frames.is_multiple_of(512) { 240 } else { 0 })));",
         )],
     },
 ];

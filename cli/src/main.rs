@@ -41,6 +41,7 @@ mod monitor;
 mod progress;
 mod protocols;
 mod rescue;
+mod seconds;
 mod sending;
 mod shells;
 mod speaking;

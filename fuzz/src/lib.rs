@@ -1,6 +1,6 @@
 //! What several targets share.
 
-use cantap_protocols::{Conversations, Event, Options, Protocol};
+use cantap_protocols::{Event, Options, Protocol, Reader};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceRecord};
 use cantap_wire::{Frame, Id};
 
@@ -24,14 +24,14 @@ pub fn id(number: u32) -> Id {
 /// than the last frame, except for timeouts.
 pub fn read(protocol: Protocol, frames: &[(u32, u16, Vec<u8>)], of: impl Fn(u32) -> Id) {
     let options = Options { protocols: vec![protocol], ..Options::default() };
-    let (mut conversations, mut events) = (Conversations::new(&options), Vec::<Event>::new());
+    let (mut reader, mut events) = (Reader::new(options), Vec::<Event>::new());
     let mut time_ns = 0_i64;
     for (number, after_100us, data) in frames {
         time_ns += i64::from(*after_100us) * 100_000;
-        conversations.take(&record(time_ns, of(*number), data), &mut events);
+        reader.push(&record(time_ns, of(*number), data), &mut events);
     }
-    let _ = conversations.under_way();
-    conversations.finish(&mut events);
+    let _ = reader.under_way();
+    reader.finish(&mut events);
     for event in events {
         assert_eq!(event.protocol, protocol);
         assert!(event.start_ns <= event.time_ns, "{event}");

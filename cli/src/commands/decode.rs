@@ -12,7 +12,6 @@ mod text;
 mod wide;
 
 pub use command_line::Args;
-pub use decoded::Seconds;
 pub use text::write_values;
 
 use std::process::ExitCode;
@@ -20,12 +19,13 @@ use std::process::ExitCode;
 use std::sync::Arc;
 
 use cantap::{TraceEvent, TraceRecord};
+use cantap_protocols::ReadItem;
 use cantap_signals::{Decoder, NotDecoded, SignalValue};
 
 use self::decoded::Decoded;
 use self::output::{Form, Output};
 use crate::input::Records;
-use crate::protocols::{Read, Reading};
+use crate::protocols::Reading;
 use crate::wrong::wrong;
 
 /// The figures in the summary.
@@ -116,11 +116,12 @@ fn decode(
                 }
             }
             Some(reading) => reading.take_both(&batch, more, |read| match read {
-                Read::Record(record) => one(args, decoder, record, &mut values, &mut count, output),
-                Read::Event(event) => {
+                ReadItem::Record(record) => one(args, decoder, record, &mut values, &mut count, output),
+                ReadItem::Event(event) => {
                     count.events += 1;
                     output.push_said(&event)
                 }
+                ReadItem::Announcement(_) => Ok(()),
             })?,
         }
         if !more {

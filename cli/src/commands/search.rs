@@ -21,6 +21,7 @@ use crate::input::{FollowArgs, Records};
 use crate::live::LiveArgs;
 use crate::missing::Missing;
 use crate::protocols::{self, ProtocolArgs};
+use crate::seconds::Seconds;
 use crate::trace_output::TraceOutput;
 use crate::words::failure_text;
 use crate::wrong::wrong;
@@ -209,7 +210,7 @@ impl Sink {
         let message =
             record.frame().and_then(|frame| self.decoder.decode(record.channel, frame, &mut self.values));
         let message = message.map(|message| self.decoder.message(message));
-        let time = decode::Seconds(record.time_ns);
+        let time = Seconds(record.time_ns);
         match &mut self.kind {
             Kind::Nowhere => Ok(()),
             Kind::Trace(writer) => writer.write(record),

@@ -1,11 +1,10 @@
 //! What the frames mean, for every command that needs it: the options, and reading records by the bus's
 //! protocols.
 
+mod announcement;
 mod known;
-mod later;
 mod reading;
 mod sheet;
-mod surveyed;
 
 use cantap_protocols::Options;
 use cantap_protocols::iso_tp::{KnownPairs, Maker};
@@ -13,7 +12,7 @@ use cantap_signals::Decoder;
 use cantap_signals::condition::{Condition, ConditionError};
 
 pub use self::known::{Known, about, named};
-pub use self::reading::{Read, Reading};
+pub use self::reading::Reading;
 pub use self::sheet::SheetPath;
 
 /// What helps to understand a bus; commands flatten this into their arguments.

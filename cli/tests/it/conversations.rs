@@ -196,3 +196,48 @@ fn a_sheet_names_what_pdos_carry_and_one_that_is_none_is_refused() {
     let (code, _, err) = cantap("conversations_sheet", log, &["--eds", "200:drive.eds"]);
     assert!(code == Some(2) && err.contains("nodes from 1 to 127"), "{err}");
 }
+
+/// Identifiers that no standard has, from the first request on: the same exchanges in text, as JSON and as columns.
+#[test]
+fn a_makers_pairs_are_read_alike_in_every_form() {
+    let bmw = ["12", "18", "40"].iter().zip(1..).flat_map(|(ecu, second)| {
+        [
+            format!("({second}.000000) can0 6F1#{ecu}0322F190\n"),
+            format!("({second}.005000) can0 6{ecu}#F1101462F1905742\n"),
+            format!("({second}.010000) can0 6F1#{ecu}300000\n"),
+            format!("({second}.015000) can0 6{ecu}#F121415A5A5A3132\n"),
+            format!("({second}.020000) can0 6{ecu}#F122333435363738\n"),
+            format!("({second}.025000) can0 6{ecu}#F12339303132FFFF\n"),
+            format!("({second}.100000) can0 6F1#{ecu}021003\n"),
+            format!("({second}.105000) can0 6{ecu}#F1065003003201F4\n"),
+        ]
+    });
+    let bmw: String = bmw.collect();
+    let (_, text, err) = cantap("makers_pairs", &bmw, &[]);
+    assert_eq!(text.lines().count(), 6, "{text}");
+    assert!(text.lines().all(|line| line.contains(" uds 6F1/") && line.ends_with("after 5 ms")), "{text}");
+    assert!(err.starts_with("cantap: channel 1 speaks uds\n"), "{err}");
+    let (_, json, _) = cantap("makers_pairs", &bmw, &["--json", "--quiet"]);
+    let kinds: Vec<_> = json.lines().map(|line| line.contains("\"kind\":\"exchange\"")).collect();
+    assert_eq!(kinds, [true; 6], "{json}");
+    let directory = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("conversations/makers_pairs");
+    let wide = ["decode", "bus.log", "--protocols", "--wide", "--quiet"];
+    let output =
+        Command::new(env!("CARGO_BIN_EXE_cantap")).args(wide).current_dir(directory).output().unwrap();
+    let table = String::from_utf8(output.stdout).unwrap();
+    assert!(table.lines().next().is_some_and(|head| head.contains("uds.p2_ms")), "{table}");
+    assert_eq!(table.lines().count(), 7, "{table}");
+
+    // A server that never answers is one only if somebody says so.
+    let silent = "(1.0) can0 715#0322F19000000000\n(2.0) can0 715#0322F19000000000\n";
+    let (_, text, _) = cantap("makers_silent", silent, &[]);
+    assert_eq!(text, "");
+    let (_, text, _) = cantap("makers_silent", silent, &["--pair", "VAG"]);
+    assert_eq!(text.matches("uds 715 > 77F ReadDataByIdentifier").count(), 2, "{text}");
+    let (code, _, err) = cantap("makers_silent", silent, &["--pair", "VGA"]);
+    assert_eq!(code, Some(2));
+    assert!(
+        err.contains("'VGA' is not a pair; write two identifiers") && err.contains("vag, toyota"),
+        "{err}"
+    );
+}

@@ -7,15 +7,15 @@ use cantap_signals::Decoder;
 use cantap_signals::condition::{Condition, ConditionError, Listener, Said};
 use cantap_trace::TraceRecord;
 
+use crate::conversations::Conversations;
 use crate::naming;
-use crate::{Conversations, Event, Options};
+use crate::{Event, Options};
 
 /// Parses a condition whose names may also be those of [`crate::naming`]. The protocols that it names are decoded on every channel, with
 /// the pairs and sheets of the options; the decoder's signals include those of J1939's long messages.
 pub fn condition(text: &str, decoder: &Decoder, options: &Options) -> Result<Condition, ConditionError> {
     let options = Options {
         protocols: Vec::new(),
-        spoken: None,
         decoder: Some(decoder.clone().into()),
         pairs: options.pairs.clone(),
         sheets: options.sheets.clone(),
@@ -49,7 +49,8 @@ impl Listener for Watcher {
 
     fn take(&mut self, record: &TraceRecord, said: &mut dyn FnMut(&dyn Said)) {
         let options = &self.options;
-        let conversations = self.conversations.get_or_insert_with(|| Box::new(Conversations::new(options)));
+        let conversations =
+            self.conversations.get_or_insert_with(|| Box::new(Conversations::new(options, None)));
         conversations.take(record, &mut self.events);
         self.events.drain(..).for_each(|event| said(&event));
     }

@@ -14,17 +14,14 @@ use crate::iso_tp::{IsoTp, KnownPairs};
 use crate::j1939::{Groups, J1939};
 use crate::signs::FAMILY;
 use crate::survey::DiagnosticsSigns;
-use crate::{Assembler, Begun, Event, Evidence, Protocol, UnderWay};
+use crate::watch::Begun;
+use crate::{Assembler, Event, Evidence, Protocol, UnderWay};
 
 /// What to decode.
 #[derive(Clone, Debug, Default)]
 pub struct Options {
     /// Only these protocols; all if empty. `isotp` alone shows every transfer as it is.
     pub protocols: Vec<Protocol>,
-    /// What each channel speaks, according to a survey. Without one, channels are decoded by the protocols above; if those are
-    /// empty too, by ISO 15765-2 and the protocols on top of it. These are looked for on every channel, since a tester may come at any
-    /// time: where a survey has not found them, what looks like them is held back until an exchange shows that it is them.
-    pub spoken: Option<Vec<Evidence>>,
     /// Pairs of identifiers that communicate by ISO 15765-2, in addition to those of the standards.
     pub pairs: Vec<KnownPairs>,
     /// Signals for the messages of J1939 and NMEA 2000.
@@ -83,21 +80,24 @@ const fn groups_of(spoken: u16) -> Groups {
 }
 
 impl Conversations {
-    /// Sets up decoding according to the options.
-    pub fn new(options: &Options) -> Self {
+    /// Sets up decoding according to the options, and to what each channel speaks by a survey. Without one, channels are decoded by the
+    /// protocols of the options; if those are empty too, by ISO 15765-2 and the protocols on top of it. These are looked for on every
+    /// channel, since a tester may come at any time: where a survey has not found them, what looks like them is held back until an
+    /// exchange shows that it is them.
+    pub fn new(options: &Options, spoken: Option<&[Evidence]>) -> Self {
         let bits = |protocols: &[Protocol]| protocols.iter().fold(0, |bits, protocol| bits | protocol.bit());
         let wanted = if options.protocols.is_empty() { u16::MAX } else { bits(&options.protocols) };
         // Without a survey or a choice, frames that fit two protocols would be decoded twice.
-        let everywhere = match (&options.spoken, options.protocols.is_empty()) {
+        let everywhere = match (spoken, options.protocols.is_empty()) {
             (Some(_), _) | (None, true) => Protocol::DIAGNOSTICS & wanted,
             (None, false) => wanted,
         };
-        let (mut spoken, mut doubts) = ([everywhere; 256], FxHashMap::default());
-        if options.spoken.is_some() {
+        let (mut of_channels, mut doubts) = ([everywhere; 256], FxHashMap::default());
+        if spoken.is_some() {
             doubts.extend((0..=u8::MAX).map(|channel| (channel, Doubt::default())));
         }
-        for evidence in options.spoken.iter().flatten() {
-            spoken[usize::from(evidence.channel)] |= evidence.protocol.bit() & wanted;
+        for evidence in spoken.into_iter().flatten() {
+            of_channels[usize::from(evidence.channel)] |= evidence.protocol.bit() & wanted;
             if evidence.protocol.is_diagnostics() {
                 doubts.remove(&evidence.channel);
             }
@@ -105,13 +105,31 @@ impl Conversations {
         let mut this = Self {
             readers: Default::default(),
             family: None,
-            spoken: Box::new(spoken),
+            spoken: Box::new(of_channels),
             of_channel: Box::new([0; 256]),
             wanted,
             doubts,
         };
         this.assign(options);
         this
+    }
+
+    /// Goes on with diagnostics that have been read until here.
+    pub fn go_on_with(&mut self, diagnostics: Diagnostics) {
+        self.readers[OF_DIAGNOSTICS.trailing_zeros() as usize] = Some(Box::new(diagnostics));
+    }
+
+    /// Takes a record whose diagnostics have been read already, with what they said.
+    pub fn take_read(
+        &mut self,
+        record: &TraceRecord,
+        said: impl Iterator<Item = Event>,
+        events: &mut Vec<Event>,
+    ) {
+        let before = events.len();
+        self.read(record, self.of_channel[usize::from(record.channel)] & !OF_DIAGNOSTICS, events);
+        events.extend(said);
+        self.hold_back(before, events);
     }
 
     /// From now on, decodes this as well, beginning with the records that showed it.
@@ -254,7 +272,7 @@ mod tests {
 
     fn said(protocol: Protocol, frames: &[(f64, &str)]) -> Vec<String> {
         let options = Options { protocols: vec![protocol], ..Options::default() };
-        let (mut conversations, mut events) = (Conversations::new(&options), Vec::new());
+        let (mut conversations, mut events) = (Conversations::new(&options, None), Vec::new());
         for (ms, frame) in frames {
             conversations.take(&at(*ms, frame), &mut events);
         }
@@ -278,8 +296,8 @@ mod tests {
     /// not what only looks like them.
     #[test]
     fn a_tester_may_come_at_any_time() {
-        let options = Options { spoken: Some(Vec::new()), ..Options::default() };
-        let (mut conversations, mut events) = (Conversations::new(&options), Vec::new());
+        let (mut conversations, mut events) =
+            (Conversations::new(&Options::default(), Some(&[])), Vec::new());
         for (ms, frame) in
             [(0.0, "7E8#0150000000000000"), (1.0, "7E3#1122334455667788"), (3000.0, "7E0#023E00")]
         {

@@ -1,7 +1,7 @@
 #![doc = include_str!("../README.md")]
 //!
-//! An [`Assembler`] takes records and returns [`Event`]s. [`Conversations`] runs the assemblers of several protocols; a [`Survey`]
-//! finds out which of them are used on a bus, and a [`Watch`] which begin later.
+//! A [`Reader`] takes records and returns [`Event`]s. It runs an [`Assembler`] for each protocol: those that were asked for, or those
+//! that a bus uses, by its first records and for as long as more come, which it announces.
 
 #![forbid(unsafe_code)]
 
@@ -19,6 +19,7 @@ pub mod naming;
 pub mod nmea2000;
 mod overview;
 mod protocol;
+mod reader;
 mod relatives;
 mod signs;
 mod survey;
@@ -29,10 +30,10 @@ mod watch;
 
 pub use assembler::{Assembler, UnderWay, is_gap};
 pub use condition::condition;
-pub use conversations::{Conversations, Options};
+pub use conversations::Options;
 pub use event::{Bytes, Event, Field, Party, Trouble, Value};
 pub use overview::{Histogram, KnownNode, KnownObject, Overview, ServiceFigures};
 pub use protocol::{Protocol, UnknownProtocol};
+pub use reader::{Announcement, ReadItem, Reader};
 pub use relatives::Relative;
-pub use survey::{Evidence, Survey};
-pub use watch::{Begun, Watch};
+pub use survey::Evidence;

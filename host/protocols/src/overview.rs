@@ -318,15 +318,15 @@ fn identity(event: &Event) -> String {
 mod tests {
     use super::*;
     use crate::testing::at;
-    use crate::{Conversations, Options};
+    use crate::{Options, Reader};
 
     fn overview(protocol: Protocol, frames: &[(f64, &str)]) -> Overview {
         let options = Options { protocols: vec![protocol], ..Options::default() };
-        let (mut conversations, mut events) = (Conversations::new(&options), Vec::new());
+        let (mut reader, mut events) = (Reader::new(options), Vec::new());
         for (ms, frame) in frames {
-            conversations.take(&at(*ms, frame), &mut events);
+            reader.push(&at(*ms, frame), &mut events);
         }
-        conversations.finish(&mut events);
+        reader.finish(&mut events);
         let mut overview = Overview::default();
         for event in &events {
             overview.take(event);

@@ -6,6 +6,7 @@ use cantap_trace::TraceRecord;
 use rustc_hash::FxHashMap;
 
 use crate::diagnostics::Diagnostics;
+use crate::iso_tp::KnownPairs;
 use crate::relatives::{Relative, Relatives};
 use crate::signs::Signs;
 use crate::{Assembler, Event, Protocol, UnderWay};
@@ -16,8 +17,11 @@ const CONVINCING_BYTES: u32 = 20;
 /// Examines the first records of a trace or a bus.
 #[derive(Clone, Debug, Default)]
 pub struct Survey {
-    diagnostics: Option<Diagnostics>,
+    diagnostics: Diagnostics,
+    /// What they have said so far, with the number of the record that completed it.
+    said: Vec<(usize, Event)>,
     events: Vec<Event>,
+    records: usize,
     diagnostics_signs: FxHashMap<u8, DiagnosticsSigns>,
     channels: FxHashMap<u8, (Signs, Relatives)>,
 }
@@ -70,16 +74,14 @@ pub struct Evidence {
 }
 
 impl Survey {
-    /// For all protocols.
-    pub fn new() -> Self {
-        Self { diagnostics: Some(Diagnostics::new(&[], true)), ..Self::default() }
+    /// For all protocols; these pairs are known to talk by ISO 15765-2.
+    pub fn new(pairs: &[KnownPairs]) -> Self {
+        Self { diagnostics: Diagnostics::new(pairs, true), ..Self::default() }
     }
 
     /// Takes the next record.
     pub fn take(&mut self, record: &TraceRecord) {
-        if let Some(diagnostics) = &mut self.diagnostics {
-            diagnostics.take(record, &mut self.events);
-        }
+        self.diagnostics.take(record, &mut self.events);
         if let Some(frame) = record.frame() {
             let (signs, relatives) = self.channels.entry(record.channel).or_default();
             signs.take(record, u16::MAX);
@@ -87,7 +89,14 @@ impl Survey {
         }
         for event in self.events.drain(..) {
             self.diagnostics_signs.entry(event.channel).or_default().take(&event);
+            self.said.push((self.records, event));
         }
+        self.records += 1;
+    }
+
+    /// The diagnostics that have been read, which go on from here, and what they have said, with the numbers of the records, from 0.
+    pub(crate) fn into_diagnostics(self) -> (Diagnostics, Vec<(usize, Event)>) {
+        (self.diagnostics, self.said)
     }
 
     /// Whether the channel has had a frame.
@@ -116,9 +125,7 @@ impl Survey {
             .collect();
         // A trace may end before any message is complete.
         let mut open = Vec::new();
-        if let Some(diagnostics) = &self.diagnostics {
-            diagnostics.under_way(&mut open);
-        }
+        self.diagnostics.under_way(&mut open);
         for UnderWay { channel, protocol, .. } in
             open.into_iter().filter(|open| open.received >= CONVINCING_BYTES)
         {

@@ -5,7 +5,8 @@ use std::collections::VecDeque;
 use cantap_trace::TraceRecord;
 
 use crate::signs::{FAMILY, Signs};
-use crate::{Evidence, Protocol, Survey, is_gap};
+use crate::survey::Survey;
+use crate::{Evidence, Protocol, is_gap};
 
 /// How often to look whether a protocol shows by now, in nanoseconds.
 const LOOK_EVERY_NS: i64 = 100_000_000;
@@ -16,7 +17,7 @@ const CONVINCING: u32 = 5;
 /// How many records of a channel are kept, so that what showed the protocol is read by it as well.
 const MOST_HELD: usize = 1024;
 
-/// The protocols that are looked for here. [`crate::Conversations`] finds those of diagnostics by itself.
+/// The protocols that are looked for here. [`crate::conversations::Conversations`] finds those of diagnostics by itself.
 const WATCHED: u16 = FAMILY | Protocol::CanOpen.bit() | Protocol::DeviceNet.bit();
 
 /// Looks for protocols that a survey has not found, on every channel, for as long as records come.
@@ -177,27 +178,25 @@ impl Watched {
 mod tests {
     use super::*;
     use crate::testing::{at, lost};
-    use crate::{Conversations, Options};
+    use crate::{Announcement, Options, ReadItem, Reader};
 
-    /// What the records say, surveyed for the first three seconds; and what began later, with the second of its first frame.
+    /// What the records say; and what began later, except for diagnostics, with the second of its first frame.
     fn said(records: &[TraceRecord]) -> (Vec<String>, Vec<(Protocol, i64)>) {
-        let (mut survey, mut events, mut all_begun) = (Survey::new(), Vec::new(), Vec::new());
-        records.iter().filter(|record| record.time_ns < WINDOW_NS).for_each(|record| survey.take(record));
-        let options = Options { spoken: Some(survey.found()), ..Options::default() };
-        let (mut conversations, mut watch) = (Conversations::new(&options), Watch::new(&survey));
-        for record in records {
-            for begun in watch.take(record) {
-                conversations.also(&options, &begun, &mut events);
-                all_begun.push((begun.evidence.protocol, begun.from_ns / 1_000_000_000));
+        let (mut lines, mut all_begun) = (Vec::new(), Vec::new());
+        let mut reader = Reader::new(Options::default());
+        let Ok(()) = reader.take(records, false, |read| {
+            match read {
+                ReadItem::Event(event) => lines.push(event.to_string()),
+                ReadItem::Announcement(Announcement::Begun { protocol, from_ns, .. })
+                    if !protocol.is_diagnostics() =>
+                {
+                    all_begun.push((protocol, from_ns / 1_000_000_000));
+                }
+                _ => {}
             }
-            conversations.take(record, &mut events);
-        }
-        for begun in watch.finish() {
-            conversations.also(&options, &begun, &mut events);
-            all_begun.push((begun.evidence.protocol, begun.from_ns / 1_000_000_000));
-        }
-        conversations.finish(&mut events);
-        (events.iter().map(ToString::to_string).collect(), all_begun)
+            Ok::<_, std::convert::Infallible>(())
+        });
+        (lines, all_begun)
     }
 
     const TRUCK: &str = "0CF00400#FFFFFF0000FFFFFF";
@@ -338,7 +337,7 @@ mod tests {
             }
             let (_, begun) = said(&records);
             let found: Vec<_> = {
-                let mut survey = Survey::new();
+                let mut survey = Survey::new(&[]);
                 records
                     .iter()
                     .filter(|record| record.time_ns < WINDOW_NS)

@@ -103,16 +103,22 @@ fn number(text: &str) -> Result<u32, ParseFilterError> {
     grammar::hex(text).ok_or_else(|| ParseFilterError::Number(text.to_owned()))
 }
 
+/// What an interface's name means.
+enum Channels {
+    Any,
+    One(u8),
+}
+
 /// `can0` is channel 1, and so is `vcan0`; so may any name be that no identifier can look like.
-fn interface(text: &str) -> Option<Option<u8>> {
+fn interface(text: &str) -> Option<Channels> {
     if text.is_empty() || text == "any" {
-        return Some(None);
+        return Some(Channels::Any);
     }
     if text == CHANNEL_0 {
-        return Some(Some(0));
+        return Some(Channels::One(0));
     }
     if let Some(channel) = grammar::interface(text) {
-        return Some(Some(channel));
+        return Some(Channels::One(channel));
     }
     let letters = text.trim_end_matches(|c: char| c.is_ascii_digit());
     let is_name = letters.starts_with(|c: char| c.is_ascii_alphabetic())
@@ -120,7 +126,7 @@ fn interface(text: &str) -> Option<Option<u8>> {
         && !text.bytes().all(|byte| byte.is_ascii_hexdigit())
         && !text.starts_with("0x");
     let channel = text[letters.len()..].parse::<u8>().ok()?.checked_add(1)?;
-    is_name.then_some(Some(channel))
+    is_name.then_some(Channels::One(channel))
 }
 
 impl FromStr for Filter {
@@ -136,17 +142,22 @@ impl FromStr for Filter {
                 filter.errors = Some(filter.errors.unwrap_or(0) | number(mask)?);
             } else if let Some((id, mask)) = part.split_once('~') {
                 // It is clear which of the two is no number.
-                (number(id)?, number(mask)?);
+                number(id)?;
+                number(mask)?;
                 filter.ids.extend(grammar::masked(id, mask, true));
-            } else if let Some(channel) = interface(part).filter(|_| at == 0) {
-                filter.channel = channel;
+            } else if let Some(channels) = interface(part).filter(|_| at == 0) {
+                filter.channel = match channels {
+                    Channels::Any => None,
+                    Channels::One(channel) => Some(channel),
+                };
             } else if part.eq_ignore_ascii_case("j") {
                 filter.join = true;
             } else {
                 if let Some((id, mask)) =
                     part.split_once(':').filter(|(id, _)| !id.eq_ignore_ascii_case("pgn"))
                 {
-                    (number(id)?, number(mask)?);
+                    number(id)?;
+                    number(mask)?;
                 }
                 let pattern = part.parse::<IdPattern>().map_err(|error| match error {
                     IdError::Unknown(part) if at == 0 => ParseFilterError::Interface(part),

@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 
 use cantap_protocols::{Event, Field, Party, Value};
 
-use crate::commands::decode::Seconds;
+use crate::seconds::Seconds;
 
 /// Appends the object and the end of its line.
 pub(super) fn push(out: &mut String, event: &Event) {

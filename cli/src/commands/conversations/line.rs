@@ -6,8 +6,8 @@ use std::io::Write;
 use cantap_protocols::Event;
 use cantap_trace::Interface;
 
-use super::super::decode::Seconds;
 use super::json;
+use crate::seconds::Seconds;
 
 /// Writes an event as a line.
 pub fn write(out: &mut impl Write, event: &Event, json: bool) -> std::io::Result<()> {

@@ -4,7 +4,8 @@ use std::io::{self, Write};
 
 use cantap_signals::Reading;
 
-use super::decoded::{Decoded, Seconds};
+use super::decoded::Decoded;
+use crate::seconds::Seconds;
 
 /// Writes the object; with `details` each signal is an object too, with its unit and text.
 pub fn write(out: &mut impl Write, decoded: &Decoded, details: bool) -> io::Result<()> {

@@ -6,7 +6,7 @@ use cantap_protocols::{Event, Party, Value, naming};
 use cantap_trace::Interface;
 
 use super::csv::Cells;
-use super::decoded::Seconds;
+use crate::seconds::Seconds;
 
 /// Whether a name is `name`, or `name_2` and so on: `spn_version` is not the second `spn`.
 fn is_again(known: &str, name: &str) -> bool {

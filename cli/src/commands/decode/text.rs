@@ -5,7 +5,8 @@ use std::io::{self, Write};
 use cantap_signals::{Message, Reading, SignalValue};
 use cantap_trace::Interface;
 
-use super::decoded::{Decoded, Seconds};
+use super::decoded::Decoded;
+use crate::seconds::Seconds;
 
 pub fn write(out: &mut impl Write, decoded: &Decoded) -> io::Result<()> {
     let Decoded { record, frame, message, values, .. } = decoded;

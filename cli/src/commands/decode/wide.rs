@@ -12,8 +12,9 @@ use cantap_protocols::Event;
 use cantap_signals::{MessageRef, Reading};
 
 use super::csv::Cells;
-use super::decoded::{Decoded, Seconds};
+use super::decoded::Decoded;
 use super::said;
+use crate::seconds::Seconds;
 
 /// Separates cells of a waiting line: it occurs in no number and no time.
 const SEPARATOR: char = '\x1f';

@@ -1,69 +1,69 @@
 //! Authentication: the content of its requests and responses, by sub-function. The
 //! fields are those of the Python package py-uds, with which a test compares them.
 
-use super::reader::Reader;
+use super::cursor::Cursor;
 
 /// Bytes of the algorithm's object identifier.
 const ALGORITHM: usize = 16;
 
 /// The content of a request after the sub-function, which does not include the bit that suppresses the response.
-pub fn request(sub: u8, reader: &mut Reader<'_, '_>) -> Option<()> {
+pub fn request(sub: u8, cursor: &mut Cursor<'_, '_>) -> Option<()> {
     match sub {
         0x01 | 0x02 => {
-            reader.hex("communication_configuration", 1)?;
-            reader.sized("certificate_client")?;
-            reader.sized("challenge_client")
+            cursor.hex("communication_configuration", 1)?;
+            cursor.sized("certificate_client")?;
+            cursor.sized("challenge_client")
         }
         0x03 => {
-            reader.sized("proof_of_ownership_client")?;
-            reader.sized("ephemeral_public_key_client")
+            cursor.sized("proof_of_ownership_client")?;
+            cursor.sized("ephemeral_public_key_client")
         }
         0x04 => {
-            reader.hex("certificate_evaluation", 2)?;
-            reader.sized("certificate_data")
+            cursor.hex("certificate_evaluation", 2)?;
+            cursor.sized("certificate_data")
         }
         0x05 => {
-            reader.hex("communication_configuration", 1)?;
-            reader.bytes("algorithm", ALGORITHM)
+            cursor.hex("communication_configuration", 1)?;
+            cursor.bytes("algorithm", ALGORITHM)
         }
         0x06 | 0x07 => {
-            reader.bytes("algorithm", ALGORITHM)?;
-            reader.sized("proof_of_ownership_client")?;
-            reader.sized("challenge_client")?;
-            reader.sized("additional_parameter")
+            cursor.bytes("algorithm", ALGORITHM)?;
+            cursor.sized("proof_of_ownership_client")?;
+            cursor.sized("challenge_client")?;
+            cursor.sized("additional_parameter")
         }
         _ => None,
     }
 }
 
 /// The content of a positive response after the sub-function.
-pub fn response(sub: u8, reader: &mut Reader<'_, '_>) -> Option<()> {
-    reader.byte("result", result)?;
+pub fn response(sub: u8, cursor: &mut Cursor<'_, '_>) -> Option<()> {
+    cursor.byte("result", result)?;
     match sub {
         0x01 => {
-            reader.sized("challenge_server")?;
-            reader.sized("ephemeral_public_key_server")
+            cursor.sized("challenge_server")?;
+            cursor.sized("ephemeral_public_key_server")
         }
         0x02 => {
-            reader.sized("challenge_server")?;
-            reader.sized("certificate_server")?;
-            reader.sized("proof_of_ownership_server")?;
-            reader.sized("ephemeral_public_key_server")
+            cursor.sized("challenge_server")?;
+            cursor.sized("certificate_server")?;
+            cursor.sized("proof_of_ownership_server")?;
+            cursor.sized("ephemeral_public_key_server")
         }
-        0x03 => reader.sized("session_key_information"),
+        0x03 => cursor.sized("session_key_information"),
         0x05 => {
-            reader.bytes("algorithm", ALGORITHM)?;
-            reader.sized("challenge_server")?;
-            reader.sized("needed_additional_parameter")
+            cursor.bytes("algorithm", ALGORITHM)?;
+            cursor.sized("challenge_server")?;
+            cursor.sized("needed_additional_parameter")
         }
         0x06 => {
-            reader.bytes("algorithm", ALGORITHM)?;
-            reader.sized("session_key_information")
+            cursor.bytes("algorithm", ALGORITHM)?;
+            cursor.sized("session_key_information")
         }
         0x07 => {
-            reader.bytes("algorithm", ALGORITHM)?;
-            reader.sized("proof_of_ownership_server")?;
-            reader.sized("session_key_information")
+            cursor.bytes("algorithm", ALGORITHM)?;
+            cursor.sized("proof_of_ownership_server")?;
+            cursor.sized("session_key_information")
         }
         _ => None,
     }

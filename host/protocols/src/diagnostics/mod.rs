@@ -13,6 +13,7 @@
 //! been requests.
 
 mod authentication;
+mod cursor;
 mod dialect;
 mod dtc;
 pub(crate) mod echo;
@@ -24,7 +25,6 @@ pub(crate) mod names;
 mod obd;
 mod parameters;
 mod periodic;
-mod reader;
 mod reports;
 mod scaling;
 #[cfg(test)]

@@ -1,38 +1,38 @@
 //! ReadScalingDataByIdentifier: how the data of an identifier are to be read. The fields are those
 //! of the Python package py-uds, with which a test compares them.
 
-use super::reader::Reader;
+use super::cursor::Cursor;
 use crate::Field;
 
 /// The content of a positive response after the identifier: bytes of type and length, some with an extension.
-pub fn response(reader: &mut Reader<'_, '_>) -> Option<()> {
-    while reader.left() > 0 {
-        let byte = reader.take(1)?[0];
+pub fn response(cursor: &mut Cursor<'_, '_>) -> Option<()> {
+    while cursor.left() > 0 {
+        let byte = cursor.take(1)?[0];
         let (kind, length) = (byte >> 4, byte & 15);
         let Some(name) = KINDS.get(usize::from(kind)) else {
-            reader.push(Field::hex("scaling", byte, 2));
+            cursor.push(Field::hex("scaling", byte, 2));
             return None;
         };
         // Units and formulas say how to read the data described before them, and are no data.
         let words = if kind < FORMULA { format!("{name}, {length} bytes") } else { (*name).to_owned() };
-        reader.push(Field::hex("scaling", byte, 2).meaning(Some(words)));
+        cursor.push(Field::hex("scaling", byte, 2).meaning(Some(words)));
         match kind {
-            BITS_WITHOUT_MASK => reader.hex("mask", usize::from(length)).map(drop)?,
+            BITS_WITHOUT_MASK => cursor.hex("mask", usize::from(length)).map(drop)?,
             FORMULA => {
                 let formula =
-                    reader.byte("formula", |formula| FORMULAS.get(usize::from(formula)).copied())?;
+                    cursor.byte("formula", |formula| FORMULAS.get(usize::from(formula)).copied())?;
                 let constants = FORMULAS.get(usize::from(formula))?.matches('C').count();
                 for _ in 0..constants {
-                    let constant = reader.take(2)?;
+                    let constant = cursor.take(2)?;
                     // Four bits are the exponent, twelve the mantissa, both signed.
                     let raw = i16::from_be_bytes([constant[0], constant[1]]);
                     let (exponent, mantissa) = (raw >> 12, raw << 4 >> 4);
                     let value = f64::from(mantissa) * 10_f64.powi(exponent.into());
-                    reader.push(Field::real("constant", value, ""));
+                    cursor.push(Field::real("constant", value, ""));
                 }
             }
-            UNIT => reader.byte("unit", unit).map(drop)?,
-            STATE => reader.hex("state_and_connection", 1).map(drop)?,
+            UNIT => cursor.byte("unit", unit).map(drop)?,
+            STATE => cursor.hex("state_and_connection", 1).map(drop)?,
             _ => {}
         }
     }

@@ -374,7 +374,7 @@ fn a_session_above_80_is_one_of_kwp2000() {
 #[test]
 fn requests_without_answers_show_what_is_spoken() {
     let found = |frames: &[&str]| {
-        let mut survey = crate::Survey::new();
+        let mut survey = crate::survey::Survey::new(&[]);
         for (number, frame) in (0_u32..).zip(frames) {
             survey.take(&at(f64::from(number) * 100.0, frame));
         }
@@ -809,4 +809,39 @@ fn cyclic_traffic_makes_no_pair() {
         let claimed: Vec<_> = claimed.iter().map(ToString::to_string).collect();
         assert!(claimed.is_empty(), "round {round}: {claimed:?}");
     }
+}
+
+/// A cyclic frame that looks like a request is not taken for one because a server answers its own tester at that time.
+#[test]
+fn another_identifier_with_the_same_bytes_does_not_ask() {
+    let frames = [
+        (0.0, "7E0#023E000000000000"),
+        (1.0, "123#023E000000000000"),
+        (2.0, "7E8#027E00AAAAAAAAAA"),
+        (100.0, "123#023E000000000000"),
+        (200.0, "7E0#023E000000000000"),
+        (201.0, "123#023E000000000000"),
+        (202.0, "7E8#027E00AAAAAAAAAA"),
+    ];
+    let lines = said(&frames);
+    assert_eq!(lines.len(), 2, "{lines:?}");
+    assert!(lines.iter().all(|line| line.starts_with("uds 7E0 > 7E8 TesterPresent")), "{lines:?}");
+}
+
+/// Stamps of a coarse clock: a request and its answer have the same one.
+#[test]
+fn what_is_read_later_is_in_the_order_in_which_it_was_heard() {
+    let lines = said(&[
+        (0.0, "456#027E000000000000"),
+        (10.0, "123#023E000000000000"),
+        (10.0, "456#027E000000000000"),
+        (20.0, "123#021003"),
+        (20.0, "456#065003003201F4"),
+    ]);
+    assert_eq!(lines.len(), 3, "{lines:?}");
+    assert!(
+        lines[1].starts_with("uds 123 > 456 TesterPresent") && lines[1].ends_with("after 0 ms"),
+        "{lines:?}"
+    );
+    assert!(lines[2].starts_with("uds 123 > 456 DiagnosticSessionControl"), "{lines:?}");
 }

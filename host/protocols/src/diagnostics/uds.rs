@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use super::reader::Reader;
+use super::cursor::Cursor;
 use super::values::{number, unsigned};
 use super::{authentication, dtc, events, files, names, reports, scaling, values};
 use crate::Field;
@@ -81,13 +81,13 @@ pub fn request(bytes: &[u8], fields: &mut Vec<Field>) {
         }
         (0x38, [operation, data @ ..]) => {
             fields.push(sub_function(sid, *operation));
-            read(data, "parameters", fields, |reader| files::request(*operation, reader));
+            read(data, "parameters", fields, |cursor| files::request(*operation, cursor));
         }
         (0x28, [sub, kind, data @ ..]) => {
             fields.push(sub_function(sid, *sub));
             fields.push(Field::hex("communication_type", *kind, 2).meaning(communication(*kind)));
-            read(data, "parameters", fields, |reader| match sub & !SUPPRESS {
-                4 | 5 => reader.hex("node", 2).map(drop),
+            read(data, "parameters", fields, |cursor| match sub & !SUPPRESS {
+                4 | 5 => cursor.hex("node", 2).map(drop),
                 _ => None,
             });
         }
@@ -119,18 +119,18 @@ pub fn request(bytes: &[u8], fields: &mut Vec<Field>) {
         }
         (0x29, [sub, data @ ..]) => {
             fields.push(sub_function(sid, *sub));
-            read(data, "parameters", fields, |reader| authentication::request(sub & !SUPPRESS, reader));
+            read(data, "parameters", fields, |cursor| authentication::request(sub & !SUPPRESS, cursor));
         }
         (0x84, data) => read(data, "parameters", fields, secured),
         (0x86, [sub, data @ ..]) => {
             fields.push(sub_function(sid, *sub));
-            read(data, "parameters", fields, |reader| events::request(sub & !SUPPRESS, reader));
+            read(data, "parameters", fields, |cursor| events::request(sub & !SUPPRESS, cursor));
         }
         (0x87, [sub, data @ ..]) => {
             fields.push(sub_function(sid, *sub));
-            read(data, "parameters", fields, |reader| match sub & !SUPPRESS {
-                1 => reader.byte("link_mode", link_mode).map(drop),
-                2 => reader.number("bit_rate", 3, "bit/s"),
+            read(data, "parameters", fields, |cursor| match sub & !SUPPRESS {
+                1 => cursor.byte("link_mode", link_mode).map(drop),
+                2 => cursor.number("bit_rate", 3, "bit/s"),
                 _ => None,
             });
         }
@@ -170,12 +170,12 @@ fn read(
     data: &[u8],
     left: &'static str,
     fields: &mut Vec<Field>,
-    rules: impl FnOnce(&mut Reader<'_, '_>) -> Option<()>,
+    rules: impl FnOnce(&mut Cursor<'_, '_>) -> Option<()>,
 ) {
-    let mut reader = Reader::new(data, fields);
+    let mut cursor = Cursor::new(data, fields);
     // Bytes that do not suffice for a field are shown as they are.
-    let _ = rules(&mut reader);
-    reader.finish(left);
+    let _ = rules(&mut cursor);
+    cursor.finish(left);
 }
 
 /// What a communication control is for: messages, in the low bits, and networks, in the high ones.
@@ -211,18 +211,18 @@ fn link_mode(mode: u8) -> Option<&'static str> {
 }
 
 /// A secured message, as py-uds and scapy read it: a service in an envelope.
-fn secured(reader: &mut Reader<'_, '_>) -> Option<()> {
+fn secured(cursor: &mut Cursor<'_, '_>) -> Option<()> {
     const ENCRYPTED: u64 = 1 << 4;
-    let how = reader.hex("administrative", 2)?;
-    reader.hex("signature_encryption", 1)?;
-    let signature = usize::try_from(reader.hex("signature_length", 2)?).ok()?;
-    reader.hex("anti_replay_counter", 2)?;
+    let how = cursor.hex("administrative", 2)?;
+    cursor.hex("signature_encryption", 1)?;
+    let signature = usize::try_from(cursor.hex("signature_length", 2)?).ok()?;
+    cursor.hex("anti_replay_counter", 2)?;
     if how & ENCRYPTED != 0 {
         return None;
     }
-    reader.byte("service", |sid| names::uds_service(sid & !0x40))?;
-    reader.bytes("parameters", reader.left().checked_sub(signature)?)?;
-    reader.bytes("signature", signature)
+    cursor.byte("service", |sid| names::uds_service(sid & !0x40))?;
+    cursor.bytes("parameters", cursor.left().checked_sub(signature)?)?;
+    cursor.bytes("signature", signature)
 }
 
 /// Several addresses and sizes after a byte with their lengths.
@@ -309,7 +309,7 @@ pub fn response(request: Option<&[u8]>, bytes: &[u8], fields: &mut Vec<Field>) {
             if !heard {
                 fields.push(sub_function(sid, *sub));
             }
-            read(data, "value", fields, |reader| authentication::response(*sub, reader));
+            read(data, "value", fields, |cursor| authentication::response(*sub, cursor));
         }
         (0x2E, [_, _]) if !heard => fields.push(did(after)),
         (0x2F, [_, _, control, data @ ..]) => {
@@ -322,14 +322,14 @@ pub fn response(request: Option<&[u8]>, bytes: &[u8], fields: &mut Vec<Field>) {
             if !heard {
                 fields.push(sub_function(sid, *mode));
             }
-            read(data, "value", fields, |reader| files::response(*mode, reader));
+            read(data, "value", fields, |cursor| files::response(*mode, cursor));
         }
         (0x84, data) => read(data, "value", fields, secured),
         (0x86, [sub, data @ ..]) => {
             if !heard {
                 fields.push(sub_function(sid, *sub));
             }
-            read(data, "value", fields, |reader| events::response(heard, *sub, reader));
+            read(data, "value", fields, |cursor| events::response(heard, *sub, cursor));
         }
         // The request already said this.
         (0x28, [_]) | (0x2C, [_, _, _]) if heard => {}

@@ -49,8 +49,18 @@ pub(super) struct Found {
     pub channel: u8,
     pub client: Endpoint,
     pub server: Option<Endpoint>,
-    /// Frames of them that have not been read, in order, and whether frames of the channel were lost before each.
-    pub held: Vec<(TraceRecord, bool)>,
+    /// Frames of them that have not been read, in order.
+    pub held: Vec<Held>,
+}
+
+/// A frame that has not been read.
+#[derive(Clone, Debug)]
+pub(super) struct Held {
+    pub record: TraceRecord,
+    /// Frames of the channel were lost between this one and the sender's last.
+    pub after_loss: bool,
+    /// Its number among all that were held: stamps may be equal.
+    number: u64,
 }
 
 /// Somebody who may be one side of a pair.
@@ -58,7 +68,7 @@ pub(super) struct Found {
 struct Sender {
     channel: u8,
     from: Endpoint,
-    held: VecDeque<(TraceRecord, bool)>,
+    held: VecDeque<Held>,
     seen_ns: i64,
     /// Frames of the channel were lost after the last one that is held.
     has_gap: bool,
@@ -87,8 +97,20 @@ struct Request {
     time_ns: i64,
     until_ns: i64,
     data: SmallVec<[u8; MOST_ASKED]>,
-    /// Its sender is already one of a pair.
-    is_known: bool,
+    client: Client,
+    /// Whom it asks, if that is known and one.
+    server: Option<Endpoint>,
+}
+
+/// What is known about the sender of a request.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Client {
+    /// Nothing.
+    Unknown,
+    /// It was found, or asks several: others may answer it, too.
+    Open,
+    /// It has its server.
+    Closed,
 }
 
 /// Requests and answers of identifiers that belong to no pair.
@@ -99,6 +121,8 @@ pub(super) struct Exchanges {
     requests: VecDeque<Request>,
     /// No request may still be answered after this.
     until_ns: i64,
+    /// Number of frames that were held so far.
+    count: u64,
     look_ns: i64,
     /// Rules of makers whose pairs need no evidence.
     given: Vec<&'static Rule>,
@@ -138,7 +162,7 @@ impl Exchanges {
             }
             match role {
                 Role::Request if is_whole => {
-                    self.ask(record.channel, from, record.time_ns, message, false);
+                    self.ask(record, from, message, Client::Unknown, None);
                     let sender = self.hold(record, from);
                     sender.unanswered_ns.get_or_insert(record.time_ns);
                 }
@@ -157,17 +181,32 @@ impl Exchanges {
         None
     }
 
-    /// Takes a message of a sender that is known; returns whose request it answers, if nobody knew them.
-    pub fn take_known(&mut self, record: &TraceRecord, from: Endpoint, bytes: &[u8]) -> Option<Found> {
+    /// Takes a message of a sender that is known; returns whose request it answers, if nobody knew them. `asks` says what is known
+    /// about the sender, and whom it asks.
+    pub fn take_known(
+        &mut self,
+        record: &TraceRecord,
+        from: Endpoint,
+        bytes: &[u8],
+        asks: impl FnOnce() -> (Client, Option<Endpoint>),
+    ) -> Option<Found> {
         let offset = usize::from(from.address.is_some());
         let (role, message, is_whole) = message(bytes, offset)?;
         match role {
-            Role::Request if is_whole => self.ask(record.channel, from, record.time_ns, message, true),
+            Role::Request if is_whole => {
+                let (client, server) = asks();
+                self.ask(record, from, message, client, server);
+            }
             Role::Answer if record.time_ns <= self.until_ns => {
-                let place = self.asked(record, from, message)?;
-                let Request { from: client, is_known, .. } = self.requests[place];
-                if !is_known {
-                    return Some(self.found(record.channel, client, Some(from)));
+                // One that is known to ask this server may have asked the same.
+                let is_others = |place: usize| {
+                    let Request { client, server, .. } = &self.requests[place];
+                    *client == Client::Unknown || server.is_some_and(|server| server != from)
+                };
+                if self.fitting(record, from, message).all(is_others)
+                    && let Some(place) = self.asked(record, from, message, &[Client::Unknown])
+                {
+                    return Some(self.found(record.channel, self.requests[place].from, Some(from)));
                 }
             }
             _ => {}
@@ -212,10 +251,13 @@ impl Exchanges {
         };
         let mut held: Vec<_> =
             self.senders.extract_if(.., |sender| is_one(sender)).flat_map(|sender| sender.held).collect();
-        held.sort_by_key(|(record, _)| record.time_ns);
+        held.sort_by_key(|held| held.number);
         self.mark();
         for request in self.requests.iter_mut().filter(|request| request.channel == channel) {
-            request.is_known |= request.from == client || Some(request.from) == server;
+            if request.client == Client::Unknown && (request.from == client || Some(request.from) == server) {
+                request.client = Client::Open;
+                request.server = server;
+            }
         }
         Found { channel, client, server, held }
     }
@@ -228,8 +270,9 @@ impl Exchanges {
             Role::Answer => rule.client(from).map(|client| (client, Some(from))),
         });
         let (client, server) = pair?;
+        let after_loss = self.sender(record.channel, from).is_some_and(|sender| sender.has_gap);
         let mut found = self.found(record.channel, client, server);
-        found.held.push((*record, false));
+        found.held.push(Held { record: *record, after_loss, number: self.count });
         Some(found)
     }
 
@@ -246,12 +289,20 @@ impl Exchanges {
             let is_there = |request: &Request| {
                 senders.iter().any(|sender| (sender.channel, sender.from) == (request.channel, request.from))
             };
-            self.requests.retain(|request| request.is_known || is_there(request));
+            self.requests.retain(|request| request.client != Client::Unknown || is_there(request));
             self.mark();
         }
     }
 
-    fn ask(&mut self, channel: u8, from: Endpoint, time_ns: i64, message: &[u8], is_known: bool) {
+    fn ask(
+        &mut self,
+        record: &TraceRecord,
+        from: Endpoint,
+        message: &[u8],
+        client: Client,
+        server: Option<Endpoint>,
+    ) {
+        let (channel, time_ns) = (record.channel, record.time_ns);
         self.requests.retain(|request| (request.channel, request.from) != (channel, from));
         if self.requests.len() == MOST_REQUESTS {
             self.requests.pop_front();
@@ -259,12 +310,12 @@ impl Exchanges {
         let until_ns = time_ns.saturating_add(ANSWER_NS);
         self.until_ns = self.until_ns.max(until_ns);
         let data = kept(message);
-        self.requests.push_back(Request { channel, from, time_ns, until_ns, data, is_known });
+        self.requests.push_back(Request { channel, from, time_ns, until_ns, data, client, server });
     }
 
-    /// The request that a message answers.
-    fn asked(&self, record: &TraceRecord, from: Endpoint, message: &[u8]) -> Option<usize> {
-        let fits = |request: &Request| {
+    /// The requests that a message may answer.
+    fn fitting(&self, record: &TraceRecord, from: Endpoint, message: &[u8]) -> impl Iterator<Item = usize> {
+        let fits = move |request: &Request| {
             request.channel == record.channel
                 && record.time_ns <= request.until_ns
                 && request.from.id != from.id
@@ -273,9 +324,14 @@ impl Exchanges {
                     || makers::is_to_all(request.from))
                 && answers(&request.data, message)
         };
-        let fitting = (0..self.requests.len()).filter(|place| fits(&self.requests[*place]));
-        // The last one, or one that it is expected to answer.
-        fitting.max_by_key(|place| (is_expected(self.requests[*place].from, from), *place))
+        (0..self.requests.len()).filter(move |place| fits(&self.requests[*place]))
+    }
+
+    /// The request of such clients that a message answers: the last one, or one that it is expected to answer.
+    fn asked(&self, record: &TraceRecord, from: Endpoint, message: &[u8], of: &[Client]) -> Option<usize> {
+        let fitting = self.fitting(record, from, message);
+        let open = fitting.filter(|place| of.contains(&self.requests[*place].client));
+        open.max_by_key(|place| (is_expected(self.requests[*place].from, from), *place))
     }
 
     fn answer(
@@ -286,7 +342,9 @@ impl Exchanges {
         is_whole: bool,
     ) -> Option<Found> {
         let channel = record.channel;
-        let Some(place) = self.asked(record, from, message).filter(|_| record.time_ns <= self.until_ns)
+        let Some(place) = self
+            .asked(record, from, message, &[Client::Unknown, Client::Open])
+            .filter(|_| record.time_ns <= self.until_ns)
         else {
             // Whoever answers is silent unless asked.
             if let Some(sender) = self.sender(channel, from) {
@@ -300,7 +358,7 @@ impl Exchanges {
             request.until_ns = record.time_ns.saturating_add(PENDING_NS);
             self.until_ns = self.until_ns.max(request.until_ns);
         }
-        let (client, data, is_known) = (request.from, request.data.clone(), request.is_known);
+        let (client, data, is_known) = (request.from, request.data.clone(), request.client == Client::Open);
         if let Some(asking) = self.sender(channel, client) {
             asking.unanswered_ns = None;
         }
@@ -344,17 +402,20 @@ impl Exchanges {
         }
         let has_gap = self.sender(channel, from).is_some_and(|sender| sender.has_gap);
         let mut found = self.found(channel, client, Some(from));
-        found.held.push((*record, has_gap));
+        found.held.push(Held { record: *record, after_loss: has_gap, number: self.count });
         Some(found)
     }
 
     fn hold(&mut self, record: &TraceRecord, from: Endpoint) -> &mut Sender {
+        let number = self.count;
+        self.count += 1;
         let sender = self.sender_or_new(record.channel, from, record.time_ns);
         if sender.held.len() == MOST_HELD {
             sender.held.pop_front();
         }
         sender.seen_ns = record.time_ns;
-        sender.held.push_back((*record, std::mem::take(&mut sender.has_gap)));
+        let after_loss = std::mem::take(&mut sender.has_gap);
+        sender.held.push_back(Held { record: *record, after_loss, number });
         sender
     }
 

@@ -27,7 +27,7 @@ use std::ops::RangeInclusive;
 use cantap_trace::{Id, TraceRecord};
 use rustc_hash::FxHashMap;
 
-use self::exchanges::{Exchanges, Found, is_expected};
+use self::exchanges::{Client, Exchanges, Found, Held, is_expected};
 use self::finder::Finder;
 use self::pairs::{Pairs, Reading};
 use crate::{Assembler, Bytes, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
@@ -133,7 +133,13 @@ impl Transport {
             Reading::Known(offset) => {
                 if self.finder.is_some() {
                     let from = Endpoint { id, address: bytes.first().copied().filter(|_| offset == 1) };
-                    if let Some(found) = self.exchanges.take_known(record, from, bytes) {
+                    let pairs = &self.pairs;
+                    let asks = || {
+                        let server = pairs.partner(channel, from);
+                        let is_closed = server.is_some() && !pairs.was_found(channel, from);
+                        (if is_closed { Client::Closed } else { Client::Open }, server)
+                    };
+                    if let Some(found) = self.exchanges.take_known(record, from, bytes, asks) {
                         self.adopt(found, out);
                     }
                 }
@@ -181,7 +187,7 @@ impl Transport {
         if let Some(finder) = &mut self.finder {
             [Some(client), server].into_iter().flatten().for_each(|one| finder.forget(channel, one));
         }
-        for (record, after_loss) in held {
+        for Held { record, after_loss, .. } in held {
             self.after_loss |= after_loss;
             let Some(frame) = record.frame() else { continue };
             if !self.open.is_empty() && record.time_ns >= self.sweep_ns {

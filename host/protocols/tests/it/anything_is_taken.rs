@@ -3,7 +3,7 @@
 
 use cantap_protocols::canopen::Sheet;
 use cantap_protocols::canopen::eds::Eds;
-use cantap_protocols::{Conversations, Event, Options, Overview, Protocol, Survey};
+use cantap_protocols::{Event, Options, Overview, Protocol, Reader};
 use cantap_trace::{Direction, FdFrame, Frame, Id, TraceEvent, TraceRecord};
 
 fn record(time_ns: i64, id: Id, data: &[u8]) -> TraceRecord {
@@ -42,8 +42,9 @@ fn any_frames_are_taken_by_every_protocol_and_each_event_can_be_written() {
         let sheet: Vec<u8> = (0..random.usize(0..300)).map(|_| random.u8(..)).collect();
         let sheets = vec![Sheet { node: None, eds: Eds::parse(&sheet).into() }];
         let options = Options { protocols: protocols.clone(), sheets, ..Options::default() };
-        let (mut conversations, mut survey) = (Conversations::new(&options), Survey::new());
+        let (mut reader, mut finder) = (Reader::new(options), Reader::new(Options::default()));
         let (mut overview, mut events) = (Overview::default(), Vec::<Event>::new());
+        let mut found = Vec::new();
         let mut time_ns = 0_i64;
         for _ in 0..20_000 {
             time_ns += random.i64(0..3_000_000);
@@ -56,8 +57,8 @@ fn any_frames_are_taken_by_every_protocol_and_each_event_can_be_written() {
             if random.u8(..) == 0 {
                 record.event = TraceEvent::GAP;
             }
-            survey.take(&record);
-            conversations.take(&record, &mut events);
+            finder.push(&record, &mut found);
+            reader.push(&record, &mut events);
             for event in events.drain(..) {
                 let broke = event.protocol == Protocol::IsoTp && event.trouble.is_some();
                 assert!(protocols.contains(&event.protocol) || broke, "{event}");
@@ -66,8 +67,12 @@ fn any_frames_are_taken_by_every_protocol_and_each_event_can_be_written() {
                 let _ = event.to_string();
             }
         }
-        let _ = (conversations.under_way(), survey.found());
-        conversations.finish(&mut events);
+        let _ = (reader.under_way(), finder.under_way());
+        reader.finish(&mut events);
+        finder.finish(&mut found);
+        for event in &found {
+            let _ = event.to_string();
+        }
         for event in &events {
             overview.take(event);
         }
@@ -175,17 +180,17 @@ fn memory_is_flat_under_a_flood_of_messages_that_are_never_finished() {
         // By its own reader, and with every other one beside it.
         for protocols in [protocols, &everything[..]] {
             let options = Options { protocols: protocols.to_vec(), ..Options::default() };
-            let mut conversations = Conversations::new(&options);
+            let mut reader = Reader::new(options);
             let mut events = Vec::new();
             let mut said = 0_u64;
             let mut flood = |frames: std::ops::Range<u32>| {
                 for at in frames {
                     let (id, data) = begin(at);
-                    conversations.take(&record(i64::from(at) * 50_000, id, &data), &mut events);
+                    reader.push(&record(i64::from(at) * 50_000, id, &data), &mut events);
                     said += events.iter().filter(|event| event.trouble.is_some()).count() as u64;
                     events.clear();
                 }
-                conversations.under_way().len()
+                reader.under_way().len()
             };
             flood(0..70_000);
             let before = resident();

@@ -11,7 +11,7 @@ use std::io::Read;
 use std::process::Command;
 
 use cantap_protocols::canopen::eds::{self, Eds};
-use cantap_protocols::{Conversations, Event, Evidence, Options, Party, Protocol, Survey, Value};
+use cantap_protocols::{Announcement, Event, Evidence, Options, Party, Protocol, ReadItem, Reader, Value};
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
 const SCRIPT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/protocol_peer.py");
@@ -48,21 +48,24 @@ fn talk(module: &str, what: &str) -> Option<(Vec<TraceRecord>, Vec<serde_json::V
 
 fn events(records: &[TraceRecord], protocols: &[Protocol]) -> Vec<Event> {
     let options = Options { protocols: protocols.to_vec(), ..Options::default() };
-    let mut conversations = Conversations::new(&options);
+    let mut reader = Reader::new(options);
     let mut events = Vec::new();
     for record in records {
-        conversations.take(record, &mut events);
+        reader.push(record, &mut events);
     }
-    conversations.finish(&mut events);
+    reader.finish(&mut events);
     events
 }
 
 fn found(records: &[TraceRecord]) -> Vec<Protocol> {
-    let mut survey = Survey::new();
-    for record in records {
-        survey.take(record);
-    }
-    survey.found().into_iter().map(|Evidence { protocol, .. }| protocol).collect()
+    let mut found = Vec::new();
+    let Ok(()) = Reader::new(Options::default()).take(records, false, |read| {
+        if let ReadItem::Announcement(Announcement::Found { protocols, .. }) = read {
+            found.extend(protocols.into_iter().map(|Evidence { protocol, .. }| protocol));
+        }
+        Ok::<_, std::convert::Infallible>(())
+    });
+    found
 }
 
 fn hex(bytes: &[u8]) -> String {

@@ -11,7 +11,7 @@ use std::process::Command;
 
 use cantap_protocols::iso_tp::{FlowStatus, Pci, parse};
 use cantap_protocols::j1939::Header;
-use cantap_protocols::{Conversations, Event, Options, Protocol};
+use cantap_protocols::{Event, Options, Protocol, Reader};
 use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
 
 const BOAT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../formats/tests/data/nmea2000.log.gz");
@@ -91,11 +91,11 @@ fn frame(id: &str, data: &[u8]) -> TraceFrame {
 /// The events that each frame completes.
 fn events(frames: &[TraceFrame], protocol: Protocol) -> Vec<Vec<Event>> {
     let options = Options { protocols: vec![protocol], ..Options::default() };
-    let mut conversations = Conversations::new(&options);
+    let mut reader = Reader::new(options);
     let take = |(at, frame): (usize, &TraceFrame)| {
         let event = TraceEvent::Frame { frame: *frame, direction: Direction::Rx, late: false };
         let mut events = Vec::new();
-        conversations.take(&TraceRecord { time_ns: at as i64 * 1_000_000, channel: 1, event }, &mut events);
+        reader.push(&TraceRecord { time_ns: at as i64 * 1_000_000, channel: 1, event }, &mut events);
         events
     };
     frames.iter().enumerate().map(take).collect()

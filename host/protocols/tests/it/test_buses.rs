@@ -6,7 +6,7 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
-use cantap_protocols::{Conversations, Options, Overview, Survey};
+use cantap_protocols::{Announcement, Options, Overview, ReadItem, Reader};
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
 /// Frames with their times in microseconds.
@@ -176,26 +176,25 @@ fn check(name: &str, bus: &Bus) {
             TraceRecord { time_ns: *us as i64 * 1000, channel: 1, event }
         })
         .collect();
-    let mut survey = Survey::new();
-    for record in &records {
-        survey.take(record);
-    }
-    let found = survey.found();
-    assert_eq!(survey.relatives(), []);
-    let mut text = String::new();
-    for evidence in &found {
-        writeln!(text, "# speaks {}", evidence.protocol).unwrap();
-    }
-    let mut conversations = Conversations::new(&Options { spoken: Some(found), ..Options::default() });
-    let (mut events, mut overview) = (Vec::new(), Overview::default());
-    for record in &records {
-        conversations.take(record, &mut events);
-    }
-    conversations.finish(&mut events);
-    for event in &events {
-        overview.take(event);
-        writeln!(text, "{:>9.4} {event}", event.time_ns as f64 / 1e9).unwrap();
-    }
+    let (mut text, mut overview) = (String::new(), Overview::default());
+    let mut reader = Reader::new(Options::default());
+    let Ok(()) = reader.take(&records, false, |read| {
+        match read {
+            ReadItem::Record(_) => {}
+            ReadItem::Event(event) => {
+                overview.take(&event);
+                writeln!(text, "{:>9.4} {event}", event.time_ns as f64 / 1e9).unwrap();
+            }
+            ReadItem::Announcement(Announcement::Found { protocols, relatives }) => {
+                assert_eq!(relatives, []);
+                for evidence in protocols {
+                    writeln!(text, "# speaks {}", evidence.protocol).unwrap();
+                }
+            }
+            ReadItem::Announcement(begun) => panic!("{begun:?}"),
+        }
+        Ok::<_, std::convert::Infallible>(())
+    });
     for ((_, protocol, node), known) in overview.nodes() {
         let state = known.state.as_deref().map_or(String::new(), |state| format!(", {state}"));
         writeln!(text, "# {protocol} {node}: {} events, {} faults{state}", known.events, known.faults)

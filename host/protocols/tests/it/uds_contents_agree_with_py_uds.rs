@@ -7,7 +7,7 @@ use cantap_testing::peers;
 
 use std::process::Command;
 
-use cantap_protocols::{Conversations, Event, Options, Value};
+use cantap_protocols::{Event, Options, Protocol, Reader, Value};
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
 const SCRIPT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/uds_contents_peer.py");
@@ -132,10 +132,11 @@ fn event(message: &str, time_ns: i64) -> Event {
     let frame = format!("{from}##1{control}{message}");
     let frame = format!("{frame:C<width$}", width = from.len() + 3 + 2 * full);
     let event = TraceEvent::Frame { frame: frame.parse().unwrap(), direction: Direction::Rx, late: false };
-    let mut conversations = Conversations::new(&Options::default());
+    let protocols = vec![Protocol::IsoTp, Protocol::Uds, Protocol::Kwp2000, Protocol::Obd];
+    let mut reader = Reader::new(Options { protocols, ..Options::default() });
     let mut events = Vec::new();
-    conversations.take(&TraceRecord { time_ns, channel: 1, event }, &mut events);
-    conversations.finish(&mut events);
+    reader.push(&TraceRecord { time_ns, channel: 1, event }, &mut events);
+    reader.finish(&mut events);
     let said: Vec<_> = events.iter().map(ToString::to_string).collect();
     assert_eq!(events.len(), 1, "{message}: {said:?}");
     events.remove(0)

@@ -5,14 +5,14 @@ use std::borrow::Cow;
 use super::values::{number, unsigned};
 use crate::Field;
 
-/// The bytes that are left, and the fields so far. A field that the bytes do not suffice for takes none: [`Reader::finish`] shows what is
+/// The bytes that are left, and the fields so far. A field that the bytes do not suffice for takes none: [`Cursor::finish`] shows what is
 /// left.
-pub struct Reader<'a, 'f> {
+pub struct Cursor<'a, 'f> {
     left: &'a [u8],
     fields: &'f mut Vec<Field>,
 }
 
-impl<'a, 'f> Reader<'a, 'f> {
+impl<'a, 'f> Cursor<'a, 'f> {
     pub fn new(bytes: &'a [u8], fields: &'f mut Vec<Field>) -> Self {
         Self { left: bytes, fields }
     }

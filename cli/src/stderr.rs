@@ -14,9 +14,9 @@ pub fn is_coloured() -> bool {
 pub fn warn(text: &str) {
     let text = clean::lines(text);
     if is_coloured() {
-        write(&format!("\x1b[1;31mcantap: {text}\x1b[0m\n"))
+        write(&format!("\x1b[1;31mcantap: {text}\x1b[0m\n"));
     } else {
-        write(&format!("cantap: {text}\n"))
+        write(&format!("cantap: {text}\n"));
     }
 }
 

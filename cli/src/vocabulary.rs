@@ -177,7 +177,7 @@ fn every_identifier_filter_rate_and_channel_is_written_as_the_others() {
             match parse(text) {
                 Ok(()) => wrong.push(format!("{command} {id}: {text} is taken")),
                 Err(error) if error.exit_code() != 2 => {
-                    wrong.push(format!("{command} {id}: {text}: another code"))
+                    wrong.push(format!("{command} {id}: {text}: another code"));
                 }
                 Err(_) => {}
             }

@@ -43,7 +43,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         send(&mut rig)?;
     }
     slcan(&mut rig)?;
-    rig.with_host(|host, otg| host.reset(otg));
+    rig.with_host(cantap_emu::usb_host::UsbHost::reset);
     rig.run_for(20 * MS)?;
     rig.cut();
     rig.wait_for_port()?;

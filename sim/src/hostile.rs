@@ -206,7 +206,7 @@ impl Bench {
                     self.rig.run_for(10 * MS)?;
                     self.rig.with_host(|host, _| host.plug());
                 }
-                (Status::Suspended, _) => self.rig.with_host(|host, otg| host.resume(otg)),
+                (Status::Suspended, _) => self.rig.with_host(cantap_emu::usb_host::UsbHost::resume),
                 _ => {}
             }
             self.rig.run_for(MS)?;
@@ -285,7 +285,12 @@ impl Bench {
             }
             Blow::Save => {
                 for channel in Channel::ALL {
-                    if self.in_session && self.asks(|rig| rig.close(channel))?.is_err() && self.in_session {
+                    if !self.in_session {
+                        break;
+                    }
+                    let is_refused = self.asks(|rig| rig.close(channel))?.is_err();
+                    // The question may have ended the session.
+                    if is_refused && self.in_session {
                         self.cut()?;
                     }
                 }
@@ -307,14 +312,14 @@ impl Bench {
                 self.rig.machine.board().hold_buses_dominant(false);
             }
             Blow::ResetBus => {
-                self.rig.with_host(|host, otg| host.reset(otg));
+                self.rig.with_host(cantap_emu::usb_host::UsbHost::reset);
                 self.rig.run_for(span)?;
                 self.cut()?;
             }
             Blow::Suspend => {
                 self.rig.with_host(|host, _| host.suspend());
                 self.rig.run_for(4 * MS + span)?;
-                self.rig.with_host(|host, otg| host.resume(otg));
+                self.rig.with_host(cantap_emu::usb_host::UsbHost::resume);
                 self.cut()?;
             }
             Blow::Unplug => {

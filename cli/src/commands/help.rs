@@ -81,7 +81,7 @@ fn push_row(text: &mut String, name: &str, about: &str, columns: usize) {
     for (number, line) in wrapped.lines().enumerate() {
         let name = if number == 0 { name } else { "" };
         // Writing to a String cannot fail.
-        let _ = writeln!(text, "  {name:<width$}{line}", width = NAME);
+        let _ = writeln!(text, "  {name:<NAME$}{line}");
     }
 }
 

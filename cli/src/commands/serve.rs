@@ -241,7 +241,7 @@ fn start(args: &Args, number: usize, address: &Address) -> anyhow::Result<Board>
 fn tell(news: News) {
     match news {
         News::BoardLost { .. } | News::Refused { .. } | News::DeadMan { .. } => {
-            stderr::warn(&news.to_string())
+            stderr::warn(&news.to_string());
         }
         news => eprintln!("cantap: {news}"),
     }

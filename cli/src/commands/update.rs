@@ -63,29 +63,26 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let described = check_image(&image).with_context(|| format!("'{file}'"))?;
     check_protocol(&described, args.other_protocol)?;
     let writer = Writer::ready(args)?;
-    let port = match &args.in_bootloader {
-        Some(board) => {
-            check_board(&described, board)?;
-            if drives_channel_2(board) && !args.yes && !is_unplugged()? {
-                bail!("nothing was done; unplug channel 2 and run this again");
-            }
-            writer.bootloader_there()?
+    let port = if let Some(board) = &args.in_bootloader {
+        check_board(&described, board)?;
+        if drives_channel_2(board) && !args.yes && !is_unplugged()? {
+            bail!("nothing was done; unplug channel 2 and run this again");
         }
-        None => {
-            let Some(address) = &args.device else {
-                return Err(wrong("give the device with -d, or --in-bootloader BOARD"));
-            };
-            let device = address.open()?;
-            let hello = device.hello();
-            check_board(&described, &hello.board)?;
-            check_bootloader(hello)?;
-            if drives_channel_2(&hello.board) && !args.yes && !is_unplugged()? {
-                bail!("nothing was done; unplug channel 2 and run this again");
-            }
-            device.bootloader()?;
-            drop(device);
-            writer.bootloader_to_come().with_context(|| left_in_bootloader(args, described.board))?
+        writer.bootloader_there()?
+    } else {
+        let Some(address) = &args.device else {
+            return Err(wrong("give the device with -d, or --in-bootloader BOARD"));
+        };
+        let device = address.open()?;
+        let hello = device.hello();
+        check_board(&described, &hello.board)?;
+        check_bootloader(hello)?;
+        if drives_channel_2(&hello.board) && !args.yes && !is_unplugged()? {
+            bail!("nothing was done; unplug channel 2 and run this again");
         }
+        device.bootloader()?;
+        drop(device);
+        writer.bootloader_to_come().with_context(|| left_in_bootloader(args, described.board))?
     };
     write(port, &image, args).with_context(|| left_in_bootloader(args, described.board))?;
     let [major, minor, patch] = described.version;

@@ -34,8 +34,10 @@ pub(crate) struct FormatSpec {
     /// Makes a reader. The zone is that of dates in files that name none.
     pub reader: fn(&Zone) -> Box<dyn Decode>,
     /// Makes a writer; `None` if the format is only read.
-    pub writer: Option<fn(&WriteOptions) -> Box<dyn Encode>>,
+    pub writer: Option<MakeWriter>,
 }
+
+type MakeWriter = fn(&WriteOptions) -> Box<dyn Encode>;
 
 /// The beginning of a file.
 struct Head<'a> {

@@ -155,8 +155,8 @@ mod tests {
     use super::*;
     use std::sync::atomic::{AtomicUsize, Ordering};
 
-    fn address(last: u8) -> Option<IpAddr> {
-        Some(IpAddr::from([192, 0, 2, last]))
+    fn address(last: u8) -> IpAddr {
+        IpAddr::from([192, 0, 2, last])
     }
 
     #[test]
@@ -194,14 +194,14 @@ mod tests {
                 gone.fetch_add(1, Ordering::Relaxed);
             })
         };
-        let own = enter(address(1)).unwrap();
-        let _crowd: Vec<_> = (0..20).map(|_| enter(address(2)).unwrap()).collect();
+        let own = enter(Some(address(1))).unwrap();
+        let _crowd: Vec<_> = (0..20).map(|_| enter(Some(address(2))).unwrap()).collect();
         assert_eq!(gone.load(Ordering::Relaxed), 18);
         own.is_served();
-        let last: Vec<_> = (0..2).map(|_| enter(address(2)).unwrap()).collect();
+        let last: Vec<_> = (0..2).map(|_| enter(Some(address(2))).unwrap()).collect();
         last.iter().for_each(Place::is_served);
-        assert_eq!(enter(address(2)).err(), Some(NoPlace::FromOne(2)));
-        assert!(enter(address(3)).is_ok());
+        assert_eq!(enter(Some(address(2))).err(), Some(NoPlace::FromOne(2)));
+        assert!(enter(Some(address(3))).is_ok());
         // On this computer, addresses say nothing.
         let local: Vec<_> = (0..9).map(|_| enter(Some(IpAddr::from([127, 0, 0, 1])))).collect();
         assert!(local.iter().all(Result::is_ok));

@@ -51,14 +51,13 @@ const NEEDED: &[&str] = &["BO_", "SG_", "VAL_", "SIG_VALTYPE_", "SG_MUL_VAL_"];
 /// Lines that end with a carriage return alone get a line feed.
 pub fn decode(bytes: &[u8]) -> (Cow<'_, str>, Option<&'static str>) {
     let encoding = unusual(bytes);
-    let text = match encoding {
-        Some(encoding) => encoding.decode(bytes).0,
-        None => {
-            let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
-            match str::from_utf8(bytes) {
-                Ok(text) => Cow::Borrowed(text),
-                Err(_) => encodings::WINDOWS_1252.decode_without_bom_handling(bytes).0,
-            }
+    let text = if let Some(encoding) = encoding {
+        encoding.decode(bytes).0
+    } else {
+        let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
+        match str::from_utf8(bytes) {
+            Ok(text) => Cow::Borrowed(text),
+            Err(_) => encodings::WINDOWS_1252.decode_without_bom_handling(bytes).0,
         }
     };
     let text =
@@ -90,9 +89,9 @@ fn is_shift_jis(bytes: &[u8]) -> bool {
                 let is_clear = *first <= 0x9F && *second >= 0x80
                     || matches!(first, 0x81 | 0x83 | 0x8D | 0x8F | 0x90 | 0x9D);
                 if is_clear {
-                    pairs += 1
+                    pairs += 1;
                 } else {
-                    others += usize::from(*first > 0x9F)
+                    others += usize::from(*first > 0x9F);
                 }
                 rest = behind;
             }

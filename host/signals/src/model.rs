@@ -473,7 +473,7 @@ mod tests {
         };
         for value in [0.1, 3.3, -12.75, 1e-8, 1e30, 16_777_216.0, f32::MIN_POSITIVE] {
             let text = shown(&single, value);
-            assert_eq!(text.parse::<f32>().unwrap(), value, "{text}");
+            assert_eq!(text.parse::<f32>().unwrap().to_bits(), value.to_bits(), "{text}");
             assert!(text.len() <= 13, "{text}");
         }
         assert_eq!([0.1, 3.3, f32::NAN].map(|value| shown(&single, value)), ["0.1", "3.3", "NaN"]);

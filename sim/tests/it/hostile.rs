@@ -66,7 +66,7 @@ fn lives_with(hostile: Hostile) -> Rig {
         rig.listen(channel, MEGABIT).unwrap();
     }
     rig.run_for(3 * MS).unwrap();
-    rig.with_host(|host, otg| host.reset(otg));
+    rig.with_host(cantap_emu::usb_host::UsbHost::reset);
     rig.run_for(8 * MS).unwrap();
     rig.cut();
     rig.wait_for_port().unwrap();

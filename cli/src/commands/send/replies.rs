@@ -1,12 +1,13 @@
 //! Replies: the device sends them on its own, and says how each ended, but not which frames it saw. Those are counted here, so that a
 //! reply that never gets onto the bus does not look like none that was asked for.
 
+use std::fmt::Write as _;
 use std::time::Duration;
 
 use cantap::device::{Records, Ticks, Transmission};
 use cantap::transmit::Stream;
 use cantap::unsent::PATIENCE;
-use cantap::wire::message::{Filter as HardwareFilter, FrameKind, TRIGGER_TAG, Trigger};
+use cantap::wire::message::{Filter as HardwareFilter, FrameKind, OTHERS_TAG, TRIGGER_TAG, Trigger};
 use cantap::{Channel, Device, Direction, Frame, Id, TraceEvent, TraceFrame, TraceRecord};
 
 use crate::sending::{LOOK_EVERY, Sending};
@@ -89,11 +90,14 @@ impl<'d> Replies<'d> {
         self.stream.wait(wait)?;
         while let Some(batch) = self.records.next_batch(Duration::ZERO)?.filter(|batch| !batch.is_empty()) {
             sending.take(&batch);
-            batch.iter().for_each(|record| self.take(record));
+            for record in &batch {
+                self.take(record);
+            }
             self.records.recycle(batch);
         }
         let mut ends = self.stream.take_ended();
-        ends.retain(|end| end.channel == self.channel && end.tag >= TRIGGER_TAG);
+        // On a shared board, what other programs sent is no reply of ours.
+        ends.retain(|end| end.channel == self.channel && end.tag >= TRIGGER_TAG && end.tag != OTHERS_TAG);
         for end in &ends {
             let slot = (end.tag - TRIGGER_TAG) as usize;
             let Some(entry) = self.entries.get_mut(slot) else { continue };
@@ -153,7 +157,7 @@ impl<'d> Replies<'d> {
             let mut text = format!("{frame} on {on}: {} matches, {} sent", entry.matches, entry.sent);
             for (count, kind) in [(left_out, "left out"), (withdrawn, "taken back at the end")] {
                 if count > 0 {
-                    text += &format!(", {count} {kind}");
+                    let _ = write!(text, ", {count} {kind}");
                 }
             }
             eprintln!("cantap: {text}");

@@ -143,7 +143,9 @@ mod tests {
     fn what_is_suggested_is_replaced_by_typing_and_kept_by_moving() {
         let after = |codes: &[KeyCode]| {
             let mut line = Line::suggested("1:500000");
-            codes.iter().for_each(|code| line.key(*code));
+            for code in codes {
+                line.key(*code);
+            }
             line.text()
         };
         assert_eq!(after(&[]), "1:500000");

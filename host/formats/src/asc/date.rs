@@ -105,7 +105,7 @@ impl Parts {
         } else {
             // The names of days come before those of months, and some are the same.
             let begins = |names: &&[&str]| names.iter().any(|name| letters.starts_with(name));
-            if let Some(month) = MONTHS.iter().position(|names| begins(&names)) {
+            if let Some(month) = MONTHS.iter().position(begins) {
                 self.month = Some(month as u64 + 1);
             }
         }

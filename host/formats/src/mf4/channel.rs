@@ -214,7 +214,7 @@ impl Number {
         let any = |raw| Source::Any { raw, conversion: conversion.clone(), meaning };
         let source = match raw {
             Raw::Number if matches!(conversion, Conversion::Linear { factor: 0.0, .. }) => {
-                let constant = meaning.of_converted(Value::Unsigned(0), &conversion);
+                let constant = meaning.of_converted(&Value::Unsigned(0), &conversion);
                 constant.map_or_else(|| any(Raw::Number), Source::Constant)
             }
             Raw::Field(field) if field.is_unsigned() && conversion == Conversion::None => {
@@ -222,7 +222,7 @@ impl Number {
             }
             Raw::Field(field) if field.is_unsigned() && (1..=TABLE_BITS).contains(&field.bits()) => {
                 let meanings = (0..1_u64 << field.bits())
-                    .map(|raw| meaning.of_converted(Value::Unsigned(raw), &conversion).unwrap_or(NONE));
+                    .map(|raw| meaning.of_converted(&Value::Unsigned(raw), &conversion).unwrap_or(NONE));
                 Source::Table(field, meanings.collect())
             }
             raw => any(raw),
@@ -261,7 +261,7 @@ impl Number {
                         Field::of_whole(channel, bytes).value(bytes)?
                     }
                 };
-                meaning.of_converted(value, conversion)
+                meaning.of_converted(&value, conversion)
             }
         }
     }
@@ -285,11 +285,11 @@ impl Number {
 impl Meaning {
     /// The number that a raw value stands for after its conversion. A conversion into texts is often there for readers only: if what it gives
     /// says nothing known, or nothing at all, the raw value counts.
-    fn of_converted(self, raw: Value, conversion: &Conversion) -> Option<u64> {
+    fn of_converted(self, raw: &Value, conversion: &Conversion) -> Option<u64> {
         match conversion.apply(raw.clone()) {
-            Some(Value::Text(text)) => self.of(&Value::Text(text)).or_else(|| self.of(&raw)),
+            Some(Value::Text(text)) => self.of(&Value::Text(text)).or_else(|| self.of(raw)),
             Some(value) => self.of(&value),
-            None if conversion.gives_texts() => self.of(&raw),
+            None if conversion.gives_texts() => self.of(raw),
             None => None,
         }
     }

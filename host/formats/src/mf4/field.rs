@@ -153,9 +153,10 @@ impl Field {
             Kind::Float { .. } => self.float(record).map(Value::Float),
             Kind::Text { is_latin } => {
                 let bytes = self.bytes(record)?.split(|byte| *byte == 0).next()?;
-                Some(Value::Text(match is_latin {
-                    true => bytes.iter().map(|byte| char::from(*byte)).collect(),
-                    false => String::from_utf8_lossy(bytes).into_owned(),
+                Some(Value::Text(if is_latin {
+                    bytes.iter().map(|byte| char::from(*byte)).collect()
+                } else {
+                    String::from_utf8_lossy(bytes).into_owned()
                 }))
             }
             Kind::Utf16 { big_endian } => {

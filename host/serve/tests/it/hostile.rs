@@ -32,7 +32,7 @@ impl Random {
     }
 
     fn bytes(&mut self, most: usize) -> Vec<u8> {
-        (0..self.below(most) + 1).map(|_| self.below(256) as u8).collect()
+        (0..=self.below(most)).map(|_| self.below(256) as u8).collect()
     }
 
     /// Changes a message in a few places.
@@ -211,7 +211,7 @@ fn whatever_clients_send_the_next_one_is_served() {
             attack(door.address().unwrap(), &bytes, &mut random);
         }
     }
-    let deadline = Instant::now() + Duration::from_secs(60);
+    let deadline = Instant::now() + Duration::from_mins(1);
     while board.clients() > 1 {
         assert!(Instant::now() < deadline, "{} are still there", board.clients());
         std::thread::sleep(Duration::from_millis(20));
@@ -292,7 +292,7 @@ fn a_server_that_lies_is_an_error_at_worst() {
             }
             let _ = device.stop();
         }
-        assert!(began.elapsed() < Duration::from_secs(60), "seed {seed} took {:?}", began.elapsed());
+        assert!(began.elapsed() < Duration::from_mins(1), "seed {seed} took {:?}", began.elapsed());
     }
     assert!(heard > 0, "nothing was lied about");
     assert_eq!(panics.load(Ordering::Relaxed), 0);

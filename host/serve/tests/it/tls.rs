@@ -312,7 +312,9 @@ fn silent_peers_keep_nobody_out() {
         served.connect("localhost", &files).unwrap();
     }
     is_over.store(true, std::sync::atomic::Ordering::Relaxed);
-    strangers.into_iter().for_each(|stranger| stranger.join().unwrap());
+    for stranger in strangers {
+        stranger.join().unwrap();
+    }
 }
 
 #[cfg(unix)]

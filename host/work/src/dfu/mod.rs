@@ -98,7 +98,7 @@ const MOST_BUSY: Duration = Duration::from_secs(20);
 
 /// What `GETSTATUS` answers.
 struct Status {
-    status: u8,
+    code: u8,
     poll: Duration,
     state: u8,
 }
@@ -162,7 +162,7 @@ impl<P: Port> Dfu<'_, P> {
             return Err(DfuError::Port(format!("{} bytes of status instead of 6", answer.len()).into()));
         };
         let poll = Duration::from_millis(u32::from_le_bytes([low, middle, high, 0]).into());
-        Ok(Status { status, poll, state })
+        Ok(Status { code: status, poll, state })
     }
 
     /// Whatever was before: ready for a command.
@@ -191,7 +191,7 @@ impl<P: Port> Dfu<'_, P> {
         self.port.send(DNLOAD, number, data).map_err(DfuError::Port)?;
         let mut waited = Duration::ZERO;
         loop {
-            let Status { status, poll, state } = self.status()?;
+            let Status { code: status, poll, state } = self.status()?;
             if status != 0 || state == ERROR {
                 // So that the next attempt finds it ready; this one has failed anyway.
                 let _ = self.port.send(CLRSTATUS, 0, &[]);
@@ -217,13 +217,12 @@ impl<P: Port> Dfu<'_, P> {
         self.command("take an address", SET_ADDRESS, start)?;
         self.port.send(DNLOAD, FIRST_BLOCK, &[]).map_err(DfuError::Port)?;
         match self.status() {
-            Ok(Status { state: MANIFEST | 6 | 8, status: 0, .. }) => Ok(()),
-            Ok(Status { status, .. }) if status != 0 => {
-                Err(DfuError::Refused { what: "start the firmware", reason: reason(status) })
+            // An error: it has gone already.
+            Ok(Status { state: MANIFEST | 6 | 8, code: 0, .. }) | Err(_) => Ok(()),
+            Ok(Status { code: 0, state, .. }) => Err(DfuError::State { state, expected: MANIFEST }),
+            Ok(Status { code, .. }) => {
+                Err(DfuError::Refused { what: "start the firmware", reason: reason(code) })
             }
-            Ok(Status { state, .. }) => Err(DfuError::State { state, expected: MANIFEST }),
-            // It has gone already.
-            Err(_) => Ok(()),
         }
     }
 }

@@ -65,7 +65,7 @@ impl Chip {
     fn work(&mut self, number: u16, data: &[u8]) {
         match (number, data) {
             (0, [SET_ADDRESS, address @ ..]) => {
-                self.pointer = u32::from_le_bytes(address.try_into().unwrap())
+                self.pointer = u32::from_le_bytes(address.try_into().unwrap());
             }
             (0, [ERASE, address @ ..]) => {
                 let address = u32::from_le_bytes(address.try_into().unwrap());

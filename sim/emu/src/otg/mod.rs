@@ -147,6 +147,7 @@ impl Otg {
     }
 
     /// The state after a reset of a controller with the same faults.
+    #[must_use]
     pub fn after_reset(&self) -> Self {
         Self { late: self.late.after_reset(), ..Self::new() }
     }
@@ -382,7 +383,7 @@ impl Otg {
                 let completing = &mut self.completing[(status & 0xF) as usize % ENDPOINTS];
                 *completing = completing.saturating_sub(1);
             }
-            registers::pktsts::SETUP_COMPLETE if status & 0xF == 0 => {
+            registers::pktsts::SETUP_COMPLETE if (status & 0xF) as u8 == 0 => {
                 out.interrupt |= epint::STUP;
                 if self.late.faults.setup_complete_disarms {
                     out.control = out.control & !registers::epctl::EPENA | registers::epctl::NAKSTS;

@@ -366,11 +366,12 @@ fn file(layout: fn(&mut Blocks, &[Frame]) -> Vec<Group>, form: Form, frames: &[F
     file
 }
 
+type Layout = fn(&mut Blocks, &[Frame]) -> Vec<Group>;
+
 /// Both layouts in all forms.
 fn files() -> Vec<(String, Vec<u8>)> {
     let frames = FRAMES.map(Frame::of);
-    let layouts: [(&str, fn(&mut Blocks, &[Frame]) -> Vec<Group>); 2] =
-        [("first", first_layout), ("second", second_layout)];
+    let layouts: [(&str, Layout); 2] = [("first", first_layout), ("second", second_layout)];
     let forms = [Form::Unfinished, Form::Finished, Form::Sorted];
     let each = layouts.into_iter().flat_map(|layout| forms.map(|form| (layout, form)));
     each.map(|((name, layout), form)| (format!("{name}-{form:?}"), file(layout, form, &frames))).collect()
@@ -483,7 +484,7 @@ fn a_second_file_behind_the_first_is_told_with_its_place() {
             }
         }
         // Anything else behind it is none.
-        let (_, issues) = tests::read(Format::Mf4, [&file[..], &vec![0; 99]].concat());
+        let (_, issues) = tests::read(Format::Mf4, [&file[..], &[0; 99]].concat());
         assert!(name.ends_with("Unfinished") || issues.is_empty(), "{name}: {issues:?}");
     }
 }

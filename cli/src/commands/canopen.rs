@@ -10,7 +10,7 @@ use std::time::Duration;
 use anyhow::bail;
 use cantap::{Frame, Id};
 use cantap_protocols::Event;
-use cantap_protocols::active::Announcement;
+use cantap_protocols::active::Broadcast;
 use cantap_protocols::canopen::{CanOpen, Sheet, state_name};
 use cantap_trace::grammar;
 
@@ -182,7 +182,7 @@ fn nmt(speak: &SpeakArgs, node: u8, command: Command, sheets: Vec<Sheet>) -> any
     };
     let device = speak.open()?;
     let mut speaking = speak.speak(&device, Box::new(CanOpen::new(sheets)));
-    speaking.run(&mut Announcement::new([frame]))?;
+    speaking.run(&mut Broadcast::new([frame]))?;
     let said = |event: &Event| matches!(event.kind, "nmt" | "boot_up" | "state" | "emergency");
     speaking.tell(said)?;
     // Show the result, if nodes report their states.

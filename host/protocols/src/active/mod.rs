@@ -53,19 +53,19 @@ pub trait Machine {
 
 /// Frames that need no answer: done when they have been on the bus.
 #[derive(Clone, Debug)]
-pub struct Announcement {
+pub struct Broadcast {
     frames: VecDeque<Frame>,
     under_way: usize,
 }
 
-impl Announcement {
+impl Broadcast {
     /// Sends these frames in order.
     pub fn new(frames: impl IntoIterator<Item = Frame>) -> Self {
         Self { frames: frames.into_iter().collect(), under_way: 0 }
     }
 }
 
-impl Machine for Announcement {
+impl Machine for Broadcast {
     fn next(&mut self, _now_ns: u64) -> Option<Frame> {
         let frame = self.frames.pop_front();
         self.under_way += usize::from(frame.is_some());

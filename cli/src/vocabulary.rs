@@ -155,8 +155,10 @@ fn every_identifier_filter_rate_and_channel_is_written_as_the_others() {
     each(&Cli::command(), "", &mut |command, argument| {
         let Some(name) = argument.get_value_names().and_then(<[_]>::first) else { return };
         // What makes identifiers, and two endpoints of a conversation, are other things; so is an option of Wireshark's.
-        let is_other =
-            matches!(command, "gen" | "extcap") || matches!(argument.get_long(), Some("load" | "format"));
+        let is_other = matches!(command, "gen" | "extcap")
+            || matches!(argument.get_long(), Some("load" | "format"))
+            // A filter and a frame are two values of one option; a routine has an identifier of its own.
+            || matches!((command, argument.get_id().as_str()), ("send", "on_rx") | ("uds routine", "routine"));
         let Some((kind, good, bad)) = GRAMMAR.iter().find(|(kind, ..)| name == kind).filter(|_| !is_other)
         else {
             return;

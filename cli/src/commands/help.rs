@@ -112,7 +112,7 @@ fn wrapped(text: &str, columns: usize) -> String {
 }
 
 /// Runs it; `line` describes the whole command.
-pub fn run(args: &Args, mut line: clap::Command) -> anyhow::Result<ExitCode> {
+pub fn run(args: &Args, line: &clap::Command) -> anyhow::Result<ExitCode> {
     let mut out = std::io::stdout().lock();
     if let [word] = &args.words[..]
         && let Some((_, _, text)) = TOPICS.iter().find(|(name, ..)| name == word)
@@ -120,11 +120,10 @@ pub fn run(args: &Args, mut line: clap::Command) -> anyhow::Result<ExitCode> {
         out.write_all(wrapped(text, columns()).as_bytes())?;
         return Ok(ExitCode::SUCCESS);
     }
-    line.build();
-    let mut command = &mut line;
+    let mut command = line;
     for word in &args.words {
-        let below = command.get_name().to_owned();
-        command = match command.find_subcommand_mut(word) {
+        let below = command.get_name();
+        command = match command.find_subcommand(word) {
             Some(command) => command,
             None => {
                 return Err(wrong(format!(
@@ -133,7 +132,12 @@ pub fn run(args: &Args, mut line: clap::Command) -> anyhow::Result<ExitCode> {
             }
         };
     }
-    write!(out, "{}", command.render_long_help())?;
+    // The same text as with --help, which clap composes only for a command line.
+    let name = line.get_name().to_owned();
+    let words = std::iter::once(name.as_str()).chain(args.words.iter().map(String::as_str)).chain(["--help"]);
+    if let Err(help) = line.clone().try_get_matches_from(words) {
+        write!(out, "{}", help.render())?;
+    }
     Ok(ExitCode::SUCCESS)
 }
 

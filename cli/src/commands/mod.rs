@@ -141,7 +141,7 @@ impl Command {
             Self::Uds(args) => uds::run(&args),
             Self::Canopen(args) => canopen::run(&args),
             Self::J1939(args) => j1939::run(&args),
-            Self::Help(args) => help::run(&args, line),
+            Self::Help(args) => help::run(&args, &line),
             Self::Completions(args) => completions::run(&args),
             Self::Man(args) => man::run(&args, line),
             Self::Db(args) => db::run(&args),

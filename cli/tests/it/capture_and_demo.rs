@@ -199,7 +199,10 @@ fn data_that_was_left_out_is_told_and_gives_no_load() {
     assert_eq!((code, out.lines().count()), (Some(0), 30));
     let notice = "cantap: standard output does not carry the data that the device left out, and has zeros in its place (30)";
     assert!(err.lines().any(|line| line == notice), "{err}");
-    assert!(err.contains("channel 1: 30 frames, ") && !err.contains("bus load"), "{err}");
+    assert!(
+        err.contains("channel 1: 30 frames, ") && err.contains("bus load – (frames come without data)"),
+        "{err}"
+    );
     let (_, out, err) = cantap(&format!("{line} --json"));
     assert_eq!(err, "");
     let channel = &json(&out)["channels"][0];
@@ -215,7 +218,7 @@ fn times_that_were_left_out_give_neither_rate_nor_load() {
     let (code, _, err) = cantap(line);
     assert_eq!(code, Some(0));
     assert!(err.contains("does not carry the mark of times that are only upper bounds"), "{err}");
-    assert!(!err.contains("frames/s") && !err.contains("bus load"), "{err}");
+    assert!(!err.contains("frames/s") && err.contains("bus load – (frames come without times)"), "{err}");
     let (_, out, _) = cantap(&format!("{line} --json"));
     let channel = &json(&out)["channels"][0];
     assert!(channel["bus_load_pct"].is_null() && channel["frames_per_s"].is_null(), "{out}");
@@ -369,7 +372,9 @@ fn the_demo_loses_nothing_and_says_so_in_the_promised_object() {
     let _turn = cantap_testing::process::turn();
     let (code, out, err) = cantap("demo --time 1 --json");
     let object = json(&out);
-    assert_eq!((code, err.as_str()), (Some(0), ""), "{out}");
+    // A frame that ends while its channel leaves the bus has a stamp that is only an upper bound, which the demo's log does not show.
+    assert!(err.lines().all(|line| line.contains("the mark of times that are only upper bounds")), "{err}");
+    assert_eq!(code, Some(0), "{out}");
     assert_eq!(
         keys(&object),
         [

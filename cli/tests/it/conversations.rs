@@ -221,7 +221,7 @@ fn a_makers_pairs_are_read_alike_in_every_form() {
     let kinds: Vec<_> = json.lines().map(|line| line.contains("\"kind\":\"exchange\"")).collect();
     assert_eq!(kinds, [true; 6], "{json}");
     let directory = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("conversations/makers_pairs");
-    let wide = ["decode", "bus.log", "--protocols", "--wide", "--quiet"];
+    let wide = ["decode", "bus.log", "--protocols", "--wide", "--csv", "--quiet"];
     let output =
         Command::new(env!("CARGO_BIN_EXE_cantap")).args(wide).current_dir(directory).output().unwrap();
     let table = String::from_utf8(output.stdout).unwrap();

@@ -53,8 +53,8 @@ fn saved_settings_survive_a_power_cycle_and_are_used_where_no_bit_rate_is_given(
     );
     done(
         &format!("defaults show -d {device}"),
-        "channel 1  250000 bit/s, sample point 87.5 %, listen, receives 000:400 data\n\
-         channel 2  125000 bit/s, sample point 87.5 %, listen, one-shot, recovery manual, receives everything\n",
+        "channel 1  250000 bit/s, sample point 87.5 %, listen-only, receives 000:400 data\n\
+         channel 2  125000 bit/s, sample point 87.5 %, listen-only, one-shot, recovery manual, receives everything\n",
     );
     let (code, out, err) = cantap(&format!("capture -d {device} -c 1 -n 50 -t 5s"));
     assert_eq!(code, Some(0), "{err}");

@@ -182,7 +182,8 @@ fn what_is_wrong_with_profile_and_database_is_said_and_the_view_opens_without_it
     assert!(text.contains("line 3: unknown field `speed`"), "{text}");
     assert!(text.contains("car.dbc: line 3: Engine.Speed: "), "{text}");
     view.wait_for("virtual listen-only: running");
-    view.keys("q");
+    // The first key only ends the message.
+    view.keys("xq");
     assert_eq!(view.end(), 0);
     // A part of a profile that is wrong does not affect the others.
     let profile = write(
@@ -194,6 +195,6 @@ fn what_is_wrong_with_profile_and_database_is_said_and_the_view_opens_without_it
     let text = view.wait_for("bit rate fast: ");
     assert!(text.contains("filter nonsense,,: ") && text.contains("to send, 123#1: "), "{text}");
     view.wait_for("Channel 2: 250000 bit/s");
-    view.keys("q");
+    view.keys("xq");
     assert_eq!(view.end(), 0);
 }

@@ -86,6 +86,9 @@ fn refusing_server() -> String {
     std::thread::spawn(move || {
         for mut stream in listener.incoming().map_while(Result::ok) {
             let _ = stream.write_all(format!("cantap: {HARMFUL}\r\nmore").as_bytes());
+            let _ = stream.shutdown(std::net::Shutdown::Write);
+            // Closed with something unread, the connection would be reset, and the text perhaps lost.
+            std::thread::spawn(move || std::io::copy(&mut stream, &mut std::io::sink()));
         }
     });
     at

@@ -393,6 +393,9 @@ impl Signal {
     /// the bus is 0.10000000149011612 as a double; otherwise as [`Number::for_people`].
     pub fn for_people(&self, number: Number) -> Number {
         let Number::Real(value) = number else { return number };
+        if is_integer(value) {
+            return number;
+        }
         let shortest = match self.kind {
             ValueKind::Single => (value as f32).to_string().parse().ok(),
             ValueKind::Half => (0..5).find_map(|digits| {

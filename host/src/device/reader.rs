@@ -24,6 +24,8 @@ use super::{DeviceError, SessionOver};
 const READ_BYTES: usize = 64 * 1024;
 /// A device makes the host wait while it has no room; one that accepts nothing for this long is stuck.
 const WRITE_PATIENCE: Duration = Duration::from_secs(2);
+/// How long a failed write waits for what reading says of the end.
+const END_PATIENCE: Duration = Duration::from_millis(300);
 
 /// The possible answers to a request.
 #[expect(clippy::large_enum_variant, reason = "one for each request, taken at once")]
@@ -227,14 +229,23 @@ impl Shared {
     pub fn write(&self, bytes: &[u8]) -> Result<(), DeviceError> {
         let written = lock(&self.output).write(bytes, WRITE_PATIENCE);
         written.map_err(|error| {
-            self.gone().unwrap_or_else(|| {
-                if is_idle(&error) {
-                    DeviceError::Timeout { seconds: WRITE_PATIENCE.as_secs_f32() }
-                } else {
-                    Gone::Vanished(error.to_string()).error(&self.name)
-                }
-            })
+            if is_idle(&error) {
+                return self.gone().unwrap_or(DeviceError::Timeout { seconds: WRITE_PATIENCE.as_secs_f32() });
+            }
+            self.reason_for_the_end().unwrap_or_else(|| Gone::Vanished(error.to_string()).error(&self.name))
         })
+    }
+
+    /// Why the connection ended, as the reading thread sees it: a server says why before it closes. Waits a moment for it.
+    fn reason_for_the_end(&self) -> Option<DeviceError> {
+        let deadline = Instant::now() + END_PATIENCE;
+        loop {
+            let gone = self.gone();
+            if gone.is_some() || Instant::now() >= deadline {
+                return gone;
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
     }
 
     /// The reader's own request for the time; nothing waits for it, and it waits for nothing.

@@ -62,7 +62,7 @@ fn handle() -> Result<(), ctrlc::Error> {
 }
 
 /// From now on, Ctrl-C (and the system's request to terminate) sets a flag instead of ending the program. Only a third one, or
-/// one that comes [`ECHO`] after the first, ends it immediately.
+/// one that comes two seconds after the first, ends it immediately.
 pub fn watch() -> Result<(), ctrlc::Error> {
     handle()?;
     state().is_watched = true;

@@ -22,7 +22,7 @@ impl Served {
         let socket = folder.path().join("cantap.sock").display().to_string();
         let mut server = Command::new(env!("CARGO_BIN_EXE_cantap"))
             .args(["serve", "-d", device, "-b", "500k", "--unix", &socket])
-            .args(["--socketcand", "127.0.0.1:0", "--allow", "socketcand:send"])
+            .args(["--allow", "send", "--socketcand", "127.0.0.1:0", "--allow", "socketcand:send"])
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .stderr(stderr)

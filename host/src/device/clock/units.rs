@@ -19,20 +19,20 @@ impl Ticks {
     }
 }
 
-/// UTC: nanoseconds since the Unix epoch.
+/// UTC: nanoseconds since the Unix epoch. A device that lies about its clock may lead beyond what can be counted, where the count stays.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct UtcNs(pub i64);
 
 impl UtcNs {
     /// Nanoseconds from `other` to this time.
     pub const fn since(self, other: Self) -> i64 {
-        self.0 - other.0
+        self.0.saturating_sub(other.0)
     }
 
     /// This time plus a number of nanoseconds.
     #[must_use]
     pub const fn plus(self, ns: i64) -> Self {
-        Self(self.0 + ns)
+        Self(self.0.saturating_add(ns))
     }
 }
 
@@ -45,13 +45,13 @@ pub struct FrameNs(pub i64);
 impl FrameNs {
     /// Nanoseconds from `other` to this time.
     pub const fn since(self, other: Self) -> i64 {
-        self.0 - other.0
+        self.0.saturating_sub(other.0)
     }
 
     /// This time plus a number of nanoseconds.
     #[must_use]
     pub const fn plus(self, ns: i64) -> Self {
-        Self(self.0 + ns)
+        Self(self.0.saturating_add(ns))
     }
 }
 

@@ -116,6 +116,10 @@ impl Layout for DifLayout {
     }
 }
 
+/// The two lines at which a row begins.
+const MARK: &[u8] = b"-1,0";
+const BEGIN: &[u8] = b"BOT";
+
 /// More cells than this in a row mean damage.
 const MAX_CELLS: usize = 256;
 
@@ -130,6 +134,10 @@ pub(crate) struct Decoder {
     named: bool,
     /// The line at which the row begins.
     row_line: u64,
+    /// Whether the rest of a damaged row is being passed over, up to where the next begins.
+    skipping: bool,
+    /// A line that was read as the second of a damaged pair and is the first of the next.
+    held: Option<Vec<u8>>,
     pending: Option<TraceRecord>,
     ended: bool,
 }
@@ -153,47 +161,74 @@ impl Decode for Decoder {
         while !self.ended {
             if self.named
                 && self.cells.is_empty()
+                && self.held.is_none()
+                && !self.skipping
                 && let Some(found) = self.whole_row(input)
             {
                 return Ok(found);
             }
-            let place = Place::Line(input.line_number() + 1);
-            let Some(first) = input.line()? else {
+            let held = self.held.take();
+            let place = Place::Line(input.line_number() + u64::from(held.is_none()));
+            let first =
+                if held.is_some() { held } else { input.line()?.map(|line| line.text.trim_ascii().to_vec()) };
+            let Some(first) = first else {
                 self.ended = true;
                 // Without its end, the last row may lack cells.
                 let cut = Fault::Truncated("a table; its last row is left out");
                 return Ok(Found::Issue(place, cut));
             };
-            let first = first.text.trim_ascii().to_vec();
             if !self.in_data {
                 match self.header(&first, input)? {
                     None => continue,
                     Some(fault) => return Ok(Found::Issue(place, fault)),
                 }
             }
+            // Pairs that are out of step never get into it again by themselves.
+            if self.skipping && first != MARK && first != BEGIN {
+                continue;
+            }
             let Some(second) = input.line()? else { continue };
             let second = second.text.trim_ascii();
-            let result = match (first.split(|byte| *byte == b',').next(), second) {
-                (Some(b"-1"), b"BOT") => self.row(),
+            let row_place = Place::Line(self.row_line);
+            let (fault_place, result) = match (first.split(|byte| *byte == b',').next(), second) {
+                (Some(b"-1"), BEGIN) => {
+                    (self.row_line, self.skipping) = (input.line_number() + 1, false);
+                    (row_place, self.row())
+                }
                 (Some(b"-1"), b"EOD") => {
                     self.ended = true;
-                    self.row()
+                    (row_place, self.row())
                 }
-                (Some(b"0"), _) => self.cell(first.get(2..).unwrap_or_default()),
-                (Some(b"1"), [b'"', text @ .., b'"'] | text) => self.cell(text),
-                _ => Err(Fault::malformed("a cell: '0,' and a number, '1,0', or '-1,0'", &first)),
+                (Some(b"0"), _) if second != MARK && second != BEGIN => {
+                    (row_place, self.cell(first.get(2..).unwrap_or_default()))
+                }
+                (Some(b"1"), [b'"', text @ .., b'"'] | text) if second != MARK && second != BEGIN => {
+                    (row_place, self.cell(text))
+                }
+                (_, second) => {
+                    let was_skipping = std::mem::replace(&mut self.skipping, true);
+                    self.cells.clear();
+                    if first == BEGIN {
+                        self.held = Some(second.to_vec());
+                        (self.row_line, self.skipping) = (input.line_number(), false);
+                    } else if second == BEGIN {
+                        (self.row_line, self.skipping) = (input.line_number() + 1, false);
+                    } else if second == MARK {
+                        self.held = Some(second.to_vec());
+                    }
+                    if was_skipping {
+                        continue;
+                    }
+                    (place, Err(Fault::malformed("a cell: '0,' and a number, '1,0', or '-1,0'", &first)))
+                }
             };
-            let row_place = Place::Line(self.row_line);
-            if matches!(second, b"BOT") {
-                self.row_line = input.line_number() + 1;
-            }
             match result {
                 Ok(Some((record, second))) => {
                     self.pending = second.map(|event| TraceRecord { event, ..record });
                     return Ok(Found::Record(record));
                 }
                 Ok(None) => {}
-                Err(fault) => return Ok(Found::Issue(row_place, fault)),
+                Err(fault) => return Ok(Found::Issue(fault_place, fault)),
             }
         }
         // Only the end shows whether a compressed file is complete.
@@ -233,7 +268,7 @@ impl Decoder {
                 [b'1', b',', ..] => match trimmed(second) {
                     [b'"', text @ .., b'"'] | text => text,
                 },
-                b"-1,0" if trimmed(second) == b"BOT" => break,
+                MARK if trimmed(second) == BEGIN => break,
                 _ => return None,
             };
             *cells.get_mut(count)? = cell;
@@ -273,6 +308,7 @@ impl Decoder {
     fn cell(&mut self, text: &[u8]) -> Result<super::found::Row, Fault> {
         if self.cells.len() >= MAX_CELLS {
             self.cells.clear();
+            self.skipping = true;
             return Err(Fault::malformed("the end of a row", text));
         }
         self.cells.push(text.to_vec());
@@ -344,6 +380,27 @@ mod tests {
         for keep in [whole.len() - 6, whole.len() - 12, whole.len() - 40] {
             let (records, issues) = tests::read(Format::Dif, &whole[..keep]);
             assert_eq!((records.len(), issues.len()), (2, 1), "{issues:?}");
+        }
+    }
+
+    /// A line more or less put all pairs behind it out of step, to the end of the file.
+    #[test]
+    fn a_damaged_row_is_one_issue_and_the_rows_behind_it_are_read() {
+        let records: Vec<_> = (1..=6).map(data_record).collect();
+        let whole = tests::write(Format::Dif, &records);
+        let lines: Vec<_> = whole.split_inclusive('\n').collect();
+        let begins: Vec<_> = (0..lines.len()).filter(|at| lines[*at] == "BOT\r\n").collect();
+        // The names of the columns, then the rows: from the third's first cell to the mark of the fourth.
+        for at in begins[3] + 1..begins[4] {
+            let without = [&lines[..at], &lines[at + 1..]].concat().concat();
+            let with = [&lines[..at], &["rubbish\r\n"], &lines[at..]].concat().concat();
+            for text in [without, with] {
+                let (read, issues) = tests::read(Format::Dif, text);
+                assert_eq!(issues.len(), 1, "line {at}: {issues:?}");
+                assert!(read.len() >= 4, "line {at}: {}", read.len());
+                assert_eq!(read[..2], records[..2]);
+                assert_eq!(read[read.len() - 2..], records[4..]);
+            }
         }
     }
 }

@@ -322,8 +322,20 @@ impl Input {
 
     /// Uses up this many lines that [`Self::buffered`] showed, `len` bytes in total.
     pub(crate) fn consume_lines(&mut self, len: usize, lines: u64) {
+        if self.has_nul {
+            self.note_nul_lines(len);
+        }
         self.consume(len);
         self.lines += lines;
+    }
+
+    /// Keeps the numbers of the lines with a NUL byte among the next `len` bytes, which are whole lines.
+    #[cold]
+    fn note_nul_lines(&mut self, len: usize) {
+        let lines = self.buffer[self.start..self.start + len].split_inclusive(|byte| *byte == b'\n');
+        let numbered = (self.lines + 1..).zip(lines);
+        self.nul_lines
+            .extend(numbered.filter(|(_, line)| memchr::memchr(0, line).is_some()).map(|(number, _)| number));
     }
 
     /// The next line; `None` at the end.

@@ -251,6 +251,8 @@ mod tests {
         long[5] = FLAG_FDF;
         assert_eq!(read(&mut packets, &long), "123#ABCD");
         long[4] = 8;
+        assert_eq!(read(&mut packets, &long), "123#ABCD000000000000", "the flag before was none");
+        let mut packets = Packets::default();
         assert_eq!(read(&mut packets, &long), "123##0ABCD000000000000", "nothing of it is padding");
         long[7] = 9;
         assert_eq!(read(&mut packets, &long), "123#ABCD000000000000", "nor a flag, where something else is");

@@ -102,6 +102,7 @@ mod tests {
         for (text, point) in [
             ("12.5", TimePoint::AfterFirst(12_500_000_000)),
             ("2m", TimePoint::AfterFirst(120_000_000_000)),
+            ("5d", TimePoint::AfterFirst(432_000_000_000_000)),
             ("1410714882.5", TimePoint::At(1_410_714_882_500_000_000)),
             ("2014-09-14T17:14:42.5Z", TimePoint::At(1_410_714_882_500_000_000)),
             ("2014-09-14 17:14:42", TimePoint::At(1_410_714_882_000_000_000)),
@@ -109,7 +110,7 @@ mod tests {
         ] {
             assert_eq!(text.parse(), Ok(point), "{text}");
         }
-        for bad in ["", "s", "noon", "1e5", "2014-13-01T00:00:00", "2014-13-01", "2014-09", "5d"] {
+        for bad in ["", "s", "noon", "1e5", "2014-13-01T00:00:00", "2014-13-01", "2014-09", "5y"] {
             assert!(bad.parse::<TimePoint>().is_err(), "{bad}");
         }
     }

@@ -230,6 +230,19 @@ fn samples() -> Vec<(Format, Vec<u8>)> {
              Timestamp: 1436509052.249714    ID: 18daf110    X Tx                DL:  0                               Channel: can1\n\
              Timestamp: 1436509052.249715    ID:      123    S Rx   R            DL:  3                               Channel: can0\n",
         ),
+        text(
+            Format::CanEdgeCsv,
+            "TimestampEpoch;BusChannel;ID;IDE;DLC;DataLength;Dir;EDL;BRS;ESI;RTR;DataBytes\n\
+             1670926807.419500;1;044;0;8;8;0;0;0;0;0;2A366E4C11223344\n1670926807.419700;2;18DAF110;1;0;0;1;0;0;0;0;\n\
+             1670926807.419900;1;321;0;9;12;0;1;1;0;0;000102030405060708090A0B\n\
+             1670926807.420000;9;7FF;0;1;1;0;1;0;1;0;AA\n1670926807.420100;1;126;0;12;8;0;0;0;0;0;0102030405060708\n\
+             1670926807.420200;1;123;0;4;0;0;0;0;0;1;\n",
+        ),
+        text(
+            Format::BatteryEmulator,
+            "(0.05) RX0 17FC007B [8] 11 22 33 44 55 66 77 88\r\n(0.05) TX1 3C0 [2] 00 FF\r\n(0.06) RX2 7 [0]\r\n\
+             [12 CAN frames not printed]\r\n(51.261) TX3 1FFFFFFF [12] 00 01 02 03 04 05 06 07 08 09 0A 0B\r\n",
+        ),
     ]
 }
 

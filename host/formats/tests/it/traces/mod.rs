@@ -34,12 +34,16 @@ pub fn file_name(format: Format, compression: &str) -> String {
         Format::Asc => "asc",
         Format::Blf => "blf",
         Format::Trc(_) | Format::CanHacker => "trc",
-        Format::Csv(_) => "csv",
+        Format::Csv(_) | Format::CanEdgeCsv => "csv",
         Format::Pcapng => "pcapng",
         Format::Dif => "dif",
         Format::Mf4 => "mf4",
         Format::Pcap => "pcap",
-        Format::CandumpScreen | Format::Kvaser | Format::Printer | Format::CanKing => "txt",
+        Format::CandumpScreen
+        | Format::Kvaser
+        | Format::Printer
+        | Format::CanKing
+        | Format::BatteryEmulator => "txt",
         Format::Sqlite => "db",
         Format::Crtd => "crtd",
         Format::Microchip => "can",

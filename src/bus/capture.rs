@@ -11,7 +11,7 @@ pub use orders::Closing;
 
 use cantap_wire::message::ChannelConfig;
 use cantap_wire::record::{ErrorState, LossStage, Stamp, TransmitFailure};
-use cantap_wire::{CHANNELS, Channel, Event, Received};
+use cantap_wire::{CHANNELS, Channel, Event, Frame, Received};
 use gaps::{Gap, Gaps};
 
 use crate::QUEUE_BYTES;
@@ -37,6 +37,28 @@ pub const CALLS_PER_TICK: usize = 4;
 
 /// An alarm is never set farther ahead than this, a quarter of the timer's range. When it fires, the next one is set.
 const ALARM_AHEAD_TICKS: u64 = 1 << 30;
+
+/// How far draining a FIFO has got.
+struct Drain {
+    /// Frames and overrun as just seen, and not handled yet.
+    look: Option<(u8, bool)>,
+    /// So many looks are left, [`Self::look`] included.
+    looks: usize,
+    /// So many frames may still be taken.
+    room: u32,
+    /// When the interrupt was entered, if nothing has been taken since; otherwise nothing is known about when a frame ended.
+    entered: Option<u32>,
+    /// Replies are to be sent.
+    reply: bool,
+}
+
+impl Drain {
+    /// One that has only had its first look.
+    #[inline]
+    const fn whole(look: (u8, bool)) -> Self {
+        Self { look: Some(look), looks: LOOKS_PER_DRAIN, room: FRAMES_PER_DRAIN, entered: None, reply: false }
+    }
+}
 
 /// One channel's state.
 struct ChannelState<'q> {
@@ -108,7 +130,33 @@ impl<'q, const N: usize> Capture<'q, N> {
         clock: &impl Clock,
         entered: u32,
     ) -> bool {
-        self.drain(channel, traffic, clock, Some(entered))
+        let state = &mut self.channels[channel.index()];
+        if state.closing {
+            state.held = true;
+            return false;
+        }
+        let mut drain = Drain { entered: Some(entered), ..Drain::whole(traffic.look()) };
+        // Nearly always: one frame, which raised the interrupt, and none after it. Apart from all the rest, it takes a tenth less time (measured).
+        if drain.look == Some((1, false)) {
+            drain.entered = None;
+            drain.looks -= 1;
+            let frame = traffic.receive();
+            let taken = u8::from(frame.is_some());
+            drain.room -= u32::from(taken);
+            if let Some(frame) = frame {
+                let at = self.recorder.time(entered);
+                drain.reply = Self::record(state, &mut self.recorder, channel, frame, at, Stamp::Exact);
+            }
+            state.gaps.looked(1, taken, traffic);
+            let look = traffic.look();
+            if look == (0, false) && !drain.reply {
+                state.held = false;
+                state.gaps.emptied();
+                return true;
+            }
+            drain.look = Some(look);
+        }
+        self.drain(channel, traffic, clock, drain)
     }
 
     /// Part of [`Self::on_tick`]: drains a FIFO whose last drain was given up. Returns whether the receive interrupt, which was left silent
@@ -125,7 +173,7 @@ impl<'q, const N: usize> Capture<'q, N> {
             state.gaps.overrun(traffic);
             Self::record_gap(state, &mut self.recorder, channel, now);
         }
-        state.held && !state.closing && self.drain(channel, traffic, clock, None)
+        state.held && !state.closing && self.drain_late(channel, traffic, clock)
     }
 
     /// Records that frames are missing before the next one in the FIFO, if they are.
@@ -151,29 +199,56 @@ impl<'q, const N: usize> Capture<'q, N> {
         recorder.event(&Event::Lost { channel, stage: LossStage::Controller, count, at_least: true }, at);
     }
 
-    /// Drains the FIFO; without `entered`, nothing is known about when its frames ended. Returns whether it is empty.
-    fn drain(
-        &mut self,
+    /// Records a frame that was taken out of the FIFO. Returns whether there are replies to it.
+    #[inline(always)]
+    #[expect(clippy::inline_always, reason = "measured, as for `Recorder::frame`")]
+    fn record(
+        state: &mut ChannelState<'_>,
+        recorder: &mut Recorder<'_, N>,
         channel: Channel,
-        traffic: &mut impl Traffic,
-        clock: &impl Clock,
-        entered: Option<u32>,
+        frame: Frame,
+        at: u64,
+        quality: Stamp,
     ) -> bool {
+        let (data_omitted, omit_stamps) = match &state.open {
+            Some(config) => (config.omit_data, config.omit_stamps),
+            None => (false, false),
+        };
+        state.frames = state.frames.wrapping_add(1);
+        let reply = state.transmitter.on_frame(&frame);
+        let stamp = if omit_stamps { Stamp::Omitted } else { quality };
+        recorder.frame(&Received { channel, frame, stamp, data_omitted }, at);
+        if state.gaps.taken() {
+            Self::record_gap(state, recorder, channel, at);
+        }
+        reply
+    }
+
+    /// Drains the FIFO when nothing is known about when its frames ended. Returns whether it is empty.
+    fn drain_late(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) -> bool {
         let state = &mut self.channels[channel.index()];
         if state.closing {
             state.held = true;
             return false;
         }
-        let (omit_data, omit_stamps) = match &state.open {
-            Some(config) => (config.omit_data, config.omit_stamps),
-            None => (false, false),
-        };
-        let mut entered = entered;
-        let mut reply = false;
+        let drain = Drain::whole(traffic.look());
+        self.drain(channel, traffic, clock, drain)
+    }
+
+    /// What is left of draining the FIFO. Returns whether it is empty.
+    #[inline(never)]
+    fn drain(
+        &mut self,
+        channel: Channel,
+        traffic: &mut impl Traffic,
+        clock: &impl Clock,
+        drain: Drain,
+    ) -> bool {
+        let state = &mut self.channels[channel.index()];
+        let Drain { mut look, looks, mut room, mut entered, mut reply } = drain;
         let mut emptied = false;
-        let mut room = FRAMES_PER_DRAIN;
-        for _ in 0..LOOKS_PER_DRAIN {
-            let (pending, overrun) = traffic.look();
+        for _ in 0..looks {
+            let (pending, overrun) = look.take().unwrap_or_else(|| traffic.look());
             if pending == 0 && !overrun {
                 emptied = true;
                 break;
@@ -195,26 +270,14 @@ impl<'q, const N: usize> Capture<'q, N> {
                 };
                 room -= 1;
                 taken += 1;
-                state.frames = state.frames.wrapping_add(1);
-                reply |= state.transmitter.on_frame(&frame);
-                let received = Received {
-                    channel,
-                    frame,
-                    stamp: if omit_stamps { Stamp::Omitted } else { quality },
-                    data_omitted: omit_data,
-                };
-                self.recorder.frame(&received, at);
-                if state.gaps.taken() {
-                    Self::record_gap(state, &mut self.recorder, channel, at);
-                }
+                reply |= Self::record(state, &mut self.recorder, channel, frame, at, quality);
             }
             state.gaps.looked(pending, taken, traffic);
         }
         state.held = !emptied;
         if emptied {
             state.gaps.emptied();
-        }
-        if !emptied {
+        } else {
             state.drains_given_up = state.drains_given_up.wrapping_add(1);
         }
         if reply {

@@ -5,7 +5,8 @@ use core::sync::atomic::{AtomicU32, Ordering};
 
 use bbqueue::nicknames::Churrasco;
 use bbqueue::prod_cons::stream::{StreamConsumer, StreamProducer};
-use cantap_wire::record::MAX_RECORD;
+use cantap_wire::Received;
+use cantap_wire::record::{MAX_RECORD, encode_received};
 
 use crate::QUEUE_BYTES;
 
@@ -49,15 +50,6 @@ impl<const N: usize> Default for RecordQueue<N> {
     }
 }
 
-/// How the queue treats a record.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Kind {
-    /// A received frame: refused when the queue is full.
-    Frame,
-    /// Anything else: may use the reserve.
-    Event,
-}
-
 /// The interrupts' end.
 pub struct Producer<'q, const N: usize> {
     queue: &'q RecordQueue<N>,
@@ -97,24 +89,43 @@ impl<const N: usize> Producer<'_, N> {
         !self.full
     }
 
-    /// Lets `encode` write one record in place. Returns false, without calling it, if there is no room.
-    #[inline]
-    pub fn push(&mut self, kind: Kind, encode: impl FnOnce(&mut [u8; MAX_RECORD]) -> usize) -> bool {
+    /// Writes a received frame in place. Returns false if the queue is full.
+    #[inline(always)]
+    #[expect(clippy::inline_always, reason = "measured, as for `Recorder::frame`")]
+    pub fn push_frame(&mut self, received: &Received, ticks: i64) -> bool {
         let fill = self.fill();
-        if kind == Kind::Frame && !self.has_room_beside(fill) {
+        if !self.has_room_beside(fill) {
             return false;
         }
         let Ok(mut grant) = self.ring.grant_exact(MAX_RECORD) else {
-            self.full |= kind == Kind::Frame;
+            self.full = true;
             return false;
         };
         let Some(room) = grant.first_chunk_mut::<MAX_RECORD>() else { return false };
+        let len = encode_received(received, ticks, room);
+        grant.commit(len);
+        self.has_written(fill, len as u32);
+        true
+    }
+
+    /// Lets `encode` write one record of anything else in place, which may use the reserve. Returns false, without calling it, if there is
+    /// no room.
+    #[inline]
+    pub fn push_event(&mut self, encode: impl FnOnce(&mut [u8; MAX_RECORD]) -> usize) -> bool {
+        let fill = self.fill();
+        let Ok(mut grant) = self.ring.grant_exact(MAX_RECORD) else { return false };
+        let Some(room) = grant.first_chunk_mut::<MAX_RECORD>() else { return false };
         let len = encode(room);
         grant.commit(len);
-        self.written = self.written.wrapping_add(len as u32);
-        // The reader may have taken some since then: reading its position once per record is enough.
-        self.high_water = self.high_water.max(fill + len as u32);
+        self.has_written(fill, len as u32);
         true
+    }
+
+    #[inline]
+    fn has_written(&mut self, fill: u32, len: u32) {
+        self.written = self.written.wrapping_add(len);
+        // The reader may have taken some since then: reading its position once per record is enough.
+        self.high_water = self.high_water.max(fill + len);
     }
 }
 

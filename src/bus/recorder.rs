@@ -1,11 +1,11 @@
 //! Writes records into the queue: each with its time since the last one, and a loss record in place
 //! of what did not fit.
 
-use cantap_wire::record::{LossStage, encode_event, encode_received};
+use cantap_wire::record::{LossStage, encode_event};
 use cantap_wire::{CHANNELS, Channel, Event, Received};
 
 use crate::QUEUE_BYTES;
-use crate::bus::queue::{Kind, Producer};
+use crate::bus::queue::Producer;
 use crate::bus::time::Timebase;
 
 /// Records that one call of anything that writes many of them writes at most. Most such calls hold the lock, and the transmission alarm is
@@ -61,7 +61,7 @@ impl<'q, const N: usize> Recorder<'q, N> {
         let difference = self.difference(at);
         // If the reader has just made room, the loss record gets it first: it belongs before the next frame.
         let in_turn = self.unreported == [0; CHANNELS];
-        if in_turn && self.producer.push(Kind::Frame, |room| encode_received(received, difference, room)) {
+        if in_turn && self.producer.push_frame(received, difference) {
             if received.stamp != cantap_wire::Stamp::Omitted {
                 self.last_ticks = at;
             }
@@ -86,9 +86,10 @@ impl<'q, const N: usize> Recorder<'q, N> {
         }
     }
 
+    #[inline(never)]
     fn write(&mut self, event: &Event, at: u64) -> bool {
         let difference = self.difference(at);
-        let written = self.producer.push(Kind::Event, |room| encode_event(event, difference, room));
+        let written = self.producer.push_event(|room| encode_event(event, difference, room));
         if written {
             self.last_ticks = at;
         }
@@ -103,6 +104,8 @@ impl<'q, const N: usize> Recorder<'q, N> {
 
     /// Writes a loss record for each channel that lost frames, once the queue accepts frames again. The record
     /// then stands exactly where they are missing.
+    #[cold]
+    #[inline(never)]
     fn report_losses(&mut self, at: u64) {
         if !self.producer.takes_frames() {
             return;

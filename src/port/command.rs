@@ -607,6 +607,10 @@ const fn parse(text: &str) -> u16 {
 }
 
 fn begin_close<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, N>) {
+    // Two locks: each takes a while.
+    board.with_capture(|capture, traffic, clock| {
+        capture.drain_last(channel, &mut traffic[channel.index()], clock);
+    });
     board.with_capture(|capture, traffic, clock| {
         capture.begin_close(channel, &mut traffic[channel.index()], clock);
     });

@@ -27,7 +27,7 @@ pub fn line(text: &str) -> Cow<'_, str> {
     text.chars().map(harmless).collect::<String>().into()
 }
 
-/// Like [`line`], but keeps the text's own lines, each ended by `\n`.
+/// Like [`line()`], but keeps the text's own lines, each ended by `\n`.
 pub fn lines(text: &str) -> Cow<'_, str> {
     if !text.contains(is_harmful) {
         return Cow::Borrowed(text);

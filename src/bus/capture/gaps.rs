@@ -50,6 +50,8 @@ impl Gaps {
     }
 
     /// The FIFO overran since the last look.
+    #[cold]
+    #[inline(never)]
     pub fn overrun(&mut self, traffic: &impl Traffic) {
         let waiting = traffic.pending().min(DEPTH);
         self.marks |= match self.since {

@@ -39,6 +39,7 @@ pub const CALLS_PER_TICK: usize = 4;
 const ALARM_AHEAD_TICKS: u64 = 1 << 30;
 
 /// How far draining a FIFO has got.
+#[derive(Clone, Copy)]
 struct Drain {
     /// Frames and overrun as just seen, and not handled yet.
     look: Option<(u8, bool)>,

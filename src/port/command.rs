@@ -608,9 +608,7 @@ const fn parse(text: &str) -> u16 {
 
 fn begin_close<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, N>) {
     // Two locks: each takes a while.
-    board.with_capture(|capture, traffic, clock| {
-        capture.drain_last(channel, &mut traffic[channel.index()], clock);
-    });
+    board.with_capture(|capture, _, clock| capture.end_entries(channel, clock));
     board.with_capture(|capture, traffic, clock| {
         capture.begin_close(channel, &mut traffic[channel.index()], clock);
     });

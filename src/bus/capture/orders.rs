@@ -58,19 +58,20 @@ impl<'q, const N: usize> Capture<'q, N> {
         self.recorder.event(&lost, now);
     }
 
-    /// First part of closing: drains the FIFO for the last time before the channel has left. The channel is still on the bus.
-    /// [`Self::begin_close`] follows, with a lock of its own.
-    pub fn drain_last(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) {
-        self.drain_late(channel, traffic, clock);
-        self.channels[channel.index()].closing = true;
+    /// First part of closing: periodic frames and replies end. [`Self::begin_close`] follows, under a lock of its own.
+    pub fn end_entries(&mut self, channel: Channel, clock: &impl Clock) {
+        let now = self.now(clock);
+        self.channels[channel.index()].transmitter.clear_entries(now);
     }
 
-    /// Second part of closing: aborts transmissions. The channel is still on the bus.
+    /// Second part of closing: drains the FIFO for the last time before the channel has left, and aborts transmissions. The channel is still
+    /// on the bus.
     pub fn begin_close(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) {
+        self.drain_late(channel, traffic, clock);
         let now = self.now(clock);
         let state = &mut self.channels[channel.index()];
+        state.closing = true;
         state.abort_reason = TransmitFailure::Closed;
-        state.transmitter.clear_entries(now);
         state.transmitter.drop_all(TransmitFailure::Closed, traffic);
         state.transmitter.on_finished(traffic, &mut self.recorder, now, state.abort_reason);
     }

@@ -194,7 +194,8 @@ def break_some(folder: Path) -> dict[str, tuple[str, int | None]]:
     # Databases that cannot be used, or are another vehicle's, cost signals only.
     put("baddb/drive.log", text.encode(), "undecoded", len(frames))
     put("wrongdb/drive.log", text.encode(), "undecoded", len(frames))
-    cut = "".join(lines[:100]).encode() + lines[100].encode()[:22]
+    whole_lines = text.splitlines(keepends=True)
+    cut = "".join(whole_lines[:100]).encode() + whole_lines[100].encode()[:22]
     put("wrongdb/cut.log", cut, "cut", 100)
     # Opening it waits for somebody to write.
     os.mkfifo(folder / "odd" / "hangs.log")

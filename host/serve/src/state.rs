@@ -79,6 +79,8 @@ impl Table {
 pub struct Entries {
     periodic: BTreeMap<u8, (ClientId, u8)>,
     triggers: BTreeMap<u8, (ClientId, u8)>,
+    /// Whose an entry was that is free again, by its first tag and its number: its last frames may be confirmed after it is cleared.
+    former: BTreeMap<(u32, u8), (ClientId, u8)>,
 }
 
 impl Entries {
@@ -107,7 +109,9 @@ impl Entries {
     }
 
     pub fn free(&mut self, table: Table, entry: u8) {
-        self.table(table).remove(&entry);
+        if let Some(owner) = self.table(table).remove(&entry) {
+            self.former.insert((table.tag(), entry), owner);
+        }
     }
 
     /// Every entry of a client, with its own number for it.
@@ -127,7 +131,8 @@ impl Entries {
         } else {
             (Table::Periodic, &self.periodic)
         };
-        let (client, slot) = entries.get(&u8::try_from(tag - table.tag()).ok()?)?;
+        let entry = u8::try_from(tag - table.tag()).ok()?;
+        let (client, slot) = entries.get(&entry).or_else(|| self.former.get(&(table.tag(), entry)))?;
         Some(Owner { client: *client, tag: table.tag() + u32::from(*slot) })
     }
 

@@ -19,6 +19,14 @@ pub fn links() -> Result<()> {
     again("links")
 }
 
+/// The public face of each published library against its file.
+pub fn public_api() -> Result<()> {
+    #[cfg(feature = "check")]
+    return crate::public_api::check();
+    #[cfg(not(feature = "check"))]
+    again("public-api")
+}
+
 #[cfg(not(feature = "check"))]
 fn again(task: &str) -> Result<()> {
     let shell = crate::workspace::shell()?;

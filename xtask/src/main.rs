@@ -1,4 +1,4 @@
-//! The project's own build steps: `cargo xtask firmware | test | ci | kernel | circles | links | size | bench | soak | dist`.
+//! The project's own build steps: `cargo xtask firmware | test | ci | kernel | circles | links | public-api | size | bench | soak | dist`.
 //!
 //! Kept light, because `cargo fw` builds it first: what only measurements and checks need is optional, behind
 //! features.
@@ -26,6 +26,8 @@ mod mutants;
 mod outcome;
 mod package;
 mod peers;
+#[cfg(feature = "check")]
+mod public_api;
 mod python;
 mod reproducible;
 mod size;
@@ -63,6 +65,8 @@ enum Task {
     Circles,
     /// Finds broken links in the pages, and files named there that do not exist.
     Links,
+    /// Compares the public items of each published library with its `public-api.txt`.
+    PublicApi,
     /// Prints each board's flash and static RAM, and fails past `size-budget.toml`.
     Size,
     /// Measures speed and size.
@@ -81,6 +85,7 @@ fn main() -> ExitCode {
         Task::Kernel(args) => kernel::main(&args),
         Task::Circles => check::circles(),
         Task::Links => check::links(),
+        Task::PublicApi => check::public_api(),
         Task::Size => size::run(&board::Board::ALL),
         Task::Bench(args) => bench::run(&args),
         Task::Soak(args) => soak::run(&args),

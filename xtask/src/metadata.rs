@@ -29,12 +29,21 @@ pub struct Package {
     pub features: BTreeMap<String, Vec<String>>,
     /// Where its source is.
     pub manifest_path: PathBuf,
+    #[cfg_attr(not(feature = "check"), expect(dead_code, reason = "only the checks ask for it"))]
+    targets: Vec<Target>,
     /// Empty if it must not be published.
     publish: Option<Vec<String>>,
     /// Where it comes from; nothing for our own.
     pub source: Option<String>,
     /// Its page.
     pub repository: Option<String>,
+}
+
+/// What a package compiles to.
+#[derive(Deserialize)]
+struct Target {
+    kind: Vec<String>,
+    name: String,
 }
 
 impl Metadata {
@@ -56,6 +65,13 @@ impl Metadata {
 }
 
 impl Package {
+    /// The name of its library, if it has one.
+    #[cfg(feature = "check")]
+    pub fn library(&self) -> Option<&str> {
+        let target = self.targets.iter().find(|target| target.kind.iter().any(|kind| kind == "lib"))?;
+        Some(&target.name)
+    }
+
     /// Whether it can be published.
     pub fn is_published(&self) -> bool {
         self.publish.as_ref().is_none_or(|registries| !registries.is_empty())

@@ -39,6 +39,8 @@ pub enum Step {
     Fuzz,
     /// The documentation of public items, with every link checked.
     Doc,
+    /// The public items of each published library against its `public-api.txt`.
+    PublicApi,
     /// The libraries without ports and threads compile for WebAssembly.
     Wasm,
     /// Windows and macOS, as far as they can be checked here.
@@ -93,6 +95,7 @@ impl Step {
                     .env("RUSTDOCFLAGS", "-D warnings")
                     .run()?;
             }
+            Step::PublicApi => check::public_api()?,
             Step::Wasm => return cross::check(shell, machine.chip()?.ok(), cross::WASM),
             Step::Systems => return cross::check(shell, machine.chip()?.ok(), cross::SYSTEMS),
             Step::ClippyFirmware => return with_chip(machine, |chip| firmware::clippy(shell, chip)),

@@ -27,7 +27,7 @@ const GROUPS: [(&str, &[&str]); 7] = [
     ("Look at a bus or a trace", &["monitor", "stats", "autobaud"]),
     ("Record, convert", &["capture", "convert", "align"]),
     ("Understand", &["decode", "search", "conversations", "plot", "diff", "db", "bits", "timing"]),
-    ("Send, ask", &["send", "replay", "gen", "obd", "uds", "canopen", "j1939"]),
+    ("Send, ask", &["send", "replay", "gen", "run", "obd", "uds", "canopen", "j1939"]),
     (
         "Devices",
         &["list", "info", "status", "defaults", "selftest", "identify", "reset", "update", "virtual", "demo"],

@@ -26,6 +26,7 @@ pub mod monitor;
 pub mod obd;
 pub mod plot;
 pub mod replay;
+pub mod run;
 pub mod search;
 pub mod selftest;
 pub mod send;
@@ -112,6 +113,8 @@ pub enum Command {
     Gen(r#gen::Args),
     /// Play a trace on a bus with its original timing.
     Replay(Box<replay::Args>),
+    /// Run nodes and tests as scripts: on simulated buses, or on a device.
+    Run(Box<run::Args>),
     /// Blink a device's LEDs, to find it among others.
     Identify(care::Identify),
     /// Restart a device's firmware.
@@ -161,6 +164,7 @@ impl Command {
             Self::Send(args) => send::run(&args),
             Self::Gen(args) => r#gen::run(&args),
             Self::Replay(args) => replay::run(&args),
+            Self::Run(args) => run::run(&args),
             Self::Identify(args) => care::identify(&args),
             Self::Reset(args) => care::reset(&args),
             Self::Update(args) => update::run(&args),

@@ -45,6 +45,7 @@ mod port;
 mod protocols;
 mod python_can;
 mod schema;
+mod scripts;
 mod search_and_diff;
 mod selftest;
 mod send_signals;

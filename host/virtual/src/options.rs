@@ -243,8 +243,8 @@ impl Options {
         if self.car { nodes::bitrate_in_car(channel) } else { self.bitrate_bps }
     }
 
-    /// A channel's bus.
-    pub(super) fn bus(&mut self, channel: usize) -> SimBus {
+    /// A channel's bus, with what these options put on it. A log is handed to the first bus that is made.
+    pub fn bus(&mut self, channel: usize) -> SimBus {
         let log = self.log.as_mut().map(|log| std::mem::take(&mut log[channel]));
         let schedule = match (log, self.burst) {
             _ if !self.traffic_on[channel] => Schedule::Silent,

@@ -1,0 +1,263 @@
+//! `cantap run`: nodes and tests as scripts.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use cantap::wire::message::Mode;
+use cantap::{Channel, TraceRecord};
+use cantap_address::Address;
+use cantap_formats::WriteOptions;
+use cantap_scripts::{Bench, Live, Message, Outcome, Report, Script, TestResult};
+use cantap_trace::clean;
+use cantap_virtual::Options;
+use cantap_work::{interrupt, rounded};
+use serde_json::{Value, json};
+
+use crate::args;
+use crate::channel_args::ChannelArgs;
+use crate::channel_bitrate::ChannelBitrate;
+use crate::completion;
+use crate::databases::DatabaseArgs;
+use crate::trace_output::{TraceOutput, refuse_older};
+use crate::wrong::wrong;
+
+/// How long a simulated run takes if nothing else ends it.
+const SIMULATED: Duration = Duration::from_secs(60);
+/// The bit rate of simulated buses that nothing else fixes.
+const SIMULATED_BPS: u32 = 500_000;
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(
+    after_help = "Each script is a node; several are several nodes on one bus. Without -d the buses are simulated, as fast as the computer can, and a \
+                  run with the same scripts and seed is the same to the bit. With -d they are real: the device then acknowledges, and sends what \
+                  the scripts send.\n\n\
+                  A function whose name begins with test_ is a test; the run ends with the last one, and with exit code 1 if one fails. Without \
+                  tests it ends with --for (60 s if simulated), or when no script has anything left to do. The language and its functions: \
+                  docs/scripts.md.\n\n\
+                  Examples:\n  cantap run node.rhai tester.rhai --junit report.xml\n  \
+                  cantap run tester.rhai --bus car --for 2h -o drive.log\n  \
+                  cantap run tester.rhai -d /dev/ttyACM0 -b 500k --db car.dbc"
+)]
+pub struct Args {
+    /// The scripts.
+    #[arg(value_name = "FILE", required = true)]
+    scripts: Vec<PathBuf>,
+    /// Where the device is: a serial port, or virtual. Without it, the buses are simulated.
+    #[arg(short, long, add = completion::devices())]
+    device: Option<Address>,
+    /// What else is on the simulated buses, as in a virtual device's address: car, canopen, load=20, errors=1.
+    #[arg(long, value_name = "OPTIONS", default_value = "load=0", conflicts_with = "device")]
+    bus: Options,
+    #[command(flatten)]
+    open: ChannelArgs,
+    #[command(flatten)]
+    databases: DatabaseArgs,
+    /// End after this time, of the bus.
+    #[arg(long = "for", value_name = "TIME", value_parser = args::duration)]
+    duration: Option<Duration>,
+    /// Select other random numbers.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Write the results of the tests as JUnit's XML.
+    #[arg(long, value_name = "FILE")]
+    junit: Option<PathBuf>,
+    /// Write the frames of the buses as a trace; its name's suffix says the format.
+    #[arg(short, long, value_name = "FILE")]
+    output: Option<PathBuf>,
+    /// Overwrite an existing trace.
+    #[arg(long, requires = "output")]
+    force: bool,
+    /// Print one JSON object per line: what scripts log, tests, and a summary.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let scripts: Vec<Script> = args.scripts.iter().map(|path| read(path)).collect::<anyhow::Result<_>>()?;
+    let given: Vec<&Address> = args.device.iter().collect();
+    let databases = args.databases.or_of(given);
+    let decoder = Arc::new(databases.load(false, args.json)?);
+    if let Some(path) = &args.output {
+        refuse_older(path, args.force)?;
+    }
+    interrupt::watch()?;
+    let mut trace = match &args.output {
+        Some(path) => Some(TraceOutput::create(path, &WriteOptions::default(), args.device.is_some())?),
+        None => None,
+    };
+    let mut failed = None;
+    let mut on_record = |record: TraceRecord| {
+        if failed.is_none()
+            && let Some(trace) = &mut trace
+        {
+            failed = trace.write(&record).err();
+        }
+    };
+    let mut on_message = |message: Message| tell(&message, args.json);
+    let mut goes_on = || !interrupt::requested();
+    let report = match &args.device {
+        None => {
+            let bench = args.bench(decoder)?;
+            bench.run(&scripts, &mut on_record, &mut on_message, &mut goes_on)?
+        }
+        Some(address) => {
+            let device = address.open()?;
+            args.open.open(&device, args.channels(&device)?.into_iter(), Mode::Normal, None)?;
+            let live = Live { decoder, seed: args.seed, duration: args.duration };
+            let result = live.run(&device, &scripts, &mut on_record, &mut on_message, &mut goes_on);
+            if result.is_ok() {
+                device.stop()?;
+            }
+            result?
+        }
+    };
+    if let Some(error) = failed {
+        return Err(error);
+    }
+    trace.map(TraceOutput::finish).transpose()?;
+    if let Some(path) = &args.junit {
+        std::fs::write(path, report.junit()).with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    print(&report, args.json)?;
+    if interrupt::requested() {
+        bail!("ended before the scripts were done");
+    }
+    Ok(if report.is_success() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+impl Args {
+    fn bench(&self, decoder: Arc<cantap_signals::Decoder>) -> anyhow::Result<Bench> {
+        let rates = &self.open.timing.bitrates;
+        let bitrates_bps = [1, 2].map(|channel| ChannelBitrate::of(rates, channel).unwrap_or(SIMULATED_BPS));
+        let duration_ns = self.duration.unwrap_or(SIMULATED).as_nanos();
+        let duration_ns = u64::try_from(duration_ns)
+            .ok()
+            .filter(|duration_ns| i64::try_from(*duration_ns).is_ok())
+            .ok_or_else(|| wrong("--for is longer than the 292 years that times can hold"))?;
+        Ok(Bench { options: self.bus.clone(), bitrates_bps, decoder, seed: self.seed, duration_ns })
+    }
+
+    /// The channels to open: those with a bit rate of their own; with one for all, or none, the first.
+    fn channels(&self, device: &cantap_address::OpenDevice) -> anyhow::Result<Vec<Channel>> {
+        let rates = &self.open.timing.bitrates;
+        let own: Vec<Channel> = Channel::ALL
+            .into_iter()
+            .filter(|channel| rates.iter().any(|rate| rate.channel == Some(channel.number())))
+            .filter(|channel| channel.number() <= device.hello().channels)
+            .collect();
+        Ok(if own.is_empty() { vec![Channel::Can1] } else { own })
+    }
+}
+
+fn read(path: &Path) -> anyhow::Result<Script> {
+    let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let source = String::from_utf8(bytes)
+        .map_err(|_| wrong(format!("{} is no script: it is not text in UTF-8", path.display())))?;
+    Ok(Script { name: path.display().to_string(), source })
+}
+
+/// Prints what a script logs, at once.
+fn tell(message: &Message, json: bool) {
+    let Message { at_ns, script, text } = message;
+    let seconds = *at_ns as f64 / 1e9;
+    let mut out = std::io::stdout().lock();
+    // Whoever does not read any more wants no more lines; the run goes on for its tests.
+    let _ = if json {
+        writeln!(
+            out,
+            "{}",
+            json!({ "event": "log", "time_s": rounded(seconds, 9), "script": script, "text": text })
+        )
+    } else {
+        writeln!(out, "{seconds:12.6} {}: {}", clean::line(script), clean::lines(text))
+    };
+}
+
+fn print(report: &Report, as_json: bool) -> anyhow::Result<()> {
+    let mut out = std::io::stdout().lock();
+    for test in &report.tests {
+        if as_json {
+            writeln!(out, "{}", object(test))?;
+        } else {
+            describe(&mut out, test)?;
+        }
+    }
+    for (script, error) in &report.errors {
+        if as_json {
+            writeln!(out, "{}", json!({ "event": "error", "script": script, "error": error }))?;
+        } else {
+            writeln!(out, "ERROR  {}: {}", clean::line(script), clean::lines(error))?;
+        }
+    }
+    let seconds = report.duration_ns as f64 / 1e9;
+    let failed = report.failed().count();
+    if as_json {
+        let summary = json!({
+            "event": "summary",
+            "tests": report.tests.len(),
+            "failed": failed,
+            "errors": report.errors.len(),
+            "seconds": rounded(seconds, 9),
+            "frames_sent": report.frames_sent,
+            "frames_received": report.frames_received,
+            "frames_not_sent": report.frames_not_sent,
+            "frames_lost": report.frames_lost,
+        });
+        writeln!(out, "{summary}")?;
+    } else {
+        let passed = report.tests.len() - failed;
+        writeln!(
+            out,
+            "{passed} passed, {failed} failed, {} scripts ended with an error; {seconds:.3} s, {} frames sent, {} received",
+            report.errors.len(),
+            report.frames_sent,
+            report.frames_received
+        )?;
+        if report.frames_not_sent > 0 {
+            writeln!(
+                out,
+                "{} frames were not sent: nobody acknowledged them, or the run ended first",
+                report.frames_not_sent
+            )?;
+        }
+        if report.frames_lost > 0 {
+            writeln!(out, "at least {} frames were lost; the scripts did not see them", report.frames_lost)?;
+        }
+    }
+    Ok(out.flush()?)
+}
+
+fn describe(out: &mut impl Write, test: &TestResult) -> std::io::Result<()> {
+    let milliseconds = (test.ended_ns - test.began_ns) as f64 / 1e6;
+    let name = format!("{}: {}", clean::line(&test.script), clean::line(&test.name));
+    match &test.outcome {
+        Outcome::Passed => writeln!(out, "ok     {name} ({milliseconds:.3} ms)"),
+        Outcome::Failed(reason) => {
+            writeln!(out, "FAILED {name} ({milliseconds:.3} ms): {}", clean::lines(reason))?;
+            test.trace.iter().try_for_each(|line| writeln!(out, "       {line}"))
+        }
+    }
+}
+
+fn object(test: &TestResult) -> Value {
+    let reason = match &test.outcome {
+        Outcome::Passed => None,
+        Outcome::Failed(reason) => Some(reason),
+    };
+    json!({
+        "event": "test",
+        "script": test.script,
+        "test": test.name,
+        "passed": reason.is_none(),
+        "reason": reason,
+        "begin_s": rounded(test.began_ns as f64 / 1e9, 9),
+        "end_s": rounded(test.ended_ns as f64 / 1e9, 9),
+        "frames": test.trace,
+    })
+}

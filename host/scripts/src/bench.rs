@@ -1,0 +1,313 @@
+//! Scripts as nodes on simulated buses, in simulated time.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+use cantap_can::{BusErrorKind, CHANNELS, Channel, Frame};
+use cantap_signals::Decoder;
+use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use cantap_virtual::Options;
+use cantap_virtual::simbus::{Node as BusNode, SimBus};
+
+use crate::exchange::{Input, Output};
+use crate::node::{Node, Script, ScriptError};
+use crate::report::{Message, Report};
+use crate::results::{Results, is_over};
+
+/// How long frames that are under way at the end may take to be on the bus.
+const FAREWELL_NS: u64 = 100_000_000;
+/// "Never", for times.
+const NEVER: u64 = u64::MAX;
+
+/// What a run on simulated buses needs.
+#[derive(Clone, Debug)]
+pub struct Bench {
+    /// What else is on the buses, as in the address of a virtual device: `load=0` for nothing, `car` for a vehicle.
+    pub options: Options,
+    /// The bit rates of the buses, in bit/s, where the options do not fix them.
+    pub bitrates_bps: [u32; CHANNELS],
+    /// The databases for messages and signals.
+    pub decoder: Arc<Decoder>,
+    /// Selects another sequence of random numbers; each script has its own.
+    pub seed: u64,
+    /// When the run ends, in nanoseconds of simulated time; scripts with tests end it earlier.
+    pub duration_ns: u64,
+}
+
+impl Bench {
+    /// Runs scripts until the tests are done, all scripts have ended, or the time is up. Each frame on a bus goes to `on_record`, each line that a
+    /// script logs to `on_message`, when `goes_on` returns false the run ends.
+    ///
+    /// The same scripts, options and seed give the same frames at the same times.
+    ///
+    /// # Errors
+    /// If a script is not in the language; what goes wrong later is in the report.
+    pub fn run(
+        &self,
+        scripts: &[Script],
+        on_record: &mut dyn FnMut(TraceRecord),
+        on_message: &mut dyn FnMut(Message),
+        goes_on: &mut dyn FnMut() -> bool,
+    ) -> Result<Report, ScriptError> {
+        if scripts.is_empty() {
+            return Err(ScriptError::None);
+        }
+        let seeds = (1..).map(|number: u64| self.seed.wrapping_mul(0x9E37_79B9).wrapping_add(number));
+        let nodes: Result<Vec<Node>, _> = scripts
+            .iter()
+            .zip(seeds)
+            .map(|(script, seed)| Node::start(script, &self.decoder, seed))
+            .collect();
+        let mut options = self.options.clone();
+        let buses = [0, 1].map(|channel| {
+            let bitrate_bps = options.bitrate_of_bus(channel).unwrap_or(self.bitrates_bps[channel]);
+            Wire {
+                bus: options.bus(channel),
+                nodes: scripts.iter().map(|_| Attached::new(bitrate_bps)).collect(),
+                witness: Attached::new(bitrate_bps),
+            }
+        });
+        let mut run = Run {
+            nodes: nodes?,
+            buses,
+            repeats: Vec::new(),
+            results: Results::new(on_message),
+            on_record,
+            now_ns: 0,
+        };
+        while run.now_ns < self.duration_ns && !is_over(&run.nodes) && goes_on() {
+            if !run.step(self.duration_ns) {
+                break;
+            }
+        }
+        let until_ns = run.now_ns + FAREWELL_NS;
+        while is_over(&run.nodes)
+            && run.is_sending()
+            && goes_on()
+            && run.step(until_ns)
+            && run.now_ns < until_ns
+        {}
+        Ok(run.finish())
+    }
+}
+
+/// A frame that is sent again and again.
+struct Repeat {
+    node: usize,
+    handle: u32,
+    channel: Channel,
+    frame: Frame,
+    period_ns: u64,
+    due_ns: u64,
+}
+
+/// A bus with the scripts' controllers on it, and one that only watches.
+struct Wire {
+    bus: SimBus,
+    nodes: Vec<Attached>,
+    witness: Attached,
+}
+
+impl Wire {
+    fn with<R>(&mut self, act: impl FnOnce(&mut SimBus, &mut [&mut dyn BusNode]) -> R) -> R {
+        let Self { bus, nodes, witness } = self;
+        let mut all: Vec<&mut dyn BusNode> = nodes.iter_mut().map(|node| node as &mut dyn BusNode).collect();
+        all.push(witness);
+        act(bus, &mut all)
+    }
+}
+
+/// A script's controller on one bus.
+struct Attached {
+    bitrate_bps: u32,
+    to_send: VecDeque<Frame>,
+    received: Vec<(Frame, bool)>,
+    errors: Vec<BusErrorKind>,
+}
+
+impl Attached {
+    const fn new(bitrate_bps: u32) -> Self {
+        Self { bitrate_bps, to_send: VecDeque::new(), received: Vec::new(), errors: Vec::new() }
+    }
+}
+
+impl BusNode for Attached {
+    fn bitrate_bps(&self) -> Option<u32> {
+        Some(self.bitrate_bps)
+    }
+
+    fn bid(&self) -> Option<Frame> {
+        self.to_send.front().copied()
+    }
+
+    fn acknowledges(&self) -> bool {
+        true
+    }
+
+    fn destroys(&self) -> bool {
+        false
+    }
+
+    fn on_start(&mut self) {}
+
+    fn on_lost(&mut self) {}
+
+    fn on_frame(&mut self, frame: &Frame, own: bool) {
+        if own {
+            self.to_send.pop_front();
+        }
+        self.received.push((*frame, own));
+    }
+
+    fn on_error(&mut self, kind: BusErrorKind, _own: bool) {
+        self.errors.push(kind);
+    }
+
+    fn on_boundary(&mut self) {}
+}
+
+/// A run.
+struct Run<'a> {
+    nodes: Vec<Node>,
+    buses: [Wire; CHANNELS],
+    repeats: Vec<Repeat>,
+    results: Results<'a>,
+    on_record: &'a mut dyn FnMut(TraceRecord),
+    now_ns: u64,
+}
+
+impl Run<'_> {
+    /// Does what is due next, and returns false if nothing will be.
+    fn step(&mut self, end_ns: u64) -> bool {
+        let now_ns = self.now_ns;
+        let of_scripts = self.nodes.iter().filter_map(|node| node.wake_ns).min().unwrap_or(NEVER);
+        let of_repeats = self.repeats.iter().map(|repeat| repeat.due_ns).min().unwrap_or(NEVER);
+        let mut next_ns = of_scripts.min(of_repeats);
+        for wire in &mut self.buses {
+            next_ns = next_ns.min(wire.with(|bus, nodes| bus.next_event_ns(now_ns, nodes)));
+        }
+        if next_ns == NEVER {
+            self.now_ns = end_ns;
+            return false;
+        }
+        if next_ns > end_ns {
+            self.now_ns = end_ns;
+            return true;
+        }
+        self.now_ns = next_ns.max(now_ns);
+        for channel in Channel::ALL {
+            self.pass(channel);
+        }
+        self.repeat();
+        self.wake();
+        true
+    }
+
+    /// Whether a frame of a script that has ended is not on the bus yet.
+    fn is_sending(&self) -> bool {
+        self.buses.iter().any(|wire| {
+            let ended = self.nodes.iter().zip(&wire.nodes).filter(|(node, _)| node.ended.is_some());
+            ended.into_iter().any(|(_, attached)| !attached.to_send.is_empty())
+        })
+    }
+
+    /// Lets a bus do what is due, and passes to the scripts what they received.
+    fn pass(&mut self, channel: Channel) {
+        let now_ns = self.now_ns;
+        let wire = &mut self.buses[channel.index()];
+        wire.with(|bus, nodes| bus.step(now_ns, nodes));
+        for (frame, _) in std::mem::take(&mut wire.witness.received) {
+            self.results.frame(now_ns, channel, frame);
+            let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };
+            (self.on_record)(TraceRecord { time_ns: now_ns as i64, channel: channel.number(), event });
+        }
+        for kind in std::mem::take(&mut wire.witness.errors) {
+            let event = TraceEvent::BusError { kind: Some(kind), counters: None };
+            (self.on_record)(TraceRecord { time_ns: now_ns as i64, channel: channel.number(), event });
+        }
+        for place in 0..self.nodes.len() {
+            let attached = &mut self.buses[channel.index()].nodes[place];
+            let (received, errors) =
+                (std::mem::take(&mut attached.received), std::mem::take(&mut attached.errors));
+            for (frame, own) in received {
+                let report = &mut self.results.report;
+                let input = if own {
+                    report.frames_sent += 1;
+                    Input::Sent { channel }
+                } else {
+                    report.frames_received += 1;
+                    Input::Frame { channel, frame }
+                };
+                self.resume(place, Some(input));
+            }
+            for kind in errors {
+                self.resume(place, Some(Input::Error { channel, kind: Some(kind) }));
+            }
+        }
+    }
+
+    /// Queues the repeated frames that are due.
+    fn repeat(&mut self) {
+        for repeat in &mut self.repeats {
+            if repeat.due_ns <= self.now_ns {
+                repeat.due_ns += repeat.period_ns;
+                self.buses[repeat.channel.index()].nodes[repeat.node].to_send.push_back(repeat.frame);
+            }
+        }
+    }
+
+    /// Wakes the scripts whose time has come.
+    fn wake(&mut self) {
+        for place in 0..self.nodes.len() {
+            if self.nodes[place].wake_ns.is_some_and(|wake_ns| wake_ns <= self.now_ns) {
+                self.resume(place, None);
+            }
+        }
+    }
+
+    /// A script's turn.
+    fn resume(&mut self, place: usize, input: Option<Input>) {
+        let node = &mut self.nodes[place];
+        let outputs = node.resume(self.now_ns, input);
+        let name = node.name.clone();
+        let has_ended = node.ended.is_some();
+        for output in outputs {
+            match self.results.take(&name, self.now_ns, output) {
+                Some(Output::Send { channel, frame }) => {
+                    self.buses[channel.index()].nodes[place].to_send.push_back(frame);
+                }
+                Some(Output::Repeat { handle, channel, frame, period_ns }) => {
+                    let known = self
+                        .repeats
+                        .iter_mut()
+                        .find(|repeat| (repeat.node, repeat.handle) == (place, handle));
+                    match known {
+                        Some(repeat) => repeat.frame = frame,
+                        None => self.repeats.push(Repeat {
+                            node: place,
+                            handle,
+                            channel,
+                            frame,
+                            period_ns,
+                            due_ns: self.now_ns,
+                        }),
+                    }
+                }
+                Some(Output::EndRepeat { handle }) => {
+                    self.repeats.retain(|repeat| (repeat.node, repeat.handle) != (place, handle));
+                }
+                Some(Output::Log(_) | Output::Test { .. }) | None => {}
+            }
+        }
+        if has_ended {
+            // A node that is gone sends nothing more.
+            self.repeats.retain(|repeat| repeat.node != place);
+        }
+    }
+
+    fn finish(mut self) -> Report {
+        let waiting = self.buses.iter().flat_map(|wire| &wire.nodes).map(|node| node.to_send.len() as u64);
+        self.results.report.frames_not_sent = waiting.sum();
+        self.results.finish(&self.nodes, self.now_ns)
+    }
+}

@@ -1,0 +1,380 @@
+//! The functions that scripts call.
+
+use std::rc::Rc;
+use std::time::Duration;
+
+use cantap_can::{Channel, Frame, Id};
+use cantap_protocols::active::exchange::{Answerer, Exchange, ResponseTiming};
+use cantap_protocols::active::transfer::TransferSettings;
+use cantap_protocols::iso_tp::Endpoint;
+use cantap_signals::encode;
+use cantap_trace::grammar::{self, IdPattern};
+use rhai::{Array, Blob, Dynamic, Engine, FnPtr, Map, NativeCallContext};
+
+use crate::exchange::Output;
+use crate::handlers::Selector;
+use crate::report::Outcome;
+use crate::runtime::{Result, Runtime};
+use crate::script_frame::ScriptFrame;
+
+/// A repetition that a script can change and end.
+#[derive(Clone, Copy, Debug)]
+struct Repetition {
+    handle: u32,
+    channel: Channel,
+    frame: Frame,
+    period_ns: u64,
+}
+
+/// Something that a script reacts to, and can end.
+#[derive(Clone, Copy, Debug)]
+struct Handle(u32);
+
+/// Makes everything known to an engine.
+pub fn register(engine: &mut Engine, runtime: &Rc<Runtime>) {
+    crate::script_frame::register(engine);
+    engine.register_type_with_name::<Repetition>("Repetition").register_type_with_name::<Handle>("Handle");
+    sending(engine, runtime);
+    reacting(engine, runtime);
+    waiting(engine, runtime);
+    values(engine, runtime);
+    verdicts(engine, runtime);
+}
+
+fn sending(engine: &mut Engine, runtime: &Rc<Runtime>) {
+    let frame_of = |text: &str| ScriptFrame::parse(text).map_err(Into::into);
+    engine.register_fn("frame", move |text: &str| -> Result<ScriptFrame> { frame_of(text) });
+    engine.register_fn("frame", |id: i64, data: Blob| make_frame(id, &data));
+    engine.register_fn("frame", |id: i64, data: Array| make_frame(id, &bytes_of(&data)?));
+
+    let send = {
+        let runtime = Rc::clone(runtime);
+        move |channel: i64, frame: Frame| -> Result<()> {
+            runtime.output(Output::Send { channel: channel_of(channel)?, frame })
+        }
+    };
+    let one = send.clone();
+    engine.register_fn("send", move |text: &str| one(1, ScriptFrame::parse(text)?.frame));
+    let one = send.clone();
+    engine.register_fn("send", move |channel: i64, text: &str| one(channel, ScriptFrame::parse(text)?.frame));
+    let one = send.clone();
+    engine.register_fn("send", move |frame: ScriptFrame| one(1, frame.frame));
+    let one = send.clone();
+    engine.register_fn("send", move |channel: i64, frame: ScriptFrame| one(channel, frame.frame));
+
+    let of = Rc::clone(runtime);
+    let message_frame = move |channel: i64, name: &str, signals: &Map| -> Result<Frame> {
+        encoded(&of, channel, name, signals)
+    };
+    let make = message_frame.clone();
+    engine.register_fn("message", move |name: &str, signals: Map| -> Result<ScriptFrame> {
+        Ok(ScriptFrame::new(make(1, name, &signals)?))
+    });
+    let (make, one) = (message_frame.clone(), send.clone());
+    engine.register_fn("send", move |name: &str, signals: Map| one(1, make(1, name, &signals)?));
+    engine.register_fn("send", move |channel: i64, name: &str, signals: Map| {
+        send(channel, message_frame(channel, name, &signals)?)
+    });
+
+    let repeat = {
+        let runtime = Rc::clone(runtime);
+        move |channel: i64, frame: Frame, period: &str| -> Result<Repetition> {
+            let handle = runtime.with_handlers(super::handlers::Handlers::new_handle);
+            let period_ns = positive_ns(period)?;
+            let repetition = Repetition { handle, channel: channel_of(channel)?, frame, period_ns };
+            runtime.output(repetition.output())?;
+            Ok(repetition)
+        }
+    };
+    let every = repeat.clone();
+    engine.register_fn("periodic", move |text: &str, period: &str| {
+        every(1, ScriptFrame::parse(text)?.frame, period)
+    });
+    let every = repeat.clone();
+    engine.register_fn("periodic", move |frame: ScriptFrame, period: &str| every(1, frame.frame, period));
+    engine.register_fn("periodic", move |channel: i64, frame: ScriptFrame, period: &str| {
+        repeat(channel, frame.frame, period)
+    });
+    let of = Rc::clone(runtime);
+    engine.register_fn("change", move |repetition: &mut Repetition, frame: ScriptFrame| {
+        repetition.frame = frame.frame;
+        of.output(repetition.output())
+    });
+    let of = Rc::clone(runtime);
+    engine.register_fn("stop", move |repetition: Repetition| {
+        of.output(Output::EndRepeat { handle: repetition.handle })
+    });
+}
+
+fn reacting(engine: &mut Engine, runtime: &Rc<Runtime>) {
+    let of = Rc::clone(runtime);
+    engine.register_fn("on_frame", move |ids: &str, call: FnPtr| -> Result<Handle> {
+        let selector = selector(&of, ids)?;
+        Ok(Handle(of.with_handlers(|handlers| handlers.on_frame(selector, call))))
+    });
+    let of = Rc::clone(runtime);
+    engine.register_fn("on_frame", move |call: FnPtr| {
+        Handle(of.with_handlers(|handlers| handlers.on_frame(Selector::All, call)))
+    });
+    let of = Rc::clone(runtime);
+    engine.register_fn("on_message", move |name: &str, call: FnPtr| -> Result<Handle> {
+        let selector = message_selector(&of, name)?;
+        Ok(Handle(of.with_handlers(|handlers| handlers.on_frame(selector, call))))
+    });
+    let of = Rc::clone(runtime);
+    engine.register_fn("on_error", move |call: FnPtr| of.with_handlers(|handlers| handlers.on_error(call)));
+    let of = Rc::clone(runtime);
+    engine.register_fn("on_state", move |call: FnPtr| of.with_handlers(|handlers| handlers.on_state(call)));
+    let of = Rc::clone(runtime);
+    engine.register_fn("every", move |period: &str, call: FnPtr| -> Result<Handle> {
+        let period_ns = positive_ns(period)?;
+        let due_ns = of.now_ns() + period_ns;
+        Ok(Handle(of.with_handlers(|handlers| handlers.at(due_ns, Some(period_ns), call))))
+    });
+    let of = Rc::clone(runtime);
+    engine.register_fn("after", move |delay: &str, call: FnPtr| -> Result<Handle> {
+        let due_ns = of.now_ns() + ns(delay)?;
+        Ok(Handle(of.with_handlers(|handlers| handlers.at(due_ns, None, call))))
+    });
+    let of = Rc::clone(runtime);
+    engine.register_fn("stop", move |handle: Handle| of.with_handlers(|handlers| handlers.end(handle.0)));
+}
+
+fn waiting(engine: &mut Engine, runtime: &Rc<Runtime>) {
+    let of = Rc::clone(runtime);
+    engine.register_fn("now", move || of.now_ns() as f64 / 1e9);
+    let of = Rc::clone(runtime);
+    engine.register_fn("wait", move |context: NativeCallContext<'_>, delay: &str| {
+        of.wait(&context, of.now_ns() + ns(delay)?)
+    });
+    let of = Rc::clone(runtime);
+    engine.register_fn("wait_for", move |context: NativeCallContext<'_>, ids: &str, within: &str| {
+        let found = of.wait_for(&context, of.now_ns() + ns(within)?, &selector(&of, ids)?)?;
+        Ok::<Dynamic, Box<rhai::EvalAltResult>>(found.map_or(Dynamic::UNIT, Dynamic::from))
+    });
+    let of = Rc::clone(runtime);
+    engine.register_fn("expect", move |context: NativeCallContext<'_>, ids: &str, within: &str| {
+        let found = of.wait_for(&context, of.now_ns() + ns(within)?, &selector(&of, ids)?)?;
+        let missing = || Box::<rhai::EvalAltResult>::from(format!("no frame {ids} within {within}"));
+        found.ok_or_else(missing)
+    });
+    let of = Rc::clone(runtime);
+    engine.register_fn(
+        "expect",
+        move |context: NativeCallContext<'_>,
+              ids: &str,
+              within: &str,
+              is_wanted: FnPtr|
+              -> Result<ScriptFrame> {
+            let until_ns = of.now_ns() + ns(within)?;
+            let selector = selector(&of, ids)?;
+            while let Some(frame) = of.wait_for(&context, until_ns, &selector)? {
+                if is_wanted.call_within_context::<bool>(&context, (frame,))? {
+                    return Ok(frame);
+                }
+            }
+            Err(format!("no frame {ids} of the kind that is expected within {within}").into())
+        },
+    );
+    let of = Rc::clone(runtime);
+    engine.register_fn("serve", move |context: NativeCallContext<'_>| of.serve(&context));
+    let of = Rc::clone(runtime);
+    engine.register_fn(
+        "request",
+        move |context: NativeCallContext<'_>, request: &str, response: &str, data: Array| -> Result<Blob> {
+            let ids = (grammar::identifier(request)?, grammar::identifier(response)?);
+            ask(&of, &context, ids, &bytes_of(&data)?)
+        },
+    );
+}
+
+fn values(engine: &mut Engine, runtime: &Rc<Runtime>) {
+    let of = Rc::clone(runtime);
+    engine.register_fn("signals", move |frame: ScriptFrame| of.decode(&frame));
+    let of = Rc::clone(runtime);
+    engine.register_fn("value", move |name: &str| -> Result<Dynamic> {
+        let (message, signal) = name.rsplit_once('.').ok_or("write it as Message.Signal")?;
+        let found = of.decoder.messages().find(|(_, _, candidate)| candidate.name == message);
+        let Some((_, _, found)) = found else { return Err(unknown_message(&of, message)) };
+        if !found.signals.iter().any(|candidate| candidate.label() == signal) {
+            return Err(format!("message {message} has no signal {signal}").into());
+        }
+        Ok(of.value(name).unwrap_or(Dynamic::UNIT))
+    });
+    let of = Rc::clone(runtime);
+    engine.register_fn("random", move |from: i64, to: i64| -> Result<i64> {
+        if from > to {
+            return Err(format!("random({from}, {to}): the first must not be larger than the second").into());
+        }
+        Ok(of.with_random(|random| random.i64(from..=to)))
+    });
+}
+
+fn verdicts(engine: &mut Engine, runtime: &Rc<Runtime>) {
+    let of = Rc::clone(runtime);
+    let log = move |text: &str| {
+        // Only frames can be refused.
+        let _ = of.output(Output::Log(text.to_owned()));
+    };
+    let print = log.clone();
+    engine.on_print(move |text| print(text));
+    let print = log.clone();
+    engine.on_debug(move |text, _, _| print(text));
+    let print = log.clone();
+    engine.register_fn("log", move |value: Dynamic| print(&value.to_string()));
+    // For a number, the language has a logarithm of this name.
+    engine.register_fn("log", move |value: f64| log(&value.to_string()));
+    engine.register_fn("fail", |reason: &str| -> Result<()> { Err(reason.into()) });
+    engine.register_fn("check", |is_so: bool, what: &str| -> Result<()> {
+        if is_so { Ok(()) } else { Err(format!("not so: {what}").into()) }
+    });
+    let of = Rc::clone(runtime);
+    engine.register_fn(
+        "run_test",
+        move |context: NativeCallContext<'_>, name: &str, steps: Array| -> Result<()> {
+            let began_ns = of.now_ns();
+            let mut outcome = Outcome::Passed;
+            for step in steps {
+                let call: FnPtr = step.try_cast().ok_or("a step of a test is a function")?;
+                // The last step tidies up: it runs whatever happened before.
+                let result = call.call_within_context::<Dynamic>(&context, ());
+                match result {
+                    Err(error) if is_final(&error) => return Err(error),
+                    Err(error) if outcome == Outcome::Passed => outcome = Outcome::Failed(describe(&error)),
+                    _ => {}
+                }
+            }
+            of.output(Output::Test { name: name.to_owned(), outcome, began_ns })
+        },
+    );
+}
+
+/// Whether nothing of a script may run after this.
+fn is_final(error: &rhai::EvalAltResult) -> bool {
+    match error {
+        rhai::EvalAltResult::ErrorTerminated(..) => true,
+        rhai::EvalAltResult::ErrorInFunctionCall(_, _, inner, _) => is_final(inner),
+        _ => false,
+    }
+}
+
+/// An error for people: its reason, and the line where it happened.
+pub fn describe(error: &rhai::EvalAltResult) -> String {
+    match error {
+        rhai::EvalAltResult::ErrorInFunctionCall(_, _, inner, _) => describe(inner),
+        rhai::EvalAltResult::ErrorTerminated(reason, at) => with_line(&reason.to_string(), *at),
+        rhai::EvalAltResult::ErrorRuntime(reason, at) => with_line(&reason.to_string(), *at),
+        other => other.to_string(),
+    }
+}
+
+fn with_line(reason: &str, at: rhai::Position) -> String {
+    at.line().map_or_else(|| reason.to_owned(), |line| format!("line {line}: {reason}"))
+}
+
+impl Repetition {
+    const fn output(self) -> Output {
+        let Self { handle, channel, frame, period_ns } = self;
+        Output::Repeat { handle, channel, frame, period_ns }
+    }
+}
+
+/// Asks a server over ISO-TP, as testers do; a negative response is an error.
+fn ask(
+    runtime: &Runtime,
+    context: &NativeCallContext<'_>,
+    (request, response): (Id, Id),
+    data: &[u8],
+) -> Result<Blob> {
+    if data.is_empty() {
+        return Err("a request has at least one byte".into());
+    }
+    let [to, from] = [request, response].map(|id| Endpoint { id, address: None });
+    let answerer = Answerer::One { from, flow_to: to };
+    let mut exchange =
+        Exchange::new(to, answerer, data.to_vec(), TransferSettings::default(), ResponseTiming::default());
+    runtime.run_client(context, Channel::Can1, &mut exchange)?;
+    let (answers, broken) = exchange.finish().map_err(|error| error.to_string())?;
+    if let Some((_, error)) = broken.first() {
+        return Err(format!("the response broke off: {error}").into());
+    }
+    let answer = answers.into_iter().next().ok_or("there was no response")?;
+    match answer.refusal() {
+        Some(code) => Err(format!("negative response {code:02X}").into()),
+        None => Ok(answer.data),
+    }
+}
+
+fn make_frame(id: i64, data: &[u8]) -> Result<ScriptFrame> {
+    let raw = u32::try_from(id).map_err(|_| format!("{id} is no identifier"))?;
+    let id = Id::standard(raw)
+        .or_else(|| Id::extended(raw))
+        .ok_or_else(|| format!("0x{raw:X} has more than 29 bits"))?;
+    let frame =
+        Frame::data_frame(id, data).ok_or_else(|| format!("{} bytes; a frame carries 8", data.len()))?;
+    Ok(ScriptFrame::new(frame))
+}
+
+fn bytes_of(values: &Array) -> Result<Vec<u8>> {
+    let byte = |value: &Dynamic| {
+        value
+            .as_int()
+            .ok()
+            .and_then(|value| u8::try_from(value).ok())
+            .ok_or_else(|| format!("{value} is no byte"))
+    };
+    values.iter().map(|value| byte(value).map_err(Into::into)).collect()
+}
+
+fn channel_of(number: i64) -> Result<Channel> {
+    let channel = u8::try_from(number).ok().and_then(Channel::from_number);
+    channel.ok_or_else(|| format!("there is no channel {number}; there are 1 and 2").into())
+}
+
+/// Identifiers in the grammar of every command, or a message's name.
+fn selector(runtime: &Runtime, text: &str) -> Result<Selector> {
+    match text.parse::<IdPattern>() {
+        Ok(ids) => Ok(Selector::Ids { channel: None, ids }),
+        Err(error) => message_selector(runtime, text).map_err(|_| error.to_string().into()),
+    }
+}
+
+fn message_selector(runtime: &Runtime, name: &str) -> Result<Selector> {
+    let found = runtime.decoder.messages().find(|(_, _, message)| message.name == name);
+    found.map(|(reference, _, _)| Selector::Message(reference)).ok_or_else(|| unknown_message(runtime, name))
+}
+
+fn unknown_message(runtime: &Runtime, name: &str) -> Box<rhai::EvalAltResult> {
+    if runtime.decoder.messages().next().is_none() {
+        return format!("there is no message {name}: give a database with --db").into();
+    }
+    // The database's own words for a name that is nearly one of its own.
+    match encode::encode(&runtime.decoder, None, name) {
+        Err(error) => error.to_string().into(),
+        Ok(_) => format!("there is no message {name}").into(),
+    }
+}
+
+/// A message's frame from values, or the texts of value tables.
+fn encoded(runtime: &Runtime, channel: i64, name: &str, signals: &Map) -> Result<Frame> {
+    let channel = channel_of(channel)?;
+    if runtime.decoder.messages().next().is_none() {
+        return Err(unknown_message(runtime, name));
+    }
+    let values: Vec<String> = signals.iter().map(|(signal, value)| format!("{signal}={value}")).collect();
+    let text = if values.is_empty() { name.to_owned() } else { format!("{name}:{}", values.join(",")) };
+    let encoded = encode::encode(&runtime.decoder, Some(channel.number()), &text);
+    encoded.map(|encoded| encoded.frame).map_err(|error| error.to_string().into())
+}
+
+fn ns(text: &str) -> Result<u64> {
+    grammar::duration(text).map(as_ns).map_err(Into::into)
+}
+
+fn positive_ns(text: &str) -> Result<u64> {
+    grammar::positive_duration(text).map(as_ns).map_err(Into::into)
+}
+
+fn as_ns(duration: Duration) -> u64 {
+    u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX / 2).min(u64::MAX / 2)
+}

@@ -1,0 +1,148 @@
+//! What a script does when something happens: its functions for frames, errors and times.
+
+use cantap_can::{BusErrorKind, Channel, ErrorState};
+use cantap_signals::MessageRef;
+use cantap_trace::grammar::IdPattern;
+use rhai::FnPtr;
+
+use crate::script_frame::ScriptFrame;
+
+/// Which frames a function is for.
+#[derive(Clone, Debug)]
+pub enum Selector {
+    /// Those with one of these identifiers, on one channel or on both.
+    Ids { channel: Option<Channel>, ids: IdPattern },
+    /// All frames.
+    All,
+    /// A message of the database.
+    Message(MessageRef),
+}
+
+impl Selector {
+    /// Whether it selects this frame, which is this message.
+    pub fn selects(&self, frame: &ScriptFrame, message: Option<MessageRef>) -> bool {
+        match self {
+            Self::All => true,
+            Self::Ids { channel, ids } => {
+                channel.is_none_or(|channel| channel == frame.channel) && ids.matches(frame.frame.id())
+            }
+            Self::Message(wanted) => message == Some(*wanted),
+        }
+    }
+}
+
+/// An error or a change of state, as scripts see it.
+#[derive(Clone, Copy, Debug)]
+pub enum BusEvent {
+    /// An error on the bus.
+    Error(Channel, Option<BusErrorKind>),
+    /// A controller's new state.
+    State(Channel, ErrorState),
+}
+
+/// A function that is called at a time, once or again and again.
+#[derive(Clone, Debug)]
+struct Timer {
+    due_ns: u64,
+    handle: u32,
+    period_ns: Option<u64>,
+    call: FnPtr,
+}
+
+/// Everything that a script wants to react to.
+#[derive(Debug, Default)]
+pub struct Handlers {
+    frames: Vec<(u32, Selector, FnPtr)>,
+    errors: Vec<FnPtr>,
+    states: Vec<FnPtr>,
+    timers: Vec<Timer>,
+    last_handle: u32,
+}
+
+impl Handlers {
+    /// A number that nothing else of this script has.
+    pub fn new_handle(&mut self) -> u32 {
+        self.last_handle += 1;
+        self.last_handle
+    }
+
+    /// Calls a function with each selected frame; returns its handle.
+    pub fn on_frame(&mut self, selector: Selector, call: FnPtr) -> u32 {
+        let handle = self.new_handle();
+        self.frames.push((handle, selector, call));
+        handle
+    }
+
+    /// Calls a function with each error.
+    pub fn on_error(&mut self, call: FnPtr) {
+        self.errors.push(call);
+    }
+
+    /// Calls a function with each change of a controller's state.
+    pub fn on_state(&mut self, call: FnPtr) {
+        self.states.push(call);
+    }
+
+    /// Calls a function at a time, then after each period if there is one; returns its handle.
+    pub fn at(&mut self, due_ns: u64, period_ns: Option<u64>, call: FnPtr) -> u32 {
+        let handle = self.new_handle();
+        self.timers.push(Timer { due_ns, handle, period_ns, call });
+        handle
+    }
+
+    /// Ends a timer or a frame's function.
+    pub fn end(&mut self, handle: u32) {
+        self.timers.retain(|timer| timer.handle != handle);
+        self.frames.retain(|(of, _, _)| *of != handle);
+    }
+
+    /// Whether there is no function for anything.
+    pub fn is_empty(&self) -> bool {
+        !self.has_frames() && !self.has_events() && self.timers.is_empty()
+    }
+
+    /// Whether there is a function for frames.
+    pub fn has_frames(&self) -> bool {
+        !self.frames.is_empty()
+    }
+
+    /// Whether there is a function for errors or states.
+    pub fn has_events(&self) -> bool {
+        !self.errors.is_empty() || !self.states.is_empty()
+    }
+
+    /// When the next timer is due.
+    pub fn next_due_ns(&self) -> Option<u64> {
+        self.timers.iter().map(|timer| timer.due_ns).min()
+    }
+
+    /// The function of the earliest timer that is due; it is due again after its period. Of two that are due at the same time, the older one
+    /// is first.
+    pub fn take_due(&mut self, now_ns: u64) -> Option<FnPtr> {
+        let due = (0..self.timers.len()).filter(|&place| self.timers[place].due_ns <= now_ns);
+        let place = due.min_by_key(|&place| (self.timers[place].due_ns, self.timers[place].handle))?;
+        let timer = &mut self.timers[place];
+        let call = timer.call.clone();
+        match timer.period_ns {
+            Some(period_ns) => timer.due_ns += period_ns,
+            None => {
+                self.timers.remove(place);
+            }
+        }
+        Some(call)
+    }
+
+    /// The functions for a frame.
+    pub fn for_frame(&self, frame: &ScriptFrame, message: Option<MessageRef>) -> Vec<(bool, FnPtr)> {
+        let selected = self.frames.iter().filter(|(_, selector, _)| selector.selects(frame, message));
+        selected.map(|(_, selector, call)| (matches!(selector, Selector::Message(_)), call.clone())).collect()
+    }
+
+    /// The functions for an error or a state.
+    pub fn for_event(&self, event: BusEvent) -> Vec<FnPtr> {
+        match event {
+            BusEvent::Error(..) => self.errors.clone(),
+            BusEvent::State(..) => self.states.clone(),
+        }
+    }
+}

@@ -1,0 +1,25 @@
+#![doc = include_str!("../README.md")]
+//!
+//! A [`Script`] is a node. [`Bench`] runs several on simulated buses, [`Live`] on a device; both return a [`Report`].
+//!
+//! Each script has a thread of its own, but only one runs at a time: it is given an input and the time, and hands over what it wants sent when it
+//! waits for the next input. So a run depends on nothing but its scripts, its seed and its bus.
+
+#![forbid(unsafe_code)]
+
+mod bench;
+mod exchange;
+mod functions;
+mod handlers;
+mod live;
+mod node;
+mod report;
+mod results;
+mod runtime;
+mod sandbox;
+mod script_frame;
+
+pub use bench::Bench;
+pub use live::{Live, LiveError};
+pub use node::{Script, ScriptError};
+pub use report::{Message, Outcome, Report, TestResult};

@@ -1,0 +1,208 @@
+//! A script, and the thread that it runs in.
+
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::thread::JoinHandle;
+
+use cantap_signals::Decoder;
+use rhai::{AST, Engine, Scope};
+
+use crate::exchange::{Input, Next, Output, Resume, Turn, Wanted};
+use crate::functions;
+use crate::runtime::{ENDED, Runtime};
+use crate::sandbox::{self, Operations};
+
+/// The stack of a script's thread: enough for the deepest calls that it may make, with functions of the bus in between, also without
+/// optimisation.
+const STACK_BYTES: usize = 64 << 20;
+/// The functions whose names begin so are tests.
+const TEST_PREFIX: &str = "test_";
+
+/// A node: its name and what it does.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Script {
+    /// Its name in reports, usually its file's.
+    pub name: String,
+    /// Its source.
+    pub source: String,
+}
+
+/// Why a script cannot run.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum ScriptError {
+    /// It is not in the language.
+    #[error("{name}: {reason}")]
+    Syntax {
+        /// The script.
+        name: String,
+        /// What is not, and where.
+        reason: String,
+    },
+    /// Nothing to run.
+    #[error("there is no script to run")]
+    None,
+    /// The system gives no thread.
+    #[error("{name}: cannot start: {reason}")]
+    Thread {
+        /// The script.
+        name: String,
+        /// Why not.
+        reason: String,
+    },
+}
+
+impl Script {
+    /// Its tests, in the order of its text.
+    ///
+    /// # Errors
+    /// If it is not in the language.
+    pub fn tests(&self) -> Result<Vec<String>, ScriptError> {
+        let engine = sandbox::engine(&Operations::default());
+        Ok(tests_of(&self.compile(&engine)?, &self.source))
+    }
+
+    fn compile(&self, engine: &Engine) -> Result<AST, ScriptError> {
+        let faulty = |error: rhai::ParseError| ScriptError::Syntax {
+            name: self.name.clone(),
+            reason: error.to_string(),
+        };
+        engine.compile(&self.source).map_err(faulty)
+    }
+}
+
+/// The tests of a script in the order of its text; the compiler keeps them in no order.
+fn tests_of(ast: &AST, source: &str) -> Vec<String> {
+    let functions = ast.iter_functions().filter(|function| function.params.is_empty());
+    let mut names: Vec<String> = functions
+        .map(|function| function.name.to_owned())
+        .filter(|name| name.starts_with(TEST_PREFIX))
+        .collect();
+    names.sort_by_key(|name| (source.find(&format!("fn {name}(")), name.clone()));
+    names
+}
+
+/// What follows a script's own text: its `on_start`, then its tests, each between `setup` and `teardown`, or else its functions for as
+/// long as there are any.
+fn tail_of(ast: &AST, source: &str) -> String {
+    let has =
+        |name: &str| ast.iter_functions().any(|function| function.name == name && function.params.is_empty());
+    let mut tail = String::new();
+    if has("on_start") {
+        tail.push_str("on_start();\n");
+    }
+    let tests = tests_of(ast, source);
+    for test in &tests {
+        let steps = [("setup", has("setup")), (test, true), ("teardown", has("teardown"))];
+        let steps: Vec<String> = steps
+            .iter()
+            .filter(|(_, is_there)| *is_there)
+            .map(|(name, _)| format!("Fn(\"{name}\")"))
+            .collect();
+        tail.push_str(&format!("run_test(\"{test}\", [{}]);\n", steps.join(", ")));
+    }
+    if tests.is_empty() {
+        tail.push_str("serve();\n");
+    }
+    tail
+}
+
+/// A script that has begun.
+pub struct Node {
+    /// Its name.
+    pub name: String,
+    /// Whether it has tests: the run ends with the last one.
+    pub has_tests: bool,
+    /// When it is to be woken, if nothing happens before.
+    pub wake_ns: Option<u64>,
+    /// Whether it has ended, and with what error.
+    pub ended: Option<Option<String>>,
+    inputs: Wanted,
+    /// Frames that were on the bus, of which it does not know yet.
+    confirmed: usize,
+    to: Option<SyncSender<Resume>>,
+    from: Receiver<Turn>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Node {
+    /// Starts its thread; its first turn is at time 0.
+    pub fn start(script: &Script, decoder: &Arc<Decoder>, seed: u64) -> Result<Self, ScriptError> {
+        let has_tests = !script.tests()?.is_empty();
+        let (to, resume) = sync_channel(1);
+        let (turn, from) = sync_channel(1);
+        let (own, decoder) = (script.clone(), Arc::clone(decoder));
+        let thread = std::thread::Builder::new()
+            .name(format!("script {}", script.name))
+            .stack_size(STACK_BYTES)
+            .spawn(move || run(&own, resume, turn, decoder, seed))
+            .map_err(|error| ScriptError::Thread { name: script.name.clone(), reason: error.to_string() })?;
+        Ok(Self {
+            name: script.name.clone(),
+            has_tests,
+            wake_ns: Some(0),
+            ended: None,
+            inputs: Wanted::default(),
+            confirmed: 0,
+            to: Some(to),
+            from,
+            thread: Some(thread),
+        })
+    }
+
+    /// Its turn, if it has one for this input: returns what it wants.
+    pub fn resume(&mut self, now_ns: u64, input: Option<Input>) -> Vec<Output> {
+        if self.ended.is_some() {
+            return Vec::new();
+        }
+        if input.as_ref().is_some_and(|input| !self.inputs.has(input)) {
+            self.confirmed += usize::from(matches!(input, Some(Input::Sent { .. })));
+            return Vec::new();
+        }
+        let confirmed = std::mem::take(&mut self.confirmed);
+        let is_sent = self.to.as_ref().is_some_and(|to| to.send(Resume { now_ns, input, confirmed }).is_ok());
+        let turn = if is_sent { self.from.recv().ok() } else { None };
+        let lost = || Turn {
+            outputs: Vec::new(),
+            next: Next::End { error: Some("the script's thread has died; please report this".to_owned()) },
+        };
+        let Turn { outputs, next } = turn.unwrap_or_else(lost);
+        match next {
+            Next::Wait { until_ns, inputs } => {
+                self.wake_ns = until_ns;
+                self.inputs = inputs;
+            }
+            Next::End { error } => {
+                self.wake_ns = None;
+                self.ended = Some(error);
+            }
+        }
+        outputs
+    }
+}
+
+impl Drop for Node {
+    fn drop(&mut self) {
+        // Its wait fails now, which ends it.
+        self.to = None;
+        while self.from.recv().is_ok() {}
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// A script's thread.
+fn run(script: &Script, resume: Receiver<Resume>, turn: SyncSender<Turn>, decoder: Arc<Decoder>, seed: u64) {
+    let operations = Operations::default();
+    let runtime = Runtime::new(resume, turn, operations.clone(), decoder, seed);
+    let mut engine = sandbox::engine(&operations);
+    functions::register(&mut engine, &runtime);
+    let result = runtime.begin().map_err(|error| functions::describe(&error)).and_then(|()| {
+        let ast = script.compile(&engine).map_err(|error| error.to_string())?;
+        let tail = engine.compile(tail_of(&ast, &script.source)).map_err(|error| error.to_string())?;
+        let whole = ast.merge(&tail);
+        engine.run_ast_with_scope(&mut Scope::new(), &whole).map_err(|error| functions::describe(&error))
+    });
+    runtime.finish(result.err().filter(|error| error != ENDED));
+}

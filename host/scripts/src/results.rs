@@ -1,0 +1,89 @@
+//! What a run collects for its report.
+
+use std::collections::VecDeque;
+
+use cantap_can::{Channel, Frame};
+
+use crate::exchange::Output;
+use crate::node::Node;
+use crate::report::{Message, Outcome, Report, TestResult};
+
+/// How many of the last frames go with a failure.
+const TRACE: usize = 40;
+
+/// Collects tests and frames while a run goes on.
+pub struct Results<'a> {
+    /// The report so far.
+    pub report: Report,
+    last: VecDeque<(u64, Channel, Frame)>,
+    on_message: &'a mut dyn FnMut(Message),
+}
+
+impl<'a> Results<'a> {
+    /// Of a run that begins; lines that scripts log go to `on_message` at once.
+    pub fn new(on_message: &'a mut dyn FnMut(Message)) -> Self {
+        Self { report: Report::default(), last: VecDeque::new(), on_message }
+    }
+
+    /// A frame was on the bus.
+    pub fn frame(&mut self, at_ns: u64, channel: Channel, frame: Frame) {
+        if self.last.len() == TRACE {
+            self.last.pop_front();
+        }
+        self.last.push_back((at_ns, channel, frame));
+    }
+
+    /// Takes what is for the report; returns what is for the bus.
+    pub fn take(&mut self, script: &str, now_ns: u64, output: Output) -> Option<Output> {
+        match output {
+            Output::Log(text) => {
+                (self.on_message)(Message { at_ns: now_ns, script: script.to_owned(), text });
+                None
+            }
+            Output::Test { name, outcome, began_ns } => {
+                let trace = if outcome == Outcome::Passed { Vec::new() } else { self.trace() };
+                let script = script.to_owned();
+                self.report.tests.push(TestResult {
+                    script,
+                    name,
+                    outcome,
+                    began_ns,
+                    ended_ns: now_ns,
+                    trace,
+                });
+                None
+            }
+            for_the_bus => Some(for_the_bus),
+        }
+    }
+
+    fn trace(&self) -> Vec<String> {
+        let line = |(at_ns, channel, frame): &(u64, Channel, Frame)| {
+            format!(
+                "({}.{:06}) can{} {frame}",
+                at_ns / 1_000_000_000,
+                at_ns / 1000 % 1_000_000,
+                channel.index()
+            )
+        };
+        self.last.iter().map(line).collect()
+    }
+
+    /// The report of a run that is over.
+    pub fn finish(mut self, nodes: &[Node], now_ns: u64) -> Report {
+        self.report.duration_ns = now_ns;
+        let errors = nodes.iter().filter_map(|node| Some((node.name.clone(), node.ended.clone()??)));
+        self.report.errors.extend(errors);
+        self.report
+    }
+}
+
+/// Whether a run is over: every script with tests has ended, or, if none has tests, every script has.
+pub fn is_over(nodes: &[Node]) -> bool {
+    let mut deciding = nodes.iter().filter(|node| node.has_tests).peekable();
+    if deciding.peek().is_some() {
+        deciding.all(|node| node.ended.is_some())
+    } else {
+        nodes.iter().all(|node| node.ended.is_some())
+    }
+}

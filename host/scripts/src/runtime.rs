@@ -1,0 +1,353 @@
+//! A script's thread from inside: its functions call this to send, and to wait for their turn.
+
+use std::cell::RefCell;
+use std::collections::{BTreeMap, BTreeSet};
+use std::rc::Rc;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, SyncSender};
+
+use cantap_protocols::active::Machine;
+use cantap_signals::{Decoder, MessageRef, Reading, SignalValue};
+use cantap_trace::TraceFrame;
+use rhai::{Dynamic, EvalAltResult, FnPtr, FuncArgs, Map, NativeCallContext};
+
+use crate::exchange::{Input, Next, Output, Resume, Turn, Wanted};
+use crate::handlers::{BusEvent, Handlers, Selector};
+use crate::sandbox::Operations;
+use crate::script_frame::ScriptFrame;
+
+/// What a function of a script returns: a value, or why the script cannot go on.
+pub type Result<T> = std::result::Result<T, Box<EvalAltResult>>;
+
+/// Ends a script from outside: an error that it cannot catch.
+pub const ENDED: &str = "ended";
+
+/// How many unconfirmed frames a script may have: more are a loop without a wait.
+const MAX_UNCONFIRMED: usize = 4096;
+
+/// The state of a script.
+pub struct Runtime {
+    resume: Receiver<Resume>,
+    turn: SyncSender<Turn>,
+    operations: Operations,
+    /// The databases.
+    pub decoder: Arc<Decoder>,
+    state: RefCell<State>,
+}
+
+struct State {
+    now_ns: u64,
+    outputs: Vec<Output>,
+    handlers: Handlers,
+    /// The last value of each signal, by `Message.Signal`.
+    values: BTreeMap<String, Dynamic>,
+    unconfirmed: usize,
+    /// Its repetitions.
+    repeated: BTreeSet<u32>,
+    random: fastrand::Rng,
+}
+
+/// What ends a wait early.
+enum Want<'a> {
+    /// Nothing does.
+    Time,
+    /// Nothing can happen any more.
+    End,
+    /// A frame.
+    Frame(&'a Selector),
+    /// A client that talks on the bus is done.
+    Machine(&'a mut dyn Machine, cantap_can::Channel),
+}
+
+impl Runtime {
+    /// Of a script that has not begun.
+    pub fn new(
+        resume: Receiver<Resume>,
+        turn: SyncSender<Turn>,
+        operations: Operations,
+        decoder: Arc<Decoder>,
+        seed: u64,
+    ) -> Rc<Self> {
+        let state = State {
+            now_ns: 0,
+            outputs: Vec::new(),
+            handlers: Handlers::default(),
+            values: BTreeMap::new(),
+            unconfirmed: 0,
+            repeated: BTreeSet::new(),
+            random: fastrand::Rng::with_seed(seed),
+        };
+        Rc::new(Self { resume, turn, operations, decoder, state: RefCell::new(state) })
+    }
+
+    /// Nanoseconds since the run began.
+    pub fn now_ns(&self) -> u64 {
+        self.state.borrow().now_ns
+    }
+
+    /// Calls `act` with what the script reacts to.
+    pub fn with_handlers<R>(&self, act: impl FnOnce(&mut Handlers) -> R) -> R {
+        act(&mut self.state.borrow_mut().handlers)
+    }
+
+    /// Calls `act` with the script's random numbers.
+    pub fn with_random<R>(&self, act: impl FnOnce(&mut fastrand::Rng) -> R) -> R {
+        act(&mut self.state.borrow_mut().random)
+    }
+
+    /// Hands over at the end of this turn.
+    pub fn output(&self, output: Output) -> Result<()> {
+        let mut state = self.state.borrow_mut();
+        match &output {
+            Output::Send { .. } => {
+                state.unconfirmed += 1;
+                if state.unconfirmed > MAX_UNCONFIRMED {
+                    let reason =
+                        format!("{MAX_UNCONFIRMED} frames wait to be sent; wait(…) before sending more");
+                    return Err(reason.into());
+                }
+            }
+            Output::Repeat { handle, .. } => {
+                state.repeated.insert(*handle);
+            }
+            Output::EndRepeat { handle } => {
+                state.repeated.remove(handle);
+            }
+            Output::Log(_) | Output::Test { .. } => {}
+        }
+        state.outputs.push(output);
+        Ok(())
+    }
+
+    /// Whether nothing of the script can happen any more: it has no function to call, and repeats nothing.
+    fn has_nothing_left(&self) -> bool {
+        let state = self.state.borrow();
+        state.handlers.is_empty() && state.repeated.is_empty()
+    }
+
+    /// The last value of a signal, if it was on the bus.
+    pub fn value(&self, name: &str) -> Option<Dynamic> {
+        self.state.borrow().values.get(name).cloned()
+    }
+
+    /// Waits for the first turn.
+    pub fn begin(&self) -> Result<()> {
+        self.take_turn().map(|_| ())
+    }
+
+    /// Lets time pass up to `until_ns` while the script's functions are called.
+    pub fn wait(&self, context: &NativeCallContext<'_>, until_ns: u64) -> Result<()> {
+        self.pump(context, Some(until_ns), Want::Time).map(|_| ())
+    }
+
+    /// The same for as long as anything of the script can happen.
+    pub fn serve(&self, context: &NativeCallContext<'_>) -> Result<()> {
+        self.pump(context, None, Want::End).map(|_| ())
+    }
+
+    /// The next selected frame, if one comes in time.
+    pub fn wait_for(
+        &self,
+        context: &NativeCallContext<'_>,
+        until_ns: u64,
+        selector: &Selector,
+    ) -> Result<Option<ScriptFrame>> {
+        self.pump(context, Some(until_ns), Want::Frame(selector))
+    }
+
+    /// Runs a client on the bus until it is done.
+    pub fn run_client(
+        &self,
+        context: &NativeCallContext<'_>,
+        channel: cantap_can::Channel,
+        client: &mut dyn Machine,
+    ) -> Result<()> {
+        self.pump(context, None, Want::Machine(client, channel)).map(|_| ())
+    }
+
+    fn pump(
+        &self,
+        context: &NativeCallContext<'_>,
+        until_ns: Option<u64>,
+        mut want: Want<'_>,
+    ) -> Result<Option<ScriptFrame>> {
+        loop {
+            while let Some(call) = self.take_due() {
+                self.call(context, &call, ())?;
+            }
+            let mut until_ns = until_ns;
+            if let Want::Machine(machine, channel) = &mut want {
+                while let Some(frame) = machine.next(self.now_ns()) {
+                    self.output(Output::Send { channel: *channel, frame })?;
+                }
+                if machine.is_done() {
+                    return Ok(None);
+                }
+                until_ns = machine.due_ns();
+            } else if matches!(want, Want::End) && self.has_nothing_left() {
+                return Ok(None);
+            } else if until_ns.is_some_and(|until_ns| until_ns <= self.now_ns()) {
+                return Ok(None);
+            }
+            let timer_ns = self.with_handlers(|handlers| handlers.next_due_ns());
+            let wake_ns = [until_ns, timer_ns].into_iter().flatten().min();
+            self.hand_over(Next::Wait { until_ns: wake_ns, inputs: self.wanted(&want) })?;
+            let Some(input) = self.take_turn()? else { continue };
+            if let Some(found) = self.take_input(context, input, &mut want)? {
+                return Ok(Some(found));
+            }
+        }
+    }
+
+    fn take_due(&self) -> Option<FnPtr> {
+        let State { handlers, now_ns, .. } = &mut *self.state.borrow_mut();
+        handlers.take_due(*now_ns)
+    }
+
+    fn wanted(&self, want: &Want<'_>) -> Wanted {
+        let state = self.state.borrow();
+        let is_client = matches!(want, Want::Machine(..));
+        // With a database, the last value of each signal is kept.
+        let keeps_values = self.decoder.messages().next().is_some();
+        Wanted {
+            frames: keeps_values
+                || is_client
+                || matches!(want, Want::Frame(_))
+                || state.handlers.has_frames(),
+            confirmations: is_client,
+            events: state.handlers.has_events(),
+        }
+    }
+
+    /// The turn ends.
+    fn hand_over(&self, next: Next) -> Result<()> {
+        let outputs = std::mem::take(&mut self.state.borrow_mut().outputs);
+        self.turn.send(Turn { outputs, next }).map_err(|_| ended())
+    }
+
+    /// The script has ended.
+    pub fn finish(&self, error: Option<String>) {
+        // If nobody is there any more, nobody wants to know.
+        let _ = self.hand_over(Next::End { error });
+    }
+
+    fn take_turn(&self) -> Result<Option<Input>> {
+        let Resume { now_ns, input, confirmed } = self.resume.recv().map_err(|_| ended())?;
+        let mut state = self.state.borrow_mut();
+        state.now_ns = now_ns;
+        state.unconfirmed = state.unconfirmed.saturating_sub(confirmed);
+        drop(state);
+        self.operations.reset();
+        Ok(input)
+    }
+
+    /// Calls the functions for an input; returns the frame that ends the wait.
+    fn take_input(
+        &self,
+        context: &NativeCallContext<'_>,
+        input: Input,
+        want: &mut Want<'_>,
+    ) -> Result<Option<ScriptFrame>> {
+        let now_ns = self.now_ns();
+        match input {
+            Input::Sent { channel } => {
+                let mut state = self.state.borrow_mut();
+                state.unconfirmed = state.unconfirmed.saturating_sub(1);
+                drop(state);
+                if let Want::Machine(machine, of) = want
+                    && *of == channel
+                {
+                    machine.sent(now_ns);
+                }
+            }
+            Input::Gap => {
+                if let Want::Machine(machine, _) = want {
+                    machine.gap(now_ns);
+                }
+            }
+            Input::Error { channel, kind } => self.take_event(context, BusEvent::Error(channel, kind))?,
+            Input::State { channel, state } => self.take_event(context, BusEvent::State(channel, state))?,
+            Input::Frame { channel, frame } => {
+                let frame = ScriptFrame { channel, frame, at_ns: now_ns };
+                let message = self.decoder.find(channel.number(), frame.frame.id());
+                let signals = message.map(|message| self.signals_of(&frame, message));
+                if let Want::Machine(machine, of) = want
+                    && *of == channel
+                    && !frame.frame.is_remote()
+                {
+                    machine.hear(now_ns, frame.frame.id(), frame.frame.data());
+                }
+                for (as_message, call) in self.with_handlers(|handlers| handlers.for_frame(&frame, message)) {
+                    match &signals {
+                        Some(signals) if as_message => self.call(context, &call, (signals.clone(),))?,
+                        _ => self.call(context, &call, (frame,))?,
+                    }
+                }
+                if let Want::Frame(selector) = want
+                    && selector.selects(&frame, message)
+                {
+                    return Ok(Some(frame));
+                }
+            }
+        }
+        Ok(None)
+    }
+
+    /// Calls a function of the script; what it returns does not matter.
+    #[expect(clippy::unused_self, reason = "only a script's own thread may call its functions")]
+    fn call(&self, context: &NativeCallContext<'_>, call: &FnPtr, arguments: impl FuncArgs) -> Result<()> {
+        call.call_within_context::<Dynamic>(context, arguments).map(|_| ())
+    }
+
+    fn take_event(&self, context: &NativeCallContext<'_>, event: BusEvent) -> Result<()> {
+        let (channel, text) = match event {
+            BusEvent::Error(channel, kind) => {
+                (channel, kind.map_or("unknown", cantap_can::BusErrorKind::name))
+            }
+            BusEvent::State(channel, state) => (channel, state.name()),
+        };
+        for call in self.with_handlers(|handlers| handlers.for_event(event)) {
+            let channel = i64::from(channel.number());
+            self.call(context, &call, (channel, text.to_owned()))?;
+        }
+        Ok(())
+    }
+
+    /// The values in a frame, which become the last ones of their signals.
+    fn signals_of(&self, frame: &ScriptFrame, message: MessageRef) -> Map {
+        let mut map = self.decode(frame);
+        let name = &self.decoder.message(message).name;
+        let mut state = self.state.borrow_mut();
+        for (signal, value) in &map {
+            state.values.insert(format!("{name}.{signal}"), value.clone());
+        }
+        drop(state);
+        map.insert("frame".into(), Dynamic::from(*frame));
+        map
+    }
+
+    /// The values in a frame by the signals' names: numbers, or a text where J1939 has one in place of a value.
+    pub fn decode(&self, frame: &ScriptFrame) -> Map {
+        let mut values: Vec<SignalValue> = Vec::new();
+        let traced = TraceFrame::from(frame.frame);
+        let Some(message) = self.decoder.decode(frame.channel.number(), &traced, &mut values) else {
+            return Map::new();
+        };
+        let message = self.decoder.message(message);
+        let readings = values.iter().map(|value| Reading::of(message, value));
+        readings
+            .map(|reading| {
+                let value = match reading.number {
+                    Some(number) => Dynamic::from(number.as_f64()),
+                    None => Dynamic::from(reading.indicator.unwrap_or_default().to_owned()),
+                };
+                (reading.label.as_ref().into(), value)
+            })
+            .collect()
+    }
+}
+
+/// The error that ends a script whose bus is gone.
+fn ended() -> Box<EvalAltResult> {
+    Box::new(EvalAltResult::ErrorTerminated(ENDED.into(), rhai::Position::NONE))
+}

@@ -1,0 +1,53 @@
+//! What a script may use up: a bus must not wait for one that never ends, and a computer must not run out of memory.
+
+use std::cell::Cell;
+use std::rc::Rc;
+
+use rhai::Engine;
+
+/// Operations of a script between two waits. A simple loop with ten million takes a few seconds, far longer than any node may be silent.
+const MAX_OPERATIONS: u64 = 10_000_000;
+/// The deepest nesting of calls; each takes space on the thread's stack.
+const MAX_CALLS: usize = 48;
+/// Values in an array with everything in it.
+const MAX_ARRAY: usize = 1 << 20;
+/// Entries in a map with everything in it.
+const MAX_MAP: usize = 1 << 16;
+/// Bytes of a text, or of all texts in an array or a map.
+const MAX_STRING: usize = 1 << 24;
+/// Variables at the same time.
+const MAX_VARIABLES: usize = 4096;
+
+/// Counts a script's operations since its last wait.
+#[derive(Clone, Debug, Default)]
+pub struct Operations(Rc<Cell<u64>>);
+
+impl Operations {
+    /// The script waits: it may use as many again.
+    pub fn reset(&self) {
+        self.0.set(0);
+    }
+}
+
+/// An engine in which a script can reach nothing but what is registered, and use no more than the limits.
+pub fn engine(operations: &Operations) -> Engine {
+    let mut engine = Engine::new();
+    engine
+        .set_max_call_levels(MAX_CALLS)
+        .set_max_expr_depths(64, 64)
+        .set_max_array_size(MAX_ARRAY)
+        .set_max_map_size(MAX_MAP)
+        .set_max_string_size(MAX_STRING)
+        .set_max_variables(MAX_VARIABLES)
+        .disable_symbol("eval");
+    let count = operations.clone();
+    engine.on_progress(move |_| {
+        let used = count.0.get() + 1;
+        count.0.set(used);
+        (used > MAX_OPERATIONS).then(|| TOO_LONG.into())
+    });
+    engine
+}
+
+/// Why a script was ended that did not wait.
+pub const TOO_LONG: &str = "it computed for too long without waiting; put a wait(\"1ms\") into its loop, or react to frames with on_frame";

@@ -1,0 +1,83 @@
+//! Scripts on the virtual device, as on a board.
+
+use std::time::Duration;
+
+use cantap::{Channel, Device};
+use cantap_scripts::{Live, Report, Script};
+
+use super::{decoder, failure, script};
+
+fn device(options: &str) -> Device {
+    let device = cantap_virtual::open(options.parse().unwrap()).unwrap();
+    device.join(Channel::Can1, 500_000).unwrap();
+    device
+}
+
+fn run(device: &Device, scripts: &[Script], duration: Option<Duration>) -> Report {
+    let live = Live { decoder: decoder(), seed: 1, duration };
+    live.run(device, scripts, &mut |_| {}, &mut |_| {}, &mut || true).unwrap()
+}
+
+#[test]
+fn a_test_of_the_vehicle_passes_as_on_the_bench() {
+    let source = r#"
+        fn test_vin() {
+            let answer = request("7E0", "7E8", [0x22, 0xF1, 0x90]);
+            check(answer.len() == 20, "17 characters");
+        }
+    "#;
+    let report = run(&device("car"), &[script("tester", source)], None);
+    assert!(report.is_success() && report.tests.len() == 1, "{report:?}");
+    assert_eq!(report.frames_lost, 0);
+}
+
+#[test]
+fn two_scripts_on_one_device_hear_each_other_and_repetitions_end_with_the_run() {
+    let device = device("load=0");
+    let server = script("server", r#"on_frame("123", |f| send(frame(0x124, f.data)));"#);
+    let tester = script(
+        "tester",
+        r#"
+        fn test_echo() {
+            let p = periodic("200#01", "5ms");
+            send("123#4142");
+            check(expect("124", "1s").data == blob_of([0x41, 0x42]), "the same data");
+        }
+        fn blob_of(values) { let b = blob(); for value in values { b.push(value); } b }
+        "#,
+    );
+    let report = run(&device, &[server, tester], Some(Duration::from_secs(20)));
+    assert!(report.is_success(), "{report:?}");
+    assert_eq!(report.frames_not_sent, 0);
+    // Nothing is sent any more: what the device still confirms is nothing.
+    let before = device.status().unwrap().channels[0];
+    let again = run(&device, &[script("idle", "wait(\"60ms\");")], None);
+    let after = device.status().unwrap().channels[0];
+    assert!(again.is_success());
+    assert_eq!(before.transmitted, after.transmitted);
+}
+
+#[test]
+fn a_device_that_vanishes_is_an_error_and_not_a_hang() {
+    let device = device("load=0");
+    let scripts = [script("a", r#"every("1ms", || send("100#"));"#)];
+    let mut turns = 0;
+    let live = Live { decoder: decoder(), seed: 1, duration: None };
+    let error = live.run(&device, &scripts, &mut |_| {}, &mut |_| {}, &mut || {
+        turns += 1;
+        if turns == 20 {
+            let _ = device.reset();
+        }
+        true
+    });
+    assert!(error.is_err(), "{error:?}");
+}
+
+#[test]
+fn what_cannot_be_sent_is_in_the_report() {
+    let device = device("load=0,ack=no");
+    let report = run(&device, &[script("a", "send(\"100#\"); wait(\"50ms\");")], None);
+    assert_eq!((report.frames_sent, report.frames_not_sent), (0, 1), "{report:?}");
+    let report = run(&device, &[script("a", "fail(\"no\");")], None);
+    assert_eq!(failure(&report), "line 1: no");
+}

@@ -169,11 +169,7 @@ fn tell(message: &Message, json: bool) {
     let mut out = std::io::stdout().lock();
     // Whoever does not read any more wants no more lines; the run goes on for its tests.
     let _ = if json {
-        writeln!(
-            out,
-            "{}",
-            json!({ "event": "log", "time_s": rounded(seconds, 9), "script": script, "text": text })
-        )
+        writeln!(out, "{}", line("log", script, seconds, text))
     } else {
         writeln!(out, "{seconds:12.6} {}: {}", clean::line(script), clean::lines(text))
     };
@@ -190,7 +186,7 @@ fn print(report: &Report, as_json: bool) -> anyhow::Result<()> {
     }
     for (script, error) in &report.errors {
         if as_json {
-            writeln!(out, "{}", json!({ "event": "error", "script": script, "error": error }))?;
+            writeln!(out, "{}", line("error", script, report.duration_ns as f64 / 1e9, error))?;
         } else {
             writeln!(out, "ERROR  {}: {}", clean::line(script), clean::lines(error))?;
         }
@@ -198,8 +194,7 @@ fn print(report: &Report, as_json: bool) -> anyhow::Result<()> {
     let seconds = report.duration_ns as f64 / 1e9;
     let failed = report.failed().count();
     if as_json {
-        let summary = json!({
-            "event": "summary",
+        let summary = json!({ "summary": {
             "tests": report.tests.len(),
             "failed": failed,
             "errors": report.errors.len(),
@@ -208,7 +203,7 @@ fn print(report: &Report, as_json: bool) -> anyhow::Result<()> {
             "frames_received": report.frames_received,
             "frames_not_sent": report.frames_not_sent,
             "frames_lost": report.frames_lost,
-        });
+        } });
         writeln!(out, "{summary}")?;
     } else {
         let passed = report.tests.len() - failed;
@@ -245,19 +240,24 @@ fn describe(out: &mut impl Write, test: &TestResult) -> std::io::Result<()> {
     }
 }
 
+/// A line that is no test.
+fn line(kind: &str, script: &str, at_s: f64, text: &str) -> Value {
+    json!({ "kind": kind, "script": script, "at_s": rounded(at_s, 9), "text": text })
+}
+
 fn object(test: &TestResult) -> Value {
     let reason = match &test.outcome {
         Outcome::Passed => None,
         Outcome::Failed(reason) => Some(reason),
     };
     json!({
-        "event": "test",
+        "kind": "test",
         "script": test.script,
+        "at_s": rounded(test.ended_ns as f64 / 1e9, 9),
+        "begin_s": rounded(test.began_ns as f64 / 1e9, 9),
         "test": test.name,
         "passed": reason.is_none(),
-        "reason": reason,
-        "begin_s": rounded(test.began_ns as f64 / 1e9, 9),
-        "end_s": rounded(test.ended_ns as f64 / 1e9, 9),
-        "frames": test.trace,
+        "text": reason,
+        "trace": test.trace,
     })
 }

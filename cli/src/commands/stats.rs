@@ -177,7 +177,7 @@ fn write_json(
     let share = missing.share_pct().map_or("null".to_owned(), |share| share.to_string());
     let members = format!("{members},\"issues\":{issues},\"left_out\":{left_out},\"missing_pct\":{share}");
     let protocols = known.map_or(String::new(), |known| format!(",\"protocols\":{}", known.object()));
-    let members = members + &protocols;
+    let members = members + protocols.as_str();
     let Some(windows) = windows else { return Ok(writeln!(out, "{members}}}")?) };
     write!(out, "{members},\"windows\":[")?;
     let mut comma = "";

@@ -38,6 +38,11 @@ pub fn directory(test: &str) -> PathBuf {
     fs::write(directory.join("talk.log"), talk).unwrap();
     let other = talk.replace("215A5A5A", "215B5A5A").replace("7DF", "7E1");
     fs::write(directory.join("other.log"), other + "(4.000000) can0 7E9#04410C1AF8AAAAAA\n").unwrap();
+    fs::write(
+        directory.join("test.rhai"),
+        "log(1); fn test_a() { send(\"123#\"); wait(\"5ms\"); } fn test_b() { fail(\"no\"); }",
+    )
+    .unwrap();
     fs::write(directory.join("car.dbc"), database).unwrap();
     fs::write(directory.join("odd.dbc"), database.replace("8|8@1-", "8|99@1-")).unwrap();
     directory
@@ -53,7 +58,7 @@ fn cantap(directory: &Path, line: &str) -> (Option<i32>, String, String) {
 }
 
 /// A command line without `--json`; its exit code; the type of its object, or of each of its lines but the last, and of the last.
-pub const LINES: [(&str, i32, &[&str]); 65] = [
+pub const LINES: [(&str, i32, &[&str]); 67] = [
     ("list", 0, &["list"]),
     ("info -d virtual", 0, &["info"]),
     ("status -d virtual --registers", 0, &["status"]),
@@ -74,6 +79,8 @@ pub const LINES: [(&str, i32, &[&str]); 65] = [
     ("gen -d virtual:load=0,ack=no 1 -g 1 -n 3", 1, &["gen"]),
     ("replay -d virtual:load=0 -b 500k b.log", 0, &["replay"]),
     ("replay -d virtual:load=0,ack=no -b 500k a.log", 1, &["replay"]),
+    ("run test.rhai", 1, &["run", "run_end"]),
+    ("run test.rhai -d virtual:load=0 -b 500k", 1, &["run", "run_end"]),
     ("autobaud -d virtual:bitrate=125k", 0, &["autobaud"]),
     ("defaults show -d virtual", 0, &["defaults_show"]),
     ("stats a.log", 0, &["stats"]),

@@ -48,8 +48,11 @@ fn a_failed_test_is_exit_code_1_with_its_frames_a_trace_and_junit() {
     assert_eq!(output.status.code(), Some(1), "{output:?}");
     let lines: Vec<serde_json::Value> =
         text(&output.stdout).lines().map(|line| serde_json::from_str(line).unwrap()).collect();
-    assert_eq!((lines.len(), &lines[0]["passed"], &lines[1]["failed"]), (2, &false.into(), &1.into()));
-    assert!(lines[0]["reason"].as_str().unwrap().contains("no frame 7E8 within 50ms"), "{lines:?}");
+    assert_eq!(
+        (lines.len(), &lines[0]["passed"], &lines[1]["summary"]["failed"]),
+        (2, &false.into(), &1.into())
+    );
+    assert!(lines[0]["text"].as_str().unwrap().contains("no frame 7E8 within 50ms"), "{lines:?}");
     let junit = std::fs::read_to_string(folder.path().join("report.xml")).unwrap();
     assert!(junit.contains("name=\"test_speed\"") && junit.contains("7DF#02010D"), "{junit}");
     let trace = std::fs::read_to_string(folder.path().join("run.log")).unwrap();

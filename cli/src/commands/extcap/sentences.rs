@@ -114,7 +114,7 @@ mod tests {
             product: Some("a {board}\nof mine".to_owned()),
         };
         let places = [Place::Board(board, "cantap-ttyACM0".to_owned()), Place::Virtual, Place::Address];
-        let said = interfaces(&places) + &link_types() + &places.iter().map(config).collect::<String>();
+        let said = [interfaces(&places), link_types(), places.iter().map(config).collect()].concat();
         for line in said.lines() {
             assert!(is_sentence(line), "{line}");
         }

@@ -140,7 +140,7 @@ impl Report {
                 }
             }
             Ok(Outcome::Fail(says, measured)) => {
-                Outcome::Fail(says + &self.excuse().unwrap_or_default(), measured)
+                Outcome::Fail(says + self.excuse().unwrap_or_default().as_str(), measured)
             }
             Ok(outcome) => outcome,
         };

@@ -197,7 +197,7 @@ pub(super) fn window_line(window: &PeakSummary, zero_s: f64) -> String {
         "    {} {:>+12.3} s {load} {:>9.1} frames/s {:>9.0} bit/s",
         window.channel, since_s, window.frames_per_s, window.bits_per_s
     );
-    line + &remarks(window.errors, window.lost, window.incomplete)
+    line + remarks(window.errors, window.lost, window.incomplete).as_str()
 }
 
 /// Remarks about a window, to be appended to its figures.

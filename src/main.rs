@@ -232,21 +232,29 @@ mod app {
     ///
     /// Priority 4, because it writes records. The controller keeps one error: a second, which comes at least 14 bit
     /// times later, replaces it uncounted if this has not started.
-    #[task(binds = CAN1_SCE, priority = 4, shared = [tap, &stamp])]
+    #[task(binds = CAN1_SCE, priority = 4, shared = [tap, &stamp, &can1_bells])]
     fn can1_sce(mut cx: can1_sce::Context) {
         let entered = cx.shared.stamp.now();
-        cx.shared.tap.lock(|Tap { capture, traffic: [can1, _], .. }| {
-            capture.on_error(Channel::Can1, can1, entered);
-        });
+        let may_come = cx
+            .shared
+            .tap
+            .lock(|Tap { capture, traffic: [can1, _], .. }| capture.on_error(Channel::Can1, can1, entered));
+        if !may_come {
+            cx.shared.can1_bells.silence_errors();
+        }
     }
 
     /// Same as [`can1_sce`], for CAN2.
-    #[task(binds = CAN2_SCE, priority = 4, shared = [tap, &stamp])]
+    #[task(binds = CAN2_SCE, priority = 4, shared = [tap, &stamp, &can2_bells])]
     fn can2_sce(mut cx: can2_sce::Context) {
         let entered = cx.shared.stamp.now();
-        cx.shared.tap.lock(|Tap { capture, traffic: [_, can2], .. }| {
-            capture.on_error(Channel::Can2, can2, entered);
-        });
+        let may_come = cx
+            .shared
+            .tap
+            .lock(|Tap { capture, traffic: [_, can2], .. }| capture.on_error(Channel::Can2, can2, entered));
+        if !may_come {
+            cx.shared.can2_bells.silence_errors();
+        }
     }
 
     /// Sends what is due.
@@ -321,9 +329,15 @@ mod app {
                 Channel::Can1 => can1_bells.open_receive(),
                 Channel::Can2 => can2_bells.open_receive(),
             }
-            let is_open = tap.lock(|Tap { capture, traffic, alarm }| {
-                capture.on_tick_errors(channel, &mut traffic[channel.index()], alarm)
+            let (is_open, may_come) = tap.lock(|Tap { capture, traffic, alarm }| {
+                let is_open = capture.on_tick_errors(channel, &mut traffic[channel.index()], alarm);
+                (is_open, capture.take_errors_held(channel))
             });
+            match channel {
+                _ if !may_come => {}
+                Channel::Can1 => can1_bells.open_errors(),
+                Channel::Can2 => can2_bells.open_errors(),
+            }
             if !is_open {
                 continue;
             }

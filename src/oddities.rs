@@ -17,6 +17,8 @@ const RECORD_EVERY_TICKS: u32 = TICK_HZ;
 pub struct ChannelOddities {
     /// Times that its receive FIFO did not release its frames, or repeated them.
     pub drains_given_up: u32,
+    /// Times that its error interrupt came more often than a bus can have errors.
+    pub error_storms: u32,
     /// Times that a mailbox went on saying that it had finished.
     pub mailboxes_stuck: u32,
 }
@@ -54,6 +56,7 @@ impl Display for Oddities {
         };
         for (number, channel) in (1..).zip(&self.channels) {
             say(channel.drains_given_up, format_args!("CAN{number}'s FIFO releases no frame"))?;
+            say(channel.error_storms, format_args!("CAN{number}'s error interrupt does not end"))?;
             say(channel.mailboxes_stuck, format_args!("CAN{number}'s mailbox stays finished"))?;
         }
         say(self.usb.words_dropped, format_args!("USB words not believed"))?;
@@ -71,7 +74,8 @@ pub struct Watch {
 impl Watch {
     /// Nothing has been recorded.
     pub const fn new() -> Self {
-        const NONE: ChannelOddities = ChannelOddities { drains_given_up: 0, mailboxes_stuck: 0 };
+        const NONE: ChannelOddities =
+            ChannelOddities { drains_given_up: 0, error_storms: 0, mailboxes_stuck: 0 };
         let usb = UsbOddities { words_dropped: 0, waits_given_up: 0 };
         Self { recorded: Oddities { channels: [NONE; CHANNELS], usb }, at: None }
     }

@@ -54,6 +54,13 @@ pub struct ErrorStatus {
 pub trait Traffic {
     /// Frames waiting in the receive FIFO: 0 to 3, without one that has been taken and is being released.
     fn pending(&self) -> u8;
+    /// The oldest frame in the receive FIFO, which stays there; `None` as for [`Self::receive`].
+    fn front(&self) -> Option<Frame>;
+    /// Whether the controller has been asked to leave its bus. The interrupts of a board can come just before [`Control::stop`] or
+    /// [`Control::halt`] has done so, and then it has not; where they cannot, it always has.
+    fn is_leaving(&self) -> bool {
+        true
+    }
     /// Takes the oldest frame out of the receive FIFO; `None` if there is none, or if the last one taken has not been released yet.
     fn receive(&mut self) -> Option<Frame>;
     /// Whether the FIFO dropped frames since the last call. The FIFO is locked when full: it keeps the

@@ -1,7 +1,7 @@
 //! A board whose silicon answers late, wrongly or never, on a host that misbehaves ([`cantap_emu::hostile`]): everything from one seed.
 //!
 //! A trial is a storm and then calm. In the storm anything may fail, except what must never happen: a dominant bit that nobody asked for,
-//! a frame that is neither delivered nor counted, a frame that was never on the bus. In the calm, within [`BACK_WITHIN`], the device is
+//! a frame that is neither delivered nor counted, a frame that was never on the bus, misuse of the USB controller. In the calm, within [`BACK_WITHIN`], the device is
 //! back without the watchdog's help: it enumerates, begins a session and captures every frame.
 
 use cantap_emu::hostile::Hostile;
@@ -121,7 +121,7 @@ struct Bench {
     /// Resets seen so far, and those that something else than the firmware's failure caused.
     resets: u64,
     resets_wanted: u64,
-    /// As last told. What the book demands of a driver is judged where the silicon keeps to it, or departs from it in one way only.
+    /// As last seen.
     misuse: Misuse,
     story: Vec<String>,
     faults: Vec<String>,
@@ -414,6 +414,10 @@ impl Bench {
             self.fault(format_args!("{unwanted} resets by failures or the watchdog"));
         }
         self.tell("the end");
+        let misuse = self.misuse;
+        if misuse != Misuse::default() {
+            self.fault(format_args!("OTG_FS was misused: {misuse:?}"));
+        }
         let Self { rig, faults, .. } = self;
         faults.extend(law(&rig.ledger));
         faults.extend(rig.session.corruptions().iter().map(|corruption| format!("on USB: {corruption:?}")));

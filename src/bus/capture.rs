@@ -15,7 +15,7 @@ use cantap_wire::{CHANNELS, Channel, Event, Frame, Received};
 use gaps::{Gap, Gaps};
 
 use crate::QUEUE_BYTES;
-use crate::bus::errors::ErrorMonitor;
+use crate::bus::errors::{ErrorMonitor, StormGuard};
 use crate::bus::queue::Producer;
 use crate::bus::recorder::Recorder;
 use crate::bus::sof::SofMark;
@@ -61,6 +61,41 @@ impl Drain {
     }
 }
 
+/// Whether a channel was asked to leave its bus. Its FIFO is released again only once it has, since what a release does in between is not
+/// known.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Leaving {
+    No,
+    /// What it still receives is recorded. As a rule that is a single frame, the one that was on the bus.
+    Closing {
+        /// The frame in front is in the FIFO, and already recorded.
+        front_is_recorded: bool,
+    },
+    /// Nobody listens any more.
+    Abandoned,
+}
+
+impl Leaving {
+    /// Whether the FIFO must not be released now.
+    #[inline]
+    fn keeps_fifo(self, traffic: &impl Traffic) -> bool {
+        match self {
+            Self::No => false,
+            Self::Closing { .. } => traffic.is_leaving(),
+            Self::Abandoned => true,
+        }
+    }
+
+    /// Whether the frame that is now taken out of the FIFO, or given up, has been recorded already.
+    const fn take_recorded(&mut self) -> bool {
+        let recorded = matches!(self, Self::Closing { front_is_recorded: true });
+        if recorded {
+            *self = Self::Closing { front_is_recorded: false };
+        }
+        recorded
+    }
+}
+
 /// One channel's state.
 struct ChannelState<'q> {
     open: Option<ChannelConfig>,
@@ -70,8 +105,7 @@ struct ChannelState<'q> {
     overruns: u32,
     /// Where in the FIFO frames were lost.
     gaps: Gaps,
-    /// The channel was asked to leave its bus. Its FIFO is left alone until it has, since what a release does in between is not known.
-    closing: bool,
+    leaving: Leaving,
     /// Since the channel left its bus: frames in its FIFO that have not been taken yet.
     left: Option<u8>,
     /// The last drain was given up: the receive interrupt stays silent until the next millisecond.
@@ -79,6 +113,7 @@ struct ChannelState<'q> {
     /// How often a drain was given up, since the start.
     drains_given_up: u32,
     errors: ErrorMonitor,
+    error_storms: StormGuard,
     transmitter: Transmitter<'q>,
 }
 
@@ -102,11 +137,12 @@ impl<'q, const N: usize> Capture<'q, N> {
                 frames: 0,
                 overruns: 0,
                 gaps: Gaps::new(),
-                closing: false,
+                leaving: Leaving::No,
                 left: None,
                 held: false,
                 drains_given_up: 0,
                 errors: ErrorMonitor::new(channel),
+                error_storms: StormGuard::new(),
                 transmitter: Transmitter::new(channel, queue),
             }
         }
@@ -132,8 +168,8 @@ impl<'q, const N: usize> Capture<'q, N> {
         entered: u32,
     ) -> bool {
         let state = &mut self.channels[channel.index()];
-        if state.closing {
-            state.held = true;
+        if state.leaving.keeps_fifo(traffic) {
+            self.record_front(channel, traffic, entered);
             return false;
         }
         let mut drain = Drain { entered: Some(entered), ..Drain::whole(traffic.look()) };
@@ -170,11 +206,11 @@ impl<'q, const N: usize> Capture<'q, N> {
     ) -> bool {
         let now = self.recorder.time(clock.now());
         let state = &mut self.channels[channel.index()];
-        if state.held && state.closing && traffic.take_overrun() {
+        if state.held && state.leaving != Leaving::No && traffic.take_overrun() {
             state.gaps.overrun(traffic);
             Self::record_gap(state, &mut self.recorder, channel, now);
         }
-        state.held && !state.closing && self.drain_late(channel, traffic, clock)
+        state.held && state.leaving == Leaving::No && self.drain_late(channel, traffic, clock)
     }
 
     /// Records that frames are missing before the next one in the FIFO, if they are.
@@ -200,6 +236,26 @@ impl<'q, const N: usize> Capture<'q, N> {
         recorder.event(&Event::Lost { channel, stage: LossStage::Controller, count, at_least: true }, at);
     }
 
+    /// Counts and records a frame.
+    #[inline(always)]
+    #[expect(clippy::inline_always, reason = "measured, as for `Recorder::frame`")]
+    fn write_frame(
+        state: &mut ChannelState<'_>,
+        recorder: &mut Recorder<'_, N>,
+        channel: Channel,
+        frame: Frame,
+        at: u64,
+        quality: Stamp,
+    ) {
+        let (data_omitted, omit_stamps) = match &state.open {
+            Some(config) => (config.omit_data, config.omit_stamps),
+            None => (false, false),
+        };
+        state.frames = state.frames.wrapping_add(1);
+        let stamp = if omit_stamps { Stamp::Omitted } else { quality };
+        recorder.frame(&Received { channel, frame, stamp, data_omitted }, at);
+    }
+
     /// Records a frame that was taken out of the FIFO. Returns whether there are replies to it.
     #[inline(always)]
     #[expect(clippy::inline_always, reason = "measured, as for `Recorder::frame`")]
@@ -211,27 +267,35 @@ impl<'q, const N: usize> Capture<'q, N> {
         at: u64,
         quality: Stamp,
     ) -> bool {
-        let (data_omitted, omit_stamps) = match &state.open {
-            Some(config) => (config.omit_data, config.omit_stamps),
-            None => (false, false),
-        };
-        state.frames = state.frames.wrapping_add(1);
         let reply = state.transmitter.on_frame(&frame);
-        let stamp = if omit_stamps { Stamp::Omitted } else { quality };
-        recorder.frame(&Received { channel, frame, stamp, data_omitted }, at);
+        Self::write_frame(state, recorder, channel, frame, at, quality);
         if state.gaps.taken() {
             Self::record_gap(state, recorder, channel, at);
         }
         reply
     }
 
+    /// A frame has ended while its channel leaves the bus: records it now, with the interrupt's stamp, and leaves it in the FIFO. From here on
+    /// the interrupt stays silent. The stamp is that of a single frame only.
+    #[cold]
+    #[inline(never)]
+    fn record_front(&mut self, channel: Channel, traffic: &impl Traffic, entered: u32) {
+        let state = &mut self.channels[channel.index()];
+        let was_silent = core::mem::replace(&mut state.held, true);
+        if was_silent
+            || state.leaving != (Leaving::Closing { front_is_recorded: false })
+            || traffic.pending() != 1
+        {
+            return;
+        }
+        let Some(frame) = traffic.front() else { return };
+        let at = self.recorder.time(entered);
+        Self::write_frame(state, &mut self.recorder, channel, frame, at, Stamp::Exact);
+        state.leaving = Leaving::Closing { front_is_recorded: true };
+    }
+
     /// Drains the FIFO when nothing is known about when its frames ended. Returns whether it is empty.
     fn drain_late(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) -> bool {
-        let state = &mut self.channels[channel.index()];
-        if state.closing {
-            state.held = true;
-            return false;
-        }
         let drain = Drain::whole(traffic.look());
         self.drain(channel, traffic, clock, drain)
     }
@@ -437,12 +501,20 @@ impl<'q, const N: usize> Capture<'q, N> {
         }
     }
 
-    /// The error interrupt.
-    pub fn on_error(&mut self, channel: Channel, traffic: &mut impl Traffic, entered: u32) {
+    /// The error interrupt. Returns whether it may come again. If its flag does not clear, it would come at once and for ever: it must stay
+    /// silent until [`Self::take_errors_held`].
+    pub fn on_error(&mut self, channel: Channel, traffic: &mut impl Traffic, entered: u32) -> bool {
         let now = self.recorder.time(entered);
         let state = &mut self.channels[channel.index()];
         state.errors.update(traffic, &mut self.recorder, now);
         Self::give_up_when_off(state, traffic);
+        state.error_storms.admits(entered)
+    }
+
+    /// Part of [`Self::on_tick`]: whether an open channel's error interrupt, which was left silent, may come again.
+    pub const fn take_errors_held(&mut self, channel: Channel) -> bool {
+        let state = &mut self.channels[channel.index()];
+        state.open.is_some() && state.error_storms.take_held()
     }
 
     /// The alarm: something is due for transmission.
@@ -474,6 +546,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         for channel in Channel::ALL {
             let traffic = &mut traffic[channel.index()];
             self.on_tick_receive(channel, traffic, clock);
+            self.take_errors_held(channel);
             if self.on_tick_errors(channel, traffic, clock) {
                 for _ in 0..CALLS_PER_TICK {
                     if !self.on_tick_queues(channel, traffic, clock) {
@@ -599,6 +672,7 @@ impl<'q, const N: usize> Capture<'q, N> {
     pub fn oddities(&self) -> [ChannelOddities; CHANNELS] {
         self.channels.each_ref().map(|state| ChannelOddities {
             drains_given_up: state.drains_given_up,
+            error_storms: state.error_storms.storms(),
             mailboxes_stuck: state.transmitter.mailboxes_stuck(),
         })
     }

@@ -14,6 +14,11 @@ const REPORTED_PER_WINDOW: u8 = 20;
 /// After this time the number of the remaining errors is reported.
 const WINDOW_TICKS: u64 = (TICK_HZ / 10) as u64;
 
+/// Times that the error interrupt may come within [`STORM_WINDOW_TICKS`]. Two errors are at least 14 bit times apart (an error flag and a
+/// delimiter), so that at 1 Mbit/s a window has 72 of them, and a few changes of state.
+const MOST_CALLS: u8 = 100;
+const STORM_WINDOW_TICKS: u32 = TICKS_PER_MS;
+
 /// One channel's errors.
 pub struct ErrorMonitor {
     channel: Channel,
@@ -24,6 +29,51 @@ pub struct ErrorMonitor {
     reported: u8,
     suppressed: u32,
     window_ends: u64,
+}
+
+/// Notices an error interrupt whose flag is not cleared by clearing it: it would come at once and for ever, and nothing below it would run.
+/// By the stamps of the interrupt rather than by the tick, which may be late when there is much to do.
+pub(crate) struct StormGuard {
+    /// When the window began.
+    from: u32,
+    /// Calls within it.
+    calls: u8,
+    held: bool,
+    storms: u32,
+}
+
+impl StormGuard {
+    /// No calls yet.
+    pub const fn new() -> Self {
+        Self { from: 0, calls: 0, held: false, storms: 0 }
+    }
+
+    /// The interrupt came. Returns whether it may come again; if not, it must stay silent until [`Self::take_held`].
+    pub fn admits(&mut self, entered: u32) -> bool {
+        if entered.wrapping_sub(self.from) >= STORM_WINDOW_TICKS {
+            (self.from, self.calls) = (entered, 0);
+        }
+        self.calls = self.calls.saturating_add(1);
+        if self.calls > MOST_CALLS && !self.held {
+            self.held = true;
+            self.storms = self.storms.wrapping_add(1);
+        }
+        !self.held
+    }
+
+    /// Once a millisecond: whether the interrupt was left silent, and may come again now.
+    pub const fn take_held(&mut self) -> bool {
+        let held = core::mem::replace(&mut self.held, false);
+        if held {
+            self.calls = 0;
+        }
+        held
+    }
+
+    /// How often the interrupt was left silent, since the start; wraps.
+    pub const fn storms(&self) -> u32 {
+        self.storms
+    }
 }
 
 impl ErrorMonitor {

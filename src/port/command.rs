@@ -212,11 +212,16 @@ impl Commands {
                 for channel in Channel::ALL {
                     if board.is_open(channel) {
                         begin_close(channel, board);
+                        board.with_capture(|capture, _, _| capture.begin_leaving(channel));
                     }
                     board.control(channel).stop();
                 }
             }
-            Work::Open(channel, _) | Work::Close(channel) | Work::Recover(channel) => {
+            Work::Close(channel) => {
+                board.with_capture(|capture, _, _| capture.begin_leaving(channel));
+                board.control(channel).stop();
+            }
+            Work::Open(channel, _) | Work::Recover(channel) => {
                 board.control(channel).stop();
             }
         }

@@ -7,6 +7,7 @@ mod edges;
 mod errors;
 mod fakes;
 mod filters;
+mod leaving;
 mod long_pauses;
 mod periodic;
 mod queue;

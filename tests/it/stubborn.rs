@@ -189,6 +189,38 @@ fn a_mailbox_that_stays_finished_does_not_hold_the_interrupt() {
     assert_eq!(bench.send_one(CAN1), Some(numbered(2)));
 }
 
+/// ERRI that is not cleared by clearing it: the error interrupt would come at once and for ever, and USB and the tick would never run.
+#[test]
+fn an_error_flag_that_stays_set_does_not_hold_the_interrupt() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::ListenOnly);
+    for round in 1..=3 {
+        let storm = (0..100_000).take_while(|_| {
+            bench.pass(2 * TICKS_PER_US);
+            let entered = bench.board.clock.now.get();
+            bench.board.capture.on_error(CAN1, &mut bench.board.traffic[0], entered)
+        });
+        assert!(storm.count() <= 100, "it goes on");
+        assert_eq!(bench.board.capture.oddities().map(|channel| channel.error_storms), [round, 0]);
+        bench.pass(TICKS_PER_MS);
+        assert!(bench.board.capture.take_errors_held(CAN1), "the next tick lets it come again");
+        assert!(!bench.board.capture.take_errors_held(CAN1));
+    }
+}
+
+/// An error flag and its delimiter are 14 bits: no bus has more errors, however late the tick is.
+#[test]
+fn the_errors_of_a_broken_bus_never_silence_their_interrupt() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::ListenOnly);
+    for _ in 0..5_000 {
+        bench.pass(14 * TICKS_PER_US);
+        let entered = bench.board.clock.now.get();
+        assert!(bench.board.capture.on_error(CAN1, &mut bench.board.traffic[0], entered));
+    }
+    assert_eq!(bench.board.capture.oddities()[0].error_storms, 0);
+}
+
 /// A controller that shows no free mailbox although none is in use. An alarm for what is due would fire again and again.
 #[test]
 fn a_controller_that_takes_no_frame_raises_no_storm_of_alarms() {

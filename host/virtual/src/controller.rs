@@ -315,6 +315,10 @@ impl Traffic for TrafficSide {
         self.0.borrow().fifo.len() as u8
     }
 
+    fn front(&self) -> Option<Frame> {
+        self.0.borrow().fifo.front().copied()
+    }
+
     fn receive(&mut self) -> Option<Frame> {
         self.0.borrow_mut().fifo.pop_front()
     }

@@ -232,3 +232,34 @@ fn a_run_depends_on_its_seed_only() {
     assert_eq!(first, figures(7));
     assert_ne!(first, figures(8));
 }
+
+/// Wherever in a frame its channel is asked to leave its bus, the frame is delivered with the stamp of its interrupt.
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn the_last_frame_before_a_channel_leaves_its_bus_has_an_exact_stamp() {
+    for kind in [Kind::Std0, Kind::Std8] {
+        let mut rig = Rig::new(common::firmware(), common::setup(), Timing::hasty(CLOCK));
+        for channel in Channel::ALL {
+            rig.add_traffic(
+                channel,
+                1_000_000,
+                Traffic::new(kind, channel.index() as u64, 100.0, 0, u64::MAX),
+            );
+        }
+        rig.connect().unwrap();
+        for round in 0..40 {
+            for channel in Channel::ALL {
+                rig.listen(channel, 1_000_000).unwrap();
+            }
+            rig.run_for(2 * MS + round * (MS / 300)).unwrap();
+            for channel in Channel::ALL {
+                rig.close(channel).unwrap();
+            }
+        }
+        assert!(rig.ledger.holds(), "{:?}", rig.ledger.faults());
+        let stamps = rig.ledger.stamps();
+        println!("{stamps:?}");
+        assert_eq!(stamps.bounds, 0, "{kind:?}: {stamps:?}");
+        assert!(stamps.max <= 1000, "{kind:?}: {stamps:?}");
+    }
+}

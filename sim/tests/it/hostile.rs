@@ -227,6 +227,45 @@ fn a_core_reset_takes_its_time() {
     lives_with(of_usb(UsbFaults { core_reset: Tardy::always(150), ..UsbFaults::default() }));
 }
 
+/// What is written to a core that is still being reset is lost, so that no host would ever see the device.
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn a_core_reset_that_does_not_end_is_asked_for_again() {
+    let mut rig = board(of_usb(UsbFaults { core_reset: Tardy::NEVER, ..UsbFaults::default() }));
+    rig.run_for(50 * MS).unwrap();
+    rig.calm();
+    rig.plug_in().unwrap();
+    capture(&mut rig);
+    check(&mut rig);
+}
+
+/// A transmit FIFO is flushed only while the bus is idle (AHBIDL). Until that has happened, what is left in it must not get in front of what
+/// is sent next. Of these resets half do not end, and after half of the others the bus does not become idle.
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn what_could_not_be_flushed_is_not_sent() {
+    let core_reset = Tardy { percent: 50, longest_us: 1, never_percent: 100 };
+    for seed in 0..12 {
+        let mut rig = board(Hostile { seed, ..of_usb(UsbFaults { core_reset, ..UsbFaults::default() }) });
+        rig.be_patient_for(BACK_WITHIN);
+        rig.plug_in().unwrap();
+        for _ in 0..4 {
+            rig.greet().unwrap();
+            for channel in Channel::ALL {
+                rig.listen(channel, MEGABIT).unwrap();
+            }
+            rig.with_host(|host, _| host.read(false));
+            rig.run_for(3 * MS).unwrap();
+            rig.with_host(cantap_emu::usb_host::UsbHost::reset);
+            rig.with_host(|host, _| host.read(true));
+            rig.run_for(8 * MS).unwrap();
+            rig.cut();
+            rig.wait_for_port().unwrap();
+        }
+        check(&mut rig);
+    }
+}
+
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn nak_and_disable_take_their_time() {

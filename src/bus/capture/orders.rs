@@ -2,10 +2,10 @@
 
 use cantap_wire::message::{ChannelConfig, ChannelStatus, Registers};
 use cantap_wire::record::{LossStage, Stamp, TransmitFailure};
-use cantap_wire::{Channel, Event, Received};
+use cantap_wire::{Channel, Event};
 
 use super::gaps::{Gap, Gaps};
-use super::{Capture, LOOKS_PER_DRAIN};
+use super::{Capture, LOOKS_PER_DRAIN, Leaving};
 use crate::bus::errors::ErrorMonitor;
 use crate::bus::transmit::{Transmitter, forget_finished};
 use crate::ports::{Clock, Traffic};
@@ -46,7 +46,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         let state = &mut self.channels[channel.index()];
         state.open = Some(config);
         state.abort_reason = TransmitFailure::Aborted;
-        (state.closing, state.left, state.gaps) = (false, None, Gaps::new());
+        (state.leaving, state.left, state.gaps) = (Leaving::No, None, Gaps::new());
         state.errors.restart();
         self.recorder.event(&Event::Started { channel }, now);
     }
@@ -64,19 +64,26 @@ impl<'q, const N: usize> Capture<'q, N> {
         self.channels[channel.index()].transmitter.clear_entries(now);
     }
 
-    /// Second part of closing: drains the FIFO for the last time before the channel has left, and aborts transmissions. The channel is still
-    /// on the bus.
+    /// Second part of closing: aborts transmissions, and drains a FIFO whose last drain was given up. Any other is left to its interrupt, which
+    /// knows when a frame ended. The channel is still on the bus.
     pub fn begin_close(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) {
-        self.drain_late(channel, traffic, clock);
+        if self.channels[channel.index()].held {
+            self.drain_late(channel, traffic, clock);
+        }
         let now = self.now(clock);
         let state = &mut self.channels[channel.index()];
-        state.closing = true;
         state.abort_reason = TransmitFailure::Closed;
         state.transmitter.drop_all(TransmitFailure::Closed, traffic);
         state.transmitter.on_finished(traffic, &mut self.recorder, now, state.abort_reason);
     }
 
-    /// Third part of closing: the channel has left the bus. Takes what is still in its FIFO, and returns whether that is empty now. Call
+    /// Third part of closing, immediately before the channel is asked to leave the bus: from here on its FIFO is not released any more. In a lock
+    /// of its own, so that frames which ended during the one before have been taken as usual.
+    pub fn begin_leaving(&mut self, channel: Channel) {
+        self.channels[channel.index()].leaving = Leaving::Closing { front_is_recorded: false };
+    }
+
+    /// Fourth part of closing: the channel has left the bus. Takes what is still in its FIFO, and returns whether that is empty now. Call
     /// it until it is.
     ///
     /// No manual promises that a frame can be released in initialisation mode. But none arrives any more, so their number says
@@ -89,14 +96,12 @@ impl<'q, const N: usize> Capture<'q, N> {
             state.gaps.overrun(traffic);
         }
         Self::record_gap(state, &mut self.recorder, channel, now);
-        let (omit_data, omit_stamps) =
-            state.open.map_or((false, false), |config| (config.omit_data, config.omit_stamps));
         while left > 0 && traffic.pending() <= left {
             let Some(frame) = traffic.receive() else { break };
             left -= 1;
-            state.frames = state.frames.wrapping_add(1);
-            let stamp = if omit_stamps { Stamp::Omitted } else { Stamp::UpperBound };
-            self.recorder.frame(&Received { channel, frame, stamp, data_omitted: omit_data }, now);
+            if !state.leaving.take_recorded() {
+                Self::write_frame(state, &mut self.recorder, channel, frame, now, Stamp::UpperBound);
+            }
             if state.gaps.taken() {
                 Self::record_gap(state, &mut self.recorder, channel, now);
             }
@@ -111,6 +116,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         let now = self.now(clock);
         let state = &mut self.channels[channel.index()];
         let left = state.left.replace(0).unwrap_or(0);
+        let left = left.saturating_sub(u8::from(state.leaving.take_recorded()));
         let gap = state.gaps.rest();
         if left > 0 || gap != Gap::None {
             let count = left + u8::from(gap == Gap::Certain);
@@ -155,7 +161,7 @@ impl<'q, const N: usize> Capture<'q, N> {
     /// Nobody listens any more: nothing more is sent. The channel is still on the bus.
     pub fn begin_abandon(&mut self, channel: Channel, traffic: &mut impl Traffic) {
         let state = &mut self.channels[channel.index()];
-        state.closing = true;
+        state.leaving = Leaving::Abandoned;
         state.transmitter.clear();
         traffic.abort();
     }

@@ -3,14 +3,15 @@
 use stm32f4xx_hal::pac::can1::RegisterBlock;
 use stm32f4xx_hal::pac::{CAN1, CAN2};
 
-/// Bits of IER: transmit mailbox empty, FIFO 0 message pending (RM0090, CAN_IER).
+/// Bits of IER: transmit mailbox empty, FIFO 0 message pending, errors of any kind (RM0090, CAN_IER).
 pub(super) const TMEIE: usize = 0;
 const FMPIE0: usize = 1;
+const ERRIE: usize = 15;
 
-/// The switches of a controller's receive and transmit interrupts: `CAN` is 0 or 1. Each interrupt only stamps, silences itself and leaves
-/// the rest to a task of lower priority, which enables it again.
+/// The switches of a controller's interrupts: `CAN` is 0 or 1. Those for reception and transmission each only stamp, silence themselves and
+/// leave the rest to a task of lower priority, which enables them again. That for errors is silenced only if its flag does not clear.
 ///
-/// Both tasks and both interrupts share these. The switches are bits of one register, each changed atomically through its bit-band alias
+/// All these tasks and interrupts share these. The switches are bits of one register, each changed atomically through its bit-band alias
 /// (Cortex-M4 technical reference manual, "Bit-banding"): if the whole register were read and written back, a change made by an
 /// interrupt in between would be undone. Commands write the register only while the controller is off the bus.
 ///
@@ -53,6 +54,17 @@ impl<const CAN: usize> Bells<CAN> {
     pub fn open_receive(&self) {
         switch(Self::registers(), FMPIE0, true);
         cortex_m::asm::dsb();
+    }
+
+    /// Ends the error interrupt although its flag is set.
+    #[cold]
+    pub fn silence_errors(&self) {
+        Self::silence(ERRIE);
+    }
+
+    /// Enables the error interrupt again.
+    pub fn open_errors(&self) {
+        switch(Self::registers(), ERRIE, true);
     }
 
     /// Ends the transmit interrupt although a mailbox has finished, until [`Traffic::await_finished`].

@@ -85,7 +85,7 @@ impl Traffic for CanTraffic {
 
     #[inline(always)]
     #[expect(clippy::inline_always, reason = "measured, as for `Recorder::frame`")]
-    fn receive(&mut self) -> Option<Frame> {
+    fn front(&self) -> Option<Frame> {
         let fifo = self.can.rf0r();
         // While a frame is being released, the mailbox still shows it.
         let mut status = fifo.read();
@@ -106,10 +106,22 @@ impl Traffic for CanTraffic {
         let dlc = mailbox.rdtr().read().dlc().bits();
         let low = mailbox.rdlr().read().bits();
         let high = mailbox.rdhr().read().bits();
-        fifo.write(|w| w.rfom().release());
-
         let data = (u64::from(high) << 32 | u64::from(low)).to_le_bytes();
         Some(Frame::from_bus(received_id(&rir), rir.rtr().is_remote(), dlc, data))
+    }
+
+    #[inline(always)]
+    #[expect(clippy::inline_always, reason = "measured, as for `Recorder::frame`")]
+    fn receive(&mut self) -> Option<Frame> {
+        let frame = self.front()?;
+        self.can.rf0r().write(|w| w.rfom().release());
+        Some(frame)
+    }
+
+    fn is_leaving(&self) -> bool {
+        // SLEEP, because a master reset sets that and clears INRQ (RM0090, CAN_MCR).
+        let mcr = self.can.mcr().read();
+        mcr.inrq().bit() || mcr.sleep().bit() || mcr.reset().bit()
     }
 
     #[inline]

@@ -34,7 +34,8 @@ const NOTIFY_PACKET: u16 = 8;
 const WORDS_PER_POLL: usize = 64;
 /// A controller that has not taken a packet after this time, in ms, will not: the transfer before does not end.
 const BLOCKED_MS: u32 = 100;
-/// How long the device then stays away from the bus, in ms, so that a host notices (as `hw::start` does).
+/// How long the device then stays away from the bus, in ms, so that a host notices (as `hw::start` does); also how long it waits before it
+/// tries again to reset a core whose reset did not end.
 const AWAY_MS: u32 = 10;
 
 /// Whether the host has the port open.
@@ -84,12 +85,17 @@ impl Core {
         }
     }
 
-    /// Connects to the bus (RM0090, "Core initialization" and "Device initialization").
+    /// Connects to the bus (RM0090, "Core initialization" and "Device initialization"). If the core's reset does not end, [`Self::tick`] tries
+    /// again: whatever is written before its end would be lost.
     fn enable(&mut self) {
         let registers = &mut self.registers;
         registers.wait_until(|registers| registers.read(GRSTCTL) & grstctl::AHBIDL != 0);
         registers.write(GRSTCTL, grstctl::CSRST);
-        registers.wait_until(|registers| registers.read(GRSTCTL) & grstctl::CSRST == 0);
+        if !registers.wait_until(|registers| registers.read(GRSTCTL) & grstctl::CSRST == 0) {
+            self.away_ms = Some(AWAY_MS);
+            return;
+        }
+        registers.forget_flushes();
         registers.wait_until(|registers| registers.read(GRSTCTL) & grstctl::AHBIDL != 0);
         // Before a host can see the device: what it does from then on is not to be forgotten.
         registers.write(GINTSTS, !0);
@@ -309,6 +315,7 @@ impl Core {
             Some(left) => self.away_ms = Some(left - 1),
             None => {
                 let Self { registers, control, bulk_in, bulk_out, .. } = self;
+                registers.flush_rest();
                 let blocked_ms = control.tick(registers).max(bulk_in.tick(registers));
                 bulk_out.arm(registers);
                 if blocked_ms > BLOCKED_MS {

@@ -170,6 +170,8 @@ impl Endpoint {
 /// How long to wait for a flag of the controller, in ticks: 1 ms. It follows within some clocks of USB as a rule, and within a frame where
 /// a packet has to end first.
 const MOST_TICKS: u32 = TICKS_PER_MS;
+/// A bit for each transmit FIFO: there are four.
+const ALL_FIFOS: u32 = 0xF;
 /// How long the core may take to become a device, in ticks: 50 ms. The manual asks for 25 (RM0090, GUSBCFG, FDMOD), and NuttX waits for 50.
 const MODE_TICKS: u32 = 50 * TICKS_PER_MS;
 
@@ -178,13 +180,15 @@ pub struct Registers {
     timer: StampTimer,
     /// Flags that were waited for and did not come in time; wraps.
     waits_given_up: u32,
+    /// Transmit FIFOs that the bus was not idle enough to flush, one bit each: what is left in them must not be sent.
+    unflushed: u32,
 }
 
 #[expect(clippy::unused_self, reason = "having it is the right to touch the controller")]
 impl Registers {
     /// Made from the peripheral itself, which nobody else can then have.
     pub const fn new(_: (OTG_FS_GLOBAL, OTG_FS_DEVICE, OTG_FS_PWRCLK), timer: StampTimer) -> Self {
-        Self { timer, waits_given_up: 0 }
+        Self { timer, waits_given_up: 0, unflushed: 0 }
     }
 
     fn at(offset: usize) -> *mut u32 {
@@ -280,18 +284,39 @@ impl Registers {
         }
     }
 
-    /// Whether a new transfer may be written to an IN endpoint: the last one is over, and no FIFO is being flushed.
+    /// Whether a new transfer may be written to an IN endpoint: the last one is over, and no FIFO is being flushed or still has to be.
     pub fn is_free(&self, endpoint: Endpoint) -> bool {
-        !self.is_armed(endpoint) && self.read(GRSTCTL) & grstctl::TXFFLSH == 0
+        self.unflushed == 0 && !self.is_armed(endpoint) && self.read(GRSTCTL) & grstctl::TXFFLSH == 0
     }
 
-    /// Empties a transmit FIFO, or all of them. If that takes too long, [`Self::is_free`] says when it has ended.
+    /// Empties a transmit FIFO, or all of them. If that takes too long, or cannot begin, [`Self::is_free`] says when it has ended.
     pub fn flush_tx(&mut self, number: u32) {
-        let idle = |value: u32| value & (grstctl::AHBIDL | grstctl::TXFFLSH) == grstctl::AHBIDL;
-        if self.wait_until(|registers| idle(registers.read(GRSTCTL))) {
-            self.write(GRSTCTL, grstctl::TXFFLSH | number << grstctl::TXFNUM_SHIFT);
+        self.unflushed |= if number == grstctl::ALL_TX_FIFOS { ALL_FIFOS } else { 1 << number };
+        if self.wait_until(Self::can_flush) {
+            self.flush_rest();
             self.wait_until(|registers| registers.read(GRSTCTL) & grstctl::TXFFLSH == 0);
         }
+    }
+
+    fn can_flush(&self) -> bool {
+        self.read(GRSTCTL) & (grstctl::AHBIDL | grstctl::TXFFLSH) == grstctl::AHBIDL
+    }
+
+    /// Begins to empty what [`Self::flush_tx`] could not, if that is possible now: one FIFO, or all.
+    pub fn flush_rest(&mut self) {
+        if self.unflushed == 0 || !self.can_flush() {
+            return;
+        }
+        let number =
+            if self.unflushed == ALL_FIFOS { grstctl::ALL_TX_FIFOS } else { self.unflushed.trailing_zeros() };
+        self.write(GRSTCTL, grstctl::TXFFLSH | number << grstctl::TXFNUM_SHIFT);
+        self.unflushed =
+            if number == grstctl::ALL_TX_FIFOS { 0 } else { self.unflushed & (self.unflushed - 1) };
+    }
+
+    /// The core has been reset: its FIFOs are empty.
+    pub const fn forget_flushes(&mut self) {
+        self.unflushed = 0;
     }
 
     /// Empties the receive FIFO.

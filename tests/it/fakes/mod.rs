@@ -129,6 +129,10 @@ impl Traffic for FakeTraffic {
         (self.fifo.len() as u8, self.take_overrun())
     }
 
+    fn front(&self) -> Option<Frame> {
+        self.fifo.front().copied().filter(|_| !self.releasing)
+    }
+
     fn receive(&mut self) -> Option<Frame> {
         self.received += 1;
         assert!(self.received < ENDLESS, "the drain does not end");

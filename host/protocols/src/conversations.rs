@@ -268,6 +268,7 @@ impl Conversations {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::EventKind;
     use crate::testing::at;
 
     fn said(protocol: Protocol, frames: &[(f64, &str)]) -> Vec<String> {
@@ -307,8 +308,8 @@ mod tests {
         assert_eq!(events, []);
         conversations.take(&at(9001.0, "7E8#0462F19041"), &mut events);
         let said: Vec<_> = events.iter().map(|event| (event.kind, event.time_ns / 1_000_000)).collect();
-        assert_eq!(said.last(), Some(&("exchange", 9001)));
-        assert!(said.iter().any(|(kind, _)| *kind == "no_response"), "{said:?}");
+        assert_eq!(said.last(), Some(&(EventKind::Exchange, 9001)));
+        assert!(said.iter().any(|(kind, _)| *kind == EventKind::NoResponse), "{said:?}");
         let before = events.len();
         conversations.take(&at(9002.0, "7E0#0210"), &mut events);
         conversations.take(&at(9003.0, "7E8#037F1012"), &mut events);

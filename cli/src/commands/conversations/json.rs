@@ -131,14 +131,14 @@ fn push_text(out: &mut String, text: &str) {
 
 #[cfg(test)]
 mod tests {
-    use cantap_protocols::Protocol;
+    use cantap_protocols::{EventKind, Protocol};
     use cantap_trace::{TraceEvent, TraceRecord};
 
     use super::*;
 
     fn object(fields: Vec<Field>) -> serde_json::Value {
         let record = TraceRecord { time_ns: 1_500_000_000, channel: 1, event: TraceEvent::GAP };
-        let mut event = Event::new(Protocol::Uds, &record, "exchange", "a \"title\"\n");
+        let mut event = Event::new(Protocol::Uds, &record, EventKind::Exchange, "a \"title\"\n");
         event.fields = fields;
         let mut line = String::new();
         push(&mut line, &event);

@@ -26,7 +26,7 @@ fn fields(event: &Event) -> Vec<(String, Value, String, Option<String>)> {
         fields.push((name, field.value.clone(), field.unit.to_string(), text));
     }
     let mut add = |name: &str, value: Value| fields.push((name.to_owned(), value, String::new(), None));
-    add("kind", Value::Text(event.kind.into()));
+    add("kind", Value::Text(event.kind.name().into()));
     if let Some(ns) = event.response_ns {
         add("response_ms", Value::Real(ns as f64 / 1e6));
     }

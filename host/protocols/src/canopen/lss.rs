@@ -1,45 +1,17 @@
 //! Layer setting services (CiA 305): node numbers and bit rates of nodes that have none yet.
 
+use std::borrow::Cow;
+
 use cantap_trace::TraceRecord;
 
-use crate::{Event, Field, Protocol};
+use super::codec::lss::{Bound, Part, Request, Response, Service};
+use crate::{Event, EventKind, Field, Protocol};
 
 /// A service of the master that a slave may answer.
 #[derive(Default)]
 pub struct Lss {
-    asked: Option<(i64, u8)>,
+    asked: Option<(i64, Request)>,
     frames_lost: bool,
-}
-
-const fn title(service: u8) -> Option<&'static str> {
-    Some(match service {
-        0x04 => "LSS switch state global",
-        0x11 => "LSS configure node number",
-        0x13 => "LSS configure bit timing",
-        0x15 => "LSS activate bit timing",
-        0x17 => "LSS store configuration",
-        0x40 => "LSS switch state selective: vendor",
-        0x41 => "LSS switch state selective: product",
-        0x42 => "LSS switch state selective: revision",
-        0x43 => "LSS switch state selective: serial number",
-        0x44 => "LSS switched",
-        0x46 => "LSS identify: vendor",
-        0x47 => "LSS identify: product",
-        0x48 => "LSS identify: revision, lowest",
-        0x49 => "LSS identify: revision, highest",
-        0x4A => "LSS identify: serial number, lowest",
-        0x4B => "LSS identify: serial number, highest",
-        0x4C => "LSS identify slaves without a number",
-        0x4F => "LSS identified",
-        0x50 => "LSS a slave without a number",
-        0x51 => "LSS fast scan",
-        0x5A => "LSS inquire vendor",
-        0x5B => "LSS inquire product",
-        0x5C => "LSS inquire revision",
-        0x5D => "LSS inquire serial number",
-        0x5E => "LSS inquire node number",
-        _ => return None,
-    })
 }
 
 impl Lss {
@@ -48,47 +20,50 @@ impl Lss {
         self.frames_lost = true;
     }
 
-    /// Takes a frame from the master (7E5) or a slave (7E4).
-    pub fn take(&mut self, record: &TraceRecord, from_master: bool, data: &[u8]) -> Option<Event> {
-        let (&service, rest) = data.split_first()?;
-        let kind = if from_master { "lss" } else { "lss_answer" };
-        let known = title(service);
-        let mut event = Event::new(Protocol::CanOpen, record, kind, known.unwrap_or("LSS, unknown service"));
-        if known.is_none() {
-            event.fields.push(Field::hex("service", service, 2));
-            event.fields.push(Field::bytes("data", rest));
-            return Some(event);
-        }
-        let word =
-            |bytes: &[u8]| bytes.iter().take(4).rev().fold(0_u64, |word, byte| word << 8 | u64::from(*byte));
+    /// Takes a frame from the master.
+    pub fn request(&mut self, record: &TraceRecord, data: &[u8]) -> Option<Event> {
+        let request = Request::decode(data);
+        self.asked = request.map(|request| (record.time_ns, request));
+        self.frames_lost = false;
+        let Some(request) = request else { return unknown(record, EventKind::Lss, data) };
+        let mut event = Event::new(Protocol::CanOpen, record, EventKind::Lss, request_title(&request));
         let fields = &mut event.fields;
-        match (service, rest) {
-            (0x04, [mode, ..]) => {
-                let text = ["waiting", "configuration"].get(usize::from(*mode)).copied();
-                fields.push(Field::number("mode", *mode).meaning(text));
+        match request {
+            Request::SwitchGlobal(mode) => {
+                let text = ["waiting", "configuration"].get(usize::from(mode)).copied();
+                fields.push(Field::number("mode", mode).meaning(text));
             }
-            (0x11, [node, ..]) if from_master => fields.push(Field::number("node", *node)),
-            (0x13, [table, index, ..]) if from_master => {
-                const RATES: [&str; 10] = [
-                    "1 Mbit/s",
-                    "800 kbit/s",
-                    "500 kbit/s",
-                    "250 kbit/s",
-                    "125 kbit/s",
-                    "reserved",
-                    "50 kbit/s",
-                    "20 kbit/s",
-                    "10 kbit/s",
-                    "automatic",
-                ];
-                let text = RATES.get(usize::from(*index)).copied().filter(|_| *table == 0);
-                fields.push(Field::number("table", *table));
-                fields.push(Field::number("index", *index).meaning(text));
+            Request::ConfigureNode(node) => fields.push(Field::number("node", node)),
+            Request::ConfigureBitTiming { table, index } => {
+                let text = RATES.get(usize::from(index)).copied().filter(|_| table == 0);
+                fields.push(Field::number("table", table));
+                fields.push(Field::number("index", index).meaning(text));
             }
-            (0x15, [low, high, ..]) => {
-                fields.push(Field::number("switch_delay_ms", u16::from_le_bytes([*low, *high])));
+            Request::ActivateBitTiming(delay_ms) => fields.push(Field::number("switch_delay_ms", delay_ms)),
+            Request::SwitchSelective(_, value) | Request::Identify(_, value) => {
+                fields.push(Field::hex("value", value, 8));
             }
-            (0x11 | 0x13 | 0x17, [error, own, ..]) => {
+            Request::FastScan { value, unchecked, part, next } => {
+                fields.push(Field::hex("value", value, 8));
+                fields.push(Field::number("bits_not_checked", unchecked));
+                fields.push(Field::number("part", part));
+                fields.push(Field::number("next_part", next));
+            }
+            Request::Store | Request::IdentifyWithoutNumber | Request::Inquire(_) | Request::InquireNode => {}
+        }
+        Some(event)
+    }
+
+    /// Takes a frame from a slave.
+    pub fn response(&mut self, record: &TraceRecord, data: &[u8]) -> Option<Event> {
+        let Some(response) = Response::decode(data) else {
+            return unknown(record, EventKind::LssAnswer, data);
+        };
+        let mut event =
+            Event::new(Protocol::CanOpen, record, EventKind::LssAnswer, response_title(&response));
+        let fields = &mut event.fields;
+        match response {
+            Response::Outcome { error, device_error, .. } => {
                 let text = match error {
                     0 => "success",
                     1 => "out of range, or not supported",
@@ -96,35 +71,88 @@ impl Lss {
                     0xFF => "a reason of the device",
                     _ => "reserved",
                 };
-                fields.push(Field::number("error", *error).meaning(Some(text)));
-                fields.push(Field::number("device_error", *own));
+                fields.push(Field::number("error", error).meaning(Some(text)));
+                fields.push(Field::number("device_error", device_error));
             }
-            (0x40..=0x43 | 0x46..=0x4B, rest) => fields.push(Field::hex("value", word(rest), 8)),
-            (0x5A..=0x5D, rest) if !from_master => fields.push(Field::hex("value", word(rest), 8)),
-            (0x5E, [node, ..]) if !from_master => fields.push(Field::number("node", *node)),
-            (0x51, [a, b, c, d, bit, sub, next]) => {
-                fields.push(Field::hex("value", word(&[*a, *b, *c, *d]), 8));
-                fields.push(Field::number("bits_not_checked", *bit));
-                fields.push(Field::number("part", *sub));
-                fields.push(Field::number("next_part", *next));
-            }
-            _ => {}
+            Response::Address(_, value) => fields.push(Field::hex("value", value, 8)),
+            Response::Node(node) => fields.push(Field::number("node", node)),
+            Response::Selected | Response::Identified | Response::WithoutNumber => {}
         }
-        if from_master {
-            self.asked = Some((record.time_ns, service));
-            self.frames_lost = false;
-        } else if let Some((asked_ns, asked)) = self.asked {
-            let answers = match service {
-                0x44 => asked == 0x43,
-                0x4F => matches!(asked, 0x4B | 0x51 | 0x4C),
-                0x50 => asked == 0x4C,
-                service => asked == service,
-            };
-            if answers {
-                event.response_ns = Some(record.time_ns.saturating_sub(asked_ns));
-                event.frames_lost = self.frames_lost;
-            }
+        if let Some((asked_ns, request)) = &self.asked
+            && response.answers(request)
+        {
+            event.response_ns = Some(record.time_ns.saturating_sub(*asked_ns));
+            event.frames_lost = self.frames_lost;
         }
         Some(event)
+    }
+}
+
+/// A frame that is none of this side's services, or lacks bytes.
+fn unknown(record: &TraceRecord, kind: EventKind, data: &[u8]) -> Option<Event> {
+    let (&service, rest) = data.split_first()?;
+    let mut event = Event::new(Protocol::CanOpen, record, kind, Cow::Borrowed("LSS, unknown service"));
+    event.fields.push(Field::hex("service", service, 2));
+    event.fields.push(Field::bytes("data", rest));
+    Some(event)
+}
+
+/// CiA's table of bit rates.
+const RATES: [&str; 10] = [
+    "1 Mbit/s",
+    "800 kbit/s",
+    "500 kbit/s",
+    "250 kbit/s",
+    "125 kbit/s",
+    "reserved",
+    "50 kbit/s",
+    "20 kbit/s",
+    "10 kbit/s",
+    "automatic",
+];
+
+const fn request_title(request: &Request) -> &'static str {
+    match request {
+        Request::SwitchGlobal(_) => "LSS switch state global",
+        Request::ConfigureNode(_) => "LSS configure node number",
+        Request::ConfigureBitTiming { .. } => "LSS configure bit timing",
+        Request::ActivateBitTiming(_) => "LSS activate bit timing",
+        Request::Store => "LSS store configuration",
+        Request::SwitchSelective(Part::Vendor, _) => "LSS switch state selective: vendor",
+        Request::SwitchSelective(Part::Product, _) => "LSS switch state selective: product",
+        Request::SwitchSelective(Part::Revision, _) => "LSS switch state selective: revision",
+        Request::SwitchSelective(Part::Serial, _) => "LSS switch state selective: serial number",
+        Request::Identify(Bound::Vendor, _) => "LSS identify: vendor",
+        Request::Identify(Bound::Product, _) => "LSS identify: product",
+        Request::Identify(Bound::LowestRevision, _) => "LSS identify: revision, lowest",
+        Request::Identify(Bound::HighestRevision, _) => "LSS identify: revision, highest",
+        Request::Identify(Bound::LowestSerial, _) => "LSS identify: serial number, lowest",
+        Request::Identify(Bound::HighestSerial, _) => "LSS identify: serial number, highest",
+        Request::IdentifyWithoutNumber => "LSS identify slaves without a number",
+        Request::FastScan { .. } => "LSS fast scan",
+        Request::Inquire(part) => inquiry_title(*part),
+        Request::InquireNode => "LSS inquire node number",
+    }
+}
+
+const fn response_title(response: &Response) -> &'static str {
+    match response {
+        Response::Outcome { service: Service::ConfigureNode, .. } => "LSS configure node number",
+        Response::Outcome { service: Service::ConfigureBitTiming, .. } => "LSS configure bit timing",
+        Response::Outcome { service: Service::Store, .. } => "LSS store configuration",
+        Response::Selected => "LSS switched",
+        Response::Identified => "LSS identified",
+        Response::WithoutNumber => "LSS a slave without a number",
+        Response::Address(part, _) => inquiry_title(*part),
+        Response::Node(_) => "LSS inquire node number",
+    }
+}
+
+const fn inquiry_title(part: Part) -> &'static str {
+    match part {
+        Part::Vendor => "LSS inquire vendor",
+        Part::Product => "LSS inquire product",
+        Part::Revision => "LSS inquire revision",
+        Part::Serial => "LSS inquire serial number",
     }
 }

@@ -1,6 +1,7 @@
 use cantap_trace::{TraceEvent, TraceRecord};
 
 use super::*;
+use crate::EventKind;
 use crate::testing::{self, at, hex};
 
 fn diagnostics() -> Diagnostics {
@@ -85,14 +86,14 @@ fn several_servers_answer_a_request_to_all() {
 #[test]
 fn silence_is_said_and_a_loss_meanwhile_too() {
     let all = events(&[at(0.0, "7E0#023E00"), at(2500.0, "123#")]);
-    assert_eq!((all[0].kind, all[0].time_ns), ("no_response", 2_000_000_000));
+    assert_eq!((all[0].kind, all[0].time_ns), (EventKind::NoResponse, 2_000_000_000));
     assert_eq!(all[0].trouble, Some(Trouble::Timeout { after_ms: 2000 }));
     let gap = TraceRecord { time_ns: 1_000_000, channel: 1, event: TraceEvent::GAP };
     let all = events(&[at(0.0, "7E0#023E00"), gap, at(2500.0, "123#")]);
     assert!(all[0].frames_lost, "{all:?}");
     let all = events(&[at(0.0, "7E0#023E00"), at(10.0, "7E0#021001"), at(11.0, "7E8#025001")]);
     let kinds: Vec<_> = all.iter().map(|event| (event.kind, event.trouble)).collect();
-    assert_eq!(kinds, [("no_response", Some(Trouble::Overlapped)), ("exchange", None)]);
+    assert_eq!(kinds, [(EventKind::NoResponse, Some(Trouble::Overlapped)), (EventKind::Exchange, None)]);
     assert_eq!(events(&[at(0.0, "7E0#023E00")])[0].trouble, Some(Trouble::Unfinished));
 }
 
@@ -690,7 +691,10 @@ fn a_loss_before_a_pair_is_known_is_said_of_what_it_touched() {
     ]);
     let all: Vec<_> =
         all.iter().map(|event| (event.kind, event.time_ns / 1_000_000, event.frames_lost)).collect();
-    assert_eq!(all, [("exchange", 1, false), ("exchange", 11, true), ("exchange", 21, false)]);
+    assert_eq!(
+        all,
+        [(EventKind::Exchange, 1, false), (EventKind::Exchange, 11, true), (EventKind::Exchange, 21, false)]
+    );
 }
 
 /// One identifier asks several servers, each of which has a tester's identifier of its own.

@@ -184,7 +184,7 @@ fn messages_at_random_are_whole_and_right_or_said_to_be_broken() {
         }
         let records: Vec<_> = lines.iter().enumerate().map(|(ms, (_, frame))| at(ms as f64, frame)).collect();
         let events = testing::events(J1939::default(), &records);
-        let whole: Vec<_> = events.iter().filter(|event| event.kind == "message").collect();
+        let whole: Vec<_> = events.iter().filter(|event| event.kind == EventKind::Message).collect();
         for event in &whole {
             let source = event.from.node().unwrap();
             assert!(sent.contains(&(source, event.data.to_vec())), "round {round}: never sent: {event}");

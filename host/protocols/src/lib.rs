@@ -24,6 +24,7 @@ mod reader;
 mod relatives;
 mod signs;
 mod survey;
+mod table;
 #[cfg(test)]
 mod testing;
 mod text;

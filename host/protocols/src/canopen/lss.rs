@@ -5,6 +5,7 @@ use std::borrow::Cow;
 use cantap_trace::TraceRecord;
 
 use super::codec::lss::{Bound, Part, Request, Response, Service};
+use super::names;
 use crate::{Event, EventKind, Field, Protocol};
 
 /// A service of the master that a slave may answer.
@@ -26,7 +27,7 @@ impl Lss {
         self.asked = request.map(|request| (record.time_ns, request));
         self.frames_lost = false;
         let Some(request) = request else { return unknown(record, EventKind::Lss, data) };
-        let mut event = Event::new(Protocol::CanOpen, record, EventKind::Lss, request_title(&request));
+        let mut event = Event::new(Protocol::CanOpen, record, EventKind::Lss, request_title(request));
         let fields = &mut event.fields;
         match request {
             Request::SwitchGlobal(mode) => {
@@ -35,7 +36,7 @@ impl Lss {
             }
             Request::ConfigureNode(node) => fields.push(Field::number("node", node)),
             Request::ConfigureBitTiming { table, index } => {
-                let text = RATES.get(usize::from(index)).copied().filter(|_| table == 0);
+                let text = names::bit_rate(index).filter(|_| table == 0);
                 fields.push(Field::number("table", table));
                 fields.push(Field::number("index", index).meaning(text));
             }
@@ -59,8 +60,7 @@ impl Lss {
         let Some(response) = Response::decode(data) else {
             return unknown(record, EventKind::LssAnswer, data);
         };
-        let mut event =
-            Event::new(Protocol::CanOpen, record, EventKind::LssAnswer, response_title(&response));
+        let mut event = Event::new(Protocol::CanOpen, record, EventKind::LssAnswer, response_title(response));
         let fields = &mut event.fields;
         match response {
             Response::Outcome { error, device_error, .. } => {
@@ -97,21 +97,7 @@ fn unknown(record: &TraceRecord, kind: EventKind, data: &[u8]) -> Option<Event> 
     Some(event)
 }
 
-/// CiA's table of bit rates.
-const RATES: [&str; 10] = [
-    "1 Mbit/s",
-    "800 kbit/s",
-    "500 kbit/s",
-    "250 kbit/s",
-    "125 kbit/s",
-    "reserved",
-    "50 kbit/s",
-    "20 kbit/s",
-    "10 kbit/s",
-    "automatic",
-];
-
-const fn request_title(request: &Request) -> &'static str {
+const fn request_title(request: Request) -> &'static str {
     match request {
         Request::SwitchGlobal(_) => "LSS switch state global",
         Request::ConfigureNode(_) => "LSS configure node number",
@@ -130,12 +116,12 @@ const fn request_title(request: &Request) -> &'static str {
         Request::Identify(Bound::HighestSerial, _) => "LSS identify: serial number, highest",
         Request::IdentifyWithoutNumber => "LSS identify slaves without a number",
         Request::FastScan { .. } => "LSS fast scan",
-        Request::Inquire(part) => inquiry_title(*part),
+        Request::Inquire(part) => inquiry_title(part),
         Request::InquireNode => "LSS inquire node number",
     }
 }
 
-const fn response_title(response: &Response) -> &'static str {
+const fn response_title(response: Response) -> &'static str {
     match response {
         Response::Outcome { service: Service::ConfigureNode, .. } => "LSS configure node number",
         Response::Outcome { service: Service::ConfigureBitTiming, .. } => "LSS configure bit timing",
@@ -143,7 +129,7 @@ const fn response_title(response: &Response) -> &'static str {
         Response::Selected => "LSS switched",
         Response::Identified => "LSS identified",
         Response::WithoutNumber => "LSS a slave without a number",
-        Response::Address(part, _) => inquiry_title(*part),
+        Response::Address(part, _) => inquiry_title(part),
         Response::Node(_) => "LSS inquire node number",
     }
 }

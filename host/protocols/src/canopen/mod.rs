@@ -130,7 +130,9 @@ impl CanOpen {
                     let mut event = event(record, EventKind::Emergency, "emergency");
                     event.from = Party::Node(node);
                     event.fields.push(Field::hex("code", code, 4).meaning(Some(names::emergency(code))));
-                    event.fields.push(Field::hex("register", register, 2).meaning(register_text(register)));
+                    event
+                        .fields
+                        .push(Field::hex("register", register, 2).meaning(names::error_register(register)));
                     event.fields.push(Field::bytes("manufacturer", rest));
                     // Of the required length, or else what is there.
                     event.trouble =
@@ -255,21 +257,6 @@ impl CanOpen {
         }
         events[from..].sort_by_key(|event| (event.time_ns, event.channel, event.from.node()));
     }
-}
-
-fn register_text(register: u8) -> Option<String> {
-    const BITS: [&str; 8] = [
-        "generic",
-        "current",
-        "voltage",
-        "temperature",
-        "communication",
-        "device profile",
-        "reserved",
-        "manufacturer",
-    ];
-    let set = BITS.iter().enumerate().filter(|(bit, _)| register >> bit & 1 == 1).map(|(_, name)| *name);
-    Some(set.collect::<Vec<_>>().join(", ")).filter(|text| !text.is_empty())
 }
 
 impl Assembler for CanOpen {

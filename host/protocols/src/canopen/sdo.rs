@@ -125,10 +125,14 @@ impl Sdo {
     }
 
     fn take_whole(&mut self, time_ns: i64, from_client: bool, bytes: [u8; 8]) -> [Option<SdoTransfer>; 2] {
-        if from_client { self.from_client(time_ns, bytes) } else { [None, self.from_server(time_ns, bytes)] }
+        if from_client {
+            self.take_request(time_ns, bytes)
+        } else {
+            [None, self.take_response(time_ns, bytes)]
+        }
     }
 
-    fn from_client(&mut self, time_ns: i64, bytes: [u8; 8]) -> [Option<SdoTransfer>; 2] {
+    fn take_request(&mut self, time_ns: i64, bytes: [u8; 8]) -> [Option<SdoTransfer>; 2] {
         let request = Request::decode(bytes);
         let mut behind = None;
         // If the client starts a new transfer while a block comes from the server, it has abandoned the
@@ -147,13 +151,13 @@ impl Sdo {
                 Some(self.abort(time_ns, object, code))
             }
             _ if self.phase == Phase::FromClient => self.block_segment(BlockSegment::decode(bytes)),
-            Some(request) => self.request(time_ns, request, bytes),
+            Some(request) => self.apply_request(time_ns, request, bytes),
             None => None,
         };
         [behind, done]
     }
 
-    fn from_server(&mut self, time_ns: i64, bytes: [u8; 8]) -> Option<SdoTransfer> {
+    fn take_response(&mut self, time_ns: i64, bytes: [u8; 8]) -> Option<SdoTransfer> {
         let response = Response::decode(bytes);
         // The first answer names the object. One that names another is not to this request.
         if self.phase == Phase::Command
@@ -175,7 +179,7 @@ impl Sdo {
                 Some(self.abort(time_ns, object, code))
             }
             _ if self.phase == Phase::FromServer => self.block_segment(BlockSegment::decode(bytes)),
-            response => self.response(time_ns, response, bytes),
+            response => self.apply_response(time_ns, response, bytes),
         }
     }
 
@@ -213,7 +217,7 @@ impl Sdo {
         Some(open)
     }
 
-    fn request(&mut self, time_ns: i64, request: Request, bytes: [u8; 8]) -> Option<SdoTransfer> {
+    fn apply_request(&mut self, time_ns: i64, request: Request, bytes: [u8; 8]) -> Option<SdoTransfer> {
         match request {
             Request::Download(object, content) => {
                 let mut transfer = fresh(time_ns, object, true, Mode::of(content));
@@ -275,7 +279,12 @@ impl Sdo {
         }
     }
 
-    fn response(&mut self, time_ns: i64, response: Option<Response>, bytes: [u8; 8]) -> Option<SdoTransfer> {
+    fn apply_response(
+        &mut self,
+        time_ns: i64,
+        response: Option<Response>,
+        bytes: [u8; 8],
+    ) -> Option<SdoTransfer> {
         let Some(open) = &mut self.open else {
             // An answer to an unobserved request.
             let transfer = unasked(time_ns, bytes);

@@ -1,9 +1,11 @@
 //! OBD-II: the content of the services of SAE J1979, with values in their units.
 
+use super::names::FILE;
 use super::parameters::{length, name, values};
 use super::values::{number, supported};
 use super::{dtc, monitors, names};
 use crate::Field;
+use crate::table::Table;
 
 /// The content of a request after the service byte.
 pub fn request(sid: u8, rest: &[u8], fields: &mut Vec<Field>) {
@@ -37,32 +39,20 @@ pub fn request(sid: u8, rest: &[u8], fields: &mut Vec<Field>) {
     }
 }
 
-/// Tests and actions of service 08. Test 01 is the only one that has a public description: carmakers' repair manuals
-/// ("Diagnostic Mode 08, TID $01", Audi and Volkswagen from 2006 on).
+static TESTS: Table = Table::new(FILE, "obd_test");
+static INFORMATION: Table = Table::new(FILE, "obd_information");
+
+#[cfg(test)]
+pub static TABLES: [&Table; 2] = [&TESTS, &INFORMATION];
+
+/// Tests and actions of service 08.
 fn test_name(tid: u8) -> Option<&'static str> {
-    match tid {
-        _ if tid.is_multiple_of(0x20) => Some("supported"),
-        0x01 => Some("evaporative system leak test"),
-        _ => None,
-    }
+    if tid.is_multiple_of(0x20) { Some("supported") } else { TESTS.get(tid) }
 }
 
-const fn info_name(pid: u8) -> Option<&'static str> {
-    Some(match pid {
-        0x00 => "supported",
-        0x02 => "VIN",
-        0x04 => "calibration identifications",
-        0x06 => "calibration verification numbers",
-        0x08 => "in-use performance, spark ignition",
-        0x0A => "ECU name",
-        0x0B => "in-use performance, compression ignition",
-        0x0D => "engine serial number",
-        0x0F => "exhaust regulation or type approval number",
-        0x11 => "WWH-OBD GTR number",
-        0x12 => "ignition cycles with the engine running on fuel",
-        0x14 => "distance since the decision of the evaporative monitor",
-        _ => return None,
-    })
+/// Vehicle information of service 09.
+fn info_name(pid: u8) -> Option<&'static str> {
+    INFORMATION.get(pid)
 }
 
 /// The content of a response after the service byte; the request then has no fields of its own.

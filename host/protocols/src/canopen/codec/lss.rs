@@ -233,8 +233,9 @@ impl Response {
         match (self, request) {
             (Self::Selected, Request::SwitchSelective(part, _)) => *part == Part::Serial,
             (Self::Identified, Request::Identify(bound, _)) => *bound == Bound::HighestSerial,
-            (Self::Identified, Request::FastScan { .. } | Request::IdentifyWithoutNumber) => true,
-            (Self::WithoutNumber, Request::IdentifyWithoutNumber) => true,
+            (Self::Identified, Request::FastScan { .. } | Request::IdentifyWithoutNumber)
+            | (Self::WithoutNumber, Request::IdentifyWithoutNumber)
+            | (Self::Node(_), Request::InquireNode) => true,
             (Self::Outcome { service, .. }, request) => matches!(
                 (service, request),
                 (Service::ConfigureNode, Request::ConfigureNode(_))
@@ -242,7 +243,6 @@ impl Response {
                     | (Service::Store, Request::Store)
             ),
             (Self::Address(part, _), Request::Inquire(asked)) => part == asked,
-            (Self::Node(_), Request::InquireNode) => true,
             _ => false,
         }
     }

@@ -16,6 +16,7 @@ mod event;
 mod event_kind;
 pub mod iso_tp;
 pub mod j1939;
+mod json;
 pub mod naming;
 pub mod nmea2000;
 mod overview;

@@ -9,7 +9,15 @@ use std::sync::OnceLock;
 pub struct Table {
     file: &'static str,
     name: &'static str,
-    rows: OnceLock<Vec<Row>>,
+    index: OnceLock<Index>,
+}
+
+/// The numbers from one start to the next have the same name, or none.
+#[derive(Debug, Default)]
+struct Index {
+    /// In order; the first is 0.
+    starts: Vec<u32>,
+    names: Vec<Option<&'static str>>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -22,15 +30,15 @@ struct Row {
 impl Table {
     /// The table with this name in a file.
     pub const fn new(file: &'static str, name: &'static str) -> Self {
-        Self { file, name, rows: OnceLock::new() }
+        Self { file, name, index: OnceLock::new() }
     }
 
     /// The name of a number. Of several ranges, the narrowest counts.
     pub fn get(&self, number: impl Into<u32>) -> Option<&'static str> {
         let number = number.into();
-        let rows = self.rows.get_or_init(|| self.read());
-        let until = rows.partition_point(|row| row.first <= number);
-        rows[..until].iter().rev().find(|row| number <= row.last).map(|row| row.name)
+        let Index { starts, names } = self.index.get_or_init(|| Index::of(&self.read()));
+        // The first start is 0, so there is one before every number.
+        names[starts.partition_point(|start| *start <= number) - 1]
     }
 
     /// The names of the bits that are set, the lowest first.
@@ -41,9 +49,22 @@ impl Table {
     fn read(&self) -> Vec<Row> {
         let rows = lines(self.file).filter_map(|line| line.strip_prefix(self.name)?.strip_prefix(','));
         // What cannot be read is left out, of which the tables have nothing: a test reads every line.
-        let mut rows: Vec<Row> = rows.filter_map(Row::read).collect();
-        rows.sort_by_key(|row| (row.first, std::cmp::Reverse(row.last)));
-        rows
+        rows.filter_map(Row::read).collect()
+    }
+}
+
+impl Index {
+    fn of(rows: &[Row]) -> Self {
+        let ends = rows.iter().filter_map(|row| row.last.checked_add(1));
+        let mut starts: Vec<u32> = rows.iter().map(|row| row.first).chain(ends).chain([0]).collect();
+        starts.sort_unstable();
+        starts.dedup();
+        let name = |start: &u32| {
+            let own = rows.iter().filter(|row| (row.first..=row.last).contains(start));
+            own.min_by_key(|row| row.last - row.first).map(|row| row.name)
+        };
+        let names = starts.iter().map(name).collect();
+        Self { starts, names }
     }
 }
 
@@ -76,7 +97,8 @@ pub fn range(text: &str) -> Option<(u32, u32)> {
 pub fn check(file: &'static str, tables: &[&Table]) {
     let mut read = 0;
     for table in tables {
-        let rows = table.read();
+        let mut rows = table.read();
+        rows.sort_by_key(|row| (row.first, row.last));
         assert!(!rows.is_empty(), "{} is empty", table.name);
         for two in rows.windows(2) {
             assert_ne!((two[0].first, two[0].last), (two[1].first, two[1].last), "{}", table.name);

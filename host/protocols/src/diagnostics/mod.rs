@@ -23,6 +23,7 @@ mod meanings;
 mod monitors;
 pub(crate) mod names;
 mod obd;
+mod obd_identifiers;
 mod parameters;
 mod periodic;
 mod reports;
@@ -35,7 +36,8 @@ mod values;
 
 pub use dtc::Dtc;
 pub(crate) use echo::repeats_its_request;
-pub use names::{data_identifier, reason, uds_service};
+pub use names::{reason, uds_service};
+pub use obd_identifiers::data_identifier;
 pub use parameters::name as parameter_name;
 pub(crate) use uds::is_response_suppressed;
 
@@ -477,7 +479,7 @@ fn periodic_event(transfer: &Transfer, did: u16, data: &[u8]) -> Event {
     event.protocol = Protocol::Uds;
     event.kind = EventKind::Periodic;
     event.title = "periodic data".into();
-    event.fields = vec![Field::hex("did", did, 4).meaning(names::data_identifier(did))];
+    event.fields = vec![Field::hex("did", did, 4).meaning(data_identifier(did))];
     if !data.is_empty() {
         event.fields.push(Field::bytes("value", data));
     }

@@ -51,7 +51,7 @@ fn test_name(tid: u8) -> Option<&'static str> {
 }
 
 /// Vehicle information of service 09.
-fn info_name(pid: u8) -> Option<&'static str> {
+pub fn info_name(pid: u8) -> Option<&'static str> {
     INFORMATION.get(pid)
 }
 
@@ -148,7 +148,7 @@ pub fn response(sid: u8, mut rest: &[u8], fields: &mut Vec<Field>) {
 }
 
 /// The printable characters in the bytes.
-fn letters(bytes: &[u8]) -> String {
+pub fn letters(bytes: &[u8]) -> String {
     let shown = bytes.iter().filter(|byte| byte.is_ascii_graphic() || **byte == b' ');
     let shown: String = shown.map(|byte| char::from(*byte)).collect();
     shown.trim().to_owned()

@@ -849,3 +849,19 @@ fn what_is_read_later_is_in_the_order_in_which_it_was_heard() {
     );
     assert!(lines[2].starts_with("uds 123 > 456 DiagnosticSessionControl"), "{lines:?}");
 }
+
+/// OBD-II over UDS: values of known length, so that a value with the next identifier's bytes in it is read, too.
+#[test]
+fn parameters_read_by_identifier_have_their_values() {
+    let lines = said(&[
+        (0.0, "7E0#0322F40CAAAAAAAA"),
+        (0.01, "7E8#0562F40C1AF8AAAA"),
+        (0.1, "7E0#0522F40CF405AAAA"),
+        (0.11, "7E8#100862F40CF405F4"),
+        (0.12, "7E0#300000AAAAAAAAAA"),
+        (0.13, "7E8#21057BAAAAAAAAAA"),
+    ]);
+    assert_eq!(lines.len(), 2, "{lines:#?}");
+    assert!(lines[0].contains("did 0xF40C (engine_speed), engine_speed 1726 rpm"), "{}", lines[0]);
+    assert!(lines[1].contains("engine_speed 15617.25 rpm, coolant_temperature 83 °C"), "{}", lines[1]);
+}

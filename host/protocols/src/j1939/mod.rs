@@ -4,6 +4,7 @@
 //! Memory: 256 messages of many frames in progress, each of at most 64 KiB, 64 waiting requests, and a NAME for each of 254 addresses on each
 //! channel.
 
+mod diagnostics;
 mod fast_packet;
 mod header;
 mod name;
@@ -253,6 +254,7 @@ impl J1939 {
             }
             (_, data) => {
                 if !self.signals(record.channel, header, data, &mut event)
+                    && !diagnostics::fields(header.pgn, data, &mut event.fields)
                     && !self.marine_fields(record.channel, header, data, &mut event)
                 {
                     event.fields.push(Field::bytes("data", data));

@@ -8,6 +8,9 @@ static GROUPS: Table = Table::new(FILE, "group");
 static FAILURE_MODES: Table = Table::new(FILE, "failure_mode");
 static INDUSTRY_GROUPS: Table = Table::new(FILE, "industry_group");
 static FUNCTIONS: Table = Table::new(FILE, "function");
+static CONTINUOUS_MONITORS: Table = Table::new(FILE, "continuous_monitor");
+static MONITORS: Table = Table::new(FILE, "monitor");
+static OBD_COMPLIANCE: Table = Table::new(FILE, "obd_compliance");
 
 /// A parameter group's name.
 pub fn group(pgn: u32) -> Option<&'static str> {
@@ -29,6 +32,17 @@ pub fn function(function: u8) -> Option<&'static str> {
     FUNCTIONS.get(function)
 }
 
+/// The monitors whose bits are set in DM5 and DM26: those that run all the time, and the others.
+pub fn monitors(continuous: u8, others: u16) -> impl Iterator<Item = &'static str> {
+    let others = (0..16_u16).filter(move |bit| others >> bit & 1 == 1);
+    CONTINUOUS_MONITORS.bits(continuous).chain(others.filter_map(|bit| MONITORS.get(bit)))
+}
+
+/// With what OBD a controller complies.
+pub fn obd_compliance(compliance: u8) -> Option<&'static str> {
+    OBD_COMPLIANCE.get(compliance)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -36,7 +50,9 @@ mod tests {
 
     #[test]
     fn every_line_of_the_file_is_in_a_table() {
-        check(FILE, &[&GROUPS, &FAILURE_MODES, &INDUSTRY_GROUPS, &FUNCTIONS]);
+        let names = [&GROUPS, &FAILURE_MODES, &INDUSTRY_GROUPS, &FUNCTIONS];
+        let readiness = [&CONTINUOUS_MONITORS, &MONITORS, &OBD_COMPLIANCE];
+        check(FILE, &names.into_iter().chain(readiness).collect::<Vec<_>>());
         assert_eq!(group(0xF004), Some("EEC1 engine"));
         assert_eq!(group(0x1_EF00), Some("proprietary A2"));
     }

@@ -171,7 +171,7 @@ impl J1939 {
 
     fn event(&self, record: &TraceRecord, header: Header, kind: EventKind) -> Event {
         let title =
-            names::group(header.pgn).map_or_else(|| format!("PGN {}", header.pgn).into(), Cow::Borrowed);
+            names::message(header).map_or_else(|| format!("PGN {}", header.pgn).into(), Cow::Borrowed);
         let mut event = Event::new(self.protocol(record.channel, header.pgn), record, kind, title);
         (event.from, event.to) = (party(header.source), party(header.destination));
         event.fields.reserve(4);
@@ -203,7 +203,8 @@ impl J1939 {
             }
             if long.trouble.is_some() {
                 event.kind = EventKind::Broken;
-                if let Some(name) = self.group(record.channel, header.pgn) {
+                if let Some(name) = names::message(header).or_else(|| self.group(record.channel, header.pgn))
+                {
                     event.title = name.into();
                 }
                 event.fields.push(Field::number("received", data.len() as i64).unit("bytes"));

@@ -1,10 +1,12 @@
 //! Parameter groups, failure modes and the parts of a NAME. The tables, with their sources, are in `data/j1939.csv`.
 
+use super::header::Header;
 use crate::table::Table;
 
 const FILE: &str = include_str!("../../data/j1939.csv");
 
 static GROUPS: Table = Table::new(FILE, "group");
+static CHARGING: Table = Table::new(FILE, "charging");
 static FAILURE_MODES: Table = Table::new(FILE, "failure_mode");
 static INDUSTRY_GROUPS: Table = Table::new(FILE, "industry_group");
 static FUNCTIONS: Table = Table::new(FILE, "function");
@@ -15,6 +17,20 @@ static OBD_COMPLIANCE: Table = Table::new(FILE, "obd_compliance");
 /// A parameter group's name.
 pub fn group(pgn: u32) -> Option<&'static str> {
     GROUPS.get(pgn)
+}
+
+/// A charger's address in GB/T 27930.
+const CHARGER_ADDRESS: u8 = 0x56;
+/// The address of a vehicle's battery management there.
+const BATTERY_ADDRESS: u8 = 0xF4;
+
+/// A message's name: between a charger and a battery management, groups have other names than elsewhere.
+pub fn message(header: Header) -> Option<&'static str> {
+    let charging = match [header.source, header.destination] {
+        [CHARGER_ADDRESS, BATTERY_ADDRESS] | [BATTERY_ADDRESS, CHARGER_ADDRESS] => CHARGING.get(header.pgn),
+        _ => None,
+    };
+    charging.or_else(|| group(header.pgn))
 }
 
 /// A failure mode identifier (FMI).
@@ -50,7 +66,7 @@ mod tests {
 
     #[test]
     fn every_line_of_the_file_is_in_a_table() {
-        let names = [&GROUPS, &FAILURE_MODES, &INDUSTRY_GROUPS, &FUNCTIONS];
+        let names = [&GROUPS, &CHARGING, &FAILURE_MODES, &INDUSTRY_GROUPS, &FUNCTIONS];
         let readiness = [&CONTINUOUS_MONITORS, &MONITORS, &OBD_COMPLIANCE];
         check(FILE, &names.into_iter().chain(readiness).collect::<Vec<_>>());
         assert_eq!(group(0xF004), Some("EEC1 engine"));

@@ -353,3 +353,23 @@ fn connections_with_frames_sent_again_are_whole() {
         }
     }
 }
+
+/// GB/T 27930: the group of a charger's recognition is TC1 elsewhere.
+#[test]
+fn a_chargers_messages_have_their_own_names() {
+    let title = |frame: &str| said(&[(0.0, frame)]).remove(0);
+    let recognition = title("1801F456#0000000000FFFFFF");
+    assert!(recognition.contains("CRM charger recognition"), "{recognition}");
+    assert!(title("181056F4#DC05A00F0100FFFF").contains("BCL charging demand"));
+    assert!(title("18010300#0000000000FFFFFF").contains("TC1 transmission control"));
+}
+
+/// A readiness message from its frame to its fields.
+#[test]
+fn readiness_is_read_from_the_bus() {
+    let line = said(&[(0.0, "18FECE00#0200141701000100")]).remove(0);
+    assert!(
+        line.contains("DM5 diagnostic readiness") && line.contains("obd_compliance 20 (HD OBD)"),
+        "{line}"
+    );
+}

@@ -7,7 +7,7 @@ use cantap_can::Frame;
 use cantap_trace::Id;
 
 use super::Machine;
-use crate::canopen::codec::lss::{Part, REQUEST, RESPONSE, Request, Response, WHOLE_SCAN};
+use crate::canopen::codec::lss::{LssRequest, LssResponse, Part, REQUEST, RESPONSE, WHOLE_SCAN};
 
 const WHOLE: i16 = WHOLE_SCAN as i16;
 /// The time after an answer for other slaves to send the same one.
@@ -73,7 +73,7 @@ const fn refusal(command: u8, error: u8) -> &'static str {
     }
 }
 
-fn frame(request: Request) -> Frame {
+fn frame(request: LssRequest) -> Frame {
     Frame::from_bus(REQUEST, false, 8, request.encode())
 }
 
@@ -123,12 +123,12 @@ impl FastScan {
         self.end.unwrap_or(Err(LssError::Nobody)).map(|()| LssAddress { vendor, product, revision, serial })
     }
 
-    fn question(&self) -> Request {
+    fn question(&self) -> LssRequest {
         let (unchecked, next) = match self.bit {
             -1 => (0, (self.part + 1) & 3),
             bit => (bit as u8, self.part),
         };
-        Request::FastScan { value: self.found[usize::from(self.part)], unchecked, part: self.part, next }
+        LssRequest::FastScan { value: self.found[usize::from(self.part)], unchecked, part: self.part, next }
     }
 
     /// Interprets the answer, or its absence.
@@ -176,7 +176,7 @@ impl Machine for FastScan {
         if id == REQUEST && (self.asking != Asking::Pending || self.bit != WHOLE) {
             self.end.get_or_insert(Err(LssError::OtherMaster));
         }
-        let is_answer = id == RESPONSE && Response::decode(data) == Some(Response::Identified);
+        let is_answer = id == RESPONSE && LssResponse::decode(data) == Some(LssResponse::Identified);
         if is_answer && matches!(self.asking, Asking::Waits { .. }) {
             self.has_answer = true;
             self.asking = Asking::Settles { until_ns: now_ns + SETTLE_NS };
@@ -233,10 +233,10 @@ pub const fn bit_rate_index(bitrate_bps: u32) -> Option<u8> {
 #[derive(Debug)]
 pub struct LssMaster {
     timeout_ns: u64,
-    out: VecDeque<Request>,
+    out: VecDeque<LssRequest>,
     under_way: usize,
     /// The last request, if it has an answer.
-    asked: Option<Request>,
+    asked: Option<LssRequest>,
     until_ns: Option<u64>,
     end: Option<Result<(), LssError>>,
 }
@@ -245,15 +245,15 @@ impl LssMaster {
     /// Waits this long for the answer, if the command has one.
     pub fn new(order: LssOrder, timeout_ns: u64) -> Self {
         let out = match order {
-            LssOrder::SwitchAll(waits) => vec![Request::SwitchGlobal(waits.into())],
+            LssOrder::SwitchAll(waits) => vec![LssRequest::SwitchGlobal(waits.into())],
             LssOrder::Switch(LssAddress { vendor, product, revision, serial }) => {
                 let values = [vendor, product, revision, serial];
                 let parts = Part::ALL.into_iter().zip(values);
-                parts.map(|(part, value)| Request::SwitchSelective(part, value)).collect()
+                parts.map(|(part, value)| LssRequest::SwitchSelective(part, value)).collect()
             }
-            LssOrder::SetNode(node) => vec![Request::ConfigureNode(node)],
-            LssOrder::SetBitRate(index) => vec![Request::ConfigureBitTiming { table: 0, index }],
-            LssOrder::Store => vec![Request::Store],
+            LssOrder::SetNode(node) => vec![LssRequest::ConfigureNode(node)],
+            LssOrder::SetBitRate(index) => vec![LssRequest::ConfigureBitTiming { table: 0, index }],
+            LssOrder::Store => vec![LssRequest::Store],
         };
         let asked = out.last().copied().filter(|_| !matches!(order, LssOrder::SwitchAll(_)));
         Self { timeout_ns, out: out.into(), under_way: 0, asked, until_ns: None, end: None }
@@ -272,7 +272,7 @@ impl Machine for LssMaster {
         {
             // What the answer would have begun with: that of the selection is 44.
             let command = match asked {
-                Request::SwitchSelective(..) => Response::Selected.encode()[0],
+                LssRequest::SwitchSelective(..) => LssResponse::Selected.encode()[0],
                 asked => asked.encode()[0],
             };
             self.end
@@ -300,13 +300,13 @@ impl Machine for LssMaster {
         if id == REQUEST && (self.under_way > 0 || self.until_ns.is_some()) {
             self.end.get_or_insert(Err(LssError::OtherMaster));
         }
-        let response = Response::decode(data).filter(|_| id == RESPONSE);
+        let response = LssResponse::decode(data).filter(|_| id == RESPONSE);
         let Some((response, asked)) = response.zip(self.asked) else { return };
         if !response.answers(&asked) {
             return;
         }
         self.end.get_or_insert(match response {
-            Response::Outcome { service, error, .. } if error != 0 => {
+            LssResponse::Outcome { service, error, .. } if error != 0 => {
                 Err(LssError::Refused { command: service.command(), error })
             }
             _ => Ok(()),
@@ -347,7 +347,7 @@ mod tests {
                 };
                 if is_it {
                     *at = if bit == 0 && next != part { next } else { *at };
-                    let answer = Response::Identified.encode();
+                    let answer = LssResponse::Identified.encode();
                     say.push((after * MS, Frame::from_bus(RESPONSE, false, 8, answer)));
                 }
             }

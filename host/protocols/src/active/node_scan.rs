@@ -7,11 +7,11 @@ use cantap_trace::Id;
 
 use super::Machine;
 use super::sdo::SdoIds;
-use crate::canopen::codec::sdo::{Content, Object, Request, Response, abort};
+use crate::canopen::codec::sdo::{Content, SdoObject, SdoRequest, SdoResponse, abort};
 
 /// How many questions may wait in the sender's queue at a time.
 const MOST_UNDER_WAY: usize = 8;
-const DEVICE_TYPE: Object = Object { index: 0x1000, sub: 0 };
+const DEVICE_TYPE: SdoObject = SdoObject { index: 0x1000, sub: 0 };
 
 /// A node that was found.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -78,7 +78,7 @@ impl Machine for NodeScan {
         let frame = self.aborts.pop_front().or_else(|| {
             let node = self.to_ask.pop_front()?;
             self.asked[usize::from(node)] = true;
-            Some(request(node, Request::Upload(DEVICE_TYPE)))
+            Some(request(node, SdoRequest::Upload(DEVICE_TYPE)))
         });
         if frame.is_some() {
             self.under_way += 1;
@@ -109,20 +109,20 @@ impl Machine for NodeScan {
                 let mut bytes = [0; 8];
                 let Some(used) = bytes.get_mut(..data.len()) else { return };
                 used.copy_from_slice(data);
-                if Object::decode(bytes) != DEVICE_TYPE {
+                if SdoObject::decode(bytes) != DEVICE_TYPE {
                     return;
                 }
                 let found = &mut self.found[place];
                 (found.node, found.answers) = (node, true);
-                match Response::decode(bytes) {
-                    Some(Response::Upload(_, Content::Expedited { bytes, length: None | Some(4) })) => {
+                match SdoResponse::decode(bytes) {
+                    Some(SdoResponse::Upload(_, Content::Expedited { bytes, length: None | Some(4) })) => {
                         found.device_type = Some(u32::from_le_bytes(bytes));
                     }
-                    Some(Response::Upload(_, Content::Segmented(_)))
+                    Some(SdoResponse::Upload(_, Content::Segmented(_)))
                         if !std::mem::replace(&mut self.aborted[place], true) =>
                     {
                         // It wants to send segments, which nobody will request.
-                        self.aborts.push_back(request(node, Request::Abort(DEVICE_TYPE, abort::GENERAL)));
+                        self.aborts.push_back(request(node, SdoRequest::Abort(DEVICE_TYPE, abort::GENERAL)));
                     }
                     _ => {}
                 }
@@ -142,7 +142,7 @@ impl Machine for NodeScan {
     }
 }
 
-fn request(node: u8, request: Request) -> Frame {
+fn request(node: u8, request: SdoRequest) -> Frame {
     Frame::from_bus(SdoIds::of(node).request, false, 8, request.encode())
 }
 

@@ -9,8 +9,8 @@ use cantap_trace::Id;
 
 use super::Machine;
 use crate::canopen::codec::sdo::{
-    BlockEnd, BlockSegment, Content, MOST_BLOCK_FRAMES, Object, Request, Response, SEGMENT_BYTES, Segment,
-    abort, crc_of,
+    BlockEnd, BlockSegment, Content, MOST_BLOCK_FRAMES, SEGMENT_BYTES, SdoObject, SdoRequest, SdoResponse,
+    Segment, abort, crc_of,
 };
 
 /// The longest object that is accepted, in bytes.
@@ -53,7 +53,7 @@ enum Step {
 #[derive(Clone, Debug)]
 pub struct SdoClient {
     ids: SdoIds,
-    object: Object,
+    object: SdoObject,
     job: SdoJob,
     by_blocks: bool,
     timeout_ns: u64,
@@ -86,7 +86,7 @@ impl SdoClient {
     ) -> Self {
         Self {
             ids,
-            object: Object { index, sub },
+            object: SdoObject { index, sub },
             job,
             by_blocks,
             timeout_ns,
@@ -128,13 +128,13 @@ impl SdoClient {
         self.out.push_back(frame);
     }
 
-    fn request(&mut self, request: Request) {
+    fn request(&mut self, request: SdoRequest) {
         self.queue(request.encode());
     }
 
     fn abort(&mut self, code: u32, error: SdoError) {
         self.out.clear();
-        self.request(Request::Abort(self.object, code));
+        self.request(SdoRequest::Abort(self.object, code));
         self.step = Step::Closing;
         self.end = Some(Err(error));
     }
@@ -154,16 +154,16 @@ impl SdoClient {
         self.step = Step::Initiated;
         let object = self.object;
         let request = match (&self.job, self.by_blocks) {
-            (SdoJob::Read, false) => Request::Upload(object),
+            (SdoJob::Read, false) => SdoRequest::Upload(object),
             (SdoJob::Read, true) => {
-                Request::BlockUpload { object, crc: true, block_size: MOST_BLOCK_FRAMES, threshold: 0 }
+                SdoRequest::BlockUpload { object, crc: true, block_size: MOST_BLOCK_FRAMES, threshold: 0 }
             }
             (SdoJob::Write(data), true) => {
-                Request::BlockDownload { object, crc: true, size: Some(data.len() as u32) }
+                SdoRequest::BlockDownload { object, crc: true, size: Some(data.len() as u32) }
             }
             (SdoJob::Write(data), false) => {
                 let content = Content::expedited(data);
-                Request::Download(object, content.unwrap_or(Content::Segmented(Some(data.len() as u32))))
+                SdoRequest::Download(object, content.unwrap_or(Content::Segmented(Some(data.len() as u32))))
             }
         };
         self.request(request);
@@ -207,7 +207,7 @@ impl SdoClient {
             self.retries += 1;
         }
         self.step = if is_last { Step::BlockInEnd } else { Step::BlockIn { next: 1, is_gap: false } };
-        self.request(Request::BlockUploadAcknowledge { taken: up_to, block_size: MOST_BLOCK_FRAMES });
+        self.request(SdoRequest::BlockUploadAcknowledge { taken: up_to, block_size: MOST_BLOCK_FRAMES });
     }
 
     /// Appends received bytes; false if there are more than announced. Only the end of a block transfer says how many of its last
@@ -222,22 +222,22 @@ impl SdoClient {
         if self.size.is_some() { abort::LENGTH } else { abort::MEMORY }
     }
 
-    fn read_begins(&mut self, response: Option<Response>) {
+    fn read_begins(&mut self, response: Option<SdoResponse>) {
         match response {
-            Some(Response::Upload(_, Content::Expedited { bytes, length })) => {
+            Some(SdoResponse::Upload(_, Content::Expedited { bytes, length })) => {
                 self.data = bytes[..usize::from(length.unwrap_or(4))].to_vec();
                 self.finished();
             }
-            Some(Response::Upload(_, Content::Segmented(size))) => {
+            Some(SdoResponse::Upload(_, Content::Segmented(size))) => {
                 self.size = size.map(|size| size as usize);
                 self.step = Step::Segment { toggle: false };
-                self.request(Request::UploadSegment { toggle: false });
+                self.request(SdoRequest::UploadSegment { toggle: false });
             }
-            Some(Response::BlockUpload { crc, size, .. }) if self.by_blocks => {
+            Some(SdoResponse::BlockUpload { crc, size, .. }) if self.by_blocks => {
                 self.size = size.map(|size| size as usize);
                 self.has_crc = crc;
                 self.step = Step::BlockIn { next: 1, is_gap: false };
-                self.request(Request::BlockUploadStart);
+                self.request(SdoRequest::BlockUploadStart);
             }
             _ => return self.reject(abort::COMMAND),
         }
@@ -246,8 +246,8 @@ impl SdoClient {
         }
     }
 
-    fn segment_came(&mut self, toggle: bool, response: Option<Response>) {
-        let Some(Response::UploadSegment(segment)) = response else { return self.reject(abort::COMMAND) };
+    fn segment_came(&mut self, toggle: bool, response: Option<SdoResponse>) {
+        let Some(SdoResponse::UploadSegment(segment)) = response else { return self.reject(abort::COMMAND) };
         if segment.toggle != toggle {
             return self.reject(abort::TOGGLE);
         }
@@ -260,7 +260,7 @@ impl SdoClient {
         }
         if !segment.is_last {
             self.step = Step::Segment { toggle: !toggle };
-            return self.request(Request::UploadSegment { toggle: !toggle });
+            return self.request(SdoRequest::UploadSegment { toggle: !toggle });
         }
         if self.size.is_some_and(|size| size != self.data.len()) {
             return self.reject(abort::LENGTH);
@@ -294,8 +294,8 @@ impl SdoClient {
         self.step = Step::BlockIn { next, is_gap };
     }
 
-    fn blocks_end(&mut self, response: Option<Response>) {
-        let Some(Response::BlockUploadEnd(end)) = response else { return self.reject(abort::COMMAND) };
+    fn blocks_end(&mut self, response: Option<SdoResponse>) {
+        let Some(SdoResponse::BlockUploadEnd(end)) = response else { return self.reject(abort::COMMAND) };
         let Some(length) = self.data.len().checked_sub(end.unused.into()) else {
             return self.reject(abort::LENGTH);
         };
@@ -307,7 +307,7 @@ impl SdoClient {
             return self.reject(abort::LENGTH);
         }
         self.step = Step::Closing;
-        self.request(Request::BlockUploadEnd);
+        self.request(SdoRequest::BlockUploadEnd);
         self.end = Some(Ok(()));
     }
 
@@ -318,7 +318,7 @@ impl SdoClient {
         let segment = Segment::new(toggle, end == data.len(), &data[self.at..end]);
         self.at = end;
         self.step = Step::Segment { toggle };
-        self.request(Request::DownloadSegment(segment));
+        self.request(SdoRequest::DownloadSegment(segment));
     }
 
     /// Sends the next block, of at most this many frames.
@@ -340,10 +340,10 @@ impl SdoClient {
         }
     }
 
-    fn block_acknowledged(&mut self, frames: u8, response: Option<Response>) {
+    fn block_acknowledged(&mut self, frames: u8, response: Option<SdoResponse>) {
         let SdoJob::Write(bytes) = &self.job else { return };
         let length = bytes.len();
-        let Some(Response::BlockDownloadAcknowledge { taken, block_size }) = response else {
+        let Some(SdoResponse::BlockDownloadAcknowledge { taken, block_size }) = response else {
             return self.reject(abort::COMMAND);
         };
         if taken > frames || !(1..=MOST_BLOCK_FRAMES).contains(&block_size) {
@@ -362,20 +362,20 @@ impl SdoClient {
         let SdoJob::Write(bytes) = &self.job else { return };
         let crc = if self.has_crc { crc_of(bytes) } else { 0 };
         self.step = Step::BlockOutEnd;
-        self.request(Request::BlockDownloadEnd(BlockEnd::of(length, crc)));
+        self.request(SdoRequest::BlockDownloadEnd(BlockEnd::of(length, crc)));
     }
 
-    fn write_goes_on(&mut self, response: Option<Response>) {
+    fn write_goes_on(&mut self, response: Option<SdoResponse>) {
         let SdoJob::Write(bytes) = &self.job else { return };
         let length = bytes.len();
         match (self.step, response) {
-            (Step::Initiated, Some(Response::BlockDownload { crc, block_size, .. }))
+            (Step::Initiated, Some(SdoResponse::BlockDownload { crc, block_size, .. }))
                 if self.by_blocks && (1..=MOST_BLOCK_FRAMES).contains(&block_size) =>
             {
                 self.has_crc = crc;
                 self.write_block(block_size);
             }
-            (Step::Initiated, Some(Response::Download(_))) if !self.by_blocks => {
+            (Step::Initiated, Some(SdoResponse::Download(_))) if !self.by_blocks => {
                 if (1..=4).contains(&length) {
                     self.at = length;
                     self.finished();
@@ -383,7 +383,7 @@ impl SdoClient {
                     self.write_segment(false);
                 }
             }
-            (Step::Segment { toggle: expected }, Some(Response::DownloadSegment { toggle })) => {
+            (Step::Segment { toggle: expected }, Some(SdoResponse::DownloadSegment { toggle })) => {
                 if toggle != expected {
                     self.reject(abort::TOGGLE);
                 } else if self.at == length {
@@ -393,7 +393,7 @@ impl SdoClient {
                 }
             }
             (Step::BlockOut { frames }, response) => self.block_acknowledged(frames, response),
-            (Step::BlockOutEnd, Some(Response::BlockDownloadEnd)) => self.finished(),
+            (Step::BlockOutEnd, Some(SdoResponse::BlockDownloadEnd)) => self.finished(),
             _ => self.reject(abort::COMMAND),
         }
     }
@@ -439,15 +439,15 @@ impl Machine for SdoClient {
             return;
         }
         let Ok(data) = <[u8; 8]>::try_from(data) else { return self.reject(abort::LENGTH) };
-        let response = Response::decode(data);
-        if let Some(Response::Abort(_, code)) = response {
+        let response = SdoResponse::decode(data);
+        if let Some(SdoResponse::Abort(_, code)) = response {
             self.out.clear();
             self.until_ns = None;
             self.end = Some(Err(SdoError::Aborted { code }));
             return;
         }
         // An answer to an earlier question does not count here.
-        if self.step == Step::Initiated && Object::decode(data) != self.object {
+        if self.step == Step::Initiated && SdoObject::decode(data) != self.object {
             return;
         }
         if self.until_ns.is_some() {
@@ -487,7 +487,7 @@ impl Machine for SdoClient {
         self.out.clear();
         let done = self.done();
         self.end = Some(Err(SdoError::Cancelled { done }));
-        let frame = Request::Abort(self.object, abort::GENERAL).encode();
+        let frame = SdoRequest::Abort(self.object, abort::GENERAL).encode();
         Some(Frame::from_bus(self.ids.request, false, 8, frame))
     }
 }

@@ -4,14 +4,14 @@ use std::borrow::Cow;
 
 use cantap_trace::TraceRecord;
 
-use super::codec::lss::{Bound, Part, Request, Response, Service};
+use super::codec::lss::{Bound, LssRequest, LssResponse, Part, Service};
 use super::names;
 use crate::{Event, EventKind, Field, Protocol};
 
 /// A service of the master that a slave may answer.
 #[derive(Default)]
 pub struct Lss {
-    asked: Option<(i64, Request)>,
+    asked: Option<(i64, LssRequest)>,
     frames_lost: bool,
 }
 
@@ -23,47 +23,52 @@ impl Lss {
 
     /// Takes a frame from the master.
     pub fn request(&mut self, record: &TraceRecord, data: &[u8]) -> Option<Event> {
-        let request = Request::decode(data);
+        let request = LssRequest::decode(data);
         self.asked = request.map(|request| (record.time_ns, request));
         self.frames_lost = false;
         let Some(request) = request else { return unknown(record, EventKind::Lss, data) };
         let mut event = Event::new(Protocol::CanOpen, record, EventKind::Lss, request_title(request));
         let fields = &mut event.fields;
         match request {
-            Request::SwitchGlobal(mode) => {
+            LssRequest::SwitchGlobal(mode) => {
                 let text = ["waiting", "configuration"].get(usize::from(mode)).copied();
                 fields.push(Field::number("mode", mode).meaning(text));
             }
-            Request::ConfigureNode(node) => fields.push(Field::number("node", node)),
-            Request::ConfigureBitTiming { table, index } => {
+            LssRequest::ConfigureNode(node) => fields.push(Field::number("node", node)),
+            LssRequest::ConfigureBitTiming { table, index } => {
                 let text = names::bit_rate(index).filter(|_| table == 0);
                 fields.push(Field::number("table", table));
                 fields.push(Field::number("index", index).meaning(text));
             }
-            Request::ActivateBitTiming(delay_ms) => fields.push(Field::number("switch_delay_ms", delay_ms)),
-            Request::SwitchSelective(_, value) | Request::Identify(_, value) => {
+            LssRequest::ActivateBitTiming(delay_ms) => {
+                fields.push(Field::number("switch_delay_ms", delay_ms));
+            }
+            LssRequest::SwitchSelective(_, value) | LssRequest::Identify(_, value) => {
                 fields.push(Field::hex("value", value, 8));
             }
-            Request::FastScan { value, unchecked, part, next } => {
+            LssRequest::FastScan { value, unchecked, part, next } => {
                 fields.push(Field::hex("value", value, 8));
                 fields.push(Field::number("bits_not_checked", unchecked));
                 fields.push(Field::number("part", part));
                 fields.push(Field::number("next_part", next));
             }
-            Request::Store | Request::IdentifyWithoutNumber | Request::Inquire(_) | Request::InquireNode => {}
+            LssRequest::Store
+            | LssRequest::IdentifyWithoutNumber
+            | LssRequest::Inquire(_)
+            | LssRequest::InquireNode => {}
         }
         Some(event)
     }
 
     /// Takes a frame from a slave.
     pub fn response(&mut self, record: &TraceRecord, data: &[u8]) -> Option<Event> {
-        let Some(response) = Response::decode(data) else {
+        let Some(response) = LssResponse::decode(data) else {
             return unknown(record, EventKind::LssAnswer, data);
         };
         let mut event = Event::new(Protocol::CanOpen, record, EventKind::LssAnswer, response_title(response));
         let fields = &mut event.fields;
         match response {
-            Response::Outcome { error, device_error, .. } => {
+            LssResponse::Outcome { error, device_error, .. } => {
                 let text = match error {
                     0 => "success",
                     1 => "out of range, or not supported",
@@ -74,9 +79,9 @@ impl Lss {
                 fields.push(Field::number("error", error).meaning(Some(text)));
                 fields.push(Field::number("device_error", device_error));
             }
-            Response::Address(_, value) => fields.push(Field::hex("value", value, 8)),
-            Response::Node(node) => fields.push(Field::number("node", node)),
-            Response::Selected | Response::Identified | Response::WithoutNumber => {}
+            LssResponse::Address(_, value) => fields.push(Field::hex("value", value, 8)),
+            LssResponse::Node(node) => fields.push(Field::number("node", node)),
+            LssResponse::Selected | LssResponse::Identified | LssResponse::WithoutNumber => {}
         }
         if let Some((asked_ns, request)) = &self.asked
             && response.answers(request)
@@ -97,40 +102,40 @@ fn unknown(record: &TraceRecord, kind: EventKind, data: &[u8]) -> Option<Event> 
     Some(event)
 }
 
-const fn request_title(request: Request) -> &'static str {
+const fn request_title(request: LssRequest) -> &'static str {
     match request {
-        Request::SwitchGlobal(_) => "LSS switch state global",
-        Request::ConfigureNode(_) => "LSS configure node number",
-        Request::ConfigureBitTiming { .. } => "LSS configure bit timing",
-        Request::ActivateBitTiming(_) => "LSS activate bit timing",
-        Request::Store => "LSS store configuration",
-        Request::SwitchSelective(Part::Vendor, _) => "LSS switch state selective: vendor",
-        Request::SwitchSelective(Part::Product, _) => "LSS switch state selective: product",
-        Request::SwitchSelective(Part::Revision, _) => "LSS switch state selective: revision",
-        Request::SwitchSelective(Part::Serial, _) => "LSS switch state selective: serial number",
-        Request::Identify(Bound::Vendor, _) => "LSS identify: vendor",
-        Request::Identify(Bound::Product, _) => "LSS identify: product",
-        Request::Identify(Bound::LowestRevision, _) => "LSS identify: revision, lowest",
-        Request::Identify(Bound::HighestRevision, _) => "LSS identify: revision, highest",
-        Request::Identify(Bound::LowestSerial, _) => "LSS identify: serial number, lowest",
-        Request::Identify(Bound::HighestSerial, _) => "LSS identify: serial number, highest",
-        Request::IdentifyWithoutNumber => "LSS identify slaves without a number",
-        Request::FastScan { .. } => "LSS fast scan",
-        Request::Inquire(part) => inquiry_title(part),
-        Request::InquireNode => "LSS inquire node number",
+        LssRequest::SwitchGlobal(_) => "LSS switch state global",
+        LssRequest::ConfigureNode(_) => "LSS configure node number",
+        LssRequest::ConfigureBitTiming { .. } => "LSS configure bit timing",
+        LssRequest::ActivateBitTiming(_) => "LSS activate bit timing",
+        LssRequest::Store => "LSS store configuration",
+        LssRequest::SwitchSelective(Part::Vendor, _) => "LSS switch state selective: vendor",
+        LssRequest::SwitchSelective(Part::Product, _) => "LSS switch state selective: product",
+        LssRequest::SwitchSelective(Part::Revision, _) => "LSS switch state selective: revision",
+        LssRequest::SwitchSelective(Part::Serial, _) => "LSS switch state selective: serial number",
+        LssRequest::Identify(Bound::Vendor, _) => "LSS identify: vendor",
+        LssRequest::Identify(Bound::Product, _) => "LSS identify: product",
+        LssRequest::Identify(Bound::LowestRevision, _) => "LSS identify: revision, lowest",
+        LssRequest::Identify(Bound::HighestRevision, _) => "LSS identify: revision, highest",
+        LssRequest::Identify(Bound::LowestSerial, _) => "LSS identify: serial number, lowest",
+        LssRequest::Identify(Bound::HighestSerial, _) => "LSS identify: serial number, highest",
+        LssRequest::IdentifyWithoutNumber => "LSS identify slaves without a number",
+        LssRequest::FastScan { .. } => "LSS fast scan",
+        LssRequest::Inquire(part) => inquiry_title(part),
+        LssRequest::InquireNode => "LSS inquire node number",
     }
 }
 
-const fn response_title(response: Response) -> &'static str {
+const fn response_title(response: LssResponse) -> &'static str {
     match response {
-        Response::Outcome { service: Service::ConfigureNode, .. } => "LSS configure node number",
-        Response::Outcome { service: Service::ConfigureBitTiming, .. } => "LSS configure bit timing",
-        Response::Outcome { service: Service::Store, .. } => "LSS store configuration",
-        Response::Selected => "LSS switched",
-        Response::Identified => "LSS identified",
-        Response::WithoutNumber => "LSS a slave without a number",
-        Response::Address(part, _) => inquiry_title(part),
-        Response::Node(_) => "LSS inquire node number",
+        LssResponse::Outcome { service: Service::ConfigureNode, .. } => "LSS configure node number",
+        LssResponse::Outcome { service: Service::ConfigureBitTiming, .. } => "LSS configure bit timing",
+        LssResponse::Outcome { service: Service::Store, .. } => "LSS store configuration",
+        LssResponse::Selected => "LSS switched",
+        LssResponse::Identified => "LSS identified",
+        LssResponse::WithoutNumber => "LSS a slave without a number",
+        LssResponse::Address(part, _) => inquiry_title(part),
+        LssResponse::Node(_) => "LSS inquire node number",
     }
 }
 

@@ -3,7 +3,8 @@
 //! Memory: one transfer for each of 127 nodes on each channel, of at most 64 KiB.
 
 use super::codec::sdo::{
-    BlockEnd, BlockSegment, Content, MOST_BLOCK_FRAMES, Object, Request, Response, SEGMENT_BYTES, crc_of,
+    BlockEnd, BlockSegment, Content, MOST_BLOCK_FRAMES, SEGMENT_BYTES, SdoObject, SdoRequest, SdoResponse,
+    crc_of,
 };
 use crate::{Bytes, Trouble};
 
@@ -118,8 +119,8 @@ impl Sdo {
         bytes.get_mut(..data.len())?.copy_from_slice(data);
         let used = match (self.phase, from_client) {
             (Phase::FromClient, true) | (Phase::FromServer, false) => 8,
-            (_, true) => Request::used_bytes(bytes[0]),
-            (_, false) => Response::used_bytes(bytes[0]),
+            (_, true) => SdoRequest::used_bytes(bytes[0]),
+            (_, false) => SdoResponse::used_bytes(bytes[0]),
         };
         (!data.is_empty() && data.len() >= used).then_some(bytes)
     }
@@ -133,7 +134,7 @@ impl Sdo {
     }
 
     fn take_request(&mut self, time_ns: i64, bytes: [u8; 8]) -> [Option<SdoTransfer>; 2] {
-        let request = Request::decode(bytes);
+        let request = SdoRequest::decode(bytes);
         let mut behind = None;
         // If the client starts a new transfer while a block comes from the server, it has abandoned the
         // block.
@@ -147,7 +148,7 @@ impl Sdo {
             open.frames += 1;
         }
         let done = match request {
-            Some(Request::Abort(object, code)) if self.is_abort(object) => {
+            Some(SdoRequest::Abort(object, code)) if self.is_abort(object) => {
                 Some(self.abort(time_ns, object, code))
             }
             _ if self.phase == Phase::FromClient => self.block_segment(BlockSegment::decode(bytes)),
@@ -158,7 +159,7 @@ impl Sdo {
     }
 
     fn take_response(&mut self, time_ns: i64, bytes: [u8; 8]) -> Option<SdoTransfer> {
-        let response = Response::decode(bytes);
+        let response = SdoResponse::decode(bytes);
         // The first answer names the object. One that names another is not to this request.
         if self.phase == Phase::Command
             && self.open.is_some()
@@ -175,7 +176,7 @@ impl Sdo {
             }
         }
         match response {
-            Some(Response::Abort(object, code)) if self.is_abort(object) => {
+            Some(SdoResponse::Abort(object, code)) if self.is_abort(object) => {
                 Some(self.abort(time_ns, object, code))
             }
             _ if self.phase == Phase::FromServer => self.block_segment(BlockSegment::decode(bytes)),
@@ -184,11 +185,11 @@ impl Sdo {
     }
 
     /// Whether a frame that begins like an abort is one: within a block, only if it names the object.
-    fn is_abort(&self, object: Object) -> bool {
+    fn is_abort(&self, object: SdoObject) -> bool {
         self.phase == Phase::Command || self.is_of(object)
     }
 
-    fn is_of(&self, object: Object) -> bool {
+    fn is_of(&self, object: SdoObject) -> bool {
         self.open.as_ref().is_some_and(|open| open.object() == object)
     }
 
@@ -201,7 +202,7 @@ impl Sdo {
         Some(SdoTransfer { trouble: open.trouble.or(Some(trouble)), ..open })
     }
 
-    fn abort(&mut self, time_ns: i64, object: Object, code: u32) -> SdoTransfer {
+    fn abort(&mut self, time_ns: i64, object: SdoObject, code: u32) -> SdoTransfer {
         self.phase = Phase::Command;
         let open = self.open.take().unwrap_or_else(|| fresh(time_ns, object, false, Mode::Expedited));
         SdoTransfer { abort: Some(code), trouble: Some(Trouble::Aborted(super::names::abort(code))), ..open }
@@ -217,15 +218,15 @@ impl Sdo {
         Some(open)
     }
 
-    fn apply_request(&mut self, time_ns: i64, request: Request, bytes: [u8; 8]) -> Option<SdoTransfer> {
+    fn apply_request(&mut self, time_ns: i64, request: SdoRequest, bytes: [u8; 8]) -> Option<SdoTransfer> {
         match request {
-            Request::Download(object, content) => {
+            SdoRequest::Download(object, content) => {
                 let mut transfer = fresh(time_ns, object, true, Mode::of(content));
                 transfer.begin(content);
                 (self.toggle, self.open) = (false, Some(transfer));
                 None
             }
-            Request::DownloadSegment(segment) => {
+            SdoRequest::DownloadSegment(segment) => {
                 // It is completed by its confirmation.
                 let Some(open) =
                     self.open.as_mut().filter(|open| open.is_write && open.mode == Mode::Segmented)
@@ -239,50 +240,50 @@ impl Sdo {
                 self.last_segment = segment.is_last;
                 None
             }
-            Request::Upload(object) => {
+            SdoRequest::Upload(object) => {
                 (self.toggle, self.open) = (false, Some(fresh(time_ns, object, false, Mode::Expedited)));
                 None
             }
-            Request::UploadSegment { toggle } => {
+            SdoRequest::UploadSegment { toggle } => {
                 self.open.as_ref()?;
                 if toggle == self.toggle { None } else { self.end(toggle_error(self.toggle)) }
             }
-            Request::BlockUpload { object, crc, .. } => {
+            SdoRequest::BlockUpload { object, crc, .. } => {
                 self.open = Some(fresh(time_ns, object, false, Mode::Block));
                 self.crc = [crc, false];
                 None
             }
-            Request::BlockUploadEnd => self.done(),
-            Request::BlockUploadAcknowledge { taken, .. } => {
+            SdoRequest::BlockUploadEnd => self.done(),
+            SdoRequest::BlockUploadAcknowledge { taken, .. } => {
                 self.confirm_block(taken);
                 if !self.last_segment {
                     self.phase = Phase::FromServer;
                 }
                 None
             }
-            Request::BlockUploadStart => {
+            SdoRequest::BlockUploadStart => {
                 self.begin_block();
                 self.phase = Phase::FromServer;
                 None
             }
-            Request::BlockDownload { object, crc, size } => {
+            SdoRequest::BlockDownload { object, crc, size } => {
                 let transfer = SdoTransfer { size, ..fresh(time_ns, object, true, Mode::Block) };
                 (self.open, self.crc) = (Some(transfer), [crc, false]);
                 None
             }
-            Request::BlockDownloadEnd(end) => {
+            SdoRequest::BlockDownloadEnd(end) => {
                 self.end_block(end);
                 None
             }
             // Not of this transfer.
-            Request::Abort(..) => None,
+            SdoRequest::Abort(..) => None,
         }
     }
 
     fn apply_response(
         &mut self,
         time_ns: i64,
-        response: Option<Response>,
+        response: Option<SdoResponse>,
         bytes: [u8; 8],
     ) -> Option<SdoTransfer> {
         let Some(open) = &mut self.open else {
@@ -290,26 +291,26 @@ impl Sdo {
             let transfer = unasked(time_ns, bytes);
             // Segments and their confirmations do not name an object.
             let is_segment =
-                matches!(response, Some(Response::UploadSegment(_) | Response::DownloadSegment { .. }));
+                matches!(response, Some(SdoResponse::UploadSegment(_) | SdoResponse::DownloadSegment { .. }));
             return if is_segment { self.orphan(transfer) } else { Some(transfer) };
         };
         match response? {
-            Response::Download(_) => (open.mode == Mode::Expedited).then(|| self.done()).flatten(),
-            Response::Upload(_, content) => {
+            SdoResponse::Download(_) => (open.mode == Mode::Expedited).then(|| self.done()).flatten(),
+            SdoResponse::Upload(_, content) => {
                 // Also in answer to a request for blocks, which a server need not support.
                 open.mode = Mode::of(content);
                 open.begin(content);
                 self.toggle = false;
                 if open.mode == Mode::Expedited { self.done() } else { None }
             }
-            Response::DownloadSegment { toggle } => {
+            SdoResponse::DownloadSegment { toggle } => {
                 if toggle != self.toggle {
                     return self.end(toggle_error(self.toggle));
                 }
                 self.toggle = !self.toggle;
                 if std::mem::take(&mut self.last_segment) { self.done() } else { None }
             }
-            Response::UploadSegment(segment) => {
+            SdoResponse::UploadSegment(segment) => {
                 if segment.toggle != self.toggle {
                     return self.end(toggle_error(self.toggle));
                 }
@@ -317,31 +318,31 @@ impl Sdo {
                 append(open, segment.data());
                 if segment.is_last { self.done() } else { None }
             }
-            Response::BlockDownload { crc, .. } => {
+            SdoResponse::BlockDownload { crc, .. } => {
                 self.crc[1] = crc;
                 self.begin_block();
                 self.phase = Phase::FromClient;
                 None
             }
-            Response::BlockDownloadAcknowledge { taken, .. } => {
+            SdoResponse::BlockDownloadAcknowledge { taken, .. } => {
                 self.confirm_block(taken);
                 if !self.last_segment {
                     self.phase = Phase::FromClient;
                 }
                 None
             }
-            Response::BlockDownloadEnd => self.done(),
-            Response::BlockUpload { crc, size, .. } => {
+            SdoResponse::BlockDownloadEnd => self.done(),
+            SdoResponse::BlockUpload { crc, size, .. } => {
                 open.size = size;
                 self.crc[1] = crc;
                 None
             }
-            Response::BlockUploadEnd(end) => {
+            SdoResponse::BlockUploadEnd(end) => {
                 self.end_block(end);
                 None
             }
             // Not of this transfer.
-            Response::Abort(..) => None,
+            SdoResponse::Abort(..) => None,
         }
     }
 
@@ -412,8 +413,8 @@ impl Mode {
 }
 
 impl SdoTransfer {
-    const fn object(&self) -> Object {
-        Object { index: self.index, sub: self.sub }
+    const fn object(&self) -> SdoObject {
+        SdoObject { index: self.index, sub: self.sub }
     }
 
     /// Takes what the frame that begins it says of the bytes.
@@ -432,16 +433,16 @@ fn headless(time_ns: i64, data: &[u8], trouble: Trouble) -> SdoTransfer {
     SdoTransfer {
         data: Bytes::from_slice(data),
         trouble: Some(trouble),
-        ..fresh(time_ns, Object::default(), false, Mode::Expedited)
+        ..fresh(time_ns, SdoObject::default(), false, Mode::Expedited)
     }
 }
 
 /// A server's answer to a request that was not observed.
 fn unasked(time_ns: i64, bytes: [u8; 8]) -> SdoTransfer {
-    let response = Response::decode(bytes);
-    let is_write = matches!(response, Some(Response::Download(_)));
-    let mut transfer = fresh(time_ns, Object::decode(bytes), is_write, Mode::Expedited);
-    if let Some(Response::Upload(_, content @ Content::Expedited { .. })) = response {
+    let response = SdoResponse::decode(bytes);
+    let is_write = matches!(response, Some(SdoResponse::Download(_)));
+    let mut transfer = fresh(time_ns, SdoObject::decode(bytes), is_write, Mode::Expedited);
+    if let Some(SdoResponse::Upload(_, content @ Content::Expedited { .. })) = response {
         transfer.begin(content);
     }
     SdoTransfer { trouble: Some(Trouble::Headless), ..transfer }
@@ -459,7 +460,7 @@ fn append(open: &mut SdoTransfer, bytes: &[u8]) {
     open.data.extend_from_slice(&bytes[..bytes.len().min(room)]);
 }
 
-fn fresh(time_ns: i64, object: Object, is_write: bool, mode: Mode) -> SdoTransfer {
+fn fresh(time_ns: i64, object: SdoObject, is_write: bool, mode: Mode) -> SdoTransfer {
     SdoTransfer {
         start_ns: time_ns,
         time_ns,

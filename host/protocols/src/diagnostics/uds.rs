@@ -386,12 +386,9 @@ fn several(asked: &[u8], answer: &[u8], fields: &mut Vec<Field>) {
         let known = known.filter(|place| answer.get(*place..).is_some_and(|rest| rest.starts_with(next)));
         let mut places =
             answer.windows(2).enumerate().skip(at).filter(|(_, two)| *two == next).map(|(at, _)| at);
-        let place = match (known, places.next(), places.next()) {
-            (Some(place), ..) | (None, Some(place), None) => place,
-            _ => {
-                rest("value", answer, fields);
-                return;
-            }
+        let ((Some(place), ..) | (None, Some(place), None)) = (known, places.next(), places.next()) else {
+            rest("value", answer, fields);
+            return;
         };
         parts.push(&answer[at..place]);
         at = place + 2;

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use cantap_protocols::canopen::codec::sdo::{Object, abort};
+use cantap_protocols::canopen::codec::sdo::{SdoObject, abort};
 use cantap_protocols::canopen::eds::{self, Eds};
 
 /// Longest value that is accepted, in bytes.
@@ -67,13 +67,13 @@ impl Dictionary {
     }
 
     /// A client reads.
-    pub fn read(&self, object: Object) -> Result<&[u8], u32> {
+    pub fn read(&self, object: SdoObject) -> Result<&[u8], u32> {
         let entry = self.entry(object.index, object.sub)?;
         if entry.can_read { Ok(&entry.value) } else { Err(abort::WRITE_ONLY) }
     }
 
     /// Whether a client may write this many bytes, or any number if it does not say.
-    pub fn may_write(&self, object: Object, bytes: Option<usize>) -> Result<(), u32> {
+    pub fn may_write(&self, object: SdoObject, bytes: Option<usize>) -> Result<(), u32> {
         let entry = self.entry(object.index, object.sub)?;
         if !entry.can_write {
             return Err(abort::READ_ONLY);
@@ -86,9 +86,9 @@ impl Dictionary {
     }
 
     /// A client writes.
-    pub fn write(&mut self, object: Object, value: &[u8]) -> Result<(), u32> {
+    pub fn write(&mut self, object: SdoObject, value: &[u8]) -> Result<(), u32> {
         self.may_write(object, Some(value.len()))?;
-        let Object { index, sub } = object;
+        let SdoObject { index, sub } = object;
         let number = value.iter().take(4).rev().fold(0_u32, |number, byte| number << 8 | u32::from(*byte));
         match (index, sub) {
             // The history can only be cleared.

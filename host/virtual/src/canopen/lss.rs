@@ -1,6 +1,8 @@
 //! A slave of the layer setting services (CiA 305).
 
-use cantap_protocols::canopen::codec::lss::{Bound, NO_NODE, Part, Request, Response, Service, WHOLE_SCAN};
+use cantap_protocols::canopen::codec::lss::{
+    Bound, LssRequest, LssResponse, NO_NODE, Part, Service, WHOLE_SCAN,
+};
 
 /// What a command from the master changes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -33,8 +35,10 @@ impl Slave {
     /// Takes a frame from the master; returns the answer and what changes.
     pub fn take(&mut self, bytes: &[u8]) -> (Option<[u8; 8]>, Option<Change>) {
         // All frames have 8 bytes (CiA 305, 3.2).
-        let Some(request) = Request::decode(bytes).filter(|_| bytes.len() == 8) else { return (None, None) };
-        if let Request::SwitchGlobal(mode) = request {
+        let Some(request) = LssRequest::decode(bytes).filter(|_| bytes.len() == 8) else {
+            return (None, None);
+        };
+        if let LssRequest::SwitchGlobal(mode) = request {
             self.configured = mode == 1;
             // A node without a number takes part once it is released with one.
             if !self.configured && self.node == NO_NODE && self.pending != NO_NODE {
@@ -43,15 +47,15 @@ impl Slave {
             }
             return (None, None);
         }
-        (self.respond(request).map(Response::encode), None)
+        (self.respond(request).map(LssResponse::encode), None)
     }
 
-    fn respond(&mut self, request: Request) -> Option<Response> {
+    fn respond(&mut self, request: LssRequest) -> Option<LssResponse> {
         let outcome = |service, is_right: bool| {
-            Some(Response::Outcome { service, error: u8::from(!is_right), device_error: 0 })
+            Some(LssResponse::Outcome { service, error: u8::from(!is_right), device_error: 0 })
         };
         match request {
-            Request::SwitchSelective(part, value) => {
+            LssRequest::SwitchSelective(part, value) => {
                 let place = part as usize;
                 let is_right = self.selected == place && self.part(part) == value;
                 self.selected = if is_right {
@@ -63,9 +67,9 @@ impl Slave {
                     return None;
                 }
                 (self.selected, self.configured) = (0, true);
-                Some(Response::Selected)
+                Some(LssResponse::Selected)
             }
-            Request::Identify(bound, value) => {
+            LssRequest::Identify(bound, value) => {
                 let place = bound as usize;
                 let [vendor, product, revision, serial] = self.identity;
                 let is_right = match bound {
@@ -78,16 +82,16 @@ impl Slave {
                 };
                 self.identified =
                     if is_right && (place == 0 || self.identified == place) { place + 1 } else { 0 };
-                (self.identified == Bound::ALL.len()).then_some(Response::Identified)
+                (self.identified == Bound::ALL.len()).then_some(LssResponse::Identified)
             }
-            Request::IdentifyWithoutNumber if self.node == NO_NODE => Some(Response::WithoutNumber),
-            Request::FastScan { value, unchecked, part, next }
+            LssRequest::IdentifyWithoutNumber if self.node == NO_NODE => Some(LssResponse::WithoutNumber),
+            LssRequest::FastScan { value, unchecked, part, next }
                 if self.node == NO_NODE && !self.configured =>
             {
                 self.scan(value, unchecked, part, next)
             }
             _ if !self.configured => None,
-            Request::ConfigureNode(node) => {
+            LssRequest::ConfigureNode(node) => {
                 let is_right = matches!(node, 1..=127 | NO_NODE);
                 if is_right {
                     self.pending = node;
@@ -95,12 +99,12 @@ impl Slave {
                 outcome(Service::ConfigureNode, is_right)
             }
             // Table 0, without its reserved entry. The simulated bus keeps its bit rate.
-            Request::ConfigureBitTiming { table, index } => {
+            LssRequest::ConfigureBitTiming { table, index } => {
                 outcome(Service::ConfigureBitTiming, table == 0 && matches!(index, 0..=4 | 6..=8))
             }
-            Request::Store => outcome(Service::Store, true),
-            Request::Inquire(part) => Some(Response::Address(part, self.part(part))),
-            Request::InquireNode => Some(Response::Node(self.node)),
+            LssRequest::Store => outcome(Service::Store, true),
+            LssRequest::Inquire(part) => Some(LssResponse::Address(part, self.part(part))),
+            LssRequest::InquireNode => Some(LssResponse::Node(self.node)),
             _ => None,
         }
     }
@@ -109,10 +113,10 @@ impl Slave {
         self.identity[part as usize]
     }
 
-    fn scan(&mut self, value: u32, unchecked: u8, part: u8, next: u8) -> Option<Response> {
+    fn scan(&mut self, value: u32, unchecked: u8, part: u8, next: u8) -> Option<LssResponse> {
         if unchecked == WHOLE_SCAN {
             self.scanned = 0;
-            return Some(Response::Identified);
+            return Some(LssResponse::Identified);
         }
         let own = *self.identity.get(usize::from(part))?;
         if part != self.scanned || unchecked > 31 || own >> unchecked != value >> unchecked {
@@ -120,7 +124,7 @@ impl Slave {
         }
         self.scanned = next;
         self.configured = unchecked == 0 && next < part;
-        Some(Response::Identified)
+        Some(LssResponse::Identified)
     }
 
     /// The new number applies from the next reset.

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 
 use cantap_protocols::canopen::codec::lss::{self, NO_NODE};
-use cantap_protocols::canopen::codec::sdo::Object;
+use cantap_protocols::canopen::codec::sdo::SdoObject;
 use cantap_protocols::canopen::eds::Eds;
 use cantap_wire::{Frame, Id};
 
@@ -373,7 +373,7 @@ impl CanOpenNode {
     }
 
     /// Reacts to an object that a client has written.
-    fn written(&mut self, object: Object, now_ns: u64) {
+    fn written(&mut self, object: SdoObject, now_ns: u64) {
         match (object.index, object.sub) {
             (0x1003, 0) => self.dictionary.set(0x1003, 1, &[0; 4]),
             (0x1017, 0) => self.beat_ns = now_ns + self.beat_period_ns(),

@@ -1,8 +1,8 @@
 //! The SDO server: expedited, in segments and in blocks, in both directions (CiA 301, 7.2.4.3).
 
 use cantap_protocols::canopen::codec::sdo::{
-    BlockEnd, BlockSegment, Content, MOST_BLOCK_FRAMES, Object, Request, Response, SEGMENT_BYTES, Segment,
-    abort, crc_of,
+    BlockEnd, BlockSegment, Content, MOST_BLOCK_FRAMES, SEGMENT_BYTES, SdoObject, SdoRequest, SdoResponse,
+    Segment, abort, crc_of,
 };
 
 use super::dictionary::{Dictionary, MOST_BYTES};
@@ -49,7 +49,7 @@ enum State {
 #[derive(Debug)]
 pub struct Server {
     state: State,
-    object: Object,
+    object: SdoObject,
     until_ns: u64,
     /// The segment of the next block to lose on purpose; 0 for none.
     pub loses: u8,
@@ -59,18 +59,18 @@ pub struct Server {
 #[derive(Debug, Default)]
 pub struct Reply {
     pub frames: Vec<[u8; 8]>,
-    pub written: Option<Object>,
+    pub written: Option<SdoObject>,
 }
 
 impl Reply {
-    fn push(&mut self, response: Response) {
+    fn push(&mut self, response: SdoResponse) {
         self.frames.push(response.encode());
     }
 }
 
 impl Default for Server {
     fn default() -> Self {
-        Self { state: State::Idle, object: Object::default(), until_ns: 0, loses: 0 }
+        Self { state: State::Idle, object: SdoObject::default(), until_ns: 0, loses: 0 }
     }
 }
 
@@ -87,7 +87,7 @@ impl Server {
 
     fn abort(&mut self, code: u32) -> [u8; 8] {
         self.state = State::Idle;
-        Response::Abort(self.object, code).encode()
+        SdoResponse::Abort(self.object, code).encode()
     }
 
     /// Takes a frame from the client.
@@ -102,8 +102,8 @@ impl Server {
     }
 
     fn frame(&mut self, bytes: [u8; 8], dictionary: &mut Dictionary, reply: &mut Reply) -> Result<(), u32> {
-        let request = Request::decode(bytes);
-        if let Some(Request::Abort(..)) = request {
+        let request = SdoRequest::decode(bytes);
+        if let Some(SdoRequest::Abort(..)) = request {
             self.state = State::Idle;
             return Ok(());
         }
@@ -115,7 +115,7 @@ impl Server {
 
     fn request(
         &mut self,
-        request: Request,
+        request: SdoRequest,
         dictionary: &mut Dictionary,
         reply: &mut Reply,
     ) -> Result<(), u32> {
@@ -123,7 +123,7 @@ impl Server {
             self.state = State::Idle;
         }
         match request {
-            Request::Download(object, content) => {
+            SdoRequest::Download(object, content) => {
                 self.object = object;
                 match content {
                     Content::Expedited { bytes, length } => {
@@ -135,18 +135,18 @@ impl Server {
                         self.state = State::Write { data: Vec::new(), size, toggle: false };
                     }
                 }
-                reply.push(Response::Download(object));
+                reply.push(SdoResponse::Download(object));
                 Ok(())
             }
-            Request::DownloadSegment(segment) => self.written_segment(segment, dictionary, reply),
-            Request::Upload(object) => {
+            SdoRequest::DownloadSegment(segment) => self.written_segment(segment, dictionary, reply),
+            SdoRequest::Upload(object) => {
                 self.object = object;
                 let data = dictionary.read(object)?.to_vec();
                 self.begin_reading(data, reply);
                 Ok(())
             }
-            Request::UploadSegment { toggle } => self.read_segment(toggle, reply),
-            Request::BlockUpload { object, block_size, threshold, .. } => {
+            SdoRequest::UploadSegment { toggle } => self.read_segment(toggle, reply),
+            SdoRequest::BlockUpload { object, block_size, threshold, .. } => {
                 self.object = object;
                 let data = dictionary.read(object)?.to_vec();
                 if !(1..=MOST_BLOCK_FRAMES).contains(&block_size) {
@@ -157,31 +157,31 @@ impl Server {
                     self.begin_reading(data, reply);
                     return Ok(());
                 }
-                reply.push(Response::BlockUpload { object, crc: true, size: Some(data.len() as u32) });
+                reply.push(SdoResponse::BlockUpload { object, crc: true, size: Some(data.len() as u32) });
                 self.state = State::ReadBlocks { data, at: 0, block: block_size, sent: 0, ends: false };
                 Ok(())
             }
-            Request::BlockUploadStart => {
+            SdoRequest::BlockUploadStart => {
                 self.send_block(reply);
                 Ok(())
             }
-            Request::BlockUploadAcknowledge { taken, block_size } => {
+            SdoRequest::BlockUploadAcknowledge { taken, block_size } => {
                 self.block_confirmed(taken, block_size, reply)
             }
-            Request::BlockUploadEnd | Request::Abort(..) => {
+            SdoRequest::BlockUploadEnd | SdoRequest::Abort(..) => {
                 self.state = State::Idle;
                 Ok(())
             }
-            Request::BlockDownload { object, crc, size } => {
+            SdoRequest::BlockDownload { object, crc, size } => {
                 self.object = object;
                 let size = size.map(|size| size as usize);
                 dictionary.may_write(object, size)?;
                 self.state =
                     State::WriteBlocks { data: Vec::new(), size, next: 1, with_crc: crc, ended: false };
-                reply.push(Response::BlockDownload { object, crc: true, block_size: BLOCK });
+                reply.push(SdoResponse::BlockDownload { object, crc: true, block_size: BLOCK });
                 Ok(())
             }
-            Request::BlockDownloadEnd(end) => self.end_of_blocks(end, dictionary, reply),
+            SdoRequest::BlockDownloadEnd(end) => self.end_of_blocks(end, dictionary, reply),
         }
     }
 
@@ -193,7 +193,7 @@ impl Server {
 
     fn begin_reading(&mut self, data: Vec<u8>, reply: &mut Reply) {
         let content = Content::expedited(&data).unwrap_or(Content::Segmented(Some(data.len() as u32)));
-        reply.push(Response::Upload(self.object, content));
+        reply.push(SdoResponse::Upload(self.object, content));
         if let Content::Segmented(_) = content {
             self.state = State::Read { data, at: 0, toggle: false };
         }
@@ -206,7 +206,7 @@ impl Server {
         }
         let part = &data[*at..data.len().min(*at + SEGMENT_BYTES)];
         let is_last = *at + part.len() == data.len();
-        reply.push(Response::UploadSegment(Segment::new(asked, is_last, part)));
+        reply.push(SdoResponse::UploadSegment(Segment::new(asked, is_last, part)));
         (*at, *toggle) = (*at + part.len(), !*toggle);
         if is_last {
             self.state = State::Idle;
@@ -237,7 +237,7 @@ impl Server {
             self.state = State::Idle;
             self.write(&data, dictionary, reply)?;
         }
-        reply.push(Response::DownloadSegment { toggle: segment.toggle });
+        reply.push(SdoResponse::DownloadSegment { toggle: segment.toggle });
         Ok(())
     }
 
@@ -265,7 +265,7 @@ impl Server {
             return Err(abort::SEQUENCE);
         }
         if *ends && taken == *sent {
-            reply.push(Response::BlockUploadEnd(BlockEnd::of(data.len(), crc_of(data))));
+            reply.push(SdoResponse::BlockUploadEnd(BlockEnd::of(data.len(), crc_of(data))));
             return Ok(());
         }
         if !(1..=MOST_BLOCK_FRAMES).contains(&next) {
@@ -295,7 +295,7 @@ impl Server {
             return Err(abort::MEMORY);
         }
         if number == BLOCK || is_last {
-            reply.push(Response::BlockDownloadAcknowledge { taken: *next - 1, block_size: BLOCK });
+            reply.push(SdoResponse::BlockDownloadAcknowledge { taken: *next - 1, block_size: BLOCK });
             *next = 1;
         }
         Ok(())
@@ -320,7 +320,7 @@ impl Server {
         let data = std::mem::take(data);
         self.state = State::Idle;
         self.write(&data, dictionary, reply)?;
-        reply.push(Response::BlockDownloadEnd);
+        reply.push(SdoResponse::BlockDownloadEnd);
         Ok(())
     }
 }

@@ -64,17 +64,14 @@ impl IsoTp {
     /// Takes a frame to this ECU. Returns a complete request. Only single frames are sent to all ECUs at
     /// once.
     pub fn hear(&mut self, frame: &Frame, to_all: bool, now_ns: u64) -> Option<Vec<u8>> {
-        let pci = match parse(frame.data(), 0) {
-            Ok(pci) => pci?,
-            Err(_) => {
-                // Flow control of a reserved status ends an answer (ISO 15765-2:2016, 9.6.5.3); other faults change nothing.
-                if !to_all && frame.data().first().is_some_and(|first| first >> 4 == 3) {
-                    self.sending = self.sending.take().filter(|sending| !sending.waits);
-                }
-                return None;
+        let Ok(pci) = parse(frame.data(), 0) else {
+            // Flow control of a reserved status ends an answer (N_INVALID_FS in ISO 15765-2); other faults change nothing.
+            if !to_all && frame.data().first().is_some_and(|first| first >> 4 == 3) {
+                self.sending = self.sending.take().filter(|sending| !sending.waits);
             }
+            return None;
         };
-        match pci {
+        match pci? {
             Pci::Single(request) => {
                 self.receiving = None;
                 Some(request.to_vec())

@@ -43,7 +43,7 @@ pub enum Bound {
 
 /// A frame from the master.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Request {
+pub enum LssRequest {
     /// All slaves: 0 for the waiting state, 1 for configuration.
     SwitchGlobal(u8),
     /// The slave with this address, of which it names one part after the other.
@@ -84,7 +84,7 @@ pub enum Request {
 
 /// A frame from a slave.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Response {
+pub enum LssResponse {
     /// It is the one that was selected.
     Selected,
     /// The outcome of a configuration.
@@ -149,7 +149,7 @@ const SELECT: u8 = 0x40;
 const IDENTIFY: u8 = 0x46;
 const INQUIRE: u8 = 0x5A;
 
-impl Request {
+impl LssRequest {
     /// The frame. Unused bytes are 0.
     pub fn encode(self) -> [u8; 8] {
         let word = |command: u8, value: u32| frame(command, &value.to_le_bytes());
@@ -193,7 +193,7 @@ impl Request {
     }
 }
 
-impl Response {
+impl LssResponse {
     /// The frame. Unused bytes are 0.
     pub fn encode(self) -> [u8; 8] {
         match self {
@@ -229,20 +229,20 @@ impl Response {
     }
 
     /// Whether it may be one to this request.
-    pub fn answers(&self, request: &Request) -> bool {
+    pub fn answers(&self, request: &LssRequest) -> bool {
         match (self, request) {
-            (Self::Selected, Request::SwitchSelective(part, _)) => *part == Part::Serial,
-            (Self::Identified, Request::Identify(bound, _)) => *bound == Bound::HighestSerial,
-            (Self::Identified, Request::FastScan { .. } | Request::IdentifyWithoutNumber)
-            | (Self::WithoutNumber, Request::IdentifyWithoutNumber)
-            | (Self::Node(_), Request::InquireNode) => true,
+            (Self::Selected, LssRequest::SwitchSelective(part, _)) => *part == Part::Serial,
+            (Self::Identified, LssRequest::Identify(bound, _)) => *bound == Bound::HighestSerial,
+            (Self::Identified, LssRequest::FastScan { .. } | LssRequest::IdentifyWithoutNumber)
+            | (Self::WithoutNumber, LssRequest::IdentifyWithoutNumber)
+            | (Self::Node(_), LssRequest::InquireNode) => true,
             (Self::Outcome { service, .. }, request) => matches!(
                 (service, request),
-                (Service::ConfigureNode, Request::ConfigureNode(_))
-                    | (Service::ConfigureBitTiming, Request::ConfigureBitTiming { .. })
-                    | (Service::Store, Request::Store)
+                (Service::ConfigureNode, LssRequest::ConfigureNode(_))
+                    | (Service::ConfigureBitTiming, LssRequest::ConfigureBitTiming { .. })
+                    | (Service::Store, LssRequest::Store)
             ),
-            (Self::Address(part, _), Request::Inquire(asked)) => part == asked,
+            (Self::Address(part, _), LssRequest::Inquire(asked)) => part == asked,
             _ => false,
         }
     }
@@ -268,56 +268,59 @@ mod tests {
     #[test]
     fn each_frame_has_its_bytes() {
         for (request, bytes) in [
-            (Request::SwitchGlobal(1), [0x04, 1, 0, 0, 0, 0, 0, 0]),
-            (Request::SwitchSelective(Part::Serial, 0x1234_5678), [0x43, 0x78, 0x56, 0x34, 0x12, 0, 0, 0]),
-            (Request::ConfigureNode(5), [0x11, 5, 0, 0, 0, 0, 0, 0]),
-            (Request::ConfigureBitTiming { table: 0, index: 2 }, [0x13, 0, 2, 0, 0, 0, 0, 0]),
-            (Request::ActivateBitTiming(300), [0x15, 0x2C, 1, 0, 0, 0, 0, 0]),
-            (Request::Store, [0x17, 0, 0, 0, 0, 0, 0, 0]),
-            (Request::Identify(Bound::HighestSerial, 1), [0x4B, 1, 0, 0, 0, 0, 0, 0]),
-            (Request::IdentifyWithoutNumber, [0x4C, 0, 0, 0, 0, 0, 0, 0]),
-            (Request::FastScan { value: 1, unchecked: 31, part: 2, next: 3 }, [0x51, 1, 0, 0, 0, 31, 2, 3]),
-            (Request::Inquire(Part::Product), [0x5B, 0, 0, 0, 0, 0, 0, 0]),
-            (Request::InquireNode, [0x5E, 0, 0, 0, 0, 0, 0, 0]),
+            (LssRequest::SwitchGlobal(1), [0x04, 1, 0, 0, 0, 0, 0, 0]),
+            (LssRequest::SwitchSelective(Part::Serial, 0x1234_5678), [0x43, 0x78, 0x56, 0x34, 0x12, 0, 0, 0]),
+            (LssRequest::ConfigureNode(5), [0x11, 5, 0, 0, 0, 0, 0, 0]),
+            (LssRequest::ConfigureBitTiming { table: 0, index: 2 }, [0x13, 0, 2, 0, 0, 0, 0, 0]),
+            (LssRequest::ActivateBitTiming(300), [0x15, 0x2C, 1, 0, 0, 0, 0, 0]),
+            (LssRequest::Store, [0x17, 0, 0, 0, 0, 0, 0, 0]),
+            (LssRequest::Identify(Bound::HighestSerial, 1), [0x4B, 1, 0, 0, 0, 0, 0, 0]),
+            (LssRequest::IdentifyWithoutNumber, [0x4C, 0, 0, 0, 0, 0, 0, 0]),
+            (
+                LssRequest::FastScan { value: 1, unchecked: 31, part: 2, next: 3 },
+                [0x51, 1, 0, 0, 0, 31, 2, 3],
+            ),
+            (LssRequest::Inquire(Part::Product), [0x5B, 0, 0, 0, 0, 0, 0, 0]),
+            (LssRequest::InquireNode, [0x5E, 0, 0, 0, 0, 0, 0, 0]),
         ] {
             assert_eq!(request.encode(), bytes);
-            assert_eq!(Request::decode(&bytes), Some(request));
+            assert_eq!(LssRequest::decode(&bytes), Some(request));
         }
-        let outcome = Response::Outcome { service: Service::Store, error: 2, device_error: 0 };
+        let outcome = LssResponse::Outcome { service: Service::Store, error: 2, device_error: 0 };
         for (response, bytes) in [
-            (Response::Selected, [0x44, 0, 0, 0, 0, 0, 0, 0]),
+            (LssResponse::Selected, [0x44, 0, 0, 0, 0, 0, 0, 0]),
             (outcome, [0x17, 2, 0, 0, 0, 0, 0, 0]),
-            (Response::Identified, [0x4F, 0, 0, 0, 0, 0, 0, 0]),
-            (Response::WithoutNumber, [0x50, 0, 0, 0, 0, 0, 0, 0]),
-            (Response::Address(Part::Vendor, 7), [0x5A, 7, 0, 0, 0, 0, 0, 0]),
-            (Response::Node(NO_NODE), [0x5E, 255, 0, 0, 0, 0, 0, 0]),
+            (LssResponse::Identified, [0x4F, 0, 0, 0, 0, 0, 0, 0]),
+            (LssResponse::WithoutNumber, [0x50, 0, 0, 0, 0, 0, 0, 0]),
+            (LssResponse::Address(Part::Vendor, 7), [0x5A, 7, 0, 0, 0, 0, 0, 0]),
+            (LssResponse::Node(NO_NODE), [0x5E, 255, 0, 0, 0, 0, 0, 0]),
         ] {
             assert_eq!(response.encode(), bytes);
-            assert_eq!(Response::decode(&bytes), Some(response));
+            assert_eq!(LssResponse::decode(&bytes), Some(response));
         }
         // What the master sends is nothing that a slave says, and the other way round.
-        assert_eq!((Response::decode(&[0x04, 1]), Request::decode(&[0x4F])), (None, None));
-        assert_eq!((Request::decode(&[0x40, 1, 2, 3]), Request::decode(&[])), (None, None));
+        assert_eq!((LssResponse::decode(&[0x04, 1]), LssRequest::decode(&[0x4F])), (None, None));
+        assert_eq!((LssRequest::decode(&[0x40, 1, 2, 3]), LssRequest::decode(&[])), (None, None));
     }
 
     #[test]
     fn answers_are_to_their_own_requests() {
-        let scan = Request::FastScan { value: 0, unchecked: WHOLE_SCAN, part: 0, next: 0 };
-        assert!(Response::Identified.answers(&scan));
-        assert!(Response::Selected.answers(&Request::SwitchSelective(Part::Serial, 0)));
-        assert!(!Response::Selected.answers(&Request::SwitchSelective(Part::Vendor, 0)));
-        assert!(!Response::Address(Part::Vendor, 0).answers(&Request::Inquire(Part::Serial)));
-        assert!(!Response::Node(1).answers(&Request::ConfigureNode(1)));
+        let scan = LssRequest::FastScan { value: 0, unchecked: WHOLE_SCAN, part: 0, next: 0 };
+        assert!(LssResponse::Identified.answers(&scan));
+        assert!(LssResponse::Selected.answers(&LssRequest::SwitchSelective(Part::Serial, 0)));
+        assert!(!LssResponse::Selected.answers(&LssRequest::SwitchSelective(Part::Vendor, 0)));
+        assert!(!LssResponse::Address(Part::Vendor, 0).answers(&LssRequest::Inquire(Part::Serial)));
+        assert!(!LssResponse::Node(1).answers(&LssRequest::ConfigureNode(1)));
     }
 
     proptest! {
         #[test]
         fn what_was_decoded_is_encoded_with_the_same_meaning(bytes in proptest::collection::vec(any::<u8>(), 0..9)) {
-            if let Some(request) = Request::decode(&bytes) {
-                prop_assert_eq!(Request::decode(&request.encode()), Some(request));
+            if let Some(request) = LssRequest::decode(&bytes) {
+                prop_assert_eq!(LssRequest::decode(&request.encode()), Some(request));
             }
-            if let Some(response) = Response::decode(&bytes) {
-                prop_assert_eq!(Response::decode(&response.encode()), Some(response));
+            if let Some(response) = LssResponse::decode(&bytes) {
+                prop_assert_eq!(LssResponse::decode(&response.encode()), Some(response));
             }
         }
     }

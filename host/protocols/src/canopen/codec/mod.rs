@@ -1,4 +1,4 @@
-//! Frames of SDO and LSS as types, with [`encode`](sdo::Request::encode) and [`decode`](sdo::Request::decode) and without state: for
+//! Frames of SDO and LSS as types, with [`encode`](sdo::SdoRequest::encode) and [`decode`](sdo::SdoRequest::decode) and without state: for
 //! those who read a bus, for clients, and for simulated nodes.
 
 pub mod lss;

@@ -50,7 +50,7 @@ pub mod abort {
 
 /// The object that a frame names.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct Object {
+pub struct SdoObject {
     /// The index.
     pub index: u16,
     /// The sub-index.
@@ -104,13 +104,13 @@ pub struct BlockEnd {
 
 /// A frame from the client. A download writes the object, an upload reads it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Request {
+pub enum SdoRequest {
     /// Begins to write.
-    Download(Object, Content),
+    Download(SdoObject, Content),
     /// Goes on.
     DownloadSegment(Segment),
     /// Begins to read.
-    Upload(Object),
+    Upload(SdoObject),
     /// Asks for the next segment.
     UploadSegment {
         /// As in the segment that is asked for.
@@ -119,7 +119,7 @@ pub enum Request {
     /// Begins to read by blocks.
     BlockUpload {
         /// What to read.
-        object: Object,
+        object: SdoObject,
         /// The client can check a CRC.
         crc: bool,
         /// Frames in the first block, 1 to 127.
@@ -141,7 +141,7 @@ pub enum Request {
     /// Begins to write by blocks.
     BlockDownload {
         /// What to write.
-        object: Object,
+        object: SdoObject,
         /// The client can make a CRC.
         crc: bool,
         /// How many bytes, where the frame has it.
@@ -150,18 +150,18 @@ pub enum Request {
     /// All bytes were sent.
     BlockDownloadEnd(BlockEnd),
     /// Ends the transfer.
-    Abort(Object, u32),
+    Abort(SdoObject, u32),
 }
 
 /// A frame from the server.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Response {
+pub enum SdoResponse {
     /// Reading begins.
-    Upload(Object, Content),
+    Upload(SdoObject, Content),
     /// The segment that was asked for.
     UploadSegment(Segment),
     /// Writing has begun or, if expedited, is complete.
-    Download(Object),
+    Download(SdoObject),
     /// The segment was taken.
     DownloadSegment {
         /// As in the segment.
@@ -170,7 +170,7 @@ pub enum Response {
     /// Reading by blocks begins.
     BlockUpload {
         /// What is read.
-        object: Object,
+        object: SdoObject,
         /// The server can make a CRC.
         crc: bool,
         /// How many bytes, where the frame has it.
@@ -181,7 +181,7 @@ pub enum Response {
     /// Writing by blocks begins.
     BlockDownload {
         /// What is written.
-        object: Object,
+        object: SdoObject,
         /// The server can check a CRC.
         crc: bool,
         /// Frames in the first block, 1 to 127.
@@ -197,10 +197,10 @@ pub enum Response {
     /// The object was written.
     BlockDownloadEnd,
     /// Ends the transfer.
-    Abort(Object, u32),
+    Abort(SdoObject, u32),
 }
 
-impl Object {
+impl SdoObject {
     /// From the frame that begins a transfer, or the answer to it; other frames name none.
     pub fn decode(bytes: [u8; 8]) -> Self {
         Self { index: u16::from_le_bytes([bytes[1], bytes[2]]), sub: bytes[3] }
@@ -304,7 +304,7 @@ impl BlockEnd {
     }
 }
 
-impl Request {
+impl SdoRequest {
     /// The frame. Unused bytes are 0.
     pub fn encode(self) -> [u8; 8] {
         match self {
@@ -332,12 +332,12 @@ impl Request {
         let [command, second, third, ..] = bytes;
         Some(match (command >> 5, command & 3) {
             (0, _) => Self::DownloadSegment(Segment::decode(bytes)),
-            (1, _) => Self::Download(Object::decode(bytes), Content::decode(bytes)),
-            (2, _) => Self::Upload(Object::decode(bytes)),
+            (1, _) => Self::Download(SdoObject::decode(bytes), Content::decode(bytes)),
+            (2, _) => Self::Upload(SdoObject::decode(bytes)),
             (3, _) => Self::UploadSegment { toggle: command & 0x10 != 0 },
-            (4, _) if command == ABORT => Self::Abort(Object::decode(bytes), last_word(bytes)),
+            (4, _) if command == ABORT => Self::Abort(SdoObject::decode(bytes), last_word(bytes)),
             (5, 0) => Self::BlockUpload {
-                object: Object::decode(bytes),
+                object: SdoObject::decode(bytes),
                 crc: command & 4 != 0,
                 block_size: bytes[4],
                 threshold: bytes[5],
@@ -346,7 +346,7 @@ impl Request {
             (5, 2) => Self::BlockUploadAcknowledge { taken: second, block_size: third },
             (5, _) => Self::BlockUploadStart,
             (6, 0 | 2) => Self::BlockDownload {
-                object: Object::decode(bytes),
+                object: SdoObject::decode(bytes),
                 crc: command & 4 != 0,
                 size: block_size(bytes),
             },
@@ -375,7 +375,7 @@ impl Request {
     }
 }
 
-impl Response {
+impl SdoResponse {
     /// The frame. Unused bytes are 0.
     pub fn encode(self) -> [u8; 8] {
         match self {
@@ -403,18 +403,18 @@ impl Response {
         Some(match (command >> 5, command & 3) {
             (0, _) => Self::UploadSegment(Segment::decode(bytes)),
             (1, _) => Self::DownloadSegment { toggle: command & 0x10 != 0 },
-            (2, _) => Self::Upload(Object::decode(bytes), Content::decode(bytes)),
-            (3, _) => Self::Download(Object::decode(bytes)),
-            (4, _) if command == ABORT => Self::Abort(Object::decode(bytes), last_word(bytes)),
+            (2, _) => Self::Upload(SdoObject::decode(bytes), Content::decode(bytes)),
+            (3, _) => Self::Download(SdoObject::decode(bytes)),
+            (4, _) if command == ABORT => Self::Abort(SdoObject::decode(bytes), last_word(bytes)),
             (5, 0) => Self::BlockDownload {
-                object: Object::decode(bytes),
+                object: SdoObject::decode(bytes),
                 crc: command & 4 != 0,
                 block_size: bytes[4],
             },
             (5, 1) => Self::BlockDownloadEnd,
             (5, 2) => Self::BlockDownloadAcknowledge { taken: second, block_size: third },
             (6, 0 | 2) => Self::BlockUpload {
-                object: Object::decode(bytes),
+                object: SdoObject::decode(bytes),
                 crc: command & 4 != 0,
                 size: block_size(bytes),
             },
@@ -424,7 +424,7 @@ impl Response {
     }
 
     /// The object that it names, if it is the first answer of a transfer.
-    pub const fn names(&self) -> Option<Object> {
+    pub const fn names(&self) -> Option<SdoObject> {
         match *self {
             Self::Upload(object, _)
             | Self::Download(object)
@@ -456,7 +456,7 @@ const fn acknowledge(taken: u8, block_size: u8) -> [u8; 8] {
 }
 
 /// Whoever sends the blocks begins with this.
-fn block_begin(object: Object, crc: bool, size: Option<u32>) -> [u8; 8] {
+fn block_begin(object: SdoObject, crc: bool, size: Option<u32>) -> [u8; 8] {
     let bits = u8::from(crc) << 2 | u8::from(size.is_some()) << 1;
     object.frame(0xC0 | bits, size.unwrap_or(0).to_le_bytes())
 }
@@ -501,7 +501,7 @@ mod tests {
 
     use super::*;
 
-    const OBJECT: Object = Object { index: 0x1018, sub: 1 };
+    const OBJECT: SdoObject = SdoObject { index: 0x1018, sub: 1 };
 
     #[test]
     fn the_crc_is_the_standards() {
@@ -513,66 +513,72 @@ mod tests {
     fn each_frame_has_its_bytes() {
         let content = |data: &[u8]| Content::expedited(data).unwrap();
         for (request, bytes) in [
-            (Request::Download(OBJECT, content(&[1, 2])), [0x2B, 0x18, 0x10, 1, 1, 2, 0, 0]),
-            (Request::Download(OBJECT, Content::Segmented(Some(300))), [0x21, 0x18, 0x10, 1, 0x2C, 1, 0, 0]),
-            (Request::DownloadSegment(Segment::new(true, true, &[9, 8])), [0x1B, 9, 8, 0, 0, 0, 0, 0]),
-            (Request::Upload(OBJECT), [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]),
-            (Request::UploadSegment { toggle: true }, [0x70, 0, 0, 0, 0, 0, 0, 0]),
+            (SdoRequest::Download(OBJECT, content(&[1, 2])), [0x2B, 0x18, 0x10, 1, 1, 2, 0, 0]),
             (
-                Request::BlockUpload { object: OBJECT, crc: true, block_size: 127, threshold: 7 },
+                SdoRequest::Download(OBJECT, Content::Segmented(Some(300))),
+                [0x21, 0x18, 0x10, 1, 0x2C, 1, 0, 0],
+            ),
+            (SdoRequest::DownloadSegment(Segment::new(true, true, &[9, 8])), [0x1B, 9, 8, 0, 0, 0, 0, 0]),
+            (SdoRequest::Upload(OBJECT), [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]),
+            (SdoRequest::UploadSegment { toggle: true }, [0x70, 0, 0, 0, 0, 0, 0, 0]),
+            (
+                SdoRequest::BlockUpload { object: OBJECT, crc: true, block_size: 127, threshold: 7 },
                 [0xA4, 0x18, 0x10, 1, 127, 7, 0, 0],
             ),
-            (Request::BlockUploadStart, [0xA3, 0, 0, 0, 0, 0, 0, 0]),
-            (Request::BlockUploadAcknowledge { taken: 3, block_size: 9 }, [0xA2, 3, 9, 0, 0, 0, 0, 0]),
-            (Request::BlockUploadEnd, [0xA1, 0, 0, 0, 0, 0, 0, 0]),
+            (SdoRequest::BlockUploadStart, [0xA3, 0, 0, 0, 0, 0, 0, 0]),
+            (SdoRequest::BlockUploadAcknowledge { taken: 3, block_size: 9 }, [0xA2, 3, 9, 0, 0, 0, 0, 0]),
+            (SdoRequest::BlockUploadEnd, [0xA1, 0, 0, 0, 0, 0, 0, 0]),
             (
-                Request::BlockDownload { object: OBJECT, crc: true, size: Some(1) },
+                SdoRequest::BlockDownload { object: OBJECT, crc: true, size: Some(1) },
                 [0xC6, 0x18, 0x10, 1, 1, 0, 0, 0],
             ),
-            (Request::BlockDownloadEnd(BlockEnd::of(15, 0x1234)), [0xD9, 0x34, 0x12, 0, 0, 0, 0, 0]),
-            (Request::Abort(OBJECT, abort::CRC), [0x80, 0x18, 0x10, 1, 4, 0, 4, 5]),
+            (SdoRequest::BlockDownloadEnd(BlockEnd::of(15, 0x1234)), [0xD9, 0x34, 0x12, 0, 0, 0, 0, 0]),
+            (SdoRequest::Abort(OBJECT, abort::CRC), [0x80, 0x18, 0x10, 1, 4, 0, 4, 5]),
         ] {
             assert_eq!(request.encode(), bytes);
-            assert_eq!(Request::decode(bytes), Some(request));
+            assert_eq!(SdoRequest::decode(bytes), Some(request));
         }
         for (response, bytes) in [
-            (Response::Upload(OBJECT, content(&[1, 2, 3, 4])), [0x43, 0x18, 0x10, 1, 1, 2, 3, 4]),
-            (Response::Upload(OBJECT, Content::Segmented(None)), [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]),
-            (Response::UploadSegment(Segment::new(false, false, &[7; 7])), [0, 7, 7, 7, 7, 7, 7, 7]),
-            (Response::Download(OBJECT), [0x60, 0x18, 0x10, 1, 0, 0, 0, 0]),
-            (Response::DownloadSegment { toggle: true }, [0x30, 0, 0, 0, 0, 0, 0, 0]),
+            (SdoResponse::Upload(OBJECT, content(&[1, 2, 3, 4])), [0x43, 0x18, 0x10, 1, 1, 2, 3, 4]),
+            (SdoResponse::Upload(OBJECT, Content::Segmented(None)), [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]),
+            (SdoResponse::UploadSegment(Segment::new(false, false, &[7; 7])), [0, 7, 7, 7, 7, 7, 7, 7]),
+            (SdoResponse::Download(OBJECT), [0x60, 0x18, 0x10, 1, 0, 0, 0, 0]),
+            (SdoResponse::DownloadSegment { toggle: true }, [0x30, 0, 0, 0, 0, 0, 0, 0]),
             (
-                Response::BlockUpload { object: OBJECT, crc: false, size: Some(2) },
+                SdoResponse::BlockUpload { object: OBJECT, crc: false, size: Some(2) },
                 [0xC2, 0x18, 0x10, 1, 2, 0, 0, 0],
             ),
-            (Response::BlockUploadEnd(BlockEnd::of(0, 0)), [0xDD, 0, 0, 0, 0, 0, 0, 0]),
+            (SdoResponse::BlockUploadEnd(BlockEnd::of(0, 0)), [0xDD, 0, 0, 0, 0, 0, 0, 0]),
             (
-                Response::BlockDownload { object: OBJECT, crc: true, block_size: 16 },
+                SdoResponse::BlockDownload { object: OBJECT, crc: true, block_size: 16 },
                 [0xA4, 0x18, 0x10, 1, 16, 0, 0, 0],
             ),
-            (Response::BlockDownloadAcknowledge { taken: 1, block_size: 16 }, [0xA2, 1, 16, 0, 0, 0, 0, 0]),
-            (Response::BlockDownloadEnd, [0xA1, 0, 0, 0, 0, 0, 0, 0]),
-            (Response::Abort(OBJECT, abort::GENERAL), [0x80, 0x18, 0x10, 1, 0, 0, 0, 8]),
+            (
+                SdoResponse::BlockDownloadAcknowledge { taken: 1, block_size: 16 },
+                [0xA2, 1, 16, 0, 0, 0, 0, 0],
+            ),
+            (SdoResponse::BlockDownloadEnd, [0xA1, 0, 0, 0, 0, 0, 0, 0]),
+            (SdoResponse::Abort(OBJECT, abort::GENERAL), [0x80, 0x18, 0x10, 1, 0, 0, 0, 8]),
         ] {
             assert_eq!(response.encode(), bytes);
-            assert_eq!(Response::decode(bytes), Some(response));
+            assert_eq!(SdoResponse::decode(bytes), Some(response));
         }
         assert_eq!(BlockSegment::new(2, true, &[1]).encode(), [0x82, 1, 0, 0, 0, 0, 0, 0]);
         assert_eq!([BlockEnd::of(7, 0).unused, BlockEnd::of(8, 0).unused], [0, 6]);
         assert_eq!((Content::expedited(&[]), Content::expedited(&[0; 5])), (None, None));
-        assert_eq!((Request::decode([0x81; 8]), Request::decode([0xE0; 8])), (None, None));
-        assert_eq!((Response::decode([0xA3; 8]), Response::decode([0xFF; 8])), (None, None));
+        assert_eq!((SdoRequest::decode([0x81; 8]), SdoRequest::decode([0xE0; 8])), (None, None));
+        assert_eq!((SdoResponse::decode([0xA3; 8]), SdoResponse::decode([0xFF; 8])), (None, None));
     }
 
     proptest! {
         /// What is decoded is what is encoded, whatever the bytes that mean nothing are.
         #[test]
         fn what_was_decoded_is_encoded_with_the_same_meaning(bytes: [u8; 8]) {
-            if let Some(request) = Request::decode(bytes) {
-                prop_assert_eq!(Request::decode(request.encode()), Some(request));
+            if let Some(request) = SdoRequest::decode(bytes) {
+                prop_assert_eq!(SdoRequest::decode(request.encode()), Some(request));
             }
-            if let Some(response) = Response::decode(bytes) {
-                prop_assert_eq!(Response::decode(response.encode()), Some(response));
+            if let Some(response) = SdoResponse::decode(bytes) {
+                prop_assert_eq!(SdoResponse::decode(response.encode()), Some(response));
             }
             prop_assert_eq!(BlockSegment::decode(bytes).encode(), bytes);
         }

@@ -234,7 +234,7 @@ impl Overview {
             return;
         };
         if known.count == 0 {
-            *words = object::in_words(event);
+            *words = object::object_text(event);
         }
         known.count += 1;
         if known.name.is_none() {

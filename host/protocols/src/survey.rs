@@ -100,7 +100,7 @@ impl Survey {
     }
 
     /// Whether the channel has had a frame.
-    pub(crate) fn has_heard(&self, channel: u8) -> bool {
+    pub(crate) fn has_channel(&self, channel: u8) -> bool {
         self.channels.contains_key(&channel)
     }
 

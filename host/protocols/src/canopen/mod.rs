@@ -8,11 +8,11 @@
 pub mod codec;
 pub mod eds;
 mod encode;
+mod events;
 mod lss;
 mod names;
 mod node;
 mod pdo;
-mod said;
 mod sdo;
 mod sdo_channels;
 mod signs;
@@ -32,8 +32,8 @@ use cantap_trace::TraceRecord;
 use rustc_hash::FxHashMap;
 
 use self::eds::Eds;
+use self::events::{event, malformed, nothing};
 use self::node::Bus;
-use self::said::{event, malformed, nothing};
 use self::sdo_channels::{SdoChannel, SdoChannels};
 pub(crate) use self::signs::CanOpenSigns;
 use self::states::{guard, heartbeat, sync};

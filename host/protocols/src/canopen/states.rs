@@ -2,9 +2,9 @@
 
 use cantap_trace::TraceRecord;
 
+use super::events::{event, malformed};
 use super::names;
 use super::node::Bus;
-use super::said::{event, malformed};
 use crate::{Event, EventKind, Field, Party, Trouble};
 
 pub fn sync(bus: &mut Bus, record: &TraceRecord, data: &[u8], events: &mut Vec<Event>) {

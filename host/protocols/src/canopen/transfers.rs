@@ -5,8 +5,8 @@ use std::borrow::Cow;
 use cantap_trace::TraceRecord;
 
 use super::eds::Eds;
+use super::events::event;
 use super::node::{Bus, number_of};
-use super::said::event;
 use super::sdo::SdoTransfer;
 use super::{names, types};
 use crate::{Event, EventKind, Field, Party};

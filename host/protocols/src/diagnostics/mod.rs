@@ -115,7 +115,7 @@ impl Diagnostics {
     }
 
     /// Takes a transfer, which may have been heard before the last record.
-    fn heard(&mut self, transfer: Transfer, events: &mut Vec<Event>) {
+    fn take_transfer(&mut self, transfer: Transfer, events: &mut Vec<Event>) {
         if self.due_ns < transfer.start_ns {
             self.expire(transfer.start_ns, events);
         }
@@ -501,7 +501,7 @@ impl Assembler for Diagnostics {
         let mut transfers = std::mem::take(&mut self.transfers);
         self.transport.take(record, &mut |transfer| transfers.push(transfer));
         for transfer in transfers.drain(..) {
-            self.heard(transfer, events);
+            self.take_transfer(transfer, events);
         }
         self.transfers = transfers;
     }
@@ -510,7 +510,7 @@ impl Assembler for Diagnostics {
         let mut transfers = std::mem::take(&mut self.transfers);
         self.transport.finish(&mut |transfer| transfers.push(transfer));
         for transfer in transfers {
-            self.heard(transfer, events);
+            self.take_transfer(transfer, events);
         }
         while !self.waiting.is_empty() {
             self.give_up(0, Trouble::Unfinished, events);

@@ -99,7 +99,7 @@ pub fn not_complete(bytes: &[u8]) -> String {
 mod tests {
     use super::*;
 
-    fn said(bytes: &[u8]) -> String {
+    fn shown(bytes: &[u8]) -> String {
         let mut fields = Vec::new();
         results(bytes, &mut fields);
         fields.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
@@ -108,16 +108,16 @@ mod tests {
     #[test]
     fn test_results_have_their_limits_and_whether_they_are_kept() {
         assert_eq!(
-            said(&[0x01, 0x80, 0x0A, 0x0B, 0xB0, 0x0B, 0xB0, 0x0B, 0xB0]),
+            shown(&[0x01, 0x80, 0x0A, 0x0B, 0xB0, 0x0B, 0xB0, 0x0B, 0xB0]),
             "mid 0x01 (exhaust gas sensor, bank 1, sensor 1), tid 0x80, scaling 0x0A, value 365.024 mV, minimum 365.024 mV, maximum 365.024 mV, \
              result \"passed\""
         );
         assert_eq!(
-            said(&[0x21, 0x01, 0x96, 0xFF, 0xF6, 0, 0, 0, 10]),
+            shown(&[0x21, 0x01, 0x96, 0xFF, 0xF6, 0, 0, 0, 10]),
             "mid 0x21 (catalyst, bank 1), tid 0x01, scaling 0x96, value -1 °C, minimum 0 °C, maximum 1 °C, result \"failed\""
         );
-        assert_eq!(said(&[0x00, 0xC0, 0, 0, 1]), "mid 0x00 (supported), supported \"01 02 20\"");
-        assert_eq!(said(&[0xA1, 1, 2]), "mid 0xA1 (misfire), value 01 02");
+        assert_eq!(shown(&[0x00, 0xC0, 0, 0, 1]), "mid 0x00 (supported), supported \"01 02 20\"");
+        assert_eq!(shown(&[0xA1, 1, 2]), "mid 0xA1 (misfire), value 01 02");
     }
 
     #[test]

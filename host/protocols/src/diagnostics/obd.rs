@@ -163,7 +163,7 @@ pub fn title(sid: u8) -> &'static str {
 mod tests {
     use super::*;
 
-    fn said(sid: u8, bytes: &[u8]) -> String {
+    fn shown(sid: u8, bytes: &[u8]) -> String {
         let mut fields = Vec::new();
         response(sid, bytes, &mut fields);
         fields.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
@@ -231,32 +231,32 @@ mod tests {
             (&[0xF0, 1], "pid 0xF0, value 01"),
             (&[0x0C, 1], "pid 0x0C (engine_speed), value 01"),
         ] {
-            assert_eq!(said(1, bytes), expected);
+            assert_eq!(shown(1, bytes), expected);
         }
         assert_eq!(
-            said(1, &[0x0D, 0x10, 0x05, 0x28]),
+            shown(1, &[0x0D, 0x10, 0x05, 0x28]),
             "pid 0x0D (vehicle_speed), vehicle_speed 16 km/h, pid 0x05 (coolant_temperature), coolant_temperature 0 °C"
         );
-        assert_eq!(said(3, &[2, 1, 0x33, 0x41, 0x55]), "trouble_codes 2, codes \"P0133, C0155\"");
+        assert_eq!(shown(3, &[2, 1, 0x33, 0x41, 0x55]), "trouble_codes 2, codes \"P0133, C0155\"");
         assert_eq!(
-            said(9, b"\x04\x02JMB*36761500\0\0\0\0JMB*36761501\0\0\0\0"),
+            shown(9, b"\x04\x02JMB*36761500\0\0\0\0JMB*36761501\0\0\0\0"),
             "pid 0x04 (calibration identifications), calibration \"JMB*36761500\", calibration \"JMB*36761501\""
         );
         assert_eq!(
-            said(9, &[6, 1, 0x17, 0x91, 0xBC, 0x82]),
+            shown(9, &[6, 1, 0x17, 0x91, 0xBC, 0x82]),
             "pid 0x06 (calibration verification numbers), verification_number 0x1791BC82"
         );
         assert_eq!(
-            said(9, &[8, 2, 0, 5, 1, 0]),
+            shown(9, &[8, 2, 0, 5, 1, 0]),
             "pid 0x08 (in-use performance, spark ignition), count 5, count 256"
         );
-        assert_eq!(said(8, &[0, 0xC0, 0, 0, 0]), "tid 0x00 (supported), supported \"01 02\"");
+        assert_eq!(shown(8, &[0, 0xC0, 0, 0, 0]), "tid 0x00 (supported), supported \"01 02\"");
         for vin in [&b"\x02\x01WVWZZZ1KZAW000001"[..], b"\x02\x01\0\0\0WVWZZZ1KZAW000001"] {
-            assert_eq!(said(9, vin), "pid 0x02 (VIN), vin \"WVWZZZ1KZAW000001\"");
+            assert_eq!(shown(9, vin), "pid 0x02 (VIN), vin \"WVWZZZ1KZAW000001\"");
         }
         // With another item behind it, which J1979 does not allow, but scapy's tests have.
         assert_eq!(
-            said(9, b"\x02\x01ABCDEFGHIJKLMNOPQ\x04\x01AB"),
+            shown(9, b"\x02\x01ABCDEFGHIJKLMNOPQ\x04\x01AB"),
             "pid 0x02 (VIN), vin \"ABCDEFGHIJKLMNOPQ\", rest 04 01 41 42"
         );
     }

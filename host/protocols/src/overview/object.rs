@@ -45,7 +45,7 @@ pub(super) fn key_of(event: &Event) -> Option<ObjectKey> {
 }
 
 /// The object in words: its kind and number.
-pub(super) fn in_words(event: &Event) -> String {
+pub(super) fn object_text(event: &Event) -> String {
     let value = |name: &str| event.field(name).map_or_else(String::new, |field| field.value.to_string());
     match event.protocol {
         Protocol::Uds if event.field("did").is_some() => format!("did {}", value("did")),

@@ -9,9 +9,9 @@ use std::time::Duration;
 
 use anyhow::bail;
 use cantap::{Frame, Id};
-use cantap_protocols::Event;
 use cantap_protocols::active::Broadcast;
 use cantap_protocols::canopen::{CanOpen, Sheet, state_name};
+use cantap_protocols::{Event, EventKind};
 use cantap_trace::grammar;
 
 use crate::args;
@@ -183,14 +183,17 @@ fn nmt(speak: &SpeakArgs, node: u8, command: Command, sheets: Vec<Sheet>) -> any
     let device = speak.open()?;
     let mut speaking = speak.speak(&device, Box::new(CanOpen::new(sheets)));
     speaking.run(&mut Broadcast::new([frame]))?;
-    let said = |event: &Event| matches!(event.kind, "nmt" | "boot_up" | "state" | "emergency");
+    let said = |event: &Event| {
+        matches!(event.kind, EventKind::Nmt | EventKind::BootUp | EventKind::State | EventKind::Emergency)
+    };
     speaking.tell(said)?;
     // Show the result, if nodes report their states.
     speaking.listen(OBEYS)?;
     let events = speaking.take_events();
     // Zero is for all nodes.
     let is_heard = events.iter().any(|event| {
-        matches!(event.kind, "boot_up" | "state") && (node == 0 || event.from.node() == Some(node))
+        matches!(event.kind, EventKind::BootUp | EventKind::State)
+            && (node == 0 || event.from.node() == Some(node))
     });
     speaking.put_back(events);
     speaking.tell(said)?;
@@ -246,7 +249,7 @@ fn repeat(speak: &SpeakArgs, frame: Frame, cyclic: &Cyclic) -> anyhow::Result<()
     let device = speak.open()?;
     let mut speaking = speak.speak(&device, Box::new(CanOpen::new(Vec::new())));
     let (sent, verdict) = speaking.repeat(frame, cyclic.period, cyclic.count, cyclic.time)?;
-    let own = |event: &Event| matches!(event.kind, "sync" | "state" | "heartbeat");
+    let own = |event: &Event| matches!(event.kind, EventKind::Sync | EventKind::State);
     speaking.tell(own)?;
     eprintln!("cantap: {} sent", were(sent));
     drop(speaking);

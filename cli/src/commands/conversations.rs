@@ -1,6 +1,5 @@
 //! `cantap conversations`: what the frames mean.
 
-mod json;
 mod line;
 mod lines;
 mod summary;

@@ -6,7 +6,7 @@ use std::time::Duration;
 use anyhow::{anyhow, bail};
 use cantap_protocols::active::station::{Station, StationError, StationJob, StationTiming};
 use cantap_protocols::j1939::J1939;
-use cantap_protocols::{Event, Party};
+use cantap_protocols::{Event, EventKind, Party};
 use cantap_trace::grammar;
 
 use super::uds::hex::{self, Hex};
@@ -160,7 +160,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         eprintln!("cantap: the address {} is taken; this is node {own}", args.address);
     }
     let shown = |event: &Event| match &args.what {
-        What::Claim => event.kind == "address_claim",
+        What::Claim => event.kind == EventKind::AddressClaim,
         What::Send { pgn, .. } => event.from == Party::Node(own) && is_of(event, *pgn),
         What::Request { pgn, to } => is_answer(event, *pgn, *to, own),
         What::Dm1 { to } => is_answer(event, DM1, *to, own),
@@ -187,7 +187,8 @@ fn is_of(event: &Event, pgn: u32) -> bool {
 
 fn is_answer(event: &Event, pgn: u32, to: u8, own: u8) -> bool {
     let from = to == GLOBAL && event.from != Party::Node(own) || event.from == Party::Node(to);
-    from && event.kind != "request" && (is_of(event, pgn) || event.kind == "acknowledgement")
+    from && event.kind != EventKind::Request
+        && (is_of(event, pgn) || event.kind == EventKind::Acknowledgement)
 }
 
 fn finish<T>(speaking: &Speaking<'_>, ended: Result<T, StationError>, args: &Args) -> anyhow::Result<()> {

@@ -7,9 +7,9 @@ use std::time::{Duration, Instant};
 
 use anyhow::{anyhow, bail};
 use cantap::Id;
-use cantap_protocols::Event;
 use cantap_protocols::diagnostics::{Diagnostics, parameter_name};
 use cantap_protocols::iso_tp::{Endpoint, Pair};
+use cantap_protocols::{Event, EventKind};
 
 use super::uds::{Client, TransferArgs};
 use crate::args;
@@ -133,7 +133,7 @@ fn transfer(extended: bool, p2: Duration) -> TransferArgs {
 
 /// Whether it is an answer, or a broken one.
 fn is_answer(event: &Event) -> bool {
-    matches!(event.kind, "exchange" | "refusal" | "broken")
+    matches!(event.kind, EventKind::Exchange | EventKind::Refusal | EventKind::Broken)
 }
 
 /// The parameters of a list that starts after `base`.

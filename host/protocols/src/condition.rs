@@ -47,12 +47,12 @@ impl Listener for Watcher {
         true
     }
 
-    fn take(&mut self, record: &TraceRecord, said: &mut dyn FnMut(&dyn Said)) {
+    fn take(&mut self, record: &TraceRecord, report: &mut dyn FnMut(&dyn Said)) {
         let options = &self.options;
         let conversations =
             self.conversations.get_or_insert_with(|| Box::new(Conversations::new(options, None)));
         conversations.take(record, &mut self.events);
-        self.events.drain(..).for_each(|event| said(&event));
+        self.events.drain(..).for_each(|event| report(&event));
     }
 
     fn fresh(&self) -> Box<dyn Listener> {

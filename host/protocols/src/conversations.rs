@@ -268,9 +268,10 @@ impl Conversations {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::EventKind;
     use crate::testing::at;
 
-    fn said(protocol: Protocol, frames: &[(f64, &str)]) -> Vec<String> {
+    fn event_lines(protocol: Protocol, frames: &[(f64, &str)]) -> Vec<String> {
         let options = Options { protocols: vec![protocol], ..Options::default() };
         let (mut conversations, mut events) = (Conversations::new(&options, None), Vec::new());
         for (ms, frame) in frames {
@@ -286,10 +287,10 @@ mod tests {
     fn transfers_that_break_are_said_whatever_they_would_have_been() {
         let frames =
             [(0.0, "7E0#1FFF360102030405"), (1.0, "7E8#320000"), (2.0, "7E0#023E00"), (3.0, "7E8#027E00")];
-        let said_uds = said(Protocol::Uds, &frames);
-        assert_eq!(said_uds.len(), 2, "{said_uds:?}");
-        assert!(said_uds[0].ends_with("refused by the receiver: too long for it"), "{said_uds:?}");
-        assert_eq!(said(Protocol::J1939, &frames), [""; 0]);
+        let uds_lines = event_lines(Protocol::Uds, &frames);
+        assert_eq!(uds_lines.len(), 2, "{uds_lines:?}");
+        assert!(uds_lines[0].ends_with("refused by the receiver: too long for it"), "{uds_lines:?}");
+        assert_eq!(event_lines(Protocol::J1939, &frames), [""; 0]);
     }
 
     /// A tester is plugged in long after a survey of the first frames: its requests are shown, those without a response among them, but
@@ -307,8 +308,8 @@ mod tests {
         assert_eq!(events, []);
         conversations.take(&at(9001.0, "7E8#0462F19041"), &mut events);
         let said: Vec<_> = events.iter().map(|event| (event.kind, event.time_ns / 1_000_000)).collect();
-        assert_eq!(said.last(), Some(&("exchange", 9001)));
-        assert!(said.iter().any(|(kind, _)| *kind == "no_response"), "{said:?}");
+        assert_eq!(said.last(), Some(&(EventKind::Exchange, 9001)));
+        assert!(said.iter().any(|(kind, _)| *kind == EventKind::NoResponse), "{said:?}");
         let before = events.len();
         conversations.take(&at(9002.0, "7E0#0210"), &mut events);
         conversations.take(&at(9003.0, "7E8#037F1012"), &mut events);
@@ -318,12 +319,12 @@ mod tests {
 
     #[test]
     fn a_broken_fast_packet_has_its_groups_name() {
-        let broken = said(
+        let broken = event_lines(
             Protocol::Nmea2000,
             &[(0.0, "0DF80501#002B000102030405"), (1.0, "0DF80501#020D0E0F10111213")],
         );
         assert!(broken[0].starts_with("nmea2000 1 > all GNSS Position Data: "), "{broken:?}");
-        let asked = said(Protocol::Nmea2000, &[(0.0, "18EAFF01#14F001")]);
+        let asked = event_lines(Protocol::Nmea2000, &[(0.0, "18EAFF01#14F001")]);
         assert!(asked[0].contains("requested 126996 (Product Information)"), "{asked:?}");
     }
 }

@@ -5,7 +5,7 @@ use std::borrow::Cow;
 use cantap_trace::{Id, TraceRecord};
 use smallvec::SmallVec;
 
-use crate::Protocol;
+use crate::{EventKind, Protocol};
 
 /// Bytes of a message; those of one frame, which most are, without an allocation of their own.
 pub type Bytes = SmallVec<[u8; 16]>;
@@ -26,8 +26,8 @@ pub struct Event {
     pub from: Party,
     /// The receiver.
     pub to: Party,
-    /// The kind of event within its protocol, such as `exchange`.
-    pub kind: &'static str,
+    /// What kind of event it is within its protocol.
+    pub kind: EventKind,
     /// The service, message or parameter group.
     pub title: Cow<'static, str>,
     /// The content, in order.
@@ -218,7 +218,7 @@ impl Event {
     pub fn new(
         protocol: Protocol,
         record: &TraceRecord,
-        kind: &'static str,
+        kind: EventKind,
         title: impl Into<Cow<'static, str>>,
     ) -> Self {
         Self {

@@ -7,7 +7,7 @@
 use cantap_signals::condition::Said;
 use cantap_trace::TraceRecord;
 
-use crate::{Event, Field, Party, Protocol, Value};
+use crate::{Event, EventKind, Field, Party, Protocol, Value};
 
 /// The names that every event has besides its own fields, which take precedence.
 pub const COMMON: [(&str, &str); 13] = [
@@ -64,7 +64,7 @@ enum Named<'a> {
 impl Event {
     /// Whether something went wrong: a refusal, an unanswered request, a broken transfer, missing frames.
     pub fn is_fault(&self) -> bool {
-        self.trouble.is_some() || self.frames_lost || self.kind == "refusal"
+        self.trouble.is_some() || self.frames_lost || self.kind == EventKind::Refusal
     }
 
     /// The node that sent it, or that it was sent to.
@@ -98,7 +98,7 @@ impl Event {
         let number = |number: f64| Some(Named::Number(number));
         let party = |party: Party| (party != Party::Unknown).then(|| Named::Text(party.to_string().into()));
         match wanted {
-            "kind" => Some(Named::Text(self.kind.into())),
+            "kind" => Some(Named::Text(self.kind.name().into())),
             "title" => Some(Named::Text(self.title.as_ref().into())),
             "from" => party(self.from),
             "to" => party(self.to),

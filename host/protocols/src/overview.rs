@@ -14,7 +14,7 @@ use hdrhistogram::Histogram as Counts;
 use rustc_hash::FxHashMap;
 
 use self::object::{ObjectKey, number, short};
-use crate::{Event, Party, Protocol, Trouble, Value};
+use crate::{Event, EventKind, Party, Protocol, Trouble, Value};
 
 const MOST_NODES: usize = 1024;
 const MOST_SERVICES: usize = 256;
@@ -165,7 +165,7 @@ impl Overview {
     fn service(&mut self, event: &Event) {
         // Only if somebody answers: what is sent without being asked has its period in the statistics of its
         // identifier.
-        if event.response_ns.is_none() && event.kind != "no_response" {
+        if event.response_ns.is_none() && event.kind != EventKind::NoResponse {
             return;
         }
         let key = (event.channel, event.protocol, service_name(event));
@@ -175,7 +175,7 @@ impl Overview {
         };
         figures.count += 1;
         figures.faults += u64::from(event.is_fault());
-        figures.unanswered += u64::from(event.kind == "no_response");
+        figures.unanswered += u64::from(event.kind == EventKind::NoResponse);
         if let Some(ns) = event.response_ns {
             figures.responses.add(ns);
         }
@@ -195,21 +195,21 @@ impl Overview {
         node.events += 1;
         node.faults += u64::from(event.is_fault());
         match event.kind {
-            "state" | "boot_up" => node.state = Some(event.title.to_string()),
-            "heartbeat_back" => {
+            EventKind::State | EventKind::BootUp => node.state = Some(event.title.to_string()),
+            EventKind::HeartbeatBack => {
                 let state = event.title.rsplit(": ").next().unwrap_or_default();
                 node.state = Some(state.to_owned());
             }
-            "heartbeat_missing" | "guard_missing" | "guarding_stopped" => {
+            EventKind::HeartbeatMissing | EventKind::GuardMissing | EventKind::GuardingStopped => {
                 node.missed += 1;
                 node.state = Some(event.title.to_string());
                 node.period_ms = number(event, "period_ms").or(node.period_ms);
             }
-            "emergency" => {
+            EventKind::Emergency => {
                 let code = event.field("code").map(ToString::to_string).unwrap_or_default();
                 keep(&mut node.codes, "emergency", code);
             }
-            "address_claim" => node.identity = Some(identity(event)),
+            EventKind::AddressClaim => node.identity = Some(identity(event)),
             _ => {}
         }
         if let Some(codes) = event.field("codes").and_then(text) {
@@ -234,7 +234,7 @@ impl Overview {
             return;
         };
         if known.count == 0 {
-            *words = object::in_words(event);
+            *words = object::object_text(event);
         }
         known.count += 1;
         if known.name.is_none() {
@@ -277,9 +277,9 @@ fn text(field: &crate::Field) -> Option<String> {
 /// Services as people would count them: those of SDO by what they do, not by object.
 fn service_name(event: &Event) -> Cow<'static, str> {
     match event.kind {
-        "sdo_read" => "SDO read".into(),
-        "sdo_write" => "SDO write".into(),
-        "state" | "guard" => "guarding".into(),
+        EventKind::SdoRead => "SDO read".into(),
+        EventKind::SdoWrite => "SDO write".into(),
+        EventKind::State | EventKind::Guard => "guarding".into(),
         _ => event.title.clone(),
     }
 }
@@ -289,15 +289,19 @@ fn subject(event: &Event) -> Option<Party> {
     let known = |party: Party| (!matches!(party, Party::Unknown | Party::Everyone)).then_some(party);
     match event.protocol {
         // An unanswered request says nothing about a node, and one to all says nothing about any.
-        Protocol::J1939 | Protocol::Nmea2000 if event.kind == "no_response" => known(event.to),
+        Protocol::J1939 | Protocol::Nmea2000 if event.kind == EventKind::NoResponse => known(event.to),
         Protocol::J1939 | Protocol::Nmea2000 | Protocol::IsoTp => known(event.from),
         Protocol::Uds | Protocol::Kwp2000 | Protocol::Obd => match event.kind {
-            "response" => known(event.from),
-            "exchange" | "refusal" => known(event.to),
-            "no_response" if matches!(event.trouble, Some(Trouble::Timeout { .. })) => known(event.to),
+            EventKind::Response => known(event.from),
+            EventKind::Exchange | EventKind::Refusal => known(event.to),
+            EventKind::NoResponse if matches!(event.trouble, Some(Trouble::Timeout { .. })) => {
+                known(event.to)
+            }
             _ => None,
         },
-        Protocol::DeviceNet if matches!(event.kind, "exchange" | "refusal" | "no_response") => {
+        Protocol::DeviceNet
+            if matches!(event.kind, EventKind::Exchange | EventKind::Refusal | EventKind::NoResponse) =>
+        {
             known(event.to)
         }
         _ => event.node().map(Party::Node),
@@ -397,7 +401,7 @@ mod tests {
     #[test]
     fn memory_is_bounded_and_what_is_left_out_is_counted() {
         let mut overview = Overview::default();
-        let mut event = Event::new(Protocol::CanOpen, &at(0.0, "605#"), "sdo_read", "SDO read");
+        let mut event = Event::new(Protocol::CanOpen, &at(0.0, "605#"), EventKind::SdoRead, "SDO read");
         event.to = Party::Node(5);
         for index in 0..20_000_u32 {
             event.fields = vec![crate::Field::hex("index", index, 4), crate::Field::hex("sub", 0_u8, 2)];

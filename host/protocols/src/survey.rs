@@ -9,7 +9,7 @@ use crate::diagnostics::Diagnostics;
 use crate::iso_tp::KnownPairs;
 use crate::relatives::{Relative, Relatives};
 use crate::signs::Signs;
-use crate::{Assembler, Event, Protocol, UnderWay};
+use crate::{Assembler, Event, EventKind, Protocol, UnderWay};
 
 /// Bytes of a message under way that show ISO 15765-2 even if it is not complete: three frames.
 const CONVINCING_BYTES: u32 = 20;
@@ -40,11 +40,11 @@ impl DiagnosticsSigns {
     /// Takes what was found on the channel.
     pub fn take(&mut self, event: &Event) {
         let convinces = match event.protocol {
-            Protocol::IsoTp => event.kind == "transfer" && event.frames > 2,
-            _ => matches!(event.kind, "exchange" | "refusal"),
+            Protocol::IsoTp => event.kind == EventKind::Transfer && event.frames > 2,
+            _ => matches!(event.kind, EventKind::Exchange | EventKind::Refusal),
         };
-        let is_alone =
-            event.protocol == Protocol::Uds && matches!(event.kind, "response" | "no_response" | "request");
+        let is_alone = event.protocol == Protocol::Uds
+            && matches!(event.kind, EventKind::Response | EventKind::NoResponse | EventKind::Request);
         self.all += 1;
         self.alone += u32::from(is_alone);
         if convinces {
@@ -100,7 +100,7 @@ impl Survey {
     }
 
     /// Whether the channel has had a frame.
-    pub(crate) fn has_heard(&self, channel: u8) -> bool {
+    pub(crate) fn has_channel(&self, channel: u8) -> bool {
         self.channels.contains_key(&channel)
     }
 

@@ -50,7 +50,7 @@ pub fn events(mut assembler: impl Assembler, records: &[TraceRecord]) -> Vec<Eve
 }
 
 /// The same as text, for frames with times in milliseconds.
-pub fn said(assembler: impl Assembler, frames: &[(f64, &str)]) -> Vec<String> {
+pub fn event_lines(assembler: impl Assembler, frames: &[(f64, &str)]) -> Vec<String> {
     let records: Vec<_> = frames.iter().map(|(ms, frame)| at(*ms, frame)).collect();
     events(assembler, &records).iter().map(ToString::to_string).collect()
 }

@@ -58,7 +58,7 @@ impl Watch {
         let watched = |channel| Watched {
             known: 0,
             window: None,
-            is_new: !survey.has_heard(channel),
+            is_new: !survey.has_channel(channel),
             has_dropped: false,
             signs: None,
             held: VecDeque::new(),
@@ -181,7 +181,7 @@ mod tests {
     use crate::{Announcement, Options, ReadItem, Reader};
 
     /// What the records say; and what began later, except for diagnostics, with the second of its first frame.
-    fn said(records: &[TraceRecord]) -> (Vec<String>, Vec<(Protocol, i64)>) {
+    fn event_lines(records: &[TraceRecord]) -> (Vec<String>, Vec<(Protocol, i64)>) {
         let (mut lines, mut all_begun) = (Vec::new(), Vec::new());
         let mut reader = Reader::new(Options::default());
         let Ok(()) = reader.take(records, false, |read| {
@@ -218,20 +218,20 @@ mod tests {
     #[test]
     fn a_protocol_that_begins_on_a_channel_with_another_is_read_from_its_first_sign_on() {
         let duplicate = ["40F#00340278563412"];
-        let (lines, begun) = said(&then(&[TRUCK], 20, &[BEAT]));
+        let (lines, begun) = event_lines(&then(&[TRUCK], 20, &[BEAT]));
         assert_eq!(begun, [(Protocol::CanOpen, 20)]);
         assert!(
             lines.iter().any(|line| *line == "canopen 5 operational"),
             "{:?}",
             lines.iter().find(|line| line.contains("canopen"))
         );
-        assert_eq!(said(&then(&[BEAT], 20, &[TRUCK])).1, [(Protocol::J1939, 20)]);
-        assert_eq!(said(&then(&[BEAT], 20, &[BOAT])).1, [(Protocol::Nmea2000, 20)]);
-        assert_eq!(said(&then(&["123#00"], 20, &[BEAT, TRUCK])).1.len(), 2);
+        assert_eq!(event_lines(&then(&[BEAT], 20, &[TRUCK])).1, [(Protocol::J1939, 20)]);
+        assert_eq!(event_lines(&then(&[BEAT], 20, &[BOAT])).1, [(Protocol::Nmea2000, 20)]);
+        assert_eq!(event_lines(&then(&["123#00"], 20, &[BEAT, TRUCK])).1.len(), 2);
         // Its node checks twice, a second apart.
         let mut checks = then(&[TRUCK], 20, &[]);
         checks.extend([at(70_000.0, duplicate[0]), at(71_000.0, duplicate[0]), at(72_000.0, TRUCK)]);
-        let (lines, begun) = said(&checks);
+        let (lines, begun) = event_lines(&checks);
         assert_eq!(begun, [(Protocol::DeviceNet, 70)]);
         assert_eq!(
             lines.iter().filter(|line| line.contains("duplicate MAC ID check")).count(),
@@ -244,13 +244,13 @@ mod tests {
     #[test]
     fn nmea_2000_beside_j1939_is_told_apart_from_then_on() {
         for (first, other, protocol) in [(TRUCK, BOAT, Protocol::Nmea2000), (BOAT, TRUCK, Protocol::J1939)] {
-            let (lines, begun) = said(&then(&[first], 20, &[other]));
+            let (lines, begun) = event_lines(&then(&[first], 20, &[other]));
             assert_eq!(begun, [(protocol, 20)], "{first} {other}");
             assert!(lines.iter().any(|line| line.starts_with("nmea2000 2 > all Position")), "{lines:?}");
             assert!(lines.iter().any(|line| line.starts_with("j1939 0 > all EEC1")), "{lines:?}");
         }
         // Both from the beginning.
-        let (lines, begun) = said(&then(&[TRUCK, BOAT], 0, &[]));
+        let (lines, begun) = event_lines(&then(&[TRUCK, BOAT], 0, &[]));
         assert_eq!(begun, []);
         assert!(lines.iter().any(|line| line.starts_with("nmea2000 2 > all Position")), "{lines:?}");
         assert!(lines.iter().any(|line| line.starts_with("j1939 0 > all EEC1")), "{lines:?}");
@@ -258,19 +258,19 @@ mod tests {
         let mut busy = then(&[TRUCK; 50], 0, &[]);
         busy.extend((0..8).map(|ms| at(6000.0 + f64::from(ms), BOAT)));
         busy.push(at(6500.0, TRUCK));
-        assert_eq!(said(&busy).1, [(Protocol::Nmea2000, 6)]);
+        assert_eq!(event_lines(&busy).1, [(Protocol::Nmea2000, 6)]);
     }
 
     #[test]
     fn rare_messages_are_counted_for_as_long_as_nothing_contradicts_them() {
         let mut rare = then(&["123#00"], 0, &[]);
         rare.extend((1..5).map(|time| at(f64::from(time) * 10_000.0, BEAT)));
-        assert_eq!(said(&rare).1, [(Protocol::CanOpen, 10)]);
+        assert_eq!(event_lines(&rare).1, [(Protocol::CanOpen, 10)]);
         // At the end of the records, and with a loss in what is held.
         let mut end = then(&["123#00"], 0, &[]);
         end.extend([at(9000.0, "605#4018100100000000"), lost(9001.0), at(9002.0, "585#4318100178563412")]);
         end.push(at(9003.0, BEAT));
-        let (lines, begun) = said(&end);
+        let (lines, begun) = event_lines(&end);
         assert_eq!(begun, [(Protocol::CanOpen, 9)]);
         assert!(
             lines.iter().any(|line| line.contains("SDO read") && line.contains("frames were lost")),
@@ -294,12 +294,12 @@ mod tests {
             &["10240040#00", "1001A097#0000000000000000", "10004040#0000000000000000", "13FFE040#00"],
         ] {
             let mut records = then(&["123#00"], 20, frames);
-            assert_eq!(said(&records).1, [], "{frames:?}");
+            assert_eq!(event_lines(&records).1, [], "{frames:?}");
             records.retain(|record| record.time_ns >= 20_000_000_000);
             for record in &mut records {
                 record.time_ns -= 20_000_000_000;
             }
-            assert_eq!(said(&records).1, [], "{frames:?} from the beginning");
+            assert_eq!(event_lines(&records).1, [], "{frames:?} from the beginning");
         }
     }
 
@@ -335,7 +335,7 @@ mod tests {
                 let frame = format!("{id}#{}", crate::testing::hex(&data));
                 records.push(at(from_ms + f64::from(number), &frame));
             }
-            let (_, begun) = said(&records);
+            let (_, begun) = event_lines(&records);
             let found: Vec<_> = {
                 let mut survey = Survey::new(&[]);
                 records

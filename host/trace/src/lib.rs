@@ -20,6 +20,7 @@ pub mod levels;
 mod plain;
 pub mod playback;
 mod record;
+mod seconds;
 pub mod socketcan;
 #[cfg(any(test, feature = "proptest"))]
 pub mod testing;
@@ -34,3 +35,4 @@ pub use interface::{CHANNEL_0, Interface};
 pub use length::BusBits;
 pub use plain::PlainFrame;
 pub use record::{Direction, TraceEvent, TraceRecord};
+pub use seconds::Seconds;

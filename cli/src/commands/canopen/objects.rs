@@ -7,7 +7,7 @@ use cantap::{TraceEvent, TraceRecord};
 use cantap_protocols::active::sdo::{SdoClient, SdoError, SdoIds, SdoJob};
 use cantap_protocols::canopen::{CanOpen, Sheet, encode, known_type, type_named};
 use cantap_protocols::iso_tp::Pair;
-use cantap_protocols::{Assembler, Event};
+use cantap_protocols::{Assembler, Event, EventKind};
 
 use crate::speaking::{SpeakArgs, Speaking};
 use crate::wrong::wrong;
@@ -100,7 +100,7 @@ impl Place {
     }
 
     fn is_ours(&self, event: &Event) -> bool {
-        matches!(event.kind, "sdo_read" | "sdo_write")
+        matches!(event.kind, EventKind::SdoRead | EventKind::SdoWrite)
             && event
                 .field("index")
                 .is_some_and(|index| index.value.as_number() == Some(f64::from(self.index)))

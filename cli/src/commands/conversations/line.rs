@@ -6,7 +6,6 @@ use std::io::Write;
 use cantap_protocols::Event;
 use cantap_trace::Interface;
 
-use super::json;
 use crate::seconds::Seconds;
 
 /// Writes an event as a line.
@@ -19,7 +18,9 @@ pub fn write(out: &mut impl Write, event: &Event, json: bool) -> std::io::Result
 /// Appends an event as a line, of text or of JSON.
 pub(super) fn push(out: &mut String, event: &Event, json: bool) {
     if json {
-        return json::push(out, event);
+        event.push_json(out);
+        out.push('\n');
+        return;
     }
     // Writing to a String cannot fail.
     let _ = write!(out, "({}) {} ", Seconds(event.time_ns), Interface(event.channel));

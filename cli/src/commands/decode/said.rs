@@ -26,7 +26,7 @@ fn fields(event: &Event) -> Vec<(String, Value, String, Option<String>)> {
         fields.push((name, field.value.clone(), field.unit.to_string(), text));
     }
     let mut add = |name: &str, value: Value| fields.push((name.to_owned(), value, String::new(), None));
-    add("kind", Value::Text(event.kind.into()));
+    add("kind", Value::Text(event.kind.name().into()));
     if let Some(ns) = event.response_ns {
         add("response_ms", Value::Real(ns as f64 / 1e6));
     }
@@ -95,14 +95,7 @@ pub fn csv(out: &mut impl Write, event: &Event, cells: Cells) -> io::Result<()> 
 pub fn json(out: &mut impl Write, event: &Event, details: bool) -> io::Result<()> {
     let mut signals = serde_json::Map::new();
     for (name, value, unit, text) in fields(event) {
-        let value = match value {
-            Value::Number(number) => number.into(),
-            Value::Hex(number, _) => number.into(),
-            Value::Real(number) => number.into(),
-            Value::Text(text) => text.into_owned().into(),
-            Value::Bytes(_) => value.to_string().into(),
-            Value::Missing => serde_json::Value::Null,
-        };
+        let value = serde_json::Value::from(&value);
         let value = if details {
             let mut object = serde_json::json!({ "value": value });
             if !unit.is_empty() {

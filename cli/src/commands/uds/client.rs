@@ -10,7 +10,7 @@ use cantap_protocols::active::exchange::{Answerer, Exchange, ExchangeError, Resp
 use cantap_protocols::active::transfer::TransferSettings;
 use cantap_protocols::diagnostics::{reason, uds_service};
 use cantap_protocols::iso_tp::{Endpoint, Pair};
-use cantap_protocols::{Event, Party};
+use cantap_protocols::{Event, EventKind, Party};
 
 use crate::args;
 use crate::speaking::Speaking;
@@ -134,10 +134,10 @@ impl TransferArgs {
     pub fn is_ours(&self, event: &Event) -> bool {
         let is = |party: Party, endpoint: Endpoint| party == endpoint.into();
         match event.kind {
-            "exchange" | "refusal" | "request" => is(event.from, self.to()),
+            EventKind::Exchange | EventKind::Refusal | EventKind::Request => is(event.from, self.to()),
             // A broken transfer is shown from its sender.
-            "broken" if self.functional => true,
-            "broken" => is(event.from, self.pair.a) || is(event.from, self.pair.b),
+            EventKind::Broken if self.functional => true,
+            EventKind::Broken => is(event.from, self.pair.a) || is(event.from, self.pair.b),
             _ => false,
         }
     }

@@ -7,14 +7,11 @@ use cantap_can::Frame;
 use cantap_trace::Id;
 
 use super::Machine;
+use crate::canopen::codec::lss::{LssRequest, LssResponse, Part, REQUEST, RESPONSE, WHOLE_SCAN};
 
-/// The master's identifier.
-const REQUEST: Id = Id::standard_truncated(0x7E5);
-/// The slaves' identifier.
-const RESPONSE: Id = Id::standard_truncated(0x7E4);
+const WHOLE: i16 = WHOLE_SCAN as i16;
 /// The time after an answer for other slaves to send the same one.
 const SETTLE_NS: u64 = 10_000_000;
-const IDENTIFIED: u8 = 0x4F;
 
 /// A node's identity: object 1018.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -76,8 +73,8 @@ const fn refusal(command: u8, error: u8) -> &'static str {
     }
 }
 
-fn frame(bytes: [u8; 8]) -> Frame {
-    Frame::from_bus(REQUEST, false, 8, bytes)
+fn frame(request: LssRequest) -> Frame {
+    Frame::from_bus(REQUEST, false, 8, request.encode())
 }
 
 /// The state of a question.
@@ -99,7 +96,7 @@ pub struct FastScan {
     timeout_ns: u64,
     asking: Asking,
     found: [u32; 4],
-    /// 128 asks whether there is any node; then 31 to 0; -1 confirms the part.
+    /// [`WHOLE`] asks whether there is any node; then 31 to 0; -1 confirms the part.
     bit: i16,
     part: u8,
     has_answer: bool,
@@ -113,7 +110,7 @@ impl FastScan {
             timeout_ns,
             asking: Asking::Pending,
             found: [0; 4],
-            bit: 128,
+            bit: WHOLE,
             part: 0,
             has_answer: false,
             end: None,
@@ -126,13 +123,12 @@ impl FastScan {
         self.end.unwrap_or(Err(LssError::Nobody)).map(|()| LssAddress { vendor, product, revision, serial })
     }
 
-    fn question(&self) -> [u8; 8] {
-        let [a, b, c, d] = self.found[usize::from(self.part)].to_le_bytes();
-        let (bit, next) = match self.bit {
+    fn question(&self) -> LssRequest {
+        let (unchecked, next) = match self.bit {
             -1 => (0, (self.part + 1) & 3),
             bit => (bit as u8, self.part),
         };
-        [0x51, a, b, c, d, bit, self.part, next]
+        LssRequest::FastScan { value: self.found[usize::from(self.part)], unchecked, part: self.part, next }
     }
 
     /// Interprets the answer, or its absence.
@@ -140,8 +136,8 @@ impl FastScan {
         let answered = std::mem::take(&mut self.has_answer);
         self.asking = Asking::Pending;
         match self.bit {
-            128 if answered => self.bit = 31,
-            128 => self.end = Some(Err(LssError::Nobody)),
+            WHOLE if answered => self.bit = 31,
+            WHOLE => self.end = Some(Err(LssError::Nobody)),
             -1 if !answered => self.end = Some(Err(LssError::Unsteady { part: self.part + 1 })),
             -1 if self.part == 3 => self.end = Some(Ok(())),
             -1 => (self.part, self.bit) = (self.part + 1, 31),
@@ -177,11 +173,11 @@ impl Machine for FastScan {
     }
 
     fn hear(&mut self, now_ns: u64, id: Id, data: &[u8]) {
-        if id == REQUEST && (self.asking != Asking::Pending || self.bit != 128) {
+        if id == REQUEST && (self.asking != Asking::Pending || self.bit != WHOLE) {
             self.end.get_or_insert(Err(LssError::OtherMaster));
         }
-        if id == RESPONSE && data.first() == Some(&IDENTIFIED) && matches!(self.asking, Asking::Waits { .. })
-        {
+        let is_answer = id == RESPONSE && LssResponse::decode(data) == Some(LssResponse::Identified);
+        if is_answer && matches!(self.asking, Asking::Waits { .. }) {
             self.has_answer = true;
             self.asking = Asking::Settles { until_ns: now_ns + SETTLE_NS };
         }
@@ -237,10 +233,10 @@ pub const fn bit_rate_index(bitrate_bps: u32) -> Option<u8> {
 #[derive(Debug)]
 pub struct LssMaster {
     timeout_ns: u64,
-    out: VecDeque<[u8; 8]>,
+    out: VecDeque<LssRequest>,
     under_way: usize,
-    /// The command specifier of the answer, if one is expected.
-    answer: Option<u8>,
+    /// The last request, if it has an answer.
+    asked: Option<LssRequest>,
     until_ns: Option<u64>,
     end: Option<Result<(), LssError>>,
 }
@@ -248,22 +244,19 @@ pub struct LssMaster {
 impl LssMaster {
     /// Waits this long for the answer, if the command has one.
     pub fn new(order: LssOrder, timeout_ns: u64) -> Self {
-        let command = |command: u8, rest: [u8; 2]| [command, rest[0], rest[1], 0, 0, 0, 0, 0];
-        let word = |command: u8, word: u32| {
-            let [a, b, c, d] = word.to_le_bytes();
-            [command, a, b, c, d, 0, 0, 0]
-        };
-        let (out, answer) = match order {
-            LssOrder::SwitchAll(waits) => (vec![command(0x04, [u8::from(waits), 0])], None),
+        let out = match order {
+            LssOrder::SwitchAll(waits) => vec![LssRequest::SwitchGlobal(waits.into())],
             LssOrder::Switch(LssAddress { vendor, product, revision, serial }) => {
-                let parts = [vendor, product, revision, serial];
-                ((0x40..).zip(parts).map(|(specifier, part)| word(specifier, part)).collect(), Some(0x44))
+                let values = [vendor, product, revision, serial];
+                let parts = Part::ALL.into_iter().zip(values);
+                parts.map(|(part, value)| LssRequest::SwitchSelective(part, value)).collect()
             }
-            LssOrder::SetNode(node) => (vec![command(0x11, [node, 0])], Some(0x11)),
-            LssOrder::SetBitRate(index) => (vec![command(0x13, [0, index])], Some(0x13)),
-            LssOrder::Store => (vec![command(0x17, [0, 0])], Some(0x17)),
+            LssOrder::SetNode(node) => vec![LssRequest::ConfigureNode(node)],
+            LssOrder::SetBitRate(index) => vec![LssRequest::ConfigureBitTiming { table: 0, index }],
+            LssOrder::Store => vec![LssRequest::Store],
         };
-        Self { timeout_ns, out: out.into(), under_way: 0, answer, until_ns: None, end: None }
+        let asked = out.last().copied().filter(|_| !matches!(order, LssOrder::SwitchAll(_)));
+        Self { timeout_ns, out: out.into(), under_way: 0, asked, until_ns: None, end: None }
     }
 
     /// The result. Call it when it is done.
@@ -274,24 +267,29 @@ impl LssMaster {
 
 impl Machine for LssMaster {
     fn next(&mut self, now_ns: u64) -> Option<Frame> {
-        if let (Some(until_ns), Some(command)) = (self.until_ns, self.answer)
+        if let (Some(until_ns), Some(asked)) = (self.until_ns, self.asked)
             && now_ns >= until_ns
         {
+            // What the answer would have begun with: that of the selection is 44.
+            let command = match asked {
+                LssRequest::SwitchSelective(..) => LssResponse::Selected.encode()[0],
+                asked => asked.encode()[0],
+            };
             self.end
                 .get_or_insert(Err(LssError::NoAnswer { command, after_ms: self.timeout_ns / 1_000_000 }));
         }
         if self.is_done() {
             return None;
         }
-        let bytes = self.out.pop_front()?;
+        let request = self.out.pop_front()?;
         self.under_way += 1;
-        Some(frame(bytes))
+        Some(frame(request))
     }
 
     fn sent(&mut self, now_ns: u64) {
         self.under_way = self.under_way.saturating_sub(1);
         if self.under_way == 0 && self.out.is_empty() {
-            match self.answer {
+            match self.asked {
                 Some(_) => self.until_ns = Some(now_ns + self.timeout_ns),
                 None => self.end = Some(Ok(())),
             }
@@ -302,12 +300,17 @@ impl Machine for LssMaster {
         if id == REQUEST && (self.under_way > 0 || self.until_ns.is_some()) {
             self.end.get_or_insert(Err(LssError::OtherMaster));
         }
-        let Some(command) = self.answer.filter(|answer| id == RESPONSE && data.first() == Some(answer))
-        else {
+        let response = LssResponse::decode(data).filter(|_| id == RESPONSE);
+        let Some((response, asked)) = response.zip(self.asked) else { return };
+        if !response.answers(&asked) {
             return;
-        };
-        let error = if command == 0x44 { 0 } else { data.get(1).copied().unwrap_or_default() };
-        self.end.get_or_insert(if error == 0 { Ok(()) } else { Err(LssError::Refused { command, error }) });
+        }
+        self.end.get_or_insert(match response {
+            LssResponse::Outcome { service, error, .. } if error != 0 => {
+                Err(LssError::Refused { command: service.command(), error })
+            }
+            _ => Ok(()),
+        });
     }
 
     fn gap(&mut self, _now_ns: u64) {}
@@ -344,8 +347,7 @@ mod tests {
                 };
                 if is_it {
                     *at = if bit == 0 && next != part { next } else { *at };
-                    let mut answer = [0; 8];
-                    answer[0] = IDENTIFIED;
+                    let answer = LssResponse::Identified.encode();
                     say.push((after * MS, Frame::from_bus(RESPONSE, false, 8, answer)));
                 }
             }

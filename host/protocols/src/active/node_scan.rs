@@ -7,11 +7,11 @@ use cantap_trace::Id;
 
 use super::Machine;
 use super::sdo::SdoIds;
+use crate::canopen::codec::sdo::{Content, SdoObject, SdoRequest, SdoResponse, abort};
 
 /// How many questions may wait in the sender's queue at a time.
 const MOST_UNDER_WAY: usize = 8;
-/// Object 1000, device type.
-const DEVICE_TYPE: [u8; 3] = [0x00, 0x10, 0];
+const DEVICE_TYPE: SdoObject = SdoObject { index: 0x1000, sub: 0 };
 
 /// A node that was found.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -78,8 +78,7 @@ impl Machine for NodeScan {
         let frame = self.aborts.pop_front().or_else(|| {
             let node = self.to_ask.pop_front()?;
             self.asked[usize::from(node)] = true;
-            let [low, high, sub] = DEVICE_TYPE;
-            Some(Frame::from_bus(SdoIds::of(node).request, false, 8, [0x40, low, high, sub, 0, 0, 0, 0]))
+            Some(request(node, SdoRequest::Upload(DEVICE_TYPE)))
         });
         if frame.is_some() {
             self.under_way += 1;
@@ -105,17 +104,25 @@ impl Machine for NodeScan {
                 self.found[place].node = node;
                 self.found[place].state = Some(state & 0x7F);
             }
-            (0x580, &[command, a, b, c, ref rest @ ..]) if self.asked[place] && [a, b, c] == DEVICE_TYPE => {
+            (0x580, data) if self.asked[place] && data.len() >= 4 => {
+                // Some nodes leave out the bytes that mean nothing.
+                let mut bytes = [0; 8];
+                let Some(used) = bytes.get_mut(..data.len()) else { return };
+                used.copy_from_slice(data);
+                if SdoObject::decode(bytes) != DEVICE_TYPE {
+                    return;
+                }
                 let found = &mut self.found[place];
                 (found.node, found.answers) = (node, true);
-                let [a, b, c, d] = rest.first_chunk().copied().unwrap_or_default();
-                match command {
-                    0x43 | 0x42 => found.device_type = Some(u32::from_le_bytes([a, b, c, d])),
-                    0x40 | 0x41 if !std::mem::replace(&mut self.aborted[place], true) => {
+                match SdoResponse::decode(bytes) {
+                    Some(SdoResponse::Upload(_, Content::Expedited { bytes, length: None | Some(4) })) => {
+                        found.device_type = Some(u32::from_le_bytes(bytes));
+                    }
+                    Some(SdoResponse::Upload(_, Content::Segmented(_)))
+                        if !std::mem::replace(&mut self.aborted[place], true) =>
+                    {
                         // It wants to send segments, which nobody will request.
-                        let [low, high, sub] = DEVICE_TYPE;
-                        let abort = [0x80, low, high, sub, 0, 0, 0, 8];
-                        self.aborts.push_back(Frame::from_bus(SdoIds::of(node).request, false, 8, abort));
+                        self.aborts.push_back(request(node, SdoRequest::Abort(DEVICE_TYPE, abort::GENERAL)));
                     }
                     _ => {}
                 }
@@ -133,6 +140,10 @@ impl Machine for NodeScan {
     fn is_done(&self) -> bool {
         self.started && self.until_ns.is_none() && self.under_way == 0 && self.to_ask.is_empty()
     }
+}
+
+fn request(node: u8, request: SdoRequest) -> Frame {
+    Frame::from_bus(SdoIds::of(node).request, false, 8, request.encode())
 }
 
 #[cfg(test)]

@@ -8,7 +8,10 @@ use cantap_can::Frame;
 use cantap_trace::Id;
 
 use super::Machine;
-use crate::canopen::crc_of;
+use crate::canopen::codec::sdo::{
+    BlockEnd, BlockSegment, Content, MOST_BLOCK_FRAMES, SEGMENT_BYTES, SdoObject, SdoRequest, SdoResponse,
+    Segment, abort, crc_of,
+};
 
 /// The longest object that is accepted, in bytes.
 const MOST_BYTES: usize = 1 << 24;
@@ -20,17 +23,6 @@ const MOST_RETRIES: u32 = 20;
 const MOST_STALLED: u64 = 5;
 /// How long a transfer may take altogether, unless said otherwise.
 const PATIENCE_NS: u64 = 600_000_000_000;
-/// Frames in a block: the maximum.
-const BLOCK: u8 = 127;
-const TIMED_OUT: u32 = 0x0504_0000;
-const BAD_COMMAND: u32 = 0x0504_0001;
-const BAD_TOGGLE: u32 = 0x0503_0000;
-const BAD_CRC: u32 = 0x0504_0004;
-const BAD_SEQUENCE: u32 = 0x0504_0003;
-const OUT_OF_MEMORY: u32 = 0x0504_0005;
-const BAD_LENGTH: u32 = 0x0607_0010;
-const GENERAL: u32 = 0x0800_0000;
-
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Step {
     New,
@@ -38,7 +30,7 @@ enum Step {
     Initiated,
     /// A segment was requested or sent with this toggle bit.
     Segment {
-        toggle: u8,
+        toggle: bool,
     },
     /// The node sends a block: the next sequence number.
     BlockIn {
@@ -61,7 +53,7 @@ enum Step {
 #[derive(Clone, Debug)]
 pub struct SdoClient {
     ids: SdoIds,
-    object: [u8; 3],
+    object: SdoObject,
     job: SdoJob,
     by_blocks: bool,
     timeout_ns: u64,
@@ -92,10 +84,9 @@ impl SdoClient {
         by_blocks: bool,
         timeout_ns: u64,
     ) -> Self {
-        let [low, high] = index.to_le_bytes();
         Self {
             ids,
-            object: [low, high, sub],
+            object: SdoObject { index, sub },
             job,
             by_blocks,
             timeout_ns,
@@ -132,26 +123,24 @@ impl SdoClient {
         if matches!(self.job, SdoJob::Read) { self.data.len() } else { self.at }
     }
 
-    fn say(&mut self, frame: [u8; 8]) {
+    fn queue(&mut self, frame: [u8; 8]) {
         self.until_ns = None;
         self.out.push_back(frame);
     }
 
-    /// A command with the object's index.
-    fn command(&self, command: u8, rest: [u8; 4]) -> [u8; 8] {
-        let [low, high, sub] = self.object;
-        [command, low, high, sub, rest[0], rest[1], rest[2], rest[3]]
+    fn request(&mut self, request: SdoRequest) {
+        self.queue(request.encode());
     }
 
     fn abort(&mut self, code: u32, error: SdoError) {
         self.out.clear();
-        let frame = self.command(0x80, code.to_le_bytes());
-        self.say(frame);
+        self.request(SdoRequest::Abort(self.object, code));
         self.step = Step::Closing;
         self.end = Some(Err(error));
     }
 
-    fn wrong(&mut self, code: u32) {
+    /// Aborts because of what the node has sent.
+    fn reject(&mut self, code: u32) {
         let done = self.done();
         self.abort(code, SdoError::Wrong { code, done });
     }
@@ -163,18 +152,21 @@ impl SdoClient {
 
     fn begin(&mut self) {
         self.step = Step::Initiated;
-        let frame = match (&self.job, self.by_blocks) {
-            (SdoJob::Read, false) => self.command(0x40, [0; 4]),
-            (SdoJob::Read, true) => self.command(0xA4, [BLOCK, 0, 0, 0]),
-            (SdoJob::Write(data), true) => self.command(0xC6, (data.len() as u32).to_le_bytes()),
-            (SdoJob::Write(data), false) if (1..=4).contains(&data.len()) => {
-                let mut rest = [0; 4];
-                rest[..data.len()].copy_from_slice(data);
-                self.command(0x23 | (4 - data.len() as u8) << 2, rest)
+        let object = self.object;
+        let request = match (&self.job, self.by_blocks) {
+            (SdoJob::Read, false) => SdoRequest::Upload(object),
+            (SdoJob::Read, true) => {
+                SdoRequest::BlockUpload { object, crc: true, block_size: MOST_BLOCK_FRAMES, threshold: 0 }
             }
-            (SdoJob::Write(data), false) => self.command(0x21, (data.len() as u32).to_le_bytes()),
+            (SdoJob::Write(data), true) => {
+                SdoRequest::BlockDownload { object, crc: true, size: Some(data.len() as u32) }
+            }
+            (SdoJob::Write(data), false) => {
+                let content = Content::expedited(data);
+                SdoRequest::Download(object, content.unwrap_or(Content::Segmented(Some(data.len() as u32))))
+            }
         };
-        self.say(frame);
+        self.request(request);
     }
 
     fn time_out(&mut self) {
@@ -187,7 +179,7 @@ impl SdoClient {
             return;
         }
         let (after_ms, done) = (self.timeout_ns / 1_000_000, self.done());
-        self.abort(TIMED_OUT, SdoError::NoAnswer { after_ms, done });
+        self.abort(abort::TIMEOUT, SdoError::NoAnswer { after_ms, done });
     }
 
     /// Ends what takes too long although answers come.
@@ -203,9 +195,9 @@ impl SdoClient {
         }
         let stalled_ns = self.timeout_ns.saturating_mul(MOST_STALLED);
         if now_ns >= begun_ns.saturating_add(self.patience_ns) {
-            self.abort(TIMED_OUT, SdoError::TooSlow { after_s: self.patience_ns / 1_000_000_000, done });
+            self.abort(abort::TIMEOUT, SdoError::TooSlow { after_s: self.patience_ns / 1_000_000_000, done });
         } else if now_ns >= self.grown.0.saturating_add(stalled_ns) {
-            self.abort(TIMED_OUT, SdoError::Stalled { after_ms: stalled_ns / 1_000_000, done });
+            self.abort(abort::TIMEOUT, SdoError::Stalled { after_ms: stalled_ns / 1_000_000, done });
         }
     }
 
@@ -215,7 +207,7 @@ impl SdoClient {
             self.retries += 1;
         }
         self.step = if is_last { Step::BlockInEnd } else { Step::BlockIn { next: 1, is_gap: false } };
-        self.say([0xA2, up_to, BLOCK, 0, 0, 0, 0, 0]);
+        self.request(SdoRequest::BlockUploadAcknowledge { taken: up_to, block_size: MOST_BLOCK_FRAMES });
     }
 
     /// Appends received bytes; false if there are more than announced. Only the end of a block transfer says how many of its last
@@ -227,78 +219,69 @@ impl SdoClient {
 
     /// The reason for too many bytes.
     const fn too_many(&self) -> u32 {
-        if self.size.is_some() { BAD_LENGTH } else { OUT_OF_MEMORY }
+        if self.size.is_some() { abort::LENGTH } else { abort::MEMORY }
     }
 
-    fn read_begins(&mut self, data: [u8; 8]) {
-        let command = data[0];
-        let size = u32::from_le_bytes([data[4], data[5], data[6], data[7]]) as usize;
-        match (command >> 5, self.by_blocks) {
-            (2, _) if command & 2 != 0 => {
-                let unused = if command & 1 != 0 { usize::from(command >> 2 & 3) } else { 0 };
-                self.data = data[4..8 - unused].to_vec();
+    fn read_begins(&mut self, response: Option<SdoResponse>) {
+        match response {
+            Some(SdoResponse::Upload(_, Content::Expedited { bytes, length })) => {
+                self.data = bytes[..usize::from(length.unwrap_or(4))].to_vec();
                 self.finished();
             }
-            (2, _) => {
-                self.size = (command & 1 != 0).then_some(size);
-                self.step = Step::Segment { toggle: 0 };
-                self.say([0x60, 0, 0, 0, 0, 0, 0, 0]);
+            Some(SdoResponse::Upload(_, Content::Segmented(size))) => {
+                self.size = size.map(|size| size as usize);
+                self.step = Step::Segment { toggle: false };
+                self.request(SdoRequest::UploadSegment { toggle: false });
             }
-            (6, true) if command & 1 == 0 => {
-                self.size = (command & 2 != 0).then_some(size);
-                self.has_crc = command & 4 != 0;
+            Some(SdoResponse::BlockUpload { crc, size, .. }) if self.by_blocks => {
+                self.size = size.map(|size| size as usize);
+                self.has_crc = crc;
                 self.step = Step::BlockIn { next: 1, is_gap: false };
-                self.say([0xA3, 0, 0, 0, 0, 0, 0, 0]);
+                self.request(SdoRequest::BlockUploadStart);
             }
-            _ => return self.wrong(BAD_COMMAND),
+            _ => return self.reject(abort::COMMAND),
         }
         if self.size.is_some_and(|size| size > MOST_BYTES) {
-            self.wrong(OUT_OF_MEMORY);
+            self.reject(abort::MEMORY);
         }
     }
 
-    fn segment_came(&mut self, toggle: u8, data: [u8; 8]) {
-        let command = data[0];
-        if command >> 5 != 0 {
-            return self.wrong(BAD_COMMAND);
+    fn segment_came(&mut self, toggle: bool, response: Option<SdoResponse>) {
+        let Some(SdoResponse::UploadSegment(segment)) = response else { return self.reject(abort::COMMAND) };
+        if segment.toggle != toggle {
+            return self.reject(abort::TOGGLE);
         }
-        if command >> 4 & 1 != toggle {
-            return self.wrong(BAD_TOGGLE);
-        }
-        let used = 7 - usize::from(command >> 1 & 7);
-        let is_last = command & 1 != 0;
         // A node that keeps sending empty segments would never end.
-        if used == 0 && !is_last {
-            return self.wrong(BAD_LENGTH);
+        if segment.data().is_empty() && !segment.is_last {
+            return self.reject(abort::LENGTH);
         }
-        if !self.append(&data[1..=used]) {
-            return self.wrong(self.too_many());
+        if !self.append(segment.data()) {
+            return self.reject(self.too_many());
         }
-        if !is_last {
-            let toggle = toggle ^ 1;
-            self.step = Step::Segment { toggle };
-            return self.say([0x60 | toggle << 4, 0, 0, 0, 0, 0, 0, 0]);
+        if !segment.is_last {
+            self.step = Step::Segment { toggle: !toggle };
+            return self.request(SdoRequest::UploadSegment { toggle: !toggle });
         }
         if self.size.is_some_and(|size| size != self.data.len()) {
-            return self.wrong(BAD_LENGTH);
+            return self.reject(abort::LENGTH);
         }
         self.finished();
     }
 
-    fn block_frame_came(&mut self, next: u8, is_gap: bool, data: [u8; 8]) {
-        let (number, is_last) = (data[0] & 0x7F, data[0] & 0x80 != 0);
+    fn block_frame_came(&mut self, next: u8, is_gap: bool, segment: BlockSegment) {
+        let BlockSegment { number, is_last, bytes } = segment;
         if number == 0 {
-            return self.wrong(BAD_SEQUENCE);
+            return self.reject(abort::SEQUENCE);
         }
         let follows = number == next && !is_gap;
-        if follows && !self.append(&data[1..8]) {
-            return self.wrong(self.too_many());
+        if follows && !self.append(&bytes) {
+            return self.reject(self.too_many());
         }
         let next = if follows { next + 1 } else { next };
         let is_gap = !follows && number >= next || is_gap;
-        if number == BLOCK || is_last {
+        if number == MOST_BLOCK_FRAMES || is_last {
             if is_gap && self.retries >= MOST_RETRIES {
-                return self.wrong(BAD_SEQUENCE);
+                return self.reject(abort::SEQUENCE);
             }
             let is_whole = is_last && !is_gap;
             let retries = self.retries;
@@ -311,36 +294,31 @@ impl SdoClient {
         self.step = Step::BlockIn { next, is_gap };
     }
 
-    fn blocks_end(&mut self, data: [u8; 8]) {
-        let command = data[0];
-        if command >> 5 != 6 || command & 3 != 1 {
-            return self.wrong(BAD_COMMAND);
-        }
-        let unused = usize::from(command >> 2 & 7);
-        let Some(length) = self.data.len().checked_sub(unused) else { return self.wrong(BAD_LENGTH) };
+    fn blocks_end(&mut self, response: Option<SdoResponse>) {
+        let Some(SdoResponse::BlockUploadEnd(end)) = response else { return self.reject(abort::COMMAND) };
+        let Some(length) = self.data.len().checked_sub(end.unused.into()) else {
+            return self.reject(abort::LENGTH);
+        };
         self.data.truncate(length);
-        if self.has_crc && crc_of(&self.data) != u16::from_le_bytes([data[1], data[2]]) {
-            return self.wrong(BAD_CRC);
+        if self.has_crc && crc_of(&self.data) != end.crc {
+            return self.reject(abort::CRC);
         }
         if self.size.is_some_and(|size| size != length) {
-            return self.wrong(BAD_LENGTH);
+            return self.reject(abort::LENGTH);
         }
         self.step = Step::Closing;
-        self.say([0xA1, 0, 0, 0, 0, 0, 0, 0]);
+        self.request(SdoRequest::BlockUploadEnd);
         self.end = Some(Ok(()));
     }
 
     /// Sends the next segment.
-    fn write_segment(&mut self, toggle: u8) {
+    fn write_segment(&mut self, toggle: bool) {
         let SdoJob::Write(data) = &self.job else { return };
-        let end = data.len().min(self.at + 7);
-        let bytes = &data[self.at..end];
-        let mut frame = [0; 8];
-        frame[0] = toggle << 4 | (7 - bytes.len() as u8) << 1 | u8::from(end == data.len());
-        frame[1..=bytes.len()].copy_from_slice(bytes);
+        let end = data.len().min(self.at + SEGMENT_BYTES);
+        let segment = Segment::new(toggle, end == data.len(), &data[self.at..end]);
         self.at = end;
         self.step = Step::Segment { toggle };
-        self.say(frame);
+        self.request(SdoRequest::DownloadSegment(segment));
     }
 
     /// Sends the next block, of at most this many frames.
@@ -349,11 +327,8 @@ impl SdoClient {
         let mut frames = Vec::new();
         let mut at = self.at;
         for number in 1..=most {
-            let end = data.len().min(at + 7);
-            let mut frame = [0; 8];
-            frame[0] = number | u8::from(end == data.len()) << 7;
-            frame[1..=end - at].copy_from_slice(&data[at..end]);
-            frames.push(frame);
+            let end = data.len().min(at + SEGMENT_BYTES);
+            frames.push(BlockSegment::new(number, end == data.len(), &data[at..end]).encode());
             at = end;
             if end == data.len() {
                 break;
@@ -361,64 +336,65 @@ impl SdoClient {
         }
         self.step = Step::BlockOut { frames: frames.len() as u8 };
         for frame in frames {
-            self.say(frame);
+            self.queue(frame);
         }
     }
 
-    fn block_acknowledged(&mut self, frames: u8, data: [u8; 8]) {
-        let (up_to, next_most) = (data[1], data[2]);
+    fn block_acknowledged(&mut self, frames: u8, response: Option<SdoResponse>) {
         let SdoJob::Write(bytes) = &self.job else { return };
         let length = bytes.len();
-        if data[0] >> 5 != 5 || data[0] & 3 != 2 {
-            return self.wrong(BAD_COMMAND);
+        let Some(SdoResponse::BlockDownloadAcknowledge { taken, block_size }) = response else {
+            return self.reject(abort::COMMAND);
+        };
+        if taken > frames || !(1..=MOST_BLOCK_FRAMES).contains(&block_size) {
+            return self.reject(abort::SEQUENCE);
         }
-        if up_to > frames || next_most == 0 || next_most > BLOCK {
-            return self.wrong(BAD_SEQUENCE);
-        }
-        self.at = length.min(self.at + 7 * usize::from(up_to));
-        if up_to < frames {
+        self.at = length.min(self.at + SEGMENT_BYTES * usize::from(taken));
+        if taken < frames {
             self.retries += 1;
             if self.retries > MOST_RETRIES {
-                return self.wrong(BAD_SEQUENCE);
+                return self.reject(abort::SEQUENCE);
             }
         }
-        if self.at < length || up_to == 0 {
-            return self.write_block(next_most);
+        if self.at < length || taken == 0 {
+            return self.write_block(block_size);
         }
         let SdoJob::Write(bytes) = &self.job else { return };
-        let [low, high] = if self.has_crc { crc_of(bytes).to_le_bytes() } else { [0; 2] };
-        let unused = ((7 - length % 7) % 7) as u8;
-        // An object without bytes also takes one frame, with no content.
-        let unused = if length == 0 { 7 } else { unused };
+        let crc = if self.has_crc { crc_of(bytes) } else { 0 };
         self.step = Step::BlockOutEnd;
-        self.say([0xC1 | unused << 2, low, high, 0, 0, 0, 0, 0]);
+        self.request(SdoRequest::BlockDownloadEnd(BlockEnd::of(length, crc)));
     }
 
-    fn write_goes_on(&mut self, data: [u8; 8]) {
+    fn write_goes_on(&mut self, response: Option<SdoResponse>) {
         let SdoJob::Write(bytes) = &self.job else { return };
         let length = bytes.len();
-        match self.step {
-            Step::Initiated if self.by_blocks => {
-                let most = data[4];
-                if data[0] >> 5 != 5 || data[0] & 3 != 0 || most == 0 || most > BLOCK {
-                    return self.wrong(BAD_COMMAND);
+        match (self.step, response) {
+            (Step::Initiated, Some(SdoResponse::BlockDownload { crc, block_size, .. }))
+                if self.by_blocks && (1..=MOST_BLOCK_FRAMES).contains(&block_size) =>
+            {
+                self.has_crc = crc;
+                self.write_block(block_size);
+            }
+            (Step::Initiated, Some(SdoResponse::Download(_))) if !self.by_blocks => {
+                if (1..=4).contains(&length) {
+                    self.at = length;
+                    self.finished();
+                } else {
+                    self.write_segment(false);
                 }
-                self.has_crc = data[0] & 4 != 0;
-                self.write_block(most);
             }
-            Step::Initiated if data[0] >> 5 != 3 => self.wrong(BAD_COMMAND),
-            Step::Initiated if (1..=4).contains(&length) => {
-                self.at = length;
-                self.finished();
+            (Step::Segment { toggle: expected }, Some(SdoResponse::DownloadSegment { toggle })) => {
+                if toggle != expected {
+                    self.reject(abort::TOGGLE);
+                } else if self.at == length {
+                    self.finished();
+                } else {
+                    self.write_segment(!expected);
+                }
             }
-            Step::Initiated => self.write_segment(0),
-            Step::Segment { .. } if data[0] >> 5 != 1 => self.wrong(BAD_COMMAND),
-            Step::Segment { toggle } if data[0] >> 4 & 1 != toggle => self.wrong(BAD_TOGGLE),
-            Step::Segment { .. } if self.at == length => self.finished(),
-            Step::Segment { toggle } => self.write_segment(toggle ^ 1),
-            Step::BlockOut { frames } => self.block_acknowledged(frames, data),
-            Step::BlockOutEnd if data[0] == 0xA1 => self.finished(),
-            _ => self.wrong(BAD_COMMAND),
+            (Step::BlockOut { frames }, response) => self.block_acknowledged(frames, response),
+            (Step::BlockOutEnd, Some(SdoResponse::BlockDownloadEnd)) => self.finished(),
+            _ => self.reject(abort::COMMAND),
         }
     }
 }
@@ -462,27 +438,29 @@ impl Machine for SdoClient {
         if id != self.ids.response {
             return;
         }
-        let Ok(data) = <[u8; 8]>::try_from(data) else { return self.wrong(BAD_LENGTH) };
-        if data[0] == 0x80 {
+        let Ok(data) = <[u8; 8]>::try_from(data) else { return self.reject(abort::LENGTH) };
+        let response = SdoResponse::decode(data);
+        if let Some(SdoResponse::Abort(_, code)) = response {
             self.out.clear();
             self.until_ns = None;
-            let code = u32::from_le_bytes([data[4], data[5], data[6], data[7]]);
             self.end = Some(Err(SdoError::Aborted { code }));
             return;
         }
         // An answer to an earlier question does not count here.
-        if self.step == Step::Initiated && data[1..4] != self.object {
+        if self.step == Step::Initiated && SdoObject::decode(data) != self.object {
             return;
         }
         if self.until_ns.is_some() {
             self.until_ns = Some(now_ns + self.timeout_ns);
         }
         match (&self.job, self.step) {
-            (SdoJob::Read, Step::Initiated) => self.read_begins(data),
-            (SdoJob::Read, Step::Segment { toggle }) => self.segment_came(toggle, data),
-            (SdoJob::Read, Step::BlockIn { next, is_gap }) => self.block_frame_came(next, is_gap, data),
-            (SdoJob::Read, Step::BlockInEnd) => self.blocks_end(data),
-            _ => self.write_goes_on(data),
+            (SdoJob::Read, Step::Initiated) => self.read_begins(response),
+            (SdoJob::Read, Step::Segment { toggle }) => self.segment_came(toggle, response),
+            (SdoJob::Read, Step::BlockIn { next, is_gap }) => {
+                self.block_frame_came(next, is_gap, BlockSegment::decode(data));
+            }
+            (SdoJob::Read, Step::BlockInEnd) => self.blocks_end(response),
+            _ => self.write_goes_on(response),
         }
     }
 
@@ -490,7 +468,7 @@ impl Machine for SdoClient {
         // Frames of a block have numbers, each of which occurs only once in it, and the data have a CRC.
         let numbered = matches!(self.step, Step::BlockIn { .. });
         if self.end.is_none() && self.step != Step::New && !numbered && self.until_ns.is_some() {
-            self.abort(GENERAL, SdoError::FramesLost);
+            self.abort(abort::GENERAL, SdoError::FramesLost);
         }
     }
 
@@ -509,7 +487,8 @@ impl Machine for SdoClient {
         self.out.clear();
         let done = self.done();
         self.end = Some(Err(SdoError::Cancelled { done }));
-        Some(Frame::from_bus(self.ids.request, false, 8, self.command(0x80, GENERAL.to_le_bytes())))
+        let frame = SdoRequest::Abort(self.object, abort::GENERAL).encode();
+        Some(Frame::from_bus(self.ids.request, false, 8, frame))
     }
 }
 

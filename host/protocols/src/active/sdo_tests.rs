@@ -107,7 +107,7 @@ impl Peer for Server {
                 self.toggle ^= 1;
                 reply(frame);
             }
-            0xA4 | 0xC6 if !self.has_blocks => reply(with(0x80, BAD_COMMAND.to_le_bytes())),
+            0xA4 | 0xC6 if !self.has_blocks => reply(with(0x80, abort::COMMAND.to_le_bytes())),
             0xA4 => {
                 (self.sending, self.block_at) = (self.object.clone(), 0);
                 reply(with(0xC6, size));
@@ -202,7 +202,7 @@ fn a_node_that_refuses_is_understood_by_name() {
     let mut server = Server::new(&bytes(30));
     server.has_blocks = false;
     let error = transfer(client(SdoJob::Read, true), &mut server).unwrap_err();
-    assert_eq!(error, SdoError::Aborted { code: BAD_COMMAND });
+    assert_eq!(error, SdoError::Aborted { code: abort::COMMAND });
     assert!(error.to_string().contains("command specifier not valid or unknown (05040001)"), "{error}");
 }
 
@@ -228,10 +228,10 @@ fn whatever_the_node_does_there_is_an_end() {
         }
     };
     for (frame, code) in [
-        ([0x00, 1, 2, 3, 4, 5, 6, 7], BAD_TOGGLE),
-        ([0x0E, 0, 0, 0, 0, 0, 0, 0], BAD_LENGTH),
-        ([0x01, 1, 2, 3, 4, 5, 6, 7], BAD_LENGTH),
-        ([0xE0, 0, 0, 0, 0, 0, 0, 0], BAD_COMMAND),
+        ([0x00, 1, 2, 3, 4, 5, 6, 7], abort::TOGGLE),
+        ([0x0E, 0, 0, 0, 0, 0, 0, 0], abort::LENGTH),
+        ([0x01, 1, 2, 3, 4, 5, 6, 7], abort::LENGTH),
+        ([0xE0, 0, 0, 0, 0, 0, 0, 0], abort::COMMAND),
     ] {
         let (error, last) = fails(false, SdoJob::Read, &segments(frame));
         assert!(matches!(error, SdoError::Wrong { code: is, .. } if is == code), "{frame:02X?}: {error}");
@@ -243,21 +243,21 @@ fn whatever_the_node_does_there_is_an_end() {
         0x80 => {}
         _ => begin(say, [0x85, 0, 0, 0, 0, 0, 0, 0]),
     });
-    assert!(matches!(error, SdoError::Wrong { code: BAD_SEQUENCE, .. }), "{error}");
+    assert!(matches!(error, SdoError::Wrong { code: abort::SEQUENCE, .. }), "{error}");
     let (error, _) = fails(true, SdoJob::Read, &|data, say| match data[0] {
         0xA4 => begin(say, [0xC4, 0, 0x20, 1, 0, 0, 0, 0]),
         0xA3 => begin(say, [0x81, 1, 2, 3, 4, 5, 6, 7]),
         0xA2 => begin(say, [0xC1, 0, 0, 0, 0, 0, 0, 0]),
         _ => {}
     });
-    assert!(matches!(error, SdoError::Wrong { code: BAD_CRC, .. }), "{error}");
+    assert!(matches!(error, SdoError::Wrong { code: abort::CRC, .. }), "{error}");
     // A written block that is never understood.
     let (error, _) = fails(true, SdoJob::Write(bytes(100)), &|data, say| match data[0] {
         0xC6 => begin(say, [0xA4, 0, 0x20, 1, 4, 0, 0, 0]),
         4 => begin(say, [0xA2, 0, 4, 0, 0, 0, 0, 0]),
         _ => {}
     });
-    assert!(matches!(error, SdoError::Wrong { code: BAD_SEQUENCE, .. }), "{error}");
+    assert!(matches!(error, SdoError::Wrong { code: abort::SEQUENCE, .. }), "{error}");
 }
 
 /// What is reported as read is what is there, whatever is dropped, doubled or swapped.
@@ -307,7 +307,7 @@ fn a_node_that_sends_more_than_it_announced_is_stopped_at_once() {
         };
         let (_, sent) = run(&mut client, &mut node, arrives);
         assert!(sent.len() < 6 && sent.last().unwrap().data()[0] == 0x80, "{sent:?}");
-        assert!(matches!(client.finish(), Err(SdoError::Wrong { code: BAD_LENGTH, done: 14..=21 })));
+        assert!(matches!(client.finish(), Err(SdoError::Wrong { code: abort::LENGTH, done: 14..=21 })));
     }
 }
 
@@ -322,7 +322,7 @@ fn an_answer_of_less_than_8_bytes_is_no_answer() {
     };
     let (_, sent) = run(&mut client, &mut node, arrives);
     assert_eq!(sent.last().unwrap().data(), [0x80, 0, 0x20, 1, 0x10, 0, 7, 6]);
-    assert_eq!(client.finish(), Err(SdoError::Wrong { code: BAD_LENGTH, done: 0 }));
+    assert_eq!(client.finish(), Err(SdoError::Wrong { code: abort::LENGTH, done: 0 }));
 }
 
 /// Otherwise its server would be busy for as long as it waits.

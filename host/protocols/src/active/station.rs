@@ -4,7 +4,7 @@
 //! BAM.
 
 mod long_message;
-mod words;
+mod parts;
 
 use std::collections::VecDeque;
 
@@ -12,8 +12,8 @@ use cantap_can::Frame;
 use cantap_trace::Id;
 
 use self::long_message::{Incoming, Outgoing};
-pub use self::words::StationError;
-use self::words::{CONTROL, DATA, GLOBAL, MS, frame, three};
+pub use self::parts::StationError;
+use self::parts::{CONTROL, DATA, GLOBAL, MS, frame, three};
 use super::{Machine, earlier};
 use crate::j1939::Header;
 

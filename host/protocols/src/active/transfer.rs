@@ -2,7 +2,7 @@
 
 use cantap_can::Frame;
 
-use crate::iso_tp::{Endpoint, FlowStatus, Pci};
+use crate::iso_tp::{Endpoint, FlowStatus, Pci, separation_us};
 
 /// How many frames of a block may wait in the sender's queue at a time, if no separation time is requested.
 const MOST_UNDER_WAY: u32 = 16;
@@ -11,8 +11,6 @@ const MOST_UNDER_WAY: u32 = 16;
 const FLOW_MISSING_NS: u64 = 100_000_000;
 /// The longest message that is accepted, in bytes.
 const MOST_BYTES: u32 = 1 << 16;
-/// The longest length in the 12 bits of a first frame.
-const MOST_SHORT: usize = 0xFFF;
 
 /// Parameters of transfers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -113,20 +111,18 @@ pub enum TransferError {
 }
 
 /// A frame to an endpoint.
-fn frame(to: Endpoint, content: &[&[u8]], padding: Option<u8>) -> Frame {
-    let mut bytes = [padding.unwrap_or(0); 8];
-    let mut length = 0;
-    let all = to.address.as_slice().iter().chain(content.iter().flat_map(|part| part.iter()));
-    for (place, byte) in bytes.iter_mut().zip(all) {
-        *place = *byte;
-        length += 1;
-    }
-    Frame::from_bus(to.id, false, if padding.is_some() { 8 } else { length }, bytes)
+fn frame(to: Endpoint, pci: Pci<'_>, padding: Option<u8>) -> Frame {
+    let (bytes, length) = pci.encode(to.address, padding);
+    Frame::from_bus(to.id, false, length, bytes)
 }
 
-/// How many data bytes of a frame are left after address and control information.
-fn room(to: Endpoint, control: usize) -> usize {
-    8 - control - usize::from(to.address.is_some())
+/// Flow control. One that ends the transfer asks for nothing else.
+fn flow(to: Endpoint, settings: &TransferSettings, status: FlowStatus) -> Frame {
+    let (block_size, separation_us) = match status {
+        FlowStatus::Overflow => (0, 0),
+        _ => (settings.block_size, separation_us(settings.separation)),
+    };
+    frame(to, Pci::Flow { status, block_size, separation_us }, settings.padding)
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -164,7 +160,7 @@ impl TransferSender {
 
     /// Whether it fits one frame.
     pub fn is_single(&self) -> bool {
-        self.data.len() <= room(self.to, 1)
+        self.data.len() <= Pci::Single(&[]).room(self.to.address)
     }
 
     /// Whether everything was on the bus.
@@ -189,18 +185,14 @@ impl TransferSender {
                 self.state = Sending::Last;
                 self.at = length;
                 self.under_way = 1;
-                Ok(Some(frame(self.to, &[&[length as u8], &self.data], padding)))
+                Ok(Some(frame(self.to, Pci::Single(&self.data), padding)))
             }
             Sending::New => {
-                let head = if length <= MOST_SHORT {
-                    vec![0x10 | (length >> 8) as u8, length as u8]
-                } else {
-                    [&[0x10, 0][..], &(length as u32).to_be_bytes()].concat()
-                };
-                self.at = room(self.to, head.len());
+                let first = Pci::First { length: length as u32, data: &self.data };
+                self.at = first.room(self.to.address);
                 self.state = Sending::AwaitsFlow { until_ns: None };
                 self.under_way = 1;
-                Ok(Some(frame(self.to, &[&head, &self.data[..self.at]], padding)))
+                Ok(Some(frame(self.to, first, padding)))
             }
             Sending::AwaitsFlow { until_ns: Some(until_ns) } if now_ns >= until_ns => {
                 let after_ms = self.settings.flow_timeout_ns / 1_000_000;
@@ -215,8 +207,9 @@ impl TransferSender {
                 if !may {
                     return Ok(None);
                 }
-                let end = length.min(self.at + room(self.to, 1));
-                let sent = frame(self.to, &[&[0x20 | self.number], &self.data[self.at..end]], padding);
+                let next = Pci::Consecutive { number: self.number, data: &self.data[self.at..] };
+                let end = length.min(self.at + next.room(self.to.address));
+                let sent = frame(self.to, next, padding);
                 (self.at, self.number) = (end, (self.number + 1) & 15);
                 self.under_way += 1;
                 let left = left.map(|left| left - 1);
@@ -311,7 +304,7 @@ impl TransferReceiver {
 
     /// The flow control frame that lets a sender continue.
     pub fn go_on(flow_to: Endpoint, settings: &TransferSettings) -> Frame {
-        frame(flow_to, &[&[0x30, settings.block_size, settings.separation]], settings.padding)
+        flow(flow_to, settings, FlowStatus::Go)
     }
 
     /// Whether a message has begun but not ended.
@@ -360,7 +353,7 @@ impl TransferReceiver {
             }
             Pci::First { length, .. } if length > MOST_BYTES => {
                 self.receiving = None;
-                self.flow = Some(frame(self.flow_to, &[&[0x32, 0, 0]], self.settings.padding));
+                self.flow = Some(flow(self.flow_to, &self.settings, FlowStatus::Overflow));
                 Err(TransferError::TooLong { length })
             }
             Pci::First { length, data } => {

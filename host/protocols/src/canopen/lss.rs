@@ -1,45 +1,18 @@
 //! Layer setting services (CiA 305): node numbers and bit rates of nodes that have none yet.
 
+use std::borrow::Cow;
+
 use cantap_trace::TraceRecord;
 
-use crate::{Event, Field, Protocol};
+use super::codec::lss::{Bound, LssRequest, LssResponse, Part, Service};
+use super::names;
+use crate::{Event, EventKind, Field, Protocol};
 
 /// A service of the master that a slave may answer.
 #[derive(Default)]
 pub struct Lss {
-    asked: Option<(i64, u8)>,
+    asked: Option<(i64, LssRequest)>,
     frames_lost: bool,
-}
-
-const fn title(service: u8) -> Option<&'static str> {
-    Some(match service {
-        0x04 => "LSS switch state global",
-        0x11 => "LSS configure node number",
-        0x13 => "LSS configure bit timing",
-        0x15 => "LSS activate bit timing",
-        0x17 => "LSS store configuration",
-        0x40 => "LSS switch state selective: vendor",
-        0x41 => "LSS switch state selective: product",
-        0x42 => "LSS switch state selective: revision",
-        0x43 => "LSS switch state selective: serial number",
-        0x44 => "LSS switched",
-        0x46 => "LSS identify: vendor",
-        0x47 => "LSS identify: product",
-        0x48 => "LSS identify: revision, lowest",
-        0x49 => "LSS identify: revision, highest",
-        0x4A => "LSS identify: serial number, lowest",
-        0x4B => "LSS identify: serial number, highest",
-        0x4C => "LSS identify slaves without a number",
-        0x4F => "LSS identified",
-        0x50 => "LSS a slave without a number",
-        0x51 => "LSS fast scan",
-        0x5A => "LSS inquire vendor",
-        0x5B => "LSS inquire product",
-        0x5C => "LSS inquire revision",
-        0x5D => "LSS inquire serial number",
-        0x5E => "LSS inquire node number",
-        _ => return None,
-    })
 }
 
 impl Lss {
@@ -48,47 +21,54 @@ impl Lss {
         self.frames_lost = true;
     }
 
-    /// Takes a frame from the master (7E5) or a slave (7E4).
-    pub fn take(&mut self, record: &TraceRecord, from_master: bool, data: &[u8]) -> Option<Event> {
-        let (&service, rest) = data.split_first()?;
-        let kind = if from_master { "lss" } else { "lss_answer" };
-        let known = title(service);
-        let mut event = Event::new(Protocol::CanOpen, record, kind, known.unwrap_or("LSS, unknown service"));
-        if known.is_none() {
-            event.fields.push(Field::hex("service", service, 2));
-            event.fields.push(Field::bytes("data", rest));
-            return Some(event);
-        }
-        let word =
-            |bytes: &[u8]| bytes.iter().take(4).rev().fold(0_u64, |word, byte| word << 8 | u64::from(*byte));
+    /// Takes a frame from the master.
+    pub fn request(&mut self, record: &TraceRecord, data: &[u8]) -> Option<Event> {
+        let request = LssRequest::decode(data);
+        self.asked = request.map(|request| (record.time_ns, request));
+        self.frames_lost = false;
+        let Some(request) = request else { return unknown(record, EventKind::Lss, data) };
+        let mut event = Event::new(Protocol::CanOpen, record, EventKind::Lss, request_title(request));
         let fields = &mut event.fields;
-        match (service, rest) {
-            (0x04, [mode, ..]) => {
-                let text = ["waiting", "configuration"].get(usize::from(*mode)).copied();
-                fields.push(Field::number("mode", *mode).meaning(text));
+        match request {
+            LssRequest::SwitchGlobal(mode) => {
+                let text = ["waiting", "configuration"].get(usize::from(mode)).copied();
+                fields.push(Field::number("mode", mode).meaning(text));
             }
-            (0x11, [node, ..]) if from_master => fields.push(Field::number("node", *node)),
-            (0x13, [table, index, ..]) if from_master => {
-                const RATES: [&str; 10] = [
-                    "1 Mbit/s",
-                    "800 kbit/s",
-                    "500 kbit/s",
-                    "250 kbit/s",
-                    "125 kbit/s",
-                    "reserved",
-                    "50 kbit/s",
-                    "20 kbit/s",
-                    "10 kbit/s",
-                    "automatic",
-                ];
-                let text = RATES.get(usize::from(*index)).copied().filter(|_| *table == 0);
-                fields.push(Field::number("table", *table));
-                fields.push(Field::number("index", *index).meaning(text));
+            LssRequest::ConfigureNode(node) => fields.push(Field::number("node", node)),
+            LssRequest::ConfigureBitTiming { table, index } => {
+                let text = names::bit_rate(index).filter(|_| table == 0);
+                fields.push(Field::number("table", table));
+                fields.push(Field::number("index", index).meaning(text));
             }
-            (0x15, [low, high, ..]) => {
-                fields.push(Field::number("switch_delay_ms", u16::from_le_bytes([*low, *high])));
+            LssRequest::ActivateBitTiming(delay_ms) => {
+                fields.push(Field::number("switch_delay_ms", delay_ms));
             }
-            (0x11 | 0x13 | 0x17, [error, own, ..]) => {
+            LssRequest::SwitchSelective(_, value) | LssRequest::Identify(_, value) => {
+                fields.push(Field::hex("value", value, 8));
+            }
+            LssRequest::FastScan { value, unchecked, part, next } => {
+                fields.push(Field::hex("value", value, 8));
+                fields.push(Field::number("bits_not_checked", unchecked));
+                fields.push(Field::number("part", part));
+                fields.push(Field::number("next_part", next));
+            }
+            LssRequest::Store
+            | LssRequest::IdentifyWithoutNumber
+            | LssRequest::Inquire(_)
+            | LssRequest::InquireNode => {}
+        }
+        Some(event)
+    }
+
+    /// Takes a frame from a slave.
+    pub fn response(&mut self, record: &TraceRecord, data: &[u8]) -> Option<Event> {
+        let Some(response) = LssResponse::decode(data) else {
+            return unknown(record, EventKind::LssAnswer, data);
+        };
+        let mut event = Event::new(Protocol::CanOpen, record, EventKind::LssAnswer, response_title(response));
+        let fields = &mut event.fields;
+        match response {
+            LssResponse::Outcome { error, device_error, .. } => {
                 let text = match error {
                     0 => "success",
                     1 => "out of range, or not supported",
@@ -96,35 +76,74 @@ impl Lss {
                     0xFF => "a reason of the device",
                     _ => "reserved",
                 };
-                fields.push(Field::number("error", *error).meaning(Some(text)));
-                fields.push(Field::number("device_error", *own));
+                fields.push(Field::number("error", error).meaning(Some(text)));
+                fields.push(Field::number("device_error", device_error));
             }
-            (0x40..=0x43 | 0x46..=0x4B, rest) => fields.push(Field::hex("value", word(rest), 8)),
-            (0x5A..=0x5D, rest) if !from_master => fields.push(Field::hex("value", word(rest), 8)),
-            (0x5E, [node, ..]) if !from_master => fields.push(Field::number("node", *node)),
-            (0x51, [a, b, c, d, bit, sub, next]) => {
-                fields.push(Field::hex("value", word(&[*a, *b, *c, *d]), 8));
-                fields.push(Field::number("bits_not_checked", *bit));
-                fields.push(Field::number("part", *sub));
-                fields.push(Field::number("next_part", *next));
-            }
-            _ => {}
+            LssResponse::Address(_, value) => fields.push(Field::hex("value", value, 8)),
+            LssResponse::Node(node) => fields.push(Field::number("node", node)),
+            LssResponse::Selected | LssResponse::Identified | LssResponse::WithoutNumber => {}
         }
-        if from_master {
-            self.asked = Some((record.time_ns, service));
-            self.frames_lost = false;
-        } else if let Some((asked_ns, asked)) = self.asked {
-            let answers = match service {
-                0x44 => asked == 0x43,
-                0x4F => matches!(asked, 0x4B | 0x51 | 0x4C),
-                0x50 => asked == 0x4C,
-                service => asked == service,
-            };
-            if answers {
-                event.response_ns = Some(record.time_ns.saturating_sub(asked_ns));
-                event.frames_lost = self.frames_lost;
-            }
+        if let Some((asked_ns, request)) = &self.asked
+            && response.answers(request)
+        {
+            event.response_ns = Some(record.time_ns.saturating_sub(*asked_ns));
+            event.frames_lost = self.frames_lost;
         }
         Some(event)
+    }
+}
+
+/// A frame that is none of this side's services, or lacks bytes.
+fn unknown(record: &TraceRecord, kind: EventKind, data: &[u8]) -> Option<Event> {
+    let (&service, rest) = data.split_first()?;
+    let mut event = Event::new(Protocol::CanOpen, record, kind, Cow::Borrowed("LSS, unknown service"));
+    event.fields.push(Field::hex("service", service, 2));
+    event.fields.push(Field::bytes("data", rest));
+    Some(event)
+}
+
+const fn request_title(request: LssRequest) -> &'static str {
+    match request {
+        LssRequest::SwitchGlobal(_) => "LSS switch state global",
+        LssRequest::ConfigureNode(_) => "LSS configure node number",
+        LssRequest::ConfigureBitTiming { .. } => "LSS configure bit timing",
+        LssRequest::ActivateBitTiming(_) => "LSS activate bit timing",
+        LssRequest::Store => "LSS store configuration",
+        LssRequest::SwitchSelective(Part::Vendor, _) => "LSS switch state selective: vendor",
+        LssRequest::SwitchSelective(Part::Product, _) => "LSS switch state selective: product",
+        LssRequest::SwitchSelective(Part::Revision, _) => "LSS switch state selective: revision",
+        LssRequest::SwitchSelective(Part::Serial, _) => "LSS switch state selective: serial number",
+        LssRequest::Identify(Bound::Vendor, _) => "LSS identify: vendor",
+        LssRequest::Identify(Bound::Product, _) => "LSS identify: product",
+        LssRequest::Identify(Bound::LowestRevision, _) => "LSS identify: revision, lowest",
+        LssRequest::Identify(Bound::HighestRevision, _) => "LSS identify: revision, highest",
+        LssRequest::Identify(Bound::LowestSerial, _) => "LSS identify: serial number, lowest",
+        LssRequest::Identify(Bound::HighestSerial, _) => "LSS identify: serial number, highest",
+        LssRequest::IdentifyWithoutNumber => "LSS identify slaves without a number",
+        LssRequest::FastScan { .. } => "LSS fast scan",
+        LssRequest::Inquire(part) => inquiry_title(part),
+        LssRequest::InquireNode => "LSS inquire node number",
+    }
+}
+
+const fn response_title(response: LssResponse) -> &'static str {
+    match response {
+        LssResponse::Outcome { service: Service::ConfigureNode, .. } => "LSS configure node number",
+        LssResponse::Outcome { service: Service::ConfigureBitTiming, .. } => "LSS configure bit timing",
+        LssResponse::Outcome { service: Service::Store, .. } => "LSS store configuration",
+        LssResponse::Selected => "LSS switched",
+        LssResponse::Identified => "LSS identified",
+        LssResponse::WithoutNumber => "LSS a slave without a number",
+        LssResponse::Address(part, _) => inquiry_title(part),
+        LssResponse::Node(_) => "LSS inquire node number",
+    }
+}
+
+const fn inquiry_title(part: Part) -> &'static str {
+    match part {
+        Part::Vendor => "LSS inquire vendor",
+        Part::Product => "LSS inquire product",
+        Part::Revision => "LSS inquire revision",
+        Part::Serial => "LSS inquire serial number",
     }
 }

@@ -5,13 +5,14 @@
 //!
 //! Memory: for each node of each channel one SDO transfer of at most 64 KiB for each of its SDO servers, and the mappings of 512 PDOs.
 
+pub mod codec;
 pub mod eds;
 mod encode;
+mod events;
 mod lss;
 mod names;
 mod node;
 mod pdo;
-mod said;
 mod sdo;
 mod sdo_channels;
 mod signs;
@@ -23,7 +24,6 @@ mod types;
 
 pub use encode::{BadValue, encode, type_named};
 pub use names::{abort as abort_text, state as state_name};
-pub use sdo::crc_of;
 pub use types::known as known_type;
 
 use std::sync::Arc;
@@ -32,14 +32,16 @@ use cantap_trace::TraceRecord;
 use rustc_hash::FxHashMap;
 
 use self::eds::Eds;
+use self::events::{event, malformed, nothing};
 use self::node::Bus;
-use self::said::{event, malformed, nothing};
 use self::sdo_channels::{SdoChannel, SdoChannels};
 pub(crate) use self::signs::CanOpenSigns;
 use self::states::{guard, heartbeat, sync};
 use self::transfers::{SdoFrame, transfer_event};
-use crate::{Assembler, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
+use crate::{Assembler, Event, EventKind, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
+const LSS_MASTER: u16 = codec::lss::REQUEST.raw() as u16;
+const LSS_SLAVE: u16 = codec::lss::RESPONSE.raw() as u16;
 const SWEEP_NS: i64 = 50_000_000;
 /// A heartbeat counts as missing after this many of its periods.
 const MISSED_PERIODS: f64 = 2.5;
@@ -112,30 +114,33 @@ impl CanOpen {
                 if let &[command, node] = data
                     && let Some(title) = names::command(command)
                 {
-                    let mut event = event(record, "nmt", title);
+                    let mut event = event(record, EventKind::Nmt, title);
                     event.to = if node == 0 { Party::Everyone } else { Party::Node(node) };
                     event.fields.push(Field::number("command", command));
                     events.push(event);
                 } else {
                     let fault = if data.len() == 2 { "an unknown command" } else { "a command has 2 bytes" };
-                    events.push(malformed(record, "nmt", "network management", fault));
+                    events.push(malformed(record, EventKind::Nmt, "network management", fault));
                 }
             }
             0x80 => sync(bus, record, data, events),
             0x81..=0xFF => {
                 if let &[low, high, register, ref rest @ ..] = data {
                     let code = u16::from_le_bytes([low, high]);
-                    let mut event = event(record, "emergency", "emergency");
+                    let mut event = event(record, EventKind::Emergency, "emergency");
                     event.from = Party::Node(node);
                     event.fields.push(Field::hex("code", code, 4).meaning(Some(names::emergency(code))));
-                    event.fields.push(Field::hex("register", register, 2).meaning(register_text(register)));
+                    event
+                        .fields
+                        .push(Field::hex("register", register, 2).meaning(names::error_register(register)));
                     event.fields.push(Field::bytes("manufacturer", rest));
                     // Of the required length, or else what is there.
                     event.trouble =
                         (rest.len() != 5).then_some(Trouble::Malformed("an emergency has 8 bytes"));
                     events.push(event);
                 } else {
-                    let mut event = malformed(record, "emergency", "emergency", "an emergency has 8 bytes");
+                    let mut event =
+                        malformed(record, EventKind::Emergency, "emergency", "an emergency has 8 bytes");
                     event.from = Party::Node(node);
                     events.push(event);
                 }
@@ -144,15 +149,16 @@ impl CanOpen {
                 if let &[a, b, c, d, low, high] = data {
                     let ms = u32::from_le_bytes([a, b, c, d]) & 0x0FFF_FFFF;
                     let days = u16::from_le_bytes([low, high]);
-                    let mut event = event(record, "time", "time");
+                    let mut event = event(record, EventKind::Time, "time");
                     event.fields.push(Field::number("days_since_1984", days));
                     event.fields.push(Field::real("time_of_day_s", f64::from(ms) / 1000.0, "s"));
                     events.push(event);
                 } else {
-                    events.push(malformed(record, "time", "time", "a time has 6 bytes"));
+                    events.push(malformed(record, EventKind::Time, "time", "a time has 6 bytes"));
                 }
             }
-            0x7E4 | 0x7E5 => events.extend(bus.lss.take(record, id == 0x7E5, data)),
+            LSS_SLAVE => events.extend(bus.lss.response(record, data)),
+            LSS_MASTER => events.extend(bus.lss.request(record, data)),
             _ if node == 0 => {}
             0x581..=0x5FF | 0x601..=0x67F => {
                 let channel = SdoFrame { node, request: None, from_client: id > 0x600, data };
@@ -198,7 +204,7 @@ impl CanOpen {
                             beat_ns + patience,
                             beat_ns,
                             number,
-                            "heartbeat_missing",
+                            EventKind::HeartbeatMissing,
                             "heartbeat missing",
                         );
                         event.fields.push(Field::real("period_ms", period_ns as f64 / 1e6, "ms"));
@@ -216,7 +222,7 @@ impl CanOpen {
                         guard_ns + GUARD_NS,
                         guard_ns,
                         number,
-                        "guard_missing",
+                        EventKind::GuardMissing,
                         "no answer to guarding",
                     );
                     event.trouble = Some(Trouble::Timeout { after_ms: (GUARD_NS / 1_000_000) as u32 });
@@ -230,7 +236,7 @@ impl CanOpen {
                     node.guarded_ns = None;
                     let title = "guarding has stopped for longer than the life time";
                     let mut event =
-                        event(guarded_ns + life_ns, guarded_ns, number, "guarding_stopped", title);
+                        event(guarded_ns + life_ns, guarded_ns, number, EventKind::GuardingStopped, title);
                     event.trouble = Some(Trouble::Timeout { after_ms: (life_ns / 1_000_000) as u32 });
                     event.frames = 0;
                     events.push(event);
@@ -251,21 +257,6 @@ impl CanOpen {
         }
         events[from..].sort_by_key(|event| (event.time_ns, event.channel, event.from.node()));
     }
-}
-
-fn register_text(register: u8) -> Option<String> {
-    const BITS: [&str; 8] = [
-        "generic",
-        "current",
-        "voltage",
-        "temperature",
-        "communication",
-        "device profile",
-        "reserved",
-        "manufacturer",
-    ];
-    let set = BITS.iter().enumerate().filter(|(bit, _)| register >> bit & 1 == 1).map(|(_, name)| *name);
-    Some(set.collect::<Vec<_>>().join(", ")).filter(|text| !text.is_empty())
 }
 
 impl Assembler for CanOpen {

@@ -4,7 +4,7 @@ use rustc_hash::FxHashMap;
 
 use super::eds::Eds;
 use super::{names, sdo, types};
-use crate::{Bytes, Event, Field, Party, Protocol, Trouble};
+use crate::{Bytes, Event, EventKind, Field, Party, Protocol, Trouble};
 use cantap_trace::TraceRecord;
 
 /// How many mapping parameters of a node are kept: 512 PDOs with eight entries each.
@@ -106,7 +106,7 @@ impl Pdos {
         let parameter = if number >= 0x1400 { number } else { parameter(number) };
         let sends = parameter >= 0x1800;
         let title = format!("{}PDO{}", if sends { 'T' } else { 'R' }, (parameter & 0x1FF) + 1);
-        let mut event = Event::new(Protocol::CanOpen, record, "pdo", title);
+        let mut event = Event::new(Protocol::CanOpen, record, EventKind::Pdo, title);
         let mapping = parameter + 0x200;
         if sends {
             event.from = Party::Node(node);

@@ -2,6 +2,10 @@
 //!
 //! Memory: one transfer for each of 127 nodes on each channel, of at most 64 KiB.
 
+use super::codec::sdo::{
+    BlockEnd, BlockSegment, Content, MOST_BLOCK_FRAMES, SEGMENT_BYTES, SdoObject, SdoRequest, SdoResponse,
+    crc_of,
+};
 use crate::{Bytes, Trouble};
 
 /// How long either side may take. CiA 301 gives no time; masters use 0.3 to 2 s.
@@ -115,64 +119,78 @@ impl Sdo {
         bytes.get_mut(..data.len())?.copy_from_slice(data);
         let used = match (self.phase, from_client) {
             (Phase::FromClient, true) | (Phase::FromServer, false) => 8,
-            _ => used(bytes[0], from_client),
+            (_, true) => SdoRequest::used_bytes(bytes[0]),
+            (_, false) => SdoResponse::used_bytes(bytes[0]),
         };
         (!data.is_empty() && data.len() >= used).then_some(bytes)
     }
 
     fn take_whole(&mut self, time_ns: i64, from_client: bool, bytes: [u8; 8]) -> [Option<SdoTransfer>; 2] {
-        let [b0, low, high, sub, ..] = bytes;
+        if from_client {
+            self.take_request(time_ns, bytes)
+        } else {
+            [None, self.take_response(time_ns, bytes)]
+        }
+    }
+
+    fn take_request(&mut self, time_ns: i64, bytes: [u8; 8]) -> [Option<SdoTransfer>; 2] {
+        let request = SdoRequest::decode(bytes);
         let mut behind = None;
-        let initiates = match b0 >> 5 {
-            1 | 2 => true,
-            5 => matches!(b0 & 3, 0),
-            6 => matches!(b0 & 1, 0),
-            _ => false,
-        };
         // If the client starts a new transfer while a block comes from the server, it has abandoned the
         // block.
-        let begins = from_client && self.phase != Phase::FromClient && initiates;
-        if begins {
+        if self.phase != Phase::FromClient && request.is_some_and(|request| request.begins()) {
             behind = self.end(Trouble::Overlapped);
             self.phase = Phase::Command;
             self.is_orphan = false;
         }
-        // The first answer names the object. One that names another is not to this request.
-        let answers_by_name = match b0 >> 5 {
-            2 | 3 => true,
-            5 => matches!(b0 & 3, 0),
-            6 => matches!(b0 & 1, 0),
-            _ => false,
-        };
-        if !from_client
-            && answers_by_name
-            && self.phase == Phase::Command
-            && self.open.is_some()
-            && !self.names(low, high, sub)
-        {
-            return [None, Some(unasked(time_ns, bytes))];
-        }
         if let Some(open) = &mut self.open {
             open.time_ns = time_ns;
             open.frames += 1;
-            if !from_client && open.response_ns.is_none() {
-                open.response_ns = Some(time_ns.saturating_sub(open.start_ns));
-            }
         }
-        let done = match (self.phase, from_client) {
-            (_, _) if b0 == 0x80 && (self.phase == Phase::Command || self.names(low, high, sub)) => {
-                Some(self.abort(time_ns, bytes))
+        let done = match request {
+            Some(SdoRequest::Abort(object, code)) if self.is_abort(object) => {
+                Some(self.abort(time_ns, object, code))
             }
-            (Phase::FromClient, true) | (Phase::FromServer, false) => self.block_segment(bytes),
-            (_, true) => self.client(time_ns, bytes),
-            (_, false) => self.server(time_ns, bytes),
+            _ if self.phase == Phase::FromClient => self.block_segment(BlockSegment::decode(bytes)),
+            Some(request) => self.apply_request(time_ns, request, bytes),
+            None => None,
         };
         [behind, done]
     }
 
-    fn names(&self, low: u8, high: u8, sub: u8) -> bool {
-        let object = (u16::from_le_bytes([low, high]), sub);
-        self.open.as_ref().is_some_and(|open| (open.index, open.sub) == object)
+    fn take_response(&mut self, time_ns: i64, bytes: [u8; 8]) -> Option<SdoTransfer> {
+        let response = SdoResponse::decode(bytes);
+        // The first answer names the object. One that names another is not to this request.
+        if self.phase == Phase::Command
+            && self.open.is_some()
+            && let Some(named) = response.and_then(|response| response.names())
+            && !self.is_of(named)
+        {
+            return Some(unasked(time_ns, bytes));
+        }
+        if let Some(open) = &mut self.open {
+            open.time_ns = time_ns;
+            open.frames += 1;
+            if open.response_ns.is_none() {
+                open.response_ns = Some(time_ns.saturating_sub(open.start_ns));
+            }
+        }
+        match response {
+            Some(SdoResponse::Abort(object, code)) if self.is_abort(object) => {
+                Some(self.abort(time_ns, object, code))
+            }
+            _ if self.phase == Phase::FromServer => self.block_segment(BlockSegment::decode(bytes)),
+            response => self.apply_response(time_ns, response, bytes),
+        }
+    }
+
+    /// Whether a frame that begins like an abort is one: within a block, only if it names the object.
+    fn is_abort(&self, object: SdoObject) -> bool {
+        self.phase == Phase::Command || self.is_of(object)
+    }
+
+    fn is_of(&self, object: SdoObject) -> bool {
+        self.open.as_ref().is_some_and(|open| open.object() == object)
     }
 
     /// Ends the current transfer.
@@ -184,10 +202,9 @@ impl Sdo {
         Some(SdoTransfer { trouble: open.trouble.or(Some(trouble)), ..open })
     }
 
-    fn abort(&mut self, time_ns: i64, bytes: [u8; 8]) -> SdoTransfer {
-        let code = u32::from_le_bytes([bytes[4], bytes[5], bytes[6], bytes[7]]);
+    fn abort(&mut self, time_ns: i64, object: SdoObject, code: u32) -> SdoTransfer {
         self.phase = Phase::Command;
-        let open = self.open.take().unwrap_or_else(|| fresh(time_ns, bytes, false, Mode::Expedited));
+        let open = self.open.take().unwrap_or_else(|| fresh(time_ns, object, false, Mode::Expedited));
         SdoTransfer { abort: Some(code), trouble: Some(Trouble::Aborted(super::names::abort(code))), ..open }
     }
 
@@ -201,139 +218,131 @@ impl Sdo {
         Some(open)
     }
 
-    fn client(&mut self, time_ns: i64, bytes: [u8; 8]) -> Option<SdoTransfer> {
-        let b0 = bytes[0];
-        match b0 >> 5 {
-            1 => {
-                let (expedited, sized) = (b0 & 2 != 0, b0 & 1 != 0);
-                let mode = if expedited { Mode::Expedited } else { Mode::Segmented };
-                let mut transfer = fresh(time_ns, bytes, true, mode);
-                first_bytes(&mut transfer, b0, expedited, sized, bytes);
+    fn apply_request(&mut self, time_ns: i64, request: SdoRequest, bytes: [u8; 8]) -> Option<SdoTransfer> {
+        match request {
+            SdoRequest::Download(object, content) => {
+                let mut transfer = fresh(time_ns, object, true, Mode::of(content));
+                transfer.begin(content);
                 (self.toggle, self.open) = (false, Some(transfer));
                 None
             }
-            0 => {
-                // A segment, which is completed by its confirmation.
+            SdoRequest::DownloadSegment(segment) => {
+                // It is completed by its confirmation.
                 let Some(open) =
                     self.open.as_mut().filter(|open| open.is_write && open.mode == Mode::Segmented)
                 else {
                     return self.orphan(headless(time_ns, &bytes, Trouble::Headless));
                 };
-                if (b0 & 0x10 != 0) != self.toggle {
-                    return self.end(wrong_toggle(self.toggle));
+                if segment.toggle != self.toggle {
+                    return self.end(toggle_error(self.toggle));
                 }
-                let unused = usize::from(b0 >> 1 & 7);
-                append(open, &bytes[1..8 - unused]);
-                self.last_segment = b0 & 1 != 0;
+                append(open, segment.data());
+                self.last_segment = segment.is_last;
                 None
             }
-            2 => {
-                (self.toggle, self.open) = (false, Some(fresh(time_ns, bytes, false, Mode::Expedited)));
+            SdoRequest::Upload(object) => {
+                (self.toggle, self.open) = (false, Some(fresh(time_ns, object, false, Mode::Expedited)));
                 None
             }
-            3 => {
+            SdoRequest::UploadSegment { toggle } => {
                 self.open.as_ref()?;
-                if (b0 & 0x10 != 0) != self.toggle {
-                    return self.end(wrong_toggle(self.toggle));
-                }
+                if toggle == self.toggle { None } else { self.end(toggle_error(self.toggle)) }
+            }
+            SdoRequest::BlockUpload { object, crc, .. } => {
+                self.open = Some(fresh(time_ns, object, false, Mode::Block));
+                self.crc = [crc, false];
                 None
             }
-            5 => match b0 & 3 {
-                0 => {
-                    self.open = Some(fresh(time_ns, bytes, false, Mode::Block));
-                    self.crc = [b0 & 4 != 0, false];
-                    None
-                }
-                1 => self.done(),
-                2 => {
-                    self.confirm_block(bytes[1]);
-                    if !self.last_segment {
-                        self.phase = Phase::FromServer;
-                    }
-                    None
-                }
-                _ => {
-                    self.begin_block();
+            SdoRequest::BlockUploadEnd => self.done(),
+            SdoRequest::BlockUploadAcknowledge { taken, .. } => {
+                self.confirm_block(taken);
+                if !self.last_segment {
                     self.phase = Phase::FromServer;
-                    None
                 }
-            },
-            6 if b0 & 1 == 0 => {
-                let mut transfer = fresh(time_ns, bytes, true, Mode::Block);
-                transfer.size =
-                    (b0 & 2 != 0).then(|| u32::from_le_bytes([bytes[4], bytes[5], bytes[6], bytes[7]]));
-                (self.open, self.crc) = (Some(transfer), [b0 & 4 != 0, false]);
                 None
             }
-            6 => {
-                self.end_block(b0, bytes);
+            SdoRequest::BlockUploadStart => {
+                self.begin_block();
+                self.phase = Phase::FromServer;
                 None
             }
-            _ => None,
+            SdoRequest::BlockDownload { object, crc, size } => {
+                let transfer = SdoTransfer { size, ..fresh(time_ns, object, true, Mode::Block) };
+                (self.open, self.crc) = (Some(transfer), [crc, false]);
+                None
+            }
+            SdoRequest::BlockDownloadEnd(end) => {
+                self.end_block(end);
+                None
+            }
+            // Not of this transfer.
+            SdoRequest::Abort(..) => None,
         }
     }
 
-    fn server(&mut self, time_ns: i64, bytes: [u8; 8]) -> Option<SdoTransfer> {
-        let b0 = bytes[0];
+    fn apply_response(
+        &mut self,
+        time_ns: i64,
+        response: Option<SdoResponse>,
+        bytes: [u8; 8],
+    ) -> Option<SdoTransfer> {
         let Some(open) = &mut self.open else {
             // An answer to an unobserved request.
             let transfer = unasked(time_ns, bytes);
             // Segments and their confirmations do not name an object.
-            return if matches!(b0 >> 5, 0 | 1) { self.orphan(transfer) } else { Some(transfer) };
+            let is_segment =
+                matches!(response, Some(SdoResponse::UploadSegment(_) | SdoResponse::DownloadSegment { .. }));
+            return if is_segment { self.orphan(transfer) } else { Some(transfer) };
         };
-        match b0 >> 5 {
-            3 => (open.mode == Mode::Expedited).then(|| self.done()).flatten(),
-            2 => {
-                let (expedited, sized) = (b0 & 2 != 0, b0 & 1 != 0);
-                open.mode = if expedited { Mode::Expedited } else { Mode::Segmented };
+        match response? {
+            SdoResponse::Download(_) => (open.mode == Mode::Expedited).then(|| self.done()).flatten(),
+            SdoResponse::Upload(_, content) => {
                 // Also in answer to a request for blocks, which a server need not support.
+                open.mode = Mode::of(content);
+                open.begin(content);
                 self.toggle = false;
-                first_bytes(open, b0, expedited, sized, bytes);
-                if expedited { self.done() } else { None }
+                if open.mode == Mode::Expedited { self.done() } else { None }
             }
-            1 => {
-                if (b0 & 0x10 != 0) != self.toggle {
-                    return self.end(wrong_toggle(self.toggle));
+            SdoResponse::DownloadSegment { toggle } => {
+                if toggle != self.toggle {
+                    return self.end(toggle_error(self.toggle));
                 }
                 self.toggle = !self.toggle;
                 if std::mem::take(&mut self.last_segment) { self.done() } else { None }
             }
-            0 => {
-                if (b0 & 0x10 != 0) != self.toggle {
-                    return self.end(wrong_toggle(self.toggle));
+            SdoResponse::UploadSegment(segment) => {
+                if segment.toggle != self.toggle {
+                    return self.end(toggle_error(self.toggle));
                 }
                 self.toggle = !self.toggle;
-                let unused = usize::from(b0 >> 1 & 7);
-                append(open, &bytes[1..8 - unused]);
-                if b0 & 1 != 0 { self.done() } else { None }
+                append(open, segment.data());
+                if segment.is_last { self.done() } else { None }
             }
-            5 => match b0 & 3 {
-                0 => {
-                    self.crc[1] = b0 & 4 != 0;
-                    self.begin_block();
+            SdoResponse::BlockDownload { crc, .. } => {
+                self.crc[1] = crc;
+                self.begin_block();
+                self.phase = Phase::FromClient;
+                None
+            }
+            SdoResponse::BlockDownloadAcknowledge { taken, .. } => {
+                self.confirm_block(taken);
+                if !self.last_segment {
                     self.phase = Phase::FromClient;
-                    None
                 }
-                2 => {
-                    self.confirm_block(bytes[1]);
-                    if !self.last_segment {
-                        self.phase = Phase::FromClient;
-                    }
-                    None
-                }
-                _ => self.done(),
-            },
-            6 if b0 & 1 == 0 => {
-                open.size =
-                    (b0 & 2 != 0).then(|| u32::from_le_bytes([bytes[4], bytes[5], bytes[6], bytes[7]]));
-                self.crc[1] = b0 & 4 != 0;
                 None
             }
-            6 => {
-                self.end_block(b0, bytes);
+            SdoResponse::BlockDownloadEnd => self.done(),
+            SdoResponse::BlockUpload { crc, size, .. } => {
+                open.size = size;
+                self.crc[1] = crc;
                 None
             }
-            _ => None,
+            SdoResponse::BlockUploadEnd(end) => {
+                self.end_block(end);
+                None
+            }
+            // Not of this transfer.
+            SdoResponse::Abort(..) => None,
         }
     }
 
@@ -347,18 +356,17 @@ impl Sdo {
         (self.block_next, self.last_segment) = (1, false);
     }
 
-    fn block_segment(&mut self, bytes: [u8; 8]) -> Option<SdoTransfer> {
-        let number = bytes[0] & 0x7F;
+    fn block_segment(&mut self, segment: BlockSegment) -> Option<SdoTransfer> {
         let open = self.open.as_mut()?;
         // The receiver also rejects frames that are out of order, and requests them again.
-        if number == self.block_next {
+        if segment.number == self.block_next {
             self.block_next += 1;
-            append(open, &bytes[1..]);
-            self.last_segment = bytes[0] & 0x80 != 0;
-        } else if bytes[0] & 0x80 != 0 {
+            append(open, &segment.bytes);
+            self.last_segment = segment.is_last;
+        } else if segment.is_last {
             self.last_segment = true;
         }
-        if bytes[0] & 0x80 != 0 || number == 127 {
+        if segment.is_last || segment.number == MOST_BLOCK_FRAMES {
             self.phase = Phase::Command;
         }
         None
@@ -373,7 +381,7 @@ impl Sdo {
                 open.trouble
                     .get_or_insert(Trouble::Sequence { expected: self.block_next.into(), got: taken.into() });
             } else if taken < ours {
-                open.data.truncate(self.block_start + usize::from(taken) * 7);
+                open.data.truncate(self.block_start + usize::from(taken) * SEGMENT_BYTES);
                 self.last_segment = false;
             }
         }
@@ -382,17 +390,41 @@ impl Sdo {
         self.last_segment = last;
     }
 
-    fn end_block(&mut self, b0: u8, bytes: [u8; 8]) {
+    fn end_block(&mut self, end: BlockEnd) {
         let Some(open) = &mut self.open else { return };
-        let unused = usize::from(b0 >> 2 & 7);
-        open.data.truncate(open.data.len().saturating_sub(unused));
-        let crc = u16::from_le_bytes([bytes[1], bytes[2]]);
+        open.data.truncate(open.data.len().saturating_sub(end.unused.into()));
         if self.crc == [true; 2]
             && open.trouble.is_none()
             && open.data.len() < MOST_BYTES
-            && crc_of(&open.data) != crc
+            && crc_of(&open.data) != end.crc
         {
             open.trouble = Some(Trouble::Malformed("the CRC is wrong"));
+        }
+    }
+}
+
+impl Mode {
+    const fn of(content: Content) -> Self {
+        match content {
+            Content::Expedited { .. } => Self::Expedited,
+            Content::Segmented(_) => Self::Segmented,
+        }
+    }
+}
+
+impl SdoTransfer {
+    const fn object(&self) -> SdoObject {
+        SdoObject { index: self.index, sub: self.sub }
+    }
+
+    /// Takes what the frame that begins it says of the bytes.
+    fn begin(&mut self, content: Content) {
+        match content {
+            Content::Expedited { bytes, length } => {
+                self.data = Bytes::from_slice(&bytes[..usize::from(length.unwrap_or(4))]);
+            }
+            Content::Segmented(Some(size)) => self.size = Some(size),
+            Content::Segmented(None) => {}
         }
     }
 }
@@ -401,21 +433,22 @@ fn headless(time_ns: i64, data: &[u8], trouble: Trouble) -> SdoTransfer {
     SdoTransfer {
         data: Bytes::from_slice(data),
         trouble: Some(trouble),
-        ..fresh(time_ns, [0; 8], false, Mode::Expedited)
+        ..fresh(time_ns, SdoObject::default(), false, Mode::Expedited)
     }
 }
 
 /// A server's answer to a request that was not observed.
 fn unasked(time_ns: i64, bytes: [u8; 8]) -> SdoTransfer {
-    let b0 = bytes[0];
-    let mut transfer = fresh(time_ns, bytes, b0 >> 5 == 3, Mode::Expedited);
-    if b0 >> 5 == 2 && b0 & 2 != 0 {
-        first_bytes(&mut transfer, b0, true, b0 & 1 != 0, bytes);
+    let response = SdoResponse::decode(bytes);
+    let is_write = matches!(response, Some(SdoResponse::Download(_)));
+    let mut transfer = fresh(time_ns, SdoObject::decode(bytes), is_write, Mode::Expedited);
+    if let Some(SdoResponse::Upload(_, content @ Content::Expedited { .. })) = response {
+        transfer.begin(content);
     }
     SdoTransfer { trouble: Some(Trouble::Headless), ..transfer }
 }
 
-fn wrong_toggle(expected: bool) -> Trouble {
+fn toggle_error(expected: bool) -> Trouble {
     Trouble::Sequence { expected: expected.into(), got: (!expected).into() }
 }
 
@@ -427,40 +460,12 @@ fn append(open: &mut SdoTransfer, bytes: &[u8]) {
     open.data.extend_from_slice(&bytes[..bytes.len().min(room)]);
 }
 
-/// How many bytes of a command's frame count.
-fn used(b0: u8, from_client: bool) -> usize {
-    match (b0 >> 5, from_client) {
-        // A segment.
-        (0, _) => 8 - usize::from(b0 >> 1 & 7),
-        // The begin of a transfer, with its bytes or how many they are.
-        (1, true) | (2, false) => match b0 & 3 {
-            0 => 4,
-            3 => 8 - usize::from(b0 >> 2 & 3),
-            _ => 8,
-        },
-        // A request for a segment, or the confirmation of one.
-        (1, false) | (3, true) => 1,
-        (2, true) | (3, false) => 4,
-        _ => 8,
-    }
-}
-
-/// The data in the frame that begins a transfer.
-fn first_bytes(transfer: &mut SdoTransfer, b0: u8, expedited: bool, sized: bool, bytes: [u8; 8]) {
-    if expedited {
-        let unused = if sized { usize::from(b0 >> 2 & 3) } else { 0 };
-        transfer.data = Bytes::from_slice(&bytes[4..8 - unused]);
-    } else if sized {
-        transfer.size = Some(u32::from_le_bytes([bytes[4], bytes[5], bytes[6], bytes[7]]));
-    }
-}
-
-fn fresh(time_ns: i64, bytes: [u8; 8], is_write: bool, mode: Mode) -> SdoTransfer {
+fn fresh(time_ns: i64, object: SdoObject, is_write: bool, mode: Mode) -> SdoTransfer {
     SdoTransfer {
         start_ns: time_ns,
         time_ns,
-        index: u16::from_le_bytes([bytes[1], bytes[2]]),
-        sub: bytes[3],
+        index: object.index,
+        sub: object.sub,
         is_write,
         mode,
         data: Bytes::new(),
@@ -470,27 +475,5 @@ fn fresh(time_ns: i64, bytes: [u8; 8], is_write: bool, mode: Mode) -> SdoTransfe
         abort: None,
         trouble: None,
         frames_lost: false,
-    }
-}
-
-/// CRC-16 with the polynomial 1021, from 0 (CiA 301, 7.2.4.3.16).
-pub fn crc_of(bytes: &[u8]) -> u16 {
-    bytes.iter().fold(0, |crc, byte| {
-        (0..8).fold(
-            crc ^ u16::from(*byte) << 8,
-            |crc, _| {
-                if crc & 0x8000 == 0 { crc << 1 } else { crc << 1 ^ 0x1021 }
-            },
-        )
-    })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_crc_is_the_standards() {
-        assert_eq!(crc_of(b"123456789"), 0x31C3);
     }
 }

@@ -1,14 +1,14 @@
 use super::*;
 use crate::testing::{self, at, hex, lost};
 
-fn said(frames: &[(f64, &str)]) -> Vec<String> {
-    testing::said(CanOpen::default(), frames)
+fn event_lines(frames: &[(f64, &str)]) -> Vec<String> {
+    testing::event_lines(CanOpen::default(), frames)
 }
 
 #[test]
 fn what_the_network_is_told_and_what_nodes_are() {
     assert_eq!(
-        said(&[
+        event_lines(&[
             (0.0, "705#00"),
             (1.0, "000#0105"),
             (2.0, "705#05"),
@@ -42,7 +42,7 @@ fn a_heartbeat_that_stops_and_comes_back_is_said() {
         (800.0, "705#05"),
     ];
     assert_eq!(
-        said(&beats),
+        event_lines(&beats),
         [
             "canopen 5 operational",
             "canopen 5 heartbeat missing: period_ms 100 ms; nothing came for 250 ms",
@@ -57,7 +57,7 @@ fn a_heartbeat_that_stops_and_comes_back_is_said() {
     // Configured by SDO, it is known before the second heartbeat.
     let set =
         [(0.0, "605#2B17100032000000"), (1.0, "585#6017100000000000"), (2.0, "705#05"), (500.0, "200#")];
-    assert_eq!(said(&set)[2], "canopen 5 heartbeat missing: period_ms 50 ms; nothing came for 125 ms");
+    assert_eq!(event_lines(&set)[2], "canopen 5 heartbeat missing: period_ms 50 ms; nothing came for 125 ms");
     // If frames were lost, heartbeats may be among them.
     let records =
         [at(0.0, "705#05"), at(100.0, "705#05"), lost(150.0), at(900.0, "705#05"), at(1000.0, "705#05")];
@@ -78,7 +78,7 @@ fn guarding_is_followed() {
         (900.0, "200#"),
     ];
     assert_eq!(
-        said(&guard),
+        event_lines(&guard),
         [
             "canopen 5 operational: after 1 ms",
             "canopen 5 operational; frame 1 came instead of 0",
@@ -125,14 +125,14 @@ fn sdo_transfers_of_every_kind_are_one_event() {
             "canopen ? > 5 SDO read 1018:01: index 0x1018 (identity object), sub 0x01, transport \"expedited\"; nothing came for 2000 ms",
         ),
     ] {
-        assert_eq!(said(frames), [expected], "{frames:?}");
+        assert_eq!(event_lines(frames), [expected], "{frames:?}");
     }
 }
 
 /// The toggle bit reveals a segment that is missing or comes twice.
 #[test]
 fn a_missing_segment_is_said() {
-    let said = said(&[
+    let said = event_lines(&[
         (0.0, "605#4008100000000000"),
         (1.0, "585#410810000A000000"),
         (2.0, "605#6000000000000000"),
@@ -182,7 +182,7 @@ fn pdos_carry_what_was_written_or_what_the_sheet_says() {
         (8.0, "190#3702785634120000"),
     ];
     assert_eq!(
-        said(&learned).last().unwrap(),
+        event_lines(&learned).last().unwrap(),
         "canopen 5 TPDO1: 6041:00 0x0237, 6064:00 0x12345678, rest 00 00"
     );
     let sheet = "[DeviceInfo]\n[1A00]\nObjectType=9\n[1A00sub0]\nDefaultValue=2\n[1A00sub1]\nDefaultValue=0x60410010\n\
@@ -191,7 +191,7 @@ fn pdos_carry_what_was_written_or_what_the_sheet_says() {
     assert_eq!(eds.issues, [] as [String; 0]);
     let with = CanOpen::new(vec![Sheet { node: None, eds }]);
     assert_eq!(
-        testing::said(with, &[(0.0, "185#3702FFFFFFFF")]),
+        testing::event_lines(with, &[(0.0, "185#3702FFFFFFFF")]),
         ["canopen 5 TPDO1: Statusword 567, Position -1"]
     );
 }
@@ -199,7 +199,11 @@ fn pdos_carry_what_was_written_or_what_the_sheet_says() {
 #[test]
 fn layer_settings_and_sync_counters() {
     assert_eq!(
-        said(&[(0.0, "7E5#0401000000000000"), (1.0, "7E5#1107000000000000"), (2.0, "7E4#1100000000000000")]),
+        event_lines(&[
+            (0.0, "7E5#0401000000000000"),
+            (1.0, "7E5#1107000000000000"),
+            (2.0, "7E4#1100000000000000")
+        ]),
         [
             "canopen ? LSS switch state global: mode 1 (configuration)",
             "canopen ? LSS configure node number: node 7",
@@ -208,7 +212,7 @@ fn layer_settings_and_sync_counters() {
         .map(str::to_owned)
     );
     assert_eq!(
-        said(&[(0.0, "080#01"), (1.0, "080#02"), (2.0, "080#04"), (3.0, "080#01")]),
+        event_lines(&[(0.0, "080#01"), (1.0, "080#02"), (2.0, "080#04"), (3.0, "080#01")]),
         ["canopen ? SYNC: counter 1", "canopen ? SYNC: counter 4; frame 4 came instead of 3"]
             .map(str::to_owned)
     );
@@ -237,7 +241,7 @@ fn any_frames_are_taken() {
 /// Nodes wait as long as they were configured to; a node whose life time has passed is no longer guarded.
 #[test]
 fn timeouts_are_those_that_were_set() {
-    let told = said(&[
+    let told = event_lines(&[
         (0.0, "601#23161001C8000500"),
         (1.0, "581#6016100100000000"),
         (10.0, "705#05"),
@@ -246,7 +250,7 @@ fn timeouts_are_those_that_were_set() {
     ]);
     let missing = told.iter().find(|line| line.contains("heartbeat missing")).unwrap();
     assert!(missing.ends_with("nothing came for 200 ms"), "{told:?}");
-    let guarded = said(&[
+    let guarded = event_lines(&[
         (0.0, "605#2B0C100064000000"),
         (1.0, "585#600C100000000000"),
         (2.0, "605#2F0D100003000000"),
@@ -272,25 +276,25 @@ fn a_sheet_says_which_identifiers_pdos_have() {
         [1A00sub2]\nDataType=7\nDefaultValue=0x2001000D\n[1804]\nParameterName=T5\nObjectType=9\n[1804sub1]\nDataType=7\n\
         DefaultValue=0x80000000\n[1805]\nParameterName=T6\nObjectType=9\n[1805sub1]\nDataType=7\nDefaultValue=0x6A5\n\
         [2000]\nParameterName=Mode\nDataType=5\n[2001]\nParameterName=Speed\nDataType=6\n";
-    let said = |node: Option<u8>, frames: &[(f64, &str)]| {
+    let event_lines = |node: Option<u8>, frames: &[(f64, &str)]| {
         let sheet = Sheet { node, eds: Eds::parse(SHEET.as_bytes()).into() };
-        testing::said(CanOpen::new(vec![sheet]), frames)
+        testing::event_lines(CanOpen::new(vec![sheet]), frames)
     };
     // Three and thirteen bits: 5, and 0x123.
     for node in [Some(5), None] {
-        assert_eq!(said(node, &[(0.0, "1A5#1D09")]), ["canopen 5 TPDO1: Mode 5, Speed 291"]);
+        assert_eq!(event_lines(node, &[(0.0, "1A5#1D09")]), ["canopen 5 TPDO1: Mode 5, Speed 291"]);
         assert_eq!(
-            said(node, &[(0.0, "1A5#1D")]),
+            event_lines(node, &[(0.0, "1A5#1D")]),
             ["canopen 5 TPDO1: Mode 5, rest 03; malformed: shorter than what is mapped to it"]
         );
     }
-    assert_eq!(said(Some(5), &[(0.0, "6A5#01")]), ["canopen 5 TPDO6: data 01"]);
-    assert_eq!(said(None, &[(0.0, "6A5#01")]), [""; 0]);
+    assert_eq!(event_lines(Some(5), &[(0.0, "6A5#01")]), ["canopen 5 TPDO6: data 01"]);
+    assert_eq!(event_lines(None, &[(0.0, "6A5#01")]), [""; 0]);
 }
 
 #[test]
 fn what_is_not_as_the_protocol_has_it_is_said() {
-    let all = said(&[
+    let all = event_lines(&[
         (0.0, "000#01"),
         (1.0, "000#7705"),
         (2.0, "085#00"),
@@ -314,7 +318,7 @@ fn what_is_not_as_the_protocol_has_it_is_said() {
 #[test]
 fn a_transfer_that_another_one_leaves_behind_is_said() {
     // A block is being read when the client requests something else.
-    let all = said(&[
+    let all = event_lines(&[
         (0.0, "605#A408100014000000"),
         (1.0, "585#C608100014000000"),
         (2.0, "605#A300000000000000"),
@@ -329,7 +333,7 @@ fn a_transfer_that_another_one_leaves_behind_is_said() {
     );
     assert!(all[1].contains("value 0x00000191"), "{all:?}");
     // Segments without a beginning are reported once.
-    let orphans = said(&[
+    let orphans = event_lines(&[
         (0.0, "605#0041414141414141"),
         (1.0, "585#2000000000000000"),
         (2.0, "605#1041414141414141"),
@@ -337,7 +341,7 @@ fn a_transfer_that_another_one_leaves_behind_is_said() {
     ]);
     assert_eq!(orphans.len(), 1, "{orphans:?}");
     // A server that does not support blocks answers differently.
-    let without = said(&[
+    let without = event_lines(&[
         (0.0, "605#A408100014000000"),
         (1.0, "585#4108100009000000"),
         (2.0, "605#6000000000000000"),
@@ -372,7 +376,7 @@ fn sdo_servers_beyond_the_first_are_followed() {
         (18.0, "645#4000300000000000"),
         (5000.0, "123#"),
     ];
-    let lines = said(&[&set[..], &talk].concat());
+    let lines = event_lines(&[&set[..], &talk].concat());
     let on_second: Vec<_> = lines.iter().filter(|line| line.contains("cob_id 0x645")).collect();
     assert_eq!(on_second.len(), 3, "{lines:?}");
     assert!(on_second[0].contains("transport \"segmented\", value \"A second!\""), "{lines:?}");
@@ -388,7 +392,7 @@ fn sdo_servers_beyond_the_first_are_followed() {
     let eds = Arc::new(Eds::parse(sheet.as_bytes()));
     for node in [None, Some(5)] {
         let canopen = CanOpen::new(vec![Sheet { node, eds: eds.clone() }]);
-        let lines = testing::said(canopen, &talk);
+        let lines = testing::event_lines(canopen, &talk);
         assert_eq!(
             lines
                 .iter()
@@ -403,7 +407,7 @@ fn sdo_servers_beyond_the_first_are_followed() {
 /// Nothing that was said about one object is shown as the value of another.
 #[test]
 fn an_answer_about_another_object_is_not_the_answer() {
-    let said = said(&[
+    let said = event_lines(&[
         (0.0, "605#4000100000000000"),
         (1.0, "585#4308100001020304"),
         (2.0, "585#4300100092010200"),
@@ -444,10 +448,10 @@ fn an_sdo_frame_without_its_unused_bytes_is_read_and_reported() {
              value \"AB\", after 1 ms; malformed: an SDO frame has 8 bytes",
         ),
     ] {
-        assert_eq!(said(frames), [expected]);
+        assert_eq!(event_lines(frames), [expected]);
     }
     // What lacks used bytes is not read.
-    let said = said(&[(0.0, "602#4000140200000000"), (1.0, "582#43001402FE")]);
+    let said = event_lines(&[(0.0, "602#4000140200000000"), (1.0, "582#43001402FE")]);
     assert!(said[0].contains("malformed: an SDO frame has 8 bytes"), "{said:?}");
     assert!(said[1].contains("SDO read 1400:02") && said[1].contains("the trace ends here"), "{said:?}");
 }
@@ -460,14 +464,17 @@ fn a_signed_integer_of_a_few_bits_keeps_its_sign() {
         [1A00sub5]\nDefaultValue=0x20050001\n[1A00sub6]\nDefaultValue=0x20060001\n[2001]\nParameterName=A\nDataType=3\n\
         [2002]\nParameterName=B\nDataType=5\n[2003]\nParameterName=C\nDataType=2\n[2004]\nParameterName=D\nDataType=4\n\
         [2005]\nParameterName=E\nDataType=1\n[2006]\nParameterName=F\nDataType=1\n";
-    let said = |frame| {
+    let event_lines = |frame| {
         let sheet = Sheet { node: Some(1), eds: Eds::parse(SHEET.as_bytes()).into() };
-        testing::said(CanOpen::new(vec![sheet]), &[(0.0, frame)])
+        testing::event_lines(CanOpen::new(vec![sheet]), &[(0.0, frame)])
     };
-    assert_eq!(said("181#FDFFEF0403020102"), ["canopen 1 TPDO1: A -3, B 15, C -2, D 16909060, E 0, F 1"]);
+    assert_eq!(
+        event_lines("181#FDFFEF0403020102"),
+        ["canopen 1 TPDO1: A -3, B 15, C -2, D 16909060, E 0, F 1"]
+    );
     // What is left is shown unless it only fills up the last byte.
     assert_eq!(
-        said("181#FDFF7F0403020106"),
+        event_lines("181#FDFF7F0403020106"),
         ["canopen 1 TPDO1: A -3, B 15, C 7, D 16909060, E 0, F 1, rest 01"]
     );
 }

@@ -5,11 +5,11 @@ use std::borrow::Cow;
 use cantap_trace::TraceRecord;
 
 use super::eds::Eds;
+use super::events::event;
 use super::node::{Bus, number_of};
-use super::said::event;
 use super::sdo::SdoTransfer;
 use super::{names, types};
-use crate::{Event, Field, Party};
+use crate::{Event, EventKind, Field, Party};
 
 /// A frame of an SDO channel.
 pub struct SdoFrame<'a> {
@@ -69,7 +69,8 @@ pub fn transfer_event(
     transfer: SdoTransfer,
     sheet: Option<&Eds>,
 ) -> Event {
-    let (verb, kind) = if transfer.is_write { ("write", "sdo_write") } else { ("read", "sdo_read") };
+    let (verb, kind) =
+        if transfer.is_write { ("write", EventKind::SdoWrite) } else { ("read", EventKind::SdoRead) };
     let mut event = event(record, kind, format!("SDO {verb} {:04X}:{:02X}", transfer.index, transfer.sub));
     (event.time_ns, event.start_ns) = (transfer.time_ns, transfer.start_ns);
     event.to = Party::Node(node);

@@ -19,7 +19,7 @@ pub(crate) use self::signs::DeviceNetSigns;
 use cantap_trace::TraceRecord;
 use rustc_hash::FxHashMap;
 
-use crate::{Assembler, Bytes, Event, Field, Party, Protocol, Trouble, is_gap};
+use crate::{Assembler, Bytes, Event, EventKind, Field, Party, Protocol, Trouble, is_gap};
 
 /// How long a response may take; the default of a connection's expected packet rate is 2.5 s.
 const RESPONSE_NS: i64 = 2_500_000_000;
@@ -65,7 +65,7 @@ impl DeviceNet {
     fn frame(&mut self, record: &TraceRecord, id: u16, data: &[u8], events: &mut Vec<Event>) {
         match use_of(id) {
             Some(Use::Io(node, title, from_slave)) => {
-                let mut event = event(record, "io", title);
+                let mut event = event(record, EventKind::Io, title);
                 if from_slave {
                     event.from = Party::Node(node);
                 } else if title == "bit-strobe command" {
@@ -95,7 +95,7 @@ impl DeviceNet {
                 );
             }
             Some(Use::DuplicateCheck(node)) => {
-                let mut event = event(record, "duplicate_check", "duplicate MAC ID check");
+                let mut event = event(record, EventKind::DuplicateCheck, "duplicate MAC ID check");
                 event.from = Party::Node(node);
                 if let &[port, v0, v1, s0, s1, s2, s3] = data {
                     event.fields.push(Field::number("physical_port", port & 0x7F));
@@ -103,7 +103,7 @@ impl DeviceNet {
                     event.fields.push(Field::hex("serial_number", u32::from_le_bytes([s0, s1, s2, s3]), 8));
                     if port & 0x80 != 0 {
                         event.title = "the MAC ID is in use".into();
-                        event.kind = "duplicate";
+                        event.kind = EventKind::Duplicate;
                     }
                 } else {
                     event.trouble = Some(Trouble::Malformed("a duplicate MAC ID check has 7 bytes"));
@@ -117,7 +117,7 @@ impl DeviceNet {
                     "offline ownership response",
                     "offline ownership request",
                 ];
-                let mut event = event(record, "offline", title[usize::from(message & 3)]);
+                let mut event = event(record, EventKind::Offline, title[usize::from(message & 3)]);
                 event.fields.push(Field::bytes("data", data));
                 events.push(event);
             }
@@ -136,7 +136,7 @@ impl DeviceNet {
         events: &mut Vec<Event>,
     ) {
         let &[header, second, ref rest @ ..] = data else {
-            let mut event = event(record, "broken", "explicit message");
+            let mut event = event(record, EventKind::Broken, "explicit message");
             event.trouble = Some(Trouble::Malformed("an explicit message has at least 2 bytes"));
             events.push(event);
             return;
@@ -217,7 +217,7 @@ impl DeviceNet {
         events: &mut Vec<Event>,
     ) {
         let Some((message, trouble)) = broken else { return };
-        let mut event = event(record, "broken", "explicit message");
+        let mut event = event(record, EventKind::Broken, "explicit message");
         (event.start_ns, event.time_ns) = (message.start_ns, message.time_ns);
         (event.from, event.to) = parties(server, message.other, answers);
         event.fields.push(Field::bytes("received", &message.body));
@@ -250,9 +250,9 @@ impl DeviceNet {
             .take_if(|asked| code == 0x14 || asked.body.first().is_some_and(|asked| asked & 0x7F == code));
         let request = asked.as_ref().map(|asked| &asked.body[..]);
         let kind = match (code, &asked) {
-            (0x14, _) => "refusal",
-            (_, Some(_)) => "exchange",
-            _ => "response",
+            (0x14, _) => EventKind::Refusal,
+            (_, Some(_)) => EventKind::Exchange,
+            _ => EventKind::Response,
         };
         let mut event = service_event(record, kind, request.unwrap_or(&message.body), request.is_some());
         (event.from, event.to) = parties(server, message.other, asked.is_none());
@@ -297,12 +297,12 @@ fn parties(server: u8, client: u8, from_server: bool) -> (Party, Party) {
     if from_server { (server, client) } else { (client, server) }
 }
 
-fn event(record: &TraceRecord, kind: &'static str, title: &'static str) -> Event {
+fn event(record: &TraceRecord, kind: EventKind, title: &'static str) -> Event {
     Event::new(Protocol::DeviceNet, record, kind, title)
 }
 
 /// A service; a request names its object by 8-bit class and instance, as slaves of the predefined set use.
-fn service_event(record: &TraceRecord, kind: &'static str, body: &[u8], is_request: bool) -> Event {
+fn service_event(record: &TraceRecord, kind: EventKind, body: &[u8], is_request: bool) -> Event {
     let service = body.first().copied().unwrap_or_default() & 0x7F;
     let class = if is_request { body.get(1).map(|class| u16::from(*class)) } else { None };
     let title =
@@ -351,7 +351,7 @@ fn allocation(choice: u8) -> String {
 
 fn unanswered(channel: u8, server: u8, asked: Message, trouble: Trouble) -> Event {
     let record = TraceRecord { time_ns: asked.time_ns, channel, event: cantap_trace::TraceEvent::GAP };
-    let mut event = service_event(&record, "no_response", &asked.body, true);
+    let mut event = service_event(&record, EventKind::NoResponse, &asked.body, true);
     (event.from, event.to) = parties(server, asked.other, false);
     event.start_ns = asked.start_ns;
     event.frames = asked.frames;
@@ -395,7 +395,7 @@ impl Assembler for DeviceNet {
                         channel,
                         event: cantap_trace::TraceEvent::GAP,
                     };
-                    let mut event = event(&record, "broken", "explicit message");
+                    let mut event = event(&record, EventKind::Broken, "explicit message");
                     (event.from, event.to) = parties(server, message.other, place == 1);
                     (event.start_ns, event.frames) = (message.start_ns, message.frames);
                     event.fields.push(Field::bytes("received", &message.body));

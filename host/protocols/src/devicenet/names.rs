@@ -1,105 +1,44 @@
-//! Names for DeviceNet's and CIP's numbers, as far as they are public.
+//! Names for DeviceNet's and CIP's numbers, as far as they are public. The tables are in `data/devicenet.csv`.
+
+use crate::table::Table;
+
+const FILE: &str = include_str!("../../data/devicenet.csv");
+/// The class of the DeviceNet object.
+const DEVICENET: u16 = 3;
+
+static SERVICES: Table = Table::new(FILE, "service");
+static SERVICES_OF_DEVICENET: Table = Table::new(FILE, "service_of_devicenet");
+static SERVICES_WITHOUT_CLASS: Table = Table::new(FILE, "service_without_class");
+static CLASSES: Table = Table::new(FILE, "class");
+static ERRORS: Table = Table::new(FILE, "error");
 
 /// Services; from 4B on they depend on the class.
-pub const fn service(service: u8, class: Option<u16>) -> Option<&'static str> {
-    Some(match (service, class) {
-        (0x01, _) => "Get_Attributes_All",
-        (0x02, _) => "Set_Attributes_All",
-        (0x03, _) => "Get_Attribute_List",
-        (0x04, _) => "Set_Attribute_List",
-        (0x05, _) => "Reset",
-        (0x06, _) => "Start",
-        (0x07, _) => "Stop",
-        (0x08, _) => "Create",
-        (0x09, _) => "Delete",
-        (0x0A, _) => "Multiple_Service_Packet",
-        (0x0D, _) => "Apply_Attributes",
-        (0x0E, _) => "Get_Attribute_Single",
-        (0x10, _) => "Set_Attribute_Single",
-        (0x11, _) => "Find_Next_Object_Instance",
-        (0x14, _) => "Error_Response",
-        (0x15, _) => "Restore",
-        (0x16, _) => "Save",
-        (0x17, _) => "No_Operation",
-        (0x18, _) => "Get_Member",
-        (0x19, _) => "Set_Member",
-        (0x1A, _) => "Insert_Member",
-        (0x1B, _) => "Remove_Member",
-        (0x4B, Some(3)) => "Allocate_Master/Slave_Connection_Set",
-        (0x4C, Some(3)) => "Release_Master/Slave_Connection_Set",
-        (0x4B, None) => "Open_Explicit_Messaging_Connection",
-        (0x4C, None) => "Close_Connection",
-        (0x4D, None) => "Device_Heartbeat",
-        (0x4E, None) => "Device_Shutdown",
-        _ => return None,
+pub fn service(service: u8, class: Option<u16>) -> Option<&'static str> {
+    SERVICES.get(service).or_else(|| match class {
+        Some(DEVICENET) => SERVICES_OF_DEVICENET.get(service),
+        Some(_) => None,
+        None => SERVICES_WITHOUT_CLASS.get(service),
     })
 }
 
 /// Classes of objects.
-pub const fn class(class: u16) -> Option<&'static str> {
-    Some(match class {
-        0x01 => "Identity",
-        0x02 => "Message Router",
-        0x03 => "DeviceNet",
-        0x04 => "Assembly",
-        0x05 => "Connection",
-        0x06 => "Connection Manager",
-        0x07 => "Register",
-        0x08 => "Discrete Input Point",
-        0x09 => "Discrete Output Point",
-        0x0A => "Analog Input Point",
-        0x0B => "Analog Output Point",
-        0x0E => "Presence Sensing",
-        0x0F => "Parameter",
-        0x10 => "Parameter Group",
-        0x12 => "Group",
-        0x1D => "Discrete Input Group",
-        0x1E => "Discrete Output Group",
-        0x1F => "Discrete Group",
-        0x20 => "Analog Input Group",
-        0x21 => "Analog Output Group",
-        0x22 => "Analog Group",
-        0x23 => "Position Sensor",
-        0x24 => "Position Controller Supervisor",
-        0x25 => "Position Controller",
-        0x28 => "Motor Data",
-        0x29 => "Control Supervisor",
-        0x2A => "AC/DC Drive",
-        0x2B => "Acknowledge Handler",
-        0x2C => "Overload",
-        0x2D => "Softstart",
-        0x2E => "Selection",
-        0x30 => "S-Device Supervisor",
-        0x31 => "S-Analog Sensor",
-        0x32 => "S-Analog Actuator",
-        0x33 => "S-Single Stage Controller",
-        0x34 => "S-Gas Calibration",
-        _ => return None,
-    })
+pub fn class(class: u16) -> Option<&'static str> {
+    CLASSES.get(class)
 }
 
 /// Why a service is refused.
-pub const fn error(code: u8) -> &'static str {
-    match code {
-        0x02 => "resource unavailable",
-        0x08 => "service not supported",
-        0x09 => "invalid attribute value",
-        0x0B => "already in requested mode or state",
-        0x0C => "object state conflict",
-        0x0E => "attribute not settable",
-        0x0F => "privilege violation",
-        0x10 => "device state conflict",
-        0x11 => "reply data too large",
-        0x13 => "not enough data",
-        0x14 => "attribute not supported",
-        0x15 => "too much data",
-        0x16 => "object does not exist",
-        0x18 => "no stored attribute data",
-        0x19 => "store operation failure",
-        0x1F => "vendor specific error",
-        0x20 => "invalid parameter",
-        0x28 => "invalid member",
-        0x29 => "member not settable",
-        _ => "reserved",
+pub fn error(code: u8) -> &'static str {
+    ERRORS.get(code).unwrap_or("reserved")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::table::check;
+
+    #[test]
+    fn every_line_of_the_file_is_in_a_table() {
+        let services = [&SERVICES, &SERVICES_OF_DEVICENET, &SERVICES_WITHOUT_CLASS];
+        check(FILE, &services.into_iter().chain([&CLASSES, &ERRORS]).collect::<Vec<_>>());
     }
 }

@@ -1,8 +1,8 @@
 use super::*;
 use crate::testing::{self, at, hex, lost};
 
-fn said(frames: &[(f64, &str)]) -> Vec<String> {
-    testing::said(DeviceNet::new(), frames)
+fn event_lines(frames: &[(f64, &str)]) -> Vec<String> {
+    testing::event_lines(DeviceNet::new(), frames)
 }
 
 /// Slave 5, master 0.
@@ -44,7 +44,7 @@ fn requests_and_responses_are_one_event() {
             "devicenet 5 > 0 Get_Attribute_Single: service 0x0E, value 05, request \"not heard\"",
         ),
     ] {
-        assert_eq!(said(frames), [expected], "{frames:?}");
+        assert_eq!(event_lines(frames), [expected], "{frames:?}");
     }
 }
 

@@ -2,6 +2,11 @@
 
 use std::fmt;
 
+use super::names::FILE;
+use crate::table::Table;
+
+pub static STATUS: Table = Table::new(FILE, "dtc_status");
+
 /// A trouble code of two bytes (SAE J2012): a letter and four digits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Dtc(pub u16);
@@ -30,18 +35,7 @@ pub fn list_with_status(bytes: &[u8]) -> String {
 
 /// The bits of a status (ISO 14229-1:2020, D.2).
 pub fn status(byte: u8) -> String {
-    const BITS: [&str; 8] = [
-        "test failed",
-        "failed this cycle",
-        "pending",
-        "confirmed",
-        "not completed since clear",
-        "failed since clear",
-        "not completed this cycle",
-        "warning indicator",
-    ];
-    let set = BITS.iter().enumerate().filter(|(bit, _)| byte >> bit & 1 == 1).map(|(_, name)| *name);
-    let set = set.collect::<Vec<_>>().join(" + ");
+    let set = STATUS.bits(byte).collect::<Vec<_>>().join(" + ");
     if set.is_empty() { "no status".to_owned() } else { set }
 }
 

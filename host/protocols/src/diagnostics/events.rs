@@ -3,6 +3,7 @@
 
 use super::cursor::Cursor;
 use super::names;
+use super::obd_identifiers::data_identifier;
 use crate::Field;
 
 /// The bits of the sub-function that are the event, without whether it is stored.
@@ -58,7 +59,7 @@ fn record(event: u8, cursor: &mut Cursor<'_, '_>) -> Option<()> {
 fn did(cursor: &mut Cursor<'_, '_>) -> Option<()> {
     let did = cursor.take(2)?;
     let did = u16::from_be_bytes([did[0], did[1]]);
-    cursor.push(Field::hex("did", did, 4).meaning(names::data_identifier(did)));
+    cursor.push(Field::hex("did", did, 4).meaning(data_identifier(did)));
     Some(())
 }
 

@@ -23,6 +23,7 @@ mod meanings;
 mod monitors;
 pub(crate) mod names;
 mod obd;
+mod obd_identifiers;
 mod parameters;
 mod periodic;
 mod reports;
@@ -35,7 +36,8 @@ mod values;
 
 pub use dtc::Dtc;
 pub(crate) use echo::repeats_its_request;
-pub use names::{data_identifier, reason, uds_service};
+pub use names::{reason, uds_service};
+pub use obd_identifiers::data_identifier;
 pub use parameters::name as parameter_name;
 pub(crate) use uds::is_response_suppressed;
 
@@ -48,7 +50,7 @@ use self::dialect::Dialects;
 use self::periodic::Periodic;
 use self::unnamed::Unnamed;
 use crate::iso_tp::{Endpoint, KnownPairs, Transfer, Transport};
-use crate::{Assembler, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
+use crate::{Assembler, Event, EventKind, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
 /// How many requests may wait for a response at a time.
 const MOST_WAITING: usize = 256;
@@ -113,7 +115,7 @@ impl Diagnostics {
     }
 
     /// Takes a transfer, which may have been heard before the last record.
-    fn heard(&mut self, transfer: Transfer, events: &mut Vec<Event>) {
+    fn take_transfer(&mut self, transfer: Transfer, events: &mut Vec<Event>) {
         if self.due_ns < transfer.start_ns {
             self.expire(transfer.start_ns, events);
         }
@@ -174,7 +176,7 @@ impl Diagnostics {
         let is_wanted =
             !(is_uds && uds::is_response_suppressed(&transfer.data) || transfer.data[..] == [0x3E, 0x02]);
         if !is_wanted {
-            let mut event = self.event(&transfer, None, "request");
+            let mut event = self.event(&transfer, None, EventKind::Request);
             event.fields.push(Field::text("response", "not wanted"));
             events.push(event);
         }
@@ -266,7 +268,7 @@ impl Diagnostics {
         let answered = self.answered(place, transfer.from);
         self.dialects.learn(transfer.channel, transfer.from, &answered.request.data, &transfer.data);
         self.periodic.learn(transfer.channel, transfer.from, &answered.request.data);
-        events.push(self.event(&answered.request, Some((transfer, &answered)), "exchange"));
+        events.push(self.event(&answered.request, Some((transfer, &answered)), EventKind::Exchange));
     }
 
     /// The request's state until now; one to a single server stops waiting.
@@ -308,15 +310,15 @@ impl Diagnostics {
             return;
         }
         let answered = self.answered(place, transfer.from);
-        let mut event = self.event(&answered.request, Some((transfer, &answered)), "exchange");
-        event.kind = "refusal";
+        let mut event = self.event(&answered.request, Some((transfer, &answered)), EventKind::Exchange);
+        event.kind = EventKind::Refusal;
         events.push(event);
         self.dialects.learn(transfer.channel, transfer.from, &answered.request.data, &transfer.data);
     }
 
     /// A response whose request was not observed, or no longer waits for it.
     fn unasked(&mut self, transfer: &Transfer, sid: u8) -> Event {
-        let mut event = self.event(transfer, None, "response");
+        let mut event = self.event(transfer, None, EventKind::Response);
         let late = self.late.iter().position(|request| {
             transfer.start_ns.saturating_sub(request.time_ns) <= LATE_NS
                 && request.to.is_none_or(|to| to == transfer.from)
@@ -333,7 +335,7 @@ impl Diagnostics {
     }
 
     /// One transfer, or a request with its response, as an event.
-    fn event(&self, first: &Transfer, response: Option<(&Transfer, &Answered)>, kind: &'static str) -> Event {
+    fn event(&self, first: &Transfer, response: Option<(&Transfer, &Answered)>, kind: EventKind) -> Event {
         let refused = |data: &[u8]| data[0] == 0x7F && data.len() >= 3;
         let sid = if refused(&first.data) { first.data[1] } else { first.data[0] & !0x40 };
         let is_kwp = self.is_kwp(first) || response.is_some_and(|(response, _)| self.is_kwp(response));
@@ -416,7 +418,7 @@ impl Diagnostics {
             silent.push((None, 0));
         }
         for (by, pending) in silent {
-            let mut event = self.event(&waiting.request, None, "no_response");
+            let mut event = self.event(&waiting.request, None, EventKind::NoResponse);
             event.fields.push(Field::text("response", "none"));
             if pending > 0 {
                 event.fields.push(Field::number("pending", pending).unit("times"));
@@ -475,9 +477,9 @@ fn service(is_kwp: bool, sid: u8) -> Option<(Protocol, Cow<'static, str>)> {
 fn periodic_event(transfer: &Transfer, did: u16, data: &[u8]) -> Event {
     let mut event = Event::from(transfer.clone());
     event.protocol = Protocol::Uds;
-    event.kind = "periodic";
+    event.kind = EventKind::Periodic;
     event.title = "periodic data".into();
-    event.fields = vec![Field::hex("did", did, 4).meaning(names::data_identifier(did))];
+    event.fields = vec![Field::hex("did", did, 4).meaning(data_identifier(did))];
     if !data.is_empty() {
         event.fields.push(Field::bytes("value", data));
     }
@@ -499,7 +501,7 @@ impl Assembler for Diagnostics {
         let mut transfers = std::mem::take(&mut self.transfers);
         self.transport.take(record, &mut |transfer| transfers.push(transfer));
         for transfer in transfers.drain(..) {
-            self.heard(transfer, events);
+            self.take_transfer(transfer, events);
         }
         self.transfers = transfers;
     }
@@ -508,7 +510,7 @@ impl Assembler for Diagnostics {
         let mut transfers = std::mem::take(&mut self.transfers);
         self.transport.finish(&mut |transfer| transfers.push(transfer));
         for transfer in transfers {
-            self.heard(transfer, events);
+            self.take_transfer(transfer, events);
         }
         while !self.waiting.is_empty() {
             self.give_up(0, Trouble::Unfinished, events);

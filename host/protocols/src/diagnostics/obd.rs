@@ -1,9 +1,11 @@
 //! OBD-II: the content of the services of SAE J1979, with values in their units.
 
+use super::names::FILE;
 use super::parameters::{length, name, values};
 use super::values::{number, supported};
 use super::{dtc, monitors, names};
 use crate::Field;
+use crate::table::Table;
 
 /// The content of a request after the service byte.
 pub fn request(sid: u8, rest: &[u8], fields: &mut Vec<Field>) {
@@ -37,32 +39,20 @@ pub fn request(sid: u8, rest: &[u8], fields: &mut Vec<Field>) {
     }
 }
 
-/// Tests and actions of service 08. Test 01 is the only one that has a public description: carmakers' repair manuals
-/// ("Diagnostic Mode 08, TID $01", Audi and Volkswagen from 2006 on).
+static TESTS: Table = Table::new(FILE, "obd_test");
+static INFORMATION: Table = Table::new(FILE, "obd_information");
+
+#[cfg(test)]
+pub static TABLES: [&Table; 2] = [&TESTS, &INFORMATION];
+
+/// Tests and actions of service 08.
 fn test_name(tid: u8) -> Option<&'static str> {
-    match tid {
-        _ if tid.is_multiple_of(0x20) => Some("supported"),
-        0x01 => Some("evaporative system leak test"),
-        _ => None,
-    }
+    if tid.is_multiple_of(0x20) { Some("supported") } else { TESTS.get(tid) }
 }
 
-const fn info_name(pid: u8) -> Option<&'static str> {
-    Some(match pid {
-        0x00 => "supported",
-        0x02 => "VIN",
-        0x04 => "calibration identifications",
-        0x06 => "calibration verification numbers",
-        0x08 => "in-use performance, spark ignition",
-        0x0A => "ECU name",
-        0x0B => "in-use performance, compression ignition",
-        0x0D => "engine serial number",
-        0x0F => "exhaust regulation or type approval number",
-        0x11 => "WWH-OBD GTR number",
-        0x12 => "ignition cycles with the engine running on fuel",
-        0x14 => "distance since the decision of the evaporative monitor",
-        _ => return None,
-    })
+/// Vehicle information of service 09.
+pub fn info_name(pid: u8) -> Option<&'static str> {
+    INFORMATION.get(pid)
 }
 
 /// The content of a response after the service byte; the request then has no fields of its own.
@@ -158,7 +148,7 @@ pub fn response(sid: u8, mut rest: &[u8], fields: &mut Vec<Field>) {
 }
 
 /// The printable characters in the bytes.
-fn letters(bytes: &[u8]) -> String {
+pub fn letters(bytes: &[u8]) -> String {
     let shown = bytes.iter().filter(|byte| byte.is_ascii_graphic() || **byte == b' ');
     let shown: String = shown.map(|byte| char::from(*byte)).collect();
     shown.trim().to_owned()
@@ -173,7 +163,7 @@ pub fn title(sid: u8) -> &'static str {
 mod tests {
     use super::*;
 
-    fn said(sid: u8, bytes: &[u8]) -> String {
+    fn shown(sid: u8, bytes: &[u8]) -> String {
         let mut fields = Vec::new();
         response(sid, bytes, &mut fields);
         fields.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
@@ -241,32 +231,32 @@ mod tests {
             (&[0xF0, 1], "pid 0xF0, value 01"),
             (&[0x0C, 1], "pid 0x0C (engine_speed), value 01"),
         ] {
-            assert_eq!(said(1, bytes), expected);
+            assert_eq!(shown(1, bytes), expected);
         }
         assert_eq!(
-            said(1, &[0x0D, 0x10, 0x05, 0x28]),
+            shown(1, &[0x0D, 0x10, 0x05, 0x28]),
             "pid 0x0D (vehicle_speed), vehicle_speed 16 km/h, pid 0x05 (coolant_temperature), coolant_temperature 0 °C"
         );
-        assert_eq!(said(3, &[2, 1, 0x33, 0x41, 0x55]), "trouble_codes 2, codes \"P0133, C0155\"");
+        assert_eq!(shown(3, &[2, 1, 0x33, 0x41, 0x55]), "trouble_codes 2, codes \"P0133, C0155\"");
         assert_eq!(
-            said(9, b"\x04\x02JMB*36761500\0\0\0\0JMB*36761501\0\0\0\0"),
+            shown(9, b"\x04\x02JMB*36761500\0\0\0\0JMB*36761501\0\0\0\0"),
             "pid 0x04 (calibration identifications), calibration \"JMB*36761500\", calibration \"JMB*36761501\""
         );
         assert_eq!(
-            said(9, &[6, 1, 0x17, 0x91, 0xBC, 0x82]),
+            shown(9, &[6, 1, 0x17, 0x91, 0xBC, 0x82]),
             "pid 0x06 (calibration verification numbers), verification_number 0x1791BC82"
         );
         assert_eq!(
-            said(9, &[8, 2, 0, 5, 1, 0]),
+            shown(9, &[8, 2, 0, 5, 1, 0]),
             "pid 0x08 (in-use performance, spark ignition), count 5, count 256"
         );
-        assert_eq!(said(8, &[0, 0xC0, 0, 0, 0]), "tid 0x00 (supported), supported \"01 02\"");
+        assert_eq!(shown(8, &[0, 0xC0, 0, 0, 0]), "tid 0x00 (supported), supported \"01 02\"");
         for vin in [&b"\x02\x01WVWZZZ1KZAW000001"[..], b"\x02\x01\0\0\0WVWZZZ1KZAW000001"] {
-            assert_eq!(said(9, vin), "pid 0x02 (VIN), vin \"WVWZZZ1KZAW000001\"");
+            assert_eq!(shown(9, vin), "pid 0x02 (VIN), vin \"WVWZZZ1KZAW000001\"");
         }
         // With another item behind it, which J1979 does not allow, but scapy's tests have.
         assert_eq!(
-            said(9, b"\x02\x01ABCDEFGHIJKLMNOPQ\x04\x01AB"),
+            shown(9, b"\x02\x01ABCDEFGHIJKLMNOPQ\x04\x01AB"),
             "pid 0x02 (VIN), vin \"ABCDEFGHIJKLMNOPQ\", rest 04 01 41 42"
         );
     }

@@ -212,7 +212,7 @@ pub fn response(heard: bool, sub: u8, data: &[u8], fields: &mut Vec<Field>) {
 mod tests {
     use super::*;
 
-    fn said(decode: fn(u8, &[u8], &mut Vec<Field>), sub: u8, bytes: &[u8]) -> String {
+    fn shown(decode: fn(u8, &[u8], &mut Vec<Field>), sub: u8, bytes: &[u8]) -> String {
         let mut fields = Vec::new();
         decode(sub, bytes, &mut fields);
         fields.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
@@ -252,7 +252,7 @@ mod tests {
             // What does not fit stays unchanged.
             (0x02, vec![0xFF, 1, 2], "value FF 01 02".to_owned()),
         ] {
-            assert_eq!(said(|sub, data, fields| response(false, sub, data, fields), sub, &bytes), expected, "{sub:02X}");
+            assert_eq!(shown(|sub, data, fields| response(false, sub, data, fields), sub, &bytes), expected, "{sub:02X}");
         }
         for (sub, bytes, expected) in [
             (
@@ -264,7 +264,7 @@ mod tests {
             (0x17, &[8, 1], "status_mask 0x08, memory 0x01"),
             (0x0A, &[], ""),
         ] {
-            assert_eq!(said(request, sub, bytes), expected, "{sub:02X}");
+            assert_eq!(shown(request, sub, bytes), expected, "{sub:02X}");
         }
     }
 
@@ -274,8 +274,8 @@ mod tests {
             for length in 0..24 {
                 let bytes = vec![sub; length];
                 let _ = (
-                    said(request, sub, &bytes),
-                    said(|sub, data, fields| response(false, sub, data, fields), sub, &bytes),
+                    shown(request, sub, &bytes),
+                    shown(|sub, data, fields| response(false, sub, data, fields), sub, &bytes),
                 );
             }
         }

@@ -1,14 +1,15 @@
 use cantap_trace::{TraceEvent, TraceRecord};
 
 use super::*;
+use crate::EventKind;
 use crate::testing::{self, at, hex};
 
 fn diagnostics() -> Diagnostics {
     Diagnostics::new(&[], true)
 }
 
-fn said(frames: &[(f64, &str)]) -> Vec<String> {
-    testing::said(diagnostics(), frames)
+fn event_lines(frames: &[(f64, &str)]) -> Vec<String> {
+    testing::event_lines(diagnostics(), frames)
 }
 
 fn events(records: &[TraceRecord]) -> Vec<Event> {
@@ -69,14 +70,14 @@ fn a_request_and_its_response_are_one_event() {
              rest FF, nrc 0x13 (incorrectMessageLengthOrInvalidFormat), after 1 ms",
         ),
     ] {
-        assert_eq!(said(frames), [expected], "{frames:?}");
+        assert_eq!(event_lines(frames), [expected], "{frames:?}");
     }
 }
 
 #[test]
 fn several_servers_answer_a_request_to_all() {
     let frames = [(0.0, "7DF#020105"), (1.0, "7E8#03410528"), (2.0, "7E9#0341057B"), (9000.0, "123#")];
-    let said = said(&frames);
+    let said = event_lines(&frames);
     assert_eq!(said.len(), 2, "{said:?}");
     assert!(said[1].starts_with("obd 7DF > 7E9 current data"), "{said:?}");
     assert!(said[1].ends_with("asked \"all\", after 2 ms"), "{said:?}");
@@ -85,14 +86,14 @@ fn several_servers_answer_a_request_to_all() {
 #[test]
 fn silence_is_said_and_a_loss_meanwhile_too() {
     let all = events(&[at(0.0, "7E0#023E00"), at(2500.0, "123#")]);
-    assert_eq!((all[0].kind, all[0].time_ns), ("no_response", 2_000_000_000));
+    assert_eq!((all[0].kind, all[0].time_ns), (EventKind::NoResponse, 2_000_000_000));
     assert_eq!(all[0].trouble, Some(Trouble::Timeout { after_ms: 2000 }));
     let gap = TraceRecord { time_ns: 1_000_000, channel: 1, event: TraceEvent::GAP };
     let all = events(&[at(0.0, "7E0#023E00"), gap, at(2500.0, "123#")]);
     assert!(all[0].frames_lost, "{all:?}");
     let all = events(&[at(0.0, "7E0#023E00"), at(10.0, "7E0#021001"), at(11.0, "7E8#025001")]);
     let kinds: Vec<_> = all.iter().map(|event| (event.kind, event.trouble)).collect();
-    assert_eq!(kinds, [("no_response", Some(Trouble::Overlapped)), ("exchange", None)]);
+    assert_eq!(kinds, [(EventKind::NoResponse, Some(Trouble::Overlapped)), (EventKind::Exchange, None)]);
     assert_eq!(events(&[at(0.0, "7E0#023E00")])[0].trouble, Some(Trouble::Unfinished));
 }
 
@@ -122,18 +123,18 @@ fn any_bytes_are_taken() {
 #[test]
 fn what_wanted_no_response_may_still_be_refused() {
     assert_eq!(
-        said(&[(0.0, "7E0#023E80"), (1.0, "7E8#037F3E12")]),
+        event_lines(&[(0.0, "7E0#023E80"), (1.0, "7E8#037F3E12")]),
         [
             "uds 7E0 > 7E8 TesterPresent: sid 0x3E, sub_function 0x00 (zero), response \"not wanted\"",
             "uds 7E0 > 7E8 TesterPresent: sid 0x3E, sub_function 0x00 (zero), nrc 0x12 (subFunctionNotSupported), after 1 ms",
         ]
     );
     // Once it is pending, the response comes.
-    let pending = said(&[(0.0, "7E0#021083"), (1.0, "7E8#037F1078"), (2.0, "7E8#065003003201F4")]);
+    let pending = event_lines(&[(0.0, "7E0#021083"), (1.0, "7E8#037F1078"), (2.0, "7E8#065003003201F4")]);
     assert_eq!(pending.len(), 2, "{pending:?}");
     assert!(pending[1].contains("p2_ms 50") && pending[1].contains("pending 1 times"), "{pending:?}");
     // It does not end a request that is waiting for its response meanwhile.
-    let between = said(&[
+    let between = event_lines(&[
         (0.0, "7E0#0431010203"),
         (1.0, "7E8#037F3178"),
         (2000.0, "7E0#023E80"),
@@ -144,7 +145,12 @@ fn what_wanted_no_response_may_still_be_refused() {
     assert!(between[2].contains("RoutineControl") && between[2].contains("status 00"), "{between:?}");
     // KWP2000 expresses it differently.
     assert_eq!(
-        said(&[(0.0, "7E0#021A90"), (1.0, "7E8#065A9041424344"), (2.0, "7E0#023E02"), (4000.0, "100#")])[1],
+        event_lines(&[
+            (0.0, "7E0#021A90"),
+            (1.0, "7E8#065A9041424344"),
+            (2.0, "7E0#023E02"),
+            (4000.0, "100#")
+        ])[1],
         "kwp2000 7E0 > 7E8 testerPresent: sid 0x3E, parameters 02, response \"not wanted\""
     );
 }
@@ -152,7 +158,7 @@ fn what_wanted_no_response_may_still_be_refused() {
 /// If several servers are asked at once, each is reported separately.
 #[test]
 fn who_said_pending_and_fell_silent_is_named() {
-    let said = said(&[
+    let said = event_lines(&[
         (0.0, "7DF#0322F190"),
         (1.0, "7E8#037F2278"),
         (2.0, "7E8#037F2278"),
@@ -241,7 +247,7 @@ fn services_have_their_own_fields() {
         let frames = frames.iter().enumerate().filter(|(_, frame)| !frame.is_empty());
         let frames: Vec<_> = frames.map(|(at, frame)| (at as f64, frame.replace(' ', ""))).collect();
         let frames: Vec<_> = frames.iter().map(|(at, frame)| (*at, frame.as_str())).collect();
-        let said = said(&frames);
+        let said = event_lines(&frames);
         assert!(said[0].contains(expected), "{said:?}");
     }
 }
@@ -271,7 +277,7 @@ fn requests_and_responses_of_any_bytes_are_taken() {
 #[test]
 fn a_response_to_something_else_is_not_the_response() {
     assert_eq!(
-        said(&[
+        event_lines(&[
             (0.0, "7E0#0322F190"),
             (1.0, "7E8#0562F1914142"),
             (2.0, "7E8#0562F1904344"),
@@ -283,7 +289,7 @@ fn a_response_to_something_else_is_not_the_response() {
         ]
     );
     // One that comes after its request was given up.
-    let late = said(&[
+    let late = event_lines(&[
         (0.0, "7E0#0322F190"),
         (500.0, "7E0#0322F191"),
         (510.0, "7E8#0562F1904142"),
@@ -292,20 +298,21 @@ fn a_response_to_something_else_is_not_the_response() {
     assert_eq!(late.len(), 3, "{late:?}");
     assert!(late[1].ends_with("did 0xF190 (VIN), value 41 42, request \"given up before\""), "{late:?}");
     assert!(late[2].ends_with("did 0xF191 (ECU hardware number), value 43 44, after 20 ms"), "{late:?}");
-    let late = said(&[(0.0, "7E0#021003"), (2500.0, "7E8#065003003201F4"), (2600.0, "7E8#065003003201F4")]);
+    let late =
+        event_lines(&[(0.0, "7E0#021003"), (2500.0, "7E8#065003003201F4"), (2600.0, "7E8#065003003201F4")]);
     assert!(late[0].ends_with("nothing came for 2000 ms"), "{late:?}");
     assert!(
         late[1].ends_with("request \"given up before\"") && late[2].ends_with("\"not heard\""),
         "{late:?}"
     );
-    let late = said(&[(0.0, "7E0#0322F190"), (2500.0, "7E8#037F2210")]);
+    let late = event_lines(&[(0.0, "7E0#0322F190"), (2500.0, "7E8#037F2210")]);
     assert!(late[1].ends_with("nrc 0x10 (generalReject), request \"given up before\""), "{late:?}");
 }
 
 /// Of several identifiers a server answers those that it has.
 #[test]
 fn values_belong_to_the_identifiers_that_came() {
-    let said = said(&[(0.0, "7E0#0722F190F18CF191"), (1.0, "7E8#0762F18C41F19142")]);
+    let said = event_lines(&[(0.0, "7E0#0722F190F18CF191"), (1.0, "7E8#0762F18C41F19142")]);
     assert!(said[0].contains("value_F18C 41, value_F191 42, after 1 ms"), "{said:?}");
 }
 
@@ -318,16 +325,16 @@ fn a_response_that_has_begun_is_waited_for() {
         frames.push((11.0 + f64::from(number) * 127.0, format!("7E8#2{:X}01020304050607", number & 15)));
     }
     let frames: Vec<_> = frames.iter().map(|(at, frame)| (*at, frame.as_str())).collect();
-    let whole = said(&frames);
+    let whole = event_lines(&frames);
     assert_eq!(whole.len(), 1, "{whole:?}");
     assert!(whole[0].ends_with("after 10 ms"), "{whole:?}");
     // Of one that breaks off, both are said.
-    let broken = said(&[&frames[..20], &[(9000.0, "123#")]].concat());
+    let broken = event_lines(&[&frames[..20], &[(9000.0, "123#")]].concat());
     assert_eq!(broken.len(), 2, "{broken:?}");
     // To all, too.
     let mut to_all = frames.clone();
     to_all[0].1 = "7DF#03221234";
-    let whole = said(&to_all);
+    let whole = event_lines(&to_all);
     assert_eq!(whole.len(), 1, "{whole:?}");
 }
 
@@ -346,7 +353,7 @@ fn periodic_data_are_known_by_what_was_asked() {
         (250.0, "7E8#0401AABBCD"),
         (260.0, "7E8#03E31234"),
     ];
-    let said = said(&frames);
+    let said = event_lines(&frames);
     assert_eq!(
         said[1..3],
         [
@@ -362,7 +369,7 @@ fn periodic_data_are_known_by_what_was_asked() {
 /// Only the response to a session says that its highest bit was part of the number.
 #[test]
 fn a_session_above_80_is_one_of_kwp2000() {
-    let said = said(&[(0.0, "7E0#021089"), (1.0, "7E8#025089"), (2.0, "7E0#013E"), (3.0, "7E8#017E")]);
+    let said = event_lines(&[(0.0, "7E0#021089"), (1.0, "7E8#025089"), (2.0, "7E0#013E"), (3.0, "7E8#017E")]);
     assert_eq!(
         said[1],
         "kwp2000 7E0 > 7E8 startDiagnosticSession: sid 0x10, mode 0x89, value 89, after 1 ms"
@@ -398,7 +405,12 @@ fn requests_without_answers_show_what_is_spoken() {
 fn a_service_that_no_standard_names_is_refused_as_it_was_asked_for() {
     // As a scan of all services goes.
     assert_eq!(
-        said(&[(0.0, "7E0#02BF01"), (1.0, "7E8#037FBF11"), (10.0, "7E0#013F"), (11.0, "7E8#037F3F11")]),
+        event_lines(&[
+            (0.0, "7E0#02BF01"),
+            (1.0, "7E8#037FBF11"),
+            (10.0, "7E0#013F"),
+            (11.0, "7E8#037F3F11")
+        ]),
         [
             "isotp 7E0 > 7E8 transfer: length 2 bytes, data BF 01",
             "uds 7E0 > 7E8 service BF: sid 0xBF, parameters 01, nrc 0x11 (serviceNotSupported), after 1 ms",
@@ -408,7 +420,7 @@ fn a_service_that_no_standard_names_is_refused_as_it_was_asked_for() {
     );
     // One that asks for time first, and answers.
     assert_eq!(
-        said(&[(0.0, "7E0#02A501"), (1.0, "7E8#037FA578"), (3000.0, "7E8#02E501")]),
+        event_lines(&[(0.0, "7E0#02A501"), (1.0, "7E8#037FA578"), (3000.0, "7E8#02E501")]),
         [
             "isotp 7E0 > 7E8 transfer: length 2 bytes, data A5 01",
             "uds 7E0 > 7E8 service A5: sid 0xA5, parameters 01, value 01, pending 1 times, after 3000 ms",
@@ -421,7 +433,7 @@ fn a_service_that_no_standard_names_is_refused_as_it_was_asked_for() {
         (&[(0.0, "7E0#02BF01"), (1.0, "7E9#037FBF11")], false),
         (&[(0.0, "7DF#02BF01"), (1.0, "7E9#037FBF11")], true),
     ] {
-        let said = said(frames);
+        let said = event_lines(frames);
         assert_eq!(!said[1].contains("not heard"), heard, "{said:?}");
     }
 }
@@ -429,7 +441,12 @@ fn a_service_that_no_standard_names_is_refused_as_it_was_asked_for() {
 #[test]
 fn services_of_the_system_supplier_are_requests_too() {
     assert_eq!(
-        said(&[(0.0, "7E0#03BA1205"), (1.0, "7E8#02FA05"), (10.0, "7E0#02BE01"), (11.0, "7E8#037FBE31")]),
+        event_lines(&[
+            (0.0, "7E0#03BA1205"),
+            (1.0, "7E8#02FA05"),
+            (10.0, "7E0#02BE01"),
+            (11.0, "7E8#037FBE31")
+        ]),
         [
             "uds 7E0 > 7E8 system supplier specific: sid 0xBA, parameters 12 05, value 05, after 1 ms",
             "uds 7E0 > 7E8 system supplier specific: sid 0xBE, parameters 01, nrc 0x31 (requestOutOfRange), after 1 ms",
@@ -448,12 +465,12 @@ fn a_scan_of_all_services_does_not_make_a_server_one_of_kwp2000() {
         ("7E8#037F2131", "kwp2000 7E0 > 7E8 readDataByCommonIdentifier"),
         ("7E8#03610141", "kwp2000 7E0 > 7E8 readDataByCommonIdentifier"),
     ] {
-        let said = said(&[(0.0, "7E0#022101"), (1.0, answer), read, value]);
+        let said = event_lines(&[(0.0, "7E0#022101"), (1.0, answer), read, value]);
         assert!(said[0].starts_with("kwp2000 7E0 > 7E8 readDataByLocalIdentifier"), "{said:?}");
         assert!(said[1].starts_with(expected), "{said:?}");
     }
     // Nor does a refusal make a server of KWP2000 one of UDS.
-    let said = said(&[
+    let said = event_lines(&[
         (0.0, "7E0#021A90"),
         (1.0, "7E8#035A9041"),
         (10.0, "7E0#022101"),
@@ -479,7 +496,7 @@ fn services_of_kwp2000_have_its_names_where_uds_has_others() {
         frames.push((time + 1.0, format!("7E8#02{:02X}01", sid | 0x40)));
     }
     let frames: Vec<_> = frames.iter().map(|(time, frame)| (*time, frame.as_str())).collect();
-    let said = said(&frames);
+    let said = event_lines(&frames);
     for (event, (_, name)) in said[1..].iter().zip(names) {
         assert!(event.starts_with(&format!("kwp2000 7E0 > 7E8 {name}: ")), "{said:?}");
     }
@@ -489,7 +506,7 @@ fn services_of_kwp2000_have_its_names_where_uds_has_others() {
 /// Its tester first ends a session as testers of KWP2000 do, which the server still answers; and it refuses another old service.
 #[test]
 fn a_server_of_uds_that_keeps_an_old_service_stays_one() {
-    let said = said(&[
+    let said = event_lines(&[
         (0.0, "7E4#0120000000000000"),
         (10.0, "7EC#0160AAAAAAAAAAAA"),
         (1000.0, "7E4#0210030000000000"),
@@ -520,7 +537,7 @@ fn a_server_of_uds_that_keeps_an_old_service_stays_one() {
 /// What was claimed by one old service is taken back by one that only UDS has.
 #[test]
 fn a_claim_of_kwp2000_is_taken_back_by_what_contradicts_it() {
-    let said = said(&[
+    let said = event_lines(&[
         (0.0, "7E0#022101"),
         (1.0, "7E8#03610141"),
         (10.0, "7E0#0322F190"),
@@ -558,7 +575,7 @@ fn every_server_behind_one_identifier_is_read_from_its_first_frame_on() {
         now += 200.0;
     }
     let vins: Vec<_> = frames.iter().map(|(at, frame)| (*at, frame.as_str())).collect();
-    let lines = said(&vins);
+    let lines = event_lines(&vins);
     assert_eq!(lines.len(), 5, "{lines:?}");
     for (line, ecu) in lines.iter().zip(["12", "18", "40", "60", "72"]) {
         assert!(line.starts_with(&format!("uds 6F1/{ecu} > 6{ecu}/F1 ReadDataByIdentifier: ")), "{line}");
@@ -573,7 +590,7 @@ fn every_server_behind_one_identifier_is_read_from_its_first_frame_on() {
     .concat();
     let silent: Vec<_> = silent.iter().map(|(at, frame)| (*at, frame.replace(' ', ""))).collect();
     let silent: Vec<_> = silent.iter().map(|(at, frame)| (*at, frame.as_str())).collect();
-    let lines = said(&silent);
+    let lines = event_lines(&silent);
     assert_eq!(lines.len(), 5, "{lines:?}");
     assert!(
         lines[2].starts_with("uds 6F1/29 > 629/F1 ") && lines[2].ends_with("nothing came for 2000 ms"),
@@ -584,7 +601,7 @@ fn every_server_behind_one_identifier_is_read_from_its_first_frame_on() {
         "{lines:?}"
     );
     assert!(lines[4].starts_with("uds 6F1/EF > 618/F1 TesterPresent"), "{lines:?}");
-    let end = said(&silent[..13]);
+    let end = event_lines(&silent[..13]);
     assert!(end[2].starts_with("uds 6F1/29 > 629/F1 ") && end[2].ends_with("the trace ends here"), "{end:?}");
 }
 
@@ -611,7 +628,7 @@ fn addresses_that_answers_repeat_are_conversations_of_their_own() {
         }
     }
     let frames: Vec<_> = frames.iter().map(|(at, frame)| (*at, frame.as_str())).collect();
-    let lines = said(&frames);
+    let lines = event_lines(&frames);
     assert_eq!(lines.len(), 9, "{lines:?}");
     for (line, place) in lines.iter().zip(0..) {
         let address = ["40", "6D", "A7"][place / 3];
@@ -632,7 +649,7 @@ fn a_long_answer_has_the_request_that_came_before_its_pair_was_known() {
         ];
         let frames: Vec<_> = frames.iter().map(|(at, frame)| (*at, frame.as_str())).collect();
         assert_eq!(
-            said(&frames),
+            event_lines(&frames),
             [format!(
                 "uds {a} > {b} ReadDataByIdentifier: sid 0x22, did 0xF190 (VIN), value \"WVWZZZ1KZAW000001\", after 10 ms"
             )]
@@ -665,7 +682,7 @@ fn pairs_are_found_by_single_frames_and_nothing_before_is_missing() {
             }
         }
         let frames: Vec<_> = frames.iter().map(|(at, frame)| (*at, frame.as_str())).collect();
-        let lines = said(&frames);
+        let lines = event_lines(&frames);
         assert_eq!(lines.len(), 15, "{pair}: {lines:?}");
         for line in &lines {
             assert!(
@@ -690,13 +707,16 @@ fn a_loss_before_a_pair_is_known_is_said_of_what_it_touched() {
     ]);
     let all: Vec<_> =
         all.iter().map(|event| (event.kind, event.time_ns / 1_000_000, event.frames_lost)).collect();
-    assert_eq!(all, [("exchange", 1, false), ("exchange", 11, true), ("exchange", 21, false)]);
+    assert_eq!(
+        all,
+        [(EventKind::Exchange, 1, false), (EventKind::Exchange, 11, true), (EventKind::Exchange, 21, false)]
+    );
 }
 
 /// One identifier asks several servers, each of which has a tester's identifier of its own.
 #[test]
 fn requests_to_all_by_a_makers_identifier_have_every_answer() {
-    let lines = said(&[
+    let lines = event_lines(&[
         (0.0, "713#0322F19000000000"),
         (1.0, "77D#0462F19041000000"),
         (10.0, "714#0322F19000000000"),
@@ -714,7 +734,7 @@ fn requests_to_all_by_a_makers_identifier_have_every_answer() {
         "{lines:?}"
     );
     // It is heard first, and in no maker's table.
-    let lines = said(&[
+    let lines = event_lines(&[
         (20.0, "222#0322F19100000000"),
         (21.0, "333#0462F19143000000"),
         (22.0, "444#0462F19144000000"),
@@ -730,7 +750,7 @@ fn requests_to_all_by_a_makers_identifier_have_every_answer() {
         "{lines:?}"
     );
     // It is heard first.
-    let lines = said(&[
+    let lines = event_lines(&[
         (20.0, "700#0322F19100000000"),
         (21.0, "77D#0462F19143000000"),
         (22.0, "77E#0462F19144000000"),
@@ -746,10 +766,10 @@ fn requests_to_all_by_a_makers_identifier_have_every_answer() {
 /// A maker's name stands for all of its pairs, a server that does not answer included.
 #[test]
 fn a_makers_pairs_need_no_evidence() {
-    let said = |maker: &str, frames: &[(f64, &str)]| {
-        testing::said(Diagnostics::new(&[maker.parse().unwrap()], true), frames)
+    let event_lines = |maker: &str, frames: &[(f64, &str)]| {
+        testing::event_lines(Diagnostics::new(&[maker.parse().unwrap()], true), frames)
     };
-    let lines = said(
+    let lines = event_lines(
         "vag",
         &[(0.0, "715#023E0000"), (3000.0, "715#0322F190"), (3001.0, "77F#0462F19041"), (9000.0, "123#")],
     );
@@ -758,7 +778,7 @@ fn a_makers_pairs_need_no_evidence() {
         lines[0].starts_with("uds 715 > 77F TesterPresent") && lines[0].contains("nothing came"),
         "{lines:?}"
     );
-    let lines = said("BMW", &[(0.0, "6F1#29023E00"), (3000.0, "6F1#EF023E80"), (9000.0, "123#")]);
+    let lines = event_lines("BMW", &[(0.0, "6F1#29023E00"), (3000.0, "6F1#EF023E80"), (9000.0, "123#")]);
     assert!(lines[0].starts_with("uds 6F1/29 > 629/F1 TesterPresent"), "{lines:?}");
     assert!(lines[1].starts_with("uds 6F1/EF > all TesterPresent"), "{lines:?}");
 }
@@ -823,7 +843,7 @@ fn another_identifier_with_the_same_bytes_does_not_ask() {
         (201.0, "123#023E000000000000"),
         (202.0, "7E8#027E00AAAAAAAAAA"),
     ];
-    let lines = said(&frames);
+    let lines = event_lines(&frames);
     assert_eq!(lines.len(), 2, "{lines:?}");
     assert!(lines.iter().all(|line| line.starts_with("uds 7E0 > 7E8 TesterPresent")), "{lines:?}");
 }
@@ -831,7 +851,7 @@ fn another_identifier_with_the_same_bytes_does_not_ask() {
 /// Stamps of a coarse clock: a request and its answer have the same one.
 #[test]
 fn what_is_read_later_is_in_the_order_in_which_it_was_heard() {
-    let lines = said(&[
+    let lines = event_lines(&[
         (0.0, "456#027E000000000000"),
         (10.0, "123#023E000000000000"),
         (10.0, "456#027E000000000000"),
@@ -844,4 +864,20 @@ fn what_is_read_later_is_in_the_order_in_which_it_was_heard() {
         "{lines:?}"
     );
     assert!(lines[2].starts_with("uds 123 > 456 DiagnosticSessionControl"), "{lines:?}");
+}
+
+/// OBD-II over UDS: values of known length, so that a value with the next identifier's bytes in it is read, too.
+#[test]
+fn parameters_read_by_identifier_have_their_values() {
+    let lines = event_lines(&[
+        (0.0, "7E0#0322F40CAAAAAAAA"),
+        (0.01, "7E8#0562F40C1AF8AAAA"),
+        (0.1, "7E0#0522F40CF405AAAA"),
+        (0.11, "7E8#100862F40CF405F4"),
+        (0.12, "7E0#300000AAAAAAAAAA"),
+        (0.13, "7E8#21057BAAAAAAAAAA"),
+    ]);
+    assert_eq!(lines.len(), 2, "{lines:#?}");
+    assert!(lines[0].contains("did 0xF40C (engine_speed), engine_speed 1726 rpm"), "{}", lines[0]);
+    assert!(lines[1].contains("engine_speed 15617.25 rpm, coolant_temperature 83 °C"), "{}", lines[1]);
 }

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::cursor::Cursor;
 use super::values::{number, unsigned};
-use super::{authentication, dtc, events, files, names, reports, scaling, values};
+use super::{authentication, dtc, events, files, names, obd_identifiers, reports, scaling, values};
 use crate::Field;
 
 /// The bit of a sub-function that suppresses the positive response.
@@ -17,7 +17,7 @@ pub fn is_response_suppressed(request: &[u8]) -> bool {
 
 fn did(bytes: &[u8]) -> Field {
     let did = u16::from_be_bytes([bytes[0], bytes[1]]);
-    Field::hex("did", did, 4).meaning(names::data_identifier(did))
+    Field::hex("did", did, 4).meaning(obd_identifiers::data_identifier(did))
 }
 
 fn sub_function(sid: u8, sub: u8) -> Field {
@@ -103,7 +103,8 @@ pub fn request(bytes: &[u8], fields: &mut Vec<Field>) {
             if sub & !SUPPRESS == 1 && data.len() % 4 == 0 {
                 for source in data.chunks_exact(4) {
                     let from = u16::from_be_bytes([source[0], source[1]]);
-                    fields.push(Field::hex("source", from, 4).meaning(names::data_identifier(from)));
+                    fields
+                        .push(Field::hex("source", from, 4).meaning(obd_identifiers::data_identifier(from)));
                     fields.push(Field::number("position", source[2]));
                     fields.push(Field::number("size", source[3]).unit("bytes"));
                 }
@@ -262,7 +263,9 @@ pub fn response(request: Option<&[u8]>, bytes: &[u8], fields: &mut Vec<Field>) {
                 if !heard {
                     fields.push(did(after));
                 }
-                value(data, fields);
+                if !obd_identifiers::value(u16::from_be_bytes([after[0], after[1]]), data, fields) {
+                    value(data, fields);
+                }
             } else {
                 several(asked, after, fields);
             }
@@ -377,10 +380,13 @@ fn several(asked: &[u8], answer: &[u8], fields: &mut Vec<Field>) {
     let dids: Vec<&[u8]> = asked.chunks_exact(2).skip_while(|did| !answer.starts_with(did)).collect();
     let mut at = 2;
     let mut parts = Vec::new();
-    for next in dids.iter().skip(1) {
+    for two in dids.windows(2) {
+        let (did, next) = (u16::from_be_bytes([two[0][0], two[0][1]]), two[1]);
+        let known = obd_identifiers::length(did).map(|length| at + length);
+        let known = known.filter(|place| answer.get(*place..).is_some_and(|rest| rest.starts_with(next)));
         let mut places =
-            answer.windows(2).enumerate().skip(at).filter(|(_, two)| two == next).map(|(at, _)| at);
-        let (Some(place), None) = (places.next(), places.next()) else {
+            answer.windows(2).enumerate().skip(at).filter(|(_, two)| *two == next).map(|(at, _)| at);
+        let ((Some(place), ..) | (None, Some(place), None)) = (known, places.next(), places.next()) else {
             rest("value", answer, fields);
             return;
         };
@@ -389,6 +395,9 @@ fn several(asked: &[u8], answer: &[u8], fields: &mut Vec<Field>) {
     }
     parts.push(answer.get(at..).unwrap_or_default());
     for (did, part) in dids.iter().zip(parts) {
+        if obd_identifiers::value(u16::from_be_bytes([did[0], did[1]]), part, fields) {
+            continue;
+        }
         let mut name = String::from("value_");
         // Writing to a String cannot fail.
         let _ = write!(name, "{:02X}{:02X}", did[0], did[1]);

@@ -19,7 +19,7 @@ mod transfer;
 
 pub use makers::{BadPairs, KnownPairs, Maker};
 pub use pairs::{BadPair, Endpoint, Pair};
-pub use pci::{FlowStatus, Pci, parse};
+pub use pci::{FlowStatus, Pci, parse, separation_us};
 pub use transfer::Transfer;
 
 use std::ops::RangeInclusive;
@@ -30,7 +30,7 @@ use rustc_hash::FxHashMap;
 use self::exchanges::{Client, Exchanges, Found, Held, is_expected};
 use self::finder::Finder;
 use self::pairs::{Pairs, Reading};
-use crate::{Assembler, Bytes, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
+use crate::{Assembler, Bytes, Event, EventKind, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
 /// How long the receiver waits for the next frame: N_Cr.
 const NEXT_TIMEOUT_NS: i64 = 1_000_000_000;
@@ -528,7 +528,7 @@ impl From<Transfer> for Event {
             protocol: Protocol::IsoTp,
             from: transfer.from.into(),
             to: transfer.to.map_or(Party::Unknown, Party::from),
-            kind: if is_whole { "transfer" } else { "broken" },
+            kind: if is_whole { EventKind::Transfer } else { EventKind::Broken },
             title: if is_whole { "transfer".into() } else { "broken transfer".into() },
             fields,
             data: transfer.data,

@@ -96,8 +96,82 @@ fn single(length: u8, data: &[u8]) -> Result<&[u8], &'static str> {
     }
 }
 
-/// Reserved values mean the longest time (clause 9.6.5.5).
-fn separation_us(byte: u8) -> u32 {
+/// The longest length that the 12 bits of a first frame hold; longer ones follow in 32 bits.
+const MOST_SHORT: u32 = 0xFFF;
+
+impl Pci<'_> {
+    /// A frame of classical CAN and how many of its bytes count: all eight with padding. `address` is the byte in front of the control
+    /// information, if there is one. Data that do not fit are left out: [`Self::room`] says how many do.
+    pub fn encode(&self, address: Option<u8>, padding: Option<u8>) -> ([u8; 8], u8) {
+        let mut frame = Builder { bytes: [padding.unwrap_or(0); 8], length: 0 };
+        frame.push(address.as_slice());
+        match *self {
+            Self::Single(data) => {
+                frame.push(&[data.len().min(7) as u8]);
+                frame.push(data);
+            }
+            Self::First { length, data } => {
+                if length <= MOST_SHORT {
+                    frame.push(&[0x10 | (length >> 8) as u8, length as u8]);
+                } else {
+                    frame.push(&[0x10, 0]);
+                    frame.push(&length.to_be_bytes());
+                }
+                frame.push(data);
+            }
+            Self::Consecutive { number, data } => {
+                frame.push(&[0x20 | number & 15]);
+                frame.push(data);
+            }
+            Self::Flow { status, block_size, separation_us } => {
+                let status = match status {
+                    FlowStatus::Go => 0,
+                    FlowStatus::Wait => 1,
+                    FlowStatus::Overflow => 2,
+                };
+                frame.push(&[0x30 | status, block_size, separation_byte(separation_us)]);
+            }
+        }
+        (frame.bytes, if padding.is_some() { 8 } else { frame.length as u8 })
+    }
+
+    /// How many data bytes of a message fit in a frame like this one, in classical CAN.
+    pub fn room(&self, address: Option<u8>) -> usize {
+        let control = match self {
+            Self::Single(_) | Self::Consecutive { .. } => 1,
+            Self::First { length, .. } if *length <= MOST_SHORT => 2,
+            Self::First { .. } => 6,
+            Self::Flow { .. } => return 0,
+        };
+        8 - control - usize::from(address.is_some())
+    }
+}
+
+struct Builder {
+    bytes: [u8; 8],
+    length: usize,
+}
+
+impl Builder {
+    /// Appends as many as fit.
+    fn push(&mut self, bytes: &[u8]) {
+        for (place, byte) in self.bytes[self.length..].iter_mut().zip(bytes) {
+            *place = *byte;
+            self.length += 1;
+        }
+    }
+}
+
+/// The shortest time between two frames that flow control can ask for and that is no shorter than this; at most 127 ms.
+fn separation_byte(us: u32) -> u8 {
+    match us {
+        1..=900 => 0xF0 + us.div_ceil(100) as u8,
+        _ => us.div_ceil(1000).min(0x7F) as u8,
+    }
+}
+
+/// Microseconds between two frames, from the byte in flow control. Reserved values mean the longest time (clause 9.6.5.5).
+pub fn separation_us(byte: u8) -> u32 {
     match byte {
         0..=0x7F => u32::from(byte) * 1000,
         0xF1..=0xF9 => u32::from(byte - 0xF0) * 100,
@@ -108,6 +182,49 @@ fn separation_us(byte: u8) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_is_encoded_is_decoded_with_and_without_address_and_padding() {
+        let data = [1, 2, 3, 4, 5, 6, 7];
+        let flow = |separation_us| Pci::Flow { status: FlowStatus::Wait, block_size: 3, separation_us };
+        for address in [None, Some(0xF1)] {
+            for padding in [None, Some(0xCC)] {
+                for pci in [
+                    Pci::Single(&data[..2]),
+                    Pci::Single(&data[..6]),
+                    Pci::First { length: 4095, data: &data[..6 - usize::from(address.is_some())] },
+                    Pci::First { length: 4096, data: &data[..2 - usize::from(address.is_some())] },
+                    Pci::Consecutive { number: 15, data: &data[..7 - usize::from(address.is_some())] },
+                    flow(0),
+                    flow(300),
+                    flow(127_000),
+                ] {
+                    let (bytes, length) = pci.encode(address, padding);
+                    let decoded = parse(&bytes[..usize::from(length)], usize::from(address.is_some()));
+                    assert_eq!(decoded, Ok(Some(pci)), "{address:?} {padding:?}");
+                    assert!(padding.is_none() || length == 8);
+                }
+            }
+        }
+        assert_eq!(
+            Pci::Single(&[0x3E, 0]).encode(None, Some(0xAA)),
+            ([2, 0x3E, 0, 0xAA, 0xAA, 0xAA, 0xAA, 0xAA], 8)
+        );
+        assert_eq!(Pci::Single(&[0x3E, 0]).encode(Some(0x12), None), ([0x12, 2, 0x3E, 0, 0, 0, 0, 0], 4));
+        assert_eq!(Pci::First { length: 300, data: &[] }.room(Some(0)), 5);
+        assert_eq!(Pci::First { length: 70_000, data: &[] }.room(None), 2);
+    }
+
+    /// A time between two that can be asked for becomes the longer one.
+    #[test]
+    fn separation_times_are_never_shortened() {
+        for byte in (0..=0x7F).chain(0xF1..=0xF9) {
+            assert_eq!(separation_byte(separation_us(byte)), byte);
+        }
+        for (us, byte) in [(1, 0xF1), (101, 0xF2), (901, 1), (1001, 2), (200_000, 0x7F)] {
+            assert_eq!(separation_byte(us), byte, "{us}");
+        }
+    }
 
     #[test]
     fn frames_are_what_their_first_bytes_say() {

@@ -14,7 +14,7 @@ fn transfers(pairs: &[&str], records: &[TraceRecord]) -> Vec<Transfer> {
     all
 }
 
-fn said(pairs: &[&str], records: &[TraceRecord]) -> Vec<String> {
+fn event_lines(pairs: &[&str], records: &[TraceRecord]) -> Vec<String> {
     transfers(pairs, records).into_iter().map(|transfer| Event::from(transfer).to_string()).collect()
 }
 
@@ -53,7 +53,7 @@ fn a_missing_frame_breaks_the_transfer_once() {
     records.remove(2);
     records.push(at(4.0, "7E8#23FFFFFFFFFFFFFF"));
     assert_eq!(
-        said(&[], &records),
+        event_lines(&[], &records),
         [
             "isotp 7E8 > 7E0 broken transfer: length 20 bytes, received 6 bytes, block_size 0, separation_us 0, \
           data 62 0F 19 05 75 65; frame 2 came instead of 1"
@@ -126,7 +126,7 @@ fn pairs_can_be_given() {
     assert_eq!(transfers(&[], &single), []);
     assert_eq!(transfers(&["123:124"], &single).len(), 2);
     assert_eq!(
-        said(&["6F1/12:612/F1"], &[at(0.0, "6F1#12023E00")]),
+        event_lines(&["6F1/12:612/F1"], &[at(0.0, "6F1#12023E00")]),
         ["isotp 6F1/12 > 612/F1 transfer: length 2 bytes, data 3E 00"]
     );
     for bad in ["", "123", "123:1234", "123/1:124", "123:123", "123/123:124/1", "123/:124/"] {

@@ -4,6 +4,7 @@
 //! Memory: 256 messages of many frames in progress, each of at most 64 KiB, 64 waiting requests, and a NAME for each of 254 addresses on each
 //! channel.
 
+mod diagnostics;
 mod fast_packet;
 mod header;
 mod name;
@@ -27,7 +28,7 @@ use self::fast_packet::FastPackets;
 use self::header::{GLOBAL, NULL, party};
 use self::transport::{Assembled, LongMessages};
 use crate::nmea2000;
-use crate::{Assembler, Bytes, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
+use crate::{Assembler, Bytes, Event, EventKind, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
 const REQUEST: u32 = 0xEA00;
 const ACKNOWLEDGEMENT: u32 = 0xE800;
@@ -135,7 +136,7 @@ impl J1939 {
                     Ok(())
                 } else {
                     // Reported once for each message: the rest of it adds nothing.
-                    let mut event = self.event(record, header, "broken");
+                    let mut event = self.event(record, header, EventKind::Broken);
                     event.trouble = Some(Trouble::Headless);
                     events.push(event);
                     Ok(())
@@ -151,7 +152,7 @@ impl J1939 {
             }
         };
         if let Err(fault) = taken {
-            let mut event = self.event(record, header, "broken");
+            let mut event = self.event(record, header, EventKind::Broken);
             event.trouble = Some(Trouble::Malformed(fault));
             events.push(event);
         }
@@ -168,9 +169,9 @@ impl J1939 {
         self.message(&record, message.header, &data, Some(&message), events);
     }
 
-    fn event(&self, record: &TraceRecord, header: Header, kind: &'static str) -> Event {
+    fn event(&self, record: &TraceRecord, header: Header, kind: EventKind) -> Event {
         let title =
-            names::group(header.pgn).map_or_else(|| format!("PGN {}", header.pgn).into(), Cow::Borrowed);
+            names::message(header).map_or_else(|| format!("PGN {}", header.pgn).into(), Cow::Borrowed);
         let mut event = Event::new(self.protocol(record.channel, header.pgn), record, kind, title);
         (event.from, event.to) = (party(header.source), party(header.destination));
         event.fields.reserve(4);
@@ -187,7 +188,7 @@ impl J1939 {
         long: Option<&Assembled>,
         events: &mut Vec<Event>,
     ) {
-        let mut event = self.event(record, header, "message");
+        let mut event = self.event(record, header, EventKind::Message);
         let mut asked = None;
         if let Some(long) = long {
             event.start_ns = long.start_ns;
@@ -201,8 +202,9 @@ impl J1939 {
                 event.fields.push(Field::real("rts_to_cts_ms", cleared_ns as f64 / 1e6, "ms"));
             }
             if long.trouble.is_some() {
-                event.kind = "broken";
-                if let Some(name) = self.group(record.channel, header.pgn) {
+                event.kind = EventKind::Broken;
+                if let Some(name) = names::message(header).or_else(|| self.group(record.channel, header.pgn))
+                {
                     event.title = name.into();
                 }
                 event.fields.push(Field::number("received", data.len() as i64).unit("bytes"));
@@ -213,13 +215,13 @@ impl J1939 {
         match (header.pgn, data) {
             (REQUEST, [a, b, c, ..]) => {
                 let pgn = header::pgn([*a, *b, *c]);
-                event.kind = "request";
+                event.kind = EventKind::Request;
                 event.fields.push(Field::number("requested", pgn).meaning(self.group(record.channel, pgn)));
                 self.ask(record, header, pgn, events);
             }
             (ACKNOWLEDGEMENT, [control, function, _, _, address, a, b, c]) => {
                 let pgn = header::pgn([*a, *b, *c]);
-                event.kind = "acknowledgement";
+                event.kind = EventKind::Acknowledgement;
                 let said = ["yes", "no", "access denied", "cannot respond now"];
                 let said = said.get(usize::from(*control)).copied();
                 event.fields.push(Field::number("control", *control).meaning(said));
@@ -234,12 +236,12 @@ impl J1939 {
                 self.claim(record.channel, header, u64_of(data), &mut event);
             }
             (COMMANDED_ADDRESS, [name @ .., address]) if name.len() == 8 => {
-                event.kind = "address_command";
+                event.kind = EventKind::AddressCommand;
                 event.fields.push(Field::number("address", *address));
                 name::fields(u64_of(name), &mut event.fields);
             }
             (pgn, data) if trouble_codes::carries(pgn) => {
-                event.kind = "trouble_codes";
+                event.kind = EventKind::TroubleCodes;
                 trouble_codes::fields(data, &mut event.fields);
             }
             (0xFEDA | 0xFEEB | 0xFEEC, data) => {
@@ -253,6 +255,7 @@ impl J1939 {
             }
             (_, data) => {
                 if !self.signals(record.channel, header, data, &mut event)
+                    && !diagnostics::fields(header.pgn, data, &mut event.fields)
                     && !self.marine_fields(record.channel, header, data, &mut event)
                 {
                     event.fields.push(Field::bytes("data", data));
@@ -296,7 +299,7 @@ impl J1939 {
     }
 
     fn claim(&mut self, channel: u8, header: Header, name: u64, event: &mut Event) {
-        event.kind = "address_claim";
+        event.kind = EventKind::AddressClaim;
         if header.source == NULL {
             event.title = "cannot claim an address".into();
         }
@@ -360,7 +363,7 @@ impl J1939 {
         }
         let header = Header { priority: 6, pgn: REQUEST, source: request.from, destination: request.to };
         let record = &TraceRecord { channel: request.channel, ..*record };
-        let mut event = self.event(record, header, "no_response");
+        let mut event = self.event(record, header, EventKind::NoResponse);
         event.fields.pop();
         event.start_ns = request.time_ns;
         if let Trouble::Timeout { .. } = trouble {

@@ -6,8 +6,8 @@ use cantap_trace::TraceEvent;
 use super::*;
 use crate::testing::{self, at, hex, lost};
 
-fn said(frames: &[(f64, &str)]) -> Vec<String> {
-    testing::said(J1939::default(), frames)
+fn event_lines(frames: &[(f64, &str)]) -> Vec<String> {
+    testing::event_lines(J1939::default(), frames)
 }
 
 /// Active trouble codes: two of them, ten bytes by broadcast.
@@ -20,7 +20,7 @@ const DM1: [(f64, &str); 3] = [
 #[test]
 fn a_broadcast_of_trouble_codes_is_one_message() {
     assert_eq!(
-        said(&DM1),
+        event_lines(&DM1),
         [
             "j1939 0 > all DM1 active trouble codes: pgn 65226, priority 7, transport \"BAM\", length 10 bytes, \
           malfunction_lamp \"off\", red_stop_lamp \"off\", amber_warning_lamp \"on\", protect_lamp \"off\", trouble_codes 2, \
@@ -32,15 +32,15 @@ fn a_broadcast_of_trouble_codes_is_one_message() {
 
 #[test]
 fn missing_frames_are_said() {
-    let broken = said(&[DM1[0], DM1[2]]);
+    let broken = event_lines(&[DM1[0], DM1[2]]);
     assert_eq!(broken.len(), 1);
     assert!(broken[0].ends_with("received 0 bytes; frame 2 came instead of 1"), "{broken:?}");
-    let late = said(&[DM1[0], DM1[1], (2000.0, "18FEF100#0000000000000000")]);
+    let late = event_lines(&[DM1[0], DM1[1], (2000.0, "18FEF100#0000000000000000")]);
     assert!(late[0].ends_with("received 7 bytes; nothing came for 750 ms"), "{late:?}");
-    let headless = said(&DM1[1..]);
+    let headless = event_lines(&DM1[1..]);
     assert_eq!(headless.len(), 1, "{headless:?}");
     assert!(headless[0].ends_with("its beginning is missing"), "{headless:?}");
-    let unfinished = said(&DM1[..2]);
+    let unfinished = event_lines(&DM1[..2]);
     assert!(unfinished[0].ends_with("the trace ends here"), "{unfinished:?}");
     let records = [at(0.0, DM1[0].1), lost(10.0), at(50.0, DM1[1].1), at(100.0, DM1[2].1)];
     assert!(testing::events(J1939::default(), &records)[0].frames_lost);
@@ -64,11 +64,11 @@ fn connections_are_followed_with_their_times() {
     let frames: Vec<_> = frames.iter().map(|(ms, frame)| (*ms, frame.as_str())).collect();
     let expected = "j1939 0 > 33 CI component identification: pgn 65259, priority 6, transport \"RTS/CTS\", length 23 bytes, \
                     rts_to_cts_ms 5 ms, text \"ABCDEFGHIJKLMNOPQRSTUVW\"";
-    assert_eq!(said(&frames), [expected]);
+    assert_eq!(event_lines(&frames), [expected]);
     // Without the repetition, the missing frame is reported at the acknowledgement.
     let without: Vec<_> = [&frames[..3], &frames[7..]].concat();
-    assert!(said(&without)[0].ends_with("frame 4 came instead of 2"), "{:?}", said(&without));
-    let aborted = said(&[frames[0], (1.0, "18EC0021#FF01FFFFFFEBFE00")]);
+    assert!(event_lines(&without)[0].ends_with("frame 4 came instead of 2"), "{:?}", event_lines(&without));
+    let aborted = event_lines(&[frames[0], (1.0, "18EC0021#FF01FFFFFFEBFE00")]);
     assert!(aborted[0].ends_with("aborted: the receiver has as many connections as it can"), "{aborted:?}");
 }
 
@@ -95,7 +95,7 @@ fn long_messages_come_by_the_extended_protocol() {
 
 #[test]
 fn requests_are_answered_or_not() {
-    let said = said(&[
+    let said = event_lines(&[
         (0.0, "18EA00F9#EBFE00"),
         (3.0, "18E8FF00#01FFFFFFF9EBFE00"),
         (10.0, "18EA03F9#E5FE00"),
@@ -117,7 +117,7 @@ fn requests_are_answered_or_not() {
 
 #[test]
 fn addresses_are_claimed_and_lost() {
-    let said = said(&[
+    let said = event_lines(&[
         (0.0, "18EEFF00#0100A0FF00000080"),
         (1.0, "18EEFF00#0000A0FF00000080"),
         (2.0, "18EEFFFE#0100A0FF00000080"),
@@ -143,7 +143,7 @@ fn a_database_gives_signals_of_one_and_of_many_frames() {
     let assembler = J1939::new(Some(Arc::new(decoder)));
     let frames = [(0.0, "0CF00400#FFFFFF6813FFFFFF")];
     assert_eq!(
-        testing::said(assembler, &frames),
+        testing::event_lines(assembler, &frames),
         ["j1939 0 > all EEC1: pgn 61444, priority 3, EngSpeed 621 rpm"]
     );
 }
@@ -184,7 +184,7 @@ fn messages_at_random_are_whole_and_right_or_said_to_be_broken() {
         }
         let records: Vec<_> = lines.iter().enumerate().map(|(ms, (_, frame))| at(ms as f64, frame)).collect();
         let events = testing::events(J1939::default(), &records);
-        let whole: Vec<_> = events.iter().filter(|event| event.kind == "message").collect();
+        let whole: Vec<_> = events.iter().filter(|event| event.kind == EventKind::Message).collect();
         for event in &whole {
             let source = event.from.node().unwrap();
             assert!(sent.contains(&(source, event.data.to_vec())), "round {round}: never sent: {event}");
@@ -233,18 +233,18 @@ fn frames_that_come_again_behind_the_last_one_are_no_fault() {
         (5.0, "18EB2100#0141424344454647"),
         (6.0, "18EC0021#130E0002FFEBFE00"),
     ];
-    let all = said(&frames);
+    let all = event_lines(&frames);
     assert_eq!(all.len(), 1, "{all:?}");
     assert!(all[0].contains("text \"ABCDEFGHIJKLMN\""), "{all:?}");
     // What comes long afterwards belongs to nothing.
-    let late = said(&[frames[0], frames[1], frames[2], frames[3], (9000.0, frames[5].1)]);
+    let late = event_lines(&[frames[0], frames[1], frames[2], frames[3], (9000.0, frames[5].1)]);
     assert!(late[1].ends_with("its beginning is missing"), "{late:?}");
 }
 
 /// Two nodes send to each other at the same time; one of them aborts.
 #[test]
 fn an_abort_ends_the_message_that_it_names() {
-    let all = said(&[
+    let all = event_lines(&[
         (0.0, "18EC2100#100E0002FFEBFE00"),
         (1.0, "18EC0021#100E0002FFDAFE00"),
         (2.0, "18EC0021#FF09FFFFFFDAFE00"),
@@ -278,17 +278,17 @@ fn one_frame_of_a_window_may_be_sent_again() {
         (25.0, "1CEB375E#073536373839404F"),
         (27.0, "1CEC5E37#13310007FF00E700"),
     ];
-    let whole = said(&frames);
+    let whole = event_lines(&frames);
     assert_eq!(whole.len(), 1, "{whole:?}");
     assert!(whole[0].contains("length 49 bytes") && whole[0].contains("0E 0F 10 11"), "{whole:?}");
     // The frame that the receiver missed may be one that was not captured the first time either.
     let mut missed = frames.to_vec();
     missed.remove(3);
-    let again = said(&missed);
+    let again = event_lines(&missed);
     assert_eq!(again[0].replace("1 frames", ""), whole[0].replace("1 frames", ""));
     // It did not come again: the message ends with the receiver's acknowledgement, as far as it came.
     missed.retain(|(_, frame)| !frame.starts_with("1CEB375E#02"));
-    let broken = said(&missed);
+    let broken = event_lines(&missed);
     assert_eq!(broken.len(), 1, "{broken:?}");
     assert!(
         broken[0].contains("received 7 bytes") && broken[0].contains("frame 3 came instead of 2"),
@@ -352,4 +352,24 @@ fn connections_with_frames_sent_again_are_whole() {
             assert!(sent.contains(&(source, event.data.to_vec())), "round {round}: never sent: {event}");
         }
     }
+}
+
+/// GB/T 27930: the group of a charger's recognition is TC1 elsewhere.
+#[test]
+fn a_chargers_messages_have_their_own_names() {
+    let title = |frame: &str| event_lines(&[(0.0, frame)]).remove(0);
+    let recognition = title("1801F456#0000000000FFFFFF");
+    assert!(recognition.contains("CRM charger recognition"), "{recognition}");
+    assert!(title("181056F4#DC05A00F0100FFFF").contains("BCL charging demand"));
+    assert!(title("18010300#0000000000FFFFFF").contains("TC1 transmission control"));
+}
+
+/// A readiness message from its frame to its fields.
+#[test]
+fn readiness_is_read_from_the_bus() {
+    let line = event_lines(&[(0.0, "18FECE00#0200141701000100")]).remove(0);
+    assert!(
+        line.contains("DM5 diagnostic readiness") && line.contains("obd_compliance 20 (HD OBD)"),
+        "{line}"
+    );
 }

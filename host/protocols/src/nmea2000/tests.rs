@@ -5,7 +5,7 @@ use crate::j1939::J1939;
 use crate::testing::{self, at, hex};
 
 fn marine(frames: &[(f64, &str)]) -> Vec<String> {
-    testing::said(J1939::nmea2000(None), frames)
+    testing::event_lines(J1939::nmea2000(None), frames)
 }
 
 #[test]
@@ -65,19 +65,19 @@ fn single_frames_and_fast_packets_have_their_values() {
 /// A manufacturer's code is there only if the group is a manufacturer's own; canboatjs reads the same.
 #[test]
 fn fields_that_are_not_always_there_are_read_where_they_are() {
-    let said = |data: &[u8]| {
+    let event_lines = |data: &[u8]| {
         let mut fields = Vec::new();
         describe(126_208, data, &mut fields);
         fields.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
     };
     // Reading fields of a position: unique number 7, no selection, one parameter.
-    let position = said(&[3, 0x01, 0xF8, 0x01, 7, 0, 1, 2]);
+    let position = event_lines(&[3, 0x01, 0xF8, 0x01, 7, 0, 1, 2]);
     assert!(
         position.contains("Unique ID 7, Number of Selection Pairs 0, Number of Parameters 1"),
         "{position}"
     );
     assert!(!position.contains("Manufacturer Code"), "{position}");
-    let own = said(&[3, 0x00, 0xFF, 0x01, 0x89, 0x98, 7, 0, 1, 2]);
+    let own = event_lines(&[3, 0x00, 0xFF, 0x01, 0x89, 0x98, 7, 0, 1, 2]);
     assert!(own.contains("Manufacturer Code 137 (Maretron)") && own.contains("Unique ID 7, "), "{own}");
 }
 

@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use crate::{Event, Protocol};
+use crate::{Event, EventKind, Protocol};
 
 /// How many characters of a value are kept.
 const MOST_TEXT: usize = 256;
@@ -25,17 +25,17 @@ pub(super) fn key_of(event: &Event) -> Option<ObjectKey> {
         Protocol::Kwp2000 => one("identifier", "local_identifier"),
         Protocol::Obd => Some(ObjectKey::Numbered("pid", [Some(bits("pid")?), Some(bits("sid")?), None])),
         Protocol::CanOpen => match event.kind {
-            "sdo_read" | "sdo_write" => {
+            EventKind::SdoRead | EventKind::SdoWrite => {
                 Some(ObjectKey::Numbered("object", [Some(bits("index")?), Some(bits("sub")?), None]))
             }
-            "pdo" => Some(ObjectKey::Titled(event.title.clone())),
+            EventKind::Pdo => Some(ObjectKey::Titled(event.title.clone())),
             _ => None,
         },
         Protocol::J1939 | Protocol::Nmea2000 => match event.kind {
-            "request" | "no_response" | "acknowledgement" => None,
+            EventKind::Request | EventKind::NoResponse | EventKind::Acknowledgement => None,
             _ => one("pgn", "pgn"),
         },
-        Protocol::DeviceNet if event.kind == "io" => Some(ObjectKey::Titled(event.title.clone())),
+        Protocol::DeviceNet if event.kind == EventKind::Io => Some(ObjectKey::Titled(event.title.clone())),
         Protocol::DeviceNet => {
             let numbers = [Some(bits("class")?), Some(bits("instance")?), bits("attribute")];
             Some(ObjectKey::Numbered("class", numbers))
@@ -45,19 +45,19 @@ pub(super) fn key_of(event: &Event) -> Option<ObjectKey> {
 }
 
 /// The object in words: its kind and number.
-pub(super) fn in_words(event: &Event) -> String {
+pub(super) fn object_text(event: &Event) -> String {
     let value = |name: &str| event.field(name).map_or_else(String::new, |field| field.value.to_string());
     match event.protocol {
         Protocol::Uds if event.field("did").is_some() => format!("did {}", value("did")),
         Protocol::Uds => format!("routine {}", value("routine")),
         Protocol::Kwp2000 => format!("identifier {}", value("local_identifier")),
         Protocol::Obd => format!("pid {} of service {}", value("pid"), value("sid")),
-        Protocol::CanOpen if event.kind != "pdo" => {
+        Protocol::CanOpen if event.kind != EventKind::Pdo => {
             let number = |name: &str| number(event, name).unwrap_or_default();
             format!("{:04X}:{:02X}", number("index") as u32, number("sub") as u32)
         }
         Protocol::J1939 | Protocol::Nmea2000 => format!("pgn {}", value("pgn")),
-        Protocol::DeviceNet if event.kind != "io" => {
+        Protocol::DeviceNet if event.kind != EventKind::Io => {
             let attribute = event.field("attribute").map(|field| format!(" attribute {}", field.value));
             let class = format!("class {} instance {}", value("class"), value("instance"));
             class + attribute.as_deref().unwrap_or_default()
@@ -84,8 +84,8 @@ pub(super) fn value_of(event: &Event) -> Option<String> {
     let has_value = match event.protocol {
         Protocol::Uds => event.fields.iter().filter(|field| field.name == "did").count() == 1,
         Protocol::Kwp2000 => true,
-        Protocol::CanOpen => event.kind != "pdo",
-        Protocol::DeviceNet => event.kind != "io",
+        Protocol::CanOpen => event.kind != EventKind::Pdo,
+        Protocol::DeviceNet => event.kind != EventKind::Io,
         _ => false,
     };
     let value = event.field("value").filter(|_| has_value && event.trouble.is_none())?;

@@ -11,7 +11,9 @@ use std::io::Read;
 use std::process::Command;
 
 use cantap_protocols::canopen::eds::{self, Eds};
-use cantap_protocols::{Announcement, Event, Evidence, Options, Party, Protocol, ReadItem, Reader, Value};
+use cantap_protocols::{
+    Announcement, Event, EventKind, Evidence, Options, Party, Protocol, ReadItem, Reader, Value,
+};
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
 const SCRIPT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/protocol_peer.py");
@@ -75,7 +77,7 @@ fn hex(bytes: &[u8]) -> String {
 /// Whether a field has the peer's value.
 fn agrees(event: &Event, name: &str, value: &serde_json::Value) -> bool {
     match name {
-        "kind" => return event.kind == value,
+        "kind" => return value == event.kind.name(),
         "source" => return event.from.node().is_some_and(|node| *value == node),
         "data" => {
             return hex(&event.data) == *value;
@@ -106,7 +108,7 @@ fn all_are_there(events: &[Event], said: &[serde_json::Value]) {
         assert!(there, "{expected} is not there, or not in its place:\n{}", text.join("\n"));
     }
     let troubled: Vec<_> =
-        events.iter().filter(|event| event.trouble.is_some() && event.kind != "sdo_read").collect();
+        events.iter().filter(|event| event.trouble.is_some() && event.kind != EventKind::SdoRead).collect();
     assert!(troubled.is_empty(), "{troubled:?}");
 }
 

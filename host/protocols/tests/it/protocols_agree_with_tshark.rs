@@ -11,7 +11,7 @@ use std::process::Command;
 
 use cantap_protocols::iso_tp::{FlowStatus, Pci, parse};
 use cantap_protocols::j1939::Header;
-use cantap_protocols::{Event, Options, Protocol, Reader};
+use cantap_protocols::{Event, EventKind, Options, Protocol, Reader};
 use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
 
 const BOAT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../formats/tests/data/nmea2000.log.gz");
@@ -216,7 +216,7 @@ fn uds_services() {
     let mut compared = 0;
     for (row, events) in rows.iter().zip(events(&frames, Protocol::Uds)) {
         for event in &events {
-            let refused = event.kind == "refusal";
+            let refused = event.kind == EventKind::Refusal;
             let theirs = |names: &[&str]| names.iter().find_map(|name| number(row, name));
             let sid = if refused { "uds.err.sid" } else { "uds.sid" };
             let pairs = [
@@ -386,20 +386,20 @@ fn canopen_objects() {
             };
             let node = event.node().map(f64::from);
             match event.kind {
-                "nmt" => {
+                EventKind::Nmt => {
                     is("canopen.nmt_ctrl.cd", ours(event, "command"));
                     is("canopen.nmt_ctrl.node_id", node);
                 }
-                "boot_up" | "state" => {
+                EventKind::BootUp | EventKind::State => {
                     is("canopen.node_id", node);
                     is("canopen.nmt_guard.state", Some(f64::from(frame.data()[0])));
                 }
-                "emergency" => {
+                EventKind::Emergency => {
                     is("canopen.node_id", node);
                     is("canopen.em.err_code", ours(event, "code"));
                     is("canopen.em.err_reg", ours(event, "register"));
                 }
-                "sdo_read" => {
+                EventKind::SdoRead => {
                     is("canopen.node_id", node);
                     is("canopen.sdo.main_idx", ours(event, "index"));
                     is("canopen.sdo.sub_idx", ours(event, "sub"));
@@ -410,11 +410,11 @@ fn canopen_objects() {
                         assert!(theirs.starts_with(&hex(&event.data)), "{event}: {theirs}");
                     }
                 }
-                "time" => {
+                EventKind::Time => {
                     is("canopen.time_stamp_ms", ours(event, "time_of_day_s").map(|s| (s * 1000.0).round()));
                     is("canopen.time_stamp_days", ours(event, "days_since_1984"));
                 }
-                "heartbeat_missing" => {}
+                EventKind::HeartbeatMissing => {}
                 other => panic!("{other}: {event}"),
             }
         }
@@ -449,7 +449,7 @@ fn devicenet_messages() {
             let node = event.node().map(f64::from);
             assert_eq!(number(row, "devicenet.src_mac_id"), node, "{event} {frame} {row:?}");
             match event.kind {
-                "duplicate_check" | "duplicate" => {
+                EventKind::DuplicateCheck | EventKind::Duplicate => {
                     for (name, theirs) in [
                         ("physical_port", "physical_port_number"),
                         ("vendor", "vendor"),
@@ -460,7 +460,7 @@ fn devicenet_messages() {
                     }
                     checks += 1;
                 }
-                "io" => {
+                EventKind::Io => {
                     let is_input = frame.id().raw() < 0x400;
                     let message = if is_input { "devicenet.grp_msg1.id" } else { "devicenet.grp_msg2.id" };
                     let expected = if is_input { 15.0 } else { 5.0 };

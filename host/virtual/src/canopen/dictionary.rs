@@ -2,43 +2,8 @@
 
 use std::collections::BTreeMap;
 
+use cantap_protocols::canopen::codec::sdo::{SdoObject, abort};
 use cantap_protocols::canopen::eds::{self, Eds};
-
-/// Why a transfer is aborted (CiA 301, table 22).
-pub mod abort {
-    /// The toggle bit did not change.
-    pub const TOGGLE: u32 = 0x0503_0000;
-    /// The other side fell silent.
-    pub const TIMEOUT: u32 = 0x0504_0000;
-    /// There is no such command.
-    pub const COMMAND: u32 = 0x0504_0001;
-    /// A block of no frames or more than 127.
-    pub const BLOCK_SIZE: u32 = 0x0504_0002;
-    /// A frame has the wrong number.
-    pub const SEQUENCE: u32 = 0x0504_0003;
-    /// The CRC of a block transfer is wrong.
-    pub const CRC: u32 = 0x0504_0004;
-    /// More than there is room for.
-    pub const MEMORY: u32 = 0x0504_0005;
-    /// It can only be written.
-    pub const WRITE_ONLY: u32 = 0x0601_0001;
-    /// It can only be read.
-    pub const READ_ONLY: u32 = 0x0601_0002;
-    /// There is no such object.
-    pub const NO_OBJECT: u32 = 0x0602_0000;
-    /// It cannot be mapped.
-    pub const NOT_MAPPABLE: u32 = 0x0604_0041;
-    /// More than eight bytes are mapped.
-    pub const PDO_LENGTH: u32 = 0x0604_0042;
-    /// The value has the wrong length.
-    pub const LENGTH: u32 = 0x0607_0010;
-    /// There is no such entry.
-    pub const NO_ENTRY: u32 = 0x0609_0011;
-    /// The value is invalid.
-    pub const VALUE: u32 = 0x0609_0030;
-    /// Not possible in this state.
-    pub const STATE: u32 = 0x0800_0022;
-}
 
 /// Longest value that is accepted, in bytes.
 pub const MOST_BYTES: usize = 1 << 16;
@@ -102,14 +67,14 @@ impl Dictionary {
     }
 
     /// A client reads.
-    pub fn read(&self, index: u16, sub: u8) -> Result<&[u8], u32> {
-        let entry = self.entry(index, sub)?;
+    pub fn read(&self, object: SdoObject) -> Result<&[u8], u32> {
+        let entry = self.entry(object.index, object.sub)?;
         if entry.can_read { Ok(&entry.value) } else { Err(abort::WRITE_ONLY) }
     }
 
     /// Whether a client may write this many bytes, or any number if it does not say.
-    pub fn may_write(&self, index: u16, sub: u8, bytes: Option<usize>) -> Result<(), u32> {
-        let entry = self.entry(index, sub)?;
+    pub fn may_write(&self, object: SdoObject, bytes: Option<usize>) -> Result<(), u32> {
+        let entry = self.entry(object.index, object.sub)?;
         if !entry.can_write {
             return Err(abort::READ_ONLY);
         }
@@ -121,8 +86,9 @@ impl Dictionary {
     }
 
     /// A client writes.
-    pub fn write(&mut self, index: u16, sub: u8, value: &[u8]) -> Result<(), u32> {
-        self.may_write(index, sub, Some(value.len()))?;
+    pub fn write(&mut self, object: SdoObject, value: &[u8]) -> Result<(), u32> {
+        self.may_write(object, Some(value.len()))?;
+        let SdoObject { index, sub } = object;
         let number = value.iter().take(4).rev().fold(0_u32, |number, byte| number << 8 | u32::from(*byte));
         match (index, sub) {
             // The history can only be cleared.

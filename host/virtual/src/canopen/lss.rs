@@ -1,7 +1,8 @@
 //! A slave of the layer setting services (CiA 305).
 
-/// The node has no number so far.
-pub const NO_NODE: u8 = 255;
+use cantap_protocols::canopen::codec::lss::{
+    Bound, LssRequest, LssResponse, NO_NODE, Part, Service, WHOLE_SCAN,
+};
 
 /// What a command from the master changes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -26,84 +27,96 @@ pub struct Slave {
     scanned: u8,
 }
 
-const fn answer(service: u8, rest: [u8; 4]) -> [u8; 8] {
-    let [a, b, c, d] = rest;
-    [service, a, b, c, d, 0, 0, 0]
-}
-
 impl Slave {
     pub const fn new(identity: [u32; 4], node: u8) -> Self {
         Self { identity, node, pending: node, configured: false, selected: 0, identified: 0, scanned: 0 }
     }
 
     /// Takes a frame from the master; returns the answer and what changes.
-    pub fn take(&mut self, bytes: [u8; 8]) -> (Option<[u8; 8]>, Option<Change>) {
-        let value = u32::from_le_bytes([bytes[1], bytes[2], bytes[3], bytes[4]]);
-        let said = match bytes[0] {
-            0x04 => {
-                self.configured = bytes[1] == 1;
-                // A node without a number takes part once it is released with one.
-                if !self.configured && self.node == NO_NODE && self.pending != NO_NODE {
-                    self.node = self.pending;
-                    return (None, Some(Change::Node));
-                }
-                None
+    pub fn take(&mut self, bytes: &[u8]) -> (Option<[u8; 8]>, Option<Change>) {
+        // All frames have 8 bytes (CiA 305, 3.2).
+        let Some(request) = LssRequest::decode(bytes).filter(|_| bytes.len() == 8) else {
+            return (None, None);
+        };
+        if let LssRequest::SwitchGlobal(mode) = request {
+            self.configured = mode == 1;
+            // A node without a number takes part once it is released with one.
+            if !self.configured && self.node == NO_NODE && self.pending != NO_NODE {
+                self.node = self.pending;
+                return (None, Some(Change::Node));
             }
-            part @ 0x40..=0x43 => {
-                let place = usize::from(part - 0x40);
-                let is_right = self.selected == place && self.identity[place] == value;
-                self.selected =
-                    if is_right { place + 1 } else { usize::from(place == 0 && self.identity[0] == value) };
-                if self.selected == 4 {
-                    (self.selected, self.configured) = (0, true);
-                    Some(answer(0x44, [0; 4]))
+            return (None, None);
+        }
+        (self.respond(request).map(LssResponse::encode), None)
+    }
+
+    fn respond(&mut self, request: LssRequest) -> Option<LssResponse> {
+        let outcome = |service, is_right: bool| {
+            Some(LssResponse::Outcome { service, error: u8::from(!is_right), device_error: 0 })
+        };
+        match request {
+            LssRequest::SwitchSelective(part, value) => {
+                let place = part as usize;
+                let is_right = self.selected == place && self.part(part) == value;
+                self.selected = if is_right {
+                    place + 1
                 } else {
-                    None
+                    usize::from(part == Part::Vendor && self.part(Part::Vendor) == value)
+                };
+                if self.selected < Part::ALL.len() {
+                    return None;
                 }
+                (self.selected, self.configured) = (0, true);
+                Some(LssResponse::Selected)
             }
-            part @ 0x46..=0x4B => {
-                let place = usize::from(part - 0x46);
+            LssRequest::Identify(bound, value) => {
+                let place = bound as usize;
                 let [vendor, product, revision, serial] = self.identity;
-                let is_right = match place {
-                    0 => vendor == value,
-                    1 => product == value,
-                    2 => revision >= value,
-                    3 => revision <= value,
-                    4 => serial >= value,
-                    _ => serial <= value,
+                let is_right = match bound {
+                    Bound::Vendor => vendor == value,
+                    Bound::Product => product == value,
+                    Bound::LowestRevision => revision >= value,
+                    Bound::HighestRevision => revision <= value,
+                    Bound::LowestSerial => serial >= value,
+                    Bound::HighestSerial => serial <= value,
                 };
                 self.identified =
                     if is_right && (place == 0 || self.identified == place) { place + 1 } else { 0 };
-                if self.identified == 6 { Some(answer(0x4F, [0; 4])) } else { None }
+                (self.identified == Bound::ALL.len()).then_some(LssResponse::Identified)
             }
-            0x4C if self.node == NO_NODE => Some(answer(0x50, [0; 4])),
-            0x51 if self.node == NO_NODE && !self.configured => {
-                self.scan(value, bytes[5], bytes[6], bytes[7])
+            LssRequest::IdentifyWithoutNumber if self.node == NO_NODE => Some(LssResponse::WithoutNumber),
+            LssRequest::FastScan { value, unchecked, part, next }
+                if self.node == NO_NODE && !self.configured =>
+            {
+                self.scan(value, unchecked, part, next)
             }
             _ if !self.configured => None,
-            0x11 => {
-                let is_right = matches!(bytes[1], 1..=127 | NO_NODE);
+            LssRequest::ConfigureNode(node) => {
+                let is_right = matches!(node, 1..=127 | NO_NODE);
                 if is_right {
-                    self.pending = bytes[1];
+                    self.pending = node;
                 }
-                Some(answer(0x11, [u8::from(!is_right), 0, 0, 0]))
+                outcome(Service::ConfigureNode, is_right)
             }
             // Table 0, without its reserved entry. The simulated bus keeps its bit rate.
-            0x13 => {
-                Some(answer(0x13, [u8::from(bytes[1] != 0 || !matches!(bytes[2], 0..=4 | 6..=8)), 0, 0, 0]))
+            LssRequest::ConfigureBitTiming { table, index } => {
+                outcome(Service::ConfigureBitTiming, table == 0 && matches!(index, 0..=4 | 6..=8))
             }
-            0x17 => Some(answer(0x17, [0; 4])),
-            part @ 0x5A..=0x5D => Some(answer(part, self.identity[usize::from(part - 0x5A)].to_le_bytes())),
-            0x5E => Some(answer(0x5E, [self.node, 0, 0, 0])),
+            LssRequest::Store => outcome(Service::Store, true),
+            LssRequest::Inquire(part) => Some(LssResponse::Address(part, self.part(part))),
+            LssRequest::InquireNode => Some(LssResponse::Node(self.node)),
             _ => None,
-        };
-        (said, None)
+        }
     }
 
-    fn scan(&mut self, value: u32, unchecked: u8, part: u8, next: u8) -> Option<[u8; 8]> {
-        if unchecked == 0x80 {
+    const fn part(&self, part: Part) -> u32 {
+        self.identity[part as usize]
+    }
+
+    fn scan(&mut self, value: u32, unchecked: u8, part: u8, next: u8) -> Option<LssResponse> {
+        if unchecked == WHOLE_SCAN {
             self.scanned = 0;
-            return Some(answer(0x4F, [0; 4]));
+            return Some(LssResponse::Identified);
         }
         let own = *self.identity.get(usize::from(part))?;
         if part != self.scanned || unchecked > 31 || own >> unchecked != value >> unchecked {
@@ -111,7 +124,7 @@ impl Slave {
         }
         self.scanned = next;
         self.configured = unchecked == 0 && next < part;
-        Some(answer(0x4F, [0; 4]))
+        Some(LssResponse::Identified)
     }
 
     /// The new number applies from the next reset.

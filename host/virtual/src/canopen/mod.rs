@@ -10,10 +10,10 @@ mod sdo;
 #[cfg(test)]
 mod tests;
 
+use cantap_protocols::canopen::codec::lss::NO_NODE;
 use cantap_protocols::canopen::eds::Eds;
 use cantap_wire::Frame;
 
-use self::lss::NO_NODE;
 use self::node::CanOpenNode;
 use crate::simbus::{Senders, arbitration_field};
 
@@ -48,11 +48,11 @@ impl CanOpenBus {
     /// Of the frames that are due, the one with the lowest identifier, with its node.
     fn first(&mut self, now_ns: u64) -> Option<(usize, Frame)> {
         self.advance(now_ns);
-        let wishes = self.nodes.iter().enumerate().filter_map(|(place, node)| {
-            let (due_ns, frame) = node.wish()?;
+        let bids = self.nodes.iter().enumerate().filter_map(|(place, node)| {
+            let (due_ns, frame) = node.bid()?;
             (due_ns <= now_ns).then_some((place, frame))
         });
-        wishes.min_by_key(|(_, frame)| arbitration_field(frame.id(), frame.is_remote()))
+        bids.min_by_key(|(_, frame)| arbitration_field(frame.id(), frame.is_remote()))
     }
 }
 

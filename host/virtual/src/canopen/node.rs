@@ -2,11 +2,13 @@
 
 use std::collections::VecDeque;
 
+use cantap_protocols::canopen::codec::lss::{self, NO_NODE};
+use cantap_protocols::canopen::codec::sdo::SdoObject;
 use cantap_protocols::canopen::eds::Eds;
 use cantap_wire::{Frame, Id};
 
 use super::dictionary::Dictionary;
-use super::lss::{Change, NO_NODE, Slave};
+use super::lss::{Change, Slave};
 use super::sdo::Server;
 
 const MS_NS: u64 = 1_000_000;
@@ -25,8 +27,6 @@ const RAMP: i64 = 2000;
 const STEP_NS: u64 = 10 * MS_NS;
 
 const SYNC: u32 = 0x80;
-const LSS_MASTER: u32 = 0x7E5;
-const LSS_SLAVE: u32 = 0x7E4;
 
 /// States as heartbeats say them (CiA 301, table 31).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -126,7 +126,7 @@ impl CanOpenNode {
     }
 
     /// The next frame to send, and the earliest time for it.
-    pub fn wish(&self) -> Option<(u64, Frame)> {
+    pub fn bid(&self) -> Option<(u64, Frame)> {
         self.waiting.front().copied()
     }
 
@@ -147,7 +147,7 @@ impl CanOpenNode {
                 due_ns = due_ns.min(*at_ns);
             }
         }
-        due_ns.min(self.wish().map_or(u64::MAX, |(at_ns, _)| at_ns))
+        due_ns.min(self.bid().map_or(u64::MAX, |(at_ns, _)| at_ns))
     }
 
     fn beat_period_ns(&self) -> u64 {
@@ -290,23 +290,21 @@ impl CanOpenNode {
         if heard.is_remote() {
             // Node guarding, if there is no heartbeat.
             if id == 0x700 + node && self.state != State::Silent && self.beat_period_ns() == 0 {
-                let said = self.state.code() | u8::from(self.toggle) << 7;
+                let state = self.state.code() | u8::from(self.toggle) << 7;
                 self.toggle = !self.toggle;
-                self.send(at_ns, frame(id, &[said]));
+                self.send(at_ns, frame(id, &[state]));
             }
             return;
         }
         let data = heard.data();
-        if id == LSS_MASTER {
-            if let Ok(bytes) = data.try_into() {
-                let (said, change) = self.slave.take(bytes);
-                if let Some(bytes) = said {
-                    self.send(at_ns, frame(LSS_SLAVE, &bytes));
-                }
-                if change == Some(Change::Node) {
-                    self.load();
-                    self.boots_ns = Some(now_ns + BOOT_NS);
-                }
+        if id == lss::REQUEST.raw() {
+            let (answer, change) = self.slave.take(data);
+            if let Some(bytes) = answer {
+                self.send(at_ns, frame(lss::RESPONSE.raw(), &bytes));
+            }
+            if change == Some(Change::Node) {
+                self.load();
+                self.boots_ns = Some(now_ns + BOOT_NS);
             }
             return;
         }
@@ -325,13 +323,13 @@ impl CanOpenNode {
             _ if id == 0x600 + node && matches!(self.state, State::PreOperational | State::Operational) => {
                 let Ok(bytes) = data.try_into() else { return };
                 self.drive(now_ns);
-                let said = self.server.take(bytes, &mut self.dictionary, now_ns);
+                let reply = self.server.take(bytes, &mut self.dictionary, now_ns);
                 let mut at_ns = at_ns;
-                for bytes in said.frames {
+                for bytes in reply.frames {
                     self.send(at_ns, frame(0x580 + node, &bytes));
                     at_ns += SEGMENT_GAP_NS;
                 }
-                if let Some(object) = said.written {
+                if let Some(object) = reply.written {
                     self.written(object, now_ns);
                 }
             }
@@ -375,8 +373,8 @@ impl CanOpenNode {
     }
 
     /// Reacts to an object that a client has written.
-    fn written(&mut self, object: (u16, u8), now_ns: u64) {
-        match object {
+    fn written(&mut self, object: SdoObject, now_ns: u64) {
+        match (object.index, object.sub) {
             (0x1003, 0) => self.dictionary.set(0x1003, 1, &[0; 4]),
             (0x1017, 0) => self.beat_ns = now_ns + self.beat_period_ns(),
             (0x1800 | 0x1801, 5) => self.timers_ns = [now_ns; 2],

@@ -1,11 +1,12 @@
 //! The SDO server: expedited, in segments and in blocks, in both directions (CiA 301, 7.2.4.3).
 
-use cantap_protocols::canopen::crc_of;
+use cantap_protocols::canopen::codec::sdo::{
+    BlockEnd, BlockSegment, Content, MOST_BLOCK_FRAMES, SEGMENT_BYTES, SdoObject, SdoRequest, SdoResponse,
+    Segment, abort, crc_of,
+};
 
-use super::dictionary::{Dictionary, MOST_BYTES, abort};
+use super::dictionary::{Dictionary, MOST_BYTES};
 
-/// Bytes of a segment.
-const SEGMENT: usize = 7;
 /// Frames in a block that is written: few, so that a short transfer has several blocks.
 const BLOCK: u8 = 16;
 /// After this silence of the client, a transfer ends.
@@ -48,7 +49,7 @@ enum State {
 #[derive(Debug)]
 pub struct Server {
     state: State,
-    object: (u16, u8),
+    object: SdoObject,
     until_ns: u64,
     /// The segment of the next block to lose on purpose; 0 for none.
     pub loses: u8,
@@ -56,14 +57,20 @@ pub struct Server {
 
 /// Frames to send, and what was written.
 #[derive(Debug, Default)]
-pub struct Said {
+pub struct Reply {
     pub frames: Vec<[u8; 8]>,
-    pub written: Option<(u16, u8)>,
+    pub written: Option<SdoObject>,
+}
+
+impl Reply {
+    fn push(&mut self, response: SdoResponse) {
+        self.frames.push(response.encode());
+    }
 }
 
 impl Default for Server {
     fn default() -> Self {
-        Self { state: State::Idle, object: (0, 0), until_ns: 0, loses: 0 }
+        Self { state: State::Idle, object: SdoObject::default(), until_ns: 0, loses: 0 }
     }
 }
 
@@ -80,131 +87,126 @@ impl Server {
 
     fn abort(&mut self, code: u32) -> [u8; 8] {
         self.state = State::Idle;
-        self.frame(0x80, code.to_le_bytes())
-    }
-
-    fn frame(&self, command: u8, last: [u8; 4]) -> [u8; 8] {
-        let ([low, high], sub) = (self.object.0.to_le_bytes(), self.object.1);
-        let [a, b, c, d] = last;
-        [command, low, high, sub, a, b, c, d]
+        SdoResponse::Abort(self.object, code).encode()
     }
 
     /// Takes a frame from the client.
-    pub fn take(&mut self, bytes: [u8; 8], dictionary: &mut Dictionary, now_ns: u64) -> Said {
+    pub fn take(&mut self, bytes: [u8; 8], dictionary: &mut Dictionary, now_ns: u64) -> Reply {
         self.until_ns = now_ns + PATIENCE_NS;
-        let mut said = Said::default();
-        if let Err(code) = self.command(bytes, dictionary, &mut said) {
-            said.frames = vec![self.abort(code)];
-            said.written = None;
+        let mut reply = Reply::default();
+        if let Err(code) = self.frame(bytes, dictionary, &mut reply) {
+            reply.frames = vec![self.abort(code)];
+            reply.written = None;
         }
-        said
+        reply
     }
 
-    fn command(&mut self, bytes: [u8; 8], dictionary: &mut Dictionary, said: &mut Said) -> Result<(), u32> {
-        let command = bytes[0];
-        if command == 0x80 {
+    fn frame(&mut self, bytes: [u8; 8], dictionary: &mut Dictionary, reply: &mut Reply) -> Result<(), u32> {
+        let request = SdoRequest::decode(bytes);
+        if let Some(SdoRequest::Abort(..)) = request {
             self.state = State::Idle;
             return Ok(());
         }
         if let State::WriteBlocks { ended: false, .. } = self.state {
-            return self.block_segment(bytes, said);
+            return self.block_segment(BlockSegment::decode(bytes), reply);
         }
-        let named = (u16::from_le_bytes([bytes[1], bytes[2]]), bytes[3]);
-        let size = u32::from_le_bytes([bytes[4], bytes[5], bytes[6], bytes[7]]) as usize;
-        match (command >> 5, command & 3) {
-            (1, kind) => {
-                self.object = named;
-                self.state = State::Idle;
-                if kind & 2 != 0 {
-                    let unused = if kind & 1 == 0 { 0 } else { usize::from(command >> 2 & 3) };
-                    self.write(&bytes[4..8 - unused], dictionary, said)?;
-                } else {
-                    let size = (kind & 1 != 0).then_some(size);
-                    dictionary.may_write(named.0, named.1, size)?;
-                    self.state = State::Write { data: Vec::new(), size, toggle: false };
+        self.request(request.ok_or(abort::COMMAND)?, dictionary, reply)
+    }
+
+    fn request(
+        &mut self,
+        request: SdoRequest,
+        dictionary: &mut Dictionary,
+        reply: &mut Reply,
+    ) -> Result<(), u32> {
+        if request.begins() {
+            self.state = State::Idle;
+        }
+        match request {
+            SdoRequest::Download(object, content) => {
+                self.object = object;
+                match content {
+                    Content::Expedited { bytes, length } => {
+                        self.write(&bytes[..usize::from(length.unwrap_or(4))], dictionary, reply)?;
+                    }
+                    Content::Segmented(size) => {
+                        let size = size.map(|size| size as usize);
+                        dictionary.may_write(object, size)?;
+                        self.state = State::Write { data: Vec::new(), size, toggle: false };
+                    }
                 }
-                said.frames.push(self.frame(0x60, [0; 4]));
+                reply.push(SdoResponse::Download(object));
                 Ok(())
             }
-            (0, _) => self.written_segment(bytes, dictionary, said),
-            (2, _) => {
-                self.object = named;
-                self.state = State::Idle;
-                let data = dictionary.read(named.0, named.1)?.to_vec();
-                self.begin_reading(data, said);
+            SdoRequest::DownloadSegment(segment) => self.written_segment(segment, dictionary, reply),
+            SdoRequest::Upload(object) => {
+                self.object = object;
+                let data = dictionary.read(object)?.to_vec();
+                self.begin_reading(data, reply);
                 Ok(())
             }
-            (3, _) => self.read_segment(command, said),
-            (5, 0) => {
-                self.object = named;
-                self.state = State::Idle;
-                let data = dictionary.read(named.0, named.1)?.to_vec();
-                let (block, threshold) = (bytes[4], usize::from(bytes[5]));
-                if !(1..=127).contains(&block) {
+            SdoRequest::UploadSegment { toggle } => self.read_segment(toggle, reply),
+            SdoRequest::BlockUpload { object, block_size, threshold, .. } => {
+                self.object = object;
+                let data = dictionary.read(object)?.to_vec();
+                if !(1..=MOST_BLOCK_FRAMES).contains(&block_size) {
                     return Err(abort::BLOCK_SIZE);
                 }
                 // So short that the client wants it without blocks.
-                if data.len() <= threshold {
-                    self.begin_reading(data, said);
+                if data.len() <= usize::from(threshold) {
+                    self.begin_reading(data, reply);
                     return Ok(());
                 }
-                said.frames.push(self.frame(0xC6, (data.len() as u32).to_le_bytes()));
-                self.state = State::ReadBlocks { data, at: 0, block, sent: 0, ends: false };
+                reply.push(SdoResponse::BlockUpload { object, crc: true, size: Some(data.len() as u32) });
+                self.state = State::ReadBlocks { data, at: 0, block: block_size, sent: 0, ends: false };
                 Ok(())
             }
-            (5, 3) => {
-                self.send_block(said);
+            SdoRequest::BlockUploadStart => {
+                self.send_block(reply);
                 Ok(())
             }
-            (5, 2) => self.block_confirmed(bytes[1], bytes[2], said),
-            (5, _) => {
+            SdoRequest::BlockUploadAcknowledge { taken, block_size } => {
+                self.block_confirmed(taken, block_size, reply)
+            }
+            SdoRequest::BlockUploadEnd | SdoRequest::Abort(..) => {
                 self.state = State::Idle;
                 Ok(())
             }
-            (6, kind) if kind & 1 == 0 => {
-                self.object = named;
-                self.state = State::Idle;
-                let size = (kind & 2 != 0).then_some(size);
-                dictionary.may_write(named.0, named.1, size)?;
-                let with_crc = command & 4 != 0;
-                self.state = State::WriteBlocks { data: Vec::new(), size, next: 1, with_crc, ended: false };
-                said.frames.push(self.frame(0xA4, [BLOCK, 0, 0, 0]));
+            SdoRequest::BlockDownload { object, crc, size } => {
+                self.object = object;
+                let size = size.map(|size| size as usize);
+                dictionary.may_write(object, size)?;
+                self.state =
+                    State::WriteBlocks { data: Vec::new(), size, next: 1, with_crc: crc, ended: false };
+                reply.push(SdoResponse::BlockDownload { object, crc: true, block_size: BLOCK });
                 Ok(())
             }
-            (6, _) => self.end_of_blocks(bytes, dictionary, said),
-            _ => Err(abort::COMMAND),
+            SdoRequest::BlockDownloadEnd(end) => self.end_of_blocks(end, dictionary, reply),
         }
     }
 
-    fn write(&self, value: &[u8], dictionary: &mut Dictionary, said: &mut Said) -> Result<(), u32> {
-        let (index, sub) = self.object;
-        dictionary.write(index, sub, value)?;
-        said.written = Some(self.object);
+    fn write(&self, value: &[u8], dictionary: &mut Dictionary, reply: &mut Reply) -> Result<(), u32> {
+        dictionary.write(self.object, value)?;
+        reply.written = Some(self.object);
         Ok(())
     }
 
-    fn begin_reading(&mut self, data: Vec<u8>, said: &mut Said) {
-        if (1..=4).contains(&data.len()) {
-            let mut last = [0; 4];
-            last[..data.len()].copy_from_slice(&data);
-            said.frames.push(self.frame(0x43 | (4 - data.len() as u8) << 2, last));
-        } else {
-            said.frames.push(self.frame(0x41, (data.len() as u32).to_le_bytes()));
+    fn begin_reading(&mut self, data: Vec<u8>, reply: &mut Reply) {
+        let content = Content::expedited(&data).unwrap_or(Content::Segmented(Some(data.len() as u32)));
+        reply.push(SdoResponse::Upload(self.object, content));
+        if let Content::Segmented(_) = content {
             self.state = State::Read { data, at: 0, toggle: false };
         }
     }
 
-    fn read_segment(&mut self, command: u8, said: &mut Said) -> Result<(), u32> {
+    fn read_segment(&mut self, asked: bool, reply: &mut Reply) -> Result<(), u32> {
         let State::Read { data, at, toggle } = &mut self.state else { return Err(abort::COMMAND) };
-        if (command & 0x10 != 0) != *toggle {
+        if asked != *toggle {
             return Err(abort::TOGGLE);
         }
-        let part = &data[*at..data.len().min(*at + SEGMENT)];
+        let part = &data[*at..data.len().min(*at + SEGMENT_BYTES)];
         let is_last = *at + part.len() == data.len();
-        let mut frame = [0; 8];
-        frame[0] = u8::from(*toggle) << 4 | ((SEGMENT - part.len()) as u8) << 1 | u8::from(is_last);
-        frame[1..=part.len()].copy_from_slice(part);
-        said.frames.push(frame);
+        reply.push(SdoResponse::UploadSegment(Segment::new(asked, is_last, part)));
         (*at, *toggle) = (*at + part.len(), !*toggle);
         if is_last {
             self.state = State::Idle;
@@ -214,52 +216,48 @@ impl Server {
 
     fn written_segment(
         &mut self,
-        bytes: [u8; 8],
+        segment: Segment,
         dictionary: &mut Dictionary,
-        said: &mut Said,
+        reply: &mut Reply,
     ) -> Result<(), u32> {
         let State::Write { data, size, toggle } = &mut self.state else { return Err(abort::COMMAND) };
-        if (bytes[0] & 0x10 != 0) != *toggle {
+        if segment.toggle != *toggle {
             return Err(abort::TOGGLE);
         }
-        data.extend_from_slice(&bytes[1..8 - usize::from(bytes[0] >> 1 & 7)]);
+        data.extend_from_slice(segment.data());
         if data.len() > MOST_BYTES {
             return Err(abort::MEMORY);
         }
-        let answer = [0x20 | u8::from(*toggle) << 4, 0, 0, 0, 0, 0, 0, 0];
         *toggle = !*toggle;
-        if bytes[0] & 1 != 0 {
+        if segment.is_last {
             if size.is_some_and(|size| size != data.len()) {
                 return Err(abort::LENGTH);
             }
             let data = std::mem::take(data);
             self.state = State::Idle;
-            self.write(&data, dictionary, said)?;
+            self.write(&data, dictionary, reply)?;
         }
-        said.frames.push(answer);
+        reply.push(SdoResponse::DownloadSegment { toggle: segment.toggle });
         Ok(())
     }
 
     /// Sends a block, from where the last one was confirmed.
-    fn send_block(&mut self, said: &mut Said) {
+    fn send_block(&mut self, reply: &mut Reply) {
         let loses = std::mem::take(&mut self.loses);
         let State::ReadBlocks { data, at, block, sent, ends } = &mut self.state else { return };
         (*sent, *ends) = (0, false);
         while *sent < *block && !*ends {
-            let from = *at + usize::from(*sent) * SEGMENT;
-            let part = &data[from.min(data.len())..data.len().min(from + SEGMENT)];
-            *ends = from + SEGMENT >= data.len();
+            let from = *at + usize::from(*sent) * SEGMENT_BYTES;
+            let part = &data[from.min(data.len())..data.len().min(from + SEGMENT_BYTES)];
+            *ends = from + SEGMENT_BYTES >= data.len();
             *sent += 1;
-            let mut frame = [0; 8];
-            frame[0] = u8::from(*ends) << 7 | *sent;
-            frame[1..=part.len()].copy_from_slice(part);
             if *sent != loses {
-                said.frames.push(frame);
+                reply.frames.push(BlockSegment::new(*sent, *ends, part).encode());
             }
         }
     }
 
-    fn block_confirmed(&mut self, taken: u8, next: u8, said: &mut Said) -> Result<(), u32> {
+    fn block_confirmed(&mut self, taken: u8, next: u8, reply: &mut Reply) -> Result<(), u32> {
         let State::ReadBlocks { data, at, block, sent, ends } = &mut self.state else {
             return Err(abort::COMMAND);
         };
@@ -267,40 +265,37 @@ impl Server {
             return Err(abort::SEQUENCE);
         }
         if *ends && taken == *sent {
-            let unused = (SEGMENT - data.len() % SEGMENT) % SEGMENT;
-            let unused = if data.is_empty() { SEGMENT } else { unused };
-            let [low, high] = crc_of(data).to_le_bytes();
-            said.frames.push([0xC1 | (unused as u8) << 2, low, high, 0, 0, 0, 0, 0]);
+            reply.push(SdoResponse::BlockUploadEnd(BlockEnd::of(data.len(), crc_of(data))));
             return Ok(());
         }
-        if !(1..=127).contains(&next) {
+        if !(1..=MOST_BLOCK_FRAMES).contains(&next) {
             return Err(abort::BLOCK_SIZE);
         }
-        (*at, *block) = (*at + usize::from(taken) * SEGMENT, next);
-        self.send_block(said);
+        (*at, *block) = (*at + usize::from(taken) * SEGMENT_BYTES, next);
+        self.send_block(reply);
         Ok(())
     }
 
-    fn block_segment(&mut self, bytes: [u8; 8], said: &mut Said) -> Result<(), u32> {
+    fn block_segment(&mut self, segment: BlockSegment, reply: &mut Reply) -> Result<(), u32> {
         let State::WriteBlocks { data, next, ended, .. } = &mut self.state else {
             return Err(abort::COMMAND);
         };
-        let (number, is_last) = (bytes[0] & 0x7F, bytes[0] & 0x80 != 0);
+        let BlockSegment { number, is_last, bytes } = segment;
         if number == 0 || number > BLOCK {
             return Err(abort::SEQUENCE);
         }
         if number == self.loses {
             self.loses = 0;
         } else if number == *next {
-            data.extend_from_slice(&bytes[1..]);
+            data.extend_from_slice(&bytes);
             *next += 1;
             *ended = is_last;
         }
-        if data.len() > MOST_BYTES + SEGMENT {
+        if data.len() > MOST_BYTES + SEGMENT_BYTES {
             return Err(abort::MEMORY);
         }
         if number == BLOCK || is_last {
-            said.frames.push([0xA2, *next - 1, BLOCK, 0, 0, 0, 0, 0]);
+            reply.push(SdoResponse::BlockDownloadAcknowledge { taken: *next - 1, block_size: BLOCK });
             *next = 1;
         }
         Ok(())
@@ -308,15 +303,15 @@ impl Server {
 
     fn end_of_blocks(
         &mut self,
-        bytes: [u8; 8],
+        end: BlockEnd,
         dictionary: &mut Dictionary,
-        said: &mut Said,
+        reply: &mut Reply,
     ) -> Result<(), u32> {
         let State::WriteBlocks { data, size, with_crc, .. } = &mut self.state else {
             return Err(abort::COMMAND);
         };
-        data.truncate(data.len().saturating_sub(usize::from(bytes[0] >> 2 & 7)));
-        if *with_crc && crc_of(data) != u16::from_le_bytes([bytes[1], bytes[2]]) {
+        data.truncate(data.len().saturating_sub(end.unused.into()));
+        if *with_crc && crc_of(data) != end.crc {
             return Err(abort::CRC);
         }
         if size.is_some_and(|size| size != data.len()) {
@@ -324,8 +319,8 @@ impl Server {
         }
         let data = std::mem::take(data);
         self.state = State::Idle;
-        self.write(&data, dictionary, said)?;
-        said.frames.push([0xA1, 0, 0, 0, 0, 0, 0, 0]);
+        self.write(&data, dictionary, reply)?;
+        reply.push(SdoResponse::BlockDownloadEnd);
         Ok(())
     }
 }

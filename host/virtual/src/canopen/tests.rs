@@ -2,7 +2,7 @@ use std::collections::VecDeque;
 use std::fmt::Write as _;
 
 use cantap_protocols::canopen::CanOpen;
-use cantap_protocols::{Assembler, Event};
+use cantap_protocols::{Assembler, Event, EventKind};
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 use cantap_wire::Id;
 
@@ -115,7 +115,7 @@ fn a_node_boots_beats_and_follows_its_master() {
     );
     // Too short.
     assert!(bus.ask("205#0F00").iter().any(|frame| frame == "085#1082010000000000"));
-    assert!(bus.events().iter().any(|event| event.kind == "emergency"));
+    assert!(bus.events().iter().any(|event| event.kind == EventKind::Emergency));
     bus.send("000#8105");
     bus.pass(200);
     assert!(bus.heard.contains(&"705#00".to_owned()));
@@ -171,7 +171,7 @@ fn blocks_go_both_ways_with_what_is_lost_sent_again() {
         .flat_map(|place| bus.ask(&segment(place + 1, 14 + usize::from(place) * 7, place == 2)))
         .collect();
     assert_eq!(again, ["585#A203100000000000"]);
-    let [low, high] = cantap_protocols::canopen::crc_of(&bytes).to_le_bytes();
+    let [low, high] = cantap_protocols::canopen::codec::sdo::crc_of(&bytes).to_le_bytes();
     assert_eq!(bus.ask(&format!("605#D5{low:02X}{high:02X}0000000000")), ["585#A100000000000000"]);
     // Back, in blocks of four, the second segment lost.
     bus.ask("605#2F04200002000000");
@@ -184,7 +184,10 @@ fn blocks_go_both_ways_with_what_is_lost_sent_again() {
     // The listener has both, complete.
     let events = bus.events();
     let blocks: Vec<_> = events.iter().filter(|event| event.data[..] == bytes[..]).collect();
-    assert_eq!(blocks.iter().map(|event| event.kind).collect::<Vec<_>>(), ["sdo_write", "sdo_read"]);
+    assert_eq!(
+        blocks.iter().map(|event| event.kind).collect::<Vec<_>>(),
+        [EventKind::SdoWrite, EventKind::SdoRead]
+    );
     assert!(blocks.iter().all(|event| event.trouble.is_none()), "{blocks:?}");
     // A wrong CRC is refused.
     bus.ask("605#C600200007000000");

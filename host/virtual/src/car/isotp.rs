@@ -3,17 +3,17 @@
 
 use std::collections::VecDeque;
 
+use cantap_protocols::iso_tp::{FlowStatus, Pci, parse};
 use cantap_wire::{Frame, Id};
 
 /// Longest request that is accepted, in bytes. For longer ones, flow control reports an overflow.
-const MAX_REQUEST: usize = 512;
+const MAX_REQUEST: u32 = 512;
 /// A transfer ends after this much silence from the other side (N_Bs, N_Cr).
 const PATIENCE_NS: u64 = 1_000_000_000;
 /// How long an ECU takes to answer.
 const THINKS_NS: u64 = 4_000_000;
 /// The time until the next frame of an answer, if allowed.
 const NEXT_NS: u64 = 400_000;
-const MS_NS: u64 = 1_000_000;
 /// Fills frames to eight bytes.
 const PADDING: u8 = 0xAA;
 
@@ -56,44 +56,43 @@ impl IsoTp {
         Self { answers_with, ready: VecDeque::new(), sending: None, receiving: None }
     }
 
-    fn frame(&self, bytes: &[u8]) -> Frame {
-        let mut data = [PADDING; 8];
-        data[..bytes.len()].copy_from_slice(bytes);
-        Frame::from_bus(self.answers_with, false, 8, data)
+    fn frame(&self, pci: Pci<'_>) -> Frame {
+        let (bytes, length) = pci.encode(None, Some(PADDING));
+        Frame::from_bus(self.answers_with, false, length, bytes)
     }
 
     /// Takes a frame to this ECU. Returns a complete request. Only single frames are sent to all ECUs at
     /// once.
     pub fn hear(&mut self, frame: &Frame, to_all: bool, now_ns: u64) -> Option<Vec<u8>> {
-        let data = frame.data();
-        let (&first, rest) = data.split_first()?;
-        match first >> 4 {
-            0 => {
-                let length = usize::from(first & 15);
-                let request = rest.get(..length).filter(|request| !request.is_empty())?;
+        let Ok(pci) = parse(frame.data(), 0) else {
+            // Flow control of a reserved status ends an answer (N_INVALID_FS in ISO 15765-2); other faults change nothing.
+            if !to_all && frame.data().first().is_some_and(|first| first >> 4 == 3) {
+                self.sending = self.sending.take().filter(|sending| !sending.waits);
+            }
+            return None;
+        };
+        match pci? {
+            Pci::Single(request) => {
                 self.receiving = None;
                 Some(request.to_vec())
             }
-            1 if !to_all => {
-                let length = usize::from(first & 15) << 8 | usize::from(*rest.first()?);
-                // It would have fitted in a single frame.
-                if length < 8 || data.len() < 8 {
-                    return None;
-                }
+            // One byte less would have fitted in a single frame.
+            Pci::First { length, data } if !to_all && length >= 8 => {
                 let takes = length <= MAX_REQUEST;
-                let go_on = self.frame(&[if takes { 0x30 } else { 0x32 }, 0, 0]);
-                self.ready.push_back((now_ns + NEXT_NS, go_on));
+                let status = if takes { FlowStatus::Go } else { FlowStatus::Overflow };
+                let flow = self.frame(Pci::Flow { status, block_size: 0, separation_us: 0 });
+                self.ready.push_back((now_ns + NEXT_NS, flow));
                 self.receiving = takes.then(|| Receiving {
-                    data: data[2..].to_vec(),
-                    length,
+                    data: data.to_vec(),
+                    length: length as usize,
                     number: 1,
                     until_ns: now_ns + PATIENCE_NS,
                 });
                 None
             }
-            2 if !to_all => self.take_consecutive(first & 15, rest, now_ns),
-            3 if !to_all => {
-                self.take_flow_control(first & 15, rest, now_ns);
+            Pci::Consecutive { number, data } if !to_all => self.take_consecutive(number, data, now_ns),
+            Pci::Flow { status, block_size, separation_us } if !to_all => {
+                self.take_flow_control(status, block_size, separation_us, now_ns);
                 None
             }
             _ => None,
@@ -116,23 +115,17 @@ impl IsoTp {
         Some(receiving.data)
     }
 
-    fn take_flow_control(&mut self, status: u8, rest: &[u8], now_ns: u64) {
+    fn take_flow_control(&mut self, status: FlowStatus, block_size: u8, separation_us: u32, now_ns: u64) {
         let Some(sending) = self.sending.as_mut().filter(|sending| sending.waits) else { return };
-        let (Some(&block), Some(&gap)) = (rest.first(), rest.get(1)) else { return };
         match status {
-            0 => {
+            FlowStatus::Go => {
                 sending.waits = false;
-                sending.block = (block > 0).then_some(block);
-                // Reserved values mean the longest (ISO 15765-2:2016, 9.6.5.5).
-                sending.gap_ns = match gap {
-                    0..=0x7F => u64::from(gap) * MS_NS,
-                    0xF1..=0xF9 => u64::from(gap & 15) * 100_000,
-                    _ => 127 * MS_NS,
-                };
+                sending.block = (block_size > 0).then_some(block_size);
+                sending.gap_ns = u64::from(separation_us) * 1000;
                 sending.next_ns = now_ns + NEXT_NS;
             }
-            1 => sending.until_ns = now_ns + PATIENCE_NS,
-            _ => self.sending = None,
+            FlowStatus::Wait => sending.until_ns = now_ns + PATIENCE_NS,
+            FlowStatus::Overflow => self.sending = None,
         }
     }
 
@@ -141,16 +134,17 @@ impl IsoTp {
         self.sending = None;
         self.ready.clear();
         let at_ns = now_ns + THINKS_NS;
-        if data.len() < 8 {
-            let single = [&[data.len() as u8][..], &data].concat();
-            self.ready.push_back((at_ns, self.frame(&single)));
+        let single = Pci::Single(&data);
+        if data.len() <= single.room(None) {
+            self.ready.push_back((at_ns, self.frame(single)));
             return;
         }
-        let head = [0x10 | (data.len() >> 8) as u8, data.len() as u8];
-        self.ready.push_back((at_ns, self.frame(&[&head, &data[..6]].concat())));
+        let first = Pci::First { length: data.len() as u32, data: &data };
+        let at = first.room(None);
+        self.ready.push_back((at_ns, self.frame(first)));
         self.sending = Some(Sending {
             data,
-            at: 6,
+            at,
             number: 1,
             block: None,
             gap_ns: 0,
@@ -177,7 +171,7 @@ impl IsoTp {
         }
         let frame = self.peek()?;
         let sending = self.sending.as_mut()?;
-        sending.at += 7;
+        sending.at += Pci::Consecutive { number: 0, data: &[] }.room(None);
         sending.number = (sending.number + 1) & 15;
         sending.next_ns = now_ns + sending.gap_ns.max(NEXT_NS);
         if let Some(block) = &mut sending.block {
@@ -197,7 +191,7 @@ impl IsoTp {
             return Some(*frame);
         }
         let sending = self.sending.as_ref()?;
-        let end = sending.data.len().min(sending.at + 7);
-        Some(self.frame(&[&[0x20 | sending.number][..], &sending.data[sending.at..end]].concat()))
+        let data = &sending.data[sending.at.min(sending.data.len())..];
+        Some(self.frame(Pci::Consecutive { number: sending.number, data }))
     }
 }

@@ -227,7 +227,7 @@ impl CarBus {
     }
 
     /// Passes everything waiting to be sent, with its earliest time.
-    fn each_wish(&mut self, now_ns: u64, mut show: impl FnMut(&Self, u64, Origin)) {
+    fn each_bid(&mut self, now_ns: u64, mut show: impl FnMut(&Self, u64, Origin)) {
         if !self.again.is_empty() {
             show(self, 0, Origin::Again);
         }
@@ -268,7 +268,7 @@ impl CarBus {
     fn first(&mut self, now_ns: u64) -> Option<(u64, Origin)> {
         self.advance(now_ns);
         let mut first: Option<(u32, u64, Origin)> = None;
-        self.each_wish(now_ns, |bus, due_ns, origin| {
+        self.each_bid(now_ns, |bus, due_ns, origin| {
             if due_ns <= now_ns {
                 let rank = bus.rank(origin);
                 if first.is_none_or(|(lowest, ..)| rank < lowest) {
@@ -284,7 +284,7 @@ impl Senders for CarBus {
     fn due(&mut self, now_ns: u64) -> Option<u64> {
         self.advance(now_ns);
         let mut next = None;
-        self.each_wish(now_ns, |_, due_ns, _| next = Some(next.unwrap_or(NEVER).min(due_ns)));
+        self.each_bid(now_ns, |_, due_ns, _| next = Some(next.unwrap_or(NEVER).min(due_ns)));
         next
     }
 

@@ -2,7 +2,7 @@
 
 use cantap_can::Frame;
 
-use super::words::{CONTROL, DATA, GLOBAL, MOST_BYTES, MS, StationError, frame, three};
+use super::parts::{CONTROL, DATA, GLOBAL, MOST_BYTES, MS, StationError, frame, three};
 use crate::j1939::Header;
 
 /// Time between the frames of a message to all: 50 to 200 ms.

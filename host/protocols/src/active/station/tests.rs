@@ -1,4 +1,4 @@
-use super::words::MOST_BYTES;
+use super::parts::MOST_BYTES;
 use super::*;
 use crate::active::testing::{Say, arrives, disturbed, run};
 

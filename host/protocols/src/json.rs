@@ -1,57 +1,78 @@
-//! For programs: one object per event.
+//! Events as JSON, for programs: one object per event.
 
 use std::borrow::Cow;
 use std::fmt::Write as _;
 
-use cantap_protocols::{Event, Field, Party, Value};
+use cantap_trace::Seconds;
 
-use crate::seconds::Seconds;
+use crate::{Event, Field, Party, Value};
 
-/// Appends the object and the end of its line.
-pub(super) fn push(out: &mut String, event: &Event) {
-    // Written by hand, as in decode, so that times keep every digit. Writing to a String cannot fail.
-    let _ = write!(
-        out,
-        "{{\"time_s\":{},\"start_s\":{},\"channel\":{},\"protocol\":\"{}\",\"kind\":\"{}\"",
-        Seconds(event.time_ns),
-        Seconds(event.start_ns),
-        event.channel,
-        event.protocol.name(),
-        event.kind
-    );
-    push_party(out, ",\"from\":", event.from);
-    push_party(out, ",\"to\":", event.to);
-    out.push_str(",\"title\":");
-    push_text(out, &event.title);
-    out.push_str(",\"fields\":{");
-    push_members(out, &event.fields, |field| Some(&field.value), push_value);
-    out.push('}');
-    if event.fields.iter().any(|field| field.text.is_some()) {
-        out.push_str(",\"texts\":{");
-        push_members(out, &event.fields, |field| field.text.as_deref(), push_text);
+impl Event {
+    /// Appends the event as an object in one line, without the line's end. The keys are those of `docs/protocols.md`.
+    pub fn push_json(&self, out: &mut String) {
+        let event = self;
+        // Written by hand, so that times keep every digit. Writing to a String cannot fail.
+        let _ = write!(
+            out,
+            "{{\"time_s\":{},\"start_s\":{},\"channel\":{},\"protocol\":\"{}\",\"kind\":\"{}\"",
+            Seconds(event.time_ns),
+            Seconds(event.start_ns),
+            event.channel,
+            event.protocol.name(),
+            event.kind.name()
+        );
+        push_party(out, ",\"from\":", event.from);
+        push_party(out, ",\"to\":", event.to);
+        out.push_str(",\"title\":");
+        push_text(out, &event.title);
+        out.push_str(",\"fields\":{");
+        push_members(out, &event.fields, |field| Some(&field.value), push_value);
+        out.push('}');
+        if event.fields.iter().any(|field| field.text.is_some()) {
+            out.push_str(",\"texts\":{");
+            push_members(out, &event.fields, |field| field.text.as_deref(), push_text);
+            out.push('}');
+        }
+        let unit = |field: &Field| !field.unit.is_empty();
+        if event.fields.iter().any(unit) {
+            out.push_str(",\"units\":{");
+            push_members(out, &event.fields, |field| unit(field).then_some(&*field.unit), push_text);
+            out.push('}');
+        }
+        if let Some(response_ns) = event.response_ns {
+            out.push_str(",\"response_ms\":");
+            push_real(out, response_ns as f64 / 1e6);
+        }
+        out.push_str(",\"data\":");
+        push_bytes(out, &event.data);
+        let _ = write!(out, ",\"frames\":{}", event.frames);
+        if let Some(trouble) = &event.trouble {
+            let _ = write!(out, ",\"trouble\":\"{}\",\"trouble_text\":", trouble.code());
+            push_text(out, &trouble.to_string());
+        }
+        if event.frames_lost {
+            out.push_str(",\"frames_lost\":true");
+        }
         out.push('}');
     }
-    let unit = |field: &Field| !field.unit.is_empty();
-    if event.fields.iter().any(unit) {
-        out.push_str(",\"units\":{");
-        push_members(out, &event.fields, |field| unit(field).then_some(&*field.unit), push_text);
-        out.push('}');
+}
+
+impl From<&Value> for serde_json::Value {
+    /// As in [`Event::push_json`].
+    fn from(value: &Value) -> Self {
+        match value {
+            Value::Number(number) => (*number).into(),
+            Value::Hex(number, _) => (*number).into(),
+            Value::Real(number) => (*number).into(),
+            Value::Missing => Self::Null,
+            Value::Text(text) => (&**text).into(),
+            Value::Bytes(bytes) => {
+                let mut text = String::new();
+                push_digits(&mut text, bytes);
+                text.into()
+            }
+        }
     }
-    if let Some(response_ns) = event.response_ns {
-        out.push_str(",\"response_ms\":");
-        push_real(out, response_ns as f64 / 1e6);
-    }
-    out.push_str(",\"data\":");
-    push_bytes(out, &event.data);
-    let _ = write!(out, ",\"frames\":{}", event.frames);
-    if let Some(trouble) = &event.trouble {
-        let _ = write!(out, ",\"trouble\":\"{}\",\"trouble_text\":", trouble.code());
-        push_text(out, &trouble.to_string());
-    }
-    if event.frames_lost {
-        out.push_str(",\"frames_lost\":true");
-    }
-    out.push_str("}\n");
 }
 
 /// Members of an object, for the fields that have such a value; the second and later fields of a name have a number
@@ -110,13 +131,18 @@ fn push_real(out: &mut String, value: f64) {
 }
 
 fn push_bytes(out: &mut String, bytes: &[u8]) {
-    const DIGITS: &[u8; 16] = b"0123456789ABCDEF";
     out.push('"');
+    push_digits(out, bytes);
+    out.push('"');
+}
+
+/// In hexadecimal, without spaces.
+fn push_digits(out: &mut String, bytes: &[u8]) {
+    const DIGITS: &[u8; 16] = b"0123456789ABCDEF";
     for byte in bytes {
         out.push(char::from(DIGITS[usize::from(byte >> 4)]));
         out.push(char::from(DIGITS[usize::from(byte & 15)]));
     }
-    out.push('"');
 }
 
 fn push_text(out: &mut String, text: &str) {
@@ -131,17 +157,17 @@ fn push_text(out: &mut String, text: &str) {
 
 #[cfg(test)]
 mod tests {
-    use cantap_protocols::Protocol;
     use cantap_trace::{TraceEvent, TraceRecord};
 
     use super::*;
+    use crate::{EventKind, Protocol};
 
     fn object(fields: Vec<Field>) -> serde_json::Value {
         let record = TraceRecord { time_ns: 1_500_000_000, channel: 1, event: TraceEvent::GAP };
-        let mut event = Event::new(Protocol::Uds, &record, "exchange", "a \"title\"\n");
+        let mut event = Event::new(Protocol::Uds, &record, EventKind::Exchange, "a \"title\"\n");
         event.fields = fields;
         let mut line = String::new();
-        push(&mut line, &event);
+        event.push_json(&mut line);
         serde_json::from_str(&line).unwrap()
     }
 
@@ -170,6 +196,25 @@ mod tests {
             let mut text = String::new();
             push_real(&mut text, value);
             assert_eq!(text.parse::<f64>().map(f64::to_bits), Ok(value.to_bits()), "{text}");
+        }
+    }
+
+    /// The line and the object of `serde_json` say the same.
+    #[test]
+    fn both_forms_of_a_value_agree() {
+        for value in [
+            Value::Number(-5),
+            Value::Hex(u64::MAX, 16),
+            Value::Real(0.1),
+            Value::Real(f64::NAN),
+            Value::Missing,
+            Value::Text("a \"b\"\n".into()),
+            Value::Bytes(vec![0x0A, 0xF1].into()),
+        ] {
+            let mut text = String::new();
+            push_value(&mut text, &value);
+            let read: serde_json::Value = serde_json::from_str(&text).unwrap();
+            assert_eq!(read, serde_json::Value::from(&value));
         }
     }
 }

@@ -4,24 +4,19 @@ use std::borrow::Cow;
 
 use cantap_trace::{TraceEvent, TraceRecord};
 
-use crate::{Event, Field, Protocol, Trouble};
+use crate::{Event, EventKind, Field, Protocol, Trouble};
 
 /// A record without a frame, for events that no frame causes.
 pub const fn nothing(channel: u8) -> TraceRecord {
     TraceRecord { time_ns: 0, channel, event: TraceEvent::GAP }
 }
 
-pub fn event(record: &TraceRecord, kind: &'static str, title: impl Into<Cow<'static, str>>) -> Event {
+pub fn event(record: &TraceRecord, kind: EventKind, title: impl Into<Cow<'static, str>>) -> Event {
     Event::new(Protocol::CanOpen, record, kind, title)
 }
 
 /// An event for something that violates the protocol.
-pub fn malformed(
-    record: &TraceRecord,
-    kind: &'static str,
-    title: &'static str,
-    fault: &'static str,
-) -> Event {
+pub fn malformed(record: &TraceRecord, kind: EventKind, title: &'static str, fault: &'static str) -> Event {
     let mut event = event(record, kind, title);
     event.fields.push(Field::bytes("data", &event.data));
     event.trouble = Some(Trouble::Malformed(fault));

@@ -4,7 +4,7 @@
 //! without a board. [`transmit`] sends many frames and accounts for each, [`replay`] sends them with a trace's own timing,
 //! [`periodic`] checks what the device is asked to repeat, [`hw_filter`] has it drop unwanted frames, [`autobaud`] finds a
 //! bus's bit rate by listening, [`recovery`] brings a channel back from bus-off, and [`unsent`] says why something was not
-//! sent.
+//! sent. [`responder`] is the other side: for programs that answer as a device does.
 
 #![forbid(unsafe_code)]
 
@@ -15,6 +15,7 @@ pub mod hw_filter;
 pub mod periodic;
 pub mod recovery;
 pub mod replay;
+pub mod responder;
 pub mod transmit;
 pub mod unsent;
 

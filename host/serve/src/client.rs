@@ -9,12 +9,12 @@ use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 use cantap::device::is_idle;
-use cantap_wire::framing::{CRC_LEN, MAX_ENCODED, MAX_MESSAGE, seal};
-use cantap_wire::message::{Defaults, Role, capability, write_response};
+use cantap::responder::{Inbox, Incoming, encode_response};
+use cantap_wire::message::{Defaults, Role, capability};
 use cantap_wire::{Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply, Request};
 
+use crate::flow::read_ack;
 use crate::foreign;
-use crate::inbox::{Heard, Inbox};
 use crate::news::News;
 use crate::outbox::Outbox;
 use crate::places::{GREETING_TIMEOUT, Place};
@@ -167,7 +167,7 @@ impl Client {
                 first.extend(bytes.iter().skip(zeros).take(foreign::ENOUGH));
             }
             let mut goes_on = !is_stranger(&first, &inbox);
-            inbox.push(bytes, |heard| goes_on = goes_on && self.take(heard));
+            inbox.push(bytes, |incoming| goes_on = goes_on && self.take(incoming));
             if !self.has_greeted() && !first.is_empty() && (!goes_on || is_stranger(&first, &inbox)) {
                 self.let_go(foreign::reason(&first));
                 return;
@@ -190,21 +190,23 @@ impl Client {
     }
 
     /// Takes what it said. Returns whether it may go on.
-    fn take(&self, heard: Heard) -> bool {
-        match heard {
-            Heard::Request(Request { id, command: Command::Hello { protocol } }) => self.greet(id, protocol),
-            Heard::Read(bytes) => {
+    fn take(&self, incoming: Incoming<'_>) -> bool {
+        match incoming {
+            Incoming::Request(Request { id, command: Command::Hello { protocol } }) => {
+                self.greet(id, protocol)
+            }
+            Incoming::Other(message) if let Some(bytes) = read_ack(message) => {
                 self.outbox.acknowledge(bytes);
                 true
             }
             // Whoever does not begin with a greeting is no client.
             _ if !self.has_greeted() => false,
-            Heard::Request(Request { id, command }) => {
+            Incoming::Request(Request { id, command }) => {
                 let result = self.perform(command);
                 self.answer(id, &result)
             }
-            Heard::Unreadable(id, refusal) => self.answer(id, &Err(refusal)),
-            Heard::Damaged => true,
+            Incoming::Unreadable(id, refusal) => self.answer(id, &Err(refusal)),
+            Incoming::Other(_) | Incoming::Damaged => true,
         }
     }
 
@@ -249,8 +251,8 @@ impl Client {
     fn answer(&self, id: u16, result: &Result<Reply, Refusal>) -> bool {
         match result {
             // That the session is over, and why, comes first.
-            Err(Refusal::NoSession) => self.outbox.answer_in_turn(encoded(id, result)),
-            _ => self.outbox.answer(encoded(id, result)),
+            Err(Refusal::NoSession) => self.outbox.answer_in_turn(encode_response(id, result)),
+            _ => self.outbox.answer(encode_response(id, result)),
         }
     }
 
@@ -278,7 +280,7 @@ impl Client {
         if let Some(member) = state.clients.get_mut(&self.id) {
             member.in_session = true;
             // Under the lock, so that nothing of the session can come before it.
-            member.outbox.restart(encoded(id, &Ok(Reply::Hello(hello))), ticks);
+            member.outbox.restart(encode_response(id, &Ok(Reply::Hello(hello))), ticks);
         }
         true
     }
@@ -406,16 +408,4 @@ impl Silence {
         self.since = if spoke { Duration::ZERO } else { self.since + passed.min(LONGEST_PASS) };
         self.since
     }
-}
-
-/// An answer as it goes over the wire.
-fn encoded(id: u16, result: &Result<Reply, Refusal>) -> Vec<u8> {
-    let mut message = vec![0; MAX_MESSAGE + CRC_LEN];
-    let mut out = vec![0; MAX_ENCODED];
-    // This cannot fail: the longest answer is shorter than the longest message.
-    let len = write_response(id, result, &mut message[..MAX_MESSAGE])
-        .and_then(|len| seal(&mut message, len, &mut out))
-        .unwrap_or(0);
-    out.truncate(len);
-    out
 }

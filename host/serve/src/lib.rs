@@ -11,7 +11,6 @@ mod client;
 pub mod connect;
 mod flow;
 mod foreign;
-mod inbox;
 pub mod lines;
 pub mod listen;
 mod modes;

@@ -4,11 +4,10 @@ use std::io::Write;
 use std::time::{Duration, Instant};
 
 use cantap::device::is_idle;
-use cantap_wire::batch::BatchWriter;
-use cantap_wire::framing::MAX_ENCODED;
+use cantap::responder::StreamEncoder;
 use cantap_wire::message::EndReason;
-use cantap_wire::record::{MAX_RECORD, Record, encode_event, encode_received};
-use cantap_wire::{CHANNELS, Channel, Event, Stamp};
+use cantap_wire::record::Record;
+use cantap_wire::{CHANNELS, Channel, Event};
 
 use crate::outbox::{Item, Outbox};
 use crate::stream::{ClientId, Gap, Views, shown};
@@ -26,9 +25,7 @@ pub fn run(outbox: &Outbox, output: &mut dyn Write, client: ClientId) -> Result<
     loop {
         let work = outbox.take(LOOK_EVERY);
         for answer in &work.answers {
-            // An earlier batch may have been read only in part.
-            encoder.out.push(0);
-            encoder.out.extend_from_slice(answer);
+            encoder.stream.answer(answer);
         }
         if !work.given_up.is_empty() {
             outbox.give_up(encoder.give_up(work.given_up));
@@ -36,15 +33,16 @@ pub fn run(outbox: &Outbox, output: &mut dyn Write, client: ClientId) -> Result<
         for item in work.items {
             encoder.take(item);
         }
-        encoder.finish();
-        if !encoder.out.is_empty() || !outbox.is_held_up() {
+        encoder.stream.finish();
+        let bytes = encoder.stream.bytes();
+        if !bytes.is_empty() || !outbox.is_held_up() {
             moved = Instant::now();
         } else if moved.elapsed() >= PATIENCE {
             return Err(TOOK_NOTHING.to_owned());
         }
-        write(output, &encoder.out, outbox)?;
-        outbox.wrote(encoder.out.len());
-        encoder.out.clear();
+        write(output, bytes, outbox)?;
+        outbox.wrote(bytes.len());
+        encoder.stream.clear_bytes();
         if work.is_last {
             return Ok(());
         }
@@ -82,55 +80,42 @@ fn write(output: &mut dyn Write, mut bytes: &[u8], outbox: &Outbox) -> Result<()
 
 /// Encodes what is waiting.
 struct Encoder {
-    batch: Box<BatchWriter>,
-    /// Time of the last record, or of the session's beginning.
-    last_ticks: u64,
+    stream: StreamEncoder,
     views: Views,
     client: ClientId,
-    out: Vec<u8>,
 }
 
 impl Encoder {
     fn new(client: ClientId) -> Self {
-        Self {
-            batch: Box::new(BatchWriter::new()),
-            last_ticks: 0,
-            views: Views::default(),
-            client,
-            out: Vec::new(),
-        }
+        Self { stream: StreamEncoder::new(), views: Views::default(), client }
     }
 
     fn take(&mut self, item: Item) {
         match item {
             Item::Restart(answer, ticks) => {
-                self.batch.restart();
-                self.last_ticks = ticks;
+                self.stream.begin(&answer, ticks);
                 self.views = Views::default();
-                self.out.push(0);
-                self.out.extend_from_slice(&answer);
             }
             Item::Attach(channel, view, ticks) => {
                 self.views[channel.index()] = view;
-                self.event(ticks, Event::Started { channel });
+                self.stream.event(ticks, Event::Started { channel });
             }
             Item::Detach(channel, ticks, _) => self.stop(channel, ticks),
             Item::Chunk(chunk) => {
                 for entry in chunk.iter() {
                     if let Some(record) = shown(entry, self.client, &self.views) {
-                        self.record(entry.ticks, &record);
+                        self.stream.record(entry.ticks, &record);
                     }
                 }
             }
             Item::Gap(gap) => {
                 for (ticks, event) in gap.events() {
-                    self.event(ticks, event);
+                    self.stream.event(ticks, event);
                 }
             }
             Item::Answer(answer) => {
-                self.finish();
-                self.out.push(0);
-                self.out.extend_from_slice(&answer);
+                self.stream.finish();
+                self.stream.answer(&answer);
             }
             Item::Ended(reason, ticks) => self.end(reason, ticks),
         }
@@ -164,7 +149,7 @@ impl Encoder {
 
     fn stop(&mut self, channel: Channel, ticks: u64) {
         if self.views[channel.index()].config.take().is_some() {
-            self.event(ticks.max(self.last_ticks), Event::Stopped { channel });
+            self.stream.event(ticks.max(self.stream.last_ticks()), Event::Stopped { channel });
         }
     }
 
@@ -172,43 +157,6 @@ impl Encoder {
         for channel in Channel::ALL {
             self.stop(channel, ticks);
         }
-        self.finish();
-        let at = self.out.len();
-        self.out.resize(at + MAX_ENCODED, 0);
-        let len = self.batch.end(reason, ticks.max(self.last_ticks), &mut self.out[at..]);
-        self.out.truncate(at + len);
-    }
-
-    fn event(&mut self, ticks: u64, event: Event) {
-        self.record(ticks, &Record::Event(event));
-    }
-
-    fn record(&mut self, ticks: u64, record: &Record) {
-        let mut bytes = [0; MAX_RECORD];
-        let difference = ticks.wrapping_sub(self.last_ticks) as i64;
-        let (len, frame_of, is_stamped) = match record {
-            Record::Received(received) => (
-                encode_received(received, difference, &mut bytes),
-                Some(received.channel),
-                received.stamp != Stamp::Omitted,
-            ),
-            Record::Event(event) => (encode_event(event, difference, &mut bytes), None, true),
-        };
-        if !self.batch.push(&bytes[..len], self.last_ticks, frame_of) {
-            self.finish();
-            // This cannot fail: any record fits in an empty batch.
-            let _ = self.batch.push(&bytes[..len], self.last_ticks, frame_of);
-        }
-        if is_stamped {
-            self.last_ticks = ticks;
-        }
-    }
-
-    /// Writes the current batch.
-    fn finish(&mut self) {
-        let at = self.out.len();
-        self.out.resize(at + MAX_ENCODED, 0);
-        let len = self.batch.finish(&mut self.out[at..]);
-        self.out.truncate(at + len);
+        self.stream.end(reason, ticks);
     }
 }

@@ -1,10 +1,8 @@
-//! Finds a client's requests in what it sends.
+//! Finds a host's requests in what it sends.
 
 use cantap_wire::Refusal;
 use cantap_wire::framing::{CRC_LEN, MAX_REQUEST, max_encoded_len, unseal};
 use cantap_wire::message::{Request, why_unreadable};
-
-use crate::flow;
 
 /// The most bytes before a zero that can be a request.
 const MOST: usize = max_encoded_len(MAX_REQUEST) - 1;
@@ -12,18 +10,18 @@ const MOST: usize = max_encoded_len(MAX_REQUEST) - 1;
 /// What came between two zeros.
 #[derive(Debug, PartialEq, Eq)]
 #[expect(clippy::large_enum_variant, reason = "one for each request, taken at once")]
-pub enum Heard {
+pub enum Incoming<'a> {
     /// A request.
     Request(Request),
     /// A request of which only the number is readable, and what is wrong with it.
     Unreadable(u16, Refusal),
-    /// The client has read so many bytes since the connection began.
-    Read(u64),
-    /// It cannot be answered: nobody can tell which request it was.
+    /// An undamaged message that is no request. It is not answered.
+    Other(&'a [u8]),
+    /// Not a message. It cannot be answered: nobody can tell which request it was.
     Damaged,
 }
 
-/// Holds at most one request.
+/// Finds requests in any pieces of a stream. It holds at most one.
 #[derive(Default)]
 pub struct Inbox {
     partial: Vec<u8>,
@@ -37,7 +35,7 @@ impl Inbox {
     }
 
     /// Takes any piece of the stream and reports what is complete.
-    pub fn push(&mut self, bytes: &[u8], mut report: impl FnMut(Heard)) {
+    pub fn push(&mut self, bytes: &[u8], mut report: impl FnMut(Incoming<'_>)) {
         for &byte in bytes {
             if byte != 0 {
                 if self.partial.len() < MOST {
@@ -48,23 +46,23 @@ impl Inbox {
                 continue;
             }
             if std::mem::take(&mut self.is_overlong) {
-                report(Heard::Damaged);
+                report(Incoming::Damaged);
             } else if !self.partial.is_empty() {
-                report(read(&self.partial));
+                let mut message = [0; MOST];
+                report(read(&self.partial, &mut message));
             }
             self.partial.clear();
         }
     }
 }
 
-fn read(encoded: &[u8]) -> Heard {
-    let mut message = [0; MOST];
-    let Ok(message) = unseal(encoded, &mut message) else { return Heard::Damaged };
+fn read<'a>(encoded: &[u8], message: &'a mut [u8; MOST]) -> Incoming<'a> {
+    let Ok(message) = unseal(encoded, message) else { return Incoming::Damaged };
     match postcard::take_from_bytes(message) {
-        Ok((request, _)) => Heard::Request(request),
+        Ok((request, _)) => Incoming::Request(request),
         Err(_) => match postcard::take_from_bytes::<u16>(message) {
-            Ok((id, _)) => Heard::Unreadable(id, why_unreadable(message)),
-            Err(_) => flow::read_ack(message).map_or(Heard::Damaged, Heard::Read),
+            Ok((id, _)) => Incoming::Unreadable(id, why_unreadable(message)),
+            Err(_) => Incoming::Other(message),
         },
     }
 }
@@ -75,14 +73,16 @@ const _: () = assert!(MOST > MAX_REQUEST + CRC_LEN);
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cantap::device::encode;
+    use crate::device::encode;
     use cantap_wire::Command;
 
-    fn heard(bytes: &[u8], piece: usize) -> Vec<Heard> {
+    fn check(bytes: &[u8], piece: usize, expected: &[Incoming<'_>]) {
         let mut inbox = Inbox::default();
-        let mut all = Vec::new();
-        bytes.chunks(piece).for_each(|bytes| inbox.push(bytes, |heard| all.push(heard)));
-        all
+        let mut expected = expected.iter();
+        for bytes in bytes.chunks(piece) {
+            inbox.push(bytes, |incoming| assert_eq!(Some(&incoming), expected.next(), "{piece}"));
+        }
+        assert_eq!(expected.next(), None, "{piece}");
     }
 
     #[test]
@@ -98,9 +98,13 @@ mod tests {
         ]
         .concat();
         for piece in [1, 3, 1000, bytes.len()] {
-            let expected =
-                [Heard::Damaged, Heard::Request(request(1)), Heard::Damaged, Heard::Request(request(2))];
-            assert_eq!(heard(&bytes, piece), expected, "{piece}");
+            let expected = [
+                Incoming::Damaged,
+                Incoming::Request(request(1)),
+                Incoming::Damaged,
+                Incoming::Request(request(2)),
+            ];
+            check(&bytes, piece, &expected);
         }
     }
 
@@ -109,6 +113,6 @@ mod tests {
         let mut message = [5, 127, 0, 0, 0, 0];
         let mut out = [0; 32];
         let len = cantap_wire::framing::seal(&mut message, 2, &mut out).unwrap();
-        assert_eq!(heard(&out[..len], 32), [Heard::Unreadable(5, Refusal::Malformed)]);
+        check(&out[..len], 32, &[Incoming::Unreadable(5, Refusal::Malformed)]);
     }
 }

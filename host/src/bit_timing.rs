@@ -18,7 +18,7 @@ use std::fmt;
 use cantap_wire::BitTiming;
 use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS, NoTiming};
 
-use crate::device::no_timing;
+use crate::session::no_timing;
 
 /// Delay of a node, in and out, that the cable lengths assume, in ns.
 pub const NODE_DELAY_NS: f64 = 150.0;
@@ -301,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn wishes_are_kept_or_refused() {
+    fn requested_sample_points_are_kept_or_refused() {
         let timing = rate(500_000, Some(80.0), Some(2)).resolve(CLOCK).unwrap();
         assert!(timing.jump_width == 2 && timing.sample_point_permille().abs_diff(800) < 40, "{timing:?}");
         // The recommended timing has no room for it; another one has.

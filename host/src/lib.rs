@@ -4,7 +4,8 @@
 //! without a board. [`transmit`] sends many frames and accounts for each, [`replay`] sends them with a trace's own timing,
 //! [`periodic`] checks what the device is asked to repeat, [`hw_filter`] has it drop unwanted frames, [`autobaud`] finds a
 //! bus's bit rate by listening, [`recovery`] brings a channel back from bus-off, and [`unsent`] says why something was not
-//! sent. [`responder`] is the other side: for programs that answer as a device does.
+//! sent. [`session`] is what [`Device`] and the
+//! server of a shared board have in common, and [`responder`] is the other side: for programs that answer as a device does.
 
 #![forbid(unsafe_code)]
 
@@ -16,6 +17,7 @@ pub mod periodic;
 pub mod recovery;
 pub mod replay;
 pub mod responder;
+pub mod session;
 pub mod transmit;
 pub mod unsent;
 

@@ -43,6 +43,13 @@ pub struct Guest {
     pub is_remote: bool,
 }
 
+impl Guest {
+    /// A client on this machine that has no place at a listener.
+    pub fn of_board(name: &str, role: Role) -> Self {
+        Self { name: name.to_owned(), role, place: None, is_counted: true, is_remote: false }
+    }
+}
+
 /// Admits a client. Two separate threads serve it until either side ends.
 pub fn admit(
     shared: &Arc<Shared>,

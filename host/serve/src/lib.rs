@@ -28,6 +28,7 @@ mod stream;
 mod text;
 #[cfg(feature = "tls")]
 pub mod tls;
+mod upstream;
 mod writer;
 
 pub use board::{Board, BoardError, Connect, ConnectError};

@@ -17,7 +17,7 @@ use crate::connect::SOCKET_TIMEOUT;
 use crate::connect::prepare;
 #[cfg(unix)]
 use crate::peer;
-use crate::places::{Places, ends, refuse};
+use crate::places::{NoPlace, Place, Places, ends, refuse};
 #[cfg(unix)]
 use crate::socket_file::{self, SocketError, SocketFile};
 use crate::{Board, News};
@@ -87,7 +87,7 @@ pub fn unix(board: &Arc<Board>, path: &Path, role: Role) -> Result<Listening, So
     let places = Places::new(board.most_clients());
     let mut count = 0;
     let mut listening = Listening::start("cantap-unix", None, move || {
-        let (mut stream, _) = listener.accept()?;
+        let (stream, _) = listener.accept()?;
         count += 1;
         let name = format!("local client {count}");
         if let Err(stranger) = peer::check(&stream) {
@@ -99,20 +99,9 @@ pub fn unix(board: &Arc<Board>, path: &Path, role: Role) -> Result<Listening, So
         stream.set_write_timeout(Some(SOCKET_TIMEOUT))?;
         keep_little(&stream)?;
         let ended = stream.try_clone()?;
-        let end = move || drop(ended.shutdown(std::net::Shutdown::Both));
-        match places.enter(None, end) {
-            Ok(place) => {
-                let output = stream.try_clone()?;
-                let place = Some(place);
-                admit(
-                    &board,
-                    stream,
-                    output,
-                    Guest { name, role, place, is_counted: false, is_remote: false },
-                );
-            }
-            Err(full) => turn_away(&board, &mut stream, name, &full),
-        }
+        let place = places.enter(None, move || drop(ended.shutdown(std::net::Shutdown::Both)));
+        let output = stream.try_clone()?;
+        let_in(&board, place, stream, output, Arrival { name, role, is_remote: false });
         Ok(())
     })?;
     listening.file = Some(file);
@@ -126,22 +115,12 @@ pub fn tcp(board: &Arc<Board>, address: SocketAddr, role: Role) -> io::Result<Li
     let board = Arc::clone(board);
     let places = Places::new(board.most_clients());
     Listening::start("cantap-tcp", Some(address), move || {
-        let (mut stream, peer) = accept(&listener)?;
+        let (stream, peer) = accept(&listener)?;
         let name = format!("client {peer}");
-        match places.enter(Some(peer.ip()), ends(&stream)?) {
-            Ok(place) => {
-                let output = stream.try_clone()?;
-                let place = Some(place);
-                // A tunnel may end here.
-                admit(
-                    &board,
-                    stream,
-                    output,
-                    Guest { name, role, place, is_counted: false, is_remote: true },
-                );
-            }
-            Err(full) => turn_away(&board, &mut stream, name, &full),
-        }
+        let place = places.enter(Some(peer.ip()), ends(&stream)?);
+        let output = stream.try_clone()?;
+        // A tunnel may end here.
+        let_in(&board, place, stream, output, Arrival { name, role, is_remote: true });
         Ok(())
     })
 }
@@ -194,15 +173,33 @@ fn keep_little(stream: &impl std::os::fd::AsFd) -> io::Result<()> {
     Ok(setsockopt(stream, sockopt::SndBuf, &SYSTEM_KEEPS)?)
 }
 
-/// Admits a client, or reports that it was refused.
-pub(crate) fn admit(
+/// Who has come to a listener.
+pub(crate) struct Arrival {
+    /// Its name in messages.
+    pub name: String,
+    /// The most that it may do.
+    pub role: Role,
+    /// It is at the other end of a line that can break without notice.
+    pub is_remote: bool,
+}
+
+/// Admits whoever has come and has got a place; anybody else learns why it is turned away.
+pub(crate) fn let_in(
     board: &Board,
+    place: Result<Place, NoPlace>,
     input: impl Read + Send + 'static,
-    output: impl Write + Send + 'static,
-    guest: Guest,
+    mut output: impl Write + Send + 'static,
+    arrival: Arrival,
 ) {
-    let client = guest.name.clone();
-    if let Err(refused) = board.admit_guest(input, output, guest) {
-        board.tell(News::Refused { client, reason: refused.to_string() });
+    let Arrival { name, role, is_remote } = arrival;
+    match place {
+        Ok(place) => {
+            let client = name.clone();
+            let guest = Guest { name, role, place: Some(place), is_counted: false, is_remote };
+            if let Err(refused) = board.admit_guest(input, output, guest) {
+                board.tell(News::Refused { client, reason: refused.to_string() });
+            }
+        }
+        Err(full) => turn_away(board, &mut output, name, &full),
     }
 }

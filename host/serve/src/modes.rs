@@ -56,7 +56,7 @@ impl Shared {
             self.ask(Command::Open { channel, config: Some(config) }, Then::Opened { client: None, channel });
         if opened.is_err() {
             // They must not believe that the bus is quiet.
-            self.state().must_end = true;
+            self.end_session("it does not open a channel again");
         }
         opened.map(|_| ())
     }

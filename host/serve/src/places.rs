@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn the_peer_that_has_said_least_goes_for_whoever_comes_and_those_served_stay() {
+    fn the_most_silent_peer_goes_for_whoever_comes_and_those_served_stay() {
         let places = Places::new(3);
         let gone = Arc::new(Mutex::new(Vec::new()));
         let enter = |name: &'static str| {

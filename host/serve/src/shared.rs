@@ -1,24 +1,21 @@
 //! What the threads of a shared board have in common: its state, the connection to it, and requests to it.
 
-use std::io::Write;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::mpsc::sync_channel;
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use cantap::device::{encode, write_patiently};
+use cantap::DeviceError;
+use cantap::session::Requests;
 use cantap_wire::message::{ChannelConfig, Mode};
-use cantap_wire::{CHANNELS, Command, Refusal, Reply, Request};
+use cantap_wire::{CHANNELS, Command, Refusal, Reply};
 
 use crate::news::News;
 use crate::outbox::MOST_RECORDS;
-use crate::state::{Asked, State, Then};
+use crate::state::{State, Then};
 use crate::stream::ClientId;
 
 /// The longest time a board takes to answer: saving takes two seconds.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(3);
-/// A board makes the server wait while it has no room; one that accepts nothing for this long is stuck.
-pub(crate) const WRITE_PATIENCE: Duration = Duration::from_secs(2);
 
 /// How a board is shared.
 #[derive(Clone, Debug)]
@@ -64,7 +61,8 @@ impl Default for Settings {
 pub(crate) struct Shared {
     pub name: String,
     pub settings: Settings,
-    pub port: Mutex<Option<Box<dyn Write + Send>>>,
+    /// Requests to the board, while it is there.
+    pub requests: Mutex<Option<Arc<Requests<Then>>>>,
     pub state: Mutex<State>,
     /// Something has arrived from the board.
     pub changed: Condvar,
@@ -95,45 +93,36 @@ impl Shared {
 
     /// Sends a request to the board and waits for its answer. `then` is done in the order of its stream.
     pub fn ask(&self, command: Command, then: Then) -> Result<Reply, Refusal> {
-        let (answer, answered) = sync_channel(1);
-        let id = self.send(command, Asked { answer, then })?;
-        answered.recv_timeout(ANSWER_TIMEOUT).unwrap_or_else(|_| {
-            self.state().asked.remove(&id);
-            Err(Refusal::NoBoard)
-        })
-    }
-
-    /// Sends a request without waiting.
-    pub fn send(&self, command: Command, asked: Asked) -> Result<u16, Refusal> {
-        let id = {
-            let mut state = self.state();
-            if state.hello.is_none() {
-                return Err(Refusal::NoBoard);
-            }
-            state.ask(asked)
-        };
-        let bytes = encode(&Request { id, command }).map_err(|_| Refusal::Malformed)?;
-        let mut port = lock(&self.port);
-        let written = port.as_mut().map(|port| {
-            write_patiently(port, &bytes, WRITE_PATIENCE)?;
-            port.flush()
-        });
-        drop(port);
-        if !matches!(written, Some(Ok(()))) {
-            let mut state = self.state();
-            state.asked.remove(&id);
-            // Half a request may have been sent.
-            state.must_end = true;
-            return Err(Refusal::NoBoard);
-        }
-        Ok(id)
+        let requests = self.requests()?;
+        let pending = requests.send(command, then).map_err(|error| self.not_sent(&error))?;
+        pending.answer_within(ANSWER_TIMEOUT).unwrap_or(Err(Refusal::NoBoard))
     }
 
     /// Sends a request for whose answer nobody waits.
     pub fn send_unattended(&self, command: Command, then: Then) {
-        let (answer, _) = sync_channel(1);
-        // If it fails, the board's thread notices.
-        let _ = self.send(command, Asked { answer, then });
+        if let Ok(requests) = self.requests() {
+            // If it fails, the session with the board ends.
+            let _ = requests.send_unattended(command, then).map_err(|error| self.not_sent(&error));
+        }
+    }
+
+    fn requests(&self) -> Result<Arc<Requests<Then>>, Refusal> {
+        lock(&self.requests).clone().ok_or(Refusal::NoBoard)
+    }
+
+    fn not_sent(&self, error: &DeviceError) -> Refusal {
+        if matches!(error, DeviceError::RequestTooLong) {
+            return Refusal::Malformed;
+        }
+        self.end_session("it does not take requests any more");
+        Refusal::NoBoard
+    }
+
+    /// Ends the session with the board.
+    pub fn end_session(&self, reason: &str) {
+        if let Ok(requests) = self.requests() {
+            requests.end(reason);
+        }
     }
 
     /// Nothing more is written to a client.

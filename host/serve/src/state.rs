@@ -3,12 +3,11 @@
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
-use std::sync::mpsc::SyncSender;
 use std::time::Instant;
 
 use cantap_wire::message::{ChannelConfig, DEVICE_TAG, Mode, Role, TRIGGER_TAG, TxFrame};
 use cantap_wire::record::{ErrorState, LossStage, Record, TransmitFailure};
-use cantap_wire::{CHANNELS, Channel, Command, Event, Hello, Refusal, Reply};
+use cantap_wire::{CHANNELS, Channel, Command, Event, Hello, Refusal};
 
 use crate::outbox::{Item, Outbox};
 use crate::stream::{ClientId, Counts, Entry, Owner, Views};
@@ -41,19 +40,15 @@ pub struct Sent {
 }
 
 /// What to do when an answer arrives, in the order of the stream.
+#[derive(Default)]
 pub enum Then {
     /// Nothing.
+    #[default]
     Nothing,
     /// The channel is open on the board; it becomes this client's, if there is one.
     Opened { client: Option<(ClientId, ChannelConfig)>, channel: Channel },
     /// A frame was sent again.
     SentAgain(u32),
-}
-
-/// A request to the board.
-pub struct Asked {
-    pub answer: SyncSender<Result<Reply, Refusal>>,
-    pub then: Then,
 }
 
 /// One of the board's tables.
@@ -165,12 +160,8 @@ pub struct State {
     pub sent: HashMap<u32, Sent>,
     next_tag: u32,
     pub entries: [Entries; CHANNELS],
-    pub asked: HashMap<u16, Asked>,
-    next_request: u16,
     /// Frames to send once more, with their channel, when the lock is free.
     pub again: Vec<(Channel, TxFrame)>,
-    /// The connection to the board must be ended.
-    pub must_end: bool,
     /// Number of clients being written to.
     pub writers: usize,
     /// The server is ending: nobody else is admitted.
@@ -178,14 +169,6 @@ pub struct State {
 }
 
 impl State {
-    /// Records a request. Returns its number.
-    pub fn ask(&mut self, asked: Asked) -> u16 {
-        let id = self.next_request;
-        self.next_request = id.wrapping_add(1);
-        self.asked.insert(id, asked);
-        id
-    }
-
     /// Records a frame that is going to the board. Returns its tag there.
     pub fn note_sent(&mut self, client: ClientId, channel: Channel, frame: TxFrame) -> u32 {
         let tag = self.next_tag;
@@ -358,9 +341,6 @@ impl State {
         self.sent.clear();
         self.again.clear();
         self.entries = Default::default();
-        // Everyone waiting for an answer learns that none will come.
-        self.asked.clear();
-        self.must_end = false;
     }
 }
 

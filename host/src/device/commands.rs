@@ -5,8 +5,8 @@ use cantap_wire::message::{
 };
 use cantap_wire::{Channel, Command, Refusal, Reply};
 
-use super::clean::printable;
 use super::{Device, DeviceError};
+use crate::session::printable;
 
 impl Device {
     /// The state of the device.

@@ -5,63 +5,47 @@
 //! nothing as long as the buffer lasts, and after that is shown exactly what it lost.
 
 mod buffer;
-mod clean;
 mod clock;
 mod commands;
-mod error;
 mod intake;
-mod link;
 mod pipe;
-mod plausible;
 mod reader;
 mod reconnect;
 #[cfg(feature = "serial")]
 mod serial;
 mod several;
 mod stamps;
-mod watch;
 
-use std::sync::atomic::Ordering;
 use std::sync::mpsc::{Receiver, Sender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use cantap_wire::message::{ChannelConfig, Filter, Mode, Status};
 use cantap_wire::record::LossStage;
-use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply};
+use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Hello, Reply};
 
 pub use buffer::Buffer;
-pub use clean::clean;
 pub use clock::{
     ClockMap, ClockReport, ClockSource, CommonClock, Follower, FollowerReport, FrameClock, FrameDoubt,
     FrameNs, NotCommon, SofMark, Ticks, UtcClock, UtcNs,
 };
-pub(crate) use error::no_timing;
-pub use error::{DeviceError, SessionOver};
 pub use intake::{ChannelCounters, Counters, Intake, Notice, PIECE_BYTES, Transmission};
-pub use link::{Link, is_idle};
 pub use pipe::{PipeReader, PipeWriter, pipe};
-pub use reader::{encode, write_patiently};
 pub use reconnect::{Gaps, Happening, Reconnecting, Return};
 #[cfg(feature = "serial")]
 pub use serial::{Board, list, open as open_port, port_of};
 pub use several::{Several, channel_number};
 pub use stamps::{BitLengths, tighten};
-pub use watch::{Next, SilenceWatch};
 
 use crate::TraceRecord;
-use plausible::believe;
-use reader::{Answer, Order, Shared};
+use crate::session::{self, Session};
+pub use crate::session::{DeviceError, Link, SessionOver, encode, is_idle, write_patiently};
+use reader::{Order, Reader, Shared, TimeAsked};
 
 /// Records that wait for a consumer: 32 MB, half a minute of two saturated channels.
 const BUFFER_RECORDS: usize = 1 << 20;
 /// Time limit for a request.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(2);
-/// How often `Hello` is tried: a device may have half a line from another program in its input.
-const HELLO_TRIES: u32 = 3;
-/// Time limit for each try.
-const HELLO_TIMEOUT: Duration = Duration::from_millis(700);
 /// Round trips that set the clock at the beginning.
 const CLOCK_ROUNDS: u32 = 8;
 /// When closing a channel, its last records are given up if none has arrived for this long.
@@ -71,10 +55,9 @@ const TRANSMISSIONS: usize = 65_536;
 
 /// A device in a session of ours.
 pub struct Device {
+    session: Session<Option<TimeAsked>>,
     shared: Arc<Shared>,
     orders: Sender<Order>,
-    hello: Hello,
-    thread: Option<JoinHandle<()>>,
     settings: Mutex<Settings>,
 }
 
@@ -99,21 +82,10 @@ impl Device {
 
     /// The same, with a limit on how many records may wait to be taken; others are lost and counted.
     pub fn over_holding(link: Link, name: &str, records: usize) -> Result<Self, DeviceError> {
-        let Link { reader, writer, keep_alive } = link;
-        let shared = Arc::new(Shared::new(name, writer, records));
+        let shared = Arc::new(Shared::new(records));
         let (orders, received_orders) = std::sync::mpsc::channel();
-        let for_thread = Arc::clone(&shared);
-        let thread = std::thread::Builder::new()
-            .name("cantap-reader".to_owned())
-            .spawn(move || {
-                reader::run(reader, &for_thread, &received_orders);
-                drop(keep_alive);
-            })
-            .map_err(DeviceError::Thread)?;
-        // Dropping it stops the thread, whatever happens from here on.
-        let settings = Mutex::default();
-        let mut device = Self { shared, orders, hello: no_hello(), thread: Some(thread), settings };
-        device.hello = device.shake_hands()?;
+        let session = Session::begin(link, name, Reader::new(Arc::clone(&shared), received_orders))?;
+        let device = Self { session, shared, orders, settings: Mutex::default() };
         for _ in 0..CLOCK_ROUNDS {
             device.time()?;
         }
@@ -121,50 +93,27 @@ impl Device {
         Ok(device)
     }
 
-    fn shake_hands(&self) -> Result<Hello, DeviceError> {
-        for _ in 0..HELLO_TRIES {
-            // The zero byte ends anything left in the device's input and selects our protocol over slcan.
-            self.shared.write(&[0])?;
-            match self.request_within(Command::Hello { protocol: PROTOCOL_VERSION }, HELLO_TIMEOUT) {
-                Ok(Reply::Hello(mut hello)) => {
-                    clean(&mut hello);
-                    return Ok(hello);
-                }
-                Ok(_) => return Err(DeviceError::WrongReply),
-                Err(DeviceError::Timeout { .. }) => {}
-                Err(error) => return Err(error),
-            }
-        }
-        Err(DeviceError::NotCantap { address: self.shared.name.clone() })
-    }
-
     /// The device's description of itself.
     pub const fn hello(&self) -> &Hello {
-        &self.hello
+        self.session.hello()
     }
 
     /// Its address, as given when it was opened.
     pub fn name(&self) -> &str {
-        &self.shared.name
+        self.session.requests().name()
     }
 
     /// Sends any request and waits for its answer.
     pub fn request(&self, command: Command) -> Result<Reply, DeviceError> {
-        self.request_within(command, REQUEST_TIMEOUT)
+        self.request_later(command)?.wait()
     }
 
     /// Sends any request without waiting for its answer, so that several can be in flight: a device handles them
     /// in order. Use it for a few at a time; their bytes wait in the device's input.
     pub fn request_later(&self, command: Command) -> Result<Pending<'_>, DeviceError> {
-        if let Some(gone) = self.shared.gone() {
-            return Err(gone);
-        }
-        let (id, answers) = self.shared.ask(command)?;
-        Ok(Pending { shared: &self.shared, id, answers })
-    }
-
-    fn request_within(&self, command: Command, timeout: Duration) -> Result<Reply, DeviceError> {
-        self.request_later(command)?.wait_within(timeout)
+        let is_time = matches!(command, Command::Time);
+        let note = is_time.then(|| self.shared.time_asked());
+        self.session.requests().send(command, note).map(Pending)
     }
 
     fn order(&self, order: Order) {
@@ -174,7 +123,7 @@ impl Device {
 
     /// The bit timing for a bit rate on this device, with the recommended sample point.
     pub fn timing(&self, bitrate_bps: u32) -> Result<BitTiming, DeviceError> {
-        BitTiming::choose(self.hello.can_clock_hz, bitrate_bps, None)
+        BitTiming::choose(self.hello().can_clock_hz, bitrate_bps, None)
             .map_err(|reason| DeviceError::BitRate { bitrate_bps, reason })
     }
 
@@ -185,7 +134,7 @@ impl Device {
         channel: Channel,
         config: Option<ChannelConfig>,
     ) -> Result<ChannelConfig, DeviceError> {
-        if channel.number() > self.hello.channels {
+        if channel.number() > self.hello().channels {
             return Err(DeviceError::NoChannel { channel });
         }
         // This must be set before the first frame can arrive.
@@ -199,7 +148,7 @@ impl Device {
             {
                 // Left open, it might acknowledge frames, or destroy them at a wrong bit rate.
                 self.done(Command::Close { channel })?;
-                let bitrate_bps = applied.timing.bitrate_bps(self.hello.can_clock_hz);
+                let bitrate_bps = applied.timing.bitrate_bps(self.hello().can_clock_hz);
                 Err(DeviceError::OpenedOtherwise { channel, bitrate_bps, mode: applied.mode })
             }
             Reply::Opened(applied) => {
@@ -215,8 +164,8 @@ impl Device {
         self.order(Order::BitLength {
             channel,
             clocks_per_bit: config.timing.clocks_per_bit(),
-            clock_hz: self.hello.can_clock_hz,
-            tick_hz: self.hello.tick_hz,
+            clock_hz: self.hello().can_clock_hz,
+            tick_hz: self.hello().tick_hz,
         });
     }
 
@@ -276,7 +225,7 @@ impl Device {
             !open.iter().all(stopped)
         };
         while goes_on(&seen) {
-            if let Some(gone) = self.shared.gone() {
+            if let Some(gone) = self.session.requests().gone() {
                 return Err(gone);
             }
             let now = self.shared.wait_for_news(&seen, DRAIN_TIMEOUT / 4);
@@ -369,77 +318,27 @@ impl Device {
     /// The current map from the device's time to UTC, with the marks that it is based on. It stays valid for as long as
     /// crystals keep their rate: some seconds. Before the device's time is known, a map from tick 0 to the epoch.
     pub fn clock_map(&self) -> Arc<ClockMap> {
-        self.shared.clock_map().unwrap_or_else(|| Arc::new(ClockMap::new(self.hello.tick_hz, UtcNs(0))))
+        self.shared.clock_map().unwrap_or_else(|| Arc::new(ClockMap::new(self.hello().tick_hz, UtcNs(0))))
     }
 }
 
 impl Drop for Device {
-    /// Leaves the bus. A device does that by itself when the port closes, but a request is quicker.
+    /// Leaves the buses.
     fn drop(&mut self) {
-        if !self.shared.buffer.has_ended() && self.shared.gone().is_none() && self.hello.channels > 0 {
-            for channel in Channel::ALL {
-                let _ = self.shared.ask(Command::Close { channel });
-            }
+        if !self.shared.buffer.has_ended() {
+            self.session.leave_buses();
         }
-        self.shared.quit.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
-            // Joined so that the port is closed before anyone opens it again.
-            let _ = thread.join();
-        }
-    }
-}
-
-/// A placeholder until there is an answer.
-fn no_hello() -> Hello {
-    Hello {
-        protocol: PROTOCOL_VERSION,
-        firmware: [0; 3],
-        board: heapless::String::new(),
-        serial: heapless::String::new(),
-        channels: 0,
-        tick_hz: 1,
-        can_clock_hz: 1,
-        queue_bytes: 0,
-        tx_queue: 0,
-        periodic_slots: 0,
-        trigger_slots: 0,
-        filter_banks: 0,
-        capabilities: 0,
     }
 }
 
 /// A request under way. Dropping it ignores the answer.
 #[must_use = "the answer may be a refusal"]
-pub struct Pending<'d> {
-    shared: &'d Shared,
-    id: u16,
-    answers: Receiver<Answer>,
-}
+pub struct Pending<'d>(session::Pending<'d, Option<TimeAsked>>);
 
 impl Pending<'_> {
     /// Waits for the answer.
     pub fn wait(self) -> Result<Reply, DeviceError> {
-        self.wait_within(REQUEST_TIMEOUT)
-    }
-
-    fn wait_within(self, timeout: Duration) -> Result<Reply, DeviceError> {
-        match self.answers.recv_timeout(timeout) {
-            Ok(Answer::Response(response)) => match response.result {
-                Ok(reply) => believe(reply),
-                Err(Refusal::Protocol { device }) => Err(DeviceError::Protocol { device }),
-                Err(refusal) => Err(DeviceError::Refused { refusal }),
-            },
-            Ok(Answer::OtherProtocol(device)) => Err(DeviceError::Protocol { device }),
-            Err(_) => {
-                Err(self.shared.gone().unwrap_or(DeviceError::Timeout { seconds: timeout.as_secs_f32() }))
-            }
-        }
-    }
-}
-
-impl Drop for Pending<'_> {
-    fn drop(&mut self) {
-        self.shared.forget(self.id);
+        self.0.reply_within(REQUEST_TIMEOUT)
     }
 }
 

@@ -83,7 +83,7 @@ impl StreamEncoder {
 
     /// Finishes the current batch.
     pub fn finish(&mut self) {
-        self.put(|batch, out| batch.finish(out));
+        self.put(BatchWriter::finish);
     }
 
     /// Ends the session at this device time, in ticks: nothing was captured after it.
@@ -146,7 +146,9 @@ mod tests {
         let received = Received { channel, frame, stamp: Stamp::Exact, data_omitted: false };
         // Several batches.
         let times: Vec<u64> = (0..500).map(|number| 1000 + 70 * number).collect();
-        times.iter().for_each(|ticks| stream.record(*ticks, &Record::Received(received)));
+        for ticks in &times {
+            stream.record(*ticks, &Record::Received(received));
+        }
         let lost = Event::Lost { channel, stage: LossStage::Host, count: 3, at_least: false };
         stream.event(40_000, lost);
         stream.finish();

@@ -18,10 +18,9 @@ use rustls::{
     ClientConfig, ClientConnection, Connection, RootCertStore, ServerConfig, ServerConnection, crypto,
 };
 
-use crate::client::Guest;
 use crate::connect::dial;
 use crate::flow::acknowledging;
-use crate::listen::{Listening, accept, admit, bind, turn_away};
+use crate::listen::{Arrival, Listening, accept, bind, let_in};
 use crate::places::{Places, ends};
 use crate::{Board, News};
 
@@ -169,17 +168,11 @@ pub fn listen(board: &Arc<Board>, address: SocketAddr, most: Role, server: &Serv
             drop(handshake);
             let secured = secured.and_then(|secured| Ok((secured, places.enter(Some(peer.ip()), end?))));
             match secured {
-                Ok(((role, secured), Ok(place))) => {
+                Ok(((role, secured), place)) => {
                     let (input, output) = secured.split();
-                    let (role, place) = (role.min(most), Some(place));
-                    admit(
-                        &board,
-                        input,
-                        output,
-                        Guest { name, role, place, is_counted: false, is_remote: true },
-                    );
+                    let arrival = Arrival { name, role: role.min(most), is_remote: true };
+                    let_in(&board, place, input, output, arrival);
                 }
-                Ok(((_, secured), Err(full))) => turn_away(&board, &mut secured.split().1, name, &full),
                 Err(error) => board.tell(News::Refused { client: name, reason: error.to_string() }),
             }
         })?;

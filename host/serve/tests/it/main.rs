@@ -1,5 +1,6 @@
 //! Every integration test of this crate, in one program: each program is linked on its own.
 
+mod board;
 mod browser;
 mod eight_clients;
 mod hostile;

@@ -255,7 +255,7 @@ fn a_suspended_bus_is_noticed_and_what_follows_begins_anew() {
 }
 
 #[test]
-fn a_single_wrong_mark_is_left_out() {
+fn a_single_false_mark_is_left_out() {
     let marks = |second: i64, mark: SofMark| {
         Some(if second == 30 { SofMark { frame: (mark.frame + 1) % 2048, ..mark } } else { mark })
     };
@@ -327,7 +327,7 @@ fn a_bad_beginning_does_not_put_two_devices_on_two_controllers() {
 /// One device's UTC was wrong for three seconds, as after an answer that was late undetectably, and one mark was as late as marks may be.
 /// Both are counted and do not undo what minutes have shown.
 #[test]
-fn a_time_that_is_wrong_once_is_counted_and_decides_nothing() {
+fn a_time_that_is_false_once_is_counted_and_decides_nothing() {
     let controller = Simulated { frames_ppm: 35.0, jitter_ns: 100.0, ..EXACT };
     let here = follow(&Simulated { ppm: 40.0, ..controller }, 300, usual, all_marks).0;
     let late_mark = |second: i64, mark: SofMark| {

@@ -4,7 +4,7 @@
 use cantap_wire::message::ChannelConfig;
 use cantap_wire::{Hello, Reply};
 
-use super::DeviceError;
+use super::error::DeviceError;
 
 /// No device has a slower clock: a tick is a microsecond at most, and so is the shortest bit.
 const LEAST_CLOCK_HZ: u32 = 1_000_000;

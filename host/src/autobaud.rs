@@ -179,7 +179,7 @@ pub fn search(
 }
 
 /// The result of one measurement.
-enum Heard {
+enum Round {
     /// Frames, or a guess that has none.
     Frames(Measured),
     /// The search is over.
@@ -198,8 +198,8 @@ impl Search<'_> {
                 self.begin()?;
             }
             let measured = match self.measure(wanted)? {
-                Heard::Frames(measured) => measured,
-                Heard::Over(outcome) => return Ok(outcome),
+                Round::Frames(measured) => measured,
+                Round::Over(outcome) => return Ok(outcome),
             };
             let measured_bps = f64::from(self.device.hello().tick_hz) / measured.bit_ticks;
             let is_guess = measured.frames == 0;
@@ -239,7 +239,7 @@ impl Search<'_> {
 
     /// Measures until this many frames were read, or nothing new arrives. Everything read since the measurement began
     /// counts.
-    fn measure(&mut self, wanted: u32) -> Result<Heard, DeviceError> {
+    fn measure(&mut self, wanted: u32) -> Result<Round, DeviceError> {
         let tick_hz = f64::from(self.device.hello().tick_hz);
         // Slightly wider than what a device can open, so that a rate beyond it is named rather than mistaken
         // for another.
@@ -276,7 +276,7 @@ impl Search<'_> {
                     && now > guess_at
                     && let Some(guess) = estimate(&self.edges, least, most)
                 {
-                    return Ok(Heard::Frames(guess));
+                    return Ok(Round::Frames(guess));
                 }
             }
             if let Some((since, measured)) = found {
@@ -285,14 +285,14 @@ impl Search<'_> {
                 let pause = self.ticks(PAUSE).max((PAUSE_BITS * measured.bit_ticks) as u64);
                 let is_alone = now.saturating_sub(self.heard) > pause;
                 if measured.frames >= wanted && is_good && (measured.frames > 1 || is_alone) {
-                    return Ok(Heard::Frames(measured));
+                    return Ok(Round::Frames(measured));
                 }
             }
             if let Some(over) = self.is_over(&told, found.is_some()) {
-                return Ok(found.map_or(Heard::Over(over), |(_, measured)| Heard::Frames(measured)));
+                return Ok(found.map_or(Round::Over(over), |(_, measured)| Round::Frames(measured)));
             }
             if !(self.progress)(Progress::Measuring { edges: self.seen }) {
-                return Ok(Heard::Over(Outcome::Stopped));
+                return Ok(Round::Over(Outcome::Stopped));
             }
             std::thread::sleep(ASK_EVERY);
         }

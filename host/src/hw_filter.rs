@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn what_hardware_cannot_do_is_said() {
+    fn what_hardware_cannot_do_is_reported() {
         assert_eq!(compiled("can0,123~7FF").remainder, Some(Remainder::Inverse));
         assert_eq!(compiled("can1,123:7FF").remainder, Some(Remainder::Nothing));
         assert_eq!(compiled("can0,100:C00007FF,200:C00007FF,j").remainder, Some(Remainder::Nothing));

@@ -89,7 +89,7 @@ mod tests {
     const TICK_HZ: u32 = 12_000_000;
 
     #[test]
-    fn periods_are_refused_for_what_is_wrong_with_them() {
+    fn periods_are_refused_with_the_reason() {
         let ticks = |period| period_ticks(period, TICK_HZ).map_err(|error| error.to_string());
         assert_eq!(ticks(SHORTEST_PERIOD), Ok(47 * 12));
         assert_eq!(ticks(Duration::from_secs(357)), Ok(357 * TICK_HZ));

@@ -400,7 +400,7 @@ mod tests {
     }
 
     #[test]
-    fn reasons_that_the_device_told_count_where_nothing_waits() {
+    fn reasons_that_the_device_gave_count_where_nothing_waits() {
         use TransmitFailure::{ArbitrationLost, BusError, BusOff, Overtaken};
         let ours = frame(Direction::Tx, "123#");
         let (ack, bit) = (error(BusErrorKind::Acknowledgment), error(BusErrorKind::BitRecessive));

@@ -287,7 +287,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn a_frame_that_nobody_acknowledges_is_read_and_told() {
+    fn a_frame_that_nobody_acknowledges_is_read_and_reported() {
         let mut pin = Pin::at(250e3);
         let mut bits = levels(&"123#1122".parse().unwrap());
         bits.truncate(bits.len() - ACK_SLOT_FROM_END + 1);

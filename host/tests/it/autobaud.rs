@@ -113,7 +113,7 @@ fn a_bus_without_one_good_frame_is_no_success() {
 }
 
 #[test]
-fn a_sender_that_nobody_acknowledges_is_measured_and_told() {
+fn a_sender_that_nobody_acknowledges_is_measured_and_reported() {
     let (outcome, _) = search_within(Duration::from_millis(600), "bitrate=250k,load=50,ack=no");
     assert!(
         matches!(outcome, Outcome::Unconfirmed { bitrate_bps: 250_000, acknowledged: false, .. }),

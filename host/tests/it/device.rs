@@ -169,7 +169,7 @@ fn another_version_names_the_side_to_update() {
 }
 
 #[test]
-fn something_that_is_no_device_is_told_from_one_that_vanished() {
+fn something_that_is_no_device_is_distinguished_from_one_that_vanished() {
     let (link, mut fake) = FakeDevice::new();
     let served = std::thread::spawn(move || {
         fake.write(b"\x07\x07NMEA 0183 $GPGGA,\r\n\x07");

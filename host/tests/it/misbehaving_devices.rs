@@ -108,7 +108,7 @@ fn in_order(numbers: &[u32]) -> bool {
 }
 
 #[test]
-fn whatever_ends_a_session_is_said_and_the_capture_goes_on_with_the_gap_in_place() {
+fn whatever_ends_a_session_is_reported_and_the_capture_goes_on_with_the_gap_in_place() {
     for (fault, words) in [
         (Fault::Deaf, "the device at 'fake' has answered nothing for 1."),
         (Fault::Mute, "the device at 'fake' has answered nothing for 1."),
@@ -228,7 +228,7 @@ fn on_another_board_channels_only_listen() {
 }
 
 #[test]
-fn a_device_that_is_gone_at_the_end_is_told_and_the_gap_stands_there() {
+fn a_device_that_is_gone_at_the_end_is_reported_and_the_gap_stands_there() {
     for fault in [Fault::Deaf, Fault::SessionLost, Fault::Vanishes] {
         let log = Arc::default();
         let (device, _) = start(fault, "1", &log);

@@ -94,7 +94,7 @@ fn two_devices() -> FollowerReport {
 /// How well they match is measured where the emulator defines time (`cli/tests/it/emulated_clock`): a virtual device's milliseconds are the
 /// computer's, and on a busy one they are later than a clock allows. In that case the report must say so.
 #[test]
-fn two_devices_are_one_stream_of_four_channels_in_order_and_are_on_one_clock_or_it_is_said_why_not() {
+fn two_devices_are_one_stream_of_four_channels_in_order_and_are_on_one_clock_or_the_report_says_why_not() {
     let clock = two_devices();
     match clock.common {
         Ok(()) => {}
@@ -108,7 +108,7 @@ fn two_devices_are_one_stream_of_four_channels_in_order_and_are_on_one_clock_or_
 }
 
 #[test]
-fn a_device_without_usb_frames_is_there_by_utc_and_that_is_said() {
+fn a_device_without_usb_frames_is_there_by_utc_and_that_is_reported() {
     let mut devices =
         Several::new(vec![virtual_board("load=20"), fake_board(&[Fault::None], Duration::ZERO)]);
     devices.connect().unwrap();

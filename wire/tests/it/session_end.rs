@@ -25,14 +25,14 @@ fn end(writer: &mut BatchWriter) -> Vec<u8> {
     out[..len].to_vec()
 }
 
-fn heard(decoder: &mut Decoder, bytes: &[u8]) -> Vec<String> {
-    let mut heard = Vec::new();
+fn reports(decoder: &mut Decoder, bytes: &[u8]) -> Vec<String> {
+    let mut all = Vec::new();
     decoder.push(bytes, |decoded| {
         if !matches!(decoded, Decoded::Record { .. }) {
-            heard.push(format!("{decoded:?}"));
+            all.push(format!("{decoded:?}"));
         }
     });
-    heard
+    all
 }
 
 #[test]
@@ -43,7 +43,7 @@ fn the_end_counts_what_went_missing_before_it() {
     let _lost = [batch(&mut writer), batch(&mut writer)];
     let stream = [first, end(&mut writer)].concat();
     assert_eq!(
-        heard(&mut decoder, &stream),
+        reports(&mut decoder, &stream),
         ["BatchesLost { batches: 2, frames: [0, 2] }", "Ended { ticks: 1234, reason: Suspended }"]
     );
 }
@@ -55,5 +55,5 @@ fn an_end_older_than_the_session_does_not_end_it() {
     let mut decoder = Decoder::new();
     let stream = [batch(&mut writer), old].concat();
     let corruption = Corruption::OutOfOrder { sequence: 0 };
-    assert_eq!(heard(&mut decoder, &stream), [format!("{:?}", Decoded::Corrupt(corruption))]);
+    assert_eq!(reports(&mut decoder, &stream), [format!("{:?}", Decoded::Corrupt(corruption))]);
 }

@@ -33,7 +33,7 @@ fn channel_name(channel: Channel) -> String {
 }
 
 /// The last part of a variant's name, in lower case with hyphens.
-fn words(value: &impl Serialize) -> String {
+fn hyphenated(value: &impl Serialize) -> String {
     let name = variant(value);
     let mut words = String::new();
     for letter in name.chars() {
@@ -86,16 +86,16 @@ fn event_reads(event: &Event) -> String {
     match event {
         Event::Lost { channel, stage, count, at_least } => {
             let bound = if *at_least { "at-least " } else { "" };
-            format!("{} lost {bound}{count} {}", channel_name(*channel), words(stage))
+            format!("{} lost {bound}{count} {}", channel_name(*channel), hyphenated(stage))
         }
         Event::BusError { channel, kind, tec, rec } => {
-            format!("{} error {} tec {tec} rec {rec}", channel_name(*channel), words(kind))
+            format!("{} error {} tec {tec} rec {rec}", channel_name(*channel), hyphenated(kind))
         }
         Event::ErrorsSuppressed { channel, count } => {
             format!("{} errors-suppressed {count}", channel_name(*channel))
         }
         Event::State { channel, state, tec, rec } => {
-            format!("{} state {} tec {tec} rec {rec}", channel_name(*channel), words(state))
+            format!("{} state {} tec {tec} rec {rec}", channel_name(*channel), hyphenated(state))
         }
         Event::Started { channel } => format!("{} started", channel_name(*channel)),
         Event::Stopped { channel } => format!("{} stopped", channel_name(*channel)),
@@ -107,7 +107,7 @@ fn event_reads(event: &Event) -> String {
                 TransmitFailure::Overtaken { periods } => format!(" {periods}"),
                 _ => String::new(),
             };
-            format!("{} not-sent tag {tag} {}{periods}", channel_name(*channel), words(reason))
+            format!("{} not-sent tag {tag} {}{periods}", channel_name(*channel), hyphenated(reason))
         }
         Event::SofMark { frame, doubled } => format!("sof {frame} doubled {doubled}"),
     }

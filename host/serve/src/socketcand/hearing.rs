@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 use cantap::{Direction, TraceEvent, TraceRecord};
 use cantap_wire::{Frame, Id};
 
+use super::messages::{now_ns, put_error, put_frame};
 use super::subscriptions::Subscriptions;
-use super::told::{now_ns, put_error, put_frame};
 
 /// What a client receives, by its mode.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

@@ -1,14 +1,14 @@
 //! The socketcand protocol (<https://github.com/linux-can/socketcand>, doc/protocol.md), for SavvyCAN, Kayak, python-can and
 //! other clients: raw, BCM and control mode, and the beacon. ISO-TP mode is not supported.
 //!
-//! The protocol page leaves some things open, and clients differ: `told` defines how frames are written, `command` how they are read. The
+//! The protocol page leaves some things open, and clients differ: `messages` defines how frames are written, `command` how they are read. The
 //! bus is only listened to until a client that may send does so; its frames are then passed on to the others, but not to itself. Frames
 //! sent repeatedly (`add`) are sent by the board, timed by its own clock.
 
 mod command;
 mod hearing;
+mod messages;
 mod subscriptions;
-mod told;
 
 use std::collections::HashMap;
 use std::io::{self, Read, Write};
@@ -292,7 +292,7 @@ impl Connection {
     /// A reason as the client reads it: in raw mode, clients read nothing but frames.
     fn refusal(&self, reason: &str) -> String {
         if lock(&self.hearing).hears == Hears::All {
-            return told::not_sent();
+            return messages::not_sent();
         }
         format!("< error {} >", plain(reason))
     }
@@ -450,7 +450,7 @@ impl Connection {
                 std::thread::sleep(wait);
             }
             records.recycle(batch);
-            if out.is_empty() && self.must_be_told() {
+            if out.is_empty() && self.needs_keep_alive() {
                 out.push_str(KEEP_ALIVE);
             }
             if self.write(&out).is_err() {
@@ -462,7 +462,7 @@ impl Connection {
     }
 
     /// Whether nothing has been sent for too long to a client that reads only frames.
-    fn must_be_told(&self) -> bool {
+    fn needs_keep_alive(&self) -> bool {
         lock(&self.told_at).elapsed() >= KEEP_ALIVE_EVERY && lock(&self.hearing).hears == Hears::All
     }
 

@@ -125,7 +125,7 @@ mod tests {
 
     const ID: u32 = 0x123;
 
-    fn told(subscriptions: &mut Subscriptions, frames: &[(i64, &str)]) -> Vec<i64> {
+    fn passed_on(subscriptions: &mut Subscriptions, frames: &[(i64, &str)]) -> Vec<i64> {
         let take = |(ms, text): &(i64, &str)| {
             subscriptions.take(ms * 1_000_000, &text.parse().unwrap()).map(|(time_ns, _)| time_ns / 1_000_000)
         };
@@ -138,7 +138,7 @@ mod tests {
         all.add(Id::standard(ID).unwrap(), Wanted::Changes([0xF0, 0, 0, 0, 0, 0, 0, 0]), 0);
         let frames =
             [(1, "123#11"), (2, "123#12"), (3, "123#21FF"), (4, "124#33"), (5, "00000123#44"), (6, "123#11")];
-        assert_eq!(told(&mut all, &frames), [1, 3, 6]);
+        assert_eq!(passed_on(&mut all, &frames), [1, 3, 6]);
     }
 
     #[test]
@@ -156,18 +156,18 @@ mod tests {
             (6, "123#440000"),
             (7, "123#330201"),
         ];
-        assert_eq!(told(&mut all, &frames), [1, 2, 5, 7]);
+        assert_eq!(passed_on(&mut all, &frames), [1, 2, 5, 7]);
     }
 
     #[test]
     fn an_interval_tells_the_latest_when_it_is_over() {
         let mut all = Subscriptions::default();
         all.add(Id::standard(ID).unwrap(), Wanted::All, 10_000);
-        assert_eq!(told(&mut all, &[(1, "123#01"), (2, "123#02"), (5, "123#03")]), [1]);
+        assert_eq!(passed_on(&mut all, &[(1, "123#01"), (2, "123#02"), (5, "123#03")]), [1]);
         assert!(all.ripe(10_000_000).is_empty());
         assert_eq!(all.ripe(11_000_000), [(5_000_000, "123#03".parse().unwrap())]);
         assert!(all.ripe(40_000_000).is_empty());
         all.remove(Id::standard(ID).unwrap());
-        assert_eq!(told(&mut all, &[(90, "123#01")]), []);
+        assert_eq!(passed_on(&mut all, &[(90, "123#01")]), []);
     }
 }

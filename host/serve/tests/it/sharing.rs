@@ -168,7 +168,7 @@ impl std::io::Read for Gated {
 }
 
 #[test]
-fn a_listener_changes_nothing_and_is_told_what_it_would_take() {
+fn a_listener_changes_nothing_and_learns_what_it_would_take() {
     let board = board("load=20");
     let device = client(&board, "listener", Role::Listen);
     let not_granted = |needs| Refusal::NotGranted { needs };
@@ -341,7 +341,7 @@ fn each_client_has_its_own_filters_and_leaves_out_what_it_wants() {
 }
 
 #[test]
-fn when_the_board_goes_clients_are_told_and_find_it_again() {
+fn when_the_board_goes_clients_learn_it_and_find_it_again() {
     let (board, told) = board_at("load=30", Settings::at(BITRATE_BPS));
     let manager = client(&board, "manager", Role::Configure);
     let device = client(&board, "listener", Role::Listen);

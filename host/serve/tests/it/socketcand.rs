@@ -320,7 +320,7 @@ fn the_protocol_page_is_a_transcript() {
 
 /// A frame held back by an interval is sent when that is over, even if nothing else is on the bus.
 #[test]
-fn a_throttled_frame_is_told_on_a_silent_bus() {
+fn a_throttled_frame_is_passed_on_on_a_silent_bus() {
     let board = board("load=0");
     let server = listen(&board, Role::Listen);
     let other = other(&board);

@@ -193,7 +193,7 @@ fn silent_connections_take_nobody_s_place() {
 }
 
 #[test]
-fn whoever_finds_no_place_is_told_so() {
+fn whoever_finds_no_place_learns_why() {
     let (board, _told) = board_at(Settings { most_clients: 2, ..Settings::at(BITRATE_BPS) });
     let native = listen::tcp(&board, any_port(), Role::Listen).unwrap();
     let _served = [over(&native), over(&native)];

@@ -62,7 +62,7 @@ fn refuses_to_send(device: &Device) {
 }
 
 #[test]
-fn a_capture_over_tls_is_one_made_beside_it_and_the_certificate_says_what_is_allowed() {
+fn a_capture_over_tls_is_the_same_as_a_local_one_and_the_certificate_says_what_is_allowed() {
     let folder = tempfile::tempdir().unwrap();
     let served = serve(folder.path(), Role::Send);
     // Clients are added later, by the existing authority.
@@ -94,7 +94,7 @@ fn a_capture_over_tls_is_one_made_beside_it_and_the_certificate_says_what_is_all
 }
 
 #[test]
-fn the_server_grants_no_more_than_it_was_told_to() {
+fn the_server_grants_no_more_than_it_was_set_to() {
     let folder = tempfile::tempdir().unwrap();
     let served = serve(folder.path(), Role::Listen);
     let sender = Keys::in_folder(folder.path()).unwrap().add_client("sender", Role::Send).unwrap();
@@ -104,7 +104,7 @@ fn the_server_grants_no_more_than_it_was_told_to() {
 }
 
 #[test]
-fn strangers_and_wrong_certificates_hear_nothing() {
+fn strangers_and_untrusted_certificates_receive_nothing() {
     let (folder, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     let served = serve(folder.path(), Role::Send);
     let keys = Keys::in_folder(folder.path()).unwrap();

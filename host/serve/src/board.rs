@@ -72,6 +72,7 @@ impl Board {
             quit: AtomicBool::new(false),
             next_client: AtomicU64::new(1),
             news: Box::new(news),
+            refusals: Mutex::default(),
         });
         let (first, began) = std::sync::mpsc::channel();
         let for_thread = Arc::clone(&shared);

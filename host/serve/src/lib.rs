@@ -13,6 +13,7 @@ mod flow;
 mod foreign;
 pub mod lines;
 pub mod listen;
+mod log_limit;
 mod modes;
 mod news;
 mod outbox;

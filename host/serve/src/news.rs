@@ -31,6 +31,11 @@ pub enum News {
         /// The reason.
         reason: String,
     },
+    /// So many more clients were refused since the last report: only some refusals are reported while there are many.
+    RefusedMore {
+        /// How many.
+        count: u64,
+    },
     /// A client said nothing for the dead-man time: what it has sent on its own is stopped.
     DeadMan {
         /// Its name.
@@ -68,6 +73,7 @@ impl fmt::Display for News {
             Self::ClientLeft { client, reason: None } => write!(f, "{client} has left"),
             Self::ClientLeft { client, reason: Some(reason) } => write!(f, "{client} was let go: {reason}"),
             Self::Refused { client, reason } => write!(f, "{client} was not let in: {reason}"),
+            Self::RefusedMore { count } => write!(f, "{count} more were not let in"),
             Self::DeadMan { client, after } => {
                 write!(
                     f,

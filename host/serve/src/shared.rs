@@ -2,13 +2,14 @@
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use cantap::DeviceError;
 use cantap::session::Requests;
 use cantap_wire::message::{ChannelConfig, Mode};
 use cantap_wire::{CHANNELS, Command, Refusal, Reply};
 
+use crate::log_limit::LogLimit;
 use crate::news::News;
 use crate::outbox::MOST_RECORDS;
 use crate::state::{State, Then};
@@ -71,6 +72,7 @@ pub(crate) struct Shared {
     pub quit: AtomicBool,
     pub next_client: AtomicU64,
     pub news: Box<dyn Fn(News) + Send + Sync>,
+    pub refusals: Mutex<LogLimit>,
 }
 
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -84,6 +86,12 @@ impl Shared {
     }
 
     pub fn tell(&self, news: News) {
+        if let News::Refused { .. } = news {
+            let Some(count) = lock(&self.refusals).pass(Instant::now()) else { return };
+            if count > 0 {
+                (self.news)(News::RefusedMore { count });
+            }
+        }
         (self.news)(news);
     }
 

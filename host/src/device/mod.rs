@@ -333,7 +333,7 @@ impl Drop for Device {
 
 /// A request under way. Dropping it ignores the answer.
 #[must_use = "the answer may be a refusal"]
-pub struct Pending<'d>(session::Pending<'d, Option<TimeAsked>>);
+pub struct Pending<'d>(session::InFlight<'d, Option<TimeAsked>>);
 
 impl Pending<'_> {
     /// Waits for the answer.

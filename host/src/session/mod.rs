@@ -22,7 +22,7 @@ pub(crate) use error::no_timing;
 pub use error::{DeviceError, SessionOver};
 pub use link::{Link, is_idle};
 pub use reading::{Pass, Sink};
-pub use requests::{Pending, Requests, Waiting, encode, write_patiently};
+pub use requests::{InFlight, Requests, Waiting, encode, write_patiently};
 
 /// How often `Hello` is tried: a device may have half a line from another program in its input.
 const HELLO_TRIES: u32 = 3;

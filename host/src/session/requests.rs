@@ -117,10 +117,10 @@ impl<N> Requests<N> {
     }
 
     /// Sends a request. Its answer is waited for with what this returns, so several can be in flight: a device handles them in order.
-    pub fn send(&self, command: Command, note: N) -> Result<Pending<'_, N>, DeviceError> {
+    pub fn send(&self, command: Command, note: N) -> Result<InFlight<'_, N>, DeviceError> {
         let (sender, answers) = sync_channel(1);
         let id = self.send_to(command, note, Some(sender))?;
-        Ok(Pending { requests: self, id, answers })
+        Ok(InFlight { requests: self, id, answers })
     }
 
     /// Sends a request for whose answer nobody waits; it only comes in the stream.
@@ -234,13 +234,13 @@ impl<N> Requests<N> {
 
 /// A request under way. Dropping it ignores the answer.
 #[must_use = "the answer may be a refusal"]
-pub struct Pending<'r, N> {
+pub struct InFlight<'r, N> {
     requests: &'r Requests<N>,
     id: u16,
     answers: Receiver<Answer>,
 }
 
-impl<N> Pending<'_, N> {
+impl<N> InFlight<'_, N> {
     /// Waits for the answer, at most `timeout`: a value that is possible, or an error.
     pub fn reply_within(self, timeout: Duration) -> Result<Reply, DeviceError> {
         match self.answer_within(timeout)? {
@@ -258,7 +258,7 @@ impl<N> Pending<'_, N> {
     }
 }
 
-impl<N> Drop for Pending<'_, N> {
+impl<N> Drop for InFlight<'_, N> {
     fn drop(&mut self) {
         self.requests.forget(self.id);
     }

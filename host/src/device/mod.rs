@@ -27,7 +27,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use cantap_wire::message::{ChannelConfig, Filter, Mode, Status};
+use cantap_wire::message::{ChannelConfig, Filter, Mode, Status, capability};
 use cantap_wire::record::LossStage;
 use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply};
 
@@ -45,7 +45,7 @@ pub use pipe::{PipeReader, PipeWriter, pipe};
 pub use reader::{encode, write_patiently};
 pub use reconnect::{Gaps, Happening, Reconnecting, Return};
 #[cfg(feature = "serial")]
-pub use serial::{Board, list, open as open_port, port_of};
+pub use serial::{Board, list, open as open_port, open_at as open_port_at, port_of};
 pub use several::{Several, channel_number};
 pub use stamps::{BitLengths, tighten};
 pub use watch::{Next, SilenceWatch};
@@ -188,6 +188,10 @@ impl Device {
         if channel.number() > self.hello.channels {
             return Err(DeviceError::NoChannel { channel });
         }
+        let must_be_silent = config.as_ref().is_some_and(|config| config.mode == Mode::ListenOnly);
+        if must_be_silent && self.hello.capabilities & capability::ALWAYS_ACKNOWLEDGES != 0 {
+            return Err(DeviceError::AlwaysAcknowledges { address: self.shared.name.clone() });
+        }
         // This must be set before the first frame can arrive.
         if let Some(config) = &config {
             self.set_bit_length(channel, config);
@@ -212,6 +216,9 @@ impl Device {
     }
 
     fn set_bit_length(&self, channel: Channel, config: &ChannelConfig) {
+        if self.hello.capabilities & capability::NO_BIT_RATE != 0 {
+            return;
+        }
         self.order(Order::BitLength {
             channel,
             clocks_per_bit: config.timing.clocks_per_bit(),

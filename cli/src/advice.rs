@@ -73,6 +73,7 @@ fn of_device(error: &DeviceError) -> Option<String> {
         }
         DeviceError::Silent { .. } => "; if that stays so, unplug it and plug it in again",
         DeviceError::NoChannel { .. } => "; choose one it has with -c",
+        DeviceError::AlwaysAcknowledges { .. } => " (--mode normal)",
         DeviceError::Refused { refusal } => match refusal {
             Refusal::Unsupported => "; `cantap info` shows what it can",
             Refusal::BadTiming => "; see `cantap timing`",

@@ -221,7 +221,11 @@ impl ChannelArgs {
         channels: impl Iterator<Item = Channel>,
         mode: Option<Mode>,
     ) -> anyhow::Result<Vec<Plan>> {
-        channels.map(|channel| self.plan_one(device, channel, mode)).collect()
+        // Other makers' adapters often have a single channel; who asks for that alone learns so when it is opened.
+        let is_there = |channel: &Channel| channel.number() <= device.hello().channels;
+        let (there, missing): (Vec<_>, Vec<_>) = channels.partition(is_there);
+        let used = if there.is_empty() { &missing } else { &there };
+        used.iter().map(|channel| self.plan_one(device, *channel, mode)).collect()
     }
 
     /// The requested configuration; without bit timing, the one saved on the device. The mode is the user's, otherwise `mode`,

@@ -4,6 +4,7 @@
 //! raised the interrupt, so its stamp is its end plus the interrupt's latency. Frames queued behind another, or that arrive
 //! while the FIFO is being drained, ended at some unknown earlier time: their stamps say so, and the host tightens them.
 
+mod foreign;
 mod gaps;
 mod orders;
 

@@ -4,7 +4,7 @@
 //! two 11-bit identifiers with masks, or four without. Banks below the split belong to CAN1, the others to CAN2.
 
 use cantap_wire::message::{Filter, FrameKind};
-use cantap_wire::{CHANNELS, Channel, Id, Refusal};
+use cantap_wire::{CHANNELS, Channel, Frame, Id, Refusal};
 
 /// Banks of the chip, for both channels.
 pub const BANKS: usize = 28;
@@ -38,6 +38,23 @@ pub struct Bank {
 impl Bank {
     /// Lets every frame pass.
     pub const ALL: Bank = Bank { shape: Shape::Mask32, first: 0, second: 0 };
+
+    /// Whether it lets a frame pass (RM0090 Rev 21 §32.7.4): what a controller's hardware does, for those that have none.
+    pub fn passes(&self, frame: &Frame) -> bool {
+        let (id, extended, remote) =
+            (frame.id().raw(), frame.id().is_extended(), u32::from(frame.is_remote()));
+        let standard_part = if extended { id >> 18 } else { id };
+        let wide = if extended { id << 3 | 1 << 2 } else { id << 21 } | remote << 1;
+        let extended_part = if extended { id >> 15 & 7 } else { 0 };
+        let narrow = standard_part << 5 | remote << 4 | u32::from(extended) << 3 | extended_part;
+        let halves = [self.first & 0xFFFF, self.first >> 16, self.second & 0xFFFF, self.second >> 16];
+        match self.shape {
+            Shape::Mask32 => (wide ^ self.first) & self.second == 0,
+            Shape::List32 => [self.first, self.second].contains(&wide),
+            Shape::Mask16 => (narrow ^ halves[0]) & halves[1] == 0 || (narrow ^ halves[2]) & halves[3] == 0,
+            Shape::List16 => halves.contains(&narrow),
+        }
+    }
 }
 
 /// All banks.

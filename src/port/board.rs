@@ -1,7 +1,7 @@
 //! The whole board, as commands see it: the hardware's traits ([`crate::ports`]) and the capture, which belongs to other tasks.
 
 use cantap_wire::framing;
-use cantap_wire::{CHANNELS, Channel};
+use cantap_wire::{CHANNELS, Channel, Command, Hello, Refusal};
 
 use crate::bus::capture::Capture;
 use crate::bus::sof::SofReading;
@@ -44,6 +44,13 @@ pub trait Board<'q, const N: usize> {
     fn chip(&mut self) -> &mut Self::Chip;
     /// The meter for the receive pins.
     fn meter(&mut self) -> &mut Self::Meter;
+
+    /// Corrects the device's description of itself, where its hardware is not a board's.
+    fn describe(&self, _hello: &mut Hello) {}
+    /// Refuses a command that this hardware cannot carry out, before anything has changed. A board's hardware can do everything.
+    fn prepare(&mut self, _command: &Command) -> Result<(), Refusal> {
+        Ok(())
+    }
 
     /// Whether a channel is open.
     fn is_open(&mut self, channel: Channel) -> bool {

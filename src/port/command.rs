@@ -149,6 +149,7 @@ impl Commands {
         command: Command,
         board: &mut impl Board<'q, N>,
     ) -> Result<Step, Refusal> {
+        board.prepare(&command)?;
         let reply = match command {
             Command::Hello { protocol } if protocol != PROTOCOL_VERSION => {
                 return Err(Refusal::Protocol { device: PROTOCOL_VERSION });
@@ -256,7 +257,9 @@ impl Commands {
                 }
                 self.forget(board);
                 let refused = leave.into_iter().flatten().find_map(Result::err);
-                Some(refused.map_or_else(|| Ok(Reply::Hello(self.hello())), Err))
+                let mut hello = self.hello();
+                board.describe(&mut hello);
+                Some(refused.map_or(Ok(Reply::Hello(hello)), Err))
             }
             Work::Retreat => {
                 // Both, as for `Silence`.

@@ -364,4 +364,10 @@ pub mod capability {
     pub const BOOTLOADER: u32 = 1 << 4;
     /// Measures edges of its receive pins.
     pub const EDGES: u32 = 1 << 5;
+    /// Never of a board of ours: another maker's adapter, whose kind is the board's name. What it cannot know is not told.
+    pub const ADAPTER: u32 = 1 << 6;
+    /// Never of a board of ours: cannot listen without acknowledging frames.
+    pub const ALWAYS_ACKNOWLEDGES: u32 = 1 << 7;
+    /// Never of a board of ours: there is no bus behind it whose bit rate is known, so frames' lengths say nothing about their times.
+    pub const NO_BIT_RATE: u32 = 1 << 8;
 }

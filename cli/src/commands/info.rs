@@ -4,6 +4,7 @@ use std::io::Write;
 use std::process::ExitCode;
 
 use cantap::wire::message::capability;
+use cantap_adapters::Row;
 
 use crate::boards::OneBoard;
 
@@ -21,13 +22,16 @@ pub struct Args {
 }
 
 /// Names of the device's capabilities.
-const CAPABILITIES: [(u32, &str); 6] = [
+const CAPABILITIES: [(u32, &str); 9] = [
     (capability::TRANSMIT, "transmit"),
     (capability::TIMED_TRANSMIT, "timed-transmit"),
     (capability::SLCAN, "slcan"),
     (capability::DEFAULTS, "defaults"),
     (capability::BOOTLOADER, "bootloader"),
     (capability::EDGES, "edges"),
+    (capability::ADAPTER, "adapter"),
+    (capability::ALWAYS_ACKNOWLEDGES, "always-acknowledges"),
+    (capability::NO_BIT_RATE, "no-bit-rate"),
 ];
 
 /// Runs it.
@@ -41,7 +45,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let round_trip_us = device.clock().round_trip_ns as f64 / 1e3;
     let mut out = std::io::stdout().lock();
     if args.json {
-        let object = serde_json::json!({
+        let mut object = serde_json::json!({
             "device": device.name(),
             "board": hello.board.as_str(),
             "serial_number": hello.serial.as_str(),
@@ -59,6 +63,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             "round_trip_us": round_trip_us,
             "clock": clock::object(&device.clock()),
         });
+        if let (Some(row), Some(object)) = (cantap_adapters::row(&hello.board), object.as_object_mut()) {
+            object.insert("adapter".to_owned(), adapter(row));
+        }
         writeln!(out, "{object}")?;
     } else {
         writeln!(out, "board           {}", hello.board)?;
@@ -77,6 +84,30 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         writeln!(out, "capabilities    {}", capabilities.join(", "))?;
         writeln!(out, "round trip      {round_trip_us:.0} us")?;
         writeln!(out, "clock           {}", clock::line(&device.clock()))?;
+        if let Some(row) = cantap_adapters::row(&hello.board) {
+            writeln!(out, "adapter         {}", row.what)?;
+            writeln!(out, "  stamps        {}", row.stamps)?;
+            writeln!(out, "  losses        {}", row.losses_before())?;
+            writeln!(out, "  errors        {}", row.errors)?;
+            writeln!(out, "  confirmation  {}", row.confirmation)?;
+            writeln!(out, "  listen-only   {}", row.listen_only)?;
+            let failures = device.failures()?;
+            if failures.count > 0 {
+                writeln!(out, "  left out      {}", failures.last)?;
+            }
+        }
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// What another maker's adapter can tell, for scripts.
+fn adapter(row: &Row) -> serde_json::Value {
+    serde_json::json!({
+        "kind": row.what,
+        "stamps": row.stamps.to_string(),
+        "losses": row.losses_before(),
+        "errors": row.errors,
+        "confirmation": row.confirmation.to_string(),
+        "listen_only": row.listen_only.to_string(),
+    })
 }

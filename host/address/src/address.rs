@@ -1,4 +1,5 @@
-//! Where a device is: `/dev/ttyACM0`, `COM5`, `virtual:load=50`, `emu:firmware.elf`, or at a server: `unix:`, `tcp://HOST`.
+//! Where a device is: `/dev/ttyACM0`, `COM5`, `virtual:load=50`, `emu:firmware.elf`; at a server: `unix:`, `tcp://HOST`; another
+//! maker's adapter: `slcan:PORT`, `socketcand://HOST/can0`.
 
 use std::borrow::Borrow;
 use std::fmt;
@@ -33,6 +34,8 @@ enum Place {
     Serial,
     /// A server that shares a board.
     Server(Server),
+    /// Another maker's adapter.
+    Adapter(cantap_adapters::Place),
     /// The virtual device.
     Virtual(Box<Options>),
     /// A firmware ELF on the emulated board.
@@ -75,6 +78,9 @@ pub enum LinkError {
     /// The server cannot be used.
     #[error(transparent)]
     Server(#[from] ServerError),
+    /// The adapter cannot be used.
+    #[error(transparent)]
+    Adapter(cantap_adapters::OpenError),
     /// The virtual device's thread could not be started.
     #[error("the system refused a thread; close other programs and try again")]
     Virtual(#[source] io::Error),
@@ -137,6 +143,9 @@ impl FromStr for Address {
             _ if Server::is_meant(text) => {
                 Place::Server(Server::parse(text).map_err(|reason| option(&reason))?)
             }
+            _ if cantap_adapters::Place::is_meant(text) => Place::Adapter(
+                text.parse().map_err(|error: cantap_adapters::BadPlace| option(&error.to_string()))?,
+            ),
             _ => Place::Serial,
         };
         Ok(Self { text: if text == "virtual:" { "virtual" } else { text }.to_owned(), place })
@@ -151,7 +160,11 @@ impl Address {
 
     /// Whether a device there can have a stored configuration; a virtual one cannot unless a file is given for it.
     pub fn may_have_saved(&self) -> bool {
-        !matches!(&self.place, Place::Virtual(options) if options.settings.is_none())
+        match &self.place {
+            Place::Virtual(options) => options.settings.is_some(),
+            Place::Adapter(_) => false,
+            _ => true,
+        }
     }
 
     /// Whether a text can only mean a device that needs no port.
@@ -171,7 +184,11 @@ impl Address {
             digits
                 .is_some_and(|digits| !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit()))
         };
-        Self::is_no_port(text) || Server::is_meant(text) || text.starts_with("/dev/") || is_com(text)
+        Self::is_no_port(text)
+            || Server::is_meant(text)
+            || cantap_adapters::Place::is_meant(text)
+            || text.starts_with("/dev/")
+            || is_com(text)
     }
 
     /// Whether the virtual device simulates a vehicle, which has its own database.
@@ -182,6 +199,7 @@ impl Address {
     /// Whether a device there can go and come back; one inside this process cannot.
     pub const fn may_come_back(&self) -> bool {
         matches!(self.place, Place::Serial | Place::Server(_))
+            || matches!(&self.place, Place::Adapter(adapter) if adapter.may_come_back())
     }
 
     /// Begins a session with the board of a serial number at its current port, if the system can find it; otherwise with
@@ -205,6 +223,10 @@ impl Address {
                 cantap::device::open_port(port.as_deref().unwrap_or(&self.text))?
             }
             Place::Server(server) => server.link()?,
+            Place::Adapter(adapter) => cantap_adapters::open(adapter).map_err(|error| match error {
+                cantap_adapters::OpenError::Device(error) => LinkError::Device(error),
+                other => LinkError::Adapter(other),
+            })?,
             Place::Virtual(options) => {
                 cantap_virtual::start((**options).clone()).map_err(LinkError::Virtual)?.into_link()
             }
@@ -286,13 +308,29 @@ mod tests {
 
     #[test]
     fn addresses_round_trip_and_bad_ones_say_what_would_be_right() {
-        for text in
-            ["/dev/ttyACM0", "COM5", "virtual", "virtual:load=50", "tcp://[::1]:5", "ssh://a@b/virtual:car"]
-        {
+        for text in [
+            "/dev/ttyACM0",
+            "COM5",
+            "virtual",
+            "virtual:load=50",
+            "tcp://[::1]:5",
+            "ssh://a@b/virtual:car",
+            "slcan:COM3",
+        ] {
             assert_eq!(text.parse::<Address>().unwrap().to_string(), text);
         }
         assert_eq!("virtual:".parse::<Address>().unwrap().to_string(), "virtual");
-        for text in ["", "emu", "emu:", "tcp:1.2.3.4", "virtual:speed=9", "tcp://", "ssh://-oX"] {
+        for text in [
+            "",
+            "emu",
+            "emu:",
+            "tcp:1.2.3.4",
+            "virtual:speed=9",
+            "tcp://",
+            "ssh://-oX",
+            "slcan:",
+            "socketcand:pi",
+        ] {
             assert!(text.parse::<Address>().is_err(), "{text}");
         }
     }
@@ -308,6 +346,8 @@ mod tests {
             ("virtual:car", true),
             ("emu:a.elf", true),
             ("COM5", true),
+            ("slcan:/dev/ttyACM0", true),
+            ("candump:-", true),
             ("/dev/ttyACM17", true),
             ("tcp://bench:4000", true),
             ("drive.log", false),

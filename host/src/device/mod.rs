@@ -20,7 +20,7 @@ use std::sync::mpsc::{Receiver, Sender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use cantap_wire::message::{ChannelConfig, Filter, Mode, Status};
+use cantap_wire::message::{ChannelConfig, Filter, Mode, Status, capability};
 use cantap_wire::record::LossStage;
 use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Hello, Reply};
 
@@ -33,7 +33,7 @@ pub use intake::{ChannelCounters, Counters, Intake, Notice, PIECE_BYTES, Transmi
 pub use pipe::{PipeReader, PipeWriter, pipe};
 pub use reconnect::{Gaps, Happening, Reconnecting, Return};
 #[cfg(feature = "serial")]
-pub use serial::{Board, list, open as open_port, port_of};
+pub use serial::{Board, list, open as open_port, open_at as open_port_at, port_of};
 pub use several::{Several, channel_number};
 pub use stamps::{BitLengths, tighten};
 
@@ -137,6 +137,10 @@ impl Device {
         if channel.number() > self.hello().channels {
             return Err(DeviceError::NoChannel { channel });
         }
+        let must_be_silent = config.as_ref().is_some_and(|config| config.mode == Mode::ListenOnly);
+        if must_be_silent && self.hello.capabilities & capability::ALWAYS_ACKNOWLEDGES != 0 {
+            return Err(DeviceError::AlwaysAcknowledges { address: self.shared.name.clone() });
+        }
         // This must be set before the first frame can arrive.
         if let Some(config) = &config {
             self.set_bit_length(channel, config);
@@ -161,6 +165,9 @@ impl Device {
     }
 
     fn set_bit_length(&self, channel: Channel, config: &ChannelConfig) {
+        if self.hello.capabilities & capability::NO_BIT_RATE != 0 {
+            return;
+        }
         self.order(Order::BitLength {
             channel,
             clocks_per_bit: config.timing.clocks_per_bit(),

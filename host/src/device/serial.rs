@@ -47,7 +47,12 @@ pub fn port_of(serial_number: &str) -> Option<String> {
 
 /// Opens a port exclusively, in raw mode, and raises DTR.
 pub fn open(port: &str) -> Result<Link, DeviceError> {
-    let open = serialport::new(port, NOMINAL_BAUD).timeout(READ_TIMEOUT).dtr_on_open(true).open();
+    open_at(port, NOMINAL_BAUD)
+}
+
+/// The same, for a line that has a speed, in baud.
+pub fn open_at(port: &str, baud: u32) -> Result<Link, DeviceError> {
+    let open = serialport::new(port, baud).timeout(READ_TIMEOUT).dtr_on_open(true).open();
     let reader = open.map_err(|error| translate(port, error))?;
     let writer = reader.try_clone().map_err(|error| translate(port, error))?;
     Ok(Link { reader: Box::new(reader), writer: Box::new(writer), keep_alive: Box::new(()) })

@@ -156,6 +156,14 @@ pub enum DeviceError {
         /// The requested channel.
         channel: Channel,
     },
+    /// Another maker's adapter cannot listen without acknowledging.
+    #[error(
+        "the adapter at '{address}' cannot only listen: it acknowledges every frame; open it in normal mode if that is wanted"
+    )]
+    AlwaysAcknowledges {
+        /// As given.
+        address: String,
+    },
     /// A thread could not be started.
     #[error("the system refused a thread: {0}; close other programs and try again")]
     Thread(#[source] io::Error),

@@ -7,7 +7,7 @@ use std::collections::VecDeque;
 use std::rc::Rc;
 
 use cantap_firmware::CAN_CLOCK_HZ;
-use cantap_firmware::bus::filters::{Bank, Shape};
+use cantap_firmware::bus::filters::Bank;
 use cantap_firmware::bus::mailboxes::MAILBOXES;
 use cantap_firmware::ports::{Control, ErrorStatus, Outcome, Traffic};
 use cantap_wire::Frame;
@@ -166,7 +166,7 @@ impl Controller {
     }
 
     fn passes(&self, frame: &Frame) -> bool {
-        self.filters.iter().any(|bank| bank_passes(bank, frame))
+        self.filters.iter().any(|bank| bank.passes(frame))
     }
 
     fn receive_from_bus(&mut self, frame: &Frame) {
@@ -443,21 +443,5 @@ const fn error_code(kind: BusErrorKind) -> u32 {
         BusErrorKind::BitRecessive => 4,
         BusErrorKind::BitDominant => 5,
         BusErrorKind::Crc => 6,
-    }
-}
-
-/// Whether a filter bank lets a frame pass (RM0090 Rev 21 §32.7.4).
-fn bank_passes(bank: &Bank, frame: &Frame) -> bool {
-    let (id, extended, remote) = (frame.id().raw(), frame.id().is_extended(), u32::from(frame.is_remote()));
-    let standard_part = if extended { id >> 18 } else { id };
-    let wide = if extended { id << 3 | 1 << 2 } else { id << 21 } | remote << 1;
-    let extended_part = if extended { id >> 15 & 7 } else { 0 };
-    let narrow = standard_part << 5 | remote << 4 | u32::from(extended) << 3 | extended_part;
-    let halves = [bank.first & 0xFFFF, bank.first >> 16, bank.second & 0xFFFF, bank.second >> 16];
-    match bank.shape {
-        Shape::Mask32 => (wide ^ bank.first) & bank.second == 0,
-        Shape::List32 => [bank.first, bank.second].contains(&wide),
-        Shape::Mask16 => (narrow ^ halves[0]) & halves[1] == 0 || (narrow ^ halves[2]) & halves[3] == 0,
-        Shape::List16 => halves.contains(&narrow),
     }
 }

@@ -3,6 +3,7 @@
 use std::io::{self, Write};
 use std::path::Path;
 
+use cantap::Device;
 use cantap::device::{Gaps, channel_number};
 use cantap_address::Address;
 use cantap_signals::trigger::{Trigger, TriggerCounts};
@@ -35,6 +36,9 @@ pub struct Summary {
     pub channels: Vec<ChannelSummary>,
     lost: Losses,
     clock_drift_ppm: Option<f64>,
+    /// What other makers' adapters say about losses before this program.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    not_known: Vec<String>,
     /// If there are several devices.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     devices: Vec<DeviceSummary>,
@@ -103,6 +107,7 @@ impl Summary {
             channels,
             lost: counters.map(|counters| Losses::of(&counters)).fold(Losses::default(), Losses::plus),
             clock_drift_ppm: live.lines().lines().next().and_then(drift_ppm),
+            not_known: not_known(live),
             devices: devices(live, boards),
             gaps: (gaps.count > 0)
                 .then(|| GapSummary { count: gaps.count, seconds: rounded(gaps.time.as_secs_f64(), 3) }),
@@ -134,6 +139,9 @@ impl Summary {
             eprintln!("{in_file} of the {frames} frames are in '{}'", path.display());
         }
         eprintln!("lost: {}", self.lost.line());
+        for note in &self.not_known {
+            eprintln!("{note}");
+        }
         if let Some(GapSummary { count, seconds }) = &self.gaps {
             eprintln!(
                 "gaps: {count}, {seconds} s in which the device was not there: frames on the bus at that time were not counted"
@@ -148,6 +156,15 @@ impl Summary {
         }
         Ok(())
     }
+}
+
+/// A sentence for each device that is another maker's adapter.
+fn not_known(live: &LiveRecords) -> Vec<String> {
+    let row = |(board, device): (usize, &Device)| {
+        let row = cantap_adapters::row(&device.hello().board)?;
+        Some(format!("{}: {}", live.addresses().get(board)?, row.losses_before()))
+    };
+    live.lines().devices().filter_map(row).collect()
 }
 
 fn drift_ppm(line: &Line) -> Option<f64> {

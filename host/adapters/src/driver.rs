@@ -1,0 +1,201 @@
+//! What an adapter's protocol must provide.
+
+use std::io;
+use std::time::{Duration, Instant};
+
+use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, Stamp};
+use cantap_wire::{Channel, Frame, Refusal};
+
+use crate::rows::Row;
+
+/// Why there is no adapter at an address. Each message says what to do next.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum OpenError {
+    /// The port cannot be opened.
+    #[error(transparent)]
+    Device(#[from] cantap::DeviceError),
+    /// The server cannot be reached.
+    #[error("'{address}' cannot be reached ({source}); check host and port, and that the program there runs")]
+    Unreachable {
+        /// As given.
+        address: String,
+        /// The system's error.
+        source: io::Error,
+    },
+    /// What is there does not speak the protocol.
+    #[error(
+        "'{address}' does not answer as {expected}; check the address and the line's speed (@BAUD), and that no other program uses it"
+    )]
+    Foreign {
+        /// As given.
+        address: String,
+        /// What was expected.
+        expected: &'static str,
+    },
+    /// The server refused.
+    #[error("'{address}': the server refuses the interface; check its name there")]
+    Refused {
+        /// As given.
+        address: String,
+    },
+    /// The input is no trace.
+    #[error("'{address}' cannot be read: {reason}")]
+    NoTrace {
+        /// As given.
+        address: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
+
+/// How a channel is opened.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Opening {
+    /// Bits per second.
+    pub bitrate_bps: u32,
+    /// Without acknowledging.
+    pub listen_only: bool,
+}
+
+/// When something happened, on this computer's clock, and what that time means.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct At {
+    /// When.
+    pub instant: Instant,
+    /// [`Stamp::UpperBound`] for arrivals.
+    pub stamp: Stamp,
+}
+
+impl At {
+    /// Something that arrived at this time and happened earlier.
+    pub const fn arrival(instant: Instant) -> Self {
+        Self { instant, stamp: Stamp::UpperBound }
+    }
+}
+
+/// What an adapter reports.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Incoming {
+    /// A frame was received.
+    Received {
+        /// Where.
+        channel: Channel,
+        /// The frame.
+        frame: Frame,
+        /// When.
+        at: At,
+    },
+    /// As much as the adapter knows of success: see the row's [`crate::Confirmation`].
+    Sent {
+        /// Where.
+        channel: Channel,
+        /// As given to [`Driver::send`].
+        mailbox: u8,
+        /// When.
+        at: At,
+    },
+    /// The adapter cannot send such a frame.
+    NotSent {
+        /// Where.
+        channel: Channel,
+        /// As given to [`Driver::send`].
+        mailbox: u8,
+        /// When.
+        at: At,
+    },
+    /// A bus error of this kind, with the counters if they are known (otherwise 0).
+    BusError {
+        /// Where.
+        channel: Channel,
+        /// What.
+        kind: BusErrorKind,
+        /// When.
+        at: At,
+    },
+    /// At least this many bus errors of unknown kind.
+    BusErrors {
+        /// Where.
+        channel: Channel,
+        /// How many.
+        count: u32,
+        /// When.
+        at: At,
+    },
+    /// The state of fault confinement, perhaps as before; with the error counters, 0 if they are not known.
+    State {
+        /// Where.
+        channel: Channel,
+        /// Which.
+        state: ErrorState,
+        /// Transmit and receive error counter.
+        counters: (u8, u8),
+        /// When.
+        at: At,
+    },
+    /// Frames are missing here.
+    Lost {
+        /// Where.
+        channel: Channel,
+        /// Who lost them.
+        stage: LossStage,
+        /// How many.
+        count: u32,
+        /// Whether there may be more.
+        at_least: bool,
+        /// When.
+        at: At,
+    },
+}
+
+/// An adapter. Nothing is sent or acknowledged before [`Driver::open`].
+pub(crate) trait Driver: Send {
+    /// What it can tell.
+    fn row(&self) -> &'static Row;
+    /// Channels.
+    fn channels(&self) -> u8 {
+        1
+    }
+    /// Its serial number or name, if it has one.
+    fn serial(&self) -> String {
+        String::new()
+    }
+    /// Its own version, if it has one.
+    fn version(&self) -> [u16; 3] {
+        [0; 3]
+    }
+    /// Takes part in a channel's bus. Waits for the adapter's answer, for a second at most.
+    fn open(&mut self, channel: Channel, opening: Opening) -> Result<(), Refusal>;
+    /// Leaves a channel's bus. What arrives before is still reported by the next [`Driver::poll`].
+    fn close(&mut self, channel: Channel);
+    /// Takes a frame to be sent. Returns false if it cannot now: it is offered again.
+    fn send(&mut self, channel: Channel, mailbox: u8, frame: &Frame) -> bool;
+    /// Waits up to `wait` for something to report, and appends it. An error is the adapter's end, with the reason for people.
+    fn poll(&mut self, wait: Duration, reports: &mut Vec<Incoming>) -> Result<(), String>;
+    /// Text about what was left out or misunderstood, with its count: shown by `cantap info`.
+    fn oddities(&self) -> (u32, String) {
+        (0, String::new())
+    }
+}
+
+/// Counts of what an adapter sent that makes no sense, by kind.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Oddities {
+    kinds: Vec<(&'static str, u32)>,
+}
+
+impl Oddities {
+    /// Counts one.
+    pub fn count(&mut self, kind: &'static str) {
+        match self.kinds.iter_mut().find(|(name, _)| *name == kind) {
+            Some((_, count)) => *count = count.saturating_add(1),
+            None => self.kinds.push((kind, 1)),
+        }
+    }
+
+    /// All of them, and a list of them.
+    pub fn summary(&self) -> (u32, String) {
+        let text: Vec<String> = self.kinds.iter().map(|(kind, count)| format!("{count} {kind}")).collect();
+        (self.kinds.iter().fold(0, |sum, (_, count)| sum.saturating_add(*count)), text.join(", "))
+    }
+}

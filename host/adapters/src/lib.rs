@@ -1,0 +1,33 @@
+#![doc = include_str!("../README.md")]
+//!
+//! # Why the firmware runs here
+//!
+//! An adapter stands behind a [`Link`](cantap::device::Link) as a board does, and speaks the native protocol. Two ways lead there: a device side written
+//! anew, or the firmware's own library with the adapter in place of its controllers. The second was chosen. Sessions, periodic frames with their
+//! modifiers, replies, send queues, filters, the accounting of losses and the order of closing a channel are the firmware's, tested there;
+//! written again they would be a second copy of some three thousand lines. The firmware had to learn only two things: to take a frame with a
+//! stamp that is not its own, and to describe hardware that is not its own (`bus/capture/foreign.rs`, `port/board.rs`).
+//!
+//! A driver turns an adapter's bytes into events; the engine is the thread in which firmware and driver run.
+//! What each kind of adapter can tell is a [`Row`], found by the board's name that it answers to `Hello`.
+
+#![forbid(unsafe_code)]
+
+mod adapter_clock;
+mod board;
+mod cannelloni;
+mod driver;
+mod engine;
+mod gvret;
+mod line;
+mod mailboxes;
+mod place;
+mod rows;
+mod slcan;
+mod socketcand;
+mod source;
+mod trace_pipe;
+
+pub use driver::OpenError;
+pub use place::{BadPlace, Place, open};
+pub use rows::{Confirmation, ListenOnly, Losses, ROWS, Row, Stamps, row};

@@ -1,0 +1,212 @@
+//! Where an adapter is, as users type it.
+
+use std::fmt;
+use std::str::FromStr;
+
+use cantap::device::Link;
+use cantap_formats::Format;
+
+use crate::cannelloni::{self, Cannelloni};
+use crate::driver::{Driver, OpenError};
+use crate::engine;
+use crate::gvret::{self, Gvret};
+use crate::line::Line;
+use crate::slcan::{self, Slcan};
+use crate::socketcand::{self, Socketcand};
+use crate::trace_pipe::TracePipe;
+
+/// An adapter's place: `slcan:/dev/ttyACM0@115200`, `gvret:tcp://192.168.4.1`, `socketcand://HOST/can0`, `cannelloni://HOST:PORT`,
+/// `candump:-`, `pcapng:-`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Place {
+    text: String,
+    kind: Kind,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+enum Kind {
+    Slcan { port: String, baud: u32 },
+    GvretSerial { port: String, baud: u32 },
+    GvretTcp { host: String },
+    Socketcand { host: String, interface: String },
+    Cannelloni { host: String, listen: u16 },
+    Trace { path: String, format: TraceFormat },
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum TraceFormat {
+    Candump,
+    Pcapng,
+}
+
+/// Why a text is no adapter's place. It says what would be right.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct BadPlace(String);
+
+/// What addresses of adapters begin with.
+const SCHEMES: [&str; 6] = ["slcan:", "gvret:", "socketcand:", "cannelloni:", "candump:", "pcapng:"];
+
+impl Place {
+    /// Whether a text is meant for an adapter.
+    pub fn is_meant(text: &str) -> bool {
+        SCHEMES.iter().any(|scheme| text.starts_with(scheme))
+    }
+
+    /// Whether the adapter may come back after it was pulled out. A trace that has ended does not go on.
+    pub const fn may_come_back(&self) -> bool {
+        !matches!(self.kind, Kind::Trace { .. })
+    }
+}
+
+impl FromStr for Place {
+    type Err = BadPlace;
+
+    fn from_str(text: &str) -> Result<Self, BadPlace> {
+        let bad = |reason: &str| BadPlace(reason.to_owned());
+        let (scheme, rest) = text.split_once(':').unwrap_or((text, ""));
+        let kind = match scheme {
+            "slcan" => {
+                let (port, baud) = port_and_baud(rest, slcan::DEFAULT_BAUD)
+                    .ok_or_else(|| bad("write slcan:PORT or slcan:PORT@BAUD, as in slcan:/dev/ttyACM0"))?;
+                Kind::Slcan { port, baud }
+            }
+            "gvret" => {
+                if let Some(host) = rest.strip_prefix("tcp://") {
+                    let host = with_port(host, gvret::PORT)
+                        .ok_or_else(|| bad("write gvret:tcp://HOST or gvret:tcp://HOST:PORT"))?;
+                    Kind::GvretTcp { host }
+                } else {
+                    let (port, baud) = port_and_baud(rest, gvret::DEFAULT_BAUD)
+                        .ok_or_else(|| bad("write gvret:PORT, gvret:PORT@BAUD or gvret:tcp://HOST"))?;
+                    Kind::GvretSerial { port, baud }
+                }
+            },
+            "socketcand" => {
+                let place = rest.strip_prefix("//").and_then(|rest| rest.split_once('/'));
+                let is_name = |name: &str| {
+                    !name.is_empty() && name.len() < 16 && name.chars().all(|letter| letter.is_ascii_graphic() && !"<>/".contains(letter))
+                };
+                place
+                    .filter(|(_, interface)| is_name(interface))
+                    .and_then(|(host, interface)| {
+                        let host = with_port(host, socketcand::PORT)?;
+                        Some(Kind::Socketcand { host, interface: interface.to_owned() })
+                    })
+                    .ok_or_else(|| bad("write socketcand://HOST/INTERFACE, as in socketcand://raspberry/can0"))?
+            }
+            "cannelloni" => cannelloni_of(rest)
+                .ok_or_else(|| bad("write cannelloni://HOST:PORT, and ?listen=PORT after it if the other end sends to another port here"))?,
+            "candump" | "pcapng" if !rest.is_empty() => {
+                let format = if scheme == "candump" { TraceFormat::Candump } else { TraceFormat::Pcapng };
+                Kind::Trace { path: rest.to_owned(), format }
+            }
+            "candump" | "pcapng" => return Err(bad("name the pipe, as in candump:- for standard input")),
+            _ => return Err(bad("it begins with none of slcan:, gvret:, socketcand:, cannelloni:, candump:, pcapng:")),
+        };
+        Ok(Self { text: text.to_owned(), kind })
+    }
+}
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.text)
+    }
+}
+
+fn port_and_baud(text: &str, default: u32) -> Option<(String, u32)> {
+    let (port, baud) = match text.rsplit_once('@') {
+        Some((port, baud)) => (port, baud.parse().ok().filter(|baud| *baud > 0)?),
+        None => (text, default),
+    };
+    (!port.is_empty()).then(|| (port.to_owned(), baud))
+}
+
+fn with_port(host: &str, port: u16) -> Option<String> {
+    if host.is_empty() || host.contains(|letter: char| letter.is_whitespace() || letter == '/') {
+        return None;
+    }
+    // An IPv6 address has its colons in brackets.
+    let after = host.rsplit_once(']').map_or(host, |(_, after)| after);
+    Some(match after.rsplit_once(':') {
+        Some((_, port)) => {
+            port.parse::<u16>().ok()?;
+            host.to_owned()
+        }
+        None => format!("{host}:{port}"),
+    })
+}
+
+fn cannelloni_of(rest: &str) -> Option<Kind> {
+    let rest = rest.strip_prefix("//")?;
+    let (host, listen) = match rest.split_once("?listen=") {
+        Some((host, listen)) => (host, Some(listen.parse().ok()?)),
+        None => (rest, None),
+    };
+    let host = with_port(host, cannelloni::PORT)?;
+    let port = host.rsplit_once(':')?.1.parse().ok()?;
+    Some(Kind::Cannelloni { host, listen: listen.unwrap_or(port) })
+}
+
+/// Connects to an adapter. Nothing is sent to its bus, and nothing acknowledged, before a channel is opened.
+pub fn open(place: &Place) -> Result<Link, OpenError> {
+    let address = place.text.as_str();
+    let driver: Box<dyn Driver> = match &place.kind {
+        Kind::Slcan { port, baud } => Box::new(Slcan::open_port(port, *baud)?),
+        Kind::GvretSerial { port, baud } => Box::new(Gvret::over(Line::serial(port, *baud)?, address)?),
+        Kind::GvretTcp { host } => Box::new(Gvret::over(Line::tcp(host)?, address)?),
+        Kind::Socketcand { host, interface } => Box::new(Socketcand::connect(host, interface, address)?),
+        Kind::Cannelloni { host, listen } => Box::new(Cannelloni::connect(host, *listen, address)?),
+        Kind::Trace { path, format } => {
+            let format = match format {
+                TraceFormat::Candump => Format::Candump,
+                TraceFormat::Pcapng => Format::Pcapng,
+            };
+            Box::new(TracePipe::open_path(path, format, address)?)
+        }
+    };
+    engine::start(driver).map_err(|source| OpenError::Unreachable { address: address.to_owned(), source })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn places_round_trip_and_bad_ones_say_what_would_be_right() {
+        for text in [
+            "slcan:/dev/ttyACM0",
+            "slcan:COM5@921600",
+            "gvret:/dev/ttyUSB0",
+            "gvret:tcp://192.168.4.1",
+            "gvret:tcp://[::1]:2300",
+            "socketcand://pi/can0",
+            "socketcand://pi:29000/vcan1",
+            "cannelloni://pi:20001",
+            "cannelloni://pi?listen=4",
+            "candump:-",
+            "pcapng:/tmp/pipe",
+        ] {
+            assert!(Place::is_meant(text));
+            assert_eq!(text.parse::<Place>().unwrap().to_string(), text);
+        }
+        for text in [
+            "slcan:",
+            "slcan:@9600",
+            "slcan:COM1@fast",
+            "gvret:",
+            "gvret:tcp://",
+            "gvret:tcp://a:b",
+            "socketcand:pi/can0",
+            "socketcand://pi",
+            "socketcand://pi/can 0",
+            "socketcand://pi/> < send",
+            "cannelloni:pi",
+            "cannelloni://pi?listen=x",
+            "candump:",
+            "usb:1",
+        ] {
+            assert!(text.parse::<Place>().is_err(), "{text}");
+        }
+    }
+}

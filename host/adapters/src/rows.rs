@@ -1,0 +1,200 @@
+//! What each kind of adapter can tell, and what it cannot.
+
+use std::fmt;
+
+/// Who stamps frames.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stamps {
+    /// This computer, when a frame's bytes arrive: never early, late by whatever the line takes.
+    Arrival,
+    /// The adapter, with a clock of this grain, placed in this computer's time by arrivals.
+    Adapter {
+        /// In nanoseconds.
+        grain_ns: u32,
+        /// What the stamp marks.
+        when: &'static str,
+    },
+    /// Another program, which wrote them into the trace.
+    Trace,
+}
+
+/// Who counts losses before this program.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Losses {
+    /// Nobody.
+    NotReported,
+    /// The adapter, as flags: at least one frame each time.
+    Flags,
+    /// The program that wrote the trace, if it did.
+    Trace,
+}
+
+/// What is known of frames that are sent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Confirmation {
+    /// The adapter has accepted the frame. Whether it reached the bus is not known.
+    Accepted,
+    /// It was handed over, and nothing more is known.
+    HandedOver,
+    /// Nothing can be sent.
+    CannotSend,
+}
+
+/// Whether the adapter can listen without acknowledging.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ListenOnly {
+    /// It can, and confirms that it does.
+    Confirmed,
+    /// It can, but confirms nothing.
+    Unconfirmed,
+    /// It cannot: listening is refused, and `--mode normal` allows it to acknowledge.
+    Never,
+    /// It has no part in the bus, or its owner decides.
+    Elsewhere,
+}
+
+/// One kind of adapter.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Row {
+    /// Its name in `Hello` and in `cantap info`.
+    pub board: &'static str,
+    /// For people.
+    pub what: &'static str,
+    /// Who stamps.
+    pub stamps: Stamps,
+    /// Who counts losses.
+    pub losses: Losses,
+    /// Whether it reports bus errors or the controller's state.
+    pub errors: &'static str,
+    /// What becomes of frames that are sent.
+    pub confirmation: Confirmation,
+    /// Whether it can be silent.
+    pub listen_only: ListenOnly,
+    /// Whether a bit rate is known and set; otherwise the one given is used for figures only.
+    pub sets_bit_rate: bool,
+}
+
+/// All kinds.
+pub const ROWS: [Row; 7] = [
+    Row {
+        board: "slcan",
+        what: "an slcan adapter that answers (Lawicel's protocol)",
+        stamps: Stamps::Arrival,
+        losses: Losses::Flags,
+        errors: "state and the fact of errors, once a second",
+        confirmation: Confirmation::Accepted,
+        listen_only: ListenOnly::Confirmed,
+        sets_bit_rate: true,
+    },
+    Row {
+        board: "slcan-normal",
+        what: "an slcan adapter that cannot only listen",
+        stamps: Stamps::Arrival,
+        losses: Losses::Flags,
+        errors: "state and the fact of errors, once a second",
+        confirmation: Confirmation::Accepted,
+        listen_only: ListenOnly::Never,
+        sets_bit_rate: true,
+    },
+    Row {
+        board: "slcan-canable",
+        what: "an slcan adapter that answers nothing (CANable's firmware)",
+        stamps: Stamps::Arrival,
+        losses: Losses::NotReported,
+        errors: "not reported",
+        confirmation: Confirmation::HandedOver,
+        listen_only: ListenOnly::Unconfirmed,
+        sets_bit_rate: true,
+    },
+    Row {
+        board: "gvret",
+        what: "a GVRET adapter (ESP32RET, Macchina)",
+        stamps: Stamps::Adapter { grain_ns: 1_000, when: "the frame's way out of the adapter, not the bus" },
+        losses: Losses::NotReported,
+        errors: "not reported",
+        confirmation: Confirmation::HandedOver,
+        listen_only: ListenOnly::Confirmed,
+        sets_bit_rate: true,
+    },
+    Row {
+        board: "socketcand",
+        what: "an interface of a socketcand server",
+        stamps: Stamps::Adapter { grain_ns: 1_000, when: "the server's receiving it" },
+        losses: Losses::NotReported,
+        errors: "that there was one",
+        confirmation: Confirmation::HandedOver,
+        listen_only: ListenOnly::Elsewhere,
+        sets_bit_rate: false,
+    },
+    Row {
+        board: "cannelloni",
+        what: "the other end of a cannelloni tunnel",
+        stamps: Stamps::Arrival,
+        losses: Losses::NotReported,
+        errors: "not reported",
+        confirmation: Confirmation::HandedOver,
+        listen_only: ListenOnly::Elsewhere,
+        sets_bit_rate: false,
+    },
+    Row {
+        board: "trace-pipe",
+        what: "a trace that another program writes into a pipe",
+        stamps: Stamps::Trace,
+        losses: Losses::Trace,
+        errors: "as in the trace",
+        confirmation: Confirmation::CannotSend,
+        listen_only: ListenOnly::Elsewhere,
+        sets_bit_rate: false,
+    },
+];
+
+/// The row of the adapter that answers `Hello` with this board's name; `None` for a board of ours.
+pub fn row(board: &str) -> Option<&'static Row> {
+    ROWS.iter().find(|row| row.board == board)
+}
+
+impl Row {
+    /// The sentence that a summary of received frames needs.
+    pub const fn losses_before(&self) -> &'static str {
+        match self.losses {
+            Losses::NotReported => "losses before this program: not reported by this adapter",
+            Losses::Flags => {
+                "losses before this program: the adapter reports that there were some, not how many"
+            }
+            Losses::Trace => "losses before this program: as far as the trace reports them",
+        }
+    }
+}
+
+impl fmt::Display for Stamps {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Arrival => f.write_str("this computer's, at a frame's arrival"),
+            Self::Adapter { grain_ns, when } => {
+                write!(f, "the adapter's, to {} us, of {when}", f64::from(*grain_ns) / 1e3)
+            }
+            Self::Trace => f.write_str("the trace's"),
+        }
+    }
+}
+
+impl fmt::Display for Confirmation {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Accepted => "accepted by the adapter; whether a frame reached the bus is not known",
+            Self::HandedOver => "handed over; what became of a frame is not known",
+            Self::CannotSend => "nothing can be sent",
+        })
+    }
+}
+
+impl fmt::Display for ListenOnly {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Confirmed => "yes, confirmed by the adapter",
+            Self::Unconfirmed => "yes, but not confirmed by the adapter",
+            Self::Never => "no: open it with --mode normal, and it acknowledges frames",
+            Self::Elsewhere => "decided elsewhere: this program has no influence on it",
+        })
+    }
+}

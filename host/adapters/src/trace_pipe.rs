@@ -1,0 +1,172 @@
+//! A trace that another program writes while this one reads it: `candump -L can0 | cantap capture -d candump:-`.
+//!
+//! Every format that can be read from its beginning can be read here. Its times become the device's, placed by arrivals: a trace that arrives
+//! faster than it was recorded has none to keep, and its frames are stamped on arrival. Read such a file by its name.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use cantap_formats::{Format, ReadOptions, open_reader};
+use cantap_trace::{TraceEvent, TraceRecord};
+use cantap_wire::record::LossStage;
+use cantap_wire::{Channel, Frame, Refusal};
+
+use crate::adapter_clock::AdapterClock;
+use crate::driver::{At, Driver, Incoming, Oddities, OpenError, Opening};
+use crate::rows::{Row, row};
+use crate::source::Source;
+
+/// How long an address waits for the first bytes to be a trace before it counts as open: a quiet bus writes nothing.
+const FIRST_BYTES: Duration = Duration::from_millis(200);
+
+/// What the reader found.
+enum Found {
+    Records(Vec<TraceRecord>),
+    /// Something unreadable.
+    Issue,
+}
+
+/// The driver.
+pub(crate) struct TracePipe {
+    source: Source<Found>,
+    clock: AdapterClock,
+    /// Found while opening.
+    first: Option<(Found, Instant)>,
+    is_open: [bool; 2],
+    oddities: Oddities,
+}
+
+impl TracePipe {
+    /// Reads from a file or pipe, `-` for standard input.
+    pub fn open_path(path: &str, format: Format, address: &str) -> Result<Self, OpenError> {
+        let no_trace = |reason: String| OpenError::NoTrace { address: address.to_owned(), reason };
+        if path != "-" && !Path::new(path).exists() {
+            return Err(no_trace("there is no such file or pipe; `-` is standard input".to_owned()));
+        }
+        let path = path.to_owned();
+        let mut reader = None;
+        // Opening a named pipe waits for its writer, so it happens in the thread.
+        let mut source = Source::start(false, move || {
+            if reader.is_none() {
+                let options = ReadOptions { format: Some(format), ..ReadOptions::default() };
+                reader = Some(open_reader(&path, &options).map_err(|error| error.to_string())?);
+            }
+            let Some(reader) = &mut reader else { return Ok(None) };
+            let mut records = Vec::new();
+            match reader.next_batch(&mut records) {
+                None => Err("its input has ended".to_owned()),
+                Some(Ok(())) => Ok(Some(Found::Records(records))),
+                Some(Err(_)) => Ok(Some(Found::Issue)),
+            }
+        })
+        .map_err(|error| no_trace(error.to_string()))?;
+        let first = source.next(FIRST_BYTES).map_err(no_trace)?.map(|piece| (piece.content, piece.at));
+        // Nanoseconds that never start again.
+        let clock = AdapterClock::new(1, 1 << 62);
+        Ok(Self { source, clock, first, is_open: [false; 2], oddities: Oddities::default() })
+    }
+
+    fn take(&mut self, found: Found, arrival: Instant, reports: &mut Vec<Incoming>) {
+        match found {
+            Found::Records(records) => {
+                for record in records {
+                    self.record(&record, arrival, reports);
+                }
+            }
+            Found::Issue => {
+                self.oddities.count("parts that cannot be read");
+                // One gap, on whichever channel is open.
+                if let Some(channel) = Channel::ALL.into_iter().find(|channel| self.is_open[channel.index()])
+                {
+                    let (stage, at) = (LossStage::Link, At::arrival(arrival));
+                    reports.push(Incoming::Lost { channel, stage, count: 1, at_least: true, at });
+                }
+            }
+        }
+    }
+
+    fn record(&mut self, record: &TraceRecord, arrival: Instant, reports: &mut Vec<Incoming>) {
+        let Some(channel) = Channel::from_number(record.channel) else {
+            return self.oddities.count("records of a third or higher channel");
+        };
+        let at = match u64::try_from(record.time_ns) {
+            Ok(time_ns) => self.clock.place(time_ns, arrival),
+            Err(_) => At::arrival(arrival),
+        };
+        match record.event {
+            TraceEvent::Frame { frame, .. } => {
+                if let Some(frame) = frame.classic() {
+                    reports.push(Incoming::Received { channel, frame: *frame, at });
+                } else {
+                    self.oddities.count("CAN FD frames, which do not fit the device's protocol");
+                    let stage = LossStage::Link;
+                    reports.push(Incoming::Lost { channel, stage, count: 1, at_least: false, at });
+                }
+            }
+            TraceEvent::BusError { kind: Some(kind), .. } => {
+                reports.push(Incoming::BusError { channel, kind, at });
+            }
+            TraceEvent::BusError { kind: None, .. } => {
+                reports.push(Incoming::BusErrors { channel, count: 1, at });
+            }
+            TraceEvent::ErrorsSuppressed { count } => {
+                reports.push(Incoming::BusErrors { channel, count, at });
+            }
+            TraceEvent::State { state, counters } => {
+                reports.push(Incoming::State { channel, state, counters: counters.unwrap_or((0, 0)), at });
+            }
+            TraceEvent::Lost { stage, count, at_least } => {
+                let stage = stage.unwrap_or(LossStage::Link);
+                reports.push(Incoming::Lost { channel, stage, count, at_least, at });
+            }
+            TraceEvent::TransmitFailed { .. } => self.oddities.count("transmissions that failed elsewhere"),
+        }
+    }
+}
+
+impl Driver for TracePipe {
+    fn row(&self) -> &'static Row {
+        row("trace-pipe").unwrap_or(&crate::ROWS[0])
+    }
+
+    fn channels(&self) -> u8 {
+        2
+    }
+
+    fn open(&mut self, channel: Channel, opening: Opening) -> Result<(), Refusal> {
+        // Nothing is acknowledged by reading, and nothing can be.
+        if !opening.listen_only {
+            return Err(Refusal::Unsupported);
+        }
+        self.is_open[channel.index()] = true;
+        Ok(())
+    }
+
+    fn close(&mut self, channel: Channel) {
+        self.is_open[channel.index()] = false;
+    }
+
+    fn send(&mut self, _channel: Channel, _mailbox: u8, _frame: &Frame) -> bool {
+        false
+    }
+
+    fn poll(&mut self, wait: Duration, reports: &mut Vec<Incoming>) -> Result<(), String> {
+        // Until somebody listens, the pipe waits.
+        if self.is_open == [false; 2] {
+            std::thread::sleep(wait);
+            return Ok(());
+        }
+        if let Some((found, at)) = self.first.take() {
+            self.take(found, at, reports);
+            return Ok(());
+        }
+        if let Some(piece) = self.source.next(wait)? {
+            self.take(piece.content, piece.at, reports);
+        }
+        Ok(())
+    }
+
+    fn oddities(&self) -> (u32, String) {
+        self.oddities.summary()
+    }
+}

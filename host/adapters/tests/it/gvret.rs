@@ -1,0 +1,163 @@
+//! A GVRET adapter that reads and writes as ESP32RET does, on TCP.
+
+use std::io::{Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::sync::mpsc::{Receiver, channel};
+
+use cantap::wire::Refusal;
+use cantap::{Channel, DeviceError};
+
+use crate::{frames, losses, open, send, until_frame};
+
+/// The two buses' settings as last set, and each frame that was to be sent.
+#[derive(Debug, PartialEq, Eq)]
+enum Seen {
+    Buses([u32; 2]),
+    Frame(Vec<u8>),
+}
+
+/// Serves one client, passes on what it does, and returns the stream to it. One that is deaf to `LISTENS` says so.
+fn start(honours_listening: bool) -> (String, Receiver<TcpStream>, Receiver<Seen>) {
+    let server = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = format!("gvret:tcp://{}", server.local_addr().unwrap());
+    let (to_test, streams) = channel();
+    let (report, seen) = channel();
+    std::thread::spawn(move || {
+        let (mut stream, _) = server.accept().unwrap();
+        to_test.send(stream.try_clone().unwrap()).unwrap();
+        let mut buses = [0u32; 2];
+        let mut one = [0];
+        let mut read = |stream: &mut TcpStream| stream.read_exact(&mut one).map(|()| one[0]);
+        while let Ok(byte) = read(&mut stream) {
+            if byte != 0xF1 {
+                continue;
+            }
+            let answer: Vec<u8> = match read(&mut stream).unwrap() {
+                0 => {
+                    let mut head = [0; 6];
+                    head.iter_mut().for_each(|byte| *byte = read(&mut stream).unwrap());
+                    let data = (0..=usize::from(head[5] & 15)).map(|_| read(&mut stream).unwrap());
+                    let data: Vec<u8> = data.collect();
+                    report.send(Seen::Frame([&head[..], &data].concat())).unwrap();
+                    continue;
+                }
+                5 => {
+                    for bus in &mut buses {
+                        let bytes = [(); 4].map(|()| read(&mut stream).unwrap());
+                        *bus = u32::from_le_bytes(bytes);
+                    }
+                    report.send(Seen::Buses(buses)).unwrap();
+                    continue;
+                }
+                6 => {
+                    let bus = |setting: u32| {
+                        let listens = u8::from(setting >> 29 & 1 == 1 && honours_listening);
+                        let mut bytes = vec![u8::from(setting >> 30 & 1 == 1) | listens << 4];
+                        bytes.extend_from_slice(&(setting & 0xF_FFFF).to_le_bytes());
+                        bytes
+                    };
+                    [vec![0xF1, 6], bus(buses[0]), bus(buses[1])].concat()
+                }
+                7 => vec![0xF1, 7, 0x6A, 2, 0x20, 0, 0, 0],
+                9 => vec![0xF1, 9, 0xDE, 0xAD],
+                12 => vec![0xF1, 12, 2],
+                _ => continue,
+            };
+            stream.write_all(&answer).unwrap();
+        }
+    });
+    (address, streams, seen)
+}
+
+/// A received frame as the adapter sends it.
+fn received(time_us: u32, id: u32, bus: u8, data: &[u8]) -> Vec<u8> {
+    let mut bytes = vec![0xF1, 0];
+    bytes.extend_from_slice(&time_us.to_le_bytes());
+    bytes.extend_from_slice(&id.to_le_bytes());
+    bytes.push(data.len() as u8 | bus << 4);
+    bytes.extend_from_slice(data);
+    bytes.push(0);
+    bytes
+}
+
+#[test]
+fn two_buses_are_heard_with_the_adapter_s_own_intervals_and_both_are_off_until_asked() {
+    let (address, streams, seen) = start(true);
+    let device = open(&address);
+    let mut adapter = streams.recv().unwrap();
+    assert_eq!(seen.recv().unwrap(), Seen::Buses([1 << 31; 2]));
+    assert_eq!((device.hello().board.as_str(), device.hello().channels), ("gvret", 2));
+    device.listen(Channel::Can1, 500_000).unwrap();
+    assert_eq!(seen.recv().unwrap(), Seen::Buses([0xE000_0000 | 500_000, 1 << 31]));
+    device.listen(Channel::Can2, 250_000).unwrap();
+    // Over the wrap of the clock, in pieces, with rubbish and a CAN FD frame between.
+    let fd = [&[0xF1, 20, 0, 0, 0, 0, 1, 0, 0, 0, 12, 1], &[0; 12][..], &[0]].concat();
+    let bytes = [
+        received(u32::MAX - 99, 0x123, 0, &[0xAA]),
+        received(u32::MAX - 49, 0x8000_0001 | 0x1ABC_0000, 1, &[]),
+        vec![0x55, 0x66],
+        fd,
+        received(900, 0x124, 0, &[1, 2, 3, 4, 5, 6, 7, 8]),
+    ]
+    .concat();
+    for piece in bytes.chunks(5) {
+        adapter.write_all(piece).unwrap();
+    }
+    let records = until_frame(&device, "124#0102030405060708");
+    assert_eq!(frames(&records), ["123#AA", "1ABC0001#", "124#0102030405060708"]);
+    assert_eq!(losses(&records), [("link", 1), ("link", 1)]);
+    let times: Vec<i64> =
+        records.iter().filter(|record| record.frame().is_some()).map(|record| record.time_ns).collect();
+    // 1000 us, to a tick or two, and to how much earlier a later frame arrived while the clock settles.
+    assert!((times[2] - times[0]).abs_diff(1_000_000) < 1_000_000, "{times:?}");
+    device.stop().unwrap();
+}
+
+#[test]
+fn one_that_does_not_listen_silently_is_not_left_open() {
+    let (address, _streams, seen) = start(false);
+    let device = open(&address);
+    let refused = device.listen(Channel::Can1, 500_000).unwrap_err();
+    assert!(matches!(refused, DeviceError::Refused { refusal: Refusal::Unsupported }), "{refused}");
+    let all: Vec<Seen> = seen.try_iter().collect();
+    assert_eq!(all.last().unwrap(), &Seen::Buses([1 << 31; 2]));
+    device.join(Channel::Can1, 500_000).unwrap();
+}
+
+#[test]
+fn a_frame_is_handed_over_and_one_that_cannot_be_is_reported_as_not_sent() {
+    let (address, _streams, seen) = start(true);
+    let device = open(&address);
+    device.join(Channel::Can1, 500_000).unwrap();
+    assert_eq!(send(&device, "1ABCDEF0#1122").result.unwrap().to_string(), "1ABCDEF0#1122");
+    let sent = seen.iter().find(|seen| matches!(seen, Seen::Frame(_))).unwrap();
+    assert_eq!(sent, Seen::Frame(vec![0xF0, 0xDE, 0xBC, 0x9A, 0, 2, 0x11, 0x22, 0]));
+    assert!(send(&device, "123#R").result.is_err());
+}
+
+#[test]
+fn a_connection_that_ends_ends_the_session_with_its_reason() {
+    let (address, streams, _seen) = start(true);
+    let device = open(&address);
+    let mut adapter = streams.recv().unwrap();
+    device.listen(Channel::Can1, 500_000).unwrap();
+    adapter.write_all(&received(1, 1, 0, &[])).unwrap();
+    adapter.shutdown(std::net::Shutdown::Both).unwrap();
+    let records: Vec<_> = device.records().collect();
+    assert_eq!(records[0].as_ref().unwrap().frame().unwrap().to_string(), "001#");
+    let error = records.last().unwrap().as_ref().unwrap_err();
+    assert!(matches!(error, DeviceError::Vanished { .. }), "{error}");
+}
+
+#[test]
+fn one_that_says_something_else_without_an_end_is_not_waited_for() {
+    let server = TcpListener::bind("127.0.0.1:0").unwrap();
+    let place: cantap_adapters::Place =
+        format!("gvret:tcp://{}", server.local_addr().unwrap()).parse().unwrap();
+    let babbler = std::thread::spawn(move || {
+        let (mut stream, _) = server.accept().unwrap();
+        while stream.write_all(&[0xF1, 0, 0xFF, 0xF1, 0x30]).is_ok() {}
+    });
+    assert!(matches!(cantap_adapters::open(&place), Err(cantap_adapters::OpenError::Foreign { .. })));
+    babbler.join().unwrap();
+}

@@ -1,0 +1,72 @@
+//! A socketcand server, as its protocol's description and its raw mode have it.
+
+use std::io::{Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::sync::mpsc::{Receiver, channel};
+
+use cantap::Channel;
+use cantap::wire::message::capability;
+use cantap_adapters::OpenError;
+
+use crate::{frames, losses, open, send, until_frame};
+
+/// Serves one client with this interface; passes on its messages.
+fn start(interface: &'static str) -> (String, Receiver<TcpStream>, Receiver<String>) {
+    let server = TcpListener::bind("127.0.0.1:0").unwrap();
+    let place = server.local_addr().unwrap().to_string();
+    let (to_test, streams) = channel();
+    let (report, messages) = channel();
+    std::thread::spawn(move || {
+        let (mut stream, _) = server.accept().unwrap();
+        to_test.send(stream.try_clone().unwrap()).unwrap();
+        stream.write_all(b"< hi >").unwrap();
+        let (mut message, mut byte) = (String::new(), [0]);
+        while stream.read_exact(&mut byte).is_ok() {
+            message.push(char::from(byte[0]));
+            if byte[0] != b'>' {
+                continue;
+            }
+            let answer = match message.as_str() {
+                "< rawmode >" => "< ok >",
+                open if open == format!("< open {interface} >") => "< ok >",
+                open if open.starts_with("< open") => "< error could not open bus >",
+                _ => "",
+            };
+            let _ = report.send(std::mem::take(&mut message));
+            stream.write_all(answer.as_bytes()).unwrap();
+        }
+    });
+    (place, streams, messages)
+}
+
+#[test]
+fn frames_come_and_go_and_what_cannot_be_read_is_a_loss() {
+    let (place, streams, messages) = start("can0");
+    let device = open(&format!("socketcand://{place}/can0"));
+    let mut server = streams.recv().unwrap();
+    assert_ne!(device.hello().capabilities & capability::NO_BIT_RATE, 0);
+    device.join(Channel::Can1, 500_000).unwrap();
+    // Without data there are two blanks.
+    for piece in [
+        "< frame 123 1700000000.000100 1122 >< frame 00000123 1700000000.000200  ><",
+        " frame 124 17000",
+        "00000.000300  >< frame 999999999 1 00 >< frame 1 1 001 >",
+    ] {
+        server.write_all(piece.as_bytes()).unwrap();
+    }
+    server.write_all(format!("< {} ", "x".repeat(100_000)).as_bytes()).unwrap();
+    server.write_all(b"< frame 7FF 1700000000.1 FF >").unwrap();
+    let records = until_frame(&device, "7FF#FF");
+    assert_eq!(frames(&records), ["123#1122", "00000123#", "124#", "7FF#FF"]);
+    assert_eq!(losses(&records), [("link", 1); 3]);
+    assert_eq!(send(&device, "5A1#0102").result.unwrap().to_string(), "5A1#0102");
+    assert_eq!(messages.iter().nth(2).unwrap(), "< send 5A1 2 01 02 >");
+    assert!(send(&device, "123#R").result.is_err());
+}
+
+#[test]
+fn an_interface_that_is_not_there_is_refused() {
+    let (place, _streams, _messages) = start("can0");
+    let place: cantap_adapters::Place = format!("socketcand://{place}/can7").parse().unwrap();
+    assert!(matches!(cantap_adapters::open(&place), Err(OpenError::Refused { .. })));
+}

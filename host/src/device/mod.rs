@@ -138,8 +138,8 @@ impl Device {
             return Err(DeviceError::NoChannel { channel });
         }
         let must_be_silent = config.as_ref().is_some_and(|config| config.mode == Mode::ListenOnly);
-        if must_be_silent && self.hello.capabilities & capability::ALWAYS_ACKNOWLEDGES != 0 {
-            return Err(DeviceError::AlwaysAcknowledges { address: self.shared.name.clone() });
+        if must_be_silent && self.hello().capabilities & capability::ALWAYS_ACKNOWLEDGES != 0 {
+            return Err(DeviceError::AlwaysAcknowledges { address: self.name().to_owned() });
         }
         // This must be set before the first frame can arrive.
         if let Some(config) = &config {
@@ -165,7 +165,7 @@ impl Device {
     }
 
     fn set_bit_length(&self, channel: Channel, config: &ChannelConfig) {
-        if self.hello.capabilities & capability::NO_BIT_RATE != 0 {
+        if self.hello().capabilities & capability::NO_BIT_RATE != 0 {
             return;
         }
         self.order(Order::BitLength {

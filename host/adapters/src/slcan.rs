@@ -171,7 +171,7 @@ impl Slcan {
             return Ok(());
         }
         if let Text::Line(text) = &answer {
-            let digits = |range: std::ops::Range<usize>| text.get(range).and_then(hex).unwrap_or(0) as u16;
+            let digits = |range: std::ops::Range<usize>| number(text.get(range).unwrap_or_default());
             self.version = [digits(1..3), digits(3..5), 0];
         }
         if let Some(Text::Line(text)) = self.ask(b"N\r")?
@@ -489,6 +489,11 @@ impl Driver for Slcan {
 
 fn is_done(answer: Option<&Text>) -> bool {
     matches!(answer, Some(Text::Line(_)))
+}
+
+/// A decimal number; 0 if it is none.
+fn number(digits: &[u8]) -> u16 {
+    std::str::from_utf8(digits).ok().and_then(|digits| digits.parse().ok()).unwrap_or(0)
 }
 
 /// The number that hexadecimal digits say.

@@ -149,7 +149,7 @@ fn it_listens_without_ever_having_been_open_to_acknowledge() {
     let adapter = StandIn::start(Manner::Lawicel);
     let device = open(&adapter.address());
     assert_eq!((device.hello().board.as_str(), device.hello().serial.as_str()), ("slcan", "A123"));
-    assert_eq!((device.hello().channels, device.hello().firmware), (1, [0x10, 0x13, 0]));
+    assert_eq!((device.hello().channels, device.hello().firmware), (1, [10, 13, 0]));
     device.listen(Channel::Can1, 250_000).unwrap();
     adapter.says("t1232DEAD\rT1ABCDEF00\rr4563\r");
     adapter.says("t1232BEEF0010\r");

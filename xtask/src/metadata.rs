@@ -29,6 +29,7 @@ pub struct Package {
     pub features: BTreeMap<String, Vec<String>>,
     /// Where its source is.
     pub manifest_path: PathBuf,
+    #[serde(default)]
     #[cfg_attr(not(feature = "check"), expect(dead_code, reason = "only the checks ask for it"))]
     targets: Vec<Target>,
     /// Empty if it must not be published.

@@ -13,7 +13,7 @@ use crate::live_args::LiveArgs;
 use cantap_work::interrupt;
 use cantap_work::live::LiveRecords;
 use cantap_work::missing::Missing;
-use cantap_work::read_ahead::{ReadAhead, Step};
+use cantap_work::read_ahead::{Progress, ReadAhead};
 
 /// How to read a trace; commands flatten this into their arguments.
 #[derive(clap::Args)]
@@ -217,11 +217,11 @@ fn batch_of_file(
 ) -> anyhow::Result<bool> {
     let nothing = loop {
         match reader.next(records)? {
-            Step::Records => return Ok(true),
-            Step::Issue(issue, _) if strict => bail!(issue),
-            Step::Issue(issue, number) if number <= ISSUES_SHOWN => eprintln!("cantap: {issue}"),
-            Step::Issue(..) => {}
-            Step::End(nothing) => break nothing,
+            Progress::Records => return Ok(true),
+            Progress::Issue(issue, _) if strict => bail!(issue),
+            Progress::Issue(issue, number) if number <= ISSUES_SHOWN => eprintln!("cantap: {issue}"),
+            Progress::Issue(..) => {}
+            Progress::End(nothing) => break nothing,
         }
     };
     if let Some(nothing) = nothing {

@@ -29,8 +29,8 @@ pub struct Package {
     pub features: BTreeMap<String, Vec<String>>,
     /// Where its source is.
     pub manifest_path: PathBuf,
+    #[cfg(feature = "check")]
     #[serde(default)]
-    #[cfg_attr(not(feature = "check"), expect(dead_code, reason = "only the checks ask for it"))]
     targets: Vec<Target>,
     /// Empty if it must not be published.
     publish: Option<Vec<String>>,
@@ -41,6 +41,7 @@ pub struct Package {
 }
 
 /// What a package compiles to.
+#[cfg(feature = "check")]
 #[derive(Deserialize)]
 struct Target {
     kind: Vec<String>,

@@ -35,7 +35,7 @@ struct Known {
 type Item = (Next, Known);
 
 /// The next of a trace that was read ahead.
-pub enum Step {
+pub enum Progress {
     /// There are records.
     Records,
     /// A place that could not be read, and the number of such places so far.
@@ -108,13 +108,13 @@ impl ReadAhead {
 
     /// Replaces the content of `records` with the next ones; leaves none if something else comes first. The error is that
     /// there is no thread to be had.
-    pub fn next(&mut self, records: &mut Vec<TraceRecord>) -> io::Result<Step> {
+    pub fn next(&mut self, records: &mut Vec<TraceRecord>) -> io::Result<Progress> {
         records.clear();
         self.source = match std::mem::replace(&mut self.source, Source::Ended) {
             Source::Waiting(reader) => start(*reader)?,
             source => source,
         };
-        let Some((next, known)) = self.item() else { return Ok(Step::End(None)) };
+        let Some((next, known)) = self.item() else { return Ok(Progress::End(None)) };
         self.known = known;
         Ok(match next {
             Next::Records(batch) => {
@@ -123,10 +123,10 @@ impl ReadAhead {
                     // At the file's end nobody wants it.
                     let _ = used.send(before);
                 }
-                Step::Records
+                Progress::Records
             }
-            Next::Issue(issue, number) => Step::Issue(issue, number),
-            Next::End(nothing) => Step::End(nothing),
+            Next::Issue(issue, number) => Progress::Issue(issue, number),
+            Next::End(nothing) => Progress::End(nothing),
         })
     }
 

@@ -32,7 +32,7 @@ impl Point {
 
 /// The content of a stretch of time that is drawn as one column.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Column {
+pub struct Extent {
     /// The smallest value.
     pub min: f64,
     /// The largest value.
@@ -197,12 +197,12 @@ impl Series {
     }
 
     /// The content from one time until before another; `None` if there is no value.
-    pub fn column(&self, from_ns: i64, until_ns: i64) -> Option<Column> {
+    pub fn column(&self, from_ns: i64, until_ns: i64) -> Option<Extent> {
         if until_ns <= from_ns {
             return None;
         }
         let (start, end) = (self.place(from_ns), self.place(until_ns));
-        let mut found: Option<Column> = None;
+        let mut found: Option<Extent> = None;
         let mut gap = self.before_place(start).is_none_or(Point::is_gap);
         for index in start.0..=end.0 {
             let Some(block) = self.blocks.get(index) else { break };
@@ -222,7 +222,7 @@ impl Series {
                 })
             };
             let after_gap = gap || points[0].is_gap();
-            let column = found.get_or_insert(Column {
+            let column = found.get_or_insert(Extent {
                 min,
                 max,
                 first: *first,
@@ -230,10 +230,10 @@ impl Series {
                 after_gap,
                 before_gap: false,
             });
-            *column = Column { min: column.min.min(min), max: column.max.max(max), last: *last, ..*column };
+            *column = Extent { min: column.min.min(min), max: column.max.max(max), last: *last, ..*column };
             gap = points.last().is_some_and(|point| point.is_gap());
         }
-        found.map(|column| Column { before_gap: gap, ..column })
+        found.map(|column| Extent { before_gap: gap, ..column })
     }
 }
 

@@ -3,7 +3,7 @@
 use ratatui::style::Color;
 use ratatui::widgets::canvas::{Painter, Shape};
 
-use super::super::super::model::{Column, Point, Series};
+use super::super::super::model::{Extent, Point, Series};
 
 /// A stretch of time in columns of equal length.
 #[derive(Clone, Copy, Debug)]
@@ -41,7 +41,7 @@ impl Time {
 pub struct Trail {
     time: Time,
     /// The content of each column.
-    columns: Vec<Option<Column>>,
+    columns: Vec<Option<Extent>>,
     before: Option<Point>,
     after: Option<Point>,
 }
@@ -62,7 +62,7 @@ impl Trail {
     }
 
     /// The content of each column.
-    pub fn columns(&self) -> &[Option<Column>] {
+    pub fn columns(&self) -> &[Option<Extent>] {
         &self.columns
     }
 

@@ -64,7 +64,11 @@ fn items(json: &std::path::Path) -> Result<String> {
         .omit_auto_trait_impls(true)
         .omit_auto_derived_impls(true)
         .build()?;
-    Ok(api.items().map(|item| format!("{item}\n")).collect())
+    let mut text = String::new();
+    for item in api.items() {
+        writeln!(text, "{item}")?;
+    }
+    Ok(text)
 }
 
 /// Adds the lines that only one of two texts has.

@@ -26,7 +26,7 @@ use crate::usage_error::usage;
 use cantap_work::channel_bitrate::ChannelBitrate;
 
 /// How long a simulated run takes if nothing else ends it.
-const SIMULATED: Duration = Duration::from_secs(60);
+const SIMULATED: Duration = Duration::from_mins(1);
 /// The bit rate of simulated buses that nothing else fixes.
 const SIMULATED_BPS: u32 = 500_000;
 
@@ -108,7 +108,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         }
         Some(address) => {
             let device = address.open()?;
-            args.open.open(&device, args.channels(&device)?.into_iter(), Mode::Normal, None)?;
+            args.open.open(&device, args.channels(&device).into_iter(), Mode::Normal, None)?;
             let live = Live { decoder, seed: args.seed, duration: args.duration };
             let result = live.run(&device, &scripts, &mut on_record, &mut on_message, &mut goes_on);
             if result.is_ok() {
@@ -144,14 +144,14 @@ impl Args {
     }
 
     /// The channels to open: those with a bit rate of their own; with one for all, or none, the first.
-    fn channels(&self, device: &cantap_address::OpenDevice) -> anyhow::Result<Vec<Channel>> {
+    fn channels(&self, device: &cantap_address::OpenDevice) -> Vec<Channel> {
         let rates = self.open.options().timing.bitrates;
         let own: Vec<Channel> = Channel::ALL
             .into_iter()
             .filter(|channel| rates.iter().any(|rate| rate.channel == Some(channel.number())))
             .filter(|channel| channel.number() <= device.hello().channels)
             .collect();
-        Ok(if own.is_empty() { vec![Channel::Can1] } else { own })
+        if own.is_empty() { vec![Channel::Can1] } else { own }
     }
 }
 

@@ -206,7 +206,7 @@ impl Run<'_> {
     /// Whether a frame of a script that has ended is not on the bus yet.
     fn is_sending(&self) -> bool {
         self.buses.iter().any(|wire| {
-            let ended = self.nodes.iter().zip(&wire.nodes).filter(|(node, _)| node.ended.is_some());
+            let ended = self.nodes.iter().zip(&wire.nodes).filter(|(node, _)| node.has_ended);
             ended.into_iter().any(|(_, attached)| !attached.to_send.is_empty())
         })
     }
@@ -270,7 +270,7 @@ impl Run<'_> {
         let node = &mut self.nodes[place];
         let outputs = node.resume(self.now_ns, input);
         let name = node.name.clone();
-        let has_ended = node.ended.is_some();
+        let has_ended = node.has_ended;
         for output in outputs {
             match self.results.take(&name, self.now_ns, output) {
                 Some(Output::Send { channel, frame }) => {

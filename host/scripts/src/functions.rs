@@ -195,7 +195,7 @@ fn values(engine: &mut Engine, runtime: &Rc<Runtime>) {
     engine.register_fn("value", move |name: &str| -> Result<Dynamic> {
         let (message, signal) = name.rsplit_once('.').ok_or("write it as Message.Signal")?;
         let found = of.decoder.messages().find(|(_, _, candidate)| candidate.name == message);
-        let Some((_, _, found)) = found else { return Err(unknown_message(&of, message)) };
+        let Some((_, _, found)) = found else { return Err(unknown_message(&of, message).into()) };
         if !found.signals.iter().any(|candidate| candidate.label() == signal) {
             return Err(format!("message {message} has no signal {signal}").into());
         }
@@ -262,8 +262,9 @@ fn is_final(error: &rhai::EvalAltResult) -> bool {
 pub fn describe(error: &rhai::EvalAltResult) -> String {
     match error {
         rhai::EvalAltResult::ErrorInFunctionCall(_, _, inner, _) => describe(inner),
-        rhai::EvalAltResult::ErrorTerminated(reason, at) => with_line(&reason.to_string(), *at),
-        rhai::EvalAltResult::ErrorRuntime(reason, at) => with_line(&reason.to_string(), *at),
+        rhai::EvalAltResult::ErrorTerminated(reason, at) | rhai::EvalAltResult::ErrorRuntime(reason, at) => {
+            with_line(&reason.to_string(), *at)
+        }
         other => other.to_string(),
     }
 }
@@ -341,17 +342,19 @@ fn selector(runtime: &Runtime, text: &str) -> Result<Selector> {
 
 fn message_selector(runtime: &Runtime, name: &str) -> Result<Selector> {
     let found = runtime.decoder.messages().find(|(_, _, message)| message.name == name);
-    found.map(|(reference, _, _)| Selector::Message(reference)).ok_or_else(|| unknown_message(runtime, name))
+    found
+        .map(|(reference, _, _)| Selector::Message(reference))
+        .ok_or_else(|| unknown_message(runtime, name).into())
 }
 
-fn unknown_message(runtime: &Runtime, name: &str) -> Box<rhai::EvalAltResult> {
+fn unknown_message(runtime: &Runtime, name: &str) -> String {
     if runtime.decoder.messages().next().is_none() {
-        return format!("there is no message {name}: give a database with --db").into();
+        return format!("there is no message {name}: give a database with --db");
     }
     // The database's own words for a name that is nearly one of its own.
     match encode::encode(&runtime.decoder, None, name) {
-        Err(error) => error.to_string().into(),
-        Ok(_) => format!("there is no message {name}").into(),
+        Err(error) => error.to_string(),
+        Ok(_) => format!("there is no message {name}"),
     }
 }
 
@@ -359,7 +362,7 @@ fn unknown_message(runtime: &Runtime, name: &str) -> Box<rhai::EvalAltResult> {
 fn encoded(runtime: &Runtime, channel: i64, name: &str, signals: &Map) -> Result<Frame> {
     let channel = channel_of(channel)?;
     if runtime.decoder.messages().next().is_none() {
-        return Err(unknown_message(runtime, name));
+        return Err(unknown_message(runtime, name).into());
     }
     let values: Vec<String> = signals.iter().map(|(signal, value)| format!("{signal}={value}")).collect();
     let text = if values.is_empty() { name.to_owned() } else { format!("{name}:{}", values.join(",")) };

@@ -196,12 +196,12 @@ impl Run<'_> {
                     self.repeat(place, (handle, channel), frame, period_ns)?;
                 }
                 Some(Output::EndRepeat { handle }) => {
-                    self.end_repeats(|of, own| (of, own) == (place, handle))?
+                    self.end_repeats(|of, own| (of, own) == (place, handle))?;
                 }
                 Some(Output::Log(_) | Output::Test { .. }) | None => {}
             }
         }
-        if self.nodes[place].ended.is_some() {
+        if self.nodes[place].has_ended {
             self.end_repeats(|of, _| of == place)?;
         }
         Ok(())

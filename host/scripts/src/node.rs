@@ -1,5 +1,6 @@
 //! A script, and the thread that it runs in.
 
+use std::fmt::Write as _;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::JoinHandle;
@@ -99,7 +100,8 @@ fn tail_of(ast: &AST, source: &str) -> String {
             .filter(|(_, is_there)| *is_there)
             .map(|(name, _)| format!("Fn(\"{name}\")"))
             .collect();
-        tail.push_str(&format!("run_test(\"{test}\", [{}]);\n", steps.join(", ")));
+        // Writing to a text cannot fail.
+        let _ = writeln!(tail, "run_test(\"{test}\", [{}]);", steps.join(", "));
     }
     if tests.is_empty() {
         tail.push_str("serve();\n");
@@ -115,8 +117,10 @@ pub struct Node {
     pub has_tests: bool,
     /// When it is to be woken, if nothing happens before.
     pub wake_ns: Option<u64>,
-    /// Whether it has ended, and with what error.
-    pub ended: Option<Option<String>>,
+    /// Whether it has ended.
+    pub has_ended: bool,
+    /// The error with which it has ended.
+    pub error: Option<String>,
     inputs: Wanted,
     /// Frames that were on the bus, of which it does not know yet.
     confirmed: usize,
@@ -141,7 +145,8 @@ impl Node {
             name: script.name.clone(),
             has_tests,
             wake_ns: Some(0),
-            ended: None,
+            has_ended: false,
+            error: None,
             inputs: Wanted::default(),
             confirmed: 0,
             to: Some(to),
@@ -152,7 +157,7 @@ impl Node {
 
     /// Its turn, if it has one for this input: returns what it wants.
     pub fn resume(&mut self, now_ns: u64, input: Option<Input>) -> Vec<Output> {
-        if self.ended.is_some() {
+        if self.has_ended {
             return Vec::new();
         }
         if input.as_ref().is_some_and(|input| !self.inputs.has(input)) {
@@ -174,7 +179,8 @@ impl Node {
             }
             Next::End { error } => {
                 self.wake_ns = None;
-                self.ended = Some(error);
+                self.has_ended = true;
+                self.error = error;
             }
         }
         outputs

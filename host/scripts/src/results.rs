@@ -72,7 +72,7 @@ impl<'a> Results<'a> {
     /// The report of a run that is over.
     pub fn finish(mut self, nodes: &[Node], now_ns: u64) -> Report {
         self.report.duration_ns = now_ns;
-        let errors = nodes.iter().filter_map(|node| Some((node.name.clone(), node.ended.clone()??)));
+        let errors = nodes.iter().filter_map(|node| Some((node.name.clone(), node.error.clone()?)));
         self.report.errors.extend(errors);
         self.report
     }
@@ -82,8 +82,8 @@ impl<'a> Results<'a> {
 pub fn is_over(nodes: &[Node]) -> bool {
     let mut deciding = nodes.iter().filter(|node| node.has_tests).peekable();
     if deciding.peek().is_some() {
-        deciding.all(|node| node.ended.is_some())
+        deciding.all(|node| node.has_ended)
     } else {
-        nodes.iter().all(|node| node.ended.is_some())
+        nodes.iter().all(|node| node.has_ended)
     }
 }

@@ -184,9 +184,9 @@ impl Runtime {
                     return Ok(None);
                 }
                 until_ns = machine.due_ns();
-            } else if matches!(want, Want::End) && self.has_nothing_left() {
-                return Ok(None);
-            } else if until_ns.is_some_and(|until_ns| until_ns <= self.now_ns()) {
+            } else if until_ns.is_some_and(|until_ns| until_ns <= self.now_ns())
+                || matches!(want, Want::End) && self.has_nothing_left()
+            {
                 return Ok(None);
             }
             let timer_ns = self.with_handlers(|handlers| handlers.next_due_ns());
@@ -222,7 +222,7 @@ impl Runtime {
     /// The turn ends.
     fn hand_over(&self, next: Next) -> Result<()> {
         let outputs = std::mem::take(&mut self.state.borrow_mut().outputs);
-        self.turn.send(Turn { outputs, next }).map_err(|_| ended())
+        self.turn.send(Turn { outputs, next }).map_err(|_| Box::new(ended()))
     }
 
     /// The script has ended.
@@ -232,7 +232,7 @@ impl Runtime {
     }
 
     fn take_turn(&self) -> Result<Option<Input>> {
-        let Resume { now_ns, input, confirmed } = self.resume.recv().map_err(|_| ended())?;
+        let Resume { now_ns, input, confirmed } = self.resume.recv().map_err(|_| Box::new(ended()))?;
         let mut state = self.state.borrow_mut();
         state.now_ns = now_ns;
         state.unconfirmed = state.unconfirmed.saturating_sub(confirmed);
@@ -348,6 +348,6 @@ impl Runtime {
 }
 
 /// The error that ends a script whose bus is gone.
-fn ended() -> Box<EvalAltResult> {
-    Box::new(EvalAltResult::ErrorTerminated(ENDED.into(), rhai::Position::NONE))
+fn ended() -> EvalAltResult {
+    EvalAltResult::ErrorTerminated(ENDED.into(), rhai::Position::NONE)
 }

@@ -3,15 +3,10 @@
 use std::time::Duration;
 
 use cantap::Channel;
-use cantap::wire::CHANNELS;
 use cantap_trace::grammar;
-
-use crate::wrong::wrong;
+use cantap_work::channels::{Channels, channel_number};
 
 pub use cantap_trace::grammar::{bit_rate as bitrate, duration, per_second, positive_duration};
-
-/// The most channels that a command supports, over all its devices.
-pub const MOST_CHANNELS: u8 = 32;
 
 /// In milliseconds: a plain number as in can-utils, or a time with its unit.
 pub fn milliseconds(text: &str) -> Result<f64, String> {
@@ -30,51 +25,13 @@ pub fn nanoseconds(time: Duration) -> u64 {
     u64::try_from(time.as_nanos()).unwrap_or(u64::MAX).min(u64::MAX / 4)
 }
 
-/// Channels, as `1`, `2`, several separated by commas, or `both`, which means all.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Channels {
-    /// From 1; empty for all.
-    numbers: Vec<u8>,
-}
-
-impl Channels {
-    /// All channels.
-    pub const fn all() -> Self {
-        Self { numbers: Vec::new() }
-    }
-
-    /// Whether the channel with this number, from 1, is included.
-    pub fn has(&self, number: u8) -> bool {
-        self.numbers.is_empty() || self.numbers.contains(&number)
-    }
-
-    /// Those of a single device, one by one.
-    pub fn iter(&self) -> impl Iterator<Item = Channel> + use<'_> {
-        Channel::ALL.into_iter().filter(|channel| self.has(channel.number()))
-    }
-
-    /// Refuses channels that this number of boards does not have.
-    pub fn check(&self, boards: usize) -> anyhow::Result<()> {
-        let count = boards * CHANNELS;
-        match self.numbers.iter().find(|number| usize::from(**number) > count) {
-            None => Ok(()),
-            Some(number) if boards == 1 => {
-                Err(wrong(format!("a device has channels 1 and 2, and no channel {number}")))
-            }
-            Some(number) => {
-                Err(wrong(format!("{boards} devices have channels 1 to {count}, and no channel {number}")))
-            }
-        }
-    }
-}
-
 /// See [`Channels`].
 pub fn channels(text: &str) -> Result<Channels, String> {
     if matches!(text, "both" | "all") {
         return Ok(Channels::all());
     }
     let numbers = text.split(',').map(channel_number).collect::<Option<Vec<_>>>();
-    numbers.map(|numbers| Channels { numbers }).ok_or_else(|| {
+    numbers.map(Channels::of_numbers).ok_or_else(|| {
         "channels are 1, 2, several as 1,3, or both; a second device has 3 and 4, and can0 in a trace is channel 1"
             .to_owned()
     })
@@ -94,27 +51,11 @@ pub fn channel_of_trace(text: &str) -> Result<u8, String> {
     })
 }
 
-/// The number of a device's channel, from 1.
-fn channel_number(text: &str) -> Option<u8> {
-    grammar::channel(text).filter(|number| *number <= MOST_CHANNELS)
-}
-
 /// One channel of a device, as `1`, `2`, or as an interface: `can0` is channel 1, as in every trace.
 pub fn channel(text: &str) -> Result<Channel, String> {
     let found = channel_number(text)
         .and_then(|number| Channel::ALL.into_iter().find(|channel| channel.number() == number));
     found.ok_or_else(|| "a channel is 1 or 2; can0 is channel 1, can1 is channel 2".to_owned())
-}
-
-/// Whether the terminal shows more than ASCII, judging by its environment.
-pub fn is_utf8_locale() -> bool {
-    if cfg!(windows) {
-        return true;
-    }
-    // The first that is set and not empty decides (POSIX.1-2017, 8.2).
-    let set = ["LC_ALL", "LC_CTYPE", "LANG"].into_iter().filter_map(|name| std::env::var(name).ok());
-    let locale = set.into_iter().find(|value| !value.is_empty()).unwrap_or_default().to_ascii_lowercase();
-    locale.contains("utf-8") || locale.contains("utf8")
 }
 
 #[cfg(test)]

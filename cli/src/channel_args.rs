@@ -1,26 +1,21 @@
 //! How a channel is opened: the options of every command that opens one.
 
-use std::time::Duration;
-
-use anyhow::{Context, bail};
 use cantap::Channel;
-use cantap::device::channel_number;
-use cantap::hw_filter::{self, Compiled};
-use cantap::recovery::Recovery;
-use cantap::wire::message::{ChannelConfig, Defaults, Mode};
+use cantap::wire::message::{ChannelConfig, Mode};
 use cantap_address::OpenDevice;
 use cantap_trace::filter::Filter;
+use cantap_work::bus_off::BusOffRecovery;
+use cantap_work::channel_options::{ChannelOptions, RecoveryOption};
 
 use crate::args;
-use crate::channel_bitrate::ChannelBitrate;
-use crate::rescue::Rescue;
+use crate::stderr;
 use crate::timing_args::TimingArgs;
 
 /// How to open a channel; commands flatten this into their arguments.
 #[derive(clap::Args, Clone, Debug, Default)]
 pub struct ChannelArgs {
     #[command(flatten)]
-    pub timing: TimingArgs,
+    timing: TimingArgs,
     /// How to take part in the bus.
     #[arg(long, value_enum)]
     mode: Option<ModeArg>,
@@ -30,16 +25,13 @@ pub struct ChannelArgs {
     /// How to leave bus-off: auto, by the controller itself (the default); manual, not at all while the command runs; or
     /// after a time, such as 100ms.
     #[arg(long, value_name = "auto|manual|TIME", value_parser = recovery)]
-    recovery: Option<RecoveryArg>,
+    recovery: Option<RecoveryOption>,
     /// Leave data bytes out of the stream, to save bandwidth: files contain zeros instead.
     #[arg(long)]
     no_data: bool,
     /// Leave time stamps out of the stream, to save bandwidth: times are only upper bounds.
     #[arg(long)]
     no_stamps: bool,
-    /// Which of several boards this is for, from 0.
-    #[arg(skip)]
-    board: usize,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -55,99 +47,48 @@ enum ModeArg {
     SilentLoopback,
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum RecoveryArg {
-    /// After 128 times 11 recessive bits.
-    Auto,
-    /// Never.
-    Manual,
-    /// This long after it went bus-off, by this program.
-    After(Duration),
-}
-
-fn recovery(text: &str) -> Result<RecoveryArg, String> {
+fn recovery(text: &str) -> Result<RecoveryOption, String> {
     match text {
-        "auto" => Ok(RecoveryArg::Auto),
-        "manual" => Ok(RecoveryArg::Manual),
+        "auto" => Ok(RecoveryOption::Auto),
+        "manual" => Ok(RecoveryOption::Manual),
         _ => args::duration(text)
-            .map(RecoveryArg::After)
+            .map(RecoveryOption::After)
             .map_err(|_| "write auto, manual, or a time, such as 100ms".to_owned()),
     }
 }
 
-/// The settings for opening a channel.
-struct Plan {
-    channel: Channel,
-    config: ChannelConfig,
-    /// What is saved on the device, if that is used.
-    saved: Option<Defaults>,
+impl From<ModeArg> for Mode {
+    fn from(mode: ModeArg) -> Self {
+        match mode {
+            ModeArg::ListenOnly => Self::ListenOnly,
+            ModeArg::Normal => Self::Normal,
+            ModeArg::Loopback => Self::Loopback,
+            ModeArg::SilentLoopback => Self::SilentLoopback,
+        }
+    }
 }
 
 impl ChannelArgs {
-    /// Only listening, at these bit rates; without any, with what is saved on the device.
-    pub fn listening(bitrates: Vec<ChannelBitrate>) -> Self {
-        let mut args = Self::default();
-        args.timing.bitrates = bitrates;
-        args
-    }
-
-    /// The part for one of several boards, counted from 0, whose channels have their own numbers there.
-    pub fn on_board(&self, board: usize) -> Self {
-        Self { timing: self.timing.on_board(board), board, ..self.clone() }
-    }
-
-    /// The channel's number for users.
-    const fn number(&self, channel: Channel) -> u8 {
-        channel_number(self.board, channel)
-    }
-
-    /// Whether any option is given.
-    pub fn is_given(&self) -> bool {
-        let Self { timing, mode, one_shot, recovery, no_data, no_stamps, board: _ } = self;
-        timing.is_given_or_wished()
-            || mode.is_some()
-            || recovery.is_some()
-            || [one_shot, no_data, no_stamps].into_iter().any(|flag| *flag)
-    }
-
-    /// The requested mode, if any.
-    pub fn mode(&self) -> Option<Mode> {
-        Some(match self.mode? {
-            ModeArg::ListenOnly => Mode::ListenOnly,
-            ModeArg::Normal => Mode::Normal,
-            ModeArg::Loopback => Mode::Loopback,
-            ModeArg::SilentLoopback => Mode::SilentLoopback,
-        })
-    }
-
-    /// Requests another mode.
-    pub fn set_mode(&mut self, mode: Mode) {
-        self.mode = Some(match mode {
-            Mode::ListenOnly => ModeArg::ListenOnly,
-            Mode::Normal => ModeArg::Normal,
-            Mode::Loopback => ModeArg::Loopback,
-            Mode::SilentLoopback => ModeArg::SilentLoopback,
-        });
-    }
-
-    /// Brings channels back from bus-off while the command runs, if the user requested that.
-    pub fn rescue(&self) -> Rescue {
-        Rescue::new(self.recovery())
-    }
-
-    /// Brings channels back from bus-off if the user requested that; for callers that report it in their own
-    /// way.
-    pub fn recovery(&self) -> Option<Recovery> {
-        match self.recovery {
-            Some(RecoveryArg::After(time)) => Some(Recovery::new(time)),
-            _ => None,
+    /// The same without clap.
+    pub fn options(&self) -> ChannelOptions {
+        let Self { timing, mode, one_shot, recovery, no_data, no_stamps } = self;
+        ChannelOptions {
+            timing: timing.options(),
+            mode: mode.map(Mode::from),
+            one_shot: *one_shot,
+            recovery: *recovery,
+            no_data: *no_data,
+            no_stamps: *no_stamps,
+            board: 0,
         }
     }
 
-    /// Opens channels, with `mode` unless the user requested another, and returns how they were opened. Anything
-    /// impossible is detected before the first one is opened. Commands that receive pass their filters; with none, those
-    /// saved on the device apply. Reports on standard error which filters the hardware could not take, and that saved ones
-    /// apply.
+    /// See [`ChannelOptions::bus_off_recovery`]; it reports on standard error.
+    pub fn bus_off_recovery(&self) -> BusOffRecovery {
+        self.options().bus_off_recovery(&stderr::reporter())
+    }
+
+    /// See [`ChannelOptions::open`]; it reports on standard error.
     pub fn open(
         &self,
         device: &OpenDevice,
@@ -155,117 +96,6 @@ impl ChannelArgs {
         mode: Mode,
         filters: Option<&[Filter]>,
     ) -> anyhow::Result<Vec<(Channel, ChannelConfig)>> {
-        let plans = self.plan(device, channels, Some(mode))?;
-        // A channel's filters can be changed only while both channels are closed.
-        for Plan { channel, saved, .. } in &plans {
-            match (filters, saved) {
-                (Some(filters), _) if !filters.is_empty() => {
-                    if let Some(remainder) = hw_filter::apply(device, *channel, filters)?.remainder {
-                        eprintln!("cantap: channel {}: {remainder}", self.number(*channel));
-                    }
-                }
-                (Some(_), Some(saved)) if !saved.filters.is_empty() => {
-                    device.set_filters(*channel, &saved.filters)?;
-                    let (number, count) = (self.number(*channel), saved.filters.len());
-                    eprintln!("cantap: channel {number}: only what its {count} saved filters accept");
-                }
-                _ => {}
-            }
-        }
-        for Plan { channel, config, .. } in &plans {
-            device
-                .open_channel(*channel, Some(*config))
-                .with_context(|| format!("channel {}", self.number(*channel)))?;
-        }
-        Ok(plans.into_iter().map(|plan| (plan.channel, plan.config)).collect())
+        self.options().open(device, channels, mode, filters, &stderr::reporter())
     }
-
-    /// How channels would be opened, with `mode` unless the user requested another. Nothing is opened.
-    pub fn configs(
-        &self,
-        device: &OpenDevice,
-        channels: impl IntoIterator<Item = Channel>,
-        mode: Mode,
-    ) -> anyhow::Result<Vec<(Channel, ChannelConfig)>> {
-        let plans = self.plan(device, channels.into_iter(), Some(mode))?;
-        Ok(plans.into_iter().map(|plan| (plan.channel, plan.config)).collect())
-    }
-
-    /// Gives closed channels the requested configuration and filters, without opening them: what
-    /// [`Device::save_defaults`] stores. Anything not requested stays as it was saved before.
-    pub fn configure(
-        &self,
-        device: &OpenDevice,
-        channels: impl Iterator<Item = Channel>,
-        filters: &[Filter],
-    ) -> anyhow::Result<()> {
-        for Plan { channel, config, saved } in self.plan(device, channels, None)? {
-            let number = self.number(channel);
-            let kept = saved.filter(|_| filters.is_empty()).map(|saved| saved.filters).unwrap_or_default();
-            let filters = match hw_filter::compile(filters, channel) {
-                Compiled { remainder: Some(remainder), .. } => bail!(
-                    "channel {number}: {remainder}, which cannot be saved; give filters that the hardware knows"
-                ),
-                Compiled { hardware, .. } if !hardware.is_empty() => hardware,
-                Compiled { .. } => kept.to_vec(),
-            };
-            device.set_filters(channel, &filters).with_context(|| format!("channel {number}"))?;
-            device.configure(channel, config).with_context(|| format!("channel {number}"))?;
-        }
-        Ok(())
-    }
-
-    fn plan(
-        &self,
-        device: &OpenDevice,
-        channels: impl Iterator<Item = Channel>,
-        mode: Option<Mode>,
-    ) -> anyhow::Result<Vec<Plan>> {
-        // Other makers' adapters often have a single channel; who asks for that alone learns so when it is opened.
-        let is_there = |channel: &Channel| channel.number() <= device.hello().channels;
-        let (there, missing): (Vec<_>, Vec<_>) = channels.partition(is_there);
-        let used = if there.is_empty() { &missing } else { &there };
-        used.iter().map(|channel| self.plan_one(device, *channel, mode)).collect()
-    }
-
-    /// The requested configuration; without bit timing, the one saved on the device. The mode is the user's, otherwise `mode`,
-    /// otherwise the saved one.
-    fn plan_one(&self, device: &OpenDevice, channel: Channel, mode: Option<Mode>) -> anyhow::Result<Plan> {
-        let (base, saved) = match self.timing.request(channel)? {
-            Some(request) => {
-                (ChannelConfig::listen_only(request.resolve(device.hello().can_clock_hz)?), None)
-            }
-            None => match (device.defaults(channel)?, device.bitrate_of_bus(channel)) {
-                (Some(saved), _) => (saved.config, Some(saved)),
-                (None, Some(bitrate_bps)) => (ChannelConfig::listen_only(device.timing(bitrate_bps)?), None),
-                (None, None) => bail!(
-                    "no bit rate for channel {}: give one with -b RATE, find it with `cantap autobaud`, or save one \
-                     with `cantap defaults save`",
-                    self.number(channel)
-                ),
-            },
-        };
-        let config = ChannelConfig {
-            mode: self.mode().or(mode).unwrap_or(base.mode),
-            one_shot: base.one_shot || self.one_shot,
-            manual_recovery: self
-                .recovery
-                .map_or(base.manual_recovery, |recovery| recovery != RecoveryArg::Auto),
-            omit_data: base.omit_data || self.no_data,
-            omit_stamps: base.omit_stamps || self.no_stamps,
-            ..base
-        };
-        Ok(Plan { channel, config, saved })
-    }
-}
-
-/// A description of how a channel is open.
-pub fn description(config: &ChannelConfig, can_clock_hz: u32) -> String {
-    let mode = match config.mode {
-        Mode::ListenOnly => "listening only",
-        Mode::Normal => "taking part",
-        Mode::Loopback => "in loopback",
-        Mode::SilentLoopback => "in silent loopback",
-    };
-    format!("{} bit/s, {mode}", config.timing.bitrate_bps(can_clock_hz))
 }

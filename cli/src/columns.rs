@@ -6,7 +6,7 @@ use cantap::TraceRecord;
 use cantap_columns::FrameColumns;
 use cantap_columns::parquet::{Dataset, Key, ParquetError, ParquetFile, Table};
 
-use crate::wrong::wrong;
+use crate::usage_error::usage;
 
 /// Whether the name is that of a Parquet file.
 pub fn is_parquet(path: &Path) -> bool {
@@ -23,7 +23,7 @@ pub fn name_of(trace: &Path) -> &str {
 pub fn refuse_file(folder: &Path) -> anyhow::Result<()> {
     if folder.as_os_str() == "-" || is_parquet(folder) || folder.is_file() {
         let shown = folder.display();
-        return Err(wrong(format!(
+        return Err(usage(format!(
             "--partition makes a folder of files; {shown} is a file's name, give a folder's"
         )));
     }

@@ -120,7 +120,7 @@ fn offer_channel(current: &OsStr) -> Vec<CompletionCandidate> {
 }
 
 fn numbers() -> impl Iterator<Item = (String, String)> {
-    let devices = shells::words().iter().filter(|word| matches!(word.as_str(), "-d" | "--device")).count();
+    let devices = shells::line().iter().filter(|word| matches!(word.as_str(), "-d" | "--device")).count();
     (1..=CHANNELS * devices.max(1)).map(|number| (number.to_string(), format!("can{} in traces", number - 1)))
 }
 
@@ -152,7 +152,7 @@ fn is_database(path: &Path) -> bool {
 
 /// The databases named on the command line, otherwise the virtual vehicle's if it is used.
 fn loaded() -> Vec<Database> {
-    let words = shells::words();
+    let words = shells::line();
     let path = |word: &String| {
         let word = word.strip_prefix("--db=").unwrap_or(word);
         let behind_channel = word

@@ -8,11 +8,12 @@ use cantap::TraceRecord;
 use cantap_formats::{Format, LeftOut, ReadOptions, Zone, open_reader};
 use cantap_trace::filter::Filter;
 
-use crate::ahead::{Ahead, Step};
 use crate::completion;
-use crate::live::{LiveArgs, LiveRecords};
-use crate::missing::Missing;
+use crate::live_args::LiveArgs;
 use cantap_work::interrupt;
+use cantap_work::live::LiveRecords;
+use cantap_work::missing::Missing;
+use cantap_work::read_ahead::{ReadAhead, Step};
 
 /// How to read a trace; commands flatten this into their arguments.
 #[derive(clap::Args)]
@@ -80,7 +81,7 @@ pub struct Records {
 
 enum Source {
     /// A file, and whether it may grow.
-    File(Ahead, bool),
+    File(ReadAhead, bool),
     Device(LiveRecords),
 }
 
@@ -118,7 +119,7 @@ impl ReadArgs {
             reader.end_when(interrupt::requested);
         }
         let grows = follow || path.as_os_str() == "-";
-        Ok(self.records(Source::File(Ahead::new(reader), grows)))
+        Ok(self.records(Source::File(ReadAhead::new(reader), grows)))
     }
 
     fn records(&self, source: Source) -> Records {
@@ -209,7 +210,11 @@ impl Records {
 }
 
 /// The next records; reports faults on the way, and their number at the end.
-fn batch_of_file(reader: &mut Ahead, strict: bool, records: &mut Vec<TraceRecord>) -> anyhow::Result<bool> {
+fn batch_of_file(
+    reader: &mut ReadAhead,
+    strict: bool,
+    records: &mut Vec<TraceRecord>,
+) -> anyhow::Result<bool> {
     let nothing = loop {
         match reader.next(records)? {
             Step::Records => return Ok(true),
@@ -225,8 +230,8 @@ fn batch_of_file(reader: &mut Ahead, strict: bool, records: &mut Vec<TraceRecord
     for (what, count) in reader.notes().iter() {
         eprintln!("cantap: note: {what} ({count})");
     }
-    if let Some(words) = reader.missing().in_words() {
-        eprintln!("cantap: {words}");
+    if let Some(text) = reader.missing().description() {
+        eprintln!("cantap: {text}");
     }
     Ok(false)
 }

@@ -19,40 +19,30 @@ macro_rules! eprint {
     };
 }
 
-mod advice;
-mod ahead;
 mod args;
-mod beside;
-mod boards;
 mod channel_args;
-mod channel_bitrate;
 mod clock;
 #[cfg(feature = "parquet")]
 mod columns;
 mod commands;
 mod completion;
-mod databases;
+mod database_args;
 mod exit;
-mod hearing;
 mod input;
-mod live;
-mod missing;
-mod monitor;
+mod live_args;
+mod one_board;
+mod print_sent;
 mod progress;
 mod protocols;
-mod rescue;
-mod seconds;
-mod sending;
 mod shells;
-mod speaking;
+mod speak_args;
 mod stderr;
 mod timing_args;
 mod trace_output;
 mod trigger_args;
+mod usage_error;
 #[cfg(test)]
 mod vocabulary;
-mod words;
-mod wrong;
 
 use std::error::Error;
 use std::process::ExitCode;
@@ -86,12 +76,8 @@ fn main() -> ExitCode {
         // `cantap … | head` has read enough.
         Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("cantap: {}", advice::sentence(&error));
-            ExitCode::from(if is_wrong_command_line(&error) {
-                exit::WRONG_COMMAND_LINE
-            } else {
-                exit::FAILURE
-            })
+            eprintln!("cantap: {}", cantap_work::advice::sentence(&error));
+            ExitCode::from(if is_usage_error(&error) { exit::WRONG_COMMAND_LINE } else { exit::FAILURE })
         }
     }
 }
@@ -109,10 +95,18 @@ fn leave(error: &clap::Error) -> ! {
 
 /// Errors of the command line that are detected only later, such as those in a condition after the databases have been
 /// read.
-fn is_wrong_command_line(error: &anyhow::Error) -> bool {
-    error.is::<wrong::WrongCommandLine>()
+fn is_usage_error(error: &anyhow::Error) -> bool {
+    use cantap_work::timing_options::TimingOptionsError;
+
+    error.is::<usage_error::UsageError>()
         || error.is::<cantap_signals::condition::ConditionError>()
-        || advice::is_unknown_format(error)
+        || error.is::<cantap_work::channels::NoSuchChannel>()
+        || error.is::<cantap::periodic::BadPeriodic>()
+        || error.downcast_ref().is_some_and(cantap_work::boards::BoardsError::is_usage)
+        || error
+            .downcast_ref()
+            .is_some_and(|error: &TimingOptionsError| !matches!(error, TimingOptionsError::Timing(_)))
+        || cantap_work::advice::is_unknown_format(error)
 }
 
 /// Whether it only says that nobody reads our output any more.

@@ -25,7 +25,7 @@ pub fn script(shell: Shell) -> io::Result<Vec<u8>> {
 }
 
 /// The words of the command line for which a shell requests completions.
-pub fn words() -> Vec<String> {
+pub fn line() -> Vec<String> {
     let words = std::env::args_os().skip_while(|word| word != "--").skip(1).collect();
     let (words, _) = join(words, 0);
     words.into_iter().filter_map(|word| word.into_string().ok()).collect()

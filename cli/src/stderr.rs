@@ -4,6 +4,7 @@
 use std::io::{IsTerminal, Write};
 
 use cantap_trace::clean;
+use cantap_work::report::{Reporter, Severity};
 
 /// Whether it supports colours, and its reader wants them (<https://no-color.org>).
 pub fn is_coloured() -> bool {
@@ -35,4 +36,12 @@ fn write(text: &str) {
     crate::progress::aside(|| {
         let _ = std::io::stderr().write_all(text.as_bytes());
     });
+}
+
+/// Prints what the libraries report.
+pub fn reporter() -> Reporter {
+    Reporter::new(|severity, text| match severity {
+        Severity::Note => tell(&format!("cantap: {text}\n")),
+        Severity::Warning => warn(text),
+    })
 }

@@ -1,14 +1,12 @@
 //! How a user gives a bit timing: the options of every command that opens a channel.
 
-use cantap::Channel;
-use cantap::bit_timing::{self, TimingError, TimingRequest};
-use cantap::wire::{BitTiming, CHANNELS};
+use cantap::bit_timing::{self, TimingError};
+use cantap::wire::BitTiming;
+use cantap_work::advice;
+use cantap_work::channel_bitrate::ChannelBitrate;
+use cantap_work::timing_options::TimingOptions;
 
-use crate::advice;
-use crate::boards::place_of;
-use crate::channel_bitrate::ChannelBitrate;
 use crate::completion;
-use crate::wrong::wrong;
 
 /// A bit timing on the command line; commands flatten this into their arguments.
 #[derive(clap::Args, Clone, Debug, Default)]
@@ -16,9 +14,9 @@ pub struct TimingArgs {
     /// Bit rate in bit/s: 500000, 500k, 1M; with a channel before it (2:250k), only for that channel. Can be
     /// repeated.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", add = completion::bit_rates())]
-    pub bitrates: Vec<ChannelBitrate>,
+    bitrates: Vec<ChannelBitrate>,
     #[command(flatten)]
-    wishes: Wishes,
+    preferences: Preferences,
     /// The whole timing, in quanta: prescaler, PROP+PS1, PS2, jump width.
     #[arg(long, value_name = "BRP,SEG1,SEG2,SJW", value_parser = bit_timing::parse_segments,
           conflicts_with_all = ["bitrates", "sample_point", "sjw", "btr"])]
@@ -29,9 +27,9 @@ pub struct TimingArgs {
     btr: Option<BitTiming>,
 }
 
-/// Optional wishes for a timing besides its bit rate.
+/// What a timing should have besides its bit rate.
 #[derive(clap::Args, Clone, Debug, Default)]
-pub struct Wishes {
+pub struct Preferences {
     /// Sample point in per cent of the bit, instead of the one that CiA recommends.
     #[arg(long, value_name = "PCT", value_parser = percent)]
     pub sample_point: Option<f64>,
@@ -43,7 +41,7 @@ pub struct Wishes {
     triple: bool,
 }
 
-impl Wishes {
+impl Preferences {
     /// Refuses what no timing can have.
     pub fn check(&self) -> Result<(), TimingError> {
         if self.triple { Err(TimingError::TripleSampling) } else { Ok(()) }
@@ -51,67 +49,15 @@ impl Wishes {
 }
 
 impl TimingArgs {
-    /// Whether any timing was given.
-    pub fn is_given(&self) -> bool {
-        !self.bitrates.is_empty() || self.segments.is_some() || self.btr.is_some()
-    }
-
-    /// Whether anything was given, even if only a wish.
-    pub fn is_given_or_wished(&self) -> bool {
-        let Wishes { sample_point, sjw, triple } = &self.wishes;
-        self.is_given() || sample_point.is_some() || sjw.is_some() || *triple
-    }
-
-    /// Requests these bit rates instead of any other timing.
-    pub fn set_bit_rates(&mut self, rates: Vec<ChannelBitrate>) {
-        (self.segments, self.btr) = (None, None);
-        self.bitrates = rates;
-    }
-
-    /// Refuses bit rates of channels that this number of boards does not have.
-    pub fn check_channels(&self, boards: usize) -> anyhow::Result<()> {
-        let count = boards * CHANNELS;
-        let named = self.bitrates.iter().filter_map(|rate| rate.channel);
-        let Some(number) = named.into_iter().find(|number| usize::from(*number) > count) else {
-            return Ok(());
-        };
-        Err(wrong(if boards == 1 {
-            format!("a device has no channel {number}; give a bit rate for channel 1 or 2, as -b 2:250k")
-        } else {
-            format!(
-                "{boards} devices have no channel {number}; give a bit rate for channels 1 to {count}, as -b 2:250k"
-            )
-        }))
-    }
-
-    /// The part for one of several boards, counted from 0, whose channels have their own numbers there.
-    pub fn on_board(&self, board: usize) -> Self {
-        let own = |rate: &ChannelBitrate| match rate.channel.map(place_of) {
-            None => Some(*rate),
-            Some((place, channel)) if place == board => {
-                Some(ChannelBitrate { channel: Some(channel.number()), ..*rate })
-            }
-            Some(_) => None,
-        };
-        Self { bitrates: self.bitrates.iter().filter_map(own).collect(), ..self.clone() }
-    }
-
-    /// The request for a channel, if any.
-    pub fn request(&self, channel: Channel) -> anyhow::Result<Option<TimingRequest>> {
-        self.wishes.check()?;
-        self.check_channels(1)?;
-        if let Some(timing) = self.segments.or(self.btr) {
-            return Ok(Some(TimingRequest::Exact(timing)));
-        }
-        let Wishes { sample_point, sjw, .. } = self.wishes;
-        match ChannelBitrate::of(&self.bitrates, channel.number()) {
-            Some(bitrate_bps) => {
-                Ok(Some(TimingRequest::Rate { bitrate_bps, sample_point_percent: sample_point, sjw }))
-            }
-            None if sample_point.is_some() || sjw.is_some() => {
-                Err(wrong("a sample point or jump width needs a bit rate; add -b RATE"))
-            }
-            None => Ok(None),
+    /// The same without clap.
+    pub fn options(&self) -> TimingOptions {
+        let Preferences { sample_point, sjw, triple } = self.preferences;
+        TimingOptions {
+            bitrates: self.bitrates.clone(),
+            sample_point,
+            sjw,
+            triple,
+            exact: self.segments.or(self.btr),
         }
     }
 }
@@ -122,7 +68,7 @@ fn register(text: &str) -> Result<BitTiming, String> {
     let plain = digits.bytes().all(|digit| digit.is_ascii_hexdigit());
     let value = u32::from_str_radix(digits, 16).ok().filter(|_| plain);
     let value = value.ok_or("write the register in hexadecimal, such as 0x001C0008")?;
-    bit_timing::from_register(value).map_err(|error| advice::told(&error))
+    bit_timing::from_register(value).map_err(|error| advice::explained(&error))
 }
 
 fn percent(text: &str) -> Result<f64, String> {
@@ -136,6 +82,8 @@ fn percent(text: &str) -> Result<f64, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cantap::Channel;
+    use cantap::bit_timing::TimingRequest;
     use clap::Parser;
 
     #[derive(Parser)]
@@ -147,7 +95,7 @@ mod tests {
     fn timing(line: &str) -> Result<Option<BitTiming>, String> {
         let line = Line::try_parse_from(std::iter::once("x").chain(line.split_whitespace()))
             .map_err(|error| error.to_string())?;
-        let request = line.timing.request(Channel::Can1).map_err(|error| error.to_string())?;
+        let request = line.timing.options().request(Channel::Can1).map_err(|error| error.to_string())?;
         request.map(|request| request.resolve(36_000_000)).transpose().map_err(|error| error.to_string())
     }
 
@@ -165,18 +113,18 @@ mod tests {
     #[test]
     fn a_channel_may_have_a_bit_rate_of_its_own() {
         let line = Line::try_parse_from("x -b 500k -b 2:250k -b 1M".split(' ')).unwrap();
-        let rate = |channel| match line.timing.request(channel).unwrap() {
+        let rate = |channel| match line.timing.options().request(channel).unwrap() {
             Some(TimingRequest::Rate { bitrate_bps, .. }) => bitrate_bps,
             other => panic!("{other:?}"),
         };
         // As with any option given twice, the last one counts.
         assert_eq!((rate(Channel::Can1), rate(Channel::Can2)), (1_000_000, 250_000));
         let line = Line::try_parse_from("x -b 2:250k".split(' ')).unwrap();
-        assert_eq!(line.timing.request(Channel::Can1).unwrap(), None);
+        assert_eq!(line.timing.options().request(Channel::Can1).unwrap(), None);
     }
 
     #[test]
-    fn contradictions_and_impossible_wishes_are_refused() {
+    fn contradictions_and_impossible_timings_are_refused() {
         for line in [
             "-b 250k --segments 9,13,2,2",
             "--btr 1 --segments 9,13,2,2",

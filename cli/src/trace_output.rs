@@ -9,9 +9,9 @@ use cantap::TraceRecord;
 use cantap_columns::parquet::{Key, ParquetError};
 use cantap_formats::{Format, LeftOut, TraceWriter, WriteOptions, create_writer};
 
-use crate::beside::Beside;
 #[cfg(feature = "parquet")]
 use crate::columns::{self, FrameFiles};
+use cantap_work::atomic_file::AtomicFile;
 
 /// A trace being written. An older file with its name stays unchanged until this one is complete.
 pub struct TraceOutput {
@@ -22,7 +22,7 @@ pub struct TraceOutput {
 enum Sink {
     Trace {
         writer: Box<dyn TraceWriter>,
-        beside: Option<Beside>,
+        replacement: Option<AtomicFile>,
     },
     #[cfg(feature = "parquet")]
     Columns(Box<FrameFiles>),
@@ -38,10 +38,10 @@ impl TraceOutput {
         }
         let options = &named(options.clone(), path)?;
         let is_whole = options.rotation.at.is_empty() && !grows;
-        let beside = if is_whole { Beside::of(path) } else { None };
-        let written = beside.as_ref().map_or(path, |beside| &beside.temporary);
+        let replacement = if is_whole { AtomicFile::of(path) } else { None };
+        let written = replacement.as_ref().map_or(path, |file| &file.temporary);
         let writer = create_writer(written, options).with_context(|| failed(path))?;
-        Ok(Self { path: path.to_owned(), sink: Sink::Trace { writer, beside } })
+        Ok(Self { path: path.to_owned(), sink: Sink::Trace { writer, replacement } })
     }
 
     /// Begins a folder of Parquet files, each called `name`, in folders by these keys.
@@ -78,10 +78,10 @@ impl TraceOutput {
     /// ended properly, because its content may be nowhere else.
     pub fn give_up(self) -> anyhow::Result<()> {
         match self.sink {
-            Sink::Trace { writer, beside: None } => {
+            Sink::Trace { writer, replacement: None } => {
                 writer.finish().with_context(|| failed(&self.path))?;
             }
-            Sink::Trace { beside: Some(_), .. } => {
+            Sink::Trace { replacement: Some(_), .. } => {
                 eprintln!(
                     "cantap: {} was not written; the trace could not be read to its end",
                     shown(&self.path)
@@ -96,10 +96,10 @@ impl TraceOutput {
     /// Ends the file and puts it in its place. Reports what it could not carry, and returns that.
     pub fn finish(self) -> anyhow::Result<LeftOut> {
         let left_out = match self.sink {
-            Sink::Trace { writer, beside } => {
+            Sink::Trace { writer, replacement } => {
                 let left_out = writer.finish().with_context(|| failed(&self.path))?;
-                if let Some(beside) = beside {
-                    beside.put_in_place().with_context(|| failed(&self.path))?;
+                if let Some(file) = replacement {
+                    file.put_in_place().with_context(|| failed(&self.path))?;
                 }
                 left_out
             }

@@ -8,7 +8,7 @@ use cantap_signals::trigger::{Trigger, Window};
 
 use crate::args;
 use crate::completion;
-use crate::databases::DatabaseArgs;
+use crate::database_args::{DatabaseArgs, load};
 use crate::protocols;
 
 /// When to keep records; commands flatten this into their arguments.
@@ -38,7 +38,7 @@ impl TriggerArgs {
         devices: impl IntoIterator<Item = &'a Address>,
     ) -> anyhow::Result<Option<Trigger>> {
         let Some(text) = &self.trigger else { return Ok(None) };
-        let decoder = self.databases.or_of(devices).load(false, false)?;
+        let decoder = load(&self.databases.or_of(devices), false, false)?;
         let condition = protocols::condition(text, &decoder).context("--trigger")?;
         let nanoseconds = |time: Duration| i64::try_from(time.as_nanos()).unwrap_or(i64::MAX);
         let window =

@@ -16,8 +16,8 @@ use crate::args::duration;
 use crate::completion;
 use crate::exit;
 use crate::input::{ReadArgs, Records};
-use crate::missing::Missing;
 use crate::trace_output::TraceOutput;
+use cantap_work::missing::Missing;
 
 /// The command line.
 #[derive(clap::Args)]

@@ -9,8 +9,8 @@ use cantap::Channel;
 use cantap::autobaud::{self, Limits, Outcome, Progress};
 
 use crate::args;
-use crate::boards::OneBoard;
 use crate::completion;
+use crate::one_board::OneBoard;
 use crate::stderr;
 use cantap_work::interrupt;
 

@@ -23,12 +23,14 @@ use cantap_address::OpenDevice;
 use self::interface::CanPort;
 use self::lane::Lane;
 use self::sender::Sender;
-use crate::boards::OneBoard;
 use crate::channel_args::ChannelArgs;
-use crate::hearing::{self, Hearing};
-use crate::wrong::wrong;
-use crate::{advice, args, live, stderr};
+use crate::one_board::OneBoard;
+use crate::usage_error::usage;
+use crate::{args, stderr};
+use cantap_work::advice;
 use cantap_work::interrupt;
+use cantap_work::live;
+use cantap_work::reception::{self, Reception};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -69,11 +71,11 @@ fn places(interfaces: &[String]) -> anyhow::Result<Vec<(Channel, &str)>> {
     let mut places: Vec<(Channel, &str)> = Vec::new();
     for (text, usual) in interfaces.iter().zip(Channel::ALL) {
         let (channel, name) = match text.split_once(':') {
-            Some((channel, name)) => (args::channel(channel).map_err(wrong)?, name),
+            Some((channel, name)) => (args::channel(channel).map_err(usage)?, name),
             None => (usual, text.as_str()),
         };
         if places.iter().any(|(taken, other)| *taken == channel || *other == name) {
-            return Err(wrong(format!("'{text}' is given twice: one interface for each channel")));
+            return Err(usage(format!("'{text}' is given twice: one interface for each channel")));
         }
         places.push((channel, name));
     }
@@ -83,7 +85,7 @@ fn places(interfaces: &[String]) -> anyhow::Result<Vec<(Channel, &str)>> {
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let places = places(&args.interfaces)?;
-    args.open.timing.check_channels(1)?;
+    args.open.options().timing.check_channels(1)?;
     let address = args.board.address()?;
     let lanes = places.iter().map(|(channel, name)| {
         let (port, known) = CanPort::open(name)?;
@@ -98,9 +100,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         *connected.lock().unwrap_or_else(PoisonError::into_inner) = Arc::downgrade(&device);
         Ok(Handle(device))
     };
-    let open = args.open.clone();
+    let (open, reporter) = (args.open.options(), stderr::reporter());
     let setup = move |handle: &Handle| {
-        open.open(&handle.0, channels.iter().copied(), Mode::ListenOnly, Some(&[])).map(|_| ())
+        open.open(&handle.0, channels.iter().copied(), Mode::ListenOnly, Some(&[]), &reporter).map(|_| ())
     };
     let mut line: Reconnecting<Handle, anyhow::Error> =
         Reconnecting::new(&address.to_string(), connect, setup);
@@ -112,8 +114,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     for lane in lanes.iter() {
         eprintln!("cantap: {}", begun(lane, device().as_deref()));
     }
-    let mut bridge = Bridge { lanes: &lanes, hearing: Hearing::default(), address: address.to_string() };
-    let mut rescue = args.open.rescue();
+    let mut bridge = Bridge { lanes: &lanes, reception: Reception::default(), address: address.to_string() };
+    let mut recovery = args.open.bus_off_recovery();
     loop {
         if interrupt::requested() {
             sender.use_device(None);
@@ -137,11 +139,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             }
             Happening::Back(back) => {
                 sender.use_device(device());
-                eprintln!("cantap: {}", live::welcome(0, None, &back));
+                eprintln!("cantap: {}", live::return_text(0, None, &back));
             }
             Happening::Ended => break,
         }
-        match line.device().map(|device| rescue.look(device)) {
+        match line.device().map(|device| recovery.look(device)) {
             // The stream reports it.
             Some(Err(error)) if !error.is_of_the_connection() => return Err(error.into()),
             _ => {}
@@ -161,7 +163,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 /// The direction from the buses to programs.
 struct Bridge<'l> {
     lanes: &'l [Lane],
-    hearing: Hearing,
+    reception: Reception,
     address: String,
 }
 
@@ -171,9 +173,9 @@ impl Bridge<'_> {
             lane.hear(records).with_context(|| format!("the interface '{}' is gone", lane.name))?;
         }
         let now = Instant::now();
-        self.hearing.take(records, now);
-        for number in self.hearing.news(now) {
-            stderr::warn(&hearing::meaning(number, &self.address, number));
+        self.reception.take(records, now);
+        for number in self.reception.news(now) {
+            stderr::warn(&reception::errors_only_text(number, &self.address, number));
         }
         Ok(())
     }

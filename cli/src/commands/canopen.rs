@@ -16,9 +16,9 @@ use cantap_trace::grammar;
 
 use crate::args;
 use crate::protocols::SheetPath;
-use crate::speaking::SpeakArgs;
-use crate::words::counted;
-use crate::wrong::wrong;
+use crate::speak_args::SpeakArgs;
+use crate::usage_error::usage;
+use cantap_work::terms::counted;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -183,10 +183,10 @@ fn nmt(speak: &SpeakArgs, node: u8, command: Command, sheets: Vec<Sheet>) -> any
     let device = speak.open()?;
     let mut speaking = speak.speak(&device, Box::new(CanOpen::new(sheets)));
     speaking.run(&mut Broadcast::new([frame]))?;
-    let said = |event: &Event| {
+    let shown = |event: &Event| {
         matches!(event.kind, EventKind::Nmt | EventKind::BootUp | EventKind::State | EventKind::Emergency)
     };
-    speaking.tell(said)?;
+    speaking.show(shown)?;
     // Show the result, if nodes report their states.
     speaking.listen(OBEYS)?;
     let events = speaking.take_events();
@@ -196,7 +196,7 @@ fn nmt(speak: &SpeakArgs, node: u8, command: Command, sheets: Vec<Sheet>) -> any
             && (node == 0 || event.from.node() == Some(node))
     });
     speaking.put_back(events);
-    speaking.tell(said)?;
+    speaking.show(shown)?;
     if !is_heard {
         let state = state_name(becomes).unwrap_or_default();
         eprintln!(
@@ -220,11 +220,11 @@ fn monitor(speak: &SpeakArgs, time: Option<Duration>, sheets: Vec<Sheet>) -> any
             break;
         }
         speaking.listen(left.unwrap_or(Duration::MAX).min(Duration::from_millis(50)))?;
-        speaking.tell(|_| true)?;
+        speaking.show(|_| true)?;
     }
     // A silent bus is not a failure, but it is said; errors alone are one.
     let deaf = speaking.judge();
-    if deaf.is_ok() && !speaking.has_heard() {
+    if deaf.is_ok() && !speaking.has_received() {
         let seconds = started.elapsed().as_secs_f64();
         eprintln!("cantap: no frame was heard in {seconds:.1} s; check the bit rate and that the bus is on");
     }
@@ -241,7 +241,7 @@ fn were(frames: u64) -> String {
 
 fn repeat(speak: &SpeakArgs, frame: Frame, cyclic: &Cyclic) -> anyhow::Result<()> {
     if cyclic.period < cantap::periodic::SHORTEST_PERIOD {
-        return Err(wrong(format!(
+        return Err(usage(format!(
             "a period is at least {} us",
             cantap::periodic::SHORTEST_PERIOD.as_micros()
         )));
@@ -250,7 +250,7 @@ fn repeat(speak: &SpeakArgs, frame: Frame, cyclic: &Cyclic) -> anyhow::Result<()
     let mut speaking = speak.speak(&device, Box::new(CanOpen::new(Vec::new())));
     let (sent, verdict) = speaking.repeat(frame, cyclic.period, cyclic.count, cyclic.time)?;
     let own = |event: &Event| matches!(event.kind, EventKind::Sync | EventKind::State);
-    speaking.tell(own)?;
+    speaking.show(own)?;
     eprintln!("cantap: {} sent", were(sent));
     drop(speaking);
     device.stop()?;

@@ -17,14 +17,16 @@ use self::sink::Sink;
 use self::summary::{ChannelSummary, Summary, TriggerSummary};
 use super::convert::WriteArgs;
 use crate::args;
-use crate::boards::Boards;
 use crate::channel_args::ChannelArgs;
 use crate::completion;
-use crate::live::LiveRecords;
 use crate::progress::Progress;
+use crate::stderr;
 use crate::trace_output::refuse_older;
 use crate::trigger_args::TriggerArgs;
-use crate::wrong::wrong;
+use crate::usage_error::usage;
+use cantap_work::boards::Boards;
+use cantap_work::channels::Channels;
+use cantap_work::live::LiveRecords;
 use cantap_work::{Meter, lost_frames};
 
 /// The command line.
@@ -50,7 +52,7 @@ pub struct Args {
     devices: Vec<Address>,
     /// Which channels: 1, 2, several as 1,3, or both, which means all.
     #[arg(short, long, default_value = "both", value_parser = args::channels, add = completion::channels())]
-    channel: args::Channels,
+    channel: Channels,
     #[command(flatten)]
     open: ChannelArgs,
     /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j. In hardware as far as it can, where 123:7FF counts
@@ -90,7 +92,7 @@ const FLUSH_EVERY: Duration = Duration::from_millis(200);
 
 /// Whether a channel to be opened has no bit rate.
 fn needs_bit_rate(args: &Args, board: usize, boards: &Boards) -> anyhow::Result<bool> {
-    let timing = args.open.timing.on_board(board);
+    let timing = args.open.options().timing.on_board(board);
     for channel in boards.channels_of(board) {
         if timing.request(channel)?.is_none() {
             return Ok(true);
@@ -102,18 +104,19 @@ fn needs_bit_rate(args: &Args, board: usize, boards: &Boards) -> anyhow::Result<
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let boards = Boards::new(&args.devices, &args.channel)?;
-    args.open.timing.check_channels(boards.addresses().len())?;
+    args.open.options().timing.check_channels(boards.addresses().len())?;
     for (board, address) in boards.addresses().iter().enumerate() {
         // A virtual device without settings has no bit rate saved.
         if !address.may_have_saved() && !address.is_car() && needs_bit_rate(args, board, &boards)? {
-            return Err(wrong(
+            return Err(usage(
                 "give the bus's bit rate with -b, such as -b 500k, for each channel that -c names",
             ));
         }
     }
     refuse_output(args)?;
     let trigger = args.trigger.trigger(boards.addresses())?;
-    let mut live = LiveRecords::open(&boards, &args.open, &args.filter, args.time)?;
+    let mut live =
+        LiveRecords::open(&boards, &args.open.options(), &args.filter, args.time, &stderr::reporter())?;
     live.give_up_after(args.give_up_after.or(args.frames.map(|_| GIVE_UP_AFTER)));
     // The requested time starts here.
     let started = Instant::now();
@@ -211,8 +214,9 @@ fn write_all(
     sink: &mut Sink,
     meters: &mut Meters,
 ) -> anyhow::Result<()> {
-    let mut rescues: Vec<_> =
-        (0..live.addresses().len()).map(|board| args.open.on_board(board).rescue()).collect();
+    let mut recoveries: Vec<_> = (0..live.addresses().len())
+        .map(|board| args.open.options().on_board(board).bus_off_recovery(&stderr::reporter()))
+        .collect();
     let mut flushed = Instant::now();
     let mut view = View::of(args);
     let mut batch = Vec::new();
@@ -236,7 +240,7 @@ fn write_all(
             view.show(meters);
         }
         for (board, device) in live.lines().devices() {
-            match rescues[board].look(device) {
+            match recoveries[board].look(device) {
                 // The stream reports it.
                 Err(error) if error.is_of_the_connection() => {}
                 looked => looked?,

@@ -4,7 +4,7 @@ use std::io::Write;
 use std::process::ExitCode;
 
 use crate::args;
-use crate::boards::OneBoard;
+use crate::one_board::OneBoard;
 
 /// The command line of `cantap identify`.
 #[derive(clap::Args)]

@@ -14,10 +14,10 @@ use cantap_protocols::{Options, Protocol};
 pub use self::line::write;
 use self::lines::Lines;
 use self::summary::Summary;
-use crate::databases::DatabaseArgs;
+use crate::database_args::{DatabaseArgs, load};
 use crate::input::FollowArgs;
-use crate::live::LiveArgs;
-use crate::protocols::{ProtocolArgs, Reading};
+use crate::live_args::LiveArgs;
+use crate::protocols::{self, ProtocolArgs};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -65,11 +65,11 @@ pub struct Args {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let databases = args.databases.or_of(args.live.devices());
     let decoder = (!databases.is_empty())
-        .then(|| databases.load(args.read.strict, args.quiet))
+        .then(|| load(&databases, args.read.strict, args.quiet))
         .transpose()?
         .map(Arc::new);
     let options = Options { protocols: args.protocols.clone(), ..args.help.options(args.quiet)? };
-    let mut reading = Reading::new(options, decoder, args.quiet);
+    let mut reading = protocols::reading(options, decoder, args.quiet);
     let mut records = args.read.open_either(args.input.as_ref(), &args.live)?;
     let mut lines = Lines::new(args.json)?;
     let mut summary = Summary::default();

@@ -16,9 +16,9 @@ use crate::args;
 use crate::columns;
 use crate::completion;
 use crate::input::{FollowArgs, ReadArgs};
-use crate::missing::by_kind;
 use crate::trace_output::{TraceOutput, named};
 use cantap_work::interrupt;
+use cantap_work::missing::by_kind;
 
 /// The command line.
 #[derive(clap::Args)]

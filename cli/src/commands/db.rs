@@ -12,7 +12,7 @@ use serde_json::json;
 
 use crate::completion;
 use crate::input::ReadArgs;
-use crate::words::counted;
+use cantap_work::terms::counted;
 
 /// The command line.
 #[derive(clap::Args)]

@@ -5,9 +5,9 @@ mod columns;
 mod command_line;
 mod csv;
 mod decoded;
+mod events;
 mod json;
 mod output;
-mod said;
 mod text;
 mod wide;
 
@@ -24,9 +24,10 @@ use cantap_signals::{Decoder, NotDecoded, SignalValue};
 
 use self::decoded::Decoded;
 use self::output::{Form, Output};
+use crate::database_args::load_selected;
 use crate::input::Records;
-use crate::protocols::Reading;
-use crate::wrong::wrong;
+use crate::protocols::reading;
+use crate::usage_error::usage;
 
 /// The figures in the summary.
 #[derive(Default, serde::Serialize)]
@@ -54,11 +55,11 @@ const fn is_zero(count: &u64) -> bool {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let databases = args.databases.or_of(args.live.devices());
     if databases.is_empty() && !args.protocols {
-        return Err(wrong(
+        return Err(usage(
             "no database to decode by; give one with --db FILE (.dbc, .kcd, .sym, .arxml or .toml), or --protocols",
         ));
     }
-    let decoder = databases.load_some(args.read.strict, args.quiet, &args.signals)?;
+    let decoder = load_selected(&databases, args.read.strict, args.quiet, &args.signals)?;
     let form = Form::of(args)?;
     let mut records = args.read.open_either(args.input.as_ref(), &args.live)?;
     let mut output = Output::open(args, form, &decoder)?;
@@ -103,7 +104,7 @@ fn decode(
     let mut batch = Vec::new();
     let mut reading = if args.protocols {
         let decoder = (!args.databases.is_empty()).then(|| Arc::new(decoder.clone()));
-        Some(Reading::new(args.protocol.options(args.quiet)?, decoder, args.quiet))
+        Some(reading(args.protocol.options(args.quiet)?, decoder, args.quiet))
     } else {
         None
     };
@@ -119,7 +120,7 @@ fn decode(
                 ReadItem::Record(record) => one(args, decoder, record, &mut values, &mut count, output),
                 ReadItem::Event(event) => {
                     count.events += 1;
-                    output.push_said(&event)
+                    output.push_protocol_event(&event)
                 }
                 ReadItem::Announcement(_) => Ok(()),
             })?,

@@ -8,10 +8,12 @@ use cantap::wire::message::{Defaults, FrameKind};
 use cantap_trace::filter::Filter;
 use serde_json::{Value, json};
 
+use cantap_work::channels::Channels;
+
 use crate::args;
-use crate::boards::OneBoard;
 use crate::channel_args::ChannelArgs;
 use crate::completion;
+use crate::one_board::OneBoard;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -42,7 +44,7 @@ struct Save {
     device: OneBoard,
     /// Which channels: 1, 2 or both. The other one keeps what is stored for it.
     #[arg(short, long, default_value = "both", value_parser = args::channels_of_one, add = completion::channels())]
-    channel: args::Channels,
+    channel: Channels,
     #[command(flatten)]
     open: ChannelArgs,
     /// Hardware filters, in candump's syntax.
@@ -71,7 +73,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     match &args.action {
         Action::Save(save) => {
             let device = save.device.open()?;
-            save.open.configure(&device, save.channel.iter(), &save.filter)?;
+            save.open.options().configure(&device, save.channel.iter(), &save.filter)?;
             device.save_defaults()?;
             writeln!(out, "saved on the device")?;
         }

@@ -12,8 +12,8 @@ use serde_json::{Value, json};
 use self::protocols::Protocols;
 use crate::exit;
 use crate::input::ReadArgs;
-use crate::missing::Missing;
 use crate::protocols::{Known, ProtocolArgs};
+use cantap_work::missing::Missing;
 
 /// The command line.
 #[derive(clap::Args)]

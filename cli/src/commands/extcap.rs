@@ -24,7 +24,7 @@ use self::bit_rates::BitRate;
 use self::capture::Wanted;
 use self::toolbar::Toolbar;
 use crate::completion;
-use crate::wrong::wrong;
+use crate::usage_error::usage;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -141,7 +141,7 @@ pub fn run(args: Args) -> anyhow::Result<ExitCode> {
         return say(&sentences::interfaces(&places::all()));
     }
     let Some(interface) = &args.extcap_interface else {
-        return Err(wrong(
+        return Err(usage(
             "Wireshark calls this; `cantap extcap install` has it do so, and `tshark -D` shows the interfaces then",
         ));
     };
@@ -159,7 +159,7 @@ pub fn run(args: Args) -> anyhow::Result<ExitCode> {
         if args.extcap_capture_filter.is_some() {
             return Ok(ExitCode::SUCCESS);
         }
-        return Err(wrong(
+        return Err(usage(
             "say what to do with the interface: --capture --fifo PIPE, --extcap-config or --extcap-dlts",
         ));
     }

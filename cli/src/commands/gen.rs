@@ -13,13 +13,14 @@ use cantap::{Channel, Frame, Id, bits_on_bus};
 use serde_json::{Value, json};
 
 use crate::args;
-use crate::boards::OneBoard;
 use crate::channel_args::ChannelArgs;
 use crate::completion;
-use crate::sending::Sending;
-use crate::wrong::wrong;
+use crate::one_board::OneBoard;
+use crate::print_sent::print_sent;
+use crate::usage_error::usage;
 use cantap_work::interrupt;
 use cantap_work::rounded;
+use cantap_work::sending::Sending;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -288,7 +289,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     if matches!(args.length, Some(Values::Fixed(9..))) && !args.raw_dlc {
         let reason = "a frame carries 0 to 8 bytes; -8 allows lengths up to 15, which say eight";
-        return Err(wrong(reason));
+        return Err(usage(reason));
     }
     interrupt::watch()?;
     let device = args.device.open()?;
@@ -300,7 +301,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // A trace in which all frames end at the same time, separated by the gap.
     let pace = Pace { shortest_gap: gap, burst: args.burst, ignore_times: gap.is_zero(), ..Pace::default() };
     let mut replay = Replay::new(&device, pace, bitrates_bps)?;
-    let mut sending = Sending::new(&device, args.open.rescue(), !args.verbose);
+    let mut sending = Sending::new(&device, args.open.bus_off_recovery(), args.verbose.then(print_sent));
     let mut generator = Generator { args, random: fastrand::Rng::with_seed(args.seed), count: 0 };
     let mut filled = Filled::new(bitrates_bps);
     let started = Instant::now();

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 use std::io::Write as _;
 use std::process::ExitCode;
 
-use crate::wrong::wrong;
+use crate::usage_error::usage;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -126,7 +126,7 @@ pub fn run(args: &Args, line: &clap::Command) -> anyhow::Result<ExitCode> {
         command = match command.find_subcommand(word) {
             Some(command) => command,
             None => {
-                return Err(wrong(format!(
+                return Err(usage(format!(
                     "'{word}' is no command of {below} and no topic; `cantap help` lists both"
                 )));
             }

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use cantap::wire::message::capability;
 use cantap_adapters::Row;
 
-use crate::boards::OneBoard;
+use crate::one_board::OneBoard;
 
 use crate::clock;
 

@@ -11,9 +11,10 @@ use cantap_trace::grammar;
 
 use super::uds::hex::{self, Hex};
 use crate::args;
-use crate::databases::DatabaseArgs;
-use crate::speaking::{SpeakArgs, Speaking};
-use crate::wrong::wrong;
+use crate::database_args::DatabaseArgs;
+use crate::speak_args::SpeakArgs;
+use crate::usage_error::usage;
+use cantap_work::speaking::Speaking;
 
 /// The group of address claims.
 const CLAIM: u32 = 0xEE00;
@@ -142,7 +143,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         What::Dm1 { to } => StationJob::Request { pgn: DM1, to: *to },
         What::Send { pgn, data, to, priority } => {
             if *to != GLOBAL && pgn >> 8 & 0xFF >= 240 {
-                return Err(wrong(format!("the group {pgn} goes to all; omit --to")));
+                return Err(usage(format!("the group {pgn} goes to all; omit --to")));
             }
             StationJob::Send { pgn: *pgn, to: *to, priority: *priority, data: data.0.clone() }
         }
@@ -165,7 +166,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         What::Request { pgn, to } => is_answer(event, *pgn, *to, own),
         What::Dm1 { to } => is_answer(event, DM1, *to, own),
     };
-    speaking.tell(shown)?;
+    speaking.show(shown)?;
     let imposters = station.imposters();
     let ended = finish(&speaking, station.finish(), args);
     if imposters > 0 {

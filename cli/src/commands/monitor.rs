@@ -12,22 +12,23 @@ use cantap_address::{Address, AddressError};
 use cantap_formats::WriteOptions;
 use cantap_trace::filter::Filter;
 
-use crate::boards::Boards;
+use cantap_tui::{
+    App, Model, Once, Order, Origin, Plan, Profile, SendEntry, Theme, View, once, orders, parse_entry,
+    run as show, svg, text,
+};
+use cantap_work::atomic_file;
+use cantap_work::boards::Boards;
+use cantap_work::channel_bitrate::ChannelBitrate;
+use cantap_work::channel_options::ChannelOptions;
+use cantap_work::channels::Channels;
+use cantap_work::databases::{Databases, LoadReport};
+
+use crate::args;
 use crate::channel_args::ChannelArgs;
-use crate::channel_bitrate::ChannelBitrate;
 use crate::completion;
-use crate::databases::{DatabaseArgs, Databases, Said};
-use crate::monitor::app::{App, SendEntry, View, parse_entry};
-use crate::monitor::model::Model;
-use crate::monitor::order::Order;
-use crate::monitor::plan::Plan;
-use crate::monitor::profile::Profile;
-use crate::monitor::source::Origin;
-use crate::monitor::theme::Theme;
-use crate::monitor::{Once, once, orders, picture, run as show, text};
+use crate::database_args::DatabaseArgs;
 use crate::trace_output::{named, refuse_older};
-use crate::wrong::wrong;
-use crate::{args, beside};
+use crate::usage_error::usage;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -47,7 +48,7 @@ pub struct Args {
     devices: Vec<Address>,
     /// Which channels: 1, 2, several as 1,3, or both, which means all. Default: those whose bit rate is given; all if none is.
     #[arg(short, long, value_parser = args::channels, add = completion::channels())]
-    channel: Option<args::Channels>,
+    channel: Option<Channels>,
     #[command(flatten)]
     open: ChannelArgs,
     /// Take part in the bus: acknowledge, and send on request. Otherwise listen only. The same as --mode normal.
@@ -109,39 +110,39 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let (file, devices) = args.source()?;
     refuse_recording(args)?;
     // Faults in profile and databases are shown, and the view opens without them; with --once they are errors.
-    let mut said = Said::default();
-    let profile = load_profile(args.profile.as_deref(), &mut said);
-    let databases = load_databases(args, &devices, &profile, &mut said);
-    let decoder = databases.decoder_saying(&mut said);
-    let open = channel_args(args, &profile, &mut said);
+    let mut report = LoadReport::default();
+    let profile = load_profile(args.profile.as_deref(), &mut report);
+    let databases = load_databases(args, &devices, &profile, &mut report);
+    let decoder = databases.decoder_reporting(&mut report);
+    let open = channel_options(args, &profile, &mut report);
     let options = ChannelBitrate::options(&open.timing.bitrates);
     let mut model = Model::new(Arc::new(decoder), options, args.history as usize * 1_000_000)?;
-    let filters = filters(args, &profile, &mut said);
+    let filters = filters(args, &profile, &mut report);
     model.history.set_filters(filters, None);
     for name in &profile.graph {
         if let Err(error) = model.seen.signals.choose(name) {
-            said.faults.push(format!("graph: {error}"));
+            report.faults.push(format!("graph: {error}"));
         }
     }
     let name = file.as_deref().and_then(Path::file_name).map(|name| name.to_string_lossy().into_owned());
     let (origin, plan) = if let Some(path) = file {
         (Origin::File(path), None)
     } else {
-        let plan = plan(args, devices, &profile, open, &mut said)?;
+        let plan = plan(args, devices, &profile, open, &mut report)?;
         (Origin::Device(plan.clone()), Some(plan))
     };
     let theme = Theme::from_environment(args.light || profile.light);
     let (sender, receiver) = orders();
     let mut app = App::new(args.view.or(profile.view).unwrap_or(View::Fixed), theme, plan, sender);
     app.sort = profile.sort.unwrap_or(app.sort);
-    app.send = send_list(&profile, &model, &mut said);
+    app.send = send_list(&profile, &model, &mut report);
     app.databases = databases;
     app.file = name;
     let record = profile.record.as_ref().map(|path| profile.folder.join(path));
     if let Some(path) = args.output.clone().or(record) {
         app.orders.send(Order::Record(path))?;
     }
-    let Said { faults, remarks } = said;
+    let LoadReport { faults, remarks } = report;
     if args.once {
         if !faults.is_empty() {
             bail!("{}", faults.join("\ncantap: "));
@@ -152,7 +153,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         let Once { screen, nothing_read } = once(origin, app, model, receiver, args.size, args.time)?;
         match &args.svg {
             None => std::io::stdout().lock().write_all(text(&screen).as_bytes())?,
-            Some(path) => beside::write(path, picture::svg(&screen).as_bytes())
+            Some(path) => atomic_file::write(path, svg(&screen).as_bytes())
                 .with_context(|| format!("cannot write {}", path.display()))?,
         }
         if let Some(first) = nothing_read {
@@ -160,7 +161,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         }
     } else {
         model.notice = [faults, remarks].concat().join("; ");
-        show(origin, app, model, receiver)?;
+        for notice in show(origin, app, model, receiver)? {
+            eprintln!("cantap: {notice}");
+        }
     }
     Ok(ExitCode::SUCCESS)
 }
@@ -172,11 +175,11 @@ impl Args {
             return Ok((None, self.devices.clone()));
         };
         if Address::is_meant_by(path) {
-            let address = path.to_str().unwrap_or_default().parse().map_err(wrong_address)?;
+            let address = path.to_str().unwrap_or_default().parse().map_err(address_usage)?;
             return Ok((None, vec![address]));
         }
         if self.channel.is_some() {
-            return Err(wrong(
+            return Err(usage(
                 "-c chooses a device's channels; of a trace's, -f can0,0:0 shows channel 1 alone",
             ));
         }
@@ -185,8 +188,8 @@ impl Args {
 }
 
 #[expect(clippy::needless_pass_by_value, reason = "for map_err")]
-fn wrong_address(error: AddressError) -> anyhow::Error {
-    wrong(error.to_string())
+fn address_usage(error: AddressError) -> anyhow::Error {
+    usage(error.to_string())
 }
 
 /// Refuses a recording that cannot be made as requested. Its name may be followed by a condition: `FILE if
@@ -200,49 +203,49 @@ fn refuse_recording(args: &Args) -> anyhow::Result<()> {
     refuse_older(path, args.force)
 }
 
-fn load_profile(path: Option<&Path>, said: &mut Said) -> Profile {
+fn load_profile(path: Option<&Path>, report: &mut LoadReport) -> Profile {
     let loaded = path.map(Profile::load).transpose();
     loaded
         .unwrap_or_else(|complaint| {
-            said.faults.push(complaint);
+            report.faults.push(complaint);
             None
         })
         .unwrap_or_default()
 }
 
-fn load_databases(args: &Args, devices: &[Address], profile: &Profile, said: &mut Said) -> Databases {
+fn load_databases(args: &Args, devices: &[Address], profile: &Profile, report: &mut LoadReport) -> Databases {
     let own = if args.databases.is_empty() { profile.databases.as_slice() } else { &[] };
-    let given = if own.is_empty() { args.databases.or_of(devices) } else { args.databases.clone() };
-    let mut databases = given.to_begin_with(said);
+    let given = if own.is_empty() { args.databases.or_of(devices) } else { args.databases.options() };
+    let mut databases = given.load_available(report);
     for text in own {
-        databases.add(text, &profile.folder, said);
+        databases.add(text, &profile.folder, report);
     }
     databases
 }
 
 /// How to open channels: the profile supplies what the command line leaves open.
-fn channel_args(args: &Args, profile: &Profile, said: &mut Said) -> ChannelArgs {
-    let mut open = args.open.clone();
+fn channel_options(args: &Args, profile: &Profile, report: &mut LoadReport) -> ChannelOptions {
+    let mut open = args.open.options();
     if !open.timing.is_given() {
         for text in &profile.bitrates {
             match text.parse() {
                 Ok(rate) => open.timing.bitrates.push(rate),
-                Err(reason) => said.faults.push(format!("bit rate {text}: {reason}")),
+                Err(reason) => report.faults.push(format!("bit rate {text}: {reason}")),
             }
         }
     }
-    if open.mode().is_none() && (args.normal || profile.normal) {
-        open.set_mode(Mode::Normal);
+    if open.mode.is_none() && (args.normal || profile.normal) {
+        open.mode = Some(Mode::Normal);
     }
     open
 }
 
-fn filters(args: &Args, profile: &Profile, said: &mut Said) -> Vec<Filter> {
+fn filters(args: &Args, profile: &Profile, report: &mut LoadReport) -> Vec<Filter> {
     let mut filters = args.filter.clone();
     for text in if args.filter.is_empty() { profile.filters.as_slice() } else { &[] } {
         match text.parse() {
             Ok(filter) => filters.push(filter),
-            Err(error) => said.faults.push(format!("filter {text}: {error}")),
+            Err(error) => report.faults.push(format!("filter {text}: {error}")),
         }
     }
     filters
@@ -252,8 +255,8 @@ fn plan(
     args: &Args,
     mut addresses: Vec<Address>,
     profile: &Profile,
-    open: ChannelArgs,
-    said: &mut Said,
+    open: ChannelOptions,
+    report: &mut LoadReport,
 ) -> anyhow::Result<Plan> {
     let own = if addresses.is_empty() {
         profile.device.iter().chain(&profile.devices).cloned().collect()
@@ -263,13 +266,13 @@ fn plan(
     for text in own {
         match text.parse() {
             Ok(address) => addresses.push(address),
-            Err(error) => said.faults.push(format!("device {text}: {error}")),
+            Err(error) => report.faults.push(format!("device {text}: {error}")),
         }
     }
-    if addresses.is_empty() && !said.faults.is_empty() {
+    if addresses.is_empty() && !report.faults.is_empty() {
         addresses.push(Address::of_virtual_device());
     }
-    let all = args::Channels::all();
+    let all = Channels::all();
     let boards = Boards::new(&addresses, args.channel.as_ref().unwrap_or(&all))?;
     open.timing.check_channels(boards.addresses().len())?;
     let mut plan = Plan { addresses: boards.addresses().to_vec(), channels: Vec::new(), open };
@@ -280,12 +283,12 @@ fn plan(
     Ok(plan)
 }
 
-fn send_list(profile: &Profile, model: &Model, said: &mut Said) -> Vec<SendEntry> {
+fn send_list(profile: &Profile, model: &Model, report: &mut LoadReport) -> Vec<SendEntry> {
     let mut entries = Vec::new();
     for text in &profile.send {
         match parse_entry(text, model) {
             Ok(entry) => entries.push(entry),
-            Err(reason) => said.faults.push(format!("to send, {text}: {reason}")),
+            Err(reason) => report.faults.push(format!("to send, {text}: {reason}")),
         }
     }
     entries

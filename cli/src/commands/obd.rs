@@ -11,11 +11,11 @@ use cantap_protocols::diagnostics::{Diagnostics, parameter_name};
 use cantap_protocols::iso_tp::{Endpoint, Pair};
 use cantap_protocols::{Event, EventKind};
 
-use super::uds::{Client, TransferArgs};
-use crate::args;
-use crate::speaking::SpeakArgs;
-use crate::wrong::wrong;
+use crate::speak_args::SpeakArgs;
+use crate::usage_error::usage;
+use crate::{args, stderr};
 use cantap_work::interrupt;
+use cantap_work::uds::{Client, TransferOptions};
 
 /// Bits of a list of supported parameters.
 const LIST: u8 = 0x20;
@@ -83,20 +83,23 @@ struct Server {
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if matches!(args.what, Some(What::Clear { yes: false })) {
-        return Err(wrong(
+        return Err(usage(
             "clearing erases what the workshop needs to find the fault, and readiness tests start over; to go ahead, add --yes",
         ));
     }
     let device = args.speak.open()?;
     let speaking = args.speak.speak(&device, Box::new(Diagnostics::new(&[], false)));
-    let mut vehicle =
-        Vehicle { client: Client::new(speaking, transfer(false, args.p2)), p2: args.p2, servers: Vec::new() };
+    let mut vehicle = Vehicle {
+        client: Client::new(speaking, transfer(false, args.p2), stderr::reporter()),
+        p2: args.p2,
+        servers: Vec::new(),
+    };
     vehicle.find()?;
     match &args.what {
         None => vehicle.everything()?,
         Some(What::Supported) => {
             vehicle.lists()?;
-            vehicle.client.tell_if(|event| args.speak.json && is_answer(event))?;
+            vehicle.client.show_if(|event| args.speak.json && is_answer(event))?;
             if !args.speak.json {
                 vehicle.show_lists()?;
             }
@@ -106,7 +109,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         Some(What::Vin) => vehicle.identification()?,
         Some(What::Clear { .. }) => {
             let answers = vehicle.client.ask_whoever(&[0x04], None)?;
-            vehicle.client.tell_if(is_answer)?;
+            vehicle.client.show_if(is_answer)?;
             vehicle.client.all_agreed()?;
             if answers.is_empty() {
                 bail!(
@@ -121,14 +124,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 }
 
 /// How to address all ECUs.
-fn transfer(extended: bool, p2: Duration) -> TransferArgs {
+fn transfer(extended: bool, p2: Duration) -> TransferOptions {
     let endpoint = |id| Endpoint { id, address: None };
     let (a, b) = if extended {
         (Id::extended_truncated(0x18DA_10F1), Id::extended_truncated(0x18DA_F110))
     } else {
         (Id::standard_truncated(0x7E0), Id::standard_truncated(0x7E8))
     };
-    TransferArgs::of_obd(Pair { a: endpoint(a), b: endpoint(b) }, p2, true)
+    TransferOptions::of_obd(Pair { a: endpoint(a), b: endpoint(b) }, p2, true)
 }
 
 /// Whether it is an answer, or a broken one.
@@ -260,7 +263,7 @@ impl Vehicle<'_> {
             if answers > 0 {
                 answered.push(*pid);
             }
-            self.client.tell_if(is_answer)?;
+            self.client.show_if(is_answer)?;
             if answers < servers {
                 eprintln!("cantap: {pid:02X}: {answers} of {servers} ECUs answered");
             }
@@ -272,7 +275,7 @@ impl Vehicle<'_> {
         let mut any = false;
         for service in [0x03, 0x07, 0x0A] {
             let answers = self.client.ask_whoever(&[service], Some(self.servers.len()))?;
-            self.client.tell_if(|event| {
+            self.client.show_if(|event| {
                 is_answer(event)
                     && event.field("sid").is_some_and(|sid| sid.value.as_number() == Some(f64::from(service)))
             })?;
@@ -293,7 +296,7 @@ impl Vehicle<'_> {
         for kind in [0x02, 0x0A, 0x04] {
             any |= !self.client.ask_whoever(&[0x09, kind], None)?.is_empty();
         }
-        self.client.tell_if(|event| {
+        self.client.show_if(|event| {
             is_answer(event) && event.field("sid").is_some_and(|sid| sid.value.as_number() == Some(9.0))
         })?;
         if !any {

@@ -15,14 +15,15 @@ use cantap_analysis::stats::Options;
 use cantap_formats::time_range::{TimePoint, TimeRange, date_text};
 use cantap_trace::grammar;
 
-use crate::channel_bitrate::ChannelBitrate;
+use crate::args;
 use crate::completion;
-use crate::databases::DatabaseArgs;
+use crate::database_args::{DatabaseArgs, load_selected};
 use crate::input::ReadArgs;
-use crate::missing::Missing;
 use crate::trace_output::failed;
-use crate::wrong::wrong;
-use crate::{args, beside};
+use crate::usage_error::usage;
+use cantap_work::atomic_file;
+use cantap_work::channel_bitrate::ChannelBitrate;
+use cantap_work::missing::Missing;
 use serde_json::json;
 
 /// The command line.
@@ -95,7 +96,7 @@ pub struct Args {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // A wrong name should not be discovered after an hour of reading.
     if let Some(path) = &args.output {
-        PictureFormat::of_path(path).map_err(|error| wrong(error.to_string()))?;
+        PictureFormat::of_path(path).map_err(|error| usage(error.to_string()))?;
     }
     let (mut plot, read) = collect(args)?;
     for pane in &mut plot.panes {
@@ -106,7 +107,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     match &args.output {
         Some(path) => {
             let picture = plot.render(PictureFormat::of_path(path)?, args.width.unwrap_or(DEFAULT_WIDTH))?;
-            beside::write(path, &picture).with_context(|| failed(path))?;
+            atomic_file::write(path, &picture).with_context(|| failed(path))?;
         }
         None => std::io::stdout().lock().write_all(plot.to_text(&terminal_style(args)).as_bytes())?,
     }
@@ -138,7 +139,7 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
     let title = |what: &str| args.title.clone().unwrap_or_else(|| format!("{name}: {what}"));
     if args.bus_load {
         if args.read.hides_frames() {
-            return Err(wrong(
+            return Err(usage(
                 "a filter hides part of the bus's load; leave -f out, or give only a channel, as -f can0",
             ));
         }
@@ -179,11 +180,11 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
         return Ok((plot, read));
     }
     if args.databases.is_empty() {
-        return Err(wrong(
+        return Err(usage(
             "no database to find signals in; give one with --db FILE, or ask for --bus-load or --timing ID",
         ));
     }
-    let decoder = args.databases.load_some(args.read.strict, args.quiet, &args.signals)?;
+    let decoder = load_selected(&args.databases.options(), args.read.strict, args.quiet, &args.signals)?;
     let mut collector = SignalCollector::new(&decoder).with_most_curves(args.curves);
     let mut read = for_each(args, |record| collector.push(record))?;
     if collector.is_empty() {
@@ -246,7 +247,7 @@ fn terminal_style(args: &Args) -> TextStyle {
     TextStyle {
         width: width.unwrap_or(TextStyle::default().width),
         colour: is_terminal && std::env::var_os("NO_COLOR").is_none(),
-        unicode: crate::args::is_utf8_locale(),
+        unicode: cantap_work::locale::is_utf8_locale(),
         ..TextStyle::default()
     }
 }

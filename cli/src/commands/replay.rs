@@ -12,15 +12,16 @@ use cantap::wire::message::{ChannelConfig, Mode};
 use cantap::{Channel, Device, TraceEvent, TraceFrame};
 
 use crate::args;
-use crate::boards::OneBoard;
 use crate::channel_args::ChannelArgs;
 use crate::input::FollowArgs;
-use crate::missing::Missing;
-use crate::sending::Sending;
-use crate::wrong::wrong;
+use crate::one_board::OneBoard;
+use crate::print_sent::print_sent;
+use crate::usage_error::usage;
 use cantap_trace::grammar;
 use cantap_work::interrupt;
+use cantap_work::missing::Missing;
 use cantap_work::rounded;
+use cantap_work::sending::Sending;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -150,8 +151,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let device = args.device.open()?;
     let mut bitrates_bps = [0; CHANNELS];
-    let mut buses =
-        Buses { device: &device, closed: args.open.configs(&device, source.channels(), Mode::Normal)? };
+    let mut buses = Buses {
+        device: &device,
+        closed: args.open.options().configs(&device, source.channels(), Mode::Normal)?,
+    };
     for (channel, config) in &buses.closed {
         bitrates_bps[channel.index()] = config.timing.bitrate_bps(device.hello().can_clock_hz);
     }
@@ -166,7 +169,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         ignore_times: args.ignore_times,
     };
     let mut replay = Replay::new(&device, pace, bitrates_bps)?;
-    let mut sending = Sending::new(&device, args.open.rescue(), !args.verbose);
+    let mut sending = Sending::new(&device, args.open.bus_off_recovery(), args.verbose.then(print_sent));
     let started = Instant::now();
     let Played { asked, left_out, fd_left_out, missing } =
         args.play(&source, &mut replay, &mut sending, &mut buses)?;
@@ -266,7 +269,7 @@ impl Args {
             (Some(from), first) => {
                 // With -I, the first word is a mapping too.
                 if let Some(word) = first {
-                    mapping.insert(0, self::mapping(&word.to_string_lossy()).map_err(wrong)?);
+                    mapping.insert(0, self::mapping(&word.to_string_lossy()).map_err(usage)?);
                 }
                 from.clone()
             }
@@ -279,7 +282,7 @@ impl Args {
             .find(|(at, (_, from))| mapping[..*at].iter().any(|(_, earlier)| earlier == from));
         if let Some((_, (_, from))) = repeated {
             let interface = from - 1;
-            return Err(wrong(format!(
+            return Err(usage(format!(
                 "can{interface} is mapped twice, and each frame is sent once; give one TO=can{interface}"
             )));
         }

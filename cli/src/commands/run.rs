@@ -19,11 +19,11 @@ use serde_json::{Value, json};
 
 use crate::args;
 use crate::channel_args::ChannelArgs;
-use crate::channel_bitrate::ChannelBitrate;
 use crate::completion;
-use crate::databases::DatabaseArgs;
+use crate::database_args::{DatabaseArgs, load};
 use crate::trace_output::{TraceOutput, refuse_older};
-use crate::wrong::wrong;
+use crate::usage_error::usage;
+use cantap_work::channel_bitrate::ChannelBitrate;
 
 /// How long a simulated run takes if nothing else ends it.
 const SIMULATED: Duration = Duration::from_secs(60);
@@ -82,7 +82,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let scripts: Vec<Script> = args.scripts.iter().map(|path| read(path)).collect::<anyhow::Result<_>>()?;
     let given: Vec<&Address> = args.device.iter().collect();
     let databases = args.databases.or_of(given);
-    let decoder = Arc::new(databases.load(false, args.json)?);
+    let decoder = Arc::new(load(&databases, false, args.json)?);
     if let Some(path) = &args.output {
         refuse_older(path, args.force)?;
     }
@@ -133,19 +133,19 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 
 impl Args {
     fn bench(&self, decoder: Arc<cantap_signals::Decoder>) -> anyhow::Result<Bench> {
-        let rates = &self.open.timing.bitrates;
-        let bitrates_bps = [1, 2].map(|channel| ChannelBitrate::of(rates, channel).unwrap_or(SIMULATED_BPS));
+        let rates = self.open.options().timing.bitrates;
+        let bitrates_bps = [1, 2].map(|channel| ChannelBitrate::of(&rates, channel).unwrap_or(SIMULATED_BPS));
         let duration_ns = self.duration.unwrap_or(SIMULATED).as_nanos();
         let duration_ns = u64::try_from(duration_ns)
             .ok()
             .filter(|duration_ns| i64::try_from(*duration_ns).is_ok())
-            .ok_or_else(|| wrong("--for is longer than the 292 years that times can hold"))?;
+            .ok_or_else(|| usage("--for is longer than the 292 years that times can hold"))?;
         Ok(Bench { options: self.bus.clone(), bitrates_bps, decoder, seed: self.seed, duration_ns })
     }
 
     /// The channels to open: those with a bit rate of their own; with one for all, or none, the first.
     fn channels(&self, device: &cantap_address::OpenDevice) -> anyhow::Result<Vec<Channel>> {
-        let rates = &self.open.timing.bitrates;
+        let rates = self.open.options().timing.bitrates;
         let own: Vec<Channel> = Channel::ALL
             .into_iter()
             .filter(|channel| rates.iter().any(|rate| rate.channel == Some(channel.number())))
@@ -158,7 +158,7 @@ impl Args {
 fn read(path: &Path) -> anyhow::Result<Script> {
     let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
     let source = String::from_utf8(bytes)
-        .map_err(|_| wrong(format!("{} is no script: it is not text in UTF-8", path.display())))?;
+        .map_err(|_| usage(format!("{} is no script: it is not text in UTF-8", path.display())))?;
     Ok(Script { name: path.display().to_string(), source })
 }
 

@@ -15,16 +15,16 @@ use cantap_trace::Interface;
 
 use super::decode;
 use crate::completion;
-use crate::databases::DatabaseArgs;
+use crate::database_args::{DatabaseArgs, load};
 use crate::exit;
 use crate::input::{FollowArgs, Records};
-use crate::live::LiveArgs;
-use crate::missing::Missing;
+use crate::live_args::LiveArgs;
 use crate::protocols::{self, ProtocolArgs};
-use crate::seconds::Seconds;
 use crate::trace_output::TraceOutput;
-use crate::words::failure_text;
-use crate::wrong::wrong;
+use crate::usage_error::usage;
+use cantap_trace::Seconds;
+use cantap_work::missing::Missing;
+use cantap_work::terms::failure_text;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -100,13 +100,13 @@ const MAX_CONTEXT: usize = 1_000_000;
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let databases = args.databases.or_of(args.live.devices());
-    let decoder = databases.load(args.read.strict, args.quiet)?;
+    let decoder = load(&databases, args.read.strict, args.quiet)?;
     let text = args.condition.as_ref().or(args.positional.as_ref());
     let helps = args.protocol.options(args.quiet)?;
     let condition = text.map(|text| cantap_protocols::condition(text, &decoder, &helps)).transpose();
     let condition = condition.context("condition")?;
     if condition.is_none() && args.ids.is_empty() && args.data.is_empty() {
-        return Err(wrong(
+        return Err(usage(
             "nothing to look for; give --id, --data or a condition (see cantap search --help)",
         ));
     }
@@ -116,7 +116,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut search = search;
     let found = find(args, &mut records, &mut search, &mut sink)?;
     if let Some(condition) = search.condition.as_ref().filter(|_| !args.quiet) {
-        protocols::tell_unheard(condition);
+        protocols::report_unmatched(condition);
     }
     sink.finish(found, &records.missing())?;
     if args.count {

@@ -17,8 +17,9 @@ use cantap::{Channel, Device};
 use cantap_address::{Address, OpenDevice};
 
 use self::report::{Lines, Outcome, Report};
-use crate::boards::OneBoard;
-use crate::{args, beside, exit};
+use crate::one_board::OneBoard;
+use crate::{args, exit};
+use cantap_work::atomic_file;
 use cantap_work::interrupt;
 
 /// The command line.
@@ -69,7 +70,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     restart(args, &address, device, &serial, &mut report);
     report.finish();
     if let Some(path) = &args.report {
-        beside::write(path, report.text()?.as_bytes())
+        atomic_file::write(path, report.text()?.as_bytes())
             .with_context(|| format!("'{}' cannot be written; choose another place", path.display()))?;
     }
     if args.json {

@@ -18,14 +18,15 @@ use modifiers::Modifiers;
 use replies::{Counts, Replies};
 
 use crate::args;
-use crate::boards::OneBoard;
 use crate::channel_args::ChannelArgs;
 use crate::completion;
-use crate::databases::DatabaseArgs;
-use crate::sending::{LOOK_EVERY, Sending};
-use crate::wrong::wrong;
+use crate::database_args::{DatabaseArgs, load};
+use crate::one_board::OneBoard;
+use crate::print_sent::print_sent;
+use crate::usage_error::usage;
 use cantap_work::interrupt;
 use cantap_work::rounded;
+use cantap_work::sending::{LOOK_EVERY, Sending};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -95,13 +96,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
     let device = args.device.open()?;
     args.open.open(&device, [args.channel].into_iter(), Mode::Normal, None)?;
-    let quiet = args.quiet || args.json;
+    let on_sent = (!args.quiet && !args.json).then(print_sent);
     let started = Instant::now();
     let mut replies = None;
     let mut sending = if triggers.is_some() {
-        Sending::fed(&device, args.open.rescue(), quiet)
+        Sending::fed(&device, args.open.bus_off_recovery(), on_sent)
     } else {
-        Sending::new(&device, args.open.rescue(), quiet)
+        Sending::new(&device, args.open.bus_off_recovery(), on_sent)
     };
     let outcome = match (triggers, periodic) {
         (Some(triggers), _) => {
@@ -120,7 +121,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         }
         (None, Some((period, modifiers))) => {
             let period_ticks = periodic::period_ticks(period, device.hello().tick_hz)
-                .map_err(|error| wrong(error.to_string()))?;
+                .map_err(|error| usage(error.to_string()))?;
             let slots = device.hello().periodic_slots;
             if frames.len() > usize::from(slots) {
                 bail!("the device keeps {slots} periodic frames and these are {}; give fewer", frames.len());
@@ -171,13 +172,13 @@ impl Args {
         // No frame contains a colon, and every message with values does.
         let is_message = |text: &String| text.contains(':') && !text.contains('#');
         let device = self.device.given().filter(|_| self.frames.iter().any(is_message));
-        let database = self.databases.or_of(device).load(false, self.quiet)?;
+        let database = load(&self.databases.or_of(device), false, self.quiet)?;
         let frame = |text: &String| {
             if is_message(text) {
                 Ok(cantap_signals::encode::encode(&database, Some(self.channel.number()), text)?.frame)
             } else {
                 let frame = grammar::frame(text);
-                Ok(frame.map_err(|error| wrong(format!("'{text}' is not a frame: {error}")))?)
+                Ok(frame.map_err(|error| usage(format!("'{text}' is not a frame: {error}")))?)
             }
         };
         let frames = self.frames.iter().map(frame).collect::<anyhow::Result<_>>()?;
@@ -188,11 +189,11 @@ impl Args {
     fn periodic(&self, frames: &[Frame]) -> anyhow::Result<Option<(Duration, Modifiers)>> {
         let Some(period) = self.period else { return Ok(None) };
         if period < SHORTEST_PERIOD {
-            return Err(wrong(BadPeriodic::TooShort { period }.to_string()));
+            return Err(usage(BadPeriodic::TooShort { period }.to_string()));
         }
         let modifiers = self.modifiers.list()?;
         for frame in frames {
-            periodic::check_modifiers(frame, &modifiers).map_err(|error| wrong(error.to_string()))?;
+            periodic::check_modifiers(frame, &modifiers).map_err(|error| usage(error.to_string()))?;
         }
         Ok(Some((period, modifiers)))
     }
@@ -210,10 +211,10 @@ impl Args {
         }
         let Some(text) = &self.on_rx else { return Ok(None) };
         let filters = {
-            let filter = text.parse::<Filter>().map_err(|error| wrong(error.to_string()))?;
+            let filter = text.parse::<Filter>().map_err(|error| usage(error.to_string()))?;
             let compiled = hw_filter::compile(&[filter], self.channel);
             if let Some(remainder) = compiled.remainder {
-                return Err(wrong(format!(
+                return Err(usage(format!(
                     "'{text}' cannot start a reply: {remainder}, which is too late for it"
                 )));
             }

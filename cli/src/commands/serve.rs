@@ -1,12 +1,13 @@
 //! `cantap serve`: a device for many programs at once, on this machine or on others.
 
+mod doors;
 #[cfg(feature = "tls")]
 mod keys;
 
 use std::io::{self, Read, Write};
-use std::net::{Ipv4Addr, SocketAddr};
-#[cfg(unix)]
-use std::path::Path;
+#[cfg(not(unix))]
+use std::net::Ipv4Addr;
+use std::net::SocketAddr;
 #[cfg(any(unix, feature = "tls"))]
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -17,20 +18,24 @@ use anyhow::{Context, bail};
 use cantap::Channel;
 use cantap::device::{channel_number, pipe, write_patiently};
 use cantap::wire::CHANNELS;
-use cantap_address::server::{PORT, role};
+use cantap_address::server::PORT;
 use cantap_address::{Address, LinkError};
 use cantap_serve::listen::{self, Listening};
 #[cfg(unix)]
 use cantap_serve::socket_file::{self, SocketError};
 use cantap_serve::{Board, BoardError, News, Role, Settings, connect, lines, socketcand};
 
-use crate::args::{self, Channels};
-use crate::boards::Boards;
-use crate::channel_bitrate::ChannelBitrate;
+#[cfg(unix)]
+use self::doors::numbered;
+use self::doors::{Allowed, Door, address, allow, allowed, loopback};
+use crate::args;
 use crate::stderr;
-use crate::timing_args::TimingArgs;
-use crate::wrong::wrong;
+use crate::usage_error::usage;
+use cantap_work::boards::Boards;
+use cantap_work::channel_bitrate::ChannelBitrate;
+use cantap_work::channels::Channels;
 use cantap_work::interrupt;
+use cantap_work::timing_options::TimingOptions;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -122,45 +127,6 @@ fn dead_man(text: &str) -> Result<DeadMan, String> {
     args::positive_duration(text).map(|after| DeadMan(Some(after)))
 }
 
-/// A way in.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Door {
-    Unix,
-    Tcp,
-    Socketcand,
-    Stdio,
-}
-
-/// What `--allow` allows, everywhere or at one door.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Allowed {
-    door: Option<Door>,
-    role: Role,
-}
-
-fn allowed(text: &str) -> Result<Allowed, String> {
-    let Some((door, text)) = text.split_once(':') else {
-        return Ok(Allowed { door: None, role: role(text)? });
-    };
-    let door = match door {
-        "unix" => Door::Unix,
-        "tcp" => Door::Tcp,
-        "socketcand" => Door::Socketcand,
-        _ => return Err("a listener is unix, tcp or socketcand".to_owned()),
-    };
-    Ok(Allowed { door: Some(door), role: role(text)? })
-}
-
-/// The maximum role at a door; the last one given applies. Whoever reaches socketcand's port is not asked who it is, so what is allowed
-/// everywhere is not allowed there.
-fn allow(all: &[Allowed], door: Door) -> Role {
-    let of = |door: Option<Door>| {
-        all.iter().rev().find(|allowed| allowed.door == door).map(|allowed| allowed.role)
-    };
-    let everywhere = if door == Door::Socketcand { None } else { of(None) };
-    of(Some(door)).or(everywhere).unwrap_or(Role::Listen)
-}
-
 /// How often to check whether to end.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
 /// The default port of `--lines`.
@@ -177,9 +143,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let addresses = Boards::new(&args.devices, &Channels::all())?;
     let addresses = addresses.addresses();
     if args.stdio && addresses.len() > 1 {
-        return Err(wrong("--stdio serves one device; omit the others"));
+        return Err(usage("--stdio serves one device; omit the others"));
     }
-    let mut timing = TimingArgs::default();
+    let mut timing = TimingOptions::default();
     timing.set_bit_rates(args.bitrates.clone());
     timing.check_channels(addresses.len())?;
     let way = Way::of(args)?;
@@ -189,7 +155,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         Way::Encrypted(_) => address(text, PORT),
     });
     let tcp = tcp.transpose()?;
-    let beside = Beside {
+    let other_doors = OtherDoors {
         socketcand: args.socketcand.as_deref().map(|text| address(text, socketcand::PORT)).transpose()?,
         lines: args.lines.as_deref().map(|text| loopback(text, LINES_PORT)).transpose()?,
     };
@@ -204,7 +170,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.stdio {
         return serve_stdio(&boards[0], allow(&args.allowed, Door::Stdio));
     }
-    let listening = listen(args, tcp.map(|tcp| (tcp, way)).as_ref(), &beside, &boards)?;
+    let listening = listen(args, tcp.map(|tcp| (tcp, way)).as_ref(), &other_doors, &boards)?;
     while !interrupt::requested() {
         std::thread::sleep(LOOK_EVERY);
     }
@@ -272,42 +238,11 @@ fn check_bitrates(args: &Args, number: usize, board: &Board) -> anyhow::Result<(
     }
 }
 
-/// An address, a port of this computer, or both.
-fn address(text: &str, port: u16) -> anyhow::Result<SocketAddr> {
-    let not_one = || wrong(format!("'{text}' is not an address to listen at; write it as 127.0.0.1:{port}"));
-    let address: SocketAddr = match text.parse() {
-        Ok(address) => address,
-        Err(_) => match (text.parse(), text.parse()) {
-            (Ok(ip), _) => SocketAddr::new(ip, port),
-            (_, Ok(port)) => SocketAddr::from((Ipv4Addr::LOCALHOST, port)),
-            _ => return Err(not_one()),
-        },
-    };
-    if address.ip().is_unspecified() {
-        return Err(wrong(format!(
-            "at {address} everybody on every network could use the device; name one address of this computer"
-        )));
-    }
-    Ok(address)
-}
-
-/// An address that can only be reached from this computer.
-fn loopback(text: &str, port: u16) -> anyhow::Result<SocketAddr> {
-    let address = address(text, port)?;
-    if !address.ip().is_loopback() {
-        return Err(wrong(format!(
-            "at {address} everybody on the network could use the device; let clients come by ssh (-d ssh://HOST/…), or \
-             give --tls and --clients (`cantap serve keygen` makes the keys)"
-        )));
-    }
-    Ok(address)
-}
-
 /// Opens every listener and prints it.
 fn listen(
     args: &Args,
     tcp: Option<&(SocketAddr, Way)>,
-    beside: &Beside,
+    other_doors: &OtherDoors,
     boards: &[Arc<Board>],
 ) -> anyhow::Result<Vec<Listening>> {
     let mut ways = Vec::new();
@@ -355,7 +290,7 @@ fn listen(
         }
         said.push((board.name(), names, roles));
     }
-    let other = beside.listen(&args.allowed, boards)?;
+    let other = other_doors.listen(&args.allowed, boards)?;
     let mut out = io::stdout().lock();
     for (_, names, _) in &said {
         for name in names {
@@ -423,12 +358,12 @@ impl Way {
 }
 
 /// Listeners for other programs, each for all boards.
-struct Beside {
+struct OtherDoors {
     socketcand: Option<SocketAddr>,
     lines: Option<SocketAddr>,
 }
 
-impl Beside {
+impl OtherDoors {
     /// Opens them. Returns their names.
     fn listen(&self, all: &[Allowed], boards: &[Arc<Board>]) -> anyhow::Result<Vec<(String, Listening)>> {
         let mut ways = Vec::new();
@@ -462,17 +397,6 @@ impl Beside {
     }
 }
 
-/// The path for a further device.
-#[cfg(unix)]
-fn numbered(path: &Path, number: usize) -> PathBuf {
-    if number == 0 {
-        return path.to_owned();
-    }
-    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
-    let suffix = path.extension().map_or_else(String::new, |suffix| format!(".{}", suffix.to_string_lossy()));
-    path.with_file_name(format!("{stem}-{}{suffix}", number + 1))
-}
-
 /// Serves the client at the other end of standard input and output until that is closed.
 fn serve_stdio(board: &Board, role: Role) -> anyhow::Result<ExitCode> {
     let (input, mut to_input) = pipe(STDIN_BYTES);
@@ -495,44 +419,4 @@ fn serve_stdio(board: &Board, role: Role) -> anyhow::Result<ExitCode> {
         std::thread::sleep(LOOK_EVERY);
     }
     Ok(ExitCode::SUCCESS)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn only_addresses_of_this_computer_are_listened_at() {
-        let at = |text: &str| loopback(text, PORT).map(|address| address.to_string());
-        assert_eq!(at("127.0.0.1").unwrap(), format!("127.0.0.1:{PORT}"));
-        assert_eq!(at("5000").unwrap(), "127.0.0.1:5000");
-        assert_eq!(at("[::1]:5000").unwrap(), "[::1]:5000");
-        for wrong in ["0.0.0.0", "192.168.0.1:5000", "[::]:1", "car", ""] {
-            assert!(loopback(wrong, PORT).is_err(), "{wrong}");
-        }
-    }
-
-    #[test]
-    fn what_is_allowed_everywhere_is_not_allowed_to_socketcand() {
-        let roles = |texts: &[&str]| {
-            let all: Vec<Allowed> = texts.iter().map(|text| allowed(text).unwrap()).collect();
-            [Door::Unix, Door::Tcp, Door::Socketcand, Door::Stdio].map(|door| allow(&all, door))
-        };
-        let (listen, send) = (Role::Listen, Role::Send);
-        assert_eq!(roles(&[]), [listen; 4]);
-        assert_eq!(roles(&["send"]), [send, send, listen, send]);
-        assert_eq!(roles(&["socketcand:send"]), [listen, listen, send, listen]);
-        assert_eq!(roles(&["send", "tcp:configure"]), [send, Role::Configure, listen, send]);
-        for text in ["all", "udp:send", "unix:", ":send"] {
-            assert!(allowed(text).is_err(), "{text}");
-        }
-    }
-
-    #[cfg(unix)]
-    #[test]
-    fn a_further_device_has_a_number_in_its_path() {
-        assert_eq!(numbered(Path::new("/run/cantap.sock"), 0), Path::new("/run/cantap.sock"));
-        assert_eq!(numbered(Path::new("/run/cantap.sock"), 1), Path::new("/run/cantap-2.sock"));
-        assert_eq!(numbered(Path::new("x"), 2), Path::new("x-3"));
-    }
 }

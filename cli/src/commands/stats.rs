@@ -15,11 +15,12 @@ use cantap_analysis::stats::{Options, Statistics, Summary};
 
 use self::windows::Windows;
 use crate::args;
-use crate::channel_bitrate::ChannelBitrate;
 use crate::completion;
 use crate::input::FollowArgs;
-use crate::missing::{Missing, by_kind};
 use crate::protocols::{Known, ProtocolArgs};
+use cantap_work::channel_bitrate::ChannelBitrate;
+use cantap_work::channels::Channels;
+use cantap_work::missing::{Missing, by_kind};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -56,7 +57,7 @@ pub struct Args {
     data_bitrates: Vec<ChannelBitrate>,
     /// The device's channels to listen to: 1, 2, several as 1,3, or both, which means all.
     #[arg(short, long, default_value = "both", value_parser = args::channels, add = completion::channels())]
-    channel: args::Channels,
+    channel: Channels,
     /// How long to listen.
     #[arg(short = 't', long, value_name = "TIME", conflicts_with = "input", value_parser = args::positive_duration)]
     time: Option<Duration>,

@@ -9,11 +9,12 @@ use cantap::wire::message::{ChannelStatus, Failures, Hello, Mode, RegisterSet, S
 use cantap_trace::BusErrorKind;
 use serde_json::{Value, json};
 
-use crate::boards::OneBoard;
 use crate::channel_args::ChannelArgs;
 use crate::completion;
-use crate::wrong::wrong;
+use crate::one_board::OneBoard;
+use crate::usage_error::usage;
 use crate::{args, clock};
+use cantap_work::channels::Channels;
 use cantap_work::interrupt;
 
 /// The command line.
@@ -35,7 +36,7 @@ pub struct Args {
     time: Option<Duration>,
     /// Which channels --time opens: 1, 2 or both.
     #[arg(short, long, default_value = "both", requires = "time", value_parser = args::channels_of_one, add = completion::channels())]
-    channel: args::Channels,
+    channel: Channels,
     #[command(flatten)]
     open: ChannelArgs,
     /// Also the controllers' registers, now and at the last error.
@@ -51,8 +52,8 @@ const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    if args.time.is_none() && args.open.is_given() {
-        return Err(wrong(
+    if args.time.is_none() && args.open.options().is_given() {
+        return Err(usage(
             "without --time no channel is opened, so these options have no effect; add --time to listen for a while before asking",
         ));
     }
@@ -60,11 +61,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let device = args.device.open()?;
     if let Some(time) = args.time {
         args.open.open(&device, args.channel.iter(), Mode::ListenOnly, Some(&[]))?;
-        let mut rescue = args.open.rescue();
+        let mut recovery = args.open.bus_off_recovery();
         let ends = Instant::now() + time;
         while Instant::now() < ends && !interrupt::requested() {
             std::thread::sleep(LOOK_EVERY.min(ends.saturating_duration_since(Instant::now())));
-            rescue.look(&device)?;
+            recovery.look(&device)?;
         }
     }
     let status = device.status()?;
@@ -103,7 +104,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         status.queue_high_water_bytes
     )?;
     writeln!(out, "bad requests {}", status.bad_requests)?;
-    writeln!(out, "failures     {}", in_words(&failures))?;
+    writeln!(out, "failures     {}", failures_text(&failures))?;
     for (channel, state) in Channel::ALL.into_iter().zip(&status.channels) {
         let open = state.open.map_or("closed".to_owned(), |config| {
             let bitrate = config.timing.bitrate_bps(device.hello().can_clock_hz);
@@ -137,7 +138,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 }
 
 /// How often the firmware has failed since power-on, and the last reason.
-fn in_words(failures: &Failures) -> String {
+fn failures_text(failures: &Failures) -> String {
     match failures.count {
         0 => "none since power-on".to_owned(),
         1 => format!("1 since power-on: {}", failures.last),
@@ -218,7 +219,7 @@ mod tests {
             (2, format!("2 since power-on, the last: {last}")),
         ] {
             let last = if count > 0 { last } else { "" };
-            assert_eq!(in_words(&Failures { count, last: last.try_into().unwrap() }), words);
+            assert_eq!(failures_text(&Failures { count, last: last.try_into().unwrap() }), words);
         }
     }
 }

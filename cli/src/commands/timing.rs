@@ -7,7 +7,7 @@ use cantap::bit_timing::{self, Assessment, LINE_DELAY_NS_PER_M, NODE_DELAY_NS, T
 
 use crate::args;
 use crate::completion;
-use crate::timing_args::Wishes;
+use crate::timing_args::Preferences;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -25,7 +25,7 @@ pub struct Args {
     #[arg(long, value_name = "HZ", default_value = "36M", value_parser = clock)]
     clock: u32,
     #[command(flatten)]
-    wishes: Wishes,
+    preferences: Preferences,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
@@ -43,9 +43,10 @@ fn clock(text: &str) -> Result<u32, String> {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    args.wishes.check()?;
-    let (bitrate_bps, sjw) = (args.bitrate, args.wishes.sjw);
-    let request = TimingRequest::Rate { bitrate_bps, sample_point_percent: args.wishes.sample_point, sjw };
+    args.preferences.check()?;
+    let (bitrate_bps, sjw) = (args.bitrate, args.preferences.sjw);
+    let request =
+        TimingRequest::Rate { bitrate_bps, sample_point_percent: args.preferences.sample_point, sjw };
     let chosen = Assessment::of(&request.resolve(args.clock)?, args.clock);
     let all = bit_timing::all(args.clock, bitrate_bps, sjw);
     let mut out = std::io::stdout().lock();

@@ -1,21 +1,22 @@
 //! `cantap uds`: queries an ECU.
 
-mod client;
 pub mod hex;
 mod key;
+mod transfer_args;
 
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use cantap_protocols::diagnostics::Diagnostics;
 
-pub use self::client::{Client, TransferArgs};
 use self::hex::{Hex, byte, bytes, number, word};
 use self::key::KeyArgs;
-use crate::args;
-use crate::speaking::SpeakArgs;
-use crate::wrong::wrong;
+pub use self::transfer_args::TransferArgs;
+use crate::speak_args::SpeakArgs;
+use crate::usage_error::usage;
+use crate::{args, stderr};
 use cantap_work::interrupt;
+use cantap_work::uds::Client;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -141,24 +142,24 @@ fn session(text: &str) -> Result<u8, String> {
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let requests = args.requests()?;
-    let pair = args.transfer.pair();
+    let options = args.transfer.options();
     let device = args.speak.open()?;
-    let witness = || Box::new(Diagnostics::new(&[pair.into()], false));
+    let witness = || Box::new(Diagnostics::new(&[options.pair.into()], false));
     let speaking = args.speak.speak(&device, witness());
-    let mut client = Client::new(speaking, args.transfer);
+    let mut client = Client::new(speaking, options, stderr::reporter());
     if let Some(session) = args.session {
         client.ask(&[0x10, session])?;
-        client.tell()?;
+        client.show()?;
         client.all_agreed()?;
     }
     args.key.unlock(&mut client)?;
-    client.tell()?;
+    client.show()?;
     if let What::TesterPresent { period: Some(period), count, time } = args.what {
         stay(&mut client, period, count, time)?;
     } else {
         for request in &requests {
             let asked = client.ask(request);
-            client.tell()?;
+            client.show()?;
             asked?;
         }
         client.all_agreed()?;
@@ -179,13 +180,13 @@ fn stay(
     let mut said = 0;
     loop {
         // A refusal comes within P2; the next period begins in time all the same.
-        let told = client.tell_only(&[0x3E, 0x80], REFUSAL.min(period / 2));
-        client.tell()?;
+        let asked = client.request_only(&[0x3E, 0x80], REFUSAL.min(period / 2));
+        client.show()?;
         // Ctrl-C is its usual end, also between the request and what might answer it.
         if interrupt::requested() {
             return Ok(());
         }
-        told?;
+        asked?;
         // No answer is wanted, but a refusal means that the session is not kept.
         client.all_agreed()?;
         said += 1;
@@ -196,7 +197,7 @@ fn stay(
         }
         let next = period * said;
         client.speaking.listen(next.saturating_sub(started.elapsed()))?;
-        client.tell()?;
+        client.show()?;
         if interrupt::requested() {
             return Ok(());
         }
@@ -222,10 +223,10 @@ impl Args {
             }
             What::TesterPresent { count, period, .. } => {
                 if period.is_some_and(|period| period < SHORTEST_PERIOD) {
-                    return Err(wrong(format!("a period is at least {} ms", SHORTEST_PERIOD.as_millis())));
+                    return Err(usage(format!("a period is at least {} ms", SHORTEST_PERIOD.as_millis())));
                 }
                 if period.is_none() && count.is_some_and(|count| count > 1) {
-                    return Err(wrong("say how often with --period, as --period 2s"));
+                    return Err(usage("say how often with --period, as --period 2s"));
                 }
                 vec![vec![0x3E, 0]]
             }
@@ -238,14 +239,14 @@ impl Args {
                 vec![vec![0x11, kind]]
             }
             What::Dtc { clear: true, yes: false, .. } => {
-                return Err(wrong(
+                return Err(usage(
                     "clearing erases what the workshop needs to find the fault; if that is meant, add --yes",
                 ));
             }
             What::Dtc { clear: true, .. } => vec![vec![0x14, 0xFF, 0xFF, 0xFF]],
             What::Dtc { mask, .. } => vec![vec![0x19, 0x02, *mask]],
             What::Raw { bytes: texts } => {
-                let Hex(request) = bytes(&texts.concat()).map_err(wrong)?;
+                let Hex(request) = bytes(&texts.concat()).map_err(usage)?;
                 vec![request]
             }
         })

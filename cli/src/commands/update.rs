@@ -15,7 +15,7 @@ use cantap_work::dfu::{self, Step};
 
 use crate::completion;
 use crate::progress::Progress;
-use crate::wrong::wrong;
+use crate::usage_error::usage;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -71,7 +71,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         writer.bootloader_there()?
     } else {
         let Some(address) = &args.device else {
-            return Err(wrong("give the device with -d, or --in-bootloader BOARD"));
+            return Err(usage("give the device with -d, or --in-bootloader BOARD"));
         };
         let device = address.open()?;
         let hello = device.hello();

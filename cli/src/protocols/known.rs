@@ -3,10 +3,11 @@
 use std::fmt::Write as _;
 
 use cantap::TraceRecord;
-use cantap_protocols::{Histogram, KnownNode, Overview, Protocol};
+use cantap_protocols::{Histogram, Overview, Protocol};
 use serde_json::{Value, json};
 
-use super::reading::Reading;
+use cantap_work::node_text::about;
+use cantap_work::reading::Reading;
 
 /// Responses, nodes and objects of a trace, collected by reading it.
 pub struct Known {
@@ -120,29 +121,4 @@ pub fn named((channel, protocol, node): (u8, Protocol, &str)) -> Value {
 fn times(responses: &Histogram) -> Option<[f64; 4]> {
     let at = |percent| responses.percentile_ms(percent);
     Some([at(0.0)?, at(50.0)?, at(99.0)?, at(100.0)?])
-}
-
-/// Faults, state, identity and codes, as far as there are any.
-pub fn about(known: &KnownNode) -> String {
-    let mut about = String::new();
-    if known.faults > 0 {
-        let _ = write!(about, ", {} faults", known.faults);
-    }
-    if let Some(state) = &known.state {
-        let _ = write!(about, ", {state}");
-    }
-    if known.missed > 0 {
-        let _ = write!(about, " ({} times missed", known.missed);
-        if let Some(period_ms) = known.period_ms {
-            let _ = write!(about, ", period {period_ms:.0} ms");
-        }
-        about.push(')');
-    }
-    if let Some(identity) = &known.identity {
-        let _ = write!(about, ", {identity}");
-    }
-    for (list, codes) in &known.codes {
-        let _ = write!(about, "; {list}: {codes}");
-    }
-    about
 }

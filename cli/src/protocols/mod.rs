@@ -1,19 +1,21 @@
 //! What the frames mean, for every command that needs it: the options, and reading records by the bus's
 //! protocols.
 
-mod announcement;
 mod known;
-mod reading;
 mod sheet;
+
+use std::sync::Arc;
 
 use cantap_protocols::Options;
 use cantap_protocols::iso_tp::{KnownPairs, Maker};
 use cantap_signals::Decoder;
 use cantap_signals::condition::{Condition, ConditionError};
+use cantap_work::reading::Reading;
 
-pub use self::known::{Known, about, named};
-pub use self::reading::Reading;
+pub use self::known::{Known, named};
 pub use self::sheet::SheetPath;
+
+use crate::stderr;
 
 /// What helps to understand a bus; commands flatten this into their arguments.
 #[derive(Clone, Debug, Default, clap::Args)]
@@ -37,7 +39,7 @@ fn pair_help() -> String {
 impl ProtocolArgs {
     /// A reader that collects a trace's nodes and services.
     pub fn known(&self, quiet: bool) -> anyhow::Result<Known> {
-        Ok(Known::new(Reading::new(self.options(quiet)?, None, quiet)))
+        Ok(Known::new(reading(self.options(quiet)?, None, quiet)))
     }
 
     /// The library's options; what is not understood in a sheet is reported on standard error, unless
@@ -48,13 +50,18 @@ impl ProtocolArgs {
     }
 }
 
+/// A reader of records that reports on standard error which protocols it found, unless `quiet`.
+pub fn reading(options: Options, decoder: Option<Arc<Decoder>>, quiet: bool) -> Reading {
+    Reading::new(options, decoder, (!quiet).then(stderr::reporter))
+}
+
 /// A condition on signals, frames, and what frames say together.
 pub fn condition(text: &str, decoder: &Decoder) -> Result<Condition, ConditionError> {
     cantap_protocols::condition(text, decoder, &Options::default())
 }
 
 /// Reports which of a condition's names never occurred: a misspelt name finds nothing, as if there were nothing.
-pub fn tell_unheard(condition: &Condition) {
+pub fn report_unmatched(condition: &Condition) {
     let names: Vec<_> = condition.unheard().collect();
     if !names.is_empty() {
         eprintln!(

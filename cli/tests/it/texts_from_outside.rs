@@ -165,7 +165,7 @@ fn no_print_goes_round_the_place_that_cleans() {
             "\\x1b[",
             &[
                 "cli/src/stderr.rs",
-                "cli/src/monitor/",
+                "tui/src/",
                 "host/trace/src/clean.rs",
                 "cli/src/commands/stats/live.rs",
                 "host/analysis/src/plot/text.rs",

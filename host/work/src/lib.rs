@@ -1,12 +1,64 @@
-//! What the `cantap` command does with buses and traces, without its arguments and its texts, for other programs.
+//! What the `cantap` command does with buses and traces, without its arguments and its output, for other programs.
+//!
+//! | Modules | Subject |
+//! |---|---|
+//! | [`boards`], [`channels`], [`channel_bitrate`] | which devices, and which of their channels |
+//! | [`channel_options`], [`timing_options`], [`bus_off`] | how channels are opened, and brought back from bus-off |
+//! | [`live`], [`reception`] | records of devices that may come and go; a channel that receives only errors |
+//! | [`sending`], [`speaking`], [`uds`] | frames and their fate; a protocol's client on a device |
+//! | [`read_ahead`], [`missing`], [`databases`], [`reading`] | traces, what is missing from them, and what they mean |
+//! | [`report`], [`advice`], [`announcement`], [`terms`] | messages for people |
+//! | [`atomic_file`], [`interrupt`], [`dfu`] | files, Ctrl-C, and the chip's bootloader |
 
 #![forbid(unsafe_code)]
 
+#[cfg(feature = "buses")]
+pub mod advice;
+#[cfg(feature = "buses")]
+pub mod announcement;
+pub mod atomic_file;
+#[cfg(feature = "buses")]
+pub mod boards;
+#[cfg(feature = "buses")]
+pub mod bus_off;
+#[cfg(feature = "buses")]
+pub mod channel_bitrate;
+#[cfg(feature = "buses")]
+pub mod channel_options;
+#[cfg(feature = "buses")]
+pub mod channels;
+#[cfg(feature = "buses")]
+pub mod databases;
 #[cfg(feature = "dfu")]
 pub mod dfu;
 pub mod interrupt;
+#[cfg(feature = "buses")]
+pub mod live;
+pub mod locale;
 mod losses;
 mod meter;
+#[cfg(feature = "buses")]
+pub mod missing;
+#[cfg(feature = "buses")]
+pub mod node_text;
+#[cfg(feature = "buses")]
+pub mod read_ahead;
+#[cfg(feature = "buses")]
+pub mod reading;
+#[cfg(feature = "buses")]
+pub mod reception;
+#[cfg(feature = "buses")]
+pub mod report;
+#[cfg(feature = "buses")]
+pub mod sending;
+#[cfg(feature = "buses")]
+pub mod speaking;
+#[cfg(feature = "buses")]
+pub mod terms;
+#[cfg(feature = "buses")]
+pub mod timing_options;
+#[cfg(feature = "buses")]
+pub mod uds;
 
 pub use cantap_trace::grammar::{duration, positive_duration};
 pub use losses::{Losses, lost_frames};

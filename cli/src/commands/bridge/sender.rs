@@ -19,7 +19,8 @@ use rustix::event::{PollFd, PollFlags, poll};
 use super::frames::{RawFrame, frame_of};
 use super::interface::BATCH;
 use super::lane::Lane;
-use crate::{advice, stderr};
+use crate::stderr;
+use cantap_work::advice;
 
 /// How often to check for confirmations while frames are on their way.
 const CONFIRM_EVERY: Duration = Duration::from_millis(2);

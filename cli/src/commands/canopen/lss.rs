@@ -9,9 +9,10 @@ use cantap_protocols::canopen::CanOpen;
 use serde_json::json;
 
 use crate::args;
-use crate::speaking::{SpeakArgs, Speaking};
-use crate::wrong::wrong;
+use crate::speak_args::SpeakArgs;
+use crate::usage_error::usage;
 use cantap_work::interrupt;
+use cantap_work::speaking::Speaking;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -45,7 +46,7 @@ pub(super) fn run(speak: &SpeakArgs, args: &LssArgs, timeout_ns: u64) -> anyhow:
         .node_bitrate
         .map(|bps| {
             bit_rate_index(bps)
-                .ok_or_else(|| wrong("nodes know 10k, 20k, 50k, 125k, 250k, 500k, 800k and 1M".to_owned()))
+                .ok_or_else(|| usage("nodes know 10k, 20k, 50k, 125k, 250k, 500k, 800k and 1M".to_owned()))
         })
         .transpose()?;
     let device = speak.open()?;
@@ -55,7 +56,7 @@ pub(super) fn run(speak: &SpeakArgs, args: &LssArgs, timeout_ns: u64) -> anyhow:
     let configured = configure(&mut speaking, args, index, timeout_ns);
     // Whatever happened, no node must stay in configuration mode.
     let released = match LssMaster::new(LssOrder::SwitchAll(false), timeout_ns).next(0) {
-        Some(frame) if interrupt::requested() => speaking.last_word(frame),
+        Some(frame) if interrupt::requested() => speaking.send_last(frame),
         _ => order(&mut speaking, LssOrder::SwitchAll(false), timeout_ns),
     };
     let found = configured?;

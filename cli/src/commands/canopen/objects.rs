@@ -9,8 +9,9 @@ use cantap_protocols::canopen::{CanOpen, Sheet, encode, known_type, type_named};
 use cantap_protocols::iso_tp::Pair;
 use cantap_protocols::{Assembler, Event, EventKind};
 
-use crate::speaking::{SpeakArgs, Speaking};
-use crate::wrong::wrong;
+use crate::speak_args::SpeakArgs;
+use crate::usage_error::usage;
+use cantap_work::speaking::Speaking;
 
 /// How long to wait.
 #[derive(Clone, Copy)]
@@ -116,7 +117,7 @@ impl Place {
         let mut client = SdoClient::new(self.ids(), self.index, sub, job, self.block, times.timeout_ns);
         client.set_patience(times.patience_ns);
         speaking.run(&mut client)?;
-        speaking.tell(|event| self.is_ours(event))?;
+        speaking.show(|event| self.is_ours(event))?;
         client.finish().map_err(|error| {
             let object = format!("node {}, object {:04X}:{:X}", self.node, self.index, sub);
             match error {
@@ -230,17 +231,17 @@ impl WriteObject {
         };
         let data_type = match &self.data_type {
             Some(name) => Some(type_named(name).ok_or_else(|| {
-                wrong(format!(
+                usage(format!(
                     "there is no type '{name}'; there are bool, u8 to u64, i8 to i64, f32, f64, text, utf16, hex, domain"
                 ))
             })?),
             None => entry().or_else(|| known_type(index, sub)),
         };
         let Some(data_type) = data_type else {
-            return Err(wrong(format!(
+            return Err(usage(format!(
                 "the type of {index:04X}:{sub:X} is not known; give it with --type, as --type u16, or the node's sheet with --eds"
             )));
         };
-        encode(data_type, &self.value).map_err(|error| wrong(error.to_string()))
+        encode(data_type, &self.value).map_err(|error| usage(error.to_string()))
     }
 }

@@ -9,7 +9,8 @@ use cantap_protocols::canopen::{CanOpen, Sheet, state_name};
 use serde_json::{Value, json};
 
 use crate::args;
-use crate::speaking::{SpeakArgs, Speaking};
+use crate::speak_args::SpeakArgs;
+use cantap_work::speaking::Speaking;
 
 /// The command line.
 #[derive(clap::Args)]

@@ -8,8 +8,8 @@ use cantap::device::{Gaps, channel_number};
 use cantap_address::Address;
 use cantap_signals::trigger::{Trigger, TriggerCounts};
 
-use crate::boards::Boards;
-use crate::live::{Line, LiveRecords};
+use cantap_work::boards::Boards;
+use cantap_work::live::{Line, LiveRecords};
 use cantap_work::{Losses, Meter, lost_frames, rounded};
 
 /// A channel in the JSON object.

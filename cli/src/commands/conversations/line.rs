@@ -4,9 +4,7 @@ use std::fmt::Write as _;
 use std::io::Write;
 
 use cantap_protocols::Event;
-use cantap_trace::Interface;
-
-use crate::seconds::Seconds;
+use cantap_trace::{Interface, Seconds};
 
 /// Writes an event as a line.
 pub fn write(out: &mut impl Write, event: &Event, json: bool) -> std::io::Result<()> {

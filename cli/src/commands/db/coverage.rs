@@ -10,13 +10,13 @@ use serde_json::json;
 
 use super::describe::header_id;
 use crate::input::Records;
-use crate::words::counted;
+use cantap_work::terms::counted;
 
 /// A cycle differs from the database's if it deviates by more than this fraction.
 const TOLERANCE: f64 = 0.1;
 
 /// An identifier in the trace.
-struct Heard {
+struct Received {
     channel: u8,
     id: String,
     frames: u64,
@@ -24,7 +24,7 @@ struct Heard {
     max_ms: Option<f64>,
 }
 
-impl Heard {
+impl Received {
     fn of(channel: u8, id: &IdStatistics) -> Self {
         Self {
             channel,
@@ -109,7 +109,7 @@ pub fn run(
         frames += channel.frames;
         unlisted += channel.unlisted_frames();
         for id in channel.ids() {
-            let heard = Heard::of(channel.number, id);
+            let heard = Received::of(channel.number, id);
             if let Some(message) = decoder.find(channel.number, id.id) {
                 covered += id.frames;
                 *came.entry(message).or_default() += id.frames;
@@ -123,13 +123,13 @@ pub fn run(
     unknown.sort_by_key(|heard| std::cmp::Reverse(heard.frames));
     let all = decoder.messages();
     let never: Vec<_> = all.filter(|(reference, ..)| !came.contains_key(reference)).collect();
-    let off = |heard: &Heard, message: MessageRef| {
+    let off = |heard: &Received, message: MessageRef| {
         let nominal = decoder.message(message).cycle_ms.map(f64::from)?;
         let mean = heard.mean_ms?;
         Some(((mean - nominal) / nominal).abs() > TOLERANCE)
     };
     if json {
-        let entry = |heard: &Heard| json!({ "channel": heard.channel, "id": heard.id, "frames": heard.frames, "period_mean_ms": heard.mean_ms, "period_max_ms": heard.max_ms });
+        let entry = |heard: &Received| json!({ "channel": heard.channel, "id": heard.id, "frames": heard.frames, "period_mean_ms": heard.mean_ms, "period_max_ms": heard.max_ms });
         let missing: Vec<_> = unknown.iter().map(entry).collect();
         let silent: Vec<_> = never
             .iter()

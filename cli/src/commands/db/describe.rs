@@ -7,7 +7,7 @@ use cantap_signals::{
 };
 use serde_json::{Value, json};
 
-use crate::words::counted;
+use cantap_work::terms::counted;
 
 /// Shows the requested messages.
 pub fn run(

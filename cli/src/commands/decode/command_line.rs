@@ -8,9 +8,9 @@ use cantap_columns::parquet::Key;
 
 use crate::args;
 use crate::completion;
-use crate::databases::DatabaseArgs;
+use crate::database_args::DatabaseArgs;
 use crate::input::FollowArgs;
-use crate::live::LiveArgs;
+use crate::live_args::LiveArgs;
 use crate::protocols::ProtocolArgs;
 
 /// The command line.

@@ -6,7 +6,7 @@ use std::io::{self, Write};
 use cantap_signals::Reading;
 
 use super::decoded::Decoded;
-use crate::seconds::Seconds;
+use cantap_trace::Seconds;
 
 pub fn write_header(out: &mut impl Write) -> io::Result<()> {
     out.write_all(b"time,channel,id,message,signal,value,unit,text\r\n")

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use cantap_signals::Reading;
 
 use super::decoded::Decoded;
-use crate::seconds::Seconds;
+use cantap_trace::Seconds;
 
 /// Writes the object; with `details` each signal is an object too, with its unit and text.
 pub fn write(out: &mut impl Write, decoded: &Decoded, details: bool) -> io::Result<()> {

@@ -15,10 +15,10 @@ use super::command_line::Args;
 use super::csv::Cells;
 use super::decoded::Decoded;
 use super::wide::{Csv, Wide};
-use super::{csv, json, said, text};
-use crate::beside::Beside;
+use super::{csv, events, json, text};
 use crate::trace_output::failed;
-use crate::wrong::wrong;
+use crate::usage_error::usage;
+use cantap_work::atomic_file::AtomicFile;
 
 /// The requested form, by an option or by the file's name.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -51,7 +51,7 @@ impl Form {
                 let name = args.output.as_deref().unwrap_or(Path::new("-"));
                 #[cfg(not(feature = "parquet"))]
                 crate::trace_output::refuse_parquet(name)?;
-                return Err(wrong(format!(
+                return Err(usage(format!(
                     "the name '{}' does not say which form to write; end it in .txt, .csv, .json{}, or add --csv or --json",
                     name.display(),
                     if cfg!(feature = "parquet") { " or .parquet" } else { "" },
@@ -59,13 +59,13 @@ impl Form {
             }
         };
         if matches!(form, Self::Text | Self::Json) && (args.wide || args.resample.is_some()) {
-            return Err(wrong(
+            return Err(usage(
                 "--wide and --resample make tables; add --csv, or -o with a name that ends in .csv or .parquet",
             ));
         }
         #[cfg(feature = "parquet")]
         if form == Self::Parquet && args.protocols && !args.wide && args.resample.is_none() {
-            return Err(wrong(
+            return Err(usage(
                 "this table has no place for what protocols say; add --wide or --resample TIME, which make columns of its numbers, or write it to \
                  a file that ends in .csv or .json",
             ));
@@ -104,7 +104,7 @@ enum WideTo {
 /// Lines for standard output, or for a file that takes its name once it is complete.
 struct Lines {
     out: BufWriter<Box<dyn Write>>,
-    beside: Option<Beside>,
+    replacement: Option<AtomicFile>,
     name: String,
 }
 
@@ -112,20 +112,20 @@ impl Lines {
     fn open(path: Option<&Path>) -> anyhow::Result<Self> {
         let path = path.unwrap_or(Path::new("-"));
         let name = failed(path);
-        let beside = Beside::of(path);
+        let replacement = AtomicFile::of(path);
         let out: Box<dyn Write> = if path.as_os_str() == "-" {
             Box::new(std::io::stdout().lock())
         } else {
-            let file = beside.as_ref().map_or(path, |beside| &beside.temporary);
+            let file = replacement.as_ref().map_or(path, |file| &file.temporary);
             Box::new(File::create(file).with_context(|| name.clone())?)
         };
-        Ok(Self { out: BufWriter::with_capacity(1 << 16, out), beside, name })
+        Ok(Self { out: BufWriter::with_capacity(1 << 16, out), replacement, name })
     }
 
     fn finish(mut self) -> anyhow::Result<()> {
         self.out.flush().with_context(|| self.name.clone())?;
         drop(self.out);
-        self.beside.map_or(Ok(()), Beside::put_in_place).context(self.name)
+        self.replacement.map_or(Ok(()), AtomicFile::put_in_place).context(self.name)
     }
 }
 
@@ -182,12 +182,12 @@ impl<'a> Output<'a> {
     }
 
     /// Takes an event from several frames.
-    pub fn push_said(&mut self, event: &Event) -> anyhow::Result<()> {
+    pub fn push_protocol_event(&mut self, event: &Event) -> anyhow::Result<()> {
         match &mut self.to {
-            To::Lines { lines, json: true, details } => said::json(&mut lines.out, event, *details)?,
-            To::Lines { lines, .. } => said::text(&mut lines.out, event)?,
-            To::Csv(lines, cells) => said::csv(&mut lines.out, event, *cells)?,
-            To::Wide(wide, _) => wide.push_said(event)?,
+            To::Lines { lines, json: true, details } => events::json(&mut lines.out, event, *details)?,
+            To::Lines { lines, .. } => events::text(&mut lines.out, event)?,
+            To::Csv(lines, cells) => events::csv(&mut lines.out, event, *cells)?,
+            To::Wide(wide, _) => wide.push_protocol_event(event)?,
             #[cfg(feature = "parquet")]
             // Refused on the command line.
             _ => {}

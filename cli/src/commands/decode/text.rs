@@ -6,7 +6,7 @@ use cantap_signals::{Message, Reading, SignalValue};
 use cantap_trace::Interface;
 
 use super::decoded::Decoded;
-use crate::seconds::Seconds;
+use cantap_trace::Seconds;
 
 pub fn write(out: &mut impl Write, decoded: &Decoded) -> io::Result<()> {
     let Decoded { record, frame, message, values, .. } = decoded;

@@ -13,8 +13,8 @@ use cantap_signals::{MessageRef, Reading};
 
 use super::csv::Cells;
 use super::decoded::Decoded;
-use super::said;
-use crate::seconds::Seconds;
+use super::events;
+use cantap_trace::Seconds;
 
 /// Separates cells of a waiting line: it occurs in no number and no time.
 const SEPARATOR: char = '\x1f';
@@ -64,7 +64,7 @@ impl Wide {
     }
 
     /// Takes an event from several frames: its numbers.
-    pub fn push_said(&mut self, event: &Event) -> io::Result<()> {
+    pub fn push_protocol_event(&mut self, event: &Event) -> io::Result<()> {
         // An event that ends because nothing came is reported with the frame that shows it: lines at regular intervals do not
         // go back for it.
         let time_ns = match (self.step_ns, self.due_ns) {
@@ -73,7 +73,7 @@ impl Wide {
         };
         self.advance(time_ns)?;
         let mut cells: Vec<(usize, String)> = Vec::new();
-        for (name, unit, number) in said::numbers(event) {
+        for (name, unit, number) in events::numbers(event) {
             let Some(number) = number else {
                 self.left_out += 1;
                 continue;

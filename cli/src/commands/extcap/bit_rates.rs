@@ -9,7 +9,7 @@ use cantap_address::Address;
 
 use super::super::autobaud::failure;
 use crate::args;
-use crate::channel_bitrate::ChannelBitrate;
+use cantap_work::channel_bitrate::ChannelBitrate;
 use cantap_work::interrupt;
 
 /// The ones offered in a list; any other can be given, too.

@@ -16,12 +16,14 @@ use super::bit_rates::{BitRate, settle};
 use super::pipe::Opening;
 use super::toolbar::{Change, Toolbar};
 use super::traffic::Traffic;
-use crate::boards::Boards;
-use crate::channel_args::{self, ChannelArgs};
-use crate::live::{Line, LiveRecords};
-use crate::{advice, args, exit};
+use crate::{args, exit, stderr};
 use cantap_work::Losses;
+use cantap_work::advice;
+use cantap_work::boards::Boards;
+use cantap_work::channel_options::{self, ChannelOptions};
 use cantap_work::interrupt;
+use cantap_work::live::{Line, LiveRecords};
+use cantap_work::report::Reporter;
 
 /// The longest delay of captured records while there are more; on a quiet bus they are passed on immediately. Two saturated channels
 /// have 208 frames in this time.
@@ -82,9 +84,9 @@ fn open(wanted: &Wanted, pipe: &Opening) -> anyhow::Result<()> {
     let numbers: Vec<String> = channels.iter().map(u8::to_string).collect();
     let channels = args::channels(&numbers.join(",")).map_err(anyhow::Error::msg)?;
     let boards = Boards::new(std::slice::from_ref(address), &channels)?;
-    let mut how = ChannelArgs::listening(rates);
-    how.set_mode(wanted.mode);
-    let mut live = LiveRecords::open(&boards, &how, &[], None)?;
+    let mut how = ChannelOptions::listening(rates);
+    how.mode = Some(wanted.mode);
+    let mut live = LiveRecords::open(&boards, &how, &[], None, &stderr::reporter())?;
     let opened = pipe.wait(PIPE_PATIENCE).with_context(|| {
         format!(
             "cannot write to '{}'; Wireshark makes this pipe and names it with --fifo",
@@ -98,7 +100,7 @@ fn open(wanted: &Wanted, pipe: &Opening) -> anyhow::Result<()> {
     };
     if screen.is_there() {
         let screen = screen.clone();
-        live.report_to(move |text| screen.report(text));
+        live.report_to(Reporter::new(move |_, text| screen.report(text)));
     }
     let options = WriteOptions {
         format: Some(Format::Pcapng),
@@ -232,11 +234,11 @@ impl Capture<'_> {
             });
             match reopened {
                 Ok(changed) => {
-                    let how = format!("from here on {}", channel_args::description(&changed, clock_hz));
+                    let how = format!("from here on {}", channel_options::description(&changed, clock_hz));
                     screen.report(&format!("channel {number}: {how}"));
                     self.remarks.push((number, now_ns(), how));
                 }
-                Err(error) => screen.report(&format!("channel {number}: {}", advice::told(&error))),
+                Err(error) => screen.report(&format!("channel {number}: {}", advice::explained(&error))),
             }
         }
         self.show_channels();

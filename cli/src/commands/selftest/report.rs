@@ -136,7 +136,7 @@ impl Report {
                 match self.excuse() {
                     // No advice on what to do with the board.
                     Some(excuse) => Outcome::Fail(format!("{error:#}{excuse}"), Value::Null),
-                    None => Outcome::Fail(crate::advice::sentence(&error), Value::Null),
+                    None => Outcome::Fail(cantap_work::advice::sentence(&error), Value::Null),
                 }
             }
             Ok(Outcome::Fail(says, measured)) => {

@@ -2,7 +2,7 @@
 
 use cantap::wire::message::{Checksum, MAX_MODIFIERS, Modifier};
 
-use crate::wrong::wrong;
+use crate::usage_error::usage;
 
 /// The modifiers; applied in this order, so that a checksum covers the others.
 #[derive(clap::Args)]
@@ -28,7 +28,7 @@ impl ModifierArgs {
         let mut list = Modifiers::new();
         for modifier in self.counter.iter().copied().chain(random).chain(self.checksum.iter().copied()) {
             if list.push(modifier).is_err() {
-                return Err(wrong(format!(
+                return Err(usage(format!(
                     "a frame takes {MAX_MODIFIERS} modifiers; give fewer of --counter, --random, --checksum"
                 )));
             }

@@ -10,7 +10,7 @@ use cantap::unsent::PATIENCE;
 use cantap::wire::message::{Filter as HardwareFilter, FrameKind, OTHERS_TAG, TRIGGER_TAG, Trigger};
 use cantap::{Channel, Device, Direction, Frame, Id, TraceEvent, TraceFrame, TraceRecord};
 
-use crate::sending::{LOOK_EVERY, Sending};
+use cantap_work::sending::{LOOK_EVERY, Sending};
 
 /// What became of one reply's matches.
 struct Entry {

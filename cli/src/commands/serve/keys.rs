@@ -8,7 +8,7 @@ use cantap_address::server::role;
 use cantap_serve::Role;
 use cantap_serve::tls::{Files, Keys, LIFETIME_DAYS, Server};
 
-use crate::wrong::wrong;
+use crate::usage_error::usage;
 
 /// What else the command can do.
 #[derive(clap::Subcommand)]
@@ -48,7 +48,7 @@ impl Command {
         let Self::Keygen { folder, hosts, clients, days } = self;
         let has_server = Keys::files(folder, "server").certificate.exists();
         if !has_server && hosts.is_empty() {
-            return Err(wrong(
+            return Err(usage(
                 "name the server's computer with --host, as clients will; repeat it for each name and address",
             ));
         }

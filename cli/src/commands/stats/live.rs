@@ -9,12 +9,13 @@ use cantap_trace::filter::Filter;
 
 use super::table::remarks;
 use super::windows::Windows;
-use crate::args::Channels;
-use crate::boards::Boards;
-use crate::channel_bitrate::ChannelBitrate;
-use crate::live::{LiveRecords, unasked};
+use crate::live_args::{self, for_listening};
 use crate::protocols::Known;
 use crate::stderr;
+use cantap_work::boards::Boards;
+use cantap_work::channel_bitrate::ChannelBitrate;
+use cantap_work::channels::Channels;
+use cantap_work::live::LiveRecords;
 
 /// How long after its end a window is closed, so that it includes what is still on the way.
 const LATENESS_NS: i64 = 1_000_000_000;
@@ -29,8 +30,8 @@ pub(super) fn open(
     time: Option<Duration>,
 ) -> anyhow::Result<LiveRecords> {
     let boards = Boards::new(devices, channels)
-        .map_err(|error| unasked(error, devices, "without a trace to measure"))?;
-    LiveRecords::listen(&boards, bitrates, time)
+        .map_err(|error| for_listening(error.into(), devices, "without a trace to measure"))?;
+    live_args::listen(&boards, bitrates, time)
 }
 
 /// Listens until Ctrl-C or the end of the time, and prints a line per window if `shown`. What was received counts, even if this

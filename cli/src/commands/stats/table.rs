@@ -5,8 +5,8 @@ use std::fmt::Write as _;
 
 use cantap_analysis::stats::{ChannelSummary, IdSummary, PeakSummary, Summary};
 
-use crate::missing::Missing;
 use cantap_work::lost_frames;
+use cantap_work::missing::Missing;
 
 /// The whole text, for a terminal of at least eighty columns.
 pub(super) fn text(summary: &Summary, missing: &Missing, per_id: bool) -> String {
@@ -22,8 +22,8 @@ pub(super) fn text(summary: &Summary, missing: &Missing, per_id: bool) -> String
         lost_frames(summary.lost, summary.lost_at_least),
         summary.errors,
     );
-    if let Some(words) = missing.in_words() {
-        let _ = writeln!(out, "not in these figures: {words}");
+    if let Some(text) = missing.description() {
+        let _ = writeln!(out, "not in these figures: {text}");
     }
     for channel in &summary.channels {
         channel_text(channel, summary, &mut out);

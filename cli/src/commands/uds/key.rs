@@ -7,9 +7,9 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 
-use super::client::{Client, first};
 use super::hex::{Hex, byte, bytes};
 use cantap_work::interrupt;
+use cantap_work::uds::{Client, first};
 
 /// How often to check whether the command has ended.
 const LOOK_EVERY: Duration = Duration::from_millis(5);

@@ -1,0 +1,121 @@
+//! Events from several frames, in the forms of decoded frames.
+
+use std::io::{self, Write};
+
+use cantap_protocols::{Event, Party, Value, naming};
+use cantap_trace::Interface;
+
+use super::csv::Cells;
+use cantap_trace::Seconds;
+
+/// Whether a name is `name`, or `name_2` and so on: `spn_version` is not the second `spn`.
+fn is_again(known: &str, name: &str) -> bool {
+    known.strip_prefix(name).is_some_and(|rest| {
+        rest.is_empty() || rest.strip_prefix('_').is_some_and(|rest| rest.parse::<usize>().is_ok())
+    })
+}
+
+/// Names and values, followed by those that every event has.
+fn fields(event: &Event) -> Vec<(String, Value, String, Option<String>)> {
+    let mut fields: Vec<(String, Value, String, Option<String>)> = Vec::new();
+    for field in &event.fields {
+        let name = naming::plain(&field.name);
+        let before = fields.iter().filter(|(known, ..)| is_again(known, &name)).count();
+        let name = if before == 0 { name } else { format!("{name}_{}", before + 1) };
+        let text = field.text.as_ref().map(ToString::to_string);
+        fields.push((name, field.value.clone(), field.unit.to_string(), text));
+    }
+    let mut add = |name: &str, value: Value| fields.push((name.to_owned(), value, String::new(), None));
+    add("kind", Value::Text(event.kind.name().into()));
+    if let Some(ns) = event.response_ns {
+        add("response_ms", Value::Real(ns as f64 / 1e6));
+    }
+    if let Some(trouble) = &event.trouble {
+        add("trouble", Value::Text(trouble.code().into()));
+    }
+    if event.frames_lost {
+        add("frames_lost", Value::Number(1));
+    }
+    fields
+}
+
+/// Names, units and values of an event, each a number as text; `None` for an own field that is not a number.
+pub fn numbers(event: &Event) -> impl Iterator<Item = (String, String, Option<String>)> {
+    let protocol = event.protocol;
+    let own = event.fields.len();
+    fields(event).into_iter().enumerate().filter_map(move |(place, (name, value, unit, _))| {
+        let number = match value {
+            Value::Number(number) => Some(number.to_string()),
+            Value::Hex(number, _) => Some(number.to_string()),
+            Value::Real(number) if number.is_finite() => Some(number.to_string()),
+            // The kind and the fault are texts in every event.
+            _ if place >= own => return None,
+            _ => None,
+        };
+        Some((format!("{protocol}.{name}"), unit, number))
+    })
+}
+
+/// The identifier or node that sent it; empty if unknown.
+fn sender(event: &Event) -> String {
+    if event.from == Party::Unknown { String::new() } else { event.from.to_string() }
+}
+
+/// As in `cantap conversations`.
+pub fn text(out: &mut impl Write, event: &Event) -> io::Result<()> {
+    writeln!(out, "({}) {} {event}", Seconds(event.time_ns), Interface(event.channel))
+}
+
+/// A line per field; texts are in the last column.
+pub fn csv(out: &mut impl Write, event: &Event, cells: Cells) -> io::Result<()> {
+    for (name, value, unit, text) in fields(event) {
+        let (number, own) = match &value {
+            Value::Number(_) | Value::Real(_) => (value.to_string(), None),
+            Value::Hex(number, _) => (number.to_string(), None),
+            Value::Text(text) => (String::new(), Some(text.to_string())),
+            Value::Bytes(_) => (String::new(), Some(value.to_string())),
+            Value::Missing => (String::new(), Some("not available".to_owned())),
+        };
+        write!(
+            out,
+            "{},{},{},{},{}.{name},{number},{},{}\r\n",
+            Seconds(event.time_ns),
+            event.channel,
+            sender(event),
+            cells.field(&event.title),
+            event.protocol,
+            cells.field(&unit),
+            cells.field(&text.or(own).unwrap_or_default())
+        )?;
+    }
+    Ok(())
+}
+
+/// An object; with `details` each value is an object too.
+pub fn json(out: &mut impl Write, event: &Event, details: bool) -> io::Result<()> {
+    let mut signals = serde_json::Map::new();
+    for (name, value, unit, text) in fields(event) {
+        let value = serde_json::Value::from(&value);
+        let value = if details {
+            let mut object = serde_json::json!({ "value": value });
+            if !unit.is_empty() {
+                object["unit"] = unit.into();
+            }
+            if let Some(text) = text {
+                object["text"] = text.into();
+            }
+            object
+        } else {
+            value
+        };
+        signals.insert(format!("{}.{name}", event.protocol), value);
+    }
+    let party = |party: Party| if party == Party::Unknown { None } else { Some(party.to_string()) };
+    let rest = serde_json::json!({
+        "id": sender(event), "message": event.title, "protocol": event.protocol.name(),
+        "from": party(event.from), "to": party(event.to), "signals": signals,
+    });
+    // The time is written by hand, to keep all its digits.
+    let rest = rest.to_string();
+    writeln!(out, "{{\"time_s\":{},\"channel\":{},{}", Seconds(event.time_ns), event.channel, &rest[1..])
+}

@@ -1,0 +1,64 @@
+//! Which devices to listen to: the options of commands that read a trace or listen to buses.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use cantap_address::Address;
+use cantap_work::boards::Boards;
+use cantap_work::channel_bitrate::ChannelBitrate;
+use cantap_work::channel_options::ChannelOptions;
+use cantap_work::channels::Channels;
+use cantap_work::live::LiveRecords;
+
+use crate::{args, completion, stderr};
+
+/// Which devices, and how; commands flatten this into their arguments, in addition to an input file.
+#[derive(clap::Args)]
+pub struct LiveArgs {
+    /// Listen to a device instead of reading a file, until Ctrl-C. Repeat for several, with channels numbered
+    /// consecutively.
+    #[arg(short, long, conflicts_with = "input", add = completion::devices())]
+    device: Vec<Address>,
+    /// The device's channels to listen to: 1, 2, several as 1,3, or both, which means all.
+    #[arg(short, long, default_value = "both", value_parser = args::channels, add = completion::channels())]
+    channel: Channels,
+    /// Bit rate of the bus in bit/s: 500000, 500k, 1M; with a channel before it (2:250k), only for that channel. Can
+    /// be repeated. Without it, the one saved on the device.
+    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", add = completion::bit_rates())]
+    bitrates: Vec<ChannelBitrate>,
+    /// How long to listen, as 10, 500ms or 2m.
+    #[arg(short, long, value_parser = args::positive_duration)]
+    time: Option<Duration>,
+}
+
+impl LiveArgs {
+    /// The given devices.
+    pub fn devices(&self) -> impl Iterator<Item = &Address> {
+        self.device.iter()
+    }
+
+    /// Opens the devices and their channels: the given ones or, without a file, the one that is connected.
+    pub fn open(&self, input: Option<&PathBuf>) -> anyhow::Result<Option<LiveRecords>> {
+        if input.is_some() {
+            return Ok(None);
+        }
+        let boards = Boards::new(&self.device, &self.channel)
+            .map_err(|error| for_listening(error.into(), &self.device, "without a trace to read"))?;
+        listen(&boards, &self.bitrates, self.time).map(Some)
+    }
+}
+
+/// Only listens, at these bit rates or otherwise the saved ones, until Ctrl-C or the end of the time.
+pub fn listen(
+    boards: &Boards,
+    bitrates: &[ChannelBitrate],
+    time: Option<Duration>,
+) -> anyhow::Result<LiveRecords> {
+    let open = ChannelOptions::listening(bitrates.to_vec());
+    LiveRecords::open(boards, &open, &[], time, &stderr::reporter())
+}
+
+/// An error about a device that nobody named: it says why one is needed.
+pub fn for_listening(error: anyhow::Error, given: &[Address], without: &str) -> anyhow::Error {
+    if given.is_empty() { error.context(format!("{without}, a device is listened to")) } else { error }
+}

@@ -1,3 +1,0 @@
-//! Times of records as text.
-
-pub use cantap_trace::Seconds;

@@ -1,0 +1,222 @@
+//! How a channel is opened.
+
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use cantap::Channel;
+use cantap::device::channel_number;
+use cantap::hw_filter::{self, Compiled};
+use cantap::recovery::Recovery;
+use cantap::wire::message::{ChannelConfig, Defaults, Mode};
+use cantap_address::OpenDevice;
+use cantap_trace::filter::Filter;
+
+use crate::bus_off::BusOffRecovery;
+use crate::channel_bitrate::ChannelBitrate;
+use crate::report::Reporter;
+use crate::timing_options::TimingOptions;
+
+/// How to open a channel, as far as it is given.
+#[derive(Clone, Debug, Default)]
+pub struct ChannelOptions {
+    /// Its bit timing; without one, the one saved on the device.
+    pub timing: TimingOptions,
+    /// How to take part in the bus.
+    pub mode: Option<Mode>,
+    /// Send each frame once: no retransmission after an error or lost arbitration.
+    pub one_shot: bool,
+    /// How to leave bus-off.
+    pub recovery: Option<RecoveryOption>,
+    /// Leave data bytes out of the stream.
+    pub no_data: bool,
+    /// Leave time stamps out of the stream.
+    pub no_stamps: bool,
+    /// Which of several boards this is for, from 0: messages name its channels' numbers.
+    pub board: usize,
+}
+
+/// How to leave bus-off.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RecoveryOption {
+    /// After 128 times 11 recessive bits, by the controller itself.
+    Auto,
+    /// Never.
+    Manual,
+    /// This long after it went bus-off, by this program.
+    After(Duration),
+}
+
+/// The settings for opening a channel.
+struct Plan {
+    channel: Channel,
+    config: ChannelConfig,
+    /// What is saved on the device, if that is used.
+    saved: Option<Defaults>,
+}
+
+impl ChannelOptions {
+    /// Only listening, at these bit rates; without any, with what is saved on the device.
+    pub fn listening(bitrates: Vec<ChannelBitrate>) -> Self {
+        Self { timing: TimingOptions { bitrates, ..TimingOptions::default() }, ..Self::default() }
+    }
+
+    /// The part for one of several boards, counted from 0, whose channels have their own numbers there.
+    #[must_use]
+    pub fn on_board(&self, board: usize) -> Self {
+        Self { timing: self.timing.on_board(board), board, ..self.clone() }
+    }
+
+    /// The channel's number for users.
+    const fn number(&self, channel: Channel) -> u8 {
+        channel_number(self.board, channel)
+    }
+
+    /// Whether any option is given.
+    pub fn is_given(&self) -> bool {
+        let Self { timing, mode, one_shot, recovery, no_data, no_stamps, board: _ } = self;
+        timing.is_given_in_part()
+            || mode.is_some()
+            || recovery.is_some()
+            || [one_shot, no_data, no_stamps].into_iter().any(|flag| *flag)
+    }
+
+    /// Brings channels back from bus-off, if the user requested that, and reports it.
+    pub fn bus_off_recovery(&self, reporter: &Reporter) -> BusOffRecovery {
+        BusOffRecovery::new(self.recovery(), reporter.clone())
+    }
+
+    /// Brings channels back from bus-off if the user requested that; for callers that report it in their own
+    /// way.
+    pub fn recovery(&self) -> Option<Recovery> {
+        match self.recovery {
+            Some(RecoveryOption::After(time)) => Some(Recovery::new(time)),
+            _ => None,
+        }
+    }
+
+    /// Opens channels, with `mode` unless the user requested another, and returns how they were opened. Anything
+    /// impossible is detected before the first one is opened. Commands that receive pass their filters; with none, those
+    /// saved on the device apply. Reports which filters the hardware could not take, and that saved ones
+    /// apply.
+    pub fn open(
+        &self,
+        device: &OpenDevice,
+        channels: impl Iterator<Item = Channel>,
+        mode: Mode,
+        filters: Option<&[Filter]>,
+        reporter: &Reporter,
+    ) -> anyhow::Result<Vec<(Channel, ChannelConfig)>> {
+        let plans = self.plan(device, channels, Some(mode))?;
+        // A channel's filters can be changed only while both channels are closed.
+        for Plan { channel, saved, .. } in &plans {
+            match (filters, saved) {
+                (Some(filters), _) if !filters.is_empty() => {
+                    if let Some(remainder) = hw_filter::apply(device, *channel, filters)?.remainder {
+                        reporter.note(format!("channel {}: {remainder}", self.number(*channel)));
+                    }
+                }
+                (Some(_), Some(saved)) if !saved.filters.is_empty() => {
+                    device.set_filters(*channel, &saved.filters)?;
+                    let (number, count) = (self.number(*channel), saved.filters.len());
+                    reporter.note(format!("channel {number}: only what its {count} saved filters accept"));
+                }
+                _ => {}
+            }
+        }
+        for Plan { channel, config, .. } in &plans {
+            device
+                .open_channel(*channel, Some(*config))
+                .with_context(|| format!("channel {}", self.number(*channel)))?;
+        }
+        Ok(plans.into_iter().map(|plan| (plan.channel, plan.config)).collect())
+    }
+
+    /// How channels would be opened, with `mode` unless the user requested another. Nothing is opened.
+    pub fn configs(
+        &self,
+        device: &OpenDevice,
+        channels: impl IntoIterator<Item = Channel>,
+        mode: Mode,
+    ) -> anyhow::Result<Vec<(Channel, ChannelConfig)>> {
+        let plans = self.plan(device, channels.into_iter(), Some(mode))?;
+        Ok(plans.into_iter().map(|plan| (plan.channel, plan.config)).collect())
+    }
+
+    /// Gives closed channels the requested configuration and filters, without opening them: what
+    /// [`Device::save_defaults`] stores. Anything not requested stays as it was saved before.
+    pub fn configure(
+        &self,
+        device: &OpenDevice,
+        channels: impl Iterator<Item = Channel>,
+        filters: &[Filter],
+    ) -> anyhow::Result<()> {
+        for Plan { channel, config, saved } in self.plan(device, channels, None)? {
+            let number = self.number(channel);
+            let kept = saved.filter(|_| filters.is_empty()).map(|saved| saved.filters).unwrap_or_default();
+            let filters = match hw_filter::compile(filters, channel) {
+                Compiled { remainder: Some(remainder), .. } => bail!(
+                    "channel {number}: {remainder}, which cannot be saved; give filters that the hardware knows"
+                ),
+                Compiled { hardware, .. } if !hardware.is_empty() => hardware,
+                Compiled { .. } => kept.to_vec(),
+            };
+            device.set_filters(channel, &filters).with_context(|| format!("channel {number}"))?;
+            device.configure(channel, config).with_context(|| format!("channel {number}"))?;
+        }
+        Ok(())
+    }
+
+    fn plan(
+        &self,
+        device: &OpenDevice,
+        channels: impl Iterator<Item = Channel>,
+        mode: Option<Mode>,
+    ) -> anyhow::Result<Vec<Plan>> {
+        // Other makers' adapters often have a single channel; who asks for that alone learns so when it is opened.
+        let is_there = |channel: &Channel| channel.number() <= device.hello().channels;
+        let (there, missing): (Vec<_>, Vec<_>) = channels.partition(is_there);
+        let used = if there.is_empty() { &missing } else { &there };
+        used.iter().map(|channel| self.plan_one(device, *channel, mode)).collect()
+    }
+
+    /// The requested configuration; without bit timing, the one saved on the device. The mode is the user's, otherwise `mode`,
+    /// otherwise the saved one.
+    fn plan_one(&self, device: &OpenDevice, channel: Channel, mode: Option<Mode>) -> anyhow::Result<Plan> {
+        let (base, saved) = match self.timing.request(channel)? {
+            Some(request) => {
+                (ChannelConfig::listen_only(request.resolve(device.hello().can_clock_hz)?), None)
+            }
+            None => match (device.defaults(channel)?, device.bitrate_of_bus(channel)) {
+                (Some(saved), _) => (saved.config, Some(saved)),
+                (None, Some(bitrate_bps)) => (ChannelConfig::listen_only(device.timing(bitrate_bps)?), None),
+                (None, None) => bail!(
+                    "no bit rate for channel {}: give one with -b RATE, find it with `cantap autobaud`, or save one \
+                     with `cantap defaults save`",
+                    self.number(channel)
+                ),
+            },
+        };
+        let config = ChannelConfig {
+            mode: self.mode.or(mode).unwrap_or(base.mode),
+            one_shot: base.one_shot || self.one_shot,
+            manual_recovery: self
+                .recovery
+                .map_or(base.manual_recovery, |recovery| recovery != RecoveryOption::Auto),
+            omit_data: base.omit_data || self.no_data,
+            omit_stamps: base.omit_stamps || self.no_stamps,
+            ..base
+        };
+        Ok(Plan { channel, config, saved })
+    }
+}
+
+/// A description of how a channel is open.
+pub fn description(config: &ChannelConfig, can_clock_hz: u32) -> String {
+    let mode = match config.mode {
+        Mode::ListenOnly => "listening only",
+        Mode::Normal => "taking part",
+        Mode::Loopback => "in loopback",
+        Mode::SilentLoopback => "in silent loopback",
+    };
+    format!("{} bit/s, {mode}", config.timing.bitrate_bps(can_clock_hz))
+}

@@ -1,0 +1,30 @@
+//! What is known of a node, as text.
+
+use std::fmt::Write as _;
+
+use cantap_protocols::KnownNode;
+
+/// Faults, state, identity and codes, as far as there are any.
+pub fn about(known: &KnownNode) -> String {
+    let mut about = String::new();
+    if known.faults > 0 {
+        let _ = write!(about, ", {} faults", known.faults);
+    }
+    if let Some(state) = &known.state {
+        let _ = write!(about, ", {state}");
+    }
+    if known.missed > 0 {
+        let _ = write!(about, " ({} times missed", known.missed);
+        if let Some(period_ms) = known.period_ms {
+            let _ = write!(about, ", period {period_ms:.0} ms");
+        }
+        about.push(')');
+    }
+    if let Some(identity) = &known.identity {
+        let _ = write!(about, ", {identity}");
+    }
+    for (list, codes) in &known.codes {
+        let _ = write!(about, "; {list}: {codes}");
+    }
+    about
+}

@@ -1,0 +1,116 @@
+//! How a channel's bit timing is chosen: by bit rate, with wishes, or as a whole.
+
+use cantap::Channel;
+use cantap::bit_timing::{TimingError, TimingRequest};
+use cantap::wire::{BitTiming, CHANNELS};
+
+use crate::channel_bitrate::ChannelBitrate;
+use crate::channels::place_of;
+
+/// A bit timing, as far as it is given.
+#[derive(Clone, Debug, Default)]
+pub struct TimingOptions {
+    /// Bit rates; the last one for a channel counts.
+    pub bitrates: Vec<ChannelBitrate>,
+    /// The sample point in per cent of the bit, instead of the one that CiA recommends.
+    pub sample_point: Option<f64>,
+    /// Resynchronisation jump width in quanta, 1 to 4.
+    pub sjw: Option<u8>,
+    /// Sample each bit three times: refused, since bxCAN cannot do this.
+    pub triple: bool,
+    /// The whole timing, which leaves no wishes.
+    pub exact: Option<BitTiming>,
+}
+
+/// A timing that cannot be requested.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum TimingOptionsError {
+    /// A bit rate for a channel that the only device does not have.
+    #[error("a device has no channel {number}; give a bit rate for channel 1 or 2, as -b 2:250k")]
+    NoChannel {
+        /// From 1.
+        number: u8,
+    },
+    /// A bit rate for a channel that none of several devices has.
+    #[error(
+        "{boards} devices have no channel {number}; give a bit rate for channels 1 to {count}, as -b 2:250k"
+    )]
+    NoChannelOfSeveral {
+        /// How many devices there are.
+        boards: usize,
+        /// How many channels they have.
+        count: usize,
+        /// From 1.
+        number: u8,
+    },
+    /// A sample point or a jump width, and no bit rate.
+    #[error("a sample point or jump width needs a bit rate; add -b RATE")]
+    NoBitRate,
+    /// The controller cannot have it.
+    #[error(transparent)]
+    Timing(#[from] TimingError),
+}
+
+impl TimingOptions {
+    /// Whether any timing was given.
+    pub fn is_given(&self) -> bool {
+        !self.bitrates.is_empty() || self.exact.is_some()
+    }
+
+    /// Whether anything was given, even if only a sample point or a jump width.
+    pub fn is_given_in_part(&self) -> bool {
+        self.is_given() || self.sample_point.is_some() || self.sjw.is_some() || self.triple
+    }
+
+    /// Requests these bit rates instead of any other timing.
+    pub fn set_bit_rates(&mut self, rates: Vec<ChannelBitrate>) {
+        self.exact = None;
+        self.bitrates = rates;
+    }
+
+    /// Refuses bit rates of channels that this number of boards does not have.
+    pub fn check_channels(&self, boards: usize) -> Result<(), TimingOptionsError> {
+        let count = boards * CHANNELS;
+        let named = self.bitrates.iter().filter_map(|rate| rate.channel);
+        let Some(number) = named.into_iter().find(|number| usize::from(*number) > count) else {
+            return Ok(());
+        };
+        Err(match boards {
+            1 => TimingOptionsError::NoChannel { number },
+            _ => TimingOptionsError::NoChannelOfSeveral { boards, count, number },
+        })
+    }
+
+    /// The part for one of several boards, counted from 0, whose channels have their own numbers there.
+    #[must_use]
+    pub fn on_board(&self, board: usize) -> Self {
+        let own = |rate: &ChannelBitrate| match rate.channel.map(place_of) {
+            None => Some(*rate),
+            Some((place, channel)) if place == board => {
+                Some(ChannelBitrate { channel: Some(channel.number()), ..*rate })
+            }
+            Some(_) => None,
+        };
+        Self { bitrates: self.bitrates.iter().filter_map(own).collect(), ..self.clone() }
+    }
+
+    /// The request for a channel, if any.
+    pub fn request(&self, channel: Channel) -> Result<Option<TimingRequest>, TimingOptionsError> {
+        if self.triple {
+            return Err(TimingError::TripleSampling.into());
+        }
+        self.check_channels(1)?;
+        if let Some(timing) = self.exact {
+            return Ok(Some(TimingRequest::Exact(timing)));
+        }
+        let Self { sample_point, sjw, .. } = *self;
+        match ChannelBitrate::of(&self.bitrates, channel.number()) {
+            Some(bitrate_bps) => {
+                Ok(Some(TimingRequest::Rate { bitrate_bps, sample_point_percent: sample_point, sjw }))
+            }
+            None if sample_point.is_some() || sjw.is_some() => Err(TimingOptionsError::NoBitRate),
+            None => Ok(None),
+        }
+    }
+}

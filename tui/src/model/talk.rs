@@ -1,0 +1,54 @@
+//! The meaning of the frames, as they arrive.
+
+use std::collections::VecDeque;
+
+use cantap::TraceRecord;
+use cantap_protocols::{Event, Options, Overview, UnderWay};
+
+use cantap_work::reading::Reading;
+
+/// How many events are kept.
+const RECENT: usize = 500;
+
+/// What can be shown of it.
+#[derive(Clone, Default)]
+pub struct Talked {
+    /// Nodes, services and objects.
+    pub overview: Overview,
+    /// The last events; the newest last.
+    pub recent: VecDeque<Event>,
+    /// Transfers in progress.
+    pub under_way: Vec<UnderWay>,
+    /// Number of events so far, and of those in which something went wrong.
+    pub events: u64,
+    /// See [`Self::events`].
+    pub faults: u64,
+}
+
+/// Decodes the protocols found on each channel.
+pub struct Talk {
+    reading: Reading,
+}
+
+impl Default for Talk {
+    fn default() -> Self {
+        Self { reading: Reading::new(Options::default(), None, None) }
+    }
+}
+
+impl Talk {
+    /// Takes records. The first seconds of a bus are examined before they are decoded.
+    pub fn take(&mut self, records: &[TraceRecord], talked: &mut Talked) {
+        let Ok(()) = self.reading.take(records, true, |event| {
+            talked.events += 1;
+            talked.faults += u64::from(event.is_fault());
+            talked.overview.take(&event);
+            if talked.recent.len() == RECENT {
+                talked.recent.pop_front();
+            }
+            talked.recent.push_back(event);
+            Ok::<_, std::convert::Infallible>(())
+        });
+        talked.under_way = self.reading.under_way();
+    }
+}

@@ -1,0 +1,157 @@
+//! The source of the records: a thread that reads a device or plays a file, records, and fills the model.
+//!
+//! It holds the model's lock only to hand over what it has, so that the display cannot delay it; a device's
+//! buffer in the library covers slow moments.
+
+mod autobaud;
+mod device;
+mod playback;
+
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::Receiver;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use cantap::TraceRecord;
+
+use super::model::Model;
+use super::order::Order;
+use super::plan::Plan;
+use super::recorder::Recorder;
+use cantap_work::advice;
+
+/// The model, shared by the source thread and the display.
+pub type Shared = Arc<Mutex<Model>>;
+
+/// Locks the model. Nobody leaves it half changed.
+pub fn lock(model: &Mutex<Model>) -> MutexGuard<'_, Model> {
+    model.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Where records come from.
+#[derive(Clone, Debug)]
+pub enum Origin {
+    /// A device.
+    Device(Plan),
+    /// A file, played back.
+    File(PathBuf),
+}
+
+/// What the source does after an order.
+enum Then {
+    GoOn,
+    Autobaud,
+    Reopen(Plan),
+    Quit,
+}
+
+/// How long a single wait for records lasts.
+const WAIT: Duration = Duration::from_millis(20);
+/// How often to ask for the device's state, and to flush a recording.
+const FIGURES_EVERY: Duration = Duration::from_millis(500);
+
+/// Runs until [`Order::Quit`].
+pub fn run(origin: Origin, model: &Shared, orders: &Receiver<Order>) {
+    let mut source = Source { model, orders, recorder: None };
+    match origin {
+        Origin::Device(plan) => source.run_device(plan),
+        Origin::File(path) => source.run_file(&path),
+    }
+    source.stop_recording();
+}
+
+struct Source<'a> {
+    model: &'a Shared,
+    orders: &'a Receiver<Order>,
+    recorder: Option<Recorder>,
+}
+
+impl Source<'_> {
+    fn notice(&self, text: impl Into<String>) {
+        lock(self.model).notice = text.into();
+    }
+
+    /// Records first, then shows.
+    fn take(&mut self, records: &[TraceRecord]) {
+        if let Some(recorder) = &mut self.recorder
+            && let Err(error) = recorder.write(records)
+        {
+            self.recording_failed(&error);
+        }
+        lock(self.model).take(records);
+    }
+
+    fn record(&mut self, path: &Path) {
+        self.stop_recording();
+        let decoder = Arc::clone(lock(self.model).seen.signals.decoder());
+        match Recorder::create(path, &decoder) {
+            Ok(recorder) => {
+                self.recorder = Some(recorder);
+                self.show_recording();
+                let armed = lock(self.model)
+                    .recording
+                    .as_ref()
+                    .is_some_and(|recording| recording.condition.is_some());
+                self.notice(if armed {
+                    format!("armed: {}", path.display())
+                } else {
+                    format!("recording to {}", path.display())
+                });
+            }
+            Err(error) => self.notice(error.to_string()),
+        }
+    }
+
+    fn stop_recording(&mut self) {
+        if let Some(recorder) = self.recorder.take() {
+            let said = recorder.finish();
+            let mut model = lock(self.model);
+            model.recording = None;
+            model.notice = said;
+        }
+    }
+
+    fn recording_failed(&mut self, error: &anyhow::Error) {
+        self.stop_recording();
+        self.notice(match error.downcast_ref::<std::io::Error>() {
+            Some(error) => format!("recording ended: {error}; check the disk's free space"),
+            None => format!("recording ended: {}", advice::sentence(error)),
+        });
+    }
+
+    fn show_recording(&mut self) {
+        let Some(recorder) = &mut self.recorder else {
+            return;
+        };
+        match recorder.state() {
+            Ok(state) => lock(self.model).recording = Some(state),
+            Err(error) => self.recording_failed(&error.into()),
+        }
+    }
+
+    /// Follows orders that apply to every source.
+    fn follow(&mut self, order: Order) -> Then {
+        match order {
+            Order::Record(path) => self.record(&path),
+            Order::StopRecording => self.stop_recording(),
+            Order::Open(plan) => return Then::Reopen(plan),
+            Order::Autobaud => return Then::Autobaud,
+            Order::Quit => return Then::Quit,
+            Order::Send(..) => self.notice("there is no device to send with; open one with D"),
+            Order::SetPeriodic(channel, slot, _) => {
+                self.notice("there is no device to send with; open one with D");
+                lock(self.model).refused.push((channel, slot));
+            }
+            Order::Recover => self.notice("there is no device to bring back onto a bus"),
+            Order::Faster
+            | Order::Slower
+            | Order::TogglePause
+            | Order::Step
+            | Order::ToggleLoop
+            | Order::Seek(_) => {
+                self.notice("only a file can be played slower, faster or in steps");
+            }
+        }
+        Then::GoOn
+    }
+}

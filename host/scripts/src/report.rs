@@ -144,7 +144,7 @@ fn escape(text: &str) -> String {
             '"' => escaped.push_str("&quot;"),
             '\n' => escaped.push_str("&#10;"),
             '\t' => escaped.push('\t'),
-            other if other.is_control() || matches!(other, '\u{FFFE}' | '\u{FFFF}') => {
+            '\0'..='\u{1F}' | '\u{7F}'..='\u{9F}' | '\u{FFFE}' | '\u{FFFF}' => {
                 escaped.push('\u{FFFD}');
             }
             other => escaped.push(other),

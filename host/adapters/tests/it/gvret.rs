@@ -35,7 +35,9 @@ fn start(honours_listening: bool) -> (String, Receiver<TcpStream>, Receiver<Seen
             let answer: Vec<u8> = match read(&mut stream).unwrap() {
                 0 => {
                     let mut head = [0; 6];
-                    head.iter_mut().for_each(|byte| *byte = read(&mut stream).unwrap());
+                    for byte in &mut head {
+                        *byte = read(&mut stream).unwrap();
+                    }
                     let data = (0..=usize::from(head[5] & 15)).map(|_| read(&mut stream).unwrap());
                     let data: Vec<u8> = data.collect();
                     report.send(Seen::Frame([&head[..], &data].concat())).unwrap();
@@ -88,7 +90,7 @@ fn two_buses_are_heard_with_the_adapter_s_own_intervals_and_both_are_off_until_a
     assert_eq!(seen.recv().unwrap(), Seen::Buses([1 << 31; 2]));
     assert_eq!((device.hello().board.as_str(), device.hello().channels), ("gvret", 2));
     device.listen(Channel::Can1, 500_000).unwrap();
-    assert_eq!(seen.recv().unwrap(), Seen::Buses([0xE000_0000 | 500_000, 1 << 31]));
+    assert_eq!(seen.recv().unwrap(), Seen::Buses([0xE000_0000 + 500_000, 1 << 31]));
     device.listen(Channel::Can2, 250_000).unwrap();
     // Over the wrap of the clock, in pieces, with rubbish and a CAN FD frame between.
     let fd = [&[0xF1, 20, 0, 0, 0, 0, 1, 0, 0, 0, 12, 1], &[0; 12][..], &[0]].concat();

@@ -47,7 +47,7 @@ fn a_pipe_faster_than_any_bus_waits_and_loses_nothing() {
     const FRAMES: u64 = 60_000;
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("log");
-    let line = |number: u64| format!("(1700000000.{number:06}) can0 123#{:016X}\n", number);
+    let line = |number: u64| format!("(1700000000.{number:06}) can0 123#{number:016X}\n");
     std::fs::write(&path, (0..FRAMES).map(line).collect::<String>()).unwrap();
     let device = open(&format!("candump:{}", path.display()));
     device.listen(Channel::Can1, 500_000).unwrap();

@@ -142,10 +142,7 @@ fn a_diagnostic_request_reaches_a_server_of_the_virtual_vehicle() {
 
 #[test]
 fn errors_on_the_bus_reach_scripts() {
-    let source = r#"
-        let seen = 0;
-        on_error(|channel, kind| log(`${channel} ${kind}`));
-    "#;
+    let source = "on_error(|channel, kind| log(`${channel} ${kind}`));";
     let (_, _, lines) = run_on(&bench("load=10,errors=50", 1), &[script("a", source)]);
     assert!(lines.len() > 100 && lines.iter().any(|line| line.ends_with("1 stuff")), "{:?}", lines.first());
 }

@@ -143,7 +143,7 @@ impl ChannelOptions {
     }
 
     /// Gives closed channels the requested configuration and filters, without opening them: what
-    /// [`Device::save_defaults`] stores. Anything not requested stays as it was saved before.
+    /// [`cantap::Device::save_defaults`] stores. Anything not requested stays as it was saved before.
     pub fn configure(
         &self,
         device: &OpenDevice,

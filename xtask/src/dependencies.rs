@@ -64,8 +64,10 @@ fn licences<'a>(others: &'a [&Package], allowed: &'a [String]) -> impl Iterator<
     })
 }
 
+/// "Or a later version" leaves the choice of the version that is allowed.
 fn is_allowed(licence: &LicenseReq, allowed: &[String]) -> bool {
-    allowed.contains(&licence.to_string())
+    let text = licence.to_string();
+    allowed.iter().any(|allowed| allowed == text.strip_suffix('+').unwrap_or(&text))
 }
 
 /// Crates present in several versions of which more than one is not excused, and excuses that are no longer needed.
@@ -115,12 +117,15 @@ mod tests {
 
     fn faults_of(license: &str) -> Vec<String> {
         let package = package("a", "1.0.0", license);
-        licences(&[&package], &["MIT".to_owned(), "Apache-2.0 WITH LLVM-exception".to_owned()]).collect()
+        licences(&[&package], &["MIT", "MPL-2.0", "Apache-2.0 WITH LLVM-exception"].map(str::to_owned))
+            .collect()
     }
 
     #[test]
     fn a_licence_is_allowed_where_each_part_that_must_hold_is() {
-        for good in ["MIT", "GPL-3.0-only OR MIT", "MIT/Apache-2.0", "Apache-2.0 WITH LLVM-exception"] {
+        for good in
+            ["MIT", "MPL-2.0+", "GPL-3.0-only OR MIT", "MIT/Apache-2.0", "Apache-2.0 WITH LLVM-exception"]
+        {
             assert_eq!(faults_of(good), Vec::<String>::new(), "{good}");
         }
         for bad in ["GPL-3.0-only", "MIT AND BSD-3-Clause", "Apache-2.0", "as you like"] {

@@ -62,7 +62,7 @@ impl Memory {
     }
 
     /// Frames as text, and errors as their meaning.
-    fn told(&self) -> Vec<String> {
+    fn written(&self) -> Vec<String> {
         let told = self.told.lock().unwrap();
         let text = |raw: &RawFrame| {
             if let Some(frame) = frame_of(raw) {
@@ -115,7 +115,7 @@ impl Bridged {
             assert!(
                 Instant::now() < deadline,
                 "{what}: {:?}",
-                self.memories.each_ref().map(|memory| memory.told())
+                self.memories.each_ref().map(|memory| memory.written())
             );
             let batch = self.records.next_batch(Duration::from_millis(10)).unwrap().unwrap();
             self.lanes.iter().for_each(|lane| lane.hear(&batch).unwrap());
@@ -136,14 +136,14 @@ fn programs_hear_both_buses_and_errors_as_error_frames() {
     let mut bridged = Bridged::new("load=60,errors=5", Mode::ListenOnly, false);
     bridged.until("frames and errors", |memories| {
         memories.iter().all(|memory| {
-            let told = memory.told();
+            let told = memory.written();
             told.len() > 200 && told.iter().any(|text| text.starts_with("BusError"))
         })
     });
     // They come as the bus had them, and nothing twice: programs have exactly what the lanes got.
     let heard: u64 = bridged.lanes.iter().map(|lane| lane.counts.heard.load(Ordering::Relaxed)).sum();
     let frames =
-        bridged.memories.iter().flat_map(|memory| memory.told()).filter(|text| text.contains('#')).count();
+        bridged.memories.iter().flat_map(|memory| memory.written()).filter(|text| text.contains('#')).count();
     assert_eq!(heard, frames as u64);
 }
 
@@ -163,9 +163,9 @@ fn what_programs_write_is_sent_in_order_on_both_channels_and_not_shown_twice() {
     // Another sender's frame, through the same device, is passed on.
     let frame = TxFrame { tag: 1 << 30, frame: "321#99".parse().unwrap(), at_ticks: None };
     bridged.device.send(Channel::Can1, &[frame]).unwrap();
-    bridged.until("the other's frame", |memories| !memories[0].told().is_empty());
-    assert_eq!(bridged.memories[0].told(), ["321#99"]);
-    assert!(bridged.memories[1].told().is_empty());
+    bridged.until("the other's frame", |memories| !memories[0].written().is_empty());
+    assert_eq!(bridged.memories[0].written(), ["321#99"]);
+    assert!(bridged.memories[1].written().is_empty());
 }
 
 /// If the kernel shows a written frame to nobody, its confirmation does, in its place among the received frames.
@@ -175,8 +175,8 @@ fn confirmations_are_the_echo_where_the_kernel_makes_none() {
     for frame in ["123#01", "123#02", "7FF#R3"] {
         bridged.memories[0].write(frame);
     }
-    bridged.until("the echo", |memories| memories[0].told().len() == 3);
-    assert_eq!(bridged.memories[0].told(), ["123#01", "123#02", "7FF#R3"]);
+    bridged.until("the echo", |memories| memories[0].written().len() == 3);
+    assert_eq!(bridged.memories[0].written(), ["123#01", "123#02", "7FF#R3"]);
 }
 
 #[test]
@@ -185,8 +185,8 @@ fn a_channel_that_only_listens_sends_nothing_and_programs_are_told_of_each_frame
     for _ in 0..3 {
         bridged.memories[0].write("123#11");
     }
-    bridged.until("the refusals", |memories| memories[0].told().len() == 3);
-    assert_eq!(bridged.memories[0].told(), vec![not_sent(); 3]);
+    bridged.until("the refusals", |memories| memories[0].written().len() == 3);
+    assert_eq!(bridged.memories[0].written(), vec![not_sent(); 3]);
     assert_eq!(bridged.sent(), [0, 0]);
 }
 
@@ -196,7 +196,7 @@ fn frames_written_without_a_device_are_refused_and_never_sent_later() {
     let mut bridged = Bridged::new("load=0", Mode::Normal, false);
     bridged.sender.use_device(None);
     bridged.memories[0].write("123#11");
-    bridged.until("the refusal", |memories| memories[0].told() == [not_sent()]);
+    bridged.until("the refusal", |memories| memories[0].written() == [not_sent()]);
     let device = Arc::clone(&bridged.device);
     bridged.sender.use_device(Some(device));
     bridged.memories[0].write("123#22");
@@ -224,10 +224,10 @@ fn a_bus_on_which_nothing_leaves_does_not_hold_up_the_other() {
     bridged.until("the first channel's are sent", |_| lanes[0].counts.sent.load(Ordering::Relaxed) == 500);
     // On the full one, the device refuses a frame, and its program is informed.
     bridged.memories[1].write("222#");
-    bridged.until("the refusal", |memories| memories[1].told().contains(&not_sent()));
+    bridged.until("the refusal", |memories| memories[1].written().contains(&not_sent()));
 }
 
-fn heard(frame: &str) -> TraceRecord {
+fn received(frame: &str) -> TraceRecord {
     let frame = frame.parse::<cantap::Frame>().unwrap().into();
     let event = TraceEvent::Frame { frame, direction: cantap::Direction::Rx, late: false };
     TraceRecord { time_ns: 0, channel: 1, event }
@@ -237,14 +237,14 @@ fn heard(frame: &str) -> TraceRecord {
 fn what_an_interface_does_not_take_is_counted_and_told_in_place() {
     let memory = Arc::new(Memory::default());
     let lane = Lane::new(Channel::Can1, "can0", Box::new(Arc::clone(&memory)), Known { echoes: false });
-    lane.hear(&[heard("101#")]).unwrap();
+    lane.hear(&[received("101#")]).unwrap();
     memory.is_full.store(true, Ordering::Relaxed);
-    lane.hear(&[heard("102#"), heard("103#")]).unwrap();
-    lane.hear(&[heard("104#")]).unwrap();
+    lane.hear(&[received("102#"), received("103#")]).unwrap();
+    lane.hear(&[received("104#")]).unwrap();
     memory.is_full.store(false, Ordering::Relaxed);
-    lane.hear(&[heard("105#")]).unwrap();
+    lane.hear(&[received("105#")]).unwrap();
     let lost = TraceEvent::Lost { stage: Some(LossStage::Host), count: 3, at_least: false };
-    assert_eq!(memory.told(), ["101#".to_owned(), format!("{lost:?}"), "105#".to_owned()]);
+    assert_eq!(memory.written(), ["101#".to_owned(), format!("{lost:?}"), "105#".to_owned()]);
     assert_eq!(lane.counts.heard.load(Ordering::Relaxed), 2);
     assert_eq!(lane.counts.undelivered.load(Ordering::Relaxed), 3);
 }
@@ -257,16 +257,17 @@ fn frames_heard_and_frames_counted_are_all_there_were() {
     let of_frames = |event| TraceRecord { time_ns: 0, channel: 1, event };
     let error = of_frames(TraceEvent::BusError { kind: None, counters: None });
     let lost = of_frames(TraceEvent::Lost { stage: Some(LossStage::Queue), count: 10, at_least: false });
-    lane.hear(&[heard("101#"), lost, heard("102#"), heard("103#"), error, heard("104#")]).unwrap();
+    lane.hear(&[received("101#"), lost, received("102#"), received("103#"), error, received("104#")])
+        .unwrap();
     let counts = || {
         [&lane.counts.heard, &lane.counts.lost, &lane.counts.undelivered]
             .map(|count| count.load(Ordering::Relaxed))
     };
     assert_eq!(counts(), [2, 10, 2]);
     // What was not taken, including the error, is reported first.
-    lane.hear(&[heard("105#")]).unwrap();
+    lane.hear(&[received("105#")]).unwrap();
     let told = TraceEvent::Lost { stage: Some(LossStage::Host), count: 3, at_least: false };
-    assert_eq!(memory.told()[3..], [format!("{told:?}"), "105#".to_owned()]);
+    assert_eq!(memory.written()[3..], [format!("{told:?}"), "105#".to_owned()]);
     assert_eq!(counts(), [3, 10, 2]);
     assert!(!lane.counts.lost_more.load(Ordering::Relaxed));
     lane.hear(&[of_frames(TraceEvent::GAP)]).unwrap();
@@ -280,7 +281,7 @@ fn what_the_kernel_throws_away_of_programs_frames_is_counted() {
     bridged.memories[0].write("123#");
     let lanes = Arc::clone(&bridged.lanes);
     bridged.until("it is told", |memories| {
-        memories[0].told() == [not_sent()] && lanes[0].counts.sent.load(Ordering::Relaxed) == 1
+        memories[0].written() == [not_sent()] && lanes[0].counts.sent.load(Ordering::Relaxed) == 1
     });
     assert_eq!(lanes[0].counts.not_sent.load(Ordering::Relaxed), 7);
 }

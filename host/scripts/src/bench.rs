@@ -49,15 +49,7 @@ impl Bench {
         on_message: &mut dyn FnMut(Message),
         goes_on: &mut dyn FnMut() -> bool,
     ) -> Result<Report, ScriptError> {
-        if scripts.is_empty() {
-            return Err(ScriptError::None);
-        }
-        let seeds = (1..).map(|number: u64| self.seed.wrapping_mul(0x9E37_79B9).wrapping_add(number));
-        let nodes: Result<Vec<Node>, _> = scripts
-            .iter()
-            .zip(seeds)
-            .map(|(script, seed)| Node::start(script, &self.decoder, seed))
-            .collect();
+        let nodes = Node::start_all(scripts, &self.decoder, self.seed)?;
         let mut options = self.options.clone();
         let buses = [0, 1].map(|channel| {
             let bitrate_bps = options.bitrate_of_bus(channel).unwrap_or(self.bitrates_bps[channel]);
@@ -68,7 +60,7 @@ impl Bench {
             }
         });
         let mut run = Run {
-            nodes: nodes?,
+            nodes,
             buses,
             repeats: Vec::new(),
             results: Results::new(on_message),

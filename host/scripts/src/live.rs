@@ -61,18 +61,10 @@ impl Live {
         on_message: &mut dyn FnMut(Message),
         goes_on: &mut dyn FnMut() -> bool,
     ) -> Result<Report, LiveError> {
-        if scripts.is_empty() {
-            return Err(ScriptError::None.into());
-        }
-        let seeds = (1..).map(|number: u64| self.seed.wrapping_mul(0x9E37_79B9).wrapping_add(number));
-        let nodes: Result<Vec<Node>, _> = scripts
-            .iter()
-            .zip(seeds)
-            .map(|(script, seed)| Node::start(script, &self.decoder, seed))
-            .collect();
+        let nodes = Node::start_all(scripts, &self.decoder, self.seed)?;
         let mut run = Run {
             device,
-            nodes: nodes?,
+            nodes,
             stream: Stream::new(device),
             under_way: BTreeMap::new(),
             slots: BTreeMap::new(),

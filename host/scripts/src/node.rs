@@ -130,8 +130,21 @@ pub struct Node {
 }
 
 impl Node {
+    /// Starts all scripts of a run, each with random numbers of its own.
+    pub fn start_all(
+        scripts: &[Script],
+        decoder: &Arc<Decoder>,
+        seed: u64,
+    ) -> Result<Vec<Self>, ScriptError> {
+        if scripts.is_empty() {
+            return Err(ScriptError::None);
+        }
+        let seeds = (1..).map(|number: u64| seed.wrapping_mul(0x9E37_79B9).wrapping_add(number));
+        scripts.iter().zip(seeds).map(|(script, seed)| Self::start(script, decoder, seed)).collect()
+    }
+
     /// Starts its thread; its first turn is at time 0.
-    pub fn start(script: &Script, decoder: &Arc<Decoder>, seed: u64) -> Result<Self, ScriptError> {
+    fn start(script: &Script, decoder: &Arc<Decoder>, seed: u64) -> Result<Self, ScriptError> {
         let has_tests = !script.tests()?.is_empty();
         let (to, resume) = sync_channel(1);
         let (turn, from) = sync_channel(1);

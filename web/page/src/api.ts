@@ -1,0 +1,268 @@
+// What the page asks the engine, and what the engine answers. The engine (`web/engine`) is Rust compiled to WebAssembly and runs in a
+// worker; each request is one of `Requests`, and each answer has the type beside it. Nothing here depends on how the two are joined.
+//
+// Times are seconds since the trace's first record, as float64 (exact to well below a microsecond for any trace of a year). The start in
+// UTC stands in `Summary`. Channels have the numbers that the trace gives them. Identifiers are numbers, and `extended` says their kind.
+
+/** Losses, per stage of the law of counting. `atLeast`: the stage could not count exactly. */
+export interface Loss {
+  stage: string;
+  channel: number | null;
+  count: number;
+  atLeast: boolean;
+}
+
+export interface ChannelSummary {
+  channel: number;
+  frames: number;
+  sent: number;
+  remote: number;
+  errors: number;
+  /** Bit per second; null if neither the trace nor the user gave it. Without it there is no bus load. */
+  bitrate: number | null;
+  /** 0 to 1, over the whole trace. */
+  load: number | null;
+}
+
+export interface Summary {
+  name: string;
+  format: string;
+  /** Start in UTC, nanoseconds since 1970 as a decimal string; null if the trace has no date. */
+  startUtcNs: string | null;
+  /** Seconds from the first record to the last. */
+  duration: number;
+  frames: number;
+  /** Records of all kinds: rows of the trace. */
+  records: number;
+  channels: ChannelSummary[];
+  losses: Loss[];
+  /** What of the file was not read, in words; with a count. Empty if everything was read. */
+  issues: { text: string; count: number }[];
+  /** True while more of the file (or of a live source) is still to come. */
+  growing: boolean;
+  /** 0 to 1 of the file's bytes read so far; null for a live source. */
+  progress: number | null;
+}
+
+export type RowKind = 'data' | 'remote' | 'fd' | 'error' | 'state' | 'lost' | 'other';
+
+/** One row of the trace. */
+export interface Row {
+  /** Number of the record in the whole trace, from 0. */
+  index: number;
+  time: number;
+  /** The stamp is an upper bound, not exact. */
+  late: boolean;
+  channel: number | null;
+  kind: RowKind;
+  id: number | null;
+  extended: boolean;
+  dlc: number | null;
+  /** Data bytes as upper-case hex without blanks. */
+  data: string;
+  sent: boolean;
+  /** What the record says if it is no frame (a loss, a state, an error), in words. */
+  text: string;
+  /** Name of the message, if a database knows it. */
+  message: string | null;
+}
+
+/** One identifier on one channel: a row of the fixed view. */
+export interface IdRow {
+  channel: number;
+  id: number;
+  extended: boolean;
+  message: string | null;
+  count: number;
+  /** Period in seconds: median, smallest, largest. Null with fewer than two frames. */
+  period: { median: number; min: number; max: number } | null;
+  lastTime: number;
+  lastData: string;
+  /** For each bit of the data (byte 0 bit 7 first), the time it last changed; NaN if never. */
+  changed: Float64Array;
+  signals: SignalValue[];
+}
+
+export interface SignalValue {
+  name: string;
+  /** Null: not in this frame (multiplexed away, or too short). */
+  value: number | null;
+  /** As it is shown: shortest number that reads back, or the value's text. */
+  text: string;
+  unit: string;
+}
+
+export interface MessageInfo {
+  /** Key to name it in other requests. */
+  key: number;
+  name: string;
+  channel: number | null;
+  id: number;
+  extended: boolean;
+  length: number;
+  count: number;
+  comment: string;
+  signals: SignalInfo[];
+}
+
+export interface SignalInfo {
+  /** Key to name it in other requests: stable while the database does not change. */
+  key: number;
+  name: string;
+  unit: string;
+  comment: string;
+  /** Limits as the database has them; null if it gives none. */
+  min: number | null;
+  max: number | null;
+  /** Texts of values, if it has any: then a digital lane serves better than a line. */
+  texts: { value: number; text: string }[];
+  startBit: number;
+  bitLength: number;
+  littleEndian: boolean;
+  signed: boolean;
+  float: boolean;
+  factor: number;
+  offset: number;
+  /** Empty: always there. Otherwise e.g. `m3`, as a DBC writes it; `M` for the multiplexer itself. */
+  multiplex: string;
+}
+
+/**
+ * A signal over time, thinned to columns so that no single value is lost: each column holds the first, smallest, largest and last value
+ * of its stretch. All arrays have the same length; a column without a value is left out.
+ */
+export interface Series {
+  /** Time of the column's first value. */
+  time: Float64Array;
+  /** Time of its last value. */
+  end: Float64Array;
+  first: Float64Array;
+  min: Float64Array;
+  max: Float64Array;
+  last: Float64Array;
+  /** Values behind the columns. */
+  values: number;
+  /** True if each column is exactly one value: the picture is exact. */
+  exact: boolean;
+}
+
+/** A stretch in which frames are known to be missing, or the device was off the bus. */
+export interface Gap {
+  from: number;
+  to: number;
+  channel: number | null;
+  stage: string;
+  count: number;
+  atLeast: boolean;
+}
+
+export interface BitGrid {
+  /** Bytes that were seen for this identifier at most. */
+  length: number;
+  /** For each bit (byte 0 bit 7 first): how often it changed in the window. */
+  flips: Uint32Array;
+  /** How often it was 1. */
+  ones: Uint32Array;
+  /** Frames in the window. */
+  frames: number;
+  signals: SignalInfo[];
+}
+
+export interface Finding {
+  severity: 'info' | 'warning' | 'error';
+  /** What was found, in a sentence. */
+  text: string;
+  /** Where to look: seconds, and an identifier. */
+  time: number | null;
+  channel: number | null;
+  id: number | null;
+  extended: boolean;
+}
+
+/** A conversation's event: a request, an answer, an announcement. */
+export interface ProtocolEvent {
+  time: number;
+  end: number;
+  channel: number;
+  protocol: string;
+  kind: string;
+  from: string;
+  to: string;
+  text: string;
+  failed: boolean;
+}
+
+/** A DBC's signal as the user draws it; see `editSignal`. */
+export interface SignalEdit {
+  channel: number;
+  id: number;
+  extended: boolean;
+  messageName: string;
+  name: string;
+  startBit: number;
+  bitLength: number;
+  littleEndian: boolean;
+  signed: boolean;
+  factor: number;
+  offset: number;
+  unit: string;
+  texts: { value: number; text: string }[];
+}
+
+/** Each request: what it takes, and what it answers. A refused one answers `{ error: string }`, which says what to do next. */
+export interface Requests {
+  /** Takes a file whole, or its first piece if `more` follows. The format is recognised by name and content. */
+  open: { in: { name: string; bytes: Uint8Array; more: boolean; size: number | null }; out: Summary };
+  /** The next piece of the file that `open` began. */
+  append: { in: { bytes: Uint8Array; more: boolean }; out: Summary };
+  summary: { in: Record<string, never>; out: Summary };
+  bitrate: { in: { channel: number; bitrate: number }; out: Summary };
+  /** Adds a database (DBC, KCD, SYM, ARXML, DBF: recognised by name and content), for one channel or all. */
+  database: { in: { name: string; bytes: Uint8Array; channel: number | null }; out: { messages: number; signals: number; warnings: string[] } };
+  /** All messages: those of databases, and whether they occur. */
+  messages: { in: Record<string, never>; out: MessageInfo[] };
+  /**
+   * A filter in cantap's syntax (docs/grammar.md; an empty text: everything), `search` as of `cantap search`. Counts, and names the view
+   * that `rows` reads.
+   */
+  filter: { in: { filter: string }; out: { view: number; rows: number } };
+  rows: { in: { view: number; from: number; count: number }; out: Row[] };
+  /** The row of a view at or after a time. */
+  rowAt: { in: { view: number; time: number }; out: { row: number } };
+  /** The next row after `from` (or before, backwards) whose frame matches a filter or whose data has these bytes. */
+  find: { in: { view: number; text: string; from: number; backwards: boolean }; out: { row: number | null } };
+  /** A row's signals. */
+  decode: { in: { index: number }; out: SignalValue[] };
+  /** The fixed view at a time (Infinity: the end). */
+  ids: { in: { at: number }; out: IdRow[] };
+  bits: { in: { channel: number; id: number; extended: boolean; from: number; to: number }; out: BitGrid };
+  /** At most `columns` columns between the times. */
+  series: { in: { signal: number; from: number; to: number; columns: number }; out: Series };
+  /** A whole field of an identifier as a signal that no database has. */
+  rawSeries: { in: SignalEdit & { from: number; to: number; columns: number }; out: Series };
+  /** 0 to 1 per column. */
+  load: { in: { channel: number; from: number; to: number; columns: number }; out: { time: Float64Array; load: Float64Array } };
+  gaps: { in: { from: number; to: number }; out: Gap[] };
+  /** Periods of one identifier: a histogram, `counts[i]` between `edges[i]` and `edges[i + 1]` seconds. */
+  periods: {
+    in: { channel: number; id: number; extended: boolean };
+    out: { edges: Float64Array; counts: Uint32Array; min: number; max: number; mean: number; deviation: number };
+  };
+  conversations: { in: { from: number; to: number; limit: number }; out: { events: ProtocolEvent[]; total: number } };
+  findings: { in: Record<string, never>; out: Finding[] };
+  /** Adds or changes a signal of the user's own database; undo and redo are the page's, by the whole text. */
+  editSignal: { in: SignalEdit; out: { dbc: string } };
+  /** Replaces the user's own database by this text. */
+  setOwnDatabase: { in: { dbc: string }; out: { messages: number; signals: number; warnings: string[] } };
+  /** What a view holds between the times, in a format's name (`candump`, `asc`, `trc`, `csv`, `blf` …), ready to be saved. */
+  export: { in: { view: number; format: string; from: number; to: number }; out: { name: string; bytes: Uint8Array; omitted: string[] } };
+  formats: { in: Record<string, never>; out: { name: string; extension: string; about: string }[] };
+}
+
+export type Answer<K extends keyof Requests> = Requests[K]['out'];
+
+/** The engine, wherever it runs. */
+export interface Engine {
+  ask<K extends keyof Requests>(request: K, parameters: Requests[K]['in']): Promise<Answer<K>>;
+  close(): void;
+}

@@ -1,7 +1,7 @@
 //! Finds files of one crate that import each other in a circle, and public types of a library that share a name.
 //!
 //! Parses the sources to find which file names a path into which other. A `pub use` alone is a front door, not an import; a path
-//! through one leads to where the item is defined. Imports by tests alone do not count, and neither do methods, which name no file.
+//! through one, or through what another module imports, or through all names of a module (`*`), leads to where the item is defined. Imports by tests alone do not count, and neither do methods, which name no file.
 //! Inside a macro's arguments, which have no grammar, only paths from `crate`, `self` or `super` are seen.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -54,8 +54,12 @@ struct Crate {
     files: BTreeMap<Module, PathBuf>,
     /// The paths that each module names.
     named: Vec<(Module, Paths)>,
-    /// Names that a module re-exports with `pub use`, and where they come from.
+    /// Names that a module imports or re-exports, and where they come from.
     doors: BTreeMap<(Module, String), Module>,
+    /// Modules of which a module imports or re-exports all names.
+    wide_doors: BTreeMap<Module, Vec<Module>>,
+    /// Names that a module defines.
+    defined: BTreeSet<(Module, String)>,
     /// Public types by name: the files that define one.
     types: BTreeMap<String, Vec<PathBuf>>,
 }
@@ -87,6 +91,7 @@ impl Crate {
                 Item::Use(used) => self.read_use(used, &module, &mut named),
                 other => {
                     self.note_type(other, file);
+                    self.defined.extend(name(other).map(|name| (module.clone(), name)));
                     named.visit_item(other);
                 }
             }
@@ -110,9 +115,12 @@ impl Crate {
     fn read_use(&mut self, used: &ItemUse, module: &Module, named: &mut Paths) {
         let public = !matches!(used.vis, Visibility::Inherited);
         for (path, name) in leaves(&used.tree) {
-            if public {
-                self.doors.insert((module.clone(), name), path);
+            if name == "*" {
+                self.wide_doors.entry(module.clone()).or_default().push(path.clone());
             } else {
+                self.doors.insert((module.clone(), name), path.clone());
+            }
+            if !public {
                 named.0.insert(path);
             }
         }
@@ -163,15 +171,57 @@ impl Crate {
                 at = child;
                 continue;
             }
-            if let Some(door) = self.doors.get(&(at.clone(), segment.clone()))
-                && depth < 8
+            if depth < 8
+                && let Some(file) = self.through_a_door(&at, segment, &path[n + 1..], depth)
             {
-                let through = [door.clone(), path[n + 1..].to_vec()].concat();
-                return self.file_of(&at, &through, depth + 1);
+                return file;
             }
             break;
         }
         self.files.get(&at)
+    }
+
+    /// Where a name leads that this module has from elsewhere: to a file of this crate, or out of it. `None` if it has it from nowhere.
+    fn through_a_door(
+        &self,
+        at: &Module,
+        name: &str,
+        rest: &[String],
+        depth: usize,
+    ) -> Option<Option<&PathBuf>> {
+        let item = (at.clone(), name.to_owned());
+        if self.defined.contains(&item) {
+            return None;
+        }
+        if let Some(door) = self.doors.get(&item) {
+            return Some(self.file_of(at, &[door, rest].concat(), depth + 1));
+        }
+        let modules = self.wide_doors.get(at)?.iter().filter_map(|door| self.module_of(at, door));
+        modules
+            .filter(|module| *module != *at)
+            .find(|module| {
+                let item = (module.clone(), name.to_owned());
+                self.defined.contains(&item)
+                    || self.doors.contains_key(&item)
+                    || self.files.contains_key(&[module.clone(), vec![name.to_owned()]].concat())
+            })
+            .map(|module| self.descend(module, &[&[name.to_owned()], rest].concat(), depth + 1))
+    }
+
+    /// The module of this crate that a path names.
+    fn module_of(&self, from: &Module, path: &[String]) -> Option<Module> {
+        let mut module = match path.first()?.as_str() {
+            "crate" => Vec::new(),
+            _ => from.clone(),
+        };
+        for segment in path {
+            match segment.as_str() {
+                "crate" | "self" => {}
+                "super" => drop(module.pop()?),
+                name => module.push(name.to_owned()),
+            }
+        }
+        self.files.contains_key(&module).then_some(module)
     }
 
     /// Which file imports which.
@@ -256,6 +306,22 @@ fn attributes(item: &Item) -> &[Attribute] {
         Item::Use(item) => &item.attrs,
         _ => &[],
     }
+}
+
+/// The name that an item defines.
+fn name(item: &Item) -> Option<String> {
+    let name = match item {
+        Item::Const(item) => &item.ident,
+        Item::Enum(item) => &item.ident,
+        Item::Fn(item) => &item.sig.ident,
+        Item::Static(item) => &item.ident,
+        Item::Struct(item) => &item.ident,
+        Item::Trait(item) => &item.ident,
+        Item::Type(item) => &item.ident,
+        Item::Union(item) => &item.ident,
+        _ => return None,
+    };
+    Some(name.unraw().to_string())
 }
 
 /// Test-only items, and files that `#[path]` takes from elsewhere, which belong to another crate.
@@ -343,11 +409,15 @@ impl Paths {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::atomic::{AtomicU32, Ordering};
+
     use super::*;
 
     /// The faults found in a crate made of these files.
     fn faults(files: &[(&str, &str)]) -> Vec<String> {
-        let folder = std::env::temp_dir().join(format!("circles-{}", std::process::id()));
+        static FOLDERS: AtomicU32 = AtomicU32::new(0);
+        let number = FOLDERS.fetch_add(1, Ordering::Relaxed);
+        let folder = std::env::temp_dir().join(format!("circles-{}-{number}", std::process::id()));
         for (name, text) in files {
             let file = folder.join(name);
             fs::create_dir_all(file.parent().unwrap()).unwrap();
@@ -356,6 +426,31 @@ mod tests {
         let krate = Crate::read(&folder.join("lib.rs")).unwrap();
         fs::remove_dir_all(&folder).unwrap();
         krate.circles().into_iter().chain(krate.namesakes()).collect()
+    }
+
+    #[test]
+    fn a_circle_is_found_through_all_names_of_a_module_and_through_what_another_imports() {
+        for (door, a) in [
+            (
+                "mod c; pub struct Two(crate::One); pub use c::*;",
+                "pub struct One; fn f() -> crate::b::Three { todo!() }",
+            ),
+            (
+                "mod c; use c::Three; pub struct Two(crate::One, Three);",
+                "pub struct One; fn f() { use crate::b::Three; }",
+            ),
+        ] {
+            let files = [
+                ("lib.rs", "pub mod a; pub mod b; pub use a::*;"),
+                ("a.rs", a),
+                ("b/mod.rs", door),
+                ("b/c.rs", "use crate::One; pub struct Three(One);"),
+            ];
+            let found = faults(&files);
+            assert_eq!(found.len(), 1, "{found:?}");
+            assert!(found[0].contains("a.rs imports"), "{found:?}");
+            assert!(found[0].contains("c.rs imports"), "{found:?}");
+        }
     }
 
     #[test]

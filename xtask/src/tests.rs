@@ -14,7 +14,7 @@ pub fn build(shell: &Shell) -> Result<()> {
     Ok(cargo_test(shell).arg("--no-run").run()?)
 }
 
-/// Runs them all, even if one fails; those on the emulated board use the default board's firmware, and are ignored without it. Those that
+/// Runs them all, even if one fails; those on the emulated board use the default board's firmware, and are left out without it: they are marked as ignored. Those that
 /// concern every board use `boards`, the ones that were built. If there are peers, none may be skipped but those left out on purpose.
 pub fn run(shell: &Shell, peers: Option<&Peers>, boards: &[Board]) -> Result<()> {
     let names: Vec<&str> = boards.iter().map(|board| board.name()).collect();
@@ -25,8 +25,21 @@ pub fn run(shell: &Shell, peers: Option<&Peers>, boards: &[Board]) -> Result<()>
             .env("CANTAP_REQUIRE_PEERS", "1")
             .env("CANTAP_WITHOUT_PEERS", peers.left_out.join(" "));
     }
+    if Board::ALL[0].elf().exists() {
+        test = test
+            .args(["--", "--include-ignored"])
+            .args(OTHERWISE_IGNORED.iter().flat_map(|name| ["--skip", name]));
+    }
     Ok(test.run()?)
 }
+
+/// Tests that are ignored for a reason other than that they run the firmware.
+const OTHERWISE_IGNORED: [&str; 2] = [
+    // Run by another test, in a terminal of its own.
+    "a_display_that_panics",
+    // A measurement: `cargo xtask bench graph`.
+    "redraws_of_five_million_values",
+];
 
 fn cargo_test(shell: &Shell) -> Cmd<'_> {
     let elf = Board::ALL[0].elf();

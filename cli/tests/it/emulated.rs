@@ -90,7 +90,7 @@ fn conversation() -> Vec<Command> {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn both_devices_answer_alike() {
     let [native, emulated] = both("load=0");
     let facts = |hello: &Hello| {
@@ -141,7 +141,7 @@ fn capture(device: &Device) -> Vec<(u8, Frame, i64)> {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn both_devices_capture_a_log_alike() {
     let directory = tempfile::tempdir().unwrap();
     let log = directory.path().join("both.log");
@@ -174,7 +174,7 @@ fn both_devices_capture_a_log_alike() {
 /// The whole way: the host's stream, the emulated USB, the firmware's alarm, the bus. Time is slowed down, so that a busy
 /// machine does not act as a slow host.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_replay_keeps_the_traces_spacing_and_order_on_the_elf() {
     const MEGABIT: u32 = 1_000_000;
     const CYCLES_PER_US: f64 = 144.0;

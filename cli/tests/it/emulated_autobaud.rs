@@ -72,7 +72,7 @@ fn search_on(channel: Channel, options: &str) -> Found {
 
 /// Each board has its receive pins in different places, which its firmware knows.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn every_board_hears_both_of_its_buses() {
     for (name, ..) in common::boards() {
         let elf = common::elf().with_file_name(format!("cantap-{name}.elf"));
@@ -87,7 +87,7 @@ fn every_board_hears_both_of_its_buses() {
 /// Every CiA rate and the others in common use, with frames twenty milliseconds apart. The emulation is slowed down so
 /// that a busy machine does not act as a slow host.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn fifty_frames_a_second_are_enough_to_find_any_common_rate_within_a_second() {
     let mut longest: f64 = 0.0;
     for (at, bitrate) in COMMON_BPS.into_iter().enumerate() {
@@ -103,7 +103,7 @@ fn fifty_frames_a_second_are_enough_to_find_any_common_rate_within_a_second() {
 /// One second, or two frames. It once found none of these while it guessed. The emulation is slowed down so that a busy machine does
 /// not act as a slow host.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_bus_that_is_nearly_silent_is_found_in_little_more_than_a_second() {
     for (at, bitrate) in [500_000, 125_000, 1_000_000, 10_000].into_iter().enumerate() {
         for burst in ["3/1s", "1/500ms"] {
@@ -117,7 +117,7 @@ fn a_bus_that_is_nearly_silent_is_found_in_little_more_than_a_second() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_busy_bus_is_found_whatever_its_frames_and_however_slow_the_memories() {
     for (at, bitrate) in COMMON_BPS.into_iter().enumerate() {
         let (kind, load) = (["mix", "std0", "ext8", "rtr", "std8"][at % 5], [50, 100, 90][at % 3]);
@@ -129,7 +129,7 @@ fn a_busy_bus_is_found_whatever_its_frames_and_however_slow_the_memories() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_third_of_the_frames_destroyed_hinders_nothing() {
     for seed in 1..=6 {
         let bitrate = [500_000, 1_000_000, 250_000][seed % 3];
@@ -141,7 +141,7 @@ fn a_third_of_the_frames_destroyed_hinders_nothing() {
 
 /// The measurement runs below capture, which interrupts it: at 1 Mbit/s some frames are lost to it, and none to capture.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_full_channel_beside_it_loses_nothing_and_hinders_nothing() {
     for timing in ["best", "worst"] {
         for channel in Channel::ALL {
@@ -153,7 +153,7 @@ fn a_full_channel_beside_it_loses_nothing_and_hinders_nothing() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn odd_rates_are_named_right() {
     for (at, bitrate) in
         [33_333, 47_619, 83_333, 200_000, 307_692, 333_333, 400_000, 480_000, 666_667].into_iter().enumerate()
@@ -164,7 +164,7 @@ fn odd_rates_are_named_right() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_rate_that_the_clock_does_not_reach_is_named_and_is_no_success() {
     // 36 MHz / 58.5, 16 MHz / 63 and / 65.
     for (at, bitrate) in [615_384, 253_968, 246_154].into_iter().enumerate() {
@@ -178,7 +178,7 @@ fn a_rate_that_the_clock_does_not_reach_is_named_and_is_no_success() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn silence_destroyed_frames_and_a_sender_without_an_audience_are_told_apart() {
     let within = |options| search_beside(Channel::Can2, options, Duration::from_millis(400), None).outcome;
     assert_eq!(within("load=0"), Outcome::NoTraffic);

@@ -459,7 +459,7 @@ fn a_tshark_that_is_killed_and_one_that_filters_leave_nothing_behind() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn tshark_captures_two_saturated_channels_of_the_emulated_board() {
     let _turn = cantap_testing::process::turn();
     let Some(tshark) = Tshark::install() else { return };

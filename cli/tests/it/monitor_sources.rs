@@ -251,7 +251,7 @@ fn a_channel_that_is_bus_off_is_brought_back_from_inside() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn the_emulated_board_is_watched_sent_with_and_recorded() {
     let elf = firmware::elf();
     let folder = tempfile::tempdir().unwrap();

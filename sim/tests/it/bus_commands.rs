@@ -30,7 +30,7 @@ fn connected_under(bound: Bound) -> Rig {
 
 /// Longer emulation would add nothing: these are 100 replies at different phases of the other channel's traffic.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_reply_starts_within_50_us_even_with_the_other_channel_full() {
     for bound in Bound::ALL {
         let mut rig = connected_under(bound);
@@ -45,7 +45,7 @@ fn a_reply_starts_within_50_us_even_with_the_other_channel_full() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn periodic_frames_keep_their_period() {
     for bound in Bound::ALL {
         let mut rig = connected_under(bound);
@@ -62,7 +62,7 @@ fn periodic_frames_keep_their_period() {
 /// 6150 frames a second on each bus, 78 % of it: none is left out, and one that is due together with others waits for some of them, 0.13 ms
 /// each.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn all_periodic_entries_of_both_channels_keep_their_periods() {
     let mut rig = connected();
     join(&mut rig, &[Can1, Can2]).unwrap();
@@ -77,7 +77,7 @@ fn all_periodic_entries_of_both_channels_keep_their_periods() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn hardware_filters_accept_and_reject() {
     let mut rig = connected();
     let filter = |extended, kind, id, mask| Filter { extended, kind, id, mask };
@@ -125,7 +125,7 @@ fn hardware_filters_accept_and_reject() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn every_cia_rate_is_heard_and_its_double_is_not() {
     let mut rig = connected();
     let mut added = false;

@@ -40,7 +40,7 @@ fn led_changes(rig: &mut Rig, ms: u64) -> usize {
 
 /// An overflow would fault, so a quarter of the stack is kept in reserve for what these tests do not reach.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn the_stack_is_never_used_beyond_three_quarters() {
     let mut rig = connected(common::setup());
     let filters: Vec<Filter> = (0..MAX_FILTERS as u32)
@@ -72,7 +72,7 @@ fn the_stack_is_never_used_beyond_three_quarters() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_quiet_device_shows_a_steady_light_and_blinks_when_asked() {
     let mut rig = connected(common::setup());
     assert_eq!(led_changes(&mut rig, 300), 0);
@@ -83,7 +83,7 @@ fn a_quiet_device_shows_a_steady_light_and_blinks_when_asked() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn traffic_and_errors_show_on_the_light() {
     let mut rig = connected(common::setup());
     rig.listen(Channel::Can1, 1_000_000).unwrap();
@@ -95,7 +95,7 @@ fn traffic_and_errors_show_on_the_light() {
 
 /// What follows is ST's ROM, of which the emulator has only the vectors: the run ends at its first instruction.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn the_bootloader_is_entered_after_the_answer_is_sent() {
     let mut rig = connected(common::setup());
     rig.ask(Command::Bootloader).unwrap();

@@ -26,7 +26,7 @@ fn text(bytes: &[u8]) -> String {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_run_prints_one_object_with_the_demos_keys_and_its_own() {
     let elf = common::elf();
     let output = run(&elf, &["--seconds", "0.05", "--frames", "mix", "--json"]);
@@ -61,7 +61,7 @@ fn a_run_prints_one_object_with_the_demos_keys_and_its_own() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_log_is_replayed_at_its_own_times_to_the_last_frame() {
     let elf = common::elf();
     let directory = tempfile::tempdir().unwrap();
@@ -76,7 +76,7 @@ fn a_log_is_replayed_at_its_own_times_to_the_last_frame() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn bad_input_is_told_in_one_line_that_names_it() {
     let elf = common::elf();
     let host_program = env!("CARGO_BIN_EXE_cantap-sim");
@@ -101,7 +101,7 @@ fn bad_input_is_told_in_one_line_that_names_it() {
 
 /// The device as a byte stream in this process, as the host library uses it.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_served_device_talks_to_whoever_reads_and_writes() {
     use std::io::{ErrorKind, Read, Write};
 
@@ -141,7 +141,7 @@ fn a_served_device_talks_to_whoever_reads_and_writes() {
 /// A client that is killed closes the port like any other: the channel leaves the bus, and the next client finds it closed.
 #[cfg(unix)]
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_pty_whose_client_is_gone_leaves_the_bus() {
     use std::fs::File;
     use std::io::{BufRead, BufReader, Read, Write};
@@ -189,7 +189,7 @@ fn a_pty_whose_client_is_gone_leaves_the_bus() {
 /// Served on a pseudo-terminal, it is a serial port like any other.
 #[cfg(unix)]
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_pty_is_announced_by_its_name_and_answers() {
     use std::fs::File;
     use std::io::{BufRead, BufReader, Read, Write};
@@ -222,7 +222,7 @@ fn a_pty_is_announced_by_its_name_and_answers() {
 /// Asked politely, by Ctrl-C or by the system, it ends as a device that is no longer needed, with or without a client.
 #[cfg(unix)]
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_pty_ends_when_it_is_asked_to() {
     use std::fs::File;
     use std::io::{BufRead, BufReader};

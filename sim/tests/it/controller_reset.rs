@@ -76,7 +76,7 @@ fn some_frames(rig: &Rig, ids: [u32; 3]) -> Vec<(u64, Frame)> {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn nothing_of_before_is_sent_and_the_filters_stand_after_a_reset() {
     for master_reset in [MasterReset::Least, MasterReset::Most] {
         let mut rig = stuck_and_closed(master_reset);
@@ -113,7 +113,7 @@ fn nothing_of_before_is_sent_and_the_filters_stand_after_a_reset() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_reset_beside_a_full_channel_costs_it_no_frame_where_the_banks_survive() {
     let image = common::firmware();
     let setup = Setup { master_reset: MasterReset::Least, ..board::setup() };
@@ -135,7 +135,7 @@ fn a_reset_beside_a_full_channel_costs_it_no_frame_where_the_banks_survive() {
 /// If the reset clears the banks, the other channel hears nothing until they are written again: for at most one frame, and that
 /// something may be missing is reported.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_reset_that_clears_the_banks_costs_a_full_channel_a_frame_at_most_and_is_told_of() {
     for (round, bound) in [(0, Bound::Best), (1, Bound::Best), (2, Bound::Worst), (3, Bound::Worst)] {
         let setup = Setup { master_reset: MasterReset::Most, bound, ..board::setup() };

@@ -36,7 +36,7 @@ fn frame() -> Frame {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn every_request_is_answered_on_a_closed_and_on_an_open_channel() {
     let mut rig = connected();
     let normal =
@@ -90,7 +90,7 @@ fn every_request_is_answered_on_a_closed_and_on_an_open_channel() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn refusals_name_their_reason() {
     let mut rig = connected();
     let send = TxFrame { tag: 1, frame: frame(), at_ticks: None };
@@ -118,7 +118,7 @@ fn refusals_name_their_reason() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_reset_request_brings_the_device_back_on_the_bus() {
     let mut rig = connected();
     rig.ask(Command::Reset).unwrap();
@@ -130,7 +130,7 @@ fn a_reset_request_brings_the_device_back_on_the_bus() {
 
 /// Random bytes, in pieces of every length, while a capture runs: the capture loses nothing, and nothing reaches the bus.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn garbage_neither_hangs_the_device_nor_disturbs_the_capture() {
     let mut rig = connected();
     rig.listen(CAN1, MEGABIT).unwrap();
@@ -153,7 +153,7 @@ fn garbage_neither_hangs_the_device_nor_disturbs_the_capture() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn half_a_request_waits_and_a_zero_throws_it_away() {
     let mut rig = connected();
     let (id, bytes) = rig.session.request(Command::Time);
@@ -171,7 +171,7 @@ fn half_a_request_waits_and_a_zero_throws_it_away() {
 /// Requests faster than they can be answered, both while the host reads and while it does not: the host is made to wait,
 /// except on the control pipe, and every request is answered.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn every_request_of_a_flood_is_answered() {
     const FLOOD: usize = 400;
     for reading in [true, false] {
@@ -196,7 +196,7 @@ fn every_request_of_a_flood_is_answered() {
 
 /// The closing of the port arrives by the control pipe, past packets that must wait, and ends the capture.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_host_that_floods_and_never_reads_can_close_the_port() {
     let mut rig = connected();
     rig.listen(CAN1, MEGABIT).unwrap();
@@ -218,7 +218,7 @@ fn a_host_that_floods_and_never_reads_can_close_the_port() {
 
 /// The device stalls requests that it need not support, and carries on.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn unknown_control_requests_are_refused_and_harm_nothing() {
     let mut rig = connected();
     for (kind, request) in [(0xC0, 1), (0xA1, 0x77), (0x40, 9), (0x80, 6), (0x21, 0x23)] {
@@ -240,7 +240,7 @@ fn unknown_control_requests_are_refused_and_harm_nothing() {
 
 /// Letters are slcan: a terminal program gets its version, and the native protocol works again in the next session.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_terminal_program_finds_slcan_on_the_same_port() {
     let mut rig = connected();
     rig.with_host(|host, _| host.close_port());

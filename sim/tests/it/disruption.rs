@@ -92,7 +92,7 @@ fn begin(rig: &mut Rig) {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn the_device_survives_a_host_that_goes_away_at_any_instant() {
     let mut random = fastrand::Rng::with_seed(20_261);
     let mut captured = 0;
@@ -144,7 +144,7 @@ fn the_device_survives_a_host_that_goes_away_at_any_instant() {
 
 /// A host that dies in the middle of an enumeration finds the device again.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn an_enumeration_may_be_cut_off_anywhere() {
     let image = common::firmware();
     let mut random = fastrand::Rng::with_seed(7);
@@ -167,7 +167,7 @@ fn an_enumeration_may_be_cut_off_anywhere() {
 
 /// Handshakes get lost on real cables: the device sends the packet again, and the host drops the copy.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_lost_handshake_neither_loses_nor_doubles_a_frame() {
     let mut rig = board(true);
     rig.with_host(|host, _| host.drop_handshake_every(Some(7)));
@@ -185,7 +185,7 @@ fn a_lost_handshake_neither_loses_nor_doubles_a_frame() {
 /// Suspended and woken without losing the configuration, as when a laptop is closed and opened: the session is
 /// over, and a new one begins without an enumeration.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn resume_needs_no_enumeration() {
     let mut rig = board(true);
     begin(&mut rig);
@@ -206,7 +206,7 @@ fn resume_needs_no_enumeration() {
 /// A laptop that sleeps and wakes with the port open: everything captured until then is delivered, and the device says that and
 /// when the session ended. Nothing is missing, and nobody waits for frames that will not come.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_host_that_wakes_is_told_that_the_session_has_ended_and_misses_nothing() {
     let mut rig = board(true);
     for (round, stalled) in [(1, false), (2, true), (3, false)] {

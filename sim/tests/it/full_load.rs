@@ -43,7 +43,7 @@ fn nothing_is_lost(options: &Options, least_frames_per_s: f64) -> Report {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn two_seconds_of_the_shortest_data_frames_on_both_channels_lose_nothing() {
     let report = nothing_is_lost(&at_full_load(Kind::Std0, 2.0), 20_800.0);
     assert!(report.bound == Bound::Worst || report.cpu_load_pct <= 25.0, "{} %", report.cpu_load_pct);
@@ -51,7 +51,7 @@ fn two_seconds_of_the_shortest_data_frames_on_both_channels_lose_nothing() {
 
 /// During the capture of a full channel, with everything as slow as the manuals allow.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_queue_that_has_filled_drains_at_a_megabyte_a_second() {
     let setup = Setup { bound: Bound::Worst, ..board::setup() };
     let mut rig = Rig::new(common::firmware(), setup, Timing::hasty(CLOCK));
@@ -75,7 +75,7 @@ fn a_queue_that_has_filled_drains_at_a_megabyte_a_second() {
 
 /// The same with everything as slow as the manuals allow.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn the_shortest_frames_lose_nothing_at_worst() {
     for (kind, least_frames_per_s) in [(Kind::Std0, 20_800.0), (Kind::Rtr, 21_250.0)] {
         nothing_is_lost(&Options { bound: Bound::Worst, ..at_full_load(kind, 0.2) }, least_frames_per_s);
@@ -83,25 +83,25 @@ fn the_shortest_frames_lose_nothing_at_worst() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn remote_frames_of_47_bits_lose_nothing() {
     nothing_is_lost(&at_full_load(Kind::Rtr, 0.3), 21_250.0);
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn extended_frames_with_eight_bytes_lose_nothing() {
     nothing_is_lost(&at_full_load(Kind::Ext8, 0.5), 6_200.0);
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn standard_frames_with_eight_bytes_lose_nothing() {
     nothing_is_lost(&at_full_load(Kind::Std8, 0.3), 7_400.0);
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_mix_of_everything_loses_nothing() {
     nothing_is_lost(&at_full_load(Kind::Mix, 0.5), 8_000.0);
 }
@@ -109,7 +109,7 @@ fn a_mix_of_everything_loses_nothing() {
 /// The earlier analyser's table of the load it could carry without loss, 7.7 to 12.8 % over RS-232. Ours: all of it, on
 /// two channels. "No stamp" is what its users could leave out to save bandwidth.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn each_row_of_the_earlier_analysers_table_is_carried_at_full_load() {
     const MEGABIT: u32 = 1_000_000;
     for (kind, omit_stamps) in [
@@ -147,7 +147,7 @@ fn each_row_of_the_earlier_analysers_table_is_carried_at_full_load() {
 
 /// The queue holds 96 KiB: at 5 bytes and 48 us for each frame of the worst kind on one channel, 0.9 s.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_host_that_stalls_for_100_300_or_600_ms_costs_nothing_on_one_channel() {
     for millis in [100, 300, 600] {
         let options = Options {
@@ -165,7 +165,7 @@ fn a_host_that_stalls_for_100_300_or_600_ms_costs_nothing_on_one_channel() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_stall_beyond_the_queue_loses_frames_and_counts_every_one() {
     let options = Options { stall: Some(Duration::from_millis(700)), ..at_full_load(Kind::Std0, 0.9) };
     let report = capture(&options);
@@ -178,7 +178,7 @@ fn a_stall_beyond_the_queue_loses_frames_and_counts_every_one() {
 
 /// One channel fills the queue in 0.94 s.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_stall_of_more_than_a_second_on_one_channel_loses_what_does_not_fit_and_counts_it() {
     let options = Options {
         stall: Some(Duration::from_millis(1200)),
@@ -196,7 +196,7 @@ fn a_stall_of_more_than_a_second_on_one_channel_loses_what_does_not_fit_and_coun
 
 /// 2 packets of 64 bytes in a frame are 128 kB/s; two channels of this kind make 230 kB/s.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_host_that_is_too_slow_fills_the_queue_and_then_catches_up() {
     let mut options = at_full_load(Kind::Ext8, 0.6);
     options.timing.packets_per_frame = 2;
@@ -207,7 +207,7 @@ fn a_host_that_is_too_slow_fills_the_queue_and_then_catches_up() {
 
 /// Behind a high-speed hub a packet in every second microframe is 256 kB/s: both channels full of the shortest frames make 215.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_host_behind_a_high_speed_hub_carries_both_channels() {
     let mut options = at_full_load(Kind::Std0, 0.3);
     options.timing = options.timing.behind_hub(2);
@@ -219,7 +219,7 @@ fn a_host_behind_a_high_speed_hub_carries_both_channels() {
 
 /// The same seed gives the same run, a different seed a different one.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_run_depends_on_its_seed_only() {
     let figures = |seed| {
         let options = Options { seed, ..at_full_load(Kind::Mix, 0.05) };
@@ -235,7 +235,7 @@ fn a_run_depends_on_its_seed_only() {
 
 /// Wherever in a frame its channel is asked to leave its bus, the frame is delivered with the stamp of its interrupt.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn the_last_frame_before_a_channel_leaves_its_bus_has_an_exact_stamp() {
     for kind in [Kind::Std0, Kind::Std8] {
         let mut rig = Rig::new(common::firmware(), common::setup(), Timing::hasty(CLOCK));

@@ -87,7 +87,7 @@ fn of_usb(usb: UsbFaults) -> Hostile {
 
 /// The bench itself: nothing of this fails on prompt and true silicon.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn prompt_silicon_loses_nothing_and_is_driven_by_the_book() {
     let rig = lives_with(Hostile::default());
     for channel in Channel::ALL {
@@ -96,7 +96,7 @@ fn prompt_silicon_loses_nothing_and_is_driven_by_the_book() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_release_that_takes_long_neither_doubles_nor_loses_a_frame_uncounted() {
     let rig = lives_with(of_can(CanFaults { release: Tardy::always(60), ..CanFaults::default() }));
     for channel in Channel::ALL {
@@ -106,7 +106,7 @@ fn a_release_that_takes_long_neither_doubles_nor_loses_a_frame_uncounted() {
 
 /// The frames that cannot be taken out are in the way of those that follow, which are counted lost; the device goes on.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_release_that_never_ends_costs_counted_frames_and_not_the_device() {
     let mut rig = board(of_can(CanFaults { release: Tardy::NEVER, ..CanFaults::default() }));
     rig.plug_in().unwrap();
@@ -127,7 +127,7 @@ fn a_release_that_never_ends_costs_counted_frames_and_not_the_device() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn no_release_is_needed_in_initialisation_mode() {
     for release_in_init in [ReleaseInInit::Waits, ReleaseInInit::Ignored] {
         for initialisation in [Tardy::PROMPT, Tardy::always(2_000)] {
@@ -137,14 +137,14 @@ fn no_release_is_needed_in_initialisation_mode() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_controller_may_take_its_time_to_leave_its_bus() {
     lives_with(of_can(CanFaults { initialisation: Tardy::always(30_000), ..CanFaults::default() }));
 }
 
 /// It is made to leave, by a reset that is late as well.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_controller_that_never_leaves_its_bus_is_reset() {
     let faults = CanFaults {
         initialisation: Tardy { percent: 50, longest_us: 1_000, never_percent: 100 },
@@ -177,7 +177,7 @@ fn a_controller_that_never_leaves_its_bus_is_reset() {
 /// Pins are connected to controllers that have a clock and are stopped, and no connected controller is reset by the clock controller: not
 /// at power-on, and not when the firmware starts again after a reset, the buses being busy.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn starting_and_restarting_never_hold_a_live_bus() {
     let faults = CanFaults { reset_sticks_percent: 100, unclocked_is_dominant: true, ..CanFaults::default() };
     let mut rig = lives_with(of_can(faults));
@@ -192,7 +192,7 @@ fn starting_and_restarting_never_hold_a_live_bus() {
 
 /// A reset in the middle of a frame of ours would be an error on the bus.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_reset_that_was_asked_for_cuts_no_frame() {
     for command in [Command::Reset, Command::Bootloader] {
         let mut rig = board(Hostile::default());
@@ -216,20 +216,20 @@ fn a_reset_that_was_asked_for_cuts_no_frame() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_flush_takes_its_time_and_what_is_written_meanwhile_is_not_lost() {
     lives_with(of_usb(UsbFaults { flush: Tardy::always(150), ..UsbFaults::default() }));
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_core_reset_takes_its_time() {
     lives_with(of_usb(UsbFaults { core_reset: Tardy::always(150), ..UsbFaults::default() }));
 }
 
 /// What is written to a core that is still being reset is lost, so that no host would ever see the device.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_core_reset_that_does_not_end_is_asked_for_again() {
     let mut rig = board(of_usb(UsbFaults { core_reset: Tardy::NEVER, ..UsbFaults::default() }));
     rig.run_for(50 * MS).unwrap();
@@ -242,7 +242,7 @@ fn a_core_reset_that_does_not_end_is_asked_for_again() {
 /// A transmit FIFO is flushed only while the bus is idle (AHBIDL). Until that has happened, what is left in it must not get in front of what
 /// is sent next. Of these resets half do not end, and after half of the others the bus does not become idle.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn what_could_not_be_flushed_is_not_sent() {
     let core_reset = Tardy { percent: 50, longest_us: 1, never_percent: 100 };
     for seed in 0..12 {
@@ -267,7 +267,7 @@ fn what_could_not_be_flushed_is_not_sent() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn nak_and_disable_take_their_time() {
     let faults = UsbFaults { nak: Tardy::always(400), disable: Tardy::always(400), ..UsbFaults::default() };
     lives_with(of_usb(faults));
@@ -275,13 +275,13 @@ fn nak_and_disable_take_their_time() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn an_out_endpoint_is_disabled_under_global_out_nak_or_left_alone() {
     lives_with(of_usb(UsbFaults { out_needs_global_nak: true, ..UsbFaults::default() }));
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn an_impossible_status_is_dropped() {
     for bogus_status_percent in [20, 100] {
         lives_with(of_usb(UsbFaults { bogus_status_percent, ..UsbFaults::default() }));
@@ -289,7 +289,7 @@ fn an_impossible_status_is_dropped() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn the_end_of_a_setup_stage_comes_with_the_next_token_and_disarms() {
     for (late_setup_complete, setup_complete_disarms) in [(true, false), (false, true), (true, true)] {
         lives_with(of_usb(UsbFaults { late_setup_complete, setup_complete_disarms, ..UsbFaults::default() }));
@@ -297,13 +297,13 @@ fn the_end_of_a_setup_stage_comes_with_the_next_token_and_disarms() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn the_flag_of_a_setup_stage_is_cleared() {
     lives_with(of_usb(UsbFaults { stup_blocks: true, ..UsbFaults::default() }));
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_transfer_has_completed_when_its_endpoint_says_so() {
     let mut rig = lives_with(of_usb(UsbFaults { daint_shows_all: true, ..UsbFaults::default() }));
     rig.greet().unwrap();
@@ -320,19 +320,19 @@ fn a_transfer_has_completed_when_its_endpoint_says_so() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn device_mode_is_waited_for() {
     lives_with(of_usb(UsbFaults { device_mode: Tardy::always(25_000), ..UsbFaults::default() }));
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_flash_that_is_busy_for_long_is_waited_for() {
     lives_with(Hostile { flash_busy: Tardy::always(2_000), ..Hostile::default() });
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_flash_that_stays_busy_is_given_up() {
     let mut rig = board(Hostile { flash_busy: Tardy::NEVER, ..Hostile::default() });
     rig.plug_in().unwrap();
@@ -348,7 +348,7 @@ fn a_flash_that_stays_busy_is_given_up() {
 /// The watchdog has its own oscillator: the chip restarts without a crystal, waits for it, and is back. A frame of ours that was on the
 /// bus is cut off, and its last bit stays there until then.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_board_whose_crystal_stops_is_back_when_it_starts_again() {
     let setup = Setup { survive_watchdog: true, ..common::setup() };
     let mut rig = Rig::new(common::firmware(), setup, Timing::hasty(CLOCK));
@@ -382,25 +382,25 @@ fn after_any_storm_the_device_is_back(seeds: std::ops::Range<u64>) {
 
 // Two hundred seeds, in parts, so that every core has some.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn after_any_storm_the_device_is_back_and_has_counted_every_frame() {
     after_any_storm_the_device_is_back(0..50);
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn after_fifty_other_storms_too() {
     after_any_storm_the_device_is_back(50..100);
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn and_after_fifty_more() {
     after_any_storm_the_device_is_back(100..150);
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn and_after_the_last_fifty() {
     after_any_storm_the_device_is_back(150..200);
 }

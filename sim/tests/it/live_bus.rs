@@ -71,7 +71,7 @@ fn settle(rig: &mut Rig) {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn one_channel_sends_to_the_other_in_order_and_each_frame_is_confirmed() {
     let mut rig = connected(Setup { joined: true, ..common::setup() });
     for channel in Channel::ALL {
@@ -100,7 +100,7 @@ fn one_channel_sends_to_the_other_in_order_and_each_frame_is_confirmed() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn sending_while_the_other_channel_is_full_costs_no_frame() {
     let mut rig = connected(common::setup());
     rig.listen(Can1, MEGABIT).unwrap();
@@ -120,7 +120,7 @@ fn sending_while_the_other_channel_is_full_costs_no_frame() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_timed_frame_starts_at_its_tick() {
     let mut rig = connected(common::setup());
     rig.open(Can1, normal()).unwrap();
@@ -140,7 +140,7 @@ fn a_timed_frame_starts_at_its_tick() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn one_shot_frames_report_what_stopped_them() {
     let mut rig = connected(common::setup());
     rig.open(Can1, ChannelConfig { one_shot: true, ..normal() }).unwrap();
@@ -162,7 +162,7 @@ fn one_shot_frames_report_what_stopped_them() {
 
 /// Thirty-two failures in a row put the controller off the bus.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn bus_off_is_reported_and_left_as_configured() {
     for manual_recovery in [false, true] {
         let mut rig = connected(common::setup());
@@ -191,7 +191,7 @@ fn bus_off_is_reported_and_left_as_configured() {
 /// Nobody acknowledges: error-passive, never bus-off, and the device still answers. As soon as somebody does, the
 /// frame is sent.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_lone_node_floods_nobody() {
     let mut rig = connected(common::setup());
     rig.open(Can1, normal()).unwrap();
@@ -209,7 +209,7 @@ fn a_lone_node_floods_nobody() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_stuck_bus_hangs_nothing() {
     let mut rig = connected(common::setup());
     rig.machine.board().hold_buses_dominant(true);
@@ -243,7 +243,7 @@ fn a_stuck_bus_hangs_nothing() {
 
 /// Erasing a flash sector stops the core for a second, which must trigger neither the watchdog nor the host's timeout.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn defaults_are_saved_and_used_after_a_reset() {
     let mut rig = connected(common::setup());
     rig.open(Can1, normal()).unwrap();
@@ -277,7 +277,7 @@ fn defaults_are_saved_and_used_after_a_reset() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn the_order_on_the_bus_is_the_order_of_confirmation() {
     let mut rig = connected(Setup { joined: true, ..common::setup() });
     for channel in Channel::ALL {

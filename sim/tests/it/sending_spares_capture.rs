@@ -120,7 +120,7 @@ fn weather(rig: &mut Rig, what: &str) {
 
 /// CAN1 sends as much as can be requested, next to a full CAN2.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_full_table_costs_the_other_channel_no_frame() {
     for (bound, acknowledged) in [(Best, false), (Best, true), (Worst, true)] {
         let mut rig = connected(bound);
@@ -144,7 +144,7 @@ fn a_full_table_costs_the_other_channel_no_frame() {
 
 /// Both channels send as much as can be requested.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn full_tables_on_both_channels_leave_usb_alive() {
     for (bound, acknowledged) in [(Best, false), (Best, true), (Worst, false), (Worst, true)] {
         let mut rig = connected(bound);
@@ -199,7 +199,7 @@ fn full_tables_on_both_channels_leave_usb_alive() {
 
 /// A queue that is given up is reported frame by frame, not all at once.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn an_aborted_queue_costs_the_other_channel_no_frame() {
     let mut rig = connected(Worst);
     open_normal(&mut rig, Can1, false);
@@ -222,7 +222,7 @@ fn an_aborted_queue_costs_the_other_channel_no_frame() {
 
 /// Frames due so close together that each is waited for rather than left to the alarm: this is the longest that one call can last.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn frames_that_are_due_one_after_the_other_hold_up_no_drain_for_long() {
     for spacing_us in [5, 7, 9, 10, 11, 13] {
         let mut rig = connected(Worst);
@@ -259,7 +259,7 @@ fn frames_that_are_due_one_after_the_other_hold_up_no_drain_for_long() {
 
 /// What holds up the alarm and the drains is short, whatever a host asks for.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn no_lock_is_held_for_long() {
     let mut longest = 0.0f64;
     for bound in Bound::ALL {

@@ -48,7 +48,7 @@ fn text(bytes: Vec<u8>) -> String {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn every_letter_is_answered_on_a_closed_channel() {
     let mut rig = plugged_in();
     let serial = say(&mut rig, "\rN\r");
@@ -99,7 +99,7 @@ fn every_letter_is_answered_on_a_closed_channel() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn every_letter_is_answered_on_an_open_channel_and_what_would_change_it_is_refused() {
     let mut rig = plugged_in();
     converse(&mut rig, &[("\r\rC\r", "\r\r\r"), ("S6\r", "\r"), ("Z0\r", "\r"), ("O\r", "\r")]);
@@ -164,7 +164,7 @@ fn every_letter_is_answered_on_an_open_channel_and_what_would_change_it_is_refus
 
 /// Through the flash: once `K1` is saved, programs that never send it get reports.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn reports_that_were_saved_are_there_without_being_asked_for() {
     let mut rig = plugged_in();
     for (lines, reports) in [("C\rK1\rQ1\r", true), ("K0\rQ1\r", false), ("K1\rQ1\rQ0\r", false)] {
@@ -185,7 +185,7 @@ fn reports_that_were_saved_are_there_without_being_asked_for() {
 
 /// What can-utils' `slcand -o -c -f -s6` writes before it asks the kernel for the line discipline.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn slcands_opening_opens_the_channel() {
     let mut rig = plugged_in();
     converse(&mut rig, &[("C\rS6\rF\rO\r", "\r\r\x07\r")]);
@@ -195,7 +195,7 @@ fn slcands_opening_opens_the_channel() {
 
 /// Frames that the controller's FIFO dropped because its interrupt was handled too late.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn an_overrun_sets_the_data_overrun_flag_once() {
     const DATA_OVERRUN: u8 = 1 << 3;
     let mut rig = plugged_in();
@@ -267,7 +267,7 @@ print("done")
     }
 
     #[test]
-    #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+    #[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
     fn python_can_sends_and_receives_through_the_elf() {
         let (image, Some(python)) = (common::firmware(), peers::python_with("can, serial")) else { return };
         let load = Load::Frames { kind: Kind::Std8, percent: 5.0 };

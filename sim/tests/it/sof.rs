@@ -43,7 +43,7 @@ fn check(rig: &mut Rig, timing: &Timing, least: usize) {
 /// Across the wrap of the frame number, with a board that is 80 ppm fast and a host whose frames jitter by 500
 /// ns.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn an_idle_session_has_exact_marks_once_a_second() {
     let timing = Timing { board_ppm: 80.0, sof_jitter: 72, ..Timing::hasty(CLOCK) };
     let mut rig = connected(timing);
@@ -58,7 +58,7 @@ fn an_idle_session_has_exact_marks_once_a_second() {
 
 /// Both buses full, and as much as possible to do for the millisecond tick.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn marks_are_exact_beside_two_full_buses() {
     let timing = Timing { board_ppm: -80.0, sof_jitter: 72, ..Timing::hasty(CLOCK) };
     let mut rig = connected(timing);
@@ -83,7 +83,7 @@ fn marks_are_exact_beside_two_full_buses() {
 
 /// A suspended bus has no frames. The session after it begins with a new mark.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_suspended_bus_makes_no_marks() {
     let timing = Timing::hasty(CLOCK);
     let mut rig = connected(timing);

@@ -46,7 +46,7 @@ fn connected(name: &str, setup: Setup) -> Rig {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn every_board_starts_behind_the_rom_bootloader() {
     for (name, hz, _) in common::boards() {
         let rig = connected(name, behind_the_bootloader(hz));
@@ -60,7 +60,7 @@ fn every_board_starts_behind_the_rom_bootloader() {
 
 /// A host must see the bootloader's device disconnect, or it goes on talking to it.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn the_bootloaders_usb_device_goes_before_ours_comes() {
     let image = common::firmware();
     let mut rig = Rig::new(image, behind_the_bootloader(8_000_000), Timing::hasty(CLOCK));
@@ -81,13 +81,13 @@ fn the_bootloaders_usb_device_goes_before_ours_comes() {
 
 /// The bootloader leaves the flash interface open, with uncleared errors.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn defaults_are_saved_behind_the_bootloader() {
     save_defaults(behind_the_bootloader(8_000_000), |_| {});
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn defaults_are_saved_whatever_error_the_flash_shows() {
     save_defaults(board::setup(), |rig| rig.machine.board().leave_flash_error());
 }
@@ -105,7 +105,7 @@ fn save_defaults(setup: Setup, before: fn(&mut Rig)) {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn the_rom_bootloader_finds_its_memory_at_zero_and_its_vectors_there() {
     let mut rig = connected("olimex-p405", board::setup());
     rig.ask(Command::Bootloader).unwrap();
@@ -145,7 +145,7 @@ fn a_peripheral_is_there_only_some_cycles_after_its_clock_was_switched_on() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn edges_of_the_can_tx_pins_are_fast_on_every_board() {
     for (name, hz, pins) in common::boards() {
         let setup = Setup { crystal: crystal(hz), ..board::setup() };
@@ -166,7 +166,7 @@ fn edges_of_the_can_tx_pins_are_fast_on_every_board() {
 /// On a live bus, TX must not show what a controller does while it is reset or has no clock. Until it is connected, a pull-up keeps it
 /// recessive.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_tx_pin_is_connected_only_to_a_controller_that_has_been_stopped() {
     for (name, hz, pins) in common::boards() {
         let mut rig = connected(name, Setup { crystal: crystal(hz), ..board::setup() });
@@ -202,7 +202,7 @@ fn a_tx_pin_is_connected_only_to_a_controller_that_has_been_stopped() {
 
 /// Powered by its other connector, a board that pulls the USB line up with no host there feeds a host that is off.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_board_that_can_sense_vbus_shows_itself_only_when_it_is_there() {
     for (name, hz, _) in common::boards() {
         let mut rig = connected(name, Setup { crystal: crystal(hz), ..board::setup() });
@@ -212,7 +212,7 @@ fn a_board_that_can_sense_vbus_shows_itself_only_when_it_is_there() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_debugger_keeps_its_connection_while_the_processor_sleeps() {
     let rig = connected("olimex-p405", board::setup());
     assert_eq!(rig.machine.board().debug_control() & 1, 1);
@@ -220,14 +220,14 @@ fn a_debugger_keeps_its_connection_while_the_processor_sleeps() {
 
 /// The firmware waits 100 ms at HSI's frequency; the emulator's time passes at 144 MHz, where that takes 15 ms.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_crystal_that_is_slow_is_waited_for() {
     let slow = Crystal { hz: 8_000_000, start_us: Some(5 * CRYSTAL_START_US) };
     connected("olimex-p405", Setup { crystal: slow, ..board::setup() });
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_crystal_that_does_not_start_is_told_by_the_led_and_tried_again() {
     let image = common::firmware();
     let broken = Crystal { hz: 8_000_000, start_us: None };
@@ -293,7 +293,7 @@ fn fail_once(rig: &mut Rig, target: u32) {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn the_last_failure_outlives_the_restart_and_can_be_asked_for() {
     let setup = Setup { survive_failures: true, survive_watchdog: true, ..board::setup() };
     let mut rig = connected("olimex-p405", setup);

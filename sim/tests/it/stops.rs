@@ -113,7 +113,7 @@ fn bend(number: u32, target: impl Fn(&Image) -> u32) -> (Image, Stopped) {
 const TIM7: u32 = 16 + 55;
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_panic_ends_the_run_where_it_began() {
     let panic = |image: &Image| image.address_of("__rustc::rust_begin_unwind").expect("the panic handler");
     let (_, stopped) = bend(TIM7, panic);
@@ -121,7 +121,7 @@ fn a_panic_ends_the_run_where_it_began() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_fault_in_the_firmware_names_the_function_and_its_callers() {
     // No code: the next instruction is fetched from erased flash.
     let (image, stopped) = bend(TIM7, |_| FLASH.end - 16);
@@ -131,7 +131,7 @@ fn a_fault_in_the_firmware_names_the_function_and_its_callers() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn entering_the_rom_bootloader_ends_the_run() {
     let image = common::firmware();
     let mut rig = Rig::new(image, common::setup(), Timing::new(CLOCK));

@@ -55,7 +55,7 @@ fn hold_times(bound: Bound, what: &str, replayed: Option<&[Replayed]>, within_us
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_replay_keeps_its_spacing_at_any_load_below_saturation() {
     for (bound, load, seconds) in [
         (Best, 10.0, 0.3),
@@ -74,7 +74,7 @@ fn a_replay_keeps_its_spacing_at_any_load_below_saturation() {
 /// The alarm comes early, and the rest of the time is spent waiting at the priority that drains the FIFOs: that must not cost
 /// the other channel a frame.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_replay_keeps_its_spacing_beside_a_full_channel_and_costs_it_nothing() {
     for (bound, load) in
         [(Best, 30.0), (Best, 60.0), (Best, 90.0), (Best, 98.0), (Worst, 90.0), (Worst, 98.0)]
@@ -95,7 +95,7 @@ fn a_replay_keeps_its_spacing_beside_a_full_channel_and_costs_it_nothing() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn two_replays_at_once_keep_their_spacing() {
     for (bound, load, seconds) in [
         (Best, 10.0, 0.3),
@@ -113,7 +113,7 @@ fn two_replays_at_once_keep_their_spacing() {
 
 /// Two emulated seconds, streamed: 17 500 frames, each sent once, in order, and confirmed with the time of its end.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_stream_of_eight_byte_frames_fills_the_bus() {
     let mut rig = joined(&[Can1]);
     let filled = fill(&mut rig, &[Can1], Kind::Std8, 2.0).unwrap().expect("all frames in order");
@@ -126,7 +126,7 @@ fn a_stream_of_eight_byte_frames_fills_the_bus() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn two_streams_at_once_fill_both_buses() {
     for (bound, seconds) in [(Best, 0.2), (Worst, 0.1)] {
         let mut rig = joined_under(bound, &[Can1, Can2]);
@@ -139,7 +139,7 @@ fn two_streams_at_once_fill_both_buses() {
 
 /// The most frames and confirmations possible: 20 833 a second of each on each channel.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn two_streams_of_frames_without_data_fill_both_buses() {
     for (bound, seconds) in [(Best, 0.15), (Worst, 0.3)] {
         let mut rig = joined_under(bound, &[Can1, Can2]);
@@ -154,7 +154,7 @@ fn two_streams_of_frames_without_data_fill_both_buses() {
 /// A full record queue has no room for confirmations. Frames that are due then wait for room; an alarm that fired again and
 /// again would keep USB from making room.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn timed_frames_that_cannot_be_confirmed_do_not_keep_the_host_out() {
     let mut rig = joined(&[Can1]);
     saturate(&mut rig, Can2, 1_150);

@@ -69,7 +69,7 @@ fn frame(text: &str) -> Frame {
 
 /// At 1 Mbit/s receivers accept a frame 1 us before its end, which is then still to come when it is stamped.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn stamps_are_at_most_a_microsecond_late_under_full_load() {
     for (bound, latest_ns) in [(Bound::Best, 600), (Bound::Worst, 1000)] {
         let mut rig = listening_under(bound);
@@ -92,7 +92,7 @@ fn stamps_are_at_most_a_microsecond_late_under_full_load() {
 /// The earlier analyser's calibration: ID 0, one byte 0x55, 58 us; bursts of ten, frame 11 − frame 1 =
 /// 0.960375 ms.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn bursts_of_ten_are_stamped_58_us_apart() {
     let mut rig = listening();
     let period = 960_375 * CYCLES_PER_US / 1000;
@@ -115,7 +115,7 @@ fn bursts_of_ten_are_stamped_58_us_apart() {
 /// The traffic that the earlier analyser lost after 26 frames, with a gap of 23 ms: bursts of five every
 /// 1919.6 us, 15.1 % load.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn bursts_of_five_are_never_lost() {
     let mut rig = listening();
     let period = 1_919_600 * CYCLES_PER_US / 1000;
@@ -132,7 +132,7 @@ fn bursts_of_five_are_never_lost() {
 /// Two nodes with identifiers 1 and 2: the intervals between frames are the lengths of the frames, bit for
 /// bit.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn two_node_traffic_has_its_golden_lengths() {
     let golden = [
         ("8001880189018C02", 119),
@@ -168,7 +168,7 @@ fn two_node_traffic_has_its_golden_lengths() {
 /// Two full buses with errors, a sender that nobody acknowledges, a bus stuck dominant, another bit rate: the
 /// device's pins stay recessive, even in the ACK slot.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn listen_only_never_drives_the_bus() {
     let mut rig = listening();
     let from = rig.now();
@@ -199,7 +199,7 @@ fn listen_only_never_drives_the_bus() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn every_error_on_the_bus_is_reported_by_its_name() {
     let mut rig = listening();
     let from = rig.now() + MS;
@@ -226,7 +226,7 @@ fn every_error_on_the_bus_is_reported_by_its_name() {
 
 /// What autobaud builds on: the wrong rate gives errors and no frame, and disturbs nobody.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_wrong_bit_rate_shows_as_errors_and_disturbs_nobody() {
     let image = common::firmware();
     let mut rig = Rig::new(image, common::setup(), Timing::new(CLOCK));
@@ -254,7 +254,7 @@ fn a_wrong_bit_rate_shows_as_errors_and_disturbs_nobody() {
 
 /// Everything else here relies on these: the time of the bus, of the stamps and of USB.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn the_clock_tree_is_set_up_as_designed() {
     let rig = listening();
     let clocks = rig.machine.board().rcc.clocks();
@@ -265,7 +265,7 @@ fn the_clock_tree_is_set_up_as_designed() {
 
 /// Firmware that cannot reach its FIFOs in time loses frames, and says so.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_forced_overrun_is_counted() {
     let mut rig = listening();
     let from = rig.now();
@@ -289,7 +289,7 @@ fn a_forced_overrun_is_counted() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn the_same_seed_gives_the_same_run_byte_for_byte() {
     let run = |seed| {
         let mut rig = listening();
@@ -312,7 +312,7 @@ fn the_same_seed_gives_the_same_run_byte_for_byte() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_trace_file_shows_interrupts_frames_masking_and_sleep() {
     let mut rig = listening();
     let from = rig.now();

@@ -9,7 +9,7 @@ use cantap_sim::board::{self, CLOCK};
 use cantap_sim::rig::Rig;
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn the_device_enumerates_as_a_serial_port_and_says_hello() {
     for bound in Bound::ALL {
         let image = common::firmware();

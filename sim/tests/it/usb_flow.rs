@@ -48,7 +48,7 @@ fn only_usb_touches_the_controller(rig: &Rig) -> Vec<String> {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_flood_of_questions_is_answered_without_taking_back_nak_early() {
     flood(
         |random| {
@@ -58,7 +58,7 @@ fn a_flood_of_questions_is_answered_without_taking_back_nak_early() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_flood_of_frames_is_taken_without_taking_back_nak_early() {
     let mut tag = 0;
     flood(|random| {

@@ -68,7 +68,7 @@ fn nothing_was_lost(mut rig: Rig) {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_device_that_is_configured_again_begins_with_data0_on_every_pipe() {
     let mut rig = capturing();
     for round in 0..6 {
@@ -94,7 +94,7 @@ fn a_device_that_is_configured_again_begins_with_data0_on_every_pipe() {
 /// A reconfiguration under an open port, of which the program that has it learns nothing: when it makes a request, it learns when and why
 /// its session ended. What the reconfiguration removed from the endpoint is counted, and nothing else is missing.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_client_under_which_the_device_is_configured_anew_is_told_when_it_asks() {
     for (round, without) in [(0, false), (1, true), (2, false), (3, true)] {
         let mut rig = capturing();
@@ -134,7 +134,7 @@ fn a_client_under_which_the_device_is_configured_anew_is_told_when_it_asks() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn an_interface_set_anew_under_an_open_port_loses_nothing() {
     let mut rig = capturing();
     for round in 0..8 {
@@ -147,7 +147,7 @@ fn an_interface_set_anew_under_an_open_port_loses_nothing() {
 
 /// The driver notices the halt with its next token or packet and clears it, as Linux's does.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_halt_and_its_end_lose_nothing() {
     let mut rig = capturing();
     for (round, endpoint) in [BULK_IN, BULK_OUT, BULK_IN, BULK_OUT, BULK_IN].into_iter().enumerate() {
@@ -166,7 +166,7 @@ fn a_halt_and_its_end_lose_nothing() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_configuration_ends_a_halt() {
     let mut rig = capturing();
     for endpoint in [BULK_IN, BULK_OUT, NOTIFY_IN] {
@@ -191,7 +191,7 @@ fn a_configuration_ends_a_halt() {
 
 /// usb-device has room for 128 bytes. More is refused, and the next request is answered.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_request_with_more_data_than_there_is_room_for_is_refused_and_leaves_nothing_behind() {
     let mut rig = capturing();
     let encapsulated = |len| Request::with_data(0x21, 0, 0, 0, vec![7; len]);
@@ -213,7 +213,7 @@ fn a_request_with_more_data_than_there_is_room_for_is_refused_and_leaves_nothing
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn what_the_descriptors_do_not_offer_is_refused() {
     let mut rig = capturing();
     let wakeup = Request::new(0x00, SET_FEATURE, DEVICE_REMOTE_WAKEUP, 0, 0);

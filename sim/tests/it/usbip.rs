@@ -201,7 +201,7 @@ const ECONNRESET: i32 = -104;
 const EPIPE: i32 = -32;
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_kernel_enumerates_it_and_talks_through_its_port() {
     let server = Server::start();
     let mut kernel = server.attach();
@@ -216,7 +216,7 @@ fn a_kernel_enumerates_it_and_talks_through_its_port() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_read_is_taken_back_and_what_it_would_have_brought_comes_with_the_next() {
     let server = Server::start();
     let mut kernel = server.attach();
@@ -231,7 +231,7 @@ fn a_read_is_taken_back_and_what_it_would_have_brought_comes_with_the_next() {
 /// Linux's virtual controller may send the withdrawal of a transfer before the transfer itself. If the answer were that it has ended,
 /// and the transfer were then carried out, the kernel would give up the device.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_transfer_that_is_taken_back_before_it_comes_is_not_carried_out() {
     let server = Server::start();
     let mut kernel = server.attach();
@@ -244,7 +244,7 @@ fn a_transfer_that_is_taken_back_before_it_comes_is_not_carried_out() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_request_that_the_device_refuses_ends_with_a_stall() {
     let server = Server::start();
     let mut kernel = server.attach();
@@ -253,7 +253,7 @@ fn a_request_that_the_device_refuses_ends_with_a_stall() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn one_kernel_has_the_device_and_another_may_when_it_is_gone() {
     let server = Server::start();
     let kernel = server.attach();
@@ -265,7 +265,7 @@ fn one_kernel_has_the_device_and_another_may_when_it_is_gone() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn a_pulled_cable_ends_the_connection_without_answers() {
     let server = Server::start();
     let mut kernel = server.attach();
@@ -280,7 +280,7 @@ fn a_pulled_cable_ends_the_connection_without_answers() {
 
 /// A slow client does not lose frames while it sets the pace, since time stands still; in real time the device's queue fills.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn time_stands_still_while_the_kernel_owes_reads() {
     let server = Server::start();
     let mut kernel = server.attach();
@@ -296,7 +296,7 @@ fn time_stands_still_while_the_kernel_owes_reads() {
 }
 
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn lines_that_make_no_sense_are_refused() {
     let server = Server::start();
     for line in

@@ -8,7 +8,7 @@ use cantap::device::ClockSource;
 
 /// Two boards whose crystals are 80 ppm apart, on one computer.
 #[test]
-#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn two_boards_80_ppm_apart_are_on_one_clock_and_on_utc() {
     let image = common::firmware();
     let clocks = measure::measure(&image, [40.0, -40.0], 16, 8).unwrap();

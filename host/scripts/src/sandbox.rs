@@ -2,11 +2,15 @@
 
 use std::cell::Cell;
 use std::rc::Rc;
+use std::time::{Duration, Instant};
 
 use rhai::Engine;
 
 /// Operations of a script between two waits. A simple loop with ten million takes a few seconds, far longer than any node may be silent.
 const MAX_OPERATIONS: u64 = 10_000_000;
+/// How long a script may compute between two waits, by the computer's clock. Operations on large arrays take long each, and longer the deeper
+/// these are nested, so that their number alone is no bound. No script that ends within both bounds depends on this one.
+const MAX_TIME: Duration = Duration::from_secs(5);
 /// The deepest nesting of calls; each takes space on the thread's stack.
 const MAX_CALLS: usize = 48;
 /// Values in an array with everything in it.
@@ -18,14 +22,29 @@ const MAX_STRING: usize = 1 << 24;
 /// Variables at the same time.
 const MAX_VARIABLES: usize = 4096;
 
-/// Counts a script's operations since its last wait.
+/// Counts a script's operations, and its time, since its last wait.
 #[derive(Clone, Debug, Default)]
-pub struct Operations(Rc<Cell<u64>>);
+pub struct Operations(Rc<Cell<Used>>);
+
+#[derive(Clone, Copy, Debug, Default)]
+struct Used {
+    operations: u64,
+    /// When the first one began.
+    since: Option<Instant>,
+}
 
 impl Operations {
     /// The script waits: it may use as many again.
     pub fn reset(&self) {
-        self.0.set(0);
+        self.0.set(Used::default());
+    }
+
+    /// One more; whether that is too much.
+    fn count(&self) -> bool {
+        let Used { operations, since } = self.0.get();
+        let (operations, since) = (operations + 1, since.unwrap_or_else(Instant::now));
+        self.0.set(Used { operations, since: Some(since) });
+        operations > MAX_OPERATIONS || (operations.is_multiple_of(8) && since.elapsed() > MAX_TIME)
     }
 }
 
@@ -41,11 +60,7 @@ pub fn engine(operations: &Operations) -> Engine {
         .set_max_variables(MAX_VARIABLES)
         .disable_symbol("eval");
     let count = operations.clone();
-    engine.on_progress(move |_| {
-        let used = count.0.get() + 1;
-        count.0.set(used);
-        (used > MAX_OPERATIONS).then(|| TOO_LONG.into())
-    });
+    engine.on_progress(move |_| count.count().then(|| TOO_LONG.into()));
     engine
 }
 

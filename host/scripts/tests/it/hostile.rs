@@ -9,6 +9,14 @@ fn error(source: &str) -> String {
 }
 
 #[test]
+fn what_takes_long_in_few_operations_is_ended() {
+    // Each of these looks at all that is in the array again.
+    assert!(error("let a = 1; for i in 0..1_000_000 { a = [a]; }").contains("computed for too long"));
+    let wide = error("let a = []; for i in 0..900_000 { a.push([1, 2, 3, 4, 5, 6, 7, 8]); }");
+    assert!(wide.contains("computed for too long") || wide.contains("too large"), "{wide}");
+}
+
+#[test]
 fn an_endless_loop_is_ended_also_if_it_tries_to_catch_that() {
     assert!(error("loop { }").contains("computed for too long"));
     assert!(error("loop { try { loop { } } catch { } }").contains("computed for too long"));

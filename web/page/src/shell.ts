@@ -165,7 +165,7 @@ export class Shell {
   }
 
   #help(): void {
-    const rows = (list: readonly Command[]): HTMLElement[] => list.filter((c) => c.keys).flatMap((c) => [el('dt', {}, ...(c.keys ?? []).flatMap((k, i) => [i > 0 ? ' ' : '', el('kbd', {}, keyLabel(k))])), el('dd', {}, c.title)]);
+    const rows = (list: readonly Command[]): HTMLElement[] => list.filter((c) => c.keys).flatMap((c) => [el('dt', {}, ...(c.keys ?? []).slice(0, 2).flatMap((k, i) => [i > 0 ? ' ' : '', el('kbd', {}, keyLabel(k))])), el('dd', {}, shortTitle(c))]);
     const every = this.#commands.every();
     openDialog(
       'Keys',
@@ -295,3 +295,8 @@ export function applyTheme(theme: 'auto' | 'dark' | 'light'): void {
   else root.dataset['theme'] = theme;
 }
 
+/** A command's title below the heading of its view: without the view's name. */
+function shortTitle(command: Command): string {
+  const title = command.view === undefined ? command.title : command.title.replace(/^(Graphs|Fixed view|Bits|Periods|Conversations): /, '');
+  return title.charAt(0).toUpperCase() + title.slice(1);
+}

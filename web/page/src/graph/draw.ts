@@ -136,7 +136,7 @@ function drawLines(pen: Pen, sheet: Sheet, x: Scale): void {
   for (const tick of marks.values) {
     const at = Math.round(toPixel(y, tick)) + 0.5;
     pen.line([x.start, at, x.end, at], colours.grid, 1);
-    if (at > 12 || sheet.traces[0]?.unit === '') pen.text(tickText(tick, marks.step), MARGIN - 6, at, { colour: colours.text, align: 'right', size: 10 });
+    if (at > 18) pen.text(tickText(tick, marks.step), MARGIN - 6, at, { colour: colours.text, align: 'right', size: 10 });
   }
   const units = [...new Set(sheet.traces.map((t) => t.unit))].join(' ');
   if (units) pen.text(units, MARGIN - 6, 8, { colour: colours.text, align: 'right', size: 10, maxWidth: MARGIN - 8 });

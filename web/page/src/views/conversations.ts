@@ -30,7 +30,7 @@ const LADDER = [
 const LIMIT = 100_000;
 /** Lanes of the ladder; who speaks less often shares the last one. */
 const LANES = 8;
-const LADDER_WIDTH = 480;
+const LADDER_WIDTH = { wide: 480, narrow: 200 };
 
 export class ConversationsView implements View {
   readonly id = 'conversations';
@@ -47,6 +47,7 @@ export class ConversationsView implements View {
   #shown: ProtocolEvent[] = [];
   #parties: string[] = [];
   #total = 0;
+  #width = LADDER_WIDTH.wide;
   #visible = false;
 
   constructor(
@@ -121,6 +122,8 @@ export class ConversationsView implements View {
   }
 
   #arrange(): void {
+    this.#width = matchMedia('(max-width: 700px)').matches ? LADDER_WIDTH.narrow : LADDER_WIDTH.wide;
+    this.element.style.setProperty('--ladder', `${this.#width}px`);
     const query = this.#search.value.trim();
     this.#shown = query === '' ? this.#events : this.#events.filter((e) => match(query, `${e.protocol} ${e.kind} ${e.from} ${e.to} ${e.text}`) !== null);
     const spoken = new Map<string, number>();
@@ -131,7 +134,7 @@ export class ConversationsView implements View {
       ...this.#parties.map((party, i) => {
         const label = el('span', { title: party }, party);
         label.style.left = `${this.#laneX(i)}px`;
-        label.style.maxWidth = `${LADDER_WIDTH / Math.max(1, this.#parties.length) - 6}px`;
+        label.style.maxWidth = `${this.#width / Math.max(1, this.#parties.length) - 6}px`;
         return label;
       }),
     );
@@ -142,7 +145,7 @@ export class ConversationsView implements View {
   }
 
   #laneX(i: number): number {
-    return ((i + 0.5) * LADDER_WIDTH) / Math.max(1, this.#parties.length);
+    return ((i + 0.5) * this.#width) / Math.max(1, this.#parties.length);
   }
 
   #lane(party: string): number {
@@ -176,7 +179,7 @@ export class ConversationsView implements View {
       to === null || to === from
         ? [svg('circle', { cx: from, cy: 13, r: 4, class: 'arrow' })]
         : [svg('line', { x1: from, x2: to, y1: 13, y2: 13, class: 'arrow' }), svg('path', { d: `M${to} 13l${to > from ? -7 : 7} -4v8z`, class: 'arrow head' })];
-    rung.replaceChildren(svg('svg', { width: LADDER_WIDTH, height: 26, role: 'img', 'aria-label': event.to ? `${event.from} to ${event.to}` : event.from }, ...lines, ...arrow));
+    rung.replaceChildren(svg('svg', { width: this.#width, height: 26, role: 'img', 'aria-label': event.to ? `${event.from} to ${event.to}` : event.from }, ...lines, ...arrow));
     return true;
   }
 }

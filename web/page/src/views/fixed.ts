@@ -169,6 +169,7 @@ export class FixedView implements View {
       const signal = line.row.signals[line.signal];
       const texts = ['', '', '', signal?.name ?? '', '', '', '', '', '', ''];
       for (const [i, cell] of cells.entries()) setText(cell, texts[i] ?? '');
+      delete data.dataset['key'];
       setText(data, signal ? (signal.value === null ? 'not in this frame' : `${signal.text} ${signal.unit}`.trim()) : '');
       row.removeAttribute('aria-expanded');
       return true;
@@ -183,27 +184,23 @@ export class FixedView implements View {
     return true;
   }
 
-  /** Bytes one by one; the more recently a byte's bits changed, the stronger its ground. */
+  /** Bytes one by one. The ground of each is its eight bits from left to right: the more recently a bit changed, the stronger. */
   #fillBytes(cell: HTMLElement, id: IdRow): void {
-    const key = `${id.lastData} ${this.#time} ${newest(id.changed)}`;
+    const key = `${id.channel} ${id.id} ${id.extended} ${id.lastData} ${this.#time} ${newest(id.changed)}`;
     if (cell.dataset['key'] === key && cell.childElementCount > 0) return;
     cell.dataset['key'] = key;
-    const bytes = bytesText(id.lastData).split(' ').filter(Boolean);
-    replace(
-      cell,
-      ...bytes.map((text, i) => {
-        let last = -Infinity;
-        let mask = 0;
-        for (let bit = 0; bit < 8; bit++) {
-          const at = id.changed[i * 8 + bit] ?? NaN;
-          if (at > last) last = at;
-          if (this.#time - at < FADE) mask |= 0x80 >> bit;
-        }
-        const age = this.#time - last;
-        const level = age < FADE ? Math.ceil((1 - age / FADE) * 4) : 0;
-        return el('span', { class: `byte fade${level}`, title: mask ? `bits ${mask.toString(2).padStart(8, '0')} changed within ${FADE} s` : '' }, text);
-      }),
-    );
+    replace(cell, ...bytesText(id.lastData).split(' ').filter(Boolean).map((text, byte) => this.#byte(text, id.changed.subarray(byte * 8, byte * 8 + 8))));
+  }
+
+  #byte(text: string, changed: Float64Array): HTMLElement {
+    const strengths = [...changed].map((at) => (this.#time - at < FADE ? 1 - (this.#time - at) / FADE : 0));
+    const element = el('span', { class: 'byte' }, text);
+    if (strengths.every((s) => !(s > 0))) return element;
+    const stops = strengths.map((s, bit) => `rgb(var(--heat) / ${(s * 0.55).toFixed(3)}) ${bit * 12.5}% ${(bit + 1) * 12.5}%`);
+    element.style.background = `linear-gradient(90deg, ${stops.join(', ')})`;
+    element.title = `bits ${strengths.map((s, bit) => (s > 0 ? 7 - bit : '')).filter((b) => b !== '').join(', ')} changed within ${FADE} s`;
+    element.dataset['changed'] = String(strengths.filter((s) => s > 0).length);
+    return element;
   }
 }
 

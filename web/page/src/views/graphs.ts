@@ -5,6 +5,7 @@ import { duration, quantity, seconds } from '../model/format';
 import { type Item, type Panel, itemLabel, itemTexts, itemUnit } from '../model/panels';
 import type { Commands } from '../ui/commands';
 import { button, el, replace, select, setText } from '../ui/dom';
+import { CursorValues } from '../graph/cursor-values';
 import { readColours } from '../graph/colours';
 import { type Colours, type Sheet, type Trace, drawPanel, drawTimeAxis, isDigital } from '../graph/draw';
 import { GraphPointer } from '../graph/pointer';
@@ -33,6 +34,7 @@ export class GraphsView implements View {
   readonly #axis = el('canvas', { class: 'time-axis', attrs: { 'aria-hidden': 'true' } });
   readonly #state = el('span', { class: 'state mono', attrs: { role: 'status' } });
   readonly #pointer: GraphPointer;
+  readonly #exact: CursorValues;
   #shown: Shown[] = [];
   #visible = false;
   #scheduled = false;
@@ -46,6 +48,7 @@ export class GraphsView implements View {
     commands: Commands,
   ) {
     this.#cache = new SeriesCache(app, () => this.redraw());
+    this.#exact = new CursorValues(app, () => this.redraw());
     this.#tree = new SignalTree(app, () => undefined);
     this.#pointer = new GraphPointer(app, {
       hover: (time) => {
@@ -85,10 +88,12 @@ export class GraphsView implements View {
     app.on('profile', () => this.redraw());
     app.on('messages', () => {
       this.#cache.clear();
+      this.#exact.clear();
       this.redraw();
     });
     app.on('summary', () => {
       this.#cache.clear();
+      this.#exact.clear();
       this.redraw();
     });
     const cursor = (which: 'A' | 'B') => () => app.setCursor(which, this.#hover ?? (app.range.from + app.range.to) / 2);
@@ -302,17 +307,19 @@ export class GraphsView implements View {
         setText(entry.a, failure ?? 'no database has it');
         continue;
       }
-      const at = (time: number | null): { min: number; max: number } | null => (time === null || !trace.series ? null : valueAt(trace.series, time));
-      const write = (value: { min: number; max: number } | null): string => {
-        if (!value) return '';
-        const text = trace.texts.find((t) => t.value === value.min && value.min === value.max)?.text;
-        return text ?? (value.min === value.max ? quantity(value.min, '') : `${quantity(value.min, '')} … ${quantity(value.max, '')}`);
+      const write = (value: number): string => trace.texts.find((t) => t.value === value)?.text ?? quantity(value, trace.unit);
+      const at = (cursor: 'A' | 'B', time: number | null): number | null => {
+        if (time === null || !trace.series) return null;
+        const exact = this.#exact.get(entry.item, cursor, time);
+        const drawn = valueAt(trace.series, time);
+        return exact !== undefined ? exact : drawn && drawn.min === drawn.max ? drawn.min : null;
       };
-      const a = at(cursorA ?? this.#hover);
-      const b = at(cursorB);
-      setText(entry.a, a ? `${cursorA === null ? '' : 'A '}${write(a)}` : '');
-      setText(entry.b, b ? `B ${write(b)}` : '');
-      setText(entry.delta, a && b && cursorA !== null && a.min === a.max && b.min === b.max ? `Δ ${quantity(b.min - a.min, trace.unit)}` : '');
+      const a = at('A', cursorA);
+      const b = at('B', cursorB);
+      const hover = cursorA === null && this.#hover !== null && trace.series ? valueAt(trace.series, this.#hover) : null;
+      setText(entry.a, a !== null ? `A ${write(a)}` : hover ? (hover.min === hover.max ? write(hover.min) : `${quantity(hover.min, '')} … ${quantity(hover.max, trace.unit)}`) : '');
+      setText(entry.b, b !== null ? `B ${write(b)}` : '');
+      setText(entry.delta, a !== null && b !== null ? `Δy ${quantity(b - a, trace.unit)}` : '');
     }
   }
 

@@ -58,7 +58,7 @@ export class NotesView implements View {
 
   #draw(): void {
     const { notes } = this.app;
-    replace(this.#list, ...notes.map((note) => this.#entry(note)), notes.length === 0 ? el('li', { class: 'muted' }, 'No notes yet. Ctrl+B adds one at cursor A.') : null);
+    replace(this.#list, ...notes.map((note) => this.#entry(note)), notes.length === 0 ? el('li', { class: 'muted empty' }, 'No notes yet. Ctrl+B adds one at cursor A.') : null);
   }
 
   #entry(note: Note): HTMLElement {

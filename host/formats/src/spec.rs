@@ -402,6 +402,11 @@ impl Format {
             .ok_or_else(|| UnknownFormat::Suffix(path.display().to_string()))
     }
 
+    /// What the names of its files usually end with, without the dot.
+    pub fn suffix(self) -> &'static str {
+        FormatSpec::of(self).suffixes.first().copied().unwrap_or("txt")
+    }
+
     /// Whether a file of the format may have this name.
     pub(crate) fn has_suffix_of(self, path: &Path) -> bool {
         let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();

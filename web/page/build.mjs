@@ -1,5 +1,5 @@
 // Builds the page: one HTML file with style, script and engine inside.
-//   node build.mjs [--engine FILE.wasm] [--entry FILE.ts] --out FILE.html
+//   node build.mjs [--engine FILE.wasm] [--licences FILE.txt] [--entry FILE.ts] --out FILE.html
 // The policy allows exactly this script and this style, by their hashes, and no connection at all.
 
 import { createHash } from 'node:crypto';
@@ -11,7 +11,7 @@ import { build } from 'esbuild';
 
 const here = dirname(fileURLToPath(import.meta.url));
 
-export async function buildPage({ engine, entry = join(here, 'src/main.ts'), out }) {
+export async function buildPage({ engine, licences, entry = join(here, 'src/main.ts'), out }) {
   const options = { bundle: true, minify: true, write: false, legalComments: 'inline', logLevel: 'warning' };
   const script = (await build({ ...options, entryPoints: [entry], format: 'iife', target: ['chrome110', 'firefox115', 'safari16.4'] })).outputFiles[0].text;
   const style = (await build({ ...options, entryPoints: [join(here, 'src/style.css')] })).outputFiles[0].text;
@@ -30,7 +30,11 @@ export async function buildPage({ engine, entry = join(here, 'src/main.ts'), out
     "base-uri 'none'",
     "form-action 'none'",
   ].join('; ');
-  const packed = engine ? `<script type="application/octet-stream" id="cantap-engine" data-encoding="gzip">${gzipSync(readFileSync(engine), { level: 9 }).toString('base64')}</script>` : '';
+  // The page's own script has no code of others; the licences are those of the engine's crates.
+  const packed = [
+    ['cantap-engine', engine],
+    ['cantap-licences', licences],
+  ].map(([id, file]) => (file ? `<script type="application/octet-stream" id="${id}" data-encoding="gzip">${gzipSync(readFileSync(file), { level: 9 }).toString('base64')}</script>` : '')).join('');
   const parts = { '<!--csp-->': policy, '<!--style-->': safeStyle, '<!--cantap-engine-->': packed, '<!--script-->': safeScript };
   let page = readFileSync(join(here, 'src/index.html'), 'utf8');
   for (const [mark, text] of Object.entries(parts)) {
@@ -49,9 +53,9 @@ if (process.argv[1] && resolve(process.argv[1]) === fileURLToPath(import.meta.ur
   };
   const out = value('--out');
   if (!out) {
-    console.error('usage: node build.mjs [--engine FILE.wasm] [--entry FILE.ts] --out FILE.html');
+    console.error('usage: node build.mjs [--engine FILE.wasm] [--licences FILE.txt] [--entry FILE.ts] --out FILE.html');
     process.exit(2);
   }
-  const size = await buildPage({ engine: value('--engine'), out, ...(value('--entry') ? { entry: value('--entry') } : {}) });
+  const size = await buildPage({ engine: value('--engine'), licences: value('--licences'), out, ...(value('--entry') ? { entry: value('--entry') } : {}) });
   console.log(`${out}: ${size} bytes`);
 }

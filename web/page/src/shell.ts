@@ -2,7 +2,7 @@
 
 import type { App } from './model/app';
 import { openFiles } from './model/open-files';
-import { save } from './model/files';
+import { blobOfBase64, gunzip, save } from './model/files';
 import { bytes, count, duration, idText, parseTime, percent } from './model/format';
 import { parseProfile } from './model/storage';
 import { Commands, type Command, keyLabel } from './ui/commands';
@@ -130,6 +130,7 @@ export class Shell {
       { id: 'goto', title: 'Go to a time', keys: [':'], run: () => this.#askTime() },
       { id: 'theme', title: 'Dark, light, or as the system has it', keys: ['D'], run: () => this.#cycleTheme() },
       { id: 'profile.save', title: 'Save the layout as a profile', run: () => this.#saveProfile() },
+      { id: 'licences', title: 'Licences', run: () => void this.#licences() },
       { id: 'profile.load', title: 'Load a profile', run: () => this.#loadProfile() },
     );
   }
@@ -232,6 +233,16 @@ export class Shell {
       }
     });
     picker.click();
+  }
+
+  async #licences(): Promise<void> {
+    const packed = document.getElementById('cantap-licences')?.textContent ?? '';
+    try {
+      const others = packed === '' ? '' : await (await gunzip(blobOfBase64(packed))).text();
+      openDialog('Licences', [el('p', {}, 'cantap: MIT or Apache-2.0, at your choice.'), el('pre', { class: 'licences', attrs: { tabindex: 0 } }, others)], [{ label: 'Close', primary: true }], 'keys');
+    } catch (error) {
+      this.app.failed(error);
+    }
   }
 
   #cycleTheme(): void {

@@ -181,7 +181,7 @@ function drawSeries(pen: Pen, series: Series, colour: string, sheet: Sheet, x: S
     previous = exit;
   }
   // The last value holds until the next one, which is not there: to the trace's end it is drawn only as far as it is known.
-  pen.line(points, colour, 1.25);
+  pen.line(points, colour, 1);
   // Few values are shown one by one, so that it is seen where frames are.
   if (series.exact && last - first < (x.end - x.start) / 12) {
     const dots: number[] = [];

@@ -20,6 +20,8 @@ export interface Pen {
 }
 
 const FONT = 'ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace';
+/** Segments that are stroked at once: the time for one stroke grows faster than its length. */
+const PIECE = 100;
 /** Width of a character of the monospaced face, as a share of its size. */
 const ADVANCE = 0.603;
 
@@ -53,14 +55,22 @@ export class CanvasPen implements Pen {
     c.setLineDash(dash);
     c.beginPath();
     let down = false;
+    let since = 0;
     for (let i = 0; i + 1 < points.length; i += 2) {
       const x = points[i] as number;
       const y = points[i + 1] as number;
       if (Number.isNaN(x) || Number.isNaN(y)) down = false;
-      else if (down) c.lineTo(x, y);
-      else {
+      else if (!down) {
         c.moveTo(x, y);
         down = true;
+      } else {
+        c.lineTo(x, y);
+        if (++since >= PIECE) {
+          c.stroke();
+          c.beginPath();
+          c.moveTo(x, y);
+          since = 0;
+        }
       }
     }
     c.stroke();

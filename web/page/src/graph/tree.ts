@@ -92,18 +92,18 @@ export class SignalTree {
     const picture = el('canvas', { class: 'sparkline', attrs: { width: 160, height: 36, 'aria-hidden': 'true' } });
     this.#pictures.set(picture, signal);
     this.#observer.observe(picture);
-    return this.#row(item, `${message.name}.${signal.name}`, signal.name, signal.unit, signal.comment, picture);
+    return this.#row(item, signal.name, signal.unit, signal.comment, picture);
   }
 
   #loadRow(channel: number, bitrate: number | null): HTMLElement {
     const item: Item = { kind: 'load', channel };
-    return this.#row(item, `Bus load, channel ${channel}`, `Bus load, channel ${channel}`, bitrate === null ? 'no bit rate' : '%', bitrate === null ? 'The trace gives no bit rate: set it in the summary.' : '', null);
+    return this.#row(item, `Bus load, channel ${channel}`, bitrate === null ? 'no bit rate' : '%', bitrate === null ? 'The trace gives no bit rate: set it in the summary.' : '', null);
   }
 
-  #row(item: Item, label: string, name: string, unit: string, comment: string, picture: HTMLCanvasElement | null): HTMLElement {
+  #row(item: Item, name: string, unit: string, comment: string, picture: HTMLCanvasElement | null): HTMLElement {
     const row = el(
       'div',
-      { class: 'tree-signal', title: comment, attrs: { role: 'treeitem', tabindex: -1, 'aria-level': picture ? 2 : 1, 'aria-label': unit ? `${label}, ${unit}` : label, draggable: 'true' } },
+      { class: 'tree-signal', title: comment, attrs: { role: 'treeitem', tabindex: -1, 'aria-level': picture ? 2 : 1, draggable: 'true' } },
       el('span', { class: 'tick', attrs: { 'aria-hidden': 'true' } }),
       el('span', { class: 'tree-name' }, name),
       el('span', { class: 'muted' }, unit),

@@ -5,6 +5,8 @@ import { el } from './dom';
 
 /** Well below every browser's limit. */
 const MAX_HEIGHT = 8_000_000;
+/** Pixels of the head, as in the style sheet. */
+const HEAD = 22;
 
 export interface Column {
   name: string;
@@ -27,8 +29,8 @@ export interface RowSource {
 let lists = 0;
 
 export class VirtualList {
+  /** The scrolled table itself: it holds the focus and its head stays at the top. */
   readonly element: HTMLElement;
-  readonly #viewport: HTMLElement;
   readonly #spacer: HTMLElement;
   readonly #layer: HTMLElement;
   readonly #rows: { row: HTMLElement; cells: HTMLElement[] }[] = [];
@@ -47,21 +49,21 @@ export class VirtualList {
     private readonly columns: Column[],
     private readonly source: RowSource,
     private readonly rowHeight = 20,
+    role: 'grid' | 'treegrid' = 'grid',
   ) {
     this.#spacer = el('div', { class: 'list-spacer' });
     this.#layer = el('div', { class: 'list-layer', attrs: { role: 'rowgroup' } });
-    this.#viewport = el('div', { class: 'list-viewport', attrs: { role: 'presentation' } }, this.#spacer, this.#layer);
     const head = el('div', { class: 'list-head', attrs: { role: 'rowgroup' } }, el('div', { class: 'list-row', attrs: { role: 'row', 'aria-rowindex': 1 } }, ...columns.map((c) => el('div', { class: `cell ${c.class}`, attrs: { role: 'columnheader' } }, c.name))));
-    this.element = el('div', { class: 'list', attrs: { role: 'grid', tabindex: 0, 'aria-label': label, 'aria-colcount': columns.length } }, head, this.#viewport);
-    this.#viewport.addEventListener('scroll', () => this.#scrolled(), { passive: true });
-    this.#viewport.addEventListener('wheel', (event) => this.#wheel(event), { passive: false });
+    this.element = el('div', { class: 'list', attrs: { role, tabindex: 0, 'aria-label': label, 'aria-colcount': columns.length } }, head, this.#spacer, this.#layer);
+    this.element.addEventListener('scroll', () => this.#scrolled(), { passive: true });
+    this.element.addEventListener('wheel', (event) => this.#wheel(event), { passive: false });
     this.element.addEventListener('keydown', (event) => this.#key(event));
     this.#layer.addEventListener('click', (event) => this.#click(event));
     this.#layer.addEventListener('dblclick', () => this.source.opened?.(this.#selected));
     new ResizeObserver(() => {
-      this.#height = this.#viewport.clientHeight;
+      this.#height = Math.max(0, this.element.clientHeight - HEAD);
       this.#layout();
-    }).observe(this.#viewport);
+    }).observe(this.element);
   }
 
   get selected(): number {
@@ -109,18 +111,18 @@ export class VirtualList {
     const range = Math.min(this.#full, MAX_HEIGHT) - this.#height;
     const position = this.#lastTop > 0 ? (this.#top / this.#lastTop) * range : 0;
     const rounded = this.#full <= MAX_HEIGHT ? this.#top * this.rowHeight : position;
-    this.#viewport.scrollTop = rounded;
-    this.#expected = this.#viewport.scrollTop;
-    this.#lastScroll = this.#viewport.scrollTop;
+    this.element.scrollTop = rounded;
+    this.#expected = this.element.scrollTop;
+    this.#lastScroll = this.element.scrollTop;
   }
 
   #scrolled(): void {
-    const at = this.#viewport.scrollTop;
+    const at = this.element.scrollTop;
     if (this.#expected !== null && Math.abs(at - this.#expected) < 1) return;
     this.#expected = null;
     const step = at - this.#lastScroll;
     this.#lastScroll = at;
-    const range = this.#viewport.scrollHeight - this.#height;
+    const range = this.element.scrollHeight - HEAD - this.#height;
     if (this.#full <= MAX_HEIGHT) this.#top = at / this.rowHeight;
     else if (at <= 0) this.#top = 0;
     else if (at >= range - 1) this.#top = this.#lastTop;

@@ -37,7 +37,7 @@ export class BitsView implements View {
     commands: Commands,
   ) {
     this.#picker = new IdentifierPicker(app);
-    this.#editor = new SignalEditor(app, () => this.#markedField());
+    this.#editor = new SignalEditor(app, () => this.#markedField(), () => this.#mark());
     this.#asking = new Latest(() => this.#fetch(), (error) => app.failed(error));
     const windows = select(
       [
@@ -146,7 +146,8 @@ export class BitsView implements View {
     const share = bits.frames > 1 ? flips / (bits.frames - 1) : 0;
     // Rare changes must be seen, too: the square root lifts them.
     const heat = flips === 0 ? 0 : Math.max(1, Math.ceil(Math.sqrt(share) * 9));
-    const element = el('span', { class: `bit heat${heat}`, id: `bit-${cell}`, attrs: { role: 'gridcell', 'aria-label': `byte ${cell >> 3} bit ${bitOfCell(cell) & 7}: ${flips} changes, 1 in ${ones} of ${bits.frames} frames` } }, flips === 0 ? (ones > 0 ? '1' : '0') : shortCount(flips));
+    const shown = flips === 0 ? (ones > 0 ? '1' : '0') : shortCount(flips);
+    const element = el('span', { class: `bit heat${heat}`, id: `bit-${cell}`, attrs: { role: 'gridcell', 'aria-label': `${shown}, byte ${cell >> 3} bit ${bitOfCell(cell) & 7}: ${flips} changes, 1 in ${ones} of ${bits.frames} frames` } }, shown);
     element.dataset['cell'] = String(cell);
     let depth = 0;
     for (const [i, cells] of places.entries()) {

@@ -22,7 +22,7 @@ const COLUMNS = [
 ];
 const LADDER = [
   { name: 'Time / s', class: 'c-time' },
-  { name: '', class: 'c-ladder' },
+  { name: 'From → to', class: 'c-ladder' },
   { name: 'What', class: 'c-what' },
 ];
 

@@ -11,7 +11,7 @@ import { VirtualList } from '../ui/virtual-list';
 import type { View } from './view';
 
 const COLUMNS = [
-  { name: '', class: 'c-twist' },
+  { name: '±', class: 'c-twist' },
   { name: 'Ch', class: 'c-channel' },
   { name: 'ID', class: 'c-id' },
   { name: 'Message', class: 'c-message' },
@@ -67,7 +67,7 @@ export class FixedView implements View {
         if (line && !sameIdentifier(app.identifier, line.row)) app.choose(identifierOf(line.row));
       },
       opened: (index) => this.#toggle(index),
-    });
+    }, 20, 'treegrid');
     this.#list.element.addEventListener('click', (event) => {
       if ((event.target as Element).closest('.c-twist')) this.#toggle(this.#list.selected);
     });
@@ -171,6 +171,7 @@ export class FixedView implements View {
       for (const [i, cell] of cells.entries()) setText(cell, texts[i] ?? '');
       delete data.dataset['key'];
       setText(data, signal ? (signal.value === null ? 'not in this frame' : `${signal.text} ${signal.unit}`.trim()) : '');
+      row.setAttribute('aria-level', '2');
       row.removeAttribute('aria-expanded');
       return true;
     }
@@ -178,6 +179,7 @@ export class FixedView implements View {
     const open = this.#open.has(keyOf(id));
     const texts = [id.signals.length > 0 ? (open ? '▾' : '▸') : '', String(id.channel), idText(id.id, id.extended), id.message ?? '', count(id.count), id.period ? duration(id.period.median) : '–', id.period ? duration(id.period.min) : '–', id.period ? duration(id.period.max) : '–', seconds(id.lastTime)];
     for (const [i, text] of texts.entries()) setText(cells[i] as HTMLElement, text);
+    row.setAttribute('aria-level', '1');
     if (id.signals.length > 0) row.setAttribute('aria-expanded', String(open));
     else row.removeAttribute('aria-expanded');
     this.#fillBytes(data, id);

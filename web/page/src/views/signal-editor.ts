@@ -39,6 +39,7 @@ export class SignalEditor {
   constructor(
     private readonly app: App,
     private readonly marked: () => BitField,
+    orderChanged: () => void,
   ) {
     this.#little.checked = true;
     this.#preview = new Latest(() => this.#draw(), (error) => setText(this.#problem, error instanceof Error ? error.message : String(error)));
@@ -63,7 +64,7 @@ export class SignalEditor {
       void this.#make();
     });
     form.addEventListener('input', () => this.#preview.ask(null));
-    this.#little.addEventListener('change', () => this.markedChanged());
+    this.#little.addEventListener('change', orderChanged);
     this.element = el('aside', { class: 'signal-editor', attrs: { 'aria-label': 'Signal editor', tabindex: 0 } }, form);
     app.on('own', () => this.#preview.ask(null));
   }

@@ -191,10 +191,10 @@ fn count(mut byte: u8, counts: &mut [u32]) {
 pub struct Periods {
     edges: Floats,
     counts: Integers,
-    min: Option<f64>,
-    max: Option<f64>,
-    mean: Option<f64>,
-    deviation: Option<f64>,
+    min: f64,
+    max: f64,
+    mean: f64,
+    deviation: f64,
 }
 
 /// A histogram of an identifier's periods, without those in which frames of the channel were lost.
@@ -209,7 +209,7 @@ pub fn periods(place: Place, content: &Content, index: &Index, sections: &mut Se
     seconds.sort_by(f64::total_cmp);
     let (Some(min), Some(max)) = (seconds.first().copied(), seconds.last().copied()) else {
         let (edges, counts) = (sections.floats(&[]), sections.integers(&[]));
-        return Periods { edges, counts, min: None, max: None, mean: None, deviation: None };
+        return Periods { edges, counts, min: 0.0, max: 0.0, mean: 0.0, deviation: 0.0 };
     };
     let count = seconds.len() as f64;
     let mean = seconds.iter().sum::<f64>() / count;
@@ -231,14 +231,7 @@ pub fn periods(place: Place, content: &Content, index: &Index, sections: &mut Se
         let bin = edges.partition_point(|edge| edge <= one).saturating_sub(1).min(counts.len() - 1);
         counts[bin] += 1;
     }
-    Periods {
-        edges: sections.floats(&edges),
-        counts: sections.integers(&counts),
-        min: Some(min),
-        max: Some(max),
-        mean: Some(mean),
-        deviation: Some(deviation),
-    }
+    Periods { edges: sections.floats(&edges), counts: sections.integers(&counts), min, max, mean, deviation }
 }
 
 /// The intervals between an identifier's frames, each with the time of its end, without those with a gap of the channel in them.

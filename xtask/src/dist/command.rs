@@ -2,12 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::Result;
+use anyhow::{Result, bail};
 use xshell::{Shell, cmd};
 
 use super::archive::{VERSION, archive, staging};
 use super::notices;
-use crate::workspace;
+use crate::machine::Machine;
+use crate::{web, workspace};
 
 /// Shells, and how each names the file with a command's completions.
 const COMPLETIONS: [(&str, &str); 4] =
@@ -31,9 +32,13 @@ pub fn pack(shell: &Shell, dist: &Path) -> Result<()> {
     archive(shell, dist, &name, &content)
 }
 
-/// Builds the command as released.
+/// Builds the command as released, with the page in it.
 pub fn build(shell: &Shell) -> Result<PathBuf> {
-    cmd!(shell, "cargo build --locked --release -p cantap-cli").run()?;
+    let page = match web::build(&Machine::new()?)? {
+        Ok(page) => page.compressed,
+        Err(reason) => bail!("{reason}"),
+    };
+    cmd!(shell, "cargo build --locked --release -p cantap-cli").env("CANTAP_BUILT_PAGE", page).run()?;
     Ok(workspace::target().join("release").join(format!("cantap{}", std::env::consts::EXE_SUFFIX)))
 }
 

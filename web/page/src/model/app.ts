@@ -86,7 +86,7 @@ export class App extends Emitter<Topic> {
     if (this.dead !== null) return;
     this.dead = reason;
     this.emit('engine');
-    this.notify('error', `The engine stopped: ${reason} What was read stays in sight, but nothing new can be asked.`, {
+    this.notify('error', `${reason.charAt(0).toUpperCase()}${reason.slice(1)}.`, {
       label: 'Start it again',
       run: () => void this.startAgain(),
     });

@@ -13,6 +13,6 @@ const at = process.argv.indexOf('--page');
 const page = at < 0 ? undefined : process.argv[at + 1];
 
 await buildPage({ entry: join(here, 'fake-main.ts'), out: join(here, '../dist/fake.html') });
-const files = ['trace', 'graphs', 'bits', 'views', 'errors', 'report', 'access', ...(page ? ['delivered'] : [])].map((name) => join(here, `${name}.test.mjs`));
+const files = ['trace', 'graphs', 'bits', 'views', 'errors', 'report', 'access', ...(page ? ['engine', 'delivered'] : [])].map((name) => join(here, `${name}.test.mjs`));
 const { status } = spawnSync(process.execPath, ['--test', '--test-concurrency=1', ...files], { stdio: 'inherit', env: { ...process.env, ...(page ? { CANTAP_TEST_PAGE: page } : {}) } });
 process.exit(status ?? 1);

@@ -54,7 +54,7 @@ async function openReport(app: App, report: Report): Promise<boolean> {
         app.failed(error);
       }
     }
-    await app.openTrace(await unpack(report.trace));
+    await app.openTrace(await unpack(report.trace), report.bitrates);
     return true;
   } catch (error) {
     app.failed(error);

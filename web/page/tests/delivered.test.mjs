@@ -147,5 +147,10 @@ test('a file of no known format is refused in words, and the page goes on', asyn
   await page.locator('.notice.error').waitFor();
   await page.locator('main.start input[type=file]').setInputFiles([file('drive.log', lines()[0])]);
   await page.locator('.shell').waitFor();
+  await page.locator('.shell > input[type=file]').setInputFiles([file('y.bin', Buffer.from([0, 1, 2, 3, 255, 254]))]);
+  await until(page, 'the second file is refused, too', () => document.querySelectorAll('.notice.error').length === 2);
+  await show(page, 'trace');
+  await page.locator('#trace-filter').fill('100');
+  await untilText(page, '#view-trace .state', '1 of 1 records');
   await page.done();
 });

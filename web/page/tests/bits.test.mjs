@@ -43,6 +43,11 @@ test('bits are marked by keys, made a signal, seen in the graphs, undone, redone
   await page.locator('#tab-graphs').click();
   await untilText(page, '.panel', 'Engine.Torque');
   await page.locator('#tab-bits').click();
+  // In a field, Ctrl+Z is the field's own.
+  await page.getByLabel('Unit').fill('Nm2');
+  await page.getByLabel('Unit').press('Control+z');
+  assert.equal(await page.locator('.bit-legend button', { hasText: 'Torque' }).count(), 1);
+  await page.locator('.bit-grid').focus();
   await page.keyboard.press('Control+z');
   await until(page, 'undone', () => ![...document.querySelectorAll('.bit-legend button')].some((b) => b.textContent.startsWith('Torque ')));
   await page.keyboard.press('Control+y');

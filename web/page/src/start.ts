@@ -41,6 +41,8 @@ export async function start(loadEngine: () => Promise<Engine>): Promise<void> {
   if (app.storage.refused !== null) notices.notify('info', 'This browser keeps nothing for this page: save your layout as a profile (Ctrl+K) if you want it again.');
   if (report) {
     app.report = report;
+    // Whoever opens a report sees its findings first, whatever was looked at last.
+    app.profile.view = 'summary';
     if (!(await openReport(app, report)) && !shown) replace(place, screen, notices.element);
   }
 }
@@ -54,7 +56,7 @@ async function openReport(app: App, report: Report): Promise<boolean> {
         app.failed(error);
       }
     }
-    await app.openTrace(await unpack(report.trace));
+    await app.openTrace(await unpack(report.trace), report.bitrates);
     return true;
   } catch (error) {
     app.failed(error);

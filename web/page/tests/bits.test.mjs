@@ -39,14 +39,19 @@ test('bits are marked by keys, made a signal, seen in the graphs, undone, redone
   await page.getByLabel('Unit').fill('Nm');
   await page.getByLabel('Factor').fill('0.5');
   await page.getByRole('button', { name: 'Make the signal' }).click();
-  await until(page, 'the signal is in the grid', () => [...document.querySelectorAll('.bit-legend button')].some((b) => b.textContent === 'Torque'));
+  await until(page, 'the signal is in the grid', () => [...document.querySelectorAll('.bit-legend button')].some((b) => b.textContent.startsWith('Torque ')));
   await page.locator('#tab-graphs').click();
   await untilText(page, '.panel', 'Engine.Torque');
   await page.locator('#tab-bits').click();
+  // In a field, Ctrl+Z is the field's own.
+  await page.getByLabel('Unit').fill('Nm2');
+  await page.getByLabel('Unit').press('Control+z');
+  assert.equal(await page.locator('.bit-legend button', { hasText: 'Torque' }).count(), 1);
+  await page.locator('.bit-grid').focus();
   await page.keyboard.press('Control+z');
-  await until(page, 'undone', () => ![...document.querySelectorAll('.bit-legend button')].some((b) => b.textContent === 'Torque'));
+  await until(page, 'undone', () => ![...document.querySelectorAll('.bit-legend button')].some((b) => b.textContent.startsWith('Torque ')));
   await page.keyboard.press('Control+y');
-  await until(page, 'redone', () => [...document.querySelectorAll('.bit-legend button')].some((b) => b.textContent === 'Torque'));
+  await until(page, 'redone', () => [...document.querySelectorAll('.bit-legend button')].some((b) => b.textContent.startsWith('Torque ')));
   const dbc = await saved(page, () => page.getByRole('button', { name: 'Save DBC' }).click());
   assert.match(dbc.bytes.toString(), /"name":"Torque","startBit":39,"bitLength":16,"littleEndian":false/);
   await page.done();

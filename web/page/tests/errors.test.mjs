@@ -43,7 +43,7 @@ test('when the engine dies, what is shown stays, and it is started again with th
   const page = await opened('trace');
   await page.evaluate(() => globalThis.fakeEngines.at(-1).close());
   await page.locator('#trace-filter').fill('123');
-  await untilText(page, '.notice.error', 'The engine stopped: it ran into a fault of its own. What was read stays in sight');
+  await untilText(page, '.notice.error', 'The engine has stopped: it met a fault. What is shown stays.');
   assert.ok((await page.locator('#view-trace .list-row:not([hidden])').count()) > 10);
   await page.getByRole('button', { name: 'Start it again' }).click();
   await until(page, 'the filter is answered', () => /records/.test(document.querySelector('#view-trace .state').textContent) && !document.querySelector('.engine-dead'));

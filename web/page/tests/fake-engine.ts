@@ -64,7 +64,7 @@ export class FakeEngine implements Engine {
   async ask<K extends keyof Requests>(request: K, parameters: Requests[K]['in']): Promise<Answer<K>> {
     this.asked.set(request, (this.asked.get(request) ?? 0) + 1);
     await Promise.resolve();
-    if (this.#died) throw Object.assign(new Error('it ran into a fault of its own.'), { name: 'EngineDied' });
+    if (this.#died) throw Object.assign(new Error('the engine has stopped: it met a fault. What is shown stays'), { name: 'EngineDied' });
     const handler = this.#handlers[request] as (p: Requests[K]['in']) => Answer<K>;
     return handler(parameters);
   }

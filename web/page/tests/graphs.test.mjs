@@ -136,6 +136,17 @@ test('what is saved is well-formed: PNG by its signature, SVG by a parser, CSV b
   await page.done();
 });
 
+test('a message of the tree is closed and opened again', async () => {
+  const page = await opened('graphs');
+  const engine = page.locator('.tree-message', { hasText: 'Engine' });
+  await engine.click();
+  await until(page, 'closed', () => document.querySelectorAll('.tree-message[aria-expanded=false]').length === 1);
+  assert.equal(await signal(page, 'Speed').count(), 0);
+  await page.keyboard.press('ArrowRight');
+  await until(page, 'open', () => document.querySelectorAll('.tree-message[aria-expanded=false]').length === 0);
+  await page.done();
+});
+
 test('bus load is a graph, and the search leaves what matches', async () => {
   const page = await withGraphs('Bus load');
   await page.keyboard.press('/');

@@ -24,6 +24,7 @@ function report(changes = {}) {
     notes: ['Brake <i>pedal</i> at 12 s'],
     trace: packed('drive.log', trace),
     databases: [{ ...packed('car.dbc', Buffer.from('BU_:')), channel: null }],
+    bitrates: [{ channel: 1, bitrate: 125000, dataBitrate: null }],
     findings: [{ severity: 'error', text: 'From the report', time: 2, channel: 1, id: null, extended: false }],
     thinned: ['Every second frame of 1FF was left out.'],
     ...changes,
@@ -45,6 +46,7 @@ test('a report opens by itself: notes, findings, databases, and the trace comes 
   await untilText(page, '#view-summary .findings li', 'From the report');
   await untilText(page, '#view-summary', 'Every second frame of 1FF was left out.');
   await untilText(page, '#view-summary', 'car.dbc');
+  await untilText(page, '#view-summary', '125 kbit/s');
   const file = await saved(page, () => page.getByRole('button', { name: 'Save the trace' }).click());
   assert.equal(file.name, 'drive.log');
   assert.ok(file.bytes.equals(trace));

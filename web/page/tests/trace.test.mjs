@@ -71,8 +71,7 @@ test('find goes forwards and backwards, and says when there is none', async () =
 
 test('times are shown since the start, in UTC or since the row above', async () => {
   const page = await opened('trace');
-  const first = () => page.locator('#view-trace .list-row[data-index="2"] .c-time').textContent();
-  assert.equal(await first(), '0.002000');
+  await until(page, 'seconds', () => document.querySelector('#view-trace .list-row[data-index="2"] .c-time')?.textContent === '0.002000');
   await focus(page);
   await page.keyboard.press('t');
   await until(page, 'UTC', () => document.querySelector('#view-trace .list-row[data-index="2"] .c-time').textContent === '05:12:35.125456');
@@ -103,6 +102,27 @@ test('ten million rows: the bar leaps, the wheel moves by rows, both ends are re
   await until(page, 'five rows further', (top) => [...document.querySelectorAll('#view-trace .list-layer .list-row:not([hidden])')].some((row) => Number(row.dataset.index) === top + 5) && Math.min(...[...document.querySelectorAll('#view-trace .list-layer .list-row:not([hidden])')].map((row) => Number(row.dataset.index))) === top + 5, before);
   await page.keyboard.press('g');
   await untilRow(page, 0);
+  await page.done();
+});
+
+test('in a long trace, a finger’s small steps move by as many rows, and the bar follows', async () => {
+  const page = await opened('trace', { records: 10_000_000 });
+  const list = page.locator('#view-trace .list');
+  await list.evaluate((element) => {
+    element.scrollTop = element.scrollHeight / 2;
+  });
+  const top = () => page.evaluate(() => Math.min(...[...document.querySelectorAll('#view-trace .list-layer .list-row:not([hidden])')].map((row) => Number(row.dataset.index))));
+  await until(page, 'the middle is in sight', () => Number(document.querySelector('#view-trace .list-layer .list-row:not([hidden]):not(.pending)')?.dataset.index) > 4_000_000);
+  const before = await top();
+  const bar = await list.evaluate((element) => element.scrollTop);
+  for (let i = 1; i <= 5; i++) {
+    await list.evaluate((element) => {
+      element.scrollTop += 200;
+    });
+    await until(page, `${i * 10} rows further`, (row) => [...document.querySelectorAll('#view-trace .list-layer .list-row:not([hidden])')].some((r) => Number(r.dataset.index) === row) && !document.querySelector(`#view-trace .list-layer .list-row:not([hidden])[data-index="${row - 1}"]`), before + i * 10);
+  }
+  // 50 rows of ten million, of a bar of eight million pixels: 40 pixels, and not the 1000 that were scrolled.
+  await until(page, 'the bar follows', (b) => Math.abs(document.querySelector('#view-trace .list').scrollTop - b - 40) < 5, bar);
   await page.done();
 });
 

@@ -17,7 +17,7 @@ export interface PointerListener {
 
 type Gesture =
   | { kind: 'none' }
-  | { kind: 'box'; startX: number; start: number; moved: boolean; shift: boolean }
+  | { kind: 'box'; startX: number; start: number; moved: boolean }
   | { kind: 'pan'; startX: number; range: Range; moved: boolean }
   | { kind: 'cursor'; which: 'A' | 'B' }
   | { kind: 'pinch'; distance: number; centre: number; range: Range };
@@ -70,7 +70,7 @@ export class GraphPointer {
     else if (!event.shiftKey && near(this.app.cursorA)) this.#gesture = { kind: 'cursor', which: 'A' };
     else if (!event.shiftKey && near(this.app.cursorB)) this.#gesture = { kind: 'cursor', which: 'B' };
     else if (event.shiftKey) this.#gesture = { kind: 'pan', startX: x, range, moved: false };
-    else this.#gesture = { kind: 'box', startX: x, start: fromPixel(this.#scale(canvas), x), moved: false, shift: event.shiftKey };
+    else this.#gesture = { kind: 'box', startX: x, start: fromPixel(this.#scale(canvas), x), moved: false };
     if (event.button === 1) event.preventDefault();
   }
 

@@ -17,7 +17,8 @@ export class SignalTree {
   readonly #search = el('input', { attrs: { type: 'search', placeholder: 'Search messages and signals', 'aria-label': 'Search messages and signals', spellcheck: 'false' } });
   readonly #list = el('div', { class: 'tree', attrs: { role: 'tree', 'aria-label': 'Messages and signals' } });
   readonly #state = el('p', { class: 'muted', attrs: { role: 'status' } });
-  readonly #open = new Set<string>();
+  /** Messages that were opened or closed by hand. */
+  readonly #open = new Map<string, boolean>();
   readonly #observer: IntersectionObserver;
   readonly #pictures = new WeakMap<Element, SignalInfo>();
 
@@ -58,7 +59,7 @@ export class SignalTree {
       if (!name && signals.length === 0) continue;
       shown += signals.length;
       const key = `${message.key}`;
-      const open = this.#open.has(key) || (query !== '' && shown < 60) || messages.length <= 6;
+      const open = this.#open.get(key) ?? ((query !== '' && shown < 60) || messages.length <= 6);
       rows.push(this.#messageRow(message, key, open));
       if (open) rows.push(...signals.map((signal) => this.#signalRow(message, signal)));
     }
@@ -79,8 +80,7 @@ export class SignalTree {
       el('span', { class: 'mono number' }, message.count === 0 ? 'absent' : count(message.count)),
     );
     row.addEventListener('click', () => {
-      if (this.#open.has(key)) this.#open.delete(key);
-      else this.#open.add(key);
+      this.#open.set(key, !open);
       this.show();
       this.#focusText(message.name);
     });

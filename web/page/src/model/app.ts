@@ -86,7 +86,7 @@ export class App extends Emitter<Topic> {
     if (this.dead !== null) return;
     this.dead = reason;
     this.emit('engine');
-    this.notify('error', `The engine stopped: ${reason} What was read stays in sight, but nothing new can be asked.`, {
+    this.notify('error', `${reason.charAt(0).toUpperCase()}${reason.slice(1)}.`, {
       label: 'Start it again',
       run: () => void this.startAgain(),
     });
@@ -110,7 +110,8 @@ export class App extends Emitter<Topic> {
     this.notify('error', error instanceof Error ? error.message : String(error));
   }
 
-  async openTrace(file: File): Promise<void> {
+  /** `bitrates`: what the file does not say itself, in bit/s. */
+  async openTrace(file: File, bitrates: Report['bitrates'] = []): Promise<void> {
     const turn = ++this.#opening;
     this.traceFile = file;
     this.#fitted = true;
@@ -136,6 +137,7 @@ export class App extends Emitter<Topic> {
       const reason = error instanceof Error ? error.message : String(error);
       this.notify('error', `${file.name} was read to byte ${count(read)} of ${count(file.size)}, and no further: ${reason} What was read stays.`);
     }
+    for (const { channel, bitrate, dataBitrate } of bitrates) await this.ask('bitrate', { channel, bitrate, ...(dataBitrate === null ? {} : { dataBitrate }) });
     await this.refresh();
     for (const issue of this.summary?.issues ?? []) this.notify('warning', `${issue.text}${issue.count > 1 ? ` (${count(issue.count)} times)` : ''}`);
   }

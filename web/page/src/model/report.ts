@@ -20,6 +20,8 @@ export interface Report {
   notes: string[];
   trace: Packed;
   databases: (Packed & { channel: number | null })[];
+  /** Bit rates that the trace itself does not give, in bit/s. */
+  bitrates: { channel: number; bitrate: number; dataBitrate: number | null }[];
   findings: Finding[];
   /** What was left out to keep to the size limit, in sentences. */
   thinned: string[];
@@ -44,6 +46,7 @@ export function embeddedReport(root: Document): Report | null {
     notes: raw.notes ?? [],
     trace: raw.trace,
     databases: raw.databases ?? [],
+    bitrates: raw.bitrates ?? [],
     findings: raw.findings ?? [],
     thinned: raw.thinned ?? [],
   };

@@ -1,4 +1,4 @@
-// Rows of a view of the trace, fetched by blocks as they come into sight. The newest wish goes first; blocks long out of sight are forgotten.
+// Rows of a view of the trace, fetched by blocks as they come into sight. The newest request goes first; blocks long out of sight are forgotten.
 
 import type { Row } from '../api';
 import type { App } from './app';

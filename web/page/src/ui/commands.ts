@@ -29,7 +29,8 @@ export class Commands {
   key(event: KeyboardEvent, view: string): boolean {
     const name = keyName(event);
     const typing = isTyping(event.target);
-    if (typing && !event.ctrlKey && !event.metaKey) return false;
+    // In a field, undo and redo are the field's own.
+    if (typing && ((!event.ctrlKey && !event.metaKey) || /^[zy]$/i.test(event.key))) return false;
     const found = this.all(view)
       .filter((c) => c.keys?.includes(name))
       .sort((a, b) => Number(a.view === undefined) - Number(b.view === undefined))[0];

@@ -56,6 +56,8 @@ export class VirtualList {
     const head = el('div', { class: 'list-head', attrs: { role: 'rowgroup' } }, el('div', { class: 'list-row', attrs: { role: 'row', 'aria-rowindex': 1 } }, ...columns.map((c) => el('div', { class: `cell ${c.class}`, attrs: { role: 'columnheader' } }, c.name))));
     this.element = el('div', { class: 'list', attrs: { role, tabindex: 0, 'aria-label': label, 'aria-colcount': columns.length } }, head, this.#spacer, this.#layer);
     this.element.addEventListener('scroll', () => this.#scrolled(), { passive: true });
+    // After a finger has moved by rows, the bar is put where these rows are.
+    this.element.addEventListener('scrollend', () => this.#place());
     this.element.addEventListener('wheel', (event) => this.#wheel(event), { passive: false });
     this.element.addEventListener('keydown', (event) => this.#key(event));
     this.#layer.addEventListener('click', (event) => this.#click(event));

@@ -162,7 +162,9 @@ export class BitsView implements View {
 
   #legendEntry(signal: SignalInfo, i: number): HTMLElement {
     const about = `${signal.startBit}|${signal.bitLength}@${signal.littleEndian ? 1 : 0}${signal.signed ? '−' : '+'}${signal.multiplex ? ` ${signal.multiplex}` : ''}`;
-    return button(`${signal.name}`, () => this.#editor.edit(signal), { class: `signal-entry line-${i % 8}`, title: `${signal.comment}\nEdit a copy of it in your own database`, attrs: { 'aria-label': `${signal.name}, ${about}: edit` } });
+    const entry = button(signal.name, () => this.#editor.edit(signal), { class: `signal-entry line-${i % 8}`, title: `${signal.comment}\nEdit a copy of it in your own database`.trim() });
+    entry.append(' ', el('span', { class: 'mono muted' }, about));
+    return entry;
   }
 
   #mark(): void {

@@ -78,7 +78,7 @@ export class GraphsView implements View {
     const stack = el('div', { class: 'graph-stack', attrs: { tabindex: 0, role: 'group', 'aria-label': 'Graphs: arrows pan, plus and minus zoom' } }, this.#panels, this.#axis);
     this.element = el('section', { class: 'view view-graphs', attrs: { 'aria-label': 'Graphs' } }, bar, el('div', { class: 'split graphs-split' }, this.#tree.element, stack));
     this.#pointer.attach(this.#axis);
-    for (const target of [this.#panels]) this.#acceptDrops(target, null);
+    this.#acceptDrops(this.#panels, null);
     new ResizeObserver(() => this.redraw()).observe(stack);
     matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => this.redraw());
     app.on('panels', () => this.#rebuild());

@@ -93,6 +93,8 @@ fn engine(shell: &Shell, toolchain: Toolchain, directory: &Path) -> Result<PathB
         .env("CARGO_TARGET_WASM32_UNKNOWN_UNKNOWN_LINKER", linker(toolchain))
         // The page has no paths of this machine in it.
         .env("CARGO_ENCODED_RUSTFLAGS", toolchain.remaps(shell)?)
+        // Without the parts that read debug information for backtraces.
+        .args(toolchain.std_features())
         .args(["--profile", "web", "-p", "cantap-web-engine"])
         .run()?;
     Ok(directory.join(TARGET).join("web/cantap_web_engine.wasm"))

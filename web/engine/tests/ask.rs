@@ -120,7 +120,7 @@ fn filters_and_searches_have_cantaps_grammar() {
         assert_eq!(rows.as_array().unwrap().len() as u64, view["rows"].as_u64().unwrap());
     }
     assert!(page.error("filter", json!({ "filter": "Sped > 4" })).contains("Speed"));
-    assert!(page.error("filter", json!({ "filter": "12g" })).contains("filter"));
+    assert!(page.error("filter", json!({ "filter": "12g" })).contains("'12g'"));
     let view = page.ask("filter", json!({ "filter": "123" }))["view"].clone();
     let mut find = |text: &str, from: i64, backwards: bool| {
         page.ask("find", json!({ "view": view, "text": text, "from": from, "backwards": backwards }))["row"]
@@ -193,8 +193,6 @@ fn identifiers_bits_periods_and_load() {
     let ids = page.ask("ids", json!({ "at": 0.0305 }));
     assert_eq!((&ids[0]["count"], &ids[0]["lastData"]), (&json!(4), &json!("1E00030000000000")));
     assert!((ids[0]["period"]["median"].as_f64().unwrap() - 0.01).abs() < 1e-6);
-    let changed = page.floats("ids", json!({ "at": 0.0305 }), "none");
-    assert!(changed.is_empty());
     let grid =
         page.ask("bits", json!({ "channel": 1, "id": 0x123, "extended": false, "from": null, "to": null }));
     assert_eq!((&grid["length"], &grid["frames"]), (&json!(8), &json!(10)));
@@ -353,7 +351,7 @@ fn random_damage_never_panics() {
     let mut random = fastrand::Rng::with_seed(7);
     let mut source = Page::default();
     source.open("drive.log", log().as_bytes()).unwrap();
-    for format in ["candump", "asc", "blf", "trc", "csv", "pcapng", "pcap"] {
+    for format in ["candump", "asc", "blf", "trc", "csv", "pcapng", "mf4", "dif"] {
         let (answer, sections) = source
             .try_ask("export", json!({ "view": 0, "format": format, "from": null, "to": null }), None)
             .unwrap();

@@ -3,42 +3,20 @@
 use std::fmt::Write as _;
 
 use cantap::{TraceEvent, TraceRecord};
-use cantap_trace::{BusErrorKind, LossStage};
+pub use cantap_trace::event_text::lost;
 
 use super::times::seconds;
 
-use cantap_work::terms::failure_text;
-
 /// The text for a record that is not a frame.
 pub fn event_text(event: &TraceEvent) -> String {
-    let counters = |counters: Option<(u8, u8)>| {
-        counters.map_or(String::new(), |(tec, rec)| format!(", counters {tec} / {rec}"))
+    let letter = match event {
+        TraceEvent::Frame { .. } => return String::new(),
+        TraceEvent::BusError { .. } | TraceEvent::ErrorsSuppressed { .. } => 'E',
+        TraceEvent::State { .. } => 'S',
+        TraceEvent::Lost { .. } => 'L',
+        TraceEvent::TransmitFailed { .. } => 'F',
     };
-    match *event {
-        TraceEvent::Frame { .. } => String::new(),
-        TraceEvent::BusError { kind, counters: at } => {
-            format!("E bus error: {}{}", kind.map_or("unknown", BusErrorKind::name), counters(at))
-        }
-        TraceEvent::ErrorsSuppressed { count } => format!("E {count} more bus errors"),
-        TraceEvent::State { state, counters: at } => format!("S controller {}{}", state.name(), counters(at)),
-        TraceEvent::Lost { stage, count, at_least } => {
-            let stage = stage.map_or("unknown", LossStage::name);
-            format!("L {} frames lost ({stage})", lost(count, at_least))
-        }
-        TraceEvent::TransmitFailed { tag, reason } => {
-            format!("F frame {tag} not sent: {}", failure_text(reason))
-        }
-    }
-}
-
-/// The number of missing frames.
-pub fn lost(count: u32, at_least: bool) -> String {
-    match (count, at_least) {
-        // For example while a device was gone.
-        (0, true) => "an unknown number of".to_owned(),
-        (count, true) => format!("at least {count}"),
-        (count, false) => count.to_string(),
-    }
+    format!("{letter} {event}")
 }
 
 /// A frame as candump writes it.

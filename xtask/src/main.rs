@@ -1,4 +1,4 @@
-//! The project's own build steps: `cargo xtask firmware | test | ci | kernel | circles | links | public-api | size | bench | soak | dist`.
+//! The project's own build steps: `cargo xtask firmware | test | ci | kernel | circles | links | public-api | size | bench | soak | web | dist`.
 //!
 //! Kept light, because `cargo fw` builds it first: what only measurements and checks need is optional, behind
 //! features.
@@ -37,6 +37,7 @@ mod test;
 mod tests;
 mod toolchain;
 mod typos;
+mod web;
 mod workspace;
 
 use std::process::ExitCode;
@@ -73,6 +74,8 @@ enum Task {
     Bench(bench::Args),
     /// Runs the firmware on the emulated board for a long time, with a new seed for each run.
     Soak(soak::Args),
+    /// Builds the page of `cantap report` into `target/web/page.html`.
+    Web,
     /// Packs a release: the command, Debian's package, each board's firmware.
     Dist(dist::Args),
 }
@@ -89,6 +92,7 @@ fn main() -> ExitCode {
         Task::Size => size::run(&board::Board::ALL),
         Task::Bench(args) => bench::run(&args),
         Task::Soak(args) => soak::run(&args),
+        Task::Web => web::run(),
         Task::Dist(args) => dist::run(&args),
     };
     match result {

@@ -9,7 +9,7 @@ use crate::outcome::Outcome;
 use crate::toolchain::Toolchain;
 use crate::{
     check, compiler, cross, dependencies, features, firmware, kernel, package, python, reproducible, tests,
-    typos, workspace,
+    typos, web, workspace,
 };
 
 /// One thing that is checked, in the order of the run. What [`TEST`](Step::TEST) names comes first.
@@ -53,6 +53,8 @@ pub enum Step {
     Kernel,
     /// The package for Python: wheel, types, tests, python-can's own tests, notebooks.
     Python,
+    /// The page of `cantap report`: it builds, is small enough, and its tests pass in a browser.
+    Web,
     /// The command that a newcomer runs first: both channels at full load, nothing lost.
     Demo,
     /// The crates as they would be published: each packs.
@@ -107,6 +109,7 @@ impl Step {
                 };
             }
             Step::Python => return python::check(shell, machine.peers()?),
+            Step::Web => return web::check(machine),
             Step::Demo => cmd!(shell, "cargo demo --time 3s").run()?,
             Step::Package => package::check(shell)?,
         }

@@ -63,10 +63,16 @@ impl Toolchain {
 
     /// `cargo SUBCOMMAND` for the chip. What it builds contains no paths of this machine.
     pub fn cargo<'a>(self, shell: &'a Shell, subcommand: &str, target_dir: &Path) -> Result<Cmd<'a>> {
-        let flags = remaps(shell, &sysroot(shell, self.rustc())?)?;
+        // Both chips' core: the target alone does not schedule code for it.
+        let flags = self.remaps(shell)? + "\x1f-Ctarget-cpu=cortex-m4";
         Ok(self
             .cargo_for(shell, subcommand, TARGET, "core", target_dir)?
             .env("CARGO_ENCODED_RUSTFLAGS", flags))
+    }
+
+    /// Compiler flags, in `CARGO_ENCODED_RUSTFLAGS`' form, that replace this machine's directories.
+    pub fn remaps(self, shell: &Shell) -> Result<String> {
+        remaps(shell, &sysroot(shell, self.rustc())?)
     }
 
     /// The toolchain that has a standard library for a target, preferably rustup's; `None` if neither has one.
@@ -160,7 +166,7 @@ fn sysroot(shell: &Shell, rustc: &str) -> Result<PathBuf> {
     Ok(cmd!(shell, "{rustc} --print sysroot").quiet().read()?.into())
 }
 
-/// Compiler flags, in `CARGO_ENCODED_RUSTFLAGS`' form, that replace this machine's directories.
+/// See [`Toolchain::remaps`].
 fn remaps(shell: &Shell, sysroot: &Path) -> Result<String> {
     let home = std::env::var_os("CARGO_HOME")
         .map(PathBuf::from)
@@ -178,8 +184,6 @@ fn remaps(shell: &Shell, sysroot: &Path) -> Result<String> {
     }
     flags.push(remap(&library, "/rust"));
     flags.push(remap(&shell.current_dir(), "/cantap"));
-    // Both chips' core: the target alone does not schedule code for it.
-    flags.push("-Ctarget-cpu=cortex-m4".to_owned());
     Ok(flags.join("\x1f"))
 }
 

@@ -26,6 +26,7 @@ pub mod monitor;
 pub mod obd;
 pub mod plot;
 pub mod replay;
+pub mod report;
 pub mod run;
 pub mod search;
 pub mod selftest;
@@ -50,6 +51,8 @@ pub enum Command {
     Monitor(monitor::Args),
     /// Draw signals, bus load or periods of a trace: SVG, PNG, HTML, or in the terminal.
     Plot(plot::Args),
+    /// Make a page of a trace that opens in any browser, offline: rows, graphs, findings.
+    Report(report::Args),
     /// Measure a trace or a bus: load, rates, periods, losses, errors.
     Stats(stats::Args),
     /// Convert a trace from any format to any other: filtered, cut out, split.
@@ -132,6 +135,7 @@ impl Command {
             Self::Bits(args) => bits::run(&args),
             Self::Monitor(args) => monitor::run(&args),
             Self::Plot(args) => plot::run(&args),
+            Self::Report(args) => report::run(&args),
             Self::Stats(args) => stats::run(&args),
             Self::Convert(args) => convert::run(&args),
             Self::Diff(args) => diff::run(&args),

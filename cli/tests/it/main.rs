@@ -44,6 +44,7 @@ mod outputs;
 mod port;
 mod protocols;
 mod python_can;
+mod report;
 mod schema;
 mod scripts;
 mod search_and_diff;

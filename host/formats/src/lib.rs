@@ -77,7 +77,7 @@ pub use csv::CsvDialect;
 pub use format::Format;
 pub use issue::{Fault, Place, ReadIssue};
 pub use left_out::LeftOut;
-pub use reader::{NothingRead, OpenError, ReadOptions, TraceReader, open_reader};
+pub use reader::{NothingRead, OpenError, ReadOptions, TraceReader, open_reader, open_source};
 pub use rotation::{BadRotation, RotateAt, Rotation};
 pub use spec::{NotWritten, UnknownFormat};
 pub use trc::TrcVersion;

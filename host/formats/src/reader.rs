@@ -95,8 +95,29 @@ enum Beyond {
 pub fn open_reader(path: impl AsRef<Path>, options: &ReadOptions) -> Result<TraceReader, OpenError> {
     let path = path.as_ref();
     let name = if path.as_os_str() == "-" { "standard input".to_owned() } else { path.display().to_string() };
+    let input = Input::open(path, options.follow).map_err(|error| OpenError::Io(name.clone(), error))?;
+    recognise(path, name, input, options)
+}
+
+/// Like [`open_reader`], for the bytes of a file of this name that is not in the file system: an archive's, a browser's.
+pub fn open_source(
+    name: &str,
+    source: impl Read + Send + 'static,
+    options: &ReadOptions,
+) -> Result<TraceReader, OpenError> {
+    let input = Input::decompressing(Box::new(source), options.follow)
+        .map_err(|error| OpenError::Io(name.to_owned(), error))?;
+    recognise(Path::new(name), name.to_owned(), input, options)
+}
+
+/// Finds the format by content and name.
+fn recognise(
+    path: &Path,
+    name: String,
+    mut input: Input,
+    options: &ReadOptions,
+) -> Result<TraceReader, OpenError> {
     let failed = |error| OpenError::Io(name.clone(), error);
-    let mut input = Input::open(path, options.follow).map_err(failed)?;
     let mut named = None;
     let format = if let Some(format) = options.format {
         format

@@ -402,6 +402,14 @@ impl Format {
             .ok_or_else(|| UnknownFormat::Suffix(path.display().to_string()))
     }
 
+    /// What the names of its files usually end with, without the dot. Versions and dialects share their format's.
+    pub fn suffix(self) -> &'static str {
+        let kinds = Self::all().filter(|format| format.is_kind_of(self));
+        let mut suffixes =
+            std::iter::once(self).chain(kinds).flat_map(|format| FormatSpec::of(format).suffixes);
+        suffixes.next().copied().unwrap_or("txt")
+    }
+
     /// Whether a file of the format may have this name.
     pub(crate) fn has_suffix_of(self, path: &Path) -> bool {
         let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();

@@ -58,18 +58,58 @@ pub use select::{Selection, SelectionError, Suggestion};
 pub fn load(path: &Path) -> Result<Database, DatabaseError> {
     let file = path.display().to_string();
     let (path, bus) = with_bus(path);
-    let suffix = path.extension().and_then(|suffix| suffix.to_str()).unwrap_or_default().to_ascii_lowercase();
-    let read = || std::fs::read(path).map_err(|source| DatabaseError::Read { file: file.clone(), source });
-    match suffix.as_str() {
-        "arxml" => arxml::parse_bus(&file, &read()?, bus),
-        "kcd" => kcd::parse_bus(&file, &read()?, bus),
-        "dbc" | "sym" | "toml" if bus.is_some() => {
-            Err(xml::faulty(&file, format!("a .{suffix} file is of one bus; leave out what follows the #")))
+    let kind = FileKind::of(&file, path)?;
+    if bus.is_none() || kind.has_buses() {
+        let bytes =
+            std::fs::read(path).map_err(|source| DatabaseError::Read { file: file.clone(), source })?;
+        return kind.parse(&file, &bytes, bus);
+    }
+    let suffix = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+    Err(xml::faulty(&file, format!("a .{suffix} file is of one bus; leave out what follows the #")))
+}
+
+/// Reads the content of a database file of this name, by its suffix, as [`load`] does: for files that are not in the file system. All
+/// buses of the file are read.
+pub fn parse(name: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
+    FileKind::of(name, Path::new(name))?.parse(name, bytes, None)
+}
+
+/// The kinds of database files.
+#[derive(Clone, Copy)]
+enum FileKind {
+    Dbc,
+    Kcd,
+    Sym,
+    Arxml,
+    Toml,
+}
+
+impl FileKind {
+    fn of(file: &str, path: &Path) -> Result<Self, DatabaseError> {
+        let suffix = path.extension().and_then(|suffix| suffix.to_str()).unwrap_or_default();
+        match suffix.to_ascii_lowercase().as_str() {
+            "dbc" => Ok(Self::Dbc),
+            "kcd" => Ok(Self::Kcd),
+            "sym" => Ok(Self::Sym),
+            "arxml" => Ok(Self::Arxml),
+            "toml" => Ok(Self::Toml),
+            _ => Err(DatabaseError::UnknownKind { file: file.to_owned() }),
         }
-        "dbc" => dbc::parse(&file, &read()?),
-        "sym" => sym::parse(&file, &read()?),
-        "toml" => file::parse(&file, &read()?),
-        _ => Err(DatabaseError::UnknownKind { file }),
+    }
+
+    /// Whether a file may describe several buses.
+    const fn has_buses(self) -> bool {
+        matches!(self, Self::Kcd | Self::Arxml)
+    }
+
+    fn parse(self, file: &str, bytes: &[u8], bus: Option<&str>) -> Result<Database, DatabaseError> {
+        match self {
+            Self::Dbc => dbc::parse(file, bytes),
+            Self::Kcd => kcd::parse_bus(file, bytes, bus),
+            Self::Sym => sym::parse(file, bytes),
+            Self::Arxml => arxml::parse_bus(file, bytes, bus),
+            Self::Toml => file::parse(file, bytes),
+        }
     }
 }
 

@@ -8,6 +8,7 @@
 
 pub mod clean;
 pub mod diff;
+pub mod event_text;
 pub mod fd;
 mod fd_bits;
 pub mod filter;

@@ -74,11 +74,11 @@ export interface IdRow {
   extended: boolean;
   message: string | null;
   count: number;
-  /** Period in seconds: median, smallest, largest. Null with fewer than two frames. */
+  /** Period in seconds, of the last 512 frames: median, smallest, largest. Null with fewer than two frames. */
   period: { median: number; min: number; max: number } | null;
   lastTime: number;
   lastData: string;
-  /** For each bit of the data (byte 0 bit 7 first), the time it last changed; NaN if never. */
+  /** For each bit of the data (byte 0 bit 7 first), the time it last changed; NaN if not within the last 512 frames. */
   changed: Float64Array;
   signals: SignalValue[];
 }
@@ -129,7 +129,8 @@ export interface SignalInfo {
 
 /**
  * A signal over time, thinned to columns so that no single value is lost: each column holds the first, smallest, largest and last value
- * of its stretch. All arrays have the same length; a column without a value is left out.
+ * of its stretch. All arrays have the same length; a column without a value is left out. The last value before the window and the first
+ * after it are columns of their own at both ends, so that lines reach the picture's edges.
  */
 export interface Series {
   /** Time of the column's first value. */
@@ -211,25 +212,32 @@ export interface SignalEdit {
 
 /** Each request: what it takes, and what it answers. A refused one answers `{ error: string }`, which says what to do next. */
 export interface Requests {
-  /** Takes a file whole, or its first piece if `more` follows. The format is recognised by name and content. */
+  /**
+   * Takes a file whole, or its first piece if `more` follows. The format is recognised by name and content. Without a `size` and with `more`
+   * to come it is live: lines of a candump log.
+   */
   open: { in: { name: string; bytes: Uint8Array; more: boolean; size: number | null }; out: Summary };
   /** The next piece of the file that `open` began. */
   append: { in: { bytes: Uint8Array; more: boolean }; out: Summary };
   summary: { in: Record<string, never>; out: Summary };
-  bitrate: { in: { channel: number; bitrate: number }; out: Summary };
+  /** In bit/s; `dataBitrate` is that of data phases of CAN FD. */
+  bitrate: { in: { channel: number; bitrate: number; dataBitrate?: number }; out: Summary };
   /** Adds a database (DBC, KCD, SYM, ARXML, DBF: recognised by name and content), for one channel or all. */
   database: { in: { name: string; bytes: Uint8Array; channel: number | null }; out: { messages: number; signals: number; warnings: string[] } };
   /** All messages: those of databases, and whether they occur. */
   messages: { in: Record<string, never>; out: MessageInfo[] };
   /**
-   * A filter in cantap's syntax (docs/grammar.md; an empty text: everything), `search` as of `cantap search`. Counts, and names the view
-   * that `rows` reads.
+   * A filter as of candump (several separated by blanks: any may match), or a condition as of `cantap search` (docs/grammar.md); an empty text:
+   * everything. Counts, and names the view that `rows` reads. The eight views used last are kept, and that of everything.
    */
   filter: { in: { filter: string }; out: { view: number; rows: number } };
   rows: { in: { view: number; from: number; count: number }; out: Row[] };
   /** The row of a view at or after a time. */
   rowAt: { in: { view: number; time: number }; out: { row: number } };
-  /** The next row after `from` (or before, backwards) whose frame matches a filter or whose data has these bytes. */
+  /**
+   * The next row after `from` (or before, backwards) that matches: bytes as of `cantap search --data` (`11 ?? 3?`, `* DE AD` for anywhere), or a
+   * filter or condition. −1 is before the first row.
+   */
   find: { in: { view: number; text: string; from: number; backwards: boolean }; out: { row: number | null } };
   /** A row's signals. */
   decode: { in: { index: number }; out: SignalValue[] };
@@ -240,10 +248,13 @@ export interface Requests {
   series: { in: { signal: number; from: number; to: number; columns: number }; out: Series };
   /** A whole field of an identifier as a signal that no database has. */
   rawSeries: { in: SignalEdit & { from: number; to: number; columns: number }; out: Series };
-  /** 0 to 1 per column. */
+  /** 0 to 1 per column; NaN where it cannot be known, such as without a bit rate. */
   load: { in: { channel: number; from: number; to: number; columns: number }; out: { time: Float64Array; load: Float64Array } };
   gaps: { in: { from: number; to: number }; out: Gap[] };
-  /** Periods of one identifier: a histogram, `counts[i]` between `edges[i]` and `edges[i + 1]` seconds. */
+  /**
+   * Periods of one identifier: a histogram, `counts[i]` between `edges[i]` and `edges[i + 1]` seconds. Periods in which frames of the channel
+   * were lost are left out. Empty, with zeros, if there is none.
+   */
   periods: {
     in: { channel: number; id: number; extended: boolean };
     out: { edges: Float64Array; counts: Uint32Array; min: number; max: number; mean: number; deviation: number };

@@ -2,12 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::Result;
+use anyhow::{Result, bail};
 use xshell::{Shell, cmd};
 
 use super::archive::{VERSION, archive, staging};
 use super::notices;
-use crate::workspace;
+use crate::machine::Machine;
+use crate::{web, workspace};
 
 /// Shells, and how each names the file with a command's completions.
 const COMPLETIONS: [(&str, &str); 4] =
@@ -31,9 +32,19 @@ pub fn pack(shell: &Shell, dist: &Path) -> Result<()> {
     archive(shell, dist, &name, &content)
 }
 
-/// Builds the command as released.
+/// Names the page, compressed, for a system on which it is not built.
+const BUILT_PAGE: &str = "CANTAP_BUILT_PAGE";
+
+/// Builds the command as released, with the page in it.
 pub fn build(shell: &Shell) -> Result<PathBuf> {
-    cmd!(shell, "cargo build --locked --release -p cantap-cli").run()?;
+    let page = match std::env::var_os(BUILT_PAGE) {
+        Some(page) => PathBuf::from(page),
+        None => match web::build(&Machine::new()?)? {
+            Ok(page) => page.compressed,
+            Err(reason) => bail!("{reason}; or name a page that was built elsewhere by {BUILT_PAGE}"),
+        },
+    };
+    cmd!(shell, "cargo build --locked --release -p cantap-cli").env(BUILT_PAGE, page).run()?;
     Ok(workspace::target().join("release").join(format!("cantap{}", std::env::consts::EXE_SUFFIX)))
 }
 

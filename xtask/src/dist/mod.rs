@@ -5,7 +5,7 @@ mod archive;
 mod command;
 mod deb;
 mod firmware;
-mod notices;
+pub mod notices;
 
 use anyhow::Result;
 

@@ -129,7 +129,8 @@ impl Encoder {
 
     /// The totals of each channel up to now. Wireshark adds up nothing: an interface's last block counts.
     fn statistics(&mut self, time_ns: i64, out: &mut Vec<u8>) {
-        self.counted = Some(Instant::now());
+        // A target without a clock writes files, too.
+        self.counted = self.statistics_every.map(|_| Instant::now());
         for (number, Interface { delivered, lost, .. }) in (0_u32..).zip(&self.interfaces) {
             block(out, STATISTICS, |out| {
                 let [high, low] = halves(time_ns);

@@ -1,0 +1,127 @@
+//! What frames say together: requests and answers, messages of several frames, announcements.
+
+use std::convert::Infallible;
+use std::sync::Arc;
+
+use cantap_protocols::{Event, EventKind, Options, Party, ReadItem, Reader};
+use cantap_signals::Decoder;
+use serde::Serialize;
+
+use crate::trace::Content;
+
+/// The records by which a channel's protocols are found: those of so many nanoseconds from the beginning.
+const SURVEY_NS: i64 = 3_000_000_000;
+/// No more than so many.
+const MOST_SURVEYED: usize = 200_000;
+/// What began so long before the window is known in it, in nanoseconds.
+const LEAD_NS: i64 = 10_000_000_000;
+/// The longest text of an event, in characters.
+const TEXT: usize = 400;
+
+/// `ProtocolEvent` in `api.ts`.
+#[derive(Serialize)]
+pub struct ProtocolEvent {
+    time: f64,
+    end: f64,
+    channel: u8,
+    protocol: &'static str,
+    kind: &'static str,
+    from: String,
+    to: String,
+    text: String,
+    failed: bool,
+}
+
+/// The answer to `conversations` in `api.ts`.
+#[derive(Serialize)]
+pub struct Found {
+    events: Vec<ProtocolEvent>,
+    total: usize,
+}
+
+/// Reads the records by their protocols, and passes on each event, those of `from_ns` and later for certain.
+pub fn read(content: &Content, decoder: &Decoder, from_ns: i64, to_ns: i64, mut each: impl FnMut(&Event)) {
+    let store = &content.store;
+    let mut reader = Reader::new(Options { decoder: Some(Arc::new(decoder.clone())), ..Options::default() });
+    let surveyed = store.row_at(content.origin_ns().saturating_add(SURVEY_NS)).min(MOST_SURVEYED);
+    let begin = store.row_at(from_ns.saturating_sub(LEAD_NS)).max(surveyed);
+    let end = store.row_at(to_ns.saturating_add(1));
+    let mut batch = Vec::with_capacity(1024);
+    let mut take = |records: &[_], more| {
+        let result: Result<(), Infallible> = reader.take(records, more, |item| {
+            if let ReadItem::Event(event) = item {
+                each(&event);
+            }
+            Ok(())
+        });
+        let Ok(()) = result;
+    };
+    for row in (0..surveyed.min(end)).chain(begin..end) {
+        batch.extend(store.record(row));
+        if batch.len() == batch.capacity() {
+            take(&batch, true);
+            batch.clear();
+        }
+    }
+    take(&batch, false);
+}
+
+/// The first events that ended in a stretch of time, and how many there are.
+pub fn found(content: &Content, decoder: &Decoder, from_ns: i64, to_ns: i64, limit: usize) -> Found {
+    let mut found = Found { events: Vec::new(), total: 0 };
+    read(content, decoder, from_ns, to_ns, |event| {
+        if event.time_ns < from_ns || event.start_ns > to_ns {
+            return;
+        }
+        found.total += 1;
+        if found.events.len() < limit {
+            found.events.push(ProtocolEvent {
+                time: content.seconds(event.start_ns),
+                end: content.seconds(event.time_ns),
+                channel: event.channel,
+                protocol: event.protocol.name(),
+                kind: event.kind.name(),
+                from: party(event.from),
+                to: party(event.to),
+                text: text(event),
+                failed: is_failed(event),
+            });
+        }
+    });
+    found
+}
+
+/// Whether something went wrong.
+fn is_failed(event: &Event) -> bool {
+    event.trouble.is_some()
+        || matches!(
+            event.kind,
+            EventKind::Refusal
+                | EventKind::NoResponse
+                | EventKind::Broken
+                | EventKind::HeartbeatMissing
+                | EventKind::GuardMissing
+                | EventKind::Emergency
+        )
+}
+
+fn party(party: Party) -> String {
+    let mut text = String::new();
+    if party != Party::Unknown {
+        party.push_to(&mut text);
+    }
+    text
+}
+
+/// The event as a sentence, without protocol and parties, which have fields of their own.
+pub fn text(event: &Event) -> String {
+    let mut whole = String::new();
+    event.push_to(&mut whole);
+    let title = whole.find(&*event.title).map_or(0, |at| at.min(whole.len()));
+    let text = if event.title.is_empty() { &whole[..] } else { &whole[title..] };
+    let text = cantap_trace::clean::line(text);
+    match text.char_indices().nth(TEXT) {
+        Some((end, _)) => format!("{}…", &text[..end]),
+        None => text.into_owned(),
+    }
+}

@@ -1,0 +1,51 @@
+// The exact values at the two cursors. What is drawn is thinned to columns; these are asked for one by one.
+
+import type { App } from '../model/app';
+import { Latest } from '../model/latest';
+import type { Item } from '../model/panels';
+import { keyOf, valueAt } from './series-cache';
+
+interface Entry {
+  time: number;
+  value: number | null;
+  latest: Latest<number>;
+}
+
+export class CursorValues {
+  readonly #entries = new Map<string, Entry>();
+
+  constructor(
+    private readonly app: App,
+    private readonly arrived: () => void,
+  ) {}
+
+  clear(): void {
+    this.#entries.clear();
+  }
+
+  /** The value that holds at the cursor: null before the first, undefined until it is known (and for bus load, which has no single values). */
+  get(item: Item, cursor: 'A' | 'B', time: number): number | null | undefined {
+    if (item.kind === 'load') return undefined;
+    const key = `${cursor} ${keyOf(item)}`;
+    let entry = this.#entries.get(key);
+    if (!entry) {
+      const made: Entry = {
+        time: NaN,
+        value: null,
+        latest: new Latest(
+          async (at) => {
+            const series = item.kind === 'raw' ? await this.app.ask('rawSeries', { ...item.edit, from: at, to: at, columns: 4 }) : item.info ? await this.app.ask('series', { signal: item.info.key, from: at, to: at, columns: 4 }) : null;
+            made.value = series ? (valueAt(series, at)?.min ?? null) : null;
+            made.time = at;
+            this.arrived();
+          },
+          () => undefined,
+        ),
+      };
+      this.#entries.set(key, (entry = made));
+    }
+    if (entry.time === time) return entry.value;
+    entry.latest.ask(time);
+    return undefined;
+  }
+}

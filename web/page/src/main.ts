@@ -1,0 +1,4 @@
+import { loadEngine } from './engine';
+import { start } from './start';
+
+void start(loadEngine);

@@ -1,0 +1,301 @@
+// What all views share: the engine and what it holds, the stretch of time that is looked at, marks, notes. Views listen to topics and never
+// to each other.
+
+import type { Answer, Engine, Finding, Gap, IdRow, MessageInfo, Requests, SignalInfo, Summary } from '../api';
+import { Emitter } from './emitter';
+import { pieces } from './files';
+import { count } from './format';
+import { History } from './history';
+import { Panels } from './panels';
+import type { Report } from './report';
+import { type Profile, Storage } from './storage';
+
+export type Topic = 'summary' | 'messages' | 'range' | 'cursors' | 'identifier' | 'panels' | 'notes' | 'own' | 'profile' | 'findings' | 'engine' | 'goto';
+
+export interface Range {
+  from: number;
+  to: number;
+}
+
+export interface Identifier {
+  channel: number;
+  id: number;
+  extended: boolean;
+}
+
+export interface Note {
+  /** Seconds; null for a note about the whole trace. */
+  time: number | null;
+  text: string;
+}
+
+export type Notify = (level: 'info' | 'warning' | 'error', text: string, action?: { label: string; run: () => void }) => void;
+
+export class App extends Emitter<Topic> {
+  summary: Summary | null = null;
+  messages: MessageInfo[] = [];
+  gaps: Gap[] = [];
+  findings: Finding[] = [];
+  report: Report | null = null;
+  /** The trace's file, for saving it again as it was. */
+  traceFile: File | null = null;
+  databases: string[] = [];
+  identifier: Identifier | null = null;
+  cursorA: number | null = null;
+  cursorB: number | null = null;
+  notes: Note[] = [];
+  /** Where a view was asked to go; the trace and the graphs follow. */
+  target: { time: number } | null = null;
+  /** Null until the engine has died; then why. */
+  dead: string | null = null;
+
+  readonly storage = new Storage();
+  readonly profile: Profile;
+  readonly panels: Panels;
+  readonly zoom = new History<Range>({ from: 0, to: 1 });
+  readonly own = new History<string>('');
+  #fitted = true;
+  #opening = 0;
+  #bitrates: Report['bitrates'] = [];
+
+  constructor(
+    private engine: Engine,
+    private readonly restart: () => Promise<Engine>,
+    readonly notify: Notify,
+  ) {
+    super();
+    this.profile = this.storage.load();
+    this.panels = new Panels(() => this.panelsChanged());
+    this.panels.restore(this.profile.panels);
+  }
+
+  /** Asks the engine. Once it has died, every question is refused with the same words; what is shown stays. */
+  async ask<K extends keyof Requests>(request: K, parameters: Requests[K]['in']): Promise<Answer<K>> {
+    if (this.dead !== null) throw new EngineStopped(this.dead);
+    try {
+      return await this.engine.ask(request, parameters);
+    } catch (error) {
+      if (error instanceof Error && error.name === 'EngineDied') {
+        this.#died(error.message);
+        throw new EngineStopped(error.message);
+      }
+      throw error;
+    }
+  }
+
+  #died(reason: string): void {
+    if (this.dead !== null) return;
+    this.dead = reason;
+    this.emit('engine');
+    this.notify('error', `${reason.charAt(0).toUpperCase()}${reason.slice(1)}.`, {
+      label: 'Start it again',
+      run: () => void this.startAgain(),
+    });
+  }
+
+  async startAgain(): Promise<void> {
+    try {
+      this.engine.close();
+      this.engine = await this.restart();
+      this.dead = null;
+      this.emit('engine');
+      if (this.traceFile) await this.openTrace(this.traceFile);
+    } catch (error) {
+      this.failed(error);
+    }
+  }
+
+  /** Shows an error once; those of a stopped engine were shown already. */
+  failed(error: unknown): void {
+    if (error instanceof EngineStopped) return;
+    this.notify('error', error instanceof Error ? error.message : String(error));
+  }
+
+  /** `bitrates`: what the file does not say itself, in bit/s. */
+  async openTrace(file: File, bitrates: Report['bitrates'] = []): Promise<void> {
+    const turn = ++this.#opening;
+    const before = this.summary ? { file: this.traceFile, bitrates: this.#bitrates } : null;
+    this.traceFile = file;
+    this.#bitrates = bitrates;
+    this.#fitted = true;
+    let first = true;
+    let read = 0;
+    try {
+      for await (const piece of pieces(file)) {
+        if (turn !== this.#opening) return;
+        const summary = first
+          ? await this.ask('open', { name: file.name, bytes: piece.bytes, more: piece.more, size: file.size })
+          : await this.ask('append', { bytes: piece.bytes, more: piece.more });
+        if (turn !== this.#opening) return;
+        if (first) this.#forget();
+        first = false;
+        read += piece.bytes.length;
+        this.#take(summary);
+      }
+    } catch (error) {
+      if (first) {
+        // Nothing of the new file was taken in. The engine may have let go of the one before: it is read again.
+        this.traceFile = null;
+        if (before?.file && this.dead === null) await this.openTrace(before.file, before.bitrates);
+        throw error instanceof EngineStopped ? error : new Error(`${file.name}: ${error instanceof Error ? error.message : String(error)}`);
+      }
+      const reason = error instanceof Error ? error.message : String(error);
+      this.notify('error', `${file.name} was read to byte ${count(read)} of ${count(file.size)}, and no further: ${reason} What was read stays.`);
+    }
+    for (const { channel, bitrate, dataBitrate } of bitrates) await this.ask('bitrate', { channel, bitrate, ...(dataBitrate === null ? {} : { dataBitrate }) });
+    await this.refresh();
+    for (const issue of this.summary?.issues ?? []) this.notify('warning', `${issue.text}${issue.count > 1 ? ` (${count(issue.count)} times)` : ''}`);
+  }
+
+  #forget(): void {
+    this.identifier = null;
+    this.cursorA = this.cursorB = null;
+    this.findings = [];
+    this.gaps = [];
+    this.notes = this.notes.filter((note) => note.time === null);
+  }
+
+  #take(summary: Summary): void {
+    this.summary = summary;
+    if (this.#fitted) this.zoom.amend(this.whole());
+    this.emit('summary');
+    this.emit('range');
+  }
+
+  /** Asks anew what depends on the whole trace or on the databases. */
+  async refresh(): Promise<void> {
+    if (!this.summary) return;
+    const [summary, messages, gaps, findings] = await Promise.all([
+      this.ask('summary', {}),
+      this.ask('messages', {}),
+      this.ask('gaps', { from: 0, to: this.summary.duration }),
+      this.ask('findings', {}),
+    ]);
+    this.messages = messages;
+    this.gaps = gaps;
+    this.findings = this.#joined(findings);
+    this.panels.resolve(messages);
+    this.#take(summary);
+    this.emit('messages');
+    this.emit('findings');
+    this.emit('panels');
+  }
+
+  #joined(findings: Finding[]): Finding[] {
+    const seen = new Set<string>();
+    return [...(this.report?.findings ?? []), ...findings].filter((f) => {
+      const key = `${f.time} ${f.text}`;
+      return seen.has(key) ? false : (seen.add(key), true);
+    });
+  }
+
+  async addDatabase(name: string, bytes: Uint8Array, channel: number | null): Promise<void> {
+    const answer = await this.ask('database', { name, bytes, channel });
+    this.databases.push(name);
+    for (const warning of answer.warnings.slice(0, 5)) this.notify('warning', `${name}: ${warning}`);
+    if (answer.warnings.length > 5) this.notify('warning', `${name}: ${count(answer.warnings.length - 5)} more warnings.`);
+    await this.refresh();
+    this.emit('messages');
+  }
+
+  /** The user's own database as text: one step of undo. */
+  async setOwn(dbc: string): Promise<void> {
+    await this.ask('setOwnDatabase', { dbc });
+    await this.refresh();
+    this.emit('own');
+  }
+
+  whole(): Range {
+    const duration = this.summary?.duration ?? 0;
+    return { from: 0, to: duration > 0 ? duration : 1 };
+  }
+
+  get range(): Range {
+    return this.zoom.current;
+  }
+
+  /** Looks at a stretch; `step` false for what a drag passes through. Kept within the trace and above a nanosecond. */
+  look(range: Range, step = true): void {
+    const whole = this.whole();
+    const span = Math.min(Math.max(range.to - range.from, 1e-8), whole.to - whole.from);
+    const from = Math.min(Math.max(range.from, whole.from), whole.to - span);
+    const next = { from, to: from + span };
+    if (next.from === this.range.from && next.to === this.range.to) return;
+    this.#fitted = false;
+    if (step) this.zoom.push(next);
+    else this.zoom.amend(next);
+    this.emit('range');
+  }
+
+  fit(): void {
+    this.look(this.whole());
+    this.#fitted = true;
+  }
+
+  unzoom(): void {
+    if (this.zoom.undo()) this.emit('range');
+  }
+
+  rezoom(): void {
+    if (this.zoom.redo()) this.emit('range');
+  }
+
+  setCursor(which: 'A' | 'B', time: number | null): void {
+    if (which === 'A') this.cursorA = time;
+    else this.cursorB = time;
+    this.emit('cursors');
+  }
+
+  /** Between the two cursors, or null. */
+  get marked(): Range | null {
+    if (this.cursorA === null || this.cursorB === null) return null;
+    return { from: Math.min(this.cursorA, this.cursorB), to: Math.max(this.cursorA, this.cursorB) };
+  }
+
+  choose(identifier: Identifier): void {
+    this.identifier = identifier;
+    this.emit('identifier');
+  }
+
+  /** Leads the trace and the graphs to a time. */
+  goto(time: number): void {
+    this.target = { time };
+    this.setCursor('A', time);
+    const { from, to } = this.range;
+    if (time < from || time > to) this.look({ from: time - (to - from) / 2, to: time + (to - from) / 2 });
+    this.emit('goto');
+  }
+
+  addNote(note: Note): void {
+    this.notes.push(note);
+    this.notes.sort((a, b) => (a.time ?? -1) - (b.time ?? -1));
+    this.emit('notes');
+  }
+
+  findSignal(key: number): { message: MessageInfo; signal: SignalInfo } | null {
+    for (const message of this.messages) {
+      const signal = message.signals.find((s) => s.key === key);
+      if (signal) return { message, signal };
+    }
+    return null;
+  }
+
+  saveProfile(): void {
+    this.profile.panels = this.panels.profile();
+    this.storage.save(this.profile);
+    this.emit('profile');
+  }
+
+  private panelsChanged(): void {
+    this.panels.resolve(this.messages);
+    this.saveProfile();
+    this.emit('panels');
+  }
+}
+
+/** The engine is no longer there; this was said already. */
+export class EngineStopped extends Error {}
+
+export function sameIdentifier(a: Identifier | null, b: Identifier | IdRow): boolean {
+  return a !== null && a.channel === b.channel && a.id === b.id && a.extended === b.extended;
+}

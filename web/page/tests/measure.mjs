@@ -1,0 +1,63 @@
+// Measures how often the page redraws: scrolling the trace, panning and zooming graphs.
+//   node tests/measure.mjs PAGE.html TRACE [DATABASE …]     a page as it is delivered
+//   node tests/measure.mjs --rows N                         the page over the tests' engine
+// A redraw counts once per animation frame in which the view was drawn anew. Figures belong with the machine they were measured on.
+
+import { LOG, newPage, quit, show } from './browser.mjs';
+
+const argv = process.argv.slice(2);
+const fake = argv[0] === '--rows';
+const page = await newPage(fake ? { hash: `#records=${argv[1]}` } : { file: argv[0] });
+const started = Date.now();
+await page.locator('main.start input[type=file]').setInputFiles(fake ? [LOG] : argv.slice(1));
+await page.locator('.shell').waitFor({ timeout: 600_000 });
+const firstScreen = Date.now() - started;
+await page.locator('.shell[data-growing=false]').waitFor({ timeout: 600_000 });
+console.log(`first screen after ${firstScreen} ms, all after ${Date.now() - started} ms, ${await page.locator('.shell').getAttribute('data-records')} records`);
+
+/** Does something in each animation frame for two seconds; answers redraws a second, and the longest time between two. */
+async function run(name, selector, act) {
+  const result = await page.evaluate(
+    async ([selector, body]) => {
+      const step = new Function('i', body);
+      const element = document.querySelector(selector);
+      const before = Number(element.dataset.drawn);
+      const start = performance.now();
+      let longest = 0;
+      let last = start;
+      let frames = 0;
+      await new Promise((done) => {
+        const tick = (now) => {
+          longest = Math.max(longest, now - last);
+          last = now;
+          frames++;
+          // Input comes between frames, as a hand's does.
+          setTimeout(() => step(frames));
+          if (now - start < 2000) requestAnimationFrame(tick);
+          else done();
+        };
+        requestAnimationFrame(tick);
+      });
+      const seconds = (performance.now() - start) / 1000;
+      return { drawn: (Number(element.dataset.drawn) - before) / seconds, frames: frames / seconds, longest };
+    },
+    [selector, act],
+  );
+  console.log(`${name}: ${result.drawn.toFixed(1)} redraws/s (${result.frames.toFixed(1)} animation frames/s), at most ${result.longest.toFixed(0)} ms between two`);
+}
+
+await show(page, 'trace');
+await page.locator('#view-trace .list-layer .list-row:not(.pending)').first().waitFor();
+await run('scrolling by the wheel', '#view-trace .list', `document.querySelector('#view-trace .list').dispatchEvent(new WheelEvent('wheel', { deltaY: 240, bubbles: true, cancelable: true }))`);
+await run('dragging the scroll bar', '#view-trace .list', `const l = document.querySelector('#view-trace .list'); l.scrollTop = (i % 100) / 100 * l.scrollHeight`);
+await show(page, 'graphs');
+const signals = page.locator('#view-graphs .tree-signal');
+for (let i = 0; i < Math.min(20, await signals.count()); i++) await signals.nth(i).click();
+await page.waitForFunction(() => document.querySelector('#view-graphs').dataset.busy === 'false', undefined, { timeout: 600_000 });
+const wheel = (x, options) => `const c = document.querySelector('.time-axis'); const b = c.getBoundingClientRect(); c.dispatchEvent(new WheelEvent('wheel', { clientX: b.left + b.width * ${x}, bubbles: true, cancelable: true, ${options} }))`;
+console.log(`${await page.locator('.panel').count()} graphs`);
+await run('zooming in', '#view-graphs', wheel(0.5, 'deltaY: -40'));
+await run('panning', '#view-graphs', wheel(0.5, 'deltaX: i % 120 < 60 ? 12 : -12'));
+await run('zooming out', '#view-graphs', wheel(0.5, 'deltaY: 40'));
+await page.context().close();
+await quit();

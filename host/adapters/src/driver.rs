@@ -3,6 +3,7 @@
 use std::io;
 use std::time::{Duration, Instant};
 
+use cantap_trace::TraceEvent;
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, Stamp};
 use cantap_wire::{Channel, Frame, Refusal};
 
@@ -38,6 +39,30 @@ pub enum OpenError {
     Refused {
         /// As given.
         address: String,
+    },
+    /// This computer has no such CAN interface.
+    #[error("'{address}' is no CAN interface of this computer: {there}")]
+    NoInterface {
+        /// As given.
+        address: String,
+        /// Those that there are.
+        there: String,
+    },
+    /// The interface is down.
+    #[error("the interface '{address}' is down; as root: {command}")]
+    InterfaceDown {
+        /// As given.
+        address: String,
+        /// What brings it up.
+        command: String,
+    },
+    /// The system does not let this program use the interface.
+    #[error("the interface '{address}' cannot be used ({source})")]
+    Interface {
+        /// As given.
+        address: String,
+        /// The system's error.
+        source: io::Error,
     },
     /// The input is no trace.
     #[error("'{address}' cannot be read: {reason}")]
@@ -146,6 +171,25 @@ pub enum Incoming {
         /// When.
         at: At,
     },
+}
+
+impl Incoming {
+    /// What a trace or an error frame reports; `None` for what has no place here.
+    pub fn of(event: &TraceEvent, channel: Channel, at: At) -> Option<Self> {
+        Some(match *event {
+            TraceEvent::Frame { frame, .. } => Self::Received { channel, frame: *frame.classic()?, at },
+            TraceEvent::BusError { kind: Some(kind), .. } => Self::BusError { channel, kind, at },
+            TraceEvent::BusError { kind: None, .. } => Self::BusErrors { channel, count: 1, at },
+            TraceEvent::ErrorsSuppressed { count } => Self::BusErrors { channel, count, at },
+            TraceEvent::State { state, counters } => {
+                Self::State { channel, state, counters: counters.unwrap_or((0, 0)), at }
+            }
+            TraceEvent::Lost { stage, count, at_least } => {
+                Self::Lost { channel, stage: stage.unwrap_or(LossStage::Link), count, at_least, at }
+            }
+            TraceEvent::TransmitFailed { .. } => return None,
+        })
+    }
 }
 
 /// An adapter. Nothing is sent or acknowledged before [`Driver::open`].

@@ -19,11 +19,15 @@ mod cannelloni;
 mod driver;
 mod engine;
 mod gvret;
+mod interface_name;
 mod line;
 mod mailboxes;
 mod place;
+pub mod raw_can;
 mod rows;
 mod slcan;
+#[cfg(target_os = "linux")]
+mod socketcan;
 mod socketcand;
 mod source;
 mod trace_pipe;

@@ -188,7 +188,11 @@ impl AdapterBoard<'_> {
             self.driver.close(channel);
             boxes.borrow_mut().switch_off();
         }
-        let opening = Opening { bitrate_bps: config.timing.bitrate_bps(CAN_CLOCK_HZ), listen_only };
+        let opening = Opening {
+            bitrate_bps: config.timing.bitrate_bps(CAN_CLOCK_HZ),
+            sample_point_permille: config.timing.sample_point_permille(),
+            listen_only,
+        };
         self.driver.open(channel, opening)?;
         boxes.borrow_mut().phase = Phase::Opened;
         Ok(())
@@ -259,12 +263,12 @@ impl<'q> Board<'q, QUEUE_BYTES> for AdapterBoard<'q> {
         match command {
             Command::SetPeriodic { .. } | Command::SetTrigger { .. } if !sends => Err(Refusal::Unsupported),
             Command::Registers { .. }
-            | Command::Identify { .. }
             | Command::Reset
             | Command::Bootloader
             | Command::SaveDefaults
             | Command::ClearDefaults
             | Command::MeasureEdges { .. } => Err(Refusal::Unsupported),
+            Command::Identify { seconds } => self.driver.identify(*seconds),
             // What the firmware refuses anyway must not reach the adapter.
             Command::Open { channel, config: Some(config) }
                 if config.timing.is_valid() && !self.is_open(*channel) =>

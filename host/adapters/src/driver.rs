@@ -64,6 +64,32 @@ pub enum OpenError {
         /// The system's error.
         source: io::Error,
     },
+    /// There is no such adapter on USB, or more than one.
+    #[error(
+        "'{address}' is no single gs_usb adapter: {there}; name one by its serial number, as in gs_usb:SERIAL"
+    )]
+    NoUsbAdapter {
+        /// As given.
+        address: String,
+        /// Those that there are.
+        there: String,
+    },
+    /// The adapter on USB cannot be opened.
+    #[error("'{address}' cannot be opened: {reason}{advice}")]
+    Usb {
+        /// As given.
+        address: String,
+        /// The system's error.
+        reason: String,
+        /// What to do.
+        advice: &'static str,
+    },
+    /// The adapter has no resistor that could be switched.
+    #[error("'{address}': this adapter cannot switch its termination; leave out ?termination")]
+    NoTermination {
+        /// As given.
+        address: String,
+    },
     /// The input is no trace.
     #[error("'{address}' cannot be read: {reason}")]
     NoTrace {
@@ -79,6 +105,8 @@ pub enum OpenError {
 pub struct Opening {
     /// Bits per second.
     pub bitrate_bps: u32,
+    /// Where in the bit, in thousandths of it.
+    pub sample_point_permille: u32,
     /// Without acknowledging.
     pub listen_only: bool,
 }
@@ -216,6 +244,10 @@ pub(crate) trait Driver: Send {
     fn send(&mut self, channel: Channel, mailbox: u8, frame: &Frame) -> bool;
     /// Waits up to `wait` for something to report, and appends it. An error is the adapter's end, with the reason for people.
     fn poll(&mut self, wait: Duration, reports: &mut Vec<Incoming>) -> Result<(), String>;
+    /// Shows for some seconds which adapter it is; 0 ends that.
+    fn identify(&mut self, _seconds: u8) -> Result<(), Refusal> {
+        Err(Refusal::Unsupported)
+    }
     /// Text about what was left out or misunderstood, with its count: shown by `cantap info`.
     fn oddities(&self) -> (u32, String) {
         (0, String::new())

@@ -18,6 +18,8 @@ mod board;
 mod cannelloni;
 mod driver;
 mod engine;
+mod error_frames;
+mod gs_usb;
 mod gvret;
 mod interface_name;
 mod line;

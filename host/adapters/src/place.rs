@@ -9,6 +9,7 @@ use cantap_formats::Format;
 use crate::cannelloni::{self, Cannelloni};
 use crate::driver::{Driver, OpenError};
 use crate::engine;
+use crate::gs_usb::GsUsb;
 use crate::gvret::{self, Gvret};
 use crate::interface_name;
 use crate::line::Line;
@@ -30,6 +31,7 @@ enum Kind {
     GvretSerial { port: String, baud: u32 },
     GvretTcp { host: String },
     Socketcan { interface: String },
+    GsUsb { serial: String, termination: Option<bool> },
     Socketcand { host: String, interface: String },
     Cannelloni { host: String, listen: u16 },
     Trace { path: String, format: TraceFormat },
@@ -47,13 +49,15 @@ enum TraceFormat {
 pub struct BadPlace(String);
 
 /// What addresses of adapters begin with.
-const SCHEMES: [&str; 7] =
-    ["socketcan:", "slcan:", "gvret:", "socketcand:", "cannelloni:", "candump:", "pcapng:"];
+const SCHEMES: [&str; 8] =
+    ["socketcan:", "gs_usb:", "slcan:", "gvret:", "socketcand:", "cannelloni:", "candump:", "pcapng:"];
 
 impl Place {
     /// Whether a text is meant for an adapter.
     pub fn is_meant(text: &str) -> bool {
-        SCHEMES.iter().any(|scheme| text.starts_with(scheme)) || interface_name::is_meant(text)
+        SCHEMES.iter().any(|scheme| text.starts_with(scheme))
+            || text == "gs_usb"
+            || interface_name::is_meant(text)
     }
 
     /// The bit rate that the adapter's owner has set, in bit/s, if it can be read without the adapter.
@@ -93,6 +97,9 @@ impl FromStr for Place {
         let kind = match scheme {
             "socketcan" if interface_name::is_possible(rest) => Kind::Socketcan { interface: rest.to_owned() },
             "socketcan" => return Err(bad("name the interface, as in socketcan:can0")),
+            "gs_usb" => gs_usb_of(rest).ok_or_else(|| {
+                bad("write gs_usb: or gs_usb:SERIAL, and ?termination=on or ?termination=off after it if that is to be changed")
+            })?,
             "slcan" => {
                 let (port, baud) = port_and_baud(rest, slcan::DEFAULT_BAUD)
                     .ok_or_else(|| bad("write slcan:PORT or slcan:PORT@BAUD, as in slcan:/dev/ttyACM0"))?;
@@ -129,7 +136,7 @@ impl FromStr for Place {
                 Kind::Trace { path: rest.to_owned(), format }
             }
             "candump" | "pcapng" => return Err(bad("name the pipe, as in candump:- for standard input")),
-            _ => return Err(bad("it is no CAN interface's name, and begins with none of socketcan:, slcan:, gvret:, socketcand:, cannelloni:, candump:, pcapng:")),
+            _ => return Err(bad("it is no CAN interface's name, and begins with none of socketcan:, gs_usb:, slcan:, gvret:, socketcand:, cannelloni:, candump:, pcapng:")),
         };
         Ok(Self { text: text.to_owned(), kind })
     }
@@ -147,6 +154,17 @@ fn port_and_baud(text: &str, default: u32) -> Option<(String, u32)> {
         None => (text, default),
     };
     (!port.is_empty()).then(|| (port.to_owned(), baud))
+}
+
+fn gs_usb_of(rest: &str) -> Option<Kind> {
+    let (serial, termination) = match rest.split_once('?') {
+        Some((serial, "termination=on")) => (serial, Some(true)),
+        Some((serial, "termination=off")) => (serial, Some(false)),
+        Some(_) => return None,
+        None => (rest, None),
+    };
+    let is_serial = serial.chars().all(|letter| letter.is_ascii_graphic());
+    is_serial.then(|| Kind::GsUsb { serial: serial.to_owned(), termination })
 }
 
 fn with_port(host: &str, port: u16) -> Option<String> {
@@ -183,6 +201,7 @@ pub fn open(place: &Place) -> Result<Link, OpenError> {
         Kind::GvretSerial { port, baud } => Box::new(Gvret::over(Line::serial(port, *baud)?, address)?),
         Kind::GvretTcp { host } => Box::new(Gvret::over(Line::tcp(host)?, address)?),
         Kind::Socketcan { interface } => socketcan(interface, address)?,
+        Kind::GsUsb { serial, termination } => Box::new(GsUsb::connect(serial, *termination, address)?),
         Kind::Socketcand { host, interface } => Box::new(Socketcand::connect(host, interface, address)?),
         Kind::Cannelloni { host, listen } => Box::new(Cannelloni::connect(host, *listen, address)?),
         Kind::Trace { path, format } => {
@@ -226,6 +245,10 @@ mod tests {
             "vcan3",
             "socketcan:can0",
             "socketcan:bus-a",
+            "gs_usb",
+            "gs_usb:",
+            "gs_usb:003F0023",
+            "gs_usb:?termination=on",
             "slcan:/dev/ttyACM0",
             "slcan:COM5@921600",
             "gvret:/dev/ttyUSB0",
@@ -246,6 +269,8 @@ mod tests {
             "socketcan:",
             "socketcan:/dev/can0",
             "socketcan:a-name-that-is-too-long",
+            "gs_usb:a b",
+            "gs_usb:?termination=yes",
             "slcan:",
             "slcan:@9600",
             "slcan:COM1@fast",

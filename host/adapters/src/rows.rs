@@ -88,7 +88,7 @@ pub struct Row {
 }
 
 /// All kinds.
-pub const ROWS: [Row; 13] = [
+pub const ROWS: [Row; 17] = [
     Row {
         board: "slcan",
         what: "an slcan adapter that answers (Lawicel's protocol)",
@@ -170,7 +170,26 @@ pub const ROWS: [Row; 13] = [
         sets_bit_rate: false,
         ..interface("socketcan-virtual", Stamps::Kernel, Confirmation::Accepted, true)
     },
+    gs_usb("gs_usb", true, true),
+    gs_usb("gs_usb-normal", true, false),
+    gs_usb("gs_usb-arrival", false, true),
+    gs_usb("gs_usb-arrival-normal", false, false),
 ];
+
+/// A row of gs_usb adapters.
+const fn gs_usb(board: &'static str, has_stamps: bool, can_listen: bool) -> Row {
+    const CLOCK: Stamps = Stamps::Adapter { grain_ns: 1_000, when: "its firmware's taking the frame" };
+    Row {
+        board,
+        what: if can_listen { "a gs_usb adapter" } else { "a gs_usb adapter that cannot only listen" },
+        stamps: if has_stamps { CLOCK } else { Stamps::Arrival },
+        losses: Losses::Flags,
+        errors: "states, and each error if the adapter reports it",
+        confirmation: Confirmation::OnTheBus,
+        listen_only: if can_listen { ListenOnly::Unconfirmed } else { ListenOnly::Never },
+        sets_bit_rate: true,
+    }
+}
 
 /// A row of Linux's CAN interfaces.
 const fn interface(board: &'static str, stamps: Stamps, confirmation: Confirmation, is_silent: bool) -> Row {
@@ -224,7 +243,7 @@ impl fmt::Display for Stamps {
 impl fmt::Display for Confirmation {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
-            Self::OnTheBus => "confirmed by the driver once a frame was on the bus",
+            Self::OnTheBus => "confirmed once a frame was on the bus",
             Self::Accepted => "accepted by the adapter; whether a frame reached the bus is not known",
             Self::HandedOver => "handed over; what became of a frame is not known",
             Self::CannotSend => "nothing can be sent",

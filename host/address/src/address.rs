@@ -196,6 +196,11 @@ impl Address {
         matches!(&self.place, Place::Virtual(options) if options.car)
     }
 
+    /// Whether the bit rate of a bus there is set by somebody else: a simulated vehicle, or a CAN interface's owner.
+    pub fn has_bit_rate(&self) -> bool {
+        self.is_car() || matches!(&self.place, Place::Adapter(adapter) if adapter.bitrate().is_some())
+    }
+
     /// Whether a device there can go and come back; one inside this process cannot.
     pub const fn may_come_back(&self) -> bool {
         matches!(self.place, Place::Serial | Place::Server(_))

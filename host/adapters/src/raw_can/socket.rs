@@ -2,6 +2,7 @@
 
 use std::io::{self, IoSlice, IoSliceMut};
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use nix::errno::Errno;
@@ -10,6 +11,7 @@ use nix::sys::socket::{
     ControlMessageOwned, MsgFlags, MultiHeaders, recvmmsg, sendmmsg, setsockopt, sockopt,
 };
 use nix::sys::time::TimeSpec;
+use rustix::net::{RecvAncillaryBuffer, RecvFlags};
 use socketcan::{CanSocket, Socket, SocketOptions};
 
 use super::frame::RawFrame;
@@ -69,7 +71,13 @@ impl Message {
 }
 
 /// A socket bound to an interface.
-pub struct RawSocket(CanSocket);
+pub struct RawSocket {
+    socket: CanSocket,
+    /// It receives what it sends.
+    own: bool,
+    /// Something was sent, so what is received may be its own.
+    has_sent: AtomicBool,
+}
 
 impl RawSocket {
     /// Opens an interface.
@@ -98,11 +106,43 @@ impl RawSocket {
         if setsockopt(&socket, sockopt::RcvBufForce, &BUFFER_AS_ROOT).is_err() {
             let _ = setsockopt(&socket, sockopt::RcvBuf, &BUFFER);
         }
-        Ok(Self(socket))
+        Ok(Self { socket, own: options.own, has_sent: AtomicBool::new(false) })
     }
 
     /// Adds what is there, up to a limit, without waiting.
     pub fn receive(&self, most: usize, messages: &mut Vec<Message>) -> io::Result<()> {
+        if !self.own || !self.has_sent.load(Ordering::Relaxed) {
+            return self.receive_batch(most, messages);
+        }
+        let first = messages.len();
+        while messages.len() - first < most {
+            let next = match self.next_is_own() {
+                // After the others it comes again.
+                Err(_) if messages.len() > first => None,
+                next => next?,
+            };
+            let Some(is_own) = next else { break };
+            let before = messages.len();
+            self.receive_batch(1, messages)?;
+            if let Some(message) = messages.get_mut(before) {
+                message.is_own = is_own;
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether the next message was sent through this socket, if there is one: nix cuts the flag that says so from the batch's.
+    fn next_is_own(&self) -> io::Result<Option<bool>> {
+        let flags = RecvFlags::PEEK | RecvFlags::DONTWAIT;
+        let mut control = RecvAncillaryBuffer::default();
+        match rustix::net::recvmsg(&self.socket, &mut [], &mut control, flags) {
+            Ok(message) => Ok(Some(message.flags.bits() & libc::MSG_CONFIRM as u32 != 0)),
+            Err(rustix::io::Errno::AGAIN | rustix::io::Errno::INTR) => Ok(None),
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    fn receive_batch(&self, most: usize, messages: &mut Vec<Message>) -> io::Result<()> {
         let most = most.min(BATCH);
         let space = nix::cmsg_space!(u32, [TimeSpec; 3]);
         let mut headers = MultiHeaders::<()>::preallocate(most, Some(space));
@@ -111,17 +151,16 @@ impl RawSocket {
         let taken = {
             let mut slices: Vec<[IoSliceMut<'_>; 1]> =
                 buffers.iter_mut().map(|buffer| [IoSliceMut::new(buffer)]).collect();
-            let fd = self.0.as_raw_fd();
+            let fd = self.socket.as_raw_fd();
             recvmmsg(fd, &mut headers, slices.iter_mut(), MsgFlags::MSG_DONTWAIT, None).map(|taken| {
                 for message in taken {
-                    let is_own = message.flags.bits() & libc::MSG_CONFIRM != 0;
                     let len = message.bytes.min(FD_BYTES);
-                    headings.push((len, is_own, message.cmsgs().into_iter().flatten().collect::<Vec<_>>()));
+                    headings.push((len, message.cmsgs().into_iter().flatten().collect::<Vec<_>>()));
                 }
             })
         };
-        messages.extend(buffers.into_iter().zip(headings).map(|(buffer, (len, is_own, controls))| {
-            let mut message = Message { is_own, ..Message::new(&buffer[..len]) };
+        messages.extend(buffers.into_iter().zip(headings).map(|(buffer, (len, controls))| {
+            let mut message = Message::new(&buffer[..len]);
             for control in controls {
                 match control {
                     ControlMessageOwned::RxqOvfl(count) => message.dropped = Some(count),
@@ -146,20 +185,22 @@ impl RawSocket {
         let mut headers = MultiHeaders::<()>::preallocate(BATCH, None);
         let slices: Vec<[IoSlice<'_>; 1]> = frames.iter().map(|frame| [IoSlice::new(frame)]).collect();
         let taken = sendmmsg(
-            self.0.as_raw_fd(),
+            self.socket.as_raw_fd(),
             &mut headers,
             slices.iter(),
             [None; BATCH],
             [],
             MsgFlags::MSG_DONTWAIT,
         );
-        Ok(taken?.count())
+        let taken = taken?.count();
+        self.has_sent.store(true, Ordering::Relaxed);
+        Ok(taken)
     }
 
     /// How many messages this socket has dropped so far, for lack of room.
     pub fn dropped(&self) -> io::Result<u32> {
         let mut figures = [0; 4 * (MEMINFO_DROPS + 1)];
-        let len = self.0.get_socket_option_bytes(libc::SOL_SOCKET, SO_MEMINFO, &mut figures)?;
+        let len = self.socket.get_socket_option_bytes(libc::SOL_SOCKET, SO_MEMINFO, &mut figures)?;
         match figures[..len.min(figures.len())].as_chunks().0.get(MEMINFO_DROPS) {
             Some(drops) => Ok(u32::from_ne_bytes(*drops)),
             None => Err(io::ErrorKind::Unsupported.into()),
@@ -168,13 +209,13 @@ impl RawSocket {
 
     /// Whether the controller stamps what it receives, as its driver says.
     pub fn has_hardware_stamps(&self) -> bool {
-        self.0.has_hw_timestamps()
+        self.socket.has_hw_timestamps()
     }
 }
 
 impl AsFd for RawSocket {
     fn as_fd(&self) -> BorrowedFd<'_> {
-        self.0.as_fd()
+        self.socket.as_fd()
     }
 }
 

@@ -11,7 +11,6 @@ use std::collections::VecDeque;
 use std::io;
 use std::time::{Duration, Instant, SystemTime};
 
-use cantap_trace::TraceEvent;
 use cantap_trace::socketcan::ErrorFrame;
 use cantap_wire::record::{ErrorState, LossStage};
 use cantap_wire::{Channel, Frame, Refusal};
@@ -22,6 +21,7 @@ use self::link::Link;
 use self::linux::LinuxInterface;
 use crate::adapter_clock::AdapterClock;
 use crate::driver::{At, Driver, Incoming, Oddities, OpenError, Opening};
+use crate::error_frames::ErrorFrames;
 use crate::interface_name::same_rate;
 use crate::raw_can::{BATCH, Message, RawFrame, raw_frame};
 use crate::rows::{Row, row};
@@ -76,7 +76,7 @@ pub(crate) struct SocketCan {
     in_flight: VecDeque<(u8, Frame)>,
     /// Since when a confirmation may be among the messages that were dropped.
     uncertain_since: Option<Instant>,
-    state: Option<(ErrorState, (u8, u8))>,
+    errors: ErrorFrames,
     clock: AdapterClock,
     looked: Instant,
     backlog: Vec<Incoming>,
@@ -136,7 +136,7 @@ impl SocketCan {
             counted: Counted::default(),
             in_flight: VecDeque::new(),
             uncertain_since: None,
-            state: None,
+            errors: ErrorFrames::default(),
             // Nanoseconds that never start again.
             clock: AdapterClock::new(1, 1 << 62),
             looked: Instant::now(),
@@ -224,37 +224,14 @@ impl SocketCan {
     }
 
     fn error(&mut self, error: ErrorFrame, at: At) {
-        if !error.is_told_whole() {
-            self.oddities
-                .count("details of errors that have no place here, such as their position in the frame");
+        if self.errors.take(error, Channel::Can1, at, &mut self.backlog, &mut self.oddities) {
+            self.counted.overruns_ahead += 1;
         }
-        let (first, second) = error.events();
-        for event in [Some(first), second].into_iter().flatten() {
-            match event {
-                TraceEvent::Lost { stage: None | Some(LossStage::Controller), .. } => {
-                    self.counted.overruns_ahead += 1;
-                    self.lost(LossStage::Controller, 1, true, at);
-                }
-                TraceEvent::State { state, counters } => self.set_state(state, counters, at),
-                TraceEvent::BusError { counters, .. } => {
-                    if let (Some(_), Some((state, _))) = (counters, self.state) {
-                        self.set_state(state, counters, at);
-                    }
-                    self.backlog.extend(Incoming::of(&event, Channel::Can1, at));
-                }
-                TraceEvent::TransmitFailed { .. } => self.oddities.count("attempts to send that failed"),
-                _ => self.backlog.extend(Incoming::of(&event, Channel::Can1, at)),
-            }
-        }
+        self.follow_state(at);
     }
 
-    fn set_state(&mut self, state: ErrorState, counters: Option<(u8, u8)>, at: At) {
-        let channel = Channel::Can1;
-        let counters = counters.or(self.state.map(|(_, counters)| counters)).unwrap_or((0, 0));
-        if self.state.replace((state, counters)) != Some((state, counters)) {
-            self.backlog.push(Incoming::State { channel, state, counters, at });
-        }
-        if state == ErrorState::BusOff {
+    fn follow_state(&mut self, at: At) {
+        if self.errors.state() == Some(ErrorState::BusOff) {
             // The driver drops them.
             self.give_up(at);
         }
@@ -275,7 +252,8 @@ impl SocketCan {
             Ok(link) => {
                 self.count_losses(&link, at);
                 if let Some(state) = link.state {
-                    self.set_state(state, link.counters, at);
+                    self.errors.set(state, link.counters, Channel::Can1, at, &mut self.backlog);
+                    self.follow_state(at);
                 }
                 if !link.is_up {
                     self.end(&io::Error::from_raw_os_error(ENETDOWN));
@@ -309,7 +287,14 @@ impl SocketCan {
     /// The interface is of no more use.
     fn end(&mut self, error: &io::Error) {
         let name = &self.name;
-        let reason = match error.raw_os_error() {
+        let mut code = error.raw_os_error();
+        // Before it is deleted, an interface is taken down.
+        if code == Some(ENETDOWN)
+            && let Err(error) = self.interface.look()
+        {
+            code = error.raw_os_error();
+        }
+        let reason = match code {
             Some(ENETDOWN) => format!("the interface {name} was taken down; as root: ip link set {name} up"),
             Some(ENODEV | ENXIO) => format!("the interface {name} is gone"),
             _ => format!("the interface {name} fails: {error}"),
@@ -326,7 +311,7 @@ impl SocketCan {
 
     fn look_after_time(&mut self) {
         if self.uncertain_since.is_some_and(|since| since.elapsed() > UNCONFIRMED)
-            && self.state.is_none_or(|(state, _)| state < ErrorState::Passive)
+            && self.errors.state().is_none_or(|state| state < ErrorState::Passive)
         {
             self.uncertain_since = None;
             let (channel, at) = (Channel::Can1, At::arrival(Instant::now()));
@@ -377,7 +362,7 @@ impl Driver for SocketCan {
         self.interface.open().map_err(|_| Refusal::Hardware)?;
         let (overruns, dropped) = (link.overruns, link.dropped);
         self.counted = Counted { overruns, dropped, ..Counted::default() };
-        self.state = None;
+        self.errors = ErrorFrames::default();
         self.is_open = true;
         Ok(())
     }
@@ -387,7 +372,7 @@ impl Driver for SocketCan {
             self.finish();
         }
         self.is_open = false;
-        (self.uncertain_since, self.state) = (None, None);
+        (self.uncertain_since, self.errors) = (None, ErrorFrames::default());
         self.in_flight.clear();
         self.interface.close();
     }

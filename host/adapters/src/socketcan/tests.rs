@@ -86,8 +86,8 @@ fn controller() -> Link {
     }
 }
 
-const NORMAL: Opening = Opening { bitrate_bps: 500_000, listen_only: false };
-const LISTEN: Opening = Opening { bitrate_bps: 500_000, listen_only: true };
+const NORMAL: Opening = Opening { bitrate_bps: 500_000, sample_point_permille: 875, listen_only: false };
+const LISTEN: Opening = Opening { listen_only: true, ..NORMAL };
 
 /// A driver with its channel open.
 fn opened(link: Link) -> (Fake, SocketCan) {
@@ -257,12 +257,17 @@ fn a_confirmation_that_was_dropped_is_not_waited_for_without_an_end() {
 
 #[test]
 fn an_interface_that_goes_down_or_is_gone_ends_the_session_after_everything_it_had_received() {
-    for (code, words) in [(ENETDOWN, "ip link set can0 up"), (ENODEV, "can0 is gone")] {
+    // A deletion begins with the first, and ends with the second.
+    for (code, is_gone, words) in [
+        (ENETDOWN, false, "ip link set can0 up"),
+        (ENETDOWN, true, "can0 is gone"),
+        (ENODEV, true, "can0 is gone"),
+    ] {
         let (fake, mut driver) = opened(controller());
         {
             let mut state = fake.lock();
             state.arrived = [Ok(message("001#")), Err(code), Ok(message("002#"))].into();
-            state.is_gone = code == ENODEV;
+            state.is_gone = is_gone;
             state.dropped = 4;
         }
         let all = reports(&mut driver);

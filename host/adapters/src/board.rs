@@ -163,6 +163,8 @@ pub(crate) struct AdapterBoard<'q> {
     pub chip: NoChip,
     pub meter: NoMeter,
     pub driver: Box<dyn Driver>,
+    /// The time at which the firmware's commands stand still, while the engine delivers what a channel that is being closed had received.
+    pub held_at: Option<u32>,
 }
 
 impl AdapterBoard<'_> {
@@ -215,7 +217,7 @@ impl<'q> Board<'q, QUEUE_BYTES> for AdapterBoard<'q> {
     }
 
     fn now(&self) -> u32 {
-        self.clock.now()
+        self.held_at.unwrap_or_else(|| self.clock.now())
     }
 
     fn take_sof(&mut self) -> Option<SofReading> {

@@ -8,6 +8,7 @@ use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, Stamp};
 use cantap_wire::{Channel, Frame, Refusal};
 
 use crate::rows::Row;
+use crate::source::Piece;
 
 /// Why there is no adapter at an address. Each message says what to do next.
 #[derive(Debug, thiserror::Error)]
@@ -252,6 +253,31 @@ pub(crate) trait Driver: Send {
     fn oddities(&self) -> (u32, String) {
         (0, String::new())
     }
+}
+
+/// An adapter that sends pieces of bytes.
+pub(crate) trait Bytes {
+    /// The next piece, if one comes in time.
+    fn next(&mut self, wait: Duration) -> Result<Option<Piece<Vec<u8>>>, String>;
+    /// Reads a piece.
+    fn push(&mut self, bytes: &[u8], arrival: Instant);
+    /// What is to be reported.
+    fn backlog(&mut self) -> &mut Vec<Incoming>;
+}
+
+/// [`Driver::poll`] of such an adapter: reads what comes, unless there is something to report already.
+pub(crate) fn poll_bytes(
+    adapter: &mut impl Bytes,
+    wait: Duration,
+    reports: &mut Vec<Incoming>,
+) -> Result<(), String> {
+    let wait = if adapter.backlog().is_empty() { wait } else { Duration::ZERO };
+    let next = adapter.next(wait);
+    if let Ok(Some(piece)) = &next {
+        adapter.push(&piece.content, piece.at);
+    }
+    reports.append(adapter.backlog());
+    next.map(|_| ())
 }
 
 /// Counts of what an adapter sent that makes no sense, by kind.

@@ -32,6 +32,8 @@ const TICK: Duration = Duration::from_millis(1);
 const HOLD_BACK_BYTES: u32 = 48 * 1024;
 /// How long a channel that is being closed waits for the confirmation of what the adapter has taken.
 const CONFIRM_WITHIN: Duration = Duration::from_millis(50);
+/// How long what it had received may take to reach the host. What is left then is counted as lost where the record queue has no room.
+const DELIVER_WITHIN: Duration = Duration::from_millis(1_500);
 /// After an adapter's end, and with everything handed over, the firmware goes on for this many ticks: a batch waits for one.
 const LAST_TICKS: u32 = 20;
 /// Reports that found no room, at most; more are counted by kind in the status only.
@@ -124,6 +126,7 @@ fn run(driver: Box<dyn Driver>, port: PipePort, reason: &Reason) {
             chip: NoChip((0, std::string::String::new())),
             meter: NoMeter,
             driver,
+            held_at: None,
         },
         session: Session::new(consumer, identity, session),
         port,
@@ -329,11 +332,19 @@ impl Engine<'_> {
                 // If it says why it ended, the next poll says so again.
                 let _ = self.ask_driver(Duration::ZERO);
             }
+            if since.elapsed() > DELIVER_WITHIN {
+                while let Some(incoming) = self.reports.pop_front() {
+                    self.take(incoming);
+                }
+            }
             if !self.reports.is_empty() {
                 continue;
             }
             self.closed[channel.index()] = false;
             boxes.borrow_mut().switch_off();
         }
+        let is_leaving = self.board.boxes.iter().any(|boxes| boxes.borrow().phase == Phase::Leaving);
+        let board = &mut self.board;
+        board.held_at = is_leaving.then(|| board.held_at.unwrap_or_else(|| board.clock.now()));
     }
 }

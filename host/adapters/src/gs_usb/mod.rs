@@ -22,6 +22,8 @@ use crate::source::Piece;
 const ASK_EVERY: Duration = Duration::from_secs(1);
 /// Transfers that one call of [`Driver::poll`] takes.
 const TRANSFERS: usize = 256;
+/// As often at the end.
+const CALLS_AT_THE_END: usize = 4;
 /// After a channel was switched off, what was received before comes within this time.
 const QUIET: Duration = Duration::from_millis(20);
 /// Frames of a channel under way: the firmware here has three mailboxes.
@@ -287,8 +289,12 @@ impl Driver for GsUsb {
         let number = channel.index();
         // If that fails, so will the next read, which has the reason.
         let _ = self.switch_off(number);
-        let deadline = Instant::now() + 10 * QUIET;
-        while self.ended.is_none() && self.receive(QUIET) && Instant::now() < deadline {}
+        // As much as can wait, here and in the adapter; what comes after that is of the other channel.
+        for _ in 0..CALLS_AT_THE_END {
+            if self.ended.is_some() || !self.receive(QUIET) {
+                break;
+            }
+        }
         let can = &mut self.channels[number];
         (can.is_open, can.in_flight, can.errors) = (false, [false; MAILBOXES], ErrorFrames::default());
     }

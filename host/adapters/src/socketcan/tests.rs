@@ -346,3 +346,17 @@ fn a_frame_s_time_is_the_driver_s_and_the_interval_of_two_is_the_controller_s() 
     assert_eq!((apart(2, 3), times[3].stamp), (ms(3), Stamp::Exact));
     assert!(times[4].instant >= before && times[4].stamp == Stamp::UpperBound);
 }
+
+/// Ctrl-C while more is waiting than the firmware's queue holds.
+#[test]
+fn what_waits_in_the_socket_when_a_channel_is_closed_is_delivered() {
+    let (fake, driver) = connected(controller()).unwrap();
+    let device = cantap::Device::over(crate::engine::start(Box::new(driver)).unwrap(), "can0").unwrap();
+    fake.lock().arrived = (0..20_000).map(|_| Ok(message("123#0102030405060708"))).collect();
+    device.listen(Channel::Can1, 500_000).unwrap();
+    let records = device.records();
+    device.stop().unwrap();
+    drop(device);
+    let count = records.filter(|record| record.as_ref().is_ok_and(|record| record.frame().is_some())).count();
+    assert_eq!(count, 20_000);
+}

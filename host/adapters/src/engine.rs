@@ -13,6 +13,7 @@ use cantap::device::{Link, PipeReader, pipe};
 use cantap_firmware::bus::capture::Capture;
 use cantap_firmware::bus::queue::RecordQueue;
 use cantap_firmware::bus::transmit::TxQueue;
+use cantap_firmware::port::board::Board as _;
 use cantap_firmware::port::command::Identity;
 use cantap_firmware::port::session::{self, Session};
 use cantap_firmware::ports::{Clock, Outcome};
@@ -316,6 +317,7 @@ impl Engine<'_> {
 
     /// Closes what the firmware has stopped, after what the adapter has taken is confirmed, and with everything it had received.
     fn close_channels(&mut self, is_gone: bool) {
+        self.hold_time();
         for channel in Channel::ALL {
             let boxes = Rc::clone(&self.board.boxes[channel.index()]);
             if boxes.borrow().phase != Phase::Leaving {
@@ -343,8 +345,16 @@ impl Engine<'_> {
             self.closed[channel.index()] = false;
             boxes.borrow_mut().switch_off();
         }
-        let is_leaving = self.board.boxes.iter().any(|boxes| boxes.borrow().phase == Phase::Leaving);
+    }
+
+    /// While a channel is being closed, the firmware's commands see no time pass: a controller leaves its bus in milliseconds, and what a socket
+    /// holds may take longer.
+    fn hold_time(&mut self) {
         let board = &mut self.board;
+        let is_leaving = Channel::ALL.into_iter().any(|channel| {
+            let phase = board.boxes[channel.index()].borrow().phase;
+            phase == Phase::Leaving || phase == Phase::Off && board.is_open(channel)
+        });
         board.held_at = is_leaving.then(|| board.held_at.unwrap_or_else(|| board.clock.now()));
     }
 }

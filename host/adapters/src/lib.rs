@@ -35,5 +35,5 @@ mod source;
 mod trace_pipe;
 
 pub use driver::OpenError;
-pub use place::{BadPlace, Place, open};
+pub use place::{BadPlace, Place, can_interfaces, open};
 pub use rows::{Confirmation, ListenOnly, Losses, ROWS, Row, Stamps, row};

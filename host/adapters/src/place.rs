@@ -215,6 +215,14 @@ pub fn open(place: &Place) -> Result<Link, OpenError> {
     engine::start(driver).map_err(|source| OpenError::Unreachable { address: address.to_owned(), source })
 }
 
+/// The CAN interfaces of this computer, by name; none but on Linux.
+pub fn can_interfaces() -> Vec<String> {
+    #[cfg(target_os = "linux")]
+    return crate::socketcan::interfaces();
+    #[cfg(not(target_os = "linux"))]
+    Vec::new()
+}
+
 #[cfg(target_os = "linux")]
 use crate::socketcan::bitrate_of;
 

@@ -20,6 +20,9 @@ use crate::source::Piece;
 
 /// How often the state is asked for, where it can be.
 const ASK_EVERY: Duration = Duration::from_secs(1);
+/// Time limit for an answer before a channel is open, and afterwards, when frames wait for it.
+const GREETED_WITHIN: Duration = Duration::from_secs(1);
+const ANSWER_WITHIN: Duration = Duration::from_millis(100);
 /// Transfers that one call of [`Driver::poll`] takes.
 const TRANSFERS: usize = 256;
 /// As often at the end.
@@ -33,8 +36,8 @@ const MAILBOXES: usize = 3;
 trait Usb: Send {
     /// A request with data for the adapter.
     fn tell(&mut self, request: u8, value: u16, data: &[u8]) -> Result<(), String>;
-    /// A request that it answers.
-    fn ask(&mut self, request: u8, value: u16, len: u16) -> Result<Vec<u8>, String>;
+    /// A request that it answers in time.
+    fn ask(&mut self, request: u8, value: u16, len: u16, within: Duration) -> Result<Vec<u8>, String>;
     /// The next transfer from it, if one comes in time. An error is its end.
     fn next(&mut self, wait: Duration) -> Result<Option<Piece<Vec<u8>>>, String>;
     /// Begins a transfer to it. Returns false if too many are waiting.
@@ -47,6 +50,8 @@ struct Can {
     is_open: bool,
     in_flight: [bool; MAILBOXES],
     errors: ErrorFrames,
+    /// It answers when asked for its state.
+    tells_state: bool,
 }
 
 /// The driver.
@@ -82,7 +87,7 @@ impl GsUsb {
     ) -> Result<Self, OpenError> {
         let foreign = || OpenError::Foreign { address: address.to_owned(), expected: "a gs_usb adapter" };
         usb.tell(request::HOST_FORMAT, 1, &HOST_FORMAT).map_err(|_| foreign())?;
-        let device = usb.ask(request::DEVICE_CONFIG, 1, 12).map_err(|_| foreign())?;
+        let device = usb.ask(request::DEVICE_CONFIG, 1, 12, GREETED_WITHIN).map_err(|_| foreign())?;
         let (count, version) = wire::device(&device).ok_or_else(foreign)?;
         let mut oddities = Oddities::default();
         if usize::from(count) > CHANNELS {
@@ -90,13 +95,18 @@ impl GsUsb {
         }
         let mut channels = Vec::new();
         for number in 0..count.min(CHANNELS as u16) {
-            let constants = usb.ask(request::CONSTANTS, number, 40).map_err(|_| foreign())?;
+            let constants = usb.ask(request::CONSTANTS, number, 40, GREETED_WITHIN).map_err(|_| foreign())?;
             let constants = Constants::parse(&constants).ok_or_else(foreign)?;
             if termination.is_some() && !constants.has(feature::TERMINATION) {
                 return Err(OpenError::NoTermination { address: address.to_owned() });
             }
-            let (is_open, in_flight, errors) = (false, [false; MAILBOXES], ErrorFrames::default());
-            channels.push(Can { constants, is_open, in_flight, errors });
+            channels.push(Can {
+                tells_state: constants.has(feature::STATE),
+                constants,
+                is_open: false,
+                in_flight: [false; MAILBOXES],
+                errors: ErrorFrames::default(),
+            });
         }
         let mut adapter = Self {
             usb,
@@ -231,15 +241,20 @@ impl GsUsb {
         self.asked = now;
         for (number, channel) in Channel::ALL.into_iter().enumerate().take(self.channels.len()) {
             let can = &mut self.channels[number];
-            if !can.is_open || !can.constants.has(feature::STATE) {
+            if !can.is_open || !can.tells_state {
                 continue;
             }
-            match self.usb.ask(request::STATE, number as u16, 12).map(|bytes| wire::state(&bytes)) {
+            let answer = self.usb.ask(request::STATE, number as u16, 12, ANSWER_WITHIN);
+            match answer.map(|bytes| wire::state(&bytes)) {
                 Ok(Some((Some(state), counters))) => {
                     can.errors.set(state, Some(counters), channel, At::arrival(now), &mut self.backlog);
                 }
                 Ok(Some((None, _))) => {}
-                _ => self.oddities.count("questions that were not answered"),
+                _ => {
+                    // Its error frames tell the state, too, and frames need not wait for this again.
+                    can.tells_state = false;
+                    self.oddities.count("questions for the state that were not answered");
+                }
             }
         }
     }

@@ -116,7 +116,7 @@ impl Usb for StandIn {
         Ok(())
     }
 
-    fn ask(&mut self, request: u8, _value: u16, len: u16) -> Result<Vec<u8>, String> {
+    fn ask(&mut self, request: u8, _value: u16, len: u16, _within: Duration) -> Result<Vec<u8>, String> {
         let state = self.lock();
         if state.is_unplugged || state.stalls.contains(&request) {
             return Err("stalled".to_owned());
@@ -368,6 +368,13 @@ fn errors_states_and_counters_are_those_of_the_error_frames_and_of_the_answers()
     let [Incoming::State { state: ErrorState::Passive, counters: (7, 130), .. }] = reports[..] else {
         panic!("{reports:?}")
     };
+    // One that does not answer is not asked again: frames would wait for it.
+    stand_in.lock().stalls.push(request::STATE);
+    for _ in 0..2 {
+        driver.asked = Instant::now().checked_sub(ASK_EVERY).unwrap();
+        driver.poll(Duration::ZERO, &mut reports).unwrap();
+    }
+    assert_eq!(driver.oddities().1, "1 questions for the state that were not answered");
 }
 
 #[test]

@@ -24,7 +24,7 @@ const KNOWN: [(u16, u16); 6] = [
     (0x1209, 0xCA01),
 ];
 const INTERFACE: u8 = 0;
-/// Time limit for a request.
+/// Time limit for a request with data for the adapter.
 const REQUEST_WITHIN: Duration = Duration::from_secs(1);
 /// A read returns after this time.
 const READ_TIMEOUT: Duration = Duration::from_millis(50);
@@ -138,10 +138,10 @@ impl Usb for UsbAdapter {
         self.interface.control_out(request, REQUEST_WITHIN).wait().map_err(reason)
     }
 
-    fn ask(&mut self, request: u8, value: u16, length: u16) -> Result<Vec<u8>, String> {
+    fn ask(&mut self, request: u8, value: u16, length: u16, within: Duration) -> Result<Vec<u8>, String> {
         let (control_type, recipient, index) = (ControlType::Vendor, Recipient::Interface, INTERFACE.into());
         let request = ControlIn { control_type, recipient, request, value, index, length };
-        self.interface.control_in(request, REQUEST_WITHIN).wait().map_err(reason)
+        self.interface.control_in(request, within).wait().map_err(reason)
     }
 
     fn next(&mut self, wait: Duration) -> Result<Option<Piece<Vec<u8>>>, String> {

@@ -4,7 +4,7 @@
 # FOLDER/traffic: a number of frames, which every started channel then receives; they are appended to FOLDER/sent once all are on their way.
 # FOLDER/error: the eight digits of an error frame's classes and its data, for the first channel.
 # FOLDER/peer: while it is there, somebody else on the bus acknowledges frames.
-# FOLDER/told: each vendor request. FOLDER/listening: it can be attached.
+# FOLDER/requests: each vendor request. FOLDER/listening: it can be attached.
 use strict;
 use warnings;
 use Socket;
@@ -116,7 +116,7 @@ sub control {
   return descriptor($value >> 8, $value & 255) if $type == 0x80 && $request == 6;
   return pack 'v', 0 if $type == 0x80 && $request == 0;
   return '' if $type < 3;
-  append('told', sprintf "%d %d %s\n", $request, $value, unpack 'H*', $data) if $type == 0x41;
+  append('requests', sprintf "%d %d %s\n", $request, $value, unpack 'H*', $data) if $type == 0x41;
   if ($type == 0x41 && $request == 2) {
     my ($mode, $flags) = unpack 'V2', $data;
     delete $started{$value};

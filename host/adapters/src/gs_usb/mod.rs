@@ -35,9 +35,9 @@ const MAILBOXES: usize = 3;
 /// Two pipes and vendor requests: another one in tests.
 trait Usb: Send {
     /// A request with data for the adapter.
-    fn tell(&mut self, request: u8, value: u16, data: &[u8]) -> Result<(), String>;
+    fn control_out(&mut self, request: u8, value: u16, data: &[u8]) -> Result<(), String>;
     /// A request that it answers in time.
-    fn ask(&mut self, request: u8, value: u16, len: u16, within: Duration) -> Result<Vec<u8>, String>;
+    fn control_in(&mut self, request: u8, value: u16, len: u16, within: Duration) -> Result<Vec<u8>, String>;
     /// The next transfer from it, if one comes in time. An error is its end.
     fn next(&mut self, wait: Duration) -> Result<Option<Piece<Vec<u8>>>, String>;
     /// Begins a transfer to it. Returns false if too many are waiting.
@@ -86,8 +86,8 @@ impl GsUsb {
         address: &str,
     ) -> Result<Self, OpenError> {
         let foreign = || OpenError::Foreign { address: address.to_owned(), expected: "a gs_usb adapter" };
-        usb.tell(request::HOST_FORMAT, 1, &HOST_FORMAT).map_err(|_| foreign())?;
-        let device = usb.ask(request::DEVICE_CONFIG, 1, 12, GREETED_WITHIN).map_err(|_| foreign())?;
+        usb.control_out(request::HOST_FORMAT, 1, &HOST_FORMAT).map_err(|_| foreign())?;
+        let device = usb.control_in(request::DEVICE_CONFIG, 1, 12, GREETED_WITHIN).map_err(|_| foreign())?;
         let (count, version) = wire::device(&device).ok_or_else(foreign)?;
         let mut oddities = Oddities::default();
         if usize::from(count) > CHANNELS {
@@ -95,7 +95,8 @@ impl GsUsb {
         }
         let mut channels = Vec::new();
         for number in 0..count.min(CHANNELS as u16) {
-            let constants = usb.ask(request::CONSTANTS, number, 40, GREETED_WITHIN).map_err(|_| foreign())?;
+            let constants =
+                usb.control_in(request::CONSTANTS, number, 40, GREETED_WITHIN).map_err(|_| foreign())?;
             let constants = Constants::parse(&constants).ok_or_else(foreign)?;
             if termination.is_some() && !constants.has(feature::TERMINATION) {
                 return Err(OpenError::NoTermination { address: address.to_owned() });
@@ -130,7 +131,7 @@ impl GsUsb {
     }
 
     fn switch_off(&mut self, number: usize) -> Result<(), String> {
-        self.usb.tell(request::MODE, number as u16, &words(&[0, 0]))
+        self.usb.control_out(request::MODE, number as u16, &words(&[0, 0]))
     }
 
     fn start(&mut self, number: usize, opening: Opening) -> Result<(), Refusal> {
@@ -144,13 +145,14 @@ impl GsUsb {
         if opening.listen_only {
             flags |= feature::LISTEN_ONLY;
         }
-        let mut tell =
-            |request, data: &[u8]| self.usb.tell(request, number as u16, data).map_err(|_| Refusal::Hardware);
+        let mut set = |request, data: &[u8]| {
+            self.usb.control_out(request, number as u16, data).map_err(|_| Refusal::Hardware)
+        };
         if let Some(is_on) = self.termination {
-            tell(request::SET_TERMINATION, &words(&[u32::from(is_on)]))?;
+            set(request::SET_TERMINATION, &words(&[u32::from(is_on)]))?;
         }
-        tell(request::BIT_TIMING, &timing)?;
-        tell(request::MODE, &words(&[1, flags]))
+        set(request::BIT_TIMING, &timing)?;
+        set(request::MODE, &words(&[1, flags]))
     }
 
     fn take(&mut self, bytes: &[u8], arrival: Instant) {
@@ -233,7 +235,7 @@ impl GsUsb {
         if self.identifies_until.is_some_and(|until| until <= now) {
             self.identifies_until = None;
             // If it goes on, it does no harm.
-            let _ = self.usb.tell(request::IDENTIFY, 0, &words(&[0]));
+            let _ = self.usb.control_out(request::IDENTIFY, 0, &words(&[0]));
         }
         if now.duration_since(self.asked) < ASK_EVERY {
             return;
@@ -244,7 +246,7 @@ impl GsUsb {
             if !can.is_open || !can.tells_state {
                 continue;
             }
-            let answer = self.usb.ask(request::STATE, number as u16, 12, ANSWER_WITHIN);
+            let answer = self.usb.control_in(request::STATE, number as u16, 12, ANSWER_WITHIN);
             match answer.map(|bytes| wire::state(&bytes)) {
                 Ok(Some((Some(state), counters))) => {
                     can.errors.set(state, Some(counters), channel, At::arrival(now), &mut self.backlog);
@@ -339,7 +341,7 @@ impl Driver for GsUsb {
         if !self.channels.first().is_some_and(|can| can.constants.has(feature::IDENTIFY)) {
             return Err(Refusal::Unsupported);
         }
-        self.usb.tell(request::IDENTIFY, 0, &words(&[1])).map_err(|_| Refusal::Hardware)?;
+        self.usb.control_out(request::IDENTIFY, 0, &words(&[1])).map_err(|_| Refusal::Hardware)?;
         self.identifies_until = Some(Instant::now() + Duration::from_secs(seconds.into()));
         Ok(())
     }

@@ -22,7 +22,7 @@ struct State {
     features: u32,
     channels: u8,
     /// Vendor requests with data for the adapter: which, to which channel, and what.
-    told: Vec<(u8, u16, Vec<u8>)>,
+    requests: Vec<(u8, u16, Vec<u8>)>,
     /// The flags with which each channel was started.
     started: [Option<u32>; 2],
     /// On their way to the host.
@@ -43,7 +43,7 @@ impl StandIn {
         let state = State {
             features,
             channels,
-            told: Vec::new(),
+            requests: Vec::new(),
             started: [None; 2],
             transfers: VecDeque::new(),
             unacknowledged: None,
@@ -89,14 +89,18 @@ impl StandIn {
         self.changed();
     }
 
-    fn told(&self, request: u8) -> Vec<(u16, Vec<u8>)> {
-        let told = &self.lock().told;
-        told.iter().filter(|(of, ..)| *of == request).map(|(_, value, data)| (*value, data.clone())).collect()
+    fn requests(&self, request: u8) -> Vec<(u16, Vec<u8>)> {
+        let requests = &self.lock().requests;
+        requests
+            .iter()
+            .filter(|(of, ..)| *of == request)
+            .map(|(_, value, data)| (*value, data.clone()))
+            .collect()
     }
 }
 
 impl Usb for StandIn {
-    fn tell(&mut self, request: u8, value: u16, data: &[u8]) -> Result<(), String> {
+    fn control_out(&mut self, request: u8, value: u16, data: &[u8]) -> Result<(), String> {
         let mut state = self.lock();
         let known = [
             request::HOST_FORMAT,
@@ -108,7 +112,7 @@ impl Usb for StandIn {
         if state.is_unplugged || state.stalls.contains(&request) || !known.contains(&request) {
             return Err("stalled".to_owned());
         }
-        state.told.push((request, value, data.to_vec()));
+        state.requests.push((request, value, data.to_vec()));
         if request == request::MODE {
             let word = |at: usize| u32::from_le_bytes(data[at..at + 4].try_into().unwrap());
             state.started[usize::from(value)] = (word(0) == 1).then(|| word(4));
@@ -116,7 +120,13 @@ impl Usb for StandIn {
         Ok(())
     }
 
-    fn ask(&mut self, request: u8, _value: u16, len: u16, _within: Duration) -> Result<Vec<u8>, String> {
+    fn control_in(
+        &mut self,
+        request: u8,
+        _value: u16,
+        len: u16,
+        _within: Duration,
+    ) -> Result<Vec<u8>, String> {
         let state = self.lock();
         if state.is_unplugged || state.stalls.contains(&request) {
             return Err("stalled".to_owned());
@@ -209,16 +219,16 @@ fn send(device: &Device, frame: &str) {
 fn it_is_greeted_and_both_channels_are_off_until_they_are_asked_for() {
     let stand_in = StandIn::new(EVERYTHING, 2);
     let device = session(&stand_in);
-    assert_eq!(stand_in.told(request::HOST_FORMAT), [(1, vec![0xEF, 0xBE, 0, 0])]);
-    assert_eq!(stand_in.told(request::MODE), [(0, vec![0; 8]), (1, vec![0; 8])]);
+    assert_eq!(stand_in.requests(request::HOST_FORMAT), [(1, vec![0xEF, 0xBE, 0, 0])]);
+    assert_eq!(stand_in.requests(request::MODE), [(0, vec![0; 8]), (1, vec![0; 8])]);
     let hello = device.hello();
     assert_eq!((hello.board.as_str(), hello.serial.as_str(), hello.channels), ("gs_usb", "0042", 2));
     device.listen(Channel::Can1, 500_000).unwrap();
-    assert_eq!(stand_in.told(request::BIT_TIMING), [(0, words(&[6, 7, 2, 2, 6]))]);
+    assert_eq!(stand_in.requests(request::BIT_TIMING), [(0, words(&[6, 7, 2, 2, 6]))]);
     let flags = feature::LISTEN_ONLY | feature::STAMPS | feature::BUS_ERRORS;
     assert_eq!(stand_in.lock().started, [Some(flags), None]);
     device.identify(1).unwrap();
-    assert_eq!(stand_in.told(request::IDENTIFY)[0], (0, words(&[1])));
+    assert_eq!(stand_in.requests(request::IDENTIFY)[0], (0, words(&[1])));
     device.stop().unwrap();
     drop(device);
     assert_eq!(stand_in.lock().started, [None; 2]);
@@ -382,9 +392,9 @@ fn the_resistor_is_switched_only_where_that_is_asked_for_and_there_is_one() {
     let opening = Opening { bitrate_bps: 500_000, sample_point_permille: 875, listen_only: true };
     let stand_in = StandIn::new(EVERYTHING, 1);
     connect(&stand_in, None).unwrap().open(Channel::Can1, opening).unwrap();
-    assert_eq!(stand_in.told(request::SET_TERMINATION), []);
+    assert_eq!(stand_in.requests(request::SET_TERMINATION), []);
     connect(&stand_in, Some(true)).unwrap().open(Channel::Can1, opening).unwrap();
-    assert_eq!(stand_in.told(request::SET_TERMINATION), [(0, words(&[1]))]);
+    assert_eq!(stand_in.requests(request::SET_TERMINATION), [(0, words(&[1]))]);
     let without = StandIn::new(feature::LISTEN_ONLY, 1);
     assert!(matches!(connect(&without, Some(true)), Err(OpenError::NoTermination { .. })));
 }
@@ -413,7 +423,7 @@ fn one_that_stalls_a_request_is_foreign_or_refuses_and_is_not_left_half_open() {
     let device = session(&stand_in);
     stand_in.lock().stalls.push(request::BIT_TIMING);
     assert!(device.listen(Channel::Can1, 500_000).is_err());
-    assert_eq!(stand_in.told(request::MODE).last(), Some(&(0, vec![0; 8])));
+    assert_eq!(stand_in.requests(request::MODE).last(), Some(&(0, vec![0; 8])));
     // A bit rate that its clock has not.
     stand_in.lock().stalls.clear();
     let refused = device.listen(Channel::Can1, 700_000).unwrap_err();

@@ -132,13 +132,19 @@ const fn advice(kind: ErrorKind) -> &'static str {
 }
 
 impl Usb for UsbAdapter {
-    fn tell(&mut self, request: u8, value: u16, data: &[u8]) -> Result<(), String> {
+    fn control_out(&mut self, request: u8, value: u16, data: &[u8]) -> Result<(), String> {
         let (control_type, recipient, index) = (ControlType::Vendor, Recipient::Interface, INTERFACE.into());
         let request = ControlOut { control_type, recipient, request, value, index, data };
         self.interface.control_out(request, REQUEST_WITHIN).wait().map_err(reason)
     }
 
-    fn ask(&mut self, request: u8, value: u16, length: u16, within: Duration) -> Result<Vec<u8>, String> {
+    fn control_in(
+        &mut self,
+        request: u8,
+        value: u16,
+        length: u16,
+        within: Duration,
+    ) -> Result<Vec<u8>, String> {
         let (control_type, recipient, index) = (ControlType::Vendor, Recipient::Interface, INTERFACE.into());
         let request = ControlIn { control_type, recipient, request, value, index, length };
         self.interface.control_in(request, within).wait().map_err(reason)

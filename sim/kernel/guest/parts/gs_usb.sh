@@ -29,7 +29,7 @@ gs_end() {
 }
 # The frames of a log on an interface, without errors.
 frames_on() { awk -v name="$1" '$2 == name { print $3 }' "$2" | grep -v '^2[0-9A-F]\{7\}#'; }
-is_started() { [ "$(grep -c "^2 $1 01000000" $GS/told)" -ge "$2" ]; }
+is_started() { [ "$(grep -c "^2 $1 01000000" $GS/requests)" -ge "$2" ]; }
 can_is_up() {
   # shellcheck disable=SC2086 # words
   ip link set $1 down
@@ -111,7 +111,7 @@ verdict $? "gs_usb: it is found by its serial number" "$(head -n 1 info.txt)"
 [ $? != 0 ] && grep -q "there are 0042" info.txt
 verdict $? "gs_usb: another number's message lists those that there are"
 rm -f $GS/sent
-: > $GS/told
+: > $GS/requests
 gs_start -d gs_usb: -b 500k
 wait_until is_started 0 1 && wait_until is_started 1 1
 sleep 0.5
@@ -122,9 +122,9 @@ check "gs_usb: a capture of both channels ends" gs_end
 _bad=0
 for _n in 0 1; do frames_on can$_n capture.log | cmp -s - $GS/sent || _bad=1; done
 verdict $_bad "gs_usb: every frame of both channels, in order" "$(frames_on can0 capture.log | wc -l) + $(frames_on can1 capture.log | wc -l) of $(wc -l < $GS/sent)"
-[ $_bad = 0 ] || { cat capture.json capture.err gs.err; grep '^2 ' $GS/told; }
+[ $_bad = 0 ] || { cat capture.json capture.err gs.err; grep '^2 ' $GS/requests; }
 # Listen-only, with stamps and bus errors.
-[ "$(grep -c '^2 [01] 0100000011100000' $GS/told)" = 2 ] && [ "$(grep '^2 [01]' $GS/told | tail -n 2 | grep -c ' 0000000000000000')" = 2 ]
+[ "$(grep -c '^2 [01] 0100000011100000' $GS/requests)" = 2 ] && [ "$(grep '^2 [01]' $GS/requests | tail -n 2 | grep -c ' 0000000000000000')" = 2 ]
 verdict $? "gs_usb: both only listened, and are off afterwards"
 
 touch $GS/peer
@@ -135,7 +135,7 @@ timeout 60 "$CANTAP" send -d gs_usb: -b 500k 1 123#0102 > send.txt 2>&1
 [ $? != 0 ]
 verdict $? "gs_usb: a frame that nobody acknowledges is not" "$(tail -n 1 send.txt)"
 
-: > $GS/told
+: > $GS/requests
 rm -f $GS/sent
 gs_start -d gs_usb: -b 500k
 wait_until is_started 1 1

@@ -105,9 +105,12 @@ fn offer_devices(current: &OsStr) -> Vec<CompletionCandidate> {
     let others = [
         ("virtual", "a simulated device, which needs no board"),
         ("virtual:car", "the same, with a vehicle on its buses"),
+        ("gs_usb:", "a gs_usb adapter, such as candleLight or CANable"),
     ];
+    let interfaces = cantap_adapters::can_interfaces();
+    let interfaces = interfaces.into_iter().map(|name| (name, "a CAN interface of this computer".to_owned()));
     let others = others.into_iter().map(|(address, what)| (address.to_owned(), what.to_owned()));
-    beginning(current, boards.chain(others))
+    beginning(current, boards.chain(interfaces).chain(others))
 }
 
 fn offer_channels(current: &OsStr) -> Vec<CompletionCandidate> {

@@ -18,7 +18,7 @@ fi
 programs="busybox-static can-utils usbip kmod usbutils iproute2 util-linux perl-base"
 modem_manager="modemmanager udev dbus-daemon dbus-bin"
 python="python3-can python3-wrapt python3-typing-extensions python3-packaging python3-msgpack python3-pkg-resources python3-minimal"
-modules="virtio_pci virtio_net 9p 9pnet_virtio can can-raw vcan vxcan slcan cdc-acm vhci-hcd xhci-pci"
+modules="virtio_pci virtio_net 9p 9pnet_virtio can can-raw vcan vxcan slcan gs_usb cdc-acm vhci-hcd xhci-pci"
 
 # `apt-get` prints where each file comes from, which is only useful if it fails.
 quietly() { "$@" > log 2>&1 || { cat log >&2; return 1; }; }

@@ -1,6 +1,5 @@
 //! `cantap bridge`: a device's channels as CAN interfaces of Linux, for every program that uses SocketCAN.
 
-mod frames;
 mod interface;
 mod lane;
 mod sender;

@@ -107,7 +107,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     args.open.options().timing.check_channels(boards.addresses().len())?;
     for (board, address) in boards.addresses().iter().enumerate() {
         // A virtual device without settings has no bit rate saved.
-        if !address.may_have_saved() && !address.is_car() && needs_bit_rate(args, board, &boards)? {
+        if !address.may_have_saved() && !address.has_bit_rate() && needs_bit_rate(args, board, &boards)? {
             return Err(usage(
                 "give the bus's bit rate with -b, such as -b 500k, for each channel that -c names",
             ));

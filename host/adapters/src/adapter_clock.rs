@@ -47,6 +47,12 @@ impl AdapterClock {
         Self { unit_ns: unit_ns.into(), period: period.into(), started: Instant::now(), state: None }
     }
 
+    /// A clock to whose arrivals belong some from before now.
+    #[cfg(test)]
+    pub fn starting(self, started: Instant) -> Self {
+        Self { started, ..self }
+    }
+
     /// When a frame was stamped that arrived at `arrival`: never later than that. A stamp that cannot be believed is replaced by the arrival.
     pub fn place(&mut self, stamp: u64, arrival: Instant) -> At {
         let arrival_ns = arrival.saturating_duration_since(self.started).as_nanos() as i128;

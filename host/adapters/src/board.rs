@@ -163,6 +163,8 @@ pub(crate) struct AdapterBoard<'q> {
     pub chip: NoChip,
     pub meter: NoMeter,
     pub driver: Box<dyn Driver>,
+    /// The time at which the firmware's commands stand still, while the engine delivers what a channel that is being closed had received.
+    pub held_at: Option<u32>,
 }
 
 impl AdapterBoard<'_> {
@@ -188,7 +190,11 @@ impl AdapterBoard<'_> {
             self.driver.close(channel);
             boxes.borrow_mut().switch_off();
         }
-        let opening = Opening { bitrate_bps: config.timing.bitrate_bps(CAN_CLOCK_HZ), listen_only };
+        let opening = Opening {
+            bitrate_bps: config.timing.bitrate_bps(CAN_CLOCK_HZ),
+            sample_point_permille: config.timing.sample_point_permille(),
+            listen_only,
+        };
         self.driver.open(channel, opening)?;
         boxes.borrow_mut().phase = Phase::Opened;
         Ok(())
@@ -211,7 +217,7 @@ impl<'q> Board<'q, QUEUE_BYTES> for AdapterBoard<'q> {
     }
 
     fn now(&self) -> u32 {
-        self.clock.now()
+        self.held_at.unwrap_or_else(|| self.clock.now())
     }
 
     fn take_sof(&mut self) -> Option<SofReading> {
@@ -259,12 +265,12 @@ impl<'q> Board<'q, QUEUE_BYTES> for AdapterBoard<'q> {
         match command {
             Command::SetPeriodic { .. } | Command::SetTrigger { .. } if !sends => Err(Refusal::Unsupported),
             Command::Registers { .. }
-            | Command::Identify { .. }
             | Command::Reset
             | Command::Bootloader
             | Command::SaveDefaults
             | Command::ClearDefaults
             | Command::MeasureEdges { .. } => Err(Refusal::Unsupported),
+            Command::Identify { seconds } => self.driver.identify(*seconds),
             // What the firmware refuses anyway must not reach the adapter.
             Command::Open { channel, config: Some(config) }
                 if config.timing.is_valid() && !self.is_open(*channel) =>

@@ -11,9 +11,9 @@ use cantap::device::is_idle;
 use cantap_wire::record::LossStage;
 use cantap_wire::{Channel, Frame, Id, Refusal};
 
-use crate::driver::{At, Driver, Incoming, Oddities, OpenError, Opening};
+use crate::driver::{At, Bytes, Driver, Incoming, Oddities, OpenError, Opening, poll_bytes};
 use crate::rows::{Row, row};
-use crate::source::Source;
+use crate::source::{Piece, Source};
 
 /// cannelloni's usual port.
 pub(crate) const PORT: u16 = 20_000;
@@ -172,6 +172,20 @@ fn id_of(raw: u32) -> Option<Id> {
     if raw & EXTENDED != 0 { Id::extended(id) } else { Id::standard(id) }
 }
 
+impl Bytes for Cannelloni {
+    fn next(&mut self, wait: Duration) -> Result<Option<Piece<Vec<u8>>>, String> {
+        self.source.next(wait)
+    }
+
+    fn push(&mut self, bytes: &[u8], arrival: Instant) {
+        self.datagram(bytes, arrival);
+    }
+
+    fn backlog(&mut self) -> &mut Vec<Incoming> {
+        &mut self.backlog
+    }
+}
+
 impl Driver for Cannelloni {
     fn row(&self) -> &'static Row {
         row("cannelloni").unwrap_or(&crate::ROWS[0])
@@ -211,13 +225,7 @@ impl Driver for Cannelloni {
         if let Some(reason) = &self.failed {
             return Err(reason.clone());
         }
-        let wait = if self.backlog.is_empty() { wait } else { Duration::ZERO };
-        let next = self.source.next(wait);
-        if let Ok(Some(piece)) = &next {
-            self.datagram(&piece.content, piece.at);
-        }
-        reports.append(&mut self.backlog);
-        next.map(|_| ())
+        poll_bytes(self, wait, reports)
     }
 
     fn oddities(&self) -> (u32, String) {

@@ -3,10 +3,12 @@
 use std::io;
 use std::time::{Duration, Instant};
 
+use cantap_trace::TraceEvent;
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, Stamp};
 use cantap_wire::{Channel, Frame, Refusal};
 
 use crate::rows::Row;
+use crate::source::Piece;
 
 /// Why there is no adapter at an address. Each message says what to do next.
 #[derive(Debug, thiserror::Error)]
@@ -39,6 +41,56 @@ pub enum OpenError {
         /// As given.
         address: String,
     },
+    /// This computer has no such CAN interface.
+    #[error("'{address}' is no CAN interface of this computer: {there}")]
+    NoInterface {
+        /// As given.
+        address: String,
+        /// Those that there are.
+        there: String,
+    },
+    /// The interface is down.
+    #[error("the interface '{address}' is down; as root: {command}")]
+    InterfaceDown {
+        /// As given.
+        address: String,
+        /// What brings it up.
+        command: String,
+    },
+    /// The system does not let this program use the interface.
+    #[error("the interface '{address}' cannot be used ({source})")]
+    Interface {
+        /// As given.
+        address: String,
+        /// The system's error.
+        source: io::Error,
+    },
+    /// There is no such adapter on USB, or more than one.
+    #[error(
+        "'{address}' is no single gs_usb adapter: {there}; name one by its serial number, as in gs_usb:SERIAL"
+    )]
+    NoUsbAdapter {
+        /// As given.
+        address: String,
+        /// Those that there are.
+        there: String,
+    },
+    /// The adapter on USB cannot be opened.
+    #[error("'{address}' cannot be opened: {reason}{advice}")]
+    Usb {
+        /// As given.
+        address: String,
+        /// The system's error.
+        reason: String,
+        /// What to do.
+        advice: &'static str,
+    },
+    /// The adapter has no resistor that could be switched.
+    #[error("'{address}': this adapter cannot switch its termination; leave out ?termination")]
+    NoTermination {
+        /// As given.
+        address: String,
+    },
     /// The input is no trace.
     #[error("'{address}' cannot be read: {reason}")]
     NoTrace {
@@ -54,6 +106,8 @@ pub enum OpenError {
 pub struct Opening {
     /// Bits per second.
     pub bitrate_bps: u32,
+    /// Where in the bit, in thousandths of it.
+    pub sample_point_permille: u32,
     /// Without acknowledging.
     pub listen_only: bool,
 }
@@ -148,6 +202,25 @@ pub enum Incoming {
     },
 }
 
+impl Incoming {
+    /// What a trace or an error frame reports; `None` for what has no place here.
+    pub fn of(event: &TraceEvent, channel: Channel, at: At) -> Option<Self> {
+        Some(match *event {
+            TraceEvent::Frame { frame, .. } => Self::Received { channel, frame: *frame.classic()?, at },
+            TraceEvent::BusError { kind: Some(kind), .. } => Self::BusError { channel, kind, at },
+            TraceEvent::BusError { kind: None, .. } => Self::BusErrors { channel, count: 1, at },
+            TraceEvent::ErrorsSuppressed { count } => Self::BusErrors { channel, count, at },
+            TraceEvent::State { state, counters } => {
+                Self::State { channel, state, counters: counters.unwrap_or((0, 0)), at }
+            }
+            TraceEvent::Lost { stage, count, at_least } => {
+                Self::Lost { channel, stage: stage.unwrap_or(LossStage::Link), count, at_least, at }
+            }
+            TraceEvent::TransmitFailed { .. } => return None,
+        })
+    }
+}
+
 /// An adapter. Nothing is sent or acknowledged before [`Driver::open`].
 pub(crate) trait Driver: Send {
     /// What it can tell.
@@ -172,10 +245,39 @@ pub(crate) trait Driver: Send {
     fn send(&mut self, channel: Channel, mailbox: u8, frame: &Frame) -> bool;
     /// Waits up to `wait` for something to report, and appends it. An error is the adapter's end, with the reason for people.
     fn poll(&mut self, wait: Duration, reports: &mut Vec<Incoming>) -> Result<(), String>;
+    /// Shows for some seconds which adapter it is; 0 ends that.
+    fn identify(&mut self, _seconds: u8) -> Result<(), Refusal> {
+        Err(Refusal::Unsupported)
+    }
     /// Text about what was left out or misunderstood, with its count: shown by `cantap info`.
     fn oddities(&self) -> (u32, String) {
         (0, String::new())
     }
+}
+
+/// An adapter that sends pieces of bytes.
+pub(crate) trait Bytes {
+    /// The next piece, if one comes in time.
+    fn next(&mut self, wait: Duration) -> Result<Option<Piece<Vec<u8>>>, String>;
+    /// Reads a piece.
+    fn push(&mut self, bytes: &[u8], arrival: Instant);
+    /// What is to be reported.
+    fn backlog(&mut self) -> &mut Vec<Incoming>;
+}
+
+/// [`Driver::poll`] of such an adapter: reads what comes, unless there is something to report already.
+pub(crate) fn poll_bytes(
+    adapter: &mut impl Bytes,
+    wait: Duration,
+    reports: &mut Vec<Incoming>,
+) -> Result<(), String> {
+    let wait = if adapter.backlog().is_empty() { wait } else { Duration::ZERO };
+    let next = adapter.next(wait);
+    if let Ok(Some(piece)) = &next {
+        adapter.push(&piece.content, piece.at);
+    }
+    reports.append(adapter.backlog());
+    next.map(|_| ())
 }
 
 /// Counts of what an adapter sent that makes no sense, by kind.

@@ -13,6 +13,7 @@ use cantap::device::{Link, PipeReader, pipe};
 use cantap_firmware::bus::capture::Capture;
 use cantap_firmware::bus::queue::RecordQueue;
 use cantap_firmware::bus::transmit::TxQueue;
+use cantap_firmware::port::board::Board as _;
 use cantap_firmware::port::command::Identity;
 use cantap_firmware::port::session::{self, Session};
 use cantap_firmware::ports::{Clock, Outcome};
@@ -32,6 +33,8 @@ const TICK: Duration = Duration::from_millis(1);
 const HOLD_BACK_BYTES: u32 = 48 * 1024;
 /// How long a channel that is being closed waits for the confirmation of what the adapter has taken.
 const CONFIRM_WITHIN: Duration = Duration::from_millis(50);
+/// How long what it had received may take to reach the host. What is left then is counted as lost where the record queue has no room.
+const DELIVER_WITHIN: Duration = Duration::from_millis(1_500);
 /// After an adapter's end, and with everything handed over, the firmware goes on for this many ticks: a batch waits for one.
 const LAST_TICKS: u32 = 20;
 /// Reports that found no room, at most; more are counted by kind in the status only.
@@ -124,6 +127,7 @@ fn run(driver: Box<dyn Driver>, port: PipePort, reason: &Reason) {
             chip: NoChip((0, std::string::String::new())),
             meter: NoMeter,
             driver,
+            held_at: None,
         },
         session: Session::new(consumer, identity, session),
         port,
@@ -313,6 +317,7 @@ impl Engine<'_> {
 
     /// Closes what the firmware has stopped, after what the adapter has taken is confirmed, and with everything it had received.
     fn close_channels(&mut self, is_gone: bool) {
+        self.hold_time();
         for channel in Channel::ALL {
             let boxes = Rc::clone(&self.board.boxes[channel.index()]);
             if boxes.borrow().phase != Phase::Leaving {
@@ -329,11 +334,27 @@ impl Engine<'_> {
                 // If it says why it ended, the next poll says so again.
                 let _ = self.ask_driver(Duration::ZERO);
             }
+            if since.elapsed() > DELIVER_WITHIN {
+                while let Some(incoming) = self.reports.pop_front() {
+                    self.take(incoming);
+                }
+            }
             if !self.reports.is_empty() {
                 continue;
             }
             self.closed[channel.index()] = false;
             boxes.borrow_mut().switch_off();
         }
+    }
+
+    /// While a channel is being closed, the firmware's commands see no time pass: a controller leaves its bus in milliseconds, and what a socket
+    /// holds may take longer.
+    fn hold_time(&mut self) {
+        let board = &mut self.board;
+        let is_leaving = Channel::ALL.into_iter().any(|channel| {
+            let phase = board.boxes[channel.index()].borrow().phase;
+            phase == Phase::Leaving || phase == Phase::Off && board.is_open(channel)
+        });
+        board.held_at = is_leaving.then(|| board.held_at.unwrap_or_else(|| board.clock.now()));
     }
 }

@@ -9,9 +9,10 @@ use cantap_wire::record::LossStage;
 use cantap_wire::{Channel, Frame, Id, Refusal};
 
 use crate::adapter_clock::AdapterClock;
-use crate::driver::{At, Driver, Incoming, Oddities, OpenError, Opening};
+use crate::driver::{At, Bytes, Driver, Incoming, Oddities, OpenError, Opening, poll_bytes};
 use crate::line::Line;
 use crate::rows::{Row, row};
+use crate::source::Piece;
 
 /// The TCP port that the adapters listen on.
 pub(crate) const PORT: u16 = 23;
@@ -189,7 +190,7 @@ impl Gvret {
             }
             let Some(piece) = self.line.next(left)? else { continue };
             let mut found = None;
-            self.push(&piece.content, piece.at, |message| {
+            self.read(&piece.content, piece.at, |message| {
                 if found.is_none() {
                     found = is_it(message);
                 }
@@ -200,7 +201,7 @@ impl Gvret {
         }
     }
 
-    fn push(&mut self, bytes: &[u8], arrival: Instant, mut see: impl FnMut(&Message)) {
+    fn read(&mut self, bytes: &[u8], arrival: Instant, mut see: impl FnMut(&Message)) {
         self.bytes.extend_from_slice(bytes);
         let mut used = 0;
         while let Some((message, len)) = message(&self.bytes[used..]) {
@@ -250,6 +251,20 @@ impl Gvret {
             command.extend_from_slice(&setting.to_le_bytes());
         }
         self.line.write(&command);
+    }
+}
+
+impl Bytes for Gvret {
+    fn next(&mut self, wait: Duration) -> Result<Option<Piece<Vec<u8>>>, String> {
+        self.line.next(wait)
+    }
+
+    fn push(&mut self, bytes: &[u8], arrival: Instant) {
+        self.read(bytes, arrival, |_| {});
+    }
+
+    fn backlog(&mut self) -> &mut Vec<Incoming> {
+        &mut self.backlog
     }
 }
 
@@ -317,13 +332,7 @@ impl Driver for Gvret {
     }
 
     fn poll(&mut self, wait: Duration, reports: &mut Vec<Incoming>) -> Result<(), String> {
-        let wait = if self.backlog.is_empty() { wait } else { Duration::ZERO };
-        let next = self.line.next(wait);
-        if let Ok(Some(piece)) = &next {
-            self.push(&piece.content, piece.at, |_| {});
-        }
-        reports.append(&mut self.backlog);
-        next.map(|_| ())
+        poll_bytes(self, wait, reports)
     }
 
     fn oddities(&self) -> (u32, String) {

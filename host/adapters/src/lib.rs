@@ -18,16 +18,22 @@ mod board;
 mod cannelloni;
 mod driver;
 mod engine;
+mod error_frames;
+mod gs_usb;
 mod gvret;
+mod interface_name;
 mod line;
 mod mailboxes;
 mod place;
+pub mod raw_can;
 mod rows;
 mod slcan;
+#[cfg(target_os = "linux")]
+mod socketcan;
 mod socketcand;
 mod source;
 mod trace_pipe;
 
 pub use driver::OpenError;
-pub use place::{BadPlace, Place, open};
+pub use place::{BadPlace, Place, can_interfaces, open};
 pub use rows::{Confirmation, ListenOnly, Losses, ROWS, Row, Stamps, row};

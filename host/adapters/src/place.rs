@@ -9,13 +9,15 @@ use cantap_formats::Format;
 use crate::cannelloni::{self, Cannelloni};
 use crate::driver::{Driver, OpenError};
 use crate::engine;
+use crate::gs_usb::GsUsb;
 use crate::gvret::{self, Gvret};
+use crate::interface_name;
 use crate::line::Line;
 use crate::slcan::{self, Slcan};
 use crate::socketcand::{self, Socketcand};
 use crate::trace_pipe::TracePipe;
 
-/// An adapter's place: `slcan:/dev/ttyACM0@115200`, `gvret:tcp://192.168.4.1`, `socketcand://HOST/can0`, `cannelloni://HOST:PORT`,
+/// An adapter's place: `can0`, `socketcan:can0`, `slcan:/dev/ttyACM0@115200`, `gvret:tcp://192.168.4.1`, `socketcand://HOST/can0`, `cannelloni://HOST:PORT`,
 /// `candump:-`, `pcapng:-`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Place {
@@ -28,6 +30,8 @@ enum Kind {
     Slcan { port: String, baud: u32 },
     GvretSerial { port: String, baud: u32 },
     GvretTcp { host: String },
+    Socketcan { interface: String },
+    GsUsb { serial: String, termination: Option<bool> },
     Socketcand { host: String, interface: String },
     Cannelloni { host: String, listen: u16 },
     Trace { path: String, format: TraceFormat },
@@ -45,12 +49,33 @@ enum TraceFormat {
 pub struct BadPlace(String);
 
 /// What addresses of adapters begin with.
-const SCHEMES: [&str; 6] = ["slcan:", "gvret:", "socketcand:", "cannelloni:", "candump:", "pcapng:"];
+const SCHEMES: [&str; 8] =
+    ["socketcan:", "gs_usb:", "slcan:", "gvret:", "socketcand:", "cannelloni:", "candump:", "pcapng:"];
 
 impl Place {
     /// Whether a text is meant for an adapter.
     pub fn is_meant(text: &str) -> bool {
         SCHEMES.iter().any(|scheme| text.starts_with(scheme))
+            || text == "gs_usb"
+            || interface_name::is_meant(text)
+    }
+
+    /// The bit rate that the adapter's owner has set, in bit/s, if it can be read without the adapter.
+    pub fn bitrate(&self) -> Option<u32> {
+        match &self.kind {
+            Kind::Socketcan { interface } => bitrate_of(interface),
+            _ => None,
+        }
+    }
+
+    /// Why a bit rate that a user asks for cannot be used: it is another than the one that the adapter's owner has set.
+    pub fn rate_conflict(&self, bitrate_bps: u32) -> Option<String> {
+        let set = self.bitrate().filter(|set| !interface_name::same_rate(*set, bitrate_bps))?;
+        let Kind::Socketcan { interface } = &self.kind else { return None };
+        Some(format!(
+            "{interface} runs at {set} bit/s, not at {bitrate_bps}: leave out -b, or set it, as root: ip link set {interface} down && \
+             ip link set {interface} up type can bitrate {bitrate_bps}"
+        ))
     }
 
     /// Whether the adapter may come back after it was pulled out. A trace that has ended does not go on.
@@ -64,8 +89,17 @@ impl FromStr for Place {
 
     fn from_str(text: &str) -> Result<Self, BadPlace> {
         let bad = |reason: &str| BadPlace(reason.to_owned());
-        let (scheme, rest) = text.split_once(':').unwrap_or((text, ""));
+        let (scheme, rest) = match text.split_once(':') {
+            None if interface_name::is_meant(text) => ("socketcan", text),
+            None => (text, ""),
+            Some(parts) => parts,
+        };
         let kind = match scheme {
+            "socketcan" if interface_name::is_possible(rest) => Kind::Socketcan { interface: rest.to_owned() },
+            "socketcan" => return Err(bad("name the interface, as in socketcan:can0")),
+            "gs_usb" => gs_usb_of(rest).ok_or_else(|| {
+                bad("write gs_usb: or gs_usb:SERIAL, and ?termination=on or ?termination=off after it if that is to be changed")
+            })?,
             "slcan" => {
                 let (port, baud) = port_and_baud(rest, slcan::DEFAULT_BAUD)
                     .ok_or_else(|| bad("write slcan:PORT or slcan:PORT@BAUD, as in slcan:/dev/ttyACM0"))?;
@@ -102,7 +136,7 @@ impl FromStr for Place {
                 Kind::Trace { path: rest.to_owned(), format }
             }
             "candump" | "pcapng" => return Err(bad("name the pipe, as in candump:- for standard input")),
-            _ => return Err(bad("it begins with none of slcan:, gvret:, socketcand:, cannelloni:, candump:, pcapng:")),
+            _ => return Err(bad("it is no CAN interface's name, and begins with none of socketcan:, gs_usb:, slcan:, gvret:, socketcand:, cannelloni:, candump:, pcapng:")),
         };
         Ok(Self { text: text.to_owned(), kind })
     }
@@ -120,6 +154,17 @@ fn port_and_baud(text: &str, default: u32) -> Option<(String, u32)> {
         None => (text, default),
     };
     (!port.is_empty()).then(|| (port.to_owned(), baud))
+}
+
+fn gs_usb_of(rest: &str) -> Option<Kind> {
+    let (serial, termination) = match rest.split_once('?') {
+        Some((serial, "termination=on")) => (serial, Some(true)),
+        Some((serial, "termination=off")) => (serial, Some(false)),
+        Some(_) => return None,
+        None => (rest, None),
+    };
+    let is_serial = serial.chars().all(|letter| letter.is_ascii_graphic());
+    is_serial.then(|| Kind::GsUsb { serial: serial.to_owned(), termination })
 }
 
 fn with_port(host: &str, port: u16) -> Option<String> {
@@ -155,6 +200,8 @@ pub fn open(place: &Place) -> Result<Link, OpenError> {
         Kind::Slcan { port, baud } => Box::new(Slcan::open_port(port, *baud)?),
         Kind::GvretSerial { port, baud } => Box::new(Gvret::over(Line::serial(port, *baud)?, address)?),
         Kind::GvretTcp { host } => Box::new(Gvret::over(Line::tcp(host)?, address)?),
+        Kind::Socketcan { interface } => socketcan(interface, address)?,
+        Kind::GsUsb { serial, termination } => Box::new(GsUsb::connect(serial, *termination, address)?),
         Kind::Socketcand { host, interface } => Box::new(Socketcand::connect(host, interface, address)?),
         Kind::Cannelloni { host, listen } => Box::new(Cannelloni::connect(host, *listen, address)?),
         Kind::Trace { path, format } => {
@@ -168,6 +215,33 @@ pub fn open(place: &Place) -> Result<Link, OpenError> {
     engine::start(driver).map_err(|source| OpenError::Unreachable { address: address.to_owned(), source })
 }
 
+/// The CAN interfaces of this computer, by name; none but on Linux.
+pub fn can_interfaces() -> Vec<String> {
+    #[cfg(target_os = "linux")]
+    return crate::socketcan::interfaces();
+    #[cfg(not(target_os = "linux"))]
+    Vec::new()
+}
+
+#[cfg(target_os = "linux")]
+use crate::socketcan::bitrate_of;
+
+#[cfg(target_os = "linux")]
+fn socketcan(interface: &str, address: &str) -> Result<Box<dyn Driver>, OpenError> {
+    Ok(Box::new(crate::socketcan::SocketCan::connect(interface, address)?))
+}
+
+#[cfg(not(target_os = "linux"))]
+fn bitrate_of(_: &str) -> Option<u32> {
+    None
+}
+
+#[cfg(not(target_os = "linux"))]
+fn socketcan(_: &str, address: &str) -> Result<Box<dyn Driver>, OpenError> {
+    let there = "only Linux has them".to_owned();
+    Err(OpenError::NoInterface { address: address.to_owned(), there })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -175,6 +249,14 @@ mod tests {
     #[test]
     fn places_round_trip_and_bad_ones_say_what_would_be_right() {
         for text in [
+            "can0",
+            "vcan3",
+            "socketcan:can0",
+            "socketcan:bus-a",
+            "gs_usb",
+            "gs_usb:",
+            "gs_usb:003F0023",
+            "gs_usb:?termination=on",
             "slcan:/dev/ttyACM0",
             "slcan:COM5@921600",
             "gvret:/dev/ttyUSB0",
@@ -191,6 +273,12 @@ mod tests {
             assert_eq!(text.parse::<Place>().unwrap().to_string(), text);
         }
         for text in [
+            "canal",
+            "socketcan:",
+            "socketcan:/dev/can0",
+            "socketcan:a-name-that-is-too-long",
+            "gs_usb:a b",
+            "gs_usb:?termination=yes",
             "slcan:",
             "slcan:@9600",
             "slcan:COM1@fast",

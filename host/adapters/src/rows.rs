@@ -14,6 +14,10 @@ pub enum Stamps {
         /// What the stamp marks.
         when: &'static str,
     },
+    /// This computer's kernel, when the driver hands over a frame.
+    Kernel,
+    /// The controller, by its own clock, which the driver passes on without its grain, placed in this computer's time by arrivals.
+    Controller,
     /// Another program, which wrote them into the trace.
     Trace,
 }
@@ -25,6 +29,8 @@ pub enum Losses {
     NotReported,
     /// The adapter, as flags: at least one frame each time.
     Flags,
+    /// The kernel exactly, and the controller's driver as far as it notices.
+    Kernel,
     /// The program that wrote the trace, if it did.
     Trace,
 }
@@ -32,6 +38,8 @@ pub enum Losses {
 /// What is known of frames that are sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Confirmation {
+    /// The frame was on the bus.
+    OnTheBus,
     /// The adapter has accepted the frame. Whether it reached the bus is not known.
     Accepted,
     /// It was handed over, and nothing more is known.
@@ -49,6 +57,11 @@ pub enum ListenOnly {
     Unconfirmed,
     /// It cannot: listening is refused, and `--mode normal` allows it to acknowledge.
     Never,
+    /// The interface of this computer decides, whatever this program asks for.
+    Interface {
+        /// It is set to listen only, or has no controller.
+        is_silent: bool,
+    },
     /// It has no part in the bus, or its owner decides.
     Elsewhere,
 }
@@ -75,7 +88,7 @@ pub struct Row {
 }
 
 /// All kinds.
-pub const ROWS: [Row; 7] = [
+pub const ROWS: [Row; 17] = [
     Row {
         board: "slcan",
         what: "an slcan adapter that answers (Lawicel's protocol)",
@@ -146,7 +159,51 @@ pub const ROWS: [Row; 7] = [
         listen_only: ListenOnly::Elsewhere,
         sets_bit_rate: false,
     },
+    interface("socketcan", Stamps::Kernel, Confirmation::OnTheBus, false),
+    interface("socketcan-silent", Stamps::Kernel, Confirmation::CannotSend, true),
+    interface("socketcan-hw", Stamps::Controller, Confirmation::OnTheBus, false),
+    interface("socketcan-hw-silent", Stamps::Controller, Confirmation::CannotSend, true),
+    interface("socketcan-no-echo", Stamps::Kernel, Confirmation::Accepted, false),
+    Row {
+        what: "a CAN interface of Linux without a bit rate, such as a virtual one",
+        errors: "those that other programs write",
+        sets_bit_rate: false,
+        ..interface("socketcan-virtual", Stamps::Kernel, Confirmation::Accepted, true)
+    },
+    gs_usb("gs_usb", true, true),
+    gs_usb("gs_usb-normal", true, false),
+    gs_usb("gs_usb-arrival", false, true),
+    gs_usb("gs_usb-arrival-normal", false, false),
 ];
+
+/// A row of gs_usb adapters.
+const fn gs_usb(board: &'static str, has_stamps: bool, can_listen: bool) -> Row {
+    const CLOCK: Stamps = Stamps::Adapter { grain_ns: 1_000, when: "its firmware's taking the frame" };
+    Row {
+        board,
+        what: if can_listen { "a gs_usb adapter" } else { "a gs_usb adapter that cannot only listen" },
+        stamps: if has_stamps { CLOCK } else { Stamps::Arrival },
+        losses: Losses::Flags,
+        errors: "states, and each error if the adapter reports it",
+        confirmation: Confirmation::OnTheBus,
+        listen_only: if can_listen { ListenOnly::Unconfirmed } else { ListenOnly::Never },
+        sets_bit_rate: true,
+    }
+}
+
+/// A row of Linux's CAN interfaces.
+const fn interface(board: &'static str, stamps: Stamps, confirmation: Confirmation, is_silent: bool) -> Row {
+    Row {
+        board,
+        what: "a CAN interface of Linux",
+        stamps,
+        losses: Losses::Kernel,
+        errors: "states, and each error if the driver reports it (berr-reporting on)",
+        confirmation,
+        listen_only: ListenOnly::Interface { is_silent },
+        sets_bit_rate: true,
+    }
+}
 
 /// The row of the adapter that answers `Hello` with this board's name; `None` for a board of ours.
 pub fn row(board: &str) -> Option<&'static Row> {
@@ -161,6 +218,9 @@ impl Row {
             Losses::Flags => {
                 "losses before this program: the adapter reports that there were some, not how many"
             }
+            Losses::Kernel => {
+                "losses before this program: counted by the kernel, and by the controller's driver as far as it notices"
+            }
             Losses::Trace => "losses before this program: as far as the trace reports them",
         }
     }
@@ -173,6 +233,8 @@ impl fmt::Display for Stamps {
             Self::Adapter { grain_ns, when } => {
                 write!(f, "the adapter's, to {} us, of {when}", f64::from(*grain_ns) / 1e3)
             }
+            Self::Kernel => f.write_str("this computer's kernel's, when the driver hands a frame over"),
+            Self::Controller => f.write_str("the controller's hardware clock's, of unknown grain"),
             Self::Trace => f.write_str("the trace's"),
         }
     }
@@ -181,6 +243,7 @@ impl fmt::Display for Stamps {
 impl fmt::Display for Confirmation {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
+            Self::OnTheBus => "confirmed once a frame was on the bus",
             Self::Accepted => "accepted by the adapter; whether a frame reached the bus is not known",
             Self::HandedOver => "handed over; what became of a frame is not known",
             Self::CannotSend => "nothing can be sent",
@@ -194,6 +257,10 @@ impl fmt::Display for ListenOnly {
             Self::Confirmed => "yes, confirmed by the adapter",
             Self::Unconfirmed => "yes, but not confirmed by the adapter",
             Self::Never => "no: open it with --mode normal, and it acknowledges frames",
+            Self::Interface { is_silent: true } => "yes: the interface acknowledges nothing",
+            Self::Interface { is_silent: false } => {
+                "no: the interface is in normal mode, and acknowledges frames while it is up"
+            }
             Self::Elsewhere => "decided elsewhere: this program has no influence on it",
         })
     }

@@ -4,21 +4,22 @@
 //! but `V`, has `M1` for silent mode in place of `L`, and puts data bytes into remote frames. The lines `e` and `s` with errors and states are
 //! those that Linux reads (`drivers/net/can/slcan/slcan-core.c`).
 
-use std::fmt::Write;
+mod lines;
+
 use std::time::{Duration, Instant};
 
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, Stamp};
 use cantap_wire::{Channel, Frame, Id, Refusal};
 
+use self::lines::{Splitter, Text, hex, line_of, number};
 use crate::adapter_clock::AdapterClock;
-use crate::driver::{At, Driver, Incoming, Oddities, OpenError, Opening};
+use crate::driver::{At, Bytes, Driver, Incoming, Oddities, OpenError, Opening, poll_bytes};
 use crate::line::Line;
 use crate::rows::{Row, row};
+use crate::source::Piece;
 
 /// The speed of a serial line if the address gives none. USB adapters ignore it.
 pub(crate) const DEFAULT_BAUD: u32 = 115_200;
-/// The longest line there is: an extended frame with eight bytes and a stamp is 35 bytes, `V` of CANable a web address.
-const MAX_LINE: usize = 128;
 /// Time limit for an answer.
 const ANSWER_WITHIN: Duration = Duration::from_millis(500);
 /// How long a line must be quiet to be empty.
@@ -32,9 +33,6 @@ const UNANSWERED: Duration = Duration::from_secs(1);
 /// Bit rates of `S0` to `S8` in bit/s (Lawicel).
 const RATES: [u32; 9] = [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000];
 
-const CR: u8 = b'\r';
-const LF: u8 = b'\n';
-const BEL: u8 = 7;
 /// Bits of the flags (Lawicel, `F`).
 const FLAG_FIFO_FULL: u8 = 1 << 0;
 const FLAG_WARNING: u8 = 1 << 2;
@@ -49,53 +47,6 @@ enum Dialect {
     Lawicel { listens: bool },
     /// Nothing.
     Canable,
-}
-
-/// One line, without its end.
-#[derive(Clone, Debug, PartialEq, Eq)]
-enum Text {
-    /// Ended by CR, or by LF as some firmware does.
-    Line(Vec<u8>),
-    /// BEL: refused.
-    Bell,
-    /// More bytes than any line has.
-    TooLong,
-}
-
-/// Splits bytes into lines.
-#[derive(Default)]
-struct Splitter {
-    partial: Vec<u8>,
-    overlong: bool,
-}
-
-impl Splitter {
-    fn push(&mut self, bytes: &[u8], mut take: impl FnMut(Text)) {
-        for &byte in bytes {
-            match byte {
-                CR | LF => {
-                    let line = std::mem::take(&mut self.partial);
-                    match (std::mem::take(&mut self.overlong), byte) {
-                        (true, _) => take(Text::TooLong),
-                        // The LF of CR LF.
-                        (false, LF) if line.is_empty() => {}
-                        (false, _) => take(Text::Line(line)),
-                    }
-                }
-                BEL => {
-                    self.partial.clear();
-                    self.overlong = false;
-                    take(Text::Bell);
-                }
-                _ if self.overlong => {}
-                _ if self.partial.len() == MAX_LINE => {
-                    self.overlong = true;
-                    self.partial.clear();
-                }
-                _ => self.partial.push(byte),
-            }
-        }
-    }
 }
 
 /// A frame that the adapter has been given and has not answered.
@@ -409,6 +360,24 @@ impl Slcan {
     }
 }
 
+impl Bytes for Slcan {
+    fn next(&mut self, wait: Duration) -> Result<Option<Piece<Vec<u8>>>, String> {
+        self.line.next(wait)
+    }
+
+    fn push(&mut self, bytes: &[u8], arrival: Instant) {
+        let mut lines = Vec::new();
+        self.splitter.push(bytes, |text| lines.push(text));
+        for text in lines {
+            self.take(text, arrival);
+        }
+    }
+
+    fn backlog(&mut self) -> &mut Vec<Incoming> {
+        &mut self.backlog
+    }
+}
+
 impl Driver for Slcan {
     fn row(&self) -> &'static Row {
         let board = match self.dialect {
@@ -469,17 +438,7 @@ impl Driver for Slcan {
 
     fn poll(&mut self, wait: Duration, reports: &mut Vec<Incoming>) -> Result<(), String> {
         self.look_after_time();
-        let wait = if self.backlog.is_empty() { wait } else { Duration::ZERO };
-        let next = self.line.next(wait);
-        if let Ok(Some(piece)) = &next {
-            let mut lines = Vec::new();
-            self.splitter.push(&piece.content, |text| lines.push(text));
-            for text in lines {
-                self.take(text, piece.at);
-            }
-        }
-        reports.append(&mut self.backlog);
-        next.map(|_| ())
+        poll_bytes(self, wait, reports)
     }
 
     fn oddities(&self) -> (u32, String) {
@@ -489,36 +448,4 @@ impl Driver for Slcan {
 
 fn is_done(answer: Option<&Text>) -> bool {
     matches!(answer, Some(Text::Line(_)))
-}
-
-/// A decimal number; 0 if it is none.
-fn number(digits: &[u8]) -> u16 {
-    std::str::from_utf8(digits).ok().and_then(|digits| digits.parse().ok()).unwrap_or(0)
-}
-
-/// The number that hexadecimal digits say.
-fn hex(digits: &[u8]) -> Option<u32> {
-    if digits.is_empty() || digits.len() > 8 {
-        return None;
-    }
-    digits.iter().try_fold(0, |value: u32, digit| Some(value << 4 | char::from(*digit).to_digit(16)?))
-}
-
-/// A frame as a command.
-fn line_of(frame: &Frame) -> Vec<u8> {
-    let id = frame.id();
-    let kind = match (id.is_extended(), frame.is_remote()) {
-        (false, false) => 't',
-        (true, false) => 'T',
-        (false, true) => 'r',
-        (true, true) => 'R',
-    };
-    let width = if id.is_extended() { 8 } else { 3 };
-    let mut line = format!("{kind}{:0width$X}{:X}", id.raw(), frame.dlc().min(8));
-    for byte in frame.data() {
-        // Writing to a text cannot fail.
-        let _ = write!(line, "{byte:02X}");
-    }
-    line.push('\r');
-    line.into_bytes()
 }

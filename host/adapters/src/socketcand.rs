@@ -10,9 +10,10 @@ use cantap_wire::record::LossStage;
 use cantap_wire::{Channel, Frame, Id, Refusal};
 
 use crate::adapter_clock::AdapterClock;
-use crate::driver::{At, Driver, Incoming, Oddities, OpenError, Opening};
+use crate::driver::{At, Bytes, Driver, Incoming, Oddities, OpenError, Opening, poll_bytes};
 use crate::line::Line;
 use crate::rows::{Row, row};
+use crate::source::Piece;
 
 /// socketcand's TCP port.
 pub(crate) const PORT: u16 = 29_536;
@@ -157,6 +158,22 @@ fn frame<'a>(mut fields: impl Iterator<Item = &'a str>) -> Option<(Frame, u64)> 
     Some((Frame::data_frame(id, &data?)?, time_us))
 }
 
+impl Bytes for Socketcand {
+    fn next(&mut self, wait: Duration) -> Result<Option<Piece<Vec<u8>>>, String> {
+        self.line.next(wait)
+    }
+
+    fn push(&mut self, bytes: &[u8], arrival: Instant) {
+        for message in self.split(bytes, arrival) {
+            self.take(&message, arrival);
+        }
+    }
+
+    fn backlog(&mut self) -> &mut Vec<Incoming> {
+        &mut self.backlog
+    }
+}
+
 impl Driver for Socketcand {
     fn row(&self) -> &'static Row {
         row("socketcand").unwrap_or(&crate::ROWS[0])
@@ -192,15 +209,7 @@ impl Driver for Socketcand {
     }
 
     fn poll(&mut self, wait: Duration, reports: &mut Vec<Incoming>) -> Result<(), String> {
-        let wait = if self.backlog.is_empty() { wait } else { Duration::ZERO };
-        let next = self.line.next(wait);
-        if let Ok(Some(piece)) = &next {
-            for message in self.split(&piece.content, piece.at) {
-                self.take(&message, piece.at);
-            }
-        }
-        reports.append(&mut self.backlog);
-        next.map(|_| ())
+        poll_bytes(self, wait, reports)
     }
 
     fn oddities(&self) -> (u32, String) {

@@ -93,33 +93,16 @@ impl TracePipe {
             Ok(time_ns) => self.clock.place(time_ns, arrival),
             Err(_) => At::arrival(arrival),
         };
-        match record.event {
-            TraceEvent::Frame { frame, .. } => {
-                if let Some(frame) = frame.classic() {
-                    reports.push(Incoming::Received { channel, frame: *frame, at });
-                } else {
-                    self.oddities.count("CAN FD frames, which do not fit the device's protocol");
-                    let stage = LossStage::Link;
-                    reports.push(Incoming::Lost { channel, stage, count: 1, at_least: false, at });
-                }
+        match (Incoming::of(&record.event, channel, at), &record.event) {
+            (Some(incoming), _) => reports.push(incoming),
+            (None, TraceEvent::TransmitFailed { .. }) => {
+                self.oddities.count("transmissions that failed elsewhere");
             }
-            TraceEvent::BusError { kind: Some(kind), .. } => {
-                reports.push(Incoming::BusError { channel, kind, at });
+            (None, _) => {
+                self.oddities.count("CAN FD frames, which do not fit the device's protocol");
+                let stage = LossStage::Link;
+                reports.push(Incoming::Lost { channel, stage, count: 1, at_least: false, at });
             }
-            TraceEvent::BusError { kind: None, .. } => {
-                reports.push(Incoming::BusErrors { channel, count: 1, at });
-            }
-            TraceEvent::ErrorsSuppressed { count } => {
-                reports.push(Incoming::BusErrors { channel, count, at });
-            }
-            TraceEvent::State { state, counters } => {
-                reports.push(Incoming::State { channel, state, counters: counters.unwrap_or((0, 0)), at });
-            }
-            TraceEvent::Lost { stage, count, at_least } => {
-                let stage = stage.unwrap_or(LossStage::Link);
-                reports.push(Incoming::Lost { channel, stage, count, at_least, at });
-            }
-            TraceEvent::TransmitFailed { .. } => self.oddities.count("transmissions that failed elsewhere"),
         }
     }
 }

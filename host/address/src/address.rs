@@ -1,5 +1,5 @@
 //! Where a device is: `/dev/ttyACM0`, `COM5`, `virtual:load=50`, `emu:firmware.elf`; at a server: `unix:`, `tcp://HOST`; another
-//! maker's adapter: `slcan:PORT`, `socketcand://HOST/can0`.
+//! maker's adapter: `can0`, `slcan:PORT`, `socketcand://HOST/can0`.
 
 use std::borrow::Borrow;
 use std::fmt;
@@ -196,6 +196,11 @@ impl Address {
         matches!(&self.place, Place::Virtual(options) if options.car)
     }
 
+    /// Whether the bit rate of a bus there is set by somebody else: a simulated vehicle, or a CAN interface's owner.
+    pub fn has_bit_rate(&self) -> bool {
+        self.is_car() || matches!(&self.place, Place::Adapter(adapter) if adapter.bitrate().is_some())
+    }
+
     /// Whether a device there can go and come back; one inside this process cannot.
     pub const fn may_come_back(&self) -> bool {
         matches!(self.place, Place::Serial | Place::Server(_))
@@ -206,7 +211,7 @@ impl Address {
     /// whatever is at the address.
     pub fn open_again(&self, serial_number: Option<&str>) -> Result<OpenDevice, LinkError> {
         let device = Device::over(self.link(serial_number)?, &self.text)?;
-        Ok(OpenDevice { device, bitrates: self.bitrates_of_buses() })
+        Ok(OpenDevice { device, address: self.clone(), bitrates: self.bitrates_of_buses() })
     }
 
     /// Begins a session with the device.
@@ -246,6 +251,7 @@ impl Address {
         match &self.place {
             Place::Virtual(options) => Channel::ALL
                 .map(|channel| options.bitrate_of_bus(channel.index()).or(Some(VIRTUAL_BITRATE_BPS))),
+            Place::Adapter(adapter) => [adapter.bitrate(), None],
             _ => [None; CHANNELS],
         }
     }
@@ -277,6 +283,7 @@ impl fmt::Display for Address {
 /// A device in a session, with what only its address says about it.
 pub struct OpenDevice {
     device: Device,
+    address: Address,
     /// Its buses' bit rates in bit/s, if known.
     bitrates: [Option<u32>; CHANNELS],
 }
@@ -285,6 +292,14 @@ impl OpenDevice {
     /// The bit rate of a channel's bus in bit/s, if it is known without listening.
     pub const fn bitrate_of_bus(&self, channel: Channel) -> Option<u32> {
         self.bitrates[channel.index()]
+    }
+
+    /// Why a channel cannot be opened at a bit rate: the device's owner has set another one, which is not changed without being asked.
+    pub fn rate_conflict(&self, bitrate_bps: u32) -> Option<String> {
+        match &self.address.place {
+            Place::Adapter(adapter) => adapter.rate_conflict(bitrate_bps),
+            _ => None,
+        }
     }
 }
 
@@ -316,6 +331,8 @@ mod tests {
             "tcp://[::1]:5",
             "ssh://a@b/virtual:car",
             "slcan:COM3",
+            "can0",
+            "socketcan:bus7",
         ] {
             assert_eq!(text.parse::<Address>().unwrap().to_string(), text);
         }
@@ -348,6 +365,9 @@ mod tests {
             ("COM5", true),
             ("slcan:/dev/ttyACM0", true),
             ("candump:-", true),
+            ("vcan0", true),
+            ("socketcan:can0", true),
+            ("can0.log", false),
             ("/dev/ttyACM17", true),
             ("tcp://bench:4000", true),
             ("drive.log", false),

@@ -196,6 +196,10 @@ impl ChannelOptions {
                 ),
             },
         };
+        let bitrate_bps = base.timing.bitrate_bps(device.hello().can_clock_hz);
+        if let Some(reason) = device.rate_conflict(bitrate_bps) {
+            bail!("{reason}");
+        }
         let config = ChannelConfig {
             mode: self.mode.or(mode).unwrap_or(base.mode),
             one_shot: base.one_shot || self.one_shot,

@@ -6,7 +6,7 @@
 
 # shellcheck source=/dev/null
 . /share/settings
-ALL_PARTS="enumeration captures stalls slcan slcan_reports bridge serve disturbances chapter9 suspend hub modem_manager xhci"
+ALL_PARTS="enumeration captures stalls slcan slcan_reports socketcan gs_usb bridge serve disturbances chapter9 suspend hub modem_manager xhci"
 for part in ${PARTS:-$ALL_PARTS}; do
   echo "--- $part, at $(uptime_s) s"
   # shellcheck source=/dev/null # whichever it is

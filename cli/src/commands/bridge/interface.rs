@@ -1,21 +1,14 @@
 //! A Linux CAN interface, through a raw socket: many frames with each system call.
 
-use std::io::{self, IoSlice, IoSliceMut};
-use std::os::fd::{AsFd, AsRawFd, BorrowedFd};
+use std::io;
+use std::os::fd::{AsFd, BorrowedFd};
 use std::path::Path;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use nix::errno::Errno;
-use nix::sys::socket::{
-    ControlMessageOwned, MsgFlags, MultiHeaders, recvmmsg, sendmmsg, setsockopt, sockopt,
-};
-use socketcan::{CanSocket, Socket, SocketOptions};
+use cantap_adapters::raw_can::{Options, RawFrame, RawSocket};
+use nix::libc::{EAGAIN, ENETDOWN, ENOBUFS};
 
-use super::frames::RawFrame;
-
-/// Frames per system call.
-pub const BATCH: usize = 64;
 /// How often a full socket is retried, a millisecond apart.
 const TRIES: u32 = 200;
 /// Where the kernel describes its network interfaces.
@@ -41,7 +34,7 @@ pub trait Port: Send + Sync {
 }
 
 /// An open interface.
-pub struct CanPort(CanSocket);
+pub struct CanPort(RawSocket);
 
 /// What is known of an interface before it is opened.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -54,18 +47,9 @@ impl CanPort {
     /// Opens an interface, which must be virtual, and up. The error contains the command for that.
     pub fn open(name: &str) -> anyhow::Result<(Self, Known)> {
         let known = look(Path::new(NETWORK), name)?;
-        let opened = || -> io::Result<CanSocket> {
-            let socket = CanSocket::open(name)?;
-            // Errors on this interface would be our own.
-            socket.set_error_filter_drop_all()?;
-            socket.set_loopback(true)?;
-            socket.set_recv_own_msgs(false)?;
-            setsockopt(&socket, sockopt::RxqOvfl, &1)?;
-            Ok(socket)
-        };
-        let socket = opened().with_context(|| format!("the interface '{name}' cannot be opened"))?;
-        // As much as any user may have: what programs write waits here while the bus is busy.
-        let _ = setsockopt(&socket, sockopt::RcvBuf, &(8 << 20));
+        // Errors on this interface would be our own.
+        let socket = RawSocket::open(name, Options::default())
+            .with_context(|| format!("the interface '{name}' cannot be opened"))?;
         Ok((Self(socket), known))
     }
 }
@@ -107,63 +91,32 @@ fn look(network: &Path, name: &str) -> anyhow::Result<Known> {
 
 impl Port for CanPort {
     fn receive(&self, most: usize, frames: &mut Vec<RawFrame>) -> io::Result<u32> {
-        let mut headers = MultiHeaders::<()>::preallocate(most.min(BATCH), Some(nix::cmsg_space!(u32)));
-        let mut buffers = vec![[0; 16]; most.min(BATCH)];
-        let mut lens = Vec::with_capacity(buffers.len());
-        let mut thrown_away = 0;
-        {
-            let mut slices: Vec<[IoSliceMut<'_>; 1]> =
-                buffers.iter_mut().map(|buffer| [IoSliceMut::new(buffer)]).collect();
-            let taken =
-                recvmmsg(self.0.as_raw_fd(), &mut headers, slices.iter_mut(), MsgFlags::MSG_DONTWAIT, None);
-            match taken {
-                Ok(messages) => {
-                    for message in messages {
-                        lens.push(message.bytes);
-                        for control in message.cmsgs().into_iter().flatten() {
-                            if let ControlMessageOwned::RxqOvfl(count) = control {
-                                thrown_away = count;
-                            }
-                        }
-                    }
-                }
-                // An interface that is down may come up again.
-                Err(Errno::EAGAIN | Errno::EINTR | Errno::ENETDOWN) => {}
-                Err(error) => return Err(error.into()),
-            }
+        let mut messages = Vec::new();
+        match self.0.receive(most, &mut messages) {
+            // An interface that is down may come up again.
+            Err(error) if error.raw_os_error() != Some(ENETDOWN) => return Err(error),
+            _ => {}
         }
-        let whole = buffers.iter().zip(lens).filter(|(_, len)| *len == size_of::<RawFrame>());
-        frames.extend(whole.map(|(buffer, _)| *buffer));
-        Ok(thrown_away)
+        frames.extend(messages.iter().filter_map(|message| RawFrame::try_from(message.bytes()).ok()));
+        Ok(messages.iter().rev().find_map(|message| message.dropped).unwrap_or(0))
     }
 
     fn send(&self, frames: &[RawFrame]) -> io::Result<usize> {
-        let mut headers = MultiHeaders::<()>::preallocate(BATCH, None);
         let mut sent = 0;
         let mut tries = 0;
         while sent < frames.len() {
-            let rest = &frames[sent..frames.len().min(sent + BATCH)];
-            let slices: Vec<[IoSlice<'_>; 1]> = rest.iter().map(|frame| [IoSlice::new(frame)]).collect();
-            let taken = sendmmsg(
-                self.0.as_raw_fd(),
-                &mut headers,
-                slices.iter(),
-                [None; BATCH],
-                [],
-                MsgFlags::MSG_DONTWAIT,
-            );
-            match taken.map(Iterator::count) {
+            match self.0.send(&frames[sent..]) {
                 Ok(count) => {
                     sent += count;
                     tries = 0;
                 }
-                Err(Errno::EINTR) => {}
-                Err(Errno::EAGAIN | Errno::ENOBUFS) if tries < TRIES => {
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) if matches!(error.raw_os_error(), Some(EAGAIN | ENOBUFS)) && tries < TRIES => {
                     tries += 1;
                     std::thread::sleep(Duration::from_millis(1));
                 }
                 Err(_) if sent > 0 => return Ok(sent),
-                Err(error) => return Err(error.into()),
+                Err(error) => return Err(error),
             }
         }
         Ok(sent)

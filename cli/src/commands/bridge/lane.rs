@@ -9,8 +9,8 @@ use cantap::device::channel_number;
 use cantap::wire::record::{LossStage, TransmitFailure};
 use cantap::wire::{Channel, Frame};
 use cantap::{Direction, TraceEvent, TraceRecord};
+use cantap_adapters::raw_can::{RawFrame, frame_of, raw_error, raw_frame};
 
-use super::frames::{RawFrame, frame_of, raw_error, raw_frame};
 use super::interface::{Known, Port};
 use crate::stderr;
 

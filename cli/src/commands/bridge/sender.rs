@@ -13,11 +13,10 @@ use cantap::transmit::Stream;
 use cantap::wire::Frame;
 use cantap::wire::message::Mode;
 use cantap::{Device, DeviceError};
+use cantap_adapters::raw_can::{BATCH, RawFrame, frame_of};
 use cantap_address::OpenDevice;
 use rustix::event::{PollFd, PollFlags, poll};
 
-use super::frames::{RawFrame, frame_of};
-use super::interface::BATCH;
 use super::lane::Lane;
 use crate::stderr;
 use cantap_work::advice;

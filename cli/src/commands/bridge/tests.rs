@@ -12,10 +12,10 @@ use cantap::device::Records;
 use cantap::wire::message::{ChannelConfig, Mode, TxFrame};
 use cantap::wire::record::{LossStage, TransmitFailure};
 use cantap::{Channel, TraceEvent, TraceRecord};
+use cantap_adapters::raw_can::{RawFrame, frame_of, raw_frame};
 use cantap_address::{Address, OpenDevice};
 use cantap_trace::socketcan::{ERROR_FLAG, ErrorFrame};
 
-use super::frames::{RawFrame, frame_of, raw_frame};
 use super::interface::{Known, Port};
 use super::lane::Lane;
 use super::places;

@@ -1,8 +1,8 @@
-//! What crosses a raw CAN socket, Linux's 16-byte `struct can_frame` (`linux/can.h`), and its meaning here.
+//! Linux's `struct can_frame` and `struct canfd_frame` (`linux/can.h`), and their meaning here.
 
-use cantap::TraceEvent;
-use cantap::wire::{Frame, Id};
+use cantap_trace::TraceEvent;
 use cantap_trace::socketcan::{ERROR_FLAG, ErrorFrame};
+use cantap_wire::{Frame, Id};
 
 /// The identifier with its flags in the machine's byte order, the length, two unused bytes, the DLC where it is above 8, the data.
 pub type RawFrame = [u8; 16];
@@ -61,7 +61,8 @@ pub fn frame_of(raw: &RawFrame) -> Option<Frame> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cantap::wire::record::{ErrorState, LossStage};
+    use cantap_trace::{Direction, TraceFrame};
+    use cantap_wire::record::{ErrorState, LossStage};
 
     fn bytes(id: u32, rest: [u8; 12]) -> RawFrame {
         let mut raw = [0; 16];
@@ -113,8 +114,8 @@ mod tests {
             let data = std::array::from_fn(|at| raw[8 + at]);
             assert_eq!(ErrorFrame { classes: id & !ERROR_FLAG, data }.events(), (event, None));
         }
-        let frame = cantap::TraceFrame::from("123#".parse::<Frame>().unwrap());
-        let heard = TraceEvent::Frame { frame, direction: cantap::Direction::Rx, late: false };
-        assert_eq!(raw_error(&heard), None);
+        let frame = TraceFrame::from("123#".parse::<Frame>().unwrap());
+        let received = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
+        assert_eq!(raw_error(&received), None);
     }
 }

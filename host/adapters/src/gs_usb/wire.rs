@@ -1,0 +1,250 @@
+//! What crosses USB: Linux's `drivers/net/can/usb/gs_usb.c` and candleLight's `include/gs_usb.h`. Numbers have the lowest byte first.
+
+use std::cmp::Reverse;
+use std::ops::RangeInclusive;
+
+use cantap_trace::socketcan::{ERROR_FLAG, ErrorFrame};
+use cantap_wire::record::ErrorState;
+use cantap_wire::{BitTiming, Frame, Id};
+
+/// Vendor requests to the interface.
+pub(super) mod request {
+    pub const HOST_FORMAT: u8 = 0;
+    pub const BIT_TIMING: u8 = 1;
+    pub const MODE: u8 = 2;
+    pub const CONSTANTS: u8 = 4;
+    pub const DEVICE_CONFIG: u8 = 5;
+    pub const IDENTIFY: u8 = 7;
+    pub const SET_TERMINATION: u8 = 12;
+    pub const STATE: u8 = 14;
+}
+
+/// What a channel can do. The same bits switch most of it on with [`request::MODE`].
+pub(super) mod feature {
+    pub const LISTEN_ONLY: u32 = 1 << 0;
+    pub const STAMPS: u32 = 1 << 4;
+    pub const IDENTIFY: u32 = 1 << 5;
+    /// A transfer must not end with a packet of a certain length: one byte is added (an erratum of LPC546xx).
+    pub const LPC546XX: u32 = 1 << 9;
+    pub const TERMINATION: u32 = 1 << 11;
+    pub const BUS_ERRORS: u32 = 1 << 12;
+    pub const STATE: u32 = 1 << 13;
+}
+
+/// With this number the adapter learns in which order the host sends bytes; most ignore it.
+pub(super) const HOST_FORMAT: [u8; 4] = 0x0000_BEEF_u32.to_le_bytes();
+/// The echo's number of a frame that was received.
+pub(super) const RECEIVED: u32 = u32::MAX;
+
+const FLAG_OVERFLOW: u8 = 1;
+const FLAG_FD: u8 = 2;
+const EXTENDED: u32 = 1 << 31;
+const REMOTE: u32 = 1 << 30;
+/// Bytes before the data.
+const HEADER: usize = 12;
+
+/// Numbers of 32 bits.
+pub(super) fn words(words: &[u32]) -> Vec<u8> {
+    words.iter().flat_map(|word| word.to_le_bytes()).collect()
+}
+
+fn word(bytes: &[u8], index: usize) -> Option<u32> {
+    bytes.get(4 * index..)?.first_chunk().map(|bytes| u32::from_le_bytes(*bytes))
+}
+
+/// The answer to [`request::DEVICE_CONFIG`]: the number of channels, and the firmware's version.
+pub(super) fn device(bytes: &[u8]) -> Option<(u16, u32)> {
+    Some((u16::from(*bytes.get(3)?) + 1, word(bytes, 1)?))
+}
+
+/// The answer to [`request::CONSTANTS`].
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Constants {
+    pub features: u32,
+    clock_hz: u32,
+    segment1: RangeInclusive<u32>,
+    segment2: RangeInclusive<u32>,
+    jump_width_max: u32,
+    prescaler: RangeInclusive<u32>,
+    prescaler_step: u32,
+}
+
+impl Constants {
+    pub fn parse(bytes: &[u8]) -> Option<Self> {
+        let word = |index| word(bytes, index);
+        Some(Self {
+            features: word(0)?,
+            clock_hz: word(1)?,
+            segment1: word(2)?..=word(3)?,
+            segment2: word(4)?..=word(5)?,
+            jump_width_max: word(6)?,
+            prescaler: word(7)?..=word(8)?,
+            prescaler_step: word(9)?,
+        })
+    }
+
+    pub const fn has(&self, feature: u32) -> bool {
+        self.features & feature != 0
+    }
+
+    /// The request's data for a bit rate; `None` if this channel's clock cannot be divided to it. A sample point within what is possible.
+    pub fn timing(&self, bitrate_bps: u32, sample_point_permille: u32) -> Option<Vec<u8>> {
+        let fits = |timing: &BitTiming| {
+            let prescaler = u32::from(timing.prescaler);
+            self.prescaler.contains(&prescaler)
+                && (prescaler - self.prescaler.start()).is_multiple_of(self.prescaler_step.max(1))
+                && self.segment1.contains(&u32::from(timing.segment1))
+                && self.segment2.contains(&u32::from(timing.segment2))
+        };
+        let best = BitTiming::all(self.clock_hz, bitrate_bps).filter(fits).min_by_key(|timing| {
+            let off = timing.sample_point_permille().abs_diff(sample_point_permille);
+            (off, Reverse(timing.quanta()))
+        })?;
+        let (segment1, segment2) = (u32::from(best.segment1), u32::from(best.segment2));
+        // The propagation segment is only a part of the first, and the adapter adds them up; neither may be 0.
+        let propagation = segment1 / 2;
+        let jump_width = (best.quanta() / 8).clamp(1, self.jump_width_max.min(segment2).max(1));
+        Some(words(&[propagation, segment1 - propagation, segment2, jump_width, u32::from(best.prescaler)]))
+    }
+}
+
+/// The answer to [`request::STATE`]: the state, if the channel is started, and the transmit and the receive error counter.
+pub(super) fn state(bytes: &[u8]) -> Option<(Option<ErrorState>, (u8, u8))> {
+    let counter = |index| word(bytes, index).map(|count| count.min(255) as u8);
+    let state = match word(bytes, 0)? {
+        0 => Some(ErrorState::Active),
+        1 => Some(ErrorState::Warning),
+        2 => Some(ErrorState::Passive),
+        3 => Some(ErrorState::BusOff),
+        _ => None,
+    };
+    Some((state, (counter(2)?, counter(1)?)))
+}
+
+/// What a transfer contains.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Content {
+    Frame(Frame),
+    Error(ErrorFrame),
+    Fd,
+    /// An identifier or a length that no frame has.
+    Impossible,
+}
+
+/// A transfer from the adapter.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Transfer {
+    pub echo: u32,
+    pub channel: u8,
+    /// Frames before it are missing.
+    pub overflow: bool,
+    pub stamp_us: Option<u32>,
+    pub content: Content,
+}
+
+/// Reads a transfer; `None` if it is too short for what it says to contain. `stamps`: they were asked for.
+pub(super) fn transfer(bytes: &[u8], stamps: bool) -> Option<Transfer> {
+    let (echo, id) = (word(bytes, 0)?, word(bytes, 1)?);
+    let &[dlc, channel, flags, _] = bytes.get(8..HEADER)? else { return None };
+    let is_fd = flags & FLAG_FD != 0;
+    let data_len = if is_fd { 64 } else { 8 };
+    let data = bytes.get(HEADER..HEADER + data_len)?;
+    let stamp = bytes.get(HEADER + data_len..).and_then(|rest| word(rest, 0));
+    let mut eight = [0; 8];
+    eight.copy_from_slice(&data[..8]);
+    let content = if is_fd {
+        Content::Fd
+    } else if id & ERROR_FLAG != 0 {
+        Content::Error(ErrorFrame { classes: id & (ERROR_FLAG - 1), data: eight })
+    } else {
+        let raw = id & !(EXTENDED | REMOTE);
+        let id_of = if id & EXTENDED != 0 { Id::extended(raw) } else { Id::standard(raw) };
+        match id_of {
+            Some(id_of) if dlc < 16 => Content::Frame(Frame::from_bus(id_of, id & REMOTE != 0, dlc, eight)),
+            _ => Content::Impossible,
+        }
+    };
+    let overflow = flags & FLAG_OVERFLOW != 0;
+    Some(Transfer { echo, channel, overflow, stamp_us: stamp.filter(|_| stamps), content })
+}
+
+/// A frame to be sent, whose echo will have this number.
+pub(super) fn frame(frame: &Frame, channel: u8, echo: u32) -> Vec<u8> {
+    let id = frame.id();
+    let raw = id.raw() | u32::from(id.is_extended()) << 31 | u32::from(frame.is_remote()) << 30;
+    let mut bytes = words(&[echo, raw]);
+    bytes.extend_from_slice(&[frame.dlc(), channel, 0, 0]);
+    bytes.extend_from_slice(&frame.padded_data());
+    bytes
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+
+    /// candleLight's bxCAN at 48 MHz (`can_btconst` of `src/can/bxcan.c`).
+    pub fn constants(features: u32) -> Vec<u8> {
+        words(&[features, 48_000_000, 1, 16, 1, 8, 4, 1, 1024, 1])
+    }
+
+    #[test]
+    fn a_bit_rate_is_reached_within_the_adapter_s_limits() {
+        let can = Constants::parse(&constants(0)).unwrap();
+        // 48 MHz by 6 is 16 quanta: 1 + 13 + 2, sampled at 87.5 %.
+        assert_eq!(can.timing(500_000, 875), Some(words(&[6, 7, 2, 2, 6])));
+        assert_eq!(can.timing(700_000, 875), None);
+        // One whose prescalers are even, and whose segments are shorter.
+        let narrow = words(&[0, 48_000_000, 1, 8, 1, 4, 1, 2, 64, 2]);
+        let narrow = Constants::parse(&narrow).unwrap();
+        let timing = narrow.timing(500_000, 875).unwrap();
+        let word = |index| word(&timing, index).unwrap();
+        let (segment1, prescaler) = (word(0) + word(1), word(4));
+        assert_eq!(48_000_000 / prescaler / (1 + segment1 + word(2)), 500_000);
+        assert!(prescaler % 2 == 0 && segment1 <= 8 && word(2) <= 4 && word(3) == 1);
+        assert_eq!(Constants::parse(&constants(0)[..39]), None);
+    }
+
+    #[test]
+    fn transfers_have_stamps_only_where_they_were_asked_for() {
+        let mut bytes = words(&[RECEIVED, 0x9ABC_DEF0]);
+        bytes.extend_from_slice(&[3, 1, FLAG_OVERFLOW, 0, 1, 2, 3, 0, 0, 0, 0, 0]);
+        bytes.extend(words(&[77]));
+        let frame = Content::Frame("1ABCDEF0#010203".parse().unwrap());
+        let wanted =
+            Transfer { echo: RECEIVED, channel: 1, overflow: true, stamp_us: Some(77), content: frame };
+        assert_eq!(transfer(&bytes, true), Some(wanted));
+        assert_eq!(transfer(&bytes, false), Some(Transfer { stamp_us: None, ..wanted }));
+        for cut in 0..20 {
+            assert_eq!(transfer(&bytes[..cut], true), None, "{cut}");
+        }
+        // A length that nothing has, an identifier that is too large, and CAN FD in as many bytes as a classic frame.
+        let content = |at: usize, byte: u8| {
+            let mut bytes = bytes.clone();
+            bytes[at] = byte;
+            transfer(&bytes, true).map(|transfer| transfer.content)
+        };
+        assert_eq!(content(8, 16), Some(Content::Impossible));
+        assert_eq!(content(7, 0x1A), Some(Content::Impossible));
+        assert_eq!(content(10, FLAG_FD), None);
+    }
+
+    #[test]
+    fn a_frame_to_be_sent_comes_back_as_it_was() {
+        for text in ["123#1122", "1ABCDEF0#R4", "000#"] {
+            let sent: Frame = text.parse().unwrap();
+            let bytes = frame(&sent, 1, 2);
+            let back = transfer(&bytes, true).unwrap();
+            assert_eq!((back.echo, back.channel, back.content), (2, 1, Content::Frame(sent)));
+        }
+    }
+
+    proptest::proptest! {
+        #[test]
+        fn any_bytes_are_a_transfer_or_refused(bytes in proptest::collection::vec(0_u8.., 0..90), stamps: bool) {
+            let _ = (transfer(&bytes, stamps), device(&bytes), state(&bytes));
+            if let Some(constants) = Constants::parse(&bytes) {
+                let _ = constants.timing(500_000, 875);
+            }
+        }
+    }
+}

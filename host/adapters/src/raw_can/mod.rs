@@ -1,0 +1,11 @@
+//! Raw CAN sockets of Linux: what crosses them, and, on Linux itself, the socket with what it says about each message.
+
+mod frame;
+#[cfg(target_os = "linux")]
+mod socket;
+
+pub use frame::{RawFrame, frame_of, raw_error, raw_frame};
+#[cfg(target_os = "linux")]
+pub(crate) use socket::FD_BYTES;
+#[cfg(target_os = "linux")]
+pub use socket::{BATCH, Message, Options, RawSocket};

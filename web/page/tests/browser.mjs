@@ -22,6 +22,8 @@ export async function quit() {
 /** A page; whatever it writes as an error, and each request that leaves it, fails the test in `done`. */
 export async function newPage({ file = FAKE, hash = '', theme = 'dark', size = { width: 1440, height: 900 }, before } = {}) {
   const context = await (await launch()).newContext({ viewport: size, colorScheme: theme, acceptDownloads: true });
+  // A limit that only a fault reaches, on a busy machine, too.
+  context.setDefaultTimeout(60_000);
   const page = await context.newPage();
   const faults = [];
   page.on('pageerror', (error) => faults.push(`error: ${error.message}`));
@@ -64,7 +66,7 @@ export async function show(page, view) {
 /** Waits until a function in the page answers true; what it saw last is in the error. */
 export async function until(page, about, fn, argument) {
   try {
-    await page.waitForFunction(fn, argument, { timeout: 15_000 });
+    await page.waitForFunction(fn, argument, { timeout: 60_000 });
   } catch {
     throw new Error(`waited in vain until ${about}`);
   }

@@ -128,6 +128,8 @@ test('bits: changes are counted, a signal is made of them, and its DBC is read a
 
 test('conversations: a refused UDS request is marked as failed', async () => {
   const page = await opened('conversations');
+  await page.keyboard.press('/');
+  await page.keyboard.type('refusal F190');
   await until(page, 'a failed exchange', () => document.querySelectorAll('#view-conversations .list:not([hidden]) .list-row.failed:not([hidden])').length >= 1);
   await page.done();
 });

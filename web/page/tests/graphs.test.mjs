@@ -136,6 +136,20 @@ test('what is saved is well-formed: PNG by its signature, SVG by a parser, CSV b
   await page.done();
 });
 
+test('signals of different units in one graph have a scale each', async () => {
+  const page = await withGraphs('Speed', 'Temperature');
+  await page.getByRole('button', { name: /^Join Engine.Temperature/ }).click();
+  await until(page, 'one graph', () => document.querySelectorAll('.panel').length === 1);
+  const svg = (await saved(page, () => page.getByRole('button', { name: 'SVG' }).click())).bytes.toString();
+  const spread = [...svg.matchAll(/<path d="(M[^"]{1000,})"/g)].map((m) => {
+    const ys = [...m[1].matchAll(/[ML][\d.]+ ([\d.]+)/g)].map((p) => Number(p[1]));
+    return Math.max(...ys) - Math.min(...ys);
+  });
+  assert.equal(spread.length, 2);
+  assert.ok(Math.abs(spread[0] - spread[1]) < 1, `both fill the height: ${spread}`);
+  await page.done();
+});
+
 test('a message of the tree is closed and opened again', async () => {
   const page = await opened('graphs');
   const engine = page.locator('.tree-message', { hasText: 'Engine' });

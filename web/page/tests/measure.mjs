@@ -51,7 +51,9 @@ await page.locator('#view-trace .list-layer .list-row:not(.pending)').first().wa
 await run('scrolling by the wheel', '#view-trace .list', `document.querySelector('#view-trace .list').dispatchEvent(new WheelEvent('wheel', { deltaY: 240, bubbles: true, cancelable: true }))`);
 await run('dragging the scroll bar', '#view-trace .list', `const l = document.querySelector('#view-trace .list'); l.scrollTop = (i % 100) / 100 * l.scrollHeight`);
 await show(page, 'graphs');
-const signals = page.locator('#view-graphs .tree-signal');
+const closed = page.locator('#view-graphs .tree-message[aria-expanded=false]');
+for (let i = 0; i < 20 && (await closed.count()) > 0; i++) await closed.first().click();
+const signals = page.locator('#view-graphs .tree-signal:has(.sparkline)');
 for (let i = 0; i < Math.min(20, await signals.count()); i++) await signals.nth(i).click();
 await page.waitForFunction(() => document.querySelector('#view-graphs').dataset.busy === 'false', undefined, { timeout: 600_000 });
 const wheel = (x, options) => `const c = document.querySelector('.time-axis'); const b = c.getBoundingClientRect(); c.dispatchEvent(new WheelEvent('wheel', { clientX: b.left + b.width * ${x}, bubbles: true, cancelable: true, ${options} }))`;

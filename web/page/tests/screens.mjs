@@ -10,7 +10,9 @@ if (!file || !folder || files.length === 0) {
   console.error('usage: node tests/screens.mjs PAGE.html FOLDER TRACE [DATABASE …]');
   process.exit(2);
 }
-const SIGNALS = 4;
+/** Of `host/virtual/src/car/car.dbc`, the database of `docs/screens/drive.log.xz`. */
+const SIGNALS = ['EngineSpeed', 'VehicleSpeed', 'CurrentGear', 'AcceleratorPedal'];
+const IDENTIFIER = '0C0';
 
 for (const theme of ['dark', 'light']) {
   const page = await newPage({ file, theme, size: { width: 1200, height: 750 } });
@@ -20,14 +22,26 @@ for (const theme of ['dark', 'light']) {
     await show(page, view);
     if (view === 'trace') {
       await page.locator('#view-trace .list').press('End');
-      await page.locator('#view-trace .details dl').waitFor();
+      await page.locator('#trace-find').fill(IDENTIFIER);
+      await page.locator('#trace-find').press('Shift+Enter');
+      await page.locator('#view-trace .details .signals').waitFor();
     }
     if (view === 'graphs') {
-      const signals = page.locator('#view-graphs .tree-signal');
-      for (let i = 0; i < Math.min(SIGNALS, await signals.count()); i++) await signals.nth(i).click();
+      const search = page.getByRole('searchbox', { name: 'Search messages and signals' });
+      for (const name of SIGNALS) {
+        await search.fill(name);
+        await page.locator('#view-graphs .tree-signal').first().click();
+      }
+      await search.fill('ECM');
       await page.waitForFunction(() => document.querySelector('#view-graphs').dataset.busy === 'false');
     }
-    if (view === 'bits') await page.locator('.bit').first().waitFor();
+    if (view === 'bits') {
+      await page.locator('#view-bits .bit').first().waitFor();
+      const option = page.locator('#view-bits select option', { hasText: ` ${IDENTIFIER} ` });
+      await page.locator('#view-bits select').first().selectOption(await option.getAttribute('value'));
+      await page.waitForFunction((id) => document.querySelector('footer').textContent.includes(id), IDENTIFIER);
+      await page.locator('.bit-legend .signal-entry').first().waitFor();
+    }
     await page.screenshot({ path: join(folder, `page-${view}.png`) });
   }
   await page.done();

@@ -124,30 +124,43 @@ function columnsInSight(series: Series, range: Range): [number, number] {
   return [first, last];
 }
 
+/** Width of an axis that stands within the picture, at its right edge. */
+const INNER_AXIS = 54;
+
+/** Signals of one unit share a scale; the first unit's axis stands on the left, others at the right edge in their signal's colour. */
 function drawLines(pen: Pen, sheet: Sheet, x: Scale): void {
-  const values = valueRange(sheet.traces, sheet.range);
-  const { colours } = sheet;
-  if (!values) {
-    pen.text('no value in sight', (x.start + x.end) / 2, sheet.height / 2, { colour: colours.text, align: 'center' });
-    return;
+  const units = [...new Set(sheet.traces.map((t) => t.unit))];
+  let shown = 0;
+  for (const unit of units) {
+    const traces = sheet.traces.filter((t) => t.unit === unit);
+    const values = valueRange(traces, sheet.range);
+    if (!values) continue;
+    const y: Scale = { ...values, start: sheet.height - BOTTOM, end: TOP };
+    drawValueAxis(pen, sheet, x, y, unit, shown, traces[0]?.colour ?? sheet.colours.text);
+    pen.clipped(x.start, 0, x.end - x.start, sheet.height, () => {
+      for (const trace of traces) {
+        for (const limit of trace.limits) {
+          if (limit > values.from && limit < values.to) pen.line([x.start, toPixel(y, limit), x.end, toPixel(y, limit)], trace.colour, 1, [2, 5]);
+        }
+        if (trace.series) drawSeries(pen, trace.series, trace.colour, sheet, x, y);
+      }
+    });
+    shown++;
   }
-  const y: Scale = { ...values, start: sheet.height - BOTTOM, end: TOP };
-  const marks = ticks(values.from, values.to, Math.max(2, sheet.height / 34));
+  if (shown === 0) pen.text('no value in sight', (x.start + x.end) / 2, sheet.height / 2, { colour: sheet.colours.text, align: 'center' });
+}
+
+function drawValueAxis(pen: Pen, sheet: Sheet, x: Scale, y: Scale, unit: string, number: number, own: string): void {
+  const { colours } = sheet;
+  const marks = ticks(y.from, y.to, Math.max(2, sheet.height / 34));
+  const right = number === 0 ? MARGIN - 6 : x.end - 4 - (number - 1) * INNER_AXIS;
+  const colour = number === 0 ? colours.text : own;
   for (const tick of marks.values) {
     const at = Math.round(toPixel(y, tick)) + 0.5;
-    pen.line([x.start, at, x.end, at], colours.grid, 1);
-    if (at > 18) pen.text(tickText(tick, marks.step), MARGIN - 6, at, { colour: colours.text, align: 'right', size: 10 });
+    if (number === 0) pen.line([x.start, at, x.end, at], colours.grid, 1);
+    if (at > 18) pen.text(tickText(tick, marks.step), right, at, { colour, align: 'right', size: 10 });
   }
-  const units = [...new Set(sheet.traces.map((t) => t.unit))].join(' ');
-  if (units) pen.text(units, MARGIN - 6, 8, { colour: colours.text, align: 'right', size: 10, maxWidth: MARGIN - 8 });
-  pen.clipped(x.start, 0, x.end - x.start, sheet.height, () => {
-    for (const trace of sheet.traces) {
-      for (const limit of trace.limits) {
-        if (limit > values.from && limit < values.to) pen.line([x.start, toPixel(y, limit), x.end, toPixel(y, limit)], trace.colour, 1, [2, 5]);
-      }
-      if (trace.series) drawSeries(pen, trace.series, trace.colour, sheet, x, y);
-    }
-  });
+  if (unit) pen.text(unit, right, 8, { colour, align: 'right', size: 10, maxWidth: INNER_AXIS });
 }
 
 function drawSeries(pen: Pen, series: Series, colour: string, sheet: Sheet, x: Scale, y: Scale): void {

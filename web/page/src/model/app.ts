@@ -56,6 +56,7 @@ export class App extends Emitter<Topic> {
   readonly own = new History<string>('');
   #fitted = true;
   #opening = 0;
+  #bitrates: Report['bitrates'] = [];
 
   constructor(
     private engine: Engine,
@@ -113,7 +114,9 @@ export class App extends Emitter<Topic> {
   /** `bitrates`: what the file does not say itself, in bit/s. */
   async openTrace(file: File, bitrates: Report['bitrates'] = []): Promise<void> {
     const turn = ++this.#opening;
+    const before = this.summary ? { file: this.traceFile, bitrates: this.#bitrates } : null;
     this.traceFile = file;
+    this.#bitrates = bitrates;
     this.#fitted = true;
     let first = true;
     let read = 0;
@@ -131,7 +134,9 @@ export class App extends Emitter<Topic> {
       }
     } catch (error) {
       if (first) {
-        // Nothing of the new file was taken in: what was open before is still there.
+        // Nothing of the new file was taken in. The engine may have let go of the one before: it is read again.
+        this.traceFile = null;
+        if (before?.file && this.dead === null) await this.openTrace(before.file, before.bitrates);
         throw error instanceof EngineStopped ? error : new Error(`${file.name}: ${error instanceof Error ? error.message : String(error)}`);
       }
       const reason = error instanceof Error ? error.message : String(error);

@@ -79,6 +79,7 @@ export class GraphsView implements View {
     this.element = el('section', { class: 'view view-graphs', attrs: { 'aria-label': 'Graphs' } }, bar, el('div', { class: 'split graphs-split' }, this.#tree.element, stack));
     this.#pointer.attach(this.#axis);
     this.#acceptDrops(this.#panels, null);
+    this.#panels.addEventListener('scroll', () => this.redraw(), { passive: true });
     new ResizeObserver(() => this.redraw()).observe(stack);
     matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => this.redraw());
     app.on('panels', () => this.#rebuild());
@@ -272,8 +273,15 @@ export class GraphsView implements View {
   #draw(): void {
     const { app } = this;
     const { sheets, colours } = this.#sheets();
+    // Graphs that are scrolled out of sight are not drawn; a scroll draws them.
+    const frame = this.#panels.getBoundingClientRect();
+    const inSight = this.#shown.map(({ element }) => {
+      const { top, bottom } = element.getBoundingClientRect();
+      return bottom >= frame.top && top <= frame.bottom;
+    });
     for (const [i, sheet] of sheets.entries()) {
       const shown = this.#shown[i] as Shown;
+      if (!inSight[i]) continue;
       const digital = isDigital(sheet.traces);
       shown.element.style.setProperty('--panel-min', digital ? `${sheet.traces.length * 32 + 4}px` : '110px');
       shown.element.classList.toggle('digital', digital);

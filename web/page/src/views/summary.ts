@@ -100,7 +100,7 @@ export class SummaryView implements View {
 
   #finding(finding: Finding): HTMLElement {
     const place = [finding.time === null ? '' : `${seconds(finding.time)} s`, finding.channel === null ? '' : `channel ${finding.channel}`, finding.id === null ? '' : idText(finding.id, finding.extended)].filter(Boolean).join(', ');
-    return el('span', {}, el('b', { class: 'severity' }, finding.severity), ' ', finding.text, ' ', place && (finding.time !== null || finding.id !== null) ? button(place, () => this.#follow(finding), { class: 'link mono' }) : place);
+    return el('span', {}, el('b', { class: 'severity' }, finding.severity), ' ', finding.text, ' ', finding.time !== null || finding.id !== null ? button(place, () => this.#follow(finding), { class: 'link mono' }) : null);
   }
 
   #follow(finding: Finding): void {

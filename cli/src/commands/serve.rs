@@ -75,8 +75,12 @@ pub struct Args {
     #[arg(long, value_name = "MODE", value_enum, default_value = "listen-only")]
     mode: Listeners,
     /// Periodic frames and replies of a client at --tcp or ssh that has said nothing for this long are stopped, as 2s; 0 for never.
-    #[arg(long, value_name = "TIME", value_parser = dead_man, default_value = "2s")]
-    dead_man: DeadMan,
+    #[arg(long, value_name = "TIME", value_parser = time_limit, default_value = "2s")]
+    dead_man: TimeLimit,
+    /// A socketcand client that has sent nothing for this long, and has the board send nothing periodically, only listens again, so
+    /// that the board does not acknowledge for a program that has stopped; 0 for never.
+    #[arg(long, value_name = "TIME", value_parser = time_limit, default_value = "60s")]
+    idle: TimeLimit,
     /// Listen on a UNIX socket that only this user can reach; the default, at a path in the user's own
     /// folder.
     #[cfg(unix)]
@@ -116,15 +120,15 @@ enum Listeners {
     Normal,
 }
 
-/// The silence after which what a client sends on its own is stopped.
+/// How long a client may be silent; `None` is for ever.
 #[derive(Clone, Copy)]
-struct DeadMan(Option<Duration>);
+struct TimeLimit(Option<Duration>);
 
-fn dead_man(text: &str) -> Result<DeadMan, String> {
+fn time_limit(text: &str) -> Result<TimeLimit, String> {
     if matches!(text, "0" | "0s") {
-        return Ok(DeadMan(None));
+        return Ok(TimeLimit(None));
     }
-    args::positive_duration(text).map(|after| DeadMan(Some(after)))
+    args::positive_duration(text).map(|after| TimeLimit(Some(after)))
 }
 
 /// How often to check whether to end.
@@ -188,6 +192,7 @@ fn start(args: &Args, number: usize, address: &Address) -> anyhow::Result<Board>
         bitrates_bps,
         always_acknowledges: args.mode == Listeners::Normal,
         dead_man: args.dead_man.0,
+        idle_sender: args.idle.0,
         ..Settings::default()
     };
     let at = address.clone();

@@ -158,6 +158,11 @@ impl Board {
         Ok(Link::new(reader, writer))
     }
 
+    /// See [`Settings::idle_sender`].
+    pub(crate) fn idle_sender(&self) -> Option<Duration> {
+        self.shared.settings.idle_sender
+    }
+
     /// Limit for clients at one listener.
     pub(crate) fn most_clients(&self) -> usize {
         self.shared.settings.most_clients

@@ -102,7 +102,13 @@ pub fn admit(
     std::thread::Builder::new()
         .name("cantap-to-client".to_owned())
         .spawn(move || {
-            let failed = writer::run(&for_writer, &mut *output, id).err();
+            let patience = || {
+                let state = told.state();
+                let sends =
+                    state.clients.get(&id).is_some_and(|member| member.views.iter().any(View::transmits));
+                if sends { writer::SENDER_PATIENCE } else { writer::PATIENCE }
+            };
+            let failed = writer::run(&for_writer, &mut *output, id, &patience).err();
             for_writer.abandon();
             let reason = lock(&let_go).take();
             if has_greeted.load(Ordering::Relaxed) {

@@ -43,6 +43,15 @@ pub enum News {
         /// The time.
         after: Duration,
     },
+    /// A client has sent nothing for this long, and only listens again on a channel.
+    Idle {
+        /// Its name.
+        client: String,
+        /// The channel.
+        channel: Channel,
+        /// The time.
+        after: Duration,
+    },
     /// A channel was off its bus because its mode had to change, which clients that had it open see as a gap.
     OffBus {
         /// Who asked for it; `None` if the server went back to listening.
@@ -81,6 +90,12 @@ impl fmt::Display for News {
                     after.as_secs_f64()
                 )
             }
+            Self::Idle { client, channel, after } => write!(
+                f,
+                "{client} sent nothing on channel {} for {} s, and only listens there again",
+                channel.number(),
+                after.as_secs_f64()
+            ),
             Self::OffBus { client: Some(client), channel, others } => write!(
                 f,
                 "channel {} was off its bus for a moment, because {client} may send on it; {} a gap",

@@ -34,6 +34,10 @@ pub struct Settings {
     /// How channels are opened for clients that only listen: with `true`, so that the board acknowledges, and no client that sends takes
     /// it off the bus.
     pub always_acknowledges: bool,
+    /// A client whose first frame opened a channel for sending, because its protocol has no other way to ask for that, only listens again
+    /// after sending nothing for this long; `None` for never. Until then the board acknowledges for it, and nobody knows whether it is
+    /// still there.
+    pub idle_sender: Option<Duration>,
     /// Periodic frames and replies of a client on another computer that has said nothing for this long are stopped; `None` for never.
     pub dead_man: Option<Duration>,
 }
@@ -53,6 +57,7 @@ impl Default for Settings {
             most_clients: 32,
             keep_mode: Duration::from_secs(10),
             always_acknowledges: false,
+            idle_sender: Some(Duration::from_secs(60)),
             dead_man: Some(Duration::from_secs(2)),
         }
     }

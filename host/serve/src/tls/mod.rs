@@ -152,7 +152,7 @@ pub fn listen(board: &Arc<Board>, address: SocketAddr, most: Role, server: &Serv
     let (board, config) = (Arc::clone(board), Arc::clone(&server.0));
     let (handshakes, places) = (Places::new(MOST_HANDSHAKES), Places::new(board.most_clients()));
     Listening::start("cantap-tls", Some(address), move || {
-        let (stream, peer) = accept(&listener)?;
+        let (stream, peer) = accept(&listener, most)?;
         let name = format!("client {peer}");
         // Who is let go is not reported: a flood of connections would be a flood of messages.
         let Ok(handshake) = handshakes.enter(Some(peer.ip()), ends(&stream)?) else { return Ok(()) };

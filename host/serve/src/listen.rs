@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use cantap_wire::message::Role;
 
-use crate::client::Guest;
+use crate::client::{Guest, Identity};
 #[cfg(unix)]
 use crate::connect::SOCKET_TIMEOUT;
 use crate::connect::prepare;
@@ -101,7 +101,7 @@ pub fn unix(board: &Arc<Board>, path: &Path, role: Role) -> Result<Listening, So
         let ended = stream.try_clone()?;
         let place = places.enter(None, move || drop(ended.shutdown(std::net::Shutdown::Both)));
         let output = stream.try_clone()?;
-        let_in(&board, place, stream, output, Arrival { name, role, is_remote: false });
+        let_in(&board, place, stream, output, Arrival { name, role, is_remote: false, identity: None });
         Ok(())
     })?;
     listening.file = Some(file);
@@ -120,7 +120,7 @@ pub fn tcp(board: &Arc<Board>, address: SocketAddr, role: Role) -> io::Result<Li
         let place = places.enter(Some(peer.ip()), ends(&stream)?);
         let output = stream.try_clone()?;
         // A tunnel may end here.
-        let_in(&board, place, stream, output, Arrival { name, role, is_remote: true });
+        let_in(&board, place, stream, output, Arrival { name, role, is_remote: true, identity: None });
         Ok(())
     })
 }
@@ -209,6 +209,8 @@ pub(crate) struct Arrival {
     pub role: Role,
     /// It is at the other end of a line that can break without notice.
     pub is_remote: bool,
+    /// Who it is, if it has shown a certificate.
+    pub identity: Option<Identity>,
 }
 
 /// Admits whoever has come and has got a place; anybody else learns why it is turned away.
@@ -219,11 +221,11 @@ pub(crate) fn let_in(
     mut output: impl Write + Send + 'static,
     arrival: Arrival,
 ) {
-    let Arrival { name, role, is_remote } = arrival;
+    let Arrival { name, role, is_remote, identity } = arrival;
     match place {
         Ok(place) => {
             let client = name.clone();
-            let guest = Guest { name, role, place: Some(place), is_counted: false, is_remote };
+            let guest = Guest { name, role, place: Some(place), is_counted: false, is_remote, identity };
             if let Err(refused) = board.admit_guest(input, output, guest) {
                 board.tell(News::Refused { client, reason: refused.to_string() });
             }

@@ -39,7 +39,7 @@ pub fn run(
             encoder.stream.answer(answer);
         }
         if !work.given_up.is_empty() {
-            outbox.give_up(encoder.give_up(work.given_up));
+            outbox.give_up(encoder.give_up(work.given_up, outbox));
         }
         for item in work.items {
             encoder.take(item);
@@ -142,7 +142,7 @@ impl Encoder {
 
     /// What is not sent any more is a loss where it would have stood. Returns the frames of each channel that count as such only by
     /// being lost: those that others sent.
-    fn give_up(&mut self, items: Vec<Item>) -> [u32; CHANNELS] {
+    fn give_up(&mut self, items: Vec<Item>, outbox: &Outbox) -> [u32; CHANNELS] {
         let mut others = [0; CHANNELS];
         let mut lost = Gap::default();
         for item in items {
@@ -151,6 +151,9 @@ impl Encoder {
                     for entry in chunk.iter() {
                         let Some(record) = shown(entry, self.client, &self.views) else { continue };
                         let channel = lost.absorb(entry.ticks, &record);
+                        if let Some(channel) = channel {
+                            outbox.count_lost(channel);
+                        }
                         if let Some(channel) = channel.filter(|_| !matches!(record, Record::Received(_))) {
                             others[channel.index()] += 1;
                         }

@@ -3,12 +3,12 @@
 mod doors;
 #[cfg(feature = "tls")]
 mod keys;
+mod upkeep;
 
 use std::io::{self, Read, Write};
 #[cfg(not(unix))]
 use std::net::Ipv4Addr;
 use std::net::SocketAddr;
-#[cfg(any(unix, feature = "tls"))]
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -23,11 +23,12 @@ use cantap_address::{Address, LinkError};
 use cantap_serve::listen::{self, Listening};
 #[cfg(unix)]
 use cantap_serve::socket_file::{self, SocketError};
-use cantap_serve::{Board, BoardError, News, Role, Settings, connect, lines, socketcand};
+use cantap_serve::{Board, BoardError, News, Role, Settings, connect, lines, metrics, socketcand};
 
 #[cfg(unix)]
 use self::doors::numbered;
 use self::doors::{Allowed, Door, address, allow, allowed, loopback};
+use self::upkeep::Upkeep;
 use crate::args;
 use crate::stderr;
 use crate::usage_error::usage;
@@ -75,8 +76,12 @@ pub struct Args {
     #[arg(long, value_name = "MODE", value_enum, default_value = "listen-only")]
     mode: Listeners,
     /// Periodic frames and replies of a client at --tcp or ssh that has said nothing for this long are stopped, as 2s; 0 for never.
-    #[arg(long, value_name = "TIME", value_parser = dead_man, default_value = "2s")]
-    dead_man: DeadMan,
+    #[arg(long, value_name = "TIME", value_parser = time_limit, default_value = "2s")]
+    dead_man: TimeLimit,
+    /// A socketcand client that has sent nothing for this long, and has the board send nothing periodically, only listens again, so
+    /// that the board does not acknowledge for a program that has stopped; 0 for never.
+    #[arg(long, value_name = "TIME", value_parser = time_limit, default_value = "60s")]
+    idle: TimeLimit,
     /// Listen on a UNIX socket that only this user can reach; the default, at a path in the user's own
     /// folder.
     #[cfg(unix)]
@@ -101,6 +106,24 @@ pub struct Args {
     /// Write candump's log lines to anyone who connects, for nc and SavvyCAN's log server; default 127.0.0.1:29538.
     #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
     lines: Option<String>,
+    /// What clients may do, by the names in their certificates: channels, identifiers, frames per second, modes, hours. The file is
+    /// described in docs/serve.md, and read again at SIGHUP.
+    #[cfg(feature = "tls")]
+    #[arg(long, value_name = "FILE", requires = "tls")]
+    permissions: Option<PathBuf>,
+    /// The authority's list of revoked certificates, as `keygen --revoke` writes it; read again at SIGHUP.
+    #[cfg(feature = "tls")]
+    #[arg(long, value_name = "FILE", requires = "tls")]
+    revoked: Option<PathBuf>,
+    /// Append to this file, as JSON lines, who came, opened and sent what, and was refused.
+    #[arg(long, value_name = "FILE")]
+    audit: Option<PathBuf>,
+    /// Give Prometheus figures at http://ADDR:PORT/metrics; default 127.0.0.1:29539. Whoever reaches another address can read them.
+    #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
+    metrics: Option<String>,
+    /// Wait for a device that is not there yet.
+    #[arg(long)]
+    wait: bool,
     /// Serve one client through standard input and output, as ssh starts it.
     #[arg(long)]
     stdio: bool,
@@ -116,21 +139,23 @@ enum Listeners {
     Normal,
 }
 
-/// The silence after which what a client sends on its own is stopped.
+/// How long a client may be silent; `None` is for ever.
 #[derive(Clone, Copy)]
-struct DeadMan(Option<Duration>);
+struct TimeLimit(Option<Duration>);
 
-fn dead_man(text: &str) -> Result<DeadMan, String> {
+fn time_limit(text: &str) -> Result<TimeLimit, String> {
     if matches!(text, "0" | "0s") {
-        return Ok(DeadMan(None));
+        return Ok(TimeLimit(None));
     }
-    args::positive_duration(text).map(|after| DeadMan(Some(after)))
+    args::positive_duration(text).map(|after| TimeLimit(Some(after)))
 }
 
 /// How often to check whether to end.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
 /// The default port of `--lines`.
 const LINES_PORT: u16 = 29_538;
+/// The default port of `--metrics`.
+const METRICS_PORT: u16 = 29_539;
 /// How many bytes of standard input may wait.
 const STDIN_BYTES: usize = 16 * 1024;
 
@@ -158,7 +183,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let other_doors = OtherDoors {
         socketcand: args.socketcand.as_deref().map(|text| address(text, socketcand::PORT)).transpose()?,
         lines: args.lines.as_deref().map(|text| loopback(text, LINES_PORT)).transpose()?,
+        metrics: args.metrics.as_deref().map(|text| address(text, METRICS_PORT)).transpose()?,
     };
+    let mut upkeep = Upkeep::of(args)?;
+    // Before there is another thread.
+    #[cfg(unix)]
+    upkeep.catch_hang_ups(way.scheme() == "tls")?;
     // From here on, Ctrl-C ends it properly.
     interrupt::watch()?;
     let mut boards = Vec::new();
@@ -167,6 +197,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         check_bitrates(args, number, &board)?;
         boards.push(Arc::new(board));
     }
+    upkeep.begin(
+        &boards,
+        #[cfg(feature = "tls")]
+        way.server(),
+    )?;
     if args.stdio {
         return serve_stdio(&boards[0], allow(&args.allowed, Door::Stdio));
     }
@@ -175,10 +210,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         std::thread::sleep(LOOK_EVERY);
     }
     drop(listening);
+    drop(boards);
+    upkeep.finish();
     Ok(ExitCode::SUCCESS)
 }
 
-/// Opens a device, which must be there.
+/// Opens a device, which must be there unless it is waited for.
 fn start(args: &Args, number: usize, address: &Address) -> anyhow::Result<Board> {
     let of_buses = address.bitrates_of_buses();
     let bitrates_bps: [Option<u32>; CHANNELS] = Channel::ALL.map(|channel| {
@@ -186,8 +223,10 @@ fn start(args: &Args, number: usize, address: &Address) -> anyhow::Result<Board>
     });
     let settings = Settings {
         bitrates_bps,
+        waits_for_board: args.wait,
         always_acknowledges: args.mode == Listeners::Normal,
         dead_man: args.dead_man.0,
+        idle_sender: args.idle.0,
         ..Settings::default()
     };
     let at = address.clone();
@@ -206,7 +245,7 @@ fn start(args: &Args, number: usize, address: &Address) -> anyhow::Result<Board>
 /// Whoever runs the server sees who comes and goes; what must not be overlooked stands out.
 fn tell(news: News) {
     match news {
-        News::BoardLost { .. } | News::Refused { .. } | News::DeadMan { .. } => {
+        News::BoardLost { .. } | News::Refused { .. } | News::NotPermitted { .. } | News::DeadMan { .. } => {
             stderr::warn(&news.to_string());
         }
         news => eprintln!("cantap: {news}"),
@@ -215,6 +254,10 @@ fn tell(news: News) {
 
 /// If nobody may choose a bit rate, there has to be one.
 fn check_bitrates(args: &Args, number: usize, board: &Board) -> anyhow::Result<()> {
+    // Those saved on a board that is not there yet are not known.
+    if board.hello().is_none() {
+        return Ok(());
+    }
     let doors = [Door::Unix, Door::Tcp, Door::Socketcand, Door::Stdio];
     if doors.into_iter().any(|door| allow(&args.allowed, door) >= Role::Configure) {
         return Ok(());
@@ -330,13 +373,19 @@ impl Way {
     #[cfg(feature = "tls")]
     fn of(args: &Args) -> anyhow::Result<Self> {
         let (Some(files), Some(authority)) = (&args.tls, &args.clients) else { return Ok(Self::Plain) };
-        keys::server(files, authority).map(Self::Encrypted)
+        keys::server(files, authority, args.revoked.as_deref()).map(Self::Encrypted)
     }
 
     #[cfg(not(feature = "tls"))]
     #[expect(clippy::unnecessary_wraps, reason = "as with TLS")]
     const fn of(_args: &Args) -> anyhow::Result<Self> {
         Ok(Self::Plain)
+    }
+
+    /// What is read again at a hang-up.
+    #[cfg(feature = "tls")]
+    fn server(&self) -> Option<cantap_serve::tls::Server> {
+        if let Self::Encrypted(server) = self { Some(server.clone()) } else { None }
     }
 
     /// The scheme in addresses.
@@ -361,6 +410,7 @@ impl Way {
 struct OtherDoors {
     socketcand: Option<SocketAddr>,
     lines: Option<SocketAddr>,
+    metrics: Option<SocketAddr>,
 }
 
 impl OtherDoors {
@@ -392,6 +442,16 @@ impl OtherDoors {
             let way = lines::listen(boards, address)
                 .with_context(|| format!("nobody can listen at {address}; give another port with --lines"))?;
             ways.push((format!("lines at {}", way.address().unwrap_or(address)), way));
+        }
+        if let Some(address) = self.metrics {
+            let way = metrics::listen(boards, address).with_context(|| {
+                format!("nobody can listen at {address}; give another port with --metrics")
+            })?;
+            let address = way.address().unwrap_or(address);
+            if !address.ip().is_loopback() {
+                stderr::warn(&format!("anyone who reaches {address} can read the server's figures"));
+            }
+            ways.push((format!("http://{address}/metrics"), way));
         }
         Ok(ways)
     }

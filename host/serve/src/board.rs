@@ -13,9 +13,12 @@ use cantap::session::Session;
 use cantap_wire::message::{ChannelConfig, EndReason, Role};
 use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Hello, Reply};
 
+use crate::audit::Audit;
 use crate::client::{self, Guest};
+use crate::metrics::Metrics;
 use crate::modes;
 use crate::news::News;
+use crate::permissions::{Denied, Permissions, Permit};
 use crate::shared::{Refused, Settings, Shared, lock};
 use crate::state::Then;
 use crate::upstream::{Upstream, end_sessions};
@@ -73,6 +76,10 @@ impl Board {
             next_client: AtomicU64::new(1),
             news: Box::new(news),
             refusals: Mutex::default(),
+            not_permitted: Mutex::default(),
+            permissions: Mutex::default(),
+            audit: Mutex::default(),
+            refused: AtomicU64::new(0),
         });
         let (first, began) = std::sync::mpsc::channel();
         let for_thread = Arc::clone(&shared);
@@ -113,6 +120,36 @@ impl Board {
     /// The number of clients.
     pub fn clients(&self) -> usize {
         self.shared.state().clients.len()
+    }
+
+    /// From now on, clients with certificates may do only what these permit; those without, what their roles allow. `number` is the
+    /// board's among those of the server, from 0: channels are numbered across them, as everywhere. Clients that are connected notice at
+    /// once.
+    pub fn permit_only(&self, permissions: Arc<Permissions>, number: usize) {
+        *lock(&self.shared.permissions) = Some((permissions, number));
+    }
+
+    /// Who does what is recorded there from now on.
+    pub fn record_to(&self, audit: Arc<Audit>) {
+        *lock(&self.shared.audit) = Some(audit);
+    }
+
+    /// What the client with a certificate of this name may do, unless nothing is restricted.
+    pub(crate) fn permit_of(&self, certificate: &str) -> Result<Option<Permit>, Denied> {
+        self.shared.permit_of(certificate).map(|found| found.map(|(permit, _)| permit))
+    }
+
+    pub(crate) fn metrics(&self) -> Metrics {
+        let state = self.shared.state();
+        let clock_hz = state.hello.as_ref().map_or(1, |hello| hello.can_clock_hz);
+        Metrics {
+            is_there: state.hello.is_some(),
+            clients: state.clients.len() as u64,
+            places: self.shared.settings.most_clients as u64,
+            refused: self.shared.refused.load(Ordering::Relaxed),
+            channels: state.totals(),
+            bitrates_bps: state.open.map(|open| open.map(|config| config.timing.bitrate_bps(clock_hz))),
+        }
     }
 
     pub(crate) fn tell(&self, news: News) {
@@ -158,6 +195,11 @@ impl Board {
         Ok(Link::new(reader, writer))
     }
 
+    /// See [`Settings::idle_sender`].
+    pub(crate) fn idle_sender(&self) -> Option<Duration> {
+        self.shared.settings.idle_sender
+    }
+
     /// Limit for clients at one listener.
     pub(crate) fn most_clients(&self) -> usize {
         self.shared.settings.most_clients
@@ -201,8 +243,17 @@ fn run(shared: &Arc<Shared>, mut connect: Connect, first: Sender<Result<(), Boar
             }
             Err(error) => {
                 if let Some(first) = first.take() {
-                    let _ = first.send(Err(error));
-                    return;
+                    // What is wrong with a board that is there does not mend itself.
+                    let is_absent = matches!(
+                        &error,
+                        BoardError::Connect(_)
+                            | BoardError::Device(DeviceError::NotFound { .. } | DeviceError::Busy { .. })
+                    );
+                    if !(shared.settings.waits_for_board && is_absent) {
+                        let _ = first.send(Err(error));
+                        return;
+                    }
+                    let _ = first.send(Ok(()));
                 }
                 let reason = error.to_string();
                 if reported.as_ref() != Some(&reason) {

@@ -1,5 +1,6 @@
 //! One client: its requests are carried out, and those beyond its role are refused.
 
+mod budget;
 mod channels;
 mod sending;
 
@@ -11,12 +12,16 @@ use std::time::{Duration, Instant};
 use cantap::device::is_idle;
 use cantap::responder::{Inbox, Incoming, encode_response};
 use cantap_wire::message::{Defaults, Role, capability};
-use cantap_wire::{Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply, Request};
+use cantap_wire::{CHANNELS, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply, Request};
+use serde_json::{Value, json};
 
+use self::budget::Budget;
+use crate::audit::who;
 use crate::flow::read_ack;
 use crate::foreign;
 use crate::news::News;
 use crate::outbox::Outbox;
+use crate::permissions::{Denied, Permit};
 use crate::places::{GREETING_TIMEOUT, Place};
 use crate::shared::{Refused, Shared, lock};
 use crate::state::{Member, State, Then};
@@ -26,6 +31,8 @@ use crate::writer;
 /// A client that may send and says nothing for this long is let go, because the board acknowledges for it. Programs of ours say something
 /// twice a second.
 const SENDER_TIMEOUT: Duration = Duration::from_secs(5);
+/// How often to check whether a client may still be there, and to record how much it sent.
+const CHECK_EVERY: Duration = Duration::from_secs(1);
 /// A read takes 50 ms. During the rest of a longer pass, the computer was too busy to listen, for which a client is not to blame.
 const LONGEST_PASS: Duration = Duration::from_millis(100);
 
@@ -41,12 +48,22 @@ pub struct Guest {
     pub is_counted: bool,
     /// It is at the other end of a line that can break without notice.
     pub is_remote: bool,
+    /// Who it is, if it has shown a certificate.
+    pub identity: Option<Identity>,
+}
+
+/// Who a client is, as its certificate says.
+pub struct Identity {
+    /// The certificate's name.
+    pub certificate: String,
+    /// Whether it is still trusted. An error says why not.
+    pub check: Box<dyn Fn() -> Result<(), String> + Send>,
 }
 
 impl Guest {
     /// A client on this machine that has no place at a listener.
     pub fn of_board(name: &str, role: Role) -> Self {
-        Self { name: name.to_owned(), role, place: None, is_counted: true, is_remote: false }
+        Self { name: name.to_owned(), role, place: None, is_counted: true, is_remote: false, identity: None }
     }
 }
 
@@ -57,7 +74,12 @@ pub fn admit(
     mut output: Box<dyn Write + Send>,
     guest: Guest,
 ) -> Result<(), Refused> {
-    let Guest { name, role, place, is_counted, is_remote } = guest;
+    let Guest { name, role, place, is_counted, is_remote, identity } = guest;
+    let permit = match &identity {
+        None => None,
+        Some(identity) => shared.permit_of(&identity.certificate).map_err(Refused::NotPermitted)?,
+    };
+    let role = permit.as_ref().map_or(role, |(permit, _)| permit.role(role));
     let id = shared.next_client();
     let outbox = Arc::new(Outbox::new(shared.settings.most_records));
     {
@@ -87,6 +109,10 @@ pub fn admit(
         role,
         name: name.clone(),
         dead_man: shared.settings.dead_man.filter(|_| is_remote),
+        identity,
+        permit,
+        budget: Mutex::default(),
+        sent: Mutex::default(),
         place,
         has_greeted: Arc::clone(&has_greeted),
         let_go: Arc::default(),
@@ -94,7 +120,7 @@ pub fn admit(
     };
     let let_go = Arc::clone(&client.let_go);
     let leave = |error| {
-        shared.state().clients.remove(&id);
+        shared.state().remove(id);
         Refused::Thread(error)
     };
     let told = Arc::clone(shared);
@@ -102,7 +128,13 @@ pub fn admit(
     std::thread::Builder::new()
         .name("cantap-to-client".to_owned())
         .spawn(move || {
-            let failed = writer::run(&for_writer, &mut *output, id).err();
+            let patience = || {
+                let state = told.state();
+                let sends =
+                    state.clients.get(&id).is_some_and(|member| member.views.iter().any(View::transmits));
+                if sends { writer::SENDER_PATIENCE } else { writer::PATIENCE }
+            };
+            let failed = writer::run(&for_writer, &mut *output, id, &patience).err();
             for_writer.abandon();
             let reason = lock(&let_go).take();
             if has_greeted.load(Ordering::Relaxed) {
@@ -137,6 +169,12 @@ struct Client {
     name: String,
     /// After this silence, what it sends on its own is stopped.
     dead_man: Option<Duration>,
+    identity: Option<Identity>,
+    /// What it may do, and the number of the board's first channel, from 0.
+    permit: Option<(Permit, usize)>,
+    budget: Mutex<Budget>,
+    /// Frames sent on each channel that are not recorded yet.
+    sent: Mutex<[u64; CHANNELS]>,
     place: Option<Place>,
     has_greeted: Arc<AtomicBool>,
     /// Why it was let go. Clients that connect and say nothing are not reported.
@@ -151,6 +189,7 @@ impl Client {
         let mut inbox = Inbox::default();
         let mut first = Vec::new();
         let mut silence = Silence::default();
+        let mut checked_at = came;
         let mut bytes = [0; 4096];
         while !self.outbox.is_closed() {
             let len = match input.read(&mut bytes) {
@@ -181,6 +220,14 @@ impl Client {
             }
             if !goes_on || !self.has_greeted() && came.elapsed() > GREETING_TIMEOUT {
                 return;
+            }
+            if checked_at.elapsed() >= CHECK_EVERY {
+                checked_at = Instant::now();
+                self.record_sent();
+                if let Err(reason) = self.check() {
+                    self.let_go(reason);
+                    return;
+                }
             }
             let silent = silence.pass(len > 0);
             if silent >= SENDER_TIMEOUT && self.with(|_, member| member.views.iter().any(View::transmits)) {
@@ -228,16 +275,63 @@ impl Client {
 
     /// Gives back everything it had.
     fn leave(&self) {
+        self.record_sent();
         self.end_session();
-        self.shared.state().clients.remove(&self.id);
+        self.shared.state().remove(self.id);
         // What is waiting is written if anybody reads it.
         self.outbox.close();
+    }
+
+    /// Whether it may stay: what it showed is still trusted, and its permissions are what they were when it came.
+    fn check(&self) -> Result<(), String> {
+        let Some(identity) = &self.identity else { return Ok(()) };
+        (identity.check)()?;
+        let now = self.shared.permit_of(&identity.certificate).map_err(|denied| denied.to_string())?;
+        if now == self.permit { Ok(()) } else { Err("its permissions have changed".to_owned()) }
+    }
+
+    /// Checks that its permissions cover something, for which it would need this role. The log says what is missing.
+    fn must_be_permitted(
+        &self,
+        needs: Role,
+        check: impl FnOnce(&Permit, usize) -> Result<(), Denied>,
+    ) -> Result<(), Refusal> {
+        let Some((permit, number)) = &self.permit else { return Ok(()) };
+        check(permit, *number).map_err(|denied| {
+            let (client, reason) = (self.name.clone(), denied.to_string());
+            self.shared.tell(News::NotPermitted { client, reason });
+            Refusal::NotGranted { needs }
+        })
+    }
+
+    /// Adds to the audit log what it did, for which there is a channel.
+    fn note(&self, event: &str, channel: Channel, more: impl FnOnce() -> Value) {
+        self.shared.note(|| {
+            let mut noted = who(&self.name);
+            noted["event"] = json!(event);
+            noted["channel"] = json!(channel.number());
+            if let (Value::Object(noted), Value::Object(more)) = (&mut noted, more()) {
+                noted.extend(more);
+            }
+            noted
+        });
+    }
+
+    /// Records how many frames it sent since the last time.
+    fn record_sent(&self) {
+        let sent = std::mem::take(&mut *lock(&self.sent));
+        for (channel, frames) in Channel::ALL.into_iter().zip(sent).filter(|(_, frames)| *frames > 0) {
+            self.note("sent", channel, || json!({ "frames": frames }));
+        }
     }
 
     /// Closes its channels unless others use them.
     fn end_session(&self) {
         let setup = self.setup();
         for channel in Channel::ALL {
+            if self.is_open(channel) {
+                self.note("closed", channel, || json!({}));
+            }
             // If the board does not respond, its thread notices.
             let _ = self.close(channel);
         }
@@ -305,15 +399,43 @@ impl Client {
     }
 
     fn perform_in_session(&self, command: Command) -> Result<Reply, Refusal> {
+        let changes = match &command {
+            Command::ClearDefaults => Some("clears the saved settings"),
+            Command::SaveDefaults => Some("saves settings"),
+            Command::Configure { .. } => Some("configures"),
+            Command::Reset => Some("restarts the board"),
+            _ => None,
+        };
+        let result = self.carry_out(command);
+        if let (Some(changes), Ok(_)) = (changes, &result) {
+            self.shared.note(|| {
+                let mut noted = who(&self.name);
+                noted["event"] = json!("changed");
+                noted["text"] = json!(changes);
+                noted
+            });
+        }
+        result
+    }
+
+    fn carry_out(&self, command: Command) -> Result<Reply, Refusal> {
         match command {
             // Greeting is handled elsewhere.
             Command::Hello { .. } => Err(Refusal::Malformed),
             Command::Open { channel, config } => {
                 let _setup = self.setup();
-                self.open(channel, config)
+                let opened = self.open(channel, config);
+                if let Ok(Reply::Opened(config)) = &opened {
+                    let clock_hz = self.shared.state().hello.as_ref().map_or(1, |hello| hello.can_clock_hz);
+                    let bitrate_bps = config.timing.bitrate_bps(clock_hz);
+                    let mode = config.mode.name();
+                    self.note("opened", channel, || json!({ "mode": mode, "bitrate_bps": bitrate_bps }));
+                }
+                opened
             }
             Command::Close { channel } => {
                 let _setup = self.setup();
+                self.note("closed", channel, || json!({}));
                 self.close(channel).map(|()| Reply::Done)
             }
             Command::Status => self.status(),

@@ -6,6 +6,7 @@
 
 #![forbid(unsafe_code)]
 
+pub mod audit;
 mod board;
 mod client;
 pub mod connect;
@@ -14,11 +15,13 @@ mod foreign;
 pub mod lines;
 pub mod listen;
 mod log_limit;
+pub mod metrics;
 mod modes;
 mod news;
 mod outbox;
 #[cfg(unix)]
 mod peer;
+pub mod permissions;
 mod places;
 mod shared;
 #[cfg(unix)]
@@ -29,6 +32,7 @@ mod stream;
 mod text;
 #[cfg(feature = "tls")]
 pub mod tls;
+mod totals;
 mod upstream;
 mod writer;
 

@@ -14,12 +14,11 @@ use cantap_wire::{Channel, Refusal};
 use crate::foreign;
 use crate::listen::{Listening, accept, bind_loopback, turn_away};
 use crate::places::{Places, ends};
+use crate::writer::PATIENCE;
 use crate::{Board, News};
 
 /// Limit for records waiting for one client, in addition to those in the server's queue.
 pub(crate) const HELD_RECORDS: usize = 1 << 16;
-/// A client that takes nothing for this long is considered gone.
-const PATIENCE: Duration = Duration::from_secs(30);
 /// How long to wait for records before checking the other board's.
 const WAIT: Duration = Duration::from_millis(10);
 
@@ -30,7 +29,7 @@ pub fn listen(boards: &[Arc<Board>], address: SocketAddr) -> io::Result<Listenin
     let boards = boards.to_vec();
     let places = Places::new(boards.first().map_or(0, |board| board.most_clients()));
     Listening::start("cantap-lines", Some(address), move || {
-        let (mut stream, peer) = accept(&listener)?;
+        let (mut stream, peer) = accept(&listener, Role::Listen)?;
         let name = format!("line reader {peer}");
         let place = match places.enter(Some(peer.ip()), ends(&stream)?) {
             Ok(place) => place,

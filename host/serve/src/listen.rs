@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use cantap_wire::message::Role;
 
-use crate::client::Guest;
+use crate::client::{Guest, Identity};
 #[cfg(unix)]
 use crate::connect::SOCKET_TIMEOUT;
 use crate::connect::prepare;
@@ -20,7 +20,7 @@ use crate::peer;
 use crate::places::{NoPlace, Place, Places, ends, refuse};
 #[cfg(unix)]
 use crate::socket_file::{self, SocketError, SocketFile};
-use crate::{Board, News};
+use crate::{Board, News, writer};
 
 /// How often to check for new connections.
 const LOOK_EVERY: Duration = Duration::from_millis(10);
@@ -101,7 +101,7 @@ pub fn unix(board: &Arc<Board>, path: &Path, role: Role) -> Result<Listening, So
         let ended = stream.try_clone()?;
         let place = places.enter(None, move || drop(ended.shutdown(std::net::Shutdown::Both)));
         let output = stream.try_clone()?;
-        let_in(&board, place, stream, output, Arrival { name, role, is_remote: false });
+        let_in(&board, place, stream, output, Arrival { name, role, is_remote: false, identity: None });
         Ok(())
     })?;
     listening.file = Some(file);
@@ -115,12 +115,12 @@ pub fn tcp(board: &Arc<Board>, address: SocketAddr, role: Role) -> io::Result<Li
     let board = Arc::clone(board);
     let places = Places::new(board.most_clients());
     Listening::start("cantap-tcp", Some(address), move || {
-        let (stream, peer) = accept(&listener)?;
+        let (stream, peer) = accept(&listener, role)?;
         let name = format!("client {peer}");
         let place = places.enter(Some(peer.ip()), ends(&stream)?);
         let output = stream.try_clone()?;
         // A tunnel may end here.
-        let_in(&board, place, stream, output, Arrival { name, role, is_remote: true });
+        let_in(&board, place, stream, output, Arrival { name, role, is_remote: true, identity: None });
         Ok(())
     })
 }
@@ -151,13 +151,41 @@ pub(crate) fn bind(address: SocketAddr) -> io::Result<(TcpListener, SocketAddr)>
     Ok((listener, address))
 }
 
-pub(crate) fn accept(listener: &TcpListener) -> io::Result<(TcpStream, SocketAddr)> {
+/// A connection from somebody who may have this role.
+pub(crate) fn accept(listener: &TcpListener, role: Role) -> io::Result<(TcpStream, SocketAddr)> {
     let (stream, peer) = listener.accept()?;
     stream.set_nonblocking(false)?;
     prepare(&stream)?;
     #[cfg(unix)]
     keep_little(&stream)?;
+    #[cfg(target_os = "linux")]
+    notice_absence(&stream, patience(role))?;
+    #[cfg(not(target_os = "linux"))]
+    let _ = role;
     Ok((stream, peer))
+}
+
+/// For how long somebody who may have this role is waited for while nothing shows that it is still there.
+pub(crate) const fn patience(role: Role) -> Duration {
+    match role {
+        Role::Send => writer::SENDER_PATIENCE,
+        Role::Listen | Role::Configure => writer::PATIENCE,
+    }
+}
+
+/// A computer that was switched off, or whose cable was pulled, sends no end of its connections. The system asks for a sign of life a few
+/// times in this period, and ends the connection when there is none, also when data for the peer wait for so long.
+#[cfg(target_os = "linux")]
+fn notice_absence(stream: &TcpStream, patience: Duration) -> io::Result<()> {
+    use nix::sys::socket::{setsockopt, sockopt};
+    let third = u32::try_from(patience.as_secs()).unwrap_or(u32::MAX).div_ceil(3);
+    setsockopt(stream, sockopt::KeepAlive, &true)?;
+    setsockopt(stream, sockopt::TcpKeepIdle, &third)?;
+    setsockopt(stream, sockopt::TcpKeepInterval, &third)?;
+    setsockopt(stream, sockopt::TcpKeepCount, &2)?;
+    // A peer that is there and takes nothing is noticed earlier, and with a reason.
+    let patience_ms = u32::try_from(patience.as_millis() + 1000).unwrap_or(u32::MAX);
+    Ok(setsockopt(stream, sockopt::TcpUserTimeout, &patience_ms)?)
 }
 
 /// Data for a client should wait in its outbox, where answers go first and losses are counted, rather than in the system, whose
@@ -181,6 +209,8 @@ pub(crate) struct Arrival {
     pub role: Role,
     /// It is at the other end of a line that can break without notice.
     pub is_remote: bool,
+    /// Who it is, if it has shown a certificate.
+    pub identity: Option<Identity>,
 }
 
 /// Admits whoever has come and has got a place; anybody else learns why it is turned away.
@@ -191,11 +221,11 @@ pub(crate) fn let_in(
     mut output: impl Write + Send + 'static,
     arrival: Arrival,
 ) {
-    let Arrival { name, role, is_remote } = arrival;
+    let Arrival { name, role, is_remote, identity } = arrival;
     match place {
         Ok(place) => {
             let client = name.clone();
-            let guest = Guest { name, role, place: Some(place), is_counted: false, is_remote };
+            let guest = Guest { name, role, place: Some(place), is_counted: false, is_remote, identity };
             if let Err(refused) = board.admit_guest(input, output, guest) {
                 board.tell(News::Refused { client, reason: refused.to_string() });
             }

@@ -43,6 +43,22 @@ pub enum News {
         /// The time.
         after: Duration,
     },
+    /// A client's request was refused, because the permissions of its certificate do not cover it.
+    NotPermitted {
+        /// Its name.
+        client: String,
+        /// What is not permitted.
+        reason: String,
+    },
+    /// A client has sent nothing for this long, and only listens again on a channel.
+    Idle {
+        /// Its name.
+        client: String,
+        /// The channel.
+        channel: Channel,
+        /// The time.
+        after: Duration,
+    },
     /// A channel was off its bus because its mode had to change, which clients that had it open see as a gap.
     OffBus {
         /// Who asked for it; `None` if the server went back to listening.
@@ -66,6 +82,41 @@ pub enum News {
     },
 }
 
+impl News {
+    /// What kind it is, in the audit log.
+    pub(crate) const fn event(&self) -> &'static str {
+        match self {
+            Self::ClientCame { .. } => "came",
+            Self::ClientLeft { .. } => "left",
+            Self::Refused { .. } => "refused",
+            Self::RefusedMore { .. } => "refused_more",
+            Self::DeadMan { .. } => "dead_man",
+            Self::NotPermitted { .. } => "not_permitted",
+            Self::Idle { .. } => "idle",
+            Self::OffBus { .. } => "off_bus",
+            Self::BoardLost { .. } => "board_lost",
+            Self::BoardBack { .. } => "board_back",
+        }
+    }
+
+    /// The client that it is about.
+    pub(crate) fn client(&self) -> Option<&str> {
+        match self {
+            Self::ClientCame { client, .. }
+            | Self::ClientLeft { client, .. }
+            | Self::Refused { client, .. }
+            | Self::DeadMan { client, .. }
+            | Self::NotPermitted { client, .. }
+            | Self::Idle { client, .. }
+            | Self::OffBus { client: Some(client), .. } => Some(client),
+            Self::RefusedMore { .. }
+            | Self::OffBus { client: None, .. }
+            | Self::BoardLost { .. }
+            | Self::BoardBack { .. } => None,
+        }
+    }
+}
+
 impl fmt::Display for News {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
@@ -81,6 +132,13 @@ impl fmt::Display for News {
                     after.as_secs_f64()
                 )
             }
+            Self::NotPermitted { client, reason } => write!(f, "{client} was refused: {reason}"),
+            Self::Idle { client, channel, after } => write!(
+                f,
+                "{client} sent nothing on channel {} for {} s, and only listens there again",
+                channel.number(),
+                after.as_secs_f64()
+            ),
             Self::OffBus { client: Some(client), channel, others } => write!(
                 f,
                 "channel {} was off its bus for a moment, because {client} may send on it; {} a gap",

@@ -2,6 +2,7 @@
 //! counted.
 
 use std::collections::VecDeque;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -10,6 +11,7 @@ use cantap_wire::{CHANNELS, Channel};
 
 use crate::flow::Flow;
 use crate::stream::{ClientId, Counts, Entry, Gap, View, Views, count, shown};
+use crate::totals::Totals;
 
 /// Limit for records waiting for a client: six seconds of two saturated channels, in at most 15 MB, which clients share if they wait for
 /// the same records.
@@ -75,11 +77,13 @@ pub struct Outbox {
     queue: Mutex<Queue>,
     changed: Condvar,
     most_records: usize,
+    /// Frames of each channel lost here since the client came.
+    lost: [AtomicU64; CHANNELS],
 }
 
 impl Outbox {
     pub fn new(most_records: usize) -> Self {
-        Self { queue: Mutex::default(), changed: Condvar::new(), most_records }
+        Self { queue: Mutex::default(), changed: Condvar::new(), most_records, lost: Default::default() }
     }
 
     fn lock(&self) -> MutexGuard<'_, Queue> {
@@ -106,10 +110,12 @@ impl Outbox {
             seen += 1;
             let is_own = entry.owner.is_some_and(|owner| owner.client == client);
             count(counts, &record, is_own);
-            if !has_room
-                && let Some(channel) = queue.gap.get_or_insert_default().absorb(entry.ticks, &record)
-                && !matches!(record, cantap_wire::record::Record::Received(_))
+            if !has_room && let Some(channel) = queue.gap.get_or_insert_default().absorb(entry.ticks, &record)
             {
+                self.count_lost(channel);
+                if matches!(record, cantap_wire::record::Record::Received(_)) {
+                    continue;
+                }
                 // The client will count it as both received and lost.
                 let frames = &mut counts[channel.index()].frames;
                 *frames = frames.wrapping_add(1);
@@ -155,6 +161,18 @@ impl Outbox {
     pub fn give_up(&self, frames: [u32; CHANNELS]) {
         for (sum, frames) in self.lock().given_up.iter_mut().zip(frames) {
             *sum = sum.wrapping_add(frames);
+        }
+    }
+
+    /// Counts a frame that is not sent to the client.
+    pub fn count_lost(&self, channel: Channel) {
+        self.lost[channel.index()].fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Adds what was lost here.
+    pub fn add_lost(&self, totals: &mut Totals) {
+        for (of, lost) in totals.iter_mut().zip(&self.lost) {
+            of.lost_host += lost.load(Ordering::Relaxed);
         }
     }
 

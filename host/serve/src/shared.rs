@@ -8,10 +8,13 @@ use cantap::DeviceError;
 use cantap::session::Requests;
 use cantap_wire::message::{ChannelConfig, Mode};
 use cantap_wire::{CHANNELS, Command, Refusal, Reply};
+use serde_json::json;
 
+use crate::audit::{Audit, who};
 use crate::log_limit::LogLimit;
 use crate::news::News;
 use crate::outbox::MOST_RECORDS;
+use crate::permissions::{Denied, Permissions, Permit};
 use crate::state::{State, Then};
 use crate::stream::ClientId;
 
@@ -34,6 +37,12 @@ pub struct Settings {
     /// How channels are opened for clients that only listen: with `true`, so that the board acknowledges, and no client that sends takes
     /// it off the bus.
     pub always_acknowledges: bool,
+    /// A board that is not there at the start is waited for.
+    pub waits_for_board: bool,
+    /// A client whose first frame opened a channel for sending, because its protocol has no other way to ask for that, only listens again
+    /// after sending nothing for this long; `None` for never. Until then the board acknowledges for it, and nobody knows whether it is
+    /// still there.
+    pub idle_sender: Option<Duration>,
     /// Periodic frames and replies of a client on another computer that has said nothing for this long are stopped; `None` for never.
     pub dead_man: Option<Duration>,
 }
@@ -53,6 +62,8 @@ impl Default for Settings {
             most_clients: 32,
             keep_mode: Duration::from_secs(10),
             always_acknowledges: false,
+            waits_for_board: false,
+            idle_sender: Some(Duration::from_mins(1)),
             dead_man: Some(Duration::from_secs(2)),
         }
     }
@@ -73,6 +84,13 @@ pub(crate) struct Shared {
     pub next_client: AtomicU64,
     pub news: Box<dyn Fn(News) + Send + Sync>,
     pub refusals: Mutex<LogLimit>,
+    /// The same for requests that are not permitted.
+    pub not_permitted: Mutex<LogLimit>,
+    /// Those of certificates, and the number of the board's first channel.
+    pub permissions: Mutex<Option<(Arc<Permissions>, usize)>>,
+    pub audit: Mutex<Option<Arc<Audit>>>,
+    /// Connections and requests that were refused.
+    pub refused: AtomicU64,
 }
 
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -86,13 +104,47 @@ impl Shared {
     }
 
     pub fn tell(&self, news: News) {
-        if let News::Refused { .. } = news {
-            let Some(count) = lock(&self.refusals).pass(Instant::now()) else { return };
+        let limit = match news {
+            News::Refused { .. } => Some(&self.refusals),
+            News::NotPermitted { .. } => Some(&self.not_permitted),
+            _ => None,
+        };
+        if let Some(limit) = limit {
+            self.refused.fetch_add(1, Ordering::Relaxed);
+            let Some(count) = lock(limit).pass(Instant::now()) else { return };
             if count > 0 {
-                (self.news)(News::RefusedMore { count });
+                self.report(News::RefusedMore { count });
             }
         }
+        self.report(news);
+    }
+
+    fn report(&self, news: News) {
+        self.note(|| {
+            let mut event = news.client().map_or_else(|| json!({}), who);
+            event["event"] = json!(news.event());
+            event["text"] = json!(news.to_string());
+            event
+        });
         (self.news)(news);
+    }
+
+    /// What the client with a certificate of this name may do now, unless nothing is restricted, and the number of the board's first
+    /// channel, from 0.
+    pub fn permit_of(&self, certificate: &str) -> Result<Option<(Permit, usize)>, Denied> {
+        let permissions = lock(&self.permissions).clone();
+        let Some((permissions, number)) = permissions else { return Ok(None) };
+        Ok(Some((permissions.of(certificate)?.clone(), number)))
+    }
+
+    /// Adds to the audit log, if there is one.
+    pub fn note(&self, event: impl FnOnce() -> serde_json::Value) {
+        let audit = lock(&self.audit).clone();
+        if let Some(audit) = audit {
+            let mut event = event();
+            event["board"] = json!(self.name);
+            audit.note(event);
+        }
     }
 
     pub fn next_client(&self) -> ClientId {
@@ -153,6 +205,9 @@ pub enum Refused {
     /// There are as many as allowed.
     #[error("there are {0} clients already")]
     TooMany(usize),
+    /// Its certificate's permissions do not let it in.
+    #[error(transparent)]
+    NotPermitted(Denied),
     /// The server is ending.
     #[error("the server ends")]
     Over,

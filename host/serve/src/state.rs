@@ -11,6 +11,7 @@ use cantap_wire::{CHANNELS, Channel, Command, Event, Hello, Refusal};
 
 use crate::outbox::{Item, Outbox};
 use crate::stream::{ClientId, Counts, Entry, Owner, Views};
+use crate::totals::{Totals, count};
 
 /// Tags in a board's queue wrap here: far below the board's own tags, far above the number in flight.
 const TAGS: u32 = 1 << 30;
@@ -162,6 +163,8 @@ pub struct State {
     pub entries: [Entries; CHANNELS],
     /// Frames to send once more, with their channel, when the lock is free.
     pub again: Vec<(Channel, TxFrame)>,
+    /// Since the start, without what connected clients have lost.
+    totals: Totals,
     /// Number of clients being written to.
     pub writers: usize,
     /// The server is ending: nobody else is admitted.
@@ -180,6 +183,20 @@ impl State {
     /// Number of a client's frames in flight on a channel.
     pub fn under_way(&self, client: ClientId, channel: Channel) -> usize {
         self.sent.values().filter(|sent| sent.client == client && sent.channel == channel).count()
+    }
+
+    /// What was counted since the start.
+    pub fn totals(&self) -> Totals {
+        let mut totals = self.totals;
+        self.clients.values().for_each(|member| member.outbox.add_lost(&mut totals));
+        totals
+    }
+
+    /// Removes a client.
+    pub fn remove(&mut self, client: ClientId) {
+        if let Some(member) = self.clients.remove(&client) {
+            member.outbox.add_lost(&mut self.totals);
+        }
     }
 
     /// Whether another client has a channel open, and whether one of them may send on it.
@@ -289,6 +306,9 @@ impl State {
     pub fn deliver(&mut self, chunk: &mut Vec<Entry>) {
         if chunk.is_empty() {
             return;
+        }
+        for entry in &*chunk {
+            count(&mut self.totals, entry);
         }
         let chunk = std::mem::take(chunk).into();
         for (id, member) in &mut self.clients {

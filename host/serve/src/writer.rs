@@ -15,11 +15,22 @@ use crate::stream::{ClientId, Gap, Views, shown};
 /// How often to check whether the connection is over while there is nothing to write.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
 /// A client that takes nothing for this long is gone: a peer that was switched off sends nothing.
-const PATIENCE: Duration = Duration::from_secs(30);
-const TOOK_NOTHING: &str = "it took nothing for 30 s";
+pub const PATIENCE: Duration = Duration::from_secs(30);
+/// The same for one that may send: the board acknowledges for it.
+pub const SENDER_PATIENCE: Duration = Duration::from_secs(5);
 
-/// Writes until nothing follows. An error says why the client is dropped.
-pub fn run(outbox: &Outbox, output: &mut dyn Write, client: ClientId) -> Result<(), String> {
+/// Why a client that took nothing for this long is dropped.
+pub fn took_nothing(patience: Duration) -> String {
+    format!("it took nothing for {} s", patience.as_secs())
+}
+
+/// Writes until nothing follows; `patience` is asked for how long a client may take nothing. An error says why the client is dropped.
+pub fn run(
+    outbox: &Outbox,
+    output: &mut dyn Write,
+    client: ClientId,
+    patience: &dyn Fn() -> Duration,
+) -> Result<(), String> {
     let mut encoder = Encoder::new(client);
     let mut moved = Instant::now();
     loop {
@@ -28,7 +39,7 @@ pub fn run(outbox: &Outbox, output: &mut dyn Write, client: ClientId) -> Result<
             encoder.stream.answer(answer);
         }
         if !work.given_up.is_empty() {
-            outbox.give_up(encoder.give_up(work.given_up));
+            outbox.give_up(encoder.give_up(work.given_up, outbox));
         }
         for item in work.items {
             encoder.take(item);
@@ -37,10 +48,10 @@ pub fn run(outbox: &Outbox, output: &mut dyn Write, client: ClientId) -> Result<
         let bytes = encoder.stream.bytes();
         if !bytes.is_empty() || !outbox.is_held_up() {
             moved = Instant::now();
-        } else if moved.elapsed() >= PATIENCE {
-            return Err(TOOK_NOTHING.to_owned());
+        } else {
+            check(moved, patience)?;
         }
-        write(output, bytes, outbox)?;
+        write(output, bytes, outbox, patience)?;
         outbox.wrote(bytes.len());
         encoder.stream.clear_bytes();
         if work.is_last {
@@ -49,7 +60,17 @@ pub fn run(outbox: &Outbox, output: &mut dyn Write, client: ClientId) -> Result<
     }
 }
 
-fn write(output: &mut dyn Write, mut bytes: &[u8], outbox: &Outbox) -> Result<(), String> {
+fn check(moved: Instant, patience: &dyn Fn() -> Duration) -> Result<(), String> {
+    let patience = patience();
+    if moved.elapsed() >= patience { Err(took_nothing(patience)) } else { Ok(()) }
+}
+
+fn write(
+    output: &mut dyn Write,
+    mut bytes: &[u8],
+    outbox: &Outbox,
+    patience: &dyn Fn() -> Duration,
+) -> Result<(), String> {
     let mut moved = Instant::now();
     let mut closing: Option<Instant> = None;
     while !bytes.is_empty() {
@@ -60,9 +81,7 @@ fn write(output: &mut dyn Write, mut bytes: &[u8], outbox: &Outbox) -> Result<()
                 moved = Instant::now();
             }
             Err(error) if is_idle(&error) => {
-                if moved.elapsed() >= PATIENCE {
-                    return Err(TOOK_NOTHING.to_owned());
-                }
+                check(moved, patience)?;
                 // At the end, a client that does not read is not waited for.
                 let is_late = |since: &mut Instant| since.elapsed() >= Duration::from_secs(1);
                 if outbox.is_closed() && is_late(closing.get_or_insert_with(Instant::now)) {
@@ -123,7 +142,7 @@ impl Encoder {
 
     /// What is not sent any more is a loss where it would have stood. Returns the frames of each channel that count as such only by
     /// being lost: those that others sent.
-    fn give_up(&mut self, items: Vec<Item>) -> [u32; CHANNELS] {
+    fn give_up(&mut self, items: Vec<Item>, outbox: &Outbox) -> [u32; CHANNELS] {
         let mut others = [0; CHANNELS];
         let mut lost = Gap::default();
         for item in items {
@@ -132,6 +151,9 @@ impl Encoder {
                     for entry in chunk.iter() {
                         let Some(record) = shown(entry, self.client, &self.views) else { continue };
                         let channel = lost.absorb(entry.ticks, &record);
+                        if let Some(channel) = channel {
+                            outbox.count_lost(channel);
+                        }
                         if let Some(channel) = channel.filter(|_| !matches!(record, Record::Received(_))) {
                             others[channel.index()] += 1;
                         }

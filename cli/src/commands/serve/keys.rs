@@ -7,6 +7,7 @@ use std::process::ExitCode;
 use cantap_address::server::role;
 use cantap_serve::Role;
 use cantap_serve::tls::{Files, Keys, LIFETIME_DAYS, Server};
+use cantap_trace::clean;
 
 use crate::usage_error::usage;
 
@@ -23,6 +24,12 @@ pub enum Command {
         /// A client and its maximum role: alice:listen, bob:send. Can be repeated.
         #[arg(long = "client", value_name = "NAME:ROLE", value_parser = named_role)]
         clients: Vec<(String, Role)>,
+        /// Make a new key and certificate for a client, with the same role. Can be repeated.
+        #[arg(long, value_name = "NAME")]
+        renew: Vec<String>,
+        /// Put a client's certificate on the list of those that are let in no more (revoked.pem, for --revoked). Can be repeated.
+        #[arg(long, value_name = "NAME")]
+        revoke: Vec<String>,
         /// How long the certificates made now are valid, in days.
         #[arg(long, value_name = "DAYS", default_value_t = LIFETIME_DAYS, value_parser = clap::value_parser!(u32).range(1..=3650))]
         days: u32,
@@ -45,25 +52,46 @@ fn named_role(text: &str) -> Result<(String, Role), String> {
 impl Command {
     /// Makes keys and lists them.
     pub fn run(&self) -> anyhow::Result<ExitCode> {
-        let Self::Keygen { folder, hosts, clients, days } = self;
+        let Self::Keygen { folder, hosts, clients, renew, revoke, days } = self;
         let has_server = Keys::files(folder, "server").certificate.exists();
         if !has_server && hosts.is_empty() {
             return Err(usage(
                 "name the server's computer with --host, as clients will; repeat it for each name and address",
             ));
         }
-        make(folder, hosts, clients, *days)
+        let keys = Keys::in_folder(folder)?.lasting(*days);
+        // In this order, `--revoke NAME --renew NAME` locks the old certificate out and not the new one.
+        for name in revoke {
+            let list = keys.revoke_client(name)?;
+            writeln!(io::stdout(), "{}", list.display())?;
+            eprintln!(
+                "cantap: '{}' is revoked: give the list to the server with --revoked, and send it SIGHUP",
+                clean::line(name)
+            );
+        }
+        let mut made = Vec::new();
+        for name in renew {
+            made.push(keys.renew_client(name)?);
+        }
+        make(&keys, hosts, clients, made, *days)
     }
 }
 
-fn make(folder: &Path, hosts: &[String], clients: &[(String, Role)], days: u32) -> anyhow::Result<ExitCode> {
-    let keys = Keys::in_folder(folder)?.lasting(days);
-    let mut made = Vec::new();
+fn make(
+    keys: &Keys,
+    hosts: &[String],
+    clients: &[(String, Role)],
+    mut made: Vec<Files>,
+    days: u32,
+) -> anyhow::Result<ExitCode> {
     if !hosts.is_empty() {
         made.push(keys.add_server(hosts)?);
     }
     for (name, role) in clients {
         made.push(keys.add_client(name, *role)?);
+    }
+    if made.is_empty() {
+        return Ok(ExitCode::SUCCESS);
     }
     let mut out = io::stdout().lock();
     for files in made {
@@ -78,7 +106,11 @@ fn make(folder: &Path, hosts: &[String], clients: &[(String, Role)], days: u32) 
 }
 
 /// The server's side: its certificate and key, and the authority of its clients.
-pub fn server((certificate, key): &(PathBuf, PathBuf), authority: &Path) -> anyhow::Result<Server> {
+pub fn server(
+    (certificate, key): &(PathBuf, PathBuf),
+    authority: &Path,
+    revoked: Option<&Path>,
+) -> anyhow::Result<Server> {
     let files = Files { certificate: certificate.clone(), key: key.clone(), authority: authority.to_owned() };
-    Ok(Server::new(&files)?)
+    Ok(Server::new(&files, revoked)?)
 }

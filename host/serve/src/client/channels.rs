@@ -3,12 +3,13 @@
 
 use std::time::{Duration, Instant};
 
+use cantap::device::channel_number;
 use cantap_wire::message::{ChannelConfig, Filter, FrameKind, Mode, Role};
 use cantap_wire::{Channel, Command, Refusal, Reply};
 
 use super::Client;
 use crate::News;
-use crate::shared::only_listens;
+use crate::shared::{lock, only_listens};
 use crate::state::{State, Then, for_all};
 
 /// What a board captured before it was asked for its time has arrived by this time.
@@ -25,7 +26,7 @@ enum Way {
 }
 
 impl Client {
-    fn is_open(&self, channel: Channel) -> bool {
+    pub(super) fn is_open(&self, channel: Channel) -> bool {
         self.with(|_, member| member.views[channel.index()].config.is_some())
     }
 
@@ -41,6 +42,10 @@ impl Client {
                 _ => return Err(Refusal::NothingSaved),
             },
         };
+        self.must_be_permitted(Role::Listen, |permit, number| {
+            permit.channel(channel_number(number, channel))?;
+            permit.mode(wanted.mode)
+        })?;
         let way = self.way(channel, &wanted)?;
         let then = || Then::Opened { client: Some((self.id, wanted)), channel };
         let config = Some(self.shared.on_board(channel, wanted));
@@ -110,6 +115,7 @@ impl Client {
         if !self.is_open(channel) {
             return Ok(());
         }
+        lock(&self.budget).clear(channel);
         let sends = self.with(|_, member| member.views[channel.index()].transmits());
         let (any_other, other_sends) = self.shared.state().others_on(self.id, channel);
         if sends && any_other {

@@ -6,8 +6,12 @@ use cantap_wire::message::{Periodic, Role, Trigger, TxFrame};
 use cantap_wire::record::TransmitFailure;
 use cantap_wire::{Channel, Command, Event, Refusal, Reply};
 
+use serde_json::json;
+
 use super::Client;
 use crate::News;
+use crate::permissions::Denied;
+use crate::shared::lock;
 use crate::state::{Table, Then, clears};
 use crate::stream::{Entry, Owner};
 
@@ -37,7 +41,20 @@ impl Client {
         if frames.iter().any(|frame| frame.tag >= cantap_wire::message::DEVICE_TAG) {
             return Err(Refusal::BadTag);
         }
+        self.must_be_permitted(Role::Send, |permit, _| {
+            frames.iter().try_for_each(|frame| permit.send(frame.frame.id()))
+        })?;
         let deadline = Instant::now() + ROOM_TIMEOUT;
+        if let Some(most) = self.frames_per_second() {
+            while !lock(&self.budget).take(frames.len(), most, Instant::now()) {
+                if Instant::now() >= deadline || self.outbox.is_closed() {
+                    let (client, reason) = (self.name.clone(), Denied::Rate(most).to_string());
+                    self.shared.tell(News::NotPermitted { client, reason });
+                    return Err(Refusal::QueueFull { free: 0 });
+                }
+                std::thread::sleep(Duration::from_millis(2));
+            }
+        }
         loop {
             let noted: heapless::Vec<TxFrame, { cantap_wire::message::MAX_SEND }> = {
                 let mut state = self.shared.state();
@@ -58,9 +75,18 @@ impl Client {
                 Err(Refusal::QueueFull { .. }) if Instant::now() < deadline && !self.outbox.is_closed() => {
                     std::thread::sleep(Duration::from_millis(2));
                 }
-                result => return result,
+                result => {
+                    if result.is_ok() {
+                        lock(&self.sent)[channel.index()] += frames.len() as u64;
+                    }
+                    return result;
+                }
             }
         }
+    }
+
+    fn frames_per_second(&self) -> Option<u32> {
+        self.permit.as_ref().and_then(|(permit, _)| permit.frames_per_second)
     }
 
     /// Takes the client's frames out of the board's queue. Those of others are still sent.
@@ -90,6 +116,7 @@ impl Client {
             let _ = self.shared.ask(clears(*table, channel, *entry), Then::Nothing);
             self.shared.state().entries[channel.index()].free(*table, *entry);
         }
+        lock(&self.budget).clear(channel);
         entries.into_iter().map(|(table, _, slot)| table.tag() + u32::from(slot)).collect()
     }
 
@@ -120,9 +147,32 @@ impl Client {
         slot: u8,
         entry: Option<Periodic>,
     ) -> Result<Reply, Refusal> {
+        let tick_hz = self.with(|state, _| state.hello.as_ref().map_or(0, |hello| hello.tick_hz));
+        if let Some(entry) = &entry {
+            let rate = f64::from(tick_hz) / f64::from(entry.period_ticks.max(1));
+            self.must_be_permitted(Role::Send, |permit, _| {
+                permit.send(entry.frame.id())?;
+                let Some(most) = permit.frames_per_second else { return Ok(()) };
+                let fits = lock(&self.budget).set_periodic(channel, slot, rate, most);
+                if fits { Ok(()) } else { Err(Denied::Rate(most)) }
+            })?;
+        }
+        let noted = entry.as_ref().map(|entry| {
+            let period_ms = f64::from(entry.period_ticks) * 1e3 / f64::from(tick_hz.max(1));
+            json!({ "periodic": slot, "frame": entry.frame.to_string(), "period_ms": period_ms })
+        });
+        let is_cleared = entry.is_none();
         let command = |slot, entry| Command::SetPeriodic { channel, slot, entry };
         let slots = self.with(|state, _| state.hello.as_ref().map_or(0, |hello| hello.periodic_slots));
-        self.set_entry(Table::Periodic, channel, slot, slots, entry, command)
+        let result = self.set_entry(Table::Periodic, channel, slot, slots, entry, command);
+        if result.is_err() || is_cleared {
+            lock(&self.budget).clear_periodic(channel, slot);
+        }
+        if result.is_ok() {
+            let event = if is_cleared { "cleared" } else { "set" };
+            self.note(event, channel, || noted.unwrap_or_else(|| json!({ "periodic": slot })));
+        }
+        result
     }
 
     pub(super) fn set_trigger(
@@ -131,9 +181,21 @@ impl Client {
         slot: u8,
         entry: Option<Trigger>,
     ) -> Result<Reply, Refusal> {
+        if let Some(entry) = &entry {
+            self.must_be_permitted(Role::Send, |permit, _| {
+                permit.send(entry.reply.id())?;
+                permit.frames_per_second.map_or(Ok(()), |most| Err(Denied::Replies(most)))
+            })?;
+        }
+        let noted = entry.as_ref().map(|entry| json!({ "reply": slot, "frame": entry.reply.to_string() }));
         let command = |slot, entry| Command::SetTrigger { channel, slot, entry };
         let slots = self.with(|state, _| state.hello.as_ref().map_or(0, |hello| hello.trigger_slots));
-        self.set_entry(Table::Triggers, channel, slot, slots, entry, command)
+        let result = self.set_entry(Table::Triggers, channel, slot, slots, entry, command);
+        if result.is_ok() {
+            let event = if noted.is_none() { "cleared" } else { "set" };
+            self.note(event, channel, || noted.unwrap_or_else(|| json!({ "reply": slot })));
+        }
+        result
     }
 
     fn set_entry<E>(

@@ -25,8 +25,9 @@ use cantap_wire::{Channel, Frame, Id};
 
 use crate::foreign;
 use crate::lines::device_of;
-use crate::listen::{Listening, accept, bind};
+use crate::listen::{Listening, accept, bind, patience};
 use crate::places::{Place, Places, ends};
+use crate::writer::took_nothing;
 use crate::{Board, News};
 use command::{BadCommand, Command, Finder};
 use hearing::{Hearing, Hears};
@@ -49,8 +50,6 @@ const KEEP_ALIVE_EVERY: Duration = Duration::from_secs(7);
 const KEEP_ALIVE: &str = "< echo >";
 /// A client that has not opened a bus by this time is dropped.
 const OPEN_TIMEOUT: Duration = Duration::from_secs(30);
-/// A client that takes nothing for this long is considered gone.
-const PATIENCE: Duration = Duration::from_secs(30);
 /// Limit for connections at a time, including those that have not opened a bus.
 const MOST_CONNECTIONS: usize = 32;
 
@@ -78,7 +77,7 @@ pub fn listen(boards: &[Arc<Board>], address: SocketAddr, role: Role) -> io::Res
             beacon.send();
             sent = Some(Instant::now());
         }
-        let (stream, peer) = accept(&listener)?;
+        let (stream, peer) = accept(&listener, role)?;
         let name = format!("socketcand client {peer}");
         let place = match places.enter(Some(peer.ip()), ends(&stream)?) {
             Ok(place) => place,
@@ -178,6 +177,10 @@ struct Opened {
     /// The mode for sending, if it may send.
     sends_in: Option<Mode>,
     next_tag: u32,
+    /// When it last had something sent.
+    sent_at: Instant,
+    /// After sending nothing for this long, it only listens again.
+    idle_after: Option<Duration>,
     /// Frames sent repeatedly, by entry.
     periodic: HashMap<Id, (u8, u64)>,
 }
@@ -266,8 +269,15 @@ impl Connection {
             if lock(&self.hearing).has_chosen {
                 place.is_served();
             }
-            if opened.is_none() && came.elapsed() > OPEN_TIMEOUT {
-                break;
+            match &mut opened {
+                None if came.elapsed() > OPEN_TIMEOUT => break,
+                None => {}
+                Some(bus) => {
+                    if let Err(reason) = self.listen_again(bus) {
+                        self.refused(&reason);
+                        break;
+                    }
+                }
             }
         }
         self.is_over.store(true, Ordering::Relaxed);
@@ -302,7 +312,13 @@ impl Connection {
             return Ok(());
         }
         *lock(&self.told_at) = Instant::now();
-        write_patiently(&mut *lock(&self.output), text.as_bytes(), PATIENCE)
+        let patience = patience(self.role);
+        let written = write_patiently(&mut *lock(&self.output), text.as_bytes(), patience);
+        if written.as_ref().is_err_and(is_idle) && !self.is_over.swap(true, Ordering::Relaxed) {
+            let (client, reason) = (self.name.clone(), Some(took_nothing(patience)));
+            self.buses[0].board.tell(News::ClientLeft { client, reason });
+        }
+        written
     }
 
     /// Carries out one command. Returns what to answer.
@@ -392,6 +408,7 @@ impl Connection {
             Command::Delete(id) => match bus.periodic.remove(&id) {
                 Some((slot, _)) => {
                     lock(&self.hearing).own_entries.remove(&id);
+                    bus.sent_at = Instant::now();
                     bus.device.set_periodic(bus.channel, slot, None).map_err(|error| error.to_string())
                 }
                 None => Err(format!("nothing is sent periodically as {id}")),
@@ -430,7 +447,16 @@ impl Connection {
             .name("cantap-socketcand-hears".to_owned())
             .spawn(move || connection.hear(&heard))
             .map_err(|error| error.to_string())?;
-        Ok(Opened { device, channel, config, sends_in, next_tag: 0, periodic: HashMap::new() })
+        Ok(Opened {
+            device,
+            channel,
+            config,
+            sends_in,
+            next_tag: 0,
+            sent_at: Instant::now(),
+            idle_after: bus.board.idle_sender(),
+            periodic: HashMap::new(),
+        })
     }
 
     /// Sends the client what is received, until either side ends.
@@ -477,9 +503,25 @@ impl Connection {
     /// Opens the bus for sending, when a client sends.
     fn may_send(&self, bus: &mut Opened) -> Result<(), String> {
         let Some(mode) = bus.sends_in else { return Err("the bus was opened to listen only".to_owned()) };
-        if bus.config.mode == mode {
+        bus.sent_at = Instant::now();
+        if bus.config.mode == mode { Ok(()) } else { self.change_mode(bus, mode) }
+    }
+
+    /// Only listens again, if nothing was sent for long enough: a client need not say anything, and one that has been stopped would keep
+    /// the board acknowledging for ever.
+    fn listen_again(&self, bus: &mut Opened) -> Result<(), String> {
+        let Some(after) = bus.idle_after else { return Ok(()) };
+        let sends = bus.config.mode != Mode::ListenOnly;
+        if !sends || !bus.periodic.is_empty() || bus.sent_at.elapsed() < after {
             return Ok(());
         }
+        self.change_mode(bus, Mode::ListenOnly)?;
+        let (client, channel) = (self.name.clone(), bus.channel);
+        self.buses[0].board.tell(News::Idle { client, channel, after });
+        Ok(())
+    }
+
+    fn change_mode(&self, bus: &mut Opened, mode: Mode) -> Result<(), String> {
         let said = |error: DeviceError| error.to_string();
         let config = ChannelConfig { mode, ..bus.config };
         bus.device.close_channel(bus.channel).map_err(said)?;

@@ -168,6 +168,6 @@ mod tests {
         assert_eq!(all.ripe(11_000_000), [(5_000_000, "123#03".parse().unwrap())]);
         assert!(all.ripe(40_000_000).is_empty());
         all.remove(Id::standard(ID).unwrap());
-        assert_eq!(passed_on(&mut all, &[(90, "123#01")]), []);
+        assert_eq!(passed_on(&mut all, &[(90, "123#01")]), [0_i64; 0]);
     }
 }

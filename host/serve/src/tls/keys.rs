@@ -2,15 +2,17 @@
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use cantap_wire::message::Role;
 use rcgen::{
-    BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
-    KeyUsagePurpose, date_time_ymd,
+    BasicConstraints, CertificateParams, CertificateRevocationListParams, DnType, ExtendedKeyUsagePurpose,
+    IsCa, Issuer, KeyIdMethod, KeyPair, KeyUsagePurpose, RevokedCertParams, SerialNumber, date_time_ymd,
 };
+use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, CertificateRevocationListDer};
 
-use super::{Files, name_of};
+use super::{Files, is_name, name_of, role_of};
 
 /// How long the authority's certificate is valid, in days.
 const AUTHORITY_DAYS: u32 = 10 * 365;
@@ -22,6 +24,8 @@ const ALLOWANCE_S: u64 = 86_400;
 const SERVER: &str = "server";
 /// The name of the authority's files.
 const AUTHORITY: &str = "ca";
+/// The file with the authority's list of revoked certificates.
+pub const REVOKED: &str = "revoked.pem";
 
 /// Why keys could not be made.
 #[derive(Debug, thiserror::Error)]
@@ -35,6 +39,9 @@ pub enum KeysError {
     /// A server's certificate must be for a name, or whoever has it could stand in for all.
     #[error("'{0}' is not the name or address of one computer; name each by which clients reach the server")]
     Host(String),
+    /// It is no client's certificate.
+    #[error("'{}' is not a client's certificate made by keygen", .0.display())]
+    NotOurs(PathBuf),
     /// A file could not be written or read.
     #[error("'{}': {source}", path.display())]
     File {
@@ -89,11 +96,59 @@ impl Keys {
 
     /// Makes a client's certificate, which contains its maximum role.
     pub fn add_client(&self, name: &str, role: Role) -> Result<Files, KeysError> {
-        let is_plain = |letter: char| letter.is_ascii_alphanumeric() || matches!(letter, '-' | '_');
-        if name.is_empty() || !name.chars().all(is_plain) || name.ends_with("-key") {
-            return Err(KeysError::Name(name.to_owned()));
-        }
+        client_name(name)?;
         self.add(name, vec![name_of(role)], ExtendedKeyUsagePurpose::ClientAuth)
+    }
+
+    /// Makes a new key and certificate for a client that has one in the folder, with the same role. The old certificate stays valid until
+    /// it expires.
+    pub fn renew_client(&self, name: &str) -> Result<Files, KeysError> {
+        client_name(name)?;
+        let path = Self::files(&self.folder, name).certificate;
+        let role = role_of(&certificate(&path)?).ok_or_else(|| KeysError::NotOurs(path.clone()))?;
+        let key = KeyPair::generate()?;
+        let certificate =
+            self.certificate(name, vec![name_of(role)], ExtendedKeyUsagePurpose::ClientAuth, &key)?;
+        let files = Self::files(&self.folder, name);
+        replace(&files.key, &key.serialize_pem(), true)?;
+        replace(&files.certificate, &certificate, false)?;
+        Ok(files)
+    }
+
+    /// Adds a client's certificate to the list of those that are revoked, and returns the list's file: a server that has it lets the client in
+    /// no more.
+    pub fn revoke_client(&self, name: &str) -> Result<PathBuf, KeysError> {
+        client_name(name)?;
+        let path = Self::files(&self.folder, name).certificate;
+        let der = certificate(&path)?;
+        let serial = match webpki::EndEntityCert::try_from(&der) {
+            Ok(certificate) if role_of(&der).is_some() => certificate.serial().to_vec(),
+            _ => return Err(KeysError::NotOurs(path)),
+        };
+        let list = self.folder.join(REVOKED);
+        let mut all = if list.exists() { revoked(&list)? } else { Vec::new() };
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
+        if all.iter().all(|(there, _)| *there != serial) {
+            all.push((serial, now));
+        }
+        let entry = |(serial, at): &(Vec<u8>, u64)| RevokedCertParams {
+            serial_number: SerialNumber::from_slice(serial),
+            revocation_time: date_time_ymd(1970, 1, 1) + Duration::from_secs(*at),
+            reason_code: None,
+            invalidity_date: None,
+        };
+        let params = CertificateRevocationListParams {
+            this_update: date_time_ymd(1970, 1, 1) + Duration::from_secs(now),
+            next_update: date_time_ymd(1970, 1, 1)
+                + Duration::from_secs(now + u64::from(AUTHORITY_DAYS) * 86_400),
+            crl_number: SerialNumber::from(now),
+            issuing_distribution_point: None,
+            revoked_certs: all.iter().map(entry).collect(),
+            key_identifier_method: KeyIdMethod::Sha256,
+        };
+        let signed = params.signed_by(&Issuer::from_params(&authority(), &self.key))?;
+        replace(&list, &signed.pem()?, false)?;
+        Ok(list)
     }
 
     /// The files with a name, together with the authority's certificate.
@@ -112,13 +167,23 @@ impl Keys {
         purpose: ExtendedKeyUsagePurpose,
     ) -> Result<Files, KeysError> {
         let key = KeyPair::generate()?;
+        let certificate = self.certificate(name, hosts, purpose, &key)?;
+        self.write(name, &certificate, &key)?;
+        Ok(Self::files(&self.folder, name))
+    }
+
+    fn certificate(
+        &self,
+        name: &str,
+        hosts: Vec<String>,
+        purpose: ExtendedKeyUsagePurpose,
+        key: &KeyPair,
+    ) -> Result<String, KeysError> {
         let mut params = lasting(CertificateParams::new(hosts)?, name, self.days);
         params.extended_key_usages = vec![purpose];
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
         params.use_authority_key_identifier_extension = true;
-        let certificate = params.signed_by(&key, &Issuer::from_params(&authority(), &self.key))?;
-        self.write(name, &certificate.pem(), &key)?;
-        Ok(Self::files(&self.folder, name))
+        Ok(params.signed_by(key, &Issuer::from_params(&authority(), &self.key))?.pem())
     }
 
     fn write(&self, name: &str, certificate: &str, key: &KeyPair) -> Result<(), KeysError> {
@@ -137,6 +202,43 @@ impl Keys {
         }
         Ok(())
     }
+}
+
+fn client_name(name: &str) -> Result<(), KeysError> {
+    let is_own = [SERVER, AUTHORITY].contains(&name) || name.ends_with("-key");
+    if is_name(name) && !is_own { Ok(()) } else { Err(KeysError::Name(name.to_owned())) }
+}
+
+/// The certificate in a file.
+fn certificate(path: &Path) -> Result<CertificateDer<'static>, KeysError> {
+    CertificateDer::from_pem_file(path).map_err(|error| unreadable(path, error))
+}
+
+fn unreadable(path: &Path, error: impl std::fmt::Display) -> KeysError {
+    KeysError::File { path: path.to_owned(), source: io::Error::other(error.to_string()) }
+}
+
+/// The serial numbers on a list, and when each was put there, in seconds since the Unix epoch.
+fn revoked(path: &Path) -> Result<Vec<(Vec<u8>, u64)>, KeysError> {
+    let der = CertificateRevocationListDer::from_pem_file(path).map_err(|error| unreadable(path, error))?;
+    let list = webpki::BorrowedCertRevocationList::from_der(&der).map_err(|error| unreadable(path, error))?;
+    list.into_iter()
+        .map(|entry| match entry {
+            Ok(entry) => Ok((entry.serial_number.to_vec(), entry.revocation_date.as_secs())),
+            Err(error) => Err(unreadable(path, error)),
+        })
+        .collect()
+}
+
+/// Puts a new content in the place of a file of ours, in one step.
+fn replace(path: &Path, text: &str, is_secret: bool) -> Result<(), KeysError> {
+    let new = path.with_extension("new");
+    let failed = |source| KeysError::File { path: path.to_owned(), source };
+    create(&new, text, is_secret).map_err(|source| match source.kind() {
+        io::ErrorKind::AlreadyExists => KeysError::There(new.clone()),
+        _ => failed(source),
+    })?;
+    std::fs::rename(&new, path).map_err(failed)
 }
 
 /// The same every time: certificates refer to it by this, and by its key.

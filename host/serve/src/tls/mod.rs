@@ -6,25 +6,31 @@ mod stream;
 use std::io;
 use std::net::{SocketAddr, TcpStream};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use cantap::device::{Link, is_idle};
 use cantap_wire::message::Role;
 use rustls::pki_types::pem::PemObject;
-use rustls::pki_types::{CertificateDer, DnsName, PrivateKeyDer, ServerName};
+use rustls::pki_types::{
+    CertificateDer, CertificateRevocationListDer, DnsName, PrivateKeyDer, ServerName, UnixTime,
+};
 use rustls::server::WebPkiClientVerifier;
+use rustls::server::danger::ClientCertVerifier;
 use rustls::{
     ClientConfig, ClientConnection, Connection, RootCertStore, ServerConfig, ServerConnection, crypto,
 };
 
+use crate::audit::AT;
+use crate::client::Identity;
 use crate::connect::dial;
 use crate::flow::acknowledging;
-use crate::listen::{Arrival, Listening, accept, bind, let_in};
+use crate::listen::{Arrival, Listening, accept, bind, let_in, turn_away};
 use crate::places::{Places, ends};
+use crate::shared::lock;
 use crate::{Board, News};
 
-pub use keys::{Keys, KeysError, LIFETIME_DAYS};
+pub use keys::{Keys, KeysError, LIFETIME_DAYS, REVOKED};
 use stream::{Secured, shake_hands};
 
 /// A peer that has not shown its certificate by this time is dropped.
@@ -127,36 +133,85 @@ fn setup(error: impl std::fmt::Display) -> TlsError {
 
 /// A server that requires a certificate from each client.
 #[derive(Clone)]
-pub struct Server(Arc<ServerConfig>);
+pub struct Server {
+    files: Files,
+    revoked: Option<PathBuf>,
+    trust: Arc<Mutex<Trust>>,
+}
+
+/// What a server shows, and whom it trusts.
+#[derive(Clone)]
+struct Trust {
+    config: Arc<ServerConfig>,
+    clients: Arc<dyn ClientCertVerifier>,
+}
 
 impl Server {
-    /// Reads the files; the authority is that of the clients.
-    pub fn new(files: &Files) -> Result<Self, TlsError> {
+    /// Reads the files; the authority is that of the clients. `revoked` is its list of revoked certificates (PEM): whoever is on it is
+    /// refused, and with a list of another authority, everybody.
+    pub fn new(files: &Files, revoked: Option<&Path>) -> Result<Self, TlsError> {
+        let trust = Trust::read(files, revoked)?;
+        let revoked = revoked.map(Path::to_owned);
+        Ok(Self { files: files.clone(), revoked, trust: Arc::new(Mutex::new(trust)) })
+    }
+
+    /// Reads the files again. If one of them cannot be used, nothing changes. Clients that are no longer trusted are let go within a second.
+    pub fn reload(&self) -> Result<(), TlsError> {
+        let trust = Trust::read(&self.files, self.revoked.as_deref())?;
+        *lock(&self.trust) = trust;
+        Ok(())
+    }
+
+    fn trust(&self) -> Trust {
+        lock(&self.trust).clone()
+    }
+
+    /// Whether a certificate is trusted at this moment.
+    fn check(&self, certificate: &CertificateDer<'_>) -> Result<(), String> {
+        let clients = self.trust().clients;
+        match clients.verify_client_cert(certificate, &[], UnixTime::now()) {
+            Ok(_) => Ok(()),
+            Err(error) => Err(format!("its certificate is no longer trusted: {error}")),
+        }
+    }
+}
+
+impl Trust {
+    fn read(files: &Files, revoked: Option<&Path>) -> Result<Self, TlsError> {
         let Credentials { chain, key, authority } = files.read()?;
-        let clients =
-            WebPkiClientVerifier::builder_with_provider(authority, provider()).build().map_err(setup)?;
+        let mut clients = WebPkiClientVerifier::builder_with_provider(authority, provider());
+        if let Some(path) = revoked {
+            clients = clients.with_crls([revocations(path)?]);
+        }
+        let clients = clients.build().map_err(setup)?;
         let config = ServerConfig::builder_with_provider(provider())
             .with_protocol_versions(&[&rustls::version::TLS13])
             .map_err(setup)?
-            .with_client_cert_verifier(clients)
+            .with_client_cert_verifier(Arc::clone(&clients))
             .with_single_cert(chain, key)
             .map_err(setup)?;
-        Ok(Self(Arc::new(config)))
+        Ok(Self { config: Arc::new(config), clients })
     }
+}
+
+/// The list in a file.
+fn revocations(path: &Path) -> Result<CertificateRevocationListDer<'static>, TlsError> {
+    CertificateRevocationListDer::from_pem_file(path)
+        .map_err(|error| TlsError::File { path: path.to_owned(), reason: error.to_string() })
 }
 
 /// Admits clients at any address of this computer. Each may do what its certificate says, limited to `most`. A client
 /// without a certificate signed by the authority receives nothing.
 pub fn listen(board: &Arc<Board>, address: SocketAddr, most: Role, server: &Server) -> io::Result<Listening> {
     let (listener, address) = bind(address)?;
-    let (board, config) = (Arc::clone(board), Arc::clone(&server.0));
+    let (board, server) = (Arc::clone(board), server.clone());
     let (handshakes, places) = (Places::new(MOST_HANDSHAKES), Places::new(board.most_clients()));
     Listening::start("cantap-tls", Some(address), move || {
-        let (stream, peer) = accept(&listener)?;
+        let (stream, peer) = accept(&listener, most)?;
         let name = format!("client {peer}");
         // Who is let go is not reported: a flood of connections would be a flood of messages.
         let Ok(handshake) = handshakes.enter(Some(peer.ip()), ends(&stream)?) else { return Ok(()) };
-        let (board, config, places) = (Arc::clone(&board), Arc::clone(&config), Arc::clone(&places));
+        let (board, server, places) = (Arc::clone(&board), server.clone(), Arc::clone(&places));
         std::thread::Builder::new().name("cantap-tls-client".to_owned()).spawn(move || {
             let end = ends(&stream);
             let deadline = Instant::now() + HANDSHAKE_TIMEOUT;
@@ -164,13 +219,21 @@ pub fn listen(board: &Arc<Board>, address: SocketAddr, most: Role, server: &Serv
                 return;
             }
             handshake.spoke();
-            let secured = welcome(stream, config, deadline);
+            let secured = welcome(stream, server.trust().config, deadline);
             drop(handshake);
             let secured = secured.and_then(|secured| Ok((secured, places.enter(Some(peer.ip()), end?))));
             match secured {
-                Ok(((role, secured), place)) => {
-                    let (input, output) = secured.split();
-                    let arrival = Arrival { name, role: role.min(most), is_remote: true };
+                Ok(((own, secured), place)) => {
+                    let (input, mut output) = secured.split();
+                    let name = own.name.as_ref().map_or(name, |own| format!("{own}{AT} {peer}"));
+                    let certificate = own.name.unwrap_or_default();
+                    if let Err(denied) = board.permit_of(&certificate) {
+                        turn_away(&board, &mut output, name, &denied);
+                        return;
+                    }
+                    let check = Box::new(move || server.check(&own.der));
+                    let identity = Some(Identity { certificate, check });
+                    let arrival = Arrival { name, role: own.role.min(most), is_remote: true, identity };
                     let_in(&board, place, input, output, arrival);
                 }
                 Err(error) => board.tell(News::Refused { client: name, reason: error.to_string() }),
@@ -191,12 +254,39 @@ fn has_spoken(stream: &TcpStream, deadline: Instant) -> bool {
     false
 }
 
-fn welcome(stream: TcpStream, config: Arc<ServerConfig>, deadline: Instant) -> io::Result<(Role, Secured)> {
+/// What a client's certificate says.
+struct Own {
+    der: CertificateDer<'static>,
+    /// Another authority's certificates may have names that are no good for messages and files, or none.
+    name: Option<String>,
+    role: Role,
+}
+
+fn welcome(stream: TcpStream, config: Arc<ServerConfig>, deadline: Instant) -> io::Result<(Own, Secured)> {
     let connection = ServerConnection::new(config).map_err(io::Error::other)?;
     let secured = shake_hands(stream, Connection::Server(connection), deadline)?;
-    let role = secured.peer_certificate().and_then(|certificate| role_of(&certificate));
-    let role = role.ok_or_else(|| io::Error::other("its certificate says nothing of what it may do"))?;
-    Ok((role, secured))
+    let without = |what: &str| io::Error::other(format!("its certificate says nothing of {what}"));
+    let der = secured.peer_certificate().ok_or_else(|| without("whose it is"))?;
+    let role = role_of(&der).ok_or_else(|| without("what it may do"))?;
+    Ok((Own { name: certificate_name(&der), der, role }, secured))
+}
+
+/// The common name in a certificate, if it is one that `keygen` makes: what it is used for, in messages and files, needs no more.
+fn certificate_name(certificate: &CertificateDer<'_>) -> Option<String> {
+    /// The object identifier 2.5.4.3, as DER has it.
+    const COMMON_NAME: [u8; 5] = [6, 3, 0x55, 4, 3];
+    let certificate = webpki::EndEntityCert::try_from(certificate).ok()?;
+    let subject = certificate.subject();
+    let at = subject.windows(COMMON_NAME.len()).position(|bytes| bytes == COMMON_NAME)?;
+    let [_type, len, rest @ ..] = subject.get(at + COMMON_NAME.len()..)? else { return None };
+    let name = std::str::from_utf8(rest.get(..usize::from(*len))?).ok()?;
+    is_name(name).then(|| name.to_owned())
+}
+
+/// Whether a text is a client's name.
+fn is_name(text: &str) -> bool {
+    let is_plain = |letter: char| letter.is_ascii_alphanumeric() || matches!(letter, '-' | '_');
+    (1..=64).contains(&text.len()) && text.chars().all(is_plain)
 }
 
 /// The name for a role in a client's certificate: one that no computer has.

@@ -5,6 +5,8 @@ mod browser;
 mod eight_clients;
 mod hostile;
 mod line;
+mod metrics;
+mod permissions;
 mod reconnects;
 mod sharing;
 mod slow_line;

@@ -272,6 +272,78 @@ fn a_client_that_could_send_and_says_nothing_is_let_go_and_the_board_only_listen
     drop(stopped);
 }
 
+/// The messages of a socketcand client's server, up to the one that contains this.
+fn read_until(stream: &mut TcpStream, wanted: &str) -> String {
+    let mut heard = String::new();
+    let mut bytes = [0; 4096];
+    while !heard.contains(wanted) {
+        let len = stream.read(&mut bytes).unwrap();
+        assert!(len > 0, "{heard}");
+        heard.push_str(&String::from_utf8_lossy(&bytes[..len]));
+    }
+    heard
+}
+
+/// Its connection may be that of a stopped program, which the system keeps up.
+#[test]
+fn a_socketcand_client_that_sends_no_more_does_not_keep_the_board_acknowledging() {
+    let settings = Settings {
+        keep_mode: Duration::from_millis(100),
+        idle_sender: Some(Duration::from_millis(300)),
+        ..Settings::at(BITRATE_BPS)
+    };
+    let (board, told) = board_at(settings);
+    let server = socketcand::listen(std::slice::from_ref(&board), any_port(), Role::Send).unwrap();
+    let listener = client(&board, "listener", Role::Listen);
+    listener.listen(Channel::Can1, BITRATE_BPS).unwrap();
+    let mut stream = dial(&server);
+    stream.write_all(b"< open can0 >< send 7A1 1 01 >").unwrap();
+    let is_idle = |news: News| matches!(news, News::Idle { channel: Channel::Can1, .. });
+    assert!(told.iter().any(is_idle));
+    wait_until("it only listens", || listens_only(&listener));
+    // It is still there, learns of the gap, and may send again; what the board sends for it is no silence.
+    stream.write_all(b"< rawmode >< add 0 10000 7A2 1 02 >").unwrap();
+    read_until(&mut stream, "< error 20000004 ");
+    let mut records = listener.records();
+    let is_periodic = |record: &Result<cantap::TraceRecord, _>| {
+        record.as_ref().is_ok_and(|record| record.frame().is_some_and(|frame| frame.to_string() == "7A2#02"))
+    };
+    assert_eq!(records.by_ref().filter(is_periodic).take(100).count(), 100);
+    assert!(!listens_only(&listener));
+    stream.write_all(b"< delete 7A2 >").unwrap();
+    assert!(told.iter().any(is_idle));
+    wait_until("it only listens", || listens_only(&listener));
+    // Both changes are gaps for the others, never a zero.
+    listener.stop().unwrap();
+    let off_bus = listener.counters().channels[0].off_bus;
+    assert!(off_bus >= 3, "{off_bus}");
+}
+
+#[test]
+fn a_socketcand_client_that_reads_no_more_is_let_go() {
+    let options: cantap_virtual::Options = "load=100,frames=std0".parse().unwrap();
+    let connect = Box::new(move |_: Option<&str>| Ok(cantap_virtual::start(options.clone())?.into_link()));
+    let settings = Settings { keep_mode: Duration::from_millis(100), ..Settings::at(BITRATE_BPS) };
+    let (news, told) = channel();
+    let board = Board::start("board", connect, settings, move |of| drop(news.send(of))).unwrap();
+    let board = Arc::new(board);
+    let server = socketcand::listen(std::slice::from_ref(&board), any_port(), Role::Send).unwrap();
+    let listener = client(&board, "listener", Role::Listen);
+    listener.listen(Channel::Can2, BITRATE_BPS).unwrap();
+    let mut stream = dial(&server);
+    stream.write_all(b"< open can0 >< rawmode >< send 7A1 1 01 >").unwrap();
+    let is_let_go = |news: News| news.to_string().ends_with("it took nothing for 5 s");
+    assert!(told.iter().any(is_let_go));
+    assert!(told.iter().any(|news| matches!(news, News::ClientLeft { .. })));
+    wait_until("the board leaves the bus", || {
+        let status = listener.request(Command::Registers { channel: Channel::Can1 });
+        // INAK, bit 0 of MSR: initialisation (RM0090 Rev 21, 32.9.2).
+        matches!(status, Ok(Reply::Registers(registers)) if registers.now.msr & 1 == 1)
+    });
+    // As long as its connection is there.
+    drop(stream);
+}
+
 /// After its dead-man time the bus is silent, though the client's connection is still there.
 #[test]
 fn what_a_silent_client_sends_periodically_stops() {

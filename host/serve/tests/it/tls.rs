@@ -36,7 +36,7 @@ fn serve(folder: &Path, most: Role) -> Served {
     let board = Arc::new(Board::start("board", connect, Settings::at(BITRATE_BPS), tell).unwrap());
     let keys = Keys::in_folder(folder).unwrap();
     let files = keys.add_server(&["localhost".to_owned(), "127.0.0.1".to_owned()]).unwrap();
-    let server = tls::Server::new(&files).unwrap();
+    let server = tls::Server::new(&files, None).unwrap();
     let listening = tls::listen(&board, "127.0.0.1:0".parse().unwrap(), most, &server).unwrap();
     Served { board, listening, said }
 }
@@ -205,7 +205,7 @@ fn certificates_that_are_expired_not_valid_yet_or_name_no_role_let_nobody_in() {
         [(ExtendedKeyUsagePurpose::ServerAuth, [2010, 2020]), (ExtendedKeyUsagePurpose::ClientAuth, NOW)]
     {
         let of_server = forge(folder.path(), "other-server", &["localhost"], purpose, years);
-        let server = tls::Server::new(&of_server).unwrap();
+        let server = tls::Server::new(&of_server, None).unwrap();
         let listening =
             tls::listen(&served.board, "127.0.0.1:0".parse().unwrap(), Role::Send, &server).unwrap();
         let address = format!("localhost:{}", listening.address().unwrap().port());
@@ -287,7 +287,7 @@ fn keys_are_secret_and_nothing_is_overwritten() {
         assert!(keys.add_client(name, Role::Listen).is_err(), "{name}");
     }
     let missing = Keys::files(folder.path(), "nobody");
-    assert!(tls::Server::new(&missing).err().unwrap().to_string().contains("nobody"));
+    assert!(tls::Server::new(&missing, None).err().unwrap().to_string().contains("nobody"));
 }
 
 /// Peers that connect and say nothing, and come again whenever they are let go, keep nobody out.
@@ -328,9 +328,9 @@ fn a_key_that_others_can_read_is_refused() {
     use std::os::unix::fs::PermissionsExt;
     let folder = tempfile::tempdir().unwrap();
     let files = Keys::in_folder(folder.path()).unwrap().add_server(&["localhost".to_owned()]).unwrap();
-    assert!(tls::Server::new(&files).is_ok());
+    assert!(tls::Server::new(&files, None).is_ok());
     std::fs::set_permissions(&files.key, PermissionsExt::from_mode(0o644)).unwrap();
-    let refused = tls::Server::new(&files).err().unwrap().to_string();
+    let refused = tls::Server::new(&files, None).err().unwrap().to_string();
     assert!(refused.ends_with("other users can use it; `chmod 600` it"), "{refused}");
 }
 

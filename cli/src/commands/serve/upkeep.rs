@@ -1,0 +1,141 @@
+//! What goes on beside serving: the permissions, the audit log, and reading files again when a hang-up asks for it (SIGHUP).
+
+use std::path::PathBuf;
+use std::sync::{Arc, Weak};
+
+use anyhow::Context;
+use cantap_serve::Board;
+use cantap_serve::audit::Audit;
+#[cfg(feature = "tls")]
+use cantap_serve::permissions::Permissions;
+#[cfg(feature = "tls")]
+use cantap_serve::tls::Server;
+#[cfg(unix)]
+use nix::sys::signal::{SigSet, Signal};
+
+use super::Args;
+use crate::stderr;
+
+/// Prepared before there are boards.
+pub struct Upkeep {
+    files: Reread,
+    audit: Option<Arc<Audit>>,
+    #[cfg(unix)]
+    hang_ups: Option<SigSet>,
+}
+
+/// What is read again.
+#[derive(Default)]
+struct Reread {
+    boards: Vec<Weak<Board>>,
+    permissions: Option<PathBuf>,
+    #[cfg(feature = "tls")]
+    server: Option<Server>,
+}
+
+impl Upkeep {
+    /// Reads the files, so that a mistake in them is known before there is a server.
+    pub fn of(args: &Args) -> anyhow::Result<Self> {
+        #[cfg(feature = "tls")]
+        let permissions = args.permissions.clone();
+        #[cfg(not(feature = "tls"))]
+        let permissions = None;
+        #[cfg(feature = "tls")]
+        if let Some(path) = &permissions {
+            Permissions::read(path)?;
+        }
+        let audit = args.audit.as_deref().map(|path| {
+            Audit::open(path, |trouble| stderr::warn(&trouble)).with_context(|| {
+                format!("nothing can be recorded in '{}'; give another file with --audit", path.display())
+            })
+        });
+        Ok(Self {
+            files: Reread { permissions, ..Reread::default() },
+            audit: audit.transpose()?.map(Arc::new),
+            #[cfg(unix)]
+            hang_ups: None,
+        })
+    }
+
+    /// From now on, a hang-up does not end the program if there is something to read again. Threads that exist already are not affected.
+    #[cfg(unix)]
+    pub fn catch_hang_ups(&mut self, is_encrypted: bool) -> anyhow::Result<()> {
+        if is_encrypted || self.files.permissions.is_some() {
+            let mut signals = SigSet::empty();
+            signals.add(Signal::SIGHUP);
+            signals.thread_block()?;
+            self.hang_ups = Some(signals);
+        }
+        Ok(())
+    }
+
+    /// Applies the permissions and begins to record. Ends with the program.
+    pub fn begin(
+        &mut self,
+        boards: &[Arc<Board>],
+        #[cfg(feature = "tls")] server: Option<Server>,
+    ) -> anyhow::Result<()> {
+        let mut files = std::mem::take(&mut self.files);
+        files.boards = boards.iter().map(Arc::downgrade).collect();
+        #[cfg(feature = "tls")]
+        {
+            files.server = server;
+        }
+        files.permit()?;
+        if let Some(audit) = &self.audit {
+            for board in boards {
+                board.record_to(Arc::clone(audit));
+            }
+        }
+        #[cfg(unix)]
+        if let Some(signals) = self.hang_ups.take() {
+            std::thread::Builder::new().name("cantap-hang-ups".to_owned()).spawn(move || {
+                while signals.wait().is_ok() {
+                    files.read_again();
+                }
+            })?;
+        }
+        Ok(())
+    }
+
+    /// Waits for what is recorded.
+    pub fn finish(self) {
+        if let Some(audit) = self.audit {
+            audit.finish();
+        }
+    }
+}
+
+impl Reread {
+    /// Applies the permissions as they are in their file now.
+    fn permit(&self) -> anyhow::Result<()> {
+        #[cfg(feature = "tls")]
+        if let Some(path) = &self.permissions {
+            let permissions = Arc::new(Permissions::read(path)?);
+            for (number, board) in self.boards.iter().enumerate() {
+                if let Some(board) = board.upgrade() {
+                    board.permit_only(Arc::clone(&permissions), number);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// A file that cannot be used changes nothing.
+    #[cfg(unix)]
+    fn read_again(&self) {
+        let mut failed = false;
+        if let Err(error) = self.permit() {
+            failed = true;
+            stderr::warn(&format!("{error}; the permissions stay as they were"));
+        }
+        #[cfg(feature = "tls")]
+        if let Some(Err(error)) = self.server.as_ref().map(Server::reload) {
+            failed = true;
+            stderr::warn(&format!("{error}; the certificates stay as they were"));
+        }
+        if !failed {
+            stderr::tell("cantap: the permissions and certificates were read again\n");
+        }
+    }
+}

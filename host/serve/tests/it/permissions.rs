@@ -1,0 +1,207 @@
+//! What the owner of a server permits to each certificate, and the record of who did what.
+#![cfg(feature = "tls")]
+
+use std::path::Path;
+use std::sync::Arc;
+
+use cantap::wire::Refusal;
+use cantap::wire::message::{ChannelConfig, Filter, FrameKind, Mode, Periodic, Role, Trigger, TxFrame};
+use cantap::{Channel, Device, DeviceError};
+use cantap_serve::audit::Audit;
+use cantap_serve::listen::Listening;
+use cantap_serve::permissions::Permissions;
+use cantap_serve::tls::{self, Files, Keys, Server};
+use cantap_serve::{Board, News, Settings};
+use std::sync::mpsc::Receiver;
+
+use crate::strangers::{BITRATE_BPS, any_port, board_at};
+
+struct Served {
+    board: Arc<Board>,
+    server: Server,
+    listening: Listening,
+    told: Receiver<News>,
+}
+
+fn serve(folder: &Path) -> Served {
+    let (board, told) = board_at(Settings::at(BITRATE_BPS));
+    let files = Keys::in_folder(folder).unwrap().add_server(&["localhost".to_owned()]).unwrap();
+    // An empty list, as it is before anybody is revoked, is none.
+    let list = folder.join(tls::REVOKED);
+    let server = Server::new(&files, list.exists().then_some(list.as_path())).unwrap();
+    let listening = tls::listen(&board, any_port(), Role::Send, &server).unwrap();
+    Served { board, server, listening, told }
+}
+
+impl Served {
+    fn connect(&self, files: &Files) -> Result<Device, String> {
+        let address = format!("localhost:{}", self.listening.address().unwrap().port());
+        let link = tls::connect(&address, files).map_err(|error| error.to_string())?;
+        Device::over(link, "far").map_err(|error| error.to_string())
+    }
+
+    fn permit(&self, text: &str) {
+        self.board.permit_only(Arc::new(Permissions::parse(text).unwrap()), 0);
+    }
+
+    /// Waits for a message of the server that contains this.
+    fn tells(&self, wanted: &str) {
+        let mut others = Vec::new();
+        let is_it = |news: News| {
+            others.push(news.to_string());
+            news.to_string().contains(wanted)
+        };
+        assert!(self.told.iter().any(is_it), "{wanted}: {others:?}");
+    }
+}
+
+fn in_mode(device: &Device, mode: Mode) -> ChannelConfig {
+    ChannelConfig { mode, ..ChannelConfig::listen_only(device.timing(BITRATE_BPS).unwrap()) }
+}
+
+fn frame(text: &str) -> TxFrame {
+    TxFrame { tag: 1, frame: text.parse().unwrap(), at_ticks: None }
+}
+
+fn is_refused<T: std::fmt::Debug>(result: Result<T, DeviceError>, why: &str) {
+    let is_it = matches!(&result, Err(DeviceError::Refused { refusal: Refusal::NotGranted { .. } }));
+    assert!(is_it, "{why}: {result:?}");
+}
+
+#[test]
+fn a_client_does_what_its_permissions_name_and_nothing_else() {
+    let folder = tempfile::tempdir().unwrap();
+    let served = serve(folder.path());
+    served.permit(
+        "[clients.alice]\nchannels = [1]\nsend = [\"123\", \"700:7F0\"]\nmodes = [\"normal\"]\nframes_per_second = 50",
+    );
+    let keys = Keys::in_folder(folder.path()).unwrap();
+    let alice = keys.add_client("alice", Role::Send).unwrap();
+    let bob = keys.add_client("bob", Role::Send).unwrap();
+    let refused = served.connect(&bob).err().unwrap();
+    assert!(refused.contains("the permissions do not name its certificate"), "{refused}");
+    let device = served.connect(&alice).unwrap();
+    is_refused(device.open_channel(Channel::Can2, Some(in_mode(&device, Mode::Normal))), "channel 2");
+    is_refused(device.open_channel(Channel::Can1, Some(in_mode(&device, Mode::Loopback))), "loopback");
+    served.tells("the mode loopback is not permitted");
+    device.open_channel(Channel::Can1, Some(in_mode(&device, Mode::Normal))).unwrap();
+    device.send(Channel::Can1, &[frame("123#11"), frame("70F#")]).unwrap();
+    is_refused(device.send(Channel::Can1, &[frame("123#11"), frame("124#")]), "another identifier");
+    served.tells("sending 124 is not permitted");
+    is_refused(device.send(Channel::Can1, &[frame("00000123#")]), "an extended identifier");
+    let periodic = |text: &str, period_ticks| Periodic {
+        frame: text.parse().unwrap(),
+        period_ticks,
+        count: 0,
+        modifiers: [].into_iter().collect(),
+    };
+    let tick_hz = device.hello().tick_hz;
+    is_refused(device.set_periodic(Channel::Can1, 0, Some(periodic("124#", tick_hz))), "another identifier");
+    is_refused(device.set_periodic(Channel::Can1, 0, Some(periodic("123#", tick_hz / 51))), "51 frames/s");
+    device.set_periodic(Channel::Can1, 0, Some(periodic("123#", tick_hz / 49))).unwrap();
+    is_refused(device.set_periodic(Channel::Can1, 1, Some(periodic("123#", tick_hz / 2))), "2 more");
+    let filter = Filter { extended: false, kind: FrameKind::Any, id: 0x123, mask: 0x7FF };
+    let reply = Trigger { filter, reply: "123#".parse().unwrap(), count: 1 };
+    is_refused(device.set_trigger(Channel::Can1, 0, Some(reply)), "replies cannot be limited");
+    // Whoever has no certificate is not restricted by what is written of certificates.
+    let local = crate::strangers::client(&served.board, "local", Role::Listen);
+    local.listen(Channel::Can2, BITRATE_BPS).unwrap();
+}
+
+#[test]
+fn permissions_that_change_let_those_go_whom_they_concern() {
+    let folder = tempfile::tempdir().unwrap();
+    let served = serve(folder.path());
+    served.permit("[clients.alice]\n[clients.bob]");
+    let keys = Keys::in_folder(folder.path()).unwrap();
+    let [alice, bob] = ["alice", "bob"].map(|name| keys.add_client(name, Role::Listen).unwrap());
+    let (_alice, bob) = (served.connect(&alice).unwrap(), served.connect(&bob).unwrap());
+    served.permit("[clients.alice]\nchannels = [2]\n[clients.bob]");
+    served.tells("was let go: its permissions have changed");
+    bob.status().unwrap();
+    let again = served.connect(&alice).unwrap();
+    is_refused(again.listen(Channel::Can1, BITRATE_BPS), "channel 1");
+}
+
+#[test]
+fn a_revoked_client_is_let_go_and_does_not_get_in_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let served = serve(folder.path());
+    let keys = Keys::in_folder(folder.path()).unwrap();
+    let [alice, bob, carol] =
+        ["alice", "bob", "carol"].map(|name| keys.add_client(name, Role::Listen).unwrap());
+    let list = keys.revoke_client("alice").unwrap();
+    keys.revoke_client("carol").unwrap();
+    assert!(keys.revoke_client("server").is_err() && keys.revoke_client("nobody").is_err());
+    // As the server is started with it.
+    let server = Server::new(&Keys::files(folder.path(), "server"), Some(&list)).unwrap();
+    let listening = tls::listen(&served.board, any_port(), Role::Send, &server).unwrap();
+    let at = |files: &Files| {
+        let address = format!("localhost:{}", listening.address().unwrap().port());
+        let link = tls::connect(&address, files).map_err(|error| error.to_string())?;
+        Device::over(link, "far").map_err(|error| error.to_string())
+    };
+    assert!(at(&alice).is_err() && at(&carol).is_err());
+    let connected = at(&bob).unwrap();
+    // The server reads it again.
+    keys.revoke_client("bob").unwrap();
+    server.reload().unwrap();
+    served.tells("was let go: its certificate is no longer trusted");
+    assert!(at(&bob).is_err());
+    drop(connected);
+    // A new certificate of the same name is another one.
+    let renewed = keys.renew_client("bob").unwrap();
+    at(&renewed).unwrap();
+    // A list that cannot be read changes nothing; that of another authority lets nobody in.
+    std::fs::write(&list, "nothing").unwrap();
+    assert!(server.reload().is_err());
+    at(&renewed).unwrap();
+    let other = tempfile::tempdir().unwrap();
+    let others = Keys::in_folder(other.path()).unwrap();
+    others.add_client("bob", Role::Listen).unwrap();
+    std::fs::copy(others.revoke_client("bob").unwrap(), &list).unwrap();
+    server.reload().unwrap();
+    assert!(at(&renewed).is_err());
+    // The first server has no list.
+    drop(served.connect(&renewed).unwrap());
+    served.server.reload().unwrap();
+}
+
+#[test]
+fn the_record_has_who_did_what() {
+    let folder = tempfile::tempdir().unwrap();
+    let served = serve(folder.path());
+    let path = folder.path().join("audit");
+    let audit = Arc::new(Audit::open(&path, |text| panic!("{text}")).unwrap());
+    served.board.record_to(Arc::clone(&audit));
+    served.permit("[clients.alice]\nsend = [\"123\"]");
+    let alice = Keys::in_folder(folder.path()).unwrap().add_client("alice", Role::Send).unwrap();
+    let device = served.connect(&alice).unwrap();
+    device.open_channel(Channel::Can1, Some(in_mode(&device, Mode::Normal))).unwrap();
+    for _ in 0..5 {
+        device.send(Channel::Can1, &[frame("123#11")]).unwrap();
+    }
+    is_refused(device.send(Channel::Can1, &[frame("124#")]), "another identifier");
+    device.stop().unwrap();
+    drop(device);
+    served.tells("has left");
+    let Served { board, listening, .. } = served;
+    drop((listening, board, audit));
+    let text = std::fs::read_to_string(&path).unwrap();
+    let events: Vec<serde_json::Value> =
+        text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let of = |name: &str| {
+        events.iter().find(|event| event["event"] == name).unwrap_or_else(|| panic!("{name} in {text}"))
+    };
+    for name in ["came", "opened", "sent", "not_permitted", "closed", "left"] {
+        let event = of(name);
+        assert_eq!(event["certificate"], "alice", "{event}");
+        assert!(event["address"].as_str().unwrap().starts_with("127.0.0.1:"), "{event}");
+    }
+    assert_eq!(
+        (&of("opened")["mode"], &of("opened")["bitrate_bps"]),
+        (&"normal".into(), &BITRATE_BPS.into())
+    );
+    let sent = events.iter().filter(|event| event["event"] == "sent");
+    assert_eq!(sent.filter_map(|event| event["frames"].as_u64()).sum::<u64>(), 5);
+}

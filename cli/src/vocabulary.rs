@@ -240,6 +240,7 @@ fn what_measures_or_tells_has_json() {
         "identify",
         "man",
         "monitor",
+        "report",
         "reset",
         "serve",
         "update",

@@ -123,15 +123,13 @@ impl Databases {
             }
             let Some(message) = self.decoder.find(place.channel, place.id) else { continue };
             let entry = Entry { message, place: Some(place) };
-            let key = match self.entries.get_mut(message.index()).filter(|first| first.place.is_none()) {
-                Some(first) => {
-                    *first = entry;
-                    message.index()
-                }
-                None => {
-                    self.entries.push(entry);
-                    self.entries.len() - 1
-                }
+            let first = self.entries.get_mut(message.index()).filter(|first| first.place.is_none());
+            let key = if let Some(first) = first {
+                *first = entry;
+                message.index()
+            } else {
+                self.entries.push(entry);
+                self.entries.len() - 1
             };
             self.by_place.insert(place, key);
         }
@@ -191,7 +189,7 @@ impl Databases {
                 None => number.map_or(String::new(), |number| signal.for_people(number).to_string()),
             });
             let value = number.map(cantap_signals::Number::as_f64).filter(|value| value.is_finite());
-            Value { name: signal.label().into_owned(), value, text, unit: signal.unit.clone() }
+            Value { name: signal.label().into_owned(), number: value, text, unit: signal.unit.clone() }
         };
         message.signals.iter().enumerate().map(one).collect()
     }
@@ -245,7 +243,8 @@ pub struct ValueText {
 #[derive(Serialize)]
 pub struct Value {
     name: String,
-    value: Option<f64>,
+    #[serde(rename = "value")]
+    number: Option<f64>,
     text: String,
     unit: String,
 }

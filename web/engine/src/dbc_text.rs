@@ -28,7 +28,7 @@ pub fn write(database: &Database) -> String {
     let mut after = String::new();
     for message in &database.messages {
         // Writing to a String cannot fail.
-        let _ = write!(out, "BO_ {} {}: {} Vector__XXX\n", number(message), message.name, message.length);
+        let _ = writeln!(out, "BO_ {} {}: {} Vector__XXX", number(message), message.name, message.length);
         for signal in &message.signals {
             write_signal(&mut out, signal);
             write_extras(&mut after, message, signal);
@@ -62,7 +62,7 @@ fn write_signal(out: &mut String, signal: &Signal) {
         signal.name,
         signal.start,
         signal.length,
-        if signal.order == ByteOrder::Little { 1 } else { 0 },
+        u8::from(signal.order == ByteOrder::Little),
         if matches!(signal.kind, ValueKind::Unsigned) { '+' } else { '-' },
         signal.factor,
         signal.offset,

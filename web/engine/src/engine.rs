@@ -1,5 +1,7 @@
 //! The engine's state, and its answers.
 
+use std::collections::hash_map::Entry;
+
 use rustc_hash::FxHashMap;
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -214,7 +216,7 @@ impl Engine {
         let trace = trace.as_ref().ok_or(EngineError::NoTrace)?;
         let content = &trace.content;
         let store = &content.store;
-        let window = |from, to| (content.from_ns(from), content.to_ns(to));
+        let window = |from, to| (content.begin_ns(from), content.end_of_ns(to));
         match request {
             Request::Filter { filter } => {
                 let view = views.filter(&filter, databases.decoder(), store)?;
@@ -228,7 +230,7 @@ impl Engine {
                 json(records.filter_map(row).collect::<Vec<_>>())
             }
             Request::RowAt { view, time } => {
-                let record = store.row_at(content.to_ns(time));
+                let record = store.row_at(content.end_of_ns(time));
                 json(json!({ "row": views.rows(view, store)?.row_of(record) }))
             }
             Request::Find { view, text, from, backwards } => {
@@ -240,7 +242,7 @@ impl Engine {
                 json(databases.values(&record))
             }
             Request::Ids { at } => {
-                json(identifiers::rows_at(content.to_ns(at), content, index, databases, sections))
+                json(identifiers::rows_at(content.end_of_ns(at), content, index, databases, sections))
             }
             Request::Bits { channel, id, extended, from, to } => {
                 let place = Place { channel, id: identifier(id, extended)? };
@@ -301,13 +303,14 @@ impl Engine {
     ) -> Answer {
         let Some(place) = signal.place else { return picture(&Picture::EMPTY, self.content()?, sections) };
         let message = self.databases.decoder().message(signal.message).clone();
-        if !self.series.contains_key(&signal) {
-            let new = Series::new(message, signal.signal).ok_or(EngineError::NoSignal)?;
-            self.series.insert(signal, new);
-        }
         let Self { trace, index, series, .. } = self;
         let content = trace.as_ref().map(|trace| &trace.content).ok_or(EngineError::NoTrace)?;
-        let series = series.get_mut(&signal).ok_or(EngineError::NoSignal)?;
+        let series = match series.entry(signal) {
+            Entry::Occupied(known) => known.into_mut(),
+            Entry::Vacant(new) => {
+                new.insert(Series::new(message, signal.signal).ok_or(EngineError::NoSignal)?)
+            }
+        };
         let rows = index.rows(place);
         series.extend(&content.store, rows);
         let found = series.picture(&content.store, rows, from, to, columns.min(MOST_COLUMNS));
@@ -327,7 +330,7 @@ impl Engine {
         let content = self.content()?;
         let rows = self.index.rows(place);
         series.extend(&content.store, rows);
-        let (from, to) = (content.from_ns(raw.from), content.to_ns(raw.to));
+        let (from, to) = (content.begin_ns(raw.from), content.end_of_ns(raw.to));
         let found = series.picture(&content.store, rows, from, to, raw.columns.min(MOST_COLUMNS));
         let answer = picture(&found, content, sections);
         // The one used last stands last.

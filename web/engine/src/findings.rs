@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use cantap_analysis::stats::Statistics;
+use cantap_analysis::stats::{Statistics, WorkLoad};
 use cantap_signals::Decoder;
 use cantap_trace::{Id, Seconds, TraceEvent};
 use serde::Serialize;
@@ -161,7 +161,7 @@ fn channels(content: &Content, found: &mut Vec<Finding>) {
             );
             found.push(on(Severity::Warning, text));
         }
-        let summary = channel.load.as_ref().and_then(|load| load.mean_pct());
+        let summary = channel.load.as_ref().and_then(WorkLoad::mean_pct);
         if let Some(peak) =
             channel.peaks().find(|peak| peak.load_pct.is_some_and(|load| load >= HIGH_LOAD_PCT))
         {

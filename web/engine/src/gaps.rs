@@ -62,7 +62,9 @@ impl Gaps {
                 if !of.open.is_empty() || of.off.is_some() {
                     let mut closed = std::mem::take(&mut of.open);
                     closed.extend(of.off.take());
-                    closed.into_iter().for_each(|gap| self.close(gap, time_ns));
+                    for gap in closed {
+                        self.close(gap, time_ns);
+                    }
                 }
             }
             TraceEvent::Lost { stage, count, at_least } => {
@@ -89,9 +91,9 @@ impl Gaps {
         }
     }
 
-    fn close(&mut self, gap: Gap, to_ns: i64) {
+    fn close(&mut self, mut gap: Gap, to_ns: i64) {
         // A trace's clock may be set back.
-        let gap = Gap { to_ns: gap.to_ns.max(to_ns), ..gap };
+        gap.to_ns = gap.to_ns.max(to_ns);
         let is_full = self.found.len() >= MOST;
         match self.found.last_mut() {
             Some(last) if is_full => {

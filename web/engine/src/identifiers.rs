@@ -89,14 +89,12 @@ fn period(recent: &[u32], store: &Store) -> Option<PeriodOf> {
 /// A row's data bytes.
 fn data_of(store: &Store, row: u32, bytes: &mut Vec<u8>) {
     bytes.clear();
-    match store.short_data(row as usize) {
-        Some((data, len)) => bytes.extend_from_slice(&data[..len]),
-        None => {
-            let record = store.record(row as usize);
-            if let Some(TraceEvent::Frame { frame, .. }) = record.map(|record| record.event) {
-                bytes.extend_from_slice(frame.data());
-            }
-        }
+    if let Some((data, len)) = store.short_data(row as usize) {
+        bytes.extend_from_slice(&data[..len]);
+    } else if let Some(TraceEvent::Frame { frame, .. }) =
+        store.record(row as usize).map(|record| record.event)
+    {
+        bytes.extend_from_slice(frame.data());
     }
 }
 

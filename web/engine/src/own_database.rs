@@ -119,21 +119,19 @@ impl OwnDatabase {
         let fresh = edit.message()?;
         let mut database = self.0.clone().unwrap_or_default();
         let place = database.messages.iter().position(|message| message.id == fresh.id);
-        let message = match place {
-            Some(place) => &mut database.messages[place],
-            None => {
-                let known = known.filter(|known| known.container.is_none());
-                database.messages.push(match known {
-                    Some(known) => Message { id: fresh.id, ..known.clone() },
-                    None => {
-                        dbc_text::check_name(&edit.message_name)?;
-                        Message { signals: Vec::new(), ..fresh.clone() }
-                    }
-                });
-                let last = database.messages.len() - 1;
-                &mut database.messages[last]
-            }
+        let place = if let Some(place) = place {
+            place
+        } else {
+            let known = known.filter(|known| known.container.is_none());
+            database.messages.push(if let Some(known) = known {
+                Message { id: fresh.id, ..known.clone() }
+            } else {
+                dbc_text::check_name(&edit.message_name)?;
+                Message { signals: Vec::new(), ..fresh.clone() }
+            });
+            database.messages.len() - 1
         };
+        let message = &mut database.messages[place];
         message.length = message.length.max(fresh.length);
         for signal in fresh.signals {
             match message.signals.iter_mut().find(|known| known.name == signal.name) {

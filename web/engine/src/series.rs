@@ -138,7 +138,7 @@ impl Series {
         }
         // An incomplete block is made anew.
         let begun = self.values / BLOCK;
-        if self.values % BLOCK > 0 {
+        if !self.values.is_multiple_of(BLOCK) {
             self.scanned = self.places[begun] as usize;
             self.places.truncate(begun);
             self.levels[0].truncate(begun);
@@ -269,7 +269,7 @@ impl Series {
         while at < blocks.end {
             // The largest block that begins here and ends in the range.
             let (mut of, mut step) = (level, size);
-            while of > 0 && (at % step > 0 || at + step > blocks.end) {
+            while of > 0 && (!at.is_multiple_of(step) || at + step > blocks.end) {
                 (of, step) = (of - 1, step / FAN);
             }
             parts.push(self.levels[of][at / step]);
@@ -376,17 +376,11 @@ mod tests {
                 .collect();
             assert_eq!(picture.values, inside.len(), "{span:?} {columns}");
             assert!(shown.len() <= columns);
-            let fold = |of: fn(f64, f64) -> f64, start, one: fn(&Block) -> f64| {
-                shown.iter().map(|block| one(block)).fold(start, of)
-            };
-            assert_eq!(
-                fold(f64::max, f64::MIN, |block| block.max),
-                inside.iter().map(|(_, value)| *value).fold(f64::MIN, f64::max)
-            );
-            assert_eq!(
-                fold(f64::min, f64::MAX, |block| block.min),
-                inside.iter().map(|(_, value)| *value).fold(f64::MAX, f64::min)
-            );
+            let largest = |values: &mut dyn Iterator<Item = f64>| values.max_by(f64::total_cmp);
+            let smallest = |values: &mut dyn Iterator<Item = f64>| values.min_by(f64::total_cmp);
+            let mut values = inside.iter().map(|(_, value)| *value);
+            assert_eq!(largest(&mut shown.iter().map(|block| block.max)), largest(&mut values.clone()));
+            assert_eq!(smallest(&mut shown.iter().map(|block| block.min)), smallest(&mut values));
             assert_eq!(
                 shown.first().map(|block| (block.from_ns, block.first)),
                 inside.first().map(|first| **first)

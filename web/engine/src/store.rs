@@ -227,7 +227,9 @@ mod tests {
         #[test]
         fn a_record_comes_out_as_it_went_in(records in prop::collection::vec(record_or_fd(3), 1..60)) {
             let mut store = Store::default();
-            records.iter().for_each(|record| store.push(record));
+            for record in &records {
+                store.push(record);
+            }
             for (row, record) in records.iter().enumerate() {
                 prop_assert_eq!(store.record(row), Some(*record));
                 let short = record.frame().filter(|frame| !frame.is_remote() && frame.data_len() <= 8);

@@ -1,5 +1,6 @@
 //! The first page's figures.
 
+use cantap_analysis::stats::WorkLoad;
 use serde::Serialize;
 
 use crate::trace::Trace;
@@ -65,7 +66,7 @@ impl Summary {
                 remote: channel.remote,
                 errors: channel.errors.total(),
                 bitrate: channel.bitrate_bps,
-                load: channel.load.as_ref().and_then(|load| load.mean_pct()).map(|load| load / 100.0),
+                load: channel.load.as_ref().and_then(WorkLoad::mean_pct).map(|load| load / 100.0),
             })
             .collect();
         channels.sort_by_key(|channel| channel.channel);
@@ -97,15 +98,12 @@ fn losses(trace: &Trace) -> Vec<Loss> {
         }
         let known =
             losses.iter_mut().find(|loss| loss.channel == Some(gap.channel) && loss.stage == gap.stage);
-        match known {
-            Some(loss) => {
-                loss.count += gap.count;
-                loss.at_least |= gap.at_least;
-            }
-            None => {
-                let channel = Some(gap.channel);
-                losses.push(Loss { stage: gap.stage, channel, count: gap.count, at_least: gap.at_least });
-            }
+        if let Some(loss) = known {
+            loss.count += gap.count;
+            loss.at_least |= gap.at_least;
+        } else {
+            let channel = Some(gap.channel);
+            losses.push(Loss { stage: gap.stage, channel, count: gap.count, at_least: gap.at_least });
         }
     }
     losses.sort_by_key(|loss| (loss.channel, loss.stage));

@@ -148,13 +148,13 @@ impl Content {
     }
 
     /// The time in nanoseconds; without one, that of before the beginning, or of after the end.
-    pub fn from_ns(&self, seconds: Option<f64>) -> i64 {
+    pub fn begin_ns(&self, seconds: Option<f64>) -> i64 {
         seconds.map_or(i64::MIN, |seconds| self.origin_ns().saturating_add((seconds * 1e9).round() as i64))
     }
 
     /// The same for the end of a stretch.
-    pub fn to_ns(&self, seconds: Option<f64>) -> i64 {
-        seconds.map_or(i64::MAX, |seconds| self.from_ns(Some(seconds)))
+    pub fn end_of_ns(&self, seconds: Option<f64>) -> i64 {
+        seconds.map_or(i64::MAX, |seconds| self.begin_ns(Some(seconds)))
     }
 
     /// The time of the latest record in nanoseconds.
@@ -254,17 +254,16 @@ impl Trace {
             if !is_complete && unread < *reserve {
                 return Ok(());
             }
-            let more = match reader {
-                Some(reader) => take_batch(reader, &mut self.content),
-                None => {
-                    let opened = open_source(&self.name, pieces.clone(), &ReadOptions::default());
-                    if !pieces.ran_dry() {
-                        let opened = opened?;
-                        self.format = Some(opened.format());
-                        *reader = Some(Box::new(opened));
-                    }
-                    true
+            let more = if let Some(reader) = reader {
+                take_batch(reader, &mut self.content)
+            } else {
+                let opened = open_source(&self.name, pieces.clone(), &ReadOptions::default());
+                if !pieces.ran_dry() {
+                    let opened = opened?;
+                    self.format = Some(opened.format());
+                    *reader = Some(Box::new(opened));
                 }
+                true
             };
             if pieces.ran_dry() {
                 // What it found may be wrong, such as a file that seems to be cut.

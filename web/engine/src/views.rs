@@ -88,7 +88,7 @@ impl View {
 /// All views.
 #[derive(Default)]
 pub struct Views {
-    views: Vec<View>,
+    kept: Vec<View>,
     numbers: u32,
     uses: u64,
 }
@@ -131,7 +131,7 @@ impl Rows<'_> {
 impl Views {
     /// Forgets all, such as after a database has changed: conditions may have another meaning.
     pub fn clear(&mut self) {
-        self.views.clear();
+        self.kept.clear();
     }
 
     /// The view of a filter; [`ALL`] for an empty one. One that is there goes on.
@@ -149,8 +149,7 @@ impl Views {
         let text = text.trim();
         self.uses += 1;
         let used = self.uses;
-        if let Some(view) =
-            self.views.iter_mut().find(|view| view.text == text && view.is_search == is_search)
+        if let Some(view) = self.kept.iter_mut().find(|view| view.text == text && view.is_search == is_search)
         {
             view.used = used;
             view.extend(store);
@@ -169,12 +168,12 @@ impl Views {
             used,
         };
         view.extend(store);
-        if self.views.len() >= KEPT
-            && let Some(oldest) = (0..self.views.len()).min_by_key(|at| self.views[*at].used)
+        if self.kept.len() >= KEPT
+            && let Some(oldest) = (0..self.kept.len()).min_by_key(|at| self.kept[*at].used)
         {
-            self.views.swap_remove(oldest);
+            self.kept.swap_remove(oldest);
         }
-        self.views.push(view);
+        self.kept.push(view);
         Ok(self.numbers)
     }
 
@@ -185,7 +184,7 @@ impl Views {
         }
         self.uses += 1;
         let used = self.uses;
-        let view = self.views.iter_mut().find(|view| view.number == number).ok_or(EngineError::NoView)?;
+        let view = self.kept.iter_mut().find(|view| view.number == number).ok_or(EngineError::NoView)?;
         view.used = used;
         Ok(Rows::Some(&view.rows))
     }
@@ -209,7 +208,7 @@ impl Views {
         self.rows(number, store)?;
         let found = self.view(text, true, decoder, store)?;
         let of = |wanted: u32| {
-            self.views.iter().find(|view| view.number == wanted).map(|view| Rows::Some(&view.rows))
+            self.kept.iter().find(|view| view.number == wanted).map(|view| Rows::Some(&view.rows))
         };
         let within =
             if number == ALL { Rows::All(store.len()) } else { of(number).ok_or(EngineError::NoView)? };

@@ -67,7 +67,8 @@ fn log() -> String {
                 time + 0.001
             )
         })
-        .collect()
+        .collect::<Vec<_>>()
+        .concat()
 }
 
 #[test]

@@ -5,6 +5,7 @@ use std::process::Command;
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
+use cantap_formats::ReadOptions;
 use serde_json::Value;
 
 const PAGE: &str = "<!doctype html><body><!--cantap-report--><script>page()</script></body>";
@@ -55,7 +56,8 @@ fn log(frames: u32, period_ms: u32) -> String {
         .map(|n| {
             format!("({:.6}) can0 123#{:08X}\n", f64::from(n * period_ms) / 1e3, n.wrapping_mul(0x9E37_79B9))
         })
-        .collect()
+        .collect::<Vec<_>>()
+        .concat()
 }
 
 #[test]
@@ -114,8 +116,11 @@ fn of_a_trace_that_is_too_large_the_beginning_is_in_the_page_and_that_is_said() 
     assert!(report["thinned"][0].as_str().unwrap().contains("Only the first"));
     assert_eq!(report["trace"]["name"], "large-beginning.blf");
     let bytes = content(&report["trace"]);
-    let reader =
-        cantap_formats::open_source("large-beginning.blf", std::io::Cursor::new(bytes), &Default::default());
+    let reader = cantap_formats::open_source(
+        "large-beginning.blf",
+        std::io::Cursor::new(bytes),
+        &ReadOptions::default(),
+    );
     let records = reader.unwrap().readable().count();
     let said = format!("Only the first {records} of 300000 records");
     assert!(records > 10_000 && text.contains(&said), "{records}: {text}");

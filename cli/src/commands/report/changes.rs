@@ -9,7 +9,7 @@ const TOLERANCE: f64 = 0.1;
 const MOST: usize = 50;
 
 /// `Finding` of the page's `api.ts`.
-fn finding(severity: &str, text: String, key: Option<Key>) -> Value {
+fn finding(severity: &str, text: &str, key: Option<Key>) -> Value {
     json!({
         "severity": severity,
         "text": text,
@@ -30,14 +30,14 @@ pub fn findings(before: &Profile, after: &Profile, name: &str) -> Vec<Value> {
         only_b.len(),
         changed.len()
     );
-    all.push(finding("info", text, None));
+    all.push(finding("info", &text, None));
     let mut list = |texts: Vec<(Key, String)>| {
         let more = texts.len().saturating_sub(MOST);
-        all.extend(texts.into_iter().take(MOST).map(|(key, text)| finding("warning", text, Some(key))));
+        all.extend(texts.into_iter().take(MOST).map(|(key, text)| finding("warning", &text, Some(key))));
         if more > 0 {
             all.push(finding(
                 "warning",
-                format!("{more} more such differences against {name}; see cantap diff"),
+                &format!("{more} more such differences against {name}; see cantap diff"),
                 None,
             ));
         }

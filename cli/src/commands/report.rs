@@ -20,7 +20,7 @@ use crate::database_args::{DatabaseArgs, load};
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
                 cantap report drive.blf --db car.dbc -o drive.html\n  \
-                cantap report drive.log.gz --db 1:engine.dbc -b 500k --note 'Stalls at 80 km/h'\n  \
+                cantap report drive.log.gz --db 1:engine.dbc -b 500k --note 'It stalls'\n  \
                 cantap report today.blf --db car.dbc --against yesterday.blf\n\n\
                 The page has the trace and the databases in it, and opens by a double click: rows, graphs, bits, conversations, and \
                 first of all what was found. It loads nothing, and the trace can be saved out of it again, byte for byte.\n\n\

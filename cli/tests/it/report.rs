@@ -1,11 +1,11 @@
 //! `cantap report` as users run it; the page that it is put into is a stand-in with the real one's mark.
 
-use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
+use cantap_formats::ReadOptions;
 use serde_json::Value;
 
 const PAGE: &str = "<!doctype html><body><!--cantap-report--><script>page()</script></body>";
@@ -52,12 +52,12 @@ fn content(file: &Value) -> Vec<u8> {
 }
 
 fn log(frames: u32, period_ms: u32) -> String {
-    let mut log = String::new();
-    for n in 0..frames {
-        let (time, data) = (f64::from(n * period_ms) / 1e3, n.wrapping_mul(0x9E37_79B9));
-        writeln!(log, "({time:.6}) can0 123#{data:08X}").unwrap();
-    }
-    log
+    (0..frames)
+        .map(|n| {
+            format!("({:.6}) can0 123#{:08X}\n", f64::from(n * period_ms) / 1e3, n.wrapping_mul(0x9E37_79B9))
+        })
+        .collect::<Vec<_>>()
+        .concat()
 }
 
 #[test]
@@ -119,7 +119,7 @@ fn of_a_trace_that_is_too_large_the_beginning_is_in_the_page_and_that_is_said() 
     let reader = cantap_formats::open_source(
         "large-beginning.blf",
         std::io::Cursor::new(bytes),
-        &cantap_formats::ReadOptions::default(),
+        &ReadOptions::default(),
     );
     let records = reader.unwrap().readable().count();
     let said = format!("Only the first {records} of 300000 records");

@@ -63,7 +63,7 @@ fn frame(text: &str) -> TxFrame {
     TxFrame { tag: 1, frame: text.parse().unwrap(), at_ticks: None }
 }
 
-fn is_refused<T: std::fmt::Debug>(result: Result<T, DeviceError>, why: &str) {
+fn is_refused<T: std::fmt::Debug>(result: &Result<T, DeviceError>, why: &str) {
     let is_it = matches!(&result, Err(DeviceError::Refused { refusal: Refusal::NotGranted { .. } }));
     assert!(is_it, "{why}: {result:?}");
 }
@@ -81,14 +81,14 @@ fn a_client_does_what_its_permissions_name_and_nothing_else() {
     let refused = served.connect(&bob).err().unwrap();
     assert!(refused.contains("the permissions do not name its certificate"), "{refused}");
     let device = served.connect(&alice).unwrap();
-    is_refused(device.open_channel(Channel::Can2, Some(in_mode(&device, Mode::Normal))), "channel 2");
-    is_refused(device.open_channel(Channel::Can1, Some(in_mode(&device, Mode::Loopback))), "loopback");
+    is_refused(&device.open_channel(Channel::Can2, Some(in_mode(&device, Mode::Normal))), "channel 2");
+    is_refused(&device.open_channel(Channel::Can1, Some(in_mode(&device, Mode::Loopback))), "loopback");
     served.tells("the mode loopback is not permitted");
     device.open_channel(Channel::Can1, Some(in_mode(&device, Mode::Normal))).unwrap();
     device.send(Channel::Can1, &[frame("123#11"), frame("70F#")]).unwrap();
-    is_refused(device.send(Channel::Can1, &[frame("123#11"), frame("124#")]), "another identifier");
+    is_refused(&device.send(Channel::Can1, &[frame("123#11"), frame("124#")]), "another identifier");
     served.tells("sending 124 is not permitted");
-    is_refused(device.send(Channel::Can1, &[frame("00000123#")]), "an extended identifier");
+    is_refused(&device.send(Channel::Can1, &[frame("00000123#")]), "an extended identifier");
     let periodic = |text: &str, period_ticks| Periodic {
         frame: text.parse().unwrap(),
         period_ticks,
@@ -96,13 +96,13 @@ fn a_client_does_what_its_permissions_name_and_nothing_else() {
         modifiers: [].into_iter().collect(),
     };
     let tick_hz = device.hello().tick_hz;
-    is_refused(device.set_periodic(Channel::Can1, 0, Some(periodic("124#", tick_hz))), "another identifier");
-    is_refused(device.set_periodic(Channel::Can1, 0, Some(periodic("123#", tick_hz / 51))), "51 frames/s");
+    is_refused(&device.set_periodic(Channel::Can1, 0, Some(periodic("124#", tick_hz))), "another identifier");
+    is_refused(&device.set_periodic(Channel::Can1, 0, Some(periodic("123#", tick_hz / 51))), "51 frames/s");
     device.set_periodic(Channel::Can1, 0, Some(periodic("123#", tick_hz / 49))).unwrap();
-    is_refused(device.set_periodic(Channel::Can1, 1, Some(periodic("123#", tick_hz / 2))), "2 more");
+    is_refused(&device.set_periodic(Channel::Can1, 1, Some(periodic("123#", tick_hz / 2))), "2 more");
     let filter = Filter { extended: false, kind: FrameKind::Any, id: 0x123, mask: 0x7FF };
     let reply = Trigger { filter, reply: "123#".parse().unwrap(), count: 1 };
-    is_refused(device.set_trigger(Channel::Can1, 0, Some(reply)), "replies cannot be limited");
+    is_refused(&device.set_trigger(Channel::Can1, 0, Some(reply)), "replies cannot be limited");
     // Whoever has no certificate is not restricted by what is written of certificates.
     let local = crate::strangers::client(&served.board, "local", Role::Listen);
     local.listen(Channel::Can2, BITRATE_BPS).unwrap();
@@ -120,7 +120,7 @@ fn permissions_that_change_let_those_go_whom_they_concern() {
     served.tells("was let go: its permissions have changed");
     bob.status().unwrap();
     let again = served.connect(&alice).unwrap();
-    is_refused(again.listen(Channel::Can1, BITRATE_BPS), "channel 1");
+    is_refused(&again.listen(Channel::Can1, BITRATE_BPS), "channel 1");
 }
 
 #[test]
@@ -181,7 +181,7 @@ fn the_record_has_who_did_what() {
     for _ in 0..5 {
         device.send(Channel::Can1, &[frame("123#11")]).unwrap();
     }
-    is_refused(device.send(Channel::Can1, &[frame("124#")]), "another identifier");
+    is_refused(&device.send(Channel::Can1, &[frame("124#")]), "another identifier");
     device.stop().unwrap();
     drop(device);
     served.tells("has left");

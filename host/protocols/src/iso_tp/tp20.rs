@@ -57,7 +57,8 @@ struct Open {
 /// An agreed channel; the tester is the first side.
 #[derive(Clone, Debug)]
 struct Channel {
-    channel: u8,
+    /// The bus's channel, from 1.
+    bus: u8,
     last_ns: i64,
     sides: [Side; 2],
 }
@@ -103,7 +104,7 @@ impl Channels {
     }
 
     fn of(&self, channel: u8, id: Id) -> Option<usize> {
-        let has = |of: &Channel| of.channel == channel && of.sides.iter().any(|side| side.id == id);
+        let has = |of: &Channel| of.bus == channel && of.sides.iter().any(|side| side.id == id);
         self.channels.iter().position(has)
     }
 
@@ -162,7 +163,7 @@ impl Channels {
             self.close(oldest, Trouble::GivenUp, out);
         }
         let sides = ids.map(|id| Side { id, next: Some(0), is_reported: false, open: None });
-        self.channels.push(Channel { channel, last_ns: time_ns, sides });
+        self.channels.push(Channel { bus: channel, last_ns: time_ns, sides });
     }
 
     /// A frame with an identifier of a channel; false if it cannot be one of this protocol, which ends the channel.
@@ -195,11 +196,11 @@ impl Channels {
             }
             // The receiver has had enough: the sender repeats from the last one that was acknowledged.
             [0xA4] => {
-                let (number, from) = (channel.channel, id);
+                let (bus, from) = (channel.bus, id);
                 let other = &mut channel.sides[receiver];
                 if let Some(open) = other.open.take() {
                     let trouble = Trouble::Aborted("the receiver asked for a break");
-                    out(open.transfer(number, other.id, from, Some(trouble)));
+                    out(open.transfer(bus, other.id, from, Some(trouble)));
                     (other.next, other.is_reported) = (None, true);
                 }
             }
@@ -220,19 +221,19 @@ impl Channels {
     }
 
     fn close(&mut self, place: usize, trouble: Trouble, out: &mut impl FnMut(Transfer)) {
-        let Channel { channel, sides, .. } = self.channels.swap_remove(place);
+        let Channel { bus, sides, .. } = self.channels.swap_remove(place);
         let [a, b] = sides;
         let (a_id, b_id) = (a.id, b.id);
         for (side, to) in [(a, b_id), (b, a_id)] {
             if let Some(open) = side.open {
-                out(open.transfer(channel, side.id, to, Some(trouble)));
+                out(open.transfer(bus, side.id, to, Some(trouble)));
             }
         }
     }
 
     /// Ends messages whose next frame does not come.
     pub fn advance(&mut self, now_ns: i64, out: &mut impl FnMut(Transfer)) {
-        for Channel { channel, sides, .. } in &mut self.channels {
+        for Channel { bus, sides, .. } in &mut self.channels {
             let ids = [sides[1].id, sides[0].id];
             for (side, to) in sides.iter_mut().zip(ids) {
                 let is_late = |open: &mut Open| now_ns.saturating_sub(open.last_ns) > NEXT_NS;
@@ -240,7 +241,7 @@ impl Channels {
                     open.last_ns = open.last_ns.saturating_add(NEXT_NS);
                     (side.next, side.is_reported) = (None, true);
                     let after_ms = (NEXT_NS / 1_000_000) as u32;
-                    out(open.transfer(*channel, side.id, to, Some(Trouble::Timeout { after_ms })));
+                    out(open.transfer(*bus, side.id, to, Some(Trouble::Timeout { after_ms })));
                 }
             }
         }
@@ -259,10 +260,11 @@ impl Channels {
 
     /// Frames of the channel are missing.
     pub fn interrupt(&mut self, channel: u8) {
-        for side in self.channels.iter_mut().filter(|of| of.channel == channel).flat_map(|of| &mut of.sides) {
-            match &mut side.open {
-                Some(open) => open.frames_lost = true,
-                None => (side.next, side.is_reported) = (None, false),
+        for side in self.channels.iter_mut().filter(|of| of.bus == channel).flat_map(|of| &mut of.sides) {
+            if let Some(open) = &mut side.open {
+                open.frames_lost = true;
+            } else {
+                (side.next, side.is_reported) = (None, false);
             }
         }
     }

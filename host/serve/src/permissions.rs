@@ -299,7 +299,7 @@ mod tests {
     #[test]
     fn what_is_not_understood_is_an_error() {
         for (text, named) in [
-            ("[clients.a]\nchanels = [1]", "chanels"),
+            ("[clients.a]\nlanes = [1]", "lanes"),
             ("[client.a]", "client"),
             ("[clients.a]\nrole = \"admin\"", "clients.a: 'admin' is no role"),
             ("[clients.a]\nsend = [\"1234\"]", "'1234' is no identifier"),

@@ -185,7 +185,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         lines: args.lines.as_deref().map(|text| loopback(text, LINES_PORT)).transpose()?,
         metrics: args.metrics.as_deref().map(|text| address(text, METRICS_PORT)).transpose()?,
     };
-    let mut upkeep = Upkeep::of(args)?;
+    #[cfg(feature = "tls")]
+    let permissions = args.permissions.as_deref();
+    #[cfg(not(feature = "tls"))]
+    let permissions = None;
+    let mut upkeep = Upkeep::new(permissions, args.audit.as_deref())?;
     // Before there is another thread.
     #[cfg(unix)]
     upkeep.catch_hang_ups(way.scheme() == "tls")?;

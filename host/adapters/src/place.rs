@@ -14,8 +14,16 @@ use crate::gvret::{self, Gvret};
 use crate::interface_name;
 use crate::line::Line;
 use crate::slcan::{self, Slcan};
+#[cfg(target_os = "linux")]
+use crate::socketcan::exists;
 use crate::socketcand::{self, Socketcand};
 use crate::trace_pipe::TracePipe;
+
+/// Only Linux has CAN interfaces.
+#[cfg(not(target_os = "linux"))]
+fn exists(_: &str) -> bool {
+    false
+}
 
 /// An adapter's place: `can0`, `socketcan:can0`, `slcan:/dev/ttyACM0@115200`, `gvret:tcp://192.168.4.1`, `socketcand://HOST/can0`, `cannelloni://HOST:PORT`,
 /// `candump:-`, `pcapng:-`.
@@ -57,7 +65,7 @@ impl Place {
     pub fn is_meant(text: &str) -> bool {
         SCHEMES.iter().any(|scheme| text.starts_with(scheme))
             || text == "gs_usb"
-            || interface_name::is_meant(text)
+            || interface_name::is_meant(text, exists)
     }
 
     /// The bit rate that the adapter's owner has set, in bit/s, if it can be read without the adapter.
@@ -90,7 +98,7 @@ impl FromStr for Place {
     fn from_str(text: &str) -> Result<Self, BadPlace> {
         let bad = |reason: &str| BadPlace(reason.to_owned());
         let (scheme, rest) = match text.split_once(':') {
-            None if interface_name::is_meant(text) => ("socketcan", text),
+            None if interface_name::is_meant(text, exists) => ("socketcan", text),
             None => (text, ""),
             Some(parts) => parts,
         };

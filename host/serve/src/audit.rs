@@ -13,7 +13,7 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 
-use crate::shared::lock;
+use crate::lock::lock;
 
 /// Lines that wait for the disk.
 const MOST_WAITING: usize = 4096;

@@ -14,12 +14,13 @@ use cantap_wire::message::{ChannelConfig, EndReason, Role};
 use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Hello, Reply};
 
 use crate::audit::Audit;
+use crate::board_figures::BoardFigures;
 use crate::client::{self, Guest};
-use crate::metrics::Metrics;
+use crate::lock::lock;
 use crate::modes;
 use crate::news::News;
 use crate::permissions::{Denied, Permissions, Permit};
-use crate::shared::{Refused, Settings, Shared, lock};
+use crate::shared::{Refused, Settings, Shared};
 use crate::state::Then;
 use crate::upstream::{Upstream, end_sessions};
 
@@ -139,10 +140,10 @@ impl Board {
         self.shared.permit_of(certificate).map(|found| found.map(|(permit, _)| permit))
     }
 
-    pub(crate) fn metrics(&self) -> Metrics {
+    pub(crate) fn figures(&self) -> BoardFigures {
         let state = self.shared.state();
         let clock_hz = state.hello.as_ref().map_or(1, |hello| hello.can_clock_hz);
-        Metrics {
+        BoardFigures {
             is_there: state.hello.is_some(),
             clients: state.clients.len() as u64,
             places: self.shared.settings.most_clients as u64,

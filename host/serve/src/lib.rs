@@ -8,12 +8,14 @@
 
 pub mod audit;
 mod board;
+mod board_figures;
 mod client;
 pub mod connect;
 mod flow;
 mod foreign;
 pub mod lines;
 pub mod listen;
+mod lock;
 mod log_limit;
 pub mod metrics;
 mod modes;

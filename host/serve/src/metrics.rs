@@ -14,6 +14,7 @@ use cantap_wire::Channel;
 use cantap_wire::message::Role;
 
 use crate::Board;
+use crate::board_figures::BoardFigures;
 use crate::listen::{Listening, accept, bind};
 use crate::places::{Places, ends};
 use crate::totals::ChannelTotals;
@@ -115,7 +116,7 @@ type OfChannel = fn(&ChannelTotals) -> u64;
 fn text(boards: &[(String, Weak<Board>)]) -> String {
     let mut out = String::new();
     let all: Vec<_> =
-        boards.iter().filter_map(|(name, board)| Some((label(name), board.upgrade()?.metrics()))).collect();
+        boards.iter().filter_map(|(name, board)| Some((label(name), board.upgrade()?.figures()))).collect();
     let mut family = |name: &str, kind: &str, help: &str, rows: &mut dyn FnMut(Row<'_>)| {
         // Writing to memory cannot fail.
         let _ = write!(out, "# HELP {name} {help}\n# TYPE {name} {kind}\n");
@@ -123,7 +124,7 @@ fn text(boards: &[(String, Weak<Board>)]) -> String {
             let _ = writeln!(out, "{name}{{{labels}}} {value}");
         });
     };
-    let mut of_boards = |name: &str, kind: &str, help: &str, of: fn(&Metrics) -> u64| {
+    let mut of_boards = |name: &str, kind: &str, help: &str, of: fn(&BoardFigures) -> u64| {
         family(name, kind, help, &mut |row| {
             for (board, metrics) in &all {
                 row(&format!("board=\"{board}\""), of(metrics));
@@ -193,16 +194,6 @@ fn text(boards: &[(String, Weak<Board>)]) -> String {
 /// A label's value: what would end it is escaped.
 fn label(text: &str) -> String {
     text.replace('\\', "\\\\").replace('"', "\\\"").replace('\n', "\\n")
-}
-
-/// A board's figures.
-pub(crate) struct Metrics {
-    pub is_there: bool,
-    pub clients: u64,
-    pub places: u64,
-    pub refused: u64,
-    pub channels: crate::totals::Totals,
-    pub bitrates_bps: [Option<u32>; cantap_wire::CHANNELS],
 }
 
 #[cfg(test)]

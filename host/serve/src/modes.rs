@@ -9,7 +9,8 @@ use cantap_wire::message::{ChannelConfig, Mode};
 use cantap_wire::{Channel, Command, Refusal};
 
 use crate::News;
-use crate::shared::{Shared, lock, only_listens};
+use crate::lock::lock;
+use crate::shared::{Shared, only_listens};
 use crate::state::{State, Then, for_all};
 use crate::stream::ClientId;
 

@@ -11,6 +11,7 @@ use cantap_wire::{CHANNELS, Command, Refusal, Reply};
 use serde_json::json;
 
 use crate::audit::{Audit, who};
+use crate::lock::lock;
 use crate::log_limit::LogLimit;
 use crate::news::News;
 use crate::outbox::MOST_RECORDS;
@@ -91,11 +92,6 @@ pub(crate) struct Shared {
     pub audit: Mutex<Option<Arc<Audit>>>,
     /// Connections and requests that were refused.
     pub refused: AtomicU64,
-}
-
-pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Every holder leaves the state consistent, even if it panicked elsewhere.
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Shared {

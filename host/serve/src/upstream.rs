@@ -10,8 +10,9 @@ use cantap_wire::message::EndReason;
 use cantap_wire::record::{LossStage, Record};
 use cantap_wire::{Channel, Command, Corruption, Decoded, Decoder, Event, Reply};
 
+use crate::lock::lock;
 use crate::outbox::Item;
-use crate::shared::{Shared, lock};
+use crate::shared::Shared;
 use crate::state::{State, Then};
 use crate::stream::Entry;
 

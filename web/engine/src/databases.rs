@@ -5,13 +5,13 @@ use std::collections::BTreeSet;
 use cantap_signals::{
     ByteOrder, Database, Decoder, Message, MessageRef, Multiplexed, Signal, Source, ValueKind,
 };
-use cantap_trace::{Id, TraceRecord};
+use cantap_trace::TraceRecord;
 use rustc_hash::FxHashMap;
 use serde::Serialize;
 
 use crate::error::EngineError;
 use crate::index::{Index, Place};
-use crate::own_database::OwnDatabase;
+use crate::own_database::{OwnDatabase, ValueText};
 
 /// Bits of a key that are the signal's place in its message.
 const SIGNAL_BITS: u32 = 20;
@@ -230,15 +230,6 @@ pub struct SignalInfo {
     multiplex: String,
 }
 
-/// The text of a value.
-#[derive(Clone, Debug, Serialize, serde::Deserialize)]
-pub struct ValueText {
-    /// The physical value.
-    pub value: f64,
-    /// Its text.
-    pub text: String,
-}
-
 /// A signal's value for the page: `SignalValue` in `api.ts`.
 #[derive(Serialize)]
 pub struct Value {
@@ -294,10 +285,4 @@ pub fn multiplex(signal: &Signal) -> String {
         text.push('M');
     }
     text
-}
-
-/// The identifier of a request.
-pub fn identifier(id: u32, extended: bool) -> Result<Id, EngineError> {
-    let id_of = if extended { Id::extended(id) } else { Id::standard(id) };
-    id_of.ok_or(EngineError::BadId(id))
 }

@@ -6,12 +6,12 @@ use rustc_hash::FxHashMap;
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use crate::databases::{Databases, Loaded, SignalPlace, identifier};
+use crate::databases::{Databases, Loaded, SignalPlace};
 use crate::error::EngineError;
 use crate::export;
 use crate::findings::{self, Finding};
 use crate::identifiers;
-use crate::index::{Index, Place};
+use crate::index::{Index, Place, identifier};
 use crate::load::{self, ChannelBits};
 use crate::message::{self, Floats, Received, Sections};
 use crate::own_database::SignalEdit;
@@ -347,7 +347,7 @@ impl Engine {
         let bits = bits.entry(channel).or_default();
         bits.extend(channel, store);
         let (nominal, data) = rates.of(channel);
-        let rates = nominal.map(|nominal| load::Rates { nominal, data });
+        let rates = nominal.map(|nominal| load::ChannelRates { nominal, data });
         let found = bits.columns(store, from, to, columns.clamp(1, MOST_COLUMNS), rates);
         let content = self.content()?;
         let times: Vec<_> = found.iter().map(|(time, _)| content.seconds(*time)).collect();

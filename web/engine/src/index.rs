@@ -3,6 +3,7 @@
 use cantap_trace::Id;
 use rustc_hash::FxHashMap;
 
+use crate::error::EngineError;
 use crate::store::Store;
 
 /// So many identifiers have a list. Random or hostile traffic may have half a billion; frames of those beyond are found in the trace
@@ -100,4 +101,10 @@ pub fn window<'a>(rows: &'a [u32], store: &Store, from_ns: i64, to_ns: i64) -> &
     let first = first_at(rows, store, from_ns);
     let end = first_after(rows, store, to_ns).max(first);
     &rows[first..end]
+}
+
+/// The identifier of a request.
+pub fn identifier(id: u32, extended: bool) -> Result<Id, EngineError> {
+    let id_of = if extended { Id::extended(id) } else { Id::standard(id) };
+    id_of.ok_or(EngineError::BadId(id))
 }

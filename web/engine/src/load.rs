@@ -40,14 +40,14 @@ fn bits(record: &TraceRecord) -> (u64, u64) {
 
 /// Bit rates in bit/s.
 #[derive(Clone, Copy)]
-pub struct Rates {
+pub struct ChannelRates {
     /// Outside data phases.
     pub nominal: u32,
     /// In data phases, if known.
     pub data: Option<u32>,
 }
 
-impl Rates {
+impl ChannelRates {
     fn ns(self, bits: (u64, u64)) -> f64 {
         let of = |bits: u64, rate: u32| bits as f64 * 1e9 / f64::from(rate);
         of(bits.0, self.nominal) + self.data.map_or(0.0, |rate| of(bits.1, rate))
@@ -86,7 +86,7 @@ impl ChannelBits {
     }
 
     /// How long the bus was busy up to a time, in nanoseconds.
-    fn busy_ns(&self, store: &Store, time_ns: i64, rates: Rates) -> f64 {
+    fn busy_ns(&self, store: &Store, time_ns: i64, rates: ChannelRates) -> f64 {
         let ended = index::first_after(&self.rows, store, time_ns);
         let summed = ended / STEP;
         let record = |row: &u32| store.record(*row as usize);
@@ -116,7 +116,7 @@ impl ChannelBits {
         from_ns: i64,
         to_ns: i64,
         columns: usize,
-        rates: Option<Rates>,
+        rates: Option<ChannelRates>,
     ) -> Vec<(i64, f64)> {
         let span = to_ns.saturating_sub(from_ns).max(1) as f64;
         let edge = |column: usize| from_ns.saturating_add((span * column as f64 / columns as f64) as i64);
@@ -156,7 +156,7 @@ mod tests {
         }
         let mut channel = ChannelBits::default();
         channel.extend(1, &store);
-        let rates = Some(Rates { nominal: 1_000_000, data: None });
+        let rates = Some(ChannelRates { nominal: 1_000_000, data: None });
         for columns in [1, 7, 250] {
             for (_, load) in channel.columns(&store, period, 1000 * period, columns, rates) {
                 assert!((load - 0.5).abs() < 0.15 / (1000.0 / columns as f64) + 0.01, "{columns}: {load}");

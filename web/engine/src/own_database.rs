@@ -3,9 +3,18 @@
 use cantap_signals::{ByteOrder, Database, Message, Signal, ValueKind, ValueTable, dbc};
 use serde::Deserialize;
 
-use crate::databases::{ValueText, identifier};
 use crate::dbc_text;
 use crate::error::EngineError;
+use crate::index::identifier;
+
+/// The text of a value.
+#[derive(Clone, Debug, serde::Serialize, serde::Deserialize)]
+pub struct ValueText {
+    /// The physical value.
+    pub value: f64,
+    /// Its text.
+    pub text: String,
+}
 
 /// Its name in messages to the user, and of the file that the page saves.
 pub const NAME: &str = "own.dbc";

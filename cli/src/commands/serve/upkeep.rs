@@ -1,6 +1,6 @@
 //! What goes on beside serving: the permissions, the audit log, and reading files again when a hang-up asks for it (SIGHUP).
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Weak};
 
 use anyhow::Context;
@@ -13,7 +13,6 @@ use cantap_serve::tls::Server;
 #[cfg(unix)]
 use nix::sys::signal::{SigSet, Signal};
 
-use super::Args;
 use crate::stderr;
 
 /// Prepared before there are boards.
@@ -34,23 +33,20 @@ struct Reread {
 }
 
 impl Upkeep {
-    /// Reads the files, so that a mistake in them is known before there is a server.
-    pub fn of(args: &Args) -> anyhow::Result<Self> {
+    /// Reads the file of permissions, which are those of certificates, and begins the one of the audit, so that a mistake is known before there
+    /// is a server.
+    pub fn new(permissions: Option<&Path>, audit: Option<&Path>) -> anyhow::Result<Self> {
         #[cfg(feature = "tls")]
-        let permissions = args.permissions.clone();
-        #[cfg(not(feature = "tls"))]
-        let permissions = None;
-        #[cfg(feature = "tls")]
-        if let Some(path) = &permissions {
+        if let Some(path) = permissions {
             Permissions::read(path)?;
         }
-        let audit = args.audit.as_deref().map(|path| {
+        let audit = audit.map(|path| {
             Audit::open(path, |trouble| stderr::warn(&trouble)).with_context(|| {
                 format!("nothing can be recorded in '{}'; give another file with --audit", path.display())
             })
         });
         Ok(Self {
-            files: Reread { permissions, ..Reread::default() },
+            files: Reread { permissions: permissions.map(Path::to_owned), ..Reread::default() },
             audit: audit.transpose()?.map(Arc::new),
             #[cfg(unix)]
             hang_ups: None,

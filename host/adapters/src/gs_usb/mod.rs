@@ -2,6 +2,7 @@
 //!
 //! CAN FD is not switched on, since a data bit rate would have to be guessed: on a bus with CAN FD frames each of them is an error.
 
+mod pipes;
 mod usb;
 mod wire;
 
@@ -10,13 +11,13 @@ use std::time::{Duration, Instant};
 use cantap_wire::record::LossStage;
 use cantap_wire::{CHANNELS, Channel, Frame, Refusal};
 
+use self::pipes::Usb;
 use self::usb::UsbAdapter;
 use self::wire::{Constants, Content, HOST_FORMAT, RECEIVED, Transfer, feature, request, words};
 use crate::adapter_clock::AdapterClock;
 use crate::driver::{At, Driver, Incoming, Oddities, OpenError, Opening};
 use crate::error_frames::ErrorFrames;
 use crate::rows::{Row, row};
-use crate::source::Piece;
 
 /// How often the state is asked for, where it can be.
 const ASK_EVERY: Duration = Duration::from_secs(1);
@@ -31,18 +32,6 @@ const CALLS_AT_THE_END: usize = 4;
 const QUIET: Duration = Duration::from_millis(20);
 /// Frames of a channel under way: the firmware here has three mailboxes.
 const MAILBOXES: usize = 3;
-
-/// Two pipes and vendor requests: another one in tests.
-trait Usb: Send {
-    /// A request with data for the adapter.
-    fn control_out(&mut self, request: u8, value: u16, data: &[u8]) -> Result<(), String>;
-    /// A request that it answers in time.
-    fn control_in(&mut self, request: u8, value: u16, len: u16, within: Duration) -> Result<Vec<u8>, String>;
-    /// The next transfer from it, if one comes in time. An error is its end.
-    fn next(&mut self, wait: Duration) -> Result<Option<Piece<Vec<u8>>>, String>;
-    /// Begins a transfer to it. Returns false if too many are waiting.
-    fn write(&mut self, bytes: Vec<u8>) -> Result<bool, String>;
-}
 
 /// One channel.
 struct Can {

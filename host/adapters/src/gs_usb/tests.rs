@@ -10,6 +10,7 @@ use cantap_wire::record::ErrorState;
 
 use super::wire::tests::constants;
 use super::*;
+use crate::source::Piece;
 
 const EVERYTHING: u32 = feature::LISTEN_ONLY
     | feature::STAMPS

@@ -5,7 +5,7 @@ use std::time::Duration;
 use nusb::transfer::{Buffer, Bulk, ControlIn, ControlOut, ControlType, In, Out, Recipient, TransferError};
 use nusb::{DeviceInfo, Endpoint, ErrorKind, Interface, MaybeFuture};
 
-use super::Usb;
+use super::pipes::Usb;
 use crate::driver::OpenError;
 use crate::source::{Piece, Source};
 

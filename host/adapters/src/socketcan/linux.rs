@@ -11,7 +11,7 @@ use nix::sys::socket::{
 use nix::sys::time::{TimeVal, TimeValLike};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
-use super::Interface;
+use super::interface::Interface;
 use super::link::{self, Link};
 use crate::interface_name;
 use crate::raw_can::{BATCH, Message, Options, RawFrame, RawSocket};

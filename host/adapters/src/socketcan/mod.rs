@@ -4,6 +4,7 @@
 //! controller and its driver, by the kernel on the way to this program, and by the socket.
 
 mod content;
+mod interface;
 mod link;
 mod linux;
 
@@ -17,13 +18,14 @@ use cantap_wire::{Channel, Frame, Refusal};
 use nix::libc::{EAGAIN, EINTR, ENETDOWN, ENOBUFS, ENODEV, ENXIO};
 
 use self::content::{Content, content};
+use self::interface::Interface;
 use self::link::Link;
 use self::linux::LinuxInterface;
 use crate::adapter_clock::AdapterClock;
 use crate::driver::{At, Driver, Incoming, Oddities, OpenError, Opening};
 use crate::error_frames::ErrorFrames;
 use crate::interface_name::same_rate;
-use crate::raw_can::{BATCH, Message, RawFrame, raw_frame};
+use crate::raw_can::{BATCH, Message, raw_frame};
 use crate::rows::{Row, row};
 
 pub(crate) use self::linux::{exists, interfaces};
@@ -38,22 +40,6 @@ const BATCHES_AT_THE_END: usize = 4096;
 const UNCONFIRMED: Duration = Duration::from_secs(1);
 /// A stamp older than this when it is read belongs to a clock that was set.
 const OLDEST: Duration = Duration::from_mins(1);
-
-/// The system's side: another one in tests, where there are no CAN interfaces.
-trait Interface: Send {
-    /// What the kernel says about the interface.
-    fn look(&mut self) -> io::Result<Link>;
-    /// Opens a socket on it.
-    fn open(&mut self) -> io::Result<()>;
-    fn close(&mut self);
-    /// Waits until something has arrived.
-    fn wait(&mut self, wait: Duration);
-    /// Adds what has arrived, without waiting.
-    fn receive(&mut self, messages: &mut Vec<Message>) -> io::Result<()>;
-    fn send(&mut self, frame: &RawFrame) -> io::Result<()>;
-    /// How many messages the socket has dropped, if the kernel says so.
-    fn dropped(&mut self) -> Option<u32>;
-}
 
 /// What has been reported as lost.
 #[derive(Default)]

@@ -6,6 +6,7 @@ use cantap_trace::socketcan::ERROR_FLAG;
 use cantap_wire::record::Stamp;
 
 use super::*;
+use crate::raw_can::RawFrame;
 
 /// What the kernel has, and what was sent.
 #[derive(Default)]

@@ -9,7 +9,8 @@ use cantap_wire::{Channel, Command, Refusal, Reply};
 
 use super::Client;
 use crate::News;
-use crate::shared::{lock, only_listens};
+use crate::lock::lock;
+use crate::shared::only_listens;
 use crate::state::{State, Then, for_all};
 
 /// What a board captured before it was asked for its time has arrived by this time.

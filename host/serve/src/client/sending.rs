@@ -10,8 +10,8 @@ use serde_json::json;
 
 use super::Client;
 use crate::News;
+use crate::lock::lock;
 use crate::permissions::Denied;
-use crate::shared::lock;
 use crate::state::{Table, Then, clears};
 use crate::stream::{Entry, Owner};
 

@@ -26,8 +26,8 @@ use crate::client::Identity;
 use crate::connect::dial;
 use crate::flow::acknowledging;
 use crate::listen::{Arrival, Listening, accept, bind, let_in, turn_away};
+use crate::lock::lock;
 use crate::places::{Places, ends};
-use crate::shared::lock;
 use crate::{Board, News};
 
 pub use keys::{Keys, KeysError, LIFETIME_DAYS, REVOKED};

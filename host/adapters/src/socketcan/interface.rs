@@ -1,0 +1,23 @@
+//! What the driver needs of the system.
+
+use std::io;
+use std::time::Duration;
+
+use super::link::Link;
+use crate::raw_can::{Message, RawFrame};
+
+/// The system's side: another one in tests, where there are no CAN interfaces.
+pub(super) trait Interface: Send {
+    /// What the kernel says about the interface.
+    fn look(&mut self) -> io::Result<Link>;
+    /// Opens a socket on it.
+    fn open(&mut self) -> io::Result<()>;
+    fn close(&mut self);
+    /// Waits until something has arrived.
+    fn wait(&mut self, wait: Duration);
+    /// Adds what has arrived, without waiting.
+    fn receive(&mut self, messages: &mut Vec<Message>) -> io::Result<()>;
+    fn send(&mut self, frame: &RawFrame) -> io::Result<()>;
+    /// How many messages the socket has dropped, if the kernel says so.
+    fn dropped(&mut self) -> Option<u32>;
+}

@@ -1,7 +1,7 @@
 //! The engine of cantap's page: reads, filters and decodes traces in the reader's own browser.
 //!
 //! [`Engine::ask`] takes a request and gives its answer, both as [`message`] lays them out; `web/page/src/api.ts` lists the requests. In
-//! WebAssembly, [`abi`] has the functions that the page's worker calls. Natively, the same code serves tests and `cantap report`.
+//! WebAssembly, the module `abi` has the functions that the page's worker calls. Natively, the same code is tested.
 //!
 //! It draws nothing, keeps no file, and speaks to no network. Nothing that a stranger's file contains may make it panic: there, a panic is
 //! the engine's end.

@@ -68,6 +68,18 @@ struct Crate {
 #[derive(Default)]
 struct Paths(BTreeSet<Vec<String>>);
 
+/// Where a name leads that a module has from elsewhere.
+enum Way<'a> {
+    To(&'a PathBuf),
+    OutOfTheCrate,
+}
+
+impl<'a> From<Option<&'a PathBuf>> for Way<'a> {
+    fn from(file: Option<&'a PathBuf>) -> Self {
+        file.map_or(Self::OutOfTheCrate, Self::To)
+    }
+}
+
 impl Crate {
     fn read(root: &Path) -> Result<Self> {
         let mut krate = Self::default();
@@ -174,7 +186,10 @@ impl Crate {
             if depth < 8
                 && let Some(file) = self.through_a_door(&at, segment, &path[n + 1..], depth)
             {
-                return file;
+                return match file {
+                    Way::To(file) => Some(file),
+                    Way::OutOfTheCrate => None,
+                };
             }
             break;
         }
@@ -182,19 +197,13 @@ impl Crate {
     }
 
     /// Where a name leads that this module has from elsewhere: to a file of this crate, or out of it. `None` if it has it from nowhere.
-    fn through_a_door(
-        &self,
-        at: &Module,
-        name: &str,
-        rest: &[String],
-        depth: usize,
-    ) -> Option<Option<&PathBuf>> {
+    fn through_a_door(&self, at: &Module, name: &str, rest: &[String], depth: usize) -> Option<Way<'_>> {
         let item = (at.clone(), name.to_owned());
         if self.defined.contains(&item) {
             return None;
         }
         if let Some(door) = self.doors.get(&item) {
-            return Some(self.file_of(at, &[door, rest].concat(), depth + 1));
+            return Some(self.file_of(at, &[door, rest].concat(), depth + 1).into());
         }
         let modules = self.wide_doors.get(at)?.iter().filter_map(|door| self.module_of(at, door));
         modules
@@ -205,7 +214,7 @@ impl Crate {
                     || self.doors.contains_key(&item)
                     || self.files.contains_key(&[module.clone(), vec![name.to_owned()]].concat())
             })
-            .map(|module| self.descend(module, &[&[name.to_owned()], rest].concat(), depth + 1))
+            .map(|module| self.descend(module, &[&[name.to_owned()], rest].concat(), depth + 1).into())
     }
 
     /// The module of this crate that a path names.

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::bail;
 use cantap::TraceRecord;
-use cantap_formats::{Format, LeftOut, ReadOptions, Zone, open_reader};
+use cantap_formats::{Columns, Format, LeftOut, ReadOptions, Zone, open_reader};
 use cantap_trace::filter::Filter;
 
 use crate::completion;
@@ -21,6 +21,9 @@ pub struct ReadArgs {
     /// The trace's format, if neither its content nor its name show it, or show the wrong one.
     #[arg(long = "from", value_name = "FORMAT", add = completion::formats())]
     pub format: Option<Format>,
+    /// The trace is a table with these columns: time=Timestamp:ms,id=ID:hex,data=Data. By name or number from 1; also dlc, bytes, channel.
+    #[arg(long, value_name = "COLUMNS", conflicts_with = "format")]
+    pub columns: Option<Columns>,
     /// Stop at the first fault instead of leaving it out.
     #[arg(long)]
     pub strict: bool,
@@ -105,8 +108,13 @@ impl ReadArgs {
     }
 
     fn open_as(&self, path: &Path, follow: bool) -> anyhow::Result<Records> {
-        let options =
-            ReadOptions { format: self.format, follow, strict: self.strict, zone: self.zone.clone() };
+        let options = ReadOptions {
+            format: self.format,
+            follow,
+            strict: self.strict,
+            zone: self.zone.clone(),
+            columns: self.columns.clone(),
+        };
         let mut reader = open_reader(path, &options)?;
         if let Some(named) = reader.named_otherwise() {
             let (name, format) = (path.display(), reader.format());

@@ -137,7 +137,7 @@ fn find(args: &Args) -> anyhow::Result<(Vec<Alignment>, Vec<u8>)> {
 
 fn sketch(args: &Args, path: &Path, length: usize) -> anyhow::Result<Sketch> {
     let zone = args.write.zone.clone();
-    let options = ReadOptions { format: args.from, follow: false, strict: args.strict, zone };
+    let options = ReadOptions { format: args.from, strict: args.strict, zone, ..ReadOptions::default() };
     let mut reader = open_reader(path, &options)?;
     let mut sketch = Sketch::new(length);
     let mut batch = Vec::new();
@@ -182,7 +182,8 @@ struct Merged<'a> {
 impl<'a> Merged<'a> {
     fn open(args: &Args, alignments: Vec<Alignment>, offsets: &'a [u8]) -> anyhow::Result<Self> {
         let zone = args.write.zone.clone();
-        let read = ReadArgs { format: args.from, strict: args.strict, filter: Vec::new(), zone };
+        let read =
+            ReadArgs { format: args.from, columns: None, strict: args.strict, filter: Vec::new(), zone };
         let sources = args.traces.iter().map(|path| read.open(path)).collect::<anyhow::Result<Vec<_>>>()?;
         let others = alignments
             .into_iter()

@@ -8,7 +8,9 @@ use anyhow::bail;
 #[cfg(feature = "parquet")]
 use cantap_columns::parquet::Key;
 use cantap_formats::time_range::{TimePoint, TimeRange};
-use cantap_formats::{DifConvention, Format, LineEnd, RotateAt, Rotation, TableStyle, WriteOptions, Zone};
+use cantap_formats::{
+    Columns, DifConvention, Format, LineEnd, RotateAt, Rotation, TableStyle, WriteOptions, Zone,
+};
 use cantap_trace::filter::Filter;
 
 use crate::args;
@@ -37,6 +39,9 @@ pub struct Args {
     /// The format of IN, if neither its content nor its name show it, or show the wrong one. All are listed below.
     #[arg(long, value_name = "FORMAT", add = completion::formats())]
     from: Option<Format>,
+    /// IN is a table with these columns: time=Timestamp:ms,id=ID:hex,data=Data. By name or number from 1; also dlc, bytes, channel.
+    #[arg(long, value_name = "COLUMNS", conflicts_with = "from")]
+    columns: Option<Columns>,
     /// Wait for more at the end of IN, until Ctrl-C.
     #[arg(long)]
     follow: bool,
@@ -182,7 +187,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let filter = args.filters.iter().chain(&args.filter_options).cloned().collect();
     let zone = args.write.zone.clone();
-    let read = ReadArgs { format: args.from, strict: args.strict, filter, zone };
+    let read =
+        ReadArgs { format: args.from, columns: args.columns.clone(), strict: args.strict, filter, zone };
     let read = FollowArgs { read, follow: args.follow };
     let mut records = read.open(&args.input)?;
     let grows = records.end_when(interrupt::requested);

@@ -46,6 +46,12 @@ pub(crate) const COLUMNS: [&str; 23] = [
     "SFF",
 ];
 
+/// Whether a text begins with the first names of the table's columns.
+pub(crate) fn is_head(text: &[u8]) -> bool {
+    let rest = text.strip_prefix(COLUMNS[0].as_bytes()).and_then(|rest| rest.get(1..));
+    rest.is_some_and(|rest| rest.starts_with(COLUMNS[1].as_bytes()))
+}
+
 /// The error for each of the four columns from `ACK` on.
 const ERRORS: [BusErrorKind; 4] =
     [BusErrorKind::Acknowledgment, BusErrorKind::Form, BusErrorKind::Crc, BusErrorKind::Stuff];

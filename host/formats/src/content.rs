@@ -1,6 +1,6 @@
 //! Describes what the beginning of a file looks like, for users who gave the wrong one.
 
-use super::Format;
+use super::{Format, table};
 
 /// How many bytes to look at.
 pub(crate) const HEAD_BYTES: usize = 256;
@@ -54,7 +54,16 @@ pub(crate) fn looks_like(head: &[u8], read_as: Format) -> String {
     let shown: String =
         line.chars().filter(|character| !cantap_trace::clean::is_harmful(*character)).take(60).collect();
     let more = if shown.len() < line.len() { "…" } else { "" };
-    format!("text that begins with '{shown}{more}'")
+    let text = format!("text that begins with '{shown}{more}'");
+    // Read as a table in certain columns, it may be one in others.
+    let is_table = matches!(read_as, Format::Csv(_) | Format::Table);
+    match table::proposal(head).filter(|_| is_table) {
+        Some(mut columns) => {
+            columns.retain(|character| !cantap_trace::clean::is_harmful(character));
+            format!("{text}; if it is a table of frames, say what its columns are: --columns '{columns}'")
+        }
+        None => text,
+    }
 }
 
 #[cfg(test)]

@@ -108,7 +108,10 @@ impl Decode for Decoder {
 
 /// Whether a text begins like a table of python-can, of ours or of the analyser.
 pub(crate) fn is_head(text: &[u8]) -> bool {
-    text.starts_with(b"timestamp,") || text.starts_with(b"time,") || text.starts_with(b"Index")
+    // Tables of others have some of the same names.
+    text.starts_with(b"timestamp,arbitration_id,extended")
+        || text.starts_with(b"time,channel,direction")
+        || analyser::is_head(text)
 }
 
 /// More lines than this before the header are not comments.

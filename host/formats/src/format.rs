@@ -47,4 +47,6 @@ pub enum Format {
     CanEdgeCsv,
     /// The log of Battery-Emulator.
     BatteryEmulator,
+    /// A table of any columns.
+    Table,
 }

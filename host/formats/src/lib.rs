@@ -59,6 +59,7 @@ mod socketcan_packet;
 mod spec;
 #[cfg(feature = "sqlite")]
 mod sqlite;
+mod table;
 #[cfg(test)]
 mod tests;
 mod text;
@@ -80,6 +81,7 @@ pub use left_out::LeftOut;
 pub use reader::{NothingRead, OpenError, ReadOptions, TraceReader, open_reader};
 pub use rotation::{BadRotation, RotateAt, Rotation};
 pub use spec::{NotWritten, UnknownFormat};
+pub use table::{BadColumns, Columns};
 pub use trc::TrcVersion;
 pub use unread::{Readable, Unread};
 pub use writer::{ChannelInfo, TraceWriter, WriteOptions};

@@ -8,8 +8,8 @@ use super::issue::Fault;
 use super::row_format::{Line, RowFormat};
 use super::text::{self, NS_PER_S};
 use super::zone::Zone;
-use cantap_trace::TraceRecord;
 use cantap_trace::socketcan::ERROR_FLAG;
+use cantap_trace::{Direction, TraceRecord};
 
 /// Reads the output.
 #[derive(Default)]
@@ -20,7 +20,8 @@ pub(crate) struct Decoder {
 
 /// Whether a line is in this format.
 pub(crate) fn is_line(line: &[u8]) -> bool {
-    line.trim_ascii_start().starts_with(b"Timestamp: ")
+    let mut words = line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
+    words.next() == Some(b"Timestamp:") && words.nth(1) == Some(b"ID:")
 }
 
 impl RowFormat for Decoder {
@@ -38,23 +39,36 @@ impl RowFormat for Decoder {
         let time_ns = text::time(time, NS_PER_S, b'.');
         let time_ns = time_ns.ok_or_else(|| Fault::malformed("a time in seconds", time))?;
         let raw = text::hex(id).ok_or_else(|| Fault::malformed("an identifier in hexadecimal digits", id))?;
-        let extended = match format {
-            b"X" => true,
-            b"S" => false,
-            other => return Err(Fault::malformed("X for extended or S for standard", other)),
-        };
-        let direction = direction(way)?;
         let (mut error, mut remote, mut is_fd, mut flags) = (false, false, false, FdFields::default());
+        // Version 1 had a digit each for remote, extended and error.
+        let old = <[u8; 3]>::try_from(format)
+            .ok()
+            .filter(|digits| digits.iter().all(|digit| matches!(digit, b'0' | b'1')));
+        let extended = match (format, old) {
+            (b"X", _) => true,
+            (b"S", _) => false,
+            (_, Some(digits)) => {
+                (remote, error) = (digits[0] == b'1', digits[2] == b'1');
+                digits[1] == b'1'
+            }
+            (other, None) => return Err(Fault::malformed("X for extended or S for standard", other)),
+        };
+        // Before version 4 there was no direction.
+        let (direction, mut word) = match direction(way) {
+            Ok(direction) => (direction, words.next().unwrap_or_default()),
+            Err(_) => (Direction::Rx, way),
+        };
         loop {
-            match words.next().unwrap_or_default() {
+            match std::mem::take(&mut word) {
                 b"E" => error = true,
                 b"R" => remote = true,
                 b"F" => is_fd = true,
                 b"BS" => flags.brs = true,
                 b"EI" => flags.esi = true,
-                b"DL:" => break,
-                other => return Err(Fault::malformed("flags, then 'DL:'", other)),
+                b"DL:" | b"DLC:" => break,
+                other => return Err(Fault::malformed("'Rx' or 'Tx', flags, then 'DL:'", other)),
             }
+            word = words.next().unwrap_or_default();
         }
         let len = words.next().unwrap_or_default();
         let number = text::decimal(len).filter(|number| *number <= if is_fd { 64 } else { 15 });

@@ -13,6 +13,7 @@ use super::input::Input;
 use super::issue::{Fault, Place, ReadIssue};
 use super::left_out::LeftOut;
 use super::spec::{FormatSpec, UnknownFormat};
+use super::table::Columns;
 use super::zone::Zone;
 use cantap_trace::{PlainFrame, TraceRecord};
 
@@ -28,6 +29,8 @@ pub struct ReadOptions {
     pub strict: bool,
     /// The zone of dates in files that name none.
     pub zone: Zone,
+    /// Which columns of a table mean what. If they are given and no format is, files are tables.
+    pub columns: Option<Columns>,
 }
 
 /// Why a file cannot be opened for reading.
@@ -98,7 +101,8 @@ pub fn open_reader(path: impl AsRef<Path>, options: &ReadOptions) -> Result<Trac
     let failed = |error| OpenError::Io(name.clone(), error);
     let mut input = Input::open(path, options.follow).map_err(failed)?;
     let mut named = None;
-    let format = if let Some(format) = options.format {
+    let table = options.columns.as_ref().map(|_| Format::Table);
+    let format = if let Some(format) = options.format.or(table) {
         format
     } else {
         // A pipe may deliver only a single line for a long time.
@@ -120,13 +124,13 @@ pub fn open_reader(path: impl AsRef<Path>, options: &ReadOptions) -> Result<Trac
         }
     };
     input.set_zone(options.zone.clone());
-    let reader = TraceReader::new(name.into(), format, input, options.strict);
+    let reader = TraceReader::new(name.into(), format, input, options);
     Ok(TraceReader { named, ..reader })
 }
 
 impl TraceReader {
-    fn new(name: Arc<str>, format: Format, input: Input, strict: bool) -> Self {
-        let decoder = (FormatSpec::of(format).reader)(input.zone());
+    fn new(name: Arc<str>, format: Format, input: Input, options: &ReadOptions) -> Self {
+        let decoder = (FormatSpec::of(format).reader)(options);
         let batch = Vec::with_capacity(BATCH);
         let head = input.buffered().iter().take(content::HEAD_BYTES).copied().collect();
         Self {
@@ -137,7 +141,7 @@ impl TraceReader {
             batch,
             at: 0,
             after: None,
-            strict,
+            strict: options.strict,
             issues: 0,
             notes: LeftOut::default(),
             left_out: LeftOut::default(),
@@ -157,7 +161,7 @@ impl TraceReader {
     ) -> io::Result<Self> {
         let mut input = Input::decompressing(Box::new(source), options.follow)?;
         input.set_zone(options.zone.clone());
-        Ok(Self::new(name.into(), format, input, options.strict))
+        Ok(Self::new(name.into(), format, input, options))
     }
 
     /// The file's format.

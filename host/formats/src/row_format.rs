@@ -60,6 +60,13 @@ pub(crate) struct Rows<F> {
     more: ErrorFrames,
 }
 
+impl<F> Rows<F> {
+    /// With a format that is not the default of its kind.
+    pub(crate) fn of(format: F) -> Self {
+        Self { format, begun: false, ended: false, more: ErrorFrames::default() }
+    }
+}
+
 impl<F: RowFormat> Decode for Rows<F> {
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
         if let Some(found) = self.more.next() {

@@ -11,13 +11,13 @@ use super::compression::Compression;
 use super::csv::CsvDialect;
 use super::dif::{self, DifLayout};
 use super::format::Format;
+use super::reader::ReadOptions;
 use super::row_format::Rows;
 use super::trc::TrcVersion;
 use super::writer::WriteOptions;
-use super::zone::Zone;
 use super::{
     asc, battery_emulator, blf, busmaster, candump, candump_screen, canedge, canhacker, canking, crtd, csv,
-    gvret, kvaser, mf4, microchip, pcap, pcapng, printer, trc,
+    gvret, kvaser, mf4, microchip, pcap, pcapng, printer, table, trc,
 };
 
 /// One format.
@@ -31,8 +31,8 @@ pub(crate) struct FormatSpec {
     begins: fn(&Head<'_>) -> bool,
     /// Whether its files begin with something other than a record, so that an empty file is not one of them.
     pub has_head: bool,
-    /// Makes a reader. The zone is that of dates in files that name none.
-    pub reader: fn(&Zone) -> Box<dyn Decode>,
+    /// Makes a reader.
+    pub reader: fn(&ReadOptions) -> Box<dyn Decode>,
     /// Makes a writer; `None` if the format is only read.
     pub writer: Option<MakeWriter>,
 }
@@ -95,7 +95,7 @@ const FORMATS: &[FormatSpec] = &[
         suffixes: &["asc"],
         begins: |head| asc::is_head(head.text),
         has_head: true,
-        reader: |zone| Box::new(asc::Decoder::new(zone)),
+        reader: |options| Box::new(asc::Decoder::new(&options.zone)),
         writer: Some(|options| Box::new(asc::Encoder::new(&options.zone))),
     },
     FormatSpec {
@@ -104,7 +104,7 @@ const FORMATS: &[FormatSpec] = &[
         suffixes: &["blf"],
         begins: |head| head.bytes.starts_with(blf::FILE_MAGIC),
         has_head: true,
-        reader: |zone| Box::new(blf::Decoder::new(zone)),
+        reader: |options| Box::new(blf::Decoder::new(&options.zone)),
         writer: Some(|options| Box::new(blf::Encoder::new(&options.zone))),
     },
     FormatSpec {
@@ -113,7 +113,7 @@ const FORMATS: &[FormatSpec] = &[
         suffixes: &["trc"],
         begins: |head| trc::is_head(head.text, head.line),
         has_head: true,
-        reader: |zone| Box::new(trc::Decoder::new(zone)),
+        reader: |options| Box::new(trc::Decoder::new(&options.zone)),
         writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V2_1, &options.zone))),
     },
     FormatSpec {
@@ -122,7 +122,7 @@ const FORMATS: &[FormatSpec] = &[
         suffixes: &[],
         begins: NEVER,
         has_head: true,
-        reader: |zone| Box::new(trc::Decoder::new(zone)),
+        reader: |options| Box::new(trc::Decoder::new(&options.zone)),
         writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V2_0, &options.zone))),
     },
     FormatSpec {
@@ -131,7 +131,7 @@ const FORMATS: &[FormatSpec] = &[
         suffixes: &[],
         begins: NEVER,
         has_head: true,
-        reader: |zone| Box::new(trc::Decoder::new(zone)),
+        reader: |options| Box::new(trc::Decoder::new(&options.zone)),
         writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_3, &options.zone))),
     },
     FormatSpec {
@@ -140,7 +140,7 @@ const FORMATS: &[FormatSpec] = &[
         suffixes: &[],
         begins: NEVER,
         has_head: true,
-        reader: |zone| Box::new(trc::Decoder::new(zone)),
+        reader: |options| Box::new(trc::Decoder::new(&options.zone)),
         writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_2, &options.zone))),
     },
     FormatSpec {
@@ -149,7 +149,7 @@ const FORMATS: &[FormatSpec] = &[
         suffixes: &[],
         begins: NEVER,
         has_head: true,
-        reader: |zone| Box::new(trc::Decoder::new(zone)),
+        reader: |options| Box::new(trc::Decoder::new(&options.zone)),
         writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_1, &options.zone))),
     },
     FormatSpec {
@@ -158,16 +158,16 @@ const FORMATS: &[FormatSpec] = &[
         suffixes: &[],
         begins: NEVER,
         has_head: true,
-        reader: |zone| Box::new(trc::Decoder::new(zone)),
+        reader: |options| Box::new(trc::Decoder::new(&options.zone)),
         writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_0, &options.zone))),
     },
     FormatSpec {
         format: Format::Csv(CsvDialect::PythonCan),
         names: &["csv", "csv-python-can"],
         suffixes: &["csv"],
-        begins: |head| csv::is_head(head.text),
+        begins: |head| csv::is_head(head.text) || csv::is_head(head.first),
         has_head: true,
-        reader: |zone| Box::new(csv::Decoder::new(zone)),
+        reader: |options| Box::new(csv::Decoder::new(&options.zone)),
         writer: Some(|_| Box::new(csv::PythonCanEncoder::default())),
     },
     FormatSpec {
@@ -176,7 +176,7 @@ const FORMATS: &[FormatSpec] = &[
         suffixes: &[],
         begins: NEVER,
         has_head: true,
-        reader: |zone| Box::new(csv::Decoder::new(zone)),
+        reader: |options| Box::new(csv::Decoder::new(&options.zone)),
         writer: Some(|_| Box::new(csv::FullEncoder::default())),
     },
     FormatSpec {
@@ -185,7 +185,7 @@ const FORMATS: &[FormatSpec] = &[
         suffixes: &[],
         begins: NEVER,
         has_head: true,
-        reader: |zone| Box::new(csv::Decoder::new(zone)),
+        reader: |options| Box::new(csv::Decoder::new(&options.zone)),
         writer: Some(|options| Box::new(TableEncoder::new(CsvLayout(options.table), &options.zone))),
     },
     FormatSpec {
@@ -194,7 +194,7 @@ const FORMATS: &[FormatSpec] = &[
         suffixes: &[],
         begins: |head| gvret::is_head(head.line),
         has_head: true,
-        reader: |zone| Box::new(csv::Decoder::new(zone)),
+        reader: |options| Box::new(csv::Decoder::new(&options.zone)),
         writer: Some(|_| Box::new(gvret::Encoder::default())),
     },
     FormatSpec {
@@ -221,7 +221,7 @@ const FORMATS: &[FormatSpec] = &[
         suffixes: &["dif"],
         begins: |head| head.text.starts_with(b"TABLE"),
         has_head: true,
-        reader: |zone| Box::new(dif::Decoder::new(zone)),
+        reader: |options| Box::new(dif::Decoder::new(&options.zone)),
         writer: Some(|options| Box::new(TableEncoder::new(DifLayout::new(options.table), &options.zone))),
     },
     FormatSpec {
@@ -334,7 +334,21 @@ const FORMATS: &[FormatSpec] = &[
         reader: |_| Box::new(Rows::<battery_emulator::Decoder>::default()),
         writer: None,
     },
+    FormatSpec {
+        format: Format::Table,
+        names: &["table"],
+        suffixes: &["csv", "tsv", "txt"],
+        begins: |head| table::is_first(head.first) && !is_of_another(head),
+        has_head: false,
+        reader: |options| Box::new(Rows::of(table::Decoder::new(options.columns.clone()))),
+        writer: None,
+    },
 ];
+
+/// Whether a file begins like one of a format other than a table of any columns.
+fn is_of_another(head: &Head<'_>) -> bool {
+    FORMATS.iter().filter(|spec| spec.format != Format::Table).any(|spec| (spec.begins)(head))
+}
 
 /// There is no such format.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -478,6 +492,11 @@ mod tests {
             (utf8("//-----\nMicrochip Technology Inc.\n"), Format::Microchip),
             (utf8("Time   ID     DLC Data                    Comment\n"), Format::CanHacker),
             (utf8("Timestamp: 1410714882.000000    ID:      123    S Rx"), Format::Printer),
+            (utf8("Timestamp: 1479121434.850202        ID: 0350    000    DLC: 8    05 28"), Format::Printer),
+            (utf8("timestamp,arbitration_id,data_field,attack\n1.0,0C1,00,0\n"), Format::Table),
+            (utf8("time,addr,bus,data\n"), Format::Table),
+            (utf8("Index;ID;Data\n"), Format::Table),
+            (utf8("1478198376.389427,0316,2,05,21,R\n"), Format::Table),
         ] {
             assert_eq!(Format::of_content(&head), Some(format), "{}", String::from_utf8_lossy(&head));
             let begins = FORMATS.iter().filter(|spec| (spec.begins)(&Head::of(&head)));

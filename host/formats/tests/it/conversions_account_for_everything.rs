@@ -243,6 +243,12 @@ fn samples() -> Vec<(Format, Vec<u8>)> {
             "(0.05) RX0 17FC007B [8] 11 22 33 44 55 66 77 88\r\n(0.05) TX1 3C0 [2] 00 FF\r\n(0.06) RX2 7 [0]\r\n\
              [12 CAN frames not printed]\r\n(51.261) TX3 1FFFFFFF [12] 00 01 02 03 04 05 06 07 08 09 0A 0B\r\n",
         ),
+        text(
+            Format::Table,
+            "Timestamp,CAN ID,IDE,Bus,Dir,RTR,DLC,Data,Label\n1478198376.389427,0A5,0,0,Rx,0,2,05 21,R\n\
+             1478198376.389428,18DAF110,1,1,Tx,0,0,,R\n1478198376.389429,123,0,0,Rx,1,3,,R\n\
+             1478198376.389430,124,0,0,Rx,0,12,00 01 02 03 04 05 06 07 08 09 0A 0B,T\n",
+        ),
     ]
 }
 

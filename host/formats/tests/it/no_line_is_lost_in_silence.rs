@@ -135,6 +135,9 @@ fn foreign() -> Vec<Text> {
             "Time   ID     DLC Data                    Comment\n",
             |_, id, _, data| format!("00.500 {id:X} {} {} \n", data.len(), hex(data, " ")),
         ),
+        Text::foreign(Format::Table, "Timestamp,CAN ID,IDE,DLC,Data\n", |at, id, extended, data| {
+            format!("1.{at:06},{id:03X},{},{},{}\n", u8::from(extended), data.len(), hex(data, " "))
+        }),
         Text::foreign(Format::Printer, "", |at, id, extended, data| {
             format!(
                 "Timestamp: 1410714882.{at:06}    ID: {id:8x}    {} Rx                DL:  {}    {}     Channel: can0\n",

@@ -43,7 +43,8 @@ pub fn file_name(format: Format, compression: &str) -> String {
         | Format::Kvaser
         | Format::Printer
         | Format::CanKing
-        | Format::BatteryEmulator => "txt",
+        | Format::BatteryEmulator
+        | Format::Table => "txt",
         Format::Sqlite => "db",
         Format::Crtd => "crtd",
         Format::Microchip => "can",

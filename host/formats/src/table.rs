@@ -1,0 +1,377 @@
+//! Tables of any columns: what they mean is said by the user, shown by the names above them, or by the first row.
+
+mod columns;
+mod layout;
+mod time;
+
+pub use columns::{BadColumns, Columns};
+
+use super::frame_fields::{FdFields, FrameFields, Payload, identifier};
+use super::interfaces::Interfaces;
+use super::issue::Fault;
+use super::row_format::{Line, RowFormat};
+use super::text;
+use super::zone::Zone;
+use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
+use cantap_trace::{Direction, TraceRecord};
+use columns::{Form, Role};
+use layout::{Layout, Separator};
+use time::FileDate;
+
+const NO_TIMES: &str = "the table has no times: all its frames stand at 0";
+const OTHERS: &str = "columns of the table that have no place in a trace, such as labels, were left out";
+const MAY_BE_DECIMAL: &str =
+    "identifiers were read as hexadecimal, but may be decimal: the columns say so with id=NAME:dec";
+
+/// Reads the rows.
+#[derive(Default)]
+pub(crate) struct Decoder {
+    columns: Option<Columns>,
+    layout: Option<Layout>,
+    /// The first rows, to see how numbers are written in them.
+    sample: Vec<u8>,
+    unit_ns: Option<i64>,
+    day: Option<FileDate>,
+    interfaces: Interfaces,
+    radix: Radix,
+    notes: Vec<&'static str>,
+}
+
+/// Whether numbers are decimal.
+#[derive(Clone, Copy, Default)]
+struct Radix {
+    id: bool,
+    data: bool,
+}
+
+/// Whether a line is the names above the columns of a table, or a row of one without names.
+pub(crate) fn is_first(line: &[u8]) -> bool {
+    Layout::of_names(line).is_some() || Layout::of_row(line).is_some()
+}
+
+/// Columns as a user may give them for a table that is not known by itself.
+pub(crate) fn proposal(head: &[u8]) -> Option<String> {
+    layout::proposal(first_line(head)?)
+}
+
+/// The first line that is no comment.
+fn first_line(head: &[u8]) -> Option<&[u8]> {
+    let mut lines = head.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii);
+    lines.find(|line| !line.is_empty() && !line.starts_with(b"#"))
+}
+
+fn without_0x(cell: &[u8]) -> Option<&[u8]> {
+    cell.strip_prefix(b"0x").or_else(|| cell.strip_prefix(b"0X"))
+}
+
+impl Decoder {
+    /// With the columns that the user gave, if any.
+    pub(crate) fn new(columns: Option<Columns>) -> Self {
+        Self { columns, ..Self::default() }
+    }
+
+    /// Takes the first line that is no comment; true if it is a row.
+    fn first(&mut self, line: &[u8]) -> Result<bool, Fault> {
+        let (layout, is_row) = match &self.columns {
+            Some(columns) => Layout::of_columns(columns, line)?,
+            None => match (Layout::of_names(line), Layout::of_row(line)) {
+                (Some(layout), _) => (layout, false),
+                (None, Some(layout)) => (layout, true),
+                (None, None) => {
+                    let expected = "names above the columns, among them an identifier and data bytes";
+                    return Err(Fault::malformed(expected, line));
+                }
+            },
+        };
+        if layout.place(Role::Time).is_none() {
+            self.notes.push(NO_TIMES);
+        }
+        if layout.has_others {
+            self.notes.push(OTHERS);
+        }
+        self.radix = self.radix_of(&layout, is_row);
+        self.layout = Some(layout);
+        self.sample = Vec::new();
+        Ok(is_row)
+    }
+
+    /// How identifiers and bytes are written, by what is said, and otherwise by what the first rows have.
+    fn radix_of(&mut self, layout: &Layout, is_row: bool) -> Radix {
+        let lines = self.sample.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii);
+        let rows = lines.filter(|line| !line.is_empty() && !line.starts_with(b"#"));
+        let (mut ids, mut bytes) = (Vec::new(), Vec::new());
+        let data = layout.place(Role::Data).or(layout.place(Role::Bytes));
+        for row in rows.skip(usize::from(!is_row)) {
+            let cells = layout.separator.cells(row);
+            let at = |role| layout.place(role).and_then(|place| cells.get(place.at)).copied();
+            ids.extend(at(Role::Id));
+            if let Some(first) = layout.place(Role::Bytes) {
+                bytes.extend(cells.iter().skip(first.at).take(layout.byte_columns.min(8)).copied());
+            }
+        }
+        let form = layout.place(Role::Id).and_then(|place| place.form);
+        let (id, is_sure) = form.map_or_else(|| ids_are_decimal(&ids), |form| (form == Form::Decimal, true));
+        if !is_sure {
+            self.notes.push(MAY_BE_DECIMAL);
+        }
+        let data = match data.and_then(|place| place.form) {
+            Some(form) => form == Form::Decimal,
+            // Hexadecimal bytes have two digits at most.
+            None => bytes.iter().any(|byte| byte.len() == 3 && text::decimal(byte).is_some()),
+        };
+        Radix { id, data }
+    }
+
+    fn time_ns(&mut self, cell: &[u8], form: Option<Form>, zone: &Zone) -> Result<i64, Fault> {
+        let is_number =
+            |byte: &u8| byte.is_ascii_digit() || matches!(byte, b'.' | b',' | b'-' | b'+' | b'e' | b'E');
+        let time_ns = if cell.iter().all(is_number) {
+            let unit_ns = match (form, self.unit_ns) {
+                (Some(Form::Unit(unit_ns)), _) | (_, Some(unit_ns)) => unit_ns,
+                _ => *self.unit_ns.insert(time::unit_of(cell)),
+            };
+            time::number(cell, unit_ns)
+        } else {
+            time::stamp(cell, self.day, zone).or_else(|| time::date(cell, zone))
+        };
+        time_ns.ok_or_else(|| Fault::malformed("a time: a number or a date", cell))
+    }
+
+    fn row(&mut self, line: &[u8], zone: &Zone) -> Result<Line, Fault> {
+        let Some(layout) = self.layout.take() else { return Ok(Line::Nothing) };
+        let record = self.record(&layout, line, zone);
+        self.layout = Some(layout);
+        record.map(Line::Record)
+    }
+
+    fn record(&mut self, layout: &Layout, line: &[u8], zone: &Zone) -> Result<TraceRecord, Fault> {
+        let cells = layout.separator.cells(line);
+        if cells.len() < layout.least_cells() {
+            return Err(Fault::malformed(format!("{} cells or more", layout.least_cells()), line));
+        }
+        let cell = |role| {
+            layout.place(role).map(|place| (cells.get(place.at).copied().unwrap_or_default(), place.form))
+        };
+        let time_ns = match cell(Role::Time) {
+            Some((time, form)) => self.time_ns(time, form, zone)?,
+            None => 0,
+        };
+        let (shown, _) = cell(Role::Id).unwrap_or_default();
+        let raw = id(shown, self.radix.id)?;
+        let extended = cell(Role::Extended).and_then(|(cell, _)| mark(cell));
+        let id = identifier(raw, extended.unwrap_or(raw > 0x7FF), shown)?;
+        let remote = cell(Role::Remote).and_then(|(cell, _)| mark(cell)).unwrap_or(false);
+        let direction = match cell(Role::Direction) {
+            Some((way, _)) => direction(way)?,
+            None => Direction::Rx,
+        };
+        let channel = match cell(Role::Channel) {
+            Some((name, form)) => self.channel(name, form)?,
+            None => 1,
+        };
+        let len = match cell(Role::Dlc) {
+            Some((cell, _)) => Some(length(cell)?),
+            None => None,
+        };
+        let data = if remote { Payload::EMPTY } else { self.data(layout, &cells, len)? };
+        let count = data.as_slice().len();
+        let code = len.filter(|_| remote || count == 8).filter(|len| *len <= 15);
+        let fd = (count > 8).then(FdFields::default);
+        let len = code.map_or(count, |code| if code < 8 && !remote { count } else { code });
+        let fields = FrameFields { id, remote, direction, len: len as u8, fd };
+        Ok(TraceRecord { time_ns, channel, event: fields.event(&data)? })
+    }
+
+    fn channel(&mut self, name: &[u8], form: Option<Form>) -> Result<u8, Fault> {
+        let Some(number) = text::decimal(name) else { return Ok(self.interfaces.channel(name)) };
+        let channel = number.checked_add(u64::from(form == Some(Form::FromZero)));
+        let channel = channel.and_then(|channel| u8::try_from(channel).ok());
+        channel.ok_or_else(|| Fault::malformed("a channel of 0 to 255", name))
+    }
+
+    /// The bytes, as many as the length says if there is one.
+    fn data(&self, layout: &Layout, cells: &[&[u8]], len: Option<usize>) -> Result<Payload, Fault> {
+        let decimal = self.radix.data;
+        let mut bytes = Vec::with_capacity(8);
+        if let Some(place) = layout.place(Role::Data) {
+            let is_last = layout.separator == Separator::Blanks;
+            let end = if is_last { cells.len() } else { (place.at + 1).min(cells.len()) };
+            for cell in cells.get(place.at..end).unwrap_or_default() {
+                push_bytes(cell, decimal, &mut bytes)?;
+            }
+            let fits = |len: usize| {
+                len == bytes.len()
+                    || bytes.len() == 8 && (9..16).contains(&len)
+                    || FD_LENGTHS.get(len).is_some_and(|fd| usize::from(*fd) == bytes.len())
+            };
+            if let Some(len) = len.filter(|len| !fits(*len)) {
+                let found = format!("{} bytes", bytes.len());
+                return Err(Fault::malformed(format!("{len} data bytes"), found.as_bytes()));
+            }
+        } else if let Some(first) = layout.place(Role::Bytes) {
+            let columns = cells.iter().skip(first.at).take(layout.byte_columns);
+            match len {
+                Some(len) => {
+                    // A classical frame's code may be above 8; it has 8 bytes all the same.
+                    let here = columns.clone().filter(|cell| !cell.is_empty()).count();
+                    let len = if (9..16).contains(&len) && here < len { 8 } else { len };
+                    let parse = |cell: &[u8]| byte(cell, decimal);
+                    return Payload::words(columns.copied(), len, parse);
+                }
+                None => {
+                    for cell in columns.take_while(|cell| !is_empty(cell)) {
+                        push_bytes(cell, decimal, &mut bytes)?;
+                    }
+                }
+            }
+        }
+        let found = format!("{} bytes", bytes.len());
+        Payload::of(&bytes)
+            .filter(|_| bytes.len() <= 8 || FD_LENGTHS.iter().any(|fd| usize::from(*fd) == bytes.len()))
+            .ok_or_else(|| Fault::malformed("a number of bytes that CAN or CAN FD has", found.as_bytes()))
+    }
+}
+
+/// Whether identifiers are decimal, and whether that is sure.
+fn ids_are_decimal(ids: &[&[u8]]) -> (bool, bool) {
+    /// So many different identifiers without a letter are no chance.
+    const ENOUGH: usize = 10;
+    let plain: Vec<_> = ids.iter().filter(|id| without_0x(id).is_none() && !id.is_empty()).collect();
+    let has_letter = |id: &&&&[u8]| id.iter().any(u8::is_ascii_alphabetic);
+    let has_zero = |id: &&&&[u8]| id.len() > 1 && id.starts_with(b"0");
+    if plain.is_empty() || plain.iter().any(|id| has_letter(&id) || has_zero(&id)) {
+        return (false, true);
+    }
+    if plain.iter().any(|id| text::hex(id).is_none_or(|raw| raw > 0x1FFF_FFFF)) {
+        return (true, true);
+    }
+    let mut different = plain;
+    different.sort_unstable();
+    different.dedup();
+    // Those of one digit are the same in both.
+    (different.len() >= ENOUGH, different.len() >= ENOUGH || different.iter().all(|id| id.len() == 1))
+}
+
+fn id(shown: &[u8], decimal: bool) -> Result<u32, Fault> {
+    let digits = shown.strip_suffix(b"h").or_else(|| shown.strip_suffix(b"x")).unwrap_or(shown);
+    let number = match without_0x(digits) {
+        Some(digits) => text::hex(digits),
+        None if decimal => text::decimal(digits).and_then(|id| u32::try_from(id).ok()),
+        None => text::hex(digits),
+    };
+    let expected =
+        if decimal { "an identifier in decimal digits" } else { "an identifier in hexadecimal digits" };
+    number.ok_or_else(|| Fault::malformed(expected, shown))
+}
+
+/// A length; programs that know no whole numbers write it with a fraction.
+fn length(cell: &[u8]) -> Result<usize, Fault> {
+    let number = text::decimal(cell.strip_suffix(b".0").unwrap_or(cell));
+    let len = number.filter(|len| *len <= FD_MAX_BYTES as u64);
+    len.map(|len| len as usize).ok_or_else(|| Fault::malformed("a length of 0 to 64", cell))
+}
+
+/// Yes or no, as different programs write it; `None` for anything else.
+fn mark(cell: &[u8]) -> Option<bool> {
+    let is = |words: &[&str]| words.iter().any(|word| cell.eq_ignore_ascii_case(word.as_bytes()));
+    if is(&[
+        "1", "true", "yes", "y", "x", "e", "ext", "extended", "xtd", "29", "29-bit", "r", "rtr", "remote",
+    ]) {
+        Some(true)
+    } else if is(&["0", "false", "no", "n", "s", "std", "standard", "11", "11-bit", "d", "-", ""]) {
+        Some(false)
+    } else {
+        None
+    }
+}
+
+fn direction(way: &[u8]) -> Result<Direction, Fault> {
+    let is = |words: &[&str]| words.iter().any(|word| way.eq_ignore_ascii_case(word.as_bytes()));
+    if is(&["rx", "r", "receive", "received", "in", "0", ""]) {
+        Ok(Direction::Rx)
+    } else if is(&["tx", "t", "transmit", "transmitted", "sent", "out", "1"]) {
+        Ok(Direction::Tx)
+    } else {
+        Err(Fault::malformed("'Rx' or 'Tx'", way))
+    }
+}
+
+/// Whether a cell of a byte holds none.
+fn is_empty(cell: &[u8]) -> bool {
+    cell.is_empty() || cell.eq_ignore_ascii_case(b"nan") || cell == b"-"
+}
+
+/// One byte.
+fn byte(cell: &[u8], decimal: bool) -> Option<u8> {
+    match without_0x(cell) {
+        None if decimal => text::decimal(cell).and_then(|byte| u8::try_from(byte).ok()),
+        digits => text::hex(digits.unwrap_or(cell)).and_then(|byte| u8::try_from(byte).ok()),
+    }
+}
+
+/// The bytes of a cell: digits without gaps, or bytes with something between them.
+fn push_bytes(cell: &[u8], decimal: bool, bytes: &mut Vec<u8>) -> Result<(), Fault> {
+    let is_between =
+        |byte: &u8| matches!(byte, b' ' | b'-' | b':' | b',' | b';' | b'_' | b'.' | b'|' | b'[' | b']');
+    for word in cell.split(is_between).filter(|word| !word.is_empty()) {
+        let fault = || Fault::malformed("data bytes", cell);
+        // No bytes at all, as Cabana writes them.
+        if without_0x(word).is_some_and(<[u8]>::is_empty) {
+            continue;
+        }
+        if decimal || without_0x(word).unwrap_or(word).len() <= 2 {
+            bytes.push(byte(word, decimal).ok_or_else(fault)?);
+        } else {
+            let digits = without_0x(word).unwrap_or(word);
+            if !digits.len().is_multiple_of(2) {
+                return Err(fault());
+            }
+            for pair in digits.chunks_exact(2) {
+                bytes.push(text::hex_pair(pair[0], pair[1]).ok_or_else(fault)?);
+            }
+        }
+    }
+    Ok(())
+}
+
+impl RowFormat for Decoder {
+    fn begin(&mut self, buffered: &[u8]) {
+        const SAMPLE_BYTES: usize = 64 << 10;
+        // The last line may not be whole.
+        let sample = &buffered[..buffered.len().min(SAMPLE_BYTES)];
+        self.sample = memchr::memrchr(b'\n', sample).map_or(sample, |end| &sample[..end]).to_vec();
+    }
+
+    fn line(&mut self, line: &[u8], zone: &Zone) -> Result<Line, Fault> {
+        if line.is_empty() || line.starts_with(b"#") {
+            self.day = self.day.or_else(|| FileDate::of_comment(line));
+            return Ok(Line::Nothing);
+        }
+        if self.layout.is_none() && !self.first(line)? {
+            return Ok(Line::Nothing);
+        }
+        self.row(line, zone)
+    }
+
+    fn may_be_cut(&self, line: &[u8], record: &TraceRecord) -> bool {
+        let Some(layout) = &self.layout else { return true };
+        let cells = layout.separator.cells(line);
+        let data_len = record.frame().map_or(0, |frame| frame.data().len());
+        // Where the cells of the bytes end, of which there are as many as the length says.
+        let end = match (layout.place(Role::Bytes), layout.place(Role::Data)) {
+            (Some(first), _) => first.at + data_len,
+            (None, place) => place.map_or(0, |place| place.at + 1),
+        };
+        let later = [Role::Time, Role::Id, Role::Dlc, Role::Channel].into_iter();
+        let is_behind = |role| layout.place(role).is_some_and(|place| place.at >= end);
+        let is_whole = cells.len() > end || cells.last().is_some_and(|last| last.len() >= 2);
+        layout.place(Role::Dlc).is_none() || data_len == 0 || !is_whole || later.into_iter().any(is_behind)
+    }
+
+    fn note(&mut self) -> Option<&'static str> {
+        self.notes.pop()
+    }
+}
+
+#[cfg(test)]
+mod tests;

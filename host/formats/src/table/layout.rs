@@ -1,0 +1,185 @@
+//! Where in a row of a table everything is.
+
+use super::super::issue::Fault;
+use super::super::text::{self, NS_PER_S};
+use super::columns::{Column, Columns, Form, ROLES, Role, role_of};
+
+/// What separates the cells of a row.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Separator {
+    Byte(u8),
+    /// One or more blanks.
+    Blanks,
+}
+
+impl Separator {
+    /// The one that makes the most cells of a line.
+    pub(super) fn of(line: &[u8]) -> Self {
+        let count = |separator: u8| memchr::memchr_iter(separator, line).count();
+        let most = [b';', b'\t', b','].into_iter().max_by_key(|separator| count(*separator));
+        most.filter(|separator| count(*separator) > 0).map_or(Self::Blanks, Self::Byte)
+    }
+
+    /// The cells of a line, without quotation marks and the space around them.
+    pub(super) fn cells(self, line: &[u8]) -> Vec<&[u8]> {
+        let Self::Byte(separator) = self else {
+            return line.split(u8::is_ascii_whitespace).filter(|cell| !cell.is_empty()).collect();
+        };
+        let mut quoted = false;
+        line.split(|byte| {
+            quoted ^= *byte == b'"';
+            *byte == separator && !quoted
+        })
+        .map(|cell| {
+            let cell = cell.trim_ascii();
+            cell.strip_prefix(b"\"").and_then(|cell| cell.strip_suffix(b"\"")).unwrap_or(cell).trim_ascii()
+        })
+        .collect()
+    }
+}
+
+/// A column of a role: where it is, from 0, and its form.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Place {
+    pub at: usize,
+    pub form: Option<Form>,
+}
+
+/// Where everything is.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Layout {
+    pub separator: Separator,
+    places: [Option<Place>; ROLES.len()],
+    /// How many columns of one byte there are.
+    pub byte_columns: usize,
+    /// Whether there are columns that have no place in a trace.
+    pub has_others: bool,
+}
+
+impl Layout {
+    pub(super) fn place(&self, role: Role) -> Option<Place> {
+        self.places[role as usize]
+    }
+
+    /// How many cells a row has at least: those of bytes may be missing where a frame has none.
+    pub(super) fn least_cells(&self) -> usize {
+        let may_be_missing = |role: Role| match role {
+            Role::Bytes => true,
+            Role::Data => self.separator == Separator::Blanks,
+            _ => false,
+        };
+        let needed = ROLES.iter().filter(|(_, role)| !may_be_missing(*role));
+        needed.filter_map(|(_, role)| self.place(*role)).map(|place| place.at + 1).max().unwrap_or(0)
+    }
+
+    /// From the names above the columns, if they are usual ones.
+    pub(super) fn of_names(line: &[u8]) -> Option<Self> {
+        let separator = Separator::of(line);
+        let names = separator.cells(line);
+        let mut layout = Self { separator, places: [None; ROLES.len()], byte_columns: 0, has_others: false };
+        for (at, name) in names.iter().enumerate() {
+            match role_of(name) {
+                Some((Role::Bytes, form)) => {
+                    let first = layout.places[Role::Bytes as usize].get_or_insert(Place { at, form });
+                    // Only those side by side are the bytes of a frame.
+                    if at == first.at + layout.byte_columns {
+                        layout.byte_columns += 1;
+                    } else {
+                        layout.has_others = true;
+                    }
+                }
+                Some((role, form)) if layout.place(role).is_none() => {
+                    layout.places[role as usize] = Some(Place { at, form });
+                }
+                _ => layout.has_others = true,
+            }
+        }
+        let has = |role| layout.place(role).is_some();
+        let blanks_too = separator != Separator::Blanks || has(Role::Time);
+        (has(Role::Id) && (has(Role::Data) || has(Role::Bytes)) && blanks_too).then_some(layout)
+    }
+
+    /// From what the user says, and the first line. The second value is whether that line is a row, because every column is a number.
+    pub(super) fn of_columns(columns: &Columns, line: &[u8]) -> Result<(Self, bool), Fault> {
+        let separator = Separator::of(line);
+        let names = separator.cells(line);
+        let mut layout = Self { separator, places: [None; ROLES.len()], byte_columns: 0, has_others: false };
+        let mut is_row = true;
+        for Column { role, name, form } in &columns.0 {
+            let same = |cell: &&[u8]| cell.eq_ignore_ascii_case(name.as_bytes());
+            let number = || text::decimal(name.as_bytes()).filter(|number| *number > 0);
+            let at = match (names.iter().position(same), number()) {
+                // A number that also stands in the first row is still a number.
+                (_, Some(number)) => usize::try_from(number - 1).ok(),
+                (Some(at), None) => {
+                    is_row = false;
+                    Some(at)
+                }
+                (None, None) => None,
+            };
+            let at = at.ok_or_else(|| Fault::malformed(format!("a column with the name '{name}'"), line))?;
+            layout.places[*role as usize] = Some(Place { at, form: *form });
+        }
+        if let Some(first) = layout.place(Role::Bytes) {
+            let others = layout.places.iter().flatten().map(|place| place.at).filter(|at| *at > first.at);
+            let end = others.min().unwrap_or(usize::MAX);
+            let is_byte = |name: &&&[u8]| is_row || matches!(role_of(name), Some((Role::Bytes, _)));
+            let columns = names.iter().skip(first.at).take_while(is_byte).count();
+            // Rows may be longer than the first, whose frame may have no bytes.
+            layout.byte_columns = (end - first.at).min(if is_row { usize::MAX } else { columns.max(1) });
+        }
+        Ok((layout, is_row))
+    }
+
+    /// From a row of a table without names, if it is a time, an identifier, a length and as many bytes, in one cell or one each: as in tables
+    /// that people made of logs. What follows, such as a mark of an attack, has no place in a trace.
+    pub(super) fn of_row(line: &[u8]) -> Option<Self> {
+        let separator = Separator::of(line);
+        let cells = separator.cells(line);
+        let [time, id, len, data @ ..] = &cells[..] else { return None };
+        let time_ns = text::time(time, NS_PER_S, b'.').filter(|_| time.contains(&b'.'));
+        let is_id = matches!(id.len(), 3 | 4 | 8) && text::hex(id).is_some();
+        let len = text::decimal(len).filter(|len| *len <= 8 && is_id && time_ns.is_some())? as usize;
+        let is_byte = |cell: &&[u8]| cell.len() == 2 && text::hex(cell).is_some();
+        let one_each = data.iter().take(len).take_while(|cell| is_byte(cell)).count() == len;
+        let in_one = len > 1 && data.first().is_some_and(|cell| byte_count(cell) == Some(len));
+        if !one_each && !in_one || separator == Separator::Blanks && len == 0 {
+            return None;
+        }
+        let mut places = [None; ROLES.len()];
+        let hex = Some(Form::Hex);
+        places[Role::Time as usize] = Some(Place { at: 0, form: Some(Form::Unit(NS_PER_S)) });
+        places[Role::Id as usize] = Some(Place { at: 1, form: hex });
+        places[Role::Dlc as usize] = Some(Place { at: 2, form: None });
+        let role = if one_each { Role::Bytes } else { Role::Data };
+        places[role as usize] = Some(Place { at: 3, form: hex });
+        let has_others = data.len() > if one_each { len } else { 1 };
+        Some(Self { separator, places, byte_columns: usize::MAX, has_others })
+    }
+}
+
+/// How many bytes a cell of hexadecimal digits without gaps is.
+fn byte_count(cell: &[u8]) -> Option<usize> {
+    let all = cell.len().is_multiple_of(2) && cell.iter().all(u8::is_ascii_hexdigit);
+    all.then_some(cell.len() / 2)
+}
+
+/// Columns as a user may give them, for a table of unusual names: what is not found is a question mark.
+pub(super) fn proposal(line: &[u8]) -> Option<String> {
+    let separator = Separator::of(line);
+    let names = separator.cells(line);
+    if separator == Separator::Blanks || names.len() < 2 {
+        return None;
+    }
+    let named = |wanted: Role| {
+        let found = names.iter().find(|name| role_of(name).is_some_and(|(role, _)| role == wanted));
+        found.map(|name| String::from_utf8_lossy(name).into_owned())
+    };
+    let unknown = || "?".to_owned();
+    let data = match (named(Role::Data), named(Role::Bytes)) {
+        (None, Some(bytes)) => format!("bytes={bytes}"),
+        (data, _) => format!("data={}", data.unwrap_or_else(unknown)),
+    };
+    let [time, id] = [Role::Time, Role::Id].map(|role| named(role).unwrap_or_else(unknown));
+    Some(format!("time={time},id={id},{data}"))
+}

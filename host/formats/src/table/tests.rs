@@ -1,0 +1,135 @@
+//! Tables as people share them, in the columns of the collections named.
+
+use super::super::tests;
+use crate::{Columns, CsvDialect, Format, ReadOptions, TraceReader};
+use proptest::prelude::*;
+
+/// What is read of a table that is known by its content, as candump's lines, and what is wrong with it.
+fn as_log(file: &str) -> (String, Vec<String>) {
+    assert_eq!(Format::of_content(file.as_bytes()), Some(Format::Table), "{file}");
+    let (records, issues) = tests::read(Format::Table, file);
+    (tests::write(Format::Candump, &records), issues)
+}
+
+fn with_columns(columns: &str, file: &str) -> (String, Vec<String>) {
+    let columns: Columns = columns.parse().unwrap();
+    let options =
+        ReadOptions { format: Some(Format::Table), columns: Some(columns), ..ReadOptions::default() };
+    let (records, issues) = tests::read_with(&options, file);
+    (tests::write(Format::Candump, &records), issues)
+}
+
+#[test]
+fn tables_of_public_collections_are_known_and_read_whole() {
+    for (file, log) in [
+        // HCRL's car hacking: no names, as many cells of bytes as the length says, then a mark.
+        (
+            "1478198376.389427,0316,8,05,21,68,09,21,21,00,6f,R\n1478198376.389636,0690,2,00,0a,T\n",
+            "(1478198376.389427) can0 316#052168092121006F\n(1478198376.389636) can0 690#000A\n",
+        ),
+        // HCRL's challenge.
+        (
+            "Timestamp,Arbitration_ID,DLC,Data,Class,SubClass\n1597759710.1258,153,8,20 A1 10 FF 00 FF 50 1F,Normal,Normal\n1597759710.2,2B0,2,05 00,Attack,Spoofing\n",
+            "(1597759710.125800) can0 153#20A110FF00FF501F\n(1597759710.200000) can0 2B0#0500\n",
+        ),
+        // can-train-and-test.
+        (
+            "timestamp,arbitration_id,data_field,attack\n1672531360.46,0C1,0000000000000000,0\n1672531360.461,0C5,14E06E,0\n",
+            "(1672531360.460000) can0 0C1#0000000000000000\n(1672531360.461000) can0 0C5#14E06E\n",
+        ),
+        // Cabana's.
+        (
+            "time,addr,bus,data\n0.01,0x1d2,0,0x40a0\n0.02,0x18DAF110,1,0x\n",
+            "(0.010000) can0 1D2#40A0\n(0.020000) can1 18DAF110#\n",
+        ),
+        // SavvyCAN's generic table, which has no times, and identifiers of eight digits whatever they are.
+        (
+            "ID,Data Bytes\n0000021A,FE 36 12 \n18DAF110,00 \n",
+            "(0.000000) can0 21A#FE3612\n(0.000000) can0 18DAF110#00\n",
+        ),
+        // CL2000's; the last day is one of the next month.
+        (
+            "# Logger type: CL2000\n# Time: 20231031T071031\n# Value separator: \";\"\nTimestamp;Type;ID;Data\n31T135012345;1;cf00203;cde0270004b827ff\n01T000000001;0;123;0102\n",
+            "(1698760212.345000) can0 0CF00203#CDE0270004B827FF\n(1698796800.001000) can0 123#0102\n",
+        ),
+        // Cells of bytes with names, more of them than a frame has, tabs, times in milliseconds.
+        (
+            "Time (ms)\tCAN ID\tDLC\tD0\tD1\tD2\tD3\tLabel\n12.5\t7FF\t2\t01\t02\t\t\tx\n13\t100\t0\t\t\t\t\tx\n",
+            "(0.012500) can0 7FF#0102\n(0.013000) can0 100#\n",
+        ),
+        // Blanks, no names.
+        (
+            "1538480862.456 0110 2 00 11\n1538480862.457 0120 1 22\n",
+            "(1538480862.456000) can0 110#0011\n(1538480862.457000) can0 120#22\n",
+        ),
+    ] {
+        assert_eq!(as_log(file), (log.to_owned(), vec![]), "{file}");
+    }
+}
+
+#[test]
+fn the_kind_of_numbers_is_found_in_the_rows() {
+    // No identifier has a letter, and one is too large for hexadecimal digits.
+    let (log, issues) =
+        as_log("timestamp,id,data\n1614875400123456,419361024,01\n1614875400123457,291,0xFF\n");
+    assert_eq!(issues, Vec::<String>::new());
+    assert_eq!(log, "(1614875400.123456) can0 18FEF100#01\n(1614875400.123457) can0 123#FF\n");
+    let (log, issues) =
+        as_log("time,id,byte0,byte1\n2020-01-01 12:00:00,1A,255,7\n2020-01-01 12:00:01,1A,1,\n");
+    assert_eq!(issues, Vec::<String>::new());
+    assert_eq!(log, "(1577880000.000000) can0 01A#FF07\n(1577880001.000000) can0 01A#01\n");
+}
+
+#[test]
+fn columns_that_a_user_gives_are_read() {
+    let (log, issues) = with_columns(
+        "time=when:ms,id=who:dec,data=what,channel=bus:0,direction=way,extended=long,remote=rtr",
+        "\"who\";what;when;bus;way;long;rtr\n291;\"01 02\";5;0;Tx;no;0\n16;;6;1;Rx;yes;1\n",
+    );
+    assert_eq!(issues, Vec::<String>::new());
+    assert_eq!(log, "(0.005000) can0 123#0102 T\n(0.006000) can1 00000010#R\n");
+    let (log, issues) = with_columns("time=2:us,id=1,bytes=3", "1A3,7,1,2\n1A4,8,3,4\n");
+    assert_eq!(issues, Vec::<String>::new());
+    assert_eq!(log, "(0.000007) can0 1A3#0102\n(0.000008) can0 1A4#0304\n");
+    let (log, issues) = with_columns("id=ID,data=Bytes", "id,dat\n1,22\n");
+    assert_eq!(log, "");
+    assert!(issues[0].contains("a column with the name 'Bytes'"), "{issues:?}");
+}
+
+#[test]
+fn broken_rows_are_named_and_what_has_no_place_is_counted() {
+    let file = "timestamp,id,dlc,data,label\n1.0,123,2,0102,a\nx,123,0,,a\n1.0,G,0,,a\n1.0,123,3,0102,a\n\
+                1.0,123,1,0,a\n1.0,123,65,00,a\n1.0,20000000,1,00,a\n1.0,A23,2,010203,a\n1.0,123\n2.0,A,1,0";
+    let (log, issues) = as_log(file);
+    assert_eq!(log, "(1.000000) can0 123#0102\n(1.000000) can0 123#00\n");
+    assert_eq!(issues.len(), 8, "{issues:#?}");
+    let source = std::io::Cursor::new(file.to_owned());
+    let mut reader = TraceReader::from_source("t", source, Format::Table, &ReadOptions::default()).unwrap();
+    reader.by_ref().for_each(drop);
+    assert_eq!(reader.notes().iter().collect::<Vec<_>>(), [(super::OTHERS, 1)]);
+}
+
+#[test]
+fn a_table_that_is_not_known_is_answered_with_columns_to_give() {
+    let file = "when,CAN ID,b\n1.0,123,00\n2.0,1,3\n";
+    assert_eq!(Format::of_content(file.as_bytes()), None);
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("a.csv");
+    std::fs::write(&path, file).unwrap();
+    let mut reader = crate::open_reader(&path, &ReadOptions::default()).unwrap();
+    assert_eq!(reader.format(), Format::Csv(CsvDialect::PythonCan));
+    reader.by_ref().for_each(drop);
+    let message = reader.nothing_read().unwrap().to_string();
+    assert!(message.contains("--columns 'time=?,id=CAN ID,data=?'"), "{message}");
+}
+
+proptest! {
+    #[test]
+    fn any_rows_are_read_or_counted(rows in "([0-9a-fxT.,;: \t\"-]{0,40}\n){0,10}", head in 0..3_usize) {
+        let head = ["Timestamp,ID,DLC,Data\n", "time;id;d0;d1\n", "1.0,123,1,00\n"][head];
+        let lines = rows.lines().filter(|line| !line.trim().is_empty()).count();
+        let (records, issues) = tests::read(Format::Table, format!("{head}{rows}"));
+        let first = usize::from(head.starts_with('1'));
+        prop_assert_eq!(records.len() + issues.len(), lines + first);
+    }
+}

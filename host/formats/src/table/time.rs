@@ -1,0 +1,124 @@
+//! The times in tables: numbers, dates, and the stamps of CSS Electronics' older loggers.
+
+use jiff::Timestamp;
+use jiff::civil::DateTime;
+use jiff::tz::Offset;
+
+use super::super::calendar::{Date, NS_PER_DAY};
+use super::super::text::{self, NS_PER_S};
+use super::super::zone::Zone;
+
+/// The unit of a time that has none: seconds if there is a fraction, and otherwise what makes a date of our days of a large number.
+pub(super) fn unit_of(cell: &[u8]) -> i64 {
+    match text::decimal(cell) {
+        Some(100_000_000_000_000_000..) => 1,
+        Some(100_000_000_000_000..) => 1_000,
+        Some(100_000_000_000..) => 1_000_000,
+        _ => NS_PER_S,
+    }
+}
+
+/// A number in this unit, also with an exponent.
+pub(super) fn number(cell: &[u8], unit_ns: i64) -> Option<i64> {
+    if let Some(time_ns) = text::time_of_any_mark(cell, unit_ns) {
+        return Some(time_ns);
+    }
+    let value: f64 = std::str::from_utf8(cell).ok()?.parse().ok()?;
+    let time_ns = (value * unit_ns as f64).round();
+    (time_ns.abs() < 9e18).then_some(time_ns as i64)
+}
+
+/// A date, or a time of a day without one.
+pub(super) fn date(cell: &[u8], zone: &Zone) -> Option<i64> {
+    let cell = std::str::from_utf8(cell).ok()?.replace('/', "-");
+    if let Ok(time) = cell.parse::<Timestamp>() {
+        return i64::try_from(time.as_nanosecond()).ok();
+    }
+    if let Ok(date) = cell.replace(',', ".").parse::<DateTime>() {
+        let clock = Offset::UTC.to_timestamp(date).ok()?;
+        return Some(zone.utc_ns(i64::try_from(clock.as_nanosecond()).ok()?));
+    }
+    let mut parts = cell.split(':').map(str::as_bytes);
+    let [hour, minute] = [(); 2].map(|()| parts.next().and_then(text::decimal));
+    let second_ns = text::time_of_any_mark(parts.next()?, NS_PER_S)?;
+    let (hour, minute) = (hour?, minute?);
+    let valid = hour < 24 && minute < 60 && (0..61 * NS_PER_S).contains(&second_ns) && parts.next().is_none();
+    valid.then(|| (hour * 3600 + minute * 60) as i64 * NS_PER_S + second_ns)
+}
+
+/// The year, the month and the day of a file: what its stamps leave out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct FileDate {
+    year: i64,
+    month: u8,
+    day: u8,
+}
+
+impl FileDate {
+    /// From a comment such as `# Time: 20231005T071031`.
+    pub(super) fn of_comment(line: &[u8]) -> Option<Self> {
+        let stamp = line.strip_prefix(b"#")?.trim_ascii_start().strip_prefix(b"Time:")?.trim_ascii();
+        let digits = stamp.split(|byte| *byte == b'T').next().filter(|digits| digits.len() == 8)?;
+        let number = |digits: &[u8]| text::decimal(digits);
+        let [year, month, day] = [number(&digits[..4])?, number(&digits[4..6])?, number(&digits[6..])?];
+        let valid = (1..=12).contains(&month) && (1..=31).contains(&day);
+        valid.then_some(Self { year: year as i64, month: month as u8, day: day as u8 })
+    }
+}
+
+/// A stamp such as `31T135012345`, day of the month, time and milliseconds, or `20231031T135012345`. Without a day of the file, the days count
+/// from the first of no month.
+pub(super) fn stamp(cell: &[u8], file: Option<FileDate>, zone: &Zone) -> Option<i64> {
+    let at = memchr::memchr(b'T', cell)?;
+    let (date, clock) = (&cell[..at], &cell[at + 1..]);
+    if clock.len() != 9 && clock.len() != 6 {
+        return None;
+    }
+    let [hour, minute, second] = [0, 2, 4].map(|at| text::decimal(&clock[at..at + 2]));
+    let ms = if clock.len() == 9 { text::decimal(&clock[6..])? } else { 0 };
+    let of_day_ns = Date::of_day(hour?, minute?, second?, ms as i64 * 1_000_000)?;
+    let [year, month, day] = match (date.len(), file) {
+        (8, _) => [&date[..4], &date[4..6], &date[6..]].map(text::decimal),
+        (2, Some(file)) => {
+            let day = text::decimal(date)?;
+            // A day before the file's is one of the next month.
+            let months = 12 * file.year as u64 + u64::from(file.month) - 1 + u64::from(day < file.day.into());
+            [Some(months / 12), Some(months % 12 + 1), Some(day)]
+        }
+        (2, None) => {
+            let day = text::decimal(date).filter(|day| (1..=31).contains(day))?;
+            return Some((day as i64 - 1) * NS_PER_DAY + of_day_ns);
+        }
+        _ => return None,
+    };
+    let [month, day] = [month?, day?].map(|number| u8::try_from(number).unwrap_or(0));
+    let clock_ns = Date { year: year? as i64, month, day, of_day_ns }.time_ns()?;
+    Some(zone.utc_ns(clock_ns))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn dates_stamps_and_numbers_are_times() {
+        let zone = Zone::default();
+        let noon = 1_577_880_000 * NS_PER_S;
+        for text in ["2020-01-01 12:00:00", "2020/01/01 12:00:00,000", "2020-01-01T13:00:00+01:00"] {
+            assert_eq!(date(text.as_bytes(), &zone), Some(noon), "{text}");
+        }
+        assert_eq!(date(b"01:00:00.5", &zone), Some(3600 * NS_PER_S + NS_PER_S / 2));
+        for bad in ["", "x", "25:00:00", "1:2", "1:2:3:4", "2020-13-01 12:00:00"] {
+            assert_eq!(date(bad.as_bytes(), &zone), None, "{bad}");
+        }
+        assert_eq!(stamp(b"20200101T120000000", None, &zone), Some(noon));
+        let day = FileDate::of_comment(b"# Time: 20191231T235959");
+        assert_eq!(stamp(b"01T120000000", day, &zone), Some(noon));
+        assert_eq!(stamp(b"02T000000011", None, &zone), Some(NS_PER_DAY + 11_000_000));
+        for bad in ["", "T", "32T000000000", "1T", "01T250000000", "01T12000000\u{e9}"] {
+            assert_eq!(stamp(bad.as_bytes(), None, &zone), None, "{bad}");
+        }
+        assert_eq!(number(b"1.5e-3", NS_PER_S), Some(1_500_000));
+        assert_eq!((unit_of(b"1614875400123456"), unit_of(b"12")), (1000, NS_PER_S));
+    }
+}

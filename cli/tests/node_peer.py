@@ -1,6 +1,6 @@
 """Nodes of other programs on a board shared by `cantap serve`, for nodes.rs: they connect through socketcand.
 
-uds, ecus, obd, obd_29, canopen, j1939 HOST PORT     serves until standard input ends; prints "ready" when it does
+uds, memory, ecus, obd, obd_29, obd_on_uds, canopen, j1939 HOST PORT     serves until standard input ends; prints "ready" when it does
 tester HOST PORT                                     prints "ready", and then what udsoncan has read of the ECU that is asked with 7E0
 """
 
@@ -52,6 +52,72 @@ def serve_uds(host, port):
             for answer in known:
                 stack.send(bytes.fromhex(answer))
                 time.sleep(0.02)
+
+    server = threading.Thread(target=serve)
+    server.start()
+    wait()
+    over.set()
+    server.join()
+    stack.stop()
+
+
+def serve_memory(host, port):
+    """An ECU with a session that ends after three seconds without a request, a key, and 256 bytes of memory from 2000 on."""
+    import isotp
+
+    address = isotp.Address(isotp.AddressingMode.Normal_11bits, txid=0x7E8, rxid=0x7E0)
+    stack = isotp.CanStack(bus(host, port), address=address, params={"blocksize": 0, "stmin": 0})
+    stack.start()
+    over = threading.Event()
+    memory = bytearray(256)
+    ecu = {"session": False, "unlocked": False, "last": 0.0, "place": 0, "left": 0, "counter": 0, "writes": False}
+
+    def answer(request):
+        now = time.monotonic()
+        if now - ecu["last"] > 3:
+            ecu["session"] = ecu["unlocked"] = False
+        ecu["last"] = now
+        service = request[0]
+        if service == 0x10:
+            ecu["session"] = request[1] == 3
+            return bytes([0x50, request[1], 0x00, 0x32, 0x01, 0xF4])
+        if request == b"\x3E\x80":
+            return None
+        if not ecu["session"]:
+            return bytes([0x7F, service, 0x7F])
+        if request == b"\x27\x01":
+            return bytes.fromhex("670111223344")
+        if request == bytes.fromhex("2702EEDDCCBB"):
+            ecu["unlocked"] = True
+            return bytes.fromhex("6702")
+        if not ecu["unlocked"]:
+            return bytes([0x7F, service, 0x33])
+        if service in (0x34, 0x35) and request[1:3] == b"\x00\x44":
+            start, size = int.from_bytes(request[3:7], "big"), int.from_bytes(request[7:11], "big")
+            if not 0x2000 <= start <= start + size <= 0x2100:
+                return bytes([0x7F, service, 0x31])
+            ecu.update(place=start - 0x2000, left=size, counter=0, writes=service == 0x34)
+            return bytes([service + 0x40, 0x20, 0x00, 0x12])
+        if service == 0x36:
+            ecu["counter"] = ecu["counter"] + 1 & 0xFF
+            length = len(request) - 2 if ecu["writes"] else min(16, ecu["left"])
+            if request[1] != ecu["counter"] or length > ecu["left"] or length > 16:
+                return bytes([0x7F, service, 0x73])
+            part = slice(ecu["place"], ecu["place"] + length)
+            ecu["place"], ecu["left"] = ecu["place"] + length, ecu["left"] - length
+            if ecu["writes"]:
+                memory[part] = request[2:]
+            return bytes([0x76, request[1]]) + (b"" if ecu["writes"] else memory[part])
+        if service == 0x37:
+            return b"\x77" if ecu["left"] == 0 else bytes([0x7F, service, 0x24])
+        return bytes([0x7F, service, 0x11])
+
+    def serve():
+        while not over.is_set():
+            request = bytes(stack.recv(block=True, timeout=0.1) or b"")
+            reply = answer(request) if request else None
+            if reply:
+                stack.send(reply)
 
     server = threading.Thread(target=serve)
     server.start()
@@ -138,6 +204,17 @@ def serve_obd(host, port, extended=False):
 
 def serve_obd_29(host, port):
     serve_obd(host, port, True)
+
+
+def serve_obd_on_uds(host, port):
+    """SAE J1979-2: OBD-II's own services are not answered."""
+    none = {"194233041E": ["594233FF1E04"], "195533": ["595533FF04"]}
+    engine = {
+        "22F400": ["62F40000180000"], "22F40C": ["62F40C1AF8"], "22F40D": ["62F40D32"], "22F802": ["62F802" + (VIN + b"1").hex()], **none,
+        "194233081E": ["594233FF1E0402" + "01330008"], "14FFFF33": ["54"],
+    }
+    gearbox = {"22F400": ["7F2278", "62F40000080000"], "22F40D": ["62F40D31"], **none}
+    serve_four(host, port, [False], [engine, gearbox, {"22F400": ["7F2211"]}, {}])
 
 
 def serve_tester(host, port):

@@ -1,19 +1,24 @@
 //! `cantap obd`: queries a vehicle.
 
-use std::collections::BTreeMap;
+mod services;
+
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write as _;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use anyhow::{anyhow, bail};
+use anyhow::{Context as _, anyhow, bail};
 use cantap::Id;
 use cantap_protocols::diagnostics::{Diagnostics, parameter_name};
 use cantap_protocols::iso_tp::{Endpoint, Pair};
-use cantap_protocols::{Event, EventKind};
+use cantap_protocols::{Event, EventKind, Value};
 
+use self::services::Services;
 use crate::speak_args::SpeakArgs;
 use crate::usage_error::usage;
 use crate::{args, stderr};
+use cantap_work::code_texts::CodeTexts;
 use cantap_work::interrupt;
 use cantap_work::uds::{Client, TransferOptions};
 
@@ -28,7 +33,8 @@ const LIST: u8 = 0x20;
                 cantap obd -d /dev/ttyACM0 -b 500k codes\n  \
                 cantap obd -d COM5 -b 500k clear --yes\n\n\
                 Without a command: VIN, trouble codes, and every value once. All ECUs are asked at once (7DF), and \
-                where none answers, with identifiers of 29 bits (18DB33F1). It takes part in the bus: it acknowledges, \
+                where none answers, with identifiers of 29 bits (18DB33F1); if still none does, both again over UDS \
+                (SAE J1979-2). It takes part in the bus: it acknowledges, \
                 and sends what it is asked for here and nothing else.")]
 pub struct Args {
     #[command(flatten)]
@@ -37,6 +43,9 @@ pub struct Args {
     /// add to that.
     #[arg(long, value_name = "TIME", default_value = "200ms", value_parser = args::positive_duration, global = true)]
     p2: Duration,
+    /// A table of the texts of trouble codes, which are listed after the codes: a line is P0133,"its text".
+    #[arg(long, value_name = "FILE", global = true, value_hint = clap::ValueHint::FilePath)]
+    dtc: Option<PathBuf>,
     #[command(subcommand)]
     what: Option<What>,
 }
@@ -87,11 +96,17 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             "clearing erases what the workshop needs to find the fault, and readiness tests start over; to go ahead, add --yes",
         ));
     }
+    if args.dtc.is_some() && args.speak.json {
+        return Err(usage("--json has no lines for the texts of --dtc; leave one of them out"));
+    }
+    let texts = args.dtc.as_deref().map(code_texts).transpose()?;
     let device = args.speak.open()?;
     let speaking = args.speak.speak(&device, Box::new(Diagnostics::new(&[], false)));
     let mut vehicle = Vehicle {
         client: Client::new(speaking, transfer(false, args.p2), stderr::reporter()),
         p2: args.p2,
+        services: Services::Own,
+        texts,
         servers: Vec::new(),
     };
     vehicle.find()?;
@@ -108,7 +123,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         Some(What::Codes) => vehicle.codes()?,
         Some(What::Vin) => vehicle.identification()?,
         Some(What::Clear { .. }) => {
-            let answers = vehicle.client.ask_whoever(&[0x04], None)?;
+            let request = vehicle.services.clear();
+            // What was said to find the ECUs.
+            vehicle.client.speaking.take_events();
+            let answers = vehicle.client.ask_whoever(request, None)?;
             vehicle.client.show_if(is_answer)?;
             vehicle.client.all_agreed()?;
             if answers.is_empty() {
@@ -121,6 +139,21 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     drop(vehicle);
     device.stop()?;
     Ok(ExitCode::SUCCESS)
+}
+
+fn code_texts(path: &Path) -> anyhow::Result<CodeTexts> {
+    let table = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+    CodeTexts::read(&table).with_context(|| format!("cannot use {}", path.display()))
+}
+
+/// The trouble codes in an event: the names before each one's status.
+fn codes_of(event: &Event) -> impl Iterator<Item = String> + '_ {
+    let lists = event.fields.iter().filter(|field| field.name == "codes");
+    let lists = lists.filter_map(|field| match &field.value {
+        Value::Text(text) => Some(text.split(", ")),
+        _ => None,
+    });
+    lists.flatten().filter_map(|code| code.split(' ').next().map(str::to_owned))
 }
 
 /// How to address all ECUs.
@@ -151,27 +184,32 @@ fn listed(base: u8, bits: &[u8]) -> Vec<u8> {
 struct Vehicle<'d> {
     client: Client<'d>,
     p2: Duration,
+    services: Services,
+    /// What trouble codes mean, if the user has a table.
+    texts: Option<CodeTexts>,
     servers: Vec<Server>,
 }
 
 impl Vehicle<'_> {
     /// Finds out which ECUs answer.
     fn find(&mut self) -> anyhow::Result<()> {
-        for extended in [false, true] {
+        for (services, extended) in
+            [(Services::Own, false), (Services::Own, true), (Services::OnUds, false), (Services::OnUds, true)]
+        {
             self.client.set_transfer(transfer(extended, self.p2));
-            let answers = self.client.ask_whoever(&[0x01, 0x00], None)?;
-            for answer in answers {
-                if let [0x41, 0x00, bits @ ..] = &answer.data[..] {
+            for answer in self.client.ask_unknown(&services.value(0))? {
+                if let Some(bits) = services.bits(0, &answer.data) {
                     self.servers.push(Server { answers_with: answer.from, pids: listed(0, bits) });
                 }
             }
             if !self.servers.is_empty() {
+                self.services = services;
                 self.client.set_servers(self.servers.iter().map(|server| server.answers_with).collect());
                 return Ok(());
             }
         }
         Err(anyhow!(
-            "no ECU answers, neither to 7DF nor to 18DB33F1; {}; check that the ignition is on, and the bit rate: vehicles have 500k \
+            "no ECU answers, neither to 7DF nor to 18DB33F1, by OBD-II's own services or over UDS; {}; check that the ignition is on, and the bit rate: vehicles have 500k \
              or 250k; --p2 waits longer",
             self.client.speaking.circumstances()
         ))
@@ -184,10 +222,11 @@ impl Vehicle<'_> {
             if servers == 0 {
                 break;
             }
-            for answer in self.client.ask_whoever(&[0x01, base], Some(servers))? {
-                let [0x41, asked, bits @ ..] = &answer.data[..] else { continue };
-                let server = self.servers.iter_mut().find(|server| server.answers_with == answer.from);
-                if let Some(server) = server.filter(|_| *asked == base) {
+            for answer in self.client.ask_whoever(&self.services.value(base), Some(servers))? {
+                let Some(bits) = self.services.bits(base, &answer.data) else { continue };
+                if let Some(server) =
+                    self.servers.iter_mut().find(|server| server.answers_with == answer.from)
+                {
                     server.pids.extend(listed(base, bits));
                 }
             }
@@ -255,7 +294,7 @@ impl Vehicle<'_> {
         let mut answered = Vec::new();
         for pid in pids {
             let servers = self.having(*pid);
-            let asked = self.client.ask_whoever(&[0x01, *pid], Some(servers));
+            let asked = self.client.ask_whoever(&self.services.value(*pid), Some(servers));
             if interrupt::requested() {
                 return Ok(answered);
             }
@@ -273,31 +312,46 @@ impl Vehicle<'_> {
 
     fn codes(&mut self) -> anyhow::Result<()> {
         let mut any = false;
-        for service in [0x03, 0x07, 0x0A] {
-            let answers = self.client.ask_whoever(&[service], Some(self.servers.len()))?;
+        let mut codes = BTreeSet::new();
+        for (kind, request) in self.services.codes() {
+            let answers = self.client.ask_whoever(request, Some(self.servers.len()))?;
+            let sid = f64::from(request[0]);
             self.client.show_if(|event| {
-                is_answer(event)
-                    && event.field("sid").is_some_and(|sid| sid.value.as_number() == Some(f64::from(service)))
+                let is_wanted = is_answer(event)
+                    && event.field("sid").is_some_and(|of| of.value.as_number() == Some(sid));
+                if is_wanted {
+                    codes.extend(codes_of(event));
+                }
+                is_wanted
             })?;
             any |= !answers.is_empty();
             if answers.is_empty() {
-                let kind = ["stored", "pending", "permanent"][usize::from(service / 4)];
                 eprintln!("cantap: no ECU tells {kind} codes");
             }
         }
         if !any {
             bail!("no ECU tells any codes; {}", self.client.speaking.circumstances());
         }
+        if let Some(texts) = &self.texts {
+            let mut out = std::io::stdout().lock();
+            for code in codes {
+                writeln!(out, "{code:<8}  {}", texts.get(&code).unwrap_or("(not in the table)"))?;
+            }
+        }
         Ok(())
     }
 
     fn identification(&mut self) -> anyhow::Result<()> {
         let mut any = false;
-        for kind in [0x02, 0x0A, 0x04] {
-            any |= !self.client.ask_whoever(&[0x09, kind], None)?.is_empty();
+        let requests = self.services.identification();
+        let sid = f64::from(requests[0][0]);
+        // What was asked to find the ECUs may be of the same service.
+        self.client.speaking.take_events();
+        for request in &requests {
+            any |= !self.client.ask_whoever(request, None)?.is_empty();
         }
         self.client.show_if(|event| {
-            is_answer(event) && event.field("sid").is_some_and(|sid| sid.value.as_number() == Some(9.0))
+            is_answer(event) && event.field("sid").is_some_and(|of| of.value.as_number() == Some(sid))
         })?;
         if !any {
             bail!("no ECU tells who it is; vehicles before 2005 often do not");

@@ -2,6 +2,8 @@
 
 pub mod hex;
 mod key;
+mod memory;
+mod script;
 mod transfer_args;
 
 use std::process::ExitCode;
@@ -10,13 +12,15 @@ use std::time::{Duration, Instant};
 use cantap_protocols::diagnostics::Diagnostics;
 
 use self::hex::{Hex, byte, bytes, number, word};
-use self::key::KeyArgs;
+use self::key::{KeyArgs, level};
+use self::memory::{DownloadArgs, UploadArgs};
+use self::script::{RunArgs, Step};
 pub use self::transfer_args::TransferArgs;
 use crate::speak_args::SpeakArgs;
 use crate::usage_error::usage;
 use crate::{args, stderr};
 use cantap_work::interrupt;
-use cantap_work::uds::Client;
+use cantap_work::uds::{Client, REFUSAL};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -26,7 +30,8 @@ use cantap_work::uds::Client;
                 cantap uds -d COM5 -b 500k --pair 18DA10F1:18DAF110 dtc\n  \
                 cantap uds -d COM5 -b 500k --session extended --security 1 \\\n      \
                 --key-command './key' routine start FF00\n  \
-                cantap uds -d COM5 -b 500k raw '22 F1 90'\n\n\
+                cantap uds -d COM5 -b 500k raw '22 F1 90'\n  \
+                cantap uds -d COM5 -b 500k --session extended run requests.txt\n\n\
                 It takes part in the bus: it acknowledges, and sends what it is asked for here and nothing else. What \
                 was said is shown as `cantap conversations` does. A refusal is exit code 1.")]
 pub struct Args {
@@ -43,8 +48,8 @@ pub struct Args {
     what: What,
 }
 
-#[derive(clap::Subcommand)]
-enum What {
+#[derive(clap::Subcommand, Clone)]
+pub enum What {
     /// Read data by identifier.
     Read {
         /// The identifiers in hexadecimal, as F190.
@@ -99,6 +104,24 @@ enum What {
         #[arg(short, long, requires = "clear")]
         yes: bool,
     },
+    /// Do several of these in one session: each line of a file is one, as 'read F190'.
+    Run(RunArgs),
+    /// Unlock the ECU at a level, an odd number in hexadecimal; requires --key-command.
+    Security {
+        /// The level.
+        #[arg(value_name = "LEVEL", value_parser = level)]
+        level: u8,
+    },
+    /// Do nothing for this time, except for keeping the session.
+    Wait {
+        /// How long.
+        #[arg(value_name = "TIME", value_parser = args::positive_duration)]
+        time: Duration,
+    },
+    /// Write a file to the ECU's memory (34, 36, 37); requires --yes.
+    Download(DownloadArgs),
+    /// Read the ECU's memory into a file (35, 36, 37).
+    Upload(UploadArgs),
     /// Send any request.
     Raw {
         /// Its bytes in hexadecimal, as 22F190 or 22 F1 90.
@@ -108,7 +131,7 @@ enum What {
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-enum RoutineAction {
+pub enum RoutineAction {
     Start,
     Stop,
     /// The result.
@@ -116,14 +139,12 @@ enum RoutineAction {
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-enum ResetKind {
+pub enum ResetKind {
     Hard,
     KeyOffOn,
     Soft,
 }
 
-/// How long to wait for the refusal of a request that wants no answer: P2 of ISO 14229-2.
-const REFUSAL: Duration = Duration::from_millis(50);
 /// The shortest time between two "tester present", which this computer sends one by one.
 const SHORTEST_PERIOD: Duration = Duration::from_millis(10);
 
@@ -141,7 +162,14 @@ fn session(text: &str) -> Result<u8, String> {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let requests = args.requests()?;
+    let steps = match &args.what {
+        What::Run(RunArgs { file }) => script::read(file)?,
+        what => vec![Step { place: None, what: what.clone() }],
+    };
+    // Nothing is sent unless all of it can be.
+    for Step { place, what } in &steps {
+        located(place.as_deref(), args.check(what))?;
+    }
     let options = args.transfer.options();
     let device = args.speak.open()?;
     let witness = || Box::new(Diagnostics::new(&[options.pair.into()], false));
@@ -154,19 +182,25 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     args.key.unlock(&mut client)?;
     client.show()?;
-    if let What::TesterPresent { period: Some(period), count, time } = args.what {
-        stay(&mut client, period, count, time)?;
-    } else {
-        for request in &requests {
-            let asked = client.ask(request);
-            client.show()?;
-            asked?;
+    for Step { place, what } in &steps {
+        located(place.as_deref(), args.perform(what, &mut client))?;
+        // A line that was ended by Ctrl-C is the last one.
+        if interrupt::requested() {
+            break;
         }
-        client.all_agreed()?;
     }
     drop(client);
     device.stop()?;
     Ok(ExitCode::SUCCESS)
+}
+
+/// With the place of what failed, if it has one.
+fn located(place: Option<&str>, done: anyhow::Result<()>) -> anyhow::Result<()> {
+    match place {
+        // The usage error stays one.
+        Some(place) => done.map_err(|error| error.context(place.to_owned())),
+        None => done,
+    }
 }
 
 /// Sends "tester present" repeatedly.
@@ -205,50 +239,90 @@ fn stay(
 }
 
 impl Args {
-    /// The requests to send.
-    fn requests(&self) -> anyhow::Result<Vec<Vec<u8>>> {
-        Ok(match &self.what {
-            What::Read { dids } => {
-                dids.iter().map(|did| [&[0x22][..], &did.to_be_bytes()].concat()).collect()
+    /// Does one thing.
+    fn perform(&self, what: &What, client: &mut Client<'_>) -> anyhow::Result<()> {
+        match what {
+            What::TesterPresent { period: Some(period), count, time } => stay(client, *period, *count, *time),
+            What::Security { level } => {
+                let unlocked = self.key.unlock_at(*level, client);
+                client.show()?;
+                unlocked
             }
-            What::Session { kind } => vec![vec![0x10, *kind]],
-            What::Routine { action, routine, option } => {
-                let action = match action {
-                    RoutineAction::Start => 1,
-                    RoutineAction::Stop => 2,
-                    RoutineAction::Result => 3,
-                };
-                let option = option.as_ref().map_or(&[][..], |option| &option.0);
-                vec![[&[0x31, action][..], &routine.to_be_bytes(), option].concat()]
+            What::Wait { time } => {
+                client.wait(*time)?;
+                client.show()?;
+                client.all_agreed()
             }
-            What::TesterPresent { count, period, .. } => {
-                if period.is_some_and(|period| period < SHORTEST_PERIOD) {
-                    return Err(usage(format!("a period is at least {} ms", SHORTEST_PERIOD.as_millis())));
+            What::Download(download) => download.run(client),
+            What::Upload(upload) => upload.run(client),
+            _ => {
+                for request in &requests(what)? {
+                    let asked = client.ask(request);
+                    client.show()?;
+                    asked?;
                 }
-                if period.is_none() && count.is_some_and(|count| count > 1) {
-                    return Err(usage("say how often with --period, as --period 2s"));
-                }
-                vec![vec![0x3E, 0]]
+                client.all_agreed()
             }
-            What::Reset { kind } => {
-                let kind = match kind {
-                    ResetKind::Hard => 1,
-                    ResetKind::KeyOffOn => 2,
-                    ResetKind::Soft => 3,
-                };
-                vec![vec![0x11, kind]]
-            }
-            What::Dtc { clear: true, yes: false, .. } => {
-                return Err(usage(
-                    "clearing erases what the workshop needs to find the fault; if that is meant, add --yes",
-                ));
-            }
-            What::Dtc { clear: true, .. } => vec![vec![0x14, 0xFF, 0xFF, 0xFF]],
-            What::Dtc { mask, .. } => vec![vec![0x19, 0x02, *mask]],
-            What::Raw { bytes: texts } => {
-                let Hex(request) = bytes(&texts.concat()).map_err(usage)?;
-                vec![request]
-            }
-        })
+        }
     }
+
+    /// Whether it can be done, as far as that is known before anything is sent.
+    fn check(&self, what: &What) -> anyhow::Result<()> {
+        match what {
+            What::Security { .. } if !self.key.has_command() => {
+                Err(usage("unlocking requires --key-command, which computes the key"))
+            }
+            What::Download(download) => download.image().map(drop),
+            What::Upload(upload) => upload.check(),
+            _ => requests(what).map(drop),
+        }
+    }
+}
+
+/// The requests to send.
+fn requests(what: &What) -> anyhow::Result<Vec<Vec<u8>>> {
+    Ok(match what {
+        What::Read { dids } => dids.iter().map(|did| [&[0x22][..], &did.to_be_bytes()].concat()).collect(),
+        What::Session { kind } => vec![vec![0x10, *kind]],
+        What::Routine { action, routine, option } => {
+            let action = match action {
+                RoutineAction::Start => 1,
+                RoutineAction::Stop => 2,
+                RoutineAction::Result => 3,
+            };
+            let option = option.as_ref().map_or(&[][..], |option| &option.0);
+            vec![[&[0x31, action][..], &routine.to_be_bytes(), option].concat()]
+        }
+        What::TesterPresent { count, period, .. } => {
+            if period.is_some_and(|period| period < SHORTEST_PERIOD) {
+                return Err(usage(format!("a period is at least {} ms", SHORTEST_PERIOD.as_millis())));
+            }
+            if period.is_none() && count.is_some_and(|count| count > 1) {
+                return Err(usage("say how often with --period, as --period 2s"));
+            }
+            vec![vec![0x3E, 0]]
+        }
+        What::Reset { kind } => {
+            let kind = match kind {
+                ResetKind::Hard => 1,
+                ResetKind::KeyOffOn => 2,
+                ResetKind::Soft => 3,
+            };
+            vec![vec![0x11, kind]]
+        }
+        What::Dtc { clear: true, yes: false, .. } => {
+            return Err(usage(
+                "clearing erases what the workshop needs to find the fault; if that is meant, add --yes",
+            ));
+        }
+        What::Dtc { clear: true, .. } => vec![vec![0x14, 0xFF, 0xFF, 0xFF]],
+        What::Dtc { mask, .. } => vec![vec![0x19, 0x02, *mask]],
+        What::Raw { bytes: texts } => {
+            let Hex(request) = bytes(&texts.concat()).map_err(usage)?;
+            vec![request]
+        }
+        What::Run(_) | What::Security { .. } | What::Wait { .. } | What::Download(_) | What::Upload(_) => {
+            Vec::new()
+        }
+    })
 }

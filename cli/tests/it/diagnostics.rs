@@ -44,6 +44,21 @@ fn a_car_tells_who_it_is_what_it_has_and_how_it_is() {
 }
 
 #[test]
+fn trouble_codes_have_the_texts_of_the_user_s_table() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("codes.csv");
+    let at = path.display();
+    std::fs::write(&path, "code,text\nP0128,\"Coolant below the thermostat's temperature\"\n").unwrap();
+    let out = well(&format!("obd -d virtual:car codes --dtc {at}"));
+    assert!(out.contains("P0128     Coolant below the thermostat's temperature"), "{out}");
+    std::fs::write(&path, "P0001,Another\n").unwrap();
+    assert!(well(&format!("obd -d virtual:car codes --dtc {at}")).contains("P0128     (not in the table)"));
+    std::fs::write(&path, "P0001,Another\nP00\n").unwrap();
+    let (code, said) = badly(&format!("obd -d virtual:car codes --dtc {at}"));
+    assert!(code == Some(1) && said.contains("codes.csv") && said.contains("line 2"), "{said}");
+}
+
+#[test]
 fn codes_are_erased_only_when_that_is_meant() {
     let (code, said) = badly("obd -d virtual:car clear");
     assert!(code == Some(2) && said.contains("--yes"), "{said}");

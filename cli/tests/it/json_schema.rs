@@ -132,9 +132,21 @@ pub const LINES: [(&str, i32, &[&str]); 67] = [
     ("demo -t 300ms", 0, &["demo"]),
 ];
 
-/// Commands that print something only if there are nodes: `tests/nodes.rs` checks their output.
-const WITH_NODES: [&str; 6] =
-    ["canopen read", "canopen write", "canopen monitor", "canopen lss", "j1939 request", "j1939 dm1"];
+/// Commands that print something only if there are nodes: `tests/nodes.rs` checks their output. What `uds run` does in it is done by the
+/// three after it as well, and `uds wait` has something to show only in it.
+const WITH_NODES: [&str; 11] = [
+    "canopen read",
+    "canopen write",
+    "canopen monitor",
+    "canopen lss",
+    "j1939 request",
+    "j1939 dm1",
+    "uds run",
+    "uds security",
+    "uds download",
+    "uds upload",
+    "uds wait",
+];
 
 fn hold(schema: &Schema, line: &str, code: Option<i32>, types: &[&str]) {
     let directory = directory(&line.replace(['/', ' ', ':', '#'], "."));

@@ -123,6 +123,48 @@ fn an_ecu_on_can_isotp_is_asked_unlocked_and_given_long_requests() {
     );
 }
 
+/// The ECU's session ends after three seconds without a request, and the key takes four.
+#[test]
+fn requests_of_a_file_are_one_session_that_lasts_while_a_key_is_computed() {
+    let Some(rig) = Rig::new(NO_NODE, "isotp", "memory") else { return };
+    let folder = rig.served.folder.path();
+    let image =
+        ":10200000000102030405060708090A0B0C0D0E0F58\n:042010001011121386\n:01208000AAB5\n:00000001FF\n";
+    std::fs::write(folder.join("image.hex"), image).unwrap();
+    let steps = "# All of it in one session.\nsession extended\nsecurity 1\ndownload image.hex --yes\nwait 800ms\n\
+                 upload 2000 14 -o back.bin\nupload 2080 1 -o one.bin\n";
+    std::fs::write(folder.join("steps.txt"), steps).unwrap();
+    let fast = "tr${IFS}0123456789ABCDEF${IFS}FEDCBA9876543210";
+    let key = format!("sleep${{IFS}}4;{fast}");
+    let all = rig.json(&format!("uds --key-command {key} --keep-alive 500ms run steps.txt"), "conversations");
+    let titles: Vec<_> = all.iter().map(|event| event["title"].as_str().unwrap()).collect();
+    let count = |title: &str| titles.iter().filter(|one| **one == title).count();
+    let counts = ["RequestDownload", "RequestUpload", "RequestTransferExit"].map(count);
+    assert_eq!(counts, [2, 2, 4], "{titles:?}");
+    let kept = |from: &str, to: &str| {
+        let place = |title: &str| titles.iter().position(|one| *one == title).unwrap();
+        titles[place(from)..place(to)].iter().filter(|title| **title == "TesterPresent").count()
+    };
+    // While the key was computed, and during the wait.
+    assert!(kept("SecurityAccess", "RequestDownload") >= 2, "{titles:?}");
+    assert!(kept("RequestDownload", "RequestUpload") >= 1, "{titles:?}");
+    assert_eq!(std::fs::read(folder.join("back.bin")).unwrap(), (0..20).collect::<Vec<u8>>());
+    assert_eq!(std::fs::read(folder.join("one.bin")).unwrap(), [0xAA]);
+    // Without anything said meanwhile, the session is over, and that is shown.
+    let (code, _, err) = rig.run(&format!("uds --key-command {key} --keep-alive 60s run steps.txt"));
+    assert!(code == Some(2) && err.contains("steps.txt:6") && err.contains("already exists"), "{err}");
+    std::fs::write(folder.join("short.txt"), "session extended\nsecurity 1\n").unwrap();
+    let (code, _, err) = rig.run(&format!("uds --key-command {key} --keep-alive 60s run short.txt"));
+    assert!(code == Some(1) && err.contains("short.txt:2") && err.contains("(7F)"), "{err}");
+    // Memory that is not there: what was written before stays as it is, and no file is left behind.
+    let unlocked = format!("uds --session extended --security 1 --key-command {fast}");
+    let (code, _, err) = rig.run(&format!("{unlocked} upload 3000 10 -o none.bin"));
+    assert!(code == Some(1) && err.contains("requestOutOfRange (31)"), "{err}");
+    assert!(!folder.join("none.bin").exists());
+    let (code, _, err) = rig.run(&format!("{unlocked} download image.hex"));
+    assert!(code == Some(2) && err.contains("--yes"), "{err}");
+}
+
 #[test]
 fn a_node_on_python_canopen_is_found_read_written_and_commanded() {
     let Some(rig) = Rig::new(NO_NODE, "canopen", "canopen") else { return };
@@ -278,6 +320,24 @@ fn a_vehicle_of_several_ecus_is_asked_with_identifiers_of_both_lengths() {
         let out = rig.well("obd vin");
         assert!(out.contains("WVWZZZ1KZAW000001") && out.contains("WVWZZZ1KZAW000002"), "{out}");
     }
+}
+
+/// SAE J1979-2: none of OBD-II's own services is answered.
+#[test]
+fn a_vehicle_with_obd_over_uds_is_asked_that_way() {
+    let Some(rig) = Rig::new(NO_NODE, "isotp", "obd_on_uds") else { return };
+    let out = rig.well("obd supported");
+    assert!(out.lines().any(|line| line.starts_with("0C  engine_speed") && line.ends_with("7E8")), "{out}");
+    assert!(out.lines().any(|line| line.starts_with("0D") && line.ends_with("7E8, 7E9")), "{out}");
+    let live = rig.json("obd live 0C 0D -n 1", "conversations");
+    let mut data: Vec<_> = live.iter().map(|event| event["data"].as_str().unwrap()).collect();
+    data.sort_unstable();
+    assert_eq!(data, ["62F40C1AF8", "62F40D31", "62F40D32"]);
+    assert_eq!(live[0]["fields"]["engine_speed"], 1726.0, "{}", live[0]);
+    let out = rig.well("obd codes");
+    assert!(out.contains("P0133-00 (confirmed)"), "{out}");
+    assert!(rig.well("obd vin").contains("WVWZZZ1KZAW000001"));
+    assert!(rig.well("obd clear --yes").contains("ClearDiagnosticInformation"));
 }
 
 /// The other way round: a tester of theirs, on our car.

@@ -82,6 +82,35 @@ pub fn lines(file: &'static str) -> impl Iterator<Item = &'static str> {
     file.lines().filter(|line| !line.is_empty() && !line.starts_with('#'))
 }
 
+/// What a raw number is multiplied with.
+#[derive(Clone, Copy, Debug)]
+pub enum Scale {
+    /// This factor.
+    Times(f64),
+    /// One divided by this number, which gives the nearest decimal where the factor has no exact binary form.
+    Over(f64),
+}
+
+impl Scale {
+    /// A number, a quotient such as `100/255`, or `/20` for a division.
+    pub fn read(text: &str) -> Option<Self> {
+        let number = |text: &str| text.parse::<f64>().ok();
+        match text.split_once('/') {
+            Some(("", divisor)) => number(divisor).map(Self::Over),
+            Some((dividend, divisor)) => Some(Self::Times(number(dividend)? / number(divisor)?)),
+            None => number(text).map(Self::Times),
+        }
+    }
+
+    /// Of this number.
+    pub fn of(self, raw: f64) -> f64 {
+        match self {
+            Self::Times(factor) => raw * factor,
+            Self::Over(divisor) => raw / divisor,
+        }
+    }
+}
+
 /// A hexadecimal number, or a range of them.
 pub fn range(text: &str) -> Option<(u32, u32)> {
     let number = |text| u32::from_str_radix(text, 16).ok();

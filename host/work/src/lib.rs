@@ -5,10 +5,10 @@
 //! | [`boards`], [`channels`], [`channel_bitrate`] | which devices, and which of their channels |
 //! | [`channel_options`], [`timing_options`], [`bus_off`] | how channels are opened, and brought back from bus-off |
 //! | [`live`], [`reception`] | records of devices that may come and go; a channel that receives only errors |
-//! | [`sending`], [`speaking`], [`uds`] | frames and their fate; a protocol's client on a device |
+//! | [`sending`], [`speaking`], [`uds`], [`uds_memory`] | frames and their fate; a protocol's client on a device |
 //! | [`read_ahead`], [`missing`], [`databases`], [`reading`] | traces, what is missing from them, and what they mean |
-//! | [`report`], [`advice`], [`announcement`], [`terms`] | messages for people |
-//! | [`atomic_file`], [`interrupt`], [`dfu`] | files, Ctrl-C, and the chip's bootloader |
+//! | [`report`], [`advice`], [`announcement`], [`terms`], [`code_texts`] | messages for people |
+//! | [`atomic_file`], [`memory_image`], [`interrupt`], [`dfu`] | files, Ctrl-C, and the chip's bootloader |
 
 #![forbid(unsafe_code)]
 
@@ -28,6 +28,8 @@ pub mod channel_options;
 #[cfg(feature = "buses")]
 pub mod channels;
 #[cfg(feature = "buses")]
+pub mod code_texts;
+#[cfg(feature = "buses")]
 pub mod databases;
 #[cfg(feature = "dfu")]
 pub mod dfu;
@@ -36,6 +38,8 @@ pub mod interrupt;
 pub mod live;
 pub mod locale;
 mod losses;
+#[cfg(feature = "buses")]
+pub mod memory_image;
 mod meter;
 #[cfg(feature = "buses")]
 pub mod missing;
@@ -59,6 +63,8 @@ pub mod terms;
 pub mod timing_options;
 #[cfg(feature = "buses")]
 pub mod uds;
+#[cfg(feature = "buses")]
+pub mod uds_memory;
 
 pub use cantap_trace::grammar::{duration, positive_duration};
 pub use losses::{Losses, lost_frames};

@@ -1,7 +1,7 @@
 //! A diagnostics client (UDS, KWP 2000, OBD-II): sends requests over a device and receives the answers.
 
 use std::io;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{anyhow, bail};
 use cantap::DeviceError;
@@ -13,12 +13,20 @@ use cantap_protocols::diagnostics::{reason, uds_service};
 use cantap_protocols::iso_tp::{Endpoint, Pair};
 use cantap_protocols::{Event, EventKind, Party};
 
+use crate::interrupt;
 use crate::report::Reporter;
 use crate::speaking::Speaking;
 use crate::terms::counted;
 
 /// The device's reply slots, from 0 on, that may be used for flow control: all of them.
 const FLOW_SLOTS: usize = 8;
+
+/// The usual time between two "tester present": S3 of clients (ISO 14229-2, 2 s), of which servers wait 5 s.
+pub const KEEP_ALIVE: Duration = Duration::from_secs(2);
+/// "Tester present", not to be answered.
+const TESTER_PRESENT: [u8; 2] = [0x3E, 0x80];
+/// How long to wait for the refusal of a request that wants no answer: P2 of ISO 14229-2.
+pub const REFUSAL: Duration = Duration::from_millis(50);
 
 /// Whom to ask, and the parameters of transfers.
 #[derive(Clone, Copy, Debug)]
@@ -45,6 +53,8 @@ pub struct TransferOptions {
     pub padding: Option<u8>,
     /// Who sends the first flow control frame of an answer.
     pub flow_control: FlowControl,
+    /// How long a session that was opened may be without a request before "tester present" is sent.
+    pub keep_alive: Duration,
 }
 
 /// Who sends the first flow control frame of an answer.
@@ -73,6 +83,7 @@ impl TransferOptions {
             block_size: 0,
             padding: Some(0),
             flow_control: FlowControl::Auto,
+            keep_alive: KEEP_ALIVE,
         }
     }
 
@@ -158,12 +169,14 @@ pub struct Client<'d> {
     refused: Option<anyhow::Error>,
     /// It was said that there is another tester.
     has_rival: bool,
+    /// When the last request was over, if a session other than the default one is open.
+    kept: Option<Instant>,
 }
 
 impl<'d> Client<'d> {
     /// Over a device whose channel is open.
     pub const fn new(speaking: Speaking<'d>, options: TransferOptions, reporter: Reporter) -> Self {
-        Self { speaking, options, reporter, servers: Vec::new(), refused: None, has_rival: false }
+        Self { speaking, options, reporter, servers: Vec::new(), refused: None, has_rival: false, kept: None }
     }
 
     /// Who answers requests to all.
@@ -198,7 +211,44 @@ impl<'d> Client<'d> {
 
     /// Sends a request, and returns the answers; refusals among them are remembered for [`Self::all_agreed`].
     pub fn ask(&mut self, request: &[u8]) -> anyhow::Result<Vec<ServerAnswer>> {
-        self.ask_so_many(request, None).map_err(|failure| self.explain(failure))
+        let answers = self.ask_so_many(request, None).map_err(|failure| self.explain(failure))?;
+        self.note_session(request, &answers);
+        Ok(answers)
+    }
+
+    /// Which session is open, by what was asked and answered.
+    fn note_session(&mut self, request: &[u8], answers: &[ServerAnswer]) {
+        let is_positive = answers.iter().any(|answer| answer.refusal().is_none());
+        match request {
+            [0x10, kind, ..] if is_positive => self.kept = (kind & 0x7F != 1).then(Instant::now),
+            // After a reset, an ECU is in its default session.
+            [0x11, ..] if is_positive => self.kept = None,
+            _ if self.kept.is_some() => self.kept = Some(Instant::now()),
+            _ => {}
+        }
+    }
+
+    /// Waits while there is nothing to ask, and keeps the session that is open: the time ends it otherwise.
+    ///
+    /// # Errors
+    ///
+    /// The device is gone, or "tester present" cannot be sent. A refusal is remembered for [`Self::all_agreed`].
+    pub fn wait(&mut self, time: Duration) -> anyhow::Result<()> {
+        let until = Instant::now() + time;
+        loop {
+            let left = until.saturating_duration_since(Instant::now());
+            let due = self.kept.map(|last| self.options.keep_alive.saturating_sub(last.elapsed()));
+            if due == Some(Duration::ZERO) && !interrupt::requested() {
+                self.request_only(&TESTER_PRESENT, REFUSAL.min(self.options.keep_alive / 2))?;
+                // A request that may not be answered is over all the same.
+                self.kept = Some(Instant::now());
+                continue;
+            }
+            self.speaking.listen(due.map_or(left, |due| due.min(left)))?;
+            if left.is_zero() || interrupt::requested() {
+                return Ok(());
+            }
+        }
     }
 
     /// Like [`Self::ask`], but answers are optional.
@@ -210,6 +260,23 @@ impl<'d> Client<'d> {
         match self.ask_so_many(request, servers) {
             Ok(answers) => Ok(answers),
             Err(Failure::Exchange(ExchangeError::NoAnswer { .. })) => Ok(Vec::new()),
+            Err(failure) => Err(self.explain(failure)),
+        }
+    }
+
+    /// Like [`Self::ask_whoever`], where it is not known yet whether anybody answers at all: what looks like the beginning of an answer
+    /// may be others' frames, and is only reported. A refusal is no failure of anything that was asked for, and is not remembered.
+    pub fn ask_unknown(&mut self, request: &[u8]) -> anyhow::Result<Vec<ServerAnswer>> {
+        let before = self.refused.take();
+        let asked = self.ask_so_many(request, None);
+        self.refused = before;
+        match asked {
+            Ok(answers) => Ok(answers),
+            Err(Failure::Exchange(ExchangeError::NoAnswer { .. })) => Ok(Vec::new()),
+            Err(Failure::Exchange(error @ ExchangeError::Answer { .. })) => {
+                self.reporter.note(error.to_string());
+                Ok(Vec::new())
+            }
             Err(failure) => Err(self.explain(failure)),
         }
     }

@@ -26,29 +26,42 @@ pub struct KeyArgs {
     key_command: Option<String>,
 }
 
-fn level(text: &str) -> Result<u8, String> {
+/// See [`KeyArgs`].
+pub fn level(text: &str) -> Result<u8, String> {
     let level = byte(text).ok().filter(|level| level % 2 == 1 && *level < 0x7F);
     level.ok_or_else(|| "levels are odd numbers from 1 to 7D, in hexadecimal".to_owned())
 }
 
 impl KeyArgs {
+    /// Whether there is a command that computes keys.
+    pub const fn has_command(&self) -> bool {
+        self.key_command.is_some()
+    }
+
     /// Unlocks it, if requested.
     pub fn unlock(&self, client: &mut Client<'_>) -> anyhow::Result<()> {
-        let (Some(level), Some(command)) = (self.security, &self.key_command) else { return Ok(()) };
-        let answer = first(client.ask(&[0x27, level])?)?;
+        self.security.map_or(Ok(()), |level| self.unlock_at(level, client))
+    }
+
+    /// Unlocks it at this level. A session that is open is kept while the key is computed.
+    pub fn unlock_at(&self, level: u8, client: &mut Client<'_>) -> anyhow::Result<()> {
+        let Some(command) = &self.key_command else { return Ok(()) };
+        let asked = client.ask(&[0x27, level]);
+        client.show()?;
+        let answer = first(asked?)?;
         client.all_agreed()?;
         let seed = answer.data.get(2..).unwrap_or_default();
         // An ECU that is already unlocked sends a seed of zeros (ISO 14229-1).
         if seed.iter().all(|byte| *byte == 0) {
             return Ok(());
         }
-        let key = key(command, seed, client.patience())?;
+        let key = key(command, seed, client)?;
         client.ask(&[&[0x27, level + 1][..], &key].concat())?;
         client.all_agreed()
     }
 }
 
-fn key(command: &str, seed: &[u8], patience: Duration) -> anyhow::Result<Vec<u8>> {
+fn key(command: &str, seed: &[u8], client: &mut Client<'_>) -> anyhow::Result<Vec<u8>> {
     let seed = seed.iter().fold(String::new(), |mut text, byte| {
         let _ = write!(text, "{byte:02X}");
         text
@@ -66,7 +79,7 @@ fn key(command: &str, seed: &[u8], patience: Duration) -> anyhow::Result<Vec<u8>
         let mut text = Vec::new();
         stdout.read_to_end(&mut text).map(|_| text)
     });
-    let status = end_of(&mut child, command, patience)?;
+    let status = end_of(&mut child, command, client)?;
     ensure!(status.success(), "--key-command '{command}' failed: {status}; no key was sent");
     let printed = printed.join().ok().and_then(Result::ok).context("cannot read from --key-command")?;
     let text = String::from_utf8_lossy(&printed);
@@ -82,8 +95,8 @@ fn key(command: &str, seed: &[u8], patience: Duration) -> anyhow::Result<Vec<u8>
 }
 
 /// Waits for the command, which is ended by Ctrl-C or when it takes too long: the ECU does not wait for ever either.
-fn end_of(child: &mut Child, command: &str, patience: Duration) -> anyhow::Result<ExitStatus> {
-    let started = Instant::now();
+fn end_of(child: &mut Child, command: &str, client: &mut Client<'_>) -> anyhow::Result<ExitStatus> {
+    let (started, patience) = (Instant::now(), client.patience());
     loop {
         if let Some(status) = child.try_wait().context("cannot wait for --key-command")? {
             return Ok(status);
@@ -99,6 +112,11 @@ fn end_of(child: &mut Child, command: &str, patience: Duration) -> anyhow::Resul
             "--key-command '{command}' did not end within {} s and was stopped; no key was sent; --patience gives it more time",
             patience.as_secs_f64()
         );
-        std::thread::sleep(LOOK_EVERY);
+        let kept = client.wait(LOOK_EVERY);
+        if kept.is_err() {
+            let _ = child.kill();
+            let _ = child.wait();
+        }
+        kept?;
     }
 }

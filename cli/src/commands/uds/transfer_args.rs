@@ -43,6 +43,9 @@ pub struct TransferArgs {
     /// Who sends the first flow control frame of an answer.
     #[arg(long, value_enum, default_value = "auto", global = true)]
     flow_control: FlowBy,
+    /// How long a session that was opened may be without a request, as while a key is computed, before "tester present" is sent.
+    #[arg(long, value_name = "TIME", default_value = "2s", value_parser = args::positive_duration, global = true)]
+    keep_alive: Duration,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -97,6 +100,7 @@ impl TransferArgs {
                 FlowBy::Host => FlowControl::Host,
                 FlowBy::Device => FlowControl::Device,
             },
+            keep_alive: self.keep_alive,
         }
     }
 }

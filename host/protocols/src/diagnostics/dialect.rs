@@ -31,6 +31,13 @@ impl Dialects {
         !self.servers.is_empty() && (is_kwp(side) || other.is_some_and(is_kwp))
     }
 
+    /// A server is taken to speak KWP2000 until it shows something else.
+    pub fn assume_kwp(&mut self, channel: u8, server: Endpoint) {
+        if self.servers.len() < MOST_SERVERS {
+            self.servers.entry((channel, server)).or_insert(1);
+        }
+    }
+
     /// A server has answered this request.
     pub fn learn(&mut self, channel: u8, server: Endpoint, request: &[u8], response: &[u8]) {
         let weight = weight(request, response);

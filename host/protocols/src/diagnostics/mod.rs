@@ -119,6 +119,9 @@ impl Diagnostics {
         if self.due_ns < transfer.start_ns {
             self.expire(transfer.start_ns, events);
         }
+        if let Some(server) = self.transport.server_of_tp20(transfer.channel, transfer.from) {
+            self.dialects.assume_kwp(transfer.channel, server);
+        }
         if transfer.after_loss {
             let sides = [Some(transfer.from), transfer.to];
             for waiting in &mut self.waiting {

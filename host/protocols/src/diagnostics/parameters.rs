@@ -5,7 +5,7 @@ use std::sync::LazyLock;
 use super::values::{number, supported};
 use super::{dtc, meanings, monitors};
 use crate::Field;
-use crate::table::{lines, range};
+use crate::table::{Scale, lines, range};
 
 const FILE: &str = include_str!("../../data/obd-parameters.csv");
 const TRIM: f64 = 100.0 / 128.0;
@@ -32,12 +32,6 @@ struct Quantity {
     scale: Scale,
     offset: f64,
     is_signed: bool,
-}
-
-#[derive(Clone, Copy, Debug)]
-enum Scale {
-    Times(f64),
-    Over(f64),
 }
 
 /// One line of the table: the range of parameters, what they are, and one of their values.
@@ -99,17 +93,6 @@ impl Line {
     }
 }
 
-impl Scale {
-    fn read(text: &str) -> Option<Self> {
-        let number = |text: &str| text.parse::<f64>().ok();
-        match text.split_once('/') {
-            Some(("", divisor)) => number(divisor).map(Self::Over),
-            Some((dividend, divisor)) => Some(Self::Times(number(dividend)? / number(divisor)?)),
-            None => number(text).map(Self::Times),
-        }
-    }
-}
-
 impl Quantity {
     fn field(&self, pid: u8, bytes: &[u8]) -> Field {
         if self.present.is_some_and(|bit| bytes[0] >> bit & 1 == 0) {
@@ -117,11 +100,7 @@ impl Quantity {
         }
         let raw = number(&bytes[self.at..self.at + self.length]);
         let value = if self.is_signed { f64::from(raw as u16 as i16) } else { raw as f64 };
-        let scaled = match self.scale {
-            Scale::Times(factor) => value * factor,
-            Scale::Over(divisor) => value / divisor,
-        };
-        Field::real(self.name, scaled + self.offset, self.unit).meaning(meanings::of(pid, raw))
+        Field::real(self.name, self.scale.of(value) + self.offset, self.unit).meaning(meanings::of(pid, raw))
     }
 }
 

@@ -1,4 +1,5 @@
-//! Transfers of many frames: ISO 15765-2 in normal, extended and mixed addressing, on classical CAN and CAN FD.
+//! Transfers of many frames: ISO 15765-2 in normal, extended and mixed addressing, on classical CAN and CAN FD; and Volkswagen's transport
+//! protocol 2.0 in channels that were agreed on.
 //!
 //! The identifiers that take part are those reserved by the standards (7DF, 7E0 to 7EF, 18DAxxyy, 18DBxxyy, 18CExxyy,
 //! 18CDxxyy), those of the given pairs, and those that [`Transport`] finds by their behaviour: by transfers of many frames, and by
@@ -15,6 +16,7 @@ mod pairs;
 mod pci;
 #[cfg(test)]
 mod tests;
+mod tp20;
 mod transfer;
 
 pub use makers::{BadPairs, KnownPairs, Maker};
@@ -30,6 +32,7 @@ use rustc_hash::FxHashMap;
 use self::exchanges::{Client, Exchanges, Found, Held, is_expected};
 use self::finder::Finder;
 use self::pairs::{Pairs, Reading};
+use self::tp20::Channels;
 use crate::{Assembler, Bytes, Event, EventKind, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
 /// How long the receiver waits for the next frame: N_Cr.
@@ -65,6 +68,8 @@ pub struct Transport {
     pairs: Pairs,
     finder: Option<Finder>,
     exchanges: Exchanges,
+    /// Channels of Volkswagen's own transport protocol.
+    tp20: Channels,
     /// The next transfer comes after a loss that has not been reported.
     after_loss: bool,
     open: FxHashMap<(u8, Endpoint), Open>,
@@ -94,6 +99,11 @@ impl Transport {
         self.pairs.partner(channel, from)
     }
 
+    /// The ECU, if this sender talks in a channel of Volkswagen's transport protocol.
+    pub(crate) fn server_of_tp20(&self, channel: u8, from: Endpoint) -> Option<Endpoint> {
+        self.tp20.server(channel, from)
+    }
+
     /// Whether a sender asks several others, or nobody knows whom.
     pub fn is_to_all(&self, channel: u8, from: Endpoint) -> bool {
         self.pairs.is_known(channel, from) && self.pairs.partner(channel, from).is_none()
@@ -115,6 +125,9 @@ impl Transport {
         if !self.open.is_empty() && record.time_ns >= self.sweep_ns {
             self.sweep(record.time_ns, out);
         }
+        if !self.tp20.is_empty() {
+            self.tp20.advance(record.time_ns, out);
+        }
         let channel = record.channel;
         let Some(frame) = record.frame() else {
             if is_gap(&record.event) {
@@ -127,6 +140,9 @@ impl Transport {
         }
         let (id, bytes) = (frame.id(), frame.data());
         if self.finder.is_some() {
+            if self.tp20.take(record, id, bytes, out) {
+                return;
+            }
             self.read_unanswered(record.time_ns, out);
         }
         match self.pairs.reading(channel, id, bytes) {
@@ -250,6 +266,7 @@ impl Transport {
         for open in open {
             end(open, Trouble::Unfinished, out);
         }
+        self.tp20.finish(out);
         self.headless.clear();
     }
 
@@ -275,6 +292,7 @@ impl Transport {
             finder.interrupt(channel);
         }
         self.exchanges.interrupt(channel);
+        self.tp20.interrupt(channel);
     }
 
     /// Ends whatever has timed out.

@@ -3,7 +3,7 @@
 //!
 //! Layouts as in the Equipment and Tool Institute's program j1939-84, whose tests have the messages of this file's tests.
 
-use super::names;
+use super::{names, parameters};
 use crate::Field;
 
 const DM5: u32 = 0xFECE;
@@ -53,7 +53,7 @@ pub fn fields(pgn: u32, data: &[u8], fields: &mut Vec<Field>) -> bool {
             fields.push(word("ignition_cycles", [a, b], ""));
             fields.push(word("monitoring_conditions_encountered", [c, d], ""));
             for ratio in ratios.chunks_exact(RATIO_BYTES) {
-                fields.push(Field::number("spn", spn(ratio)));
+                fields.push(suspect(ratio));
                 fields.push(Field::number("numerator", u16::from_le_bytes([ratio[3], ratio[4]])));
                 fields.push(Field::number("denominator", u16::from_le_bytes([ratio[5], ratio[6]])));
             }
@@ -65,7 +65,7 @@ pub fn fields(pgn: u32, data: &[u8], fields: &mut Vec<Field>) -> bool {
                 let kinds = ["expanded freeze frame", "data stream", "scaled test results"];
                 let supported = kinds.into_iter().enumerate().filter(|(bit, _)| missing >> bit & 1 == 0);
                 let supported: Vec<_> = supported.map(|(_, kind)| kind).collect();
-                fields.push(Field::number("spn", spn(parameter)));
+                fields.push(suspect(parameter));
                 fields.push(Field::text("supported_in", supported.join(", ")));
                 fields.push(Field::number("length", parameter[3]).unit("bytes"));
             }
@@ -76,8 +76,9 @@ pub fn fields(pgn: u32, data: &[u8], fields: &mut Vec<Field>) -> bool {
 }
 
 /// The suspect parameter number at the beginning of these bytes: 19 bits.
-fn spn(bytes: &[u8]) -> u32 {
-    u32::from(bytes[0]) | u32::from(bytes[1]) << 8 | u32::from(bytes[2] >> 5) << 16
+fn suspect(bytes: &[u8]) -> Field {
+    let spn = u32::from(bytes[0]) | u32::from(bytes[1]) << 8 | u32::from(bytes[2] >> 5) << 16;
+    Field::number("spn", spn).meaning(parameters::name(spn))
 }
 
 /// From FB on, a byte is no value (SAE J1939-71).
@@ -158,7 +159,7 @@ mod tests {
             (
                 DM24,
                 &[0x5C, 0x00, 0x1C, 0x01, 0x20, 0x02, 0x1C, 0x02],
-                "spn 92, supported_in \"expanded freeze frame, data stream\", length 1 bytes, spn 544, \
+                "spn 92 (engine_load), supported_in \"expanded freeze frame, data stream\", length 1 bytes, spn 544, \
                  supported_in \"expanded freeze frame, data stream\", length 2 bytes",
             ),
         ] {

@@ -1,5 +1,5 @@
-//! SAE J1939: parameter groups, messages of many frames, address claims, requests, trouble codes; and signals from a
-//! database.
+//! SAE J1939: parameter groups, messages of many frames, address claims, requests, trouble codes; and values of the groups
+//! that most vehicles send, or those of a database.
 //!
 //! Memory: 256 messages of many frames in progress, each of at most 64 KiB, 64 waiting requests, and a NAME for each of 254 addresses on each
 //! channel.
@@ -9,6 +9,7 @@ mod fast_packet;
 mod header;
 mod name;
 mod names;
+mod parameters;
 #[cfg(test)]
 mod tests;
 pub(crate) mod transport;
@@ -256,6 +257,7 @@ impl J1939 {
             (_, data) => {
                 if !self.signals(record.channel, header, data, &mut event)
                     && !diagnostics::fields(header.pgn, data, &mut event.fields)
+                    && !parameters::fields(header.pgn, data, &mut event.fields)
                     && !self.marine_fields(record.channel, header, data, &mut event)
                 {
                     event.fields.push(Field::bytes("data", data));

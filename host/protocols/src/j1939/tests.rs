@@ -108,7 +108,10 @@ fn requests_are_answered_or_not() {
         "j1939 0 > all acknowledgement: pgn 59392, priority 6, control 1 (no), group_function 255, \
          requested 65259 (CI component identification), of 249, after 3 ms"
     );
-    assert!(said[3].ends_with("data 01 02 03 04 05 06 07 08, after 3 ms"), "{said:?}");
+    assert!(
+        said[3].ends_with("engine_hours 3365299.25 h, engine_revolutions 134678021000 r, after 3 ms"),
+        "{said:?}"
+    );
     assert_eq!(
         said[5],
         "j1939 249 > 3 request: pgn 59904, requested 65254 (TD time and date), response \"none\"; nothing came for 1250 ms"

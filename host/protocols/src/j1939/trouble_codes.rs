@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 
 use super::names::failure_mode;
+use super::parameters;
 use crate::Field;
 
 /// Whether the group contains lamps and codes like DM1.
@@ -31,9 +32,13 @@ pub fn fields(data: &[u8], fields: &mut Vec<Field>) {
     for code in codes.chunks_exact(4).filter(|code| **code != [0; 4] && **code != [0xFF; 4]) {
         let spn = u32::from(code[0]) | u32::from(code[1]) << 8 | u32::from(code[2] >> 5) << 16;
         let (fmi, times) = (code[2] & 31, code[3] & 0x7F);
+        let parameter = parameters::name(spn);
+        let (separator, mode) = (if count == 0 { "" } else { ", " }, failure_mode(fmi));
         // Writing to a String cannot fail.
-        let _ =
-            write!(text, "{}SPN {spn} FMI {fmi} ({})", if count == 0 { "" } else { ", " }, failure_mode(fmi));
+        let _ = match parameter {
+            Some(parameter) => write!(text, "{separator}SPN {spn} FMI {fmi} ({parameter}: {mode})"),
+            None => write!(text, "{separator}SPN {spn} FMI {fmi} ({mode})"),
+        };
         if times != 0x7F {
             let _ = write!(text, " {times} times");
         }
@@ -43,7 +48,7 @@ pub fn fields(data: &[u8], fields: &mut Vec<Field>) {
             let (first, second) = (a << 11 | b << 3 | c, b << 11 | a << 3 | c);
             let _ = write!(text, " in an old conversion: SPN {first} by version 1, {second} by version 2");
         }
-        each.push(Field::number("spn", spn));
+        each.push(Field::number("spn", spn).meaning(parameter));
         each.push(Field::number("fmi", fmi));
         // Also without a value, so that the same number of each belongs to one code.
         each.push(if times == 0x7F {

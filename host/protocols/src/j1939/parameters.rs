@@ -1,0 +1,189 @@
+//! Values in the groups that most vehicles send, and the names of suspect parameters (SPN), without a database. The table, with its
+//! sources, is `data/j1939-parameters.csv`.
+
+use std::sync::LazyLock;
+
+use rustc_hash::FxHashMap;
+
+use crate::Field;
+use crate::table::{Scale, lines};
+
+const FILE: &str = include_str!("../../data/j1939-parameters.csv");
+
+/// The length of all these groups, in bytes.
+const GROUP_BYTES: usize = 8;
+
+/// A parameter at its place in a group.
+#[derive(Debug)]
+struct Parameter {
+    pgn: u32,
+    /// From the lowest bit of the first byte.
+    bit: u32,
+    bits: u32,
+    spn: u32,
+    name: &'static str,
+    unit: &'static str,
+    scale: Scale,
+    offset: f64,
+    is_switch: bool,
+}
+
+/// The parameters in the order of the table, and where each group's begin and end in it.
+struct Parameters {
+    all: Vec<Parameter>,
+    groups: FxHashMap<u32, (usize, usize)>,
+    names: FxHashMap<u32, &'static str>,
+}
+
+static PARAMETERS: LazyLock<Parameters> = LazyLock::new(|| {
+    // What cannot be read is left out, of which the table has nothing: a test reads every line.
+    let all: Vec<Parameter> = lines(FILE).filter_map(Parameter::read).collect();
+    let mut groups = FxHashMap::default();
+    for (at, parameter) in all.iter().enumerate() {
+        groups.entry(parameter.pgn).or_insert((at, at)).1 = at + 1;
+    }
+    let names = all.iter().map(|parameter| (parameter.spn, parameter.name)).collect();
+    Parameters { all, groups, names }
+});
+
+impl Parameter {
+    fn read(line: &'static str) -> Option<Self> {
+        let columns: Vec<&'static str> = line.split(',').collect();
+        let &[pgn, bit, bits, spn, name, unit, factor, offset, states] = &columns[..] else { return None };
+        Some(Self {
+            pgn: u32::from_str_radix(pgn, 16).ok()?,
+            bit: bit.parse().ok()?,
+            bits: bits.parse().ok()?,
+            spn: spn.parse().ok()?,
+            name,
+            unit,
+            scale: Scale::read(factor)?,
+            offset: offset.parse().ok()?,
+            is_switch: match states {
+                "switch" => true,
+                "" => false,
+                _ => return None,
+            },
+        })
+    }
+
+    fn field(&self, data: u64) -> Field {
+        let raw = data >> self.bit & ((1 << self.bits) - 1);
+        match self.indicator(raw) {
+            Some(Absence::NotAvailable) => Field::missing(self.name),
+            Some(Absence::Error) => Field::missing(self.name).meaning(Some("error")),
+            Some(Absence::Reserved) => Field::missing(self.name).meaning(Some("reserved")),
+            None if self.is_switch => {
+                Field::number(self.name, raw as i64).meaning(Some(if raw == 0 { "off" } else { "on" }))
+            }
+            // States by number.
+            None if self.bits < 8 => Field::number(self.name, raw as i64),
+            None => Field::real(self.name, self.scale.of(raw as f64) + self.offset, self.unit),
+        }
+    }
+
+    /// What the bits say in place of a value (SAE J1939-71, ranges of transmitted values).
+    fn indicator(&self, raw: u64) -> Option<Absence> {
+        let all = (1 << self.bits) - 1;
+        match self.bits {
+            0..8 if raw == all => Some(Absence::NotAvailable),
+            2 | 4 if raw == all - 1 => Some(Absence::Error),
+            0..8 => None,
+            _ => match raw >> (self.bits - 8) {
+                0xFF => Some(Absence::NotAvailable),
+                0xFE => Some(Absence::Error),
+                0xFB..=0xFD => Some(Absence::Reserved),
+                _ => None,
+            },
+        }
+    }
+}
+
+/// Why there is no value.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Absence {
+    NotAvailable,
+    Error,
+    Reserved,
+}
+
+/// Adds the values of a group; false if the table does not have it, or it is not as long as it should be.
+pub fn fields(pgn: u32, data: &[u8], fields: &mut Vec<Field>) -> bool {
+    let Ok(data) = <[u8; GROUP_BYTES]>::try_from(data) else { return false };
+    let Some(&(first, end)) = PARAMETERS.groups.get(&pgn) else { return false };
+    let data = u64::from_le_bytes(data);
+    fields.extend(PARAMETERS.all[first..end].iter().map(|parameter| parameter.field(data)));
+    true
+}
+
+/// The name of a suspect parameter number.
+pub fn name(spn: u32) -> Option<&'static str> {
+    PARAMETERS.names.get(&spn).copied()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn shown(pgn: u32, data: [u8; 8]) -> String {
+        let mut all = Vec::new();
+        assert!(fields(pgn, &data, &mut all));
+        all.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
+    }
+
+    #[test]
+    fn every_line_is_read_and_no_two_parameters_of_a_group_share_a_bit() {
+        let mut taken: FxHashMap<u32, u64> = FxHashMap::default();
+        let mut before = 0;
+        for line in lines(FILE) {
+            let parameter = Parameter::read(line).unwrap_or_else(|| panic!("{line}"));
+            assert!(matches!(parameter.bits, 1..8 | 8 | 16 | 32), "{line}");
+            let (Scale::Times(scale) | Scale::Over(scale)) = parameter.scale;
+            assert!(parameter.bit + parameter.bits <= 64 && scale > 0.0, "{line}");
+            assert!(!parameter.is_switch || parameter.bits == 2, "{line}");
+            // The lines of a group follow each other.
+            assert!(parameter.pgn == before || !taken.contains_key(&parameter.pgn), "{line}");
+            before = parameter.pgn;
+            let bits = ((1_u64 << parameter.bits) - 1) << parameter.bit;
+            let taken = taken.entry(parameter.pgn).or_default();
+            assert_eq!(*taken & bits, 0, "{line}");
+            *taken |= bits;
+            assert_eq!(name(parameter.spn), Some(parameter.name), "two names: {line}");
+        }
+        assert!(taken.len() > 35);
+    }
+
+    /// Values by hand from the published scalings: 0.125 rpm, 1 % from −125 %, 1/256 km/h, 1 °C from −40 °C, 1/32 °C from −273 °C.
+    #[test]
+    fn groups_are_shown_as_values() {
+        assert_eq!(
+            shown(0xF004, [0x01, 0x7D, 0xA0, 0x68, 0x13, 0xFF, 0xF0, 0xFF]),
+            "engine_torque_mode 1, demanded_engine_torque 0 %, actual_engine_torque 35 %, engine_speed 621 rpm, \
+             engine_starter_mode 0, engine_demand_torque not available"
+        );
+        assert!(shown(0xFEF1, [0xF7, 0x80, 0x50, 0x10, 0, 0, 0, 0]).starts_with(
+            "two_speed_axle not available, parking_brake 1 (on), cruise_pause not available, wheel_based_speed 80.5 km/h, \
+             cruise_active 0 (off), cruise_enable 0 (off), brake_switch 1 (on)"
+        ));
+        assert!(
+            shown(0xFEEE, [130, 0xFE, 0x00, 0x2D, 0xFF, 0xFF, 0xFC, 0])
+                .starts_with("engine_coolant_temperature 90 °C, fuel_temperature not available (error)")
+        );
+        assert!(
+            shown(0xFEEE, [130, 60, 0x00, 0x2D, 0xFF, 0xFF, 0xFC, 0])
+                .contains("engine_oil_temperature 87 °C")
+        );
+    }
+
+    #[test]
+    fn a_group_of_another_length_and_one_that_is_not_in_the_table_stay_bytes() {
+        assert!(!fields(0xF004, &[0; 7], &mut Vec::new()));
+        assert!(!fields(0xFF00, &[0; 8], &mut Vec::new()));
+    }
+
+    #[test]
+    fn suspect_parameters_have_names() {
+        assert_eq!(name(100), Some("engine_oil_pressure"));
+        assert_eq!(name(7969), None);
+    }
+}

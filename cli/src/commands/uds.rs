@@ -163,7 +163,7 @@ fn session(text: &str) -> Result<u8, String> {
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let steps = match &args.what {
-        What::Run(RunArgs { file }) => script::read(file)?,
+        What::Run(RunArgs { file }) => script::read(file, |what| matches!(what, What::Run { .. }))?,
         what => vec![Step { place: None, what: what.clone() }],
     };
     // Nothing is sent unless all of it can be.

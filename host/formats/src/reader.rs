@@ -12,26 +12,9 @@ use super::found::Found;
 use super::input::Input;
 use super::issue::{Fault, Place, ReadIssue};
 use super::left_out::LeftOut;
+use super::read_options::ReadOptions;
 use super::spec::{FormatSpec, UnknownFormat};
-use super::table::Columns;
-use super::zone::Zone;
 use cantap_trace::{PlainFrame, TraceRecord};
-
-/// How to read.
-#[derive(Clone, Debug, Default)]
-pub struct ReadOptions {
-    /// The format; if not given, it is determined by the file's first bytes where they are clear, otherwise
-    /// by its suffix.
-    pub format: Option<Format>,
-    /// Wait for more at the end of the file instead of ending.
-    pub follow: bool,
-    /// End after the first issue.
-    pub strict: bool,
-    /// The zone of dates in files that name none.
-    pub zone: Zone,
-    /// Which columns of a table mean what. If they are given and no format is, files are tables.
-    pub columns: Option<Columns>,
-}
 
 /// Why a file cannot be opened for reading.
 #[derive(Debug, thiserror::Error)]

@@ -11,7 +11,7 @@ use super::compression::Compression;
 use super::csv::CsvDialect;
 use super::dif::{self, DifLayout};
 use super::format::Format;
-use super::reader::ReadOptions;
+use super::read_options::ReadOptions;
 use super::row_format::Rows;
 use super::trc::TrcVersion;
 use super::writer::WriteOptions;

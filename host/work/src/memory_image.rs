@@ -44,11 +44,11 @@ pub enum ImageError {
     Twice(u32),
     /// Plain bytes do not say where they belong.
     #[error(
-        "it is neither Intel HEX nor S-records, and plain bytes do not say where they belong; give --address"
+        "it is neither Intel HEX nor S-records, and plain bytes do not say where they belong; give --memory-address"
     )]
     NoAddress,
     /// An address was given for a file that has its own.
-    #[error("it has its own addresses; leave --address out, or convert it to plain bytes first")]
+    #[error("it has its own addresses; leave --memory-address out, or convert it to plain bytes first")]
     OwnAddresses,
     /// Bytes end after the last 32-bit address.
     #[error("its bytes would end after address FFFFFFFF")]
@@ -275,7 +275,7 @@ mod tests {
             ("S1050000AABB95\nS1040001AA50\nS9030000FC", "00000001 is given twice"),
             ("S1040000AA51", "it has no end record"),
             ("S4040000AA51", "line 1: there is no record of this type"),
-            ("\u{0}\u{1}", "give --address"),
+            ("\u{0}\u{1}", "give --memory-address"),
         ] {
             let error = segments(&file.replace(' ', "")).unwrap_err().to_string();
             assert!(error.contains(expected), "{file}: {error}");

@@ -26,11 +26,11 @@ pub struct FormatArgs {
 /// What to write.
 #[derive(clap::Args, Clone)]
 pub struct DownloadArgs {
-    /// Intel HEX, S-records, or plain bytes with --address.
+    /// Intel HEX, S-records, or plain bytes with --memory-address.
     #[arg(value_name = "FILE", value_hint = clap::ValueHint::FilePath)]
     file: PathBuf,
     /// Where plain bytes belong, in hexadecimal.
-    #[arg(long, value_name = "HEX", value_parser = address)]
+    #[arg(long = "memory-address", value_name = "HEX", value_parser = address)]
     address: Option<u32>,
     #[command(flatten)]
     format: FormatArgs,

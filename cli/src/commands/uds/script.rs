@@ -3,54 +3,53 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use clap::Parser;
+use clap::{Parser, Subcommand};
 
-use super::What;
 use crate::usage_error::usage;
 
 /// A line of a file.
 #[derive(clap::Parser)]
 #[command(no_binary_name = true, disable_help_subcommand = true)]
-struct Line {
+struct Line<W: Subcommand> {
     #[command(subcommand)]
-    what: What,
+    what: W,
 }
 
 /// What to do, and where that is written.
-pub struct Step {
+pub struct Step<W> {
     /// `file:line`; `None` on the command line.
     pub place: Option<String>,
     /// What to do.
-    pub what: What,
+    pub what: W,
 }
 
-/// The steps of a file; `-` is standard input. Empty lines and those that begin with `#` do nothing.
+/// The steps of a file, none of which may run another file; `-` is standard input. Empty lines and those that begin with `#` do nothing.
 ///
 /// # Errors
 ///
 /// The file cannot be read; any line that is no request, before anything is sent.
-pub fn read(path: &Path) -> anyhow::Result<Vec<Step>> {
+pub fn read<W: Subcommand>(path: &Path, runs_a_file: fn(&W) -> bool) -> anyhow::Result<Vec<Step<W>>> {
     let (name, text) = if path.as_os_str() == "-" {
         ("standard input".to_owned(), std::io::read_to_string(std::io::stdin()))
     } else {
         (path.display().to_string(), std::fs::read_to_string(path))
     };
     let text = text.with_context(|| format!("cannot read {name}"))?;
-    let steps = steps(&name, &text)?;
+    let steps = steps(&name, &text, runs_a_file)?;
     if steps.is_empty() {
         return Err(usage(format!("{name} has no requests; a line is one, as 'read F190'")));
     }
     Ok(steps)
 }
 
-fn steps(name: &str, text: &str) -> anyhow::Result<Vec<Step>> {
+fn steps<W: Subcommand>(name: &str, text: &str, runs_a_file: fn(&W) -> bool) -> anyhow::Result<Vec<Step<W>>> {
     let lines = (1..).zip(text.lines().map(str::trim));
     let lines = lines.filter(|(_, line)| !line.is_empty() && !line.starts_with('#'));
     lines
         .map(|(number, line)| {
             let place = format!("{name}:{number}");
             match Line::try_parse_from(line.split_whitespace()) {
-                Ok(Line { what: What::Run { .. } }) => {
+                Ok(Line { what }) if runs_a_file(&what) => {
                     Err(usage(format!("{place}: a file cannot run another one; put its lines here")))
                 }
                 Ok(Line { what }) => Ok(Step { place: Some(place), what }),
@@ -76,7 +75,12 @@ pub struct RunArgs {
 
 #[cfg(test)]
 mod tests {
+    use super::super::What;
     use super::*;
+
+    fn steps(name: &str, text: &str) -> anyhow::Result<Vec<Step<What>>> {
+        super::steps(name, text, |what| matches!(what, What::Run { .. }))
+    }
 
     #[test]
     fn a_file_has_a_request_in_each_line() {

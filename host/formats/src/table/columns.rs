@@ -187,7 +187,7 @@ pub(super) fn role_of(name: &[u8]) -> Option<(Role, Option<Form>)> {
         "id" | "canid" | "arbitrationid" | "arbid" | "identifier" | "canidentifier" | "addr" | "address"
         | "messageid" | "msgid" | "frameid" | "idh" => Role::Id,
         "dlc" | "len" | "length" | "datalength" | "datalen" | "candlc" => Role::Dlc,
-        "data" | "payload" | "databytes" | "datafield" | "candata" | "rawdata" | "datas" => Role::Data,
+        "data" | "payload" | "databytes" | "datafield" | "candata" | "rawdata" => Role::Data,
         "bus" | "busid" | "busnumber" => return Some((Role::Channel, Some(Form::FromZero))),
         "channel" | "chn" | "ch" | "interface" | "buschannel" | "canchannel" => Role::Channel,
         "extended" | "ide" | "ext" | "isextended" | "extendedid" | "idtype" | "type" => Role::Extended,

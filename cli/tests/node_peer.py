@@ -20,6 +20,25 @@ def wait():
     sys.stdin.read()
 
 
+def serve(stack, take):
+    """Hands on each request until standard input ends."""
+    over = threading.Event()
+
+    def requests():
+        while not over.is_set():
+            request = bytes(stack.recv(block=True, timeout=0.1) or b"")
+            if request:
+                take(request)
+
+    stack.start()
+    server = threading.Thread(target=requests)
+    server.start()
+    wait()
+    over.set()
+    server.join()
+    stack.stop()
+
+
 def serve_uds(host, port):
     """An ECU on can-isotp; the request's bytes decide the answer, and the seed the key."""
     import isotp
@@ -39,26 +58,18 @@ def serve_uds(host, port):
     address = isotp.Address(isotp.AddressingMode.Normal_11bits, txid=0x7E8, rxid=0x7E0)
     parameters = {"blocksize": 3, "stmin": 1, "rx_flowcontrol_timeout": 5000, "rx_consecutive_frame_timeout": 5000}
     stack = isotp.CanStack(bus(host, port), address=address, params=parameters)
-    stack.start()
-    over = threading.Event()
 
-    def serve():
-        while not over.is_set():
-            request = bytes(stack.recv(block=True, timeout=0.1) or b"").hex().upper()
-            known = answers.get(request) or next((answers[key] for key in ("2702", "36") if request.startswith(key)), [])
-            if request.startswith("36"):
-                # The block's number, and as many bytes as came, in two.
-                known = [f"76{request[2:4]}{len(request) // 2:04X}"]
-            for answer in known:
-                stack.send(bytes.fromhex(answer))
-                time.sleep(0.02)
+    def answer(request):
+        request = request.hex().upper()
+        known = answers.get(request) or next((answers[key] for key in ("2702", "36") if request.startswith(key)), [])
+        if request.startswith("36"):
+            # The block's number, and as many bytes as came, in two.
+            known = [f"76{request[2:4]}{len(request) // 2:04X}"]
+        for each in known:
+            stack.send(bytes.fromhex(each))
+            time.sleep(0.02)
 
-    server = threading.Thread(target=serve)
-    server.start()
-    wait()
-    over.set()
-    server.join()
-    stack.stop()
+    serve(stack, answer)
 
 
 def serve_memory(host, port):
@@ -67,8 +78,6 @@ def serve_memory(host, port):
 
     address = isotp.Address(isotp.AddressingMode.Normal_11bits, txid=0x7E8, rxid=0x7E0)
     stack = isotp.CanStack(bus(host, port), address=address, params={"blocksize": 0, "stmin": 0})
-    stack.start()
-    over = threading.Event()
     memory = bytearray(256)
     ecu = {"session": False, "unlocked": False, "last": 0.0, "place": 0, "left": 0, "counter": 0, "writes": False}
 
@@ -112,19 +121,12 @@ def serve_memory(host, port):
             return b"\x77" if ecu["left"] == 0 else bytes([0x7F, service, 0x24])
         return bytes([0x7F, service, 0x11])
 
-    def serve():
-        while not over.is_set():
-            request = bytes(stack.recv(block=True, timeout=0.1) or b"")
-            reply = answer(request) if request else None
-            if reply:
-                stack.send(reply)
+    def send_answer(request):
+        reply = answer(request)
+        if reply:
+            stack.send(reply)
 
-    server = threading.Thread(target=serve)
-    server.start()
-    wait()
-    over.set()
-    server.join()
-    stack.stop()
+    serve(stack, send_answer)
 
 
 VIN = b"WVWZZZ1KZAW00000"

@@ -14,8 +14,9 @@ pub fn build(shell: &Shell) -> Result<()> {
     Ok(cargo_test(shell).arg("--no-run").run()?)
 }
 
-/// Runs them all, even if one fails; those on the emulated board use the default board's firmware, and are left out without it: they are marked as ignored. Those that
-/// concern every board use `boards`, the ones that were built. If there are peers, none may be skipped but those left out on purpose.
+/// Runs them all, even if one fails. Those on the emulated board are marked as ignored; they use the default board's firmware, and are left
+/// out without it. Those that concern every board use `boards`, the ones that were built. If there are peers, none may be skipped but
+/// those left out on purpose.
 pub fn run(shell: &Shell, peers: Option<&Peers>, boards: &[Board]) -> Result<()> {
     let names: Vec<&str> = boards.iter().map(|board| board.name()).collect();
     let mut test = cargo_test(shell).arg("--no-fail-fast").env("CANTAP_BOARDS", names.join(" "));

@@ -52,11 +52,7 @@ impl RowFormat for Decoder {
         let direction = direction(way)?;
         let number = text::decimal(channel).and_then(|channel| u8::try_from(channel).ok());
         let channel = number.ok_or_else(|| Fault::malformed("a channel of 0 to 255", channel))?;
-        let raw = match id.strip_prefix(b"0x").or_else(|| id.strip_prefix(b"0X")) {
-            Some(digits) => text::hex(digits),
-            None if self.decimal => text::decimal(id).and_then(|id| u32::try_from(id).ok()),
-            None => text::hex(id),
-        };
+        let raw = text::number(id, self.decimal);
         let raw = raw.ok_or_else(|| Fault::malformed("an identifier such as 0x123", id))?;
         let (extended, remote) = match kind {
             b"s" | b"S" => (false, false),

@@ -20,13 +20,6 @@ pub(crate) fn is_head(text: &[u8]) -> bool {
     text.starts_with(b"//-----") && memchr::memmem::find(text, b"Microchip").is_some()
 }
 
-fn number(word: &[u8]) -> Option<u32> {
-    match word.strip_prefix(b"0x").or_else(|| word.strip_prefix(b"0X")) {
-        Some(digits) => text::hex(digits),
-        None => text::decimal(word).and_then(|number| u32::try_from(number).ok()),
-    }
-}
-
 impl RowFormat for Decoder {
     fn line(&mut self, line: &[u8], _zone: &Zone) -> Result<Line, Fault> {
         const NS_PER_MS: i64 = 1_000_000;
@@ -48,10 +41,11 @@ impl RowFormat for Decoder {
             [digits @ .., b'x'] => (digits, true),
             _ => (id, false),
         };
-        let raw = number(digits).ok_or_else(|| Fault::malformed("an identifier such as 0xC2", id))?;
+        let raw =
+            text::number(digits, true).ok_or_else(|| Fault::malformed("an identifier such as 0xC2", id))?;
         let id = identifier(raw, marked || raw > 0x7FF, id)?;
         let fields = FrameFields { id, remote: false, direction, len: length_code(len)?, fd: None };
-        let byte = |word: &[u8]| number(word).and_then(|byte| u8::try_from(byte).ok());
+        let byte = |word: &[u8]| text::number(word, true).and_then(|byte| u8::try_from(byte).ok());
         let data = Payload::exactly(cells, fields.data_len(), byte)?;
         Ok(Line::Record(TraceRecord { time_ns, channel: 1, event: fields.event(&data)? }))
     }

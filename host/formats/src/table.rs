@@ -60,10 +60,6 @@ fn first_line(head: &[u8]) -> Option<&[u8]> {
     lines.find(|line| !line.is_empty() && !line.starts_with(b"#"))
 }
 
-fn without_0x(cell: &[u8]) -> Option<&[u8]> {
-    cell.strip_prefix(b"0x").or_else(|| cell.strip_prefix(b"0X"))
-}
-
 impl Decoder {
     /// With the columns that the user gave, if any.
     pub(crate) fn new(columns: Option<Columns>) -> Self {
@@ -236,7 +232,7 @@ impl Decoder {
 fn ids_are_decimal(ids: &[&[u8]]) -> (bool, bool) {
     /// So many different identifiers without a letter are no chance.
     const ENOUGH: usize = 10;
-    let plain: Vec<_> = ids.iter().filter(|id| without_0x(id).is_none() && !id.is_empty()).collect();
+    let plain: Vec<_> = ids.iter().filter(|id| text::after_0x(id).is_none() && !id.is_empty()).collect();
     let has_letter = |id: &&&&[u8]| id.iter().any(u8::is_ascii_alphabetic);
     let has_zero = |id: &&&&[u8]| id.len() > 1 && id.starts_with(b"0");
     if plain.is_empty() || plain.iter().any(|id| has_letter(&id) || has_zero(&id)) {
@@ -254,11 +250,7 @@ fn ids_are_decimal(ids: &[&[u8]]) -> (bool, bool) {
 
 fn id(shown: &[u8], decimal: bool) -> Result<u32, Fault> {
     let digits = shown.strip_suffix(b"h").or_else(|| shown.strip_suffix(b"x")).unwrap_or(shown);
-    let number = match without_0x(digits) {
-        Some(digits) => text::hex(digits),
-        None if decimal => text::decimal(digits).and_then(|id| u32::try_from(id).ok()),
-        None => text::hex(digits),
-    };
+    let number = text::number(digits, decimal);
     let expected =
         if decimal { "an identifier in decimal digits" } else { "an identifier in hexadecimal digits" };
     number.ok_or_else(|| Fault::malformed(expected, shown))
@@ -303,10 +295,7 @@ fn is_empty(cell: &[u8]) -> bool {
 
 /// One byte.
 fn byte(cell: &[u8], decimal: bool) -> Option<u8> {
-    match without_0x(cell) {
-        None if decimal => text::decimal(cell).and_then(|byte| u8::try_from(byte).ok()),
-        digits => text::hex(digits.unwrap_or(cell)).and_then(|byte| u8::try_from(byte).ok()),
-    }
+    text::number(cell, decimal).and_then(|byte| u8::try_from(byte).ok())
 }
 
 /// The bytes of a cell: digits without gaps, or bytes with something between them.
@@ -316,13 +305,13 @@ fn push_bytes(cell: &[u8], decimal: bool, bytes: &mut Vec<u8>) -> Result<(), Fau
     for word in cell.split(is_between).filter(|word| !word.is_empty()) {
         let fault = || Fault::malformed("data bytes", cell);
         // No bytes at all, as Cabana writes them.
-        if without_0x(word).is_some_and(<[u8]>::is_empty) {
+        if text::after_0x(word).is_some_and(<[u8]>::is_empty) {
             continue;
         }
-        if decimal || without_0x(word).unwrap_or(word).len() <= 2 {
+        if decimal || text::after_0x(word).unwrap_or(word).len() <= 2 {
             bytes.push(byte(word, decimal).ok_or_else(fault)?);
         } else {
-            let digits = without_0x(word).unwrap_or(word);
+            let digits = text::after_0x(word).unwrap_or(word);
             if !digits.len().is_multiple_of(2) {
                 return Err(fault());
             }

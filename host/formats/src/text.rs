@@ -169,6 +169,20 @@ pub(crate) fn hex_pair(high: u8, low: u8) -> Option<u8> {
     (high | low < 16).then_some(high << 4 | low)
 }
 
+/// What follows `0x`, if that is how a number begins.
+pub(crate) fn after_0x(word: &[u8]) -> Option<&[u8]> {
+    word.strip_prefix(b"0x").or_else(|| word.strip_prefix(b"0X"))
+}
+
+/// A number of 32 bits: hexadecimal behind `0x`; without it, decimal or not.
+pub(crate) fn number(word: &[u8], is_decimal: bool) -> Option<u32> {
+    match after_0x(word) {
+        Some(digits) => hex(digits),
+        None if is_decimal => decimal(word).and_then(|number| u32::try_from(number).ok()),
+        None => hex(word),
+    }
+}
+
 /// A hexadecimal number of up to eight digits.
 #[inline]
 pub(crate) fn hex(digits: &[u8]) -> Option<u32> {

@@ -216,6 +216,19 @@ impl<'d> Client<'d> {
         Ok(answers)
     }
 
+    /// The same, showing what was said; returns the first answer, if none is a refusal.
+    ///
+    /// # Errors
+    ///
+    /// No answer, or a refusal.
+    pub fn ask_and_show(&mut self, request: &[u8]) -> anyhow::Result<ServerAnswer> {
+        let asked = self.ask(request);
+        self.show()?;
+        let answer = first(asked?)?;
+        self.all_agreed()?;
+        Ok(answer)
+    }
+
     /// Which session is open, by what was asked and answered.
     fn note_session(&mut self, request: &[u8], answers: &[ServerAnswer]) {
         let is_positive = answers.iter().any(|answer| answer.refusal().is_none());
@@ -257,7 +270,15 @@ impl<'d> Client<'d> {
         request: &[u8],
         servers: Option<usize>,
     ) -> anyhow::Result<Vec<ServerAnswer>> {
-        match self.ask_so_many(request, servers) {
+        let asked = self.ask_so_many(request, servers);
+        self.none_is_no_failure(asked)
+    }
+
+    fn none_is_no_failure(
+        &self,
+        asked: Result<Vec<ServerAnswer>, Failure>,
+    ) -> anyhow::Result<Vec<ServerAnswer>> {
+        match asked {
             Ok(answers) => Ok(answers),
             Err(Failure::Exchange(ExchangeError::NoAnswer { .. })) => Ok(Vec::new()),
             Err(failure) => Err(self.explain(failure)),
@@ -270,15 +291,11 @@ impl<'d> Client<'d> {
         let before = self.refused.take();
         let asked = self.ask_so_many(request, None);
         self.refused = before;
-        match asked {
-            Ok(answers) => Ok(answers),
-            Err(Failure::Exchange(ExchangeError::NoAnswer { .. })) => Ok(Vec::new()),
-            Err(Failure::Exchange(error @ ExchangeError::Answer { .. })) => {
-                self.reporter.note(error.to_string());
-                Ok(Vec::new())
-            }
-            Err(failure) => Err(self.explain(failure)),
+        if let Err(Failure::Exchange(error @ ExchangeError::Answer { .. })) = asked {
+            self.reporter.note(error.to_string());
+            return Ok(Vec::new());
         }
+        self.none_is_no_failure(asked)
     }
 
     /// Sends a request that wants no answer, and waits this long for a refusal.

@@ -3,7 +3,7 @@
 use anyhow::{anyhow, bail, ensure};
 
 use crate::memory_image::Segment;
-use crate::uds::{Client, first};
+use crate::uds::Client;
 
 /// A block is a message of ISO 15765-2, of which classical CAN has at most so many bytes.
 const MOST_MESSAGE_BYTES: usize = 4095;
@@ -59,36 +59,28 @@ fn block_bytes(answer: &[u8]) -> anyhow::Result<usize> {
     Ok(longest.min(MOST_MESSAGE_BYTES) - BLOCK_HEAD_BYTES)
 }
 
-/// Asks, shows what was said, and returns the positive answer.
-fn ask(client: &mut Client<'_>, request: &[u8]) -> anyhow::Result<Vec<u8>> {
-    let asked = client.ask(request);
-    client.show()?;
-    let answer = first(asked?)?;
-    client.all_agreed()?;
-    Ok(answer.data)
-}
-
 /// Writes bytes to memory.
 ///
 /// # Errors
 ///
 /// A refusal, an answer to another block, or a transfer that broke off; says how much of it was taken.
 pub fn download(client: &mut Client<'_>, segment: &Segment, format: MemoryFormat) -> anyhow::Result<()> {
-    let begun = ask(client, &format.request(0x34, segment.address, segment.data.len())?)?;
-    let each = block_bytes(&begun)?;
+    let begun = client.ask_and_show(&format.request(0x34, segment.address, segment.data.len())?)?;
+    let each = block_bytes(&begun.data)?;
     let mut counter = 0_u8;
     for (number, block) in segment.data.chunks(each).enumerate() {
         counter = counter.wrapping_add(1);
         let taken = || format!("{} of {} bytes were taken", number * each, segment.data.len());
-        let answer = ask(client, &[&[0x36, counter], block].concat())
+        let answer = client
+            .ask_and_show(&[&[0x36, counter], block].concat())
             .map_err(|error| anyhow!("{error}; {}", taken()))?;
         ensure!(
-            answer.get(1) == Some(&counter),
+            answer.data.get(1) == Some(&counter),
             "the ECU answered another block than {counter:02X}; {}",
             taken()
         );
     }
-    ask(client, &[0x37]).map(drop)
+    client.ask_and_show(&[0x37]).map(drop)
 }
 
 /// Reads bytes from memory.
@@ -102,15 +94,16 @@ pub fn upload(
     size: usize,
     format: MemoryFormat,
 ) -> anyhow::Result<Vec<u8>> {
-    let begun = ask(client, &format.request(0x35, address, size)?)?;
-    block_bytes(&begun)?;
+    let begun = client.ask_and_show(&format.request(0x35, address, size)?)?;
+    block_bytes(&begun.data)?;
     let mut data = Vec::new();
     let mut counter = 0_u8;
     while data.len() < size {
         counter = counter.wrapping_add(1);
-        let answer = ask(client, &[0x36, counter])
+        let answer = client
+            .ask_and_show(&[0x36, counter])
             .map_err(|error| anyhow!("{error}; {} of {size} bytes had come", data.len()))?;
-        match &answer[..] {
+        match &answer.data[..] {
             [_, number, block @ ..] if *number == counter && !block.is_empty() => data.extend(block),
             _ => bail!(
                 "the ECU answered another block than {counter:02X}, or without bytes; {} of {size} bytes had come",
@@ -119,7 +112,7 @@ pub fn upload(
         }
     }
     ensure!(data.len() == size, "the ECU sent {} bytes in place of {size}", data.len());
-    ask(client, &[0x37])?;
+    client.ask_and_show(&[0x37])?;
     Ok(data)
 }
 

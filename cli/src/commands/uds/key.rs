@@ -9,7 +9,7 @@ use anyhow::{Context, bail, ensure};
 
 use super::hex::{Hex, byte, bytes};
 use cantap_work::interrupt;
-use cantap_work::uds::{Client, first};
+use cantap_work::uds::Client;
 
 /// How often to check whether the command has ended.
 const LOOK_EVERY: Duration = Duration::from_millis(5);
@@ -46,10 +46,7 @@ impl KeyArgs {
     /// Unlocks it at this level. A session that is open is kept while the key is computed.
     pub fn unlock_at(&self, level: u8, client: &mut Client<'_>) -> anyhow::Result<()> {
         let Some(command) = &self.key_command else { return Ok(()) };
-        let asked = client.ask(&[0x27, level]);
-        client.show()?;
-        let answer = first(asked?)?;
-        client.all_agreed()?;
+        let answer = client.ask_and_show(&[0x27, level])?;
         let seed = answer.data.get(2..).unwrap_or_default();
         // An ECU that is already unlocked sends a seed of zeros (ISO 14229-1).
         if seed.iter().all(|byte| *byte == 0) {

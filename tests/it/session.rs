@@ -146,6 +146,21 @@ fn a_channel_that_was_deaf_behind_the_others_reset_says_so() {
     }
 }
 
+/// The reset was given up, ended later and took the filters with it: the channel would be deaf, and nothing would count what it misses.
+#[test]
+fn a_channel_is_opened_with_the_filters_that_a_late_reset_took() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    bench.board.control[0].stuck = true;
+    bench.board.control[0].halts_needed = usize::MAX;
+    assert_eq!(bench.ask(Command::Close { channel: CAN1 }), Err(Refusal::Hardware));
+    bench.board.control[0].stuck = false;
+    assert_eq!(bench.ask(Command::Close { channel: CAN1 }), Ok(Reply::Done));
+    let written = bench.board.filters.written.len();
+    bench.ask(Command::Open { channel: CAN1, config: Some(config(Mode::ListenOnly)) }).unwrap();
+    assert_eq!(bench.board.filters.written[written..], [Layout::open()]);
+}
+
 /// A controller without a clock: the host gets an answer, and can try again.
 #[test]
 fn a_controller_that_does_not_follow_is_refused_in_time() {

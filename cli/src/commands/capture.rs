@@ -130,6 +130,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             sink.omits_data.push(number);
         }
     }
+    // One that was left out has no figures.
+    channels.retain(|(number, _)| live.opened().any(|(opened, ..)| opened == *number));
     let filtered = live.filtered();
     let channels = channels
         .into_iter()

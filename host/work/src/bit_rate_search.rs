@@ -59,12 +59,25 @@ pub fn search(
     limits: &Limits,
     progress: &mut dyn FnMut(Progress) -> bool,
 ) -> Result<Search, DeviceError> {
-    let serial_number = device.hello().serial.as_str();
-    let found = match remembered(device).get(serial_number, channel) {
-        Some(bitrate_bps) if holds(device, channel, bitrate_bps, progress)? => {
-            Search::Confirmed { bitrate_bps }
-        }
-        _ => Search::Measured(measure(device, channel, limits, progress)?),
+    search_with(device, channel, limits, &remembered(device), progress)
+}
+
+fn search_with(
+    device: &Device,
+    channel: Channel,
+    limits: &Limits,
+    remembered: &RememberedRates,
+    progress: &mut dyn FnMut(Progress) -> bool,
+) -> Result<Search, DeviceError> {
+    let before = remembered.get(device.hello().serial.as_str(), channel);
+    let check = match before {
+        Some(bitrate_bps) => confirm(device, channel, bitrate_bps, progress)?,
+        None => Check::Open,
+    };
+    let found = match (check, before) {
+        (Check::Holds, Some(bitrate_bps)) => Search::Confirmed { bitrate_bps },
+        (Check::Stopped, _) => Search::Measured(Outcome::Stopped),
+        _ => Search::Measured(measure_with(device, channel, limits, remembered, progress)?),
     };
     discard_records(device)?;
     Ok(found)
@@ -77,9 +90,19 @@ pub fn measure(
     limits: &Limits,
     progress: &mut dyn FnMut(Progress) -> bool,
 ) -> Result<Outcome, DeviceError> {
+    measure_with(device, channel, limits, &remembered(device), progress)
+}
+
+fn measure_with(
+    device: &Device,
+    channel: Channel,
+    limits: &Limits,
+    remembered: &RememberedRates,
+    progress: &mut dyn FnMut(Progress) -> bool,
+) -> Result<Outcome, DeviceError> {
     let outcome = autobaud::search(device, channel, limits, progress)?;
     if let Outcome::Found { bitrate_bps, .. } = outcome {
-        remembered(device).set(device.hello().serial.as_str(), channel, bitrate_bps);
+        remembered.set(device.hello().serial.as_str(), channel, bitrate_bps);
     }
     Ok(outcome)
 }
@@ -89,15 +112,25 @@ fn remembered(device: &Device) -> RememberedRates {
     if Address::is_no_port(device.name()) { RememberedRates::none() } else { RememberedRates::of_user() }
 }
 
+/// What frames say about a remembered bit rate.
+enum Check {
+    /// The bus runs at it.
+    Holds,
+    /// It does not, or nothing shows it in a short time.
+    Open,
+    /// The caller asked to stop.
+    Stopped,
+}
+
 /// Whether the bus runs at this bit rate, as far as frames show it in a short time.
-fn holds(
+fn confirm(
     device: &Device,
     channel: Channel,
     bitrate_bps: u32,
     progress: &mut dyn FnMut(Progress) -> bool,
-) -> Result<bool, DeviceError> {
+) -> Result<Check, DeviceError> {
     // One that another firmware could reach is as good as none.
-    let Ok(timing) = device.timing(bitrate_bps) else { return Ok(false) };
+    let Ok(timing) = device.timing(bitrate_bps) else { return Ok(Check::Open) };
     let index = channel.index();
     let before = device.status()?.channels[index];
     device.open_channel(channel, Some(ChannelConfig::listen_only(timing)))?;
@@ -110,20 +143,20 @@ fn holds(
             let frames = now.frames.wrapping_sub(before.frames);
             let errors = now.bus_errors.wrapping_sub(before.bus_errors);
             if frames >= GOOD_FRAMES {
-                return Ok(true);
+                return Ok(Check::Holds);
             }
             let is_late = status.ticks.saturating_sub(opened) > within;
-            if is_late
-                || frames == 0 && errors >= MOST_ERRORS
-                || !progress(Progress::Confirming { bitrate_bps, frames })
-            {
-                return Ok(false);
+            if is_late || frames == 0 && errors >= MOST_ERRORS {
+                return Ok(Check::Open);
+            }
+            if !progress(Progress::Confirming { bitrate_bps, frames }) {
+                return Ok(Check::Stopped);
             }
             std::thread::sleep(ASK_EVERY);
         }
     })();
     let closed = device.close_channel(channel);
-    watched.and_then(|holds| closed.map(|_| holds))
+    watched.and_then(|check| closed.map(|()| check))
 }
 
 /// Forgets what was received during the search: nobody asked for it, and errors at a bit rate that did not hold were not
@@ -200,5 +233,40 @@ mod tests {
         assert!(unconfirmed(false, 12).ends_with("does it run at the same bit rate?"));
         assert!(unconfirmed(true, 12).ends_with("check termination and wiring"));
         assert!(unconfirmed(true, 0).ends_with("when there is more traffic"));
+    }
+
+    /// A search that was stopped while it listened at the remembered bit rate began to measure.
+    #[test]
+    fn a_search_can_be_stopped_while_it_confirms_what_it_remembers() {
+        let folder = tempfile::tempdir().unwrap();
+        let rates = RememberedRates::at(folder.path().join("rates.json"));
+        let device = "virtual:load=0,serial=A".parse::<Address>().unwrap().open().unwrap();
+        rates.set("A", Channel::Can1, 500_000);
+        let mut seen = Vec::new();
+        let mut stop = |progress| {
+            seen.push(progress);
+            false
+        };
+        let found = search_with(&device, Channel::Can1, &Limits::default(), &rates, &mut stop).unwrap();
+        assert_eq!(found, Search::Measured(Outcome::Stopped));
+        assert_eq!(seen, [Progress::Confirming { bitrate_bps: 500_000, frames: 0 }]);
+    }
+
+    /// Nothing is believed that frames do not confirm, and the next search begins with what was found.
+    #[test]
+    fn a_remembered_rate_that_does_not_hold_is_measured_anew() {
+        let folder = tempfile::tempdir().unwrap();
+        let rates = RememberedRates::at(folder.path().join("rates.json"));
+        let device = "virtual:bitrate=125k,serial=A".parse::<Address>().unwrap().open().unwrap();
+        rates.set("A", Channel::Can1, 500_000);
+        let search =
+            || search_with(&device, Channel::Can1, &Limits::default(), &rates, &mut |_| true).unwrap();
+        let found = search();
+        assert!(matches!(found, Search::Measured(_)) && found.bitrate_bps() == Some(125_000), "{found:?}");
+        assert_eq!(rates.get("A", Channel::Can1), Some(125_000));
+        assert_eq!(search(), Search::Confirmed { bitrate_bps: 125_000 });
+        // A rate that the clock does not reach is as good as none.
+        rates.set("A", Channel::Can1, 499_999);
+        assert_eq!(search().bitrate_bps(), Some(125_000));
     }
 }

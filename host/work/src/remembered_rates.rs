@@ -47,6 +47,12 @@ impl RememberedRates {
         Self { path: cache_folder().map(|folder| folder.join(NAME)) }
     }
 
+    /// Those in this file.
+    #[cfg(test)]
+    pub(crate) const fn at(path: PathBuf) -> Self {
+        Self { path: Some(path) }
+    }
+
     /// None, now and later.
     pub const fn none() -> Self {
         Self { path: None }
@@ -97,7 +103,7 @@ mod tests {
     fn a_rate_is_remembered_for_each_channel_of_each_device() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("cantap").join(NAME);
-        let rates = || RememberedRates { path: Some(path.clone()) };
+        let rates = || RememberedRates::at(path.clone());
         assert_eq!(rates().get("A", Channel::Can1), None);
         rates().set("A", Channel::Can1, 500_000);
         rates().set("A", Channel::Can2, 250_000);

@@ -144,9 +144,11 @@ impl TimingOptions {
             return Ok(Some(TimingRequest::Exact(timing)));
         }
         let Self { sample_point, sjw, .. } = *self;
-        match RequestedRate::of(&self.bitrates, channel.number()).map(|rate| rate.bitrate_bps) {
-            Some(None) => Ok(None),
-            Some(Some(bitrate_bps)) => {
+        if self.is_auto(channel.number()) {
+            return Ok(None);
+        }
+        match RequestedRate::of(&self.bitrates, channel.number()).and_then(|rate| rate.bitrate_bps) {
+            Some(bitrate_bps) => {
                 Ok(Some(TimingRequest::Rate { bitrate_bps, sample_point_percent: sample_point, sjw }))
             }
             None if sample_point.is_some() || sjw.is_some() => Err(TimingOptionsError::NoBitRate),

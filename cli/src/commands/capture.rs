@@ -94,7 +94,7 @@ const FLUSH_EVERY: Duration = Duration::from_millis(200);
 fn needs_bit_rate(args: &Args, board: usize, boards: &Boards) -> anyhow::Result<bool> {
     let timing = args.open.options().timing.on_board(board);
     for channel in boards.channels_of(board) {
-        if timing.request(channel)?.is_none() {
+        if timing.request(channel)?.is_none() && !timing.is_auto(channel.number()) {
             return Ok(true);
         }
     }
@@ -130,6 +130,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             sink.omits_data.push(number);
         }
     }
+    // One that was left out has no figures.
+    channels.retain(|(number, _)| live.opened().any(|(opened, ..)| opened == *number));
     let filtered = live.filtered();
     let channels = channels
         .into_iter()

@@ -2,6 +2,7 @@
 
 mod align;
 mod analysis;
+mod bit_rate_auto;
 mod boards;
 mod bus_commands;
 mod canopen_ends;
@@ -44,6 +45,7 @@ mod outputs;
 mod port;
 mod protocols;
 mod python_can;
+mod readme;
 mod report;
 mod schema;
 mod scripts;

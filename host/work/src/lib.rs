@@ -3,6 +3,7 @@
 //! | Modules | Subject |
 //! |---|---|
 //! | [`boards`], [`channels`], [`channel_bitrate`] | which devices, and which of their channels |
+//! | [`requested_rate`], [`bit_rate_search`], [`remembered_rates`] | the bit rate that is asked for, or found by listening |
 //! | [`channel_options`], [`timing_options`], [`bus_off`] | how channels are opened, and brought back from bus-off |
 //! | [`live`], [`reception`] | records of devices that may come and go; a channel that receives only errors |
 //! | [`sending`], [`speaking`], [`uds`], [`uds_memory`] | frames and their fate; a protocol's client on a device |
@@ -17,6 +18,8 @@ pub mod advice;
 #[cfg(feature = "buses")]
 pub mod announcement;
 pub mod atomic_file;
+#[cfg(feature = "buses")]
+pub mod bit_rate_search;
 #[cfg(feature = "buses")]
 pub mod boards;
 #[cfg(feature = "buses")]
@@ -52,7 +55,11 @@ pub mod reading;
 #[cfg(feature = "buses")]
 pub mod reception;
 #[cfg(feature = "buses")]
+pub mod remembered_rates;
+#[cfg(feature = "buses")]
 pub mod report;
+#[cfg(feature = "buses")]
+pub mod requested_rate;
 #[cfg(feature = "buses")]
 pub mod sending;
 #[cfg(feature = "buses")]

@@ -27,8 +27,16 @@ impl Source<'_> {
         let mut reconnects = vec![0; plan.addresses.len()];
         let mut is_new = true;
         loop {
-            if std::mem::take(&mut is_new) && Self::lacks_bit_rates(&plan) {
-                match self.find_bit_rates(&mut plan) {
+            let first = std::mem::take(&mut is_new);
+            let found = if plan.open.timing.has_auto() {
+                Some(self.find_requested(&mut plan))
+            } else if first && Self::lacks_bit_rates(&plan) {
+                Some(self.find_bit_rates(&mut plan))
+            } else {
+                None
+            };
+            if let Some(found) = found {
+                match found {
                     Then::GoOn | Then::Autobaud => {}
                     Then::Reopen(other) => {
                         (plan, is_new) = (other, true);

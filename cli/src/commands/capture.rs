@@ -142,13 +142,19 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let trigger = sink.trigger.as_ref().map(TriggerSummary::of);
     let finished = sink.finish();
     let failed = end.is_err() || finished.is_err();
-    let channels = meters.channels.iter().map(|(number, meter)| ChannelSummary::of(*number, meter)).collect();
+    let of = |(number, meter): &(u8, Meter)| ChannelSummary::of(*number, meter, live.hint(*number));
+    let channels = meters.channels.iter().map(of).collect();
     let mut summary = Summary::of(seconds, channels, &live, &boards);
     summary.trigger = trigger;
     summary.frames_in_file = if failed { frames_in_file(args) } else { None };
     summary.tell(args.json, args.output.as_deref())?;
     end?;
     finished?;
+    for (number, _) in &meters.channels {
+        if let Some(hint) = live.hint_sentence(*number) {
+            stderr::warn(&hint);
+        }
+    }
     live.judge()?;
     Ok(ExitCode::SUCCESS)
 }

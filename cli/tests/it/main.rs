@@ -22,6 +22,7 @@ mod decode;
 mod defaults;
 mod device_care;
 mod diagnostics;
+mod doctor;
 mod emulated;
 mod emulated_autobaud;
 mod emulated_clock;

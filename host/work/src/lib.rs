@@ -6,6 +6,7 @@
 //! | [`requested_rate`], [`bit_rate_search`], [`remembered_rates`] | the bit rate that is asked for, or found by listening |
 //! | [`channel_options`], [`timing_options`], [`bus_off`] | how channels are opened, and brought back from bus-off |
 //! | [`live`], [`reception`] | records of devices that may come and go; a channel that receives only errors |
+//! | [`doctor`], [`bus_hints`], `port_access` (Linux) | what is the matter with a port, a device or a bus, and what to do next |
 //! | [`sending`], [`speaking`], [`uds`], [`uds_memory`] | frames and their fate; a protocol's client on a device |
 //! | [`read_ahead`], [`missing`], [`databases`], [`reading`] | traces, what is missing from them, and what they mean |
 //! | [`report`], [`advice`], [`announcement`], [`terms`], [`code_texts`] | messages for people |
@@ -23,6 +24,8 @@ pub mod bit_rate_search;
 #[cfg(feature = "buses")]
 pub mod boards;
 #[cfg(feature = "buses")]
+pub mod bus_hints;
+#[cfg(feature = "buses")]
 pub mod bus_off;
 #[cfg(feature = "buses")]
 pub mod channel_bitrate;
@@ -36,6 +39,8 @@ pub mod code_texts;
 pub mod databases;
 #[cfg(feature = "dfu")]
 pub mod dfu;
+#[cfg(feature = "buses")]
+pub mod doctor;
 pub mod interrupt;
 #[cfg(feature = "buses")]
 pub mod live;
@@ -48,6 +53,8 @@ mod meter;
 pub mod missing;
 #[cfg(feature = "buses")]
 pub mod node_text;
+#[cfg(target_os = "linux")]
+pub mod port_access;
 #[cfg(feature = "buses")]
 pub mod read_ahead;
 #[cfg(feature = "buses")]

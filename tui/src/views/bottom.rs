@@ -44,7 +44,7 @@ fn over(frame: &mut Frame<'_>, body: Rect, text: &str) {
 }
 
 /// Lines no longer than the width in characters; only longer words are split.
-fn wrapped(text: &str, width: usize) -> Vec<String> {
+pub fn wrapped(text: &str, width: usize) -> Vec<String> {
     let width = width.max(1);
     let mut lines = vec![String::new()];
     let mut room = width;

@@ -60,6 +60,7 @@ mod terminal;
 mod texts_from_outside;
 mod timing;
 mod trigger;
+mod tutorial;
 mod two_testers;
 mod unsent;
 mod virtual_canopen;

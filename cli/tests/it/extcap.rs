@@ -23,6 +23,7 @@ const PATIENCE: Duration = Duration::from_mins(1);
 
 fn cantap<'a>(arguments: impl IntoIterator<Item = &'a str>) -> Command {
     let mut command = Command::new(CANTAP);
+    command.env("XDG_CACHE_HOME", "/dev/null");
     command.args(arguments).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
     command
 }

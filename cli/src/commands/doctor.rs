@@ -1,5 +1,6 @@
 //! `cantap doctor`: what is the matter with a port, a board or a bus, and what to do next.
 
+use std::fmt::Write as _;
 use std::io::Write;
 use std::process::ExitCode;
 use std::time::Duration;
@@ -93,7 +94,8 @@ fn text(check: &Check) -> String {
     let mut text = format!("{outcome:<9}{subject:<width$}{}", clean::line(&check.found), width = INDENT - 9);
     for (number, line) in check.next.iter().flat_map(|next| next.lines()).enumerate() {
         let label = if number == 0 { "next: " } else { "  " };
-        text.push_str(&format!("\n{:INDENT$}{label}{}", "", clean::line(line)));
+        // Writing to a text cannot fail.
+        let _ = write!(text, "\n{:INDENT$}{label}{}", "", clean::line(line));
     }
     text
 }

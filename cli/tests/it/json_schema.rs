@@ -58,8 +58,9 @@ fn cantap(directory: &Path, line: &str) -> (Option<i32>, String, String) {
 }
 
 /// A command line without `--json`; its exit code; the type of its object, or of each of its lines but the last, and of the last.
-pub const LINES: [(&str, i32, &[&str]); 69] = [
+pub const LINES: [(&str, i32, &[&str]); 70] = [
     ("list", 0, &["list"]),
+    ("list --network", 0, &["list"]),
     ("info -d virtual", 0, &["info"]),
     ("doctor -d virtual -t 200ms", 0, &["doctor"]),
     ("doctor -d virtual:bitrate=125k -b 500k -t 200ms", 3, &["doctor"]),

@@ -54,6 +54,8 @@ mod search_and_diff;
 mod selftest;
 mod send_signals;
 mod serve;
+mod serve_far;
+mod serve_lab;
 mod served;
 mod speaking_ends;
 mod terminal;

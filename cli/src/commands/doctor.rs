@@ -8,7 +8,7 @@ use std::time::Duration;
 use cantap_address::Address;
 use cantap_trace::clean;
 use cantap_work::channels::Channels;
-use cantap_work::doctor::{Check, Examination, Outcome, examine};
+use cantap_work::doctor::{Check, Examination, Verdict, examine};
 use cantap_work::interrupt;
 use cantap_work::requested_rate::RequestedRate;
 
@@ -66,7 +66,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         checks.push(check);
     })?;
     written?;
-    let problems = checks.iter().filter(|check| check.outcome == Outcome::Problem).count();
+    let problems = checks.iter().filter(|check| check.outcome == Verdict::Problem).count();
     if args.json {
         let device = args.device.as_ref().map(ToString::to_string);
         let object = serde_json::json!({ "device": device, "checks": checks, "problems": problems });
@@ -82,10 +82,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 /// A check in lines: what was found, then what to do.
 fn text(check: &Check) -> String {
     let outcome = match check.outcome {
-        Outcome::Ok => "ok",
-        Outcome::Note => "note",
-        Outcome::Problem => "PROBLEM",
-        Outcome::Skipped => "skipped",
+        Verdict::Ok => "ok",
+        Verdict::Note => "note",
+        Verdict::Problem => "PROBLEM",
+        Verdict::Skipped => "skipped",
     };
     let subject = match check.channel {
         Some(number) => format!("{} {number}", check.check),

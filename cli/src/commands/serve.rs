@@ -186,15 +186,17 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         Way::Encrypted(_) => address(text, PORT),
     });
     let tcp = tcp.transpose()?;
-    let other_doors = OtherDoors::of(args, addresses.len())?;
+    let other_doors = OtherDoors::of(
+        [&args.socketcand, &args.gvret, &args.lines, &args.metrics].map(Option::as_deref),
+        &args.tunnels,
+        addresses.len(),
+    )?;
     #[cfg(feature = "tls")]
     let permissions = args.permissions.as_deref();
     #[cfg(not(feature = "tls"))]
     let permissions = None;
-    let mut upkeep = Upkeep::new(permissions, args.audit.as_deref())?;
     // Before there is another thread.
-    #[cfg(unix)]
-    upkeep.catch_hang_ups(way.scheme() == "tls")?;
+    let mut upkeep = Upkeep::new(permissions, args.audit.as_deref(), way.scheme() == "tls")?;
     // From here on, Ctrl-C ends it properly.
     interrupt::watch()?;
     let mut boards = Vec::new();

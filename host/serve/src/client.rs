@@ -306,9 +306,9 @@ impl Client {
     }
 
     /// Checks that its permissions cover channels that it is about to configure.
-    fn must_have(&self, channels: &[Channel]) -> Result<(), Refusal> {
+    fn must_have(&self, these: &[Channel]) -> Result<(), Refusal> {
         self.must_be_permitted(Role::Configure, |permit, number| {
-            channels.iter().try_for_each(|channel| permit.channel(channel_number(number, *channel)))
+            these.iter().try_for_each(|channel| permit.channel(channel_number(number, *channel)))
         })
     }
 

@@ -10,7 +10,6 @@ use cantap_serve::cannelloni::{self, Tunnel};
 use cantap_serve::listen::Listening;
 use cantap_serve::{Board, Role, gvret, lines, metrics, socketcand};
 
-use super::Args;
 use super::doors::{Allowed, Door, TunnelArg, address, allow, loopback};
 use crate::stderr;
 use crate::usage_error::usage;
@@ -30,21 +29,25 @@ pub struct OtherDoors {
 }
 
 impl OtherDoors {
-    /// Those that a command line asks for.
-    pub fn of(args: &Args, boards: usize) -> anyhow::Result<Self> {
+    /// Those that a command line asks for, by the options of these names.
+    pub fn of(
+        [socketcand, gvret, lines, metrics]: [Option<&str>; 4],
+        tunnels: &[TunnelArg],
+        boards: usize,
+    ) -> anyhow::Result<Self> {
         let most = boards * CHANNELS;
-        if let Some(tunnel) = args.tunnels.iter().find(|tunnel| usize::from(tunnel.number) > most) {
+        if let Some(tunnel) = tunnels.iter().find(|tunnel| usize::from(tunnel.number) > most) {
             return Err(usage(format!(
                 "--cannelloni: there is no channel {}, only 1 to {most}",
                 tunnel.number
             )));
         }
         Ok(Self {
-            socketcand: args.socketcand.as_deref().map(|text| address(text, socketcand::PORT)).transpose()?,
-            gvret: args.gvret.as_deref().map(|text| address(text, gvret::PORT)).transpose()?,
-            tunnels: args.tunnels.clone(),
-            lines: args.lines.as_deref().map(|text| loopback(text, LINES_PORT)).transpose()?,
-            metrics: args.metrics.as_deref().map(|text| address(text, METRICS_PORT)).transpose()?,
+            socketcand: socketcand.map(|text| address(text, socketcand::PORT)).transpose()?,
+            gvret: gvret.map(|text| address(text, gvret::PORT)).transpose()?,
+            tunnels: tunnels.to_vec(),
+            lines: lines.map(|text| loopback(text, LINES_PORT)).transpose()?,
+            metrics: metrics.map(|text| address(text, METRICS_PORT)).transpose()?,
         })
     }
 

@@ -7,7 +7,7 @@ use cantap::autobaud::{Limits, Outcome as Measured};
 use cantap::wire::message::{ChannelConfig, Mode};
 use cantap_address::OpenDevice;
 
-use super::{BusFigures, Check, Examination, Outcome, channels, is_stopped};
+use super::check::{BusFigures, Check, Examination, Verdict, channels, is_stopped};
 use crate::bit_rate_search::{self, Search};
 use crate::bus_hints::{BusEvidence, BusHint, HintPlace};
 use crate::channel_options::ChannelOptions;
@@ -27,7 +27,7 @@ pub fn examine(device: &OpenDevice, examination: &Examination) -> Vec<Check> {
     let mut checks = Vec::new();
     for channel in channels(examination, device.hello()) {
         let check = if is_stopped() {
-            Check::new("bus", Outcome::Skipped, "stopped before it was listened to")
+            Check::new("bus", Verdict::Skipped, "stopped before it was listened to")
         } else {
             let bus = Bus { device, channel, time: examination.time };
             let rate = RequestedRate::of(&examination.bitrates, channel.number());
@@ -41,7 +41,7 @@ pub fn examine(device: &OpenDevice, examination: &Examination) -> Vec<Check> {
         |check: &Check| check.bus.as_ref().is_some_and(|bus| bus.hint == Some(BusHint::Silent.name()));
     if checks.iter().any(|check| check.bus.as_ref().is_some_and(|bus| bus.frames > 0)) {
         for check in checks.iter_mut().filter(|check| is_silent(check)) {
-            check.outcome = Outcome::Note;
+            check.outcome = Verdict::Note;
         }
     }
     checks
@@ -176,7 +176,7 @@ impl Bus<'_> {
                 let next = "listen longer: -t 10s".to_owned();
                 Check {
                     next: Some(next),
-                    ..received.check(Outcome::Note, Some(hint), "traffic is sparse: it began only later")
+                    ..received.check(Verdict::Note, Some(hint), "traffic is sparse: it began only later")
                 }
             }
             Some(_) => received.with(BusHint::Disturbed, &place),
@@ -229,7 +229,7 @@ impl Received {
         }
     }
 
-    fn check(&self, outcome: Outcome, hint: Option<BusHint>, found: impl Into<String>) -> Check {
+    fn check(&self, outcome: Verdict, hint: Option<BusHint>, found: impl Into<String>) -> Check {
         Check { bus: Some(self.figures(hint)), ..Check::new("bus", outcome, found) }
     }
 
@@ -243,7 +243,7 @@ impl Received {
             count => format!("{count} errors ({})", self.evidence.errors_text()),
         };
         let text = format!("{} frames at {} bit/s{load}, {errors}", self.evidence.frames(), self.bitrate_bps);
-        self.check(Outcome::Ok, None, text)
+        self.check(Verdict::Ok, None, text)
     }
 
     fn with(&self, hint: BusHint, place: &HintPlace<'_>) -> Check {
@@ -254,7 +254,7 @@ impl Received {
             }
         };
         let found = format!("at {} bit/s {}{figures}", self.bitrate_bps, hint.meaning());
-        Check { next: Some(hint.next_step(place)), ..self.check(Outcome::Problem, Some(hint), found) }
+        Check { next: Some(hint.next_step(place)), ..self.check(Verdict::Problem, Some(hint), found) }
     }
 }
 

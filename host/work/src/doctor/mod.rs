@@ -2,101 +2,19 @@
 //! nothing acknowledged.
 
 mod bus;
+mod check;
 mod port;
 
-use std::time::Duration;
-
-use cantap::Channel;
 use cantap::wire::message::{Failures, Hello, capability};
-use cantap_address::{Address, OpenDevice};
+use cantap_address::OpenDevice;
 
+pub use self::check::{BusFigures, Check, Examination, Verdict};
+use crate::advice;
 use crate::boards::{BoardsError, the_one_connected};
-use crate::channels::Channels;
-use crate::requested_rate::RequestedRate;
-use crate::{advice, interrupt};
 
 /// Below this, the chip's supply of 3.3 V is too low, in millivolts: the firmware's brown-out reset is at 2.7 V, and transceivers need
 /// 3.0 V.
 const LEAST_SUPPLY_MV: u16 = 3_000;
-
-/// What to examine, and how.
-#[derive(Clone, Debug)]
-pub struct Examination {
-    /// The device; without one, the board that is connected.
-    pub address: Option<Address>,
-    /// Its channels.
-    pub channels: Channels,
-    /// Bit rates; a channel without one uses what is known of its bus, what is saved on the device, or what is found by listening.
-    pub bitrates: Vec<RequestedRate>,
-    /// How long to listen to each channel.
-    pub time: Duration,
-}
-
-/// How a check ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Outcome {
-    /// As it should be.
-    Ok,
-    /// Worth knowing, and often as it should be.
-    Note,
-    /// Something is the matter.
-    Problem,
-    /// It could not be examined.
-    Skipped,
-}
-
-/// What was examined, and what was found.
-#[derive(Clone, Debug, PartialEq, serde::Serialize)]
-pub struct Check {
-    /// `port`, `rights`, `in-use`, `modem-manager`, `device`, `firmware`, `supply` or `bus`.
-    pub check: &'static str,
-    /// Of a `bus`: the channel's number, from 1.
-    pub channel: Option<u8>,
-    /// How it ended.
-    pub outcome: Outcome,
-    /// What was found, without a full stop.
-    pub found: String,
-    /// What to do next; every problem has it.
-    pub next: Option<String>,
-    /// Of a bus that was listened to.
-    pub bus: Option<BusFigures>,
-}
-
-/// What was received while listening to a bus.
-#[derive(Clone, Debug, PartialEq, serde::Serialize)]
-pub struct BusFigures {
-    /// At this bit rate, in bit/s; `None` if none was found.
-    pub bitrate_bps: Option<u32>,
-    /// Frames, including lost ones.
-    pub frames: u64,
-    /// Bus errors.
-    pub bus_errors: u64,
-    /// The name of a [`crate::bus_hints::BusHint`].
-    pub hint: Option<&'static str>,
-}
-
-impl Check {
-    fn new(check: &'static str, outcome: Outcome, found: impl Into<String>) -> Self {
-        Self { check, channel: None, outcome, found: found.into(), next: None, bus: None }
-    }
-
-    fn ok(check: &'static str, found: impl Into<String>) -> Self {
-        Self::new(check, Outcome::Ok, found)
-    }
-
-    fn problem(check: &'static str, found: impl Into<String>, next: impl Into<String>) -> Self {
-        Self { next: Some(next.into()), ..Self::new(check, Outcome::Problem, found) }
-    }
-
-    fn note(check: &'static str, found: impl Into<String>, next: impl Into<String>) -> Self {
-        Self { outcome: Outcome::Note, ..Self::problem(check, found, next) }
-    }
-
-    fn on(self, channel: u8) -> Self {
-        Self { channel: Some(channel), ..self }
-    }
-}
 
 /// Examines, and shows each check as soon as it is done. An error says that it cannot be examined at all, such as several boards of which
 /// none was named.
@@ -115,7 +33,7 @@ pub fn examine(examination: &Examination, show: &mut dyn FnMut(Check)) -> Result
     if let Some(port) = address.serial_port()
         && !port::examine(port, show)
     {
-        show(Check::new("device", Outcome::Skipped, "its port cannot be opened"));
+        show(Check::new("device", Verdict::Skipped, "its port cannot be opened"));
         return Ok(());
     }
     let device = match address.open() {
@@ -189,21 +107,10 @@ fn is_older(hello: &Hello, program: &str) -> bool {
     hello.capabilities & capability::ADAPTER == 0 && [hello.firmware[0], hello.firmware[1]] < program
 }
 
-/// Whether the user wants it to end.
-fn is_stopped() -> bool {
-    interrupt::requested()
-}
-
-/// The channels of a device that are to be examined.
-fn channels<'a>(examination: &'a Examination, hello: &Hello) -> impl Iterator<Item = Channel> + use<'a> {
-    let count = hello.channels;
-    Channel::ALL
-        .into_iter()
-        .filter(move |channel| channel.number() <= count && examination.channels.has(channel.number()))
-}
-
 #[cfg(test)]
 mod tests {
+    use cantap_address::Address;
+
     use super::*;
 
     #[test]
@@ -224,10 +131,10 @@ mod tests {
         assert_eq!(of_failures("a board", device.hello(), &failures(0)), Check::ok("device", "a board"));
         let failed = of_failures("a board", device.hello(), &failures(2));
         assert!(
-            failed.outcome == Outcome::Note && failed.found.ends_with("the last time: panicked"),
+            failed.outcome == Verdict::Note && failed.found.ends_with("the last time: panicked"),
             "{failed:?}"
         );
         let adapter = Hello { capabilities: capability::ADAPTER, ..device.hello().clone() };
-        assert_eq!(of_failures("can0", &adapter, &failures(2)).outcome, Outcome::Ok);
+        assert_eq!(of_failures("can0", &adapter, &failures(2)).outcome, Verdict::Ok);
     }
 }

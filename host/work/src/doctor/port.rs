@@ -3,7 +3,7 @@
 use cantap::DeviceError;
 use cantap_address::{Address, LinkError};
 
-use super::Check;
+use super::check::Check;
 use crate::advice;
 
 /// For when nothing better is known.
@@ -204,7 +204,7 @@ fn forbidden(address: &str) -> Check {
 
 #[cfg(all(test, target_os = "linux"))]
 mod tests {
-    use super::super::Outcome;
+    use super::super::check::Verdict;
     use super::*;
     use crate::port_access::{Holder, Holders};
 
@@ -218,7 +218,7 @@ mod tests {
     fn a_port_that_others_hold_is_not_opened_and_they_are_named() {
         let named = |pid, name: &str| Holder { pid, name: name.to_owned() };
         let (may_open, checks) = shown(&Holders { seen: vec![named(7, "minicom")], hidden: 0 });
-        assert!(!may_open && checks[0].outcome == Outcome::Problem, "{checks:?}");
+        assert!(!may_open && checks[0].outcome == Verdict::Problem, "{checks:?}");
         assert_eq!(checks[0].found, "it is open in minicom, process 7");
         let (_, checks) = shown(&Holders { seen: vec![named(7, "ModemManager")], hidden: 0 });
         assert!(checks[0].next.as_ref().unwrap().contains(r#"ENV{ID_MM_DEVICE_IGNORE}="1""#), "{checks:?}");
@@ -238,7 +238,7 @@ mod tests {
         // Nobody is to join root's group.
         let next = of_group("/dev/ttyACM0", "root", false).next.unwrap();
         assert!(next.starts_with("write these two lines"), "{next}");
-        assert_eq!(of_modem_manager(true).outcome, Outcome::Ok);
-        assert_eq!(of_modem_manager(false).outcome, Outcome::Note);
+        assert_eq!(of_modem_manager(true).outcome, Verdict::Ok);
+        assert_eq!(of_modem_manager(false).outcome, Verdict::Note);
     }
 }

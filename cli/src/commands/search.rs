@@ -282,6 +282,7 @@ fn describe(event: &TraceEvent) -> String {
         TraceEvent::BusError { kind: None, .. } => "bus error".to_owned(),
         TraceEvent::ErrorsSuppressed { count } => format!("{count} more bus errors"),
         TraceEvent::State { state, .. } => format!("controller: {}", state.name()),
+        TraceEvent::Lost { count: 0, at_least: true, .. } => "an unknown number of frames lost".to_owned(),
         TraceEvent::Lost { count, at_least: true, .. } => format!("at least {count} frames lost"),
         TraceEvent::Lost { count, .. } => format!("{count} frames lost"),
         TraceEvent::TransmitFailed { reason, .. } => format!("not sent: {}", failure_text(*reason)),

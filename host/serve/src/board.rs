@@ -159,6 +159,7 @@ impl Board {
             clients: state.clients.len() as u64,
             places: self.shared.settings.most_clients as u64,
             refused: self.shared.refused.load(Ordering::Relaxed),
+            counts_losses: state.hello.as_ref().is_none_or(Hello::counts_losses),
             channels: state.totals(),
             bitrates_bps: state.open.map(|open| open.map(|config| config.timing.bitrate_bps(clock_hz))),
         }

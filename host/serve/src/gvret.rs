@@ -371,6 +371,9 @@ impl Connection {
                 lock(&self.own[number]).failed(*tag);
                 lock(&self.left_out).count("failed transmissions", 1);
             }
+            event if *event == TraceEvent::UNCOUNTED => {
+                lock(&self.left_out).count("that losses are not counted", 1);
+            }
             TraceEvent::Lost { count, .. } => {
                 lock(&self.left_out).count("lost frames, or more", (*count).max(1));
             }

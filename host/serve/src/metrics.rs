@@ -167,12 +167,16 @@ fn text(boards: &[(String, Weak<Board>)]) -> String {
         ("link", |of| of.lost_link),
         ("host", |of| of.lost_host),
     ];
-    let help = "Frames lost, by stage; those of the stage host are the sum over the clients that lost them.";
+    let help = "Frames lost, by stage; those of the stage host are the sum over the clients that lost them; an adapter that does not count its losses has no controller stage.";
     family("cantap_frames_lost_total", "counter", help, &mut |row| {
         for (number, (board, metrics)) in all.iter().enumerate() {
             for (channel, totals) in Channel::ALL.into_iter().zip(&metrics.channels) {
                 let channel = channel_number(number, channel);
                 for (stage, of) in stages {
+                    // What nobody counts has no figure.
+                    if stage == "controller" && !metrics.counts_losses {
+                        continue;
+                    }
                     row(&format!("board=\"{board}\",channel=\"{channel}\",stage=\"{stage}\""), of(totals));
                 }
             }

@@ -136,9 +136,11 @@ impl Capture<'_> {
         let copied = self.copy();
         let counters = self.live.lines().lines().map(Line::counters);
         let lost = counters.map(|counters| Losses::of(&counters)).fold(Losses::default(), Losses::plus);
+        // Wireshark shows these messages when the capture has ended.
         if lost.total() > 0 || lost.off_bus > 0 {
-            // Wireshark shows these messages when the capture has ended.
             eprintln!("cantap: frames were lost, which is marked where they are missing: {}", lost.line());
+        } else if !lost.is_none() {
+            eprintln!("cantap: frames may be missing that nobody counted: {}", lost.line());
         }
         let finished = self.writer.finish().map(|_| ());
         copied?;

@@ -270,6 +270,7 @@ mod tests {
         let mut condition = Condition::new("error or lost", &Decoder::new(Vec::new())).unwrap();
         assert!(condition.holds(&record(TraceEvent::BusError { kind: None, counters: None })));
         assert!(condition.holds(&record(TraceEvent::Lost { stage: None, count: 1, at_least: false })));
+        assert!(!condition.holds(&record(TraceEvent::UNCOUNTED)));
         assert!(!condition.holds(&frame("001#")));
     }
 

@@ -65,12 +65,17 @@ pub(super) fn part(name: &str) -> Option<Part> {
     })
 }
 
+/// That a device does not count its losses is none.
+fn is_loss(event: &TraceEvent) -> bool {
+    matches!(event, TraceEvent::Lost { .. }) && *event != TraceEvent::UNCOUNTED
+}
+
 pub(super) fn part_of(part: Part, record: &TraceRecord) -> Option<f64> {
     let flag = |flag: bool| Some(f64::from(u8::from(flag)));
     match part {
         Part::Channel => return Some(record.channel.into()),
         Part::Error => return flag(matches!(record.event, TraceEvent::BusError { .. })),
-        Part::Lost => return flag(matches!(record.event, TraceEvent::Lost { .. })),
+        Part::Lost => return flag(is_loss(&record.event)),
         _ => {}
     }
     let frame = record.frame()?;

@@ -58,7 +58,7 @@ fn cantap(directory: &Path, line: &str) -> (Option<i32>, String, String) {
 }
 
 /// A command line without `--json`; its exit code; the type of its object, or of each of its lines but the last, and of the last.
-pub const LINES: [(&str, i32, &[&str]); 70] = [
+pub const LINES: [(&str, i32, &[&str]); 71] = [
     ("list", 0, &["list"]),
     ("list --network", 0, &["list"]),
     ("info -d virtual", 0, &["info"]),
@@ -96,6 +96,7 @@ pub const LINES: [(&str, i32, &[&str]); 70] = [
     ("convert a.log out.csv", 0, &["convert"]),
     ("convert a.asc out.log", 0, &["convert"]),
     ("align b.log b.log", 0, &["align"]),
+    ("compare-adapters -d candump:b.log -d candump:b.log -b 500k -t 2s", 0, &["compare-adapters"]),
     ("decode a.log --db car.dbc", 0, &["decode", "decode_end"]),
     ("decode a.log --db car.dbc --details", 0, &["decode", "decode_end"]),
     ("search a.log --db car.dbc --id 100 -C 2", 0, &["search", "search_end"]),

@@ -48,6 +48,14 @@ pub struct Alignment {
     tolerance_ns: i64,
 }
 
+impl Alignment {
+    /// How far apart the stamps of a frame may be, in nanoseconds. One whose stamps are farther apart counts as two, each of which the
+    /// other trace lacks.
+    pub const fn tolerance_ns(&self) -> i64 {
+        self.tolerance_ns
+    }
+}
+
 /// Why two traces cannot be aligned.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]

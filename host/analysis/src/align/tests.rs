@@ -220,3 +220,45 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn frames_in_another_order_are_counted_and_are_not_missing() {
+    let first = bus(2_000, 7);
+    let mut second = first.clone();
+    // Each changes places with its neighbour: two pairs, far apart.
+    for at in [500, 1_500] {
+        let (one, next) = (second[at].event, second[at + 1].event);
+        (second[at].event, second[at + 1].event) = (next, one);
+    }
+    let alignment = align(&sketch(&first), &sketch(&second)).unwrap();
+    let mut verifier = Verifier::new(&alignment);
+    for (a, b) in first.iter().zip(&second) {
+        verifier.first(a);
+        verifier.second(b);
+    }
+    let agreement = verifier.finish();
+    assert_eq!((agreement.out_of_order, agreement.only_first, agreement.only_second), (2, 0, 0));
+}
+
+#[test]
+fn upper_bounds_are_compared_only_where_that_is_asked_for() {
+    let late = |record: &TraceRecord| {
+        let mut record = *record;
+        if let TraceEvent::Frame { late, .. } = &mut record.event {
+            *late = true;
+        }
+        record
+    };
+    let first = bus(1_000, 8);
+    let second: Vec<_> = first.iter().map(late).collect();
+    let alignment = align(&sketch(&first), &sketch(&second)).unwrap();
+    let worst = |mut verifier: Verifier| {
+        for (a, b) in first.iter().zip(&second) {
+            verifier.first(a);
+            verifier.second(b);
+        }
+        verifier.finish().worst_ns
+    };
+    assert_eq!(worst(Verifier::new(&alignment)), 0);
+    assert_eq!(worst(Verifier::new(&alignment).with_bounds()), 1);
+}

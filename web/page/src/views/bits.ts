@@ -71,7 +71,7 @@ export class BitsView implements View {
     addEventListener('pointerup', () => (this.#dragging = false));
     app.on('identifier', () => this.#ask());
     app.on('messages', () => this.#ask());
-    app.on('summary', () => {
+    app.on('steady', () => {
       if (this.#visible) this.#picker.refresh();
       this.#ask();
     });

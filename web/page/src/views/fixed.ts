@@ -100,7 +100,7 @@ export class FixedView implements View {
     app.on('messages', () => this.#ask());
     app.on('cursors', () => {
       if (!this.#visible || app.cursorA === null) return;
-      this.#at.value = String((app.cursorA / app.whole().to) * 1000);
+      this.#at.value = String(((app.cursorA - app.whole().from) / (app.whole().to - app.whole().from)) * 1000);
       this.#ask();
     });
     commands.add(
@@ -124,7 +124,8 @@ export class FixedView implements View {
   #ask(): void {
     if (!this.#visible || !this.app.summary) return;
     const share = Number(this.#at.value) / 1000;
-    this.#asking.ask(share >= 1 ? Infinity : share * this.app.whole().to);
+    const { from, to } = this.app.whole();
+    this.#asking.ask(share >= 1 ? Infinity : from + share * (to - from));
   }
 
   #arrange(): void {

@@ -35,7 +35,7 @@ export class StatisticsView implements View {
     const bar = el('div', { class: 'bar' }, button('↑', () => this.#picker.step(-1), { attrs: { 'aria-label': 'Previous identifier' } }), button('↓', () => this.#picker.step(1), { attrs: { 'aria-label': 'Next identifier' } }), this.#picker.element);
     this.element = el('section', { class: 'view view-statistics', attrs: { 'aria-label': 'Periods' } }, bar, el('div', { class: 'page-scroll', attrs: { tabindex: 0, role: 'group', 'aria-label': 'Figures' } }, this.#figures, this.#canvas, this.#table));
     app.on('identifier', () => this.#ask());
-    app.on('summary', () => {
+    app.on('steady', () => {
       if (this.#visible) this.#picker.refresh();
       this.#ask();
     });

@@ -273,6 +273,8 @@ impl Commands {
                 if let Err(refusal) = self.leave(channel, waited, board)? {
                     return Some(Err(refusal));
                 }
+                // A reset that was given up may have ended since, and have taken the filters with it.
+                self.restore_filters(channel, board);
                 board.with_capture(|capture, _, clock| capture.open(channel, config, clock));
                 board.control(channel).start(&config);
                 self.settings[channel.index()].config = Some(config);

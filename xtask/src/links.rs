@@ -109,7 +109,8 @@ fn pages_under(folder: &Path) -> Result<Vec<PathBuf>> {
     for entry in fs::read_dir(folder)? {
         let entry = entry?;
         let (name, path) = (entry.file_name(), entry.path().canonicalize()?);
-        let is_left_out = name.as_encoded_bytes().starts_with(b".") || name == "target";
+        let is_left_out =
+            name.as_encoded_bytes().starts_with(b".") || name == "target" || name == "node_modules";
         if entry.file_type()?.is_dir() && !is_left_out {
             pages.extend(pages_under(&path)?);
         } else if path.extension().is_some_and(|extension| extension == "md") {

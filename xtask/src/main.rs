@@ -21,6 +21,7 @@ mod kernel;
 #[cfg(feature = "check")]
 mod links;
 mod machine;
+mod meanwhile;
 mod metadata;
 mod mutants;
 mod outcome;

@@ -53,10 +53,12 @@ pub enum Step {
     Kernel,
     /// The package for Python: wheel, types, tests, python-can's own tests, notebooks.
     Python,
-    /// The page of `cantap report`: it builds, is small enough, and its tests pass in a browser.
+    /// The page of `cantap report` in a browser: its tests.
     Web,
     /// The command that a newcomer runs first: both channels at full load, nothing lost.
     Demo,
+    /// The page itself, without its tests.
+    Page,
     /// The crates as they would be published: each packs.
     Package,
 }
@@ -65,6 +67,23 @@ impl Step {
     /// What `cargo xtask test` runs.
     pub const TEST: [Self; 7] =
         [Self::Fmt, Self::Typos, Self::Circles, Self::Links, Self::Clippy, Self::Firmware, Self::Tests];
+
+    /// What `cargo xtask ci` runs beside the others, at the lowest priority: these steps only compile, and nothing in them waits or looks
+    /// at a clock. The first ones have target folders of their own, so that they keep nobody waiting.
+    pub const MEANWHILE: [Self; 12] = [
+        Self::Page,
+        Self::Wasm,
+        Self::Systems,
+        Self::Fuzz,
+        Self::Dependencies,
+        Self::OldestCompiler,
+        Self::Features,
+        Self::Doc,
+        Self::PublicApi,
+        Self::ClippyFirmware,
+        Self::Reproducible,
+        Self::Package,
+    ];
 
     /// Runs it for these boards; the first is the one that most tests use.
     pub fn run(self, machine: &Machine, boards: &[Board]) -> Result<Outcome> {
@@ -110,6 +129,7 @@ impl Step {
             }
             Step::Python => return python::check(shell, machine.peers()?),
             Step::Web => return web::check(machine),
+            Step::Page => return web::builds(machine),
             Step::Demo => cmd!(shell, "cargo demo --time 3s").run()?,
             Step::Package => package::check(shell)?,
         }

@@ -3,11 +3,12 @@
 
 use std::time::{Duration, Instant};
 
-use anyhow::Result;
+use anyhow::{Result, ensure};
 use clap::ValueEnum;
 
 use crate::board::Board;
 use crate::machine::Machine;
+use crate::meanwhile::Meanwhile;
 use crate::outcome::Outcome;
 use crate::steps::Step;
 
@@ -24,19 +25,26 @@ pub struct Args {
 
 /// What a change needs: the first steps, with the default board's firmware.
 pub fn run(args: &Args) -> Result<()> {
-    run_steps(args, &Step::TEST, &Board::ALL[..1])
+    let steps = if args.only.is_empty() { &Step::TEST } else { &args.only[..] };
+    run_steps(args, steps, &[], &Board::ALL[..1])
 }
 
 /// Every step, with every board's firmware.
 pub fn ci(args: &Args) -> Result<()> {
-    run_steps(args, Step::value_variants(), &Board::ALL)
+    if !args.only.is_empty() {
+        return run_steps(args, &args.only, &[], &Board::ALL);
+    }
+    let steps: Vec<Step> =
+        Step::value_variants().iter().copied().filter(|step| !Step::MEANWHILE.contains(step)).collect();
+    run_steps(args, &steps, &Step::MEANWHILE, &Board::ALL)
 }
 
-/// Runs the steps one after the other and stops at the first that fails.
-fn run_steps(args: &Args, all: &[Step], boards: &[Board]) -> Result<()> {
-    let steps = if args.only.is_empty() { all } else { &args.only };
+/// Runs the steps one after the other, and others meanwhile; stops at the first that fails.
+fn run_steps(args: &Args, steps: &[Step], others: &[Step], boards: &[Board]) -> Result<()> {
     let machine = Machine::new()?;
     let mut done: Vec<(String, Outcome, Duration)> = Vec::new();
+    let whole = Instant::now();
+    let mut meanwhile = if others.is_empty() { None } else { Some(Meanwhile::begin(others)?) };
     for step in steps {
         let name = step.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned());
         println!("\n--- {name}");
@@ -49,9 +57,23 @@ fn run_steps(args: &Args, all: &[Step], boards: &[Board]) -> Result<()> {
                 return Err(error);
             }
         }
+        if let Some(meanwhile) = &mut meanwhile
+            && meanwhile.has_failed()?
+        {
+            break;
+        }
     }
     println!();
-    report(&done);
+    if let Some(meanwhile) = meanwhile {
+        println!("--- meanwhile");
+        let status = meanwhile.end()?;
+        println!("\n--- beside them");
+        report(&done);
+        ensure!(status.success(), "a step that ran meanwhile failed; see above");
+    } else {
+        report(&done);
+    }
+    println!("{:<16}    {:>6.1} s by the clock", "all", whole.elapsed().as_secs_f64());
     if args.timings {
         table(&machine, &done);
     }

@@ -26,6 +26,11 @@ pub fn run(shell: &Shell, peers: Option<&Peers>, boards: &[Board]) -> Result<()>
             .env("CANTAP_REQUIRE_PEERS", "1")
             .env("CANTAP_WITHOUT_PEERS", peers.left_out.join(" "));
     }
+    if std::env::var_os("RUST_TEST_THREADS").is_none() {
+        // Most tests wait for devices and programs; those that fill a processor take turns.
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        test = test.env("RUST_TEST_THREADS", (2 * cores).to_string());
+    }
     if Board::ALL[0].elf().exists() {
         test = test
             .args(["--", "--include-ignored"])

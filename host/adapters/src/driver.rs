@@ -203,6 +203,19 @@ pub enum Incoming {
 }
 
 impl Incoming {
+    /// Where and when it was.
+    pub const fn place_mut(&mut self) -> (Channel, &mut At) {
+        match self {
+            Self::Received { channel, at, .. }
+            | Self::Sent { channel, at, .. }
+            | Self::NotSent { channel, at, .. }
+            | Self::BusError { channel, at, .. }
+            | Self::BusErrors { channel, at, .. }
+            | Self::State { channel, at, .. }
+            | Self::Lost { channel, at, .. } => (*channel, at),
+        }
+    }
+
     /// What a trace or an error frame reports; `None` for what has no place here.
     pub fn of(event: &TraceEvent, channel: Channel, at: At) -> Option<Self> {
         Some(match *event {

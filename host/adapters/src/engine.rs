@@ -22,6 +22,7 @@ use heapless::String;
 
 use crate::board::{AdapterBoard, Filters, HostClock, NoChip, NoMeter, PipePort};
 use crate::driver::{At, Driver, Incoming};
+use crate::in_order::InOrder;
 use crate::mailboxes::{ControlSide, Mailboxes, Phase, TrafficSide};
 
 /// Bytes on their way to the host, and to the device.
@@ -133,6 +134,7 @@ fn run(driver: Box<dyn Driver>, port: PipePort, reason: &Reason) {
         port,
         reports: VecDeque::new(),
         fresh: Vec::new(),
+        order: InOrder::default(),
         unreported: VecDeque::new(),
         leaving_since: [None; CHANNELS],
         closed: [false; CHANNELS],
@@ -150,6 +152,7 @@ struct Engine<'q> {
     reports: VecDeque<Incoming>,
     /// The driver's last reports, for a moment.
     fresh: Vec<Incoming>,
+    order: InOrder,
     /// Events that found no room in the record queue.
     unreported: VecDeque<(Event, u64)>,
     /// Since when a channel is being closed.
@@ -221,6 +224,7 @@ impl Engine<'_> {
     /// Lets the driver report, for up to `wait`. Returns why it has ended, if it has.
     fn ask_driver(&mut self, wait: Duration) -> Option<std::string::String> {
         let ended = self.board.driver.poll(wait, &mut self.fresh).err();
+        self.order.correct(&mut self.fresh);
         self.reports.extend(self.fresh.drain(..));
         self.take_reports();
         ended

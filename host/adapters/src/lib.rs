@@ -21,6 +21,7 @@ mod engine;
 mod error_frames;
 mod gs_usb;
 mod gvret;
+mod in_order;
 mod interface_name;
 mod line;
 mod mailboxes;

@@ -248,14 +248,19 @@ impl Control for FakeControl {
 
 #[derive(Default)]
 pub struct FakeFilters {
+    /// Whatever was written, changed or not.
     pub written: Vec<Layout>,
+    /// How often that changed something; the banks let everything pass at first.
+    pub changes: usize,
     /// A controller's reset has cleared the banks.
     pub cleared: bool,
 }
 
 impl FilterBanks for FakeFilters {
     fn write(&mut self, layout: &Layout) -> bool {
-        let differed = std::mem::take(&mut self.cleared) || self.written.last() != Some(layout);
+        let was = self.written.last().cloned().unwrap_or_else(Layout::open);
+        let differed = std::mem::take(&mut self.cleared) || was != *layout;
+        self.changes += usize::from(differed);
         self.written.push(layout.clone());
         differed
     }

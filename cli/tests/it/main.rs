@@ -58,6 +58,7 @@ mod texts_from_outside;
 mod timing;
 mod trigger;
 mod two_testers;
+mod ui;
 mod unsent;
 mod virtual_canopen;
 mod vocabulary;

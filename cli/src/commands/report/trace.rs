@@ -9,7 +9,7 @@ use cantap_formats::{Format, ReadOptions, WriteOptions, create_stream_writer, op
 use cantap_trace::TraceRecord;
 use cantap_trace::diff::Profile;
 
-use super::page::Carried;
+use crate::page::Carried;
 
 /// How many records are written between two looks at the size.
 const BETWEEN_LOOKS: u64 = 4096;

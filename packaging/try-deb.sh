@@ -12,6 +12,7 @@ apt-get -q install -y --no-install-recommends "$1"
 cantap --version
 for file in /usr/lib/udev/rules.d/60-cantap.rules /usr/share/bash-completion/completions/cantap \
     /usr/share/zsh/vendor-completions/_cantap /usr/share/fish/vendor_completions.d/cantap.fish \
+    /usr/lib/systemd/user/cantap.socket /usr/lib/systemd/user/cantap.service /usr/lib/systemd/system/cantap-lab.service \
     /usr/share/doc/cantap/copyright /usr/share/doc/cantap/THIRD-PARTY.txt; do
     test -s "$file" || { echo "missing: $file"; exit 1; }
 done

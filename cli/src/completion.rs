@@ -128,7 +128,8 @@ fn numbers() -> impl Iterator<Item = (String, String)> {
 }
 
 fn offer_bit_rates(current: &OsStr) -> Vec<CompletionCandidate> {
-    let rates = ["1M", "800k", "500k", "250k", "125k", "100k", "83.333k", "50k", "33.333k", "20k", "10k"];
+    let rates =
+        ["auto", "1M", "800k", "500k", "250k", "125k", "100k", "83.333k", "50k", "33.333k", "20k", "10k"];
     beginning(current, rates.map(|rate| (rate, "")))
 }
 

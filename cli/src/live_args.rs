@@ -5,10 +5,10 @@ use std::time::Duration;
 
 use cantap_address::Address;
 use cantap_work::boards::Boards;
-use cantap_work::channel_bitrate::ChannelBitrate;
 use cantap_work::channel_options::ChannelOptions;
 use cantap_work::channels::Channels;
 use cantap_work::live::LiveRecords;
+use cantap_work::requested_rate::RequestedRate;
 
 use crate::{args, completion, stderr};
 
@@ -22,10 +22,10 @@ pub struct LiveArgs {
     /// The device's channels to listen to: 1, 2, several as 1,3, or both, which means all.
     #[arg(short, long, default_value = "both", value_parser = args::channels, add = completion::channels())]
     channel: Channels,
-    /// Bit rate of the bus in bit/s: 500000, 500k, 1M; with a channel before it (2:250k), only for that channel. Can
-    /// be repeated. Without it, the one saved on the device.
+    /// Bit rate of the bus in bit/s: 500000, 500k, 1M; or auto, to find it by listening; with a channel before it (2:250k), only
+    /// for that channel. Can be repeated. Without it, the one saved on the device.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", add = completion::bit_rates())]
-    bitrates: Vec<ChannelBitrate>,
+    bitrates: Vec<RequestedRate>,
     /// How long to listen, as 10, 500ms or 2m.
     #[arg(short, long, value_parser = args::positive_duration)]
     time: Option<Duration>,
@@ -51,12 +51,15 @@ impl LiveArgs {
 /// Only listens, at these bit rates or otherwise the saved ones, until Ctrl-C or the end of the time.
 pub fn listen(
     boards: &Boards,
-    bitrates: &[ChannelBitrate],
+    bitrates: &[RequestedRate],
     time: Option<Duration>,
 ) -> anyhow::Result<LiveRecords> {
     let open = ChannelOptions::listening(bitrates.to_vec());
     LiveRecords::open(boards, &open, &[], time, &stderr::reporter())
 }
+
+/// The answer to `-b auto` for a trace.
+pub const AUTO_NEEDS_A_DEVICE: &str = "-b auto listens to a device, and a trace cannot be listened to; give the bus's bit rate, such as -b 500k";
 
 /// An error about a device that nobody named: it says why one is needed.
 pub fn for_listening(error: anyhow::Error, given: &[Address], without: &str) -> anyhow::Error {

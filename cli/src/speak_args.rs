@@ -7,9 +7,9 @@ use cantap::wire::message::Mode;
 use cantap_address::{Address, OpenDevice};
 use cantap_protocols::{Assembler, Event};
 use cantap_work::boards::the_one_connected;
-use cantap_work::channel_bitrate::ChannelBitrate;
 use cantap_work::channel_options::ChannelOptions;
 use cantap_work::interrupt;
+use cantap_work::requested_rate::RequestedRate;
 use cantap_work::speaking::Speaking;
 
 use crate::commands::conversations;
@@ -24,9 +24,10 @@ pub struct SpeakArgs {
     /// The channel to talk on: 1 or 2.
     #[arg(short, long, global = true, default_value = "1", value_parser = args::channel, add = completion::channels())]
     channel: Channel,
-    /// Bit rate of the bus in bit/s: 500000, 500k, 1M. Without it, the one saved on the device.
+    /// Bit rate of the bus in bit/s: 500000, 500k, 1M; or auto, to find it by listening before anything is sent. Without it, the one saved on
+    /// the device.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", global = true, add = completion::bit_rates())]
-    bitrates: Vec<ChannelBitrate>,
+    bitrates: Vec<RequestedRate>,
     /// Print one JSON object per line.
     #[arg(long, global = true)]
     pub json: bool,

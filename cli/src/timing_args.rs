@@ -3,7 +3,7 @@
 use cantap::bit_timing::{self, TimingError};
 use cantap::wire::BitTiming;
 use cantap_work::advice;
-use cantap_work::channel_bitrate::ChannelBitrate;
+use cantap_work::requested_rate::RequestedRate;
 use cantap_work::timing_options::TimingOptions;
 
 use crate::completion;
@@ -11,10 +11,10 @@ use crate::completion;
 /// A bit timing on the command line; commands flatten this into their arguments.
 #[derive(clap::Args, Clone, Debug, Default)]
 pub struct TimingArgs {
-    /// Bit rate in bit/s: 500000, 500k, 1M; with a channel before it (2:250k), only for that channel. Can be
-    /// repeated.
+    /// Bit rate in bit/s: 500000, 500k, 1M; or auto, to find it by listening; with a channel before it (2:250k), only for that
+    /// channel. Can be repeated.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", add = completion::bit_rates())]
-    bitrates: Vec<ChannelBitrate>,
+    bitrates: Vec<RequestedRate>,
     #[command(flatten)]
     preferences: Preferences,
     /// The whole timing, in quanta: prescaler, PROP+PS1, PS2, jump width.

@@ -8,6 +8,7 @@ use cantap_address::Address;
 
 use cantap_work::channel_bitrate::ChannelBitrate;
 use cantap_work::channel_options::ChannelOptions;
+use cantap_work::requested_rate::RequestedRate;
 use cantap_work::timing_options::TimingOptions;
 
 /// Which devices, and how to take part in their buses.
@@ -28,7 +29,7 @@ impl Plan {
         for channel in plan.all_channels() {
             let rate = options.bitrate_of(channel);
             let rates = rate.map(|bitrate_bps| ChannelBitrate { channel: Some(channel), bitrate_bps });
-            plan.open.timing.bitrates.extend(rates);
+            plan.open.timing.bitrates.extend(rates.map(RequestedRate::from));
         }
         plan.choose_channels();
         plan
@@ -71,7 +72,7 @@ impl Plan {
     }
 
     /// Sets other bit rates, replacing any earlier timing. If a rate is for one channel, only that channel is opened.
-    pub fn set_bit_rates(&mut self, rates: Vec<ChannelBitrate>) {
+    pub fn set_bit_rates(&mut self, rates: Vec<RequestedRate>) {
         self.open.timing.set_bit_rates(rates);
         self.choose_channels();
     }
@@ -81,14 +82,15 @@ impl Plan {
         let rates = &self.open.timing.bitrates;
         self.channels = self
             .all_channels()
-            .filter(|channel| rates.is_empty() || ChannelBitrate::of(rates, *channel).is_some())
+            .filter(|channel| rates.is_empty() || RequestedRate::of(rates, *channel).is_some())
             .collect();
     }
 
     /// The statistics' options with this plan's bit rates, if it has any.
     pub fn options(&self, others: &cantap_analysis::stats::Options) -> cantap_analysis::stats::Options {
+        let known = self.open.timing.known();
         let rates = self.channels.iter().copied().filter_map(|number| {
-            let own = ChannelBitrate::of(&self.open.timing.bitrates, number);
+            let own = ChannelBitrate::of(&known, number);
             Some((number, own.or_else(|| others.bitrate_of(number))?))
         });
         cantap_analysis::stats::Options {

@@ -27,9 +27,10 @@ use crate::one_board::OneBoard;
 use crate::usage_error::usage;
 use crate::{args, stderr};
 use cantap_work::advice;
+use cantap_work::bus_hints::{BusHint, HintPlace};
 use cantap_work::interrupt;
 use cantap_work::live;
-use cantap_work::reception::{self, Reception};
+use cantap_work::reception::Reception;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -174,7 +175,9 @@ impl Bridge<'_> {
         let now = Instant::now();
         self.reception.take(records, now);
         for number in self.reception.news(now) {
-            stderr::warn(&reception::errors_only_text(number, &self.address, number));
+            let hint = self.reception.hint(number, false).unwrap_or(BusHint::WrongBitRate);
+            let place = HintPlace { number, device: &self.address, channel_there: number };
+            stderr::warn(&hint.sentence(&place));
         }
         Ok(())
     }

@@ -94,7 +94,7 @@ const FLUSH_EVERY: Duration = Duration::from_millis(200);
 fn needs_bit_rate(args: &Args, board: usize, boards: &Boards) -> anyhow::Result<bool> {
     let timing = args.open.options().timing.on_board(board);
     for channel in boards.channels_of(board) {
-        if timing.request(channel)?.is_none() {
+        if timing.request(channel)?.is_none() && !timing.is_auto(channel.number()) {
             return Ok(true);
         }
     }
@@ -130,6 +130,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             sink.omits_data.push(number);
         }
     }
+    // One that was left out has no figures.
+    channels.retain(|(number, _)| live.opened().any(|(opened, ..)| opened == *number));
     let filtered = live.filtered();
     let channels = channels
         .into_iter()
@@ -140,13 +142,19 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let trigger = sink.trigger.as_ref().map(TriggerSummary::of);
     let finished = sink.finish();
     let failed = end.is_err() || finished.is_err();
-    let channels = meters.channels.iter().map(|(number, meter)| ChannelSummary::of(*number, meter)).collect();
+    let of = |(number, meter): &(u8, Meter)| ChannelSummary::of(*number, meter, live.hint(*number));
+    let channels = meters.channels.iter().map(of).collect();
     let mut summary = Summary::of(seconds, channels, &live, &boards);
     summary.trigger = trigger;
     summary.frames_in_file = if failed { frames_in_file(args) } else { None };
     summary.tell(args.json, args.output.as_deref())?;
     end?;
     finished?;
+    for (number, _) in &meters.channels {
+        if let Some(hint) = live.hint_sentence(*number) {
+            stderr::warn(&hint);
+        }
+    }
     live.judge()?;
     Ok(ExitCode::SUCCESS)
 }

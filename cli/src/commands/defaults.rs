@@ -14,6 +14,7 @@ use crate::args;
 use crate::channel_args::ChannelArgs;
 use crate::completion;
 use crate::one_board::OneBoard;
+use crate::stderr;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -73,7 +74,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     match &args.action {
         Action::Save(save) => {
             let device = save.device.open()?;
-            save.open.options().configure(&device, save.channel.iter(), &save.filter)?;
+            save.open.options().configure(&device, save.channel.iter(), &save.filter, &stderr::reporter())?;
             device.save_defaults()?;
             writeln!(out, "saved on the device")?;
         }

@@ -30,7 +30,10 @@ const GROUPS: [(&str, &[&str]); 7] = [
     ("Send, ask", &["send", "replay", "gen", "run", "obd", "uds", "canopen", "j1939"]),
     (
         "Devices",
-        &["list", "info", "status", "defaults", "selftest", "identify", "reset", "update", "virtual", "demo"],
+        &[
+            "doctor", "list", "info", "status", "defaults", "selftest", "identify", "reset", "update",
+            "virtual", "demo",
+        ],
     ),
     ("Share with other programs", &["serve", "bridge", "extcap"]),
     ("More", &["help", "completions"]),

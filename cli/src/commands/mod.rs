@@ -15,6 +15,7 @@ pub mod db;
 pub mod decode;
 pub mod defaults;
 pub mod diff;
+pub mod doctor;
 pub mod extcap;
 pub mod r#gen;
 pub mod help;
@@ -95,6 +96,8 @@ pub enum Command {
     Demo(cantap_demo::Args),
     /// Describe a device.
     Info(info::Args),
+    /// Find out what is the matter with a port, a device or a bus, and what to do next.
+    Doctor(doctor::Args),
     /// List connected boards.
     List(list::Args),
     /// Run a virtual device behind a pseudo-terminal.
@@ -159,6 +162,7 @@ impl Command {
             Self::Decode(args) => decode::run(&args),
             Self::Demo(args) => cantap_demo::run(&args, &crate::trace_output::of_demo),
             Self::Info(args) => info::run(&args),
+            Self::Doctor(args) => doctor::run(&args),
             Self::List(args) => list::run(&args),
             #[cfg(unix)]
             Self::Virtual(args) => virtual_device::run(&args),

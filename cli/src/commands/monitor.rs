@@ -27,6 +27,7 @@ use crate::args;
 use crate::channel_args::ChannelArgs;
 use crate::completion;
 use crate::database_args::DatabaseArgs;
+use crate::live_args::AUTO_NEEDS_A_DEVICE;
 use crate::trace_output::{named, refuse_older};
 use crate::usage_error::usage;
 
@@ -115,7 +116,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let databases = load_databases(args, &devices, &profile, &mut report);
     let decoder = databases.decoder_reporting(&mut report);
     let open = channel_options(args, &profile, &mut report);
-    let options = ChannelBitrate::options(&open.timing.bitrates);
+    if file.is_some() && open.timing.has_auto() {
+        return Err(usage(AUTO_NEEDS_A_DEVICE));
+    }
+    let options = ChannelBitrate::options(&open.timing.known());
     let mut model = Model::new(Arc::new(decoder), options, args.history as usize * 1_000_000)?;
     let filters = filters(args, &profile, &mut report);
     model.history.set_filters(filters, None);

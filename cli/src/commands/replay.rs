@@ -16,6 +16,7 @@ use crate::channel_args::ChannelArgs;
 use crate::input::FollowArgs;
 use crate::one_board::OneBoard;
 use crate::print_sent::print_sent;
+use crate::stderr;
 use crate::usage_error::usage;
 use cantap_trace::grammar;
 use cantap_work::interrupt;
@@ -153,7 +154,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut bitrates_bps = [0; CHANNELS];
     let mut buses = Buses {
         device: &device,
-        closed: args.open.options().configs(&device, source.channels(), Mode::Normal)?,
+        closed: args.open.options().configs(&device, source.channels(), Mode::Normal, &stderr::reporter())?,
     };
     for (channel, config) in &buses.closed {
         bitrates_bps[channel.index()] = config.timing.bitrate_bps(device.hello().can_clock_hz);

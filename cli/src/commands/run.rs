@@ -133,7 +133,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 
 impl Args {
     fn bench(&self, decoder: Arc<cantap_signals::Decoder>) -> anyhow::Result<Bench> {
-        let rates = self.open.options().timing.bitrates;
+        let timing = self.open.options().timing;
+        if timing.has_auto() {
+            return Err(usage(
+                "-b auto listens to a device; give one with -d, or the simulated bus's bit rate, such as -b 500k",
+            ));
+        }
+        let rates = timing.known();
         let bitrates_bps = [1, 2].map(|channel| ChannelBitrate::of(&rates, channel).unwrap_or(SIMULATED_BPS));
         let duration_ns = self.duration.unwrap_or(SIMULATED).as_nanos();
         let duration_ns = u64::try_from(duration_ns)

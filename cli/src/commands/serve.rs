@@ -3,6 +3,7 @@
 mod doors;
 #[cfg(feature = "tls")]
 mod keys;
+mod other_doors;
 mod upkeep;
 
 use std::io::{self, Read, Write};
@@ -23,11 +24,12 @@ use cantap_address::{Address, LinkError};
 use cantap_serve::listen::{self, Listening};
 #[cfg(unix)]
 use cantap_serve::socket_file::{self, SocketError};
-use cantap_serve::{Board, BoardError, News, Role, Settings, connect, lines, metrics, socketcand};
+use cantap_serve::{Board, BoardError, News, Role, Settings, connect};
 
 #[cfg(unix)]
 use self::doors::numbered;
-use self::doors::{Allowed, Door, address, allow, allowed, loopback};
+use self::doors::{Allowed, Door, TunnelArg, address, allow, allowed, loopback, tunnel};
+use self::other_doors::OtherDoors;
 use self::upkeep::Upkeep;
 use crate::args;
 use crate::stderr;
@@ -67,8 +69,8 @@ pub struct Args {
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE")]
     bitrates: Vec<ChannelBitrate>,
     /// The maximum role of clients: listen (the default); configure, which allows choosing bit rates and storing settings, one client at a
-    /// time for each channel; send, which includes acknowledging. With a listener before it (unix:send, tcp:send, socketcand:send), only
-    /// for that one. Can be repeated. Socketcand's clients only listen unless it is named.
+    /// time for each channel; send, which includes acknowledging. With a listener before it (unix:send, tcp:send, socketcand:send, gvret:send,
+    /// cannelloni:send), only for that one. Can be repeated. The last three are asked for no name, and only listen unless they are named.
     #[arg(long = "allow", value_name = "[LISTENER:]ROLE", value_parser = allowed)]
     allowed: Vec<Allowed>,
     /// normal: the board acknowledges on its buses from the first listener on, so that no client that sends takes it off its bus for a
@@ -78,7 +80,7 @@ pub struct Args {
     /// Periodic frames and replies of a client at --tcp or ssh that has said nothing for this long are stopped, as 2s; 0 for never.
     #[arg(long, value_name = "TIME", value_parser = time_limit, default_value = "2s")]
     dead_man: TimeLimit,
-    /// A socketcand client that has sent nothing for this long, and has the board send nothing periodically, only listens again, so
+    /// A socketcand, GVRET or cannelloni client that has sent nothing for this long, and has the board send nothing periodically, only listens again, so
     /// that the board does not acknowledge for a program that has stopped; 0 for never.
     #[arg(long, value_name = "TIME", value_parser = time_limit, default_value = "60s")]
     idle: TimeLimit,
@@ -103,6 +105,14 @@ pub struct Args {
     /// computers can reach, clients may only listen: the protocol has no authentication.
     #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
     socketcand: Option<String>,
+    /// Speak GVRET, for SavvyCAN, which takes the server for an ESP32RET; default 127.0.0.1:23, the only port that SavvyCAN knows, and which
+    /// takes rights. At an address that other computers can reach, clients may only listen.
+    #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
+    gvret: Option<String>,
+    /// A cannelloni tunnel for a channel (without it, 1): the address here and the peer's, as 1:127.0.0.1:20000,127.0.0.1:20001. Datagrams of
+    /// others are not taken. Can be repeated. If one of the two is not of this computer, the peer may only listen.
+    #[arg(long = "cannelloni", value_name = "[CHANNEL:]ADDR:PORT,PEER:PORT", value_parser = tunnel)]
+    tunnels: Vec<TunnelArg>,
     /// Write candump's log lines to anyone who connects, for nc and SavvyCAN's log server; default 127.0.0.1:29538.
     #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
     lines: Option<String>,
@@ -152,10 +162,6 @@ fn time_limit(text: &str) -> Result<TimeLimit, String> {
 
 /// How often to check whether to end.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
-/// The default port of `--lines`.
-const LINES_PORT: u16 = 29_538;
-/// The default port of `--metrics`.
-const METRICS_PORT: u16 = 29_539;
 /// How many bytes of standard input may wait.
 const STDIN_BYTES: usize = 16 * 1024;
 
@@ -180,19 +186,17 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         Way::Encrypted(_) => address(text, PORT),
     });
     let tcp = tcp.transpose()?;
-    let other_doors = OtherDoors {
-        socketcand: args.socketcand.as_deref().map(|text| address(text, socketcand::PORT)).transpose()?,
-        lines: args.lines.as_deref().map(|text| loopback(text, LINES_PORT)).transpose()?,
-        metrics: args.metrics.as_deref().map(|text| address(text, METRICS_PORT)).transpose()?,
-    };
+    let other_doors = OtherDoors::of(
+        [&args.socketcand, &args.gvret, &args.lines, &args.metrics].map(Option::as_deref),
+        &args.tunnels,
+        addresses.len(),
+    )?;
     #[cfg(feature = "tls")]
     let permissions = args.permissions.as_deref();
     #[cfg(not(feature = "tls"))]
     let permissions = None;
-    let mut upkeep = Upkeep::new(permissions, args.audit.as_deref())?;
     // Before there is another thread.
-    #[cfg(unix)]
-    upkeep.catch_hang_ups(way.scheme() == "tls")?;
+    let mut upkeep = Upkeep::new(permissions, args.audit.as_deref(), way.scheme() == "tls")?;
     // From here on, Ctrl-C ends it properly.
     interrupt::watch()?;
     let mut boards = Vec::new();
@@ -214,7 +218,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         std::thread::sleep(LOOK_EVERY);
     }
     drop(listening);
-    drop(boards);
+    for board in &boards {
+        board.end();
+    }
     upkeep.finish();
     Ok(ExitCode::SUCCESS)
 }
@@ -240,9 +246,14 @@ fn start(args: &Args, number: usize, address: &Address) -> anyhow::Result<Board>
             error => error.into(),
         })
     });
-    Board::start(&address.to_string(), connect, settings, tell).map_err(|error| match error {
-        BoardError::Device(error) => error.into(),
-        BoardError::Connect(error) => anyhow::anyhow!(error),
+    Board::start(&address.to_string(), connect, settings, tell).map_err(|error| {
+        if error.is_absent() && !args.stdio {
+            stderr::tell("cantap: with --wait, the server starts without its device and waits for it\n");
+        }
+        match error {
+            BoardError::Device(error) => error.into(),
+            BoardError::Connect(error) => anyhow::anyhow!(error),
+        }
     })
 }
 
@@ -252,7 +263,7 @@ fn tell(news: News) {
         News::BoardLost { .. } | News::Refused { .. } | News::NotPermitted { .. } | News::DeadMan { .. } => {
             stderr::warn(&news.to_string());
         }
-        news => eprintln!("cantap: {news}"),
+        news => stderr::tell(&format!("cantap: {news}\n")),
     }
 }
 
@@ -262,7 +273,7 @@ fn check_bitrates(args: &Args, number: usize, board: &Board) -> anyhow::Result<(
     if board.hello().is_none() {
         return Ok(());
     }
-    let doors = [Door::Unix, Door::Tcp, Door::Socketcand, Door::Stdio];
+    let doors = [Door::Unix, Door::Tcp, Door::Socketcand, Door::Gvret, Door::Stdio];
     if doors.into_iter().any(|door| allow(&args.allowed, door) >= Role::Configure) {
         return Ok(());
     }
@@ -407,57 +418,6 @@ impl Way {
             #[cfg(feature = "tls")]
             Self::Encrypted(server) => cantap_serve::tls::listen(board, address, most, server),
         }
-    }
-}
-
-/// Listeners for other programs, each for all boards.
-struct OtherDoors {
-    socketcand: Option<SocketAddr>,
-    lines: Option<SocketAddr>,
-    metrics: Option<SocketAddr>,
-}
-
-impl OtherDoors {
-    /// Opens them. Returns their names.
-    fn listen(&self, all: &[Allowed], boards: &[Arc<Board>]) -> anyhow::Result<Vec<(String, Listening)>> {
-        let mut ways = Vec::new();
-        if let Some(address) = self.socketcand {
-            let role = allow(all, Door::Socketcand);
-            let way = socketcand::listen(boards, address, role).with_context(|| {
-                format!("nobody can listen at {address}; give another port with --socketcand")
-            })?;
-            let address = way.address().unwrap_or(address);
-            if !address.ip().is_loopback() {
-                stderr::warn(&format!(
-                    "anyone who reaches {address} can listen to the buses; nobody can send there"
-                ));
-            } else if role >= Role::Send {
-                stderr::warn(&format!(
-                    "every user and program of this computer can send on the buses at {address}: the protocol does not ask who they are"
-                ));
-            } else if allow(all, Door::Tcp) > role {
-                eprintln!(
-                    "cantap: clients at {address} may only listen; --allow socketcand:send lets every program of this computer send there"
-                );
-            }
-            ways.push((format!("can://{address}"), way));
-        }
-        if let Some(address) = self.lines {
-            let way = lines::listen(boards, address)
-                .with_context(|| format!("nobody can listen at {address}; give another port with --lines"))?;
-            ways.push((format!("lines at {}", way.address().unwrap_or(address)), way));
-        }
-        if let Some(address) = self.metrics {
-            let way = metrics::listen(boards, address).with_context(|| {
-                format!("nobody can listen at {address}; give another port with --metrics")
-            })?;
-            let address = way.address().unwrap_or(address);
-            if !address.ip().is_loopback() {
-                stderr::warn(&format!("anyone who reaches {address} can read the server's figures"));
-            }
-            ways.push((format!("http://{address}/metrics"), way));
-        }
-        Ok(ways)
     }
 }
 

@@ -17,10 +17,14 @@ use self::windows::Windows;
 use crate::args;
 use crate::completion;
 use crate::input::FollowArgs;
+use crate::live_args::AUTO_NEEDS_A_DEVICE;
 use crate::protocols::{Known, ProtocolArgs};
+use crate::usage_error::usage;
 use cantap_work::channel_bitrate::ChannelBitrate;
 use cantap_work::channels::Channels;
 use cantap_work::missing::{Missing, by_kind};
+use cantap_work::requested_rate::RequestedRate;
+use cantap_work::timing_options::TimingOptions;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -41,10 +45,10 @@ pub struct Args {
     /// consecutively. Without this and without a file, it listens to the board that is connected.
     #[arg(short, long, conflicts_with = "input", add = completion::devices())]
     device: Vec<Address>,
-    /// The bus's bit rate, such as 500k; with a channel before it (2:250k), only for that channel. Can be
-    /// repeated. Without it, a file has no load, and a device listens at the saved bit rate.
+    /// The bus's bit rate, such as 500k; with a channel before it (2:250k), only for that channel; auto has a device find it by
+    /// listening. Can be repeated. Without it, a file has no load, and a device listens at the saved bit rate.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", add = completion::bit_rates())]
-    bitrates: Vec<ChannelBitrate>,
+    bitrates: Vec<RequestedRate>,
     /// The bit rate of CAN FD's data phases, such as 2M; with a channel before it (2:5M), only for that channel. Can
     /// be repeated. Without it a channel with switched bit rates has no load.
     #[arg(
@@ -83,13 +87,17 @@ pub struct Args {
 }
 
 impl Args {
+    fn timing(&self) -> TimingOptions {
+        TimingOptions { bitrates: self.bitrates.clone(), ..TimingOptions::default() }
+    }
+
     fn options(&self) -> Options {
         let data = ChannelBitrate::options(&self.data_bitrates);
         Options {
             window: self.window,
             data_bitrate_bps: data.bitrate_bps,
             channel_data_bitrate_bps: data.channel_bitrate_bps,
-            ..ChannelBitrate::options(&self.bitrates)
+            ..ChannelBitrate::options(&self.timing().known())
         }
     }
 }
@@ -97,6 +105,9 @@ impl Args {
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let live = if args.input.is_some() {
+        if args.timing().has_auto() {
+            return Err(usage(AUTO_NEEDS_A_DEVICE));
+        }
         None
     } else {
         Some(live::open(&args.device, &args.channel, &args.bitrates, args.time)?)

@@ -58,9 +58,12 @@ fn cantap(directory: &Path, line: &str) -> (Option<i32>, String, String) {
 }
 
 /// A command line without `--json`; its exit code; the type of its object, or of each of its lines but the last, and of the last.
-pub const LINES: [(&str, i32, &[&str]); 67] = [
+pub const LINES: [(&str, i32, &[&str]); 70] = [
     ("list", 0, &["list"]),
+    ("list --network", 0, &["list"]),
     ("info -d virtual", 0, &["info"]),
+    ("doctor -d virtual -t 200ms", 0, &["doctor"]),
+    ("doctor -d virtual:bitrate=125k -b 500k -t 200ms", 3, &["doctor"]),
     ("status -d virtual --registers", 0, &["status"]),
     ("status -d virtual:errors=20,load=50 -b 500k -t 300ms --registers", 0, &["status"]),
     ("capture -d virtual -b 500k -t 300ms", 0, &["capture"]),

@@ -1,124 +1,16 @@
-//! `cantap serve`, and commands that use it: on a UNIX socket, over TCP, through ssh.
+//! `cantap serve` on a UNIX socket and on TCP, and commands that use it.
 #![cfg(unix)]
 
-use cantap_testing::peers;
-
-use std::io::{BufRead, BufReader, Read, Write};
-use std::net::TcpStream;
+use std::io::{Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::os::fd::OwnedFd;
 use std::os::unix::fs::PermissionsExt;
+use std::os::unix::net::UnixListener;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitStatus, Output, Stdio};
+use std::process::{Child, Stdio};
 use std::time::{Duration, Instant};
 
-use rustix::process::{Pid, Signal, kill_process};
-
-const CANTAP: &str = env!("CARGO_BIN_EXE_cantap");
-
-fn cantap(arguments: &str) -> Command {
-    let mut command = Command::new(CANTAP);
-    command
-        .args(arguments.split_whitespace())
-        .stdin(Stdio::null())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped());
-    command
-}
-
-fn run(arguments: &str) -> (Option<i32>, String, String) {
-    said(&cantap(arguments).output().unwrap())
-}
-
-fn said(output: &Output) -> (Option<i32>, String, String) {
-    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    (output.status.code(), text(&output.stdout), text(&output.stderr))
-}
-
-/// A running server.
-struct Server {
-    child: Child,
-    /// Its addresses, as printed.
-    at: Vec<String>,
-}
-
-impl Server {
-    fn start(arguments: &str, ways: usize) -> Self {
-        let mut child = cantap(&format!("serve {arguments}")).stderr(Stdio::inherit()).spawn().unwrap();
-        let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
-        let at = (0..ways).map(|_| lines.next().expect("it listens").unwrap()).collect();
-        Self { child, at }
-    }
-
-    fn interrupt(&mut self) -> ExitStatus {
-        signal(&self.child, Signal::INT);
-        self.child.wait().unwrap()
-    }
-}
-
-impl Drop for Server {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
-fn signal(child: &Child, signal: Signal) {
-    kill_process(Pid::from_child(child), signal).unwrap();
-}
-
-fn socket(folder: &Path) -> String {
-    folder.join("cantap.sock").display().to_string()
-}
-
-/// A candump log's lines as (seconds, channel and frame), without errors and losses.
-fn log(path: &Path) -> Vec<(f64, String)> {
-    let text = std::fs::read_to_string(path).unwrap();
-    let line = |line: &str| {
-        let (time, frame) = line.split_once(") ")?;
-        Some((time.trim_start_matches('(').parse().ok()?, frame.to_owned()))
-    };
-    text.lines().filter_map(line).filter(|(_, frame)| !frame.contains(" 20000")).collect()
-}
-
-/// Checks two traces of one bus: the frames in both are the same, in the same order and at the same times.
-fn agree(one: &[(f64, String)], other: &[(f64, String)]) {
-    let of = |all: &[(f64, String)], channel: &str| {
-        all.iter().filter(|(_, frame)| frame.starts_with(channel)).cloned().collect::<Vec<_>>()
-    };
-    for channel in ["can0", "can1"] {
-        let (one, other) = (of(one, channel), of(other, channel));
-        assert!(one.len() > 100 && other.len() > 100, "{channel}: {} and {}", one.len(), other.len());
-        let frames = |of: &[(f64, String)], at: usize| {
-            of[at..at + 12].iter().map(|(_, frame)| frame.clone()).collect::<Vec<_>>()
-        };
-        let find =
-            |of: &[(f64, String)], what: &[String]| (0..of.len() - 12).find(|at| frames(of, *at) == what);
-        // The one that began later starts within the other.
-        let (from, to) = match find(&one, &frames(&other, 0)) {
-            Some(at) => (at, 0),
-            None => (0, find(&other, &frames(&one, 0)).expect("common frames")),
-        };
-        let common = (one.len() - from).min(other.len() - to);
-        assert!(common > 100, "{channel}: {common}");
-        for (a, b) in one[from..].iter().zip(&other[to..]) {
-            assert_eq!(a.1, b.1);
-            // Each has measured UTC by its own round trips, on a busy computer.
-            assert!((a.0 - b.0).abs() < 0.02, "{a:?} {b:?}");
-        }
-    }
-}
-
-fn capture(at: &str, file: &Path, rest: &str) -> Command {
-    cantap(&format!("capture -d {at} -o {} --json {rest}", file.display()))
-}
-
-fn nothing_lost(output: &Output) {
-    let (code, out, err) = said(output);
-    assert_eq!(code, Some(0), "{err}");
-    let summary: serde_json::Value = serde_json::from_str(&out).unwrap();
-    for stage in summary["lost"].as_object().unwrap() {
-        assert_eq!(*stage.1, 0, "{summary}");
-    }
-}
+use crate::served::server::{Server, agree, cantap, capture, log, nothing_lost, run, said, socket};
 
 #[test]
 fn programs_share_a_device_each_with_all_of_its_frames() {
@@ -194,301 +86,6 @@ fn who_may_send_sends_and_others_see_it() {
     );
     assert_eq!(heard.iter().filter(|(_, frame)| frame.starts_with("can1 ")).count(), 50);
 }
-
-/// A stand-in for ssh: does on this computer what the other computer's shell would do.
-fn ssh(folder: &Path) -> PathBuf {
-    let program = folder.join("ssh");
-    std::fs::write(
-        &program,
-        "#!/bin/sh\n[ \"$1 $2 $3\" = '-T -oBatchMode=yes --' ] || exit 255\nshift 4\nsleep ${FAR:-0}\nexec sh -c \"$*\"\n",
-    )
-    .unwrap();
-    std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
-    program
-}
-
-#[test]
-fn a_capture_through_ssh_is_one_made_beside_it() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = socket(folder.path());
-    let server = Server::start(&format!("-d virtual:load=70 -b 500k --unix {path}"), 1);
-    let bin = Path::new(CANTAP).parent().unwrap().display().to_string();
-    let search = format!("{bin}:{}", std::env::var("PATH").unwrap());
-    let through = |command: &mut Command| {
-        command.env("CANTAP_SSH", ssh(folder.path())).env("PATH", &search).spawn().unwrap()
-    };
-    let (near, far) = (folder.path().join("near.log"), folder.path().join("far.log"));
-    let beside = capture(&server.at[0], &near, "-t 2500ms").spawn().unwrap();
-    // A server's board is as good as any device.
-    let remote = through(&mut capture(&format!("ssh://me@there/unix:{path}"), &far, "-b 500k -t 1s"));
-    nothing_lost(&remote.wait_with_output().unwrap());
-    nothing_lost(&beside.wait_with_output().unwrap());
-    agree(&log(&near), &log(&far));
-    // It listens unless the address says otherwise.
-    let send = |at: &str| {
-        said(&through(&mut cantap(&format!("send -d {at} -b 500k 1 123#11"))).wait_with_output().unwrap())
-    };
-    let (code, _, err) = send("ssh://there/virtual");
-    assert_eq!(code, Some(1));
-    assert!(err.contains("the right to send"), "{err}");
-    let (code, _, err) = send("ssh://there/virtual?allow=send");
-    assert_eq!(code, Some(0), "{err}");
-    // A computer that takes a long time to reach.
-    let far_away = through(cantap("info -d ssh://there/virtual").env("FAR", "4")).wait_with_output().unwrap();
-    assert_eq!(far_away.status.code(), Some(0), "{}", String::from_utf8_lossy(&far_away.stderr));
-    // Ctrl-C ends the capture, and then the other side: complete, with its summary.
-    let mut interrupted =
-        through(&mut capture("ssh://there/virtual:load=50", &folder.path().join("c.log"), "-b 500k"));
-    std::thread::sleep(Duration::from_millis(1500));
-    signal(&interrupted, Signal::INT);
-    let started = Instant::now();
-    while interrupted.try_wait().unwrap().is_none() {
-        assert!(started.elapsed() < Duration::from_secs(5), "it does not end");
-        std::thread::sleep(Duration::from_millis(20));
-    }
-    nothing_lost(&interrupted.wait_with_output().unwrap());
-}
-
-const SSHD: &str = "/usr/sbin/sshd";
-
-/// A real ssh server on this computer, with its own keys, and the client's configuration for it.
-struct Sshd {
-    child: Child,
-    /// The program used in place of ssh: ssh, with this server's settings.
-    program: PathBuf,
-}
-
-impl Drop for Sshd {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
-/// Starts it, or returns the reason why that is impossible.
-fn sshd(folder: &Path) -> Result<Sshd, String> {
-    let has = |program: &str| Path::new(program).exists();
-    if !has(SSHD) || !has("/usr/bin/ssh") {
-        return Err("there is no ssh and sshd; on Debian run `apt-get install openssh-server`".to_owned());
-    }
-    let at = |name: &str| folder.join(name).display().to_string();
-    for key in ["host", "user"] {
-        let made =
-            Command::new("ssh-keygen").args(["-q", "-t", "ed25519", "-N", "", "-f", &at(key)]).status();
-        if !made.is_ok_and(|status| status.success()) {
-            return Err("ssh-keygen makes no key".to_owned());
-        }
-    }
-    std::fs::copy(at("user.pub"), at("authorized")).unwrap();
-    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
-    let host_key = std::fs::read_to_string(at("host.pub")).unwrap();
-    std::fs::write(at("known"), format!("[127.0.0.1]:{port} {host_key}")).unwrap();
-    // The other computer has `cantap` in its path.
-    let bin = Path::new(CANTAP).parent().unwrap().display().to_string();
-    let server = format!(
-        "Port {port}\nListenAddress 127.0.0.1\nHostKey {}\nPidFile none\nAuthorizedKeysFile {}\nStrictModes no\nUsePAM no\n\
-         PasswordAuthentication no\nKbdInteractiveAuthentication no\nSetEnv PATH={bin}:/usr/bin:/bin\n",
-        at("host"),
-        at("authorized"),
-    );
-    std::fs::write(at("server"), server).unwrap();
-    let client = format!(
-        "Host localhost\n HostName 127.0.0.1\n Port {port}\n IdentityFile {}\n IdentitiesOnly yes\n UserKnownHostsFile {}\n \
-         StrictHostKeyChecking yes\n",
-        at("user"),
-        at("known"),
-    );
-    std::fs::write(at("client"), client).unwrap();
-    let program = folder.join("ssh");
-    std::fs::write(&program, format!("#!/bin/sh\nexec /usr/bin/ssh -F {} \"$@\"\n", at("client"))).unwrap();
-    std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
-    if rustix::process::getuid().is_root() {
-        // The folder to which it confines itself; a package's own start script creates it otherwise.
-        std::fs::create_dir_all("/run/sshd").unwrap();
-    }
-    let log = std::fs::File::create(at("log")).unwrap();
-    let child = Command::new(SSHD).args(["-D", "-e", "-f", &at("server")]).stderr(log).spawn().unwrap();
-    let sshd = Sshd { child, program };
-    let deadline = Instant::now() + Duration::from_secs(10);
-    while Instant::now() < deadline {
-        let reached =
-            Command::new(&sshd.program).args(["-oBatchMode=yes", "localhost", "true"]).output().unwrap();
-        if reached.status.success() {
-            return Ok(sshd);
-        }
-        std::thread::sleep(Duration::from_millis(100));
-    }
-    Err(format!("sshd lets nobody in: {}", std::fs::read_to_string(at("log")).unwrap_or_default()))
-}
-
-#[test]
-fn a_capture_over_a_real_ssh_is_one_made_beside_it() {
-    let folder = tempfile::tempdir().unwrap();
-    let sshd = match sshd(folder.path()) {
-        Ok(sshd) => sshd,
-        Err(reason) => return peers::skip_without("ssh", &reason),
-    };
-    let path = socket(folder.path());
-    let server = Server::start(&format!("-d virtual:load=70 -b 500k --unix {path} --allow send"), 1);
-    let (near, far) = (folder.path().join("near.log"), folder.path().join("far.log"));
-    let beside = capture(&server.at[0], &near, "-t 4s").spawn().unwrap();
-    let through = |command: &mut Command| command.env("CANTAP_SSH", &sshd.program).output().unwrap();
-    // A server's board is as good as any device.
-    nothing_lost(&through(&mut capture(&format!("ssh://localhost/unix:{path}"), &far, "-b 500k -t 1s")));
-    nothing_lost(&beside.wait_with_output().unwrap());
-    agree(&log(&near), &log(&far));
-    let send = |at: &str| said(&through(&mut cantap(&format!("send -d {at} -b 500k 1 123#11"))));
-    let (code, _, err) = send(&format!("ssh://localhost/unix:{path}"));
-    assert_eq!(code, Some(1));
-    assert!(err.contains("the right to send"), "{err}");
-    let (code, _, err) = send(&format!("ssh://localhost/unix:{path}?allow=send"));
-    assert_eq!(code, Some(0), "{err}");
-    // A client unknown to ssh gets no further.
-    std::fs::write(folder.path().join("authorized"), "").unwrap();
-    let (code, _, err) = send("ssh://localhost/virtual");
-    assert_eq!(code, Some(1), "{err}");
-    assert!(err.contains("Permission denied"), "{err}");
-}
-
-/// A relay between a client and its server that can be cut.
-struct Cable {
-    port: u16,
-    ends: std::sync::Arc<std::sync::Mutex<Vec<TcpStream>>>,
-}
-
-impl Cable {
-    fn new(to: &str) -> Self {
-        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
-        let port = listener.local_addr().unwrap().port();
-        let ends: std::sync::Arc<std::sync::Mutex<Vec<TcpStream>>> = std::sync::Arc::default();
-        let (kept, to) = (std::sync::Arc::clone(&ends), to.to_owned());
-        std::thread::spawn(move || {
-            for near in listener.incoming().map_while(Result::ok) {
-                let Ok(far) = TcpStream::connect(&to) else { continue };
-                let mut kept = kept.lock().unwrap();
-                kept.extend([near.try_clone().unwrap(), far.try_clone().unwrap()]);
-                for (mut from, mut to) in [(near.try_clone().unwrap(), far.try_clone().unwrap()), (far, near)]
-                {
-                    std::thread::spawn(move || std::io::copy(&mut from, &mut to));
-                }
-            }
-        });
-        Self { port, ends }
-    }
-
-    fn cut(&self) {
-        for end in self.ends.lock().unwrap().drain(..) {
-            let _ = end.shutdown(std::net::Shutdown::Both);
-        }
-    }
-}
-
-/// The client's trace has the gaps, and the frames around them; the server is unaffected.
-#[test]
-fn cut_connections_are_gaps_and_the_capture_goes_on() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = socket(folder.path());
-    let server = Server::start(&format!("-d virtual:load=40 -b 500k --unix {path} --tcp 0"), 2);
-    let cable = Cable::new(server.at[1].strip_prefix("tcp://").unwrap());
-    let (near, far) = (folder.path().join("near.log"), folder.path().join("far.log"));
-    let beside = capture(&server.at[0], &near, "-t 8s").spawn().unwrap();
-    // It begins before the other and ends after it, however busy the computer.
-    let started = Instant::now();
-    while std::fs::metadata(&near).map_or(0, |file| file.len()) < 1000 {
-        assert!(started.elapsed() < Duration::from_secs(10), "nothing is captured");
-        std::thread::sleep(Duration::from_millis(20));
-    }
-    let cut = capture(&format!("tcp://127.0.0.1:{}", cable.port), &far, "-t 4s").spawn().unwrap();
-    for _ in 0..2 {
-        std::thread::sleep(Duration::from_millis(1300));
-        cable.cut();
-    }
-    let (code, out, err) = said(&cut.wait_with_output().unwrap());
-    assert_eq!(code, Some(0), "{err}");
-    let summary: serde_json::Value = serde_json::from_str(&out).unwrap();
-    assert_eq!(summary["gaps"]["count"], 2, "{summary} {err}");
-    assert_eq!(err.matches("is back after").count(), 2, "{err}");
-    nothing_lost(&beside.wait_with_output().unwrap());
-    // Each stretch is in the other's trace.
-    let (near, far) = (log(&near), log(&far));
-    let of = |all: &[(f64, String)]| {
-        let first = all.iter().filter(|(_, frame)| frame.starts_with("can0"));
-        first.map(|(_, frame)| frame.clone()).collect::<Vec<_>>()
-    };
-    let (near, far) = (of(&near), of(&far));
-    let mut stretches = 1;
-    let mut at = near.windows(8).position(|window| *window == far[..8]).expect("common frames");
-    for (number, frame) in far.iter().enumerate() {
-        if near.get(at) != Some(frame) {
-            let rest = &far[number..far.len().min(number + 8)];
-            let next = near[at..].windows(rest.len()).position(|window| window == rest);
-            at += next.unwrap_or_else(|| panic!("frame {number} is nobody's"));
-            stretches += 1;
-        }
-        at += 1;
-    }
-    assert_eq!(stretches, 3);
-}
-
-#[test]
-fn a_server_that_is_killed_leaves_a_gap_and_the_capture_goes_on_with_the_next() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = socket(folder.path());
-    let start = || Server::start(&format!("-d virtual:load=30 -b 500k --unix {path}"), 1);
-    let server = start();
-    let file = folder.path().join("all.log");
-    let listener = capture(&server.at[0], &file, "-t 5s").spawn().unwrap();
-    std::thread::sleep(Duration::from_millis(1200));
-    // kill -9: its socket stays behind, and the next server replaces it.
-    drop(server);
-    assert!(Path::new(&path).exists());
-    let _server = start();
-    let (code, out, err) = said(&listener.wait_with_output().unwrap());
-    assert_eq!(code, Some(0), "{err}");
-    assert!(err.contains("vanished") && err.contains("is back after"), "{err}");
-    let summary: serde_json::Value = serde_json::from_str(&out).unwrap();
-    assert_eq!(summary["gaps"]["count"], 1, "{summary}");
-}
-
-#[cfg(feature = "tls")]
-#[test]
-fn clients_of_other_computers_come_with_keys() {
-    let folder = tempfile::tempdir().unwrap();
-    let keys = folder.path().join("keys").display().to_string();
-    let (code, _, err) = run(&format!("serve keygen {keys} --client alice:listen"));
-    assert_eq!(code, Some(2), "{err}");
-    assert!(err.contains("--host"), "{err}");
-    let (code, out, err) = run(&format!("serve keygen {keys} --host 127.0.0.1 --client alice:listen"));
-    assert_eq!(code, Some(0), "{err}");
-    assert!(out.contains("alice-key.pem") && out.contains("server-key.pem"), "{out}");
-    let files = format!("--tls {keys}/server.pem,{keys}/server-key.pem --clients {keys}/ca.pem");
-    let server = Server::start(&format!("-d virtual:load=50 -b 500k --tcp 0 {files} --allow send"), 1);
-    let at = &server.at[0];
-    assert!(at.starts_with("tls://127.0.0.1:"), "{at}");
-    let (code, _, err) = run(&format!("info -d {at}"));
-    assert_eq!(code, Some(1));
-    assert!(err.contains("CANTAP_KEYS"), "{err}");
-    let file = folder.path().join("far.log");
-    nothing_lost(&capture(&format!("{at}?keys={keys}/alice"), &file, "-t 500ms").output().unwrap());
-    assert!(log(&file).len() > 100);
-    let (code, _, err) = run(&format!("send -d {at}?keys={keys}/alice -b 500k 1 123#11"));
-    assert_eq!(code, Some(1));
-    assert!(err.contains("the right to send"), "{err}");
-    // With another authority's keys, among them one named like the server's: refused immediately, with the
-    // reason.
-    let other = folder.path().join("other").display().to_string();
-    let (code, _, err) = run(&format!("serve keygen {other} --host 127.0.0.1 --client eve:send"));
-    assert_eq!(code, Some(0), "{err}");
-    std::fs::copy(format!("{keys}/ca.pem"), format!("{other}/ca.pem")).unwrap();
-    let (code, _, err) = run(&format!("info -d {at}?keys={other}/eve"));
-    assert_eq!(code, Some(1));
-    assert!(err.contains("lets nobody in with these keys") && err.contains("alert"), "{err}");
-    // Without encryption, nothing answers.
-    let (code, _, err) = run(&format!("info -d {}", at.replace("tls:", "tcp:")));
-    assert_eq!(code, Some(1), "{err}");
-    assert!(err.contains("does not let this client in"), "{err}");
-}
-
 /// Garbage, half-open peers and floods harm nobody, and receive nothing.
 #[test]
 fn strangers_on_the_port_hear_nothing_and_take_nobodys_place() {
@@ -578,12 +175,22 @@ fn a_change_of_mode_is_in_the_capture_s_summary_and_in_the_statistics() {
     assert!(out.lines().next().unwrap().contains(", an unknown number lost, "), "{out}");
 }
 
-/// The server's end is what clients are told, and commands say what was done until then.
+/// The server's end is what clients are told, and commands say what was done until then. Programs with other protocols, which the end does not
+/// concern, keep it from nobody.
 #[test]
 fn what_was_sent_until_the_server_ended_is_told() {
     let folder = tempfile::tempdir().unwrap();
     let path = socket(folder.path());
-    let mut server = Server::start(&format!("-d virtual:load=0 -b 500k --unix {path} --allow send"), 1);
+    let doors = "--socketcand 127.0.0.1:0 --lines 127.0.0.1:0 --gvret 127.0.0.1:0";
+    let mut server =
+        Server::start(&format!("-d virtual:load=0 -b 500k --unix {path} --allow send {doors}"), 4);
+    let place = |way: &str| TcpStream::connect(way.rsplit(['/', ' ']).next().unwrap()).unwrap();
+    let mut others: Vec<TcpStream> = server.at[1..].iter().map(|way| place(way)).collect();
+    others[0].write_all(b"< open can0 >< rawmode >").unwrap();
+    others[1].write_all(&[0xE7, 0xE7, 0xF1, 9]).unwrap();
+    for other in &mut others[..2] {
+        assert!(other.read(&mut [0; 16]).unwrap() > 0);
+    }
     let sends = cantap(&format!("gen -d unix:{path} can0 -g 5 --json")).spawn().unwrap();
     let mut ears = capture(&server.at[0], &folder.path().join("x.log"), "-n 20").spawn().unwrap();
     assert!(ears.wait().unwrap().success());
@@ -594,4 +201,55 @@ fn what_was_sent_until_the_server_ended_is_told() {
     let object: serde_json::Value = serde_json::from_str(&out).unwrap();
     assert!(object["sent"].as_u64() >= Some(19), "{object}");
     assert!(object["reason"].as_str().unwrap().contains("its server has ended"), "{object}");
+}
+
+/// As systemd starts it: the socket is there before the server, and after it. Nobody else could listen at these addresses meanwhile.
+#[test]
+fn a_server_takes_the_listening_socket_that_it_is_started_with() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = socket(folder.path());
+    let listener = UnixListener::bind(&path).unwrap();
+    for number in 0..2 {
+        let mut command = cantap(&format!("serve -d virtual:load=30 -b 500k --unix {path}"));
+        let input = OwnedFd::from(listener.try_clone().unwrap());
+        let mut server = Server::of(command.stdin(input).stderr(Stdio::inherit()), 1);
+        let file = folder.path().join(format!("{number}.log"));
+        nothing_lost(&capture(&server.at[0], &file, "-t 500ms").output().unwrap());
+        assert!(server.interrupt().success());
+        assert!(Path::new(&path).exists());
+    }
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let at = listener.local_addr().unwrap();
+    let doors = format!("--unix {path}-2 --gvret {at}");
+    let mut command = cantap(&format!("serve -d virtual:load=30 -b 500k {doors}"));
+    let server = Server::of(command.stdin(OwnedFd::from(listener)).stderr(Stdio::inherit()), 2);
+    assert_eq!(server.at[1], format!("gvret:tcp://{at}"));
+    let (code, out, err) = run(&format!("capture -d gvret:tcp://{at} -b 500k -c 1 -n 20 -o {path}.log"));
+    assert_eq!(code, Some(0), "{out}{err}");
+}
+
+/// A beacon at 127.0.0.1 stays on this computer.
+#[test]
+fn a_server_that_announces_itself_is_listed_and_can_be_used() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = socket(folder.path());
+    let board = "virtual:load=20,serial=BENCH-7";
+    let server = Server::start(&format!("-d {board} -b 500k --unix {path} --socketcand 127.0.0.1:0"), 2);
+    let place = server.at[1].strip_prefix("can://").unwrap();
+    let (code, out, err) = run("list --network --json");
+    assert_eq!(code, Some(0), "{err}");
+    let object: serde_json::Value = serde_json::from_str(&out).unwrap();
+    let servers = object["servers"].as_array().unwrap();
+    let device = format!("socketcand://{place}/can0");
+    let found = servers.iter().find(|server| server["devices"][0] == *device).expect(&out);
+    assert!(found["name"].as_str().unwrap().starts_with("cantap BENCH-7"), "{found}");
+    assert_eq!(found["from"], "127.0.0.1");
+    let (code, out, err) = run(&format!("capture -d {device} -b 500k -n 5 -o {path}.log"));
+    assert_eq!(code, Some(0), "{out}{err}");
+    // Without it, nothing of the network is listed.
+    let (code, out, _) = run("list --json");
+    assert_eq!(
+        (code, serde_json::from_str::<serde_json::Value>(&out).unwrap().get("servers")),
+        (Some(0), None)
+    );
 }

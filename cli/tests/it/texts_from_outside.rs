@@ -107,6 +107,7 @@ fn a_server_s_texts_move_no_cursor() {
         ("info", "board           ?]0;P???31m?x"),
         ("info --json", "?]0;P???31m?x"),
         ("status", ""),
+        ("doctor -t 100ms", ""),
         ("selftest", ""),
         ("defaults", ""),
         ("capture -t 100ms -o /dev/null", ""),

@@ -1,42 +1,32 @@
 //! The other end of a cannelloni tunnel: `cannelloni://HOST:PORT[?listen=PORT]` over UDP.
 //!
-//! As its README describes the datagrams: version 2, operation 0, a sequence number of eight bits, a count of frames; each frame an identifier
-//! as Linux has it, a length, the data unless it is remote. There is no time in it, and UDP may lose or reorder.
+//! There is no time in its datagrams, and UDP may lose or reorder them.
 
 use std::io;
 use std::net::UdpSocket;
 use std::time::{Duration, Instant};
 
 use cantap::device::is_idle;
+use cantap_codecs::cannelloni::{Item, NoDatagram, Order, Sequence, Writer, datagram, item};
 use cantap_wire::record::LossStage;
-use cantap_wire::{Channel, Frame, Id, Refusal};
+use cantap_wire::{Channel, Frame, Refusal};
 
 use crate::driver::{At, Bytes, Driver, Incoming, Oddities, OpenError, Opening, poll_bytes};
 use crate::rows::{Row, row};
 use crate::source::{Piece, Source};
 
-/// cannelloni's usual port.
-pub(crate) const PORT: u16 = 20_000;
-const VERSION: u8 = 2;
-const DATA: u8 = 0;
-const HEADER: usize = 5;
+pub(crate) use cantap_codecs::cannelloni::PORT;
+
 const READ_TIMEOUT: Duration = Duration::from_millis(50);
 /// Largest datagram.
 const MAX_DATAGRAM: usize = 65_536;
-
-const EXTENDED: u32 = 1 << 31;
-const REMOTE: u32 = 1 << 30;
-const ERROR: u32 = 1 << 29;
-/// In the length: a CAN FD frame, with a byte of flags after it.
-const FD: u8 = 0x80;
 
 /// The driver.
 pub(crate) struct Cannelloni {
     socket: UdpSocket,
     source: Source<Vec<u8>>,
-    /// The next datagram's number.
-    expected: Option<u8>,
-    sequence: u8,
+    sequence: Sequence,
+    writer: Writer,
     is_open: bool,
     backlog: Vec<Incoming>,
     oddities: Oddities,
@@ -66,8 +56,8 @@ impl Cannelloni {
         Ok(Self {
             socket,
             source,
-            expected: None,
-            sequence: 0,
+            sequence: Sequence::default(),
+            writer: Writer::default(),
             is_open: false,
             backlog: Vec::new(),
             oddities: Oddities::default(),
@@ -87,43 +77,41 @@ impl Cannelloni {
 
     fn datagram(&mut self, bytes: &[u8], arrival: Instant) {
         let at = At::arrival(arrival);
-        let Some((&[version, operation, sequence, high, low], mut rest)) =
-            bytes.split_first_chunk::<HEADER>()
-        else {
-            return self.oddities.count("datagrams that are too short");
+        let (header, mut rest) = match datagram(bytes) {
+            Ok(datagram) => datagram,
+            Err(NoDatagram::TooShort) => return self.oddities.count("datagrams that are too short"),
+            Err(NoDatagram::Other) => {
+                return self.oddities.count("datagrams of another version or operation");
+            }
         };
-        if (version, operation) != (VERSION, DATA) {
-            return self.oddities.count("datagrams of another version or operation");
-        }
-        let expected = self.expected.replace(sequence.wrapping_add(1));
-        match sequence.wrapping_sub(expected.unwrap_or(sequence)) {
-            0 => {}
-            missing @ 1..0x80 => {
+        match self.sequence.take(header.sequence) {
+            Order::Next => {}
+            Order::Missing(missing) => {
                 self.oddities.count("gaps between datagrams");
                 // Each had at least a frame.
                 self.lost(missing.into(), true, at);
             }
-            _ => self.oddities.count("datagrams out of order"),
+            Order::Late => self.oddities.count("datagrams out of order"),
         }
-        let count = u32::from(u16::from_be_bytes([high, low]));
+        let count = u32::from(header.count);
         for done in 0..count {
-            let Some((parsed, after)) = frame(rest) else {
+            let Some((parsed, after)) = item(rest) else {
                 self.oddities.count("datagrams that end too early");
                 return self.lost(count - done, false, at);
             };
             rest = after;
             match parsed {
-                Parsed::Frame(frame) => {
+                Item::Frame(frame) => {
                     self.backlog.push(Incoming::Received { channel: Channel::Can1, frame, at });
                 }
-                Parsed::Error => {
+                Item::Error => {
                     self.backlog.push(Incoming::BusErrors { channel: Channel::Can1, count: 1, at });
                 }
-                Parsed::Fd => {
+                Item::Fd => {
                     self.oddities.count("CAN FD frames, which do not fit the device's protocol");
                     self.lost(1, false, at);
                 }
-                Parsed::Impossible => {
+                Item::Impossible => {
                     self.oddities.count("frames that cannot be");
                     self.lost(1, false, at);
                 }
@@ -133,43 +121,6 @@ impl Cannelloni {
             self.oddities.count("datagrams with bytes after their frames");
         }
     }
-}
-
-/// A frame of a datagram.
-enum Parsed {
-    Frame(Frame),
-    Error,
-    Fd,
-    Impossible,
-}
-
-/// The first frame, and what follows it; `None` if it is not whole.
-fn frame(bytes: &[u8]) -> Option<(Parsed, &[u8])> {
-    let (raw, rest) = bytes.split_first_chunk()?;
-    let raw = u32::from_be_bytes(*raw);
-    let (&length, rest) = rest.split_first()?;
-    let (is_fd, len) = (length & FD != 0, usize::from(length & !FD));
-    let rest = if is_fd { rest.get(1..)? } else { rest };
-    if raw & REMOTE != 0 {
-        return Some((
-            id_of(raw)
-                .and_then(|id| Frame::remote_frame(id, len as u8))
-                .map_or(Parsed::Impossible, Parsed::Frame),
-            rest,
-        ));
-    }
-    let (data, rest) = rest.split_at_checked(len)?;
-    let parsed = match id_of(raw) {
-        _ if raw & ERROR != 0 => Parsed::Error,
-        _ if is_fd => Parsed::Fd,
-        id => id.and_then(|id| Frame::data_frame(id, data)).map_or(Parsed::Impossible, Parsed::Frame),
-    };
-    Some((parsed, rest))
-}
-
-fn id_of(raw: u32) -> Option<Id> {
-    let id = raw & !(EXTENDED | REMOTE | ERROR);
-    if raw & EXTENDED != 0 { Id::extended(id) } else { Id::standard(id) }
 }
 
 impl Bytes for Cannelloni {
@@ -193,7 +144,7 @@ impl Driver for Cannelloni {
 
     fn open(&mut self, _channel: Channel, _opening: Opening) -> Result<(), Refusal> {
         self.is_open = true;
-        self.expected = None;
+        self.sequence = Sequence::default();
         Ok(())
     }
 
@@ -202,13 +153,8 @@ impl Driver for Cannelloni {
     }
 
     fn send(&mut self, channel: Channel, mailbox: u8, frame: &Frame) -> bool {
-        let id = frame.id();
-        let raw = id.raw() | u32::from(id.is_extended()) << 31 | u32::from(frame.is_remote()) << 30;
-        let mut datagram = vec![VERSION, DATA, self.sequence, 0, 1];
-        self.sequence = self.sequence.wrapping_add(1);
-        datagram.extend_from_slice(&raw.to_be_bytes());
-        datagram.push(frame.dlc().min(8));
-        datagram.extend_from_slice(frame.data());
+        self.writer.push(frame);
+        let datagram = self.writer.take().unwrap_or_default();
         match self.socket.send(&datagram) {
             Ok(_) => {}
             // Nobody listens at the other end: as with a lost datagram, nobody knows.
@@ -230,19 +176,5 @@ impl Driver for Cannelloni {
 
     fn oddities(&self) -> (u32, String) {
         self.oddities.summary()
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    proptest::proptest! {
-        #[test]
-        fn any_bytes_are_a_frame_or_not_whole(bytes: Vec<u8>) {
-            if let Some((_, rest)) = frame(&bytes) {
-                proptest::prop_assert!(rest.len() < bytes.len());
-            }
-        }
     }
 }

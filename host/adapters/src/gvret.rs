@@ -1,12 +1,13 @@
-//! GVRET: the binary protocol of ESP32RET, M2RET and Macchina's boards, on a serial port or TCP port 23.
+//! GVRET adapters: ESP32RET, M2RET and Macchina's boards, on a serial port or TCP.
 //!
-//! As ESP32RET reads and writes it (`src/gvret_comm.cpp`, `src/commbuffer.cpp`). It knows neither remote frames nor errors nor losses, and
-//! stamps a frame when it leaves the adapter. The adapter keeps what it was last set to: until it is opened here, it may acknowledge frames.
+//! The protocol knows neither remote frames nor errors nor losses, and the adapter stamps a frame when it leaves it. It keeps what it was last
+//! set to: until it is opened here, it may acknowledge frames.
 
 use std::time::{Duration, Instant};
 
+use cantap_codecs::gvret::{Bus, Command, Message, message};
 use cantap_wire::record::LossStage;
-use cantap_wire::{Channel, Frame, Id, Refusal};
+use cantap_wire::{Channel, Frame, Refusal};
 
 use crate::adapter_clock::AdapterClock;
 use crate::driver::{At, Bytes, Driver, Incoming, Oddities, OpenError, Opening, poll_bytes};
@@ -14,118 +15,11 @@ use crate::line::Line;
 use crate::rows::{Row, row};
 use crate::source::Piece;
 
-/// The TCP port that the adapters listen on.
-pub(crate) const PORT: u16 = 23;
+pub(crate) use cantap_codecs::gvret::PORT;
 /// The speed of a serial line if the address gives none (ESP32RET, `Serial.begin`).
 pub(crate) const DEFAULT_BAUD: u32 = 1_000_000;
 /// Time limit for an answer.
 const ANSWER_WITHIN: Duration = Duration::from_millis(700);
-
-/// Begins every command and every message.
-const START: u8 = 0xF1;
-const FRAME: u8 = 0;
-const SET_BUSES: u8 = 5;
-const GET_BUSES: u8 = 6;
-const GET_INFO: u8 = 7;
-const KEEP_ALIVE: u8 = 9;
-const GET_NUMBER: u8 = 12;
-const FD_FRAME: u8 = 20;
-
-/// Bits of a bus's setting: the others are valid, it is on, it only listens.
-const SET_STATE: u32 = 1 << 31;
-const ENABLED: u32 = 1 << 30;
-const LISTENS: u32 = 1 << 29;
-
-/// A message from the adapter.
-#[derive(Clone, Debug, PartialEq, Eq)]
-enum Message {
-    Frame {
-        stamp_us: u32,
-        bus: u8,
-        frame: Frame,
-    },
-    /// A CAN FD frame on this bus.
-    Fd {
-        bus: u8,
-    },
-    /// Two buses: whether each is on, only listens, and its bit rate in bit/s.
-    Buses([(bool, bool, u32); 2]),
-    /// Its firmware's build number.
-    Info {
-        build: u16,
-    },
-    Alive,
-    Number(u8),
-    Other,
-    /// Bytes that are no message.
-    Garbage,
-}
-
-/// The first message in the bytes, and its length; `None` if it is not complete.
-fn message(bytes: &[u8]) -> Option<(Message, usize)> {
-    let (&start, rest) = bytes.split_first()?;
-    if start != START {
-        let len = bytes.iter().position(|byte| *byte == START).unwrap_or(bytes.len());
-        return Some((Message::Garbage, len));
-    }
-    let (&kind, content) = rest.split_first()?;
-    let u32_at = |at: usize| content.get(at..)?.first_chunk().map(|bytes| u32::from_le_bytes(*bytes));
-    Some(match kind {
-        FRAME => {
-            let (stamp_us, raw) = (u32_at(0)?, u32_at(4)?);
-            let lengths = *content.get(8)?;
-            let (len, bus) = (usize::from(lengths & 0xF), lengths >> 4);
-            let id = id_of(raw);
-            // A length that no frame has, or an impossible identifier: the start was data.
-            let Some(id) = id.filter(|_| len <= 8) else { return Some((Message::Garbage, 1)) };
-            let data = content.get(9..9 + len)?;
-            content.get(9 + len)?;
-            let frame = Frame::data_frame(id, data)?;
-            (Message::Frame { stamp_us, bus, frame }, 2 + 9 + len + 1)
-        }
-        FD_FRAME => {
-            let (len, bus) = (usize::from(*content.get(8)?), *content.get(9)?);
-            if len > 64 {
-                return Some((Message::Garbage, 1));
-            }
-            content.get(10 + len)?;
-            (Message::Fd { bus }, 2 + 10 + len + 1)
-        }
-        GET_BUSES => {
-            let bus = |at: usize| {
-                let state = *content.get(at)?;
-                Some((state & 0xF != 0, state >> 4 != 0, u32_at(at + 1)?))
-            };
-            (Message::Buses([bus(0)?, bus(5)?]), 2 + 10)
-        }
-        GET_INFO => {
-            content.get(5)?;
-            let build = u16::from_le_bytes(*content.first_chunk()?);
-            (Message::Info { build }, 2 + 6)
-        }
-        KEEP_ALIVE => match content.first_chunk::<2>()? {
-            [0xDE, 0xAD] => (Message::Alive, 2 + 2),
-            _ => (Message::Garbage, 1),
-        },
-        GET_NUMBER => (Message::Number(*content.first()?), 2 + 1),
-        // Time, digital and analogue inputs, further buses.
-        1 | 2 | 3 | 13 => {
-            let len = match kind {
-                1 => 4,
-                2 => 2,
-                _ => 15,
-            };
-            content.get(len - 1)?;
-            (Message::Other, 2 + len)
-        }
-        _ => (Message::Garbage, 1),
-    })
-}
-
-fn id_of(raw: u32) -> Option<Id> {
-    const EXTENDED: u32 = 1 << 31;
-    if raw & EXTENDED != 0 { Id::extended(raw & !EXTENDED) } else { Id::standard(raw) }
-}
 
 /// The driver.
 pub(crate) struct Gvret {
@@ -133,7 +27,7 @@ pub(crate) struct Gvret {
     bytes: Vec<u8>,
     channels: u8,
     build: u16,
-    settings: [u32; 2],
+    buses: [Bus; 2],
     clock: AdapterClock,
     backlog: Vec<Incoming>,
     oddities: Oddities,
@@ -147,7 +41,7 @@ impl Gvret {
             bytes: Vec::new(),
             channels: 1,
             build: 0,
-            settings: [SET_STATE; 2],
+            buses: [Bus::default(); 2],
             clock: AdapterClock::new(1_000, 1 << 32),
             backlog: Vec::new(),
             oddities: Oddities::default(),
@@ -160,16 +54,16 @@ impl Gvret {
     }
 
     fn greet(&mut self) -> Result<(), String> {
-        self.line.write(&[0xE7, 0xE7, START, KEEP_ALIVE]);
+        self.write(&[Command::Binary, Command::Binary, Command::KeepAlive]);
         self.answer(|message| (*message == Message::Alive).then_some(()))?.ok_or("no answer")?;
-        self.line.write(&[START, GET_NUMBER]);
+        self.write(&[Command::GetNumber]);
         let number = self.answer(|message| match message {
             Message::Number(number) => Some(*number),
             _ => None,
         })?;
         // An older one does not know the question, and has two.
         self.channels = number.unwrap_or(2).clamp(1, 2);
-        self.line.write(&[START, GET_INFO]);
+        self.write(&[Command::GetInfo]);
         let build = self.answer(|message| match message {
             Message::Info { build } => Some(*build),
             _ => None,
@@ -239,6 +133,7 @@ impl Gvret {
             Message::Buses(_)
             | Message::Info { .. }
             | Message::Alive
+            | Message::Time(_)
             | Message::Number(_)
             | Message::Other => {}
         }
@@ -246,11 +141,15 @@ impl Gvret {
 
     /// Tells the adapter both buses' settings.
     fn set(&mut self) {
-        let mut command = vec![START, SET_BUSES];
-        for setting in self.settings {
-            command.extend_from_slice(&setting.to_le_bytes());
+        self.write(&[Command::SetBuses(self.buses.map(|bus| (bus, Some(bus.only_listens))))]);
+    }
+
+    fn write(&mut self, commands: &[Command]) {
+        let mut bytes = Vec::new();
+        for command in commands {
+            command.put(&mut bytes);
         }
-        self.line.write(&command);
+        self.line.write(&bytes);
     }
 }
 
@@ -282,21 +181,20 @@ impl Driver for Gvret {
     }
 
     fn open(&mut self, channel: Channel, opening: Opening) -> Result<(), Refusal> {
-        let before = self.settings;
-        let listens = if opening.listen_only { LISTENS } else { 0 };
-        self.settings[channel.index()] = SET_STATE | ENABLED | listens | opening.bitrate_bps;
+        let before = self.buses;
+        let wanted = Bus { is_on: true, only_listens: opening.listen_only, bitrate_bps: opening.bitrate_bps };
+        self.buses[channel.index()] = wanted;
         self.set();
-        self.line.write(&[START, GET_BUSES]);
+        self.write(&[Command::GetBuses]);
         let buses = self.answer(|message| match message {
             Message::Buses(buses) => Some(*buses),
             _ => None,
         });
-        let wanted = (true, opening.listen_only, opening.bitrate_bps);
         match buses {
             Ok(Some(buses)) if buses[channel.index()] == wanted => Ok(()),
             other => {
                 // Left as it is, it might acknowledge frames, or destroy them.
-                self.settings = before;
+                self.buses = before;
                 self.set();
                 Err(if matches!(other, Ok(Some(_))) { Refusal::Unsupported } else { Refusal::Hardware })
             }
@@ -304,9 +202,9 @@ impl Driver for Gvret {
     }
 
     fn close(&mut self, channel: Channel) {
-        self.settings[channel.index()] = SET_STATE;
+        self.buses[channel.index()] = Bus::default();
         self.set();
-        self.line.write(&[START, KEEP_ALIVE]);
+        self.write(&[Command::KeepAlive]);
         // Its answer comes after everything received before.
         let _ = self.answer(|message| (*message == Message::Alive).then_some(()));
     }
@@ -318,15 +216,7 @@ impl Driver for Gvret {
             self.backlog.push(Incoming::NotSent { channel, mailbox, at });
             return true;
         }
-        let id = frame.id();
-        let raw = id.raw() | u32::from(id.is_extended()) << 31;
-        let mut command = vec![START, FRAME];
-        command.extend_from_slice(&raw.to_le_bytes());
-        command.extend_from_slice(&[channel.index() as u8, frame.data_len() as u8]);
-        command.extend_from_slice(frame.data());
-        // Where a checksum was meant to be, which nobody checks.
-        command.push(0);
-        self.line.write(&command);
+        self.write(&[Command::Frame { bus: channel.index() as u8, frame: *frame }]);
         self.backlog.push(Incoming::Sent { channel, mailbox, at });
         true
     }
@@ -337,39 +227,5 @@ impl Driver for Gvret {
 
     fn oddities(&self) -> (u32, String) {
         self.oddities.summary()
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    proptest::proptest! {
-        #[test]
-        fn whatever_arrives_is_used_up_or_waited_for(bytes: Vec<u8>) {
-            if let Some((_, len)) = message(&bytes) {
-                proptest::prop_assert!((1..=bytes.len()).contains(&len));
-            } else {
-                // No message is longer than a CAN FD frame.
-                proptest::prop_assert!(bytes.len() < 80);
-            }
-        }
-    }
-
-    #[test]
-    fn a_frame_in_data_that_lies_about_its_length_is_not_one() {
-        // A length nibble of 15.
-        let lie = [START, FRAME, 1, 0, 0, 0, 0x23, 1, 0, 0, 0x0F, 0, 0, 0, 0, 0, 0, 0, 0];
-        assert_eq!(message(&lie), Some((Message::Garbage, 1)));
-        let whole = [START, FRAME, 4, 3, 2, 1, 0x23, 1, 0, 0, 0x12, 0xAA, 0xBB, 0];
-        let frame = "123#AABB".parse().ok();
-        let read = match message(&whole) {
-            Some((Message::Frame { stamp_us: 0x0102_0304, bus: 1, frame }, 14)) => Some(frame),
-            _ => None,
-        };
-        assert_eq!(read, frame);
-        for cut in 0..whole.len() {
-            assert_eq!(message(&whole[..cut]), None, "{cut}");
-        }
     }
 }

@@ -167,6 +167,11 @@ impl Address {
         }
     }
 
+    /// The serial port's path or name, if a cantap board is expected at one.
+    pub fn serial_port(&self) -> Option<&str> {
+        matches!(self.place, Place::Serial).then_some(self.text.as_str())
+    }
+
     /// Whether a text can only mean a device that needs no port.
     pub fn is_no_port(text: &str) -> bool {
         text == "virtual" || text.starts_with("virtual:") || text.starts_with("emu:")

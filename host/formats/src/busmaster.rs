@@ -31,8 +31,18 @@ enum Times {
 }
 
 /// Whether a text begins like such a file.
+///
+/// Its first lines may have been cut off.
 pub(crate) fn is_head(text: &[u8]) -> bool {
-    text.starts_with(b"***BUSMASTER")
+    [&b"***BUSMASTER"[..], b"***HEX***", b"***DEC***", b"***<Time>"].iter().any(|head| text.starts_with(head))
+}
+
+/// Whether a line is a row of such a file, from which the head was cut off.
+pub(crate) fn is_line(line: &[u8]) -> bool {
+    let mut words = line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
+    let mut next = || words.next().unwrap_or_default();
+    let [time, way, _, _, kind] = [(); 5].map(|()| next());
+    clock(time).is_some() && direction(way).is_ok() && matches!(kind, b"s" | b"x" | b"sr" | b"xr")
 }
 
 impl RowFormat for Decoder {

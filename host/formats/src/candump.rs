@@ -6,7 +6,7 @@ mod decode;
 mod encode;
 mod lengths;
 
-pub(crate) use decode::Decoder;
+pub(crate) use decode::{Decoder, is_untimed};
 pub(crate) use encode::Encoder;
 
 #[cfg(test)]
@@ -44,6 +44,41 @@ mod tests {
         let items: Vec<_> = reader.by_ref().collect();
         assert_eq!((items.len(), items[0].is_err(), items[1].is_ok()), (2, true, true));
         assert_eq!(reader.left_out().iter().collect::<Vec<_>>(), [("CAN XL frames", 2)]);
+    }
+
+    #[test]
+    fn lists_of_frames_for_cansend_are_read_without_times_and_only_as_whole_files() {
+        let (records, issues) =
+            tests::read(Format::Candump, "# doors\n309#40\n00000123#R2\n\n7E0##1AABB\n123#1\nrubbish\n");
+        assert_eq!(
+            tests::write(Format::Candump, &records),
+            "(0.000000) can0 309#40\n(0.000000) can0 00000123#R2\n(0.000000) can0 7E0##1AABB\n"
+        );
+        assert_eq!(issues.len(), 2, "{issues:?}");
+        let (records, issues) = tests::read(Format::Candump, "cansend vcan0 1D0#0A\ncansend vcan1 158#19\n");
+        assert_eq!(
+            tests::write(Format::Candump, &records),
+            "(0.000000) can0 1D0#0A\n(0.000000) can1 158#19\n"
+        );
+        assert_eq!(issues, Vec::<String>::new());
+        // A fragment at the beginning or within a log is no frame.
+        for log in ["123#11\n(1.0) can0 123#11\n", "(1.0) can0 123#11\n123#11\n"] {
+            let (records, issues) = tests::read(Format::Candump, log);
+            assert_eq!((records.len(), issues.len()), (1, 1), "{log}");
+        }
+    }
+
+    /// As programs write them that print SocketCAN's number of the identifier.
+    #[test]
+    fn identifiers_with_the_flag_of_29_bits_are_read() {
+        let (records, issues) =
+            tests::read(Format::Candump, "(1.000000) can0 98f010fe#35\n(1.000000) can0 8cf150fe#\n");
+        let log = tests::write(Format::Candump, &records);
+        assert_eq!(log, "(1.000000) can0 18F010FE#35\n(1.000000) can0 0CF150FE#\n");
+        assert_eq!(issues, Vec::<String>::new());
+        let (_, issues) =
+            tests::read(Format::Candump, "(1.000000) can0 C8F010FE#\n(1.000000) can0 58F010FE#\n");
+        assert_eq!(issues.len(), 2, "{issues:?}");
     }
 
     #[test]

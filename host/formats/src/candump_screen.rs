@@ -36,16 +36,32 @@ pub(crate) fn is_line(line: &[u8]) -> bool {
     }
     let Some((_, rest)) = stamp(&line) else { return false };
     let mut words = rest.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
-    let _interface = words.next();
-    // After the interface and the columns of -x: the identifier, then the length.
+    // The interface, which may be missing, the columns of -x, the identifier, then the length.
     let mut before = words.next().unwrap_or_default();
-    for word in words.take(4) {
+    for word in words.take(5) {
         if length(word).is_some() {
-            return [3, 8].contains(&before.len()) && text::hex(before).is_some();
+            return number(before).is_some();
         }
         before = word;
     }
     false
+}
+
+/// Whether a line is the command itself, with or without what a shell shows before it, or what the first candump printed about its interface.
+pub(crate) fn is_command(line: &[u8]) -> bool {
+    let command = memchr::memmem::find(line, b"$ ").map_or(line, |at| &line[at + 2..]).trim_ascii();
+    command.starts_with(b"candump ") || line.starts_with(b"interface = ")
+}
+
+/// An identifier, and whether it has 29 bits: three digits or eight, `<0x123>` as the first candump wrote it, or four digits, of which the first
+/// is 0, as people's own programs do.
+fn number(word: &[u8]) -> Option<(u32, bool)> {
+    let digits = word.strip_prefix(b"<0x").and_then(|word| word.strip_suffix(b">")).unwrap_or(word);
+    let is_extended = match digits {
+        [_, _, _] | [b'0', _, _, _] => false,
+        _ => (digits.len() == 8).then_some(true)?,
+    };
+    text::hex(digits).map(|raw| (raw, is_extended))
 }
 
 /// `[8]` for a classical frame, `[08]` for one of CAN FD, `{F}` for a length code above 8.
@@ -119,7 +135,7 @@ impl RowFormat for Decoder {
         let line = plain(line);
         // The explanation of an error frame (-e) is on the lines below it.
         // Comments are those of the people who kept it.
-        if line.is_empty() || line.starts_with(b"\t") || line.starts_with(b"#") {
+        if line.is_empty() || line.starts_with(b"\t") || line.starts_with(b"#") || is_command(&line) {
             return Ok(Line::Nothing);
         }
         let missing = || Fault::malformed("a line of candump such as 'can0  123   [2]  11 22'", &line);
@@ -151,7 +167,12 @@ impl Decoder {
     fn row(&mut self, line: &[u8], time: &[u8], rest: &[u8], zone: &Zone) -> Result<Line, Fault> {
         let missing = || Fault::malformed("a line of candump such as 'can0  123   [2]  11 22'", line);
         let time_ns = self.time(time, zone)?;
-        let (interface, rest) = text::word(rest);
+        let (first, behind) = text::word(rest);
+        // Without an interface, the length follows the first word.
+        let (interface, rest) = match number(first).and(length(text::word(behind).0)) {
+            Some(_) => (&b"can0"[..], rest),
+            None => (first, behind),
+        };
         let (mut id, mut rest) = text::word(rest);
         let (mut direction, mut flags) = (Direction::Rx, FdFields::default());
         if let b"RX" | b"TX" = id {
@@ -162,12 +183,12 @@ impl Decoder {
             (id, rest) = text::word(behind);
         }
         let (len, rest) = text::word(rest);
-        let raw = text::hex(id).filter(|_| [3, 8].contains(&id.len())).ok_or_else(missing)?;
+        let (raw, is_extended) = number(id).ok_or_else(missing)?;
         let (len, is_fd) = length(len).ok_or_else(missing)?;
         let channel = self.interfaces.channel(interface);
         let record = |event| TraceRecord { time_ns, channel, event };
         let mut words = rest.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
-        if id.len() == 8 && raw & ERROR_FLAG != 0 {
+        if is_extended && raw & ERROR_FLAG != 0 {
             let data = Payload::words(words, usize::from(len.min(8)), hex_byte)?;
             let (event, second) = self.errors.read(raw, data.first_eight());
             return Ok(match second {
@@ -177,7 +198,7 @@ impl Decoder {
         }
         let remote = rest.trim_ascii().starts_with(b"remote request");
         let fd = is_fd.then_some(flags);
-        let id = identifier(raw, id.len() == 8, id)?;
+        let id = identifier(raw, is_extended, id)?;
         let fields = FrameFields { id, remote, direction, len, fd };
         let data = Payload::words(&mut words, fields.data_len(), hex_byte)?;
         // With a byte too many, the length is wrong: a digit was changed.
@@ -248,6 +269,21 @@ mod tests {
         assert!(as_log(&lines(from_start)).0.contains("(0.020500)"));
         let absolute = ["2015-07-10 08:17:32.249713"; 4];
         assert!(as_log(&lines(absolute)).0.starts_with("(1436516252.249713)"));
+    }
+
+    /// As people keep it: with the command, from a program of their own, from the first candump of all.
+    #[test]
+    fn a_command_a_missing_interface_and_old_identifiers_are_read() {
+        let (log, issues) = as_log(
+            "pi@car:~ $ candump can0\n  can0  080   [0] \ncandump any\n0128 [2] 0b 61 \n18DAF110 [1] AA\n\
+             interface = can0, family = 29, type = 3, proto = 1\n<0x18eeff01> [2] 05 a0 \n<0x123> [0]\n (1.5)  7FF [1] 00\n",
+        );
+        assert_eq!(issues, Vec::<String>::new());
+        let lines = ["080#", "128#0B61", "18DAF110#AA", "18EEFF01#05A0", "123#"]
+            .map(|frame| format!("(0.000000) can0 {frame}\n"));
+        assert_eq!(log, format!("{}(1.500000) can0 7FF#00\n", lines.concat()));
+        let (log, issues) = as_log("1128 [2] 0b 61\n<0x923> [0]\n<0x12> [0]\n0128 [2] 0b\n");
+        assert_eq!((log.as_str(), issues.len()), ("", 4), "{issues:#?}");
     }
 
     #[test]

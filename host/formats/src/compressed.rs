@@ -49,6 +49,7 @@ enum Encoder {
 
 impl Encoder {
     fn new(compression: Compression) -> io::Result<Self> {
+        compression.check_written()?;
         let out = Vec::new();
         Ok(match compression {
             Compression::Gzip => {
@@ -67,7 +68,8 @@ impl Encoder {
                 let info = lz4_flex::frame::FrameInfo::new().block_checksums(true).content_checksum(true);
                 Self::Lz4(lz4_flex::frame::FrameEncoder::with_frame_info(info, out))
             }
-            Compression::Xz => {
+            // Refused before.
+            Compression::Bzip2 | Compression::Xz => {
                 let options = lzma_rust2::XzOptions::with_preset(XZ_PRESET);
                 Self::Xz(lzma_rust2::XzWriter::new(out, options)?)
             }

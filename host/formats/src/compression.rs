@@ -10,14 +10,17 @@ pub(crate) enum Compression {
     Zstd,
     Xz,
     Lz4,
+    /// Only read.
+    Bzip2,
 }
 
 /// Each with its suffix and as many of its first four bytes as do not vary.
-const KNOWN: [(Compression, &str, &[u8]); 4] = [
+const KNOWN: [(Compression, &str, &[u8]); 5] = [
     (Compression::Gzip, ".gz", &[0x1F, 0x8B]),
     (Compression::Zstd, ".zst", &[0x28, 0xB5, 0x2F, 0xFD]),
     (Compression::Xz, ".xz", &[0xFD, b'7', b'z', b'X']),
     (Compression::Lz4, ".lz4", &[0x04, 0x22, 0x4D, 0x18]),
+    (Compression::Bzip2, ".bz2", super::bzip2::MAGIC),
 ];
 
 /// This many bytes are enough to detect how a file is compressed.
@@ -34,7 +37,7 @@ pub(crate) fn without_zstd() -> io::Error {
 }
 
 impl Compression {
-    /// By suffix: `.gz`, `.zst`, `.xz`, `.lz4`.
+    /// By suffix: `.gz`, `.zst`, `.xz`, `.lz4`, `.bz2`.
     pub(crate) fn of_path(path: &Path) -> Option<Self> {
         Self::split(&path.file_name()?.to_string_lossy()).1
     }
@@ -56,6 +59,15 @@ impl Compression {
         KNOWN.iter().find(|(.., magic)| head.starts_with(magic)).map(|(compression, ..)| *compression)
     }
 
+    /// Whether files can be written so. If not, the error says what else there is.
+    pub(crate) fn check_written(self) -> io::Result<()> {
+        if self != Self::Bzip2 {
+            return Ok(());
+        }
+        let reason = "bzip2 is only read; .gz, .zst, .xz and .lz4 are written";
+        Err(io::Error::new(io::ErrorKind::Unsupported, reason))
+    }
+
     /// Unpacks a file; several members, frames or streams one after another are one file.
     pub(crate) fn unpack(self, source: impl Read + Send + 'static) -> io::Result<Box<dyn Read + Send>> {
         Ok(match self {
@@ -66,6 +78,7 @@ impl Compression {
             Self::Zstd => return Err(without_zstd()),
             Self::Xz => Box::new(XzStreams::new(source)),
             Self::Lz4 => Box::new(Lz4Frames::new(source)),
+            Self::Bzip2 => Box::new(super::bzip2::Bzip2::new(source)),
         })
     }
 }
@@ -227,6 +240,7 @@ mod tests {
             ("a.log.gz", "a.log", Some(Compression::Gzip)),
             ("a.blf.XZ", "a.blf", Some(Compression::Xz)),
             ("a.lz4", "a", Some(Compression::Lz4)),
+            ("a.asc.bz2", "a.asc", Some(Compression::Bzip2)),
             ("µ", "µ", None),
             ("a.gzip", "a.gzip", None),
         ] {

@@ -6,13 +6,12 @@ use super::{Format, table};
 pub(crate) const HEAD_BYTES: usize = 256;
 
 /// Other files that users mistake for traces, by their first bytes.
-const KNOWN: [(&[u8], &str); 12] = [
+const KNOWN: [(&[u8], &str); 11] = [
     (b"PK\x03\x04", "a ZIP archive or spreadsheet"),
     (b"%PDF", "a PDF document"),
     (b"\x7FELF", "a program"),
     (b"\x89PNG", "a picture"),
     (b"7z\xBC\xAF\x27\x1C", "a 7z archive"),
-    (b"BZh", "a bzip2 archive"),
     (b"VERSION \"", "a DBC database"),
     (b"<", "XML or HTML"),
     (b"{", "JSON"),

@@ -42,7 +42,8 @@ pub(crate) fn is_line(line: &[u8]) -> bool {
 
 impl RowFormat for Decoder {
     fn line(&mut self, line: &[u8], _zone: &Zone) -> Result<Line, Fault> {
-        if line.is_empty() {
+        // Its own comments are lines of the type CXX; people add others.
+        if line.is_empty() || line.starts_with(b"#") {
             return Ok(Line::Nothing);
         }
         let (time, rest) = text::word(line);

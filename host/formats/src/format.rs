@@ -47,6 +47,10 @@ pub enum Format {
     CanEdgeCsv,
     /// The log of Battery-Emulator.
     BatteryEmulator,
+    /// What gateways between NMEA 2000 and computers print.
+    Nmea2000,
+    /// The trace of CARBUS Analyzer.
+    Carbus,
     /// A table of any columns.
     Table,
 }

@@ -132,10 +132,19 @@ impl Input {
 
     /// Reads from a source that may be compressed, or a text in UTF-16.
     pub(crate) fn decompressing(source: Box<dyn Read + Send>, follow: bool) -> io::Result<Self> {
-        let mut input = Self::new(source, follow);
+        Self::new(source, follow).recognised()
+    }
+
+    /// Reads from what unpacks a file of an archive, which may be compressed or in UTF-16, too.
+    pub(crate) fn unpacking(source: Box<dyn Read + Send>) -> io::Result<Self> {
+        Self { is_as_it_is: false, ..Self::new(source, false) }.recognised()
+    }
+
+    fn recognised(self) -> io::Result<Self> {
+        let mut input = self;
         if let Some(compression) = Compression::of_content(input.peek(compression::MAGIC_BYTES)?) {
-            input = Self::new(compression.unpack(input.into_rest())?, false);
-            input.is_as_it_is = false;
+            let unpacked = compression.unpack(input.into_rest())?;
+            input = Self { is_as_it_is: false, ..Self::new(unpacked, false) };
         }
         if let Some(order) = Utf16::of_content(input.peek(utf16::HEAD_BYTES)?) {
             input = input.converted(|rest, follow| Box::new(ToUtf8::new(rest, order, follow)));

@@ -11,16 +11,19 @@
 extern crate self as cantap_formats;
 
 mod analyser;
+mod archive;
 mod asc;
 mod battery_emulator;
 mod blf;
 mod busmaster;
+mod bzip2;
 mod calendar;
 mod candump;
 mod candump_screen;
 mod canedge;
 mod canhacker;
 mod canking;
+mod carbus;
 mod carriage_return;
 mod codec;
 mod compressed;
@@ -46,6 +49,7 @@ mod left_out;
 mod line;
 mod mf4;
 mod microchip;
+mod nmea2000;
 mod output;
 mod pcap;
 mod pcapng;
@@ -74,6 +78,7 @@ mod zone;
 
 pub(crate) use analyser::date as date_time_ns;
 pub use analyser::{DifConvention, LineEnd, TableStyle};
+pub use archive::ArchiveError;
 pub use create::{create_stream_writer, create_writer};
 pub use csv::CsvDialect;
 pub use format::Format;

@@ -38,8 +38,11 @@ impl Output {
         if path.as_os_str() == "-" {
             return Ok(Self::Stream(Box::new(io::stdout())));
         }
+        let compression = Compression::of_path(path);
+        // If it cannot be written, nothing is created or overwritten.
+        compression.map_or(Ok(()), Compression::check_written)?;
         let file = File::create(path)?;
-        Ok(match Compression::of_path(path) {
+        Ok(match compression {
             // A pipe or device cannot be rewound.
             None if !file.metadata()?.is_file() => Self::Stream(Box::new(file)),
             None => Self::File { file, written: 0, extent: 0 },

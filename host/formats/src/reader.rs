@@ -6,6 +6,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use super::Format;
+use super::archive::{self, ArchiveError, OpenFailure};
 use super::codec::{BATCH, Decode};
 use super::content;
 use super::found::Found;
@@ -14,7 +15,7 @@ use super::issue::{Fault, Place, ReadIssue};
 use super::left_out::LeftOut;
 use super::read_options::ReadOptions;
 use super::spec::{FormatSpec, UnknownFormat};
-use cantap_trace::{PlainFrame, TraceRecord};
+use cantap_trace::{PlainFrame, TraceRecord, clean};
 
 /// Why a file cannot be opened for reading.
 #[derive(Debug, thiserror::Error)]
@@ -26,6 +27,9 @@ pub enum OpenError {
     /// Neither name nor content show the format.
     #[error(transparent)]
     Format(#[from] UnknownFormat),
+    /// Which file of an archive to read is not clear, or it cannot be unpacked.
+    #[error(transparent)]
+    Archive(#[from] ArchiveError),
 }
 
 /// Nothing of a file could be read, and it is not simply empty.
@@ -77,12 +81,44 @@ enum Beyond {
 }
 
 /// Opens a trace file, or standard input for `-` (a candump log unless the options or the first bytes say
-/// otherwise). Compression (gzip, zstd, xz, LZ4) is recognised by content.
+/// otherwise). Compression (gzip, zstd, xz, LZ4, bzip2) is recognised by content. Of a ZIP archive, the only file that may be a trace is read, or the
+/// one in a path such as `traces.zip/inside/a.asc`.
 pub fn open_reader(path: impl AsRef<Path>, options: &ReadOptions) -> Result<TraceReader, OpenError> {
     let path = path.as_ref();
     let name = if path.as_os_str() == "-" { "standard input".to_owned() } else { path.display().to_string() };
-    let input = Input::open(path, options.follow).map_err(|error| OpenError::Io(name.clone(), error))?;
-    recognise(path, name, input, options)
+    let (file, member) = archive::split(path);
+    let input = Input::open(file, options.follow).map_err(|error| OpenError::Io(name.clone(), error))?;
+    let name = if member.is_some() { file.display().to_string() } else { name };
+    open(file, name, input, member.as_deref(), options)
+}
+
+/// Finds the file to read, if it is in an archive, and opens it.
+fn open(
+    path: &Path,
+    name: String,
+    mut input: Input,
+    member: Option<&str>,
+    options: &ReadOptions,
+) -> Result<TraceReader, OpenError> {
+    let failed = |error| OpenError::Io(name.clone(), error);
+    // A pipe may deliver less than that for a long time, but no archive.
+    let head =
+        if input.has_line() { input.buffered() } else { input.peek(archive::HEAD_BYTES).map_err(failed)? };
+    if !archive::is_archive(head) {
+        return match member {
+            Some(_) => Err(ArchiveError::NotOne(name).into()),
+            None => recognise(path, name, input, options),
+        };
+    }
+    let opened = archive::open(input.whole().map_err(failed)?, &name, member);
+    let (inside, source) = opened.map_err(|failure| match failure {
+        OpenFailure::Io(error) => failed(error),
+        OpenFailure::Archive(error) => error.into(),
+        OpenFailure::NoTrace(error) => error.into(),
+    })?;
+    let name = format!("{name}/{}", clean::line(&inside.to_string_lossy()));
+    let input = Input::unpacking(source).map_err(|error| OpenError::Io(name.clone(), error))?;
+    recognise(&inside, name, input, options)
 }
 
 /// Like [`open_reader`], for the bytes of a file of this name that is not in the file system: an archive's, a browser's.
@@ -93,7 +129,7 @@ pub fn open_source(
 ) -> Result<TraceReader, OpenError> {
     let input = Input::decompressing(Box::new(source), options.follow)
         .map_err(|error| OpenError::Io(name.to_owned(), error))?;
-    recognise(Path::new(name), name.to_owned(), input, options)
+    open(Path::new(name), name.to_owned(), input, None, options)
 }
 
 /// Finds the format by content and name.

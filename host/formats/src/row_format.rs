@@ -17,6 +17,8 @@ pub(crate) enum Line {
     Record(TraceRecord),
     /// Two at the same time.
     Two(TraceRecord, TraceEvent),
+    /// Something that a CAN trace does not hold, by kind.
+    LeftOut(&'static str),
     /// Nothing from the bus: part of the header, a comment, an empty line.
     Nothing,
 }
@@ -88,11 +90,12 @@ impl<F: RowFormat> Decode for Rows<F> {
                     return Ok(line.cut());
                 }
                 Ok(Line::Record(record)) => return Ok(Found::Record(record)),
-                Ok(Line::Two(..)) if !line.terminated => return Ok(line.cut()),
+                Ok(Line::Two(..) | Line::LeftOut(_)) if !line.terminated => return Ok(line.cut()),
                 Ok(Line::Two(record, second)) => {
                     self.more.keep([TraceRecord { event: second, ..record }]);
                     return Ok(Found::Record(record));
                 }
+                Ok(Line::LeftOut(what)) => return Ok(Found::LeftOut(what)),
                 Err(fault) => return Ok(line.issue(fault)),
             }
         }

@@ -16,8 +16,8 @@ use super::row_format::Rows;
 use super::trc::TrcVersion;
 use super::writer::WriteOptions;
 use super::{
-    asc, battery_emulator, blf, busmaster, candump, candump_screen, canedge, canhacker, canking, crtd, csv,
-    gvret, kvaser, mf4, microchip, pcap, pcapng, printer, table, trc,
+    asc, battery_emulator, blf, busmaster, candump, candump_screen, canedge, canhacker, canking, carbus,
+    crtd, csv, gvret, kvaser, mf4, microchip, nmea2000, pcap, pcapng, printer, table, trc,
 };
 
 /// One format.
@@ -55,10 +55,12 @@ impl<'a> Head<'a> {
         /// Where the header of a log names its program.
         const HEAD_BYTES: usize = 1024;
         let text = bytes[..bytes.len().min(HEAD_BYTES)].trim_ascii_start();
-        let mut lines = text.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii_end);
+        let lines = text.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii_end);
         let line = lines.clone().next().unwrap_or_default();
-        let first = lines.find(|line| !line.is_empty() && !line.starts_with(b"#")).unwrap_or_default();
-        Self { bytes, text, line, first }
+        let is_comment = |line: &[u8]| line.starts_with(b"#") || candump_screen::is_command(line);
+        // The first line is not among the others any more.
+        let first = std::iter::once(line).chain(lines).find(|line| !line.is_empty() && !is_comment(line));
+        Self { bytes, text, line, first: first.unwrap_or_default() }
     }
 }
 
@@ -83,7 +85,8 @@ const FORMATS: &[FormatSpec] = &[
         suffixes: &["log", "txt"],
         begins: |head| {
             let others = [candump_screen::is_line, battery_emulator::is_line];
-            head.first.starts_with(b"(") && !others.iter().any(|is_line| is_line(head.first))
+            let timed = head.first.starts_with(b"(") && !others.iter().any(|is_line| is_line(head.first));
+            timed || candump::is_untimed(head.first)
         },
         has_head: false,
         reader: |_| Box::new(candump::Decoder::default()),
@@ -248,7 +251,7 @@ const FORMATS: &[FormatSpec] = &[
         format: Format::Busmaster,
         names: &["busmaster"],
         suffixes: &["log"],
-        begins: |head| busmaster::is_head(head.text),
+        begins: |head| busmaster::is_head(head.text) || busmaster::is_line(head.line),
         has_head: true,
         reader: |_| Box::new(Rows::<busmaster::Decoder>::default()),
         writer: None,
@@ -257,7 +260,7 @@ const FORMATS: &[FormatSpec] = &[
         format: Format::Crtd,
         names: &["crtd"],
         suffixes: &["crtd", "crt"],
-        begins: |head| crtd::is_line(head.line),
+        begins: |head| crtd::is_line(head.first),
         has_head: false,
         reader: |_| Box::new(Rows::<crtd::Decoder>::default()),
         writer: None,
@@ -335,6 +338,24 @@ const FORMATS: &[FormatSpec] = &[
         writer: None,
     },
     FormatSpec {
+        format: Format::Nmea2000,
+        names: &["n2k"],
+        suffixes: &["raw", "txt", "log"],
+        begins: |head| nmea2000::is_line(head.first),
+        has_head: false,
+        reader: |_| Box::new(Rows::<nmea2000::Decoder>::default()),
+        writer: None,
+    },
+    FormatSpec {
+        format: Format::Carbus,
+        names: &["carbus"],
+        suffixes: &["trc"],
+        begins: |head| carbus::is_head(head.text),
+        has_head: true,
+        reader: |_| Box::new(Rows::<carbus::Decoder>::default()),
+        writer: None,
+    },
+    FormatSpec {
         format: Format::Table,
         names: &["table"],
         suffixes: &["csv", "tsv", "txt"],
@@ -409,7 +430,7 @@ impl Format {
         FORMATS.iter().map(|spec| spec.names[0]).collect::<Vec<_>>().join(", ")
     }
 
-    /// By a path's suffix; `.gz`, `.zst`, `.xz` and `.lz4` are skipped.
+    /// By a path's suffix; `.gz`, `.zst`, `.xz`, `.lz4` and `.bz2` are skipped.
     pub fn of_path(path: &Path) -> Result<Self, UnknownFormat> {
         Self::all()
             .find(|format| format.has_suffix_of(path))
@@ -486,7 +507,23 @@ mod tests {
             (utf8(" (000.000000)  can0  RX - -  12345678   [0]\n"), Format::CandumpScreen),
             (utf8("# drive 3\n\n can0  123   [2]  11 22\n"), Format::CandumpScreen),
             (utf8("# drive 3\n(1410714882.622188) can0 123#11\n"), Format::Candump),
+            (utf8("123#DEADBEEF\n18DAF110#\n"), Format::Candump),
+            (utf8("cansend vcan0 1D0#000000000000000A\n"), Format::Candump),
+            (utf8("candump can0\n  can0  080   [0] \n"), Format::CandumpScreen),
+            (utf8("pi@car:~$ candump any\n  can0  080   [0] \n"), Format::CandumpScreen),
+            (
+                utf8("interface = can0, family = 29, type = 3, proto = 1\n<0x18eeff01> [1] 05\n"),
+                Format::CandumpScreen,
+            ),
+            (utf8("0128 [2] 0b 61\n"), Format::CandumpScreen),
             (utf8("***BUSMASTER Ver 2.4.0***\n"), Format::Busmaster),
+            (utf8("\r\n***HEX***\n***RELATIVE MODE***\n"), Format::Busmaster),
+            (utf8("22:20:14:992 Rx 0 0000021A s 2 FE 36\n"), Format::Busmaster),
+            (utf8("00:29:58.617 R 0DFF180D A2 8C\n"), Format::Nmea2000),
+            (utf8("2011-11-24-22:42:04.388,2,127250,36,255,2,ff,10\n"), Format::Nmea2000),
+            (utf8("A000159.990 CCFF7 0FF63 3B9F\n"), Format::Nmea2000),
+            (utf8("@ TEXT @ 3 @ 64 @ 0 @ 10094 @ 20672 @ 00:00:20.672 @\r"), Format::Carbus),
+            (utf8("# a fixture\n1320745424.002 1R11 402 FA 01\n"), Format::Crtd),
             (utf8("1320745424.000 CXX OVMS converted log\n"), Format::Crtd),
             (utf8("123.431 2R11 27E 00\n"), Format::Crtd),
             (utf8("                              Kvaser Memorator Log\n"), Format::Kvaser),
@@ -505,6 +542,9 @@ mod tests {
             (utf8("time,addr,bus,data\n"), Format::Table),
             (utf8("Index;ID;Data\n"), Format::Table),
             (utf8("1478198376.389427,0316,2,05,21,R\n"), Format::Table),
+            (utf8("1483093132.049669        0380    000    2    30 bb\n"), Format::Table),
+            (utf8("0.001 0x100 204E00000000\n"), Format::Table),
+            (utf8("11T082554602;1;cf00203;cd402800043828ff\n"), Format::Table),
         ] {
             assert_eq!(Format::of_content(&head), Some(format), "{}", String::from_utf8_lossy(&head));
             let begins = FORMATS.iter().filter(|spec| (spec.begins)(&Head::of(&head)));
@@ -543,6 +583,9 @@ mod tests {
     #[test]
     fn a_format_that_is_only_read_is_not_written_and_nothing_is_created() {
         let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.log.bz2");
+        let error = crate::create_writer(&path, &crate::WriteOptions::default()).err().unwrap().to_string();
+        assert!(error.contains("only read") && error.contains(".xz") && !path.exists(), "{error}");
         for format in Format::all().filter(|format| !format.is_written()) {
             let path = dir.path().join("a");
             let options = crate::WriteOptions { format: Some(format), ..Default::default() };

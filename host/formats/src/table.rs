@@ -17,6 +17,7 @@ use cantap_trace::{Direction, TraceRecord};
 use columns::{Form, Role};
 use layout::{Layout, Separator};
 use time::FileDate;
+pub(crate) use time::date;
 
 const NO_TIMES: &str = "the table has no times: all its frames stand at 0";
 const OTHERS: &str = "columns of the table that have no place in a trace, such as labels, were left out";

@@ -40,6 +40,16 @@ pub enum BoardError {
     Connect(ConnectError),
 }
 
+impl BoardError {
+    /// Whether the board is not there, or another program has it, which may change: what is wrong with one that is there does not mend itself.
+    pub const fn is_absent(&self) -> bool {
+        matches!(
+            self,
+            Self::Connect(_) | Self::Device(DeviceError::NotFound { .. } | DeviceError::Busy { .. })
+        )
+    }
+}
+
 /// Time from a failure to the next try.
 const RETRY_AFTER: Duration = Duration::from_millis(500);
 /// Time limit for each request before there are clients.
@@ -51,10 +61,10 @@ const LAST_WORDS: Duration = Duration::from_millis(1500);
 /// Bytes on their way to a client in this process, and from it.
 const PIPE_BYTES: usize = 64 * 1024;
 
-/// A shared board. Dropping it ends every session, and the board leaves its buses.
+/// A shared board. Dropping it ends every session, and the board leaves its buses: see [`Board::end`].
 pub struct Board {
     shared: Arc<Shared>,
-    threads: Vec<JoinHandle<()>>,
+    threads: Mutex<Vec<JoinHandle<()>>>,
 }
 
 impl Board {
@@ -88,12 +98,13 @@ impl Board {
             .name("cantap-board".to_owned())
             .spawn(move || run(&for_thread, connect, first))
             .map_err(DeviceError::Thread)?;
-        let mut board = Self { shared, threads: vec![thread] };
+        let board = Self { shared, threads: Mutex::new(vec![thread]) };
         match began.recv() {
             Ok(Ok(())) => {
                 let shared = Arc::clone(&board.shared);
                 let modes = std::thread::Builder::new().name("cantap-modes".to_owned());
-                board.threads.push(modes.spawn(move || modes::run(&shared)).map_err(DeviceError::Thread)?);
+                lock(&board.threads)
+                    .push(modes.spawn(move || modes::run(&shared)).map_err(DeviceError::Thread)?);
                 Ok(board)
             }
             Ok(Err(error)) => Err(error),
@@ -207,14 +218,21 @@ impl Board {
     }
 }
 
-impl Drop for Board {
-    fn drop(&mut self) {
+impl Board {
+    /// Ends every session; the board leaves its buses. A server that ends calls it, because connections have a board for as long as they last.
+    pub fn end(&self) {
         self.shared.quit.store(true, Ordering::Relaxed);
-        for thread in self.threads.drain(..) {
+        for thread in std::mem::take(&mut *lock(&self.threads)) {
             let _ = thread.join();
         }
         // Clients that are still reading learn that it is over.
         self.shared.wait_for(LAST_WORDS, |state| state.writers == 0);
+    }
+}
+
+impl Drop for Board {
+    fn drop(&mut self) {
+        self.end();
     }
 }
 
@@ -244,13 +262,7 @@ fn run(shared: &Arc<Shared>, mut connect: Connect, first: Sender<Result<(), Boar
             }
             Err(error) => {
                 if let Some(first) = first.take() {
-                    // What is wrong with a board that is there does not mend itself.
-                    let is_absent = matches!(
-                        &error,
-                        BoardError::Connect(_)
-                            | BoardError::Device(DeviceError::NotFound { .. } | DeviceError::Busy { .. })
-                    );
-                    if !(shared.settings.waits_for_board && is_absent) {
+                    if !(shared.settings.waits_for_board && error.is_absent()) {
                         let _ = first.send(Err(error));
                         return;
                     }

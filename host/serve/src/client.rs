@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
-use cantap::device::is_idle;
+use cantap::device::{channel_number, is_idle};
 use cantap::responder::{Inbox, Incoming, encode_response};
 use cantap_wire::message::{Defaults, Role, capability};
 use cantap_wire::{CHANNELS, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply, Request};
@@ -305,6 +305,13 @@ impl Client {
         })
     }
 
+    /// Checks that its permissions cover channels that it is about to configure.
+    fn must_have(&self, these: &[Channel]) -> Result<(), Refusal> {
+        self.must_be_permitted(Role::Configure, |permit, number| {
+            these.iter().try_for_each(|channel| permit.channel(channel_number(number, *channel)))
+        })
+    }
+
     /// Adds to the audit log what it did, for which there is a channel.
     fn note(&self, event: &str, channel: Channel, more: impl FnOnce() -> Value) {
         self.shared.note(|| {
@@ -466,10 +473,12 @@ impl Client {
             // A measurement's edges go to a single client: the one with the right to configure the channel. It ends when a
             // channel opens.
             Command::Configure { channel, .. } | Command::MeasureEdges { channel: Some(channel) } => {
+                self.must_have(&[channel])?;
                 self.shared.state().hold(self.id, &[channel])?;
                 self.shared.ask(command, Then::Nothing)
             }
             Command::ClearDefaults => {
+                self.must_have(&Channel::ALL)?;
                 self.shared.state().hold(self.id, &Channel::ALL)?;
                 self.shared.ask(command, Then::Nothing)
             }
@@ -477,8 +486,12 @@ impl Client {
                 self.shared.state().must_hold_any(self.id)?;
                 self.shared.ask(command, Then::Nothing)
             }
-            Command::SaveDefaults => self.save_defaults(),
+            Command::SaveDefaults => {
+                self.must_have(&Channel::ALL)?;
+                self.save_defaults()
+            }
             Command::Reset => {
+                self.must_have(&Channel::ALL)?;
                 let mut state = self.shared.state();
                 state.hold(self.id, &Channel::ALL)?;
                 if Channel::ALL.into_iter().any(|channel| state.others_on(self.id, channel).0) {

@@ -7,12 +7,17 @@
 #![forbid(unsafe_code)]
 
 pub mod audit;
+pub mod beacon;
 mod board;
 mod board_figures;
+pub mod cannelloni;
 mod client;
 pub mod connect;
 mod flow;
 mod foreign;
+pub mod gvret;
+#[cfg(unix)]
+mod inherited;
 pub mod lines;
 pub mod listen;
 mod lock;
@@ -20,7 +25,10 @@ mod log_limit;
 pub mod metrics;
 mod modes;
 mod news;
+mod open_bus;
 mod outbox;
+mod own_frames;
+mod pace;
 #[cfg(unix)]
 mod peer;
 pub mod permissions;

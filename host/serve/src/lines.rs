@@ -4,7 +4,7 @@ use std::io;
 use std::net::SocketAddr;
 use std::net::TcpStream;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use cantap::Device;
 use cantap::device::{Records, channel_number, is_idle, write_patiently};
@@ -13,6 +13,7 @@ use cantap_wire::{Channel, Refusal};
 
 use crate::foreign;
 use crate::listen::{Listening, accept, bind_loopback, turn_away};
+use crate::pace::Pace;
 use crate::places::{Places, ends};
 use crate::writer::PATIENCE;
 use crate::{Board, News};
@@ -75,10 +76,12 @@ fn serve(boards: &[Arc<Board>], mut stream: TcpStream, name: &str) -> Result<(),
         heard.push((number, device, records));
     }
     let mut out = String::new();
+    let mut pace = Pace::default();
     loop {
         for (number, _, records) in &mut heard {
+            let wait = if out.is_empty() { WAIT } else { pace.left(Instant::now()) };
             // The board or the server is gone, so the connection is, too.
-            let Ok(Some(batch)) = records.next_batch(WAIT) else { return Ok(()) };
+            let Ok(Some(batch)) = records.next_batch(wait) else { return Ok(()) };
             for record in &batch {
                 let Some(channel) = Channel::from_number(record.channel) else { continue };
                 crate::text::put_line(&mut out, channel_number(*number, channel), record);
@@ -87,10 +90,14 @@ fn serve(boards: &[Arc<Board>], mut stream: TcpStream, name: &str) -> Result<(),
         if out.is_empty() && is_over(&stream)? {
             return Ok(());
         }
+        if out.is_empty() || !pace.left(Instant::now()).is_zero() {
+            continue;
+        }
         if write_patiently(&mut stream, out.as_bytes(), PATIENCE).is_err() {
             return Ok(());
         }
         out.clear();
+        pace.has_written(Instant::now());
     }
 }
 

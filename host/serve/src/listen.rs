@@ -16,6 +16,8 @@ use crate::client::{Guest, Identity};
 use crate::connect::SOCKET_TIMEOUT;
 use crate::connect::prepare;
 #[cfg(unix)]
+use crate::inherited;
+#[cfg(unix)]
 use crate::peer;
 use crate::places::{NoPlace, Place, Places, ends, refuse};
 #[cfg(unix)]
@@ -79,10 +81,15 @@ impl Drop for Listening {
 }
 
 /// Admits clients of this user on this machine only: nobody else can open the socket at `path`, and the system is asked who each client
-/// is. A socket left behind by a server is replaced, and nothing else.
+/// is. A socket left behind by a server is replaced, and nothing else. If standard input is a socket that listens there, it is taken as it is.
 #[cfg(unix)]
 pub fn unix(board: &Arc<Board>, path: &Path, role: Role) -> Result<Listening, SocketError> {
-    let (listener, file) = socket_file::bind(path)?;
+    let (listener, file) = if let Some(listener) = inherited::unix(path) {
+        (listener, None)
+    } else {
+        let (listener, file) = socket_file::bind(path)?;
+        (listener, Some(file))
+    };
     let board = Arc::clone(board);
     let places = Places::new(board.most_clients());
     let mut count = 0;
@@ -104,7 +111,7 @@ pub fn unix(board: &Arc<Board>, path: &Path, role: Role) -> Result<Listening, So
         let_in(&board, place, stream, output, Arrival { name, role, is_remote: false, identity: None });
         Ok(())
     })?;
-    listening.file = Some(file);
+    listening.file = file;
     Ok(listening)
 }
 
@@ -144,8 +151,13 @@ pub(crate) fn bind_loopback(address: SocketAddr) -> io::Result<(TcpListener, Soc
     bind(address)
 }
 
+/// A socket at an address: the one that the program was started with, if it is there.
 pub(crate) fn bind(address: SocketAddr) -> io::Result<(TcpListener, SocketAddr)> {
-    let listener = TcpListener::bind(address)?;
+    #[cfg(unix)]
+    let given = inherited::tcp(address);
+    #[cfg(not(unix))]
+    let given = None;
+    let listener = given.map_or_else(|| TcpListener::bind(address), Ok)?;
     listener.set_nonblocking(true)?;
     let address = listener.local_addr()?;
     Ok((listener, address))

@@ -50,6 +50,20 @@ pub enum News {
         /// What is not permitted.
         reason: String,
     },
+    /// What a client of a foreign protocol asked for was not done.
+    NotDone {
+        /// Its name.
+        client: String,
+        /// What, and why.
+        reason: String,
+    },
+    /// A client was not told of what happened, because its protocol has no message for it.
+    LeftOut {
+        /// Its name.
+        client: String,
+        /// What, with its numbers.
+        what: String,
+    },
     /// A client has sent nothing for this long, and only listens again on a channel.
     Idle {
         /// Its name.
@@ -92,6 +106,8 @@ impl News {
             Self::RefusedMore { .. } => "refused_more",
             Self::DeadMan { .. } => "dead_man",
             Self::NotPermitted { .. } => "not_permitted",
+            Self::NotDone { .. } => "not_done",
+            Self::LeftOut { .. } => "left_out",
             Self::Idle { .. } => "idle",
             Self::OffBus { .. } => "off_bus",
             Self::BoardLost { .. } => "board_lost",
@@ -107,6 +123,8 @@ impl News {
             | Self::Refused { client, .. }
             | Self::DeadMan { client, .. }
             | Self::NotPermitted { client, .. }
+            | Self::NotDone { client, .. }
+            | Self::LeftOut { client, .. }
             | Self::Idle { client, .. }
             | Self::OffBus { client: Some(client), .. } => Some(client),
             Self::RefusedMore { .. }
@@ -124,7 +142,7 @@ impl fmt::Display for News {
             Self::ClientLeft { client, reason: None } => write!(f, "{client} has left"),
             Self::ClientLeft { client, reason: Some(reason) } => write!(f, "{client} was let go: {reason}"),
             Self::Refused { client, reason } => write!(f, "{client} was not let in: {reason}"),
-            Self::RefusedMore { count } => write!(f, "{count} more were not let in"),
+            Self::RefusedMore { count } => write!(f, "{count} more were refused"),
             Self::DeadMan { client, after } => {
                 write!(
                     f,
@@ -132,7 +150,12 @@ impl fmt::Display for News {
                     after.as_secs_f64()
                 )
             }
-            Self::NotPermitted { client, reason } => write!(f, "{client} was refused: {reason}"),
+            Self::NotPermitted { client, reason } | Self::NotDone { client, reason } => {
+                write!(f, "{client} was refused: {reason}")
+            }
+            Self::LeftOut { client, what } => {
+                write!(f, "{client} was not told of {what}: its protocol has no message for them")
+            }
             Self::Idle { client, channel, after } => write!(
                 f,
                 "{client} sent nothing on channel {} for {} s, and only listens there again",

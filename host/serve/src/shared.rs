@@ -85,7 +85,7 @@ pub(crate) struct Shared {
     pub next_client: AtomicU64,
     pub news: Box<dyn Fn(News) + Send + Sync>,
     pub refusals: Mutex<LogLimit>,
-    /// The same for requests that are not permitted.
+    /// The same for requests that are not permitted or not done.
     pub not_permitted: Mutex<LogLimit>,
     /// Those of certificates, and the number of the board's first channel.
     pub permissions: Mutex<Option<(Arc<Permissions>, usize)>>,
@@ -102,7 +102,7 @@ impl Shared {
     pub fn tell(&self, news: News) {
         let limit = match news {
             News::Refused { .. } => Some(&self.refusals),
-            News::NotPermitted { .. } => Some(&self.not_permitted),
+            News::NotPermitted { .. } | News::NotDone { .. } => Some(&self.not_permitted),
             _ => None,
         };
         if let Some(limit) = limit {

@@ -1,4 +1,4 @@
-//! Records as text: what the text protocols have in common.
+//! Records as text, and what else the foreign protocols have in common.
 
 use std::fmt::{self, Write};
 
@@ -14,6 +14,12 @@ impl fmt::Display for Seconds {
         let us = self.0.div_euclid(1000);
         write!(f, "{}.{:06}", us.div_euclid(1_000_000), us.rem_euclid(1_000_000))
     }
+}
+
+/// The computer's time, in UTC nanoseconds since the Unix epoch.
+pub fn now_ns() -> i64 {
+    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+    now.map_or(0, |since| since.as_nanos() as i64)
 }
 
 /// The identifier of an error frame, including its flag, and its data.

@@ -7,6 +7,7 @@ use std::io;
 use cantap::DeviceError;
 use cantap::bit_timing::TimingError;
 use cantap::wire::Refusal;
+use cantap::wire::message::Role;
 use cantap_formats::{Format, NothingRead, OpenError, UnknownFormat};
 use cantap_signals::condition::{ConditionError, ConditionFault};
 
@@ -89,7 +90,14 @@ fn of_device(error: &DeviceError) -> Option<String> {
             Refusal::BadTiming => "; see `cantap timing`",
             Refusal::BadSlot => "; `cantap info` shows how many there are",
             Refusal::ListenOnly => "; open it in normal mode (--mode normal) to send",
-            Refusal::NotGranted { needs } => return Some(format!("; start the server with --allow {needs}")),
+            Refusal::NotGranted { needs: Role::Listen } => {
+                "; the server's --permissions do not cover it, and its log says why"
+            }
+            Refusal::NotGranted { needs } => {
+                return Some(format!(
+                    "; start the server with --allow {needs}; if it was, its log says whether the certificate's role or --permissions do not cover it"
+                ));
+            }
             Refusal::OtherSettings => " (without -b, the server's bit rate is taken)",
             _ => return None,
         },

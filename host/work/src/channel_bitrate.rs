@@ -5,6 +5,9 @@ use std::str::FromStr;
 use cantap_analysis::stats::Options;
 use cantap_trace::grammar;
 
+/// What is written for a bit rate that is to be found by listening: see [`crate::requested_rate`].
+pub(crate) const AUTO: &str = "auto";
+
 /// A bit rate, for one channel or for all that have none of their own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ChannelBitrate {
@@ -18,13 +21,23 @@ impl FromStr for ChannelBitrate {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let Some((channel, bitrate)) = text.split_once(':') else {
-            return Ok(Self { channel: None, bitrate_bps: grammar::bit_rate(text)? });
-        };
-        match grammar::channel(channel) {
-            Some(channel) => Ok(Self { channel: Some(channel), bitrate_bps: grammar::bit_rate(bitrate)? }),
-            None => Err("write it as BITRATE or CHANNEL:BITRATE, such as 500k or 2:250k".to_owned()),
+        let (channel, bitrate) = split(text)?;
+        if bitrate == AUTO {
+            return Err(
+                "auto listens to a device, which is not possible here; give the bus's bit rate, such as 500k"
+                    .to_owned(),
+            );
         }
+        Ok(Self { channel, bitrate_bps: grammar::bit_rate(bitrate)? })
+    }
+}
+
+/// A channel, if one is named, and what is written for its bit rate.
+pub(crate) fn split(text: &str) -> Result<(Option<u8>, &str), String> {
+    let Some((channel, bitrate)) = text.split_once(':') else { return Ok((None, text)) };
+    match grammar::channel(channel) {
+        Some(channel) => Ok((Some(channel), bitrate)),
+        None => Err("write it as BITRATE or CHANNEL:BITRATE, such as 500k or 2:250k".to_owned()),
     }
 }
 

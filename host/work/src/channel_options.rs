@@ -1,9 +1,10 @@
 //! How a channel is opened.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use cantap::Channel;
+use cantap::autobaud::{Limits, Outcome};
 use cantap::device::channel_number;
 use cantap::hw_filter::{self, Compiled};
 use cantap::recovery::Recovery;
@@ -11,9 +12,11 @@ use cantap::wire::message::{ChannelConfig, Defaults, Mode};
 use cantap_address::OpenDevice;
 use cantap_trace::filter::Filter;
 
+use crate::bit_rate_search::{self, Search};
 use crate::bus_off::BusOffRecovery;
-use crate::channel_bitrate::ChannelBitrate;
+use crate::interrupt;
 use crate::report::Reporter;
+use crate::requested_rate::RequestedRate;
 use crate::timing_options::TimingOptions;
 
 /// How to open a channel, as far as it is given.
@@ -46,6 +49,10 @@ pub enum RecoveryOption {
     After(Duration),
 }
 
+/// How long to wait for traffic on one of several channels whose bit rates are to be found: often only one of them is
+/// connected.
+const PATIENCE_OF_SEVERAL: Duration = Duration::from_secs(3);
+
 /// The settings for opening a channel.
 struct Plan {
     channel: Channel,
@@ -56,8 +63,10 @@ struct Plan {
 
 impl ChannelOptions {
     /// Only listening, at these bit rates; without any, with what is saved on the device.
-    pub fn listening(bitrates: Vec<ChannelBitrate>) -> Self {
-        Self { timing: TimingOptions { bitrates, ..TimingOptions::default() }, ..Self::default() }
+    pub fn listening(bitrates: impl IntoIterator<Item = impl Into<RequestedRate>>) -> Self {
+        let mut options = Self::default();
+        options.timing.set_bit_rates(bitrates);
+        options
     }
 
     /// The part for one of several boards, counted from 0, whose channels have their own numbers there.
@@ -96,8 +105,9 @@ impl ChannelOptions {
 
     /// Opens channels, with `mode` unless the user requested another, and returns how they were opened. Anything
     /// impossible is detected before the first one is opened. Commands that receive pass their filters; with none, those
-    /// saved on the device apply. Reports which filters the hardware could not take, and that saved ones
-    /// apply.
+    /// saved on the device apply. Reports which filters the hardware could not take, that saved ones apply, and which bit
+    /// rates were found by listening. Of several channels of a command that receives, those on which none is found are left out, unless
+    /// their bit rate was requested to be found by channel.
     pub fn open(
         &self,
         device: &OpenDevice,
@@ -106,7 +116,8 @@ impl ChannelOptions {
         filters: Option<&[Filter]>,
         reporter: &Reporter,
     ) -> anyhow::Result<Vec<(Channel, ChannelConfig)>> {
-        let plans = self.plan(device, channels, Some(mode))?;
+        let leaves_out = filters.is_some() && !self.mode.unwrap_or(mode).transmits();
+        let plans = self.plan(device, channels, Some(mode), leaves_out, reporter)?;
         // A channel's filters can be changed only while both channels are closed.
         for Plan { channel, saved, .. } in &plans {
             match (filters, saved) {
@@ -131,14 +142,16 @@ impl ChannelOptions {
         Ok(plans.into_iter().map(|plan| (plan.channel, plan.config)).collect())
     }
 
-    /// How channels would be opened, with `mode` unless the user requested another. Nothing is opened.
+    /// How channels would be opened, with `mode` unless the user requested another. Nothing stays open; bit rates are found by
+    /// listening, which is reported.
     pub fn configs(
         &self,
         device: &OpenDevice,
         channels: impl IntoIterator<Item = Channel>,
         mode: Mode,
+        reporter: &Reporter,
     ) -> anyhow::Result<Vec<(Channel, ChannelConfig)>> {
-        let plans = self.plan(device, channels.into_iter(), Some(mode))?;
+        let plans = self.plan(device, channels.into_iter(), Some(mode), false, reporter)?;
         Ok(plans.into_iter().map(|plan| (plan.channel, plan.config)).collect())
     }
 
@@ -149,8 +162,9 @@ impl ChannelOptions {
         device: &OpenDevice,
         channels: impl Iterator<Item = Channel>,
         filters: &[Filter],
+        reporter: &Reporter,
     ) -> anyhow::Result<()> {
-        for Plan { channel, config, saved } in self.plan(device, channels, None)? {
+        for Plan { channel, config, saved } in self.plan(device, channels, None, false, reporter)? {
             let number = self.number(channel);
             let kept = saved.filter(|_| filters.is_empty()).map(|saved| saved.filters).unwrap_or_default();
             let filters = match hw_filter::compile(filters, channel) {
@@ -171,18 +185,94 @@ impl ChannelOptions {
         device: &OpenDevice,
         channels: impl Iterator<Item = Channel>,
         mode: Option<Mode>,
+        leaves_out: bool,
+        reporter: &Reporter,
     ) -> anyhow::Result<Vec<Plan>> {
         // Other makers' adapters often have a single channel; who asks for that alone learns so when it is opened.
         let is_there = |channel: &Channel| channel.number() <= device.hello().channels;
         let (there, missing): (Vec<_>, Vec<_>) = channels.partition(is_there);
         let used = if there.is_empty() { &missing } else { &there };
-        used.iter().map(|channel| self.plan_one(device, *channel, mode)).collect()
+        let leaves_out = leaves_out && used.len() > 1;
+        let mut plans = Vec::new();
+        let mut reasons = Vec::new();
+        for &channel in used {
+            let found_bps = if self.timing.is_auto(channel.number()) {
+                match self.find_bit_rate(device, channel, used.len() > 1, reporter)? {
+                    Ok(bitrate_bps) => Some(bitrate_bps),
+                    Err(reason) if leaves_out && !self.is_auto_by_name(channel) => {
+                        reasons.push(reason);
+                        continue;
+                    }
+                    Err(reason) => bail!(reason),
+                }
+            } else {
+                None
+            };
+            plans.push(self.plan_one(device, channel, mode, found_bps)?);
+        }
+        if plans.is_empty() && !reasons.is_empty() {
+            bail!(reasons.join("; "));
+        }
+        for reason in reasons {
+            reporter.warn(format!("{reason}; the channel is left out"));
+        }
+        Ok(plans)
     }
 
-    /// The requested configuration; without bit timing, the one saved on the device. The mode is the user's, otherwise `mode`,
+    /// Whether a channel's bit rate is to be found because the user named this channel.
+    fn is_auto_by_name(&self, channel: Channel) -> bool {
+        let of_channel = RequestedRate::of(&self.timing.bitrates, channel.number());
+        of_channel.is_some_and(|rate| rate.is_auto() && rate.channel.is_some())
+    }
+
+    /// The bit rate of a channel's bus, in bit/s, found by listening; otherwise the reason why there is none. Reports what is going on.
+    fn find_bit_rate(
+        &self,
+        device: &OpenDevice,
+        channel: Channel,
+        is_one_of_several: bool,
+        reporter: &Reporter,
+    ) -> anyhow::Result<Result<u32, String>> {
+        let number = self.number(channel);
+        if !bit_rate_search::is_possible(device) {
+            bail!(
+                "channel {number}: this device cannot find a bit rate by listening; give it with -b RATE, such as -b 500k"
+            );
+        }
+        reporter.note(format!("channel {number}: listening for its bit rate"));
+        let mut limits = Limits::default();
+        if is_one_of_several {
+            limits.silence = PATIENCE_OF_SEVERAL;
+        }
+        let started = Instant::now();
+        let found = bit_rate_search::search(device, channel, &limits, &mut |_| !interrupt::requested())
+            .with_context(|| format!("channel {number}"))?;
+        Ok(match found {
+            Search::Confirmed { bitrate_bps } => {
+                reporter.note(format!("channel {number}: {bitrate_bps} bit/s, as the last time"));
+                Ok(bitrate_bps)
+            }
+            Search::Measured(Outcome::Found { bitrate_bps, .. }) => {
+                reporter.note(format!("channel {number}: {bitrate_bps} bit/s, found by listening"));
+                Ok(bitrate_bps)
+            }
+            Search::Measured(Outcome::Stopped) => bail!("stopped before a bit rate was found"),
+            Search::Measured(outcome) => {
+                Err(bit_rate_search::failure(outcome, number, started.elapsed().as_secs_f64()))
+            }
+        })
+    }
+
+    /// The requested configuration, with the bit rate that was found, in bit/s, if it was to be found; without bit timing, the one saved on the device. The mode is the user's, otherwise `mode`,
     /// otherwise the saved one.
-    fn plan_one(&self, device: &OpenDevice, channel: Channel, mode: Option<Mode>) -> anyhow::Result<Plan> {
-        let (base, saved) = match self.timing.request(channel)? {
+    fn plan_one(
+        &self,
+        device: &OpenDevice,
+        channel: Channel,
+        mode: Option<Mode>,
+        found_bps: Option<u32>,
+    ) -> anyhow::Result<Plan> {
+        let (base, saved) = match self.timing.request_with(channel, found_bps)? {
             Some(request) => {
                 (ChannelConfig::listen_only(request.resolve(device.hello().can_clock_hz)?), None)
             }
@@ -190,7 +280,7 @@ impl ChannelOptions {
                 (Some(saved), _) => (saved.config, Some(saved)),
                 (None, Some(bitrate_bps)) => (ChannelConfig::listen_only(device.timing(bitrate_bps)?), None),
                 (None, None) => bail!(
-                    "no bit rate for channel {}: give one with -b RATE, find it with `cantap autobaud`, or save one \
+                    "no bit rate for channel {}: give one with -b RATE, have it found with -b auto, or save one \
                      with `cantap defaults save`",
                     self.number(channel)
                 ),

@@ -3,8 +3,10 @@
 //! | Modules | Subject |
 //! |---|---|
 //! | [`boards`], [`channels`], [`channel_bitrate`] | which devices, and which of their channels |
+//! | [`requested_rate`], [`bit_rate_search`], [`remembered_rates`] | the bit rate that is asked for, or found by listening |
 //! | [`channel_options`], [`timing_options`], [`bus_off`] | how channels are opened, and brought back from bus-off |
 //! | [`live`], [`reception`] | records of devices that may come and go; a channel that receives only errors |
+//! | [`doctor`], [`bus_hints`], `port_access` (Linux) | what is the matter with a port, a device or a bus, and what to do next |
 //! | [`sending`], [`speaking`], [`uds`], [`uds_memory`] | frames and their fate; a protocol's client on a device |
 //! | [`read_ahead`], [`missing`], [`databases`], [`reading`] | traces, what is missing from them, and what they mean |
 //! | [`report`], [`advice`], [`announcement`], [`terms`], [`code_texts`] | messages for people |
@@ -18,7 +20,11 @@ pub mod advice;
 pub mod announcement;
 pub mod atomic_file;
 #[cfg(feature = "buses")]
+pub mod bit_rate_search;
+#[cfg(feature = "buses")]
 pub mod boards;
+#[cfg(feature = "buses")]
+pub mod bus_hints;
 #[cfg(feature = "buses")]
 pub mod bus_off;
 #[cfg(feature = "buses")]
@@ -33,6 +39,8 @@ pub mod code_texts;
 pub mod databases;
 #[cfg(feature = "dfu")]
 pub mod dfu;
+#[cfg(feature = "buses")]
+pub mod doctor;
 pub mod interrupt;
 #[cfg(feature = "buses")]
 pub mod live;
@@ -45,6 +53,8 @@ mod meter;
 pub mod missing;
 #[cfg(feature = "buses")]
 pub mod node_text;
+#[cfg(target_os = "linux")]
+pub mod port_access;
 #[cfg(feature = "buses")]
 pub mod read_ahead;
 #[cfg(feature = "buses")]
@@ -52,7 +62,11 @@ pub mod reading;
 #[cfg(feature = "buses")]
 pub mod reception;
 #[cfg(feature = "buses")]
+pub mod remembered_rates;
+#[cfg(feature = "buses")]
 pub mod report;
+#[cfg(feature = "buses")]
+pub mod requested_rate;
 #[cfg(feature = "buses")]
 pub mod sending;
 #[cfg(feature = "buses")]

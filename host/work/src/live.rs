@@ -11,9 +11,10 @@ use cantap_address::{Address, OpenDevice};
 use cantap_formats::ChannelInfo;
 
 use crate::boards::{Boards, filters_on};
+use crate::bus_hints::{BusHint, HintPlace};
 use crate::channel_options::{self, ChannelOptions};
 use crate::channels::place_of;
-use crate::reception::{self, Reception};
+use crate::reception::Reception;
 use crate::report::Reporter;
 use crate::{advice, interrupt};
 
@@ -168,9 +169,27 @@ impl LiveRecords {
 
     /// What it means that a channel receives only errors, and what to do.
     fn errors_only(&self, number: u8) -> String {
+        self.sentence(number, self.reception.hint(number, false).unwrap_or(BusHint::WrongBitRate))
+    }
+
+    /// What is the matter with a channel's bus, as far as its errors and its silence show it. A channel is silent only if all are:
+    /// often not every channel is connected.
+    pub fn hint(&self, number: u8) -> Option<BusHint> {
+        let hint = self.reception.hint(number, self.is_filtered)?;
+        (hint != BusHint::Silent || !self.reception.has_frames()).then_some(hint)
+    }
+
+    /// A hint about a channel as a sentence, with what to do next; `None` if [`Self::judge`] or the stream has its own for it.
+    pub fn hint_sentence(&self, number: u8) -> Option<String> {
+        let hint = self.hint(number)?;
+        let is_deaf = !self.is_filtered && self.reception.deaf().any(|deaf| deaf == number);
+        (!is_deaf).then(|| self.sentence(number, hint))
+    }
+
+    fn sentence(&self, number: u8, hint: BusHint) -> String {
         let (board, channel) = place_of(number);
         let device = self.addresses.get(board).map(ToString::to_string).unwrap_or_default();
-        reception::errors_only_text(number, &device, channel.number())
+        hint.sentence(&HintPlace { number, device: &device, channel_there: channel.number() })
     }
 
     /// Ends the capture: the rest comes from [`Self::next_batch`], with an error at its end if a device did not end

@@ -4,6 +4,8 @@ use std::time::{Duration, Instant};
 
 use cantap::{TraceEvent, TraceRecord};
 
+use crate::bus_hints::{BusEvidence, BusHint};
+
 /// How long after its first error a channel that has received no frame is reported. By then, at any bit rate, an active
 /// bus has had frames.
 const PATIENCE: Duration = Duration::from_secs(1);
@@ -17,8 +19,7 @@ pub struct Reception {
 
 #[derive(Clone, Debug, Default)]
 struct ChannelReception {
-    /// Lost frames count as frames, too.
-    has_frames: bool,
+    evidence: BusEvidence,
     first_error: Option<Instant>,
     is_reported: bool,
 }
@@ -32,12 +33,9 @@ impl Reception {
                 self.channels.resize(index + 1, ChannelReception::default());
             }
             let channel = &mut self.channels[index];
-            match record.event {
-                TraceEvent::Frame { .. } | TraceEvent::Lost { .. } => channel.has_frames = true,
-                TraceEvent::BusError { .. } | TraceEvent::ErrorsSuppressed { .. } => {
-                    channel.first_error.get_or_insert(now);
-                }
-                _ => {}
+            channel.evidence.take(&record.event);
+            if matches!(record.event, TraceEvent::BusError { .. } | TraceEvent::ErrorsSuppressed { .. }) {
+                channel.first_error.get_or_insert(now);
             }
         }
     }
@@ -65,13 +63,20 @@ impl Reception {
 
     /// The channels, from 1, that have received errors but no frame in the end, however short that was.
     pub fn deaf(&self) -> impl Iterator<Item = u8> {
-        let is_deaf = |channel: &ChannelReception| !channel.has_frames && channel.first_error.is_some();
+        let is_deaf = |channel: &ChannelReception| !channel.has_frames() && channel.first_error.is_some();
         (1..).zip(&self.channels).filter_map(move |(number, channel)| is_deaf(channel).then_some(number))
     }
 
     /// Whether any channel has received a frame.
     pub fn has_frames(&self) -> bool {
-        self.channels.iter().any(|channel| channel.has_frames)
+        self.channels.iter().any(ChannelReception::has_frames)
+    }
+
+    /// What a channel's errors or its silence mean, numbered from 1; see [`BusEvidence::hint`].
+    pub fn hint(&self, number: u8, is_filtered: bool) -> Option<BusHint> {
+        let silent = BusEvidence::default();
+        let channel = self.channels.get(usize::from(number.saturating_sub(1)));
+        channel.map_or(&silent, |channel| &channel.evidence).hint(is_filtered)
     }
 
     /// Whether this was reported for a channel.
@@ -81,18 +86,15 @@ impl Reception {
 }
 
 impl ChannelReception {
+    /// Lost frames count as frames, too.
+    const fn has_frames(&self) -> bool {
+        self.evidence.frames() > 0
+    }
+
     fn has_errors_only_since(&self, now: Instant) -> bool {
-        !self.has_frames
+        !self.has_frames()
             && self.first_error.is_some_and(|first| now.saturating_duration_since(first) >= PATIENCE)
     }
-}
-
-/// What it means, and what to do; `device` is the address for finding the bit rate.
-pub fn errors_only_text(number: u8, device: &str, channel_there: u8) -> String {
-    format!(
-        "channel {number}: only errors and no frame, which usually means a wrong bit rate or a broken bus, or a lone node that \
-         nobody acknowledges; `cantap autobaud -d {device} -c {channel_there}` finds the bit rate, if the bus is whole"
-    )
 }
 
 #[cfg(test)]
@@ -120,6 +122,9 @@ mod tests {
         assert_eq!(reception.news(after(2000)), [0; 0]);
         assert!(reception.is_reported(3) && !reception.is_reported(1));
         assert_eq!(reception.errors_only(after(2000)).collect::<Vec<_>>(), [3]);
+        assert_eq!(reception.hint(3, false), Some(BusHint::WrongBitRate));
+        assert_eq!((reception.hint(1, false), reception.hint(2, false)), (None, Some(BusHint::Silent)));
+        assert_eq!(reception.hint(9, true), None);
         reception.take(&[record(3, frame)], after(2100));
         assert_eq!(reception.errors_only(after(2200)).count(), 0);
     }

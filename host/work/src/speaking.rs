@@ -16,9 +16,10 @@ use cantap_address::OpenDevice;
 use cantap_protocols::active::Machine;
 use cantap_protocols::{Assembler, Event};
 
+use crate::bus_hints::{BusHint, HintPlace};
 use crate::bus_off::BusOffRecovery;
 use crate::interrupt;
-use crate::reception::{self, Reception};
+use crate::reception::Reception;
 use crate::sending::Sending;
 use crate::terms::counted;
 
@@ -380,11 +381,9 @@ impl<'d> Speaking<'d> {
     pub fn judge(&self) -> anyhow::Result<()> {
         let is_deaf = self.reception.deaf().any(|number| number == self.channel.number());
         if is_deaf {
-            bail!(reception::errors_only_text(
-                self.channel.number(),
-                self.device.name(),
-                self.channel.number()
-            ));
+            let number = self.channel.number();
+            let hint = self.reception.hint(number, false).unwrap_or(BusHint::WrongBitRate);
+            bail!(hint.sentence(&HintPlace { number, device: self.device.name(), channel_there: number }));
         }
         Ok(())
     }

@@ -5,13 +5,14 @@ use cantap::bit_timing::{TimingError, TimingRequest};
 use cantap::wire::{BitTiming, CHANNELS};
 
 use crate::channel_bitrate::ChannelBitrate;
-use crate::channels::place_of;
+use crate::channels::{MOST_CHANNELS, place_of};
+use crate::requested_rate::RequestedRate;
 
 /// A bit timing, as far as it is given.
 #[derive(Clone, Debug, Default)]
 pub struct TimingOptions {
     /// Bit rates; the last one for a channel counts.
-    pub bitrates: Vec<ChannelBitrate>,
+    pub bitrates: Vec<RequestedRate>,
     /// The sample point in per cent of the bit, instead of the one that CiA recommends.
     pub sample_point: Option<f64>,
     /// Resynchronisation jump width in quanta, 1 to 4.
@@ -64,9 +65,34 @@ impl TimingOptions {
     }
 
     /// Requests these bit rates instead of any other timing.
-    pub fn set_bit_rates(&mut self, rates: Vec<ChannelBitrate>) {
+    pub fn set_bit_rates(&mut self, rates: impl IntoIterator<Item = impl Into<RequestedRate>>) {
         self.exact = None;
-        self.bitrates = rates;
+        self.bitrates = rates.into_iter().map(Into::into).collect();
+    }
+
+    /// Whether any bit rate is to be found by listening.
+    pub fn has_auto(&self) -> bool {
+        self.bitrates.iter().any(RequestedRate::is_auto)
+    }
+
+    /// Whether a channel's bit rate, from 1, is to be found by listening.
+    pub fn is_auto(&self, channel: u8) -> bool {
+        RequestedRate::of(&self.bitrates, channel).is_some_and(|rate| rate.is_auto())
+    }
+
+    /// The bit rates that are numbers. A channel whose bit rate is to be found has none.
+    pub fn known(&self) -> Vec<ChannelBitrate> {
+        let number = |rate: RequestedRate| {
+            Some(ChannelBitrate { channel: rate.channel, bitrate_bps: rate.bitrate_bps? })
+        };
+        if !self.has_auto() {
+            return self.bitrates.iter().copied().filter_map(number).collect();
+        }
+        // The one for all channels does not concern those that are to be found.
+        let of = |channel| {
+            number(RequestedRate { channel: Some(channel), ..RequestedRate::of(&self.bitrates, channel)? })
+        };
+        (1..=MOST_CHANNELS).filter_map(of).collect()
     }
 
     /// Refuses bit rates of channels that this number of boards does not have.
@@ -85,17 +111,30 @@ impl TimingOptions {
     /// The part for one of several boards, counted from 0, whose channels have their own numbers there.
     #[must_use]
     pub fn on_board(&self, board: usize) -> Self {
-        let own = |rate: &ChannelBitrate| match rate.channel.map(place_of) {
+        let own = |rate: &RequestedRate| match rate.channel.map(place_of) {
             None => Some(*rate),
             Some((place, channel)) if place == board => {
-                Some(ChannelBitrate { channel: Some(channel.number()), ..*rate })
+                Some(RequestedRate { channel: Some(channel.number()), ..*rate })
             }
             Some(_) => None,
         };
         Self { bitrates: self.bitrates.iter().filter_map(own).collect(), ..self.clone() }
     }
 
-    /// The request for a channel, if any.
+    /// The request for a channel, if any; of one whose bit rate is to be found, `found_bps` is what was found, in bit/s.
+    pub fn request_with(
+        &self,
+        channel: Channel,
+        found_bps: Option<u32>,
+    ) -> Result<Option<TimingRequest>, TimingOptionsError> {
+        let Some(bitrate_bps) = found_bps.filter(|_| self.is_auto(channel.number())) else {
+            return self.request(channel);
+        };
+        let Self { sample_point, sjw, .. } = *self;
+        Ok(Some(TimingRequest::Rate { bitrate_bps, sample_point_percent: sample_point, sjw }))
+    }
+
+    /// The request for a channel, if any; none if its bit rate is to be found.
     pub fn request(&self, channel: Channel) -> Result<Option<TimingRequest>, TimingOptionsError> {
         if self.triple {
             return Err(TimingError::TripleSampling.into());
@@ -105,7 +144,10 @@ impl TimingOptions {
             return Ok(Some(TimingRequest::Exact(timing)));
         }
         let Self { sample_point, sjw, .. } = *self;
-        match ChannelBitrate::of(&self.bitrates, channel.number()) {
+        if self.is_auto(channel.number()) {
+            return Ok(None);
+        }
+        match RequestedRate::of(&self.bitrates, channel.number()).and_then(|rate| rate.bitrate_bps) {
             Some(bitrate_bps) => {
                 Ok(Some(TimingRequest::Rate { bitrate_bps, sample_point_percent: sample_point, sjw }))
             }

@@ -38,6 +38,8 @@ sub slurp {
   open my $file, '<', "$folder/$name" or return;
   my $text = <$file>;
   close $file;
+  # The shell opens a file before it writes the line.
+  return unless defined $text && $text =~ /\n\z/;
   unlink "$folder/$name";
   return $text;
 }

@@ -11,7 +11,7 @@ use super::super::plan::Plan;
 use super::line::PromptKind;
 use super::state::App;
 use cantap_work::advice;
-use cantap_work::channel_bitrate::ChannelBitrate;
+use cantap_work::requested_rate::RequestedRate;
 
 impl App {
     /// Switches between listen-only and taking part, after asking: acknowledging changes the bus.
@@ -63,9 +63,9 @@ impl App {
             return Ok(());
         };
         let rates =
-            text.split_whitespace().map(str::parse::<ChannelBitrate>).collect::<Result<Vec<_>, _>>()?;
+            text.split_whitespace().map(str::parse::<RequestedRate>).collect::<Result<Vec<_>, _>>()?;
         if rates.is_empty() {
-            return Err("give a bit rate, such as 500k, or one for each channel: 1:500k 2:250k".to_owned());
+            return Err("give a bit rate, such as 500k, one for each channel: 1:500k 2:250k, or auto to find it by listening".to_owned());
         }
         let mut plan = plan.clone();
         plan.set_bit_rates(rates);

@@ -1,8 +1,9 @@
 //! Finds bit rates by listening, showing progress; it can be stopped at any time.
 
-use std::sync::mpsc::TryRecvError;
+use std::sync::mpsc::{RecvTimeoutError, TryRecvError};
+use std::time::Duration;
 
-use cantap::autobaud::{self, Limits, Outcome, Progress};
+use cantap::autobaud::{Limits, Outcome, Progress};
 
 use cantap::device::channel_number;
 use cantap::wire::message::Mode;
@@ -11,12 +12,22 @@ use super::super::model::SourceState;
 use super::super::plan::Plan;
 use super::{Source, Then, lock};
 use cantap_work::advice;
+use cantap_work::bit_rate_search::{self, Search};
 use cantap_work::channel_bitrate::ChannelBitrate;
+use cantap_work::requested_rate::RequestedRate;
+
+/// How long after a search that found nothing the next one begins.
+const AGAIN_AFTER: Duration = Duration::from_millis(200);
 
 impl Source<'_> {
     /// Adds the bit rates that are found to the plan; those not found stay as they were. Returns what to do next:
     /// an order may have come meanwhile.
     pub(super) fn autobaud(&mut self, plan: &mut Plan) -> Then {
+        self.find(plan, |_| true)
+    }
+
+    /// As [`Self::autobaud`], for the channels with the numbers for which `is_wanted`.
+    fn find(&mut self, plan: &mut Plan, is_wanted: impl Fn(u8) -> bool) -> Then {
         lock(self.model).source = SourceState::Searching;
         let mut said = Vec::new();
         let mut rates = Vec::new();
@@ -31,26 +42,38 @@ impl Source<'_> {
             };
             for channel in plan.channels_of(board) {
                 let number = channel_number(board, channel);
+                if !is_wanted(number) {
+                    continue;
+                }
+                if !bit_rate_search::is_possible(&device) {
+                    said.push(format!(
+                        "channel {number}: this device cannot find a bit rate; give it with b"
+                    ));
+                    continue;
+                }
                 let mut progress = |progress: Progress| {
                     self.notice(format!("channel {number}: {}; A stops", describe(progress)));
                     then = self.order_meanwhile();
                     matches!(then, Then::GoOn)
                 };
-                said.push(match autobaud::search(&device, channel, &Limits::default(), &mut progress) {
-                    Ok(Outcome::Found { bitrate_bps, .. }) => {
-                        rates.push(ChannelBitrate { channel: Some(number), bitrate_bps });
+                said.push(match bit_rate_search::search(&device, channel, &Limits::default(), &mut progress) {
+                    Ok(
+                        Search::Confirmed { bitrate_bps }
+                        | Search::Measured(Outcome::Found { bitrate_bps, .. }),
+                    ) => {
+                        rates.push(RequestedRate { channel: Some(number), bitrate_bps: Some(bitrate_bps) });
                         format!("channel {number}: {bitrate_bps} bit/s")
                     }
-                    Ok(Outcome::NoTraffic) => format!("channel {number}: no traffic"),
-                    Ok(Outcome::Stuck) => format!("channel {number}: the bus is dominant all the time"),
-                    Ok(Outcome::Unreadable { .. }) => format!("channel {number}: traffic, but not one whole frame"),
-                    Ok(Outcome::Unreachable { measured_bps, .. }) => {
+                    Ok(Search::Measured(Outcome::NoTraffic)) => format!("channel {number}: no traffic"),
+                    Ok(Search::Measured(Outcome::Stuck)) => format!("channel {number}: the bus is dominant all the time"),
+                    Ok(Search::Measured(Outcome::Unreadable { .. })) => format!("channel {number}: traffic, but not one whole frame"),
+                    Ok(Search::Measured(Outcome::Unreachable { measured_bps, .. })) => {
                         format!("channel {number}: {measured_bps:.0} bit/s, which the device's clock does not reach")
                     }
-                    Ok(Outcome::Unconfirmed { bitrate_bps, .. }) => {
+                    Ok(Search::Measured(Outcome::Unconfirmed { bitrate_bps, .. })) => {
                         format!("channel {number}: bits of {bitrate_bps} bit/s, but no good frame")
                     }
-                    Ok(Outcome::Stopped) => format!("channel {number}: stopped"),
+                    Ok(Search::Measured(Outcome::Stopped)) => format!("channel {number}: stopped"),
                     Err(error) => format!("channel {number}: {}", advice::explained(&error)),
                 });
                 if !matches!(then, Then::GoOn) {
@@ -102,9 +125,48 @@ impl Source<'_> {
                 lock(self.model).found = Some(plan.clone());
                 return then;
             }
+            let then = if matches!(then, Then::GoOn) { self.wait_for_order() } else { then };
             if !matches!(then, Then::GoOn) {
                 return then;
             }
+        }
+    }
+
+    /// Finds the bit rates that were requested to be found, until there is a channel to open or an order ends it. Channels without
+    /// one are then not opened.
+    pub(super) fn find_requested(&mut self, plan: &mut Plan) -> Then {
+        loop {
+            let requested = plan.open.timing.clone();
+            let then = self.find(plan, |number| requested.is_auto(number));
+            let known = plan.open.timing.known();
+            if matches!(then, Then::Reopen(_) | Then::Quit) {
+                return then;
+            }
+            if matches!(then, Then::Autobaud) {
+                // The search was stopped: without a bit rate, opening says what is missing.
+                plan.open.timing.set_bit_rates(known);
+                return then;
+            }
+            if plan.channels.iter().any(|number| ChannelBitrate::of(&known, *number).is_some()) {
+                plan.open.timing.set_bit_rates(known.iter().copied());
+                plan.channels.retain(|number| ChannelBitrate::of(&known, *number).is_some());
+                lock(self.model).found = Some(plan.clone());
+                return Then::GoOn;
+            }
+            match self.wait_for_order() {
+                // The search begins anew in any case.
+                Then::GoOn | Then::Autobaud => {}
+                then => return then,
+            }
+        }
+    }
+
+    /// Waits before the next search: one that cannot begin ends at once, and orders are followed all the same.
+    fn wait_for_order(&mut self) -> Then {
+        match self.orders.recv_timeout(AGAIN_AFTER) {
+            Ok(order) => self.follow(order),
+            Err(RecvTimeoutError::Timeout) => Then::GoOn,
+            Err(RecvTimeoutError::Disconnected) => Then::Quit,
         }
     }
 

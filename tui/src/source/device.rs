@@ -14,6 +14,7 @@ use super::super::order::Order;
 use super::super::plan::Plan;
 use super::{FIGURES_EVERY, Source, Then, WAIT, lock};
 use cantap_work::advice;
+use cantap_work::bus_hints::BusHint;
 use cantap_work::channels::place_of;
 use cantap_work::live::{Line, Lines, lines};
 use cantap_work::reception::Reception;
@@ -27,8 +28,16 @@ impl Source<'_> {
         let mut reconnects = vec![0; plan.addresses.len()];
         let mut is_new = true;
         loop {
-            if std::mem::take(&mut is_new) && Self::lacks_bit_rates(&plan) {
-                match self.find_bit_rates(&mut plan) {
+            let first = std::mem::take(&mut is_new);
+            let found = if plan.open.timing.has_auto() {
+                Some(self.find_requested(&mut plan))
+            } else if first && Self::lacks_bit_rates(&plan) {
+                Some(self.find_bit_rates(&mut plan))
+            } else {
+                None
+            };
+            if let Some(found) = found {
+                match found {
                     Then::GoOn | Then::Autobaud => {}
                     Then::Reopen(other) => {
                         (plan, is_new) = (other, true);
@@ -330,8 +339,12 @@ impl Source<'_> {
         let now = Instant::now();
         model.reception.take(&batch, now);
         for number in model.reception.news(now) {
-            model.notice =
-                format!("channel {number}: only errors and no frame; is the bit rate right? A looks for it");
+            let hint = model.reception.hint(number, false).unwrap_or(BusHint::WrongBitRate);
+            let step = match hint {
+                BusHint::WrongBitRate => "A looks for the bit rate",
+                _ => "Statistics says what to do",
+            };
+            model.notice = format!("channel {number}: {}; {step}", hint.meaning());
         }
         drop(model);
         lines.recycle(batch);

@@ -44,7 +44,7 @@ fn over(frame: &mut Frame<'_>, body: Rect, text: &str) {
 }
 
 /// Lines no longer than the width in characters; only longer words are split.
-fn wrapped(text: &str, width: usize) -> Vec<String> {
+pub fn wrapped(text: &str, width: usize) -> Vec<String> {
     let width = width.max(1);
     let mut lines = vec![String::new()];
     let mut room = width;
@@ -118,7 +118,7 @@ fn question(kind: PromptKind) -> &'static str {
         PromptKind::Send => {
             "[CHANNEL:]FRAME or Message:Signal=value,… (Tab completes), then a period if it is periodic"
         }
-        PromptKind::BitRate => "bit rates: 500k, or one for each channel: 1:500k 2:250k",
+        PromptKind::BitRate => "bit rates: 500k, one for each channel: 1:500k 2:250k, or auto",
         PromptKind::Device => {
             "device: a serial port, virtual, or emu:FIRMWARE.elf; several with \" + \" between them; a trace opens beside"
         }

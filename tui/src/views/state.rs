@@ -6,6 +6,7 @@ use std::time::Instant;
 use cantap::wire::message::Mode;
 use cantap::wire::record::ErrorState;
 use cantap_analysis::stats::Window;
+use cantap_work::bus_hints::BusHint;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::style::Style;
@@ -81,11 +82,7 @@ fn line(app: &App, model: &Model, detail: Detail, most_address: usize) -> Vec<Sp
         }
     };
     spans.push(Span::styled(format!(": {}", source_text(app, model)), style));
-    let deaf: Vec<String> =
-        model.reception.errors_only(Instant::now()).map(|number| number.to_string()).collect();
-    if !deaf.is_empty() {
-        spans.push(Span::styled(format!("  {}: ONLY ERRORS, press A", deaf.join(", ")), theme.error()));
-    }
+    spans.extend(errors_only(model).map(|text| Span::styled(format!("  {text}"), theme.error())));
     let channels = model.seen.statistics.channels();
     let mut off: Vec<u8> = channels
         .iter()
@@ -139,6 +136,22 @@ fn line(app: &App, model: &Model, detail: Detail, most_address: usize) -> Vec<Sp
         spans.push(Span::styled(format!("  {}", app.signals.filter.text()), Theme::heading()));
     }
     spans
+}
+
+/// What is said of the channels that receive errors and no frame, those of the same kind together.
+fn errors_only(model: &Model) -> impl Iterator<Item = String> {
+    let mut kinds: Vec<(&str, Vec<String>)> = Vec::new();
+    for number in model.reception.errors_only(Instant::now()) {
+        let kind = model.reception.hint(number, false).unwrap_or(BusHint::WrongBitRate).short();
+        match kinds.iter_mut().find(|(known, _)| *known == kind) {
+            Some((_, numbers)) => numbers.push(number.to_string()),
+            None => kinds.push((kind, vec![number.to_string()])),
+        }
+    }
+    kinds.into_iter().map(|(kind, numbers)| {
+        let press = if kind == BusHint::WrongBitRate.short() { ", press A" } else { "" };
+        format!("{}: {kind}{press}", numbers.join(", "))
+    })
 }
 
 /// A mode that acknowledges and sends must not be overlooked.

@@ -4,18 +4,23 @@ use cantap::Channel;
 use cantap::device::{ClockSource, channel_number};
 use cantap::wire::record::{BusErrorKind, LossStage};
 use cantap_analysis::stats::ChannelStatistics;
+use cantap_work::bus_hints::{BusHint, HintPlace};
+use cantap_work::channels::place_of;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::text::{Line, Span};
 
 use super::super::app::App;
 use super::super::cut::draw_lines;
-use super::super::model::{DeviceFigures, Model, Seen};
+use super::super::model::{DeviceFigures, Model, Seen, SourceState};
 use super::super::theme::Theme;
+use super::bottom::wrapped;
 use super::list::bytes;
 
 /// Number of columns of the gauge on a narrow and on a wide screen.
 const GAUGE_COLUMNS: [usize; 2] = [12, 40];
+/// Columns of a line's label.
+const LABEL: usize = 10;
 
 /// Draws the page.
 pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, seen: &Seen) {
@@ -25,10 +30,14 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
     channels.sort_by_key(|channel| channel.number);
     for channel in channels {
         channel_lines(channel, width, app, seen, &mut lines);
+        hint_lines(channel.number, channel.frames > 0, model, app, width, &mut lines);
         lines.push(Line::default());
     }
     if lines.is_empty() {
         lines.push(Line::from("Nothing was received yet."));
+        if let Some(first) = app.plan.as_ref().and_then(|plan| plan.channels.first()) {
+            hint_lines(*first, false, model, app, width, &mut lines);
+        }
         lines.push(Line::default());
     }
     for (board, device) in seen.devices.iter().enumerate() {
@@ -116,6 +125,37 @@ fn channel_lines(
             .map(|window| levels[((window.load_pct.unwrap_or(0.0) * 8.0 / 100.0).ceil() as usize).min(8)])
             .collect();
         lines.push(Line::from(vec![Span::raw("History   "), Span::styled(bars, theme.series(0))]));
+    }
+}
+
+/// What is probably the matter with the bus of a device's channel, and what to do next. One that has had frames is
+/// not silent because it was opened again.
+fn hint_lines(
+    number: u8,
+    had_frames: bool,
+    model: &Model,
+    app: &App,
+    width: usize,
+    lines: &mut Vec<Line<'static>>,
+) {
+    let is_open = app.plan.is_some() && matches!(model.source, SourceState::Running);
+    let hint = model
+        .reception
+        .hint(number, false)
+        .filter(|hint| is_open && !(had_frames && *hint == BusHint::Silent));
+    let Some(hint) = hint else { return };
+    let (board, channel) = place_of(number);
+    let addresses = app.plan.as_ref().map(|plan| &plan.addresses);
+    let device =
+        addresses.and_then(|addresses| addresses.get(board)).map(ToString::to_string).unwrap_or_default();
+    let next = hint.next_step(&HintPlace { number, device: &device, channel_there: channel.number() });
+    for (label, text, style) in
+        [("Hint", hint.meaning(), app.theme.error()), ("Next", next.as_str(), app.theme.label())]
+    {
+        for (at, part) in wrapped(text, width.saturating_sub(LABEL)).into_iter().enumerate() {
+            let label = if at == 0 { label } else { "" };
+            lines.push(Line::styled(format!("{label:<LABEL$}{part}"), style));
+        }
     }
 }
 

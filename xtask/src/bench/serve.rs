@@ -1,5 +1,7 @@
-//! One board and eight clients on two saturated channels: what the server consumes, how much delay it adds, and whether each client gets
-//! everything or has its losses counted.
+//! One board and eight clients on two saturated channels, and beside them a program that speaks socketcand: what the server consumes, how much
+//! delay it adds, and whether each client gets everything or has its losses counted.
+
+mod socketcand;
 
 #[path = "../../../host/serve/tests/it/line/mod.rs"]
 mod line;
@@ -33,18 +35,18 @@ const MOST_AGES: usize = 1 << 20;
 /// A running program, which is ended when this is dropped.
 struct Running {
     child: Child,
-    /// The first line that it wrote.
-    said: String,
+    /// The first lines that it wrote.
+    lines: Vec<String>,
 }
 
 impl Running {
-    fn start(binary: &Path, arguments: &[&str]) -> Result<Self> {
+    fn start(binary: &Path, arguments: &[&str], lines: usize) -> Result<Self> {
         let mut child =
             Command::new(binary).args(arguments).stdout(Stdio::piped()).stderr(Stdio::null()).spawn()?;
-        let mut said = String::new();
-        BufReader::new(child.stdout.take().context("no output")?).read_line(&mut said)?;
-        ensure!(!said.is_empty(), "`cantap {}` ended", arguments.join(" "));
-        Ok(Self { child, said: said.trim().to_owned() })
+        let output = BufReader::new(child.stdout.take().context("no output")?).lines();
+        let written: Vec<String> = output.take(lines).collect::<Result<_, _>>()?;
+        ensure!(written.len() == lines, "`cantap {}` ended", arguments.join(" "));
+        Ok(Self { child, lines: written })
     }
 
     /// Seconds of processor time so far.
@@ -135,19 +137,23 @@ pub fn run(seconds: u32) -> Result<()> {
     let binary = workspace::target().join(folder).join("cantap");
     let scratch = tempfile::tempdir()?;
     let socket = scratch.path().join("cantap.sock").display().to_string();
-    let board = Running::start(&binary, &["virtual", "load=100,frames=std0,bitrate=1M"])?;
+    let board = Running::start(&binary, &["virtual", "load=100,frames=std0,bitrate=1M"], 1)?;
+    let port = &board.lines[0];
     // One program at the port, without a server.
     let is_over = AtomicBool::new(false);
     let alone = std::thread::scope(|scope| {
-        let listening = scope.spawn(|| listen(&Device::open(&board.said)?, &is_over));
+        let listening = scope.spawn(|| listen(&Device::open(port)?, &is_over));
         std::thread::sleep(Duration::from_secs(u64::from(seconds / 10).clamp(8, 30)));
         is_over.store(true, Ordering::Relaxed);
         listening.join().map_err(|_| anyhow::anyhow!("the client panicked"))?
     })?;
-    let server = Running::start(&binary, &["serve", "-d", &board.said, "-b", "1M", "--unix", &socket])?;
+    let arguments = ["serve", "-d", port, "-b", "1M", "--unix", &socket, "--socketcand", "127.0.0.1:0"];
+    let server = Running::start(&binary, &arguments, 2)?;
+    let place = server.lines[1].strip_prefix("can://").context("no address of socketcand")?;
     let is_over = AtomicBool::new(false);
     let (before, began) = (server.processor_s()?, Instant::now());
-    let (outcomes, processor, measured_s) = std::thread::scope(|scope| {
+    let (outcomes, foreign, processor, measured_s) = std::thread::scope(|scope| {
+        let foreign = scope.spawn(|| socketcand::read(place, &is_over));
         let clients: Vec<_> = (0..QUICK + SLOW)
             .map(|number| {
                 let (socket, is_over) = (&socket, &is_over);
@@ -162,7 +168,8 @@ pub fn run(seconds: u32) -> Result<()> {
         let processor = server.processor_s();
         is_over.store(true, Ordering::Relaxed);
         let outcomes: Vec<_> = clients.into_iter().map(std::thread::ScopedJoinHandle::join).collect();
-        (outcomes, processor, measured_s)
+        let foreign = foreign.join().map_err(|_| anyhow::anyhow!("the reader of socketcand panicked"));
+        (outcomes, foreign, processor, measured_s)
     });
     let share = (processor? - before) / measured_s * 100.0;
     println!(
@@ -199,6 +206,9 @@ pub fn run(seconds: u32) -> Result<()> {
             ));
         }
     }
+    let socketcand::Outcome { frames, ages } = foreign??;
+    let (median, most) = quantiles(ages);
+    println!("{:<10} {frames:>12} {:>12} {:>12} {median:>16.2} {most:>16.2}", "socketcand", "", "");
     println!(
         "the server: {share:.1} % of a core, {:.1} MB at most, {:.1} MB at the end",
         server.memory_mb("VmHWM")?,

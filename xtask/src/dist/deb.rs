@@ -1,4 +1,4 @@
-//! Debian's package: the command, its manual pages and completions, and the udev rule.
+//! Debian's package: the command, its manual pages and completions, the udev rule, and units for a shared board.
 //!
 //! Assembled by hand and packed by `dpkg-deb`: cargo-deb would be one more program to build, for a handful of files.
 
@@ -16,6 +16,13 @@ const COMPLETIONS: [(&str, &str); 3] = [
     ("bash", "usr/share/bash-completion/completions/cantap"),
     ("zsh", "usr/share/zsh/vendor-completions/_cantap"),
     ("fish", "usr/share/fish/vendor_completions.d/cantap.fish"),
+];
+
+/// Units of systemd: files in `packaging/systemd`, and where systemd looks for them.
+const UNITS: [(&str, &str); 3] = [
+    ("cantap.socket", "usr/lib/systemd/user"),
+    ("cantap.service", "usr/lib/systemd/user"),
+    ("cantap-lab.service", "usr/lib/systemd/system"),
 ];
 
 /// Builds and packs it.
@@ -44,6 +51,11 @@ pub fn pack(shell: &Shell, dist: &Path) -> Result<()> {
     let rules = root.join("usr/lib/udev/rules.d");
     shell.create_dir(&rules)?;
     shell.copy_file("packaging/60-cantap.rules", &rules)?;
+    for (unit, folder) in UNITS {
+        let folder = root.join(folder);
+        shell.create_dir(&folder)?;
+        shell.copy_file(format!("packaging/systemd/{unit}"), &folder)?;
+    }
     let papers = root.join("usr/share/doc/cantap");
     shell.create_dir(&papers)?;
     notices::write(shell, &papers.join("THIRD-PARTY.txt"), &["-p", "cantap-cli"])?;

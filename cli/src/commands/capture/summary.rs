@@ -9,6 +9,7 @@ use cantap_address::Address;
 use cantap_signals::trigger::{Trigger, TriggerCounts};
 
 use cantap_work::boards::Boards;
+use cantap_work::bus_hints::BusHint;
 use cantap_work::live::{Line, LiveRecords};
 use cantap_work::{Losses, Meter, lost_frames, rounded};
 
@@ -27,6 +28,8 @@ pub struct ChannelSummary {
     bus_load_pct: Option<f64>,
     /// If it is not known, the reason.
     no_bus_load_because: Option<&'static str>,
+    /// What is probably the matter with its bus.
+    hint: Option<&'static str>,
 }
 
 /// The JSON object.
@@ -220,7 +223,7 @@ impl DeviceSummary {
 
 impl ChannelSummary {
     /// For the channel with this number.
-    pub fn of(channel: u8, meter: &Meter) -> Self {
+    pub fn of(channel: u8, meter: &Meter, hint: Option<BusHint>) -> Self {
         Self {
             channel,
             frames: meter.frames(),
@@ -230,6 +233,7 @@ impl ChannelSummary {
             frames_per_s: meter.frames_per_s().map(|rate| rounded(rate, 1)),
             bus_load_pct: meter.bus_load_pct().map(|load| rounded(load, 2)),
             no_bus_load_because: meter.no_bus_load_because(),
+            hint: hint.map(BusHint::name),
         }
     }
 

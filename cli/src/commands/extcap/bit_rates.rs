@@ -4,11 +4,11 @@ use std::str::FromStr;
 use std::time::Duration;
 
 use cantap::Channel;
-use cantap::autobaud::{self, Limits, Outcome};
+use cantap::autobaud::Limits;
 use cantap_address::Address;
 
-use super::super::autobaud::failure;
 use crate::args;
+use cantap_work::bit_rate_search::{self, Search};
 use cantap_work::channel_bitrate::ChannelBitrate;
 use cantap_work::interrupt;
 
@@ -87,13 +87,16 @@ pub fn settle(
                     if !channels.is_empty() {
                         limits.silence = PATIENCE_BESIDE;
                     }
-                    match autobaud::search(device, channel, &limits, &mut |_| !interrupt::requested())? {
-                        Outcome::Found { bitrate_bps, .. } => {
+                    let found =
+                        bit_rate_search::search(device, channel, &limits, &mut |_| !interrupt::requested())?;
+                    match (found.bitrate_bps(), found) {
+                        (Some(bitrate_bps), _) | (None, Search::Confirmed { bitrate_bps }) => {
                             report(&format!("channel {number}: {bitrate_bps} bit/s found"));
                             rates.push(rate(bitrate_bps));
                         }
-                        outcome => {
-                            let reason = failure(outcome, channel, limits.silence.as_secs_f64());
+                        (None, Search::Measured(outcome)) => {
+                            let seconds = limits.silence.as_secs_f64();
+                            let reason = bit_rate_search::failure(outcome, number, seconds);
                             report(&format!("{reason}; it is not captured"));
                             reasons.push(reason);
                             continue;

@@ -5,7 +5,7 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 
 use cantap_address::server::role;
-use cantap_serve::Role;
+use cantap_serve::{Role, cannelloni};
 
 use crate::usage_error::usage;
 
@@ -15,7 +15,16 @@ pub enum Door {
     Unix,
     Tcp,
     Socketcand,
+    Gvret,
+    Cannelloni,
     Stdio,
+}
+
+impl Door {
+    /// Whoever comes this way is not asked who it is.
+    const fn is_open_to_all(self) -> bool {
+        matches!(self, Self::Socketcand | Self::Gvret | Self::Cannelloni)
+    }
 }
 
 /// What `--allow` allows, everywhere or at one door.
@@ -33,18 +42,20 @@ pub fn allowed(text: &str) -> Result<Allowed, String> {
         "unix" => Door::Unix,
         "tcp" => Door::Tcp,
         "socketcand" => Door::Socketcand,
-        _ => return Err("a listener is unix, tcp or socketcand".to_owned()),
+        "gvret" => Door::Gvret,
+        "cannelloni" => Door::Cannelloni,
+        _ => return Err("a listener is unix, tcp, socketcand, gvret or cannelloni".to_owned()),
     };
     Ok(Allowed { door: Some(door), role: role(text)? })
 }
 
-/// The maximum role at a door; the last one given applies. Whoever reaches socketcand's port is not asked who it is, so what is allowed
-/// everywhere is not allowed there.
+/// The maximum role at a door; the last one given applies. Whoever reaches the port of a foreign protocol is not asked who it is, so what is
+/// allowed everywhere is not allowed there.
 pub fn allow(all: &[Allowed], door: Door) -> Role {
     let of = |door: Option<Door>| {
         all.iter().rev().find(|allowed| allowed.door == door).map(|allowed| allowed.role)
     };
-    let everywhere = if door == Door::Socketcand { None } else { of(None) };
+    let everywhere = if door.is_open_to_all() { None } else { of(None) };
     of(Some(door)).or(everywhere).unwrap_or(Role::Listen)
 }
 
@@ -65,6 +76,41 @@ pub fn address(text: &str, port: u16) -> anyhow::Result<SocketAddr> {
         )));
     }
     Ok(address)
+}
+
+/// Where a tunnel begins and ends, and whose it is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TunnelArg {
+    /// The channel's number.
+    pub number: u8,
+    /// The address here.
+    pub local: SocketAddr,
+    /// The peer's.
+    pub peer: SocketAddr,
+}
+
+/// Parses `[CHANNEL:]ADDR:PORT,PEER:PORT`; an address may be left out for a port of this computer.
+pub fn tunnel(text: &str) -> Result<TunnelArg, String> {
+    const FORM: &str = "write it as CHANNEL:ADDR:PORT,PEER:PORT, as 1:127.0.0.1:20000,127.0.0.1:20001";
+    let (local, peer) = text.split_once(',').ok_or(FORM)?;
+    let (number, local) = match local.split_once(':') {
+        Some((number, rest)) if !number.is_empty() && number.bytes().all(|digit| digit.is_ascii_digit()) => {
+            (number.parse().map_err(|_| FORM)?, rest)
+        }
+        _ => (1, local),
+    };
+    let at = |text: &str| address(text, cannelloni::PORT).map_err(|error| error.to_string());
+    let (local, peer) = (at(local)?, at(peer)?);
+    if number == 0 {
+        return Err("channels are numbered from 1".to_owned());
+    }
+    if local.is_ipv4() != peer.is_ipv4() {
+        return Err("both addresses must be of one kind, IPv4 or IPv6".to_owned());
+    }
+    if local == peer {
+        return Err("a tunnel to itself would send every frame again; name the peer's port".to_owned());
+    }
+    Ok(TunnelArg { number, local, peer })
 }
 
 /// An address that can only be reached from this computer.
@@ -107,18 +153,49 @@ mod tests {
     }
 
     #[test]
-    fn what_is_allowed_everywhere_is_not_allowed_to_socketcand() {
+    fn what_is_allowed_everywhere_is_not_allowed_to_foreign_protocols() {
         let roles = |texts: &[&str]| {
             let all: Vec<Allowed> = texts.iter().map(|text| allowed(text).unwrap()).collect();
-            [Door::Unix, Door::Tcp, Door::Socketcand, Door::Stdio].map(|door| allow(&all, door))
+            [Door::Unix, Door::Tcp, Door::Socketcand, Door::Gvret, Door::Cannelloni, Door::Stdio]
+                .map(|door| allow(&all, door))
         };
         let (listen, send) = (Role::Listen, Role::Send);
-        assert_eq!(roles(&[]), [listen; 4]);
-        assert_eq!(roles(&["send"]), [send, send, listen, send]);
-        assert_eq!(roles(&["socketcand:send"]), [listen, listen, send, listen]);
-        assert_eq!(roles(&["send", "tcp:configure"]), [send, Role::Configure, listen, send]);
+        assert_eq!(roles(&[]), [listen; 6]);
+        assert_eq!(roles(&["send"]), [send, send, listen, listen, listen, send]);
+        assert_eq!(roles(&["socketcand:send"]), [listen, listen, send, listen, listen, listen]);
+        assert_eq!(roles(&["gvret:send", "cannelloni:send"]), [listen, listen, listen, send, send, listen]);
+        assert_eq!(roles(&["send", "tcp:configure"]), [send, Role::Configure, listen, listen, listen, send]);
         for text in ["all", "udp:send", "unix:", ":send"] {
             assert!(allowed(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_tunnel_names_both_of_its_ends() {
+        let parts = |text: &str| {
+            tunnel(text)
+                .map(|TunnelArg { number, local, peer }| (number, local.to_string(), peer.to_string()))
+        };
+        let (near, far) = ("127.0.0.1:20000".to_owned(), "127.0.0.1:20001".to_owned());
+        assert_eq!(parts("127.0.0.1:20000,127.0.0.1:20001").unwrap(), (1, near.clone(), far.clone()));
+        assert_eq!(parts("20000,20001").unwrap(), (1, near.clone(), far.clone()));
+        assert_eq!(parts("2:20000,20001").unwrap(), (2, near, far));
+        assert_eq!(parts("2:[::1]:5,[::1]:6").unwrap(), (2, "[::1]:5".to_owned(), "[::1]:6".to_owned()));
+        assert_eq!(parts("[::1]:5,[::1]:6").unwrap().0, 1);
+        for wrong in [
+            "",
+            "20000",
+            "20000,",
+            "0:20000,20001",
+            "256:20000,20001",
+            "x:20000,20001",
+            "20000,20000",
+            "0.0.0.0:1,127.0.0.1:2",
+            "127.0.0.1:1,[::1]:2",
+            "1:2:3,4",
+            "20000,20001,20002",
+        ] {
+            assert!(tunnel(wrong).is_err(), "{wrong}");
         }
     }
 

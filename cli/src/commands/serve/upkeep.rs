@@ -34,8 +34,15 @@ struct Reread {
 
 impl Upkeep {
     /// Reads the file of permissions, which are those of certificates, and begins the one of the audit, so that a mistake is known before there
-    /// is a server.
-    pub fn new(permissions: Option<&Path>, audit: Option<&Path>) -> anyhow::Result<Self> {
+    /// is a server. From now on, a hang-up does not end the program if there is something to read again. Threads that exist already are not
+    /// affected, so this comes before the first.
+    pub fn new(permissions: Option<&Path>, audit: Option<&Path>, is_encrypted: bool) -> anyhow::Result<Self> {
+        #[cfg(unix)]
+        let hang_ups = (is_encrypted || permissions.is_some()).then(|| {
+            let mut signals = SigSet::empty();
+            signals.add(Signal::SIGHUP);
+            signals.thread_block().map(|()| signals)
+        });
         #[cfg(feature = "tls")]
         if let Some(path) = permissions {
             Permissions::read(path)?;
@@ -49,20 +56,8 @@ impl Upkeep {
             files: Reread { permissions: permissions.map(Path::to_owned), ..Reread::default() },
             audit: audit.transpose()?.map(Arc::new),
             #[cfg(unix)]
-            hang_ups: None,
+            hang_ups: hang_ups.transpose()?,
         })
-    }
-
-    /// From now on, a hang-up does not end the program if there is something to read again. Threads that exist already are not affected.
-    #[cfg(unix)]
-    pub fn catch_hang_ups(&mut self, is_encrypted: bool) -> anyhow::Result<()> {
-        if is_encrypted || self.files.permissions.is_some() {
-            let mut signals = SigSet::empty();
-            signals.add(Signal::SIGHUP);
-            signals.thread_block()?;
-            self.hang_ups = Some(signals);
-        }
-        Ok(())
     }
 
     /// Applies the permissions and begins to record. Ends with the program.

@@ -13,9 +13,9 @@ use crate::live_args::{self, for_listening};
 use crate::protocols::Known;
 use crate::stderr;
 use cantap_work::boards::Boards;
-use cantap_work::channel_bitrate::ChannelBitrate;
 use cantap_work::channels::Channels;
 use cantap_work::live::LiveRecords;
+use cantap_work::requested_rate::RequestedRate;
 
 /// How long after its end a window is closed, so that it includes what is still on the way.
 const LATENESS_NS: i64 = 1_000_000_000;
@@ -26,7 +26,7 @@ const BAR_COLUMNS: usize = 20;
 pub(super) fn open(
     devices: &[Address],
     channels: &Channels,
-    bitrates: &[ChannelBitrate],
+    bitrates: &[RequestedRate],
     time: Option<Duration>,
 ) -> anyhow::Result<LiveRecords> {
     let boards = Boards::new(devices, channels)

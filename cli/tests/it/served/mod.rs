@@ -1,5 +1,8 @@
 //! A board that `cantap serve` shares, for programs of other people that connect through python-can's socketcand.
 
+#[cfg(unix)]
+pub mod server;
+
 use std::io::{BufRead, BufReader};
 use std::process::{Child, Command, Stdio};
 

@@ -45,6 +45,8 @@ impl Terminal {
         command.env("TERM", "xterm-256color");
         command.env("LC_ALL", "C.UTF-8");
         command.env_remove("NO_COLOR");
+        // No test depends on what another one found, and none writes into the user's folder.
+        command.env("XDG_CACHE_HOME", "/dev/null");
         for (name, value) in environment {
             match value {
                 Some(value) => command.env(name, value),

@@ -121,8 +121,10 @@ fn one_that_does_not_listen_silently_is_not_left_open() {
     let device = open(&address);
     let refused = device.listen(Channel::Can1, 500_000).unwrap_err();
     assert!(matches!(refused, DeviceError::Refused { refusal: Refusal::Unsupported }), "{refused}");
-    let all: Vec<Seen> = seen.try_iter().collect();
-    assert_eq!(all.last().unwrap(), &Seen::Buses([1 << 31; 2]));
+    let off = Seen::Buses([1 << 31; 2]);
+    // It is tried, and then off again, which the adapter may learn only after the refusal.
+    assert!(seen.iter().any(|set| set != off));
+    assert_eq!(seen.iter().next(), Some(off));
     device.join(Channel::Can1, 500_000).unwrap();
 }
 

@@ -169,7 +169,10 @@ impl Decoder {
             b"Rx" => Direction::Rx,
             b"Tx" => Direction::Tx,
             b"TxRq" => return Ok(OnChannel::Request),
-            _ => return Err(Fault::malformed("'Rx' or 'Tx' after the identifier", word)),
+            _ => {
+                let marker = others::like_a_frame(rest).map(OnChannel::LeftOut);
+                return marker.ok_or_else(|| Fault::malformed("'Rx' or 'Tx' after the identifier", word));
+            }
         };
         let id = if extended { Id::extended(raw) } else { Id::standard(raw) }.ok_or_else(|| {
             Fault::malformed("an identifier up to 7FF, or up to 1FFFFFFF followed by x", id)

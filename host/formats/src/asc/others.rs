@@ -17,7 +17,7 @@ const KINDS: [(&[&str], &str); 11] = [
     (&["TFS:", "Diag", "DIAG"], "diagnostics and tests"),
     (&["J1587", "J1708"], "J1708 frames"),
     (&["AFDX", "A429"], "AFDX and ARINC 429 frames and events"),
-    (&["WLAN", "GPS", "GPS:"], "WLAN and GPS events"),
+    (&["WLAN", "GPS", "GPS:", "GPS-Device:"], "WLAN and GPS events"),
 ];
 
 /// Classifies a line, after its time, that belongs to no CAN channel.
@@ -45,12 +45,20 @@ pub(super) fn kind(line: &[u8]) -> Result<Content, Fault> {
     if first.starts_with(b"MOST") || numbered(b"M") {
         return Ok(Content::LeftOut("MOST frames and events"));
     }
+    if numbered(b"COM") {
+        return Ok(Content::LeftOut("serial port events"));
+    }
     // `name := value`.
     if text::word(rest).0 == b":=" {
         return Ok(Content::LeftOut("environment and system variables"));
     }
     let expected = "a channel of 0 to 255, CAN, CANFD, or another event of ASC after the time";
     Err(Fault::malformed(expected, line))
+}
+
+/// What a line is that looks like one on a CAN channel until after the identifier, if it is known: a marker has numbers there.
+pub(super) fn like_a_frame(rest: &[u8]) -> Option<&'static str> {
+    memchr::memmem::find(rest, b" GMGroup:").map(|_| "triggers and markers")
 }
 
 /// A line on a CAN channel that is neither a frame nor an error: `word` is in the identifier's place.

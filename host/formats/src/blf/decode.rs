@@ -11,6 +11,7 @@ use super::super::input::{Input, MAX_ITEM_BYTES};
 use super::super::issue::{Fault, Place};
 use super::super::zone::Zone;
 use super::containers::{AHEAD_BYTES, Containers};
+use super::kinds::{group, is_left_out};
 use super::object::{Content, event, u16_at, u32_at, u64_at};
 use super::{
     BASE_HEADER_BYTES, CAN_MESSAGE, CAN_MESSAGE2, COMPRESSION_NONE, COMPRESSION_ZLIB, CONTAINER_FIELDS_BYTES,
@@ -384,6 +385,9 @@ impl Decoder {
         let kind = u32_at(object, 12);
         self.at += len;
         // Only these headers have the time in the expected place.
+        if !matches!(version, 1 | 2) && is_left_out(kind) {
+            return Object::LeftOut(group(kind));
+        }
         if !matches!(version, 1 | 2) {
             let found = format!("version {version}");
             return Object::Issue(Fault::malformed("an object's header of version 1 or 2", found.as_bytes()));

@@ -2,6 +2,13 @@
 //!
 //! Numbers from Tobias Lorenz's vector_blf (`ObjectHeaderBase.h`).
 
+const OTHER: &str = "objects of other kinds";
+
+/// Whether an object belongs to one of the groups that are no part of a CAN trace.
+pub(super) fn is_left_out(kind: u32) -> bool {
+    group(kind) != OTHER
+}
+
 /// A description of an object that is not part of a CAN trace.
 pub(super) fn group(kind: u32) -> &'static str {
     match kind {
@@ -23,7 +30,7 @@ pub(super) fn group(kind: u32) -> &'static str {
         97 | 98 | 106 | 107 | 109 => "AFDX frames and events",
         99 | 118 | 119 => "diagnostics and tests",
         110..=113 => "ARINC 429 frames and events",
-        _ => "objects of other kinds",
+        _ => OTHER,
     }
 }
 

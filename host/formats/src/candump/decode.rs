@@ -16,6 +16,9 @@ use cantap_trace::fd::{FD_MAX_BYTES, FLAG_BRS, FLAG_ESI, FLAG_FDF};
 use cantap_trace::socketcan::ERROR_FLAG;
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
+const NO_TIMES: &str = "frames have no time: they are a list for cansend";
+/// The flag of 29 bits in SocketCAN's number of an identifier.
+const EXTENDED_FLAG: u32 = 0x8000_0000;
 const EXPECTED: &str = "a log line such as '(1410714882.622188) can0 123#DEADBEEF'";
 
 /// Reads the format.
@@ -24,6 +27,10 @@ pub(crate) struct Decoder {
     interfaces: Interfaces,
     error_frames: ErrorFrames,
     lengths: Lengths,
+    /// Whether the file is a list of frames without times; `None` before its first line.
+    untimed: Option<bool>,
+    /// To be reported once.
+    note: Option<&'static str>,
     /// The last line looked whole and had no line end.
     end_missing: bool,
     /// The digits and time of the last second: most lines are in the same second as the one before.
@@ -36,12 +43,20 @@ impl Decode for Decoder {
         if let Some(found) = self.error_frames.next() {
             return Ok(found);
         }
+        if let Some(note) = self.note.take() {
+            return Ok(Found::Note(note));
+        }
+        if self.untimed.is_none() {
+            self.untimed = Some(is_list(input.peek(1)?));
+            self.note = self.untimed.filter(|untimed| *untimed).map(|_| NO_TIMES);
+        }
         while let Some(line) = input.line()? {
             let text = line.text.trim_ascii();
             if matches!(text.first(), None | Some(b'#')) && !line.too_long {
                 continue;
             }
-            return Ok(match self.parse(text) {
+            let parsed = if self.untimed == Some(true) { self.untimed(text) } else { self.parse(text) };
+            return Ok(match parsed {
                 Ok((record, _)) if !line.terminated && self.was_cut(line.text, &record) => line.cut(),
                 Ok((record, second)) => {
                     self.end_missing = !line.terminated;
@@ -75,6 +90,9 @@ impl Decode for Decoder {
                     lines += 1;
                 }
                 input.consume_lines(used, lines);
+                if lines > 0 {
+                    self.untimed = Some(false);
+                }
             }
             if records.len() >= BATCH || !records.is_empty() && input.may_wait() && !input.has_line() {
                 return Ok(None);
@@ -163,22 +181,52 @@ impl Decoder {
             .ok_or_else(|| Fault::malformed("a time in seconds between the parentheses", time))?;
         let (interface, rest) = text::word(rest);
         let (frame, rest) = text::word(rest);
-        let (id, data) = split_at_byte(frame, b'#').ok_or_else(malformed)?;
         let direction = match rest.trim_ascii() {
             b"" | b"R" | b"r" => Direction::Rx,
             b"T" | b"t" => Direction::Tx,
             other => return Err(Fault::malformed("'R', 'T' or nothing after the frame", other)),
         };
-        let raw = text::hex(id).ok_or_else(|| Fault::malformed("a hexadecimal identifier", id))?;
+        let (event, second) = self.event(frame).ok_or_else(malformed)??;
+        let event = match event {
+            TraceEvent::Frame { frame, late, .. } => TraceEvent::Frame { frame, direction, late },
+            other => other,
+        };
         let channel = self.interfaces.channel(interface);
+        Ok((TraceRecord { time_ns, channel, event }, second))
+    }
+
+    /// The same for a line of a list: `123#DEADBEEF`, with or without an interface or cansend before it.
+    fn untimed(&mut self, line: &[u8]) -> Result<(TraceRecord, Option<TraceEvent>), Fault> {
+        let malformed =
+            || Fault::malformed("a frame such as '123#DEADBEEF' or 'cansend can0 123#DEADBEEF'", line);
+        let (interface, frame) = untimed_parts(line).ok_or_else(malformed)?;
+        let (event, second) = self.event(frame).ok_or_else(malformed)??;
+        let channel = self.interfaces.channel(interface);
+        Ok((TraceRecord { time_ns: 0, channel, event }, second))
+    }
+
+    /// What `123#DEADBEEF` is, as received; `None` without a `#`.
+    #[inline]
+    fn event(&mut self, frame: &[u8]) -> Option<Result<(TraceEvent, Option<TraceEvent>), Fault>> {
+        let (id, data) = split_at_byte(frame, b'#')?;
+        Some(self.event_of(frame, id, data))
+    }
+
+    #[inline]
+    fn event_of(
+        &mut self,
+        frame: &[u8],
+        id: &[u8],
+        data: &[u8],
+    ) -> Result<(TraceEvent, Option<TraceEvent>), Fault> {
+        let raw = text::hex(id).ok_or_else(|| Fault::malformed("a hexadecimal identifier", id))?;
         if id.len() == 8 && raw & ERROR_FLAG != 0 {
             let (bytes, _) = bytes(data).ok_or_else(|| Fault::malformed("up to eight data bytes", data))?;
-            let (event, second) = self.error_frames.read(raw, bytes);
-            return Ok((TraceRecord { time_ns, channel, event }, second));
+            return Ok(self.error_frames.read(raw, bytes));
         }
         let id = match id.len() {
             3 => Id::standard(raw),
-            8 => Id::extended(raw),
+            8 => Id::extended(raw & !EXTENDED_FLAG),
             _ => None,
         };
         let id = id.ok_or_else(|| {
@@ -190,9 +238,36 @@ impl Decoder {
             })?,
             _ => payload(id, data)?.into(),
         };
-        let event = TraceEvent::Frame { frame, direction, late: false };
-        Ok((TraceRecord { time_ns, channel, event }, None))
+        Ok((TraceEvent::Frame { frame, direction: Direction::Rx, late: false }, None))
     }
+}
+
+/// The interface and the frame of a line of a list.
+fn untimed_parts(line: &[u8]) -> Option<(&[u8], &[u8])> {
+    let mut words = line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty()).peekable();
+    words.next_if(|word| *word == b"cansend");
+    match (words.next()?, words.next(), words.next()) {
+        (frame, None, None) => Some((b"can0", frame)),
+        (interface, Some(frame), None) => Some((interface, frame)),
+        _ => None,
+    }
+}
+
+/// Whether a line is one of a list of frames without times.
+pub(crate) fn is_untimed(line: &[u8]) -> bool {
+    let frame = untimed_parts(line).and_then(|(_, frame)| split_at_byte(frame, b'#'));
+    frame.is_some_and(|(id, data)| {
+        let is_data = |byte: &u8| byte.is_ascii_hexdigit() || matches!(byte, b'#' | b'.' | b'R' | b'_');
+        matches!(id.len(), 3 | 8) && text::hex(id).is_some() && data.iter().all(is_data)
+    })
+}
+
+/// Whether a file that begins so is such a list: a fragment of a line may look like a frame, but not the line after it.
+fn is_list(head: &[u8]) -> bool {
+    const ENOUGH: usize = 4;
+    let lines = head.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii);
+    let mut lines = lines.filter(|line| !line.is_empty() && !line.starts_with(b"#")).take(ENOUGH);
+    lines.next().is_some_and(is_untimed) && lines.all(|line| !line.starts_with(b"("))
 }
 
 /// Whether a line has a CAN XL frame: three hexadecimal numbers with colons after the first `#`, then the data.

@@ -164,7 +164,7 @@ pub(super) fn role_of(name: &[u8]) -> Option<(Role, Option<Form>)> {
     if stem.len() < plain.len() && matches!(stem, "d" | "b" | "data" | "byte" | "databyte" | "db") {
         return Some((Role::Bytes, None));
     }
-    for prefix in ["timestamps", "timestamp", "timeoffset", "time", "ts"] {
+    for prefix in ["timestamps", "timestamp", "timeoffset", "unixtimestamp", "unixtime", "time", "ts"] {
         if let Some(unit) = plain.strip_prefix(prefix) {
             let unit = match unit {
                 "" | "stamp" | "epoch" => None,
@@ -227,6 +227,7 @@ mod tests {
             ("Timestamp", Role::Time),
             ("time_s", Role::Time),
             ("Time (ms)", Role::Time),
+            ("Unix Time", Role::Time),
             ("CAN ID", Role::Id),
             ("Arbitration_ID", Role::Id),
             ("ID (hex)", Role::Id),

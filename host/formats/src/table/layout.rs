@@ -131,12 +131,21 @@ impl Layout {
         Ok((layout, is_row))
     }
 
-    /// From a row of a table without names, if it is a time, an identifier, a length and as many bytes, in one cell or one each: as in tables
-    /// that people made of logs. What follows, such as a mark of an attack, has no place in a trace.
+    /// From a row of a table without names, if it is like those that people made of logs: see [`Self::with_length`] and [`Self::without_length`].
     pub(super) fn of_row(line: &[u8]) -> Option<Self> {
         let separator = Separator::of(line);
         let cells = separator.cells(line);
-        let [time, id, len, data @ ..] = &cells[..] else { return None };
+        Self::with_length(separator, &cells).or_else(|| Self::without_length(separator, &cells))
+    }
+
+    /// A time, an identifier, a length and as many bytes, in one cell or one each. What follows, such as a mark of an attack, has no place in
+    /// a trace, nor has the `000` between identifier and length of data sets of HCRL and CrySyS.
+    fn with_length(separator: Separator, cells: &[&[u8]]) -> Option<Self> {
+        let (cells, skipped) = match cells {
+            [time, id, b"000", rest @ ..] => (&[&[*time, *id], rest].concat()[..], 1),
+            _ => (cells, 0),
+        };
+        let [time, id, len, data @ ..] = cells else { return None };
         let time_ns = text::time(time, NS_PER_S, b'.').filter(|_| time.contains(&b'.'));
         let is_id = matches!(id.len(), 3 | 4 | 8) && text::hex(id).is_some();
         let len = text::decimal(len).filter(|len| *len <= 8 && is_id && time_ns.is_some())? as usize;
@@ -150,12 +159,52 @@ impl Layout {
         let hex = Some(Form::Hex);
         places[Role::Time as usize] = Some(Place { at: 0, form: Some(Form::Unit(NS_PER_S)) });
         places[Role::Id as usize] = Some(Place { at: 1, form: hex });
-        places[Role::Dlc as usize] = Some(Place { at: 2, form: None });
+        places[Role::Dlc as usize] = Some(Place { at: 2 + skipped, form: None });
         let role = if one_each { Role::Bytes } else { Role::Data };
-        places[role as usize] = Some(Place { at: 3, form: hex });
+        places[role as usize] = Some(Place { at: 3 + skipped, form: hex });
         let has_others = data.len() > if one_each { len } else { 1 };
         Some(Self { separator, places, byte_columns: usize::MAX, has_others })
     }
+
+    /// A time, an identifier with `0x` before it and all bytes in a cell; or a stamp of CSS Electronics' older loggers, a mark of 29 bits, the
+    /// identifier and all bytes in a cell, as in their files without the head.
+    fn without_length(separator: Separator, cells: &[&[u8]]) -> Option<Self> {
+        let is_hex = |cell: &[u8]| matches!(cell.len(), 1..=8) && text::hex(cell).is_some();
+        let is_data = |cell: &[u8]| byte_count(cell).is_some_and(|count| count <= 8);
+        let mut places = [None; ROLES.len()];
+        let hex = Some(Form::Hex);
+        match cells {
+            [time, id, data] => {
+                let is_time = time.contains(&b'.') && text::time(time, NS_PER_S, b'.').is_some();
+                let is_id = text::after_0x(id).is_some_and(is_hex);
+                if !is_time || !is_id || !is_data(data) || data.len() < 4 {
+                    return None;
+                }
+                places[Role::Time as usize] = Some(Place { at: 0, form: Some(Form::Unit(NS_PER_S)) });
+                places[Role::Id as usize] = Some(Place { at: 1, form: hex });
+                places[Role::Data as usize] = Some(Place { at: 2, form: hex });
+            }
+            [time, b"0" | b"1", id, data] => {
+                let is_stamp = is_stamp(time) && separator != Separator::Blanks;
+                if !is_stamp || !is_hex(id) || !is_data(data) {
+                    return None;
+                }
+                places[Role::Time as usize] = Some(Place { at: 0, form: None });
+                places[Role::Extended as usize] = Some(Place { at: 1, form: None });
+                places[Role::Id as usize] = Some(Place { at: 2, form: hex });
+                places[Role::Data as usize] = Some(Place { at: 3, form: hex });
+            }
+            _ => return None,
+        }
+        Some(Self { separator, places, byte_columns: 0, has_others: false })
+    }
+}
+
+/// Whether a cell is a day, `T`, and a time of day in digits: `31T135012345`.
+fn is_stamp(cell: &[u8]) -> bool {
+    let Some(at) = memchr::memchr(b'T', cell) else { return false };
+    let digits = [&cell[..at], &cell[at + 1..]].concat();
+    matches!((at, cell.len() - at - 1), (2 | 8, 6 | 9)) && digits.iter().all(u8::is_ascii_digit)
 }
 
 /// How many bytes a cell of hexadecimal digits without gaps is.

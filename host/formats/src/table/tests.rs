@@ -19,6 +19,16 @@ fn with_columns(columns: &str, file: &str) -> (String, Vec<String>) {
     (tests::write(Format::Candump, &records), issues)
 }
 
+/// As scanners of hobbyists print them: no time, and as many cells as the frame has bytes.
+#[test]
+fn rows_that_begin_with_the_identifier_are_read_with_columns() {
+    let (log, issues) = with_columns("id=1,bytes=2", "394,57,4,1F,0\n1AC,4\n0,1,0\n7FF\n");
+    assert_eq!(issues, Vec::<String>::new());
+    let lines =
+        ["394#57041F00", "1AC#04", "000#0100", "7FF#"].map(|frame| format!("(0.000000) can0 {frame}\n"));
+    assert_eq!(log, lines.concat());
+}
+
 #[test]
 fn tables_of_public_collections_are_known_and_read_whole() {
     for (file, log) in [
@@ -26,6 +36,21 @@ fn tables_of_public_collections_are_known_and_read_whole() {
         (
             "1478198376.389427,0316,8,05,21,68,09,21,21,00,6f,R\n1478198376.389636,0690,2,00,0a,T\n",
             "(1478198376.389427) can0 316#052168092121006F\n(1478198376.389636) can0 690#000A\n",
+        ),
+        // CrySyS's: blanks, and a cell that is always 000.
+        (
+            "1483093132.049669        0380    000    8    30 bb 82 00 9d 53 00 81\n1483093132.050104        0180    000    2    64 10\n",
+            "(1483093132.049669) can0 380#30BB82009D530081\n(1483093132.050104) can0 180#6410\n",
+        ),
+        // A CL2000's file without its head.
+        (
+            "11T082554602;1;cf00203;cd402800043828ff\n11T082554603;0;7df;02\n",
+            "(894354.602000) can0 0CF00203#CD402800043828FF\n(894354.603000) can0 7DF#02\n",
+        ),
+        // Of programs for lessons.
+        (
+            "0.001 0x100 204E000000000000\n0.002 0x18DAF110 507D\n",
+            "(0.001000) can0 100#204E000000000000\n(0.002000) can0 18DAF110#507D\n",
         ),
         // HCRL's challenge.
         (

@@ -29,7 +29,7 @@ pub(super) fn number(cell: &[u8], unit_ns: i64) -> Option<i64> {
 }
 
 /// A date, or a time of a day without one.
-pub(super) fn date(cell: &[u8], zone: &Zone) -> Option<i64> {
+pub(crate) fn date(cell: &[u8], zone: &Zone) -> Option<i64> {
     let cell = std::str::from_utf8(cell).ok()?.replace('/', "-");
     if let Ok(time) = cell.parse::<Timestamp>() {
         return i64::try_from(time.as_nanosecond()).ok();

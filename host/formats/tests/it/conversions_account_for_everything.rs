@@ -244,6 +244,16 @@ fn samples() -> Vec<(Format, Vec<u8>)> {
              [12 CAN frames not printed]\r\n(51.261) TX3 1FFFFFFF [12] 00 01 02 03 04 05 06 07 08 09 0A 0B\r\n",
         ),
         text(
+            Format::Nmea2000,
+            "00:29:58.617 R 0DFF180D A2 8C 50 C0 FF FF FF FF\n00:29:58.700 T 18EAFF44 14 F0 01\n\
+             2011-11-24-22:42:04.388,2,127250,36,255,8,ff,10,3b,ff,7f,ce,f5,fc\nA000159.990 CCFF7 0FF63 3B9F0000000002FF\n",
+        ),
+        text(
+            Format::Carbus,
+            "@ TEXT @ 3 @ 64 @ 0 @ 2 @ 20672 @ 00:00:20.672 @\r15,316000\t1\t00000004\t30B\t8\t10 2E 02 00 08 00 00 14\t00000000\t .      \t\r\
+             15,320000\t2\t00000005\t1B000067\t2\t67 00\t00000000\tg \t\r",
+        ),
+        text(
             Format::Table,
             "Timestamp,CAN ID,IDE,Bus,Dir,RTR,DLC,Data,Label\n1478198376.389427,0A5,0,0,Rx,0,2,05 21,R\n\
              1478198376.389428,18DAF110,1,1,Tx,0,0,,R\n1478198376.389429,123,0,0,Rx,1,3,,R\n\

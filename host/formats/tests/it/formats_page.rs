@@ -54,6 +54,8 @@ fn row(format: Format) -> String {
             Format::BatteryEmulator => {
                 ["as written, no date", "yes | yes | – | without flags | – | – | that there was one"]
             }
+            Format::Nmea2000 => ["as written, local if a date", "– | from Yacht Devices | – | – | – | – | –"],
+            Format::Carbus => ["as written, no date", "yes | – | – | – | – | – | –"],
             Format::Table => ["as written, local if a date", "yes | yes | yes | without flags | – | – | –"],
             Format::Sqlite => ["as written", "– | – | yes | without flags | yes | yes | yes"],
             new => panic!("{new} has no row here yet"),

@@ -1,14 +1,14 @@
 //! Which records a client receives, and what it counts.
 
-use std::collections::HashMap;
 use std::fmt::Write;
 use std::time::{Duration, Instant};
 
 use cantap::{Direction, TraceEvent, TraceRecord};
-use cantap_wire::{Frame, Id};
 
-use super::messages::{now_ns, put_error, put_frame};
+use super::messages::{put_error, put_frame};
 use super::subscriptions::Subscriptions;
+use crate::own_frames::OwnFrames;
+use crate::text::now_ns;
 
 /// What a client receives, by its mode.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -29,10 +29,8 @@ pub struct Hearing {
     /// Nothing before this time.
     from: Option<Instant>,
     pub subscriptions: Subscriptions,
-    /// Frames it has sent, by tag, until they are on the bus: a client does not receive its own frames.
-    pub own_frames: HashMap<u32, Frame>,
-    /// Frames sent for it repeatedly.
-    pub own_entries: HashMap<Id, Frame>,
+    /// What it has sent: a client does not receive its own frames.
+    pub own: OwnFrames,
     /// It was off the bus for a moment.
     pub has_gap: bool,
     /// It has said what it wants since it opened its bus. Before that, it compares what it reads with an answer that it waits for.
@@ -100,7 +98,7 @@ impl Hearing {
             TraceEvent::Frame { frame, direction, .. } => {
                 let Some(frame) = frame.classic() else { return };
                 let bytes = frame.data().len() as u64;
-                if *direction == Direction::Tx && self.is_own(frame) {
+                if *direction == Direction::Tx && self.own.take(frame) {
                     self.statistics.sent += 1;
                     self.statistics.sent_bytes += bytes;
                     return;
@@ -119,7 +117,7 @@ impl Hearing {
             }
             event => {
                 if let TraceEvent::TransmitFailed { tag, .. } = event {
-                    self.own_frames.remove(tag);
+                    self.own.failed(*tag);
                 }
                 if self.tells_errors() {
                     put_error(out, time_ns, event);
@@ -139,15 +137,6 @@ impl Hearing {
         }
     }
 
-    /// Whether the client sent this frame itself; if so, that is now complete.
-    fn is_own(&mut self, frame: &Frame) -> bool {
-        if self.own_entries.get(&frame.id()) == Some(frame) {
-            return true;
-        }
-        let tag = self.own_frames.iter().find(|(_, own)| *own == frame).map(|(tag, _)| *tag);
-        tag.is_some_and(|tag| self.own_frames.remove(&tag).is_some())
-    }
-
     fn put_statistics(&mut self, out: &mut String) {
         let Statistics { every, told_at, received_bytes, received, sent_bytes, sent } = &mut self.statistics;
         if every.is_zero() || told_at.is_some_and(|told_at| told_at.elapsed() < *every) {
@@ -162,6 +151,7 @@ impl Hearing {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cantap_wire::{Frame, Id};
 
     fn record(ms: i64, frame: &str, direction: Direction) -> TraceRecord {
         let frame = frame.parse::<Frame>().unwrap().into();
@@ -175,8 +165,8 @@ mod tests {
     #[test]
     fn a_client_hears_others_frames_and_not_its_own() {
         let mut hearing = Hearing { hears: Hears::All, ..Hearing::default() };
-        hearing.own_frames.insert(1, "123#11".parse().unwrap());
-        hearing.own_entries.insert(Id::standard(0x200).unwrap(), "200#".parse().unwrap());
+        hearing.own.sends(1, "123#11".parse().unwrap());
+        hearing.own.repeats(Id::standard(0x200).unwrap(), Some("200#".parse().unwrap()));
         let mut out = String::new();
         let sent = |ms, frame| record(ms, frame, Direction::Tx);
         let records =
@@ -191,7 +181,7 @@ mod tests {
         let mut out = String::new();
         hearing.begin(Hears::Nothing, Instant::now());
         hearing.statistics_every(Duration::from_nanos(1));
-        hearing.own_frames.insert(1, "123#11".parse().unwrap());
+        hearing.own.sends(1, "123#11".parse().unwrap());
         hearing.take(&[record(1, "123#11", Direction::Tx), record(2, "124#2233", Direction::Rx)], &mut out);
         assert_eq!(out, "< stat 2 1 1 1 >");
         out.clear();

@@ -10,7 +10,7 @@ use cantap::TraceEvent;
 use cantap_wire::Frame;
 use cantap_wire::record::TransmitFailure;
 
-use crate::text::{Seconds, error_frame, put_bytes};
+use crate::text::{Seconds, error_frame, now_ns, put_bytes};
 
 /// Adds a frame. `is_raw` is false in BCM mode.
 pub fn put_frame(out: &mut String, time_ns: i64, frame: &Frame, is_raw: bool) {
@@ -31,12 +31,6 @@ pub fn put_error(out: &mut String, time_ns: i64, event: &TraceEvent) {
     let _ = write!(out, "< error {id:08X} {} ", Seconds(time_ns));
     put_bytes(out, &data, " ");
     out.push_str(" >");
-}
-
-/// The computer's time, in UTC nanoseconds since the Unix epoch.
-pub fn now_ns() -> i64 {
-    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
-    now.map_or(0, |since| since.as_nanos() as i64)
 }
 
 /// The message for a refused frame, for which raw mode has none.

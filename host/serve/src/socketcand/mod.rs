@@ -12,20 +12,24 @@ mod subscriptions;
 
 use std::collections::HashMap;
 use std::io::{self, Read, Write};
-use std::net::{Ipv4Addr, SocketAddr, TcpStream, UdpSocket};
+use std::net::{SocketAddr, TcpStream};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use cantap::Device;
 use cantap::device::{channel_number, is_idle, write_patiently};
-use cantap::{Device, DeviceError};
 use cantap_trace::Interface;
-use cantap_wire::message::{ChannelConfig, Mode, Periodic, Role, TxFrame};
+use cantap_wire::message::{Mode, Periodic, Role};
 use cantap_wire::{Channel, Frame, Id};
 
+use crate::beacon::{self, Beacon};
 use crate::foreign;
 use crate::lines::device_of;
 use crate::listen::{Listening, accept, bind, patience};
+use crate::lock::lock;
+use crate::open_bus::OpenBus;
+use crate::pace::Pace;
 use crate::places::{Place, Places, ends};
 use crate::writer::took_nothing;
 use crate::{Board, News};
@@ -35,10 +39,6 @@ use subscriptions::{MOST, Wanted};
 
 /// The port of the original server.
 pub const PORT: u16 = 29_536;
-/// The port for beacons.
-const BEACON_PORT: u16 = 42_000;
-/// The page requires one at least every three seconds.
-const BEACON_EVERY: Duration = Duration::from_secs(2);
 /// Clients compare the result of one read with one answer, so two are not sent together.
 const BETWEEN_ANSWERS: Duration = Duration::from_millis(20);
 /// For the same reason, no frame right after the answer to `rawmode`.
@@ -50,6 +50,8 @@ const KEEP_ALIVE_EVERY: Duration = Duration::from_secs(7);
 const KEEP_ALIVE: &str = "< echo >";
 /// A client that has not opened a bus by this time is dropped.
 const OPEN_TIMEOUT: Duration = Duration::from_secs(30);
+/// How long to wait for records before checking whether the client is still there.
+const WAIT: Duration = Duration::from_millis(20);
 /// Limit for connections at a time, including those that have not opened a bus.
 const MOST_CONNECTIONS: usize = 32;
 
@@ -69,11 +71,12 @@ pub fn listen(boards: &[Arc<Board>], address: SocketAddr, role: Role) -> io::Res
             })
         })
         .collect();
-    let beacon = Beacon::new(address, &buses)?;
+    let names: Vec<&str> = buses.iter().map(|bus| bus.name.as_str()).collect();
+    let beacon = Beacon::new(address, boards, &names)?;
     let mut sent: Option<Instant> = None;
     let places = Places::new(MOST_CONNECTIONS);
     Listening::start("cantap-socketcand", Some(address), move || {
-        if sent.is_none_or(|sent| sent.elapsed() >= BEACON_EVERY) {
+        if sent.is_none_or(|sent| sent.elapsed() >= beacon::EVERY) {
             beacon.send();
             sent = Some(Instant::now());
         }
@@ -104,37 +107,6 @@ struct Bus {
     name: String,
     board: Arc<Board>,
     channel: Channel,
-}
-
-/// Announces where the server is.
-struct Beacon {
-    socket: UdpSocket,
-    to: SocketAddr,
-    text: String,
-}
-
-impl Beacon {
-    fn new(address: SocketAddr, buses: &[Bus]) -> io::Result<Self> {
-        let is_local = address.ip().is_loopback();
-        let (from, to) = if is_local {
-            (Ipv4Addr::LOCALHOST, Ipv4Addr::LOCALHOST)
-        } else {
-            (Ipv4Addr::UNSPECIFIED, Ipv4Addr::BROADCAST)
-        };
-        let socket = UdpSocket::bind((from, 0))?;
-        socket.set_broadcast(!is_local)?;
-        let buses: Vec<String> = buses.iter().map(|bus| format!("<Bus name=\"{}\"/>", bus.name)).collect();
-        let buses = buses.concat();
-        let text = format!(
-            "<CANBeacon name=\"cantap\" type=\"adapter\" description=\"cantap CAN analyser\"><URL>can://{address}</URL>{buses}</CANBeacon>"
-        );
-        Ok(Self { socket, to: (to, BEACON_PORT).into(), text })
-    }
-
-    fn send(&self) {
-        // Nobody may be listening.
-        let _ = self.socket.send_to(self.text.as_bytes(), self.to);
-    }
 }
 
 /// One client.
@@ -171,23 +143,9 @@ struct Setup {
 
 /// An open bus.
 struct Opened {
-    device: Arc<Device>,
-    channel: Channel,
-    config: ChannelConfig,
-    /// The mode for sending, if it may send.
-    sends_in: Option<Mode>,
-    next_tag: u32,
-    /// When it last had something sent.
-    sent_at: Instant,
-    /// After sending nothing for this long, it only listens again.
-    idle_after: Option<Duration>,
+    bus: OpenBus,
     /// Frames sent repeatedly, by entry.
     periodic: HashMap<Id, (u8, u64)>,
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Every holder leaves the state consistent.
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Connection {
@@ -244,7 +202,7 @@ impl Connection {
                     Err(bad) => {
                         // Nothing is skipped in search of the first command.
                         self.is_over.fetch_or(!has_spoken, Ordering::Relaxed);
-                        Some(self.misunderstood(&bad, text))
+                        Some(self.misunderstood(&bad, text, has_spoken))
                     }
                 };
                 if let Some(answer) = answer {
@@ -284,19 +242,21 @@ impl Connection {
         result
     }
 
-    /// What is answered to a text that is no command.
-    fn misunderstood(&self, bad: &BadCommand, text: &str) -> String {
-        match bad {
-            BadCommand::Unknown => {
-                self.refused(&format!("there is no command '{}'", plain(text.trim())));
-                "< error unknown command >".to_owned()
-            }
-            BadCommand::Syntax(what) => {
-                let reason = format!("{what} is wrong in '{}'", plain(text.trim()));
-                self.refused(&reason);
-                self.refusal(&reason)
-            }
+    /// What is answered to a text that is no command; if it is the first, the connection ends.
+    fn misunderstood(&self, bad: &BadCommand, text: &str, has_spoken: bool) -> String {
+        let (reason, answer) = match bad {
+            BadCommand::Unknown => (
+                format!("there is no command '{}'", plain(text.trim())),
+                Some("< error unknown command >".to_owned()),
+            ),
+            BadCommand::Syntax(what) => (format!("{what} is wrong in '{}'", plain(text.trim())), None),
+        };
+        if has_spoken {
+            self.not_done(&reason);
+        } else {
+            self.refused(&reason);
         }
+        answer.unwrap_or_else(|| self.refusal(&reason))
     }
 
     /// A reason as the client reads it: in raw mode, clients read nothing but frames.
@@ -396,7 +356,7 @@ impl Connection {
                 lock(&self.hearing).subscriptions.remove(id);
                 Ok(())
             }
-            Command::Send(frame) => self.send(bus, frame),
+            Command::Send(frame) => self.send(&mut bus.bus, frame),
             Command::Add(us, frame) => self.add(bus, us, frame),
             Command::Update(frame) => match bus.periodic.get(&frame.id()) {
                 Some((_, us)) => {
@@ -407,18 +367,25 @@ impl Connection {
             },
             Command::Delete(id) => match bus.periodic.remove(&id) {
                 Some((slot, _)) => {
-                    lock(&self.hearing).own_entries.remove(&id);
-                    bus.sent_at = Instant::now();
+                    lock(&self.hearing).own.repeats(id, None);
+                    let bus = &mut bus.bus;
+                    bus.has_ended_sending();
                     bus.device.set_periodic(bus.channel, slot, None).map_err(|error| error.to_string())
                 }
                 None => Err(format!("nothing is sent periodically as {id}")),
             },
         };
         let reason = done.err()?;
-        self.refused(&reason);
+        self.not_done(&reason);
         Some(self.refusal(&reason))
     }
 
+    /// A command was not carried out.
+    fn not_done(&self, reason: &str) {
+        self.buses[0].board.tell(News::NotDone { client: self.name.clone(), reason: reason.to_owned() });
+    }
+
+    /// The connection ends for this reason.
     fn refused(&self, reason: &str) {
         self.buses[0].board.tell(News::Refused { client: self.name.clone(), reason: reason.to_owned() });
     }
@@ -447,25 +414,19 @@ impl Connection {
             .name("cantap-socketcand-hears".to_owned())
             .spawn(move || connection.hear(&heard))
             .map_err(|error| error.to_string())?;
-        Ok(Opened {
-            device,
-            channel,
-            config,
-            sends_in,
-            next_tag: 0,
-            sent_at: Instant::now(),
-            idle_after: bus.board.idle_sender(),
-            periodic: HashMap::new(),
-        })
+        let bus = OpenBus::new(device, channel, config, sends_in, bus.board.idle_sender());
+        Ok(Opened { bus, periodic: HashMap::new() })
     }
 
     /// Sends the client what is received, until either side ends.
     fn hear(&self, device: &Device) {
         let mut records = device.records();
         let mut out = String::new();
+        let mut pace = Pace::default();
         while !self.is_over.load(Ordering::Relaxed) {
+            let wait = if out.is_empty() { WAIT } else { pace.left(Instant::now()) };
             // The board or the server is gone, so the connection is, too.
-            let Ok(Some(batch)) = records.next_batch(Duration::from_millis(20)) else { break };
+            let Ok(Some(batch)) = records.next_batch(wait) else { break };
             loop {
                 let mut hearing = lock(&self.hearing);
                 let Some(wait) = hearing.wait() else {
@@ -479,10 +440,14 @@ impl Connection {
             if out.is_empty() && self.needs_keep_alive() {
                 out.push_str(KEEP_ALIVE);
             }
+            if out.is_empty() || !pace.left(Instant::now()).is_zero() {
+                continue;
+            }
             if self.write(&out).is_err() {
                 break;
             }
             out.clear();
+            pace.has_written(Instant::now());
         }
         self.is_over.store(true, Ordering::Relaxed);
     }
@@ -500,57 +465,34 @@ impl Connection {
         }
     }
 
-    /// Opens the bus for sending, when a client sends.
-    fn may_send(&self, bus: &mut Opened) -> Result<(), String> {
-        let Some(mode) = bus.sends_in else { return Err("the bus was opened to listen only".to_owned()) };
-        bus.sent_at = Instant::now();
-        if bus.config.mode == mode { Ok(()) } else { self.change_mode(bus, mode) }
+    /// The client has missed what was on the bus for a moment.
+    fn missed(&self) {
+        lock(&self.hearing).has_gap = true;
     }
 
-    /// Only listens again, if nothing was sent for long enough: a client need not say anything, and one that has been stopped would keep
-    /// the board acknowledging for ever.
-    fn listen_again(&self, bus: &mut Opened) -> Result<(), String> {
-        let Some(after) = bus.idle_after else { return Ok(()) };
-        let sends = bus.config.mode != Mode::ListenOnly;
-        if !sends || !bus.periodic.is_empty() || bus.sent_at.elapsed() < after {
+    /// Only listens again, if nothing is sent any more.
+    fn listen_again(&self, opened: &mut Opened) -> Result<(), String> {
+        if !opened.periodic.is_empty() {
             return Ok(());
         }
-        self.change_mode(bus, Mode::ListenOnly)?;
-        let (client, channel) = (self.name.clone(), bus.channel);
-        self.buses[0].board.tell(News::Idle { client, channel, after });
+        if let Some(after) = opened.bus.listen_again(|| self.missed())? {
+            let (client, channel) = (self.name.clone(), opened.bus.channel);
+            self.buses[0].board.tell(News::Idle { client, channel, after });
+        }
         Ok(())
     }
 
-    fn change_mode(&self, bus: &mut Opened, mode: Mode) -> Result<(), String> {
-        let said = |error: DeviceError| error.to_string();
-        let config = ChannelConfig { mode, ..bus.config };
-        bus.device.close_channel(bus.channel).map_err(said)?;
-        let opened = bus.device.open_channel(bus.channel, Some(config));
-        if opened.is_err() {
-            bus.device.open_channel(bus.channel, Some(bus.config)).map_err(said)?;
-        }
-        // The client has missed what was on the bus meanwhile.
-        lock(&self.hearing).has_gap = true;
-        bus.config = opened.map_err(said)?;
-        Ok(())
-    }
-
-    fn send(&self, bus: &mut Opened, frame: Frame) -> Result<(), String> {
-        self.may_send(bus)?;
-        let tag = bus.next_tag;
-        bus.next_tag = (tag + 1) % (1 << 24);
-        lock(&self.hearing).own_frames.insert(tag, frame);
-        let sent = bus.device.send(bus.channel, &[TxFrame { tag, frame, at_ticks: None }]);
-        if let Err(error) = sent {
-            lock(&self.hearing).own_frames.remove(&tag);
-            return Err(error.to_string());
-        }
-        Ok(())
+    fn send(&self, bus: &mut OpenBus, frame: Frame) -> Result<(), String> {
+        bus.may_send(|| self.missed())?;
+        let tag = bus.next_tag();
+        lock(&self.hearing).own.sends(tag, frame);
+        bus.send(tag, frame).inspect_err(|_| lock(&self.hearing).own.failed(tag))
     }
 
     /// Has the board send a frame repeatedly; one with the same identifier is replaced.
-    fn add(&self, bus: &mut Opened, us: u64, frame: Frame) -> Result<(), String> {
-        self.may_send(bus)?;
+    fn add(&self, opened: &mut Opened, us: u64, frame: Frame) -> Result<(), String> {
+        let Opened { bus, periodic } = opened;
+        bus.may_send(|| self.missed())?;
         let hello = bus.device.hello();
         let ticks = u128::from(us) * u128::from(hello.tick_hz) / 1_000_000;
         let period_ticks = u32::try_from(ticks).map_err(|_| {
@@ -559,25 +501,21 @@ impl Connection {
                 u64::from(u32::MAX) / u64::from(hello.tick_hz.max(1))
             )
         })?;
-        let slot = match bus.periodic.get(&frame.id()) {
+        let slot = match periodic.get(&frame.id()) {
             Some((slot, _)) => *slot,
             None => (0..hello.periodic_slots)
-                .find(|slot| bus.periodic.values().all(|(taken, _)| taken != slot))
+                .find(|slot| periodic.values().all(|(taken, _)| taken != slot))
                 .ok_or_else(|| {
                     format!("the board sends at most {} frames periodically", hello.periodic_slots)
                 })?,
         };
         let entry = Periodic { frame, period_ticks, count: 0, modifiers: heapless::Vec::new() };
-        let before = lock(&self.hearing).own_entries.insert(frame.id(), frame);
+        let before = lock(&self.hearing).own.repeats(frame.id(), Some(frame));
         if let Err(error) = bus.device.set_periodic(bus.channel, slot, Some(entry)) {
-            let entries = &mut lock(&self.hearing).own_entries;
-            match before {
-                Some(before) => entries.insert(frame.id(), before),
-                None => entries.remove(&frame.id()),
-            };
+            lock(&self.hearing).own.repeats(frame.id(), before);
             return Err(error.to_string());
         }
-        bus.periodic.insert(frame.id(), (slot, us));
+        periodic.insert(frame.id(), (slot, us));
         Ok(())
     }
 }

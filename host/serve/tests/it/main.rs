@@ -2,7 +2,9 @@
 
 mod board;
 mod browser;
+mod cannelloni;
 mod eight_clients;
+mod gvret;
 mod hostile;
 mod line;
 mod metrics;

@@ -108,6 +108,24 @@ fn a_client_does_what_its_permissions_name_and_nothing_else() {
     local.listen(Channel::Can2, BITRATE_BPS).unwrap();
 }
 
+/// Configuring reaches further than listening: what is stored, a measurement and a restart concern channels that need not be open.
+#[test]
+fn who_has_one_channel_configures_no_other() {
+    let folder = tempfile::tempdir().unwrap();
+    let served = serve(folder.path());
+    served.permit("[clients.carol]\nchannels = [1]");
+    let carol = Keys::in_folder(folder.path()).unwrap().add_client("carol", Role::Configure).unwrap();
+    let device = served.connect(&carol).unwrap();
+    let config = in_mode(&device, Mode::ListenOnly);
+    device.configure(Channel::Can1, config).unwrap();
+    is_refused(&device.configure(Channel::Can2, config), "channel 2's settings");
+    served.tells("channel 2 is not permitted");
+    is_refused(&device.measure_edges(Some(Channel::Can2)), "a measurement of channel 2");
+    is_refused(&device.save_defaults(), "both channels' settings");
+    is_refused(&device.clear_defaults(), "both channels' settings");
+    is_refused(&device.reset(), "a restart, which both channels see");
+}
+
 #[test]
 fn permissions_that_change_let_those_go_whom_they_concern() {
     let folder = tempfile::tempdir().unwrap();

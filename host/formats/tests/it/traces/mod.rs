@@ -33,7 +33,7 @@ pub fn file_name(format: Format, compression: &str) -> String {
         Format::Candump | Format::Busmaster => "log",
         Format::Asc => "asc",
         Format::Blf => "blf",
-        Format::Trc(_) | Format::CanHacker => "trc",
+        Format::Trc(_) | Format::CanHacker | Format::Carbus => "trc",
         Format::Csv(_) | Format::CanEdgeCsv => "csv",
         Format::Pcapng => "pcapng",
         Format::Dif => "dif",
@@ -44,6 +44,7 @@ pub fn file_name(format: Format, compression: &str) -> String {
         | Format::Printer
         | Format::CanKing
         | Format::BatteryEmulator
+        | Format::Nmea2000
         | Format::Table => "txt",
         Format::Sqlite => "db",
         Format::Crtd => "crtd",

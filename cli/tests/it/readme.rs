@@ -1,0 +1,60 @@
+//! The README's commands, as written.
+
+use std::path::Path;
+use std::process::Command;
+
+/// The lines of the first block of commands below a heading.
+fn commands(page: &str, heading: &str) -> Vec<String> {
+    let (_, section) = page.split_once(&format!("\n## {heading}\n")).expect("the heading is there");
+    let (_, block) = section.split_once("```sh\n").expect("a block of commands follows");
+    let (block, _) = block.split_once("```").expect("the block ends");
+    block.lines().map(|line| line.split(" #").next().unwrap_or_default().trim().to_owned()).collect()
+}
+
+/// Each command that needs no board works on a capture of the virtual vehicle, which is the block's first line.
+#[test]
+fn the_examples_work_on_the_virtual_vehicle_as_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let binary = Path::new(env!("CARGO_BIN_EXE_cantap"));
+    let mut search_path = binary.parent().unwrap().as_os_str().to_owned();
+    search_path.push(":");
+    search_path.push(std::env::var_os("PATH").unwrap_or_default());
+    let run = |line: &str| {
+        let mut command = Command::new("sh");
+        command.args(["-c", line]).env("PATH", &search_path).current_dir(folder.path());
+        let output = command.output().unwrap();
+        let texts = [output.stdout, output.stderr].map(|text| String::from_utf8_lossy(&text).into_owned());
+        assert!(output.status.success(), "{line}: {} {}", output.status, texts[1]);
+        texts[0].clone()
+    };
+    let page = std::fs::read_to_string("../README.md").unwrap();
+    let mut ran = 0;
+    for line in commands(&page, "Use") {
+        // These need a board, or Parquet, which not every build has.
+        if line.contains("/dev/tty") || line.contains(".parquet") && !cfg!(feature = "parquet") {
+            continue;
+        }
+        // Two recorders of a bus, and two drives, are assumed to be there.
+        for (name, command) in [
+            ("cabin.blf", "cp drive.blf engine.blf && cp drive.blf cabin.blf"),
+            ("after.log", "cantap convert drive.blf before.log && cp before.log after.log"),
+        ] {
+            if line.contains(name) && !path(name).exists() {
+                run(command);
+            }
+        }
+        let out = run(&line);
+        match line.split(' ').nth(1).unwrap() {
+            "search" => assert!(out.contains('#'), "{line} finds nothing: {out}"),
+            "plot" => assert!(path("speed.svg").metadata().unwrap().len() > 2_000, "{line}"),
+            "capture" => assert!(path("drive.blf").metadata().unwrap().len() > 10_000, "{line}"),
+            "decode" | "conversations" if !line.contains(" -o ") => {
+                assert!(out.lines().count() > 10, "{line} prints {out}");
+            }
+            _ => {}
+        }
+        ran += 1;
+    }
+    assert!(ran >= 12, "only {ran} of the commands ran");
+}

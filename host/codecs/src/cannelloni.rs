@@ -1,0 +1,233 @@
+//! cannelloni: CAN frames in UDP datagrams, as its `doc/udp_format.md` and `udpthread.cpp` describe version 2.
+//!
+//! Version, operation 0, a sequence number of eight bits, a count of frames; each frame an identifier as Linux has it, a length, the data unless it
+//! is remote. There is no time in it, UDP may lose or reorder, and nothing says who sent it.
+
+use cantap_can::{Frame, Id};
+
+/// cannelloni's usual port.
+pub const PORT: u16 = 20_000;
+/// The most bytes of a datagram that is sent: what Ethernet carries in one piece.
+pub const MOST_BYTES: usize = 1472;
+
+const VERSION: u8 = 2;
+const DATA: u8 = 0;
+const HEADER: usize = 5;
+/// Bytes of the longest frame that is written.
+const FRAME_BYTES: usize = 4 + 1 + 8;
+
+const EXTENDED: u32 = 1 << 31;
+const REMOTE: u32 = 1 << 30;
+const ERROR: u32 = 1 << 29;
+/// In the length: a CAN FD frame, with a byte of flags after it.
+const FD: u8 = 0x80;
+
+/// What a datagram says first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Header {
+    /// Its number, modulo 256.
+    pub sequence: u8,
+    /// Frames that are said to follow.
+    pub count: u16,
+}
+
+/// Why a datagram is none of this protocol.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum NoDatagram {
+    /// It has less than a header.
+    TooShort,
+    /// It is of another version, or no data.
+    Other,
+}
+
+/// One of a datagram's frames.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Item {
+    /// A frame.
+    Frame(Frame),
+    /// An error frame.
+    Error,
+    /// A CAN FD frame.
+    Fd,
+    /// A length or an identifier that no frame has.
+    Impossible,
+}
+
+/// A datagram's header, and its frames for [`item`].
+pub fn datagram(bytes: &[u8]) -> Result<(Header, &[u8]), NoDatagram> {
+    let (&[version, operation, sequence, high, low], rest) =
+        bytes.split_first_chunk::<HEADER>().ok_or(NoDatagram::TooShort)?;
+    if (version, operation) != (VERSION, DATA) {
+        return Err(NoDatagram::Other);
+    }
+    Ok((Header { sequence, count: u16::from_be_bytes([high, low]) }, rest))
+}
+
+/// The first frame, and what follows it; `None` if it is not whole.
+pub fn item(bytes: &[u8]) -> Option<(Item, &[u8])> {
+    let (raw, rest) = bytes.split_first_chunk()?;
+    let raw = u32::from_be_bytes(*raw);
+    let (&length, rest) = rest.split_first()?;
+    let (is_fd, len) = (length & FD != 0, usize::from(length & !FD));
+    let rest = if is_fd { rest.get(1..)? } else { rest };
+    if raw & REMOTE != 0 {
+        let frame = id_of(raw).and_then(|id| Frame::remote_frame(id, len as u8));
+        return Some((frame.map_or(Item::Impossible, Item::Frame), rest));
+    }
+    let (data, rest) = rest.split_at_checked(len)?;
+    let item = match id_of(raw) {
+        _ if raw & ERROR != 0 => Item::Error,
+        _ if is_fd => Item::Fd,
+        id => id.and_then(|id| Frame::data_frame(id, data)).map_or(Item::Impossible, Item::Frame),
+    };
+    Some((item, rest))
+}
+
+fn id_of(raw: u32) -> Option<Id> {
+    let id = raw & !(EXTENDED | REMOTE | ERROR);
+    if raw & EXTENDED != 0 { Id::extended(id) } else { Id::standard(id) }
+}
+
+/// What a datagram's number says about those before it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Order {
+    /// It is the next one, or the first.
+    Next,
+    /// So many before it are missing; each had at least a frame.
+    Missing(u8),
+    /// One with a higher number came before.
+    Late,
+}
+
+/// Watches the numbers of one sender.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Sequence {
+    expected: Option<u8>,
+}
+
+impl Sequence {
+    /// Takes the next number.
+    pub const fn take(&mut self, sequence: u8) -> Order {
+        let expected = self.expected;
+        self.expected = Some(sequence.wrapping_add(1));
+        let Some(expected) = expected else { return Order::Next };
+        match sequence.wrapping_sub(expected) {
+            0 => Order::Next,
+            missing @ 1..0x80 => Order::Missing(missing),
+            _ => Order::Late,
+        }
+    }
+}
+
+/// Makes datagrams, numbered one after the other.
+#[derive(Clone, Debug, Default)]
+pub struct Writer {
+    sequence: u8,
+    count: u16,
+    bytes: Vec<u8>,
+}
+
+impl Writer {
+    /// Adds a frame, for which there must be [room](Self::has_room).
+    pub fn push(&mut self, frame: &Frame) {
+        let id = frame.id();
+        let extended = if id.is_extended() { EXTENDED } else { 0 };
+        let remote = if frame.is_remote() { REMOTE } else { 0 };
+        self.put(id.raw() | extended | remote, frame.dlc().min(8), frame.data());
+    }
+
+    /// Adds an error frame: its classes as an identifier, the flag included, and its data.
+    pub fn push_error(&mut self, id: u32, data: [u8; 8]) {
+        self.put(id | ERROR, 8, &data);
+    }
+
+    fn put(&mut self, id: u32, len: u8, data: &[u8]) {
+        if self.bytes.is_empty() {
+            self.bytes.resize(HEADER, 0);
+        }
+        self.bytes.extend_from_slice(&id.to_be_bytes());
+        self.bytes.push(len);
+        self.bytes.extend_from_slice(data);
+        self.count += 1;
+    }
+
+    /// Whether nothing was added since the last datagram.
+    pub const fn is_empty(&self) -> bool {
+        self.bytes.is_empty()
+    }
+
+    /// Whether another frame fits.
+    pub const fn has_room(&self) -> bool {
+        self.bytes.len() + FRAME_BYTES + HEADER <= MOST_BYTES
+    }
+
+    /// The datagram with what was added, if there is anything.
+    pub fn take(&mut self) -> Option<Vec<u8>> {
+        let mut bytes = std::mem::take(&mut self.bytes);
+        let [high, low] = std::mem::take(&mut self.count).to_be_bytes();
+        bytes.get_mut(..HEADER)?.copy_from_slice(&[VERSION, DATA, self.sequence, high, low]);
+        self.sequence = self.sequence.wrapping_add(1);
+        Some(bytes)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Order::{Late, Missing, Next};
+    use super::*;
+
+    proptest::proptest! {
+        #[test]
+        fn any_bytes_are_a_frame_or_not_whole(bytes: Vec<u8>) {
+            if let Some((_, rest)) = item(&bytes) {
+                proptest::prop_assert!(rest.len() < bytes.len());
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_written_is_read_and_datagrams_are_numbered() {
+        let mut writer = Writer::default();
+        assert_eq!(writer.take(), None);
+        let frames: Vec<Frame> = ["123#AA", "1ABCDEF0#0102030405060708", "7FF#R4", "00000001#"]
+            .map(|text| text.parse().unwrap())
+            .into();
+        for frame in &frames {
+            writer.push(frame);
+        }
+        writer.push_error(0x0000_0004, [1; 8]);
+        let bytes = writer.take().unwrap();
+        assert_eq!(bytes[..11], [2, 0, 0, 0, 5, 0, 0, 1, 0x23, 1, 0xAA]);
+        let (header, mut rest) = datagram(&bytes).unwrap();
+        assert_eq!(header, Header { sequence: 0, count: 5 });
+        let mut read = Vec::new();
+        while let Some((item, after)) = item(rest) {
+            read.push(item);
+            rest = after;
+        }
+        let mut expected: Vec<Item> = frames.into_iter().map(Item::Frame).collect();
+        expected.push(Item::Error);
+        assert_eq!(read, expected);
+        // The longest is no longer than Ethernet carries in one piece.
+        while writer.has_room() {
+            writer.push(&"1ABCDEF0#0102030405060708".parse().unwrap());
+        }
+        let bytes = writer.take().unwrap();
+        assert!((MOST_BYTES - 2 * FRAME_BYTES..=MOST_BYTES).contains(&bytes.len()), "{}", bytes.len());
+        assert_eq!(datagram(&bytes).unwrap().0.sequence, 1);
+    }
+
+    #[test]
+    fn numbers_say_what_is_missing_and_what_came_late() {
+        let mut sequence = Sequence::default();
+        let orders = [250, 251, 254, 255, 0, 3, 2, 3].map(|number| sequence.take(number));
+        assert_eq!(orders, [Next, Next, Missing(2), Next, Next, Missing(2), Late, Next]);
+    }
+
+    #[test]
+    fn what_is_no_datagram_says_why() {
+        assert_eq!(datagram(&[2, 0, 1, 0]), Err(NoDatagram::TooShort));
+        assert_eq!(datagram(&[1, 0, 1, 0, 0]), Err(NoDatagram::Other));
+        assert_eq!(datagram(&[2, 1, 1, 0, 0]), Err(NoDatagram::Other));
+    }
+}

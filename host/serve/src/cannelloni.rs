@@ -1,0 +1,310 @@
+//! A channel in a cannelloni tunnel: UDP datagrams to and from one peer, named when the tunnel is opened.
+//!
+//! Nothing in a datagram shows who sent it, so the socket is connected: the system takes datagrams from the peer's address and port only, and
+//! whatever arrives, datagrams go nowhere else. What is sent is what is on the bus, never an answer. The bus is only listened to until the peer
+//! sends, as with socketcand. Losses and errors are error frames.
+
+use std::io;
+use std::net::{SocketAddr, UdpSocket};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use cantap::device::{Records, is_idle};
+use cantap::{Direction, TraceEvent};
+use cantap_codecs::cannelloni::{Item, NoDatagram, Order, Sequence, Writer, datagram, item};
+use cantap_wire::message::{Mode, Role};
+use cantap_wire::{Channel, Frame};
+
+use crate::connect::SOCKET_TIMEOUT;
+use crate::lines::device_of;
+use crate::listen::Listening;
+use crate::lock::lock;
+use crate::open_bus::OpenBus;
+use crate::own_frames::OwnFrames;
+use crate::pace::Pace;
+use crate::text::error_frame;
+use crate::{Board, News};
+
+pub use cantap_codecs::cannelloni::PORT;
+
+/// Longest datagram that is read: what a network with large packets carries in one piece. With it, the frames of one are sent within seconds.
+const MOST_BYTES: usize = 9000;
+/// How long to wait for records before checking whether the tunnel is over.
+const WAIT: Duration = Duration::from_millis(20);
+/// Time from a failure to the next try.
+const RETRY_AFTER: Duration = Duration::from_millis(500);
+
+/// A channel and where its tunnel ends.
+pub struct Tunnel {
+    /// The board.
+    pub board: Arc<Board>,
+    /// The board's channel.
+    pub channel: Channel,
+    /// The address here, with the port chosen by the system if it is 0.
+    pub local: SocketAddr,
+    /// The peer's.
+    pub peer: SocketAddr,
+    /// What the peer may do. At an address that is not this machine's own (loopback), it may only listen.
+    pub role: Role,
+}
+
+/// Opens a tunnel, which begins as soon as the board is there.
+pub fn open(tunnel: Tunnel) -> io::Result<Listening> {
+    let Tunnel { board, channel, local, peer, role } = tunnel;
+    let is_local = local.ip().is_loopback() && peer.ip().is_loopback();
+    let socket = UdpSocket::bind(local)?;
+    socket.connect(peer)?;
+    socket.set_read_timeout(Some(SOCKET_TIMEOUT))?;
+    let local = socket.local_addr()?;
+    let name = format!("cannelloni peer {peer}");
+    let role = if is_local { role } else { Role::Listen };
+    let mut end = End {
+        far: Arc::new(Far { socket, own: Mutex::default(), has_gap: AtomicBool::new(false) }),
+        board,
+        channel,
+        name,
+        role,
+        session: None,
+        tried_at: None,
+        failed: None,
+        sequence: Sequence::default(),
+        buffer: vec![0; MOST_BYTES + 1],
+    };
+    Listening::start("cantap-cannelloni", Some(local), move || end.step())
+}
+
+/// The far end, and what is known of it.
+struct Far {
+    socket: UdpSocket,
+    own: Mutex<OwnFrames>,
+    /// The tunnel was off the bus for a moment.
+    has_gap: AtomicBool,
+}
+
+/// This end of a tunnel.
+struct End {
+    far: Arc<Far>,
+    board: Arc<Board>,
+    channel: Channel,
+    name: String,
+    role: Role,
+    session: Option<Session>,
+    tried_at: Option<Instant>,
+    /// Why there is no session, as last reported.
+    failed: Option<String>,
+    sequence: Sequence,
+    buffer: Vec<u8>,
+}
+
+/// A session with the board.
+struct Session {
+    bus: OpenBus,
+    is_over: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Drop for Session {
+    fn drop(&mut self) {
+        self.is_over.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+impl End {
+    /// Waits for a datagram for a short time, and carries out what is in it.
+    fn step(&mut self) -> io::Result<()> {
+        if self.session.as_ref().is_some_and(|session| session.is_over.load(Ordering::Relaxed)) {
+            // The board has gone.
+            self.session = None;
+        }
+        if self.session.is_none() && self.tried_at.is_none_or(|at| at.elapsed() >= RETRY_AFTER) {
+            self.tried_at = Some(Instant::now());
+            match self.begin() {
+                Ok(session) => {
+                    self.failed = None;
+                    self.session = Some(session);
+                }
+                Err(reason) => {
+                    if self.failed.as_ref() != Some(&reason) {
+                        self.board.tell(News::Refused { client: self.name.clone(), reason: reason.clone() });
+                        self.failed = Some(reason);
+                    }
+                }
+            }
+        }
+        match self.far.socket.recv(&mut self.buffer) {
+            Ok(len) => self.take(len),
+            // Nobody listens at the other end yet.
+            Err(error) if is_idle(&error) || error.kind() == io::ErrorKind::ConnectionRefused => {}
+            Err(error) => return Err(error),
+        }
+        self.listen_again();
+        Ok(())
+    }
+
+    fn begin(&self) -> Result<Session, String> {
+        let device = Arc::new(device_of(&self.board, &self.name, self.role)?);
+        let config = device.open_channel(self.channel, None).map_err(|error| error.to_string())?;
+        let records = device.records();
+        let is_over = Arc::new(AtomicBool::new(false));
+        let (far, over, channel) = (Arc::clone(&self.far), Arc::clone(&is_over), self.channel);
+        let thread = std::thread::Builder::new().name("cantap-cannelloni-hears".to_owned());
+        let thread = thread.spawn(move || {
+            far.hear(records, channel, &over);
+            over.store(true, Ordering::Relaxed);
+        });
+        let thread = Some(thread.map_err(|error| error.to_string())?);
+        let sends_in = (self.role >= Role::Send).then_some(Mode::Normal);
+        let bus = OpenBus::new(device, self.channel, config, sends_in, self.board.idle_sender());
+        Ok(Session { bus, is_over, thread })
+    }
+
+    /// Takes a datagram.
+    fn take(&mut self, len: usize) {
+        match self.frames(len) {
+            Ok(frames) => {
+                if let Err(reason) = self.send(&frames) {
+                    self.not_done(reason);
+                }
+            }
+            Err(reason) => self.not_done(reason.to_owned()),
+        }
+    }
+
+    /// The frames in a datagram.
+    fn frames(&mut self, len: usize) -> Result<Vec<Frame>, &'static str> {
+        if len > MOST_BYTES {
+            return Err("it sent a datagram that is too long");
+        }
+        let (header, mut rest) = match datagram(&self.buffer[..len]) {
+            Ok(datagram) => datagram,
+            Err(NoDatagram::TooShort) => return Err("it sent a datagram that is too short"),
+            Err(NoDatagram::Other) => return Err("it sent a datagram of another version or operation"),
+        };
+        let mut left_out = match self.sequence.take(header.sequence) {
+            Order::Next => None,
+            Order::Missing(_) => Some("datagrams before this one are missing"),
+            Order::Late => Some("a datagram came late"),
+        };
+        let mut frames = Vec::new();
+        for _ in 0..header.count {
+            let Some((item, after)) = item(rest) else {
+                left_out = Some("it sent a datagram that ends too early");
+                break;
+            };
+            rest = after;
+            match item {
+                Item::Frame(frame) => frames.push(frame),
+                Item::Error => left_out = Some("it sent an error frame"),
+                Item::Fd => left_out = Some("it sent a CAN FD frame"),
+                Item::Impossible => left_out = Some("it sent a frame that is none"),
+            }
+        }
+        if let Some(reason) = left_out {
+            self.not_done(reason.to_owned());
+        }
+        Ok(frames)
+    }
+
+    /// Has frames sent, in their order. What follows one that is refused is not sent either.
+    fn send(&mut self, frames: &[Frame]) -> Result<(), String> {
+        if frames.is_empty() {
+            return Ok(());
+        }
+        let not_sent = |reason: String, count: usize| format!("{count} frames were not sent: {reason}");
+        let Some(session) = &mut self.session else {
+            return Err(not_sent("the board is not there".to_owned(), frames.len()));
+        };
+        let far = &self.far;
+        if session.bus.sends_in.is_none() {
+            return Err(not_sent("it may only listen".to_owned(), frames.len()));
+        }
+        session
+            .bus
+            .may_send(|| far.has_gap.store(true, Ordering::Relaxed))
+            .map_err(|reason| not_sent(reason, frames.len()))?;
+        for (done, frame) in frames.iter().enumerate() {
+            let tag = session.bus.next_tag();
+            lock(&far.own).sends(tag, *frame);
+            session.bus.send(tag, *frame).map_err(|reason| {
+                lock(&far.own).failed(tag);
+                not_sent(reason, frames.len() - done)
+            })?;
+        }
+        Ok(())
+    }
+
+    fn listen_again(&mut self) {
+        let Some(session) = &mut self.session else { return };
+        let far = &self.far;
+        match session.bus.listen_again(|| far.has_gap.store(true, Ordering::Relaxed)) {
+            Ok(None) => {}
+            Ok(Some(after)) => {
+                let (client, channel) = (self.name.clone(), self.channel);
+                self.board.tell(News::Idle { client, channel, after });
+            }
+            Err(reason) => {
+                self.not_done(reason);
+                self.session = None;
+            }
+        }
+    }
+
+    fn not_done(&self, reason: String) {
+        self.board.tell(News::NotDone { client: self.name.clone(), reason });
+    }
+}
+
+impl Far {
+    /// Sends it what is on the bus, until the session is over.
+    fn hear(&self, mut records: Records, channel: Channel, is_over: &AtomicBool) {
+        let mut writer = Writer::default();
+        let mut pace = Pace::default();
+        while !is_over.load(Ordering::Relaxed) {
+            let wait = if writer.is_empty() { WAIT } else { pace.left(Instant::now()) };
+            let Ok(Some(batch)) = records.next_batch(wait) else { return };
+            for record in batch.iter().filter(|record| record.channel == channel.number()) {
+                if self.has_gap.swap(false, Ordering::Relaxed) {
+                    self.put(&TraceEvent::GAP, &mut writer);
+                }
+                self.put(&record.event, &mut writer);
+            }
+            records.recycle(batch);
+            if !writer.is_empty() && pace.left(Instant::now()).is_zero() {
+                self.flush(&mut writer);
+                pace.has_written(Instant::now());
+            }
+        }
+    }
+
+    fn put(&self, event: &TraceEvent, writer: &mut Writer) {
+        if !writer.has_room() {
+            self.flush(writer);
+        }
+        match event {
+            TraceEvent::Frame { frame, direction, .. } => {
+                let Some(frame) = frame.classic() else { return };
+                if *direction != Direction::Tx || !lock(&self.own).take(frame) {
+                    writer.push(frame);
+                }
+            }
+            event => {
+                if let TraceEvent::TransmitFailed { tag, .. } = event {
+                    lock(&self.own).failed(*tag);
+                }
+                if let Some((id, data)) = error_frame(event) {
+                    writer.push_error(id, data);
+                }
+            }
+        }
+    }
+
+    fn flush(&self, writer: &mut Writer) {
+        // Nobody may be listening at the other end, and UDP loses datagrams: their numbers show it.
+        let _ = writer.take().map(|bytes| self.socket.send(&bytes));
+    }
+}

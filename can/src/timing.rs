@@ -107,7 +107,8 @@ impl BitTiming {
     /// Every timing whose bit rate, rounded to whole bit/s, is `bitrate_bps` (so that 83 333 is 83
     /// 333.3), from the most quanta down, each with the widest jump that it allows.
     pub fn all(clock_hz: u32, bitrate_bps: u32) -> impl Iterator<Item = BitTiming> {
-        let clocks = (clock_hz + bitrate_bps / 2).checked_div(bitrate_bps).unwrap_or(0);
+        // An adapter may claim any clock.
+        let clocks = clock_hz.saturating_add(bitrate_bps / 2).checked_div(bitrate_bps).unwrap_or(0);
         let exact = clocks > 0 && rate_of(clock_hz, clocks) == bitrate_bps;
         Self::of_clocks(if exact { clocks } else { 0 })
     }
@@ -176,7 +177,7 @@ impl BitTiming {
 
 /// The bit rate of a bit that is `clocks` controller clocks long, rounded to whole bit/s.
 const fn rate_of(clock_hz: u32, clocks: u32) -> u32 {
-    (clock_hz + clocks / 2) / clocks
+    clock_hz.saturating_add(clocks / 2) / clocks
 }
 
 #[cfg(test)]
@@ -196,6 +197,16 @@ mod tests {
             "the clock cannot be divided to it; the nearest rates are 777778 and 807692 bit/s"
         );
         assert_eq!(words(1, 500_000), "the clock cannot be divided to any bit rate of CAN");
+    }
+
+    /// An adapter says which clock it has.
+    #[test]
+    fn no_clock_is_too_fast_to_be_refused() {
+        for clock in [u32::MAX, u32::MAX - 250_000] {
+            for rate in [5_000, 500_000, 1_000_000, u32::MAX] {
+                assert!(BitTiming::all(clock, rate).all(|timing| timing.is_valid()), "{clock} {rate}");
+            }
+        }
     }
 
     #[test]

@@ -383,5 +383,5 @@ fn clients_are_bounded_and_places_become_free() {
     assert_eq!(board.link("third", Role::Listen).err().unwrap().to_string(), "there are 2 clients already");
     drop(first);
     wait_until("a place is free", || board.link("third", Role::Listen).is_ok());
-    assert!(told.try_iter().any(|news| news.to_string() == "first has left"));
+    wait_until("it is told", || told.try_iter().any(|news| news.to_string() == "first has left"));
 }

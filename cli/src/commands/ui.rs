@@ -12,8 +12,8 @@ use cantap_address::Address;
 use cantap_trace::filter::Filter;
 use cantap_ui::{Device, Server, Site, Source};
 use cantap_work::boards::Boards;
-use cantap_work::channel_bitrate::ChannelBitrate;
 use cantap_work::channels::Channels;
+use cantap_work::requested_rate::RequestedRate;
 use serde_json::{Value, json};
 
 use crate::args;
@@ -140,10 +140,11 @@ impl Args {
 
     /// Bit rates that the trace itself may lack.
     fn bitrates(&self) -> Vec<Value> {
-        let of = |rate: &ChannelBitrate| -> Vec<Value> {
+        let of = |rate: &RequestedRate| -> Vec<Value> {
+            let Some(bitrate_bps) = rate.bitrate_bps else { return Vec::new() };
             let channels = rate.channel.map_or_else(|| vec![1, 2], |channel| vec![channel]);
             let object =
-                |channel: u8| json!({ "channel": channel, "bitrate": rate.bitrate_bps, "dataBitrate": null });
+                |channel: u8| json!({ "channel": channel, "bitrate": bitrate_bps, "dataBitrate": null });
             channels.into_iter().map(object).collect()
         };
         self.open.options().timing.bitrates.iter().flat_map(of).collect()

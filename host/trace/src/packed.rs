@@ -57,7 +57,7 @@ fn write_one(record: &TraceRecord, before_ns: i64, out: &mut Vec<u8>) {
         varint(zigzag(record.time_ns.wrapping_sub(before_ns)), out);
     };
     let counters = |at: Option<(u8, u8)>, out: &mut Vec<u8>| {
-        out.extend(at.map(|(tec, rec)| [tec, rec]).into_iter().flatten())
+        out.extend(at.map(|(tec, rec)| [tec, rec]).into_iter().flatten());
     };
     match record.event {
         TraceEvent::Frame { frame, direction, late } => {
@@ -184,6 +184,7 @@ impl<'a> Rest<'a> {
     }
 
     /// One of these, or none.
+    #[expect(clippy::option_option, reason = "bytes that are cut are not a value that is absent")]
     fn of<T: Copy>(&mut self, all: &[T]) -> Option<Option<T>> {
         match self.byte()? {
             0 => Some(None),
@@ -191,6 +192,7 @@ impl<'a> Rest<'a> {
         }
     }
 
+    #[expect(clippy::option_option, reason = "bytes that are cut are not a value that is absent")]
     fn counters(&mut self, flags: u8) -> Option<Option<(u8, u8)>> {
         if flags & COUNTERS == 0 {
             return Some(None);

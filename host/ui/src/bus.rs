@@ -14,10 +14,11 @@ use cantap_signals::Decoder;
 use cantap_trace::filter::Filter;
 use cantap_trace::{TraceEvent, TraceRecord};
 use cantap_work::boards::{Boards, filters_on};
+use cantap_work::bus_hints::{BusHint, HintPlace};
 use cantap_work::channel_bitrate::ChannelBitrate;
 use cantap_work::channel_options::ChannelOptions;
 use cantap_work::live::{Lines, lines, return_text};
-use cantap_work::reception::{self, Reception};
+use cantap_work::reception::Reception;
 use cantap_work::report::{Reporter, Severity};
 use cantap_work::{advice, channels::place_of, interrupt};
 use serde_json::{Value, json};
@@ -317,7 +318,9 @@ impl Bus {
                 let (board, channel) = place_of(number);
                 let name =
                     self.device.boards.addresses().get(board).map(ToString::to_string).unwrap_or_default();
-                self.warn(reception::errors_only_text(number, &name, channel.number()));
+                let hint = self.reception.hint(number, false).unwrap_or(BusHint::WrongBitRate);
+                let place = HintPlace { number, device: &name, channel_there: channel.number() };
+                self.warn(hint.sentence(&place));
             }
         }
     }
@@ -478,7 +481,7 @@ impl Bus {
             bitrate_bps: if open.channel == channel { bitrate_bps } else { open.bitrate },
         });
         let mut open = self.device.open.clone();
-        open.timing.set_bit_rates(rates.collect());
+        open.timing.set_bit_rates(rates);
         // The user has agreed to take part at another bit rate.
         open.mode = Some(Mode::ListenOnly);
         self.reconnect(open, self.device.filters.clone())?;

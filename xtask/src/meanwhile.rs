@@ -7,7 +7,6 @@ use std::path::PathBuf;
 use std::process::{Child, Command, ExitStatus, Stdio};
 
 use anyhow::{Context, Result};
-use clap::ValueEnum;
 
 use crate::steps::Step;
 use crate::{toolchain, workspace};
@@ -35,8 +34,7 @@ impl Meanwhile {
         };
         command.args(["xtask", "ci"]).current_dir(workspace::root());
         for step in steps {
-            let name = step.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned());
-            command.args(["--only", &name]);
+            command.args(["--only", &step.name()]);
         }
         let child =
             command.stdin(Stdio::null()).stdout(file.try_clone()?).stderr(file).spawn().context("cargo")?;

@@ -1,6 +1,7 @@
 //! What is checked before a change lands, one step each.
 
 use anyhow::Result;
+use clap::ValueEnum;
 use xshell::cmd;
 
 use crate::board::Board;
@@ -84,6 +85,11 @@ impl Step {
         Self::Reproducible,
         Self::Package,
     ];
+
+    /// Its name on the command line.
+    pub fn name(self) -> String {
+        self.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned())
+    }
 
     /// Runs it for these boards; the first is the one that most tests use.
     pub fn run(self, machine: &Machine, boards: &[Board]) -> Result<Outcome> {

@@ -46,7 +46,7 @@ fn run_steps(args: &Args, steps: &[Step], others: &[Step], boards: &[Board]) -> 
     let whole = Instant::now();
     let mut meanwhile = if others.is_empty() { None } else { Some(Meanwhile::begin(others)?) };
     for step in steps {
-        let name = step.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned());
+        let name = step.name();
         println!("\n--- {name}");
         let begin = Instant::now();
         match step.run(&machine, boards) {

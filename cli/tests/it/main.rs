@@ -57,6 +57,7 @@ mod serve;
 mod serve_far;
 mod serve_lab;
 mod served;
+mod shell;
 mod speaking_ends;
 mod terminal;
 mod texts_from_outside;

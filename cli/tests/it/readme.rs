@@ -1,7 +1,6 @@
 //! The README's commands, as written.
 
-use std::path::Path;
-use std::process::Command;
+use crate::shell;
 
 /// The lines of the first block of commands below a heading.
 fn commands(page: &str, heading: &str) -> Vec<String> {
@@ -16,18 +15,7 @@ fn commands(page: &str, heading: &str) -> Vec<String> {
 fn the_examples_work_on_the_virtual_vehicle_as_written() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
-    let binary = Path::new(env!("CARGO_BIN_EXE_cantap"));
-    let mut search_path = binary.parent().unwrap().as_os_str().to_owned();
-    search_path.push(":");
-    search_path.push(std::env::var_os("PATH").unwrap_or_default());
-    let run = |line: &str| {
-        let mut command = Command::new("sh");
-        command.args(["-c", line]).env("PATH", &search_path).current_dir(folder.path());
-        let output = command.output().unwrap();
-        let texts = [output.stdout, output.stderr].map(|text| String::from_utf8_lossy(&text).into_owned());
-        assert!(output.status.success(), "{line}: {} {}", output.status, texts[1]);
-        texts[0].clone()
-    };
+    let run = |line: &str| shell::run(&mut shell::line(folder.path(), line), line);
     let page = std::fs::read_to_string("../README.md").unwrap();
     let mut ran = 0;
     for line in commands(&page, "Use") {

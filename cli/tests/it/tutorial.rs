@@ -5,6 +5,7 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
+use crate::shell;
 use crate::terminal::Terminal;
 
 /// Longer than anything here takes, however busy the machine.
@@ -32,23 +33,14 @@ struct Reader<'f> {
 
 impl Reader<'_> {
     fn command(&self, line: &str) -> Command {
-        let binary = Path::new(env!("CARGO_BIN_EXE_cantap"));
-        let mut path = binary.parent().unwrap().as_os_str().to_owned();
-        path.push(":");
-        path.push(std::env::var_os("PATH").unwrap_or_default());
-        let mut command = Command::new("sh");
-        command.args(["-c", line]).env("PATH", path).current_dir(self.folder).stdin(Stdio::null());
-        command.env("CANTAP_PAGE", self.folder.join("page.html")).env("XDG_CACHE_HOME", "/dev/null");
+        let mut command = shell::line(self.folder, line);
+        command.env("CANTAP_PAGE", self.folder.join("page.html"));
         command
     }
 
-    /// Runs a line to its end, and returns its exit code and its standard output.
-    fn run(&self, line: &str) -> (Option<i32>, String) {
-        let output = self.command(line).output().unwrap();
-        let err = String::from_utf8_lossy(&output.stderr).into_owned();
-        let code = output.status.code();
-        assert_eq!(code, Some(0), "{line}: {err}");
-        (code, String::from_utf8_lossy(&output.stdout).into_owned())
+    /// Runs a line to its end, and returns its standard output.
+    fn run(&self, line: &str) -> String {
+        shell::run(&mut self.command(line), line)
     }
 
     /// Starts a line that goes on until somebody ends it, and waits for the file that shows that it has begun.
@@ -108,7 +100,7 @@ fn every_line_of_the_tutorial_does_what_it_says() {
                     } else if line.starts_with("cantap serve") {
                         reader.start(line, "car.sock");
                     } else {
-                        last = reader.run(line).1;
+                        last = reader.run(line);
                         check(line, &last, folder.path());
                     }
                 }
@@ -122,7 +114,7 @@ fn every_line_of_the_tutorial_does_what_it_says() {
             "toml" => std::fs::write(folder.path().join("guess.toml"), &block).unwrap(),
             "python" if has_python_package() => {
                 std::fs::write(folder.path().join("program.py"), &block).unwrap();
-                let (_, out) = reader.run("python3 program.py");
+                let out = reader.run("python3 program.py");
                 assert!(out.trim().parse::<f64>().is_ok_and(|speed| speed > 30.0), "{out}");
             }
             "python" => eprintln!("Python has no package cantap: its block is skipped"),

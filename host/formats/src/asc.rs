@@ -59,8 +59,7 @@ mod tests {
 
     /// The records of some lines after an ordinary header, as a candump log, and the issues.
     fn as_log(lines: &str) -> (String, Vec<String>) {
-        let (records, issues) = tests::read(Format::Asc, format!("{HEAD}{lines}"));
-        (tests::write(Format::Candump, &records), issues)
+        tests::as_log(Format::Asc, format!("{HEAD}{lines}"))
     }
 
     #[test]

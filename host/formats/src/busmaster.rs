@@ -175,8 +175,7 @@ mod tests {
     use crate::Format;
 
     fn as_log(file: &str) -> (String, Vec<String>) {
-        let (records, issues) = tests::read(Format::Busmaster, file);
-        (tests::write(Format::Candump, &records), issues)
+        tests::as_log(Format::Busmaster, file)
     }
 
     fn head(mode: &str) -> String {

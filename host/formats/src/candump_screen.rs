@@ -233,8 +233,7 @@ mod tests {
     use crate::Format;
 
     fn as_log(screen: &str) -> (String, Vec<String>) {
-        let (records, issues) = tests::read(Format::CandumpScreen, screen);
-        (tests::write(Format::Candump, &records), issues)
+        tests::as_log(Format::CandumpScreen, screen)
     }
 
     #[test]

@@ -139,8 +139,7 @@ mod tests {
     const HEAD: &str = "TimestampEpoch;BusChannel;ID;IDE;DLC;DataLength;Dir;EDL;BRS;ESI;RTR;DataBytes\n";
 
     fn as_log(file: &str) -> (String, Vec<String>) {
-        let (records, issues) = tests::read(Format::CanEdgeCsv, file);
-        (tests::write(Format::Candump, &records), issues)
+        tests::as_log(Format::CanEdgeCsv, file)
     }
 
     #[test]

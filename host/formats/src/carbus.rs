@@ -93,8 +93,7 @@ mod tests {
     use crate::Format;
 
     fn as_log(file: &str) -> (String, Vec<String>) {
-        let (records, issues) = tests::read(Format::Carbus, file);
-        (tests::write(Format::Candump, &records), issues)
+        tests::as_log(Format::Carbus, file)
     }
 
     #[test]

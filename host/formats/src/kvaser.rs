@@ -144,8 +144,7 @@ mod tests {
              Time Chan   Identifier Flags        DLC  Data                           Counter\n\
              ==================================================================================\n{rows}"
         );
-        let (records, issues) = tests::read(Format::Kvaser, file);
-        (tests::write(Format::Candump, &records), issues)
+        tests::as_log(Format::Kvaser, file)
     }
 
     #[test]

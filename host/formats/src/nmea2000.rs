@@ -211,8 +211,7 @@ mod tests {
     use crate::{Format, ReadOptions, TraceReader};
 
     fn as_log(file: &str) -> (String, Vec<String>) {
-        let (records, issues) = tests::read(Format::Nmea2000, file);
-        (tests::write(Format::Candump, &records), issues)
+        tests::as_log(Format::Nmea2000, file)
     }
 
     #[test]

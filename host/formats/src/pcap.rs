@@ -224,8 +224,7 @@ mod tests {
     }
 
     fn as_log(file: &[u8]) -> (String, Vec<String>) {
-        let (records, issues) = tests::read(Format::Pcap, file);
-        (tests::write(Format::Candump, &records), issues)
+        tests::as_log(Format::Pcap, file)
     }
 
     /// As tshark reads the same bytes.

@@ -4,39 +4,22 @@
 mod mixed;
 
 use std::io;
-use std::sync::{Arc, Mutex};
 
 use super::file_writer::FileWriter;
 use super::output::Output;
-use super::{Format, LeftOut, ReadOptions, TraceReader, TraceWriter, WriteOptions};
+use super::{Format, LeftOut, MemoryFile, ReadOptions, TraceReader, TraceWriter, WriteOptions};
 use cantap_trace::TraceRecord;
-
-/// A file in memory.
-#[derive(Clone, Default)]
-struct Memory(Arc<Mutex<Vec<u8>>>);
-
-impl io::Write for Memory {
-    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        self.0.lock().unwrap().extend_from_slice(bytes);
-        Ok(bytes.len())
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        Ok(())
-    }
-}
 
 /// The file that a format makes of records, and what it could not carry.
 pub(crate) fn write_with(options: &WriteOptions, records: &[TraceRecord]) -> (Vec<u8>, LeftOut) {
-    let memory = Memory::default();
+    let memory = MemoryFile::default();
     let output = Output::Stream(Box::new(memory.clone()));
     let mut writer = Box::new(FileWriter::new(output, options.format.unwrap(), options));
     for record in records {
         writer.write(record).unwrap();
     }
     let left_out = writer.finish().unwrap();
-    let bytes = std::mem::take(&mut *memory.0.lock().unwrap());
-    (bytes, left_out)
+    (memory.take(), left_out)
 }
 
 /// The file that a text format makes of records.
@@ -50,7 +33,13 @@ pub(crate) fn read(format: Format, bytes: impl AsRef<[u8]>) -> (Vec<TraceRecord>
     read_with(&ReadOptions { format: Some(format), ..ReadOptions::default() }, bytes)
 }
 
-/// The same with other options.
+/// The records in a file as candump writes them, and what is wrong with it.
+pub(crate) fn as_log(format: Format, bytes: impl AsRef<[u8]>) -> (String, Vec<String>) {
+    let (records, issues) = read(format, bytes);
+    (write(Format::Candump, &records), issues)
+}
+
+/// As [`read`], with other options.
 pub(crate) fn read_with(options: &ReadOptions, bytes: impl AsRef<[u8]>) -> (Vec<TraceRecord>, Vec<String>) {
     mixed::assert_mixed_is_the_same(options.format.unwrap(), options, bytes.as_ref());
     let source = io::Cursor::new(bytes.as_ref().to_vec());

@@ -1,9 +1,6 @@
 //! A part of the trace as a file in any format.
 
-use std::io::{self, Write};
-use std::sync::{Arc, Mutex, PoisonError};
-
-use cantap_formats::{Format, WriteOptions, create_stream_writer};
+use cantap_formats::{Format, MemoryFile, WriteOptions, create_stream_writer};
 use serde::Serialize;
 
 use crate::error::EngineError;
@@ -37,21 +34,6 @@ pub fn formats() -> Vec<FormatInfo> {
     Format::written().map(info).collect()
 }
 
-/// Where the writer writes.
-#[derive(Clone, Default)]
-struct Shared(Arc<Mutex<Vec<u8>>>);
-
-impl Write for Shared {
-    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).extend_from_slice(bytes);
-        Ok(bytes.len())
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        Ok(())
-    }
-}
-
 /// Writes the rows whose time lies in the stretch.
 pub fn export(
     rows: Rows<'_>,
@@ -63,10 +45,10 @@ pub fn export(
 ) -> Result<Exported, EngineError> {
     let failed = |error: &dyn std::fmt::Display| EngineError::Export(format.to_owned(), error.to_string());
     let format_of: Format = format.parse().map_err(|error: cantap_formats::UnknownFormat| failed(&error))?;
-    let shared = Shared::default();
+    let file = MemoryFile::default();
     let options = WriteOptions { format: Some(format_of), ..WriteOptions::default() };
     let mut writer =
-        create_stream_writer(Box::new(shared.clone()), &options).map_err(|error| failed(&error))?;
+        create_stream_writer(Box::new(file.clone()), &options).map_err(|error| failed(&error))?;
     for row in 0..rows.len() {
         let Some(record) = rows.record(row).and_then(|row| store.record(row)) else { continue };
         if (from_ns..=to_ns).contains(&record.time_ns) {
@@ -74,10 +56,9 @@ pub fn export(
         }
     }
     let omitted = writer.finish().map_err(|error| failed(&error))?;
-    let bytes = std::mem::take(&mut *shared.0.lock().unwrap_or_else(PoisonError::into_inner));
     Ok(Exported {
         name: format!("{}-part.{}", stem(trace_name), format_of.suffix()),
-        bytes: sections.bytes(&bytes),
+        bytes: sections.bytes(&file.take()),
         omitted: omitted.iter().map(|(what, count)| format!("{what} ({count})")).collect(),
     })
 }

@@ -342,10 +342,15 @@ export class Shell {
   }
 }
 
+const SYSTEM_IS_DARK = matchMedia('(prefers-color-scheme: dark)');
+
+/** Applies a theme now, and the system's again when that changes. */
 export function applyTheme(theme: 'auto' | 'dark' | 'light'): void {
-  const root = document.documentElement;
-  if (theme === 'auto') delete root.dataset['theme'];
-  else root.dataset['theme'] = theme;
+  const apply = (): void => {
+    document.documentElement.dataset['theme'] = theme === 'auto' ? (SYSTEM_IS_DARK.matches ? 'dark' : 'light') : theme;
+  };
+  SYSTEM_IS_DARK.onchange = apply;
+  apply();
 }
 
 /** A command's title below the heading of its view: without the view's name. */

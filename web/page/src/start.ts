@@ -13,6 +13,7 @@ export async function start(loadEngine: () => Promise<Engine>): Promise<void> {
   const root = document.body;
   const notices = new Notices();
   const place = el('div', { id: 'cantap' });
+  applyTheme('auto');
   root.append(place);
   replace(place, el('p', { class: 'starting', attrs: { role: 'status' } }, 'Starting …'));
   let engine: Engine;

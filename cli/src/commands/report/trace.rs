@@ -1,11 +1,9 @@
 //! The trace of a report: read once to know that it can be, and packed whole or, if it is too large, its beginning.
 
-use std::io::{self, Write};
 use std::path::Path;
-use std::sync::{Arc, Mutex, PoisonError};
 
 use anyhow::{Context, bail};
-use cantap_formats::{Format, ReadOptions, WriteOptions, create_stream_writer, open_reader};
+use cantap_formats::{Format, MemoryFile, ReadOptions, WriteOptions, create_stream_writer, open_reader};
 use cantap_trace::TraceRecord;
 use cantap_trace::diff::Profile;
 
@@ -88,9 +86,9 @@ pub fn carried(path: &Path, name: &str, read: &Read, room: u64) -> anyhow::Resul
 
 /// As much of the beginning as fits, as a BLF: compressed, and every kind of frame is in it.
 fn beginning(path: &Path, name: &str, read: &Read, room: u64) -> anyhow::Result<Trace> {
-    let shared = Shared::default();
+    let file = MemoryFile::default();
     let options = WriteOptions { format: Some(Format::Blf), ..WriteOptions::default() };
-    let mut writer = create_stream_writer(Box::new(shared.clone()), &options)?;
+    let mut writer = create_stream_writer(Box::new(file.clone()), &options)?;
     let (mut written, mut first_ns, mut last_ns) = (0, None, 0);
     each(path, |record| {
         writer.write(record)?;
@@ -101,10 +99,10 @@ fn beginning(path: &Path, name: &str, read: &Read, room: u64) -> anyhow::Result<
             writer.flush()?;
         }
         // What is begun now may take as much again as a look is apart.
-        Ok(shared.len() + 2 * BETWEEN_LOOKS * 16 < room)
+        Ok(file.len() as u64 + 2 * BETWEEN_LOOKS * 16 < room)
     })?;
     let left_out = writer.finish()?;
-    let bytes = shared.take();
+    let bytes = file.take();
     if bytes.len() as u64 > room || written == 0 {
         bail!(
             "not even the beginning of {} fits into the page; allow more with --size-limit",
@@ -123,29 +121,4 @@ fn beginning(path: &Path, name: &str, read: &Read, room: u64) -> anyhow::Result<
         left_out.iter().map(|(what, count)| format!("The BLF in this page does not have {what} ({count})")),
     );
     Ok(Trace { file: Carried::new(&format!("{stem}-beginning.blf"), &bytes)?, thinned })
-}
-
-/// Bytes that the writer writes.
-#[derive(Clone, Default)]
-struct Shared(Arc<Mutex<Vec<u8>>>);
-
-impl Shared {
-    fn len(&self) -> u64 {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).len() as u64
-    }
-
-    fn take(&self) -> Vec<u8> {
-        std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner))
-    }
-}
-
-impl Write for Shared {
-    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).extend_from_slice(bytes);
-        Ok(bytes.len())
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        Ok(())
-    }
 }

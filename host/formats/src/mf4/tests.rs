@@ -81,8 +81,7 @@ fn finish(mut blocks: Blocks, group: u64, data: u64, id_bytes: u8, open: u16) ->
 }
 
 fn as_log(file: &[u8]) -> (String, Vec<String>) {
-    let (records, issues) = tests::read(Format::Mf4, file);
-    (tests::write(Format::Candump, &records), issues)
+    tests::as_log(Format::Mf4, file)
 }
 
 /// A block of compressed data, transposed if there are columns.

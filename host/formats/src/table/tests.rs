@@ -7,8 +7,7 @@ use proptest::prelude::*;
 /// What is read of a table that is known by its content, as candump's lines, and what is wrong with it.
 fn as_log(file: &str) -> (String, Vec<String>) {
     assert_eq!(Format::of_content(file.as_bytes()), Some(Format::Table), "{file}");
-    let (records, issues) = tests::read(Format::Table, file);
-    (tests::write(Format::Candump, &records), issues)
+    tests::as_log(Format::Table, file)
 }
 
 fn with_columns(columns: &str, file: &str) -> (String, Vec<String>) {

@@ -3,7 +3,7 @@
 import type { App } from '../model/app';
 import { Latest } from '../model/latest';
 import type { Item } from '../model/panels';
-import { keyOf, valueAt } from './series-cache';
+import { askSeries, keyOf, valueAt } from './series-cache';
 
 interface Entry {
   time: number;
@@ -34,7 +34,7 @@ export class CursorValues {
         value: null,
         latest: new Latest(
           async (at) => {
-            const series = item.kind === 'raw' ? await this.app.ask('rawSeries', { ...item.edit, from: at, to: at, columns: 4 }) : item.info ? await this.app.ask('series', { signal: item.info.key, from: at, to: at, columns: 4 }) : null;
+            const series = await askSeries(this.app, item, { from: at, to: at }, 4);
             made.value = series ? (valueAt(series, at)?.min ?? null) : null;
             made.time = at;
             this.arrived();

@@ -83,12 +83,17 @@ export class SeriesCache {
   }
 
   async #ask(item: Item, { from, to }: Range, columns: number): Promise<Series | null> {
-    if (item.kind === 'signal') return item.info ? this.app.ask('series', { signal: item.info.key, from, to, columns }) : null;
-    if (item.kind === 'raw') return this.app.ask('rawSeries', { ...item.edit, from, to, columns });
+    if (item.kind !== 'load') return askSeries(this.app, item, { from, to }, columns);
     const { time, load } = await this.app.ask('load', { channel: item.channel, from, to, columns });
     const share = load.map((value) => value * 100);
     return { time, end: time, first: share, min: share, max: share, last: share, values: time.length, exact: true };
   }
+}
+
+/** A signal's columns; null if no database has it any more. */
+export async function askSeries(app: App, item: Exclude<Item, { kind: 'load' }>, { from, to }: Range, columns: number): Promise<Series | null> {
+  if (item.kind === 'raw') return app.ask('rawSeries', { ...item.edit, from, to, columns });
+  return item.info ? app.ask('series', { signal: item.info.key, from, to, columns }) : null;
 }
 
 function serves(entry: Entry, range: Range, width: number, whole: Range): boolean {

@@ -4,11 +4,10 @@ import type { BitGrid, SignalInfo } from '../api';
 import type { App } from '../model/app';
 import { bitOfCell, borders, cellsOf, fieldBetween } from '../model/bit-layout';
 import { bytesText, count, duration, percent } from '../model/format';
-import { Latest } from '../model/latest';
 import type { Commands } from '../ui/commands';
 import { button, el, replace, select, setText } from '../ui/dom';
-import { IdentifierPicker } from '../ui/identifier-picker';
 import { SignalEditor } from './signal-editor';
+import { OfIdentifier } from './of-identifier';
 import type { View } from './view';
 
 /** What counts: the whole trace, what the graphs show, or what lies between the cursors. */
@@ -18,27 +17,24 @@ export class BitsView implements View {
   readonly id = 'bits';
   readonly title = 'Bits';
   readonly element: HTMLElement;
-  readonly #picker: IdentifierPicker;
+  readonly #chosen: OfIdentifier;
   readonly #grid = el('div', { class: 'bit-grid', attrs: { role: 'grid', tabindex: 0, 'aria-label': 'Bits: arrows move, Shift and arrows mark, Enter makes a signal' } });
   readonly #legend = el('div', { class: 'bit-legend' });
   readonly #state = el('span', { class: 'state', attrs: { role: 'status' } });
   readonly #about = el('p', { class: 'bit-about mono', attrs: { 'aria-live': 'polite' } });
   readonly #editor: SignalEditor;
-  readonly #asking: Latest<null>;
   #window: Window = 'all';
   #bits: BitGrid | null = null;
   #anchor = 0;
   #at = 0;
   #dragging = false;
-  #visible = false;
 
   constructor(
     private readonly app: App,
     commands: Commands,
   ) {
-    this.#picker = new IdentifierPicker(app);
+    this.#chosen = new OfIdentifier(app, () => this.#fetch());
     this.#editor = new SignalEditor(app, () => this.#markedField(), () => this.#mark());
-    this.#asking = new Latest(() => this.#fetch(), (error) => app.failed(error));
     const windows = select(
       [
         ['all', 'whole trace'],
@@ -48,16 +44,14 @@ export class BitsView implements View {
       this.#window,
       (value) => {
         this.#window = value as Window;
-        this.#ask();
+        this.#chosen.ask();
       },
       'Stretch of time',
     );
     const bar = el(
       'div',
       { class: 'bar' },
-      button('↑', () => this.#picker.step(-1), { attrs: { 'aria-label': 'Previous identifier' } }),
-      button('↓', () => this.#picker.step(1), { attrs: { 'aria-label': 'Next identifier' } }),
-      this.#picker.element,
+      ...this.#chosen.controls,
       windows,
       button('Undo', () => void this.#editor.undo(), { title: 'Undo the last change of a signal (Ctrl+Z)' }),
       button('Redo', () => void this.#editor.redo(), { title: 'Redo (Ctrl+Y)' }),
@@ -69,17 +63,11 @@ export class BitsView implements View {
     this.#grid.addEventListener('pointerdown', (event) => this.#down(event));
     this.#grid.addEventListener('pointermove', (event) => this.#move(event));
     addEventListener('pointerup', () => (this.#dragging = false));
-    app.on('identifier', () => this.#ask());
-    app.on('messages', () => this.#ask());
-    app.on('steady', () => {
-      if (this.#visible) this.#picker.refresh();
-      this.#ask();
-    });
-    app.on('range', () => this.#window === 'view' && this.#ask());
-    app.on('cursors', () => this.#window === 'marked' && this.#ask());
+    app.on('messages', () => this.#chosen.ask());
+    app.on('range', () => this.#window === 'view' && this.#chosen.ask());
+    app.on('cursors', () => this.#window === 'marked' && this.#chosen.ask());
     commands.add(
-      { id: 'bits.next', title: 'Bits: next identifier', keys: ['n'], view: this.id, run: () => this.#picker.step(1) },
-      { id: 'bits.previous', title: 'Bits: previous identifier', keys: ['p'], view: this.id, run: () => this.#picker.step(-1) },
+      ...this.#chosen.commands(this.id, this.title),
       { id: 'bits.signal', title: 'Bits: make a signal of the marked bits', keys: ['s'], view: this.id, run: () => this.#editor.begin() },
       { id: 'bits.undo', title: 'Bits: undo the last change of a signal', keys: ['Ctrl+z'], view: this.id, run: () => void this.#editor.undo() },
       { id: 'bits.redo', title: 'Bits: redo', keys: ['Ctrl+y', 'Ctrl+Shift+z'], view: this.id, run: () => void this.#editor.redo() },
@@ -88,17 +76,11 @@ export class BitsView implements View {
   }
 
   shown(): void {
-    this.#visible = true;
-    this.#picker.refresh();
-    this.#ask();
+    this.#chosen.shown();
   }
 
   hidden(): void {
-    this.#visible = false;
-  }
-
-  #ask(): void {
-    if (this.#visible && this.app.identifier) this.#asking.ask(null);
+    this.#chosen.hidden();
   }
 
   async #fetch(): Promise<void> {
@@ -121,13 +103,13 @@ export class BitsView implements View {
   #draw(): void {
     const bits = this.#bits;
     if (!bits) return;
-    const period = this.#picker.row?.period;
+    const period = this.#chosen.picker.row?.period;
     setText(this.#state, `${count(bits.frames)} frames${period ? `, one every ${duration(period.median)}` : ''}`);
     const cells = bits.length * 8;
     this.#anchor = Math.min(this.#anchor, Math.max(0, cells - 1));
     this.#at = Math.min(this.#at, Math.max(0, cells - 1));
     const places = bits.signals.map((signal) => new Set(cellsOf(signal)));
-    const last = bytesText(this.#picker.row?.lastData ?? '').split(' ');
+    const last = bytesText(this.#chosen.picker.row?.lastData ?? '').split(' ');
     const rows: HTMLElement[] = [el('div', { class: 'bit-row head', attrs: { role: 'row' } }, el('span', { attrs: { role: 'columnheader' } }, 'Byte'), ...[7, 6, 5, 4, 3, 2, 1, 0].map((b) => el('span', { attrs: { role: 'columnheader' } }, String(b))), el('span', { attrs: { role: 'columnheader' } }, 'last'))];
     for (let byte = 0; byte < bits.length; byte++) {
       const row = el('div', { class: 'bit-row', attrs: { role: 'row' } }, el('span', { class: 'mono', attrs: { role: 'rowheader' } }, String(byte)));

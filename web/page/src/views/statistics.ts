@@ -3,13 +3,12 @@
 import type { Answer } from '../api';
 import type { App } from '../model/app';
 import { count, duration, idText, percent } from '../model/format';
-import { Latest } from '../model/latest';
 import type { Commands } from '../ui/commands';
-import { button, el, replace } from '../ui/dom';
-import { IdentifierPicker } from '../ui/identifier-picker';
+import { el, replace } from '../ui/dom';
 import { readColours } from '../graph/colours';
 import { CanvasPen } from '../graph/pen';
 import { facts } from './summary';
+import { OfIdentifier } from './of-identifier';
 import type { View } from './view';
 
 type Periods = Answer<'periods'>;
@@ -18,47 +17,30 @@ export class StatisticsView implements View {
   readonly id = 'statistics';
   readonly title = 'Periods';
   readonly element: HTMLElement;
-  readonly #picker: IdentifierPicker;
+  readonly #chosen: OfIdentifier;
   readonly #figures = el('div', { class: 'figures' });
   readonly #canvas = el('canvas', { class: 'histogram', attrs: { role: 'img' } });
   readonly #table = el('div', { class: 'scroll', attrs: { tabindex: 0, role: 'group', 'aria-label': 'Histogram as numbers' } });
-  readonly #asking: Latest<null>;
   #periods: Periods | null = null;
-  #visible = false;
 
   constructor(
     private readonly app: App,
     commands: Commands,
   ) {
-    this.#picker = new IdentifierPicker(app);
-    this.#asking = new Latest(() => this.#fetch(), (error) => app.failed(error));
-    const bar = el('div', { class: 'bar' }, button('↑', () => this.#picker.step(-1), { attrs: { 'aria-label': 'Previous identifier' } }), button('↓', () => this.#picker.step(1), { attrs: { 'aria-label': 'Next identifier' } }), this.#picker.element);
+    this.#chosen = new OfIdentifier(app, () => this.#fetch());
+    const bar = el('div', { class: 'bar' }, ...this.#chosen.controls);
     this.element = el('section', { class: 'view view-statistics', attrs: { 'aria-label': 'Periods' } }, bar, el('div', { class: 'page-scroll', attrs: { tabindex: 0, role: 'group', 'aria-label': 'Figures' } }, this.#figures, this.#canvas, this.#table));
-    app.on('identifier', () => this.#ask());
-    app.on('steady', () => {
-      if (this.#visible) this.#picker.refresh();
-      this.#ask();
-    });
     app.on('profile', () => this.#draw());
     new ResizeObserver(() => this.#draw()).observe(this.#canvas);
-    commands.add(
-      { id: 'statistics.next', title: 'Periods: next identifier', keys: ['n'], view: this.id, run: () => this.#picker.step(1) },
-      { id: 'statistics.previous', title: 'Periods: previous identifier', keys: ['p'], view: this.id, run: () => this.#picker.step(-1) },
-    );
+    commands.add(...this.#chosen.commands(this.id, this.title));
   }
 
   shown(): void {
-    this.#visible = true;
-    this.#picker.refresh();
-    this.#ask();
+    this.#chosen.shown();
   }
 
   hidden(): void {
-    this.#visible = false;
-  }
-
-  #ask(): void {
-    if (this.#visible && this.app.identifier) this.#asking.ask(null);
+    this.#chosen.hidden();
   }
 
   async #fetch(): Promise<void> {
@@ -68,7 +50,7 @@ export class StatisticsView implements View {
     this.#periods = periods;
     const total = periods.counts.reduce((sum, n) => sum + n, 0);
     const name = idText(chosen.id, chosen.extended);
-    const frames = this.#picker.row?.count;
+    const frames = this.#chosen.picker.row?.count;
     replace(
       this.#figures,
       el('h3', {}, `Periods of ${name} on channel ${chosen.channel}`),

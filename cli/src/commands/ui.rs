@@ -13,6 +13,7 @@ use cantap_trace::filter::Filter;
 use cantap_ui::{Device, Server, Site, Source};
 use cantap_work::boards::Boards;
 use cantap_work::channels::Channels;
+use cantap_work::interrupt;
 use cantap_work::requested_rate::RequestedRate;
 use serde_json::{Value, json};
 
@@ -80,6 +81,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let page = page::find()?;
     let (source, about) = args.source()?;
     let page = page::with(&page, page::LIVE, &about)?;
+    // A recording is finished when Ctrl-C ends it.
+    interrupt::watch()?;
     let server = Server::open(Site::new(&page)?, source, args.port, stderr::reporter())?;
     let url = server.url();
     writeln!(std::io::stdout(), "{url}")?;
@@ -92,7 +95,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         match &opened {
             Ok(_) => eprintln!("cantap: a browser opens; Ctrl-C ends it"),
             Err(error) => {
-                eprintln!("cantap: no browser opens ({error}): open this address in one on this machine")
+                eprintln!("cantap: no browser opens ({error}): open this address in one on this machine");
             }
         }
         server.run()?;

@@ -148,7 +148,9 @@ impl Backlog {
             packed::write(&losses(before, cursor.frames.as_deref(), *first_ns), &mut packed);
             add(&packed);
         }
-        found.iter().for_each(|(_, packed, ..)| add(packed));
+        for (_, packed, ..) in &found {
+            add(packed);
+        }
         let taken = Taken { first: *first, latest: latest.0, chunks, gone };
         *cursor = Cursor { next: latest.1, frames: Some(frames_after) };
         Some(taken)

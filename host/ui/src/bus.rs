@@ -33,6 +33,8 @@ use crate::state::{ChannelState, DeviceState, State};
 const WAIT: Duration = Duration::from_millis(20);
 /// How often to ask for the device's state, and to flush a recording.
 const FIGURES_EVERY: Duration = Duration::from_millis(500);
+/// After so many requests of pages, what has arrived is taken first.
+const ORDERS_AT_A_TIME: usize = 8;
 /// Below this no controller works, in bit/s.
 const LEAST_BITRATE: u32 = 1000;
 /// More filters than anybody needs.
@@ -113,7 +115,8 @@ impl Bus {
         let mut next_figures = Instant::now();
         while !interrupt::requested() && !self.shared.is_over() {
             self.receive();
-            while let Ok(Order { request, answer }) = self.orders.try_recv() {
+            for _ in 0..ORDERS_AT_A_TIME {
+                let Ok(Order { request, answer }) = self.orders.try_recv() else { break };
                 let result = self.follow(request).map_err(|error| advice::sentence(&error));
                 // The page may have gone.
                 let _ = answer.try_send(result);

@@ -87,7 +87,7 @@ impl Recorder {
 fn checked(name: &str) -> anyhow::Result<&str> {
     const RESERVED: [&str; 6] = ["con", "prn", "aux", "nul", "com", "lpt"];
     let stem = name.split('.').next().unwrap_or_default().to_ascii_lowercase();
-    let stem = stem.trim_end_matches(|digit: char| digit.is_ascii_digit());
+    let stem = stem.trim_end_matches(char::is_numeric);
     let is_plain = |letter: char| letter.is_alphanumeric() || " ._-+()".contains(letter);
     let is_good = !name.is_empty()
         && name.len() <= MOST_NAME
@@ -140,6 +140,7 @@ mod tests {
             "a.log:stream",
             "con.log",
             "COM1.log",
+            "com¹.log",
             "nul",
             "a\n.log",
             "a\0.log",

@@ -135,7 +135,7 @@ impl<'a> Session<'a> {
         }
         for notice in self.shared.notices_after(self.notices) {
             self.notices = notice.number;
-            self.text(&json!({ "type": "notice", "level": notice.level, "text": notice.text }))?;
+            self.text(&json!({ "type": "notice", "number": notice.number, "level": notice.level, "text": notice.text }))?;
         }
         let mut at = 0;
         while at < self.waiting.len() {
@@ -185,9 +185,9 @@ impl<'a> Session<'a> {
                 Err(reason) => self.answer(number, Err(reason))?,
             },
             Err(_) => {
-                // Without a number it cannot be answered otherwise.
+                // Without a number it cannot be answered otherwise. It concerns this page alone, so it has no number either.
                 let text = "the server did not understand the page; load it anew";
-                self.text(&json!({ "type": "notice", "level": "warning", "text": text }))?;
+                self.text(&json!({ "type": "notice", "number": null, "level": "warning", "text": text }))?;
             }
         }
         Ok(())

@@ -11,10 +11,10 @@ use tempfile::NamedTempFile;
 pub fn open(url: &str) -> io::Result<NamedTempFile> {
     let mut file = tempfile::Builder::new().prefix("cantap-ui-").suffix(".html").tempfile()?;
     // The address has letters, digits and :/?=. alone.
-    write!(
+    writeln!(
         file,
         "<!doctype html><meta charset=\"utf-8\"><meta name=\"referrer\" content=\"no-referrer\">\
-         <meta http-equiv=\"refresh\" content=\"0;url={url}\"><title>cantap</title><a href=\"{url}\">cantap</a>\n"
+         <meta http-equiv=\"refresh\" content=\"0;url={url}\"><title>cantap</title><a href=\"{url}\">cantap</a>"
     )?;
     file.flush()?;
     let mut child =

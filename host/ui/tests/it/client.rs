@@ -24,7 +24,7 @@ use tungstenite::{Message, WebSocket};
 pub const PAGE: &str =
     "<html><meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'\"><p>page</p></html>";
 /// Longer than anything here takes.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_mins(1);
 
 /// A server that runs.
 pub struct Running {
@@ -47,7 +47,7 @@ pub fn device(address: &str, folder: &Path, may_send: bool) -> Device {
         decoder: Decoder::new(Vec::new()),
         folder: folder.to_owned(),
         record: None,
-        dead_man: Duration::from_secs(3600),
+        dead_man: Duration::from_hours(1),
     }
 }
 

@@ -30,6 +30,8 @@ export class Connection extends Emitter<'status' | 'state' | 'progress'> {
   #retry = RETRY;
   #timer = 0;
   #numbers = 0;
+  /** The number of the latest notice that was shown. */
+  #notices = 0;
   readonly #waiting = new Map<number, { resolve: (answer: never) => void; reject: (error: Error) => void }>();
 
   constructor(
@@ -72,6 +74,7 @@ export class Connection extends Emitter<'status' | 'state' | 'progress'> {
   #text(message: FromServer): void {
     switch (message.type) {
       case 'hello':
+        if (message.run !== this.#run) this.#notices = 0;
         this.#run = message.run;
         this.#retry = RETRY;
         this.#set('open', '');
@@ -81,6 +84,11 @@ export class Connection extends Emitter<'status' | 'state' | 'progress'> {
         this.emit('state');
         break;
       case 'notice':
+        // Whoever comes back is sent the latest ones again.
+        if (message.number !== null) {
+          if (message.number <= this.#notices) break;
+          this.#notices = message.number;
+        }
         this.notify(message.level, message.text);
         break;
       case 'answer': {

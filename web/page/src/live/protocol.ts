@@ -61,7 +61,7 @@ export interface Requests {
 export type FromServer =
   | { type: 'hello'; run: string; version: string }
   | ({ type: 'state' } & State)
-  | { type: 'notice'; level: 'info' | 'warning'; text: string }
+  | { type: 'notice'; number: number | null; level: 'info' | 'warning'; text: string }
   | { type: 'answer'; number: number; ok?: unknown; error?: string };
 
 /** Bytes before the records of a binary message: the numbers of the first record, of the one after the last, and of all so far. */

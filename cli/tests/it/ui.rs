@@ -117,7 +117,6 @@ fn without_a_page_a_device_or_a_trace_it_says_what_to_do() {
         (&["-d", "virtual", "-b", "500k", "--allow", "everything"], 2, "send"),
         (&["-d", "virtual", "--db", "none.dbc"], 1, "none.dbc"),
         (&["-d", "unix:nowhere"], 1, "nowhere"),
-        (&["-d", "virtual"], 1, "-b"),
     ] {
         let output = command(&directory, arguments).arg("--no-open").output().unwrap();
         let text = String::from_utf8(output.stderr).unwrap();

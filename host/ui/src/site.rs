@@ -25,7 +25,7 @@ impl Site {
         let (policy, after) = rest.split_once("\">").ok_or(SiteError)?;
         // It goes into a header.
         if !policy.starts_with("default-src 'none'")
-            || policy.contains(|letter: char| !letter.is_ascii() || letter.is_control())
+            || policy.contains(|letter: char| !letter.is_ascii_graphic() && letter != ' ')
         {
             return Err(SiteError);
         }

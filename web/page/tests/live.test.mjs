@@ -1,12 +1,13 @@
 // The page as `cantap ui` serves it, live from a virtual device: what arrives is shown, recorded and sent.
 
 import assert from 'node:assert/strict';
+import { spawnSync } from 'node:child_process';
 import { existsSync, readFileSync, writeFileSync, mkdtempSync } from 'node:fs';
 import { tmpdir } from 'node:os';
-import { join } from 'node:path';
+import { join, resolve } from 'node:path';
 import { after, test } from 'node:test';
 import { newPage, quit, rowsInSight, show, until, untilText } from './browser.mjs';
-import { serve } from './served.mjs';
+import { boardAt, serve } from './served.mjs';
 
 after(quit);
 
@@ -146,12 +147,22 @@ test('a lost connection comes back without a gap or a record twice; a second pag
     await before.goto(server.url);
     await before.locator('.shell').waitFor();
     await untilMore(before);
+    // A notice that stays comes once, although the server has it for whoever comes anew.
+    await before.locator('#live-record').click();
+    await untilText(before, '#live-record', '■');
+    await before.locator('#live-record').click();
+    await untilText(before, '.notices', 'records are in');
+    await before.evaluate(() => {
+      window.noticesAgain = [];
+      new MutationObserver((changes) => window.noticesAgain.push(...changes.flatMap((c) => [...c.addedNodes].map((n) => n.textContent)))).observe(document.querySelector('.notices'), { childList: true, subtree: true });
+    });
     for (let i = 0; i < 3; i++) {
       await socket.close({ code: 1011 });
       await untilText(before, '.live-state', 'connection lost');
       await untilText(before, '.live-state', 'live');
       await untilMore(before);
     }
+    assert.deepEqual((await before.evaluate(() => window.noticesAgain)).filter((text) => /record|×/.test(text)), []);
     const second = await newPage({ url: server.url });
     await second.locator('.shell').waitFor();
     await show(second, 'device');
@@ -181,6 +192,71 @@ test('the page says that the server has ended, and what it has stays', async () 
     await show(page, 'trace');
     await until(page, 'rows are there', () => document.querySelector('#view-trace .list-row:not([hidden]) .c-id').textContent !== '');
     await page.context().close();
+  }
+});
+
+test('a device that goes away and comes back leaves a gap and a whole recording, and Ctrl-C ends that', async () => {
+  const folder = mkdtempSync(join(tmpdir(), 'cantap-ui-'));
+  const socket = join(folder, 'door');
+  let board = await boardAt(socket);
+  const server = await serve(['-d', `unix:${socket}`], { folder });
+  const page = await newPage({ url: server.url });
+  try {
+    await page.locator('.shell').waitFor();
+    await until(page, 'records arrive', () => Number(document.querySelector('.shell').dataset.received) > 50);
+    await show(page, 'device');
+    await page.getByLabel('Name of the recording').fill('all.blf');
+    await page.locator('#live-record').click();
+    await until(page, 'the recording grows', () => /all\.blf: .*, \d.* records/.test(document.querySelector('#view-device').textContent));
+    await board.stop();
+    await untilText(page, '#view-device', 'away');
+    await untilText(page, '.notices', 'it continues when the device is back');
+    board = await boardAt(socket);
+    await untilText(page, '#view-device', ': there');
+    await untilMore(page);
+    await show(page, 'trace');
+    await page.locator('#trace-filter').fill('lost');
+    await until(page, 'the gap is in the trace', () => !/^0 of/.test(document.querySelector('#view-trace .bar .state').textContent) && / of /.test(document.querySelector('#view-trace .bar .state').textContent));
+    server.child.kill('SIGINT');
+    await untilText(page, '.live-state', 'ended');
+    assert.equal(await server.ended, 0);
+    const { status, stdout, stderr } = spawnSync(resolve(process.env.CANTAP_TEST_PROGRAM), ['stats', '--json', 'all.blf'], { cwd: folder, encoding: 'utf8' });
+    assert.equal(status, 0, stderr);
+    assert.match(stdout, /"frames": *[1-9]\d\d/);
+  } finally {
+    await page.context().close();
+    await board.stop();
+    await server.stop();
+  }
+});
+
+test('what is damaged on its way ends the trace where it was, and is not taken for records', async () => {
+  const server = await serve(['-d', 'virtual:car']);
+  const lies = {
+    'bytes that are no records': (bytes) => bytes.fill(0xff, 28),
+    'a chunk longer than the message': (bytes) => (bytes.writeUInt32LE(0x7fff_ffff, 24), bytes),
+    'a message without numbers': (bytes) => bytes.subarray(0, 3),
+  };
+  try {
+    for (const [about, lie] of Object.entries(lies)) {
+      const page = await newPage({ url: 'about:blank' });
+      page.faults.length = 0;
+      let messages = 0;
+      await page.routeWebSocket(/\/live/, (route) => {
+        const real = route.connectToServer();
+        real.onMessage((message) => route.send(typeof message !== 'string' && ++messages === 20 ? lie(Buffer.from(message)) : message));
+      });
+      await page.goto(server.url);
+      await page.locator('.shell').waitFor();
+      await untilText(page, '.live-state', 'ended');
+      await untilText(page, '.notices', 'load the page anew');
+      const { received, records } = await page.locator('.shell').evaluate((shell) => ({ ...shell.dataset }));
+      assert.ok(Number(received) > 0 && Number(records) >= Number(received), `${about}: ${received} ${records}`);
+      assert.deepEqual(page.faults.filter((fault) => !fault.startsWith('request:')), [], about);
+      await page.context().close();
+    }
+  } finally {
+    await server.stop();
   }
 });
 

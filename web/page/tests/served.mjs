@@ -23,12 +23,29 @@ export async function serve(args, { folder = mkdtempSync(join(tmpdir(), 'cantap-
     folder,
     child,
     errors: () => errors,
+    /** Its exit code, when it has ended. */
+    ended,
     /** Ends it as Ctrl-C does, and waits for it. */
     async stop(signal = 'SIGINT') {
       child.kill(signal);
       const code = await ended;
       rmSync(folder, { recursive: true, force: true });
       return code;
+    },
+  };
+}
+
+/** A virtual device that others reach at a socket, such as one on another machine: `cantap serve`. */
+export async function boardAt(socket) {
+  const child = spawn(resolve(PROGRAM), ['serve', '-d', 'virtual:car', '--unix', socket], { stdio: ['ignore', 'pipe', 'pipe'] });
+  let errors = '';
+  const ended = new Promise((done) => child.on('close', done));
+  const listens = new Promise((found) => child.stderr.on('data', (text) => (errors += text).includes(socket) && found(true)));
+  if ((await Promise.race([listens, ended])) !== true) throw new Error(`cantap serve ended: ${errors}`);
+  return {
+    async stop() {
+      child.kill('SIGINT');
+      await ended;
     },
   };
 }

@@ -111,6 +111,7 @@ fn messages_that_are_too_long_or_senseless_end_one_connection_at_most() {
     page.until(|page| page.records.len() > so_far + 100);
     let ends = |message: Message| {
         let mut page = server.page();
+        page.acknowledges = false;
         // The connection may end before all of it is taken.
         let _ = page.socket.send(message);
         while page.step().is_ok() {}
@@ -121,9 +122,27 @@ fn messages_that_are_too_long_or_senseless_end_one_connection_at_most() {
     for head in [&[0x81, 0xFF, 0x7F, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 1, 2, 3, 4][..], b"\x81\x02{}"]
     {
         let mut page = server.page();
+        page.acknowledges = false;
         let _ = page.socket.get_mut().write_all(head);
         while page.step().is_ok() {}
     }
+    // One that is cut: half of its head, half of its content, fragments without a last one.
+    for cut in [&[0x81][..], &[0x81, 0x8A, 1, 2, 3, 4, b'x'], &[0x01, 0x81, 1, 2, 3, 4, b'x']] {
+        let mut page = server.page();
+        page.acknowledges = false;
+        page.socket.get_mut().write_all(cut).unwrap();
+        page.socket.get_ref().shutdown(std::net::Shutdown::Write).unwrap();
+        while page.step().is_ok() {}
+    }
+    let mut page = server.page();
+    page.acknowledges = false;
+    let fragment = [&[0x01, 0xFE, 0x10, 0x00, 0, 0, 0, 0][..], &[b'x'; 0x1000]].concat();
+    let next = [&[0x00, 0xFE, 0x10, 0x00, 0, 0, 0, 0][..], &[b'x'; 0x1000]].concat();
+    let _ = page.socket.get_mut().write_all(&fragment);
+    for _ in 0..20 {
+        let _ = page.socket.get_mut().write_all(&next);
+    }
+    while page.step().is_ok() {}
     let so_far = watching.records.len();
     watching.until(|page| page.records.len() > so_far + 100);
     watching.until(|page| page.state["pages"] == 2);
@@ -140,6 +159,17 @@ fn requests_without_end_are_answered_or_refused() {
         );
     }
     assert!(page.ask("send", &json!({ "channel": 1, "frame": "123#" })).is_err());
+    // Meanwhile the capture goes on for everybody.
+    let mut watching = server.page();
+    for round in 0..20_u64 {
+        for number in 0..50 {
+            page.say(
+                &json!({ "number": 2000 + 50 * round + number, "request": "recover", "parameters": {} }),
+            );
+        }
+        let so_far = watching.frames();
+        watching.until(|page| page.frames() > so_far);
+    }
 }
 
 #[test]

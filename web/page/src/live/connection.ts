@@ -100,12 +100,25 @@ export class Connection extends Emitter<'status' | 'state' | 'progress'> {
     }
   }
 
-  #closed(code: number, reason: string): void {
+  /** Nothing more can be taken in: what is shown stays as it is, instead of going on with records missing. */
+  #stop(reason: string): void {
+    const socket = this.#socket;
+    this.#forgetSocket();
+    socket?.close();
+    this.#set('ended', reason);
+    this.notify('error', reason);
+  }
+
+  #forgetSocket(): void {
     this.#socket = null;
     // What the server has sent and was not taken in comes again.
     this.#queue = [];
     for (const { reject } of this.#waiting.values()) reject(new Error('The connection was lost before the answer; look whether it was done.'));
     this.#waiting.clear();
+  }
+
+  #closed(code: number, reason: string): void {
+    this.#forgetSocket();
     if (code === 1001) {
       this.#set('ended', 'cantap ui has ended. What was received stays here; start it again for more.');
       return;
@@ -144,18 +157,18 @@ export class Connection extends Emitter<'status' | 'state' | 'progress'> {
       const run = this.#run;
       this.#queue = [];
       const anew = run !== this.#takenRun;
-      const { next, latest } = numbers(messages[messages.length - 1] as Uint8Array);
       try {
+        const { next, latest } = numbers(messages);
         await this.take(joined(messages), anew);
+        this.next = next;
+        this.latest = latest;
       } catch (error) {
-        this.notify('error', error instanceof Error ? error.message : String(error));
         this.#pumping = false;
+        this.#stop(error instanceof Error ? error.message : String(error));
         return;
       }
       this.#takenRun = run;
-      this.next = next;
-      this.latest = latest;
-      if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ received: next }));
+      if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ received: this.next }));
       this.emit('progress');
     }
     this.#pumping = false;
@@ -173,7 +186,10 @@ export class Connection extends Emitter<'status' | 'state' | 'progress'> {
   }
 }
 
-function numbers(message: Uint8Array): { next: number; latest: number } {
+/** Those of the last message; all have some. */
+function numbers(messages: readonly Uint8Array[]): { next: number; latest: number } {
+  if (messages.some((m) => m.length < HEADER)) throw new Error('What came from cantap ui is damaged; load the page anew');
+  const message = messages[messages.length - 1] as Uint8Array;
   const view = new DataView(message.buffer, message.byteOffset, HEADER);
   return { next: Number(view.getBigUint64(8, true)), latest: Number(view.getBigUint64(16, true)) };
 }

@@ -38,7 +38,7 @@ test('the trace grows and is followed; paused, it stands still while records sti
     await untilText(page, '.live-state', 'live');
     const last = async () => (await rowsInSight(page)).at(-1).index;
     const before = await last();
-    await until(page, 'the last row is a later one', (b) => Math.max(...[...document.querySelectorAll('#view-trace .list-row:not([hidden])')].map((r) => Number(r.dataset.index))) > b + 50, before);
+    await until(page, 'the last row is a later one', (b) => Math.max(...[...document.querySelectorAll('#view-trace .list-layer .list-row:not([hidden])')].map((r) => Number(r.dataset.index))) > b + 50, before);
     await page.locator('#live-pause').click();
     await untilText(page, '.live-state', 'paused');
     const rows = await page.locator('#view-trace .bar .state').textContent();
@@ -54,10 +54,10 @@ test('the trace grows and is followed; paused, it stands still while records sti
 
 test('all views show what arrives', () =>
   live(['-d', 'virtual:car'], 'fixed', async (page) => {
-    await until(page, 'identifiers have periods', () => [...document.querySelectorAll('#view-fixed .list-row:not([hidden]) .c-period')].some((cell) => /ms/.test(cell.textContent)));
-    const frames = () => page.locator('#view-fixed .list-row:not([hidden]) .c-count').first().textContent();
+    await until(page, 'identifiers have periods', () => [...document.querySelectorAll('#view-fixed .list-layer .list-row:not([hidden]) .c-period')].some((cell) => /ms/.test(cell.textContent)));
+    const frames = () => page.locator('#view-fixed .list-layer .list-row:not([hidden]) .c-count').first().textContent();
     const before = await frames();
-    await until(page, 'a count grows', (b) => document.querySelector('#view-fixed .list-row:not([hidden]) .c-count').textContent !== b, before);
+    await until(page, 'a count grows', (b) => document.querySelector('#view-fixed .list-layer .list-row:not([hidden]) .c-count').textContent !== b, before);
     await show(page, 'graphs');
     await page.locator('.tree-signal').first().click();
     await until(page, 'the graph reaches on', () => {
@@ -137,28 +137,33 @@ test('without --allow send the page offers nothing to send', () =>
 test('a lost connection comes back without a gap or a record twice; a second page has the same', async () => {
   const server = await serve(['-d', 'virtual:car']);
   try {
-    let socket;
-    const before = await newPage({ url: 'about:blank' });
-    await before.routeWebSocket(/\/live/, (route) => {
-      route.connectToServer();
-      socket = route;
+    const before = await newPage({
+      url: server.url,
+      before: () => {
+        window.sockets = [];
+        window.WebSocket = class extends WebSocket {
+          constructor(...where) {
+            super(...where);
+            window.sockets.push(this);
+          }
+        };
+      },
     });
-    before.faults.length = 0;
-    await before.goto(server.url);
     await before.locator('.shell').waitFor();
     await untilMore(before);
     // A notice that stays comes once, although the server has it for whoever comes anew.
-    await before.locator('#live-record').click();
+    await before.keyboard.press('R');
     await untilText(before, '#live-record', '■');
-    await before.locator('#live-record').click();
+    await before.keyboard.press('R');
     await untilText(before, '.notices', 'records are in');
     await before.evaluate(() => {
       window.noticesAgain = [];
       new MutationObserver((changes) => window.noticesAgain.push(...changes.flatMap((c) => [...c.addedNodes].map((n) => n.textContent)))).observe(document.querySelector('.notices'), { childList: true, subtree: true });
     });
     for (let i = 0; i < 3; i++) {
-      await socket.close({ code: 1011 });
-      await untilText(before, '.live-state', 'connection lost');
+      const lost = until(before, 'the connection is lost', () => document.querySelector('.live-state').textContent === 'connection lost');
+      await before.evaluate(() => window.sockets.at(-1).close());
+      await lost;
       await untilText(before, '.live-state', 'live');
       await untilMore(before);
     }
@@ -190,7 +195,7 @@ test('the page says that the server has ended, and what it has stays', async () 
     await server.stop(signal);
     await untilText(page, '.live-state', text);
     await show(page, 'trace');
-    await until(page, 'rows are there', () => document.querySelector('#view-trace .list-row:not([hidden]) .c-id').textContent !== '');
+    await until(page, 'rows are there', () => document.querySelector('#view-trace .list-layer .list-row:not([hidden]) .c-id').textContent !== '');
     await page.context().close();
   }
 });

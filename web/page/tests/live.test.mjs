@@ -72,6 +72,35 @@ test('all views show what arrives', () =>
     await untilMore(page);
   }));
 
+test('very many identifiers keep no view from taking records in', async () => {
+  const server = await serve(['-d', 'virtual:load=100', '-b', '1M']);
+  const page = await newPage({
+    url: server.url,
+    before: () => {
+      window.asked = { ids: 0, append: 0 };
+      const post = Worker.prototype.postMessage;
+      Worker.prototype.postMessage = function (message, ...rest) {
+        if (message.request in window.asked) window.asked[message.request]++;
+        return post.call(this, message, ...rest);
+      };
+    },
+  });
+  try {
+    await page.locator('.shell').waitFor();
+    await until(page, 'there are thousands', () => Number(document.querySelector('.shell').dataset.received) > 50_000);
+    for (const view of ['fixed', 'statistics']) {
+      const from = await page.evaluate(() => ({ ...window.asked }));
+      await show(page, view);
+      await until(page, `${view} has asked, and records were taken in many times`, (f) => window.asked.ids > f.ids && window.asked.append >= f.append + 40, from);
+      const ids = (await page.evaluate(() => window.asked.ids)) - from.ids;
+      assert.ok(ids <= 10, `${view}: for 40 times records, ${ids} times identifiers`);
+    }
+    await page.done();
+  } finally {
+    await server.stop();
+  }
+});
+
 test('a recording has its size and time, keeps an older file, and can be read', () =>
   live(['-d', 'virtual:car'], 'device', async (page, server) => {
     writeFileSync(join(server.folder, 'older.log'), 'somebody’s');

@@ -9,6 +9,7 @@ import { count } from './format';
 import { History } from './history';
 import { Panels } from './panels';
 import type { Report } from './report';
+import { Spacing } from './spacing';
 import { type Profile, Storage } from './storage';
 
 /** `steady` comes with `summary`, but of a trace that grows live only about once a second: for what is costly, or is read and not watched. */
@@ -72,7 +73,7 @@ export class App extends Emitter<Topic> {
   #fitted = true;
   #zoomed = false;
   #steadyAt = 0;
-  #refreshAt = 0;
+  #refreshing = new Spacing(STEADY);
   #waitingSummary: Summary | null = null;
   #opening = 0;
   #bitrates: Report['bitrates'] = [];
@@ -182,7 +183,7 @@ export class App extends Emitter<Topic> {
       this.traceFile = null;
       this.#fitted = false;
       this.following = true;
-      this.#refreshAt = 0;
+      this.#refreshing = new Spacing(STEADY);
     }
     const summary = anew ? await this.ask('open', { name, bytes: chunks, more: true, size: null }) : await this.ask('append', { bytes: chunks, more: true });
     if (anew) this.#forget();
@@ -193,12 +194,7 @@ export class App extends Emitter<Topic> {
       return;
     }
     this.#take(summary);
-    if (performance.now() >= this.#refreshAt) {
-      // Where it takes long, it comes less often: it must not hold up what is watched.
-      const begin = performance.now();
-      this.#refreshAt = Infinity;
-      void this.#refreshLive().finally(() => (this.#refreshAt = performance.now() + Math.max(1000, 10 * (performance.now() - begin))));
-    }
+    this.#refreshing.ask(() => void this.#refreshing.run(() => this.#refreshLive()));
   }
 
   async #refreshLive(): Promise<void> {

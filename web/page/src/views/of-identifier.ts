@@ -26,7 +26,7 @@ export class OfIdentifier {
     this.#asking = new Latest(fetch, (error) => app.failed(error));
     app.on('identifier', () => this.ask());
     app.on('steady', () => {
-      if (this.#visible) this.picker.refresh();
+      if (this.#visible) this.picker.keepUp();
       this.ask();
     });
   }

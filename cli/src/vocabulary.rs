@@ -243,6 +243,7 @@ fn what_measures_or_tells_has_json() {
         "report",
         "reset",
         "serve",
+        "ui",
         "update",
         "virtual",
     ]

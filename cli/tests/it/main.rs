@@ -65,6 +65,7 @@ mod timing;
 mod trigger;
 mod tutorial;
 mod two_testers;
+mod ui;
 mod unsent;
 mod virtual_canopen;
 mod vocabulary;

@@ -264,7 +264,7 @@ mod tests {
     }
 
     fn same(text: &str) -> Result<String, String> {
-        Ok(text.parse::<Filter>().unwrap().to_string())
+        text.parse::<Filter>().map(|filter| filter.to_string()).map_err(|error| error.to_string())
     }
 
     #[test]

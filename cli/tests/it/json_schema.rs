@@ -58,7 +58,7 @@ fn cantap(directory: &Path, line: &str) -> (Option<i32>, String, String) {
 }
 
 /// A command line without `--json`; its exit code; the type of its object, or of each of its lines but the last, and of the last.
-pub const LINES: [(&str, i32, &[&str]); 70] = [
+pub const LINES: [(&str, i32, &[&str]); 71] = [
     ("list", 0, &["list"]),
     ("list --network", 0, &["list"]),
     ("info -d virtual", 0, &["info"]),
@@ -103,6 +103,7 @@ pub const LINES: [(&str, i32, &[&str]); 70] = [
     ("conversations talk.log", 0, &["conversations", "conversations_end"]),
     ("obd supported -d virtual:car", 0, &["conversations", "conversations"]),
     ("obd live -d virtual:car 0C -n 1", 0, &["conversations"]),
+    ("obd watch -d virtual:car 0C -n 1", 0, &["conversations"]),
     ("obd codes -d virtual:car", 0, &["conversations", "conversations"]),
     ("obd vin -d virtual:car", 0, &["conversations", "conversations"]),
     ("obd clear -d virtual:car --yes", 0, &["conversations", "conversations"]),

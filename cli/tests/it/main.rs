@@ -34,6 +34,7 @@ mod firmware;
 mod follow;
 mod help;
 mod json_schema;
+mod message_names;
 mod misbehaving_devices;
 mod monitor_keys;
 mod monitor_replug;

@@ -62,7 +62,8 @@ fn run_steps(args: &Args, steps: &[Step], others: &[Step], boards: &[Board]) -> 
         let (begin, processor) = (Instant::now(), processor_time::of_children());
         match step.run(&machine, boards) {
             Ok(outcome) => {
-                let processor = processor_time::of_children().zip(processor).map(|(now, then)| now - then);
+                let processor =
+                    processor_time::of_children().zip(processor).map(|(now, then)| now.saturating_sub(then));
                 done.push(Done { name, outcome, time: begin.elapsed(), processor });
             }
             Err(error) => {
@@ -98,7 +99,7 @@ fn report(done: &[Done]) {
     for Done { name, outcome, time, processor } in done {
         match outcome {
             Outcome::Passed => {
-                println!("{name:<16} ok {:>6.1} s{}", time.as_secs_f64(), of_processor(*processor))
+                println!("{name:<16} ok {:>6.1} s{}", time.as_secs_f64(), of_processor(*processor));
             }
             Outcome::Skipped(reason) => println!("{name:<16} NOT RUN: {reason}"),
         }

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use cantap_address::Address;
-use cantap_trace::filter::Filter;
+use cantap_signals::named::NamedFilter;
 use cantap_ui::{Device, Server, Site, Source};
 use cantap_work::boards::Boards;
 use cantap_work::channels::Channels;
@@ -21,6 +21,7 @@ use crate::args;
 use crate::channel_args::ChannelArgs;
 use crate::completion;
 use crate::database_args::{DatabaseArgs, load};
+use crate::input::resolved;
 use crate::live_args::for_listening;
 use crate::page::{self, Carried};
 use crate::stderr;
@@ -56,14 +57,14 @@ pub struct Args {
     open: ChannelArgs,
     #[command(flatten)]
     databases: DatabaseArgs,
-    /// Receive only these frames, in candump's syntax. Repeat for any of several. The page can change it.
+    /// Receive only these frames, in candump's syntax; with a database also EngineData. Repeat for any of several. The page can change it.
     #[arg(short, long, value_name = "FILTER")]
-    filter: Vec<Filter>,
+    filter: Vec<NamedFilter>,
     /// Record to this file from the start, in the format of its suffix. Recordings that the page begins are in the working folder.
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// What the page may do besides looking, choosing bit rates and recording: send, which includes taking part in the bus.
-    #[arg(long, value_name = "send", value_parser = ["send"])]
+    #[arg(long, value_name = "ROLE", value_parser = ["send"])]
     allow: Option<String>,
     /// The port; without it, any that is free.
     #[arg(long, value_name = "PORT", default_value_t = 0)]
@@ -176,7 +177,7 @@ impl Args {
         let device = Device {
             boards,
             open: self.open.options(),
-            filters: self.filter.clone(),
+            filters: resolved(&self.filter, &decoder)?,
             may_send: self.allow.is_some(),
             decoder,
             folder: std::env::current_dir().context("there is no working folder for recordings")?,

@@ -11,6 +11,7 @@ use cantap::device::{Happening, UtcClock, channel_number};
 use cantap::wire::message::Mode;
 use cantap::wire::record::ErrorState;
 use cantap_signals::Decoder;
+use cantap_signals::named::NamedFilter;
 use cantap_trace::filter::Filter;
 use cantap_trace::{TraceEvent, TraceRecord};
 use cantap_work::boards::{Boards, filters_on};
@@ -400,10 +401,7 @@ impl Bus {
                 if filters.len() > MOST_FILTERS {
                     bail!("{} filters are too many; give at most {MOST_FILTERS}", filters.len());
                 }
-                let parsed = filters
-                    .iter()
-                    .map(|text| text.parse::<Filter>().map_err(|error| anyhow::anyhow!("{error}")));
-                let filters = parsed.collect::<anyhow::Result<Vec<_>>>()?;
+                let filters = filters.iter().map(|text| self.filter(text)).collect::<anyhow::Result<_>>()?;
                 self.reconnect(self.device.open.clone(), filters)?;
             }
             Request::Mode { normal, confirmed } => self.set_mode(normal, confirmed)?,
@@ -430,6 +428,12 @@ impl Bus {
             Request::Recover {} => self.recover()?,
         }
         Ok(json!({}))
+    }
+
+    /// A filter as the command takes it, with the databases' names of messages.
+    fn filter(&self, text: &str) -> anyhow::Result<Filter> {
+        let named = text.parse::<NamedFilter>().map_err(|error| anyhow::anyhow!("{error}"))?;
+        Ok(named.resolve(&self.device.decoder)?)
     }
 
     fn may_send(&self) -> anyhow::Result<()> {

@@ -136,6 +136,37 @@ fn the_peer_sends_in_order_and_does_not_hear_itself() {
     assert_eq!(heard, ["126#"]);
 }
 
+/// A network may double a datagram: a frame must not be on the bus twice for that. What a datagram hides or lacks is reported, with numbers.
+#[test]
+fn a_datagram_that_comes_twice_is_sent_once_and_what_is_wrong_with_one_is_reported() {
+    let far = tunnel(Role::Send);
+    let other = client(&far.board, "other", Role::Listen);
+    other.listen(Channel::Can2, BITRATE_BPS).unwrap();
+    let mut seen = other.records().map(Result::unwrap).filter_map(|record| match record.event {
+        TraceEvent::Frame { frame, .. } => Some(frame.to_string()),
+        _ => None,
+    });
+    let twice = with(0, &["123#11"]);
+    far.peer.send(&twice).unwrap();
+    far.peer.send(&twice).unwrap();
+    far.tells("came twice; what it holds was not sent again");
+    far.peer.send(&with(1, &["124#22"])).unwrap();
+    assert_eq!([(); 2].map(|()| seen.next().unwrap()), ["123#11", "124#22"]);
+    // It says that it has one frame, and holds three.
+    let mut hiding = with(5, &["125#", "126#", "127#"]);
+    hiding[4] = 1;
+    far.peer.send(&hiding).unwrap();
+    far.tells(
+        "3 datagrams before this one are missing; 10 bytes follow the frames that a datagram says it has",
+    );
+    assert_eq!(seen.next().unwrap(), "125#");
+    let mut cut = with(6, &["128#", "129#"]);
+    cut[4] = 4;
+    far.peer.send(&cut).unwrap();
+    far.tells("it sent a datagram that ends before 2 of its frames");
+    assert_eq!([(); 2].map(|()| seen.next().unwrap()), ["128#", "129#"]);
+}
+
 #[test]
 fn a_peer_that_may_only_listen_sends_nothing() {
     let far = tunnel(Role::Listen);

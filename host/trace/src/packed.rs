@@ -129,7 +129,7 @@ fn varint(mut value: u64, out: &mut Vec<u8>) {
     out.push(value as u8);
 }
 
-/// Hands the records of [`write`] to `take`, those before a fault too.
+/// Hands the records of [`write()`] to `take`, those before a fault too.
 ///
 /// # Errors
 ///

@@ -54,33 +54,33 @@ pub struct Args {
     what: Option<What>,
 }
 
+/// Which values are asked for, and how often.
+#[derive(clap::Args)]
+struct Polling {
+    /// Parameters in hexadecimal, as 0C; default: all that are supported.
+    #[arg(value_name = "PID", value_parser = pid)]
+    pids: Vec<u8>,
+    /// How often.
+    #[arg(long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration)]
+    period: Duration,
+    /// How many times.
+    #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    count: Option<u32>,
+}
+
 #[derive(clap::Subcommand)]
 enum What {
     /// List the parameters of each ECU.
     Supported,
     /// Current values, until Ctrl-C.
     Live {
-        /// Parameters in hexadecimal, as 0C; default: all that are supported.
-        #[arg(value_name = "PID", value_parser = pid)]
-        pids: Vec<u8>,
-        /// How often.
-        #[arg(long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration)]
-        period: Duration,
-        /// How many times.
-        #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
-        count: Option<u32>,
+        #[command(flatten)]
+        polling: Polling,
     },
     /// Current values in a table on the terminal, with the least and the most so far, until Ctrl-C.
     Watch {
-        /// Parameters in hexadecimal, as 0C; default: all that are supported.
-        #[arg(value_name = "PID", value_parser = pid)]
-        pids: Vec<u8>,
-        /// How often.
-        #[arg(long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration)]
-        period: Duration,
-        /// How many times.
-        #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
-        count: Option<u32>,
+        #[command(flatten)]
+        polling: Polling,
     },
     /// Trouble codes: stored, pending and permanent.
     Codes,
@@ -137,8 +137,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 vehicle.show_lists()?;
             }
         }
-        Some(What::Live { pids, period, count }) => vehicle.live(pids, *period, *count, &mut |_| Ok(()))?,
-        Some(What::Watch { pids, period, count }) => vehicle.watch(pids, *period, *count, args.speak.json)?,
+        Some(What::Live { polling }) => vehicle.live(polling, &mut |_| Ok(()))?,
+        Some(What::Watch { polling }) => vehicle.watch(polling, args.speak.json)?,
         Some(What::Codes) => vehicle.codes()?,
         Some(What::Vin) => vehicle.identification()?,
         Some(What::Clear { .. }) => {
@@ -296,16 +296,10 @@ impl Vehicle<'_> {
     }
 
     /// Shows values in a table that stays where it is on a terminal. Elsewhere, and for scripts, answers are lines as in [`Self::live`].
-    fn watch(
-        &mut self,
-        wanted: &[u8],
-        period: Duration,
-        count: Option<u32>,
-        is_json: bool,
-    ) -> anyhow::Result<()> {
+    fn watch(&mut self, polling: &Polling, is_json: bool) -> anyhow::Result<()> {
         self.table = (!is_json && std::io::stdout().is_terminal()).then(Table::default);
         let mut shown = 0;
-        self.live(wanted, period, count, &mut |table| {
+        self.live(polling, &mut |table| {
             let (columns, rows) = screen();
             // What has left the top of the screen could not be drawn over, and the cursor takes a line.
             let lines = table.lines(true, (columns, rows.saturating_sub(1)));
@@ -323,14 +317,13 @@ impl Vehicle<'_> {
     /// Shows values, each as soon as it is there; `round` is called after each round with the table, if there is one.
     fn live(
         &mut self,
-        wanted: &[u8],
-        period: Duration,
-        count: Option<u32>,
+        polling: &Polling,
         round: &mut dyn FnMut(&Table) -> std::io::Result<()>,
     ) -> anyhow::Result<()> {
         self.lists()?;
         self.client.speaking.take_events();
-        let pids = if wanted.is_empty() { self.all_pids() } else { wanted.to_vec() };
+        let Polling { pids: wanted, period, count } = polling;
+        let pids = if wanted.is_empty() { self.all_pids() } else { wanted.clone() };
         if let Some(pid) = pids.iter().find(|pid| self.having(**pid) == 0) {
             bail!("no ECU has the parameter {pid:02X}; `cantap obd supported` shows those that there are");
         }
@@ -351,7 +344,7 @@ impl Vehicle<'_> {
             }
             rounds += 1;
             if count.is_none_or(|count| rounds < count) {
-                self.client.speaking.listen((period * rounds).saturating_sub(started.elapsed()))?;
+                self.client.speaking.listen((*period * rounds).saturating_sub(started.elapsed()))?;
             }
         }
         // Before the end of the first round, Ctrl-C is why.

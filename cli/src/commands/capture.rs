@@ -12,7 +12,7 @@ use cantap_address::Address;
 use cantap_formats::{ChannelInfo, Format, ReadOptions, WriteOptions, open_reader};
 use cantap_signals::named::NamedFilter;
 use cantap_signals::trigger::Trigger;
-use cantap_trace::filter::Filter;
+use cantap_trace::filter::{Filter, passes};
 
 use self::sink::Sink;
 use self::summary::{ChannelSummary, Summary, TriggerSummary};
@@ -205,15 +205,10 @@ impl Meters {
     }
 }
 
-/// What the hardware could not filter is filtered here.
-fn accepts(filters: &[Filter], record: &TraceRecord) -> bool {
-    filters.is_empty() || filters.iter().any(|filter| filter.accepts(record))
-}
-
 /// Whether a record counts in the summary: errors describe the state of the bus, whatever is captured of it.
 fn counts(filters: &[Filter], record: &TraceRecord) -> bool {
     matches!(record.event, TraceEvent::BusError { .. } | TraceEvent::ErrorsSuppressed { .. })
-        || accepts(filters, record)
+        || passes(filters, record)
 }
 
 /// Writes what is captured until Ctrl-C or a limit, including what had been captured by then.
@@ -233,7 +228,8 @@ fn write_all(
     while live.next_batch(&mut batch)? {
         for record in &batch {
             meters.push(record, counts(filters, record));
-            if !accepts(filters, record) {
+            // What the hardware could not filter is filtered here.
+            if !passes(filters, record) {
                 continue;
             }
             if !sink.write(record)? || is_enough(args, sink, meters) {

@@ -12,7 +12,7 @@ use cantap::wire::message::Mode;
 use cantap::wire::record::ErrorState;
 use cantap_signals::Decoder;
 use cantap_signals::named::NamedFilter;
-use cantap_trace::filter::Filter;
+use cantap_trace::filter::{Filter, passes};
 use cantap_trace::{TraceEvent, TraceRecord};
 use cantap_work::boards::{Boards, filters_on};
 use cantap_work::bus_hints::{BusHint, HintPlace};
@@ -294,11 +294,7 @@ impl Bus {
     /// Records first, then keeps it for the pages.
     fn take(&mut self, records: &[TraceRecord]) {
         let filters = &self.device.filters;
-        let is_wanted = |record: &&TraceRecord| {
-            record.frame().is_none()
-                || filters.is_empty()
-                || filters.iter().any(|filter| filter.accepts(record))
-        };
+        let is_wanted = |record: &&TraceRecord| record.frame().is_none() || passes(filters, record);
         let passed: Vec<TraceRecord>;
         let records = if filters.is_empty() {
             records

@@ -17,6 +17,7 @@ use crate::audit::Audit;
 use crate::board_figures::BoardFigures;
 use crate::client::{self, Guest};
 use crate::lock::lock;
+use crate::log_limit::LogLimit;
 use crate::modes;
 use crate::news::News;
 use crate::permissions::{Denied, Permissions, Permit};
@@ -86,8 +87,9 @@ impl Board {
             quit: AtomicBool::new(false),
             next_client: AtomicU64::new(1),
             news: Box::new(news),
-            refusals: Mutex::default(),
-            not_permitted: Mutex::default(),
+            refusals: Mutex::new(LogLimit::of_refusals()),
+            not_permitted: Mutex::new(LogLimit::of_refusals()),
+            sessions: Mutex::new(LogLimit::of_sessions()),
             permissions: Mutex::default(),
             audit: Mutex::default(),
             refused: AtomicU64::new(0),

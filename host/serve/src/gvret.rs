@@ -278,6 +278,7 @@ impl Connection {
             Some(there) if is_other(&there.config) => {
                 let before = there.config;
                 device.close_channel(channel).map_err(reason)?;
+                self.missed();
                 match open() {
                     Ok(config) => *bus = Some(open_bus(board, device, channel, config, sends_in)),
                     Err(error) => {

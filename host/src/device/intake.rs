@@ -284,6 +284,11 @@ impl Intake {
         &mut self.records
     }
 
+    /// The records that wait to be taken out of the vector.
+    pub const fn records(&mut self) -> &mut Vec<TraceRecord> {
+        &mut self.records
+    }
+
     /// Counts the new frames as lost, because their times are unknown.
     fn withhold(&mut self) {
         let at = Ticks(self.latest_ticks);

@@ -10,7 +10,7 @@ use cantap::wire::message::{ChannelConfig, Mode};
 use cantap::{Channel, Device, DeviceError, TraceRecord};
 use cantap_address::Address;
 use cantap_formats::{Format, TraceWriter, WriteOptions, create_stream_writer};
-use cantap_trace::filter::Filter;
+use cantap_trace::filter::{Filter, passes};
 
 use super::bit_rates::{BitRate, settle};
 use super::pipe::Opening;
@@ -268,6 +268,6 @@ fn now_ns() -> i64 {
 
 impl Wanted {
     fn accepts(&self, record: &TraceRecord) -> bool {
-        self.filters.is_empty() || self.filters.iter().any(|filter| filter.accepts(record))
+        passes(&self.filters, record)
     }
 }

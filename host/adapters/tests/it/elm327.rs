@@ -187,12 +187,8 @@ impl State {
         } else {
             format!("{:03X}", frame.id().raw())
         };
-        if self.dlc {
-            line += &format!("{:X}", frame.dlc());
-        }
-        for byte in frame.data() {
-            line += &format!("{byte:02X}");
-        }
+        line.extend(self.dlc.then(|| format!("{:X}", frame.dlc())));
+        line.extend(frame.data().iter().map(|byte| format!("{byte:02X}")));
         if frame.is_remote() {
             line += "RTR";
         }

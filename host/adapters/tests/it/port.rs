@@ -14,7 +14,7 @@ use rustix_openpty::{Pty, openpty};
 
 pub struct Port {
     pub path: String,
-    port: File,
+    other_end: File,
     /// Keeps the port from looking closed before it is opened.
     user: OwnedFd,
     pulled: Arc<AtomicBool>,
@@ -53,17 +53,17 @@ impl Port {
                 }
             }
         });
-        Self { path, port, user, pulled, thread }
+        Self { path, other_end: port, user, pulled, thread }
     }
 
     /// It is gone, with its other end.
     pub fn pull(self) {
         self.pulled.store(true, Ordering::Relaxed);
         self.thread.join().unwrap();
-        drop((self.port, self.user));
+        drop((self.other_end, self.user));
     }
 
     pub fn says(&self, text: &str) {
-        write(&self.port, text.as_bytes());
+        write(&self.other_end, text.as_bytes());
     }
 }

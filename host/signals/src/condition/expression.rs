@@ -22,6 +22,8 @@ pub(super) enum Expression {
     Part(Part),
     Byte(Box<Expression>),
     Signal(usize),
+    /// Whether the frame is one of these messages.
+    Message(Vec<MessageRef>),
     /// Whether a signal's value has a text: for each candidate, the raw values with that text.
     HasText(usize, Vec<Vec<i64>>),
     /// The first value of a listener's name, by its index among the names.

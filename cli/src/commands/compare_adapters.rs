@@ -9,18 +9,21 @@ use anyhow::{Context, bail};
 use cantap::TraceRecord;
 use cantap::device::channel_number;
 use cantap_address::Address;
-use cantap_analysis::align::{AlignError, Alignment, RUN_LENGTHS, Sketch, Verifier, align};
+use cantap_analysis::align::compare;
 use cantap_work::boards::Boards;
 use cantap_work::channels::{Channels, place_of};
 use cantap_work::live::LiveRecords;
 
-use self::result::{Adapter, Comparison};
+use self::result::{Adapter, Outcome};
 use crate::channel_args::ChannelArgs;
 use crate::usage_error::usage;
 use crate::{args, completion, exit, stderr};
 
-/// Records kept of both devices together: some gigabyte.
-const MOST_RECORDS: usize = 10_000_000;
+/// Records kept of both devices together: some gigabyte with what the comparison needs.
+const MOST_RECORDS: usize = 4_000_000;
+
+/// How long to go on when one of the two has ended: frames that it has may still be on their way from the other.
+const ON_THE_WAY: Duration = Duration::from_millis(500);
 
 /// The command line.
 #[derive(clap::Args)]
@@ -30,8 +33,8 @@ const MOST_RECORDS: usize = 10_000_000;
                   Examples:\n  \
                   cantap compare-adapters -d /dev/ttyACM0 -d can0 -b 500k\n  \
                   cantap compare-adapters -d /dev/ttyACM0 -d elm327:tcp://192.168.0.10 -b 500k -t 60s --json\n\n\
-                  Exit code 3: a frame is missing at one of the two, or in another order. 1: they have nothing in common that repeats in no \
-                  other place."
+                  Exit code 3: one of the two missed a frame, has one more often than the other, or has them in another order. \
+                  1: one received nothing, or they have nothing in common that occurs only once."
 )]
 pub struct Args {
     /// Where the two devices are. Exactly two; the first one's clock is what the second is measured by.
@@ -56,27 +59,45 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         return Err(usage("name two devices with -d, such as -d /dev/ttyACM0 -d can0"));
     }
     let boards = Boards::new(&args.devices, &args.channel)?;
+    if let Some(board) = (0..2).find(|board| boards.channels_of(*board).next().is_none()) {
+        let of = ["first device's are 1 and 2", "second device's are 3 and 4"][board];
+        return Err(usage(format!("-c must name a channel of each device; the {of}, such as -c 1,3")));
+    }
     let mut live =
         LiveRecords::open(&boards, &args.open.options(), &[], Some(args.time), &stderr::reporter())?;
-    let records = receive(&mut live)?;
-    let adapters = [0, 1].map(|board| Adapter::of(board, &live, &records[board]));
-    let alignment = find(&records).with_context(|| {
+    let mut adapters = [0, 1].map(|board| Adapter::of(board, &live));
+    let Received { records, is_cut } = receive(&mut live)?;
+    for (board, adapter) in adapters.iter_mut().enumerate() {
+        adapter.received(board, &live, &records[board]);
+    }
+    if let Some(silent) = adapters.iter().find(|adapter| adapter.frames == 0) {
+        live.judge()?;
+        bail!(silent.nothing_received());
+    }
+    let [first, second] = &records;
+    let comparison = compare(first, second).with_context(|| {
         let [first, second] = &adapters;
         format!(
             "the {} frames of '{}' and the {} of '{}' cannot be compared",
             first.frames, first.device, second.frames, second.device
         )
     })?;
-    let agreement = verify(&alignment, &records);
-    let comparison = Comparison::new(adapters, &alignment, agreement);
-    comparison.print(args.json)?;
+    let result = Outcome::new(adapters, &comparison, is_cut);
+    result.print(args.json)?;
     live.judge()?;
-    Ok(if comparison.is_equal() { ExitCode::SUCCESS } else { ExitCode::from(exit::CHECK_FAILED) })
+    Ok(if result.is_equal() { ExitCode::SUCCESS } else { ExitCode::from(exit::CHECK_FAILED) })
 }
 
-/// What each of the two received, its channels numbered from 1.
-fn receive(live: &mut LiveRecords) -> anyhow::Result<[Vec<TraceRecord>; 2]> {
-    let mut kept = [Vec::new(), Vec::new()];
+/// What the two received.
+struct Received {
+    /// Of each, its channels numbered from 1.
+    records: [Vec<TraceRecord>; 2],
+    /// One of them ended before the other.
+    is_cut: bool,
+}
+
+fn receive(live: &mut LiveRecords) -> anyhow::Result<Received> {
+    let mut records = [Vec::new(), Vec::new()];
     let mut batch = Vec::new();
     let mut ended = None;
     loop {
@@ -84,68 +105,31 @@ fn receive(live: &mut LiveRecords) -> anyhow::Result<[Vec<TraceRecord>; 2]> {
             Ok(true) => {}
             Ok(false) => break,
             // One that has ended, such as a pipe, ends the comparison. What both have is compared.
-            Err(error) if ended.is_none() && kept.iter().all(|records| !records.is_empty()) => {
+            Err(error) if ended.is_none() => {
                 ended = Some(error);
+                std::thread::sleep(ON_THE_WAY);
                 live.stop();
                 continue;
             }
-            Err(_) if ended.is_some() => break,
-            Err(error) => return Err(error),
+            Err(_) => break,
         }
         for record in &batch {
             let (board, channel) = place_of(record.channel);
-            if let Some(records) = kept.get_mut(board) {
+            if let Some(records) = records.get_mut(board) {
                 records.push(TraceRecord { channel: channel_number(0, channel), ..*record });
             }
         }
-        if kept.iter().map(Vec::len).sum::<usize>() >= MOST_RECORDS {
+        if records.iter().map(Vec::len).sum::<usize>() >= MOST_RECORDS {
             stderr::warn(
                 "there are too many frames to keep for that long: what was received so far is compared",
             );
-            live.stop();
+            live.end()?;
             break;
         }
     }
+    let is_cut = ended.is_some();
     if let Some(error) = ended {
         stderr::warn(&format!("{error:#}; what both received before that is compared"));
     }
-    Ok(kept)
-}
-
-/// How the second one's clock relates to the first one's.
-fn find(records: &[Vec<TraceRecord>; 2]) -> anyhow::Result<Alignment> {
-    let mut unclear = AlignError::NothingInCommon;
-    for length in RUN_LENGTHS {
-        let [first, second] = records.each_ref().map(|records| {
-            let mut sketch = Sketch::new(length);
-            for record in records {
-                sketch.add(record);
-            }
-            sketch
-        });
-        match align(&first, &second) {
-            Ok(alignment) => return Ok(alignment),
-            Err(error) => unclear = error,
-        }
-    }
-    bail!(unclear)
-}
-
-/// Compares the records in the order of the first one's time.
-fn verify(
-    alignment: &Alignment,
-    [first, second]: &[Vec<TraceRecord>; 2],
-) -> cantap_analysis::align::Agreement {
-    let mut verifier = Verifier::new(alignment).with_bounds();
-    let mut firsts = first.iter().peekable();
-    let mapped =
-        |record: &TraceRecord| TraceRecord { time_ns: alignment.map.to_first(record.time_ns), ..*record };
-    for record in second.iter().map(mapped) {
-        while let Some(earlier) = firsts.next_if(|first| first.time_ns <= record.time_ns) {
-            verifier.first(earlier);
-        }
-        verifier.second(&record);
-    }
-    firsts.for_each(|record| verifier.first(record));
-    verifier.finish()
+    Ok(Received { records, is_cut })
 }

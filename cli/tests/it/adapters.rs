@@ -1,39 +1,37 @@
 //! What commands say of an adapter that does not count its losses: never zero.
 
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Output, Stdio};
 use std::sync::mpsc;
 
 use serde_json::Value;
 
-/// A pipe into which another program writes a trace: nobody knows what that program lost.
-fn pipe(test: &str) -> PathBuf {
+/// A pipe into which another program writes a trace: nobody knows what that program lost. It stays open until the sender is dropped.
+pub fn pipe(test: &str, text: String) -> (String, mpsc::Sender<()>) {
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("adapters");
     std::fs::create_dir_all(&folder).unwrap();
     let pipe = folder.join(test);
     let _ = std::fs::remove_file(&pipe);
     assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
-    pipe
+    let (done, ends) = mpsc::channel::<()>();
+    let device = format!("candump:{}", pipe.display());
+    std::thread::spawn(move || {
+        let mut writer = std::fs::File::options().write(true).open(pipe).unwrap();
+        let _ = writer.write_all(text.as_bytes());
+        let _ = ends.recv();
+    });
+    (device, done)
 }
 
 /// Runs a command on such a pipe. Standard output and standard error.
 fn on_pipe(test: &str, line: &str) -> (String, String) {
-    let pipe = pipe(test);
-    let (done, ends) = mpsc::channel::<()>();
-    let path = pipe.clone();
-    std::thread::spawn(move || {
-        let mut writer = std::fs::File::options().write(true).open(path).unwrap();
-        // It does not go back to zero.
-        for at in 0..100 {
-            let _ = writeln!(writer, "(1700000000.{:06}) can0 123#{at:04X}", at * 500);
-        }
-        let _ = ends.recv();
-    });
-    let device = format!("candump:{}", pipe.display());
+    // It does not go back to zero.
+    let text = (0..100).map(|at| format!("(1700000000.{:06}) can0 123#{at:04X}\n", at * 500)).collect();
+    let (device, done) = pipe(test, text);
     let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
-    let words = line.split(' ').map(|word| if word == "PIPE" { device.as_str() } else { word });
-    let Output { status, stdout, stderr } = command.args(words).stdin(Stdio::null()).output().unwrap();
+    let args = line.split(' ').map(|arg| if arg == "PIPE" { device.as_str() } else { arg });
+    let Output { status, stdout, stderr } = command.args(args).stdin(Stdio::null()).output().unwrap();
     drop(done);
     let text = |bytes| String::from_utf8(bytes).unwrap();
     let (out, err) = (text(stdout), text(stderr));

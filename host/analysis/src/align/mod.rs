@@ -12,6 +12,9 @@
 
 mod chain;
 mod clock_map;
+mod compare;
+#[cfg(test)]
+mod compare_tests;
 mod sketch;
 #[cfg(test)]
 mod tests;
@@ -21,6 +24,7 @@ use std::collections::BTreeMap;
 
 use chain::{Chain, FEWEST, Unclear, chains};
 pub use clock_map::ClockMap;
+pub use compare::{Comparison, Differences, Side, compare};
 use sketch::Pair;
 pub use sketch::Sketch;
 pub use verify::{Agreement, Verifier};
@@ -46,14 +50,6 @@ pub struct Alignment {
     pub common_ns: (i64, i64),
     /// How far apart stamps of the same frame may be.
     tolerance_ns: i64,
-}
-
-impl Alignment {
-    /// How far apart the stamps of a frame may be, in nanoseconds. One whose stamps are farther apart counts as two, each of which the
-    /// other trace lacks.
-    pub const fn tolerance_ns(&self) -> i64 {
-        self.tolerance_ns
-    }
 }
 
 /// Why two traces cannot be aligned.

@@ -19,9 +19,6 @@ pub struct Verifier {
     differences: Histogram<u64>,
     both: u64,
     only: [u64; 2],
-    out_of_order: u64,
-    /// Stamps that are only upper bounds are compared, too.
-    takes_bounds: bool,
 }
 
 /// A frame whose counterpart has not been found yet.
@@ -31,8 +28,6 @@ struct Waiting {
     bus: usize,
     frame: TraceFrame,
     late: bool,
-    /// A later frame of its bus has been found before it.
-    overtaken: bool,
 }
 
 /// How well two traces agree.
@@ -44,8 +39,6 @@ pub struct Agreement {
     pub only_first: u64,
     /// Frames that only the second has.
     pub only_second: u64,
-    /// Frames of those in both that the two have in another order: each before which a later one came.
-    pub out_of_order: u64,
     /// The median distance between the two stamps of a frame, in nanoseconds. Stamps that are only upper bounds are
     /// excluded.
     pub median_ns: u64,
@@ -68,15 +61,7 @@ impl Verifier {
             differences,
             both: 0,
             only: [0; 2],
-            out_of_order: 0,
-            takes_bounds: false,
         }
-    }
-
-    /// Compares stamps that are only upper bounds, too: for what is to be known about the stamps, not about the clocks.
-    #[must_use]
-    pub fn with_bounds(self) -> Self {
-        Self { takes_bounds: true, ..self }
     }
 
     /// Takes the first trace's next record.
@@ -99,21 +84,11 @@ impl Verifier {
         if let Some(at) = others.iter().position(|other| other.bus == bus && other.frame == *frame) {
             let Some(other) = others.remove(at) else { return };
             self.both += 1;
-            self.out_of_order += u64::from(other.overtaken);
-            for passed in others.iter_mut().take(at).filter(|passed| passed.bus == bus) {
-                passed.overtaken = true;
-            }
-            if self.takes_bounds || !late && !other.late {
+            if !late && !other.late {
                 self.differences.saturating_record(other.time_ns.abs_diff(time_ns).max(1));
             }
         } else {
-            self.waiting[side].push_back(Waiting {
-                time_ns,
-                bus,
-                frame: *frame,
-                late: *late,
-                overtaken: false,
-            });
+            self.waiting[side].push_back(Waiting { time_ns, bus, frame: *frame, late: *late });
         }
     }
 
@@ -136,7 +111,6 @@ impl Verifier {
             both: self.both,
             only_first: self.only[0],
             only_second: self.only[1],
-            out_of_order: self.out_of_order,
             median_ns: quantile(0.5),
             most_ns: quantile(0.99),
             worst_ns: self.differences.max(),

@@ -122,11 +122,18 @@ pub fn compare(first: &[TraceRecord], second: &[TraceRecord]) -> Result<Comparis
     Ok(found)
 }
 
-/// How the clocks and channels relate. Single frames come second: they survive any loss, but fewer of them occur only once.
+/// How the clocks and channels relate. Single frames come second: they survive any loss, but fewer of them occur only once. Of equal frames in a row the
+/// first stands for all, since a device may hand each frame over twice.
 fn find(first: &[TraceRecord], second: &[TraceRecord]) -> Result<Alignment, AlignError> {
     let sketch = |records: &[TraceRecord], length| {
         let mut sketch = Sketch::new(length).with_bounds();
-        records.iter().for_each(|record| sketch.add(record));
+        let mut last = HashMap::new();
+        for record in records {
+            let TraceEvent::Frame { frame, .. } = record.event else { continue };
+            if last.insert(record.channel, frame) != Some(frame) {
+                sketch.add(record);
+            }
+        }
         sketch
     };
     let [short, longer @ ..] = RUN_LENGTHS;

@@ -4,7 +4,7 @@ use std::io::Write;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use cantap_serve::beacon::{self, Found};
+use cantap_serve::beacon::{self, Announced, Found};
 
 use crate::stderr;
 
@@ -35,7 +35,7 @@ const LISTEN_FOR: Duration = Duration::from_millis(3100);
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let boards = cantap::device::list()?;
-    let servers = if args.network {
+    let announced = if args.network {
         let found = beacon::listen_for(LISTEN_FOR);
         Some(found.map_err(|error| {
             anyhow::anyhow!("nobody can listen for servers at UDP port {}: {error}", beacon::PORT)
@@ -56,8 +56,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             })
             .collect();
         let mut object = serde_json::json!({ "devices": devices });
-        if let Some(servers) = &servers {
-            object["servers"] = servers.iter().map(json_of).collect();
+        if let Some(announced) = &announced {
+            object["servers"] = announced.servers.iter().map(json_of).collect();
+            object["beacons_left_out"] = announced.beacons_left_out.into();
+            object["unreadable"] = announced.unreadable.into();
         }
         writeln!(out, "{object}")?;
         return Ok(ExitCode::SUCCESS);
@@ -70,17 +72,41 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             writeln!(out, "{}\t{}\t{serial}", board.port, board.product.as_deref().unwrap_or("-"))?;
         }
     }
-    for server in servers.iter().flatten() {
+    let Some(announced) = announced else { return Ok(ExitCode::SUCCESS) };
+    for server in &announced.servers {
         for bus in &server.buses {
             writeln!(out, "{}\t{}\t{}", address(server, bus), server.name, server.from)?;
         }
     }
-    if servers.is_some_and(|servers| servers.is_empty()) {
+    drop(out);
+    tell_left_out(&announced);
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Says what is not listed.
+fn tell_left_out(announced: &Announced) {
+    let Announced { servers, beacons_left_out, unreadable } = announced;
+    if servers.is_empty() {
         stderr::tell(
             "cantap: no server announced itself; `cantap serve --socketcand` does, and others need not\n",
         );
     }
-    Ok(ExitCode::SUCCESS)
+    if *beacons_left_out > 0 {
+        stderr::warn(&format!(
+            "{beacons_left_out} beacons of further servers are left out, because {} are listed already: somebody may be inventing them",
+            servers.len()
+        ));
+    }
+    let more: usize = servers.iter().map(|server| server.more_buses).sum();
+    if more > 0 {
+        stderr::warn(&format!("{more} further buses of these servers are left out"));
+    }
+    if *unreadable > 0 {
+        stderr::tell(&format!(
+            "cantap: {unreadable} datagrams at UDP port {} were no beacons\n",
+            beacon::PORT
+        ));
+    }
 }
 
 /// A bus of a server as `-d` takes it.
@@ -90,5 +116,5 @@ fn address(server: &Found, bus: &str) -> String {
 
 fn json_of(server: &Found) -> serde_json::Value {
     let devices: Vec<String> = server.buses.iter().map(|bus| address(server, bus)).collect();
-    serde_json::json!({ "devices": devices, "name": server.name, "from": server.from.to_string() })
+    serde_json::json!({ "devices": devices, "name": server.name, "from": server.from.to_string(), "more_buses": server.more_buses })
 }

@@ -104,34 +104,56 @@ pub struct Found {
     pub from: IpAddr,
     /// What it calls itself.
     pub name: String,
-    /// Its buses.
+    /// Its buses; at most 32.
     pub buses: Vec<String>,
+    /// How many more buses it says that it has.
+    pub more_buses: usize,
 }
 
-/// Listens for beacons for this long, and returns each server once, by its place; at most 256.
-pub fn listen_for(time: Duration) -> io::Result<Vec<Found>> {
+/// What was heard on the network.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Announced {
+    /// Each server once, by its place; at most 256.
+    pub servers: Vec<Found>,
+    /// Beacons of further servers. How many servers these are is not known: each sends one every few seconds.
+    pub beacons_left_out: u64,
+    /// Datagrams that are no beacon.
+    pub unreadable: u64,
+}
+
+/// Listens for beacons for this long.
+pub fn listen_for(time: Duration) -> io::Result<Announced> {
     gather(&socket()?, time)
 }
 
-fn gather(socket: &UdpSocket, time: Duration) -> io::Result<Vec<Found>> {
+fn gather(socket: &UdpSocket, time: Duration) -> io::Result<Announced> {
     socket.set_read_timeout(Some(SOCKET_TIMEOUT))?;
+    let mut announced = Announced::default();
     let mut found = BTreeMap::new();
     let deadline = Instant::now() + time;
-    let mut bytes = vec![0; MOST_BYTES];
+    let mut bytes = vec![0; MOST_BYTES + 1];
     while Instant::now() < deadline {
         match socket.recv_from(&mut bytes) {
             Ok((len, from)) => {
-                let Some(server) = read(&bytes[..len], from.ip()) else { continue };
+                // A longer one is cut, and counts as unreadable.
+                let Some(server) = read(&bytes[..len], from.ip()).filter(|_| len <= MOST_BYTES) else {
+                    announced.unreadable += 1;
+                    continue;
+                };
+                let key = (server.place.clone(), server.from);
                 if found.len() < MOST_FOUND {
                     // The first one stays, so that nobody takes its place.
-                    found.entry((server.place.clone(), server.from)).or_insert(server);
+                    found.entry(key).or_insert(server);
+                } else if !found.contains_key(&key) {
+                    announced.beacons_left_out += 1;
                 }
             }
             Err(error) if is_idle(&error) => {}
             Err(error) => return Err(error),
         }
     }
-    Ok(found.into_values().collect())
+    announced.servers = found.into_values().collect();
+    Ok(announced)
 }
 
 /// The port is shared with other programs that listen for beacons.
@@ -162,12 +184,13 @@ fn read(bytes: &[u8], from: IpAddr) -> Option<Found> {
     let is_place = !place.is_empty()
         && place.len() <= 256
         && place.bytes().all(|byte| byte.is_ascii_alphanumeric() || b".-_:[]%".contains(&byte));
-    let buses = beacon.split("<Bus").skip(1).filter_map(|bus| attribute(bus, "name")).take(MOST_BUSES);
+    let mut buses = beacon.split("<Bus").skip(1).filter_map(|bus| attribute(bus, "name"));
     is_place.then(|| Found {
         place: place.to_owned(),
         from,
         name: short(attribute(beacon, "name").unwrap_or_default()),
-        buses: buses.map(short).collect(),
+        buses: buses.by_ref().take(MOST_BUSES).map(short).collect(),
+        more_buses: buses.count(),
     })
 }
 
@@ -214,7 +237,8 @@ mod tests {
             assert_eq!(read(with("x", url).as_bytes(), FROM), None, "{url}");
         }
         let many = format!("<CANBeacon><URL>can://h</URL>{}", "<Bus name='a'/>".repeat(100));
-        assert_eq!(read(many.as_bytes(), FROM).unwrap().buses.len(), MOST_BUSES);
+        let found = read(many.as_bytes(), FROM).unwrap();
+        assert_eq!((found.buses.len(), found.more_buses), (MOST_BUSES, 100 - MOST_BUSES));
         for text in ["", "<CANBeacon", "<CANBeacon name=", "<CANBeacon name=\"", "<URL>can://h</URL>"] {
             assert_eq!(read(text.as_bytes(), FROM), None, "{text}");
         }
@@ -239,7 +263,37 @@ mod tests {
         }
         say("<CANBeacon name=\"liar\"><URL>can://h:1</URL></CANBeacon>".to_owned());
         let found = gather(&here, Duration::from_millis(200)).unwrap();
-        let names: Vec<&str> = found.iter().map(|server| server.name.as_str()).collect();
-        assert_eq!(names, ["1", "2"]);
+        let names: Vec<&str> = found.servers.iter().map(|server| server.name.as_str()).collect();
+        assert_eq!(
+            (names.as_slice(), found.beacons_left_out, found.unreadable),
+            (["1", "2"].as_slice(), 0, 0)
+        );
+    }
+
+    /// Whoever invents servers by the hundred must not keep the true ones out without a trace.
+    #[test]
+    fn what_there_is_no_room_for_is_counted() {
+        let here = UdpSocket::bind("127.0.0.1:0").unwrap();
+        let address = here.local_addr().unwrap();
+        let flood = std::thread::spawn(move || {
+            let sender = UdpSocket::bind("127.0.0.1:0").unwrap();
+            let say = |text: String| {
+                sender.send_to(text.as_bytes(), address).unwrap();
+                // The system keeps only so many that are not read yet.
+                std::thread::sleep(Duration::from_micros(500));
+            };
+            let beacon = |name: &str, port| {
+                format!("<CANBeacon name=\"{name}\"><URL>can://h:{port}</URL></CANBeacon>")
+            };
+            (0..MOST_FOUND).for_each(|number| say(beacon("liar", number)));
+            say(beacon("true", 29_536));
+            // One that is listed says so again.
+            say(beacon("liar", 0));
+            say("<CANBeacon".to_owned());
+            say(format!("{}{}", beacon("long", 1), " ".repeat(MOST_BYTES)));
+        });
+        let found = gather(&here, Duration::from_secs(3)).unwrap();
+        flood.join().unwrap();
+        assert_eq!((found.servers.len(), found.beacons_left_out, found.unreadable), (MOST_FOUND, 1, 2));
     }
 }

@@ -145,10 +145,19 @@ fn a_hang_up_reads_the_files_again_and_those_whom_it_concerns_go() {
     assert_eq!(send("124#11").0, Some(1));
     // A slip changes nothing.
     lab.hang_up("[clients.alice]\nsend = [\"1234\"]\n");
-    let remarks = lab.remark("the permissions stay as they were");
+    let remarks = lab.remark("the permissions and certificates all stay as they were");
     assert!(remarks.contains("'1234' is no identifier"), "{remarks}");
     assert_eq!(send("124#11").0, Some(1));
     assert_eq!(send("123#11").0, Some(0));
+    // Nor does one in another file: the permissions by themselves would be good.
+    let list = lab.path("keys").join("revoked.pem");
+    let good = std::fs::read(&list).unwrap();
+    std::fs::write(&list, "no list").unwrap();
+    lab.hang_up("[clients.alice]\nsend = [\"124\"]\n\n[clients.bob]\n");
+    lab.remark("revoked.pem' cannot be used");
+    assert_eq!(send("124#11").0, Some(1));
+    assert_eq!(send("123#11").0, Some(0));
+    std::fs::write(&list, good).unwrap();
     lab.hang_up("[clients.alice]\nsend = [\"124\"]\n\n[clients.bob]\n");
     lab.remark("were read again");
     let (code, _, err) = send("124#11");

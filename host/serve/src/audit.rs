@@ -14,6 +14,7 @@ use std::time::Duration;
 use serde_json::{Value, json};
 
 use crate::lock::lock;
+use crate::small_file;
 
 /// Lines that wait for the disk.
 const MOST_WAITING: usize = 4096;
@@ -159,7 +160,7 @@ fn open(path: &Path) -> io::Result<File> {
     options.create(true).append(true);
     #[cfg(unix)]
     std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
-    options.open(path)
+    small_file::open(path, &mut options)
 }
 
 /// Whether a file is still the one at its path.

@@ -34,6 +34,7 @@ mod peer;
 pub mod permissions;
 mod places;
 mod shared;
+mod small_file;
 #[cfg(unix)]
 pub mod socket_file;
 pub mod socketcand;

@@ -8,8 +8,8 @@ use cantap_wire::Id;
 use cantap_wire::message::{Mode, Role};
 use serde::Deserialize;
 
-/// Largest file that is read.
-const MOST_BYTES: u64 = 1 << 20;
+use crate::small_file;
+
 const MINUTES_PER_DAY: u16 = 24 * 60;
 
 /// Why a file cannot be used.
@@ -106,11 +106,7 @@ impl Permissions {
     /// Reads a file.
     pub fn read(path: &Path) -> Result<Self, PermissionsError> {
         let bad = |reason: String| PermissionsError { path: path.to_owned(), reason };
-        let size = path.metadata().map_err(|error| bad(error.to_string()))?.len();
-        if size > MOST_BYTES {
-            return Err(bad(format!("it has {size} bytes, more than {MOST_BYTES}")));
-        }
-        let text = std::fs::read_to_string(path).map_err(|error| bad(error.to_string()))?;
+        let text = small_file::read_text(path).map_err(|error| bad(error.to_string()))?;
         Self::parse(&text).map_err(bad)
     }
 

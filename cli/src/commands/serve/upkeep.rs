@@ -7,9 +7,9 @@ use anyhow::Context;
 use cantap_serve::Board;
 use cantap_serve::audit::Audit;
 #[cfg(feature = "tls")]
-use cantap_serve::permissions::Permissions;
+use cantap_serve::permissions::{Permissions, PermissionsError};
 #[cfg(feature = "tls")]
-use cantap_serve::tls::Server;
+use cantap_serve::tls::{self, Server};
 #[cfg(unix)]
 use nix::sys::signal::{SigSet, Signal};
 
@@ -72,7 +72,8 @@ impl Upkeep {
         {
             files.server = server;
         }
-        files.permit()?;
+        #[cfg(feature = "tls")]
+        files.permit(files.read_permissions()?.as_ref());
         if let Some(audit) = &self.audit {
             for board in boards {
                 board.record_to(Arc::clone(audit));
@@ -98,35 +99,43 @@ impl Upkeep {
 }
 
 impl Reread {
-    /// Applies the permissions as they are in their file now.
-    fn permit(&self) -> anyhow::Result<()> {
+    /// The permissions as they are in their file now, if there is one.
+    #[cfg(feature = "tls")]
+    fn read_permissions(&self) -> Result<Option<Arc<Permissions>>, PermissionsError> {
+        Ok(self.permissions.as_deref().map(Permissions::read).transpose()?.map(Arc::new))
+    }
+
+    /// Applies permissions.
+    #[cfg(feature = "tls")]
+    fn permit(&self, permissions: Option<&Arc<Permissions>>) {
+        let Some(permissions) = permissions else { return };
+        for (number, board) in self.boards.iter().enumerate() {
+            if let Some(board) = board.upgrade() {
+                board.permit_only(Arc::clone(permissions), number);
+            }
+        }
+    }
+
+    /// Everything is read before anything changes: half of the old and half of the new may let somebody do what neither does.
+    #[cfg(unix)]
+    fn read_again(&self) {
         #[cfg(feature = "tls")]
-        if let Some(path) = &self.permissions {
-            let permissions = Arc::new(Permissions::read(path)?);
-            for (number, board) in self.boards.iter().enumerate() {
-                if let Some(board) = board.upgrade() {
-                    board.permit_only(Arc::clone(&permissions), number);
+        {
+            let read = || -> anyhow::Result<_> {
+                let permissions = self.read_permissions()?;
+                Ok((permissions, self.server.as_ref().map(Server::read_again).transpose()?))
+            };
+            match read() {
+                Ok((permissions, server)) => {
+                    self.permit(permissions.as_ref());
+                    server.into_iter().for_each(tls::Reread::apply);
+                }
+                Err(error) => {
+                    stderr::warn(&format!("{error}; the permissions and certificates all stay as they were"));
+                    return;
                 }
             }
         }
-        Ok(())
-    }
-
-    /// A file that cannot be used changes nothing.
-    #[cfg(unix)]
-    fn read_again(&self) {
-        let mut failed = false;
-        if let Err(error) = self.permit() {
-            failed = true;
-            stderr::warn(&format!("{error}; the permissions stay as they were"));
-        }
-        #[cfg(feature = "tls")]
-        if let Some(Err(error)) = self.server.as_ref().map(Server::reload) {
-            failed = true;
-            stderr::warn(&format!("{error}; the certificates stay as they were"));
-        }
-        if !failed {
-            stderr::tell("cantap: the permissions and certificates were read again\n");
-        }
+        stderr::tell("cantap: the permissions and certificates were read again\n");
     }
 }

@@ -13,6 +13,7 @@ use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, CertificateRevocationListDer};
 
 use super::{Files, is_name, name_of, role_of};
+use crate::small_file;
 
 /// How long the authority's certificate is valid, in days.
 const AUTHORITY_DAYS: u32 = 10 * 365;
@@ -69,7 +70,7 @@ impl Keys {
         std::fs::create_dir_all(folder).map_err(failed)?;
         let path = folder.join(format!("{AUTHORITY}-key.pem"));
         if path.exists() {
-            let text = std::fs::read_to_string(&path)
+            let text = small_file::read_text(&path)
                 .map_err(|source| KeysError::File { path: path.clone(), source })?;
             let key = KeyPair::from_pem(&text)?;
             return Ok(Self { folder: folder.to_owned(), key, days: LIFETIME_DAYS });
@@ -211,7 +212,8 @@ fn client_name(name: &str) -> Result<(), KeysError> {
 
 /// The certificate in a file.
 fn certificate(path: &Path) -> Result<CertificateDer<'static>, KeysError> {
-    CertificateDer::from_pem_file(path).map_err(|error| unreadable(path, error))
+    let pem = small_file::read(path).map_err(|error| unreadable(path, error))?;
+    CertificateDer::from_pem_slice(&pem).map_err(|error| unreadable(path, error))
 }
 
 fn unreadable(path: &Path, error: impl std::fmt::Display) -> KeysError {
@@ -220,7 +222,8 @@ fn unreadable(path: &Path, error: impl std::fmt::Display) -> KeysError {
 
 /// The serial numbers on a list, and when each was put there, in seconds since the Unix epoch.
 fn revoked(path: &Path) -> Result<Vec<(Vec<u8>, u64)>, KeysError> {
-    let der = CertificateRevocationListDer::from_pem_file(path).map_err(|error| unreadable(path, error))?;
+    let pem = small_file::read(path).map_err(|error| unreadable(path, error))?;
+    let der = CertificateRevocationListDer::from_pem_slice(&pem).map_err(|error| unreadable(path, error))?;
     let list = webpki::BorrowedCertRevocationList::from_der(&der).map_err(|error| unreadable(path, error))?;
     list.into_iter()
         .map(|entry| match entry {

@@ -28,7 +28,7 @@ use crate::flow::acknowledging;
 use crate::listen::{Arrival, Listening, accept, bind, let_in, turn_away};
 use crate::lock::lock;
 use crate::places::{Places, ends};
-use crate::{Board, News};
+use crate::{Board, News, small_file};
 
 pub use keys::{Keys, KeysError, LIFETIME_DAYS, REVOKED};
 use stream::{Secured, shake_hands};
@@ -81,7 +81,8 @@ impl Files {
     fn read(&self) -> Result<Credentials, TlsError> {
         let bad = |path: &Path, reason: String| TlsError::File { path: path.to_owned(), reason };
         let certificates = |path: &Path| {
-            let all: Result<Vec<_>, _> = CertificateDer::pem_file_iter(path).and_then(Iterator::collect);
+            let pem = small_file::read(path).map_err(|error| bad(path, error.to_string()))?;
+            let all: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(&pem).collect();
             match all {
                 Ok(all) if all.is_empty() => Err(bad(path, "there is no certificate in it".to_owned())),
                 all => all.map_err(|error| bad(path, error.to_string())),
@@ -92,10 +93,10 @@ impl Files {
             authority.add(certificate).map_err(|error| bad(&self.authority, error.to_string()))?;
         }
         private(&self.key)?;
+        let key = small_file::read(&self.key).map_err(|error| bad(&self.key, error.to_string()))?;
         Ok(Credentials {
             chain: certificates(&self.certificate)?,
-            key: PrivateKeyDer::from_pem_file(&self.key)
-                .map_err(|error| bad(&self.key, error.to_string()))?,
+            key: PrivateKeyDer::from_pem_slice(&key).map_err(|error| bad(&self.key, error.to_string()))?,
             authority: Arc::new(authority),
         })
     }
@@ -157,9 +158,13 @@ impl Server {
 
     /// Reads the files again. If one of them cannot be used, nothing changes. Clients that are no longer trusted are let go within a second.
     pub fn reload(&self) -> Result<(), TlsError> {
+        self.read_again().map(Reread::apply)
+    }
+
+    /// Reads the files again without using them yet, for whoever has others to read before that.
+    pub fn read_again(&self) -> Result<Reread, TlsError> {
         let trust = Trust::read(&self.files, self.revoked.as_deref())?;
-        *lock(&self.trust) = trust;
-        Ok(())
+        Ok(Reread { trust, server: Arc::clone(&self.trust) })
     }
 
     fn trust(&self) -> Trust {
@@ -173,6 +178,19 @@ impl Server {
             Ok(_) => Ok(()),
             Err(error) => Err(format!("its certificate is no longer trusted: {error}")),
         }
+    }
+}
+
+/// A server's files, read again.
+pub struct Reread {
+    trust: Trust,
+    server: Arc<Mutex<Trust>>,
+}
+
+impl Reread {
+    /// From now on, the server uses them.
+    pub fn apply(self) {
+        *lock(&self.server) = self.trust;
     }
 }
 
@@ -196,8 +214,9 @@ impl Trust {
 
 /// The list in a file.
 fn revocations(path: &Path) -> Result<CertificateRevocationListDer<'static>, TlsError> {
-    CertificateRevocationListDer::from_pem_file(path)
-        .map_err(|error| TlsError::File { path: path.to_owned(), reason: error.to_string() })
+    let bad = |reason: String| TlsError::File { path: path.to_owned(), reason };
+    let pem = small_file::read(path).map_err(|error| bad(error.to_string()))?;
+    CertificateRevocationListDer::from_pem_slice(&pem).map_err(|error| bad(error.to_string()))
 }
 
 /// Admits clients at any address of this computer. Each may do what its certificate says, limited to `most`. A client

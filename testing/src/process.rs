@@ -1,7 +1,8 @@
-//! Tests that cannot share their process or the machine with others.
+//! Tests that cannot share their process or the machine with others, or wait for what other threads do.
 
 use std::process::Command;
 use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
 
 /// The variable that names the test whose body is to run in this process.
 const ALONE: &str = "CANTAP_TEST_ALONE";
@@ -26,4 +27,19 @@ static TURN: Mutex<()> = Mutex::new(());
 pub fn turn() -> MutexGuard<'static, ()> {
     // Whoever failed while it had its turn is no concern of the next.
     TURN.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Far longer than anything takes, even on a busy machine: only what never happens takes this long.
+const PATIENCE: Duration = Duration::from_mins(1);
+
+/// Waits until something holds.
+///
+/// # Panics
+/// If it never does, with `what` is wrong then.
+pub fn wait_until(what: &str, mut holds: impl FnMut() -> bool) {
+    let deadline = Instant::now() + PATIENCE;
+    while !holds() {
+        assert!(Instant::now() < deadline, "{what}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
 }

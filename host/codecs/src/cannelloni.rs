@@ -173,6 +173,11 @@ impl Writer {
         self.bytes.is_empty()
     }
 
+    /// Frames that were added since the last datagram.
+    pub const fn count(&self) -> u16 {
+        self.count
+    }
+
     /// Whether another frame fits.
     pub const fn has_room(&self) -> bool {
         self.bytes.len() + FRAME_BYTES + HEADER <= MOST_BYTES

@@ -167,6 +167,11 @@ impl Board {
         }
     }
 
+    /// Frames of each channel were lost in front of a client of this process.
+    pub(crate) fn count_lost(&self, lost: [u64; CHANNELS]) {
+        self.shared.state().count_lost(lost);
+    }
+
     pub(crate) fn tell(&self, news: News) {
         self.shared.tell(news);
     }
@@ -213,6 +218,11 @@ impl Board {
     /// See [`Settings::idle_sender`].
     pub(crate) fn idle_sender(&self) -> Option<Duration> {
         self.shared.settings.idle_sender
+    }
+
+    /// Limit for records waiting for a slow client.
+    pub(crate) fn most_records(&self) -> usize {
+        self.shared.settings.most_records
     }
 
     /// Limit for clients at one listener.

@@ -11,19 +11,20 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use cantap::device::{Records, is_idle};
-use cantap::{Direction, TraceEvent};
+use cantap::device::is_idle;
+use cantap::{Direction, TraceEvent, TraceRecord};
 use cantap_codecs::cannelloni::{Item, NoDatagram, Order, Sequence, Writer, datagram, item};
 use cantap_wire::message::{Mode, Role};
 use cantap_wire::{Channel, Frame};
 
 use crate::connect::SOCKET_TIMEOUT;
+use crate::feed::{self, Feed, Losses, Source};
+use crate::left_out::{LOST, LeftOut};
 use crate::lines::device_of;
 use crate::listen::Listening;
 use crate::lock::lock;
 use crate::open_bus::OpenBus;
 use crate::own_frames::OwnFrames;
-use crate::pace::Pace;
 use crate::text::error_frame;
 use crate::{Board, News};
 
@@ -31,8 +32,8 @@ pub use cantap_codecs::cannelloni::PORT;
 
 /// Longest datagram that is read: what a network with large packets carries in one piece. With it, the frames of one are sent within seconds.
 const MOST_BYTES: usize = 9000;
-/// How long to wait for records before checking whether the tunnel is over.
-const WAIT: Duration = Duration::from_millis(20);
+/// Datagrams that came to the other computer, which said that nobody is there.
+const NOBODY: &str = "datagrams that nobody listened for";
 /// Time from a failure to the next try.
 const RETRY_AFTER: Duration = Duration::from_millis(500);
 
@@ -61,7 +62,12 @@ pub fn open(tunnel: Tunnel) -> io::Result<Listening> {
     let name = format!("cannelloni peer {peer}");
     let role = if is_local { role } else { Role::Listen };
     let mut end = End {
-        far: Arc::new(Far { socket, own: Mutex::default(), has_gap: AtomicBool::new(false) }),
+        far: Arc::new(Far {
+            socket,
+            own: Mutex::default(),
+            has_gap: AtomicBool::new(false),
+            left_out: Mutex::default(),
+        }),
         board,
         channel,
         name,
@@ -81,6 +87,7 @@ struct Far {
     own: Mutex<OwnFrames>,
     /// The tunnel was off the bus for a moment.
     has_gap: AtomicBool,
+    left_out: Mutex<LeftOut>,
 }
 
 /// This end of a tunnel.
@@ -138,8 +145,11 @@ impl End {
         }
         match self.far.socket.recv(&mut self.buffer) {
             Ok(len) => self.take(len),
+            Err(error) if is_idle(&error) => {}
             // Nobody listens at the other end yet.
-            Err(error) if is_idle(&error) || error.kind() == io::ErrorKind::ConnectionRefused => {}
+            Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => {
+                lock(&self.far.left_out).count(NOBODY, 1);
+            }
             Err(error) => return Err(error),
         }
         self.listen_again();
@@ -149,14 +159,18 @@ impl End {
     fn begin(&self) -> Result<Session, String> {
         let device = Arc::new(device_of(&self.board, &self.name, self.role)?);
         let config = device.open_channel(self.channel, None).map_err(|error| error.to_string())?;
-        let records = device.records();
+        let source = Source::new(&self.board, &device);
         let is_over = Arc::new(AtomicBool::new(false));
-        let (far, over, channel) = (Arc::clone(&self.far), Arc::clone(&is_over), self.channel);
+        let feed = TunnelFeed {
+            far: Arc::clone(&self.far),
+            board: Arc::clone(&self.board),
+            name: self.name.clone(),
+            channel: self.channel,
+            is_over: Arc::clone(&is_over),
+            writer: Writer::default(),
+        };
         let thread = std::thread::Builder::new().name("cantap-cannelloni-hears".to_owned());
-        let thread = thread.spawn(move || {
-            far.hear(records, channel, &over);
-            over.store(true, Ordering::Relaxed);
-        });
+        let thread = thread.spawn(move || feed.run(source));
         let thread = Some(thread.map_err(|error| error.to_string())?);
         let sends_in = (self.role >= Role::Send).then_some(Mode::Normal);
         let bus = OpenBus::new(device, self.channel, config, sends_in, self.board.idle_sender());
@@ -277,52 +291,94 @@ impl End {
     }
 }
 
-impl Far {
+/// What the far end receives in a session.
+struct TunnelFeed {
+    far: Arc<Far>,
+    board: Arc<Board>,
+    name: String,
+    channel: Channel,
+    is_over: Arc<AtomicBool>,
+    writer: Writer,
+}
+
+impl TunnelFeed {
     /// Sends it what is on the bus, until the session is over.
-    fn hear(&self, mut records: Records, channel: Channel, is_over: &AtomicBool) {
-        let mut writer = Writer::default();
-        let mut pace = Pace::default();
-        while !is_over.load(Ordering::Relaxed) {
-            let wait = if writer.is_empty() { WAIT } else { pace.left(Instant::now()) };
-            let Ok(Some(batch)) = records.next_batch(wait) else { return };
-            for record in batch.iter().filter(|record| record.channel == channel.number()) {
-                if self.has_gap.swap(false, Ordering::Relaxed) {
-                    self.put(&TraceEvent::GAP, &mut writer);
-                }
-                self.put(&record.event, &mut writer);
-            }
-            records.recycle(batch);
-            if !writer.is_empty() && pace.left(Instant::now()).is_zero() {
-                self.flush(&mut writer);
-                pace.has_written(Instant::now());
-            }
-        }
+    fn run(mut self, source: Source) {
+        let untold = feed::run(&mut [source], &mut self);
+        lock(&self.far.left_out).count(LOST, untold);
+        self.report_left_out(true);
+        self.is_over.store(true, Ordering::Relaxed);
     }
 
-    fn put(&self, event: &TraceEvent, writer: &mut Writer) {
-        if !writer.has_room() {
-            self.flush(writer);
+    fn report_left_out(&self, is_end: bool) {
+        lock(&self.far.left_out).report(is_end, &self.board, &self.name);
+    }
+
+    fn put(&mut self, event: &TraceEvent) {
+        if !self.writer.has_room() {
+            self.flush();
         }
         match event {
             TraceEvent::Frame { frame, direction, .. } => {
-                let Some(frame) = frame.classic() else { return };
-                if *direction != Direction::Tx || !lock(&self.own).take(frame) {
-                    writer.push(frame);
+                let Some(frame) = frame.classic() else {
+                    return lock(&self.far.left_out).count("CAN FD frames", 1);
+                };
+                if *direction != Direction::Tx || !lock(&self.far.own).take(frame) {
+                    self.writer.push(frame);
                 }
             }
             event => {
                 if let TraceEvent::TransmitFailed { tag, .. } = event {
-                    lock(&self.own).failed(*tag);
+                    lock(&self.far.own).failed(*tag);
                 }
                 if let Some((id, data)) = error_frame(event) {
-                    writer.push_error(id, data);
+                    self.writer.push_error(id, data);
                 }
             }
         }
     }
 
-    fn flush(&self, writer: &mut Writer) {
-        // Nobody may be listening at the other end, and UDP loses datagrams: their numbers show it.
-        let _ = writer.take().map(|bytes| self.socket.send(&bytes));
+    /// Sends a datagram. That UDP loses some, their numbers show to the other end; what this computer does not send is counted here, too.
+    fn flush(&mut self) {
+        let count = u64::from(self.writer.count());
+        let Some(bytes) = self.writer.take() else { return };
+        let sent = self.far.socket.send(&bytes).or_else(|error| match error.kind() {
+            // That is about an earlier datagram, and this one was not sent.
+            io::ErrorKind::ConnectionRefused => {
+                lock(&self.far.left_out).count(NOBODY, 1);
+                self.far.socket.send(&bytes)
+            }
+            _ => Err(error),
+        });
+        if sent.is_err() {
+            lock(&self.far.left_out).count("frames that could not be sent", count);
+        }
+    }
+}
+
+impl Feed for TunnelFeed {
+    fn is_over(&mut self) -> bool {
+        self.report_left_out(false);
+        self.is_over.load(Ordering::Relaxed)
+    }
+
+    fn take(&mut self, _: usize, records: &[TraceRecord]) -> Losses {
+        let channel = self.channel.number();
+        for record in records.iter().filter(|record| record.channel == channel) {
+            if self.far.has_gap.swap(false, Ordering::Relaxed) {
+                self.put(&TraceEvent::GAP);
+            }
+            self.put(&record.event);
+        }
+        Losses::ToldByWriting
+    }
+
+    fn is_empty(&self) -> bool {
+        self.writer.is_empty()
+    }
+
+    fn write(&mut self) -> io::Result<()> {
+        self.flush();
+        Ok(())
     }
 }

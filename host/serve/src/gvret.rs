@@ -3,33 +3,31 @@
 //! Frames come once the client has given its first command. A bus is only listened to until the client sends, as with socketcand. The protocol
 //! knows neither errors nor losses nor remote frames: they are counted, and the server says how many it left out.
 
-mod left_out;
-
 use std::io::{self, Read};
 use std::net::{SocketAddr, TcpStream};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
-use cantap::device::{Records, channel_number, is_idle, write_patiently};
+use cantap::device::{channel_number, is_idle, write_patiently};
 use cantap::{Device, DeviceError, Direction, TraceEvent, TraceRecord};
 use cantap_codecs::gvret::{Bus, Command, Message, command};
 use cantap_wire::message::{ChannelConfig, Mode, Role};
 use cantap_wire::{CHANNELS, Channel, Frame, Refusal};
 
+use crate::feed::{self, Feed, Losses, Source};
 use crate::foreign;
+use crate::left_out::{LOST, LeftOut};
 use crate::lines::device_of;
 use crate::listen::{Listening, accept, bind, patience};
 use crate::lock::lock;
 use crate::open_bus::OpenBus;
 use crate::own_frames::OwnFrames;
-use crate::pace::Pace;
 use crate::places::{GREETING_TIMEOUT, Place, Places, ends};
 use crate::text::now_ns;
 use crate::writer::took_nothing;
 use crate::{Board, News};
-use left_out::LeftOut;
 
 pub use cantap_codecs::gvret::PORT;
 
@@ -37,9 +35,6 @@ pub use cantap_codecs::gvret::PORT;
 const BUILD: u16 = 618;
 /// Boards whose channels have a place in the protocol's two bits for a bus.
 pub const MOST_BOARDS: usize = 2;
-/// How long to wait for records before checking whether the client is still there.
-const WAIT: Duration = Duration::from_millis(20);
-
 /// Admits clients. The buses are the channels of the first two boards. The protocol has no authentication: at an address that is not this
 /// machine's own (loopback), clients may only listen.
 pub fn listen(boards: &[Arc<Board>], address: SocketAddr, role: Role) -> io::Result<Listening> {
@@ -207,7 +202,7 @@ impl Connection {
     /// Opens every channel whose bit rate is known, to listen.
     fn begin(self: &Arc<Self>) -> Result<Session, String> {
         let mut session = Session { devices: Vec::new(), buses: Vec::new(), threads: Vec::new() };
-        let mut all = Vec::new();
+        let mut sources = Vec::new();
         for board in self.boards.iter() {
             let device = Arc::new(device_of(board, &self.name, self.role)?);
             let sends_in = (self.role >= Role::Send).then_some(Mode::Normal);
@@ -220,13 +215,13 @@ impl Connection {
                 };
                 session.buses.push(bus);
             }
-            all.push(device.records());
+            sources.push(Source::new(board, &device));
             session.devices.push(device);
         }
-        for (number, records) in all.into_iter().enumerate() {
-            let connection = Arc::clone(self);
+        for (board, source) in sources.into_iter().enumerate() {
+            let feed = BoardFeed { connection: Arc::clone(self), board, out: Vec::new() };
             let thread = std::thread::Builder::new().name("cantap-gvret-hears".to_owned());
-            let thread = thread.spawn(move || connection.hear(number, records));
+            let thread = thread.spawn(move || feed.run(source));
             session.threads.push(thread.map_err(|error| error.to_string())?);
         }
         Ok(session)
@@ -326,31 +321,6 @@ impl Connection {
         }
     }
 
-    /// Sends the client what is received, until either side ends.
-    fn hear(&self, board: usize, mut records: Records) {
-        let mut out = Vec::new();
-        let mut pace = Pace::default();
-        while !self.is_over() {
-            let wait = if out.is_empty() { WAIT } else { pace.left(Instant::now()) };
-            // The board or the server is gone, so the connection is, too.
-            let Ok(Some(batch)) = records.next_batch(wait) else { break };
-            for record in &batch {
-                self.put(board, record, &mut out);
-            }
-            records.recycle(batch);
-            self.report_left_out(false);
-            if out.is_empty() || !pace.left(Instant::now()).is_zero() {
-                continue;
-            }
-            if self.write(&out).is_err() {
-                break;
-            }
-            out.clear();
-            pace.has_written(Instant::now());
-        }
-        self.end();
-    }
-
     fn put(&self, board: usize, record: &TraceRecord, out: &mut Vec<u8>) {
         let Some(channel) = Channel::from_number(record.channel) else { return };
         let number = usize::from(channel_number(board, channel)) - 1;
@@ -376,9 +346,11 @@ impl Connection {
                 lock(&self.left_out).count("that losses are not counted", 1);
             }
             TraceEvent::Lost { count, .. } => {
-                lock(&self.left_out).count("lost frames, or more", (*count).max(1));
+                lock(&self.left_out).count(LOST, (*count).max(1).into());
             }
-            TraceEvent::ErrorsSuppressed { count } => lock(&self.left_out).count("bus errors", *count),
+            TraceEvent::ErrorsSuppressed { count } => {
+                lock(&self.left_out).count("bus errors", (*count).into())
+            }
             TraceEvent::BusError { .. } => lock(&self.left_out).count("bus errors", 1),
             TraceEvent::State { .. } => lock(&self.left_out).count("changes of state", 1),
         }
@@ -390,9 +362,7 @@ impl Connection {
     }
 
     fn report_left_out(&self, is_end: bool) {
-        if let Some(what) = lock(&self.left_out).report(is_end) {
-            self.boards[0].tell(News::LeftOut { client: self.name.clone(), what });
-        }
+        lock(&self.left_out).report(is_end, &self.boards[0], &self.name);
     }
 
     fn write(&self, bytes: &[u8]) -> io::Result<()> {
@@ -416,6 +386,46 @@ impl Connection {
     /// A command was not carried out, for which the protocol has no answer.
     fn not_done(&self, reason: String) {
         self.boards[0].tell(News::NotDone { client: self.name.clone(), reason });
+    }
+}
+
+/// What a client receives of one board.
+struct BoardFeed {
+    connection: Arc<Connection>,
+    board: usize,
+    out: Vec<u8>,
+}
+
+impl BoardFeed {
+    /// Sends the client what is received, until either side ends.
+    fn run(mut self, source: Source) {
+        let untold = feed::run(&mut [source], &mut self);
+        lock(&self.connection.left_out).count(LOST, untold);
+        self.connection.end();
+    }
+}
+
+impl Feed for BoardFeed {
+    fn is_over(&mut self) -> bool {
+        self.connection.report_left_out(false);
+        self.connection.is_over()
+    }
+
+    fn take(&mut self, _: usize, records: &[TraceRecord]) -> Losses {
+        for record in records {
+            self.connection.put(self.board, record, &mut self.out);
+        }
+        Losses::LeftOut
+    }
+
+    fn is_empty(&self) -> bool {
+        self.out.is_empty()
+    }
+
+    fn write(&mut self) -> io::Result<()> {
+        self.connection.write(&self.out)?;
+        self.out.clear();
+        Ok(())
     }
 }
 

@@ -13,11 +13,13 @@ mod board_figures;
 pub mod cannelloni;
 mod client;
 pub mod connect;
+mod feed;
 mod flow;
 mod foreign;
 pub mod gvret;
 #[cfg(unix)]
 mod inherited;
+mod left_out;
 pub mod lines;
 pub mod listen;
 mod lock;

@@ -4,24 +4,22 @@ use std::io;
 use std::net::SocketAddr;
 use std::net::TcpStream;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 
-use cantap::Device;
-use cantap::device::{Records, channel_number, is_idle, write_patiently};
+use cantap::device::{channel_number, is_idle, write_patiently};
+use cantap::{Device, TraceRecord};
 use cantap_wire::message::Role;
 use cantap_wire::{Channel, Refusal};
 
+use crate::feed::{self, Feed, Losses, Source};
 use crate::foreign;
+use crate::left_out::{LOST, LeftOut};
 use crate::listen::{Listening, accept, bind_loopback, turn_away};
-use crate::pace::Pace;
 use crate::places::{Places, ends};
 use crate::writer::PATIENCE;
 use crate::{Board, News};
 
 /// Limit for records waiting for one client, in addition to those in the server's queue.
-pub(crate) const HELD_RECORDS: usize = 1 << 16;
-/// How long to wait for records before checking the other board's.
-const WAIT: Duration = Duration::from_millis(10);
+const HELD_RECORDS: usize = 1 << 16;
 
 /// Admits clients at an address of this machine (loopback). They receive every channel of the boards whose bit rate is known, with
 /// consecutive numbers as everywhere.
@@ -55,16 +53,17 @@ pub fn listen(boards: &[Arc<Board>], address: SocketAddr) -> io::Result<Listenin
 /// A device for a board of this process, for a client that has its place at a listener.
 pub(crate) fn device_of(board: &Board, name: &str, role: Role) -> Result<Device, String> {
     let link = board.link_placed(name, role).map_err(|refused| refused.to_string())?;
-    Device::over_holding(link, name, HELD_RECORDS).map_err(|error| error.to_string())
+    Device::over_holding(link, name, HELD_RECORDS.min(board.most_records()))
+        .map_err(|error| error.to_string())
 }
 
-fn serve(boards: &[Arc<Board>], mut stream: TcpStream, name: &str) -> Result<(), String> {
+fn serve(boards: &[Arc<Board>], stream: TcpStream, name: &str) -> Result<(), String> {
     if is_over(&stream)? {
         return Ok(());
     }
-    let mut heard: Vec<(usize, Device, Records)> = Vec::new();
-    for (number, board) in boards.iter().enumerate() {
-        let device = device_of(board, name, Role::Listen)?;
+    let mut sources = Vec::new();
+    for board in boards {
+        let device = Arc::new(device_of(board, name, Role::Listen)?);
         for channel in Channel::ALL {
             match device.open_channel(channel, None) {
                 // The bit rate of its bus is unknown.
@@ -72,32 +71,54 @@ fn serve(boards: &[Arc<Board>], mut stream: TcpStream, name: &str) -> Result<(),
                 Err(error) => return Err(error.to_string()),
             }
         }
-        let records = device.records();
-        heard.push((number, device, records));
+        sources.push(Source::new(board, &device));
     }
-    let mut out = String::new();
-    let mut pace = Pace::default();
-    loop {
-        for (number, _, records) in &mut heard {
-            let wait = if out.is_empty() { WAIT } else { pace.left(Instant::now()) };
-            // The board or the server is gone, so the connection is, too.
-            let Ok(Some(batch)) = records.next_batch(wait) else { return Ok(()) };
-            for record in &batch {
-                let Some(channel) = Channel::from_number(record.channel) else { continue };
-                crate::text::put_line(&mut out, channel_number(*number, channel), record);
-            }
+    let mut lines = Lines { stream, out: String::new(), stranger: None };
+    let untold = feed::run(&mut sources, &mut lines);
+    if let Some(reason) = lines.stranger {
+        return Err(reason);
+    }
+    let mut left_out = LeftOut::default();
+    left_out.count(LOST, untold);
+    left_out.report(true, &boards[0], name);
+    Ok(())
+}
+
+/// A client's lines.
+struct Lines {
+    stream: TcpStream,
+    out: String,
+    /// What it speaks instead of nothing.
+    stranger: Option<String>,
+}
+
+impl Feed for Lines {
+    fn is_over(&mut self) -> bool {
+        if !self.out.is_empty() {
+            return false;
         }
-        if out.is_empty() && is_over(&stream)? {
-            return Ok(());
+        is_over(&self.stream).unwrap_or_else(|reason| {
+            self.stranger = Some(reason);
+            true
+        })
+    }
+
+    fn take(&mut self, source: usize, records: &[TraceRecord]) -> Losses {
+        for record in records {
+            let Some(channel) = Channel::from_number(record.channel) else { continue };
+            crate::text::put_line(&mut self.out, channel_number(source, channel), record);
         }
-        if out.is_empty() || !pace.left(Instant::now()).is_zero() {
-            continue;
-        }
-        if write_patiently(&mut stream, out.as_bytes(), PATIENCE).is_err() {
-            return Ok(());
-        }
-        out.clear();
-        pace.has_written(Instant::now());
+        Losses::ToldByWriting
+    }
+
+    fn is_empty(&self) -> bool {
+        self.out.is_empty()
+    }
+
+    fn write(&mut self) -> io::Result<()> {
+        write_patiently(&mut self.stream, self.out.as_bytes(), PATIENCE)?;
+        self.out.clear();
+        Ok(())
     }
 }
 

@@ -62,7 +62,7 @@ pub enum News {
         /// What, and why.
         reason: String,
     },
-    /// A client was not told of what happened, because its protocol has no message for it.
+    /// A client was not told of what happened: because its protocol has no message for it, or because it was too slow, or gone.
     LeftOut {
         /// Its name.
         client: String,
@@ -164,7 +164,7 @@ impl fmt::Display for News {
                 write!(f, "{client} was refused: {reason}")
             }
             Self::LeftOut { client, what } => {
-                write!(f, "{client} was not told of {what}: its protocol has no message for them")
+                write!(f, "{client} was not told of {what}")
             }
             Self::Idle { client, channel, after } => write!(
                 f,

@@ -192,6 +192,13 @@ impl State {
         totals
     }
 
+    /// Frames of each channel were lost in front of a client that is fed from its own queue.
+    pub fn count_lost(&mut self, lost: [u64; CHANNELS]) {
+        for (of, lost) in self.totals.iter_mut().zip(lost) {
+            of.lost_host += lost;
+        }
+    }
+
     /// Removes a client.
     pub fn remove(&mut self, client: ClientId) {
         if let Some(member) = self.clients.remove(&client) {

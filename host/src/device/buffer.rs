@@ -28,6 +28,8 @@ struct State {
     spares: Vec<Vec<TraceRecord>>,
     /// Frames lost here that no record reports yet.
     unreported: [u32; CHANNELS],
+    /// All frames lost here.
+    lost: [u64; CHANNELS],
     /// Time of the last record that was dropped.
     lost_at_ns: i64,
     end: Option<End>,
@@ -48,6 +50,7 @@ impl Buffer {
             records: 0,
             spares: Vec::new(),
             unreported: [0; CHANNELS],
+            lost: [0; CHANNELS],
             lost_at_ns: 0,
             end: None,
         };
@@ -86,6 +89,9 @@ impl Buffer {
             });
             for (sum, lost) in state.unreported.iter_mut().zip(lost) {
                 *sum = sum.wrapping_add(lost);
+            }
+            for (sum, lost) in state.lost.iter_mut().zip(lost) {
+                *sum += u64::from(lost);
             }
         }
         let mut next = state.spares.pop().unwrap_or_default();
@@ -127,6 +133,11 @@ impl Buffer {
         }
         drop(state);
         self.changed.notify_all();
+    }
+
+    /// Frames of each channel that found no room here so far.
+    pub fn lost(&self) -> [u64; CHANNELS] {
+        self.lock().lost
     }
 
     /// Whether the stream has ended.

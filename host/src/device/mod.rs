@@ -363,6 +363,12 @@ impl Records {
         if rest.is_empty() { self.shared.buffer.pop(Some(timeout)) } else { Ok(Some(rest)) }
     }
 
+    /// Frames of each channel that found no room here, because they were not taken fast enough. They are among the device's losses at the
+    /// stage `host`.
+    pub fn lost(&self) -> [u64; CHANNELS] {
+        self.shared.buffer.lost()
+    }
+
     /// Takes back the memory of a batch. Optional, but faster.
     pub fn recycle(&self, batch: Vec<TraceRecord>) {
         self.shared.buffer.recycle(batch);

@@ -126,7 +126,8 @@ impl Hearing {
         }
     }
 
-    fn tells_errors(&self) -> bool {
+    /// Whether the client is told of errors and losses.
+    pub fn tells_errors(&self) -> bool {
         self.has_chosen && self.hears != Hears::Nothing
     }
 

@@ -5,9 +5,11 @@
 //! bus is only listened to until a client that may send does so; its frames are then passed on to the others, but not to itself. Frames
 //! sent repeatedly (`add`) are sent by the board, timed by its own clock.
 
+mod bus_feed;
 mod command;
 mod hearing;
 mod messages;
+mod opened;
 mod subscriptions;
 
 use std::collections::HashMap;
@@ -17,11 +19,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use cantap::Device;
 use cantap::device::{channel_number, is_idle, write_patiently};
 use cantap_trace::Interface;
-use cantap_wire::message::{Mode, Periodic, Role};
-use cantap_wire::{Channel, Frame, Id};
+use cantap_wire::message::{Mode, Role};
+use cantap_wire::{Channel, Id};
 
 use crate::beacon::{self, Beacon};
 use crate::foreign;
@@ -29,12 +30,13 @@ use crate::lines::device_of;
 use crate::listen::{Listening, accept, bind, patience};
 use crate::lock::lock;
 use crate::open_bus::OpenBus;
-use crate::pace::Pace;
 use crate::places::{Place, Places, ends};
 use crate::writer::took_nothing;
 use crate::{Board, News};
+use bus_feed::BusFeed;
 use command::{BadCommand, Command, Finder};
 use hearing::{Hearing, Hears};
+use opened::Opened;
 use subscriptions::{MOST, Wanted};
 
 /// The port of the original server.
@@ -43,15 +45,8 @@ pub const PORT: u16 = 29_536;
 const BETWEEN_ANSWERS: Duration = Duration::from_millis(20);
 /// For the same reason, no frame right after the answer to `rawmode`.
 const BEFORE_FRAMES: Duration = Duration::from_millis(100);
-/// SavvyCAN reconnects after ten seconds without receiving anything, which loses what is on the bus meanwhile.
-const KEEP_ALIVE_EVERY: Duration = Duration::from_secs(7);
-/// What is then sent to the client: the protocol's own word for "still here". SavvyCAN and Kayak ignore it; so does python-can, with
-/// a warning in its log. No client identifies itself, and a frame that SavvyCAN misses is worse than a warning.
-const KEEP_ALIVE: &str = "< echo >";
 /// A client that has not opened a bus by this time is dropped.
 const OPEN_TIMEOUT: Duration = Duration::from_secs(30);
-/// How long to wait for records before checking whether the client is still there.
-const WAIT: Duration = Duration::from_millis(20);
 /// Limit for connections at a time, including those that have not opened a bus.
 const MOST_CONNECTIONS: usize = 32;
 
@@ -139,13 +134,6 @@ struct Setup {
     bitrates_bps: HashMap<String, u32>,
     listen_only: bool,
     loopback: bool,
-}
-
-/// An open bus.
-struct Opened {
-    bus: OpenBus,
-    /// Frames sent repeatedly, by entry.
-    periodic: HashMap<Id, (u8, u64)>,
 }
 
 impl Connection {
@@ -409,52 +397,12 @@ impl Connection {
             (false, false) => Some(Mode::Normal),
         };
         let device = Arc::new(device);
-        let (connection, heard) = (Arc::clone(self), Arc::clone(&device));
+        let feed = BusFeed::new(self, &bus.board, &device);
         std::thread::Builder::new()
             .name("cantap-socketcand-hears".to_owned())
-            .spawn(move || connection.hear(&heard))
+            .spawn(move || feed.run())
             .map_err(|error| error.to_string())?;
-        let bus = OpenBus::new(device, channel, config, sends_in, bus.board.idle_sender());
-        Ok(Opened { bus, periodic: HashMap::new() })
-    }
-
-    /// Sends the client what is received, until either side ends.
-    fn hear(&self, device: &Device) {
-        let mut records = device.records();
-        let mut out = String::new();
-        let mut pace = Pace::default();
-        while !self.is_over.load(Ordering::Relaxed) {
-            let wait = if out.is_empty() { WAIT } else { pace.left(Instant::now()) };
-            // The board or the server is gone, so the connection is, too.
-            let Ok(Some(batch)) = records.next_batch(wait) else { break };
-            loop {
-                let mut hearing = lock(&self.hearing);
-                let Some(wait) = hearing.wait() else {
-                    hearing.take(&batch, &mut out);
-                    break;
-                };
-                drop(hearing);
-                std::thread::sleep(wait);
-            }
-            records.recycle(batch);
-            if out.is_empty() && self.needs_keep_alive() {
-                out.push_str(KEEP_ALIVE);
-            }
-            if out.is_empty() || !pace.left(Instant::now()).is_zero() {
-                continue;
-            }
-            if self.write(&out).is_err() {
-                break;
-            }
-            out.clear();
-            pace.has_written(Instant::now());
-        }
-        self.is_over.store(true, Ordering::Relaxed);
-    }
-
-    /// Whether nothing has been sent for too long to a client that reads only frames.
-    fn needs_keep_alive(&self) -> bool {
-        lock(&self.told_at).elapsed() >= KEEP_ALIVE_EVERY && lock(&self.hearing).hears == Hears::All
+        Ok(Opened::new(OpenBus::new(device, channel, config, sends_in, bus.board.idle_sender())))
     }
 
     fn subscribe(&self, id: Id, wanted: Wanted, interval_us: u64) -> Result<(), String> {
@@ -463,60 +411,6 @@ impl Connection {
         } else {
             Err(format!("{MOST} identifiers are subscribed to, which is the most"))
         }
-    }
-
-    /// The client has missed what was on the bus for a moment.
-    fn missed(&self) {
-        lock(&self.hearing).has_gap = true;
-    }
-
-    /// Only listens again, if nothing is sent any more.
-    fn listen_again(&self, opened: &mut Opened) -> Result<(), String> {
-        if !opened.periodic.is_empty() {
-            return Ok(());
-        }
-        if let Some(after) = opened.bus.listen_again(|| self.missed())? {
-            let (client, channel) = (self.name.clone(), opened.bus.channel);
-            self.buses[0].board.tell(News::Idle { client, channel, after });
-        }
-        Ok(())
-    }
-
-    fn send(&self, bus: &mut OpenBus, frame: Frame) -> Result<(), String> {
-        bus.may_send(|| self.missed())?;
-        let tag = bus.next_tag();
-        lock(&self.hearing).own.sends(tag, frame);
-        bus.send(tag, frame).inspect_err(|_| lock(&self.hearing).own.failed(tag))
-    }
-
-    /// Has the board send a frame repeatedly; one with the same identifier is replaced.
-    fn add(&self, opened: &mut Opened, us: u64, frame: Frame) -> Result<(), String> {
-        let Opened { bus, periodic } = opened;
-        bus.may_send(|| self.missed())?;
-        let hello = bus.device.hello();
-        let ticks = u128::from(us) * u128::from(hello.tick_hz) / 1_000_000;
-        let period_ticks = u32::try_from(ticks).map_err(|_| {
-            format!(
-                "the board's longest period is {} s",
-                u64::from(u32::MAX) / u64::from(hello.tick_hz.max(1))
-            )
-        })?;
-        let slot = match periodic.get(&frame.id()) {
-            Some((slot, _)) => *slot,
-            None => (0..hello.periodic_slots)
-                .find(|slot| periodic.values().all(|(taken, _)| taken != slot))
-                .ok_or_else(|| {
-                    format!("the board sends at most {} frames periodically", hello.periodic_slots)
-                })?,
-        };
-        let entry = Periodic { frame, period_ticks, count: 0, modifiers: heapless::Vec::new() };
-        let before = lock(&self.hearing).own.repeats(frame.id(), Some(frame));
-        if let Err(error) = bus.device.set_periodic(bus.channel, slot, Some(entry)) {
-            lock(&self.hearing).own.repeats(frame.id(), before);
-            return Err(error.to_string());
-        }
-        periodic.insert(frame.id(), (slot, us));
-        Ok(())
     }
 }
 

@@ -10,8 +10,10 @@ use cantap::{Channel, Device, TraceEvent};
 use cantap_codecs::cannelloni::{Item, Writer, datagram, item};
 use cantap_serve::cannelloni::{self, Tunnel};
 use cantap_serve::listen::Listening;
-use cantap_serve::{Board, News, Settings};
+use cantap_serve::{Board, News, Settings, metrics};
+use cantap_testing::process::wait_until;
 
+use crate::metrics::scrape;
 use crate::strangers::{BITRATE_BPS, any_port, board_at, client};
 
 struct Far {
@@ -22,6 +24,7 @@ struct Far {
 }
 
 fn tunnel(role: Role) -> Far {
+    let of_bus = format!("cantap_bitrate_bps{{board=\"board\",channel=\"2\"}} {BITRATE_BPS}");
     let (board, told) = board_at(Settings::at(BITRATE_BPS));
     let peer = UdpSocket::bind("127.0.0.1:0").unwrap();
     peer.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
@@ -35,7 +38,9 @@ fn tunnel(role: Role) -> Far {
     let tunnel = tunnel.unwrap();
     peer.connect(tunnel.address().unwrap()).unwrap();
     let far = Far { board, told, tunnel, peer };
-    far.tells("is in and may");
+    // From then on, it has what is on the bus.
+    let figures = metrics::listen(std::slice::from_ref(&far.board), any_port()).unwrap();
+    wait_until("the tunnel has no bus", || scrape(&figures).contains(&of_bus));
     far
 }
 
@@ -231,4 +236,22 @@ fn addresses_of_the_network_only_listen() {
         // Without any network there is no way there.
         Err(error) => assert_eq!(error.kind(), std::io::ErrorKind::NetworkUnreachable),
     }
+}
+
+/// Nothing shows it but an answer of the other computer, which UDP's senders seldom look at.
+#[test]
+fn datagrams_that_nobody_listened_for_are_counted() {
+    let far = tunnel(Role::Listen);
+    let device = on_the_bus(&far.board);
+    // The port is free from now on.
+    let Far { board, told, tunnel, peer } = far;
+    drop(peer);
+    for _ in 0..5 {
+        send(&device, "123#11");
+        std::thread::sleep(Duration::from_millis(30));
+    }
+    drop(tunnel);
+    let is_it = |news: News| matches!(&news, News::LeftOut { what, .. } if what.contains("datagrams that nobody listened for"));
+    assert!(told.iter().any(is_it));
+    drop((device, board));
 }

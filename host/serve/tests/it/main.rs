@@ -11,6 +11,7 @@ mod metrics;
 mod permissions;
 mod reconnects;
 mod sharing;
+mod slow_clients;
 mod slow_line;
 mod socketcand;
 mod strangers;

@@ -21,14 +21,14 @@ fn ask(server: &Listening, request: &str) -> String {
     String::from_utf8(answer).unwrap()
 }
 
-fn scrape(server: &Listening) -> String {
+pub fn scrape(server: &Listening) -> String {
     let host = server.address().unwrap();
     let answer = ask(server, &format!("GET /metrics HTTP/1.1\r\nHost: {host}\r\n\r\n"));
     assert!(answer.starts_with("HTTP/1.1 200 OK\r\n"), "{answer}");
     answer
 }
 
-fn figure(text: &str, name: &str) -> u64 {
+pub fn figure(text: &str, name: &str) -> u64 {
     let line = text.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' '));
     line.unwrap_or_else(|| panic!("{name} in {text}")).parse().unwrap()
 }

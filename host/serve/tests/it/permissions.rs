@@ -223,3 +223,58 @@ fn the_record_has_who_did_what() {
     let sent = events.iter().filter(|event| event["event"] == "sent");
     assert_eq!(sent.filter_map(|event| event["frames"].as_u64()).sum::<u64>(), 5);
 }
+
+/// A pipe to which nobody writes would keep the server waiting, at its start and at each hang-up.
+#[cfg(unix)]
+#[test]
+fn files_that_never_end_are_refused_by_every_option() {
+    let folder = tempfile::tempdir().unwrap();
+    let files = Keys::in_folder(folder.path()).unwrap().add_server(&["localhost".to_owned()]).unwrap();
+    let pipe = folder.path().join("pipe");
+    assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    for bad in [pipe.as_path(), Path::new("/dev/zero")] {
+        let server =
+            |files: Files, revoked| Server::new(&files, revoked).err().map(|error| error.to_string());
+        let at = |path: &Path| path.to_owned();
+        let reasons = [
+            Permissions::read(bad).err().map(|error| error.to_string()),
+            Audit::open(bad, |_| {}).err().map(|error| error.to_string()),
+            server(Files { certificate: at(bad), ..files.clone() }, None),
+            server(Files { authority: at(bad), ..files.clone() }, None),
+            server(files.clone(), Some(bad)),
+        ];
+        for reason in reasons {
+            assert!(
+                reason.as_ref().is_some_and(|reason| reason.contains("give a regular file")),
+                "{reason:?}"
+            );
+        }
+    }
+    let reason = Server::new(&Files { key: pipe, ..files }, None).err().map(|error| error.to_string());
+    assert!(
+        reason.as_ref().is_some_and(|reason| reason.contains("regular file") || reason.contains("chmod")),
+        "{reason:?}"
+    );
+}
+
+/// Programs close both channels to be sure; the record is of what they had.
+#[test]
+fn a_channel_that_was_never_open_is_not_recorded_as_closed() {
+    let (board, _told) = board_at(Settings::at(BITRATE_BPS));
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("audit");
+    let audit = Arc::new(Audit::open(&path, |trouble| panic!("{trouble}")).unwrap());
+    board.record_to(Arc::clone(&audit));
+    let device = Device::over(board.link("client", Role::Listen).unwrap(), "client").unwrap();
+    device.listen(Channel::Can1, BITRATE_BPS).unwrap();
+    for channel in Channel::ALL {
+        let _ = device.close_channel(channel);
+        let _ = device.request(cantap::wire::Command::Close { channel });
+    }
+    drop(device);
+    cantap_testing::process::wait_until("the client is still there", || board.clients() == 0);
+    audit.finish();
+    let text = std::fs::read_to_string(&path).unwrap();
+    let closed: Vec<&str> = text.lines().filter(|line| line.contains("\"event\":\"closed\"")).collect();
+    assert!(closed.len() == 1 && closed[0].contains("\"channel\":1"), "{text}");
+}

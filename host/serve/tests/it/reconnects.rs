@@ -4,23 +4,15 @@
 use std::io::Write;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::time::{Duration, Instant};
 
 use cantap::Channel;
 use cantap::device::{Device, Link, encode};
 use cantap::wire::message::Role;
 use cantap::wire::{Command, PROTOCOL_VERSION, Request};
 use cantap_serve::{Board, Settings, connect, listen};
+use cantap_testing::process::wait_until;
 
 const BITRATE_BPS: u32 = 500_000;
-
-fn wait_until(what: &str, mut holds: impl FnMut() -> bool) {
-    let deadline = Instant::now() + Duration::from_secs(10);
-    while !holds() {
-        assert!(Instant::now() < deadline, "{what}");
-        std::thread::sleep(Duration::from_millis(5));
-    }
-}
 
 /// Tasks and open files of this process.
 fn held() -> [usize; 2] {

@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 use std::sync::mpsc::{Receiver, channel};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use cantap::device::{Device, Link};
 use cantap::wire::message::{
@@ -12,11 +12,12 @@ use cantap::wire::message::{
 use cantap::wire::{Command, Frame, Refusal};
 use cantap::{Channel, DeviceError, Direction, TraceEvent, TraceRecord};
 use cantap_serve::{Board, News, Settings};
+use cantap_testing::process::wait_until;
 
 const BITRATE_BPS: u32 = 500_000;
 const FAST_BPS: u32 = 1_000_000;
 
-fn board_at(options: &str, settings: Settings) -> (Board, Receiver<News>) {
+pub fn board_at(options: &str, settings: Settings) -> (Board, Receiver<News>) {
     let options: cantap_virtual::Options = options.parse().unwrap();
     let connect = Box::new(move |_: Option<&str>| Ok(cantap_virtual::start(options.clone())?.into_link()));
     let (news, told) = channel();
@@ -51,14 +52,6 @@ fn refusal<T: std::fmt::Debug>(result: Result<T, DeviceError>) -> Refusal {
 
 fn normal(device: &Device) -> ChannelConfig {
     ChannelConfig { mode: Mode::Normal, ..ChannelConfig::listen_only(device.timing(BITRATE_BPS).unwrap()) }
-}
-
-fn wait_until(what: &str, mut holds: impl FnMut() -> bool) {
-    let deadline = Instant::now() + Duration::from_secs(5);
-    while !holds() {
-        assert!(Instant::now() < deadline, "{what}");
-        std::thread::sleep(Duration::from_millis(5));
-    }
 }
 
 /// The board's time of each record is the same for all clients, to the tick; UTC is each client's own.

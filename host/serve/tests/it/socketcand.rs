@@ -5,6 +5,7 @@
 //! `CANTAP_REQUIRE_PEERS=1`.
 
 use cantap_testing::peers;
+use cantap_testing::process::wait_until;
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -220,11 +221,7 @@ fn lines_are_a_candump_log_of_all_channels() {
     }
     assert!(whole.contains(" can0 ") && whole.contains(" can1 "));
     drop(stream);
-    let deadline = Instant::now() + Duration::from_secs(5);
-    while board.clients() > 0 {
-        assert!(Instant::now() < deadline, "its place is not free");
-        std::thread::sleep(Duration::from_millis(20));
-    }
+    wait_until("its place is not free", || board.clients() == 0);
 }
 
 /// The protocol page's own texts, in order: `>` is the client's, `<` the server's, where a time is written as T, and `!` what

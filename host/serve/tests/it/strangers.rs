@@ -5,7 +5,7 @@ use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use cantap::device::encode;
 use cantap::wire::message::{ChannelConfig, Mode, Periodic, Role, TxFrame};
@@ -13,6 +13,7 @@ use cantap::wire::{BitTiming, Command, PROTOCOL_VERSION, Refusal, Reply, Request
 use cantap::{Channel, Device, DeviceError, Direction, TraceEvent};
 use cantap_serve::listen::{self, Listening};
 use cantap_serve::{Board, News, Settings, connect, lines, socketcand};
+use cantap_testing::process::wait_until;
 
 pub const BITRATE_BPS: u32 = 500_000;
 
@@ -54,14 +55,6 @@ fn all_from(mut stream: TcpStream) -> Vec<u8> {
     // Ended or cut off.
     let _ = stream.read_to_end(&mut heard);
     heard
-}
-
-fn wait_until(what: &str, mut holds: impl FnMut() -> bool) {
-    let deadline = Instant::now() + Duration::from_secs(20);
-    while !holds() {
-        assert!(Instant::now() < deadline, "{what}");
-        std::thread::sleep(Duration::from_millis(10));
-    }
 }
 
 /// A greeting, and requests to open a channel for sending and to send, as a web page would put them into a request's body.

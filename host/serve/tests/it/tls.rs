@@ -15,6 +15,7 @@ use cantap::{Channel, Device, DeviceError};
 use cantap_serve::listen::Listening;
 use cantap_serve::tls::{self, Files, Keys};
 use cantap_serve::{Board, Settings};
+use cantap_testing::process::wait_until;
 use rcgen::{
     CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, Issuer, KeyPair, date_time_ymd,
 };
@@ -191,7 +192,7 @@ fn certificates_that_are_expired_not_valid_yet_or_name_no_role_let_nobody_in() {
         (client("other-role", &["root.role.cantap.invalid"], NOW), "says nothing of what it may do"),
     ] {
         let refused = served.connect("localhost", &files).err().expect("it is refused");
-        wait_until(|| {
+        wait_until("it did not come to be", || {
             let said = served.said.lock().unwrap().join("\n");
             said.contains("was not let in") && said.contains(part)
         });
@@ -211,14 +212,6 @@ fn certificates_that_are_expired_not_valid_yet_or_name_no_role_let_nobody_in() {
         let address = format!("localhost:{}", listening.address().unwrap().port());
         let good = Keys::files(folder.path(), "good");
         assert!(tls::connect(&address, &good).is_err(), "{years:?}");
-    }
-}
-
-fn wait_until(mut holds: impl FnMut() -> bool) {
-    let deadline = Instant::now() + Duration::from_secs(10);
-    while !holds() {
-        assert!(Instant::now() < deadline, "it did not come to be");
-        std::thread::sleep(Duration::from_millis(10));
     }
 }
 
@@ -249,7 +242,7 @@ fn half_open_peers_are_let_go_and_the_others_are_served_meanwhile() {
     let started = Instant::now();
     // Completes the handshake, then sends nothing.
     let mute = tls::connect(&format!("localhost:{}", address.port()), &good).unwrap();
-    wait_until(|| served.board.clients() == 1);
+    wait_until("the half-open ones are still there", || served.board.clients() == 1);
     let device = served.connect("localhost", &good).unwrap();
     device.listen(Channel::Can1, BITRATE_BPS).unwrap();
     for stream in [&mut silent, &mut slow] {

@@ -349,7 +349,7 @@ impl Connection {
                 lock(&self.left_out).count(LOST, (*count).max(1).into());
             }
             TraceEvent::ErrorsSuppressed { count } => {
-                lock(&self.left_out).count("bus errors", (*count).into())
+                lock(&self.left_out).count("bus errors", (*count).into());
             }
             TraceEvent::BusError { .. } => lock(&self.left_out).count("bus errors", 1),
             TraceEvent::State { .. } => lock(&self.left_out).count("changes of state", 1),

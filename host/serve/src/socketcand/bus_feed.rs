@@ -24,11 +24,11 @@ const KEEP_ALIVE: &str = "< echo >";
 pub struct BusFeed {
     connection: Arc<Connection>,
     source: Source,
-    out: Out,
+    out: Outgoing,
 }
 
 /// What is written to it.
-struct Out {
+struct Outgoing {
     connection: Arc<Connection>,
     text: String,
     left_out: LeftOut,
@@ -36,8 +36,11 @@ struct Out {
 
 impl BusFeed {
     pub fn new(connection: &Arc<Connection>, board: &Arc<Board>, device: &Arc<Device>) -> Self {
-        let out =
-            Out { connection: Arc::clone(connection), text: String::new(), left_out: LeftOut::default() };
+        let out = Outgoing {
+            connection: Arc::clone(connection),
+            text: String::new(),
+            left_out: LeftOut::default(),
+        };
         Self { connection: Arc::clone(connection), source: Source::new(board, device), out }
     }
 
@@ -51,7 +54,7 @@ impl BusFeed {
     }
 }
 
-impl Out {
+impl Outgoing {
     fn report_left_out(&mut self, is_end: bool) {
         let Self { connection, left_out, .. } = self;
         left_out.report(is_end, &connection.buses[0].board, &connection.name);
@@ -65,7 +68,7 @@ impl Out {
     }
 }
 
-impl Feed for Out {
+impl Feed for Outgoing {
     fn is_over(&mut self) -> bool {
         self.report_left_out(false);
         self.connection.is_over.load(Ordering::Relaxed)

@@ -172,6 +172,11 @@ impl From<EncodeError> for Error {
 impl From<Error> for PyErr {
     fn from(error: Error) -> Self {
         match error {
+            // An object of Python that was read as a file raised it.
+            Error::Io(error, _) if error.get_ref().is_some_and(|inner| inner.is::<PyErr>()) => {
+                let inner = error.into_inner().and_then(|inner| inner.downcast::<PyErr>().ok());
+                inner.map_or_else(|| PyOSError::new_err("a file object could not be read"), |error| *error)
+            }
             // With number and name it becomes FileNotFoundError, PermissionError and so on.
             Error::Io(error, file) => match error.raw_os_error() {
                 Some(number) => {

@@ -35,9 +35,54 @@ pub struct Counts {
     /// All channels in the file, before any filter.
     #[serde(default)]
     pub channels: Channels,
+    /// What the file says about its measurement.
+    #[serde(default)]
+    pub properties: BTreeMap<String, String>,
+    /// If there were several files: how many, and the counts of each.
+    #[serde(default)]
+    pub files: Vec<Counts>,
 }
 
 impl Counts {
+    /// Of a file of which nothing was read yet.
+    pub fn of(file: String, reader: &TraceReader) -> Self {
+        Self { file, format: reader.format().to_string(), ..Self::default() }
+    }
+
+    /// Of several files: those that were read, and the last one. One alone stays as it is.
+    pub fn joined(before: &[Self], last: &Self) -> Self {
+        let Some(first) = before.first() else { return last.clone() };
+        let mut all = Self { is_whole: true, ..Self::default() };
+        for part in before.iter().chain([last]) {
+            all.records_read += part.records_read;
+            all.records += part.records;
+            all.frames += part.frames;
+            all.lost += part.lost;
+            all.lost_at_least |= part.lost_at_least;
+            all.bus_errors += part.bus_errors;
+            all.decoded += part.decoded;
+            all.values += part.values;
+            all.issues += part.issues;
+            all.is_cut |= part.is_cut;
+            all.is_whole &= part.is_whole;
+            let room = FAULTS_KEPT - all.faults.len();
+            all.faults.extend(part.faults.iter().take(room).cloned());
+            for (sum, counts) in [(&mut all.left_out, &part.left_out), (&mut all.notes, &part.notes)] {
+                for (what, count) in counts {
+                    *sum.entry(what.clone()).or_default() += count;
+                }
+            }
+            all.channels.extend(part.channels.iter());
+            if !all.format.split(", ").any(|format| format == part.format) {
+                let comma = if all.format.is_empty() { "" } else { ", " };
+                all.format = format!("{}{comma}{}", all.format, part.format);
+            }
+        }
+        all.file = format!("{} files from {} to {}", before.len() + 1, first.file, last.file);
+        all.files = before.iter().chain([last]).cloned().collect();
+        all
+    }
+
     /// Counts a record that is passed on.
     pub fn count(&mut self, record: &TraceRecord) {
         self.records += 1;
@@ -73,6 +118,8 @@ impl Counts {
         self.records_read = reader.records();
         self.left_out = by_kind(reader.left_out());
         self.notes = by_kind(reader.notes());
+        self.properties =
+            reader.properties().map(|(name, value)| (name.to_owned(), value.to_owned())).collect();
     }
 
     /// The percentage of the file's entries that is missing; an issue counts as one entry.
@@ -123,10 +170,15 @@ impl Report {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Sets how many frames were decoded, and how many values they had.
-    pub fn set_decoded(&self, (decoded, values): (u64, u64)) {
+    /// Sets how many frames were decoded, and how many values they had: in the first file, the first two, and so on.
+    pub fn set_decoded(&self, up_to_file: &[(u64, u64)]) {
         let mut counts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        (counts.decoded, counts.values) = (decoded, values);
+        (counts.decoded, counts.values) = up_to_file.last().copied().unwrap_or_default();
+        let mut before = (0, 0);
+        for (file, up_to) in counts.files.iter_mut().zip(up_to_file) {
+            (file.decoded, file.values) = (up_to.0 - before.0, up_to.1 - before.1);
+            before = *up_to;
+        }
     }
 
     /// Replaces it.
@@ -233,6 +285,18 @@ impl Report {
         self.now().notes
     }
 
+    /// What an MF4 file says about its measurement, by name: device, session, author, the program that wrote it.
+    #[getter]
+    fn properties(&self) -> BTreeMap<String, String> {
+        self.now().properties
+    }
+
+    /// The reports of the single files, if there were several.
+    #[getter]
+    fn files(&self) -> Vec<Self> {
+        self.now().files.into_iter().map(|counts| Self(Arc::new(Mutex::new(counts)))).collect()
+    }
+
     /// The percentage of the file's entries that could not be read or were left out.
     #[getter]
     fn missing_pct(&self) -> f64 {
@@ -253,6 +317,8 @@ impl Report {
         object["missing_pct"] = counts.missing_pct().into();
         object["is_whole"] = self.is_whole().into();
         object["channels"] = self.channels().into();
+        let files: Vec<_> = self.now().files.into_iter().map(|file| file.file).collect();
+        object["files"] = files.into();
         from_json(py, &object.to_string())
     }
 

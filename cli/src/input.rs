@@ -6,10 +6,13 @@ use std::path::{Path, PathBuf};
 use anyhow::bail;
 use cantap::TraceRecord;
 use cantap_formats::{Columns, Format, LeftOut, ReadOptions, Zone, open_reader};
+use cantap_signals::Decoder;
+use cantap_signals::named::{NameError, NamedFilter};
 use cantap_trace::filter::Filter;
 
 use crate::completion;
 use crate::live_args::LiveArgs;
+use crate::usage_error::usage;
 use cantap_work::interrupt;
 use cantap_work::live::LiveRecords;
 use cantap_work::missing::Missing;
@@ -27,9 +30,10 @@ pub struct ReadArgs {
     /// Stop at the first fault instead of leaving it out.
     #[arg(long)]
     pub strict: bool,
-    /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j. If repeated, any may match.
+    /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j; with a database also EngineData. If repeated, any
+    /// may match.
     #[arg(short, long, value_name = "FILTER")]
-    pub filter: Vec<Filter>,
+    pub filter: Vec<NamedFilter>,
     /// The time zone of dates in files that do not name one, such as ASC, TRC and BLF: Europe/Berlin, +02:00.
     #[arg(long, value_name = "ZONE", default_value_t)]
     pub zone: Zone,
@@ -55,18 +59,43 @@ impl Deref for FollowArgs {
 
 impl FollowArgs {
     /// Opens the file, or standard input for `-`.
-    pub fn open(&self, path: &Path) -> anyhow::Result<Records> {
-        self.read.open_as(path, self.follow)
+    pub fn open(&self, path: &Path, filters: Vec<Filter>) -> anyhow::Result<Records> {
+        self.read.open_as(path, self.follow, filters)
     }
 
     /// Opens the device if given, otherwise the file.
-    pub fn open_either(&self, path: Option<&PathBuf>, live: &LiveArgs) -> anyhow::Result<Records> {
+    pub fn open_either(
+        &self,
+        path: Option<&PathBuf>,
+        live: &LiveArgs,
+        filters: Vec<Filter>,
+    ) -> anyhow::Result<Records> {
         match (live.open(path)?, path) {
-            (Some(live), _) => Ok(self.read.records(Source::Device(live))),
-            (None, Some(path)) => self.open(path),
+            (Some(live), _) => Ok(Records::new(Source::Device(live), filters, self.strict)),
+            (None, Some(path)) => self.open(path, filters),
             (None, None) => bail!("give a trace to read, or a device with -d"),
         }
     }
+}
+
+/// The filters with the identifiers of the messages that they name.
+pub fn resolved(filters: &[NamedFilter], decoder: &Decoder) -> anyhow::Result<Vec<Filter>> {
+    let all = filters.iter().map(|filter| filter.resolve(decoder));
+    all.collect::<Result<_, _>>().map_err(|error| not_a_message("-f", &error))
+}
+
+/// A name in an option's value that is no message's is an error of the command line.
+pub fn not_a_message(option: &str, error: &NameError) -> anyhow::Error {
+    let hint = if matches!(error, NameError::NoDatabase(_)) { "; load one with --db" } else { "" };
+    usage(format!("{option}: {error}{hint}"))
+}
+
+/// The channels, from 1, of which filters hide some frames.
+pub fn filtered(filters: &[Filter]) -> Vec<u8> {
+    let accepts_all = |channel: &u8| filters.iter().any(|filter| filter.accepts_all_of(*channel));
+    let accepts_some =
+        |channel: &u8| filters.iter().any(|filter| filter.channel.is_none_or(|own| own == *channel));
+    (0..=u8::MAX).filter(|channel| accepts_some(channel) && !accepts_all(channel)).collect()
 }
 
 /// Broken lines are reported individually until it is clear that the whole file is broken.
@@ -89,25 +118,17 @@ enum Source {
 }
 
 impl ReadArgs {
-    /// Whether the filters hide frames of a channel rather than whole channels: what is left is not the channel's load.
-    pub fn hides_frames(&self) -> bool {
-        !self.filtered().is_empty()
-    }
-
-    /// The channels, from 1, of which the filters hide frames.
-    pub fn filtered(&self) -> Vec<u8> {
-        let accepts_all = |channel: &u8| self.filter.iter().any(|filter| filter.accepts_all_of(*channel));
-        let accepts_some =
-            |channel: &u8| self.filter.iter().any(|filter| filter.channel.is_none_or(|own| own == *channel));
-        (0..=u8::MAX).filter(|channel| accepts_some(channel) && !accepts_all(channel)).collect()
-    }
-
     /// Opens the file, or standard input for `-`.
-    pub fn open(&self, path: &Path) -> anyhow::Result<Records> {
-        self.open_as(path, false)
+    pub fn open(&self, path: &Path, filters: Vec<Filter>) -> anyhow::Result<Records> {
+        self.open_as(path, false, filters)
     }
 
-    fn open_as(&self, path: &Path, follow: bool) -> anyhow::Result<Records> {
+    /// What to open it with; messages that filters name are looked up in `decoder`.
+    pub fn filters(&self, decoder: &Decoder) -> anyhow::Result<Vec<Filter>> {
+        resolved(&self.filter, decoder)
+    }
+
+    fn open_as(&self, path: &Path, follow: bool, filters: Vec<Filter>) -> anyhow::Result<Records> {
         let options = ReadOptions {
             format: self.format,
             follow,
@@ -127,16 +148,15 @@ impl ReadArgs {
             reader.end_when(interrupt::requested);
         }
         let grows = follow || path.as_os_str() == "-";
-        Ok(self.records(Source::File(ReadAhead::new(reader), grows)))
-    }
-
-    fn records(&self, source: Source) -> Records {
-        let filters = self.filter.clone();
-        Records { source, filters, strict: self.strict, batch: Vec::new(), at: 0 }
+        Ok(Records::new(Source::File(ReadAhead::new(reader), grows), filters, self.strict))
     }
 }
 
 impl Records {
+    const fn new(source: Source, filters: Vec<Filter>, strict: bool) -> Self {
+        Self { source, filters, strict, batch: Vec::new(), at: 0 }
+    }
+
     /// Whether the next record may take a while, so that results should not be buffered.
     pub fn may_wait(&mut self) -> bool {
         self.at == self.batch.len()

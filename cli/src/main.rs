@@ -31,6 +31,7 @@ mod exit;
 mod input;
 mod live_args;
 mod one_board;
+mod page;
 mod print_sent;
 mod progress;
 mod protocols;

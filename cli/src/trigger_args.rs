@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use cantap_address::Address;
+use cantap_signals::Decoder;
 use cantap_signals::trigger::{Trigger, Window};
 
 use crate::args;
@@ -32,14 +33,16 @@ pub struct TriggerArgs {
 }
 
 impl TriggerArgs {
-    /// The trigger, if requested, for what these devices receive.
-    pub fn trigger<'a>(
-        &self,
-        devices: impl IntoIterator<Item = &'a Address>,
-    ) -> anyhow::Result<Option<Trigger>> {
+    /// The databases, otherwise those of these devices.
+    pub fn decoder<'a>(&self, devices: impl IntoIterator<Item = &'a Address>) -> anyhow::Result<Decoder> {
+        // Without a trigger, only filters can need them.
+        load(&self.databases.or_of(devices), false, self.trigger.is_none())
+    }
+
+    /// The trigger, if requested.
+    pub fn trigger(&self, decoder: &Decoder) -> anyhow::Result<Option<Trigger>> {
         let Some(text) = &self.trigger else { return Ok(None) };
-        let decoder = load(&self.databases.or_of(devices), false, false)?;
-        let condition = protocols::condition(text, &decoder).context("--trigger")?;
+        let condition = protocols::condition(text, decoder).context("--trigger")?;
         let nanoseconds = |time: Duration| i64::try_from(time.as_nanos()).unwrap_or(i64::MAX);
         let window =
             Window { pre_ns: nanoseconds(self.pre), post_ns: nanoseconds(self.post), events: self.events };

@@ -1,7 +1,7 @@
 //! Every option has the same meaning in every command, which is checked by walking the command line that clap has. The output of
 //! commands is checked in `tests/vocabulary.rs`.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use clap::{Arg, ArgAction, Command, CommandFactory};
 
@@ -157,8 +157,8 @@ fn every_identifier_filter_rate_and_channel_is_written_as_the_others() {
         // What makes identifiers, and two endpoints of a conversation, are other things; so is an option of Wireshark's.
         let is_other = matches!(command, "gen" | "extcap")
             || matches!(argument.get_long(), Some("load" | "format"))
-            // A filter and a frame are two values of one option; a routine has an identifier of its own.
-            || matches!((command, argument.get_id().as_str()), ("send", "on_rx") | ("uds routine", "routine"));
+            // A routine has an identifier of its own.
+            || (command, argument.get_id().as_str()) == ("uds routine", "routine");
         let Some((kind, good, bad)) = GRAMMAR.iter().find(|(kind, ..)| name == kind).filter(|_| !is_other)
         else {
             return;
@@ -187,6 +187,39 @@ fn every_identifier_filter_rate_and_channel_is_written_as_the_others() {
     });
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
     assert!(seen["FILTER"] > 8 && seen["[CHANNEL:]RATE"] > 8 && seen.len() == GRAMMAR.len(), "{seen:?}");
+}
+
+/// Filters and identifiers take the names of messages in every command, and each of them takes databases.
+#[test]
+fn whatever_takes_filters_takes_names_of_messages_and_databases() {
+    let mut named = BTreeSet::new();
+    let mut with_databases = BTreeSet::new();
+    let mut wrong = Vec::new();
+    each(&Cli::command(), "", &mut |command, argument| {
+        if argument.get_long() == Some("db") {
+            with_databases.insert(command.to_owned());
+        }
+        let is_filter =
+            argument.get_value_names().and_then(<[_]>::first).is_some_and(|name| name == "FILTER");
+        // A board keeps its defaults without their databases, and Wireshark has none.
+        let is_filter = is_filter && !matches!(command, "defaults save" | "extcap");
+        if !is_filter && (command, argument.get_long()) != ("search", Some("id")) {
+            return;
+        }
+        named.insert(command.to_owned());
+        for text in ["EngineData", "msg:EngineData", "msg:ACC", "Body2"] {
+            let line = Arg::new("value").long("value").value_parser(argument.get_value_parser().clone());
+            if Command::new("x").arg(line).try_get_matches_from(["x", "--value", text]).is_err() {
+                wrong.push(format!("{command} {}: {text}", argument.get_id()));
+            }
+        }
+    });
+    // `db` takes them as files.
+    named.remove("db");
+    assert!(wrong.is_empty() && named.len() >= 10, "{named:?} {wrong:?}");
+    assert!(named.is_subset(&with_databases), "{named:?} {with_databases:?}");
+    let page = include_str!("../../docs/grammar.md");
+    assert!(page.contains("`EngineData`") && page.contains("`msg:EngineData`"));
 }
 
 /// The page has every example of the table.
@@ -243,6 +276,7 @@ fn what_measures_or_tells_has_json() {
         "report",
         "reset",
         "serve",
+        "ui",
         "update",
         "virtual",
     ]

@@ -1,8 +1,9 @@
-//! Any text as a condition, as a pattern, and as a message to be encoded.
+//! Any text as a condition, as a pattern, as a filter with names of messages, and as a message to be encoded.
 
 #![no_main]
 
 use cantap_signals::condition::Condition;
+use cantap_signals::named::{NamedFilter, NamedId};
 use cantap_signals::search::{DataPattern, IdPattern};
 use cantap_signals::{Decoder, Source, dbc, encode};
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
@@ -20,5 +21,7 @@ libfuzzer_sys::fuzz_target!(|text: &str| {
         let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };
         condition.holds(&TraceRecord { time_ns: 0, channel: 1, event });
     }
+    let _ = text.parse::<NamedFilter>().map(|named| named.resolve(&decoder));
+    let _ = text.parse::<NamedId>().map(|named| named.resolve(&decoder));
     let _ = (text.parse::<IdPattern>(), text.parse::<DataPattern>());
 });

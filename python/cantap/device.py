@@ -269,9 +269,10 @@ class Device:
     def losses(self) -> dict[int, dict[str, int]]:
         """Frames received and lost since the session began, by channel: at the controller, in the queue, on the link, here.
 
-        `host` is what this session's own reader lost; the losses of a stream of records are in `Records.lost`. `off_bus` is how often the
-        device was off the bus because another client of its server changed the mode, and `off_bus_ns` for how long: each time an unknown
-        number of frames is missing, which `lost` does not contain.
+        `host` is what this session's own reader lost; the losses of a stream of records are in `Records.lost`. `unknown` is how often an
+        unknown number was lost, or may have been: once for each channel that is opened on an adapter that does not count its losses.
+        `off_bus` is how often the device was off the bus because another client of its server changed the mode, and `off_bus_ns` for how
+        long. `lost` contains neither: only without both is it the whole.
         """
         return self._native.losses()
 

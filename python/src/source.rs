@@ -6,7 +6,7 @@ use std::sync::Arc;
 use cantap_formats::time_range::{TimePoint, TimeRange};
 use cantap_formats::{Fault, Format, ReadOptions, TraceReader, Zone};
 use cantap_signals::Decoder;
-use cantap_trace::filter::Filter;
+use cantap_trace::filter::{Filter, passes};
 use cantap_trace::{PlainFrame, TraceRecord};
 use pyo3::prelude::*;
 
@@ -226,9 +226,7 @@ impl TraceSource {
         records.retain(|record| {
             // The window starts at the trace's first record, whatever its channel.
             let inside = window.contains(record);
-            inside
-                && (channels.is_empty() || channels.contains(&record.channel))
-                && (filters.is_empty() || filters.iter().any(|filter| filter.accepts(record)))
+            inside && (channels.is_empty() || channels.contains(&record.channel)) && passes(filters, record)
         });
     }
 }

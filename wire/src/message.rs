@@ -350,6 +350,13 @@ pub struct Hello {
     pub capabilities: u32,
 }
 
+impl Hello {
+    /// Whether every loss is counted by somebody, if only as "at least one".
+    pub const fn counts_losses(&self) -> bool {
+        self.capabilities & capability::UNCOUNTED_LOSSES == 0
+    }
+}
+
 /// Bits of [`Hello::capabilities`].
 pub mod capability {
     /// Can transmit.
@@ -370,4 +377,6 @@ pub mod capability {
     pub const ALWAYS_ACKNOWLEDGES: u32 = 1 << 7;
     /// Never of a board of ours: there is no bus behind it whose bit rate is known, so frames' lengths say nothing about their times.
     pub const NO_BIT_RATE: u32 = 1 << 8;
+    /// Never of a board of ours: frames may be missing that nobody counted, so that no sum of losses is the whole.
+    pub const UNCOUNTED_LOSSES: u32 = 1 << 9;
 }

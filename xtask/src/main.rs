@@ -27,6 +27,7 @@ mod mutants;
 mod outcome;
 mod package;
 mod peers;
+mod processor_time;
 #[cfg(feature = "check")]
 mod public_api;
 mod python;

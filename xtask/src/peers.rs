@@ -97,7 +97,8 @@ pub fn environment(shell: &Shell, name: &str, requirements: &str) -> Result<Path
     ensure!(has_venv(shell)?, "no Python environments: {NO_VENV}");
     cmd!(shell, "python3 -m venv --clear {venv}").run()?;
     let python = venv.join("bin/python");
-    cmd!(shell, "{python} -m pip install --quiet --retries 10 -r {requirements}").run()?;
+    // Most of their modules are never imported: those that are, are compiled then.
+    cmd!(shell, "{python} -m pip install --quiet --no-compile --retries 10 -r {requirements}").run()?;
     shell.write_file(installed, wanted)?;
     Ok(venv)
 }

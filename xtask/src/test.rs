@@ -10,6 +10,7 @@ use crate::board::Board;
 use crate::machine::Machine;
 use crate::meanwhile::Meanwhile;
 use crate::outcome::Outcome;
+use crate::processor_time;
 use crate::steps::Step;
 
 /// The arguments of `cargo xtask test` and `cargo xtask ci`.
@@ -39,18 +40,32 @@ pub fn ci(args: &Args) -> Result<()> {
     run_steps(args, &steps, &Step::MEANWHILE, &Board::ALL)
 }
 
+/// A step that has run.
+struct Done {
+    name: String,
+    outcome: Outcome,
+    /// By the clock.
+    time: Duration,
+    /// Of the processors, if the system tells.
+    processor: Option<Duration>,
+}
+
 /// Runs the steps one after the other, and others meanwhile; stops at the first that fails.
 fn run_steps(args: &Args, steps: &[Step], others: &[Step], boards: &[Board]) -> Result<()> {
     let machine = Machine::new()?;
-    let mut done: Vec<(String, Outcome, Duration)> = Vec::new();
+    let mut done: Vec<Done> = Vec::new();
     let whole = Instant::now();
     let mut meanwhile = if others.is_empty() { None } else { Some(Meanwhile::begin(others)?) };
     for step in steps {
         let name = step.name();
         println!("\n--- {name}");
-        let begin = Instant::now();
+        let (begin, processor) = (Instant::now(), processor_time::of_children());
         match step.run(&machine, boards) {
-            Ok(outcome) => done.push((name, outcome, begin.elapsed())),
+            Ok(outcome) => {
+                let processor =
+                    processor_time::of_children().zip(processor).map(|(now, then)| now.saturating_sub(then));
+                done.push(Done { name, outcome, time: begin.elapsed(), processor });
+            }
             Err(error) => {
                 report(&done);
                 eprintln!("{name:<16} failed; to repeat it: cargo xtask ci --only {name}");
@@ -80,24 +95,35 @@ fn run_steps(args: &Args, steps: &[Step], others: &[Step], boards: &[Board]) -> 
     Ok(())
 }
 
-fn report(done: &[(String, Outcome, Duration)]) {
-    for (name, outcome, time) in done {
+fn report(done: &[Done]) {
+    for Done { name, outcome, time, processor } in done {
         match outcome {
-            Outcome::Passed => println!("{name:<16} ok {:>6.1} s", time.as_secs_f64()),
+            Outcome::Passed => {
+                println!("{name:<16} ok {:>6.1} s{}", time.as_secs_f64(), of_processor(*processor));
+            }
             Outcome::Skipped(reason) => println!("{name:<16} NOT RUN: {reason}"),
         }
     }
-    let total: Duration = done.iter().map(|(_, _, time)| *time).sum();
-    println!("{:<16}    {:>6.1} s", "together", total.as_secs_f64());
+    let time: Duration = done.iter().map(|step| step.time).sum();
+    let processor: Option<Duration> = done.iter().map(|step| step.processor).sum();
+    println!("{:<16}    {:>6.1} s{}", "together", time.as_secs_f64(), of_processor(processor));
+}
+
+fn of_processor(time: Option<Duration>) -> String {
+    time.map_or_else(String::new, |time| format!(", {:.1} s of processor", time.as_secs_f64()))
 }
 
 /// The same for `docs/testing.md`.
-fn table(machine: &Machine, done: &[(String, Outcome, Duration)]) {
-    println!("\n{}\n\n| step | s |\n|---|---:|", machine.description());
-    for (name, outcome, time) in done {
+fn table(machine: &Machine, done: &[Done]) {
+    println!("\n{}\n\n| step | s | of processor |\n|---|---:|---:|", machine.description());
+    for Done { name, outcome, time, processor } in done {
         match outcome {
-            Outcome::Passed => println!("| `{name}` | {:.0} |", time.as_secs_f64()),
-            Outcome::Skipped(_) => println!("| `{name}` | not run |"),
+            Outcome::Passed => {
+                let processor =
+                    processor.map_or("–".to_owned(), |time| format!("{:.0}", time.as_secs_f64()));
+                println!("| `{name}` | {:.0} | {processor} |", time.as_secs_f64());
+            }
+            Outcome::Skipped(_) => println!("| `{name}` | not run | – |"),
         }
     }
 }

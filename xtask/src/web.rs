@@ -10,6 +10,7 @@ use xshell::{Shell, cmd};
 use crate::dist::notices;
 use crate::machine::Machine;
 use crate::outcome::Outcome;
+use crate::tests;
 use crate::toolchain::{self, Toolchain};
 use crate::workspace;
 
@@ -45,7 +46,7 @@ pub fn builds(machine: &Machine) -> Result<Outcome> {
     Ok(build(machine)?.map_or_else(Outcome::Skipped, |_| Outcome::Passed))
 }
 
-/// Builds the page, and runs its tests in a browser.
+/// Builds the page, and runs its tests in a browser, with a trace of its own and served by the command.
 pub fn check(machine: &Machine) -> Result<Outcome> {
     let page = match build(machine)? {
         Ok(page) => page,
@@ -55,9 +56,12 @@ pub fn check(machine: &Machine) -> Result<Outcome> {
     if let Err(reason) = install(shell, &[BROWSER])? {
         return Ok(Outcome::Skipped(reason));
     }
+    // The command that serves it, as the tests' step builds it.
+    tests::build(shell)?;
+    let program = workspace::target().join(format!("debug/cantap{}", std::env::consts::EXE_SUFFIX));
     let _in_page = shell.push_dir("web/page");
     let html = &page.html;
-    cmd!(shell, "npm test -- --page {html}").run()?;
+    cmd!(shell, "npm test -- --page {html} --program {program}").run()?;
     Ok(Outcome::Passed)
 }
 

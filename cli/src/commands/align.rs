@@ -184,7 +184,8 @@ impl<'a> Merged<'a> {
         let zone = args.write.zone.clone();
         let read =
             ReadArgs { format: args.from, columns: None, strict: args.strict, filter: Vec::new(), zone };
-        let sources = args.traces.iter().map(|path| read.open(path)).collect::<anyhow::Result<Vec<_>>>()?;
+        let sources =
+            args.traces.iter().map(|path| read.open(path, Vec::new())).collect::<anyhow::Result<Vec<_>>>()?;
         let others = alignments
             .into_iter()
             .map(|alignment| Other { verifier: Verifier::new(&alignment), alignment })

@@ -10,8 +10,9 @@ use std::time::{Duration, Instant};
 use cantap::{TraceEvent, TraceRecord};
 use cantap_address::Address;
 use cantap_formats::{ChannelInfo, Format, ReadOptions, WriteOptions, open_reader};
+use cantap_signals::named::NamedFilter;
 use cantap_signals::trigger::Trigger;
-use cantap_trace::filter::Filter;
+use cantap_trace::filter::{Filter, passes};
 
 use self::sink::Sink;
 use self::summary::{ChannelSummary, Summary, TriggerSummary};
@@ -19,6 +20,7 @@ use super::convert::WriteArgs;
 use crate::args;
 use crate::channel_args::ChannelArgs;
 use crate::completion;
+use crate::input::resolved;
 use crate::progress::Progress;
 use crate::stderr;
 use crate::trace_output::refuse_older;
@@ -55,10 +57,10 @@ pub struct Args {
     channel: Channels,
     #[command(flatten)]
     open: ChannelArgs,
-    /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j. In hardware as far as it can, where 123:7FF counts
+    /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j; with --db also EngineData. In hardware as far as it can, where 123:7FF counts
     /// twice (standard and extended) and 123:C00007FF once. Repeat for any of several.
     #[arg(short, long, value_name = "FILTER")]
-    filter: Vec<Filter>,
+    filter: Vec<NamedFilter>,
     /// File to write; its suffix determines the format, unless --format does. Without a suffix it is a candump
     /// log.
     #[arg(short, long, value_name = "FILE")]
@@ -114,9 +116,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         }
     }
     refuse_output(args)?;
-    let trigger = args.trigger.trigger(boards.addresses())?;
+    let decoder = args.trigger.decoder(boards.addresses())?;
+    let trigger = args.trigger.trigger(&decoder)?;
+    let filters = resolved(&args.filter, &decoder)?;
     let mut live =
-        LiveRecords::open(&boards, &args.open.options(), &args.filter, args.time, &stderr::reporter())?;
+        LiveRecords::open(&boards, &args.open.options(), &filters, args.time, &stderr::reporter())?;
     live.give_up_after(args.give_up_after.or(args.frames.map(|_| GIVE_UP_AFTER)));
     // The requested time starts here.
     let started = Instant::now();
@@ -137,7 +141,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         .into_iter()
         .map(|(number, meter)| (number, if filtered.contains(&number) { meter.filtered() } else { meter }));
     let mut meters = Meters { channels: channels.collect() };
-    let end = write_all(args, &mut live, &mut sink, &mut meters);
+    let end = write_all(args, &filters, &mut live, &mut sink, &mut meters);
     let seconds = started.elapsed().as_secs_f64();
     let trigger = sink.trigger.as_ref().map(TriggerSummary::of);
     let finished = sink.finish();
@@ -201,23 +205,16 @@ impl Meters {
     }
 }
 
-impl Args {
-    /// What the hardware could not filter is filtered here.
-    fn accepts(&self, record: &TraceRecord) -> bool {
-        self.filter.is_empty() || self.filter.iter().any(|filter| filter.accepts(record))
-    }
-
-    /// Whether a record counts in the summary: errors describe the state of the bus, whatever is captured of
-    /// it.
-    fn counts(&self, record: &TraceRecord) -> bool {
-        matches!(record.event, TraceEvent::BusError { .. } | TraceEvent::ErrorsSuppressed { .. })
-            || self.accepts(record)
-    }
+/// Whether a record counts in the summary: errors describe the state of the bus, whatever is captured of it.
+fn counts(filters: &[Filter], record: &TraceRecord) -> bool {
+    matches!(record.event, TraceEvent::BusError { .. } | TraceEvent::ErrorsSuppressed { .. })
+        || passes(filters, record)
 }
 
 /// Writes what is captured until Ctrl-C or a limit, including what had been captured by then.
 fn write_all(
     args: &Args,
+    filters: &[Filter],
     live: &mut LiveRecords,
     sink: &mut Sink,
     meters: &mut Meters,
@@ -230,8 +227,9 @@ fn write_all(
     let mut batch = Vec::new();
     while live.next_batch(&mut batch)? {
         for record in &batch {
-            meters.push(record, args.counts(record));
-            if !args.accepts(record) {
+            meters.push(record, counts(filters, record));
+            // What the hardware could not filter is filtered here.
+            if !passes(filters, record) {
                 continue;
             }
             if !sink.write(record)? || is_enough(args, sink, meters) {

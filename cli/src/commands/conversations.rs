@@ -10,6 +10,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 
 use cantap_protocols::{Options, Protocol};
+use cantap_signals::Decoder;
 
 pub use self::line::write;
 use self::lines::Lines;
@@ -69,8 +70,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         .transpose()?
         .map(Arc::new);
     let options = Options { protocols: args.protocols.clone(), ..args.help.options(args.quiet)? };
+    let filters = match &decoder {
+        Some(decoder) => args.read.filters(decoder)?,
+        None => args.read.filters(&Decoder::new(Vec::new()))?,
+    };
+    let mut records = args.read.open_either(args.input.as_ref(), &args.live, filters)?;
     let mut reading = protocols::reading(options, decoder, args.quiet);
-    let mut records = args.read.open_either(args.input.as_ref(), &args.live)?;
     let mut lines = Lines::new(args.json)?;
     let mut summary = Summary::default();
     let mut batch = Vec::new();

@@ -11,12 +11,13 @@ use cantap_formats::time_range::{TimePoint, TimeRange};
 use cantap_formats::{
     Columns, DifConvention, Format, LineEnd, RotateAt, Rotation, TableStyle, WriteOptions, Zone,
 };
-use cantap_trace::filter::Filter;
+use cantap_signals::named::NamedFilter;
 
 use crate::args;
 #[cfg(feature = "parquet")]
 use crate::columns;
 use crate::completion;
+use crate::database_args::DatabaseArgs;
 use crate::input::{FollowArgs, ReadArgs};
 use crate::trace_output::{TraceOutput, named};
 use cantap_work::interrupt;
@@ -32,10 +33,10 @@ pub struct Args {
     /// The trace to write; - for standard output.
     #[arg(value_name = "OUT")]
     output: PathBuf,
-    /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j. If several are given, any may
-    /// match.
+    /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j; with a database also EngineData.
+    /// If several are given, any may match.
     #[arg(value_name = "FILTER")]
-    filters: Vec<Filter>,
+    filters: Vec<NamedFilter>,
     /// The format of IN, if neither its content nor its name show it, or show the wrong one. All are listed below.
     #[arg(long, value_name = "FORMAT", add = completion::formats())]
     from: Option<Format>,
@@ -50,7 +51,9 @@ pub struct Args {
     strict: bool,
     /// Only these frames, as FILTER.
     #[arg(short, long = "filter", value_name = "FILTER")]
-    filter_options: Vec<Filter>,
+    filter_options: Vec<NamedFilter>,
+    #[command(flatten)]
+    databases: DatabaseArgs,
     /// Only these channels: 1, 2, several as 1,3. Can be repeated. Default: all.
     #[arg(short, long, value_delimiter = ',', value_parser = args::channel_of_trace)]
     channel: Vec<u8>,
@@ -190,7 +193,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let read =
         ReadArgs { format: args.from, columns: args.columns.clone(), strict: args.strict, filter, zone };
     let read = FollowArgs { read, follow: args.follow };
-    let mut records = read.open(&args.input)?;
+    let filters = read.filters(&args.databases.load(false, true)?)?;
+    let mut records = read.open(&args.input, filters)?;
     let grows = records.end_when(interrupt::requested);
     if grows {
         interrupt::watch()?;

@@ -7,7 +7,7 @@ use std::io::{BufWriter, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use cantap_signals::Database;
+use cantap_signals::{Database, Decoder, Source};
 use serde_json::json;
 
 use crate::completion;
@@ -52,7 +52,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         args.files.iter().map(|path| cantap_signals::load(path)).collect::<Result<_, _>>()?;
     let mut out = BufWriter::new(std::io::stdout().lock());
     if let Some(trace) = &args.coverage {
-        coverage::run(databases, args.j1939, args.read.open(trace)?, args.json, &mut out)?;
+        let sources = databases.into_iter().map(|database| Source { channel: None, database });
+        let mut decoder = Decoder::new(sources.collect());
+        if args.j1939 {
+            decoder.assume_j1939();
+        }
+        let records = args.read.open(trace, args.read.filters(&decoder)?)?;
+        coverage::run(&decoder, records, args.json, &mut out)?;
     } else if args.warnings {
         warnings(args, &databases, &mut out)?;
     } else if args.messages.is_empty() {

@@ -7,9 +7,11 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use cantap_trace::diff::{Changed, Difference, Key, Profile, compare};
+use cantap_trace::filter::Filter;
 use serde_json::{Value, json};
 
 use self::protocols::Protocols;
+use crate::database_args::DatabaseArgs;
 use crate::exit;
 use crate::input::ReadArgs;
 use crate::protocols::{Known, ProtocolArgs};
@@ -46,6 +48,8 @@ pub struct Args {
     #[arg(long)]
     json: bool,
     #[command(flatten)]
+    databases: DatabaseArgs,
+    #[command(flatten)]
     read: ReadArgs,
 }
 
@@ -58,8 +62,9 @@ fn percent(text: &str) -> Result<f64, String> {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let (a, mut missing_a, known_a) = profile(args, &args.a)?;
-    let (b, missing_b, known_b) = profile(args, &args.b)?;
+    let filters = args.read.filters(&args.databases.load(false, true)?)?;
+    let (a, mut missing_a, known_a) = profile(args, &args.a, &filters)?;
+    let (b, missing_b, known_b) = profile(args, &args.b, &filters)?;
     let difference = compare(&a, &b, args.tolerance / 100.0);
     let known = known_a.as_ref().zip(known_b.as_ref());
     let protocols = known.map(|(a, b)| Protocols::new([a.overview(), b.overview()], args.ignore_channels));
@@ -87,9 +92,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(if failed { ExitCode::from(exit::CHECK_FAILED) } else { ExitCode::SUCCESS })
 }
 
-fn profile(args: &Args, path: &Path) -> anyhow::Result<(Profile, Missing, Option<Known>)> {
+fn profile(
+    args: &Args,
+    path: &Path,
+    filters: &[Filter],
+) -> anyhow::Result<(Profile, Missing, Option<Known>)> {
     let mut profile = if args.ignore_channels { Profile::ignoring_channels() } else { Profile::default() };
-    let mut records = args.read.open(path)?;
+    let mut records = args.read.open(path, filters.to_vec())?;
     let mut known = args.protocols.then(|| args.protocol.known(false)).transpose()?;
     let mut batch = Vec::new();
     while records.next_batch(&mut batch)? {

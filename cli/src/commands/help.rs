@@ -24,7 +24,7 @@ const TOPICS: [(&str, &str, &str); 4] = [
 
 /// The commands by what they are for, the most used first.
 const GROUPS: [(&str, &[&str]); 7] = [
-    ("Look at a bus or a trace", &["monitor", "stats", "autobaud"]),
+    ("Look at a bus or a trace", &["monitor", "ui", "stats", "autobaud"]),
     ("Record, convert", &["capture", "convert", "align"]),
     ("Understand", &["decode", "search", "conversations", "plot", "report", "diff", "db", "bits", "timing"]),
     ("Send, ask", &["send", "replay", "gen", "run", "obd", "uds", "canopen", "j1939"]),

@@ -22,7 +22,7 @@ pub struct Args {
 }
 
 /// Names of the device's capabilities.
-const CAPABILITIES: [(u32, &str); 9] = [
+const CAPABILITIES: [(u32, &str); 10] = [
     (capability::TRANSMIT, "transmit"),
     (capability::TIMED_TRANSMIT, "timed-transmit"),
     (capability::SLCAN, "slcan"),
@@ -32,6 +32,7 @@ const CAPABILITIES: [(u32, &str); 9] = [
     (capability::ADAPTER, "adapter"),
     (capability::ALWAYS_ACKNOWLEDGES, "always-acknowledges"),
     (capability::NO_BIT_RATE, "no-bit-rate"),
+    (capability::UNCOUNTED_LOSSES, "uncounted-losses"),
 ];
 
 /// Runs it.
@@ -91,6 +92,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             writeln!(out, "  errors        {}", row.errors)?;
             writeln!(out, "  confirmation  {}", row.confirmation)?;
             writeln!(out, "  listen-only   {}", row.listen_only)?;
+            if let Some(limits) = row.limits {
+                writeln!(out, "  limits        {limits}")?;
+            }
             let failures = device.failures()?;
             if failures.count > 0 {
                 writeln!(out, "  left out      {}", failures.last)?;
@@ -109,5 +113,7 @@ fn adapter(row: &Row) -> serde_json::Value {
         "errors": row.errors,
         "confirmation": row.confirmation.to_string(),
         "listen_only": row.listen_only.to_string(),
+        "counts_losses": row.losses.are_counted(),
+        "limits": row.limits,
     })
 }

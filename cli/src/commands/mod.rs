@@ -37,6 +37,7 @@ pub mod stats;
 pub mod status;
 pub mod timing;
 pub mod uds;
+pub mod ui;
 pub mod update;
 #[cfg(unix)]
 pub mod virtual_device;
@@ -54,6 +55,8 @@ pub enum Command {
     Plot(plot::Args),
     /// Make a page of a trace that opens in any browser, offline: rows, graphs, findings.
     Report(report::Args),
+    /// Show a device or a trace in a browser on this machine: live, with recording and sending.
+    Ui(Box<ui::Args>),
     /// Measure a trace or a bus: load, rates, periods, losses, errors.
     Stats(stats::Args),
     /// Convert a trace from any format to any other: filtered, cut out, split.
@@ -139,6 +142,7 @@ impl Command {
             Self::Monitor(args) => monitor::run(&args),
             Self::Plot(args) => plot::run(&args),
             Self::Report(args) => report::run(&args),
+            Self::Ui(args) => ui::run(&args),
             Self::Stats(args) => stats::run(&args),
             Self::Convert(args) => convert::run(&args),
             Self::Diff(args) => diff::run(&args),

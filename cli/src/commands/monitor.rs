@@ -10,6 +10,8 @@ use anyhow::{Context, bail};
 use cantap::wire::message::Mode;
 use cantap_address::{Address, AddressError};
 use cantap_formats::WriteOptions;
+use cantap_signals::Decoder;
+use cantap_signals::named::NamedFilter;
 use cantap_trace::filter::Filter;
 
 use cantap_tui::{
@@ -27,6 +29,7 @@ use crate::args;
 use crate::channel_args::ChannelArgs;
 use crate::completion;
 use crate::database_args::DatabaseArgs;
+use crate::input::resolved;
 use crate::live_args::AUTO_NEEDS_A_DEVICE;
 use crate::trace_output::{named, refuse_older};
 use crate::usage_error::usage;
@@ -57,9 +60,9 @@ pub struct Args {
     normal: bool,
     #[command(flatten)]
     databases: DatabaseArgs,
-    /// Show only these frames, in candump's syntax. Can be repeated. Recordings contain all frames.
+    /// Show only these frames, in candump's syntax; with a database also EngineData. Can be repeated. Recordings contain all frames.
     #[arg(short, long, value_name = "FILTER")]
-    filter: Vec<Filter>,
+    filter: Vec<NamedFilter>,
     /// A profile: device, bit rates, databases, filters, view, send list.
     #[arg(short, long, value_name = "FILE")]
     profile: Option<PathBuf>,
@@ -120,8 +123,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         return Err(usage(AUTO_NEEDS_A_DEVICE));
     }
     let options = ChannelBitrate::options(&open.timing.known());
+    let filters = filters(args, &profile, &decoder, &mut report)?;
     let mut model = Model::new(Arc::new(decoder), options, args.history as usize * 1_000_000)?;
-    let filters = filters(args, &profile, &mut report);
     model.history.set_filters(filters, None);
     for name in &profile.graph {
         if let Err(error) = model.seen.signals.choose(name) {
@@ -244,15 +247,21 @@ fn channel_options(args: &Args, profile: &Profile, report: &mut LoadReport) -> C
     open
 }
 
-fn filters(args: &Args, profile: &Profile, report: &mut LoadReport) -> Vec<Filter> {
-    let mut filters = args.filter.clone();
+fn filters(
+    args: &Args,
+    profile: &Profile,
+    decoder: &Decoder,
+    report: &mut LoadReport,
+) -> anyhow::Result<Vec<Filter>> {
+    let mut filters = resolved(&args.filter, decoder)?;
     for text in if args.filter.is_empty() { profile.filters.as_slice() } else { &[] } {
-        match text.parse() {
+        let filter = text.parse::<NamedFilter>().map_err(|error| error.to_string());
+        match filter.and_then(|filter| filter.resolve(decoder).map_err(|error| error.to_string())) {
             Ok(filter) => filters.push(filter),
             Err(error) => report.faults.push(format!("filter {text}: {error}")),
         }
     }
-    filters
+    Ok(filters)
 }
 
 fn plan(

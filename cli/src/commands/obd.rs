@@ -1,9 +1,10 @@
 //! `cantap obd`: queries a vehicle.
 
 mod services;
+mod table;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::Write as _;
+use std::io::{IsTerminal as _, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
@@ -15,6 +16,7 @@ use cantap_protocols::iso_tp::{Endpoint, Pair};
 use cantap_protocols::{Event, EventKind, Value};
 
 use self::services::Services;
+use self::table::Table;
 use crate::speak_args::SpeakArgs;
 use crate::usage_error::usage;
 use crate::{args, stderr};
@@ -30,9 +32,11 @@ const LIST: u8 = 0x20;
 #[command(after_help = "Examples:\n  \
                 cantap obd -d virtual:car\n  \
                 cantap obd -d virtual:car live 0C 0D --period 500ms\n  \
+                cantap obd -d virtual:car watch 0C 0D 05\n  \
                 cantap obd -d /dev/ttyACM0 -b 500k codes\n  \
                 cantap obd -d COM5 -b 500k clear --yes\n\n\
-                Without a command: VIN, trouble codes, and every value once. All ECUs are asked at once (7DF), and \
+                Without a command: a table of the VIN, the trouble codes, and every value once. What watch writes to a file \
+                or a pipe is lines, as of live. All ECUs are asked at once (7DF), and \
                 where none answers, with identifiers of 29 bits (18DB33F1); if still none does, both again over UDS \
                 (SAE J1979-2). It takes part in the bus: it acknowledges, \
                 and sends what it is asked for here and nothing else.")]
@@ -50,21 +54,33 @@ pub struct Args {
     what: Option<What>,
 }
 
+/// Which values are asked for, and how often.
+#[derive(clap::Args)]
+struct Polling {
+    /// Parameters in hexadecimal, as 0C; default: all that are supported.
+    #[arg(value_name = "PID", value_parser = pid)]
+    pids: Vec<u8>,
+    /// How often.
+    #[arg(long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration)]
+    period: Duration,
+    /// How many times.
+    #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    count: Option<u32>,
+}
+
 #[derive(clap::Subcommand)]
 enum What {
     /// List the parameters of each ECU.
     Supported,
     /// Current values, until Ctrl-C.
     Live {
-        /// Parameters in hexadecimal, as 0C; default: all that are supported.
-        #[arg(value_name = "PID", value_parser = pid)]
-        pids: Vec<u8>,
-        /// How often.
-        #[arg(long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration)]
-        period: Duration,
-        /// How many times.
-        #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
-        count: Option<u32>,
+        #[command(flatten)]
+        polling: Polling,
+    },
+    /// Current values in a table on the terminal, with the least and the most so far, until Ctrl-C.
+    Watch {
+        #[command(flatten)]
+        polling: Polling,
     },
     /// Trouble codes: stored, pending and permanent.
     Codes,
@@ -106,12 +122,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         client: Client::new(speaking, transfer(false, args.p2), stderr::reporter()),
         p2: args.p2,
         services: Services::Own,
+        is_extended: false,
         texts,
+        table: None,
         servers: Vec::new(),
     };
     vehicle.find()?;
     match &args.what {
-        None => vehicle.everything()?,
+        None => vehicle.everything(args.speak.json)?,
         Some(What::Supported) => {
             vehicle.lists()?;
             vehicle.client.show_if(|event| args.speak.json && is_answer(event))?;
@@ -119,7 +137,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 vehicle.show_lists()?;
             }
         }
-        Some(What::Live { pids, period, count }) => vehicle.live(pids, *period, *count)?,
+        Some(What::Live { polling }) => vehicle.live(polling, &mut |_| Ok(()))?,
+        Some(What::Watch { polling }) => vehicle.watch(polling, args.speak.json)?,
         Some(What::Codes) => vehicle.codes()?,
         Some(What::Vin) => vehicle.identification()?,
         Some(What::Clear { .. }) => {
@@ -181,12 +200,22 @@ fn listed(base: u8, bits: &[u8]) -> Vec<u8> {
         .collect()
 }
 
+/// The columns and rows of the terminal.
+fn screen() -> (usize, usize) {
+    let size = terminal_size::terminal_size();
+    size.map_or((100, usize::MAX), |(columns, rows)| (usize::from(columns.0), usize::from(rows.0)))
+}
+
 struct Vehicle<'d> {
     client: Client<'d>,
     p2: Duration,
     services: Services,
+    /// Whether the ECUs have identifiers of 29 bits.
+    is_extended: bool,
     /// What trouble codes mean, if the user has a table.
     texts: Option<CodeTexts>,
+    /// Takes the answers, if they are not printed one by one.
+    table: Option<Table>,
     servers: Vec<Server>,
 }
 
@@ -203,7 +232,7 @@ impl Vehicle<'_> {
                 }
             }
             if !self.servers.is_empty() {
-                self.services = services;
+                (self.services, self.is_extended) = (services, extended);
                 self.client.set_servers(self.servers.iter().map(|server| server.answers_with).collect());
                 return Ok(());
             }
@@ -254,11 +283,47 @@ impl Vehicle<'_> {
         Ok(())
     }
 
-    /// Shows values, each as soon as it is there.
-    fn live(&mut self, wanted: &[u8], period: Duration, count: Option<u32>) -> anyhow::Result<()> {
+    /// Prints the wanted events of what was asked here, or puts them into the table.
+    fn show(&mut self, mut is_wanted: impl FnMut(&Event) -> bool) -> std::io::Result<()> {
+        let Some(table) = &mut self.table else { return self.client.show_if(is_wanted) };
+        let options = transfer(self.is_extended, self.p2);
+        let events = self.client.speaking.take_events();
+        events
+            .iter()
+            .filter(|event| options.is_ours(event) && is_wanted(event))
+            .for_each(|event| table.take(event));
+        Ok(())
+    }
+
+    /// Shows values in a table that stays where it is on a terminal. Elsewhere, and for scripts, answers are lines as in [`Self::live`].
+    fn watch(&mut self, polling: &Polling, is_json: bool) -> anyhow::Result<()> {
+        self.table = (!is_json && std::io::stdout().is_terminal()).then(Table::default);
+        let mut shown = 0;
+        self.live(polling, &mut |table| {
+            let (columns, rows) = screen();
+            // What has left the top of the screen could not be drawn over, and the cursor takes a line.
+            let lines = table.lines(true, (columns, rows.saturating_sub(1)));
+            let mut out = std::io::stdout().lock();
+            if shown > 0 {
+                // To the first line of the table before this one, which is erased.
+                write!(out, "\x1b[{shown}F\x1b[J")?;
+            }
+            shown = lines.len();
+            writeln!(out, "{}", lines.join("\n"))?;
+            out.flush()
+        })
+    }
+
+    /// Shows values, each as soon as it is there; `round` is called after each round with the table, if there is one.
+    fn live(
+        &mut self,
+        polling: &Polling,
+        round: &mut dyn FnMut(&Table) -> std::io::Result<()>,
+    ) -> anyhow::Result<()> {
         self.lists()?;
         self.client.speaking.take_events();
-        let pids = if wanted.is_empty() { self.all_pids() } else { wanted.to_vec() };
+        let Polling { pids: wanted, period, count } = polling;
+        let pids = if wanted.is_empty() { self.all_pids() } else { wanted.clone() };
         if let Some(pid) = pids.iter().find(|pid| self.having(**pid) == 0) {
             bail!("no ECU has the parameter {pid:02X}; `cantap obd supported` shows those that there are");
         }
@@ -266,11 +331,20 @@ impl Vehicle<'_> {
         let mut rounds = 0;
         let mut silent = pids.clone();
         while count.is_none_or(|count| rounds < count) && !interrupt::requested() {
+            if let Some(table) = &mut self.table {
+                table.begin_round();
+            }
             let answered = self.values(&pids)?;
             silent.retain(|pid| !answered.contains(pid));
+            // After Ctrl-C, what was not asked any more would look as if it had not been answered.
+            if let Some(table) =
+                self.table.as_ref().filter(|table| !table.is_empty() && !interrupt::requested())
+            {
+                round(table)?;
+            }
             rounds += 1;
             if count.is_none_or(|count| rounds < count) {
-                self.client.speaking.listen((period * rounds).saturating_sub(started.elapsed()))?;
+                self.client.speaking.listen((*period * rounds).saturating_sub(started.elapsed()))?;
             }
         }
         // Before the end of the first round, Ctrl-C is why.
@@ -302,8 +376,9 @@ impl Vehicle<'_> {
             if answers > 0 {
                 answered.push(*pid);
             }
-            self.client.show_if(is_answer)?;
-            if answers < servers {
+            self.show(is_answer)?;
+            // A table shows it in its rows.
+            if answers < servers && self.table.is_none() {
                 eprintln!("cantap: {pid:02X}: {answers} of {servers} ECUs answered");
             }
         }
@@ -316,7 +391,7 @@ impl Vehicle<'_> {
         for (kind, request) in self.services.codes() {
             let answers = self.client.ask_whoever(request, Some(self.servers.len()))?;
             let sid = f64::from(request[0]);
-            self.client.show_if(|event| {
+            self.show(|event| {
                 let is_wanted = is_answer(event)
                     && event.field("sid").is_some_and(|of| of.value.as_number() == Some(sid));
                 if is_wanted {
@@ -350,7 +425,7 @@ impl Vehicle<'_> {
         for request in &requests {
             any |= !self.client.ask_whoever(request, None)?.is_empty();
         }
-        self.client.show_if(|event| {
+        self.show(|event| {
             is_answer(event) && event.field("sid").is_some_and(|of| of.value.as_number() == Some(sid))
         })?;
         if !any {
@@ -359,7 +434,19 @@ impl Vehicle<'_> {
         Ok(())
     }
 
-    fn everything(&mut self) -> anyhow::Result<()> {
+    /// As a table, unless it is for scripts.
+    fn everything(&mut self, is_json: bool) -> anyhow::Result<()> {
+        self.table = (!is_json).then(Table::default);
+        let asked = self.ask_everything();
+        // What was answered before something went wrong is worth showing.
+        if let Some(table) = self.table.take().filter(|table| !table.is_empty()) {
+            let columns = if std::io::stdout().is_terminal() { screen().0 } else { usize::MAX };
+            writeln!(std::io::stdout(), "{}", table.lines(false, (columns, usize::MAX)).join("\n"))?;
+        }
+        asked
+    }
+
+    fn ask_everything(&mut self) -> anyhow::Result<()> {
         if let Err(error) = self.identification() {
             eprintln!("cantap: {error}");
         }

@@ -13,12 +13,13 @@ use cantap_analysis::plot::{
 };
 use cantap_analysis::stats::Options;
 use cantap_formats::time_range::{TimePoint, TimeRange, date_text};
+use cantap_trace::filter::Filter;
 use cantap_trace::grammar;
 
 use crate::args;
 use crate::completion;
-use crate::database_args::{DatabaseArgs, load_selected};
-use crate::input::ReadArgs;
+use crate::database_args::{DatabaseArgs, load, load_selected};
+use crate::input::{ReadArgs, filtered};
 use crate::trace_output::failed;
 use crate::usage_error::usage;
 use cantap_work::atomic_file;
@@ -137,8 +138,11 @@ struct Read {
 fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
     let name = args.input.file_name().map_or("-".into(), |name| name.to_string_lossy());
     let title = |what: &str| args.title.clone().unwrap_or_else(|| format!("{name}: {what}"));
+    // What is wrong with a database matters only where its signals are drawn.
+    let filters = || args.read.filters(&load(&args.databases.options(), false, true)?);
     if args.bus_load {
-        if args.read.hides_frames() {
+        let filters = filters()?;
+        if !filtered(&filters).is_empty() {
             return Err(usage(
                 "a filter hides part of the bus's load; leave -f out, or give only a channel, as -f can0",
             ));
@@ -151,7 +155,7 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
             ..ChannelBitrate::options(&args.bitrates)
         };
         let mut collector = LoadCollector::new(options)?;
-        let read = for_each(args, |record| collector.push(record))?;
+        let read = for_each(args, filters, |record| collector.push(record))?;
         let (plot, unknown) = collector.finish_counting(title("bus load"));
         if plot.is_empty() && unknown > 0 {
             bail!(
@@ -172,7 +176,7 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
     }
     if let Some(id) = args.timing {
         let mut collector = TimingCollector::new(id);
-        let read = for_each(args, |record| collector.push(record))?;
+        let read = for_each(args, filters()?, |record| collector.push(record))?;
         let plot = collector.finish(title(&format!("periods of {id}")));
         if plot.panes.is_empty() {
             bail!("there are no two frames of {id} without a loss between them in {name}");
@@ -186,7 +190,7 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
     }
     let decoder = load_selected(&args.databases.options(), args.read.strict, args.quiet, &args.signals)?;
     let mut collector = SignalCollector::new(&decoder).with_most_curves(args.curves);
-    let mut read = for_each(args, |record| collector.push(record))?;
+    let mut read = for_each(args, args.read.filters(&decoder)?, |record| collector.push(record))?;
     if collector.is_empty() {
         bail!("none of the signals is in {name}{}; `cantap decode` shows what is", within(args));
     }
@@ -206,8 +210,12 @@ fn within(args: &Args) -> &'static str {
 }
 
 /// Reads the part of the trace to be drawn.
-fn for_each(args: &Args, mut take: impl FnMut(&cantap::TraceRecord)) -> anyhow::Result<Read> {
-    let mut records = args.read.open(&args.input)?;
+fn for_each(
+    args: &Args,
+    filters: Vec<Filter>,
+    mut take: impl FnMut(&cantap::TraceRecord),
+) -> anyhow::Result<Read> {
+    let mut records = args.read.open(&args.input, filters)?;
     let mut window = TimeRange::new(args.start, args.end);
     let mut batch = Vec::new();
     let mut first_ns = None;

@@ -13,11 +13,13 @@ use cantap::{Channel, Device, TraceEvent, TraceFrame};
 
 use crate::args;
 use crate::channel_args::ChannelArgs;
+use crate::database_args::DatabaseArgs;
 use crate::input::FollowArgs;
 use crate::one_board::OneBoard;
 use crate::print_sent::print_sent;
 use crate::stderr;
 use crate::usage_error::usage;
+use cantap_trace::filter::Filter;
 use cantap_trace::grammar;
 use cantap_work::interrupt;
 use cantap_work::missing::Missing;
@@ -47,6 +49,8 @@ pub struct Args {
     mapping: Vec<(Channel, u8)>,
     #[command(flatten)]
     open: ChannelArgs,
+    #[command(flatten)]
+    databases: DatabaseArgs,
     #[command(flatten)]
     read: FollowArgs,
     /// Play this many times, or i for ever.
@@ -144,7 +148,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let source = args.source()?;
     // Faults in the file are found before anything is opened.
     if !source.is_pipe() {
-        drop(args.read.open(&source.input)?);
+        drop(args.read.open(&source.input, source.filters.clone())?);
     } else if args.rounds != Rounds::Times(1) {
         bail!("standard input can be played once only; give a file to repeat it");
     } else if args.interactive {
@@ -239,6 +243,7 @@ const FD: &str = "CAN FD frames, which the device cannot send";
 struct Source {
     input: PathBuf,
     mapping: Vec<(Channel, u8)>,
+    filters: Vec<Filter>,
 }
 
 impl Source {
@@ -287,7 +292,8 @@ impl Args {
                 "can{interface} is mapped twice, and each frame is sent once; give one TO=can{interface}"
             )));
         }
-        Ok(Source { input, mapping })
+        let filters = self.read.filters(&self.databases.load(false, true)?)?;
+        Ok(Source { input, mapping, filters })
     }
 
     /// Plays the trace until everything has ended, or frames can no longer be sent.
@@ -306,7 +312,7 @@ impl Args {
             let before = played.asked;
             let mut first_ns = None;
             let mut last_ns = 0;
-            let mut records = self.read.open(&source.input)?;
+            let mut records = self.read.open(&source.input, source.filters.clone())?;
             // A pipe may have no end, and endless playing has none: in those cases, what was not read is not counted.
             let ends = !source.is_pipe() && self.rounds != Rounds::ForEver;
             while !self.has_all(&played)

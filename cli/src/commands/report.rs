@@ -1,7 +1,6 @@
 //! `cantap report`: a trace as one page that opens in any browser, offline.
 
 mod changes;
-mod page;
 mod trace;
 
 use std::path::PathBuf;
@@ -12,9 +11,9 @@ use cantap_work::atomic_file;
 use cantap_work::channel_bitrate::ChannelBitrate;
 use serde_json::json;
 
-use self::page::Carried;
 use crate::completion;
 use crate::database_args::{DatabaseArgs, load};
+use crate::page::{self, Carried};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -66,7 +65,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     // Only so that faults are reported here rather than to the reader of the page.
     load(&args.databases.options(), false, args.quiet)?;
-    let databases = databases(args)?;
+    let databases = page::databases(&args.databases.options().paths)?;
     let read = trace::read(&args.input)?;
     let mut findings = Vec::new();
     if let Some(against) = &args.against {
@@ -92,7 +91,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         "findings": findings,
         "thinned": trace.thinned,
     });
-    let bytes = page::with_report(&page, &report)?;
+    let bytes = page::with(&page, page::REPORT, &report)?;
     atomic_file::write(&output, bytes.as_bytes())
         .with_context(|| format!("cannot write {}", output.display()))?;
     eprintln!(
@@ -104,27 +103,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// A path's last part.
+/// The trace's name.
 fn file_name(path: &std::path::Path) -> anyhow::Result<String> {
-    let name = path.file_name().filter(|_| path.as_os_str() != "-");
-    let name = name.context("a report is made of a file; write standard input into one first")?;
-    Ok(name.to_string_lossy().into_owned())
-}
-
-fn databases(args: &Args) -> anyhow::Result<Vec<Carried>> {
-    let mut all = Vec::new();
-    for database in &args.databases.options().paths {
-        let path = &database.path;
-        let bytes = std::fs::read(path).with_context(|| {
-            format!(
-                "cannot read {}; a report takes whole files, so leave out what follows a #",
-                path.display()
-            )
-        })?;
-        let carried = Carried::new(&file_name(path)?, &bytes)?;
-        all.push(carried.with("channel", database.channel.into()));
-    }
-    Ok(all)
+    let name = page::file_name(path).filter(|_| path.as_os_str() != "-");
+    name.context("a report is made of a file; write standard input into one first")
 }
 
 fn bitrates(args: &Args, channels: &[u8]) -> Vec<serde_json::Value> {

@@ -9,7 +9,8 @@ use anyhow::Context;
 use cantap::{TraceEvent, TraceRecord};
 use cantap_formats::{Format, WriteOptions};
 use cantap_signals::condition::Condition;
-use cantap_signals::search::{DataPattern, IdPattern, Search};
+use cantap_signals::named::NamedId;
+use cantap_signals::search::{DataPattern, Search};
 use cantap_signals::{Decoder, SignalValue};
 use cantap_trace::Interface;
 
@@ -17,7 +18,7 @@ use super::decode;
 use crate::completion;
 use crate::database_args::{DatabaseArgs, load};
 use crate::exit;
-use crate::input::{FollowArgs, Records};
+use crate::input::{FollowArgs, Records, not_a_message};
 use crate::live_args::LiveArgs;
 use crate::protocols::{self, ProtocolArgs};
 use crate::trace_output::TraceOutput;
@@ -36,7 +37,7 @@ use cantap_work::terms::failure_text;
                 cantap search -d /dev/ttyACM0 -b 500k -e 'error or id == 0x7DF' -m 1\n  \
                 cantap search workshop.log 'uds.sid == 0x22 and uds.nrc'\n\n\
                 A condition knows: signals (Speed, Engine.Speed; the last value received), texts of value tables, id, \
-                dlc, len, ch (from 1), ext, rtr, byte[N], error, lost, numbers (12, 0x1F), + - * / % & |, == != < <= > \
+                messages (EngineData; true for its frames), dlc, len, ch (from 1), ext, rtr, byte[N], error, lost, numbers (12, 0x1F), + - * / % & |, == != < <= > \
                 >=, not, and, or, parentheses; and what frames say together: uds.nrc, j1939.spn == 110, canopen.node == \
                 5 and canopen.fault (docs/protocols.md). Of such, the frame is shown that completes it, and behind it \
                 what it says.\n\n\
@@ -51,9 +52,10 @@ pub struct Args {
     /// The condition, as an option.
     #[arg(short = 'e', long = "condition", visible_alias = "where", value_name = "CONDITION", add = completion::conditions())]
     condition: Option<String>,
-    /// This identifier: 123, 18FEF1?? with ? for any digit, or 100-1FF. If repeated, any may match.
+    /// This identifier: 123, 18FEF1?? with ? for any digit, or 100-1FF; with a database also EngineData. If repeated, any
+    /// may match.
     #[arg(short, long = "id", value_name = "ID", add = completion::identifiers())]
-    ids: Vec<IdPattern>,
+    ids: Vec<NamedId>,
     /// These data bytes from the first on: "11 ?? 3?"; * for any number. If repeated, any may match.
     #[arg(long, value_name = "BYTES")]
     data: Vec<DataPattern>,
@@ -110,8 +112,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             "nothing to look for; give --id, --data or a condition (see cantap search --help)",
         ));
     }
-    let search = Search { ids: args.ids.clone(), data: args.data.clone(), condition };
-    let mut records = args.read.open_either(args.input.as_ref(), &args.live)?;
+    let mut ids = Vec::new();
+    for id in &args.ids {
+        ids.extend(id.resolve(&decoder).map_err(|error| not_a_message("--id", &error))?);
+    }
+    let search = Search { ids, data: args.data.clone(), condition };
+    let mut records = args.read.open_either(args.input.as_ref(), &args.live, args.read.filters(&decoder)?)?;
     let mut sink = Sink::new(args, decoder, records.grows())?;
     let mut search = search;
     let found = find(args, &mut records, &mut search, &mut sink)?;
@@ -282,6 +288,7 @@ fn describe(event: &TraceEvent) -> String {
         TraceEvent::BusError { kind: None, .. } => "bus error".to_owned(),
         TraceEvent::ErrorsSuppressed { count } => format!("{count} more bus errors"),
         TraceEvent::State { state, .. } => format!("controller: {}", state.name()),
+        TraceEvent::Lost { count: 0, at_least: true, .. } => "an unknown number of frames lost".to_owned(),
         TraceEvent::Lost { count, at_least: true, .. } => format!("at least {count} frames lost"),
         TraceEvent::Lost { count, .. } => format!("{count} frames lost"),
         TraceEvent::TransmitFailed { reason, .. } => format!("not sent: {}", failure_text(*reason)),

@@ -12,7 +12,8 @@ use cantap::periodic::{self, BadPeriodic, SHORTEST_PERIOD};
 use cantap::transmit::Stream;
 use cantap::wire::message::{DEVICE_TAG, Filter as HardwareFilter, FrameKind, Mode, Periodic, Trigger};
 use cantap::{Channel, Device, Frame, Id, hw_filter};
-use cantap_trace::filter::Filter;
+use cantap_signals::Decoder;
+use cantap_signals::named::NamedFilter;
 use cantap_trace::grammar;
 use modifiers::Modifiers;
 use replies::{Counts, Replies};
@@ -21,6 +22,7 @@ use crate::args;
 use crate::channel_args::ChannelArgs;
 use crate::completion;
 use crate::database_args::{DatabaseArgs, load};
+use crate::input::not_a_message;
 use crate::one_board::OneBoard;
 use crate::print_sent::print_sent;
 use crate::usage_error::usage;
@@ -57,9 +59,10 @@ pub struct Args {
     /// How many times to send each frame. Without --period and --on-rx they are sent back to back.
     #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     count: Option<u32>,
-    /// Send when a frame is received that this filter accepts: ID, or ID:MASK as in candump.
+    /// Send when a frame is received that this filter accepts: ID, or ID:MASK as in candump, or with a database a
+    /// message's name.
     #[arg(long, value_name = "FILTER", conflicts_with = "period")]
-    on_rx: Option<String>,
+    on_rx: Option<NamedFilter>,
     /// Send as the answer to remote frames of the same ID.
     #[arg(long, conflicts_with_all = ["period", "on_rx"])]
     reply: bool,
@@ -87,11 +90,17 @@ fn channel(text: &str) -> Result<Channel, String> {
     })
 }
 
+/// Whether it is a message with values: no frame contains a colon.
+fn is_message(text: &str) -> bool {
+    text.contains(':') && !text.contains('#')
+}
+
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // Everything wrong on the command line is found before anything is sent.
-    let (frames, faults) = args.frames()?;
-    let triggers = args.triggers(&frames)?;
+    let decoder = args.decoder()?;
+    let frames = args.frames(&decoder)?;
+    let triggers = args.triggers(&frames, &decoder)?;
     let periodic = args.periodic(&frames)?;
     interrupt::watch()?;
     let device = args.device.open()?;
@@ -154,7 +163,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         object["channel"] = args.channel.number().into();
         object["sent"] = sending.sent().into();
         object["seconds"] = rounded(seconds, 3).into();
-        object["issues"] = faults.into();
+        object["issues"] = decoder.faults().into();
         if let Some(replies) = &replies {
             object["replies"] = replies.objects();
         }
@@ -167,22 +176,23 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 }
 
 impl Args {
-    /// The frames, and the number of faults in the databases.
-    fn frames(&self) -> anyhow::Result<(Vec<Frame>, usize)> {
-        // No frame contains a colon, and every message with values does.
-        let is_message = |text: &String| text.contains(':') && !text.contains('#');
-        let device = self.device.given().filter(|_| self.frames.iter().any(is_message));
-        let database = load(&self.databases.or_of(device), false, self.quiet)?;
+    fn decoder(&self) -> anyhow::Result<Decoder> {
+        let is_sent = self.frames.iter().any(|text| is_message(text));
+        let device = self.device.given().filter(|_| is_sent || self.on_rx.is_some());
+        // What is wrong with the databases matters to what is sent by them.
+        load(&self.databases.or_of(device), false, self.quiet || !is_sent && self.databases.is_empty())
+    }
+
+    fn frames(&self, decoder: &Decoder) -> anyhow::Result<Vec<Frame>> {
         let frame = |text: &String| {
             if is_message(text) {
-                Ok(cantap_signals::encode::encode(&database, Some(self.channel.number()), text)?.frame)
+                Ok(cantap_signals::encode::encode(decoder, Some(self.channel.number()), text)?.frame)
             } else {
                 let frame = grammar::frame(text);
                 Ok(frame.map_err(|error| usage(format!("'{text}' is not a frame: {error}")))?)
             }
         };
-        let frames = self.frames.iter().map(frame).collect::<anyhow::Result<_>>()?;
-        Ok((frames, database.faults()))
+        self.frames.iter().map(frame).collect()
     }
 
     /// The period and what changes each time, if frames should be sent periodically.
@@ -199,7 +209,7 @@ impl Args {
     }
 
     /// The replies, if requested: for each frame, one per hardware filter.
-    fn triggers(&self, frames: &[Frame]) -> anyhow::Result<Option<Vec<Trigger>>> {
+    fn triggers(&self, frames: &[Frame], decoder: &Decoder) -> anyhow::Result<Option<Vec<Trigger>>> {
         let count = self.count.unwrap_or(0);
         if self.reply {
             let answer = |frame: &Frame| Trigger {
@@ -209,13 +219,13 @@ impl Args {
             };
             return Ok(Some(frames.iter().map(answer).collect()));
         }
-        let Some(text) = &self.on_rx else { return Ok(None) };
+        let Some(named) = &self.on_rx else { return Ok(None) };
         let filters = {
-            let filter = text.parse::<Filter>().map_err(|error| usage(error.to_string()))?;
+            let filter = named.resolve(decoder).map_err(|error| not_a_message("--on-rx", &error))?;
             let compiled = hw_filter::compile(&[filter], self.channel);
             if let Some(remainder) = compiled.remainder {
                 return Err(usage(format!(
-                    "'{text}' cannot start a reply: {remainder}, which is too late for it"
+                    "'{named}' cannot start a reply: {remainder}, which is too late for it"
                 )));
             }
             if compiled.hardware.is_empty() {

@@ -71,7 +71,7 @@ pub struct Args {
     /// The maximum role of clients: listen (the default); configure, which allows choosing bit rates and storing settings, one client at a
     /// time for each channel; send, which includes acknowledging. With a listener before it (unix:send, tcp:send, socketcand:send, gvret:send,
     /// cannelloni:send), only for that one. Can be repeated. The last three are asked for no name, and only listen unless they are named.
-    #[arg(long = "allow", value_name = "[LISTENER:]ROLE", value_parser = allowed)]
+    #[arg(long = "allow", value_name = "ROLE", value_parser = allowed)]
     allowed: Vec<Allowed>,
     /// normal: the board acknowledges on its buses from the first listener on, so that no client that sends takes it off its bus for a
     /// moment.

@@ -16,7 +16,8 @@ use cantap_analysis::stats::{Options, Statistics, Summary};
 use self::windows::Windows;
 use crate::args;
 use crate::completion;
-use crate::input::FollowArgs;
+use crate::database_args::{DatabaseArgs, load};
+use crate::input::{FollowArgs, filtered};
 use crate::live_args::AUTO_NEEDS_A_DEVICE;
 use crate::protocols::{Known, ProtocolArgs};
 use crate::usage_error::usage;
@@ -83,6 +84,8 @@ pub struct Args {
     #[arg(long)]
     json: bool,
     #[command(flatten)]
+    databases: DatabaseArgs,
+    #[command(flatten)]
     read: FollowArgs,
 }
 
@@ -104,6 +107,9 @@ impl Args {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let names =
+        if args.input.is_some() { args.databases.options() } else { args.databases.or_of(&args.device) };
+    let filters = args.read.filters(&load(&names, false, true)?)?;
     let live = if args.input.is_some() {
         if args.timing().has_auto() {
             return Err(usage(AUTO_NEEDS_A_DEVICE));
@@ -117,19 +123,18 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         options.channel_bitrate_bps = live.bit_rates();
         options.filtered = live.filtered();
     }
-    options.filtered.extend(args.read.filtered());
+    options.filtered.extend(filtered(&filters));
     let mut statistics = Statistics::new(options)?;
     let mut windows = args.windows.then(Windows::new).transpose()?;
     let mut known = args.protocols.then(|| args.protocol.known(args.json)).transpose()?;
     let mut ended = Ok(());
     let mut missing = Missing::default();
     if let Some(mut live) = live {
-        ended =
-            live::run(!args.json, &args.read.filter, &mut live, &mut statistics, &mut windows, &mut known);
+        ended = live::run(!args.json, &filters, &mut live, &mut statistics, &mut windows, &mut known);
         // What was received is shown, but it is a failure if there were only errors.
         ended = ended.and_then(|()| live.judge());
     } else if let Some(path) = &args.input {
-        let mut records = args.read.open(path)?;
+        let mut records = args.read.open(path, filters)?;
         let mut closed = |window: &_| {
             if let Some(windows) = &mut windows {
                 windows.push(window);

@@ -115,8 +115,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         writeln!(out, "  last error {}", state.last_error.map_or("none", BusErrorKind::name))?;
         writeln!(
             out,
-            "  received   {} frames; lost: controller at least {}, queue {}",
-            state.frames, state.lost_controller, state.lost_queue
+            "  received   {} frames; lost: controller {}, queue {}",
+            state.frames,
+            if device.hello().counts_losses() {
+                format!("at least {}", state.lost_controller)
+            } else {
+                "not counted by this adapter".to_owned()
+            },
+            state.lost_queue
         )?;
         writeln!(
             out,
@@ -150,7 +156,7 @@ fn object(status: &Status, failures: &Failures, uptime_s: f64, hello: &Hello) ->
     let channels: Vec<Value> = Channel::ALL
         .into_iter()
         .zip(&status.channels)
-        .map(|(channel, state)| channel_object(channel, state, hello.can_clock_hz))
+        .map(|(channel, state)| channel_object(channel, state, hello))
         .collect();
     json!({
         "uptime_s": uptime_s,
@@ -166,7 +172,8 @@ fn object(status: &Status, failures: &Failures, uptime_s: f64, hello: &Hello) ->
     })
 }
 
-fn channel_object(channel: Channel, state: &ChannelStatus, can_clock_hz: u32) -> Value {
+fn channel_object(channel: Channel, state: &ChannelStatus, hello: &Hello) -> Value {
+    let can_clock_hz = hello.can_clock_hz;
     json!({
         "channel": channel.number(),
         "open": state.open.is_some(),
@@ -177,7 +184,7 @@ fn channel_object(channel: Channel, state: &ChannelStatus, can_clock_hz: u32) ->
         "rec": state.rec,
         "last_error": state.last_error.map(BusErrorKind::name),
         "frames": state.frames,
-        "lost_controller": state.lost_controller,
+        "lost_controller": hello.counts_losses().then_some(state.lost_controller),
         "lost_queue": state.lost_queue,
         "bus_errors": state.bus_errors,
         "transmitted": state.transmitted,

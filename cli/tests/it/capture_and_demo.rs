@@ -386,7 +386,10 @@ fn the_demo_loses_nothing_and_says_so_in_the_promised_object() {
             "wire_bytes_per_frame"
         ]
     );
-    assert_eq!(keys(&object["lost"]), ["controller", "host", "link", "off_bus", "off_bus_us", "queue"]);
+    assert_eq!(
+        keys(&object["lost"]),
+        ["controller", "host", "link", "off_bus", "off_bus_us", "queue", "unknown"]
+    );
     for channel in object["channels"].as_array().unwrap() {
         assert_eq!(keys(channel), ["bus_load_pct", "channel", "delivered", "frames_per_s", "lost", "sent"]);
         assert_eq!((&channel["delivered"], channel["lost"].as_u64()), (&channel["sent"], Some(0)));

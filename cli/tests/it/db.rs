@@ -10,7 +10,7 @@ const CAR: &str = "BO_ 256 Engine: 3 A\n SG_ Enable : 7|1@0- (1,0) [0|0] \"-\" A
                    CM_ BO_ 256 \"What the engine does\nand how\";\nCM_ SG_ 256 Temp \"of the oil\";\n\
                    VAL_ 256 Enable 0 \"Off\" 1 \"On\" ;\n\
                    BA_DEF_ BO_ \"GenMsgCycleTime\" INT 0 10000;\nBA_DEF_DEF_ \"GenMsgCycleTime\" 0;\n\
-                   BA_ \"GenMsgCycleTime\" BO_ 256 10;\nBA_ \"GenMsgCycleTime\" BO_ 768 500;\nBO_ 99999 Far: 1 A\n";
+                   BA_ \"GenMsgCycleTime\" BO_ 256 10;\nBA_ \"GenMsgCycleTime\" BO_ 768 500;\nBO_ 536870912 Far: 1 A\n";
 
 fn cantap(test: &str, arguments: &[&str]) -> (Option<i32>, String, String) {
     let directory = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("db-{test}"));
@@ -41,7 +41,7 @@ fn messages_are_listed_with_cycle_and_comment() {
          \x20 300      Lamp        1    500 ms       3\n"
     );
     let (_, out, _) = cantap("list", &["car.dbc", "--warnings"]);
-    assert!(out.starts_with("car.dbc: line ") && out.contains("Far: identifier 0x1869F"), "{out}");
+    assert!(out.starts_with("car.dbc: line ") && out.contains("Far: identifier 0x20000000"), "{out}");
 }
 
 #[test]

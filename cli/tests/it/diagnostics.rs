@@ -2,6 +2,9 @@
 
 use std::process::{Command, Output};
 
+#[cfg(unix)]
+use crate::terminal::Terminal;
+
 fn cantap(line: &[&str]) -> (Option<i32>, String, String) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
     let Output { status, stdout, stderr } = command.args(line).output().unwrap();
@@ -22,9 +25,17 @@ fn badly(line: &str) -> (Option<i32>, String) {
 #[test]
 fn a_car_tells_who_it_is_what_it_has_and_how_it_is() {
     let out = well("obd -d virtual:car");
-    for part in ["7DF > 7E8", "vin \"", "P0128", "engine_speed", "coolant_temperature", "7DF > 7E9"] {
-        assert!(out.contains(part), "{part}: {out}");
-    }
+    let row = |start: &str, ecu: &str| {
+        let mut lines = out.lines().filter(|line| line.starts_with(start) && line.contains(ecu));
+        lines.next().unwrap_or_else(|| panic!("no row {start} of {ecu}: {out}"))
+    };
+    assert!(out.lines().next().unwrap().starts_with("PID    name "), "{out}");
+    assert!(row("0C     engine_speed ", "7E8").ends_with(" rpm"), "{out}");
+    assert!(row("05     coolant_temperature ", "7E8").ends_with(" °C"), "{out}");
+    assert!(row("09 02  vin ", "7E8").ends_with("  WCTCANTA4P0000001"), "{out}");
+    assert!(row("       stored trouble codes: codes ", "7E8").ends_with("  P0128"), "{out}");
+    assert!(row("       stored trouble codes: codes ", "7E9").ends_with("  none"), "{out}");
+    row("0D     vehicle_speed ", "7E9");
     let out = well("obd supported -d virtual:car");
     assert!(out.lines().any(|line| line.starts_with("0C  engine_speed") && line.ends_with("7E8")), "{out}");
     assert!(
@@ -39,6 +50,14 @@ fn a_car_tells_who_it_is_what_it_has_and_how_it_is() {
         3,
         "{out}"
     );
+    let out = well("obd -d virtual:car watch 0C 0D --period 100ms -n 3");
+    // Without a terminal, lines as of live: each with both speeds of two ECUs.
+    assert_eq!(
+        out.lines().filter(|line| line.contains("(vehicle_speed), vehicle_speed ")).count(),
+        6,
+        "{out}"
+    );
+    assert!(!out.contains('\u{1b}') && !out.contains("PID"), "{out}");
     let (code, said) = badly("obd -d virtual:car live FE -n 1");
     assert!(code == Some(1) && said.contains("cantap obd supported"), "{said}");
 }
@@ -192,4 +211,26 @@ fn wrong_words_are_exit_code_2() {
     ] {
         assert_eq!(badly(line).0, Some(2), "{line}");
     }
+}
+
+/// On a terminal the table stays where it is, above it what was there before.
+#[cfg(unix)]
+#[test]
+fn a_watched_table_is_drawn_over_the_one_before() {
+    let mut view = Terminal::start("obd -d virtual:car watch 0C 0D --period 50ms", (80, 24));
+    view.wait_for("0C   engine_speed");
+    let times = |text: &str, what: &str| text.matches(what).count();
+    // More than two rounds: the speed of a car that moves off.
+    let text = view.wait_until("a range", |screen| {
+        let speed = screen.lines().find(|line| line.starts_with("0C   engine_speed"));
+        let cells = speed.map(|line| line.split_whitespace().collect::<Vec<_>>()).unwrap_or_default();
+        cells.len() == 7 && cells[5] != cells[6]
+    });
+    assert_eq!((times(&text, "PID  name"), times(&text, "0D   vehicle_speed")), (1, 2), "{text}");
+    // One that is too low shows as much as it can, and says how much that is not.
+    view.resize((40, 4));
+    let text = view.wait_for("2 more: ");
+    assert!(text.lines().all(|line| line.chars().count() <= 40), "{text}");
+    view.keys("\u{3}");
+    assert_eq!(view.end(), 0);
 }

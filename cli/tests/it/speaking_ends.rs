@@ -13,11 +13,12 @@ use served::Served;
 
 const CANTAP: &str = env!("CARGO_BIN_EXE_cantap");
 /// Nobody answers, so each of them is in the middle of something for as long as its options say.
-const WAITING: [&str; 11] = [
+const WAITING: [&str; 12] = [
     "uds --p2 50s read F190",
     "uds --p2 50s --session extended --security 1 --key-command true tester-present",
     "uds --p2 50s routine start FF00",
     "obd live 0C",
+    "obd watch 0C",
     "canopen --timeout 50s read 5 1000",
     "canopen --timeout 50s write 6 2000 0 11223344556677889900 --type hex --block",
     "canopen --timeout 50s scan 20-30",

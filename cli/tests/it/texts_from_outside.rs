@@ -169,6 +169,7 @@ fn no_print_goes_round_the_place_that_cleans() {
                 "tui/src/",
                 "host/trace/src/clean.rs",
                 "cli/src/commands/stats/live.rs",
+                "cli/src/commands/obd.rs",
                 "host/analysis/src/plot/text.rs",
             ],
         ),

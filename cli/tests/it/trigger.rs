@@ -64,7 +64,7 @@ fn a_condition_that_cannot_be_understood_ends_before_anything_is_written() {
         cantap("wrong", &["capture", "--trigger", "Sped > 1", "--db", "car.dbc", "-o", "wrong.log"]);
     assert_eq!(code, Some(2));
     assert!(
-        err.starts_with("cantap: --trigger: there is no signal \"Sped\"; did you mean Speed?\n"),
+        err.starts_with("cantap: --trigger: there is no signal or message \"Sped\"; did you mean Speed?\n"),
         "{err}"
     );
 }

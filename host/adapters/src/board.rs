@@ -255,6 +255,9 @@ impl<'q> Board<'q, QUEUE_BYTES> for AdapterBoard<'q> {
         if row.listen_only == ListenOnly::Never {
             hello.capabilities |= capability::ALWAYS_ACKNOWLEDGES;
         }
+        if !row.losses.are_counted() {
+            hello.capabilities |= capability::UNCOUNTED_LOSSES;
+        }
         if !row.sets_bit_rate {
             hello.capabilities |= capability::NO_BIT_RATE;
         }

@@ -84,7 +84,7 @@ impl Cannelloni {
                 return self.oddities.count("datagrams of another version or operation");
             }
         };
-        match self.sequence.take(header.sequence) {
+        match self.sequence.take(header.sequence, bytes) {
             Order::Next => {}
             Order::Missing(missing) => {
                 self.oddities.count("gaps between datagrams");
@@ -92,6 +92,8 @@ impl Cannelloni {
                 self.lost(missing.into(), true, at);
             }
             Order::Late => self.oddities.count("datagrams out of order"),
+            // What it holds was received once.
+            Order::Repeated => return self.oddities.count("datagrams that came twice"),
         }
         let count = u32::from(header.count);
         for done in 0..count {

@@ -91,6 +91,16 @@ pub enum OpenError {
         /// As given.
         address: String,
     },
+    /// The chip lacks what is needed to listen with it.
+    #[error(
+        "'{address}' is a copy of an ELM327 that refuses {command}: its lines are no frames, and another adapter is needed"
+    )]
+    Unsuitable {
+        /// As given.
+        address: String,
+        /// The command.
+        command: &'static str,
+    },
     /// The input is no trace.
     #[error("'{address}' cannot be read: {reason}")]
     NoTrace {

@@ -17,6 +17,7 @@ mod adapter_clock;
 mod board;
 mod cannelloni;
 mod driver;
+mod elm327;
 mod engine;
 mod error_frames;
 mod gs_usb;
@@ -33,6 +34,7 @@ mod slcan;
 mod socketcan;
 mod socketcand;
 mod source;
+mod text_lines;
 mod trace_pipe;
 
 pub use driver::OpenError;

@@ -8,6 +8,7 @@ use cantap_formats::Format;
 
 use crate::cannelloni::{self, Cannelloni};
 use crate::driver::{Driver, OpenError};
+use crate::elm327::{self, Elm327, Family, Ids};
 use crate::engine;
 use crate::gs_usb::GsUsb;
 use crate::gvret::{self, Gvret};
@@ -25,8 +26,8 @@ fn exists(_: &str) -> bool {
     false
 }
 
-/// An adapter's place: `can0`, `socketcan:can0`, `slcan:/dev/ttyACM0@115200`, `gvret:tcp://192.168.4.1`, `socketcand://HOST/can0`, `cannelloni://HOST:PORT`,
-/// `candump:-`, `pcapng:-`.
+/// An adapter's place: `can0`, `socketcan:can0`, `slcan:/dev/ttyACM0@115200`, `gvret:tcp://192.168.4.1`, `elm327:tcp://192.168.0.10`,
+/// `stn:/dev/ttyUSB0`, `socketcand://HOST/can0`, `cannelloni://HOST:PORT`, `candump:-`, `pcapng:-`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Place {
     text: String,
@@ -38,11 +39,18 @@ enum Kind {
     Slcan { port: String, baud: u32 },
     GvretSerial { port: String, baud: u32 },
     GvretTcp { host: String },
+    Elm327 { family: Family, place: ElmPlace, ids: Option<Ids> },
     Socketcan { interface: String },
     GsUsb { serial: String, termination: Option<bool> },
     Socketcand { host: String, interface: String },
     Cannelloni { host: String, listen: u16 },
     Trace { path: String, format: TraceFormat },
+}
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+enum ElmPlace {
+    Serial { port: String, baud: u32 },
+    Tcp { host: String },
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -57,8 +65,18 @@ enum TraceFormat {
 pub struct BadPlace(String);
 
 /// What addresses of adapters begin with.
-const SCHEMES: [&str; 8] =
-    ["socketcan:", "gs_usb:", "slcan:", "gvret:", "socketcand:", "cannelloni:", "candump:", "pcapng:"];
+const SCHEMES: [&str; 10] = [
+    "socketcan:",
+    "gs_usb:",
+    "slcan:",
+    "gvret:",
+    "elm327:",
+    "stn:",
+    "socketcand:",
+    "cannelloni:",
+    "candump:",
+    "pcapng:",
+];
 
 impl Place {
     /// Whether a text is meant for an adapter.
@@ -124,6 +142,11 @@ impl FromStr for Place {
                     Kind::GvretSerial { port, baud }
                 }
             },
+            "elm327" => elm327_of(Family::Elm, rest).ok_or_else(|| {
+                bad("write elm327:PORT, elm327:PORT@BAUD or elm327:tcp://HOST:PORT, and ?ids=standard or ?ids=extended after it to choose")
+            })?,
+            "stn" => elm327_of(Family::Stn, rest)
+                .ok_or_else(|| bad("write stn:PORT, stn:PORT@BAUD or stn:tcp://HOST:PORT"))?,
             "socketcand" => {
                 let place = rest.strip_prefix("//").and_then(|rest| rest.split_once('/'));
                 let is_name = |name: &str| {
@@ -144,7 +167,7 @@ impl FromStr for Place {
                 Kind::Trace { path: rest.to_owned(), format }
             }
             "candump" | "pcapng" => return Err(bad("name the pipe, as in candump:- for standard input")),
-            _ => return Err(bad("it is no CAN interface's name, and begins with none of socketcan:, gs_usb:, slcan:, gvret:, socketcand:, cannelloni:, candump:, pcapng:")),
+            _ => return Err(bad("it is no CAN interface's name, and begins with none of socketcan:, gs_usb:, slcan:, gvret:, elm327:, stn:, socketcand:, cannelloni:, candump:, pcapng:")),
         };
         Ok(Self { text: text.to_owned(), kind })
     }
@@ -173,6 +196,22 @@ fn gs_usb_of(rest: &str) -> Option<Kind> {
     };
     let is_serial = serial.chars().all(|letter| letter.is_ascii_graphic());
     is_serial.then(|| Kind::GsUsb { serial: serial.to_owned(), termination })
+}
+
+fn elm327_of(family: Family, rest: &str) -> Option<Kind> {
+    let (place, ids) = match rest.split_once('?') {
+        Some((place, "ids=standard")) if family == Family::Elm => (place, Some(Ids::Standard)),
+        Some((place, "ids=extended")) if family == Family::Elm => (place, Some(Ids::Extended)),
+        Some(_) => return None,
+        None => (rest, None),
+    };
+    let place = if let Some(host) = place.strip_prefix("tcp://") {
+        ElmPlace::Tcp { host: with_port(host, elm327::PORT)? }
+    } else {
+        let (port, baud) = port_and_baud(place, family.default_baud())?;
+        ElmPlace::Serial { port, baud }
+    };
+    Some(Kind::Elm327 { family, place, ids })
 }
 
 fn with_port(host: &str, port: u16) -> Option<String> {
@@ -208,6 +247,13 @@ pub fn open(place: &Place) -> Result<Link, OpenError> {
         Kind::Slcan { port, baud } => Box::new(Slcan::open_port(port, *baud)?),
         Kind::GvretSerial { port, baud } => Box::new(Gvret::over(Line::serial(port, *baud)?, address)?),
         Kind::GvretTcp { host } => Box::new(Gvret::over(Line::tcp(host)?, address)?),
+        Kind::Elm327 { family, place, ids } => {
+            let line = match place {
+                ElmPlace::Serial { port, baud } => Line::serial(port, *baud)?,
+                ElmPlace::Tcp { host } => Line::tcp(host)?,
+            };
+            Box::new(Elm327::over(line, *family, *ids, address)?)
+        }
         Kind::Socketcan { interface } => socketcan(interface, address)?,
         Kind::GsUsb { serial, termination } => Box::new(GsUsb::connect(serial, *termination, address)?),
         Kind::Socketcand { host, interface } => Box::new(Socketcand::connect(host, interface, address)?),
@@ -270,6 +316,12 @@ mod tests {
             "gvret:/dev/ttyUSB0",
             "gvret:tcp://192.168.4.1",
             "gvret:tcp://[::1]:2300",
+            "elm327:/dev/rfcomm0",
+            "elm327:COM4@115200?ids=extended",
+            "elm327:tcp://192.168.0.10",
+            "elm327:tcp://192.168.0.10:35000?ids=standard",
+            "stn:/dev/ttyUSB0",
+            "stn:tcp://car:23",
             "socketcand://pi/can0",
             "socketcand://pi:29000/vcan1",
             "cannelloni://pi:20001",
@@ -293,6 +345,11 @@ mod tests {
             "gvret:",
             "gvret:tcp://",
             "gvret:tcp://a:b",
+            "elm327:",
+            "elm327:tcp://",
+            "elm327:COM4?ids=all",
+            "elm327:?ids=standard",
+            "stn:COM4?ids=standard",
             "socketcand:pi/can0",
             "socketcand://pi",
             "socketcand://pi/can 0",

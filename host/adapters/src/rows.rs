@@ -29,10 +29,22 @@ pub enum Losses {
     NotReported,
     /// The adapter, as flags: at least one frame each time.
     Flags,
+    /// Nobody; but the adapter reports when its buffer was full and it stopped listening.
+    Stops,
     /// The kernel exactly, and the controller's driver as far as it notices.
     Kernel,
     /// The program that wrote the trace, if it did.
     Trace,
+}
+
+impl Losses {
+    /// Whether every loss before this program is counted by somebody, if only as "at least one". If not, no number is the whole.
+    pub const fn are_counted(self) -> bool {
+        match self {
+            Self::Flags | Self::Kernel => true,
+            Self::NotReported | Self::Stops | Self::Trace => false,
+        }
+    }
 }
 
 /// What is known of frames that are sent.
@@ -85,10 +97,12 @@ pub struct Row {
     pub listen_only: ListenOnly,
     /// Whether a bit rate is known and set; otherwise the one given is used for figures only.
     pub sets_bit_rate: bool,
+    /// What of a bus's frames it does not show at all, if there is anything.
+    pub limits: Option<&'static str>,
 }
 
 /// All kinds.
-pub const ROWS: [Row; 17] = [
+pub const ROWS: [Row; 25] = [
     Row {
         board: "slcan",
         what: "an slcan adapter that answers (Lawicel's protocol)",
@@ -98,6 +112,7 @@ pub const ROWS: [Row; 17] = [
         confirmation: Confirmation::Accepted,
         listen_only: ListenOnly::Confirmed,
         sets_bit_rate: true,
+        limits: None,
     },
     Row {
         board: "slcan-normal",
@@ -108,6 +123,7 @@ pub const ROWS: [Row; 17] = [
         confirmation: Confirmation::Accepted,
         listen_only: ListenOnly::Never,
         sets_bit_rate: true,
+        limits: None,
     },
     Row {
         board: "slcan-canable",
@@ -118,6 +134,7 @@ pub const ROWS: [Row; 17] = [
         confirmation: Confirmation::HandedOver,
         listen_only: ListenOnly::Unconfirmed,
         sets_bit_rate: true,
+        limits: None,
     },
     Row {
         board: "gvret",
@@ -128,6 +145,7 @@ pub const ROWS: [Row; 17] = [
         confirmation: Confirmation::HandedOver,
         listen_only: ListenOnly::Confirmed,
         sets_bit_rate: true,
+        limits: None,
     },
     Row {
         board: "socketcand",
@@ -138,6 +156,7 @@ pub const ROWS: [Row; 17] = [
         confirmation: Confirmation::HandedOver,
         listen_only: ListenOnly::Elsewhere,
         sets_bit_rate: false,
+        limits: None,
     },
     Row {
         board: "cannelloni",
@@ -148,6 +167,7 @@ pub const ROWS: [Row; 17] = [
         confirmation: Confirmation::HandedOver,
         listen_only: ListenOnly::Elsewhere,
         sets_bit_rate: false,
+        limits: None,
     },
     Row {
         board: "trace-pipe",
@@ -158,6 +178,7 @@ pub const ROWS: [Row; 17] = [
         confirmation: Confirmation::CannotSend,
         listen_only: ListenOnly::Elsewhere,
         sets_bit_rate: false,
+        limits: None,
     },
     interface("socketcan", Stamps::Kernel, Confirmation::OnTheBus, false),
     interface("socketcan-silent", Stamps::Kernel, Confirmation::CannotSend, true),
@@ -174,7 +195,34 @@ pub const ROWS: [Row; 17] = [
     gs_usb("gs_usb-normal", true, false),
     gs_usb("gs_usb-arrival", false, true),
     gs_usb("gs_usb-arrival-normal", false, false),
+    elm327("elm327", true, Some(NO_LENGTHS)),
+    elm327("elm327-normal", false, Some(NO_LENGTHS)),
+    elm327("elm327-standard", true, Some(STANDARD_ONLY)),
+    elm327("elm327-standard-normal", false, Some(STANDARD_ONLY)),
+    elm327("elm327-extended", true, Some(EXTENDED_ONLY)),
+    elm327("elm327-extended-normal", false, Some(EXTENDED_ONLY)),
+    Row { what: "an STN chip (OBDLink)", ..elm327("stn", true, None) },
+    Row { what: "an STN chip (OBDLink) that cannot only listen", ..elm327("stn-normal", false, None) },
 ];
+
+const NO_LENGTHS: &str = "a remote frame's length is not reported, and shown as 0";
+const STANDARD_ONLY: &str = "extended frames are not received (?ids=extended receives only them); a remote frame's length is shown as 0";
+const EXTENDED_ONLY: &str = "standard frames are not received (?ids=standard receives only them); a remote frame's length is shown as 0";
+
+/// A row of ELM327 chips and those that speak as they do.
+const fn elm327(board: &'static str, can_listen: bool, limits: Option<&'static str>) -> Row {
+    Row {
+        board,
+        what: if can_listen { "an ELM327" } else { "an ELM327 that does not confirm that it only listens" },
+        stamps: Stamps::Arrival,
+        losses: Losses::Stops,
+        errors: "that there was one, if the adapter reports it",
+        confirmation: Confirmation::CannotSend,
+        listen_only: if can_listen { ListenOnly::Confirmed } else { ListenOnly::Never },
+        sets_bit_rate: true,
+        limits,
+    }
+}
 
 /// A row of gs_usb adapters.
 const fn gs_usb(board: &'static str, has_stamps: bool, can_listen: bool) -> Row {
@@ -188,6 +236,7 @@ const fn gs_usb(board: &'static str, has_stamps: bool, can_listen: bool) -> Row 
         confirmation: Confirmation::OnTheBus,
         listen_only: if can_listen { ListenOnly::Unconfirmed } else { ListenOnly::Never },
         sets_bit_rate: true,
+        limits: None,
     }
 }
 
@@ -202,6 +251,7 @@ const fn interface(board: &'static str, stamps: Stamps, confirmation: Confirmati
         confirmation,
         listen_only: ListenOnly::Interface { is_silent },
         sets_bit_rate: true,
+        limits: None,
     }
 }
 
@@ -217,6 +267,9 @@ impl Row {
             Losses::NotReported => "losses before this program: not reported by this adapter",
             Losses::Flags => {
                 "losses before this program: the adapter reports that there were some, not how many"
+            }
+            Losses::Stops => {
+                "losses before this program: the adapter reports when its buffer was full, not how many frames that cost, and nothing of others"
             }
             Losses::Kernel => {
                 "losses before this program: counted by the kernel, and by the controller's driver as far as it notices"

@@ -11,12 +11,13 @@ use std::time::{Duration, Instant};
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, Stamp};
 use cantap_wire::{Channel, Frame, Id, Refusal};
 
-use self::lines::{Splitter, Text, hex, line_of, number};
+use self::lines::line_of;
 use crate::adapter_clock::AdapterClock;
 use crate::driver::{At, Bytes, Driver, Incoming, Oddities, OpenError, Opening, poll_bytes};
 use crate::line::Line;
 use crate::rows::{Row, row};
 use crate::source::Piece;
+use crate::text_lines::{Mark, Splitter, Text, hex, number};
 
 /// The speed of a serial line if the address gives none. USB adapters ignore it.
 pub(crate) const DEFAULT_BAUD: u32 = 115_200;
@@ -87,7 +88,7 @@ impl Slcan {
         let mut slcan = Self {
             line,
             dialect: Dialect::Lawicel { listens: false },
-            splitter: Splitter::default(),
+            splitter: Splitter::new(Mark::Bell),
             version: [0; 3],
             serial: String::new(),
             is_open: false,
@@ -110,7 +111,7 @@ impl Slcan {
         // Whatever half a line is there ends, and a channel that an earlier program left open is closed.
         self.line.write(b"\r\r\rC\r");
         self.line.discard(QUIET)?;
-        self.splitter = Splitter::default();
+        self.splitter = Splitter::new(Mark::Bell);
         let Some(answer) = self.ask(b"V\r")? else { return Err("no answer".to_owned()) };
         if let Text::Line(text) = &answer
             && text.first() != Some(&b'V')
@@ -185,7 +186,7 @@ impl Slcan {
         let at = At::arrival(arrival);
         let line = match text {
             Text::Line(line) => line,
-            Text::Bell => {
+            Text::Mark => {
                 match &mut self.in_flight {
                     Some(frame) => frame.again = Some(Instant::now() + RETRY_AFTER),
                     None if self.flags_asked.is_some() => self.flags_refused = true,

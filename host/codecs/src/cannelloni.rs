@@ -3,6 +3,8 @@
 //! Version, operation 0, a sequence number of eight bits, a count of frames; each frame an identifier as Linux has it, a length, the data unless it
 //! is remote. There is no time in it, UDP may lose or reorder, and nothing says who sent it.
 
+use std::hash::{DefaultHasher, Hasher as _};
+
 use cantap_can::{Frame, Id};
 
 /// cannelloni's usual port.
@@ -95,25 +97,40 @@ pub enum Order {
     Next,
     /// So many before it are missing; each had at least a frame.
     Missing(u8),
-    /// One with a higher number came before.
+    /// One with a higher number came before, or the sender has begun anew.
     Late,
+    /// The same datagram came before: the network has doubled it.
+    Repeated,
 }
+
+/// Datagrams that a network may overtake, or double, with others between. One with a number further back is of a sender that has begun anew.
+const OVERTAKEN: u8 = 16;
 
 /// Watches the numbers of one sender.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Sequence {
     expected: Option<u8>,
+    /// Of the last datagrams, by the remainder of their number: the number, and a hash of the bytes.
+    last: [Option<(u8, u64)>; OVERTAKEN as usize],
 }
 
 impl Sequence {
-    /// Takes the next number.
-    pub const fn take(&mut self, sequence: u8) -> Order {
-        let expected = self.expected;
-        self.expected = Some(sequence.wrapping_add(1));
-        let Some(expected) = expected else { return Order::Next };
-        match sequence.wrapping_sub(expected) {
-            0 => Order::Next,
-            missing @ 1..0x80 => Order::Missing(missing),
+    /// Takes the next datagram.
+    pub fn take(&mut self, sequence: u8, datagram: &[u8]) -> Order {
+        let mut hasher = DefaultHasher::new();
+        hasher.write(datagram);
+        let own = (sequence, hasher.finish());
+        let before = self.last[usize::from(sequence % OVERTAKEN)].replace(own);
+        let next = sequence.wrapping_add(1);
+        let Some(expected) = self.expected.replace(next) else { return Order::Next };
+        match (sequence.wrapping_sub(expected), expected.wrapping_sub(sequence)) {
+            (0, _) => Order::Next,
+            (missing @ 1..0x80, _) => Order::Missing(missing),
+            (_, 1..=OVERTAKEN) => {
+                // It changes nothing about what is expected.
+                self.expected = Some(expected);
+                if before == Some(own) { Order::Repeated } else { Order::Late }
+            }
             _ => Order::Late,
         }
     }
@@ -173,7 +190,7 @@ impl Writer {
 
 #[cfg(test)]
 mod tests {
-    use super::Order::{Late, Missing, Next};
+    use super::Order::{Late, Missing, Next, Repeated};
     use super::*;
 
     proptest::proptest! {
@@ -218,10 +235,24 @@ mod tests {
     }
 
     #[test]
-    fn numbers_say_what_is_missing_and_what_came_late() {
+    fn numbers_say_what_is_missing_and_what_came_late_or_twice() {
         let mut sequence = Sequence::default();
-        let orders = [250, 251, 254, 255, 0, 3, 2, 3].map(|number| sequence.take(number));
+        let mut take = |number: u8, content: u8| sequence.take(number, &[number, content]);
+        let orders = [250, 251, 254, 255, 0, 3, 2, 4].map(|number| take(number, 0));
         assert_eq!(orders, [Next, Next, Missing(2), Next, Next, Missing(2), Late, Next]);
+        // The same once more, next to each other and with others between.
+        assert_eq!([4, 2, 5].map(|number| take(number, 0)), [Repeated, Repeated, Next]);
+        // Another one with a number that was there is none of these: its sender has begun anew.
+        assert_eq!([take(0, 1), take(1, 1), take(2, 1), take(2, 1)], [Late, Late, Late, Repeated]);
+        // So has one that is far back.
+        for number in 6..100 {
+            assert_eq!(take(number, 0), Next);
+        }
+        assert_eq!([0, 1, 2].map(|number| take(number, 0)), [Late, Next, Next]);
+        // A number is used again every 256 datagrams, with the same content if a sender repeats itself.
+        for number in (3..=255).chain(0..=255) {
+            assert_eq!(take(number, 0), Next);
+        }
     }
 
     #[test]

@@ -1,16 +1,21 @@
-//! Reads a file of a ZIP archive, by the directory at its end (PKWARE's APPNOTE 6.3.10, sections 4.3 and 4.5.3): stored or deflated, above 4 GiB too.
-//! A file's bytes are unpacked as they are read, so memory does not grow with what they become.
+//! Reads a file of a ZIP archive, stored or deflated, above 4 GiB too: rawzip finds it in the directory at the archive's end. Its bytes are
+//! unpacked as they are read, so memory does not grow with what they become. What rawzip leaves to us: the first file of an archive that was cut
+//! off (PKWARE's APPNOTE 6.3.10, section 4.3.7), and that a file whose check does not fit still gives what can be read.
 
 #[cfg(test)]
 mod tests;
 
-use std::io::{self, Read};
+use std::io::{self, Read, SeekFrom};
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 
 use super::format::Format;
-use super::spec::UnknownFormat;
-use super::whole::Whole;
+use super::format_names::UnknownFormat;
+use super::whole::{ReadSeek, Whole};
 use cantap_trace::clean;
+use rawzip::{
+    ErrorKind, RangeReader, ReaderAt, ZipArchive, ZipArchiveEntryWayfinder, ZipFileHeaderRecord, ZipLocator,
+};
 
 /// So many bytes show whether a file is an archive.
 pub(crate) const HEAD_BYTES: usize = 4;
@@ -18,16 +23,8 @@ pub(crate) const HEAD_BYTES: usize = 4;
 const MAGIC: [&[u8]; 2] = [FILE, b"PK\x05\x06"];
 const FILE: &[u8] = b"PK\x03\x04";
 const FILE_BYTES: usize = 30;
-const ENTRY: &[u8] = b"PK\x01\x02";
-const ENTRY_BYTES: usize = 46;
-const END: &[u8] = b"PK\x05\x06";
-const END_BYTES: usize = 22;
-const LOCATOR: &[u8] = b"PK\x06\x07";
-const LOCATOR_BYTES: usize = 20;
-const LONG_END: &[u8] = b"PK\x06\x06";
-const LONG_END_BYTES: usize = 56;
-/// A comment follows the end, of this many bytes at most.
-const COMMENT_BYTES: usize = 0xFFFF;
+/// The longest name of a file, and its extra fields.
+const NAME_BYTES: usize = 2 * 0xFFFF;
 /// A directory larger than this is damage or malice: it would be one of 300,000 files.
 const DIRECTORY_BYTES: u64 = 16 << 20;
 /// So many names are shown of an archive that has several traces.
@@ -105,31 +102,64 @@ pub(crate) fn split(path: &Path) -> (&Path, Option<String>) {
 /// A file in an archive.
 struct Member {
     name: String,
-    /// What the flags say: encrypted.
-    encrypted: bool,
+    is_encrypted: bool,
     method: u16,
-    crc: u32,
-    /// Packed and unpacked size.
-    packed: u64,
-    size: u64,
-    /// Where its header begins.
-    at: u64,
+    /// The check and the size of what is unpacked; `None` of a file that was cut off.
+    expected: Option<(u32, u64)>,
+    place: Option<ZipArchiveEntryWayfinder>,
+}
+
+impl Member {
+    fn of(entry: &ZipFileHeaderRecord<'_>) -> Self {
+        Self {
+            name: String::from_utf8_lossy(entry.file_path().as_ref()).replace('\\', "/"),
+            is_encrypted: entry.flags().is_encrypted(),
+            method: entry.compression_method().as_u16(),
+            expected: Some((entry.crc32(), entry.uncompressed_size_hint())),
+            place: Some(entry.wayfinder()),
+        }
+    }
+}
+
+/// An archive's bytes, from any place.
+struct Bytes {
+    source: Mutex<Box<dyn ReadSeek>>,
+    len: u64,
+}
+
+impl ReaderAt for Bytes {
+    fn read_at(&self, out: &mut [u8], at: u64) -> io::Result<usize> {
+        // In a damaged file an address may be beyond what the system can seek to.
+        if at >= self.len {
+            return Ok(0);
+        }
+        let mut source = self.source.lock().unwrap_or_else(PoisonError::into_inner);
+        source.seek(SeekFrom::Start(at))?;
+        source.read(out)
+    }
 }
 
 /// Bytes of a file in an archive, and its name there.
 pub(crate) type Inside = (PathBuf, Box<dyn Read + Send>);
 
 /// Opens a file of the archive `file`: the one of this name, or else the only one that may be a trace.
-pub(crate) fn open(mut whole: Whole, file: &str, member: Option<&str>) -> Result<Inside, OpenFailure> {
-    let Some(mut members) = members(&mut whole).map_err(|failure| failure.of(file))? else {
-        return open_first(whole, file, member);
+pub(crate) fn open(whole: Whole, file: &str, member: Option<&str>) -> Result<Inside, OpenFailure> {
+    let len = whole.len();
+    let source = Bytes { source: Mutex::new(whole.into_source()), len };
+    let mut buffer = vec![0; rawzip::MAX_CENTRAL_DIRECTORY_RECORD_SIZE];
+    let archive = match ZipLocator::new().locate_in_reader(source, &mut buffer, len) {
+        Ok(archive) => archive,
+        Err((source, error)) if matches!(error.kind(), ErrorKind::MissingEndOfCentralDirectory) => {
+            return open_first(source, file, member);
+        }
+        Err((_, error)) => return Err(failure(error, file)),
     };
+    let mut members = members(&archive, &mut buffer, file)?;
     if members.iter().any(|member| member.name == "[Content_Types].xml") {
         let looks_like = "a spreadsheet or document: save its table as CSV";
         return Err(OpenFailure::NoTrace(UnknownFormat::NoTrace { file: file.to_owned(), looks_like }));
     }
     members.retain(|member| is_own(&member.name));
-    let names = |members: &[Member]| members.iter().map(|member| member.name.clone()).collect();
     let at = match member {
         Some(wanted) => members.iter().position(|member| member.name == wanted),
         None if members.len() == 1 => Some(0),
@@ -138,9 +168,9 @@ pub(crate) fn open(mut whole: Whole, file: &str, member: Option<&str>) -> Result
             traces.next().filter(|_| traces.next().is_none()).map(|(at, _)| at)
         }
     };
-    let file = file.to_owned();
     let Some(at) = at else {
-        let members: Vec<String> = names(&members);
+        let members: Vec<String> = members.into_iter().map(|member| member.name).collect();
+        let file = file.to_owned();
         return Err(OpenFailure::Archive(match member {
             _ if members.is_empty() => ArchiveError::Empty(file),
             Some(member) => ArchiveError::Missing { file, member: member.to_owned(), members },
@@ -148,54 +178,81 @@ pub(crate) fn open(mut whole: Whole, file: &str, member: Option<&str>) -> Result
         }));
     };
     let member = members.swap_remove(at);
-    let shown = shown_path(&file, &member);
-    let from = whole.read_at(member.at, FILE_BYTES)?;
-    if !from.starts_with(FILE) || from.len() < FILE_BYTES {
-        return Err(OpenFailure::Archive(ArchiveError::Damaged(
-            shown,
-            "it does not begin where the directory says",
-        )));
+    let entry = member.place.and_then(|place| archive.get_entry(place).ok());
+    let Some(range) = entry.map(|entry| entry.compressed_data_range()) else {
+        let what = "it does not begin where the directory says";
+        return Err(OpenFailure::Archive(ArchiveError::Damaged(shown_path(file, &member), what)));
+    };
+    unpacked(archive.into_inner(), range, member, file)
+}
+
+/// The files of an archive.
+fn members(archive: &ZipArchive<Bytes>, buffer: &mut [u8], file: &str) -> Result<Vec<Member>, OpenFailure> {
+    if archive.eocd_offset().saturating_sub(archive.directory_offset()) > DIRECTORY_BYTES {
+        let what = "its directory is larger than 16 MiB";
+        return Err(OpenFailure::Archive(ArchiveError::Damaged(file.to_owned(), what)));
     }
-    let from = member.at + (FILE_BYTES + u16_at(&from, 26) + u16_at(&from, 28)) as u64;
-    let packed = Part { whole, at: from, end: from.saturating_add(member.packed) };
-    let source = unpacked(packed, &member, shown)?;
-    let checked =
-        Checked { source, crc: flate2::Crc::new(), expected: (member.crc, member.size), ended: false };
-    Ok((PathBuf::from(member.name), Box::new(checked)))
+    let mut entries = archive.entries(buffer);
+    let mut members = Vec::new();
+    while let Some(entry) = entries.next_entry().map_err(|error| failure(error, file))? {
+        members.push(Member::of(&entry));
+    }
+    Ok(members)
+}
+
+/// What rawzip's errors come to.
+fn failure(error: rawzip::Error, file: &str) -> OpenFailure {
+    match error.into_kind() {
+        // The system's errors have a number; the others say that the file ends.
+        ErrorKind::IO(error) if error.raw_os_error().is_some() => OpenFailure::Io(error),
+        _ => OpenFailure::Archive(ArchiveError::Damaged(file.to_owned(), "its directory is not whole")),
+    }
 }
 
 /// The first file of an archive whose directory was cut off: as much of it as there is.
-fn open_first(mut whole: Whole, file: &str, wanted: Option<&str>) -> Result<Inside, OpenFailure> {
+fn open_first(source: Bytes, file: &str, wanted: Option<&str>) -> Result<Inside, OpenFailure> {
     let damaged = |what| OpenFailure::Archive(ArchiveError::Damaged(file.to_owned(), what));
-    let header = whole.read_at(0, FILE_BYTES + COMMENT_BYTES)?;
+    let len = source.len;
+    let mut header = Vec::new();
+    RangeReader::new(&source, 0..len.min((FILE_BYTES + NAME_BYTES) as u64)).read_to_end(&mut header)?;
     let name = header.get(FILE_BYTES..).and_then(|rest| rest.get(..u16_at(&header, 26)));
     let name = name.filter(|_| header.starts_with(FILE));
     let name = name.ok_or_else(|| damaged("its directory is missing, and its first file"))?;
     let member = Member {
         name: String::from_utf8_lossy(name).into_owned(),
-        encrypted: header[6] & 1 != 0,
+        is_encrypted: header[6] & 1 != 0,
         method: u16_at(&header, 8) as u16,
-        crc: 0,
-        packed: 0,
-        size: 0,
-        at: 0,
+        expected: None,
+        place: None,
     };
     if wanted.is_some_and(|wanted| wanted != member.name) {
         return Err(damaged("its directory is missing, so only its first file can be read"));
     }
     let from = (FILE_BYTES + u16_at(&header, 26) + u16_at(&header, 28)) as u64;
-    let end = whole.len();
-    let source = unpacked(Part { whole, at: from, end }, &member, shown_path(file, &member))?;
-    Ok((PathBuf::from(member.name), Box::new(Cut(source))))
+    unpacked(source, (from, len.max(from)), member, file)
 }
 
-fn unpacked(packed: Part, member: &Member, shown: String) -> Result<Box<dyn Read + Send>, OpenFailure> {
-    match member.method {
-        _ if member.encrypted => Err(OpenFailure::Archive(ArchiveError::Encrypted(shown))),
-        0 => Ok(Box::new(packed)),
-        8 => Ok(Box::new(flate2::read::DeflateDecoder::new(packed))),
-        method => Err(OpenFailure::Archive(ArchiveError::Method(shown, method))),
-    }
+/// What a file becomes whose packed bytes are in this range.
+fn unpacked(
+    source: Bytes,
+    (from, to): (u64, u64),
+    member: Member,
+    file: &str,
+) -> Result<Inside, OpenFailure> {
+    let packed = RangeReader::new(source, from..to);
+    let source: Box<dyn Read + Send> = match member.method {
+        _ if member.is_encrypted => {
+            return Err(OpenFailure::Archive(ArchiveError::Encrypted(shown_path(file, &member))));
+        }
+        0 => Box::new(packed),
+        8 => Box::new(flate2::read::DeflateDecoder::new(packed)),
+        method => return Err(OpenFailure::Archive(ArchiveError::Method(shown_path(file, &member), method))),
+    };
+    let source: Box<dyn Read + Send> = match member.expected {
+        Some(expected) => Box::new(Checked { source, crc: flate2::Crc::new(), expected, ended: false }),
+        None => Box::new(Cut(source)),
+    };
+    Ok((PathBuf::from(member.name), source))
 }
 
 /// Why an archive could not be opened.
@@ -206,27 +263,6 @@ pub(crate) enum OpenFailure {
 }
 
 impl From<io::Error> for OpenFailure {
-    fn from(error: io::Error) -> Self {
-        Self::Io(error)
-    }
-}
-
-/// Why a directory could not be read.
-enum DirectoryFailure {
-    Io(io::Error),
-    Damaged(&'static str),
-}
-
-impl DirectoryFailure {
-    fn of(self, file: &str) -> OpenFailure {
-        match self {
-            Self::Io(error) => OpenFailure::Io(error),
-            Self::Damaged(what) => OpenFailure::Archive(ArchiveError::Damaged(file.to_owned(), what)),
-        }
-    }
-}
-
-impl From<io::Error> for DirectoryFailure {
     fn from(error: io::Error) -> Self {
         Self::Io(error)
     }
@@ -247,114 +283,6 @@ fn is_trace(name: &str) -> bool {
 
 fn u16_at(bytes: &[u8], at: usize) -> usize {
     bytes.get(at..at + 2).map_or(0, |field| usize::from(u16::from_le_bytes([field[0], field[1]])))
-}
-
-fn u32_at(bytes: &[u8], at: usize) -> u32 {
-    bytes.get(at..).and_then(<[u8]>::first_chunk).map_or(0, |field| u32::from_le_bytes(*field))
-}
-
-fn u64_at(bytes: &[u8], at: usize) -> u64 {
-    bytes.get(at..).and_then(<[u8]>::first_chunk).map_or(0, |field| u64::from_le_bytes(*field))
-}
-
-/// The files of an archive; `None` if its end, and the directory with it, is missing.
-fn members(whole: &mut Whole) -> Result<Option<Vec<Member>>, DirectoryFailure> {
-    let tail_at = whole.len().saturating_sub((END_BYTES + COMMENT_BYTES) as u64);
-    let tail = whole.read_at(tail_at, END_BYTES + COMMENT_BYTES)?;
-    let Some(end_at) = memchr::memmem::rfind(&tail, END).filter(|at| tail.len() - at >= END_BYTES) else {
-        return Ok(None);
-    };
-    let end = &tail[end_at..];
-    let (mut size, mut at) = (u64::from(u32_at(end, 12)), u64::from(u32_at(end, 16)));
-    if u16_at(end, 10) == 0xFFFF || size == 0xFFFF_FFFF || at == 0xFFFF_FFFF {
-        let locator_at = (tail_at + end_at as u64).saturating_sub(LOCATOR_BYTES as u64);
-        let locator = whole.read_at(locator_at, LOCATOR_BYTES)?;
-        let long = whole.read_at(u64_at(&locator, 8), LONG_END_BYTES)?;
-        if !locator.starts_with(LOCATOR) || !long.starts_with(LONG_END) || long.len() < LONG_END_BYTES {
-            return Err(DirectoryFailure::Damaged(
-                "its end says that there is a longer one, which is missing",
-            ));
-        }
-        (size, at) = (u64_at(&long, 40), u64_at(&long, 48));
-    }
-    if size > DIRECTORY_BYTES {
-        return Err(DirectoryFailure::Damaged("its directory is larger than 16 MiB"));
-    }
-    let directory = whole.read_at(at, size as usize)?;
-    let mut rest = &directory[..];
-    let mut members = Vec::new();
-    while !rest.is_empty() {
-        let damaged = DirectoryFailure::Damaged("its directory is not whole");
-        let [name, extra, comment] = [28, 30, 32].map(|at| u16_at(rest, at));
-        let len = ENTRY_BYTES + name + extra + comment;
-        let Some(entry) = rest.get(..len).filter(|entry| entry.starts_with(ENTRY)) else {
-            return Err(damaged);
-        };
-        rest = &rest[len..];
-        members.push(member(entry, name, extra));
-    }
-    if (directory.len() as u64) < size {
-        return Err(DirectoryFailure::Damaged("its directory is not whole"));
-    }
-    Ok(Some(members))
-}
-
-/// A file by its entry in the directory.
-fn member(entry: &[u8], name: usize, extra: usize) -> Member {
-    const LONG: u32 = u32::MAX;
-    let [packed, size, at] = [20, 24, 42].map(|at| u32_at(entry, at));
-    // Numbers that are too long are among the extra fields, in this order.
-    let mut long = long_numbers(&entry[ENTRY_BYTES + name..][..extra]);
-    let mut number = |short: u32| {
-        if short != LONG {
-            return u64::from(short);
-        }
-        let number = u64_at(long, 0);
-        long = long.get(8..).unwrap_or_default();
-        number
-    };
-    let (size, packed, at) = (number(size), number(packed), number(at));
-    Member {
-        name: String::from_utf8_lossy(&entry[ENTRY_BYTES..][..name]).replace('\\', "/"),
-        encrypted: entry[8] & 1 != 0,
-        method: u16_at(entry, 10) as u16,
-        crc: u32_at(entry, 16),
-        packed,
-        size,
-        at,
-    }
-}
-
-/// The extra field of long numbers.
-fn long_numbers(mut extra: &[u8]) -> &[u8] {
-    const KIND: usize = 1;
-    while extra.len() >= 4 {
-        let (kind, len) = (u16_at(extra, 0), u16_at(extra, 2));
-        let field = &extra[4..];
-        let Some(content) = field.get(..len) else { break };
-        if kind == KIND {
-            return content;
-        }
-        extra = &field[len..];
-    }
-    &[]
-}
-
-/// A part of a file, as a stream.
-struct Part {
-    whole: Whole,
-    at: u64,
-    end: u64,
-}
-
-impl Read for Part {
-    fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
-        let len = (self.end.saturating_sub(self.at)).min(out.len() as u64) as usize;
-        let bytes = self.whole.read_at(self.at, len)?;
-        out[..bytes.len()].copy_from_slice(&bytes);
-        self.at += bytes.len() as u64;
-        Ok(bytes.len())
-    }
 }
 
 /// Compares a file's check and size at its end.

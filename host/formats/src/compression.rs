@@ -20,7 +20,7 @@ const KNOWN: [(Compression, &str, &[u8]); 5] = [
     (Compression::Zstd, ".zst", &[0x28, 0xB5, 0x2F, 0xFD]),
     (Compression::Xz, ".xz", &[0xFD, b'7', b'z', b'X']),
     (Compression::Lz4, ".lz4", &[0x04, 0x22, 0x4D, 0x18]),
-    (Compression::Bzip2, ".bz2", super::bzip2::MAGIC),
+    (Compression::Bzip2, ".bz2", b"BZh"),
 ];
 
 /// This many bytes are enough to detect how a file is compressed.
@@ -78,7 +78,7 @@ impl Compression {
             Self::Zstd => return Err(without_zstd()),
             Self::Xz => Box::new(XzStreams::new(source)),
             Self::Lz4 => Box::new(Lz4Frames::new(source)),
-            Self::Bzip2 => Box::new(super::bzip2::Bzip2::new(source)),
+            Self::Bzip2 => Box::new(bzip2::read::MultiBzDecoder::new(source)),
         })
     }
 }
@@ -199,6 +199,7 @@ impl<R: Read> Read for Lz4Frames<R> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use base64::Engine;
     use std::io::Write;
 
     fn unpack(compression: Compression, bytes: &[u8]) -> (Vec<u8>, Option<io::ErrorKind>) {
@@ -232,6 +233,51 @@ mod tests {
             assert!(text.starts_with(&read), "{compression:?}");
             assert_eq!(error, Some(io::ErrorKind::UnexpectedEof), "{compression:?}");
         }
+    }
+
+    /// `python3 -c "import bz2; print(bz2.compress(b'(1.0) can0 123#11\n' * 3 + b'a' * 300, 1))"`, in Base64.
+    fn bzip2() -> (Vec<u8>, Vec<u8>) {
+        const PACKED: &str = "QlpoMTFBWSZTWRaBmiMAAAZZAIAQSGF4ACgBAAggADEAAAj1CGj1GlFGjg+GkWTwiBCESdKLUNY+h2b4u5IpwoSAtAzRGA==";
+        let content = [&b"(1.0) can0 123#11\n".repeat(3)[..], &[b'a'; 300]].concat();
+        (base64::engine::general_purpose::STANDARD.decode(PACKED).unwrap(), content)
+    }
+
+    #[test]
+    fn bzip2_s_streams_one_after_another_are_one_file() {
+        let (packed, content) = bzip2();
+        assert_eq!(Compression::of_content(&packed), Some(Compression::Bzip2));
+        assert_eq!(unpack(Compression::Bzip2, &packed), (content.clone(), None));
+        assert_eq!(unpack(Compression::Bzip2, &packed.repeat(3)), (content.repeat(3), None));
+    }
+
+    #[test]
+    fn a_cut_in_bzip2_is_an_unexpected_end_and_nothing_before_it_is_lost() {
+        let (packed, content) = bzip2();
+        let whole = packed.repeat(2);
+        for len in 1..whole.len() {
+            let (out, error) = unpack(Compression::Bzip2, &whole[..len]);
+            let is_between = len == packed.len();
+            assert_eq!(error, (!is_between).then_some(io::ErrorKind::UnexpectedEof), "{len}");
+            assert!(content.repeat(2).starts_with(&out), "{len}");
+            assert!(len < packed.len() || out.len() >= content.len(), "{len}");
+        }
+    }
+
+    #[test]
+    fn every_changed_byte_of_bzip2_is_noticed_and_none_is_a_panic() {
+        let (whole, content) = bzip2();
+        for at in 0..whole.len() {
+            for change in 1..=255 {
+                let mut bytes = whole.clone();
+                bytes[at] ^= change;
+                let (out, error) = unpack(Compression::Bzip2, &bytes);
+                // The last bits fill a byte up, and the size of blocks may be larger than needed.
+                assert!(error.is_some() || out == content, "{at} {change}");
+            }
+        }
+        // What follows the end and is no stream is damage, too.
+        let (out, error) = unpack(Compression::Bzip2, &[&whole[..], b"more"].concat());
+        assert!(out == content && error.is_some(), "{error:?}");
     }
 
     #[test]

@@ -5,9 +5,10 @@ use std::path::Path;
 
 use super::Format;
 use super::codec::Encode;
+use super::format_names::NotWritten;
 use super::left_out::LeftOut;
 use super::output::Output;
-use super::spec::{FormatSpec, NotWritten};
+use super::spec::FormatSpec;
 use super::writer::{TraceWriter, WriteOptions};
 use cantap_trace::{TraceEvent, TraceRecord};
 

@@ -9,12 +9,13 @@ use super::Format;
 use super::archive::{self, ArchiveError, OpenFailure};
 use super::codec::{BATCH, Decode};
 use super::content;
+use super::format_names::UnknownFormat;
 use super::found::Found;
 use super::input::Input;
 use super::issue::{Fault, Place, ReadIssue};
 use super::left_out::LeftOut;
 use super::read_options::ReadOptions;
-use super::spec::{FormatSpec, UnknownFormat};
+use super::spec::FormatSpec;
 use cantap_trace::{PlainFrame, TraceRecord, clean};
 
 /// Why a file cannot be opened for reading.

@@ -1,13 +1,11 @@
 //! What is known of each format, in one table: its names, its files' suffixes and beginnings, its reader and its writer. Help, completion,
 //! recognition and dispatch follow from it.
 
-use std::fmt;
-use std::path::Path;
-use std::str::FromStr;
+#[cfg(test)]
+mod tests;
 
 use super::analyser::{CsvLayout, TableEncoder};
 use super::codec::{Decode, Encode};
-use super::compression::Compression;
 use super::csv::CsvDialect;
 use super::dif::{self, DifLayout};
 use super::format::Format;
@@ -22,11 +20,11 @@ use super::{
 
 /// One format.
 pub(crate) struct FormatSpec {
-    format: Format,
+    pub format: Format,
     /// Its names. The first is the one shown.
-    names: &'static [&'static str],
+    pub names: &'static [&'static str],
     /// What the names of its files may end with. A suffix selects the first format that has it.
-    suffixes: &'static [&'static str],
+    pub suffixes: &'static [&'static str],
     /// Whether a file begins like one of it: of no file may two say so.
     begins: fn(&Head<'_>) -> bool,
     /// Whether its files begin with something other than a record, so that an empty file is not one of them.
@@ -371,227 +369,21 @@ fn is_of_another(head: &Head<'_>) -> bool {
     FORMATS.iter().filter(|spec| spec.format != Format::Table).any(|spec| (spec.begins)(head))
 }
 
-/// There is no such format.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[non_exhaustive]
-pub enum UnknownFormat {
-    /// Not a format's name.
-    #[error("'{0}' is not a trace format; the formats are {known}", known = Format::names())]
-    Name(String),
-    /// A file's suffix does not name a format.
-    #[error("the name '{0}' does not show the format")]
-    Suffix(String),
-    /// Nor does its content, which looks like something else.
-    #[error("{file} is no trace that is read here: it looks like {looks_like}")]
-    NoTrace {
-        /// The file's name, as given.
-        file: String,
-        /// What it looks like.
-        looks_like: &'static str,
-    },
-}
-
-/// A format that can be read but not written.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{0} is a format that is only read; those that are written are {written}", written = Format::written_names())]
-pub struct NotWritten(pub Format);
-
 impl FormatSpec {
+    /// All of them.
+    pub(crate) fn all() -> impl Iterator<Item = &'static Self> {
+        FORMATS.iter()
+    }
+
+    /// The first row whose files begin so.
+    pub(crate) fn of_content(head: &[u8]) -> Option<&'static Self> {
+        let head = Head::of(head);
+        FORMATS.iter().find(|spec| (spec.begins)(&head))
+    }
+
     /// The row of a format.
     pub(crate) fn of(format: Format) -> &'static Self {
         // Each has one, which a test sees to.
         FORMATS.iter().find(|spec| spec.format == format).unwrap_or(&FORMATS[0])
-    }
-}
-
-impl Format {
-    /// Every format.
-    pub fn all() -> impl Iterator<Item = Self> {
-        FORMATS.iter().map(|spec| spec.format)
-    }
-
-    /// Whether files of the format can be written, not only read.
-    pub fn is_written(self) -> bool {
-        FormatSpec::of(self).writer.is_some()
-    }
-
-    /// Every format that can be written.
-    pub fn written() -> impl Iterator<Item = Self> {
-        Self::all().filter(|format| format.is_written())
-    }
-
-    /// The names of the formats that can be written, for messages.
-    pub fn written_names() -> String {
-        Self::written().map(|format| format.to_string()).collect::<Vec<_>>().join(", ")
-    }
-
-    /// The names of all formats, for messages.
-    pub fn names() -> String {
-        FORMATS.iter().map(|spec| spec.names[0]).collect::<Vec<_>>().join(", ")
-    }
-
-    /// By a path's suffix; `.gz`, `.zst`, `.xz`, `.lz4` and `.bz2` are skipped.
-    pub fn of_path(path: &Path) -> Result<Self, UnknownFormat> {
-        Self::all()
-            .find(|format| format.has_suffix_of(path))
-            .ok_or_else(|| UnknownFormat::Suffix(path.display().to_string()))
-    }
-
-    /// What the names of its files usually end with, without the dot. Versions and dialects share their format's.
-    pub fn suffix(self) -> &'static str {
-        let kinds = Self::all().filter(|format| format.is_kind_of(self));
-        let mut suffixes =
-            std::iter::once(self).chain(kinds).flat_map(|format| FormatSpec::of(format).suffixes);
-        suffixes.next().copied().unwrap_or("txt")
-    }
-
-    /// Whether a file of the format may have this name.
-    pub(crate) fn has_suffix_of(self, path: &Path) -> bool {
-        let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
-        let (bare, _) = Compression::split(&name);
-        let suffixes = FormatSpec::of(self).suffixes;
-        bare.rsplit_once('.').is_some_and(|(_, suffix)| suffixes.contains(&suffix))
-    }
-
-    /// Whether both are read by the same reader: the content shows which version or dialect it is.
-    pub fn is_kind_of(self, other: Self) -> bool {
-        std::mem::discriminant(&self) == std::mem::discriminant(&other)
-    }
-
-    /// By a file's first bytes.
-    pub fn of_content(head: &[u8]) -> Option<Self> {
-        let head = Head::of(head);
-        FORMATS.iter().find(|spec| (spec.begins)(&head)).map(|spec| spec.format)
-    }
-}
-
-impl fmt::Display for Format {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(FormatSpec::of(*self).names[0])
-    }
-}
-
-impl FromStr for Format {
-    type Err = UnknownFormat;
-
-    fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let lower = text.to_ascii_lowercase();
-        let spec = FORMATS.iter().find(|spec| spec.names.contains(&lower.as_str()));
-        spec.map(|spec| spec.format).ok_or_else(|| UnknownFormat::Name(text.to_owned()))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn files_are_known_by_their_beginning() {
-        let utf8 = |text: &str| text.as_bytes().to_vec();
-        for (head, format) in [
-            (utf8("(1410714882.622188) can0 123#11\n"), Format::Candump),
-            (utf8("date Sam Sep 30 15:06:13.191 2017\n"), Format::Asc),
-            (utf8("// a comment\n\ndate Sam Sep 30 15:06:13.191 2017\n"), Format::Asc),
-            (utf8("base hex  timestamps absolute\n"), Format::Asc),
-            (utf8(";   Start time: 18.12.2021 14:28:07.062\n;\n"), Format::Trc(TrcVersion::V2_1)),
-            (utf8(";$FILEVERSION=1.1\n"), Format::Trc(TrcVersion::V2_1)),
-            (utf8("LOGG\0\0\0\0"), Format::Blf),
-            (utf8("MDF     4.10    "), Format::Mf4),
-            (utf8("UnFinMF 4.11    "), Format::Mf4),
-            (vec![0x0A, 0x0D, 0x0D, 0x0A], Format::Pcapng),
-            (vec![0xD4, 0xC3, 0xB2, 0xA1], Format::Pcap),
-            (vec![0xA1, 0xB2, 0x3C, 0x4D], Format::Pcap),
-            (utf8("Time Stamp,ID,Extended,Dir,Bus,LEN,D1\n"), Format::Csv(CsvDialect::Gvret)),
-            (utf8("timestamp,arbitration_id,extended\n"), Format::Csv(CsvDialect::PythonCan)),
-            (utf8("  can0  123   [8]  11 22 33 44 55 66 77 88\n"), Format::CandumpScreen),
-            (utf8(" (000.000000)  can0  RX - -  12345678   [0]\n"), Format::CandumpScreen),
-            (utf8("# drive 3\n\n can0  123   [2]  11 22\n"), Format::CandumpScreen),
-            (utf8("# drive 3\n(1410714882.622188) can0 123#11\n"), Format::Candump),
-            (utf8("123#DEADBEEF\n18DAF110#\n"), Format::Candump),
-            (utf8("cansend vcan0 1D0#000000000000000A\n"), Format::Candump),
-            (utf8("candump can0\n  can0  080   [0] \n"), Format::CandumpScreen),
-            (utf8("pi@car:~$ candump any\n  can0  080   [0] \n"), Format::CandumpScreen),
-            (
-                utf8("interface = can0, family = 29, type = 3, proto = 1\n<0x18eeff01> [1] 05\n"),
-                Format::CandumpScreen,
-            ),
-            (utf8("0128 [2] 0b 61\n"), Format::CandumpScreen),
-            (utf8("***BUSMASTER Ver 2.4.0***\n"), Format::Busmaster),
-            (utf8("\r\n***HEX***\n***RELATIVE MODE***\n"), Format::Busmaster),
-            (utf8("22:20:14:992 Rx 0 0000021A s 2 FE 36\n"), Format::Busmaster),
-            (utf8("00:29:58.617 R 0DFF180D A2 8C\n"), Format::Nmea2000),
-            (utf8("2011-11-24-22:42:04.388,2,127250,36,255,2,ff,10\n"), Format::Nmea2000),
-            (utf8("A000159.990 CCFF7 0FF63 3B9F\n"), Format::Nmea2000),
-            (utf8("@ TEXT @ 3 @ 64 @ 0 @ 10094 @ 20672 @ 00:00:20.672 @\r"), Format::Carbus),
-            (utf8("# a fixture\n1320745424.002 1R11 402 FA 01\n"), Format::Crtd),
-            (utf8("1320745424.000 CXX OVMS converted log\n"), Format::Crtd),
-            (utf8("123.431 2R11 27E 00\n"), Format::Crtd),
-            (utf8("                              Kvaser Memorator Log\n"), Format::Kvaser),
-            (utf8("Chn Identifier Flg   DLC  D0...1...2...3\n"), Format::CanKing),
-            (utf8("SQLite format 3\0"), Format::Sqlite),
-            (utf8("(51.26) RX0 17FC007B [8] 01 02 03 04 05 06 07 08\n"), Format::BatteryEmulator),
-            (
-                utf8("TimestampEpoch;BusChannel;ID;IDE;DLC;DataLength;Dir;EDL;BRS;DataBytes\n"),
-                Format::CanEdgeCsv,
-            ),
-            (utf8("//-----\nMicrochip Technology Inc.\n"), Format::Microchip),
-            (utf8("Time   ID     DLC Data                    Comment\n"), Format::CanHacker),
-            (utf8("Timestamp: 1410714882.000000    ID:      123    S Rx"), Format::Printer),
-            (utf8("Timestamp: 1479121434.850202        ID: 0350    000    DLC: 8    05 28"), Format::Printer),
-            (utf8("timestamp,arbitration_id,data_field,attack\n1.0,0C1,00,0\n"), Format::Table),
-            (utf8("time,addr,bus,data\n"), Format::Table),
-            (utf8("Index;ID;Data\n"), Format::Table),
-            (utf8("1478198376.389427,0316,2,05,21,R\n"), Format::Table),
-            (utf8("1483093132.049669        0380    000    2    30 bb\n"), Format::Table),
-            (utf8("0.001 0x100 204E00000000\n"), Format::Table),
-            (utf8("11T082554602;1;cf00203;cd402800043828ff\n"), Format::Table),
-        ] {
-            assert_eq!(Format::of_content(&head), Some(format), "{}", String::from_utf8_lossy(&head));
-            let begins = FORMATS.iter().filter(|spec| (spec.begins)(&Head::of(&head)));
-            assert_eq!(begins.count(), 1, "{}", String::from_utf8_lossy(&head));
-        }
-        for head in ["", "rubbish", "   0.015991 1 123 Rx d 1 0A", "[8]", "{}"] {
-            assert_eq!(Format::of_content(head.as_bytes()), None, "{head}");
-        }
-    }
-
-    #[test]
-    fn each_format_has_a_row_and_names_of_its_own() {
-        for (at, spec) in FORMATS.iter().enumerate() {
-            assert_eq!(spec.format.to_string().parse(), Ok(spec.format));
-            for other in &FORMATS[at + 1..] {
-                assert_ne!(spec.format, other.format);
-                assert!(spec.names.iter().all(|name| !other.names.contains(name)), "{}", spec.format);
-            }
-        }
-        let dialects = [CsvDialect::PythonCan, CsvDialect::Full, CsvDialect::Analyser, CsvDialect::Gvret]
-            .map(Format::Csv);
-        let versions = [
-            TrcVersion::V2_1,
-            TrcVersion::V2_0,
-            TrcVersion::V1_3,
-            TrcVersion::V1_2,
-            TrcVersion::V1_1,
-            TrcVersion::V1_0,
-        ]
-        .map(Format::Trc);
-        for format in dialects.into_iter().chain(versions) {
-            assert_eq!(FormatSpec::of(format).format, format);
-        }
-    }
-
-    #[test]
-    fn a_format_that_is_only_read_is_not_written_and_nothing_is_created() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("a.log.bz2");
-        let error = crate::create_writer(&path, &crate::WriteOptions::default()).err().unwrap().to_string();
-        assert!(error.contains("only read") && error.contains(".xz") && !path.exists(), "{error}");
-        for format in Format::all().filter(|format| !format.is_written()) {
-            let path = dir.path().join("a");
-            let options = crate::WriteOptions { format: Some(format), ..Default::default() };
-            let error = crate::create_writer(&path, &options).err().unwrap().to_string();
-            assert!(error.contains("only read") && error.contains("mf4"), "{error}");
-            assert!(!path.exists());
-        }
     }
 }

@@ -24,6 +24,11 @@ impl Whole {
         Ok(Self { source, len })
     }
 
+    /// The source itself.
+    pub(crate) fn into_source(self) -> Box<dyn ReadSeek> {
+        self.source
+    }
+
     /// Length of the file in bytes.
     pub(crate) fn len(&self) -> u64 {
         self.len

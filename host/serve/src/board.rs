@@ -17,6 +17,7 @@ use crate::audit::Audit;
 use crate::board_figures::BoardFigures;
 use crate::client::{self, Guest};
 use crate::lock::lock;
+use crate::log_limit::LogLimit;
 use crate::modes;
 use crate::news::News;
 use crate::permissions::{Denied, Permissions, Permit};
@@ -86,8 +87,9 @@ impl Board {
             quit: AtomicBool::new(false),
             next_client: AtomicU64::new(1),
             news: Box::new(news),
-            refusals: Mutex::default(),
-            not_permitted: Mutex::default(),
+            refusals: Mutex::new(LogLimit::of_refusals()),
+            not_permitted: Mutex::new(LogLimit::of_refusals()),
+            sessions: Mutex::new(LogLimit::of_sessions()),
             permissions: Mutex::default(),
             audit: Mutex::default(),
             refused: AtomicU64::new(0),
@@ -159,6 +161,7 @@ impl Board {
             clients: state.clients.len() as u64,
             places: self.shared.settings.most_clients as u64,
             refused: self.shared.refused.load(Ordering::Relaxed),
+            counts_losses: state.hello.as_ref().is_none_or(Hello::counts_losses),
             channels: state.totals(),
             bitrates_bps: state.open.map(|open| open.map(|config| config.timing.bitrate_bps(clock_hz))),
         }

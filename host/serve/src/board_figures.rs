@@ -6,6 +6,8 @@ pub(crate) struct BoardFigures {
     pub clients: u64,
     pub places: u64,
     pub refused: u64,
+    /// Whether it counts the losses of its own controllers.
+    pub counts_losses: bool,
     pub channels: crate::totals::Totals,
     pub bitrates_bps: [Option<u32>; cantap_wire::CHANNELS],
 }

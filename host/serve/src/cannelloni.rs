@@ -175,37 +175,55 @@ impl End {
         }
     }
 
-    /// The frames in a datagram.
+    /// The frames in a datagram. What is left out of it, or missing before it, is reported.
     fn frames(&mut self, len: usize) -> Result<Vec<Frame>, &'static str> {
         if len > MOST_BYTES {
             return Err("it sent a datagram that is too long");
         }
-        let (header, mut rest) = match datagram(&self.buffer[..len]) {
+        let bytes = &self.buffer[..len];
+        let (header, mut rest) = match datagram(bytes) {
             Ok(datagram) => datagram,
             Err(NoDatagram::TooShort) => return Err("it sent a datagram that is too short"),
             Err(NoDatagram::Other) => return Err("it sent a datagram of another version or operation"),
         };
-        let mut left_out = match self.sequence.take(header.sequence) {
-            Order::Next => None,
-            Order::Missing(_) => Some("datagrams before this one are missing"),
-            Order::Late => Some("a datagram came late"),
+        let mut faults = match self.sequence.take(header.sequence, bytes) {
+            Order::Next => Vec::new(),
+            Order::Missing(1) => vec!["1 datagram before this one is missing".to_owned()],
+            Order::Missing(missing) => vec![format!("{missing} datagrams before this one are missing")],
+            Order::Late => vec!["a datagram came late".to_owned()],
+            Order::Repeated => return Err("a datagram came twice; what it holds was not sent again"),
         };
         let mut frames = Vec::new();
-        for _ in 0..header.count {
+        let (mut errors, mut fd, mut impossible) = (0, 0, 0);
+        for done in 0..header.count {
             let Some((item, after)) = item(rest) else {
-                left_out = Some("it sent a datagram that ends too early");
+                faults.push(format!(
+                    "it sent a datagram that ends before {} of its frames",
+                    header.count - done
+                ));
+                rest = &[];
                 break;
             };
             rest = after;
             match item {
                 Item::Frame(frame) => frames.push(frame),
-                Item::Error => left_out = Some("it sent an error frame"),
-                Item::Fd => left_out = Some("it sent a CAN FD frame"),
-                Item::Impossible => left_out = Some("it sent a frame that is none"),
+                Item::Error => errors += 1,
+                Item::Fd => fd += 1,
+                Item::Impossible => impossible += 1,
             }
         }
-        if let Some(reason) = left_out {
-            self.not_done(reason.to_owned());
+        if !rest.is_empty() {
+            faults.push(format!("{} bytes follow the frames that a datagram says it has", rest.len()));
+        }
+        for (count, what) in
+            [(errors, "error frames"), (fd, "CAN FD frames"), (impossible, "frames that are none")]
+        {
+            if count > 0 {
+                faults.push(format!("it sent {count} {what}"));
+            }
+        }
+        if !faults.is_empty() {
+            self.not_done(faults.join("; "));
         }
         Ok(frames)
     }

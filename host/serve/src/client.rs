@@ -325,6 +325,13 @@ impl Client {
         });
     }
 
+    /// The same for what every session does.
+    fn note_session(&self, event: &str, channel: Channel, more: impl FnOnce() -> Value) {
+        if self.shared.passes_session() {
+            self.note(event, channel, more);
+        }
+    }
+
     /// Records how many frames it sent since the last time.
     fn record_sent(&self) {
         let sent = std::mem::take(&mut *lock(&self.sent));
@@ -338,7 +345,7 @@ impl Client {
         let setup = self.setup();
         for channel in Channel::ALL {
             if self.is_open(channel) {
-                self.note("closed", channel, || json!({}));
+                self.note_session("closed", channel, || json!({}));
             }
             // If the board does not respond, its thread notices.
             let _ = self.close(channel);
@@ -437,13 +444,17 @@ impl Client {
                     let clock_hz = self.shared.state().hello.as_ref().map_or(1, |hello| hello.can_clock_hz);
                     let bitrate_bps = config.timing.bitrate_bps(clock_hz);
                     let mode = config.mode.name();
-                    self.note("opened", channel, || json!({ "mode": mode, "bitrate_bps": bitrate_bps }));
+                    self.note_session(
+                        "opened",
+                        channel,
+                        || json!({ "mode": mode, "bitrate_bps": bitrate_bps }),
+                    );
                 }
                 opened
             }
             Command::Close { channel } => {
                 let _setup = self.setup();
-                self.note("closed", channel, || json!({}));
+                self.note_session("closed", channel, || json!({}));
                 self.close(channel).map(|()| Reply::Done)
             }
             Command::Status => self.status(),

@@ -278,6 +278,7 @@ impl Connection {
             Some(there) if is_other(&there.config) => {
                 let before = there.config;
                 device.close_channel(channel).map_err(reason)?;
+                self.missed();
                 match open() {
                     Ok(config) => *bus = Some(open_bus(board, device, channel, config, sends_in)),
                     Err(error) => {
@@ -370,6 +371,9 @@ impl Connection {
             TraceEvent::TransmitFailed { tag, .. } => {
                 lock(&self.own[number]).failed(*tag);
                 lock(&self.left_out).count("failed transmissions", 1);
+            }
+            event if *event == TraceEvent::UNCOUNTED => {
+                lock(&self.left_out).count("that losses are not counted", 1);
             }
             TraceEvent::Lost { count, .. } => {
                 lock(&self.left_out).count("lost frames, or more", (*count).max(1));

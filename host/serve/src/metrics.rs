@@ -30,8 +30,9 @@ const MOST_CONNECTIONS: usize = 8;
 pub fn listen(boards: &[Arc<Board>], address: SocketAddr) -> io::Result<Listening> {
     let (listener, address) = bind(address)?;
     // A connection does not keep a server that ends from leaving its buses.
+    let names = distinct(boards.iter().map(|board| board.name()));
     let boards: Vec<(String, Weak<Board>)> =
-        boards.iter().map(|board| (board.name().to_owned(), Arc::downgrade(board))).collect();
+        names.into_iter().zip(boards.iter().map(Arc::downgrade)).collect();
     let places = Places::new(MOST_CONNECTIONS);
     Listening::start("cantap-metrics", Some(address), move || {
         let (stream, peer) = accept(&listener, Role::Listen)?;
@@ -44,6 +45,18 @@ pub fn listen(boards: &[Arc<Board>], address: SocketAddr) -> io::Result<Listenin
         })?;
         Ok(())
     })
+}
+
+/// The boards' names as labels. Of several boards with one name, the second has `#2` after it: two rows with the same labels would be no
+/// metrics.
+fn distinct<'n>(names: impl Iterator<Item = &'n str>) -> Vec<String> {
+    let mut all: Vec<String> = Vec::new();
+    for name in names {
+        let numbered = (2..).map(|number| format!("{name}#{number}"));
+        let mut candidates = std::iter::once(name.to_owned()).chain(numbered);
+        all.extend(candidates.find(|candidate| !all.contains(candidate)));
+    }
+    all
 }
 
 fn serve(boards: &[(String, Weak<Board>)], mut stream: TcpStream) -> io::Result<()> {
@@ -167,12 +180,16 @@ fn text(boards: &[(String, Weak<Board>)]) -> String {
         ("link", |of| of.lost_link),
         ("host", |of| of.lost_host),
     ];
-    let help = "Frames lost, by stage; those of the stage host are the sum over the clients that lost them.";
+    let help = "Frames lost, by stage; those of the stage host are the sum over the clients that lost them; an adapter that does not count its losses has no controller stage.";
     family("cantap_frames_lost_total", "counter", help, &mut |row| {
         for (number, (board, metrics)) in all.iter().enumerate() {
             for (channel, totals) in Channel::ALL.into_iter().zip(&metrics.channels) {
                 let channel = channel_number(number, channel);
                 for (stage, of) in stages {
+                    // What nobody counts has no figure.
+                    if stage == "controller" && !metrics.counts_losses {
+                        continue;
+                    }
                     row(&format!("board=\"{board}\",channel=\"{channel}\",stage=\"{stage}\""), of(totals));
                 }
             }
@@ -199,6 +216,13 @@ fn label(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn boards_of_one_name_have_labels_of_their_own() {
+        let labels = |names: &[&str]| distinct(names.iter().copied());
+        assert_eq!(labels(&["a", "b"]), ["a", "b"]);
+        assert_eq!(labels(&["a", "a", "a#2", "a"]), ["a", "a#2", "a#2#2", "a#3"]);
+    }
 
     #[test]
     fn only_the_figures_are_given_and_only_to_whoever_asks_for_an_address() {

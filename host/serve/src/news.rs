@@ -36,6 +36,11 @@ pub enum News {
         /// How many.
         count: u64,
     },
+    /// So many more reports of clients that came, opened and closed channels and left were not made since the last one: there are too many.
+    SessionsMore {
+        /// How many.
+        count: u64,
+    },
     /// A client said nothing for the dead-man time: what it has sent on its own is stopped.
     DeadMan {
         /// Its name.
@@ -104,6 +109,7 @@ impl News {
             Self::ClientLeft { .. } => "left",
             Self::Refused { .. } => "refused",
             Self::RefusedMore { .. } => "refused_more",
+            Self::SessionsMore { .. } => "sessions_more",
             Self::DeadMan { .. } => "dead_man",
             Self::NotPermitted { .. } => "not_permitted",
             Self::NotDone { .. } => "not_done",
@@ -128,6 +134,7 @@ impl News {
             | Self::Idle { client, .. }
             | Self::OffBus { client: Some(client), .. } => Some(client),
             Self::RefusedMore { .. }
+            | Self::SessionsMore { .. }
             | Self::OffBus { client: None, .. }
             | Self::BoardLost { .. }
             | Self::BoardBack { .. } => None,
@@ -143,6 +150,9 @@ impl fmt::Display for News {
             Self::ClientLeft { client, reason: Some(reason) } => write!(f, "{client} was let go: {reason}"),
             Self::Refused { client, reason } => write!(f, "{client} was not let in: {reason}"),
             Self::RefusedMore { count } => write!(f, "{count} more were refused"),
+            Self::SessionsMore { count } => {
+                write!(f, "clients come and leave too fast to report: {count} reports of that are left out")
+            }
             Self::DeadMan { client, after } => {
                 write!(
                     f,

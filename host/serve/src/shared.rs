@@ -87,6 +87,8 @@ pub(crate) struct Shared {
     pub refusals: Mutex<LogLimit>,
     /// The same for requests that are not permitted or not done.
     pub not_permitted: Mutex<LogLimit>,
+    /// The same for what sessions do that are let in.
+    pub sessions: Mutex<LogLimit>,
     /// Those of certificates, and the number of the board's first channel.
     pub permissions: Mutex<Option<(Arc<Permissions>, usize)>>,
     pub audit: Mutex<Option<Arc<Audit>>>,
@@ -103,6 +105,12 @@ impl Shared {
         let limit = match news {
             News::Refused { .. } => Some(&self.refusals),
             News::NotPermitted { .. } | News::NotDone { .. } => Some(&self.not_permitted),
+            News::ClientCame { .. } | News::ClientLeft { .. } | News::LeftOut { .. } => {
+                if self.passes_session() {
+                    self.report(news);
+                }
+                return;
+            }
             _ => None,
         };
         if let Some(limit) = limit {
@@ -113,6 +121,16 @@ impl Shared {
             }
         }
         self.report(news);
+    }
+
+    /// Whether what a session does is reported now. Sessions that come and leave as fast as they can must not fill a disk either; how many
+    /// reports are missing is one.
+    pub fn passes_session(&self) -> bool {
+        let passed = lock(&self.sessions).pass(Instant::now());
+        if let Some(count @ 1..) = passed {
+            self.report(News::SessionsMore { count });
+        }
+        passed.is_some()
     }
 
     fn report(&self, news: News) {

@@ -463,7 +463,9 @@ impl<'a> Reader<'a> {
         }
         let unit = method.and_then(|method| self.reference(method, "UNIT-REF")).or_else(|| find("UNIT-REF"));
         if let Some(unit) = unit {
-            signal.unit = content(unit, "DISPLAY-NAME").unwrap_or_else(|| short_name(unit));
+            let name = content(unit, "DISPLAY-NAME").unwrap_or_else(|| short_name(unit));
+            // What tools call the unit of a signal that has none.
+            signal.unit = if name == "NoUnit" { String::new() } else { name };
         }
         let initial = i_signal.children().find(|child| child.tag_name().name() == "INIT-VALUE");
         let initial = initial.and_then(|initial| within(initial, "VALUE").next()).map(xml::text);

@@ -5,20 +5,23 @@
 
 use std::borrow::Cow;
 use std::collections::HashSet;
-use std::ops::Range;
+use std::ops::{Range, RangeInclusive};
 
 use can_dbc::{Dbc, DbcError};
 use cantap_can::Id;
 use pest::error::{ErrorVariant, LineColLocation};
 
-use super::dbc_text::{Index, Statement};
+use super::dbc_text::{self, Index, Statement};
 use super::fault::{Fault, FaultKind};
 
 /// Holds signals that belong to no message, under an identifier that no frame can have.
 pub const NO_MESSAGE: &str = "VECTOR__INDEPENDENT_SIG_MSG";
 
 /// The flag of an extended identifier in a DBC file.
-pub const EXTENDED: u64 = 1 << 31;
+const EXTENDED: u64 = 1 << 31;
+
+/// The identifiers that need 29 bits.
+const LONG_IDS: RangeInclusive<u64> = 0x800..=0x1FFF_FFFF;
 
 /// The identifier for a number in the file, if a frame can have it.
 pub fn id_of(written: u64) -> Option<Id> {
@@ -41,7 +44,8 @@ pub fn parse(text: &str, faults: &mut Vec<Fault>) -> Option<(Dbc, Index)> {
         faults.push(Fault { line: 0, symbol: String::new(), kind: FaultKind::Syntax(reason) });
         return None;
     }
-    let (mut text, mut index) = without_bad_ids(text, index, faults);
+    let (flagged, index) = with_flags(text, index, faults);
+    let (mut text, mut index) = without_bad_ids(&flagged, index, faults);
     let mut error = match try_parse(&text) {
         Ok(dbc) => return Some((dbc, index)),
         Err(error) => error,
@@ -79,6 +83,30 @@ fn try_parse(text: &str) -> Result<Dbc, DbcError> {
     Dbc::try_from(format!("{text}\n").as_str())
 }
 
+/// The text with the flag on each identifier that needs 29 bits, in everything said about these messages: many files
+/// lack it. With the flag can-dbc keeps all bits.
+fn with_flags<'a>(text: &'a str, index: Index, faults: &mut Vec<Fault>) -> (Cow<'a, str>, Index) {
+    let is_unflagged = |(id, name, _): &&(u64, String, u32)| LONG_IDS.contains(id) && name != NO_MESSAGE;
+    let mut unflagged = index.messages.iter().filter(is_unflagged);
+    let Some((first, name, line)) = unflagged.next() else { return (Cow::Borrowed(text), index) };
+    let kind = FaultKind::UnflaggedIds { id: *first, messages: 1 + unflagged.count() };
+    faults.push(Fault { line: *line, symbol: name.clone(), kind });
+    let ids: HashSet<_> = index.messages.iter().filter(is_unflagged).map(|&(id, ..)| id).collect();
+    let (mut flagged, mut used) = (String::with_capacity(text.len() + 2 * index.statements.len()), 0);
+    for statement in &index.statements {
+        let Some(place) = dbc_text::id_place(&text[statement.range.clone()]) else { continue };
+        let place = statement.range.start + place.start..statement.range.start + place.end;
+        if let Some(id) = text[place.clone()].parse().ok().filter(|id| ids.contains(id)) {
+            flagged.push_str(&text[used..place.start]);
+            flagged.push_str(&(id | EXTENDED).to_string());
+            used = place.end;
+        }
+    }
+    flagged.push_str(&text[used..]);
+    let index = Index::of(&flagged);
+    (flagged.into(), index)
+}
+
 /// Leaves out messages whose identifier no frame can have, and everything said about them: can-dbc keeps 16 bits of a
 /// standard identifier and would attach those statements to another message.
 fn without_bad_ids<'a>(text: &'a str, index: Index, faults: &mut Vec<Fault>) -> (Cow<'a, str>, Index) {
@@ -106,20 +134,12 @@ fn without_messages(text: &str, index: &Index, ids: &HashSet<String>) -> String 
     while place < index.statements.len() {
         let block = block(&index.statements, place);
         let range = range_of(&index.statements[block.clone()]);
-        if id_word(&text[range.clone()]).is_some_and(|id| ids.contains(id)) {
+        if dbc_text::id(&text[range.clone()]).is_some_and(|id| ids.contains(id)) {
             blanks.blank(range);
         }
         place = block.end;
     }
     blanks.text()
-}
-
-/// The identifier of a statement's message: `BO_ ID`, `VAL_ ID SIGNAL`, `CM_ SG_ ID SIGNAL`, `BA_ "ATTRIBUTE"
-/// SG_ ID SIGNAL VALUE`.
-fn id_word(statement: &str) -> Option<&str> {
-    let words: Vec<_> = statement.lines().next()?.split_whitespace().take(4).collect();
-    let kind = words.iter().skip(1).position(|word| matches!(*word, "BO_" | "SG_"));
-    words.get(kind.map_or(1, |kind| kind + 2)).copied()
 }
 
 /// The text with each statement that can-dbc refuses replaced by spaces; a message goes with its signals.
@@ -163,7 +183,7 @@ fn without_bad_statements(text: &str, faults: &mut Vec<Fault>) -> String {
             faults.push(fault(culprit, line, reason, is_message || is_orphan));
         }
         let changes_values = matches!(first.keyword.as_str(), "BO_" | "SIG_VALTYPE_" | "SG_MUL_VAL_");
-        if changes_values && let Some(id) = id_word(piece) {
+        if changes_values && let Some(id) = dbc_text::id(piece) {
             messages.insert(id.to_owned());
         }
         left_out = is_message || is_orphan;

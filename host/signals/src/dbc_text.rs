@@ -240,6 +240,34 @@ impl Index {
     }
 }
 
+/// Where in a statement its message's identifier is: `BO_ ID`, `VAL_ ID SIGNAL`, `CM_ SG_ ID SIGNAL`, `BA_ "ATTRIBUTE"
+/// SG_ ID SIGNAL VALUE`.
+pub fn id_place(statement: &str) -> Option<Range<usize>> {
+    let line = statement.split('\n').next()?;
+    let mut end = 0;
+    let mut next = || {
+        let is_between = |c: char| c.is_ascii_whitespace() || c == ':';
+        let start = end + line[end..].find(|c| !is_between(c))?;
+        end = start + line[start..].find(is_between).unwrap_or(line.len() - start);
+        Some(start..end)
+    };
+    let word = match &line[next()?] {
+        // A signal's name may be a number.
+        "SG_" => return None,
+        keyword @ ("BA_" | "CM_") => {
+            let object = if keyword == "BA_" { next().and_then(|_| next())? } else { next()? };
+            matches!(&line[object], "BO_" | "SG_").then(&mut next)??
+        }
+        _ => next()?,
+    };
+    line[word.clone()].bytes().all(|byte| byte.is_ascii_digit()).then_some(word)
+}
+
+/// The identifier of a statement's message, as written.
+pub fn id(statement: &str) -> Option<&str> {
+    id_place(statement).map(|place| &statement[place])
+}
+
 /// Whether a string is open at the line's end. `\"` inside one does not close it.
 fn ends_in_string(line: &str, mut in_string: bool) -> bool {
     let mut bytes = line.bytes().peekable();
@@ -333,6 +361,29 @@ mod tests {
             (12, 9, 13)
         );
         assert_eq!(index.place_at(11), Some(5));
+    }
+
+    #[test]
+    fn a_statement_s_identifier_is_no_number_of_its_text() {
+        for (statement, expected) in [
+            ("BO_ 5 First: 8 A\n SG_ One : 0|8@1+", Some("5")),
+            (" SG_ 5 : 0|8@1+ (1,0) [0|0] \"\" A", None),
+            ("CM_ BO_ 5 \"6\";", Some("5")),
+            ("CM_ SG_ 5 One \"6\";", Some("5")),
+            ("BA_ \"Cycle\" BO_ 5 100;", Some("5")),
+            ("BA_ \"Cycle\" SG_ 5 One 100;", Some("5")),
+            ("BO_TX_BU_ 5 : A,B;", Some("5")),
+            ("VAL_ 5 One 6 \"a\" ;", Some("5")),
+            ("CM_ \"see BO_ 5\";", None),
+            ("CM_ \" BO_ 5 is old\";", None),
+            ("BA_ \"Year\" 5;", None),
+            ("BA_ \"Cycle\" BU_ Node 5;", None),
+            ("VAL_ Variable 5 \"a\" ;", None),
+            ("BO_", None),
+            ("", None),
+        ] {
+            assert_eq!(id(statement), expected, "{statement}");
+        }
     }
 
     #[test]

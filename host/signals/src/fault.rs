@@ -80,10 +80,19 @@ pub enum FaultKind {
     #[error("{0}")]
     Syntax(String),
     /// An identifier that no frame can have.
-    #[error(
-        "identifier 0x{0:X} does not fit 11 bits (standard) or 29 bits (extended: add 0x80000000 in DBC)"
-    )]
+    #[error("identifier 0x{0:X} does not fit 11 bits (standard) or 29 bits (extended)")]
     Id(u64),
+    /// Identifiers of 29 bits without the flag that DBC files mark them with. Each is taken for an extended one.
+    #[error(
+        "identifier 0x{id:X} lacks the flag of extended identifiers (0x80000000) and does not fit 11 bits; {messages} such \
+         {} read as extended", if *.messages == 1 { "message is" } else { "messages are" }
+    )]
+    UnflaggedIds {
+        /// The first such identifier, as written in the file.
+        id: u64,
+        /// The number of messages with such identifiers.
+        messages: usize,
+    },
     /// A signal without bits.
     #[error("a signal needs at least 1 bit")]
     NoBits,
@@ -183,6 +192,7 @@ impl FaultKind {
                 | Self::Ignored(_)
                 | Self::LeftOut(_)
                 | Self::Encoding(_)
+                | Self::UnflaggedIds { .. }
                 | Self::OddFloat(_)
         )
     }

@@ -23,6 +23,7 @@ mod j1939;
 pub mod kcd;
 mod layout;
 mod model;
+pub mod named;
 mod number;
 mod picture;
 mod plan;

@@ -107,6 +107,11 @@ impl Suggestion {
         let best = scored.max_by(|(a, _), (b, _)| a.total_cmp(b)).filter(|&(like, _)| like >= LIKE);
         Self(best.map(|(_, name)| name.to_owned()))
     }
+
+    /// Whether no name is similar.
+    pub const fn is_none(&self) -> bool {
+        self.0.is_none()
+    }
 }
 
 impl fmt::Display for Suggestion {

@@ -1,6 +1,6 @@
 """cantools' decoded values, as JSON lines, for tests/signals_agree_with_cantools.rs.
 
-    cantools_peer.py decode FILE...    $PAYLOADS random payloads, or 100, per message of each database
+    cantools_peer.py decode FILE...    what each signal of each database is, and $PAYLOADS random payloads, or 100, per message
     cantools_peer.py files DIR         fetch cantools' source from PyPI and print its test files
     cantools_peer.py others DIR        as files, the databases of canmatrix and opendbc
 
@@ -12,6 +12,7 @@ import json
 import os
 import pathlib
 import random
+import re
 import subprocess
 import sys
 import tarfile
@@ -73,17 +74,81 @@ def decode_container(message, data, texts):
     return values
 
 
-def decode_file(path):
+def signal_layout(signal):
+    kind = "float" if signal.is_float else "signed" if signal.is_signed else "unsigned"
+    return {
+        "start": signal.start,
+        "length": signal.length,
+        "little": signal.byte_order == "little_endian",
+        "kind": kind,
+        "scale": repr(float(signal.scale)),
+        "offset": repr(float(signal.offset)),
+        "unit": signal.unit or "",
+        "switch": signal.multiplexer_signal if signal.multiplexer_ids else None,
+        "ids": sorted(signal.multiplexer_ids or []),
+        "texts": {str(int(raw)): str(choice) for raw, choice in (signal.choices or {}).items()},
+    }
+
+
+def with_switches(message, node, data, random_bytes):
+    """The payload with multiplexers at values that the database lists: random ones rarely meet those of long multiplexers."""
+    number = int.from_bytes(data, "little")
+    for switch, children in node["multiplexers"].items():
+        signal = message.get_signal_by_name(switch)
+        value = random_bytes.choice(list(children))
+        positions = range(signal.start, signal.start + signal.length)
+        if signal.byte_order == "big_endian":
+            first = signal.start // 8 * 8 + 7 - signal.start % 8
+            positions = [at // 8 * 8 + 7 - at % 8 for at in range(first + signal.length - 1, first - 1, -1)]
+        for place, bit in enumerate(positions):
+            number = number & ~(1 << bit) | (value >> place & 1) << bit
+        data = (number & (1 << 8 * len(data)) - 1).to_bytes(len(data), "little")
+        data = with_switches(message, children[value], data, random_bytes)
+        number = int.from_bytes(data, "little")
+    return data
+
+
+IDENTIFIER = re.compile(r'^((?:BO_|VAL_|SIG_VALTYPE_|SG_MUL_VAL_|BO_TX_BU_|SIG_GROUP_|(?:CM_|BA_ +"\w+") +(?:BO_|SG_)) +)(\d+)', re.M)
+
+
+def with_flags(text):
+    """A DBC file with the flag on each identifier that needs 29 bits, which cantools refuses without."""
+    flag = lambda id: id | 1 << 31 if 0x7FF < id < 0x20000000 else id
+    return IDENTIFIER.sub(lambda found: found[1] + str(flag(int(found[2]))), text)
+
+
+def load(path):
     import cantools
 
+    kind = pathlib.Path(path).suffix.lower()[1:]
+    if kind != "dbc":
+        return cantools.database.load_file(path, database_format=kind, strict=False)
+    content = pathlib.Path(path).read_bytes()
     try:
-        database = cantools.database.load_file(path, database_format=pathlib.Path(path).suffix.lower()[1:], strict=False)
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = content.decode("cp1252", errors="replace")
+    try:
+        return cantools.database.load_string(text, database_format="dbc", strict=False)
+    except cantools.database.UnsupportedDatabaseFormatError as error:
+        if "is more than 11 bits" not in str(error):
+            raise
+        return cantools.database.load_string(with_flags(text), database_format="dbc", strict=False)
+
+
+def decode_file(path):
+    try:
+        database = load(path)
     except Exception as error:  # the reason why cantools refuses a file is its answer
         print(json.dumps({"file": path, "refused": str(error).splitlines()[0]}))
         return
     print(json.dumps({"file": path, "messages": len(database.messages)}))
     random_bytes = random.Random(618)
     for message in database.messages:
+        head = {"message": message.name, "id": message.frame_id, "extended": message.is_extended_frame}
+        if not message.is_container:
+            layouts = [[signal.name, signal_layout(signal)] for signal in message.signals]
+            print(json.dumps({**head, "length": message.length, "layouts": layouts}))
         for number in range(PAYLOADS):
             length = message.length
             if number % TRUNCATED_EVERY == 0 and length:
@@ -91,8 +156,9 @@ def decode_file(path):
             data = random_bytes.randbytes(length)
             if message.is_container:
                 data = contained(message, random_bytes)
-            answer = {"message": message.name, "id": message.frame_id, "extended": message.is_extended_frame}
-            answer["data"] = data.hex()
+            elif number % 2:
+                data = with_switches(message, message._codecs, data, random_bytes)
+            answer = {**head, "data": data.hex()}
             try:
                 texts = {}
                 if message.is_container:

@@ -31,6 +31,9 @@ pub struct ChannelCounters {
     pub lost_link: u64,
     /// Frames that arrived but that a slow consumer lost.
     pub lost_host: u64,
+    /// How often an unknown number of frames was lost, or may have been: where the device was deaf or its buffer was full, and once each time
+    /// that the channel starts on a device that does not count its losses.
+    pub unknown: u64,
     /// How often the device was off the bus while the channel was open, because another client of its server changed the mode: an unknown
     /// number of frames is missing each time.
     pub off_bus: u64,
@@ -44,7 +47,7 @@ impl ChannelCounters {
         self.received - self.lost_host
     }
 
-    /// Frames lost at any stage that can count them. While the device was off the bus, none can: see [`Self::off_bus`].
+    /// Frames lost at any stage that can count them. Others are missing where none can: see [`Self::unknown`] and [`Self::off_bus`].
     pub const fn lost(&self) -> u64 {
         self.lost_controller + self.lost_queue + self.lost_link + self.lost_host
     }
@@ -71,6 +74,7 @@ impl Add for ChannelCounters {
             lost_queue: self.lost_queue + other.lost_queue,
             lost_link: self.lost_link + other.lost_link,
             lost_host: self.lost_host + other.lost_host,
+            unknown: self.unknown + other.unknown,
             off_bus: self.off_bus + other.off_bus,
             off_bus_ns: self.off_bus_ns + other.off_bus_ns,
         }
@@ -149,6 +153,8 @@ pub struct Intake {
     tick_hz: u32,
     /// How far a time may be before that of the preceding record, in ticks.
     disorder_ticks: u64,
+    /// Whether the device counts its losses.
+    counts_losses: bool,
     /// Whether `Hello` was answered; anything earlier belongs to another program's session.
     in_session: bool,
 }
@@ -170,6 +176,7 @@ impl Intake {
             off_bus_since: [None; CHANNELS],
             tick_hz: cantap_tick_hz_before_hello(),
             disorder_ticks: u64::MAX,
+            counts_losses: true,
             in_session: false,
         }
     }
@@ -191,6 +198,7 @@ impl Intake {
             off_bus_since,
             tick_hz,
             disorder_ticks,
+            counts_losses,
         } = self;
         let mut last_ticks = None;
         let mut ended = None;
@@ -213,6 +221,11 @@ impl Intake {
             Decoded::Record { ticks, record: Record::Event(event) } => {
                 last_ticks = Some(ticks);
                 follow_bus(event, ticks, *tick_hz, off_bus_since, counters);
+                if let (Event::Started { channel }, false) = (event, *counts_losses) {
+                    counters.channels[channel.index()].unknown += 1;
+                    let (at, channel) = (Ticks(ticks), channel.number());
+                    stamped.push(Stamped { at, channel, event: TraceEvent::UNCOUNTED });
+                }
                 on_event(event, Ticks(ticks), counters, clock, stamped, &mut notice);
             }
             Decoded::BatchesLost { frames, .. } => {
@@ -234,6 +247,7 @@ impl Intake {
                     last_ticks = None;
                     *latest_ticks = 0;
                     *tick_hz = answer.tick_hz.max(1);
+                    *counts_losses = answer.counts_losses();
                     *disorder_ticks = u64::from(answer.tick_hz) / DISORDER_PER_S;
                     *counters = Counters::default();
                     *off_bus_since = [None; CHANNELS];
@@ -267,6 +281,11 @@ impl Intake {
         if let Some((ticks, reason)) = ended {
             notice(Notice::Ended { time_ns: self.clock.utc(Ticks(ticks)).0, reason });
         }
+        &mut self.records
+    }
+
+    /// The records that wait to be taken out of the vector.
+    pub const fn records(&mut self) -> &mut Vec<TraceRecord> {
         &mut self.records
     }
 
@@ -429,6 +448,8 @@ fn on_event(
     let (channel, event) = match event {
         Event::Lost { channel, stage, count, at_least } => {
             let counters = &mut counters.channels[channel.index()];
+            // On the link, this is a time off the bus, which has a count of its own.
+            counters.unknown += u64::from(count == 0 && at_least && stage != LossStage::Link);
             match stage {
                 LossStage::Controller => counters.lost_controller += u64::from(count),
                 LossStage::Queue => counters.lost_queue += u64::from(count),

@@ -300,7 +300,7 @@ impl Device {
         receiver
     }
 
-    /// What has been received and lost so far.
+    /// What has been received and lost so far: at least every record that was already handed over.
     pub fn counters(&self) -> Counters {
         self.shared.published().counters
     }

@@ -54,6 +54,11 @@ pub enum ParseFilterError {
     JoinedRange(String),
 }
 
+/// Whether one of several filters accepts a record. Without filters, every record passes.
+pub fn passes(filters: &[Filter], record: &TraceRecord) -> bool {
+    filters.is_empty() || filters.iter().any(|filter| filter.accepts(record))
+}
+
 impl Filter {
     /// A filter that accepts everything on one channel.
     pub fn on_channel(channel: u8) -> Self {

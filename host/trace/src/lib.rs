@@ -18,6 +18,7 @@ mod id_filter;
 mod interface;
 mod length;
 pub mod levels;
+pub mod packed;
 mod plain;
 pub mod playback;
 mod record;

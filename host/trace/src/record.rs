@@ -79,6 +79,8 @@ pub enum TraceEvent {
 impl TraceEvent {
     /// Nothing is known from here to the next record: the device was not there. The number of missing frames is unknown.
     pub const GAP: Self = Self::Lost { stage: Some(LossStage::Link), count: 0, at_least: true };
+    /// A channel starts here on a device that does not count its losses: from here on, frames may be missing without another record.
+    pub const UNCOUNTED: Self = Self::Lost { stage: None, count: 0, at_least: true };
 }
 
 impl TraceRecord {

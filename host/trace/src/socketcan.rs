@@ -147,8 +147,8 @@ impl ErrorFrame {
         if has(CONTROLLER) && data[1] & RX_OVERFLOW != 0 {
             let stage = STAGES.get((data[0] & !AT_LEAST).wrapping_sub(1) as usize).copied();
             let is_at_least = data[0] & AT_LEAST != 0;
-            // There is a count only if nothing else uses the bytes. A loss of unknown size has no count, but it has a stage.
-            let counted = (number > 0 || is_at_least && stage.is_some()) && !has(PROTOCOL);
+            // There is a count only if nothing else uses the bytes. A loss of unknown size has no count, but the flag, which drivers never set.
+            let counted = (number > 0 || is_at_least) && !has(PROTOCOL);
             let (count, at_least) = if counted { (number, is_at_least) } else { (1, true) };
             return (TraceEvent::Lost { stage, count, at_least }, None);
         }

@@ -42,6 +42,7 @@ pub fn event() -> impl Strategy<Value = TraceEvent> {
         (prop::option::of(prop::sample::select(LossStage::ALL.to_vec())), 1..=u32::MAX, any::<bool>())
             .prop_map(|(stage, count, at_least)| TraceEvent::Lost { stage, count, at_least }),
         Just(TraceEvent::GAP),
+        Just(TraceEvent::UNCOUNTED),
         (prop::option::of(prop::sample::select(BusErrorKind::ALL.to_vec())), counters.clone())
             .prop_map(|(kind, counters)| TraceEvent::BusError { kind, counters }),
         (1..=u32::MAX).prop_map(|count| TraceEvent::ErrorsSuppressed { count }),

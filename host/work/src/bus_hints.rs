@@ -27,12 +27,14 @@ impl BusEvidence {
     pub fn take(&mut self, event: &TraceEvent) {
         match event {
             TraceEvent::Frame { .. } => self.frames += 1,
+            // For the start of a channel whose losses are not counted, nothing was on the bus.
+            TraceEvent::Lost { stage: None, count: 0, at_least: true }
+            | TraceEvent::TransmitFailed { .. } => {}
             TraceEvent::Lost { count, .. } => self.frames += u64::from(*count).max(1),
             TraceEvent::BusError { kind: Some(kind), .. } => self.errors[index(*kind)] += 1,
             TraceEvent::BusError { kind: None, .. } => self.unknown_errors += 1,
             TraceEvent::ErrorsSuppressed { count } => self.unknown_errors += u64::from(*count),
             TraceEvent::State { state, .. } => self.state = Some(*state),
-            TraceEvent::TransmitFailed { .. } => {}
         }
     }
 
@@ -266,6 +268,8 @@ mod tests {
         let back = TraceEvent::State { state: ErrorState::Active, counters: None };
         for (events, hint) in [
             (vec![], BusHint::Silent),
+            // That an adapter counts no losses is no sign of traffic.
+            (vec![TraceEvent::UNCOUNTED], BusHint::Silent),
             (vec![error(Stuff), error(Form)], BusHint::WrongBitRate),
             (vec![error(Crc)], BusHint::WrongBitRate),
             (vec![unknown], BusHint::WrongBitRate),

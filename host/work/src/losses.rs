@@ -13,6 +13,9 @@ pub struct Losses {
     pub link: u64,
     /// In the host.
     pub host: u64,
+    /// How often an unknown number of frames was lost, or may have been: at the start of each channel of a device that does not count its
+    /// losses, for example.
+    pub unknown: u64,
     /// How often the device was off a bus, because another client of its server changed the mode: an unknown number of frames each time.
     pub off_bus: u64,
     /// For how long in total, in microseconds.
@@ -28,6 +31,7 @@ impl Losses {
             losses.queue += channel.lost_queue;
             losses.link += channel.lost_link;
             losses.host += channel.lost_host;
+            losses.unknown += channel.unknown;
             losses.off_bus += channel.off_bus;
             losses.off_bus_us += channel.off_bus_ns / 1000;
         }
@@ -42,6 +46,7 @@ impl Losses {
             queue: self.queue + other.queue,
             link: self.link + other.link,
             host: self.host + other.host,
+            unknown: self.unknown + other.unknown,
             off_bus: self.off_bus + other.off_bus,
             off_bus_us: self.off_bus_us + other.off_bus_us,
         }
@@ -52,10 +57,20 @@ impl Losses {
         self.controller + self.queue + self.link + self.host
     }
 
+    /// Whether no frame is known to be missing, nor can be without being known.
+    pub const fn is_none(&self) -> bool {
+        self.total() == 0 && self.unknown == 0 && self.off_bus == 0
+    }
+
     /// One line.
     pub fn line(&self) -> String {
-        let Self { controller, queue, link, host, off_bus, off_bus_us } = self;
+        let Self { controller, queue, link, host, unknown, off_bus, off_bus_us } = self;
         let stages = format!("controller {controller}, queue {queue}, link {link}, host {host}");
+        let stages = match unknown {
+            0 => stages,
+            1 => format!("{stages}, and an unknown number"),
+            places => format!("{stages}, and an unknown number at {places} places"),
+        };
         if *off_bus == 0 {
             return stages;
         }
@@ -89,6 +104,10 @@ mod tests {
             some.plus(none).line(),
             "controller 0, queue 0, link 0, host 0, off the bus an unknown number, 30 times, 4.9 ms in total"
         );
+        let uncounted = Losses { unknown: 1, ..none };
+        assert_eq!(uncounted.line(), "controller 0, queue 0, link 0, host 0, and an unknown number");
+        assert!(uncounted.plus(uncounted).line().ends_with("an unknown number at 2 places"));
+        assert!(none.is_none() && !some.is_none() && !uncounted.is_none());
         assert_eq!(lost_frames(0, false), "0");
         assert_eq!(lost_frames(0, true), "an unknown number");
         assert_eq!(lost_frames(7, true), "at least 7");

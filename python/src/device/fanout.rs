@@ -12,7 +12,7 @@ use cantap::device::{Buffer, Records};
 use cantap::wire::record::LossStage;
 use cantap::wire::{CHANNELS, Channel};
 use cantap::{Direction, TraceEvent, TraceRecord};
-use cantap_trace::filter::Filter;
+use cantap_trace::filter::{Filter, passes};
 
 use super::lock::lock;
 use super::transmissions::{NOBODY, SenderId, Transmissions};
@@ -68,11 +68,6 @@ impl Wanted {
             (self.channel.is_none() || self.channel == Some(record.channel)) && passes(&self.filters, record);
         is_wanted.then_some(taken)
     }
-}
-
-/// Whether one of the filters accepts a record; without filters all are accepted.
-fn passes(filters: &[Filter], record: &TraceRecord) -> bool {
-    filters.is_empty() || filters.iter().any(|filter| filter.accepts(record))
 }
 
 /// A listener.

@@ -394,7 +394,8 @@ impl Device {
 
     /// The status of the device and its channels.
     fn status<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        let status = self.ask(py, cantap::Device::status)?;
+        let (status, counts_losses) =
+            self.ask(py, |device| Ok((device.status()?, device.hello().counts_losses())))?;
         let channels = Channel::ALL.map(|channel| {
             let state = &status.channels[channel.index()];
             json!({
@@ -406,7 +407,7 @@ impl Device {
                 "rec": state.rec,
                 "last_error": state.last_error.map(BusErrorKind::name),
                 "frames": state.frames,
-                "lost_controller": state.lost_controller,
+                "lost_controller": counts_losses.then_some(state.lost_controller),
                 "lost_queue": state.lost_queue,
                 "bus_errors": state.bus_errors,
                 "transmitted": state.transmitted,
@@ -424,8 +425,8 @@ impl Device {
         from_json(py, &object.to_string())
     }
 
-    /// Frames received and lost since the session began, by channel and stage. `off_bus` is how often the device was off the bus because
-    /// another client of its server changed the mode, `off_bus_ns` for how long: an unknown number of frames is missing each time.
+    /// Frames received and lost since the session began, by channel and stage. `unknown` is how often an unknown number was lost, or may have
+    /// been, as on an adapter that does not count its losses. `off_bus` is how often the device was off the bus because another client of its server changed the mode, `off_bus_ns` for how long: an unknown number of frames is missing each time.
     fn losses<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let session = self.session()?;
         let counters = session.device()?.counters();
@@ -438,6 +439,7 @@ impl Device {
             counts.set_item("queue", of.lost_queue)?;
             counts.set_item("link", of.lost_link)?;
             counts.set_item("host", of.lost_host)?;
+            counts.set_item("unknown", of.unknown)?;
             counts.set_item("off_bus", of.off_bus)?;
             counts.set_item("off_bus_ns", of.off_bus_ns)?;
             counts.set_item("lost", of.lost())?;

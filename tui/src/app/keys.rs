@@ -132,6 +132,10 @@ impl App {
             (View::Fixed, KeyCode::Char('H')) => self.heat = !self.heat,
             (View::Fixed, KeyCode::Char('#')) => self.each_seen(model, |seen| seen.table.notch()),
             (View::Fixed, KeyCode::Char('*')) => self.each_seen(model, |seen| seen.table.unnotch()),
+            (View::Fixed, KeyCode::Char('z')) => {
+                let begins = model.seen.table.compared_since_ns.is_none();
+                self.each_seen(model, |seen| seen.table.compare_since(begins.then_some(seen.now_ns)));
+            }
             (View::Fixed, KeyCode::Char('u')) => self.each_seen(model, |seen| seen.table.unhide()),
             (View::Fixed, KeyCode::Char(key @ ('x' | 'o'))) => self.mark_row(key == 'x', model),
             (View::Signals, KeyCode::Enter) => {

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use cantap_trace::filter::Filter;
+use cantap_signals::named::{NameError, NamedFilter};
 use ratatui::crossterm::event::KeyCode;
 
 use super::super::model::Model;
@@ -86,9 +86,15 @@ impl App {
     }
 
     fn set_filters(&mut self, text: &str, model: &mut Model) -> Result<(), String> {
-        let filters =
-            text.split_whitespace().map(|part| part.parse::<Filter>().map_err(|error| error.to_string()));
-        let filters = filters.collect::<Result<Vec<_>, _>>()?;
+        let decoder = model.seen.signals.decoder();
+        let resolve = |part: &str| {
+            let filter = part.parse::<NamedFilter>().map_err(|error| error.to_string())?;
+            filter.resolve(decoder).map_err(|error| match error {
+                NameError::NoDatabase(_) => format!("{error}; O opens one"),
+                error => error.to_string(),
+            })
+        };
+        let filters = text.split_whitespace().map(resolve).collect::<Result<Vec<_>, _>>()?;
         self.cursor = model.history.set_filters(filters, self.cursor);
         Ok(())
     }

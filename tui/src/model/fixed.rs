@@ -34,6 +34,12 @@ pub struct Row {
     pub heat: Box<[u32; 8 * FD_MAX_BYTES]>,
     /// Bits whose changes are suppressed, by byte.
     pub notched: [u8; FD_MAX_BYTES],
+    /// Bits that have changed since the comparison began, without those suppressed, by byte.
+    pub changed_since: [u8; FD_MAX_BYTES],
+    /// Its first frame came after the comparison began.
+    pub is_new: bool,
+    /// Its length has changed, or whether it is remote, since the comparison began.
+    pub length_changed: bool,
     /// Whether it is hidden.
     pub hidden: bool,
     /// Number of its marking colour; 0 for none.
@@ -55,6 +61,9 @@ impl Row {
             changed_ns: Box::new([i64::MIN; 2 * FD_MAX_BYTES]),
             heat: Box::new([0; 8 * FD_MAX_BYTES]),
             notched: [0; FD_MAX_BYTES],
+            changed_since: [0; FD_MAX_BYTES],
+            is_new: false,
+            length_changed: false,
             hidden: false,
             mark: 0,
             gap: false,
@@ -75,6 +84,8 @@ impl Row {
             }
         }
         if self.count > 0 {
+            let length = |frame: &TraceFrame| (frame.dlc(), frame.is_remote());
+            self.length_changed |= length(&self.frame) != length(&frame);
             for at in 0..self.frame.data_len().max(frame.data_len()) {
                 let byte = |frame: &TraceFrame| frame.data().get(at).copied().unwrap_or(0);
                 self.byte_changed(at, byte(&self.frame) ^ byte(&frame), time_ns);
@@ -96,6 +107,7 @@ impl Row {
             // Suppressed changes do not deserve attention.
             if self.notched[at] >> (7 - bit) & 1 == 0 {
                 self.changed_ns[place / 4] = time_ns;
+                self.changed_since[at] |= 1 << (7 - bit);
             }
             bits &= !(1 << (7 - bit));
         }
@@ -115,6 +127,20 @@ impl Row {
                 self.notched[bit / 8] |= 1 << (7 - bit % 8);
             }
         }
+        for (changed, notched) in self.changed_since.iter_mut().zip(&self.notched) {
+            *changed &= !notched;
+        }
+    }
+
+    /// Whether it is new, or its length or any of its bits has changed, since the comparison began.
+    pub fn has_changed(&self) -> bool {
+        self.is_new || self.length_changed || self.changed_since.iter().any(|bits| *bits != 0)
+    }
+
+    /// Whether a hexadecimal digit has changed since the comparison began, counted as in [`Self::changed_ns`].
+    pub const fn has_digit_changed(&self, digit: usize) -> bool {
+        let bits = if digit.is_multiple_of(2) { 0xF0 } else { 0x0F };
+        self.is_new || self.changed_since[digit / 2] & bits != 0
     }
 }
 
@@ -125,6 +151,8 @@ pub struct FixedTable {
     places: HashMap<(u8, Id), usize>,
     /// Frames of identifiers for which there was no room.
     pub unlisted: u64,
+    /// When the comparison began, if there is one: only what has changed since then is shown.
+    pub compared_since_ns: Option<i64>,
 }
 
 impl FixedTable {
@@ -136,7 +164,8 @@ impl FixedTable {
                 let place = match self.places.get(&key) {
                     Some(place) => *place,
                     None if self.rows.len() < MOST_ROWS => {
-                        self.rows.push(Row::new(record, frame, direction));
+                        let is_new = self.compared_since_ns.is_some();
+                        self.rows.push(Row { is_new, ..Row::new(record, frame, direction) });
                         self.places.insert(key, self.rows.len() - 1);
                         self.rows.len() - 1
                     }
@@ -173,6 +202,20 @@ impl FixedTable {
     /// One row, to mark or hide it.
     pub fn row_mut(&mut self, channel: u8, id: Id) -> Option<&mut Row> {
         self.places.get(&(channel, id)).map(|place| &mut self.rows[*place])
+    }
+
+    /// Begins to compare with the frames as they are now, at this time, or stops comparing.
+    pub fn compare_since(&mut self, since_ns: Option<i64>) {
+        self.compared_since_ns = since_ns;
+        for row in &mut self.rows {
+            row.changed_since = [0; FD_MAX_BYTES];
+            (row.is_new, row.length_changed) = (false, false);
+        }
+    }
+
+    /// The number of bits whose changes are suppressed.
+    pub fn notched_bits(&self) -> u32 {
+        self.rows.iter().flat_map(|row| row.notched).map(u8::count_ones).sum()
     }
 
     /// Suppresses changes of all bits that have changed so far: those that change anyway.
@@ -230,6 +273,41 @@ mod tests {
         table.unnotch();
         take(&mut table, 40, "123#8110");
         assert_eq!(table.rows()[0].changed_ns[..4], [30, 40, -1, 40].map(ns));
+    }
+
+    #[test]
+    fn a_comparison_has_what_changed_since_it_began_and_nothing_of_before() {
+        let mut table = FixedTable::default();
+        for (time, text) in [(0, "123#0011"), (10, "123#0110"), (10, "124#00")] {
+            take(&mut table, time, text);
+        }
+        table.compare_since(Some(10_000_000));
+        assert!(table.rows().iter().all(|row| !row.has_changed()));
+        // Also what is as before again has changed.
+        for text in ["123#0210", "123#0110", "125#00"] {
+            take(&mut table, 20, text);
+        }
+        let different = |table: &FixedTable| table.rows().iter().map(Row::has_changed).collect::<Vec<_>>();
+        assert_eq!(different(&table), [true, false, true]);
+        let row = &table.rows()[0];
+        assert_eq!(
+            (0..4).map(|digit| row.has_digit_changed(digit)).collect::<Vec<_>>(),
+            [false, true, false, false]
+        );
+        assert!(table.rows()[2].is_new);
+        // What is suppressed is no difference, and does not become one.
+        table.notch();
+        take(&mut table, 30, "123#0210");
+        assert_eq!(different(&table), [false, false, true]);
+        assert_eq!(table.notched_bits(), 3);
+        take(&mut table, 40, "123#8210");
+        assert_eq!(different(&table), [true, false, true]);
+        table.compare_since(None);
+        assert_eq!((table.compared_since_ns, different(&table)), (None, vec![false; 3]));
+        // A byte more is a difference, even if it is zero.
+        table.compare_since(Some(50_000_000));
+        take(&mut table, 60, "124#0000");
+        assert_eq!(different(&table), [false, true, false]);
     }
 
     #[test]

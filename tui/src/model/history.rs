@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 
 use cantap::{TraceEvent, TraceRecord};
-use cantap_trace::filter::Filter;
+use cantap_trace::filter::{Filter, passes};
 
 use super::kept::Kept;
 
@@ -80,7 +80,7 @@ impl History {
 
     /// Whether a record should be shown: without filters, or if one of them accepts it.
     pub fn accepts(&self, record: &TraceRecord) -> bool {
-        self.filters.is_empty() || self.filters.iter().any(|filter| filter.accepts(record))
+        passes(&self.filters, record)
     }
 
     /// Lists only what one of these accepts, including the past. Returns the new position of the record listed at

@@ -11,7 +11,7 @@ use ratatui::style::{Color, Modifier};
 use super::super::app::{App, View};
 use super::super::model::Model;
 use super::super::screen;
-use super::{app, database, frame, model, press};
+use super::{app, database, frame, model, press, screen_text};
 
 fn buffer(app: &mut App, model: &Model) -> Buffer {
     screen(app, model, (160, 50)).unwrap()
@@ -68,6 +68,42 @@ fn digits_that_changed_are_marked_fade_and_can_be_notched() {
     assert_eq!(style_of(&buffer(&mut app, &model), "0 20").0, Color::Reset);
     model.take(&[at(9002, "123#1820")]);
     assert_eq!(style_of(&buffer(&mut app, &model), "8 20").0, Color::LightYellow);
+}
+
+/// Press `z`, do something, and see what that changed.
+#[test]
+fn only_what_changed_since_a_key_was_pressed_is_shown_and_marked() {
+    let mut model = Model::new(Decoder::new(Vec::new()).into(), Options::default(), 0).unwrap();
+    let at = |ms: i64, text: &str| TraceRecord { time_ns: ms * 1_000_000, channel: 1, event: frame(text) };
+    model.take(&[at(0, "123#1020"), at(0, "124#55"), at(10, "123#1120")]);
+    let (mut app, _orders) = app(View::Fixed);
+    let text = |app: &mut App, model: &Model| screen_text(app, model, (40, 12)).unwrap();
+    press(&mut app, &mut model, "z");
+    let nothing = text(&mut app, &model);
+    assert!(!nothing.contains("123") && nothing.contains(" changed in 0 s: 0 of 2, z: all"), "{nothing}");
+    // It stays marked after it has faded elsewhere, also if it is as before again.
+    model.take(&[at(20, "123#1920"), at(30, "123#1120"), at(9_000, "125#77")]);
+    let changed = text(&mut app, &model);
+    assert!(changed.contains("11 20") && changed.contains("77") && !changed.contains("55"), "{changed}");
+    assert!(changed.contains(" changed in 8 s: 2 of 3, z: all"), "{changed}");
+    let screen = buffer(&mut app, &model);
+    assert_eq!(
+        (style_of(&screen, "1 20").0, style_of(&screen, "11 20").0),
+        (Color::LightYellow, Color::DarkGray)
+    );
+    assert_eq!(style_of(&screen, "77").0, Color::LightYellow, "all of a new row");
+    press(&mut app, &mut model, "#");
+    let muted = screen_text(&mut app, &model, (110, 12)).unwrap();
+    assert!(!muted.contains("11 20") && muted.contains("(2 hidden, 2 bits muted)"), "{muted}");
+    // What continues behind a stopped display is compared with the same moment.
+    press(&mut app, &mut model, " ");
+    model.take(&[at(9_100, "124#56")]);
+    assert!(!text(&mut app, &model).contains("56"));
+    press(&mut app, &mut model, " ");
+    assert!(text(&mut app, &model).contains("56"));
+    press(&mut app, &mut model, "z");
+    let all = text(&mut app, &model);
+    assert!(all.contains("11 20") && all.contains("56") && !all.contains("changed in"), "{all}");
 }
 
 #[test]

@@ -140,6 +140,7 @@ fn message(app: &App, model: &Model) -> Option<Message> {
         (SourceState::Gone(reason), _) if model.notice.is_empty() => (reason.clone(), false),
         (SourceState::Gone(reason), _) => (format!("{}; {reason}", model.notice), false),
         _ if !model.notice.is_empty() => (model.notice.clone(), true),
+        _ if let Some(text) = changes(app, model) => (text, false),
         (_, Some((count, first))) if app.view == View::Statistics => {
             let places = if *count == 1 { "place" } else { "places" };
             (format!("{count} {places} could not be read and are left out, the first: {first}"), false)
@@ -149,12 +150,22 @@ fn message(app: &App, model: &Model) -> Option<Message> {
     Some(Message { text, passes })
 }
 
+/// While only what has changed is shown: that it is so, since when, and how much that is.
+fn changes(app: &App, model: &Model) -> Option<String> {
+    let seen = app.frozen.as_deref().unwrap_or(&model.seen);
+    let since_ns = seen.table.compared_since_ns.filter(|_| app.view == View::Fixed)?;
+    let rows = seen.table.rows();
+    let changed = rows.iter().filter(|row| row.has_changed()).count();
+    let seconds = seen.now_ns.saturating_sub(since_ns).max(0) / 1_000_000_000;
+    Some(format!("changed in {seconds} s: {changed} of {}, z: all", rows.len()))
+}
+
 /// As many of the page's keys, which are two blanks apart, as fit.
 fn keys(app: &App, model: &Model, width: usize) -> String {
     let keys = match app.view {
         View::Trace => "t time  / search  n N next  Enter signals  y copy  ↑↓ scroll  End newest  f filter",
         View::Fixed => {
-            "Enter signals  s S sort  / search  g group  # * notch  H heat  x u hide  o colour  f filter"
+            "Enter signals  s S sort  / search  g group  # * mute  z changes  H heat  x u hide  o colour  f filter"
         }
         View::Signals => "Enter into the graph  / search  s S sort  g group  F condition",
         View::Graph => "+ - zoom  ← → pan  x cursors  a all  s steps or lines  End follow",

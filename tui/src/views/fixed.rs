@@ -103,16 +103,24 @@ fn heading(app: &mut App, seen: &Seen, screen: u16, hidden: usize) -> Line<'stat
             app.sort_columns.push((start as u16..text.chars().count() as u16, column));
         }
     }
-    let condition = match app.row_filter.text() {
-        "" => String::new(),
-        condition => format!("F {condition}: "),
-    };
-    match (hidden, seen.table.unlisted) {
-        (hidden, 0) if !condition.is_empty() => Line::from(format!("{text}({condition}{hidden} hidden)")),
-        (0, 0) => Line::from(text.trim_end().to_owned()),
-        (hidden, 0) => Line::from(format!("{text}({hidden} hidden)")),
-        (_, unlisted) => Line::from(format!("{text}({unlisted} frames of further IDs)")),
+    let mut notes = Vec::new();
+    let condition = app.row_filter.text();
+    if !condition.is_empty() {
+        notes.push(format!("F {condition}: {hidden} hidden"));
+    } else if hidden > 0 {
+        notes.push(format!("{hidden} hidden"));
     }
+    if seen.table.unlisted > 0 {
+        notes.push(format!("{} frames of further IDs", seen.table.unlisted));
+    }
+    let muted = seen.table.notched_bits();
+    if muted > 0 {
+        notes.push(format!("{muted} bits muted"));
+    }
+    if notes.is_empty() {
+        return Line::from(text.trim_end().to_owned());
+    }
+    Line::from(format!("{text}({})", notes.join(", ")))
 }
 
 /// The direction in which the page is sorted by a column, if it is.
@@ -144,6 +152,7 @@ fn sorted<'a>(app: &App, model: &Model, seen: &'a Seen) -> Vec<&'a Row> {
     };
     let shown = |row: &&Row| {
         !row.hidden
+            && (seen.table.compared_since_ns.is_none() || row.has_changed())
             && model.history.accepts(&row.last())
             && (app.row_filter.text().is_empty() || has_signal(row))
     };
@@ -201,11 +210,15 @@ fn line(row: &Row, screen: u16, app: &App, seen: &Seen) -> Line<'static> {
         }
     }
     let length = if row.frame.is_remote() { "R".to_owned() } else { row.frame.dlc().to_string() };
-    let mut spans = vec![Span::styled(format!("{start}{length} "), base)];
+    let is_marked = seen.table.compared_since_ns.is_some() && row.length_changed;
+    let length_style = if is_marked { theme.changed(0) } else { base };
+    let mut spans = vec![Span::styled(start, base), Span::styled(length, length_style), Span::raw(" ")];
     let data = row.frame.data();
     for (index, byte) in data.iter().enumerate() {
         for (digit, value) in [(2 * index, byte >> 4), (2 * index + 1, byte & 0xF)] {
-            let style = if app.heat {
+            let style = if seen.table.compared_since_ns.is_some() {
+                if row.has_digit_changed(digit) { app.theme.changed(0) } else { app.theme.dim() }
+            } else if app.heat {
                 heat_style(row, digit, app)
             } else {
                 changed_style(row, digit, seen.now_ns, app)

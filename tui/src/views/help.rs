@@ -22,6 +22,7 @@ pub const KEYS: &[(&str, &str)] = &[
     ("arrows, Pg, End", "scroll; End is the newest"),
     ("s  S  g", "fixed, signals: sort, reverse, group; or click on headings"),
     ("#  *  H", "fixed: hide what changes anyway, show it again, bits' heat"),
+    ("z", "fixed: only what changes from now on; again: all rows"),
     ("x  u  o", "fixed: hide the row, show all, colour the row"),
     ("Enter", "trace, fixed: signals; signals: into the graph; send: once"),
     ("F", "signals, fixed: show only some, by name, value, alarm"),

@@ -102,13 +102,18 @@ fn channel_lines(
     let losses = &channel.losses;
     let stages = LossStage::ALL.map(|stage| format!("{} {}", stage.name(), losses.of(stage)));
     let style = if losses.gaps > 0 { theme.loss() } else { theme.label() };
-    let least = if losses.at_least { " at least" } else { "" };
+    // Where nothing was counted and something may be missing, zero would be a claim.
+    let (total, least) = match (losses.total(), losses.at_least) {
+        (0, true) => ("?".to_owned(), ""),
+        (total, at_least) => (total.to_string(), if at_least { " at least" } else { "" }),
+    };
     let uncounted = match losses.uncounted {
         0 => String::new(),
+        1 => "; an unknown number".to_owned(),
         uncounted => format!("; an unknown number at {uncounted} places"),
     };
     lines.push(Line::styled(
-        format!("Lost      {:>10}{least}   {}{uncounted}", losses.total(), stages.join(", ")),
+        format!("Lost      {total:>10}{least}   {}{uncounted}", stages.join(", ")),
         style,
     ));
     if let Some(windows) = windows.filter(|windows| windows.iter().any(|window| window.load_pct.is_some())) {

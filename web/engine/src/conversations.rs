@@ -43,7 +43,7 @@ pub struct Found {
 pub fn read(content: &Content, decoder: &Decoder, from_ns: i64, to_ns: i64, mut each: impl FnMut(&Event)) {
     let store = &content.store;
     let mut reader = Reader::new(Options { decoder: Some(Arc::new(decoder.clone())), ..Options::default() });
-    let surveyed = store.row_at(content.origin_ns().saturating_add(SURVEY_NS)).min(MOST_SURVEYED);
+    let surveyed = store.row_at(content.begin_kept_ns().saturating_add(SURVEY_NS)).min(MOST_SURVEYED);
     let begin = store.row_at(from_ns.saturating_sub(LEAD_NS)).max(surveyed);
     let end = store.row_at(to_ns.saturating_add(1));
     let mut batch = Vec::with_capacity(1024);

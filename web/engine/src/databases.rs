@@ -150,7 +150,7 @@ impl Databases {
                 id: id.raw(),
                 extended: id.is_extended(),
                 length: message.length,
-                count: entry.place.map_or(0, |place| index.rows(place).len()),
+                count: entry.place.map_or(0, |place| index.frames(place)),
                 comment: message.description.clone(),
                 signals: signal_infos(message, key),
             }

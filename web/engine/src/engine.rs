@@ -93,14 +93,18 @@ impl Engine {
         let request: Request =
             serde_json::from_slice(head).map_err(|error| EngineError::BadRequest(error.to_string()))?;
         match request {
-            Request::Open { name, bytes, more, size } => {
-                self.open(&name, received.bytes(bytes)?, more, size)?;
+            Request::Open { name, bytes, more, size, keep } => {
+                let bytes = received.bytes(bytes)?;
+                self.replace(|rates, generation| {
+                    Trace::open(&name, bytes, more, size, keep, rates, generation)
+                })?;
                 self.summary()
             }
             Request::Append { bytes, more } => {
                 let bytes = received.bytes(bytes)?;
                 self.trace.as_mut().ok_or(EngineError::NoTrace)?.append(bytes, more)?;
                 self.forget_if_anew();
+                self.forget_oldest();
                 self.summary()
             }
             Request::Summary {} => self.summary(),
@@ -119,11 +123,14 @@ impl Engine {
     }
 
     /// Opens a trace in place of the one before.
-    fn open(&mut self, name: &str, bytes: &[u8], more: bool, size: Option<u64>) -> Result<(), EngineError> {
+    fn replace(
+        &mut self,
+        open: impl FnOnce(Rates, u64) -> Result<Trace, EngineError>,
+    ) -> Result<(), EngineError> {
         self.trace = None;
         self.forget();
         self.generation += 1;
-        let trace = Trace::open(name, bytes, more, size, self.rates.clone(), self.generation)?;
+        let trace = open(self.rates.clone(), self.generation)?;
         self.generation = trace.generation;
         self.trace = Some(trace);
         Ok(())
@@ -147,6 +154,17 @@ impl Engine {
         if now != self.generation {
             self.generation = now;
             self.forget();
+        }
+    }
+
+    /// A live trace keeps its newest records: what was computed from the others goes with them.
+    fn forget_oldest(&mut self) {
+        let forgotten = self.trace.as_mut().map_or(0, |trace| trace.content.forget_oldest());
+        if forgotten > 0 {
+            self.index.forget_first(forgotten);
+            self.views.forget_first(forgotten);
+            self.forget_signals();
+            self.bits.clear();
         }
     }
 
@@ -238,7 +256,9 @@ impl Engine {
                 json(json!({ "row": row }))
             }
             Request::Decode { index } => {
-                let record = store.record(index).ok_or(EngineError::NoRecord(index as u64))?;
+                let row = index.checked_sub(content.forgotten());
+                let record = row.and_then(|row| store.record(row));
+                let record = record.ok_or(EngineError::NoRecord(index as u64))?;
                 json(databases.values(&record))
             }
             Request::Ids { at } => {

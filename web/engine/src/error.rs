@@ -16,6 +16,9 @@ pub enum EngineError {
     /// No trace is open.
     #[error("no trace is open; open one first")]
     NoTrace,
+    /// What a live source sent is damaged.
+    #[error("{0}; load the page anew")]
+    Damaged(#[from] cantap_trace::packed::Damaged),
     /// `append` after the end.
     #[error("the trace is complete; open a new one")]
     Complete,

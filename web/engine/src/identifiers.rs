@@ -64,7 +64,7 @@ pub fn rows_at(
             id: place.id.raw(),
             extended: place.id.is_extended(),
             message: databases.message(place).map(|message| message.name.clone()),
-            count,
+            count: index.frames(place) - (list.len() - count),
             period: period(recent, store),
             last_time: content.seconds(record.time_ns),
             last_data: hex(data),

@@ -23,6 +23,8 @@ pub struct Place {
 #[derive(Default)]
 pub struct Index {
     lists: Vec<(Place, Vec<u32>)>,
+    /// Frames of each list that are no longer kept.
+    gone: Vec<usize>,
     by_place: FxHashMap<Place, usize>,
     scanned: usize,
     unlisted: u64,
@@ -58,6 +60,14 @@ impl Index {
         store.is_unordered()
     }
 
+    /// The first rows are no longer there: the others have lower numbers now.
+    pub fn forget_first(&mut self, forgotten: usize) {
+        for ((_, rows), gone) in self.lists.iter_mut().zip(&mut self.gone) {
+            *gone += shift(rows, forgotten);
+        }
+        self.scanned = self.scanned.saturating_sub(forgotten);
+    }
+
     fn list(&mut self, place: Place) -> Option<usize> {
         if let Some(list) = self.by_place.get(&place) {
             return Some(*list);
@@ -66,6 +76,7 @@ impl Index {
             return None;
         }
         self.lists.push((place, Vec::new()));
+        self.gone.push(0);
         self.by_place.insert(place, self.lists.len() - 1);
         Some(self.lists.len() - 1)
     }
@@ -73,6 +84,11 @@ impl Index {
     /// The rows of an identifier; none if it does not occur.
     pub fn rows(&self, place: Place) -> &[u32] {
         self.by_place.get(&place).map_or(&[], |list| &self.lists[*list].1)
+    }
+
+    /// How many frames an identifier had, kept or not.
+    pub fn frames(&self, place: Place) -> usize {
+        self.by_place.get(&place).map_or(0, |list| self.gone[*list] + self.lists[*list].1.len())
     }
 
     /// All identifiers in the order in which they first came, with their rows.
@@ -84,6 +100,19 @@ impl Index {
     pub const fn unlisted(&self) -> u64 {
         self.unlisted
     }
+}
+
+/// Takes rows from a list that are no longer there, and gives the others their lower numbers. Returns how many were taken.
+pub fn shift(rows: &mut Vec<u32>, forgotten: usize) -> usize {
+    let before = rows.len();
+    rows.retain_mut(|row| match (*row as usize).checked_sub(forgotten) {
+        Some(shifted) => {
+            *row = shifted as u32;
+            true
+        }
+        None => false,
+    });
+    before - rows.len()
 }
 
 /// Where in a list the rows from this time on begin.

@@ -9,7 +9,7 @@ use crate::own_database::SignalEdit;
 #[derive(Deserialize)]
 #[serde(tag = "request", content = "parameters", rename_all = "camelCase", rename_all_fields = "camelCase")]
 pub enum Request {
-    Open { name: String, bytes: Bytes, more: bool, size: Option<u64> },
+    Open { name: String, bytes: Bytes, more: bool, size: Option<u64>, keep: Option<usize> },
     Append { bytes: Bytes, more: bool },
     Summary {},
     Bitrate { channel: u8, bitrate: u32, data_bitrate: Option<u32> },

@@ -30,7 +30,7 @@ impl Row {
     /// The row of a record.
     pub fn of(index: usize, record: &TraceRecord, content: &Content, databases: &Databases) -> Self {
         let mut row = Self {
-            index,
+            index: content.forgotten() + index,
             time: content.seconds(record.time_ns),
             late: false,
             channel: Some(record.channel),

@@ -3,7 +3,7 @@
 use cantap_trace::{Direction, FdFrame, Frame, Id, TraceEvent, TraceFrame, TraceRecord, fd::FD_LENGTHS};
 
 /// Rows of a block: blocks are filled one after another, so that nothing is copied when the trace grows.
-const BLOCK_ROWS: usize = 1 << 16;
+pub const BLOCK_ROWS: usize = 1 << 16;
 
 /// The identifier's column also has these.
 const EXTENDED: u32 = 1 << 31;
@@ -75,6 +75,15 @@ impl Store {
         if let Some(block) = self.blocks.last_mut() {
             block.push(record);
         }
+    }
+
+    /// Forgets the first blocks, as long as another one stays. Returns the number of rows in them.
+    pub fn forget_blocks(&mut self, blocks: usize) -> usize {
+        let blocks = blocks.min(self.blocks.len().saturating_sub(1));
+        self.blocks.drain(..blocks);
+        let rows = blocks * BLOCK_ROWS;
+        self.rows -= rows;
+        rows
     }
 
     fn block(&self, row: usize) -> Option<(&Block, usize)> {

@@ -1,15 +1,13 @@
 //! The trace that is open: its records in columns, its figures, and what of it could not be read.
 
-use std::io::Cursor;
-
 use cantap_analysis::stats::{Options, Statistics};
 use cantap_formats::{Format, ReadOptions, TraceReader, open_source};
-use cantap_trace::TraceRecord;
+use cantap_trace::{TraceRecord, packed};
 
 use crate::error::EngineError;
 use crate::gaps::Gaps;
 use crate::pieces::Pieces;
-use crate::store::Store;
+use crate::store::{BLOCK_ROWS, Store};
 
 /// Reading goes on while so many bytes are there that have not been read; see [`crate::pieces`].
 const RESERVE: u64 = 512 * 1024;
@@ -17,6 +15,10 @@ const RESERVE: u64 = 512 * 1024;
 const KEPT: u64 = 512 * 1024 * 1024;
 /// More records than this do not fit in the 4 GiB that WebAssembly has, with what is computed from them.
 const MOST_RECORDS: usize = 100_000_000;
+/// A live trace keeps this many of its newest records unless it is told otherwise: 9 minutes of two saturated buses in about 240 MB.
+const KEPT_LIVE: usize = 1 << 23;
+/// When it has more, it forgets this part of them at once: forgetting costs more than keeping.
+const FORGOTTEN_PART: usize = 8;
 /// So many places that could not be read are shown one by one.
 const ISSUES_SHOWN: usize = 20;
 
@@ -54,6 +56,11 @@ pub struct Content {
     kinds: Vec<(String, u64)>,
     /// Records that are not kept.
     beyond: u64,
+    /// The time of the very first record, in nanoseconds.
+    first_ns: Option<i64>,
+    /// The number of the newest records that are kept, if older ones are forgotten.
+    keep: Option<usize>,
+    forgotten: usize,
 }
 
 /// Where the records come from.
@@ -64,8 +71,8 @@ enum Feed {
         reader: Option<Box<TraceReader>>,
         reserve: u64,
     },
-    /// Lines of a candump log as they come, and the beginning of the next one.
-    Lines(Vec<u8>),
+    /// Packed records as they come.
+    Live,
     Complete,
 }
 
@@ -120,6 +127,9 @@ impl Content {
             more_issues: 0,
             kinds: Vec::new(),
             beyond: 0,
+            first_ns: None,
+            keep: None,
+            forgotten: 0,
         }
     }
 
@@ -128,6 +138,7 @@ impl Content {
             self.beyond += 1;
             return;
         }
+        self.first_ns.get_or_insert(record.time_ns);
         self.store.push(record);
         self.statistics.push(record);
         self.gaps.push(record);
@@ -137,9 +148,28 @@ impl Content {
         if self.issues.len() < ISSUES_SHOWN { self.issues.push(text) } else { self.more_issues += 1 }
     }
 
-    /// Nanoseconds of the first record.
+    /// Nanoseconds of the first record, whether it is still kept or not: times count from there.
     pub fn origin_ns(&self) -> i64 {
+        self.first_ns.unwrap_or(0)
+    }
+
+    /// Nanoseconds of the first record that is kept.
+    pub fn begin_kept_ns(&self) -> i64 {
         if self.store.len() == 0 { 0 } else { self.store.time_ns(0) }
+    }
+
+    /// Records from the beginning that are no longer kept.
+    pub const fn forgotten(&self) -> usize {
+        self.forgotten
+    }
+
+    /// Forgets the oldest records if there are more than should be kept. Returns how many were forgotten.
+    pub fn forget_oldest(&mut self) -> usize {
+        let Some(keep) = self.keep.filter(|keep| self.store.len() > *keep) else { return 0 };
+        let part = (keep / FORGOTTEN_PART).max(self.store.len() - keep);
+        let forgotten = self.store.forget_blocks(part.div_ceil(BLOCK_ROWS));
+        self.forgotten += forgotten;
+        forgotten
     }
 
     /// Seconds since the first record.
@@ -175,28 +205,35 @@ impl Content {
             );
             all.push((text, self.beyond));
         }
+        if self.forgotten > 0 {
+            let text = "records are no longer shown, because a live page keeps the newest ones; record to a file to keep all";
+            all.push((text.to_owned(), self.forgotten as u64));
+        }
         all
     }
 }
 
 impl Trace {
-    /// Begins a trace with its first piece. Without a `size` and with `more` to come, it is live: lines of a candump log.
+    /// Begins a trace with its first piece. Without a `size` and with `more` to come, it is live: chunks of [`packed`] records, each behind
+    /// its length (4 bytes, little-endian), of which the newest `keep` are kept.
     pub fn open(
         name: &str,
         bytes: &[u8],
         more: bool,
         size: Option<u64>,
+        keep: Option<usize>,
         rates: Rates,
         generation: u64,
     ) -> Result<Self, EngineError> {
-        let feed = if more && size.is_none() {
-            Feed::Lines(Vec::new())
+        let is_live = more && size.is_none();
+        let feed = if is_live {
+            Feed::Live
         } else {
             Feed::Pieces { pieces: Pieces::default(), reader: None, reserve: RESERVE }
         };
-        let content = Content::new(&rates);
-        let format = matches!(feed, Feed::Lines(_)).then_some(Format::Candump);
-        let mut trace = Self { name: name.to_owned(), size, feed, content, format, rates, generation };
+        let mut content = Content::new(&rates);
+        content.keep = is_live.then(|| keep.unwrap_or(KEPT_LIVE));
+        let mut trace = Self { name: name.to_owned(), size, feed, content, format: None, rates, generation };
         trace.append(bytes, more)?;
         Ok(trace)
     }
@@ -205,22 +242,13 @@ impl Trace {
     pub fn append(&mut self, bytes: &[u8], more: bool) -> Result<(), EngineError> {
         match &mut self.feed {
             Feed::Complete => Err(EngineError::Complete),
-            Feed::Lines(rest) => {
-                rest.extend_from_slice(bytes);
-                let end = match rest.iter().rposition(|byte| *byte == b'\n') {
-                    _ if !more => rest.len(),
-                    Some(at) => at + 1,
-                    None => 0,
-                };
-                let lines: Vec<u8> = rest.drain(..end).collect();
+            Feed::Live => {
+                let result = chunks(bytes, &mut self.content);
                 if !more {
                     self.feed = Feed::Complete;
-                }
-                self.lines(lines)?;
-                if !more {
                     self.content.statistics.finish();
                 }
-                Ok(())
+                result
             }
             Feed::Pieces { pieces, .. } => {
                 pieces.add(bytes, more);
@@ -231,19 +259,6 @@ impl Trace {
                 result
             }
         }
-    }
-
-    /// Whole lines of a live trace.
-    fn lines(&mut self, lines: Vec<u8>) -> Result<(), EngineError> {
-        if lines.is_empty() {
-            return Ok(());
-        }
-        let source = Cursor::new(lines);
-        let reader = TraceReader::from_source(&self.name, source, Format::Candump, &ReadOptions::default());
-        let mut reader = reader.map_err(|error| EngineError::Filter(error.to_string()))?;
-        while take_batch(&mut reader, &mut self.content) {}
-        count_kinds(&reader, &mut self.content);
-        Ok(())
     }
 
     fn read_on(&mut self) -> Result<(), EngineError> {
@@ -320,13 +335,25 @@ impl Trace {
     pub fn progress(&self) -> Progress {
         match &self.feed {
             Feed::Complete => Progress { growing: false, part: self.size.map(|_| 1.0) },
-            Feed::Lines(_) => Progress { growing: true, part: None },
+            Feed::Live => Progress { growing: true, part: None },
             Feed::Pieces { pieces, .. } => {
                 let part = self.size.map(|size| (pieces.read_so_far() as f64 / size.max(1) as f64).min(1.0));
                 Progress { growing: true, part }
             }
         }
     }
+}
+
+/// Takes chunks of packed records. Those before a fault are taken.
+fn chunks(mut rest: &[u8], content: &mut Content) -> Result<(), EngineError> {
+    let cut = packed::Damaged { at: 0, len: rest.len() };
+    while !rest.is_empty() {
+        let (length, after) = rest.split_first_chunk::<4>().ok_or(cut)?;
+        let (chunk, after) = after.split_at_checked(u32::from_le_bytes(*length) as usize).ok_or(cut)?;
+        packed::read(chunk, |record| content.push(record))?;
+        rest = after;
+    }
+    Ok(())
 }
 
 /// Takes the next records, or the next issue; false at the end.

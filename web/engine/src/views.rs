@@ -10,6 +10,7 @@ use cantap_trace::TraceRecord;
 use cantap_trace::filter::Filter;
 
 use crate::error::EngineError;
+use crate::index::shift;
 use crate::store::Store;
 
 /// The view of all records.
@@ -175,6 +176,14 @@ impl Views {
         }
         self.kept.push(view);
         Ok(self.numbers)
+    }
+
+    /// The first records are no longer there: the others have lower numbers now.
+    pub fn forget_first(&mut self, forgotten: usize) {
+        for view in &mut self.kept {
+            shift(&mut view.rows, forgotten);
+            view.scanned = view.scanned.saturating_sub(forgotten);
+        }
     }
 
     /// The rows of a view, as they were when it was last asked for.

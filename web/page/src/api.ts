@@ -31,9 +31,13 @@ export interface Summary {
   startUtcNs: string | null;
   /** Seconds from the first record to the last. */
   duration: number;
+  /** When the first record that is kept was, in seconds: a live trace forgets its oldest. */
+  begin: number;
   frames: number;
   /** Records of all kinds: rows of the trace. */
   records: number;
+  /** Records before them that are no longer kept. */
+  forgotten: number;
   channels: ChannelSummary[];
   losses: Loss[];
   /** What of the file was not read, in words; with a count. Empty if everything was read. */
@@ -214,9 +218,10 @@ export interface SignalEdit {
 export interface Requests {
   /**
    * Takes a file whole, or its first piece if `more` follows. The format is recognised by name and content. Without a `size` and with `more`
-   * to come it is live: lines of a candump log.
+   * to come it is live: chunks of packed records (`host/trace/src/packed.rs`), each behind its length (4 bytes, little-endian). Of those the
+   * newest `keep` are kept, 8 million if it is not given.
    */
-  open: { in: { name: string; bytes: Uint8Array; more: boolean; size: number | null }; out: Summary };
+  open: { in: { name: string; bytes: Uint8Array; more: boolean; size: number | null; keep?: number }; out: Summary };
   /** The next piece of the file that `open` began. */
   append: { in: { bytes: Uint8Array; more: boolean }; out: Summary };
   summary: { in: Record<string, never>; out: Summary };

@@ -11,6 +11,7 @@ import { button, el, setText } from './ui/dom';
 import { openPalette } from './ui/palette';
 import { BitsView } from './views/bits';
 import { ConversationsView } from './views/conversations';
+import { DeviceView } from './views/device';
 import { openExport } from './views/export';
 import { FixedView } from './views/fixed';
 import { GraphsView } from './views/graphs';
@@ -33,6 +34,10 @@ export class Shell {
   readonly #name = el('span', { class: 'trace-name' });
   readonly #progress = el('progress', { attrs: { max: 1, 'aria-label': 'Read of the file' } });
   readonly #picker = el('input', { attrs: { type: 'file', multiple: true, hidden: true, 'aria-label': 'Open trace and database files' } });
+  readonly #liveState = el('span', { class: 'live-state', attrs: { role: 'status' } });
+  readonly #pause = button('Pause', () => this.#togglePause(), { id: 'live-pause', title: 'Let the views stand still while records still arrive (P)' });
+  readonly #record = button('● Record', () => this.#device?.toggleRecording(), { id: 'live-record', title: 'Record to a file (R)' });
+  #device: DeviceView | null = null;
   #current: View;
 
   constructor(
@@ -44,6 +49,13 @@ export class Shell {
     this.#notes = new NotesView(app, this.#commands, lead);
     const fixed = new FixedView(app, this.#commands, () => this.show('bits'));
     this.#views = [new SummaryView(app, this.#commands, lead), this.#trace, new GraphsView(app, this.#commands), fixed, new BitsView(app, this.#commands), new StatisticsView(app, this.#commands), new ConversationsView(app, this.#commands, lead), this.#notes];
+    if (app.live) {
+      this.#device = new DeviceView(app, app.live, this.#commands);
+      this.#views.push(this.#device);
+      for (const topic of ['live', 'live-state'] as const) app.on(topic, () => this.#drawLive());
+      // A frozen view is told from one to which nothing comes.
+      app.on('range', () => this.#drawLive());
+    }
     const tabs = el('div', { class: 'tabs', attrs: { role: 'tablist', 'aria-label': 'Views' } }, ...this.#views.map((view, i) => this.#tab(view, i)));
     tabs.addEventListener('keydown', (event) => this.#tabKey(event));
     const header = el(
@@ -52,6 +64,7 @@ export class Shell {
       el('b', { class: 'brand' }, 'cantap'),
       this.#name,
       tabs,
+      app.live ? el('span', { class: 'tools live' }, this.#liveState, this.#pause, this.#record) : null,
       el('span', { class: 'tools' }, button('Open …', () => this.#picker.click(), { title: 'Open a trace or databases (Ctrl+O)' }), button('Commands', () => this.#palette(), { title: 'Command palette (Ctrl+K)' }), button('?', () => this.#help(), { title: 'Keys (?)', attrs: { 'aria-label': 'Keys' } }), button('◐', () => this.#cycleTheme(), { title: 'Dark or light', attrs: { 'aria-label': 'Dark or light' } })),
     );
     this.#picker.addEventListener('change', () => {
@@ -82,6 +95,7 @@ export class Shell {
     this.#applyTheme();
     this.show(app.profile.view);
     this.#drawStatus();
+    this.#drawLive();
   }
 
   show(id: string): void {
@@ -130,9 +144,36 @@ export class Shell {
       { id: 'goto', title: 'Go to a time', keys: [':'], run: () => this.#askTime() },
       { id: 'theme', title: 'Dark, light, or as the system has it', keys: ['D'], run: () => this.#cycleTheme() },
       { id: 'profile.save', title: 'Save the layout as a profile', run: () => this.#saveProfile() },
+      ...(this.app.live ? [{ id: 'live.pause', title: 'Pause, or follow what arrives', keys: ['P'], run: () => this.#togglePause() }] : []),
       { id: 'licences', title: 'Licences', run: () => void this.#licences() },
       { id: 'profile.load', title: 'Load a profile', run: () => this.#loadProfile() },
     );
+  }
+
+  #togglePause(): void {
+    const { app } = this;
+    if (app.paused || !app.following) app.follow();
+    else app.pause(true);
+  }
+
+  #drawLive(): void {
+    const { app } = this;
+    const { live } = app;
+    if (!live) return;
+    const state = live.state?.ended ? 'device gone' : live.status === 'open' ? (app.paused ? 'paused' : app.following ? 'live' : 'looking back') : live.status === 'ended' ? 'ended' : live.status === 'lost' ? 'connection lost' : 'connecting';
+    setText(this.#liveState, state);
+    this.#liveState.title = live.reason;
+    this.#liveState.dataset['status'] = live.state?.ended ? 'lost' : live.status;
+    setText(this.#pause, app.paused ? 'Go on' : app.following ? 'Pause' : 'Follow');
+    const recording = live.state?.recording;
+    setText(this.#record, recording ? `■ ${duration(recording.seconds)}, ${bytes(recording.bytes)}` : '● Record');
+    this.#record.title = recording ? `Ends the recording to ${recording.name} (R)` : 'Record to a file (R)';
+    this.#record.setAttribute('aria-pressed', String(recording !== undefined && recording !== null));
+    // The newest record's time, for whoever measures how late the page is.
+    const { summary } = app;
+    if (summary?.startUtcNs) this.element.dataset['newest'] = String(Number(summary.startUtcNs) / 1e6 + summary.duration * 1000);
+    this.element.dataset['received'] = String(live.next);
+    this.element.dataset['behind'] = String(live.latest - live.next);
   }
 
   #showAndFocus(view: View): void {
@@ -259,6 +300,7 @@ export class Shell {
   #drawStatus(): void {
     const { summary } = this.app;
     if (!summary) return;
+    this.element.dataset['forgotten'] = String(summary.forgotten);
     document.title = `${summary.name} · cantap`;
     setText(this.#name, summary.name);
     this.#name.title = summary.name;

@@ -3,7 +3,8 @@
 import type { Engine } from './api';
 import { App } from './model/app';
 import { openFiles } from './model/open-files';
-import { embeddedReport, type Report, unpack } from './model/report';
+import { serve, servedFrom } from './live/serve';
+import { addCarried, embeddedReport, type Report, unpack } from './model/report';
 import { Shell, applyTheme } from './shell';
 import { button, el, replace } from './ui/dom';
 import { Notices } from './ui/notices';
@@ -30,6 +31,7 @@ export async function start(loadEngine: () => Promise<Engine>): Promise<void> {
   } catch (error) {
     app.failed(error);
   }
+  const served = servedFrom(document);
   const screen = startScreen(app);
   let shown = false;
   const showShell = (): void => {
@@ -39,6 +41,11 @@ export async function start(loadEngine: () => Promise<Engine>): Promise<void> {
   };
   app.on('summary', showShell);
   replace(place, report ? el('p', { class: 'starting', attrs: { role: 'status' } }, `Opening ${report.trace.name} …`) : screen, notices.element);
+  if (served) {
+    replace(place, el('p', { class: 'starting', attrs: { role: 'status' } }, `Waiting for ${served.name} …`), notices.element);
+    await serve(app, served);
+    return;
+  }
   if (app.storage.refused !== null) notices.notify('info', 'This browser keeps nothing for this page: save your layout as a profile (Ctrl+K) if you want it again.');
   if (report) {
     app.report = report;
@@ -50,13 +57,7 @@ export async function start(loadEngine: () => Promise<Engine>): Promise<void> {
 
 async function openReport(app: App, report: Report): Promise<boolean> {
   try {
-    for (const database of report.databases) {
-      try {
-        await app.addDatabase(database.name, new Uint8Array(await (await unpack(database)).arrayBuffer()), database.channel);
-      } catch (error) {
-        app.failed(error);
-      }
-    }
+    await addCarried(app, report.databases);
     await app.openTrace(await unpack(report.trace), report.bitrates);
     return true;
   } catch (error) {

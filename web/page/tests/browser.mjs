@@ -19,8 +19,8 @@ export async function quit() {
   browser = undefined;
 }
 
-/** A page; whatever it writes as an error, and each request that leaves it, fails the test in `done`. */
-export async function newPage({ file = FAKE, hash = '', theme = 'dark', size = { width: 1440, height: 900 }, before } = {}) {
+/** A page; whatever it writes as an error, and each request that leaves it (or its server), fails the test in `done`. */
+export async function newPage({ file = FAKE, url = null, hash = '', theme = 'dark', size = { width: 1440, height: 900 }, before } = {}) {
   const context = await (await launch()).newContext({ viewport: size, colorScheme: theme, acceptDownloads: true });
   // A limit that only a fault reaches, on a busy machine, too.
   context.setDefaultTimeout(60_000);
@@ -31,7 +31,7 @@ export async function newPage({ file = FAKE, hash = '', theme = 'dark', size = {
     if (message.type() === 'error') faults.push(`console: ${message.text()}`);
   });
   page.on('request', (request) => {
-    if (!/^(file|blob|data):/.test(request.url())) faults.push(`request: ${request.url()}`);
+    if (!/^(file|blob|data):/.test(request.url()) && !(url && request.url().startsWith(`${new URL(url).origin}/`))) faults.push(`request: ${request.url()}`);
   });
   page.faults = faults;
   page.done = async () => {
@@ -39,7 +39,7 @@ export async function newPage({ file = FAKE, hash = '', theme = 'dark', size = {
     if (faults.length > 0) throw new Error(faults.join('\n'));
   };
   if (before) await page.addInitScript(before);
-  await page.goto(`${pathToFileURL(file)}${hash}`);
+  await page.goto(url ?? `${pathToFileURL(file)}${hash}`);
   return page;
 }
 

@@ -76,6 +76,8 @@ export class FakeEngine implements Engine {
       name: 'drive.log',
       format: 'candump',
       startUtcNs: '1764306755123456789',
+      begin: 0,
+      forgotten: 0,
       duration: Math.max(0, this.#records - 1) * STEP,
       frames,
       records: this.#records,

@@ -161,13 +161,15 @@ impl Summary {
     }
 }
 
-/// A sentence for each device that is another maker's adapter.
+/// What other makers' adapters do not report, in sentences.
 fn not_known(live: &LiveRecords) -> Vec<String> {
     let row = |(board, device): (usize, &Device)| {
         let row = cantap_adapters::row(&device.hello().board)?;
-        Some(format!("{}: {}", live.addresses().get(board)?, row.losses_before()))
+        let address = live.addresses().get(board)?;
+        let losses = format!("{address}: {}", row.losses_before());
+        Some(std::iter::once(losses).chain(row.limits.map(|limits| format!("{address}: {limits}"))))
     };
-    live.lines().devices().filter_map(row).collect()
+    live.lines().devices().filter_map(row).flatten().collect()
 }
 
 fn drift_ppm(line: &Line) -> Option<f64> {

@@ -11,6 +11,8 @@ pub(super) struct Summary {
     frames: u64,
     lost: u64,
     gaps: u64,
+    /// Starts of channels whose device does not count its losses. They are gaps, too.
+    uncounted: u64,
     /// For each protocol: events, and those in which something went wrong.
     events: BTreeMap<Protocol, (u64, u64)>,
 }
@@ -22,6 +24,7 @@ impl Summary {
             TraceEvent::Lost { count, .. } => {
                 self.lost += u64::from(count);
                 self.gaps += 1;
+                self.uncounted += u64::from(record.event == TraceEvent::UNCOUNTED);
             }
             _ => {}
         }
@@ -58,10 +61,16 @@ impl Summary {
         let said =
             if said.is_empty() { "nothing that a protocol explains".to_owned() } else { said.join(", ") };
         eprintln!("cantap: {} frames: {said}", self.frames);
-        if self.gaps > 0 {
+        if self.uncounted > 0 {
+            eprintln!(
+                "cantap: frames may be missing that nobody counted: the adapter does not report its losses"
+            );
+        }
+        let places = self.gaps - self.uncounted;
+        if places > 0 {
             let lost =
                 if self.lost == 0 { "frames".to_owned() } else { format!("{} frames or more", self.lost) };
-            eprintln!("cantap: {lost} are missing in the trace, at {} places", self.gaps);
+            eprintln!("cantap: {lost} are missing in the trace, at {places} places");
         }
     }
 }

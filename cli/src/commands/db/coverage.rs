@@ -5,7 +5,7 @@ use std::io::Write;
 
 use cantap::TraceRecord;
 use cantap_analysis::stats::{IdStatistics, Options, Statistics};
-use cantap_signals::{Database, Decoder, MessageRef, Source};
+use cantap_signals::{Decoder, MessageRef};
 use serde_json::json;
 
 use super::describe::header_id;
@@ -81,25 +81,14 @@ impl Contained {
 }
 
 /// Compares with a trace and prints.
-pub fn run(
-    databases: Vec<Database>,
-    j1939: bool,
-    mut records: Records,
-    json: bool,
-    out: &mut impl Write,
-) -> anyhow::Result<()> {
-    let sources = databases.into_iter().map(|database| Source { channel: None, database });
-    let mut decoder = Decoder::new(sources.collect());
-    if j1939 {
-        decoder.assume_j1939();
-    }
+pub fn run(decoder: &Decoder, mut records: Records, json: bool, out: &mut impl Write) -> anyhow::Result<()> {
     let mut statistics = Statistics::new(Options::default())?;
-    let mut contained = Contained::of(&decoder);
+    let mut contained = Contained::of(decoder);
     let mut batch = Vec::new();
     while records.next_batch(&mut batch)? {
         for record in &batch {
             statistics.push(record);
-            contained.push(&decoder, record);
+            contained.push(decoder, record);
         }
     }
     let (mut known, mut unknown) = (Vec::new(), Vec::new());
@@ -146,7 +135,7 @@ pub fn run(
             })
             .collect();
         let pdus: Vec<_> = contained
-            .rows(&decoder)
+            .rows(decoder)
             .map(|(message, header_id, pdu, count)| json!({ "message": message, "header_id": header_id, "pdu": pdu, "count": count }))
             .collect();
         let mut object = json!({
@@ -210,7 +199,7 @@ pub fn run(
     if !contained.0.is_empty() {
         writeln!(out, "\nIn containers:")?;
     }
-    for (message, header_id, pdu, count) in contained.rows(&decoder) {
+    for (message, header_id, pdu, count) in contained.rows(decoder) {
         let pdu = pdu.unwrap_or("(not in the databases)");
         writeln!(out, "  {message} {header_id:<8} {count:>9}  {pdu}")?;
     }

@@ -10,7 +10,7 @@ use cantap::wire::message::{ChannelConfig, Mode};
 use cantap::{Channel, Device, DeviceError, TraceRecord};
 use cantap_address::Address;
 use cantap_formats::{Format, TraceWriter, WriteOptions, create_stream_writer};
-use cantap_trace::filter::Filter;
+use cantap_trace::filter::{Filter, passes};
 
 use super::bit_rates::{BitRate, settle};
 use super::pipe::Opening;
@@ -136,9 +136,11 @@ impl Capture<'_> {
         let copied = self.copy();
         let counters = self.live.lines().lines().map(Line::counters);
         let lost = counters.map(|counters| Losses::of(&counters)).fold(Losses::default(), Losses::plus);
+        // Wireshark shows these messages when the capture has ended.
         if lost.total() > 0 || lost.off_bus > 0 {
-            // Wireshark shows these messages when the capture has ended.
             eprintln!("cantap: frames were lost, which is marked where they are missing: {}", lost.line());
+        } else if !lost.is_none() {
+            eprintln!("cantap: frames may be missing that nobody counted: {}", lost.line());
         }
         let finished = self.writer.finish().map(|_| ());
         copied?;
@@ -266,6 +268,6 @@ fn now_ns() -> i64 {
 
 impl Wanted {
     fn accepts(&self, record: &TraceRecord) -> bool {
-        self.filters.is_empty() || self.filters.iter().any(|filter| filter.accepts(record))
+        passes(&self.filters, record)
     }
 }

@@ -7,7 +7,7 @@ use cantap_formats::{Format, MemoryFile, ReadOptions, WriteOptions, create_strea
 use cantap_trace::TraceRecord;
 use cantap_trace::diff::Profile;
 
-use super::page::Carried;
+use crate::page::Carried;
 
 /// How many records are written between two looks at the size.
 const BETWEEN_LOOKS: u64 = 4096;

@@ -5,7 +5,7 @@ use std::net::{TcpListener, TcpStream};
 use std::sync::mpsc::{Receiver, channel};
 
 use cantap::wire::Refusal;
-use cantap::{Channel, DeviceError};
+use cantap::{Channel, DeviceError, TraceEvent};
 
 use crate::{frames, losses, open, send, until_frame};
 
@@ -148,7 +148,9 @@ fn a_connection_that_ends_ends_the_session_with_its_reason() {
     adapter.write_all(&received(1, 1, 0, &[])).unwrap();
     adapter.shutdown(std::net::Shutdown::Both).unwrap();
     let records: Vec<_> = device.records().collect();
-    assert_eq!(records[0].as_ref().unwrap().frame().unwrap().to_string(), "001#");
+    // It counts no losses, which its stream begins with.
+    assert_eq!(records[0].as_ref().unwrap().event, TraceEvent::UNCOUNTED);
+    assert_eq!(records[1].as_ref().unwrap().frame().unwrap().to_string(), "001#");
     let error = records.last().unwrap().as_ref().unwrap_err();
     assert!(matches!(error, DeviceError::Vanished { .. }), "{error}");
 }

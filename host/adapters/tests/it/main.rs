@@ -1,7 +1,11 @@
 //! Adapters as devices, against stand-ins that follow foreign sources.
 
 mod cannelloni;
+#[cfg(unix)]
+mod elm327;
 mod gvret;
+#[cfg(unix)]
+mod port;
 #[cfg(unix)]
 mod slcan;
 mod socketcand;

@@ -1,21 +1,13 @@
 //! slcan adapters: one that answers as Lawicel's manual says, one that answers nothing, as CANable's firmware.
 
-use std::fs::File;
-use std::io::{ErrorKind, Read};
-use std::os::fd::OwnedFd;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
-use std::thread::JoinHandle;
-use std::time::Duration;
 
 use cantap::wire::Refusal;
 use cantap::wire::message::{Filter, Modifier, Periodic, Trigger, capability};
 use cantap::{Channel, DeviceError, TraceEvent};
 use cantap_adapters::{ListenOnly, row};
-use rustix::fs::OFlags;
-use rustix::termios::OptionalActions;
-use rustix_openpty::{Pty, openpty};
 
+use crate::port::Port;
 use crate::{frames, losses, open, send, until, until_frame};
 
 /// How the stand-in behaves.
@@ -32,67 +24,37 @@ enum Manner {
 }
 
 struct StandIn {
-    path: String,
-    port: File,
+    port: Port,
     commands: Arc<Mutex<Vec<String>>>,
-    /// Keeps the port from looking closed before it is opened.
-    user: OwnedFd,
-    pulled: Arc<AtomicBool>,
-    thread: JoinHandle<()>,
-}
-
-/// Writes all of it to a port that may have no room now.
-fn write(mut port: &File, text: &str) {
-    cantap::device::write_patiently(&mut port, text.as_bytes(), Duration::from_secs(10)).unwrap();
 }
 
 impl StandIn {
     fn start(manner: Manner) -> Self {
-        let Pty { controller, user } = openpty(None, None).unwrap();
-        let mut modes = rustix::termios::tcgetattr(&user).unwrap();
-        modes.make_raw();
-        rustix::termios::tcsetattr(&user, OptionalActions::Now, &modes).unwrap();
-        let path = rustix::termios::ttyname(&user, Vec::new()).unwrap().into_string().unwrap();
-        let flags = rustix::fs::fcntl_getfl(&controller).unwrap();
-        rustix::fs::fcntl_setfl(&controller, flags | OFlags::NONBLOCK).unwrap();
-        let port = File::from(controller);
-        let (commands, pulled) = (Arc::new(Mutex::new(Vec::new())), Arc::new(AtomicBool::new(false)));
-        let mut own = port.try_clone().unwrap();
-        let (log, quit) = (Arc::clone(&commands), Arc::clone(&pulled));
-        let thread = std::thread::spawn(move || {
-            let (mut line, mut state, mut byte) = (String::new(), State::default(), [0]);
-            while !quit.load(Ordering::Relaxed) {
-                match own.read(&mut byte) {
-                    Ok(0) => return,
-                    Ok(_) if byte[0] != b'\r' => line.push(char::from(byte[0])),
-                    Ok(_) => {
-                        let answer = state.answer(manner, &line);
-                        log.lock().unwrap().push(std::mem::take(&mut line));
-                        write(&own, answer);
-                    }
-                    Err(error) if error.kind() == ErrorKind::WouldBlock => {
-                        std::thread::sleep(Duration::from_millis(1));
-                    }
-                    Err(_) => return,
-                }
+        let commands = Arc::new(Mutex::new(Vec::new()));
+        let log = Arc::clone(&commands);
+        let (mut line, mut state) = (String::new(), State::default());
+        let port = Port::start(move |byte| {
+            if byte != b'\r' {
+                line.push(char::from(byte));
+                return Vec::new();
             }
+            let answer = state.answer(manner, &line);
+            log.lock().unwrap().push(std::mem::take(&mut line));
+            answer.as_bytes().to_vec()
         });
-        Self { path, port, commands, user, pulled, thread }
+        Self { port, commands }
     }
 
-    /// It is gone, with its port.
     fn pull(self) {
-        self.pulled.store(true, Ordering::Relaxed);
-        self.thread.join().unwrap();
-        drop((self.port, self.user));
+        self.port.pull();
     }
 
     fn address(&self) -> String {
-        format!("slcan:{}", self.path)
+        format!("slcan:{}", self.port.path)
     }
 
     fn says(&self, text: &str) {
-        write(&self.port, text);
+        self.port.says(text);
     }
 
     fn commands(&self) -> Vec<String> {

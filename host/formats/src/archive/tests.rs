@@ -1,6 +1,10 @@
 //! Archives made here: which file is read, and what damage or malice comes to.
 
 use super::*;
+
+const ENTRY: &[u8] = b"PK\x01\x02";
+const END: &[u8] = b"PK\x05\x06";
+const END_BYTES: usize = 22;
 use crate::{OpenError, ReadOptions, open_reader, open_source};
 use std::io::{Cursor, Write};
 
@@ -137,26 +141,68 @@ fn damage_is_noticed() {
 }
 
 #[test]
-fn long_numbers_and_hostile_directories_take_no_memory() {
+fn hostile_directories_take_no_memory() {
     let log = log(10);
     let mut bytes = archive(&[("a.log", &log)]);
     let end = bytes.len() - END_BYTES;
-    // A directory of 4 GiB less a byte, and one at an address beyond the file.
+    // A directory of 4 GiB less a byte, which ends where the archive does, and one at an address beyond the file.
     bytes[end + 12..end + 16].copy_from_slice(&0xFFFF_FFFE_u32.to_le_bytes());
-    assert!(read(bytes.clone()).unwrap_err().contains("larger than 16 MiB"));
+    assert_eq!(read(bytes.clone()), Ok((10, vec![])));
     bytes[end + 12..end + 20].copy_from_slice(&[100, 0, 0, 0, 0xFE, 0xFF, 0xFF, 0x7F]);
     assert!(read(bytes.clone()).unwrap_err().contains("its directory is not whole"));
+    // A longer end, which is missing.
     bytes[end + 12..end + 16].copy_from_slice(&[0xFF; 4]);
-    assert!(read(bytes).unwrap_err().contains("a longer one, which is missing"));
-    // A long form: the numbers are in an extra field.
-    let mut entry = [ENTRY, &[0; ENTRY_BYTES - 4]].concat();
+    assert!(read(bytes).unwrap_err().contains("a.zip is damaged"));
+    // A large one without content.
+    let mut bytes = archive(&[("a.log", &log)]);
+    let (end, size) = (bytes.split_off(bytes.len() - END_BYTES), DIRECTORY_BYTES as usize + 1);
+    let directory = memchr::memmem::find(&bytes, ENTRY).unwrap();
+    bytes.resize(directory + size, 0);
+    bytes.extend([&end[..12], &(size as u32).to_le_bytes(), &end[16..]].concat());
+    assert!(read(bytes).unwrap_err().contains("larger than 16 MiB"));
+}
+
+/// Numbers of 64 bits, as for a file above 4 GiB: in an extra field of the entry, and in a second end.
+#[test]
+fn an_archive_with_long_numbers_is_read() {
+    let log = log(10);
+    let plain = archive(&[("a.log", &log)]);
+    let (at, end) = (memchr::memmem::find(&plain, ENTRY).unwrap(), plain.len() - END_BYTES);
+    let (mut bytes, mut entry, mut end) =
+        (plain[..at].to_vec(), plain[at..end].to_vec(), plain[end..].to_vec());
+    let len = (log.len() as u64).to_le_bytes();
     entry[20..28].fill(0xFF);
-    entry[28] = 1;
-    entry[30] = 24;
+    entry[30] = 28;
     entry[42..46].fill(0xFF);
-    entry.extend(
-        [&b"a"[..], &[9, 0, 0, 0], &[1, 0, 16, 0], &5_u64.to_le_bytes(), &6_u64.to_le_bytes()].concat(),
-    );
-    let found = member(&entry, 1, 24);
-    assert_eq!((found.name.as_str(), found.size, found.packed, found.at), ("a", 5, 6, 0));
+    entry.extend([&[1, 0, 24, 0][..], &len, &len, &0_u64.to_le_bytes()].concat());
+    let long_at = (at + entry.len()) as u64;
+    bytes.extend(&entry);
+    bytes.extend([&b"PK\x06\x06"[..], &44_u64.to_le_bytes(), &[45, 0, 45, 0], &[0; 8]].concat());
+    for number in [1, 1, entry.len() as u64, at as u64] {
+        bytes.extend(number.to_le_bytes());
+    }
+    bytes.extend([&b"PK\x06\x07"[..], &[0; 4], &long_at.to_le_bytes(), &[1, 0, 0, 0]].concat());
+    end[8..20].fill(0xFF);
+    bytes.extend(&end);
+    assert_eq!(read(bytes), Ok((10, vec![])));
+}
+
+/// An installer that unpacks itself, and a log that was written in front by mistake: places count from the archive's first byte.
+#[test]
+fn an_archive_behind_something_else_is_found_where_it_is_taken_for_one() {
+    let log = log(10);
+    let whole = [&b"PK\x03\x04 not a file"[..], &archive(&[("a.log", &log)])].concat();
+    assert_eq!(read(whole), Ok((10, vec![])));
+}
+
+/// Its check does not fit: what was unpacked is still read, and that it does not fit is said.
+#[test]
+fn a_file_whose_check_does_not_fit_is_read_to_its_end() {
+    for name in ["a.log", "a.logz"] {
+        let mut bytes = archive(&[(name, &log(10))]);
+        let entry = memchr::memmem::find(&bytes, ENTRY).unwrap();
+        bytes[entry + 16] ^= 1;
+        let (records, issues) = read(bytes).unwrap();
+        assert_eq!((records, issues.len()), (10, 1), "{issues:?}");
+    }
 }

@@ -85,6 +85,21 @@ fn on_the_bus(board: &Board) -> Device {
     device
 }
 
+/// Another client, which only listens.
+fn another(board: &Board) -> Device {
+    let device = client(board, "other", Role::Listen);
+    device.listen(Channel::Can2, BITRATE_BPS).unwrap();
+    device
+}
+
+/// The frames that a client receives.
+fn seen(device: &Device) -> impl Iterator<Item = String> {
+    device.records().map(Result::unwrap).filter_map(|record| match record.event {
+        TraceEvent::Frame { frame, .. } => Some(frame.to_string()),
+        _ => None,
+    })
+}
+
 fn send(device: &Device, frame: &str) {
     let frame = TxFrame { tag: 1, frame: frame.parse().unwrap(), at_ticks: None };
     device.send(Channel::Can2, &[frame]).unwrap();
@@ -112,12 +127,8 @@ fn what_is_on_the_bus_comes_out_at_the_peer_numbered_and_in_order() {
 #[test]
 fn the_peer_sends_in_order_and_does_not_hear_itself() {
     let far = tunnel(Role::Send);
-    let other = client(&far.board, "other", Role::Listen);
-    other.listen(Channel::Can2, BITRATE_BPS).unwrap();
-    let mut seen = other.records().map(Result::unwrap).filter_map(|record| match record.event {
-        TraceEvent::Frame { frame, .. } => Some(frame.to_string()),
-        _ => None,
-    });
+    let other = another(&far.board);
+    let mut seen = seen(&other);
     far.peer.send(&with(250, &["123#11", "124#22"])).unwrap();
     assert_eq!([(); 2].map(|()| seen.next().unwrap()), ["123#11", "124#22"]);
     // Two are missing, which is said; what there is, is sent.
@@ -136,6 +147,33 @@ fn the_peer_sends_in_order_and_does_not_hear_itself() {
     assert_eq!(heard, ["126#"]);
 }
 
+/// A network may double a datagram: a frame must not be on the bus twice for that. What a datagram hides or lacks is reported, with numbers.
+#[test]
+fn a_datagram_that_comes_twice_is_sent_once_and_what_is_wrong_with_one_is_reported() {
+    let far = tunnel(Role::Send);
+    let other = another(&far.board);
+    let mut seen = seen(&other);
+    let twice = with(0, &["123#11"]);
+    far.peer.send(&twice).unwrap();
+    far.peer.send(&twice).unwrap();
+    far.tells("came twice; what it holds was not sent again");
+    far.peer.send(&with(1, &["124#22"])).unwrap();
+    assert_eq!([(); 2].map(|()| seen.next().unwrap()), ["123#11", "124#22"]);
+    // It says that it has one frame, and holds three.
+    let mut hiding = with(5, &["125#", "126#", "127#"]);
+    hiding[4] = 1;
+    far.peer.send(&hiding).unwrap();
+    far.tells(
+        "3 datagrams before this one are missing; 10 bytes follow the frames that a datagram says it has",
+    );
+    assert_eq!(seen.next().unwrap(), "125#");
+    let mut cut = with(6, &["128#", "129#"]);
+    cut[4] = 4;
+    far.peer.send(&cut).unwrap();
+    far.tells("it sent a datagram that ends before 2 of its frames");
+    assert_eq!([(); 2].map(|()| seen.next().unwrap()), ["128#", "129#"]);
+}
+
 #[test]
 fn a_peer_that_may_only_listen_sends_nothing() {
     let far = tunnel(Role::Listen);
@@ -148,8 +186,7 @@ fn a_peer_that_may_only_listen_sends_nothing() {
 #[test]
 fn strangers_datagrams_are_not_taken_and_nothing_is_answered() {
     let far = tunnel(Role::Send);
-    let other = client(&far.board, "other", Role::Listen);
-    other.listen(Channel::Can2, BITRATE_BPS).unwrap();
+    let other = another(&far.board);
     let stranger = UdpSocket::bind("127.0.0.1:0").unwrap();
     stranger.set_read_timeout(Some(Duration::from_millis(500))).unwrap();
     for bytes in [with(0, &["123#11"]), vec![], vec![2, 0, 0, 0, 0], vec![0; 1400]] {
@@ -172,11 +209,7 @@ fn strangers_datagrams_are_not_taken_and_nothing_is_answered() {
     far.peer.set_read_timeout(Some(Duration::from_millis(500))).unwrap();
     assert!(far.peer.recv(&mut [0; 2048]).is_err(), "an answer");
     far.peer.send(&with(0, &["7FF#"])).unwrap();
-    let first = other.records().map(Result::unwrap).find_map(|record| match record.event {
-        TraceEvent::Frame { frame, .. } => Some(frame.to_string()),
-        _ => None,
-    });
-    assert_eq!(first.as_deref(), Some("7FF#"));
+    assert_eq!(seen(&other).next().as_deref(), Some("7FF#"));
 }
 
 #[test]

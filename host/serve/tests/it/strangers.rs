@@ -439,3 +439,27 @@ fn a_request_while_the_server_ends_is_answered_with_that() {
         assert!(error.ends_with("its server has ended"), "{error}");
     }
 }
+
+/// Each report is a line on standard error and in the audit log: whoever may only listen could fill a disk with sessions of a few bytes.
+#[test]
+fn sessions_without_end_are_reported_up_to_a_limit_and_then_counted() {
+    let (board, told) = board_at(Settings::at(BITRATE_BPS));
+    let mut reports = 0;
+    let left_out = loop {
+        drop(client(&board, "flood", Role::Listen));
+        let more = told.try_iter().find_map(|news| match news {
+            News::SessionsMore { count } => Some(count),
+            News::ClientCame { .. } | News::ClientLeft { .. } => {
+                reports += 1;
+                None
+            }
+            _ => None,
+        });
+        if let Some(count) = more {
+            break count;
+        }
+    };
+    // A thousand at once, of which the two channels that each client closes take half, and one every two seconds.
+    assert!((400..1100).contains(&reports), "{reports}");
+    assert!(left_out > 0);
+}

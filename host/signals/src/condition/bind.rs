@@ -1,5 +1,6 @@
 //! Binds a condition's names to their meaning: parts of the frame, signals of databases, or what a listener knows.
 
+use crate::named::PREFIX;
 use crate::{Decoder, MessageRef, Signal, Suggestion};
 
 use super::error::ConditionFault;
@@ -108,11 +109,22 @@ impl Binder<'_> {
         if let Some(said) = self.said(name) {
             return Ok(Expression::Said(said));
         }
-        if self.decoder.signals().next().is_none() {
+        let of_message = name.strip_prefix(PREFIX).unwrap_or(name);
+        let messages = self.decoder.messages();
+        let messages: Vec<_> =
+            messages.filter(|(_, _, message)| message.name == of_message).map(|(place, ..)| place).collect();
+        if !messages.is_empty() {
+            self.about_frames = true;
+            return Ok(Expression::Message(messages));
+        }
+        if self.decoder.messages().next().is_none() {
             return Err((at, ConditionFault::NoDatabase(name.to_owned())));
         }
-        let near =
-            Suggestion::nearest(name, self.decoder.signals().map(|(_, _, signal)| signal.name.as_str()));
+        let signals = self.decoder.signals().map(|(_, _, signal)| signal.name.as_str());
+        let near = Suggestion::nearest(
+            of_message,
+            signals.chain(self.decoder.messages().map(|(_, _, message)| message.name.as_str())),
+        );
         Err((at, ConditionFault::UnknownName { name: name.to_owned(), near }))
     }
 

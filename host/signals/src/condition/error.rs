@@ -43,7 +43,7 @@ pub enum ConditionFault {
     #[error("a frame has no byte {0}; bytes are counted from 0 to 7, in CAN FD to 63")]
     ByteIndex(String),
     /// An unknown name.
-    #[error("there is no signal {name:?}{near}")]
+    #[error("there is no signal or message {name:?}{near}")]
     UnknownName {
         /// The name.
         name: String,
@@ -51,7 +51,7 @@ pub enum ConditionFault {
         near: Suggestion,
     },
     /// An unknown name, because no database was loaded.
-    #[error("{0:?} is not part of a frame, and without a database there are no signals")]
+    #[error("{0:?} is not part of a frame, and without a database there are neither signals nor messages")]
     NoDatabase(String),
     /// A text where it cannot be compared.
     #[error("a text can only be compared with a signal, by == or !=")]

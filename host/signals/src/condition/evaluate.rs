@@ -143,6 +143,11 @@ impl Condition {
                 record.frame()?.data().get(index).copied().map(f64::from)
             }
             Expression::Signal(slot) => self.slots[*slot].last.map(|(_, _, value)| value),
+            Expression::Message(_) if said.is_some_and(|heard| !heard.said.is_completed_by(record)) => None,
+            Expression::Message(messages) => {
+                let message = self.decoder.find(record.channel, record.frame()?.id());
+                boolean(message.is_some_and(|message| messages.contains(&message)))
+            }
             Expression::HasText(slot, raws) => {
                 let (candidate, raw, _) = self.slots[*slot].last?;
                 let (message, index) = self.slots[*slot].candidates[candidate];
@@ -251,6 +256,27 @@ mod tests {
     }
 
     #[test]
+    fn a_message_s_name_is_true_for_its_frames() {
+        assert_eq!(hits("Engine", FRAMES), [1, 3, 5, 6]);
+        assert_eq!(hits("Box and byte[1] == 0x50 or Engine and len == 0", FRAMES), [0, 6]);
+        assert_eq!(hits("not Engine", FRAMES), [0, 2, 4]);
+        assert_eq!(hits("Engine and len == 1 and Engine.Speed > 80", FRAMES), [1, 5]);
+        assert_eq!(
+            hits("msg:Engine and len == 1 or msg:Box", FRAMES),
+            hits("Engine and len == 1 or Box", FRAMES)
+        );
+        for (text, part) in [
+            ("Engin", "did you mean Engine?"),
+            ("msg:Engin and len > 0", "did you mean Engine?"),
+            ("msg:", "there is no signal or message \"msg:\""),
+            ("msg:Speed", "there is no signal or message \"msg:Speed\""),
+        ] {
+            let unknown = Condition::new(text, &decoder()).unwrap_err().to_string();
+            assert!(unknown.contains(part), "{text}: {unknown}");
+        }
+    }
+
+    #[test]
     fn parts_of_the_frame_are_looked_at_for_every_record() {
         assert_eq!(hits("id == 0x123 and byte[0] & 0x80 and ch == 1", FRAMES), [2]);
         assert_eq!(hits("byte[1] != 0", FRAMES), [0], "a byte that is not there is neither equal nor not");
@@ -270,6 +296,7 @@ mod tests {
         let mut condition = Condition::new("error or lost", &Decoder::new(Vec::new())).unwrap();
         assert!(condition.holds(&record(TraceEvent::BusError { kind: None, counters: None })));
         assert!(condition.holds(&record(TraceEvent::Lost { stage: None, count: 1, at_least: false })));
+        assert!(!condition.holds(&record(TraceEvent::UNCOUNTED)));
         assert!(!condition.holds(&frame("001#")));
     }
 
@@ -284,7 +311,7 @@ mod tests {
     #[test]
     fn names_that_are_nothing_are_explained() {
         for (text, expected) in [
-            ("Sped > 1", "there is no signal \"Sped\"; did you mean Speed?\n  Sped > 1\n  ^"),
+            ("Sped > 1", "there is no signal or message \"Sped\"; did you mean Speed?\n  Sped > 1\n  ^"),
             (
                 "Gear == Driv",
                 "Gear has no value \"Driv\"; it has Not available, Drive\n  Gear == Driv\n          ^",
@@ -302,6 +329,6 @@ mod tests {
             assert!(error.starts_with(expected), "{error}");
         }
         let error = Condition::new("Speed > 1", &Decoder::new(Vec::new())).unwrap_err().to_string();
-        assert!(error.contains("without a database there are no signals\n"), "{error}");
+        assert!(error.contains("without a database there are neither signals nor messages\n"), "{error}");
     }
 }

@@ -22,6 +22,8 @@ pub(super) enum Expression {
     Part(Part),
     Byte(Box<Expression>),
     Signal(usize),
+    /// Whether the frame is one of these messages.
+    Message(Vec<MessageRef>),
     /// Whether a signal's value has a text: for each candidate, the raw values with that text.
     HasText(usize, Vec<Vec<i64>>),
     /// The first value of a listener's name, by its index among the names.
@@ -65,12 +67,17 @@ pub(super) fn part(name: &str) -> Option<Part> {
     })
 }
 
+/// That a device does not count its losses is none.
+fn is_loss(event: &TraceEvent) -> bool {
+    matches!(event, TraceEvent::Lost { .. }) && *event != TraceEvent::UNCOUNTED
+}
+
 pub(super) fn part_of(part: Part, record: &TraceRecord) -> Option<f64> {
     let flag = |flag: bool| Some(f64::from(u8::from(flag)));
     match part {
         Part::Channel => return Some(record.channel.into()),
         Part::Error => return flag(matches!(record.event, TraceEvent::BusError { .. })),
-        Part::Lost => return flag(matches!(record.event, TraceEvent::Lost { .. })),
+        Part::Lost => return flag(is_loss(&record.event)),
         _ => {}
     }
     let frame = record.frame()?;

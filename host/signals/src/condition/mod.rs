@@ -3,6 +3,7 @@
 //! | Part | Means |
 //! |---|---|
 //! | `Speed`, `Engine.Speed` | a signal's physical value, the last one received |
+//! | `EngineData`, `msg:EngineData` | 1 for a frame of that message; without `msg:`, if no signal has the name |
 //! | `Gear == Drive`, `Gear == "Not available"` | a text of the signal's value table |
 //! | `id`, `dlc`, `len`, `ch` | the frame's identifier, length code, data bytes, channel (from 1) |
 //! | `ext`, `rtr` | 1 for a 29-bit identifier, for a remote frame |

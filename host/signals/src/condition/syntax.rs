@@ -1,6 +1,7 @@
 //! Parses the text of a condition into a tree.
 
 use super::error::{ConditionError, ConditionFault};
+use crate::named::PREFIX;
 
 /// Nobody types more; and it bounds the depth of the tree, on which evaluation recurses.
 const MAX_CHARACTERS: usize = 2000;
@@ -156,7 +157,14 @@ fn number(rest: &str) -> Result<(Token, usize), ConditionFault> {
 }
 
 fn name(rest: &str) -> (Token, usize) {
-    let end = rest.find(|c: char| !(c.is_alphanumeric() || c == '_' || c == '.')).unwrap_or(rest.len());
+    let length = |rest: &str| {
+        rest.find(|c: char| !(c.is_alphanumeric() || c == '_' || c == '.')).unwrap_or(rest.len())
+    };
+    if let Some(name) = rest.strip_prefix(PREFIX) {
+        let end = PREFIX.len() + length(name);
+        return (Token::Name(rest[..end].to_owned()), end);
+    }
+    let end = length(rest);
     let token = match rest[..end].to_ascii_lowercase().as_str() {
         "and" => Token::Operator(Operator::And),
         "or" => Token::Operator(Operator::Or),

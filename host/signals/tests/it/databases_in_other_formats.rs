@@ -143,6 +143,9 @@ fn an_arxml_file_is_read() {
     assert!(warnings[0].contains("U: the frame \"/P/Gone\" is not in the file"), "{warnings:?}");
     assert_eq!(decode(database.clone(), "00000123#00FFF6"), "Sig=-0.5°C");
     assert_eq!(decode(database, "00000123#007FFF"), "Sig=3277.2(Broken)°C");
+    // What tools call the unit of what has none.
+    let none = ARXML.replace("<DISPLAY-NAME>°C<", "<DISPLAY-NAME>NoUnit<");
+    assert_eq!(arxml::parse("x.arxml", none.as_bytes()).unwrap().messages[0].signals[0].unit, "");
     // UTF-16, as written by some tools.
     let wide: Vec<u8> =
         std::iter::once(0xFEFF).chain(ARXML.encode_utf16()).flat_map(u16::to_le_bytes).collect();

@@ -4,7 +4,7 @@
 use std::fmt::Write as _;
 
 use cantap_signals::condition::Condition;
-use cantap_signals::{Database, Decoder, Indicator, Source, dbc, encode};
+use cantap_signals::{Database, Decoder, Indicator, Source, ValueKind, dbc, encode};
 use cantap_trace::{Direction, Frame, TraceEvent, TraceFrame, TraceRecord};
 
 fn database(text: &str) -> Database {
@@ -163,18 +163,64 @@ fn numbers_are_the_decimals_that_the_factor_makes() {
     assert!(condition.holds(&record("005#0700")));
 }
 
+/// GM's and Honda's files in opendbc write 29-bit identifiers without the flag.
+#[test]
+fn identifiers_that_need_29_bits_are_extended_without_the_flag_too() {
+    let text = "VERSION \"2048\"\nCM_ \"BO_ 2048\";\nBO_ 2047 Short: 8 A\n SG_ 2048 : 0|8@1+ (1,0) [0|0] \"\" A\n\
+                BO_ 2048 First: 8 A\n SG_ S M : 0|8@1- (1,0) [0|0] \"\" A\n SG_ T m2048 : 8|8@1+ (1,0) [0|0] \"\" A\n\
+                BO_ 65543 Far: 4 A\n SG_ S : 0|32@1+ (1,0) [0|0] \"\" A\nBO_ 536870911 Last: 8 A\n\
+                BO_ 7 Seven: 4 A\n SG_ S : 0|32@1+ (1,0) [0|0] \"\" A\nBO_ 2566844926 Flagged: 8 A\n\
+                BO_TX_BU_ 2048 : A;\nCM_ BO_ 2048 \"the first\";\nCM_ SG_ 2048 S \"a signal\";\nBA_DEF_ BO_ \"GenMsgCycleTime\" INT 0 9999;\n\
+                BA_ \"GenMsgCycleTime\" BO_ 2048 100;\nVAL_ 2048 S 1 \"one\" ;\nSIG_VALTYPE_ 65543 S : 1;\n\
+                SG_MUL_VAL_ 2048 T S 3-4;\nVAL_ 2048 Nobody 1 \"one\" ;\n";
+    let found = database(text);
+    let ids: Vec<_> = found.messages.iter().map(|message| message.id.to_string()).collect();
+    assert_eq!(ids, ["7FF", "00000800", "00010007", "1FFFFFFF", "007", "18FEF1FE"]);
+    let [short, first, far, _, seven, _] = &found.messages[..] else { panic!("{:?}", found.messages) };
+    assert_eq!((short.signals[0].name.as_str(), first.description.as_str()), ("2048", "the first"));
+    assert_eq!((first.cycle_ms, first.signals[0].description.as_str()), (Some(100), "a signal"));
+    assert_eq!(first.signals[0].text(1), Some("one"));
+    assert_eq!(first.signals[1].multiplexed.as_ref().unwrap().values, [3..=4]);
+    assert_eq!((far.signals[0].kind, seven.signals[0].kind), (ValueKind::Single, ValueKind::Unsigned));
+    // Once for the file, however many there are.
+    assert_eq!(
+        warnings(text),
+        [
+            "line 5: First: identifier 0x800 lacks the flag of extended identifiers (0x80000000) and does not fit 11 bits; 3 such \
+             messages are read as extended",
+            "line 22: VAL_ 2147485696 Nobody: there is no such message or signal; the statement is left out",
+        ]
+    );
+    assert!(decoded(&decoder(text), "00000800#0500000000000000").is_some());
+    assert!(decoded(&decoder("BO_ 4000 One: 1 A\n"), "00000FA0#00").is_some());
+    assert_eq!(
+        warnings("BO_ 4000 One: 1 A\n"),
+        [
+            "line 1: One: identifier 0xFA0 lacks the flag of extended identifiers (0x80000000) and does not fit 11 bits; 1 such message \
+             is read as extended"
+        ]
+    );
+    // Written both ways, it is one identifier; each statement still belongs to a message.
+    let twice = "BO_ 2147487648 One: 1 A\nBO_ 4000 Other: 1 A\n SG_ S : 0|8@1+ (1,0) [0|0] \"\" A\nVAL_ 4000 S 1 \"one\" ;\n";
+    assert_eq!(database(twice).messages[1].signals[0].text(1), Some("one"));
+    assert!(
+        warnings(twice)[1].contains("identifier 00000FA0 is already that of One"),
+        "{:?}",
+        warnings(twice)
+    );
+}
+
 #[test]
 fn one_bad_message_leaves_the_others() {
     let good = "BO_ 6 Good: 8 A\n SG_ S : 0|8@1+ (1,0) [0|0] \"\" A\n";
     let about = "CM_ BO_ 5 \"bad\";\nVAL_ 5 Bad 1 \"one\" ;\n";
     for (bad, warning) in [
-        // An extended identifier without its flag, as in files used every day.
         (
-            "BO_ 419361278 Bad: 8 A\n SG_ S : 0|8@1+ (1,0) [0|0] \"\" A\nVAL_ 419361278 S 1 \"one\" ;\n",
-            "line 3: Bad: identifier 0x18FEF1FE does not fit 11 bits (standard) or 29 bits (extended: add 0x80000000 in DBC); the message is left out",
+            "BO_ 536870913 Bad: 8 A\n SG_ S : 0|8@1+ (1,0) [0|0] \"\" A\nVAL_ 536870913 S 1 \"one\" ;\n",
+            "line 3: Bad: identifier 0x20000001 does not fit 11 bits (standard) or 29 bits (extended); the message is left out",
         ),
         // Its lower 16 bits equal those of the good one.
-        ("BO_ 65542 Bad: 8 A\nVAL_ 65542 S 1 \"one\" ;\n", "line 3: Bad: identifier 0x10006"),
+        ("BO_ 1073741830 Bad: 8 A\nVAL_ 1073741830 S 1 \"one\" ;\n", "line 3: Bad: identifier 0x40000006"),
         (
             "BO_ 5 Bad: 8 A\n SG_ Bad : 0|0@1+ (1,0) [0|0] \"\" A\n",
             "line 4: Bad.Bad: a signal needs at least 1 bit; the",

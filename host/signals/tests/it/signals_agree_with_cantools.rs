@@ -6,12 +6,13 @@
 
 use cantap_testing::peers;
 
-use std::collections::BTreeMap;
+use std::borrow::Cow;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use cantap_signals::{Decoder, Number, Signal, Source};
-use cantap_trace::Id;
+use cantap_signals::{ByteOrder, Decoder, Fault, FaultKind, Message, Number, Signal, Source, ValueKind};
+use cantap_trace::{Id, clean};
 use serde::Deserialize;
 
 /// For each message.
@@ -25,8 +26,13 @@ const REFUSED: &[(&str, &str)] = &[
         "incorrect-sig_valtype.dbc",
         "a SIG_VALTYPE_ for an unknown signal is a warning here: nothing decodes wrong for it",
     ),
+    (
+        "issue_199_extended.dbc",
+        "a message whose identifier no frame can have is left out here, and the others are read",
+    ),
     ("ecu-extract-4.2.arxml", "a control unit's configuration, which has no CAN frames"),
     ("system-DAI-3.1.2.arxml", "nothing but the file's head: no frame is an error here"),
+    ("MyECU.ecuc.arxml", "a control unit's configuration, too"),
     ("issue_138.sym", "a multiplexer without bits is a name for the only variant there is"),
     ("jopp-5.0.sym", "version 5 is read here"),
     ("incorrect-val.dbc", "a VAL_ for an unknown signal is a warning here: nothing decodes wrong for it"),
@@ -46,6 +52,21 @@ const DIFFERENT: &[(&str, &str, &str)] = &[
     ),
     ("system-4.2.arxml", "MultiplexedMessage", "as in the file of version 3"),
     ("system-4.2.arxml", "Message4", "numbers in one's complement: cantools takes them for two's"),
+    (
+        "test.arxml",
+        "FRAME_testFrame1",
+        "version 3: cantools finds no conversion, which the file has (5, offset 1)",
+    ),
+    (
+        "aa.dbc",
+        "SDO_upload",
+        "m128 of a signed multiplexer of 8 bits is the raw value, and never comes for cantools",
+    ),
+    ("nissan_rogue_2021.dbc", "CRUISE", "a VAL_ without its semicolon is read here"),
+    ("Model3CAN.dbc", "ID201VCFRONT_loggingAndVitals10Hz", "cantools cuts the multiplexer's long name"),
+    ("the_homer.kcd", "ABS", "as of Gear"),
+    ("Test.kcd", "ABS", "the file is the_homer.kcd"),
+    ("Test.kcd", "Gear", "the file is the_homer.kcd"),
     ("bad_message_length.kcd", "Message1", "as in the DBC file"),
     ("bad_message_length.sym", "Message1", "as in the DBC file"),
     ("message_layout.kcd", "Message3", "the signal ends beyond its message"),
@@ -53,11 +74,7 @@ const DIFFERENT: &[(&str, &str, &str)] = &[
     ("message_layout.kcd", "Message7", "a signal of 128 bits is left out"),
     ("message_layout.kcd", "Message8", "a signal of 128 bits is left out"),
     ("dump.kcd", "Message1", "a text for 0 is that of the float 0 here, not of every float below 1"),
-    (
-        "the_homer.kcd",
-        "SteeringInfo",
-        "another bus of the file has the identifier too: the later message counts",
-    ),
+    ("the_homer.kcd", "EnumTestFloatMessage", "cantools looks for a text of a float that is not a number"),
     ("the_homer.kcd", "Gear", "texts for ranges of values (LabelGroup) are read here"),
     ("vw_pq.dbc", "Motor_2", "signals overlap"),
     (
@@ -85,6 +102,101 @@ struct Line {
     #[serde(default)]
     texts: BTreeMap<String, String>,
     failed: Option<String>,
+    #[serde(default)]
+    length: u16,
+    layouts: Option<Vec<(String, Layout)>>,
+}
+
+/// What the database says of a signal.
+#[derive(Clone, Debug, Deserialize, PartialEq)]
+struct Layout {
+    start: u16,
+    length: u16,
+    little: bool,
+    kind: String,
+    scale: String,
+    offset: String,
+    unit: String,
+    switch: Option<String>,
+    ids: Vec<u64>,
+    texts: BTreeMap<String, String>,
+}
+
+impl Layout {
+    fn of(signal: &Signal, message: &Message) -> Self {
+        let kind = match signal.kind {
+            ValueKind::Unsigned => "unsigned",
+            ValueKind::Signed => "signed",
+            ValueKind::Half | ValueKind::Single | ValueKind::Double => "float",
+            _ => "another",
+        };
+        let multiplexed = signal.multiplexed.as_ref();
+        let ranges = multiplexed.map(|multiplexed| multiplexed.values.as_slice()).unwrap_or_default();
+        let mut ids: Vec<_> = ranges.iter().cloned().flatten().collect();
+        ids.sort_unstable();
+        ids.dedup();
+        Self {
+            start: signal.start,
+            length: signal.length,
+            little: signal.order == ByteOrder::Little,
+            kind: kind.to_owned(),
+            scale: float(signal.factor),
+            offset: float(signal.offset),
+            unit: signal.unit.clone(),
+            switch: multiplexed.map(|multiplexed| message.signals[multiplexed.switch].name.clone()),
+            ids,
+            texts: signal.values.iter().map(|(raw, text)| (raw.to_string(), text.to_owned())).collect(),
+        }
+    }
+}
+
+impl Layout {
+    /// With texts as they are kept here.
+    fn cleaned(mut self) -> Self {
+        self.texts.values_mut().for_each(|text| clean::make(text, clean::line));
+        clean::make(&mut self.unit, clean::line);
+        self
+    }
+}
+
+/// A number by its bits, however it is written.
+fn float(value: f64) -> String {
+    format!("{value:e}")
+}
+
+/// What both say of a message's signals.
+fn layout_differences(decoder: &Decoder, line: &Line, layouts: &[(String, Layout)]) -> Vec<String> {
+    let id = if line.extended { Id::extended(line.id) } else { Id::standard(line.id) }.unwrap();
+    let Some(reference) = decoder.find(1, id) else { return vec!["no such message here".to_owned()] };
+    let message = decoder.message(reference);
+    let mut found = Vec::new();
+    if message.length != line.length {
+        found.push(format!("length: theirs {}, ours {}", line.length, message.length));
+    }
+    let mut ours: Vec<_> =
+        message.signals.iter().map(|signal| (signal.name.clone(), Layout::of(signal, message))).collect();
+    for (name, theirs) in layouts.iter().filter(|(_, theirs)| theirs.length <= 64) {
+        let same = |(ours_name, ours): &(String, Layout)| ours_name == name && same_layout(theirs, ours);
+        match ours.iter().position(same) {
+            Some(place) => drop(ours.swap_remove(place)),
+            None => found.push(format!(
+                "{name}: theirs {theirs:?}, ours {:?}",
+                ours.iter().filter(|(ours, _)| ours == name).collect::<Vec<_>>()
+            )),
+        }
+    }
+    let is_new = |name: &String| !layouts.iter().any(|(theirs, _)| theirs == name);
+    found
+        .extend(ours.iter().filter(|(name, _)| is_new(name)).map(|(name, _)| format!("{name} is only here")));
+    found
+}
+
+fn same_layout(theirs: &Layout, ours: &Layout) -> bool {
+    let number = |text: &str| text.parse::<f64>().map(f64::to_bits);
+    number(&theirs.scale) == number(&ours.scale)
+        && number(&theirs.offset) == number(&ours.offset)
+        && Layout { scale: ours.scale.clone(), offset: ours.offset.clone(), ..theirs.clone().cleaned() }
+            == *ours
 }
 
 fn peer(arguments: &[&Path], payloads: u32) -> Result<String, String> {
@@ -165,8 +277,10 @@ fn differences(decoder: &Decoder, line: &Line) -> Vec<String> {
     let mut found = Vec::new();
     // The selector of a multiplexed PDU in a container is a signal of its own, too: here it keeps its name and text beside.
     let is_compared = |name: &&String| !name.contains('.') || !name.contains("_selector");
-    let theirs = line.texts.iter().filter(|(name, _)| is_compared(name));
-    if texts.iter().filter(|(name, _)| is_compared(name)).ne(theirs) {
+    let theirs =
+        line.texts.iter().map(|(name, text)| (name, clean::line(text))).filter(|(name, _)| is_compared(name));
+    let our_texts = texts.iter().map(|(name, text)| (name, Cow::Borrowed(text.as_str())));
+    if our_texts.filter(|(name, _)| is_compared(name)).ne(theirs) {
         found.push(format!("texts: theirs {:?}, ours {texts:?}", line.texts));
     }
     if message.name != line.message {
@@ -192,35 +306,66 @@ fn differences(decoder: &Decoder, line: &Line) -> Vec<String> {
     found
 }
 
-/// Compares all files; returns every unlisted difference, and how much was compared.
-fn compare(files: &[PathBuf], payloads: u32) -> Option<(Vec<String>, usize, usize)> {
+/// How much was compared, and what differs.
+#[derive(Debug, Default)]
+struct Comparison {
+    /// Every difference that is not listed above.
+    unexpected: Vec<String>,
+    files: usize,
+    /// Files that only cantools refuses, and that both refuse.
+    only_here: usize,
+    nowhere: usize,
+    databases: usize,
+    messages: usize,
+    signals: usize,
+    payloads: usize,
+}
+
+/// The earlier of two messages with one identifier.
+fn replaced_by(fault: &Fault) -> Option<String> {
+    match &fault.kind {
+        FaultKind::DuplicateId { other, .. } => Some(other.clone()),
+        _ => None,
+    }
+}
+
+/// Compares all files.
+fn compare(files: &[PathBuf], payloads: u32) -> Option<Comparison> {
     let mut arguments = vec![Path::new("decode")];
     arguments.extend(files.iter().map(PathBuf::as_path));
     let output = peer_or_skip(&arguments, payloads)?;
-    let (mut unexpected, mut databases, mut payloads) = (Vec::new(), 0, 0);
+    let mut result = Comparison::default();
     let mut current: Option<(String, Decoder)> = None;
+    // Messages whose identifier is that of a later one.
+    let mut replaced = BTreeSet::new();
     for text in output.lines() {
         let line: Line = serde_json::from_str(text).expect("the script prints JSON");
         if let Some(path) = &line.file {
             let name = path.file_name().unwrap().to_string_lossy().into_owned();
             let ours = cantap_signals::load(path);
             current = None;
+            result.files += 1;
             match (&line.refused, ours) {
                 (None, Ok(database)) => {
-                    databases += 1;
+                    result.databases += 1;
                     if line.messages != Some(database.messages.len()) {
-                        unexpected.push(format!(
+                        result.unexpected.push(format!(
                             "{name}: {} messages here, {:?} there",
                             database.messages.len(),
                             line.messages
                         ));
                     }
+                    replaced = database.warnings.iter().filter_map(replaced_by).collect();
                     current = Some((name, Decoder::new(vec![Source { channel: None, database }])));
                 }
-                (Some(_), Err(_)) => {}
+                (Some(theirs), Err(ours)) => {
+                    result.nowhere += 1;
+                    println!("{name}: theirs {theirs}, ours {ours}");
+                }
                 (theirs, ours) => {
+                    result.only_here += usize::from(ours.is_ok());
                     if !REFUSED.iter().any(|&(file, _)| file == name) {
-                        unexpected.push(format!(
+                        result.unexpected.push(format!(
                             "{name}: theirs {theirs:?}, ours {:?}",
                             ours.err().map(|e| e.to_string())
                         ));
@@ -228,33 +373,80 @@ fn compare(files: &[PathBuf], payloads: u32) -> Option<(Vec<String>, usize, usiz
                 }
             }
         } else if let Some((name, decoder)) = &current {
-            payloads += 1;
-            if DIFFERENT.iter().any(|&(file, message, _)| file == *name && message == line.message) {
+            let found = if let Some(layouts) = &line.layouts {
+                result.messages += 1;
+                result.signals += layouts.len();
+                layout_differences(decoder, &line, layouts)
+            } else {
+                result.payloads += 1;
+                differences(decoder, &line)
+            };
+            let is_listed =
+                |&(file, message, _): &(&str, &str, &str)| name.ends_with(file) && message == line.message;
+            if replaced.contains(&line.message) || DIFFERENT.iter().any(is_listed) {
                 continue;
             }
-            let found = differences(decoder, &line);
             // The first payload that shows a message's difference is enough.
             let difference =
                 found.first().map(|found| format!("{name}: {}: {found} (data {})", line.message, line.data));
             let known = |text: &String| text.starts_with(&format!("{name}: {}: ", line.message));
-            unexpected.extend(difference.filter(|_| !unexpected.iter().any(known)));
+            let is_new = !result.unexpected.iter().any(known);
+            result.unexpected.extend(difference.filter(|_| is_new));
         }
     }
-    Some((unexpected, databases, payloads))
+    Some(result)
 }
 
-fn assert_none((unexpected, databases, payloads): (Vec<String>, usize, usize)) {
+fn assert_none(result: &Comparison) {
+    let Comparison { unexpected, databases, messages, signals, payloads, .. } = result;
     let shown = unexpected.join("\n");
     assert!(unexpected.is_empty(), "{databases} databases, {payloads} payloads, these differ:\n{shown}");
-    println!("{databases} databases, {payloads} payloads, no difference that is not listed");
+    println!(
+        "{databases} databases, {messages} messages, {signals} signals, {payloads} payloads, no difference that is not listed"
+    );
 }
 
 #[test]
 fn our_test_databases_decode_as_with_cantools() {
     if let Some(result) = compare(&own_files(), PAYLOADS) {
-        assert!(result.1 == own_files().len() && result.2 > 20_000);
-        assert_none(result);
+        assert!(result.databases == own_files().len() && result.payloads > 20_000);
+        assert_none(&result);
     }
+}
+
+/// Whether cantools alone gave up.
+fn is_read_here_alone(difference: &str) -> bool {
+    let is_refused = difference.contains("theirs Some(") && difference.contains("ours None");
+    is_refused
+        || difference.contains(" messages here, Some(0) there")
+        || difference.contains(": cantools fails: ")
+}
+
+/// The files of a folder that `CANTAP_DATABASES` names, one table row for each folder in it. docs/signals.md has the result of a large one.
+#[test]
+fn the_databases_of_a_folder_decode_as_with_cantools() {
+    let Some(folder) = std::env::var_os("CANTAP_DATABASES").map(PathBuf::from) else { return };
+    let wanted = std::env::var("CANTAP_PAYLOADS").map_or(3, |number| number.parse().unwrap());
+    let entries = |folder: &Path| {
+        let mut entries: Vec<_> = folder.read_dir().unwrap().map(|entry| entry.unwrap().path()).collect();
+        entries.sort();
+        entries
+    };
+    let mut unexpected = Vec::new();
+    for collection in entries(&folder) {
+        let Some(result) = compare(&entries(&collection), wanted) else { return };
+        let name = collection.file_name().unwrap().to_string_lossy();
+        let Comparison { files, only_here, nowhere, messages, signals, payloads, .. } = result;
+        println!("| {name} | {files} | {only_here} | {nowhere} | {messages} | {signals} | {payloads} |");
+        unexpected.extend(
+            result
+                .unexpected
+                .iter()
+                .filter(|text| !is_read_here_alone(text))
+                .map(|text| format!("{name}/{text}")),
+        );
+    }
+    assert!(unexpected.is_empty(), "{}", unexpected.join("\n"));
 }
 
 /// Databases of today's cars. cantools refuses a third of them; here a file is read without its broken statements. Three payloads of each
@@ -267,15 +459,10 @@ fn the_databases_of_opendbc_and_canmatrix_decode_as_with_cantools() {
     let files: Vec<PathBuf> = list.lines().map(PathBuf::from).collect();
     assert!(files.len() > 60, "{files:?}");
     let wanted = std::env::var("CANTAP_PAYLOADS").map_or(3, |number| number.parse().unwrap());
-    let Some((mut unexpected, databases, payloads)) = compare(&files, wanted) else { return };
-    let is_read_here_alone = |text: &str| {
-        text.contains("theirs Some(") && text.contains("ours None") || text.contains(": cantools fails: ")
-    };
-    // cantools takes each file for Windows' code page, also those in UTF-8.
-    let is_code_page = |text: &str| text.contains(": texts: ") && !text.is_ascii();
-    unexpected.retain(|text| !is_read_here_alone(text) && !is_code_page(text));
-    assert!(databases > 30 && payloads > 5000, "{databases} databases, {payloads} payloads");
-    assert_none((unexpected, databases, payloads));
+    let Some(mut result) = compare(&files, wanted) else { return };
+    result.unexpected.retain(|text| !is_read_here_alone(text));
+    assert!(result.databases > 30 && result.payloads > 5000, "{result:?}");
+    assert_none(&result);
 }
 
 #[test]
@@ -286,6 +473,6 @@ fn cantools_own_test_databases_decode_as_with_cantools() {
     let files: Vec<PathBuf> = list.lines().map(PathBuf::from).collect();
     assert!(files.len() > 80, "{files:?}");
     if let Some(result) = compare(&files, PAYLOADS) {
-        assert_none(result);
+        assert_none(&result);
     }
 }

@@ -17,6 +17,8 @@ interface Entry {
   columns: number;
   latest: Latest<Wanted>;
   failed: string | null;
+  /** The trace has grown since. */
+  outdated: boolean;
 }
 
 export class SeriesCache {
@@ -30,6 +32,11 @@ export class SeriesCache {
   /** Forgets all columns: the trace or a database changed. */
   clear(): void {
     this.#entries.clear();
+  }
+
+  /** The trace has grown: columns are drawn until newer ones are there. */
+  outdate(): void {
+    for (const entry of this.#entries.values()) entry.outdated = true;
   }
 
   /** Why a signal cannot be drawn; null if it can. */
@@ -47,10 +54,11 @@ export class SeriesCache {
     const key = keyOf(item);
     let entry = this.#entries.get(key);
     if (!entry) {
-      const made: Entry = { series: null, range: { from: NaN, to: NaN }, columns: 0, failed: null, latest: new Latest((wanted) => this.#fetch(item, key, made, wanted), () => undefined) };
+      const made: Entry = { series: null, range: { from: NaN, to: NaN }, columns: 0, failed: null, outdated: false, latest: new Latest((wanted) => this.#fetch(item, key, made, wanted), () => undefined) };
       this.#entries.set(key, (entry = made));
     }
-    if (!serves(entry, range, width, this.app.whole())) {
+    if (entry.outdated || !serves(entry, range, width, this.app.whole())) {
+      entry.outdated = false;
       const span = range.to - range.from;
       const whole = this.app.whole();
       const wide = { from: Math.max(whole.from, range.from - span), to: Math.min(whole.to, range.to + span) };

@@ -39,7 +39,7 @@ export class SignalTree {
     this.element = el('aside', { class: 'signal-tree', attrs: { 'aria-label': 'Signals' } }, this.#search, this.#state, this.#list);
     app.on('messages', () => this.show());
     app.on('panels', () => this.#marks());
-    app.on('summary', () => {
+    app.on('steady', () => {
       if (this.#list.childElementCount === 0) this.show();
     });
   }

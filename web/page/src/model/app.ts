@@ -2,15 +2,18 @@
 // to each other.
 
 import type { Answer, Engine, Finding, Gap, IdRow, MessageInfo, Requests, SignalInfo, Summary } from '../api';
+import type { Connection } from '../live/connection';
 import { Emitter } from './emitter';
 import { pieces } from './files';
 import { count } from './format';
 import { History } from './history';
 import { Panels } from './panels';
 import type { Report } from './report';
+import { Spacing } from './spacing';
 import { type Profile, Storage } from './storage';
 
-export type Topic = 'summary' | 'messages' | 'range' | 'cursors' | 'identifier' | 'panels' | 'notes' | 'own' | 'profile' | 'findings' | 'engine' | 'goto';
+/** `steady` comes with `summary`, but of a trace that grows live only about once a second: for what is costly, or is read and not watched. */
+export type Topic = 'live' | 'live-state' | 'steady' | 'summary' | 'messages' | 'range' | 'cursors' | 'identifier' | 'panels' | 'notes' | 'own' | 'profile' | 'findings' | 'engine' | 'goto';
 
 export interface Range {
   from: number;
@@ -31,6 +34,11 @@ export interface Note {
 
 export type Notify = (level: 'info' | 'warning' | 'error', text: string, action?: { label: string; run: () => void }) => void;
 
+/** Seconds that the graphs show of a live trace until the user chooses. */
+const FOLLOWED = 30;
+/** Milliseconds between two `steady`. */
+const STEADY = 1000;
+
 export class App extends Emitter<Topic> {
   summary: Summary | null = null;
   messages: MessageInfo[] = [];
@@ -46,6 +54,14 @@ export class App extends Emitter<Topic> {
   notes: Note[] = [];
   /** Where a view was asked to go; the trace and the graphs follow. */
   target: { time: number } | null = null;
+  /** The server that this page is live from; null without one. */
+  live: Connection | null = null;
+  /** The graphs stay at the end of a trace that grows live. */
+  following = false;
+  /** The views stand still, while records still arrive. */
+  paused = false;
+  /** Another trace has another number. */
+  serial = 0;
   /** Null until the engine has died; then why. */
   dead: string | null = null;
 
@@ -55,6 +71,10 @@ export class App extends Emitter<Topic> {
   readonly zoom = new History<Range>({ from: 0, to: 1 });
   readonly own = new History<string>('');
   #fitted = true;
+  #zoomed = false;
+  #steadyAt = 0;
+  #refreshing = new Spacing(STEADY);
+  #waitingSummary: Summary | null = null;
   #opening = 0;
   #bitrates: Report['bitrates'] = [];
 
@@ -99,7 +119,8 @@ export class App extends Emitter<Topic> {
       this.engine = await this.restart();
       this.dead = null;
       this.emit('engine');
-      if (this.traceFile) await this.openTrace(this.traceFile);
+      if (this.live) this.live.again();
+      else if (this.traceFile) await this.openTrace(this.traceFile);
     } catch (error) {
       this.failed(error);
     }
@@ -147,7 +168,72 @@ export class App extends Emitter<Topic> {
     for (const issue of this.summary?.issues ?? []) this.notify('warning', `${issue.text}${issue.count > 1 ? ` (${count(issue.count)} times)` : ''}`);
   }
 
+  /** A live source that has sent nothing yet: an empty trace, in which the views wait. */
+  async begin(name: string): Promise<void> {
+    this.following = true;
+    this.#fitted = false;
+    this.#take(await this.ask('open', { name, bytes: new Uint8Array(), more: true, size: null }));
+    this.emit('live');
+  }
+
+  /** Takes in records of a live source; `anew`: they begin another trace. */
+  async takeLive(name: string, chunks: Uint8Array, anew: boolean): Promise<void> {
+    if (anew) {
+      this.#opening++;
+      this.traceFile = null;
+      this.#fitted = false;
+      this.following = true;
+      this.#refreshing = new Spacing(STEADY);
+    }
+    const summary = anew ? await this.ask('open', { name, bytes: chunks, more: true, size: null }) : await this.ask('append', { bytes: chunks, more: true });
+    if (anew) this.#forget();
+    // Rows have other numbers then, which the views must know.
+    const moved = summary.forgotten !== this.summary?.forgotten;
+    if (this.paused && !anew && !moved) {
+      this.#waitingSummary = summary;
+      return;
+    }
+    this.#take(summary);
+    this.#refreshing.ask(() => void this.#refreshing.run(() => this.#refreshLive()));
+  }
+
+  async #refreshLive(): Promise<void> {
+    try {
+      const summary = this.summary;
+      if (!summary) return;
+      const [messages, gaps] = await Promise.all([this.ask('messages', {}), this.ask('gaps', { from: summary.begin, to: null as unknown as number })]);
+      this.gaps = gaps;
+      const known = (list: MessageInfo[]): string => list.map((m) => `${m.key} ${m.count > 0}`).join();
+      const changed = known(messages) !== known(this.messages);
+      this.messages = messages;
+      if (changed) {
+        this.panels.resolve(messages);
+        this.emit('messages');
+        this.emit('panels');
+      }
+    } catch (error) {
+      this.failed(error);
+    }
+  }
+
+  /** Lets the views stand still, or go on from what has arrived meanwhile. */
+  pause(paused: boolean): void {
+    this.paused = paused;
+    const waiting = this.#waitingSummary;
+    this.#waitingSummary = null;
+    if (!paused && waiting) this.#take(waiting);
+    this.emit('live');
+  }
+
+  /** Stays at the end again, with as much in sight as before. */
+  follow(): void {
+    this.following = true;
+    this.pause(false);
+    if (this.summary) this.#take(this.summary);
+  }
+
   #forget(): void {
+    this.serial++;
     this.identifier = null;
     this.cursorA = this.cursorB = null;
     this.findings = [];
@@ -158,8 +244,18 @@ export class App extends Emitter<Topic> {
   #take(summary: Summary): void {
     this.summary = summary;
     if (this.#fitted) this.zoom.amend(this.whole());
+    else if (this.following) {
+      const span = Math.min(this.range.to - this.range.from, summary.duration - summary.begin) || 1;
+      const wide = Math.max(span, Math.min(FOLLOWED, summary.duration - summary.begin));
+      this.zoom.amend({ from: summary.duration - (this.#zoomed ? span : wide), to: summary.duration });
+    }
     this.emit('summary');
     this.emit('range');
+    const now = performance.now();
+    if (!this.live || now >= this.#steadyAt) {
+      this.#steadyAt = now + STEADY;
+      this.emit('steady');
+    }
   }
 
   /** Asks anew what depends on the whole trace or on the databases. */
@@ -206,8 +302,8 @@ export class App extends Emitter<Topic> {
   }
 
   whole(): Range {
-    const duration = this.summary?.duration ?? 0;
-    return { from: 0, to: duration > 0 ? duration : 1 };
+    const { begin, duration } = this.summary ?? { begin: 0, duration: 0 };
+    return { from: begin, to: duration > begin ? duration : begin + 1 };
   }
 
   get range(): Range {
@@ -222,6 +318,9 @@ export class App extends Emitter<Topic> {
     const next = { from, to: from + span };
     if (next.from === this.range.from && next.to === this.range.to) return;
     this.#fitted = false;
+    this.#zoomed = true;
+    // Whoever looks at the end goes on with it.
+    this.following = this.live !== null && next.to >= whole.to - span * 0.01;
     if (step) this.zoom.push(next);
     else this.zoom.amend(next);
     this.emit('range');
@@ -230,6 +329,7 @@ export class App extends Emitter<Topic> {
   fit(): void {
     this.look(this.whole());
     this.#fitted = true;
+    this.#zoomed = false;
   }
 
   unzoom(): void {

@@ -1,6 +1,7 @@
 // A report: a trace, databases and notes that `cantap report` put into the page itself.
 
 import type { Finding } from '../api';
+import type { App } from './app';
 import { blobOfBase64, gunzip } from './files';
 
 export interface Packed {
@@ -12,6 +13,9 @@ export interface Packed {
   data: string;
 }
 
+/** A database in the page; null: for all channels. */
+export type ServedDatabase = Packed & { channel: number | null };
+
 export interface Report {
   version: 1;
   title: string;
@@ -19,7 +23,7 @@ export interface Report {
   command: string;
   notes: string[];
   trace: Packed;
-  databases: (Packed & { channel: number | null })[];
+  databases: ServedDatabase[];
   /** Bit rates that the trace itself does not give, in bit/s. */
   bitrates: { channel: number; bitrate: number; dataBitrate: number | null }[];
   findings: Finding[];
@@ -50,6 +54,17 @@ export function embeddedReport(root: Document): Report | null {
     findings: raw.findings ?? [],
     thinned: raw.thinned ?? [],
   };
+}
+
+/** Adds the databases that the page carries; one that is unusable is reported, and the others are added. */
+export async function addCarried(app: App, databases: readonly ServedDatabase[]): Promise<void> {
+  for (const database of databases) {
+    try {
+      await app.addDatabase(database.name, new Uint8Array(await (await unpack(database)).arrayBuffer()), database.channel);
+    } catch (error) {
+      app.failed(error);
+    }
+  }
 }
 
 /** The packed file as it was, byte for byte. */

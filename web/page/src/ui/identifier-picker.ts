@@ -4,20 +4,23 @@ import type { IdRow } from '../api';
 import type { App } from '../model/app';
 import { idText } from '../model/format';
 import { Latest } from '../model/latest';
+import { Spacing } from '../model/spacing';
 import { el, replace } from './dom';
 
 export class IdentifierPicker {
   readonly element = el('select', { class: 'mono', attrs: { 'aria-label': 'Identifier' } });
   readonly #asking: Latest<null>;
+  readonly #spacing = new Spacing();
   #rows: IdRow[] = [];
 
   constructor(private readonly app: App) {
     this.#asking = new Latest(
-      async () => {
-        this.#rows = await app.ask('ids', { at: Infinity });
-        if (app.identifier === null && this.#rows[0]) app.choose(this.#rows[0]);
-        this.#fill();
-      },
+      () =>
+        this.#spacing.run(async () => {
+          this.#rows = await app.ask('ids', { at: Infinity });
+          if (app.identifier === null && this.#rows[0]) app.choose(this.#rows[0]);
+          this.#fill();
+        }),
       (error) => app.failed(error),
     );
     this.element.addEventListener('change', () => {
@@ -30,6 +33,11 @@ export class IdentifierPicker {
   /** Asks for the identifiers there are now. */
   refresh(): void {
     if (this.app.summary) this.#asking.ask(null);
+  }
+
+  /** The same while a trace grows: when it is due. */
+  keepUp(): void {
+    this.#spacing.ask(() => this.refresh());
   }
 
   /** The row of the chosen identifier. */

@@ -27,6 +27,8 @@ const LADDER = [
 ];
 
 /** More events than this are left out, and said so. */
+/** Seconds that are read of a live trace. */
+const LIVE = 60;
 const LIMIT = 100_000;
 /** Lanes of the ladder; who speaks less often shares the last one. */
 const LANES = 8;
@@ -57,7 +59,7 @@ export class ConversationsView implements View {
   ) {
     this.#asking = new Latest(
       async () => {
-        const { events, total } = await app.ask('conversations', { from: -Infinity, to: Infinity, limit: LIMIT });
+        const { events, total } = await app.ask('conversations', { from: app.live ? app.whole().to - LIVE : -Infinity, to: Infinity, limit: LIMIT });
         this.#events = events;
         this.#total = total;
         this.#arrange();
@@ -84,7 +86,7 @@ export class ConversationsView implements View {
     );
     this.element = el('section', { class: 'view view-conversations', attrs: { 'aria-label': 'Conversations' } }, el('div', { class: 'bar' }, this.#search, this.#shape, this.#state), this.#lanes, this.#ladder.element, this.#list.element);
     this.#shapeChanged();
-    for (const topic of ['summary', 'messages'] as const) app.on(topic, () => this.#ask());
+    for (const topic of ['steady', 'messages'] as const) app.on(topic, () => this.#ask());
     commands.add(
       { id: 'conversations.search', title: 'Conversations: search', keys: ['/'], view: this.id, run: () => this.#search.focus() },
       {
@@ -110,7 +112,7 @@ export class ConversationsView implements View {
   }
 
   #ask(): void {
-    if (this.#visible && this.app.summary && !this.app.summary.growing) this.#asking.ask(null);
+    if (this.#visible && this.app.summary && (this.app.live || !this.app.summary.growing)) this.#asking.ask(null);
   }
 
   #shapeChanged(): void {

@@ -4,6 +4,7 @@ import type { IdRow } from '../api';
 import { type App, type Identifier, sameIdentifier } from '../model/app';
 import { bytesText, count, duration, idText, seconds } from '../model/format';
 import { Latest } from '../model/latest';
+import { Spacing } from '../model/spacing';
 import type { Commands } from '../ui/commands';
 import { button, el, replace, select, setText } from '../ui/dom';
 import { match } from '../ui/palette';
@@ -39,6 +40,7 @@ export class FixedView implements View {
   readonly #state = el('span', { class: 'state', attrs: { role: 'status' } });
   readonly #at: HTMLInputElement;
   readonly #asking: Latest<number>;
+  readonly #spacing = new Spacing();
   readonly #open = new Set<string>();
   #rows: IdRow[] = [];
   #lines: Line[] = [];
@@ -52,11 +54,12 @@ export class FixedView implements View {
     private readonly openBits: () => void,
   ) {
     this.#asking = new Latest(
-      async (at) => {
-        this.#rows = (await app.ask('ids', { at })).slice();
-        this.#time = Number.isFinite(at) ? at : (app.summary?.duration ?? 0);
-        this.#arrange();
-      },
+      (at) =>
+        this.#spacing.run(async () => {
+          this.#rows = (await app.ask('ids', { at })).slice();
+          this.#time = Number.isFinite(at) ? at : (app.summary?.duration ?? 0);
+          this.#arrange();
+        }),
       (error) => app.failed(error),
     );
     this.#list = new VirtualList('Identifiers', COLUMNS, {
@@ -96,11 +99,11 @@ export class FixedView implements View {
     );
     const bar = el('div', { class: 'bar' }, this.#search, order, button('Expand all', () => this.#expand(true)), button('Close all', () => this.#expand(false)), button('Bits', () => this.openBits(), { title: 'The bits of the selected identifier (x)' }), el('label', { class: 'inline' }, 'at', this.#at), this.#state);
     this.element = el('section', { class: 'view view-fixed', attrs: { 'aria-label': 'Fixed view' } }, bar, this.#list.element);
-    app.on('summary', () => this.#ask());
+    app.on('summary', () => (app.live ? this.#spacing.ask(() => this.#ask()) : this.#ask()));
     app.on('messages', () => this.#ask());
     app.on('cursors', () => {
       if (!this.#visible || app.cursorA === null) return;
-      this.#at.value = String((app.cursorA / app.whole().to) * 1000);
+      this.#at.value = String(((app.cursorA - app.whole().from) / (app.whole().to - app.whole().from)) * 1000);
       this.#ask();
     });
     commands.add(
@@ -124,7 +127,8 @@ export class FixedView implements View {
   #ask(): void {
     if (!this.#visible || !this.app.summary) return;
     const share = Number(this.#at.value) / 1000;
-    this.#asking.ask(share >= 1 ? Infinity : share * this.app.whole().to);
+    const { from, to } = this.app.whole();
+    this.#asking.ask(share >= 1 ? Infinity : from + share * (to - from));
   }
 
   #arrange(): void {

@@ -92,8 +92,12 @@ export class GraphsView implements View {
       this.#exact.clear();
       this.redraw();
     });
+    let serial = app.serial;
     app.on('summary', () => {
-      this.#cache.clear();
+      // Of a trace that has grown, what is drawn stays until the rest is there.
+      if (serial === app.serial) this.#cache.outdate();
+      else this.#cache.clear();
+      serial = app.serial;
       this.#exact.clear();
       this.redraw();
     });

@@ -25,8 +25,8 @@ export class OfIdentifier {
     ];
     this.#asking = new Latest(fetch, (error) => app.failed(error));
     app.on('identifier', () => this.ask());
-    app.on('summary', () => {
-      if (this.#visible) this.picker.refresh();
+    app.on('steady', () => {
+      if (this.#visible) this.picker.keepUp();
       this.ask();
     });
   }

@@ -20,7 +20,7 @@ export class SummaryView implements View {
     commands: Commands,
     private readonly lead: (view: string) => void,
   ) {
-    for (const topic of ['summary', 'findings', 'messages', 'notes'] as const) app.on(topic, () => this.#draw());
+    for (const topic of ['steady', 'findings', 'messages', 'notes'] as const) app.on(topic, () => !this.element.hidden && this.#draw());
     commands.add({ id: 'summary.bitrate', title: 'Set a channel’s bit rate', run: () => this.#askBitrate(this.app.summary?.channels[0]?.channel ?? 1) });
   }
 
@@ -47,7 +47,8 @@ export class SummaryView implements View {
       ...(summary.startUtcNs ? [['Start', `${utc(summary.startUtcNs, 0)} UTC`] as [string, string]] : []),
       ['Length', duration(summary.duration)],
       ['Frames', count(summary.frames)],
-      ['Records', count(summary.records)],
+      ['Records', count(summary.records + summary.forgotten)],
+      ...(summary.forgotten > 0 ? [['Kept', `the newest ${count(summary.records)}, from ${seconds(summary.begin)} s on`] as [string, string]] : []),
       ...(summary.growing ? [['Read', summary.progress === null ? 'live' : percent(summary.progress)] as [string, string]] : []),
       ...summary.issues.map((issue): [string, string] => ['Not read', `${issue.text}${issue.count > 1 ? ` (${count(issue.count)} times)` : ''}`]),
     ];

@@ -42,6 +42,7 @@ export class TraceView implements View {
   #ready = false;
   #visible = false;
   #follow = false;
+  #forgotten = 0;
 
   constructor(
     private readonly app: App,
@@ -99,6 +100,7 @@ export class TraceView implements View {
     this.element = el('section', { class: 'view view-trace', attrs: { 'aria-label': 'Trace' } }, bar, el('div', { class: 'split' }, this.list.element, this.#details));
     this.#emptyDetails();
     app.on('summary', () => this.#grown());
+    app.on('live', () => this.#setFollow(app.following && !app.paused));
     app.on('messages', () => this.#filtering.ask({ text: this.#filter.value, keep: false }));
     app.on('goto', () => void this.#goto());
     commands.add(
@@ -163,15 +165,19 @@ export class TraceView implements View {
     const anchor = this.list.selected >= 0 ? this.#cache.get(this.list.selected) : null;
     const { view, rows } = await this.app.ask('filter', { filter: text.trim() });
     this.#filter.removeAttribute('aria-invalid');
-    this.#cache.set(view, rows, keep && text === this.#applied);
-    const changed = text !== this.#applied;
+    const { forgotten } = this.app.summary;
+    // Rows have other numbers when older ones are gone.
+    const moved = forgotten !== this.#forgotten;
+    this.#forgotten = forgotten;
+    this.#cache.set(view, rows, keep && text === this.#applied && !moved);
+    const changed = text !== this.#applied || moved;
     this.#applied = text;
     this.#ready = true;
     setText(this.#state, text.trim() === '' ? `${count(rows)} records` : `${count(rows)} of ${count(this.app.summary.records)} records`);
     this.#state.classList.remove('bad');
     this.list.refresh();
-    if (changed && anchor && rows > 0) this.list.select((await this.app.ask('rowAt', { view, time: anchor.time })).row);
-    else if (this.#follow) this.list.select(rows - 1);
+    if (changed && anchor && rows > 0 && !this.#follow) this.list.select((await this.app.ask('rowAt', { view, time: anchor.time })).row);
+    else if (this.#follow && rows > 0) this.list.select(rows - 1);
   }
 
   /** A filter that is being typed is refused in place: the rows of the last good one stay. */
@@ -255,7 +261,8 @@ export class TraceView implements View {
 
   #selected(index: number): void {
     if (index < this.#cache.length - 1) this.#follow = false;
-    this.#decoding.ask(index);
+    // Nobody reads the details of a row that is gone in a moment.
+    if (!this.#follow || !this.app.live) this.#decoding.ask(index);
   }
 
   async #show(index: number): Promise<void> {
@@ -265,7 +272,7 @@ export class TraceView implements View {
     const signals = row.id !== null && row.message !== null ? await this.app.ask('decode', { index: row.index }) : [];
     const start = this.app.summary?.startUtcNs;
     const facts: [string, string][] = [
-      ['Record', `${count(row.index + 1)} of ${count(this.app.summary?.records ?? 0)}`],
+      ['Record', `${count(row.index + 1)} of ${count((this.app.summary?.records ?? 0) + (this.app.summary?.forgotten ?? 0))}`],
       ['Time', `${row.late ? '≤ ' : ''}${seconds(row.time)} s`],
       ...(start ? [['UTC', utc(start, row.time)] as [string, string]] : []),
       ...(row.late ? [['Stamp', 'late: the frame ended no later than this'] as [string, string]] : []),

@@ -1,11 +1,12 @@
-//! The page without a trace, where it comes from, and how a report is put into it.
+//! The page without a trace, where it comes from, and how what it opens is put into it.
 
 use std::io::{Read, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
+use cantap_work::databases::DatabasePath;
 use flate2::Compression;
 use flate2::read::GzDecoder;
 use flate2::write::GzEncoder;
@@ -17,7 +18,7 @@ const BUILT_IN: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/page.html.gz")
 const VARIABLE: &str = "CANTAP_PAGE";
 /// The page's name beside the program.
 const BESIDE: &str = "cantap-page.html";
-/// Where the report goes: the page has this once before its script.
+/// Where what it opens goes: the page has this once before its script.
 const MARK: &str = "<!--cantap-report-->";
 /// A file is compressed if that saves at least a fiftieth of it; those of compressed formats stay as they are.
 const WORTHWHILE: usize = 50;
@@ -49,11 +50,34 @@ pub fn find() -> anyhow::Result<String> {
     Ok(page)
 }
 
-/// Puts a report into the page. Whatever its texts are, they stay text: the element's content is JSON without `<`.
-pub fn with_report(page: &str, report: &Value) -> anyhow::Result<String> {
+/// The element with a report: a trace with its databases.
+pub const REPORT: &str = "cantap-report";
+/// The element with what a server has for the page.
+pub const LIVE: &str = "cantap-live";
+
+/// Puts an object into the page, as the element of this name. Whatever its texts are, they stay text: the element's content is JSON without `<`.
+pub fn with(page: &str, element: &str, object: &Value) -> anyhow::Result<String> {
     let (before, after) = page.split_once(MARK).context("the page has no place for a report")?;
-    let report = serde_json::to_string(report)?.replace('<', "\\u003c");
-    Ok(format!("{before}<script type=\"application/json\" id=\"cantap-report\">{report}</script>{after}"))
+    let object = serde_json::to_string(object)?.replace('<', "\\u003c");
+    Ok(format!("{before}<script type=\"application/json\" id=\"{element}\">{object}</script>{after}"))
+}
+
+/// A path's last part.
+pub fn file_name(path: &Path) -> Option<String> {
+    Some(path.file_name()?.to_string_lossy().into_owned())
+}
+
+/// Databases inside the page, each with its channel.
+pub fn databases(paths: &[DatabasePath]) -> anyhow::Result<Vec<Carried>> {
+    let carried = |database: &DatabasePath| {
+        let path = &database.path;
+        let bytes = std::fs::read(path).with_context(|| {
+            format!("cannot read {}; a page takes whole files, so leave out what follows a #", path.display())
+        })?;
+        let carried = Carried::new(&file_name(path).unwrap_or_default(), &bytes)?;
+        Ok(carried.with("channel", database.channel.into()))
+    };
+    paths.iter().map(carried).collect()
 }
 
 /// A file inside the page.
@@ -98,7 +122,7 @@ mod tests {
         let evil = "</script><script>alert(1)</script><!--<script>";
         let page = format!("<body>{MARK}<script>x</script></body>");
         let report = json!({ "title": evil, "trace": Carried::new(evil, b"x").unwrap().into_object() });
-        let made = with_report(&page, &report).unwrap();
+        let made = with(&page, REPORT, &report).unwrap();
         let begin = made.find("id=\"cantap-report\">").unwrap() + "id=\"cantap-report\">".len();
         let end = made[begin..].find('<').unwrap() + begin;
         assert!(made[end..].starts_with("</script><script>x</script></body>"), "{made}");

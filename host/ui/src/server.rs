@@ -1,0 +1,263 @@
+//! The port at which the page is served, with one thread for each connection.
+
+use std::fs::File;
+use std::io::{self, Write};
+use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use anyhow::Context;
+use cantap_work::interrupt;
+use cantap_work::report::Reporter;
+use tungstenite::WebSocket;
+use tungstenite::handshake::derive_accept_key;
+use tungstenite::protocol::Role;
+
+use crate::access::{self, Refusal, Token};
+use crate::bus::{Bus, Device};
+use crate::connections::Connections;
+use crate::head::{self, BadHead, Head};
+use crate::session::{self, Session};
+use crate::shared::Shared;
+use crate::site::Site;
+
+/// Pages at a time.
+const MOST_PAGES: usize = 8;
+/// A browser that takes nothing for this long has gone.
+const WRITE_PATIENCE: Duration = Duration::from_secs(10);
+/// How often to check for Ctrl-C where there is no device.
+const LOOK_EVERY: Duration = Duration::from_millis(50);
+
+/// What the page shows.
+pub enum Source {
+    /// What devices receive.
+    Device(Box<Device>),
+    /// A file.
+    Trace(PathBuf),
+}
+
+/// A server, ready to run.
+pub struct Server {
+    listener: TcpListener,
+    doors: Arc<Doors>,
+    bus: Option<Bus>,
+}
+
+/// What the connections' threads share.
+struct Doors {
+    address: SocketAddr,
+    token: Token,
+    site: Site,
+    /// With the name of this run, so that a page knows whether its place in the records is still one.
+    live: Option<(Arc<Shared>, Token)>,
+    trace: Option<PathBuf>,
+    connections: Connections,
+    is_over: AtomicBool,
+}
+
+/// Ends a server from another thread.
+#[derive(Clone)]
+pub struct Stopper(Arc<Doors>);
+
+impl Stopper {
+    /// The server ends: recordings are finished, pages are told.
+    pub fn stop(&self) {
+        self.0.is_over.store(true, Ordering::Relaxed);
+        if let Some((shared, _)) = &self.0.live {
+            shared.end();
+        }
+    }
+}
+
+impl Server {
+    /// Opens the device or the file, and a port of this machine; 0 for any that is free.
+    pub fn open(site: Site, source: Source, port: u16, reporter: Reporter) -> anyhow::Result<Self> {
+        let token = Token::new().context("the system gives no random numbers")?;
+        let run = Token::new().context("the system gives no random numbers")?;
+        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, port))
+            .with_context(|| format!("cannot listen at port {port}; give another one with --port"))?;
+        let address = listener.local_addr()?;
+        let (bus, trace) = match source {
+            Source::Device(device) => (Some(Bus::open(*device, reporter)?), None),
+            Source::Trace(path) => {
+                let file = File::open(&path).with_context(|| format!("cannot read {}", path.display()))?;
+                if !file.metadata()?.is_file() {
+                    anyhow::bail!("{} is no file; give a trace", path.display());
+                }
+                (None, Some(path))
+            }
+        };
+        let live = bus.as_ref().map(|bus| (bus.shared(), run));
+        let doors = Doors {
+            address,
+            token,
+            site,
+            live,
+            trace,
+            connections: Connections::default(),
+            is_over: AtomicBool::new(false),
+        };
+        Ok(Self { listener, doors: Arc::new(doors), bus })
+    }
+
+    /// The page's address, with its token.
+    pub fn url(&self) -> String {
+        format!("http://{}/?token={}", self.doors.address, self.doors.token.text())
+    }
+
+    /// For ending it.
+    pub fn stopper(&self) -> Stopper {
+        Stopper(Arc::clone(&self.doors))
+    }
+
+    /// Serves until Ctrl-C.
+    ///
+    /// # Errors
+    ///
+    /// If the system gives no thread.
+    pub fn run(self) -> anyhow::Result<()> {
+        let Self { listener, doors, bus } = self;
+        let accepting = Arc::clone(&doors);
+        let thread = std::thread::Builder::new().name("cantap-ui".to_owned());
+        let thread = thread.spawn(move || accept(&listener, &accepting))?;
+        match bus {
+            Some(bus) => bus.run(),
+            None => {
+                while !interrupt::requested() && !doors.is_over.load(Ordering::Relaxed) {
+                    std::thread::sleep(LOOK_EVERY);
+                }
+            }
+        }
+        doors.is_over.store(true, Ordering::Relaxed);
+        // It waits for a connection.
+        let _ = TcpStream::connect(doors.address);
+        let _ = thread.join();
+        // Pages are told within a tick or two that it ends; those that do not listen are not waited for.
+        for _ in 0..20 {
+            if doors.connections.are_gone() {
+                break;
+            }
+            std::thread::sleep(Duration::from_millis(25));
+        }
+        Ok(())
+    }
+}
+
+fn accept(listener: &TcpListener, doors: &Arc<Doors>) {
+    while !doors.is_over.load(Ordering::Relaxed) {
+        let Ok((stream, _)) = listener.accept() else {
+            // Such as no file descriptor being free: that passes.
+            std::thread::sleep(LOOK_EVERY);
+            continue;
+        };
+        let Ok(number) = doors.connections.enter(&stream) else { continue };
+        let shared = Arc::clone(doors);
+        let spawned = std::thread::Builder::new().name("cantap-ui-page".to_owned()).spawn(move || {
+            // Whoever has left needs no answer.
+            let _ = shared.answer(stream, number);
+            shared.connections.leave(number);
+        });
+        // Without a thread the connection ends, and the browser may try again.
+        if spawned.is_err() {
+            doors.connections.leave(number);
+        }
+    }
+}
+
+impl Doors {
+    fn answer(&self, mut stream: TcpStream, number: u64) -> io::Result<()> {
+        stream.set_nodelay(true)?;
+        stream.set_write_timeout(Some(WRITE_PATIENCE))?;
+        let head = match Head::read(&mut stream) {
+            Ok(head) => head,
+            Err(BadHead::Gone) => return Ok(()),
+            Err(BadHead::Malformed) => {
+                return head::sentence(&mut stream, "400 Bad Request", "This is no request of a browser.");
+            }
+            Err(BadHead::TooLong) => {
+                return head::sentence(
+                    &mut stream,
+                    "431 Request Header Fields Too Large",
+                    "The request is too long.",
+                );
+            }
+        };
+        let is_live = head.path == "/live";
+        let (host, origin) = (head.header("host"), head.header("origin"));
+        if let Err(refusal) =
+            access::check(host, origin, head.parameter("token"), is_live, (&self.token, self.address))
+        {
+            // Browsers ask for it by themselves, and without a token.
+            let is_icon = refusal == Refusal::Token && head.path == "/favicon.ico";
+            let status = if is_icon { "404 Not Found" } else { refusal.status() };
+            return head::sentence(&mut stream, status, refusal.text());
+        }
+        self.connections.has_shown_token(number);
+        if head.method != "GET" {
+            return head::sentence(&mut stream, "405 Method Not Allowed", "This server answers GET alone.");
+        }
+        match (head.path.as_str(), &self.live, &self.trace) {
+            ("/", ..) => self.page(&mut stream, host.unwrap_or_default()),
+            ("/live", Some((shared, run)), _) => upgrade(stream, &head, shared, run.text()),
+            ("/trace", _, Some(path)) => trace(&mut stream, path),
+            _ => head::sentence(&mut stream, "404 Not Found", "There is nothing here; the page is at /."),
+        }
+    }
+
+    fn page(&self, stream: &mut TcpStream, host: &str) -> io::Result<()> {
+        let page = self.site.page().as_bytes();
+        head::answer(
+            stream,
+            "200 OK",
+            "text/html; charset=utf-8",
+            page.len() as u64,
+            &self.site.policy(host),
+        )?;
+        stream.write_all(page)
+    }
+}
+
+/// The trace's bytes. A file that grows meanwhile is served as long as it was.
+fn trace(stream: &mut TcpStream, path: &Path) -> io::Result<()> {
+    let Ok(file) = File::open(path) else {
+        return head::sentence(stream, "404 Not Found", "The trace is no longer there.");
+    };
+    let length = file.metadata()?.len();
+    head::answer(
+        stream,
+        "200 OK",
+        "application/octet-stream",
+        length,
+        "Content-Security-Policy: default-src 'none'\r\n",
+    )?;
+    io::copy(&mut io::Read::take(file, length), stream).map(|_| ())
+}
+
+/// Makes the connection a WebSocket and serves it.
+fn upgrade(mut stream: TcpStream, head: &Head, shared: &Shared, run: &str) -> io::Result<()> {
+    let key = head.header("sec-websocket-key").filter(|key| key.len() == 24);
+    let is_asked = head.has("connection", "upgrade")
+        && head.has("upgrade", "websocket")
+        && head.header("sec-websocket-version") == Some("13");
+    let Some(key) = key.filter(|_| is_asked) else {
+        return head::sentence(&mut stream, "426 Upgrade Required", "Here the page opens its WebSocket.");
+    };
+    write!(
+        stream,
+        "HTTP/1.1 101 Switching Protocols\r\nConnection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Accept: {}\r\n\r\n",
+        derive_accept_key(key.as_bytes())
+    )?;
+    let socket = WebSocket::from_raw_socket(stream, Role::Server, Some(session::config()));
+    let Some(page) = shared.enter(MOST_PAGES) else {
+        session::refuse(socket, &format!("{MOST_PAGES} pages are open already; close one of them"));
+        return Ok(());
+    };
+    let is_same_run = head.parameter("run") == Some(run);
+    let from =
+        head.parameter("after").and_then(|after| after.parse().ok()).filter(|_| is_same_run).unwrap_or(0);
+    Session::new(socket, shared, from)?.run(run);
+    drop(page);
+    Ok(())
+}

@@ -1,0 +1,81 @@
+//! What a page shows of the device, besides what is received. It is sent whole whenever it has changed.
+
+use serde::Serialize;
+
+/// Of everything.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub struct State {
+    /// Whether the command allows sending and taking part.
+    pub may_send: bool,
+    /// The devices in the order of their channels.
+    pub devices: Vec<DeviceState>,
+    /// The open channels.
+    pub channels: Vec<ChannelState>,
+    /// Whether the channels take part in their buses.
+    pub is_normal: bool,
+    /// What passes, in candump's syntax; empty for everything.
+    pub filters: Vec<String>,
+    /// The recording that is under way.
+    pub recording: Option<RecordingState>,
+    /// What the device sends by itself.
+    pub periodic: Vec<PeriodicState>,
+    /// How many pages are open.
+    pub pages: usize,
+    /// Why nothing is received any more, if so.
+    pub ended: Option<String>,
+}
+
+/// Of one device.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub struct DeviceState {
+    /// Its address.
+    pub name: String,
+    /// Whether it is there.
+    pub is_there: bool,
+    /// Why it is not.
+    pub reason: Option<String>,
+}
+
+/// Of one channel.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub struct ChannelState {
+    /// From 1.
+    pub channel: u8,
+    /// Bit/s.
+    pub bitrate: u32,
+    /// The controller's state, by its name: `active`, `warning`, `passive`, `bus-off`.
+    pub state: &'static str,
+    /// Transmit and receive error counters.
+    pub counters: (u8, u8),
+}
+
+/// Of a recording.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub struct RecordingState {
+    /// The file's name.
+    pub name: String,
+    /// Records written.
+    pub records: u64,
+    /// Bytes on the disk.
+    pub bytes: u64,
+    /// Whole seconds since it began.
+    pub seconds: u64,
+}
+
+/// Of a frame that the device sends periodically.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub struct PeriodicState {
+    /// From 1.
+    pub channel: u8,
+    /// Its place on the device.
+    pub slot: u8,
+    /// As candump writes it.
+    pub frame: String,
+    /// Milliseconds.
+    pub period_ms: f64,
+}

@@ -1,0 +1,161 @@
+// The device behind a live page: its connection and channels, recording, what is sent. Only a page that `cantap ui` serves has this view.
+
+import type { App } from '../model/app';
+import type { Connection } from '../live/connection';
+import type { State } from '../live/protocol';
+import { bitrate, bytes, count, duration, plural } from '../model/format';
+import type { Commands } from '../ui/commands';
+import { openDialog } from '../ui/dialog';
+import { button, el, field, replace, setText } from '../ui/dom';
+import { SendList } from './send-list';
+import { parseRate } from './summary';
+import type { View } from './view';
+
+export class DeviceView implements View {
+  readonly id = 'device';
+  readonly title = 'Device';
+  readonly element: HTMLElement;
+  readonly #connection = el('p', { attrs: { role: 'status' } });
+  readonly #devices = el('ul', { class: 'plain' });
+  readonly #channels = el('tbody');
+  readonly #mode = el('div', { class: 'row' });
+  readonly #filters = el('input', { class: 'mono', attrs: { type: 'text', 'aria-label': 'Filters of the device', placeholder: '123:7FF 400-4FF', spellcheck: 'false', autocomplete: 'off' } });
+  readonly #name = el('input', { class: 'mono', attrs: { type: 'text', 'aria-label': 'Name of the recording', spellcheck: 'false', autocomplete: 'off' } });
+  readonly #recording = el('p', { attrs: { role: 'status' } });
+  readonly #record: HTMLButtonElement;
+  readonly #send: SendList;
+  #drawn = '';
+
+  constructor(
+    private readonly app: App,
+    private readonly live: Connection,
+    commands: Commands,
+  ) {
+    this.#record = button('Record', () => this.toggleRecording(), { class: 'primary' });
+    this.#send = new SendList(app, live);
+    const head = ['Channel', 'Bit rate', 'State', 'Errors sent / received'];
+    this.element = el(
+      'section',
+      { class: 'view view-device', attrs: { 'aria-label': 'Device' } },
+      el(
+        'div',
+        { class: 'page-scroll', attrs: { tabindex: 0, role: 'group', 'aria-label': 'Device and sending' } },
+        section('Connection', this.#connection, this.#devices),
+        section('Channels', el('table', { class: 'numbers' }, el('thead', {}, el('tr', {}, ...head.map((h) => el('th', { attrs: { scope: 'col' } }, h)))), this.#channels), this.#mode),
+        section('Recording', el('div', { class: 'row' }, field('File in the folder of cantap ui', this.#name, 'The suffix names the format: .blf, .log, .asc, .mf4 …'), this.#record), this.#recording),
+        section('Filters of the device', el('div', { class: 'row' }, field('Receive only', this.#filters, 'Several separated by blanks; empty for everything. What they keep back is neither shown nor recorded.'), button('Apply', () => this.#applyFilters()))),
+        section('Send', this.#send.element),
+      ),
+    );
+    this.#name.value = proposedName();
+    app.on('live-state', () => this.#draw());
+    commands.add(
+      { id: 'live.record', title: 'Recording: begin or end', keys: ['R'], run: () => this.toggleRecording() },
+      { id: 'live.listen', title: 'Device: only listen', run: () => this.#setMode(false) },
+      { id: 'live.normal', title: 'Device: take part in the bus', run: () => this.#askNormal() },
+    );
+    this.#draw();
+  }
+
+  shown(): void {
+    this.#draw();
+  }
+
+  #refused = (error: unknown): void => this.app.failed(error);
+
+  toggleRecording(): void {
+    const { live } = this;
+    if (live.state?.recording) {
+      void live.ask('stopRecording', {}).catch(this.#refused);
+      return;
+    }
+    const name = this.#name.value.trim();
+    void live.ask('record', { name }).then(() => (this.#name.value = proposedName()), this.#refused);
+  }
+
+  #applyFilters(): void {
+    const filters = this.#filters.value.split(/\s+/).filter((f) => f !== '');
+    void this.live.ask('filters', { filters }).catch(this.#refused);
+  }
+
+  #setMode(normal: boolean): void {
+    void this.live.ask('mode', { normal, confirmed: normal }).catch(this.#refused);
+  }
+
+  #askNormal(): void {
+    const rates = (this.live.state?.channels ?? []).map((c) => `channel ${c.channel} at ${bitrate(c.bitrate)}`).join(', ');
+    openDialog(
+      'Take part in the bus?',
+      [el('p', {}, `The device will acknowledge frames, and send what you tell it to: ${rates}.`), el('p', { class: 'bad' }, 'A wrong bit rate disturbs the bus, and frames that are sent can move things. Only on a bus on which that can do no harm.')],
+      [{ label: 'Only listen', primary: true }, { label: 'Take part', run: () => this.#setMode(true) }],
+    );
+  }
+
+  #askBitrate(channel: number, now: number): void {
+    const input = el('input', { class: 'mono', attrs: { type: 'text', 'aria-label': 'Bit rate', value: now, inputmode: 'decimal' } });
+    const problem = el('p', { class: 'bad', attrs: { role: 'alert' } });
+    openDialog(`Bit rate of channel ${channel} of the device`, [field('Bit/s', input, 'for example 500000, 500k, 1M'), el('p', { class: 'muted' }, 'The channels are opened anew: for a moment nothing is received, and afterwards they only listen.'), problem], [
+      {
+        label: 'Set',
+        primary: true,
+        run: () => {
+          const value = parseRate(input.value);
+          if (value === null) {
+            problem.textContent = `“${input.value}” is no bit rate: write for example 500k.`;
+            return false;
+          }
+          void this.live.ask('bitrate', { channel, bitrate: value }).catch(this.#refused);
+          return true;
+        },
+      },
+      { label: 'Cancel' },
+    ]);
+    input.select();
+  }
+
+  #draw(): void {
+    if (this.element.hidden) return;
+    const { live } = this;
+    const { state } = live;
+    const behind = live.latest - live.next;
+    setText(this.#connection, live.status === 'open' ? `Connected. ${count(live.next)} records received${behind > 0 ? `, ${count(behind)} behind` : ''}.${state && state.pages > 1 ? ` ${plural(state.pages, 'page')} are open.` : ''}` : live.reason || 'Connecting …');
+    this.#connection.classList.toggle('bad', live.status === 'lost' || live.status === 'ended');
+    if (!state) return;
+    this.#drawRecording(state);
+    this.#send.draw(state);
+    const key = JSON.stringify([state.devices, state.channels, state.isNormal, state.maySend, state.filters, state.ended]);
+    if (key === this.#drawn) return;
+    this.#drawn = key;
+    replace(this.#devices, state.ended ? el('li', { class: 'bad' }, state.ended) : null, ...state.devices.map((d) => el('li', { class: d.isThere ? '' : 'bad' }, `${d.name}: ${d.isThere ? 'there' : `away (${d.reason ?? 'unknown'})`}`)));
+    replace(
+      this.#channels,
+      ...state.channels.map((c) =>
+        el('tr', {}, el('th', { attrs: { scope: 'row' } }, String(c.channel)), el('td', {}, button(bitrate(c.bitrate), () => this.#askBitrate(c.channel, c.bitrate), { class: 'link', attrs: { 'aria-label': `Bit rate of channel ${c.channel}: ${bitrate(c.bitrate)}, change` } })), el('td', { class: c.state === 'active' ? '' : 'bad' }, c.state), el('td', { class: c.counters[0] + c.counters[1] > 0 ? 'bad' : '' }, c.counters.join(' / '))),
+      ),
+    );
+    replace(
+      this.#mode,
+      el('span', { id: 'live-mode', class: state.isNormal ? 'bad' : '' }, state.isNormal ? 'The channels take part in their buses. ' : 'The channels only listen. '),
+      state.isNormal ? button('Only listen', () => this.#setMode(false)) : state.maySend ? button('Take part …', () => this.#askNormal()) : el('span', { class: 'muted' }, 'To send, start cantap ui with --allow send.'),
+      state.isNormal ? button('Back from bus-off', () => void live.ask('recover', {}).catch(this.#refused)) : null,
+    );
+    if (document.activeElement !== this.#filters) this.#filters.value = state.filters.join(' ');
+  }
+
+  #drawRecording({ recording }: State): void {
+    setText(this.#record, recording ? 'Stop recording' : 'Record');
+    this.#name.disabled = recording !== null;
+    setText(this.#recording, recording ? `${recording.name}: ${duration(recording.seconds)}, ${bytes(recording.bytes)}, ${plural(recording.records, 'record')}` : 'Everything that arrives is recorded by cantap ui, whatever this page shows.');
+  }
+}
+
+/** A name of its own for each recording, by the time. */
+function proposedName(): string {
+  const now = new Date();
+  const two = (n: number): string => String(n).padStart(2, '0');
+  return `cantap-${now.getFullYear()}${two(now.getMonth() + 1)}${two(now.getDate())}-${two(now.getHours())}${two(now.getMinutes())}${two(now.getSeconds())}.blf`;
+}
+
+function section(title: string, ...children: HTMLElement[]): HTMLElement {
+  return el('section', { class: 'block' }, el('h3', {}, title), ...children);
+}

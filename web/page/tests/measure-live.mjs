@@ -1,0 +1,71 @@
+// Measures the page live over two saturated virtual channels: redraws, lag, memory, loss. Not a test: the figures are read by a person.
+//   node tests/measure-live.mjs page.html cantap [SECONDS] [DEVICE] [BITRATE]
+
+import { readFileSync } from 'node:fs';
+
+const [, , page, program, seconds = '180', device = 'virtual:load=100', bitrate = '1M'] = process.argv;
+process.env.CANTAP_TEST_PAGE = page;
+process.env.CANTAP_TEST_PROGRAM = program;
+const { serve } = await import('./served.mjs');
+const { launch, newPage, quit, show } = await import('./browser.mjs');
+
+const server = await serve(['-d', device, '-b', bitrate]);
+const tab = await newPage({ url: server.url });
+await tab.locator('.shell').waitFor();
+const inspector = await (await launch()).newBrowserCDPSession();
+
+/** Megabytes in memory of a process. */
+const memory = (pid) => Number(/VmRSS:\s+(\d+)/.exec(readFileSync(`/proc/${pid}/status`, 'utf8'))[1]) / 1024;
+
+async function renderer() {
+  const { processInfo } = await inspector.send('SystemInfo.getProcessInfo');
+  return Math.max(...processInfo.filter((p) => p.type === 'renderer').map((p) => memory(p.id)));
+}
+
+/** What happens in the page within some seconds: redraws of the browser, of the rows, the longest pause, and how far the newest record is behind the clock. */
+const look = (ms) =>
+  tab.evaluate(
+    (duration) =>
+      new Promise((done) => {
+        const shell = document.querySelector('.shell');
+        const list = document.querySelector('#view-trace .list');
+        const drawn = Number(list.dataset.drawn ?? 0);
+        const received = Number(shell.dataset.received);
+        const begin = performance.now();
+        let frames = 0;
+        let longest = 0;
+        let last = begin;
+        const lags = [];
+        const step = () => {
+          const now = performance.now();
+          longest = Math.max(longest, now - last);
+          last = now;
+          frames++;
+          if (shell.dataset.newest) lags.push(Date.now() - Number(shell.dataset.newest));
+          if (now - begin < duration) requestAnimationFrame(step);
+          else {
+            const took = (now - begin) / 1000;
+            lags.sort((a, b) => a - b);
+            done({ redraws: frames / took, rows: (Number(list.dataset.drawn ?? 0) - drawn) / took, longest, records: (Number(shell.dataset.received) - received) / took, behind: Number(shell.dataset.behind), lag: lags[Math.floor(lags.length / 2)], worst: lags.at(-1), lost: document.querySelector('footer').textContent.match(/no known loss|[\d ]+ frames lost/)?.[0] });
+          }
+        };
+        requestAnimationFrame(step);
+      }),
+    ms,
+  );
+
+const n = (value, digits = 0) => (value === undefined ? '–' : value.toFixed(digits));
+console.log('second  view      redraws/s  rows/s  longest ms  records/s  lag ms (worst)  behind  MB page  MB cantap  losses');
+const views = ['trace', 'fixed', 'graphs'];
+const begin = Date.now();
+for (let round = 0; Date.now() - begin < Number(seconds) * 1000; round++) {
+  const view = views[round % views.length];
+  await show(tab, view);
+  if (view === 'trace' && round === 0) await tab.keyboard.press('F');
+  if (view === 'graphs' && round === 2) for (const signal of (await tab.locator('.tree-signal, .tree-load').all()).slice(0, 2)) await signal.click();
+  const found = await look(10_000);
+  console.log([n((Date.now() - begin) / 1000).padStart(6), view.padEnd(8), n(found.redraws, 1).padStart(10), n(found.rows, 1).padStart(7), n(found.longest).padStart(11), n(found.records).padStart(10), `${n(found.lag)} (${n(found.worst)})`.padStart(15), String(found.behind).padStart(7), n(await renderer()).padStart(8), n(memory(server.child.pid)).padStart(10), found.lost].join('  '));
+}
+await tab.context().close();
+await server.stop();
+await quit();

@@ -297,8 +297,9 @@ impl TableEncoder<'_> {
                         .any(|(name, input)| *name == signal && !matches!(input, Input::Raw(_))) =>
                 {
                     *self.beyond_limits.entry(signal.clone()).or_default() += 1;
-                    let place = inputs.iter_mut().find(|(name, _)| *name == signal);
-                    place.into_iter().for_each(|(_, input)| *input = Input::Raw(raw));
+                    if let Some((_, input)) = inputs.iter_mut().find(|(name, _)| *name == signal) {
+                        *input = Input::Raw(raw);
+                    }
                 }
                 made => return made,
             }
@@ -366,7 +367,9 @@ pub fn encode_tables(
     let batch = py.detach(|| {
         records.sort_by_key(|record| record.time_ns);
         let mut columns = FrameColumns::default();
-        records.iter().for_each(|record| columns.push(record));
+        for record in &records {
+            columns.push(record);
+        }
         columns.take()
     });
     if !beyond_limits.is_empty() {

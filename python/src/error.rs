@@ -173,9 +173,13 @@ impl From<Error> for PyErr {
     fn from(error: Error) -> Self {
         match error {
             // An object of Python that was read as a file raised it.
-            Error::Io(error, _) if error.get_ref().is_some_and(|inner| inner.is::<PyErr>()) => {
-                let inner = error.into_inner().and_then(|inner| inner.downcast::<PyErr>().ok());
-                inner.map_or_else(|| PyOSError::new_err("a file object could not be read"), |error| *error)
+            Error::Io(error, file)
+                if error.get_ref().is_some_and(<dyn std::error::Error + Send + Sync>::is::<PyErr>) =>
+            {
+                match error.downcast::<PyErr>() {
+                    Ok(error) => error,
+                    Err(error) => Error::Io(error, file).into(),
+                }
             }
             // With number and name it becomes FileNotFoundError, PermissionError and so on.
             Error::Io(error, file) => match error.raw_os_error() {

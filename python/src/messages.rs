@@ -127,7 +127,9 @@ pub fn table_of(messages: &Bound<'_, PyAny>) -> PyResult<Table> {
         let records =
             cantap_columns::records(&columns.take()?).map_err(|error| Error::from(error.after(converted)))?;
         converted = rows;
-        records.iter().for_each(|record| frames.push(record));
+        for record in &records {
+            frames.push(record);
+        }
         Ok(frames.take())
     };
     for message in messages.try_iter()? {

@@ -14,7 +14,8 @@ const MOST_PROPERTIES: usize = 1_000;
 /// Groups inside groups; deeper ones are named by the outer ones alone.
 const MOST_DEPTH: usize = 16;
 /// Elements of the standard (ASAM MDF 4.2, comments of the head and of the history) that are properties by themselves.
-const OWN_ELEMENTS: [&str; 6] = ["time_source", "tool_id", "tool_vendor", "tool_version", "user_name", "comment"];
+const OWN_ELEMENTS: [&str; 6] =
+    ["time_source", "tool_id", "tool_vendor", "tool_version", "user_name", "comment"];
 
 /// The properties in the head's own comment, and in that of the program that wrote the file.
 pub(super) fn properties(file: &mut Whole, header: &Block) -> Result<Properties, Fault> {

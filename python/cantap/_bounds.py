@@ -6,6 +6,7 @@ joined by `and` at the top; anything that is not understood bounds nothing.
 
 from __future__ import annotations
 
+import datetime
 import re
 from dataclasses import dataclass
 from typing import Any
@@ -87,8 +88,6 @@ def _time_ns(text: str) -> int | None:
     match = re.fullmatch(r"(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?Z", text)
     if match is None:
         return None
-    import datetime
-
     year, month, day, hour, minute, second = (int(match.group(at)) for at in range(1, 7))
     try:
         date = datetime.datetime(year, month, day, hour, minute, second, tzinfo=datetime.timezone.utc)
@@ -99,8 +98,6 @@ def _time_ns(text: str) -> int | None:
 
 
 def _text(time_ns: int) -> str:
-    import datetime
-
     seconds, ns = divmod(time_ns, 10**9)
     date = datetime.datetime(1970, 1, 1) + datetime.timedelta(seconds=seconds)
     return f"{date.isoformat(timespec='seconds')}.{ns:09}"

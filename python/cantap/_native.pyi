@@ -93,9 +93,10 @@ class Database:
     ) -> Frame:
         """The frame of a message with these values: numbers, or texts of the signals' tables. The others have the database's start value,
         or 0."""
-    def decode(self, frame: Any, *, channel: int = 1) -> tuple[str, dict[str, float | str | None]] | None:
+    def decode(self, frame: Any, *, channel: int = ...) -> tuple[str, dict[str, float | str | None]] | None:
         """The name of a frame's message, and its values by signal: `Gear` is the number, `Gear.text` the text of its table. `None` if no
-        database has it. `frame` is a `Frame`, a `Record`, a text, or a message of python-can."""
+        database has it, and for an error frame. `frame` is a `Frame`, a `Record`, a text, or a message of python-can.
+        `channel`, by which a database is chosen, is 1 unless it is given."""
     def _schema_of(self, message: str, signals: list[str]) -> Table: ...
     def _signal_names(self) -> set[str]: ...
     def signals_of(self, message: str) -> list[dict[str, str]]:

@@ -26,11 +26,21 @@ def files(source: Any) -> list[TraceFile]:
     return found
 
 
+def is_file(source: Any) -> bool:
+    """Whether it is one file, or a name of files."""
+    return isinstance(source, (str, os.PathLike)) or hasattr(source, "read") or _is_of_fsspec(source)
+
+
+def _is_of_fsspec(source: Any) -> bool:
+    """Whether it is what `fsspec.open` returns."""
+    return all(hasattr(source, name) for name in ("open", "fs", "path"))
+
+
 def _files(source: Any, may_be_several: bool) -> Iterator[TraceFile]:
     if isinstance(source, (str, os.PathLike)):
         yield from _of_path(os.fspath(source))
-    elif hasattr(source, "open") and hasattr(source, "fs") and hasattr(source, "path"):
-        yield str(source.path), source.open  # fsspec's `OpenFile`
+    elif _is_of_fsspec(source):
+        yield str(source.path), source.open
     elif hasattr(source, "read"):
         name = getattr(source, "name", None)
         yield name if isinstance(name, str) else "the file object", lambda: _Borrowed(source)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import itertools
 import numbers
 import operator
 import os
@@ -12,7 +13,7 @@ from typing import IO, TYPE_CHECKING, Any, SupportsIndex, TypeAlias
 
 from . import _native
 from ._arguments import channels, words
-from ._sources import files
+from ._sources import files, is_file
 from ._native import CantapWarning, Database, Report, Scan, Table
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from ._native import Options
-    from .dataset import Dataset
+    from ._dataset import Dataset
 
 Path: TypeAlias = "str | os.PathLike[str]"
 Source: TypeAlias = "Path | IO[bytes] | Iterable[Path | IO[bytes]]"
@@ -131,7 +132,10 @@ class Messages(Mapping[str, Table]):
         """What was read, and what could not be read; `None` if there was no file."""
 
     def __getitem__(self, message: str) -> Table:
-        return self._tables[message]
+        try:
+            return self._tables[message]
+        except KeyError:
+            raise KeyError(f"no frame of a message '{message}' was decoded; there are {', '.join(self._tables) or 'none'}") from None
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._tables)
@@ -187,6 +191,7 @@ def decode(
     If a file's frames are all unknown to the databases, there is a `CantapWarning`. Of two messages with one name, the later has its
     identifier behind it, as in `Engine-1A0`.
     """
+    source = _unpacked(source)
     if _is_file(source):
         if db is None:
             raise ValueError("a database decodes; give one with db=")
@@ -311,7 +316,7 @@ def dataset(
     With `message`, it has a column for each of that message's signals. A filter's bounds on `time`, the signals that it names, and
     the columns that are wanted, decide what is decoded.
     """
-    from .dataset import Dataset
+    from ._dataset import Dataset
 
     if message is not None and db is None:
         raise ValueError("a message is decoded with a database; give one with db=")
@@ -320,10 +325,17 @@ def dataset(
 
 def _is_file(source: Any) -> bool:
     """Whether it is read, rather than a table."""
-    if isinstance(source, (str, os.PathLike)) or hasattr(source, "read"):
-        return not hasattr(source, "__arrow_c_stream__")
-    one = source[0] if isinstance(source, (list, tuple)) and source else None
-    return isinstance(one, (str, os.PathLike)) or hasattr(one, "read")
+    if hasattr(source, "__arrow_c_stream__"):
+        return False
+    return is_file(source[0] if isinstance(source, (list, tuple)) and source else source)
+
+
+def _unpacked(source: Any) -> Any:
+    """An iterator of paths, such as `Path.glob` returns, as a list; anything else as it is."""
+    if not isinstance(source, Iterator) or is_file(source) or hasattr(source, "__arrow_c_stream__"):
+        return source
+    first = list(itertools.islice(source, 1))
+    return [*first, *source] if first and is_file(first[0]) else itertools.chain(first, source)
 
 
 def _table(source: Any) -> Any:

@@ -22,7 +22,8 @@ use pyo3::types::{PyDict, PyList, PyString};
 
 use crate::database::Database;
 use crate::error::Error;
-use crate::frame::{Frame, Record};
+use crate::frame::{AnyFrame, Frame, Record};
+use crate::messages::table_of;
 use crate::number::OfTrace;
 use crate::scan::warning;
 use crate::table::{Table, batches_of};
@@ -123,7 +124,7 @@ impl Database {
         frame: &Bound<'py, PyAny>,
         channel: OfTrace,
     ) -> PyResult<Option<(String, Bound<'py, PyDict>)>> {
-        let frame = any_frame(frame)?;
+        let Some(frame) = any_frame(frame)? else { return Ok(None) };
         let mut values: Vec<SignalValue> = Vec::new();
         let Some(found) = self.decoder.decode(channel.0, &frame, &mut values) else { return Ok(None) };
         let message = self.decoder.message(found);
@@ -141,19 +142,17 @@ impl Database {
     }
 }
 
-/// A frame of this package, a text, or a message of python-can.
-fn any_frame(object: &Bound<'_, PyAny>) -> PyResult<TraceFrame> {
+/// A frame of this package, a text, or a message of python-can. `None` for what a trace has besides, such as error frames.
+fn any_frame(object: &Bound<'_, PyAny>) -> PyResult<Option<TraceFrame>> {
     if let Ok(record) = object.cast::<Record>() {
-        let frame = record.get().0.frame().copied();
-        return frame.ok_or_else(|| Error::argument("this record is no frame").into());
+        return Ok(record.get().0.frame().copied());
     }
     if object.hasattr("arbitration_id")? {
-        let table = crate::messages::table_of(PyList::new(object.py(), [object])?.as_any())?;
+        let table = table_of(PyList::new(object.py(), [object])?.as_any())?;
         let records = cantap_columns::records(&table.one_batch()?).map_err(Error::from)?;
-        let frame = records.first().and_then(|record| record.frame().copied());
-        return frame.ok_or_else(|| Error::argument("this message is no frame").into());
+        return Ok(records.first().and_then(|record| record.frame().copied()));
     }
-    object.extract::<crate::frame::AnyFrame>().map(|frame| frame.0.into())
+    object.extract::<AnyFrame>().map(|frame| Some(frame.0.into()))
 }
 
 /// A column's signal: one whose name was taken has its message's in front.

@@ -38,7 +38,7 @@ pub struct Counts {
     /// What the file says about its measurement.
     #[serde(default)]
     pub properties: BTreeMap<String, String>,
-    /// If there were several files: how many, and the counts of each.
+    /// If there were several files: the counts of each that was read.
     #[serde(default)]
     pub files: Vec<Counts>,
 }
@@ -49,38 +49,32 @@ impl Counts {
         Self { file, format: reader.format().to_string(), ..Self::default() }
     }
 
-    /// Of several files: those that were read, and the last one. One alone stays as it is.
-    pub fn joined(before: &[Self], last: &Self) -> Self {
-        let Some(first) = before.first() else { return last.clone() };
-        let mut all = Self { is_whole: true, ..Self::default() };
-        for part in before.iter().chain([last]) {
-            all.records_read += part.records_read;
-            all.records += part.records;
-            all.frames += part.frames;
-            all.lost += part.lost;
-            all.lost_at_least |= part.lost_at_least;
-            all.bus_errors += part.bus_errors;
-            all.decoded += part.decoded;
-            all.values += part.values;
-            all.issues += part.issues;
-            all.is_cut |= part.is_cut;
-            all.is_whole &= part.is_whole;
-            let room = FAULTS_KEPT - all.faults.len();
-            all.faults.extend(part.faults.iter().take(room).cloned());
-            for (sum, counts) in [(&mut all.left_out, &part.left_out), (&mut all.notes, &part.notes)] {
-                for (what, count) in counts {
-                    *sum.entry(what.clone()).or_default() += count;
-                }
-            }
-            all.channels.extend(part.channels.iter());
-            if !all.format.split(", ").any(|format| format == part.format) {
-                let comma = if all.format.is_empty() { "" } else { ", " };
-                all.format = format!("{}{comma}{}", all.format, part.format);
+    /// Adds those of another file; not to the list of files.
+    pub fn add(&mut self, part: &Self) {
+        self.records_read += part.records_read;
+        self.records += part.records;
+        self.frames += part.frames;
+        self.lost += part.lost;
+        self.lost_at_least |= part.lost_at_least;
+        self.bus_errors += part.bus_errors;
+        self.decoded += part.decoded;
+        self.values += part.values;
+        self.issues += part.issues;
+        self.is_cut |= part.is_cut;
+        self.is_whole &= part.is_whole;
+        let room = FAULTS_KEPT - self.faults.len();
+        self.faults.extend(part.faults.iter().take(room).cloned());
+        for (sum, counts) in [(&mut self.left_out, &part.left_out), (&mut self.notes, &part.notes)] {
+            for (what, count) in counts {
+                *sum.entry(what.clone()).or_default() += count;
             }
         }
-        all.file = format!("{} files from {} to {}", before.len() + 1, first.file, last.file);
-        all.files = before.iter().chain([last]).cloned().collect();
-        all
+        self.channels.extend(part.channels.iter());
+        if !self.format.split(", ").any(|format| format == part.format) {
+            self.format = format!("{}, {}", self.format, part.format);
+        }
+        // What is different in each file is in the list.
+        self.properties.clear();
     }
 
     /// Counts a record that is passed on.
@@ -181,9 +175,16 @@ impl Report {
         }
     }
 
-    /// Replaces it.
+    /// Replaces everything but the list of files.
     pub fn set(&self, counts: Counts) {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = counts;
+        let mut now = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let files = std::mem::take(&mut now.files);
+        *now = Counts { files, ..counts };
+    }
+
+    /// Adds one of several files to the list, once it was read.
+    pub fn push_file(&self, counts: Counts) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).files.push(counts);
     }
 }
 

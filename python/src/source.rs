@@ -1,6 +1,5 @@
 //! The requested records of a trace file.
 
-use std::collections::VecDeque;
 use std::sync::Arc;
 
 use cantap_formats::time_range::{TimePoint, TimeRange};
@@ -84,10 +83,10 @@ pub struct TraceSource {
     reader: TraceReader,
     read: ReadOptions,
     files: Arc<Vec<TraceFile>>,
-    /// Those that follow, by their place among the files.
-    next: VecDeque<usize>,
-    /// What was in those before.
-    before: Vec<Counts>,
+    /// The sum of those before, under the first one's name; `None` while that is read.
+    before: Option<Counts>,
+    /// The place of the current one.
+    file: usize,
     strict: bool,
     filters: Vec<Filter>,
     channels: Vec<u8>,
@@ -108,12 +107,11 @@ impl TraceSource {
         let start = point(&options.start).map_err(Error::argument)?;
         let end = point(&options.end).map_err(Error::argument)?;
         let filters = filters.map_err(Error::argument)?;
-        let mut next: VecDeque<_> = (0..options.files.len()).collect();
-        let Some(first) = next.pop_front() else {
+        let Some(first) = options.files.first() else {
             return Err(Error::argument("no file is given; name at least one"));
         };
-        let reader = options.files[first].open(&read)?;
-        let counts = Counts::of(options.files[first].name(), &reader);
+        let reader = first.open(&read)?;
+        let counts = Counts::of(first.name(), &reader);
         report.set(counts.clone());
         let is_all = filters.is_empty() && options.channels.is_empty() && start.is_none() && end.is_none();
         let window = TimeRange::new(start, end);
@@ -122,8 +120,8 @@ impl TraceSource {
             reader,
             read,
             files: Arc::clone(&options.files),
-            next,
-            before: Vec::new(),
+            before: None,
+            file: 0,
             strict: options.strict,
             filters,
             channels,
@@ -189,15 +187,23 @@ impl TraceSource {
         if let Some(frames) = &mut frames {
             frames.clear();
         }
-        self.counts.is_whole = true;
+        let is_at_its_end = !std::mem::replace(&mut self.counts.is_whole, true);
         self.tell();
         if let Some(nothing) = self.reader.nothing_read() {
             return Err(nothing.into());
         }
-        let Some(next) = self.next.pop_front() else { return Ok(false) };
-        self.reader = self.files[next].open(&self.read)?;
-        let counts = Counts::of(self.files[next].name(), &self.reader);
-        self.before.push(std::mem::replace(&mut self.counts, counts));
+        if self.files.len() > 1 && is_at_its_end {
+            self.report.push_file(self.counts.clone());
+        }
+        let Some(next) = self.files.get(self.file + 1) else { return Ok(false) };
+        self.reader = next.open(&self.read)?;
+        let counts = Counts::of(next.name(), &self.reader);
+        let done = std::mem::replace(&mut self.counts, counts);
+        match &mut self.before {
+            Some(before) => before.add(&done),
+            None => self.before = Some(done),
+        }
+        self.file += 1;
         // Its records follow with the next call.
         Ok(true)
     }
@@ -210,12 +216,16 @@ impl TraceSource {
 
     /// Which of the files is being read.
     pub fn file(&self) -> usize {
-        self.before.len()
+        self.file
     }
 
-    /// Of all files so far.
+    /// Of all files so far, without a list of them. One alone stays as it is.
     pub fn all_counts(&self) -> Counts {
-        Counts::joined(&self.before, &self.counts)
+        let Some(before) = &self.before else { return self.counts.clone() };
+        let mut all = before.clone();
+        all.add(&self.counts);
+        all.file = format!("{} files from {} to {}", self.file + 1, before.file, self.counts.file);
+        all
     }
 
     fn choose(&mut self, records: &mut Vec<TraceRecord>) {

@@ -15,7 +15,7 @@ BO_ 291 Engine: 8 ECU
  SG_ Speed : 0|16@1+ (0.5,0) [0|200] "km/h" ECU
  SG_ Gear : 16|4@1+ (1,0) [0|8] "" ECU
  SG_ Torque : 24|16@1- (0.1,0) [-3000|3000] "Nm" ECU
-BO_ 2566834688 Climate: 8 ECU
+BO_ 2566844672 Climate: 8 ECU
  SG_ time : 0|8@1+ (1,0) [0|0] "min" ECU
 VAL_ 291 Gear 1 "First" 2 "Second" ;
 """
@@ -42,6 +42,7 @@ def test_a_frame_to_decode_is_a_text_or_a_message_of_python_can(db):
     assert db.decode("123#B500")[1]["Speed"] == 90.5
     assert db.decode(can.Message(arbitration_id=291, is_extended_id=False, data=[181, 0, 2]))[1]["Gear.text"] == "Second"
     assert db.decode("124#B500") is None
+    assert db.decode(can.Message(is_error_frame=True)) is None
 
 
 @pytest.mark.parametrize(

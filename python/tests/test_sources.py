@@ -32,6 +32,8 @@ def test_several_files_are_one_trace_in_the_order_of_their_names(folder):
         assert numbers(table) == [1, 1, 1, 2, 2, 2, 10, 10, 10]
         assert table.report.frames == 9 and table.report.is_whole
         assert [(report.file[-6:].strip("/"), report.frames) for report in table.report.files] == [("1.log", 3), ("2.log", 3), ("10.log", 3)]
+    for source in ([folder / "1.log"], folder.glob("1.log"), [open(folder / "1.log", "rb")]):
+        assert list(cantap.decode(source, folder / "car.dbc")["Engine"]["Speed"]) == [0.5] * 3
     assert numbers(cantap.read([folder / "10.log", folder / "1.log"])) == [10, 10, 10, 1, 1, 1]
     assert pickle.loads(pickle.dumps(cantap.read(folder).report)).files[1].frames == 3
 
@@ -40,6 +42,9 @@ def test_decoding_and_statistics_take_them_too(folder):
     drive = cantap.decode(folder, folder / "car.dbc")
     assert list(drive["Engine"]["Speed"]) == [0.5] * 3 + [1.0] * 3 + [5.0] * 3
     assert [report.decoded for report in drive.report.files] == [3, 3, 3] and drive.report.decoded == 9
+    assert "Engin" not in drive and drive.get("Engin") is None
+    with pytest.raises(KeyError, match="'Engin' was decoded; there are Engine"):
+        drive["Engin"]
     with cantap.scan(folder, db=folder / "car.dbc", batch_rows=2) as scan:
         assert sum(len(table) for table in scan) == 9
     assert [report.decoded for report in scan.report.files] == [3, 3, 3]
@@ -135,6 +140,8 @@ def test_urls_are_read_through_fsspec(folder):
         assert numbers(table) == [1, 1, 1, 2, 2, 2, 10, 10, 10]
         assert table.report.files[0].file == "memory:///fleet/1.log"
     assert len(cantap.read(fsspec.open("memory://fleet/1.log", "rb"))) == 3
+    opened = fsspec.open_files("memory://fleet/*.log", "rb")
+    assert len(cantap.decode(opened, folder / "car.dbc")["Engine"]) == 9
     with pytest.raises(FileNotFoundError):
         cantap.read("memory://fleet/none.log")
 

@@ -42,11 +42,13 @@ class Store:
         """Makes it, unless it is there."""
         mark = self.folder / "lake.json"
         if not mark.exists():
-            if self.folder.exists() and any(self.folder.iterdir()):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            # An interrupted run may have left the beginning of a mark.
+            if any(not path.name.startswith((mark.name, f".{mark.name}.")) for path in self.folder.iterdir()):
                 raise StoreError(f"{self.folder} has files and is no lake; give a new folder")
-            self._ledger.mkdir(parents=True)
             _write_whole(mark, json.dumps({"format": FORMAT}).encode())
         self._check()
+        self._ledger.mkdir(exist_ok=True)
 
     def _check(self) -> None:
         try:
@@ -116,7 +118,7 @@ class Store:
             raise ModuleNotFoundError("Delta is written by deltalake; install it: pip install deltalake", name="deltalake") from error
         folder = self.folder / table
         schema = deltalake.Schema.from_arrow(columns.schema(TABLES[table]))
-        actions = []
+        actions: list[Any] = []
         for entry in self.entries():
             for name, rows in entry["files"].get(table, {}).items():
                 about = (self.folder / name).stat()

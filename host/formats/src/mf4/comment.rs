@@ -11,6 +11,8 @@ pub(crate) type Properties = BTreeMap<String, String>;
 
 /// More than these are not kept: the comment may come from anyone.
 const MOST_PROPERTIES: usize = 1_000;
+/// A longer name is none: each property inside a group has the group's name in front of its own.
+const MOST_NAME_BYTES: usize = 256;
 /// Groups inside groups; deeper ones are named by the outer ones alone.
 const MOST_DEPTH: usize = 16;
 /// Elements of the standard (ASAM MDF 4.2, comments of the head and of the history) that are properties by themselves.
@@ -98,7 +100,7 @@ fn attribute(tag: &str, name: &str) -> Option<String> {
         let quote = after.chars().next().filter(|quote| matches!(quote, '"' | '\''))?;
         let (value, next) = after[1..].split_once(quote)?;
         if before.split_whitespace().last() == Some(name) {
-            return Some(plain(value));
+            return Some(plain(value)).filter(|value| value.len() <= MOST_NAME_BYTES);
         }
         rest = next;
     }
@@ -160,5 +162,7 @@ mod tests {
         assert_eq!(found(&"<tree name=\"t\">".repeat(100_000)), []);
         let many: String = (0..5_000).map(|at| format!("<e name=\"n{at}\">{at}</e>")).collect();
         assert_eq!(found(&many).len(), MOST_PROPERTIES);
+        let long = format!("<tree name='{}'>{many}</tree>", "n".repeat(1 << 20));
+        assert!(found(&long).iter().all(|(name, _)| name.len() < 10));
     }
 }

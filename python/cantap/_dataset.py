@@ -138,7 +138,6 @@ class Dataset(pyarrow.dataset.Dataset):  # type: ignore[misc]
         """Joined with the last row before each time of another dataset, in memory."""
         return pyarrow.dataset.InMemoryDataset(self.to_table()).join_asof(*arguments, **options)
 
-
     def get_fragments(self, filter: pc.Expression | None = None) -> Iterator[Any]:
         raise NotImplementedError("files of traces are no fragments; use to_batches")
 

@@ -48,7 +48,7 @@ def _files(source: Any, may_be_several: bool) -> Iterator[TraceFile]:
         for one in source:
             yield from _files(one, False)
     else:
-        raise TypeError(f"a trace is a path, an open file, or several of them, not {type(source).__name__}")
+        raise TypeError(f"path is a file's name, an open file, or several of them, not {type(source).__name__}")
 
 
 def _of_path(path: Any) -> Iterator[TraceFile]:

@@ -84,6 +84,12 @@ def test_a_damaged_file_among_several_is_counted_once(folder):
     assert report.issues == 1 and not report.is_whole and [part.is_whole for part in report.files] == [True, False, True]
 
 
+def test_a_file_of_which_nothing_can_be_read_is_named(folder):
+    (folder / "5.mf4").write_bytes(b"MDF     4.10    " + bytes(500))
+    with pytest.raises(cantap.FormatError, match="5.mf4"):
+        cantap.read(folder)
+
+
 def test_an_open_file_is_read_and_stays_open(folder, tmp_path):
     with open(folder / "1.log", "rb") as file:
         assert len(cantap.read(file)) == 3

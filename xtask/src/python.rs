@@ -1,6 +1,5 @@
 //! The package for Python: built as a wheel, installed into a fresh environment, checked and tested there.
 
-use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
@@ -13,9 +12,6 @@ use crate::workspace;
 
 /// Where its crate is.
 const MANIFEST: &str = "python/Cargo.toml";
-
-/// The feature of its crate with which other people's packages are those that the workspace has compiled.
-const AS_IN_WORKSPACE: &str = "as-in-workspace";
 
 /// Packs the sources, including those of the crates it is made of, and builds a wheel from them alone. Returns both.
 pub fn dist(shell: &Shell) -> Result<[PathBuf; 2]> {
@@ -45,13 +41,12 @@ enum Profile {
 fn wheel(shell: &Shell, sources: &Path, profile: Profile, out: &Path) -> Result<PathBuf> {
     let maturin = peers::venv(shell)?.join("bin/maturin");
     let manifest = sources.join(MANIFEST);
-    let (profile, compiled, features) = match profile {
-        Profile::Dev => ("dev", workspace::target(), Some(["--features", AS_IN_WORKSPACE])),
-        Profile::Release => ("release", target(), None),
+    let (profile, compiled) = match profile {
+        Profile::Dev => ("dev", workspace::target()),
+        Profile::Release => ("release", target()),
     };
     shell.remove_path(out)?;
-    let features = features.into_iter().flatten();
-    cmd!(shell, "{maturin} build --manifest-path {manifest} --profile {profile} --out {out} {features...}")
+    cmd!(shell, "{maturin} build --manifest-path {manifest} --profile {profile} --out {out}")
         .env("CARGO_TARGET_DIR", compiled)
         .run()?;
     only_file(out)
@@ -64,15 +59,12 @@ pub fn check(shell: &Shell, peers: Option<&Peers>) -> Result<Outcome> {
     }
     // Lints first: they need no wheel.
     cmd!(shell, "cargo fmt --manifest-path {MANIFEST} --check").run()?;
-    check_shared_packages(shell)?;
-    for without in [None, Some("--no-default-features")] {
-        cmd!(
-            shell,
-            "cargo clippy --manifest-path {MANIFEST} --features {AS_IN_WORKSPACE} {without...} -- -D warnings"
-        )
+    cmd!(shell, "cargo clippy --manifest-path {MANIFEST} -- -D warnings")
         .env("CARGO_TARGET_DIR", workspace::target())
         .run()?;
-    }
+    cmd!(shell, "cargo clippy --manifest-path {MANIFEST} --no-default-features -- -D warnings")
+        .env("CARGO_TARGET_DIR", workspace::target())
+        .run()?;
     let wheel = wheel(shell, &workspace::root(), Profile::Dev, &target().join("wheels"))?;
     let python = environment(shell, &wheel)?;
     cmd!(shell, "{python} -m mypy --config-file python/pyproject.toml python/cantap python/tests/typed.py")
@@ -135,36 +127,6 @@ fn python_can(shell: &Shell, python: &Path) -> Result<PathBuf> {
         cmd!(shell, "tar --extract --file {archive} --directory {out}").run()?;
     }
     Ok(folder)
-}
-
-/// Checks that other people's packages have the versions and features that they have in the workspace: otherwise they are compiled twice.
-fn check_shared_packages(shell: &Shell) -> Result<()> {
-    let of_workspace = packages(shell, "--workspace --all-features --edges normal,build,dev")?;
-    let options = format!("--manifest-path {MANIFEST} --features {AS_IN_WORKSPACE} --edges normal,build");
-    let names: BTreeSet<_> = of_workspace.iter().map(|package| name_of(package)).collect();
-    let different: Vec<_> = packages(shell, &options)?
-        .into_iter()
-        .filter(|package| names.contains(name_of(package)) && !of_workspace.contains(package))
-        .collect();
-    ensure!(
-        different.is_empty(),
-        "these packages are not what they are in the workspace; adapt the feature '{AS_IN_WORKSPACE}' in {MANIFEST}, or its lock file:\n{}",
-        different.join("\n")
-    );
-    Ok(())
-}
-
-/// Other people's packages, each with its version and its features.
-fn packages(shell: &Shell, options: &str) -> Result<BTreeSet<String>> {
-    let options = options.split(' ');
-    let tree = cmd!(shell, "cargo tree --locked --prefix none --format '{p} {f}' {options...}").read()?;
-    // What was printed before is marked, and our own crates have a folder.
-    let lines = tree.lines().map(|line| line.trim_end_matches(" (*)").trim_end());
-    Ok(lines.filter(|line| !line.contains('/')).map(str::to_owned).collect())
-}
-
-fn name_of(package: &str) -> &str {
-    package.split(' ').next().unwrap_or_default()
 }
 
 fn only_file(folder: &Path) -> Result<PathBuf> {

@@ -8,6 +8,7 @@ pub mod bridge;
 pub mod canopen;
 pub mod capture;
 pub mod care;
+pub mod compare_adapters;
 pub mod completions;
 pub mod conversations;
 pub mod convert;
@@ -112,6 +113,8 @@ pub enum Command {
     Extcap(Box<extcap::Args>),
     /// Show a device's state: counters, errors, queue, temperature, registers.
     Status(status::Args),
+    /// Compare two devices on one bus: what each missed, and how far apart their stamps are.
+    CompareAdapters(compare_adapters::Args),
     /// Test a board: everything that it can show on its own, with a report to send in.
     Selftest(selftest::Args),
     /// Find a bus's bit rate by listening only.
@@ -168,6 +171,7 @@ impl Command {
             Self::Virtual(args) => virtual_device::run(&args),
             Self::Status(args) => status::run(&args),
             Self::Selftest(args) => selftest::run(&args),
+            Self::CompareAdapters(args) => compare_adapters::run(&args),
             Self::Autobaud(args) => autobaud::run(&args),
             #[cfg(target_os = "linux")]
             Self::Bridge(args) => bridge::run(&args),

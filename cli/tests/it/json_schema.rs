@@ -96,6 +96,7 @@ pub const LINES: &[(&str, i32, &[&str])] = &[
     ("convert a.log out.csv", 0, &["convert"]),
     ("convert a.asc out.log", 0, &["convert"]),
     ("align b.log b.log", 0, &["align"]),
+    ("compare-adapters -d candump:b.log -d candump:b.log -b 500k -t 2s", 0, &["compare-adapters"]),
     ("decode a.log --db car.dbc", 0, &["decode", "decode_end"]),
     ("decode a.log --db car.dbc --details", 0, &["decode", "decode_end"]),
     ("search a.log --db car.dbc --id 100 -C 2", 0, &["search", "search_end"]),

@@ -103,7 +103,6 @@ fn receive(live: &mut LiveRecords) -> anyhow::Result<Received> {
     loop {
         match live.next_batch(&mut batch) {
             Ok(true) => {}
-            Ok(false) => break,
             // One that has ended, such as a pipe, ends the comparison. What both have is compared.
             Err(error) if ended.is_none() => {
                 ended = Some(error);
@@ -111,7 +110,7 @@ fn receive(live: &mut LiveRecords) -> anyhow::Result<Received> {
                 live.stop();
                 continue;
             }
-            Err(_) => break,
+            Ok(false) | Err(_) => break,
         }
         for record in &batch {
             let (board, channel) = place_of(record.channel);

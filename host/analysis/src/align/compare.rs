@@ -211,7 +211,7 @@ impl Bus {
     }
 
     /// Which part of each device's frames the other can have, too: from the first to the last that certainly both have.
-    fn common(&self, groups: &[Group]) -> Option<[(usize, usize); 2]> {
+    fn common(groups: &[Group]) -> Option<[(usize, usize); 2]> {
         let clear = groups.iter().filter(|group| pair(group).is_some());
         let shared = groups.iter().filter(|group| group.iter().all(|side| !side.is_empty()));
         let range = |groups: &[&Group], side: usize| {
@@ -261,7 +261,7 @@ impl Side {
 impl Comparison {
     fn take(&mut self, bus: &Bus, differences: &mut Vec<u64>) {
         let groups = bus.groups(self.near_ns);
-        let Some(common) = bus.common(&groups) else {
+        let Some(common) = Bus::common(&groups) else {
             for (side, frames) in bus.frames.iter().enumerate() {
                 self.sides[side].other_bus += frames.len() as u64;
             }

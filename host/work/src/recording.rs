@@ -249,8 +249,8 @@ mod tests {
         TraceRecord { time_ns: second * 1_000_000_000, channel: 1, event }
     }
 
-    fn fast() -> Option<Around> {
-        Some(Around::new("byte[0] > 0x80", WINDOW, &Decoder::new(Vec::new())).unwrap())
+    fn fast() -> Around {
+        Around::new("byte[0] > 0x80", WINDOW, &Decoder::new(Vec::new())).unwrap()
     }
 
     #[test]
@@ -264,12 +264,12 @@ mod tests {
         assert_eq!(recording.finish(), format!("2 records are in {}", path.display()));
         let text = std::fs::read_to_string(&path).unwrap();
         assert_eq!(text.lines().count(), 2);
-        for around in [None, fast()] {
+        for around in [None, Some(fast())] {
             let error = Recording::create(&path, around, Older::Refuse).err().unwrap().to_string();
             assert!(error.contains("is not overwritten"), "{error}");
             assert_eq!(std::fs::read_to_string(&path).unwrap(), text);
         }
-        let mut recording = Recording::create(&path, fast(), Older::Replace).unwrap();
+        let mut recording = Recording::create(&path, Some(fast()), Older::Replace).unwrap();
         assert_eq!(std::fs::read_to_string(&path).unwrap(), text);
         recording.write(&[frame(5, "123#FF")]).unwrap();
         recording.finish();
@@ -282,7 +282,7 @@ mod tests {
     fn only_what_is_around_an_event_is_recorded_where_a_condition_is_given() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("fast.log");
-        let mut recording = Recording::create(&path, fast(), Older::Refuse).unwrap();
+        let mut recording = Recording::create(&path, Some(fast()), Older::Refuse).unwrap();
         for second in 0..30 {
             recording.write(&[frame(second, if second == 15 { "123#FF" } else { "123#01" })]).unwrap();
         }
@@ -296,7 +296,7 @@ mod tests {
     fn a_condition_that_never_comes_true_leaves_no_file_and_is_awaited() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("never.log");
-        let mut recording = Recording::create(&path, fast(), Older::Refuse).unwrap();
+        let mut recording = Recording::create(&path, Some(fast()), Older::Refuse).unwrap();
         recording.write(&[frame(0, "123#01"); 5]).unwrap();
         let state = recording.state().unwrap();
         assert_eq!((state.condition.as_deref(), state.records, state.events), (Some("byte[0] > 0x80"), 0, 0));
@@ -310,11 +310,11 @@ mod tests {
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
         // What would prevent it later is an error at once, and a file of somebody else is not overwritten later.
         for place in ["no-folder/a.log", "a.unknown"] {
-            let error = Recording::create(&folder.path().join(place), fast(), Older::Refuse);
+            let error = Recording::create(&folder.path().join(place), Some(fast()), Older::Refuse);
             let error = error.err().unwrap().to_string();
             assert!(error.starts_with("cannot record to "), "{error}");
         }
-        let mut recording = Recording::create(&path, fast(), Older::Refuse).unwrap();
+        let mut recording = Recording::create(&path, Some(fast()), Older::Refuse).unwrap();
         std::fs::write(&path, "somebody's").unwrap();
         let error = recording.write(&[frame(0, "123#FF")]).unwrap_err();
         assert!(Recording::failure(&error).contains("is not overwritten"), "{error}");

@@ -160,7 +160,8 @@ mod tests {
         }
         assert_eq!(found("<e name=>1</e><e name=\"y\">2</f>"), []);
         assert_eq!(found(&"<tree name=\"t\">".repeat(100_000)), []);
-        let many: String = (0..5_000).map(|at| format!("<e name=\"n{at}\">{at}</e>")).collect();
+        let one = |at| format!("<e name=\"n{at}\">{at}</e>");
+        let many: String = (0..5_000).map(one).collect();
         assert_eq!(found(&many).len(), MOST_PROPERTIES);
         let long = format!("<tree name='{}'>{many}</tree>", "n".repeat(1 << 20));
         assert!(found(&long).iter().all(|(name, _)| name.len() < 10));

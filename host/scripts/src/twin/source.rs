@@ -19,6 +19,8 @@ const ROUNDER: f64 = 100e-6;
 const NO_JITTER_NS: f64 = 200_000.0;
 /// Frames of a channel that a device repeats by itself; some of its 32 slots are left to whoever edits the script.
 const REPEATED: usize = 24;
+/// A list takes at least this long before it begins again: one without any time would never end.
+const SHORTEST_NS: u64 = 100_000_000;
 /// The most characters of a line of a list.
 const LINE: usize = 120;
 
@@ -174,8 +176,7 @@ fn recorded(out: &mut String, channel: u8, list: &[(u64, Frame)], frames: usize,
     let step =
         |(delay_ns, frame): &(u64, Frame)| format!("[\"{}\", \"{frame}\"]", duration(*delay_ns as f64));
     let mut steps: Vec<String> = rest.iter().map(step).collect();
-    // A list that has no time at all would never end.
-    let whole_ns = (again_ns + last_ns - first_ns).max(1_000_000);
+    let whole_ns = (again_ns + last_ns - first_ns).max(SHORTEST_NS);
     let again_ns = again_ns.max(whole_ns - (last_ns - first_ns));
     steps.push(step(&(again_ns, *first)));
     let _ = writeln!(out, "after(\"{}\", || {{", duration(*first_ns as f64));

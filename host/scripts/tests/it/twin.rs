@@ -38,7 +38,7 @@ fn round_trip(records: &[TraceRecord]) -> (Model, Vec<Script>, Distance) {
     let trace = observe(records);
     let model = Model::learn(&trace);
     let scripts = scripts(&model);
-    let duration_ns = trace.duration_ns.clamp(1, 60 * SECOND_NS);
+    let duration_ns = trace.duration_ns.clamp(SECOND_NS / 10, 60 * SECOND_NS);
     let mut bench = bench("load=0", 1);
     bench.duration_ns = duration_ns;
     let (report, played, _) = run_on(&bench, &scripts);
@@ -237,6 +237,36 @@ fn the_virtual_vehicle_has_a_twin() {
     let (_, first, _) = run_on(&bench("load=0", 5), &scripts);
     let (_, again, _) = run_on(&bench("load=0", 5), &scripts);
     assert!(first.len() > 1000 && first == again);
+}
+
+/// As J1939's broadcasts in several packets are.
+#[test]
+fn a_node_does_not_answer_itself() {
+    let mut records = Vec::new();
+    for round in 0..20_u64 {
+        let at = round * 3_000_000_000;
+        records.push(record(at, "1CECFF00#20120003FFECFE00"));
+        (1..4).for_each(|part| {
+            records.push(record(at + part * 50_000_000, &format!("1CEBFF00#0{part}57435443414E54")))
+        });
+    }
+    let (model, scripts, _) = round_trip(&records);
+    assert!(model.exchanges.is_empty() && scripts.len() == 1, "{}", scripts[0].source);
+}
+
+/// A list that is cut off goes on at once: the mean rate stays.
+#[test]
+fn what_is_not_periodic_and_long_is_played_again_at_its_rate() {
+    let mut at = 0;
+    let records: Vec<TraceRecord> = (0..2000_u64)
+        .map(|number| {
+            at += 1_000_000 + number * number * 7919 % 29 * 1_000_000;
+            record(at, &format!("123#{number:04X}"))
+        })
+        .collect();
+    let (model, _, distance) = round_trip(&records);
+    assert!(matches!(&model.streams[0].timing, Timing::Recorded(list) if list.len() == 500));
+    assert!(distance.apart_pct < 5.0, "{distance:?}");
 }
 
 /// What nobody planned for: each has scripts in the language that do not end with an error.

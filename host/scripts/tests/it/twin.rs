@@ -246,9 +246,9 @@ fn a_node_does_not_answer_itself() {
     for round in 0..20_u64 {
         let at = round * 3_000_000_000;
         records.push(record(at, "1CECFF00#20120003FFECFE00"));
-        (1..4).for_each(|part| {
-            records.push(record(at + part * 50_000_000, &format!("1CEBFF00#0{part}57435443414E54")))
-        });
+        for part in 1..4 {
+            records.push(record(at + part * 50_000_000, &format!("1CEBFF00#0{part}57435443414E54")));
+        }
     }
     let (model, scripts, _) = round_trip(&records);
     assert!(model.exchanges.is_empty() && scripts.len() == 1, "{}", scripts[0].source);

@@ -31,8 +31,18 @@ const GROUPS: [(&str, &[&str]); 7] = [
     (
         "Devices",
         &[
-            "doctor", "list", "info", "status", "defaults", "selftest", "identify", "reset", "update",
-            "virtual", "demo",
+            "doctor",
+            "list",
+            "info",
+            "status",
+            "defaults",
+            "selftest",
+            "compare-adapters",
+            "identify",
+            "reset",
+            "update",
+            "virtual",
+            "demo",
         ],
     ),
     ("Share with other programs", &["serve", "bridge", "extcap"]),
@@ -40,7 +50,7 @@ const GROUPS: [(&str, &[&str]); 7] = [
 ];
 
 /// Columns for a command's name.
-const NAME: usize = 15;
+const NAME: usize = 17;
 /// No line is longer, as in the help of a single command.
 const MOST_COLUMNS: usize = 100;
 

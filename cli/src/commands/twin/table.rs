@@ -35,7 +35,7 @@ pub fn text(model: &Model, trace: &Observed, distance: &Distance, names: Names<'
     let _ = writeln!(out, "frames that one of them has more, by identifier: {:.2} %\n", distance.apart_pct);
     let _ = writeln!(
         out,
-        "Ch  ID        Role     Frames         Period/ms              Jitter/ms            Known/%  Counter/%  Checksum/%"
+        "Ch  ID        Role     Frames         Period/ms              Jitter/ms            Known/%  Rest/%   Counter/%  Checksum/%"
     );
     for stream in &distance.streams {
         row(&mut out, stream, names);
@@ -52,13 +52,14 @@ fn row(out: &mut String, stream: &StreamDistance, names: Names<'_>) {
     let id = if key.remote { format!("{} R", key.id) } else { key.id.to_string() };
     let name = names(key.channel, key.id).map(|name| clean::line(&name).into_owned()).unwrap_or_default();
     let line = format!(
-        "{:<3} {id:<9} {:<8} {:<14} {:<22} {:<20} {:<8} {:<10} {:<10}  {name}",
+        "{:<3} {id:<9} {:<8} {:<14} {:<22} {:<20} {:<8} {:<8} {:<10} {:<10}  {name}",
         key.channel,
         stream.role.map_or("-", Role::name),
         stream.frames.map(|frames| frames.to_string()).join(" "),
         ms(stream.period_ns),
         ms(stream.jitter_ns),
         figure(stream.known_pct, 1),
+        figure(stream.known_rest_pct, 1),
         figure(stream.counters_right_pct[1], 1),
         figure(stream.checksums_right_pct[1], 1),
     );
@@ -101,6 +102,7 @@ pub fn object(model: &Model, trace: &Observed, distance: &Distance, missing: &Mi
             "period_ms": both(stream.period_ns, 1e6, 6),
             "jitter_ms": both(stream.jitter_ns, 1e6, 6),
             "known_pct": figure(stream.known_pct, 1.0, 3),
+            "known_rest_pct": figure(stream.known_rest_pct, 1.0, 3),
             "counters_right_pct": both(stream.counters_right_pct, 1.0, 3),
             "checksums_right_pct": both(stream.checksums_right_pct, 1.0, 3),
         })

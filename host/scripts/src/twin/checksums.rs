@@ -8,6 +8,9 @@ use crate::checksum;
 /// The fewest payloads, checksum aside, that show a checksum of eight bits, and one of four.
 const FEWEST: usize = 6;
 const FEWEST_OF_NIBBLE: usize = 12;
+/// The fewest values that it has, and payloads with the same constant that differ independently: less fits some CRC by chance.
+const FEWEST_VALUES: usize = 4;
+const FEWEST_INDEPENDENT: usize = 3;
 /// The most payloads that are looked at.
 const MOST: usize = 4096;
 /// The largest modulus of a counter that may select the checksum's constant.
@@ -159,7 +162,8 @@ pub fn find(payloads: &[[u8; 8]], len: usize, counters: &[Counter]) -> Option<Ch
     let distinct: BTreeSet<[u8; 8]> = payloads.iter().copied().collect();
     let distinct: Vec<[u8; 8]> = distinct.into_iter().take(MOST).collect();
     let first = *distinct.first()?;
-    let counted = |at: usize| counters.iter().fold(0, |bits, counter| bits | counter.field.mask()[at]);
+    // A part of a checksum may look like a counter; the best counter is one.
+    let counted = |at: usize| counters.first().map_or(0, |counter| counter.field.mask()[at]);
     // Of bytes that follow from each other, the checksum is the one that changes most often; most are the last byte or the first.
     let mut ordered: Vec<usize> = [len - 1, 0].into_iter().chain(1..len - 1).collect();
     let changes = |at: usize| payloads.windows(2).filter(|pair| pair[0][at] != pair[1][at]).count();
@@ -180,10 +184,14 @@ pub fn find(payloads: &[[u8; 8]], len: usize, counters: &[Counter]) -> Option<Ch
         })
     });
     let simple = [Algorithm::Xor, Algorithm::Sum, Algorithm::NegatedSum];
-    let of_bytes: Vec<Algorithm> = simple.into_iter().chain(crcs).collect();
+    let mut of_bytes: Vec<Algorithm> = simple.into_iter().chain(crcs).collect();
     let of_nibbles = [Algorithm::NibbleSum, Algorithm::NegatedNibbleSum];
     let selecting = counters.first().filter(|counter| counter.modulus <= MAX_CONSTANTS);
     let whole = || parts(Part::Byte);
+    // Two bytes that change alike are copies, unless one counts.
+    let varying = (0..len).filter(|at| distinct.iter().any(|each| each[*at] != first[*at])).count();
+    let of_bytes =
+        if varying > 2 || !counters.is_empty() { of_bytes } else { of_bytes.split_off(simple.len()) };
     whole()
         .find_map(|(at, part)| search(&distinct, len, at, part, &of_bytes, None))
         .or_else(|| {
@@ -225,6 +233,10 @@ fn search(
     if samples < fewest + constants - 1 {
         return None;
     }
+    let values: BTreeSet<u8> = payloads.iter().map(|data| data[byte] & part.mask()).collect();
+    if values.len() < FEWEST_VALUES || (!is_lookup && independent(&others, counter) < FEWEST_INDEPENDENT) {
+        return None;
+    }
     algorithms.iter().find_map(|algorithm| {
         let mut checksum = Checksum { byte, part, algorithm: *algorithm, constants: vec![0; constants] };
         let mut known: BTreeMap<usize, u8> = BTreeMap::new();
@@ -242,4 +254,20 @@ fn search(
         }
         Some(checksum)
     })
+}
+
+/// How many differences between payloads with the same constant are independent of each other, bit by bit: a CRC that is right for these is
+/// right for all that can be made of them.
+fn independent(payloads: &BTreeSet<[u8; 8]>, counter: Option<&Counter>) -> usize {
+    let mut first_of: BTreeMap<usize, u64> = BTreeMap::new();
+    let mut basis: Vec<u64> = Vec::new();
+    for data in payloads {
+        let number = u64::from_be_bytes(*data);
+        let first = *first_of.entry(counter.map_or(0, |counter| place(counter, *data))).or_insert(number);
+        let rest = basis.iter().fold(number ^ first, |rest, each| rest.min(rest ^ each));
+        if rest != 0 {
+            basis.push(rest);
+        }
+    }
+    basis.len()
 }

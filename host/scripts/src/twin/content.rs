@@ -31,6 +31,7 @@ pub struct Content {
     pub lengths: Vec<usize>,
     mask: [u8; 8],
     known: BTreeSet<[u8; 8]>,
+    known_whole: BTreeSet<[u8; 8]>,
 }
 
 impl Content {
@@ -49,6 +50,13 @@ impl Content {
             let payloads: Vec<[u8; 8]> = seen.iter().map(|seen| seen.frame.padded_data()).collect();
             counters = counters::find(&pairs, len);
             checksum = checksums::find(&payloads, len, &counters);
+            if let Some(checksum) = &checksum {
+                // What looked like a counter in it is none.
+                let is_apart = |counter: &Counter| {
+                    counter.field.mask()[checksum.byte] & checksum.mask()[checksum.byte] == 0
+                };
+                counters.retain(is_apart);
+            }
             if !counters.is_empty() && checksum.is_none() && has_unknown_checksum(&pairs, len, &counters) {
                 // Counted anew, the recorded checksum would be wrong.
                 counters.clear();
@@ -73,13 +81,19 @@ impl Content {
             }
         }
         let known = seen.iter().map(|seen| masked(&seen.frame).padded_data()).collect();
+        let known_whole = seen.iter().map(|seen| seen.frame.padded_data()).collect();
         let all_steps = all.len();
         let steps = thinned(all, longest);
-        Self { counters, begin, checksum, steps, all_steps, lengths, mask, known }
+        Self { counters, begin, checksum, steps, all_steps, lengths, mask, known, known_whole }
     }
 
-    /// Whether the trace had such a frame, what is computed aside.
+    /// Whether the trace had a frame with these data.
     pub fn has(&self, frame: &Frame) -> bool {
+        self.known_whole.contains(&frame.padded_data())
+    }
+
+    /// Whether it had one, counters and checksums aside.
+    pub fn has_rest(&self, frame: &Frame) -> bool {
         self.known.contains(&and(frame.padded_data(), self.mask))
     }
 }

@@ -2,6 +2,9 @@
 
 use std::collections::BTreeSet;
 
+use cantap_can::Frame;
+
+use super::content::Content;
 use super::learner::{Key, Observed, Seen};
 use super::model::{Model, Stream};
 use super::role::Role;
@@ -35,8 +38,10 @@ pub struct StreamDistance {
     pub period_ns: [Option<f64>; 2],
     /// The standard deviation of the intervals of both in nanoseconds.
     pub jitter_ns: [Option<f64>; 2],
-    /// Of the run's frames, those whose data are in the trace, apart from counters and checksums, in per cent.
+    /// Of the run's frames, those whose data are in the trace, in per cent.
     pub known_pct: Option<f64>,
+    /// The same apart from counters and checksums: one that was recorded with another counter is not known as a whole.
+    pub known_rest_pct: Option<f64>,
     /// Pairs of frames between which the counters count, in trace and run, in per cent, if there are counters.
     pub counters_right_pct: [Option<f64>; 2],
     /// Frames with the right checksum in trace and run, in per cent, if there is one.
@@ -87,7 +92,10 @@ pub fn compare(
 fn one(key: Key, stream: Option<&Stream>, both: &[Vec<Seen>; 2]) -> StreamDistance {
     let periods = [0, 1].map(|place| timing::period(&both[place]));
     let run = &both[1];
-    let known = stream.map(|stream| run.iter().filter(|seen| stream.content.has(&seen.frame)).count());
+    let known = |is_known: fn(&Content, &Frame) -> bool| {
+        let content = &stream?.content;
+        percent(run.iter().filter(|seen| is_known(content, &seen.frame)).count(), run.len())
+    };
     let counters_right = |seen: &[Seen]| {
         let counters = &stream.filter(|stream| !stream.content.counters.is_empty())?.content.counters;
         let pairs: Vec<_> = seen.windows(2).filter(|pair| pair[0].stretch == pair[1].stretch).collect();
@@ -113,7 +121,8 @@ fn one(key: Key, stream: Option<&Stream>, both: &[Vec<Seen>; 2]) -> StreamDistan
         frames: [both[0].len(), run.len()],
         period_ns: periods.map(|period| Some(period?.mean_ns)),
         jitter_ns: periods.map(|period| Some(period?.jitter_ns)),
-        known_pct: known.and_then(|known| percent(known, run.len())),
+        known_pct: known(Content::has),
+        known_rest_pct: known(Content::has_rest),
         counters_right_pct: [counters_right(&both[0]), counters_right(run)],
         checksums_right_pct: [checksums_right(&both[0]), checksums_right(run)],
     }

@@ -32,7 +32,7 @@ const ON_THE_WAY: Duration = Duration::from_millis(500);
                   show how their clocks relate. Each only listens unless --mode says otherwise; at least one node on the bus must acknowledge.\n\n\
                   Examples:\n  \
                   cantap compare-adapters -d /dev/ttyACM0 -d can0 -b 500k\n  \
-                  cantap compare-adapters -d /dev/ttyACM0 -d elm327:tcp://192.168.0.10 -b 500k -t 60s --json\n\n\
+                  cantap compare-adapters -d /dev/ttyACM0 -d elm327: -b 500k -t 60s --json\n\n\
                   Exit code 3: one of the two missed a frame, has one more often than the other, or has them in another order. \
                   1: one received nothing, or they have nothing in common that occurs only once."
 )]
@@ -103,7 +103,6 @@ fn receive(live: &mut LiveRecords) -> anyhow::Result<Received> {
     loop {
         match live.next_batch(&mut batch) {
             Ok(true) => {}
-            Ok(false) => break,
             // One that has ended, such as a pipe, ends the comparison. What both have is compared.
             Err(error) if ended.is_none() => {
                 ended = Some(error);
@@ -111,7 +110,7 @@ fn receive(live: &mut LiveRecords) -> anyhow::Result<Received> {
                 live.stop();
                 continue;
             }
-            Err(_) => break,
+            Ok(false) | Err(_) => break,
         }
         for record in &batch {
             let (board, channel) = place_of(record.channel);

@@ -37,6 +37,7 @@ pub mod serve;
 pub mod stats;
 pub mod status;
 pub mod timing;
+pub mod twin;
 pub mod uds;
 pub mod ui;
 pub mod update;
@@ -127,6 +128,8 @@ pub enum Command {
     Replay(Box<replay::Args>),
     /// Run nodes and tests as scripts: on simulated buses, or on a device.
     Run(Box<run::Args>),
+    /// Learn a bus from a trace, and write scripts that play it.
+    Twin(Box<twin::Args>),
     /// Blink a device's LEDs, to find it among others.
     Identify(care::Identify),
     /// Restart a device's firmware.
@@ -181,6 +184,7 @@ impl Command {
             Self::Gen(args) => r#gen::run(&args),
             Self::Replay(args) => replay::run(&args),
             Self::Run(args) => run::run(&args),
+            Self::Twin(args) => twin::run(&args),
             Self::Identify(args) => care::identify(&args),
             Self::Reset(args) => care::reset(&args),
             Self::Update(args) => update::run(&args),

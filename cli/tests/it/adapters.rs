@@ -27,7 +27,8 @@ pub fn pipe(test: &str, text: String) -> (String, mpsc::Sender<()>) {
 /// Runs a command on such a pipe. Standard output and standard error.
 fn on_pipe(test: &str, line: &str) -> (String, String) {
     // It does not go back to zero.
-    let text = (0..100).map(|at| format!("(1700000000.{:06}) can0 123#{at:04X}\n", at * 500)).collect();
+    let row = |at| format!("(1700000000.{:06}) can0 123#{at:04X}\n", at * 500);
+    let text = (0..100).map(row).collect();
     let (device, done) = pipe(test, text);
     let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
     let args = line.split(' ').map(|arg| if arg == "PIPE" { device.as_str() } else { arg });

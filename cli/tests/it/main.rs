@@ -69,6 +69,7 @@ mod texts_from_outside;
 mod timing;
 mod trigger;
 mod tutorial;
+mod twin;
 mod two_testers;
 mod ui;
 mod unsent;

@@ -209,19 +209,19 @@ impl Bus {
         let mut all = frames.flat_map(|(frames, places)| places.iter().map(|place| &frames[place.index].0));
         all.any(|frame| frame.classic().is_some_and(cantap_can::Frame::is_remote))
     }
-}
 
-/// Which part of each device's frames the other can have, too: from the first to the last that certainly both have.
-fn common(groups: &[Group]) -> Option<[(usize, usize); 2]> {
-    let clear = groups.iter().filter(|group| pair(group).is_some());
-    let shared = groups.iter().filter(|group| group.iter().all(|side| !side.is_empty()));
-    let range = |groups: &[&Group], side: usize| {
-        let indices = || groups.iter().flat_map(|group| &group[side]).map(|place| place.index);
-        Some((indices().min()?, indices().max()?))
-    };
-    let clear: Vec<_> = clear.collect();
-    let of = if clear.is_empty() { shared.collect() } else { clear };
-    Some([range(&of, 0)?, range(&of, 1)?])
+    /// Which part of each device's frames the other can have, too: from the first to the last that certainly both have.
+    fn common(groups: &[Group]) -> Option<[(usize, usize); 2]> {
+        let clear = groups.iter().filter(|group| pair(group).is_some());
+        let shared = groups.iter().filter(|group| group.iter().all(|side| !side.is_empty()));
+        let range = |groups: &[&Group], side: usize| {
+            let indices = || groups.iter().flat_map(|group| &group[side]).map(|place| place.index);
+            Some((indices().min()?, indices().max()?))
+        };
+        let clear: Vec<_> = clear.collect();
+        let of = if clear.is_empty() { shared.collect() } else { clear };
+        Some([range(&of, 0)?, range(&of, 1)?])
+    }
 }
 
 /// Cut where two are farther apart than this.
@@ -261,13 +261,13 @@ impl Side {
 impl Comparison {
     fn take(&mut self, bus: &Bus, differences: &mut Vec<u64>) {
         let groups = bus.groups(self.near_ns);
-        let Some(ranges) = common(&groups) else {
+        let Some(common) = Bus::common(&groups) else {
             for (side, frames) in bus.frames.iter().enumerate() {
                 self.sides[side].other_bus += frames.len() as u64;
             }
             return;
         };
-        for (side, (frames, (begin, end))) in bus.frames.iter().zip(ranges).enumerate() {
+        for (side, (frames, (begin, end))) in bus.frames.iter().zip(common).enumerate() {
             let (found, after) = (&mut self.sides[side], &frames[end + 1..]);
             found.before += begin as u64;
             found.after += after.len() as u64;
@@ -288,7 +288,7 @@ impl Comparison {
                 continue;
             }
             let [first, second] = [0, 1].map(|side| {
-                let (begin, end) = ranges[side];
+                let (begin, end) = common[side];
                 group[side].iter().filter(|place| (begin..=end).contains(&place.index)).count() as u64
             });
             let both = first.min(second);

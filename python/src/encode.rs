@@ -330,12 +330,8 @@ impl TableEncoder<'_> {
         for kept in ["time", "channel"] {
             columns.extend(batch.column_by_name(kept).map(|column| (kept, Arc::clone(column))));
         }
-        let fields: Vec<_> = columns
-            .iter()
-            .map(|(name, column)| Field::new(*name, column.data_type().clone(), true))
-            .collect();
-        let columns = columns.into_iter().map(|(_, column)| column).collect();
-        let frames = RecordBatch::try_new(Arc::new(Schema::new(fields)), columns);
+        let columns = columns.into_iter().map(|(name, column)| (name, column, true));
+        let frames = RecordBatch::try_from_iter_with_nullable(columns);
         let frames = frames.map_err(|error| Error::Format(error.to_string()))?;
         let records = cantap_columns::records(&frames);
         self.records

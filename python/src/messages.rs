@@ -91,12 +91,8 @@ impl Columns {
             ("dlc", Arc::new(self.dlc.finish())),
             ("data", Arc::new(self.data.finish())),
         ];
-        let fields: Vec<_> = columns
-            .iter()
-            .map(|(name, column)| Field::new(*name, column.data_type().clone(), true))
-            .collect();
-        let columns = columns.into_iter().map(|(_, column)| column).collect();
-        let batch = RecordBatch::try_new(Arc::new(Schema::new(fields)), columns);
+        let columns = columns.into_iter().map(|(name, column)| (name, column, true));
+        let batch = RecordBatch::try_from_iter_with_nullable(columns);
         batch.map_err(|error| Error::Format(error.to_string()))
     }
 }

@@ -14,7 +14,7 @@ use cantap_formats::WriteOptions;
 use cantap_scripts::{Bench, Live, Message, Outcome, Report, Script, TestResult};
 use cantap_trace::clean;
 use cantap_virtual::Options;
-use cantap_work::{interrupt, rounded};
+use cantap_work::{atomic_file, interrupt, rounded};
 use serde_json::{Value, json};
 
 use crate::args;
@@ -122,7 +122,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     trace.map(TraceOutput::finish).transpose()?;
     if let Some(path) = &args.junit {
-        std::fs::write(path, report.junit()).with_context(|| format!("cannot write {}", path.display()))?;
+        atomic_file::write(path, report.junit().as_bytes())
+            .with_context(|| format!("cannot write {}", path.display()))?;
     }
     print(&report, args.json)?;
     if interrupt::requested() {

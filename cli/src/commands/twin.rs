@@ -12,7 +12,7 @@ use cantap_scripts::twin::{Distance, Learner, Model, Observed, compare};
 use cantap_scripts::{Bench, Script};
 use cantap_signals::Decoder;
 use cantap_work::channel_bitrate::ChannelBitrate;
-use cantap_work::interrupt;
+use cantap_work::{atomic_file, interrupt};
 
 use crate::completion;
 use crate::database_args::{DatabaseArgs, load};
@@ -158,5 +158,5 @@ fn played(
 }
 
 fn write(path: &Path, source: &str) -> anyhow::Result<()> {
-    std::fs::write(path, source).with_context(|| failed(path))
+    atomic_file::write(path, source.as_bytes()).with_context(|| failed(path))
 }

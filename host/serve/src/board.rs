@@ -15,7 +15,7 @@ use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Hello, Reply};
 
 use crate::audit::Audit;
 use crate::board_figures::BoardFigures;
-use crate::client::{self, Guest};
+use crate::client::admission::{self, Guest};
 use crate::lock::lock;
 use crate::log_limit::LogLimit;
 use crate::modes;
@@ -195,7 +195,7 @@ impl Board {
         output: impl Write + Send + 'static,
         guest: Guest,
     ) -> Result<(), Refused> {
-        client::admit(&self.shared, Box::new(input), Box::new(output), guest)
+        admission::admit(&self.shared, Box::new(input), Box::new(output), guest)
     }
 
     /// Admits a client in this process, which makes a device from this link.

@@ -1,6 +1,6 @@
 //! One client: its requests are carried out, and those beyond its role are refused.
 
-mod admission;
+pub mod admission;
 mod budget;
 mod channels;
 mod sending;
@@ -16,7 +16,6 @@ use cantap_wire::message::{Defaults, Role, capability};
 use cantap_wire::{CHANNELS, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply, Request};
 use serde_json::{Value, json};
 
-pub use self::admission::{Guest, Identity, admit};
 use self::budget::Budget;
 use crate::audit::who;
 use crate::flow::read_ack;
@@ -37,6 +36,14 @@ const SENDER_TIMEOUT: Duration = Duration::from_secs(5);
 const CHECK_EVERY: Duration = Duration::from_secs(1);
 /// A read takes 50 ms. During the rest of a longer pass, the computer was too busy to listen, for which a client is not to blame.
 const LONGEST_PASS: Duration = Duration::from_millis(100);
+
+/// Who a client is, as its certificate says.
+pub struct Identity {
+    /// The certificate's name.
+    pub certificate: String,
+    /// Whether it is still trusted. An error says why not.
+    pub check: Box<dyn Fn() -> Result<(), String> + Send>,
+}
 
 /// A client, as seen by the thread that carries out its requests.
 struct Client {
@@ -288,8 +295,8 @@ impl Client {
         }
         let result = self.perform_in_session(command);
         match result {
-            // The board has gone meanwhile, and with it the session.
-            Err(Refusal::NoBoard) if !self.with(|_, member| member.in_session) => Err(Refusal::NoSession),
+            // The board has gone meanwhile, and with it the session and its channels.
+            Err(_) if !self.with(|_, member| member.in_session) => Err(Refusal::NoSession),
             result => result,
         }
     }

@@ -11,7 +11,8 @@ use std::time::Duration;
 
 use cantap_wire::message::Role;
 
-use crate::client::{Guest, Identity};
+use crate::client::Identity;
+use crate::client::admission::Guest;
 #[cfg(unix)]
 use crate::connect::SOCKET_TIMEOUT;
 use crate::connect::prepare;

@@ -132,30 +132,28 @@ impl Reader {
         let Self { shared, intake, published, .. } = self;
         let at = Instant::now();
         let (mut time, mut answered) = (None, false);
-        let is_empty = intake
-            .push(piece, |notice| match notice {
-                Notice::Response(response) => {
-                    answered = true;
-                    if let Some(waiting) = pass.response(&response) {
-                        if let (Ok(Reply::Time(ticks)), Some(asked)) = (&response.result, waiting.note) {
-                            time = Some((Ticks(*ticks), asked));
-                        }
-                        waiting.answer(response.result);
+        intake.push(piece, |notice| match notice {
+            Notice::Response(response) => {
+                answered = true;
+                if let Some(waiting) = pass.response(&response) {
+                    if let (Ok(Reply::Time(ticks)), Some(asked)) = (&response.result, waiting.note) {
+                        time = Some((Ticks(*ticks), asked));
                     }
+                    waiting.answer(response.result);
                 }
-                Notice::OtherProtocol(version) => pass.other_protocol(version),
-                Notice::Stopped(channel) => published.stopped[channel.index()] += 1,
-                Notice::Transmission(transmission) => shared.report(transmission),
-                Notice::WentBack => pass.end(SessionOver::StreamWentBack),
-                Notice::TimesDisagree => pass.end(SessionOver::TimesDisagree),
-                Notice::Ended { time_ns, reason } => {
-                    published.ended_ns = Some(time_ns);
-                    // Whatever else the same read shows, the device's own reason says most.
-                    pass.end_by_device(reason.into());
-                }
-            })
-            .is_empty();
-        if !is_empty || answered {
+            }
+            Notice::OtherProtocol(version) => pass.other_protocol(version),
+            Notice::Stopped(channel) => published.stopped[channel.index()] += 1,
+            Notice::Transmission(transmission) => shared.report(transmission),
+            Notice::WentBack => pass.end(SessionOver::StreamWentBack),
+            Notice::TimesDisagree => pass.end(SessionOver::TimesDisagree),
+            Notice::Ended { time_ns, reason } => {
+                published.ended_ns = Some(time_ns);
+                // Whatever else the same read shows, the device's own reason says most.
+                pass.end_by_device(reason.into());
+            }
+        });
+        if !intake.records().is_empty() || answered {
             published.heard_at = Some(at);
         }
         // Before the records are: whoever has one finds it counted.

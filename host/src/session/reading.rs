@@ -48,12 +48,16 @@ impl<N> Pass<'_, N> {
         *self.in_session
     }
 
-    /// Notes an answer. Returns the request, if it is one of ours and still waits.
+    /// Notes an answer. Returns the request, if it is one of ours and still waits. Whoever is refused because the session is over learns why,
+    /// once the read that shows it was taken.
     pub fn response(&mut self, response: &Response) -> Option<Waiting<N>> {
         self.answered = true;
         if *self.in_session {
             match response.result {
-                Err(Refusal::NoSession) => self.end(SessionOver::Refused),
+                Err(Refusal::NoSession) => {
+                    self.end(SessionOver::Refused);
+                    return None;
+                }
                 Ok(Reply::Hello(_)) if !self.requests.is_ours(response.id) => self.end(SessionOver::Greeted),
                 _ => {}
             }
@@ -121,4 +125,30 @@ pub(super) fn run<S: Sink>(mut reader: Box<dyn Read + Send>, requests: &Requests
         }
     };
     requests.gone_for(gone, |error| sink.over(Some(error)));
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    /// A server that ends says so, and refuses what was asked meanwhile: both may be in one read.
+    #[test]
+    fn a_request_at_the_end_of_a_session_is_answered_with_why_it_ended() {
+        let requests = Requests::<()>::new("board", Box::new(std::io::sink()));
+        let pending = requests.send(Command::Status, ()).unwrap();
+        let refused = Response { id: pending.id(), result: Err(Refusal::NoSession) };
+        let mut in_session = true;
+        let mut pass = Pass { requests: &requests, in_session: &mut in_session, answered: false, end: None };
+        pass.end_by_device(SessionOver::ServerEnded);
+        assert!(pass.response(&refused).is_none());
+        let end = pass.end.unwrap();
+        requests.gone_for(Gone::Ended(end), |_| {});
+        let answer = pending.reply_within(Duration::ZERO);
+        assert!(
+            matches!(answer, Err(DeviceError::SessionEnded { reason: SessionOver::ServerEnded, .. })),
+            "{answer:?}"
+        );
+    }
 }

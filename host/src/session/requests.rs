@@ -241,6 +241,11 @@ pub struct InFlight<'r, N> {
 }
 
 impl<N> InFlight<'_, N> {
+    #[cfg(test)]
+    pub(super) const fn id(&self) -> u16 {
+        self.id
+    }
+
     /// Waits for the answer, at most `timeout`: a value that is possible, or an error.
     pub fn reply_within(self, timeout: Duration) -> Result<Reply, DeviceError> {
         match self.answer_within(timeout)? {

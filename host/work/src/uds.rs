@@ -117,7 +117,7 @@ impl TransferOptions {
     }
 
     /// The client for a request.
-    fn exchange(&self, request: &[u8]) -> Exchange {
+    pub fn exchange(&self, request: &[u8]) -> Exchange {
         // Bounded so that deadlines can be added to it.
         let ns = |time: Duration| u64::try_from(time.as_nanos()).unwrap_or(u64::MAX).min(u64::MAX / 4);
         let settings = TransferSettings {

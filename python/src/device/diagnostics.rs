@@ -3,14 +3,14 @@
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-use cantap::{Direction, Frame, Id, TraceEvent, TraceRecord};
+use cantap::{Direction, Frame, TraceEvent, TraceRecord};
 use cantap_protocols::active::Machine;
-use cantap_protocols::active::exchange::{Answerer, Exchange, ExchangeError, ResponseTiming, ServerAnswer};
-use cantap_protocols::active::transfer::TransferSettings;
+use cantap_protocols::active::exchange::{Exchange, ExchangeError, ServerAnswer};
 use cantap_protocols::diagnostics::{reason, uds_service};
-use cantap_protocols::iso_tp::{Endpoint, Pair};
+use cantap_protocols::iso_tp::Pair;
 use cantap_trace::TransmitFailure;
 use cantap_wire::Channel;
+use cantap_work::uds::TransferOptions;
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
@@ -48,23 +48,9 @@ pub struct Request {
 
 impl Request {
     fn exchange(&self) -> Exchange {
-        let ns = |time: Duration| u64::try_from(time.as_nanos()).unwrap_or(u64::MAX).min(u64::MAX / 4);
-        let Pair { a, b } = self.pair;
-        let to_all = |id| Endpoint { id, address: None };
-        let (to, answerer) = match (self.is_to_all, a.id.is_extended()) {
-            (false, _) => (a, Answerer::One { from: b, flow_to: a }),
-            (true, false) => (to_all(Id::standard_truncated(0x7DF)), Answerer::Any11Bit),
-            (true, true) => {
-                (to_all(Id::extended_truncated(0x18DB_33F1)), Answerer::Any29Bit { tester: 0xF1 })
-            }
-        };
-        let timing = ResponseTiming {
-            p2_ns: ns(self.p2),
-            p2_star_ns: ns(self.p2_star),
-            patience_ns: ns(self.patience),
-        };
-        let settings = TransferSettings { padding: self.padding, ..TransferSettings::default() };
-        Exchange::new(to, answerer, self.data.clone(), settings, timing)
+        let Self { pair, is_to_all, ref data, p2, p2_star, patience, padding } = *self;
+        TransferOptions { p2_star, patience, padding, ..TransferOptions::of_obd(pair, p2, is_to_all) }
+            .exchange(data)
     }
 
     /// Asks, and returns the answers: a refusal is one, too.

@@ -29,6 +29,16 @@ wait_until() {
   done
 }
 
+is_count() { [ "$("$@")" = "$_wanted" ]; }
+# until_all N COMMAND...: until it counts to N; however slow this computer is, for as long as it counts on.
+until_all() {
+  _wanted=$1
+  shift
+  while _before=$("$@"); ! wait_until is_count "$@"; do
+    [ "$("$@")" != "$_before" ] || return 1
+  done
+}
+
 # random N: a number below N.
 random() { echo $(($(od -An -N4 -tu4 /dev/urandom) % $1)); }
 

@@ -243,8 +243,8 @@ fn search(
         for data in payloads {
             let place = counter.map_or(0, |counter| place(counter, *data));
             let wanted = (data[byte] & part.mask()) >> part.shift();
-            let significant = if part == Part::Byte { 0xFF } else { 0x0F };
-            let constant = algorithm.constant(checksum.sum(&data[..len]), wanted) & significant;
+            let constant =
+                algorithm.constant(checksum.sum(&data[..len]), wanted) & (part.mask() >> part.shift());
             if *known.entry(place).or_insert(constant) != constant {
                 return None;
             }

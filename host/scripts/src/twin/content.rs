@@ -80,7 +80,7 @@ impl Content {
                 _ => all.push((frame, 1)),
             }
         }
-        let known = seen.iter().map(|seen| masked(&seen.frame).padded_data()).collect();
+        let known = all.iter().map(|(frame, _)| frame.padded_data()).collect();
         let known_whole = seen.iter().map(|seen| seen.frame.padded_data()).collect();
         let all_steps = all.len();
         let steps = thinned(all, longest);

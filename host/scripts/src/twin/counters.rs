@@ -82,6 +82,11 @@ impl Counter {
     pub const fn after(&self, value: i32) -> i32 {
         self.first + (value - self.first + self.step).rem_euclid(self.modulus)
     }
+
+    /// Whether it has the next value in the second of two frames' data.
+    pub fn counts(&self, a: [u8; 8], b: [u8; 8]) -> bool {
+        self.after(self.field.get(a)) == self.field.get(b)
+    }
 }
 
 /// Finds the counters of frames with `len` bytes each, given as pairs of neighbours without a loss between them.
@@ -156,7 +161,7 @@ fn counter(field: Field, pairs: &[([u8; 8], [u8; 8])]) -> Option<(Counter, f64)>
     let part = Counter { field, first: least, modulus: span, step: signed.rem_euclid(span.max(1)) };
     let natural = Counter { field, first: 0, modulus: whole, step };
     let share = |counter: &Counter| {
-        let right = pairs.iter().filter(|(a, b)| counter.after(field.get(*a)) == field.get(*b)).count();
+        let right = pairs.iter().filter(|(a, b)| counter.counts(*a, *b)).count();
         right as f64 / pairs.len() as f64
     };
     let mut best = (natural, share(&natural));

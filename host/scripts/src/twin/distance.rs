@@ -57,20 +57,16 @@ pub fn compare(
     bitrates_bps: [u32; 2],
 ) -> Distance {
     let keys: BTreeSet<&Key> = trace.streams.keys().chain(run.streams.keys()).collect();
-    let within = |observed: &Observed, key: &Key| -> Vec<Seen> {
-        let all = observed.streams.get(key).map(Vec::as_slice).unwrap_or_default();
-        all[..all.partition_point(|seen| seen.at_ns < duration_ns)].to_vec()
-    };
     let mut bits = [[0_u64; 2]; 2];
     let mut streams = Vec::new();
     for key in keys {
         let stream = model.streams.iter().find(|stream| stream.key == *key);
-        let both = [trace, run].map(|observed| within(observed, key));
+        let both = [trace, run].map(|observed| within(observed, *key, duration_ns));
         for (place, seen) in both.iter().enumerate() {
             bits[usize::from(key.channel == 2)][place] +=
                 seen.iter().map(|seen| u64::from(cantap_can::bits_on_bus(&seen.frame))).sum::<u64>();
         }
-        streams.push(one(*key, stream, &both));
+        streams.push(one(*key, stream, both));
     }
     let frames = [0, 1].map(|place| streams.iter().map(|stream| stream.frames[place]).sum::<usize>());
     let apart: usize = streams.iter().map(|stream| stream.frames[0].abs_diff(stream.frames[1])).sum();
@@ -89,9 +85,15 @@ pub fn compare(
     }
 }
 
-fn one(key: Key, stream: Option<&Stream>, both: &[Vec<Seen>; 2]) -> StreamDistance {
-    let periods = [0, 1].map(|place| timing::period(&both[place]));
-    let run = &both[1];
+/// An identifier's frames of the first `duration_ns`.
+fn within(observed: &Observed, key: Key, duration_ns: u64) -> &[Seen] {
+    let all = observed.streams.get(&key).map(Vec::as_slice).unwrap_or_default();
+    &all[..all.partition_point(|seen| seen.at_ns < duration_ns)]
+}
+
+fn one(key: Key, stream: Option<&Stream>, both: [&[Seen]; 2]) -> StreamDistance {
+    let periods = both.map(timing::period);
+    let [trace, run] = both;
     let known = |is_known: fn(&Content, &Frame) -> bool| {
         let content = &stream?.content;
         percent(run.iter().filter(|seen| is_known(content, &seen.frame)).count(), run.len())
@@ -100,11 +102,8 @@ fn one(key: Key, stream: Option<&Stream>, both: &[Vec<Seen>; 2]) -> StreamDistan
         let counters = &stream.filter(|stream| !stream.content.counters.is_empty())?.content.counters;
         let pairs: Vec<_> = seen.windows(2).filter(|pair| pair[0].stretch == pair[1].stretch).collect();
         let data = |seen: &Seen| seen.frame.padded_data();
-        let is_right = |pair: &&[Seen]| {
-            counters.iter().all(|counter| {
-                counter.after(counter.field.get(data(&pair[0]))) == counter.field.get(data(&pair[1]))
-            })
-        };
+        let is_right =
+            |pair: &&[Seen]| counters.iter().all(|counter| counter.counts(data(&pair[0]), data(&pair[1])));
         percent(pairs.iter().filter(|pair| is_right(pair)).count(), pairs.len())
     };
     let checksums_right = |seen: &[Seen]| {
@@ -118,13 +117,13 @@ fn one(key: Key, stream: Option<&Stream>, both: &[Vec<Seen>; 2]) -> StreamDistan
     StreamDistance {
         key,
         role: stream.map(|stream| stream.role),
-        frames: [both[0].len(), run.len()],
+        frames: both.map(<[_]>::len),
         period_ns: periods.map(|period| Some(period?.mean_ns)),
         jitter_ns: periods.map(|period| Some(period?.jitter_ns)),
         known_pct: known(Content::has),
         known_rest_pct: known(Content::has_rest),
-        counters_right_pct: [counters_right(&both[0]), counters_right(run)],
-        checksums_right_pct: [checksums_right(&both[0]), checksums_right(run)],
+        counters_right_pct: [counters_right(trace), counters_right(run)],
+        checksums_right_pct: [checksums_right(trace), checksums_right(run)],
     }
 }
 

@@ -45,14 +45,9 @@ pub struct Learner {
     clock: Clock,
     /// When the last frame of each channel ended.
     last_ns: BTreeMap<u8, u64>,
-    too_close: u64,
-    streams: BTreeMap<Key, Vec<Seen>>,
     stretch: u32,
     frames: usize,
-    duration_ns: u64,
-    lost: u64,
-    jumps: u64,
-    left_out: BTreeMap<&'static str, u64>,
+    observed: Observed,
 }
 
 /// What a trace contains.
@@ -79,14 +74,9 @@ impl Learner {
             bitrates_bps,
             clock: Clock::default(),
             last_ns: BTreeMap::new(),
-            too_close: 0,
-            streams: BTreeMap::new(),
             stretch: 0,
             frames: 0,
-            duration_ns: 0,
-            lost: 0,
-            jumps: 0,
-            left_out: BTreeMap::new(),
+            observed: Observed::default(),
         }
     }
 
@@ -95,7 +85,7 @@ impl Learner {
         let frame = match &record.event {
             TraceEvent::Frame { frame, .. } => frame,
             TraceEvent::Lost { count, at_least, .. } => {
-                self.lost += u64::from(*count);
+                self.observed.lost += u64::from(*count);
                 if *count > 0 || *at_least {
                     self.stretch += 1;
                 }
@@ -113,19 +103,19 @@ impl Learner {
         if self.frames >= MAX_FRAMES {
             return self.leave_out("frames after the first two million");
         }
-        if self.streams.len() >= MAX_KEYS && !self.streams.contains_key(&key) {
+        if self.observed.streams.len() >= MAX_KEYS && !self.observed.streams.contains_key(&key) {
             return self.leave_out("frames with other identifiers than the first 8192");
         }
         let (at_ns, jumped) = self.clock.advance(record.time_ns);
         if jumped {
-            self.jumps += 1;
+            self.observed.jumps += 1;
             self.stretch += 1;
         }
         let at_ns = self.possible(record.channel, frame, at_ns);
-        self.duration_ns = self.duration_ns.max(at_ns);
+        self.observed.duration_ns = self.observed.duration_ns.max(at_ns);
         let order = self.frames as u32;
         self.frames += 1;
-        self.streams.entry(key).or_default().push(Seen {
+        self.observed.streams.entry(key).or_default().push(Seen {
             at_ns,
             order,
             stretch: self.stretch,
@@ -139,33 +129,34 @@ impl Learner {
         // The last bits of a frame are after its end; a stamp is not more exact than a microsecond.
         let shortest_ns = FrameBits::of(frame).duration_ns(bitrate_bps).saturating_sub(2_000);
         let possible_ns = self.last_ns.get(&channel).map_or(0, |last_ns| last_ns + shortest_ns);
-        self.too_close += u64::from(at_ns < possible_ns);
+        self.observed.too_close += u64::from(at_ns < possible_ns);
         let at_ns = at_ns.max(possible_ns);
         self.last_ns.insert(channel, at_ns);
         at_ns
     }
 
     fn leave_out(&mut self, what: &'static str) {
-        *self.left_out.entry(what).or_default() += 1;
+        *self.observed.left_out.entry(what).or_default() += 1;
     }
 
     /// All that there was. Of more than two channels the first two with frames remain, as 1 and 2.
     pub fn finish(self) -> Observed {
-        let Self { streams, duration_ns, lost, jumps, too_close, mut left_out, .. } = self;
-        let used: BTreeSet<u8> = streams.keys().map(|key| key.channel).collect();
+        let mut observed = self.observed;
+        let used: BTreeSet<u8> = observed.streams.keys().map(|key| key.channel).collect();
         let is_named = used.iter().all(|channel| (1..=CHANNELS).contains(&usize::from(*channel)));
-        let mut kept = BTreeMap::new();
-        for (key, frames) in streams {
+        if is_named {
+            return observed;
+        }
+        for (key, frames) in std::mem::take(&mut observed.streams) {
             let place = used.iter().position(|channel| *channel == key.channel).unwrap_or_default();
-            if is_named {
-                kept.insert(key, frames);
-            } else if place < CHANNELS {
-                kept.insert(Key { channel: place as u8 + 1, ..key }, frames);
+            if place < CHANNELS {
+                observed.streams.insert(Key { channel: place as u8 + 1, ..key }, frames);
             } else {
-                *left_out.entry("frames of a third channel and more").or_default() += frames.len() as u64;
+                *observed.left_out.entry("frames of a third channel and more").or_default() +=
+                    frames.len() as u64;
             }
         }
-        Observed { streams: kept, duration_ns, lost, jumps, too_close, left_out }
+        observed
     }
 }
 

@@ -100,12 +100,11 @@ impl Model {
         heading(&mut out, "The tester of a twin", title, self);
         let _ = write!(out, "\n{REPLAY}");
         for exchange in &self.exchanges {
-            let asked: Vec<Id> = exchange.requests.clone();
             let _ = write!(
                 out,
                 "\n// {} requests by {}.\n",
                 exchange.asked.len(),
-                named(exchange.channel, &asked, names)
+                named(exchange.channel, &exchange.requests, names)
             );
             let asked = &exchange.asked;
             recorded(&mut out, exchange.channel, asked, asked.len(), self.duration_ns);
@@ -173,8 +172,6 @@ fn recorded(out: &mut String, channel: u8, list: &[(u64, Frame)], frames: usize,
     } else {
         duration_ns.saturating_sub(last_ns) + first_ns
     };
-    let step =
-        |(delay_ns, frame): &(u64, Frame)| format!("[\"{}\", \"{frame}\"]", duration(*delay_ns as f64));
     let mut steps: Vec<String> = rest.iter().map(step).collect();
     let whole_ns = (again_ns + last_ns - first_ns).max(SHORTEST_NS);
     let again_ns = again_ns.max(whole_ns - (last_ns - first_ns));
@@ -182,6 +179,11 @@ fn recorded(out: &mut String, channel: u8, list: &[(u64, Frame)], frames: usize,
     let _ = writeln!(out, "after(\"{}\", || {{", duration(*first_ns as f64));
     let _ = writeln!(out, "    send({channel}, \"{first}\");");
     let _ = writeln!(out, "    replay({channel}, steps([\n{}    ]));\n}});", list_of(&steps, 8));
+}
+
+/// A delay and the frame after it.
+fn step((delay_ns, frame): &(u64, Frame)) -> String {
+    format!("[\"{}\", \"{frame}\"]", duration(*delay_ns as f64))
 }
 
 /// Texts with commas, some to a line.
@@ -387,11 +389,7 @@ fn answers(out: &mut String, exchange: &Exchange, names: Names<'_>) {
     let who = named(*channel, answers, names);
     let whom = named(*channel, requests, names);
     let _ = write!(out, "\n// {who} answer {whom}.\n{{\n");
-    let variant = |answer: &Answer| {
-        let step =
-            |(delay_ns, frame): &(u64, Frame)| format!("[\"{}\", \"{frame}\"]", duration(*delay_ns as f64));
-        format!("[{}]", answer.iter().map(step).collect::<Vec<_>>().join(", "))
-    };
+    let variant = |answer: &Answer| format!("[{}]", answer.iter().map(step).collect::<Vec<_>>().join(", "));
     line(out, "    let answers = #{");
     for ((before, request), variants) in table {
         let key = before.as_ref().map_or_else(|| request.clone(), |before| format!("{before} {request}"));

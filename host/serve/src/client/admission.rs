@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 
 use cantap_wire::message::Role;
 
-use super::Client;
+use super::{Client, Identity};
 use crate::lock::lock;
 use crate::news::News;
 use crate::outbox::Outbox;
@@ -30,14 +30,6 @@ pub struct Guest {
     pub is_remote: bool,
     /// Who it is, if it has shown a certificate.
     pub identity: Option<Identity>,
-}
-
-/// Who a client is, as its certificate says.
-pub struct Identity {
-    /// The certificate's name.
-    pub certificate: String,
-    /// Whether it is still trusted. An error says why not.
-    pub check: Box<dyn Fn() -> Result<(), String> + Send>,
 }
 
 impl Guest {

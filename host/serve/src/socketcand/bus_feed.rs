@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use cantap::{Device, TraceEvent, TraceRecord};
 
-use super::Connection;
+use super::connection::Connection;
 use super::hearing::Hears;
 use crate::Board;
 use crate::feed::{self, Feed, Losses, Source};

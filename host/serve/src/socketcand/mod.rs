@@ -7,6 +7,7 @@
 
 mod bus_feed;
 mod command;
+mod connection;
 mod hearing;
 mod messages;
 mod opened;
@@ -14,12 +15,12 @@ mod subscriptions;
 
 use std::collections::HashMap;
 use std::io::{self, Read, Write};
-use std::net::{SocketAddr, TcpStream};
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex};
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use cantap::device::{channel_number, is_idle, write_patiently};
+use cantap::device::{channel_number, is_idle};
 use cantap_trace::Interface;
 use cantap_wire::message::{Mode, Role};
 use cantap_wire::{Channel, Id};
@@ -27,15 +28,15 @@ use cantap_wire::{Channel, Id};
 use crate::beacon::{self, Beacon};
 use crate::foreign;
 use crate::lines::device_of;
-use crate::listen::{Listening, accept, bind, patience};
+use crate::listen::{Listening, accept, bind};
 use crate::lock::lock;
 use crate::open_bus::OpenBus;
 use crate::places::{Place, Places, ends};
-use crate::writer::took_nothing;
 use crate::{Board, News};
 use bus_feed::BusFeed;
 use command::{BadCommand, Command, Finder};
-use hearing::{Hearing, Hears};
+use connection::{Bus, Connection};
+use hearing::Hears;
 use opened::Opened;
 use subscriptions::{MOST, Wanted};
 
@@ -97,26 +98,6 @@ pub fn listen(boards: &[Arc<Board>], address: SocketAddr, role: Role) -> io::Res
     })
 }
 
-/// A channel that can be opened.
-struct Bus {
-    name: String,
-    board: Arc<Board>,
-    channel: Channel,
-}
-
-/// One client.
-struct Connection {
-    input: Mutex<TcpStream>,
-    output: Mutex<TcpStream>,
-    name: String,
-    buses: Arc<[Bus]>,
-    role: Role,
-    hearing: Mutex<Hearing>,
-    /// When something was last sent to it.
-    told_at: Mutex<Instant>,
-    is_over: AtomicBool,
-}
-
 /// What a client receives after a command that changes that, on an open bus.
 const fn mode(command: &Command, is_open: bool) -> Option<Hears> {
     match command {
@@ -137,20 +118,6 @@ struct Setup {
 }
 
 impl Connection {
-    fn new(stream: TcpStream, name: String, buses: Arc<[Bus]>, role: Role) -> io::Result<Arc<Self>> {
-        let output = Mutex::new(stream.try_clone()?);
-        Ok(Arc::new(Self {
-            input: Mutex::new(stream),
-            output,
-            name,
-            buses,
-            role,
-            hearing: Mutex::default(),
-            told_at: Mutex::new(Instant::now()),
-            is_over: AtomicBool::new(false),
-        }))
-    }
-
     /// Carries out the client's commands until either side ends. It has its place for itself once it has said what it wants to receive or
     /// send.
     fn serve(self: &Arc<Self>, place: &Place) -> io::Result<()> {
@@ -253,20 +220,6 @@ impl Connection {
             return messages::not_sent();
         }
         format!("< error {} >", plain(reason))
-    }
-
-    fn write(&self, text: &str) -> io::Result<()> {
-        if text.is_empty() {
-            return Ok(());
-        }
-        *lock(&self.told_at) = Instant::now();
-        let patience = patience(self.role);
-        let written = write_patiently(&mut *lock(&self.output), text.as_bytes(), patience);
-        if written.as_ref().is_err_and(is_idle) && !self.is_over.swap(true, Ordering::Relaxed) {
-            let (client, reason) = (self.name.clone(), Some(took_nothing(patience)));
-            self.buses[0].board.tell(News::ClientLeft { client, reason });
-        }
-        written
     }
 
     /// Carries out one command. Returns what to answer.

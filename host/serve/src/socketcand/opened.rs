@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use cantap_wire::message::Periodic;
 use cantap_wire::{Frame, Id};
 
-use super::Connection;
+use super::connection::Connection;
 use crate::News;
 use crate::lock::lock;
 use crate::open_bus::OpenBus;
@@ -24,11 +24,6 @@ impl Opened {
 }
 
 impl Connection {
-    /// The client has missed what was on the bus for a moment.
-    pub fn missed(&self) {
-        lock(&self.hearing).has_gap = true;
-    }
-
     /// Only listens again, if nothing is sent any more.
     pub fn listen_again(&self, opened: &mut Opened) -> Result<(), String> {
         if !opened.periodic.is_empty() {

@@ -57,19 +57,10 @@ echo 2000 > $GS/traffic
 echo '00000088 0000040000000000' > $GS/error
 sent() { cat $GS/sent 2> /dev/null | wc -l; }
 captured() { { frames_on can0 capture.log; frames_on can1 capture.log; } | wc -l; }
-is_count() { [ "$("$@")" = "$_wanted" ]; }
-# until_all N COMMAND...: until it counts to N; however slow this computer is, for as long as it counts on.
-until_all() {
-  _wanted=$1
-  shift
-  while _before=$("$@"); ! wait_until is_count "$@"; do
-    [ "$("$@")" != "$_before" ] || return 1
-  done
-}
-# Until candump has all of them, and as long again as this computer may be busy.
-has_dumped() { [ "$(frames_on can0 dump.txt | wc -l)" = 2500 ]; }
-for _ in 1 2 3; do wait_until has_dumped && break; done
-sleep 3
+dumped() { frames_on can0 dump.txt | wc -l; }
+of_can0() { frames_on can0 capture.log | wc -l; }
+until_all 2500 dumped
+until_all 2500 of_can0
 check "gs_usb, kernel: the capture ends" gs_end
 kill $CANDUMP
 wait $CANDUMP 2> /dev/null

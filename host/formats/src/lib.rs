@@ -47,6 +47,7 @@ mod issue;
 mod kvaser;
 mod left_out;
 mod line;
+mod lz4;
 mod memory_file;
 mod mf4;
 mod microchip;

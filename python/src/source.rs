@@ -100,15 +100,7 @@ impl TraceSource {
         let start = point(&options.start).map_err(Error::argument)?;
         let end = point(&options.end).map_err(Error::argument)?;
         let filters = filters.map_err(Error::argument)?;
-        let reader = open_reader(&options.path, &read).map_err(|error| {
-            let is_parquet = options.path.extension().is_some_and(|suffix| suffix.eq_ignore_ascii_case("parquet"));
-            match Error::from(error) {
-                Error::Format(words) if is_parquet => Error::Format(format!(
-                    "{words}; Parquet is only written here: read it with pandas, Polars or DuckDB, and pass on what they return"
-                )),
-                error => error,
-            }
-        })?;
+        let reader = open_reader(&options.path, &read).map_err(Error::from)?;
         let counts = Counts {
             file: options.path.display().to_string(),
             format: reader.format().to_string(),

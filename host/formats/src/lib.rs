@@ -53,6 +53,8 @@ mod mf4;
 mod microchip;
 mod nmea2000;
 mod output;
+#[cfg(feature = "parquet")]
+mod parquet;
 mod pcap;
 mod pcapng;
 mod printer;

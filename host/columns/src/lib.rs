@@ -6,6 +6,8 @@ mod cells;
 mod events;
 mod foreign;
 mod frames;
+#[cfg(feature = "mcap")]
+mod mcap;
 mod messages;
 mod names;
 #[cfg(feature = "parquet")]
@@ -22,6 +24,8 @@ pub use arrow_array::RecordBatch;
 pub use bad::BadColumns;
 pub use cells::{CellKind, cells};
 pub use frames::FrameColumns;
+#[cfg(feature = "mcap")]
+pub use mcap::McapFile;
 pub use messages::MessageColumns;
 pub use records::records;
 pub use rows::{Row, rows};

@@ -22,7 +22,8 @@ from ._native import (
     __version__,
 )
 from .device import Checksum, Counter, Device, RandomByte, boards, open
-from .traces import Database, Messages, decode, load_database, read, scan, search, stats, write
+from .diagnostics import Ecu, NegativeResponse
+from .traces import Database, Messages, dataset, decode, encode, load_database, read, scan, search, stats, write
 
 __all__ = [
     "CantapError",
@@ -34,9 +35,11 @@ __all__ = [
     "DatabaseError",
     "Device",
     "DeviceError",
+    "Ecu",
     "FormatError",
     "Frame",
     "Messages",
+    "NegativeResponse",
     "PeriodicFrame",
     "RandomByte",
     "Record",
@@ -48,7 +51,9 @@ __all__ = [
     "Table",
     "__version__",
     "boards",
+    "dataset",
     "decode",
+    "encode",
     "load_database",
     "open",
     "read",

@@ -130,6 +130,15 @@ def to_html(table: Table) -> str:
     return "\n".join([*lines, "</tbody></table>"])
 
 
+def messages_to_html(messages: Mapping[str, Table]) -> str:
+    """A decoded trace for a notebook: its messages, with their signals."""
+    lines = [f"<p>cantap.Messages: {len(messages)} messages</p>", "<table>", "<thead><tr><th>message</th><th>rows</th><th>signals</th></tr></thead><tbody>"]
+    for name, table in messages.items():
+        signals = ", ".join(_clean(column) for column in table.column_names[3:])
+        lines.append(f"<tr><td>{_clean(name)}</td><td>{len(table)}</td><td>{signals}</td></tr>")
+    return "\n".join([*lines, "</tbody></table>"])
+
+
 def _cell(value: Any, kind: str) -> str:
     if value is None:
         return ""

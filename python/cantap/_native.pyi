@@ -1,7 +1,7 @@
 """The compiled half. What is documented for users is in `cantap` itself."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from types import TracebackType
 from typing import Any, TypedDict, final, overload, type_check_only
 
@@ -9,8 +9,10 @@ import numpy as np
 import pandas as pd
 import polars as pl
 import pyarrow as pa
+from matplotlib.axes import Axes
 
 from ._columns import Column, Schema
+from ._sources import TraceFile
 
 __all__ = [
     "CantapError",
@@ -30,10 +32,15 @@ __all__ = [
     "Scan",
     "Table",
     "__version__",
+    "ask_ecu",
     "decode_table",
+    "encode_tables",
+    "is_trace_name",
     "list_boards",
+    "refusal_text",
     "search",
     "stats",
+    "table_of_messages",
     "write",
 ]
 
@@ -56,7 +63,7 @@ class CantapWarning(UserWarning):
 
 @type_check_only
 class Options(TypedDict):
-    path: str | os.PathLike[str]
+    files: list[TraceFile]
     db: Database | None
     signals: list[str]
     filters: list[str]
@@ -81,6 +88,17 @@ class Database:
     @property
     def message_names(self) -> list[str]:
         """The names of all messages."""
+    def encode(
+        self, message: str, signals: dict[str, Any] | None = None, *, channel: int | None = None
+    ) -> Frame:
+        """The frame of a message with these values: numbers, or texts of the signals' tables. The others have the database's start value,
+        or 0."""
+    def decode(self, frame: Any, *, channel: int = ...) -> tuple[str, dict[str, float | str | None]] | None:
+        """The name of a frame's message, and its values by signal: `Gear` is the number, `Gear.text` the text of its table. `None` if no
+        database has it, and for an error frame. `frame` is a `Frame`, a `Record`, a text, or a message of python-can.
+        `channel`, by which a database is chosen, is 1 unless it is given."""
+    def _schema_of(self, message: str, signals: list[str]) -> Table: ...
+    def _signal_names(self) -> set[str]: ...
     def signals_of(self, message: str) -> list[dict[str, str]]:
         """The signals of a message: `name`, `unit` and `description` of each."""
 
@@ -137,6 +155,12 @@ class Report:
     def notes(self) -> dict[str, int]:
         """What is not wrong but should be known, by kind."""
     @property
+    def properties(self) -> dict[str, str]:
+        """What an MF4 file says about its measurement, by name: device, session, author, the program that wrote it."""
+    @property
+    def files(self) -> list[Report]:
+        """The reports of the single files, if there were several."""
+    @property
     def missing_pct(self) -> float:
         """The percentage of the file's entries that could not be read or were left out."""
     @property
@@ -183,6 +207,8 @@ class Table:
     def __getitem__(self, key: str, /) -> Column: ...
     @overload
     def __getitem__(self, key: slice | list[str], /) -> Table: ...
+    def plot(self, *signals: str, ax: Axes | None = None, **options: Any) -> Axes:
+        """Plots signals over time with Matplotlib, as steps; all of them if none is named. `options` are those of `Axes.plot`."""
     def _repr_html_(self) -> str: ...
     def _values(self, name: str) -> list[Any]: ...
     def _parts(self, name: str) -> tuple[str, bytes, bytes | None, list[str] | None, int]: ...
@@ -354,6 +380,7 @@ class Device:
     def is_virtual_car(self) -> bool: ...
     def info(self) -> dict[str, Any]: ...
     def open_channel(self, number: int, options: dict[str, Any]) -> tuple[int, str | None]: ...
+    def autobaud(self, number: int, silence: float) -> int: ...
     def close_channel(self, number: int) -> None: ...
     def open_channels(self) -> dict[int, dict[str, Any]]: ...
     def records(
@@ -414,13 +441,26 @@ class Reading:
 
     def __new__(cls, options: Options) -> Reading: ...
     def decode(
-        self, db: Database, signals: list[str]
+        self, db: Database, signals: list[str], warns: bool = True
     ) -> tuple[tuple[list[tuple[str, Table]], Table], Report]:
         """A table for each message, and one for events other than frames; once."""
 
 def decode_table(
     table: Any, db: Database, signals: list[str]
 ) -> tuple[list[tuple[str, Table]], Table]: ...
+def ask_ecu(
+    device: Device,
+    number: int,
+    pair: str,
+    is_to_all: bool,
+    data: bytes,
+    times: tuple[float, float, float],
+    padding: int | None,
+) -> list[tuple[str, bytes]]: ...
+def encode_tables(tables: list[tuple[str, Any]], db: Database) -> Table: ...
+def is_trace_name(name: str | os.PathLike[str]) -> bool: ...
+def refusal_text(service: int, code: int) -> tuple[str, str]: ...
+def table_of_messages(messages: Iterable[Any]) -> Table: ...
 def search(
     options: Options, condition: str | None, ids: list[str], data: list[str], max_count: int | None
 ) -> Table: ...

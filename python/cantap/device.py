@@ -14,6 +14,7 @@ from . import _native
 from ._arguments import channels as _channels
 from ._arguments import words as _words
 from ._native import Frame, PeriodicFrame, Record, Records, Reply, Table
+from .diagnostics import Ecu
 
 Mode: TypeAlias = Literal["listen-only", "normal", "loopback", "silent-loopback"]
 AnyFrame: TypeAlias = "Frame | str"
@@ -78,7 +79,7 @@ class Device:
     def open_channel(
         self,
         channel: int,
-        bitrate: int | None = None,
+        bitrate: int | Literal["auto"] | None = None,
         *,
         mode: Mode = "listen-only",
         sample_point: float | None = None,
@@ -90,10 +91,13 @@ class Device:
     ) -> int:
         """Opens a channel, 1 or 2, and returns its bit rate in bit/s.
 
-        Without a bit rate, the one saved on the device is used; the virtual device's buses have 500 kbit/s.
+        Without a bit rate, the one saved on the device is used; the virtual device's buses have 500 kbit/s. `"auto"` finds it by
+        listening, see `autobaud`.
         `sample_point` is in per cent; `segments` is prescaler, segment 1, segment 2 and jump width, instead of a bit rate.
         `filter` as with `cantap.read`: the device drops other frames in hardware as far as it can, and this computer drops the rest.
         """
+        if bitrate == "auto":
+            bitrate = self.autobaud(channel)
         rate, _ = self._native.open_channel(
             channel,
             {
@@ -108,6 +112,39 @@ class Device:
             },
         )
         return rate
+
+    def autobaud(self, channel: int, *, timeout: float = 10.0) -> int:
+        """Finds the bit rate of a channel's bus, in bit/s, without sending anything: one frame is enough. The channel must be closed.
+
+        The rate found before on this channel is tried first. Raises `DeviceError`, with what to check, if there is no traffic for
+        `timeout` seconds, or none that a bit rate can be found from.
+        """
+        return self._native.autobaud(channel, timeout)
+
+    def ecu(
+        self,
+        channel: int,
+        request: int = 0x7E0,
+        response: int | None = None,
+        *,
+        to_all: bool = False,
+        p2: float = 1.0,
+        p2_star: float = 5.0,
+        timeout: float = 30.0,
+        padding: int | None = 0,
+    ) -> Ecu:
+        """An ECU to ask, over UDS, KWP2000 or OBD-II. The channel must be open with `mode="normal"`.
+
+        `request`, `response`: the identifiers. The response's is 8 more, or of 29 bits (18DAxxyy) the same with both addresses exchanged,
+        unless it is given. `to_all`: requests go to all ECUs at once. `p2`: seconds until an answer begins; `p2_star`: the same after the
+        ECU has said that it is pending; `timeout`: for everything. `padding`: the byte that fills frames up; `None` keeps them short.
+        """
+        if response is None:
+            is_normal_fixed = request >> 16 == 0x18DA
+            swapped = request & ~0xFFFF | (request & 0xFF) << 8 | request >> 8 & 0xFF
+            response = swapped if is_normal_fixed else request + 8
+        pair = ":".join(_id_text(id) for id in (request, response))
+        return Ecu(self._native, channel, pair, to_all, (p2, p2_star, timeout), padding)
 
     def close_channel(self, channel: int) -> None:
         """Closes a channel, after everything it captured has arrived."""
@@ -272,6 +309,13 @@ class Device:
         raise TypeError("a device cannot be pickled; open it where it is used")
 
 
+def _id_text(id: int) -> str:
+    """As the command reads it: eight digits have 29 bits."""
+    if not 0 <= id <= 0x1FFFFFFF:
+        raise ValueError(f"{id:#X} is not an identifier; 0x7FF is the last standard one, 0x1FFFFFFF the last extended one")
+    return f"{id:03X}" if id <= 0x7FF else f"{id:08X}"
+
+
 def _ns(at: float | datetime.datetime) -> int:
     """Nanoseconds since 1970."""
     if isinstance(at, datetime.datetime):
@@ -300,7 +344,7 @@ def _close_all() -> None:
 
 def open(
     address: str,
-    bitrate: int | None = None,
+    bitrate: int | Literal["auto"] | None = None,
     *,
     channels: SupportsIndex | Iterable[SupportsIndex] = (1, 2),
     mode: Mode = "listen-only",
@@ -311,7 +355,7 @@ def open(
 
     `/dev/ttyACM0`, `COM5`, `virtual`, `virtual:car`, `unix:`, `tcp://HOST`, `tls://HOST`, `ssh://[USER@]HOST`.
 
-    With a bit rate, the `channels` are opened. Without one, none is: use `Device.open_channel` for each.
+    With a bit rate, or `"auto"`, the `channels` are opened. Without one, none is: use `Device.open_channel` for each.
 
         with cantap.open("/dev/ttyACM0", 500_000) as device:
             for record in device:

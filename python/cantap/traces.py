@@ -3,23 +3,31 @@
 from __future__ import annotations
 
 import datetime
+import itertools
 import numbers
 import operator
 import os
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, SupportsIndex, TypeAlias
+from typing import IO, TYPE_CHECKING, Any, SupportsIndex, TypeAlias
 
 from . import _native
 from ._arguments import channels, words
+from ._sources import files, is_file
 from ._native import CantapWarning, Database, Report, Scan, Table
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from matplotlib.axes import Axes
+
     from ._native import Options
+    from ._dataset import Dataset
 
 Path: TypeAlias = "str | os.PathLike[str]"
+Source: TypeAlias = "Path | IO[bytes] | Iterable[Path | IO[bytes]]"
+"""Files of one trace: a path, a pattern such as `drives/*.mf4`, a folder, a URL of fsspec such as `s3://bucket/a.blf`, an open file, or
+several of these."""
 Channels: TypeAlias = "SupportsIndex | Iterable[SupportsIndex]"
 Rates: TypeAlias = "SupportsIndex | Mapping[Any, SupportsIndex]"
 Databases: TypeAlias = "Path | Database | Iterable[Path] | Mapping[Any, Path]"
@@ -54,7 +62,7 @@ def _pairs(files: Any) -> list[tuple[int | None, Path]]:
 
 
 def scan(
-    path: Path,
+    path: Source,
     *,
     db: Databases | None = None,
     signals: Words = (),
@@ -68,6 +76,10 @@ def scan(
     batch_rows: int = BATCH_ROWS,
 ) -> Scan:
     """Reads a trace in batches; memory does not grow with the file.
+
+    `path`: a file, a pattern such as `drives/*.mf4`, a folder, a URL of fsspec such as `s3://bucket/a.blf`, a file that was opened with
+    `"rb"`, or several of these. Several files are one trace, in the order of a list or of the names. MF4 needs its whole file: from other than a
+    path it is held in memory, up to 1 GiB.
 
     The result is an iterator of tables, and a stream for anything that takes Arrow: `pyarrow.RecordBatchReader.from_stream(scan)`,
     `duckdb.sql("select … from scan")`.
@@ -88,7 +100,7 @@ def scan(
 
 
 def read(
-    path: Path,
+    path: Source,
     *,
     db: Databases | None = None,
     signals: Words = (),
@@ -120,7 +132,10 @@ class Messages(Mapping[str, Table]):
         """What was read, and what could not be read; `None` if there was no file."""
 
     def __getitem__(self, message: str) -> Table:
-        return self._tables[message]
+        try:
+            return self._tables[message]
+        except KeyError:
+            raise KeyError(f"no frame of a message '{message}' was decoded; there are {', '.join(self._tables) or 'none'}") from None
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._tables)
@@ -128,8 +143,30 @@ class Messages(Mapping[str, Table]):
     def __len__(self) -> int:
         return len(self._tables)
 
+    def plot(self, *signals: str, ax: Axes | None = None, **options: Any) -> Axes:
+        """Plots signals over time with Matplotlib, as steps: `"Engine.Speed"`, or `"Speed"` if only one message has it."""
+        if not signals:
+            raise ValueError("name the signals to plot, such as 'Engine.Speed'")
+        for signal in signals:
+            message, name = self._find(signal)
+            ax = self._tables[message].plot(name, ax=ax, **options)
+        assert ax is not None
+        return ax
+
+    def _find(self, signal: str) -> tuple[str, str]:
+        found = [(message, name) for message, table in self._tables.items() for name in table.column_names if signal in (name, f"{message}.{name}")]
+        if len(found) != 1:
+            several = " and ".join(f"{message}.{name}" for message, name in found)
+            raise ValueError(f"there are {several}; choose one" if found else f"there is no signal '{signal}' in {', '.join(self._tables)}")
+        return found[0]
+
     def __repr__(self) -> str:
         return f"<cantap.Messages: {', '.join(self._tables)}>"
+
+    def _repr_html_(self) -> str:
+        from ._columns import messages_to_html
+
+        return messages_to_html(self)
 
 
 def decode(
@@ -147,13 +184,15 @@ def decode(
 ) -> Messages:
     """Decodes a trace into a table for each message, with a column for each signal.
 
-    `source` is a file, or a table of records, such as a device's batches: from this package, or anything else that exports Arrow.
+    `source` is what `scan` reads, or a table of records, such as a device's batches: from this package, or anything else that exports
+    Arrow; or messages of python-can, in a list or as a reader.
     The other arguments are those of `scan`; for a table, only `signals` is allowed.
 
     If a file's frames are all unknown to the databases, there is a `CantapWarning`. Of two messages with one name, the later has its
     identifier behind it, as in `Engine-1A0`.
     """
-    if isinstance(source, (str, os.PathLike)):
+    source = _unpacked(source)
+    if _is_file(source):
         if db is None:
             raise ValueError("a database decodes; give one with db=")
         chosen = words(signals, "signals")
@@ -164,12 +203,12 @@ def decode(
         return Messages(dict(tables), events, report)
     if filter or channel != () or (start, end, format, zone) != (None,) * 4 or strict:
         raise ValueError("of a table only signals can be chosen; choose its rows before")
-    tables, events = _native.decode_table(_arrow(source), _database(db), words(signals, "signals"))
+    tables, events = _native.decode_table(_table(source), _database(db), words(signals, "signals"))
     return Messages(dict(tables), events, None)
 
 
 def search(
-    path: Path,
+    path: Source,
     condition: str | None = None,
     *,
     id: Words = (),
@@ -194,7 +233,7 @@ def search(
 
 
 def stats(
-    path: Path,
+    path: Source,
     bitrate: Rates | None = None,
     *,
     data_bitrate: Rates | None = None,
@@ -231,16 +270,93 @@ def write(
 ) -> dict[str, int]:
     """Writes a table of records as a trace, in the format of the file's name or in `format`; `.parquet` works, too.
 
-    `table` comes from this package, or anything else that exports Arrow, such as pandas and Polars. Of the columns of `read` only
+    `table` comes from this package, or anything else that exports Arrow, such as pandas and Polars; or it is a mapping of columns, or
+    messages of python-can. Of the columns of `read` only
     `time`, `id` and `data` must be there; docs/python.md says what stands for the others, and which types are taken.
 
     An older file with that name stays unchanged until the new one is complete. Returns what the file does not carry, by kind: also
     columns that no trace has. Anything at all also causes a `CantapWarning`.
     """
-    left_out = _native.write(_arrow(table), path, format, zone)
+    left_out = _native.write(_table(table), path, format, zone)
     for what, count in left_out.items():
         warnings.warn(f"{path} does not carry {what} ({count})", CantapWarning, stacklevel=2)
     return left_out
+
+
+def encode(signals: Mapping[str, Any], db: Databases) -> Table:
+    """Makes frames out of signals: the inverse of `decode`. Returns a table of records, in the order of their times, for `write`.
+
+    `signals`: for each message's name a table, as `decode` returns, or a mapping of columns: `time`, and one for each signal, with
+    numbers or the texts of its table. `channel` is 1 if there is no such column. Where a signal has no value, the frame has the
+    database's start value, or 0. Bits of a frame that no signal describes are 0.
+
+    A value that the database's limits forbid is encoded all the same, if it fits, and causes a `CantapWarning`.
+    """
+    tables = [(message, _columns_table(table)) for message, table in signals.items()]
+    return _native.encode_tables(tables, _database(db))
+
+
+def dataset(
+    path: Source,
+    *,
+    db: Databases | None = None,
+    message: str | None = None,
+    signals: Words = (),
+    filter: Words = (),
+    channel: Channels = (),
+    start: Time | None = None,
+    end: Time | None = None,
+    format: str | None = None,
+    zone: str | None = None,
+    strict: bool = False,
+) -> Dataset:
+    """Traces as a dataset of pyarrow, which reads the files when it is queried: by DuckDB, by `pyarrow.dataset`, and by Polars with
+    `.to_polars()`, a LazyFrame. The arguments are those of `scan`.
+
+    With `message`, it has a column for each of that message's signals. A filter's bounds on `time`, the signals that it names, and
+    the columns that are wanted, decide what is decoded.
+    """
+    from ._dataset import Dataset
+
+    if message is not None and db is None:
+        raise ValueError("a message is decoded with a database; give one with db=")
+    return Dataset(files(path), _options(path, db, signals, filter, channel, start, end, format, zone, strict), message)
+
+
+def _is_file(source: Any) -> bool:
+    """Whether it is read, rather than a table."""
+    if hasattr(source, "__arrow_c_stream__"):
+        return False
+    return is_file(source[0] if isinstance(source, (list, tuple)) and source else source)
+
+
+def _unpacked(source: Any) -> Any:
+    """An iterator of paths, such as `Path.glob` returns, as a list; anything else as it is."""
+    if not isinstance(source, Iterator) or is_file(source) or hasattr(source, "__arrow_c_stream__"):
+        return source
+    first = list(itertools.islice(source, 1))
+    return [*first, *source] if first and is_file(first[0]) else itertools.chain(first, source)
+
+
+def _table(source: Any) -> Any:
+    """A table of records: of messages of python-can, too."""
+    source = _columns_table(source)
+    is_table = hasattr(source, "__arrow_c_stream__")
+    if not is_table and isinstance(source, Iterable) and not isinstance(source, (str, bytes)):
+        return _native.table_of_messages(source)
+    return source
+
+
+def _columns_table(table: Any) -> Any:
+    """A table, also of a mapping of columns."""
+    if isinstance(table, Mapping) and not hasattr(table, "__arrow_c_stream__"):
+        try:
+            import pyarrow as pa
+        except ModuleNotFoundError as error:
+            text = "a mapping of columns becomes a table by pyarrow; install it: pip install 'cantap[arrow]'"
+            raise ModuleNotFoundError(text, name="pyarrow") from error
+        return pa.table(dict(table))
+    return _arrow(table)
 
 
 def _arrow(table: Any) -> Any:
@@ -257,7 +373,7 @@ def _arrow(table: Any) -> Any:
 
 
 def _options(
-    path: Path,
+    path: Source,
     db: Databases | None,
     signals: Words,
     filter: Words,
@@ -269,7 +385,7 @@ def _options(
     strict: bool,
 ) -> Options:
     return {
-        "path": path,
+        "files": files(path),
         "db": None if db is None else _database(db),
         "signals": words(signals, "signals"),
         "filters": words(filter, "filter"),
@@ -331,7 +447,9 @@ __all__ = [
     "Report",
     "Scan",
     "Table",
+    "dataset",
     "decode",
+    "encode",
     "load_database",
     "read",
     "scan",

@@ -5,6 +5,7 @@ use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
 use std::thread::{self, JoinHandle};
 
 use cantap_trace::{PlainFrame, TraceRecord};
+use pyo3::prelude::*;
 
 use crate::error::Error;
 use crate::source::TraceSource;
@@ -17,6 +18,8 @@ const BATCHES: usize = 32;
 pub struct Batch {
     pub frames: Vec<PlainFrame>,
     pub records: Vec<TraceRecord>,
+    /// Which of the trace's files they are from.
+    pub file: usize,
 }
 
 /// The thread and its batches.
@@ -68,8 +71,12 @@ impl Drop for Ahead {
     fn drop(&mut self) {
         self.batches = None;
         if let Some(thread) = self.thread.take() {
-            // Given up on: what it could not read is of no interest.
-            let _ = thread.join();
+            // Given up on: what it could not read is of no interest. It may be waiting for Python, to read from one of its objects.
+            let mut thread = Some(thread);
+            let joined = Python::try_attach(|py| py.detach(|| thread.take().map(JoinHandle::join)));
+            if joined.is_none() {
+                let _ = thread.map(JoinHandle::join);
+            }
         }
     }
 }
@@ -78,6 +85,7 @@ fn fill(mut source: TraceSource, filled: &SyncSender<Batch>, again: &Receiver<Ba
     loop {
         let mut batch = again.try_recv().unwrap_or_default();
         let more = source.next_mixed(&mut batch.frames, &mut batch.records)?;
+        batch.file = source.file();
         if filled.send(batch).is_err() || !more {
             return Ok(());
         }

@@ -1,15 +1,20 @@
 //! Signal databases.
 
+use std::collections::HashSet;
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use cantap_columns::MessageColumns;
 use cantap_signals::{Decoder, Selection, Source};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::channels::Named;
 use crate::error::Error;
+use crate::frame::Frame;
 use crate::number::OfTrace;
+use crate::selection::{only, selection};
+use crate::table::Table;
 
 /// Compiled databases: loaded once, used for any number of traces, devices and frames, in any thread.
 #[pyclass(module = "cantap", frozen)]
@@ -105,6 +110,47 @@ impl Database {
                 Ok(about)
             })
             .collect()
+    }
+
+    /// A message's table without rows, with these signals.
+    fn _schema_of(&self, message: &str, signals: Vec<String>) -> PyResult<Table> {
+        let decoder = self.selecting(&signals)?;
+        let found = decoder.messages().find(|(_, _, known)| known.name == message);
+        let Some((reference, _, found)) = found else {
+            return Err(Error::Database(format!("the database has no message '{message}'")).into());
+        };
+        let batch = MessageColumns::new(&decoder, reference).take();
+        Ok(Table::of_batch(match selection(&signals)? {
+            Some(chosen) => only(&batch, found, &chosen),
+            None => batch,
+        }))
+    }
+
+    /// The names of all signals.
+    fn _signal_names(&self) -> HashSet<String> {
+        self.decoder.signals().map(|(_, _, signal)| signal.label().into_owned()).collect()
+    }
+
+    /// The frame of a message with these values.
+    #[pyo3(signature = (message, signals=None, *, channel=None))]
+    fn encode(
+        &self,
+        message: &str,
+        signals: Option<&Bound<'_, PyDict>>,
+        channel: Option<OfTrace>,
+    ) -> PyResult<Frame> {
+        self.frame(message, signals, channel)
+    }
+
+    /// The message of a frame, and its values; `None` if no database has it.
+    #[pyo3(signature = (frame, *, channel=OfTrace(1)))]
+    fn decode<'py>(
+        &self,
+        py: Python<'py>,
+        frame: &Bound<'py, PyAny>,
+        channel: OfTrace,
+    ) -> PyResult<Option<(String, Bound<'py, PyDict>)>> {
+        self.values(py, frame, channel)
     }
 
     fn __repr__(&self) -> String {

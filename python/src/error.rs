@@ -172,6 +172,15 @@ impl From<EncodeError> for Error {
 impl From<Error> for PyErr {
     fn from(error: Error) -> Self {
         match error {
+            // An object of Python that was read as a file raised it.
+            Error::Io(error, file)
+                if error.get_ref().is_some_and(<dyn std::error::Error + Send + Sync>::is::<PyErr>) =>
+            {
+                match error.downcast::<PyErr>() {
+                    Ok(error) => error,
+                    Err(error) => Error::Io(error, file).into(),
+                }
+            }
             // With number and name it becomes FileNotFoundError, PermissionError and so on.
             Error::Io(error, file) => match error.raw_os_error() {
                 Some(number) => {

@@ -6,12 +6,16 @@ mod ahead;
 mod channels;
 mod database;
 mod device;
+mod encode;
 mod error;
 mod frame;
+mod inputs;
+mod messages;
 mod number;
 mod numpy;
 mod report;
 mod scan;
+mod selection;
 mod source;
 mod table;
 mod traces;
@@ -35,6 +39,8 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<report::Report>()?;
     device::register(module)?;
     traces::register(module)?;
+    encode::register(module)?;
+    messages::register(module)?;
     module.add_class::<scan::Scan>()?;
     module.add_class::<table::Table>()?;
     module.add("__version__", env!("CARGO_PKG_VERSION"))

@@ -35,9 +35,48 @@ pub struct Counts {
     /// All channels in the file, before any filter.
     #[serde(default)]
     pub channels: Channels,
+    /// What the file says about its measurement.
+    #[serde(default)]
+    pub properties: BTreeMap<String, String>,
+    /// If there were several files: the counts of each that was read.
+    #[serde(default)]
+    pub files: Vec<Counts>,
 }
 
 impl Counts {
+    /// Of a file of which nothing was read yet.
+    pub fn of(file: String, reader: &TraceReader) -> Self {
+        Self { file, format: reader.format().to_string(), ..Self::default() }
+    }
+
+    /// Adds those of another file; not to the list of files.
+    pub fn add(&mut self, part: &Self) {
+        self.records_read += part.records_read;
+        self.records += part.records;
+        self.frames += part.frames;
+        self.lost += part.lost;
+        self.lost_at_least |= part.lost_at_least;
+        self.bus_errors += part.bus_errors;
+        self.decoded += part.decoded;
+        self.values += part.values;
+        self.issues += part.issues;
+        self.is_cut |= part.is_cut;
+        self.is_whole &= part.is_whole;
+        let room = FAULTS_KEPT - self.faults.len();
+        self.faults.extend(part.faults.iter().take(room).cloned());
+        for (sum, counts) in [(&mut self.left_out, &part.left_out), (&mut self.notes, &part.notes)] {
+            for (what, count) in counts {
+                *sum.entry(what.clone()).or_default() += count;
+            }
+        }
+        self.channels.extend(part.channels.iter());
+        if !self.format.split(", ").any(|format| format == part.format) {
+            self.format = format!("{}, {}", self.format, part.format);
+        }
+        // What is different in each file is in the list.
+        self.properties.clear();
+    }
+
     /// Counts a record that is passed on.
     pub fn count(&mut self, record: &TraceRecord) {
         self.records += 1;
@@ -73,6 +112,8 @@ impl Counts {
         self.records_read = reader.records();
         self.left_out = by_kind(reader.left_out());
         self.notes = by_kind(reader.notes());
+        self.properties =
+            reader.properties().map(|(name, value)| (name.to_owned(), value.to_owned())).collect();
     }
 
     /// The percentage of the file's entries that is missing; an issue counts as one entry.
@@ -123,15 +164,27 @@ impl Report {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Sets how many frames were decoded, and how many values they had.
-    pub fn set_decoded(&self, (decoded, values): (u64, u64)) {
+    /// Sets how many frames were decoded, and how many values they had: in the first file, the first two, and so on.
+    pub fn set_decoded(&self, up_to_file: &[(u64, u64)]) {
         let mut counts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        (counts.decoded, counts.values) = (decoded, values);
+        (counts.decoded, counts.values) = up_to_file.last().copied().unwrap_or_default();
+        let mut before = (0, 0);
+        for (file, up_to) in counts.files.iter_mut().zip(up_to_file) {
+            (file.decoded, file.values) = (up_to.0 - before.0, up_to.1 - before.1);
+            before = *up_to;
+        }
     }
 
-    /// Replaces it.
+    /// Replaces everything but the list of files.
     pub fn set(&self, counts: Counts) {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = counts;
+        let mut now = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let files = std::mem::take(&mut now.files);
+        *now = Counts { files, ..counts };
+    }
+
+    /// Adds one of several files to the list, once it was read.
+    pub fn push_file(&self, counts: Counts) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).files.push(counts);
     }
 }
 
@@ -233,6 +286,18 @@ impl Report {
         self.now().notes
     }
 
+    /// What an MF4 file says about its measurement, by name: device, session, author, the program that wrote it.
+    #[getter]
+    fn properties(&self) -> BTreeMap<String, String> {
+        self.now().properties
+    }
+
+    /// The reports of the single files, if there were several.
+    #[getter]
+    fn files(&self) -> Vec<Self> {
+        self.now().files.into_iter().map(|counts| Self(Arc::new(Mutex::new(counts)))).collect()
+    }
+
     /// The percentage of the file's entries that could not be read or were left out.
     #[getter]
     fn missing_pct(&self) -> f64 {
@@ -253,6 +318,8 @@ impl Report {
         object["missing_pct"] = counts.missing_pct().into();
         object["is_whole"] = self.is_whole().into();
         object["channels"] = self.channels().into();
+        let files: Vec<_> = self.now().files.into_iter().map(|file| file.file).collect();
+        object["files"] = files.into();
         from_json(py, &object.to_string())
     }
 

@@ -330,9 +330,9 @@ impl Iterator for Stream {
             Ok(None) => {
                 self.ended = true;
                 // The caller may not hold Python's lock, so a Python warning is impossible.
-                let counts = &self.pipeline.source.counts;
+                let counts = self.pipeline.source.all_counts();
                 let nothing = self.decodes.then(|| counts.nothing_decoded()).flatten();
-                for text in warnings(counts, &self.named).chain(nothing) {
+                for text in warnings(&counts, &self.named).chain(nothing) {
                     eprintln!("cantap: {text}");
                 }
                 None

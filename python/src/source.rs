@@ -1,10 +1,9 @@
 //! The requested records of a trace file.
 
-use std::path::PathBuf;
 use std::sync::Arc;
 
 use cantap_formats::time_range::{TimePoint, TimeRange};
-use cantap_formats::{Fault, Format, ReadOptions, TraceReader, Zone, open_reader};
+use cantap_formats::{Fault, Format, ReadOptions, TraceReader, Zone};
 use cantap_signals::Decoder;
 use cantap_trace::filter::{Filter, passes};
 use cantap_trace::{PlainFrame, TraceRecord};
@@ -13,12 +12,13 @@ use pyo3::prelude::*;
 use crate::channels::Named;
 use crate::database::Database;
 use crate::error::Error;
+use crate::inputs::TraceFile;
 use crate::number::{OfTrace, entry};
 use crate::report::{Counts, Report};
 
 /// What to read from a file, as passed by the Python half.
 pub struct Options {
-    pub path: PathBuf,
+    pub files: Arc<Vec<TraceFile>>,
     pub format: Option<String>,
     pub zone: Option<String>,
     pub strict: bool,
@@ -36,7 +36,7 @@ impl<'py> FromPyObject<'_, 'py> for Options {
     fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
         let channels: Vec<OfTrace> = entry(object, "channels", "channel")?;
         Ok(Self {
-            path: entry(object, "path", "path")?,
+            files: Arc::new(entry(object, "files", "path")?),
             format: entry(object, "format", "format")?,
             zone: entry(object, "zone", "zone")?,
             strict: entry(object, "strict", "strict")?,
@@ -78,14 +78,21 @@ impl Options {
     }
 }
 
-/// A file being read.
+/// Files being read, one after another.
 pub struct TraceSource {
     reader: TraceReader,
+    read: ReadOptions,
+    files: Arc<Vec<TraceFile>>,
+    /// The sum of those before, under the first one's name; `None` while that is read.
+    before: Option<Counts>,
+    /// The place of the current one.
+    file: usize,
     strict: bool,
     filters: Vec<Filter>,
     channels: Vec<u8>,
     window: TimeRange,
     is_all: bool,
+    /// Of the current file.
     pub counts: Counts,
     report: Report,
 }
@@ -100,17 +107,29 @@ impl TraceSource {
         let start = point(&options.start).map_err(Error::argument)?;
         let end = point(&options.end).map_err(Error::argument)?;
         let filters = filters.map_err(Error::argument)?;
-        let reader = open_reader(&options.path, &read).map_err(Error::from)?;
-        let counts = Counts {
-            file: options.path.display().to_string(),
-            format: reader.format().to_string(),
-            ..Counts::default()
+        let Some(first) = options.files.first() else {
+            return Err(Error::argument("no file is given; name at least one"));
         };
+        let reader = first.open(&read)?;
+        let counts = Counts::of(first.name(), &reader);
         report.set(counts.clone());
         let is_all = filters.is_empty() && options.channels.is_empty() && start.is_none() && end.is_none();
         let window = TimeRange::new(start, end);
         let channels = options.channels.clone();
-        Ok(Self { reader, strict: options.strict, filters, channels, window, is_all, counts, report })
+        Ok(Self {
+            reader,
+            read,
+            files: Arc::clone(&options.files),
+            before: None,
+            file: 0,
+            strict: options.strict,
+            filters,
+            channels,
+            window,
+            is_all,
+            counts,
+            report,
+        })
     }
 
     /// Replaces the content of `records` with the next ones, perhaps none; false at the end.
@@ -165,18 +184,48 @@ impl TraceSource {
             }
         }
         records.clear();
-        self.counts.is_whole = true;
-        self.tell();
-        match self.reader.nothing_read() {
-            Some(nothing) => Err(nothing.into()),
-            None => Ok(false),
+        if let Some(frames) = &mut frames {
+            frames.clear();
         }
+        let is_at_its_end = !std::mem::replace(&mut self.counts.is_whole, true);
+        self.tell();
+        if let Some(nothing) = self.reader.nothing_read() {
+            return Err(nothing.into());
+        }
+        if self.files.len() > 1 && is_at_its_end {
+            self.report.push_file(self.counts.clone());
+        }
+        let Some(next) = self.files.get(self.file + 1) else { return Ok(false) };
+        self.reader = next.open(&self.read)?;
+        let counts = Counts::of(next.name(), &self.reader);
+        let done = std::mem::replace(&mut self.counts, counts);
+        match &mut self.before {
+            Some(before) => before.add(&done),
+            None => self.before = Some(done),
+        }
+        self.file += 1;
+        // Its records follow with the next call.
+        Ok(true)
     }
 
     /// Brings the report up to date.
     pub fn tell(&mut self) {
         self.counts.update(&self.reader);
-        self.report.set(self.counts.clone());
+        self.report.set(self.all_counts());
+    }
+
+    /// Which of the files is being read.
+    pub fn file(&self) -> usize {
+        self.file
+    }
+
+    /// Of all files so far, without a list of them. One alone stays as it is.
+    pub fn all_counts(&self) -> Counts {
+        let Some(before) = &self.before else { return self.counts.clone() };
+        let mut all = before.clone();
+        all.add(&self.counts);
+        all.file = format!("{} files from {} to {}", self.file + 1, before.file, self.counts.file);
+        all
     }
 
     fn choose(&mut self, records: &mut Vec<TraceRecord>) {

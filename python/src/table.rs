@@ -147,6 +147,18 @@ impl Table {
         Ok(Bound::new(py, table.select(&names)?)?.into_any())
     }
 
+    /// Plots signals over time with Matplotlib.
+    #[pyo3(signature = (*signals, ax=None, **options))]
+    fn plot<'py>(
+        slf: &Bound<'py, Self>,
+        signals: &Bound<'py, PyTuple>,
+        ax: Option<Bound<'py, PyAny>>,
+        options: Option<Bound<'py, PyDict>>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let options = options.unwrap_or_else(|| PyDict::new(slf.py()));
+        slf.py().import("cantap._plot")?.call_method1("plot", (slf, signals, ax, options))
+    }
+
     fn _repr_html_<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
         slf.py().import("cantap._columns")?.call_method1("to_html", (slf,))
     }

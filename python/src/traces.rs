@@ -11,10 +11,10 @@ use cantap_analysis::stats::{Options as StatOptions, Statistics};
 #[cfg(feature = "parquet")]
 use cantap_columns::parquet::ParquetFile;
 use cantap_columns::{BATCH_ROWS, FrameColumns, MessageTables};
-use cantap_formats::{LeftOut, TraceWriter, WriteOptions, create_writer};
+use cantap_formats::{Format, LeftOut, TraceWriter, WriteOptions, create_writer};
 use cantap_signals::condition::Condition;
 use cantap_signals::search::{DataPattern, IdPattern, Search};
-use cantap_signals::{Decoder, Message, Selection};
+use cantap_signals::{Decoder, Selection};
 use pyo3::prelude::*;
 
 use crate::ahead::Ahead;
@@ -24,6 +24,7 @@ use crate::error::Error;
 use crate::number::{OfTrace, Whole};
 use crate::report::{Report, by_kind, from_json};
 use crate::scan::{warn, warn_if_nothing_decoded, warning};
+use crate::selection::{only, selection};
 use crate::source::{Options, TraceSource};
 use crate::table::{Table, batches_of};
 
@@ -99,11 +100,6 @@ pub fn stats(
 /// What Python's half makes a mapping of: tables by name, and the events.
 type Tables = (Vec<(String, Table)>, Table);
 
-/// What was chosen, if anything was.
-fn selection(signals: &[String]) -> Result<Option<Selection>, Error> {
-    Ok(if signals.is_empty() { None } else { Some(Selection::new(signals)?) })
-}
-
 /// A trace that a thread reads ahead, to be decoded: it begins before the database is loaded, which takes as long as many frames.
 #[pyclass(module = "cantap", frozen)]
 pub struct Reading {
@@ -122,20 +118,29 @@ impl Reading {
         Ok(Self { ahead: Mutex::new(Some(ahead)), report, named: options.named_channels() })
     }
 
-    /// The trace as a table for each message, and one for events other than frames; once.
+    /// The trace as a table for each message, and one for events other than frames; once. With `warns` it is a warning if nothing could
+    /// be decoded.
+    #[pyo3(signature = (db, signals, warns=true))]
     fn decode(
         &self,
         py: Python<'_>,
         db: Py<Database>,
         signals: Vec<String>,
+        warns: bool,
     ) -> PyResult<(Tables, Py<Report>)> {
         let decoder = db.get().selecting(&signals)?;
         let chosen = selection(&signals)?;
         let ahead = self.ahead.lock().unwrap_or_else(PoisonError::into_inner).take();
         let mut ahead = ahead.ok_or_else(|| Error::argument("this trace has been decoded already"))?;
         let mut tables = MessageTables::new(Arc::clone(&decoder), chosen.is_some());
+        // Of all files up to each.
+        let (mut file, mut decoded) = (0, Vec::new());
         let mut next = || -> Result<bool, Error> {
             let Some(batch) = ahead.next()? else { return Ok(false) };
+            if batch.file != file {
+                file = batch.file;
+                decoded.push(tables.counts());
+            }
             tables.push_frames(&batch.frames);
             batch.records.iter().for_each(|record| tables.push(record));
             ahead.give_back(batch);
@@ -146,8 +151,11 @@ impl Reading {
         }
         let named: Vec<_> = self.named.iter().cloned().chain(db.get().named_channels()).collect();
         warn(py, &self.report, &named)?;
-        self.report.set_decoded(py.detach(|| tables.counts()));
-        warn_if_nothing_decoded(py, &self.report)?;
+        decoded.push(py.detach(|| tables.counts()));
+        self.report.set_decoded(&decoded);
+        if warns {
+            warn_if_nothing_decoded(py, &self.report)?;
+        }
         Ok((finish(&decoder, tables, chosen.as_ref()), Py::new(py, self.report.clone())?))
     }
 }
@@ -199,22 +207,6 @@ fn finish(decoder: &Decoder, tables: MessageTables, chosen: Option<&Selection>) 
         named.push((name, Table::of_batch(batch)));
     }
     (named, Table::of_batch(events.take()))
-}
-
-/// The columns for time, channel and identifier, and those of the chosen signals.
-fn only(batch: &RecordBatch, message: &Message, chosen: &Selection) -> RecordBatch {
-    // Three for every frame; then one for each signal, and one for its texts if it has any.
-    let mut at = 3;
-    let mut kept: Vec<_> = (0..at).collect();
-    for signal in &message.signals {
-        let columns = at..at + if signal.values.is_empty() { 1 } else { 2 };
-        at = columns.end;
-        if chosen.matches(message, signal) {
-            kept.extend(columns);
-        }
-    }
-    // This cannot fail: all of these exist.
-    batch.project(&kept).unwrap_or_else(|_| batch.clone())
 }
 
 /// The records that match, each with its position in the trace.
@@ -354,8 +346,7 @@ fn write_trace(
         _ => Error::of_file(error, path),
     };
     if options.format.is_none() {
-        options.format =
-            Some(cantap_formats::Format::of_path(path).map_err(|error| Error::Format(error.to_string()))?);
+        options.format = Some(Format::of_path(path).map_err(|error| Error::Format(error.to_string()))?);
     }
     // A pipe or a device is written to directly.
     let is_file = !path.exists() || path.is_file();
@@ -398,9 +389,16 @@ impl Drop for Temporary {
     }
 }
 
+/// Whether a file's name is that of a trace. Tables of decoded signals end in `.parquet`, too: such a file is only read if it is named itself.
+#[pyfunction]
+fn is_trace_name(name: PathBuf) -> bool {
+    Format::of_path(&name).is_ok_and(|format| format != Format::Parquet)
+}
+
 /// Adds the functions to the module.
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Reading>()?;
+    module.add_function(wrap_pyfunction!(is_trace_name, module)?)?;
     module.add_function(wrap_pyfunction!(decode_table, module)?)?;
     module.add_function(wrap_pyfunction!(search, module)?)?;
     module.add_function(wrap_pyfunction!(stats, module)?)?;

@@ -34,8 +34,8 @@ def first_data(table):
 @pytest.mark.parametrize(
     ("wrong", "error", "said"),
     [
-        ({"path": None}, TypeError, "path: "),
-        ({"path": b"drive.blf"}, TypeError, "path: 'bytes'"),
+        ({"path": None}, TypeError, "path is a file's name, an open file, or several of them, not NoneType"),
+        ({"path": b"drive.blf"}, TypeError, "path is a file's name, an open file, or several of them, not bytes"),
         ({"format": 3}, TypeError, "format: 'int'"),
         ({"zone": 3}, TypeError, "zone: 'int'"),
         ({"filter": 5}, TypeError, "filter is a text or several texts, not int"),

@@ -31,7 +31,8 @@ import can
 import cantap
 import pyarrow as pa
 import pyarrow.dataset
-from cantap_fleet import columns, command, dataset, inputs, isolation, questions
+from cantap.lake import columns, isolation
+from cantap_fleet import command, dataset, inputs, questions
 from pyspark.sql import SparkSession
 
 VEHICLES = 20
@@ -391,7 +392,7 @@ class Killer(threading.Thread):
         wanted = ["decoding", "worker", "executor"]
         while wanted and not self.over.wait(0.3):
             below = descendants()
-            at_work = [number for number, (_, line) in below.items() if "cantap_fleet.decoding" in line]
+            at_work = [number for number, (_, line) in below.items() if "cantap.lake.decoding" in line]
             if not at_work:
                 continue
             victim = at_work[0]

@@ -12,7 +12,6 @@ mod order;
 mod picture;
 mod plan;
 mod profile;
-mod recorder;
 mod screen;
 mod source;
 #[cfg(test)]

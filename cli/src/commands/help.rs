@@ -27,12 +27,22 @@ const GROUPS: [(&str, &[&str]); 7] = [
     ("Look at a bus or a trace", &["monitor", "ui", "stats", "autobaud"]),
     ("Record, convert", &["capture", "convert", "align"]),
     ("Understand", &["decode", "search", "conversations", "plot", "report", "diff", "db", "bits", "timing"]),
-    ("Send, ask", &["send", "replay", "gen", "run", "obd", "uds", "canopen", "j1939"]),
+    ("Send, ask", &["send", "replay", "gen", "run", "twin", "obd", "uds", "canopen", "j1939"]),
     (
         "Devices",
         &[
-            "doctor", "list", "info", "status", "defaults", "selftest", "identify", "reset", "update",
-            "virtual", "demo",
+            "doctor",
+            "list",
+            "info",
+            "status",
+            "defaults",
+            "selftest",
+            "compare-adapters",
+            "identify",
+            "reset",
+            "update",
+            "virtual",
+            "demo",
         ],
     ),
     ("Share with other programs", &["serve", "bridge", "extcap"]),
@@ -40,7 +50,7 @@ const GROUPS: [(&str, &[&str]); 7] = [
 ];
 
 /// Columns for a command's name.
-const NAME: usize = 15;
+const NAME: usize = 17;
 /// No line is longer, as in the help of a single command.
 const MOST_COLUMNS: usize = 100;
 

@@ -8,6 +8,7 @@ pub mod bridge;
 pub mod canopen;
 pub mod capture;
 pub mod care;
+pub mod compare_adapters;
 pub mod completions;
 pub mod conversations;
 pub mod convert;
@@ -36,6 +37,7 @@ pub mod serve;
 pub mod stats;
 pub mod status;
 pub mod timing;
+pub mod twin;
 pub mod uds;
 pub mod ui;
 pub mod update;
@@ -112,6 +114,8 @@ pub enum Command {
     Extcap(Box<extcap::Args>),
     /// Show a device's state: counters, errors, queue, temperature, registers.
     Status(status::Args),
+    /// Compare two devices on one bus: what each missed, and how far apart their stamps are.
+    CompareAdapters(compare_adapters::Args),
     /// Test a board: everything that it can show on its own, with a report to send in.
     Selftest(selftest::Args),
     /// Find a bus's bit rate by listening only.
@@ -124,6 +128,8 @@ pub enum Command {
     Replay(Box<replay::Args>),
     /// Run nodes and tests as scripts: on simulated buses, or on a device.
     Run(Box<run::Args>),
+    /// Learn a bus from a trace, and write scripts that play it.
+    Twin(Box<twin::Args>),
     /// Blink a device's LEDs, to find it among others.
     Identify(care::Identify),
     /// Restart a device's firmware.
@@ -168,6 +174,7 @@ impl Command {
             Self::Virtual(args) => virtual_device::run(&args),
             Self::Status(args) => status::run(&args),
             Self::Selftest(args) => selftest::run(&args),
+            Self::CompareAdapters(args) => compare_adapters::run(&args),
             Self::Autobaud(args) => autobaud::run(&args),
             #[cfg(target_os = "linux")]
             Self::Bridge(args) => bridge::run(&args),
@@ -177,6 +184,7 @@ impl Command {
             Self::Gen(args) => r#gen::run(&args),
             Self::Replay(args) => replay::run(&args),
             Self::Run(args) => run::run(&args),
+            Self::Twin(args) => twin::run(&args),
             Self::Identify(args) => care::identify(&args),
             Self::Reset(args) => care::reset(&args),
             Self::Update(args) => update::run(&args),

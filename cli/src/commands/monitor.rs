@@ -24,6 +24,7 @@ use cantap_work::channel_bitrate::ChannelBitrate;
 use cantap_work::channel_options::ChannelOptions;
 use cantap_work::channels::Channels;
 use cantap_work::databases::{Databases, LoadReport};
+use cantap_work::recording::parts;
 
 use crate::args;
 use crate::channel_args::ChannelArgs;
@@ -202,8 +203,8 @@ fn address_usage(error: AddressError) -> anyhow::Error {
 /// Refuses a recording that cannot be made as requested. Its name may be followed by a condition: `FILE if
 /// CONDITION`.
 fn refuse_recording(args: &Args) -> anyhow::Result<()> {
-    let Some(text) = args.output.as_deref().and_then(Path::to_str) else { return Ok(()) };
-    let path = Path::new(text.split(" if ").next().unwrap_or(text));
+    let Some(text) = args.output.as_deref() else { return Ok(()) };
+    let (path, _) = parts(text);
     if path.extension().is_some() {
         named(WriteOptions::default(), path)?;
     }

@@ -60,7 +60,8 @@ pub struct Args {
     /// Receive only these frames, in candump's syntax; with a database also EngineData. Repeat for any of several. The page can change it.
     #[arg(short, long, value_name = "FILTER")]
     filter: Vec<NamedFilter>,
-    /// Record to this file from the start, in the format of its suffix. Recordings that the page begins are in the working folder.
+    /// Record to this file from the start, in the format of its suffix; 'FILE if CONDITION' keeps 2 s before and 5 s after each event.
+    /// Recordings that the page begins are in the working folder.
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// What the page may do besides looking, choosing bit rates and recording: send, which includes taking part in the bus.

@@ -1,5 +1,7 @@
 //! Every integration test of this crate, in one program: each program is linked on its own.
 
+#[cfg(unix)]
+mod adapters;
 mod align;
 mod analysis;
 mod bit_rate_auto;
@@ -14,6 +16,8 @@ mod columns;
 #[cfg(feature = "emu")]
 #[path = "../../../sim/tests/it/common/mod.rs"]
 mod common;
+#[cfg(unix)]
+mod compare_adapters;
 mod completion;
 mod conversations;
 mod convert;
@@ -66,6 +70,7 @@ mod texts_from_outside;
 mod timing;
 mod trigger;
 mod tutorial;
+mod twin;
 mod two_testers;
 mod ui;
 mod unsent;

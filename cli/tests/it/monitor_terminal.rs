@@ -92,7 +92,7 @@ fn a_signal_ends_it_with_the_terminal_given_back_and_the_recording_whole() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("trace.blf");
         let mut view = Terminal::start(&format!("{BUSY} -o {}", file.display()), (120, 24));
-        view.wait_for("REC");
+        wait_until_recorded(&view);
         view.signal(name);
         assert_eq!(view.end(), 0, "{name}");
         view.check_given_back();
@@ -106,12 +106,19 @@ fn a_window_that_is_closed_ends_it_with_the_recording_whole() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("trace.blf");
     let mut view = Terminal::start(&format!("{BUSY} -o {}", file.display()), (120, 24));
-    view.wait_for("REC");
-    std::thread::sleep(std::time::Duration::from_millis(300));
+    wait_until_recorded(&view);
     view.close();
     // It ends on its own, or with an error that nobody can read.
     view.end();
     check_complete(&file);
+}
+
+/// Until the second line says that there are thousands of bytes in the file.
+fn wait_until_recorded(view: &Terminal) {
+    let is_recorded = |text: &str| {
+        text.split("REC ").nth(1).is_some_and(|size| size.split_whitespace().nth(1) == Some("kB"))
+    };
+    view.wait_until("kilobytes are recorded", is_recorded);
 }
 
 /// Every record can be read, and nothing was lost.

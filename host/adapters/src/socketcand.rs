@@ -1,7 +1,7 @@
 //! An interface of a socketcand server: `socketcand://HOST[:PORT]/can0`.
 //!
-//! socketcand's `doc/protocol.md`, raw mode. Its server takes an identifier of eight digits as extended; it never tells remote frames, losses or
-//! what became of frames sent. The bit rate and the mode of the interface belong to the server's owner.
+//! socketcand's `doc/protocol.md`, raw mode. Its server takes an identifier of eight digits as extended; it never tells losses or what became of
+//! frames sent, and only our server tells remote frames. The bit rate and the mode of the interface belong to the server's owner.
 
 use std::fmt::Write;
 use std::time::{Duration, Instant};
@@ -120,7 +120,7 @@ impl Socketcand {
     fn take(&mut self, message: &str, arrival: Instant) {
         let mut fields = message.split_ascii_whitespace();
         match fields.next() {
-            Some("frame") => match frame(fields) {
+            Some(kind @ ("frame" | "rtr")) => match frame(fields, kind == "rtr") {
                 Some((frame, time_us)) => {
                     let at = self.clock.place(time_us, arrival);
                     self.backlog.push(Incoming::Received { channel: Channel::Can1, frame, at });
@@ -136,8 +136,9 @@ impl Socketcand {
     }
 }
 
-/// A frame from its identifier, its time and its data, with the time in microseconds.
-fn frame<'a>(mut fields: impl Iterator<Item = &'a str>) -> Option<(Frame, u64)> {
+/// A frame from its identifier, its time and its data, or the length that a remote frame asks for; with the time in microseconds. The original server
+/// tells no remote frames, ours does.
+fn frame<'a>(mut fields: impl Iterator<Item = &'a str>, is_remote: bool) -> Option<(Frame, u64)> {
     let (id, time) = (fields.next()?, fields.next()?);
     let raw = u32::from_str_radix(id, 16).ok()?;
     let id = if id.len() > 3 || raw > Id::MAX_STANDARD { Id::extended(raw) } else { Id::standard(raw) }?;
@@ -147,6 +148,9 @@ fn frame<'a>(mut fields: impl Iterator<Item = &'a str>) -> Option<(Frame, u64)> 
     let time_us =
         seconds.checked_mul(1_000_000)?.checked_add(fraction).filter(|time_us| *time_us < 1 << 53)?;
     let digits: String = fields.collect();
+    if is_remote {
+        return Some((Frame::remote_frame(id, digits.parse().ok()?)?, time_us));
+    }
     if !digits.len().is_multiple_of(2) || !digits.is_ascii() {
         return None;
     }
@@ -224,7 +228,7 @@ mod tests {
     proptest::proptest! {
         #[test]
         fn any_text_is_a_frame_or_refused(text in "[0-9a-fA-Fxé. -]{0,40}") {
-            if let Some((frame, time_us)) = frame(text.split_ascii_whitespace()) {
+            if let Some((frame, time_us)) = frame(text.split_ascii_whitespace(), false) {
                 proptest::prop_assert!(frame.data_len() <= 8 && time_us < 1 << 53);
             }
         }

@@ -6,6 +6,7 @@ use std::io;
 use super::found::Found;
 use super::input::Input;
 use super::left_out::LeftOut;
+use super::mf4::Properties;
 use super::output::Patch;
 use cantap_trace::{PlainFrame, TraceRecord};
 
@@ -27,6 +28,11 @@ pub(crate) trait Decode: Send {
     /// Whether [`Self::next`] can return for a single line without waiting for more.
     fn needs_one_line(&self) -> bool {
         true
+    }
+
+    /// What the file says about its measurement, once something was read; `None` if the format has nothing of the kind.
+    fn properties(&self) -> Option<&Properties> {
+        None
     }
 
     /// Adds records until it finds something else, which is returned; `None` if there are enough, or if it would have to

@@ -8,6 +8,7 @@
 mod blocks;
 mod channel;
 mod clock;
+mod comment;
 mod conversion;
 mod decode;
 mod encode;
@@ -24,6 +25,7 @@ mod tests;
 mod unpack;
 mod value;
 
+pub(crate) use comment::Properties;
 pub(crate) use decode::Decoder;
 #[cfg(test)]
 pub(crate) use encode::COUNTS_UNTOLD;

@@ -280,6 +280,13 @@ impl TraceReader {
         &self.left_out
     }
 
+    /// What an MF4 file says about its measurement, by name: device, session, author, the program that wrote it. It is known once
+    /// something was read. The texts are the file's own: clean them for a terminal.
+    pub fn properties(&self) -> impl Iterator<Item = (&str, &str)> {
+        let properties = self.decoder.properties().into_iter().flatten();
+        properties.map(|(name, value)| (name.as_str(), value.as_str()))
+    }
+
     fn issue(&mut self, place: Place, fault: Fault) -> ReadIssue {
         self.issues += 1;
         self.ended |= self.strict || matches!(fault, Fault::Io(_));

@@ -11,8 +11,9 @@ use cantap_signals::encode;
 use cantap_trace::grammar::{self, IdPattern};
 use rhai::{Array, Blob, Dynamic, Engine, FnPtr, Map, NativeCallContext};
 
+use crate::byte_functions::byte;
 use crate::exchange::Output;
-use crate::handlers::Selector;
+use crate::handlers::{Repeated, Selector};
 use crate::report::Outcome;
 use crate::runtime::{Result, Runtime};
 use crate::script_frame::ScriptFrame;
@@ -33,6 +34,7 @@ struct Handle(u32);
 /// Makes everything known to an engine.
 pub fn register(engine: &mut Engine, runtime: &Rc<Runtime>) {
     crate::script_frame::register(engine);
+    crate::byte_functions::register(engine);
     engine.register_type_with_name::<Repetition>("Repetition").register_type_with_name::<Handle>("Handle");
     sending(engine, runtime);
     reacting(engine, runtime);
@@ -44,8 +46,12 @@ pub fn register(engine: &mut Engine, runtime: &Rc<Runtime>) {
 fn sending(engine: &mut Engine, runtime: &Rc<Runtime>) {
     let frame_of = |text: &str| ScriptFrame::parse(text).map_err(Into::into);
     engine.register_fn("frame", move |text: &str| -> Result<ScriptFrame> { frame_of(text) });
-    engine.register_fn("frame", |id: i64, data: Blob| make_frame(id, &data));
-    engine.register_fn("frame", |id: i64, data: Array| make_frame(id, &bytes_of(&data)?));
+    engine.register_fn("frame", |id: i64, data: Blob| make_frame(numbered(id)?, &data));
+    engine.register_fn("frame", |id: i64, data: Array| make_frame(numbered(id)?, &bytes_of(&data)?));
+    engine.register_fn("frame", |id: &str, data: Blob| make_frame(grammar::identifier(id)?, &data));
+    engine.register_fn("frame", |id: &str, data: Array| {
+        make_frame(grammar::identifier(id)?, &bytes_of(&data)?)
+    });
 
     let send = {
         let runtime = Rc::clone(runtime);
@@ -128,13 +134,19 @@ fn reacting(engine: &mut Engine, runtime: &Rc<Runtime>) {
     let of = Rc::clone(runtime);
     engine.register_fn("every", move |period: &str, call: FnPtr| -> Result<Handle> {
         let period_ns = positive_ns(period)?;
-        let due_ns = of.now_ns() + period_ns;
-        Ok(Handle(of.with_handlers(|handlers| handlers.at(due_ns, Some(period_ns), call))))
+        Ok(Handle(of.after(period_ns, Some(Repeated::exactly(period_ns)), call)))
+    });
+    let of = Rc::clone(runtime);
+    engine.register_fn("every", move |period: &str, jitter: &str, call: FnPtr| -> Result<Handle> {
+        let (period_ns, jitter_ns) = (positive_ns(period)?, ns(jitter)?);
+        if jitter_ns >= period_ns {
+            return Err(format!("a jitter of {jitter} is not less than the period, {period}").into());
+        }
+        Ok(Handle(of.after(period_ns, Some(Repeated { period_ns, jitter_ns }), call)))
     });
     let of = Rc::clone(runtime);
     engine.register_fn("after", move |delay: &str, call: FnPtr| -> Result<Handle> {
-        let due_ns = of.now_ns() + ns(delay)?;
-        Ok(Handle(of.with_handlers(|handlers| handlers.at(due_ns, None, call))))
+        Ok(Handle(of.after(ns(delay)?, None, call)))
     });
     let of = Rc::clone(runtime);
     engine.register_fn("stop", move |handle: Handle| of.with_handlers(|handlers| handlers.end(handle.0)));
@@ -306,25 +318,23 @@ fn ask(
     }
 }
 
-fn make_frame(id: i64, data: &[u8]) -> Result<ScriptFrame> {
+/// An identifier from a number.
+fn numbered(id: i64) -> Result<Id> {
     let raw = u32::try_from(id).map_err(|_| format!("{id} is no identifier"))?;
-    let id = Id::standard(raw)
-        .or_else(|| Id::extended(raw))
-        .ok_or_else(|| format!("0x{raw:X} has more than 29 bits"))?;
+    let id = Id::standard(raw).or_else(|| Id::extended(raw));
+    id.ok_or_else(|| format!("0x{raw:X} has more than 29 bits").into())
+}
+
+fn make_frame(id: Id, data: &[u8]) -> Result<ScriptFrame> {
     let frame =
         Frame::data_frame(id, data).ok_or_else(|| format!("{} bytes; a frame carries 8", data.len()))?;
     Ok(ScriptFrame::new(frame))
 }
 
 fn bytes_of(values: &Array) -> Result<Vec<u8>> {
-    let byte = |value: &Dynamic| {
-        value
-            .as_int()
-            .ok()
-            .and_then(|value| u8::try_from(value).ok())
-            .ok_or_else(|| format!("{value} is no byte"))
-    };
-    values.iter().map(|value| byte(value).map_err(Into::into)).collect()
+    let number =
+        |value: &Dynamic| -> Result<i64> { value.as_int().map_err(|_| format!("{value} is no byte").into()) };
+    values.iter().map(|value| byte(number(value)?)).collect()
 }
 
 fn channel_of(number: i64) -> Result<Channel> {

@@ -3,6 +3,7 @@
 use cantap_can::{BusErrorKind, Channel, ErrorState};
 use cantap_signals::MessageRef;
 use cantap_trace::grammar::IdPattern;
+use fastrand::Rng;
 use rhai::FnPtr;
 
 use crate::script_frame::ScriptFrame;
@@ -44,9 +45,32 @@ pub enum BusEvent {
 #[derive(Clone, Debug)]
 struct Timer {
     due_ns: u64,
+    /// When it would be due without jitter.
+    on_time_ns: u64,
     handle: u32,
-    period_ns: Option<u64>,
+    repeated: Option<Repeated>,
     call: FnPtr,
+}
+
+/// How a timer is due again.
+#[derive(Clone, Copy, Debug)]
+pub struct Repeated {
+    /// After this time.
+    pub period_ns: u64,
+    /// Later by a random time up to this, which does not add up.
+    pub jitter_ns: u64,
+}
+
+impl Repeated {
+    /// Without jitter.
+    pub const fn exactly(period_ns: u64) -> Self {
+        Self { period_ns, jitter_ns: 0 }
+    }
+
+    /// How late it is this time. Without jitter no random number is used up.
+    fn late_ns(self, random: &mut Rng) -> u64 {
+        if self.jitter_ns == 0 { 0 } else { random.u64(0..=self.jitter_ns) }
+    }
 }
 
 /// Everything that a script wants to react to.
@@ -83,10 +107,11 @@ impl Handlers {
         self.states.push(call);
     }
 
-    /// Calls a function at a time, then after each period if there is one; returns its handle.
-    pub fn at(&mut self, due_ns: u64, period_ns: Option<u64>, call: FnPtr) -> u32 {
+    /// Calls a function at a time, then again if it is repeated; returns its handle.
+    pub fn at(&mut self, due_ns: u64, repeated: Option<Repeated>, call: FnPtr, random: &mut Rng) -> u32 {
         let handle = self.new_handle();
-        self.timers.push(Timer { due_ns, handle, period_ns, call });
+        let late_ns = repeated.map_or(0, |repeated| repeated.late_ns(random));
+        self.timers.push(Timer { due_ns: due_ns + late_ns, on_time_ns: due_ns, handle, repeated, call });
         handle
     }
 
@@ -118,13 +143,16 @@ impl Handlers {
 
     /// The function of the earliest timer that is due; it is due again after its period. Of two that are due at the same time, the older one
     /// is first.
-    pub fn take_due(&mut self, now_ns: u64) -> Option<FnPtr> {
+    pub fn take_due(&mut self, now_ns: u64, random: &mut Rng) -> Option<FnPtr> {
         let due = (0..self.timers.len()).filter(|&place| self.timers[place].due_ns <= now_ns);
         let place = due.min_by_key(|&place| (self.timers[place].due_ns, self.timers[place].handle))?;
         let timer = &mut self.timers[place];
         let call = timer.call.clone();
-        match timer.period_ns {
-            Some(period_ns) => timer.due_ns += period_ns,
+        match timer.repeated {
+            Some(repeated) => {
+                timer.on_time_ns += repeated.period_ns;
+                timer.due_ns = timer.on_time_ns + repeated.late_ns(random);
+            }
             None => {
                 self.timers.remove(place);
             }

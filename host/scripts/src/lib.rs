@@ -4,10 +4,14 @@
 //!
 //! Each script has a thread of its own, but only one runs at a time: it is given an input and the time, and hands over what it wants sent when it
 //! waits for the next input. So a run depends on nothing but its scripts, its seed and its bus.
+//!
+//! [`twin`] learns a bus from a trace and writes the scripts that play it.
 
 #![forbid(unsafe_code)]
 
 mod bench;
+mod byte_functions;
+mod checksum;
 mod exchange;
 mod functions;
 mod handlers;
@@ -18,6 +22,7 @@ mod results;
 mod runtime;
 mod sandbox;
 mod script_frame;
+pub mod twin;
 
 pub use bench::Bench;
 pub use live::{Live, LiveError};

@@ -12,7 +12,7 @@ use cantap_trace::TraceFrame;
 use rhai::{Dynamic, EvalAltResult, FnPtr, FuncArgs, Map, NativeCallContext};
 
 use crate::exchange::{Input, Next, Output, Resume, Turn, Wanted};
-use crate::handlers::{BusEvent, Handlers, Selector};
+use crate::handlers::{BusEvent, Handlers, Repeated, Selector};
 use crate::sandbox::Operations;
 use crate::script_frame::ScriptFrame;
 
@@ -88,6 +88,12 @@ impl Runtime {
     /// Calls `act` with what the script reacts to.
     pub fn with_handlers<R>(&self, act: impl FnOnce(&mut Handlers) -> R) -> R {
         act(&mut self.state.borrow_mut().handlers)
+    }
+
+    /// Calls a function after a time, then again if it is repeated; returns its handle.
+    pub fn after(&self, delay_ns: u64, repeated: Option<Repeated>, call: FnPtr) -> u32 {
+        let State { handlers, now_ns, random, .. } = &mut *self.state.borrow_mut();
+        handlers.at(*now_ns + delay_ns, repeated, call, random)
     }
 
     /// Calls `act` with the script's random numbers.
@@ -200,8 +206,8 @@ impl Runtime {
     }
 
     fn take_due(&self) -> Option<FnPtr> {
-        let State { handlers, now_ns, .. } = &mut *self.state.borrow_mut();
-        handlers.take_due(*now_ns)
+        let State { handlers, now_ns, random, .. } = &mut *self.state.borrow_mut();
+        handlers.take_due(*now_ns, random)
     }
 
     fn wanted(&self, want: &Want<'_>) -> Wanted {

@@ -20,15 +20,16 @@ use cantap_work::channel_bitrate::ChannelBitrate;
 use cantap_work::channel_options::ChannelOptions;
 use cantap_work::live::{Lines, lines, return_text};
 use cantap_work::reception::Reception;
+use cantap_work::recording::{Older, Recording};
 use cantap_work::report::{Reporter, Severity};
 use cantap_work::{advice, channels::place_of, interrupt};
 use serde_json::{Value, json};
 
-use crate::recorder::Recorder;
-use crate::request::Request;
+use crate::recorder;
+use crate::request::{Only, Request};
 use crate::sender;
 use crate::shared::{Order, Shared};
-use crate::state::{ChannelState, DeviceState, State};
+use crate::state::{ChannelState, DeviceState, RecordingState, State};
 
 /// How long a single wait for records lasts.
 const WAIT: Duration = Duration::from_millis(20);
@@ -55,7 +56,7 @@ pub struct Device {
     pub decoder: Decoder,
     /// The folder of recordings that pages begin.
     pub folder: PathBuf,
-    /// A recording from the start, into a file that is new.
+    /// A recording from the start, into a file that is new; `FILE if CONDITION` for what happens around events.
     pub record: Option<PathBuf>,
     /// What the device sends by itself stops when no page has shown for this long that it is there. Pages show it every second.
     pub dead_man: Duration,
@@ -68,7 +69,7 @@ pub struct Bus {
     orders: Receiver<Order>,
     reporter: Reporter,
     lines: Option<Lines>,
-    recorder: Option<Recorder>,
+    recording: Option<Recording>,
     reception: Reception,
     /// The latest record's time.
     latest_ns: i64,
@@ -78,7 +79,8 @@ impl Bus {
     /// Opens the devices and begins the recording, if one is requested.
     pub fn open(device: Device, reporter: Reporter) -> anyhow::Result<Self> {
         device.open.timing.check_channels(device.boards.addresses().len())?;
-        let recorder = device.record.as_deref().map(Recorder::create).transpose()?;
+        let begin = |text: &PathBuf| Recording::create_by_text(text, &device.decoder, Older::Refuse);
+        let recording = device.record.as_ref().map(begin).transpose()?;
         let state = State { may_send: device.may_send, ..State::default() };
         let (shared, orders) = Shared::new(state);
         let shared = Arc::new(shared);
@@ -88,7 +90,7 @@ impl Bus {
             orders,
             reporter,
             lines: None,
-            recorder,
+            recording,
             reception: Reception::default(),
             latest_ns: 0,
         };
@@ -96,8 +98,10 @@ impl Bus {
             Ok(()) => Ok(bus),
             Err(error) => {
                 // A recording that could not begin leaves nothing behind.
-                if let Some((_, path)) = bus.recorder.take().zip(bus.device.record.take()) {
-                    let _ = std::fs::remove_file(path);
+                if let Some(state) = bus.recording.take().and_then(|mut recording| recording.state().ok())
+                    && state.condition.is_none()
+                {
+                    let _ = std::fs::remove_file(state.path);
                 }
                 Err(error)
             }
@@ -305,8 +309,8 @@ impl Bus {
         if let Some(last) = records.last() {
             self.latest_ns = self.latest_ns.max(last.time_ns);
         }
-        if let Some(recorder) = &mut self.recorder
-            && let Err(error) = recorder.write(records)
+        if let Some(recording) = &mut self.recording
+            && let Err(error) = recording.write(records)
         {
             self.recording_failed(&error);
         }
@@ -342,11 +346,10 @@ impl Bus {
                 });
             }
         }
-        let recording = self.recorder.as_mut().map(Recorder::state);
-        let recording = match recording.transpose() {
-            Ok(recording) => recording,
+        let recording = match self.recording.as_mut().map(Recording::state).transpose() {
+            Ok(recording) => recording.map(|recording| RecordingState::new(recording, self.latest_ns)),
             Err(error) => {
-                self.recording_failed(&error);
+                self.recording_failed(&error.into());
                 None
             }
         };
@@ -382,13 +385,16 @@ impl Bus {
 
     fn follow(&mut self, request: Request) -> anyhow::Result<Value> {
         match request {
-            Request::Record { name } => {
+            Request::Record { name, only } => {
                 if let Some(recording) = self.shared.state().recording {
                     bail!("{} is being recorded; stop that first", recording.name);
                 }
-                let recorder = Recorder::of_page(&self.device.folder, &name)?;
-                self.recorder = Some(recorder);
-                self.note(format!("recording to {name}"));
+                let Device { folder, decoder, .. } = &self.device;
+                self.recording = Some(recorder::create(folder, &name, only.as_ref(), decoder)?);
+                self.note(match only {
+                    Some(Only { around, .. }) => format!("{name} begins when {around}"),
+                    None => format!("recording to {name}"),
+                });
                 self.show_figures();
             }
             Request::StopRecording {} => self.stop_recording(),
@@ -512,14 +518,14 @@ impl Bus {
     }
 
     fn stop_recording(&mut self) {
-        if let Some(recorder) = self.recorder.take() {
-            self.note(recorder.finish());
+        if let Some(recording) = self.recording.take() {
+            self.note(recording.finish());
             self.shared.change(|state| state.recording = None);
         }
     }
 
     fn recording_failed(&mut self, error: &anyhow::Error) {
         self.stop_recording();
-        self.warn(format!("recording ended: {}; check the disk's free space", advice::sentence(error)));
+        self.warn(Recording::failure(error));
     }
 }

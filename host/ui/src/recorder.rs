@@ -1,86 +1,38 @@
-//! Records everything that arrives into a file that is new, whatever pages show.
+//! Recordings that pages begin: into new files of one folder, whatever the pages show.
 
-use std::fs::OpenOptions;
-use std::path::{Path, PathBuf};
-use std::time::Instant;
+use std::path::Path;
 
-use anyhow::{Context, bail};
-use cantap_formats::{Format, TraceWriter, WriteOptions, create_writer};
-use cantap_trace::TraceRecord;
-use cantap_work::advice;
+use anyhow::bail;
+use cantap_signals::Decoder;
+use cantap_signals::trigger::Window;
+use cantap_work::recording::{Around, Older, Recording};
 
-use crate::state::RecordingState;
+use crate::request::Only;
 
 /// Longest name that a page may give, in bytes.
 const MOST_NAME: usize = 120;
+/// Longest time around an event, in seconds: a day.
+const MOST_SECONDS: f64 = 86_400.0;
 
-/// A growing file.
-pub struct Recorder {
-    path: PathBuf,
-    writer: Box<dyn TraceWriter>,
-    records: u64,
-    since: Instant,
+/// Creates a file by a name that a page gave. An existing one stays: then this is an error.
+pub fn create(
+    folder: &Path,
+    name: &str,
+    only: Option<&Only>,
+    decoder: &Decoder,
+) -> anyhow::Result<Recording> {
+    let path = folder.join(checked(name)?);
+    Recording::create(&path, only.map(|only| around(only, decoder)).transpose()?, Older::Refuse)
 }
 
-impl Recorder {
-    /// Creates a file in `folder` by a name that a page gave. An existing one stays: then this is an error.
-    pub fn of_page(folder: &Path, name: &str) -> anyhow::Result<Self> {
-        Self::create(&folder.join(checked(name)?))
+fn around(only: &Only, decoder: &Decoder) -> anyhow::Result<Around> {
+    let Only { around, before_s, after_s } = only;
+    let seconds = [*before_s, *after_s];
+    if !seconds.iter().all(|seconds| (0.0..=MOST_SECONDS).contains(seconds)) {
+        bail!("the time before and after an event is from 0 to {MOST_SECONDS} seconds");
     }
-
-    /// Creates a file. An existing one stays: then this is an error.
-    pub fn create(path: &Path) -> anyhow::Result<Self> {
-        // Before anything is created, whether its suffix names a format.
-        Format::of_path(path)
-            .map_err(|error| anyhow::anyhow!("nothing is recorded: {}", advice::explained(&error)))?;
-        if let Err(error) = OpenOptions::new().write(true).create_new(true).open(path) {
-            if error.kind() == std::io::ErrorKind::AlreadyExists {
-                bail!("{} exists, and is not overwritten; choose another name", path.display());
-            }
-            return Err(error).with_context(|| format!("cannot record to {}", path.display()));
-        }
-        let writer = create_writer(path, &WriteOptions::default()).inspect_err(|_| {
-            // It is empty, and this program's.
-            let _ = std::fs::remove_file(path);
-        });
-        let writer = writer.with_context(|| format!("cannot record to {}", path.display()))?;
-        Ok(Self { path: path.to_owned(), writer, records: 0, since: Instant::now() })
-    }
-
-    /// Writes records.
-    pub fn write(&mut self, records: &[TraceRecord]) -> anyhow::Result<()> {
-        for record in records {
-            self.writer.write(record)?;
-            self.records += 1;
-        }
-        Ok(())
-    }
-
-    /// Passes what was written to the system, and returns the recording's state.
-    pub fn state(&mut self) -> anyhow::Result<RecordingState> {
-        self.writer.flush()?;
-        Ok(RecordingState {
-            name: self.path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
-            records: self.records,
-            bytes: std::fs::metadata(&self.path).map_or(0, |file| file.len()),
-            seconds: self.since.elapsed().as_secs(),
-        })
-    }
-
-    /// Ends the file and returns a sentence about it.
-    pub fn finish(self) -> String {
-        let (path, records) = (self.path.display().to_string(), self.records);
-        match self.writer.finish() {
-            Ok(left_out) if left_out.is_empty() => format!("{records} records are in {path}"),
-            Ok(left_out) => {
-                let listed: Vec<_> = left_out.iter().map(|(what, count)| format!("{count} {what}")).collect();
-                format!("{records} records are in {path}, without {}", listed.join(", "))
-            }
-            Err(error) => {
-                format!("the end of {path} could not be written: {error}; check the disk's free space")
-            }
-        }
-    }
+    let [pre_ns, post_ns] = seconds.map(|seconds| (seconds * 1e9) as i64);
+    Around::new(around, Window { pre_ns, post_ns, events: None }, decoder)
 }
 
 /// A file's name that stays in its folder, on every system.
@@ -106,21 +58,9 @@ fn checked(name: &str) -> anyhow::Result<&str> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cantap_trace::testing::data_record;
 
-    #[test]
-    fn a_recording_is_a_new_file_in_its_folder() {
-        let folder = tempfile::tempdir().unwrap();
-        let mut recorder = Recorder::of_page(folder.path(), "drive 1.log").unwrap();
-        recorder.write(&[data_record(1), data_record(2)]).unwrap();
-        let state = recorder.state().unwrap();
-        assert_eq!((state.name.as_str(), state.records), ("drive 1.log", 2));
-        assert!(recorder.finish().starts_with("2 records are in "));
-        let text = std::fs::read_to_string(folder.path().join("drive 1.log")).unwrap();
-        assert_eq!(text.lines().count(), 2);
-        let again = Recorder::of_page(folder.path(), "drive 1.log").err().unwrap();
-        assert!(again.to_string().contains("is not overwritten"), "{again}");
-        assert_eq!(std::fs::read_to_string(folder.path().join("drive 1.log")).unwrap(), text);
+    fn begin(folder: &Path, name: &str) -> anyhow::Result<Recording> {
+        create(folder, name, None, &Decoder::new(Vec::new()))
     }
 
     #[test]
@@ -153,20 +93,25 @@ mod tests {
             "*.log",
             "\u{202e}gol.a",
         ] {
-            assert!(Recorder::of_page(&inner, name).is_err(), "{name:?}");
+            assert!(begin(&inner, name).is_err(), "{name:?}");
         }
-        assert!(Recorder::of_page(&inner, &format!("{}.log", "a".repeat(300))).is_err());
+        assert!(begin(&inner, &format!("{}.log", "a".repeat(300))).is_err());
         assert_eq!(std::fs::read_dir(&inner).unwrap().count(), 0);
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
     }
 
-    #[cfg(unix)]
     #[test]
-    fn a_link_is_not_followed() {
+    fn times_around_an_event_are_within_a_day() {
         let folder = tempfile::tempdir().unwrap();
-        let target = folder.path().join("target");
-        std::os::unix::fs::symlink(&target, folder.path().join("a.log")).unwrap();
-        assert!(Recorder::of_page(folder.path(), "a.log").is_err());
-        assert!(!target.exists());
+        let decoder = Decoder::new(Vec::new());
+        let begin = |before_s, after_s| {
+            let only = Only { around: "error".to_owned(), before_s, after_s };
+            create(folder.path(), "a.log", Some(&only), &decoder).map(|_| ())
+        };
+        begin(0.0, 86_400.0).unwrap();
+        for (before_s, after_s) in [(-1.0, 1.0), (1.0, f64::NAN), (f64::INFINITY, 1.0), (1.0, 1e9)] {
+            assert!(begin(before_s, after_s).is_err(), "{before_s} {after_s}");
+        }
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
     }
 }

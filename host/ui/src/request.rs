@@ -39,6 +39,9 @@ pub enum Request {
     Record {
         /// The file's name, without a folder.
         name: String,
+        /// What of it, if not everything.
+        #[serde(default)]
+        only: Option<Only>,
     },
     /// Ends the recording.
     StopRecording {},
@@ -90,6 +93,18 @@ pub enum Request {
     },
     /// Brings channels that are bus-off back onto their buses.
     Recover {},
+}
+
+/// The part of what arrives that is recorded.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub struct Only {
+    /// A condition, such as `Speed > 80`: what happened around its events.
+    pub around: String,
+    /// From how long before each, in seconds.
+    pub before_s: f64,
+    /// Until how long after each, in seconds.
+    pub after_s: f64,
 }
 
 /// What changes in a periodic frame each time; bytes are counted from 0.

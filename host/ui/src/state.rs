@@ -62,8 +62,27 @@ pub struct RecordingState {
     pub records: u64,
     /// Bytes on the disk.
     pub bytes: u64,
-    /// Whole seconds since it began.
+    /// Whole seconds from its first record to the latest one that arrived.
     pub seconds: u64,
+    /// The condition around whose events records are written, if that is not all of them.
+    pub condition: Option<String>,
+    /// How often it came true.
+    pub events: u64,
+}
+
+impl RecordingState {
+    /// Of a recording, by the time of what arrived last, in nanoseconds.
+    pub fn new(state: cantap_work::recording::RecordingState, latest_ns: i64) -> Self {
+        let length_ns = if state.records == 0 { 0 } else { latest_ns.saturating_sub(state.since_ns) };
+        Self {
+            name: state.path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+            records: state.records,
+            bytes: state.bytes,
+            seconds: u64::try_from(length_ns / 1_000_000_000).unwrap_or(0),
+            condition: state.condition,
+            events: state.events,
+        }
+    }
 }
 
 /// Of a frame that the device sends periodically.

@@ -9,6 +9,7 @@
 //! | [`doctor`], [`bus_hints`], `port_access` (Linux) | what is the matter with a port, a device or a bus, and what to do next |
 //! | [`sending`], [`speaking`], [`uds`], [`uds_memory`] | frames and their fate; a protocol's client on a device |
 //! | [`read_ahead`], [`missing`], [`databases`], [`reading`] | traces, what is missing from them, and what they mean |
+//! | [`recording`] | a trace that grows, or waits for a condition |
 //! | [`report`], [`advice`], [`announcement`], [`terms`], [`code_texts`] | messages for people |
 //! | [`atomic_file`], [`memory_image`], [`interrupt`], [`dfu`] | files, Ctrl-C, and the chip's bootloader |
 
@@ -61,6 +62,8 @@ pub mod read_ahead;
 pub mod reading;
 #[cfg(feature = "buses")]
 pub mod reception;
+#[cfg(feature = "buses")]
+pub mod recording;
 #[cfg(feature = "buses")]
 pub mod remembered_rates;
 #[cfg(feature = "buses")]

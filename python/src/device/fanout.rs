@@ -217,6 +217,8 @@ pub struct Fanout {
     listeners: Mutex<Listeners>,
     /// The filters with which a channel was opened; its hardware may pass more.
     filters: Mutex<[Vec<Filter>; CHANNELS]>,
+    /// Until when, in UTC nanoseconds, what a channel receives is nobody's: its bit rate is being searched.
+    ignored_until_ns: Mutex<[i64; CHANNELS]>,
     /// Losses that are known here alone, to be put in their places.
     gaps: Mutex<Vec<TraceRecord>>,
 }
@@ -246,6 +248,11 @@ impl Fanout {
     /// From now on, only frames matching these filters pass on a channel.
     pub fn set_filters(&self, channel: Channel, filters: Vec<Filter>) {
         lock(&self.filters)[channel.index()] = filters;
+    }
+
+    /// Records of a channel up to this time (UTC nanoseconds) are dropped.
+    pub fn ignore_until(&self, channel: Channel, time_ns: i64) {
+        lock(&self.ignored_until_ns)[channel.index()] = time_ns;
     }
 
     /// From a time (UTC nanoseconds) on, a channel received nothing for a moment: a loss says so.
@@ -278,6 +285,13 @@ impl Fanout {
                 Ok(Some(mut batch)) => {
                     // The end of a transmission is known before its record is handed over.
                     transmissions.report();
+                    let ignored_until_ns = *lock(&self.ignored_until_ns);
+                    if ignored_until_ns != [0; CHANNELS] {
+                        batch.retain(|record| {
+                            let until_ns = ignored_until_ns.get(usize::from(record.channel).wrapping_sub(1));
+                            until_ns.is_none_or(|until_ns| record.time_ns > *until_ns)
+                        });
+                    }
                     let filters = lock(&self.filters).clone();
                     if filters.iter().any(|filters| !filters.is_empty()) {
                         batch.retain(|record| {

@@ -1,5 +1,6 @@
 //! A device, for Python. Every waiting call lets other Python threads run, and Ctrl-C through.
 
+mod diagnostics;
 mod fanout;
 mod lock;
 mod records;
@@ -78,6 +79,13 @@ impl<'py> FromPyObject<'_, 'py> for ChannelOptions {
             filters: entry(object, "filters", "filter")?,
         })
     }
+}
+
+/// A time to wait, at most a day.
+pub fn duration(seconds: f64) -> PyResult<Duration> {
+    let time = Duration::try_from_secs_f64(seconds);
+    let time = time.map_err(|_| PyValueError::new_err(format!("{seconds} s is not a valid time to wait")))?;
+    Ok(time.min(MOST_TIME))
 }
 
 /// This computer's UTC in nanoseconds since 1970.
@@ -218,6 +226,13 @@ impl Device {
         Ok(opened)
     }
 
+    /// Finds the bit rate of a closed channel's bus, in bit/s.
+    fn autobaud(&self, py: Python<'_>, number: OfDevice, silence: f64) -> PyResult<u32> {
+        let session = self.session()?;
+        let silence = duration(silence)?;
+        Ok(py.detach(|| session.find_bitrate(number.0, silence, signals))?)
+    }
+
     /// Closes a channel, after everything it captured has arrived.
     fn close_channel(&self, py: Python<'_>, number: OfDevice) -> PyResult<()> {
         let channel = number.0;
@@ -279,9 +294,7 @@ impl Device {
         let session = self.session()?;
         let frames: Vec<ClassicFrame> = frames.into_iter().map(|frame| frame.0).collect();
         let seconds = timeout.unwrap_or(queue_timeout);
-        let patience = Duration::try_from_secs_f64(seconds)
-            .map_err(|_| PyValueError::new_err(format!("{seconds} s is not a valid time to wait")))?
-            .min(MOST_TIME);
+        let patience = duration(seconds)?;
         if let (Some(_), Some(at_ns)) = (timeout, at_ns) {
             let ahead_s = at_ns.saturating_sub(utc_ns()) as f64 / 1e9;
             if ahead_s > patience.as_secs_f64() {
@@ -497,5 +510,6 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Records>()?;
     module.add_class::<PeriodicFrame>()?;
     module.add_class::<Reply>()?;
+    diagnostics::register(module)?;
     module.add_function(wrap_pyfunction!(list_boards, module)?)
 }

@@ -7,6 +7,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use cantap::autobaud::{Limits, Outcome};
 use cantap::device::{Ticks, Transmission};
 use cantap::hw_filter::{self, Remainder};
 use cantap::wire::Refusal;
@@ -14,6 +15,7 @@ use cantap::wire::message::{ChannelConfig, MAX_SEND, TxFrame};
 use cantap::{Channel, Device, DeviceError, Frame};
 use cantap_address::{Address, OpenDevice};
 use cantap_trace::filter::Filter;
+use cantap_work::bit_rate_search::{self, Search};
 
 use super::fanout::Fanout;
 use super::lock::lock;
@@ -96,6 +98,52 @@ impl Session {
     /// The bit rate of a channel's bus in bit/s, if it is known without listening.
     pub fn bitrate_of_bus(&self, channel: Channel) -> Option<u32> {
         self.device.bitrate_of_bus(channel)
+    }
+
+    /// Finds the bit rate of a closed channel's bus, in bit/s, without sending anything.
+    pub fn find_bitrate(
+        &self,
+        channel: Channel,
+        silence: Duration,
+        mut go_on: impl FnMut() -> Result<(), Error>,
+    ) -> Result<u32, Error> {
+        let device = self.device()?;
+        if !bit_rate_search::is_possible(device) {
+            return Err(Error::Address(format!(
+                "'{}' cannot measure a bit rate: it does not report what its receive pin does; give bitrate=",
+                self.address
+            )));
+        }
+        if device.open_channels().iter().any(|(open, _)| *open == channel) {
+            return Err(Error::argument(format!(
+                "channel {0} is open; close it first: close_channel({0})",
+                channel.number()
+            )));
+        }
+        let started = Instant::now();
+        let mut stopped = None;
+        // What is received on the way was not asked for.
+        self.fanout.ignore_until(channel, i64::MAX);
+        let found = bit_rate_search::search(device, channel, &Limits { silence }, &mut |_| {
+            stopped = go_on().err();
+            stopped.is_none()
+        });
+        let now_ns = device.time().map(|ticks| device.clock_map().utc(Ticks(ticks)).0);
+        self.fanout.ignore_until(channel, *now_ns.as_ref().unwrap_or(&0));
+        if let Some(error) = stopped {
+            return Err(error);
+        }
+        now_ns?;
+        let found = found?;
+        match found {
+            Search::Confirmed { bitrate_bps } | Search::Measured(Outcome::Found { bitrate_bps, .. }) => {
+                Ok(bitrate_bps)
+            }
+            Search::Measured(outcome) => {
+                let seconds = started.elapsed().as_secs_f64();
+                Err(Error::Address(bit_rate_search::failure(outcome, channel.number(), seconds)))
+            }
+        }
     }
 
     /// Opens a channel; returns what its filters leave to this computer.

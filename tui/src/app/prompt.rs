@@ -3,11 +3,11 @@
 use std::path::Path;
 
 use cantap_signals::named::{NameError, NamedFilter};
+use cantap_work::recording;
 use ratatui::crossterm::event::KeyCode;
 
 use super::super::model::Model;
 use super::super::order::Order;
-use super::super::recorder;
 use super::completion::{Completed, complete};
 use super::entry::parse_entry;
 use super::line::{Prompt, PromptKind};
@@ -71,7 +71,7 @@ impl App {
     }
 
     fn record(&mut self, text: &Path) -> Result<(), String> {
-        let (path, _) = recorder::parts(text);
+        let (path, _) = recording::parts(text);
         if path.exists() {
             let path = path.display();
             return Err(format!("{path} already exists; choose another name, or remove it first"));

@@ -20,6 +20,7 @@ use cantap_signals::Decoder;
 
 use super::plan::Plan;
 use cantap_work::reception::Reception;
+use cantap_work::recording::RecordingState;
 
 pub use fixed::{FixedTable, Row};
 pub use history::History;
@@ -67,23 +68,6 @@ pub struct Playing {
     pub position_ns: i64,
     /// The latest time in the file, once known.
     pub end_ns: Option<i64>,
-}
-
-/// A recording in progress.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Recording {
-    /// The file. It does not exist while a condition has not come true.
-    pub path: String,
-    /// The condition around whose events records are written, if that is not all of them.
-    pub condition: Option<String>,
-    /// How often the condition came true.
-    pub events: u64,
-    /// Records written.
-    pub records: u64,
-    /// Size of the file according to the system, in bytes.
-    pub bytes: u64,
-    /// When it began, in nanoseconds as in [`TraceRecord::time_ns`].
-    pub since_ns: i64,
 }
 
 /// A device's figures about itself.
@@ -159,7 +143,7 @@ pub struct Model {
     /// The number of unreadable places in the file being played back, and what was wrong with the first one.
     pub unread: Option<(u64, String)>,
     /// The recording, if there is one.
-    pub recording: Option<Recording>,
+    pub recording: Option<RecordingState>,
     /// The latest message for the user.
     pub notice: String,
     talk: Talk,

@@ -17,8 +17,7 @@ use cantap::TraceRecord;
 use super::model::Model;
 use super::order::Order;
 use super::plan::Plan;
-use super::recorder::Recorder;
-use cantap_work::advice;
+use cantap_work::recording::{Older, Recording};
 
 /// The model, shared by the source thread and the display.
 pub type Shared = Arc<Mutex<Model>>;
@@ -52,7 +51,7 @@ const FIGURES_EVERY: Duration = Duration::from_millis(500);
 
 /// Runs until [`Order::Quit`].
 pub fn run(origin: Origin, model: &Shared, orders: &Receiver<Order>) {
-    let mut source = Source { model, orders, recorder: None };
+    let mut source = Source { model, orders, recording: None };
     match origin {
         Origin::Device(plan) => source.run_device(plan),
         Origin::File(path) => source.run_file(&path),
@@ -63,7 +62,7 @@ pub fn run(origin: Origin, model: &Shared, orders: &Receiver<Order>) {
 struct Source<'a> {
     model: &'a Shared,
     orders: &'a Receiver<Order>,
-    recorder: Option<Recorder>,
+    recording: Option<Recording>,
 }
 
 impl Source<'_> {
@@ -73,8 +72,8 @@ impl Source<'_> {
 
     /// Records first, then shows.
     fn take(&mut self, records: &[TraceRecord]) {
-        if let Some(recorder) = &mut self.recorder
-            && let Err(error) = recorder.write(records)
+        if let Some(recording) = &mut self.recording
+            && let Err(error) = recording.write(records)
         {
             self.recording_failed(&error);
         }
@@ -84,9 +83,10 @@ impl Source<'_> {
     fn record(&mut self, path: &Path) {
         self.stop_recording();
         let decoder = Arc::clone(lock(self.model).seen.signals.decoder());
-        match Recorder::create(path, &decoder) {
-            Ok(recorder) => {
-                self.recorder = Some(recorder);
+        // Whether an older file is overwritten, the user has been asked before.
+        match Recording::create_by_text(path, &decoder, Older::Replace) {
+            Ok(recording) => {
+                self.recording = Some(recording);
                 self.show_recording();
                 let armed = lock(self.model)
                     .recording
@@ -103,8 +103,8 @@ impl Source<'_> {
     }
 
     fn stop_recording(&mut self) {
-        if let Some(recorder) = self.recorder.take() {
-            let said = recorder.finish();
+        if let Some(recording) = self.recording.take() {
+            let said = recording.finish();
             let mut model = lock(self.model);
             model.recording = None;
             model.notice = said;
@@ -113,17 +113,14 @@ impl Source<'_> {
 
     fn recording_failed(&mut self, error: &anyhow::Error) {
         self.stop_recording();
-        self.notice(match error.downcast_ref::<std::io::Error>() {
-            Some(error) => format!("recording ended: {error}; check the disk's free space"),
-            None => format!("recording ended: {}", advice::sentence(error)),
-        });
+        self.notice(Recording::failure(error));
     }
 
     fn show_recording(&mut self) {
-        let Some(recorder) = &mut self.recorder else {
+        let Some(recording) = &mut self.recording else {
             return;
         };
-        match recorder.state() {
+        match recording.state() {
             Ok(state) => lock(self.model).recording = Some(state),
             Err(error) => self.recording_failed(&error.into()),
         }

@@ -25,11 +25,12 @@ use cantap_signals::{Decoder, Source};
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 
 use super::app::{App, Flow, View};
-use super::model::{DeviceFigures, Model, Recording, SourceState};
+use super::model::{DeviceFigures, Model, SourceState};
 use super::order::Order;
 use super::plan::Plan;
 use super::theme::Theme;
 use super::{orders, screen, text};
+use cantap_work::recording::RecordingState;
 
 use cantap_address::Address;
 
@@ -198,12 +199,12 @@ fn check_page(view: View) {
         model.seen.devices = vec![device()];
     }
     if view == View::Record {
-        model.recording = Some(Recording {
-            path: "boat.blf".to_owned(),
+        model.recording = Some(RecordingState {
+            path: "boat.blf".into(),
             records: 6002,
             bytes: 48_213,
             since_ns: model.first_ns.unwrap(),
-            ..Recording::default()
+            ..RecordingState::default()
         });
     }
     for size in SIZES {

@@ -8,10 +8,11 @@ use ratatui::backend::TestBackend;
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers, MouseButton, MouseEvent, MouseEventKind};
 
 use super::super::app::{App, View};
-use super::super::model::{Model, Playing, Recording, SourceState};
+use super::super::model::{Model, Playing, SourceState};
 use super::super::order::Order;
 use super::super::views;
 use super::{app, device, frame, model};
+use cantap_work::recording::RecordingState;
 
 const STEPS: u32 = 10_000;
 
@@ -126,14 +127,14 @@ fn happen(random: &mut fastrand::Rng, model: &mut Model, now_ns: &mut i64) {
         6 => model.seen.devices = random.bool().then(device).into_iter().collect(),
         7 => model.notice = "word ".repeat(random.usize(..200)),
         8 => {
-            let path = "x".repeat(random.usize(..300));
+            let path = "x".repeat(random.usize(..300)).into();
             let since_ns = random.i64(..);
-            model.recording = random.bool().then(|| Recording {
+            model.recording = random.bool().then(|| RecordingState {
                 path,
                 records: 1,
                 bytes: random.u64(..),
                 since_ns,
-                ..Recording::default()
+                ..RecordingState::default()
             });
         }
         _ => model.advance(now_ns.saturating_sub(random.i64(..2_000_000_000))),

@@ -6,8 +6,9 @@ use ratatui::text::Line;
 use ratatui::widgets::{Paragraph, Wrap};
 
 use super::super::app::App;
-use super::super::model::{Model, Recording};
+use super::super::model::Model;
 use super::list::bytes;
+use cantap_work::recording::RecordingState;
 
 /// Draws the page.
 pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
@@ -21,8 +22,8 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
                 "Otherwise everything that comes is recorded, whatever is shown, paused or filtered here.",
             ),
         ],
-        Some(Recording { path, condition: Some(condition), events: 0, .. }) => vec![
-            Line::from(format!("Armed: {path} begins when {condition}")).style(app.theme.loss()),
+        Some(RecordingState { path, condition: Some(condition), events: 0, .. }) => vec![
+            Line::from(format!("Armed: {} begins when {condition}", path.display())).style(app.theme.loss()),
             Line::from("It has not come true yet. Nothing is recorded, and there is no file."),
             Line::from("r gives it up."),
         ],
@@ -33,7 +34,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
             let events =
                 events.map(|condition| Line::from(format!("Events    {} of {condition}", recording.events)));
             let mut lines = vec![
-                Line::from(format!("Recording to {}", recording.path)).style(app.theme.error()),
+                Line::from(format!("Recording to {}", recording.path.display())).style(app.theme.error()),
                 Line::from(format!("Records   {}", recording.records)),
                 Line::from(format!("Size      {}", bytes(recording.bytes))),
                 Line::from(format!("Time      {seconds:.1} s")),

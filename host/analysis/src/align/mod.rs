@@ -12,6 +12,9 @@
 
 mod chain;
 mod clock_map;
+mod compare;
+#[cfg(test)]
+mod compare_tests;
 mod sketch;
 #[cfg(test)]
 mod tests;
@@ -21,6 +24,7 @@ use std::collections::BTreeMap;
 
 use chain::{Chain, FEWEST, Unclear, chains};
 pub use clock_map::ClockMap;
+pub use compare::{Comparison, Differences, Side, compare};
 use sketch::Pair;
 pub use sketch::Sketch;
 pub use verify::{Agreement, Verifier};

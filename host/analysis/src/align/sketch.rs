@@ -23,6 +23,8 @@ pub struct Sketch {
     runs: HashMap<(u64, u8), Run>,
     highest_channel: u8,
     frames: u64,
+    /// A stamp that is only an upper bound is a moment, too.
+    takes_bounds: bool,
 }
 
 /// A run of frames: when it ended, if that is known and it occurred only once.
@@ -58,7 +60,13 @@ impl Sketch {
             runs: HashMap::new(),
             highest_channel: 0,
             frames: 0,
+            takes_bounds: false,
         }
+    }
+
+    /// Takes stamps that are only upper bounds for moments, too: a device may have no others.
+    pub(super) fn with_bounds(self) -> Self {
+        Self { takes_bounds: true, ..self }
     }
 
     /// Takes the next record.
@@ -73,7 +81,7 @@ impl Sketch {
             return;
         }
         // A stamp that is only an upper bound would be a wrong moment.
-        let ended_ns = (!late).then_some(record.time_ns);
+        let ended_ns = (self.takes_bounds || !late).then_some(record.time_ns);
         self.runs
             .entry((hash, record.channel))
             .and_modify(|run| run.ended_ns = None)

@@ -5,7 +5,7 @@ use super::*;
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
 /// A frame on a bus with a few identifiers; `content` is what changes.
-fn record(time_ns: i64, channel: u8, id: u16, content: u64) -> TraceRecord {
+pub(super) fn record(time_ns: i64, channel: u8, id: u16, content: u64) -> TraceRecord {
     let frame = Frame::data_frame(Id::standard(id.into()).unwrap(), &content.to_le_bytes()).unwrap();
     TraceRecord {
         time_ns,
@@ -16,10 +16,10 @@ fn record(time_ns: i64, channel: u8, id: u16, content: u64) -> TraceRecord {
 
 /// A second clock: with a different setting and rate, and read with an error of up to `jitter_ns`.
 #[derive(Clone, Copy)]
-struct Clock {
-    ahead_ns: i64,
-    ppm: f64,
-    jitter_ns: i64,
+pub(super) struct Clock {
+    pub ahead_ns: i64,
+    pub ppm: f64,
+    pub jitter_ns: i64,
 }
 
 impl Clock {
@@ -30,7 +30,7 @@ impl Clock {
 }
 
 /// `count` frames, 500 µs apart on average, whose content never repeats.
-fn bus(count: usize, seed: u64) -> Vec<TraceRecord> {
+pub(super) fn bus(count: usize, seed: u64) -> Vec<TraceRecord> {
     let mut random = fastrand::Rng::with_seed(seed);
     let mut time_ns = 1_700_000_000_000_000_000;
     (0..count)
@@ -41,7 +41,7 @@ fn bus(count: usize, seed: u64) -> Vec<TraceRecord> {
         .collect()
 }
 
-fn heard(records: &[TraceRecord], channel: u8, clock: Clock, seed: u64) -> Vec<TraceRecord> {
+pub(super) fn heard(records: &[TraceRecord], channel: u8, clock: Clock, seed: u64) -> Vec<TraceRecord> {
     let mut random = fastrand::Rng::with_seed(seed);
     let start = records[0].time_ns;
     records
@@ -82,7 +82,7 @@ fn verify(first: &[TraceRecord], second: &[TraceRecord], alignment: &Alignment) 
     verifier.finish()
 }
 
-const CLOCK: Clock = Clock { ahead_ns: -3_600_000_000_000, ppm: 80.0, jitter_ns: 1_000 };
+pub(super) const CLOCK: Clock = Clock { ahead_ns: -3_600_000_000_000, ppm: 80.0, jitter_ns: 1_000 };
 
 #[test]
 fn clocks_an_hour_and_80_ppm_apart_are_set_on_one() {

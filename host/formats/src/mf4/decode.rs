@@ -11,6 +11,7 @@ use super::super::issue::{Fault, Place};
 use super::super::whole::Whole;
 use super::super::zone::Zone;
 use super::blocks::{BLOCK_HEAD_BYTES, u16_at, u64_at};
+use super::comment::{Properties, properties};
 use super::joined::{after_blocks, joined};
 use super::layout::Alone;
 use super::part::{Item, OPEN_LENGTH, Part, own};
@@ -18,6 +19,7 @@ use super::{FILE_MAGIC, HEADER_AT, UNFINISHED_MAGIC};
 use cantap_trace::PlainFrame;
 
 const MEASURED: &str = "groups of measured signals";
+const NO_COMMENT: &str = "what the file says about its measurement cannot be read";
 
 /// Reads MF4.
 #[derive(Default)]
@@ -25,6 +27,7 @@ pub(crate) struct Decoder {
     open: Option<Opened>,
     /// To be reported before the records.
     first: VecDeque<Found>,
+    properties: Properties,
 }
 
 struct Opened {
@@ -46,11 +49,15 @@ impl Decode for Decoder {
         Ok(true)
     }
 
+    fn properties(&self) -> Option<&Properties> {
+        Some(&self.properties)
+    }
+
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
         if self.open.is_none() {
             let zone = input.zone().clone();
             let mut file = input.whole()?;
-            let (parts, fault) = match parts(&mut file, &zone, &mut self.first) {
+            let (parts, fault) = match parts(&mut file, &zone, &mut self.first, &mut self.properties) {
                 Ok(parts) => (parts, None),
                 Err((parts, fault)) => (parts, Some(fault)),
             };
@@ -122,9 +129,10 @@ fn parts(
     file: &mut Whole,
     zone: &Zone,
     first: &mut VecDeque<Found>,
+    about: &mut Properties,
 ) -> Result<Vec<Part>, (Vec<Part>, Fault)> {
     let mut parts = Vec::new();
-    match collect(file, zone, first, &mut parts) {
+    match collect(file, zone, first, about, &mut parts) {
         Ok(()) => Ok(parts),
         Err(fault) => Err((parts, fault)),
     }
@@ -134,6 +142,7 @@ fn collect(
     file: &mut Whole,
     zone: &Zone,
     first: &mut VecDeque<Found>,
+    about: &mut Properties,
     parts: &mut Vec<Part>,
 ) -> Result<(), Fault> {
     const LOCAL_TIME: u8 = 1;
@@ -158,6 +167,12 @@ fn collect(
     }
     let open = if is_unfinished { u16_at(&identification, UNFINISHED_AT) } else { 0 };
     let header = file.block(HEADER_AT, *b"##HD")?;
+    match properties(file, &header) {
+        Ok(found) => *about = found,
+        Err(Fault::Io(error)) => return Err(error.into()),
+        // The traffic can be read all the same.
+        Err(_) => first.push_back(Found::Note(NO_COMMENT)),
+    }
     let clock_ns = i64::try_from(u64_at(&header.data, 0)).unwrap_or(0);
     let is_local = header.data.get(12).is_some_and(|flags| flags & LOCAL_TIME != 0);
     let start_ns = if is_local { zone.utc_ns(clock_ns) } else { clock_ns };

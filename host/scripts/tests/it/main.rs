@@ -3,6 +3,7 @@
 mod bench;
 mod hostile;
 mod live;
+mod twin;
 
 use std::sync::Arc;
 

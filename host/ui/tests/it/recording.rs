@@ -63,3 +63,35 @@ fn a_recording_from_the_start_is_whole_when_the_server_ends() {
     };
     assert_eq!(frames(&recorded), frames(&page.records));
 }
+
+#[test]
+fn with_a_condition_only_what_is_around_its_events_is_recorded() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = Running::of(device("virtual:car", folder.path(), false));
+    let mut page = server.page();
+    let only = |around: &str| json!({ "around": around, "beforeS": 0.05, "afterS": 0.0 });
+    for wrong in ["speed >", "Unknown > 1"] {
+        assert!(page.ask("record", &json!({ "name": "a.log", "only": only(wrong) })).is_err(), "{wrong}");
+    }
+    page.ask("record", &json!({ "name": "never.log", "only": only("dlc == 77 or id == 0x1FFFFFFF") }))
+        .unwrap();
+    page.until(|page| page.state["recording"]["condition"] == "dlc == 77 or id == 0x1FFFFFFF");
+    assert_eq!(page.state["recording"]["events"], 0);
+    page.ask("stopRecording", &json!({})).unwrap();
+    page.until(|page| page.notices.iter().any(|text| text.contains("never came true")));
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+
+    page.ask("record", &json!({ "name": "some.log", "only": only("channel == 2") })).unwrap();
+    page.until(|page| page.state["recording"]["events"].as_u64() > Some(20));
+    page.ask("stopRecording", &json!({})).unwrap();
+    page.until(|page| page.notices.iter().any(|text| text.contains("records are in")));
+    let recorded = records(&folder.path().join("some.log"));
+    // Nothing but the 50 ms before each frame of channel 2, and that frame.
+    let times: Vec<_> =
+        recorded.iter().filter(|record| record.channel == 2).map(|record| record.time_ns).collect();
+    assert!(times.len() > 20);
+    for record in &recorded {
+        let next = times.iter().find(|time| **time >= record.time_ns);
+        assert!(next.is_some_and(|time| time - record.time_ns <= 50_001_000), "{record:?}");
+    }
+}

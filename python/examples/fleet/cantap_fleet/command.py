@@ -12,12 +12,12 @@ import zipfile
 from importlib import resources
 from pathlib import Path
 
+from cantap.lake.ledger import FAILED, REFUSED
 from pyspark.sql import SparkSession
 
 from . import dataset, questions
 from .dataset import AccountError
 from .inputs import InputError
-from .ledger import FAILED, REFUSED
 from .worker import Settings
 
 _UNITS = {"": 1, "k": 1 << 10, "m": 1 << 20, "g": 1 << 30}

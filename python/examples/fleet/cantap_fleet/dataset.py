@@ -18,7 +18,9 @@ from pyspark import StorageLevel
 from pyspark.sql import DataFrame, SparkSession
 from pyspark.sql import functions as f
 
-from . import columns, inputs, ledger
+from cantap.lake import columns, ledger
+
+from . import inputs
 from .inputs import Bus, File, InputError
 from .worker import TRACES, Settings, decoder, local_path
 

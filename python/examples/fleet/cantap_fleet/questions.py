@@ -7,7 +7,9 @@ from importlib import resources
 
 from pyspark.sql import DataFrame, SparkSession
 
-from . import columns, dataset, ledger
+from cantap.lake import columns, ledger
+
+from . import dataset
 from .inputs import InputError
 
 #: The questions, and their adjustable parameters.

@@ -13,11 +13,11 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
+from cantap.lake import columns
+from cantap.lake.decoding import Request
+from cantap.lake.isolation import Failed, Process
+from cantap.lake.ledger import FAILED, REFUSED, Entry
 
-from . import columns
-from .decoding import Request
-from .isolation import Failed, Process
-from .ledger import FAILED, REFUSED, Entry
 
 if TYPE_CHECKING:
     from pyspark import Broadcast
@@ -42,7 +42,7 @@ class _Workplace:
         self._settings = settings
         self._databases = databases
         self._folder = Path(tempfile.mkdtemp(prefix="cantap-fleet-"))
-        command = [sys.executable, "-m", "cantap_fleet.decoding", str(self._folder)]
+        command = [sys.executable, "-m", "cantap.lake.decoding", str(self._folder)]
         self._process = Process(command, settings.timeout_s)
 
     def close(self) -> None:

@@ -55,7 +55,17 @@ wait_until receives can0 2
 cangen -g 1 -p 100 -n 500 -e -L r -D r can1
 echo 2000 > $GS/traffic
 echo '00000088 0000040000000000' > $GS/error
-has_sent() { [ "$(cat $GS/sent 2> /dev/null | wc -l)" = "$1" ]; }
+sent() { cat $GS/sent 2> /dev/null | wc -l; }
+captured() { { frames_on can0 capture.log; frames_on can1 capture.log; } | wc -l; }
+is_count() { [ "$("$@")" = "$_wanted" ]; }
+# until_all N COMMAND...: until it counts to N; however slow this computer is, for as long as it counts on.
+until_all() {
+  _wanted=$1
+  shift
+  while _before=$("$@"); ! wait_until is_count "$@"; do
+    [ "$("$@")" != "$_before" ] || return 1
+  done
+}
 # Until candump has all of them, and as long again as this computer may be busy.
 has_dumped() { [ "$(frames_on can0 dump.txt | wc -l)" = 2500 ]; }
 for _ in 1 2 3; do wait_until has_dumped && break; done
@@ -116,8 +126,8 @@ gs_start -d gs_usb: -b 500k
 wait_until is_started 0 1 && wait_until is_started 1 1
 sleep 0.5
 echo 5000 > $GS/traffic
-for _ in 1 2 3; do wait_until has_sent 5000 && break; done
-sleep 2
+until_all 5000 sent
+until_all 10000 captured
 check "gs_usb: a capture of both channels ends" gs_end
 _bad=0
 for _n in 0 1; do frames_on can$_n capture.log | cmp -s - $GS/sent || _bad=1; done
@@ -141,8 +151,8 @@ gs_start -d gs_usb: -b 500k
 wait_until is_started 1 1
 sleep 0.5
 echo 100 > $GS/traffic
-wait_until has_sent 100
-sleep 1
+until_all 100 sent
+until_all 200 captured
 kill $GS_SERVER
 wait_until has_told "unplugged"
 verdict $? "gs_usb: a pulled adapter is reported" "$(grep unplugged capture.err)"
@@ -154,8 +164,8 @@ wait_until has_told "the device is back after" && wait_until is_started 0 2
 verdict $? "gs_usb: the capture continues when it is back"
 sleep 0.5
 echo 100 > $GS/traffic
-for _ in 1 2; do wait_until has_sent 200 && break; done
-sleep 2
+until_all 200 sent
+until_all 400 captured
 check "gs_usb: the capture ends" gs_end
 frames_on can0 capture.log | cmp -s - $GS/sent && grep -q '"gaps":{"count":1,' capture.json
 verdict $? "gs_usb: before and after, every frame, and one gap" "$(frames_on can0 capture.log | wc -l) of $(wc -l < $GS/sent)"

@@ -35,7 +35,8 @@ export interface State {
   channels: ChannelState[];
   isNormal: boolean;
   filters: string[];
-  recording: { name: string; records: number; bytes: number; seconds: number } | null;
+  /** With a condition, `events` says how often it came true; there is no file before. */
+  recording: { name: string; records: number; bytes: number; seconds: number; condition: string | null; events: number } | null;
   periodic: PeriodicState[];
   pages: number;
   ended: string | null;
@@ -46,7 +47,7 @@ export type Change = { counter: { byte: number; lowBit: number; bits: number } }
 
 /** Each request: what it takes, and what it answers. */
 export interface Requests {
-  record: { in: { name: string }; out: Record<string, never> };
+  record: { in: { name: string; only: { around: string; beforeS: number; afterS: number } | null }; out: Record<string, never> };
   stopRecording: { in: Record<string, never>; out: Record<string, never> };
   bitrate: { in: { channel: number; bitrate: number }; out: Record<string, never> };
   filters: { in: { filters: string[] }; out: Record<string, never> };

@@ -21,6 +21,9 @@ export class DeviceView implements View {
   readonly #mode = el('div', { class: 'row' });
   readonly #filters = el('input', { class: 'mono', attrs: { type: 'text', 'aria-label': 'Filters of the device', placeholder: '123:7FF 400-4FF', spellcheck: 'false', autocomplete: 'off' } });
   readonly #name = el('input', { class: 'mono', attrs: { type: 'text', 'aria-label': 'Name of the recording', spellcheck: 'false', autocomplete: 'off' } });
+  readonly #around = el('input', { class: 'mono', attrs: { type: 'text', 'aria-label': 'Condition of the recording', placeholder: 'Speed > 80', spellcheck: 'false', autocomplete: 'off' } });
+  readonly #before = secondsInput('Seconds before each event', 2);
+  readonly #after = secondsInput('Seconds after each event', 5);
   readonly #recording = el('p', { attrs: { role: 'status' } });
   readonly #record: HTMLButtonElement;
   readonly #send: SendList;
@@ -42,7 +45,7 @@ export class DeviceView implements View {
         { class: 'page-scroll', attrs: { tabindex: 0, role: 'group', 'aria-label': 'Device and sending' } },
         section('Connection', this.#connection, this.#devices),
         section('Channels', el('table', { class: 'numbers' }, el('thead', {}, el('tr', {}, ...head.map((h) => el('th', { attrs: { scope: 'col' } }, h)))), this.#channels), this.#mode),
-        section('Recording', el('div', { class: 'row' }, field('File in the folder of cantap ui', this.#name, 'The suffix names the format: .blf, .log, .asc, .mf4 …'), this.#record), this.#recording),
+        section('Recording', el('div', { class: 'row' }, field('File in the folder of cantap ui', this.#name, 'The suffix names the format: .blf, .log, .asc, .mf4 …'), this.#record), el('div', { class: 'row' }, field('Only around', this.#around, 'A condition, such as Speed > 80, id == 0x123 or error; empty for everything.'), field('Seconds before', this.#before), field('Seconds after', this.#after)), this.#recording),
         section('Filters of the device', el('div', { class: 'row' }, field('Receive only', this.#filters, 'Several separated by blanks; empty for everything. What they keep back is neither shown nor recorded.'), button('Apply', () => this.#applyFilters()))),
         section('Send', this.#send.element),
       ),
@@ -70,7 +73,9 @@ export class DeviceView implements View {
       return;
     }
     const name = this.#name.value.trim();
-    void live.ask('record', { name }).then(() => (this.#name.value = proposedName()), this.#refused);
+    const around = this.#around.value.trim();
+    const only = around === '' ? null : { around, beforeS: Number(this.#before.value), afterS: Number(this.#after.value) };
+    void live.ask('record', { name, only }).then(() => (this.#name.value = proposedName()), this.#refused);
   }
 
   #applyFilters(): void {
@@ -144,9 +149,19 @@ export class DeviceView implements View {
 
   #drawRecording({ recording }: State): void {
     setText(this.#record, recording ? 'Stop recording' : 'Record');
-    this.#name.disabled = recording !== null;
-    setText(this.#recording, recording ? `${recording.name}: ${duration(recording.seconds)}, ${bytes(recording.bytes)}, ${plural(recording.records, 'record')}` : 'Everything that arrives is recorded by cantap ui, whatever this page shows.');
+    for (const input of [this.#name, this.#around, this.#before, this.#after]) input.disabled = recording !== null;
+    setText(this.#recording, recording ? recordingText(recording) : 'Everything that arrives is recorded by cantap ui, whatever this page shows.');
   }
+}
+
+function secondsInput(label: string, value: number): HTMLInputElement {
+  return el('input', { attrs: { type: 'number', min: 0, max: 86400, step: 'any', value, 'aria-label': label } });
+}
+
+function recordingText({ name, condition, events, records, seconds, bytes: size }: NonNullable<State['recording']>): string {
+  if (condition !== null && events === 0) return `Armed: ${name} begins when ${condition}. Until then there is no file.`;
+  const counted = `${name}: ${duration(seconds)}, ${bytes(size)}, ${plural(records, 'record')}`;
+  return condition === null ? counted : `${counted}, around ${plural(events, 'event')} of ${condition}`;
 }
 
 /** A name of its own for each recording, by the time. */

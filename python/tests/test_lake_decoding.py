@@ -1,14 +1,10 @@
-"""What the fleet's job makes of one trace, without Spark: `python/examples/fleet/cantap_fleet/decoding.py`."""
+"""What a lake has of one trace."""
 
-import sys
-from pathlib import Path
 
 import pytest
 
 pa = pytest.importorskip("pyarrow")
-sys.path.insert(0, str(Path(__file__).parents[1] / "examples" / "fleet"))
-
-from cantap_fleet import decoding
+from cantap.lake import decoding
 
 # As in its process: faults are in the ledger.
 pytestmark = pytest.mark.filterwarnings("ignore::cantap.CantapWarning")

@@ -1,0 +1,84 @@
+//! What commands say of an adapter that does not count its losses: never zero.
+
+use std::io::Write;
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+use std::sync::mpsc;
+
+use serde_json::Value;
+
+/// A pipe into which another program writes a trace: nobody knows what that program lost. It stays open until the sender is dropped.
+pub fn pipe(test: &str, text: String) -> (String, mpsc::Sender<()>) {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("adapters");
+    std::fs::create_dir_all(&folder).unwrap();
+    let pipe = folder.join(test);
+    let _ = std::fs::remove_file(&pipe);
+    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    let (done, ends) = mpsc::channel::<()>();
+    let device = format!("candump:{}", pipe.display());
+    std::thread::spawn(move || {
+        let mut writer = std::fs::File::options().write(true).open(pipe).unwrap();
+        let _ = writer.write_all(text.as_bytes());
+        let _ = ends.recv();
+    });
+    (device, done)
+}
+
+/// Runs a command on such a pipe. Standard output and standard error.
+fn on_pipe(test: &str, line: &str) -> (String, String) {
+    // It does not go back to zero.
+    let row = |at| format!("(1700000000.{:06}) can0 123#{at:04X}\n", at * 500);
+    let text = (0..100).map(row).collect();
+    let (device, done) = pipe(test, text);
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
+    let args = line.split(' ').map(|arg| if arg == "PIPE" { device.as_str() } else { arg });
+    let Output { status, stdout, stderr } = command.args(args).stdin(Stdio::null()).output().unwrap();
+    drop(done);
+    let text = |bytes| String::from_utf8(bytes).unwrap();
+    let (out, err) = (text(stdout), text(stderr));
+    assert!(status.success(), "{line}: {out}{err}");
+    (out, err)
+}
+
+fn object(text: &str) -> Value {
+    serde_json::from_str(text).unwrap_or_else(|_| panic!("{text}"))
+}
+
+#[test]
+fn a_capture_from_one_has_an_unknown_number_of_losses() {
+    let (_, err) = on_pipe("text", "capture -d PIPE -c 1 -b 500k -n 100");
+    assert!(err.contains("100 frames") && err.contains(", an unknown number lost,"), "{err}");
+    assert!(err.contains("lost: controller 0, queue 0, link 0, host 0, and an unknown number\n"), "{err}");
+    assert!(err.contains("as far as the trace reports them") && !err.contains(" 0 lost"), "{err}");
+    let (out, _) = on_pipe("json", "capture -d PIPE -c 1 -b 500k -n 100 --json");
+    let summary = object(&out);
+    assert_eq!(summary["lost"]["unknown"], 1, "{out}");
+    assert_eq!(summary["channels"][0]["lost_at_least"], true, "{out}");
+    // Nobody counted the losses of a file that came from there, either.
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("adapters");
+    let file = folder.join("kept.pcapng");
+    on_pipe("file", &format!("capture -d PIPE -c 1 -b 500k -n 100 --force -o {}", file.display()));
+    let stats = Command::new(env!("CARGO_BIN_EXE_cantap")).arg("stats").arg(&file).output().unwrap();
+    let text = String::from_utf8(stats.stdout).unwrap();
+    assert!(text.contains("an unknown number lost") && !text.contains(" 0 lost"), "{text}");
+}
+
+#[test]
+fn figures_of_one_that_are_not_counted_are_left_out() {
+    let (out, _) = on_pipe("stats", "stats -d PIPE -c 1 -b 500k -t 500ms --json");
+    let last = object(out.lines().last().unwrap());
+    assert_eq!(last["lost_at_least"], true, "{out}");
+    let (out, _) = on_pipe("status", "status -d PIPE");
+    assert!(out.contains("lost: controller not counted by this adapter, queue 0"), "{out}");
+    let (out, _) = on_pipe("status-json", "status -d PIPE --json");
+    assert_eq!(object(&out)["channels"][0]["lost_controller"], Value::Null, "{out}");
+    let (out, _) = on_pipe("info", "info -d PIPE --json");
+    assert_eq!(object(&out)["adapter"]["counts_losses"], false, "{out}");
+}
+
+/// A trigger on losses is for frames that are missing, not for an adapter that does not know.
+#[test]
+fn a_trigger_on_losses_does_not_take_it_for_one() {
+    let (out, _) = on_pipe("trigger", "capture -d PIPE -c 1 -b 500k -t 500ms --trigger lost --json");
+    assert_eq!(object(&out)["trigger"]["events"], 0, "{out}");
+}

@@ -1,0 +1,124 @@
+"""The command `cantap-lake`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+
+from .._native import CantapError
+from .ingest import ingest
+from .ledger import FAILED, REFUSED
+from .store import TABLES, Store, StoreError
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="cantap-lake", description="Many traces as tables of Parquet, decoded once each.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    add = commands.add_parser("add", help="read traces into a lake; those that are in it already are not read again")
+    add.add_argument("lake", help="the lake's folder, which is made if it is not there")
+    add.add_argument("source", nargs="+", help="a trace, a pattern, a folder with everything below it, a URL such as s3://bucket/*.blf")
+    add.add_argument("--db", metavar="[CHANNEL=]FILE", action="append", default=[], help="a database; can be repeated")
+    add.add_argument("--j1939", action="store_true", help="29-bit messages of the databases are J1939 parameter groups")
+    add.add_argument("--signal", metavar="PATTERN", action="append", default=[], help="only these signals; can be repeated")
+    add.add_argument("--vehicle", metavar="NAME", help="whose traces they are [default: the folder that they are in]")
+    add.add_argument("--zone", help="of dates in traces that name none, such as Europe/Berlin [default: UTC]")
+    add.add_argument("--workers", metavar="N", type=_count, help="how many traces at a time [default: as many as there are processors]")
+    add.add_argument("--timeout", metavar="SECONDS", type=_seconds, default=3600.0, help="longest time for one trace [default: 3600]")
+    add.add_argument("--retry", action="store_true", help="also those that were refused before")
+    ledger = commands.add_parser("ledger", help="what became of each trace, a line of JSON each")
+    ledger.add_argument("lake")
+    delta = commands.add_parser("delta", help="make the tables Delta tables, too, of the files that they have now")
+    delta.add_argument("lake")
+    check = commands.add_parser("check", help="count the rows of all files, and look for what an interrupted run left")
+    check.add_argument("lake")
+    check.add_argument("--remove", action="store_true", help="remove what an interrupted run left")
+    return parser
+
+
+def _count(text: str) -> int:
+    if not (text.isascii() and text.isdecimal() and 1 <= int(text) <= 1024):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number from 1 to 1024")
+    return int(text)
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not 0 < seconds < 1e9:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a time; give seconds, more than 0")
+    return seconds
+
+
+def _databases(texts: Sequence[str]) -> dict[int, str] | list[str] | None:
+    pairs = [text.partition("=") for text in texts]
+    if not any(equals and channel.isdecimal() for channel, equals, _ in pairs):
+        return list(texts) or None
+    if not all(equals and channel.isdecimal() for channel, equals, _ in pairs):
+        raise StoreError("either each --db names its channel, as in --db 1=car.dbc, or none does")
+    return {int(channel): path for channel, _, path in pairs}
+
+
+def _add(arguments: argparse.Namespace) -> int:
+    summary = ingest(
+        arguments.source,
+        arguments.lake,
+        db=_databases(arguments.db),
+        j1939=arguments.j1939,
+        signals=arguments.signal,
+        vehicle=arguments.vehicle,
+        zone=arguments.zone,
+        workers=arguments.workers,
+        timeout=arguments.timeout,
+        retry=arguments.retry,
+    )
+    for trace, problem in sorted(summary.problems.items()):
+        print(f"{_clean(trace)}: {_clean(problem)}", file=sys.stderr)
+    words = ", ".join(f"{count} {state}" for state, count in sorted(summary.states.items()))
+    print(f"{summary.states.total()} traces: {words or 'none'}; {summary.records} records added")
+    return 1 if summary.states[FAILED] + summary.states[REFUSED] else 0
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    store = Store(arguments.lake)
+    problems, stray = list(store.problems()), store.stray()
+    for problem in problems:
+        print(_clean(problem), file=sys.stderr)
+    if arguments.remove:
+        for path in stray:
+            path.unlink()
+    left = "removed" if arguments.remove else "found; --remove removes them"
+    print(f"{sum(1 for _ in store.entries())} traces, {len(problems)} problems" + (f", {len(stray)} files of an interrupted run {left}" if stray else ""))
+    return 1 if problems else 0
+
+
+def _clean(text: str) -> str:
+    """Names and texts come from files of others."""
+    return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command; the exit code is 1 if a trace could not be read, or the lake is not as its ledger says."""
+    chosen = _parser().parse_args(arguments)
+    try:
+        if chosen.command == "add":
+            return _add(chosen)
+        if chosen.command == "check":
+            return _check(chosen)
+        if chosen.command == "delta":
+            for table in TABLES:
+                print(f"{table}: version {Store(chosen.lake).write_delta(table)}")
+            return 0
+        for entry in Store(chosen.lake).entries():
+            print(json.dumps(entry, sort_keys=True))
+        return 0
+    except (StoreError, OSError, ValueError, ModuleNotFoundError, CantapError) as error:
+        print(f"error: {_clean(str(error))}", file=sys.stderr)
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,227 @@
+"""Reads traces into a lake: each content once, several at a time, each in a process of its own."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import sys
+import tempfile
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pyarrow as pa
+
+from .inputs import Fetched, Trace, traces
+from .isolation import Failed, Process
+from .ledger import FAILED, REFUSED, Entry
+from .store import Store
+
+if TYPE_CHECKING:
+    from .decoding import Request
+
+#: The state of a trace whose content is in the lake under another name, or was before.
+DUPLICATE = "duplicate"
+KNOWN = "known"
+
+
+@dataclass
+class Summary:
+    """What became of the traces of a run."""
+
+    states: Counter[str] = field(default_factory=Counter)
+    """How many are `read`, `cut`, `damaged`, `empty`, `undecoded`, `refused`, `failed`; `known` from an earlier run, or a `duplicate` in this one."""
+    problems: dict[str, str] = field(default_factory=dict)
+    """By trace, in words."""
+    records: int = 0
+    """Rows of frames that were added."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is the same for all traces."""
+
+    databases: tuple[tuple[int | None, str], ...]
+    j1939: bool
+    signals: tuple[str, ...]
+    zone: str | None
+    timeout_s: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """What rows depend on: databases by their content."""
+        digests = [(channel, hashlib.sha256(Path(path).read_bytes()).hexdigest()) for channel, path in self.databases]
+        return {"databases": [list(pair) for pair in digests], "j1939": self.j1939, "signals": list(self.signals), "zone": self.zone}
+
+
+def ingest(
+    sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    folder: str | os.PathLike[str],
+    *,
+    db: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | Mapping[int, str | os.PathLike[str]] | None = None,
+    j1939: bool = False,
+    signals: Iterable[str] = (),
+    vehicle: str | None = None,
+    zone: str | None = None,
+    workers: int | None = None,
+    timeout: float = 3600.0,
+    retry: bool = False,
+    done: Callable[[str, str], None] | None = None,
+) -> Summary:
+    """Reads traces into a lake, which is made if it is not there. Those whose content is in it already are not read again.
+
+    `sources`: files, patterns, folders with everything below them, URLs of fsspec. `db`: as for `cantap.read`. `retry`: traces that failed
+    before are tried again in any case; with `retry` also those that were refused. `done`: called with each trace and its state.
+    """
+    names = [sources] if isinstance(sources, (str, os.PathLike)) else list(sources)
+    settings = Settings(_pairs(db), j1939, tuple(signals), zone, timeout)
+    setup = settings.to_dict()
+    store = Store(folder)
+    found = traces([os.fspath(name) for name in names], vehicle)
+    store.create()
+    run = _Run(store, settings, setup, retry, done)
+    pool = ThreadPoolExecutor(workers or os.cpu_count() or 1)
+    try:
+        list(pool.map(run.read, [trace for trace in found if not _is_inside(trace, store)]))
+    finally:
+        # Ctrl-C does not wait for what has not begun.
+        pool.shutdown(cancel_futures=True)
+        run.close()
+    return run.summary
+
+
+def _is_inside(trace: Trace, store: Store) -> bool:
+    """Whether it is one of the lake's own files: the lake may be in the folder that has the traces."""
+    return isinstance(trace.source, str) and Path(trace.source).resolve().is_relative_to(store.folder.resolve())
+
+
+def _pairs(db: Any) -> tuple[tuple[int | None, str], ...]:
+    if db is None:
+        return ()
+    if isinstance(db, (str, os.PathLike)):
+        return ((None, os.fspath(db)),)
+    if isinstance(db, Mapping):
+        return tuple((channel, os.fspath(path)) for channel, path in db.items())
+    return tuple((None, os.fspath(path)) for path in db)
+
+
+class _Run:
+    """The state of a run that its threads share."""
+
+    def __init__(self, store: Store, settings: Settings, setup: dict[str, Any], retry: bool, done: Callable[[str, str], None] | None) -> None:
+        self._store, self._settings, self._setup, self._retry, self._done = store, settings, setup, retry, done
+        self._lock = threading.Lock()
+        #: Contents that a thread has begun with, each with all of its names in this run.
+        self._names: dict[str, set[str]] = {}
+        self._places: list[_Workplace] = []
+        self._of_thread = threading.local()
+        self.summary = Summary()
+
+    def close(self) -> None:
+        for place in self._places:
+            place.close()
+        for sha256, names in self._names.items():
+            entry = self._store.entry(sha256)
+            if entry is not None and not names <= set(entry["names"]):
+                self._store.write_entry({**entry, "names": sorted(names.union(entry["names"]))})
+
+    def read(self, trace: Trace) -> None:
+        """Reads a trace, unless its content is known."""
+        try:
+            fetched = trace.fetch(self._place().folder)
+        except OSError as error:
+            # There is no content by which it would be known: the next run tries again.
+            self._count(trace, FAILED, str(error), 0)
+            return
+        try:
+            self._read(trace, fetched)
+        finally:
+            fetched.discard()
+
+    def _read(self, trace: Trace, fetched: Fetched) -> None:
+        with self._lock:
+            is_first = fetched.sha256 not in self._names
+            self._names.setdefault(fetched.sha256, set()).add(trace.name)
+        if not is_first:
+            self._count(trace, DUPLICATE, None, 0)
+            return
+        before = self._store.entry(fetched.sha256)
+        if before is not None and before["setup"] == self._setup and not self._is_to_be_tried_again(before["state"]):
+            self._count(trace, KNOWN, None, 0)
+            return
+        answer = self._place().decode(trace, fetched)
+        if not fetched.is_unchanged():
+            with self._lock:
+                del self._names[fetched.sha256]
+            self._count(trace, FAILED, "it changed while it was read", 0)
+            return
+        names = {trace.name, *(before["names"] if before else ())}
+        entry = {**answer, "sha256": fetched.sha256, "names": sorted(names), "setup": self._setup}
+        rows = self._place().rows(answer["state"])
+        self._store.write(entry, rows)
+        self._count(trace, answer["state"], answer["problem"], answer["records"])
+
+    def _is_to_be_tried_again(self, state: str) -> bool:
+        return state == FAILED or (self._retry and state == REFUSED)
+
+    def _count(self, trace: Trace, state: str, problem: str | None, records: int) -> None:
+        with self._lock:
+            self.summary.states[state] += 1
+            self.summary.records += records
+            if problem:
+                self.summary.problems[trace.name] = problem
+            if self._done is not None:
+                self._done(trace.name, state)
+
+    def _place(self) -> _Workplace:
+        if not hasattr(self._of_thread, "place"):
+            self._of_thread.place = _Workplace(self._settings)
+            with self._lock:
+                self._places.append(self._of_thread.place)
+        place: _Workplace = self._of_thread.place
+        return place
+
+
+class _Workplace:
+    """A thread's folder, and the process that decodes for it."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self.folder = Path(tempfile.mkdtemp(prefix="cantap-lake-"))
+        self._rows = self.folder / "rows.arrow"
+        command = [sys.executable, "-m", "cantap.lake.decoding", str(self.folder)]
+        self._process = Process(command, settings.timeout_s)
+
+    def close(self) -> None:
+        self._process.__exit__(None, None, None)
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def decode(self, trace: Trace, fetched: Fetched) -> dict[str, Any]:
+        """The entry of a trace; its rows are then in a file."""
+        request: Request = {
+            "path": str(fetched.path),
+            "trace": trace.name,
+            "vehicle": trace.vehicle,
+            "bytes": fetched.bytes,
+            "databases": list(self._settings.databases),
+            "database_names": [path for _, path in self._settings.databases],
+            "j1939": self._settings.j1939,
+            "signals": list(self._settings.signals),
+            "zone": self._settings.zone,
+            "rows": str(self._rows),
+        }
+        try:
+            return self._process.ask(request)
+        except Failed as failed:
+            return Entry(trace.name, trace.vehicle, fetched.bytes, state=FAILED, problem=str(failed)).to_dict()
+
+    def rows(self, state: str) -> Iterator[pa.RecordBatch]:
+        """The rows of the trace that was decoded last."""
+        if state not in (REFUSED, FAILED):
+            with pa.memory_map(str(self._rows)) as file, pa.ipc.open_stream(file) as reader:
+                yield from reader
+        self._rows.unlink(missing_ok=True)

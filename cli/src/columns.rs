@@ -5,6 +5,7 @@ use std::path::Path;
 use cantap::TraceRecord;
 use cantap_columns::FrameColumns;
 use cantap_columns::parquet::{Dataset, Key, ParquetError, ParquetFile, Table};
+use cantap_formats::WriteOptions;
 
 use crate::usage_error::usage;
 
@@ -17,6 +18,19 @@ pub fn is_parquet(path: &Path) -> bool {
 pub fn name_of(trace: &Path) -> &str {
     let name = trace.file_name().and_then(|name| name.to_str()).filter(|name| *name != "-");
     name.and_then(|name| name.split('.').find(|part| !part.is_empty())).unwrap_or("trace")
+}
+
+/// Refuses what a Parquet file cannot be: standard output, because it takes its name when it is complete, or a series of files.
+pub fn check_file(path: &Path, options: &WriteOptions) -> anyhow::Result<()> {
+    if path.as_os_str() == "-" {
+        return Err(usage("Parquet is not written to standard output; give a file's name"));
+    }
+    if !options.rotation.at.is_empty() {
+        return Err(usage(
+            "Parquet files are not rotated; leave --rotate out, or convert with --partition day",
+        ));
+    }
+    Ok(())
 }
 
 /// Refuses a file's name where a folder is needed.

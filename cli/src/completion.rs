@@ -138,7 +138,8 @@ fn offer_formats(current: &OsStr) -> Vec<CompletionCandidate> {
 }
 
 fn offer_written_formats(current: &OsStr) -> Vec<CompletionCandidate> {
-    beginning(current, Format::written_names().split(", ").map(|name| (name, "")))
+    let names = format!("{}, {}", Format::written_names(), Format::Parquet);
+    beginning(current, names.split(", ").map(|name| (name, "")))
 }
 
 fn offer_databases(current: &OsStr) -> Vec<CompletionCandidate> {

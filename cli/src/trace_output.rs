@@ -33,7 +33,8 @@ impl TraceOutput {
     /// files of a series.
     pub fn create(path: &Path, options: &WriteOptions, grows: bool) -> anyhow::Result<Self> {
         #[cfg(feature = "parquet")]
-        if options.format.is_none() && columns::is_parquet(path) {
+        if options.format == Some(Format::Parquet) || options.format.is_none() && columns::is_parquet(path) {
+            columns::check_file(path, options)?;
             return Self::of_columns(path, FrameFiles::file(path));
         }
         let options = &named(options.clone(), path)?;
@@ -116,6 +117,10 @@ impl TraceOutput {
 
 /// The options with the format of the file's name, if no other is given.
 pub fn named(mut options: WriteOptions, path: &Path) -> anyhow::Result<WriteOptions> {
+    #[cfg(not(feature = "parquet"))]
+    if options.format == Some(Format::Parquet) {
+        bail!(WITHOUT_PARQUET);
+    }
     if options.format.is_none() && path.as_os_str() != "-" {
         #[cfg(not(feature = "parquet"))]
         refuse_parquet(path)?;
@@ -130,13 +135,14 @@ pub fn named(mut options: WriteOptions, path: &Path) -> anyhow::Result<WriteOpti
 #[cfg(not(feature = "parquet"))]
 pub fn refuse_parquet(path: &Path) -> anyhow::Result<()> {
     if path.extension().is_some_and(|suffix| suffix.eq_ignore_ascii_case("parquet")) {
-        bail!(
-            "this build has no Parquet; add `--features parquet` to its command line, or install the command with \
-             `cargo install --locked --path cli`"
-        );
+        bail!(WITHOUT_PARQUET);
     }
     Ok(())
 }
+
+#[cfg(not(feature = "parquet"))]
+const WITHOUT_PARQUET: &str = "this build has no Parquet; add `--features parquet` to its command line, or install the command with \
+     `cargo install --locked --path cli`";
 
 /// Refuses to overwrite what a bus said once and will not say again.
 pub fn refuse_older(path: &Path, force: bool) -> anyhow::Result<()> {

@@ -1,6 +1,6 @@
 """Nodes of other programs on a board shared by `cantap serve`, for nodes.rs: they connect through socketcand.
 
-uds, memory, ecus, obd, obd_29, obd_on_uds, canopen, j1939 HOST PORT     serves until standard input ends; prints "ready" when it does
+uds, memory, ecus, servers, obd, obd_29, obd_on_uds, canopen, j1939 HOST PORT     serves until standard input ends; prints "ready" when it does
 tester HOST PORT                                     prints "ready", and then what udsoncan has read of the ECU that is asked with 7E0
 """
 
@@ -189,6 +189,52 @@ def serve_ecus(host, port):
     vin = lambda number: "62F190" + (VIN + number).hex()
     answers = [[vin(b"1")], ["7F2278", "7F2278", vin(b"2")], ["7F2231"], ["62F190" + b"F4".hex()]]
     serve_four(host, port, [False, True], [{"22F190": known} for known in answers])
+
+
+def serve_servers(host, port):
+    """ECUs of all kinds: prompt, late, one that refuses, one that sends answers without end, one with an address, one with 29 bits, and one that sends
+    with the identifier of requests to 7E5. Whatever is not "tester present" is printed."""
+    import can
+
+    line = bus(host, port)
+    over = threading.Event()
+
+    def say(id, data, after=0.002):
+        def later():
+            time.sleep(after)
+            line.send(can.Message(arbitration_id=id, is_extended_id=id > 0x7FF, data=bytes.fromhex(data)))
+
+        threading.Thread(target=later, daemon=True).start()
+
+    def answer(message):
+        id, data = message.arbitration_id, bytes(message.data)
+        if bytes([0x3E, 0]) not in data[:4]:
+            print(f"{id:X}#{data.hex()}", flush=True)
+        if id == 0x7E0 or id == 0x7DF:
+            say(0x7E8, "027E00")
+        if id == 0x7E1:
+            say(0x7E9, "027E00AAAAAAAAAA", 0.4)
+        if id == 0x7E2:
+            say(0x7EA, "037F3E11AAAAAAAA")
+        if id == 0x7E3:
+            for _ in range(50):
+                say(0x7EB, "027E00AAAAAAAAAA", 0.01)
+        if id == 0x6F1 and data[0] == 0x12:
+            say(0x612, "F1027E00")
+        if id == 0x18DA10F1:
+            say(0x18DAF110, "027E00")
+        if id == 0x7E5:
+            say(0x7ED, "027E00")
+
+    def others():
+        while not over.is_set():
+            line.send(can.Message(arbitration_id=0x7E5, is_extended_id=False, data=[2, 0x3E, 0]))
+            time.sleep(0.1)
+
+    can.Notifier(line, [answer])
+    threading.Thread(target=others, daemon=True).start()
+    wait()
+    over.set()
 
 
 def serve_obd(host, port, extended=False):

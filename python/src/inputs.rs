@@ -3,7 +3,7 @@
 use std::io::{self, Read};
 use std::path::PathBuf;
 
-use cantap_formats::{OpenError, ReadOptions, TraceReader, open_reader, open_source};
+use cantap_formats::{ReadOptions, TraceReader, open_reader, open_source};
 use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
 use pyo3::pybacked::PyBackedBytes;
@@ -47,19 +47,7 @@ impl TraceFile {
             Self::Path(path) => open_reader(path, options),
             Self::Opened { name, open } => open_source(name, PythonFile::open(open)?, options),
         };
-        opened.map_err(|error| self.explain(error))
-    }
-
-    fn explain(&self, error: OpenError) -> Error {
-        let name = self.name();
-        let is_parquet =
-            name.rsplit_once('.').is_some_and(|(_, suffix)| suffix.eq_ignore_ascii_case("parquet"));
-        match Error::from(error) {
-            Error::Format(words) if is_parquet => Error::Format(format!(
-                "{words}; Parquet is only written here: read it with pandas, Polars or DuckDB, and pass on what they return"
-            )),
-            error => error,
-        }
+        opened.map_err(Error::from)
     }
 }
 

@@ -389,10 +389,10 @@ impl Drop for Temporary {
     }
 }
 
-/// Whether a file's name is that of a trace.
+/// Whether a file's name is that of a trace. Tables of decoded signals end in `.parquet`, too: such a file is only read if it is named itself.
 #[pyfunction]
 fn is_trace_name(name: PathBuf) -> bool {
-    Format::of_path(&name).is_ok()
+    Format::of_path(&name).is_ok_and(|format| format != Format::Parquet)
 }
 
 /// Adds the functions to the module.

@@ -80,7 +80,7 @@ pub struct Args {
 #[derive(clap::Args)]
 pub struct WriteArgs {
     /// The format to write, if the file's name does not show it: candump, asc, blf, trc (2.1), trc2.0, trc1.3, trc1.2,
-    /// trc1.1, trc1.0, csv (python-can's), csv-full, csv-analyser, csv-gvret, pcapng, mf4, dif.
+    /// trc1.1, trc1.0, csv (python-can's), csv-full, csv-analyser, csv-gvret, pcapng, mf4, dif, parquet.
     #[arg(long, visible_alias = "to", value_name = "FORMAT", add = completion::written_formats())]
     format: Option<Format>,
     /// Begin a new file (trace-000001.log and so on) at this size (100M) or time (1h). Repeat for both.
@@ -158,9 +158,11 @@ impl Args {
 
 /// Examples, and what the table of formats says.
 fn after_help() -> String {
-    let read: Vec<_> =
-        Format::all().filter(|format| !format.is_written()).map(|format| format.to_string()).collect();
-    let (read, written) = (read.join(", "), Format::written_names());
+    let read: Vec<_> = Format::all()
+        .filter(|format| !format.is_written() && *format != Format::Parquet)
+        .map(|format| format.to_string())
+        .collect();
+    let (read, written) = (read.join(", "), format!("{}, {}", Format::written_names(), Format::Parquet));
     format!(
         "Examples:\n  \
     cantap convert trace.log trace.blf\n  \

@@ -3,6 +3,7 @@
 pub mod hex;
 mod key;
 mod memory;
+mod scan;
 mod script;
 mod transfer_args;
 
@@ -14,6 +15,7 @@ use cantap_protocols::diagnostics::Diagnostics;
 use self::hex::{Hex, byte, bytes, number, word};
 use self::key::{KeyArgs, level};
 use self::memory::{DownloadArgs, UploadArgs};
+use self::scan::ScanArgs;
 use self::script::{RunArgs, Step};
 pub use self::transfer_args::TransferArgs;
 use crate::speak_args::SpeakArgs;
@@ -25,6 +27,7 @@ use cantap_work::uds::{Client, REFUSAL};
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
+                cantap uds -d virtual:car scan\n  \
                 cantap uds -d virtual:car read F190 F18C\n  \
                 cantap uds -d /dev/ttyACM0 -b 500k --session extended read F190\n  \
                 cantap uds -d COM5 -b 500k --pair 18DA10F1:18DAF110 dtc\n  \
@@ -50,6 +53,8 @@ pub struct Args {
 
 #[derive(clap::Subcommand, Clone)]
 pub enum What {
+    /// Find the ECUs that answer: by the identifiers that the standards reserve, and by a maker's.
+    Scan(ScanArgs),
     /// Read data by identifier.
     Read {
         /// The identifiers in hexadecimal, as F190.
@@ -162,8 +167,19 @@ fn session(text: &str) -> Result<u8, String> {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    if let What::Scan(scan) = &args.what {
+        if args.session.is_some() || args.key.has_command() {
+            return Err(usage(
+                "a scan opens no session and unlocks nothing; leave --session, --security and --key-command out",
+            ));
+        }
+        scan::run(&args.speak, scan, &args.transfer.options())?;
+        return Ok(ExitCode::SUCCESS);
+    }
     let steps = match &args.what {
-        What::Run(RunArgs { file }) => script::read(file, |what| matches!(what, What::Run { .. }))?,
+        What::Run(RunArgs { file }) => {
+            script::read(file, |what| matches!(what, What::Run { .. } | What::Scan { .. }))?
+        }
         what => vec![Step { place: None, what: what.clone() }],
     };
     // Nothing is sent unless all of it can be.
@@ -321,8 +337,11 @@ fn requests(what: &What) -> anyhow::Result<Vec<Vec<u8>>> {
             let Hex(request) = bytes(&texts.concat()).map_err(usage)?;
             vec![request]
         }
-        What::Run(_) | What::Security { .. } | What::Wait { .. } | What::Download(_) | What::Upload(_) => {
-            Vec::new()
-        }
+        What::Run(_)
+        | What::Scan(_)
+        | What::Security { .. }
+        | What::Wait { .. }
+        | What::Download(_)
+        | What::Upload(_) => Vec::new(),
     })
 }

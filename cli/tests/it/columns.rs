@@ -154,3 +154,71 @@ fn decoded_signals_go_to_a_file_of_their_form() {
         assert!(!folder.join(name).exists(), "{name}");
     }
 }
+
+/// Everything that a trace has comes back from its table, and every command reads it.
+#[test]
+fn a_parquet_file_is_a_trace_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    drive(folder);
+    cantap(folder, "convert drive.log drive.parquet");
+    cantap(folder, "convert drive.parquet again.log");
+    cantap(folder, "convert drive.log directly.log");
+    assert!(fs::read(folder.join("again.log")).unwrap() == fs::read(folder.join("directly.log")).unwrap());
+    cantap(folder, "convert --to parquet drive.log other.bin");
+    for command in ["stats IN --json", "decode --db car.dbc IN --csv"] {
+        let of = |name: &str| cantap(folder, &command.replace("IN", name)).replace(name, "IN");
+        let without_format = |text: String| text.replace("\"parquet\"", "\"candump\"");
+        assert!(without_format(of("drive.parquet")) == of("drive.log"), "{command}");
+        assert!(without_format(of("other.bin")) == of("drive.log"), "{command}");
+    }
+    for (line, says) in [
+        ("convert drive.log - --to parquet", "give a file's name"),
+        ("convert drive.log out.parquet --rotate 1M", "--partition day"),
+    ] {
+        let (code, _, err) = run(folder, line);
+        assert_eq!(code, Some(2), "{line}: {err}");
+        assert!(err.contains(says), "{line}: {err}");
+    }
+    cantap(folder, "decode --db car.dbc drive.log -o signals.parquet");
+    let (code, _, err) = run(folder, "convert signals.parquet frames.log");
+    assert_eq!(code, Some(0), "{err}");
+    assert!(err.contains("decoded values, whose frames are not in the table"), "{err}");
+    cantap(folder, "decode --db car.dbc drive.log -o wide.parquet --resample 100ms");
+    let (code, _, err) = run(folder, "convert wide.parquet frames.log");
+    assert_eq!(code, Some(1), "{err}");
+    assert!(err.contains("say what they are with --columns"), "{err}");
+}
+
+/// As pandas and pyarrow write frames: with their compressions, and columns of any names and types.
+#[test]
+fn tables_that_engines_wrote_are_traces() {
+    let Some(python) = peers::python_with("pandas, pyarrow") else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let script = "
+import pandas, sys
+frames = pandas.DataFrame({
+    'Timestamp': pandas.to_datetime([1700000000000000001, 1700000001000000002, 1700000001500000000], utc=True),
+    'CAN ID': [0x123, 0x18DAF110, 0x7FF], 'Bus': [0, 0, 1],
+    'Data': [bytes([1, 2]), b'', bytes(range(8))], 'Label': ['a', 'b', None]})
+for codec in ['snappy', 'gzip', 'lz4', 'zstd', 'none']:
+    frames.to_parquet(f'{codec}.parquet', compression=codec)
+frames.to_parquet('brotli.parquet', compression='brotli')
+frames['Data'] = [[1, 2], [], list(range(8))]
+frames.to_parquet('lists.parquet')
+pandas.DataFrame({'when': [1000.5], 'who': ['18DAF110'], 'd': ['0x0102']}).to_parquet('unknown.parquet')
+";
+    let output = Command::new(python).args(["-c", script]).current_dir(folder).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let wanted = "(1700000000.000000) can0 123#0102\n(1700000001.000000) can0 18DAF110#\n(1700000001.500000) can1 7FF#0001020304050607\n";
+    for name in ["snappy", "gzip", "lz4", "zstd", "none", "lists"] {
+        assert_eq!(cantap(folder, &format!("convert {name}.parquet -")), wanted, "{name}");
+    }
+    let (code, _, err) = run(folder, "convert brotli.parquet a.log");
+    assert!(code == Some(1) && err.to_lowercase().contains("brotli"), "{err}");
+    let (code, _, err) = run(folder, "convert unknown.parquet a.log");
+    assert!(code == Some(1) && err.contains("when, who, d"), "{err}");
+    let found = cantap(folder, "convert unknown.parquet - --columns time=when:ms,id=who,data=d");
+    assert_eq!(found, "(1.000500) can0 18DAF110#0102\n");
+}

@@ -110,6 +110,20 @@ fn an_ecu_is_asked_and_refuses_by_name() {
     assert!(code == Some(0) && said.contains("7DF > 7E9"), "{said}");
 }
 
+#[test]
+fn a_scan_of_the_car_finds_its_two_ecus_and_says_what_it_sends() {
+    let (code, out, err) = cantap(&["uds", "-d", "virtual:car", "scan", "--p2", "200ms"]);
+    assert_eq!(code, Some(0), "{err}");
+    let pairs: Vec<_> = out.lines().filter_map(|line| line.split_whitespace().nth(1)).collect();
+    assert_eq!(pairs, ["7E0:7E8", "7E1:7E9"], "{out}");
+    assert!(
+        err.contains("265 addresses") && err.contains("(3E 00)") && err.contains("7DF, 18DB33F1"),
+        "{err}"
+    );
+    let (code, said) = badly("uds -d virtual:load=0 -b 500k scan --functional --p2 100ms");
+    assert!(code == Some(1) && said.contains("nobody answered"), "{said}");
+}
+
 /// Its engine sends its trouble codes every second, whether requested or not.
 #[test]
 fn a_node_of_j1939_is_heard_for_a_bounded_time() {

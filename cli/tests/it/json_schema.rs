@@ -110,6 +110,7 @@ pub const LINES: &[(&str, i32, &[&str])] = &[
     ("obd codes -d virtual:car", 0, &["conversations", "conversations"]),
     ("obd vin -d virtual:car", 0, &["conversations", "conversations"]),
     ("obd clear -d virtual:car --yes", 0, &["conversations", "conversations"]),
+    ("uds scan -d virtual:car --p2 200ms", 0, &["uds_scan"]),
     ("uds read -d virtual:car F190", 0, &["conversations"]),
     ("uds session -d virtual:car extended", 0, &["conversations"]),
     ("uds routine -d virtual:car start FF00", 1, &["conversations"]),

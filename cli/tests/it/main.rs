@@ -38,6 +38,7 @@ mod firmware;
 mod follow;
 mod help;
 mod json_schema;
+mod mcap;
 mod message_names;
 mod misbehaving_devices;
 mod monitor_keys;

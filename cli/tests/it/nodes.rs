@@ -83,6 +83,32 @@ impl Drop for Rig {
     }
 }
 
+/// Servers of all kinds: prompt, late, refusing, flooding, with an address, with 29 bits; and an identifier that another node uses.
+#[test]
+fn a_scan_finds_every_ecu_and_disturbs_nobody() {
+    let Some(rig) = Rig::new(NO_NODE, "can", "servers") else { return };
+    let found = &rig.json("uds scan bmw", "uds_scan")[0];
+    let servers = found["servers"].as_array().unwrap();
+    let pairs: Vec<_> = servers
+        .iter()
+        .map(|server| {
+            format!("{}:{}", server["request"].as_str().unwrap_or("?"), server["answer"].as_str().unwrap())
+        })
+        .collect();
+    let wanted = ["6F1/12:612/F1", "7E0:7E8", "7E1:7E9", "7E2:7EA", "7E3:7EB", "18DA10F1:18DAF110"];
+    assert_eq!(pairs, wanted, "{found}");
+    let with = |answer: &str| servers.iter().find(|server| server["answer"] == answer).unwrap();
+    assert_eq!(with("7E8")["functional"], true);
+    assert_eq!(with("7EA")["nrc"], 0x11);
+    assert!(with("7EB")["answers"].as_u64().unwrap() > 10, "{found}");
+    assert!(with("7E9")["after_ms"].as_f64().unwrap() > 100.0, "{found}");
+    assert_eq!(found["not_asked"], serde_json::json!(["7E5"]));
+    let (code, _, err) = rig.run("uds scan --session extended");
+    assert!(code == Some(2) && err.contains("opens no session"), "{err}");
+    let (code, _, err) = rig.run("uds scan opel-or-so");
+    assert!(code == Some(2) && err.contains("vag, toyota"), "{err}");
+}
+
 #[test]
 fn an_ecu_on_can_isotp_is_asked_unlocked_and_given_long_requests() {
     let Some(rig) = Rig::new(NO_NODE, "isotp", "uds") else { return };

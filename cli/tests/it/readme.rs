@@ -19,8 +19,10 @@ fn the_examples_work_on_the_virtual_vehicle_as_written() {
     let page = std::fs::read_to_string("../README.md").unwrap();
     let mut ran = 0;
     for line in commands(&page, "Use") {
-        // These need a board, or Parquet, which not every build has.
-        if line.contains("/dev/tty") || line.contains(".parquet") && !cfg!(feature = "parquet") {
+        // These need a board, or Parquet or MCAP, which not every build has.
+        let is_left_out = line.contains(".parquet") && !cfg!(feature = "parquet")
+            || line.contains(".mcap") && !cfg!(feature = "mcap");
+        if line.contains("/dev/tty") || is_left_out {
             continue;
         }
         // Two recorders of a bus, and two drives, are assumed to be there.

@@ -57,14 +57,14 @@ pub struct Events {
 
 /// What a record says besides time and channel.
 #[derive(Default)]
-struct Said {
+pub struct Happened {
     /// The index in the column of events; 0 is the table's own.
     event: i8,
-    detail: Option<&'static str>,
-    count: Option<u32>,
-    at_least: Option<bool>,
-    counters: Option<(u8, u8)>,
-    tag: Option<u32>,
+    pub detail: Option<&'static str>,
+    pub count: Option<u32>,
+    pub at_least: Option<bool>,
+    pub counters: Option<(u8, u8)>,
+    pub tag: Option<u32>,
 }
 
 impl Events {
@@ -126,18 +126,18 @@ impl Events {
 
     fn push_event(&mut self, record: &TraceRecord) {
         self.complete();
-        let said = Said::of(&record.event);
+        let happened = Happened::of(&record.event);
         let index = |detail| self.details.iter().position(|known| *known == detail).map(|at| at as i8);
-        let detail = said.detail.and_then(index);
+        let detail = happened.detail.and_then(index);
         self.time.append_value(record.time_ns);
         self.channel.append_value(record.channel);
-        self.event.push(said.event);
+        self.event.push(happened.event);
         self.detail.push_option(detail);
-        self.count.append_option(said.count);
-        self.at_least.append_option(said.at_least);
-        self.tec.append_option(said.counters.map(|(tx, _)| tx));
-        self.rec.append_option(said.counters.map(|(_, rx)| rx));
-        self.tag.append_option(said.tag);
+        self.count.append_option(happened.count);
+        self.at_least.append_option(happened.at_least);
+        self.tec.append_option(happened.counters.map(|(tx, _)| tx));
+        self.rec.append_option(happened.counters.map(|(_, rx)| rx));
+        self.tag.append_option(happened.tag);
     }
 
     /// Returns the columns so far; the next ones start empty.
@@ -157,8 +157,14 @@ impl Events {
     }
 }
 
-impl Said {
-    fn of(event: &TraceEvent) -> Self {
+impl Happened {
+    /// The kind of event; `None` for a frame.
+    #[cfg(feature = "mcap")]
+    pub fn kind(&self) -> Option<&'static str> {
+        KINDS.get(usize::try_from(self.event - 1).ok()?).copied()
+    }
+
+    pub fn of(event: &TraceEvent) -> Self {
         let kind = |kind| 1 + KINDS.iter().position(|known| *known == kind).unwrap_or(0) as i8;
         match *event {
             TraceEvent::Frame { .. } => Self::default(),

@@ -108,22 +108,22 @@ fn converted(column: &ArrayRef, name: &str, ours: &DataType) -> Result<ArrayRef,
 }
 
 /// A value that cannot be taken.
-struct BadCell {
-    row: usize,
-    what: String,
+pub struct BadCell {
+    pub row: usize,
+    pub what: String,
 }
 
 /// The column in our type; `None` if its own is none of those that are taken.
-type Converted = Result<Option<ArrayRef>, BadCell>;
+pub type Converted = Result<Option<ArrayRef>, BadCell>;
 
-fn without_dictionary(column: &ArrayRef) -> Result<ArrayRef, BadColumns> {
+pub fn without_dictionary(column: &ArrayRef) -> Result<ArrayRef, BadColumns> {
     let Some(dictionary) = column.as_any_dictionary_opt() else { return Ok(Arc::clone(column)) };
     Ok(arrow_select::take::take(dictionary.values().as_ref(), dictionary.keys(), None)?)
 }
 
 /// Whole numbers, possibly in a floating-point column, where "not a number" is how programs say that there is none; texts only with
 /// `0x`: without, nobody knows whether they are decimal.
-fn numbers(array: &dyn Array) -> Result<Option<Vec<Option<i64>>>, BadCell> {
+pub fn numbers(array: &dyn Array) -> Result<Option<Vec<Option<i64>>>, BadCell> {
     if let Some(texts) = texts_of(array) {
         let number = |(row, text): (usize, Option<&str>)| {
             let Some(text) = text else { return Ok(None) };
@@ -192,7 +192,7 @@ fn flags(array: &dyn Array) -> Converted {
     Ok(Some(Arc::new(found)))
 }
 
-fn texts_of(array: &dyn Array) -> Option<Vec<Option<&str>>> {
+pub fn texts_of(array: &dyn Array) -> Option<Vec<Option<&str>>> {
     Some(match array.data_type() {
         DataType::Utf8 => array.as_string::<i32>().iter().collect(),
         DataType::LargeUtf8 => array.as_string::<i64>().iter().collect(),
@@ -206,7 +206,7 @@ fn texts(array: &dyn Array) -> Option<ArrayRef> {
 }
 
 /// Times. Without a zone they are UTC, as NumPy's are; durations count from the trace's start. Whole numbers do not say their unit.
-fn time(array: &dyn Array) -> Converted {
+pub fn time(array: &dyn Array) -> Converted {
     let ns: PrimitiveArray<TimestampNanosecondType> = match array.data_type() {
         DataType::Timestamp(TimeUnit::Second, _) => scaled::<TimestampSecondType>(array, 1_000_000_000)?,
         DataType::Timestamp(TimeUnit::Millisecond, _) => {
@@ -269,7 +269,7 @@ fn ns_of_seconds(seconds: f64) -> Option<i64> {
     Some(if seconds < 0.0 { -ns } else { ns })
 }
 
-fn data(array: &dyn Array) -> Converted {
+pub fn data(array: &dyn Array) -> Converted {
     let mut found = BinaryBuilder::new();
     match array.data_type() {
         DataType::LargeBinary => array.as_binary::<i64>().iter().for_each(|bytes| found.append_option(bytes)),

@@ -5,6 +5,7 @@ use std::collections::HashSet;
 use arrow_schema::Field;
 
 /// The names that are taken.
+#[derive(Default)]
 pub struct ColumnNames(HashSet<String>);
 
 /// The name of the column with a signal's texts.
@@ -16,6 +17,12 @@ impl ColumnNames {
     /// Those of the columns so far.
     pub fn of(fields: &[Field]) -> Self {
         Self(fields.iter().map(|field| field.name().clone()).collect())
+    }
+
+    /// Takes a name that is no signal's.
+    #[cfg(feature = "mcap")]
+    pub fn take(&mut self, name: &str) {
+        self.0.insert(name.to_owned());
     }
 
     /// Chooses a name for a signal's column, and for that of its texts if it has any: its own; with the message's name in front if

@@ -68,13 +68,13 @@ struct Columns<'a> {
 }
 
 /// A column of texts, in any representation.
-enum Text<'a> {
+pub enum Text<'a> {
     Plain(&'a StringArray),
     Indexed { keys: Vec<Option<usize>>, texts: &'a StringArray },
 }
 
 impl<'a> Text<'a> {
-    fn of(array: &'a dyn Array) -> Option<Self> {
+    pub fn of(array: &'a dyn Array) -> Option<Self> {
         if let Some(plain) = array.as_string_opt() {
             return Some(Self::Plain(plain));
         }
@@ -90,7 +90,7 @@ impl<'a> Text<'a> {
         Some(Self::Indexed { keys, texts })
     }
 
-    fn at(&self, row: usize) -> Option<&'a str> {
+    pub fn at(&self, row: usize) -> Option<&'a str> {
         match self {
             Self::Plain(texts) => texts.is_valid(row).then(|| texts.value(row)),
             Self::Indexed { keys, texts } => keys[row].map(|key| texts.value(key)),

@@ -80,10 +80,10 @@ pub(crate) trait Decode: Send {
 }
 
 /// Takes the place of a format that this build leaves out, and returns a system error saying so.
-#[cfg(not(feature = "sqlite"))]
+#[cfg(not(all(feature = "parquet", feature = "sqlite")))]
 pub(crate) struct Missing(pub &'static str);
 
-#[cfg(not(feature = "sqlite"))]
+#[cfg(not(all(feature = "parquet", feature = "sqlite")))]
 impl Decode for Missing {
     fn next(&mut self, _input: &mut Input) -> io::Result<Found> {
         Err(io::Error::new(io::ErrorKind::Unsupported, self.0))

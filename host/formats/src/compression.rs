@@ -3,6 +3,8 @@
 use std::io::{self, Read};
 use std::path::Path;
 
+use super::lz4;
+
 /// A way to compress a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Compression {
@@ -15,11 +17,12 @@ pub(crate) enum Compression {
 }
 
 /// Each with its suffix and as many of its first four bytes as do not vary.
-const KNOWN: [(Compression, &str, &[u8]); 5] = [
+const KNOWN: [(Compression, &str, &[u8]); 6] = [
     (Compression::Gzip, ".gz", &[0x1F, 0x8B]),
     (Compression::Zstd, ".zst", &[0x28, 0xB5, 0x2F, 0xFD]),
     (Compression::Xz, ".xz", &[0xFD, b'7', b'z', b'X']),
-    (Compression::Lz4, ".lz4", &[0x04, 0x22, 0x4D, 0x18]),
+    (Compression::Lz4, ".lz4", &lz4::MAGIC),
+    (Compression::Lz4, ".lz4", &lz4::LEGACY_MAGIC),
     (Compression::Bzip2, ".bz2", b"BZh"),
 ];
 
@@ -77,7 +80,7 @@ impl Compression {
             #[cfg(not(feature = "zstd"))]
             Self::Zstd => return Err(without_zstd()),
             Self::Xz => Box::new(XzStreams::new(source)),
-            Self::Lz4 => Box::new(Lz4Frames::new(source)),
+            Self::Lz4 => Box::new(lz4::Unpacker::new(source)),
             Self::Bzip2 => Box::new(bzip2::read::MultiBzDecoder::new(source)),
         })
     }
@@ -122,77 +125,6 @@ impl<R: Read> Read for XzStreams<R> {
             return Err(io::ErrorKind::UnexpectedEof.into());
         }
         Ok(read)
-    }
-}
-
-/// LZ4 frames one after another: the crate's decoder stops after the first.
-struct Lz4Frames<R: Read> {
-    decoder: lz4_flex::frame::FrameDecoder<Peeked<R>>,
-    /// Whether a frame has begun whose end mark has not been seen.
-    within: bool,
-}
-
-/// A source that can be peeked at by one byte.
-struct Peeked<R> {
-    source: R,
-    byte: Option<u8>,
-    ended: bool,
-}
-
-impl<R: Read> Read for Peeked<R> {
-    fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
-        match (self.byte, out) {
-            (Some(byte), [first, ..]) => {
-                *first = byte;
-                self.byte = None;
-                Ok(1)
-            }
-            (_, out) => {
-                let read = self.source.read(out)?;
-                self.ended |= read == 0 && !out.is_empty();
-                Ok(read)
-            }
-        }
-    }
-}
-
-impl<R: Read> Peeked<R> {
-    /// Whether the source has ended.
-    fn is_at_end(&mut self) -> io::Result<bool> {
-        if self.byte.is_none() {
-            let mut byte = [0];
-            self.byte = (self.read(&mut byte)? == 1).then_some(byte[0]);
-        }
-        Ok(self.byte.is_none())
-    }
-}
-
-impl<R: Read> Lz4Frames<R> {
-    fn new(source: R) -> Self {
-        let source = Peeked { source, byte: None, ended: false };
-        Self { decoder: lz4_flex::frame::FrameDecoder::new(source), within: true }
-    }
-}
-
-impl<R: Read> Read for Lz4Frames<R> {
-    fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
-        if out.is_empty() {
-            return Ok(0);
-        }
-        loop {
-            let read = self.decoder.read(out)?;
-            if read > 0 {
-                return Ok(read);
-            }
-            // The decoder returns the same for a frame's end mark and for a file that ends before it.
-            if self.decoder.get_ref().ended && self.within {
-                return Err(io::ErrorKind::UnexpectedEof.into());
-            }
-            self.within = !self.decoder.get_mut().is_at_end()?;
-            if !self.within {
-                return Ok(0);
-            }
-        }
     }
 }
 

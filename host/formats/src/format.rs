@@ -53,4 +53,6 @@ pub enum Format {
     Carbus,
     /// A table of any columns.
     Table,
+    /// A table in Parquet: a row for each record, or frames in any columns.
+    Parquet,
 }

@@ -29,9 +29,27 @@ pub enum UnknownFormat {
 }
 
 /// A format that can be read but not written.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{0} is a format that is only read; those that are written are {written}", written = Format::written_names())]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct NotWritten(pub Format);
+
+impl fmt::Display for NotWritten {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let how = match self.0 {
+            Format::Parquet => {
+                "only read, and made by converting a trace, since such a file is complete at its end only"
+            }
+            _ => "only read",
+        };
+        write!(
+            f,
+            "{} is a format that is {how}; those that are written are {}",
+            self.0,
+            Format::written_names()
+        )
+    }
+}
+
+impl std::error::Error for NotWritten {}
 
 impl Format {
     /// Every format.

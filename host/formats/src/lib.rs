@@ -47,11 +47,14 @@ mod issue;
 mod kvaser;
 mod left_out;
 mod line;
+mod lz4;
 mod memory_file;
 mod mf4;
 mod microchip;
 mod nmea2000;
 mod output;
+#[cfg(feature = "parquet")]
+mod parquet;
 mod pcap;
 mod pcapng;
 mod printer;

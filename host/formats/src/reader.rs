@@ -143,8 +143,12 @@ fn recognise(
     let failed = |error| OpenError::Io(name.clone(), error);
     let mut named = None;
     let table = options.columns.as_ref().map(|_| Format::Table);
-    let format = if let Some(format) = options.format.or(table) {
+    let format = if let Some(format) = options.format {
         format
+    } else if let Some(table) = table {
+        // Columns are those of a text, or of Parquet.
+        let head = if input.has_line() { input.buffered() } else { input.peek(64).map_err(failed)? };
+        Format::of_content(head).filter(|format| *format == Format::Parquet).unwrap_or(table)
     } else {
         // A pipe may deliver only a single line for a long time.
         let head = if input.has_line() { input.buffered() } else { input.peek(64).map_err(failed)? };

@@ -75,6 +75,16 @@ fn sqlite_reader() -> Box<dyn Decode> {
     Box::new(super::codec::Missing("this build reads no SQLite; build it with the feature `sqlite`"))
 }
 
+#[cfg(feature = "parquet")]
+fn parquet_reader(options: &ReadOptions) -> Box<dyn Decode> {
+    Box::new(super::parquet::Decoder::new(options.columns.clone()))
+}
+
+#[cfg(not(feature = "parquet"))]
+fn parquet_reader(_: &ReadOptions) -> Box<dyn Decode> {
+    Box::new(super::codec::Missing("this build reads no Parquet; build it with the feature `parquet`"))
+}
+
 /// All of them.
 const FORMATS: &[FormatSpec] = &[
     FormatSpec {
@@ -360,6 +370,15 @@ const FORMATS: &[FormatSpec] = &[
         begins: |head| table::is_first(head.first) && !is_of_another(head),
         has_head: false,
         reader: |options| Box::new(Rows::of(table::Decoder::new(options.columns.clone()))),
+        writer: None,
+    },
+    FormatSpec {
+        format: Format::Parquet,
+        names: &["parquet"],
+        suffixes: &["parquet"],
+        begins: |head| head.bytes.starts_with(b"PAR1"),
+        has_head: true,
+        reader: parquet_reader,
         writer: None,
     },
 ];

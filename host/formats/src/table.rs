@@ -5,6 +5,8 @@ mod layout;
 mod time;
 
 pub use columns::{BadColumns, Columns};
+#[cfg(feature = "parquet")]
+pub(crate) use columns::{TypedColumn, TypedForm};
 
 use super::frame_fields::{FdFields, FrameFields, Payload, identifier};
 use super::interfaces::Interfaces;
@@ -80,16 +82,59 @@ impl Decoder {
                 }
             },
         };
+        self.note_layout(&layout);
+        self.radix = self.radix_of(&layout, is_row);
+        self.layout = Some(layout);
+        self.sample = Vec::new();
+        Ok(is_row)
+    }
+
+    /// Prepares for rows whose cells come apart, from columns that have types. Returns the columns of which cells are wanted.
+    #[cfg(feature = "parquet")]
+    pub(crate) fn begin_typed(&mut self, columns: &[TypedColumn]) -> Result<Vec<usize>, Fault> {
+        let layout = Layout::of_typed(self.columns.as_ref(), columns)?;
+        self.note_layout(&layout);
+        let taken = layout.taken(columns.len());
+        self.radix.data = layout
+            .place(Role::Data)
+            .or(layout.place(Role::Bytes))
+            .is_some_and(|place| place.form == Some(Form::Decimal));
+        self.layout = Some(layout);
+        Ok(taken)
+    }
+
+    /// Looks at the first rows' cells, before [`Self::typed_row`] takes them.
+    #[cfg(feature = "parquet")]
+    pub(crate) fn first_typed_rows<'a>(&mut self, rows: impl Iterator<Item = &'a [&'a [u8]]>) {
+        let place = self.layout.as_ref().and_then(|layout| layout.place(Role::Id));
+        let ids: Vec<_> =
+            rows.filter_map(|cells| place.and_then(|place| cells.get(place.at).copied())).collect();
+        let form = place.and_then(|place| place.form);
+        let (is_decimal, is_sure) =
+            form.map_or_else(|| ids_are_decimal(&ids), |form| (form == Form::Decimal, true));
+        self.radix.id = is_decimal;
+        if !is_sure {
+            self.notes.push(MAY_BE_DECIMAL);
+        }
+    }
+
+    /// The record of a row with a cell for each column; empty where there is nothing, or where none is wanted.
+    #[cfg(feature = "parquet")]
+    pub(crate) fn typed_row(&mut self, cells: &[&[u8]], zone: &Zone) -> Result<Option<TraceRecord>, Fault> {
+        let Some(layout) = self.layout.take() else { return Ok(None) };
+        let record = self.record_of_cells(&layout, cells, zone);
+        self.layout = Some(layout);
+        record.map(Some)
+    }
+
+    /// What is worth knowing about the columns.
+    fn note_layout(&mut self, layout: &Layout) {
         if layout.place(Role::Time).is_none() {
             self.notes.push(NO_TIMES);
         }
         if layout.has_others {
             self.notes.push(OTHERS);
         }
-        self.radix = self.radix_of(&layout, is_row);
-        self.layout = Some(layout);
-        self.sample = Vec::new();
-        Ok(is_row)
     }
 
     /// How identifiers and bytes are written, by what is said, and otherwise by what the first rows have.
@@ -146,6 +191,15 @@ impl Decoder {
         if cells.len() < layout.least_cells() {
             return Err(Fault::malformed(format!("{} cells or more", layout.least_cells()), line));
         }
+        self.record_of_cells(layout, &cells, zone)
+    }
+
+    fn record_of_cells(
+        &mut self,
+        layout: &Layout,
+        cells: &[&[u8]],
+        zone: &Zone,
+    ) -> Result<TraceRecord, Fault> {
         let cell = |role| {
             layout.place(role).map(|place| (cells.get(place.at).copied().unwrap_or_default(), place.form))
         };
@@ -170,7 +224,7 @@ impl Decoder {
             Some((cell, _)) => Some(length(cell)?),
             None => None,
         };
-        let data = if remote { Payload::EMPTY } else { self.data(layout, &cells, len)? };
+        let data = if remote { Payload::EMPTY } else { self.data(layout, cells, len)? };
         let count = data.as_slice().len();
         let code = len.filter(|_| remote || count == 8).filter(|len| *len <= 15);
         let fd = (count > 8).then(FdFields::default);

@@ -22,6 +22,7 @@ use crate::protocols::ProtocolArgs;
                 candump -L can0 | cantap decode --db car.dbc - --json\n  \
                 cantap decode --db car.dbc trace.log --resample 100ms -o drive.csv\n  \
                 cantap decode --db car.dbc trace.log -o drive.parquet\n  \
+                cantap decode --db car.dbc trace.log -o drive.mcap\n  \
                 cantap decode --db car.dbc -d /dev/ttyACM0 -b 500k\n  \
                 cantap decode workshop.log --protocols --csv\n\n\
                 JSON lines are {\"time_s\", \"channel\", \"id\", \"message\", \"signals\": {NAME: NUMBER}}:\n\
@@ -49,8 +50,9 @@ pub struct Args {
     pub protocols: bool,
     #[command(flatten)]
     pub protocol: ProtocolArgs,
-    /// Write to this file instead of standard output. Its name may select the form: .csv, .json, or .parquet, a table for
-    /// DuckDB, Polars, pandas and Spark with a row per value, and one per loss or bus error.
+    /// Write to this file instead of standard output. Its name may select the form: .csv, .json, .mcap for
+    /// Foxglove with a channel per message, or .parquet, a table for DuckDB, Polars, pandas and Spark with a row per value. Both have losses and
+    /// bus errors, too.
     #[arg(short, long, value_name = "FILE")]
     pub output: Option<PathBuf>,
     /// One line of CSV per signal.

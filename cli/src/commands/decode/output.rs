@@ -6,6 +6,8 @@ use std::path::Path;
 
 use anyhow::Context;
 use cantap::{TraceEvent, TraceRecord};
+#[cfg(feature = "mcap")]
+use cantap_columns::McapFile;
 use cantap_protocols::Event;
 use cantap_signals::Decoder;
 
@@ -26,9 +28,19 @@ pub enum Form {
     Text,
     Json,
     Csv,
+    #[cfg(feature = "mcap")]
+    Mcap,
     #[cfg(feature = "parquet")]
     Parquet,
 }
+
+/// The forms that a file's name may select, for messages.
+const NAMES: &str = match (cfg!(feature = "mcap"), cfg!(feature = "parquet")) {
+    (true, true) => ".txt, .csv, .json, .mcap or .parquet",
+    (true, false) => ".txt, .csv, .json or .mcap",
+    (false, true) => ".txt, .csv, .json or .parquet",
+    (false, false) => ".txt, .csv or .json",
+};
 
 impl Form {
     pub fn of(args: &Args) -> anyhow::Result<Self> {
@@ -43,6 +55,8 @@ impl Form {
             }
             #[cfg(feature = "parquet")]
             Some("parquet") => Self::Parquet,
+            #[cfg(feature = "mcap")]
+            Some("mcap") => Self::Mcap,
             Some("csv") => Self::Csv,
             Some("json" | "jsonl" | "ndjson") => Self::Json,
             None | Some("txt" | "log") => Self::Text,
@@ -51,14 +65,26 @@ impl Form {
                 let name = args.output.as_deref().unwrap_or(Path::new("-"));
                 #[cfg(not(feature = "parquet"))]
                 crate::trace_output::refuse_parquet(name)?;
+                #[cfg(not(feature = "mcap"))]
+                if name.extension().is_some_and(|suffix| suffix.eq_ignore_ascii_case("mcap")) {
+                    anyhow::bail!("this build has no MCAP; add `--features mcap` to its command line");
+                }
                 return Err(usage(format!(
-                    "the name '{}' does not say which form to write; end it in .txt, .csv, .json{}, or add --csv or --json",
+                    "the name '{}' does not say which form to write; end it in {NAMES}, or add --csv or --json",
                     name.display(),
-                    if cfg!(feature = "parquet") { " or .parquet" } else { "" },
                 )));
             }
         };
-        if matches!(form, Self::Text | Self::Json) && (args.wide || args.resample.is_some()) {
+        #[cfg(feature = "mcap")]
+        if form == Self::Mcap && args.protocols {
+            return Err(usage(
+                "MCAP has a place for the signals of a database only; leave --protocols out, or write to a file that ends in .csv or .json",
+            ));
+        }
+        let is_table = !matches!(form, Self::Text | Self::Json);
+        #[cfg(feature = "mcap")]
+        let is_table = is_table && form != Self::Mcap;
+        if !is_table && (args.wide || args.resample.is_some()) {
             return Err(usage(
                 "--wide and --resample make tables; add --csv, or -o with a name that ends in .csv or .parquet",
             ));
@@ -76,7 +102,10 @@ impl Form {
 
 /// Takes decoded frames.
 pub struct Output<'a> {
-    #[cfg_attr(not(feature = "parquet"), expect(dead_code, reason = "only tables ask it"))]
+    #[cfg_attr(
+        not(any(feature = "mcap", feature = "parquet")),
+        expect(dead_code, reason = "only tables ask it")
+    )]
     decoder: &'a Decoder,
     to: To,
 }
@@ -89,6 +118,8 @@ enum To {
     },
     Csv(Lines, Cells),
     Wide(Box<Wide>, WideTo),
+    #[cfg(feature = "mcap")]
+    Mcap(Box<McapFile<Lines>>, String),
     #[cfg(feature = "parquet")]
     Long(Box<Long>),
     #[cfg(feature = "parquet")]
@@ -129,6 +160,17 @@ impl Lines {
     }
 }
 
+#[cfg(feature = "mcap")]
+impl Write for Lines {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.out.write(bytes)
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        self.out.flush()
+    }
+}
+
 impl<'a> Output<'a> {
     pub fn open(args: &Args, form: Form, decoder: &'a Decoder) -> anyhow::Result<Self> {
         let path = args.output.as_deref();
@@ -146,6 +188,12 @@ impl<'a> Output<'a> {
             }
             Form::Text | Form::Json => {
                 To::Lines { lines: Lines::open(path)?, json: form == Form::Json, details: args.details }
+            }
+            #[cfg(feature = "mcap")]
+            Form::Mcap => {
+                let lines = Lines::open(path)?;
+                let name = lines.name.clone();
+                To::Mcap(Box::new(McapFile::new(lines).with_context(|| name.clone())?), name)
             }
             #[cfg(feature = "parquet")]
             Form::Parquet => {
@@ -173,6 +221,10 @@ impl<'a> Output<'a> {
             To::Lines { lines, .. } => text::write(&mut lines.out, decoded)?,
             To::Csv(lines, cells) => csv::write(&mut lines.out, decoded, *cells)?,
             To::Wide(wide, _) => wide.push(decoded)?,
+            #[cfg(feature = "mcap")]
+            To::Mcap(file, name) => file
+                .push_values(self.decoder, decoded.record, decoded.reference, decoded.values)
+                .with_context(|| name.clone())?,
             #[cfg(feature = "parquet")]
             To::Long(long) => long.push(self.decoder, decoded)?,
             #[cfg(feature = "parquet")]
@@ -188,7 +240,7 @@ impl<'a> Output<'a> {
             To::Lines { lines, .. } => events::text(&mut lines.out, event)?,
             To::Csv(lines, cells) => events::csv(&mut lines.out, event, *cells)?,
             To::Wide(wide, _) => wide.push_protocol_event(event)?,
-            #[cfg(feature = "parquet")]
+            #[cfg(any(feature = "mcap", feature = "parquet"))]
             // Refused on the command line.
             _ => {}
         }
@@ -201,6 +253,8 @@ impl<'a> Output<'a> {
             To::Wide(wide, _) if matches!(record.event, TraceEvent::Lost { .. }) => {
                 wide.interrupt(record.channel);
             }
+            #[cfg(feature = "mcap")]
+            To::Mcap(file, name) => file.push_event(record).with_context(|| name.clone())?,
             #[cfg(feature = "parquet")]
             To::Long(long) => long.push_event(record)?,
             #[cfg(feature = "parquet")]
@@ -233,6 +287,17 @@ impl<'a> Output<'a> {
                 lines.finish()
             }
             To::Csv(lines, _) => lines.finish(),
+            #[cfg(feature = "mcap")]
+            To::Mcap(file, name) => {
+                let before_1970 = file.before_1970();
+                file.finish().context(name)?.finish()?;
+                if before_1970 > 0 {
+                    eprintln!(
+                        "cantap: MCAP has no times before 1970: {before_1970} messages are not in the file"
+                    );
+                }
+                Ok(())
+            }
             To::Wide(wide, WideTo::Csv(mut lines, cells)) => {
                 wide.finish(&mut Csv(&mut lines.out, cells))?;
                 lines.finish()

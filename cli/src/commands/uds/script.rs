@@ -50,7 +50,7 @@ fn steps<W: Subcommand>(name: &str, text: &str, runs_a_file: fn(&W) -> bool) -> 
             let place = format!("{name}:{number}");
             match Line::try_parse_from(line.split_whitespace()) {
                 Ok(Line { what }) if runs_a_file(&what) => {
-                    Err(usage(format!("{place}: a file cannot run another one; put its lines here")))
+                    Err(usage(format!("{place}: a file cannot run another one, or scan")))
                 }
                 Ok(Line { what }) => Ok(Step { place: Some(place), what }),
                 Err(error) => {

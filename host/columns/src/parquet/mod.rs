@@ -2,10 +2,13 @@
 
 mod dataset;
 mod file;
+mod guard;
+mod reader;
 
 pub use dataset::{BadKey, Dataset, Key};
 pub use file::ParquetFile;
 pub use parquet::errors::ParquetError;
+pub use reader::{LostRows, ParquetReader};
 
 use arrow_array::RecordBatch;
 use arrow_schema::SchemaRef;

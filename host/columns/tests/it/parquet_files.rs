@@ -6,7 +6,7 @@ use std::path::Path;
 
 use arrow_array::cast::AsArray;
 use arrow_array::types::TimestampNanosecondType;
-use cantap_columns::parquet::{Dataset, Key, ParquetFile};
+use cantap_columns::parquet::{Dataset, Key, ParquetFile, ParquetReader};
 use cantap_columns::{FrameColumns, records};
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
@@ -103,4 +103,48 @@ fn folders_are_named_by_words() {
     for text in ["", "days", "=7", "vehicle=", "a b=c", "../x=y", "id=3", "channel=1"] {
         assert!(text.parse::<Key>().is_err(), "{text}");
     }
+}
+
+/// Three groups of a thousand rows, as other programs write them.
+fn three_groups(path: &Path) -> (Vec<TraceRecord>, Vec<u8>) {
+    let trace: Vec<_> = (0..3000).map(|number| frame(number * 1_000, 1)).collect();
+    let mut columns = FrameColumns::default();
+    for record in &trace {
+        columns.push(record);
+    }
+    let properties = parquet::file::properties::WriterProperties::builder()
+        .set_max_row_group_row_count(Some(1000))
+        .set_dictionary_enabled(false)
+        .build();
+    let file = File::create(path).unwrap();
+    let mut writer =
+        parquet::arrow::ArrowWriter::try_new(file, FrameColumns::schema(), Some(properties)).unwrap();
+    writer.write(&columns.take()).unwrap();
+    writer.close().unwrap();
+    (trace, fs::read(path).unwrap())
+}
+
+#[test]
+fn damage_in_a_group_of_rows_costs_that_group_and_says_how_many() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.parquet");
+    let (trace, mut bytes) = three_groups(&path);
+    let whole: Vec<_> = ParquetReader::open(File::open(&path).unwrap())
+        .unwrap()
+        .flat_map(|batch| records(&batch.unwrap()).unwrap())
+        .collect();
+    assert!(whole == trace);
+    // The first bytes of a page in the middle group: its header says what it is.
+    let metadata = ParquetRecordBatchReaderBuilder::try_new(File::open(&path).unwrap()).unwrap();
+    let at = metadata.metadata().row_group(1).column(0).byte_range().0 as usize;
+    bytes[at..at + 8].fill(0xFF);
+    let (mut read, mut lost) = (Vec::new(), Vec::new());
+    for batch in ParquetReader::open(std::io::Cursor::new(bytes)).unwrap() {
+        match batch {
+            Ok(batch) => read.extend(records(&batch).unwrap()),
+            Err(error) => lost.push((error.from, error.rows)),
+        }
+    }
+    assert_eq!(lost, [(1000, 1000)]);
+    assert!(read == [&trace[..1000], &trace[2000..]].concat(), "{}", read.len());
 }

@@ -45,6 +45,7 @@ fn files_are_known_by_their_beginning() {
         (utf8("                              Kvaser Memorator Log\n"), Format::Kvaser),
         (utf8("Chn Identifier Flg   DLC  D0...1...2...3\n"), Format::CanKing),
         (utf8("SQLite format 3\0"), Format::Sqlite),
+        (utf8("PAR1"), Format::Parquet),
         (utf8("(51.26) RX0 17FC007B [8] 01 02 03 04 05 06 07 08\n"), Format::BatteryEmulator),
         (utf8("TimestampEpoch;BusChannel;ID;IDE;DLC;DataLength;Dir;EDL;BRS;DataBytes\n"), Format::CanEdgeCsv),
         (utf8("//-----\nMicrochip Technology Inc.\n"), Format::Microchip),

@@ -75,6 +75,29 @@ pub(super) struct Column {
     pub form: Option<Form>,
 }
 
+/// A column whose type is known, unlike that of a text.
+#[cfg(feature = "parquet")]
+pub(crate) struct TypedColumn<'a> {
+    pub name: &'a str,
+    pub form: TypedForm,
+}
+
+/// What its type says about how its cells are written.
+#[cfg(feature = "parquet")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum TypedForm {
+    /// Times in seconds.
+    Seconds,
+    /// Numbers in decimal digits.
+    Number,
+    /// Bytes in hexadecimal digits.
+    Bytes,
+    /// Texts, which may be anything.
+    Text,
+    /// It has no cells.
+    None,
+}
+
 /// Which columns of a table mean what, such as `time=Timestamp:ms,id=ID:hex,data=Data`.
 ///
 /// A column is named as above it, or by its number from 1, as in a table without names. The meanings are `time` (`:s`, `:ms`, `:us`, `:ns`), `id`

@@ -3,6 +3,8 @@
 use super::super::issue::Fault;
 use super::super::text::{self, NS_PER_S};
 use super::columns::{Column, Columns, Form, ROLES, Role, role_of};
+#[cfg(feature = "parquet")]
+use super::columns::{TypedColumn, TypedForm};
 
 /// What separates the cells of a row.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -75,7 +77,10 @@ impl Layout {
     /// From the names above the columns, if they are usual ones.
     pub(super) fn of_names(line: &[u8]) -> Option<Self> {
         let separator = Separator::of(line);
-        let names = separator.cells(line);
+        Self::of_usual_names(separator, &separator.cells(line))
+    }
+
+    fn of_usual_names(separator: Separator, names: &[&[u8]]) -> Option<Self> {
         let mut layout = Self { separator, places: [None; ROLES.len()], byte_columns: 0, has_others: false };
         for (at, name) in names.iter().enumerate() {
             match role_of(name) {
@@ -102,7 +107,14 @@ impl Layout {
     /// From what the user says, and the first line. The second value is whether that line is a row, because every column is a number.
     pub(super) fn of_columns(columns: &Columns, line: &[u8]) -> Result<(Self, bool), Fault> {
         let separator = Separator::of(line);
-        let names = separator.cells(line);
+        Self::of_given_columns(columns, separator, &separator.cells(line))
+    }
+
+    fn of_given_columns(
+        columns: &Columns,
+        separator: Separator,
+        names: &[&[u8]],
+    ) -> Result<(Self, bool), Fault> {
         let mut layout = Self { separator, places: [None; ROLES.len()], byte_columns: 0, has_others: false };
         let mut is_row = true;
         for Column { role, name, form } in &columns.0 {
@@ -117,7 +129,9 @@ impl Layout {
                 }
                 (None, None) => None,
             };
-            let at = at.ok_or_else(|| Fault::malformed(format!("a column with the name '{name}'"), line))?;
+            let at = at.ok_or_else(|| {
+                Fault::malformed(format!("a column with the name '{name}'"), &names.join(&b", "[..]))
+            })?;
             layout.places[*role as usize] = Some(Place { at, form: *form });
         }
         if let Some(first) = layout.place(Role::Bytes) {
@@ -129,6 +143,54 @@ impl Layout {
             layout.byte_columns = (end - first.at).min(if is_row { usize::MAX } else { columns.max(1) });
         }
         Ok((layout, is_row))
+    }
+
+    /// Of columns that have types, by what the user says or by their names. A type says how cells are written, unless the user does.
+    #[cfg(feature = "parquet")]
+    pub(super) fn of_typed(columns: Option<&Columns>, typed: &[TypedColumn]) -> Result<Self, Fault> {
+        // What has no cells has no name either.
+        let named = |column: &TypedColumn| column.form != TypedForm::None;
+        let names: Vec<&[u8]> =
+            typed.iter().map(|column| if named(column) { column.name.as_bytes() } else { b"" }).collect();
+        let separator = Separator::Byte(b'\t');
+        let mut layout = match columns {
+            Some(columns) => Self::of_given_columns(columns, separator, &names)?.0,
+            None => Self::of_usual_names(separator, &names).ok_or_else(|| {
+                let expected = "columns of a trace, or of frames: say what they are with --columns";
+                Fault::malformed(expected, &names.join(&b", "[..]))
+            })?,
+        };
+        for (role, place) in ROLES.iter().zip(&mut layout.places) {
+            let Some(place) = place else { continue };
+            let Some(column) = typed.get(place.at) else {
+                let found = format!("{} columns", typed.len());
+                return Err(Fault::malformed(format!("a column {}", place.at + 1), found.as_bytes()));
+            };
+            let of_type = match (role.1, column.form) {
+                (Role::Time, TypedForm::Seconds) => Some(Form::Unit(NS_PER_S)),
+                (Role::Data | Role::Bytes, TypedForm::Bytes) => Some(Form::Hex),
+                (Role::Id | Role::Data | Role::Bytes, TypedForm::Number) if columns.is_none() => {
+                    Some(Form::Decimal)
+                }
+                (Role::Id | Role::Data | Role::Bytes, TypedForm::Number) => {
+                    place.form.or(Some(Form::Decimal))
+                }
+                _ => place.form,
+            };
+            place.form = of_type;
+        }
+        Ok(layout)
+    }
+
+    /// The columns that have a place in a trace, out of so many.
+    #[cfg(feature = "parquet")]
+    pub(super) fn taken(&self, columns: usize) -> Vec<usize> {
+        let is_byte = |at: usize| {
+            let first = self.place(Role::Bytes).map(|place| place.at);
+            first.is_some_and(|first| at >= first && at - first < self.byte_columns)
+        };
+        let is_other = |at: usize| self.places.iter().flatten().any(|place| place.at == at);
+        (0..columns).filter(|at| is_byte(*at) || is_other(*at)).collect()
     }
 
     /// From a row of a table without names, if it is like those that people made of logs: see [`Self::with_length`] and [`Self::without_length`].

@@ -57,6 +57,12 @@ fn row(format: Format) -> String {
             Format::Nmea2000 => ["as written, local if a date", "– | from Yacht Devices | – | – | – | – | –"],
             Format::Carbus => ["as written, no date", "yes | – | – | – | – | – | –"],
             Format::Table => ["as written, local if a date", "yes | yes | yes | without flags | – | – | –"],
+            // The crate of columns writes it, for the command.
+            Format::Parquet => {
+                return format!(
+                    "| {format} | read, written | 1 ns | yes | yes | yes | yes | yes | yes | yes |"
+                );
+            }
             Format::Sqlite => ["as written", "– | – | yes | without flags | yes | yes | yes"],
             new => panic!("{new} has no row here yet"),
         };

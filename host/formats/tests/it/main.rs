@@ -4,6 +4,8 @@ mod conversions_account_for_everything;
 mod fd_frames_agree_with_peers;
 mod formats_page;
 mod no_line_is_lost_in_silence;
+#[cfg(feature = "parquet")]
+mod parquet;
 mod peers;
 mod trace_files_agree_with_peers;
 #[cfg(feature = "zstd")]

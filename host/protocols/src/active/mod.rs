@@ -10,6 +10,7 @@ pub mod node_scan;
 mod rivals;
 pub mod sdo;
 mod sdo_job;
+pub mod server_scan;
 pub mod station;
 #[cfg(test)]
 mod testing;

@@ -76,6 +76,24 @@ impl Maker {
     }
 }
 
+/// The addresses of one rule.
+pub(crate) struct AddressRange {
+    /// What is asked, and who answers it.
+    pub requests: Vec<(Endpoint, Endpoint)>,
+    /// What any server may answer.
+    pub to_all: Vec<Endpoint>,
+}
+
+impl Maker {
+    /// All addresses of its rules.
+    pub(crate) fn ranges(self) -> impl Iterator<Item = AddressRange> {
+        rules_of(self).map(|rule| {
+            let requests = rule.requests().filter_map(|request| Some((request, rule.server(request)?)));
+            AddressRange { requests: requests.collect(), to_all: rule.to_all.clone() }
+        })
+    }
+}
+
 /// A text that is neither a pair nor a maker.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{0}; or a maker, for all of its pairs: {names}", names = Maker::names())]
@@ -138,6 +156,18 @@ impl Rule {
     fn has_request(&self, id: Id) -> bool {
         id.is_extended() == self.first.is_extended()
             && (self.first.raw()..=self.last.raw()).contains(&id.raw())
+    }
+
+    /// All requests of the range, to all among them.
+    fn requests(&self) -> impl Iterator<Item = Endpoint> {
+        let is_extended = self.first.is_extended();
+        let id = move |raw| if is_extended { Id::extended(raw) } else { Id::standard(raw) };
+        let ids = (self.first.raw()..=self.last.raw()).filter_map(id);
+        let has_addresses = self.address != Address::No;
+        ids.flat_map(move |id| {
+            let addresses = if has_addresses { 0..=0xFF } else { 0..=0 };
+            addresses.map(move |address| Endpoint { id, address: has_addresses.then_some(address) })
+        })
     }
 
     /// Whether any server may answer this.

@@ -47,6 +47,7 @@ pub fn file_name(format: Format, compression: &str) -> String {
         | Format::Nmea2000
         | Format::Table => "txt",
         Format::Sqlite => "db",
+        Format::Parquet => "parquet",
         Format::Crtd => "crtd",
         Format::Microchip => "can",
         new => panic!("{new} has no suffix here yet"),

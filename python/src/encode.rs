@@ -10,7 +10,7 @@ use arrow_array::types::{
     UInt64Type,
 };
 use arrow_array::{Array, ArrayRef, BooleanArray, RecordBatch, UInt32Array};
-use arrow_schema::{DataType, Field, Schema};
+use arrow_schema::DataType;
 use cantap_columns::FrameColumns;
 use cantap_signals::encode::{EncodeError, Input, encode_message};
 use cantap_signals::{Decoder, Indicator, Message, MessageRef, SignalValue};

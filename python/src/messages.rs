@@ -6,7 +6,6 @@ use arrow_array::builder::{
     BinaryBuilder, BooleanBuilder, Float64Builder, StringBuilder, UInt8Builder, UInt32Builder,
 };
 use arrow_array::{ArrayRef, RecordBatch};
-use arrow_schema::{Field, Schema};
 use cantap_columns::FrameColumns;
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;

@@ -8,7 +8,7 @@ share=$2
 . "$share/ports"
 # The kernel tests the timer against a loop, which fails when this computer is busy: hence no_timer_check.
 # A guest that hangs is ended after LIMIT seconds.
-exec timeout "${LIMIT:-900}" qemu-system-x86_64 \
+exec timeout "${LIMIT:-1800}" qemu-system-x86_64 \
   -machine q35 -accel tcg,thread=multi -cpu max -smp 1 -m 1024 \
   -nodefaults -no-user-config -display none -no-reboot \
   -kernel "$cache/vmlinux" -initrd "$cache/initrd" -append "console=ttyS0 panic=-1 quiet no_timer_check" -serial stdio \

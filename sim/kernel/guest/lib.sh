@@ -29,13 +29,17 @@ wait_until() {
   done
 }
 
-is_count() { [ "$("$@")" = "$_wanted" ]; }
-# until_all N COMMAND...: until it counts to N; however slow this computer is, for as long as it counts on.
+# until_all N COMMAND...: until it counts to N; however slow this computer is, for as long as it counts on, but for 20 s of standing still.
 until_all() {
   _wanted=$1
+  _before=
   shift
-  while _before=$("$@"); ! wait_until is_count "$@"; do
-    [ "$("$@")" != "$_before" ] || return 1
+  while _now=$("$@") && [ "$_now" != "$_wanted" ]; do
+    [ "$_now" = "$_before" ] || _still=20
+    _before=$_now
+    _still=$((_still - 1))
+    [ $_still -gt 0 ] || return 1
+    sleep 1
   done
 }
 

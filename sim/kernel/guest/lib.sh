@@ -34,7 +34,7 @@ until_all() {
   _wanted=$1
   _before=
   shift
-  while _now=$("$@") && [ "$_now" != "$_wanted" ]; do
+  while _now=$("$@"); [ "$_now" != "$_wanted" ]; do
     [ "$_now" = "$_before" ] || _still=20
     _before=$_now
     _still=$((_still - 1))

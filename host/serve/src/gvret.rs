@@ -35,6 +35,7 @@ pub use cantap_codecs::gvret::PORT;
 const BUILD: u16 = 618;
 /// Boards whose channels have a place in the protocol's two bits for a bus.
 pub const MOST_BOARDS: usize = 2;
+
 /// Admits clients. The buses are the channels of the first two boards. The protocol has no authentication: at an address that is not this
 /// machine's own (loopback), clients may only listen.
 pub fn listen(boards: &[Arc<Board>], address: SocketAddr, role: Role) -> io::Result<Listening> {

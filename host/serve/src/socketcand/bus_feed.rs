@@ -5,11 +5,10 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use cantap::{Device, TraceEvent, TraceRecord};
+use cantap::{TraceEvent, TraceRecord};
 
 use super::connection::Connection;
 use super::hearing::Hears;
-use crate::Board;
 use crate::feed::{self, Feed, Losses, Source};
 use crate::left_out::{LOST, LeftOut};
 use crate::lock::lock;
@@ -23,38 +22,23 @@ const KEEP_ALIVE: &str = "< echo >";
 /// What a client receives of the bus.
 pub struct BusFeed {
     connection: Arc<Connection>,
-    source: Source,
-    out: Outgoing,
-}
-
-/// What is written to it.
-struct Outgoing {
-    connection: Arc<Connection>,
     text: String,
     left_out: LeftOut,
 }
 
 impl BusFeed {
-    pub fn new(connection: &Arc<Connection>, board: &Arc<Board>, device: &Arc<Device>) -> Self {
-        let out = Outgoing {
-            connection: Arc::clone(connection),
-            text: String::new(),
-            left_out: LeftOut::default(),
-        };
-        Self { connection: Arc::clone(connection), source: Source::new(board, device), out }
+    pub fn new(connection: &Arc<Connection>) -> Self {
+        Self { connection: Arc::clone(connection), text: String::new(), left_out: LeftOut::default() }
     }
 
-    /// Until either side ends.
-    pub fn run(self) {
-        let Self { connection, source, mut out } = self;
-        let untold = feed::run(&mut [source], &mut out);
-        connection.is_over.store(true, Ordering::Relaxed);
-        out.left_out.count(LOST, untold);
-        out.report_left_out(true);
+    /// Sends it, until either side ends.
+    pub fn run(mut self, source: Source) {
+        let untold = feed::run(&mut [source], &mut self);
+        self.connection.is_over.store(true, Ordering::Relaxed);
+        self.left_out.count(LOST, untold);
+        self.report_left_out(true);
     }
-}
 
-impl Outgoing {
     fn report_left_out(&mut self, is_end: bool) {
         let Self { connection, left_out, .. } = self;
         left_out.report(is_end, &connection.buses[0].board, &connection.name);
@@ -68,7 +52,7 @@ impl Outgoing {
     }
 }
 
-impl Feed for Outgoing {
+impl Feed for BusFeed {
     fn is_over(&mut self) -> bool {
         self.report_left_out(false);
         self.connection.is_over.load(Ordering::Relaxed)

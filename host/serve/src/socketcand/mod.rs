@@ -26,6 +26,7 @@ use cantap_wire::message::{Mode, Role};
 use cantap_wire::{Channel, Id};
 
 use crate::beacon::{self, Beacon};
+use crate::feed::Source;
 use crate::foreign;
 use crate::lines::device_of;
 use crate::listen::{Listening, accept, bind};
@@ -350,10 +351,10 @@ impl Connection {
             (false, false) => Some(Mode::Normal),
         };
         let device = Arc::new(device);
-        let feed = BusFeed::new(self, &bus.board, &device);
+        let (feed, source) = (BusFeed::new(self), Source::new(&bus.board, &device));
         std::thread::Builder::new()
             .name("cantap-socketcand-hears".to_owned())
-            .spawn(move || feed.run())
+            .spawn(move || feed.run(source))
             .map_err(|error| error.to_string())?;
         Ok(Opened::new(OpenBus::new(device, channel, config, sends_in, bus.board.idle_sender())))
     }

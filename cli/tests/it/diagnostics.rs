@@ -129,7 +129,7 @@ fn a_scan_of_the_car_finds_its_two_ecus_and_says_what_it_sends() {
 fn a_node_of_j1939_is_heard_for_a_bounded_time() {
     let started = std::time::Instant::now();
     assert!(well("j1939 -d virtual:car dm1").contains("SPN 110 FMI 17"));
-    assert!(started.elapsed() < std::time::Duration::from_secs(10), "{:?}", started.elapsed());
+    assert!(started.elapsed() < std::time::Duration::from_mins(1), "{:?}", started.elapsed());
 }
 
 /// The first flow control may come from the device itself.

@@ -63,7 +63,7 @@ fn a_capture_through_ssh_is_one_made_beside_it() {
     signal(&interrupted, Signal::INT);
     let started = Instant::now();
     while interrupted.try_wait().unwrap().is_none() {
-        assert!(started.elapsed() < Duration::from_secs(5), "it does not end");
+        assert!(started.elapsed() < Duration::from_mins(1), "it does not end");
         std::thread::sleep(Duration::from_millis(20));
     }
     nothing_lost(&interrupted.wait_with_output().unwrap());
@@ -215,7 +215,7 @@ fn cut_connections_are_gaps_and_the_capture_goes_on() {
     // It begins before the other and ends after it, however busy the computer.
     let started = Instant::now();
     while std::fs::metadata(&near).map_or(0, |file| file.len()) < 1000 {
-        assert!(started.elapsed() < Duration::from_secs(10), "nothing is captured");
+        assert!(started.elapsed() < Duration::from_mins(1), "nothing is captured");
         std::thread::sleep(Duration::from_millis(20));
     }
     let cut = capture(&format!("tcp://127.0.0.1:{}", cable.port), &far, "-t 4s").spawn().unwrap();

@@ -178,7 +178,7 @@ fn something_that_is_no_device_is_distinguished_from_one_that_vanished() {
     let started = Instant::now();
     let Err(error) = Device::over(link, "fake") else { panic!("it was accepted") };
     assert!(matches!(error, DeviceError::NotCantap { .. }), "{error}");
-    assert!(started.elapsed() < Duration::from_secs(4));
+    assert!(started.elapsed() < Duration::from_secs(30));
     served.join().unwrap();
 }
 

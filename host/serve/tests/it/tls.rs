@@ -128,13 +128,13 @@ fn strangers_and_untrusted_certificates_receive_nothing() {
     let flood: Vec<TcpStream> = (0..100).map(|_| TcpStream::connect(address).unwrap()).collect();
     let started = Instant::now();
     for mut stream in std::iter::once(plain).chain(flood) {
-        stream.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+        stream.set_read_timeout(Some(Duration::from_mins(1))).unwrap();
         let mut heard = Vec::new();
         // Ended or cut off; at most a TLS alert, which is seven bytes.
         let _ = stream.read_to_end(&mut heard);
         assert!(heard.len() <= 7, "{heard:?}");
     }
-    assert!(started.elapsed() < Duration::from_secs(9), "{:?}", started.elapsed());
+    assert!(started.elapsed() < Duration::from_secs(50), "{:?}", started.elapsed());
     assert_eq!(served.board.clients(), 0);
     served.connect("localhost", &good).unwrap();
     let said = served.said.lock().unwrap().join("\n");
@@ -259,7 +259,7 @@ fn half_open_peers_are_let_go_and_the_others_are_served_meanwhile() {
         }
     };
     assert!(matches!(closed, Ok(0) | Err(_)), "{closed:?}");
-    assert!(started.elapsed() < Duration::from_secs(9), "{:?}", started.elapsed());
+    assert!(started.elapsed() < Duration::from_secs(50), "{:?}", started.elapsed());
     assert_eq!(served.board.clients(), 1);
     assert!(device.counters().channels[0].received > 100);
     assert_eq!(device.counters().channels[0].lost(), 0);

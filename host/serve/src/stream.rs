@@ -2,7 +2,7 @@
 
 use cantap_wire::message::{ChannelConfig, DEVICE_TAG, Filter, OTHERS_TAG};
 use cantap_wire::record::{LossStage, Record, Stamp, TransmitFailure};
-use cantap_wire::{CHANNELS, Channel, Event, Frame};
+use cantap_wire::{CHANNELS, Channel, Event, Frame, Received, ReceivedFd};
 
 /// A client's number, never used twice.
 pub type ClientId = u64;
@@ -68,6 +68,15 @@ pub fn shown(entry: &Entry, client: ClientId, views: &Views) -> Option<Record> {
             }
             Some(Record::Received(received))
         }
+        Record::ReceivedFd(mut received) => {
+            let view = of(received.channel);
+            let config = view.config.filter(|_| view.accepts(&received.frame.identifier_frame()))?;
+            received.data_omitted |= config.omit_data;
+            if config.omit_stamps {
+                received.stamp = Stamp::Omitted;
+            }
+            Some(Record::ReceivedFd(received))
+        }
         Record::Event(event) => {
             let event = match event {
                     Event::SofMark { .. } => Some(event),
@@ -105,7 +114,9 @@ pub struct Counts {
 /// Counts what is passed to a client.
 pub fn count(counts: &mut [Counts; CHANNELS], record: &Record, is_own: bool) {
     match *record {
-        Record::Received(received) => add(&mut counts[received.channel.index()].frames, 1),
+        Record::Received(Received { channel, .. }) | Record::ReceivedFd(ReceivedFd { channel, .. }) => {
+            add(&mut counts[channel.index()].frames, 1);
+        }
         Record::Event(Event::Lost { channel, stage, count, .. }) => {
             let counts = &mut counts[channel.index()];
             match stage {
@@ -150,9 +161,9 @@ impl Gap {
     pub fn absorb(&mut self, ticks: u64, record: &Record) -> Option<Channel> {
         self.ticks = ticks;
         match *record {
-            Record::Received(received) => {
-                self.lost[received.channel.index()] += 1;
-                return Some(received.channel);
+            Record::Received(Received { channel, .. }) | Record::ReceivedFd(ReceivedFd { channel, .. }) => {
+                self.lost[channel.index()] += 1;
+                return Some(channel);
             }
             Record::Event(event) => match event {
                 // Bounded by the number in flight.
@@ -248,7 +259,7 @@ fn merge(kept: &mut Event, next: &Event) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cantap_wire::record::{ErrorState, Received};
+    use cantap_wire::record::ErrorState;
 
     fn lost(channel: Channel, stage: LossStage, count: u32, at_least: bool) -> Event {
         Event::Lost { channel, stage, count, at_least }

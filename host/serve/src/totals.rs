@@ -1,5 +1,6 @@
 //! What a server has counted since it started, for whoever watches it.
 
+use cantap::TraceFrame;
 use cantap_wire::record::{LossStage, Record};
 use cantap_wire::{CHANNELS, Event};
 
@@ -40,6 +41,12 @@ pub fn count(totals: &mut Totals, entry: &Entry) {
             let of = &mut totals[received.channel.index()];
             of.received += 1;
             of.bits += u64::from(cantap::bits_on_bus(&received.frame));
+        }
+        Record::ReceivedFd(received) => {
+            let of = &mut totals[received.channel.index()];
+            of.received += 1;
+            // Those of the data phase have a rate of their own, so that a load of them all would be too high.
+            of.bits += u64::from(TraceFrame::from(received.frame).bus_bits().nominal);
         }
         Record::Event(Event::Transmitted { channel, frame, .. }) => {
             let of = &mut totals[channel.index()];

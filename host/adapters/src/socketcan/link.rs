@@ -30,7 +30,9 @@ const IFLA_CAN_BITTIMING: u16 = 1;
 const IFLA_CAN_STATE: u16 = 4;
 const IFLA_CAN_CTRLMODE: u16 = 5;
 const IFLA_CAN_BERR_COUNTER: u16 = 8;
+const IFLA_CAN_DATA_BITTIMING: u16 = 9;
 const CAN_CTRLMODE_LISTENONLY: u32 = 2;
+const CAN_CTRLMODE_FD: u32 = 0x20;
 
 /// Places in `struct rtnl_link_stats64`, in 64-bit numbers.
 const RX_DROPPED: usize = 6;
@@ -50,6 +52,8 @@ pub(crate) struct Link {
     pub kind: String,
     /// In bit/s, if it is set and known.
     pub bitrate_bps: Option<u32>,
+    /// Of the data phases of CAN FD frames, in bit/s, if CAN FD is on.
+    pub data_bitrate_bps: Option<u32>,
     pub listen_only: bool,
     /// `None` for a controller that is stopped, and where there is none.
     pub state: Option<ErrorState>,
@@ -132,11 +136,12 @@ impl Link {
     }
 
     fn controller(&mut self, bytes: &[u8]) {
+        let rate = |content| u32_at(content, 0).filter(|rate| (1..u32::MAX).contains(rate));
+        let (mut data_bitrate_bps, mut has_fd) = (None, false);
         for (kind, content) in Attributes(bytes) {
             match kind {
-                IFLA_CAN_BITTIMING => {
-                    self.bitrate_bps = u32_at(content, 0).filter(|rate| (1..u32::MAX).contains(rate));
-                }
+                IFLA_CAN_BITTIMING => self.bitrate_bps = rate(content),
+                IFLA_CAN_DATA_BITTIMING => data_bitrate_bps = rate(content),
                 IFLA_CAN_STATE => {
                     self.state = match u32_at(content, 0) {
                         Some(0) => Some(ErrorState::Active),
@@ -148,8 +153,9 @@ impl Link {
                 }
                 // The mask, and the flags.
                 IFLA_CAN_CTRLMODE => {
-                    self.listen_only =
-                        u32_at(content, 4).is_some_and(|flags| flags & CAN_CTRLMODE_LISTENONLY != 0);
+                    let flags = u32_at(content, 4).unwrap_or(0);
+                    self.listen_only = flags & CAN_CTRLMODE_LISTENONLY != 0;
+                    has_fd = flags & CAN_CTRLMODE_FD != 0;
                 }
                 IFLA_CAN_BERR_COUNTER => {
                     let counter = |at| u16_at(content, at).map(|count| count.min(255) as u8);
@@ -158,6 +164,7 @@ impl Link {
                 _ => {}
             }
         }
+        self.data_bitrate_bps = data_bitrate_bps.filter(|_| has_fd);
     }
 }
 

@@ -255,7 +255,14 @@ impl Engine<'_> {
                 match frame {
                     TraceFrame::Classic(frame) => {
                         let traffic = &mut board.traffic[channel.index()];
-                        board.capture.on_stamped_frame(channel, frame, ticks, at.stamp, traffic, &board.clock);
+                        board.capture.on_stamped_frame(
+                            channel,
+                            frame,
+                            ticks,
+                            at.stamp,
+                            traffic,
+                            &board.clock,
+                        );
                     }
                     TraceFrame::Fd(frame) => {
                         board.capture.on_stamped_fd_frame(channel, frame, ticks, at.stamp);

@@ -73,7 +73,8 @@ pub fn item(bytes: &[u8]) -> Option<(Item, &[u8])> {
     let raw = u32::from_be_bytes(*raw);
     let (&length, rest) = rest.split_first()?;
     let (is_fd, len) = (length & FD != 0, usize::from(length & !FD));
-    let (flags, rest) = if is_fd { rest.split_first().map(|(flags, rest)| (*flags, rest))? } else { (0, rest) };
+    let (flags, rest) =
+        if is_fd { rest.split_first().map(|(flags, rest)| (*flags, rest))? } else { (0, rest) };
     if raw & REMOTE != 0 && !is_fd {
         let frame = id_of(raw).and_then(|id| Frame::remote_frame(id, len as u8));
         return Some((frame.map_or(Item::Impossible, Item::Frame), rest));

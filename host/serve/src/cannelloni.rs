@@ -319,16 +319,14 @@ impl TunnelFeed {
             self.flush();
         }
         match event {
-            TraceEvent::Frame { frame, direction, .. } => {
-                match frame {
-                    TraceFrame::Classic(frame) => {
-                        if *direction != Direction::Tx || !lock(&self.far.own).take(frame) {
-                            self.writer.push(frame);
-                        }
+            TraceEvent::Frame { frame, direction, .. } => match frame {
+                TraceFrame::Classic(frame) => {
+                    if *direction != Direction::Tx || !lock(&self.far.own).take(frame) {
+                        self.writer.push(frame);
                     }
-                    TraceFrame::Fd(frame) => self.writer.push_fd(frame),
                 }
-            }
+                TraceFrame::Fd(frame) => self.writer.push_fd(frame),
+            },
             event => {
                 if let TraceEvent::TransmitFailed { tag, .. } = event {
                     lock(&self.far.own).failed(*tag);

@@ -45,7 +45,8 @@ pub fn encode_received_fd(received: &ReceivedFd, ticks: i64, out: &mut [u8; MAX_
         Stamp::UpperBound => UPPER_BOUND,
         Stamp::Omitted => NO_STAMP,
     };
-    out[0] = FD | stamp | flag(received.data_omitted, NO_DATA) | flag(frame.brs(), BRS) | flag(frame.esi(), ESI);
+    out[0] =
+        FD | stamp | flag(received.data_omitted, NO_DATA) | flag(frame.brs(), BRS) | flag(frame.esi(), ESI);
     out[1] = FRAME | (received.channel.index() as u8) << 6 | flag(id.is_extended(), 0x20) | frame.dlc();
     out[2..6].copy_from_slice(&id.raw().to_le_bytes());
     let mut len = if id.is_extended() { 6 } else { 4 };
@@ -62,7 +63,9 @@ pub fn encode_received_fd(received: &ReceivedFd, ticks: i64, out: &mut [u8; MAX_
 
 /// Reads a received FD frame.
 pub(super) fn decode(bytes: &[u8]) -> Result<(Record, i64, &[u8]), BadRecord> {
-    let [qualifiers @ FD..=LAST_FD, header @ FRAME..=0xFF, ref rest @ ..] = *bytes else { return Err(BadRecord) };
+    let [qualifiers @ FD..=LAST_FD, header @ FRAME..=0xFF, ref rest @ ..] = *bytes else {
+        return Err(BadRecord);
+    };
     let stamp = match qualifiers & (UPPER_BOUND | NO_STAMP) {
         0 => Stamp::Exact,
         UPPER_BOUND => Stamp::UpperBound,
@@ -76,8 +79,11 @@ pub(super) fn decode(bytes: &[u8]) -> Result<(Record, i64, &[u8]), BadRecord> {
     let (ticks, rest) = if stamp == Stamp::Omitted { (0, rest) } else { decode_ticks(rest)? };
     let data_omitted = qualifiers & NO_DATA != 0;
     let len = usize::from(FD_LENGTHS[usize::from(header & 15)]);
-    let (data, rest) =
-        if data_omitted { (&[0; FD_MAX_BYTES][..len], rest) } else { rest.split_at_checked(len).ok_or(BadRecord)? };
+    let (data, rest) = if data_omitted {
+        (&[0; FD_MAX_BYTES][..len], rest)
+    } else {
+        rest.split_at_checked(len).ok_or(BadRecord)?
+    };
     let channel = if header & 0x40 == 0 { Channel::Can1 } else { Channel::Can2 };
     let frame = FdFrame::new(id, qualifiers & BRS != 0, qualifiers & ESI != 0, data).ok_or(BadRecord)?;
     Ok((Record::ReceivedFd(ReceivedFd { channel, frame, stamp, data_omitted }), ticks, rest))

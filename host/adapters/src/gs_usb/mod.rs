@@ -99,7 +99,8 @@ impl GsUsb {
             if let Some(data_bitrate_bps) = options.data_bitrate_bps {
                 if constants.has(feature::FD) && constants.has(feature::EXTENDED_CONSTANTS) {
                     let extended = usb.control_in(request::EXTENDED_CONSTANTS, number, 72, GREETED_WITHIN);
-                    constants = extended.ok().and_then(|bytes| Constants::parse(&bytes)).ok_or_else(foreign)?;
+                    constants =
+                        extended.ok().and_then(|bytes| Constants::parse(&bytes)).ok_or_else(foreign)?;
                 }
                 if constants.data_timing(data_bitrate_bps).is_none() {
                     let address = address.to_owned();

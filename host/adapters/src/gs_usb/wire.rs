@@ -130,7 +130,8 @@ impl Constants {
         let fitting = prescalers.filter_map(|prescaler| {
             let per_quantum = u64::from(prescaler) * u64::from(bitrate_bps.max(1));
             let clock_hz = u64::from(self.clock_hz);
-            let quanta = u32::try_from(clock_hz / per_quantum).ok().filter(|_| clock_hz % per_quantum == 0)?;
+            let quanta =
+                u32::try_from(clock_hz / per_quantum).ok().filter(|_| clock_hz % per_quantum == 0)?;
             let wanted = (quanta * DATA_SAMPLE_POINT_PERMILLE).div_ceil(1000);
             let most = (*limits.segment1.end()).min(quanta.checked_sub(1 + *limits.segment2.start())?);
             let segment1 = wanted.checked_sub(1)?.min(most);

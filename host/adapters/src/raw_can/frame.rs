@@ -58,7 +58,11 @@ pub fn frame_of(raw: &RawFrame) -> Option<Frame> {
 }
 
 fn id_of(id: u32) -> Option<Id> {
-    if id & EXTENDED_FLAG != 0 { Id::extended(id & Id::MAX_EXTENDED) } else { Id::standard(id & Id::MAX_STANDARD) }
+    if id & EXTENDED_FLAG != 0 {
+        Id::extended(id & Id::MAX_EXTENDED)
+    } else {
+        Id::standard(id & Id::MAX_STANDARD)
+    }
 }
 
 /// A CAN FD frame; `None` if no bus can carry it: a remote or an error frame, or of a length that CAN FD has no code for.

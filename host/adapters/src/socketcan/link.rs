@@ -229,7 +229,7 @@ mod tests {
     }
 
     /// A controller's interface that only listens, with everything that `ip -details -statistics link` prints.
-    fn controller() -> Vec<u8> {
+    fn controller(fd: u32) -> Vec<u8> {
         let nested = |kind: u16, parts: &[Vec<u8>]| attribute(kind | 0x8000, &parts.concat());
         let mut stats = vec![0_u8; 25 * 8];
         for (at, figure) in [(RX_DROPPED, 5_u64), (RX_OVER_ERRORS, 7), (RX_FIFO_ERRORS, 1)] {
@@ -240,7 +240,8 @@ mod tests {
             IFLA_INFO_DATA,
             &[
                 attribute(IFLA_CAN_BITTIMING, &words(&[500_000, 875, 125, 6, 7, 2, 1, 6])),
-                attribute(IFLA_CAN_CTRLMODE, &words(&[0, CAN_CTRLMODE_LISTENONLY | 0x10])),
+                attribute(IFLA_CAN_CTRLMODE, &words(&[0, CAN_CTRLMODE_LISTENONLY | 0x10 | fd])),
+                attribute(IFLA_CAN_DATA_BITTIMING, &words(&[2_000_000, 750, 25, 7, 7, 5, 1, 1])),
                 attribute(IFLA_CAN_STATE, &words(&[2])),
                 attribute(IFLA_CAN_BERR_COUNTER, &counters),
             ],
@@ -257,13 +258,14 @@ mod tests {
 
     #[test]
     fn a_controller_s_rate_mode_state_counters_and_losses_are_read() {
-        let read = answer(&controller()).unwrap();
+        let read = answer(&controller(CAN_CTRLMODE_FD)).unwrap();
         let wanted = Link {
             is_can: true,
             is_up: true,
             echoes: true,
             kind: "can".to_owned(),
             bitrate_bps: Some(500_000),
+            data_bitrate_bps: Some(2_000_000),
             listen_only: true,
             state: Some(ErrorState::Passive),
             counters: Some((130, 255)),
@@ -271,6 +273,9 @@ mod tests {
             dropped: 5,
         };
         assert_eq!(read, wanted);
+        // A data bit rate that was set once says nothing while CAN FD is off.
+        let classical = answer(&controller(0)).unwrap();
+        assert_eq!(classical, Link { data_bitrate_bps: None, ..wanted });
     }
 
     #[test]
@@ -299,7 +304,7 @@ mod tests {
     proptest::proptest! {
         #[test]
         fn an_answer_that_is_cut_or_garbled_is_read_or_refused(cut in 0_usize..600, at in 0_usize..600, byte: u8) {
-            let mut bytes = controller();
+            let mut bytes = controller(0);
             bytes.truncate(cut);
             if let Some(there) = bytes.get_mut(at) {
                 *there = byte;

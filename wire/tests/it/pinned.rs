@@ -11,7 +11,9 @@ use cantap_wire::message::{
     read_send, why_unreadable, write_response,
 };
 use cantap_wire::record::{MAX_FD_RECORD, MAX_RECORD, encode_event, encode_received, encode_received_fd};
-use cantap_wire::{Command, FdFrame, Id, PROTOCOL_VERSION, Received, ReceivedFd, Refusal, Reply, Request, Response, Stamp};
+use cantap_wire::{
+    Command, FdFrame, Id, PROTOCOL_VERSION, Received, ReceivedFd, Refusal, Reply, Request, Response, Stamp,
+};
 use samples::{commands, events, frame, hex, refusals, replies};
 use serde::Serialize;
 

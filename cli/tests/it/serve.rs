@@ -65,7 +65,9 @@ fn fd_frames_reach_the_clients_of_a_server_with_its_filters() {
     let (device, _done) = pipe("fd-serve", rows.clone());
     let server = Server::start(&format!("-d {device} -b 500k --unix {path}"), 1);
     let file = folder.path().join("fd.log");
-    let output = capture(&server.at[0], &file, "-c 1 -n 13 -f 123:7FF,124:7FF,125:7FF,18DAF110:1FFFFFFF").output().unwrap();
+    let output = capture(&server.at[0], &file, "-c 1 -n 13 -f 123:7FF,124:7FF,125:7FF,18DAF110:1FFFFFFF")
+        .output()
+        .unwrap();
     let (code, _, err) = said(&output);
     assert_eq!(code, Some(0), "{err}");
     let written = std::fs::read_to_string(&file).unwrap();

@@ -266,6 +266,47 @@ mod tests {
     }
 
     #[test]
+    fn an_fd_frame_passes_filters_as_a_data_frame_of_its_identifier_and_loses_what_is_omitted() {
+        use cantap_wire::message::FrameKind;
+        use cantap_wire::{BitTiming, FdFrame, Id, Stamp};
+        let channel = Channel::Can2;
+        let id = Id::standard(0x123).unwrap();
+        let frame = FdFrame::new(id, true, false, &[7; 12]).unwrap();
+        let received = ReceivedFd { channel, frame, stamp: Stamp::Exact, data_omitted: false };
+        let entry = Entry { ticks: 1, record: Record::ReceivedFd(received), owner: None };
+        let timing = BitTiming::choose(36_000_000, 500_000, None).unwrap();
+        let mut views = Views::default();
+        assert_eq!(shown(&entry, 1, &views), None);
+        let mut config = ChannelConfig::listen_only(timing);
+        views[1].config = Some(config);
+        assert_eq!(shown(&entry, 1, &views), Some(entry.record));
+        let filter = |id, kind| Filter { extended: false, id, mask: 0x7FF, kind };
+        for (filter, passes) in [
+            (filter(0x123, FrameKind::Data), true),
+            (filter(0x123, FrameKind::Any), true),
+            (filter(0x123, FrameKind::Remote), false),
+            (filter(0x124, FrameKind::Any), false),
+        ] {
+            views[1].filters = vec![filter];
+            assert_eq!(shown(&entry, 1, &views).is_some(), passes, "{filter:?}");
+        }
+        views[1].filters.clear();
+        (config.omit_data, config.omit_stamps) = (true, true);
+        views[1].config = Some(config);
+        let wanted = ReceivedFd { stamp: Stamp::Omitted, data_omitted: true, ..received };
+        assert_eq!(shown(&entry, 1, &views), Some(Record::ReceivedFd(wanted)));
+        let mut gap = Gap::default();
+        assert_eq!(gap.absorb(5, &entry.record), Some(channel));
+        assert_eq!(gap.events(), [(5, lost(channel, LossStage::Host, 1, false))]);
+    }
+
+    /// As [`crate::outbox::MOST_RECORDS`] says.
+    #[test]
+    fn a_record_takes_no_more_memory_than_a_server_reckons_with() {
+        assert_eq!(size_of::<Entry>(), 104);
+    }
+
+    #[test]
     fn a_gap_counts_frames_keeps_what_matters_and_does_not_grow_with_what_repeats() {
         let frame: Frame = "123#11".parse().unwrap();
         let mut gap = Gap::default();

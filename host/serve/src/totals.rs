@@ -13,7 +13,7 @@ pub struct ChannelTotals {
     pub received: u64,
     /// Frames that the board sent.
     pub transmitted: u64,
-    /// Bits of both on the bus, with stuff bits and the space after a frame.
+    /// Bits of both on the bus, with stuff bits and the space after a frame, without those of data phases with a bit rate of their own.
     pub bits: u64,
     /// Frames that the board could not send.
     pub transmit_failures: u64,

@@ -133,7 +133,8 @@ impl Constants {
             let quanta =
                 u32::try_from(clock_hz / per_quantum).ok().filter(|_| clock_hz % per_quantum == 0)?;
             let wanted = (quanta * DATA_SAMPLE_POINT_PERMILLE).div_ceil(1000);
-            let most = (*limits.segment1.end()).min(quanta.checked_sub(1 + *limits.segment2.start())?);
+            let most =
+                (*limits.segment1.end()).min(quanta.checked_sub(limits.segment2.start().saturating_add(1))?);
             let segment1 = wanted.checked_sub(1)?.min(most);
             let segment2 = quanta - 1 - segment1;
             let fits = limits.segment1.contains(&segment1) && limits.segment2.contains(&segment2);
@@ -307,7 +308,7 @@ pub(super) mod tests {
         fn any_bytes_are_a_transfer_or_refused(bytes in proptest::collection::vec(0_u8.., 0..90), stamps: bool) {
             let _ = (transfer(&bytes, stamps), device(&bytes), state(&bytes));
             if let Some(constants) = Constants::parse(&bytes) {
-                let _ = constants.timing(500_000, 875);
+                let _ = (constants.timing(500_000, 875), constants.data_timing(2_000_000));
             }
         }
     }

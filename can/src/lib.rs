@@ -1,6 +1,6 @@
 #![doc = include_str!("../README.md")]
 //!
-//! [`Frame`] and [`Id`] are what crosses a bus, [`BitTiming`] how fast, [`FrameBits`] how long it takes, [`BusErrorKind`] and
+//! [`Frame`], [`FdFrame`] and [`Id`] are what crosses a bus, [`BitTiming`] how fast, [`FrameBits`] how long it takes, [`BusErrorKind`] and
 //! [`ErrorState`] what goes wrong there, [`LossStage`] and [`TransmitFailure`] what goes wrong on a device, on its [`Channel`]s. Each of these
 //! has one name, which texts, JSON and tables use.
 
@@ -13,6 +13,7 @@ mod channel;
 mod embedded;
 mod error;
 mod failure;
+pub mod fd;
 pub mod frame;
 pub mod timing;
 
@@ -20,5 +21,6 @@ pub use bits::{FrameBits, bits_on_bus};
 pub use channel::{CHANNELS, Channel};
 pub use error::{BusErrorKind, ErrorState};
 pub use failure::{DEVICE_TAG, LossStage, TransmitFailure};
+pub use fd::FdFrame;
 pub use frame::{Frame, Id, ParseFrameError};
 pub use timing::{BitTiming, NoTiming};

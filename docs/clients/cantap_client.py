@@ -6,7 +6,7 @@
 """
 import os, select, sys, time, tty, zlib
 
-PROTOCOL = 5
+PROTOCOL = 6
 REPLIES = "Hello Done Opened Status Time Filters Queued Registers Defaults Failures Edges".split()
 REFUSALS = ("Protocol Malformed NoSession Unsupported BadTiming BadId BadDlc BadTag BadEntry BadSlot ChannelOpen ChannelClosed "
             "ListenOnly QueueFull BanksExhausted WouldDisturb TooFarAhead Hardware NothingSaved NotBusOff "

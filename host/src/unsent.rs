@@ -132,7 +132,8 @@ impl Seen {
                 self.went_off_since = false;
             }
             TraceEvent::Frame { frame, .. } => {
-                self.others_since.add(record.time_ns, frame.bus_bits().total());
+                // How long a data phase takes is not known here: without it, the bus is at least so busy.
+                self.others_since.add(record.time_ns, frame.bus_bits().nominal);
             }
             TraceEvent::BusError { kind, .. } => {
                 self.errors.add(kind);

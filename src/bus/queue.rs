@@ -5,8 +5,8 @@ use core::sync::atomic::{AtomicU32, Ordering};
 
 use bbqueue::nicknames::Churrasco;
 use bbqueue::prod_cons::stream::{StreamConsumer, StreamProducer};
-use cantap_wire::Received;
-use cantap_wire::record::{MAX_RECORD, encode_received};
+use cantap_wire::record::{MAX_FD_RECORD, MAX_RECORD, encode_received, encode_received_fd};
+use cantap_wire::{Received, ReceivedFd};
 
 use crate::QUEUE_BYTES;
 
@@ -103,6 +103,23 @@ impl<const N: usize> Producer<'_, N> {
         };
         let Some(room) = grant.first_chunk_mut::<MAX_RECORD>() else { return false };
         let len = encode_received(received, ticks, room);
+        grant.commit(len);
+        self.has_written(fill, len as u32);
+        true
+    }
+
+    /// The same for a CAN FD frame, which no controller of a board receives.
+    pub fn push_fd_frame(&mut self, received: &ReceivedFd, ticks: i64) -> bool {
+        let fill = self.fill();
+        if !self.has_room_beside(fill) {
+            return false;
+        }
+        let Ok(mut grant) = self.ring.grant_exact(MAX_FD_RECORD) else {
+            self.full = true;
+            return false;
+        };
+        let Some(room) = grant.first_chunk_mut::<MAX_FD_RECORD>() else { return false };
+        let len = encode_received_fd(received, ticks, room);
         grant.commit(len);
         self.has_written(fill, len as u32);
         true

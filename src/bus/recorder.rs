@@ -2,7 +2,7 @@
 //! of what did not fit.
 
 use cantap_wire::record::{LossStage, encode_event};
-use cantap_wire::{CHANNELS, Channel, Event, Received};
+use cantap_wire::{CHANNELS, Channel, Event, Received, ReceivedFd, Stamp};
 
 use crate::QUEUE_BYTES;
 use crate::bus::queue::Producer;
@@ -54,15 +54,36 @@ impl<'q, const N: usize> Recorder<'q, N> {
     #[inline(always)]
     #[expect(clippy::inline_always, reason = "measured: a tenth of the time for a frame")]
     pub fn frame(&mut self, received: &Received, at: u64) {
+        self.push(received.channel, received.stamp, at, |producer, difference| {
+            producer.push_frame(received, difference)
+        });
+    }
+
+    /// The same for a CAN FD frame.
+    pub fn fd_frame(&mut self, received: &ReceivedFd, at: u64) {
+        self.push(received.channel, received.stamp, at, |producer, difference| {
+            producer.push_fd_frame(received, difference)
+        });
+    }
+
+    #[inline(always)]
+    #[expect(clippy::inline_always, reason = "as for `Self::frame`")]
+    fn push(
+        &mut self,
+        channel: Channel,
+        stamp: Stamp,
+        at: u64,
+        push: impl FnOnce(&mut Producer<'q, N>, i64) -> bool,
+    ) {
         if self.unreported != [0; CHANNELS] {
             self.report_losses(at);
         }
-        let index = received.channel.index();
+        let index = channel.index();
         let difference = self.difference(at);
         // If the reader has just made room, the loss record gets it first: it belongs before the next frame.
         let in_turn = self.unreported == [0; CHANNELS];
-        if in_turn && self.producer.push_frame(received, difference) {
-            if received.stamp != cantap_wire::Stamp::Omitted {
+        if in_turn && push(&mut self.producer, difference) {
+            if stamp != Stamp::Omitted {
                 self.last_ticks = at;
             }
         } else {

@@ -439,6 +439,8 @@ impl Slcan {
                     }
                     self.frame_line(&received.frame, at, lines);
                 }
+                // The language has no CAN FD, and no controller here receives any.
+                Record::ReceivedFd(_) => {}
                 Record::Event(event) => {
                     self.note(&event);
                     // A host that polls expects nothing between its requests.

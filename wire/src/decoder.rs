@@ -222,8 +222,8 @@ fn walk(
             return report(Decoded::Corrupt(Corruption::Records));
         };
         ticks = ticks.wrapping_add_signed(difference);
-        if let Record::Received(received) = &record {
-            let frames = &mut frames[received.channel.index()];
+        if let Some(channel) = record.received_on() {
+            let frames = &mut frames[channel.index()];
             *frames = frames.wrapping_add(1);
         }
         report(Decoded::Record { ticks, record });

@@ -6,6 +6,7 @@
 //! |---|---|
 //! | `0x00..=0x3F` | an [`Event`]: this byte is postcard's enum index, its fields follow, then the time difference |
 //! | `0x40..=0x47` | qualifiers of the frame that follows: bit 0 the stamp is only an upper bound, bit 1 no time difference, bit 2 no data |
+//! | `0x60..=0x7F` | a received CAN FD frame: bits 2..0 as above, bit 3 its bit rate is switched, bit 4 its sender is error passive; then as below, without remote frames, with up to 64 bytes of data. Never from a board |
 //! | `0x80..=0xFF` | a received frame: bit 6 channel, bit 5 extended, bit 4 remote, bits 3..0 DLC; then the ID (2 or 4 bytes, little-endian), the time difference, the data |
 //!
 //! Time differences are postcard's `i64` (zigzag, 7 bits a byte), in ticks since the previous record. They are signed because
@@ -18,6 +19,10 @@ use serde::{Deserialize, Serialize};
 use crate::packed::{put_packed, take_data};
 use crate::varint::{put_u32, take_u32};
 use crate::{Channel, Frame, Id};
+
+mod fd;
+
+pub use fd::{MAX_FD_RECORD, ReceivedFd, encode_received_fd};
 
 /// Bytes of the longest received-frame record: qualifier, header, ID, time difference, data.
 pub const MAX_FRAME_RECORD: usize = 1 + 1 + 4 + MAX_TICKS + 8;
@@ -148,11 +153,29 @@ pub enum Event {
 
 /// One entry of the stream. The decoder knows its absolute time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[allow(
+    clippy::large_enum_variant,
+    reason = "no allocation on the device, and on the host one place in memory after the other"
+)]
 pub enum Record {
     /// A received frame.
     Received(Received),
     /// Anything else.
     Event(Event),
+    /// A received CAN FD frame: never from a board of ours.
+    ReceivedFd(ReceivedFd),
+}
+
+impl Record {
+    /// Where it was received, if it is a received frame.
+    #[inline]
+    pub const fn received_on(&self) -> Option<Channel> {
+        match self {
+            Self::Received(received) => Some(received.channel),
+            Self::ReceivedFd(received) => Some(received.channel),
+            Self::Event(_) => None,
+        }
+    }
 }
 
 /// A record cannot be read.
@@ -264,7 +287,8 @@ pub fn decode(bytes: &[u8]) -> Result<(Record, i64, &[u8]), BadRecord> {
     // Nearly every record is a frame without qualifiers.
     match *bytes {
         [header @ FRAME..=0xFF, ref rest @ ..] => decode_frame(0, header, rest),
-        [qualified @ QUALIFIED..=0x7F, header @ FRAME..=0xFF, ref rest @ ..] => {
+        [fd::FD..=fd::LAST_FD, ..] => fd::decode(bytes),
+        [qualified @ QUALIFIED..fd::FD, header @ FRAME..=0xFF, ref rest @ ..] => {
             let qualifiers = qualified & !QUALIFIER_MASK;
             if qualified & QUALIFIER_MASK != QUALIFIED || qualifiers == 0 {
                 return Err(BadRecord);
@@ -293,14 +317,7 @@ fn decode_frame(qualifiers: u8, header: u8, rest: &[u8]) -> Result<(Record, i64,
         NO_STAMP => Stamp::Omitted,
         _ => return Err(BadRecord),
     };
-    let (id, rest) = if header & 0x20 == 0 {
-        let (raw, rest) = rest.split_first_chunk::<2>().ok_or(BadRecord)?;
-        (Id::standard(u32::from(u16::from_le_bytes(*raw))), rest)
-    } else {
-        let (raw, rest) = rest.split_first_chunk::<4>().ok_or(BadRecord)?;
-        (Id::extended(u32::from_le_bytes(*raw)), rest)
-    };
-    let id = id.ok_or(BadRecord)?;
+    let (id, rest) = take_id(header, rest)?;
     let (ticks, rest) = if stamp == Stamp::Omitted { (0, rest) } else { decode_ticks(rest)? };
     let remote = header & 0x10 != 0;
     let dlc = header & 15;
@@ -310,6 +327,20 @@ fn decode_frame(qualifiers: u8, header: u8, rest: &[u8]) -> Result<(Record, i64,
     let channel = if header & 0x40 == 0 { Channel::Can1 } else { Channel::Can2 };
     let frame = Frame::from_clean_parts(id, remote, dlc, data);
     Ok((Record::Received(Received { channel, frame, stamp, data_omitted }), ticks, rest))
+}
+
+/// The identifier behind a header, and what follows it.
+#[inline(always)]
+#[allow(clippy::inline_always, reason = "a part of `decode_frame`")]
+fn take_id(header: u8, rest: &[u8]) -> Result<(Id, &[u8]), BadRecord> {
+    let (id, rest) = if header & 0x20 == 0 {
+        let (raw, rest) = rest.split_first_chunk::<2>().ok_or(BadRecord)?;
+        (Id::standard(u32::from(u16::from_le_bytes(*raw))), rest)
+    } else {
+        let (raw, rest) = rest.split_first_chunk::<4>().ok_or(BadRecord)?;
+        (Id::extended(u32::from_le_bytes(*raw)), rest)
+    };
+    Ok((id.ok_or(BadRecord)?, rest))
 }
 
 /// What must be known about a record to pass it on.
@@ -351,10 +382,7 @@ pub fn outline(bytes: &[u8]) -> Result<Outline, BadRecord> {
         }
     }
     let (record, ticks, after) = decode(bytes)?;
-    let frame_of = match record {
-        Record::Received(received) => Some(received.channel),
-        Record::Event(_) => None,
-    };
+    let frame_of = record.received_on();
     Ok(Outline { len: bytes.len() - after.len(), ticks, frame_of })
 }
 
@@ -413,10 +441,7 @@ mod tests {
         #[test]
         fn an_outline_says_what_decoding_says(bytes: Vec<u8>) {
             if let Ok((record, ticks, rest)) = decode(&bytes) {
-                let frame_of = match record {
-                    Record::Received(received) => Some(received.channel),
-                    Record::Event(_) => None,
-                };
+                let frame_of = record.received_on();
                 prop_assert_eq!(outline(&bytes), Ok(Outline { len: bytes.len() - rest.len(), ticks, frame_of }));
             } else if let Ok(outline) = outline(&bytes) {
                 // It does not check whether an identifier is too large.

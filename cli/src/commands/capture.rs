@@ -134,11 +134,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             sink.omits_data.push(number);
         }
     }
+    let data_rates = live.data_bit_rates();
+    let data_rate = |number: u8| data_rates.iter().find(|(of, _)| *of == number).map(|(_, rate)| *rate);
     // One that was left out has no figures.
     channels.retain(|(number, _)| live.opened().any(|(opened, ..)| opened == *number));
     let filtered = live.filtered();
     let channels = channels
         .into_iter()
+        .map(|(number, meter)| (number, meter.with_data_bitrate(data_rate(number))))
         .map(|(number, meter)| (number, if filtered.contains(&number) { meter.filtered() } else { meter }));
     let mut meters = Meters { channels: channels.collect() };
     let end = write_all(args, &filters, &mut live, &mut sink, &mut meters);

@@ -188,6 +188,11 @@ impl Args {
             if is_message(text) {
                 Ok(cantap_signals::encode::encode(decoder, Some(self.channel.number()), text)?.frame)
             } else {
+                if text.contains("##") {
+                    return Err(usage(format!(
+                        "'{text}' is a CAN FD frame, and none can be sent, whatever the device; up to eight bytes fit into a classical one, as in 123#1122"
+                    )));
+                }
                 let frame = grammar::frame(text);
                 Ok(frame.map_err(|error| usage(format!("'{text}' is not a frame: {error}")))?)
             }

@@ -51,12 +51,10 @@ pub struct Args {
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", add = completion::bit_rates())]
     bitrates: Vec<RequestedRate>,
     /// The bit rate of CAN FD's data phases, such as 2M; with a channel before it (2:5M), only for that channel. Can
-    /// be repeated. Without it a channel with switched bit rates has no load.
+    /// be repeated. Without it a channel with switched bit rates has no load, unless a device knows it.
     #[arg(
         long = "data-bitrate",
         value_name = "[CHANNEL:]RATE",
-        conflicts_with = "device",
-        requires = "bitrates",
         add = completion::bit_rates()
     )]
     data_bitrates: Vec<ChannelBitrate>,
@@ -114,6 +112,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         if args.timing().has_auto() {
             return Err(usage(AUTO_NEEDS_A_DEVICE));
         }
+        if args.bitrates.is_empty() && !args.data_bitrates.is_empty() {
+            return Err(usage("give the bit rate outside data phases, too, with -b, such as -b 500k"));
+        }
         None
     } else {
         Some(live::open(&args.device, &args.channel, &args.bitrates, args.time)?)
@@ -121,6 +122,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut options = args.options();
     if let Some(live) = &live {
         options.channel_bitrate_bps = live.bit_rates();
+        // What the command line says comes first.
+        let mut data = live.data_bit_rates();
+        data.retain(|(number, _)| options.data_bitrate_of(*number).is_none());
+        options.channel_data_bitrate_bps.extend(data);
         options.filtered = live.filtered();
     }
     options.filtered.extend(filtered(&filters));

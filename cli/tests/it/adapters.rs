@@ -28,7 +28,11 @@ pub fn pipe(test: &str, text: String) -> (String, mpsc::Sender<()>) {
 fn on_pipe(test: &str, line: &str) -> (String, String) {
     // It does not go back to zero.
     let row = |at| format!("(1700000000.{:06}) can0 123#{at:04X}\n", at * 500);
-    let text = (0..100).map(row).collect();
+    on_pipe_of(test, line, (0..100).map(row).collect())
+}
+
+/// The same with this trace.
+fn on_pipe_of(test: &str, line: &str, text: String) -> (String, String) {
     let (device, done) = pipe(test, text);
     let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
     let args = line.split(' ').map(|arg| if arg == "PIPE" { device.as_str() } else { arg });
@@ -38,6 +42,62 @@ fn on_pipe(test: &str, line: &str) -> (String, String) {
     let (out, err) = (text(stdout), text(stderr));
     assert!(status.success(), "{line}: {out}{err}");
     (out, err)
+}
+
+/// CAN FD frames of all lengths among classical ones, a millisecond apart, with each flag.
+pub fn fd_rows() -> String {
+    let lengths = [0, 1, 8, 12, 16, 20, 24, 32, 48, 64];
+    let rows = lengths.iter().flat_map(|len| [format!("123##1{}", "5A".repeat(*len)), "7FF#11".to_owned()]);
+    let rows = rows.chain(["18DAF110##2AA".to_owned(), "124##3".to_owned(), "125##0BB".to_owned()]);
+    rows.enumerate().map(|(at, text)| format!("(1700000000.{:06}) can0 {text}\n", at * 1000)).collect()
+}
+
+/// What a candump log has in its third column.
+pub fn frames_of(log: &str) -> Vec<&str> {
+    log.lines().filter_map(|line| line.split(' ').nth(2)).filter(|frame| !frame.starts_with('2')).collect()
+}
+
+#[test]
+fn fd_frames_reach_files_as_they_are_and_those_without_a_place_for_them_say_so() {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("adapters");
+    let log = folder.join("fd.log");
+    let (_, err) = on_pipe_of(
+        "fd-log",
+        &format!("capture -d PIPE -c 1 -b 500k -n 23 --force -o {}", log.display()),
+        fd_rows(),
+    );
+    assert!(err.contains("23 frames") && err.contains("a data bit rate that is not known"), "{err}");
+    let (written, wanted) = (std::fs::read_to_string(&log).unwrap(), fd_rows());
+    assert_eq!(frames_of(&written), frames_of(&wanted));
+    let table = folder.join("fd.csv");
+    let line =
+        format!("capture -d PIPE -c 1 -b 500k -n 23 --force --format csv-analyser -o {}", table.display());
+    let (_, err) = on_pipe_of("fd-table", &line, fd_rows());
+    assert!(err.contains("CAN FD frames, which the analyser's table has no row for"), "{err}");
+}
+
+#[test]
+fn the_load_of_fd_frames_is_exact_with_their_data_bit_rate_and_unknown_without() {
+    let stats = |test, rates: &str| {
+        let line = format!("stats -d PIPE -c 1 {rates} -t 700ms --json");
+        let (out, _) = on_pipe_of(test, &line, fd_rows());
+        object(out.lines().last().unwrap())["channels"][0].clone()
+    };
+    let with = stats("fd-load", "-b 500k --data-bitrate 2M");
+    assert_eq!((&with["fd"], &with["brs"], &with["esi"]), (&13.into(), &11.into(), &2.into()), "{with}");
+    assert_eq!(with["data_bitrate_bps"], 2_000_000, "{with}");
+    assert!(with["load"]["mean_pct"].as_f64().is_some_and(|load| load > 5.0), "{with}");
+    let without = stats("fd-no-load", "-b 500k");
+    assert_eq!((&without["load"], &without["fd"]), (&Value::Null, &13.into()), "{without}");
+}
+
+#[test]
+fn an_fd_frame_to_be_sent_is_refused_with_the_reason() {
+    let (device, _done) = pipe("fd-send", fd_rows());
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
+    let output = command.args(["send", "-d", &device, "-b", "500k", "1", "123##1AA"]).output().unwrap();
+    let err = String::from_utf8(output.stderr).unwrap();
+    assert!(!output.status.success() && err.contains("CAN FD"), "{err}");
 }
 
 fn object(text: &str) -> Value {

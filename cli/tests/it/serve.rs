@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Stdio};
 use std::time::{Duration, Instant};
 
+use crate::adapters::{fd_rows, frames_of, pipe};
 use crate::served::server::{Server, agree, cantap, capture, log, nothing_lost, run, said, socket};
 
 #[test]
@@ -53,6 +54,26 @@ fn programs_share_a_device_each_with_all_of_its_frames() {
         run(&format!("capture -d {} -b 500k -n 1 -o /dev/null --format candump", server.at[0]));
     assert_eq!(code, Some(1));
     assert!(err.contains("there is no server; start one with `cantap serve`"), "{err}");
+}
+
+/// From another maker's adapter.
+#[test]
+fn fd_frames_reach_the_clients_of_a_server_with_its_filters() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, rows) = (socket(folder.path()), fd_rows());
+    // The clients have as much time to come as they need.
+    let (device, _done) = pipe("fd-serve", rows.clone());
+    let server = Server::start(&format!("-d {device} -b 500k --unix {path}"), 1);
+    let file = folder.path().join("fd.log");
+    let output = capture(&server.at[0], &file, "-c 1 -n 13 -f 123:7FF,124:7FF,125:7FF,18DAF110:1FFFFFFF")
+        .output()
+        .unwrap();
+    let (code, _, err) = said(&output);
+    assert_eq!(code, Some(0), "{err}");
+    let written = std::fs::read_to_string(&file).unwrap();
+    let mut wanted = frames_of(&rows);
+    wanted.retain(|frame| *frame != "7FF#11");
+    assert_eq!(frames_of(&written), wanted, "{err}");
 }
 
 #[test]

@@ -14,8 +14,9 @@ use cantap_firmware::bus::sof::SofReading;
 use cantap_firmware::port::board::Board;
 use cantap_firmware::ports::{Chip, Clock, EdgeMeter, FilterBanks, PACKET, PinEdge, Port};
 use cantap_firmware::{CAN_CLOCK_HZ, QUEUE_BYTES, TICK_HZ};
+use cantap_trace::TraceFrame;
 use cantap_wire::message::{ChannelConfig, Failures, MAX_FAILURE_TEXT, Mode, capability};
-use cantap_wire::{CHANNELS, Channel, Command, Frame, Hello, Refusal};
+use cantap_wire::{CHANNELS, Channel, Command, Hello, Refusal};
 use heapless::String;
 
 use crate::driver::{Driver, Opening};
@@ -82,8 +83,12 @@ impl Filters {
         Self([const { Vec::new() }; CHANNELS].map(|_: Vec<Bank>| vec![Bank::ALL]))
     }
 
-    pub fn pass(&self, channel: Channel, frame: &Frame) -> bool {
-        self.0[channel.index()].iter().any(|bank| bank.passes(frame))
+    pub fn pass(&self, channel: Channel, frame: &TraceFrame) -> bool {
+        let frame = match frame {
+            TraceFrame::Classic(frame) => *frame,
+            TraceFrame::Fd(frame) => frame.identifier_frame(),
+        };
+        self.0[channel.index()].iter().any(|bank| bank.passes(&frame))
     }
 }
 

@@ -104,14 +104,13 @@ impl Cannelloni {
             rest = after;
             match parsed {
                 Item::Frame(frame) => {
-                    self.backlog.push(Incoming::Received { channel: Channel::Can1, frame, at });
+                    self.backlog.push(Incoming::Received { channel: Channel::Can1, frame: frame.into(), at });
                 }
                 Item::Error => {
                     self.backlog.push(Incoming::BusErrors { channel: Channel::Can1, count: 1, at });
                 }
-                Item::Fd => {
-                    self.oddities.count("CAN FD frames, which do not fit the device's protocol");
-                    self.lost(1, false, at);
+                Item::Fd(frame) => {
+                    self.backlog.push(Incoming::Received { channel: Channel::Can1, frame: frame.into(), at });
                 }
                 Item::Impossible => {
                     self.oddities.count("frames that cannot be");

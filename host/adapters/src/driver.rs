@@ -3,7 +3,7 @@
 use std::io;
 use std::time::{Duration, Instant};
 
-use cantap_trace::TraceEvent;
+use cantap_trace::{TraceEvent, TraceFrame};
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, Stamp};
 use cantap_wire::{Channel, Frame, Refusal};
 
@@ -91,6 +91,16 @@ pub enum OpenError {
         /// As given.
         address: String,
     },
+    /// The adapter has no CAN FD, or its clock cannot be divided to a data bit rate.
+    #[error(
+        "'{address}': this adapter has no CAN FD at a data bit rate of {data_bitrate_bps} bit/s; give another one, or leave out ?data-bitrate for classical CAN alone"
+    )]
+    NoDataBitRate {
+        /// As given.
+        address: String,
+        /// As given.
+        data_bitrate_bps: u32,
+    },
     /// The chip lacks what is needed to listen with it.
     #[error(
         "'{address}' is a copy of an ELM327 that refuses {command}: its lines are no frames, and another adapter is needed"
@@ -145,8 +155,8 @@ pub enum Incoming {
     Received {
         /// Where.
         channel: Channel,
-        /// The frame.
-        frame: Frame,
+        /// The frame, of CAN FD too.
+        frame: TraceFrame,
         /// When.
         at: At,
     },
@@ -229,7 +239,7 @@ impl Incoming {
     /// What a trace or an error frame reports; `None` for what has no place here.
     pub fn of(event: &TraceEvent, channel: Channel, at: At) -> Option<Self> {
         Some(match *event {
-            TraceEvent::Frame { frame, .. } => Self::Received { channel, frame: *frame.classic()?, at },
+            TraceEvent::Frame { frame, .. } => Self::Received { channel, frame, at },
             TraceEvent::BusError { kind: Some(kind), .. } => Self::BusError { channel, kind, at },
             TraceEvent::BusError { kind: None, .. } => Self::BusErrors { channel, count: 1, at },
             TraceEvent::ErrorsSuppressed { count } => Self::BusErrors { channel, count, at },

@@ -17,6 +17,7 @@ use cantap_firmware::port::board::Board as _;
 use cantap_firmware::port::command::Identity;
 use cantap_firmware::port::session::{self, Session};
 use cantap_firmware::ports::{Clock, Outcome};
+use cantap_trace::TraceFrame;
 use cantap_wire::{CHANNELS, Channel, Event};
 use heapless::String;
 
@@ -251,8 +252,22 @@ impl Engine<'_> {
                     return;
                 }
                 let ticks = ticks(board, at);
-                let traffic = &mut board.traffic[channel.index()];
-                board.capture.on_stamped_frame(channel, frame, ticks, at.stamp, traffic, &board.clock);
+                match frame {
+                    TraceFrame::Classic(frame) => {
+                        let traffic = &mut board.traffic[channel.index()];
+                        board.capture.on_stamped_frame(
+                            channel,
+                            frame,
+                            ticks,
+                            at.stamp,
+                            traffic,
+                            &board.clock,
+                        );
+                    }
+                    TraceFrame::Fd(frame) => {
+                        board.capture.on_stamped_fd_frame(channel, frame, ticks, at.stamp);
+                    }
+                }
             }
             Incoming::Sent { channel, mailbox, at } | Incoming::NotSent { channel, mailbox, at } => {
                 let is_sent = matches!(incoming, Incoming::Sent { .. });

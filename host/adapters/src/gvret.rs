@@ -113,10 +113,10 @@ impl Gvret {
                     return self.oddities.count("frames of a third or higher bus");
                 };
                 let at = self.clock.place(stamp_us.into(), arrival);
-                self.backlog.push(Incoming::Received { channel, frame, at });
+                self.backlog.push(Incoming::Received { channel, frame: frame.into(), at });
             }
             Message::Fd { bus } => {
-                self.oddities.count("CAN FD frames, which do not fit the device's protocol");
+                self.oddities.count("CAN FD frames, which are not read from GVRET");
                 if let Some(channel) = Channel::from_number(bus.saturating_add(1)) {
                     let (stage, at) = (LossStage::Link, At::arrival(arrival));
                     self.backlog.push(Incoming::Lost { channel, stage, count: 1, at_least: false, at });

@@ -55,7 +55,7 @@ mod tests {
 
     fn frame(instant: Instant) -> Incoming {
         let frame: Frame = "123#".parse().unwrap();
-        Incoming::Received { channel: CHANNEL, frame, at: At { instant, stamp: Stamp::Exact } }
+        Incoming::Received { channel: CHANNEL, frame: frame.into(), at: At { instant, stamp: Stamp::Exact } }
     }
 
     fn error(instant: Instant) -> Incoming {

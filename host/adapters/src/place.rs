@@ -5,12 +5,13 @@ use std::str::FromStr;
 
 use cantap::device::Link;
 use cantap_formats::Format;
+use cantap_trace::grammar::bit_rate;
 
 use crate::cannelloni::{self, Cannelloni};
 use crate::driver::{Driver, OpenError};
 use crate::elm327::{self, Elm327, Family, Ids};
 use crate::engine;
-use crate::gs_usb::GsUsb;
+use crate::gs_usb::{self, GsUsb};
 use crate::gvret::{self, Gvret};
 use crate::interface_name;
 use crate::line::Line;
@@ -41,7 +42,7 @@ enum Kind {
     GvretTcp { host: String },
     Elm327 { family: Family, place: ElmPlace, ids: Option<Ids> },
     Socketcan { interface: String },
-    GsUsb { serial: String, termination: Option<bool> },
+    GsUsb { serial: String, options: gs_usb::Options },
     Socketcand { host: String, interface: String },
     Cannelloni { host: String, listen: u16 },
     Trace { path: String, format: TraceFormat },
@@ -94,6 +95,15 @@ impl Place {
         }
     }
 
+    /// The bit rate of the data phases of CAN FD frames, in bit/s, if the adapter's owner or the address has set one.
+    pub fn data_bitrate(&self) -> Option<u32> {
+        match &self.kind {
+            Kind::Socketcan { interface } => data_bitrate_of(interface),
+            Kind::GsUsb { options, .. } => options.data_bitrate_bps,
+            _ => None,
+        }
+    }
+
     /// Why a bit rate that a user asks for cannot be used: it is another than the one that the adapter's owner has set.
     pub fn rate_conflict(&self, bitrate_bps: u32) -> Option<String> {
         let set = self.bitrate().filter(|set| !interface_name::same_rate(*set, bitrate_bps))?;
@@ -124,7 +134,7 @@ impl FromStr for Place {
             "socketcan" if interface_name::is_possible(rest) => Kind::Socketcan { interface: rest.to_owned() },
             "socketcan" => return Err(bad("name the interface, as in socketcan:can0")),
             "gs_usb" => gs_usb_of(rest).ok_or_else(|| {
-                bad("write gs_usb: or gs_usb:SERIAL, and ?termination=on or ?termination=off after it if that is to be changed")
+                bad("write gs_usb: or gs_usb:SERIAL, and after it ?termination=on or ?termination=off if that is to be changed, and ?data-bitrate=2M (or &data-bitrate=2M) for CAN FD")
             })?,
             "slcan" => {
                 let (port, baud) = port_and_baud(rest, slcan::DEFAULT_BAUD)
@@ -188,14 +198,18 @@ fn port_and_baud(text: &str, default: u32) -> Option<(String, u32)> {
 }
 
 fn gs_usb_of(rest: &str) -> Option<Kind> {
-    let (serial, termination) = match rest.split_once('?') {
-        Some((serial, "termination=on")) => (serial, Some(true)),
-        Some((serial, "termination=off")) => (serial, Some(false)),
-        Some(_) => return None,
-        None => (rest, None),
-    };
+    let (serial, texts) = rest.split_once('?').map_or((rest, None), |(serial, texts)| (serial, Some(texts)));
+    let mut options = gs_usb::Options::default();
+    for text in texts.into_iter().flat_map(|texts| texts.split('&')) {
+        match text.split_once('=')? {
+            ("termination", "on") => options.termination = Some(true),
+            ("termination", "off") => options.termination = Some(false),
+            ("data-bitrate", rate) => options.data_bitrate_bps = Some(bit_rate(rate).ok()?),
+            _ => return None,
+        }
+    }
     let is_serial = serial.chars().all(|letter| letter.is_ascii_graphic());
-    is_serial.then(|| Kind::GsUsb { serial: serial.to_owned(), termination })
+    is_serial.then(|| Kind::GsUsb { serial: serial.to_owned(), options })
 }
 
 fn elm327_of(family: Family, rest: &str) -> Option<Kind> {
@@ -255,7 +269,7 @@ pub fn open(place: &Place) -> Result<Link, OpenError> {
             Box::new(Elm327::over(line, *family, *ids, address)?)
         }
         Kind::Socketcan { interface } => socketcan(interface, address)?,
-        Kind::GsUsb { serial, termination } => Box::new(GsUsb::connect(serial, *termination, address)?),
+        Kind::GsUsb { serial, options } => Box::new(GsUsb::connect(serial, *options, address)?),
         Kind::Socketcand { host, interface } => Box::new(Socketcand::connect(host, interface, address)?),
         Kind::Cannelloni { host, listen } => Box::new(Cannelloni::connect(host, *listen, address)?),
         Kind::Trace { path, format } => {
@@ -278,7 +292,7 @@ pub fn can_interfaces() -> Vec<String> {
 }
 
 #[cfg(target_os = "linux")]
-use crate::socketcan::bitrate_of;
+use crate::socketcan::{bitrate_of, data_bitrate_of};
 
 #[cfg(target_os = "linux")]
 fn socketcan(interface: &str, address: &str) -> Result<Box<dyn Driver>, OpenError> {
@@ -287,6 +301,11 @@ fn socketcan(interface: &str, address: &str) -> Result<Box<dyn Driver>, OpenErro
 
 #[cfg(not(target_os = "linux"))]
 fn bitrate_of(_: &str) -> Option<u32> {
+    None
+}
+
+#[cfg(not(target_os = "linux"))]
+fn data_bitrate_of(_: &str) -> Option<u32> {
     None
 }
 
@@ -311,6 +330,8 @@ mod tests {
             "gs_usb:",
             "gs_usb:003F0023",
             "gs_usb:?termination=on",
+            "gs_usb:003F0023?data-bitrate=2M",
+            "gs_usb:?termination=off&data-bitrate=5000000",
             "slcan:/dev/ttyACM0",
             "slcan:COM5@921600",
             "gvret:/dev/ttyUSB0",
@@ -339,6 +360,8 @@ mod tests {
             "socketcan:a-name-that-is-too-long",
             "gs_usb:a b",
             "gs_usb:?termination=yes",
+            "gs_usb:?data-bitrate=fast",
+            "gs_usb:?data-bitrate=2M&",
             "slcan:",
             "slcan:@9600",
             "slcan:COM1@fast",

@@ -201,7 +201,7 @@ impl Slcan {
             None | Some((b'z' | b'Z', _)) => self.confirm(at),
             Some((b't' | b'T' | b'r' | b'R', _)) => match self.frame(&line, arrival) {
                 Some((frame, at)) => {
-                    self.backlog.push(Incoming::Received { channel: Channel::Can1, frame, at });
+                    self.backlog.push(Incoming::Received { channel: Channel::Can1, frame: frame.into(), at });
                 }
                 None => self.damaged("frames that cannot be read", at),
             },

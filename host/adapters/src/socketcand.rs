@@ -123,7 +123,7 @@ impl Socketcand {
             Some(kind @ ("frame" | "rtr")) => match frame(fields, kind == "rtr") {
                 Some((frame, time_us)) => {
                     let at = self.clock.place(time_us, arrival);
-                    self.backlog.push(Incoming::Received { channel: Channel::Can1, frame, at });
+                    self.backlog.push(Incoming::Received { channel: Channel::Can1, frame: frame.into(), at });
                 }
                 None => self.damaged("frames that cannot be read", arrival),
             },

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use cantap_formats::{Format, ReadOptions, open_reader};
-use cantap_trace::{TraceEvent, TraceRecord};
+use cantap_trace::TraceRecord;
 use cantap_wire::record::LossStage;
 use cantap_wire::{Channel, Frame, Refusal};
 
@@ -93,16 +93,9 @@ impl TracePipe {
             Ok(time_ns) => self.clock.place(time_ns, arrival),
             Err(_) => At::arrival(arrival),
         };
-        match (Incoming::of(&record.event, channel, at), &record.event) {
-            (Some(incoming), _) => reports.push(incoming),
-            (None, TraceEvent::TransmitFailed { .. }) => {
-                self.oddities.count("transmissions that failed elsewhere");
-            }
-            (None, _) => {
-                self.oddities.count("CAN FD frames, which do not fit the device's protocol");
-                let stage = LossStage::Link;
-                reports.push(Incoming::Lost { channel, stage, count: 1, at_least: false, at });
-            }
+        match Incoming::of(&record.event, channel, at) {
+            Some(incoming) => reports.push(incoming),
+            None => self.oddities.count("transmissions that failed elsewhere"),
         }
     }
 }

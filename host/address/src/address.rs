@@ -216,6 +216,12 @@ impl Address {
     /// whatever is at the address.
     pub fn open_again(&self, serial_number: Option<&str>) -> Result<OpenDevice, LinkError> {
         let device = Device::over(self.link(serial_number)?, &self.text)?;
+        if let Place::Adapter(adapter) = &self.place
+            && let Some(bitrate_bps) = adapter.data_bitrate()
+        {
+            let numbers = Channel::ALL.into_iter().take(device.hello().channels.into());
+            numbers.for_each(|channel| device.set_data_bitrate(channel, Some(bitrate_bps)));
+        }
         Ok(OpenDevice { device, address: self.clone(), bitrates: self.bitrates_of_buses() })
     }
 

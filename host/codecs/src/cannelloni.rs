@@ -5,7 +5,8 @@
 
 use std::hash::{DefaultHasher, Hasher as _};
 
-use cantap_can::{Frame, Id};
+use cantap_can::fd::{FLAG_BRS, FLAG_ESI};
+use cantap_can::{FdFrame, Frame, Id};
 
 /// cannelloni's usual port.
 pub const PORT: u16 = 20_000;
@@ -16,7 +17,7 @@ const VERSION: u8 = 2;
 const DATA: u8 = 0;
 const HEADER: usize = 5;
 /// Bytes of the longest frame that is written.
-const FRAME_BYTES: usize = 4 + 1 + 8;
+const FRAME_BYTES: usize = 4 + 1 + 1 + 64;
 
 const EXTENDED: u32 = 1 << 31;
 const REMOTE: u32 = 1 << 30;
@@ -44,13 +45,14 @@ pub enum NoDatagram {
 
 /// One of a datagram's frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[expect(clippy::large_enum_variant, reason = "taken apart at once")]
 pub enum Item {
     /// A frame.
     Frame(Frame),
     /// An error frame.
     Error,
     /// A CAN FD frame.
-    Fd,
+    Fd(FdFrame),
     /// A length or an identifier that no frame has.
     Impossible,
 }
@@ -71,15 +73,20 @@ pub fn item(bytes: &[u8]) -> Option<(Item, &[u8])> {
     let raw = u32::from_be_bytes(*raw);
     let (&length, rest) = rest.split_first()?;
     let (is_fd, len) = (length & FD != 0, usize::from(length & !FD));
-    let rest = if is_fd { rest.get(1..)? } else { rest };
-    if raw & REMOTE != 0 {
+    let (flags, rest) =
+        if is_fd { rest.split_first().map(|(flags, rest)| (*flags, rest))? } else { (0, rest) };
+    if raw & REMOTE != 0 && !is_fd {
         let frame = id_of(raw).and_then(|id| Frame::remote_frame(id, len as u8));
         return Some((frame.map_or(Item::Impossible, Item::Frame), rest));
     }
     let (data, rest) = rest.split_at_checked(len)?;
     let item = match id_of(raw) {
         _ if raw & ERROR != 0 => Item::Error,
-        _ if is_fd => Item::Fd,
+        // CAN FD has no remote frames.
+        _ if raw & REMOTE != 0 => Item::Impossible,
+        id if is_fd => id
+            .and_then(|id| FdFrame::new(id, flags & FLAG_BRS != 0, flags & FLAG_ESI != 0, data))
+            .map_or(Item::Impossible, Item::Fd),
         id => id.and_then(|id| Frame::data_frame(id, data)).map_or(Item::Impossible, Item::Frame),
     };
     Some((item, rest))
@@ -153,18 +160,31 @@ impl Writer {
         self.put(id.raw() | extended | remote, frame.dlc().min(8), frame.data());
     }
 
+    /// Adds a CAN FD frame, for which there must be room.
+    pub fn push_fd(&mut self, frame: &FdFrame) {
+        let id = frame.id();
+        let extended = if id.is_extended() { EXTENDED } else { 0 };
+        self.begin(id.raw() | extended, frame.data_len() as u8 | FD);
+        self.bytes.push(frame.flags());
+        self.bytes.extend_from_slice(frame.data());
+    }
+
     /// Adds an error frame: its classes as an identifier, the flag included, and its data.
     pub fn push_error(&mut self, id: u32, data: [u8; 8]) {
         self.put(id | ERROR, 8, &data);
     }
 
     fn put(&mut self, id: u32, len: u8, data: &[u8]) {
+        self.begin(id, len);
+        self.bytes.extend_from_slice(data);
+    }
+
+    fn begin(&mut self, id: u32, len: u8) {
         if self.bytes.is_empty() {
             self.bytes.resize(HEADER, 0);
         }
         self.bytes.extend_from_slice(&id.to_be_bytes());
         self.bytes.push(len);
-        self.bytes.extend_from_slice(data);
         self.count += 1;
     }
 
@@ -218,10 +238,14 @@ mod tests {
             writer.push(frame);
         }
         writer.push_error(0x0000_0004, [1; 8]);
+        let id = Id::extended(0x18DA_F110).unwrap();
+        let fd = [(0, true), (12, false), (64, true)]
+            .map(|(len, brs)| FdFrame::new(id, brs, !brs, &[0xA5; 64][..len]).unwrap());
+        fd.iter().for_each(|frame| writer.push_fd(frame));
         let bytes = writer.take().unwrap();
-        assert_eq!(bytes[..11], [2, 0, 0, 0, 5, 0, 0, 1, 0x23, 1, 0xAA]);
+        assert_eq!(bytes[..11], [2, 0, 0, 0, 8, 0, 0, 1, 0x23, 1, 0xAA]);
         let (header, mut rest) = datagram(&bytes).unwrap();
-        assert_eq!(header, Header { sequence: 0, count: 5 });
+        assert_eq!(header, Header { sequence: 0, count: 8 });
         let mut read = Vec::new();
         while let Some((item, after)) = item(rest) {
             read.push(item);
@@ -229,6 +253,7 @@ mod tests {
         }
         let mut expected: Vec<Item> = frames.into_iter().map(Item::Frame).collect();
         expected.push(Item::Error);
+        expected.extend(fd.map(Item::Fd));
         assert_eq!(read, expected);
         // The longest is no longer than Ethernet carries in one piece.
         while writer.has_room() {

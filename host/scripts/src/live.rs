@@ -142,6 +142,11 @@ impl Run<'_> {
             }
             TraceEvent::BusError { kind, .. } => Input::Error { channel, kind },
             TraceEvent::State { state, .. } => Input::State { channel, state },
+            // Scripts have no CAN FD: to them, a frame is missing.
+            TraceEvent::Frame { frame: TraceFrame::Fd(_), .. } => {
+                self.results.report.frames_lost += 1;
+                Input::Gap
+            }
             TraceEvent::Lost { count, .. } => {
                 self.results.report.frames_lost += u64::from(count);
                 Input::Gap

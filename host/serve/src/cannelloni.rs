@@ -12,7 +12,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use cantap::device::is_idle;
-use cantap::{Direction, TraceEvent, TraceRecord};
+use cantap::{Direction, TraceEvent, TraceFrame, TraceRecord};
 use cantap_codecs::cannelloni::{Item, NoDatagram, Order, Sequence, Writer, datagram, item};
 use cantap_wire::message::{Mode, Role};
 use cantap_wire::{Channel, Frame};
@@ -222,7 +222,7 @@ impl End {
             match item {
                 Item::Frame(frame) => frames.push(frame),
                 Item::Error => errors += 1,
-                Item::Fd => fd += 1,
+                Item::Fd(_) => fd += 1,
                 Item::Impossible => impossible += 1,
             }
         }
@@ -319,14 +319,14 @@ impl TunnelFeed {
             self.flush();
         }
         match event {
-            TraceEvent::Frame { frame, direction, .. } => {
-                let Some(frame) = frame.classic() else {
-                    return lock(&self.far.left_out).count("CAN FD frames", 1);
-                };
-                if *direction != Direction::Tx || !lock(&self.far.own).take(frame) {
-                    self.writer.push(frame);
+            TraceEvent::Frame { frame, direction, .. } => match frame {
+                TraceFrame::Classic(frame) => {
+                    if *direction != Direction::Tx || !lock(&self.far.own).take(frame) {
+                        self.writer.push(frame);
+                    }
                 }
-            }
+                TraceFrame::Fd(frame) => self.writer.push_fd(frame),
+            },
             event => {
                 if let TraceEvent::TransmitFailed { tag, .. } = event {
                     lock(&self.far.own).failed(*tag);

@@ -13,7 +13,7 @@ use crate::flow::Flow;
 use crate::stream::{ClientId, Counts, Entry, Gap, View, Views, count, shown};
 use crate::totals::Totals;
 
-/// Limit for records waiting for a client: six seconds of two saturated channels, in at most 15 MB, which clients share if they wait for
+/// Limit for records waiting for a client: six seconds of two saturated channels, in at most 30 MB, which clients share if they wait for
 /// the same records.
 pub const MOST_RECORDS: usize = 1 << 18;
 /// Limit for waiting answers; beyond it, the client's next request is not read.
@@ -113,7 +113,7 @@ impl Outbox {
             if !has_room && let Some(channel) = queue.gap.get_or_insert_default().absorb(entry.ticks, &record)
             {
                 self.count_lost(channel);
-                if matches!(record, cantap_wire::record::Record::Received(_)) {
+                if record.received_on().is_some() {
                     continue;
                 }
                 // The client will count it as both received and lost.

@@ -2,7 +2,7 @@
 
 use cantap_wire::message::{ChannelConfig, DEVICE_TAG, Filter, OTHERS_TAG};
 use cantap_wire::record::{LossStage, Record, Stamp, TransmitFailure};
-use cantap_wire::{CHANNELS, Channel, Event, Frame};
+use cantap_wire::{CHANNELS, Channel, Event, Frame, Received, ReceivedFd};
 
 /// A client's number, never used twice.
 pub type ClientId = u64;
@@ -68,6 +68,15 @@ pub fn shown(entry: &Entry, client: ClientId, views: &Views) -> Option<Record> {
             }
             Some(Record::Received(received))
         }
+        Record::ReceivedFd(mut received) => {
+            let view = of(received.channel);
+            let config = view.config.filter(|_| view.accepts(&received.frame.identifier_frame()))?;
+            received.data_omitted |= config.omit_data;
+            if config.omit_stamps {
+                received.stamp = Stamp::Omitted;
+            }
+            Some(Record::ReceivedFd(received))
+        }
         Record::Event(event) => {
             let event = match event {
                     Event::SofMark { .. } => Some(event),
@@ -105,7 +114,9 @@ pub struct Counts {
 /// Counts what is passed to a client.
 pub fn count(counts: &mut [Counts; CHANNELS], record: &Record, is_own: bool) {
     match *record {
-        Record::Received(received) => add(&mut counts[received.channel.index()].frames, 1),
+        Record::Received(Received { channel, .. }) | Record::ReceivedFd(ReceivedFd { channel, .. }) => {
+            add(&mut counts[channel.index()].frames, 1);
+        }
         Record::Event(Event::Lost { channel, stage, count, .. }) => {
             let counts = &mut counts[channel.index()];
             match stage {
@@ -150,9 +161,9 @@ impl Gap {
     pub fn absorb(&mut self, ticks: u64, record: &Record) -> Option<Channel> {
         self.ticks = ticks;
         match *record {
-            Record::Received(received) => {
-                self.lost[received.channel.index()] += 1;
-                return Some(received.channel);
+            Record::Received(Received { channel, .. }) | Record::ReceivedFd(ReceivedFd { channel, .. }) => {
+                self.lost[channel.index()] += 1;
+                return Some(channel);
             }
             Record::Event(event) => match event {
                 // Bounded by the number in flight.
@@ -248,10 +259,51 @@ fn merge(kept: &mut Event, next: &Event) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cantap_wire::record::{ErrorState, Received};
+    use cantap_wire::record::ErrorState;
 
     fn lost(channel: Channel, stage: LossStage, count: u32, at_least: bool) -> Event {
         Event::Lost { channel, stage, count, at_least }
+    }
+
+    #[test]
+    fn an_fd_frame_passes_filters_as_a_data_frame_of_its_identifier_and_loses_what_is_omitted() {
+        use cantap_wire::message::FrameKind;
+        use cantap_wire::{BitTiming, FdFrame, Id, Stamp};
+        let channel = Channel::Can2;
+        let id = Id::standard(0x123).unwrap();
+        let frame = FdFrame::new(id, true, false, &[7; 12]).unwrap();
+        let received = ReceivedFd { channel, frame, stamp: Stamp::Exact, data_omitted: false };
+        let entry = Entry { ticks: 1, record: Record::ReceivedFd(received), owner: None };
+        let timing = BitTiming::choose(36_000_000, 500_000, None).unwrap();
+        let mut views = Views::default();
+        assert_eq!(shown(&entry, 1, &views), None);
+        let mut config = ChannelConfig::listen_only(timing);
+        views[1].config = Some(config);
+        assert_eq!(shown(&entry, 1, &views), Some(entry.record));
+        let filter = |id, kind| Filter { extended: false, id, mask: 0x7FF, kind };
+        for (filter, passes) in [
+            (filter(0x123, FrameKind::Data), true),
+            (filter(0x123, FrameKind::Any), true),
+            (filter(0x123, FrameKind::Remote), false),
+            (filter(0x124, FrameKind::Any), false),
+        ] {
+            views[1].filters = vec![filter];
+            assert_eq!(shown(&entry, 1, &views).is_some(), passes, "{filter:?}");
+        }
+        views[1].filters.clear();
+        (config.omit_data, config.omit_stamps) = (true, true);
+        views[1].config = Some(config);
+        let wanted = ReceivedFd { stamp: Stamp::Omitted, data_omitted: true, ..received };
+        assert_eq!(shown(&entry, 1, &views), Some(Record::ReceivedFd(wanted)));
+        let mut gap = Gap::default();
+        assert_eq!(gap.absorb(5, &entry.record), Some(channel));
+        assert_eq!(gap.events(), [(5, lost(channel, LossStage::Host, 1, false))]);
+    }
+
+    /// As [`crate::outbox::MOST_RECORDS`] says.
+    #[test]
+    fn a_record_takes_no_more_memory_than_a_server_reckons_with() {
+        assert_eq!(size_of::<Entry>(), 104);
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! What a server has counted since it started, for whoever watches it.
 
+use cantap::TraceFrame;
 use cantap_wire::record::{LossStage, Record};
 use cantap_wire::{CHANNELS, Event};
 
@@ -12,7 +13,7 @@ pub struct ChannelTotals {
     pub received: u64,
     /// Frames that the board sent.
     pub transmitted: u64,
-    /// Bits of both on the bus, with stuff bits and the space after a frame.
+    /// Bits of both on the bus, with stuff bits and the space after a frame, without those of data phases with a bit rate of their own.
     pub bits: u64,
     /// Frames that the board could not send.
     pub transmit_failures: u64,
@@ -40,6 +41,12 @@ pub fn count(totals: &mut Totals, entry: &Entry) {
             let of = &mut totals[received.channel.index()];
             of.received += 1;
             of.bits += u64::from(cantap::bits_on_bus(&received.frame));
+        }
+        Record::ReceivedFd(received) => {
+            let of = &mut totals[received.channel.index()];
+            of.received += 1;
+            // Those of the data phase have a rate of their own, so that a load of them all would be too high.
+            of.bits += u64::from(TraceFrame::from(received.frame).bus_bits().nominal);
         }
         Record::Event(Event::Transmitted { channel, frame, .. }) => {
             let of = &mut totals[channel.index()];

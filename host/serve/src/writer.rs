@@ -6,7 +6,6 @@ use std::time::{Duration, Instant};
 use cantap::device::is_idle;
 use cantap::responder::StreamEncoder;
 use cantap_wire::message::EndReason;
-use cantap_wire::record::Record;
 use cantap_wire::{CHANNELS, Channel, Event};
 
 use crate::outbox::{Item, Outbox};
@@ -154,7 +153,7 @@ impl Encoder {
                         if let Some(channel) = channel {
                             outbox.count_lost(channel);
                         }
-                        if let Some(channel) = channel.filter(|_| !matches!(record, Record::Received(_))) {
+                        if let Some(channel) = channel.filter(|_| record.received_on().is_none()) {
                             others[channel.index()] += 1;
                         }
                     }

@@ -10,7 +10,7 @@ use cantap_wire::{CHANNELS, Channel, Corruption, Decoded, Decoder, Frame, Reply,
 
 use super::clock::{ClockMap, SofMark, Ticks, UtcClock};
 use super::stamps::{BitLengths, Stamped, tighten};
-use crate::{Direction, TraceEvent, TraceRecord};
+use crate::{Direction, TraceEvent, TraceFrame, TraceRecord};
 
 /// Bytes decoded at a time, few enough that their records stay in the processor's cache through every pass.
 pub const PIECE_BYTES: usize = 4096;
@@ -208,15 +208,12 @@ impl Intake {
             Decoded::Record { ticks, record: Record::Received(received) } => {
                 last_ticks = Some(ticks);
                 counters.channels[received.channel.index()].received += 1;
-                stamped.push(Stamped {
-                    at: Ticks(ticks),
-                    channel: received.channel.number(),
-                    event: TraceEvent::Frame {
-                        frame: received.frame.into(),
-                        direction: Direction::Rx,
-                        late: received.stamp != Stamp::Exact,
-                    },
-                });
+                stamped.push(frame(received.channel, received.frame.into(), ticks, received.stamp));
+            }
+            Decoded::Record { ticks, record: Record::ReceivedFd(received) } => {
+                last_ticks = Some(ticks);
+                counters.channels[received.channel.index()].received += 1;
+                stamped.push(frame(received.channel, received.frame.into(), ticks, received.stamp));
             }
             Decoded::Record { ticks, record: Record::Event(event) } => {
                 last_ticks = Some(ticks);
@@ -405,6 +402,12 @@ impl Default for Intake {
 /// No record is kept before `Hello` gives the tick rate; any number will do.
 const fn cantap_tick_hz_before_hello() -> u32 {
     1_000_000
+}
+
+#[inline]
+fn frame(channel: Channel, frame: TraceFrame, ticks: u64, stamp: Stamp) -> Stamped {
+    let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: stamp != Stamp::Exact };
+    Stamped { at: Ticks(ticks), channel: channel.number(), event }
 }
 
 fn lost(channel: Channel, at: Ticks, stage: LossStage, count: u32, at_least: bool) -> Option<Stamped> {

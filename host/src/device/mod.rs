@@ -66,6 +66,8 @@ pub struct Device {
 pub(crate) struct Settings {
     filters: [Option<Vec<Filter>>; CHANNELS],
     open: [Option<ChannelConfig>; CHANNELS],
+    /// Of data phases, in bit/s. It is no part of the session: whoever connects knows it.
+    data_bitrates_bps: [Option<u32>; CHANNELS],
 }
 
 impl Device {
@@ -174,6 +176,18 @@ impl Device {
             clock_hz: self.hello().can_clock_hz,
             tick_hz: self.hello().tick_hz,
         });
+    }
+
+    /// Sets the bit rate of a bus's data phases, in bit/s, on which the lengths of CAN FD frames depend that switch to it; `None` if it is not
+    /// known, as at first. The device is not asked. It tightens stamps where the adapter's bit rate is that of a bus.
+    pub fn set_data_bitrate(&self, channel: Channel, bitrate_bps: Option<u32>) {
+        self.settings().data_bitrates_bps[channel.index()] = bitrate_bps;
+        self.order(Order::DataBitrate { channel, bitrate_bps, tick_hz: self.hello().tick_hz });
+    }
+
+    /// The bit rate of a bus's data phases, in bit/s, if it is known.
+    pub fn data_bitrate(&self, channel: Channel) -> Option<u32> {
+        self.settings().data_bitrates_bps[channel.index()]
     }
 
     /// Opens a channel that only listens, at a bit rate.

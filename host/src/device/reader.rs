@@ -19,6 +19,8 @@ pub(super) enum Order {
     /// From now on, a channel's bits have this length: clocks of the controller per bit, its clock, tick
     /// rate.
     BitLength { channel: Channel, clocks_per_bit: u32, clock_hz: u32, tick_hz: u32 },
+    /// The bits of a channel's data phases have this rate from now on, in bit/s, if it is known.
+    DataBitrate { channel: Channel, bitrate_bps: Option<u32>, tick_hz: u32 },
     /// The first clock samples are complete; start from the best.
     SettleClock,
     /// Losses that only the device's counters show.
@@ -175,6 +177,9 @@ impl Reader {
             match order {
                 Order::BitLength { channel, clocks_per_bit, clock_hz, tick_hz } => {
                     intake.lengths().set(channel.index(), clocks_per_bit, clock_hz, tick_hz);
+                }
+                Order::DataBitrate { channel, bitrate_bps, tick_hz } => {
+                    intake.lengths().set_data(channel.index(), bitrate_bps, tick_hz);
                 }
                 Order::SettleClock => {
                     intake.clock().settle();

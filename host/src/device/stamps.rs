@@ -4,6 +4,7 @@
 //! behind another, by up to a whole frame, in which case it is flagged. But two frames never overlap: frame k
 //! ended no later than the end of frame k+1 on the same channel minus the exact length of frame k+1.
 
+use cantap_trace::BusBits;
 use cantap_wire::CHANNELS;
 
 use super::clock::Ticks;
@@ -25,6 +26,8 @@ pub struct Stamped {
 pub struct BitLengths {
     /// In ticks, as a fixed-point number with [`FRACTION_BITS`] fractional bits; 0 while closed.
     fixed: [u64; CHANNELS],
+    /// The same for the bits of CAN FD's data phases; 0 if it is not known.
+    fixed_data: [u64; CHANNELS],
 }
 
 /// Fractional bits of a bit's length in ticks.
@@ -42,14 +45,26 @@ impl BitLengths {
         self.fixed[channel] = 0;
     }
 
+    /// Sets the bit rate of a channel's data phases, in bit/s; `None` if it is not known. `tick_hz`: of the stamps.
+    pub fn set_data(&mut self, channel: usize, bitrate_bps: Option<u32>, tick_hz: u32) {
+        let of = |bitrate_bps: u32| (u64::from(tick_hz) << FRACTION_BITS) / u64::from(bitrate_bps.max(1));
+        self.fixed_data[channel] = bitrate_bps.map_or(0, of);
+    }
+
+    /// How long a frame takes, in ticks, if that is known.
     #[inline]
-    fn ticks(&self, channel: usize, bits: u32) -> i64 {
-        ((self.fixed[channel] * u64::from(bits)) >> FRACTION_BITS) as i64
+    fn ticks(&self, channel: usize, bits: BusBits) -> Option<i64> {
+        if bits.data > 0 && self.fixed_data[channel] == 0 {
+            return None;
+        }
+        let nominal = self.fixed[channel] * u64::from(bits.nominal);
+        let data = self.fixed_data[channel] * u64::from(bits.data);
+        Some(((nominal + data) >> FRACTION_BITS) as i64)
     }
 }
 
 /// Tightens records in stream order. A record after a loss still bounds the one before it, since even more
-/// lay between them.
+/// lay between them. Through an FD frame whose length is not known, because it switches to an unknown bit rate, nothing is tightened.
 pub fn tighten(records: &mut [Stamped], lengths: &BitLengths) {
     let mut limits = [None; CHANNELS];
     for record in records.iter_mut().rev() {
@@ -60,7 +75,7 @@ pub fn tighten(records: &mut [Stamped], lengths: &BitLengths) {
         }
         let limit = limits[channel].filter(|limit| record.at.since(*limit) > 0);
         record.at = limit.unwrap_or(record.at);
-        limits[channel] = Some(record.at.plus(-lengths.ticks(channel, frame.bus_bits().total())));
+        limits[channel] = lengths.ticks(channel, frame.bus_bits()).map(|ticks| record.at.plus(-ticks));
     }
 }
 
@@ -91,6 +106,35 @@ mod tests {
         let times: Vec<u64> = records.iter().map(|record| record.at.0).collect();
         // Channel 2 has no known bit rate and stays unchanged.
         assert_eq!(times, [8512, 10_001, 9208, 9904, 10_600]);
+    }
+
+    #[test]
+    fn fd_frames_tighten_by_both_of_their_bit_rates_and_not_at_all_if_one_is_unknown() {
+        let fd = |ticks, text: &str| {
+            let event =
+                TraceEvent::Frame { frame: text.parse().unwrap(), direction: Direction::Rx, late: true };
+            Stamped { at: Ticks(ticks), channel: 1, event }
+        };
+        let mut lengths = BitLengths::default();
+        lengths.set(0, 72, 36_000_000, 12_000_000);
+        let times = |lengths: &BitLengths, text: &str| {
+            let mut records = vec![record(1, 100_000, true), fd(100_000, text), record(1, 100_000, false)];
+            tighten(&mut records, lengths);
+            records.iter().map(|record| record.at.0).collect::<Vec<_>>()
+        };
+        // A classical frame is 58 bits of 24 ticks.
+        let second = 100_000 - 58 * 24;
+        let plain: crate::TraceFrame = "123##0112233445566778899AABBCC".parse().unwrap();
+        let length = u64::from(plain.bus_bits().nominal) * 24;
+        assert_eq!(times(&lengths, "123##0112233445566778899AABBCC"), [second - length, second, 100_000]);
+        let switched = "123##1112233445566778899AABBCC";
+        assert_eq!(times(&lengths, switched), [100_000, second, 100_000]);
+        lengths.set_data(0, Some(2_000_000), 12_000_000);
+        let bits = switched.parse::<crate::TraceFrame>().unwrap().bus_bits();
+        let length = u64::from(bits.nominal) * 24 + u64::from(bits.data) * 6;
+        assert_eq!(times(&lengths, switched), [second - length, second, 100_000]);
+        lengths.set_data(0, None, 12_000_000);
+        assert_eq!(times(&lengths, switched), [100_000, second, 100_000]);
     }
 
     #[test]

@@ -3,7 +3,9 @@
 use cantap_wire::batch::BatchWriter;
 use cantap_wire::framing::{CRC_LEN, MAX_ENCODED, MAX_MESSAGE, seal};
 use cantap_wire::message::{EndReason, write_response};
-use cantap_wire::record::{MAX_RECORD, Record, encode_event, encode_received};
+use cantap_wire::record::{
+    MAX_FD_RECORD, MAX_RECORD, Record, encode_event, encode_received, encode_received_fd,
+};
 use cantap_wire::{Event, Refusal, Reply, Stamp};
 
 /// An answer as it goes over the wire, with its zero byte.
@@ -61,20 +63,27 @@ impl StreamEncoder {
     /// Adds a record at this device time, in ticks. It is sent when the batch is full or [`Self::finish`] is called; a device does that a
     /// millisecond after a batch's first record.
     pub fn record(&mut self, ticks: u64, record: &Record) {
-        let mut bytes = [0; MAX_RECORD];
         let difference = ticks.wrapping_sub(self.last_ticks) as i64;
-        let (len, frame_of, is_stamped) = match record {
-            Record::Received(received) => (
-                encode_received(received, difference, &mut bytes),
-                Some(received.channel),
-                received.stamp != Stamp::Omitted,
-            ),
-            Record::Event(event) => (encode_event(event, difference, &mut bytes), None, true),
+        let (mut short, mut long) = ([0; MAX_RECORD], [0; MAX_FD_RECORD]);
+        let (bytes, is_stamped) = match record {
+            Record::Received(received) => {
+                let len = encode_received(received, difference, &mut short);
+                (&short[..len], received.stamp != Stamp::Omitted)
+            }
+            Record::ReceivedFd(received) => {
+                let len = encode_received_fd(received, difference, &mut long);
+                (&long[..len], received.stamp != Stamp::Omitted)
+            }
+            Record::Event(event) => {
+                let len = encode_event(event, difference, &mut short);
+                (&short[..len], true)
+            }
         };
-        if !self.batch.push(&bytes[..len], self.last_ticks, frame_of) {
+        let frame_of = record.received_on();
+        if !self.batch.push(bytes, self.last_ticks, frame_of) {
             self.finish();
             // This cannot fail: any record fits in an empty batch.
-            let _ = self.batch.push(&bytes[..len], self.last_ticks, frame_of);
+            let _ = self.batch.push(bytes, self.last_ticks, frame_of);
         }
         if is_stamped {
             self.last_ticks = ticks;

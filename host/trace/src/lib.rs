@@ -9,7 +9,6 @@
 pub mod clean;
 pub mod diff;
 pub mod event_text;
-pub mod fd;
 mod fd_bits;
 pub mod filter;
 mod frame;
@@ -29,6 +28,7 @@ pub mod testing;
 
 pub use cantap_can::{
     BusErrorKind, Channel, ErrorState, Frame, FrameBits, Id, LossStage, TransmitFailure, bits, bits_on_bus,
+    fd,
 };
 pub use fd::FdFrame;
 pub use fd_bits::FdBits;

@@ -429,6 +429,7 @@ impl Books {
     fn enter(&mut self, record: &Record) {
         match record {
             Record::Received(received) => self.received[received.channel.index()] += 1,
+            Record::ReceivedFd(received) => self.complaints.push(format!("{received:?}")),
             Record::Event(Event::Lost { channel, stage: LossStage::Queue, count, .. }) => {
                 self.lost[channel.index()] += u64::from(*count);
             }

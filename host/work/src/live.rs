@@ -110,6 +110,16 @@ impl LiveRecords {
         opened.map(|(number, config, clock_hz)| (number, config.timing.bitrate_bps(clock_hz))).collect()
     }
 
+    /// The bit rates of their data phases that are known, by number, in bit/s.
+    pub fn data_bit_rates(&self) -> Vec<(u8, u32)> {
+        let known = |(board, device): (usize, &cantap::Device)| {
+            let open = device.open_channels().into_iter();
+            let of = |(channel, _)| Some((channel_number(board, channel), device.data_bitrate(channel)?));
+            open.filter_map(of).collect::<Vec<_>>()
+        };
+        self.lines.devices().flat_map(known).collect()
+    }
+
     /// The open channels, by number, each with its configuration and its controller's clock in Hz.
     pub fn opened(&self) -> impl Iterator<Item = (u8, ChannelConfig, u32)> {
         self.lines.devices().flat_map(|(board, device)| {

@@ -21,6 +21,11 @@ pub struct Meter {
     without_data: u64,
     /// A filter keeps frames back in the device.
     is_filtered: bool,
+    bitrate_bps: u32,
+    /// Of data phases, if known.
+    data_bitrate_bps: Option<u32>,
+    /// Frames that switched to a bit rate that is not known.
+    of_unknown_length: u64,
 }
 
 impl Meter {
@@ -39,6 +44,9 @@ impl Meter {
             omits_stamps: false,
             without_data: 0,
             is_filtered: false,
+            bitrate_bps,
+            data_bitrate_bps: None,
+            of_unknown_length: 0,
         }
     }
 
@@ -57,12 +65,24 @@ impl Meter {
         Self { is_filtered: true, ..self }
     }
 
+    /// With the bit rate of the bus's data phases, in bit/s, if it is known.
+    #[must_use]
+    pub fn with_data_bitrate(self, data_bitrate_bps: Option<u32>) -> Self {
+        Self { data_bitrate_bps, ..self }
+    }
+
     /// Takes the channel's next record, if it is not wanted: it loads the bus all the same.
     pub fn pass_by(&mut self, record: &TraceRecord) {
         match &record.event {
             TraceEvent::Frame { frame, .. } => {
                 self.without_data += u64::from(self.omits_data && frame.data_len() > 0);
-                self.load.frame(record.time_ns, f64::from(frame.bus_bits().total()));
+                let bits = frame.bus_bits();
+                let data = match self.data_bitrate_bps {
+                    Some(rate) => f64::from(bits.data) * f64::from(self.bitrate_bps) / f64::from(rate.max(1)),
+                    None => 0.0,
+                };
+                self.of_unknown_length += u64::from(bits.data > 0 && self.data_bitrate_bps.is_none());
+                self.load.frame(record.time_ns, f64::from(bits.nominal) + data);
             }
             TraceEvent::Lost { .. } => self.load.gap(),
             _ => {}
@@ -144,6 +164,8 @@ impl Meter {
         } else if self.without_data > 0 {
             // Stuff bits depend on them.
             Some("frames come without data")
+        } else if self.of_unknown_length > 0 {
+            Some("frames switch to a data bit rate that is not known")
         } else {
             None
         }
@@ -199,6 +221,22 @@ mod tests {
         // A channel without data does not lack them.
         let without = meter(|config| config.omit_data = true, &data[1..]);
         assert!(without.without_data == 0 && without.bus_load_pct() > Some(0.0));
+    }
+
+    #[test]
+    fn the_load_of_frames_that_switch_their_bit_rate_is_exact_or_unknown() {
+        let switched: cantap::TraceFrame = "123##1112233445566778899AABBCC".parse().unwrap();
+        let event = TraceEvent::Frame { frame: switched, direction: Direction::Rx, late: false };
+        let load = |data_bitrate_bps| {
+            let mut meter = meter(|_| {}, &[]).with_data_bitrate(data_bitrate_bps);
+            (0..3).for_each(|at| meter.push(&TraceRecord { time_ns: at * 1_000_000, channel: 1, event }));
+            (meter.bus_load_pct(), meter.no_bus_load_because())
+        };
+        let bits = switched.bus_bits();
+        let busy_us = f64::from(bits.nominal) * 2.0 + f64::from(bits.data) * 0.5;
+        let (Some(load_pct), None) = load(Some(2_000_000)) else { panic!("no load") };
+        assert!((load_pct - busy_us / 10.0).abs() < 1e-9, "{load_pct}");
+        assert_eq!(load(None), (None, Some("frames switch to a data bit rate that is not known")));
     }
 
     /// A stopped computer, for example: the bus was not empty meanwhile.

@@ -39,6 +39,8 @@ struct Traffic {
     /// Frames of others.
     frames: u64,
     bits: u64,
+    /// CAN FD frames switched to a bit rate of their own: the bits of those phases are not among these.
+    is_bound: bool,
     lost: u64,
     errors: u64,
 }
@@ -295,7 +297,9 @@ impl<'d> Speaking<'d> {
                 }
                 self.traffic.frames += 1;
                 self.has_received = true;
-                self.traffic.bits += u64::from(frame.bus_bits().total());
+                let bits = frame.bus_bits();
+                self.traffic.bits += u64::from(bits.nominal);
+                self.traffic.is_bound |= bits.data > 0;
                 if let Some(machine) = machine.filter(|_| !frame.is_remote()) {
                     machine.hear(now_ns, frame.id(), frame.data());
                 }
@@ -348,7 +352,7 @@ impl<'d> Speaking<'d> {
     /// What is known of the bus when a node does not answer: whether the last request was acknowledged, and what else there
     /// was.
     pub fn circumstances(&self) -> String {
-        let Traffic { since, own, frames, bits, lost, errors } = self.traffic;
+        let Traffic { since, own, frames, bits, is_bound, lost, errors } = self.traffic;
         let seconds = since.map_or(0.0, |since| since.elapsed().as_secs_f64()).max(1e-3);
         let load_pct = (bits as f64 / (f64::from(self.bitrate_bps) * seconds) * 100.0).min(100.0);
         let count = |number, noun| counted(usize::try_from(number).unwrap_or(usize::MAX), noun);
@@ -360,8 +364,9 @@ impl<'d> Speaking<'d> {
             0 => write!(text, "; no other frame was heard in {seconds:.1} s"),
             frames => write!(
                 text,
-                "; {} of others in {seconds:.1} s (load {load_pct:.0} %)",
-                count(frames, "frame")
+                "; {} of others in {seconds:.1} s (load {}{load_pct:.0} %)",
+                count(frames, "frame"),
+                if is_bound { "at least " } else { "" }
             ),
         };
         if errors > 0 {

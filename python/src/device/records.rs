@@ -128,8 +128,9 @@ impl Records {
 }
 
 /// A message as python-can's constructor takes it: time, identifier, whether it is extended, remote, an error; channel from 0, length
-/// code, data, whether it is CAN FD, whether it was received.
-type Message<'py> = (f64, u32, bool, bool, bool, u8, u8, Bound<'py, PyByteArray>, bool, bool);
+/// code (of CAN FD: the number of bytes), data, whether it is CAN FD, whether it was received, its bit rate is switched, its sender is passive.
+type Message<'py> =
+    (f64, u32, bool, bool, bool, u8, u8, Bound<'py, PyByteArray>, bool, bool, bool, bool);
 
 fn message<'py>(py: Python<'py>, record: &TraceRecord) -> Message<'py> {
     let time_s = record.time_ns as f64 / 1e9;
@@ -137,12 +138,18 @@ fn message<'py>(py: Python<'py>, record: &TraceRecord) -> Message<'py> {
     if let TraceEvent::Frame { frame, direction, .. } = &record.event {
         let (id, is_rx) = (frame.id(), *direction == Direction::Rx);
         let data = PyByteArray::new(py, frame.data());
-        let (is_extended, is_remote, dlc) = (id.is_extended(), frame.is_remote(), frame.dlc());
-        return (time_s, id.raw(), is_extended, is_remote, false, channel, dlc, data, false, is_rx);
+        let (is_extended, is_remote) = (id.is_extended(), frame.is_remote());
+        let (dlc, brs, esi) = match frame.fd() {
+            Some(fd) => (fd.data_len() as u8, fd.brs(), fd.esi()),
+            None => (frame.dlc(), false, false),
+        };
+        let is_fd = frame.is_fd();
+        return (time_s, id.raw(), is_extended, is_remote, false, channel, dlc, data, is_fd, is_rx, brs, esi);
     }
     let (classes, data) =
         ErrorFrame::of(&record.event).map_or((0, [0; 8]), |error| (error.classes, error.data));
-    (time_s, classes, true, false, true, channel, 8, PyByteArray::new(py, &data), false, true)
+    let data = PyByteArray::new(py, &data);
+    (time_s, classes, true, false, true, channel, 8, data, false, true, false, false)
 }
 
 #[pymethods]

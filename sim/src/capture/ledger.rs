@@ -121,6 +121,11 @@ impl Ledger {
                 }
                 books.at_least |= at_least;
             }
+            Heard::Record(_, Record::ReceivedFd(received)) => {
+                self.fault(format!(
+                    "the device reports a CAN FD frame, which no board can receive: {received:?}"
+                ));
+            }
             Heard::Record(_, Record::Event(_)) | Heard::Ended(..) => {}
             Heard::BatchesLost(frames) => {
                 for (books, lost) in self.books.iter_mut().zip(frames) {

@@ -2,7 +2,7 @@
 //! The board's own tasks use none of this.
 
 use cantap_wire::record::{LossStage, Stamp};
-use cantap_wire::{Channel, Event, Frame};
+use cantap_wire::{Channel, Event, FdFrame, Frame, ReceivedFd};
 
 use super::Capture;
 use crate::ports::{Clock, Traffic};
@@ -23,6 +23,19 @@ impl<const N: usize> Capture<'_, N> {
         if Self::record(state, &mut self.recorder, channel, frame, at, stamp) {
             let now = self.recorder.time(clock.now());
             state.transmitter.service(traffic, &mut self.recorder, now);
+        }
+    }
+
+    /// The same for a CAN FD frame. It has no replies: a reply answers a classical frame.
+    pub fn on_stamped_fd_frame(&mut self, channel: Channel, frame: FdFrame, at: u64, stamp: Stamp) {
+        let state = &mut self.channels[channel.index()];
+        let (data_omitted, omit_stamps) =
+            state.open.as_ref().map_or((false, false), |config| (config.omit_data, config.omit_stamps));
+        state.frames = state.frames.wrapping_add(1);
+        let stamp = if omit_stamps { Stamp::Omitted } else { stamp };
+        self.recorder.fd_frame(&ReceivedFd { channel, frame, stamp, data_omitted }, at);
+        if state.gaps.taken() {
+            Self::record_gap(state, &mut self.recorder, channel, at);
         }
     }
 

@@ -200,6 +200,13 @@ impl Source<'_> {
                 opened.map(move |(channel, config)| (channel_number(board, channel), config, clock_hz))
             })
             .collect();
+        let data_rates: Vec<(u8, u32)> = lines
+            .devices()
+            .flat_map(|(board, device)| {
+                let known = |channel| Some((channel_number(board, channel), device.data_bitrate(channel)?));
+                Channel::ALL.into_iter().filter_map(known).collect::<Vec<_>>()
+            })
+            .collect();
         let mut model = lock(self.model);
         if let Some(other) = &back.other_board {
             model.notice = format!("another board is at {address} now: {other}");
@@ -237,11 +244,13 @@ impl Source<'_> {
                 .clone_into(&mut model.notice);
         }
         if without_load != model.options().without_load
+            || data_rates != model.options().channel_data_bitrate_bps
             || rates.iter().any(|(channel, rate)| model.options().bitrate_of(*channel) != Some(*rate))
         {
             let options = cantap_analysis::stats::Options {
                 bitrate_bps: None,
                 channel_bitrate_bps: rates,
+                channel_data_bitrate_bps: data_rates,
                 without_load,
                 ..model.options().clone()
             };

@@ -10,8 +10,10 @@ use cantap_wire::message::{
     Checksum, DeviceMessage, EndReason, Filter, FrameKind, MAX_FILTERS, MAX_SEND, Mode, SessionEnd, TxFrame,
     read_send, why_unreadable, write_response,
 };
-use cantap_wire::record::{MAX_RECORD, encode_event, encode_received};
-use cantap_wire::{Command, PROTOCOL_VERSION, Received, Refusal, Reply, Request, Response, Stamp};
+use cantap_wire::record::{MAX_FD_RECORD, MAX_RECORD, encode_event, encode_received, encode_received_fd};
+use cantap_wire::{
+    Command, FdFrame, Id, PROTOCOL_VERSION, Received, ReceivedFd, Refusal, Reply, Request, Response, Stamp,
+};
 use samples::{commands, events, frame, hex, refusals, replies};
 use serde::Serialize;
 
@@ -28,7 +30,7 @@ fn written(result: &Result<Reply, Refusal>) -> String {
 
 #[test]
 fn the_version_is_the_one_that_these_bytes_belong_to() {
-    assert_eq!(PROTOCOL_VERSION, 5);
+    assert_eq!(PROTOCOL_VERSION, 6);
 }
 
 #[test]
@@ -55,6 +57,24 @@ fn received_frames() {
     assert_eq!(record("123#1122", Can1, Stamp::UpperBound, true, 1), "45 82 23 01 02");
     assert_eq!(record("123#1122", Can1, Stamp::Omitted, true, 1), "46 82 23 01");
     assert_eq!(record("123#1122334455667788_F", Can1, Stamp::Omitted, true, 1), "46 8f 23 01");
+}
+
+#[test]
+fn received_fd_frames() {
+    let record = |id, (brs, esi), data: &[u8], channel, stamp, data_omitted, ticks| {
+        let mut out = [0; MAX_FD_RECORD];
+        let frame = FdFrame::new(id, brs, esi, data).unwrap();
+        let len = encode_received_fd(&ReceivedFd { channel, frame, stamp, data_omitted }, ticks, &mut out);
+        hex(&out[..len])
+    };
+    let (short, long) = (Id::standard(0x123).unwrap(), Id::extended(0x1F33_4455).unwrap());
+    let (exact, bound) = (Stamp::Exact, Stamp::UpperBound);
+    assert_eq!(record(short, (false, false), &[], Can1, exact, false, 576), "60 80 23 01 80 09");
+    assert_eq!(record(short, (true, false), &[1, 2], Can2, bound, false, 64), "69 c2 23 01 80 01 01 02");
+    assert_eq!(record(long, (false, true), &[7; 12], Can1, exact, true, 1), "74 a9 55 44 33 1f 02");
+    assert_eq!(record(long, (true, true), &[0xAA], Can1, Stamp::Omitted, false, 1), "7a a1 55 44 33 1f aa");
+    let whole = record(short, (true, false), &[0x11; 64], Can1, exact, false, 1);
+    assert_eq!(whole, format!("68 8f 23 01 02{}", " 11".repeat(64)));
 }
 
 #[test]

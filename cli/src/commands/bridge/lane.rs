@@ -97,7 +97,14 @@ impl Lane {
         for record in records.iter().filter(|record| record.channel == number) {
             match &record.event {
                 TraceEvent::Frame { frame, direction, .. } => {
-                    let Some(frame) = frame.classic() else { continue };
+                    let Some(frame) = frame.classic() else {
+                        // Of another maker's adapter: programs are told that one is missing.
+                        add(&self.counts.lost, 1);
+                        let missing =
+                            TraceEvent::Lost { stage: Some(LossStage::Host), count: 1, at_least: false };
+                        raw.extend(raw_error(&missing));
+                        continue;
+                    };
                     // If the kernel has already shown it to the others, once is enough.
                     if *direction == Direction::Tx && self.has_ended(frame) && !self.known.echoes {
                         continue;

@@ -21,6 +21,8 @@ struct OfChannel {
     bitrate_bps: u32,
     /// Since the last update.
     bits: u64,
+    /// CAN FD frames switched to a bit rate of their own: the bits of those phases are not among these.
+    is_bound: bool,
     lost: u64,
     is_at_least: bool,
     /// Descriptions since the last update.
@@ -41,7 +43,11 @@ impl Traffic {
     pub fn push(&mut self, record: &TraceRecord) {
         let channel = self.channels.entry(record.channel).or_default();
         match record.event {
-            TraceEvent::Frame { ref frame, .. } => channel.bits += u64::from(frame.bus_bits().total()),
+            TraceEvent::Frame { ref frame, .. } => {
+                let bits = frame.bus_bits();
+                channel.bits += u64::from(bits.nominal);
+                channel.is_bound |= bits.data > 0;
+            }
             TraceEvent::Lost { stage, count, at_least } => {
                 channel.lost += u64::from(count);
                 channel.is_at_least |= at_least;
@@ -72,7 +78,7 @@ impl Traffic {
             if channel.unlisted > 0 {
                 screen.log(&format!("{seconds:.0} s, channel {number}: {} more lost", channel.unlisted));
             }
-            (channel.bits, channel.unlisted) = (0, 0);
+            (channel.bits, channel.unlisted, channel.is_bound) = (0, 0, false);
         }
     }
 
@@ -80,7 +86,7 @@ impl Traffic {
         let share = |(number, channel): (&u8, &OfChannel)| {
             let most = f64::from(channel.bitrate_bps) * passed.as_secs_f64();
             let load = if most > 0.0 { (channel.bits as f64 / most * 100.0).min(100.0) } else { 0.0 };
-            format!("{number}: {load:.0} %")
+            format!("{number}: {}{load:.0} %", if channel.is_bound { "at least " } else { "" })
         };
         self.channels.iter().map(share).collect::<Vec<_>>().join("  ")
     }

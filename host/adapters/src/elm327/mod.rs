@@ -198,7 +198,9 @@ impl Elm327 {
             self.refusals = 0;
         }
         match content {
-            Content::Frame(frame) => self.backlog.push(Incoming::Received { channel, frame, at }),
+            Content::Frame(frame) => {
+                self.backlog.push(Incoming::Received { channel, frame: frame.into(), at })
+            }
             Content::Nothing => {}
             Content::Damaged => {
                 self.oddities.count("frames that the adapter marks as damaged");

@@ -1,6 +1,7 @@
 //! gs_usb adapters without a kernel driver, on every system: candleLight, CANable with its firmware, CANnectivity and others.
 //!
-//! CAN FD is not switched on, since a data bit rate would have to be guessed: on a bus with CAN FD frames each of them is an error.
+//! CAN FD is switched on where the address gives a data bit rate, which would otherwise have to be guessed: without it, each CAN FD frame on the
+//! bus is an error.
 
 mod pipes;
 mod usb;
@@ -43,6 +44,15 @@ struct Can {
     tells_state: bool,
 }
 
+/// What an address asks for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Options {
+    /// Whether to switch the resistor on or off; as it is if nothing is said.
+    pub termination: Option<bool>,
+    /// The bit rate of CAN FD's data phases, in bit/s; without it CAN FD stays off.
+    pub data_bitrate_bps: Option<u32>,
+}
+
 /// The driver.
 pub(crate) struct GsUsb {
     usb: Box<dyn Usb>,
@@ -50,8 +60,7 @@ pub(crate) struct GsUsb {
     serial: String,
     version: u32,
     channels: Vec<Can>,
-    /// Whether to switch the resistor on or off; as it is if nothing is said.
-    termination: Option<bool>,
+    options: Options,
     clock: AdapterClock,
     asked: Instant,
     /// Until when it shows which one it is.
@@ -63,15 +72,15 @@ pub(crate) struct GsUsb {
 
 impl GsUsb {
     /// The adapter with a serial number, or the only one.
-    pub fn connect(serial: &str, termination: Option<bool>, address: &str) -> Result<Self, OpenError> {
+    pub fn connect(serial: &str, options: Options, address: &str) -> Result<Self, OpenError> {
         let (usb, serial) = UsbAdapter::open(serial, address)?;
-        Self::over(Box::new(usb), serial, termination, address)
+        Self::over(Box::new(usb), serial, options, address)
     }
 
     fn over(
         mut usb: Box<dyn Usb>,
         serial: String,
-        termination: Option<bool>,
+        options: Options,
         address: &str,
     ) -> Result<Self, OpenError> {
         let foreign = || OpenError::Foreign { address: address.to_owned(), expected: "a gs_usb adapter" };
@@ -86,8 +95,19 @@ impl GsUsb {
         for number in 0..count.min(CHANNELS as u16) {
             let constants =
                 usb.control_in(request::CONSTANTS, number, 40, GREETED_WITHIN).map_err(|_| foreign())?;
-            let constants = Constants::parse(&constants).ok_or_else(foreign)?;
-            if termination.is_some() && !constants.has(feature::TERMINATION) {
+            let mut constants = Constants::parse(&constants).ok_or_else(foreign)?;
+            if let Some(data_bitrate_bps) = options.data_bitrate_bps {
+                if constants.has(feature::FD) && constants.has(feature::EXTENDED_CONSTANTS) {
+                    let extended = usb.control_in(request::EXTENDED_CONSTANTS, number, 72, GREETED_WITHIN);
+                    constants =
+                        extended.ok().and_then(|bytes| Constants::parse(&bytes)).ok_or_else(foreign)?;
+                }
+                if constants.data_timing(data_bitrate_bps).is_none() {
+                    let address = address.to_owned();
+                    return Err(OpenError::NoDataBitRate { address, data_bitrate_bps });
+                }
+            }
+            if options.termination.is_some() && !constants.has(feature::TERMINATION) {
                 return Err(OpenError::NoTermination { address: address.to_owned() });
             }
             channels.push(Can {
@@ -104,7 +124,7 @@ impl GsUsb {
             serial,
             version,
             channels,
-            termination,
+            options,
             clock: AdapterClock::new(1_000, 1 << 32),
             asked: Instant::now(),
             identifies_until: None,
@@ -134,13 +154,23 @@ impl GsUsb {
         if opening.listen_only {
             flags |= feature::LISTEN_ONLY;
         }
+        let data_timing = match self.options.data_bitrate_bps {
+            Some(data_bitrate_bps) => {
+                flags |= feature::FD;
+                Some(constants.data_timing(data_bitrate_bps).ok_or(Refusal::BadTiming)?)
+            }
+            None => None,
+        };
         let mut set = |request, data: &[u8]| {
             self.usb.control_out(request, number as u16, data).map_err(|_| Refusal::Hardware)
         };
-        if let Some(is_on) = self.termination {
+        if let Some(is_on) = self.options.termination {
             set(request::SET_TERMINATION, &words(&[u32::from(is_on)]))?;
         }
         set(request::BIT_TIMING, &timing)?;
+        if let Some(data_timing) = data_timing {
+            set(request::DATA_BIT_TIMING, &data_timing)?;
+        }
         set(request::MODE, &words(&[1, flags]))
     }
 
@@ -171,11 +201,6 @@ impl GsUsb {
             Content::Error(error) => {
                 let errors = &mut self.channels[number].errors;
                 errors.take(error, channel, at, &mut self.backlog, &mut self.oddities);
-            }
-            Content::Fd => {
-                self.oddities.count("CAN FD frames, which do not fit the device's protocol");
-                let stage = LossStage::Link;
-                self.backlog.push(Incoming::Lost { channel, stage, count: 1, at_least: false, at });
             }
             Content::Impossible => self.damaged(number, at),
         }

@@ -3,9 +3,11 @@
 use std::cmp::Reverse;
 use std::ops::RangeInclusive;
 
+use cantap_trace::TraceFrame;
+use cantap_trace::fd::FD_LENGTHS;
 use cantap_trace::socketcan::{ERROR_FLAG, ErrorFrame};
 use cantap_wire::record::ErrorState;
-use cantap_wire::{BitTiming, Frame, Id};
+use cantap_wire::{BitTiming, FdFrame, Frame, Id};
 
 /// Vendor requests to the interface.
 pub(super) mod request {
@@ -15,6 +17,8 @@ pub(super) mod request {
     pub const CONSTANTS: u8 = 4;
     pub const DEVICE_CONFIG: u8 = 5;
     pub const IDENTIFY: u8 = 7;
+    pub const DATA_BIT_TIMING: u8 = 10;
+    pub const EXTENDED_CONSTANTS: u8 = 11;
     pub const SET_TERMINATION: u8 = 12;
     pub const STATE: u8 = 14;
 }
@@ -24,8 +28,11 @@ pub(super) mod feature {
     pub const LISTEN_ONLY: u32 = 1 << 0;
     pub const STAMPS: u32 = 1 << 4;
     pub const IDENTIFY: u32 = 1 << 5;
+    pub const FD: u32 = 1 << 8;
     /// A transfer must not end with a packet of a certain length: one byte is added (an erratum of LPC546xx).
     pub const LPC546XX: u32 = 1 << 9;
+    /// It answers [`super::request::EXTENDED_CONSTANTS`].
+    pub const EXTENDED_CONSTANTS: u32 = 1 << 10;
     pub const TERMINATION: u32 = 1 << 11;
     pub const BUS_ERRORS: u32 = 1 << 12;
     pub const STATE: u32 = 1 << 13;
@@ -38,8 +45,12 @@ pub(super) const RECEIVED: u32 = u32::MAX;
 
 const FLAG_OVERFLOW: u8 = 1;
 const FLAG_FD: u8 = 2;
+const FLAG_BRS: u8 = 4;
+const FLAG_ESI: u8 = 8;
 const EXTENDED: u32 = 1 << 31;
 const REMOTE: u32 = 1 << 30;
+/// Where the bits of data phases are sampled, in thousandths: Linux's own choice above 800 kbit/s (`can_calc_bittiming`).
+const DATA_SAMPLE_POINT_PERMILLE: u32 = 750;
 /// Bytes before the data.
 const HEADER: usize = 12;
 
@@ -57,11 +68,18 @@ pub(super) fn device(bytes: &[u8]) -> Option<(u16, u32)> {
     Some((u16::from(*bytes.get(3)?) + 1, word(bytes, 1)?))
 }
 
-/// The answer to [`request::CONSTANTS`].
+/// The answer to [`request::CONSTANTS`], and to [`request::EXTENDED_CONSTANTS`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Constants {
     pub features: u32,
     clock_hz: u32,
+    nominal: Limits,
+    data: Option<Limits>,
+}
+
+/// What a bit timing may be.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Limits {
     segment1: RangeInclusive<u32>,
     segment2: RangeInclusive<u32>,
     jump_width_max: u32,
@@ -71,15 +89,11 @@ pub(super) struct Constants {
 
 impl Constants {
     pub fn parse(bytes: &[u8]) -> Option<Self> {
-        let word = |index| word(bytes, index);
         Some(Self {
-            features: word(0)?,
-            clock_hz: word(1)?,
-            segment1: word(2)?..=word(3)?,
-            segment2: word(4)?..=word(5)?,
-            jump_width_max: word(6)?,
-            prescaler: word(7)?..=word(8)?,
-            prescaler_step: word(9)?,
+            features: word(bytes, 0)?,
+            clock_hz: word(bytes, 1)?,
+            nominal: Limits::parse(bytes, 2)?,
+            data: Limits::parse(bytes, 10),
         })
     }
 
@@ -89,22 +103,68 @@ impl Constants {
 
     /// The request's data for a bit rate; `None` if this channel's clock cannot be divided to it. A sample point within what is possible.
     pub fn timing(&self, bitrate_bps: u32, sample_point_permille: u32) -> Option<Vec<u8>> {
+        let limits = &self.nominal;
         let fits = |timing: &BitTiming| {
             let prescaler = u32::from(timing.prescaler);
-            self.prescaler.contains(&prescaler)
-                && (prescaler - self.prescaler.start()).is_multiple_of(self.prescaler_step.max(1))
-                && self.segment1.contains(&u32::from(timing.segment1))
-                && self.segment2.contains(&u32::from(timing.segment2))
+            limits.prescaler.contains(&prescaler)
+                && (prescaler - limits.prescaler.start()).is_multiple_of(limits.prescaler_step.max(1))
+                && limits.segment1.contains(&u32::from(timing.segment1))
+                && limits.segment2.contains(&u32::from(timing.segment2))
         };
         let best = BitTiming::all(self.clock_hz, bitrate_bps).filter(fits).min_by_key(|timing| {
             let off = timing.sample_point_permille().abs_diff(sample_point_permille);
             (off, Reverse(timing.quanta()))
         })?;
         let (segment1, segment2) = (u32::from(best.segment1), u32::from(best.segment2));
+        let jump_width = best.quanta() / 8;
+        Some(self.nominal.timing(segment1, segment2, jump_width, best.prescaler.into()))
+    }
+
+    /// The same for the data phases of CAN FD frames, sampled at [`DATA_SAMPLE_POINT_PERMILLE`], with the largest jump width; `None` also if
+    /// the channel has no CAN FD.
+    pub fn data_timing(&self, bitrate_bps: u32) -> Option<Vec<u8>> {
+        let limits = self.data.as_ref().filter(|_| self.has(feature::FD))?;
+        let (first, last) = (*limits.prescaler.start(), *limits.prescaler.end());
+        // No clock is divided by more than this.
+        let prescalers = (first.max(1)..=last.min(1024)).step_by(limits.prescaler_step.max(1) as usize);
+        let fitting = prescalers.filter_map(|prescaler| {
+            let per_quantum = u64::from(prescaler) * u64::from(bitrate_bps.max(1));
+            let clock_hz = u64::from(self.clock_hz);
+            let quanta =
+                u32::try_from(clock_hz / per_quantum).ok().filter(|_| clock_hz % per_quantum == 0)?;
+            let wanted = (quanta * DATA_SAMPLE_POINT_PERMILLE).div_ceil(1000);
+            let most =
+                (*limits.segment1.end()).min(quanta.checked_sub(limits.segment2.start().saturating_add(1))?);
+            let segment1 = wanted.checked_sub(1)?.min(most);
+            let segment2 = quanta - 1 - segment1;
+            let fits = limits.segment1.contains(&segment1) && limits.segment2.contains(&segment2);
+            let off = ((1 + segment1) * 1000 / quanta).abs_diff(DATA_SAMPLE_POINT_PERMILLE);
+            fits.then_some((off, prescaler, segment1, segment2))
+        });
+        let (_, prescaler, segment1, segment2) = fitting.min()?;
+        Some(limits.timing(segment1, segment2, segment2, prescaler))
+    }
+}
+
+impl Limits {
+    /// Those that begin at the number with this index.
+    fn parse(bytes: &[u8], first: usize) -> Option<Self> {
+        let word = |index| word(bytes, first + index);
+        Some(Self {
+            segment1: word(0)?..=word(1)?,
+            segment2: word(2)?..=word(3)?,
+            jump_width_max: word(4)?,
+            prescaler: word(5)?..=word(6)?,
+            prescaler_step: word(7)?,
+        })
+    }
+
+    /// A request's data.
+    fn timing(&self, segment1: u32, segment2: u32, jump_width: u32, prescaler: u32) -> Vec<u8> {
         // The propagation segment is only a part of the first, and the adapter adds them up; neither may be 0.
         let propagation = segment1 / 2;
-        let jump_width = (best.quanta() / 8).clamp(1, self.jump_width_max.min(segment2).max(1));
-        Some(words(&[propagation, segment1 - propagation, segment2, jump_width, u32::from(best.prescaler)]))
+        let jump_width = jump_width.clamp(1, self.jump_width_max.min(segment2).max(1));
+        words(&[propagation, segment1 - propagation, segment2, jump_width, prescaler])
     }
 }
 
@@ -123,10 +183,10 @@ pub(super) fn state(bytes: &[u8]) -> Option<(Option<ErrorState>, (u8, u8))> {
 
 /// What a transfer contains.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[expect(clippy::large_enum_variant, reason = "taken apart at once")]
 pub(super) enum Content {
-    Frame(Frame),
+    Frame(TraceFrame),
     Error(ErrorFrame),
-    Fd,
     /// An identifier or a length that no frame has.
     Impossible,
 }
@@ -152,17 +212,22 @@ pub(super) fn transfer(bytes: &[u8], stamps: bool) -> Option<Transfer> {
     let stamp = bytes.get(HEADER + data_len..).and_then(|rest| word(rest, 0));
     let mut eight = [0; 8];
     eight.copy_from_slice(&data[..8]);
-    let content = if is_fd {
-        Content::Fd
-    } else if id & ERROR_FLAG != 0 {
+    let content = if id & ERROR_FLAG != 0 {
         Content::Error(ErrorFrame { classes: id & (ERROR_FLAG - 1), data: eight })
     } else {
         let raw = id & !(EXTENDED | REMOTE);
+        let is_remote = id & REMOTE != 0;
         let id_of = if id & EXTENDED != 0 { Id::extended(raw) } else { Id::standard(raw) };
-        match id_of {
-            Some(id_of) if dlc < 16 => Content::Frame(Frame::from_bus(id_of, id & REMOTE != 0, dlc, eight)),
-            _ => Content::Impossible,
-        }
+        let frame = match id_of {
+            Some(id) if dlc < 16 && is_fd && !is_remote => {
+                let (brs, esi) = (flags & FLAG_BRS != 0, flags & FLAG_ESI != 0);
+                let len = usize::from(FD_LENGTHS[usize::from(dlc)]);
+                FdFrame::new(id, brs, esi, &data[..len]).map(TraceFrame::Fd)
+            }
+            Some(id) if dlc < 16 && !is_fd => Some(Frame::from_bus(id, is_remote, dlc, eight).into()),
+            _ => None,
+        };
+        frame.map_or(Content::Impossible, Content::Frame)
     };
     let overflow = flags & FLAG_OVERFLOW != 0;
     Some(Transfer { echo, channel, overflow, stamp_us: stamp.filter(|_| stamps), content })
@@ -234,7 +299,7 @@ pub(super) mod tests {
             let sent: Frame = text.parse().unwrap();
             let bytes = frame(&sent, 1, 2);
             let back = transfer(&bytes, true).unwrap();
-            assert_eq!((back.echo, back.channel, back.content), (2, 1, Content::Frame(sent)));
+            assert_eq!((back.echo, back.channel, back.content), (2, 1, Content::Frame(sent.into())));
         }
     }
 
@@ -243,7 +308,7 @@ pub(super) mod tests {
         fn any_bytes_are_a_transfer_or_refused(bytes in proptest::collection::vec(0_u8.., 0..90), stamps: bool) {
             let _ = (transfer(&bytes, stamps), device(&bytes), state(&bytes));
             if let Some(constants) = Constants::parse(&bytes) {
-                let _ = constants.timing(500_000, 875);
+                let _ = (constants.timing(500_000, 875), constants.data_timing(2_000_000));
             }
         }
     }

@@ -1,11 +1,14 @@
 //! Linux's `struct can_frame` and `struct canfd_frame` (`linux/can.h`), and their meaning here.
 
 use cantap_trace::TraceEvent;
+use cantap_trace::fd::{FLAG_BRS, FLAG_ESI};
 use cantap_trace::socketcan::{ERROR_FLAG, ErrorFrame};
-use cantap_wire::{Frame, Id};
+use cantap_wire::{FdFrame, Frame, Id};
 
 /// The identifier with its flags in the machine's byte order, the length, two unused bytes, the DLC where it is above 8, the data.
 pub type RawFrame = [u8; 16];
+/// The identifier with its flags, the length, the flags of CAN FD, two unused bytes, the data.
+pub type RawFdFrame = [u8; 72];
 
 const EXTENDED_FLAG: u32 = 0x8000_0000;
 const REMOTE_FLAG: u32 = 0x4000_0000;
@@ -49,13 +52,27 @@ pub fn frame_of(raw: &RawFrame) -> Option<Frame> {
         return None;
     }
     let is_remote = id & REMOTE_FLAG != 0;
-    let id = if id & EXTENDED_FLAG != 0 {
-        Id::extended(id & Id::MAX_EXTENDED)?
-    } else {
-        Id::standard(id & Id::MAX_STANDARD)?
-    };
+    let id = id_of(id)?;
     let dlc = if len == 8 && (9..=15).contains(&above_8) { above_8 } else { len };
     Some(Frame::from_bus(id, is_remote, dlc, data))
+}
+
+fn id_of(id: u32) -> Option<Id> {
+    if id & EXTENDED_FLAG != 0 {
+        Id::extended(id & Id::MAX_EXTENDED)
+    } else {
+        Id::standard(id & Id::MAX_STANDARD)
+    }
+}
+
+/// A CAN FD frame; `None` if no bus can carry it: a remote or an error frame, or of a length that CAN FD has no code for.
+pub fn fd_frame_of(raw: &RawFdFrame) -> Option<FdFrame> {
+    let [a, b, c, d, len, flags, _, _, data @ ..] = raw;
+    let id = u32::from_ne_bytes([*a, *b, *c, *d]);
+    if id & (ERROR_FLAG | REMOTE_FLAG) != 0 {
+        return None;
+    }
+    FdFrame::new(id_of(id)?, flags & FLAG_BRS != 0, flags & FLAG_ESI != 0, data.get(..usize::from(*len))?)
 }
 
 #[cfg(test)]
@@ -99,6 +116,22 @@ mod tests {
         assert_eq!(frame_of(&beyond), Some("123#11".parse().unwrap()));
         assert_eq!(frame_of(&bytes(0x2000_0001, [8, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0])), None);
         assert_eq!(frame_of(&bytes(0x123, [9, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0])), None);
+    }
+
+    #[test]
+    fn fd_frames_are_canfd_frames_of_linux_and_bytes_beyond_the_length_are_left_out() {
+        let raw = |id: u32, len: u8, flags: u8| {
+            let mut raw: RawFdFrame = [7; 72];
+            raw[..4].copy_from_slice(&id.to_ne_bytes());
+            (raw[4], raw[5]) = (len, flags);
+            fd_frame_of(&raw).map(|frame| frame.to_string())
+        };
+        assert_eq!(raw(0x123, 0, 0).as_deref(), Some("123##0"));
+        assert_eq!(raw(0x98DA_F110, 2, 0x05).as_deref(), Some("18DAF110##10707"));
+        assert_eq!(raw(0x7FF, 64, 2), Some(format!("7FF##2{}", "07".repeat(64))));
+        for (id, len) in [(0x123, 9), (0x123, 65), (0x4000_0123, 0), (0x2000_0123, 8)] {
+            assert_eq!(raw(id, len, 0), None, "{id:X} {len}");
+        }
     }
 
     #[test]

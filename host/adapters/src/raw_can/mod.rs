@@ -4,8 +4,6 @@ mod frame;
 #[cfg(target_os = "linux")]
 mod socket;
 
-pub use frame::{RawFrame, frame_of, raw_error, raw_frame};
-#[cfg(target_os = "linux")]
-pub(crate) use socket::FD_BYTES;
+pub use frame::{RawFdFrame, RawFrame, fd_frame_of, frame_of, raw_error, raw_frame};
 #[cfg(target_os = "linux")]
 pub use socket::{BATCH, Message, Options, RawSocket};

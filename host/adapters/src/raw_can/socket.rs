@@ -14,10 +14,10 @@ use nix::sys::time::TimeSpec;
 use rustix::net::{RecvAncillaryBuffer, RecvFlags};
 use socketcan::{CanSocket, Socket, SocketOptions};
 
-use super::frame::RawFrame;
+use super::frame::{RawFdFrame, RawFrame};
 
 /// Bytes of a CAN FD frame, `struct canfd_frame` of `linux/can.h`.
-pub(crate) const FD_BYTES: usize = 72;
+const FD_BYTES: usize = size_of::<RawFdFrame>();
 /// Messages per system call.
 pub const BATCH: usize = 64;
 /// Room for messages that wait, as root and as anybody else. The kernel doubles the figure, and a message takes less than a kilobyte of it.

@@ -30,7 +30,9 @@ const IFLA_CAN_BITTIMING: u16 = 1;
 const IFLA_CAN_STATE: u16 = 4;
 const IFLA_CAN_CTRLMODE: u16 = 5;
 const IFLA_CAN_BERR_COUNTER: u16 = 8;
+const IFLA_CAN_DATA_BITTIMING: u16 = 9;
 const CAN_CTRLMODE_LISTENONLY: u32 = 2;
+const CAN_CTRLMODE_FD: u32 = 0x20;
 
 /// Places in `struct rtnl_link_stats64`, in 64-bit numbers.
 const RX_DROPPED: usize = 6;
@@ -50,6 +52,8 @@ pub(crate) struct Link {
     pub kind: String,
     /// In bit/s, if it is set and known.
     pub bitrate_bps: Option<u32>,
+    /// Of the data phases of CAN FD frames, in bit/s, if CAN FD is on.
+    pub data_bitrate_bps: Option<u32>,
     pub listen_only: bool,
     /// `None` for a controller that is stopped, and where there is none.
     pub state: Option<ErrorState>,
@@ -132,11 +136,12 @@ impl Link {
     }
 
     fn controller(&mut self, bytes: &[u8]) {
+        let rate = |content| u32_at(content, 0).filter(|rate| (1..u32::MAX).contains(rate));
+        let (mut data_bitrate_bps, mut has_fd) = (None, false);
         for (kind, content) in Attributes(bytes) {
             match kind {
-                IFLA_CAN_BITTIMING => {
-                    self.bitrate_bps = u32_at(content, 0).filter(|rate| (1..u32::MAX).contains(rate));
-                }
+                IFLA_CAN_BITTIMING => self.bitrate_bps = rate(content),
+                IFLA_CAN_DATA_BITTIMING => data_bitrate_bps = rate(content),
                 IFLA_CAN_STATE => {
                     self.state = match u32_at(content, 0) {
                         Some(0) => Some(ErrorState::Active),
@@ -148,8 +153,9 @@ impl Link {
                 }
                 // The mask, and the flags.
                 IFLA_CAN_CTRLMODE => {
-                    self.listen_only =
-                        u32_at(content, 4).is_some_and(|flags| flags & CAN_CTRLMODE_LISTENONLY != 0);
+                    let flags = u32_at(content, 4).unwrap_or(0);
+                    self.listen_only = flags & CAN_CTRLMODE_LISTENONLY != 0;
+                    has_fd = flags & CAN_CTRLMODE_FD != 0;
                 }
                 IFLA_CAN_BERR_COUNTER => {
                     let counter = |at| u16_at(content, at).map(|count| count.min(255) as u8);
@@ -158,6 +164,7 @@ impl Link {
                 _ => {}
             }
         }
+        self.data_bitrate_bps = data_bitrate_bps.filter(|_| has_fd);
     }
 }
 
@@ -222,7 +229,7 @@ mod tests {
     }
 
     /// A controller's interface that only listens, with everything that `ip -details -statistics link` prints.
-    fn controller() -> Vec<u8> {
+    fn controller(fd: u32) -> Vec<u8> {
         let nested = |kind: u16, parts: &[Vec<u8>]| attribute(kind | 0x8000, &parts.concat());
         let mut stats = vec![0_u8; 25 * 8];
         for (at, figure) in [(RX_DROPPED, 5_u64), (RX_OVER_ERRORS, 7), (RX_FIFO_ERRORS, 1)] {
@@ -233,7 +240,8 @@ mod tests {
             IFLA_INFO_DATA,
             &[
                 attribute(IFLA_CAN_BITTIMING, &words(&[500_000, 875, 125, 6, 7, 2, 1, 6])),
-                attribute(IFLA_CAN_CTRLMODE, &words(&[0, CAN_CTRLMODE_LISTENONLY | 0x10])),
+                attribute(IFLA_CAN_CTRLMODE, &words(&[0, CAN_CTRLMODE_LISTENONLY | 0x10 | fd])),
+                attribute(IFLA_CAN_DATA_BITTIMING, &words(&[2_000_000, 750, 25, 7, 7, 5, 1, 1])),
                 attribute(IFLA_CAN_STATE, &words(&[2])),
                 attribute(IFLA_CAN_BERR_COUNTER, &counters),
             ],
@@ -250,13 +258,14 @@ mod tests {
 
     #[test]
     fn a_controller_s_rate_mode_state_counters_and_losses_are_read() {
-        let read = answer(&controller()).unwrap();
+        let read = answer(&controller(CAN_CTRLMODE_FD)).unwrap();
         let wanted = Link {
             is_can: true,
             is_up: true,
             echoes: true,
             kind: "can".to_owned(),
             bitrate_bps: Some(500_000),
+            data_bitrate_bps: Some(2_000_000),
             listen_only: true,
             state: Some(ErrorState::Passive),
             counters: Some((130, 255)),
@@ -264,6 +273,9 @@ mod tests {
             dropped: 5,
         };
         assert_eq!(read, wanted);
+        // A data bit rate that was set once says nothing while CAN FD is off.
+        let classical = answer(&controller(0)).unwrap();
+        assert_eq!(classical, Link { data_bitrate_bps: None, ..wanted });
     }
 
     #[test]
@@ -292,7 +304,7 @@ mod tests {
     proptest::proptest! {
         #[test]
         fn an_answer_that_is_cut_or_garbled_is_read_or_refused(cut in 0_usize..600, at in 0_usize..600, byte: u8) {
-            let mut bytes = controller();
+            let mut bytes = controller(0);
             bytes.truncate(cut);
             if let Some(there) = bytes.get_mut(at) {
                 *there = byte;

@@ -12,6 +12,7 @@ use std::collections::VecDeque;
 use std::io;
 use std::time::{Duration, Instant, SystemTime};
 
+use cantap_trace::TraceFrame;
 use cantap_trace::socketcan::ErrorFrame;
 use cantap_wire::record::{ErrorState, LossStage};
 use cantap_wire::{Channel, Frame, Refusal};
@@ -73,6 +74,11 @@ pub(crate) struct SocketCan {
 /// The bit rate of an interface in bit/s, if it has one.
 pub(crate) fn bitrate_of(name: &str) -> Option<u32> {
     LinuxInterface::new(name).look().ok()?.bitrate_bps
+}
+
+/// The bit rate of the data phases of CAN FD frames, in bit/s, if it has one.
+pub(crate) fn data_bitrate_of(name: &str) -> Option<u32> {
+    LinuxInterface::new(name).look().ok()?.data_bitrate_bps
 }
 
 impl SocketCan {
@@ -165,13 +171,9 @@ impl SocketCan {
             None => At::arrival(arrival),
         };
         match content(message.bytes()) {
-            Content::Frame(frame) if message.is_own => self.confirm(&frame, at),
+            Content::Frame(TraceFrame::Classic(frame)) if message.is_own => self.confirm(&frame, at),
             Content::Frame(frame) => self.backlog.push(Incoming::Received { channel, frame, at }),
             Content::Error(error) => self.error(error, At::arrival(arrival)),
-            Content::Fd => {
-                self.oddities.count("CAN FD frames, which do not fit the device's protocol");
-                self.lost(LossStage::Link, 1, false, at);
-            }
             Content::Other => {
                 self.oddities.count("messages of unknown form");
                 self.lost(LossStage::Link, 1, true, at);

@@ -32,9 +32,16 @@ fn datagrams_that_are_missing_cut_or_strange_are_losses_or_counted() {
         datagram(253, 1, &[(0x124, &[1; 8])]),
         // Four frames are announced, and one is there.
         datagram(254, 4, &[(0x125, &[])]),
-        // A length that no frame has, and a CAN FD frame.
+        // A length that no frame has, a CAN FD frame, and one of a length that CAN FD has no code for.
         datagram(255, 1, &[(0x126, &[0; 9])]),
-        [&datagram(0, 1, &[])[..], &[0, 0, 1, 0x27, 0x8C, 0], &[0; 12]].concat(),
+        [
+            &datagram(0, 2, &[])[..],
+            &[0, 0, 1, 0x27, 0x8C, 1],
+            &[0xEE; 12],
+            &[0, 0, 1, 0x28, 0x89, 0],
+            &[0; 9],
+        ]
+        .concat(),
         // Of another version, and too short.
         vec![1, 0, 1, 0, 0],
         vec![2],
@@ -43,7 +50,8 @@ fn datagrams_that_are_missing_cut_or_strange_are_losses_or_counted() {
         peer.send_to(&bytes, here).unwrap();
     }
     let records = until_frame(&device, "7FF#");
-    assert_eq!(frames(&records), ["123#AA", "00000001#", "124#0101010101010101", "125#", "7FF#"]);
+    let fd = format!("127##1{}", "EE".repeat(12));
+    assert_eq!(frames(&records), ["123#AA", "00000001#", "124#0101010101010101", "125#", &fd, "7FF#"]);
     assert_eq!(losses(&records), [("link", 2), ("link", 3), ("link", 1), ("link", 1)]);
     assert_eq!(send(&device, "1ABCDEF0#11").result.unwrap().to_string(), "1ABCDEF0#11");
     let mut bytes = [0; 64];

@@ -116,7 +116,7 @@ impl Bus<'_> {
         let mut received = Received {
             bitrate_bps: config.map_or(0, |config| config.timing.bitrate_bps(clock_hz)),
             evidence: BusEvidence::default(),
-            meter,
+            meter: meter.with_data_bitrate(self.device.data_bitrate(channel)),
             is_filtered: self.device.is_filtered(channel),
         };
         let mut records = self.device.records();

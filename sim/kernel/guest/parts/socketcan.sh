@@ -58,6 +58,27 @@ paste dump.txt capture.log | awk '
   END { print worst + 0; exit worst > 5000 }' > worst.txt
 verdict $? "socketcan: candump's times" "$(cat worst.txt) us apart at most"
 
+# CAN FD frames among the others, with each flag. Newer kernels also flag that it is one.
+BUS=sockfd0
+iproute2 link add $BUS type vcan && iproute2 link set $BUS mtu 72 && iproute2 link set $BUS up
+capture_bus -b 500k
+candump -L -r 32000000 $BUS > dump.txt &
+CANDUMP=$!
+wait_until is_bound 2
+cangen -g 0 -n 1500 -m -L r -D r $BUS
+cansend $BUS 7EF##34C415354
+is_in_dump() { grep -q '7EF##.4C415354' dump.txt; }
+wait_until is_in_dump
+sleep 1
+check "socketcan: a capture of CAN FD ends with Ctrl-C" end_capture 0
+kill "$CANDUMP"
+wait "$CANDUMP" 2> /dev/null
+bare_frames capture.log > got1
+bare_frames dump.txt | sed 's/##4/##0/; s/##5/##1/; s/##6/##2/; s/##7/##3/' | cmp -s - got1 && [ "$(wc -l < got1)" = 1501 ]
+verdict $? "socketcan: cangen with CAN FD: each frame that candump has, in order" "$(grep -c '##' got1) of CAN FD among $(wc -l < got1)"
+iproute2 link del $BUS
+BUS=sock0
+
 # More than a small socket holds, at full speed, while the capture is stopped: as somebody who may not have a large one.
 mkdir -p open && chmod 777 open
 chmod 755 "$CANTAP"

@@ -1,8 +1,8 @@
-//! A CAN FD frame. cantap's devices are classical only, but traces from other tools are full of FD frames.
+//! A CAN FD frame. cantap's boards are classical only, but other makers' adapters and traces from other tools have FD frames.
 
-use std::fmt;
+use core::fmt;
 
-use cantap_can::Id;
+use crate::{Frame, Id};
 
 /// The data length of each length code in an FD frame (ISO 11898-1:2015, table 5).
 pub const FD_LENGTHS: [u8; 16] = [0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64];
@@ -56,6 +56,11 @@ impl FdFrame {
         &self.data[..self.data_len()]
     }
 
+    /// A classical data frame of this identifier, without data: filters, which look at nothing else, treat both alike.
+    pub fn identifier_frame(&self) -> Frame {
+        Frame::from_bus(self.id, false, 0, [0; 8])
+    }
+
     /// The number of data bytes.
     pub const fn data_len(&self) -> usize {
         FD_LENGTHS[(self.dlc & 15) as usize] as usize
@@ -98,10 +103,10 @@ mod tests {
     fn only_lengths_that_the_bus_has_a_code_for_make_a_frame() {
         let id = Id::standard(1).unwrap();
         for len in 0..=70 {
-            let frame = FdFrame::new(id, true, false, &vec![7; len]);
+            let frame = FdFrame::new(id, true, false, &[7; 70][..len]);
             let known = FD_LENGTHS.iter().any(|known| usize::from(*known) == len);
             assert_eq!(frame.is_some(), known, "{len}");
-            assert!(frame.is_none_or(|frame| frame.data() == vec![7; len]));
+            assert!(frame.is_none_or(|frame| frame.data() == &[7; 70][..len]));
         }
     }
 }

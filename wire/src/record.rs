@@ -153,10 +153,6 @@ pub enum Event {
 
 /// One entry of the stream. The decoder knows its absolute time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-#[allow(
-    clippy::large_enum_variant,
-    reason = "no allocation on the device, and on the host one place in memory after the other"
-)]
 pub enum Record {
     /// A received frame.
     Received(Received),

@@ -45,7 +45,6 @@ pub enum NoDatagram {
 
 /// One of a datagram's frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[expect(clippy::large_enum_variant, reason = "taken apart at once")]
 pub enum Item {
     /// A frame.
     Frame(Frame),

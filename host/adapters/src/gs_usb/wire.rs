@@ -183,7 +183,6 @@ pub(super) fn state(bytes: &[u8]) -> Option<(Option<ErrorState>, (u8, u8))> {
 
 /// What a transfer contains.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[expect(clippy::large_enum_variant, reason = "taken apart at once")]
 pub(super) enum Content {
     Frame(TraceFrame),
     Error(ErrorFrame),

@@ -7,7 +7,6 @@ use crate::raw_can::{RawFdFrame, RawFrame, fd_frame_of, frame_of};
 
 /// What a raw socket delivers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[expect(clippy::large_enum_variant, reason = "taken apart at once")]
 pub(super) enum Content {
     Frame(TraceFrame),
     Error(ErrorFrame),

@@ -21,7 +21,7 @@ pub use record::{Event, Received, Record, Stamp};
 
 /// Version of everything this crate defines. A device and a host with different versions refuse
 /// each other with a message that says which side to update.
-pub const PROTOCOL_VERSION: u16 = 5;
+pub const PROTOCOL_VERSION: u16 = 6;
 
 /// Name of the ELF symbol that holds [`PROTOCOL_VERSION`] as a little-endian `u16` in the
 /// firmware, so that a program that loads the ELF can refuse a mismatch before it runs it.

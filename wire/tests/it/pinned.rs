@@ -28,7 +28,7 @@ fn written(result: &Result<Reply, Refusal>) -> String {
 
 #[test]
 fn the_version_is_the_one_that_these_bytes_belong_to() {
-    assert_eq!(PROTOCOL_VERSION, 5);
+    assert_eq!(PROTOCOL_VERSION, 6);
 }
 
 #[test]

@@ -690,7 +690,11 @@ impl<'q, const N: usize> Capture<'q, N> {
         });
         let bus_off = self.channels.iter().any(|state| state.errors.status().state == ErrorState::BusOff);
         let new = |part: fn(&(u32, u32)) -> u32| seen.iter().map(part).ne(self.seen.iter().map(part));
-        let activity = Activity { traffic: new(|seen| seen.0), error: bus_off || new(|seen| seen.1) };
+        let activity = Activity {
+            traffic: new(|seen| seen.0),
+            error: bus_off || new(|seen| seen.1),
+            standalone: self.standalone,
+        };
         self.seen = seen;
         activity
     }

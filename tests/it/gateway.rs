@@ -346,3 +346,142 @@ fn a_session_begins_without_a_gateway_and_its_channels_must_be_opened_again() {
     bench.receive(CAN1, numbered(1));
     assert_eq!(bench.send_one(CAN2), None);
 }
+
+/// A device that was saved as a gateway, with power just applied, and no host.
+fn alone(queue: &'static Queue) -> Bench<'static, SMALL_QUEUE> {
+    let mut before = Bench::new(queue_of());
+    before.greet();
+    for channel in Channel::ALL {
+        before.ask(Command::Configure { channel, config: config(Mode::Normal) }).unwrap();
+    }
+    set(&mut before, CAN1, &[rule(0x100, 0x7FF, None), everything()]);
+    assert_eq!(before.ask(Command::SaveGateway), Ok(Reply::Done));
+    let mut bench = Bench::new(queue);
+    bench.port.open = false;
+    bench.board.chip.saved = before.board.chip.saved.clone();
+    for _ in 0..5 {
+        bench.millisecond();
+    }
+    bench
+}
+
+#[test]
+fn a_saved_gateway_runs_without_a_host_for_as_long_as_it_takes() {
+    let mut bench = alone(queue_of());
+    assert!(bench.board.control.iter().all(|control| control.running));
+    // Far more records than the queue holds.
+    for number in 0..5000 {
+        bench.receive(CAN1, numbered(number));
+        bench.pass(100 * TICKS_PER_US);
+        let passes = number & 0x7FF != 0x100;
+        assert_eq!(bench.send_one(CAN2), passes.then(|| numbered(number)), "{number}");
+        if number % 5 == 0 {
+            bench.millisecond();
+        }
+    }
+    assert!(bench.board.capture.take_activity().standalone);
+}
+
+#[test]
+fn a_host_finds_a_saved_gateway_at_work_and_leaves_it_so() {
+    let mut bench = alone(queue_of());
+    bench.receive(CAN1, numbered(7));
+    for round in 0..3 {
+        bench.port.open = true;
+        bench.greet();
+        let found = status(&mut bench, CAN1);
+        assert!(found.standalone && found.state == GatewayState::Running && found.rules == 2);
+        let Ok(Reply::Status(device)) = bench.ask(Command::Status) else { panic!() };
+        assert!(device.channels.iter().all(|channel| channel.open == Some(config(Mode::Normal))));
+        bench.records.clear();
+        bench.pass(500 * TICKS_PER_US);
+        bench.receive(CAN1, numbered(8));
+        let at = u64::from(bench.board.clock.now.get());
+        flush(&mut bench);
+        assert_eq!(bench.frames(CAN1), [numbered(8)], "{round}");
+        assert_eq!(bench.records[0].0, at);
+        bench.pass(500 * TICKS_PER_US);
+        while bench.send_one(CAN2).is_some() {}
+        bench.port.open = false;
+        flush(&mut bench);
+        bench.receive(CAN1, numbered(9));
+        bench.pass(100 * TICKS_PER_US);
+        assert_eq!(bench.send_one(CAN2), Some(numbered(9)), "{round}");
+        assert!(bench.board.control.iter().all(|control| control.running));
+        assert_eq!(bench.complaints, Vec::<String>::new());
+    }
+    // A sleeping computer neither.
+    bench.port.open = true;
+    bench.greet();
+    bench.sleep(true);
+    flush(&mut bench);
+    bench.receive(CAN1, numbered(10));
+    bench.pass(100 * TICKS_PER_US);
+    assert_eq!(bench.send_one(CAN2), Some(numbered(10)));
+}
+
+#[test]
+fn a_saved_gateway_that_a_host_has_stopped_is_silent_when_the_port_closes() {
+    let mut bench = alone(queue_of());
+    bench.port.open = true;
+    bench.greet();
+    assert_eq!(bench.ask(Command::StopGateway), Ok(Reply::Done));
+    bench.port.open = false;
+    flush(&mut bench);
+    assert!(bench.board.control.iter().all(|control| !control.running));
+}
+
+#[test]
+fn what_cannot_be_saved_as_a_gateway_is_refused_and_nothing_else_starts_one() {
+    let mut bench = Bench::new(queue_of());
+    bench.greet();
+    assert_eq!(bench.ask(Command::SaveGateway), Err(Refusal::NotNormal));
+    for (channel, mode) in [(CAN1, Mode::Normal), (CAN2, Mode::ListenOnly)] {
+        bench.ask(Command::Configure { channel, config: config(mode) }).unwrap();
+    }
+    assert_eq!(bench.ask(Command::SaveGateway), Err(Refusal::NotNormal));
+    bench.ask(Command::Configure { channel: CAN2, config: config(Mode::Normal) }).unwrap();
+    bench.ask(Command::Open { channel: CAN1, config: Some(config(Mode::Normal)) }).unwrap();
+    assert_eq!(bench.ask(Command::SaveGateway), Err(Refusal::ChannelOpen));
+    bench.ask(Command::Close { channel: CAN1 }).unwrap();
+    bench.ask(Command::SaveDefaults).unwrap();
+    let mut next = Bench::new(queue_of());
+    next.board.chip.saved = bench.board.chip.saved.clone();
+    for _ in 0..5 {
+        next.millisecond();
+    }
+    assert!(next.board.control.iter().all(|control| !control.running));
+}
+
+/// The most that can be stored.
+#[test]
+fn all_rules_of_both_directions_can_be_saved() {
+    let mut before = Bench::new(queue_of());
+    before.greet();
+    for channel in Channel::ALL {
+        before.ask(Command::Configure { channel, config: config(Mode::Normal) }).unwrap();
+        let filter = Filter { extended: true, kind: FrameKind::Any, id: 0x1FFF_FFFF, mask: 0x1FFF_FFFF };
+        let pass = Pass {
+            id_xor: 0x1000_0000,
+            period_ticks: u32::MAX,
+            delay_ticks: u32::MAX,
+            modifiers: [Modifier::Counter { byte: 0, low_bit: 0, bits: 8 }; 2].into_iter().collect(),
+            ..Pass::unchanged(true)
+        };
+        set(&mut before, channel, &vec![GatewayRule { filter, pass: Some(pass) }; 32]);
+    }
+    assert_eq!(before.ask(Command::SaveGateway), Ok(Reply::Done));
+    let mut bench = Bench::new(queue_of());
+    bench.board.chip.saved = before.board.chip.saved.clone();
+    for _ in 0..5 {
+        bench.millisecond();
+    }
+    bench.greet();
+    for from in Channel::ALL {
+        assert_eq!(status(&mut bench, from).rules, 32);
+        assert_eq!(
+            bench.ask(Command::GatewayRule { from, slot: 31 }),
+            before.ask(Command::GatewayRule { from, slot: 31 })
+        );
+    }
+}

@@ -41,6 +41,18 @@ impl<'q, const N: usize> Capture<'q, N> {
         now
     }
 
+    /// Starts a session beside a gateway that goes on: as [`Self::restart`], but nothing on its way to a bus is forgotten.
+    pub fn restart_beside_gateway(&mut self, clock: &impl Clock) -> u64 {
+        let now = self.now(clock);
+        self.recorder.restart(now);
+        for state in &mut self.channels {
+            state.frames = 0;
+            state.overruns = 0;
+            state.transmitter.reset_counters();
+        }
+        now
+    }
+
     /// The channel is about to join the bus.
     pub fn open(&mut self, channel: Channel, config: ChannelConfig, clock: &impl Clock) {
         let now = self.now(clock);

@@ -5,8 +5,8 @@
 
 use core::cmp::Ordering;
 
-use cantap_wire::message::{GatewayRule, MAX_GATEWAY_RULES, MAX_RULE_COUNTS, RuleCounts};
-use cantap_wire::{Channel, Frame};
+use cantap_wire::message::{Filter, FrameKind, GatewayRule, MAX_GATEWAY_RULES, MAX_RULE_COUNTS, RuleCounts};
+use cantap_wire::{Channel, Frame, Id};
 use heapless::binary_heap::{BinaryHeap, Min};
 use heapless::{Deque, Vec};
 
@@ -57,6 +57,35 @@ impl PartialEq for Later {
 
 impl Eq for Later {}
 
+/// A filter as two words: identifier, bit 31 for its length, bit 30 for remote frames.
+#[derive(Clone, Copy)]
+struct Key {
+    value: u32,
+    mask: u32,
+}
+
+impl Key {
+    const EXTENDED: u32 = 1 << 31;
+    const REMOTE: u32 = 1 << 30;
+
+    fn of(filter: &Filter) -> Self {
+        let remote = if filter.kind == FrameKind::Remote { Self::REMOTE } else { 0 };
+        let kinds = if filter.kind == FrameKind::Any { 0 } else { Self::REMOTE };
+        Self {
+            value: filter.id | remote | if filter.extended { Self::EXTENDED } else { 0 },
+            mask: filter.mask | kinds | Self::EXTENDED,
+        }
+    }
+
+    #[inline]
+    fn word(frame: &Frame) -> u32 {
+        let id = frame.id();
+        id.raw()
+            | if id.is_extended() { Self::EXTENDED } else { 0 }
+            | if frame.is_remote() { Self::REMOTE } else { 0 }
+    }
+}
+
 struct RuleState {
     rule: GatewayRule,
     counts: RuleCounts,
@@ -67,50 +96,61 @@ struct RuleState {
     held: Option<Frame>,
 }
 
+/// A frame and its time; 0 if there was none. All zero at first, so that it takes no flash.
+#[derive(Clone, Copy)]
+struct Seen {
+    frame: Frame,
+    at: u64,
+}
+
+impl Seen {
+    const NONE: Self =
+        Self { frame: Frame::from_clean_parts(Id::standard_truncated(0), false, 0, [0; 8]), at: 0 };
+}
+
 /// Whether what this channel sends comes back on the other.
 struct Echo {
-    sent: Option<(Frame, u64)>,
-    received: Option<(Frame, u64)>,
+    sent: Seen,
+    received: Seen,
     row: u32,
 }
 
 impl Echo {
     const fn new() -> Self {
-        Self { sent: None, received: None, row: 0 }
+        Self { sent: Seen::NONE, received: Seen::NONE, row: 0 }
     }
 
-    fn is_one(a: Option<(Frame, u64)>, b: Option<(Frame, u64)>) -> bool {
-        matches!((a, b), (Some(a), Some(b)) if a.1.abs_diff(b.1) <= ECHO_WITHIN_TICKS && a.0 == b.0)
-    }
-
-    fn count(&mut self) {
-        self.row += 1;
-        (self.sent, self.received) = (None, None);
+    /// Counts a frame that came back.
+    fn compare(&mut self) {
+        let Self { sent, received, .. } = self;
+        let together = sent.at.abs_diff(received.at) <= ECHO_WITHIN_TICKS && sent.at != 0;
+        if together && sent.frame == received.frame {
+            self.row += 1;
+            (self.sent, self.received) = (Seen::NONE, Seen::NONE);
+        }
     }
 
     /// The other channel has received a frame.
     fn received(&mut self, frame: Frame, at: u64) {
-        self.received = Some((frame, at));
-        if Self::is_one(self.sent, self.received) {
-            self.count();
-        }
+        self.received = Seen { frame, at };
+        self.compare();
     }
 
     /// This channel has sent a frame. Which of the two is noticed first depends on the tasks under way.
     fn sent(&mut self, frame: Frame, at: u64) {
         // The one before has not come back.
-        if self.sent.is_some() {
+        if self.sent.at != 0 {
             self.row = 0;
         }
-        self.sent = Some((frame, at));
-        if Self::is_one(self.sent, self.received) {
-            self.count();
-        }
+        self.sent = Seen { frame, at };
+        self.compare();
     }
 }
 
 /// One direction: its rules, and the frames on their way. Some ten kilobytes, constructed in place, never on a stack.
 pub struct Lane {
+    /// What the rules' filters compare, apart from the rest: every frame is compared with all of them.
+    keys: Vec<Key, MAX_GATEWAY_RULES>,
     rules: Vec<RuleState, MAX_GATEWAY_RULES>,
     unmatched: u32,
     ready: Deque<(u8, Frame), READY>,
@@ -123,6 +163,7 @@ impl Lane {
     /// No rules.
     pub const fn new() -> Self {
         Self {
+            keys: Vec::new(),
             rules: Vec::new(),
             unmatched: 0,
             ready: Deque::new(),
@@ -139,14 +180,19 @@ impl Lane {
         }
         let Some(rule) = rule else {
             self.rules.truncate(slot);
+            self.keys.truncate(slot);
             return true;
         };
+        let key = Key::of(&rule.filter);
         let state = RuleState { rule, counts: RuleCounts::default(), step: 0, open_from: 0, held: None };
         match self.rules.get_mut(slot) {
-            Some(place) => *place = state,
-            None => return self.rules.push(state).is_ok(),
+            Some(place) => {
+                *place = state;
+                self.keys[slot] = key;
+                true
+            }
+            None => self.rules.push(state).is_ok() && self.keys.push(key).is_ok(),
         }
-        true
     }
 
     /// A rule.
@@ -163,6 +209,7 @@ impl Lane {
     pub fn clear(&mut self) {
         self.restart();
         self.rules.clear();
+        self.keys.clear();
     }
 
     /// Nothing is on its way, and all counts are zero.
@@ -207,7 +254,8 @@ impl Lane {
     /// A frame that the other channel received at `at`. Returns how many frames were lost to make room: none or one.
     pub fn admit(&mut self, frame: &Frame, at: u64) -> u32 {
         self.echo.received(*frame, at);
-        let Some(slot) = self.rules.iter().position(|state| state.rule.filter.matches(frame)) else {
+        let word = Key::word(frame);
+        let Some(slot) = self.keys.iter().position(|key| (word ^ key.value) & key.mask == 0) else {
             self.unmatched = self.unmatched.wrapping_add(1);
             return 0;
         };
@@ -244,7 +292,10 @@ impl Lane {
             state.counts.lost = state.counts.lost.wrapping_add(1);
             return 1;
         };
-        let changed = apply(&pass.modifiers, &changed, state.step, 0);
+        let changed = match &pass.modifiers[..] {
+            [] => changed,
+            modifiers => apply(modifiers, &changed, state.step, 0),
+        };
         state.step = state.step.wrapping_add(1);
         if delay > 0 {
             self.defer(at + delay, slot, Some(changed));

@@ -309,16 +309,13 @@ impl<'q> Transmitter<'q> {
         self.unpassed = self.unpassed.saturating_add(self.lane.give_up());
     }
 
-    /// Takes what was received for the gateway to send on the other channel.
-    pub fn take_caught(&mut self) -> Caught {
-        core::mem::take(&mut self.caught)
-    }
-
-    /// The gateway sends on this channel what its rules make of these frames, which the other has received.
-    pub fn pass(&mut self, caught: &Caught) {
-        for (frame, at) in caught {
+    /// The gateway sends on this channel what its rules make of the frames that the other has received.
+    #[inline]
+    pub fn pass_from(&mut self, other: &mut Self) {
+        for (frame, at) in &other.caught {
             self.unpassed = self.unpassed.saturating_add(self.lane.admit(frame, *at));
         }
+        other.caught.clear();
     }
 
     /// A frame was received: arms the replies that it triggers, and keeps it for the gateway. Returns whether there is anything to send.

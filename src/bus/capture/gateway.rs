@@ -21,10 +21,11 @@ impl<const N: usize> Capture<'_, N> {
         clock: &impl Clock,
         now: u64,
     ) {
-        let caught = self.channels[channel.index()].transmitter.take_caught();
         let to = other(channel);
-        let transmitter = &mut self.channels[to.index()].transmitter;
-        transmitter.pass(&caught);
+        let [first, second] = &mut self.channels;
+        let (from, state) = if channel == Channel::Can1 { (first, second) } else { (second, first) };
+        let transmitter = &mut state.transmitter;
+        transmitter.pass_from(&mut from.transmitter);
         if transmitter.lane().is_loop() {
             return self.end_gateway(GatewayState::Ended(GatewayEnd::Loop));
         }

@@ -75,10 +75,9 @@ impl Pass {
     pub fn changed(&self, frame: &Frame) -> Option<Frame> {
         let raw = frame.id().raw() & self.id_and ^ self.id_xor;
         let id = if self.extended { Id::extended(raw) } else { Id::standard(raw) }?;
-        let mut data = frame.padded_data();
-        for (byte, (and, xor)) in data.iter_mut().zip(self.data_and.iter().zip(&self.data_xor)) {
-            *byte = *byte & and ^ xor;
-        }
+        // As one number: eight bytes one by one take a device a microsecond.
+        let [data, and, xor] = [frame.padded_data(), self.data_and, self.data_xor].map(u64::from_ne_bytes);
+        let data = (data & and ^ xor).to_ne_bytes();
         let dlc = (frame.dlc() & self.dlc_and ^ self.dlc_xor) & 15;
         Some(Frame::from_bus(id, frame.is_remote(), dlc, data))
     }

@@ -10,6 +10,11 @@ const ERROR_FOR_MS: u16 = 1_000;
 /// Half a period of the pattern that shows where the device is, in ms.
 const IDENTIFY_MS: u16 = 60;
 
+/// A gateway that needs no host: the power LED goes out for so long, in ms.
+const STANDALONE_OUT_MS: u16 = 128;
+/// Once in so many ms.
+const STANDALONE_MS: u16 = 1_024;
+
 /// Length of each flash of the pattern for a clock that does not start, and of the pause after it, in ms.
 const NO_CLOCK_FLASH_MS: u32 = 100;
 /// Flashes of that pattern.
@@ -31,6 +36,8 @@ pub struct Activity {
     pub traffic: bool,
     /// A bus error, a loss, or a channel that is bus-off.
     pub error: bool,
+    /// A gateway runs that needs no host.
+    pub standalone: bool,
 }
 
 /// Which LEDs are lit.
@@ -87,7 +94,7 @@ impl Lights {
             return Lit { power: lit, traffic: !lit, error: !lit };
         }
         Lit {
-            power: true,
+            power: !activity.standalone || self.now_ms % STANDALONE_MS >= STANDALONE_OUT_MS,
             traffic: self.traffic_left_ms > FLICKER_MS,
             error: self.error_left_ms > 0 && (self.now_ms / ERROR_MS).is_multiple_of(2),
         }
@@ -98,9 +105,9 @@ impl Lights {
 mod tests {
     use super::*;
 
-    const QUIET: Activity = Activity { traffic: false, error: false };
-    const FRAME: Activity = Activity { traffic: true, error: false };
-    const ERROR: Activity = Activity { traffic: false, error: true };
+    const QUIET: Activity = Activity { traffic: false, error: false, standalone: false };
+    const FRAME: Activity = Activity { traffic: true, error: false, standalone: false };
+    const ERROR: Activity = Activity { traffic: false, error: true, standalone: false };
 
     /// How often `is` turns true in this many milliseconds.
     fn turns(lights: &mut Lights, ms: u32, activity: Activity, is: fn(Lit) -> bool) -> usize {
@@ -127,6 +134,14 @@ mod tests {
         lights.tick(ERROR);
         assert!(turns(&mut lights, 1000, QUIET, |lit| lit.error) >= 3);
         assert_eq!(turns(&mut lights, 1000, QUIET, |lit| lit.error), 0);
+    }
+
+    #[test]
+    fn a_gateway_that_needs_no_host_shows_in_the_power_led() {
+        let mut lights = Lights::new();
+        let alone = Activity { standalone: true, ..QUIET };
+        assert_eq!(turns(&mut lights, 4096, alone, |lit| lit.power), 4);
+        assert_eq!(turns(&mut lights, 4096, QUIET, |lit| lit.power), 0);
     }
 
     #[test]

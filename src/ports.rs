@@ -160,7 +160,7 @@ pub trait Chip {
     fn bootloader(&mut self) -> bool;
     /// Stores bytes (at most [`crate::port::command::MAX_SAVED`]) over a power cycle; empty erases. Returns whether it worked.
     fn save(&mut self, bytes: &[u8]) -> bool;
-    /// Reads what was stored into `out` and returns its length.
+    /// Reads what was stored into `out`, as far as it fits, and returns the length read.
     fn load(&mut self, out: &mut [u8]) -> usize;
 }
 

@@ -90,14 +90,13 @@ pub fn save(sector: &mut impl Sector, bytes: &[u8]) -> bool {
     programmed && sector.program(at, checksum(bytes.iter().copied()))
 }
 
-/// Reads what was last saved into `out` and returns its length: 0 if there is nothing, or if it does not fit.
+/// Reads what was last saved into `out`, as far as it fits, and returns the length read: 0 if there is nothing.
 pub fn load(sector: &impl Sector, out: &mut [u8]) -> usize {
     let words = sector.words();
     let Some((body, len)) = scan(words).newest else { return 0 };
-    let Some(out) = out.get_mut(..len) else { return 0 };
-    let bytes = words[body..].iter().flat_map(|word| word.to_le_bytes());
+    let bytes = words[body..].iter().flat_map(|word| word.to_le_bytes()).take(len);
     out.iter_mut().zip(bytes).for_each(|(out, byte)| *out = byte);
-    len
+    len.min(out.len())
 }
 
 #[cfg(test)]

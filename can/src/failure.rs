@@ -12,11 +12,13 @@ pub enum LossStage {
     Link,
     /// In the host: a consumer did not keep up.
     Host,
+    /// In a gateway: received on the other channel, to be sent on this one, and dropped, because more came than this bus took.
+    Gateway,
 }
 
 impl LossStage {
-    /// All of them, in the order in which frames pass them.
-    pub const ALL: [Self; 4] = [Self::Controller, Self::Queue, Self::Link, Self::Host];
+    /// All of them: those on the way to the host in the order in which frames pass them, then a gateway's.
+    pub const ALL: [Self; 5] = [Self::Controller, Self::Queue, Self::Link, Self::Host, Self::Gateway];
 
     /// Its name in texts, JSON and tables.
     pub const fn name(self) -> &'static str {
@@ -25,6 +27,7 @@ impl LossStage {
             Self::Queue => "queue",
             Self::Link => "link",
             Self::Host => "host",
+            Self::Gateway => "gateway",
         }
     }
 

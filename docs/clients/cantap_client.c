@@ -25,7 +25,7 @@ static const char *const REFUSALS[] = {"Protocol", "Malformed", "NoSession", "Un
                                        "BadTag", "BadEntry", "BadSlot", "ChannelOpen", "ChannelClosed", "ListenOnly", "QueueFull",
                                        "BanksExhausted", "WouldDisturb", "TooFarAhead", "Hardware", "NothingSaved", "NotBusOff",
                                        "NotMeasuring", "NotGranted", "Held", "OtherSettings", "NoBoard"};
-static const char *const STAGES[] = {"controller", "queue", "link", "host"};
+static const char *const STAGES[] = {"controller", "queue", "link", "host", "gateway"};
 static const char *const ERRORS[] = {"stuff", "form", "acknowledgment", "bit-recessive", "bit-dominant", "crc"};
 static const char *const STATES[] = {"active", "warning", "passive", "bus-off"};
 static const char *const FAILURES[] = {"arbitration-lost", "bus-error", "aborted", "closed", "bus-off", "overtaken"};

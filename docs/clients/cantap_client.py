@@ -12,7 +12,7 @@ REFUSALS = ("Protocol Malformed NoSession Unsupported BadTiming BadId BadDlc Bad
             "ListenOnly QueueFull BanksExhausted WouldDisturb TooFarAhead Hardware NothingSaved NotBusOff "
             "NotMeasuring NotGranted Held OtherSettings NoBoard").split()
 NUMBERS = {"Protocol": 1, "QueueFull": 1, "BanksExhausted": 2, "NotGranted": 1}  # numbers after a refusal
-STAGES = "controller queue link host".split()
+STAGES = "controller queue link host gateway".split()
 ERRORS = "stuff form acknowledgment bit-recessive bit-dominant crc".split()
 STATES = "active warning passive bus-off".split()
 ENDS = "suspended board-lost server-ended configured".split()

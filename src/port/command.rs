@@ -14,6 +14,7 @@ use crate::port::board::Board;
 use crate::ports::{Chip, Control, EdgeMeter, FilterBanks};
 use crate::{CAN_CLOCK_HZ, QUEUE_BYTES, TICK_HZ, TICKS_PER_MS};
 
+mod gateway;
 mod measuring;
 mod sending;
 mod settings;
@@ -22,7 +23,9 @@ use measuring::Measuring;
 pub use sending::send;
 use sending::{set_periodic, set_trigger};
 pub use settings::MAX_SAVED;
-use settings::{ChannelSettings, add_reports, saved, saved_reports, store};
+use settings::{
+    ChannelSettings, MAX_SETTINGS, add_reports, load_gateway, saved, saved_reports, store, store_gateway,
+};
 
 /// A controller leaves the bus when the frame on it has ended: 160 bits at 5 kbit/s are 32 ms. After this long the
 /// bus is stuck, and the controller is made to leave.
@@ -51,6 +54,8 @@ pub struct Identity {
 pub enum Work {
     /// Both channels leave the bus and everything is dropped: a session begins or ends.
     Silence,
+    /// A session begins or ends beside a gateway that needs no host: its channels stay as they are.
+    Keep,
     /// Both channels leave the bus and say so in the stream, which is kept: the host is asleep.
     Retreat,
     /// A channel joins the bus.
@@ -63,6 +68,13 @@ pub enum Work {
     Restart,
     /// The bootloader takes over.
     Bootloader,
+}
+
+impl Work {
+    /// What begins or ends a session.
+    pub fn fresh<'q, const N: usize>(board: &mut impl Board<'q, N>) -> Self {
+        if board.with_capture(|capture, _, _| capture.is_standalone()) { Self::Keep } else { Self::Silence }
+    }
 }
 
 /// A FIFO that does not become empty after its channel has left the bus.
@@ -139,7 +151,8 @@ impl Commands {
                 | capability::SLCAN
                 | capability::DEFAULTS
                 | capability::BOOTLOADER
-                | capability::EDGES,
+                | capability::EDGES
+                | capability::GATEWAY,
         }
     }
 
@@ -154,7 +167,7 @@ impl Commands {
             Command::Hello { protocol } if protocol != PROTOCOL_VERSION => {
                 return Err(Refusal::Protocol { device: PROTOCOL_VERSION });
             }
-            Command::Hello { .. } => return Ok(self.begin(Work::Silence, board)),
+            Command::Hello { .. } => return Ok(self.begin(Work::fresh(board), board)),
             Command::Open { channel, config } => return self.open(channel, config, board),
             Command::Close { channel } => return Ok(self.close(channel, board)),
             Command::Status => Reply::Status(self.status(board)),
@@ -190,6 +203,12 @@ impl Commands {
             Command::Failures => Reply::Failures(board.chip().failures()),
             Command::MeasureEdges { channel } => measuring::measure(&mut self.measuring, channel, board)?,
             Command::Edges => measuring::edges(&mut self.measuring, board)?,
+            Command::SetGatewayRule { from, slot, rule } => gateway::set_rule(from, slot, rule, board)?,
+            Command::GatewayRule { from, slot } => gateway::rule(from, slot, board)?,
+            Command::StartGateway => gateway::start(board)?,
+            Command::StopGateway => gateway::stop(board),
+            Command::GatewayStatus { from, first } => gateway::status(from, first, board),
+            Command::SaveGateway => store_gateway(&self.settings, board)?,
         };
         Ok(Step::Done(reply))
     }
@@ -225,6 +244,7 @@ impl Commands {
             Work::Open(channel, _) | Work::Recover(channel) => {
                 board.control(channel).stop();
             }
+            Work::Keep => {}
         }
         Step::Begun(work)
     }
@@ -234,7 +254,7 @@ impl Commands {
         let ends = match work {
             Work::Open(channel, _) => self.measuring.is_some_and(|measuring| measuring.channel == channel),
             Work::Close(_) | Work::Recover(_) => false,
-            Work::Silence | Work::Retreat | Work::Restart | Work::Bootloader => true,
+            Work::Keep | Work::Silence | Work::Retreat | Work::Restart | Work::Bootloader => true,
         };
         if ends && self.measuring.take().is_some() {
             board.meter().watch(None);
@@ -260,6 +280,10 @@ impl Commands {
                 let mut hello = self.hello();
                 board.describe(&mut hello);
                 Some(refused.map_or(Ok(Reply::Hello(hello)), Err))
+            }
+            Work::Keep => {
+                self.bad_requests = 0;
+                Some(Ok(Reply::Hello(self.hello())))
             }
             Work::Retreat => {
                 // Both, as for `Silence`.
@@ -439,6 +463,21 @@ impl Commands {
         }
     }
 
+    /// Begins what a stored gateway needs before it can start, if there is one: the next channel that is not open is opened.
+    pub fn begin_stored_gateway<'q, const N: usize>(
+        &mut self,
+        board: &mut impl Board<'q, N>,
+    ) -> Option<Work> {
+        if Channel::ALL.iter().all(|&channel| !board.is_open(channel)) && !load_gateway(board) {
+            return None;
+        }
+        let channel = Channel::ALL.into_iter().find(|&channel| !board.is_open(channel))?;
+        match self.open(channel, None, board) {
+            Ok(Step::Begun(work)) => Some(work),
+            _ => None,
+        }
+    }
+
     /// A channel's configuration in this session.
     pub fn config(&self, channel: Channel) -> Option<ChannelConfig> {
         self.settings[channel.index()].config
@@ -572,7 +611,7 @@ impl Commands {
             return Err(Refusal::NothingSaved);
         }
         let reports = reports.unwrap_or_else(|| saved_reports(board));
-        let mut bytes = [0; MAX_SAVED];
+        let mut bytes = [0; MAX_SETTINGS];
         let mut len = 0;
         for (channel, settings) in Channel::ALL.into_iter().zip(&self.settings) {
             let out = &mut bytes[len..];
@@ -620,6 +659,6 @@ fn begin_close<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, 
     // Two locks: each takes a while.
     board.with_capture(|capture, _, clock| capture.end_entries(channel, clock));
     board.with_capture(|capture, traffic, clock| {
-        capture.begin_close(channel, &mut traffic[channel.index()], clock);
+        capture.begin_close(channel, traffic, clock);
     });
 }

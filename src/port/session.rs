@@ -6,7 +6,7 @@
 
 use cantap_wire::framing::{MAX_REQUEST, max_encoded_len, unseal_with};
 use cantap_wire::message::{EndReason, read_send, why_unreadable};
-use cantap_wire::{Command, Refusal, Reply, Request};
+use cantap_wire::{Channel, Command, Refusal, Reply, Request};
 
 use crate::QUEUE_BYTES;
 use crate::bus::queue::Consumer;
@@ -58,6 +58,19 @@ enum Ending {
     Since(EndReason, u64),
 }
 
+/// What became of the gateway that is stored in the device.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Stored {
+    /// The device has just started.
+    Unread,
+    /// Its channels are being opened.
+    Opening,
+    /// It was started, and what no host reads is dropped.
+    Started,
+    /// There is none, or it could not be started.
+    None,
+}
+
 /// The memory of a session: a dozen kilobytes, constructed in place, never on a stack.
 pub struct Memory {
     sender: Sender,
@@ -100,6 +113,8 @@ pub struct Session<'q, const N: usize = QUEUE_BYTES> {
     language: Language,
     work: Option<(Work, Origin)>,
     ending: Ending,
+    /// How far the device has come with the gateway that is stored in it.
+    stored: Stored,
     /// As far as the device can tell, the host of a session that has ended is still there: what is left of the session is for it.
     is_heir: bool,
     /// What the host had done with the port at the last check.
@@ -124,6 +139,7 @@ impl<'q, const N: usize> Session<'q, N> {
             language: Language::Unknown,
             work: None,
             ending: Ending::No,
+            stored: Stored::Unread,
             is_heir: false,
             history: PortHistory { opened: 0, configured: 0 },
             answers,
@@ -140,12 +156,41 @@ impl<'q, const N: usize> Session<'q, N> {
 
     /// Marks the start of a USB frame once a second. Call it every millisecond.
     pub fn tick(&mut self, board: &mut impl Board<'q, N>) {
+        if self.stored != Stored::None {
+            self.look_after_stored(board);
+        }
         let reading = board.take_sof();
         // Only a native session has a place for marks.
         if matches!(self.language, Language::Native { greeted: true })
             && let Some(mark) = self.marks.tick(reading)
         {
             board.with_capture(|capture, _, _| capture.on_sof(mark));
+        }
+    }
+
+    /// Starts the gateway that is stored in the device, once; and drops what it records while no host reads.
+    fn look_after_stored(&mut self, board: &mut impl Board<'q, N>) {
+        match self.stored {
+            Stored::Unread if self.is_active() || self.work.is_some() => self.stored = Stored::None,
+            Stored::Unread => {
+                self.stored = Stored::Opening;
+                self.go_on_with_stored(board);
+            }
+            Stored::Started if self.language == Language::Unknown => self.queue.clear(),
+            _ => {}
+        }
+    }
+
+    /// Opens the next channel for the stored gateway, or starts it.
+    fn go_on_with_stored(&mut self, board: &mut impl Board<'q, N>) {
+        if let Some(work) = self.commands.begin_stored_gateway(board) {
+            self.work = Some((work, Origin::Device));
+            return;
+        }
+        let started = board.with_capture(|capture, _, _| capture.start_gateway(true)).is_ok();
+        self.stored = if started { Stored::Started } else { Stored::None };
+        if !started && Channel::ALL.iter().any(|&channel| board.is_open(channel)) {
+            self.begin(Work::Silence, Origin::Device, board);
         }
     }
 
@@ -213,7 +258,7 @@ impl<'q, const N: usize> Session<'q, N> {
     fn begin_end(&mut self, board: &mut impl Board<'q, N>) {
         let Ending::Wanted(reason) = self.ending else { return };
         // A session that is just beginning is begun first, and a requested restart is carried out.
-        if matches!(self.work, Some((Work::Silence | Work::Restart | Work::Bootloader, _))) {
+        if matches!(self.work, Some((Work::Keep | Work::Silence | Work::Restart | Work::Bootloader, _))) {
             return;
         }
         let in_session = match self.language {
@@ -224,6 +269,10 @@ impl<'q, const N: usize> Session<'q, N> {
         if !in_session {
             self.ending = Ending::No;
             return;
+        }
+        if matches!(Work::fresh(board), Work::Keep) {
+            // The gateway's channels do not leave their buses, so there is no end to report: the host finds that nobody answers.
+            return self.forget_host(board);
         }
         self.ending = Ending::Leaving(reason);
         if let Some((_, Origin::Request(id))) = self.work {
@@ -252,7 +301,7 @@ impl<'q, const N: usize> Session<'q, N> {
             self.answers.clear();
             // A host that requested a restart may be gone before it happens.
             if !matches!(self.work, Some((Work::Restart | Work::Bootloader, _))) {
-                self.begin(Work::Silence, Origin::Device, board);
+                self.begin(Work::fresh(board), Origin::Device, board);
             }
         }
     }
@@ -283,12 +332,22 @@ impl<'q, const N: usize> Session<'q, N> {
         let Some((work, origin)) = self.work else { return };
         let Some(result) = self.commands.progress(work, board) else { return };
         self.work = None;
-        if matches!(work, Work::Silence) {
+        if self.stored == Stored::Opening && matches!(work, Work::Open(..)) {
+            self.go_on_with_stored(board);
+        }
+        if matches!(work, Work::Silence | Work::Keep) {
             if !matches!(self.ending, Ending::Wanted(_)) {
                 self.ending = Ending::No;
             }
-            self.queue.clear();
-            let now = board.with_capture(|capture, _, clock| capture.restart(clock));
+            let Self { queue, .. } = self;
+            // Under one lock: beside a gateway, records are written at any time.
+            let now = board.with_capture(|capture, _, clock| {
+                queue.clear();
+                match work {
+                    Work::Keep => capture.restart_beside_gateway(clock),
+                    _ => capture.restart(clock),
+                }
+            });
             self.sender.restart(now);
             self.slcan.restart(now);
             self.marks = SofMarks::new();
@@ -299,7 +358,7 @@ impl<'q, const N: usize> Session<'q, N> {
         }
         match origin {
             Origin::Request(id) => {
-                if matches!(work, Work::Silence) {
+                if matches!(work, Work::Silence | Work::Keep) {
                     self.language = Language::Native { greeted: result.is_ok() };
                     self.outbox.clear();
                     self.answers.clear();
@@ -345,7 +404,7 @@ impl<'q, const N: usize> Session<'q, N> {
             }
             b'\r' | b'A'..=b'Z' | b'a'..=b'z' => {
                 self.language = Language::Slcan;
-                self.begin(Work::Silence, Origin::Device, board);
+                self.begin(Work::fresh(board), Origin::Device, board);
             }
             _ => self.inbox.skip(1),
         }

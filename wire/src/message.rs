@@ -9,6 +9,7 @@ use crate::{CHANNELS, Channel};
 mod bytes;
 mod channel;
 mod edges;
+mod gateway;
 mod sharing;
 mod status;
 mod transmission;
@@ -16,6 +17,10 @@ mod transmission;
 pub use bytes::{read_send, why_unreadable, write_response};
 pub use channel::{ChannelConfig, Filter, FrameKind, Mode};
 pub use edges::{Edge, Edges, MAX_EDGES};
+pub use gateway::{
+    GATEWAY_TAG, GatewayEnd, GatewayRule, GatewayState, GatewayStatus, MAX_GATEWAY_RULES, MAX_RULE_COUNTS,
+    MAX_RULE_MODIFIERS, Pass, RuleCounts,
+};
 pub use sharing::Role;
 pub use status::{ChannelStatus, Failures, MAX_FAILURE_TEXT, RegisterSet, Registers, Status};
 pub use transmission::{
@@ -203,6 +208,37 @@ pub enum Command {
     },
     /// Requests the [`Edges`] measured since the last answer.
     Edges,
+    /// Sets a rule of the gateway. It must not be running. A session begins without rules.
+    SetGatewayRule {
+        /// The channel that receives the frames; the other sends them.
+        from: Channel,
+        /// Which rule, from 0: at most the number of those set already.
+        slot: u8,
+        /// `None` removes this rule and all after it.
+        rule: Option<GatewayRule>,
+    },
+    /// Passes frames on between the channels, both of which must be open in normal mode. Counts begin at zero.
+    StartGateway,
+    /// Ends that. What waits to be sent is dropped and counted. Stopping a gateway that does not run succeeds.
+    StopGateway,
+    /// Requests a [`GatewayStatus`].
+    GatewayStatus {
+        /// The channel that receives the frames.
+        from: Channel,
+        /// The slot of the first rule whose counts are wanted.
+        first: u8,
+    },
+    /// Requests a rule of the gateway.
+    GatewayRule {
+        /// The channel that receives the frames.
+        from: Channel,
+        /// Which rule, from 0.
+        slot: u8,
+    },
+    /// As [`Command::SaveDefaults`], and stores this session's rules with it. From its next start on, the device opens both channels and
+    /// runs the gateway on its own, whether there is a host or not, until the session that [`Command::StopGateway`] is sent in, or
+    /// [`Command::ClearDefaults`]. Both channels must be closed, and configured for normal mode.
+    SaveGateway,
 }
 
 /// A value that answers a request.
@@ -239,6 +275,10 @@ pub enum Reply {
     Failures(Failures),
     /// To [`Command::Edges`].
     Edges(Edges),
+    /// To [`Command::GatewayStatus`].
+    Gateway(GatewayStatus),
+    /// To [`Command::GatewayRule`].
+    GatewayRule(GatewayRule),
 }
 
 /// What is stored for a channel over a power cycle.
@@ -317,6 +357,10 @@ pub enum Refusal {
     OtherSettings,
     /// Never from a device: the server has no board at the moment.
     NoBoard,
+    /// A gateway needs both channels in [`Mode::Normal`].
+    NotNormal,
+    /// The gateway must be stopped first.
+    GatewayRunning,
 }
 
 /// What a device is. The first field's encoding never changes between versions.
@@ -379,4 +423,6 @@ pub mod capability {
     pub const NO_BIT_RATE: u32 = 1 << 8;
     /// Never of a board of ours: frames may be missing that nobody counted, so that no sum of losses is the whole.
     pub const UNCOUNTED_LOSSES: u32 = 1 << 9;
+    /// Can be a gateway between its channels.
+    pub const GATEWAY: u32 = 1 << 10;
 }

@@ -11,6 +11,7 @@ mod controller_reset;
 mod conversation;
 mod disruption;
 mod full_load;
+mod gateway;
 mod hostile;
 mod live_bus;
 mod sending_spares_capture;

@@ -10,7 +10,8 @@ pub use cantap_can::DEVICE_TAG;
 
 /// Most modifiers of one periodic frame.
 pub const MAX_MODIFIERS: usize = 4;
-/// What the tags from [`DEVICE_TAG`] up say: a periodic entry's slot; or, from this one up, a trigger's slot.
+/// What the tags from [`DEVICE_TAG`] up say: a periodic entry's slot; from this one up, a trigger's; from
+/// [`super::GATEWAY_TAG`] up, a gateway rule's.
 pub const TRIGGER_TAG: u32 = 0xFFFF_8000;
 
 /// Never from a device: the tag of frames that another client of a shared board has sent.
@@ -67,6 +68,18 @@ pub enum Modifier {
         /// Byte of the data, from 0.
         byte: u8,
     },
+}
+
+impl Modifier {
+    /// Whether it is inside the data of a frame with `len` bytes.
+    pub fn fits(&self, len: usize) -> bool {
+        match *self {
+            Self::Counter { byte, low_bit, bits } => {
+                usize::from(byte) < len && low_bit < 8 && (1..=8 - low_bit).contains(&bits)
+            }
+            Self::Checksum { byte, .. } | Self::Random { byte } => usize::from(byte) < len,
+        }
+    }
 }
 
 /// A checksum over data bytes.

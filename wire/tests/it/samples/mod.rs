@@ -1,8 +1,9 @@
 //! One or more of every variant that crosses USB, with its bytes: what the tests pin and what `vectors.json` holds.
 
 use cantap_wire::message::{
-    ChannelConfig, ChannelStatus, Checksum, Defaults, Edge, Edges, Failures, Filter, FrameKind, Modifier,
-    Periodic, RegisterSet, Registers, Role, Status, Trigger, TxFrame, capability,
+    ChannelConfig, ChannelStatus, Checksum, Defaults, Edge, Edges, Failures, Filter, FrameKind, GatewayEnd,
+    GatewayRule, GatewayState, GatewayStatus, Modifier, Pass, Periodic, RegisterSet, Registers, Role,
+    RuleCounts, Status, Trigger, TxFrame, capability,
 };
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 use cantap_wire::{BitTiming, Channel, Command, Event, Frame, Hello, Refusal, Reply};
@@ -27,6 +28,7 @@ pub fn events() -> Vec<(Event, &'static str)> {
         (Event::Lost { channel, stage: LossStage::Queue, count: 300, at_least: false }, "00 01 01 ac 02 00"),
         (Event::Lost { channel, stage: LossStage::Link, count: 1, at_least: false }, "00 01 02 01 00"),
         (Event::Lost { channel, stage: LossStage::Host, count: 1, at_least: false }, "00 01 03 01 00"),
+        (Event::Lost { channel, stage: LossStage::Gateway, count: 1, at_least: false }, "00 01 04 01 00"),
         (Event::BusError { channel, kind: BusErrorKind::Stuff, tec: 1, rec: 200 }, "01 01 00 01 c8"),
         (Event::BusError { channel, kind: BusErrorKind::Form, tec: 0, rec: 0 }, "01 01 01 00 00"),
         (Event::BusError { channel, kind: BusErrorKind::Acknowledgment, tec: 0, rec: 0 }, "01 01 02 00 00"),
@@ -57,6 +59,30 @@ pub fn events() -> Vec<(Event, &'static str)> {
             "07 01 02 05 ac 02",
         ),
     ]
+}
+
+/// A gateway's rule in which every field differs.
+fn rule() -> GatewayRule {
+    GatewayRule {
+        filter: Filter { extended: true, kind: FrameKind::Remote, id: 300, mask: 1 },
+        pass: Some(Pass {
+            extended: false,
+            id_and: 0x7FF,
+            id_xor: 300,
+            dlc_and: 14,
+            dlc_xor: 1,
+            data_and: [1, 2, 3, 4, 5, 6, 7, 8],
+            data_xor: [9, 10, 11, 12, 13, 14, 15, 16],
+            modifiers: [
+                Modifier::Counter { byte: 1, low_bit: 2, bits: 3 },
+                Modifier::Checksum { byte: 2, algorithm: Checksum::Sum },
+            ]
+            .into_iter()
+            .collect(),
+            period_ticks: 300,
+            delay_ticks: 5,
+        }),
+    }
 }
 
 /// Every command, without the request's id.
@@ -115,6 +141,25 @@ pub fn commands() -> Vec<(Command, &'static str)> {
         (Command::MeasureEdges { channel: None }, "14 00"),
         (Command::MeasureEdges { channel: Some(channel) }, "14 01 01"),
         (Command::Edges, "15"),
+        (Command::SetGatewayRule { from: channel, slot: 3, rule: None }, "16 01 03 00"),
+        (
+            Command::SetGatewayRule {
+                from: channel,
+                slot: 3,
+                rule: Some(GatewayRule { filter, pass: None }),
+            },
+            "16 01 03 01 01 01 ac 02 01 00",
+        ),
+        (
+            Command::SetGatewayRule { from: channel, slot: 3, rule: Some(rule()) },
+            "16 01 03 01 01 01 ac 02 01 01 00 ff 0f ac 02 0e 01 01 02 03 04 05 06 07 08 09 0a 0b 0c 0d 0e 0f 10 \
+             02 00 01 02 03 01 02 01 ac 02 05",
+        ),
+        (Command::StartGateway, "17"),
+        (Command::StopGateway, "18"),
+        (Command::GatewayStatus { from: channel, first: 16 }, "19 01 10"),
+        (Command::GatewayRule { from: channel, slot: 3 }, "1a 01 03"),
+        (Command::SaveGateway, "1b"),
     ]
 }
 
@@ -210,6 +255,26 @@ pub fn replies() -> Vec<(Reply, &'static str)> {
             Reply::Edges(Edges { ticks: 300, dominant: true, edges: edges.into_iter().collect() }),
             "0a ac 02 01 02 ac 02 01 01 0c 00 00",
         ),
+        (
+            Reply::Gateway(GatewayStatus {
+                state: GatewayState::Ended(GatewayEnd::ChannelClosed),
+                standalone: true,
+                from: Channel::Can2,
+                unmatched: 300,
+                waiting: 4,
+                rules: 17,
+                first: 16,
+                counts: [RuleCounts { matched: 300, sent: 1, overtaken: 2, lost: 3, failed: 4 }]
+                    .into_iter()
+                    .collect(),
+            }),
+            "0b 02 01 01 01 ac 02 04 11 10 01 ac 02 01 02 03 04",
+        ),
+        (
+            Reply::GatewayRule(rule()),
+            "0c 01 01 ac 02 01 01 00 ff 0f ac 02 0e 01 01 02 03 04 05 06 07 08 09 0a 0b 0c 0d 0e 0f 10 \
+             02 00 01 02 03 01 02 01 ac 02 05",
+        ),
     ]
 }
 
@@ -241,5 +306,7 @@ pub fn refusals() -> Vec<(Refusal, &'static str)> {
         (Refusal::Held, "16"),
         (Refusal::OtherSettings, "17"),
         (Refusal::NoBoard, "18"),
+        (Refusal::NotNormal, "19"),
+        (Refusal::GatewayRunning, "1a"),
     ]
 }

@@ -32,6 +32,7 @@ mod app {
 
     use cantap_firmware::bus::capture::{CALLS_PER_TICK, Capture};
     use cantap_firmware::bus::filters::Layout;
+    use cantap_firmware::bus::gateway::Lane;
     use cantap_firmware::bus::queue::RecordQueue;
     use cantap_firmware::bus::transmit::TxQueue;
     use cantap_firmware::lights::Activity;
@@ -92,12 +93,14 @@ mod app {
     #[init(local = [
         records: RecordQueue = RecordQueue::new(),
         tx_memory: [TxQueue; CHANNELS] = [const { TxQueue::new() }; CHANNELS],
+        lanes: [Lane; CHANNELS] = [const { Lane::new() }; CHANNELS],
         session_memory: session::Memory = session::Memory::new(),
         usb_memory: Memory = Memory::new(),
         sent_at: [AtomicU32; CHANNELS] = [const { AtomicU32::new(0) }; CHANNELS],
     ])]
     fn init(cx: init::Context) -> (Shared, Local) {
-        let init::LocalResources { records, tx_memory, session_memory, usb_memory, sent_at, .. } = cx.local;
+        let init::LocalResources { records, tx_memory, lanes, session_memory, usb_memory, sent_at, .. } =
+            cx.local;
         let sent_at: &'static [AtomicU32; CHANNELS] = sent_at;
         let [can1_sent_at, can2_sent_at] = sent_at;
         let hardware = hw::start(cx.device, usb_memory, sent_at);
@@ -123,7 +126,7 @@ mod app {
         let (producer, consumer) = records.split();
         (
             Shared {
-                tap: Tap { capture: Capture::new(producer, tx_memory), traffic: can.traffic, alarm },
+                tap: Tap { capture: Capture::new(producer, tx_memory, lanes), traffic: can.traffic, alarm },
                 stamp,
                 catcher,
                 can1_bells,
@@ -167,8 +170,8 @@ mod app {
     #[task(binds = CAN1_RX1, priority = 4, shared = [tap, &can1_bells, &can1_entered])]
     fn can1_drain(mut cx: can1_drain::Context) {
         let entered = cx.shared.can1_entered.load(Ordering::Relaxed);
-        let emptied = cx.shared.tap.lock(|Tap { capture, traffic: [can1, _], alarm }| {
-            capture.on_receive(Channel::Can1, can1, alarm, entered)
+        let emptied = cx.shared.tap.lock(|Tap { capture, traffic, alarm }| {
+            capture.on_receive(Channel::Can1, traffic, alarm, entered)
         });
         if emptied {
             cx.shared.can1_bells.open_receive();
@@ -180,8 +183,8 @@ mod app {
     #[task(binds = DMA1_STREAM0, priority = 4, shared = [tap, &can2_bells, &can2_entered])]
     fn can2_drain(mut cx: can2_drain::Context) {
         let entered = cx.shared.can2_entered.load(Ordering::Relaxed);
-        let emptied = cx.shared.tap.lock(|Tap { capture, traffic: [_, can2], alarm }| {
-            capture.on_receive(Channel::Can2, can2, alarm, entered)
+        let emptied = cx.shared.tap.lock(|Tap { capture, traffic, alarm }| {
+            capture.on_receive(Channel::Can2, traffic, alarm, entered)
         });
         if emptied {
             cx.shared.can2_bells.open_receive();
@@ -321,9 +324,8 @@ mod app {
         // Short locks, so that the transmission alarm can come between them: it fires 14 µs early, and a lock, a drain and its
         // own work have to fit into that.
         for channel in Channel::ALL {
-            let emptied = tap.lock(|Tap { capture, traffic, alarm }| {
-                capture.on_tick_receive(channel, &mut traffic[channel.index()], alarm)
-            });
+            let emptied =
+                tap.lock(|Tap { capture, traffic, alarm }| capture.on_tick_receive(channel, traffic, alarm));
             match channel {
                 _ if !emptied => {}
                 Channel::Can1 => can1_bells.open_receive(),

@@ -6,17 +6,19 @@
 
 mod foreign;
 mod gaps;
+mod gateway;
 mod orders;
 
 pub use orders::Closing;
 
-use cantap_wire::message::ChannelConfig;
+use cantap_wire::message::{ChannelConfig, GatewayState};
 use cantap_wire::record::{ErrorState, LossStage, Stamp, TransmitFailure};
 use cantap_wire::{CHANNELS, Channel, Event, Frame, Received};
 use gaps::{Gap, Gaps};
 
 use crate::QUEUE_BYTES;
 use crate::bus::errors::{ErrorMonitor, StormGuard};
+use crate::bus::gateway::Lane;
 use crate::bus::queue::Producer;
 use crate::bus::recorder::Recorder;
 use crate::bus::sof::SofMark;
@@ -124,14 +126,21 @@ pub struct Capture<'q, const N: usize = QUEUE_BYTES> {
     channels: [ChannelState<'q>; CHANNELS],
     /// The time at which the alarm is to fire, its lead already taken off; [`NEVER`] if it is off.
     alarm: u64,
+    gateway: GatewayState,
+    /// The gateway was started without a host, and goes on without one.
+    standalone: bool,
     /// Per channel, the counts of frames and of errors and losses at the last [`Self::take_activity`].
     seen: [(u32, u32); CHANNELS],
 }
 
 impl<'q, const N: usize> Capture<'q, N> {
     /// Both channels closed, with the memory of their queues.
-    pub const fn new(producer: Producer<'q, N>, queues: &'q mut [TxQueue; CHANNELS]) -> Self {
-        const fn state(channel: Channel, queue: &mut TxQueue) -> ChannelState<'_> {
+    pub const fn new(
+        producer: Producer<'q, N>,
+        queues: &'q mut [TxQueue; CHANNELS],
+        lanes: &'q mut [Lane; CHANNELS],
+    ) -> Self {
+        const fn state<'q>(channel: Channel, queue: &'q mut TxQueue, lane: &'q mut Lane) -> ChannelState<'q> {
             ChannelState {
                 open: None,
                 abort_reason: TransmitFailure::Aborted,
@@ -144,14 +153,17 @@ impl<'q, const N: usize> Capture<'q, N> {
                 drains_given_up: 0,
                 errors: ErrorMonitor::new(channel),
                 error_storms: StormGuard::new(),
-                transmitter: Transmitter::new(channel, queue),
+                transmitter: Transmitter::new(channel, queue, lane),
             }
         }
         let [first, second] = queues;
+        let [to_first, to_second] = lanes;
         Self {
             recorder: Recorder::new(producer),
-            channels: [state(Channel::Can1, first), state(Channel::Can2, second)],
+            channels: [state(Channel::Can1, first, to_first), state(Channel::Can2, second, to_second)],
             alarm: NEVER,
+            gateway: GatewayState::Off,
+            standalone: false,
             seen: [(0, 0); CHANNELS],
         }
     }
@@ -161,14 +173,15 @@ impl<'q, const N: usize> Capture<'q, N> {
     /// Returns whether the FIFO is empty, so that the interrupt may come again. If the FIFO does not release its frames, or repeats them, the
     /// interrupt would come at once and for ever, and nothing below it would run: it must stay silent until [`Self::on_tick_receive`].
     #[inline]
-    pub fn on_receive(
+    pub fn on_receive<T: Traffic>(
         &mut self,
         channel: Channel,
-        traffic: &mut impl Traffic,
+        both: &mut [T; CHANNELS],
         clock: &impl Clock,
         entered: u32,
     ) -> bool {
         let state = &mut self.channels[channel.index()];
+        let traffic = &mut both[channel.index()];
         if state.leaving.keeps_fifo(traffic) {
             self.record_front(channel, traffic, entered);
             return false;
@@ -194,24 +207,25 @@ impl<'q, const N: usize> Capture<'q, N> {
             }
             drain.look = Some(look);
         }
-        self.drain(channel, traffic, clock, drain)
+        self.drain(channel, both, clock, drain)
     }
 
     /// Part of [`Self::on_tick`]: drains a FIFO whose last drain was given up. Returns whether the receive interrupt, which was left silent
     /// then, may come again.
-    pub fn on_tick_receive(
+    pub fn on_tick_receive<T: Traffic>(
         &mut self,
         channel: Channel,
-        traffic: &mut impl Traffic,
+        both: &mut [T; CHANNELS],
         clock: &impl Clock,
     ) -> bool {
         let now = self.recorder.time(clock.now());
         let state = &mut self.channels[channel.index()];
+        let traffic = &mut both[channel.index()];
         if state.held && state.leaving != Leaving::No && traffic.take_overrun() {
             state.gaps.overrun(traffic);
             Self::record_gap(state, &mut self.recorder, channel, now);
         }
-        state.held && state.leaving == Leaving::No && self.drain_late(channel, traffic, clock)
+        state.held && state.leaving == Leaving::No && self.drain_late(channel, both, clock)
     }
 
     /// Records that frames are missing before the next one in the FIFO, if they are.
@@ -268,7 +282,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         at: u64,
         quality: Stamp,
     ) -> bool {
-        let reply = state.transmitter.on_frame(&frame);
+        let reply = state.transmitter.on_frame(&frame, at);
         Self::write_frame(state, recorder, channel, frame, at, quality);
         if state.gaps.taken() {
             Self::record_gap(state, recorder, channel, at);
@@ -296,21 +310,27 @@ impl<'q, const N: usize> Capture<'q, N> {
     }
 
     /// Drains the FIFO when nothing is known about when its frames ended. Returns whether it is empty.
-    fn drain_late(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) -> bool {
-        let drain = Drain::whole(traffic.look());
-        self.drain(channel, traffic, clock, drain)
+    fn drain_late<T: Traffic>(
+        &mut self,
+        channel: Channel,
+        both: &mut [T; CHANNELS],
+        clock: &impl Clock,
+    ) -> bool {
+        let drain = Drain::whole(both[channel.index()].look());
+        self.drain(channel, both, clock, drain)
     }
 
     /// What is left of draining the FIFO. Returns whether it is empty.
     #[inline(never)]
-    fn drain(
+    fn drain<T: Traffic>(
         &mut self,
         channel: Channel,
-        traffic: &mut impl Traffic,
+        both: &mut [T; CHANNELS],
         clock: &impl Clock,
         drain: Drain,
     ) -> bool {
         let state = &mut self.channels[channel.index()];
+        let traffic = &mut both[channel.index()];
         let Drain { mut look, looks, mut room, mut entered, mut reply } = drain;
         let mut emptied = false;
         for _ in 0..looks {
@@ -348,7 +368,12 @@ impl<'q, const N: usize> Capture<'q, N> {
         }
         if reply {
             let now = self.recorder.time(clock.now());
-            state.transmitter.service(traffic, &mut self.recorder, now);
+            if state.transmitter.is_replying() {
+                state.transmitter.service(traffic, &mut self.recorder, now);
+            }
+            if self.gateway == GatewayState::Running {
+                self.pass_on(channel, both, clock, now);
+            }
         }
         emptied
     }
@@ -375,7 +400,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         let state = &mut self.channels[channel.index()];
         let recorded = state.transmitter.record(&mut self.recorder);
         let now = self.recorder.time(clock.now());
-        if !recorded || state.transmitter.has_more(now) {
+        if !recorded || state.transmitter.has_more(now) || state.transmitter.has_passing(now) {
             state.transmitter.service(&mut traffic[channel.index()], &mut self.recorder, now);
         }
         // Recording took a while, and the other channel's frame may be due: the alarm would be too late for it.
@@ -531,7 +556,8 @@ impl<'q, const N: usize> Capture<'q, N> {
         }
         let mut serviced = false;
         for (state, traffic) in self.channels.iter_mut().zip(traffic.iter_mut()) {
-            if state.open.is_some() && state.transmitter.has_more(now) {
+            let due = state.transmitter.has_more(now) || state.transmitter.has_passing(now);
+            if state.open.is_some() && due {
                 state.transmitter.service(traffic, &mut self.recorder, now);
                 serviced = true;
             }
@@ -543,10 +569,10 @@ impl<'q, const N: usize> Capture<'q, N> {
     }
 
     /// Once a millisecond: keeps time, reads what no interrupt reports, retries what had no room.
-    pub fn on_tick<T: Traffic>(&mut self, traffic: &mut [T; CHANNELS], clock: &impl Clock) {
+    pub fn on_tick<T: Traffic>(&mut self, both: &mut [T; CHANNELS], clock: &impl Clock) {
         for channel in Channel::ALL {
-            let traffic = &mut traffic[channel.index()];
-            self.on_tick_receive(channel, traffic, clock);
+            self.on_tick_receive(channel, both, clock);
+            let traffic = &mut both[channel.index()];
             self.take_errors_held(channel);
             if self.on_tick_errors(channel, traffic, clock) {
                 for _ in 0..CALLS_PER_TICK {

@@ -7,6 +7,7 @@ pub mod capture;
 pub mod checksum;
 pub mod errors;
 pub mod filters;
+pub mod gateway;
 pub mod mailboxes;
 pub mod periodic;
 pub mod queue;

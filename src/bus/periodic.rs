@@ -202,7 +202,10 @@ impl PeriodicTable {
         let slot = *self.waiting.front()?;
         let random = self.next_random();
         let entry = self.entries[usize::from(slot)].as_ref()?;
-        Some((DEVICE_TAG + u32::from(slot), modified(entry, random)))
+        Some((
+            DEVICE_TAG + u32::from(slot),
+            apply(&entry.entry.modifiers, &entry.entry.frame, entry.step, random),
+        ))
     }
 
     /// The frame that [`Self::next_frame`] returned is in a mailbox.
@@ -287,17 +290,16 @@ fn slots(mut bits: u32) -> impl Iterator<Item = usize> {
     })
 }
 
-/// A periodic entry's frame with its modifiers applied.
-fn modified(periodic: &PeriodicState, mut random: u32) -> Frame {
-    let frame = &periodic.entry.frame;
+/// A frame with modifiers applied. `step` is how often that was done before.
+pub fn apply(modifiers: &[Modifier], frame: &Frame, step: u32, mut random: u32) -> Frame {
     let mut data = frame.padded_data();
     let len = frame.data_len();
-    for modifier in &periodic.entry.modifiers {
+    for modifier in modifiers {
         match *modifier {
             Modifier::Counter { byte, low_bit, bits } => {
                 let mask = ((1u16 << bits) - 1) as u8;
                 if let Some(value) = data[..len].get_mut(byte as usize) {
-                    let counted = (*value >> low_bit).wrapping_add(periodic.step as u8) & mask;
+                    let counted = (*value >> low_bit).wrapping_add(step as u8) & mask;
                     *value = *value & !(mask << low_bit) | counted << low_bit;
                 }
             }
@@ -321,11 +323,5 @@ fn modified(periodic: &PeriodicState, mut random: u32) -> Frame {
 /// Whether an entry can be applied: a period, and modifiers inside the frame's data.
 pub fn is_valid(entry: &Periodic) -> bool {
     let len = entry.frame.data_len();
-    entry.period_ticks >= MIN_PERIOD_TICKS
-        && entry.modifiers.iter().all(|modifier| match *modifier {
-            Modifier::Counter { byte, low_bit, bits } => {
-                (byte as usize) < len && low_bit < 8 && (1..=8 - low_bit).contains(&bits)
-            }
-            Modifier::Checksum { byte, .. } | Modifier::Random { byte } => (byte as usize) < len,
-        })
+    entry.period_ticks >= MIN_PERIOD_TICKS && entry.modifiers.iter().all(|modifier| modifier.fits(len))
 }

@@ -22,6 +22,8 @@ pub struct Recorder<'q, const N: usize = QUEUE_BYTES> {
     unreported: [u32; CHANNELS],
     /// All frames that did not fit.
     lost: [u32; CHANNELS],
+    /// Those of them that this device had sent.
+    lost_sent: [u32; CHANNELS],
 }
 
 impl<'q, const N: usize> Recorder<'q, N> {
@@ -33,6 +35,7 @@ impl<'q, const N: usize> Recorder<'q, N> {
             last_ticks: 0,
             unreported: [0; CHANNELS],
             lost: [0; CHANNELS],
+            lost_sent: [0; CHANNELS],
         }
     }
 
@@ -47,6 +50,7 @@ impl<'q, const N: usize> Recorder<'q, N> {
         self.last_ticks = now;
         self.unreported = [0; CHANNELS];
         self.lost = [0; CHANNELS];
+        self.lost_sent = [0; CHANNELS];
         self.producer.reset_high_water();
     }
 
@@ -69,6 +73,22 @@ impl<'q, const N: usize> Recorder<'q, N> {
             self.unreported[index] = self.unreported[index].wrapping_add(1);
             self.lost[index] = self.lost[index].wrapping_add(1);
         }
+    }
+
+    /// Writes the confirmation of a frame that is not held up by a full queue, or counts it as lost: it was on the bus.
+    pub fn confirm(&mut self, event: &Event, channel: Channel, at: u64) {
+        if self.producer.takes_frames() && self.event(event, at) {
+            return;
+        }
+        for count in [&mut self.unreported, &mut self.lost, &mut self.lost_sent] {
+            let count = &mut count[channel.index()];
+            *count = count.wrapping_add(1);
+        }
+    }
+
+    /// Frames that this device had sent, among [`Self::lost`].
+    pub const fn lost_sent(&self, channel: Channel) -> u32 {
+        self.lost_sent[channel.index()]
     }
 
     /// Writes an event and returns whether there was room for it.

@@ -1,16 +1,18 @@
 //! Puts frames on the bus: a queue in order, frames at their time, periodic frames, replies.
 //!
 //! One per channel, in the tasks of priority 4. Mailboxes are sent in the order in which they were requested. Whenever one is free, a
-//! reply goes first, then a periodic frame that is due ([`crate::bus::periodic`]), then the head of the queue once its time has come.
+//! reply goes first, then a periodic frame that is due ([`crate::bus::periodic`]), then the head of the queue once its time has come. A gateway's
+//! frames ([`crate::bus::gateway`]) go before a head without a time, and leave one mailbox to all the others.
 //!
 //! Each call does a bounded amount of work: it fills the free mailboxes, three at most, and writes at most
 //! [`RECORDS_PER_CALL`] records of frames that are given up. `docs/architecture.md` says how long this takes.
 
-use cantap_wire::message::{Periodic, TRIGGER_TAG, Trigger, TxFrame};
-use cantap_wire::record::TransmitFailure;
+use cantap_wire::message::{GATEWAY_TAG, Periodic, TRIGGER_TAG, Trigger, TxFrame};
+use cantap_wire::record::{LossStage, TransmitFailure};
 use cantap_wire::{Channel, Event, Frame};
-use heapless::Deque;
+use heapless::{Deque, Vec};
 
+use crate::bus::gateway::Lane;
 use crate::bus::mailboxes::{MAILBOXES, Mailboxes};
 use crate::bus::periodic::PeriodicTable;
 use crate::bus::recorder::{RECORDS_PER_CALL, Recorder};
@@ -19,6 +21,9 @@ use crate::ports::{Outcome, Traffic};
 
 /// Frames that the queue holds: 28 ms of the shortest eight-byte frames at 1 Mbit/s.
 pub const TX_QUEUE: usize = 256;
+/// Frames received in one drain, with their times: six at most.
+pub type Caught = Vec<(Frame, u64), 6>;
+
 /// Replies.
 pub const TRIGGER_SLOTS: usize = 8;
 
@@ -68,8 +73,17 @@ pub struct Transmitter<'q> {
     mailboxes: Mailboxes,
     periodic: PeriodicTable,
     triggers: [Option<TriggerState>; TRIGGER_SLOTS],
-    triggers_armed: bool,
+    /// Received frames are looked at: there are replies, or a gateway passes them on.
+    watching: bool,
     replies_waiting: u8,
+    /// The frames to be sent for a gateway.
+    lane: &'q mut Lane,
+    /// The gateway runs.
+    passing: bool,
+    /// What this channel has received, for the gateway to send on the other.
+    caught: Caught,
+    /// Frames that the gateway has lost and that no record reports yet.
+    unpassed: u32,
     /// Finished but not recorded yet. Every transmission must be confirmed, so if the record queue has no room, nothing
     /// more is sent until these are written. There is room here for what is then still in the mailboxes, too.
     unconfirmed: Deque<Ended, { 2 * MAILBOXES }>,
@@ -88,16 +102,20 @@ pub struct Transmitter<'q> {
 }
 
 impl<'q> Transmitter<'q> {
-    /// Nothing to send; `queue` is empty.
-    pub const fn new(channel: Channel, queue: &'q mut TxQueue) -> Self {
+    /// Nothing to send; `queue` and `lane` are empty.
+    pub const fn new(channel: Channel, queue: &'q mut TxQueue, lane: &'q mut Lane) -> Self {
         Self {
             channel,
             queue: &mut queue.0,
             mailboxes: Mailboxes::new(),
             periodic: PeriodicTable::new(channel),
             triggers: [const { None }; TRIGGER_SLOTS],
-            triggers_armed: false,
+            watching: false,
             replies_waiting: 0,
+            lane,
+            passing: false,
+            caught: Vec::new(),
+            unpassed: 0,
             unconfirmed: Deque::new(),
             dropping: None,
             off: false,
@@ -171,7 +189,7 @@ impl<'q> Transmitter<'q> {
     }
 
     fn count_triggers(&mut self) {
-        self.triggers_armed = self.triggers.iter().any(Option::is_some);
+        self.watching = self.passing || self.triggers.iter().any(Option::is_some);
         self.replies_waiting = self.triggers.iter().flatten().filter(|entry| entry.waiting).count() as u8;
     }
 
@@ -202,6 +220,9 @@ impl<'q> Transmitter<'q> {
             }
             self.failed = self.failed.wrapping_add(1);
             self.mailboxes.take(mailbox);
+            if tag >= GATEWAY_TAG {
+                self.lane.ended((tag - GATEWAY_TAG) as usize, None);
+            }
         }
         // Their end has just been recorded.
         forget_finished(traffic);
@@ -226,6 +247,10 @@ impl<'q> Transmitter<'q> {
     /// Forgets everything without recording it, for when nobody is listening any more.
     pub fn clear(&mut self) {
         self.periodic.forget();
+        self.passing = false;
+        self.unpassed = 0;
+        self.caught.clear();
+        self.lane.clear();
         self.clear_triggers();
         self.queue.clear();
         self.unconfirmed.clear();
@@ -237,34 +262,88 @@ impl<'q> Transmitter<'q> {
     /// Once a millisecond: records how many periods passed without a frame, rather than each of them.
     pub fn tick<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) {
         self.periodic.tick(recorder, now);
+        if self.unpassed > 0 && recorder.takes_frames() {
+            self.tell_unpassed(recorder, now);
+        }
     }
 
-    /// Whether periods that passed without a frame are still to be recorded.
+    /// Records what the gateway has lost. Returns whether there was room.
+    #[cold]
+    #[inline(never)]
+    fn tell_unpassed<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) -> bool {
+        let (channel, count) = (self.channel, self.unpassed);
+        let lost = Event::Lost { channel, stage: LossStage::Gateway, count, at_least: false };
+        let written = recorder.event(&lost, now);
+        if written {
+            self.unpassed = 0;
+        }
+        written
+    }
+
+    /// Whether periods that passed without a frame, or losses of the gateway, are still to be recorded.
     pub const fn owes(&self) -> bool {
-        self.periodic.owes()
+        self.periodic.owes() || self.unpassed > 0
     }
 
     /// The channel is closed: records what [`Self::tick`] has not recorded yet, a little per call. Returns whether there was room.
     pub fn tell_rest<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) -> bool {
-        self.periodic.tell_rest(recorder, now)
+        (self.unpassed == 0 || self.tell_unpassed(recorder, now)) && self.periodic.tell_rest(recorder, now)
     }
 
-    /// A frame was received: arms the replies that it triggers. Returns whether there is one.
+    /// The gateway's frames on this channel.
+    pub const fn lane(&mut self) -> &mut Lane {
+        self.lane
+    }
+
+    /// The gateway starts.
+    pub fn start_passing(&mut self) {
+        self.lane.restart();
+        (self.passing, self.watching) = (true, true);
+    }
+
+    /// The gateway ends: what waits is lost. What is in a mailbox is still sent.
+    pub fn stop_passing(&mut self) {
+        self.passing = false;
+        self.caught.clear();
+        self.count_triggers();
+        self.unpassed = self.unpassed.saturating_add(self.lane.give_up());
+    }
+
+    /// Takes what was received for the gateway to send on the other channel.
+    pub fn take_caught(&mut self) -> Caught {
+        core::mem::take(&mut self.caught)
+    }
+
+    /// The gateway sends on this channel what its rules make of these frames, which the other has received.
+    pub fn pass(&mut self, caught: &Caught) {
+        for (frame, at) in caught {
+            self.unpassed = self.unpassed.saturating_add(self.lane.admit(frame, *at));
+        }
+    }
+
+    /// A frame was received: arms the replies that it triggers, and keeps it for the gateway. Returns whether there is anything to send.
     #[inline]
-    pub fn on_frame(&mut self, frame: &Frame) -> bool {
-        self.triggers_armed && self.arm_replies(frame)
+    pub fn on_frame(&mut self, frame: &Frame, at: u64) -> bool {
+        self.watching && self.arm_replies(frame, at)
+    }
+
+    /// Whether a reply waits.
+    pub const fn is_replying(&self) -> bool {
+        self.replies_waiting > 0
     }
 
     /// Separate from [`Self::on_frame`] and out of line, so that without replies the draining loop has the registers to itself.
     #[inline(never)]
-    fn arm_replies(&mut self, frame: &Frame) -> bool {
+    fn arm_replies(&mut self, frame: &Frame, at: u64) -> bool {
+        // Cannot fail: a drain takes no more.
+        let caught = self.passing && self.caught.push((*frame, at)).is_ok();
         for trigger in self.triggers.iter_mut().flatten() {
             if trigger.left != Some(0) && !trigger.waiting && trigger.entry.filter.matches(frame) {
                 trigger.waiting = true;
                 self.replies_waiting += 1;
             }
         }
-        self.replies_waiting > 0
+        caught || self.replies_waiting > 0
     }
 
     /// Mailboxes may have finished: records how, and fills them again. `reason` says why frames were aborted, if they were. Returns what
@@ -348,6 +427,12 @@ impl<'q> Transmitter<'q> {
         waiting || self.periodic.due() <= now
     }
 
+    /// Whether the gateway waits for [`Self::service`].
+    #[inline]
+    pub fn has_passing(&self, now: u64) -> bool {
+        self.passing && (self.lane.is_ready() || self.lane.due() <= now)
+    }
+
     /// Fills free mailboxes with the queue's frames that are due, unless something else goes first.
     pub fn load_due(&mut self, traffic: &mut impl Traffic, now: u64) {
         for _ in 0..MAILBOXES {
@@ -369,7 +454,11 @@ impl<'q> Transmitter<'q> {
         if kept >= self.unconfirmed.capacity() || self.off || self.has_more(at) {
             return None;
         }
-        let mailbox = traffic.prepare(&self.queue.front()?.frame);
+        let head = self.queue.front()?;
+        if self.passing && head.at == 0 && self.lane.is_ready() {
+            return None;
+        }
+        let mailbox = traffic.prepare(&head.frame);
         self.refused = mailbox.is_none() && !self.mailboxes.are_full();
         mailbox
     }
@@ -400,13 +489,32 @@ impl<'q> Transmitter<'q> {
                 None => Event::Transmitted { channel, tag, frame },
                 Some(reason) => Event::TransmitFailed { channel, tag, reason },
             };
-            if !recorder.event(&event, at) {
+            if tag >= GATEWAY_TAG {
+                self.confirm_passed(recorder, &event, at);
+            } else if !recorder.event(&event, at) {
                 return false;
             }
             self.unconfirmed.pop_front();
             *room -= 1;
         }
         true
+    }
+
+    /// A frame of the gateway has ended. A full record queue does not hold it up: a host that is slow must not disturb the buses.
+    #[inline(never)]
+    fn confirm_passed<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, event: &Event, at: u64) {
+        match *event {
+            Event::Transmitted { channel, tag, frame } => {
+                self.lane.ended((tag - GATEWAY_TAG) as usize, Some((frame, at)));
+                recorder.confirm(event, channel, at);
+            }
+            Event::TransmitFailed { tag, .. } => {
+                self.lane.ended((tag - GATEWAY_TAG) as usize, None);
+                // Counted by the rule in any case.
+                recorder.aside(event, at);
+            }
+            _ => {}
+        }
     }
 
     /// Records what has finished or is given up, [`RECORDS_PER_CALL`] at most, and fills free mailboxes with what is due. Returns whether
@@ -458,6 +566,28 @@ impl<'q> Transmitter<'q> {
             }
         }
         self.load_due(traffic, now);
+        if self.passing {
+            self.fill_passing(traffic, now);
+        }
+    }
+
+    /// Fills all but one of the mailboxes with the gateway's frames, then with those of the queue that gave way to them.
+    #[inline(never)]
+    fn fill_passing(&mut self, traffic: &mut impl Traffic, now: u64) {
+        if self.lane.due() <= now {
+            self.unpassed = self.unpassed.saturating_add(self.lane.release(now));
+        }
+        while self.mailboxes.len() < MAILBOXES - 1 {
+            let Some(&(rule, frame)) = self.lane.next() else { return self.load_due(traffic, now) };
+            // There must be room for everything in a mailbox once it has finished.
+            let kept = self.unconfirmed.len() + self.mailboxes.len();
+            if kept >= self.unconfirmed.capacity()
+                || !self.load(GATEWAY_TAG + u32::from(rule), &frame, traffic)
+            {
+                return;
+            }
+            self.lane.loaded();
+        }
     }
 
     /// Whether a frame that becomes due can leave. Otherwise it waits for something other than time: for a mailbox, which an
@@ -496,7 +626,8 @@ impl<'q> Transmitter<'q> {
         }
         let head = self.head_due();
         // A frame without a due time waits for something other than time.
-        self.periodic.due().min(if head == 0 { NEVER } else { head })
+        let passing = if self.passing { self.lane.due() } else { NEVER };
+        self.periodic.due().min(if head == 0 { NEVER } else { head }).min(passing)
     }
 
     fn load(&mut self, tag: u32, frame: &Frame, traffic: &mut impl Traffic) -> bool {

@@ -14,6 +14,7 @@ use crate::port::board::Board;
 use crate::ports::{Chip, Control, EdgeMeter, FilterBanks};
 use crate::{CAN_CLOCK_HZ, QUEUE_BYTES, TICK_HZ, TICKS_PER_MS};
 
+mod gateway;
 mod measuring;
 mod sending;
 mod settings;
@@ -139,7 +140,8 @@ impl Commands {
                 | capability::SLCAN
                 | capability::DEFAULTS
                 | capability::BOOTLOADER
-                | capability::EDGES,
+                | capability::EDGES
+                | capability::GATEWAY,
         }
     }
 
@@ -190,6 +192,12 @@ impl Commands {
             Command::Failures => Reply::Failures(board.chip().failures()),
             Command::MeasureEdges { channel } => measuring::measure(&mut self.measuring, channel, board)?,
             Command::Edges => measuring::edges(&mut self.measuring, board)?,
+            Command::SetGatewayRule { from, slot, rule } => gateway::set_rule(from, slot, rule, board)?,
+            Command::GatewayRule { from, slot } => gateway::rule(from, slot, board)?,
+            Command::StartGateway => gateway::start(board)?,
+            Command::StopGateway => gateway::stop(board),
+            Command::GatewayStatus { from, first } => gateway::status(from, first, board),
+            Command::SaveGateway => return Err(Refusal::Unsupported),
         };
         Ok(Step::Done(reply))
     }
@@ -620,6 +628,6 @@ fn begin_close<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, 
     // Two locks: each takes a while.
     board.with_capture(|capture, _, clock| capture.end_entries(channel, clock));
     board.with_capture(|capture, traffic, clock| {
-        capture.begin_close(channel, &mut traffic[channel.index()], clock);
+        capture.begin_close(channel, traffic, clock);
     });
 }

@@ -106,8 +106,8 @@ fn a_frame_whose_interrupt_waits_is_left_to_it() {
     let ended = bench.board.clock.now.get();
     bench.board.traffic[0].arrive(numbered(1));
     bench.pass(3 * TICKS_PER_US);
-    bench.board.capture.begin_close(CAN1, &mut bench.board.traffic[0], &bench.board.clock);
-    bench.board.capture.on_receive(CAN1, &mut bench.board.traffic[0], &bench.board.clock, ended);
+    bench.board.capture.begin_close(CAN1, &mut bench.board.traffic, &bench.board.clock);
+    bench.board.capture.on_receive(CAN1, &mut bench.board.traffic, &bench.board.clock, ended);
     bench.millisecond();
     bench.millisecond();
     assert_eq!(bench.records[0], (ended.into(), received(CAN1, numbered(1), Stamp::Exact)));

@@ -7,6 +7,7 @@ mod edges;
 mod errors;
 mod fakes;
 mod filters;
+mod gateway;
 mod leaving;
 mod long_pauses;
 mod periodic;

@@ -3,6 +3,7 @@
 
 use crate::fakes;
 
+use cantap_firmware::bus::gateway::Lane;
 use cantap_firmware::bus::periodic::PERIODIC_SLOTS;
 use cantap_firmware::bus::queue::RecordQueue;
 use cantap_firmware::bus::transmit::{TRIGGER_SLOTS, TX_QUEUE};
@@ -279,7 +280,8 @@ fn a_frame_that_comes_while_the_queue_is_given_up_is_told_of() {
     use cantap_firmware::bus::transmit::{Transmitter, TxQueue};
     use cantap_wire::record::TransmitFailure;
     let mut queue = TxQueue::new();
-    let mut transmitter = Transmitter::new(CAN1, &mut queue);
+    let mut lane = Lane::new();
+    let mut transmitter = Transmitter::new(CAN1, &mut queue, &mut lane);
     let mut traffic = fakes::FakeTraffic::default();
     let frame = |tag| TxFrame { tag, frame: numbered(1), at_ticks: None };
     assert!(transmitter.enqueue(&frame(1)));

@@ -22,13 +22,14 @@ pub struct Args {
 }
 
 /// Names of the device's capabilities.
-const CAPABILITIES: [(u32, &str); 10] = [
+const CAPABILITIES: [(u32, &str); 11] = [
     (capability::TRANSMIT, "transmit"),
     (capability::TIMED_TRANSMIT, "timed-transmit"),
     (capability::SLCAN, "slcan"),
     (capability::DEFAULTS, "defaults"),
     (capability::BOOTLOADER, "bootloader"),
     (capability::EDGES, "edges"),
+    (capability::GATEWAY, "gateway"),
     (capability::ADAPTER, "adapter"),
     (capability::ALWAYS_ACKNOWLEDGES, "always-acknowledges"),
     (capability::NO_BIT_RATE, "no-bit-rate"),

@@ -272,7 +272,10 @@ impl<'q> Board<'q, QUEUE_BYTES> for AdapterBoard<'q> {
             | Command::Bootloader
             | Command::SaveDefaults
             | Command::ClearDefaults
-            | Command::MeasureEdges { .. } => Err(Refusal::Unsupported),
+            | Command::MeasureEdges { .. }
+            | Command::SetGatewayRule { .. }
+            | Command::StartGateway
+            | Command::SaveGateway => Err(Refusal::Unsupported),
             Command::Identify { seconds } => self.driver.identify(*seconds),
             // What the firmware refuses anyway must not reach the adapter.
             Command::Open { channel, config: Some(config) }

@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use cantap::device::{Link, PipeReader, pipe};
 use cantap_firmware::bus::capture::Capture;
+use cantap_firmware::bus::gateway::Lane;
 use cantap_firmware::bus::queue::RecordQueue;
 use cantap_firmware::bus::transmit::TxQueue;
 use cantap_firmware::port::board::Board as _;
@@ -45,6 +46,7 @@ const MAX_UNREPORTED: usize = 1024;
 struct Memory {
     records: RecordQueue,
     transmit: [TxQueue; CHANNELS],
+    lanes: [Lane; CHANNELS],
     session: session::Memory,
 }
 
@@ -107,9 +109,10 @@ fn run(driver: Box<dyn Driver>, port: PipePort, reason: &Reason) {
     let mut memory = Box::new(Memory {
         records: RecordQueue::new(),
         transmit: [const { TxQueue::new() }; CHANNELS],
+        lanes: [const { Lane::new() }; CHANNELS],
         session: session::Memory::new(),
     });
-    let Memory { records, transmit, session } = &mut *memory;
+    let Memory { records, transmit, lanes, session } = &mut *memory;
     let (producer, consumer) = records.split();
     let boxes = [(); CHANNELS].map(|()| Rc::new(RefCell::new(Mailboxes::new())));
     let side = |channel: usize| Rc::clone(&boxes[channel]);
@@ -119,7 +122,7 @@ fn run(driver: Box<dyn Driver>, port: PipePort, reason: &Reason) {
         Identity { board: driver.row().board, serial: String::try_from(serial.as_str()).unwrap_or_default() };
     let mut engine = Engine {
         board: AdapterBoard {
-            capture: Capture::new(producer, transmit),
+            capture: Capture::new(producer, transmit, lanes),
             traffic: [TrafficSide(side(0)), TrafficSide(side(1))],
             control: [ControlSide(side(0)), ControlSide(side(1))],
             boxes: [side(0), side(1)],

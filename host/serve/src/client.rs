@@ -401,6 +401,13 @@ impl Client {
             }
             // Whoever flashes a firmware is at the board.
             Command::Bootloader => Err(Refusal::Unsupported),
+            // A gateway needs both channels to itself.
+            Command::SetGatewayRule { .. }
+            | Command::StartGateway
+            | Command::StopGateway
+            | Command::GatewayStatus { .. }
+            | Command::GatewayRule { .. }
+            | Command::SaveGateway => Err(Refusal::Unsupported),
         }
     }
 

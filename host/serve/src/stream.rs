@@ -115,6 +115,7 @@ pub fn count(counts: &mut [Counts; CHANNELS], record: &Record, is_own: bool) {
                     add(&mut counts.frames, count);
                 }
                 LossStage::Link | LossStage::Host => add(&mut counts.frames, count),
+                LossStage::Gateway => {}
             }
         }
         Record::Event(Event::Transmitted { channel, .. }) if is_own => {

@@ -61,6 +61,8 @@ pub fn count(totals: &mut Totals, entry: &Entry) {
                 (LossStage::Queue, count) => of.lost_queue += u64::from(count),
                 (LossStage::Link, count) => of.lost_link += u64::from(count),
                 (LossStage::Host, count) => of.lost_host += u64::from(count),
+                // A server's clients cannot start one.
+                (LossStage::Gateway, _) => {}
             }
         }
         Record::Event(_) => {}

@@ -1,7 +1,8 @@
 //! The requests to a device, one method each.
 
 use cantap_wire::message::{
-    ChannelConfig, Defaults, Edges, Failures, Filter, Periodic, Registers, Status, Trigger, TxFrame,
+    ChannelConfig, Defaults, Edges, Failures, Filter, GatewayRule, GatewayStatus, Periodic, Registers,
+    Status, Trigger, TxFrame,
 };
 use cantap_wire::{Channel, Command, Refusal, Reply};
 
@@ -90,6 +91,53 @@ impl Device {
     /// Sets or clears a reply that is sent when a matching frame is received.
     pub fn set_trigger(&self, channel: Channel, slot: u8, entry: Option<Trigger>) -> Result<(), DeviceError> {
         self.done(Command::SetTrigger { channel, slot, entry })
+    }
+
+    /// Replaces the gateway's rules for what a channel receives, [`MAX_GATEWAY_RULES`](cantap_wire::message::MAX_GATEWAY_RULES) at
+    /// most. The first that matches a frame decides; one that none matches is not passed on. The gateway must not be running.
+    pub fn set_gateway_rules(&self, from: Channel, rules: &[GatewayRule]) -> Result<(), DeviceError> {
+        self.done(Command::SetGatewayRule { from, slot: 0, rule: None })?;
+        for (slot, rule) in rules.iter().enumerate() {
+            let slot = u8::try_from(slot).map_err(|_| DeviceError::RequestTooLong)?;
+            self.done(Command::SetGatewayRule { from, slot, rule: Some(rule.clone()) })?;
+        }
+        Ok(())
+    }
+
+    /// The gateway's rules for what a channel receives.
+    pub fn gateway_rules(&self, from: Channel) -> Result<Vec<GatewayRule>, DeviceError> {
+        let rules = self.gateway_status(from, 0)?.rules;
+        (0..rules)
+            .map(|slot| match self.request(Command::GatewayRule { from, slot })? {
+                Reply::GatewayRule(rule) => Ok(rule),
+                _ => Err(DeviceError::WrongReply),
+            })
+            .collect()
+    }
+
+    /// Passes frames on between the channels, which must both be open in normal mode. Counts begin at zero.
+    pub fn start_gateway(&self) -> Result<(), DeviceError> {
+        self.done(Command::StartGateway)
+    }
+
+    /// Ends that. Frames that still wait are dropped, and counted as lost.
+    pub fn stop_gateway(&self) -> Result<(), DeviceError> {
+        self.done(Command::StopGateway)
+    }
+
+    /// What the gateway does with what a channel receives, with the counts of the rules from `first` on,
+    /// [`MAX_RULE_COUNTS`](cantap_wire::message::MAX_RULE_COUNTS) at most.
+    pub fn gateway_status(&self, from: Channel, first: u8) -> Result<GatewayStatus, DeviceError> {
+        match self.request(Command::GatewayStatus { from, first })? {
+            Reply::Gateway(status) => Ok(status),
+            _ => Err(DeviceError::WrongReply),
+        }
+    }
+
+    /// Stores what [`Self::save_defaults`] does, and the gateway's rules: from its next start on, the device opens both channels and
+    /// runs the gateway on its own. Both channels must be closed, and configured for normal mode.
+    pub fn save_gateway(&self) -> Result<(), DeviceError> {
+        self.done(Command::SaveGateway)
     }
 
     /// The controller's registers.

@@ -31,6 +31,8 @@ pub struct ChannelCounters {
     pub lost_link: u64,
     /// Frames that arrived but that a slow consumer lost.
     pub lost_host: u64,
+    /// Frames that a gateway was to send on this channel and dropped, because more came than the bus took.
+    pub lost_gateway: u64,
     /// How often an unknown number of frames was lost, or may have been: where the device was deaf or its buffer was full, and once each time
     /// that the channel starts on a device that does not count its losses.
     pub unknown: u64,
@@ -47,7 +49,7 @@ impl ChannelCounters {
         self.received - self.lost_host
     }
 
-    /// Frames lost at any stage that can count them. Others are missing where none can: see [`Self::unknown`] and [`Self::off_bus`].
+    /// Frames lost on the way to the host at any stage that can count them. Others are missing where none can: see [`Self::unknown`] and [`Self::off_bus`].
     pub const fn lost(&self) -> u64 {
         self.lost_controller + self.lost_queue + self.lost_link + self.lost_host
     }
@@ -74,6 +76,7 @@ impl Add for ChannelCounters {
             lost_queue: self.lost_queue + other.lost_queue,
             lost_link: self.lost_link + other.lost_link,
             lost_host: self.lost_host + other.lost_host,
+            lost_gateway: self.lost_gateway + other.lost_gateway,
             unknown: self.unknown + other.unknown,
             off_bus: self.off_bus + other.off_bus,
             off_bus_ns: self.off_bus_ns + other.off_bus_ns,
@@ -389,6 +392,7 @@ impl Intake {
             LossStage::Queue => counters.lost_queue += u64::from(count),
             LossStage::Link => counters.lost_link += u64::from(count),
             LossStage::Host => counters.lost_host += u64::from(count),
+            LossStage::Gateway => counters.lost_gateway += u64::from(count),
         }
         self.stamped.extend(lost(channel, Ticks(0), stage, count, stage == LossStage::Controller));
         self.place_in_time();
@@ -459,6 +463,7 @@ fn on_event(
                     counters.received += u64::from(count);
                     counters.lost_host += u64::from(count);
                 }
+                LossStage::Gateway => counters.lost_gateway += u64::from(count),
             }
             (channel, TraceEvent::Lost { stage: Some(stage), count, at_least })
         }

@@ -329,6 +329,8 @@ fn sentence(refusal: Refusal) -> String {
         Refusal::OtherSettings => {
             "other clients of its server have the channel open, with another bit rate or mode; open it as they have"
         }
+        Refusal::NotNormal => "a gateway needs both channels in normal mode; open them so",
+        Refusal::GatewayRunning => "its gateway is running; stop it first",
         Refusal::NoBoard => "its server has no board at the moment; connect the board to it again",
     };
     fixed.to_owned()

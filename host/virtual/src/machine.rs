@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use cantap_firmware::bus::capture::Capture;
+use cantap_firmware::bus::gateway::Lane;
 use cantap_firmware::bus::queue::RecordQueue;
 use cantap_firmware::bus::transmit::TxQueue;
 use cantap_firmware::port::command::Identity;
@@ -58,6 +59,7 @@ impl Witness {
 pub struct Memory {
     records: RecordQueue,
     transmit: [TxQueue; CHANNELS],
+    lanes: [Lane; CHANNELS],
     session: session::Memory,
 }
 
@@ -68,6 +70,7 @@ impl Memory {
         Box::new(Self {
             records: RecordQueue::new(),
             transmit: [const { TxQueue::new() }; CHANNELS],
+            lanes: [const { Lane::new() }; CHANNELS],
             session: session::Memory::new(),
         })
     }
@@ -133,13 +136,13 @@ impl<'q> Machine<'q> {
     pub fn power_up(memory: &'q mut Memory, world: World) -> Self {
         let World { port, buses, loops, joined, witness, flash, serial, name, crystal_ppm, now_ns } = world;
         let controllers = [(); CHANNELS].map(|()| Rc::new(RefCell::new(Controller::new())));
-        let Memory { records, transmit, session } = memory;
+        let Memory { records, transmit, lanes, session } = memory;
         let (producer, consumer) = records.split();
         let identity = Identity { board: name, serial: serial.clone() };
         let side = |channel: usize| Rc::clone(&controllers[channel]);
         Self {
             board: VirtualBoard {
-                capture: Capture::new(producer, transmit),
+                capture: Capture::new(producer, transmit, lanes),
                 traffic: [TrafficSide(side(0)), TrafficSide(side(1))],
                 control: [ControlSide(side(0)), ControlSide(side(1))],
                 clock: ModelClock::started_at(now_ns, crystal_ppm),
@@ -275,7 +278,7 @@ impl<'q> Machine<'q> {
             let entered = board.clock.now();
             if interrupts.receive {
                 witness.heard[index].store(heard_before.frames[index] + heard, Ordering::Release);
-                board.capture.on_receive(channel, &mut board.traffic[index], &board.clock, entered);
+                board.capture.on_receive(channel, &mut board.traffic, &board.clock, entered);
             }
             if interrupts.transmit {
                 board.capture.on_transmit(channel, &mut board.traffic, &board.clock, Some(entered));

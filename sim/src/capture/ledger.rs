@@ -112,6 +112,8 @@ impl Ledger {
                 match stage {
                     LossStage::Controller => books.announced.controller += count,
                     LossStage::Queue => books.announced.queue += count,
+                    // The frame was delivered on the channel that received it.
+                    LossStage::Gateway => return,
                     LossStage::Link | LossStage::Host => {
                         self.fault(format!(
                             "the device reports a loss of stage {stage:?}, which only a host can"

@@ -1,8 +1,8 @@
 //! What commands ask of the capture: sessions, channels on and off their buses, counters.
 
-use cantap_wire::message::{ChannelConfig, ChannelStatus, Registers};
+use cantap_wire::message::{ChannelConfig, ChannelStatus, GatewayEnd, GatewayState, Registers};
 use cantap_wire::record::{LossStage, Stamp, TransmitFailure};
-use cantap_wire::{Channel, Event};
+use cantap_wire::{CHANNELS, Channel, Event};
 
 use super::gaps::{Gap, Gaps};
 use super::{Capture, LOOKS_PER_DRAIN, Leaving};
@@ -29,6 +29,7 @@ impl<'q, const N: usize> Capture<'q, N> {
     pub fn restart(&mut self, clock: &impl Clock) -> u64 {
         let now = self.now(clock);
         self.recorder.restart(now);
+        self.forget_gateway();
         for state in &mut self.channels {
             state.frames = 0;
             state.overruns = 0;
@@ -58,18 +59,25 @@ impl<'q, const N: usize> Capture<'q, N> {
         self.recorder.event(&lost, now);
     }
 
-    /// First part of closing: periodic frames and replies end. [`Self::begin_close`] follows, under a lock of its own.
+    /// First part of closing: a gateway, periodic frames and replies end. [`Self::begin_close`] follows, under a lock of its own.
     pub fn end_entries(&mut self, channel: Channel, clock: &impl Clock) {
+        self.end_gateway(GatewayState::Ended(GatewayEnd::ChannelClosed));
         let now = self.now(clock);
         self.channels[channel.index()].transmitter.clear_entries(now);
     }
 
     /// Second part of closing: aborts transmissions, and drains a FIFO whose last drain was given up. Any other is left to its interrupt, which
     /// knows when a frame ended. The channel is still on the bus.
-    pub fn begin_close(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) {
+    pub fn begin_close<T: Traffic>(
+        &mut self,
+        channel: Channel,
+        both: &mut [T; CHANNELS],
+        clock: &impl Clock,
+    ) {
         if self.channels[channel.index()].held {
-            self.drain_late(channel, traffic, clock);
+            self.drain_late(channel, both, clock);
         }
+        let traffic = &mut both[channel.index()];
         let now = self.now(clock);
         let state = &mut self.channels[channel.index()];
         state.abort_reason = TransmitFailure::Closed;
@@ -160,6 +168,7 @@ impl<'q, const N: usize> Capture<'q, N> {
 
     /// Nobody listens any more: nothing more is sent. The channel is still on the bus.
     pub fn begin_abandon(&mut self, channel: Channel, traffic: &mut impl Traffic) {
+        self.forget_gateway();
         let state = &mut self.channels[channel.index()];
         state.leaving = Leaving::Abandoned;
         state.transmitter.clear();
@@ -223,7 +232,7 @@ impl<'q, const N: usize> Capture<'q, N> {
             tec: errors.tec,
             rec: errors.rec,
             last_error: state.errors.last_error(),
-            frames: state.frames,
+            frames: state.frames.wrapping_add(self.recorder.lost_sent(channel)),
             lost_controller: state.overruns,
             lost_queue: self.recorder.lost(channel),
             bus_errors: state.errors.errors(),

@@ -477,7 +477,7 @@ impl<'q, const N: usize> Bench<'q, N> {
         let identity = Identity { board: "fake", serial: "0123456789ABCDEF".try_into().unwrap() };
         Bench {
             board: FakeBoard {
-                capture: Capture::new(producer, Box::leak(Box::default())),
+                capture: Capture::new(producer, Box::leak(Box::default()), Box::leak(Box::default())),
                 traffic: Default::default(),
                 control: Default::default(),
                 clock: FakeClock::default(),
@@ -592,7 +592,7 @@ impl<'q, const N: usize> Bench<'q, N> {
     /// The receive interrupt.
     pub fn interrupt(&mut self, channel: Channel) {
         let entered = self.board.clock.now();
-        let traffic = &mut self.board.traffic[channel.index()];
+        let traffic = &mut self.board.traffic;
         self.board.capture.on_receive(channel, traffic, &self.board.clock, entered);
     }
 

@@ -95,7 +95,7 @@ impl Errors {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Losses {
     /// By stage, in the order of [`LossStage`].
-    pub by_stage: [u64; 4],
+    pub by_stage: [u64; LossStage::ALL.len()],
     /// Losses at a stage that the trace does not name.
     pub unknown: u64,
     /// Places in the trace where frames are missing.

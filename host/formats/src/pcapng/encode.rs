@@ -168,6 +168,7 @@ fn loss(stage: Option<LossStage>, count: u32, at_least: bool) -> String {
         Some(LossStage::Queue) => " in the device's queue",
         Some(LossStage::Link) => " between device and computer",
         Some(LossStage::Host) => " in the computer",
+        Some(LossStage::Gateway) => " on the way through the gateway",
         None => "",
     };
     match (count, at_least) {

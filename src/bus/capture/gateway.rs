@@ -1,0 +1,108 @@
+//! The gateway: frames that one channel receives are sent on the other.
+//!
+//! The drain keeps received frames, six at most, and passes them on once its FIFO is empty and its own channel's replies are in
+//! mailboxes. Without a gateway nothing of this is reached: what decides is the flag that replies have anyway.
+
+use cantap_wire::message::{GatewayEnd, GatewayRule, GatewayState, GatewayStatus, Mode};
+use cantap_wire::{CHANNELS, Channel, Refusal};
+
+use super::Capture;
+use crate::bus::gateway::other;
+use crate::ports::{Clock, Traffic};
+
+impl<const N: usize> Capture<'_, N> {
+    /// The other channel sends what the rules make of the frames just received: at most six, each compared with 32 rules, and two that go
+    /// into mailboxes.
+    #[inline(never)]
+    pub(super) fn pass_on<T: Traffic>(
+        &mut self,
+        channel: Channel,
+        traffic: &mut [T; CHANNELS],
+        clock: &impl Clock,
+        now: u64,
+    ) {
+        let caught = self.channels[channel.index()].transmitter.take_caught();
+        let to = other(channel);
+        let transmitter = &mut self.channels[to.index()].transmitter;
+        transmitter.pass(&caught);
+        if transmitter.lane().is_loop() {
+            return self.end_gateway(GatewayState::Ended(GatewayEnd::Loop));
+        }
+        transmitter.service(&mut traffic[to.index()], &mut self.recorder, now);
+        self.arm(clock);
+    }
+
+    /// Sets a rule for what this channel receives, or removes it and those after it.
+    pub fn set_rule(&mut self, from: Channel, slot: usize, rule: Option<GatewayRule>) -> Result<(), Refusal> {
+        if self.gateway == GatewayState::Running {
+            return Err(Refusal::GatewayRunning);
+        }
+        let set = self.transmitter(other(from)).lane().set_rule(slot, rule);
+        if set { Ok(()) } else { Err(Refusal::BadSlot) }
+    }
+
+    /// A rule for what this channel receives.
+    pub fn rule(&mut self, from: Channel, slot: usize) -> Option<GatewayRule> {
+        self.transmitter(other(from)).lane().rule(slot).cloned()
+    }
+
+    /// How many rules there are for what this channel receives.
+    pub fn rules(&mut self, from: Channel) -> usize {
+        self.transmitter(other(from)).lane().rules()
+    }
+
+    /// Starts the gateway.
+    pub fn start_gateway(&mut self, standalone: bool) -> Result<(), Refusal> {
+        if self.gateway == GatewayState::Running {
+            return Err(Refusal::GatewayRunning);
+        }
+        for state in &self.channels {
+            match &state.open {
+                None => return Err(Refusal::ChannelClosed),
+                Some(config) if config.mode != Mode::Normal => return Err(Refusal::NotNormal),
+                Some(_) => {}
+            }
+        }
+        self.channels.iter_mut().for_each(|state| state.transmitter.start_passing());
+        (self.gateway, self.standalone) = (GatewayState::Running, standalone);
+        Ok(())
+    }
+
+    /// Ends the gateway, if it runs.
+    #[cold]
+    #[inline(never)]
+    pub fn end_gateway(&mut self, state: GatewayState) {
+        if self.gateway == GatewayState::Running {
+            self.channels.iter_mut().for_each(|channel| channel.transmitter.stop_passing());
+            self.gateway = state;
+        }
+        self.standalone = false;
+    }
+
+    /// No gateway has run in this session.
+    pub(super) const fn forget_gateway(&mut self) {
+        (self.gateway, self.standalone) = (GatewayState::Off, false);
+    }
+
+    /// Whether a gateway runs that was started without a host.
+    pub fn is_standalone(&self) -> bool {
+        self.standalone && self.gateway == GatewayState::Running
+    }
+
+    /// One direction's state, with the counts of the rules from `first` on.
+    pub fn gateway_status(&mut self, from: Channel, first: usize) -> GatewayStatus {
+        let (state, standalone) = (self.gateway, self.is_standalone());
+        let lane = self.transmitter(other(from)).lane();
+        let (unmatched, counts) = lane.counts(first);
+        GatewayStatus {
+            state,
+            standalone,
+            from,
+            unmatched,
+            waiting: lane.waiting() as u16,
+            rules: lane.rules() as u8,
+            first: first as u8,
+            counts,
+        }
+    }
+}

@@ -15,6 +15,7 @@ pub mod convert;
 pub mod db;
 pub mod decode;
 pub mod defaults;
+pub mod delay;
 pub mod diff;
 pub mod doctor;
 pub mod extcap;
@@ -65,6 +66,8 @@ pub enum Command {
     Convert(convert::Args),
     /// Compare two traces: IDs, periods, lengths, bits.
     Diff(diff::Args),
+    /// Measure how long a gateway takes, from a trace of both its buses: delays, missing and extra frames.
+    Delay(Box<delay::Args>),
     /// Put traces of several recorders on one clock, using the frames that they have in common.
     Align(align::Args),
     /// Find frames in a trace by ID, data or a condition on signals.
@@ -152,6 +155,7 @@ impl Command {
             Self::Stats(args) => stats::run(&args),
             Self::Convert(args) => convert::run(&args),
             Self::Diff(args) => diff::run(&args),
+            Self::Delay(args) => delay::run(*args),
             Self::Align(args) => align::run(&args),
             Self::Search(args) => search::run(&args),
             Self::Timing(args) => timing::run(&args),

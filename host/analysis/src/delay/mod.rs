@@ -6,7 +6,8 @@
 //! **Frames that are alike** cannot be told apart. One on the second channel is taken for the nearest before it that is still waiting, so that a
 //! lost frame does not shift all that follow; if several were waiting and none of them stays missing, they are paired in order. If one does,
 //! or a pair had to be changed afterwards, it is not known which is whose, and those paired meanwhile are counted as [`Figures::ambiguous`], without a delay. What no pairing can show is a gateway that
-//! always takes longer than equal frames are apart: [`Figures::repeated`] and [`Figures::shortest_repeat_ns`] say where that limit is.
+//! always takes longer than equal frames are apart: its delays appear shorter by that, with one frame missing where such a row begins and one extra
+//! where it ends. [`Figures::repeated`] and [`Figures::shortest_repeat_ns`] say where that limit is.
 //!
 //! **Nothing is missing that cannot be known to be**: what the trace's beginning or end or a loss recorded in it may explain is counted apart
 //! ([`Undecided`]). Memory grows with the window and the number of identifiers, not with the trace.

@@ -3,22 +3,24 @@
 mod output;
 
 use std::io::{BufWriter, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::bail;
+use cantap::Channel;
 use cantap_analysis::delay::{Expected, Matching, Options};
 use cantap_trace::filter::{Filter, passes};
 use cantap_trace::{TraceEvent, TraceFrame};
+use cantap_work::gateway::{Map, Rules};
 
 use self::output::Output;
+use crate::args;
 use crate::database_args::DatabaseArgs;
 use crate::exit;
 use crate::input::{FollowArgs, Records};
 use crate::live_args::LiveArgs;
 use crate::usage_error::usage;
-use crate::args;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -30,7 +32,7 @@ use crate::args;
                   it only hides extra ones.\n\nExamples:\n  \
                   cantap delay both.log --from 1 --to 2\n  \
                   cantap delay both.blf --from 2 --to 1 -f 100-1FF --within 20ms\n  \
-                  cantap delay both.log --from 1 --to 2 --json\n  \
+                  cantap delay both.log --from 1 --to 2 --map rules.toml --json\n  \
                   cantap delay -d /dev/ttyACM0 -b 500k -t 60s --from 1 --to 2\n\n\
                   Exit code: 0, also if frames are missing or extra; with --check 3 if some are."
 )]
@@ -47,6 +49,9 @@ pub struct Args {
     /// A frame that has not appeared after this time is missing.
     #[arg(long, value_name = "TIME", default_value = "100ms", value_parser = args::positive_duration)]
     within: Duration,
+    /// The gateway's rules, if it changes, drops or delays frames (docs/gateway.md). What no rule passes on is not expected.
+    #[arg(long, value_name = "RULES")]
+    map: Option<PathBuf>,
     /// End with 3 if frames are missing or extra.
     #[arg(long)]
     check: bool,
@@ -73,6 +78,7 @@ pub fn run(mut args: Args) -> anyhow::Result<ExitCode> {
     if args.within > LONGEST {
         return Err(usage("--within is at most an hour"));
     }
+    let map = args.map.as_deref().map(|path| map(path, args.from, args.to)).transpose()?;
     let filters = args.read.filters(&args.databases.load(args.read.strict, false)?)?;
     let mut records = args.read.open_either(args.input.as_ref(), &args.live, Vec::new())?;
     let options = Options {
@@ -80,8 +86,11 @@ pub fn run(mut args: Args) -> anyhow::Result<ExitCode> {
         to: args.to,
         within_ns: i64::try_from(args.within.as_nanos()).unwrap_or(i64::MAX).max(1),
     };
-    let unchanged = |frame: &TraceFrame| Some(Expected::unchanged(*frame));
-    let output = analyse(Matching::new(options, unchanged), options, &filters, &mut records)?;
+    let expected = |frame: &TraceFrame| match &map {
+        Some(map) => map.expected(frame),
+        None => Some(Expected::unchanged(*frame)),
+    };
+    let output = analyse(Matching::new(options, expected), options, &filters, &mut records)?;
     let mut out = BufWriter::new(std::io::stdout().lock());
     if args.json {
         writeln!(out, "{}", output.object(&records.missing()))?;
@@ -92,6 +101,25 @@ pub fn run(mut args: Args) -> anyhow::Result<ExitCode> {
     let total = &output.outcome.total;
     let failed = args.check && total.missing + total.extra > 0;
     Ok(if failed { ExitCode::from(exit::CHECK_FAILED) } else { ExitCode::SUCCESS })
+}
+
+/// The rules for a direction.
+fn map(path: &Path, from: u8, to: u8) -> anyhow::Result<Map> {
+    let rules = Rules::read(path)?;
+    let channel = Channel::ALL.into_iter().find(|channel| channel.number() == from);
+    let Some(channel) = channel.filter(|_| matches!(to, 1 | 2)) else {
+        return Err(usage(
+            "rules are for channels 1 and 2; leave --map out, or move channels with cantap convert",
+        ));
+    };
+    let map = Map::new(&rules, channel);
+    if map.is_empty() {
+        bail!(
+            "{} has no rule for what channel {from} receives; swap --from and --to, or add one",
+            path.display()
+        );
+    }
+    Ok(map)
 }
 
 fn analyse<M: FnMut(&TraceFrame) -> Option<Expected>>(

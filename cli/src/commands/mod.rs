@@ -19,6 +19,7 @@ pub mod delay;
 pub mod diff;
 pub mod doctor;
 pub mod extcap;
+pub mod gateway;
 pub mod r#gen;
 pub mod help;
 pub mod info;
@@ -68,6 +69,8 @@ pub enum Command {
     Diff(diff::Args),
     /// Measure how long a gateway takes, from a trace of both its buses: delays, missing and extra frames.
     Delay(Box<delay::Args>),
+    /// Try a gateway's rules on a trace: what would be passed on, changed, dropped.
+    Gateway(Box<gateway::Args>),
     /// Put traces of several recorders on one clock, using the frames that they have in common.
     Align(align::Args),
     /// Find frames in a trace by ID, data or a condition on signals.
@@ -156,6 +159,7 @@ impl Command {
             Self::Convert(args) => convert::run(&args),
             Self::Diff(args) => diff::run(&args),
             Self::Delay(args) => delay::run(*args),
+            Self::Gateway(args) => gateway::run(&args),
             Self::Align(args) => align::run(&args),
             Self::Search(args) => search::run(&args),
             Self::Timing(args) => timing::run(&args),

@@ -56,12 +56,19 @@ impl Output {
         let shortest_ms = total.shortest_repeat_ns.map_or(0.0, |ns| ms(ns as f64));
         let counted = [
             (total.replaced, format!("replaced on channel {to} by a newer one within the rule's period")),
-            (undecided.start, format!("on channel {to} too soon after the beginning to know whether they are extra")),
-            (undecided.end, format!("on channel {from} too soon before the end to know whether they are missing")),
+            (
+                undecided.start,
+                format!("on channel {to} too soon after the beginning to know whether they are extra"),
+            ),
+            (
+                undecided.end,
+                format!("on channel {from} too soon before the end to know whether they are missing"),
+            ),
             (undecided.loss, "where the trace has lost frames, so neither missing nor extra".to_owned()),
             (
                 total.ambiguous,
-                "matched, but equal to others that waited at the same time: their delays are unknown".to_owned(),
+                "matched, but equal to others that waited at the same time: their delays are unknown"
+                    .to_owned(),
             ),
             (total.late, "matched with a stamp that is only an upper bound".to_owned()),
             (
@@ -81,7 +88,9 @@ impl Output {
             .collect();
         if let Some(step) = step_ns {
             let step = ms(*step as f64);
-            notes.push(format!("stamps are in steps of {step} ms: each delay may be {step} ms longer or shorter"));
+            notes.push(format!(
+                "stamps are in steps of {step} ms: each delay may be {step} ms longer or shorter"
+            ));
         }
         if *uncounted {
             notes.push(

@@ -50,7 +50,9 @@ impl Side {
     }
 
     fn has_gap(&self, from_ns: i64, until_ns: i64) -> bool {
-        self.gaps.iter().any(|gap| gap.from_ns <= until_ns && gap.until_ns.is_none_or(|until| until >= from_ns))
+        self.gaps
+            .iter()
+            .any(|gap| gap.from_ns <= until_ns && gap.until_ns.is_none_or(|until| until >= from_ns))
     }
 
     fn forget_before(&mut self, time_ns: i64) {
@@ -120,7 +122,9 @@ impl<M: FnMut(&TraceFrame) -> Option<Expected>> Matching<M> {
     pub fn push(&mut self, record: &TraceRecord, counts: bool) {
         let time_ns = record.time_ns;
         // Two traces were joined, or the clock was set back.
-        if self.start_ns.is_some() && time_ns < self.now_ns.saturating_sub(self.longest_ns.saturating_add(DISORDER_NS)) {
+        if self.start_ns.is_some()
+            && time_ns < self.now_ns.saturating_sub(self.longest_ns.saturating_add(DISORDER_NS))
+        {
             self.end();
             self.outcome.breaks += 1;
             (self.start_ns, self.now_ns) = (None, i64::MIN);
@@ -187,7 +191,8 @@ impl<M: FnMut(&TraceFrame) -> Option<Expected>> Matching<M> {
                 known.push(expected.unknown);
             }
         }
-        let allowed = self.options.within_ns.saturating_add(expected.period_ns).saturating_add(expected.held_ns);
+        let allowed =
+            self.options.within_ns.saturating_add(expected.period_ns).saturating_add(expected.held_ns);
         self.longest_ns = self.longest_ns.max(allowed);
         self.number += 1;
         let number = self.number;
@@ -199,7 +204,8 @@ impl<M: FnMut(&TraceFrame) -> Option<Expected>> Matching<M> {
             run.set_replaceable(before);
         }
         let run = self.runs.entry(key).or_default();
-        let repeat_ns = run.last_before(time_ns).map(|last| time_ns.saturating_sub(last)).filter(|gap| *gap <= allowed);
+        let repeat_ns =
+            run.last_before(time_ns).map(|last| time_ns.saturating_sub(last)).filter(|gap| *gap <= allowed);
         let deadline_ns = time_ns.saturating_add(allowed);
         let id = frame.id();
         run.push(Waiting { number, time_ns, deadline_ns, id, late, repeat_ns, replaceable: false });
@@ -228,7 +234,8 @@ impl<M: FnMut(&TraceFrame) -> Option<Expected>> Matching<M> {
         let runs: Vec<_> = keys.filter_map(|key| Some((self.runs.get(&key)?, key))).collect();
         let nearest = runs.iter().filter_map(|(run, key)| Some((run.nearest(time_ns)?, *key)));
         let found = nearest.max_by_key(|(from_ns, _)| *from_ns).map(|(_, key)| key);
-        let found = found.or_else(|| runs.iter().find(|(run, _)| run.has_one_for(time_ns, late)).map(|(_, key)| *key));
+        let found = found
+            .or_else(|| runs.iter().find(|(run, _)| run.has_one_for(time_ns, late)).map(|(_, key)| *key));
         match found {
             Some(key) => self.pair(key, time_ns, late),
             None => self.extras.push_back(Extra { time_ns, frame: *frame, late, counts }),

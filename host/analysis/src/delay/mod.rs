@@ -93,7 +93,9 @@ impl Key {
                 data.iter_mut().zip(unknown).for_each(|(byte, any)| *byte &= !any);
                 Frame::from_bus(classic.id(), classic.is_remote(), classic.dlc(), data).into()
             }
-            TraceFrame::Fd(fd) => FdFrame::new(fd.id(), fd.brs(), false, fd.data()).map_or(*frame, TraceFrame::Fd),
+            TraceFrame::Fd(fd) => {
+                FdFrame::new(fd.id(), fd.brs(), false, fd.data()).map_or(*frame, TraceFrame::Fd)
+            }
         };
         Self { frame, unknown }
     }

@@ -52,7 +52,10 @@ fn matched_missing_and_extra_frames_are_told_apart() {
     let total = &found.total;
     assert_eq!((total.matched, total.missing, total.extra, total.undecided.total()), (2, 1, 1, 0));
     let delays = &total.delays;
-    assert_eq!((delays.min_ns(), delays.mean_ns(), delays.max_ns()), (Some(3_000_000), Some(4e6), Some(5_000_000)));
+    assert_eq!(
+        (delays.min_ns(), delays.mean_ns(), delays.max_ns()),
+        (Some(3_000_000), Some(4e6), Some(5_000_000))
+    );
     let ids: Vec<_> =
         found.ids.iter().map(|(id, row)| (id.raw(), row.matched, row.missing, row.extra)).collect();
     assert_eq!(ids, [(0x123, 2, 1, 0), (0x124, 0, 0, 1)]);
@@ -82,7 +85,8 @@ fn a_lost_one_of_equal_frames_is_missing_and_leaves_the_others_their_delays() {
 
 #[test]
 fn equal_frames_that_all_arrive_are_paired_in_order() {
-    let records = [0, 1, 2].map(|ms| on(1, ms, "001#AA")).into_iter().chain([5, 6, 7].map(|ms| on(2, ms, "001#AA")));
+    let records =
+        [0, 1, 2].map(|ms| on(1, ms, "001#AA")).into_iter().chain([5, 6, 7].map(|ms| on(2, ms, "001#AA")));
     let total = analyse(&records.collect::<Vec<_>>()).total;
     assert_eq!((total.matched, total.ambiguous), (3, 0));
     assert_eq!((total.delays.min_ns(), total.delays.max_ns()), (Some(5_000_000), Some(5_000_000)));
@@ -97,7 +101,8 @@ fn equal_frames_that_take_longer_than_they_are_apart_are_not_called_missing() {
 
 #[test]
 fn what_the_traces_ends_may_explain_is_undecided() {
-    let found = outcome(&[on(2, 0, "001#"), on(2, 99, "002#"), on(2, 101, "003#"), on(1, 500, "004#")], unchanged);
+    let found =
+        outcome(&[on(2, 0, "001#"), on(2, 99, "002#"), on(2, 101, "003#"), on(1, 500, "004#")], unchanged);
     let undecided = found.total.undecided;
     assert_eq!((undecided.start, undecided.end, undecided.loss), (2, 1, 0));
     assert_eq!((found.total.missing, found.total.extra), (0, 1));
@@ -133,15 +138,24 @@ fn mapped(frame: &TraceFrame) -> Option<Expected> {
 
 #[test]
 fn a_map_changes_frames_leaves_bits_open_and_expects_nothing_of_others() {
-    let records = framed(&[on(1, 0, "123#A001"), on(1, 1, "124#A0"), on(2, 2, "456#A701"), on(2, 3, "456#B701")]);
+    let records =
+        framed(&[on(1, 0, "123#A001"), on(1, 1, "124#A0"), on(2, 2, "456#A701"), on(2, 3, "456#B701")]);
     let found = outcome(&records, mapped);
-    assert_eq!((found.total.matched, found.total.extra, found.total.missing, found.not_expected), (1, 1, 0, 1));
+    assert_eq!(
+        (found.total.matched, found.total.extra, found.total.missing, found.not_expected),
+        (1, 1, 0, 1)
+    );
 }
 
 #[test]
 fn a_newer_frame_of_its_rule_within_the_period_replaces_one() {
-    let records =
-        [on(1, 0, "123#A0"), on(1, 10, "123#B0"), on(2, 50, "456#B0"), on(1, 300, "123#C0"), on(1, 400, "123#D0")];
+    let records = [
+        on(1, 0, "123#A0"),
+        on(1, 10, "123#B0"),
+        on(2, 50, "456#B0"),
+        on(1, 300, "123#C0"),
+        on(1, 400, "123#D0"),
+    ];
     let total = outcome(&framed(&records), mapped).total;
     assert_eq!((total.matched, total.replaced, total.missing), (1, 1, 2));
 }
@@ -154,7 +168,8 @@ fn a_trace_that_is_a_little_out_of_order_is_read_all_the_same() {
 
 #[test]
 fn nothing_is_expected_across_a_clock_that_was_set_back() {
-    let found = outcome(&[on(1, 5000, "001#"), on(2, 0, "001#"), on(1, 10, "002#"), on(2, 11, "002#")], unchanged);
+    let found =
+        outcome(&[on(1, 5000, "001#"), on(2, 0, "001#"), on(1, 10, "002#"), on(2, 11, "002#")], unchanged);
     assert_eq!((found.breaks, found.total.matched, found.total.undecided.total()), (1, 1, 2));
 }
 

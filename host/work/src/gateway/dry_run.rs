@@ -105,7 +105,9 @@ impl DryRun {
             unmatched[from.index()] = u64::from(lane.counts(0).0);
             let slots = (0..).step_by(MAX_RULE_COUNTS).take_while(|first| *first < lane.rules());
             let counts = slots.flat_map(|first| lane.counts(first).1);
-            for ((number, counts), changed) in self.rules.places(from).zip(counts).zip(&self.changed[from.index()]) {
+            for ((number, counts), changed) in
+                self.rules.places(from).zip(counts).zip(&self.changed[from.index()])
+            {
                 let (sum, all_changed) = &mut rules[number];
                 sum.matched += counts.matched;
                 sum.sent += counts.sent;

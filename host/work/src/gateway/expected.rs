@@ -44,7 +44,8 @@ impl Map {
     /// What the other bus should carry; `None` if the frame is not passed on. An FD frame never is.
     pub fn expected(&self, frame: &TraceFrame) -> Option<Expected> {
         let frame = frame.classic()?;
-        let (rule, place) = self.places.iter().enumerate().find(|(_, place)| place.part.filter.matches(frame))?;
+        let (rule, place) =
+            self.places.iter().enumerate().find(|(_, place)| place.part.filter.matches(frame))?;
         let pass = place.part.pass.as_ref()?;
         let sent = apply(&pass.modifiers, &pass.changed(frame)?, 0, 0);
         Some(Expected {

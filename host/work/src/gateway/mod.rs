@@ -5,9 +5,9 @@
 mod dry_run;
 mod expected;
 mod rules;
-mod text;
 #[cfg(test)]
 mod tests;
+mod text;
 
 pub use dry_run::{DryRun, DryRunCounts, Sent};
 pub use expected::Map;

@@ -99,6 +99,11 @@ impl Rules {
         rules.flat_map(|(number, rule)| std::iter::repeat_n(number, rule.parts.len()))
     }
 
+    /// Whether a rule drops what it matches.
+    pub fn drops(&self, number: usize) -> bool {
+        self.rules.get(number).is_some_and(|rule| rule.parts.iter().all(|part| part.pass.is_none()))
+    }
+
     /// What a device is given for a channel. `tick_hz` is the rate of its clock.
     pub fn of_device(&self, from: Channel, tick_hz: u32) -> Vec<GatewayRule> {
         let ticks = |time: Duration| {

@@ -49,8 +49,12 @@ fn the_first_rule_that_matches_decides_and_what_none_matches_is_not_passed_on() 
     assert_eq!(becomes(text, "101#11").as_deref(), Some("101#11"));
     assert_eq!(becomes(text, "200#11"), None);
     assert_eq!(becomes(text, "00000101#11"), None);
-    let (sent, counts) = dry_run(&rules(text), &[on(2, 5, "1FFFFFFF#R2"), on(3, 6, "100#"), on(1, 7, "200#")]);
-    assert_eq!(sent.iter().map(|sent| (sent.channel, sent.time_ns)).collect::<Vec<_>>(), [(Channel::Can1, 5)]);
+    let (sent, counts) =
+        dry_run(&rules(text), &[on(2, 5, "1FFFFFFF#R2"), on(3, 6, "100#"), on(1, 7, "200#")]);
+    assert_eq!(
+        sent.iter().map(|sent| (sent.channel, sent.time_ns)).collect::<Vec<_>>(),
+        [(Channel::Can1, 5)]
+    );
     assert_eq!((counts.unmatched, counts.not_received), ([1, 0], 1));
 }
 
@@ -85,7 +89,10 @@ fn a_counter_counts_the_frames_of_its_rule() {
     let records: Vec<_> = (0..18).map(|at| on(1, at * MS, "123#00A5")).collect();
     let (sent, counts) = dry_run(&rules(&text), &records);
     let data: Vec<_> = sent.iter().map(|sent| sent.frame.data().to_vec()).collect();
-    assert_eq!((&data[0][..], &data[15][..], &data[17][..]), (&[5, 5][..], &[0xF5, 0xF5][..], &[0x15, 0x15][..]));
+    assert_eq!(
+        (&data[0][..], &data[15][..], &data[17][..]),
+        (&[5, 5][..], &[0xF5, 0xF5][..], &[0x15, 0x15][..])
+    );
     assert_eq!((counts.rules[0].0.matched, counts.rules[0].1), (18, 18));
 }
 
@@ -130,13 +137,25 @@ fn errors_name_the_line_and_the_field() {
         ("[[rule]]\nfrom = 1\nset = { dlc = 16 }", "rules.toml, line 3: set.dlc: a DLC is 0 to 15"),
         ("[[rule]]\nfrom = 1\nand.data = \"1\"", "rules.toml, line 3: and.data: write up to 8 bytes"),
         ("[[rule]]\nfrom = 1\nand.data = \"é1\"", "rules.toml, line 3: and.data: write up to 8 bytes"),
-        ("[[rule]]\nfrom = 1\nchecksum = \"9:xor\"", "rules.toml, line 3: checksum: a frame has bytes 0 to 7"),
-        ("[[rule]]\nfrom = 1\nchecksum = \"7:md5\"", "rules.toml, line 3: checksum: write a checksum as BYTE:xor"),
-        ("[[rule]]\nfrom = 1\nfilter = \"123\"\nperiod = \"fast\"", "rules.toml, line 4: period: write a time"),
+        (
+            "[[rule]]\nfrom = 1\nchecksum = \"9:xor\"",
+            "rules.toml, line 3: checksum: a frame has bytes 0 to 7",
+        ),
+        (
+            "[[rule]]\nfrom = 1\nchecksum = \"7:md5\"",
+            "rules.toml, line 3: checksum: write a checksum as BYTE:xor",
+        ),
+        (
+            "[[rule]]\nfrom = 1\nfilter = \"123\"\nperiod = \"fast\"",
+            "rules.toml, line 4: period: write a time",
+        ),
         ("[[rule]]\nfrom = 1\ndelay = \"1h\"", "rules.toml, line 3: delay: at most 100s"),
-        ("[[rule]]\nfrom = 1\nfilter = \"101-1FF\"\nperiod = \"1s\"", "rules.toml, line 4: period: it is one for all"),
+        (
+            "[[rule]]\nfrom = 1\nfilter = \"101-1FF\"\nperiod = \"1s\"",
+            "rules.toml, line 4: period: it is one for all",
+        ),
         ("[[rule]]\nfrom = 1\ndrop = true\ndelay = \"1s\"", "rules.toml, line 1: drop: a rule that drops"),
-        ("[[rule]]\nfrom = 1\nfilter = \"18FEF1??\"\nset.id = \"1??\"", "rules.toml, line 4: id: "),
+        ("[[rule]]\nfrom = 1\nfilter = \"123\"\nor.id = \"00000800\"", "rules.toml, line 4: id: "),
         ("[[rule]]\nfrom = 1\nfilter = \"00000001-0FFFFFFE\"", "take 54 places, and a device has 32"),
         ("[[rule]\n", "rules.toml, line 1: "),
     ] {

@@ -73,7 +73,12 @@ impl Source<'_> {
 
     fn fault(&self, span: &Range<usize>, field: &str, text: impl Into<String>) -> RulesError {
         let field = if field.is_empty() { String::new() } else { format!("{field}: ") };
-        RulesError::Faulty { file: self.file.to_owned(), line: self.line(span.start), field, text: text.into() }
+        RulesError::Faulty {
+            file: self.file.to_owned(),
+            line: self.line(span.start),
+            field,
+            text: text.into(),
+        }
     }
 
     /// What `parse` makes of a field's text.
@@ -104,7 +109,11 @@ pub fn parse(file: &str, text: &str) -> Result<Vec<Rule>, RulesError> {
         source.fault(&span, "", error.message())
     })?;
     if content.rule.is_empty() {
-        return Err(source.fault(&(0..0), "", "there is no rule; a rule begins with [[rule]] (docs/gateway.md)"));
+        return Err(source.fault(
+            &(0..0),
+            "",
+            "there is no rule; a rule begins with [[rule]] (docs/gateway.md)",
+        ));
     }
     content.rule.into_iter().map(|entry| rule(&source, &entry.span(), entry.get_ref())).collect()
 }
@@ -116,7 +125,9 @@ fn rule(source: &Source, span: &Range<usize>, entry: &Entry) -> Result<Rule, Rul
         (source.time("period", entry.period.as_ref())?, source.time("delay", entry.delay.as_ref())?);
     let changes = [entry.and.as_ref(), entry.or.as_ref(), entry.xor.as_ref(), entry.set.as_ref()];
     let modifiers = entry.counter.is_some() || entry.checksum.is_some();
-    if entry.drop && (modifiers || !period.is_zero() || !delay.is_zero() || changes.iter().any(Option::is_some)) {
+    if entry.drop
+        && (modifiers || !period.is_zero() || !delay.is_zero() || changes.iter().any(Option::is_some))
+    {
         return Err(source.fault(span, "drop", "a rule that drops frames does nothing else to them"));
     }
     for (field, text) in [("counter", &entry.counter), ("period", &entry.period)] {
@@ -157,7 +168,11 @@ fn channel(source: &Source, from: &Spanned<From>) -> Result<Channel, RulesError>
     };
     let found = Channel::ALL.into_iter().find(|channel| Some(channel.number()) == number);
     found.ok_or_else(|| {
-        source.fault(&from.span(), "from", "a channel is 1 or 2; \"can0\" is channel 1, \"can1\" is channel 2")
+        source.fault(
+            &from.span(),
+            "from",
+            "a channel is 1 or 2; \"can0\" is channel 1, \"can1\" is channel 2",
+        )
     })
 }
 
@@ -226,10 +241,18 @@ fn pass(source: &Source, entry: &Entry, filter: &Filter) -> Result<Pass, RulesEr
             let field = format!("{name}.id");
             let pattern = source.value(&field, text, str::parse::<IdPattern>)?;
             let [one] = pattern.filters() else {
-                return Err(source.fault(&text.span(), &field, "write one identifier, with ? for a digit that stays"));
+                return Err(source.fault(
+                    &text.span(),
+                    &field,
+                    "write one identifier, with ? for a digit that stays",
+                ));
             };
             if one.mask & EXTENDED == 0 || one.inverse || text.get_ref().contains(['-', 'p', 'P']) {
-                return Err(source.fault(&text.span(), &field, "write one identifier, with ? for a digit that stays"));
+                return Err(source.fault(
+                    &text.span(),
+                    &field,
+                    "write one identifier, with ? for a digit that stays",
+                ));
             }
             let mut given = one.mask & Id::MAX_EXTENDED;
             if step == 3 {
@@ -241,7 +264,8 @@ fn pass(source: &Source, entry: &Entry, filter: &Filter) -> Result<Pass, RulesEr
         }
         if let Some(value) = &change.dlc {
             let code = u8::try_from(*value.get_ref()).ok().filter(|code| *code <= 15);
-            let code = code.ok_or_else(|| source.fault(&value.span(), &format!("{name}.dlc"), "a DLC is 0 to 15"))?;
+            let code =
+                code.ok_or_else(|| source.fault(&value.span(), &format!("{name}.dlc"), "a DLC is 0 to 15"))?;
             dlc = dlc.then(step, 15, code);
         }
         if let Some(text) = &change.data {
@@ -258,7 +282,11 @@ fn pass(source: &Source, entry: &Entry, filter: &Filter) -> Result<Pass, RulesEr
     for (text, field, modifier) in modifiers.into_iter().flatten() {
         let modifier = modifier?;
         if !modifier.fits(8) {
-            return Err(source.fault(&text.span(), field, "a frame has bytes 0 to 7, and a byte bits 0 to 7"));
+            return Err(source.fault(
+                &text.span(),
+                field,
+                "a frame has bytes 0 to 7, and a byte bits 0 to 7",
+            ));
         }
         // It counts from zero: without this, from what is received.
         if let Modifier::Counter { byte, low_bit, bits } = modifier {

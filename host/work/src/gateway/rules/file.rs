@@ -6,6 +6,7 @@ use std::time::Duration;
 use cantap::Channel;
 use cantap::wire::Id;
 use cantap::wire::message::{Filter, FrameKind, GatewayRule, Modifier, Pass};
+use cantap_trace::clean;
 use cantap_trace::filter::{EXTENDED, IdFilter, REMOTE};
 use cantap_trace::grammar::{self, IdPattern};
 use serde::Deserialize;
@@ -157,7 +158,7 @@ fn rule(source: &Source, span: &Range<usize>, entry: &Entry) -> Result<Rule, Rul
         })
         .collect::<Result<_, _>>()?;
     let filter = entry.filter.as_ref().map_or("all", |filter| filter.get_ref());
-    let name = entry.name.clone().unwrap_or_else(|| filter.to_owned());
+    let name = clean::line(entry.name.as_deref().unwrap_or(filter)).into_owned();
     Ok(Rule { name, line: source.line(span.start), from, parts, period, delay })
 }
 

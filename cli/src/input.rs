@@ -37,6 +37,9 @@ pub struct ReadArgs {
     /// The time zone of dates in files that do not name one, such as ASC, TRC and BLF: Europe/Berlin, +02:00.
     #[arg(long, value_name = "ZONE", default_value_t)]
     pub zone: Zone,
+    /// What [`Self::format`] is called on the command line.
+    #[arg(skip = "--from")]
+    pub format_option: &'static str,
 }
 
 /// The same for a command that shows a trace while it grows.
@@ -140,7 +143,8 @@ impl ReadArgs {
         if let Some(named) = reader.named_otherwise() {
             let (name, format) = (path.display(), reader.format());
             eprintln!(
-                "cantap: note: {name} is read as {format}, which its content is, and not as {named}; --from overrides"
+                "cantap: note: {name} is read as {format}, which its content is, and not as {named}; {} overrides",
+                self.format_option
             );
         }
         if follow {

@@ -182,8 +182,14 @@ struct Merged<'a> {
 impl<'a> Merged<'a> {
     fn open(args: &Args, alignments: Vec<Alignment>, offsets: &'a [u8]) -> anyhow::Result<Self> {
         let zone = args.write.zone.clone();
-        let read =
-            ReadArgs { format: args.from, columns: None, strict: args.strict, filter: Vec::new(), zone };
+        let read = ReadArgs {
+            format: args.from,
+            columns: None,
+            strict: args.strict,
+            filter: Vec::new(),
+            zone,
+            format_option: "--from",
+        };
         let sources =
             args.traces.iter().map(|path| read.open(path, Vec::new())).collect::<anyhow::Result<Vec<_>>>()?;
         let others = alignments

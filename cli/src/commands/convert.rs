@@ -192,8 +192,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let filter = args.filters.iter().chain(&args.filter_options).cloned().collect();
     let zone = args.write.zone.clone();
-    let read =
-        ReadArgs { format: args.from, columns: args.columns.clone(), strict: args.strict, filter, zone };
+    let read = ReadArgs {
+        format: args.from,
+        columns: args.columns.clone(),
+        strict: args.strict,
+        filter,
+        zone,
+        format_option: "--from",
+    };
     let read = FollowArgs { read, follow: args.follow };
     let filters = read.filters(&args.databases.load(false, true)?)?;
     let mut records = read.open(&args.input, filters)?;

@@ -26,7 +26,22 @@ const TOPICS: [(&str, &str, &str); 4] = [
 const GROUPS: [(&str, &[&str]); 7] = [
     ("Look at a bus or a trace", &["monitor", "ui", "stats", "autobaud"]),
     ("Record, convert", &["capture", "convert", "align"]),
-    ("Understand", &["decode", "search", "conversations", "plot", "report", "diff", "db", "bits", "timing"]),
+    (
+        "Understand",
+        &[
+            "decode",
+            "search",
+            "conversations",
+            "plot",
+            "report",
+            "diff",
+            "delay",
+            "gateway",
+            "db",
+            "bits",
+            "timing",
+        ],
+    ),
     ("Send, ask", &["send", "replay", "gen", "run", "twin", "obd", "uds", "canopen", "j1939"]),
     (
         "Devices",

@@ -15,9 +15,11 @@ pub mod convert;
 pub mod db;
 pub mod decode;
 pub mod defaults;
+pub mod delay;
 pub mod diff;
 pub mod doctor;
 pub mod extcap;
+pub mod gateway;
 pub mod r#gen;
 pub mod help;
 pub mod info;
@@ -65,6 +67,10 @@ pub enum Command {
     Convert(convert::Args),
     /// Compare two traces: IDs, periods, lengths, bits.
     Diff(diff::Args),
+    /// Measure how long a gateway takes, from a trace of both its buses: delays, missing and extra frames.
+    Delay(Box<delay::Args>),
+    /// Try a gateway's rules on a trace: what would be passed on, changed, dropped.
+    Gateway(Box<gateway::Args>),
     /// Put traces of several recorders on one clock, using the frames that they have in common.
     Align(align::Args),
     /// Find frames in a trace by ID, data or a condition on signals.
@@ -152,6 +158,8 @@ impl Command {
             Self::Stats(args) => stats::run(&args),
             Self::Convert(args) => convert::run(&args),
             Self::Diff(args) => diff::run(&args),
+            Self::Delay(args) => delay::run(*args),
+            Self::Gateway(args) => gateway::run(&args),
             Self::Align(args) => align::run(&args),
             Self::Search(args) => search::run(&args),
             Self::Timing(args) => timing::run(&args),

@@ -43,6 +43,10 @@ pub fn directory(test: &str) -> PathBuf {
         "log(1); fn test_a() { send(\"123#\"); wait(\"5ms\"); } fn test_b() { fail(\"no\"); }",
     )
     .unwrap();
+    let both = "(1.000000) can0 123#11\n(1.000300) can1 123#11\n(1.100000) can0 123#22\n(1.200000) can1 124#22\n(2.000000) can0 7FF#\n";
+    fs::write(directory.join("both.log"), both).unwrap();
+    fs::write(directory.join("rules.toml"), "[[rule]]\nfrom = 1\nfilter = \"123\"\nset.data = \"?1\"\n")
+        .unwrap();
     fs::write(directory.join("car.dbc"), database).unwrap();
     fs::write(directory.join("odd.dbc"), database.replace("8|8@1-", "8|99@1-")).unwrap();
     directory
@@ -97,6 +101,9 @@ pub const LINES: &[(&str, i32, &[&str])] = &[
     ("bits 123##01122", 0, &["bits"]),
     ("convert a.log out.csv", 0, &["convert"]),
     ("convert a.asc out.log", 0, &["convert"]),
+    ("delay both.log --from 1 --to 2", 0, &["delay"]),
+    ("delay both.log --from 1 --to 2 --map rules.toml --check", 3, &["delay"]),
+    ("gateway rules.toml --dry-run both.log", 0, &["gateway"]),
     ("align b.log b.log", 0, &["align"]),
     ("compare-adapters -d candump:b.log -d candump:b.log -b 500k -t 2s", 0, &["compare-adapters"]),
     ("decode a.log --db car.dbc", 0, &["decode", "decode_end"]),

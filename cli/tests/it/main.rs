@@ -36,6 +36,7 @@ mod extcap;
 mod fake_device;
 mod firmware;
 mod follow;
+mod gateway;
 mod help;
 mod json_schema;
 mod mcap;

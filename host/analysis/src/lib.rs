@@ -1,11 +1,12 @@
 #![doc = include_str!("../README.md")]
 //!
-//! [`stats`] measures, [`align`] puts several recorders on one clock, `plot` draws.
+//! [`stats`] measures, [`delay`] measures gateways, [`align`] puts several recorders on one clock, `plot` draws.
 
 #![forbid(unsafe_code)]
 
 pub mod align;
 mod cadence;
+pub mod delay;
 #[cfg(feature = "plot")]
 pub mod plot;
 pub mod stats;

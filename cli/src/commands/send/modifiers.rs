@@ -1,6 +1,7 @@
 //! What changes in a periodic frame each time: counters, random bytes, checksums.
 
-use cantap::wire::message::{Checksum, MAX_MODIFIERS, Modifier};
+use cantap::wire::message::{MAX_MODIFIERS, Modifier};
+use cantap_work::gateway::{checksum, counter};
 
 use crate::usage_error::usage;
 
@@ -35,27 +36,4 @@ impl ModifierArgs {
         }
         Ok(list)
     }
-}
-
-fn counter(text: &str) -> Result<Modifier, String> {
-    let wrong = || "write a counter as BYTE or BYTE.LOWBIT:BITS, such as 7 or 7.0:4".to_owned();
-    let number = |text: &str| text.parse::<u8>().map_err(|_| wrong());
-    let Some((byte, bits)) = text.split_once('.') else {
-        return Ok(Modifier::Counter { byte: number(text)?, low_bit: 0, bits: 8 });
-    };
-    let (low_bit, bits) = bits.split_once(':').ok_or_else(wrong)?;
-    Ok(Modifier::Counter { byte: number(byte)?, low_bit: number(low_bit)?, bits: number(bits)? })
-}
-
-fn checksum(text: &str) -> Result<Modifier, String> {
-    let parts = text.split_once(':').and_then(|(byte, kind)| {
-        let algorithm = match kind {
-            "xor" => Checksum::Xor,
-            "sum" => Checksum::Sum,
-            "crc8" => Checksum::Crc8J1850,
-            _ => return None,
-        };
-        Some(Modifier::Checksum { byte: byte.parse().ok()?, algorithm })
-    });
-    parts.ok_or_else(|| "write a checksum as BYTE:xor, BYTE:sum or BYTE:crc8".to_owned())
 }

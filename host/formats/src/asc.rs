@@ -220,6 +220,42 @@ mod tests {
         );
     }
 
+    /// As the converters for CANedge loggers write CAN FD frames: among the classical ones, with decimal codes of the length.
+    #[test]
+    fn fd_frames_with_codes_among_classical_ones_are_read() {
+        let bytes = |count: usize| " 5A".repeat(count);
+        let lines: String =
+            [(9, 8), (9, 12), (10, 16), (11, 20), (12, 24), (13, 32), (14, 20), (14, 48), (15, 64)]
+                .map(|(code, count)| format!("1.0 1 123 Rx d {code}{}\n", bytes(count)))
+                .concat();
+        let (log, issues) = as_log(&lines);
+        assert_eq!(issues, Vec::<String>::new());
+        let lengths: Vec<_> =
+            log.lines().map(|line| (line.contains("##0"), line.matches("5A").count())).collect();
+        let fd = [12, 16, 20, 24, 32, 20, 48, 64].map(|count| (true, count));
+        assert_eq!(lengths, [&[(false, 8)], &fd[..]].concat());
+        // Eight of twelve bytes look like a classical frame's.
+        for line in [format!("1.0 1 123 Rx d 9{}", bytes(8)), format!("1.0 1 123 Rx d 14{}", bytes(20))] {
+            let (log, issues) = as_log(&line);
+            assert_eq!((log.as_str(), issues.len()), ("", 1), "{line}");
+        }
+        let (log, issues) = as_log(&format!("1.0 1 123 Rx d 11{}\n", bytes(19)));
+        assert_eq!((log.as_str(), issues.len()), ("", 1));
+    }
+
+    #[test]
+    fn identifiers_with_0x_and_directions_in_capitals_are_read() {
+        let (log, issues) = as_log(
+            "1.0 1 0x123 RX d 1 11\n1.0 1 0x18FEF100x TX d 1 22\n1.0 CANFD 1 RX 0x123 0 0 1 1 33\n1.0 1 0x Rx d 0\n",
+        );
+        assert_eq!(
+            log,
+            "(1506783974.191000) can0 123#11\n(1506783974.191000) can0 18FEF100#22 T\n\
+             (1506783974.191000) can0 123##033\n(1506783974.191000) can0 00000000#\n"
+        );
+        assert_eq!(issues, Vec::<String>::new());
+    }
+
     #[test]
     fn lines_are_what_other_programs_read() {
         let (records, _) = tests::read(

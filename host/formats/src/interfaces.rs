@@ -1,7 +1,7 @@
 //! Interface names (`can0`, `vcan1`, `OBD`) as channel numbers.
 
-/// Remembers the channel of each interface name in a file. `can0` is channel 1, as users count; a
-/// name without a number, or with a number already used by another name, gets the next free one.
+/// Remembers the channel of each interface name in a file. `can0` is channel 1, as users count, and so is `CAN 1`, as programs
+/// that count so write it; a name without a number, or with a number already used by another name, gets the next free one.
 #[derive(Default)]
 pub(crate) struct Interfaces {
     known: Vec<(Vec<u8>, u8)>,
@@ -34,7 +34,10 @@ impl Interfaces {
         }
         let digits = name.iter().rev().take_while(|byte| byte.is_ascii_digit()).count();
         let number = super::text::decimal(&name[name.len() - digits..]);
-        let wanted = number.and_then(|number| u8::try_from(number.saturating_add(1)).ok());
+        let counts_from_1 = name[..name.len() - digits].ends_with(b" ");
+        let wanted =
+            number.and_then(|number| u8::try_from(number.saturating_add(u64::from(!counts_from_1))).ok());
+        let wanted = wanted.filter(|channel| *channel > 0);
         let taken = |channel: u8| self.known.iter().any(|(_, known)| *known == channel);
         let channel = wanted
             .filter(|channel| !taken(*channel))
@@ -56,6 +59,10 @@ mod tests {
         for (name, channel) in
             [("can0", 1), ("can1", 2), ("vcan1", 3), ("OBD", 4), ("can7", 8), ("can300", 5), ("can0", 1)]
         {
+            assert_eq!(interfaces.channel(name.as_bytes()), channel, "{name}");
+        }
+        let mut interfaces = Interfaces::default();
+        for (name, channel) in [("CAN 2", 2), ("CAN 1", 1), ("CAN 0", 3)] {
             assert_eq!(interfaces.channel(name.as_bytes()), channel, "{name}");
         }
         for extra in 0..1000 {

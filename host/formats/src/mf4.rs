@@ -5,6 +5,7 @@
 //! block or in lists, compressed by deflate, zstd or LZ4, transposed or not; bytes inside or outside the records; times in another group (the columns
 //! of 4.2); and unfinished files. Measured signals are counted.
 
+mod apart;
 mod blocks;
 mod channel;
 mod clock;
@@ -16,6 +17,7 @@ mod field;
 mod formula;
 mod joined;
 mod layout;
+mod order;
 mod part;
 mod plain;
 mod record;

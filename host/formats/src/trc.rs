@@ -187,6 +187,39 @@ mod tests {
         Some(kept)
     }
 
+    /// As programs without a clock write it: times run from 0 and not from 1899.
+    #[test]
+    fn a_start_of_0_is_no_date() {
+        let rows = "      1)         5.0  Rx         0120  1  11\r\n";
+        let first = |head: &str| {
+            let (records, issues) =
+                tests::read(Format::Trc(TrcVersion::V1_1), format!(";$FILEVERSION=1.1\r\n{head}{rows}"));
+            assert_eq!(issues, Vec::<String>::new());
+            records[0].time_ns
+        };
+        assert_eq!(first(";$STARTTIME=0\r\n"), 5_000_000);
+        assert_eq!(first(";$STARTTIME=0.0000000000\r\n"), 5_000_000);
+        assert_eq!(first(";$STARTTIME=25569\r\n"), 5_000_000);
+    }
+
+    /// A part of a file, as it is copied into a report of a fault.
+    #[test]
+    fn rows_without_a_header_show_their_version() {
+        let rows = [
+            ("     1)      1841  0123  2  11 22", "(1.841000) can0 123#1122\n"),
+            ("     1)      1841.0  Tx     0123  2  11 22", "(1.841000) can0 123#1122 T\n"),
+            ("     1)      1841.000 2  Rx     0123  2  11 22", "(1.841000) can1 123#1122\n"),
+            ("     1)      1841.000 2  Rx     0123  -  2  11 22", "(1.841000) can1 123#1122\n"),
+            ("      1      1841.000 DT     0123 Tx 2  11 22", "(1.841000) can0 123#1122 T\n"),
+            ("      1      1841.000 DT 2      0123 Rx -  2  11 22", "(1.841000) can1 123#1122\n"),
+        ];
+        for (row, expected) in rows {
+            let (records, issues) = tests::read(Format::Trc(TrcVersion::V2_1), format!("{row}\r\n"));
+            assert_eq!(issues, Vec::<String>::new(), "{row}");
+            assert_eq!(tests::write(Format::Candump, &records), expected, "{row}");
+        }
+    }
+
     proptest! {
         #[test]
         fn any_trace_round_trips_as_far_as_the_version_carries(

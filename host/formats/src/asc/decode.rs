@@ -165,11 +165,10 @@ impl Decoder {
         }
         let Some((raw, extended)) = self.identifier(id) else { return others::on_channel(id) };
         let (word, rest) = text::word(rest);
-        let direction = match word {
-            b"Rx" => Direction::Rx,
-            b"Tx" => Direction::Tx,
-            b"TxRq" => return Ok(OnChannel::Request),
-            _ => {
+        let direction = match direction(word) {
+            Some(direction) => direction,
+            None if word == b"TxRq" => return Ok(OnChannel::Request),
+            None => {
                 let marker = others::like_a_frame(rest).map(OnChannel::LeftOut);
                 return marker.ok_or_else(|| Fault::malformed("'Rx' or 'Tx' after the identifier", word));
             }
@@ -199,14 +198,27 @@ impl Decoder {
         Ok(OnChannel::Event(TraceEvent::Frame { frame: frame.into(), direction, late: false }))
     }
 
-    /// A CAN FD frame among the classical ones, as earlier versions of python-can wrote it: with its number of bytes, two digits, in
-    /// place of the length code.
+    /// A CAN FD frame among the classical ones: with its number of bytes, two digits, in place of the length code, as earlier
+    /// versions of python-can wrote it, or with a decimal code, as the converters for CANedge loggers do. The bytes themselves
+    /// show which.
     #[inline]
     fn long(&self, id: Id, len: &[u8], columns: &[u8]) -> Option<TraceFrame> {
-        if len.len() != 2 {
-            return None;
-        }
-        let len = if self.decimal { text::decimal(len)? } else { u64::from(text::hex(len)?) } as usize;
+        let bytes = match len {
+            [_, _] if !self.decimal => text::hex(len).map(u64::from),
+            [_, _] => text::decimal(len),
+            _ => None,
+        };
+        let code = match len {
+            [digit] => text::hex_digit(*digit).map(u64::from),
+            _ => text::decimal(len),
+        };
+        let by_code = code.and_then(|code| FD_LENGTHS.get(code as usize)).map(|len| usize::from(*len));
+        let lengths = [bytes.map(|len| len as usize), by_code];
+        lengths.into_iter().flatten().find_map(|len| self.long_of(id, len, columns))
+    }
+
+    /// A CAN FD frame of exactly `len` bytes, more than a classical frame has.
+    fn long_of(&self, id: Id, len: usize, columns: &[u8]) -> Option<TraceFrame> {
         let mut words = columns.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
         let mut data = [0; FD_MAX_BYTES];
         for slot in data.get_mut(..len).filter(|data| data.len() > 8)? {
@@ -223,7 +235,8 @@ impl Decoder {
     fn may_be_cut(&self, line: &[u8], record: &TraceRecord) -> bool {
         match record.frame() {
             Some(frame) if frame.is_remote() => matches!(line.last(), Some(b'r' | b'R')),
-            Some(_) => self.decimal || memchr::memmem::find(line, b"CANFD").is_some(),
+            // What is left of a longer frame's bytes may be as many as another reading of its length asks for.
+            Some(frame) => self.decimal || frame.dlc() > 8 || memchr::memmem::find(line, b"CANFD").is_some(),
             None => true,
         }
     }
@@ -232,11 +245,11 @@ impl Decoder {
     fn flexible(&self, rest: &[u8]) -> Result<OnChannel, Fault> {
         let mut words = rest.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
         let mut next = || words.next().unwrap_or_default();
-        let direction = match next() {
-            b"Rx" => Direction::Rx,
-            b"Tx" => Direction::Tx,
-            b"TxRq" => return Ok(OnChannel::Request),
-            other => return Err(Fault::malformed("'Rx' or 'Tx' after the channel", other)),
+        let word = next();
+        let direction = match direction(word) {
+            Some(direction) => direction,
+            None if word == b"TxRq" => return Ok(OnChannel::Request),
+            None => return Err(Fault::malformed("'Rx' or 'Tx' after the channel", word)),
         };
         let word = next();
         if word.eq_ignore_ascii_case(b"ErrorFrame") {
@@ -308,7 +321,11 @@ impl Decoder {
             [digits @ .., b'x' | b'X'] => (digits, true),
             _ => (word, false),
         };
-        let raw = if self.decimal { u32::try_from(text::decimal(digits)?).ok()? } else { text::hex(digits)? };
+        let raw = match digits.strip_prefix(b"0x") {
+            Some(digits) => text::hex(digits)?,
+            None if self.decimal => u32::try_from(text::decimal(digits)?).ok()?,
+            None => text::hex(digits)?,
+        };
         Some((raw, extended))
     }
 
@@ -355,6 +372,16 @@ impl Decoder {
 #[inline]
 fn channel(word: &[u8]) -> Option<u8> {
     text::decimal(word).and_then(|channel| u8::try_from(channel).ok())
+}
+
+/// Vector writes `Rx` and `Tx`; other programs write `RX` and `TX`, too.
+#[inline]
+fn direction(word: &[u8]) -> Option<Direction> {
+    match word {
+        b"Rx" | b"RX" | b"rx" => Some(Direction::Rx),
+        b"Tx" | b"TX" | b"tx" => Some(Direction::Tx),
+        _ => None,
+    }
 }
 
 /// The event for what follows `ErrorFrame`.

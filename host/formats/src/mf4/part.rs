@@ -1,6 +1,6 @@
 //! One stream of records in an MF4 file: those of one group, or of several in turn.
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{HashMap, VecDeque};
 use std::io;
 
 use cantap_trace::{PlainFrame, TraceRecord};
@@ -8,10 +8,12 @@ use cantap_trace::{PlainFrame, TraceRecord};
 use super::super::codec::PLAIN_BATCH;
 use super::super::issue::Fault;
 use super::super::whole::Whole;
+use super::apart::{Values, has_arrived};
 use super::blocks::{BLOCK_HEAD_BYTES, Block, u32_at};
 use super::channel::Row;
 use super::joined::joined;
-use super::layout::{Alone, Apart, Content, Elsewhere, Group, RecordBytes, Times};
+use super::layout::{Alone, Content, Group, RecordBytes, Times};
+use super::order::Order;
 use super::plain::Plain;
 use super::stream::Stream;
 
@@ -24,7 +26,7 @@ const OPEN_PLACES: u16 = 0x40;
 
 /// Limit for records waiting for their bytes and bytes waiting for their records: if they are farther apart,
 /// the file is damaged.
-const MAX_APART: usize = 1 << 16;
+pub(super) const MAX_APART: usize = 1 << 16;
 
 /// Longest value of a variable-length record; a frame has 64 bytes.
 const MAX_VALUE_BYTES: usize = 1 << 20;
@@ -76,6 +78,10 @@ pub(super) struct Part {
     pub time_ns: i64,
     pub next: Option<Item>,
     ended: bool,
+    /// The group of the last record.
+    group: usize,
+    /// If frames of several groups follow each other: what was read ahead.
+    order: Option<Order>,
 }
 
 /// A record whose values may be elsewhere.
@@ -86,17 +92,6 @@ struct Waiting {
     record: Vec<u8>,
     /// Where it is in the stream.
     at: u64,
-}
-
-/// Values by their position in the stream of all values of their group.
-#[derive(Default)]
-struct Values {
-    kept: BTreeMap<u64, Vec<u8>>,
-    /// The position of the next one.
-    end: u64,
-    /// If positions were not written: how many values came, and how many were requested.
-    came: u64,
-    asked: u64,
 }
 
 /// The system's errors end the reading; others are reported.
@@ -150,6 +145,8 @@ impl Part {
             Content::Other(_) | Content::Values | Content::Signals | Content::Times => None,
         });
         let plain = plain.collect();
+        let buses = groups.iter().filter(|group| matches!(group.content, Content::Bus(_))).count();
+        let order = (buses > 1).then(|| Order::of(groups.len()));
         let is_counted = open & OPEN_COUNTERS == 0;
         let records = if is_sorted && is_counted { groups[0].records } else { u64::MAX };
         let part = Self {
@@ -174,11 +171,25 @@ impl Part {
             time_ns: start_ns,
             next: None,
             ended: false,
+            group: 0,
+            order,
         };
         Ok((Some(part), signals, faults))
     }
 
+    /// What comes next, in the order of time.
     pub fn advance(&mut self, file: &mut Whole) -> io::Result<Option<Item>> {
+        let Some(mut order) = self.order.take() else { return self.read(file) };
+        while order.needs_more() {
+            order.put(self.read(file)?, self.group);
+        }
+        let first = order.pop();
+        self.order = Some(order);
+        Ok(first)
+    }
+
+    /// What comes next in the file.
+    fn read(&mut self, file: &mut Whole) -> io::Result<Option<Item>> {
         match self.step(file) {
             Ok(item) => Ok(item),
             Err(fault) => {
@@ -229,6 +240,7 @@ impl Part {
                     };
                     self.at += len as u64;
                     self.counts[group] += 1;
+                    self.group = group;
                     let row = Row { record, number, apart: &[], invalid: &[] };
                     return Ok(Some(Item::of(bus.record(&row, record, self.start_ns), place)));
                 }
@@ -260,7 +272,7 @@ impl Part {
 
     /// Appends the plain frames that follow and are at hand, as long as it is their turn; what comes then is for [`Self::advance`].
     pub fn plain_frames(&mut self, frames: &mut Vec<PlainFrame>, is_next: impl Fn(i64) -> bool) {
-        if self.ended || !self.waiting.is_empty() {
+        if self.ended || self.order.is_some() || !self.waiting.is_empty() {
             return;
         }
         let room = PLAIN_BATCH.saturating_sub(frames.len());
@@ -388,6 +400,7 @@ impl Part {
                 continue;
             }
             let Some(waiting) = self.waiting.pop_front() else { return Ok(None) };
+            self.group = group;
             let mut apart = Vec::with_capacity(bus.apart.len());
             for values in &mut bus.apart {
                 apart.push(values.take(file, &mut self.values, &waiting.record, self.by_order)?);
@@ -424,68 +437,5 @@ impl Part {
         let time = time.as_deref().unwrap_or(record);
         let row = Row { record, number: *number, apart, invalid };
         Ok(Item::of(bus.record(&row, time, self.start_ns), *at))
-    }
-}
-
-/// Whether all values of a record that are in other groups have been read.
-fn has_arrived(
-    apart: &[Apart],
-    values: &HashMap<u64, Values>,
-    record: &[u8],
-    by_order: bool,
-) -> Result<bool, Fault> {
-    for Apart { place, values: at } in apart {
-        let Elsewhere::Group(address) = at else { continue };
-        let Some(values) = values.get(address) else {
-            return Err(Fault::malformed("the group that has the bytes of frames", b"none"));
-        };
-        if !values.has(place.unsigned(record).unwrap_or(u64::MAX), by_order) {
-            return Ok(false);
-        }
-    }
-    Ok(true)
-}
-
-impl Apart {
-    /// The value of a record, which has arrived.
-    fn take(
-        &mut self,
-        file: &mut Whole,
-        values: &mut HashMap<u64, Values>,
-        record: &[u8],
-        by_order: bool,
-    ) -> Result<Vec<u8>, Fault> {
-        let at = self.place.unsigned(record).unwrap_or(u64::MAX);
-        let value = match &mut self.values {
-            Elsewhere::Stream(stream) => {
-                let len = stream.at(file, at, 4)?.map_or(0, |head| u32_at(head, 0));
-                stream.at(file, at.saturating_add(4), len as usize)?.map(<[u8]>::to_vec)
-            }
-            Elsewhere::Group(address) => values.get_mut(address).and_then(|values| values.take(at, by_order)),
-        };
-        Ok(value.unwrap_or_default())
-    }
-}
-
-impl Values {
-    fn keep(&mut self, value: Vec<u8>, by_order: bool) {
-        let place = if by_order { self.came } else { self.end };
-        self.came += 1;
-        self.end += 4 + value.len() as u64;
-        self.kept.insert(place, value);
-        if self.kept.len() > MAX_APART {
-            self.kept.pop_first();
-        }
-    }
-
-    fn has(&self, place: u64, by_order: bool) -> bool {
-        self.kept.contains_key(&if by_order { self.asked } else { place })
-    }
-
-    fn take(&mut self, place: u64, by_order: bool) -> Option<Vec<u8>> {
-        let place = if by_order { self.asked } else { place };
-        let value = self.kept.remove(&place)?;
-        self.asked += 1;
-        Some(value)
     }
 }

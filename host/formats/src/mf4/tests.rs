@@ -314,6 +314,37 @@ fn bytes_in_records_of_another_group_are_found_before_and_behind_also_by_their_o
     }
 }
 
+/// As CANedge loggers write them: what was sent stands behind the response to it. Each group is in order, and so is what is read.
+#[test]
+fn records_of_several_groups_in_one_stream_come_in_the_order_of_time() {
+    let (mut blocks, received, bytes) = begin();
+    let link = |blocks: &Blocks, at: usize| {
+        u64::from_le_bytes(blocks.0[received as usize + 24 + at * 8..][..8].try_into().unwrap())
+    };
+    let values = group(&mut blocks, 2, 1, 0, [0; 3]);
+    let of_sent = [values, link(&blocks, 1), link(&blocks, 3)];
+    let sent = group(&mut blocks, 3, 0, RECORD_BYTES as u32, of_sent);
+    blocks.0[received as usize + 24..][..8].copy_from_slice(&sent.to_le_bytes());
+    blocks.0[bytes + LINK_TO_DATA..][..8].copy_from_slice(&values.to_le_bytes());
+    // Every tenth is sent, and comes four frames late.
+    let is_sent = |at: usize| at % 10 == 0;
+    let mut order: Vec<usize> = (0..100).collect();
+    order.sort_by_key(|at| if is_sent(*at) { at * 2 + 9 } else { at * 2 });
+    assert_eq!(order[..6], [1, 2, 3, 4, 0, 5]);
+    let (mut data, mut place) = (Vec::new(), 0);
+    for at in order {
+        let (id, value) = &records()[at];
+        data.push(if is_sent(at) { 3 } else { 1 });
+        data.extend(record(at, *id, value.len(), place));
+        data.extend([&[2][..], &(value.len() as u32).to_le_bytes(), value].concat());
+        place += 4 + value.len() as u64;
+    }
+    let data_at = blocks.0.len() as u64 + 24 + 32 + 8;
+    let mut file = finish(blocks, received, data_at, 1, 5);
+    file.extend([&b"##DT\0\0\0\0"[..], &24_u64.to_le_bytes(), &[0; 8], &data].concat());
+    assert_eq!(as_log(&file), (log(), Vec::new()));
+}
+
 /// Found by random damage: a cut after the version's first digits crashed the program.
 #[test]
 fn a_file_cut_in_its_first_bytes_is_named() {

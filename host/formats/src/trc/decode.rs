@@ -27,6 +27,8 @@ pub(crate) struct Decoder {
     version: TrcVersion,
     start_ns: i64,
     has_start: bool,
+    /// The header names the version or the columns.
+    has_layout: bool,
     has_rows: bool,
     layout: Layout,
     /// The row before gave an event exactly; the format's own row for it follows.
@@ -102,6 +104,7 @@ impl Default for Decoder {
             version,
             start_ns: 0,
             has_start: false,
+            has_layout: false,
             has_rows: false,
             layout: Layout::of(version),
             told: None,
@@ -175,14 +178,19 @@ impl Decoder {
                 other => return Err(Fault::malformed("a version from 1.0 to 2.1", other)),
             };
             self.layout = Layout::of(self.version);
+            self.has_layout = true;
         } else if let Some(days) = value(b"$STARTTIME=") {
             let start_ns = time_of_days(days)
                 .ok_or_else(|| Fault::malformed("days since 1899-12-30, such as 44548.6028595139", days))?;
-            self.start_ns = self.zone.utc_ns(start_ns);
-            self.has_start = true;
+            // Programs without a clock write 0.
+            if start_ns != -EPOCH_DAY * NS_PER_DAY {
+                self.start_ns = self.zone.utc_ns(start_ns);
+                self.has_start = true;
+            }
         } else if let Some(names) = value(b"$COLUMNS=") {
             self.layout = Layout::named(names)
                 .ok_or_else(|| Fault::malformed("column names such as N,O,T,B,I,d,R,L,D", names))?;
+            self.has_layout = true;
         } else if let Some(start) = line.trim_ascii().strip_prefix(b"Start time:")
             && !self.has_start
             && let Some(start_ns) = date(start.trim_ascii())
@@ -193,6 +201,10 @@ impl Decoder {
     }
 
     fn row(&mut self, row: &[u8]) -> Result<Row, Fault> {
+        if !self.has_rows && !self.has_layout {
+            self.version = version_of_row(row);
+            self.layout = Layout::of(self.version);
+        }
         self.has_rows = true;
         let mut columns: [&[u8]; MAX_COLUMNS] = [b""; MAX_COLUMNS];
         let mut rest = row;
@@ -391,6 +403,27 @@ fn identifier(digits: &[u8]) -> Result<Id, Fault> {
         _ => raw.and_then(Id::extended),
     };
     id.ok_or_else(|| Fault::malformed("an identifier of 4 digits up to 07FF or 8 up to 1FFFFFFF", digits))
+}
+
+/// The version that a row without a header has: version 1.0 has none, and what others wrote may have been cut out of a file.
+fn version_of_row(row: &[u8]) -> TrcVersion {
+    let mut rest = row;
+    let columns: [&[u8]; 6] = std::array::from_fn(|_| {
+        let (word, behind) = text::word(rest);
+        rest = behind;
+        word
+    });
+    let is_v1 = |kind: &[u8]| matches!(kind, b"Rx" | b"Tx" | b"Warng" | b"Error");
+    match columns {
+        [_, _, kind, ..] if is_v1(kind) => TrcVersion::V1_1,
+        [_, _, _, kind, _, b"-"] if is_v1(kind) => TrcVersion::V1_3,
+        [_, _, _, kind, ..] if is_v1(kind) => TrcVersion::V1_2,
+        [_, _, b"DT" | b"RR" | b"FD" | b"FB" | b"FE" | b"BI" | b"ST" | b"ER" | b"EC" | b"EV", bus, ..] => {
+            // Identifiers have at least four digits.
+            if bus.len() < 4 && text::decimal(bus).is_some() { TrcVersion::V2_1 } else { TrcVersion::V2_0 }
+        }
+        _ => TrcVersion::V1_0,
+    }
 }
 
 /// Days since 1899-12-30 as nanoseconds since the Unix epoch, to a microsecond, which is as exact as the

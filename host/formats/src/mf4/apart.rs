@@ -1,0 +1,83 @@
+//! Values of records that are not in the records themselves.
+
+use std::collections::{BTreeMap, HashMap};
+
+use super::super::issue::Fault;
+use super::super::whole::Whole;
+use super::blocks::u32_at;
+use super::layout::{Apart, Elsewhere};
+use super::part::MAX_APART;
+
+/// Values by their position in the stream of all values of their group.
+#[derive(Default)]
+pub(super) struct Values {
+    kept: BTreeMap<u64, Vec<u8>>,
+    /// The position of the next one.
+    end: u64,
+    /// If positions were not written: how many values came, and how many were requested.
+    came: u64,
+    asked: u64,
+}
+
+/// Whether all values of a record that are in other groups have been read.
+pub(super) fn has_arrived(
+    apart: &[Apart],
+    values: &HashMap<u64, Values>,
+    record: &[u8],
+    by_order: bool,
+) -> Result<bool, Fault> {
+    for Apart { place, values: at } in apart {
+        let Elsewhere::Group(address) = at else { continue };
+        let Some(values) = values.get(address) else {
+            return Err(Fault::malformed("the group that has the bytes of frames", b"none"));
+        };
+        if !values.has(place.unsigned(record).unwrap_or(u64::MAX), by_order) {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
+impl Apart {
+    /// The value of a record, which has arrived.
+    pub(super) fn take(
+        &mut self,
+        file: &mut Whole,
+        values: &mut HashMap<u64, Values>,
+        record: &[u8],
+        by_order: bool,
+    ) -> Result<Vec<u8>, Fault> {
+        let at = self.place.unsigned(record).unwrap_or(u64::MAX);
+        let value = match &mut self.values {
+            Elsewhere::Stream(stream) => {
+                let len = stream.at(file, at, 4)?.map_or(0, |head| u32_at(head, 0));
+                stream.at(file, at.saturating_add(4), len as usize)?.map(<[u8]>::to_vec)
+            }
+            Elsewhere::Group(address) => values.get_mut(address).and_then(|values| values.take(at, by_order)),
+        };
+        Ok(value.unwrap_or_default())
+    }
+}
+
+impl Values {
+    pub(super) fn keep(&mut self, value: Vec<u8>, by_order: bool) {
+        let place = if by_order { self.came } else { self.end };
+        self.came += 1;
+        self.end += 4 + value.len() as u64;
+        self.kept.insert(place, value);
+        if self.kept.len() > MAX_APART {
+            self.kept.pop_first();
+        }
+    }
+
+    fn has(&self, place: u64, by_order: bool) -> bool {
+        self.kept.contains_key(&if by_order { self.asked } else { place })
+    }
+
+    fn take(&mut self, place: u64, by_order: bool) -> Option<Vec<u8>> {
+        let place = if by_order { self.asked } else { place };
+        let value = self.kept.remove(&place)?;
+        self.asked += 1;
+        Some(value)
+    }
+}

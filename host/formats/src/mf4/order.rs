@@ -1,0 +1,64 @@
+//! The order of records of several groups that share a stream.
+//!
+//! The standard orders the records of each group only. A logger that queues what it sent apart from what it received may
+//! write a request behind its response.
+
+use std::collections::BTreeMap;
+
+use super::part::Item;
+
+/// How far behind others a record is looked for.
+const WINDOW_NS: i64 = 1_000_000_000;
+
+/// Most records that are kept for that: a second of two full channels at 1 Mbit/s.
+const MOST: usize = 1 << 14;
+
+/// Records that were read ahead.
+pub(super) struct Order {
+    /// By time, and by number where that is the same.
+    items: BTreeMap<(i64, u64), Item>,
+    /// The last time of each group, which none of its records comes before.
+    last: Vec<i64>,
+    /// The latest of them.
+    latest_ns: i64,
+    count: u64,
+    ended: bool,
+}
+
+impl Order {
+    pub fn of(groups: usize) -> Self {
+        let last = vec![i64::MIN; groups];
+        Self { items: BTreeMap::new(), last, latest_ns: i64::MIN, count: 0, ended: false }
+    }
+
+    /// Whether what was read might still lack the first record.
+    pub fn needs_more(&self) -> bool {
+        let is_near = |first: i64| self.latest_ns.saturating_sub(first) <= WINDOW_NS;
+        let is_open = self.items.first_key_value().is_none_or(|((first, _), _)| is_near(*first));
+        !self.ended && self.items.len() < MOST && is_open
+    }
+
+    /// Takes what came next; without anything, it was the end.
+    pub fn put(&mut self, item: Option<Item>, group: usize) {
+        let Some(item) = item else {
+            self.ended = true;
+            return;
+        };
+        let time_ns = match (&item, self.last.get_mut(group)) {
+            (Item::Record(record), Some(last)) => {
+                // What goes back by more stays where it is: a clock was set, or its time is damaged.
+                let is_far = self.latest_ns.saturating_sub(record.time_ns) > WINDOW_NS;
+                *last = if is_far { self.latest_ns } else { record.time_ns.max(*last) };
+                *last
+            }
+            _ => self.latest_ns,
+        };
+        self.latest_ns = self.latest_ns.max(time_ns);
+        self.items.insert((time_ns, self.count), item);
+        self.count += 1;
+    }
+
+    pub fn pop(&mut self) -> Option<Item> {
+        self.items.pop_first().map(|(_, item)| item)
+    }
+}

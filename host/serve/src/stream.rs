@@ -304,7 +304,7 @@ mod tests {
     /// As [`crate::outbox::MOST_RECORDS`] says.
     #[test]
     fn a_record_takes_no_more_memory_than_a_server_reckons_with() {
-        assert_eq!(size_of::<Entry>(), 104);
+        assert_eq!(size_of::<Entry>(), 112);
     }
 
     #[test]

@@ -33,6 +33,8 @@ pub(crate) struct DiagnosticsSigns {
     seen: BTreeMap<Protocol, u32>,
     /// Requests and responses of UDS that did not find each other.
     alone: u32,
+    /// Responses of OBD-II without their requests: loggers often leave out what they send.
+    answers: u32,
     all: u32,
 }
 
@@ -45,8 +47,11 @@ impl DiagnosticsSigns {
         };
         let is_alone = event.protocol == Protocol::Uds
             && matches!(event.kind, EventKind::Response | EventKind::NoResponse | EventKind::Request);
+        let is_answer =
+            event.protocol == Protocol::Obd && event.kind == EventKind::Response && event.trouble.is_none();
         self.all += 1;
         self.alone += u32::from(is_alone);
+        self.answers += u32::from(is_answer);
         if convinces {
             *self.seen.entry(event.protocol).or_default() += 1;
         }
@@ -55,10 +60,10 @@ impl DiagnosticsSigns {
     /// The protocols, with the number of messages that indicate them.
     pub fn found(&self) -> impl Iterator<Item = (Protocol, u32)> {
         // A server that does not answer, or answers something else: other traffic with these identifiers rarely looks like that.
-        let is_silent =
-            self.seen.is_empty() && self.alone > 1 && u64::from(self.alone) * 5 >= u64::from(self.all) * 4;
-        let silent = is_silent.then_some((Protocol::Uds, self.alone));
-        self.seen.iter().map(|(protocol, count)| (*protocol, *count)).chain(silent)
+        let is_most = |count: u32| self.seen.is_empty() && u64::from(count) * 5 >= u64::from(self.all) * 4;
+        let silent = (self.alone > 1 && is_most(self.alone)).then_some((Protocol::Uds, self.alone));
+        let answers = (self.answers > 2 && is_most(self.answers)).then_some((Protocol::Obd, self.answers));
+        self.seen.iter().map(|(protocol, count)| (*protocol, *count)).chain(silent).chain(answers)
     }
 }
 

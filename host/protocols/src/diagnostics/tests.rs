@@ -401,6 +401,25 @@ fn requests_without_answers_show_what_is_spoken() {
     assert_eq!(found(&["7E0#023E00", "100#0322F190"]), []);
 }
 
+/// Loggers that ask by OBD-II often record only what the vehicle responds.
+#[test]
+fn responses_of_obd_without_requests_show_what_is_spoken() {
+    let found = |frames: &[&str]| {
+        let mut survey = crate::survey::Survey::new(&[]);
+        for (number, frame) in (0_u32..).zip(frames) {
+            survey.take(&at(f64::from(number) * 100.0, frame));
+        }
+        survey.found().into_iter().map(|found| found.protocol).collect::<Vec<_>>()
+    };
+    let speed = "7E8#03410D2A00000000";
+    let revolutions = "18DAF110#04410C1AF8000000";
+    assert_eq!(found(&[speed, speed, speed, "100#00"]), [Protocol::Obd]);
+    assert_eq!(found(&[revolutions, revolutions, revolutions]), [Protocol::Obd]);
+    assert_eq!(found(&[speed, speed]), []);
+    // Anything else with these identifiers.
+    assert_eq!(found(&[speed, speed, speed, "7E8#0211"]), []);
+}
+
 #[test]
 fn a_service_that_no_standard_names_is_refused_as_it_was_asked_for() {
     // As a scan of all services goes.

@@ -55,7 +55,7 @@ fn frames_found_queued_are_stamped_as_upper_bounds() {
         .iter()
         .map(|(_, record)| match record {
             Record::Received(received) => received.stamp,
-            Record::Event(event) => panic!("{event:?}"),
+            other => panic!("{other:?}"),
         })
         .collect();
     assert_eq!(stamps, [Stamp::UpperBound, Stamp::UpperBound, Stamp::UpperBound, Stamp::Exact]);
@@ -118,7 +118,7 @@ fn a_full_queue_drops_and_counts_but_still_empties_the_fifo() {
                 next += count;
                 lost += count;
             }
-            Record::Event(event) => panic!("{event:?}"),
+            other => panic!("{other:?}"),
         }
     }
     assert_eq!(next, total + 100);

@@ -327,7 +327,7 @@ fn a_full_queue_does_not_hold_up_the_gateway_and_every_frame_is_counted() {
             {
                 *count
             }
-            Record::Event(_) => 0,
+            _ => 0,
         })
     };
     assert_eq!((of(CAN1).sum::<u32>(), of(CAN2).sum::<u32>()), (frames, frames));

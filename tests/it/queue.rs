@@ -74,7 +74,7 @@ fn check(pace: impl Fn(u32)) -> u32 {
                         next[channel.index()] += 2 * count;
                         lost[channel.index()] += count;
                     }
-                    Record::Event(event) => panic!("{event:?}"),
+                    other => panic!("{other:?}"),
                 }
                 bytes.len() - rest.len()
             });

@@ -240,7 +240,9 @@ mod tests {
         let id = Id::extended(0x18DA_F110).unwrap();
         let fd = [(0, true), (12, false), (64, true)]
             .map(|(len, brs)| FdFrame::new(id, brs, !brs, &[0xA5; 64][..len]).unwrap());
-        fd.iter().for_each(|frame| writer.push_fd(frame));
+        for frame in &fd {
+            writer.push_fd(frame);
+        }
         let bytes = writer.take().unwrap();
         assert_eq!(bytes[..11], [2, 0, 0, 0, 8, 0, 0, 1, 0x23, 1, 0xAA]);
         let (header, mut rest) = datagram(&bytes).unwrap();

@@ -399,10 +399,9 @@ impl Client {
                 drop(state);
                 self.shared.ask(command, Then::Nothing)
             }
-            // Whoever flashes a firmware is at the board.
-            Command::Bootloader => Err(Refusal::Unsupported),
-            // A gateway needs both channels to itself.
-            Command::SetGatewayRule { .. }
+            // Whoever flashes a firmware is at the board, and a gateway needs both channels to itself.
+            Command::Bootloader
+            | Command::SetGatewayRule { .. }
             | Command::StartGateway
             | Command::StopGateway
             | Command::GatewayStatus { .. }

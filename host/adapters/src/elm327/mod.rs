@@ -199,7 +199,7 @@ impl Elm327 {
         }
         match content {
             Content::Frame(frame) => {
-                self.backlog.push(Incoming::Received { channel, frame: frame.into(), at })
+                self.backlog.push(Incoming::Received { channel, frame: frame.into(), at });
             }
             Content::Nothing => {}
             Content::Damaged => {

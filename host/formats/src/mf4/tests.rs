@@ -327,7 +327,7 @@ fn records_of_several_groups_in_one_stream_come_in_the_order_of_time() {
     blocks.0[received as usize + 24..][..8].copy_from_slice(&sent.to_le_bytes());
     blocks.0[bytes + LINK_TO_DATA..][..8].copy_from_slice(&values.to_le_bytes());
     // Every tenth is sent, and comes four frames late.
-    let is_sent = |at: usize| at % 10 == 0;
+    let is_sent = |at: usize| at.is_multiple_of(10);
     let mut order: Vec<usize> = (0..100).collect();
     order.sort_by_key(|at| if is_sent(*at) { at * 2 + 9 } else { at * 2 });
     assert_eq!(order[..6], [1, 2, 3, 4, 0, 5]);

@@ -358,7 +358,7 @@ fn alone(queue: &'static Queue) -> Bench<'static, SMALL_QUEUE> {
     assert_eq!(before.ask(Command::SaveGateway), Ok(Reply::Done));
     let mut bench = Bench::new(queue);
     bench.port.open = false;
-    bench.board.chip.saved = before.board.chip.saved.clone();
+    bench.board.chip.saved.clone_from(&before.board.chip.saved);
     for _ in 0..5 {
         bench.millisecond();
     }
@@ -472,7 +472,7 @@ fn all_rules_of_both_directions_can_be_saved() {
     }
     assert_eq!(before.ask(Command::SaveGateway), Ok(Reply::Done));
     let mut bench = Bench::new(queue_of());
-    bench.board.chip.saved = before.board.chip.saved.clone();
+    bench.board.chip.saved.clone_from(&before.board.chip.saved);
     for _ in 0..5 {
         bench.millisecond();
     }

@@ -181,7 +181,9 @@ fn found_again(rules: &Rules, records: &[TraceRecord]) -> (Outcome, DryRunCounts
     let map = Map::new(rules, Channel::Can1);
     let options = Options { from: 1, to: 2, within_ns: 100 * MS };
     let mut matching = Matching::new(options, |frame: &TraceFrame| map.expected(frame));
-    all.iter().for_each(|record| matching.push(record, true));
+    for record in &all {
+        matching.push(record, true);
+    }
     (matching.finish(), counts)
 }
 
@@ -231,8 +233,8 @@ proptest! {
         let mut now = 0;
         let records: Vec<_> = frames.iter().map(|(us, id, data)| {
             now += us * 1_000;
-            let data: String = data.iter().map(|byte| format!("{byte:02X}")).collect();
-            on(1, now, &format!("{id:03X}#{data}"))
+            let data: Vec<_> = data.iter().map(|byte| format!("{byte:02X}")).collect();
+            on(1, now, &format!("{id:03X}#{}", data.concat()))
         }).collect();
         let (outcome, counts) = found_again(&rules, &records);
         let sum = |of: fn(&cantap::wire::message::RuleCounts) -> u32| {

@@ -68,8 +68,7 @@ struct Source<'t> {
 
 impl Source<'_> {
     fn line(&self, at: usize) -> u32 {
-        let before = &self.text.as_bytes()[..at.min(self.text.len())];
-        before.iter().filter(|&&byte| byte == b'\n').count() as u32 + 1
+        self.text.char_indices().filter(|&(place, char)| place < at && char == '\n').count() as u32 + 1
     }
 
     fn fault(&self, span: &Range<usize>, field: &str, text: impl Into<String>) -> RulesError {

@@ -324,6 +324,12 @@ impl<'q> Transmitter<'q> {
         self.watching && self.arm_replies(frame, at)
     }
 
+    /// Whether received frames are looked at.
+    #[inline]
+    pub const fn is_watching(&self) -> bool {
+        self.watching
+    }
+
     /// Whether a reply waits.
     pub const fn is_replying(&self) -> bool {
         self.replies_waiting > 0

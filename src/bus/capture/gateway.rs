@@ -1,18 +1,38 @@
 //! The gateway: frames that one channel receives are sent on the other.
 //!
-//! The drain keeps received frames, six at most, and passes them on once its FIFO is empty and its own channel's replies are in
-//! mailboxes. Without a gateway nothing of this is reached: what decides is the flag that replies have anyway.
+//! The drain passes each frame on before it records it. Without a gateway nothing of this is reached: what decides is the flag that replies
+//! have anyway, read once per drain.
 
 use cantap_wire::message::{GatewayEnd, GatewayRule, GatewayState, GatewayStatus, Mode};
-use cantap_wire::{CHANNELS, Channel, Refusal};
+use cantap_wire::{CHANNELS, Channel, Frame, Refusal};
 
 use super::Capture;
 use crate::bus::gateway::other;
 use crate::ports::{Clock, Traffic};
 
 impl<const N: usize> Capture<'_, N> {
-    /// The other channel sends what the rules make of the frames just received: at most six, each compared with 32 rules, and two that go
-    /// into mailboxes.
+    /// A frame was taken out of a FIFO, and is not recorded yet: the gateway passes it on, since its bus is waiting. Returns whether there
+    /// are replies to it, which follow once the FIFO is empty.
+    #[inline(never)]
+    pub(super) fn answer<T: Traffic>(
+        &mut self,
+        channel: Channel,
+        both: &mut [T; CHANNELS],
+        clock: &impl Clock,
+        frame: &Frame,
+        at: u64,
+    ) -> bool {
+        let transmitter = &mut self.channels[channel.index()].transmitter;
+        let any = transmitter.on_frame(frame, at);
+        let replies = transmitter.is_replying();
+        if any && self.gateway == GatewayState::Running {
+            let now = self.recorder.time(clock.now());
+            self.pass_on(channel, both, clock, now);
+        }
+        replies
+    }
+
+    /// The other channel sends what the rules make of the frame just received: it is compared with 32 rules, and two frames go into mailboxes.
     #[inline(never)]
     pub(super) fn pass_on<T: Traffic>(
         &mut self,

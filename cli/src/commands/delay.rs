@@ -67,7 +67,7 @@ pub struct Args {
 }
 
 /// The longest window: equal frames of a whole day are kept for no gateway.
-const LONGEST: Duration = Duration::from_secs(3600);
+const LONGEST: Duration = Duration::from_hours(1);
 
 /// Runs it.
 pub fn run(mut args: Args) -> anyhow::Result<ExitCode> {
@@ -140,7 +140,8 @@ fn analyse<M: FnMut(&TraceFrame) -> Option<Expected>>(
         }
     }
     records.judge()?;
-    for (channel, _) in [options.from, options.to].iter().zip(frames).filter(|(_, frames)| *frames == 0) {
+    if let Some(side) = frames.iter().position(|frames| *frames == 0) {
+        let channel = [options.from, options.to][side];
         bail!(
             "channel {channel} has no frames in this trace; cantap stats shows which channels have, and cantap align makes one trace of two"
         );

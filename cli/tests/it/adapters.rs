@@ -49,7 +49,9 @@ pub fn fd_rows() -> String {
     let lengths = [0, 1, 8, 12, 16, 20, 24, 32, 48, 64];
     let rows = lengths.iter().flat_map(|len| [format!("123##1{}", "5A".repeat(*len)), "7FF#11".to_owned()]);
     let rows = rows.chain(["18DAF110##2AA".to_owned(), "124##3".to_owned(), "125##0BB".to_owned()]);
-    rows.enumerate().map(|(at, text)| format!("(1700000000.{:06}) can0 {text}\n", at * 1000)).collect()
+    let lines: Vec<_> =
+        rows.enumerate().map(|(at, text)| format!("(1700000000.{:06}) can0 {text}\n", at * 1000)).collect();
+    lines.concat()
 }
 
 /// What a candump log has in its third column.

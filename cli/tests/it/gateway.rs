@@ -24,9 +24,9 @@ fn directory(test: &str) -> PathBuf {
     let toml = PAGE.split("```toml\n").nth(1).unwrap().split("```").next().unwrap();
     std::fs::write(directory.join("rules.toml"), toml).unwrap();
     std::fs::write(directory.join("both.log"), both()).unwrap();
-    let received: String =
-        both().lines().filter(|line| !line.contains("can1")).map(|line| format!("{line}\n")).collect();
-    std::fs::write(directory.join("car.log"), received).unwrap();
+    let both = both();
+    let received: Vec<_> = both.split_inclusive('\n').filter(|line| !line.contains("can1")).collect();
+    std::fs::write(directory.join("car.log"), received.concat()).unwrap();
     directory
 }
 

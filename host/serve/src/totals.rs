@@ -68,8 +68,8 @@ pub fn count(totals: &mut Totals, entry: &Entry) {
                 (LossStage::Queue, count) => of.lost_queue += u64::from(count),
                 (LossStage::Link, count) => of.lost_link += u64::from(count),
                 (LossStage::Host, count) => of.lost_host += u64::from(count),
-                // A server's clients cannot start one.
-                (LossStage::Gateway, _) => {}
+                // No client can start one, but the board may have one of its own.
+                (LossStage::Gateway, count) => of.transmit_failures += u64::from(count),
             }
         }
         Record::Event(_) => {}

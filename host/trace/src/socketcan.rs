@@ -46,7 +46,7 @@ const AT_ACK: u8 = 0x19;
 const AT_LEAST: u8 = 0x80;
 const SUPPRESSED: u8 = 0x40;
 
-const STAGES: [LossStage; 4] = [LossStage::Controller, LossStage::Queue, LossStage::Link, LossStage::Host];
+const STAGES: [LossStage; 5] = LossStage::ALL;
 const FAILURES: [TransmitFailure; 5] = [
     TransmitFailure::ArbitrationLost,
     TransmitFailure::BusError,

@@ -13,6 +13,8 @@ pub struct Losses {
     pub link: u64,
     /// In the host.
     pub host: u64,
+    /// In the device's gateway: received on the other channel, and not sent on this one.
+    pub gateway: u64,
     /// How often an unknown number of frames was lost, or may have been: at the start of each channel of a device that does not count its
     /// losses, for example.
     pub unknown: u64,
@@ -31,6 +33,7 @@ impl Losses {
             losses.queue += channel.lost_queue;
             losses.link += channel.lost_link;
             losses.host += channel.lost_host;
+            losses.gateway += channel.lost_gateway;
             losses.unknown += channel.unknown;
             losses.off_bus += channel.off_bus;
             losses.off_bus_us += channel.off_bus_ns / 1000;
@@ -46,6 +49,7 @@ impl Losses {
             queue: self.queue + other.queue,
             link: self.link + other.link,
             host: self.host + other.host,
+            gateway: self.gateway + other.gateway,
             unknown: self.unknown + other.unknown,
             off_bus: self.off_bus + other.off_bus,
             off_bus_us: self.off_bus_us + other.off_bus_us,
@@ -54,7 +58,7 @@ impl Losses {
 
     /// The total of all stages that can count.
     pub const fn total(&self) -> u64 {
-        self.controller + self.queue + self.link + self.host
+        self.controller + self.queue + self.link + self.host + self.gateway
     }
 
     /// Whether no frame is known to be missing, nor can be without being known.
@@ -64,8 +68,12 @@ impl Losses {
 
     /// One line.
     pub fn line(&self) -> String {
-        let Self { controller, queue, link, host, unknown, off_bus, off_bus_us } = self;
+        let Self { controller, queue, link, host, gateway, unknown, off_bus, off_bus_us } = self;
         let stages = format!("controller {controller}, queue {queue}, link {link}, host {host}");
+        let stages = match gateway {
+            0 => stages,
+            gateway => format!("{stages}, gateway {gateway}"),
+        };
         let stages = match unknown {
             0 => stages,
             1 => format!("{stages}, and an unknown number"),
@@ -107,7 +115,12 @@ mod tests {
         let uncounted = Losses { unknown: 1, ..none };
         assert_eq!(uncounted.line(), "controller 0, queue 0, link 0, host 0, and an unknown number");
         assert!(uncounted.plus(uncounted).line().ends_with("an unknown number at 2 places"));
-        assert!(none.is_none() && !some.is_none() && !uncounted.is_none());
+        let gateway = Losses { gateway: 3, ..none };
+        assert_eq!(
+            (gateway.line().as_str(), gateway.total()),
+            ("controller 0, queue 0, link 0, host 0, gateway 3", 3)
+        );
+        assert!(none.is_none() && !some.is_none() && !uncounted.is_none() && !gateway.is_none());
         assert_eq!(lost_frames(0, false), "0");
         assert_eq!(lost_frames(0, true), "an unknown number");
         assert_eq!(lost_frames(7, true), "at least 7");

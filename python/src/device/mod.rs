@@ -439,6 +439,7 @@ impl Device {
             counts.set_item("queue", of.lost_queue)?;
             counts.set_item("link", of.lost_link)?;
             counts.set_item("host", of.lost_host)?;
+            counts.set_item("gateway", of.lost_gateway)?;
             counts.set_item("unknown", of.unknown)?;
             counts.set_item("off_bus", of.off_bus)?;
             counts.set_item("off_bus_ns", of.off_bus_ns)?;

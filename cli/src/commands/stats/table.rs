@@ -131,6 +131,7 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
             (lost.queue, LossStage::Queue.name()),
             (lost.link, LossStage::Link.name()),
             (lost.host, LossStage::Host.name()),
+            (lost.gateway, LossStage::Gateway.name()),
             (lost.unknown, "unknown"),
         ];
         let places = if lost.gaps == 1 { "1 place".to_owned() } else { format!("{} places", lost.gaps) };

@@ -169,6 +169,7 @@ pub struct LossSummary {
     pub queue: u64,
     pub link: u64,
     pub host: u64,
+    pub gateway: u64,
     pub unknown: u64,
     /// Places in the trace where frames are missing.
     pub gaps: u64,
@@ -365,6 +366,7 @@ impl LossSummary {
             queue: losses.of(LossStage::Queue),
             link: losses.of(LossStage::Link),
             host: losses.of(LossStage::Host),
+            gateway: losses.of(LossStage::Gateway),
             unknown: losses.unknown,
             gaps: losses.gaps,
             uncounted: losses.uncounted,

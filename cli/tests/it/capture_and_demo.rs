@@ -388,7 +388,7 @@ fn the_demo_loses_nothing_and_says_so_in_the_promised_object() {
     );
     assert_eq!(
         keys(&object["lost"]),
-        ["controller", "host", "link", "off_bus", "off_bus_us", "queue", "unknown"]
+        ["controller", "gateway", "host", "link", "off_bus", "off_bus_us", "queue", "unknown"]
     );
     for channel in object["channels"].as_array().unwrap() {
         assert_eq!(keys(channel), ["bus_load_pct", "channel", "delivered", "frames_per_s", "lost", "sent"]);

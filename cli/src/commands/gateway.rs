@@ -92,9 +92,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         (Some(rules), Some(trace)) => dry::run(args, rules, trace),
         (Some(rules), None) if args.save => device::save(args, rules),
         (Some(rules), None) => device::run(args, rules),
-        (None, _) if args.timing.options().is_given() => {
-            Err(usage("the gateway that the device runs on its own has its bit rates; leave them out, or give RULES to start another"))
-        }
+        (None, _) if args.timing.options().is_given() => Err(usage(
+            "the gateway that the device runs on its own has its bit rates; leave them out, or give RULES to start another",
+        )),
         (None, _) => device::show(args),
     }
 }

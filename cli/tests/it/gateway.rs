@@ -157,7 +157,10 @@ fn what_the_other_bus_cannot_take_is_counted_as_lost() {
     let (code, out, err) = cantap(&directory, line);
     assert_eq!(code, Some(0), "{err}");
     assert!(out.contains("LOST"), "{out}");
-    assert!(err.contains("acknowledges and sends on channel 1 (") && err.contains("and channel 2 ("), "{err}");
+    assert!(
+        err.contains("acknowledges and sends on channel 1 (") && err.contains("and channel 2 ("),
+        "{err}"
+    );
 }
 
 #[test]

@@ -95,7 +95,9 @@ pub(super) fn show(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
     let device = open(args)?;
     if !device.gateway_status(Channel::Can1, 0)?.standalone {
-        bail!("the device runs no gateway on its own; `cantap gateway RULES` starts one, with --save for each start of the device");
+        bail!(
+            "the device runs no gateway on its own; `cantap gateway RULES` starts one, with --save for each start of the device"
+        );
     }
     let records = device.records();
     Watch::new(args, &device, Named::of_device(&device)?, records)?.run(false)
@@ -261,7 +263,10 @@ impl<'a> Watch<'a> {
             self.counts.print(&self.named, &mut out)?;
             writeln!(out, "{}", self.counts.line())?;
             for (channel, missed) in (1..).zip(self.missed()).filter(|(_, missed)| *missed > 0) {
-                writeln!(out, "channel {channel}: at least {missed} frames lost in the controller, before the gateway")?;
+                writeln!(
+                    out,
+                    "channel {channel}: at least {missed} frames lost in the controller, before the gateway"
+                )?;
             }
         }
         out.flush()?;

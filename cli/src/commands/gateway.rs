@@ -55,14 +55,14 @@ pub struct Args {
     #[arg(long, requires = "rules", conflicts_with_all = ["show", "time"])]
     save: bool,
     /// End the gateway that the device runs on its own. If it is stored, it starts again with the device.
-    #[arg(long, conflicts_with_all = ["rules", "show", "time", "save", "TimingArgs", "Preferences"])]
+    #[arg(long, conflicts_with_all = ["rules", "show", "time", "save", "bitrates", "sample_point", "sjw", "triple", "segments", "btr"])]
     stop: bool,
     /// End it and erase it from the device, with everything else that is stored there.
-    #[arg(long, conflicts_with_all = ["rules", "show", "time", "save", "stop", "TimingArgs", "Preferences"])]
+    #[arg(long, conflicts_with_all = ["rules", "show", "time", "save", "stop", "bitrates", "sample_point", "sjw", "triple", "segments", "btr"])]
     forget: bool,
     /// Apply the rules to a trace instead; - for standard input.
     #[arg(long, value_name = "FILE", requires = "rules",
-          conflicts_with_all = ["OneBoard", "TimingArgs", "Preferences", "time", "show", "save", "stop", "forget"])]
+          conflicts_with_all = ["OneBoard", "bitrates", "sample_point", "sjw", "triple", "segments", "btr", "time", "show", "save", "stop", "forget"])]
     dry_run: Option<PathBuf>,
     /// Write what would have been sent as a trace.
     #[arg(short, long, value_name = "FILE", requires = "dry_run")]

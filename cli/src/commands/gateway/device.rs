@@ -129,7 +129,9 @@ pub(super) fn stop(args: &Args) -> anyhow::Result<ExitCode> {
     }
     device.stop_gateway()?;
     // Both channels leave their buses; nothing can be erased before.
-    device.stop()?;
+    for channel in Channel::ALL {
+        device.close_channel(channel)?;
+    }
     let mut out = std::io::stdout().lock();
     if args.forget {
         device.clear_defaults()?;

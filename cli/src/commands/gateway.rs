@@ -1,40 +1,71 @@
-//! `cantap gateway`: rules for passing frames between two buses, tried on a trace.
+//! `cantap gateway`: the device passes frames on between its two buses; or its rules are tried on a trace.
 
-use std::io::{BufWriter, Write};
+mod counts;
+mod device;
+mod dry;
+
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::time::Duration;
 
-use cantap::wire::message::RuleCounts;
-use cantap_formats::{Format, WriteOptions};
-use cantap_trace::TraceRecord;
-use cantap_work::gateway::{DryRun, DryRunCounts, Rules, Sent};
-use cantap_work::missing::Missing;
-use serde_json::{Value, json};
+use cantap_formats::Format;
+use cantap_work::gateway::Rules;
 
+use crate::args;
 use crate::completion;
 use crate::database_args::DatabaseArgs;
 use crate::input::ReadArgs;
-use crate::trace_output::TraceOutput;
+use crate::one_board::OneBoard;
+use crate::timing_args::TimingArgs;
+use crate::usage_error::usage;
 
 /// The command line.
 #[derive(clap::Args)]
 #[command(
-    after_help = "The rules are applied as a device applies them, between buses that are never busy; nothing is sent. docs/gateway.md \
+    // A device passes on what its rules say, and nothing is read.
+    mut_arg("filter", |filter| filter.requires("dry_run")),
+    after_help = "The device acknowledges and sends on both its buses, until Ctrl-C. With --save it does so without a host, each time it starts. \
+                  --dry-run applies the rules to a trace as a device does, between buses that are never busy; nothing is sent. docs/gateway.md \
                   describes the file of rules.\n\nExamples:\n  \
+                  cantap gateway rules.toml -d /dev/ttyACM0 -b 500k -b 2:250k --show\n  \
+                  cantap gateway rules.toml -d /dev/ttyACM0 -b 500k --save\n  \
+                  cantap gateway --show -d /dev/ttyACM0\n  \
+                  cantap gateway --forget -d /dev/ttyACM0\n  \
                   cantap gateway rules.toml --dry-run car.log\n  \
-                  cantap gateway rules.toml --dry-run car.log -o sent.log\n  \
                   cantap gateway rules.toml --dry-run car.log --all -o both.log\n  \
-                  cantap delay both.log --from 1 --to 2 --map rules.toml"
+                  cantap delay both.log --from 1 --to 2 --map rules.toml\n\n\
+                  Exit code: 1 if the gateway ended on its own: both channels are on one bus, or one was closed."
 )]
 pub struct Args {
     /// The file of rules (TOML).
-    #[arg(value_name = "RULES")]
-    rules: PathBuf,
-    /// The trace to apply them to; - for standard input.
-    #[arg(long, value_name = "FILE", required = true)]
-    dry_run: PathBuf,
+    #[arg(value_name = "RULES", required_unless_present_any = ["show", "stop", "forget"])]
+    rules: Option<PathBuf>,
+    #[command(flatten)]
+    device: OneBoard,
+    #[command(flatten)]
+    timing: TimingArgs,
+    /// How long to run, as 10, 500ms or 2m.
+    #[arg(short, long, value_parser = args::positive_duration)]
+    time: Option<Duration>,
+    /// Print the counts of each rule once a second. Without RULES, of the gateway that the device runs on its own.
+    #[arg(long)]
+    show: bool,
+    /// Store the rules and bit rates on the device, which then runs them on its own each time it starts. Replaces what `cantap
+    /// defaults` has stored.
+    #[arg(long, requires = "rules", conflicts_with_all = ["show", "time"])]
+    save: bool,
+    /// End the gateway that the device runs on its own. If it is stored, it starts again with the device.
+    #[arg(long, conflicts_with_all = ["rules", "show", "time", "save", "bitrates", "sample_point", "sjw", "triple", "segments", "btr"])]
+    stop: bool,
+    /// End it and erase it from the device, with everything else that is stored there.
+    #[arg(long, conflicts_with_all = ["rules", "show", "time", "save", "stop", "bitrates", "sample_point", "sjw", "triple", "segments", "btr"])]
+    forget: bool,
+    /// Apply the rules to a trace instead; - for standard input.
+    #[arg(long, value_name = "FILE", requires = "rules",
+          conflicts_with_all = ["OneBoard", "bitrates", "sample_point", "sjw", "triple", "segments", "btr", "time", "show", "save", "stop", "forget"])]
+    dry_run: Option<PathBuf>,
     /// Write what would have been sent as a trace.
-    #[arg(short, long, value_name = "FILE")]
+    #[arg(short, long, value_name = "FILE", requires = "dry_run")]
     output: Option<PathBuf>,
     /// Write the trace's own records, too.
     #[arg(long, requires = "output")]
@@ -42,8 +73,8 @@ pub struct Args {
     /// The format to write, if the output's name does not show it.
     #[arg(long = "format", visible_alias = "to", value_name = "FORMAT", requires = "output", add = completion::written_formats())]
     written_format: Option<Format>,
-    /// Print one JSON object.
-    #[arg(long)]
+    /// Print one JSON object; with --show one a second, too.
+    #[arg(long, conflicts_with_all = ["save", "stop", "forget"])]
     json: bool,
     #[command(flatten)]
     databases: DatabaseArgs,
@@ -53,115 +84,17 @@ pub struct Args {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let rules = Rules::read(&args.rules)?;
-    let filters = args.read.filters(&args.databases.load(args.read.strict, false)?)?;
-    let mut records = args.read.open(&args.dry_run, filters)?;
-    let options = WriteOptions { format: args.written_format, ..WriteOptions::default() };
-    let output = args.output.as_ref().map(|path| TraceOutput::create(path, &options, false)).transpose()?;
-    let mut sink = Sink { output, all: args.all };
-    let mut run = DryRun::new(rules.clone());
-    let (mut batch, mut sent) = (Vec::new(), Vec::new());
-    while records.next_batch(&mut batch)? {
-        for record in &batch {
-            run.push(record, &mut sent);
-            sink.write(Some(record), &mut sent)?;
-        }
+    let rules = args.rules.as_deref().map(Rules::read).transpose()?;
+    if args.stop || args.forget {
+        return device::stop(args);
     }
-    let counts = run.finish(&mut sent);
-    sink.write(None, &mut sent)?;
-    if let Some(output) = sink.output {
-        output.finish()?;
+    match (&rules, &args.dry_run) {
+        (Some(rules), Some(trace)) => dry::run(args, rules, trace),
+        (Some(rules), None) if args.save => device::save(args, rules),
+        (Some(rules), None) => device::run(args, rules),
+        (None, _) if args.timing.options().is_given() => Err(usage(
+            "the gateway that the device runs on its own has its bit rates; leave them out, or give RULES to start another",
+        )),
+        (None, _) => device::show(args),
     }
-    let mut out = BufWriter::new(std::io::stdout().lock());
-    if args.json {
-        writeln!(out, "{}", object(&rules, &counts, &records.missing()))?;
-    } else {
-        print(&rules, &counts, &mut out)?;
-    }
-    out.flush()?;
-    Ok(ExitCode::SUCCESS)
-}
-
-struct Sink {
-    output: Option<TraceOutput>,
-    all: bool,
-}
-
-impl Sink {
-    /// Writes what is sent in order of time; what is sent because of the record comes after it.
-    fn write(&mut self, record: Option<&TraceRecord>, sent: &mut Vec<Sent>) -> anyhow::Result<()> {
-        let until = record.map_or(i64::MAX, |record| record.time_ns);
-        let before = sent.partition_point(|sent| sent.time_ns < until);
-        if let Some(output) = &mut self.output {
-            sent[..before].iter().try_for_each(|sent| output.write(&sent.record()))?;
-            if let Some(record) = record.filter(|_| self.all) {
-                output.write(record)?;
-            }
-            sent[before..].iter().try_for_each(|sent| output.write(&sent.record()))?;
-        }
-        sent.clear();
-        Ok(())
-    }
-}
-
-/// The frames that a rule kept from the other bus.
-fn dropped(rules: &Rules, number: usize, counts: &RuleCounts) -> u32 {
-    if rules.drops(number) { counts.matched } else { 0 }
-}
-
-fn print(rules: &Rules, counts: &DryRunCounts, out: &mut impl Write) -> std::io::Result<()> {
-    writeln!(
-        out,
-        "{:<4} {:<4} {:<16} {:>8} {:>8} {:>8} {:>8} {:>8} {:>6}",
-        "line", "from", "rule", "matched", "sent", "changed", "dropped", "replaced", "lost"
-    )?;
-    for (number, (rule, (sums, changed))) in rules.rules.iter().zip(&counts.rules).enumerate() {
-        writeln!(
-            out,
-            "{:<4} {:<4} {:<16} {:>8} {:>8} {changed:>8} {:>8} {:>8} {:>6}",
-            rule.line,
-            rule.from.number(),
-            rule.name,
-            sums.matched,
-            sums.sent,
-            dropped(rules, number, sums),
-            sums.overtaken,
-            sums.lost
-        )?;
-    }
-    for (channel, unmatched) in (1..).zip(counts.unmatched).filter(|(_, unmatched)| *unmatched > 0) {
-        writeln!(out, "{unmatched} frames of channel {channel} matched no rule and are not passed on")?;
-    }
-    if counts.not_received > 0 {
-        writeln!(
-            out,
-            "{} frames of other channels, or of CAN FD, which a device does not receive",
-            counts.not_received
-        )?;
-    }
-    Ok(())
-}
-
-fn object(rules: &Rules, counts: &DryRunCounts, missing: &Missing) -> Value {
-    let all = rules.rules.iter().zip(&counts.rules).enumerate();
-    let rows = all.map(|(number, (rule, (sums, changed)))| {
-        json!({
-            "rule": rule.name,
-            "line": rule.line,
-            "from": rule.from.number(),
-            "matched": sums.matched,
-            "sent": sums.sent,
-            "changed": changed,
-            "dropped": dropped(rules, number, sums),
-            "replaced": sums.overtaken,
-            "lost": sums.lost,
-        })
-    });
-    let mut value = json!({
-        "rules": rows.collect::<Vec<_>>(),
-        "unmatched": counts.unmatched,
-        "not_received": counts.not_received,
-    });
-    missing.put_into(&mut value);
-    value
 }

@@ -69,7 +69,7 @@ pub enum Command {
     Diff(diff::Args),
     /// Measure how long a gateway takes, from a trace of both its buses: delays, missing and extra frames.
     Delay(Box<delay::Args>),
-    /// Try a gateway's rules on a trace: what would be passed on, changed, dropped.
+    /// Pass frames on between a device's two buses, as rules say; or try the rules on a trace.
     Gateway(Box<gateway::Args>),
     /// Put traces of several recorders on one clock, using the frames that they have in common.
     Align(align::Args),

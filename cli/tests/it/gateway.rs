@@ -109,6 +109,111 @@ fn what_a_dry_run_writes_is_found_again_with_its_rules() {
     assert_eq!((&found["total"]["missing"], &found["total"]["extra"]), (&50.into(), &50.into()));
 }
 
+/// Rules that pass on the lower half of the 11-bit identifiers and drop the others. None matches 29-bit ones.
+const HALVES: &str = "[[rule]]\nname = \"low\"\nfrom = 1\nfilter = \"000-3FF\"\n\n[[rule]]\nfrom = 1\nfilter = \"400-7FF\"\ndrop = true\n\n\
+                      [[rule]]\nname = \"back\"\nfrom = 2\nfilter = \"000-7FF\"\n";
+
+fn on_a_device(test: &str) -> PathBuf {
+    let directory = directory(test);
+    std::fs::write(directory.join("halves.toml"), HALVES).unwrap();
+    directory
+}
+
+/// Every frame of a direction and of a rule is accounted for. Returns the counts of the direction from channel 1.
+fn accounted(counts: &Value) -> impl Fn(&str) -> u64 {
+    let count = |of: &Value, key: &str| of[key].as_u64().unwrap();
+    let all = |of: &Value| ["sent", "dropped", "replaced", "lost", "failed"].map(|key| count(of, key));
+    for of in counts["rules"].as_array().unwrap() {
+        assert_eq!(count(of, "matched"), all(of).iter().sum::<u64>(), "{counts}");
+    }
+    for of in counts["directions"].as_array().unwrap() {
+        assert_eq!(count(of, "received"), count(of, "matched") + count(of, "unmatched"), "{counts}");
+        assert_eq!(count(of, "matched"), all(of).iter().sum::<u64>(), "{counts}");
+        assert_eq!(count(of, "waiting"), 0, "{counts}");
+    }
+    let first = counts["directions"][0].clone();
+    move |key| count(&first, key)
+}
+
+#[test]
+fn a_device_passes_frames_on_and_accounts_for_each() {
+    let directory = on_a_device("device");
+    let counts =
+        object(&directory, "gateway halves.toml -d virtual:load=20,frames=mix,channels=1 -b 500k -t 2s");
+    let from_1 = accounted(&counts);
+    assert!(["sent", "dropped", "unmatched"].iter().all(|key| from_1(key) > 0), "{counts}");
+    assert_eq!((from_1("lost"), from_1("failed")), (0, 0), "{counts}");
+    assert_eq!((&counts["state"], &counts["directions"][1]["received"]), (&"off".into(), &0.into()));
+    assert_eq!((&counts["rules"][0]["rule"], &counts["rules"][0]["line"]), (&"low".into(), &1.into()));
+}
+
+#[test]
+fn what_the_other_bus_cannot_take_is_counted_as_lost() {
+    let directory = on_a_device("slower");
+    let line = "gateway halves.toml -d virtual:load=90,frames=std8,channels=1 -b 1M -b 2:125k -t 2s";
+    let counts = object(&directory, line);
+    let from_1 = accounted(&counts);
+    assert!(from_1("lost") > 0 && from_1("sent") > 0, "{counts}");
+    let (code, out, err) = cantap(&directory, line);
+    assert_eq!(code, Some(0), "{err}");
+    assert!(out.contains("LOST"), "{out}");
+    assert!(
+        err.contains("acknowledges and sends on channel 1 (") && err.contains("and channel 2 ("),
+        "{err}"
+    );
+}
+
+#[test]
+fn two_channels_on_one_bus_end_it_and_the_exit_code_says_so() {
+    let directory = on_a_device("loop");
+    let line = "gateway halves.toml -d virtual:load=50,frames=std8,wire=joined -b 500k -t 60s";
+    let (code, out, err) = cantap(&directory, line);
+    assert_eq!(code, Some(1), "{out}{err}");
+    assert!(err.contains("both channels are on one bus"), "{err}");
+    assert!(out.contains("received"), "{out}");
+}
+
+/// A device keeps its gateway until it is erased. Without one that runs, there is nothing to show or to stop.
+#[test]
+fn a_gateway_is_stored_and_erased() {
+    let directory = on_a_device("stored");
+    let settings = directory.join("settings.bin");
+    let _ = std::fs::remove_file(&settings);
+    let device = "-d virtual:load=0,settings=settings.bin";
+    let (code, out, err) =
+        cantap(&directory, &format!("gateway halves.toml {device} -b 500k -b 2:250k --save"));
+    assert_eq!(code, Some(0), "{err}");
+    assert!(out.contains("--forget"), "{out}");
+    let saved = object(&directory, &format!("defaults show {device}"));
+    let channel = |number: usize, key: &str| saved["channels"][number]["saved"][key].clone();
+    assert_eq!((channel(0, "bitrate_bps"), channel(1, "bitrate_bps")), (500_000.into(), 250_000.into()));
+    assert_eq!(channel(1, "mode"), "normal");
+    let (code, _, err) = cantap(&directory, &format!("gateway --forget {device}"));
+    assert_eq!(code, Some(0), "{err}");
+    let saved = object(&directory, &format!("defaults show {device}"));
+    assert!(saved["channels"][0]["saved"].is_null(), "{saved}");
+}
+
+#[test]
+fn options_that_do_not_go_together_are_refused() {
+    let directory = on_a_device("options");
+    for (line, code, expected) in [
+        ("gateway", 2, "RULES"),
+        ("gateway --show -d virtual:load=0", 1, "runs no gateway on its own"),
+        ("gateway --stop -d virtual:load=0", 1, "--forget erases"),
+        ("gateway --show -d virtual:load=0 -b 500k", 2, "leave them out"),
+        ("gateway --save -d virtual:load=0", 2, "RULES"),
+        ("gateway halves.toml --dry-run both.log -d virtual", 2, "cannot be used with"),
+        ("gateway halves.toml --dry-run both.log -b 500k", 2, "cannot be used with"),
+        ("gateway halves.toml -d virtual:load=0 -b 500k -f 123", 2, "--dry-run"),
+        ("gateway halves.toml -d candump:both.log -b 500k", 1, "cannot be a gateway"),
+    ] {
+        let (found, _, err) = cantap(&directory, line);
+        assert_eq!(found, Some(code), "{line}: {err}");
+        assert!(err.contains(expected), "{line}: {err}");
+    }
+}
+
 /// Each command of the page runs as it stands.
 #[test]
 fn the_pages_commands_run() {

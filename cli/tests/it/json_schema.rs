@@ -104,6 +104,7 @@ pub const LINES: &[(&str, i32, &[&str])] = &[
     ("delay both.log --from 1 --to 2", 0, &["delay"]),
     ("delay both.log --from 1 --to 2 --map rules.toml --check", 3, &["delay"]),
     ("gateway rules.toml --dry-run both.log", 0, &["gateway"]),
+    ("gateway rules.toml -d virtual:load=5 -b 500k -t 1s", 0, &["gateway_on_a_device"]),
     ("align b.log b.log", 0, &["align"]),
     ("compare-adapters -d candump:b.log -d candump:b.log -b 500k -t 2s", 0, &["compare-adapters"]),
     ("decode a.log --db car.dbc", 0, &["decode", "decode_end"]),

@@ -16,6 +16,7 @@ mod serial;
 mod several;
 mod stamps;
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -59,6 +60,8 @@ pub struct Device {
     shared: Arc<Shared>,
     orders: Sender<Order>,
     settings: Mutex<Settings>,
+    /// Whether this session may have a channel open. A gateway that the device runs on its own is not this session's to end.
+    may_be_on_a_bus: AtomicBool,
 }
 
 /// The channels' settings in this session, to be applied again in the next.
@@ -87,7 +90,13 @@ impl Device {
         let shared = Arc::new(Shared::new(records));
         let (orders, received_orders) = std::sync::mpsc::channel();
         let session = Session::begin(link, name, Reader::new(Arc::clone(&shared), received_orders))?;
-        let device = Self { session, shared, orders, settings: Mutex::default() };
+        let device = Self {
+            session,
+            shared,
+            orders,
+            settings: Mutex::default(),
+            may_be_on_a_bus: AtomicBool::new(false),
+        };
         for _ in 0..CLOCK_ROUNDS {
             device.time()?;
         }
@@ -113,6 +122,9 @@ impl Device {
     /// Sends any request without waiting for its answer, so that several can be in flight: a device handles them
     /// in order. Use it for a few at a time; their bytes wait in the device's input.
     pub fn request_later(&self, command: Command) -> Result<Pending<'_>, DeviceError> {
+        if matches!(command, Command::Open { .. } | Command::StopGateway) {
+            self.may_be_on_a_bus.store(true, Ordering::Relaxed);
+        }
         let is_time = matches!(command, Command::Time);
         let note = is_time.then(|| self.shared.time_asked());
         self.session.requests().send(command, note).map(Pending)
@@ -344,9 +356,9 @@ impl Device {
 }
 
 impl Drop for Device {
-    /// Leaves the buses.
+    /// Leaves the buses, if this session is on one.
     fn drop(&mut self) {
-        if !self.shared.buffer.has_ended() {
+        if self.may_be_on_a_bus.load(Ordering::Relaxed) && !self.shared.buffer.has_ended() {
             self.session.leave_buses();
         }
     }

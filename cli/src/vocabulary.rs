@@ -45,7 +45,10 @@ const MANY_KINDS: [(&str, &str); 8] = [
     ("data", "gen makes data, search looks for them"),
     ("length", "gen's alone"),
     ("check", "diff says whether, align how much"),
-    ("from", "delay's is the channel that a gateway receives on; in what reads or writes a trace, its format"),
+    (
+        "from",
+        "delay's is the channel that a gateway receives on; in what reads or writes a trace, its format",
+    ),
 ];
 
 /// Calls `see` with each command that does something, with its full name, and each of its options.

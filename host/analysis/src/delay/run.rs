@@ -55,10 +55,10 @@ const MOST_REARRANGED: usize = 256;
 
 /// The same frames, first with first and last with last.
 fn in_order(mut pairs: Vec<Pair>) -> Vec<Pair> {
-    let mut froms: Vec<_> = pairs.iter().map(|pair| pair.from).collect();
-    froms.sort_by_key(|from| from.time_ns);
+    let mut causes: Vec<_> = pairs.iter().map(|pair| pair.from).collect();
+    causes.sort_by_key(|from| from.time_ns);
     pairs.sort_by_key(|pair| pair.to_ns);
-    pairs.iter_mut().zip(froms).for_each(|(pair, from)| pair.from = from);
+    pairs.iter_mut().zip(causes).for_each(|(pair, from)| pair.from = from);
     pairs
 }
 

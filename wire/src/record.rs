@@ -18,40 +18,24 @@ use serde::{Deserialize, Serialize};
 
 use crate::packed::{put_packed, take_data};
 use crate::varint::{put_u32, take_u32};
-use crate::{Channel, Frame, Id};
+use crate::{Channel, Frame};
 
 mod fd;
+mod parts;
 
 pub use fd::{MAX_FD_RECORD, ReceivedFd, encode_received_fd};
+pub use parts::{BadRecord, Stamp};
+use parts::{FRAME, MAX_TICKS, NO_DATA, NO_STAMP, UPPER_BOUND, decode_ticks, encode_ticks, take_id};
 
 /// Bytes of the longest received-frame record: qualifier, header, ID, time difference, data.
 pub const MAX_FRAME_RECORD: usize = 1 + 1 + 4 + MAX_TICKS + 8;
 /// Bytes of the longest record of any kind: an [`Event::Transmitted`] with eight data bytes, which is
 /// index, channel, tag, packed ID, DLC, length, data and time difference.
 pub const MAX_RECORD: usize = 1 + 1 + 5 + 5 + 1 + 1 + 8 + MAX_TICKS;
-/// Bytes of the longest time difference: 64 bits, 7 a byte.
-const MAX_TICKS: usize = 10;
-
 /// The index of [`Event::Transmitted`].
 const TRANSMITTED: u8 = 6;
-const FRAME: u8 = 0x80;
 const QUALIFIED: u8 = 0x40;
 const QUALIFIER_MASK: u8 = 0xF8;
-const UPPER_BOUND: u8 = 1;
-const NO_STAMP: u8 = 2;
-const NO_DATA: u8 = 4;
-
-/// What the stamp of a received frame means.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Stamp {
-    /// Read at the end of the frame, plus the interrupt's latency.
-    Exact,
-    /// The frame was found queued behind another one: it ended at this time or earlier.
-    UpperBound,
-    /// Left out on request; the record's time is that of the previous record.
-    Omitted,
-}
-
 /// A received frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Received {
@@ -174,10 +158,6 @@ impl Record {
     }
 }
 
-/// A record cannot be read.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct BadRecord;
-
 /// Writes a received frame and returns its length. `ticks` is the time since the previous record.
 #[inline]
 pub fn encode_received(received: &Received, ticks: i64, out: &mut [u8; MAX_RECORD]) -> usize {
@@ -242,48 +222,15 @@ fn put_transmitted(channel: Channel, tag: u32, frame: &Frame, out: &mut [u8; MAX
     len + put_packed(frame, room)
 }
 
-/// postcard's `i64`.
-#[inline]
-fn encode_ticks(ticks: i64, out: &mut [u8]) -> usize {
-    // Nearly all fit into 32 bits, which on the device takes half the registers.
-    let Ok(ticks) = i32::try_from(ticks) else { return encode_long_ticks(ticks, out) };
-    put_u32(((ticks << 1) ^ (ticks >> 31)) as u32, out)
-}
-
-#[cold]
-#[inline(never)]
-fn encode_long_ticks(ticks: i64, out: &mut [u8]) -> usize {
-    // Cannot fail: the buffer holds the longest record.
-    postcard::to_slice(&ticks, out).map_or(0, |written| written.len())
-}
-
-/// postcard's `i64`, with what follows it. Always inline: a call would return the result through memory, for each record that the
-/// device packs.
-#[inline(always)]
-#[expect(clippy::inline_always, reason = "measured: a tenth of the time for packing")]
-fn decode_ticks(bytes: &[u8]) -> Result<(i64, &[u8]), BadRecord> {
-    // Nearly all take one or two bytes; postcard reads the rest.
-    let (zigzag, rest) = match *bytes {
-        [a, ref rest @ ..] if a < 0x80 => (u32::from(a), rest),
-        [a, b, ref rest @ ..] if b < 0x80 => (u32::from(a & 0x7F) | u32::from(b) << 7, rest),
-        _ => return decode_long_ticks(bytes),
-    };
-    Ok((i64::from((zigzag >> 1) as i32 ^ -((zigzag & 1) as i32)), rest))
-}
-
-#[cold]
-#[inline(never)]
-fn decode_long_ticks(bytes: &[u8]) -> Result<(i64, &[u8]), BadRecord> {
-    postcard::take_from_bytes(bytes).map_err(|_| BadRecord)
-}
-
 /// Reads one record: the record, its time difference in ticks, and what follows it.
 #[inline]
 pub fn decode(bytes: &[u8]) -> Result<(Record, i64, &[u8]), BadRecord> {
     // Nearly every record is a frame without qualifiers.
     match *bytes {
         [header @ FRAME..=0xFF, ref rest @ ..] => decode_frame(0, header, rest),
-        [fd::FD..=fd::LAST_FD, ..] => fd::decode(bytes),
+        [fd::FD..=fd::LAST_FD, ..] => {
+            fd::decode(bytes).map(|(received, ticks, rest)| (Record::ReceivedFd(received), ticks, rest))
+        }
         [qualified @ QUALIFIED..fd::FD, header @ FRAME..=0xFF, ref rest @ ..] => {
             let qualifiers = qualified & !QUALIFIER_MASK;
             if qualified & QUALIFIER_MASK != QUALIFIED || qualifiers == 0 {
@@ -323,20 +270,6 @@ fn decode_frame(qualifiers: u8, header: u8, rest: &[u8]) -> Result<(Record, i64,
     let channel = if header & 0x40 == 0 { Channel::Can1 } else { Channel::Can2 };
     let frame = Frame::from_clean_parts(id, remote, dlc, data);
     Ok((Record::Received(Received { channel, frame, stamp, data_omitted }), ticks, rest))
-}
-
-/// The identifier behind a header, and what follows it.
-#[inline(always)]
-#[allow(clippy::inline_always, reason = "a part of `decode_frame`")]
-fn take_id(header: u8, rest: &[u8]) -> Result<(Id, &[u8]), BadRecord> {
-    let (id, rest) = if header & 0x20 == 0 {
-        let (raw, rest) = rest.split_first_chunk::<2>().ok_or(BadRecord)?;
-        (Id::standard(u32::from(u16::from_le_bytes(*raw))), rest)
-    } else {
-        let (raw, rest) = rest.split_first_chunk::<4>().ok_or(BadRecord)?;
-        (Id::extended(u32::from_le_bytes(*raw)), rest)
-    };
-    Ok((id.ok_or(BadRecord)?, rest))
 }
 
 /// What must be known about a record to pass it on.

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use anyhow::bail;
 use cantap::Channel;
-use cantap_analysis::delay::{Expected, Matching, Options};
+use cantap_analysis::delay::{DelayOptions, Expected, Matching};
 use cantap_trace::filter::{Filter, passes};
 use cantap_trace::{TraceEvent, TraceFrame};
 use cantap_work::gateway::{Map, Rules};
@@ -81,7 +81,7 @@ pub fn run(mut args: Args) -> anyhow::Result<ExitCode> {
     let map = args.map.as_deref().map(|path| map(path, args.from, args.to)).transpose()?;
     let filters = args.read.filters(&args.databases.load(args.read.strict, false)?)?;
     let mut records = args.read.open_either(args.input.as_ref(), &args.live, Vec::new())?;
-    let options = Options {
+    let options = DelayOptions {
         from: args.from,
         to: args.to,
         within_ns: i64::try_from(args.within.as_nanos()).unwrap_or(i64::MAX).max(1),
@@ -124,7 +124,7 @@ fn map(path: &Path, from: u8, to: u8) -> anyhow::Result<Map> {
 
 fn analyse<M: FnMut(&TraceFrame) -> Option<Expected>>(
     mut matching: Matching<M>,
-    options: Options,
+    options: DelayOptions,
     filters: &[Filter],
     records: &mut Records,
 ) -> anyhow::Result<Output> {

@@ -129,8 +129,7 @@ impl Records {
 
 /// A message as python-can's constructor takes it: time, identifier, whether it is extended, remote, an error; channel from 0, length
 /// code (of CAN FD: the number of bytes), data, whether it is CAN FD, whether it was received, its bit rate is switched, its sender is passive.
-type Message<'py> =
-    (f64, u32, bool, bool, bool, u8, u8, Bound<'py, PyByteArray>, bool, bool, bool, bool);
+type Message<'py> = (f64, u32, bool, bool, bool, u8, u8, Bound<'py, PyByteArray>, bool, bool, bool, bool);
 
 fn message<'py>(py: Python<'py>, record: &TraceRecord) -> Message<'py> {
     let time_s = record.time_ns as f64 / 1e9;

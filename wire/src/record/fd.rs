@@ -4,9 +4,8 @@
 use cantap_can::FdFrame;
 use cantap_can::fd::{FD_LENGTHS, FD_MAX_BYTES};
 
-use super::{
-    BadRecord, FRAME, MAX_TICKS, NO_DATA, NO_STAMP, Record, Stamp, UPPER_BOUND, decode_ticks, encode_ticks,
-    take_id,
+use super::parts::{
+    BadRecord, FRAME, MAX_TICKS, NO_DATA, NO_STAMP, Stamp, UPPER_BOUND, decode_ticks, encode_ticks, take_id,
 };
 use crate::Channel;
 
@@ -62,7 +61,7 @@ pub fn encode_received_fd(received: &ReceivedFd, ticks: i64, out: &mut [u8; MAX_
 }
 
 /// Reads a received FD frame.
-pub(super) fn decode(bytes: &[u8]) -> Result<(Record, i64, &[u8]), BadRecord> {
+pub(super) fn decode(bytes: &[u8]) -> Result<(ReceivedFd, i64, &[u8]), BadRecord> {
     let [qualifiers @ FD..=LAST_FD, header @ FRAME..=0xFF, ref rest @ ..] = *bytes else {
         return Err(BadRecord);
     };
@@ -86,7 +85,7 @@ pub(super) fn decode(bytes: &[u8]) -> Result<(Record, i64, &[u8]), BadRecord> {
     };
     let channel = if header & 0x40 == 0 { Channel::Can1 } else { Channel::Can2 };
     let frame = FdFrame::new(id, qualifiers & BRS != 0, qualifiers & ESI != 0, data).ok_or(BadRecord)?;
-    Ok((Record::ReceivedFd(ReceivedFd { channel, frame, stamp, data_omitted }), ticks, rest))
+    Ok((ReceivedFd { channel, frame, stamp, data_omitted }, ticks, rest))
 }
 
 #[cfg(test)]

@@ -14,7 +14,7 @@ use cantap_work::channel_options::{ChannelOptions, description};
 use cantap_work::gateway::Rules;
 use cantap_work::interrupt;
 
-use super::Args;
+use super::arguments::Args;
 use super::counts::{Counts, Named};
 use crate::exit;
 use crate::stderr;

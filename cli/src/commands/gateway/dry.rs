@@ -11,7 +11,7 @@ use cantap_work::gateway::{DryRun, DryRunCounts, Rules, Sent};
 use cantap_work::missing::Missing;
 use serde_json::{Value, json};
 
-use super::Args;
+use super::arguments::Args;
 use crate::trace_output::TraceOutput;
 
 /// Runs it.

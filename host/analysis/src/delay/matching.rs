@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BinaryHeap, HashMap, VecDeque};
 use cantap_trace::{Id, LossStage, TraceEvent, TraceFrame, TraceRecord};
 
 use super::run::{Pair, Run, Waiting};
-use super::{Expected, Figures, Key, MOST_IDS, Options, Outcome};
+use super::{DelayOptions, Expected, Figures, Key, MOST_IDS, Outcome};
 
 /// Records of two channels may be this much out of order.
 const DISORDER_NS: i64 = 10_000_000;
@@ -66,7 +66,7 @@ impl Side {
 ///
 /// Records must be in order of time, each channel's at least; between channels 10 ms of disorder do no harm.
 pub struct Matching<M> {
-    options: Options,
+    options: DelayOptions,
     /// What is expected for a frame of the first channel; `None` if nothing is.
     map: M,
     now_ns: i64,
@@ -93,7 +93,7 @@ pub struct Matching<M> {
 
 impl<M: FnMut(&TraceFrame) -> Option<Expected>> Matching<M> {
     /// Begins. `map` says what is expected on the second channel for a frame of the first; it is called for each, in order.
-    pub fn new(options: Options, map: M) -> Self {
+    pub fn new(options: DelayOptions, map: M) -> Self {
         Self {
             options,
             map,

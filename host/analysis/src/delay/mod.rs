@@ -25,7 +25,7 @@ pub use matching::Matching;
 
 /// Which frames to find again.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Options {
+pub struct DelayOptions {
     /// The channel, from 1, whose frames are expected on the other.
     pub from: u8,
     /// That channel.

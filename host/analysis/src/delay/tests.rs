@@ -1,10 +1,10 @@
 use cantap_trace::{Direction, LossStage, TraceEvent, TraceFrame, TraceRecord};
 use proptest::prelude::*;
 
-use super::{Expected, Matching, Options, Outcome};
+use super::{DelayOptions, Expected, Matching, Outcome};
 
 const MS: i64 = 1_000_000;
-const OPTIONS: Options = Options { from: 1, to: 2, within_ns: 100 * MS };
+const OPTIONS: DelayOptions = DelayOptions { from: 1, to: 2, within_ns: 100 * MS };
 
 /// A frame on a channel, at a time in milliseconds.
 fn on(channel: u8, ms: i64, frame: &str) -> TraceRecord {

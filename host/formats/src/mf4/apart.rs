@@ -6,7 +6,10 @@ use super::super::issue::Fault;
 use super::super::whole::Whole;
 use super::blocks::u32_at;
 use super::layout::{Apart, Elsewhere};
-use super::part::MAX_APART;
+
+/// Limit for records waiting for their bytes and bytes waiting for their records: if they are farther apart,
+/// the file is damaged.
+pub(super) const MAX_APART: usize = 1 << 16;
 
 /// Values by their position in the stream of all values of their group.
 #[derive(Default)]

@@ -14,7 +14,8 @@ use super::blocks::{BLOCK_HEAD_BYTES, u16_at, u64_at};
 use super::comment::{Properties, properties};
 use super::joined::{after_blocks, joined};
 use super::layout::Alone;
-use super::part::{Item, OPEN_LENGTH, Part, own};
+use super::order::Item;
+use super::part::{OPEN_LENGTH, Part, own};
 use super::{FILE_MAGIC, HEADER_AT, UNFINISHED_MAGIC};
 use cantap_trace::PlainFrame;
 

@@ -5,7 +5,23 @@
 
 use std::collections::BTreeMap;
 
-use super::part::Item;
+use cantap_trace::TraceRecord;
+
+use super::super::issue::Fault;
+
+/// What a part yields next.
+pub(super) enum Item {
+    Record(TraceRecord),
+    LeftOut(&'static str),
+    Fault(u64, Fault),
+}
+
+impl Item {
+    /// The content of the record at a place, or what is wrong with it.
+    pub fn of(record: Result<TraceRecord, Fault>, place: u64) -> Self {
+        record.map_or_else(|fault| Self::Fault(place, fault), Self::Record)
+    }
+}
 
 /// How far behind others a record is looked for.
 const WINDOW_NS: i64 = 1_000_000_000;

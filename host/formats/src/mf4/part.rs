@@ -3,17 +3,17 @@
 use std::collections::{HashMap, VecDeque};
 use std::io;
 
-use cantap_trace::{PlainFrame, TraceRecord};
+use cantap_trace::PlainFrame;
 
 use super::super::codec::PLAIN_BATCH;
 use super::super::issue::Fault;
 use super::super::whole::Whole;
-use super::apart::{Values, has_arrived};
+use super::apart::{MAX_APART, Values, has_arrived};
 use super::blocks::{BLOCK_HEAD_BYTES, Block, u32_at};
 use super::channel::Row;
 use super::joined::joined;
 use super::layout::{Alone, Content, Group, RecordBytes, Times};
-use super::order::Order;
+use super::order::{Item, Order};
 use super::plain::Plain;
 use super::stream::Stream;
 
@@ -24,26 +24,8 @@ pub(super) const OPEN_COUNTERS: u16 = 1;
 pub(super) const OPEN_LENGTH: u16 = 4;
 const OPEN_PLACES: u16 = 0x40;
 
-/// Limit for records waiting for their bytes and bytes waiting for their records: if they are farther apart,
-/// the file is damaged.
-pub(super) const MAX_APART: usize = 1 << 16;
-
 /// Longest value of a variable-length record; a frame has 64 bytes.
 const MAX_VALUE_BYTES: usize = 1 << 20;
-
-/// What a part yields next.
-pub(super) enum Item {
-    Record(TraceRecord),
-    LeftOut(&'static str),
-    Fault(u64, Fault),
-}
-
-impl Item {
-    /// The content of the record at a place, or what is wrong with it.
-    fn of(record: Result<TraceRecord, Fault>, place: u64) -> Self {
-        record.map_or_else(|fault| Self::Fault(place, fault), Self::Record)
-    }
-}
 
 /// A stream of records, of one or several groups.
 pub(super) struct Part {

@@ -1,6 +1,6 @@
 use cantap::Channel;
 use cantap::wire::message::{FrameKind, Modifier};
-use cantap_analysis::delay::{Matching, Options, Outcome};
+use cantap_analysis::delay::{DelayOptions, Matching, Outcome};
 use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
 use proptest::prelude::*;
 
@@ -179,7 +179,7 @@ fn found_again(rules: &Rules, records: &[TraceRecord]) -> (Outcome, DryRunCounts
     let mut all = [records, &sent.iter().map(Sent::record).collect::<Vec<_>>()].concat();
     all.sort_by_key(|record| record.time_ns);
     let map = Map::new(rules, Channel::Can1);
-    let options = Options { from: 1, to: 2, within_ns: 100 * MS };
+    let options = DelayOptions { from: 1, to: 2, within_ns: 100 * MS };
     let mut matching = Matching::new(options, |frame: &TraceFrame| map.expected(frame));
     for record in &all {
         matching.push(record, true);

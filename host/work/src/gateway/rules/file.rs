@@ -13,7 +13,7 @@ use serde::Deserialize;
 use toml::Spanned;
 
 use super::super::text::{bytes, checksum, counter};
-use super::{Rule, RulesError};
+use super::rule::{Rule, RulesError};
 use crate::channels::channel_number;
 
 /// The longest period and delay. In a device they are ticks of 32 bits.

@@ -318,6 +318,7 @@ pub fn outline(bytes: &[u8]) -> Result<Outline, BadRecord> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Id;
     use proptest::prelude::*;
 
     fn id() -> impl Strategy<Value = Id> {

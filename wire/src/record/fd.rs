@@ -92,6 +92,7 @@ pub(super) fn decode(bytes: &[u8]) -> Result<(ReceivedFd, i64, &[u8]), BadRecord
 mod tests {
     use super::*;
     use crate::Id;
+    use crate::Record;
     use crate::record::Outline;
     use proptest::prelude::*;
 

@@ -2,13 +2,13 @@
 
 use std::io::Write;
 
-use cantap_analysis::delay::{Delays, Figures, Options, Outcome, STEPS_NS};
+use cantap_analysis::delay::{DelayOptions, Delays, Figures, Outcome, STEPS_NS};
 use cantap_work::missing::Missing;
 use serde_json::{Value, json};
 
 /// What was found.
 pub struct Output {
-    pub options: Options,
+    pub options: DelayOptions,
     pub outcome: Outcome,
 }
 
@@ -25,7 +25,7 @@ fn ms(ns: f64) -> f64 {
 impl Output {
     /// As text.
     pub fn print(&self, out: &mut impl Write) -> std::io::Result<()> {
-        let Options { from, to, within_ns } = self.options;
+        let DelayOptions { from, to, within_ns } = self.options;
         writeln!(
             out,
             "channel {from} to channel {to}, within {} ms; delays in ms, from end of frame to end of frame\n",
@@ -51,7 +51,7 @@ impl Output {
     /// What limits the figures, one sentence each.
     fn notes(&self) -> Vec<String> {
         let Outcome { total, not_expected, beyond, step_ns, uncounted, breaks, .. } = &self.outcome;
-        let Options { from, to, .. } = self.options;
+        let DelayOptions { from, to, .. } = self.options;
         let undecided = &total.undecided;
         let shortest_ms = total.shortest_repeat_ns.map_or(0.0, |ns| ms(ns as f64));
         let counted = [

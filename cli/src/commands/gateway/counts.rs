@@ -1,5 +1,6 @@
 //! What a device's gateway has done, as text and as JSON.
 
+use std::fmt::Write as _;
 use std::io::Write;
 
 use cantap::wire::message::{FrameKind, GatewayEnd, GatewayRule, GatewayState, RuleCounts};
@@ -155,7 +156,7 @@ impl Counts {
                 (u64::from(*waiting), "waiting"),
             ] {
                 if count > 0 {
-                    text += &format!(", {count} {of}");
+                    let _ = write!(text, ", {count} {of}");
                 }
             }
             text

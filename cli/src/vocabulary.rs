@@ -37,7 +37,7 @@ const LETTERS: [(char, &[&str]); 20] = [
 const OF_CAN_UTILS: [(&str, &str); 2] = [("gen", "DEILRcefgimpx8"), ("replay", "Igilstx")];
 
 /// Options whose values do not follow from their name alone, with the reason.
-const MANY_KINDS: [(&str, &str); 8] = [
+const MANY_KINDS: [(&str, &str); 9] = [
     ("pair", "what asks an ECU has one pair; what reads a trace also knows makers' pairs"),
     ("count", "as in grep, search counts instead of printing; send's is a number"),
     ("id", "gen makes identifiers, search looks for them"),
@@ -45,10 +45,8 @@ const MANY_KINDS: [(&str, &str); 8] = [
     ("data", "gen makes data, search looks for them"),
     ("length", "gen's alone"),
     ("check", "diff says whether, align how much"),
-    (
-        "from",
-        "delay's is the channel that a gateway receives on; in what reads or writes a trace, its format",
-    ),
+    ("from", "delay's is the channel that a gateway receives on; elsewhere the format of a trace"),
+    ("to", "delay's is the channel that a gateway sends on; j1939's the address of a node"),
 ];
 
 /// Calls `see` with each command that does something, with its full name, and each of its options.

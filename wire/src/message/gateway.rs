@@ -71,7 +71,7 @@ impl Pass {
     }
 
     /// The frame as it is sent, before [`Self::modifiers`]; `None` if its identifier would have too many bits, which
-    /// [`GatewayRule::is_valid`] excludes.
+    /// [`GatewayRule::has_valid_ids`] excludes.
     pub fn changed(&self, frame: &Frame) -> Option<Frame> {
         let raw = frame.id().raw() & self.id_and ^ self.id_xor;
         let id = if self.extended { Id::extended(raw) } else { Id::standard(raw) }?;

@@ -16,6 +16,11 @@ use crate::usage_error::usage;
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let rules = args.rules.as_deref().map(Rules::read).transpose()?;
+    if args.dry_run.is_none() && !args.read.filter.is_empty() {
+        return Err(usage(
+            "-f chooses among the frames of a trace, with --dry-run; what a device passes on, the rules say",
+        ));
+    }
     if args.stop || args.forget {
         return device::stop(args);
     }

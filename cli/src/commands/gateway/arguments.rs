@@ -15,8 +15,6 @@ use crate::timing_args::TimingArgs;
 /// The command line.
 #[derive(clap::Args)]
 #[command(
-    // A device passes on what its rules say, and nothing is read.
-    mut_arg("filter", |filter| filter.requires("dry_run")),
     after_help = "The device acknowledges and sends on both its buses, until Ctrl-C. With --save it does so without a host, each time it starts. \
                   --dry-run applies the rules to a trace as a device does, between buses that are never busy; nothing is sent. docs/gateway.md \
                   describes the file of rules.\n\nExamples:\n  \

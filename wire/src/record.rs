@@ -310,6 +310,13 @@ pub fn outline(bytes: &[u8]) -> Result<Outline, BadRecord> {
             return Ok(Outline { len: bytes.len() - after.len(), ticks, frame_of: None });
         }
     }
+    outline_by_decoding(bytes)
+}
+
+/// Out of line: a whole record, with room for 64 bytes of data, has no place in the loop that packs.
+#[cold]
+#[inline(never)]
+fn outline_by_decoding(bytes: &[u8]) -> Result<Outline, BadRecord> {
     let (record, ticks, after) = decode(bytes)?;
     let frame_of = record.received_on();
     Ok(Outline { len: bytes.len() - after.len(), ticks, frame_of })

@@ -194,10 +194,7 @@ impl<'q, const N: usize> Capture<'q, N> {
             drain.room -= u32::from(taken);
             if let Some(frame) = frame {
                 let at = self.recorder.time(entered);
-                Self::write_frame(state, &mut self.recorder, channel, frame, at, Stamp::Exact);
-                if state.gaps.taken() {
-                    Self::record_gap(state, &mut self.recorder, channel, at);
-                }
+                Self::record(state, &mut self.recorder, channel, frame, at, Stamp::Exact);
             }
             state.gaps.looked(1, taken, traffic);
             let look = traffic.look();
@@ -272,7 +269,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         recorder.frame(&Received { channel, frame, stamp, data_omitted }, at);
     }
 
-    /// Records a frame that was taken out of the FIFO. Returns whether there are replies to it.
+    /// Records a frame that was taken out of the FIFO.
     #[inline(always)]
     #[expect(clippy::inline_always, reason = "measured, as for `Recorder::frame`")]
     fn record(
@@ -282,13 +279,11 @@ impl<'q, const N: usize> Capture<'q, N> {
         frame: Frame,
         at: u64,
         quality: Stamp,
-    ) -> bool {
-        let reply = state.transmitter.on_frame(&frame, at);
+    ) {
         Self::write_frame(state, recorder, channel, frame, at, quality);
         if state.gaps.taken() {
             Self::record_gap(state, recorder, channel, at);
         }
-        reply
     }
 
     /// A frame has ended while its channel leaves the bus: records it now, with the interrupt's stamp, and leaves it in the FIFO. From here on
@@ -362,10 +357,7 @@ impl<'q, const N: usize> Capture<'q, N> {
                     reply |= self.answer(channel, both, clock, &frame, at);
                 }
                 let state = &mut self.channels[index];
-                Self::write_frame(state, &mut self.recorder, channel, frame, at, quality);
-                if state.gaps.taken() {
-                    Self::record_gap(state, &mut self.recorder, channel, at);
-                }
+                Self::record(state, &mut self.recorder, channel, frame, at, quality);
             }
             self.channels[index].gaps.looked(pending, taken, &both[index]);
         }

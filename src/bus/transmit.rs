@@ -10,7 +10,7 @@
 use cantap_wire::message::{GATEWAY_TAG, Periodic, TRIGGER_TAG, Trigger, TxFrame};
 use cantap_wire::record::{LossStage, TransmitFailure};
 use cantap_wire::{Channel, Event, Frame};
-use heapless::{Deque, Vec};
+use heapless::Deque;
 
 use crate::bus::gateway::Lane;
 use crate::bus::mailboxes::{MAILBOXES, Mailboxes};
@@ -21,9 +21,6 @@ use crate::ports::{Outcome, Traffic};
 
 /// Frames that the queue holds: 28 ms of the shortest eight-byte frames at 1 Mbit/s.
 pub const TX_QUEUE: usize = 256;
-/// Frames received in one drain, with their times: six at most.
-pub type Caught = Vec<(Frame, u64), 6>;
-
 /// Replies.
 pub const TRIGGER_SLOTS: usize = 8;
 
@@ -80,8 +77,6 @@ pub struct Transmitter<'q> {
     lane: &'q mut Lane,
     /// The gateway runs.
     passing: bool,
-    /// What this channel has received, for the gateway to send on the other.
-    caught: Caught,
     /// Frames that the gateway has lost and that no record reports yet.
     unpassed: u32,
     /// Finished but not recorded yet. Every transmission must be confirmed, so if the record queue has no room, nothing
@@ -114,7 +109,6 @@ impl<'q> Transmitter<'q> {
             replies_waiting: 0,
             lane,
             passing: false,
-            caught: Vec::new(),
             unpassed: 0,
             unconfirmed: Deque::new(),
             dropping: None,
@@ -249,7 +243,6 @@ impl<'q> Transmitter<'q> {
         self.periodic.forget();
         self.passing = false;
         self.unpassed = 0;
-        self.caught.clear();
         self.lane.clear();
         self.clear_triggers();
         self.queue.clear();
@@ -304,24 +297,20 @@ impl<'q> Transmitter<'q> {
     /// The gateway ends: what waits is lost. What is in a mailbox is still sent.
     pub fn stop_passing(&mut self) {
         self.passing = false;
-        self.caught.clear();
         self.count_triggers();
         self.unpassed = self.unpassed.saturating_add(self.lane.give_up());
     }
 
-    /// The gateway sends on this channel what its rules make of the frames that the other has received.
+    /// The gateway is to send on this channel what its rules make of a frame that the other has received.
     #[inline]
-    pub fn pass_from(&mut self, other: &mut Self) {
-        for (frame, at) in &other.caught {
-            self.unpassed = self.unpassed.saturating_add(self.lane.admit(frame, *at));
-        }
-        other.caught.clear();
+    pub fn pass(&mut self, frame: &Frame, at: u64) {
+        self.unpassed = self.unpassed.saturating_add(self.lane.admit(frame, at));
     }
 
-    /// A frame was received: arms the replies that it triggers, and keeps it for the gateway. Returns whether there is anything to send.
+    /// A frame was received: arms the replies that it triggers. Returns whether there is one.
     #[inline]
-    pub fn on_frame(&mut self, frame: &Frame, at: u64) -> bool {
-        self.watching && self.arm_replies(frame, at)
+    pub fn on_frame(&mut self, frame: &Frame) -> bool {
+        self.watching && self.arm_replies(frame)
     }
 
     /// Whether received frames are looked at.
@@ -330,23 +319,16 @@ impl<'q> Transmitter<'q> {
         self.watching
     }
 
-    /// Whether a reply waits.
-    pub const fn is_replying(&self) -> bool {
-        self.replies_waiting > 0
-    }
-
     /// Separate from [`Self::on_frame`] and out of line, so that without replies the draining loop has the registers to itself.
     #[inline(never)]
-    fn arm_replies(&mut self, frame: &Frame, at: u64) -> bool {
-        // Cannot fail: a drain takes no more.
-        let caught = self.passing && self.caught.push((*frame, at)).is_ok();
+    fn arm_replies(&mut self, frame: &Frame) -> bool {
         for trigger in self.triggers.iter_mut().flatten() {
             if trigger.left != Some(0) && !trigger.waiting && trigger.entry.filter.matches(frame) {
                 trigger.waiting = true;
                 self.replies_waiting += 1;
             }
         }
-        caught || self.replies_waiting > 0
+        self.replies_waiting > 0
     }
 
     /// Mailboxes may have finished: records how, and fills them again. `reason` says why frames were aborted, if they were. Returns what
@@ -629,8 +611,8 @@ impl<'q> Transmitter<'q> {
         }
         let head = self.head_due();
         // A frame without a due time waits for something other than time.
-        let passing = if self.passing { self.lane.due() } else { NEVER };
-        self.periodic.due().min(if head == 0 { NEVER } else { head }).min(passing)
+        let due = self.periodic.due().min(if head == 0 { NEVER } else { head });
+        if self.passing { due.min(self.lane.due()) } else { due }
     }
 
     fn load(&mut self, tag: u32, frame: &Frame, traffic: &mut impl Traffic) -> bool {

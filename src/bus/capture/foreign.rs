@@ -20,7 +20,9 @@ impl<const N: usize> Capture<'_, N> {
         clock: &impl Clock,
     ) {
         let state = &mut self.channels[channel.index()];
-        if Self::record(state, &mut self.recorder, channel, frame, at, stamp) {
+        let reply = state.transmitter.on_frame(&frame);
+        Self::record(state, &mut self.recorder, channel, frame, at, stamp);
+        if reply {
             let now = self.recorder.time(clock.now());
             state.transmitter.service(traffic, &mut self.recorder, now);
         }

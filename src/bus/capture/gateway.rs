@@ -22,30 +22,27 @@ impl<const N: usize> Capture<'_, N> {
         frame: &Frame,
         at: u64,
     ) -> bool {
-        let transmitter = &mut self.channels[channel.index()].transmitter;
-        let any = transmitter.on_frame(frame, at);
-        let replies = transmitter.is_replying();
-        if any && self.gateway == GatewayState::Running {
-            let now = self.recorder.time(clock.now());
-            self.pass_on(channel, both, clock, now);
+        let replies = self.channels[channel.index()].transmitter.on_frame(frame);
+        if self.gateway == GatewayState::Running {
+            self.pass_on(other(channel), both, clock, frame, at);
         }
         replies
     }
 
-    /// The other channel sends what the rules make of the frame just received: it is compared with 32 rules, and two frames go into mailboxes.
+    /// This channel sends what the rules make of a frame that the other has just received: it is compared with 32 rules, and two frames go into
+    /// mailboxes.
     #[inline(never)]
-    pub(super) fn pass_on<T: Traffic>(
+    fn pass_on<T: Traffic>(
         &mut self,
-        channel: Channel,
+        to: Channel,
         traffic: &mut [T; CHANNELS],
         clock: &impl Clock,
-        now: u64,
+        frame: &Frame,
+        at: u64,
     ) {
-        let to = other(channel);
-        let [first, second] = &mut self.channels;
-        let (from, state) = if channel == Channel::Can1 { (first, second) } else { (second, first) };
-        let transmitter = &mut state.transmitter;
-        transmitter.pass_from(&mut from.transmitter);
+        let now = self.recorder.time(clock.now());
+        let transmitter = &mut self.channels[to.index()].transmitter;
+        transmitter.pass(frame, at);
         if transmitter.lane().is_loop() {
             return self.end_gateway(GatewayState::Ended(GatewayEnd::Loop));
         }

@@ -20,11 +20,12 @@
 enum { PROTOCOL = 6, MAX_MESSAGE = 2048, MAX_ENCODED = MAX_MESSAGE + 4 + 9 + 1, HELLO = 0, OWN_TAG = 7 };
 
 static const char *const REPLIES[] = {"Hello", "Done", "Opened", "Status", "Time", "Filters", "Queued", "Registers", "Defaults",
-                                      "Failures", "Edges"};
+                                      "Failures", "Edges", "Gateway", "GatewayRule"};
 static const char *const REFUSALS[] = {"Protocol", "Malformed", "NoSession", "Unsupported", "BadTiming", "BadId", "BadDlc",
                                        "BadTag", "BadEntry", "BadSlot", "ChannelOpen", "ChannelClosed", "ListenOnly", "QueueFull",
                                        "BanksExhausted", "WouldDisturb", "TooFarAhead", "Hardware", "NothingSaved", "NotBusOff",
-                                       "NotMeasuring", "NotGranted", "Held", "OtherSettings", "NoBoard"};
+                                       "NotMeasuring", "NotGranted", "Held", "OtherSettings", "NoBoard",
+                                       "NotNormal", "GatewayRunning"};
 static const char *const STAGES[] = {"controller", "queue", "link", "host", "gateway"};
 static const char *const ERRORS[] = {"stuff", "form", "acknowledgment", "bit-recessive", "bit-dominant", "crc"};
 static const char *const STATES[] = {"active", "warning", "passive", "bus-off"};

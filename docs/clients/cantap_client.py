@@ -7,10 +7,10 @@
 import os, select, sys, time, tty, zlib
 
 PROTOCOL = 6
-REPLIES = "Hello Done Opened Status Time Filters Queued Registers Defaults Failures Edges".split()
+REPLIES = "Hello Done Opened Status Time Filters Queued Registers Defaults Failures Edges Gateway GatewayRule".split()
 REFUSALS = ("Protocol Malformed NoSession Unsupported BadTiming BadId BadDlc BadTag BadEntry BadSlot ChannelOpen ChannelClosed "
             "ListenOnly QueueFull BanksExhausted WouldDisturb TooFarAhead Hardware NothingSaved NotBusOff "
-            "NotMeasuring NotGranted Held OtherSettings NoBoard").split()
+            "NotMeasuring NotGranted Held OtherSettings NoBoard NotNormal GatewayRunning").split()
 NUMBERS = {"Protocol": 1, "QueueFull": 1, "BanksExhausted": 2, "NotGranted": 1}  # numbers after a refusal
 STAGES = "controller queue link host gateway".split()
 ERRORS = "stuff form acknowledgment bit-recessive bit-dominant crc".split()

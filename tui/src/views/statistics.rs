@@ -100,7 +100,10 @@ fn channel_lines(
     let style = if errors > 0 { theme.error() } else { theme.label() };
     lines.push(Line::styled(format!("Errors    {errors:>10}   {}", kinds.join(", ")), style));
     let losses = &channel.losses;
-    let stages = LossStage::ALL.map(|stage| format!("{} {}", stage.name(), losses.of(stage)));
+    // Few boards are a gateway.
+    let shown = |stage: &LossStage| *stage != LossStage::Gateway || losses.of(*stage) > 0;
+    let stages = LossStage::ALL.into_iter().filter(shown);
+    let stages: Vec<_> = stages.map(|stage| format!("{} {}", stage.name(), losses.of(stage))).collect();
     let style = if losses.gaps > 0 { theme.loss() } else { theme.label() };
     // Where nothing was counted and something may be missing, zero would be a claim.
     let (total, least) = match (losses.total(), losses.at_least) {

@@ -106,6 +106,8 @@ fn offer_devices(current: &OsStr) -> Vec<CompletionCandidate> {
         ("virtual", "a simulated device, which needs no board"),
         ("virtual:car", "the same, with a vehicle on its buses"),
         ("gs_usb:", "a gs_usb adapter, such as candleLight or CANable"),
+        ("pcan:", "an adapter of PEAK's, through PCAN-Basic"),
+        ("kvaser:", "an adapter of Kvaser's, through CANlib"),
     ];
     let interfaces = cantap_adapters::can_interfaces();
     let interfaces = interfaces.into_iter().map(|name| (name, "a CAN interface of this computer".to_owned()));

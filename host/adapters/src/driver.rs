@@ -101,6 +101,32 @@ pub enum OpenError {
         /// As given.
         data_bitrate_bps: u32,
     },
+    /// The maker's library is not there, or not one.
+    #[error("'{address}': {source}")]
+    Library {
+        /// As given.
+        address: String,
+        /// Why, and what to do.
+        source: cantap_vendor::LoadError,
+    },
+    /// The maker's library has no such channel, or several from which to choose.
+    #[error("'{address}' is no single channel: {there}; name one, as in {example}")]
+    NoChannel {
+        /// As given.
+        address: String,
+        /// Those that there are.
+        there: String,
+        /// How one is written.
+        example: String,
+    },
+    /// The channel cannot be used now.
+    #[error("'{address}' cannot be used: {reason}")]
+    Channel {
+        /// As given.
+        address: String,
+        /// Why, and what to do.
+        reason: String,
+    },
     /// The chip lacks what is needed to listen with it.
     #[error(
         "'{address}' is a copy of an ELM327 that refuses {command}: its lines are no frames, and another adapter is needed"
@@ -119,6 +145,21 @@ pub enum OpenError {
         /// What is wrong with it.
         reason: String,
     },
+}
+
+impl OpenError {
+    /// No channel was named where there are several, or one that is not there.
+    pub(crate) fn no_channel(address: &str, there: &[impl std::fmt::Display]) -> Self {
+        let scheme = address.split(':').next().unwrap_or_default();
+        let example = if scheme == "pcan" { "pcan:PCAN_USBBUS1" } else { "kvaser:0" }.to_owned();
+        let there = match there {
+            [] => "there is none; plug the adapter in, and look whether its driver is installed".to_owned(),
+            there => {
+                format!("there are {}", there.iter().map(ToString::to_string).collect::<Vec<_>>().join(", "))
+            }
+        };
+        Self::NoChannel { address: address.to_owned(), there, example }
+    }
 }
 
 /// How a channel is opened.

@@ -14,6 +14,7 @@
 #![forbid(unsafe_code)]
 
 mod adapter_clock;
+mod bit_limits;
 mod board;
 mod cannelloni;
 mod driver;
@@ -24,8 +25,11 @@ mod gs_usb;
 mod gvret;
 mod in_order;
 mod interface_name;
+mod kvaser;
 mod line;
 mod mailboxes;
+mod maker_options;
+mod pcan;
 mod place;
 pub mod raw_can;
 mod rows;
@@ -36,6 +40,7 @@ mod socketcand;
 mod source;
 mod text_lines;
 mod trace_pipe;
+mod under_way;
 
 pub use driver::OpenError;
 pub use place::{BadPlace, Place, can_interfaces, open};

@@ -6,6 +6,7 @@ use std::str::FromStr;
 use cantap::device::Link;
 use cantap_formats::Format;
 use cantap_trace::grammar::bit_rate;
+use cantap_vendor::pcan_basic;
 
 use crate::cannelloni::{self, Cannelloni};
 use crate::driver::{Driver, OpenError};
@@ -14,7 +15,10 @@ use crate::engine;
 use crate::gs_usb::{self, GsUsb};
 use crate::gvret::{self, Gvret};
 use crate::interface_name;
+use crate::kvaser::{self, Kvaser};
 use crate::line::Line;
+use crate::maker_options::MakerOptions;
+use crate::pcan::Pcan;
 use crate::slcan::{self, Slcan};
 #[cfg(target_os = "linux")]
 use crate::socketcan::exists;
@@ -27,7 +31,7 @@ fn exists(_: &str) -> bool {
     false
 }
 
-/// An adapter's place: `can0`, `socketcan:can0`, `slcan:/dev/ttyACM0@115200`, `gvret:tcp://192.168.4.1`, `elm327:tcp://192.168.0.10`,
+/// An adapter's place: `can0`, `socketcan:can0`, `slcan:/dev/ttyACM0@115200`, `gvret:tcp://192.168.4.1`, `pcan:PCAN_USBBUS1`, `kvaser:0`, `elm327:tcp://192.168.0.10`,
 /// `stn:/dev/ttyUSB0`, `socketcand://HOST/can0`, `cannelloni://HOST:PORT`, `candump:-`, `pcapng:-`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Place {
@@ -43,6 +47,8 @@ enum Kind {
     Elm327 { family: Family, place: ElmPlace, ids: Option<Ids> },
     Socketcan { interface: String },
     GsUsb { serial: String, options: gs_usb::Options },
+    Pcan { channel: Option<pcan_basic::Channel>, options: MakerOptions },
+    Kvaser { which: kvaser::Which, options: MakerOptions },
     Socketcand { host: String, interface: String },
     Cannelloni { host: String, listen: u16 },
     Trace { path: String, format: TraceFormat },
@@ -66,11 +72,13 @@ enum TraceFormat {
 pub struct BadPlace(String);
 
 /// What addresses of adapters begin with.
-const SCHEMES: [&str; 10] = [
+const SCHEMES: [&str; 12] = [
     "socketcan:",
     "gs_usb:",
     "slcan:",
     "gvret:",
+    "pcan:",
+    "kvaser:",
     "elm327:",
     "stn:",
     "socketcand:",
@@ -100,6 +108,7 @@ impl Place {
         match &self.kind {
             Kind::Socketcan { interface } => data_bitrate_of(interface),
             Kind::GsUsb { options, .. } => options.data_bitrate_bps,
+            Kind::Pcan { options, .. } | Kind::Kvaser { options, .. } => options.data_bitrate_bps,
             _ => None,
         }
     }
@@ -157,6 +166,10 @@ impl FromStr for Place {
             })?,
             "stn" => elm327_of(Family::Stn, rest)
                 .ok_or_else(|| bad("write stn:PORT, stn:PORT@BAUD or stn:tcp://HOST:PORT"))?,
+            "pcan" => pcan_of(rest)?,
+            "kvaser" => kvaser_of(rest).ok_or_else(|| {
+                bad("write kvaser: or kvaser:CHANNEL with CANlib's number, from 0, and after it ?data-bitrate=2M for CAN FD or ?library=PATH for a library that is not the system's")
+            })?,
             "socketcand" => {
                 let place = rest.strip_prefix("//").and_then(|rest| rest.split_once('/'));
                 let is_name = |name: &str| {
@@ -177,7 +190,7 @@ impl FromStr for Place {
                 Kind::Trace { path: rest.to_owned(), format }
             }
             "candump" | "pcapng" => return Err(bad("name the pipe, as in candump:- for standard input")),
-            _ => return Err(bad("it is no CAN interface's name, and begins with none of socketcan:, gs_usb:, slcan:, gvret:, elm327:, stn:, socketcand:, cannelloni:, candump:, pcapng:")),
+            _ => return Err(bad("it is no CAN interface's name, and begins with none of socketcan:, gs_usb:, slcan:, gvret:, pcan:, kvaser:, elm327:, stn:, socketcand:, cannelloni:, candump:, pcapng:")),
         };
         Ok(Self { text: text.to_owned(), kind })
     }
@@ -210,6 +223,42 @@ fn gs_usb_of(rest: &str) -> Option<Kind> {
     }
     let is_serial = serial.chars().all(|letter| letter.is_ascii_graphic());
     is_serial.then(|| Kind::GsUsb { serial: serial.to_owned(), options })
+}
+
+/// What an address of a maker's adapter has behind its channel.
+fn maker_options(texts: Option<&str>) -> Option<MakerOptions> {
+    let mut options = MakerOptions::default();
+    for text in texts.into_iter().flat_map(|texts| texts.split('&')) {
+        match text.split_once('=')? {
+            ("data-bitrate", rate) => options.data_bitrate_bps = Some(bit_rate(rate).ok()?),
+            ("library", path) if !path.is_empty() => options.library = Some(path.into()),
+            _ => return None,
+        }
+    }
+    Some(options)
+}
+
+fn pcan_of(rest: &str) -> Result<Kind, BadPlace> {
+    let (channel, texts) =
+        rest.split_once('?').map_or((rest, None), |(channel, texts)| (channel, Some(texts)));
+    let options = maker_options(texts).ok_or_else(|| {
+        BadPlace("behind pcan:CHANNEL write ?data-bitrate=2M for CAN FD or ?library=PATH for a library that is not the system's".to_owned())
+    })?;
+    let channel = if channel.is_empty() {
+        None
+    } else {
+        Some(channel.parse().map_err(|error: pcan_basic::BadChannel| BadPlace(error.to_string()))?)
+    };
+    Ok(Kind::Pcan { channel, options })
+}
+
+fn kvaser_of(rest: &str) -> Option<Kind> {
+    let (channel, texts) =
+        rest.split_once('?').map_or((rest, None), |(channel, texts)| (channel, Some(texts)));
+    let options = maker_options(texts)?;
+    let which =
+        if channel.is_empty() { kvaser::Which::Only } else { kvaser::Which::Number(channel.parse().ok()?) };
+    Some(Kind::Kvaser { which, options })
 }
 
 fn elm327_of(family: Family, rest: &str) -> Option<Kind> {
@@ -270,6 +319,8 @@ pub fn open(place: &Place) -> Result<Link, OpenError> {
         }
         Kind::Socketcan { interface } => socketcan(interface, address)?,
         Kind::GsUsb { serial, options } => Box::new(GsUsb::connect(serial, *options, address)?),
+        Kind::Pcan { channel, options } => Box::new(Pcan::connect(*channel, options.clone(), address)?),
+        Kind::Kvaser { which, options } => Box::new(Kvaser::connect(*which, options.clone(), address)?),
         Kind::Socketcand { host, interface } => Box::new(Socketcand::connect(host, interface, address)?),
         Kind::Cannelloni { host, listen } => Box::new(Cannelloni::connect(host, *listen, address)?),
         Kind::Trace { path, format } => {
@@ -337,6 +388,11 @@ mod tests {
             "gvret:/dev/ttyUSB0",
             "gvret:tcp://192.168.4.1",
             "gvret:tcp://[::1]:2300",
+            "pcan:",
+            "pcan:PCAN_USBBUS1",
+            "pcan:usbbus2?data-bitrate=2M",
+            "kvaser:",
+            "kvaser:1?library=/opt/lib/libcanlib.so",
             "elm327:/dev/rfcomm0",
             "elm327:COM4@115200?ids=extended",
             "elm327:tcp://192.168.0.10",
@@ -368,6 +424,10 @@ mod tests {
             "gvret:",
             "gvret:tcp://",
             "gvret:tcp://a:b",
+            "pcan:USB1",
+            "pcan:PCAN_USBBUS1?data-bitrate=fast",
+            "kvaser:first",
+            "kvaser:0?library=",
             "elm327:",
             "elm327:tcp://",
             "elm327:COM4?ids=all",

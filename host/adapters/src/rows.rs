@@ -102,7 +102,7 @@ pub struct Row {
 }
 
 /// All kinds.
-pub const ROWS: [Row; 25] = [
+pub const ROWS: [Row; 27] = [
     Row {
         board: "slcan",
         what: "an slcan adapter that answers (Lawicel's protocol)",
@@ -143,6 +143,34 @@ pub const ROWS: [Row; 25] = [
         losses: Losses::NotReported,
         errors: "not reported",
         confirmation: Confirmation::HandedOver,
+        listen_only: ListenOnly::Confirmed,
+        sets_bit_rate: true,
+        limits: None,
+    },
+    Row {
+        board: "pcan",
+        what: "an adapter of PEAK's, through PCAN-Basic",
+        stamps: Stamps::Adapter {
+            grain_ns: 1_000,
+            when: "its receiving the frame, as its driver reports it",
+        },
+        losses: Losses::Flags,
+        errors: "states, and error frames with a stuff or form error's kind",
+        confirmation: Confirmation::Accepted,
+        listen_only: ListenOnly::Confirmed,
+        sets_bit_rate: true,
+        limits: None,
+    },
+    Row {
+        board: "kvaser",
+        what: "an adapter of Kvaser's, through CANlib",
+        stamps: Stamps::Adapter {
+            grain_ns: 1_000,
+            when: "its receiving the frame, as its driver reports it",
+        },
+        losses: Losses::Flags,
+        errors: "states and counters, and each error frame",
+        confirmation: Confirmation::OnTheBus,
         listen_only: ListenOnly::Confirmed,
         sets_bit_rate: true,
         limits: None,

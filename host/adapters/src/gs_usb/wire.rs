@@ -1,13 +1,12 @@
 //! What crosses USB: Linux's `drivers/net/can/usb/gs_usb.c` and candleLight's `include/gs_usb.h`. Numbers have the lowest byte first.
 
-use std::cmp::Reverse;
-use std::ops::RangeInclusive;
-
 use cantap_trace::TraceFrame;
 use cantap_trace::fd::FD_LENGTHS;
 use cantap_trace::socketcan::{ERROR_FLAG, ErrorFrame};
 use cantap_wire::record::ErrorState;
-use cantap_wire::{BitTiming, FdFrame, Frame, Id};
+use cantap_wire::{FdFrame, Frame, Id};
+
+use crate::bit_limits::{Limits, Timing};
 
 /// Vendor requests to the interface.
 pub(super) mod request {
@@ -49,8 +48,6 @@ const FLAG_BRS: u8 = 4;
 const FLAG_ESI: u8 = 8;
 const EXTENDED: u32 = 1 << 31;
 const REMOTE: u32 = 1 << 30;
-/// Where the bits of data phases are sampled, in thousandths: Linux's own choice above 800 kbit/s (`can_calc_bittiming`).
-const DATA_SAMPLE_POINT_PERMILLE: u32 = 750;
 /// Bytes before the data.
 const HEADER: usize = 12;
 
@@ -77,23 +74,13 @@ pub(super) struct Constants {
     data: Option<Limits>,
 }
 
-/// What a bit timing may be.
-#[derive(Clone, Debug, PartialEq, Eq)]
-struct Limits {
-    segment1: RangeInclusive<u32>,
-    segment2: RangeInclusive<u32>,
-    jump_width_max: u32,
-    prescaler: RangeInclusive<u32>,
-    prescaler_step: u32,
-}
-
 impl Constants {
     pub fn parse(bytes: &[u8]) -> Option<Self> {
         Some(Self {
             features: word(bytes, 0)?,
             clock_hz: word(bytes, 1)?,
-            nominal: Limits::parse(bytes, 2)?,
-            data: Limits::parse(bytes, 10),
+            nominal: limits(bytes, 2)?,
+            data: limits(bytes, 10),
         })
     }
 
@@ -103,69 +90,34 @@ impl Constants {
 
     /// The request's data for a bit rate; `None` if this channel's clock cannot be divided to it. A sample point within what is possible.
     pub fn timing(&self, bitrate_bps: u32, sample_point_permille: u32) -> Option<Vec<u8>> {
-        let limits = &self.nominal;
-        let fits = |timing: &BitTiming| {
-            let prescaler = u32::from(timing.prescaler);
-            limits.prescaler.contains(&prescaler)
-                && (prescaler - limits.prescaler.start()).is_multiple_of(limits.prescaler_step.max(1))
-                && limits.segment1.contains(&u32::from(timing.segment1))
-                && limits.segment2.contains(&u32::from(timing.segment2))
-        };
-        let best = BitTiming::all(self.clock_hz, bitrate_bps).filter(fits).min_by_key(|timing| {
-            let off = timing.sample_point_permille().abs_diff(sample_point_permille);
-            (off, Reverse(timing.quanta()))
-        })?;
-        let (segment1, segment2) = (u32::from(best.segment1), u32::from(best.segment2));
-        let jump_width = best.quanta() / 8;
-        Some(self.nominal.timing(segment1, segment2, jump_width, best.prescaler.into()))
+        self.nominal.nominal(self.clock_hz, bitrate_bps, sample_point_permille).map(request_of)
     }
 
-    /// The same for the data phases of CAN FD frames, sampled at [`DATA_SAMPLE_POINT_PERMILLE`], with the largest jump width; `None` also if
-    /// the channel has no CAN FD.
+    /// The same for the data phases of CAN FD frames; `None` also if the channel has no CAN FD.
     pub fn data_timing(&self, bitrate_bps: u32) -> Option<Vec<u8>> {
         let limits = self.data.as_ref().filter(|_| self.has(feature::FD))?;
-        let (first, last) = (*limits.prescaler.start(), *limits.prescaler.end());
-        // No clock is divided by more than this.
-        let prescalers = (first.max(1)..=last.min(1024)).step_by(limits.prescaler_step.max(1) as usize);
-        let fitting = prescalers.filter_map(|prescaler| {
-            let per_quantum = u64::from(prescaler) * u64::from(bitrate_bps.max(1));
-            let clock_hz = u64::from(self.clock_hz);
-            let quanta =
-                u32::try_from(clock_hz / per_quantum).ok().filter(|_| clock_hz % per_quantum == 0)?;
-            let wanted = (quanta * DATA_SAMPLE_POINT_PERMILLE).div_ceil(1000);
-            let most =
-                (*limits.segment1.end()).min(quanta.checked_sub(limits.segment2.start().saturating_add(1))?);
-            let segment1 = wanted.checked_sub(1)?.min(most);
-            let segment2 = quanta - 1 - segment1;
-            let fits = limits.segment1.contains(&segment1) && limits.segment2.contains(&segment2);
-            let off = ((1 + segment1) * 1000 / quanta).abs_diff(DATA_SAMPLE_POINT_PERMILLE);
-            fits.then_some((off, prescaler, segment1, segment2))
-        });
-        let (_, prescaler, segment1, segment2) = fitting.min()?;
-        Some(limits.timing(segment1, segment2, segment2, prescaler))
+        limits.data(self.clock_hz, bitrate_bps).map(request_of)
     }
 }
 
-impl Limits {
-    /// Those that begin at the number with this index.
-    fn parse(bytes: &[u8], first: usize) -> Option<Self> {
-        let word = |index| word(bytes, first + index);
-        Some(Self {
-            segment1: word(0)?..=word(1)?,
-            segment2: word(2)?..=word(3)?,
-            jump_width_max: word(4)?,
-            prescaler: word(5)?..=word(6)?,
-            prescaler_step: word(7)?,
-        })
-    }
+/// The limits that begin at the number with this index.
+fn limits(bytes: &[u8], first: usize) -> Option<Limits> {
+    let word = |index| word(bytes, first + index);
+    Some(Limits {
+        segment1: word(0)?..=word(1)?,
+        segment2: word(2)?..=word(3)?,
+        jump_width_max: word(4)?,
+        prescaler: word(5)?..=word(6)?,
+        prescaler_step: word(7)?,
+    })
+}
 
-    /// A request's data.
-    fn timing(&self, segment1: u32, segment2: u32, jump_width: u32, prescaler: u32) -> Vec<u8> {
-        // The propagation segment is only a part of the first, and the adapter adds them up; neither may be 0.
-        let propagation = segment1 / 2;
-        let jump_width = jump_width.clamp(1, self.jump_width_max.min(segment2).max(1));
-        words(&[propagation, segment1 - propagation, segment2, jump_width, prescaler])
-    }
+/// A request's data.
+fn request_of(timing: Timing) -> Vec<u8> {
+    let Timing { prescaler, segment1, segment2, jump_width } = timing;
+    // The propagation segment is only a part of the first, and the adapter adds them up; neither may be 0.
+    let propagation = segment1 / 2;
+    words(&[propagation, segment1 - propagation, segment2, jump_width, prescaler])
 }
 
 /// The answer to [`request::STATE`]: the state, if the channel is started, and the transmit and the receive error counter.

@@ -4,6 +4,8 @@ mod cannelloni;
 #[cfg(unix)]
 mod elm327;
 mod gvret;
+#[cfg(target_os = "linux")]
+mod makers;
 #[cfg(unix)]
 mod port;
 #[cfg(unix)]

@@ -1,0 +1,109 @@
+//! Finding and loading a library.
+
+use std::path::Path;
+
+use libloading::Library;
+
+/// Why a library is not there to be used. Each message says what to do next.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum LoadError {
+    /// There is no such library.
+    #[error("{name} cannot be loaded ({reason}); {advice}")]
+    NotInstalled {
+        /// Its file.
+        name: String,
+        /// The system's reason.
+        reason: String,
+        /// Who has it.
+        advice: &'static str,
+    },
+    /// It lacks a function.
+    #[error("{name} has no function {function}: it is another library, or too old; {advice}")]
+    NoFunction {
+        /// Its file.
+        name: String,
+        /// The function.
+        function: &'static str,
+        /// Who has a newer one.
+        advice: &'static str,
+    },
+    /// The path is relative.
+    #[error("the library's path '{0}' must begin with the root, as in /opt/lib/libpcanbasic.so")]
+    RelativePath(String),
+}
+
+/// A library that is loaded, and what errors call it.
+pub(crate) struct Loaded {
+    pub library: Library,
+    name: String,
+    advice: &'static str,
+}
+
+impl Loaded {
+    /// Loads the library at a path, or the one that the system has under a name.
+    pub fn load(path: Option<&Path>, system_name: &str, advice: &'static str) -> Result<Self, LoadError> {
+        let name = match path {
+            // A relative one would depend on where the program was started.
+            Some(path) if !path.is_absolute() => {
+                return Err(LoadError::RelativePath(path.display().to_string()));
+            }
+            Some(path) => path.display().to_string(),
+            None => system_name.to_owned(),
+        };
+        let loaded = path.map_or_else(|| from_system(system_name), |path| load(path.as_os_str()));
+        match loaded {
+            Ok(library) => Ok(Self { library, name, advice }),
+            Err(error) => Err(LoadError::NotInstalled { name, reason: reason(&error), advice }),
+        }
+    }
+
+    /// A function of the library, to be called only while the library is loaded.
+    ///
+    /// # Safety
+    ///
+    /// `F` is the function's type as the maker's header declares it.
+    pub unsafe fn function<F: Copy>(&self, function: &'static str) -> Result<F, LoadError> {
+        // SAFETY: the caller knows the type.
+        unsafe { self.library.get::<F>(function) }.map(|symbol| *symbol).map_err(|_| LoadError::NoFunction {
+            name: self.name.clone(),
+            function,
+            advice: self.advice,
+        })
+    }
+}
+
+/// The error and its cause, which has the system's words.
+fn reason(error: &libloading::Error) -> String {
+    std::error::Error::source(error).map_or_else(|| error.to_string(), ToString::to_string)
+}
+
+fn load(name: &std::ffi::OsStr) -> Result<Library, libloading::Error> {
+    // SAFETY: what a maker's library does when it is loaded is the maker's; the user has installed it, or named it.
+    unsafe { Library::new(name) }
+}
+
+/// Not from the folder in which the program was started, where anybody may have put one: only from where installers put it.
+#[cfg(windows)]
+fn from_system(name: &str) -> Result<Library, libloading::Error> {
+    use libloading::os::windows::{LOAD_LIBRARY_SEARCH_SYSTEM32, Library as Windows};
+    // SAFETY: as above.
+    unsafe { Windows::load_with_flags(name, LOAD_LIBRARY_SEARCH_SYSTEM32) }.map(Library::from)
+}
+
+/// From the folders of the system's loader, among which the current one is not.
+#[cfg(not(windows))]
+fn from_system(name: &str) -> Result<Library, libloading::Error> {
+    load(name.as_ref())
+}
+
+/// The text in a buffer that a library has filled: up to its first NUL, printable characters alone.
+pub(crate) fn text(buffer: &[u8]) -> String {
+    let end = buffer.iter().position(|byte| *byte == 0).unwrap_or(buffer.len());
+    let text = String::from_utf8_lossy(&buffer[..end]);
+    text.chars()
+        .map(|letter| if letter.is_control() { ' ' } else { letter })
+        .collect::<String>()
+        .trim()
+        .to_owned()
+}

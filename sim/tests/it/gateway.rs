@@ -14,7 +14,7 @@ use cantap_sim::rig::{MS, Rig, timing};
 use cantap_wire::message::{
     ChannelConfig, Filter, FrameKind, GatewayEnd, GatewayRule, GatewayState, GatewayStatus, Mode, Pass,
 };
-use cantap_wire::record::LossStage;
+use cantap_wire::record::{LossStage, TransmitFailure};
 use cantap_wire::{CHANNELS, Channel, Command, Event, Frame, Reply};
 
 /// From the end of a frame to the start of the same on an idle bus.
@@ -191,18 +191,24 @@ fn a_closed_port_silences_a_gateway_that_a_host_has_started() {
 #[test]
 #[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn both_channels_on_one_bus_are_noticed_and_the_bus_is_left_alone() {
-    for bound in [Best, Worst] {
+    for (bound, rate) in
+        [Best, Worst].into_iter().flat_map(|bound| [1_000_000, 125_000, 33_333].map(|rate| (bound, rate)))
+    {
         let setup = Setup { bound, joined: true, ..board::setup() };
-        let mut rig = gateway_on(setup, [1_000_000; CHANNELS], &rules());
+        let mut rig = gateway_on(setup, [rate; CHANNELS], &rules());
         let from = rig.now();
-        rig.add_traffic(Can1, 1_000_000, Traffic::new(Kind::Std8, 1, 5.0, from, from + 100 * MS));
-        rig.run_for(200 * MS).unwrap();
+        rig.add_traffic(Can1, rate, Traffic::new(Kind::Std8, 1, 5.0, from, from + 100 * MS));
+        rig.run_for(600 * MS).unwrap();
+        let (told, _) = rig.events().iter().partition::<Vec<_>, _>(|(_, event)| {
+            matches!(event, Event::TransmitFailed { reason: TransmitFailure::Loop, .. })
+        });
+        assert_eq!(told.len(), 1, "{bound}, {rate}");
         let found = status(&mut rig, Can1);
         let ours = rig.take_watched()[0]
             .iter()
             .filter(|frame| matches!(frame.sender, Member::Controller(_)))
             .count();
-        eprintln!("{bound}: {ours} frames until the loop was noticed");
+        eprintln!("{bound}, {rate}: {ours} frames until the loop was noticed");
         assert_eq!(found.state, GatewayState::Ended(GatewayEnd::Loop));
         assert!(ours < 200, "{ours}");
     }

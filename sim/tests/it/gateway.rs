@@ -4,7 +4,7 @@
 use crate::common;
 
 use Channel::{Can1, Can2};
-use cantap_emu::bus::{BitTime, BusFrame, Member, Node};
+use cantap_emu::bus::{BitTime, BusFrame, Member, Node, Source};
 use cantap_emu::machine::Setup;
 use cantap_emu::timing::Bound::{self, Best, Worst};
 use cantap_emu::traffic::{Kind, Traffic};
@@ -186,6 +186,39 @@ fn a_closed_port_silences_a_gateway_that_a_host_has_started() {
     let (_, watched) = rig.run_watched(50 * MS).unwrap();
     let (received, sent) = crossed(&watched, Can1);
     assert!(received.len() > 50 && sent.is_empty(), "{} sent", sent.len());
+}
+
+/// A frame again and again, without a pause between.
+struct Same {
+    frame: Frame,
+    left: u32,
+}
+
+impl Source for Same {
+    fn next_frame(&mut self, _: BitTime) -> Option<(u64, Frame)> {
+        self.left = self.left.checked_sub(1)?;
+        Some((0, self.frame))
+    }
+}
+
+/// On the other bus each ends about when the next ends here.
+#[test]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
+fn equal_frames_back_to_back_are_no_loop() {
+    for (bound, rate) in
+        [Best, Worst].into_iter().flat_map(|bound| [1_000_000, 500_000, 125_000].map(|rate| (bound, rate)))
+    {
+        let mut rig = gateway(bound, [rate; CHANNELS], &rules());
+        let frames = 400;
+        rig.add_traffic(Can1, rate, Same { frame: "123#1122334455667788".parse().unwrap(), left: frames });
+        rig.run_for(1200 * MS * 125_000 / u64::from(rate)).unwrap();
+        let (received, sent) = crossed(&rig.take_watched(), Can1);
+        let found = status(&mut rig, Can1);
+        eprintln!("{bound}, {rate}: {} of {} sent", sent.len(), received.len());
+        assert_eq!(found.state, GatewayState::Running, "{bound}, {rate}");
+        assert_eq!((received.len(), sent.len()), (frames as usize, frames as usize), "{bound}, {rate}");
+        assert!(rig.ledger.holds(), "{:?}", rig.ledger.faults());
+    }
 }
 
 #[test]

@@ -59,17 +59,20 @@ pub enum TransmitFailure {
         /// How many, since the entry's last such record.
         periods: u32,
     },
+    /// A gateway has ended, since both its channels are on one bus. This stands for no frame; the tag is that of the rule that sent last.
+    Loop,
 }
 
 impl TransmitFailure {
     /// One of each kind; that with a number has 1.
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 7] = [
         Self::ArbitrationLost,
         Self::BusError,
         Self::Aborted,
         Self::Closed,
         Self::BusOff,
         Self::Overtaken { periods: 1 },
+        Self::Loop,
     ];
 
     /// Its name in texts, JSON and tables, without its number.
@@ -81,6 +84,7 @@ impl TransmitFailure {
             Self::Closed => "closed",
             Self::BusOff => "bus-off",
             Self::Overtaken { .. } => "overtaken",
+            Self::Loop => "loop",
         }
     }
 

@@ -30,6 +30,11 @@ impl DatabaseArgs {
         self.options().or_of(devices)
     }
 
+    /// The first of the options that was given.
+    pub fn given(&self) -> Option<&'static str> {
+        if self.databases.is_empty() { self.j1939.then_some("--j1939") } else { Some("--db") }
+    }
+
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
         self.databases.is_empty()

@@ -52,6 +52,20 @@ pub struct FollowArgs {
     pub follow: bool,
 }
 
+impl ReadArgs {
+    /// The first of the options that was given, for commands that read a trace only sometimes.
+    pub fn given(&self) -> Option<&'static str> {
+        let given = [
+            (!self.filter.is_empty(), "-f"),
+            (self.format.is_some(), self.format_option),
+            (self.columns.is_some(), "--columns"),
+            (self.strict, "--strict"),
+            (self.zone != Zone::default(), "--zone"),
+        ];
+        given.into_iter().find_map(|(given, option)| given.then_some(option))
+    }
+}
+
 impl Deref for FollowArgs {
     type Target = ReadArgs;
 

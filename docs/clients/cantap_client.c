@@ -29,7 +29,7 @@ static const char *const REFUSALS[] = {"Protocol", "Malformed", "NoSession", "Un
 static const char *const STAGES[] = {"controller", "queue", "link", "host", "gateway"};
 static const char *const ERRORS[] = {"stuff", "form", "acknowledgment", "bit-recessive", "bit-dominant", "crc"};
 static const char *const STATES[] = {"active", "warning", "passive", "bus-off"};
-static const char *const FAILURES[] = {"arbitration-lost", "bus-error", "aborted", "closed", "bus-off", "overtaken"};
+static const char *const FAILURES[] = {"arbitration-lost", "bus-error", "aborted", "closed", "bus-off", "overtaken", "loop"};
 static const char *const ENDS[] = {"suspended", "board-lost", "server-ended", "configured"};
 
 /* The name of a number, or "?" for one that this protocol version does not have. */

@@ -16,7 +16,7 @@ STAGES = "controller queue link host gateway".split()
 ERRORS = "stuff form acknowledgment bit-recessive bit-dominant crc".split()
 STATES = "active warning passive bus-off".split()
 ENDS = "suspended board-lost server-ended configured".split()
-FAILURES = "arbitration-lost bus-error aborted closed bus-off overtaken".split()
+FAILURES = "arbitration-lost bus-error aborted closed bus-off overtaken loop".split()
 
 
 def varint(n):

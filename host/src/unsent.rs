@@ -181,6 +181,8 @@ impl Seen {
             Some(TransmitFailure::Closed) => Cause::Closed,
             Some(TransmitFailure::BusOff) => Cause::BusOff,
             Some(TransmitFailure::Overtaken { .. }) => Cause::Overtaken,
+            // A gateway's, not of a frame that a host has asked for.
+            Some(TransmitFailure::Loop) => Cause::Unknown,
         }
     }
 

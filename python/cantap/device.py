@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import datetime
 import numbers
+import os
 import weakref
 from collections.abc import Iterable, Iterator
 from types import TracebackType
@@ -257,6 +258,25 @@ class Device:
     ) -> Reply:
         """Has the device send a frame whenever it receives one with this identifier, within microseconds, until it is stopped."""
         return self._native.reply(channel, (id, mask, extended), frame, count)
+
+    # Gateway
+
+    def start_gateway(self, rules: str | os.PathLike[str]) -> None:
+        """Passes frames on between the two channels, by a file of rules (docs/gateway.md), until `stop_gateway` or `close`.
+
+        Both channels must be open with `mode="normal"`. The device does it: a slow program does not delay a frame. If it finds that both
+        channels are on one bus it ends on its own, and a record has the event `transmit-failed` and the detail `loop`.
+        """
+        self._native.start_gateway(rules)
+
+    def stop_gateway(self) -> None:
+        """Ends the gateway. What waits in it is lost, and counted."""
+        self._native.stop_gateway()
+
+    @property
+    def gateway(self) -> dict[str, Any]:
+        """What the gateway does (`state`) and the counts of each direction and rule, as `cantap gateway --json` prints them."""
+        return self._native.gateway()
 
     # State
 

@@ -390,3 +390,50 @@ def test_a_program_may_end_while_a_capture_runs(ending):
 
 def test_boards_are_listed():
     assert isinstance(cantap.boards(), list)
+
+
+RULES = """
+[[rule]]
+name = "low"
+from = 1
+filter = "000-3FF"
+"""
+
+
+def test_a_gateway_passes_frames_on_and_accounts_for_each(tmp_path):
+    rules = tmp_path / "rules.toml"
+    rules.write_text(RULES)
+    with cantap.open("virtual:load=20,frames=std8,channels=1", 500_000) as device:
+        with pytest.raises(cantap.DeviceError, match="normal mode"):
+            device.start_gateway(rules)
+    with cantap.open("virtual:load=20,frames=std8,channels=1", 500_000, mode="normal") as device:
+        assert device.gateway["state"] == "off"
+        device.start_gateway(rules)
+        for record in device:
+            if record.channel == 2 and record.event == "frame" and record.direction == "tx":
+                break
+        assert device.gateway["state"] == "running"
+        device.stop_gateway()
+        counts = device.gateway
+    assert counts["state"] == "off"
+    [rule] = counts["rules"]
+    assert rule["rule"] == "low" and rule["sent"] > 0
+    assert rule["matched"] == sum(rule[key] for key in ("sent", "dropped", "replaced", "lost", "failed"))
+
+
+def test_a_gateway_that_has_found_a_loop_says_so_in_the_stream(tmp_path):
+    rules = tmp_path / "rules.toml"
+    rules.write_text(RULES)
+    with cantap.open("virtual:load=50,frames=std8,wire=joined", 500_000, mode="normal") as device:
+        device.start_gateway(rules)
+        end = next(record for record in device if record.event == "transmit-failed")
+        assert end.detail == "loop"
+        assert device.gateway["state"] == "loop"
+
+
+def test_a_file_that_is_no_rules_is_a_wrong_argument(tmp_path):
+    rules = tmp_path / "rules.toml"
+    rules.write_text("[[rule]]\nfrom = 3\n")
+    with cantap.open("virtual:load=0", 500_000, mode="normal") as device:
+        with pytest.raises(ValueError, match="line 2"):
+            device.start_gateway(rules)

@@ -9,8 +9,8 @@ use cantap_emu::otg::Misuse;
 use cantap_emu::traffic::{Kind, Traffic};
 use cantap_emu::usb_host::{Status, Timing};
 use cantap_emu::{Image, Setup};
-use cantap_wire::message::{ChannelConfig, Mode, TxFrame};
-use cantap_wire::{CHANNELS, Channel, Command};
+use cantap_wire::message::{ChannelConfig, Filter, FrameKind, GatewayRule, Mode, Pass, RuleCounts, TxFrame};
+use cantap_wire::{CHANNELS, Channel, Command, Reply};
 use fastrand::Rng;
 
 use crate::board::{self, CLOCK};
@@ -79,6 +79,15 @@ pub struct Trial {
 
 /// Runs the trial of a seed on firmware for our default board.
 pub fn try_seed(image: Image, seed: u64) -> Trial {
+    run(image, seed, false)
+}
+
+/// The same for a board that passes on between its buses whatever they carry.
+pub fn try_gateway(image: Image, seed: u64) -> Trial {
+    run(image, seed, true)
+}
+
+fn run(image: Image, seed: u64, is_gateway: bool) -> Trial {
     let hostile = Hostile::seeded(seed);
     let setup = Setup {
         hostile: Some(hostile),
@@ -90,6 +99,7 @@ pub fn try_seed(image: Image, seed: u64) -> Trial {
     let mut bench = Bench {
         rig,
         random: Rng::with_seed(seed),
+        is_gateway,
         in_session: false,
         may_send: [false; CHANNELS],
         resets: 0,
@@ -115,6 +125,7 @@ pub fn try_seed(image: Image, seed: u64) -> Trial {
 struct Bench {
     rig: Rig,
     random: Rng,
+    is_gateway: bool,
     in_session: bool,
     /// Whether the session has been asked to take part in a channel's bus.
     may_send: [bool; CHANNELS],
@@ -184,7 +195,51 @@ impl Bench {
         for channel in Channel::ALL {
             self.open(channel)?;
         }
+        self.start_gateway()?;
         Ok(self.in_session)
+    }
+
+    /// Refused where a channel has not been opened, or while it runs.
+    fn start_gateway(&mut self) -> Result<(), RigError> {
+        let rules = Channel::ALL.into_iter().flat_map(|from| {
+            [false, true].map(|extended| {
+                let filter = Filter { extended, kind: FrameKind::Any, id: 0, mask: 0 };
+                let rule = Some(GatewayRule { filter, pass: Some(Pass::unchanged(extended)) });
+                Command::SetGatewayRule { from, slot: extended.into(), rule }
+            })
+        });
+        for command in rules.chain([Command::StartGateway]) {
+            if self.is_gateway && self.in_session {
+                drop(self.asks(|rig| rig.ask(command).map(drop))?);
+            }
+        }
+        Ok(())
+    }
+
+    /// Every frame that the gateway has matched was sent, or is counted.
+    fn account_for_passed(&mut self) -> Result<(), RigError> {
+        for from in Channel::ALL {
+            if !self.is_gateway || !self.in_session {
+                return Ok(());
+            }
+            let mut found = None;
+            let asked = self.asks(|rig| {
+                found = Some(rig.ask(Command::GatewayStatus { from, first: 0 })?);
+                Ok(())
+            })?;
+            let Some(Reply::Gateway(status)) = found else {
+                self.tell(format_args!("no counts of the gateway: {asked:?}"));
+                continue;
+            };
+            let is_open = |counts: &RuleCounts| {
+                counts.matched != counts.sent + counts.overtaken + counts.lost + counts.failed
+            };
+            if status.waiting > 0 || status.counts.iter().any(is_open) {
+                self.fault(format_args!("frames of a gateway that are nowhere: {status:?}"));
+            }
+            self.tell(format_args!("{status:?}"));
+        }
+        Ok(())
     }
 
     /// Waits for a configured port, as patiently as a user who pulls the cable and tries again.
@@ -249,7 +304,7 @@ impl Bench {
         if !self.in_session {
             return Ok(());
         }
-        let mode = if self.random.u8(..4) == 0 { Mode::Normal } else { Mode::ListenOnly };
+        let mode = if self.random.u8(..4) == 0 || self.is_gateway { Mode::Normal } else { Mode::ListenOnly };
         self.may_send[channel.index()] |= mode == Mode::Normal;
         let config = ChannelConfig { mode, ..ChannelConfig::listen_only(timing(MEGABIT)?) };
         let driven = self.rig.dominant_bits(channel);
@@ -273,6 +328,7 @@ impl Bench {
             Blow::Reopen => {
                 if self.asks(|rig| rig.close(channel))?.is_ok() {
                     self.open(channel)?;
+                    self.start_gateway()?;
                 } else if self.in_session {
                     self.cut()?;
                 }
@@ -300,6 +356,7 @@ impl Bench {
                 for channel in Channel::ALL {
                     self.open(channel)?;
                 }
+                self.start_gateway()?;
             }
             Blow::StopReading => {
                 self.rig.with_host(|host, _| host.read(false));
@@ -363,7 +420,7 @@ impl Bench {
                 self.fault(format_args!("a session that was alive does not end: {error}"));
             }
         }
-        Ok(())
+        self.account_for_passed()
     }
 
     /// Nobody is there: nothing reaches the buses.

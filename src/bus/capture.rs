@@ -632,8 +632,11 @@ impl<'q, const N: usize> Capture<'q, N> {
     /// A controller that stays bus-off sends nothing more: its queue is given up, frame by frame, and periodic frames wait. The
     /// next tick begins with the records.
     fn give_up_when_off(state: &mut ChannelState<'_>, traffic: &mut impl Traffic) {
-        let off = state.errors.status().state == ErrorState::BusOff
-            && state.open.is_some_and(|config| config.manual_recovery);
+        let off = state.errors.status().state == ErrorState::BusOff;
+        if off {
+            state.transmitter.lose_ready();
+        }
+        let off = off && state.open.is_some_and(|config| config.manual_recovery);
         state.transmitter.set_off(off);
         if off && state.transmitter.pending() > 0 {
             state.abort_reason = TransmitFailure::BusOff;
@@ -690,7 +693,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         let activity = Activity {
             traffic: new(|seen| seen.0),
             error: bus_off || new(|seen| seen.1),
-            standalone: self.standalone,
+            standalone: self.is_standalone(),
         };
         self.seen = seen;
         activity

@@ -21,11 +21,15 @@ pub const LATER: usize = 128;
 /// Frames that one call takes out of those that waited for their time. Those left are due, and make the alarm come again at once.
 const RELEASED_AT_ONCE: usize = 4;
 
-/// Both channels see the end of a frame on one bus at the same moment, and each stamp is late by a microsecond or two. No frame is shorter
-/// than 47 µs, so this is never the one before.
+/// A receiver takes a frame on the same bus one bit before its sender (RM0090 Rev 21 §32.7.3), and each stamp is late by a microsecond or
+/// two. This is added to the bit. No frame is shorter than 47 bits, so it is never the one before.
 const ECHO_WITHIN_TICKS: u64 = 8 * TICKS_PER_US as u64;
 /// So many frames in a row, each received by the other channel as this one sent it, are a loop.
 const ECHOES: u32 = 32;
+/// After so many, this channel pauses once. Equal frames that follow each other on two buses no longer end together then.
+const PAUSE_AFTER: u32 = ECHOES / 2;
+/// Half of the shortest frame and the intermission: as far as possible from the frames before and after.
+const PAUSE_BITS: u64 = 25;
 
 /// What waits for its time.
 struct Later {
@@ -108,25 +112,43 @@ impl Seen {
         Self { frame: Frame::from_clean_parts(Id::standard_truncated(0), false, 0, [0; 8]), at: 0 };
 }
 
+/// How far a lane has come with the pause that tells a loop from a coincidence.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Pause {
+    No,
+    /// It begins when none of the gateway's frames is in a mailbox.
+    Wanted,
+    Until(u64),
+}
+
 /// Whether what this channel sends comes back on the other.
 struct Echo {
     sent: Seen,
     received: Seen,
     row: u32,
+    pause: Pause,
+    /// The bit time.
+    bit_ticks: u64,
+    /// The rule that sent last.
+    slot: u8,
 }
 
 impl Echo {
-    const fn new() -> Self {
-        Self { sent: Seen::NONE, received: Seen::NONE, row: 0 }
+    const fn new(bit_ticks: u32) -> Self {
+        let bit_ticks = bit_ticks as u64;
+        Self { sent: Seen::NONE, received: Seen::NONE, row: 0, pause: Pause::No, bit_ticks, slot: 0 }
     }
 
     /// Counts a frame that came back.
     fn compare(&mut self) {
-        let Self { sent, received, .. } = self;
-        let together = sent.at.abs_diff(received.at) <= ECHO_WITHIN_TICKS && sent.at != 0;
+        let Self { sent, received, bit_ticks, .. } = self;
+        let together = sent.at.abs_diff(received.at) <= ECHO_WITHIN_TICKS + *bit_ticks && sent.at != 0;
         if together && sent.frame == received.frame {
             self.row += 1;
             (self.sent, self.received) = (Seen::NONE, Seen::NONE);
+            if self.row == PAUSE_AFTER {
+                self.pause = Pause::Wanted;
+            }
         }
     }
 
@@ -169,7 +191,7 @@ impl Lane {
             ready: Deque::new(),
             later: BinaryHeap::new(),
             sequence: 0,
-            echo: Echo::new(),
+            echo: Echo::new(0),
         }
     }
 
@@ -207,20 +229,20 @@ impl Lane {
 
     /// Forgets everything.
     pub fn clear(&mut self) {
-        self.restart();
+        self.restart(0);
         self.rules.clear();
         self.keys.clear();
     }
 
-    /// Nothing is on its way, and all counts are zero.
-    pub fn restart(&mut self) {
+    /// Nothing is on its way, and all counts are zero. This channel's bits take so many ticks.
+    pub fn restart(&mut self, bit_ticks: u32) {
         for state in &mut self.rules {
             (state.counts, state.step, state.open_from, state.held) = (RuleCounts::default(), 0, 0, None);
         }
         self.unmatched = 0;
         self.ready.clear();
         self.later.clear();
-        self.echo = Echo::new();
+        self.echo = Echo::new(bit_ticks);
     }
 
     /// Frames that no rule matched, and the counts of some rules.
@@ -249,6 +271,37 @@ impl Lane {
     /// Whether both channels are on one bus.
     pub const fn is_loop(&self) -> bool {
         self.echo.row >= ECHOES
+    }
+
+    /// The rule that sent the last of the frames that came back.
+    pub const fn looped(&self) -> u8 {
+        self.echo.slot
+    }
+
+    /// Whether nothing may go into a mailbox at the moment. `loaded`: some of the gateway's frames are still in one.
+    #[inline]
+    pub fn pauses(&mut self, now: u64, loaded: impl FnOnce() -> bool) -> bool {
+        self.echo.pause != Pause::No && self.still_pauses(now, loaded())
+    }
+
+    #[cold]
+    fn still_pauses(&mut self, now: u64, loaded: bool) -> bool {
+        match self.echo.pause {
+            Pause::Wanted if loaded => return true,
+            Pause::Wanted => self.echo.pause = Pause::Until(now + PAUSE_BITS * self.echo.bit_ticks),
+            Pause::Until(end) if end > now => {}
+            Pause::Until(_) | Pause::No => self.echo.pause = Pause::No,
+        }
+        self.echo.pause != Pause::No
+    }
+
+    /// The end of a pause, if a frame waits for it.
+    #[inline]
+    pub fn pause_ends(&self) -> u64 {
+        match self.echo.pause {
+            Pause::Until(end) if self.is_ready() => end,
+            _ => NEVER,
+        }
     }
 
     /// A frame that the other channel received at `at`. Returns how many frames were lost to make room: none or one.
@@ -361,8 +414,20 @@ impl Lane {
             *counter = counter.wrapping_add(1);
         }
         if let Some((frame, at)) = sent {
+            self.echo.slot = slot as u8;
             self.echo.sent(frame, at);
         }
+    }
+
+    /// The bus is off: what waits for a mailbox would be old when it is back. Returns how many frames were lost.
+    pub fn lose_ready(&mut self) -> u32 {
+        let lost = self.ready.len() as u32;
+        while let Some((rule, _)) = self.ready.pop_front() {
+            if let Some(state) = self.rules.get_mut(usize::from(rule)) {
+                state.counts.lost = state.counts.lost.wrapping_add(1);
+            }
+        }
+        lost
     }
 
     /// Gives up what waits, as lost. Returns how many frames that were.

@@ -1,6 +1,7 @@
 //! What is in a controller's transmit mailboxes.
 
 use cantap_wire::Frame;
+use cantap_wire::message::{GATEWAY_TAG, OTHERS_TAG};
 
 /// Transmit mailboxes of a controller.
 pub const MAILBOXES: usize = 3;
@@ -45,6 +46,22 @@ impl Mailboxes {
         let held = self.places.get_mut(usize::from(mailbox))?.take()?;
         self.taken -= 1;
         Some(held)
+    }
+
+    /// How many hold a frame of the gateway's.
+    pub fn passed(&self) -> usize {
+        self.places.iter().flatten().filter(|(tag, _)| *tag >= GATEWAY_TAG).count()
+    }
+
+    /// Frames that are not the gateway's become nobody's. Returns whether there are any.
+    pub fn disown(&mut self) -> bool {
+        let mut any = false;
+        for (tag, _) in self.places.iter_mut().flatten() {
+            if *tag < GATEWAY_TAG {
+                (*tag, any) = (OTHERS_TAG, true);
+            }
+        }
+        any
     }
 
     /// The first that holds a frame, with its tag.

@@ -79,6 +79,10 @@ pub struct Transmitter<'q> {
     passing: bool,
     /// Frames that the gateway has lost and that no record reports yet.
     unpassed: u32,
+    /// The gateway has found a loop, by a frame of this rule, and no record reports it yet.
+    looped: Option<u8>,
+    /// Frames of a gateway that was stopped, which come before those of the present one.
+    stale: u8,
     /// Finished but not recorded yet. Every transmission must be confirmed, so if the record queue has no room, nothing
     /// more is sent until these are written. There is room here for what is then still in the mailboxes, too.
     unconfirmed: Deque<Ended, { 2 * MAILBOXES }>,
@@ -110,6 +114,8 @@ impl<'q> Transmitter<'q> {
             lane,
             passing: false,
             unpassed: 0,
+            looped: None,
+            stale: 0,
             unconfirmed: Deque::new(),
             dropping: None,
             off: false,
@@ -242,7 +248,7 @@ impl<'q> Transmitter<'q> {
     pub fn clear(&mut self) {
         self.periodic.forget();
         self.passing = false;
-        self.unpassed = 0;
+        (self.unpassed, self.looped, self.stale) = (0, None, 0);
         self.lane.clear();
         self.clear_triggers();
         self.queue.clear();
@@ -252,19 +258,48 @@ impl<'q> Transmitter<'q> {
         self.off = false;
     }
 
+    /// A gateway goes on without the host: what that has asked for is forgotten, unrecorded. A frame that can no longer be withdrawn is
+    /// recorded as nobody's.
+    pub fn forget_host(&mut self, traffic: &mut impl Traffic) {
+        self.periodic.forget();
+        self.clear_triggers();
+        self.queue.clear();
+        self.dropping = None;
+        for _ in 0..self.unconfirmed.len() {
+            if let Some(ended) = self.unconfirmed.pop_front().filter(|ended| ended.tag >= GATEWAY_TAG) {
+                // Cannot fail: one was just taken out.
+                let _ = self.unconfirmed.push_back(ended);
+            }
+        }
+        if self.mailboxes.disown() {
+            traffic.abort();
+        }
+    }
+
     /// Once a millisecond: records how many periods passed without a frame, rather than each of them.
     pub fn tick<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) {
         self.periodic.tick(recorder, now);
-        if self.unpassed > 0 && recorder.takes_frames() {
+        if (self.unpassed > 0 || self.looped.is_some()) && recorder.takes_frames() {
             self.tell_unpassed(recorder, now);
         }
     }
 
-    /// Records what the gateway has lost. Returns whether there was room.
+    /// Records why the gateway has ended, and what it has lost. Returns whether there was room.
     #[cold]
     #[inline(never)]
     fn tell_unpassed<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) -> bool {
         let (channel, count) = (self.channel, self.unpassed);
+        if let Some(slot) = self.looped {
+            let (tag, reason) = (GATEWAY_TAG + u32::from(slot), TransmitFailure::Loop);
+            if !recorder.event(&Event::TransmitFailed { channel, tag, reason }, now) {
+                return false;
+            }
+            self.looped = None;
+            self.failed = self.failed.wrapping_add(1);
+        }
+        if count == 0 {
+            return true;
+        }
         let lost = Event::Lost { channel, stage: LossStage::Gateway, count, at_least: false };
         let written = recorder.event(&lost, now);
         if written {
@@ -275,12 +310,12 @@ impl<'q> Transmitter<'q> {
 
     /// Whether periods that passed without a frame, or losses of the gateway, are still to be recorded.
     pub const fn owes(&self) -> bool {
-        self.periodic.owes() || self.unpassed > 0
+        self.periodic.owes() || self.unpassed > 0 || self.looped.is_some()
     }
 
     /// The channel is closed: records what [`Self::tick`] has not recorded yet, a little per call. Returns whether there was room.
     pub fn tell_rest<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) -> bool {
-        (self.unpassed == 0 || self.tell_unpassed(recorder, now)) && self.periodic.tell_rest(recorder, now)
+        self.tell_unpassed(recorder, now) && self.periodic.tell_rest(recorder, now)
     }
 
     /// The gateway's frames on this channel.
@@ -288,10 +323,24 @@ impl<'q> Transmitter<'q> {
         self.lane
     }
 
-    /// The gateway starts.
-    pub fn start_passing(&mut self) {
-        self.lane.restart();
-        (self.passing, self.watching) = (true, true);
+    /// The gateway starts on a bus whose bits take so many ticks.
+    pub fn start_passing(&mut self, bit_ticks: u32) {
+        self.lane.restart(bit_ticks);
+        (self.passing, self.watching, self.looped) = (true, true, None);
+        let ended = self.unconfirmed.iter().filter(|ended| ended.tag >= GATEWAY_TAG).count();
+        self.stale = (self.mailboxes.passed() + ended) as u8;
+    }
+
+    /// The gateway has found that what this channel sends comes back.
+    pub const fn found_loop(&mut self) {
+        self.looped = Some(self.lane.looped());
+    }
+
+    /// The bus is off: what waits for it is lost.
+    pub fn lose_ready(&mut self) {
+        if self.lane.is_ready() {
+            self.unpassed = self.unpassed.saturating_add(self.lane.lose_ready());
+        }
     }
 
     /// The gateway ends: what waits is lost. What is in a mailbox is still sent.
@@ -488,13 +537,19 @@ impl<'q> Transmitter<'q> {
     /// A frame of the gateway has ended. A full record queue does not hold it up: a host that is slow must not disturb the buses.
     #[inline(never)]
     fn confirm_passed<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, event: &Event, at: u64) {
+        let is_stale = self.stale > 0;
+        self.stale = self.stale.saturating_sub(1);
         match *event {
             Event::Transmitted { channel, tag, frame } => {
-                self.lane.ended((tag - GATEWAY_TAG) as usize, Some((frame, at)));
+                if !is_stale {
+                    self.lane.ended((tag - GATEWAY_TAG) as usize, Some((frame, at)));
+                }
                 recorder.confirm(event, channel, at);
             }
             Event::TransmitFailed { tag, .. } => {
-                self.lane.ended((tag - GATEWAY_TAG) as usize, None);
+                if !is_stale {
+                    self.lane.ended((tag - GATEWAY_TAG) as usize, None);
+                }
                 // Counted by the rule in any case.
                 recorder.aside(event, at);
             }
@@ -562,6 +617,10 @@ impl<'q> Transmitter<'q> {
         if self.lane.due() <= now {
             self.unpassed = self.unpassed.saturating_add(self.lane.release(now));
         }
+        let mailboxes = &self.mailboxes;
+        if self.lane.pauses(now, || mailboxes.passed() > 0) {
+            return self.load_due(traffic, now);
+        }
         while self.mailboxes.len() < MAILBOXES - 1 {
             let Some(&(rule, frame)) = self.lane.next() else { return self.load_due(traffic, now) };
             // There must be room for everything in a mailbox once it has finished.
@@ -612,7 +671,7 @@ impl<'q> Transmitter<'q> {
         let head = self.head_due();
         // A frame without a due time waits for something other than time.
         let due = self.periodic.due().min(if head == 0 { NEVER } else { head });
-        if self.passing { due.min(self.lane.due()) } else { due }
+        if self.passing { due.min(self.lane.due()).min(self.lane.pause_ends()) } else { due }
     }
 
     fn load(&mut self, tag: u32, frame: &Frame, traffic: &mut impl Traffic) -> bool {

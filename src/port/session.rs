@@ -176,7 +176,14 @@ impl<'q, const N: usize> Session<'q, N> {
                 self.stored = Stored::Opening;
                 self.go_on_with_stored(board);
             }
-            Stored::Started if self.language == Language::Unknown => self.queue.clear(),
+            Stored::Started if self.language == Language::Unknown && self.work.is_none() => {
+                self.queue.clear();
+                if !board.with_capture(|capture, _, _| capture.is_standalone()) {
+                    // It has ended, and nobody else closes its channels.
+                    self.stored = Stored::None;
+                    self.begin(Work::Silence, Origin::Device, board);
+                }
+            }
             _ => {}
         }
     }
@@ -333,7 +340,12 @@ impl<'q, const N: usize> Session<'q, N> {
         let Some(result) = self.commands.progress(work, board) else { return };
         self.work = None;
         if self.stored == Stored::Opening && matches!(work, Work::Open(..)) {
-            self.go_on_with_stored(board);
+            if result.is_ok() {
+                self.go_on_with_stored(board);
+            } else {
+                self.stored = Stored::None;
+                self.begin(Work::Silence, Origin::Device, board);
+            }
         }
         if matches!(work, Work::Silence | Work::Keep) {
             if !matches!(self.ending, Ending::Wanted(_)) {
@@ -341,10 +353,10 @@ impl<'q, const N: usize> Session<'q, N> {
             }
             let Self { queue, .. } = self;
             // Under one lock: beside a gateway, records are written at any time.
-            let now = board.with_capture(|capture, _, clock| {
+            let now = board.with_capture(|capture, traffic, clock| {
                 queue.clear();
                 match work {
-                    Work::Keep => capture.restart_beside_gateway(clock),
+                    Work::Keep => capture.restart_beside_gateway(traffic, clock),
                     _ => capture.restart(clock),
                 }
             });

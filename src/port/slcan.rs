@@ -237,7 +237,10 @@ impl Slcan {
             }
             (b'O', []) if !open => self.open(Mode::Normal, commands, board),
             (b'L', []) if !open => self.open(Mode::ListenOnly, commands, board),
-            (b'C', []) => run(Command::Close { channel: CHANNEL }, commands, board),
+            // What a gateway without a host has opened, is not a program's to close; many begin with this.
+            (b'C', []) if !board.with_capture(|capture, _, _| capture.is_standalone()) => {
+                run(Command::Close { channel: CHANNEL }, commands, board)
+            }
             (b't' | b'T' | b'r' | b'R', parameters) => {
                 let frame = parse_frame(letter, parameters)?;
                 self.transmit(frame, letter, board)

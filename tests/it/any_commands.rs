@@ -1,11 +1,12 @@
 //! Any sequence of commands, valid or not, on both channels, at any load: the device keeps answering, every
-//! request is answered once, and every frame is delivered or counted.
+//! request is answered once, and every frame is delivered or counted; also each that a gateway was to pass on.
 
 use crate::arbitrary;
 use crate::fakes;
 
-use arbitrary::{channel, command};
+use arbitrary::{channel, command, gateway};
 use cantap_firmware::bus::queue::RecordQueue;
+use cantap_wire::message::GatewayState;
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage};
 use cantap_wire::{CHANNELS, Channel, Command, Event, Reply, Request};
 use fakes::{Bench, encode, numbered};
@@ -17,6 +18,8 @@ const QUEUE: usize = 8 * 1024 + 512;
 #[derive(Clone, Debug)]
 enum Action {
     Ask(Box<Command>),
+    /// A gateway is started, or saved.
+    Gateway(Vec<Command>),
     /// Frames arrive, this many before the interrupt is served each time.
     Arrive {
         channel: Channel,
@@ -58,6 +61,7 @@ fn action() -> impl Strategy<Value = Action> {
     ]);
     prop_oneof![
         8 => command().prop_map(|command| Action::Ask(Box::new(command))),
+        2 => gateway().prop_map(Action::Gateway),
         3 => (channel(), 1..1500_u16, 1..6_u8)
             .prop_map(|(channel, frames, at_once)| Action::Arrive { channel, frames, at_once }),
         2 => (channel(), 1..20_u8).prop_map(|(channel, frames)| Action::Take { channel, frames }),
@@ -85,6 +89,12 @@ impl Run<'_> {
                 let id = 1000 + self.asked.len() as u16;
                 self.asked.push(id);
                 bench.say(&encode(&Request { id, command: *command }));
+            }
+            Action::Gateway(commands) => {
+                for command in commands {
+                    self.act(Action::Ask(Box::new(command)));
+                    self.bench.millisecond();
+                }
             }
             Action::Arrive { channel, frames, at_once } => {
                 let index = channel.index();
@@ -164,12 +174,44 @@ impl Run<'_> {
                     _ => None,
                 })
                 .sum();
-            prop_assert_eq!(counted.frames, self.taken[channel.index()], "taken from {:?}", channel);
+            let told = bench
+                .events()
+                .into_iter()
+                .filter(|event| matches!(event, Event::Transmitted { channel: at, .. } if *at == channel));
+            // Confirmations of a gateway's that found no room are lost frames of this channel.
+            let untold = counted.transmitted - told.count() as u32;
+            prop_assert_eq!(counted.frames, self.taken[channel.index()] + untold, "taken from {:?}", channel);
             prop_assert_eq!(bench.frames(channel).len() as u32 + lost, counted.frames, "delivered and lost");
             prop_assert_eq!(lost, counted.lost_queue);
             prop_assert_eq!((counted.tx_pending, counted.open), (0, None));
+            passed(bench, channel)?;
+        }
+        for (traffic, control) in bench.board.traffic.iter().zip(&bench.board.control) {
+            prop_assert!(!control.running && traffic.order.is_empty());
         }
         Ok(())
+    }
+}
+
+/// What became of each frame that a gateway's rules matched.
+fn passed(bench: &mut Bench<'_, QUEUE>, from: Channel) -> Result<(), TestCaseError> {
+    let mut first = 0;
+    loop {
+        let Ok(Reply::Gateway(found)) = bench.ask(Command::GatewayStatus { from, first }) else {
+            return Err(TestCaseError::fail("no status of the gateway"));
+        };
+        prop_assert!(found.waiting == 0 && found.state != GatewayState::Running, "{found:?}");
+        for (slot, counts) in (first..).zip(&found.counts) {
+            let Ok(Reply::GatewayRule(rule)) = bench.ask(Command::GatewayRule { from, slot }) else {
+                return Err(TestCaseError::fail("no rule"));
+            };
+            let ended = counts.sent + counts.overtaken + counts.lost + counts.failed;
+            prop_assert_eq!(ended, if rule.pass.is_some() { counts.matched } else { 0 }, "{:?}", found);
+        }
+        first += found.counts.len() as u8;
+        if first >= found.rules {
+            return Ok(());
+        }
     }
 }
 

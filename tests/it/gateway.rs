@@ -13,25 +13,25 @@ use cantap_wire::record::LossStage;
 use cantap_wire::{Channel, Command, Event, Frame, Record, Refusal, Reply};
 use fakes::{Bench, SMALL_QUEUE, config, numbered};
 
-const CAN1: Channel = Channel::Can1;
-const CAN2: Channel = Channel::Can2;
+pub const CAN1: Channel = Channel::Can1;
+pub const CAN2: Channel = Channel::Can2;
 
-type Queue = RecordQueue<SMALL_QUEUE>;
+pub type Queue = RecordQueue<SMALL_QUEUE>;
 
-fn frame(text: &str) -> Frame {
+pub fn frame(text: &str) -> Frame {
     text.parse().unwrap()
 }
 
 /// Lets standard frames pass whose identifier agrees with `id` in `mask`.
-fn rule(id: u32, mask: u32, pass: Option<Pass>) -> GatewayRule {
+pub fn rule(id: u32, mask: u32, pass: Option<Pass>) -> GatewayRule {
     GatewayRule { filter: Filter { extended: false, kind: FrameKind::Any, id, mask }, pass }
 }
 
-fn everything() -> GatewayRule {
+pub fn everything() -> GatewayRule {
     rule(0, 0, Some(Pass::unchanged(false)))
 }
 
-fn set<const N: usize>(bench: &mut Bench<'_, N>, from: Channel, rules: &[GatewayRule]) {
+pub fn set<const N: usize>(bench: &mut Bench<'_, N>, from: Channel, rules: &[GatewayRule]) {
     for (slot, rule) in (0..).zip(rules) {
         let rule = Some(rule.clone());
         assert_eq!(bench.ask(Command::SetGatewayRule { from, slot, rule }), Ok(Reply::Done));
@@ -39,21 +39,21 @@ fn set<const N: usize>(bench: &mut Bench<'_, N>, from: Channel, rules: &[Gateway
 }
 
 /// A device that passes on what CAN1 receives.
-fn started<'q>(queue: &'q Queue, rules: &[GatewayRule]) -> Bench<'q, SMALL_QUEUE> {
+pub fn started<'q>(queue: &'q Queue, rules: &[GatewayRule]) -> Bench<'q, SMALL_QUEUE> {
     let mut bench = Bench::opened(queue, Mode::Normal);
     set(&mut bench, CAN1, rules);
     assert_eq!(bench.ask(Command::StartGateway), Ok(Reply::Done));
     bench
 }
 
-fn status<const N: usize>(bench: &mut Bench<'_, N>, from: Channel) -> GatewayStatus {
+pub fn status<const N: usize>(bench: &mut Bench<'_, N>, from: Channel) -> GatewayStatus {
     match bench.ask(Command::GatewayStatus { from, first: 0 }) {
         Ok(Reply::Gateway(status)) => status,
         other => panic!("{other:?}"),
     }
 }
 
-fn flush<const N: usize>(bench: &mut Bench<'_, N>) {
+pub fn flush<const N: usize>(bench: &mut Bench<'_, N>) {
     bench.millisecond();
     bench.millisecond();
 }
@@ -159,7 +159,7 @@ fn what_cannot_be_is_refused_with_its_reason() {
     assert_eq!(bench.ask(Command::StartGateway), Err(Refusal::GatewayRunning));
 }
 
-fn queue_of() -> &'static Queue {
+pub fn queue_of() -> &'static Queue {
     Box::leak(Box::new(Queue::new()))
 }
 
@@ -259,6 +259,7 @@ fn one_bus_on_both_channels_is_noticed_and_ends_the_gateway() {
     let mut rounds = 0;
     loop {
         bench.pass(130 * TICKS_PER_US);
+        bench.alarm();
         // What CAN2 sends, CAN1 receives at the same moment.
         let Some(sent) = bench.board.traffic[1].send_one() else { break };
         bench.receive(CAN1, sent);
@@ -348,7 +349,7 @@ fn a_session_begins_without_a_gateway_and_its_channels_must_be_opened_again() {
 }
 
 /// A device that was saved as a gateway, with power just applied, and no host.
-fn alone(queue: &'static Queue) -> Bench<'static, SMALL_QUEUE> {
+pub fn alone(queue: &'static Queue) -> Bench<'static, SMALL_QUEUE> {
     let mut before = Bench::new(queue_of());
     before.greet();
     for channel in Channel::ALL {

@@ -8,6 +8,7 @@ mod errors;
 mod fakes;
 mod filters;
 mod gateway;
+mod gateway_safety;
 mod leaving;
 mod long_pauses;
 mod periodic;

@@ -15,12 +15,14 @@ use crate::usage_error::usage;
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let rules = args.rules.as_deref().map(Rules::read).transpose()?;
-    if args.dry_run.is_none() && !args.read.filter.is_empty() {
-        return Err(usage(
-            "-f chooses among the frames of a trace, with --dry-run; what a device passes on, the rules say",
-        ));
+    if args.dry_run.is_none()
+        && let Some(option) = args.read.given().or(args.databases.given())
+    {
+        return Err(usage(format!(
+            "{option} is for a trace that --dry-run reads; what a device passes on, the rules say"
+        )));
     }
+    let rules = args.rules.as_deref().map(Rules::read).transpose()?;
     if args.stop || args.forget {
         return device::stop(args);
     }

@@ -194,6 +194,67 @@ fn a_gateway_is_stored_and_erased() {
     assert!(saved["channels"][0]["saved"].is_null(), "{saved}");
 }
 
+/// A device starts with what is stored on it, before any host finds it.
+#[test]
+fn a_stored_gateway_is_shown_and_stopped_and_its_channels_are_its_own() {
+    let directory = on_a_device("runs_alone");
+    let _ = std::fs::remove_file(directory.join("settings.bin"));
+    let device = "-d virtual:load=20,frames=mix,channels=1,settings=settings.bin";
+    let (code, _, err) = cantap(&directory, &format!("gateway halves.toml {device} -b 500k --save"));
+    assert_eq!(code, Some(0), "{err}");
+    let shown = object(&directory, &format!("gateway --show {device} -t 1s"));
+    assert_eq!((&shown["state"], &shown["standalone"]), (&"running".into(), &true.into()), "{shown}");
+    assert!(shown["directions"][0]["sent"].as_u64().unwrap() > 0, "{shown}");
+    let (code, _, err) = cantap(&directory, &format!("capture {device} -b 500k -t 1s"));
+    assert_eq!(code, Some(1), "{err}");
+    let (code, _, err) = cantap(&directory, &format!("gateway halves.toml {device} -b 500k"));
+    assert!(code == Some(1) && err.contains("--stop ends it"), "{err}");
+    let (code, out, err) = cantap(&directory, &format!("gateway --stop {device}"));
+    assert!(code == Some(0) && out.contains("still stored"), "{out}{err}");
+    let (code, _, err) = cantap(&directory, &format!("gateway --forget {device}"));
+    assert_eq!(code, Some(0), "{err}");
+    let (code, _, err) = cantap(&directory, &format!("gateway --stop {device}"));
+    assert!(code == Some(1) && err.contains("runs no gateway on its own"), "{err}");
+}
+
+/// Both buses of a stored gateway were one, and nobody watched.
+#[test]
+fn a_stored_gateway_that_has_found_a_loop_says_so_to_the_next_host() {
+    let directory = on_a_device("looped_alone");
+    let _ = std::fs::remove_file(directory.join("settings.bin"));
+    let device = "-d virtual:load=50,frames=std8,wire=joined,settings=settings.bin";
+    let (code, _, err) = cantap(&directory, &format!("gateway halves.toml {device} -b 500k --save"));
+    assert_eq!(code, Some(0), "{err}");
+    let (code, _, err) = cantap(&directory, &format!("gateway --show {device} -t 60s"));
+    assert!(code == Some(1) && err.contains("both channels are on one bus"), "{err}");
+}
+
+#[test]
+fn files_that_are_no_rules_are_refused_with_the_place() {
+    let directory = on_a_device("hostile");
+    let rule = |fields: &str| format!("[[rule]]\nfrom = 1\n{fields}\n");
+    for (content, expected) in [
+        (rule("").repeat(40_000), "256 KiB"),
+        (rule("").repeat(10_000), "takes 20000 places"),
+        (format!("[[rule]]\nfrom = {}1", "[".repeat(100_000)), "line 2"),
+        (rule("filter = \"1\0\""), "line 3"),
+        (rule("name = \"a\"\nname = \"b\""), "line 4"),
+        (rule("period = \"0\""), "line 3"),
+        (rule("delay = \"101s\""), "at most 100s"),
+        (rule("checksum = \"8:xor\""), "bytes 0 to 7"),
+        (rule("set.dlc = 16"), "a DLC is 0 to 15"),
+        (rule("set.id = \"800\""), "line 3"),
+        (rule("filter = \"800\""), "line 3"),
+    ] {
+        std::fs::write(directory.join("bad.toml"), content).unwrap();
+        let (code, _, err) = cantap(&directory, "gateway bad.toml --dry-run both.log");
+        assert!(code == Some(1) && err.contains(expected), "{expected}: {err}");
+    }
+    std::fs::write(directory.join("bad.toml"), [0xFF, 0xFE, 0]).unwrap();
+    let (code, _, err) = cantap(&directory, "gateway bad.toml --dry-run both.log");
+    assert!(code == Some(1) && err.contains("bad.toml"), "{err}");
+}
+
 #[test]
 fn options_that_do_not_go_together_are_refused() {
     let directory = on_a_device("options");
@@ -207,6 +268,16 @@ fn options_that_do_not_go_together_are_refused() {
         ("gateway halves.toml --dry-run both.log -b 500k", 2, "cannot be used with"),
         ("gateway halves.toml -d virtual:load=0 -b 500k -f 123", 2, "--dry-run"),
         ("gateway halves.toml -d candump:both.log -b 500k", 1, "cannot be a gateway"),
+        ("gateway halves.toml -d virtual:load=0 -b 500k --db both.log", 2, "--db is for a trace"),
+        ("gateway halves.toml -d virtual:load=0 -b 500k --j1939", 2, "--j1939 is for a trace"),
+        ("gateway halves.toml -d virtual:load=0 -b 500k --from candump", 2, "--from is for a trace"),
+        (
+            "gateway halves.toml -d virtual:load=0 -b 500k --columns id=1,data=2",
+            2,
+            "--columns is for a trace",
+        ),
+        ("gateway --show -d virtual:load=0 --strict", 2, "--strict is for a trace"),
+        ("gateway --stop -d virtual:load=0 --zone +02:00", 2, "--zone is for a trace"),
     ] {
         let (found, _, err) = cantap(&directory, line);
         assert_eq!(found, Some(code), "{line}: {err}");

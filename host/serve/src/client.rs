@@ -277,8 +277,8 @@ impl Client {
             drop(state);
             return self.answer(id, &Err(Refusal::NoBoard));
         };
-        // These are possible only for a program that has the port.
-        let local = capability::SLCAN | capability::BOOTLOADER;
+        // These are possible only for a program that has the port to itself.
+        let local = capability::SLCAN | capability::BOOTLOADER | capability::GATEWAY;
         let hello = Hello { capabilities: hello.capabilities & !local, ..hello };
         let ticks = state.latest_ticks;
         if let Some(member) = state.clients.get_mut(&self.id) {

@@ -14,6 +14,7 @@ pub fn failure_text(reason: TransmitFailure) -> Cow<'static, str> {
         TransmitFailure::Overtaken { periods } => {
             format!("overtaken: its next {periods} periods came first").into()
         }
+        TransmitFailure::Loop => "loop: both channels of the gateway are on one bus, and it has ended".into(),
         reason => reason.name().into(),
     }
 }

@@ -57,6 +57,8 @@ const FAILURES: [TransmitFailure; 5] = [
 /// Takes the place of a position in [`FAILURES`]: the count is then that of the periods. Only the device's own frames are overtaken,
 /// so the lower half of the tag is enough; it uses the bytes of the error counters.
 const OVERTAKEN: u8 = 6;
+/// The same for [`TransmitFailure::Loop`], with a tag as the others have.
+const LOOP: u8 = 7;
 
 /// An error frame: its classes, without [`ERROR_FLAG`], and its data.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -122,7 +124,8 @@ impl ErrorFrame {
                 TX_TIMEOUT
             }
             TraceEvent::TransmitFailed { tag, reason } => {
-                data[1] = position(&FAILURES, Some(reason));
+                let is_loop = reason == TransmitFailure::Loop;
+                data[1] = if is_loop { LOOP } else { position(&FAILURES, Some(reason)) };
                 data[2..6].copy_from_slice(&tag.to_le_bytes());
                 if reason == TransmitFailure::ArbitrationLost { LOST_ARBITRATION } else { TX_TIMEOUT }
             }
@@ -176,7 +179,10 @@ impl ErrorFrame {
                 let reason = TransmitFailure::Overtaken { periods: number };
                 return (TraceEvent::TransmitFailed { tag, reason }, None);
             }
-            let told = FAILURES.get(data[1].wrapping_sub(1) as usize).copied();
+            let told = match data[1] {
+                LOOP => Some(TransmitFailure::Loop),
+                place => FAILURES.get(place.wrapping_sub(1) as usize).copied(),
+            };
             let guess = if has(LOST_ARBITRATION) {
                 TransmitFailure::ArbitrationLost
             } else {

@@ -76,6 +76,9 @@ impl Memory {
     }
 }
 
+/// No host finds a port as soon as its device has started. A real one takes a hundred times as long.
+const ENUMERATED_AFTER_NS: u64 = 2 * MS_NS;
+
 /// What outlives the firmware.
 pub struct World {
     port: VirtualPort,
@@ -162,7 +165,7 @@ impl<'q> Machine<'q> {
             name,
             crystal_ppm,
             now_ns,
-            next_usb_ns: now_ns,
+            next_usb_ns: now_ns + ENUMERATED_AFTER_NS,
             next_tick_ns: now_ns + MS_NS,
         }
     }

@@ -2,12 +2,14 @@
 
 mod diagnostics;
 mod fanout;
+mod gateway;
 mod lock;
 mod records;
 mod session;
 mod tasks;
 mod transmissions;
 
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
@@ -25,6 +27,7 @@ use pyo3::types::PyDict;
 use serde_json::json;
 
 use self::fanout::{SentFrames, Wanted};
+use self::gateway::Gateway;
 use self::lock::lock;
 use self::records::{Records, SLICE};
 use self::session::{HowToSend, Session};
@@ -42,6 +45,7 @@ const MOST_TIME: Duration = Duration::from_hours(24);
 #[pyclass(module = "cantap", frozen, weakref)]
 pub struct Device {
     session: Mutex<Option<Arc<Session>>>,
+    gateway: Mutex<Option<Gateway>>,
 }
 
 /// How to open a channel, as passed by the Python half.
@@ -131,7 +135,7 @@ impl Device {
     #[new]
     fn new(py: Python<'_>, address: String) -> PyResult<Self> {
         let session = py.detach(|| Session::open(&address))?;
-        Ok(Self { session: Mutex::new(Some(Arc::new(session))) })
+        Ok(Self { session: Mutex::new(Some(Arc::new(session))), gateway: Mutex::new(None) })
     }
 
     /// Its address.
@@ -447,6 +451,26 @@ impl Device {
             all.set_item(channel.number(), counts)?;
         }
         Ok(all)
+    }
+
+    /// Passes frames on between the channels, by a file's rules.
+    fn start_gateway(&self, py: Python<'_>, rules: PathBuf) -> PyResult<()> {
+        let session = self.session()?;
+        let started = py.detach(|| Gateway::start(session.device()?, &rules))?;
+        *lock(&self.gateway) = Some(started);
+        Ok(())
+    }
+
+    /// Ends the gateway. What waits in it is lost, and counted.
+    fn stop_gateway(&self, py: Python<'_>) -> PyResult<()> {
+        self.ask(py, cantap::Device::stop_gateway)
+    }
+
+    /// What the gateway does, and its counts.
+    fn gateway<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let session = self.session()?;
+        let object = py.detach(|| Gateway::counts(lock(&self.gateway).as_ref(), session.device()?))?;
+        from_json(py, &object.to_string())
     }
 
     /// What is known about the device's clock.

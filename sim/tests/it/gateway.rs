@@ -4,7 +4,7 @@
 use crate::common;
 
 use Channel::{Can1, Can2};
-use cantap_emu::bus::{BitTime, BusFrame, Member, Node};
+use cantap_emu::bus::{BitTime, BusFrame, Member, Node, Source};
 use cantap_emu::machine::Setup;
 use cantap_emu::timing::Bound::{self, Best, Worst};
 use cantap_emu::traffic::{Kind, Traffic};
@@ -14,7 +14,7 @@ use cantap_sim::rig::{MS, Rig, timing};
 use cantap_wire::message::{
     ChannelConfig, Filter, FrameKind, GatewayEnd, GatewayRule, GatewayState, GatewayStatus, Mode, Pass,
 };
-use cantap_wire::record::LossStage;
+use cantap_wire::record::{LossStage, TransmitFailure};
 use cantap_wire::{CHANNELS, Channel, Command, Event, Frame, Reply};
 
 /// From the end of a frame to the start of the same on an idle bus.
@@ -188,21 +188,61 @@ fn a_closed_port_silences_a_gateway_that_a_host_has_started() {
     assert!(received.len() > 50 && sent.is_empty(), "{} sent", sent.len());
 }
 
+/// A frame again and again, without a pause between.
+struct Same {
+    frame: Frame,
+    left: u32,
+}
+
+impl Source for Same {
+    fn next_frame(&mut self, _: BitTime) -> Option<(u64, Frame)> {
+        self.left = self.left.checked_sub(1)?;
+        Some((0, self.frame))
+    }
+}
+
+/// On the other bus each ends about when the next ends here.
+#[test]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
+fn equal_frames_back_to_back_are_no_loop() {
+    for (bound, rate) in
+        [Best, Worst].into_iter().flat_map(|bound| [1_000_000, 500_000, 125_000].map(|rate| (bound, rate)))
+    {
+        let mut rig = gateway(bound, [rate; CHANNELS], &rules());
+        let frames = 400;
+        rig.add_traffic(Can1, rate, Same { frame: "123#1122334455667788".parse().unwrap(), left: frames });
+        rig.run_for(1200 * MS * 125_000 / u64::from(rate)).unwrap();
+        let (received, sent) = crossed(&rig.take_watched(), Can1);
+        let found = status(&mut rig, Can1);
+        eprintln!("{bound}, {rate}: {} of {} sent", sent.len(), received.len());
+        assert_eq!(found.state, GatewayState::Running, "{bound}, {rate}");
+        assert_eq!((received.len(), sent.len()), (frames as usize, frames as usize), "{bound}, {rate}");
+        assert!(rig.ledger.holds(), "{:?}", rig.ledger.faults());
+    }
+}
+
 #[test]
 #[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn both_channels_on_one_bus_are_noticed_and_the_bus_is_left_alone() {
-    for bound in [Best, Worst] {
+    for (bound, rate) in
+        [Best, Worst].into_iter().flat_map(|bound| [1_000_000, 125_000, 33_333].map(|rate| (bound, rate)))
+    {
         let setup = Setup { bound, joined: true, ..board::setup() };
-        let mut rig = gateway_on(setup, [1_000_000; CHANNELS], &rules());
+        let mut rig = gateway_on(setup, [rate; CHANNELS], &rules());
         let from = rig.now();
-        rig.add_traffic(Can1, 1_000_000, Traffic::new(Kind::Std8, 1, 5.0, from, from + 100 * MS));
-        rig.run_for(200 * MS).unwrap();
+        rig.add_traffic(Can1, rate, Traffic::new(Kind::Std8, 1, 5.0, from, from + 100 * MS));
+        rig.run_for(600 * MS).unwrap();
+        let events = rig.events();
+        let told = events.iter().filter(|(_, event)| {
+            matches!(event, Event::TransmitFailed { reason: TransmitFailure::Loop, .. })
+        });
+        assert_eq!(told.count(), 1, "{bound}, {rate}");
         let found = status(&mut rig, Can1);
         let ours = rig.take_watched()[0]
             .iter()
             .filter(|frame| matches!(frame.sender, Member::Controller(_)))
             .count();
-        eprintln!("{bound}: {ours} frames until the loop was noticed");
+        eprintln!("{bound}, {rate}: {ours} frames until the loop was noticed");
         assert_eq!(found.state, GatewayState::Ended(GatewayEnd::Loop));
         assert!(ours < 200, "{ours}");
     }

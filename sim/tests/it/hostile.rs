@@ -11,7 +11,7 @@ use cantap_emu::traffic::{Kind, Traffic};
 use cantap_emu::usb_host::{Request, Timing};
 use cantap_sim::board::CLOCK;
 use cantap_sim::capture::Ledger;
-use cantap_sim::hostile::{BACK_WITHIN, try_seed};
+use cantap_sim::hostile::{BACK_WITHIN, try_gateway, try_seed};
 use cantap_sim::rig::{MS, Rig, timing};
 use cantap_wire::message::{ChannelConfig, Mode, Periodic};
 use cantap_wire::{Channel, Command, Refusal};
@@ -376,6 +376,16 @@ fn after_any_storm_the_device_is_back(seeds: std::ops::Range<u64>) {
     let image = common::firmware();
     for seed in seeds {
         let trial = try_seed(image.clone(), seed);
+        assert!(trial.faults.is_empty(), "seed {seed}: {:#?}\n{:#?}", trial.faults, trial.story);
+    }
+}
+
+#[test]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
+fn after_any_storm_a_gateway_is_silent_and_has_counted_every_frame() {
+    let image = common::firmware();
+    for seed in 0..50 {
+        let trial = try_gateway(image.clone(), seed);
         assert!(trial.faults.is_empty(), "seed {seed}: {:#?}\n{:#?}", trial.faults, trial.story);
     }
 }

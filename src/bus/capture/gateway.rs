@@ -9,6 +9,7 @@ use cantap_wire::{CHANNELS, Channel, Frame, Refusal};
 use super::Capture;
 use crate::bus::gateway::other;
 use crate::ports::{Clock, Traffic};
+use crate::{CAN_CLOCK_HZ, TICK_HZ};
 
 impl<const N: usize> Capture<'_, N> {
     /// A frame was taken out of a FIFO, and is not recorded yet: the gateway passes it on, since its bus is waiting. Returns whether there
@@ -44,6 +45,7 @@ impl<const N: usize> Capture<'_, N> {
         let transmitter = &mut self.channels[to.index()].transmitter;
         transmitter.pass(frame, at);
         if transmitter.lane().is_loop() {
+            transmitter.found_loop();
             return self.end_gateway(GatewayState::Ended(GatewayEnd::Loop));
         }
         transmitter.service(&mut traffic[to.index()], &mut self.recorder, now);
@@ -74,14 +76,17 @@ impl<const N: usize> Capture<'_, N> {
         if self.gateway == GatewayState::Running {
             return Err(Refusal::GatewayRunning);
         }
-        for state in &self.channels {
+        let mut bits_ticks = [0; CHANNELS];
+        for (state, bit_ticks) in self.channels.iter().zip(&mut bits_ticks) {
             match &state.open {
                 None => return Err(Refusal::ChannelClosed),
                 Some(config) if config.mode != Mode::Normal => return Err(Refusal::NotNormal),
-                Some(_) => {}
+                Some(config) => *bit_ticks = config.timing.clocks_per_bit().div_ceil(CAN_CLOCK_HZ / TICK_HZ),
             }
         }
-        self.channels.iter_mut().for_each(|state| state.transmitter.start_passing());
+        for (state, bit_ticks) in self.channels.iter_mut().zip(bits_ticks) {
+            state.transmitter.start_passing(bit_ticks);
+        }
         (self.gateway, self.standalone) = (GatewayState::Running, standalone);
         Ok(())
     }
@@ -94,12 +99,14 @@ impl<const N: usize> Capture<'_, N> {
             self.channels.iter_mut().for_each(|channel| channel.transmitter.stop_passing());
             self.gateway = state;
         }
-        self.standalone = false;
+        self.standalone &= state == GatewayState::Ended(GatewayEnd::Loop);
     }
 
-    /// No gateway has run in this session.
-    pub(super) const fn forget_gateway(&mut self) {
-        (self.gateway, self.standalone) = (GatewayState::Off, false);
+    /// No gateway has run in this session. That one without a host has found a loop is for the next host.
+    pub(super) fn forget_gateway(&mut self) {
+        if !self.standalone || self.gateway == GatewayState::Running {
+            (self.gateway, self.standalone) = (GatewayState::Off, false);
+        }
     }
 
     /// Whether a gateway runs that was started without a host.

@@ -41,11 +41,17 @@ impl<'q, const N: usize> Capture<'q, N> {
         now
     }
 
-    /// Starts a session beside a gateway that goes on: as [`Self::restart`], but nothing on its way to a bus is forgotten.
-    pub fn restart_beside_gateway(&mut self, clock: &impl Clock) -> u64 {
+    /// Starts a session beside a gateway that goes on: as [`Self::restart`], but what is the gateway's is not forgotten.
+    pub fn restart_beside_gateway<T: Traffic>(
+        &mut self,
+        both: &mut [T; CHANNELS],
+        clock: &impl Clock,
+    ) -> u64 {
         let now = self.now(clock);
         self.recorder.restart(now);
-        for state in &mut self.channels {
+        for (state, traffic) in self.channels.iter_mut().zip(both) {
+            state.abort_reason = TransmitFailure::Aborted;
+            state.transmitter.forget_host(traffic);
             state.frames = 0;
             state.overruns = 0;
             state.transmitter.reset_counters();

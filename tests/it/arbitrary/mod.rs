@@ -2,7 +2,7 @@
 
 use cantap_firmware::CAN_CLOCK_HZ;
 use cantap_wire::message::{
-    ChannelConfig, Checksum, Filter, FrameKind, Mode, Modifier, Periodic, Trigger, TxFrame,
+    ChannelConfig, Checksum, Filter, FrameKind, GatewayRule, Mode, Modifier, Pass, Periodic, Trigger, TxFrame,
 };
 use cantap_wire::{BitTiming, Channel, Command, Frame, Id};
 use proptest::prelude::*;
@@ -63,6 +63,68 @@ fn modifier() -> impl Strategy<Value = Modifier> {
     ]
 }
 
+fn rule() -> impl Strategy<Value = GatewayRule> {
+    let times = prop_oneof![3 => Just(0), 2 => 0..200_000_u32, 1 => any::<u32>()];
+    let bits = (any::<bool>(), any::<[u32; 2]>(), 0..20_u8, any::<[[u8; 8]; 2]>());
+    let modifiers = || prop::collection::vec(modifier(), 0..3);
+    let wild = (bits, modifiers(), times.clone(), times.clone()).prop_map(
+        |(
+            (extended, [id_and, id_xor], dlc_xor, [data_and, data_xor]),
+            modifiers,
+            period_ticks,
+            delay_ticks,
+        )| Pass {
+            extended,
+            id_and,
+            id_xor,
+            dlc_xor,
+            data_and,
+            data_xor,
+            modifiers: modifiers.into_iter().collect(),
+            period_ticks,
+            delay_ticks,
+            ..Pass::unchanged(extended)
+        },
+    );
+    let tame = (modifiers(), times.clone(), times).prop_map(|(modifiers, period_ticks, delay_ticks)| Pass {
+        modifiers: modifiers.into_iter().collect(),
+        period_ticks,
+        delay_ticks,
+        ..Pass::unchanged(false)
+    });
+    let all = Filter { extended: false, kind: FrameKind::Any, id: 0, mask: 0 };
+    prop_oneof![
+        4 => tame.prop_map(move |pass| GatewayRule { filter: all, pass: Some(pass) }),
+        1 => (filter(), prop::option::of(wild)).prop_map(|(filter, pass)| GatewayRule { filter, pass }),
+    ]
+}
+
+/// What makes a device a gateway, now or from its next start on, if none of it is refused.
+pub fn gateway() -> impl Strategy<Value = Vec<Command>> {
+    let rules = [(); 2].map(|()| prop::collection::vec(rule(), 0..4));
+    (rules, [channel_config(), channel_config()], any::<bool>()).prop_map(|(rules, configs, save)| {
+        let mut commands: Vec<_> = Channel::ALL.map(|channel| Command::Close { channel }).into();
+        for (channel, config) in Channel::ALL.into_iter().zip(configs) {
+            let config = ChannelConfig { mode: Mode::Normal, ..config };
+            commands.push(if save {
+                Command::Configure { channel, config }
+            } else {
+                Command::Open { channel, config: Some(config) }
+            });
+        }
+        for (from, rules) in Channel::ALL.into_iter().zip(rules) {
+            let rules = (0..).zip(rules);
+            commands.extend(rules.map(|(slot, rule)| Command::SetGatewayRule {
+                from,
+                slot,
+                rule: Some(rule),
+            }));
+        }
+        commands.push(if save { Command::SaveGateway } else { Command::StartGateway });
+        commands
+    })
+}
+
 pub fn command() -> impl Strategy<Value = Command> {
     let sent = |tags: std::ops::RangeInclusive<u32>, at: std::ops::RangeInclusive<u64>| {
         let frame = (tags, frame(), prop::option::of(at));
@@ -96,6 +158,9 @@ pub fn command() -> impl Strategy<Value = Command> {
         Command::SaveDefaults,
         Command::ClearDefaults,
         Command::Hello { protocol: 99 },
+        Command::StartGateway,
+        Command::StopGateway,
+        Command::SaveGateway,
     ]);
     prop_oneof![
         4 => (channel(), prop::option::weighted(0.8, channel_config()))
@@ -115,6 +180,10 @@ pub fn command() -> impl Strategy<Value = Command> {
             .prop_map(|(channel, slot, entry)| Command::SetPeriodic { channel, slot, entry }),
         2 => (channel(), 0..10_u8, prop::option::of(trigger))
             .prop_map(|(channel, slot, entry)| Command::SetTrigger { channel, slot, entry }),
+        2 => (channel(), 0..34_u8, prop::option::of(rule()))
+            .prop_map(|(from, slot, rule)| Command::SetGatewayRule { from, slot, rule }),
+        1 => (channel(), any::<u8>()).prop_map(|(from, first)| Command::GatewayStatus { from, first }),
+        1 => (channel(), 0..34_u8).prop_map(|(from, slot)| Command::GatewayRule { from, slot }),
         2 => simple,
     ]
 }

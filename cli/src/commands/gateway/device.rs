@@ -7,15 +7,16 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail};
 use cantap::device::Records;
 use cantap::wire::message::{ChannelConfig, GatewayEnd, GatewayState, Mode, capability};
+use cantap::wire::record::TransmitFailure;
 use cantap::wire::{CHANNELS, Channel};
 use cantap::{Device, TraceEvent};
 use cantap_address::OpenDevice;
 use cantap_work::channel_options::{ChannelOptions, description};
-use cantap_work::gateway::Rules;
+use cantap_work::gateway::{Counts, Named, Rules};
 use cantap_work::interrupt;
 
 use super::arguments::Args;
-use super::counts::{Counts, Named};
+use super::counts::AsText;
 use crate::exit;
 use crate::stderr;
 
@@ -23,6 +24,10 @@ use crate::stderr;
 const SHOW_EVERY: Duration = Duration::from_secs(1);
 /// How often to check whether to go on.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
+
+/// Why a gateway ends on its own, and what to do.
+const ONE_BUS: &str =
+    "both channels are on one bus: each frame that one sent, the other received; connect them to two buses";
 
 /// Begins a session with a device that can be a gateway.
 fn open(args: &Args) -> anyhow::Result<OpenDevice> {
@@ -54,22 +59,12 @@ fn configs(args: &Args, device: &OpenDevice) -> anyhow::Result<Vec<(Channel, Cha
     options.configs(device, Channel::ALL, Mode::Normal, &stderr::reporter())
 }
 
-fn set_rules(device: &Device, rules: &Rules) -> anyhow::Result<()> {
-    for from in Channel::ALL {
-        let places = rules.of_device(from, device.hello().tick_hz);
-        device
-            .set_gateway_rules(from, &places)
-            .with_context(|| format!("the rules for what channel {} receives", from.number()))?;
-    }
-    Ok(())
-}
-
 /// Runs a file's rules until it is to end.
 pub(super) fn run(args: &Args, rules: &Rules) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
     let device = open_idle(args)?;
     let configs = configs(args, &device)?;
-    set_rules(&device, rules)?;
+    rules.set(&device).context("the rules")?;
     let clock_hz = device.hello().can_clock_hz;
     let both: Vec<_> = configs
         .iter()
@@ -94,7 +89,13 @@ pub(super) fn run(args: &Args, rules: &Rules) -> anyhow::Result<ExitCode> {
 pub(super) fn show(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
     let device = open(args)?;
-    if !device.gateway_status(Channel::Can1, 0)?.standalone {
+    let status = device.gateway_status(Channel::Can1, 0)?;
+    if status.state == GatewayState::Ended(GatewayEnd::Loop) {
+        bail!(
+            "the gateway that is stored on the device has ended: {ONE_BUS}; `cantap reset` then starts it again, --forget erases it"
+        );
+    }
+    if !status.standalone {
         bail!(
             "the device runs no gateway on its own; `cantap gateway RULES` starts one, with --save for each start of the device"
         );
@@ -110,7 +111,7 @@ pub(super) fn save(args: &Args, rules: &Rules) -> anyhow::Result<ExitCode> {
         device.set_filters(channel, &[])?;
         device.configure(channel, config)?;
     }
-    set_rules(&device, rules)?;
+    rules.set(&device).context("the rules")?;
     device.save_gateway()?;
     writeln!(
         std::io::stdout(),
@@ -192,9 +193,7 @@ impl<'a> Watch<'a> {
         self.totals()?;
         let reason = match ended {
             Ended::Asked => return Ok(ExitCode::SUCCESS),
-            Ended::Gateway(GatewayState::Ended(GatewayEnd::Loop)) => {
-                "both channels are on one bus: each frame that one sent, the other received; connect them to two buses"
-            }
+            Ended::Gateway(GatewayState::Ended(GatewayEnd::Loop)) => ONE_BUS,
             Ended::Gateway(GatewayState::Ended(GatewayEnd::ChannelClosed)) => "a channel was closed",
             Ended::Gateway(_) => "it was stopped",
         };
@@ -209,8 +208,19 @@ impl<'a> Watch<'a> {
         while !interrupt::requested() && ends_at.is_none_or(|at| Instant::now() < at) {
             if let Some(batch) = self.records.next_batch(LOOK_EVERY)? {
                 for record in &batch {
-                    if let TraceEvent::State { state, .. } = &record.event {
-                        stderr::tell(&format!("cantap: channel {} is {}\n", record.channel, state.name()));
+                    match &record.event {
+                        TraceEvent::State { state, .. } => {
+                            stderr::tell(&format!(
+                                "cantap: channel {} is {}\n",
+                                record.channel,
+                                state.name()
+                            ));
+                        }
+                        // It has ended: no need to wait for the next look.
+                        TraceEvent::TransmitFailed { reason: TransmitFailure::Loop, .. } => {
+                            show_at = Instant::now();
+                        }
+                        _ => {}
                     }
                 }
                 self.records.recycle(batch);

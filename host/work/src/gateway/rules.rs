@@ -3,13 +3,18 @@
 mod file;
 mod rule;
 
+use std::fs::File;
+use std::io::Read;
 use std::path::Path;
 use std::time::Duration;
 
-use cantap::Channel;
 use cantap::wire::message::{GatewayRule, MAX_GATEWAY_RULES};
+use cantap::{Channel, Device, DeviceError};
 
 pub use rule::{Rule, RulesError};
+
+/// No file of rules is larger: a device has 64 places.
+const MOST_BYTES: u64 = 256 * 1024;
 
 /// What a file of rules says, in its order.
 #[derive(Clone, Debug)]
@@ -22,8 +27,11 @@ impl Rules {
     /// Reads a file.
     pub fn read(path: &Path) -> Result<Self, RulesError> {
         let file = path.display().to_string();
-        match std::fs::read_to_string(path) {
-            Ok(text) => Self::parse(&file, &text),
+        let mut text = String::new();
+        let read = File::open(path).and_then(|opened| opened.take(MOST_BYTES + 1).read_to_string(&mut text));
+        match read {
+            _ if text.len() as u64 > MOST_BYTES => Err(RulesError::TooLarge { file }),
+            Ok(_) => Self::parse(&file, &text),
             Err(error) => Err(RulesError::Unreadable { file, error }),
         }
     }
@@ -38,6 +46,14 @@ impl Rules {
             }
         }
         Ok(rules)
+    }
+
+    /// Gives a device those for both channels.
+    pub fn set(&self, device: &Device) -> Result<(), DeviceError> {
+        let tick_hz = device.hello().tick_hz;
+        Channel::ALL
+            .into_iter()
+            .try_for_each(|from| device.set_gateway_rules(from, &self.of_device(from, tick_hz)))
     }
 
     /// For each place in a device's list for a channel, the number of the rule in [`Self::rules`] that it belongs to.

@@ -58,6 +58,10 @@ pub fn events() -> Vec<(Event, &'static str)> {
             Event::TransmitFailed { channel, tag: 2, reason: TransmitFailure::Overtaken { periods: 300 } },
             "07 01 02 05 ac 02",
         ),
+        (
+            Event::TransmitFailed { channel, tag: GATEWAY_TAG, reason: TransmitFailure::Loop },
+            "07 01 80 80 ff ff 0f 06",
+        ),
     ]
 }
 

@@ -68,7 +68,8 @@ struct Source<'t> {
 
 impl Source<'_> {
     fn line(&self, at: usize) -> u32 {
-        self.text.char_indices().filter(|&(place, char)| place < at && char == '\n').count() as u32 + 1
+        let before = self.text.as_bytes().get(..at).unwrap_or_default();
+        before.iter().filter(|byte| **byte == b'\n').count() as u32 + 1
     }
 
     fn fault(&self, span: &Range<usize>, field: &str, text: impl Into<String>) -> RulesError {

@@ -34,6 +34,14 @@ pub enum RulesError {
         /// Why.
         error: std::io::Error,
     },
+    /// It is no file of rules.
+    #[error(
+        "{file} has more than 256 KiB, which no file of rules for a device has; docs/gateway.md says what one contains"
+    )]
+    TooLarge {
+        /// The file.
+        file: String,
+    },
     /// A place in it.
     #[error("{file}, line {line}: {field}{text}")]
     Faulty {

@@ -21,6 +21,7 @@ use crate::session::{
     over_by,
 };
 use crate::{TraceEvent, TraceRecord};
+pub use step::Stage;
 use step::{Asked, Purpose, Step};
 
 /// Time limit for a request.
@@ -31,22 +32,6 @@ const CLOCK_ROUNDS: u32 = 8;
 const STATUS_EVERY: Duration = Duration::from_secs(1);
 /// At the end, the last records are given up if none has arrived for this long.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(1);
-
-/// How far a session is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Stage {
-    /// The device has not said who it is.
-    Greeting,
-    /// Its clock is being read, and its channels opened.
-    Opening,
-    /// Its channels are open.
-    Listening,
-    /// Its channels are being closed, and the last records come.
-    Stopping,
-    /// The session has ended: as asked, or with [`Listener::error`]. What [`Listener::output`] still has should be written before the port
-    /// is closed.
-    Over,
-}
 
 /// A session that only listens; see the [module](self).
 pub struct Listener {
@@ -283,7 +268,9 @@ impl Listener {
         if !records.is_empty() && matches!(self.step, Step::Drain { .. }) {
             self.waited = Duration::ZERO;
         }
-        records.into_iter().for_each(|record| self.keep(record));
+        for record in records {
+            self.keep(record);
+        }
         if let Some((at, reason)) = ended {
             self.ended_at = Some(at);
             *over = Some(reason);
@@ -381,8 +368,9 @@ impl Listener {
             }
             (Step::LastStatus, Reply::Status(status)) => {
                 for (channel, stage, count) in unaccounted(&status, self.intake.counters()) {
-                    let mut lost = std::mem::take(self.intake.add_losses(channel, stage, count));
-                    lost.drain(..).for_each(|record| self.keep(record));
+                    for record in std::mem::take(self.intake.add_losses(channel, stage, count)) {
+                        self.keep(record);
+                    }
                 }
                 self.leave();
             }

@@ -2,8 +2,23 @@
 
 use cantap_wire::Channel;
 
-use super::Stage;
 use crate::device::UtcNs;
+
+/// How far a session is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stage {
+    /// The device has not said who it is.
+    Greeting,
+    /// Its clock is being read, and its channels opened.
+    Opening,
+    /// Its channels are open.
+    Listening,
+    /// Its channels are being closed, and the last records come.
+    Stopping,
+    /// The session has ended: as asked, or with an [error](super::Listener::error). What [`output`](super::Listener::output) still has should
+    /// be written before the port is closed.
+    Over,
+}
 
 /// What is waited for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

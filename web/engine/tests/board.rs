@@ -1,9 +1,11 @@
 //! A board's session as the page has it: bytes in, bytes out, over the virtual device.
 
 use std::io::{Read, Write};
+use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use cantap::device::is_idle;
+use cantap_virtual::Witness;
 use cantap_web_engine::{Engine, message};
 use serde_json::{Value, json};
 
@@ -11,6 +13,7 @@ use serde_json::{Value, json};
 struct Page {
     engine: Engine,
     port: cantap::device::Link,
+    witness: Arc<Witness>,
 }
 
 fn now_ms() -> f64 {
@@ -20,7 +23,8 @@ fn now_ms() -> f64 {
 impl Page {
     fn new(options: &str) -> Self {
         let connection = cantap_virtual::start(options.parse().unwrap()).unwrap();
-        Self { engine: Engine::default(), port: connection.into_link() }
+        let witness = Arc::clone(&connection.witness);
+        Self { engine: Engine::default(), port: connection.into_link(), witness }
     }
 
     fn try_ask(&mut self, request: &str, parameters: Value, bytes: Option<&[u8]>) -> Result<Value, String> {
@@ -87,6 +91,8 @@ fn what_the_board_sends_is_the_trace_and_another_session_goes_on_in_it() {
     page.ask("boardStop", json!({}));
     let end = page.until(is_over);
     assert_eq!(end["board"]["error"], Value::Null);
+    let heard = page.witness.heard();
+    assert_eq!(heard.driven, [0, 0]);
     let channels = end["board"]["channels"].as_array().unwrap();
     let mut sum = 0;
     for (channel, bitrate) in channels.iter().zip([500_000, 250_000]) {
@@ -94,6 +100,7 @@ fn what_the_board_sends_is_the_trace_and_another_session_goes_on_in_it() {
         assert_eq!((&channel["received"], &channel["lost"]), (&channel["counted"], &json!(0)));
         sum += channel["counted"].as_u64().unwrap();
     }
+    assert_eq!(sum, heard.frames.iter().sum::<u64>());
     assert_eq!((end["summary"]["frames"].as_u64().unwrap(), records(&end)), (sum, sum));
     assert_eq!(end["summary"]["channels"][0]["bitrate"], 500_000);
     // Between the two sessions nothing is known of either channel.

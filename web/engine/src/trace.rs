@@ -263,7 +263,9 @@ impl Trace {
 
     /// Adds records to a live trace.
     pub fn add(&mut self, records: &[TraceRecord]) {
-        records.iter().for_each(|record| self.content.push(record));
+        for record in records {
+            self.content.push(record);
+        }
     }
 
     fn read_on(&mut self) -> Result<(), EngineError> {

@@ -19,7 +19,7 @@ const VARIABLE: &str = "CANTAP_PAGE";
 /// The page's name beside the program.
 const BESIDE: &str = "cantap-page.html";
 /// Where what it opens goes: the page has this once before its script.
-const MARK: &str = "<!--cantap-report-->";
+pub const MARK: &str = "<!--cantap-report-->";
 /// A file is compressed if that saves at least a fiftieth of it; those of compressed formats stay as they are.
 const WORTHWHILE: usize = 50;
 

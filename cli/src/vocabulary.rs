@@ -275,6 +275,7 @@ fn what_measures_or_tells_has_json() {
         "identify",
         "man",
         "monitor",
+        "page",
         "report",
         "reset",
         "serve",

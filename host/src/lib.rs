@@ -4,7 +4,7 @@
 //! without a board. [`transmit`] sends many frames and accounts for each, [`replay`] sends them with a trace's own timing,
 //! [`periodic`] checks what the device is asked to repeat, [`hw_filter`] has it drop unwanted frames, [`autobaud`] finds a
 //! bus's bit rate by listening, [`recovery`] brings a channel back from bus-off, and [`unsent`] says why something was not
-//! sent. [`session`] is what [`Device`] and the
+//! sent. [`listener`] is a session for programs without threads. [`session`] is what [`Device`] and the
 //! server of a shared board have in common, and [`responder`] is the other side: for programs that answer as a device does.
 
 #![forbid(unsafe_code)]
@@ -13,6 +13,7 @@ pub mod autobaud;
 pub mod bit_timing;
 pub mod device;
 pub mod hw_filter;
+pub mod listener;
 pub mod periodic;
 pub mod recovery;
 pub mod replay;

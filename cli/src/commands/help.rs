@@ -28,7 +28,19 @@ const GROUPS: [(&str, &[&str]); 7] = [
     ("Record, convert", &["capture", "convert", "align"]),
     (
         "Understand",
-        &["decode", "search", "conversations", "plot", "report", "diff", "delay", "db", "bits", "timing"],
+        &[
+            "decode",
+            "search",
+            "conversations",
+            "plot",
+            "report",
+            "page",
+            "diff",
+            "delay",
+            "db",
+            "bits",
+            "timing",
+        ],
     ),
     ("Send, ask", &["send", "replay", "gen", "run", "twin", "obd", "uds", "canopen", "j1939", "gateway"]),
     (

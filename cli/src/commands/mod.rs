@@ -28,6 +28,7 @@ pub mod list;
 pub mod man;
 pub mod monitor;
 pub mod obd;
+pub mod page;
 pub mod plot;
 pub mod replay;
 pub mod report;
@@ -59,6 +60,8 @@ pub enum Command {
     Plot(plot::Args),
     /// Make a page of a trace that opens in any browser, offline: rows, graphs, findings.
     Report(report::Args),
+    /// Write the page without a trace: drop traces onto it, or open a board from the browser.
+    Page(page::Args),
     /// Show a device or a trace in a browser on this machine: live, with recording and sending.
     Ui(Box<ui::Args>),
     /// Measure a trace or a bus: load, rates, periods, losses, errors.
@@ -154,6 +157,7 @@ impl Command {
             Self::Monitor(args) => monitor::run(&args),
             Self::Plot(args) => plot::run(&args),
             Self::Report(args) => report::run(&args),
+            Self::Page(args) => page::run(&args),
             Self::Ui(args) => ui::run(&args),
             Self::Stats(args) => stats::run(&args),
             Self::Convert(args) => convert::run(&args),

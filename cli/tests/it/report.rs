@@ -146,3 +146,19 @@ fn without_a_page_or_a_trace_it_says_what_to_do() {
     assert!(code == Some(1) && text.contains("cargo xtask web"), "{text}");
     assert_eq!(std::fs::read_to_string(directory.join("a.log")).unwrap(), log(5, 1));
 }
+
+#[test]
+fn the_page_itself_is_written_and_replaces_nothing_else() {
+    let directory = directory("page");
+    let (code, text) = cantap(&directory, &["page"]);
+    assert!(code == Some(0) && text.contains("cantap.html"), "{text}");
+    let page = std::fs::read(directory.join("page.html")).unwrap();
+    assert_eq!(std::fs::read(directory.join("cantap.html")).unwrap(), page);
+    // A newer one takes its place, and no other file's.
+    let (code, _) = cantap(&directory, &["page", "-o", "cantap.html"]);
+    assert_eq!(code, Some(0));
+    std::fs::write(directory.join("notes.html"), "mine").unwrap();
+    let (code, text) = cantap(&directory, &["page", "-o", "notes.html"]);
+    assert!(code == Some(1) && text.contains("give another name"), "{text}");
+    assert_eq!(std::fs::read(directory.join("notes.html")).unwrap(), b"mine");
+}

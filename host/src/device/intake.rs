@@ -1,14 +1,13 @@
 //! Turns bytes into trace records: decodes a device's stream, tightens stamps, maps them to UTC and counts.
-//! It has no threads and does no I/O: the reader thread drives it, and so do tests and the benchmark.
+//! It has no threads and no clock and does no I/O: the reader thread drives it, and so do a listener, tests and the benchmark.
 
 use std::ops::Add;
-use std::time::Instant;
 
-use cantap_wire::message::EndReason;
+use cantap_wire::message::{EndReason, Status};
 use cantap_wire::record::{Event, LossStage, Record, Stamp, TransmitFailure};
 use cantap_wire::{CHANNELS, Channel, Corruption, Decoded, Decoder, Frame, Reply, Response};
 
-use super::clock::{ClockMap, SofMark, Ticks, UtcClock};
+use super::clock::{ClockMap, SofMark, Ticks, UtcNs};
 use super::stamps::{BitLengths, Stamped, tighten};
 use crate::{Direction, TraceEvent, TraceFrame, TraceRecord};
 
@@ -144,7 +143,6 @@ pub struct Intake {
     records: Vec<TraceRecord>,
     lengths: BitLengths,
     clock: ClockMap,
-    utc: UtcClock,
     /// The last record's time.
     last_ns: i64,
     counters: Counters,
@@ -165,14 +163,12 @@ pub struct Intake {
 impl Intake {
     /// An intake that waits for the answer to `Hello`.
     pub fn new() -> Self {
-        let utc = UtcClock::start();
         Self {
             decoder: Decoder::new(),
             stamped: Vec::new(),
             records: Vec::new(),
             lengths: BitLengths::default(),
-            clock: ClockMap::new(cantap_tick_hz_before_hello(), utc.at(Instant::now())),
-            utc,
+            clock: ClockMap::new(cantap_tick_hz_before_hello(), UtcNs(0)),
             last_ns: i64::MIN,
             counters: Counters::default(),
             latest_ticks: 0,
@@ -184,9 +180,14 @@ impl Intake {
         }
     }
 
-    /// Takes [`PIECE_BYTES`] or fewer (more works, but slower), reports notices, and returns the records, to
+    /// Takes [`PIECE_BYTES`] or fewer (more works, but slower) that have arrived by `now`, reports notices, and returns the records, to
     /// be taken out of the vector.
-    pub fn push(&mut self, bytes: &[u8], mut notice: impl FnMut(Notice)) -> &mut Vec<TraceRecord> {
+    pub fn push(
+        &mut self,
+        bytes: &[u8],
+        now: UtcNs,
+        mut notice: impl FnMut(Notice),
+    ) -> &mut Vec<TraceRecord> {
         let Self {
             decoder,
             stamped,
@@ -196,7 +197,6 @@ impl Intake {
             in_session,
             lengths,
             last_ns,
-            utc,
             latest_ticks,
             off_bus_since,
             tick_hz,
@@ -253,7 +253,7 @@ impl Intake {
                     *off_bus_since = [None; CHANNELS];
                     *lengths = BitLengths::default();
                     *last_ns = i64::MIN;
-                    *clock = ClockMap::new(answer.tick_hz, utc.at(Instant::now()));
+                    *clock = ClockMap::new(answer.tick_hz, now);
                 }
                 notice(Notice::Response(response.clone()));
             }
@@ -341,10 +341,10 @@ impl Intake {
     /// had happened. (Records heard since may be later than the answer: a server passes them on without waiting for its answers.)
     /// Returns false if the answer is earlier than that, which is impossible.
     #[must_use]
-    pub fn add_time(&mut self, ticks: Ticks, latest_ticks: u64, asked: Instant, answered: Instant) -> bool {
+    pub fn add_time(&mut self, ticks: Ticks, latest_ticks: u64, asked: UtcNs, answered: UtcNs) -> bool {
         let is_possible = latest_ticks.saturating_sub(ticks.0) <= self.disorder_ticks;
         if is_possible {
-            self.clock.add(ticks, self.utc.at(asked), self.utc.at(answered));
+            self.clock.add(ticks, asked, answered);
         }
         is_possible
     }
@@ -401,6 +401,24 @@ impl Default for Intake {
     fn default() -> Self {
         Self::new()
     }
+}
+
+/// What a device's counters show beyond ours once both channels are closed: a lost batch may have contained loss records, and nothing after
+/// the last batch reports its content.
+pub fn unaccounted(status: &Status, counters: &Counters) -> Vec<(Channel, LossStage, u32)> {
+    let missing = |device: u32, ours: u64| device.wrapping_sub(ours as u32);
+    let of = |channel: Channel| {
+        let (device, ours) = (&status.channels[channel.index()], &counters.channels[channel.index()]);
+        let on_the_link =
+            missing(device.frames.wrapping_sub(device.lost_queue), ours.received + ours.lost_link);
+        [
+            (channel, LossStage::Controller, missing(device.lost_controller, ours.lost_controller)),
+            (channel, LossStage::Queue, missing(device.lost_queue, ours.lost_queue)),
+            (channel, LossStage::Link, on_the_link),
+        ]
+    };
+    let is_loss = |(_, _, count): &(Channel, LossStage, u32)| *count > 0 && *count < u32::MAX / 2;
+    Channel::ALL.into_iter().flat_map(of).filter(is_loss).collect()
 }
 
 /// No record is kept before `Hello` gives the tick rate; any number will do.

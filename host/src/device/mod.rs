@@ -22,7 +22,6 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use cantap_wire::message::{ChannelConfig, Filter, Mode, Status, capability};
-use cantap_wire::record::LossStage;
 use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Hello, Reply};
 
 pub use buffer::Buffer;
@@ -30,6 +29,7 @@ pub use clock::{
     ClockMap, ClockReport, ClockSource, CommonClock, Follower, FollowerReport, FrameClock, FrameDoubt,
     FrameNs, NotCommon, SofMark, Ticks, UtcClock, UtcNs,
 };
+pub(crate) use intake::unaccounted;
 pub use intake::{ChannelCounters, Counters, Intake, Notice, PIECE_BYTES, Transmission};
 pub use pipe::{PipeReader, PipeWriter, pipe};
 pub use reconnect::{Gaps, Happening, Reconnecting, Return};
@@ -293,23 +293,8 @@ impl Device {
     fn close_and_account(&self) -> Result<Status, DeviceError> {
         self.close_channels(&Channel::ALL)?;
         let status = self.status()?;
-        let counters = self.counters();
-        for channel in Channel::ALL {
-            let (device, ours) = (&status.channels[channel.index()], &counters.channels[channel.index()]);
-            // A lost batch may have contained loss records, and nothing after the last batch reports its
-            // content.
-            let missing = |device: u32, ours: u64| device.wrapping_sub(ours as u32);
-            let on_the_link =
-                missing(device.frames.wrapping_sub(device.lost_queue), ours.received + ours.lost_link);
-            for (stage, count) in [
-                (LossStage::Controller, missing(device.lost_controller, ours.lost_controller)),
-                (LossStage::Queue, missing(device.lost_queue, ours.lost_queue)),
-                (LossStage::Link, on_the_link),
-            ] {
-                if count > 0 && count < u32::MAX / 2 {
-                    self.order(Order::Losses { channel, stage, count });
-                }
-            }
+        for (channel, stage, count) in intake::unaccounted(&status, &self.counters()) {
+            self.order(Order::Losses { channel, stage, count });
         }
         Ok(status)
     }

@@ -10,7 +10,7 @@ use cantap_wire::record::LossStage;
 use cantap_wire::{CHANNELS, Channel, Reply};
 
 use super::buffer::Buffer;
-use super::clock::{ClockMap, ClockReport, Ticks};
+use super::clock::{ClockMap, ClockReport, Ticks, UtcClock};
 use super::intake::{Counters, Intake, Notice, PIECE_BYTES, Transmission};
 use crate::session::{DeviceError, Pass, SessionOver, Sink};
 
@@ -122,19 +122,21 @@ pub(super) struct Reader {
     shared: Arc<Shared>,
     orders: Receiver<Order>,
     intake: Intake,
+    utc: UtcClock,
     published: Published,
 }
 
 impl Reader {
     pub fn new(shared: Arc<Shared>, orders: Receiver<Order>) -> Self {
-        Self { shared, orders, intake: Intake::new(), published: Published::default() }
+        let (intake, utc) = (Intake::new(), UtcClock::start());
+        Self { shared, orders, intake, utc, published: Published::default() }
     }
 
     fn take_piece(&mut self, piece: &[u8], pass: &mut Pass<'_, Option<TimeAsked>>) {
-        let Self { shared, intake, published, .. } = self;
+        let Self { shared, intake, utc, published, .. } = self;
         let at = Instant::now();
         let (mut time, mut answered) = (None, false);
-        intake.push(piece, |notice| match notice {
+        intake.push(piece, utc.at(at), |notice| match notice {
             Notice::Response(response) => {
                 answered = true;
                 if let Some(waiting) = pass.response(&response) {
@@ -163,7 +165,7 @@ impl Reader {
         let lost = shared.buffer.push(intake.records());
         intake.count_host_losses(lost);
         if let Some((ticks, asked)) = time {
-            if !intake.add_time(ticks, asked.latest_ticks, asked.at, at) {
+            if !intake.add_time(ticks, asked.latest_ticks, utc.at(asked.at), utc.at(at)) {
                 pass.end(SessionOver::TimesDisagree);
             }
             shared.publish_clock(intake.clock());

@@ -21,13 +21,16 @@ pub use clean::{clean, printable};
 pub(crate) use error::no_timing;
 pub use error::{DeviceError, SessionOver};
 pub use link::{Link, is_idle};
+pub(crate) use plausible::believe;
+pub(crate) use reading::over_by;
 pub use reading::{Pass, Sink};
 pub use requests::{InFlight, Requests, Waiting, encode, write_patiently};
+pub(crate) use watch::{LONGEST_PASS, Next, SilenceWatch};
 
 /// How often `Hello` is tried: a device may have half a line from another program in its input.
-const HELLO_TRIES: u32 = 3;
+pub(crate) const HELLO_TRIES: u32 = 3;
 /// Time limit for each try.
-const HELLO_TIMEOUT: Duration = Duration::from_millis(700);
+pub(crate) const HELLO_TIMEOUT: Duration = Duration::from_millis(700);
 
 /// A session. Dropping it ends the connection.
 pub struct Session<N> {

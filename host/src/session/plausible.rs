@@ -10,7 +10,7 @@ use super::error::DeviceError;
 const LEAST_CLOCK_HZ: u32 = 1_000_000;
 
 /// Returns the answer if it is possible.
-pub(super) fn believe(reply: Reply) -> Result<Reply, DeviceError> {
+pub fn believe(reply: Reply) -> Result<Reply, DeviceError> {
     let is_wrong = |config: &ChannelConfig| !config.timing.is_valid();
     let what = match &reply {
         Reply::Hello(Hello { tick_hz: hz @ ..LEAST_CLOCK_HZ, .. }) => format!("its clock ticks at {hz} Hz"),

@@ -52,14 +52,12 @@ impl<N> Pass<'_, N> {
     /// once the read that shows it was taken.
     pub fn response(&mut self, response: &Response) -> Option<Waiting<N>> {
         self.answered = true;
-        if *self.in_session {
-            match response.result {
-                Err(Refusal::NoSession) => {
-                    self.end(SessionOver::Refused);
-                    return None;
-                }
-                Ok(Reply::Hello(_)) if !self.requests.is_ours(response.id) => self.end(SessionOver::Greeted),
-                _ => {}
+        if *self.in_session
+            && let Some(over) = over_by(response, self.requests.is_ours(response.id))
+        {
+            self.end(over);
+            if over == SessionOver::Refused {
+                return None;
             }
         }
         *self.in_session |= matches!(response.result, Ok(Reply::Hello(_)));
@@ -79,6 +77,15 @@ impl<N> Pass<'_, N> {
     /// Notes that the session is over; the first reason counts.
     pub fn end(&mut self, reason: SessionOver) {
         self.end.get_or_insert(reason);
+    }
+}
+
+/// Whether an answer shows that our session is over. `is_ours`: whether one of our requests had its number.
+pub fn over_by(response: &Response, is_ours: bool) -> Option<SessionOver> {
+    match response.result {
+        Err(Refusal::NoSession) => Some(SessionOver::Refused),
+        Ok(Reply::Hello(_)) if !is_ours => Some(SessionOver::Greeted),
+        _ => None,
     }
 }
 

@@ -12,7 +12,7 @@ const ASK_EVERY: Duration = Duration::from_millis(500);
 const PATIENCE: Duration = Duration::from_millis(1400);
 /// A pass takes as long as a read waits, about 50 ms. During the rest of a longer pass, the reader was not
 /// listening.
-const LONGEST_PASS: Duration = Duration::from_millis(100);
+pub const LONGEST_PASS: Duration = Duration::from_millis(100);
 
 /// What the reader should do next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -5,7 +5,7 @@ use crate::fake_device;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use cantap::device::{Intake, Link};
+use cantap::device::{Intake, Link, UtcNs};
 use cantap::wire::batch::BatchWriter;
 use cantap::wire::framing::{self, CRC_LEN, MAX_ENCODED, MAX_MESSAGE};
 use cantap::wire::message::DeviceMessage;
@@ -220,8 +220,8 @@ fn a_sessions_first_batch_may_stand_right_behind_the_answer_to_hello() {
     writer.restart();
     bytes.extend(batch(&mut writer, "100#"));
     let mut intake = Intake::new();
-    let mut records: Vec<TraceRecord> = intake.push(&bytes, |_| {}).drain(..).collect();
-    records.append(intake.push(&batch(&mut writer, "101#"), |_| {}));
+    let mut records: Vec<TraceRecord> = intake.push(&bytes, UtcNs(0), |_| {}).drain(..).collect();
+    records.append(intake.push(&batch(&mut writer, "101#"), UtcNs(0), |_| {}));
     let events: Vec<TraceEvent> = records.into_iter().map(|record| record.event).collect();
     assert_eq!(events, [rx("100#", false), rx("101#", false)]);
     let counters = intake.counters();

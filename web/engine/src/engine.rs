@@ -2,10 +2,12 @@
 
 use std::collections::hash_map::Entry;
 
+use cantap_wire::CHANNELS;
 use rustc_hash::FxHashMap;
 use serde::Serialize;
 use serde_json::{Value, json};
 
+use crate::board::{self, Board};
 use crate::databases::{Databases, Loaded, SignalPlace};
 use crate::error::EngineError;
 use crate::export;
@@ -46,6 +48,7 @@ pub struct Engine {
     raw_series: Vec<(String, Series)>,
     bits: FxHashMap<u8, ChannelBits>,
     generation: u64,
+    board: Option<Board>,
 }
 
 /// `Series` in `api.ts`.
@@ -94,6 +97,10 @@ impl Engine {
             serde_json::from_slice(head).map_err(|error| EngineError::BadRequest(error.to_string()))?;
         match request {
             Request::Open { name, bytes, more, size, keep } => {
+                if self.board.as_ref().is_some_and(Board::is_open) {
+                    return Err(EngineError::BoardOpen);
+                }
+                self.board = None;
                 let bytes = received.bytes(bytes)?;
                 self.replace(|rates, generation| {
                     Trace::open(&name, bytes, more, size, keep, rates, generation)
@@ -118,6 +125,27 @@ impl Engine {
             }
             request @ (Request::EditSignal(_) | Request::SetOwnDatabase { .. }) => self.edit(request),
             Request::Formats {} => json(export::formats()),
+            Request::BoardUsb {} => json(board::USB_ID),
+            Request::BoardOpen { name, bitrates, now, again } => {
+                self.open_board(&name, bitrates, now, again)?;
+                self.board(sections)
+            }
+            Request::BoardTake { pieces, now } => {
+                let board = self.board.as_mut().ok_or(EngineError::NoBoard)?;
+                for piece in pieces {
+                    board.take(received.bytes(piece.bytes)?, piece.at);
+                }
+                board.take(&[], now);
+                self.board(sections)
+            }
+            Request::BoardStop {} => {
+                self.board.as_mut().ok_or(EngineError::NoBoard)?.stop();
+                self.board(sections)
+            }
+            Request::BoardVanished { reason } => {
+                self.board.as_mut().ok_or(EngineError::NoBoard)?.vanished(&reason);
+                self.board(sections)
+            }
             request => self.of_trace(request, sections),
         }
     }
@@ -174,6 +202,46 @@ impl Engine {
 
     fn summary(&self) -> Answer {
         json(Summary::of(self.trace.as_ref().ok_or(EngineError::NoTrace)?))
+    }
+
+    /// Begins a session with a board: in a new trace, or `again` in the one that an earlier session has left.
+    fn open_board(
+        &mut self,
+        name: &str,
+        bitrates: [Option<u32>; CHANNELS],
+        now: f64,
+        again: bool,
+    ) -> Result<(), EngineError> {
+        if self.board.as_ref().is_some_and(Board::is_open) {
+            return Err(EngineError::BoardOpen);
+        }
+        for (channel, bitrate) in (1..).zip(bitrates) {
+            let Some(bitrate) = bitrate else { continue };
+            if bitrate < LEAST_BITRATE {
+                return Err(EngineError::BadBitrate(bitrate));
+            }
+            self.rates.set(channel, bitrate, None);
+        }
+        let before = self.board.take().filter(|_| again && self.trace.is_some());
+        if let Some((before, trace)) = before.as_ref().zip(self.trace.as_mut()) {
+            trace.add(&before.gap());
+            trace.set_rates(self.rates.clone());
+        } else {
+            self.replace(|rates, generation| Trace::open(name, &[], true, None, None, rates, generation))?;
+        }
+        self.board = Some(Board::open(bitrates, now, before.map(|before| before.latest_ns())));
+        Ok(())
+    }
+
+    /// Takes the records that the board's session has, and answers with its state and the summary.
+    fn board(&mut self, sections: &mut Sections) -> Answer {
+        let (Some(board), Some(trace)) = (&mut self.board, &mut self.trace) else {
+            return Err(EngineError::NoBoard);
+        };
+        trace.add(&board.records());
+        let state = board.state(sections);
+        self.forget_oldest();
+        json(json!({ "board": state, "summary": self.summary()? }))
     }
 
     fn extend_index(&mut self) {

@@ -19,6 +19,14 @@ pub enum EngineError {
     /// What a live source sent is damaged.
     #[error("{0}; load the page anew")]
     Damaged(#[from] cantap_trace::packed::Damaged),
+    /// A board's session is under way.
+    #[error(
+        "a board is open, and what it sends is being taken in; close it first, and save what is not to be lost"
+    )]
+    BoardOpen,
+    /// No board is open.
+    #[error("no board is open; open one first")]
+    NoBoard,
     /// `append` after the end.
     #[error("the trace is complete; open a new one")]
     Complete,

@@ -11,6 +11,7 @@
 
 #[cfg(target_family = "wasm")]
 pub mod abi;
+mod board;
 mod conversations;
 mod databases;
 mod dbc_text;

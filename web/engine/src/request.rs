@@ -1,7 +1,9 @@
 //! The requests: `Requests` in `api.ts`.
 
+use cantap_wire::CHANNELS;
 use serde::Deserialize;
 
+use crate::board::Piece;
 use crate::message::Bytes;
 use crate::own_database::SignalEdit;
 
@@ -33,6 +35,11 @@ pub enum Request {
     SetOwnDatabase { dbc: String },
     Export { view: u32, format: String, from: Option<f64>, to: Option<f64> },
     Formats {},
+    BoardUsb {},
+    BoardOpen { name: String, bitrates: [Option<u32>; CHANNELS], now: f64, again: bool },
+    BoardTake { pieces: Vec<Piece>, now: f64 },
+    BoardStop {},
+    BoardVanished { reason: String },
 }
 
 /// The parameters of `rawSeries`.

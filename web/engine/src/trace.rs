@@ -261,6 +261,13 @@ impl Trace {
         }
     }
 
+    /// Adds records to a live trace.
+    pub fn add(&mut self, records: &[TraceRecord]) {
+        for record in records {
+            self.content.push(record);
+        }
+    }
+
     fn read_on(&mut self) -> Result<(), EngineError> {
         loop {
             let Feed::Pieces { pieces, reader, reserve } = &mut self.feed else { return Ok(()) };

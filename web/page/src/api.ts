@@ -214,6 +214,38 @@ export interface SignalEdit {
   texts: { value: number; text: string }[];
 }
 
+/** A channel of a board that the page has open. */
+export interface BoardChannel {
+  channel: number;
+  /** Bit/s. */
+  bitrate: number;
+  mode: string;
+  /** `active`, `warning`, `passive`, `bus-off`; empty until the board has said. */
+  state: string;
+  /** Transmit and receive error counters. */
+  counters: [number, number];
+  /** Frames that came, those that were lost, and those that the board has counted: the sum of both, once the channel is closed. */
+  received: number;
+  lost: number;
+  counted: number;
+}
+
+/** A session with a board on a serial port of the browser. */
+export interface BoardState {
+  stage: 'greeting' | 'opening' | 'listening' | 'stopping' | 'over';
+  /** Why it is over, in words; null if it is not, or was closed. */
+  error: string | null;
+  device: string | null;
+  firmware: string | null;
+  channels: BoardChannel[];
+  /** Messages that were damaged on their way; what they held is counted as lost. */
+  corrupt: number;
+  /** Of the stamps' UTC; null until it is known. */
+  uncertaintyNs: number | null;
+  /** To be written to the port. */
+  write: Uint8Array;
+}
+
 /** Each request: what it takes, and what it answers. A refused one answers `{ error: string }`, which says what to do next. */
 export interface Requests {
   /**
@@ -273,6 +305,24 @@ export interface Requests {
   /** What a view holds between the times, in a format's name (`candump`, `asc`, `trc`, `csv`, `blf` …), ready to be saved. */
   export: { in: { view: number; format: string; from: number; to: number }; out: { name: string; bytes: Uint8Array; omitted: string[] } };
   formats: { in: Record<string, never>; out: { name: string; extension: string; about: string }[] };
+  /** How a board is recognised among USB devices. */
+  boardUsb: { in: Record<string, never>; out: { vendorId: number; productId: number } };
+  /**
+   * Begins a session with a board that only listens, on a port that has just been opened: in a new live trace, or `again` in the one that an
+   * earlier session has left. `bitrates` are those of channels 1 and 2 in bit/s, null for one that stays closed. Times are milliseconds since 1970.
+   */
+  boardOpen: { in: { name: string; bitrates: [number | null, number | null]; now: number; again: boolean }; out: BoardAnswer };
+  /** What came from the port; also with nothing, at least every 100 ms. */
+  boardTake: { in: { pieces: { bytes: Uint8Array; at: number }[]; now: number }; out: BoardAnswer };
+  /** Closes the channels; `boardTake` then goes on until the stage is `over`. */
+  boardStop: { in: Record<string, never>; out: BoardAnswer };
+  /** The port is gone. */
+  boardVanished: { in: { reason: string }; out: BoardAnswer };
+}
+
+export interface BoardAnswer {
+  board: BoardState;
+  summary: Summary;
 }
 
 export type Answer<K extends keyof Requests> = Requests[K]['out'];

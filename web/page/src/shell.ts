@@ -10,12 +10,14 @@ import { openDialog } from './ui/dialog';
 import { button, el, setText } from './ui/dom';
 import { openPalette } from './ui/palette';
 import { BitsView } from './views/bits';
+import { BoardView } from './views/board';
 import { ConversationsView } from './views/conversations';
 import { DeviceView } from './views/device';
 import { openExport } from './views/export';
 import { FixedView } from './views/fixed';
 import { GraphsView } from './views/graphs';
 import { NotesView } from './views/notes';
+import { openBoard } from './views/open-board';
 import { StatisticsView } from './views/statistics';
 import { SummaryView } from './views/summary';
 import { TraceView } from './views/trace';
@@ -37,6 +39,9 @@ export class Shell {
   readonly #liveState = el('span', { class: 'live-state', attrs: { role: 'status' } });
   readonly #pause = button('Pause', () => this.#togglePause(), { id: 'live-pause', title: 'Let the views stand still while records still arrive (P)' });
   readonly #record = button('● Record', () => this.#device?.toggleRecording(), { id: 'live-record', title: 'Record to a file (R)' });
+  readonly #tabList = el('div', { class: 'tabs', attrs: { role: 'tablist', 'aria-label': 'Views' } });
+  readonly #main = el('main');
+  readonly #liveTools = el('span', { class: 'tools live' }, this.#liveState, this.#pause, this.#record);
   #device: DeviceView | null = null;
   #current: View;
 
@@ -49,35 +54,26 @@ export class Shell {
     this.#notes = new NotesView(app, this.#commands, lead);
     const fixed = new FixedView(app, this.#commands, () => this.show('bits'));
     this.#views = [new SummaryView(app, this.#commands, lead), this.#trace, new GraphsView(app, this.#commands), fixed, new BitsView(app, this.#commands), new StatisticsView(app, this.#commands), new ConversationsView(app, this.#commands, lead), this.#notes];
-    if (app.live) {
-      this.#device = new DeviceView(app, app.live, this.#commands);
-      this.#views.push(this.#device);
-      for (const topic of ['live', 'live-state'] as const) app.on(topic, () => this.#drawLive());
-      // A frozen view is told from one to which nothing comes.
-      app.on('range', () => this.#drawLive());
-    }
-    const tabs = el('div', { class: 'tabs', attrs: { role: 'tablist', 'aria-label': 'Views' } }, ...this.#views.map((view, i) => this.#tab(view, i)));
-    tabs.addEventListener('keydown', (event) => this.#tabKey(event));
+    if (app.server) this.#views.push((this.#device = new DeviceView(app, app.server, this.#commands)));
+    for (const topic of ['live', 'live-state'] as const) app.on(topic, () => this.#drawLive());
+    // A frozen view is told from one to which nothing comes.
+    app.on('range', () => this.#drawLive());
+    this.#tabList.addEventListener('keydown', (event) => this.#tabKey(event));
     const header = el(
       'header',
       {},
       el('b', { class: 'brand' }, 'cantap'),
       this.#name,
-      tabs,
-      app.live ? el('span', { class: 'tools live' }, this.#liveState, this.#pause, this.#record) : null,
+      this.#tabList,
+      this.#liveTools,
       el('span', { class: 'tools' }, button('Open …', () => this.#picker.click(), { title: 'Open a trace or databases (Ctrl+O)' }), button('Commands', () => this.#palette(), { title: 'Command palette (Ctrl+K)' }), button('?', () => this.#help(), { title: 'Keys (?)', attrs: { 'aria-label': 'Keys' } }), button('◐', () => this.#cycleTheme(), { title: 'Dark or light', attrs: { 'aria-label': 'Dark or light' } })),
     );
     this.#picker.addEventListener('change', () => {
       void openFiles(this.app, [...(this.#picker.files ?? [])]);
       this.#picker.value = '';
     });
-    const main = el('main', {}, ...this.#views.map((view) => view.element));
-    for (const view of this.#views) {
-      view.element.id = `view-${view.id}`;
-      view.element.setAttribute('role', 'tabpanel');
-      view.element.hidden = true;
-    }
-    this.element = el('div', { class: 'shell' }, header, main, notices, el('footer', {}, this.#status, this.#progress, this.#losses, this.#chosen), this.#picker);
+    this.#views.forEach((view, i) => this.#place(view, i));
+    this.element = el('div', { class: 'shell' }, header, this.#main, notices, el('footer', {}, this.#status, this.#progress, this.#losses, this.#chosen), this.#picker);
     this.#current = this.#views[0] as View;
     this.#addCommands();
     app.on('summary', () => this.#drawStatus());
@@ -96,6 +92,19 @@ export class Shell {
     this.show(app.profile.view);
     this.#drawStatus();
     this.#drawLive();
+    app.on('board', () => this.#showBoard());
+  }
+
+  /** The board that was opened has a view of its own. */
+  #showBoard(): void {
+    const { board } = this.app;
+    if (board && !this.#views.some((view) => view.id === 'board')) {
+      const view = new BoardView(this.app, board, () => void openExport(this.app, 0, ''));
+      this.#views.push(view);
+      this.#place(view, this.#views.length - 1);
+    }
+    this.#drawLive();
+    this.show('board');
   }
 
   show(id: string): void {
@@ -114,6 +123,16 @@ export class Shell {
       this.app.profile.view = next.id;
       this.app.saveProfile();
     }
+  }
+
+  /** Gives a view its tab, its place and its key. */
+  #place(view: View, i: number): void {
+    view.element.id = `view-${view.id}`;
+    view.element.setAttribute('role', 'tabpanel');
+    view.element.hidden = true;
+    this.#tabList.append(this.#tab(view, i));
+    this.#main.append(view.element);
+    this.#commands.add({ id: `view.${view.id}`, title: `View: ${view.title}`, keys: [String(i + 1)], run: () => this.#showAndFocus(view) });
   }
 
   #tab(view: View, i: number): HTMLButtonElement {
@@ -136,7 +155,6 @@ export class Shell {
 
   #addCommands(): void {
     this.#commands.add(
-      ...this.#views.map((view, i): Command => ({ id: `view.${view.id}`, title: `View: ${view.title}`, keys: [String(i + 1)], run: () => this.#showAndFocus(view) })),
       { id: 'palette', title: 'Command palette', keys: ['Ctrl+k'], run: () => this.#palette() },
       { id: 'help', title: 'Keys', keys: ['?'], run: () => this.#help() },
       { id: 'open', title: 'Open a trace or databases', keys: ['Ctrl+o'], run: () => this.#picker.click() },
@@ -144,7 +162,8 @@ export class Shell {
       { id: 'goto', title: 'Go to a time', keys: [':'], run: () => this.#askTime() },
       { id: 'theme', title: 'Dark, light, or as the system has it', keys: ['D'], run: () => this.#cycleTheme() },
       { id: 'profile.save', title: 'Save the layout as a profile', run: () => this.#saveProfile() },
-      ...(this.app.live ? [{ id: 'live.pause', title: 'Pause, or follow what arrives', keys: ['P'], run: () => this.#togglePause() }] : []),
+      ...(this.app.server ? [] : [{ id: 'board.open', title: 'Open a board', run: () => void openBoard(this.app) }]),
+      { id: 'live.pause', title: 'Live: pause, or follow what arrives', keys: ['P'], run: () => this.#togglePause() },
       { id: 'licences', title: 'Licences', run: () => void this.#licences() },
       { id: 'profile.load', title: 'Load a profile', run: () => this.#loadProfile() },
     );
@@ -152,6 +171,7 @@ export class Shell {
 
   #togglePause(): void {
     const { app } = this;
+    if (!app.live) return;
     if (app.paused || !app.following) app.follow();
     else app.pause(true);
   }
@@ -159,8 +179,11 @@ export class Shell {
   #drawLive(): void {
     const { app } = this;
     const { live } = app;
+    this.#liveTools.hidden = !live;
     if (!live) return;
-    const state = live.state?.ended ? 'device gone' : live.status === 'open' ? (app.paused ? 'paused' : app.following ? 'live' : 'looking back') : live.status === 'ended' ? 'ended' : live.status === 'lost' ? 'connection lost' : 'connecting';
+    this.#record.hidden = live !== app.server;
+    const gone = live === app.board ? 'board gone' : 'connection lost';
+    const state = live.state?.ended ? 'device gone' : live.status === 'open' ? (app.paused ? 'paused' : app.following ? 'live' : 'looking back') : live.status === 'ended' ? 'ended' : live.status === 'lost' ? gone : 'connecting';
     setText(this.#liveState, state);
     this.#liveState.title = live.reason;
     this.#liveState.dataset['status'] = live.state?.ended ? 'lost' : live.status;

@@ -7,6 +7,7 @@ import { serve, servedFrom } from './live/serve';
 import { addCarried, embeddedReport, type Report, unpack } from './model/report';
 import { Shell, applyTheme } from './shell';
 import { button, el, replace } from './ui/dom';
+import { openBoard } from './views/open-board';
 import { Notices } from './ui/notices';
 
 export async function start(loadEngine: () => Promise<Engine>): Promise<void> {
@@ -76,6 +77,8 @@ function startScreen(app: App): HTMLElement {
     el('p', {}, 'Drop a CAN trace here, and databases for its signals.'),
     button('Choose files …', () => picker.click(), { class: 'primary' }),
     picker,
+    el('p', {}, 'Or see a bus live, with a cantap board on this computer’s USB.'),
+    button('Open board …', () => void openBoard(app)),
     el('p', { class: 'muted' }, 'Traces: candump, ASC, BLF, TRC, MF4, pcapng, CSV and more. Databases: DBC, KCD, SYM, ARXML, DBF.'),
     el('p', { class: 'muted' }, 'Everything stays on this machine: the page sends nothing anywhere.'),
   );

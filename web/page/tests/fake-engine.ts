@@ -220,5 +220,15 @@ export class FakeEngine implements Engine {
       { name: 'candump', extension: 'log', about: 'can-utils text' },
       { name: 'asc', extension: 'asc', about: 'Vector text' },
     ],
+    boardUsb: () => ({ vendorId: 1, productId: 2 }),
+    boardOpen: noBoard,
+    boardTake: noBoard,
+    boardStop: noBoard,
+    boardVanished: noBoard,
   };
+}
+
+/** A board needs the real engine: `board.test.mjs`. */
+function noBoard(): never {
+  throw new Error('the tests’ engine has no board.');
 }

@@ -4,7 +4,7 @@ use std::hint::black_box;
 use std::time::Instant;
 
 use cantap::bits_on_bus;
-use cantap::device::{Intake, PIECE_BYTES};
+use cantap::device::{Intake, PIECE_BYTES, UtcNs};
 use cantap_wire::framing::{self, CRC_LEN, MAX_ENCODED, MAX_MESSAGE};
 use cantap_wire::message::DeviceMessage;
 use cantap_wire::{Decoded, Decoder, Hello, PROTOCOL_VERSION, Record, Reply, Response};
@@ -83,13 +83,13 @@ fn decode(stream: &[u8]) -> u64 {
 /// Everything that the reader thread does.
 fn records(hello: &[u8], stream: &[u8]) -> u64 {
     let mut intake = Intake::new();
-    intake.push(hello, |_| {});
+    intake.push(hello, UtcNs(0), |_| {});
     for channel in 0..2 {
         intake.lengths().set(channel, 36, 36_000_000, 12_000_000);
     }
     let mut frames = 0;
     for piece in stream.chunks(PIECE_BYTES) {
-        let records = intake.push(piece, |_| {});
+        let records = intake.push(piece, UtcNs(0), |_| {});
         frames += records.len() as u64;
         black_box(&records[..]);
         records.clear();

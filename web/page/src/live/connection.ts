@@ -3,17 +3,16 @@
 
 import { Emitter } from '../model/emitter';
 import { type FromServer, HEADER, type Requests, type State } from './protocol';
+import type { Source, Status } from './source';
 
 /** Milliseconds until the next try: the first, and the longest. */
 const RETRY = 500;
 const LONGEST_RETRY = 5000;
 
-export type Status = 'connecting' | 'open' | 'lost' | 'ended';
-
 /** Takes records in: chunks as the server sends them. */
 export type Take = (chunks: Uint8Array, anew: boolean) => Promise<void>;
 
-export class Connection extends Emitter<'status' | 'state' | 'progress'> {
+export class Connection extends Emitter<'status' | 'state' | 'progress'> implements Source {
   status: Status = 'connecting';
   /** Why there is no connection, for the user. */
   reason = '';

@@ -35,7 +35,7 @@ export async function serve(app: App, served: Served): Promise<void> {
     },
     (level, text) => app.notify(level, text),
   );
-  app.live = live;
+  app.live = app.server = live;
   for (const topic of ['status', 'state', 'progress'] as const) live.on(topic, () => app.emit('live-state'));
   await app.begin(served.name);
   live.connect();

@@ -2,7 +2,9 @@
 // to each other.
 
 import type { Answer, Engine, Finding, Gap, IdRow, MessageInfo, Requests, SignalInfo, Summary } from '../api';
+import type { Board } from '../live/board';
 import type { Connection } from '../live/connection';
+import type { Source } from '../live/source';
 import { Emitter } from './emitter';
 import { pieces } from './files';
 import { count } from './format';
@@ -13,7 +15,7 @@ import { Spacing } from './spacing';
 import { type Profile, Storage } from './storage';
 
 /** `steady` comes with `summary`, but of a trace that grows live only about once a second: for what is costly, or is read and not watched. */
-export type Topic = 'live' | 'live-state' | 'steady' | 'summary' | 'messages' | 'range' | 'cursors' | 'identifier' | 'panels' | 'notes' | 'own' | 'profile' | 'findings' | 'engine' | 'goto';
+export type Topic = 'live' | 'board' | 'live-state' | 'steady' | 'summary' | 'messages' | 'range' | 'cursors' | 'identifier' | 'panels' | 'notes' | 'own' | 'profile' | 'findings' | 'engine' | 'goto';
 
 export interface Range {
   from: number;
@@ -54,8 +56,12 @@ export class App extends Emitter<Topic> {
   notes: Note[] = [];
   /** Where a view was asked to go; the trace and the graphs follow. */
   target: { time: number } | null = null;
-  /** The server that this page is live from; null without one. */
-  live: Connection | null = null;
+  /** What the trace is live from: the server, or a board that the page has opened itself. */
+  live: Source | null = null;
+  /** The server that this page comes from; null without one. */
+  server: Connection | null = null;
+  /** The board that was opened last; null before. */
+  board: Board | null = null;
   /** The graphs stay at the end of a trace that grows live. */
   following = false;
   /** The views stand still, while records still arrive. */
@@ -178,14 +184,21 @@ export class App extends Emitter<Topic> {
 
   /** Takes in records of a live source; `anew`: they begin another trace. */
   async takeLive(name: string, chunks: Uint8Array, anew: boolean): Promise<void> {
-    if (anew) {
-      this.#opening++;
-      this.traceFile = null;
-      this.#fitted = false;
-      this.following = true;
-      this.#refreshing = new Spacing(STEADY);
-    }
-    const summary = anew ? await this.ask('open', { name, bytes: chunks, more: true, size: null }) : await this.ask('append', { bytes: chunks, more: true });
+    if (anew) this.beginLive();
+    this.taken(anew ? await this.ask('open', { name, bytes: chunks, more: true, size: null }) : await this.ask('append', { bytes: chunks, more: true }), anew);
+  }
+
+  /** Another trace will be live. */
+  beginLive(): void {
+    this.#opening++;
+    this.traceFile = null;
+    this.#fitted = false;
+    this.following = true;
+    this.#refreshing = new Spacing(STEADY);
+  }
+
+  /** The engine has taken in records of a live source. */
+  taken(summary: Summary, anew: boolean): void {
     if (anew) this.#forget();
     // Rows have other numbers then, which the views must know.
     const moved = summary.forgotten !== this.summary?.forgotten;

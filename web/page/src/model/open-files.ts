@@ -1,5 +1,6 @@
 // Files that were dropped or picked: databases are added, a trace replaces the one that is open.
 
+import { mayReplace } from '../views/open-board';
 import type { App } from './app';
 import { isDatabase } from './files';
 
@@ -14,7 +15,8 @@ export async function openFiles(app: App, files: File[]): Promise<void> {
     }
   }
   const trace = traces[0];
-  if (!trace) return;
+  if (!trace || !(await mayReplace(app))) return;
+  app.live = app.server;
   try {
     await app.openTrace(trace);
   } catch (error) {

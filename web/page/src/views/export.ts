@@ -17,7 +17,9 @@ export async function openExport(app: App, view: number, filter: string): Promis
   }
   const from = el('input', { class: 'mono', attrs: { type: 'text', 'aria-label': 'From' } });
   const to = el('input', { class: 'mono', attrs: { type: 'text', 'aria-label': 'To' } });
+  let exact = app.whole();
   const set = (range: { from: number; to: number }): void => {
+    exact = range;
     from.value = seconds(range.from);
     to.value = seconds(range.to);
   };
@@ -39,12 +41,14 @@ export async function openExport(app: App, view: number, filter: string): Promis
       label: 'Export',
       primary: true,
       run: () => {
-        const range = { from: parseTime(from.value), to: parseTime(to.value) };
+        // The texts are rounded: the last record may be later than its own.
+        const time = (input: HTMLInputElement, of: number): number | null => (input.value === seconds(of) ? of : parseTime(input.value));
+        const range = { from: time(from, exact.from), to: time(to, exact.to) };
         if (range.from === null || range.to === null || range.to < range.from) {
           problem.textContent = 'From and to are times, the earlier first: write for example 12.5 or 1m30s.';
           return false;
         }
-        void run(app, view, format.value, range.from, range.to);
+        void run(app, view, filter, format.value, range.from, range.to);
         return true;
       },
     },
@@ -52,10 +56,12 @@ export async function openExport(app: App, view: number, filter: string): Promis
   ]);
 }
 
-async function run(app: App, view: number, format: string, from: number, to: number): Promise<void> {
+async function run(app: App, view: number, filter: string, format: string, from: number, to: number): Promise<void> {
   try {
     const { name, bytes, omitted } = await app.ask('export', { view, format, from, to });
     save(name, bytes);
+    const whole = app.whole();
+    if (filter.trim() === '' && from <= whole.from && to >= whole.to) app.board?.saved();
     app.notify(omitted.length > 0 ? 'warning' : 'info', `${name}: ${count(bytes.length)} bytes.${omitted.length > 0 ? ` Left out, since the format cannot hold it: ${omitted.join('; ')}.` : ''}`);
   } catch (error) {
     app.failed(error);

@@ -92,7 +92,7 @@ fn object(odx: &Odx, name: &str) -> anyhow::Result<Value> {
         let ecu = odx.ecu(layer)?;
         let pairs: Vec<_> = ecu.pairs().iter().map(ToString::to_string).collect();
         let requests = ecu.requests().into_iter().map(|request| {
-            let bytes: String = request.bytes.iter().map(|byte| format!("{byte:02X}")).collect();
+            let bytes = hex(&request.bytes).replace(' ', "");
             json!({ "name": request.name, "long_name": request.long_name, "bytes": bytes, "parameters": request.open })
         });
         let codes = ecu.trouble_codes().map(|(code, text)| json!({ "code": code, "text": text }));

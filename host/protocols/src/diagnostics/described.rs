@@ -51,7 +51,7 @@ pub fn describe(
     } else {
         // A report is read by the standard; the description has the texts of its codes.
         event.fields.extend(response_fields);
-        event.fields.extend(codes.iter().take(MOST_CODES).filter_map(|code| code_text(ecu, code)));
+        event.fields.extend(codes.iter().take(MOST_CODES).filter_map(|code| code_text(ecu, *code)));
     }
 }
 
@@ -65,9 +65,9 @@ fn described(ecu: &Arc<Ecu>, request: Option<&[u8]>, response: Option<&[u8]>) ->
     })
 }
 
-fn code_text(ecu: &Ecu, code: &[u8; 3]) -> Option<Field> {
+fn code_text(ecu: &Ecu, code: [u8; 3]) -> Option<Field> {
     let number = u32::from_be_bytes([0, code[0], code[1], code[2]]);
-    ecu.trouble_code(number).map(|text| Field::text("dtc", reports::code(code)).meaning(Some(text)))
+    ecu.trouble_code(number).map(|text| Field::text("dtc", reports::code(&code)).meaning(Some(text)))
 }
 
 /// The fields of a message: those of the standard, or those of the description that say more. Where it does not describe all, both.

@@ -43,7 +43,7 @@ pub fn pairs(model: &Model, view: &View) -> Vec<Pair> {
             let mut parts = by_protocol.get(protocol).cloned().unwrap_or_default();
             match names {
                 Some((_, names)) => {
-                    parts.extend(names.iter().zip(row).map(|(name, value)| (&**name, &**value)))
+                    parts.extend(names.iter().zip(row).map(|(name, value)| (&**name, &**value)));
                 }
                 None => parts.extend(PARTS.into_iter().zip(row.iter().map(|value| &**value))),
             }

@@ -57,7 +57,7 @@ pub fn extract(
     let bytes = data.get(byte..end).ok_or(Stop::Ends)?;
     let value = match coded.base {
         BaseType::Bytes | BaseType::Ascii | BaseType::Utf8 | BaseType::Unicode => {
-            if bit != 0 || bits % 8 != 0 {
+            if bit != 0 || !bits.is_multiple_of(8) {
                 return Err(Stop::not_evaluated("text or bytes that do not begin and end with a byte"));
             }
             if coded.base == BaseType::Bytes { Internal::Bytes(bytes.to_vec()) } else { text(coded, bytes)? }

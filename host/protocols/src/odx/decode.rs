@@ -1,5 +1,7 @@
 //! A message's bytes as values, by its parameters.
 
+use std::fmt::Write as _;
+
 use super::coded::{Stop, extract};
 use super::compu::{Compu, Physical, is_between};
 use super::layer::View;
@@ -161,7 +163,7 @@ impl<'a> Reader<'a> {
                 self.keys.push((param.name.clone(), Key::Bits(bits)));
                 Ok(())
             }
-            ParamKind::FromRequest { byte, length } => self.from_request(*byte, *length),
+            ParamKind::FromRequest { byte, length } => self.repeated(*byte, *length),
             ParamKind::Reserved { bits } => {
                 let length = (param.bit as usize).saturating_add(*bits as usize).div_ceil(8);
                 self.cover(length)
@@ -204,7 +206,7 @@ impl<'a> Reader<'a> {
     }
 
     /// Bytes as they were in the request. A negative position counts from its end.
-    fn from_request(&mut self, byte: i64, length: u32) -> Result<(), Stop> {
+    fn repeated(&mut self, byte: i64, length: u32) -> Result<(), Stop> {
         let (from, length) = (self.cursor, length as usize);
         self.cover(length)?;
         let found = &self.data[from..from + length];
@@ -377,7 +379,8 @@ impl<'a> Reader<'a> {
 
     fn item(&mut self, item: Link, at: usize) -> Result<(), Stop> {
         let (length, from) = (self.path.len(), self.cursor);
-        self.path.push_str(&format!("[{at}]"));
+        // Writing to a String cannot fail.
+        let _ = write!(self.path, "[{at}]");
         self.dop(item, 0)?;
         if self.cursor <= from {
             return Err(Stop::not_evaluated("items without a length"));

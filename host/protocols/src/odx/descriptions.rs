@@ -49,15 +49,15 @@ impl Descriptions {
                 _ => None,
             };
             if ecus.iter().all(|ecu| ecu.pairs().is_empty()) {
-                match only {
-                    Some(one) => this.add(one.clone(), true),
-                    None => {
-                        let layers = odx.layers().map(|(_, name)| name.to_owned()).collect();
-                        return Err(OdxError::WhichLayer { layers });
-                    }
-                }
+                let Some(only) = only else {
+                    let layers = odx.layers().map(|(_, name)| name.to_owned()).collect();
+                    return Err(OdxError::WhichLayer { layers });
+                };
+                this.add(only.clone(), true);
             }
-            ecus.into_iter().for_each(|ecu| this.add(ecu, false));
+            for ecu in ecus {
+                this.add(ecu, false);
+            }
         }
         Ok(this)
     }

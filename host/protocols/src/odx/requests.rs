@@ -155,7 +155,7 @@ impl Ecu {
         match found.len() {
             1 => Ok(found.remove(0)),
             0 => {
-                let digits: String = begins.iter().map(|byte| format!("{byte:02X}")).collect();
+                let digits = crate::text::hex(begins);
                 let wanted = name.to_lowercase();
                 let is_like = |request: &&NamedRequest| {
                     let own = request.name.to_lowercase();

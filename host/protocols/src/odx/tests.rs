@@ -1,5 +1,6 @@
 //! Files as they are, and as they must not be.
 
+use std::fmt::Write as _;
 use std::io::Write as _;
 use std::sync::Arc;
 
@@ -248,9 +249,10 @@ fn circles_end() {
 #[test]
 fn many_ways_of_inheritance_are_gone_once() {
     let layer = |number: u32| {
-        let parents: String = (number + 1..(number + 11).min(15))
+        let parents = (number + 1..(number + 11).min(15))
             .map(|parent| format!("<PARENT-REF ID-REF=\"l{parent}\" xsi:type=\"BASE-VARIANT-REF\"/>"))
-            .collect();
+            .collect::<Vec<_>>()
+            .concat();
         format!(
             "<BASE-VARIANT ID=\"l{number}\"><SHORT-NAME>L{number}</SHORT-NAME><PARENT-REFS>{parents}</PARENT-REFS></BASE-VARIANT>"
         )
@@ -286,7 +288,7 @@ fn entities_do_not_explode() {
     let mut entities = "<!ENTITY a0 \"aaaaaaaaaa\">".to_owned();
     for at in 1..12 {
         let before = format!("&a{};", at - 1).repeat(10);
-        entities.push_str(&format!("<!ENTITY a{at} \"{before}\">"));
+        write!(entities, "<!ENTITY a{at} \"{before}\">").unwrap();
     }
     let text = format!("<!DOCTYPE ODX [{entities}]>{}", document("", "&a11;"));
     assert!(matches!(read_text(&text), Err(OdxError::Xml { .. })));

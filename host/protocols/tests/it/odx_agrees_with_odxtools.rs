@@ -19,6 +19,10 @@ fn bytes(line: &serde_json::Value, key: &str) -> Vec<u8> {
     (0..text.len()).step_by(2).map(|at| u8::from_str_radix(&text[at..at + 2], 16).unwrap()).collect()
 }
 
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect::<Vec<_>>().concat()
+}
+
 /// A reading as the script writes one.
 fn shown(reading: &Reading) -> serde_json::Value {
     let values = reading.values.iter().map(|decoded| {
@@ -30,9 +34,7 @@ fn shown(reading: &Reading) -> serde_json::Value {
             Physical::Int(value) => ("int", serde_json::json!(*value as i64)),
             Physical::Real(value) => ("real", format!("{:016x}", value.to_bits()).into()),
             Physical::Text(text) | Physical::Meaning(_, text) => ("text", text.as_str().into()),
-            Physical::Bytes(bytes) => {
-                ("bytes", bytes.iter().map(|byte| format!("{byte:02x}")).collect::<String>().into())
-            }
+            Physical::Bytes(bytes) => ("bytes", hex(bytes).into()),
         };
         serde_json::json!([decoded.path, kind, value])
     });
@@ -61,7 +63,7 @@ impl Counts {
         let theirs: Vec<_> = theirs.iter().filter(|reading| !reading.is_null()).collect();
         match ours.filter(|ours| is_whole(ours)) {
             Some(ours) if theirs.is_empty() => {
-                assert!(has_unknown_code(ours), "{ours:?} but not theirs: {line}")
+                assert!(has_unknown_code(ours), "{ours:?} but not theirs: {line}");
             }
             Some(ours) => {
                 let shown = shown(ours);

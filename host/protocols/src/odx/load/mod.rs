@@ -190,14 +190,14 @@ impl Loader {
     }
 
     /// Something at this place is not understood.
-    pub fn issue(&mut self, node: Node<'_, '_>, what: String) {
+    pub fn issue(&mut self, node: Node<'_, '_>, what: impl AsRef<str>) {
         if self.issues.len() >= MOST_ISSUES {
             self.left_out += 1;
             return;
         }
         let line = self.line(node);
         let file = self.files.last().cloned().unwrap_or_default();
-        self.issues.push(Issue { file, line, what: cantap_trace::clean::line(&what).into_owned() });
+        self.issues.push(Issue { file, line, what: cantap_trace::clean::line(what.as_ref()).into_owned() });
     }
 
     /// All documents are read: every reference gets what it refers to.

@@ -108,7 +108,7 @@ impl Loader {
     pub(super) fn child_coded(&mut self, node: Node<'_, '_>) -> Option<Coded> {
         let node = child(node, "DIAG-CODED-TYPE")?;
         let Some(base) = attribute(node, "BASE-DATA-TYPE").and_then(base_type) else {
-            self.issue(node, "a coded type without a known BASE-DATA-TYPE".to_owned());
+            self.issue(node, "a coded type without a known BASE-DATA-TYPE");
             return None;
         };
         let encoding = attribute(node, "BASE-TYPE-ENCODING").unwrap_or("NONE");

@@ -1,13 +1,16 @@
 //! A message's bytes as values, by its parameters.
 
+mod internal;
+mod tables;
+
 use std::fmt::Write as _;
 
-use super::coded::{Stop, extract};
+use super::coded::Stop;
 use super::compu::{Compu, Physical, is_between};
 use super::layer::View;
 use super::model::{
-    BaseType, Case, Coded, Data, DopKind, End, Internal, Item, KeyName, Length, Link, Model, Mux, Name,
-    Param, ParamKind, Place, Row, Table, Target,
+    BaseType, Case, Coded, Data, DopKind, Internal, Item, KeyName, Length, Link, Model, Mux, Name, Param,
+    ParamKind, Place,
 };
 use super::xml;
 
@@ -229,80 +232,6 @@ impl<'a> Reader<'a> {
         Ok(())
     }
 
-    fn internal(&mut self, coded: &Coded, bit: u32) -> Result<Internal, Stop> {
-        let data = self.data;
-        let take = |this: &mut Self, coded: &Coded, bit, bits| {
-            let (value, length) = extract(coded, data, this.cursor, bit, bits)?;
-            this.cover(length)?;
-            Ok(value)
-        };
-        match &coded.length {
-            Length::Bits { bits, mask } => {
-                let value = take(self, coded, bit, (*bits).into())?;
-                let Some(mask) = *mask else { return Ok(value) };
-                match value {
-                    Internal::Int(value) => Ok(Internal::Int(value & i128::from(mask))),
-                    _ => Err(Stop::not_evaluated("a bit mask on what is no integer")),
-                }
-            }
-            Length::Leading { bits } => {
-                let length = Coded {
-                    base: BaseType::Uint,
-                    length: Length::Bits { bits: *bits, mask: None },
-                    ..coded.clone()
-                };
-                let Internal::Int(bytes) = take(self, &length, bit, (*bits).into())? else {
-                    return Err(Stop::Ends);
-                };
-                let bits =
-                    u64::try_from(bytes).ok().and_then(|bytes| bytes.checked_mul(8)).ok_or(Stop::Ends)?;
-                take(self, coded, 0, bits)
-            }
-            Length::MinMax { min, max, end } => self.min_max(coded, *min as usize, *max, *end),
-            Length::Key(key) => match self.key(key) {
-                Some(Key::Bits(bits)) => take(self, coded, bit, bits),
-                _ => Err(Stop::not_evaluated("a length that no parameter before it says")),
-            },
-            Length::NotEvaluated(what) => Err(Stop::not_evaluated(&**what)),
-        }
-    }
-
-    fn min_max(&mut self, coded: &Coded, min: usize, max: Option<u32>, end: End) -> Result<Internal, Stop> {
-        let rest = self.data.get(self.cursor..).ok_or(Stop::Ends)?;
-        if rest.len() < min {
-            return Err(Stop::Ends);
-        }
-        let most = max.map_or(rest.len(), |max| rest.len().min(max as usize));
-        let mark: &[u8] = match (end, coded.base) {
-            (End::OfMessage, _) => &[],
-            (End::Zero, BaseType::Unicode) => &[0, 0],
-            (End::HexFf, BaseType::Unicode) => &[0xFF, 0xFF],
-            (End::Zero, _) => &[0],
-            (End::HexFf, _) => &[0xFF],
-        };
-        // A mark of two bytes begins where a letter does.
-        let ends = |at: &usize| rest.get(*at..at + mark.len()) == Some(mark) && at + mark.len() <= most;
-        let marked = (!mark.is_empty()).then(|| (min..most).step_by(mark.len()).find(ends)).flatten();
-        let length = marked.unwrap_or(most);
-        let (value, length) = extract(coded, self.data, self.cursor, 0, 8 * length as u64)?;
-        self.cover(length)?;
-        if marked.is_some() {
-            self.cover(mark.len())?;
-        }
-        Ok(value)
-    }
-
-    fn key(&self, key: &KeyName) -> Option<Key> {
-        let name = match key {
-            KeyName::Name(name) => name,
-            KeyName::Link(link) => match self.model.item(*link)? {
-                Item::Key(number) => &self.model.names[number as usize],
-                _ => return None,
-            },
-        };
-        self.keys.iter().rev().find(|(known, _)| known == name).map(|(_, key)| *key)
-    }
-
     fn dop(&mut self, link: Link, bit: u32) -> Result<(), Stop> {
         let model = self.model;
         let dop = model
@@ -447,53 +376,6 @@ impl<'a> Reader<'a> {
         Ok(())
     }
 
-    fn table(&self, link: Link) -> Option<u32> {
-        match self.model.links.get(link as usize)? {
-            Target::Item(Item::Table(table)) => Some(*table),
-            Target::Name(name) => self.view.tables.get(name).copied(),
-            _ => None,
-        }
-    }
-
-    fn table_key(&mut self, param: &'a Param, link: Link) -> Result<(), Stop> {
-        if let Some(Item::Row(table, row)) = self.model.item(link) {
-            self.keys.push((param.name.clone(), Key::Row(table, row)));
-            return Ok(());
-        }
-        let model = self.model;
-        let number =
-            self.table(link).ok_or_else(|| Stop::not_evaluated("a table that is not in the file"))?;
-        let table = &model.tables[number as usize];
-        let before = self.values.len();
-        self.dop(table.key.ok_or_else(|| Stop::not_evaluated("a table without a type of keys"))?, param.bit)?;
-        let [key] = &self.values[before..] else {
-            return Err(Stop::not_evaluated("a key of several values"));
-        };
-        let rows = model.rows(number, table);
-        let mut rows = rows.filter(|(_, row)| is_written(&key.value, &row.key));
-        let (Some((place, row)), None) = (rows.next(), rows.next()) else {
-            return Err(Stop::not_evaluated("a key that no row of the table has, or several"));
-        };
-        let name = row.name.to_string();
-        drop(rows);
-        if let Some(shown) = self.values.last_mut() {
-            shown.value = Physical::Text(name);
-        }
-        self.keys.push((param.name.clone(), Key::Row(place.0, place.1)));
-        Ok(())
-    }
-
-    fn table_struct(&mut self, key: &KeyName) -> Result<(), Stop> {
-        let Some(Key::Row(table, row)) = self.key(key) else {
-            return Err(Stop::not_evaluated("a row that no key before it says"));
-        };
-        let row = &self.model.tables[table as usize].rows[row as usize];
-        match row.content {
-            Some(content) => self.inside(&row.name, content),
-            None => Ok(()),
-        }
-    }
-
     fn simple(&mut self, data: &Data, bit: u32) -> Result<(), Stop> {
         let internal = self.internal(&data.coded, bit)?;
         let invalid =
@@ -520,18 +402,6 @@ impl<'a> Reader<'a> {
         let decoded = self.push(value, digits.filter(|_| is_plain || note.is_some()))?;
         (decoded.note, decoded.unit) = (note, unit);
         Ok(())
-    }
-}
-
-impl Model {
-    /// The rows of a table with their places, those of others among them.
-    pub fn rows<'a>(&'a self, number: u32, table: &'a Table) -> impl Iterator<Item = ((u32, u32), &'a Row)> {
-        let own = (0..).zip(&table.rows).map(move |(row, content)| ((number, row), content));
-        let shared = table.shared.iter().filter_map(|link| match self.item(*link)? {
-            Item::Row(table, row) => Some(((table, row), &self.tables[table as usize].rows[row as usize])),
-            _ => None,
-        });
-        own.chain(shared)
     }
 }
 

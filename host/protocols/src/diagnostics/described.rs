@@ -33,19 +33,19 @@ pub fn describe(
     let answers: Option<Endpoint> =
         response.map(|response| response.from).or_else(|| request.and_then(|request| request.to));
     let Some(ecu) = descriptions.of(asks, answers) else { return };
-    let data = |transfer: Option<&Transfer>| transfer.map(|transfer| transfer.data.clone());
-    let (request, response) = (data(request), data(response));
+    let (request, response) =
+        (request.map(|request| &request.data[..]), response.map(|response| &response.data[..]));
     let response_fields = event.fields.split_off(parts.request_end);
     let request_fields = event.fields.split_off(parts.before);
     event.fields.push(Field::text("ecu", ecu.name().to_owned()));
-    let described = described(ecu, request.as_deref(), response.as_deref());
+    let described = described(ecu, request, response);
     let described = described.unwrap_or_default();
     if !described.service.is_empty() {
         let long_name = Some(described.long_name.clone()).filter(|name| !name.is_empty());
         event.fields.push(Field::text("service", described.service.clone()).meaning(long_name));
     }
     merge(request_fields, described.request.as_ref(), &mut event.fields);
-    let codes = response.as_deref().map(reports::codes).unwrap_or_default();
+    let codes = response.map(reports::codes).unwrap_or_default();
     if codes.is_empty() {
         merge(response_fields, described.response.as_ref(), &mut event.fields);
     } else {
@@ -56,13 +56,31 @@ pub fn describe(
 }
 
 fn described(ecu: &Arc<Ecu>, request: Option<&[u8]>, response: Option<&[u8]>) -> Option<Described> {
-    ecu.describe(request, response).or_else(|| {
+    let described = ecu.describe(request, response);
+    let asks_for_more = |described: &Described| {
+        described.request.as_ref().is_some_and(|request| !request.undescribed.is_empty())
+    };
+    if let Some([0x22, dids @ ..]) = request
+        && dids.len() > 2
+        && described.as_ref().is_none_or(asks_for_more)
+    {
+        return several(ecu, dids);
+    }
+    described.or_else(|| {
         // The bit that suppresses the response is not in a description.
         let mut request = request?.to_vec();
         *request.get_mut(1)? &= 0x7F;
         super::uds::is_response_suppressed(&[request[0], 0x80])
             .then(|| ecu.describe(Some(&request), response))?
     })
+}
+
+/// A request for several identifiers: nobody says where the value of one ends, unless a service describes just these, so only the names are
+/// known.
+fn several(ecu: &Ecu, dids: &[u8]) -> Option<Described> {
+    let services = dids.chunks_exact(2).filter_map(|did| ecu.describe(Some(&[0x22, did[0], did[1]]), None));
+    let names: Vec<_> = services.map(|described| described.service).collect();
+    (!names.is_empty()).then(|| Described { service: names.join(", "), ..Described::default() })
 }
 
 fn code_text(ecu: &Ecu, code: [u8; 3]) -> Option<Field> {

@@ -124,6 +124,9 @@ fn exchanges_have_names_and_values() {
         (41.0, "7E8#0462F19041"),
         (50.0, "7E0#0322011C"),
         (51.0, "7E8#037F2231"),
+        // Several at once.
+        (60.0, "7E0#052201010111"),
+        (61.0, "7E8#07620101010111AA"),
     ] {
         diagnostics.take(&at(ms, frame), &mut events);
     }
@@ -135,10 +138,12 @@ fn exchanges_have_names_and_values() {
             "uds 7E0 > 7E8 ReadDataByIdentifier: sid 0x22, ecu \"Kinds\", service \"read_point\", did 0x011C, point.x -2, point.y 0 °C, after 1 ms",
             "uds 7E0 > 7E8 ReadDataByIdentifier: sid 0x22, ecu \"Kinds\", service \"read_point\", did 0x011C, value 01 02, point.x 258, \
              not_described \"the message is shorter than its description at point.y\", after 1 ms",
-            "uds 7E0 > 7E8 ReadDTCInformation: sid 0x19, ecu \"Kinds\", service \"Read_Codes\", sub_function 0x02 (reportDTCByStatusMask), mask 255, \
+            "uds 7E0 > 7E8 ReadDTCInformation: sid 0x19, ecu \"Kinds\", service \"Read_Codes\", sub_function 0x02 (DTCs by status mask), mask 255, \
              available_mask 0xFF, trouble_codes 1, codes \"P0123-11 (confirmed)\", dtc \"P0123-11\" (P012311: Air flow sensor: short to ground), after 1 ms",
             "uds 7E0 > 7E8 ReadDataByIdentifier: sid 0x22, ecu \"Kinds\", did 0xF190 (VIN), value 41, after 1 ms",
             "uds 7E0 > 7E8 ReadDataByIdentifier: sid 0x22, ecu \"Kinds\", service \"read_point\", did 0x011C, nrc 0x31 (requestOutOfRange), after 1 ms",
+            "uds 7E0 > 7E8 ReadDataByIdentifier: sid 0x22, ecu \"Kinds\", service \"read_u8, read_temperature\", did 0x0101, did 0x0111, \
+             value_0101 01, value_0111 AA, after 1 ms",
         ]
     );
     // The reader, which looks at the first records before it decides, says the same.
@@ -161,8 +166,8 @@ fn requests_are_found_by_name() {
         (&start.bytes[..], &start.open[..]),
         (&[0x31, 1, 2, 3][..], &["to".to_owned(), "gear".to_owned()][..])
     );
-    let unknown = ecu.request("poin", &[0x22]).unwrap_err().to_string();
-    assert_eq!(unknown, "poin is not the name of a request 22 of Kinds; there are: read_point");
+    let unknown = ecu.request("read_points", &[0x22]).unwrap_err().to_string();
+    assert_eq!(unknown, "read_points is not the name of a request 22 of Kinds; there are: read_point");
     let several = ecu.request("behind", &[0x22]).unwrap_err();
     assert!(matches!(several, NameError::Several { .. }), "{several}");
     assert_eq!(ecu.trouble_code(0xC1_2200).unwrap(), "U012200: Lost communication");

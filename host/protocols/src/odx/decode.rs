@@ -9,8 +9,8 @@ use super::coded::Stop;
 use super::compu::{Compu, Physical, is_between};
 use super::layer::View;
 use super::model::{
-    BaseType, Case, Coded, Data, DopKind, Internal, Item, KeyName, Length, Link, Model, Mux, Name, Param,
-    ParamKind, Place,
+    BaseType, Case, Coded, Data, DopKind, Internal, Item, Length, Link, Model, Mux, Name, Param, ParamKind,
+    Place,
 };
 use super::xml;
 

@@ -28,6 +28,7 @@ use crate::protocols::{self, ProtocolArgs};
                 cantap conversations tractor.asc --db machine.dbc\n  \
                 cantap conversations plant.log --eds 5:drive.eds --eds 6:io.dcf\n  \
                 cantap conversations workshop.log --pair 6F1/12:612/F1\n  \
+                cantap conversations workshop.log --odx car.pdx\n  \
                 cantap conversations -d /dev/ttyACM0 -b 500k\n\n\
                 Without --protocol, each channel is read by the protocols that its first frames show, and by others as \
                 soon as they show; they are named on standard error. A line is: time, interface, protocol, sender > \

@@ -2,6 +2,7 @@
 
 mod coverage;
 mod describe;
+mod odx;
 
 use std::io::{BufWriter, Write};
 use std::path::PathBuf;
@@ -12,6 +13,7 @@ use serde_json::json;
 
 use crate::completion;
 use crate::input::ReadArgs;
+use crate::usage_error::usage;
 use cantap_work::terms::counted;
 
 /// The command line.
@@ -19,11 +21,12 @@ use cantap_work::terms::counted;
 #[command(after_help = "Examples:\n  \
                 cantap db car.dbc\n  \
                 cantap db car.dbc --message EngineData --message 'Body*'\n  \
-                cantap db car.dbc --coverage trace.log\n\n\
+                cantap db car.dbc --coverage trace.log\n  \
+                cantap db car.pdx\n\n\
                 In a layout the highest bit is on the left; < is a signal's most significant bit, x its least \
                 significant one, X a bit that several signals have.")]
 pub struct Args {
-    /// The databases.
+    /// The databases, or descriptions of ECUs (PDX, ODX).
     #[arg(required = true, value_name = "FILE", add = completion::databases())]
     files: Vec<PathBuf>,
     /// Show these messages in full: layout, signals, texts, comments. A name with *, ? and [a-z], or an identifier in hexadecimal
@@ -48,6 +51,19 @@ pub struct Args {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let is_odx = |path: &PathBuf| path.to_str().is_some_and(crate::protocols::is_odx);
+    if args.files.iter().any(is_odx) {
+        anyhow::ensure!(
+            args.files.iter().all(is_odx) && args.messages.is_empty() && args.coverage.is_none(),
+            usage(
+                "descriptions of ECUs (PDX, ODX) are listed by themselves; --message and --coverage are for databases"
+            )
+        );
+        let mut out = BufWriter::new(std::io::stdout().lock());
+        odx::run(&args.files, args.warnings, args.json, &mut out)?;
+        out.flush()?;
+        return Ok(ExitCode::SUCCESS);
+    }
     let databases: Vec<Database> =
         args.files.iter().map(|path| cantap_signals::load(path)).collect::<Result<_, _>>()?;
     let mut out = BufWriter::new(std::io::stdout().lock());

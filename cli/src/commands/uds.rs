@@ -3,6 +3,7 @@
 pub mod hex;
 mod key;
 mod memory;
+mod names;
 mod scan;
 mod script;
 mod transfer_args;
@@ -11,13 +12,17 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use cantap_protocols::diagnostics::Diagnostics;
+use cantap_protocols::iso_tp::Pair;
+use cantap_protocols::odx::{Descriptions, Ecu};
 
-use self::hex::{Hex, byte, bytes, number, word};
+use self::hex::{Hex, byte, bytes, number};
 use self::key::{KeyArgs, level};
 use self::memory::{DownloadArgs, UploadArgs};
+use self::names::{Identifier, identifier};
 use self::scan::ScanArgs;
 use self::script::{RunArgs, Step};
 pub use self::transfer_args::TransferArgs;
+use crate::protocols::{OdxPath, load_odx};
 use crate::speak_args::SpeakArgs;
 use crate::usage_error::usage;
 use crate::{args, stderr};
@@ -34,6 +39,7 @@ use cantap_work::uds::{Client, REFUSAL};
                 cantap uds -d COM5 -b 500k --session extended --security 1 \\\n      \
                 --key-command './key' routine start FF00\n  \
                 cantap uds -d COM5 -b 500k raw '22 F1 90'\n  \
+                cantap uds -d COM5 -b 500k --odx car.pdx read Vehicle_Identification\n  \
                 cantap uds -d COM5 -b 500k --session extended run requests.txt\n\n\
                 It takes part in the bus: it acknowledges, and sends what it is asked for here and nothing else. What \
                 was said is shown as `cantap conversations` does. A refusal is exit code 1.")]
@@ -47,6 +53,10 @@ pub struct Args {
     session: Option<u8>,
     #[command(flatten)]
     key: KeyArgs,
+    /// The ECU's description (PDX or ODX): names and values of what it is asked and answers; with a layer behind it (car.pdx:Engine_V2), that variant. Can
+    /// be repeated.
+    #[arg(long, value_name = "FILE[:LAYER]", global = true)]
+    odx: Vec<OdxPath>,
     #[command(subcommand)]
     what: What,
 }
@@ -57,9 +67,9 @@ pub enum What {
     Scan(ScanArgs),
     /// Read data by identifier.
     Read {
-        /// The identifiers in hexadecimal, as F190.
-        #[arg(required = true, value_name = "DID", value_parser = word)]
-        dids: Vec<u16>,
+        /// The identifiers in hexadecimal, as F190, or by their names in --odx.
+        #[arg(required = true, value_name = "DID", value_parser = identifier)]
+        dids: Vec<Identifier>,
     },
     /// Open a session; it ends some seconds after the last request.
     Session {
@@ -72,9 +82,9 @@ pub enum What {
         /// What to do with it.
         #[arg(value_enum)]
         action: RoutineAction,
-        /// Its identifier in hexadecimal, as FF00.
-        #[arg(value_name = "ID", value_parser = word)]
-        routine: u16,
+        /// Its identifier in hexadecimal, as FF00, or its name in --odx.
+        #[arg(value_name = "ID", value_parser = identifier)]
+        routine: Identifier,
         /// Its option record in hexadecimal.
         #[arg(value_name = "HEX", value_parser = bytes)]
         option: Option<Hex>,
@@ -173,7 +183,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 "a scan opens no session and unlocks nothing; leave --session, --security and --key-command out",
             ));
         }
-        scan::run(&args.speak, scan, &args.transfer.options())?;
+        scan::run(&args.speak, scan, &args.transfer.options(None))?;
         return Ok(ExitCode::SUCCESS);
     }
     let steps = match &args.what {
@@ -182,13 +192,26 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         }
         what => vec![Step { place: None, what: what.clone() }],
     };
+    let descriptions = load_odx(&args.odx, false)?;
+    let options = args.transfer.options(descriptions.as_deref().and_then(only_pair));
+    let Pair { a, b } = options.pair;
+    let ecu = descriptions.as_ref().and_then(|descriptions| descriptions.of(Some(a), Some(b)));
+    if descriptions.is_some() && ecu.is_none() {
+        let pair = options.pair;
+        return Err(usage(format!(
+            "no ECU of --odx has {pair}; give --pair, or say which layer is meant, as FILE:LAYER"
+        )));
+    }
+    let ecu = ecu.map(|ecu| &**ecu);
     // Nothing is sent unless all of it can be.
     for Step { place, what } in &steps {
-        located(place.as_deref(), args.check(what))?;
+        located(place.as_deref(), args.check(what, ecu))?;
     }
-    let options = args.transfer.options();
     let device = args.speak.open()?;
-    let witness = || Box::new(Diagnostics::new(&[options.pair.into()], false));
+    let witness = || {
+        let diagnostics = Diagnostics::new(&[options.pair.into()], false);
+        Box::new(diagnostics.with_descriptions(descriptions.clone()))
+    };
     let speaking = args.speak.speak(&device, witness());
     let mut client = Client::new(speaking, options, stderr::reporter());
     if let Some(session) = args.session {
@@ -199,7 +222,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     args.key.unlock(&mut client)?;
     client.show()?;
     for Step { place, what } in &steps {
-        located(place.as_deref(), args.perform(what, &mut client))?;
+        located(place.as_deref(), args.perform(what, ecu, &mut client))?;
         // A line that was ended by Ctrl-C is the last one.
         if interrupt::requested() {
             break;
@@ -208,6 +231,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     drop(client);
     device.stop()?;
     Ok(ExitCode::SUCCESS)
+}
+
+/// The pair of identifiers of the only ECU.
+fn only_pair(descriptions: &Descriptions) -> Option<Pair> {
+    let mut pairs = descriptions.pairs();
+    pairs.next().filter(|_| pairs.next().is_none())
 }
 
 /// With the place of what failed, if it has one.
@@ -256,7 +285,7 @@ fn stay(
 
 impl Args {
     /// Does one thing.
-    fn perform(&self, what: &What, client: &mut Client<'_>) -> anyhow::Result<()> {
+    fn perform(&self, what: &What, ecu: Option<&Ecu>, client: &mut Client<'_>) -> anyhow::Result<()> {
         match what {
             What::TesterPresent { period: Some(period), count, time } => stay(client, *period, *count, *time),
             What::Security { level } => {
@@ -272,7 +301,7 @@ impl Args {
             What::Download(download) => download.run(client),
             What::Upload(upload) => upload.run(client),
             _ => {
-                for request in &requests(what)? {
+                for request in &requests(what, ecu)? {
                     let asked = client.ask(request);
                     client.show()?;
                     asked?;
@@ -283,22 +312,24 @@ impl Args {
     }
 
     /// Whether it can be done, as far as that is known before anything is sent.
-    fn check(&self, what: &What) -> anyhow::Result<()> {
+    fn check(&self, what: &What, ecu: Option<&Ecu>) -> anyhow::Result<()> {
         match what {
             What::Security { .. } if !self.key.has_command() => {
                 Err(usage("unlocking requires --key-command, which computes the key"))
             }
             What::Download(download) => download.image().map(drop),
             What::Upload(upload) => upload.check(),
-            _ => requests(what).map(drop),
+            _ => requests(what, ecu).map(drop),
         }
     }
 }
 
 /// The requests to send.
-fn requests(what: &What) -> anyhow::Result<Vec<Vec<u8>>> {
+fn requests(what: &What, ecu: Option<&Ecu>) -> anyhow::Result<Vec<Vec<u8>>> {
     Ok(match what {
-        What::Read { dids } => dids.iter().map(|did| [&[0x22][..], &did.to_be_bytes()].concat()).collect(),
+        What::Read { dids } => {
+            dids.iter().map(|did| names::request(ecu, &[0x22], did, &[])).collect::<anyhow::Result<_>>()?
+        }
         What::Session { kind } => vec![vec![0x10, *kind]],
         What::Routine { action, routine, option } => {
             let action = match action {
@@ -307,7 +338,7 @@ fn requests(what: &What) -> anyhow::Result<Vec<Vec<u8>>> {
                 RoutineAction::Result => 3,
             };
             let option = option.as_ref().map_or(&[][..], |option| &option.0);
-            vec![[&[0x31, action][..], &routine.to_be_bytes(), option].concat()]
+            vec![names::request(ecu, &[0x31, action], routine, option)?]
         }
         What::TesterPresent { count, period, .. } => {
             if period.is_some_and(|period| period < SHORTEST_PERIOD) {

@@ -2,6 +2,7 @@
 //! protocols.
 
 mod known;
+mod odx;
 mod sheet;
 
 use std::sync::Arc;
@@ -13,6 +14,7 @@ use cantap_signals::condition::{Condition, ConditionError};
 use cantap_work::reading::Reading;
 
 pub use self::known::{Known, named};
+pub use self::odx::{OdxPath, is_odx, load as load_odx, read as read_odx};
 pub use self::sheet::SheetPath;
 
 use crate::stderr;
@@ -26,6 +28,10 @@ pub struct ProtocolArgs {
     /// repeated.
     #[arg(long = "eds", value_name = "[NODE:]FILE")]
     sheets: Vec<SheetPath>,
+    /// The description (PDX or ODX) of ECUs: names and values of what they are asked and answer. An ECU is known by its identifiers in the file;
+    /// with a layer behind it (car.pdx:Engine_V2), that variant of it. Can be repeated.
+    #[arg(long = "odx", value_name = "FILE[:LAYER]")]
+    odx: Vec<OdxPath>,
 }
 
 fn pair_help() -> String {
@@ -42,11 +48,14 @@ impl ProtocolArgs {
         Ok(Known::new(reading(self.options(quiet)?, None, quiet)))
     }
 
-    /// The library's options; what is not understood in a sheet is reported on standard error, unless
+    /// The library's options; what is not understood in a sheet or description is reported on standard error, unless
     /// `quiet`.
     pub fn options(&self, quiet: bool) -> anyhow::Result<Options> {
         let sheets = self.sheets.iter().map(|path| path.load(quiet)).collect::<anyhow::Result<Vec<_>>>()?;
-        Ok(Options { pairs: self.pairs.clone(), sheets, ..Options::default() })
+        let descriptions = load_odx(&self.odx, quiet)?;
+        let mut pairs = self.pairs.clone();
+        pairs.extend(descriptions.iter().flat_map(|descriptions| descriptions.pairs()).map(KnownPairs::from));
+        Ok(Options { pairs, sheets, descriptions, ..Options::default() })
     }
 }
 

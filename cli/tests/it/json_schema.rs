@@ -48,6 +48,8 @@ pub fn directory(test: &str) -> PathBuf {
     fs::write(directory.join("rules.toml"), "[[rule]]\nfrom = 1\nfilter = \"123\"\nset.data = \"?1\"\n")
         .unwrap();
     fs::write(directory.join("car.dbc"), database).unwrap();
+    let odx = include_bytes!("../../../host/protocols/tests/data/kinds.odx-d");
+    fs::write(directory.join("kinds.odx-d"), odx).unwrap();
     fs::write(directory.join("odd.dbc"), database.replace("8|8@1-", "8|99@1-")).unwrap();
     directory
 }
@@ -120,6 +122,7 @@ pub const LINES: &[(&str, i32, &[&str])] = &[
     ("obd clear -d virtual:car --yes", 0, &["conversations", "conversations"]),
     ("uds scan -d virtual:car --p2 200ms", 0, &["uds_scan"]),
     ("uds read -d virtual:car F190", 0, &["conversations"]),
+    ("conversations talk.log --odx kinds.odx-d:Kinds", 0, &["conversations", "conversations_end"]),
     ("uds session -d virtual:car extended", 0, &["conversations"]),
     ("uds routine -d virtual:car start FF00", 1, &["conversations"]),
     ("uds tester-present -d virtual:car", 0, &["conversations"]),
@@ -142,6 +145,7 @@ pub const LINES: &[(&str, i32, &[&str])] = &[
     ("plot a.log --db car.dbc -o out.svg", 0, &["plot"]),
     ("plot b.log --timing 100 -o out.svg", 0, &["plot"]),
     ("db car.dbc", 0, &["db"]),
+    ("db kinds.odx-d", 0, &["db_of_ODX"]),
     ("db odd.dbc --warnings", 0, &["db_--warnings"]),
     ("db car.dbc --message Never", 0, &["db_--message"]),
     ("db car.dbc --coverage a.log", 0, &["db_--coverage"]),

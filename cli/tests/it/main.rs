@@ -49,6 +49,7 @@ mod monitor_sources;
 mod monitor_terminal;
 mod nodes;
 mod nothing_read;
+mod odx;
 mod outputs;
 mod port;
 mod protocols;

@@ -19,6 +19,7 @@ pub fn condition(text: &str, decoder: &Decoder, options: &Options) -> Result<Con
         decoder: Some(decoder.clone().into()),
         pairs: options.pairs.clone(),
         sheets: options.sheets.clone(),
+        descriptions: options.descriptions.clone(),
     };
     let listener = Watcher { options, conversations: None, events: Vec::new() };
     Condition::with_listener(text, decoder, Box::new(listener))

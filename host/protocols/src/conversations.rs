@@ -12,6 +12,7 @@ use crate::devicenet::DeviceNet;
 use crate::diagnostics::Diagnostics;
 use crate::iso_tp::{IsoTp, KnownPairs};
 use crate::j1939::{Groups, J1939};
+use crate::odx::Descriptions;
 use crate::signs::FAMILY;
 use crate::survey::DiagnosticsSigns;
 use crate::watch::Begun;
@@ -28,6 +29,8 @@ pub struct Options {
     pub decoder: Option<Arc<Decoder>>,
     /// The sheets of CANopen nodes.
     pub sheets: Vec<Sheet>,
+    /// Descriptions of ECUs for diagnostics.
+    pub descriptions: Option<Arc<Descriptions>>,
 }
 
 /// Takes records and returns the events of all protocols, in the order of completion.
@@ -161,7 +164,10 @@ impl Conversations {
                 OF_DIAGNOSTICS if self.wanted == Protocol::IsoTp.bit() => {
                     Box::new(IsoTp::new(&options.pairs, true))
                 }
-                OF_DIAGNOSTICS => Box::new(Diagnostics::new(&options.pairs, true)),
+                OF_DIAGNOSTICS => {
+                    let diagnostics = Diagnostics::new(&options.pairs, true);
+                    Box::new(diagnostics.with_descriptions(options.descriptions.clone()))
+                }
                 OF_CANOPEN => Box::new(CanOpen::new(options.sheets.clone())),
                 _ => Box::new(DeviceNet::new()),
             });

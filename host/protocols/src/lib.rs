@@ -19,6 +19,7 @@ pub mod j1939;
 mod json;
 pub mod naming;
 pub mod nmea2000;
+pub mod odx;
 mod overview;
 mod protocol;
 mod reader;

@@ -71,7 +71,8 @@ impl Reader {
     /// Sets up reading. With protocols given, nothing waits and nothing is announced.
     pub fn new(options: Options) -> Self {
         let is_given = !options.protocols.is_empty();
-        let first = (!is_given).then(|| First { survey: Survey::new(&options.pairs), records: Vec::new() });
+        let survey = || Survey::new(&options.pairs, options.descriptions.clone());
+        let first = (!is_given).then(|| First { survey: survey(), records: Vec::new() });
         let conversations = is_given.then(|| Conversations::new(&options, None));
         Self { options, first, conversations, watch: None, events: Vec::new(), announced: BTreeSet::new() }
     }

@@ -1,12 +1,14 @@
 //! Finds out which protocols are used on a bus, by signs that are specific to them.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use cantap_trace::TraceRecord;
 use rustc_hash::FxHashMap;
 
 use crate::diagnostics::Diagnostics;
 use crate::iso_tp::KnownPairs;
+use crate::odx::Descriptions;
 use crate::relatives::{Relative, Relatives};
 use crate::signs::Signs;
 use crate::{Assembler, Event, EventKind, Protocol, UnderWay};
@@ -79,9 +81,10 @@ pub struct Evidence {
 }
 
 impl Survey {
-    /// For all protocols; these pairs are known to talk by ISO 15765-2.
-    pub fn new(pairs: &[KnownPairs]) -> Self {
-        Self { diagnostics: Diagnostics::new(pairs, true), ..Self::default() }
+    /// For all protocols; these pairs are known to talk by ISO 15765-2, and these ECUs are described.
+    pub fn new(pairs: &[KnownPairs], descriptions: Option<Arc<Descriptions>>) -> Self {
+        let diagnostics = Diagnostics::new(pairs, true).with_descriptions(descriptions);
+        Self { diagnostics, ..Self::default() }
     }
 
     /// Takes the next record.

@@ -337,7 +337,7 @@ mod tests {
             }
             let (_, begun) = event_lines(&records);
             let found: Vec<_> = {
-                let mut survey = Survey::new(&[]);
+                let mut survey = Survey::new(&[], None);
                 records
                     .iter()
                     .filter(|record| record.time_ns < WINDOW_NS)

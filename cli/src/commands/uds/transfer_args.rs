@@ -2,17 +2,25 @@
 
 use std::time::Duration;
 
-use cantap_protocols::iso_tp::Pair;
+use cantap::Id;
+use cantap_protocols::iso_tp::{Endpoint, Pair};
 use cantap_work::uds::{FlowControl, TransferOptions};
 
 use crate::args;
 
+/// The first pair of ISO 15765-4.
+const OBD_PAIR: Pair = Pair {
+    a: Endpoint { id: Id::standard_truncated(0x7E0), address: None },
+    b: Endpoint { id: Id::standard_truncated(0x7E8), address: None },
+};
+
 /// Whom to ask, and the parameters of transfers; commands flatten this into their arguments.
 #[derive(clap::Args)]
 pub struct TransferArgs {
-    /// The ECU: the identifier of requests, and that of its answers; 6F1/12:612/F1 if the first data byte is an address.
-    #[arg(long, value_name = "ID:ID", default_value = "7E0:7E8", global = true)]
-    pair: Pair,
+    /// The ECU: the identifier of requests, and that of its answers; 6F1/12:612/F1 if the first data byte is an address. Without it, those of the only
+    /// ECU of --odx, or 7E0:7E8.
+    #[arg(long, value_name = "ID:ID", global = true)]
+    pair: Option<Pair>,
     /// Ask all ECUs at once: with 7DF, or with 18DB33F1 if the pair has 29-bit identifiers.
     #[arg(long, global = true)]
     functional: bool,
@@ -82,10 +90,10 @@ fn separation(text: &str) -> Result<u8, String> {
 }
 
 impl TransferArgs {
-    /// The same without clap.
-    pub const fn options(&self) -> TransferOptions {
+    /// The same without clap, for this pair if none was given.
+    pub fn options(&self, usual: Option<Pair>) -> TransferOptions {
         TransferOptions {
-            pair: self.pair,
+            pair: self.pair.or(usual).unwrap_or(OBD_PAIR),
             functional: self.functional,
             p2: self.p2,
             p2_star: self.p2_star,

@@ -14,6 +14,7 @@
 
 mod authentication;
 mod cursor;
+mod described;
 mod dialect;
 mod dtc;
 pub(crate) mod echo;
@@ -43,13 +44,16 @@ pub(crate) use uds::is_response_suppressed;
 
 use std::borrow::Cow;
 use std::collections::VecDeque;
+use std::sync::Arc;
 
 use cantap_trace::TraceRecord;
 
+use self::described::{Parts, describe};
 use self::dialect::Dialects;
 use self::periodic::Periodic;
 use self::unnamed::Unnamed;
 use crate::iso_tp::{Endpoint, KnownPairs, Transfer, Transport};
+use crate::odx::Descriptions;
 use crate::{Assembler, Event, EventKind, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
 /// How many requests may wait for a response at a time.
@@ -106,12 +110,20 @@ pub struct Diagnostics {
     due_ns: i64,
     dialects: Dialects,
     transfers: Vec<Transfer>,
+    descriptions: Option<Arc<Descriptions>>,
 }
 
 impl Diagnostics {
     /// With pairs that are known on all channels; `finds` enables the search for others.
     pub fn new(pairs: &[KnownPairs], finds: bool) -> Self {
         Self { transport: Transport::new(pairs, finds), ..Self::default() }
+    }
+
+    /// With descriptions of ECUs, from which names and values of their services come.
+    #[must_use]
+    pub fn with_descriptions(mut self, descriptions: Option<Arc<Descriptions>>) -> Self {
+        self.descriptions = descriptions;
+        self
     }
 
     /// Takes a transfer, which may have been heard before the last record.
@@ -345,6 +357,7 @@ impl Diagnostics {
         let (protocol, title) =
             service(is_kwp, sid).unwrap_or_else(|| (Protocol::Uds, format!("service {sid:02X}").into()));
         let mut fields = vec![Field::hex("sid", sid, 2)];
+        let before = fields.len();
         let is_request = first.data[0] & 0x40 == 0;
         if is_request {
             // Parts of the request that an OBD response repeats are shown once.
@@ -356,6 +369,7 @@ impl Diagnostics {
                 _ => uds::request(&first.data, &mut fields),
             }
         }
+        let parts = Parts { before, request_end: fields.len() };
         let answer = response.map(|(response, _)| response).or((!is_request).then_some(first));
         if let Some(answer) = answer {
             let data = &answer.data;
@@ -387,6 +401,9 @@ impl Diagnostics {
         };
         if !is_request && first.to.is_none() {
             event.to = Party::Unknown;
+        }
+        if let Some(descriptions) = &self.descriptions {
+            describe(descriptions, is_request.then_some(first), answer, &parts, &mut event);
         }
         if let Some((response, answered)) = response {
             if answered.pending > 0 {

@@ -8,7 +8,7 @@ const CODE: usize = 3;
 const CODE_AND_STATUS: usize = CODE + 1;
 
 /// `P1234-56`, of at least three bytes.
-fn code(bytes: &[u8]) -> String {
+pub fn code(bytes: &[u8]) -> String {
     format!("{}-{:02X}", Dtc(u16::from_be_bytes([bytes[0], bytes[1]])), bytes[2])
 }
 
@@ -206,6 +206,24 @@ pub fn response(heard: bool, sub: u8, data: &[u8], fields: &mut Vec<Field>) {
         }
         _ => rest("value", data, fields),
     }
+}
+
+/// The trouble codes of a positive response, which begins with 59.
+pub fn codes(response: &[u8]) -> Vec<[u8; CODE]> {
+    let [0x59, sub, data @ ..] = response else { return Vec::new() };
+    // How many bytes are in front of the list, and how many an entry has, with the place of its code.
+    let (front, entry, at) = match sub {
+        0x02 | 0x0A..=0x0F | 0x13 | 0x15 => (1, CODE_AND_STATUS, 0),
+        0x03 | 0x14 => (0, CODE_AND_STATUS, 0),
+        0x17 | 0x1A => (2, CODE_AND_STATUS, 0),
+        0x08 | 0x09 => (1, 6, 2),
+        0x42 => (4, 5, 1),
+        0x55 => (3, CODE_AND_STATUS, 0),
+        0x56 => (4, CODE_AND_STATUS, 0),
+        _ => return Vec::new(),
+    };
+    let entries = data.get(front..).unwrap_or_default().chunks_exact(entry);
+    entries.map(|entry| [entry[at], entry[at + 1], entry[at + 2]]).collect()
 }
 
 #[cfg(test)]

@@ -381,7 +381,7 @@ fn a_session_above_80_is_one_of_kwp2000() {
 #[test]
 fn requests_without_answers_show_what_is_spoken() {
     let found = |frames: &[&str]| {
-        let mut survey = crate::survey::Survey::new(&[]);
+        let mut survey = crate::survey::Survey::new(&[], None);
         for (number, frame) in (0_u32..).zip(frames) {
             survey.take(&at(f64::from(number) * 100.0, frame));
         }
@@ -405,7 +405,7 @@ fn requests_without_answers_show_what_is_spoken() {
 #[test]
 fn responses_of_obd_without_requests_show_what_is_spoken() {
     let found = |frames: &[&str]| {
-        let mut survey = crate::survey::Survey::new(&[]);
+        let mut survey = crate::survey::Survey::new(&[], None);
         for (number, frame) in (0_u32..).zip(frames) {
             survey.take(&at(f64::from(number) * 100.0, frame));
         }

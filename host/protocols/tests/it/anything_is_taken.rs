@@ -3,6 +3,7 @@
 
 use cantap_protocols::canopen::Sheet;
 use cantap_protocols::canopen::eds::Eds;
+use cantap_protocols::odx::Odx;
 use cantap_protocols::{Event, Options, Overview, Protocol, Reader};
 use cantap_trace::{Direction, FdFrame, Frame, Id, TraceEvent, TraceRecord};
 
@@ -207,4 +208,58 @@ fn flood_every_reader() {
             assert!(said > 500, "{name}: what was given up is said: {said}");
         }
     }
+}
+
+/// A description in which bytes were changed, left out or doubled is read or refused, and whatever is read of it takes any message.
+#[test]
+fn any_description_is_taken_with_any_message() {
+    let seed = fastrand::u64(..);
+    eprintln!("seed {seed}");
+    let mut random = fastrand::Rng::with_seed(seed);
+    let kinds = include_bytes!("../data/kinds.odx-d");
+    let mut read = 0;
+    for round in 0..60 {
+        let mut bytes = kinds.to_vec();
+        for _ in 0..if round == 0 { 0 } else { random.usize(1..40) } {
+            let (from, length) = (random.usize(0..bytes.len()), random.usize(0..30));
+            let part = from..(from + length).min(bytes.len());
+            match random.u8(0..4) {
+                // Digits for digits keep the document one.
+                0 => {
+                    for byte in bytes[part].iter_mut().filter(|byte| byte.is_ascii_digit()) {
+                        *byte = random.u8(b'0'..=b'9');
+                    }
+                }
+                1 => {
+                    // A value for another one of the document.
+                    let (values, to): (Vec<&[u8]>, _) =
+                        (kinds.split(|byte| *byte == b'"').collect(), random.usize(0..bytes.len()));
+                    let value = values[random.usize(0..values.len())].to_vec();
+                    if let Some(at) =
+                        bytes[to..].iter().position(|byte| *byte == b'"').filter(|_| value.len() < 40)
+                    {
+                        let end = bytes[to + at + 1..].iter().position(|byte| *byte == b'"').unwrap_or(0);
+                        bytes.splice(to + at + 1..to + at + 1 + end, value);
+                    }
+                }
+                2 if random.u8(0..8) == 0 => drop(bytes.drain(part)),
+                3 if random.u8(0..8) == 0 => bytes[from] = random.u8(..),
+                _ => {}
+            }
+        }
+        let Ok(odx) = Odx::read("any.odx-d", &bytes) else { continue };
+        read += 1;
+        let layers: Vec<_> = odx.layers().map(|(_, name)| name.to_owned()).collect();
+        for ecu in layers.iter().filter_map(|name| odx.ecu(name).ok()) {
+            for request in ecu.requests() {
+                let mut asked = request.bytes;
+                asked.extend((0..random.usize(0..4)).map(|_| random.u8(..)));
+                let Some(first) = asked.first().copied() else { continue };
+                let mut answer: Vec<u8> = (0..random.usize(0..40)).map(|_| random.u8(..)).collect();
+                answer.splice(0..0, [first | 0x40].into_iter().chain(asked[1..].iter().copied().take(2)));
+                let _ = (ecu.describe(Some(&asked), Some(&answer)), ecu.describe(None, Some(&answer)));
+            }
+        }
+    }
+    assert!(read > 0);
 }

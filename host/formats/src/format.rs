@@ -51,6 +51,8 @@ pub enum Format {
     Nmea2000,
     /// The trace of CARBUS Analyzer.
     Carbus,
+    /// The tables that the programs for USBCAN adapters save.
+    UsbCan,
     /// A table of any columns.
     Table,
     /// A table in Parquet: a row for each record, or frames in any columns.

@@ -75,6 +75,7 @@ mod text;
 pub mod time_range;
 mod trc;
 mod unread;
+mod usbcan;
 mod utf16;
 mod whole;
 mod writer;

@@ -15,7 +15,7 @@ use super::trc::TrcVersion;
 use super::writer::WriteOptions;
 use super::{
     asc, battery_emulator, blf, busmaster, candump, candump_screen, canedge, canhacker, canking, carbus,
-    crtd, csv, gvret, kvaser, mf4, microchip, nmea2000, pcap, pcapng, printer, table, trc,
+    crtd, csv, gvret, kvaser, mf4, microchip, nmea2000, pcap, pcapng, printer, table, trc, usbcan,
 };
 
 /// One format.
@@ -361,6 +361,15 @@ const FORMATS: &[FormatSpec] = &[
         begins: |head| carbus::is_head(head.text),
         has_head: true,
         reader: |_| Box::new(Rows::<carbus::Decoder>::default()),
+        writer: None,
+    },
+    FormatSpec {
+        format: Format::UsbCan,
+        names: &["usbcan"],
+        suffixes: &["csv", "txt"],
+        begins: |head| usbcan::is_head(head.line),
+        has_head: true,
+        reader: |_| Box::new(Rows::<usbcan::Decoder>::default()),
         writer: None,
     },
     FormatSpec {

@@ -174,7 +174,9 @@ impl Decoder {
             };
             time::number(cell, unit_ns)
         } else {
-            time::stamp(cell, self.day, zone).or_else(|| time::date(cell, zone))
+            time::stamp(cell, self.day, zone)
+                .or_else(|| time::with_unit(cell))
+                .or_else(|| time::date(cell, zone))
         };
         time_ns.ok_or_else(|| Fault::malformed("a time: a number or a date", cell))
     }
@@ -242,9 +244,10 @@ impl Decoder {
 
     /// The bytes, as many as the length says if there is one.
     fn data(&self, layout: &Layout, cells: &[&[u8]], len: Option<usize>) -> Result<Payload, Fault> {
-        let decimal = self.radix.data;
+        let mut decimal = self.radix.data;
         let mut bytes = Vec::with_capacity(8);
         if let Some(place) = layout.place(Role::Data) {
+            decimal |= place.form.is_none() && cells.get(place.at).is_some_and(|cell| is_list(cell));
             let is_last = layout.separator == Separator::Blanks;
             let end = if is_last { cells.len() } else { (place.at + 1).min(cells.len()) };
             for cell in cells.get(place.at..end).unwrap_or_default() {
@@ -351,6 +354,16 @@ fn is_empty(cell: &[u8]) -> bool {
 /// One byte.
 fn byte(cell: &[u8], decimal: bool) -> Option<u8> {
     text::number(cell, decimal).and_then(|byte| u8::try_from(byte).ok())
+}
+
+/// Whether a cell is a list as Python prints one, `[78, 32, 137]`: its numbers are decimal.
+fn is_list(cell: &[u8]) -> bool {
+    let inner = cell.strip_prefix(b"[").and_then(|cell| cell.strip_suffix(b"]"));
+    let is_number =
+        |word: &[u8]| text::decimal(word).is_some() && (word.len() == 1 || !word.starts_with(b"0"));
+    inner.is_some_and(|inner| {
+        inner.contains(&b',') && inner.split(|byte| *byte == b',').all(|word| is_number(word.trim_ascii()))
+    })
 }
 
 /// The bytes of a cell: digits without gaps, or bytes with something between them.

@@ -7,13 +7,13 @@ mod containers;
 
 use std::collections::{HashMap, HashSet};
 
-use cantap_can::Id;
 use roxmltree::{Document, Node};
 
 use super::container::Container;
 use super::fault::{DatabaseError, Fault, FaultKind};
 use super::layout::{self, ByteOrder};
 use super::model::{Database, Message, Multiplexed, Signal, ValueKind, ValueTable};
+use super::unflagged::Unflagged;
 use super::{buses, validate, xml};
 
 /// Parses an ARXML file's content, all of its buses (CAN clusters); `file` is its name for messages to the user.
@@ -30,7 +30,8 @@ pub fn parse_bus(file: &str, bytes: &[u8], bus: Option<&str>) -> Result<Database
         let reason = format!("its element is <{}>; an ARXML file's is <AUTOSAR>", root.tag_name().name());
         return Err(xml::faulty(file, reason));
     }
-    let mut reader = Reader { document: &document, by_path: HashMap::new(), faults: Vec::new() };
+    let (by_path, faults, unflagged) = (HashMap::new(), Vec::new(), Unflagged::default());
+    let mut reader = Reader { document: &document, by_path, faults, unflagged };
     reader.index(root);
     let triggerings = root.descendants().filter(|node| node.tag_name().name() == "CAN-FRAME-TRIGGERING");
     let triggerings: Vec<_> = triggerings.map(|node| (node, bus_of(node))).collect();
@@ -56,6 +57,7 @@ pub fn parse_bus(file: &str, bytes: &[u8], bus: Option<&str>) -> Result<Database
             messages.push(message);
         }
     }
+    reader.faults.extend(reader.unflagged.warning());
     reader.faults.extend(buses::warning(&buses, ids));
     if messages.is_empty() && reader.faults.is_empty() {
         let reason = "no CAN frame is in it: there is no CAN-FRAME-TRIGGERING".to_owned();
@@ -76,6 +78,7 @@ struct Reader<'a> {
     /// Everything with a name, by its path.
     by_path: HashMap<String, Node<'a, 'a>>,
     faults: Vec<Fault>,
+    unflagged: Unflagged,
 }
 
 fn within<'a>(node: Node<'a, 'a>, name: &'static str) -> impl Iterator<Item = Node<'a, 'a>> {
@@ -195,8 +198,7 @@ impl<'a> Reader<'a> {
         };
         let extended = content(triggering, "CAN-ADDRESSING-MODE").as_deref() == Some("EXTENDED");
         let raw = u32::try_from(written).ok();
-        let Some(id) = raw.and_then(|raw| if extended { Id::extended(raw) } else { Id::standard(raw) })
-        else {
+        let Some(id) = raw.and_then(|raw| self.unflagged.id(raw, extended, &name, line)) else {
             fault(FaultKind::Id(written as u64));
             return None;
         };

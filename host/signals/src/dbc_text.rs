@@ -65,12 +65,14 @@ pub fn decode(bytes: &[u8]) -> (Cow<'_, str>, Option<&'static str>) {
     (text, encoding.map(encodings::Encoding::name))
 }
 
-/// UTF-16 by its mark or by the zeros in its first characters, which are ASCII; and Shift-JIS.
+/// UTF-16 by its mark or by the zeros in its first characters, which are ASCII; Shift-JIS; and GBK, as programs in China write.
 fn unusual(bytes: &[u8]) -> Option<&'static encodings::Encoding> {
     match bytes {
         [0xFF, 0xFE, ..] | [(1..=0xFF), 0, (1..=0xFF), 0, ..] => Some(encodings::UTF_16LE),
         [0xFE, 0xFF, ..] | [0, (1..=0xFF), 0, (1..=0xFF), ..] => Some(encodings::UTF_16BE),
-        _ if str::from_utf8(bytes).is_err() && is_shift_jis(bytes) => Some(encodings::SHIFT_JIS),
+        _ if str::from_utf8(bytes).is_ok() => None,
+        _ if is_shift_jis(bytes) => Some(encodings::SHIFT_JIS),
+        _ if is_gbk(bytes) => Some(encodings::GBK),
         _ => None,
     }
 }
@@ -101,6 +103,31 @@ fn is_shift_jis(bytes: &[u8]) -> bool {
     pairs > 0
         && pairs >= others
         && encodings::SHIFT_JIS.decode_without_bom_handling_and_without_replacement(bytes).is_some()
+}
+
+/// Whether bytes that are not ASCII are pairs of GBK. Letters with accents are rarely two side by side and hardly ever without one alone elsewhere;
+/// Korean's pairs begin with B0 to C8, of which no Chinese sentence consists.
+fn is_gbk(bytes: &[u8]) -> bool {
+    let (mut clear, mut common, mut rare) = (0, 0, 0);
+    let mut rest = bytes;
+    while let [first, after @ ..] = rest {
+        rest = after;
+        if first.is_ascii() {
+            continue;
+        }
+        let [second, behind @ ..] = after else { return false };
+        match (first, second) {
+            // The more frequent half of the characters, from S to Z, and the signs for °C, degrees and ohms.
+            (0xC9..=0xD7, 0xA1..=0xFE) | (0xA1, 0xE3 | 0xE6) | (0xA6, 0xB8) => clear += 1,
+            (0xA1..=0xA9 | 0xB0..=0xC8, 0xA1..=0xFE) => common += 1,
+            (0x81..=0xFE, 0x40..=0x7E | 0x80..=0xFE) => rare += 1,
+            _ => return false,
+        }
+        rest = behind;
+    }
+    clear > 0
+        && clear + common >= 8 * rare
+        && encodings::GBK.decode_without_bom_handling_and_without_replacement(bytes).is_some()
 }
 
 /// The text with a receiver in each definition of a signal: some programs write none where nobody receives it, and can-dbc wants one.
@@ -292,7 +319,7 @@ mod tests {
                         CM_ BO_ 5 \"BO_ 6 \\\"No\\\"\nBO_ 7 Neither: 8 A\";\nBO_ 8 Last : 8 A\n SG_ One m0 : 0|8@1+ (1,0) [0|0] \"\" A\n";
 
     #[test]
-    fn utf_16_and_shift_jis_are_known_by_their_bytes_and_western_text_stays() {
+    fn utf_16_shift_jis_and_gbk_are_known_by_their_bytes_and_western_text_stays() {
         let text = "BO_ 5 First: 8 A\r\n SG_ One : 0|8@1+ (1,0) [0|0] \"°C\" A\r\n";
         let little: Vec<u8> = text.encode_utf16().flat_map(u16::to_le_bytes).collect();
         let big: Vec<u8> = text.encode_utf16().flat_map(u16::to_be_bytes).collect();
@@ -310,7 +337,19 @@ mod tests {
             let bytes = encodings::SHIFT_JIS.encode(&text).0;
             assert_eq!(decode(&bytes), (text.as_str().into(), Some("Shift_JIS")));
         }
+        for chinese in ["电池温度", "车速信号", "℃", "整车控制器：状态正常", "电阻 Ω"]
+        {
+            let text = format!("CM_ SG_ 5 One \"{chinese}\";\n");
+            let bytes = encodings::GBK.encode(&text).0;
+            assert_eq!(decode(&bytes), (text.as_str().into(), Some("GBK")), "{chinese}");
+        }
+        let korean = encodings::EUC_KR.encode("CM_ \"배터리 온도\";").0;
+        assert_eq!(decode(&korean).1, None);
         for western in [
+            "CÔTÉ gauche",
+            "Größe",
+            "créée",
+            "ÄÖÜäöü",
             "Öltemperatur in °C",
             "don’t",
             "“quoted” – naïve",

@@ -82,10 +82,9 @@ pub enum FaultKind {
     /// An identifier that no frame can have.
     #[error("identifier 0x{0:X} does not fit 11 bits (standard) or 29 bits (extended)")]
     Id(u64),
-    /// Identifiers of 29 bits without the flag that DBC files mark them with. Each is taken for an extended one.
+    /// Identifiers of 29 bits that the file does not mark as extended, such as by the flag of DBC files. Each is taken for an extended one.
     #[error(
-        "identifier 0x{id:X} lacks the flag of extended identifiers (0x80000000) and does not fit 11 bits; {messages} such \
-         {} read as extended", if *.messages == 1 { "message is" } else { "messages are" }
+        "identifier 0x{id:X} is not marked as extended and does not fit 11 bits; {messages} such {} read as extended", if *.messages == 1 { "message is" } else { "messages are" }
     )]
     UnflaggedIds {
         /// The first such identifier, as written in the file.

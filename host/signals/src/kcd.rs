@@ -3,12 +3,12 @@
 //! For big-endian signals, a bit offset counts from the highest bit of the first byte. The file does not say which of its buses a
 //! channel is.
 
-use cantap_can::Id;
 use roxmltree::{Document, Node};
 
 use super::fault::{DatabaseError, Fault, FaultKind};
 use super::layout::{ByteOrder, wire_position};
 use super::model::{Database, Message, Multiplexed, Signal, ValueKind, ValueTable};
+use super::unflagged::Unflagged;
 use super::{buses, validate, xml};
 
 /// Parses a KCD file's content, all of its buses; `file` is its name for messages to the user.
@@ -26,7 +26,7 @@ pub fn parse_bus(file: &str, bytes: &[u8], bus: Option<&str>) -> Result<Database
             format!("its element is <{}>; a KCD file's is <NetworkDefinition>", root.tag_name().name());
         return Err(xml::faulty(file, reason));
     }
-    let mut faults = Vec::new();
+    let (mut faults, mut unflagged) = (Vec::new(), Unflagged::default());
     let nodes: Vec<_> = root.children().filter(|node| node.has_tag_name_of("Bus")).collect();
     let name = |node: &Node| node.attribute("name").unwrap_or_default().to_owned();
     let buses = buses::chosen(file, nodes.iter().map(name).collect(), bus)?;
@@ -34,11 +34,12 @@ pub fn parse_bus(file: &str, bytes: &[u8], bus: Option<&str>) -> Result<Database
     let mut ids = Vec::new();
     for (at, node) in nodes.iter().filter(|node| buses.contains(&name(node))).enumerate() {
         for node in node.children().filter(|node| node.has_tag_name_of("Message")) {
-            let message = message(&document, node, &mut faults);
+            let message = message(&document, node, &mut unflagged, &mut faults);
             ids.extend(message.iter().map(|message| (message.id, at)));
             messages.extend(message);
         }
     }
+    faults.extend(unflagged.warning());
     faults.extend(buses::warning(&buses, ids));
     let database = validate::finish(file, messages, faults)?;
     Ok(Database { buses, ..database })
@@ -63,7 +64,12 @@ fn notes(node: Node) -> String {
     child(node, "Notes").map(|notes| xml::text(notes).trim().to_owned()).unwrap_or_default()
 }
 
-fn message(document: &Document, node: Node, faults: &mut Vec<Fault>) -> Option<Message> {
+fn message(
+    document: &Document,
+    node: Node,
+    unflagged: &mut Unflagged,
+    faults: &mut Vec<Fault>,
+) -> Option<Message> {
     let line = xml::line(document, node);
     let name = node.attribute("name").unwrap_or_default().to_owned();
     let mut fault = |kind| faults.push(Fault { line, symbol: name.clone(), kind });
@@ -74,7 +80,7 @@ fn message(document: &Document, node: Node, faults: &mut Vec<Fault>) -> Option<M
     };
     let extended = node.attribute("format") == Some("extended");
     let raw = u32::try_from(number).ok();
-    let Some(id) = raw.and_then(|raw| if extended { Id::extended(raw) } else { Id::standard(raw) }) else {
+    let Some(id) = raw.and_then(|raw| unflagged.id(raw, extended, &name, line)) else {
         fault(FaultKind::Id(number as u64));
         return None;
     };

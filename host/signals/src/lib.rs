@@ -33,6 +33,7 @@ pub mod search;
 mod select;
 pub mod sym;
 pub mod trigger;
+mod unflagged;
 mod validate;
 mod xml;
 

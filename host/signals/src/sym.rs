@@ -11,6 +11,7 @@ use super::dbc_text;
 use super::fault::{DatabaseError, Fault, FaultKind};
 use super::layout::{ByteOrder, wire_position};
 use super::model::{Database, Message, Multiplexed, Signal, ValueKind, ValueTable};
+use super::unflagged::Unflagged;
 use super::{layout, validate};
 
 /// Parses a SYM file's content; `file` is its name for messages to the user.
@@ -338,7 +339,11 @@ impl Reader {
                 None => groups.push(vec![block]),
             }
         }
-        groups.into_iter().flat_map(|group| messages_of(&group, faults)).collect()
+        let mut unflagged = Unflagged::default();
+        let messages =
+            groups.into_iter().flat_map(|group| messages_of(&group, &mut unflagged, faults)).collect();
+        faults.extend(unflagged.warning());
+        messages
     }
 }
 
@@ -359,7 +364,7 @@ fn at(signal: Signal, start: i64) -> Result<Signal, FaultKind> {
 const MOST_IDS: u32 = 256;
 
 /// A symbol's messages: one for each identifier.
-fn messages_of(group: &[Block], faults: &mut Vec<Fault>) -> Vec<Message> {
+fn messages_of(group: &[Block], unflagged: &mut Unflagged, faults: &mut Vec<Fault>) -> Vec<Message> {
     let head = &group[0];
     if group.iter().any(|block| block.is_bad) {
         return Vec::new();
@@ -394,7 +399,7 @@ fn messages_of(group: &[Block], faults: &mut Vec<Fault>) -> Vec<Message> {
     }
     let mut messages = Vec::new();
     for raw in low..=high {
-        let Some(id) = (if extended { Id::extended(raw) } else { Id::standard(raw) }) else {
+        let Some(id) = unflagged.id(raw, extended, &head.name, head.line) else {
             return fault(FaultKind::Id(raw.into()));
         };
         messages.push(Message {

@@ -46,6 +46,20 @@ fn tables_of_public_collections_are_known_and_read_whole() {
             "11T082554602;1;cf00203;cd402800043828ff\n11T082554603;0;7df;02\n",
             "(894354.602000) can0 0CF00203#CD402800043828FF\n(894354.603000) can0 7DF#02\n",
         ),
+        // Python's lists, whose numbers are decimal also where none has three digits: those were once read as hexadecimal.
+        (
+            "Timestamp,CAN_ID,Data\n1753378914.70,0x104,\"[83, 38, 131, 212, 66, 239, 132, 80]\"\n1753378915.21,0x102,\"[78, 10, 0]\"\n",
+            "(1753378914.700000) can0 104#532683D442EF8450\n(1753378915.210000) can0 102#4E0A00\n",
+        ),
+        (
+            "Timestamp,CAN_ID,Data\n1.5,104,\"[10, 0A]\"\n1.6,0FF,\"[01, 12]\"\n",
+            "(1.500000) can0 104#100A\n(1.600000) can0 0FF#0112\n",
+        ),
+        // MATLAB's table of a log.
+        (
+            "Time,ID,Extended,Name,Data_1,Data_2,Length,Error,Remote\n1.8173 sec,419427898,1,,0,200,2,0,0\n",
+            "(1.817300) can0 18FFF63A#00C8\n",
+        ),
         // Of programs for lessons.
         (
             "0.001 0x100 204E000000000000\n0.002 0x18DAF110 507D\n",

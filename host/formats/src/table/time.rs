@@ -28,6 +28,19 @@ pub(super) fn number(cell: &[u8], unit_ns: i64) -> Option<i64> {
     (time_ns.abs() < 9e18).then_some(time_ns as i64)
 }
 
+/// A number with its unit, as MATLAB writes a duration: `1.8173 sec`.
+pub(super) fn with_unit(cell: &[u8]) -> Option<i64> {
+    let at = cell.iter().position(u8::is_ascii_alphabetic)?;
+    let (number, unit) = cell.split_at(at);
+    let unit_ns = match unit {
+        b"s" | b"sec" => NS_PER_S,
+        b"ms" => 1_000_000,
+        b"us" => 1_000,
+        _ => return None,
+    };
+    text::time_of_any_mark(number.trim_ascii_end(), unit_ns)
+}
+
 /// A date, or a time of a day without one.
 pub(crate) fn date(cell: &[u8], zone: &Zone) -> Option<i64> {
     let cell = std::str::from_utf8(cell).ok()?.replace('/', "-");
@@ -118,6 +131,11 @@ mod tests {
         for bad in ["", "T", "32T000000000", "1T", "01T250000000", "01T12000000\u{e9}"] {
             assert_eq!(stamp(bad.as_bytes(), None, &zone), None, "{bad}");
         }
+        assert_eq!(with_unit(b"1.8173 sec"), Some(1_817_300_000));
+        assert_eq!(
+            (with_unit(b"2ms"), with_unit(b"2 min"), with_unit(b"sec")),
+            (Some(2_000_000), None, None)
+        );
         assert_eq!(number(b"1.5e-3", NS_PER_S), Some(1_500_000));
         assert_eq!((unit_of(b"1614875400123456"), unit_of(b"12")), (1000, NS_PER_S));
     }

@@ -31,6 +31,8 @@ pub(crate) struct Decoder {
     has_layout: bool,
     has_rows: bool,
     layout: Layout,
+    /// The file is a table that PEAK-Converter made, and what is between its cells; 0 before their names.
+    table: Option<u8>,
     /// The row before gave an event exactly; the format's own row for it follows.
     told: Option<TraceRecord>,
     /// The zone of the dates.
@@ -107,6 +109,7 @@ impl Default for Decoder {
             has_layout: false,
             has_rows: false,
             layout: Layout::of(version),
+            table: None,
             told: None,
             zone: Zone::default(),
         }
@@ -130,7 +133,21 @@ impl Decode for Decoder {
                 // comment.
                 [b';', ..] if self.has_rows => Ok(Row::LeftOut("comments and texts")),
                 [b';', comment @ ..] => self.head(comment).map(|()| Row::Nothing),
-                _ => self.row(text),
+                [b'$', ..] if !self.has_rows => {
+                    self.table = Some(0);
+                    self.head(text).map(|()| Row::Nothing)
+                }
+                _ => match self.table {
+                    None | Some(b' ') => self.row(text),
+                    Some(0) => {
+                        self.table_head(text);
+                        Ok(Row::Nothing)
+                    }
+                    Some(separator) => {
+                        let blank = |byte: &u8| if *byte == separator { b' ' } else { *byte };
+                        self.row(&text.iter().map(blank).collect::<Vec<_>>())
+                    }
+                },
             };
             let result = match result {
                 Ok(Row::LeftOut(_)) if !line.terminated => return Ok(line.cut()),
@@ -198,6 +215,17 @@ impl Decoder {
             self.start_ns = self.zone.utc_ns(start_ns);
         }
         Ok(())
+    }
+
+    /// A line of the head of PEAK-Converter's table. Its last has the names above the columns: Number, Time (ms), Bus, Direction, Type, ID (hex),
+    /// Reserved, Length, D0 …
+    fn table_head(&mut self, line: &[u8]) {
+        if let Some(names) = line.strip_prefix(b"Number") {
+            self.version = TrcVersion::V2_1;
+            self.layout = Layout::named(b"N,O,B,d,T,I,R,l,D").unwrap_or(self.layout);
+            self.has_layout = true;
+            self.table = Some(names.first().copied().unwrap_or(b' '));
+        }
     }
 
     fn row(&mut self, row: &[u8]) -> Result<Row, Fault> {

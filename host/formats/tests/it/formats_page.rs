@@ -56,6 +56,7 @@ fn row(format: Format) -> String {
             }
             Format::Nmea2000 => ["as written, local if a date", "– | from Yacht Devices | – | – | – | – | –"],
             Format::Carbus => ["as written, no date", "yes | – | – | – | – | – | –"],
+            Format::UsbCan => ["as written, local if a date", "yes | yes | yes | yes | – | – | –"],
             Format::Table => ["as written, local if a date", "yes | yes | yes | without flags | – | – | –"],
             // The crate of columns writes it, for the command.
             Format::Parquet => {

@@ -25,7 +25,7 @@ const KCD: &str = r#"<NetworkDefinition xmlns="http://kayak.2codeornot2code.org/
    <Signal name="Big" offset="16" length="12" endianess="big"><Value type="signed" intercept="-1"/>
     <LabelSet><Label name="none" value="0"/><LabelGroup name="some" from="1" to="3"/></LabelSet></Signal>
   </Message>
-  <Message id="0x900" name="Far"/>
+  <Message id="0x20000000" name="Far"/>
  </Bus></NetworkDefinition>"#;
 
 #[test]
@@ -34,9 +34,47 @@ fn a_kcd_file_is_read() {
     assert_eq!((database.messages.len(), database.messages[0].cycle_ms), (1, Some(100)));
     assert_eq!(database.messages[0].description, "Brakes");
     let warnings: Vec<_> = database.warnings.iter().map(ToString::to_string).collect();
-    assert!(warnings.len() == 1 && warnings[0].starts_with("line 9: Far: identifier 0x900"), "{warnings:?}");
+    assert!(
+        warnings.len() == 1 && warnings[0].starts_with("line 9: Far: identifier 0x20000000 does not fit"),
+        "{warnings:?}"
+    );
     assert_eq!(decode(database.clone(), "0B2#02070020"), "Mux=2 Big=1(some) Two=0.7V");
     assert_eq!(decode(database, "0B2#0107FFF0"), "Mux=1 Big=-2 One=7");
+}
+
+/// Programs forget the mark of extended identifiers; such messages were once left out.
+#[test]
+fn an_identifier_above_11_bits_is_extended_whatever_the_file_says() {
+    let warnings =
+        |database: &Database| -> Vec<_> { database.warnings.iter().map(ToString::to_string).collect() };
+    let text = KCD
+        .replace("0x20000000", "0x18FEF100")
+        .replace("</Bus>", r#"<Message id="0x800" name="Next" format="standard"/></Bus>"#);
+    let database = kcd::parse("x.kcd", text.as_bytes()).unwrap();
+    let ids: Vec<_> = database.messages.iter().map(|message| message.id.to_string()).collect();
+    assert_eq!(ids, ["0B2", "18FEF100", "00000800"]);
+    assert_eq!(
+        warnings(&database),
+        [
+            "line 9: Far: identifier 0x18FEF100 is not marked as extended and does not fit 11 bits; 2 such messages are read as extended"
+        ]
+    );
+    let text = ARXML.replace("EXTENDED", "STANDARD").replace("<IDENTIFIER>291<", "<IDENTIFIER>4660<");
+    let database = arxml::parse("x.arxml", text.as_bytes()).unwrap();
+    assert_eq!(database.messages[0].id.to_string(), "00001234");
+    let all = warnings(&database);
+    assert!(
+        all.iter().any(|one| one.contains("F: identifier 0x1234 is not marked")
+            && one.ends_with("1 such message is read as extended")),
+        "{all:?}"
+    );
+    let text =
+        "FormatVersion=6.0\n{SENDRECEIVE}\n[One]\nType=Standard\nID=900h\nLen=1\n[Sure]\nID=901h\nLen=1\n";
+    let database = sym::parse("x.sym", text.as_bytes()).unwrap();
+    let ids: Vec<_> = database.messages.iter().map(|message| message.id.to_string()).collect();
+    assert_eq!(ids, ["00000900", "00000901"]);
+    let expected = "line 3: One: identifier 0x900 is not marked as extended and does not fit 11 bits; 1 such message is read as extended";
+    assert_eq!(warnings(&database), [expected]);
 }
 
 const TWO_BUSES: &str = r#"<NetworkDefinition><Document name="x"/>

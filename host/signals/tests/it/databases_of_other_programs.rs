@@ -186,8 +186,7 @@ fn identifiers_that_need_29_bits_are_extended_without_the_flag_too() {
     assert_eq!(
         warnings(text),
         [
-            "line 5: First: identifier 0x800 lacks the flag of extended identifiers (0x80000000) and does not fit 11 bits; 3 such \
-             messages are read as extended",
+            "line 5: First: identifier 0x800 is not marked as extended and does not fit 11 bits; 3 such messages are read as extended",
             "line 22: VAL_ 2147485696 Nobody: there is no such message or signal; the statement is left out",
         ]
     );
@@ -196,8 +195,7 @@ fn identifiers_that_need_29_bits_are_extended_without_the_flag_too() {
     assert_eq!(
         warnings("BO_ 4000 One: 1 A\n"),
         [
-            "line 1: One: identifier 0xFA0 lacks the flag of extended identifiers (0x80000000) and does not fit 11 bits; 1 such message \
-             is read as extended"
+            "line 1: One: identifier 0xFA0 is not marked as extended and does not fit 11 bits; 1 such message is read as extended"
         ]
     );
     // Written both ways, it is one identifier; each statement still belongs to a message.

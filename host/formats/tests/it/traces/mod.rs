@@ -34,7 +34,7 @@ pub fn file_name(format: Format, compression: &str) -> String {
         Format::Asc => "asc",
         Format::Blf => "blf",
         Format::Trc(_) | Format::CanHacker | Format::Carbus => "trc",
-        Format::Csv(_) | Format::CanEdgeCsv => "csv",
+        Format::Csv(_) | Format::CanEdgeCsv | Format::UsbCan => "csv",
         Format::Pcapng => "pcapng",
         Format::Dif => "dif",
         Format::Mf4 => "mf4",

@@ -31,7 +31,7 @@ fn a_host_that_vanishes_beside_a_saved_gateway_leaves_nothing_that_sends() {
     let soon = u64::from(bench.board.clock.now.get()) + u64::from(5000 * TICKS_PER_US);
     let timed = TxFrame { tag: 1, frame: frame("703#"), at_ticks: Some(soon) };
     for channel in Channel::ALL {
-        bench.ask(Command::SetTrigger { channel, slot: 0, entry: Some(trigger.clone()) }).unwrap();
+        bench.ask(Command::SetTrigger { channel, slot: 0, entry: Some(trigger) }).unwrap();
         bench.ask(Command::Send { channel, frames: [timed].into_iter().collect() }).unwrap();
         bench.ask(Command::SetPeriodic { channel, slot: 0, entry: Some(periodic.clone()) }).unwrap();
     }

@@ -183,7 +183,10 @@ fn warnings_can_be_left_out_and_a_database_that_replaces_another_is_told() {
     let arguments = ["decode", "--db", "body.dbc", "--db", "other.dbc", "trace.log"];
     let (code, _, err) = cantap("quiet", &arguments);
     assert_eq!(code, Some(0));
-    assert!(err.contains("cantap: other.dbc: line 3: Far: identifier 0xFA0 is not marked as extended"), "{err}");
+    assert!(
+        err.contains("cantap: other.dbc: line 3: Far: identifier 0xFA0 is not marked as extended"),
+        "{err}"
+    );
     assert!(
         err.contains("cantap: other.dbc replaces 1 message of body.dbc with the same identifier, Body\n"),
         "{err}"

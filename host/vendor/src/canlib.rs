@@ -154,6 +154,12 @@ pub struct Segments {
     pub jump_width: u32,
 }
 
+/// A bit rate as the functions take it.
+#[allow(clippy::unnecessary_fallible_conversions, reason = "of 32 bits on Windows")]
+fn rate(bitrate_bps: u32) -> c_long {
+    c_long::try_from(bitrate_bps).unwrap_or(c_long::MAX)
+}
+
 type WithHandle = unsafe extern "system" fn(c_int) -> c_int;
 
 /// The functions, as the header declares them. `__stdcall` on Windows, which is what "system" means there.
@@ -285,8 +291,7 @@ impl CanLib {
     /// Sets the bit rate in bit/s, sampled once.
     pub fn set_bit_rate(&self, handle: Handle, bitrate_bps: u32, bit: Segments) -> Result<(), Error> {
         let Segments { first, second, jump_width } = bit;
-        // Below 2^31: the fastest bus has a hundredth of that.
-        let bitrate = c_long::try_from(bitrate_bps).unwrap_or(c_long::MAX);
+        let bitrate = rate(bitrate_bps);
         // SAFETY: numbers alone.
         let status =
             unsafe { (self.functions.set_bus_params)(handle.0, bitrate, first, second, jump_width, 1, 0) };
@@ -296,7 +301,7 @@ impl CanLib {
     /// The same for data phases of CAN FD frames.
     pub fn set_data_bit_rate(&self, handle: Handle, bitrate_bps: u32, bit: Segments) -> Result<(), Error> {
         let Segments { first, second, jump_width } = bit;
-        let bitrate = c_long::try_from(bitrate_bps).unwrap_or(c_long::MAX);
+        let bitrate = rate(bitrate_bps);
         // SAFETY: numbers alone.
         let status =
             unsafe { (self.functions.set_bus_params_fd)(handle.0, bitrate, first, second, jump_width) };

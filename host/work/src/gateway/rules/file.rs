@@ -69,7 +69,7 @@ struct Source<'t> {
 impl Source<'_> {
     fn line(&self, at: usize) -> u32 {
         let before = self.text.as_bytes().get(..at).unwrap_or_default();
-        before.iter().filter(|byte| **byte == b'\n').count() as u32 + 1
+        before.split(|byte| *byte == b'\n').count() as u32
     }
 
     fn fault(&self, span: &Range<usize>, field: &str, text: impl Into<String>) -> RulesError {

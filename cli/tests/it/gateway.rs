@@ -202,7 +202,10 @@ fn a_stored_gateway_is_shown_and_stopped_and_its_channels_are_its_own() {
     let device = "-d virtual:load=20,frames=mix,channels=1,settings=settings.bin";
     let (code, _, err) = cantap(&directory, &format!("gateway halves.toml {device} -b 500k --save"));
     assert_eq!(code, Some(0), "{err}");
-    let shown = object(&directory, &format!("gateway --show {device} -t 1s"));
+    // One object a second.
+    let (code, out, err) = cantap(&directory, &format!("gateway --show {device} -t 1s --json"));
+    assert_eq!(code, Some(0), "{err}");
+    let shown: Value = serde_json::from_str(out.lines().last().unwrap()).unwrap();
     assert_eq!((&shown["state"], &shown["standalone"]), (&"running".into(), &true.into()), "{shown}");
     assert!(shown["directions"][0]["sent"].as_u64().unwrap() > 0, "{shown}");
     let (code, _, err) = cantap(&directory, &format!("capture {device} -b 500k -t 1s"));
@@ -235,7 +238,7 @@ fn files_that_are_no_rules_are_refused_with_the_place() {
     let rule = |fields: &str| format!("[[rule]]\nfrom = 1\n{fields}\n");
     for (content, expected) in [
         (rule("").repeat(40_000), "256 KiB"),
-        (rule("").repeat(10_000), "takes 20000 places"),
+        (rule("").repeat(10_000), "take 20000 places"),
         (format!("[[rule]]\nfrom = {}1", "[".repeat(100_000)), "line 2"),
         (rule("filter = \"1\0\""), "line 3"),
         (rule("name = \"a\"\nname = \"b\""), "line 4"),

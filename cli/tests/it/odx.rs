@@ -109,7 +109,7 @@ fn a_description_is_listed() {
     );
     fs::write(directory.join("odd.odx-d"), CAR.replace("ID-REF=\"text\"", "ID-REF=\"gone\"")).unwrap();
     let (_, out, _) = cantap(&directory, "db odd.odx-d --warnings");
-    assert_eq!(out, "odd.odx-d: odd.odx-d:22: gone is not in this file\n");
+    assert_eq!(out, "odd.odx-d:20: gone is not in this file\n");
     let (code, _, err) = cantap(&directory, "db car.odx-d --message *");
     assert_eq!(code, Some(2), "{err}");
 }

@@ -4,7 +4,9 @@ use std::time::{Duration, Instant};
 
 use cantap_trace::TraceFrame;
 use cantap_trace::fd::FD_LENGTHS;
-use cantap_vendor::canlib::{self, CanLib, Error, Handle, Message, Segments, control, flag, output, status};
+use cantap_vendor::canlib::{
+    self, CanLib, Error, Handle, KvaserMessage, Segments, control, flag, output, status,
+};
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage};
 use cantap_wire::{Channel, FdFrame, Frame, Id, Refusal};
 
@@ -133,7 +135,7 @@ impl Kvaser {
         }
     }
 
-    fn take(&mut self, message: &Message, arrival: Instant) {
+    fn take(&mut self, message: &KvaserMessage, arrival: Instant) {
         let at = self.clock.place(message.stamp_us.into(), arrival);
         let channel = Channel::Can1;
         // The message is the first after a loss.
@@ -263,7 +265,7 @@ fn error_of(flags: u32, at: At) -> Incoming {
 }
 
 /// What a message says, if it is a frame that can be.
-fn frame_of(message: &Message) -> Option<TraceFrame> {
+fn frame_of(message: &KvaserMessage) -> Option<TraceFrame> {
     let raw = u32::try_from(message.id).ok()?;
     let id = if message.flags & flag::EXTENDED != 0 { Id::extended(raw) } else { Id::standard(raw) }?;
     let is_remote = message.flags & flag::REMOTE != 0;
@@ -323,7 +325,10 @@ impl Driver for Kvaser {
             self.backlog.push(Incoming::NotSent { channel, mailbox, at });
             return true;
         }
-        match self.library.write(handle, &Message { id: id.raw().into(), flags, len, data, stamp_us: 0 }) {
+        match self
+            .library
+            .write(handle, &KvaserMessage { id: id.raw().into(), flags, len, data, stamp_us: 0 })
+        {
             Ok(()) => self.under_way.push(mailbox, *frame),
             Err(Error::TRANSMIT_FULL) => return false,
             Err(_) => {

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use cantap_trace::TraceFrame;
 use cantap_trace::fd::FD_LENGTHS;
-use cantap_vendor::pcan_basic::{Channel as Handle, Message, PcanBasic, STAMP_PERIOD_US, Status};
+use cantap_vendor::pcan_basic::{Channel as Handle, PcanBasic, PcanMessage, STAMP_PERIOD_US, Status};
 use cantap_vendor::pcan_basic::{kind, parameter, status};
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage};
 use cantap_wire::{Channel, FdFrame, Frame, Id, Refusal};
@@ -159,7 +159,7 @@ impl Pcan {
         true
     }
 
-    fn take(&mut self, message: &Message, stamp_us: u64, arrival: Instant) {
+    fn take(&mut self, message: &PcanMessage, stamp_us: u64, arrival: Instant) {
         let at = self.clock.place(stamp_us, arrival);
         let channel = Channel::Can1;
         if message.kind & kind::STATUS != 0 {
@@ -191,7 +191,7 @@ impl Pcan {
     }
 
     /// An error frame: its identifier says which, its data the error counters.
-    fn error(&mut self, message: &Message, at: At) {
+    fn error(&mut self, message: &PcanMessage, at: At) {
         let channel = Channel::Can1;
         let [_, _, receive, transmit, ..] = message.data;
         if let Some(state) = self.errors.state() {
@@ -264,7 +264,7 @@ fn is_there(library: &PcanBasic, channel: Handle) -> bool {
 }
 
 /// What a message says, if it is a frame that can be.
-fn frame_of(message: &Message) -> Option<TraceFrame> {
+fn frame_of(message: &PcanMessage) -> Option<TraceFrame> {
     let id =
         if message.kind & kind::EXTENDED != 0 { Id::extended(message.id) } else { Id::standard(message.id) }?;
     let is_remote = message.kind & kind::REMOTE != 0;
@@ -364,7 +364,7 @@ impl Driver for Pcan {
         data[..8].copy_from_slice(&frame.padded_data());
         let kind = if frame.is_remote() { kind::REMOTE } else { 0 };
         let kind = if id.is_extended() { kind | kind::EXTENDED } else { kind };
-        let message = Message { id: id.raw(), kind, dlc: frame.dlc(), data };
+        let message = PcanMessage { id: id.raw(), kind, dlc: frame.dlc(), data };
         if message.dlc > 8 {
             self.oddities.count("frames with length codes above 8, which cannot be sent");
             self.backlog.push(Incoming::NotSent { channel, mailbox, at });

@@ -70,7 +70,7 @@ pub mod output {
     pub const NORMAL: u32 = 4;
 }
 
-/// Flags of [`Message::flags`].
+/// Flags of [`KvaserMessage::flags`].
 pub mod flag {
     /// A remote frame.
     pub const REMOTE: u32 = 0x1;
@@ -130,7 +130,7 @@ pub mod control {
 
 /// What is received and sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Message {
+pub struct KvaserMessage {
     /// The identifier, 11 or 29 bits.
     pub id: i64,
     /// See [`flag`].
@@ -330,7 +330,7 @@ impl CanLib {
     }
 
     /// The next message, or [`Error::NO_MESSAGE`].
-    pub fn read(&self, handle: Handle) -> Result<Message, Error> {
+    pub fn read(&self, handle: Handle) -> Result<KvaserMessage, Error> {
         let (mut id, mut len, mut flags, mut time) = (0, 0, 0, 0);
         let mut data = [0u8; 64];
         // SAFETY: the library writes as many bytes of data as a frame has, 64 at most, and a number into each of the others.
@@ -346,11 +346,11 @@ impl CanLib {
         };
         Error::check(status)?;
         #[allow(clippy::useless_conversion, reason = "of 32 bits on Windows")]
-        Ok(Message { id: i64::from(id), flags, len, data, stamp_us: time as u32 })
+        Ok(KvaserMessage { id: i64::from(id), flags, len, data, stamp_us: time as u32 })
     }
 
     /// Puts a frame into the transmit buffer.
-    pub fn write(&self, handle: Handle, message: &Message) -> Result<(), Error> {
+    pub fn write(&self, handle: Handle, message: &KvaserMessage) -> Result<(), Error> {
         let mut data = message.data;
         let id = c_long::try_from(message.id).unwrap_or(c_long::MAX);
         // SAFETY: the library reads as many bytes of data as the length says, which is 64 at most.

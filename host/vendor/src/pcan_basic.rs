@@ -179,7 +179,7 @@ pub mod parameter {
     pub const ALLOW_ECHO_FRAMES: u8 = 0x2C;
 }
 
-/// Bits of [`Message::kind`] (`TPCANMessageType`).
+/// Bits of [`PcanMessage::kind`] (`TPCANMessageType`).
 pub mod kind {
     /// A remote frame.
     pub const REMOTE: u8 = 0x01;
@@ -201,7 +201,7 @@ pub mod kind {
 
 /// What is received and sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Message {
+pub struct PcanMessage {
     /// The identifier, 11 or 29 bits; of an error frame, which error.
     pub id: u32,
     /// See [`kind`].
@@ -318,28 +318,28 @@ impl PcanBasic {
     }
 
     /// The next message of a classical channel, with its stamp in microseconds. The status may have something to report in its place.
-    pub fn read(&self, channel: Channel) -> Result<(Message, u64), Status> {
+    pub fn read(&self, channel: Channel) -> Result<(PcanMessage, u64), Status> {
         let mut message = ClassicMessage { id: 0, kind: 0, len: 0, data: [0; 8] };
         let mut stamp = ClassicStamp::default();
         // SAFETY: both are as the header lays them out, and live until the call returns.
         Status(unsafe { (self.functions.read)(channel.0, &raw mut message, &raw mut stamp) }).ok()?;
         let mut data = [0; 64];
         data[..8].copy_from_slice(&message.data);
-        Ok((Message { id: message.id, kind: message.kind, dlc: message.len, data }, stamp.micros()))
+        Ok((PcanMessage { id: message.id, kind: message.kind, dlc: message.len, data }, stamp.micros()))
     }
 
     /// The same for a channel with CAN FD.
-    pub fn read_fd(&self, channel: Channel) -> Result<(Message, u64), Status> {
+    pub fn read_fd(&self, channel: Channel) -> Result<(PcanMessage, u64), Status> {
         let mut message = FdMessage { id: 0, kind: 0, dlc: 0, data: [0; 64] };
         let mut stamp = 0;
         // SAFETY: as above.
         Status(unsafe { (self.functions.read_fd)(channel.0, &raw mut message, &raw mut stamp) }).ok()?;
         let FdMessage { id, kind, dlc, data } = message;
-        Ok((Message { id, kind, dlc, data }, stamp))
+        Ok((PcanMessage { id, kind, dlc, data }, stamp))
     }
 
     /// Puts a classical frame into the transmit queue of a classical channel. Its length is 8 at most.
-    pub fn write(&self, channel: Channel, message: &Message) -> Result<(), Status> {
+    pub fn write(&self, channel: Channel, message: &PcanMessage) -> Result<(), Status> {
         let mut eight = [0; 8];
         eight.copy_from_slice(&message.data[..8]);
         let len = message.dlc.min(8);
@@ -349,8 +349,8 @@ impl PcanBasic {
     }
 
     /// The same for a channel with CAN FD.
-    pub fn write_fd(&self, channel: Channel, message: &Message) -> Result<(), Status> {
-        let &Message { id, kind, dlc, data } = message;
+    pub fn write_fd(&self, channel: Channel, message: &PcanMessage) -> Result<(), Status> {
+        let &PcanMessage { id, kind, dlc, data } = message;
         let mut message = FdMessage { id, kind, dlc, data };
         // SAFETY: as above.
         Status(unsafe { (self.functions.write_fd)(channel.0, &raw mut message) }).ok()

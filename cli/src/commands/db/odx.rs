@@ -37,7 +37,12 @@ pub fn run(files: &[PathBuf], warnings: bool, json: bool, out: &mut impl Write) 
 
 fn write_warnings(odx: &Odx, name: &str, out: &mut impl Write) -> anyhow::Result<()> {
     for issue in &odx.issues {
-        writeln!(out, "{name}: {issue}")?;
+        // Of a package, also which of its documents.
+        if name.ends_with(&issue.file) {
+            writeln!(out, "{issue}")?;
+        } else {
+            writeln!(out, "{name}: {issue}")?;
+        }
     }
     if odx.issues_left_out > 0 {
         writeln!(out, "{name}: and {} more", odx.issues_left_out)?;

@@ -1,15 +1,15 @@
 //! From internal values to physical ones (COMPU-METHOD).
 
-use super::model::{BaseType, Internal, Name};
+use super::internal::{BaseType, Internal, Name};
 
 /// A method.
 #[derive(Clone, Debug)]
 pub enum Compu {
     Identical,
     /// Also the rational ones: a quotient of polynomials for each range.
-    Scales(Vec<Scale>),
+    Scales(Vec<CompuScale>),
     /// Texts for ranges, and one for all others.
-    Texts(Vec<Scale>, Option<Name>),
+    Texts(Vec<CompuScale>, Option<Name>),
     /// A line through points.
     Points(Vec<(f64, f64)>),
     /// A program (COMPUCODE), or what is not understood.
@@ -18,7 +18,7 @@ pub enum Compu {
 
 /// A range and its formula.
 #[derive(Clone, Debug, Default)]
-pub struct Scale {
+pub struct CompuScale {
     pub low: Option<Limit>,
     pub high: Option<Limit>,
     /// Coefficients, that of the constant first.
@@ -30,7 +30,7 @@ pub struct Scale {
 /// A limit of a range.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Limit {
-    pub value: Option<Bound>,
+    pub value: Option<BoundValue>,
     pub kind: LimitKind,
 }
 
@@ -42,7 +42,7 @@ pub enum LimitKind {
 }
 
 #[derive(Clone, Debug, PartialEq)]
-pub enum Bound {
+pub enum BoundValue {
     Int(i128),
     Real(f64),
     Text(Name),
@@ -63,7 +63,7 @@ pub enum Physical {
     Meaning(Internal, String),
 }
 
-impl Bound {
+impl BoundValue {
     /// A number, or else a text.
     pub fn read(text: &str) -> Self {
         let text = text.trim();
@@ -151,7 +151,7 @@ impl Compu {
             Self::Scales(scales) => {
                 let x = number(&value)?;
                 let applies =
-                    |scale: &&Scale| is_between(&value, scale.low.as_ref(), scale.high.as_ref(), false);
+                    |scale: &&CompuScale| is_between(&value, scale.low.as_ref(), scale.high.as_ref(), false);
                 let scale = scales.iter().find(applies).ok_or_else(outside)?;
                 let below = match &scale.denominator[..] {
                     [] => 1.0,
@@ -167,7 +167,7 @@ impl Compu {
             }
             Self::Texts(scales, default) => {
                 let applies =
-                    |scale: &&Scale| is_between(&value, scale.low.as_ref(), scale.high.as_ref(), true);
+                    |scale: &&CompuScale| is_between(&value, scale.low.as_ref(), scale.high.as_ref(), true);
                 let text = scales.iter().find(applies).and_then(|scale| scale.constant.as_ref());
                 match text.or(default.as_ref()) {
                     Some(text) => Ok(Physical::Meaning(value, text.to_string())),

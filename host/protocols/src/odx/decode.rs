@@ -1,6 +1,6 @@
 //! A message's bytes as values, by its parameters.
 
-mod internal;
+mod lengths;
 mod tables;
 
 use std::fmt::Write as _;

@@ -5,11 +5,11 @@ use std::sync::Arc;
 
 use rustc_hash::FxHashMap;
 
-use super::OdxError;
 use super::coded::Stop;
 use super::decode::{Reading, read};
+use super::error::OdxError;
 use super::layer::View;
-use super::model::{Dtc, Item, LayerKind, Link, Message, Model, Name, Service};
+use super::model::{DiagService, Item, LayerKind, Link, Message, Model, Name, OdxDtc};
 use super::prefix::Prefix;
 use crate::iso_tp::Pair;
 
@@ -28,7 +28,7 @@ pub struct Ecu {
     /// Messages by their first byte.
     requests: FxHashMap<u8, Vec<Candidate>>,
     responses: FxHashMap<u8, Vec<Candidate>>,
-    dtcs: BTreeMap<u32, Dtc>,
+    dtcs: BTreeMap<u32, OdxDtc>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -128,7 +128,7 @@ impl Ecu {
 
     /// What a trouble code means: of three bytes, as UDS has it.
     pub fn trouble_code(&self, code: u32) -> Option<String> {
-        self.dtcs.get(&code).map(Dtc::description)
+        self.dtcs.get(&code).map(OdxDtc::description)
     }
 
     /// What a request and its response say, or one of them.
@@ -167,7 +167,7 @@ impl Ecu {
     }
 
     fn named(&self, found: &[Candidate]) -> Described {
-        let services: Vec<&Service> =
+        let services: Vec<&DiagService> =
             found.iter().map(|candidate| &self.model.services[candidate.service as usize]).collect();
         let mut names: Vec<&str> = services.iter().map(|service| &*service.name).collect();
         names.dedup();

@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use rustc_hash::FxHashMap;
 
-use super::OdxError;
-use super::model::{Comparam, DopKind, Dtc, Item, Layer, Link, Model, Name, ServiceEntry, Target};
+use super::error::OdxError;
+use super::model::{Comparam, DopKind, Item, Layer, Link, Model, Name, OdxDtc, ServiceEntry, Target};
 
 /// Layers inherit from others up to this depth, of which the standard has five.
 const DEEPEST: usize = 16;
@@ -85,7 +85,7 @@ impl Model {
     }
 
     /// All trouble codes of a layer; of several texts for a code, that of the type whose name comes first.
-    pub fn dtcs(&self, view: &View) -> BTreeMap<u32, Dtc> {
+    pub fn dtcs(&self, view: &View) -> BTreeMap<u32, OdxDtc> {
         let mut dops: Vec<_> = view.dops.iter().collect();
         dops.sort();
         let mut all = BTreeMap::new();
@@ -96,7 +96,7 @@ impl Model {
     }
 
     /// A trouble code of a type, or of those that it includes.
-    pub fn dtc_of(&self, dop: u32, code: u32) -> Option<Dtc> {
+    pub fn dtc_of(&self, dop: u32, code: u32) -> Option<OdxDtc> {
         if let DopKind::Dtcs(dtcs) = &self.dops[dop as usize].kind
             && let Some(dtc) = dtcs.codes.get(&code)
         {
@@ -107,7 +107,7 @@ impl Model {
         all.remove(&code)
     }
 
-    fn add_dtcs(&self, dop: u32, depth: usize, all: &mut BTreeMap<u32, Dtc>) {
+    fn add_dtcs(&self, dop: u32, depth: usize, all: &mut BTreeMap<u32, OdxDtc>) {
         let DopKind::Dtcs(dtcs) = &self.dops[dop as usize].kind else { return };
         for (code, dtc) in &dtcs.codes {
             all.entry(*code).or_insert_with(|| dtc.clone());
@@ -131,7 +131,7 @@ impl Model {
     }
 }
 
-impl Dtc {
+impl OdxDtc {
     /// As a person knows it, and what it means.
     pub fn description(&self) -> String {
         let name = if self.display.is_empty() { &self.name } else { &self.display };

@@ -4,9 +4,8 @@
 use std::collections::BTreeMap;
 
 use super::compu::Compu;
+pub use super::internal::{BaseType, Internal, Name};
 
-/// A name that several things have.
-pub type Name = std::sync::Arc<str>;
 /// A number in [`Model::links`].
 pub type Link = u32;
 
@@ -15,9 +14,9 @@ pub type Link = u32;
 pub struct Model {
     pub layers: Vec<Layer>,
     pub dops: Vec<Dop>,
-    pub tables: Vec<Table>,
+    pub tables: Vec<OdxTable>,
     pub messages: Vec<Message>,
-    pub services: Vec<Service>,
+    pub services: Vec<DiagService>,
     pub links: Vec<Target>,
     /// The names of units, as they are shown.
     pub units: Vec<Name>,
@@ -121,7 +120,7 @@ pub struct Comparam {
 
 /// A service.
 #[derive(Clone, Debug)]
-pub struct Service {
+pub struct DiagService {
     pub name: Name,
     pub long_name: Name,
     pub request: Option<Link>,
@@ -178,19 +177,6 @@ pub enum KeyName {
     Name(Name),
 }
 
-/// Kinds of values in a message.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum BaseType {
-    Int,
-    Uint,
-    Float32,
-    Float64,
-    Ascii,
-    Utf8,
-    Unicode,
-    Bytes,
-}
-
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Coding {
     /// What the type has by itself.
@@ -234,19 +220,6 @@ pub enum End {
     OfMessage,
     Zero,
     HexFf,
-}
-
-/// A value as it is in a message.
-#[derive(Clone, Debug, PartialEq)]
-pub enum Internal {
-    /// An integer.
-    Int(i128),
-    /// A number.
-    Real(f64),
-    /// A text.
-    Text(String),
-    /// Bytes.
-    Bytes(Vec<u8>),
 }
 
 /// A type of values (a data object property), or of something that is made of such.
@@ -331,14 +304,14 @@ pub struct Data {
 pub struct Dtcs {
     pub coded: Coded,
     pub compu: Compu,
-    pub codes: BTreeMap<u32, Dtc>,
+    pub codes: BTreeMap<u32, OdxDtc>,
     /// Those that other types have.
     pub others: Vec<Link>,
 }
 
 /// A trouble code.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Dtc {
+pub struct OdxDtc {
     /// Its short name.
     pub name: Name,
     /// As a person knows it: P0123.
@@ -349,7 +322,7 @@ pub struct Dtc {
 
 /// A table, from whose rows a key chooses.
 #[derive(Clone, Debug)]
-pub struct Table {
+pub struct OdxTable {
     pub name: Name,
     pub key: Option<Link>,
     pub rows: Vec<Row>,

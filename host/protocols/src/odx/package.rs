@@ -6,7 +6,7 @@ use std::io::Read as _;
 use encoding_rs::{Encoding, UTF_8};
 use rawzip::ZipArchive;
 
-use super::OdxError;
+use super::error::OdxError;
 
 /// So much XML is read of one file, unpacked: more is damage, malice, or not one ECU's.
 pub const MOST_BYTES: u64 = 256 << 20;

@@ -2,7 +2,7 @@
 
 use super::super::coded::Stop;
 use super::super::compu::Physical;
-use super::super::model::{Item, KeyName, Link, Model, Param, Row, Table, Target};
+use super::super::model::{Item, KeyName, Link, Model, OdxTable, Param, Row, Target};
 use super::{Key, Reader, is_written};
 
 impl<'a> Reader<'a> {
@@ -56,7 +56,11 @@ impl<'a> Reader<'a> {
 
 impl Model {
     /// The rows of a table with their places, those of others among them.
-    pub fn rows<'a>(&'a self, number: u32, table: &'a Table) -> impl Iterator<Item = ((u32, u32), &'a Row)> {
+    pub fn rows<'a>(
+        &'a self,
+        number: u32,
+        table: &'a OdxTable,
+    ) -> impl Iterator<Item = ((u32, u32), &'a Row)> {
         let own = (0..).zip(&table.rows).map(move |(row, content)| ((number, row), content));
         let shared = table.shared.iter().filter_map(|link| match self.item(*link)? {
             Item::Row(table, row) => Some(((table, row), &self.tables[table as usize].rows[row as usize])),

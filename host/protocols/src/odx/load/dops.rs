@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use roxmltree::Node;
 
-use super::super::compu::{Bound, Compu, Limit, LimitKind, Scale};
-use super::super::model::{Case, Data, Dop, DopKind, Dtc, Dtcs, Item, Mux, Name, Place};
+use super::super::compu::{BoundValue, Compu, CompuScale, Limit, LimitKind};
+use super::super::model::{Case, Data, Dop, DopKind, Dtcs, Item, Mux, Name, OdxDtc, Place};
 use super::super::xml::{attribute, child, children, content, grouped, integer, number, short_name, text};
 use super::Loader;
 use super::params::base_type;
@@ -78,7 +78,7 @@ impl Loader {
                     self.register(node, Item::Dtc(own, code));
                     codes.insert(
                         code,
-                        Dtc {
+                        OdxDtc {
                             name: short_name(node),
                             display: text(node, "DISPLAY-TROUBLE-CODE").unwrap_or_default(),
                             text: text(node, "TEXT").unwrap_or_default(),
@@ -144,7 +144,7 @@ impl Loader {
         let Some(method) = child(node, "COMPU-METHOD") else { return Compu::Identical };
         let category = text(method, "CATEGORY").unwrap_or_default();
         let forward = child(method, "COMPU-INTERNAL-TO-PHYS");
-        let scales = || -> Vec<Scale> {
+        let scales = || -> Vec<CompuScale> {
             forward
                 .into_iter()
                 .flat_map(|node| grouped(node, "COMPU-SCALES", "COMPU-SCALE"))
@@ -159,11 +159,11 @@ impl Loader {
                 Compu::Texts(scales(), default.and_then(constant))
             }
             "TAB-INTP" => {
-                let point = |scale: &Scale| {
+                let point = |scale: &CompuScale| {
                     let x = match scale.low.as_ref()?.value.as_ref()? {
-                        Bound::Int(value) => *value as f64,
-                        Bound::Real(value) => *value,
-                        Bound::Text(_) => return None,
+                        BoundValue::Int(value) => *value as f64,
+                        BoundValue::Real(value) => *value,
+                        BoundValue::Text(_) => return None,
                     };
                     Some((x, scale.constant.as_ref()?.trim().parse().ok()?))
                 };
@@ -190,14 +190,14 @@ impl Loader {
     }
 }
 
-fn scale(node: Node<'_, '_>) -> Scale {
+fn scale(node: Node<'_, '_>) -> CompuScale {
     let coefficients = |name| {
         let node = child(node, "COMPU-RATIONAL-COEFFS").and_then(|node| child(node, name));
         let values = node.into_iter().flat_map(|node| children(node, "V"));
         // One that is no number makes all of them unusable, which is said.
         values.map(|node| content(node).parse().ok()).collect::<Option<Vec<f64>>>().unwrap_or_default()
     };
-    Scale {
+    CompuScale {
         low: child(node, "LOWER-LIMIT").map(limit),
         high: child(node, "UPPER-LIMIT").map(limit),
         numerator: coefficients("COMPU-NUMERATOR"),
@@ -218,7 +218,7 @@ fn limit(node: Node<'_, '_>) -> Limit {
         _ => LimitKind::Closed,
     };
     let content = content(node);
-    Limit { value: (!content.is_empty()).then(|| Bound::read(&content)), kind }
+    Limit { value: (!content.is_empty()).then(|| BoundValue::read(&content)), kind }
 }
 
 /// The ranges that are not valid, with what they mean.

@@ -3,7 +3,7 @@
 use roxmltree::Node;
 
 use super::super::model::{
-    Comparam, Item, Layer, LayerKind, Message, Parent, Row, Service, ServiceEntry, Table,
+    Comparam, DiagService, Item, Layer, LayerKind, Message, OdxTable, Parent, Row, ServiceEntry,
 };
 use super::super::xml::{attribute, child, children, grouped, short_name, text};
 use super::{Loader, names_in, texts};
@@ -140,7 +140,7 @@ impl Loader {
             let nodes: Vec<_> = grouped(node, group, name).collect();
             nodes.into_iter().filter_map(|node| self.link(node)).collect::<Vec<_>>()
         };
-        let service = Service {
+        let service = DiagService {
             name: short_name(node),
             long_name: text(node, "LONG-NAME").unwrap_or_default(),
             request,
@@ -192,7 +192,7 @@ impl Loader {
         let number = self.model.tables.len() as u32;
         self.register(node, Item::Table(number));
         let key = self.child_link(node, &["KEY-DOP-REF", "KEY-DOP-SNREF"]);
-        let mut table = Table { name: short_name(node), key, rows: Vec::new(), shared: Vec::new() };
+        let mut table = OdxTable { name: short_name(node), key, rows: Vec::new(), shared: Vec::new() };
         for row in node.children().filter(Node::is_element) {
             match row.tag_name().name() {
                 "TABLE-ROW" => {

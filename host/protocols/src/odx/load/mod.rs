@@ -7,9 +7,9 @@ mod params;
 use roxmltree::{Document, Node, ParsingOptions};
 use rustc_hash::FxHashMap;
 
+use super::error::{Issue, OdxError};
 use super::model::{Item, Link, Model, Name, Target};
 use super::xml::{attribute, children, content, grouped, short_name};
-use super::{Issue, OdxError};
 
 /// So many issues are listed; the others are counted.
 const MOST_ISSUES: usize = 1000;

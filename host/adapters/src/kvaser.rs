@@ -2,8 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-use cantap_trace::TraceFrame;
 use cantap_trace::fd::FD_LENGTHS;
+use cantap_trace::{TraceFrame, clean};
 use cantap_vendor::canlib::{
     self, CanLib, Error, Handle, KvaserMessage, Segments, control, flag, output, status,
 };
@@ -64,8 +64,9 @@ impl Kvaser {
             .map_err(|error| OpenError::Library { address: address.to_owned(), source: error })?;
         // A library that counts more channels than any computer has is not believed.
         let count = library.channels().unwrap_or(0).min(256);
-        let names: Vec<(u32, String)> =
-            (0..count).map(|number| (number, library.name(number).unwrap_or_default())).collect();
+        let names: Vec<(u32, String)> = (0..count)
+            .map(|number| (number, clean::line(&library.name(number).unwrap_or_default()).into_owned()))
+            .collect();
         let is_real = |number: &u32| library.serial(*number).is_ok_and(|serial| serial != 0);
         let real: Vec<u32> = (0..count).filter(is_real).collect();
         let number = match which {
@@ -128,7 +129,10 @@ impl Kvaser {
                 Ok(message) => self.take(&message, Instant::now()),
                 Err(Error::NO_MESSAGE) => return,
                 Err(error) => {
-                    self.ended.get_or_insert(format!("its driver says: {}", self.library.describe(error)));
+                    self.ended.get_or_insert(format!(
+                        "its driver says: {}",
+                        clean::line(&self.library.describe(error))
+                    ));
                     return;
                 }
             }
@@ -180,7 +184,10 @@ impl Kvaser {
         let bits = match self.library.status(handle) {
             Ok(bits) => bits,
             Err(error) => {
-                self.ended.get_or_insert(format!("its driver says: {}", self.library.describe(error)));
+                self.ended.get_or_insert(format!(
+                    "its driver says: {}",
+                    clean::line(&self.library.describe(error))
+                ));
                 return;
             }
         };

@@ -3,8 +3,8 @@
 use std::ffi::CString;
 use std::time::{Duration, Instant};
 
-use cantap_trace::TraceFrame;
 use cantap_trace::fd::FD_LENGTHS;
+use cantap_trace::{TraceFrame, clean};
 use cantap_vendor::pcan_basic::{Channel as Handle, PcanBasic, PcanMessage, STAMP_PERIOD_US, Status};
 use cantap_vendor::pcan_basic::{kind, parameter, status};
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage};
@@ -79,7 +79,7 @@ impl Pcan {
         Ok(Self {
             library,
             handle,
-            name: format!("{name} {id:X} {handle}").trim().to_owned(),
+            name: clean::line(format!("{name} {id:X} {handle}").trim()).into_owned(),
             options,
             is_open: false,
             echoes: false,
@@ -143,7 +143,7 @@ impl Pcan {
             match read {
                 Ok((message, stamp_us)) => self.take(&message, stamp_us, Instant::now()),
                 Err(status) if status.is_failure() => {
-                    let reason = format!("its driver says: {}", self.library.describe(status));
+                    let reason = format!("its driver says: {}", clean::line(&self.library.describe(status)));
                     self.ended.get_or_insert(reason);
                     return taken > 0;
                 }
@@ -247,7 +247,7 @@ impl Pcan {
         self.asked = now;
         let status = self.library.status(self.handle);
         if status.is_failure() {
-            let reason = format!("its driver says: {}", self.library.describe(status));
+            let reason = format!("its driver says: {}", clean::line(&self.library.describe(status)));
             self.ended.get_or_insert(reason);
             return;
         }

@@ -97,13 +97,8 @@ fn from_system(name: &str) -> Result<Library, libloading::Error> {
     load(name.as_ref())
 }
 
-/// The text in a buffer that a library has filled: up to its first NUL, printable characters alone.
+/// The text in a buffer that a library has filled, up to its first NUL. It is from outside: who shows it cleans it.
 pub(crate) fn text(buffer: &[u8]) -> String {
     let end = buffer.iter().position(|byte| *byte == 0).unwrap_or(buffer.len());
-    let text = String::from_utf8_lossy(&buffer[..end]);
-    text.chars()
-        .map(|letter| if letter.is_control() { ' ' } else { letter })
-        .collect::<String>()
-        .trim()
-        .to_owned()
+    String::from_utf8_lossy(&buffer[..end]).trim().to_owned()
 }

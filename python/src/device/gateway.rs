@@ -27,12 +27,11 @@ impl Gateway {
     /// What the device's gateway has done, whoever has started it.
     pub fn counts(of: Option<&Self>, device: &Device) -> Result<Value, Error> {
         let found;
-        let (named, began_with) = match of {
-            Some(own) => (&own.named, own.began_with),
-            None => {
-                found = Named::of_device(device)?;
-                (&found, [0; 2])
-            }
+        let (named, began_with) = if let Some(own) = of {
+            (&own.named, own.began_with)
+        } else {
+            found = Named::of_device(device)?;
+            (&found, [0; 2])
         };
         let now = lost(device);
         let missed = [0, 1].map(|at| now[at].saturating_sub(began_with[at]));

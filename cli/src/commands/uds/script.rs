@@ -94,7 +94,7 @@ mod tests {
     fn a_line_that_is_no_request_is_shown_with_its_place() {
         for (text, expected) in [
             ("read F190\nreed F190", "a.txt:2: unrecognized subcommand 'reed'"),
-            ("read XYZ", "a.txt:1: invalid value 'XYZ'"),
+            ("session XYZ", "a.txt:1: invalid value 'XYZ'"),
             ("run b.txt", "a.txt:1: a file cannot run another one"),
         ] {
             let Err(error) = steps("a.txt", text) else { panic!("{text}") };

@@ -25,7 +25,9 @@ fn two_boards_80_ppm_apart_are_on_one_clock_and_on_utc() {
     assert!(clocks.live.worst_us < 1.5, "{:?}", clocks.live);
     let (errors, report) = clocks.frames;
     assert_eq!(report.source, ClockSource::Frames);
-    assert!(errors.worst_us < 60.0, "{errors:?}");
+    // How long the way there takes and the way back, frames cannot tell: answers are looked for every 20 us, and where in these they come
+    // differs with the firmware's build.
+    assert!(errors.worst_us < 80.0, "{errors:?}");
     assert!(errors.worst_us * 1e3 < report.uncertainty_ns.unwrap() as f64, "{errors:?}, {report:?}");
     // Compared with a computer that is 25 ppm fast.
     assert!((report.drift_ppm.unwrap() - 15.0).abs() < 5.0, "{report:?}");

@@ -52,7 +52,9 @@ fn an_idle_session_has_exact_marks_once_a_second() {
     let marks = marks(&rig);
     assert!(marks.iter().any(|(_, frame, _)| *frame < 400), "no wrap of the frame number: {marks:?}");
     assert!(marks.windows(2).all(|pair| (11_988_000..12_120_000).contains(&(pair[1].0 - pair[0].0))));
-    assert!(marks.iter().all(|(_, _, doubled)| *doubled < 3), "{marks:?}");
+    // The board's millisecond slides past the host's by 80 ns each time: for a dozen of them, a jitter of 500 ns either way decides on which
+    // side a start of frame falls, and every other may come with the one before.
+    assert!(marks.iter().all(|(_, _, doubled)| *doubled < 7), "{marks:?}");
     assert_eq!(rig.machine.board().odd_accesses(), []);
 }
 

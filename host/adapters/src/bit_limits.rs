@@ -37,6 +37,17 @@ pub(crate) struct Timing {
 }
 
 impl Limits {
+    /// Everything from 1 up to these.
+    pub const fn up_to(segment1: u32, segment2: u32, jump_width: u32, prescaler: u32) -> Self {
+        Self {
+            segment1: 1..=segment1,
+            segment2: 1..=segment2,
+            jump_width_max: jump_width,
+            prescaler: 1..=prescaler,
+            prescaler_step: 1,
+        }
+    }
+
     /// For a bit rate; `None` if this clock cannot be divided to it. A sample point within what is possible.
     pub fn nominal(&self, clock_hz: u32, bitrate_bps: u32, sample_point_permille: u32) -> Option<Timing> {
         let fits = |timing: &BitTiming| {

@@ -12,19 +12,13 @@ use cantap_wire::{Channel, FdFrame, Frame, Id, Refusal};
 
 use crate::adapter_clock::AdapterClock;
 use crate::bit_limits::Limits;
-use crate::driver::{At, Driver, Incoming, Oddities, OpenError, Opening};
-use crate::error_frames::ErrorFrames;
+use crate::driver::{At, Driver, Incoming, OpenError, Opening};
+use crate::library_channel::{
+    Asked, LibraryChannel, MESSAGES, MESSAGES_AT_THE_END, REFUSED, TOO_LONG, poll_asked,
+};
 use crate::maker_options::MakerOptions;
 use crate::rows::{Row, row};
-use crate::under_way::UnderWay;
 
-/// How often the library is asked for messages while there are none, and for the state of the bus.
-const ASK_EVERY: Duration = Duration::from_millis(1);
-const STATUS_EVERY: Duration = Duration::from_millis(100);
-/// Messages that one call of [`Driver::poll`] takes.
-const MESSAGES: usize = 1024;
-/// Messages that are read after a channel has left its bus.
-const MESSAGES_AT_THE_END: usize = 1 << 16;
 /// Every Kvaser adapter's clock can be divided to a quantum of these.
 const CLOCK_HZ: u32 = 16_000_000;
 /// The clock of CAN FD adapters.
@@ -46,15 +40,8 @@ pub(crate) struct Kvaser {
     name: String,
     options: MakerOptions,
     handle: Option<Handle>,
-    under_way: UnderWay,
-    errors: ErrorFrames,
-    /// Bits that report losses and have been reported.
-    overruns: u32,
+    channel: LibraryChannel,
     clock: AdapterClock,
-    asked: Instant,
-    backlog: Vec<Incoming>,
-    oddities: Oddities,
-    ended: Option<String>,
 }
 
 impl Kvaser {
@@ -84,14 +71,8 @@ impl Kvaser {
             name,
             options,
             handle: None,
-            under_way: UnderWay::default(),
-            errors: ErrorFrames::default(),
-            overruns: 0,
+            channel: LibraryChannel::new(),
             clock: AdapterClock::new(1_000, 1 << 32),
-            asked: Instant::now(),
-            backlog: Vec::new(),
-            oddities: Oddities::default(),
-            ended: None,
         })
     }
 
@@ -128,78 +109,44 @@ impl Kvaser {
             match self.library.read(handle) {
                 Ok(message) => self.take(&message, Instant::now()),
                 Err(Error::NO_MESSAGE) => return,
-                Err(error) => {
-                    self.ended.get_or_insert(format!(
-                        "its driver says: {}",
-                        clean::line(&self.library.describe(error))
-                    ));
-                    return;
-                }
+                Err(error) => return self.channel.end(&self.library.describe(error)),
             }
         }
     }
 
     fn take(&mut self, message: &KvaserMessage, arrival: Instant) {
         let at = self.clock.place(message.stamp_us.into(), arrival);
-        let channel = Channel::Can1;
         // The message is the first after a loss.
-        for (flag, stage) in
-            [(flag::HARDWARE_OVERRUN, LossStage::Controller), (flag::SOFTWARE_OVERRUN, LossStage::Queue)]
-        {
-            if message.flags & flag != 0 {
-                self.backlog.push(Incoming::Lost { channel, stage, count: 1, at_least: true, at });
+        for (bit, stage) in LOSSES {
+            if message.flags & bit != 0 {
+                self.channel.lost(stage, at);
             }
         }
         if message.flags & flag::ERROR_FRAME != 0 {
-            return self.backlog.push(error_of(message.flags, at));
+            return self.channel.report(error_of(message.flags, at));
         }
         if message.flags & flag::TRANSMIT_REQUEST != 0 {
             return;
         }
-        let Some(frame) = frame_of(message) else {
-            self.oddities.count("messages that are no frames");
-            let stage = LossStage::Link;
-            return self.backlog.push(Incoming::Lost { channel, stage, count: 1, at_least: true, at });
-        };
-        if message.flags & flag::TRANSMITTED == 0 {
-            return self.backlog.push(Incoming::Received { channel, frame, at });
-        }
-        let mailbox = match frame {
-            TraceFrame::Classic(frame) => self.under_way.confirm(&frame),
-            TraceFrame::Fd(_) => None,
-        };
-        match mailbox {
-            Some(mailbox) => self.backlog.push(Incoming::Sent { channel, mailbox, at }),
-            None => self.oddities.count("confirmations of frames that were not under way"),
+        let is_ours = message.flags & flag::TRANSMITTED != 0;
+        if self.channel.take(frame_of(message), is_ours, at).is_some() {
+            self.channel.oddities.count("confirmations of frames that were not under way");
         }
     }
 
     /// Asks for the state, now and then.
     fn look(&mut self, handle: Handle) {
         let now = Instant::now();
-        if now.duration_since(self.asked) < STATUS_EVERY {
+        if !self.channel.asks_now(now) {
             return;
         }
-        self.asked = now;
         let bits = match self.library.status(handle) {
             Ok(bits) => bits,
-            Err(error) => {
-                self.ended.get_or_insert(format!(
-                    "its driver says: {}",
-                    clean::line(&self.library.describe(error))
-                ));
-                return;
-            }
+            Err(error) => return self.channel.end(&self.library.describe(error)),
         };
-        let (at, channel) = (At::arrival(now), Channel::Can1);
-        for (bit, stage) in
-            [(status::HARDWARE_OVERRUN, LossStage::Controller), (status::SOFTWARE_OVERRUN, LossStage::Queue)]
-        {
-            if bits & !self.overruns & bit != 0 {
-                self.backlog.push(Incoming::Lost { channel, stage, count: 1, at_least: true, at });
-            }
-        }
-        self.overruns = bits & (status::HARDWARE_OVERRUN | status::SOFTWARE_OVERRUN);
+        let at = At::arrival(now);
+        self.channel.losses(bits, LOSSES, at);
+        self.channel.forget_losses(bits);
         let state = if bits & status::BUS_OFF != 0 {
             ErrorState::BusOff
         } else if bits & status::PASSIVE != 0 {
@@ -211,9 +158,13 @@ impl Kvaser {
         };
         let counters = self.library.error_counters(handle).ok();
         let counters = counters.map(|(transmit, receive)| (transmit.min(255) as u8, receive.min(255) as u8));
-        self.errors.set(state, counters, channel, at, &mut self.backlog);
+        self.channel.state(state, counters, at);
     }
 }
+
+/// The bits of a status that report losses. They are those of a message's flags, too.
+const LOSSES: [(u32, LossStage); 2] =
+    [(status::HARDWARE_OVERRUN, LossStage::Controller), (status::SOFTWARE_OVERRUN, LossStage::Queue)];
 
 /// An error of the library as the reason why a request is refused.
 const fn refusal(error: Error) -> Refusal {
@@ -233,25 +184,13 @@ const fn timing_refusal(error: Error) -> Refusal {
 }
 
 fn nominal(clock_hz: u32, opening: Opening) -> Option<Segments> {
-    let limits = Limits {
-        segment1: 1..=16,
-        segment2: 1..=8,
-        jump_width_max: 4,
-        prescaler: 1..=1024,
-        prescaler_step: 1,
-    };
+    let limits = Limits::up_to(16, 8, 4, 1024);
     let timing = limits.nominal(clock_hz, opening.bitrate_bps, opening.sample_point_permille)?;
     Some(Segments { first: timing.segment1, second: timing.segment2, jump_width: timing.jump_width })
 }
 
 fn data(bitrate_bps: u32) -> Option<Segments> {
-    let limits = Limits {
-        segment1: 1..=32,
-        segment2: 1..=16,
-        jump_width_max: 16,
-        prescaler: 1..=2,
-        prescaler_step: 1,
-    };
+    let limits = Limits::up_to(32, 16, 16, 2);
     let timing = limits.data(FD_CLOCK_HZ, bitrate_bps)?;
     Some(Segments { first: timing.segment1, second: timing.segment2, jump_width: timing.jump_width })
 }
@@ -289,6 +228,19 @@ fn frame_of(message: &KvaserMessage) -> Option<TraceFrame> {
     Some(Frame::from_bus(id, is_remote, dlc, eight).into())
 }
 
+impl Asked for Kvaser {
+    fn channel(&mut self) -> &mut LibraryChannel {
+        &mut self.channel
+    }
+
+    fn ask(&mut self) {
+        if let Some(handle) = self.handle {
+            self.look(handle);
+            self.receive(handle, MESSAGES);
+        }
+    }
+}
+
 impl Driver for Kvaser {
     fn row(&self) -> &'static Row {
         row("kvaser").unwrap_or(&crate::ROWS[0])
@@ -303,7 +255,7 @@ impl Driver for Kvaser {
         if started.is_err() {
             self.close(channel);
         }
-        (self.overruns, self.asked) = (0, Instant::now());
+        self.channel.begin();
         started
     }
 
@@ -314,12 +266,10 @@ impl Driver for Kvaser {
             self.receive(handle, MESSAGES_AT_THE_END);
             let _ = self.library.close(handle);
         }
-        self.under_way.clear();
-        self.errors = ErrorFrames::default();
+        self.channel.leave();
     }
 
-    fn send(&mut self, channel: Channel, mailbox: u8, frame: &Frame) -> bool {
-        let at = At::arrival(Instant::now());
+    fn send(&mut self, _channel: Channel, mailbox: u8, frame: &Frame) -> bool {
         let Some(handle) = self.handle else { return false };
         let id = frame.id();
         let mut data = [0; 64];
@@ -328,43 +278,26 @@ impl Driver for Kvaser {
         let flags = if frame.is_remote() { flags | flag::REMOTE } else { flags };
         let len = u32::from(frame.dlc());
         if len > 8 {
-            self.oddities.count("frames with length codes above 8, which cannot be sent");
-            self.backlog.push(Incoming::NotSent { channel, mailbox, at });
+            self.channel.not_sent(mailbox, TOO_LONG);
             return true;
         }
         match self
             .library
             .write(handle, &KvaserMessage { id: id.raw().into(), flags, len, data, stamp_us: 0 })
         {
-            Ok(()) => self.under_way.push(mailbox, *frame),
+            Ok(()) => self.channel.sent(mailbox, frame),
             Err(Error::TRANSMIT_FULL) => return false,
-            Err(_) => {
-                self.oddities.count("frames that were refused");
-                self.backlog.push(Incoming::NotSent { channel, mailbox, at });
-            }
+            Err(_) => self.channel.not_sent(mailbox, REFUSED),
         }
         true
     }
 
     fn poll(&mut self, wait: Duration, reports: &mut Vec<Incoming>) -> Result<(), String> {
-        let deadline = Instant::now() + wait;
-        while self.ended.is_none() {
-            if let Some(handle) = self.handle {
-                self.look(handle);
-                self.receive(handle, MESSAGES);
-            }
-            let left = deadline.saturating_duration_since(Instant::now());
-            if left.is_zero() || !self.backlog.is_empty() {
-                break;
-            }
-            std::thread::sleep(left.min(ASK_EVERY));
-        }
-        reports.append(&mut self.backlog);
-        self.ended.clone().map_or(Ok(()), Err)
+        poll_asked(self, wait, reports)
     }
 
     fn oddities(&self) -> (u32, String) {
-        self.oddities.summary()
+        self.channel.oddities.summary()
     }
 }
 

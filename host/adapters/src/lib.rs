@@ -26,6 +26,7 @@ mod gvret;
 mod in_order;
 mod interface_name;
 mod kvaser;
+mod library_channel;
 mod line;
 mod mailboxes;
 mod maker_options;

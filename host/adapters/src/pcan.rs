@@ -12,19 +12,13 @@ use cantap_wire::{Channel, FdFrame, Frame, Id, Refusal};
 
 use crate::adapter_clock::AdapterClock;
 use crate::bit_limits::{Limits, Timing};
-use crate::driver::{At, Driver, Incoming, Oddities, OpenError, Opening};
-use crate::error_frames::ErrorFrames;
+use crate::driver::{At, Driver, Incoming, OpenError, Opening};
+use crate::library_channel::{
+    Asked, LibraryChannel, MESSAGES, MESSAGES_AT_THE_END, REFUSED, TOO_LONG, poll_asked,
+};
 use crate::maker_options::MakerOptions;
 use crate::rows::{Row, row};
-use crate::under_way::UnderWay;
 
-/// How often the library is asked for messages while there are none, and for the state of the bus.
-const ASK_EVERY: Duration = Duration::from_millis(1);
-const STATUS_EVERY: Duration = Duration::from_millis(100);
-/// Messages that one call of [`Driver::poll`] takes.
-const MESSAGES: usize = 1024;
-/// Messages that are read before a channel is left: its queue has room for 32,768.
-const MESSAGES_AT_THE_END: usize = 1 << 16;
 /// The clock of the bit timing registers, as for an SJA1000.
 const CLOCK_HZ: u32 = 8_000_000;
 /// The clock of CAN FD's bit timing, in MHz: every PCAN adapter with CAN FD has it.
@@ -39,16 +33,9 @@ pub(crate) struct Pcan {
     is_open: bool,
     /// Whether sent frames come back once they were on the bus.
     echoes: bool,
-    under_way: UnderWay,
-    errors: ErrorFrames,
-    /// Bits that report losses and have been reported.
-    overruns: u32,
+    channel: LibraryChannel,
     clock: AdapterClock,
-    asked: Instant,
     identifies_until: Option<Instant>,
-    backlog: Vec<Incoming>,
-    oddities: Oddities,
-    ended: Option<String>,
 }
 
 impl Pcan {
@@ -83,15 +70,9 @@ impl Pcan {
             options,
             is_open: false,
             echoes: false,
-            under_way: UnderWay::default(),
-            errors: ErrorFrames::default(),
-            overruns: 0,
+            channel: LibraryChannel::new(),
             clock: AdapterClock::new(1_000, STAMP_PERIOD_US),
-            asked: Instant::now(),
             identifies_until: None,
-            backlog: Vec::new(),
-            oddities: Oddities::default(),
-            ended: None,
         })
     }
 
@@ -125,7 +106,7 @@ impl Pcan {
             (parameter::ALLOW_ERROR_FRAMES, "error frames that are not switched on"),
         ] {
             if library.set(handle, parameter, 1).is_err() {
-                self.oddities.count(kind);
+                self.channel.oddities.count(kind);
             }
         }
         // Older libraries do not know it.
@@ -143,12 +124,11 @@ impl Pcan {
             match read {
                 Ok((message, stamp_us)) => self.take(&message, stamp_us, Instant::now()),
                 Err(status) if status.is_failure() => {
-                    let reason = format!("its driver says: {}", clean::line(&self.library.describe(status)));
-                    self.ended.get_or_insert(reason);
+                    self.channel.end(&self.library.describe(status));
                     return taken > 0;
                 }
                 Err(status) => {
-                    self.losses(status, At::arrival(Instant::now()));
+                    self.channel.losses(status.0, LOSSES, At::arrival(Instant::now()));
                     // Only the bits of the bus: whatever is said, another question may not be answered better.
                     if status.has(status::RECEIVE_EMPTY) || taken + 1 == most {
                         return taken > 0;
@@ -161,32 +141,19 @@ impl Pcan {
 
     fn take(&mut self, message: &PcanMessage, stamp_us: u64, arrival: Instant) {
         let at = self.clock.place(stamp_us, arrival);
-        let channel = Channel::Can1;
         if message.kind & kind::STATUS != 0 {
             let [a, b, c, d, ..] = message.data;
             let status = Status(u32::from_be_bytes([a, b, c, d]));
-            self.losses(status, at);
-            return self.state(status, None, at);
+            self.channel.losses(status.0, LOSSES, at);
+            return self.channel.state(state_of(status), None, at);
         }
         if message.kind & kind::ERROR != 0 {
             return self.error(message, at);
         }
-        let Some(frame) = frame_of(message) else {
-            self.oddities.count("messages that are no frames");
-            let stage = LossStage::Link;
-            return self.backlog.push(Incoming::Lost { channel, stage, count: 1, at_least: true, at });
-        };
-        if message.kind & kind::ECHO == 0 {
-            return self.backlog.push(Incoming::Received { channel, frame, at });
-        }
-        let mailbox = match frame {
-            TraceFrame::Classic(frame) => self.under_way.confirm(&frame),
-            TraceFrame::Fd(_) => None,
-        };
-        match mailbox {
-            Some(mailbox) => self.backlog.push(Incoming::Sent { channel, mailbox, at }),
+        let is_ours = message.kind & kind::ECHO != 0;
+        if let Some(frame) = self.channel.take(frame_of(message), is_ours, at) {
             // Sent by another program of this computer.
-            None => self.backlog.push(Incoming::Received { channel, frame, at }),
+            self.channel.report(Incoming::Received { channel: Channel::Can1, frame, at });
         }
     }
 
@@ -194,44 +161,16 @@ impl Pcan {
     fn error(&mut self, message: &PcanMessage, at: At) {
         let channel = Channel::Can1;
         let [_, _, receive, transmit, ..] = message.data;
-        if let Some(state) = self.errors.state() {
-            self.errors.set(state, Some((transmit, receive)), channel, at, &mut self.backlog);
-        }
+        self.channel.counters((transmit, receive), at);
         let kind = match message.id {
             2 => Some(BusErrorKind::Form),
             4 => Some(BusErrorKind::Stuff),
             _ => None,
         };
-        self.backlog.push(match kind {
+        self.channel.report(match kind {
             Some(kind) => Incoming::BusError { channel, kind, at },
             None => Incoming::BusErrors { channel, count: 1, at },
         });
-    }
-
-    /// Reports losses that were not reported yet. Bits stay set in the channel's status: [`Self::look_after_time`] forgets those that do not.
-    fn losses(&mut self, status: Status, at: At) {
-        let channel = Channel::Can1;
-        for (bit, stage) in
-            [(status::OVERRUN, LossStage::Controller), (status::QUEUE_OVERRUN, LossStage::Queue)]
-        {
-            if status.has(bit) && self.overruns & bit == 0 {
-                self.overruns |= bit;
-                self.backlog.push(Incoming::Lost { channel, stage, count: 1, at_least: true, at });
-            }
-        }
-    }
-
-    fn state(&mut self, status: Status, counters: Option<(u8, u8)>, at: At) {
-        let state = if status.has(status::BUS_OFF) {
-            ErrorState::BusOff
-        } else if status.has(status::BUS_PASSIVE) {
-            ErrorState::Passive
-        } else if status.has(status::BUS_HEAVY | status::BUS_LIGHT) {
-            ErrorState::Warning
-        } else {
-            ErrorState::Active
-        };
-        self.errors.set(state, counters, Channel::Can1, at, &mut self.backlog);
     }
 
     fn look_after_time(&mut self) {
@@ -241,20 +180,33 @@ impl Pcan {
             // If it goes on, it does no harm.
             let _ = self.library.set(self.handle, parameter::IDENTIFYING, 0);
         }
-        if !self.is_open || now.duration_since(self.asked) < STATUS_EVERY {
+        if !self.is_open || !self.channel.asks_now(now) {
             return;
         }
-        self.asked = now;
         let status = self.library.status(self.handle);
         if status.is_failure() {
-            let reason = format!("its driver says: {}", clean::line(&self.library.describe(status)));
-            self.ended.get_or_insert(reason);
-            return;
+            return self.channel.end(&self.library.describe(status));
         }
         let at = At::arrival(now);
-        self.losses(status, at);
-        self.overruns &= status.0;
-        self.state(status, None, at);
+        self.channel.losses(status.0, LOSSES, at);
+        self.channel.forget_losses(status.0);
+        self.channel.state(state_of(status), None, at);
+    }
+}
+
+/// The bits of a status that report losses.
+const LOSSES: [(u32, LossStage); 2] =
+    [(status::OVERRUN, LossStage::Controller), (status::QUEUE_OVERRUN, LossStage::Queue)];
+
+const fn state_of(status: Status) -> ErrorState {
+    if status.has(status::BUS_OFF) {
+        ErrorState::BusOff
+    } else if status.has(status::BUS_PASSIVE) {
+        ErrorState::Passive
+    } else if status.has(status::BUS_HEAVY | status::BUS_LIGHT) {
+        ErrorState::Warning
+    } else {
+        ErrorState::Active
     }
 }
 
@@ -283,8 +235,7 @@ fn frame_of(message: &PcanMessage) -> Option<TraceFrame> {
 
 /// The bit timing registers of an SJA1000: BTR0 in the upper byte.
 fn registers(opening: Opening) -> Option<u16> {
-    let limits =
-        Limits { segment1: 1..=16, segment2: 1..=8, jump_width_max: 4, prescaler: 1..=64, prescaler_step: 1 };
+    let limits = Limits::up_to(16, 8, 4, 64);
     let timing = limits.nominal(CLOCK_HZ, opening.bitrate_bps, opening.sample_point_permille)?;
     let btr0 = (timing.jump_width - 1) << 6 | (timing.prescaler - 1);
     let btr1 = (timing.segment2 - 1) << 4 | (timing.segment1 - 1);
@@ -292,25 +243,13 @@ fn registers(opening: Opening) -> Option<u16> {
 }
 
 fn data_timing(bitrate_bps: u32) -> Option<Timing> {
-    let limits = Limits {
-        segment1: 1..=32,
-        segment2: 1..=16,
-        jump_width_max: 16,
-        prescaler: 1..=1024,
-        prescaler_step: 1,
-    };
+    let limits = Limits::up_to(32, 16, 16, 1024);
     limits.data(FD_CLOCK_MHZ * 1_000_000, bitrate_bps)
 }
 
 /// Both bit timings as the library wants them.
 fn fd_timing(opening: Opening, data_bitrate_bps: u32) -> Option<CString> {
-    let limits = Limits {
-        segment1: 1..=256,
-        segment2: 1..=128,
-        jump_width_max: 128,
-        prescaler: 1..=1024,
-        prescaler_step: 1,
-    };
+    let limits = Limits::up_to(256, 128, 128, 1024);
     let clock_hz = FD_CLOCK_MHZ * 1_000_000;
     let timings = [
         ("nom", limits.nominal(clock_hz, opening.bitrate_bps, opening.sample_point_permille)?),
@@ -322,6 +261,19 @@ fn fd_timing(opening: Opening, data_bitrate_bps: u32) -> Option<CString> {
         )
     });
     CString::new(format!("f_clock_mhz={FD_CLOCK_MHZ},{}", parts.join(","))).ok()
+}
+
+impl Asked for Pcan {
+    fn channel(&mut self) -> &mut LibraryChannel {
+        &mut self.channel
+    }
+
+    fn ask(&mut self) {
+        self.look_after_time();
+        if self.is_open {
+            self.receive(MESSAGES);
+        }
+    }
 }
 
 impl Driver for Pcan {
@@ -340,7 +292,7 @@ impl Driver for Pcan {
             let _ = self.library.uninitialize(self.handle);
         }
         self.is_open = started.is_ok();
-        (self.overruns, self.asked) = (0, Instant::now());
+        self.channel.begin();
         started
     }
 
@@ -353,12 +305,10 @@ impl Driver for Pcan {
         // If that fails, so will the next read, which has the reason.
         let _ = self.library.uninitialize(self.handle);
         self.is_open = false;
-        self.under_way.clear();
-        self.errors = ErrorFrames::default();
+        self.channel.leave();
     }
 
     fn send(&mut self, channel: Channel, mailbox: u8, frame: &Frame) -> bool {
-        let at = At::arrival(Instant::now());
         let id = frame.id();
         let mut data = [0; 64];
         data[..8].copy_from_slice(&frame.padded_data());
@@ -366,8 +316,7 @@ impl Driver for Pcan {
         let kind = if id.is_extended() { kind | kind::EXTENDED } else { kind };
         let message = PcanMessage { id: id.raw(), kind, dlc: frame.dlc(), data };
         if message.dlc > 8 {
-            self.oddities.count("frames with length codes above 8, which cannot be sent");
-            self.backlog.push(Incoming::NotSent { channel, mailbox, at });
+            self.channel.not_sent(mailbox, TOO_LONG);
             return true;
         }
         let written = match self.options.data_bitrate_bps {
@@ -378,32 +327,19 @@ impl Driver for Pcan {
             Err(status) if !status.is_failure() && status.has(status::TRANSMIT_FULL | status::QUEUE_FULL) => {
                 return false;
             }
-            Err(status) if status.is_failure() => {
-                self.oddities.count("frames that were refused");
-                self.backlog.push(Incoming::NotSent { channel, mailbox, at });
-            }
+            Err(status) if status.is_failure() => self.channel.not_sent(mailbox, REFUSED),
             // Taken, whatever is said about the bus beside it.
-            Ok(()) | Err(_) if self.echoes => self.under_way.push(mailbox, *frame),
-            Ok(()) | Err(_) => self.backlog.push(Incoming::Sent { channel, mailbox, at }),
+            Ok(()) | Err(_) if self.echoes => self.channel.sent(mailbox, frame),
+            Ok(()) | Err(_) => {
+                let at = At::arrival(Instant::now());
+                self.channel.report(Incoming::Sent { channel, mailbox, at });
+            }
         }
         true
     }
 
     fn poll(&mut self, wait: Duration, reports: &mut Vec<Incoming>) -> Result<(), String> {
-        let deadline = Instant::now() + wait;
-        while self.ended.is_none() {
-            self.look_after_time();
-            if self.is_open {
-                self.receive(MESSAGES);
-            }
-            let left = deadline.saturating_duration_since(Instant::now());
-            if left.is_zero() || !self.backlog.is_empty() {
-                break;
-            }
-            std::thread::sleep(left.min(ASK_EVERY));
-        }
-        reports.append(&mut self.backlog);
-        self.ended.clone().map_or(Ok(()), Err)
+        poll_asked(self, wait, reports)
     }
 
     fn identify(&mut self, seconds: u8) -> Result<(), Refusal> {
@@ -415,7 +351,7 @@ impl Driver for Pcan {
     }
 
     fn oddities(&self) -> (u32, String) {
-        self.oddities.summary()
+        self.channel.oddities.summary()
     }
 }
 

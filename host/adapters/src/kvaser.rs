@@ -117,11 +117,7 @@ impl Kvaser {
     fn take(&mut self, message: &KvaserMessage, arrival: Instant) {
         let at = self.clock.place(message.stamp_us.into(), arrival);
         // The message is the first after a loss.
-        for (bit, stage) in LOSSES {
-            if message.flags & bit != 0 {
-                self.channel.lost(stage, at);
-            }
-        }
+        self.channel.losses_before(message.flags, LOSSES, at);
         if message.flags & flag::ERROR_FRAME != 0 {
             return self.channel.report(error_of(message.flags, at));
         }

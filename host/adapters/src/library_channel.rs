@@ -104,6 +104,16 @@ impl LibraryChannel {
         None
     }
 
+    /// Reports losses before a message, by its flags. The status that tells of them, too, does not make more of them.
+    pub fn losses_before(&mut self, flags: u32, bits: [(u32, LossStage); 2], at: At) {
+        for (bit, stage) in bits {
+            if flags & bit != 0 {
+                self.reported |= bit;
+                self.lost(stage, at);
+            }
+        }
+    }
+
     /// Reports losses that a status tells, and not again for as long as it does: bits may stay set.
     pub fn losses(&mut self, status: u32, bits: [(u32, LossStage); 2], at: At) {
         for (bit, stage) in bits {

@@ -278,10 +278,12 @@ fn kvaser_frames_losses_and_errors_arrive() {
     assert_eq!(frames(&records), ["123#1122", "1ABCDEF0#09", "200#R4"]);
     assert_eq!(losses(&records), [("controller", 1), ("link", 1)]);
     assert!(records.iter().any(|record| matches!(record.event, TraceEvent::BusError { .. })));
-    library.set(Set::BusStatus, 1);
+    // The status tells of the same loss once more.
+    library.set(Set::BusStatus, 0x200 | 1);
     let records = until(&device, |record| {
         matches!(record.event, TraceEvent::State { state: cantap::wire::record::ErrorState::Passive, .. })
     });
+    assert_eq!(losses(&records), []);
     // A counter beyond what a controller has is not wrapped round.
     assert!(matches!(records.last().unwrap().event, TraceEvent::State { counters: Some((130, 255)), .. }));
 }

@@ -158,6 +158,8 @@ mod tests {
         let mut command = portable_pty::CommandBuilder::new(std::env::current_exe().unwrap());
         command.args(["--ignored", "--nocapture", "screen::tests::a_display_that_panics"]);
         command.env("TERM", "xterm");
+        // A backtrace with lines would push the message off the screen.
+        command.env("RUST_BACKTRACE", "0");
         let mut child = pair.slave.spawn_command(command).unwrap();
         drop(pair.slave);
         let (mut reader, mut output) = (pair.master.try_clone_reader().unwrap(), Vec::new());

@@ -208,7 +208,7 @@ pub fn response(heard: bool, sub: u8, data: &[u8], fields: &mut Vec<Field>) {
     }
 }
 
-/// The trouble codes of a positive response, which begins with 59.
+/// The trouble codes of a positive response, which begins with 59: those that [`response`] lists.
 pub fn codes(response: &[u8]) -> Vec<[u8; CODE]> {
     let [0x59, sub, data @ ..] = response else { return Vec::new() };
     // How many bytes are in front of the list, and how many an entry has, with the place of its code.
@@ -222,13 +222,14 @@ pub fn codes(response: &[u8]) -> Vec<[u8; CODE]> {
         0x56 => (4, CODE_AND_STATUS, 0),
         _ => return Vec::new(),
     };
-    let entries = data.get(front..).unwrap_or_default().chunks_exact(entry);
-    entries.map(|entry| [entry[at], entry[at + 1], entry[at + 2]]).collect()
+    let list = data.get(front..).filter(|list| list.len().is_multiple_of(entry)).unwrap_or_default();
+    list.chunks_exact(entry).map(|entry| [entry[at], entry[at + 1], entry[at + 2]]).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Value;
 
     fn shown(decode: fn(u8, &[u8], &mut Vec<Field>), sub: u8, bytes: &[u8]) -> String {
         let mut fields = Vec::new();
@@ -283,6 +284,28 @@ mod tests {
             (0x0A, &[], ""),
         ] {
             assert_eq!(shown(request, sub, bytes), expected, "{sub:02X}");
+        }
+    }
+
+    /// What a description of the ECU gives texts to is what the report is shown to have.
+    #[test]
+    fn the_codes_of_a_report_are_those_that_it_is_shown_with() {
+        for sub in 0..=0xFF {
+            for length in 0..40 {
+                let data: Vec<u8> = (1..=length).collect();
+                let mut fields = Vec::new();
+                response(true, sub, &data, &mut fields);
+                let value =
+                    |name: &str| fields.iter().find(|field| field.name == name).map(|field| &field.value);
+                let (count, list) = (value("trouble_codes"), value("codes"));
+                let codes = codes(&[&[0x59, sub], &data[..]].concat());
+                if let (Some(Value::Number(count)), Some(Value::Text(list))) = (count, list) {
+                    assert_eq!(codes.len() as i64, *count, "{sub:02X}, {length} bytes");
+                    assert!(codes.iter().all(|one| list.contains(&code(one))), "{sub:02X}: {list}");
+                } else {
+                    assert!(codes.is_empty(), "{sub:02X}, {length} bytes: {codes:?}");
+                }
+            }
         }
     }
 

@@ -210,10 +210,16 @@ fn port_and_baud(text: &str, default: u32) -> Option<(String, u32)> {
     (!port.is_empty()).then(|| (port.to_owned(), baud))
 }
 
+/// What stands before `?`, and what stands behind it between `&`.
+fn and_options(rest: &str) -> (&str, impl Iterator<Item = &str>) {
+    let (place, texts) = rest.split_once('?').map_or((rest, None), |(place, texts)| (place, Some(texts)));
+    (place, texts.into_iter().flat_map(|texts| texts.split('&')))
+}
+
 fn gs_usb_of(rest: &str) -> Option<Kind> {
-    let (serial, texts) = rest.split_once('?').map_or((rest, None), |(serial, texts)| (serial, Some(texts)));
+    let (serial, texts) = and_options(rest);
     let mut options = gs_usb::Options::default();
-    for text in texts.into_iter().flat_map(|texts| texts.split('&')) {
+    for text in texts {
         match text.split_once('=')? {
             ("termination", "on") => options.termination = Some(true),
             ("termination", "off") => options.termination = Some(false),
@@ -226,9 +232,9 @@ fn gs_usb_of(rest: &str) -> Option<Kind> {
 }
 
 /// What an address of a maker's adapter has behind its channel.
-fn maker_options(texts: Option<&str>) -> Option<MakerOptions> {
+fn maker_options<'t>(texts: impl Iterator<Item = &'t str>) -> Option<MakerOptions> {
     let mut options = MakerOptions::default();
-    for text in texts.into_iter().flat_map(|texts| texts.split('&')) {
+    for text in texts {
         match text.split_once('=')? {
             ("data-bitrate", rate) => options.data_bitrate_bps = Some(bit_rate(rate).ok()?),
             ("library", path) if !path.is_empty() => options.library = Some(path.into()),
@@ -239,22 +245,17 @@ fn maker_options(texts: Option<&str>) -> Option<MakerOptions> {
 }
 
 fn pcan_of(rest: &str) -> Result<Kind, BadPlace> {
-    let (channel, texts) =
-        rest.split_once('?').map_or((rest, None), |(channel, texts)| (channel, Some(texts)));
+    let (channel, texts) = and_options(rest);
     let options = maker_options(texts).ok_or_else(|| {
         BadPlace("behind pcan:CHANNEL write ?data-bitrate=2M for CAN FD or ?library=PATH for a library that is not the system's".to_owned())
     })?;
-    let channel = if channel.is_empty() {
-        None
-    } else {
-        Some(channel.parse().map_err(|error: pcan_basic::BadChannel| BadPlace(error.to_string()))?)
-    };
+    let parse = || channel.parse().map_err(|error: pcan_basic::BadChannel| BadPlace(error.to_string()));
+    let channel = (!channel.is_empty()).then(parse).transpose()?;
     Ok(Kind::Pcan { channel, options })
 }
 
 fn kvaser_of(rest: &str) -> Option<Kind> {
-    let (channel, texts) =
-        rest.split_once('?').map_or((rest, None), |(channel, texts)| (channel, Some(texts)));
+    let (channel, texts) = and_options(rest);
     let options = maker_options(texts)?;
     let which =
         if channel.is_empty() { kvaser::Which::Only } else { kvaser::Which::Number(channel.parse().ok()?) };

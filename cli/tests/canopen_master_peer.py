@@ -5,6 +5,7 @@ HOST PORT SHEET     joins by socketcand; prints one JSON object with what the no
 
 import json
 import sys
+import threading
 import time
 
 import can
@@ -20,6 +21,14 @@ def attempt(action):
         return action()
     except canopen.SdoAbortedError as error:
         return f"{error.code:08X}"
+
+
+def wait_until(condition):
+    """Whether it holds within half a minute, which only a hang reaches."""
+    until = time.monotonic() + 30
+    while not condition() and time.monotonic() < until:
+        time.sleep(0.02)
+    return condition()
 
 
 def write_blocks(node, data):
@@ -65,9 +74,11 @@ def main(host, port, sheet):
 
     # States, PDOs, an emergency.
     node.sdo[0x1017].raw = 100
-    node.nmt.wait_for_heartbeat(5)
+    node.nmt.wait_for_heartbeat(30)
     node.nmt.state = "OPERATIONAL"
-    time.sleep(0.3)
+    # What the master wishes counts as the state until a heartbeat says it.
+    node.nmt.wait_for_heartbeat(30)
+    wait_until(lambda: node.nmt.state == "OPERATIONAL")
     said["state"] = node.nmt.state
     node.tpdo.read()
     node.rpdo.read()
@@ -75,16 +86,16 @@ def main(host, port, sheet):
     node.rpdo[1]["Target speed"].raw = 500
     node.rpdo[1].transmit()
     time.sleep(0.5)
+    # The node answers within a millisecond, so something must listen before SYNC goes out: `wait_for_reception` forgets what came first.
+    received = threading.Event()
+    node.tpdo[1].add_callback(lambda _: received.set())
     network.sync.transmit()
-    said["sync_pdo"] = node.tpdo[1].wait_for_reception(5) is not None
+    said["sync_pdo"] = received.wait(30)
     said["status"] = node.tpdo[1]["Statusword"].raw
-    said["timer_pdo"] = node.tpdo[2].wait_for_reception(5) is not None
+    said["timer_pdo"] = node.tpdo[2].wait_for_reception(30) is not None
     said["speed"] = node.tpdo[2]["Speed"].raw
     node.sdo[0x2003].raw = 0x4210
-    # It may arrive before the write is confirmed.
-    until = time.monotonic() + 5
-    while not node.emcy.log and time.monotonic() < until:
-        time.sleep(0.05)
+    wait_until(lambda: node.emcy.log)
     said["emergency"] = [node.emcy.log[-1].code, node.emcy.log[-1].register]
 
     # The node without a number.
@@ -99,8 +110,10 @@ def main(host, port, sheet):
     network.lss.configure_node_id(NEW_NODE)
     network.lss.store_configuration()
     other = network.add_node(NEW_NODE, sheet)
+    started = threading.Event()
+    network.subscribe(0x700 + NEW_NODE, lambda _id, data, _stamp: data[0] == 0 and started.set())
     network.lss.send_switch_state_global(network.lss.WAITING_STATE)
-    other.nmt.wait_for_bootup(5)
+    said["started"] = started.wait(30)
     other.sdo.RESPONSE_TIMEOUT = 5.0
     said["other_serial"] = other.sdo[0x1018][4].raw
 

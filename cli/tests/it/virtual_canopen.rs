@@ -67,6 +67,7 @@ fn python_canopen_masters_the_nodes_and_a_listener_hears_the_same() {
         ("found", json!(true)),
         ("identity", json!([0x29C, 0x4452_5631, 0x1_0000, 1002])),
         ("inquired", json!(1002)),
+        ("started", json!(true)),
         ("other_serial", json!(1002)),
     ] {
         assert_eq!(said[name], expected, "{name}: {said}");

@@ -396,6 +396,8 @@ impl<'q, const N: usize> Capture<'q, N> {
         self.load_in_time(traffic, clock, patience);
         let state = &mut self.channels[channel.index()];
         let recorded = state.transmitter.record(&mut self.recorder);
+        self.compare_sent();
+        let state = &mut self.channels[channel.index()];
         let now = self.recorder.time(clock.now());
         if !recorded || state.transmitter.has_more(now) || state.transmitter.has_passing(now) {
             state.transmitter.service(&mut traffic[channel.index()], &mut self.recorder, now);

@@ -116,7 +116,7 @@ impl Seen {
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Pause {
     No,
-    /// It begins when none of the gateway's frames is in a mailbox.
+    /// It begins when a frame waits and none of the gateway's is in a mailbox.
     Wanted,
     Until(u64),
 }
@@ -149,6 +149,21 @@ impl Echo {
             if self.row == PAUSE_AFTER {
                 self.pause = Pause::Wanted;
             }
+        }
+    }
+
+    /// Whether both channels have sent this frame at once.
+    fn is_twin(&self, other: &Self) -> bool {
+        let (a, b) = (&self.sent, &other.sent);
+        let within = ECHO_WITHIN_TICKS + self.bit_ticks;
+        a.at != 0 && b.at != 0 && a.at.abs_diff(b.at) <= within && a.frame == b.frame
+    }
+
+    /// The other channel has sent this frame as well: as good as received there, but it proves nothing after the pause.
+    fn twin_sent(&mut self) {
+        self.sent = Seen::NONE;
+        if self.row < PAUSE_AFTER {
+            self.row += 1;
         }
     }
 
@@ -278,6 +293,20 @@ impl Lane {
         self.echo.slot
     }
 
+    /// On one bus with long bits, both channels begin to send a frame in the same bit, as one, and neither receives it. So one of them pauses
+    /// before each frame once that has happened often enough: what both then receive is a loop. Two buses that carry the same at
+    /// the same time are none: nothing comes back.
+    pub fn compare_sent(first: &mut Self, second: &mut Self) {
+        let (first, second) = (&mut first.echo, &mut second.echo);
+        if first.is_twin(second) {
+            first.twin_sent();
+            second.twin_sent();
+            if second.row >= PAUSE_AFTER && second.pause == Pause::No {
+                second.pause = Pause::Wanted;
+            }
+        }
+    }
+
     /// Whether nothing may go into a mailbox at the moment. `loaded`: some of the gateway's frames are still in one.
     #[inline]
     pub fn pauses(&mut self, now: u64, loaded: impl FnOnce() -> bool) -> bool {
@@ -287,7 +316,7 @@ impl Lane {
     #[cold]
     fn still_pauses(&mut self, now: u64, loaded: bool) -> bool {
         match self.echo.pause {
-            Pause::Wanted if loaded => return true,
+            Pause::Wanted if loaded || !self.is_ready() => return true,
             Pause::Wanted => self.echo.pause = Pause::Until(now + PAUSE_BITS * self.echo.bit_ticks),
             Pause::Until(end) if end > now => {}
             Pause::Until(_) | Pause::No => self.echo.pause = Pause::No,

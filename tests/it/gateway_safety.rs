@@ -5,7 +5,7 @@ use crate::gateway;
 
 use cantap_firmware::TICKS_PER_US;
 use cantap_firmware::bus::gateway::READY;
-use cantap_wire::message::{GATEWAY_TAG, GatewayEnd, GatewayState, Periodic, Trigger, TxFrame};
+use cantap_wire::message::{GATEWAY_TAG, GatewayEnd, GatewayState, Mode, Periodic, Trigger, TxFrame};
 use cantap_wire::record::{ErrorState, LossStage, TransmitFailure};
 use cantap_wire::{Channel, Command, Event, Frame, Reply};
 use fakes::{Bench, SMALL_QUEUE, numbered};
@@ -163,6 +163,76 @@ fn round_and_round(bench: &mut Bench<'_, SMALL_QUEUE>) -> u32 {
         bench.send_one(CAN2);
     }
     panic!("the loop goes on");
+}
+
+fn passing_both_ways() -> Bench<'static, SMALL_QUEUE> {
+    let mut bench = Bench::opened(queue_of(), Mode::Normal);
+    for from in Channel::ALL {
+        gateway::set(&mut bench, from, &[everything()]);
+    }
+    bench.ask(Command::StartGateway).unwrap();
+    bench
+}
+
+/// A node's frame on both channels, and what each then has to send on the other's behalf.
+fn received_by_both(bench: &mut Bench<'_, SMALL_QUEUE>, at_us: &mut u32, frame: Frame) {
+    for channel in Channel::ALL {
+        bench.receive(channel, frame);
+    }
+    let to_us = *at_us + 10;
+    advance(bench, at_us, to_us);
+}
+
+/// With long bits, both channels of one bus begin in the same bit: they send as one, and neither receives what the other sends.
+#[test]
+fn one_bus_is_noticed_where_both_channels_send_as_one() {
+    let mut bench = passing_both_ways();
+    let (mut at_us, mut doubled) = (0, 0);
+    for number in 0..200 {
+        received_by_both(&mut bench, &mut at_us, numbered(number));
+        // Which of them has begun by now sends the frame.
+        while let [first, second] = [0, 1].map(|index| !bench.board.traffic[index].order.is_empty())
+            && (first || second)
+        {
+            let to_us = at_us + 100;
+            advance(&mut bench, &mut at_us, to_us);
+            if first && second {
+                let frames = Channel::ALL.map(|channel| bench.send_one(channel));
+                assert_eq!(frames[0], frames[1]);
+                doubled += 1;
+            } else {
+                let (from, to) = if first { (CAN1, CAN2) } else { (CAN2, CAN1) };
+                let sent = bench.board.traffic[from.index()].send_one().unwrap();
+                bench.receive(to, sent);
+                bench.transmit_interrupt(from);
+            }
+            let to_us = at_us + 10;
+            advance(&mut bench, &mut at_us, to_us);
+        }
+    }
+    assert_eq!(status(&mut bench, CAN1).state, GatewayState::Ended(GatewayEnd::Loop));
+    assert!(doubled < 64, "{doubled}");
+}
+
+/// Two buses that carry the same at the same time, for redundancy.
+#[test]
+fn two_buses_with_the_same_traffic_are_no_loop() {
+    let mut bench = passing_both_ways();
+    let mut at_us = 0;
+    for number in 0..500 {
+        received_by_both(&mut bench, &mut at_us, numbered(number));
+        // The one that pauses begins later.
+        for _ in 0..2 {
+            let begun = Channel::ALL.map(|channel| !bench.board.traffic[channel.index()].order.is_empty());
+            let to_us = at_us + 100;
+            advance(&mut bench, &mut at_us, to_us);
+            for (channel, _) in Channel::ALL.into_iter().zip(begun).filter(|&(_, begun)| begun) {
+                bench.send_one(channel);
+            }
+        }
+    }
+    assert_eq!(status(&mut bench, CAN1).state, GatewayState::Running);
+    assert_eq!(status(&mut bench, CAN1).counts[0].sent, 500);
 }
 
 #[test]

@@ -225,29 +225,41 @@ fn equal_frames_back_to_back_are_no_loop() {
 #[test]
 #[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn both_channels_on_one_bus_are_noticed_and_the_bus_is_left_alone() {
-    for (bound, rate) in
-        [Best, Worst].into_iter().flat_map(|bound| [1_000_000, 125_000, 33_333].map(|rate| (bound, rate)))
+    // Where a bit is long and there are rules both ways, both channels begin to send a frame in the same bit, as one.
+    let cases = [
+        (1_000_000, true),
+        (250_000, true),
+        (125_000, true),
+        (125_000, false),
+        (33_333, true),
+        (33_333, false),
+    ];
+    for (bound, (rate, both_ways)) in
+        [Best, Worst].into_iter().flat_map(|bound| cases.map(|case| (bound, case)))
     {
         let setup = Setup { bound, joined: true, ..board::setup() };
         let rules = rules();
-        // Where a bit is long, both channels would begin to send a frame in the same bit, as one, and neither would receive it.
-        let back: &[GatewayRule] = if rate == 1_000_000 { &rules } else { &[] };
+        let back: &[GatewayRule] = if both_ways { &rules } else { &[] };
         let mut rig = gateway_on(setup, [rate; CHANNELS], [&rules, back]);
         let from = rig.now();
-        rig.add_traffic(Can1, rate, Traffic::new(Kind::Std8, 1, 5.0, from, from + 100 * MS));
-        rig.run_for(600 * MS).unwrap();
+        let frame_ms = 130_000.0 / f64::from(rate);
+        let (load, frames) = if both_ways { (0.3, 64.0) } else { (0.05, 1.0) };
+        let length = (frames * frame_ms / load * MS as f64) as u64;
+        rig.add_traffic(Can1, rate, Traffic::new(Kind::Std8, 1, 100.0 * load, from, from + length));
+        rig.run_for(length + 300 * MS).unwrap();
         let events = rig.events();
         let told = events.iter().filter(|(_, event)| {
             matches!(event, Event::TransmitFailed { reason: TransmitFailure::Loop, .. })
         });
-        assert_eq!(told.count(), 1, "{bound}, {rate}");
+        let told = told.count();
         let found = status(&mut rig, Can1);
         let ours = rig.take_watched()[0]
             .iter()
             .filter(|frame| matches!(frame.sender, Member::Controller(_)))
             .count();
-        eprintln!("{bound}, {rate}: {ours} frames until the loop was noticed");
-        assert_eq!(found.state, GatewayState::Ended(GatewayEnd::Loop));
+        eprintln!("{bound}, {rate}, both ways {both_ways}: {ours} frames until the loop was noticed");
+        assert_eq!(found.state, GatewayState::Ended(GatewayEnd::Loop), "{bound}, {rate}, {both_ways}");
+        assert_eq!(told, 1, "{bound}, {rate}, {both_ways}");
         assert!(ours < 200, "{ours}");
     }
 }

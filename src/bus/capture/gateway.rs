@@ -7,7 +7,7 @@ use cantap_wire::message::{GatewayEnd, GatewayRule, GatewayState, GatewayStatus,
 use cantap_wire::{CHANNELS, Channel, Frame, Refusal};
 
 use super::Capture;
-use crate::bus::gateway::other;
+use crate::bus::gateway::{Lane, other};
 use crate::ports::{Clock, Traffic};
 use crate::{CAN_CLOCK_HZ, TICK_HZ};
 
@@ -50,6 +50,15 @@ impl<const N: usize> Capture<'_, N> {
         }
         transmitter.service(&mut traffic[to.index()], &mut self.recorder, now);
         self.arm(clock);
+    }
+
+    /// A frame was sent: whether the other channel has sent it at the same time, as it does on one bus.
+    #[inline]
+    pub(super) fn compare_sent(&mut self) {
+        if self.gateway == GatewayState::Running {
+            let [first, second] = &mut self.channels;
+            Lane::compare_sent(first.transmitter.lane(), second.transmitter.lane());
+        }
     }
 
     /// Sets a rule for what this channel receives, or removes it and those after it.

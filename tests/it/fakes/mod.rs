@@ -561,7 +561,7 @@ impl<'q, const N: usize> Bench<'q, N> {
     }
 
     /// The transmit interrupt.
-    fn transmit_interrupt(&mut self, channel: Channel) {
+    pub fn transmit_interrupt(&mut self, channel: Channel) {
         let entered = self.board.clock.now();
         self.board.capture.on_transmit(channel, &mut self.board.traffic, &self.board.clock, Some(entered));
     }

@@ -7,7 +7,7 @@ use crate::board::CLOCK;
 use cantap_wire::message::{ChannelConfig, EndReason, Hello, Status};
 use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Event, Record, Refusal, Reply, Response};
 
-use crate::capture::{Heard, Ledger, Session};
+use crate::capture::{Ledger, Session, SessionEvent};
 use crate::{CYCLES_PER_SECOND, CYCLES_PER_US};
 use cantap_emu::bus::{BitTime, BusFrame, Node, Source, Wire};
 use cantap_emu::elf::Image;
@@ -237,16 +237,16 @@ impl Rig {
             recording.extend_from_slice(&bytes);
         }
         let Self { session, ledger, events, ended, between_sessions, .. } = self;
-        session.take(&bytes, |heard| {
+        session.take(&bytes, |event| {
             if *between_sessions {
                 return;
             }
-            match &heard {
-                Heard::Record(ticks, Record::Event(event)) => events.push((*ticks, *event)),
-                Heard::Ended(ticks, reason) => *ended = Some((*ticks, *reason)),
-                Heard::Record(..) | Heard::BatchesLost(_) => {}
+            match &event {
+                SessionEvent::Record(ticks, Record::Event(event)) => events.push((*ticks, *event)),
+                SessionEvent::Ended(ticks, reason) => *ended = Some((*ticks, *reason)),
+                SessionEvent::Record(..) | SessionEvent::BatchesLost(_) => {}
             }
-            ledger.heard(&heard);
+            ledger.take(&event);
         });
     }
 
@@ -284,7 +284,7 @@ impl Rig {
         self.session.restart();
         let reply = self.ask(Command::Hello { protocol: cantap_wire::PROTOCOL_VERSION })?;
         let Reply::Hello(hello) = reply else {
-            return Err(wrong("Hello", &reply));
+            return Err(wrong_reply("Hello", &reply));
         };
         self.between_sessions = false;
         self.ended = None;
@@ -386,7 +386,7 @@ impl Rig {
     pub fn status(&mut self) -> Result<Status, RigError> {
         match self.ask(Command::Status)? {
             Reply::Status(status) => Ok(status),
-            reply => Err(wrong("Status", &reply)),
+            reply => Err(wrong_reply("Status", &reply)),
         }
     }
 
@@ -496,6 +496,6 @@ fn name_of(command: &Command) -> String {
     debug.split([' ', '{', '(']).next().unwrap_or_default().to_owned()
 }
 
-fn wrong(command: &str, reply: &Reply) -> RigError {
+fn wrong_reply(command: &str, reply: &Reply) -> RigError {
     RigError::WrongReply { command: command.to_owned(), reply: format!("{reply:?}") }
 }

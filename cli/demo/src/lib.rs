@@ -149,7 +149,7 @@ pub fn run(args: &Args, create: &Create) -> anyhow::Result<ExitCode> {
 
     let counters = device.counters();
     let kept = file.finish()?;
-    let heard = witness.heard().frames;
+    let heard = witness.activity().frames;
     let received: u64 = counters.channels.iter().map(|channel| channel.received).sum();
     let in_order = books.checks.iter().all(SequenceCheck::in_order);
     let holds = books.checks.iter().zip(heard).all(|(check, sent)| check.holds(sent));

@@ -152,7 +152,7 @@ fn find(args: &Args, records: &mut Records, search: &mut Search, sink: &mut Sink
             for record in earlier.drain(..) {
                 sink.show(&record, None)?;
             }
-            sink.show(&record, Some(search.condition.as_ref().map_or(&[], Condition::said)))?;
+            sink.show(&record, Some(search.condition.as_ref().map_or(&[], Condition::matched_events)))?;
             (found, still_after, gap) = (found + 1, after, false);
         } else if still_after > 0 {
             sink.show(&record, None)?;

@@ -161,7 +161,7 @@ mod tests {
         let device = Device::over(connection.into_link(), "virtual").unwrap();
         let address = args.device.address().unwrap();
         test(&args, &address, &device, &mut Report::new(&address, &device, Lines::Kept));
-        witness.heard().driven
+        witness.activity().driven
     }
 
     #[test]

@@ -71,7 +71,7 @@ pub fn condition(text: &str, decoder: &Decoder) -> Result<Condition, ConditionEr
 
 /// Reports which of a condition's names never occurred: a misspelt name finds nothing, as if there were nothing.
 pub fn report_unmatched(condition: &Condition) {
-    let names: Vec<_> = condition.unheard().collect();
+    let names: Vec<_> = condition.names_without_events().collect();
     if !names.is_empty() {
         eprintln!(
             "cantap: nothing had {}; `cantap conversations` shows what there is, with its names",

@@ -208,12 +208,12 @@ fn record(row: &Row<'_>, errors: &mut ErrorFrames) -> Result<(TraceRecord, Optio
     let value = |column: usize| row.get_ref(column).map_err(|error| of_database(&error));
     let whole = |column: usize| match value(column)? {
         ValueRef::Integer(number) => Ok(number),
-        other => Err(wrong(column, "a whole number", other)),
+        other => Err(wrong_type(column, "a whole number", other)),
     };
     let flag = |column: usize| match whole(column)? {
         0 => Ok(false),
         1 => Ok(true),
-        other => Err(wrong(column, "0 or 1", ValueRef::Integer(other))),
+        other => Err(wrong_type(column, "0 or 1", ValueRef::Integer(other))),
     };
     let time = match value(1)? {
         // The shortest digits for this number: those that were written.
@@ -221,22 +221,23 @@ fn record(row: &Row<'_>, errors: &mut ErrorFrames) -> Result<(TraceRecord, Optio
         ValueRef::Integer(seconds) => seconds.checked_mul(super::text::NS_PER_S),
         _ => None,
     };
-    let time_ns = time.ok_or_else(|| wrong(1, "a time in seconds", value(1).unwrap_or(ValueRef::Null)))?;
+    let time_ns =
+        time.ok_or_else(|| wrong_type(1, "a time in seconds", value(1).unwrap_or(ValueRef::Null)))?;
     let id = whole(2)?;
-    let id = u32::try_from(id).map_err(|_| wrong(2, "an identifier", ValueRef::Integer(id)))?;
+    let id = u32::try_from(id).map_err(|_| wrong_type(2, "an identifier", ValueRef::Integer(id)))?;
     let [extended, remote, error] = [flag(3)?, flag(4)?, flag(5)?];
     let len = whole(6)?;
-    let len = u64::try_from(len).map_err(|_| wrong(6, "a length", ValueRef::Integer(len)))?;
+    let len = u64::try_from(len).map_err(|_| wrong_type(6, "a length", ValueRef::Integer(len)))?;
     let data = match value(7)? {
         ValueRef::Blob(data) => data,
         ValueRef::Null => &[],
-        other => return Err(wrong(7, "bytes", other)),
+        other => return Err(wrong_type(7, "bytes", other)),
     };
     let (event, second) = Message { id, extended, remote, error, len }.event(data, errors)?;
     Ok((TraceRecord { time_ns, channel: 1, event }, second))
 }
 
-fn wrong(column: usize, expected: &str, found: ValueRef<'_>) -> Fault {
+fn wrong_type(column: usize, expected: &str, found: ValueRef<'_>) -> Fault {
     let found = match found {
         ValueRef::Null => "nothing".to_owned(),
         ValueRef::Integer(number) => number.to_string(),

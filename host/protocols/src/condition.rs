@@ -4,7 +4,7 @@
 use std::fmt;
 
 use cantap_signals::Decoder;
-use cantap_signals::condition::{Condition, ConditionError, Listener, Said};
+use cantap_signals::condition::{Condition, ConditionError, ConditionEvent, Listener};
 use cantap_trace::TraceRecord;
 
 use crate::conversations::Conversations;
@@ -48,7 +48,7 @@ impl Listener for Watcher {
         true
     }
 
-    fn take(&mut self, record: &TraceRecord, report: &mut dyn FnMut(&dyn Said)) {
+    fn take(&mut self, record: &TraceRecord, report: &mut dyn FnMut(&dyn ConditionEvent)) {
         let options = &self.options;
         let conversations =
             self.conversations.get_or_insert_with(|| Box::new(Conversations::new(options, None)));
@@ -106,9 +106,9 @@ mod tests {
         for (ms, frame) in TALK {
             asked.holds(&at(ms, frame));
         }
-        assert_eq!(asked.unheard().collect::<Vec<_>>(), ["uds.nrcc"]);
+        assert_eq!(asked.names_without_events().collect::<Vec<_>>(), ["uds.nrcc"]);
         let clone = asked.clone();
-        assert_eq!(clone.unheard().count(), 1);
+        assert_eq!(clone.names_without_events().count(), 1);
         assert!(condition("usd.nrc", &none, &Options::default()).is_err());
         assert!(condition("uds. == 1", &none, &Options::default()).is_err());
     }

@@ -4,7 +4,7 @@
 //! `nmea2000.cog_reference`. The second field with a name is `NAME_2`, as in JSON; without a number, all of them are meant. Every
 //! event also has the names in [`COMMON`].
 
-use cantap_signals::condition::Said;
+use cantap_signals::condition::ConditionEvent;
 use cantap_trace::TraceRecord;
 
 use crate::{Event, EventKind, Field, Party, Protocol, Value};
@@ -123,7 +123,7 @@ impl Event {
     }
 }
 
-impl Said for Event {
+impl ConditionEvent for Event {
     fn channel(&self) -> u8 {
         self.channel
     }

@@ -124,7 +124,7 @@ fn everything_on_the_bus_is_heard_and_nothing_is_ever_put_on_it() {
     session.listener.stop();
     session.until(|_| false);
     assert_eq!(session.error(), "");
-    let heard = witness.heard();
+    let heard = witness.activity();
     assert_eq!([session.frames(1), session.frames(2)], heard.frames);
     assert_eq!(heard.driven, [0, 0]);
     let errors = session.records.iter().filter(|record| matches!(record.event, TraceEvent::BusError { .. }));

@@ -267,7 +267,7 @@ impl<'q> Rig<'q> {
                     if matches!(response.result, Ok(Reply::Hello(_))) {
                         // Earlier requests may have been dropped with their session.
                         waiting.clear();
-                        let heard_before = witness.heard().frames;
+                        let heard_before = witness.activity().frames;
                         *books = Some(Books { heard_before, ..Books::default() });
                     }
                     answers.push(response.clone());
@@ -410,7 +410,7 @@ impl<'q> Rig<'q> {
         // Only requests that found no room in the device's input, which are counted, may stay unanswered.
         prop_assert!(self.waiting.len() <= status.bad_requests as usize, "{:?} of {status:?}", self.waiting);
         prop_assert!(books.complaints.is_empty(), "{:?}", books.complaints);
-        let heard = self.witness.heard().frames;
+        let heard = self.witness.activity().frames;
         for channel in Channel::ALL {
             let index = channel.index();
             let counted = &status.channels[index];

@@ -39,7 +39,7 @@ mod runner;
 pub mod simbus;
 
 pub use check::SequenceCheck;
-pub use machine::{Heard, Witness};
+pub use machine::{BusActivity, Witness};
 pub use options::{BadOption, Options, Pace};
 #[cfg(unix)]
 pub use pty::{Terminal, TerminalError, open_terminal};

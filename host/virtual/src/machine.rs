@@ -38,7 +38,7 @@ pub struct Witness {
 
 /// See [`Witness`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Heard {
+pub struct BusActivity {
     /// Frames that ended well on each channel's bus while it was open, and that its filters let pass.
     pub frames: [u64; CHANNELS],
     /// Times that each channel's controller put a dominant level on its bus: frames that it began to send, acknowledged, or
@@ -48,10 +48,10 @@ pub struct Heard {
 
 impl Witness {
     /// The counts now.
-    pub fn heard(&self) -> Heard {
+    pub fn activity(&self) -> BusActivity {
         let read =
             |counts: &[AtomicU64; CHANNELS]| counts.each_ref().map(|count| count.load(Ordering::Acquire));
-        Heard { frames: read(&self.heard), driven: read(&self.driven) }
+        BusActivity { frames: read(&self.heard), driven: read(&self.driven) }
     }
 }
 
@@ -128,7 +128,7 @@ pub struct Machine<'q> {
     name: &'static str,
     crystal_ppm: f64,
     /// What was counted in earlier lives of the firmware.
-    heard_before: Heard,
+    heard_before: BusActivity,
     now_ns: u64,
     next_usb_ns: u64,
     next_tick_ns: u64,
@@ -159,7 +159,7 @@ impl<'q> Machine<'q> {
             loops,
             joined,
             controllers,
-            heard_before: witness.heard(),
+            heard_before: witness.activity(),
             witness,
             serial,
             name,

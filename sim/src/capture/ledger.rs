@@ -7,7 +7,7 @@ use std::collections::VecDeque;
 use cantap_wire::record::{LossStage, Stamp};
 use cantap_wire::{CHANNELS, Channel, Event, Frame, Received, Record};
 
-use super::session::Heard;
+use super::session::SessionEvent;
 use crate::CYCLES_PER_SECOND;
 
 /// How many faults are kept word for word; the rest are only counted.
@@ -103,10 +103,10 @@ impl Ledger {
     }
 
     /// Something that the device reported.
-    pub fn heard(&mut self, heard: &Heard) {
-        match heard {
-            Heard::Record(ticks, Record::Received(received)) => self.delivered(*ticks, received),
-            Heard::Record(_, Record::Event(Event::Lost { channel, stage, count, at_least })) => {
+    pub fn take(&mut self, event: &SessionEvent) {
+        match event {
+            SessionEvent::Record(ticks, Record::Received(received)) => self.delivered(*ticks, received),
+            SessionEvent::Record(_, Record::Event(Event::Lost { channel, stage, count, at_least })) => {
                 let books = &mut self.books[channel.index()];
                 let count = u64::from(*count);
                 match stage {
@@ -123,13 +123,13 @@ impl Ledger {
                 }
                 books.at_least |= at_least;
             }
-            Heard::Record(_, Record::ReceivedFd(received)) => {
+            SessionEvent::Record(_, Record::ReceivedFd(received)) => {
                 self.fault(format!(
                     "the device reports a CAN FD frame, which no board can receive: {received:?}"
                 ));
             }
-            Heard::Record(_, Record::Event(_)) | Heard::Ended(..) => {}
-            Heard::BatchesLost(frames) => {
+            SessionEvent::Record(_, Record::Event(_)) | SessionEvent::Ended(..) => {}
+            SessionEvent::BatchesLost(frames) => {
                 for (books, lost) in self.books.iter_mut().zip(frames) {
                     books.announced.link += u64::from(*lost);
                 }
@@ -359,12 +359,12 @@ mod tests {
     fn deliver(ledger: &mut Ledger, n: u64) {
         let received =
             Received { channel: CHANNEL, frame: frame(n), stamp: Stamp::Exact, data_omitted: false };
-        ledger.heard(&Heard::Record(n * GAP / 12 + 6, Record::Received(received)));
+        ledger.take(&SessionEvent::Record(n * GAP / 12 + 6, Record::Received(received)));
     }
 
     fn lose(ledger: &mut Ledger, stage: LossStage, count: u32, at_least: bool) {
         let event = Event::Lost { channel: CHANNEL, stage, count, at_least };
-        ledger.heard(&Heard::Record(0, Record::Event(event)));
+        ledger.take(&SessionEvent::Record(0, Record::Event(event)));
     }
 
     #[test]
@@ -424,7 +424,7 @@ mod tests {
         deliver(&mut swapped, 1);
         deliver(&mut swapped, 0);
         let mut changed = books(3);
-        changed.heard(&Heard::Record(
+        changed.take(&SessionEvent::Record(
             10,
             Record::Received(Received {
                 channel: CHANNEL,

@@ -6,4 +6,4 @@ pub mod ledger;
 pub mod session;
 
 pub use ledger::{Ledger, Losses, Stamps};
-pub use session::{Heard, Session};
+pub use session::{Session, SessionEvent};

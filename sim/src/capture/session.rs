@@ -6,7 +6,7 @@ use cantap_wire::{CHANNELS, Command, Corruption, Decoded, Decoder, PROTOCOL_VERS
 
 /// What the device sent, apart from responses.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Heard {
+pub enum SessionEvent {
     /// A record at its device time in ticks.
     Record(u64, Record),
     /// Batches are missing here, with this many frames of each channel.
@@ -55,15 +55,15 @@ impl Session {
     }
 
     /// Takes bytes from the device and reports records in their order.
-    pub fn take(&mut self, bytes: &[u8], mut report: impl FnMut(Heard)) {
+    pub fn take(&mut self, bytes: &[u8], mut report: impl FnMut(SessionEvent)) {
         self.bytes += bytes.len() as u64;
         let Self { decoder, responses, corruptions, .. } = self;
         decoder.push(bytes, |decoded| match decoded {
-            Decoded::Record { ticks, record } => report(Heard::Record(ticks, record)),
-            Decoded::BatchesLost { frames, .. } => report(Heard::BatchesLost(frames)),
+            Decoded::Record { ticks, record } => report(SessionEvent::Record(ticks, record)),
+            Decoded::BatchesLost { frames, .. } => report(SessionEvent::BatchesLost(frames)),
             Decoded::Response(response) => responses.push(response.clone()),
             Decoded::Corrupt(corruption) => corruptions.push(corruption),
-            Decoded::Ended { ticks, reason } => report(Heard::Ended(ticks, reason)),
+            Decoded::Ended { ticks, reason } => report(SessionEvent::Ended(ticks, reason)),
             Decoded::OtherProtocol(_) => corruptions.push(Corruption::Unknown),
         });
     }

@@ -17,7 +17,7 @@ const ENDPOINT_HALT: u16 = 0;
 
 /// What a line asks for that does not concern the board.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Wish {
+pub enum ServerAction {
     /// Nothing.
     None,
     /// Whether time stands still while the kernel does not read.
@@ -31,7 +31,7 @@ pub enum Wish {
 }
 
 /// Carries out a line.
-pub fn obey(line: &str, board: &mut Board, folder: &Path) -> Result<Wish, String> {
+pub fn obey(line: &str, board: &mut Board, folder: &Path) -> Result<ServerAction, String> {
     let words: Vec<&str> = line.split_whitespace().collect();
     match words[..] {
         ["status"] => {}
@@ -54,8 +54,8 @@ pub fn obey(line: &str, board: &mut Board, folder: &Path) -> Result<Wish, String
         }
         ["acknowledge", yes_or_no] => board.acknowledge(yes_or_no == "yes"),
         ["noise", percent] => board.make_noise(number(percent)?),
-        ["pace", "client"] => return Ok(Wish::ClientPace(true)),
-        ["pace", "real"] => return Ok(Wish::ClientPace(false)),
+        ["pace", "client"] => return Ok(ServerAction::ClientPace(true)),
+        ["pace", "real"] => return Ok(ServerAction::ClientPace(false)),
         // Puts the device behind a high-speed hub, with this many microframes per transaction; 0 is a root port again.
         ["hub", microframes] => {
             let microframes = number(microframes)?;
@@ -74,15 +74,15 @@ pub fn obey(line: &str, board: &mut Board, folder: &Path) -> Result<Wish, String
         }
         ["suspend"] => board.with_host(|host, _| host.suspend()),
         ["resume"] => board.with_host(cantap_emu::usb_host::UsbHost::resume),
-        ["redirect"] => return Ok(Wish::Redirect),
-        ["unplug"] => return Ok(Wish::Unplug),
+        ["redirect"] => return Ok(ServerAction::Redirect),
+        ["unplug"] => return Ok(ServerAction::Unplug),
         // Writes what each controller received and sent, as FOLDER/NAME.taken1 and so on; NAME.stamps1 has when each of the received
         // frames was valid, in nanoseconds.
         ["dump", name] => dump(board, folder, name)?,
-        ["quit"] => return Ok(Wish::Quit),
+        ["quit"] => return Ok(ServerAction::Quit),
         _ => return Err(format!("no such line: {line}")),
     }
-    Ok(Wish::None)
+    Ok(ServerAction::None)
 }
 
 fn number<T: std::str::FromStr>(text: &str) -> Result<T, String> {

@@ -13,7 +13,7 @@ use super::error::Error;
 use super::exported::{BUS_ID, Exported};
 use super::protocol::{self, Message, Opening};
 use super::redir::{Action, Packet, Redir};
-use super::script::{self, Wish};
+use super::script::{self, ServerAction};
 use super::urb::Urb;
 use super::urbs::Urbs;
 use crate::{CYCLES_PER_SECOND, CYCLES_PER_US};
@@ -249,8 +249,8 @@ impl Server {
             Event::Submit(..) | Event::Unlink { .. } | Event::Redir(..) => {}
             Event::Line(line, mut stream) => {
                 let answer = match script::obey(&line, &mut self.board, &self.folder) {
-                    Ok(wish) => {
-                        self.grant(wish)?;
+                    Ok(action) => {
+                        self.perform(action)?;
                         script::figures(&self.board)
                     }
                     Err(error) => format!("error: {error}"),
@@ -316,13 +316,13 @@ impl Server {
         Ok(())
     }
 
-    fn grant(&mut self, wish: Wish) -> Result<(), Error> {
-        match wish {
-            Wish::None => {}
-            Wish::Redirect => self.redirect()?,
-            Wish::ClientPace(client_pace) => self.client_pace = client_pace,
-            Wish::Unplug => self.cut(),
-            Wish::Quit => self.quit = true,
+    fn perform(&mut self, action: ServerAction) -> Result<(), Error> {
+        match action {
+            ServerAction::None => {}
+            ServerAction::Redirect => self.redirect()?,
+            ServerAction::ClientPace(client_pace) => self.client_pace = client_pace,
+            ServerAction::Unplug => self.cut(),
+            ServerAction::Quit => self.quit = true,
         }
         Ok(())
     }

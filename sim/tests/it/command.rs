@@ -7,7 +7,7 @@ use std::process::{Command, Output};
 use std::time::{Duration, Instant};
 
 use cantap_sim::address::Address;
-use cantap_sim::capture::{Heard, Session};
+use cantap_sim::capture::{Session, SessionEvent};
 use cantap_sim::rig::timing;
 use cantap_wire::message::ChannelConfig;
 use cantap_wire::{Channel, Record, Reply};
@@ -119,7 +119,7 @@ fn a_served_device_talks_to_whoever_reads_and_writes() {
             match port.reader.read(&mut piece) {
                 Ok(0) => panic!("the emulation ended"),
                 Ok(len) => session.take(&piece[..len], |heard| {
-                    frames += u64::from(matches!(heard, Heard::Record(_, Record::Received(_))));
+                    frames += u64::from(matches!(heard, SessionEvent::Record(_, Record::Received(_))));
                 }),
                 Err(error) => assert_eq!(error.kind(), ErrorKind::TimedOut),
             }

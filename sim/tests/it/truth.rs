@@ -10,7 +10,7 @@ use cantap_emu::timing::Bound;
 use cantap_emu::traffic::{Kind, Script, Traffic};
 use cantap_emu::usb_host::Timing;
 use cantap_sim::board::{self, CLOCK};
-use cantap_sim::capture::{Heard, Session};
+use cantap_sim::capture::{Session, SessionEvent};
 use cantap_sim::rig::{MS, Rig};
 use cantap_sim::{CYCLES_PER_SECOND, CYCLES_PER_US};
 use cantap_wire::record::BusErrorKind;
@@ -52,7 +52,7 @@ fn settle(rig: &mut Rig) {
 fn received(rig: &Rig) -> Vec<(u64, Channel, Frame)> {
     let mut frames = Vec::new();
     Session::new().take(rig.recorded_bytes(), |heard| {
-        if let Heard::Record(ticks, Record::Received(received)) = heard {
+        if let SessionEvent::Record(ticks, Record::Received(received)) = heard {
             frames.push((ticks, received.channel, received.frame));
         }
     });

@@ -91,7 +91,7 @@ fn what_the_board_sends_is_the_trace_and_another_session_goes_on_in_it() {
     page.ask("boardStop", json!({}));
     let end = page.until(is_over);
     assert_eq!(end["board"]["error"], Value::Null);
-    let heard = page.witness.heard();
+    let heard = page.witness.activity();
     assert_eq!(heard.driven, [0, 0]);
     let channels = end["board"]["channels"].as_array().unwrap();
     let mut sum = 0;

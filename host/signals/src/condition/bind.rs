@@ -41,7 +41,7 @@ impl Binder<'_> {
     /// Binds something whose truth is asked: there, a listener's name alone asks whether it has a value.
     fn truth(&mut self, node: &Node) -> Result<Expression, Fault> {
         Ok(match self.bind(node)? {
-            Expression::Said(name) => Expression::IsSaid(name),
+            Expression::Field(name) => Expression::HasField(name),
             other => other,
         })
     }
@@ -88,10 +88,10 @@ impl Binder<'_> {
                 | Operator::GreaterOrEqual
         );
         Ok(match (left, right) {
-            (Expression::Said(name), right) if compares => {
+            (Expression::Field(name), right) if compares => {
                 Expression::AnySaid(name, operator, right.into(), true)
             }
-            (left, Expression::Said(name)) if compares => {
+            (left, Expression::Field(name)) if compares => {
                 Expression::AnySaid(name, operator, left.into(), false)
             }
             (left, right) => Expression::Binary(operator, left.into(), right.into()),
@@ -106,8 +106,8 @@ impl Binder<'_> {
             self.about_frames = true;
             return Ok(Expression::Part(part));
         }
-        if let Some(said) = self.said(name) {
-            return Ok(Expression::Said(said));
+        if let Some(field) = self.field(name) {
+            return Ok(Expression::Field(field));
         }
         let of_message = name.strip_prefix(PREFIX).unwrap_or(name);
         let messages = self.decoder.messages();
@@ -155,7 +155,7 @@ impl Binder<'_> {
     }
 
     /// The index of a listener's name, if it is one.
-    fn said(&mut self, name: &str) -> Option<usize> {
+    fn field(&mut self, name: &str) -> Option<usize> {
         let known = self.names.iter().position(|known| known == name);
         known.or_else(|| {
             self.listener.knows(name).then(|| {
@@ -175,15 +175,15 @@ impl Binder<'_> {
             };
             let Kind::Name(name) = &signal.kind else { continue };
             let slot = self.slot(name);
-            let said = if slot.is_none() && part(name).is_none() { self.said(name) } else { None };
+            let field = if slot.is_none() && part(name).is_none() { self.field(name) } else { None };
             // Without quotes it may also be another signal, or not exist at all.
             let is_value =
-                self.slot(wanted).is_some() || part(wanted).is_some() || self.said(wanted).is_some();
-            if slot.is_none() && said.is_none() || !quoted && is_value {
+                self.slot(wanted).is_some() || part(wanted).is_some() || self.field(wanted).is_some();
+            if slot.is_none() && field.is_none() || !quoted && is_value {
                 continue;
             }
             let Some(slot) = slot else {
-                return Ok(said.map(|said| Expression::SaidText(said, wanted.clone())));
+                return Ok(field.map(|field| Expression::FieldText(field, wanted.clone())));
             };
             let decoder = self.decoder;
             let signals = self.slots[slot].candidates.iter();

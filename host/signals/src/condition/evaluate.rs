@@ -6,7 +6,7 @@ use cantap_trace::TraceRecord;
 use super::bind::{Bound, bind};
 use super::error::ConditionError;
 use super::expression::{Expression, Part, Slot, binary, byte_index, part_of, truth};
-use super::listener::{Deaf, Listener, Listening, Said};
+use super::listener::{ConditionEvent, Deaf, Listener, Listening};
 use super::syntax::{self, Operator};
 
 /// A condition, with the last values of the signals that it uses.
@@ -61,25 +61,25 @@ impl Condition {
         let Some(mut listening) = self.listening.take() else { return holds };
         let Listening { listener, names, matched } = &mut listening;
         matched.clear();
-        let mut was_said = false;
-        listener.take(record, &mut |said| {
-            was_said = true;
-            for (name, was_heard) in names.iter_mut().filter(|(_, was_heard)| !was_heard) {
-                *was_heard = said.has(name) == Some(true);
+        let mut any_event = false;
+        listener.take(record, &mut |event| {
+            any_event = true;
+            for (name, occurred) in names.iter_mut().filter(|(_, occurred)| !occurred) {
+                *occurred = event.has(name) == Some(true);
             }
-            let said = Heard { said, names };
-            if self.is_true(record, Some(&said)) {
-                matched.push(said.said.describe());
+            let event = NamedEvent { event, names };
+            if self.is_true(record, Some(&event)) {
+                matched.push(event.event.describe());
             }
         });
         let holds = holds || !matched.is_empty();
-        self.concerned |= was_said;
+        self.concerned |= any_event;
         self.listening = Some(listening);
         holds
     }
 
-    fn is_true(&self, record: &TraceRecord, said: Option<&Heard<'_>>) -> bool {
-        truth(self.evaluate(&self.expression, record, said)) == Some(true)
+    fn is_true(&self, record: &TraceRecord, event: Option<&NamedEvent<'_>>) -> bool {
+        truth(self.evaluate(&self.expression, record, event)) == Some(true)
     }
 
     /// Whether it refers to the frame itself, or to what frames say together, rather than to signals alone.
@@ -89,14 +89,14 @@ impl Condition {
 
     /// The listener's events of the last record taken by [`Self::holds`] that made the condition hold; one
     /// line each.
-    pub fn said(&self) -> &[String] {
+    pub fn matched_events(&self) -> &[String] {
         self.listening.as_ref().map_or(&[], |listening| &listening.matched)
     }
 
     /// The listener's names in the condition that no event has had so far: perhaps they do not exist.
-    pub fn unheard(&self) -> impl Iterator<Item = &str> {
+    pub fn names_without_events(&self) -> impl Iterator<Item = &str> {
         let names = self.listening.iter().flat_map(|listening| &listening.names);
-        names.filter(|(_, was_heard)| !was_heard).map(|(name, _)| name.as_str())
+        names.filter(|(_, occurred)| !occurred).map(|(name, _)| name.as_str())
     }
 
     /// Whether the last record taken by [`Self::holds`] is relevant to the condition: it carries one of its
@@ -126,24 +126,24 @@ impl Condition {
         &self,
         expression: &Expression,
         record: &TraceRecord,
-        said: Option<&Heard<'_>>,
+        event: Option<&NamedEvent<'_>>,
     ) -> Option<f64> {
         let boolean = |truth: bool| Some(f64::from(u8::from(truth)));
         match expression {
             Expression::Number(value) => Some(*value),
-            Expression::Part(part) => match said {
-                Some(heard) if matches!(part, Part::Channel) => Some(heard.said.channel().into()),
+            Expression::Part(part) => match event {
+                Some(event) if matches!(part, Part::Channel) => Some(event.event.channel().into()),
                 // An event that ends because nothing came is reported with an unrelated frame.
-                Some(heard) if !heard.said.is_completed_by(record) => None,
+                Some(event) if !event.event.is_completed_by(record) => None,
                 _ => part_of(*part, record),
             },
-            Expression::Byte(_) if said.is_some_and(|heard| !heard.said.is_completed_by(record)) => None,
+            Expression::Byte(_) if event.is_some_and(|event| !event.event.is_completed_by(record)) => None,
             Expression::Byte(index) => {
-                let index = byte_index(self.evaluate(index, record, said)?)?;
+                let index = byte_index(self.evaluate(index, record, event)?)?;
                 record.frame()?.data().get(index).copied().map(f64::from)
             }
             Expression::Signal(slot) => self.slots[*slot].last.map(|(_, _, value)| value),
-            Expression::Message(_) if said.is_some_and(|heard| !heard.said.is_completed_by(record)) => None,
+            Expression::Message(_) if event.is_some_and(|event| !event.event.is_completed_by(record)) => None,
             Expression::Message(messages) => {
                 let message = self.decoder.find(record.channel, record.frame()?.id());
                 boolean(message.is_some_and(|message| messages.contains(&message)))
@@ -154,11 +154,11 @@ impl Condition {
                 let signal = &self.decoder.message(message).signals[index as usize];
                 boolean(signal.table_key(raw).is_some_and(|key| raws[candidate].contains(&key)))
             }
-            Expression::Said(name) => said?.numbers(*name).first().copied(),
-            Expression::IsSaid(name) => boolean(said?.has(*name)?),
+            Expression::Field(name) => event?.numbers(*name).first().copied(),
+            Expression::HasField(name) => boolean(event?.has(*name)?),
             Expression::AnySaid(name, operator, other, is_left) => {
-                let (heard, other) = (said?, self.evaluate(other, record, said)?);
-                let numbers = heard.numbers(*name);
+                let (event, other) = (event?, self.evaluate(other, record, event)?);
+                let numbers = event.numbers(*name);
                 let compare = |number: f64| {
                     let (left, right) = if *is_left { (number, other) } else { (other, number) };
                     truth(binary(*operator, left, right))
@@ -169,18 +169,18 @@ impl Condition {
                     boolean(numbers.iter().any(|number| compare(*number) == Some(true)))
                 }
             }
-            Expression::SaidText(name, text) => boolean(said?.is_text(*name, text)?),
-            Expression::Not(inner) => boolean(!truth(self.evaluate(inner, record, said))?),
-            Expression::Negative(inner) => self.evaluate(inner, record, said).map(|value| -value),
+            Expression::FieldText(name, text) => boolean(event?.is_text(*name, text)?),
+            Expression::Not(inner) => boolean(!truth(self.evaluate(inner, record, event))?),
+            Expression::Negative(inner) => self.evaluate(inner, record, event).map(|value| -value),
             Expression::Binary(operator, left, right) => {
-                let left = self.evaluate(left, record, said);
+                let left = self.evaluate(left, record, event);
                 // One side may decide the result on its own.
                 match (operator, truth(left)) {
                     (Operator::And, Some(false)) => return boolean(false),
                     (Operator::Or, Some(true)) => return boolean(true),
                     _ => {}
                 }
-                let right = self.evaluate(right, record, said);
+                let right = self.evaluate(right, record, event);
                 match (operator, truth(right)) {
                     (Operator::And, Some(false)) => return boolean(false),
                     (Operator::Or, Some(true)) => return boolean(true),
@@ -193,24 +193,24 @@ impl Condition {
 }
 
 /// An event's values, in the order of the condition's names.
-struct Heard<'a> {
-    said: &'a dyn Said,
+struct NamedEvent<'a> {
+    event: &'a dyn ConditionEvent,
     names: &'a [(String, bool)],
 }
 
-impl Heard<'_> {
+impl NamedEvent<'_> {
     fn numbers(&self, name: usize) -> Vec<f64> {
         let mut numbers = Vec::new();
-        self.said.numbers(&self.names[name].0, &mut |number| numbers.push(number));
+        self.event.numbers(&self.names[name].0, &mut |number| numbers.push(number));
         numbers
     }
 
     fn has(&self, name: usize) -> Option<bool> {
-        self.said.has(&self.names[name].0)
+        self.event.has(&self.names[name].0)
     }
 
     fn is_text(&self, name: usize, text: &str) -> Option<bool> {
-        self.said.is_text(&self.names[name].0, text)
+        self.event.is_text(&self.names[name].0, text)
     }
 }
 

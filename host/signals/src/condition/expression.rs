@@ -27,13 +27,13 @@ pub(super) enum Expression {
     /// Whether a signal's value has a text: for each candidate, the raw values with that text.
     HasText(usize, Vec<Vec<i64>>),
     /// The first value of a listener's name, by its index among the names.
-    Said(usize),
+    Field(usize),
     /// Whether it has a value.
-    IsSaid(usize),
+    HasField(usize),
     /// Whether one of its values compares like this with the other side; `true` if the name is on the left.
     AnySaid(usize, Operator, Box<Expression>, bool),
     /// Whether one of its values is this text.
-    SaidText(usize, String),
+    FieldText(usize, String),
     Not(Box<Expression>),
     Negative(Box<Expression>),
     Binary(Operator, Box<Expression>, Box<Expression>),

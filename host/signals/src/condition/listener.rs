@@ -7,7 +7,7 @@ use std::fmt;
 use cantap_trace::TraceRecord;
 
 /// One event, as a condition queries it. `None` if it has no such name.
-pub trait Said {
+pub trait ConditionEvent {
     /// The event's channel, from 1.
     fn channel(&self) -> u8;
 
@@ -33,9 +33,9 @@ pub trait Listener: fmt::Debug + Send + Sync {
     fn knows(&mut self, name: &str) -> bool;
 
     /// Takes a record and passes on the events that end with it.
-    fn take(&mut self, record: &TraceRecord, said: &mut dyn FnMut(&dyn Said));
+    fn take(&mut self, record: &TraceRecord, report: &mut dyn FnMut(&dyn ConditionEvent));
 
-    /// A new listener for the same names that has heard nothing yet.
+    /// A new listener for the same names that has taken nothing yet.
     fn fresh(&self) -> Box<dyn Listener>;
 }
 
@@ -64,7 +64,7 @@ impl Listener for Deaf {
         false
     }
 
-    fn take(&mut self, _: &TraceRecord, _: &mut dyn FnMut(&dyn Said)) {}
+    fn take(&mut self, _: &TraceRecord, _: &mut dyn FnMut(&dyn ConditionEvent)) {}
 
     fn fresh(&self) -> Box<dyn Listener> {
         Box::new(Self)

@@ -26,4 +26,4 @@ mod syntax;
 
 pub use error::{ConditionError, ConditionFault};
 pub use evaluate::Condition;
-pub use listener::{Listener, Said};
+pub use listener::{ConditionEvent, Listener};

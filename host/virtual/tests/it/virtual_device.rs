@@ -71,7 +71,7 @@ fn both_channels_saturated_arrive_complete_in_order_and_spaced_by_their_lengths(
         });
         device.stop().unwrap();
         records.extend(device.records().map(Result::unwrap));
-        let (delivered, lost) = check_law(&records, &options, witness.heard().frames);
+        let (delivered, lost) = check_law(&records, &options, witness.activity().frames);
         assert!(delivered.iter().all(|count| *count > 5000));
         assert_eq!(lost, [0; 2]);
         assert!(records.is_sorted_by_key(|record| record.time_ns));
@@ -122,7 +122,7 @@ fn a_host_that_stalls_too_long_loses_frames_and_every_one_is_counted() {
     std::thread::sleep(Duration::from_millis(2200));
     let status = device.stop().unwrap();
     let records: Vec<TraceRecord> = device.records().map(Result::unwrap).collect();
-    let (_, lost) = check_law(&records, &options, witness.heard().frames);
+    let (_, lost) = check_law(&records, &options, witness.activity().frames);
     assert!(lost.iter().all(|count| *count > 1000), "{lost:?}");
     assert_eq!(status.channels.map(|channel| u64::from(channel.lost_queue)), lost);
     assert!(status.queue_high_water_bytes > 90_000);
@@ -193,7 +193,7 @@ fn whatever_only_listens_never_drives_the_bus() {
         count += 1;
         count == 500
     });
-    assert_eq!(witness.heard().driven, [0, 0]);
+    assert_eq!(witness.activity().driven, [0, 0]);
     device.close_channel(Channel::Can1).unwrap();
     let timing = device.timing(250_000).unwrap();
     device.open_channel(Channel::Can1, Some(ChannelConfig { timing, ..normal })).unwrap();
@@ -202,7 +202,7 @@ fn whatever_only_listens_never_drives_the_bus() {
         count += 1;
         count == 50
     });
-    let heard = witness.heard();
+    let heard = witness.activity();
     assert!(heard.driven[0] > 0 && heard.driven[1] == 0, "{heard:?}");
 }
 

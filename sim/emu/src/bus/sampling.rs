@@ -9,7 +9,7 @@ use crate::can::BitTiming;
 
 /// How such a receiver sees a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Heard {
+pub enum Reception {
     /// It received it.
     Frame,
     /// It saw an error, this many core cycles after the start of frame.
@@ -23,7 +23,7 @@ pub enum Heard {
 
 /// Listens with `timing` to bits of `bit_cycles(n)` core cycles from the start of frame to bit `n`'s
 /// start. After the last bit the bus is recessive.
-pub fn listen(levels: &[bool], bit_start: impl Fn(usize) -> u64, timing: &BitTiming) -> Heard {
+pub fn listen(levels: &[bool], bit_start: impl Fn(usize) -> u64, timing: &BitTiming) -> Reception {
     let mut bus = Waveform { levels, bit_start, at: 0 };
     let mut parser = Parser::default();
     let (bit, to_sample) = (timing.bit(), timing.quantum * (1 + timing.segment1));
@@ -34,8 +34,8 @@ pub fn listen(levels: &[bool], bit_start: impl Fn(usize) -> u64, timing: &BitTim
         let level = bus.level(sample_at);
         if let Some(end) = parser.take(level) {
             return match end {
-                Ok(()) => Heard::Frame,
-                Err(kind) => Heard::Error { after: sample_at, kind },
+                Ok(()) => Reception::Frame,
+                Err(kind) => Reception::Error { after: sample_at, kind },
             };
         }
         let mut next = start + bit;
@@ -145,7 +145,7 @@ mod tests {
         BitTiming { quantum: bit / 12, segment1: 8, segment2: 3, jump: 1 }
     }
 
-    fn hear(text: &str, sender_bit: u64, receiver_bit: u64) -> Heard {
+    fn hear(text: &str, sender_bit: u64, receiver_bit: u64) -> Reception {
         let mut bits = FrameBits::new(&text.parse().unwrap()).levels().to_vec();
         let ack = bits.len() - END_OF_FRAME - 2;
         bits[ack] = false;
@@ -155,8 +155,8 @@ mod tests {
     #[test]
     fn the_right_rate_and_a_near_one_receive() {
         for text in ["123#", "7FF#FFFFFFFFFFFFFFFF", "1ABCDEF0#1122334455667788", "000#R8"] {
-            assert_eq!(hear(text, 1440, 1440), Heard::Frame, "{text}");
-            assert_eq!(hear(text, 1448, 1440), Heard::Frame, "{text} 0.5 % slower");
+            assert_eq!(hear(text, 1440, 1440), Reception::Frame, "{text}");
+            assert_eq!(hear(text, 1448, 1440), Reception::Frame, "{text} 0.5 % slower");
         }
     }
 
@@ -165,7 +165,7 @@ mod tests {
         for text in ["123#", "7FF#FFFFFFFFFFFFFFFF", "1ABCDEF0#1122334455667788"] {
             for receiver in [360, 720, 1152, 1800, 2880, 5760] {
                 let heard = hear(text, 1440, receiver);
-                assert!(matches!(heard, Heard::Error { .. }), "{text} at {receiver}: {heard:?}");
+                assert!(matches!(heard, Reception::Error { .. }), "{text} at {receiver}: {heard:?}");
             }
         }
     }

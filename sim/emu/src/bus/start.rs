@@ -68,7 +68,7 @@ impl Wire {
                 let own = match collision {
                     Some((_, at)) => Some((*at, BusErrorKind::BitRecessive)),
                     None if position < senders => None,
-                    None => self.misheard(*member, bits, bit, can),
+                    None => self.misreceived(*member, bits, bit, can),
                 };
                 let (acknowledges, flags) = self.abilities(*member, can);
                 Participant { sender: position < senders, acknowledges, flags, own }
@@ -177,7 +177,7 @@ impl Wire {
     }
 
     /// The error that a receiver of another bit rate sees, and the sender's bit at which it sees it.
-    fn misheard(
+    fn misreceived(
         &self,
         member: Member,
         bits: &FrameBits,
@@ -192,8 +192,8 @@ impl Wire {
         levels[bits.ack_slot()] = false;
         let timing = can.controllers[n].timing();
         match sampling::listen(&levels, |n| bit.cycles(n as u64), &timing) {
-            sampling::Heard::Frame => None,
-            sampling::Heard::Error { after, kind } => {
+            sampling::Reception::Frame => None,
+            sampling::Reception::Error { after, kind } => {
                 let at = (0..bits.len()).take_while(|n| bit.cycles(*n as u64 + 1) < after).count();
                 Some((at.min(bits.len() - 2), kind))
             }

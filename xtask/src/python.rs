@@ -8,7 +8,7 @@ use xshell::{Shell, cmd};
 use crate::fleet;
 use crate::outcome::Outcome;
 use crate::peers::{self, Peers};
-use crate::workspace;
+use crate::{tests, workspace};
 
 /// Where its crate is.
 const MANIFEST: &str = "python/Cargo.toml";
@@ -75,8 +75,16 @@ pub fn check(shell: &Shell, peers: Option<&Peers>) -> Result<Outcome> {
     // Built by the tests' step; without it, the tests that need a server say that they were skipped.
     let command = workspace::target().join("debug/cantap");
     let named = command.exists().then_some(("CANTAP_COMMAND", command));
+    let fleet = ["--ignore", "python/tests/test_fleet.py"];
+    // Most of them wait. python-can's look at the clock, so they run alone.
+    let alone = "python/tests/test_python_can_suite.py";
+    let workers = tests::threads().to_string();
+    let side_by_side = ["--numprocesses", &workers, "--dist", "worksteal", "--ignore", alone];
     // Not from `python/`, where `import cantap` would find the sources.
-    cmd!(shell, "{pytest} -m pytest --quiet python/tests --ignore python/tests/test_fleet.py")
+    cmd!(shell, "{pytest} -m pytest --quiet python/tests {fleet...} {side_by_side...}")
+        .envs(named.clone())
+        .run()?;
+    cmd!(shell, "{pytest} -m pytest --quiet {alone}")
         .env("CANTAP_PYTHON_CAN_SOURCE", suite)
         .envs(named)
         .run()?;

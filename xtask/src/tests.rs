@@ -27,9 +27,7 @@ pub fn run(shell: &Shell, peers: Option<&Peers>, boards: &[Board]) -> Result<()>
             .env("CANTAP_WITHOUT_PEERS", peers.left_out.join(" "));
     }
     if std::env::var_os("RUST_TEST_THREADS").is_none() {
-        // Most tests wait for devices and programs; those that fill a processor take turns.
-        let cores = std::thread::available_parallelism().map_or(1, usize::from);
-        test = test.env("RUST_TEST_THREADS", (2 * cores).to_string());
+        test = test.env("RUST_TEST_THREADS", threads().to_string());
     }
     if Board::ALL[0].elf().exists() {
         test = test
@@ -37,6 +35,11 @@ pub fn run(shell: &Shell, peers: Option<&Peers>, boards: &[Board]) -> Result<()>
             .args(OTHERWISE_IGNORED.iter().flat_map(|name| ["--skip", name]));
     }
     Ok(test.run()?)
+}
+
+/// How many tests run side by side: most wait for devices and programs, and those that fill a processor take turns.
+pub fn threads() -> usize {
+    2 * std::thread::available_parallelism().map_or(1, usize::from)
 }
 
 /// Tests that are ignored for a reason other than that they run the firmware.

@@ -128,6 +128,9 @@ impl Ledger {
                     "the device reports a CAN FD frame, which no board can receive: {received:?}"
                 ));
             }
+            Heard::Record(_, Record::TransmittedFd(sent)) => {
+                self.fault(format!("the device reports a CAN FD frame sent, which no board can: {sent:?}"));
+            }
             Heard::Record(_, Record::Event(_)) | Heard::Ended(..) => {}
             Heard::BatchesLost(frames) => {
                 for (books, lost) in self.books.iter_mut().zip(frames) {

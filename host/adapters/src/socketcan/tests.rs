@@ -6,7 +6,7 @@ use cantap_trace::socketcan::ERROR_FLAG;
 use cantap_wire::record::Stamp;
 
 use super::*;
-use crate::raw_can::RawFrame;
+use crate::raw_can::{RawFdFrame, RawFrame};
 
 /// What the kernel has, and what was sent.
 #[derive(Default)]
@@ -16,6 +16,7 @@ struct State {
     /// The next thing that a read returns: a message, or an error.
     arrived: VecDeque<Result<Message, i32>>,
     sent: Vec<RawFrame>,
+    sent_fd: Vec<RawFdFrame>,
     /// What the next attempts to send return.
     refusals: VecDeque<i32>,
     dropped: u32,
@@ -69,6 +70,15 @@ impl Interface for Fake {
             return Err(io::Error::from_raw_os_error(code));
         }
         state.sent.push(*frame);
+        Ok(())
+    }
+
+    fn send_fd(&mut self, frame: &RawFdFrame) -> io::Result<()> {
+        let mut state = self.lock();
+        if let Some(code) = state.refusals.pop_front() {
+            return Err(io::Error::from_raw_os_error(code));
+        }
+        state.sent_fd.push(*frame);
         Ok(())
     }
 

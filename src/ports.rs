@@ -4,9 +4,9 @@
 //! A CAN controller has two sides. [`Traffic`] is touched only by the tasks of priority 4, [`Control`]
 //! only by commands; the registers behind them are disjoint, so neither waits for the other.
 
-use cantap_wire::{FdFrame, Frame};
 use cantap_wire::message::{ChannelConfig, Failures, RegisterSet};
 use cantap_wire::record::{BusErrorKind, ErrorState};
+use cantap_wire::{FdFrame, Frame};
 
 use crate::bus::filters::Layout;
 

@@ -39,7 +39,9 @@ impl Outgoing {
         match *self {
             Self::Classic(frame) => recorder.event(&Event::Transmitted { channel, tag, frame }, at),
             #[cfg(not(target_os = "none"))]
-            Self::Fd(frame) => recorder.fd_confirmation(&cantap_wire::TransmittedFd { channel, tag, frame }, at),
+            Self::Fd(frame) => {
+                recorder.fd_confirmation(&cantap_wire::TransmittedFd { channel, tag, frame }, at)
+            }
         }
     }
 }

@@ -2,9 +2,9 @@
 //! of what did not fit.
 
 use cantap_wire::record::{LossStage, encode_event, encode_received_fd};
+use cantap_wire::{CHANNELS, Channel, Event, Received, ReceivedFd, Stamp};
 #[cfg(not(target_os = "none"))]
 use cantap_wire::{TransmittedFd, record::encode_transmitted_fd};
-use cantap_wire::{CHANNELS, Channel, Event, Received, ReceivedFd, Stamp};
 
 use crate::QUEUE_BYTES;
 use crate::bus::queue::Producer;

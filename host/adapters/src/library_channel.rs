@@ -4,8 +4,8 @@
 use std::time::{Duration, Instant};
 
 use cantap_trace::{TraceFrame, clean};
-use cantap_wire::record::{ErrorState, LossStage};
 use cantap_wire::Channel;
+use cantap_wire::record::{ErrorState, LossStage};
 
 use crate::driver::{At, Incoming, Oddities};
 use crate::error_frames::ErrorFrames;

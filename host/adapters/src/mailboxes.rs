@@ -7,9 +7,9 @@ use std::rc::Rc;
 use cantap_firmware::bus::mailboxes::MAILBOXES;
 use cantap_firmware::ports::{Control, ErrorStatus, Outcome, Traffic};
 use cantap_trace::TraceFrame;
-use cantap_wire::{FdFrame, Frame};
 use cantap_wire::message::{ChannelConfig, RegisterSet};
 use cantap_wire::record::{BusErrorKind, ErrorState};
+use cantap_wire::{FdFrame, Frame};
 
 /// Whether a channel takes part in its bus.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

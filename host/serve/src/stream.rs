@@ -355,7 +355,13 @@ mod tests {
         gap.absorb(1000, &Record::Event(own));
         let state = Event::State { channel, state: ErrorState::Passive, tec: 128, rec: 999u16 as u8 };
         let overtaken = TransmitFailure::Overtaken { periods: 2000 };
-        let events = gap.events();
+        let id = cantap_wire::Id::standard(0x123).unwrap();
+        let fd = cantap_wire::FdFrame::new(id, true, false, &[7; 12]).unwrap();
+        let own_fd = Record::TransmittedFd(TransmittedFd { channel, tag: 8, frame: fd });
+        assert_eq!(gap.absorb(1000, &own_fd), None);
+        let others = Record::TransmittedFd(TransmittedFd { channel, tag: OTHERS_TAG, frame: fd });
+        assert_eq!(gap.absorb(1000, &others), Some(channel));
+        let events = gap.records();
         assert_eq!(
             events,
             [
@@ -363,9 +369,15 @@ mod tests {
                 (999, state),
                 (999, Event::TransmitFailed { channel, tag: DEVICE_TAG, reason: overtaken }),
                 (1000, own),
-                (1000, Event::ErrorsSuppressed { channel, count: 1000 }),
-                (1000, lost(channel, LossStage::Host, 2000, false)),
             ]
+            .map(|(ticks, event)| (ticks, Record::Event(event)))
+            .into_iter()
+            .chain([
+                (1000, own_fd),
+                (1000, Record::Event(Event::ErrorsSuppressed { channel, count: 1000 })),
+                (1000, Record::Event(lost(channel, LossStage::Host, 2001, false))),
+            ])
+            .collect::<Vec<_>>()
         );
     }
 }

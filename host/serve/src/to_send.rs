@@ -46,7 +46,8 @@ pub fn command(channel: Channel, frames: &[ToSend]) -> Command {
             Command::SendFd { channel, frames }
         }
         _ => {
-            let classic = |frame: &ToSend| if let ToSend::Classic(frame) = frame { Some(*frame) } else { None };
+            let classic =
+                |frame: &ToSend| if let ToSend::Classic(frame) = frame { Some(*frame) } else { None };
             Command::Send { channel, frames: frames.iter().filter_map(classic).collect() }
         }
     }

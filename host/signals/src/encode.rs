@@ -62,8 +62,11 @@ pub fn encode_any(
         return Ok(encode(decoder, channel, text)?.frame.into());
     }
     let data = encode_message(message, &inputs)?;
-    let frame =
-        if pad { FdFrame::padded(message.id, brs, false, &data) } else { FdFrame::new(message.id, brs, false, &data) };
+    let frame = if pad {
+        FdFrame::padded(message.id, brs, false, &data)
+    } else {
+        FdFrame::new(message.id, brs, false, &data)
+    };
     frame.map(TraceFrame::Fd).ok_or_else(|| EncodeError::TooLong {
         what: format!("message {name}"),
         bytes: message.length.into(),

@@ -157,7 +157,9 @@ pub enum DeviceError {
         channel: Channel,
     },
     /// The device sends no CAN FD frames.
-    #[error("the device sends no CAN FD frames, but classical ones of up to eight bytes; nothing was sent in their place")]
+    #[error(
+        "the device sends no CAN FD frames, but classical ones of up to eight bytes; nothing was sent in their place"
+    )]
     NoFd,
     /// Another maker's adapter cannot listen without acknowledging.
     #[error(

@@ -88,8 +88,7 @@ pub fn encode_transmitted_fd(sent: &TransmittedFd, ticks: i64, out: &mut [u8; MA
 /// Writes header and identifier after the first byte, and returns the length of all of it.
 fn put_head(channel: Channel, frame: &FdFrame, out: &mut [u8; MAX_FD_RECORD]) -> usize {
     let id = frame.id();
-    out[1] =
-        FRAME | (channel.index() as u8) << 6 | if id.is_extended() { 0x20 } else { 0 } | frame.dlc();
+    out[1] = FRAME | (channel.index() as u8) << 6 | if id.is_extended() { 0x20 } else { 0 } | frame.dlc();
     out[2..6].copy_from_slice(&id.raw().to_le_bytes());
     if id.is_extended() { 6 } else { 4 }
 }
@@ -141,8 +140,7 @@ pub(super) fn decode_sent(bytes: &[u8]) -> Result<(TransmittedFd, i64, &[u8]), B
     let (ticks, rest) = decode_ticks(rest)?;
     let len = usize::from(FD_LENGTHS[usize::from(header & 15)]);
     let (data, rest) = rest.split_at_checked(len).ok_or(BadRecord)?;
-    let frame =
-        FdFrame::new(id, flags & SENT_BRS != 0, flags & SENT_ESI != 0, data).ok_or(BadRecord)?;
+    let frame = FdFrame::new(id, flags & SENT_BRS != 0, flags & SENT_ESI != 0, data).ok_or(BadRecord)?;
     Ok((TransmittedFd { channel: channel_of(header), tag, frame }, ticks, rest))
 }
 

@@ -7,9 +7,8 @@ use cantap_wire::Channel::{Can1, Can2};
 use cantap_wire::batch::BatchHeader;
 use cantap_wire::framing::MAX_REQUEST;
 use cantap_wire::message::{
-    Checksum, DeviceMessage, EndReason, Filter, FrameKind, MAX_FILTERS, MAX_SEND, MAX_SEND_FD, Mode, SessionEnd,
-    TxFdFrame, TxFrame,
-    read_send, why_unreadable, write_response,
+    Checksum, DeviceMessage, EndReason, Filter, FrameKind, MAX_FILTERS, MAX_SEND, MAX_SEND_FD, Mode,
+    SessionEnd, TxFdFrame, TxFrame, read_send, why_unreadable, write_response,
 };
 use cantap_wire::record::{
     MAX_FD_RECORD, MAX_RECORD, encode_event, encode_received, encode_received_fd, encode_transmitted_fd,
@@ -216,7 +215,8 @@ fn the_longest_request_fits() {
     let request = Request { id: u16::MAX, command: Command::SetFilters { channel: Can2, filters } };
     assert!(postcard::to_slice(&request, &mut [0; MAX_REQUEST]).is_ok());
     let frame = FdFrame::new(Id::extended(Id::MAX_EXTENDED).unwrap(), true, true, &[0xFF; 64]).unwrap();
-    let frames = [TxFdFrame { tag: u32::MAX, frame, at_ticks: Some(u64::MAX) }; MAX_SEND_FD].into_iter().collect();
+    let frames =
+        [TxFdFrame { tag: u32::MAX, frame, at_ticks: Some(u64::MAX) }; MAX_SEND_FD].into_iter().collect();
     let request = Request { id: u16::MAX, command: Command::SendFd { channel: Can2, frames } };
     assert!(postcard::to_slice(&request, &mut [0; MAX_REQUEST]).is_ok());
 }

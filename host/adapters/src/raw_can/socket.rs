@@ -191,7 +191,8 @@ impl RawSocket {
 
     fn send_messages<'m>(&self, messages: impl Iterator<Item = &'m [u8]>) -> io::Result<usize> {
         let mut headers = MultiHeaders::<()>::preallocate(BATCH, None);
-        let slices: Vec<[IoSlice<'_>; 1]> = messages.take(BATCH).map(|message| [IoSlice::new(message)]).collect();
+        let slices: Vec<[IoSlice<'_>; 1]> =
+            messages.take(BATCH).map(|message| [IoSlice::new(message)]).collect();
         let taken = sendmmsg(
             self.socket.as_raw_fd(),
             &mut headers,

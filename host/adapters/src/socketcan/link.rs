@@ -256,6 +256,8 @@ mod tests {
             IFF_UP | IFF_ECHO,
             &[
                 attribute(IFLA_IFNAME, b"can0\0"),
+                // `CAN_MTU`, or `CANFD_MTU` as the driver sets it.
+                attribute(IFLA_MTU, &words(&[if fd == 0 { 16 } else { 72 }])),
                 attribute(IFLA_STATS64, &stats),
                 nested(IFLA_LINKINFO, &[attribute(IFLA_INFO_KIND, b"can\0"), data]),
             ],
@@ -272,6 +274,7 @@ mod tests {
             kind: "can".to_owned(),
             bitrate_bps: Some(500_000),
             data_bitrate_bps: Some(2_000_000),
+            takes_fd: true,
             listen_only: true,
             state: Some(ErrorState::Passive),
             counters: Some((130, 255)),
@@ -281,7 +284,7 @@ mod tests {
         assert_eq!(read, wanted);
         // A data bit rate that was set once says nothing while CAN FD is off.
         let classical = answer(&controller(0)).unwrap();
-        assert_eq!(classical, Link { data_bitrate_bps: None, ..wanted });
+        assert_eq!(classical, Link { data_bitrate_bps: None, takes_fd: false, ..wanted });
     }
 
     #[test]

@@ -229,7 +229,13 @@ impl SocketCan {
     }
 
     /// What became of a frame that was given to the interface: false if it cannot take it now.
-    fn handed_over(&mut self, sent: io::Result<()>, channel: Channel, mailbox: u8, frame: TraceFrame) -> bool {
+    fn handed_over(
+        &mut self,
+        sent: io::Result<()>,
+        channel: Channel,
+        mailbox: u8,
+        frame: TraceFrame,
+    ) -> bool {
         let Err(error) = sent else {
             self.in_flight.push_back((mailbox, frame));
             return true;

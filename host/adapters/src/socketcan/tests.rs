@@ -392,3 +392,26 @@ fn what_waits_in_the_socket_when_a_channel_is_closed_is_delivered() {
     let count = records.filter(|record| record.as_ref().is_ok_and(|record| record.frame().is_some())).count();
     assert_eq!(count, 20_000);
 }
+
+#[test]
+fn fd_frames_are_sent_where_the_interface_takes_them_and_confirmed_as_they_come_back() {
+    let (fake, mut driver) = opened(Link { takes_fd: true, ..controller() });
+    assert!(driver.sends_fd());
+    let id = cantap_wire::Id::extended(0x18DA_F110).unwrap();
+    let frame = FdFrame::new(id, true, false, &[0xA5; 64]).unwrap();
+    assert!(driver.send_fd(Channel::Can1, 1, &frame));
+    let sent = fake.lock().sent_fd[0];
+    assert_eq!((sent[4], sent[5], sent[71]), (64, 5, 0xA5));
+    // The driver has found that its controller is error passive.
+    let mut back = fd_message(0x98DA_F110, 7, &[0xA5; 64]);
+    back.is_own = true;
+    fake.lock().arrived = [Ok(fd_message(0x98DA_F110, 5, &[0xA5; 64])), Ok(back)].into();
+    assert_eq!(reports(&mut driver), [format!("18DAF110##1{}", "A5".repeat(64)), "sent 1".to_owned()]);
+    // The queue is full, then the owner has switched CAN FD off.
+    fake.lock().refusals = [ENOBUFS, nix::libc::EINVAL].into();
+    assert!(!driver.send_fd(Channel::Can1, 2, &frame));
+    assert!(driver.send_fd(Channel::Can1, 2, &frame));
+    assert_eq!(reports(&mut driver), ["not sent 2"]);
+    let (_, driver) = opened(controller());
+    assert!(!driver.sends_fd());
+}

@@ -4,9 +4,9 @@
 //! A CAN controller has two sides. [`Traffic`] is touched only by the tasks of priority 4, [`Control`]
 //! only by commands; the registers behind them are disjoint, so neither waits for the other.
 
-use cantap_wire::Frame;
 use cantap_wire::message::{ChannelConfig, Failures, RegisterSet};
 use cantap_wire::record::{BusErrorKind, ErrorState};
+use cantap_wire::{FdFrame, Frame};
 
 use crate::bus::filters::Layout;
 
@@ -73,6 +73,10 @@ pub trait Traffic {
     /// Writes a frame to a free mailbox, where it waits for [`Self::request`], or is overwritten by the next call.
     /// Returns the mailbox, a number below [`crate::bus::mailboxes::MAILBOXES`], or `None` if all are taken.
     fn prepare(&mut self, frame: &Frame) -> Option<u8>;
+    /// The same for a CAN FD frame, which no controller of a board takes.
+    fn prepare_fd(&mut self, _frame: &FdFrame) -> Option<u8> {
+        None
+    }
     /// Requests transmission of the frame that was last prepared, which is in this mailbox. Takes next to no time; frames
     /// leave in the order of these calls.
     fn request(&mut self, mailbox: u8);

@@ -31,6 +31,14 @@ impl FdFrame {
         Some(Self { id, dlc, brs, esi, data })
     }
 
+    /// The same with zeros after the bytes, up to the next length that FD has; `None` above 64.
+    pub fn padded(id: Id, brs: bool, esi: bool, bytes: &[u8]) -> Option<Self> {
+        let len = FD_LENGTHS.iter().find(|len| usize::from(**len) >= bytes.len())?;
+        let mut data = [0; FD_MAX_BYTES];
+        data[..bytes.len()].copy_from_slice(bytes);
+        Self::new(id, brs, esi, &data[..usize::from(*len)])
+    }
+
     /// The identifier.
     pub const fn id(&self) -> Id {
         self.id
@@ -107,6 +115,12 @@ mod tests {
             let known = FD_LENGTHS.iter().any(|known| usize::from(*known) == len);
             assert_eq!(frame.is_some(), known, "{len}");
             assert!(frame.is_none_or(|frame| frame.data() == &[7; 70][..len]));
+            let padded = FdFrame::padded(id, false, true, &[7; 70][..len]);
+            assert_eq!(padded.is_some(), len <= 64);
+            assert!(padded.is_none_or(|frame| {
+                let (data, padding) = frame.data().split_at(len);
+                data == &[7; 70][..len] && padding.iter().all(|byte| *byte == 0) && padding.len() < 16
+            }));
         }
     }
 }

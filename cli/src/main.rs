@@ -28,6 +28,7 @@ mod commands;
 mod completion;
 mod database_args;
 mod exit;
+mod fd_frames;
 mod input;
 mod live_args;
 mod one_board;

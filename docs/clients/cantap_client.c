@@ -17,7 +17,7 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { PROTOCOL = 6, MAX_MESSAGE = 2048, MAX_ENCODED = MAX_MESSAGE + 4 + 9 + 1, HELLO = 0, OWN_TAG = 7 };
+enum { PROTOCOL = 7, MAX_MESSAGE = 2048, MAX_ENCODED = MAX_MESSAGE + 4 + 9 + 1, HELLO = 0, OWN_TAG = 7 };
 
 static const char *const REPLIES[] = {"Hello", "Done", "Opened", "Status", "Time", "Filters", "Queued", "Registers", "Defaults",
                                       "Failures", "Edges", "Gateway", "GatewayRule"};

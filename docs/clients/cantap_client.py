@@ -6,7 +6,7 @@
 """
 import os, select, sys, time, tty, zlib
 
-PROTOCOL = 6
+PROTOCOL = 7
 REPLIES = "Hello Done Opened Status Time Filters Queued Registers Defaults Failures Edges Gateway GatewayRule".split()
 REFUSALS = ("Protocol Malformed NoSession Unsupported BadTiming BadId BadDlc BadTag BadEntry BadSlot ChannelOpen ChannelClosed "
             "ListenOnly QueueFull BanksExhausted WouldDisturb TooFarAhead Hardware NothingSaved NotBusOff "

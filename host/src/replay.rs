@@ -7,12 +7,13 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use cantap_wire::{CHANNELS, Channel, Frame};
+use cantap_trace::TraceFrame;
+use cantap_wire::{CHANNELS, Channel};
 
 use crate::device::Transmission;
 use crate::transmit::Stream;
 use crate::{Device, DeviceError};
-use cantap_trace::bits::{FrameBits, INTERMISSION_BITS};
+use cantap_trace::bits::INTERMISSION_BITS;
 
 /// From now to the first frame: time to fill the device's queue.
 const LEAD: Duration = Duration::from_millis(100);
@@ -47,6 +48,7 @@ impl Default for Pace {
 pub struct Timetable {
     pace: Pace,
     bitrates_bps: [u32; CHANNELS],
+    data_bitrates_bps: [Option<u32>; CHANNELS],
     tick_ns: f64,
     first_ticks: u64,
     /// Begin of the last frame in the trace and in the replay, in ns since the first.
@@ -61,6 +63,7 @@ impl Timetable {
         Self {
             pace,
             bitrates_bps,
+            data_bitrates_bps: [None; CHANNELS],
             tick_ns: 1e9 / f64::from(tick_hz),
             first_ticks,
             last: None,
@@ -68,15 +71,24 @@ impl Timetable {
         }
     }
 
+    /// With these bit rates of the data phases of CAN FD frames. Without one, a frame that switches its bit rate is taken to be as long as
+    /// one that does not, and begins early.
+    pub fn with_data_bitrates(self, data_bitrates_bps: [Option<u32>; CHANNELS]) -> Self {
+        Self { data_bitrates_bps, ..self }
+    }
+
     /// A frame's time on the bus without intermission, in ns.
-    fn length_ns(&self, channel: Channel, frame: &Frame) -> f64 {
-        let bits = FrameBits::of(frame).total() - INTERMISSION_BITS;
-        f64::from(bits) * 1e9 / f64::from(self.bitrates_bps[channel.index()].max(1))
+    fn length_ns(&self, channel: Channel, frame: &TraceFrame) -> f64 {
+        let bits = frame.bus_bits();
+        let nominal_bps = self.bitrates_bps[channel.index()].max(1);
+        let data_bps = self.data_bitrates_bps[channel.index()].unwrap_or(nominal_bps).max(1);
+        f64::from(bits.nominal - INTERMISSION_BITS) * 1e9 / f64::from(nominal_bps)
+            + f64::from(bits.data) * 1e9 / f64::from(data_bps)
     }
 
     /// When a frame that ended at `end_ns` in the trace should begin, and when it will end, in ticks. A beginning before
     /// the device's start becomes 0; an end before it wraps.
-    pub fn next(&mut self, end_ns: i64, channel: Channel, frame: &Frame) -> (u64, u64) {
+    pub fn next(&mut self, end_ns: i64, channel: Channel, frame: &TraceFrame) -> (u64, u64) {
         let length_ns = self.length_ns(channel, frame);
         let begin_ns = end_ns - length_ns.round() as i64;
         let at_ns = self.last.map_or(0.0, |(last_ns, last_at_ns)| {
@@ -137,7 +149,9 @@ impl<'d> Replay<'d> {
     pub fn new(device: &'d Device, pace: Pace, bitrates_bps: [u32; CHANNELS]) -> Result<Self, DeviceError> {
         let tick_hz = device.hello().tick_hz;
         let lead = (LEAD.as_secs_f64() * f64::from(tick_hz)) as u64;
-        let timetable = Timetable::new(pace, bitrates_bps, tick_hz, device.time()? + lead);
+        let data_bitrates_bps = Channel::ALL.map(|channel| device.data_bitrate(channel));
+        let timetable = Timetable::new(pace, bitrates_bps, tick_hz, device.time()? + lead)
+            .with_data_bitrates(data_bitrates_bps);
         Ok(Self {
             device,
             stream: Stream::new(device),
@@ -156,9 +170,10 @@ impl<'d> Replay<'d> {
         &mut self,
         end_ns: i64,
         channel: Channel,
-        frame: Frame,
+        frame: impl Into<TraceFrame>,
         mut go_on: impl FnMut(&mut Self) -> bool,
     ) -> Result<bool, DeviceError> {
+        let frame = frame.into();
         let (begin, end) = self.timetable.next(end_ns, channel, &frame);
         let ignore_times = self.timetable.pace.ignore_times;
         let at = (!ignore_times).then_some(begin);
@@ -259,7 +274,7 @@ mod tests {
         Timetable::new(pace, [1_000_000, 500_000], 12_000_000, 1_000)
     }
 
-    fn frame(text: &str) -> Frame {
+    fn frame(text: &str) -> TraceFrame {
         text.parse().unwrap()
     }
 
@@ -272,6 +287,19 @@ mod tests {
             .map(|(end_ns, frame)| table.next(*end_ns, CAN1, frame).1)
             .collect();
         assert_eq!([ends[1] - ends[0], ends[2] - ends[1]], [3_600, 2_400]);
+    }
+
+    #[test]
+    fn a_can_fd_frame_takes_as_long_as_both_its_bit_rates_make_it() {
+        let long = frame(&format!("123##1{}", "55".repeat(64)));
+        let length = |data_bitrates_bps| {
+            let (begin, end) =
+                table(Pace::default()).with_data_bitrates(data_bitrates_bps).next(0, CAN1, &long);
+            end - begin
+        };
+        let bits = long.bus_bits();
+        assert_eq!(length([None; 2]), u64::from(12 * (bits.nominal - 3 + bits.data)));
+        assert_eq!(length([Some(4_000_000), None]), u64::from(12 * (bits.nominal - 3) + 3 * bits.data));
     }
 
     #[test]

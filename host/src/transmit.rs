@@ -9,8 +9,9 @@ use std::collections::VecDeque;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
-use cantap_wire::message::{MAX_SEND, TxFrame};
-use cantap_wire::{CHANNELS, Channel, Command, Frame};
+use cantap_trace::TraceFrame;
+use cantap_wire::message::{MAX_SEND, MAX_SEND_FD, TxFdFrame, TxFrame};
+use cantap_wire::{CHANNELS, Channel, Command};
 
 use crate::device::{Pending, Transmission};
 use crate::{Device, DeviceError};
@@ -22,9 +23,64 @@ const LOOK_EVERY: Duration = Duration::from_millis(20);
 /// Tags wrap here, far below the device's own tags and far above the number in flight.
 const TAGS: u32 = 1 << 24;
 
+/// Frames for one request: of one kind.
+enum Batch {
+    Classic(heapless::Vec<TxFrame, MAX_SEND>),
+    Fd(heapless::Vec<TxFdFrame, MAX_SEND_FD>),
+}
+
+impl Default for Batch {
+    fn default() -> Self {
+        Self::Classic(heapless::Vec::new())
+    }
+}
+
+impl Batch {
+    fn len(&self) -> usize {
+        match self {
+            Self::Classic(frames) => frames.len(),
+            Self::Fd(frames) => frames.len(),
+        }
+    }
+
+    fn is_full(&self) -> bool {
+        match self {
+            Self::Classic(frames) => frames.is_full(),
+            Self::Fd(frames) => frames.is_full(),
+        }
+    }
+
+    /// Adds a frame; false if the batch has none of its kind, but others.
+    fn push(&mut self, tag: u32, frame: TraceFrame, at_ticks: Option<u64>) -> bool {
+        if self.len() == 0 {
+            *self = match frame {
+                TraceFrame::Classic(_) => Self::Classic(heapless::Vec::new()),
+                TraceFrame::Fd(_) => Self::Fd(heapless::Vec::new()),
+            };
+        }
+        // There is room: a full batch is sent at once.
+        match (self, frame) {
+            (Self::Classic(frames), TraceFrame::Classic(frame)) => {
+                frames.push(TxFrame { tag, frame, at_ticks }).is_ok()
+            }
+            (Self::Fd(frames), TraceFrame::Fd(frame)) => {
+                frames.push(TxFdFrame { tag, frame, at_ticks }).is_ok()
+            }
+            _ => false,
+        }
+    }
+
+    fn command(self, channel: Channel) -> Command {
+        match self {
+            Self::Classic(frames) => Command::Send { channel, frames },
+            Self::Fd(frames) => Command::SendFd { channel, frames },
+        }
+    }
+}
+
 #[derive(Default)]
 struct Lane {
-    batch: heapless::Vec<TxFrame, MAX_SEND>,
+    batch: Batch,
     /// Tag and due time (0: immediately) of frames that have not ended, in order, including those in the
     /// batch.
     waiting: VecDeque<(u32, u64)>,
@@ -64,10 +120,12 @@ impl<'d> Stream<'d> {
 
     /// Adds a frame, to be sent no earlier than a device time. Waits while the device's queue is full, and
     /// returns `None` if `go_on` returned false meanwhile. Otherwise returns the tag of its confirmation.
+    ///
+    /// A CAN FD frame is refused ([`DeviceError::NoFd`]) if the device sends none.
     pub fn push(
         &mut self,
         channel: Channel,
-        frame: Frame,
+        frame: impl Into<TraceFrame>,
         at_ticks: Option<u64>,
         mut go_on: impl FnMut(&mut Self) -> bool,
     ) -> Result<Option<u32>, DeviceError> {
@@ -77,7 +135,7 @@ impl<'d> Stream<'d> {
                 return Ok(None);
             }
         }
-        self.add(channel, frame, at_ticks).map(Some)
+        self.add(channel, frame.into(), at_ticks).map(Some)
     }
 
     /// Whether the device's queue is full.
@@ -97,14 +155,21 @@ impl<'d> Stream<'d> {
     pub(crate) fn add(
         &mut self,
         channel: Channel,
-        frame: Frame,
+        frame: TraceFrame,
         at_ticks: Option<u64>,
     ) -> Result<u32, DeviceError> {
+        if frame.is_fd() && !self.device.hello().sends_fd() {
+            return Err(DeviceError::NoFd);
+        }
         let lane = self.lane(channel);
         let tag = lane.next_tag;
         lane.next_tag = (tag + 1) % TAGS;
-        // Cannot fail: a full batch is sent below.
-        let _ = lane.batch.push(TxFrame { tag, frame, at_ticks });
+        if !lane.batch.push(tag, frame, at_ticks) {
+            self.send(channel)?;
+            // Cannot fail: it is empty.
+            self.lane(channel).batch.push(tag, frame, at_ticks);
+        }
+        let lane = self.lane(channel);
         lane.waiting.push_back((tag, at_ticks.unwrap_or(0)));
         if lane.batch.is_full() {
             self.send(channel)?;
@@ -116,7 +181,7 @@ impl<'d> Stream<'d> {
     /// Hands everything to the device.
     pub fn flush(&mut self) -> Result<(), DeviceError> {
         for channel in Channel::ALL {
-            if !self.lane(channel).batch.is_empty() {
+            if self.lane(channel).batch.len() > 0 {
                 self.send(channel)?;
             }
         }
@@ -169,13 +234,13 @@ impl<'d> Stream<'d> {
 
     fn send(&mut self, channel: Channel) -> Result<(), DeviceError> {
         let lane = self.lane(channel);
-        let frames = std::mem::take(&mut lane.batch);
+        let batch = std::mem::take(&mut lane.batch);
         if self.requests.len() >= REQUESTS
             && let Some(oldest) = self.requests.pop_front()
         {
             oldest.wait()?;
         }
-        self.requests.push_back(self.device.request_later(Command::Send { channel, frames })?);
+        self.requests.push_back(self.device.request_later(batch.command(channel))?);
         Ok(())
     }
 

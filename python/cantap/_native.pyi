@@ -243,7 +243,7 @@ class Scan(Iterator[Table]):
 
 @final
 class Frame:
-    """A classical CAN frame."""
+    """A CAN frame: classical, or of CAN FD (`fd`, `brs` or `esi`)."""
 
     def __new__(
         cls,
@@ -253,10 +253,13 @@ class Frame:
         extended: bool | None = None,
         remote: bool = False,
         dlc: int | None = None,
+        fd: bool = False,
+        brs: bool = False,
+        esi: bool = False,
     ) -> Frame: ...
     @staticmethod
     def parse(text: str) -> Frame:
-        """Parses a frame as can-utils writes it: `123#1122`, `00000123#R3`."""
+        """Parses a frame as can-utils writes it: `123#1122`, `00000123#R3`, `123##11122`."""
     @property
     def id(self) -> int:
         """The identifier."""
@@ -266,6 +269,15 @@ class Frame:
     @property
     def remote(self) -> bool:
         """Whether it asks for data and has none."""
+    @property
+    def fd(self) -> bool:
+        """Whether it is a CAN FD frame."""
+    @property
+    def brs(self) -> bool:
+        """Whether its data have a bit rate of their own."""
+    @property
+    def esi(self) -> bool:
+        """Whether it says that its sender is error passive."""
     @property
     def dlc(self) -> int:
         """The length code, as on the bus."""

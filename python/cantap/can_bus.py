@@ -151,8 +151,8 @@ class CantapBus(can.BusABC):
         rx_capacity: int = CAPACITY,
         **kwargs: Any,
     ) -> None:
-        if isinstance(timing, can.BitTimingFd) or kwargs.get("fd"):
-            raise can.CanInitializationError("the analyser has no CAN FD; open the channel without it")
+        if isinstance(timing, can.BitTimingFd):
+            raise can.CanInitializationError("the data bit rate belongs into the address, as in gs_usb:?data-bitrate=2M; give a can.BitTiming")
         if timing is not None and not isinstance(timing, can.BitTiming):
             raise TypeError(f"timing is a can.BitTiming, not {type(timing).__name__}")
         if state is can.BusState.ERROR:
@@ -182,6 +182,12 @@ class CantapBus(can.BusABC):
                 if session is None or session.is_gone():
                     session = _Session(self._address)
                 self._device = session.device
+                if self._device.info["transmits_fd"]:
+                    self._can_protocol = can.CanProtocol.CAN_FD
+                elif kwargs.get("fd"):
+                    raise can.CanInitializationError(
+                        "this device sends no CAN FD frames; open the channel without fd, or give an adapter its data bit rate"
+                    )
                 self._options["segments"] = self._segments(timing)
                 # Before the first frame can arrive. Messages of other Bus objects come as if from another node.
                 self._records = self._device._native.records(
@@ -488,9 +494,17 @@ class DeviceCyclicTask(
 def _frame(msg: can.Message) -> _native.Frame:
     if msg.is_error_frame:
         raise can.CanOperationError("an error frame cannot be sent")
-    if msg.is_fd:
-        raise can.CanOperationError("the analyser has no CAN FD; send a frame of up to 8 bytes")
     try:
+        if msg.is_fd:
+            return _native.Frame(
+                msg.arbitration_id,
+                bytes(msg.data),
+                extended=msg.is_extended_id,
+                remote=msg.is_remote_frame,
+                fd=True,
+                brs=msg.bitrate_switch,
+                esi=msg.error_state_indicator,
+            )
         if msg.is_remote_frame:
             return _native.Frame(msg.arbitration_id, extended=msg.is_extended_id, remote=True, dlc=msg.dlc)
         return _native.Frame(msg.arbitration_id, bytes(msg.data), extended=msg.is_extended_id)

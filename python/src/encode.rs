@@ -114,7 +114,7 @@ impl Database {
                 of.length
             ))
         })?;
-        Ok(Frame(frame))
+        Ok(Frame(frame.into()))
     }
 
     /// The message of a frame, and its values; `None` if no database has it.
@@ -152,7 +152,7 @@ fn any_frame(object: &Bound<'_, PyAny>) -> PyResult<Option<TraceFrame>> {
         let records = cantap_columns::records(&table.one_batch()?).map_err(Error::from)?;
         return Ok(records.first().and_then(|record| record.frame().copied()));
     }
-    object.extract::<AnyFrame>().map(|frame| Some(frame.0.into()))
+    object.extract::<AnyFrame>().map(|frame| Some(frame.0))
 }
 
 /// A column's signal: one whose name was taken has its message's in front.

@@ -2,8 +2,8 @@
 
 use cantap_columns::FrameColumns;
 use cantap_trace::{
-    BusErrorKind, Direction, Frame as ClassicFrame, Id, LossStage, TraceEvent, TraceFrame, TraceRecord,
-    TransmitFailure,
+    BusErrorKind, Direction, FdFrame, Frame as ClassicFrame, Id, LossStage, TraceEvent, TraceFrame,
+    TraceRecord, TransmitFailure,
 };
 use pyo3::exceptions::{PyOverflowError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
@@ -13,10 +13,10 @@ use crate::error::Error;
 use crate::number::Whole;
 use crate::table::Table;
 
-/// A classical CAN frame.
+/// A CAN frame: classical, or of CAN FD.
 #[pyclass(module = "cantap", frozen, eq, hash)]
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
-pub struct Frame(pub ClassicFrame);
+pub struct Frame(pub TraceFrame);
 
 /// An identifier; of 29 bits if `extended` says so, or if it is too large for 11.
 pub fn identifier(raw: u32, extended: Option<bool>) -> Result<Id, Error> {
@@ -31,18 +31,34 @@ pub fn identifier(raw: u32, extended: Option<bool>) -> Result<Id, Error> {
 #[pymethods]
 impl Frame {
     #[new]
-    #[pyo3(signature = (id, data=None, *, extended=None, remote=false, dlc=None))]
+    #[expect(clippy::too_many_arguments, reason = "each by its name")]
+    #[pyo3(signature = (id, data=None, *, extended=None, remote=false, dlc=None, fd=false, brs=false, esi=false))]
     fn new(
         id: Whole<u32>,
         data: Option<Bytes>,
         extended: Option<bool>,
         remote: bool,
         dlc: Option<Whole<u8>>,
+        fd: bool,
+        brs: bool,
+        esi: bool,
     ) -> PyResult<Self> {
         let id = identifier(id.0, extended)?;
         let dlc = dlc.map(|dlc| dlc.0);
         let data = data.map(|data| data.0).unwrap_or_default();
         let wrong = |words: &str| Err(PyValueError::new_err(words.to_owned()));
+        if fd || brs || esi {
+            if remote {
+                return wrong("CAN FD has no remote frames");
+            }
+            let frame = FdFrame::new(id, brs, esi, &data);
+            let Some(frame) = frame.filter(|frame| dlc.is_none_or(|dlc| dlc == frame.dlc())) else {
+                return wrong(
+                    "a CAN FD frame carries 0 to 8, 12, 16, 20, 24, 32, 48 or 64 bytes, from which its dlc follows; leave dlc out",
+                );
+            };
+            return Ok(Self(frame.into()));
+        }
         let frame = if remote {
             if !data.is_empty() {
                 return wrong("a remote frame has no data; give dlc, the length that it asks for");
@@ -55,8 +71,8 @@ impl Frame {
             ClassicFrame::data_frame(id, &data)
         };
         match frame {
-            Some(frame) => Ok(Self(frame)),
-            None => wrong("a frame carries 0 to 8 bytes"),
+            Some(frame) => Ok(Self(frame.into())),
+            None => wrong("a frame carries 0 to 8 bytes, and one of CAN FD (fd=True) up to 64"),
         }
     }
 
@@ -76,6 +92,24 @@ impl Frame {
     #[getter]
     fn remote(&self) -> bool {
         self.0.is_remote()
+    }
+
+    /// Whether it is a CAN FD frame.
+    #[getter]
+    fn fd(&self) -> bool {
+        self.0.is_fd()
+    }
+
+    /// Whether its data have a bit rate of their own.
+    #[getter]
+    fn brs(&self) -> bool {
+        self.0.fd().is_some_and(FdFrame::brs)
+    }
+
+    /// Whether it says that its sender is error passive.
+    #[getter]
+    fn esi(&self) -> bool {
+        self.0.fd().is_some_and(FdFrame::esi)
     }
 
     /// The length code, as on the bus.
@@ -102,10 +136,10 @@ impl Frame {
         Ok((py.get_type::<Self>().getattr("parse")?.unbind(), (self.0.to_string(),)))
     }
 
-    /// Parses a frame as can-utils writes it: `123#1122`, `00000123#R3`.
+    /// Parses a frame as can-utils writes it: `123#1122`, `00000123#R3`, `123##11122`.
     #[staticmethod]
     fn parse(text: &str) -> PyResult<Self> {
-        let frame = text.parse::<ClassicFrame>();
+        let frame = text.parse::<TraceFrame>();
         frame.map(Self).map_err(|error| {
             // Somebody may have passed a whole file.
             let end = text.char_indices().nth(40).map_or(text.len(), |(at, _)| at);
@@ -135,7 +169,16 @@ impl<'py> FromPyObject<'_, 'py> for Bytes {
 }
 
 /// A frame, or a text that can be parsed as one.
-pub struct AnyFrame(pub ClassicFrame);
+pub struct AnyFrame(pub TraceFrame);
+
+impl AnyFrame {
+    /// The frame, where only a classical one will do.
+    pub fn classic(&self, what: &str) -> PyResult<ClassicFrame> {
+        self.0.classic().copied().ok_or_else(|| {
+            PyValueError::new_err(format!("{what} is a classical frame, and {} is one of CAN FD", self.0))
+        })
+    }
+}
 
 impl<'py> FromPyObject<'_, 'py> for AnyFrame {
     type Error = PyErr;

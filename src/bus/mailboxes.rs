@@ -1,7 +1,8 @@
 //! What is in a controller's transmit mailboxes.
 
-use cantap_wire::Frame;
 use cantap_wire::message::{GATEWAY_TAG, OTHERS_TAG};
+
+use crate::bus::outgoing::Outgoing;
 
 /// Transmit mailboxes of a controller.
 pub const MAILBOXES: usize = 3;
@@ -9,7 +10,7 @@ pub const MAILBOXES: usize = 3;
 /// Frames by mailbox, with their tags. The count is kept because it is read far more often than it
 /// changes.
 pub(crate) struct Mailboxes {
-    places: [Option<(u32, Frame)>; MAILBOXES],
+    places: [Option<(u32, Outgoing)>; MAILBOXES],
     taken: usize,
 }
 
@@ -33,7 +34,7 @@ impl Mailboxes {
 
     /// A frame was written to an empty one.
     #[inline]
-    pub fn put(&mut self, mailbox: u8, tag: u32, frame: Frame) {
+    pub fn put(&mut self, mailbox: u8, tag: u32, frame: Outgoing) {
         if let Some(place) = self.places.get_mut(usize::from(mailbox)) {
             self.taken += usize::from(place.is_none());
             *place = Some((tag, frame));
@@ -42,7 +43,7 @@ impl Mailboxes {
 
     /// Empties a mailbox; `None` if it was empty already.
     #[inline]
-    pub fn take(&mut self, mailbox: u8) -> Option<(u32, Frame)> {
+    pub fn take(&mut self, mailbox: u8) -> Option<(u32, Outgoing)> {
         let held = self.places.get_mut(usize::from(mailbox))?.take()?;
         self.taken -= 1;
         Some(held)

@@ -9,6 +9,7 @@ pub mod errors;
 pub mod filters;
 pub mod gateway;
 pub mod mailboxes;
+mod outgoing;
 pub mod periodic;
 pub mod queue;
 pub mod recorder;

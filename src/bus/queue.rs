@@ -5,8 +5,8 @@ use core::sync::atomic::{AtomicU32, Ordering};
 
 use bbqueue::nicknames::Churrasco;
 use bbqueue::prod_cons::stream::{StreamConsumer, StreamProducer};
-use cantap_wire::record::{MAX_FD_RECORD, MAX_RECORD, encode_received, encode_received_fd};
-use cantap_wire::{Received, ReceivedFd};
+use cantap_wire::Received;
+use cantap_wire::record::{MAX_FD_RECORD, MAX_RECORD, encode_received};
 
 use crate::QUEUE_BYTES;
 
@@ -108,18 +108,23 @@ impl<const N: usize> Producer<'_, N> {
         true
     }
 
-    /// The same for a CAN FD frame, which no controller of a board receives.
-    pub fn push_fd_frame(&mut self, received: &ReceivedFd, ticks: i64) -> bool {
+    /// Lets `encode` write the record of a CAN FD frame, which no controller of a board receives or sends; that of a sent one may use the
+    /// reserve. Returns false if there is no room.
+    pub fn push_fd(
+        &mut self,
+        in_reserve: bool,
+        encode: impl FnOnce(&mut [u8; MAX_FD_RECORD]) -> usize,
+    ) -> bool {
         let fill = self.fill();
-        if !self.has_room_beside(fill) {
+        if !in_reserve && !self.has_room_beside(fill) {
             return false;
         }
         let Ok(mut grant) = self.ring.grant_exact(MAX_FD_RECORD) else {
-            self.full = true;
+            self.full |= !in_reserve;
             return false;
         };
         let Some(room) = grant.first_chunk_mut::<MAX_FD_RECORD>() else { return false };
-        let len = encode_received_fd(received, ticks, room);
+        let len = encode(room);
         grant.commit(len);
         self.has_written(fill, len as u32);
         true

@@ -1,8 +1,10 @@
 //! Writes records into the queue: each with its time since the last one, and a loss record in place
 //! of what did not fit.
 
-use cantap_wire::record::{LossStage, encode_event};
+use cantap_wire::record::{LossStage, encode_event, encode_received_fd};
 use cantap_wire::{CHANNELS, Channel, Event, Received, ReceivedFd, Stamp};
+#[cfg(not(target_os = "none"))]
+use cantap_wire::{TransmittedFd, record::encode_transmitted_fd};
 
 use crate::QUEUE_BYTES;
 use crate::bus::queue::Producer;
@@ -66,7 +68,7 @@ impl<'q, const N: usize> Recorder<'q, N> {
     /// The same for a CAN FD frame.
     pub fn fd_frame(&mut self, received: &ReceivedFd, at: u64) {
         self.push(received.channel, received.stamp, at, |producer, difference| {
-            producer.push_fd_frame(received, difference)
+            producer.push_fd(false, |room| encode_received_fd(received, difference, room))
         });
     }
 
@@ -118,6 +120,20 @@ impl<'q, const N: usize> Recorder<'q, N> {
             self.report_losses(at);
         }
         self.write(event, at)
+    }
+
+    /// Writes the confirmation of a CAN FD frame, which no board sends, and returns whether there was room for it.
+    #[cfg(not(target_os = "none"))]
+    pub fn fd_confirmation(&mut self, sent: &TransmittedFd, at: u64) -> bool {
+        if self.unreported != [0; CHANNELS] {
+            self.report_losses(at);
+        }
+        let difference = self.difference(at);
+        let written = self.producer.push_fd(true, |room| encode_transmitted_fd(sent, difference, room));
+        if written {
+            self.last_ticks = at;
+        }
+        written
     }
 
     /// Writes an event that can be left out: it is dropped while the queue accepts no frames.

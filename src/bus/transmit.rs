@@ -7,6 +7,8 @@
 //! Each call does a bounded amount of work: it fills the free mailboxes, three at most, and writes at most
 //! [`RECORDS_PER_CALL`] records of frames that are given up. `docs/architecture.md` says how long this takes.
 
+#[cfg(not(target_os = "none"))]
+use cantap_wire::message::TxFdFrame;
 use cantap_wire::message::{GATEWAY_TAG, Periodic, TRIGGER_TAG, Trigger, TxFrame};
 use cantap_wire::record::{LossStage, TransmitFailure};
 use cantap_wire::{Channel, Event, Frame};
@@ -14,6 +16,7 @@ use heapless::Deque;
 
 use crate::bus::gateway::Lane;
 use crate::bus::mailboxes::{MAILBOXES, Mailboxes};
+use crate::bus::outgoing::Outgoing;
 use crate::bus::periodic::PeriodicTable;
 use crate::bus::recorder::{RECORDS_PER_CALL, Recorder};
 use crate::bus::time::NEVER;
@@ -27,7 +30,7 @@ pub const TRIGGER_SLOTS: usize = 8;
 #[derive(Clone, Copy)]
 struct Queued {
     tag: u32,
-    frame: Frame,
+    frame: Outgoing,
     /// Due time; 0 means at once.
     at: u64,
 }
@@ -35,7 +38,7 @@ struct Queued {
 /// A transmission that has ended.
 struct Ended {
     tag: u32,
-    frame: Frame,
+    frame: Outgoing,
     /// `None` if it was sent.
     failure: Option<TransmitFailure>,
     at: u64,
@@ -163,8 +166,15 @@ impl<'q> Transmitter<'q> {
     /// Queues one frame; false if the queue is full. A frame queued while the queue is being given up is given up
     /// with it, and recorded like the others.
     pub fn enqueue(&mut self, frame: &TxFrame) -> bool {
-        let queued = Queued { tag: frame.tag, frame: frame.frame, at: frame.at_ticks.unwrap_or(0) };
+        let queued = Queued { tag: frame.tag, frame: frame.frame.into(), at: frame.at_ticks.unwrap_or(0) };
         self.queue.push_back(queued).is_ok()
+    }
+
+    /// The same for a CAN FD frame: for other makers' adapters, see [`Traffic::prepare_fd`].
+    #[cfg(not(target_os = "none"))]
+    pub fn enqueue_fd(&mut self, frame: &TxFdFrame) -> bool {
+        let (tag, at) = (frame.tag, frame.at_ticks.unwrap_or(0));
+        self.queue.push_back(Queued { tag, frame: Outgoing::Fd(frame.frame), at }).is_ok()
     }
 
     /// Sets or clears a periodic entry; its first transmission is due at `now`.
@@ -492,7 +502,7 @@ impl<'q> Transmitter<'q> {
         if self.passing && head.at == 0 && self.lane.is_ready() {
             return None;
         }
-        let mailbox = traffic.prepare(&head.frame);
+        let mailbox = head.frame.prepare(traffic);
         self.refused = mailbox.is_none() && !self.mailboxes.are_full();
         mailbox
     }
@@ -519,13 +529,21 @@ impl<'q> Transmitter<'q> {
             if *room == 0 {
                 return false;
             }
-            let event = match failure {
-                None => Event::Transmitted { channel, tag, frame },
-                Some(reason) => Event::TransmitFailed { channel, tag, reason },
+            let written = match (failure, frame) {
+                (None, Outgoing::Classic(frame)) if tag >= GATEWAY_TAG => {
+                    self.confirm_passed(recorder, &Event::Transmitted { channel, tag, frame }, at);
+                    true
+                }
+                (None, frame) => frame.confirm(channel, tag, at, recorder),
+                (Some(reason), _) => {
+                    let event = Event::TransmitFailed { channel, tag, reason };
+                    if tag >= GATEWAY_TAG {
+                        self.confirm_passed(recorder, &event, at);
+                    }
+                    tag >= GATEWAY_TAG || recorder.event(&event, at)
+                }
             };
-            if tag >= GATEWAY_TAG {
-                self.confirm_passed(recorder, &event, at);
-            } else if !recorder.event(&event, at) {
+            if !written {
                 return false;
             }
             self.unconfirmed.pop_front();
@@ -680,7 +698,7 @@ impl<'q> Transmitter<'q> {
             return false;
         };
         traffic.request(mailbox);
-        self.mailboxes.put(mailbox, tag, *frame);
+        self.mailboxes.put(mailbox, tag, (*frame).into());
         true
     }
 

@@ -52,6 +52,11 @@ pub trait Board<'q, const N: usize> {
         Ok(())
     }
 
+    /// Whether the controllers transmit CAN FD frames: a board's do not.
+    fn sends_fd(&self) -> bool {
+        false
+    }
+
     /// Whether a channel is open.
     fn is_open(&mut self, channel: Channel) -> bool {
         self.with_capture(|capture, _, _| capture.config(channel).is_some())

@@ -174,6 +174,11 @@ impl Commands {
             Command::Time => Reply::Time(board.with_capture(|capture, _, clock| capture.now(clock))),
             Command::SetFilters { channel, filters } => self.set_filters(channel, &filters, board)?,
             Command::Send { channel, frames } => Reply::Queued { free: send(channel, &frames, board)? },
+            #[cfg(not(target_os = "none"))]
+            Command::SendFd { channel, frames } if board.sends_fd() => {
+                Reply::Queued { free: sending::send_fd(channel, &frames, board)? }
+            }
+            Command::SendFd { .. } => return Err(Refusal::Unsupported),
             Command::Abort { channel } => {
                 board.with_capture(|capture, traffic, clock| {
                     capture.abort(channel, &mut traffic[channel.index()], clock);

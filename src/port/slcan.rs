@@ -443,7 +443,7 @@ impl Slcan {
                     self.frame_line(&received.frame, at, lines);
                 }
                 // The language has no CAN FD, and no controller here receives any.
-                Record::ReceivedFd(_) => {}
+                Record::ReceivedFd(_) | Record::TransmittedFd(_) => {}
                 Record::Event(event) => {
                     self.note(&event);
                     // A host that polls expects nothing between its requests.

@@ -11,17 +11,18 @@ pub mod framing;
 pub mod image;
 pub mod message;
 mod packed;
+mod packed_fd;
 pub mod record;
 mod varint;
 
 pub use cantap_can::{BitTiming, CHANNELS, Channel, FdFrame, Frame, Id, frame, timing};
 pub use decoder::{Corruption, Decoded, Decoder};
 pub use message::{Command, Hello, Refusal, Reply, Request, Response};
-pub use record::{Event, Received, ReceivedFd, Record, Stamp};
+pub use record::{Event, Received, ReceivedFd, Record, Stamp, TransmittedFd};
 
 /// Version of everything this crate defines. A device and a host with different versions refuse
 /// each other with a message that says which side to update.
-pub const PROTOCOL_VERSION: u16 = 6;
+pub const PROTOCOL_VERSION: u16 = 7;
 
 /// Name of the ELF symbol that holds [`PROTOCOL_VERSION`] as a little-endian `u16` in the
 /// firmware, so that a program that loads the ELF can refuse a mismatch before it runs it.

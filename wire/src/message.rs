@@ -24,13 +24,16 @@ pub use gateway::{
 pub use sharing::Role;
 pub use status::{ChannelStatus, Failures, MAX_FAILURE_TEXT, RegisterSet, Registers, Status};
 pub use transmission::{
-    Checksum, DEVICE_TAG, MAX_MODIFIERS, Modifier, OTHERS_TAG, Periodic, TRIGGER_TAG, Trigger, TxFrame,
+    Checksum, DEVICE_TAG, MAX_MODIFIERS, Modifier, OTHERS_TAG, Periodic, TRIGGER_TAG, Trigger, TxFdFrame,
+    TxFrame,
 };
 
 /// Most filters that one channel takes; the hardware's banks may be exhausted earlier.
 pub const MAX_FILTERS: usize = 56;
 /// Most frames in one [`Command::Send`].
 pub const MAX_SEND: usize = 20;
+/// Most frames in one [`Command::SendFd`].
+pub const MAX_SEND_FD: usize = 8;
 
 /// Host → device.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -239,6 +242,14 @@ pub enum Command {
     /// runs the gateway on its own, whether there is a host or not, until the session that [`Command::StopGateway`] is sent in, or
     /// [`Command::ClearDefaults`]. Both channels must be closed, and configured for normal mode.
     SaveGateway,
+    /// Queues CAN FD frames for transmission, all or none, in one queue with those of [`Command::Send`]. A board of ours, whose controllers are
+    /// classical, refuses it: see [`capability::FD_TRANSMIT`].
+    SendFd {
+        /// Where.
+        channel: Channel,
+        /// In this order.
+        frames: Vec<TxFdFrame, MAX_SEND_FD>,
+    },
 }
 
 /// A value that answers a request.
@@ -262,7 +273,7 @@ pub enum Reply {
         /// Banks that this channel could use.
         banks_total: u8,
     },
-    /// To [`Command::Send`]: free places left in the channel's transmit queue.
+    /// To [`Command::Send`] and [`Command::SendFd`]: free places left in the channel's transmit queue.
     Queued {
         /// Frames.
         free: u16,
@@ -395,6 +406,11 @@ pub struct Hello {
 }
 
 impl Hello {
+    /// Whether it transmits CAN FD frames, too.
+    pub const fn sends_fd(&self) -> bool {
+        self.capabilities & capability::FD_TRANSMIT != 0
+    }
+
     /// Whether every loss is counted by somebody, if only as "at least one".
     pub const fn counts_losses(&self) -> bool {
         self.capabilities & capability::UNCOUNTED_LOSSES == 0
@@ -425,4 +441,6 @@ pub mod capability {
     pub const UNCOUNTED_LOSSES: u32 = 1 << 9;
     /// Can be a gateway between its channels.
     pub const GATEWAY: u32 = 1 << 10;
+    /// Never of a board of ours: can transmit CAN FD frames.
+    pub const FD_TRANSMIT: u32 = 1 << 11;
 }

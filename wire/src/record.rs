@@ -6,6 +6,7 @@
 //! |---|---|
 //! | `0x00..=0x3F` | an [`Event`]: this byte is postcard's enum index, its fields follow, then the time difference |
 //! | `0x40..=0x47` | qualifiers of the frame that follows: bit 0 the stamp is only an upper bound, bit 1 no time difference, bit 2 no data |
+//! | `0x50..=0x53` | the confirmation of a CAN FD frame that was sent: bit 0 its bit rate is switched, bit 1 its sender is error passive; then a frame's header and ID, the tag, the time difference, the data. Never from a board |
 //! | `0x60..=0x7F` | a received CAN FD frame: bits 2..0 as above, bit 3 its bit rate is switched, bit 4 its sender is error passive; then as below, without remote frames, with up to 64 bytes of data. Never from a board |
 //! | `0x80..=0xFF` | a received frame: bit 6 channel, bit 5 extended, bit 4 remote, bits 3..0 DLC; then the ID (2 or 4 bytes, little-endian), the time difference, the data |
 //!
@@ -23,7 +24,7 @@ use crate::{Channel, Frame};
 mod fd;
 mod parts;
 
-pub use fd::{MAX_FD_RECORD, ReceivedFd, encode_received_fd};
+pub use fd::{MAX_FD_RECORD, ReceivedFd, TransmittedFd, encode_received_fd, encode_transmitted_fd};
 pub use parts::{BadRecord, Stamp};
 use parts::{FRAME, MAX_TICKS, NO_DATA, NO_STAMP, UPPER_BOUND, decode_ticks, encode_ticks, take_id};
 
@@ -144,6 +145,8 @@ pub enum Record {
     Event(Event),
     /// A received CAN FD frame: never from a board of ours.
     ReceivedFd(ReceivedFd),
+    /// A CAN FD frame of ours is on the bus: as [`Event::Transmitted`], never from a board of ours.
+    TransmittedFd(TransmittedFd),
 }
 
 impl Record {
@@ -153,7 +156,7 @@ impl Record {
         match self {
             Self::Received(received) => Some(received.channel),
             Self::ReceivedFd(received) => Some(received.channel),
-            Self::Event(_) => None,
+            Self::Event(_) | Self::TransmittedFd(_) => None,
         }
     }
 }
@@ -230,6 +233,9 @@ pub fn decode(bytes: &[u8]) -> Result<(Record, i64, &[u8]), BadRecord> {
         [header @ FRAME..=0xFF, ref rest @ ..] => decode_frame(0, header, rest),
         [fd::FD..=fd::LAST_FD, ..] => {
             fd::decode(bytes).map(|(received, ticks, rest)| (Record::ReceivedFd(received), ticks, rest))
+        }
+        [fd::SENT..=fd::LAST_SENT, ..] => {
+            fd::decode_sent(bytes).map(|(sent, ticks, rest)| (Record::TransmittedFd(sent), ticks, rest))
         }
         [qualified @ QUALIFIED..fd::FD, header @ FRAME..=0xFF, ref rest @ ..] => {
             let qualifiers = qualified & !QUALIFIER_MASK;

@@ -1,16 +1,17 @@
 //! `cantap gen`: made-up frames, with cangen's options.
 
+mod filled;
+
 use std::io::Write;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
-use cantap::device::Transmission;
 use cantap::replay::{Pace, Replay};
 use cantap::wire::CHANNELS;
 use cantap::wire::message::Mode;
-use cantap::{Channel, Frame, Id, bits_on_bus};
-use serde_json::{Value, json};
+use cantap::{Channel, FdFrame, Frame, Id, TraceFrame};
+use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
 
 use crate::args;
 use crate::channel_args::ChannelArgs;
@@ -21,6 +22,7 @@ use crate::usage_error::usage;
 use cantap_work::interrupt;
 use cantap_work::rounded;
 use cantap_work::sending::Sending;
+use filled::Filled;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -58,7 +60,7 @@ pub struct Args {
     /// Identifiers.
     #[arg(short = 'I', long, value_name = "MODE|HEX", default_value = "r", value_parser = identifier)]
     id: Values,
-    /// Lengths, 0 to 8.
+    /// Lengths, 0 to 8; of CAN FD frames also 12, 16, 20, 24, 32, 48 and 64.
     #[arg(short = 'L', long, value_name = "MODE|N", value_parser = length)]
     length: Option<Values>,
     /// Data.
@@ -83,12 +85,15 @@ pub struct Args {
     /// computer.
     #[arg(short = 'x', hide = true)]
     no_loopback: bool,
-    /// Refused: in cangen this means CAN FD.
-    #[arg(short = 'f', hide = true)]
+    /// CAN FD frames; with -m, classical ones among them.
+    #[arg(short, long, conflicts_with_all = ["remote", "raw_dlc"])]
     fd: bool,
-    /// Refused: see -f.
-    #[arg(short = 'E', hide = true)]
-    fd_error_state: bool,
+    /// CAN FD frames whose bit rate is switched: cangen's -b.
+    #[arg(long, conflicts_with_all = ["remote", "raw_dlc"])]
+    brs: bool,
+    /// CAN FD frames that say that their sender is error passive.
+    #[arg(short = 'E', long, conflicts_with_all = ["remote", "raw_dlc"])]
+    esi: bool,
     /// Select another sequence.
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -98,6 +103,34 @@ pub struct Args {
     /// Print one JSON object with the summary.
     #[arg(long, conflicts_with = "verbose")]
     json: bool,
+}
+
+impl Args {
+    /// Whether CAN FD frames are wanted.
+    const fn is_fd(&self) -> bool {
+        self.fd || self.brs || self.esi
+    }
+
+    /// Finds lengths that the frames cannot have.
+    fn check(&self) -> anyhow::Result<()> {
+        let is_fd_length = |bytes: usize| FD_LENGTHS.iter().any(|len| usize::from(*len) == bytes);
+        let most = if self.raw_dlc { 15 } else { 8 };
+        let (given, fixed) = match (&self.length, &self.data) {
+            (Some(Values::Fixed(bytes)), Data::Fixed(data)) => (*bytes as usize, data.len()),
+            (Some(Values::Fixed(bytes)), Data::Varying(_)) => (*bytes as usize, 0),
+            (_, Data::Fixed(data)) => (0, data.len()),
+            _ => (0, 0),
+        };
+        if self.is_fd() && !(is_fd_length(given) && is_fd_length(fixed)) {
+            return Err(usage("a CAN FD frame carries 0 to 8, 12, 16, 20, 24, 32, 48 or 64 bytes"));
+        }
+        if (!self.is_fd() || self.mix) && (given > most || fixed > 8) {
+            return Err(usage(
+                "a classical frame carries 0 to 8 bytes; -8 allows lengths up to 15, which say eight, and --fd without --mix up to 64",
+            ));
+        }
+        Ok(())
+    }
 }
 
 /// One channel, or both in turns.
@@ -147,10 +180,10 @@ fn identifier(text: &str) -> Result<Values, String> {
 }
 
 fn length(text: &str) -> Result<Values, String> {
-    let number = || text.parse().ok().filter(|length| *length <= 15);
+    let number = || text.parse().ok().filter(|length| *length <= 64);
     mode(text)
         .or_else(|| number().map(Values::Fixed))
-        .ok_or_else(|| "write r, i, e, o or a length from 0 to 8, with -8 to 15".to_owned())
+        .ok_or_else(|| "write r, i, e, o or a length from 0 to 8, with -8 to 15, with --fd to 64".to_owned())
 }
 
 fn data(text: &str) -> Result<Data, String> {
@@ -158,10 +191,14 @@ fn data(text: &str) -> Result<Data, String> {
         return Ok(Data::Varying(mode));
     }
     // The frame's own parser checks the data.
-    let frame = format!("000#{text}").parse::<Frame>().ok().filter(|frame| !frame.is_remote());
-    frame
+    let frame = |text: String| text.parse::<TraceFrame>().ok().filter(|frame| !frame.is_remote());
+    frame(format!("000#{text}"))
+        .or_else(|| frame(format!("000##0{text}")))
         .map(|frame| Data::Fixed(frame.data().to_vec()))
-        .ok_or_else(|| "write r, i, e, o or up to 8 bytes in hexadecimal".to_owned())
+        .ok_or_else(|| {
+            "write r, i, e, o or up to 8 bytes in hexadecimal, with --fd 12, 16, 20, 24, 32, 48 or 64"
+                .to_owned()
+        })
 }
 
 /// Generates the frames.
@@ -183,16 +220,68 @@ impl Generator<'_> {
         }
     }
 
-    fn frame(&mut self) -> Frame {
+    fn frame(&mut self) -> TraceFrame {
+        if self.args.is_fd() && !(self.args.mix && self.random.bool()) {
+            return self.fd_frame().into();
+        }
+        self.classic_frame().into()
+    }
+
+    /// Its length is one that CAN FD has: modes choose among the length codes.
+    fn fd_frame(&mut self) -> FdFrame {
+        let Args { extended, mix, id, length, data, brs, esi, .. } = self.args;
+        let id = self.id(*id, *extended, *mix);
+        let codes = FD_LENGTHS.len() as u32;
+        let len = match (length, data) {
+            (Some(Values::Fixed(bytes)), _) => *bytes as usize,
+            (None, Data::Fixed(bytes)) => bytes.len(),
+            (None, Data::Varying(Values::Random)) if self.args.saturate => 0,
+            (Some(values), _) => FD_LENGTHS[self.number(*values, codes) as usize].into(),
+            (None, Data::Varying(_)) => FD_LENGTHS[self.random.usize(..FD_LENGTHS.len())].into(),
+        };
+        let len = if *data == Data::Varying(Values::Count) { len.max(1) } else { len };
+        let mut bytes = [0; FD_MAX_BYTES];
+        self.fill(&mut bytes);
+        self.count += 1;
+        // Cannot fail: the command line is checked for lengths.
+        FdFrame::padded(id, *brs, *esi, &bytes[..len.min(FD_MAX_BYTES)]).unwrap_or_else(|| unreachable!())
+    }
+
+    fn id(&mut self, id: Values, extended: bool, mix: bool) -> Id {
+        let wide = matches!(id, Values::Fixed(id) if id > Id::MAX_STANDARD);
+        if wide || if mix { self.random.bool() } else { extended } {
+            Id::extended_truncated(self.number(id, Id::MAX_EXTENDED + 1))
+        } else {
+            Id::standard_truncated(self.number(id, Id::MAX_STANDARD + 1))
+        }
+    }
+
+    /// Fills the data. Bytes beyond a frame's length do not matter.
+    fn fill(&mut self, bytes: &mut [u8]) {
+        match &self.args.data {
+            Data::Fixed(fixed) => {
+                let len = fixed.len().min(bytes.len());
+                bytes[..len].copy_from_slice(&fixed[..len]);
+            }
+            // Counts as one number, least significant byte first, as cangen does.
+            Data::Varying(Values::Count) => bytes[..8].copy_from_slice(&self.count.to_le_bytes()),
+            Data::Varying(values) => {
+                let (keep, set) = match values {
+                    Values::Even => (0xFE, 0),
+                    Values::Odd => (0xFF, 1),
+                    _ => (0xFF, 0),
+                };
+                bytes.fill_with(|| self.random.u8(..) & keep | set);
+            }
+        }
+    }
+
+    fn classic_frame(&mut self) -> Frame {
         let Args { extended, remote, mix, id, length, data, .. } = self.args;
         let wide = matches!(id, Values::Fixed(id) if *id > Id::MAX_STANDARD);
         let extended = wide || if *mix { self.random.bool() } else { *extended };
         let remote = if *mix { self.random.bool() } else { *remote };
-        let id = if extended {
-            Id::extended_truncated(self.number(*id, Id::MAX_EXTENDED + 1))
-        } else {
-            Id::standard_truncated(self.number(*id, Id::MAX_STANDARD + 1))
-        };
+        let id = self.id(*id, extended, false);
         let lengths = if self.args.raw_dlc { 16 } else { 9 };
         let length = match (length, data) {
             (Some(values), _) => self.number(*values, lengths),
@@ -203,96 +292,20 @@ impl Generator<'_> {
         let counts = *data == Data::Varying(Values::Count);
         let length = if counts && !remote { length.max(1) } else { length };
         let mut bytes = [0; 8];
-        match data {
-            Data::Fixed(fixed) => bytes[..fixed.len()].copy_from_slice(fixed),
-            // Counts as one number, least significant byte first, as cangen does.
-            Data::Varying(Values::Count) => bytes = self.count.to_le_bytes(),
-            Data::Varying(values) => {
-                let (keep, set) = match values {
-                    Values::Even => (0xFE, 0),
-                    Values::Odd => (0xFF, 1),
-                    _ => (0xFF, 0),
-                };
-                bytes.fill_with(|| self.random.u8(..) & keep | set);
-            }
-        }
+        self.fill(&mut bytes);
         self.count += 1;
         Frame::from_bus(id, remote, length as u8, bytes)
     }
 }
 
-/// How full the buses were, from the first frame sent to the last one known to have ended.
-struct Filled {
-    bitrates_bps: [u32; CHANNELS],
-    frames: [u64; CHANNELS],
-    bits: [u64; CHANNELS],
-    span_ticks: [Option<(u64, u64)>; CHANNELS],
-}
-
-impl Filled {
-    const fn new(bitrates_bps: [u32; CHANNELS]) -> Self {
-        Self { bitrates_bps, frames: [0; CHANNELS], bits: [0; CHANNELS], span_ticks: [None; CHANNELS] }
-    }
-
-    fn add(&mut self, ends: &[Transmission]) {
-        for end in ends {
-            let Ok(frame) = &end.result else { continue };
-            let channel = end.channel.index();
-            match &mut self.span_ticks[channel] {
-                None => self.span_ticks[channel] = Some((end.ticks, end.ticks)),
-                Some((_, last)) => {
-                    *last = end.ticks;
-                    self.frames[channel] += 1;
-                    self.bits[channel] += u64::from(bits_on_bus(frame));
-                }
-            }
-        }
-    }
-
-    /// Each channel's frames per second, and its load in per cent, counting only what was sent here.
-    fn rates(&self, tick_hz: u32) -> impl Iterator<Item = (Channel, f64, f64)> + use<'_> {
-        Channel::ALL.into_iter().filter_map(move |channel| {
-            let index = channel.index();
-            let (first, last) = self.span_ticks[index].filter(|(first, last)| first < last)?;
-            let seconds = (last - first) as f64 / f64::from(tick_hz);
-            let load_pct = self.bits[index] as f64 * 100.0 / (f64::from(self.bitrates_bps[index]) * seconds);
-            Some((channel, self.frames[index] as f64 / seconds, load_pct))
-        })
-    }
-
-    fn tell(&self, tick_hz: u32) {
-        for (channel, frames_per_s, load_pct) in self.rates(tick_hz) {
-            eprintln!(
-                "cantap: channel {}: {frames_per_s:.0} frames/s, bus load {load_pct:.1} %",
-                channel.number()
-            );
-        }
-    }
-
-    fn object(&self, tick_hz: u32) -> Value {
-        self.rates(tick_hz)
-            .map(|(channel, frames_per_s, load_pct)| {
-                json!({
-                    "channel": channel.number(),
-                    "frames_per_s": rounded(frames_per_s, 1),
-                    "bus_load_pct": rounded(load_pct, 2),
-                })
-            })
-            .collect()
-    }
-}
-
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    if args.fd || args.fd_error_state {
-        bail!("the device is a classical CAN controller, without CAN FD; omit -f and -E");
-    }
-    if matches!(args.length, Some(Values::Fixed(9..))) && !args.raw_dlc {
-        let reason = "a frame carries 0 to 8 bytes; -8 allows lengths up to 15, which say eight";
-        return Err(usage(reason));
-    }
+    args.check()?;
     interrupt::watch()?;
     let device = args.device.open()?;
+    if args.is_fd() && !device.hello().sends_fd() {
+        bail!("CAN FD frames cannot be sent: {}", cantap_adapters::fd_advice(&device.hello()));
+    }
     let mut bitrates_bps = [0; CHANNELS];
     for (channel, config) in args.open.open(&device, args.channel.iter().copied(), Mode::Normal, None)? {
         bitrates_bps[channel.index()] = config.timing.bitrate_bps(device.hello().can_clock_hz);
@@ -303,7 +316,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut replay = Replay::new(&device, pace, bitrates_bps)?;
     let mut sending = Sending::new(&device, args.open.bus_off_recovery(), args.verbose.then(print_sent));
     let mut generator = Generator { args, random: fastrand::Rng::with_seed(args.seed), count: 0 };
-    let mut filled = Filled::new(bitrates_bps);
+    let mut filled = Filled::new(bitrates_bps, Channel::ALL.map(|channel| device.data_bitrate(channel)));
     let started = Instant::now();
     let mut turns = args.channel.iter().cycle();
     while args.frames.is_none_or(|frames| generator.count < frames)
@@ -383,6 +396,17 @@ mod tests {
         assert_eq!(frames("-I 1 -L 0 -D i", 2), ["001#00", "001#01"]);
         assert!(frames("-I 1 -L r -D i", 200).iter().all(|frame| !frame.ends_with('#')));
         assert_eq!(frames("-I 1 -L 15 -8 -D 1122334455667788", 1), ["001#1122334455667788_F"]);
+        assert_eq!(frames("--fd --brs -I 1 -L 12 -D i", 1), [format!("001##1{}", "00".repeat(12))]);
+        assert_eq!(
+            frames("--fd -E -I 1 -D 11223344556677881122334455667788", 1),
+            ["001##211223344556677881122334455667788"]
+        );
+        assert!(frames("--fd -L r", 200).iter().all(|frame| frame.parse::<TraceFrame>().unwrap().is_fd()));
+        let mixed = frames("--brs -m", 200);
+        assert!(
+            mixed.iter().any(|frame| frame.contains("##1"))
+                && mixed.iter().any(|frame| !frame.contains("##"))
+        );
         assert!(frames("-L r -8", 200).iter().any(|frame| frame.contains('_')));
     }
 

@@ -9,7 +9,7 @@ use anyhow::{Context, bail};
 use cantap::replay::{Pace, Replay};
 use cantap::wire::CHANNELS;
 use cantap::wire::message::{ChannelConfig, Mode};
-use cantap::{Channel, Device, TraceEvent, TraceFrame};
+use cantap::{Channel, Device, TraceEvent};
 
 use crate::args;
 use crate::channel_args::ChannelArgs;
@@ -207,7 +207,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             eprint!(", {left_out} of other channels left out");
         }
         if fd_left_out > 0 {
-            eprint!(", {fd_left_out} CAN FD frames left out: the device is a classical one");
+            let advice = cantap_adapters::fd_advice(&device.hello());
+            eprint!(", {fd_left_out} CAN FD frames left out: {advice}");
         }
         if accuracy.frames > 0 {
             eprint!(
@@ -323,10 +324,10 @@ impl Args {
                 let TraceEvent::Frame { frame, .. } = record.event else {
                     continue;
                 };
-                let TraceFrame::Classic(frame) = frame else {
+                if frame.is_fd() && !buses.device.hello().sends_fd() {
                     played.fd_left_out += 1;
                     continue;
-                };
+                }
                 let Some(channel) = source.target(record.channel) else {
                     played.left_out += 1;
                     continue;
@@ -347,8 +348,9 @@ impl Args {
             }
             if played.asked == 0 && played.fd_left_out > 0 && !interrupt::requested() {
                 bail!(
-                    "'{}' has only CAN FD frames for these channels, which a classical device cannot send",
-                    source.input.display()
+                    "'{}' has only CAN FD frames for these channels, which the device cannot send: {}",
+                    source.input.display(),
+                    cantap_adapters::fd_advice(&buses.device.hello())
                 );
             }
             if played.asked == 0 && !interrupt::requested() {

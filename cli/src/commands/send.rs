@@ -2,6 +2,7 @@
 
 mod modifiers;
 mod replies;
+mod timed;
 
 use std::io::Write;
 use std::process::ExitCode;
@@ -11,17 +12,19 @@ use anyhow::bail;
 use cantap::periodic::{self, BadPeriodic, SHORTEST_PERIOD};
 use cantap::transmit::Stream;
 use cantap::wire::message::{DEVICE_TAG, Filter as HardwareFilter, FrameKind, Mode, Periodic, Trigger};
-use cantap::{Channel, Device, Frame, Id, hw_filter};
-use cantap_signals::Decoder;
+use cantap::{Channel, Device, Frame, Id, TraceFrame, hw_filter};
 use cantap_signals::named::NamedFilter;
+use cantap_signals::{Decoder, encode};
 use cantap_trace::grammar;
 use modifiers::Modifiers;
 use replies::{Counts, Replies};
+use timed::Repeated;
 
 use crate::args;
 use crate::channel_args::ChannelArgs;
 use crate::completion;
 use crate::database_args::{DatabaseArgs, load};
+use crate::fd_frames;
 use crate::input::not_a_message;
 use crate::one_board::OneBoard;
 use crate::print_sent::print_sent;
@@ -33,7 +36,8 @@ use cantap_work::sending::{LOOK_EVERY, Sending};
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Frames are written as 123#DEADBEEF, 5A1#11.22.33, 123#R3, 1F334455#1122, or as \
-                Message:Signal=value,Signal=value with --db. Each frame that was sent is printed with the time at which \
+                Message:Signal=value,Signal=value with --db; CAN FD frames as 123##1DEADBEEF, where the digit has the flags \
+                (1: the bit rate is switched, 2: the sender is error passive). Each frame that was sent is printed with the time at which \
                 it ended on the bus. When none leaves for a second, it ends and says why.\n\n\
                 Examples:\n  \
                 cantap send -d /dev/ttyACM0 -b 500k can0 123#DEADBEEF\n  \
@@ -71,6 +75,12 @@ pub struct Args {
     time: Option<Duration>,
     #[command(flatten)]
     modifiers: modifiers::ModifierArgs,
+    /// Fill CAN FD frames of a length that CAN FD does not have with zeros up to the next one, as cansend does unasked.
+    #[arg(long)]
+    pad: bool,
+    /// Switch the bit rate in CAN FD frames that are made from a database's messages of more than eight bytes.
+    #[arg(long)]
+    brs: bool,
     /// Print nothing about frames that were sent.
     #[arg(short, long)]
     quiet: bool,
@@ -100,10 +110,21 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // Everything wrong on the command line is found before anything is sent.
     let decoder = args.decoder()?;
     let frames = args.frames(&decoder)?;
-    let triggers = args.triggers(&frames, &decoder)?;
-    let periodic = args.periodic(&frames)?;
+    let classic: Vec<Frame> = frames.iter().filter_map(|frame| frame.classic().copied()).collect();
+    let has_fd = classic.len() < frames.len();
+    if has_fd && (args.reply || args.on_rx.is_some()) {
+        return Err(usage("a reply is a classical frame; give one, as in 123#1122"));
+    }
+    let triggers = args.triggers(&classic, &decoder)?;
+    let periodic = args.periodic(&classic)?;
+    if has_fd && periodic.as_ref().is_some_and(|(_, modifiers)| !modifiers.is_empty()) {
+        return Err(usage(
+            "--counter, --random and --checksum change classical frames only; omit them for CAN FD",
+        ));
+    }
     interrupt::watch()?;
     let device = args.device.open()?;
+    fd_frames::check(&device, &frames)?;
     args.open.open(&device, [args.channel].into_iter(), Mode::Normal, None)?;
     let on_sent = (!args.quiet && !args.json).then(print_sent);
     let started = Instant::now();
@@ -128,6 +149,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             replies = Some(waited);
             sending.outcome_of_replies(asked, merged)?
         }
+        (None, Some((period, _))) if has_fd => {
+            let what = Repeated { frames: &frames, period, rounds: args.count, time: args.time };
+            let asked = timed::send(&device, args.channel, &what, &mut sending, || args.is_over(started))?;
+            sending.outcome(asked)?
+        }
         (None, Some((period, modifiers))) => {
             let period_ticks = periodic::period_ticks(period, device.hello().tick_hz)
                 .map_err(|error| usage(error.to_string()))?;
@@ -136,7 +162,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 bail!("the device keeps {slots} periodic frames and these are {}; give fewer", frames.len());
             }
             let stream = Stream::new(&device);
-            for (slot, frame) in (0..).zip(&frames) {
+            for (slot, frame) in (0..).zip(&classic) {
                 let entry = Periodic {
                     frame: *frame,
                     period_ticks,
@@ -183,19 +209,19 @@ impl Args {
         load(&self.databases.or_of(device), false, self.quiet || !is_sent && self.databases.is_empty())
     }
 
-    fn frames(&self, decoder: &Decoder) -> anyhow::Result<Vec<Frame>> {
+    fn frames(&self, decoder: &Decoder) -> anyhow::Result<Vec<TraceFrame>> {
         let frame = |text: &String| {
             if is_message(text) {
-                Ok(cantap_signals::encode::encode(decoder, Some(self.channel.number()), text)?.frame)
-            } else {
-                if text.contains("##") {
-                    return Err(usage(format!(
-                        "'{text}' is a CAN FD frame, and none can be sent, whatever the device; up to eight bytes fit into a classical one, as in 123#1122"
-                    )));
-                }
-                let frame = grammar::frame(text);
-                Ok(frame.map_err(|error| usage(format!("'{text}' is not a frame: {error}")))?)
+                let how = (self.brs, self.pad);
+                return Ok(encode::encode_any(decoder, Some(self.channel.number()), text, how)?);
             }
+            let frame = grammar::any_frame(text, self.pad);
+            frame.map_err(|error| {
+                let is_fd = text.contains("##") && !self.pad;
+                let advice = if is_fd { "; --pad fills it up with zeros to the next of these" } else { "" };
+                let advice = if error.contains("carries 0 to 8, 12") { advice } else { "" };
+                usage(format!("'{text}' is not a frame: {error}{advice}"))
+            })
         };
         self.frames.iter().map(frame).collect()
     }
@@ -252,7 +278,12 @@ impl Args {
     }
 
     /// Sends the frames one after the other, `count` times. Returns how many were requested.
-    fn send_now(&self, device: &Device, frames: &[Frame], sending: &mut Sending<'_>) -> anyhow::Result<u64> {
+    fn send_now(
+        &self,
+        device: &Device,
+        frames: &[TraceFrame],
+        sending: &mut Sending<'_>,
+    ) -> anyhow::Result<u64> {
         let mut stream = Stream::new(device);
         let started = Instant::now();
         let rounds = self.count.unwrap_or(1);

@@ -94,13 +94,104 @@ fn fd_frames_that_switch_have_a_load_only_with_their_data_bit_rate() {
     assert_eq!((&without["load"], &without["fd"]), (&Value::Null, &13.into()), "{without}");
 }
 
+/// Runs `cantap` and returns its exit code, standard output and standard error.
+fn run(arguments: &[&str]) -> (Option<i32>, String, String) {
+    let output = Command::new(env!("CARGO_BIN_EXE_cantap")).args(arguments).output().unwrap();
+    let text = |bytes| String::from_utf8(bytes).unwrap();
+    (output.status.code(), text(output.stdout), text(output.stderr))
+}
+
 #[test]
-fn an_fd_frame_to_be_sent_is_refused_with_the_reason() {
+fn an_fd_frame_is_refused_where_none_can_be_sent_before_anything_of_the_list_is() {
+    let (code, out, err) = run(&["send", "-d", "virtual:load=0", "-b", "500k", "1", "123#11", "123##1AA"]);
+    assert_eq!((code, out.as_str()), (Some(1), ""), "{err}");
+    assert!(err.contains("'123##1AA' is a CAN FD frame: this device is a classical CAN controller"), "{err}");
+    // A pipe only receives.
     let (device, _done) = pipe("fd-send", fd_rows());
-    let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
-    let output = command.args(["send", "-d", &device, "-b", "500k", "1", "123##1AA"]).output().unwrap();
-    let err = String::from_utf8(output.stderr).unwrap();
-    assert!(!output.status.success() && err.contains("CAN FD"), "{err}");
+    let (code, _, err) = run(&["send", "-d", &device, "-b", "500k", "1", "123##1AA"]);
+    assert!(code == Some(1) && err.contains("use one with CAN FD"), "{err}");
+    // Lengths and flags that nothing has, and a remote frame.
+    for (frame, reason) in [
+        (format!("123##1{}", "AA".repeat(9)), "--pad"),
+        (format!("123##1{}", "AA".repeat(65)), "0 to 8, 12"),
+        ("123##8".to_owned(), "flags"),
+        ("123##1R".to_owned(), "not a frame"),
+    ] {
+        let (code, _, err) = run(&["send", "-d", "virtual", "1", &frame]);
+        assert!(code == Some(2) && err.contains(reason), "{frame}: {err}");
+    }
+    let (code, _, err) = run(&["gen", "-d", "virtual:load=0", "1", "--fd", "-n", "1"]);
+    assert!(code == Some(1) && err.contains("classical CAN controller"), "{err}");
+}
+
+/// The other end of a tunnel, and its address.
+fn tunnel() -> (std::net::UdpSocket, String) {
+    let peer = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    peer.set_read_timeout(Some(std::time::Duration::from_secs(20))).unwrap();
+    let listen = std::net::UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let address = format!("cannelloni://{}?listen={listen}", peer.local_addr().unwrap());
+    (peer, address)
+}
+
+/// What follows a datagram's header, of so many datagrams.
+fn datagrams(peer: &std::net::UdpSocket, count: usize) -> Vec<Vec<u8>> {
+    let mut bytes = [0; 200];
+    (0..count).map(|_| peer.recv(&mut bytes).map(|len| bytes[5..len].to_vec()).unwrap()).collect()
+}
+
+#[test]
+fn fd_frames_are_sent_confirmed_with_their_flags_and_padded_only_on_request() {
+    let (peer, address) = tunnel();
+    let (code, out, err) =
+        run(&["send", "-d", &address, "-b", "500k", "1", "123##1AA", "7FF#11", "1##2.01.02", "--count", "2"]);
+    assert_eq!(code, Some(0), "{err}");
+    let printed: Vec<&str> = out.lines().filter_map(|line| line.split(' ').nth(2)).collect();
+    assert_eq!(printed, ["123##1AA", "7FF#11", "001##20102", "123##1AA", "7FF#11", "001##20102"]);
+    let sent = datagrams(&peer, 6);
+    assert_eq!(sent[..2], [vec![0, 0, 1, 0x23, 0x81, 1, 0xAA], vec![0, 0, 7, 0xFF, 1, 0x11]]);
+    // Nine bytes become twelve.
+    let (code, out, err) =
+        run(&["send", "-d", &address, "-b", "500k", "1", "--pad", "123##1112233445566778899"]);
+    assert!(code == Some(0) && out.contains("123##1112233445566778899000000 T"), "{out}{err}");
+    // Repeated: the first and the last are four periods apart.
+    let (code, out, err) = run(&[
+        "send", "-d", &address, "-b", "500k", "1", "123##1AA", "123#11", "--period", "20ms", "--count", "5",
+    ]);
+    assert_eq!((code, out.lines().count()), (Some(0), 10), "{out}{err}");
+    let time = |line: &str| line[1..].split(')').next().unwrap().parse::<f64>().unwrap();
+    let times: Vec<f64> = out.lines().map(time).collect();
+    assert!(times[8] - times[0] > 0.079, "{out}");
+}
+
+#[test]
+fn fd_frames_of_a_trace_and_made_up_ones_are_sent() {
+    let (peer, address) = tunnel();
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("adapters");
+    std::fs::create_dir_all(&folder).unwrap();
+    let log = folder.join("fd-replay.log");
+    std::fs::write(&log, fd_rows()).unwrap();
+    let (code, out, err) = run(&["replay", "-d", &address, "-b", "500k", "-v", log.to_str().unwrap()]);
+    assert!(code == Some(0) && err.contains("23 frames"), "{err}");
+    let printed: Vec<&str> = out.lines().filter_map(|line| line.split(' ').nth(2)).collect();
+    assert_eq!(printed, frames_of(&fd_rows()));
+    datagrams(&peer, 23);
+    let (code, out, err) = run(&[
+        "gen", "-d", &address, "-b", "500k", "1", "--brs", "-g", "0", "-L", "64", "-I", "1", "-n", "3", "-v",
+    ]);
+    assert!(code == Some(0) && out.lines().filter(|line| line.contains("001##1")).count() == 3, "{out}{err}");
+    assert!(datagrams(&peer, 3).iter().all(|frame| frame[..6] == [0, 0, 0, 1, 0xC0, 1] && frame.len() == 70));
+    // A message of twelve bytes, whose length CAN FD has; one of ten is filled up on request.
+    let database = folder.join("fd.dbc");
+    let text = "BO_ 256 Twelve: 12 A\n SG_ S : 88|8@1+ (1,0) [0|0] \"\" A\nBO_ 257 Ten: 10 A\n SG_ T : 72|8@1+ (1,0) [0|0] \"\" A\n";
+    std::fs::write(&database, text).unwrap();
+    let database = database.to_str().unwrap();
+    let (code, out, err) = run(&["send", "-d", &address, "-b", "500k", "1", "Twelve:S=7", "--db", database]);
+    assert!(code == Some(0) && out.contains(&format!("100##0{}07 T", "00".repeat(11))), "{out}{err}");
+    let (code, _, err) = run(&["send", "-d", &address, "-b", "500k", "1", "Ten:T=7", "--db", database]);
+    assert!(code != Some(0) && err.contains("--pad"), "{err}");
+    let (code, out, err) =
+        run(&["send", "-d", &address, "-b", "500k", "1", "Ten:T=7", "--db", database, "--pad", "--brs"]);
+    assert!(code == Some(0) && out.contains(&format!("101##1{}070000 T", "00".repeat(9))), "{out}{err}");
 }
 
 fn object(text: &str) -> Value {

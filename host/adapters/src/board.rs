@@ -257,6 +257,9 @@ impl<'q> Board<'q, QUEUE_BYTES> for AdapterBoard<'q> {
         } else {
             (hello.tx_queue, hello.periodic_slots, hello.trigger_slots) = (0, 0, 0);
         }
+        if sends && self.driver.sends_fd() {
+            hello.capabilities |= capability::FD_TRANSMIT;
+        }
         if row.listen_only == ListenOnly::Never {
             hello.capabilities |= capability::ALWAYS_ACKNOWLEDGES;
         }
@@ -266,6 +269,10 @@ impl<'q> Board<'q, QUEUE_BYTES> for AdapterBoard<'q> {
         if !row.sets_bit_rate {
             hello.capabilities |= capability::NO_BIT_RATE;
         }
+    }
+
+    fn sends_fd(&self) -> bool {
+        self.driver.sends_fd()
     }
 
     fn prepare(&mut self, command: &Command) -> Result<(), Refusal> {

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use cantap::device::is_idle;
 use cantap_codecs::cannelloni::{Item, NoDatagram, Order, Sequence, Writer, datagram, item};
 use cantap_wire::record::LossStage;
-use cantap_wire::{Channel, Frame, Refusal};
+use cantap_wire::{Channel, FdFrame, Frame, Refusal};
 
 use crate::driver::{At, Bytes, Driver, Incoming, Oddities, OpenError, Opening, poll_bytes};
 use crate::rows::{Row, row};
@@ -63,6 +63,21 @@ impl Cannelloni {
             oddities: Oddities::default(),
             failed: None,
         })
+    }
+
+    /// Sends a datagram with what was written.
+    fn hand_over(&mut self, channel: Channel, mailbox: u8) -> bool {
+        let datagram = self.writer.take().unwrap_or_default();
+        match self.socket.send(&datagram) {
+            Ok(_) => {}
+            // Nobody listens at the other end: as with a lost datagram, nobody knows.
+            Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => {
+                self.oddities.count("frames sent to nobody");
+            }
+            Err(error) => self.failed = Some(error.to_string()),
+        }
+        self.backlog.push(Incoming::Sent { channel, mailbox, at: At::arrival(Instant::now()) });
+        true
     }
 
     fn lost(&mut self, count: u32, at_least: bool, at: At) {
@@ -155,17 +170,16 @@ impl Driver for Cannelloni {
 
     fn send(&mut self, channel: Channel, mailbox: u8, frame: &Frame) -> bool {
         self.writer.push(frame);
-        let datagram = self.writer.take().unwrap_or_default();
-        match self.socket.send(&datagram) {
-            Ok(_) => {}
-            // Nobody listens at the other end: as with a lost datagram, nobody knows.
-            Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => {
-                self.oddities.count("frames sent to nobody");
-            }
-            Err(error) => self.failed = Some(error.to_string()),
-        }
-        self.backlog.push(Incoming::Sent { channel, mailbox, at: At::arrival(Instant::now()) });
+        self.hand_over(channel, mailbox)
+    }
+
+    fn sends_fd(&self) -> bool {
         true
+    }
+
+    fn send_fd(&mut self, channel: Channel, mailbox: u8, frame: &FdFrame) -> bool {
+        self.writer.push_fd(frame);
+        self.hand_over(channel, mailbox)
     }
 
     fn poll(&mut self, wait: Duration, reports: &mut Vec<Incoming>) -> Result<(), String> {

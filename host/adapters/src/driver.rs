@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use cantap_trace::{TraceEvent, TraceFrame};
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, Stamp};
-use cantap_wire::{Channel, Frame, Refusal};
+use cantap_wire::{Channel, FdFrame, Frame, Refusal};
 
 use crate::rows::Row;
 use crate::source::Piece;
@@ -317,6 +317,14 @@ pub(crate) trait Driver: Send {
     fn close(&mut self, channel: Channel);
     /// Takes a frame to be sent. Returns false if it cannot now: it is offered again.
     fn send(&mut self, channel: Channel, mailbox: u8, frame: &Frame) -> bool;
+    /// Whether it sends CAN FD frames, too.
+    fn sends_fd(&self) -> bool {
+        false
+    }
+    /// [`Driver::send`] of a CAN FD frame, where [`Driver::sends_fd`] says that there are any.
+    fn send_fd(&mut self, _channel: Channel, _mailbox: u8, _frame: &FdFrame) -> bool {
+        false
+    }
     /// Waits up to `wait` for something to report, and appends it. An error is the adapter's end, with the reason for people.
     fn poll(&mut self, wait: Duration, reports: &mut Vec<Incoming>) -> Result<(), String>;
     /// Shows for some seconds which adapter it is; 0 ends that.

@@ -325,7 +325,11 @@ impl Engine<'_> {
             loop {
                 let next = board.boxes[channel.index()].borrow().waiting.front().copied();
                 let Some((mailbox, frame)) = next else { break };
-                if !board.driver.send(channel, mailbox, &frame) {
+                let taken = match frame {
+                    TraceFrame::Classic(frame) => board.driver.send(channel, mailbox, &frame),
+                    TraceFrame::Fd(frame) => board.driver.send_fd(channel, mailbox, &frame),
+                };
+                if !taken {
                     break;
                 }
                 board.boxes[channel.index()].borrow_mut().taken();

@@ -130,6 +130,16 @@ impl Kvaser {
         }
     }
 
+    /// Gives a message to the library. Returns false if it cannot take it now.
+    fn write(&mut self, handle: Handle, mailbox: u8, message: &KvaserMessage, frame: TraceFrame) -> bool {
+        match self.library.write(handle, message) {
+            Ok(()) => self.channel.sent(mailbox, frame),
+            Err(Error::TRANSMIT_FULL) => return false,
+            Err(_) => self.channel.not_sent(mailbox, REFUSED),
+        }
+        true
+    }
+
     /// Asks for the state, now and then.
     fn look(&mut self, handle: Handle) {
         let now = Instant::now();
@@ -270,22 +280,34 @@ impl Driver for Kvaser {
         let id = frame.id();
         let mut data = [0; 64];
         data[..8].copy_from_slice(&frame.padded_data());
-        let flags = if id.is_extended() { flag::EXTENDED } else { 0x2 };
+        let flags = if id.is_extended() { flag::EXTENDED } else { flag::STANDARD };
         let flags = if frame.is_remote() { flags | flag::REMOTE } else { flags };
         let len = u32::from(frame.dlc());
         if len > 8 {
             self.channel.not_sent(mailbox, TOO_LONG);
             return true;
         }
-        match self
-            .library
-            .write(handle, &KvaserMessage { id: id.raw().into(), flags, len, data, stamp_us: 0 })
-        {
-            Ok(()) => self.channel.sent(mailbox, frame),
-            Err(Error::TRANSMIT_FULL) => return false,
-            Err(_) => self.channel.not_sent(mailbox, REFUSED),
-        }
-        true
+        let message = KvaserMessage { id: id.raw().into(), flags, len, data, stamp_us: 0 };
+        self.write(handle, mailbox, &message, (*frame).into())
+    }
+
+    fn sends_fd(&self) -> bool {
+        self.options.data_bitrate_bps.is_some()
+    }
+
+    fn send_fd(&mut self, _channel: Channel, mailbox: u8, frame: &FdFrame) -> bool {
+        let Some(handle) = self.handle else { return false };
+        let id = frame.id();
+        let mut data = [0; 64];
+        data[..frame.data_len()].copy_from_slice(frame.data());
+        let flag = |is: bool, bit: u32| if is { bit } else { 0 };
+        let flags = flag::FD
+            | if id.is_extended() { flag::EXTENDED } else { flag::STANDARD }
+            | flag(frame.brs(), flag::BRS)
+            | flag(frame.esi(), flag::ESI);
+        let len = frame.data_len() as u32;
+        let message = KvaserMessage { id: id.raw().into(), flags, len, data, stamp_us: 0 };
+        self.write(handle, mailbox, &message, (*frame).into())
     }
 
     fn poll(&mut self, wait: Duration, reports: &mut Vec<Incoming>) -> Result<(), String> {

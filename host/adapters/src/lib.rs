@@ -21,6 +21,7 @@ mod driver;
 mod elm327;
 mod engine;
 mod error_frames;
+mod fd_advice;
 mod gs_usb;
 mod gvret;
 mod in_order;
@@ -44,5 +45,6 @@ mod trace_pipe;
 mod under_way;
 
 pub use driver::OpenError;
+pub use fd_advice::fd_advice;
 pub use place::{BadPlace, Place, can_interfaces, open};
 pub use rows::{Confirmation, ListenOnly, Losses, ROWS, Row, Stamps, row};

@@ -4,8 +4,8 @@
 use std::time::{Duration, Instant};
 
 use cantap_trace::{TraceFrame, clean};
+use cantap_wire::Channel;
 use cantap_wire::record::{ErrorState, LossStage};
-use cantap_wire::{Channel, Frame};
 
 use crate::driver::{At, Incoming, Oddities};
 use crate::error_frames::ErrorFrames;
@@ -95,11 +95,7 @@ impl LibraryChannel {
             self.report(Incoming::Received { channel, frame, at });
             return None;
         }
-        let mailbox = match frame {
-            TraceFrame::Classic(frame) => self.under_way.confirm(&frame),
-            TraceFrame::Fd(_) => None,
-        };
-        let Some(mailbox) = mailbox else { return Some(frame) };
+        let Some(mailbox) = self.under_way.confirm(&frame) else { return Some(frame) };
         self.report(Incoming::Sent { channel, mailbox, at });
         None
     }
@@ -142,8 +138,8 @@ impl LibraryChannel {
     }
 
     /// A frame was taken, to be confirmed later.
-    pub fn sent(&mut self, mailbox: u8, frame: &Frame) {
-        self.under_way.push(mailbox, *frame);
+    pub fn sent(&mut self, mailbox: u8, frame: TraceFrame) {
+        self.under_way.push(mailbox, frame);
     }
 
     /// A frame cannot be sent, for this reason.

@@ -6,9 +6,10 @@ use std::rc::Rc;
 
 use cantap_firmware::bus::mailboxes::MAILBOXES;
 use cantap_firmware::ports::{Control, ErrorStatus, Outcome, Traffic};
-use cantap_wire::Frame;
+use cantap_trace::TraceFrame;
 use cantap_wire::message::{ChannelConfig, RegisterSet};
 use cantap_wire::record::{BusErrorKind, ErrorState};
+use cantap_wire::{FdFrame, Frame};
 
 /// Whether a channel takes part in its bus.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -26,9 +27,9 @@ pub(crate) enum Phase {
 /// One channel, shared by the firmware's two sides and the engine.
 pub(crate) struct Mailboxes {
     pub phase: Phase,
-    prepared: Option<Frame>,
+    prepared: Option<TraceFrame>,
     /// Requested, and not yet taken by the adapter.
-    pub waiting: VecDeque<(u8, Frame)>,
+    pub waiting: VecDeque<(u8, TraceFrame)>,
     /// Taken by the adapter, and not yet confirmed.
     handed: [bool; MAILBOXES],
     finished: VecDeque<(u8, Outcome)>,
@@ -71,6 +72,18 @@ impl Mailboxes {
         *handed = false;
         self.finished.push_back((mailbox, outcome));
         true
+    }
+
+    /// Keeps a frame for the mailbox returned, if one is free.
+    fn prepare(&mut self, frame: TraceFrame) -> Option<u8> {
+        let taken = |mailbox: u8| {
+            self.handed[usize::from(mailbox)]
+                || self.waiting.iter().any(|(waiting, _)| *waiting == mailbox)
+                || self.finished.iter().any(|(finished, _)| *finished == mailbox)
+        };
+        let free = (0..MAILBOXES as u8).find(|mailbox| !taken(*mailbox))?;
+        self.prepared = Some(frame);
+        Some(free)
     }
 
     /// Whether the firmware must collect what has ended.
@@ -116,15 +129,11 @@ impl Traffic for TrafficSide {
     }
 
     fn prepare(&mut self, frame: &Frame) -> Option<u8> {
-        let mut boxes = self.0.borrow_mut();
-        let taken = |mailbox: u8| {
-            boxes.handed[usize::from(mailbox)]
-                || boxes.waiting.iter().any(|(waiting, _)| *waiting == mailbox)
-                || boxes.finished.iter().any(|(finished, _)| *finished == mailbox)
-        };
-        let free = (0..MAILBOXES as u8).find(|mailbox| !taken(*mailbox))?;
-        boxes.prepared = Some(*frame);
-        Some(free)
+        self.0.borrow_mut().prepare((*frame).into())
+    }
+
+    fn prepare_fd(&mut self, frame: &FdFrame) -> Option<u8> {
+        self.0.borrow_mut().prepare((*frame).into())
     }
 
     fn request(&mut self, mailbox: u8) {

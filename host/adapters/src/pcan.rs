@@ -173,6 +173,27 @@ impl Pcan {
         });
     }
 
+    /// Gives a message to the library. Returns false if it cannot take it now.
+    fn write(&mut self, mailbox: u8, message: &PcanMessage, frame: TraceFrame) -> bool {
+        let written = match self.options.data_bitrate_bps {
+            Some(_) => self.library.write_fd(self.handle, message),
+            None => self.library.write(self.handle, message),
+        };
+        match written {
+            Err(status) if !status.is_failure() && status.has(status::TRANSMIT_FULL | status::QUEUE_FULL) => {
+                return false;
+            }
+            Err(status) if status.is_failure() => self.channel.not_sent(mailbox, REFUSED),
+            // Taken, whatever is said about the bus beside it.
+            Ok(()) | Err(_) if self.echoes => self.channel.sent(mailbox, frame),
+            Ok(()) | Err(_) => {
+                let at = At::arrival(Instant::now());
+                self.channel.report(Incoming::Sent { channel: Channel::Can1, mailbox, at });
+            }
+        }
+        true
+    }
+
     fn look_after_time(&mut self) {
         let now = Instant::now();
         if self.identifies_until.is_some_and(|until| until <= now) {
@@ -308,7 +329,7 @@ impl Driver for Pcan {
         self.channel.leave();
     }
 
-    fn send(&mut self, channel: Channel, mailbox: u8, frame: &Frame) -> bool {
+    fn send(&mut self, _channel: Channel, mailbox: u8, frame: &Frame) -> bool {
         let id = frame.id();
         let mut data = [0; 64];
         data[..8].copy_from_slice(&frame.padded_data());
@@ -319,23 +340,24 @@ impl Driver for Pcan {
             self.channel.not_sent(mailbox, TOO_LONG);
             return true;
         }
-        let written = match self.options.data_bitrate_bps {
-            Some(_) => self.library.write_fd(self.handle, &message),
-            None => self.library.write(self.handle, &message),
-        };
-        match written {
-            Err(status) if !status.is_failure() && status.has(status::TRANSMIT_FULL | status::QUEUE_FULL) => {
-                return false;
-            }
-            Err(status) if status.is_failure() => self.channel.not_sent(mailbox, REFUSED),
-            // Taken, whatever is said about the bus beside it.
-            Ok(()) | Err(_) if self.echoes => self.channel.sent(mailbox, frame),
-            Ok(()) | Err(_) => {
-                let at = At::arrival(Instant::now());
-                self.channel.report(Incoming::Sent { channel, mailbox, at });
-            }
-        }
-        true
+        self.write(mailbox, &message, (*frame).into())
+    }
+
+    fn sends_fd(&self) -> bool {
+        self.options.data_bitrate_bps.is_some()
+    }
+
+    fn send_fd(&mut self, _channel: Channel, mailbox: u8, frame: &FdFrame) -> bool {
+        let id = frame.id();
+        let mut data = [0; 64];
+        data[..frame.data_len()].copy_from_slice(frame.data());
+        let flag = |is: bool, bit: u8| if is { bit } else { 0 };
+        let kind = kind::FD
+            | flag(id.is_extended(), kind::EXTENDED)
+            | flag(frame.brs(), kind::BRS)
+            | flag(frame.esi(), kind::ESI);
+        let message = PcanMessage { id: id.raw(), kind, dlc: frame.dlc(), data };
+        self.write(mailbox, &message, (*frame).into())
     }
 
     fn poll(&mut self, wait: Duration, reports: &mut Vec<Incoming>) -> Result<(), String> {

@@ -161,7 +161,7 @@ impl Run<'_> {
         self.stream.wait(Duration::ZERO)?;
         for Transmission { channel, tag, result, .. } in self.stream.take_ended() {
             let sender = self.under_way.remove(&(channel.index(), tag));
-            let Ok(frame) = result else { continue };
+            let Ok(TraceFrame::Classic(frame)) = result else { continue };
             let slot = tag.checked_sub(DEVICE_TAG).map(|slot| slot as u8);
             let repeats =
                 |(of, _, _): &(usize, usize, u32), own: u8| *of == channel.index() && Some(own) == slot;

@@ -28,6 +28,7 @@ use crate::places::{GREETING_TIMEOUT, Place};
 use crate::shared::Shared;
 use crate::state::{Member, State, Then};
 use crate::stream::{ClientId, View, Views};
+use crate::to_send::ToSend;
 
 /// A client that may send and says nothing for this long is let go, because the board acknowledges for it. Programs of ours say something
 /// twice a second.
@@ -350,7 +351,12 @@ impl Client {
                 self.shared.ask(command, Then::Nothing)
             }
             Command::SetFilters { channel, filters } => self.set_filters(channel, &filters),
-            Command::Send { channel, frames } => self.send(channel, &frames),
+            Command::Send { channel, frames } => {
+                self.send(channel, &frames.into_iter().map(ToSend::Classic).collect())
+            }
+            Command::SendFd { channel, frames } => {
+                self.send(channel, &frames.into_iter().map(ToSend::Fd).collect())
+            }
             Command::Abort { channel } => self.withdraw(channel, false).map(|()| Reply::Done),
             Command::SetPeriodic { channel, slot, entry } => self.set_periodic(channel, slot, entry),
             Command::SetTrigger { channel, slot, entry } => self.set_trigger(channel, slot, entry),

@@ -45,6 +45,7 @@ mod stream;
 mod text;
 #[cfg(feature = "tls")]
 pub mod tls;
+mod to_send;
 mod totals;
 mod upstream;
 mod writer;

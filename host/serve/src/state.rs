@@ -5,12 +5,13 @@ use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use std::time::Instant;
 
-use cantap_wire::message::{ChannelConfig, DEVICE_TAG, Mode, Role, TRIGGER_TAG, TxFrame};
+use cantap_wire::message::{ChannelConfig, DEVICE_TAG, Mode, Role, TRIGGER_TAG};
 use cantap_wire::record::{ErrorState, LossStage, Record, TransmitFailure};
 use cantap_wire::{CHANNELS, Channel, Command, Event, Hello, Refusal};
 
 use crate::outbox::{Item, Outbox};
 use crate::stream::{ClientId, Counts, Entry, Owner, Views};
+use crate::to_send::ToSend;
 use crate::totals::{Totals, count};
 
 /// Tags in a board's queue wrap here: far below the board's own tags, far above the number in flight.
@@ -32,7 +33,7 @@ pub struct Member {
 pub struct Sent {
     pub client: ClientId,
     /// With the client's tag.
-    pub frame: TxFrame,
+    pub frame: ToSend,
     pub channel: Channel,
     /// Another client's frames are being withdrawn: this one must be sent again.
     pub keep: bool,
@@ -162,7 +163,7 @@ pub struct State {
     next_tag: u32,
     pub entries: [Entries; CHANNELS],
     /// Frames to send once more, with their channel, when the lock is free.
-    pub again: Vec<(Channel, TxFrame)>,
+    pub again: Vec<(Channel, ToSend)>,
     /// Since the start, without what connected clients have lost.
     totals: Totals,
     /// Number of clients being written to.
@@ -173,7 +174,7 @@ pub struct State {
 
 impl State {
     /// Records a frame that is going to the board. Returns its tag there.
-    pub fn note_sent(&mut self, client: ClientId, channel: Channel, frame: TxFrame) -> u32 {
+    pub fn note_sent(&mut self, client: ClientId, channel: Channel, frame: ToSend) -> u32 {
         let tag = self.next_tag;
         self.next_tag = (tag + 1) % TAGS;
         self.sent.insert(tag, Sent { client, frame, channel, keep: false, is_closed: false });
@@ -256,27 +257,31 @@ impl State {
         // Stamps can be corrected to before an earlier record.
         self.latest_ticks = self.latest_ticks.max(ticks);
         let mut entry = Entry { ticks, record, owner: None };
-        let Record::Event(event) = record else { return Some(entry) };
+        let event = match record {
+            Record::Event(event) => event,
+            Record::TransmittedFd(sent) => {
+                entry.owner = self.owner_of_sent(sent.tag, sent.channel);
+                return Some(entry);
+            }
+            Record::Received(_) | Record::ReceivedFd(_) => return Some(entry),
+        };
         match event {
             Event::Stopped { .. } => return None,
             Event::State { channel, state, tec, rec } => {
                 self.controller[channel.index()] = Some((state, tec, rec));
             }
             Event::Transmitted { tag, channel, .. } => {
-                entry.owner = match self.sent.remove(&tag) {
-                    Some(sent) => Some(Owner { client: sent.client, tag: sent.frame.tag }),
-                    None => self.entries[channel.index()].owner_of_own(tag),
-                };
+                entry.owner = self.owner_of_sent(tag, channel);
             }
             Event::TransmitFailed { channel, tag, reason } => match self.sent.remove(&tag) {
                 Some(sent) if sent.keep && reason == TransmitFailure::Aborted => {
                     let client = sent.client;
                     let again = self.note_sent(client, channel, sent.frame);
-                    self.again.push((channel, TxFrame { tag: again, ..sent.frame }));
+                    self.again.push((channel, sent.frame.tagged(again)));
                     return None;
                 }
                 Some(sent) => {
-                    entry.owner = Some(Owner { client: sent.client, tag: sent.frame.tag });
+                    entry.owner = Some(Owner { client: sent.client, tag: sent.frame.tag() });
                     let reason = if sent.is_closed { TransmitFailure::Closed } else { reason };
                     entry.record = Record::Event(Event::TransmitFailed { channel, tag, reason });
                 }
@@ -287,13 +292,21 @@ impl State {
         Some(entry)
     }
 
+    /// Whose frame it was that the board has sent, if it was a client's.
+    fn owner_of_sent(&mut self, tag: u32, channel: Channel) -> Option<Owner> {
+        match self.sent.remove(&tag) {
+            Some(sent) => Some(Owner { client: sent.client, tag: sent.frame.tag() }),
+            None => self.entries[channel.index()].owner_of_own(tag),
+        }
+    }
+
     /// A frame that should have been sent again was not accepted.
     pub fn give_up(&mut self, tag: u32) -> Option<Entry> {
         let Sent { client, frame, channel, is_closed, .. } = self.sent.remove(&tag)?;
         let reason = if is_closed { TransmitFailure::Closed } else { TransmitFailure::Aborted };
         let mut entry =
-            Entry::event(self.latest_ticks, Event::TransmitFailed { channel, tag: frame.tag, reason });
-        entry.owner = Some(Owner { client, tag: frame.tag });
+            Entry::event(self.latest_ticks, Event::TransmitFailed { channel, tag: frame.tag(), reason });
+        entry.owner = Some(Owner { client, tag: frame.tag() });
         Some(entry)
     }
 

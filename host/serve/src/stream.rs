@@ -2,7 +2,7 @@
 
 use cantap_wire::message::{ChannelConfig, DEVICE_TAG, Filter, OTHERS_TAG};
 use cantap_wire::record::{LossStage, Record, Stamp, TransmitFailure};
-use cantap_wire::{CHANNELS, Channel, Event, Frame, Received, ReceivedFd};
+use cantap_wire::{CHANNELS, Channel, Event, Frame, Received, ReceivedFd, TransmittedFd};
 
 /// A client's number, never used twice.
 pub type ClientId = u64;
@@ -77,6 +77,8 @@ pub fn shown(entry: &Entry, client: ClientId, views: &Views) -> Option<Record> {
             }
             Some(Record::ReceivedFd(received))
         }
+        Record::TransmittedFd(sent) => is_open(sent.channel)
+            .then(|| Record::TransmittedFd(TransmittedFd { tag: own_tag.unwrap_or(OTHERS_TAG), ..sent })),
         Record::Event(event) => {
             let event = match event {
                     Event::SofMark { .. } => Some(event),
@@ -129,14 +131,17 @@ pub fn count(counts: &mut [Counts; CHANNELS], record: &Record, is_own: bool) {
                 LossStage::Gateway => {}
             }
         }
-        Record::Event(Event::Transmitted { channel, .. }) if is_own => {
+        Record::Event(Event::Transmitted { channel, .. })
+        | Record::TransmittedFd(TransmittedFd { channel, .. })
+            if is_own =>
+        {
             add(&mut counts[channel.index()].transmitted, 1);
         }
         Record::Event(Event::TransmitFailed { channel, reason, .. }) => {
             let failures = if let TransmitFailure::Overtaken { periods } = reason { periods } else { 1 };
             add(&mut counts[channel.index()].transmit_failures, failures);
         }
-        Record::Event(_) => {}
+        Record::Event(_) | Record::TransmittedFd(_) => {}
     }
 }
 
@@ -149,7 +154,7 @@ fn add(counter: &mut u32, count: u32) {
 #[derive(Debug, Default)]
 pub struct Gap {
     /// In order, as the client sees it.
-    kept: Vec<(u64, Event)>,
+    kept: Vec<(u64, Record)>,
     lost: [u32; CHANNELS],
     errors: [u32; CHANNELS],
     /// Of its last record.
@@ -166,9 +171,15 @@ impl Gap {
                 self.lost[channel.index()] += 1;
                 return Some(channel);
             }
+            // Bounded by the number in flight.
+            Record::TransmittedFd(sent) if sent.tag < DEVICE_TAG => self.kept.push((ticks, *record)),
+            Record::TransmittedFd(sent) => {
+                self.lost[sent.channel.index()] += 1;
+                return Some(sent.channel);
+            }
             Record::Event(event) => match event {
-                // Bounded by the number in flight.
-                Event::Transmitted { tag, .. } if tag < DEVICE_TAG => self.kept.push((ticks, event)),
+                // The same.
+                Event::Transmitted { tag, .. } if tag < DEVICE_TAG => self.kept.push((ticks, *record)),
                 Event::Transmitted { channel, .. } => {
                     self.lost[channel.index()] += 1;
                     return Some(channel);
@@ -187,7 +198,12 @@ impl Gap {
 
     /// Appends the gap that follows this one.
     pub fn join(&mut self, next: Self) {
-        next.kept.into_iter().for_each(|(ticks, event)| self.keep(ticks, event));
+        for (ticks, record) in next.kept {
+            match record {
+                Record::Event(event) => self.keep(ticks, event),
+                record => self.kept.push((ticks, record)),
+            }
+        }
         for (sum, more) in self.lost.iter_mut().zip(next.lost) {
             *sum += more;
         }
@@ -199,25 +215,29 @@ impl Gap {
 
     /// Keeps an event, or merges it with one of its kind: the number kept is bounded.
     fn keep(&mut self, ticks: u64, event: Event) {
-        let place = self.kept.iter_mut().rev().find_map(|(at, kept)| merge(kept, &event).then_some(at));
+        let place = self.kept.iter_mut().rev().find_map(|(at, kept)| match kept {
+            Record::Event(kept) => merge(kept, &event).then_some(at),
+            _ => None,
+        });
         match place {
             Some(at) => *at = ticks,
-            None => self.kept.push((ticks, event)),
+            None => self.kept.push((ticks, Record::Event(event))),
         }
     }
 
     /// What appears in the stream instead.
-    pub fn events(mut self) -> Vec<(u64, Event)> {
+    pub fn records(mut self) -> Vec<(u64, Record)> {
         self.kept.sort_by_key(|(ticks, _)| *ticks);
         let ticks = self.ticks;
         for channel in Channel::ALL {
             let (lost, errors) = (self.lost[channel.index()], self.errors[channel.index()]);
             if errors > 0 {
-                self.kept.push((ticks, Event::ErrorsSuppressed { channel, count: errors }));
+                let event = Event::ErrorsSuppressed { channel, count: errors };
+                self.kept.push((ticks, Record::Event(event)));
             }
             if lost > 0 {
                 let event = Event::Lost { channel, stage: LossStage::Host, count: lost, at_least: false };
-                self.kept.push((ticks, event));
+                self.kept.push((ticks, Record::Event(event)));
             }
         }
         self.kept
@@ -298,7 +318,8 @@ mod tests {
         assert_eq!(shown(&entry, 1, &views), Some(Record::ReceivedFd(wanted)));
         let mut gap = Gap::default();
         assert_eq!(gap.absorb(5, &entry.record), Some(channel));
-        assert_eq!(gap.events(), [(5, lost(channel, LossStage::Host, 1, false))]);
+        let lost = Record::Event(lost(channel, LossStage::Host, 1, false));
+        assert_eq!(gap.records(), [(5, lost)]);
     }
 
     /// As [`crate::outbox::MOST_RECORDS`] says.
@@ -334,7 +355,13 @@ mod tests {
         gap.absorb(1000, &Record::Event(own));
         let state = Event::State { channel, state: ErrorState::Passive, tec: 128, rec: 999u16 as u8 };
         let overtaken = TransmitFailure::Overtaken { periods: 2000 };
-        let events = gap.events();
+        let id = cantap_wire::Id::standard(0x123).unwrap();
+        let fd = cantap_wire::FdFrame::new(id, true, false, &[7; 12]).unwrap();
+        let own_fd = Record::TransmittedFd(TransmittedFd { channel, tag: 8, frame: fd });
+        assert_eq!(gap.absorb(1000, &own_fd), None);
+        let others = Record::TransmittedFd(TransmittedFd { channel, tag: OTHERS_TAG, frame: fd });
+        assert_eq!(gap.absorb(1000, &others), Some(channel));
+        let events = gap.records();
         assert_eq!(
             events,
             [
@@ -342,9 +369,15 @@ mod tests {
                 (999, state),
                 (999, Event::TransmitFailed { channel, tag: DEVICE_TAG, reason: overtaken }),
                 (1000, own),
-                (1000, Event::ErrorsSuppressed { channel, count: 1000 }),
-                (1000, lost(channel, LossStage::Host, 2000, false)),
             ]
+            .map(|(ticks, event)| (ticks, Record::Event(event)))
+            .into_iter()
+            .chain([
+                (1000, own_fd),
+                (1000, Record::Event(Event::ErrorsSuppressed { channel, count: 1000 })),
+                (1000, Record::Event(lost(channel, LossStage::Host, 2001, false))),
+            ])
+            .collect::<Vec<_>>()
         );
     }
 }

@@ -53,6 +53,11 @@ pub fn count(totals: &mut Totals, entry: &Entry) {
             of.transmitted += 1;
             of.bits += u64::from(cantap::bits_on_bus(&frame));
         }
+        Record::TransmittedFd(sent) => {
+            let of = &mut totals[sent.channel.index()];
+            of.transmitted += 1;
+            of.bits += u64::from(TraceFrame::from(sent.frame).bus_bits().nominal);
+        }
         Record::Event(Event::TransmitFailed { channel, .. }) => {
             totals[channel.index()].transmit_failures += 1;
         }

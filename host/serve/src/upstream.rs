@@ -8,13 +8,14 @@ use cantap::device::PIECE_BYTES;
 use cantap::session::{Pass, SessionOver, Sink};
 use cantap_wire::message::EndReason;
 use cantap_wire::record::{LossStage, Record};
-use cantap_wire::{Channel, Command, Corruption, Decoded, Decoder, Event, Reply};
+use cantap_wire::{Channel, Corruption, Decoded, Decoder, Event, Reply};
 
 use crate::lock::lock;
 use crate::outbox::Item;
 use crate::shared::Shared;
 use crate::state::{State, Then};
 use crate::stream::Entry;
+use crate::to_send;
 
 /// Takes the stream of one session with the board.
 pub struct Upstream {
@@ -38,9 +39,8 @@ impl Sink for Upstream {
             let again = std::mem::take(&mut state.again);
             drop(state);
             for (channel, frame) in again {
-                let frames = heapless::Vec::from_iter([frame]);
-                let then = Then::SentAgain(frame.tag);
-                self.shared.send_unattended(Command::Send { channel, frames }, then);
+                let then = Then::SentAgain(frame.tag());
+                self.shared.send_unattended(to_send::command(channel, &[frame]), then);
             }
         }
         if !bytes.is_empty() {

@@ -127,8 +127,8 @@ impl Encoder {
                 }
             }
             Item::Gap(gap) => {
-                for (ticks, event) in gap.events() {
-                    self.stream.event(ticks, event);
+                for (ticks, record) in gap.records() {
+                    self.stream.record(ticks, &record);
                 }
             }
             Item::Answer(answer) => {

@@ -6,7 +6,8 @@ mod value;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use cantap_can::Frame;
+use cantap_can::{FdFrame, Frame};
+use cantap_trace::TraceFrame;
 
 use super::decoder::{Decoder, MessageRef};
 use super::fault::MAX_SWITCHES;
@@ -44,6 +45,37 @@ pub fn encode(decoder: &Decoder, channel: Option<u8>, text: &str) -> Result<Enco
         room: "a frame has 8",
     })?;
     Ok(Encoded { channel: decoder.channel(reference), message: reference, frame })
+}
+
+/// The same for a message of any length: above eight bytes it is a CAN FD frame, of which a database does not say whether its bit rate is switched
+/// (`brs`). With `pad`, one of a length that CAN FD does not have is filled with zeros up to the next one.
+pub fn encode_any(
+    decoder: &Decoder,
+    channel: Option<u8>,
+    text: &str,
+    (brs, pad): (bool, bool),
+) -> Result<TraceFrame, EncodeError> {
+    let (name, inputs) = parse(text)?;
+    let message = decoder.message(find_message(decoder, channel, &name)?);
+    // A longer parameter group of J1939 is none of CAN FD, but of a transport protocol.
+    if message.length <= 8 || message.j1939 {
+        return Ok(encode(decoder, channel, text)?.frame.into());
+    }
+    let data = encode_message(message, &inputs)?;
+    let frame = if pad {
+        FdFrame::padded(message.id, brs, false, &data)
+    } else {
+        FdFrame::new(message.id, brs, false, &data)
+    };
+    frame.map(TraceFrame::Fd).ok_or_else(|| EncodeError::TooLong {
+        what: format!("message {name}"),
+        bytes: message.length.into(),
+        room: if message.length > 64 {
+            "a CAN FD frame has 64"
+        } else {
+            "a CAN FD frame has 12, 16, 20, 24, 32, 48 or 64; --pad fills it up with zeros"
+        },
+    })
 }
 
 fn find_message(decoder: &Decoder, channel: Option<u8>, name: &str) -> Result<MessageRef, EncodeError> {

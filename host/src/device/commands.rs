@@ -2,7 +2,7 @@
 
 use cantap_wire::message::{
     ChannelConfig, Defaults, Edges, Failures, Filter, GatewayRule, GatewayStatus, Periodic, Registers,
-    Status, Trigger, TxFrame,
+    Status, Trigger, TxFdFrame, TxFrame,
 };
 use cantap_wire::{Channel, Command, Refusal, Reply};
 
@@ -68,6 +68,20 @@ impl Device {
     pub fn send(&self, channel: Channel, frames: &[TxFrame]) -> Result<u16, DeviceError> {
         let frames = heapless::Vec::from_slice(frames).map_err(|_| DeviceError::RequestTooLong)?;
         match self.request(Command::Send { channel, frames })? {
+            Reply::Queued { free } => Ok(free),
+            _ => Err(DeviceError::WrongReply),
+        }
+    }
+
+    /// Queues CAN FD frames for transmission, [`MAX_SEND_FD`](cantap_wire::message::MAX_SEND_FD) at most, all or none. Returns how many
+    /// places are free afterwards. Refused ([`DeviceError::NoFd`]) by a device that sends none: see
+    /// [`Hello::sends_fd`](cantap_wire::Hello::sends_fd).
+    pub fn send_fd(&self, channel: Channel, frames: &[TxFdFrame]) -> Result<u16, DeviceError> {
+        if !self.hello().sends_fd() {
+            return Err(DeviceError::NoFd);
+        }
+        let frames = heapless::Vec::from_slice(frames).map_err(|_| DeviceError::RequestTooLong)?;
+        match self.request(Command::SendFd { channel, frames })? {
             Reply::Queued { free } => Ok(free),
             _ => Err(DeviceError::WrongReply),
         }

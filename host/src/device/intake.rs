@@ -5,7 +5,7 @@ use std::ops::Add;
 
 use cantap_wire::message::{EndReason, Status};
 use cantap_wire::record::{Event, LossStage, Record, Stamp, TransmitFailure};
-use cantap_wire::{CHANNELS, Channel, Corruption, Decoded, Decoder, Frame, Reply, Response};
+use cantap_wire::{CHANNELS, Channel, Corruption, Decoded, Decoder, Reply, Response, TransmittedFd};
 
 use super::clock::{ClockMap, SofMark, Ticks, UtcNs};
 use super::stamps::{BitLengths, Stamped, tighten};
@@ -107,7 +107,7 @@ pub struct Transmission {
     /// UTC in nanoseconds since the Unix epoch.
     pub time_ns: i64,
     /// The frame as sent, or why not.
-    pub result: Result<Frame, TransmitFailure>,
+    pub result: Result<TraceFrame, TransmitFailure>,
 }
 
 /// What the stream contains besides records.
@@ -217,6 +217,11 @@ impl Intake {
                 last_ticks = Some(ticks);
                 counters.channels[received.channel.index()].received += 1;
                 stamped.push(frame(received.channel, received.frame.into(), ticks, received.stamp));
+            }
+            Decoded::Record { ticks, record: Record::TransmittedFd(sent) } => {
+                last_ticks = Some(ticks);
+                let TransmittedFd { channel, tag, frame } = sent;
+                on_sent((channel, tag, frame.into()), Ticks(ticks), clock, stamped, &mut notice);
             }
             Decoded::Record { ticks, record: Record::Event(event) } => {
                 last_ticks = Some(ticks);
@@ -461,6 +466,20 @@ fn follow_bus(
     }
 }
 
+/// A frame of ours was on the bus.
+fn on_sent(
+    (channel, tag, frame): (Channel, u32, TraceFrame),
+    at: Ticks,
+    clock: &ClockMap,
+    stamped: &mut Vec<Stamped>,
+    notice: &mut impl FnMut(Notice),
+) {
+    let (ticks, time_ns) = (at.0, clock.utc(at).0);
+    notice(Notice::Transmission(Transmission { channel, tag, ticks, time_ns, result: Ok(frame) }));
+    let event = TraceEvent::Frame { frame, direction: Direction::Tx, late: false };
+    stamped.push(Stamped { at, channel: channel.number(), event });
+}
+
 /// Everything that is not a received frame.
 fn on_event(
     event: Event,
@@ -496,9 +515,7 @@ fn on_event(
             (channel, TraceEvent::State { state, counters: Some((tec, rec)) })
         }
         Event::Transmitted { channel, tag, frame } => {
-            let (ticks, time_ns) = (at.0, clock.utc(at).0);
-            notice(Notice::Transmission(Transmission { channel, tag, ticks, time_ns, result: Ok(frame) }));
-            (channel, TraceEvent::Frame { frame: frame.into(), direction: Direction::Tx, late: false })
+            return on_sent((channel, tag, frame.into()), at, clock, stamped, notice);
         }
         Event::TransmitFailed { channel, tag, reason } => {
             let (ticks, time_ns) = (at.0, clock.utc(at).0);

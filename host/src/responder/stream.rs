@@ -5,6 +5,7 @@ use cantap_wire::framing::{CRC_LEN, MAX_ENCODED, MAX_MESSAGE, seal};
 use cantap_wire::message::{EndReason, write_response};
 use cantap_wire::record::{
     MAX_FD_RECORD, MAX_RECORD, Record, encode_event, encode_received, encode_received_fd,
+    encode_transmitted_fd,
 };
 use cantap_wire::{Event, Refusal, Reply, Stamp};
 
@@ -73,6 +74,10 @@ impl StreamEncoder {
             Record::ReceivedFd(received) => {
                 let len = encode_received_fd(received, difference, &mut long);
                 (&long[..len], received.stamp != Stamp::Omitted)
+            }
+            Record::TransmittedFd(sent) => {
+                let len = encode_transmitted_fd(sent, difference, &mut long);
+                (&long[..len], true)
             }
             Record::Event(event) => {
                 let len = encode_event(event, difference, &mut short);

@@ -156,6 +156,11 @@ pub enum DeviceError {
         /// The requested channel.
         channel: Channel,
     },
+    /// The device sends no CAN FD frames.
+    #[error(
+        "the device sends no CAN FD frames, but classical ones of up to eight bytes; nothing was sent in their place"
+    )]
+    NoFd,
     /// Another maker's adapter cannot listen without acknowledging.
     #[error(
         "the adapter at '{address}' cannot only listen: it acknowledges every frame; open it in normal mode if that is wanted"

@@ -74,6 +74,8 @@ pub mod output {
 pub mod flag {
     /// A remote frame.
     pub const REMOTE: u32 = 0x1;
+    /// An identifier of 11 bits.
+    pub const STANDARD: u32 = 0x2;
     /// An identifier of 29 bits.
     pub const EXTENDED: u32 = 0x4;
     /// An error frame.

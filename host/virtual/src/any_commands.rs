@@ -456,6 +456,7 @@ impl Books {
         match record {
             Record::Received(received) => self.received[received.channel.index()] += 1,
             Record::ReceivedFd(received) => self.complaints.push(format!("{received:?}")),
+            Record::TransmittedFd(sent) => self.complaints.push(format!("{sent:?}")),
             Record::Event(Event::Lost { channel, stage: LossStage::Queue, count, .. }) => {
                 self.lost[channel.index()] += u64::from(*count);
             }

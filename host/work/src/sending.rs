@@ -13,7 +13,7 @@ use cantap::transmit::Stream;
 use cantap::unsent::{Cause, PATIENCE, Watch};
 use cantap::wire::record::TransmitFailure;
 use cantap::wire::{CHANNELS, Channel};
-use cantap::{Device, Frame, TraceRecord};
+use cantap::{Device, TraceFrame, TraceRecord};
 
 use crate::advice::sentence;
 use crate::bus_off::BusOffRecovery;
@@ -28,7 +28,7 @@ const UNKNOWN: &str = "unknown, since the device is gone";
 pub const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// Takes each frame that was sent, and how its transmission ended.
-pub type OnSent<'d> = Box<dyn FnMut(&Transmission, Frame) -> io::Result<()> + 'd>;
+pub type OnSent<'d> = Box<dyn FnMut(&Transmission, TraceFrame) -> io::Result<()> + 'd>;
 
 /// Frames being sent: counts their ends, passes on what was sent, and notices when no more can be sent.
 pub struct Sending<'d> {

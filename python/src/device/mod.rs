@@ -18,7 +18,7 @@ use cantap::device::{ClockSource, Transmission};
 use cantap::wire::message::capability;
 use cantap::wire::message::{ChannelConfig, Mode};
 use cantap::wire::{BitTiming, Channel, Refusal};
-use cantap::{DeviceError as DeviceFault, Frame as ClassicFrame};
+use cantap::{DeviceError as DeviceFault, TraceFrame};
 use cantap_trace::filter::Filter;
 use cantap_trace::{BusErrorKind, TransmitFailure};
 use pyo3::exceptions::PyValueError;
@@ -105,7 +105,7 @@ pub fn signals() -> Result<(), Error> {
 }
 
 /// The error for a frame that was not sent.
-fn not_sent(end: &Transmission, frame: &ClassicFrame) -> Error {
+fn not_sent(end: &Transmission, frame: &TraceFrame) -> Error {
     let reason = end.result.err().map_or("", TransmitFailure::name);
     Error::Address(format!("{frame} was not sent on channel {}: {reason}", end.channel.number()))
 }
@@ -173,6 +173,7 @@ impl Device {
             "periodic_slots": hello.periodic_slots,
             "reply_slots": hello.trigger_slots,
             "transmits": hello.capabilities & capability::TRANSMIT != 0,
+            "transmits_fd": hello.sends_fd(),
         });
         from_json(py, &object.to_string())
     }
@@ -296,7 +297,7 @@ impl Device {
     ) -> PyResult<Vec<i64>> {
         let channel = number.0;
         let session = self.session()?;
-        let frames: Vec<ClassicFrame> = frames.into_iter().map(|frame| frame.0).collect();
+        let frames: Vec<TraceFrame> = frames.into_iter().map(|frame| frame.0).collect();
         let seconds = timeout.unwrap_or(queue_timeout);
         let patience = duration(seconds)?;
         if let (Some(_), Some(at_ns)) = (timeout, at_ns) {
@@ -378,7 +379,8 @@ impl Device {
     ) -> PyResult<PeriodicFrame> {
         let channel = number.0;
         let session = self.session()?;
-        let begin = || PeriodicFrame::begin(session, channel, frame.0, period_s, count.0, &modifiers, node);
+        let frame = frame.classic("what a device repeats")?;
+        let begin = || PeriodicFrame::begin(session, channel, frame, period_s, count.0, &modifiers, node);
         Ok(py.detach(begin)?)
     }
 
@@ -393,7 +395,8 @@ impl Device {
     ) -> PyResult<Reply> {
         let channel = number.0;
         let session = self.session()?;
-        Ok(py.detach(|| Reply::begin(session, channel, to, frame.0, count.0))?)
+        let frame = frame.classic("a reply")?;
+        Ok(py.detach(|| Reply::begin(session, channel, to, frame, count.0))?)
     }
 
     /// The status of the device and its channels.

@@ -11,8 +11,8 @@ use cantap::autobaud::{Limits, Outcome};
 use cantap::device::{Ticks, Transmission};
 use cantap::hw_filter::{self, Remainder};
 use cantap::wire::Refusal;
-use cantap::wire::message::{ChannelConfig, MAX_SEND, TxFrame};
-use cantap::{Channel, Device, DeviceError, Frame};
+use cantap::wire::message::{ChannelConfig, MAX_SEND, MAX_SEND_FD, TxFdFrame, TxFrame};
+use cantap::{Channel, Device, DeviceError, TraceFrame};
 use cantap_address::{Address, OpenDevice};
 use cantap_trace::filter::Filter;
 use cantap_work::bit_rate_search::{self, Search};
@@ -180,16 +180,22 @@ impl Session {
     pub fn send(
         &self,
         channel: Channel,
-        frames: &[Frame],
+        frames: &[TraceFrame],
         how: HowToSend,
         mut go_on: impl FnMut() -> Result<(), Error>,
     ) -> Result<Sending, Error> {
         let HowToSend { sender, at_ticks, is_told, deadline } = how;
         let device = self.device()?;
         let mut sending = Sending { transmissions: Arc::clone(&self.transmissions), ends: Vec::new() };
-        for chunk in frames.chunks(MAX_SEND) {
-            let mut batch = heapless::Vec::<TxFrame, MAX_SEND>::new();
-            for frame in chunk {
+        if frames.iter().any(TraceFrame::is_fd) && !device.hello().sends_fd() {
+            return Err(DeviceError::NoFd.into());
+        }
+        // A request has frames of one kind.
+        let most = |frame: &TraceFrame| if frame.is_fd() { MAX_SEND_FD } else { MAX_SEND };
+        let runs = frames.chunk_by(|one, next| one.is_fd() == next.is_fd());
+        for chunk in runs.flat_map(|run| run.chunks(most(&run[0]))) {
+            let mut tags = Vec::with_capacity(chunk.len());
+            for _ in chunk {
                 let tag = self.next_tag.fetch_add(1, Ordering::Relaxed) % TAGS;
                 if is_told {
                     let (told, end) = sync_channel(1);
@@ -197,13 +203,12 @@ impl Session {
                     sending.ends.push((tag, end));
                 }
                 self.transmissions.requested(channel, tag, sender);
-                // This cannot fail: a chunk is no longer.
-                let _ = batch.push(TxFrame { tag, frame: *frame, at_ticks });
+                tags.push(tag);
             }
-            while let Err(error) = device.send(channel, &batch) {
+            while let Err(error) = hand_over(device, channel, chunk, &tags, at_ticks) {
                 let is_full = matches!(error, DeviceError::Refused { refusal: Refusal::QueueFull { .. } });
                 if !is_full || Instant::now() >= deadline {
-                    batch.iter().for_each(|sent| self.transmissions.requested(channel, sent.tag, NOBODY));
+                    tags.iter().for_each(|tag| self.transmissions.requested(channel, *tag, NOBODY));
                     return Err(error.into());
                 }
                 go_on()?;
@@ -236,6 +241,27 @@ impl Session {
         if let Some(slots) = lock(&self.slots).get_mut(&(table, channel)) {
             slots[usize::from(slot)] = false;
         }
+    }
+}
+
+/// Passes frames of one kind to a device.
+fn hand_over(
+    device: &Device,
+    channel: Channel,
+    frames: &[TraceFrame],
+    tags: &[u32],
+    at_ticks: Option<u64>,
+) -> Result<u16, DeviceError> {
+    let all = || frames.iter().zip(tags);
+    if frames.first().is_some_and(TraceFrame::is_fd) {
+        let fd =
+            |(frame, tag): (&TraceFrame, &u32)| Some(TxFdFrame { tag: *tag, frame: *frame.fd()?, at_ticks });
+        device.send_fd(channel, &all().filter_map(fd).collect::<Vec<_>>())
+    } else {
+        let classic = |(frame, tag): (&TraceFrame, &u32)| {
+            Some(TxFrame { tag: *tag, frame: *frame.classic()?, at_ticks })
+        };
+        device.send(channel, &all().filter_map(classic).collect::<Vec<_>>())
     }
 }
 

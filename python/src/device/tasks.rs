@@ -140,12 +140,13 @@ impl PeriodicFrame {
 
     /// Sends another frame from now on; its period starts over.
     fn update(&self, py: Python<'_>, frame: AnyFrame) -> PyResult<()> {
+        let frame = frame.classic("what a device repeats")?;
         let changed = {
             let set = lock(&self.set);
-            check_modifiers(&frame.0, &set.modifiers).map_err(Error::argument)
+            check_modifiers(&frame, &set.modifiers).map_err(Error::argument)
         };
         changed?;
-        lock(&self.set).frame = frame.0;
+        lock(&self.set).frame = frame;
         Ok(py.detach(|| self.apply())?)
     }
 

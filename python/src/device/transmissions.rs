@@ -7,7 +7,7 @@ use std::sync::mpsc::{Receiver, SyncSender};
 use cantap::device::Transmission;
 use cantap::wire::message::DEVICE_TAG;
 use cantap::wire::{CHANNELS, Channel};
-use cantap::{Direction, Frame, TraceEvent, TraceRecord};
+use cantap::{Direction, TraceEvent, TraceFrame, TraceRecord};
 
 use super::lock::lock;
 
@@ -28,7 +28,7 @@ pub struct Transmissions {
     /// Who requested it, by its tag; for frames that the device sends on its own, until the tag is used again.
     requested: Mutex<HashMap<(Channel, u32), SenderId>>,
     /// Frames that were sent but whose records have not come yet, in order.
-    confirmed: Mutex<[VecDeque<(Frame, SenderId)>; CHANNELS]>,
+    confirmed: Mutex<[VecDeque<(TraceFrame, SenderId)>; CHANNELS]>,
 }
 
 impl Transmissions {

@@ -128,6 +128,9 @@ impl Ledger {
                     "the device reports a CAN FD frame, which no board can receive: {received:?}"
                 ));
             }
+            SessionEvent::Record(_, Record::TransmittedFd(sent)) => {
+                self.fault(format!("the device reports a CAN FD frame sent, which no board can: {sent:?}"));
+            }
             SessionEvent::Record(_, Record::Event(_)) | SessionEvent::Ended(..) => {}
             SessionEvent::BatchesLost(frames) => {
                 for (books, lost) in self.books.iter_mut().zip(frames) {

@@ -1,5 +1,7 @@
 //! What a host asks to be sent: once, periodically, or in reply.
 
+#[cfg(not(target_os = "none"))]
+use cantap_wire::message::TxFdFrame;
 use cantap_wire::message::{DEVICE_TAG, MAX_SEND, Periodic, Trigger, TxFrame};
 use cantap_wire::{Channel, Refusal, Reply};
 use heapless::Vec;
@@ -29,18 +31,8 @@ pub fn send<'q, const N: usize>(
     frames: &Vec<TxFrame, MAX_SEND>,
     board: &mut impl Board<'q, N>,
 ) -> Result<u16, Refusal> {
-    can_send(channel, board)?;
-    if frames.iter().any(|frame| frame.tag >= DEVICE_TAG) {
-        return Err(Refusal::BadTag);
-    }
-    let now = board.with_capture(|capture, _, clock| capture.now(clock));
-    if frames.iter().any(|frame| frame.at_ticks.is_some_and(|at| at > now + MAX_AHEAD_TICKS)) {
-        return Err(Refusal::TooFarAhead);
-    }
-    let free = board.with_capture(|capture, _, _| capture.transmitter(channel).free());
-    if free < frames.len() {
-        return Err(Refusal::QueueFull { free: free as u16 });
-    }
+    let all = frames.iter().map(|frame| (frame.tag, frame.at_ticks));
+    can_queue(channel, all, board)?;
     for frames in frames.chunks(QUEUED_AT_ONCE) {
         board.with_capture(|capture, _, _| {
             for frame in frames {
@@ -48,11 +40,54 @@ pub fn send<'q, const N: usize>(
             }
         });
     }
-    let free = board.with_capture(|capture, traffic, clock| {
-        capture.kick(channel, &mut traffic[channel.index()], clock);
-        capture.transmitter(channel).free()
+    Ok(kick(channel, board))
+}
+
+/// The same for CAN FD frames, which only other makers' adapters send.
+#[cfg(not(target_os = "none"))]
+pub(super) fn send_fd<'q, const N: usize>(
+    channel: Channel,
+    frames: &[TxFdFrame],
+    board: &mut impl Board<'q, N>,
+) -> Result<u16, Refusal> {
+    let all = frames.iter().map(|frame| (frame.tag, frame.at_ticks));
+    can_queue(channel, all, board)?;
+    board.with_capture(|capture, _, _| {
+        for frame in frames {
+            capture.transmitter(channel).enqueue_fd(frame);
+        }
     });
-    Ok(free as u16)
+    Ok(kick(channel, board))
+}
+
+/// Checks that frames with these tags and target times can be queued, all of them.
+#[inline]
+fn can_queue<'q, const N: usize>(
+    channel: Channel,
+    frames: impl ExactSizeIterator<Item = (u32, Option<u64>)> + Clone,
+    board: &mut impl Board<'q, N>,
+) -> Result<(), Refusal> {
+    can_send(channel, board)?;
+    if frames.clone().any(|(tag, _)| tag >= DEVICE_TAG) {
+        return Err(Refusal::BadTag);
+    }
+    let now = board.with_capture(|capture, _, clock| capture.now(clock));
+    let count = frames.len();
+    let mut frames = frames;
+    if frames.any(|(_, at)| at.is_some_and(|at| at > now + MAX_AHEAD_TICKS)) {
+        return Err(Refusal::TooFarAhead);
+    }
+    let free = board.with_capture(|capture, _, _| capture.transmitter(channel).free());
+    if free < count { Err(Refusal::QueueFull { free: free as u16 }) } else { Ok(()) }
+}
+
+/// Sends what is queued as soon as it can be. Returns how many places are free.
+#[inline]
+fn kick<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, N>) -> u16 {
+    board.with_capture(|capture, traffic, clock| {
+        capture.kick(channel, &mut traffic[channel.index()], clock);
+        capture.transmitter(channel).free() as u16
+    })
 }
 
 pub(super) fn set_periodic<'q, const N: usize>(

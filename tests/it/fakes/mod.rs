@@ -629,7 +629,7 @@ impl<'q, const N: usize> Bench<'q, N> {
             .iter()
             .filter_map(|(_, record)| match record {
                 Record::Event(event) => Some(*event),
-                Record::Received(_) | Record::ReceivedFd(_) => None,
+                Record::Received(_) | Record::ReceivedFd(_) | Record::TransmittedFd(_) => None,
             })
             .collect()
     }

@@ -2,9 +2,10 @@
 
 use heapless::Vec;
 
-use super::{Filter, MAX_SEND, Refusal, Reply, TxFrame};
+use super::{Filter, MAX_SEND, MAX_SEND_FD, Refusal, Reply, TxFrame};
 use crate::Channel;
 use crate::packed::{Packed, take_packed};
+use crate::packed_fd::PackedFd;
 use crate::varint::{take_u32, take_u64};
 
 /// The index of [`super::Command::Send`], as in the pinned bytes.
@@ -49,12 +50,18 @@ pub fn why_unreadable(request: &[u8]) -> Refusal {
     // The indices of the other commands that carry frames, as the pinned bytes have them.
     const SET_PERIODIC: u32 = 8;
     const SET_TRIGGER: u32 = 9;
+    const SEND_FD: u32 = 28;
     type Head = (u16, u32, Channel);
     let fault = || {
         let ((_, command, _), rest) = postcard::take_from_bytes::<Head>(request).ok()?;
         match command {
             SEND => {
                 type Frames = Vec<(u32, Packed, Option<u64>), MAX_SEND>;
+                let (frames, _) = postcard::take_from_bytes::<Frames>(rest).ok()?;
+                frames.iter().find_map(|(_, frame, _)| frame.frame().err())
+            }
+            SEND_FD => {
+                type Frames = Vec<(u32, PackedFd, Option<u64>), MAX_SEND_FD>;
                 let (frames, _) = postcard::take_from_bytes::<Frames>(rest).ok()?;
                 frames.iter().find_map(|(_, frame, _)| frame.frame().err())
             }

@@ -4,7 +4,7 @@ use heapless::Vec;
 use serde::{Deserialize, Serialize};
 
 use super::Filter;
-use crate::Frame;
+use crate::{FdFrame, Frame};
 
 pub use cantap_can::DEVICE_TAG;
 
@@ -27,6 +27,18 @@ pub struct TxFrame {
     pub frame: Frame,
     /// Device time, in ticks, before which it is not sent. The queue keeps its order: a later frame
     /// waits for an earlier one.
+    pub at_ticks: Option<u64>,
+}
+
+/// A CAN FD frame to be sent: as [`TxFrame`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct TxFdFrame {
+    /// Returned in [`crate::TransmittedFd`] or [`crate::Event::TransmitFailed`]. Below [`DEVICE_TAG`].
+    pub tag: u32,
+    /// The frame.
+    #[serde(with = "crate::packed_fd")]
+    pub frame: FdFrame,
+    /// Device time, in ticks, before which it is not sent.
     pub at_ticks: Option<u64>,
 }
 

@@ -1,4 +1,4 @@
-//! The record of a received CAN FD frame. No board of ours sends it: its controllers are classical. It comes from devices on a computer, which
+//! The records of received and of sent CAN FD frames. No board of ours sends them: its controllers are classical. They come from devices on a computer, which
 //! stand before other makers' adapters, and from servers that share one.
 
 use cantap_can::FdFrame;
@@ -8,14 +8,23 @@ use super::parts::{
     BadRecord, FRAME, MAX_TICKS, NO_DATA, NO_STAMP, Stamp, UPPER_BOUND, decode_ticks, encode_ticks, take_id,
 };
 use crate::Channel;
+use crate::varint::{put_u32, take_u32};
 
-/// Bytes of the longest record of an FD frame: qualifiers, header, ID, time difference, data.
-pub const MAX_FD_RECORD: usize = 1 + 1 + 4 + MAX_TICKS + FD_MAX_BYTES;
+/// Bytes of the longest record of an FD frame: qualifiers, header, ID, tag, time difference, data.
+pub const MAX_FD_RECORD: usize = 1 + 1 + 4 + MAX_TAG + MAX_TICKS + FD_MAX_BYTES;
+/// Bytes of the longest tag, which only a sent frame has.
+const MAX_TAG: usize = 5;
 
 /// The first byte's upper three bits.
 pub(super) const FD: u8 = 0x60;
 /// The first byte of the last of them.
 pub(super) const LAST_FD: u8 = 0x7F;
+/// A sent frame's first byte: its upper six bits.
+pub(super) const SENT: u8 = 0x50;
+/// The first byte of the last of them.
+pub(super) const LAST_SENT: u8 = 0x53;
+const SENT_BRS: u8 = 1;
+const SENT_ESI: u8 = 2;
 const BRS: u8 = 8;
 const ESI: u8 = 16;
 /// The bit that a header has for remote frames, of which FD has none.
@@ -34,10 +43,20 @@ pub struct ReceivedFd {
     pub data_omitted: bool,
 }
 
+/// An FD frame of ours is on the bus, complete and acknowledged. Its time is the end of the frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct TransmittedFd {
+    /// Where.
+    pub channel: Channel,
+    /// As in [`crate::Event::Transmitted`].
+    pub tag: u32,
+    /// The frame as sent.
+    pub frame: FdFrame,
+}
+
 /// Writes a received FD frame and returns its length. `ticks` is the time since the previous record.
 pub fn encode_received_fd(received: &ReceivedFd, ticks: i64, out: &mut [u8; MAX_FD_RECORD]) -> usize {
     let frame = &received.frame;
-    let id = frame.id();
     let flag = |is: bool, bit: u8| if is { bit } else { 0 };
     let stamp = match received.stamp {
         Stamp::Exact => 0,
@@ -46,18 +65,38 @@ pub fn encode_received_fd(received: &ReceivedFd, ticks: i64, out: &mut [u8; MAX_
     };
     out[0] =
         FD | stamp | flag(received.data_omitted, NO_DATA) | flag(frame.brs(), BRS) | flag(frame.esi(), ESI);
-    out[1] = FRAME | (received.channel.index() as u8) << 6 | flag(id.is_extended(), 0x20) | frame.dlc();
-    out[2..6].copy_from_slice(&id.raw().to_le_bytes());
-    let mut len = if id.is_extended() { 6 } else { 4 };
+    let mut len = put_head(received.channel, frame, out);
     if received.stamp != Stamp::Omitted {
         len += encode_ticks(ticks, &mut out[len..]);
     }
     if !received.data_omitted {
-        let data = frame.data();
-        out[len..len + data.len()].copy_from_slice(data);
-        len += data.len();
+        len += put_data(frame, &mut out[len..]);
     }
     len
+}
+
+/// Writes the confirmation of an FD frame and returns its length. `ticks` is the time since the previous record.
+pub fn encode_transmitted_fd(sent: &TransmittedFd, ticks: i64, out: &mut [u8; MAX_FD_RECORD]) -> usize {
+    let frame = &sent.frame;
+    out[0] = SENT | if frame.brs() { SENT_BRS } else { 0 } | if frame.esi() { SENT_ESI } else { 0 };
+    let mut len = put_head(sent.channel, frame, out);
+    len += put_u32(sent.tag, &mut out[len..]);
+    len += encode_ticks(ticks, &mut out[len..]);
+    len + put_data(frame, &mut out[len..])
+}
+
+/// Writes header and identifier after the first byte, and returns the length of all of it.
+fn put_head(channel: Channel, frame: &FdFrame, out: &mut [u8; MAX_FD_RECORD]) -> usize {
+    let id = frame.id();
+    out[1] = FRAME | (channel.index() as u8) << 6 | if id.is_extended() { 0x20 } else { 0 } | frame.dlc();
+    out[2..6].copy_from_slice(&id.raw().to_le_bytes());
+    if id.is_extended() { 6 } else { 4 }
+}
+
+fn put_data(frame: &FdFrame, out: &mut [u8]) -> usize {
+    let data = frame.data();
+    out[..data.len()].copy_from_slice(data);
+    data.len()
 }
 
 /// Reads a received FD frame.
@@ -83,9 +122,30 @@ pub(super) fn decode(bytes: &[u8]) -> Result<(ReceivedFd, i64, &[u8]), BadRecord
     } else {
         rest.split_at_checked(len).ok_or(BadRecord)?
     };
-    let channel = if header & 0x40 == 0 { Channel::Can1 } else { Channel::Can2 };
+    let channel = channel_of(header);
     let frame = FdFrame::new(id, qualifiers & BRS != 0, qualifiers & ESI != 0, data).ok_or(BadRecord)?;
     Ok((ReceivedFd { channel, frame, stamp, data_omitted }, ticks, rest))
+}
+
+/// Reads the confirmation of an FD frame.
+pub(super) fn decode_sent(bytes: &[u8]) -> Result<(TransmittedFd, i64, &[u8]), BadRecord> {
+    let [flags @ SENT..=LAST_SENT, header @ FRAME..=0xFF, ref rest @ ..] = *bytes else {
+        return Err(BadRecord);
+    };
+    if header & REMOTE != 0 {
+        return Err(BadRecord);
+    }
+    let (id, rest) = take_id(header, rest)?;
+    let (tag, rest) = take_u32(rest).ok_or(BadRecord)?;
+    let (ticks, rest) = decode_ticks(rest)?;
+    let len = usize::from(FD_LENGTHS[usize::from(header & 15)]);
+    let (data, rest) = rest.split_at_checked(len).ok_or(BadRecord)?;
+    let frame = FdFrame::new(id, flags & SENT_BRS != 0, flags & SENT_ESI != 0, data).ok_or(BadRecord)?;
+    Ok((TransmittedFd { channel: channel_of(header), tag, frame }, ticks, rest))
+}
+
+const fn channel_of(header: u8) -> Channel {
+    if header & 0x40 == 0 { Channel::Can1 } else { Channel::Can2 }
 }
 
 #[cfg(test)]
@@ -136,7 +196,18 @@ mod tests {
         }
 
         #[test]
-        fn any_bytes_are_a_record_or_refused(first in FD..=LAST_FD, header: u8, rest: Vec<u8>) {
+        fn any_confirmation_round_trips(received in received(), tag: u32, ticks: i64, tail: Vec<u8>, cut in any::<prop::sample::Index>()) {
+            let sent = TransmittedFd { channel: received.channel, tag, frame: received.frame };
+            let mut out = [0; MAX_FD_RECORD];
+            let len = encode_transmitted_fd(&sent, ticks, &mut out);
+            let bytes = [&out[..len], &tail].concat();
+            prop_assert_eq!(crate::record::decode(&bytes), Ok((Record::TransmittedFd(sent), ticks, &tail[..])));
+            prop_assert_eq!(crate::record::outline(&bytes), Ok(Outline { len, ticks, frame_of: None }));
+            prop_assert_eq!(crate::record::decode(&out[..cut.index(len)]), Err(BadRecord));
+        }
+
+        #[test]
+        fn any_bytes_are_a_record_or_refused(first in SENT..=LAST_FD, header: u8, rest: Vec<u8>) {
             let bytes = [&[first, header], &rest[..]].concat();
             let found = crate::record::decode(&bytes).map(|(_, _, rest)| bytes.len() - rest.len());
             prop_assert_eq!(crate::record::outline(&bytes).map(|outline| outline.len), found);
@@ -148,6 +219,8 @@ mod tests {
         let frame = FdFrame::new(Id::extended(Id::MAX_EXTENDED).unwrap(), true, true, &[0xFF; 64]).unwrap();
         let received = ReceivedFd { channel: Channel::Can2, frame, stamp: Stamp::Exact, data_omitted: false };
         let mut out = [0; MAX_FD_RECORD];
-        assert_eq!(encode_received_fd(&received, i64::MIN, &mut out), MAX_FD_RECORD);
+        assert_eq!(encode_received_fd(&received, i64::MIN, &mut out), MAX_FD_RECORD - MAX_TAG);
+        let sent = TransmittedFd { channel: Channel::Can2, tag: u32::MAX, frame };
+        assert_eq!(encode_transmitted_fd(&sent, i64::MIN, &mut out), MAX_FD_RECORD);
     }
 }

@@ -7,12 +7,15 @@ use cantap_wire::Channel::{Can1, Can2};
 use cantap_wire::batch::BatchHeader;
 use cantap_wire::framing::MAX_REQUEST;
 use cantap_wire::message::{
-    Checksum, DeviceMessage, EndReason, Filter, FrameKind, MAX_FILTERS, MAX_SEND, Mode, SessionEnd, TxFrame,
-    read_send, why_unreadable, write_response,
+    Checksum, DeviceMessage, EndReason, Filter, FrameKind, MAX_FILTERS, MAX_SEND, MAX_SEND_FD, Mode,
+    SessionEnd, TxFdFrame, TxFrame, read_send, why_unreadable, write_response,
 };
-use cantap_wire::record::{MAX_FD_RECORD, MAX_RECORD, encode_event, encode_received, encode_received_fd};
+use cantap_wire::record::{
+    MAX_FD_RECORD, MAX_RECORD, encode_event, encode_received, encode_received_fd, encode_transmitted_fd,
+};
 use cantap_wire::{
     Command, FdFrame, Id, PROTOCOL_VERSION, Received, ReceivedFd, Refusal, Reply, Request, Response, Stamp,
+    TransmittedFd,
 };
 use samples::{commands, events, frame, hex, refusals, replies};
 use serde::Serialize;
@@ -30,7 +33,7 @@ fn written(result: &Result<Reply, Refusal>) -> String {
 
 #[test]
 fn the_version_is_the_one_that_these_bytes_belong_to() {
-    assert_eq!(PROTOCOL_VERSION, 6);
+    assert_eq!(PROTOCOL_VERSION, 7);
 }
 
 #[test]
@@ -75,6 +78,21 @@ fn received_fd_frames() {
     assert_eq!(record(long, (true, true), &[0xAA], Can1, Stamp::Omitted, false, 1), "7a a1 55 44 33 1f aa");
     let whole = record(short, (true, false), &[0x11; 64], Can1, exact, false, 1);
     assert_eq!(whole, format!("68 8f 23 01 02{}", " 11".repeat(64)));
+}
+
+#[test]
+fn confirmations_of_fd_frames() {
+    let record = |id, (brs, esi), data: &[u8], channel, tag, ticks| {
+        let mut out = [0; MAX_FD_RECORD];
+        let frame = FdFrame::new(id, brs, esi, data).unwrap();
+        let len = encode_transmitted_fd(&TransmittedFd { channel, tag, frame }, ticks, &mut out);
+        hex(&out[..len])
+    };
+    let (short, long) = (Id::standard(0x123).unwrap(), Id::extended(0x1F33_4455).unwrap());
+    assert_eq!(record(short, (false, false), &[], Can1, 1, 576), "50 80 23 01 01 80 09");
+    assert_eq!(record(short, (true, false), &[1, 2], Can2, 300, 64), "51 c2 23 01 ac 02 80 01 01 02");
+    let tail = " 11".repeat(64);
+    assert_eq!(record(long, (true, true), &[0x11; 64], Can1, 0, 1), format!("53 af 55 44 33 1f 00 02{tail}"));
 }
 
 #[test]
@@ -195,5 +213,10 @@ fn the_longest_request_fits() {
     let filter = Filter { extended: true, kind: FrameKind::Any, id: 0x1FFF_FFFF, mask: 0x1FFF_FFFF };
     let filters = [filter; MAX_FILTERS].into_iter().collect();
     let request = Request { id: u16::MAX, command: Command::SetFilters { channel: Can2, filters } };
+    assert!(postcard::to_slice(&request, &mut [0; MAX_REQUEST]).is_ok());
+    let frame = FdFrame::new(Id::extended(Id::MAX_EXTENDED).unwrap(), true, true, &[0xFF; 64]).unwrap();
+    let frames =
+        [TxFdFrame { tag: u32::MAX, frame, at_ticks: Some(u64::MAX) }; MAX_SEND_FD].into_iter().collect();
+    let request = Request { id: u16::MAX, command: Command::SendFd { channel: Can2, frames } };
     assert!(postcard::to_slice(&request, &mut [0; MAX_REQUEST]).is_ok());
 }

@@ -130,7 +130,9 @@ impl Session {
                 let timed = received.stamp != Stamp::Omitted;
                 (len, Some(received.channel), received_reads(received), timed)
             }
-            Record::ReceivedFd(_) => unreachable!("no board sends it, so that clients need not read it"),
+            Record::ReceivedFd(_) | Record::TransmittedFd(_) => {
+                unreachable!("no board sends it, so that clients need not read it")
+            }
             Record::Event(event) => (encode_event(event, STEP, &mut bytes), None, event_reads(event), true),
         };
         if timed {

@@ -17,7 +17,7 @@ fn documented(heading: &str) -> Vec<u8> {
 #[test]
 fn the_request_is_what_the_document_says() {
     let mut message = [0; MAX_MESSAGE + CRC_LEN];
-    let request = Request { id: 1, command: Command::Hello { protocol: 6 } };
+    let request = Request { id: 1, command: Command::Hello { protocol: 7 } };
     let mut out = [0; MAX_ENCODED];
     let len = framing::encode(&request, &mut message, &mut out).unwrap();
     assert_eq!(out[..len], documented("### The request"), "{:02x?}", &out[..len]);

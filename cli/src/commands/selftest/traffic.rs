@@ -226,8 +226,9 @@ fn take(stream: &mut Stream<'_>, records: &mut Records, flows: &mut [Flow], move
         *moved = Instant::now();
         let Some(flow) = flows.iter_mut().find(|flow| flow.from == end.channel) else { continue };
         match end.result {
-            Ok(frame) => flow.confirm(&frame, end.ticks),
-            Err(_) => flow.failed += 1,
+            Ok(TraceFrame::Classic(frame)) => flow.confirm(&frame, end.ticks),
+            // Nobody here sends one of CAN FD.
+            Ok(TraceFrame::Fd(_)) | Err(_) => flow.failed += 1,
         }
     }
     while let Ok(Some(batch)) = records.next_batch(Duration::ZERO)

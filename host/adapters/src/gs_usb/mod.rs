@@ -10,7 +10,7 @@ mod wire;
 use std::time::{Duration, Instant};
 
 use cantap_wire::record::LossStage;
-use cantap_wire::{CHANNELS, Channel, Frame, Refusal};
+use cantap_wire::{CHANNELS, Channel, FdFrame, Frame, Refusal};
 
 use self::pipes::Usb;
 use self::usb::UsbAdapter;
@@ -243,6 +243,26 @@ impl GsUsb {
         true
     }
 
+    /// Gives a frame to the adapter. Returns false if it cannot take it now.
+    fn write(&mut self, channel: Channel, mailbox: u8, mut bytes: Vec<u8>) -> bool {
+        let can = &mut self.channels[channel.index()];
+        let Some(slot @ false) = can.in_flight.get_mut(usize::from(mailbox)) else { return false };
+        if can.constants.has(feature::LPC546XX) {
+            bytes.push(0);
+        }
+        match self.usb.write(bytes) {
+            Ok(is_taken) => {
+                *slot = is_taken;
+                is_taken
+            }
+            Err(reason) => {
+                self.ended.get_or_insert(reason);
+                self.backlog.push(Incoming::NotSent { channel, mailbox, at: At::arrival(Instant::now()) });
+                true
+            }
+        }
+    }
+
     /// Asks for the states, and ends what was to last for a time.
     fn look_after_time(&mut self) {
         let now = Instant::now();
@@ -331,24 +351,17 @@ impl Driver for GsUsb {
     }
 
     fn send(&mut self, channel: Channel, mailbox: u8, frame: &Frame) -> bool {
-        let number = channel.index();
-        let can = &mut self.channels[number];
-        let Some(slot @ false) = can.in_flight.get_mut(usize::from(mailbox)) else { return false };
-        let mut bytes = wire::frame(frame, number as u8, mailbox.into());
-        if can.constants.has(feature::LPC546XX) {
-            bytes.push(0);
-        }
-        match self.usb.write(bytes) {
-            Ok(is_taken) => {
-                *slot = is_taken;
-                is_taken
-            }
-            Err(reason) => {
-                self.ended.get_or_insert(reason);
-                self.backlog.push(Incoming::NotSent { channel, mailbox, at: At::arrival(Instant::now()) });
-                true
-            }
-        }
+        let bytes = wire::frame(frame, channel.index() as u8, mailbox.into());
+        self.write(channel, mailbox, bytes)
+    }
+
+    fn sends_fd(&self) -> bool {
+        self.options.data_bitrate_bps.is_some()
+    }
+
+    fn send_fd(&mut self, channel: Channel, mailbox: u8, frame: &FdFrame) -> bool {
+        let bytes = wire::fd_frame(frame, channel.index() as u8, mailbox.into());
+        self.write(channel, mailbox, bytes)
     }
 
     fn identify(&mut self, seconds: u8) -> Result<(), Refusal> {

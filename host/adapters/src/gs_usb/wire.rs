@@ -1,7 +1,7 @@
 //! What crosses USB: Linux's `drivers/net/can/usb/gs_usb.c` and candleLight's `include/gs_usb.h`. Numbers have the lowest byte first.
 
 use cantap_trace::TraceFrame;
-use cantap_trace::fd::FD_LENGTHS;
+use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
 use cantap_trace::socketcan::{ERROR_FLAG, ErrorFrame};
 use cantap_wire::record::ErrorState;
 use cantap_wire::{FdFrame, Frame, Id};
@@ -194,6 +194,18 @@ pub(super) fn frame(frame: &Frame, channel: u8, echo: u32) -> Vec<u8> {
     bytes
 }
 
+/// A CAN FD frame to be sent. It has room for all of its data, whatever its length.
+pub(super) fn fd_frame(frame: &FdFrame, channel: u8, echo: u32) -> Vec<u8> {
+    let id = frame.id();
+    let flag = |is: bool, bit: u8| if is { bit } else { 0 };
+    let flags = FLAG_FD | flag(frame.brs(), FLAG_BRS) | flag(frame.esi(), FLAG_ESI);
+    let mut bytes = words(&[echo, id.raw() | if id.is_extended() { EXTENDED } else { 0 }]);
+    bytes.extend_from_slice(&[frame.dlc(), channel, flags, 0]);
+    bytes.extend_from_slice(frame.data());
+    bytes.resize(HEADER + FD_MAX_BYTES, 0);
+    bytes
+}
+
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
@@ -249,6 +261,18 @@ pub(super) mod tests {
         for text in ["123#1122", "1ABCDEF0#R4", "000#"] {
             let sent: Frame = text.parse().unwrap();
             let bytes = frame(&sent, 1, 2);
+            let back = transfer(&bytes, true).unwrap();
+            assert_eq!((back.echo, back.channel, back.content), (2, 1, Content::Frame(sent.into())));
+        }
+    }
+
+    #[test]
+    fn a_can_fd_frame_to_be_sent_comes_back_as_it_was() {
+        let id = Id::extended(0x1ABC_DEF0).unwrap();
+        for len in FD_LENGTHS {
+            let sent = FdFrame::new(id, len > 8, len == 64, &[0xA5; 64][..usize::from(len)]).unwrap();
+            let bytes = fd_frame(&sent, 1, 2);
+            assert_eq!(bytes.len(), 76);
             let back = transfer(&bytes, true).unwrap();
             assert_eq!((back.echo, back.channel, back.content), (2, 1, Content::Frame(sent.into())));
         }

@@ -1,7 +1,7 @@
 //! Linux's `struct can_frame` and `struct canfd_frame` (`linux/can.h`), and their meaning here.
 
 use cantap_trace::TraceEvent;
-use cantap_trace::fd::{FLAG_BRS, FLAG_ESI};
+use cantap_trace::fd::{FLAG_BRS, FLAG_ESI, FLAG_FDF};
 use cantap_trace::socketcan::{ERROR_FLAG, ErrorFrame};
 use cantap_wire::{FdFrame, Frame, Id};
 
@@ -14,6 +14,7 @@ const EXTENDED_FLAG: u32 = 0x8000_0000;
 const REMOTE_FLAG: u32 = 0x4000_0000;
 /// Offsets in a raw frame.
 const LEN: usize = 4;
+const FLAGS: usize = 5;
 const DLC_ABOVE_8: usize = 7;
 const DATA: usize = 8;
 
@@ -75,6 +76,17 @@ pub fn fd_frame_of(raw: &RawFdFrame) -> Option<FdFrame> {
     FdFrame::new(id_of(id)?, flags & FLAG_BRS != 0, flags & FLAG_ESI != 0, data.get(..usize::from(*len))?)
 }
 
+/// A CAN FD frame for programs.
+pub fn raw_fd_frame(frame: &FdFrame) -> RawFdFrame {
+    let extended = if frame.id().is_extended() { EXTENDED_FLAG } else { 0 };
+    let mut raw = [0; 72];
+    raw[..LEN].copy_from_slice(&(frame.id().raw() | extended).to_ne_bytes());
+    raw[LEN] = frame.data_len() as u8;
+    raw[FLAGS] = frame.flags() | FLAG_FDF;
+    raw[DATA..DATA + frame.data_len()].copy_from_slice(frame.data());
+    raw
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -131,6 +143,13 @@ mod tests {
         assert_eq!(raw(0x7FF, 64, 2), Some(format!("7FF##2{}", "07".repeat(64))));
         for (id, len) in [(0x123, 9), (0x123, 65), (0x4000_0123, 0), (0x2000_0123, 8)] {
             assert_eq!(raw(id, len, 0), None, "{id:X} {len}");
+        }
+        let id = Id::extended(0x18DA_F110).unwrap();
+        for len in cantap_trace::fd::FD_LENGTHS {
+            let frame = FdFrame::new(id, len > 8, len < 8, &[0xA5; 64][..usize::from(len)]).unwrap();
+            let raw = raw_fd_frame(&frame);
+            assert_eq!((raw[4], raw[5] & 4), (len, 4));
+            assert_eq!(fd_frame_of(&raw), Some(frame));
         }
     }
 

@@ -4,6 +4,6 @@ mod frame;
 #[cfg(target_os = "linux")]
 mod socket;
 
-pub use frame::{RawFdFrame, RawFrame, fd_frame_of, frame_of, raw_error, raw_frame};
+pub use frame::{RawFdFrame, RawFrame, fd_frame_of, frame_of, raw_error, raw_fd_frame, raw_frame};
 #[cfg(target_os = "linux")]
 pub use socket::{BATCH, Message, Options, RawSocket};

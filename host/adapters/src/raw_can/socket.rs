@@ -181,9 +181,18 @@ impl RawSocket {
 
     /// Sends without waiting. Returns how many were taken, at least one.
     pub fn send(&self, frames: &[RawFrame]) -> io::Result<usize> {
-        let frames = &frames[..frames.len().min(BATCH)];
+        self.send_messages(frames.iter().map(|frame| &frame[..]))
+    }
+
+    /// Sends a CAN FD frame without waiting. The socket must have been opened for CAN FD.
+    pub fn send_fd(&self, frame: &RawFdFrame) -> io::Result<()> {
+        self.send_messages(std::iter::once(&frame[..])).map(|_| ())
+    }
+
+    fn send_messages<'m>(&self, messages: impl Iterator<Item = &'m [u8]>) -> io::Result<usize> {
         let mut headers = MultiHeaders::<()>::preallocate(BATCH, None);
-        let slices: Vec<[IoSlice<'_>; 1]> = frames.iter().map(|frame| [IoSlice::new(frame)]).collect();
+        let slices: Vec<[IoSlice<'_>; 1]> =
+            messages.take(BATCH).map(|message| [IoSlice::new(message)]).collect();
         let taken = sendmmsg(
             self.socket.as_raw_fd(),
             &mut headers,

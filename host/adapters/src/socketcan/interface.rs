@@ -4,7 +4,7 @@ use std::io;
 use std::time::Duration;
 
 use super::link::Link;
-use crate::raw_can::{Message, RawFrame};
+use crate::raw_can::{Message, RawFdFrame, RawFrame};
 
 /// The system's side: another one in tests, where there are no CAN interfaces.
 pub(super) trait Interface: Send {
@@ -18,6 +18,7 @@ pub(super) trait Interface: Send {
     /// Adds what has arrived, without waiting.
     fn receive(&mut self, messages: &mut Vec<Message>) -> io::Result<()>;
     fn send(&mut self, frame: &RawFrame) -> io::Result<()>;
+    fn send_fd(&mut self, frame: &RawFdFrame) -> io::Result<()>;
     /// How many messages the socket has dropped, if the kernel says so.
     fn dropped(&mut self) -> Option<u32>;
 }

@@ -18,10 +18,13 @@ const NLM_F_REQUEST: u16 = 1;
 /// Bytes of a message's header, and of `struct ifinfomsg` after it.
 const HEADER: usize = 16;
 const INFO: usize = 16;
+/// Bytes of a CAN FD frame: an interface that takes them has at least this MTU (`linux/can.h`).
+const CANFD_MTU: u32 = 72;
 /// What the two flags in an attribute's type leave.
 const TYPE_MASK: u16 = 0x3FFF;
 
 const IFLA_IFNAME: u16 = 3;
+const IFLA_MTU: u16 = 4;
 const IFLA_LINKINFO: u16 = 18;
 const IFLA_STATS64: u16 = 23;
 const IFLA_INFO_KIND: u16 = 1;
@@ -54,6 +57,8 @@ pub(crate) struct Link {
     pub bitrate_bps: Option<u32>,
     /// Of the data phases of CAN FD frames, in bit/s, if CAN FD is on.
     pub data_bitrate_bps: Option<u32>,
+    /// It takes CAN FD frames: with a controller, if its owner has switched that on.
+    pub takes_fd: bool,
     pub listen_only: bool,
     /// `None` for a controller that is stopped, and where there is none.
     pub state: Option<ErrorState>,
@@ -106,6 +111,7 @@ fn parse(bytes: &[u8]) -> Option<io::Result<Link>> {
             for (kind, content) in Attributes(message.get(INFO..)?) {
                 match kind {
                     IFLA_LINKINFO => link.info(content),
+                    IFLA_MTU => link.takes_fd = u32_at(content, 0).is_some_and(|mtu| mtu >= CANFD_MTU),
                     IFLA_STATS64 => {
                         let figure = |at| u64_at(content, at).unwrap_or(0);
                         link.dropped = figure(RX_DROPPED);
@@ -250,6 +256,8 @@ mod tests {
             IFF_UP | IFF_ECHO,
             &[
                 attribute(IFLA_IFNAME, b"can0\0"),
+                // `CAN_MTU`, or `CANFD_MTU` as the driver sets it.
+                attribute(IFLA_MTU, &words(&[if fd == 0 { 16 } else { 72 }])),
                 attribute(IFLA_STATS64, &stats),
                 nested(IFLA_LINKINFO, &[attribute(IFLA_INFO_KIND, b"can\0"), data]),
             ],
@@ -266,6 +274,7 @@ mod tests {
             kind: "can".to_owned(),
             bitrate_bps: Some(500_000),
             data_bitrate_bps: Some(2_000_000),
+            takes_fd: true,
             listen_only: true,
             state: Some(ErrorState::Passive),
             counters: Some((130, 255)),
@@ -275,7 +284,7 @@ mod tests {
         assert_eq!(read, wanted);
         // A data bit rate that was set once says nothing while CAN FD is off.
         let classical = answer(&controller(0)).unwrap();
-        assert_eq!(classical, Link { data_bitrate_bps: None, ..wanted });
+        assert_eq!(classical, Link { data_bitrate_bps: None, takes_fd: false, ..wanted });
     }
 
     #[test]

@@ -14,7 +14,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use super::interface::Interface;
 use super::link::{self, Link};
 use crate::interface_name;
-use crate::raw_can::{BATCH, Message, Options, RawFrame, RawSocket};
+use crate::raw_can::{BATCH, Message, Options, RawFdFrame, RawFrame, RawSocket};
 
 /// Where the kernel lists its network interfaces.
 const NETWORK: &str = "/sys/class/net";
@@ -107,6 +107,10 @@ impl Interface for LinuxInterface {
             Some(socket) => socket.send(std::slice::from_ref(frame)).map(|_| ()),
             None => Err(io::ErrorKind::NotConnected.into()),
         }
+    }
+
+    fn send_fd(&mut self, frame: &RawFdFrame) -> io::Result<()> {
+        self.socket.as_ref().map_or(Err(io::ErrorKind::NotConnected.into()), |socket| socket.send_fd(frame))
     }
 
     fn dropped(&mut self) -> Option<u32> {

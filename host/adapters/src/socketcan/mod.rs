@@ -15,7 +15,7 @@ use std::time::{Duration, Instant, SystemTime};
 use cantap_trace::TraceFrame;
 use cantap_trace::socketcan::ErrorFrame;
 use cantap_wire::record::{ErrorState, LossStage};
-use cantap_wire::{Channel, Frame, Refusal};
+use cantap_wire::{Channel, FdFrame, Frame, Refusal};
 use nix::libc::{EAGAIN, EINTR, ENETDOWN, ENOBUFS, ENODEV, ENXIO};
 
 use self::content::{Content, content};
@@ -26,8 +26,9 @@ use crate::adapter_clock::AdapterClock;
 use crate::driver::{At, Driver, Incoming, Oddities, OpenError, Opening};
 use crate::error_frames::ErrorFrames;
 use crate::interface_name::same_rate;
-use crate::raw_can::{BATCH, Message, raw_frame};
+use crate::raw_can::{BATCH, Message, raw_fd_frame, raw_frame};
 use crate::rows::{Row, row};
+use crate::under_way::are_alike;
 
 pub(crate) use self::linux::{exists, interfaces};
 
@@ -60,7 +61,8 @@ pub(crate) struct SocketCan {
     row: &'static Row,
     is_open: bool,
     counted: Counted,
-    in_flight: VecDeque<(u8, Frame)>,
+    in_flight: VecDeque<(u8, TraceFrame)>,
+    takes_fd: bool,
     /// Since when a confirmation may be among the messages that were dropped.
     uncertain_since: Option<Instant>,
     errors: ErrorFrames,
@@ -122,6 +124,7 @@ impl SocketCan {
         }
         Ok(Self {
             row: row_of(&link, has_hardware_stamps),
+            takes_fd: link.takes_fd,
             interface,
             name: name.to_owned(),
             is_open: false,
@@ -171,7 +174,7 @@ impl SocketCan {
             None => At::arrival(arrival),
         };
         match content(message.bytes()) {
-            Content::Frame(TraceFrame::Classic(frame)) if message.is_own => self.confirm(&frame, at),
+            Content::Frame(frame) if message.is_own => self.confirm(&frame, at),
             Content::Frame(frame) => self.backlog.push(Incoming::Received { channel, frame, at }),
             Content::Error(error) => self.error(error, At::arrival(arrival)),
             Content::Other => {
@@ -200,8 +203,8 @@ impl SocketCan {
         }
     }
 
-    fn confirm(&mut self, frame: &Frame, at: At) {
-        match self.in_flight.iter().position(|(_, sent)| sent == frame) {
+    fn confirm(&mut self, frame: &TraceFrame, at: At) {
+        match self.in_flight.iter().position(|(_, sent)| are_alike(sent, frame)) {
             Some(place) => {
                 if let Some((mailbox, _)) = self.in_flight.remove(place) {
                     self.backlog.push(Incoming::Sent { channel: Channel::Can1, mailbox, at });
@@ -223,6 +226,28 @@ impl SocketCan {
             // The driver drops them.
             self.give_up(at);
         }
+    }
+
+    /// What became of a frame that was given to the interface: false if it cannot take it now.
+    fn handed_over(
+        &mut self,
+        sent: io::Result<()>,
+        channel: Channel,
+        mailbox: u8,
+        frame: TraceFrame,
+    ) -> bool {
+        let Err(error) = sent else {
+            self.in_flight.push_back((mailbox, frame));
+            return true;
+        };
+        match error.raw_os_error() {
+            // The interface's queue is full.
+            Some(EAGAIN | EINTR | ENOBUFS) => return false,
+            Some(ENETDOWN | ENODEV | ENXIO) => self.end(&error),
+            _ => self.oddities.count("frames that the interface refused"),
+        }
+        self.backlog.push(Incoming::NotSent { channel, mailbox, at: At::arrival(Instant::now()) });
+        true
     }
 
     /// What is under way will not be sent.
@@ -366,18 +391,17 @@ impl Driver for SocketCan {
     }
 
     fn send(&mut self, channel: Channel, mailbox: u8, frame: &Frame) -> bool {
-        let Err(error) = self.interface.send(&raw_frame(frame)) else {
-            self.in_flight.push_back((mailbox, *frame));
-            return true;
-        };
-        match error.raw_os_error() {
-            // The interface's queue is full.
-            Some(EAGAIN | EINTR | ENOBUFS) => return false,
-            Some(ENETDOWN | ENODEV | ENXIO) => self.end(&error),
-            _ => self.oddities.count("frames that the interface refused"),
-        }
-        self.backlog.push(Incoming::NotSent { channel, mailbox, at: At::arrival(Instant::now()) });
-        true
+        let sent = self.interface.send(&raw_frame(frame));
+        self.handed_over(sent, channel, mailbox, (*frame).into())
+    }
+
+    fn sends_fd(&self) -> bool {
+        self.takes_fd
+    }
+
+    fn send_fd(&mut self, channel: Channel, mailbox: u8, frame: &FdFrame) -> bool {
+        let sent = self.interface.send_fd(&raw_fd_frame(frame));
+        self.handed_over(sent, channel, mailbox, (*frame).into())
     }
 
     fn poll(&mut self, wait: Duration, reports: &mut Vec<Incoming>) -> Result<(), String> {

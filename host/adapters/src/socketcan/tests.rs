@@ -6,7 +6,7 @@ use cantap_trace::socketcan::ERROR_FLAG;
 use cantap_wire::record::Stamp;
 
 use super::*;
-use crate::raw_can::RawFrame;
+use crate::raw_can::{RawFdFrame, RawFrame};
 
 /// What the kernel has, and what was sent.
 #[derive(Default)]
@@ -16,6 +16,7 @@ struct State {
     /// The next thing that a read returns: a message, or an error.
     arrived: VecDeque<Result<Message, i32>>,
     sent: Vec<RawFrame>,
+    sent_fd: Vec<RawFdFrame>,
     /// What the next attempts to send return.
     refusals: VecDeque<i32>,
     dropped: u32,
@@ -69,6 +70,15 @@ impl Interface for Fake {
             return Err(io::Error::from_raw_os_error(code));
         }
         state.sent.push(*frame);
+        Ok(())
+    }
+
+    fn send_fd(&mut self, frame: &RawFdFrame) -> io::Result<()> {
+        let mut state = self.lock();
+        if let Some(code) = state.refusals.pop_front() {
+            return Err(io::Error::from_raw_os_error(code));
+        }
+        state.sent_fd.push(*frame);
         Ok(())
     }
 
@@ -381,4 +391,27 @@ fn what_waits_in_the_socket_when_a_channel_is_closed_is_delivered() {
     drop(device);
     let count = records.filter(|record| record.as_ref().is_ok_and(|record| record.frame().is_some())).count();
     assert_eq!(count, 20_000);
+}
+
+#[test]
+fn fd_frames_are_sent_where_the_interface_takes_them_and_confirmed_as_they_come_back() {
+    let (fake, mut driver) = opened(Link { takes_fd: true, ..controller() });
+    assert!(driver.sends_fd());
+    let id = cantap_wire::Id::extended(0x18DA_F110).unwrap();
+    let frame = FdFrame::new(id, true, false, &[0xA5; 64]).unwrap();
+    assert!(driver.send_fd(Channel::Can1, 1, &frame));
+    let sent = fake.lock().sent_fd[0];
+    assert_eq!((sent[4], sent[5], sent[71]), (64, 5, 0xA5));
+    // The driver has found that its controller is error passive.
+    let mut back = fd_message(0x98DA_F110, 7, &[0xA5; 64]);
+    back.is_own = true;
+    fake.lock().arrived = [Ok(fd_message(0x98DA_F110, 5, &[0xA5; 64])), Ok(back)].into();
+    assert_eq!(reports(&mut driver), [format!("18DAF110##1{}", "A5".repeat(64)), "sent 1".to_owned()]);
+    // The queue is full, then the owner has switched CAN FD off.
+    fake.lock().refusals = [ENOBUFS, nix::libc::EINVAL].into();
+    assert!(!driver.send_fd(Channel::Can1, 2, &frame));
+    assert!(driver.send_fd(Channel::Can1, 2, &frame));
+    assert_eq!(reports(&mut driver), ["not sent 2"]);
+    let (_, driver) = opened(controller());
+    assert!(!driver.sends_fd());
 }

@@ -2,7 +2,10 @@
 
 use std::net::UdpSocket;
 
-use cantap::Channel;
+use cantap::transmit::Stream;
+use cantap::wire::Refusal;
+use cantap::wire::message::TxFdFrame;
+use cantap::{Channel, DeviceError, TraceFrame};
 
 use crate::{frames, losses, open, send, until_frame};
 
@@ -57,4 +60,74 @@ fn datagrams_that_are_missing_cut_or_strange_are_losses_or_counted() {
     let mut bytes = [0; 64];
     let (len, _) = peer.recv_from(&mut bytes).unwrap();
     assert_eq!(bytes[..len], [2, 0, 0, 0, 1, 0x9A, 0xBC, 0xDE, 0xF0, 1, 0x11]);
+}
+
+/// Frames of both kinds leave in the order in which they were given, each as what it is, and come back as confirmed.
+#[test]
+fn fd_frames_are_sent_in_order_with_classical_ones() {
+    let peer = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let listen = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let device = open(&format!("cannelloni://{}?listen={listen}", peer.local_addr().unwrap()));
+    assert!(device.hello().sends_fd());
+    device.join(Channel::Can1, 500_000).unwrap();
+    let long = format!("18DAF110##1{}", "A5".repeat(64));
+    let texts =
+        ["123##1", "123#11", "123##2112233445566778899AABBCC", &long, "123#R4", "123#0102030405060708"];
+    let mut stream = Stream::new(&device);
+    for text in texts {
+        let frame: TraceFrame = text.parse().unwrap();
+        assert!(stream.push(Channel::Can1, frame, None, |_| true).unwrap().is_some());
+    }
+    assert!(stream.finish(|_| true).unwrap());
+    let ends = stream.take_ended();
+    assert_eq!(ends.iter().map(|end| end.result.unwrap().to_string()).collect::<Vec<_>>(), texts);
+    let records = until_frame(&device, texts[5]);
+    assert_eq!(frames(&records), texts);
+    let mut bytes = [0; 100];
+    let mut received = |want: &[u8]| {
+        let (len, _) = peer.recv_from(&mut bytes).unwrap();
+        assert_eq!(&bytes[5..len], want);
+    };
+    received(&[0, 0, 1, 0x23, 0x80, 1]);
+    received(&[0, 0, 1, 0x23, 1, 0x11]);
+    received(
+        &[
+            &[0, 0, 1, 0x23, 0x8C, 2][..],
+            &[0x11, 0x22, 0x33, 0x44, 0x55, 0x66, 0x77, 0x88, 0x99, 0xAA, 0xBB, 0xCC],
+        ]
+        .concat(),
+    );
+    received(&[&[0x98, 0xDA, 0xF1, 0x10, 0xC0, 1][..], &[0xA5; 64]].concat());
+    received(&[0x40, 0, 1, 0x23, 4]);
+    received(&[0, 0, 1, 0x23, 8, 1, 2, 3, 4, 5, 6, 7, 8]);
+}
+
+/// What only listens sends nothing, and a frame of CAN FD waits for its time as others do.
+#[test]
+fn an_fd_frame_needs_a_channel_that_sends_and_has_its_time() {
+    let peer = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let listen = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let device = open(&format!("cannelloni://{}?listen={listen}", peer.local_addr().unwrap()));
+    let frame: TraceFrame = "123##1AA".parse().unwrap();
+    let send = |at_ticks| {
+        device.send_fd(Channel::Can1, &[TxFdFrame { tag: 1, frame: *frame.fd().unwrap(), at_ticks }])
+    };
+    let refusal = |at| match send(at) {
+        Err(DeviceError::Refused { refusal }) => refusal,
+        other => panic!("{other:?}"),
+    };
+    assert_eq!(refusal(None), Refusal::ChannelClosed);
+    device.listen(Channel::Can1, 500_000).unwrap();
+    assert_eq!(refusal(None), Refusal::ListenOnly);
+    device.close_channel(Channel::Can1).unwrap();
+    device.join(Channel::Can1, 500_000).unwrap();
+    let ends = device.transmissions();
+    let due = device.time().unwrap() + u64::from(device.hello().tick_hz) / 5;
+    send(Some(due)).unwrap();
+    assert!(ends.recv().unwrap().ticks >= due);
+    // Far ahead: it is taken back.
+    send(Some(due + u64::from(device.hello().tick_hz) * 3600)).unwrap();
+    device.abort(Channel::Can1).unwrap();
+    assert!(ends.recv().unwrap().result.is_err());
+    assert_eq!(refusal(Some(u64::MAX)), Refusal::TooFarAhead);
 }

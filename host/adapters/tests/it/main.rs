@@ -15,7 +15,7 @@ mod socketcand;
 mod trace_pipe;
 
 use cantap::device::Transmission;
-use cantap::{Device, TraceEvent, TraceRecord};
+use cantap::{Device, TraceEvent, TraceFrame, TraceRecord};
 
 /// A session with the adapter at an address.
 fn open(address: &str) -> Device {
@@ -62,5 +62,15 @@ fn send(device: &Device, frame: &str) -> Transmission {
     let ends = device.transmissions();
     let frame = frame.parse().unwrap();
     device.send(cantap::Channel::Can1, &[TxFrame { tag: 7, frame, at_ticks: None }]).unwrap();
+    ends.recv().unwrap()
+}
+
+/// The same with a CAN FD frame.
+fn send_fd(device: &Device, frame: &str) -> Transmission {
+    use cantap::wire::message::TxFdFrame;
+    let ends = device.transmissions();
+    let frame: TraceFrame = frame.parse().unwrap();
+    let frame = TxFdFrame { tag: 7, frame: *frame.fd().unwrap(), at_ticks: None };
+    device.send_fd(cantap::Channel::Can1, &[frame]).unwrap();
     ends.recv().unwrap()
 }

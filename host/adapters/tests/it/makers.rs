@@ -10,7 +10,7 @@ use cantap::{Channel, Device, DeviceError, TraceEvent};
 use libloading::Library;
 use tempfile::TempDir;
 
-use crate::{frames, losses, send, until, until_frame};
+use crate::{frames, losses, send, send_fd, until, until_frame};
 
 type Receive = unsafe extern "C" fn(u32, u32, u32, *const u8, u64);
 
@@ -43,6 +43,8 @@ enum Get {
     Output = 3,
     LastSent = 4,
     DataBitRate = 5,
+    LastKind = 6,
+    LastLength = 7,
 }
 
 impl StandIn {
@@ -333,4 +335,54 @@ fn kvaser_fd_and_a_pulled_adapter() {
     library.set(Set::Unplugged, 1);
     let end = device.records().find_map(Result::err).unwrap().to_string();
     assert!(end.contains("Hardware error"), "{end}");
+}
+
+/// A classical frame beside it stays one, and without a data bit rate nothing of CAN FD is sent.
+#[test]
+fn pcan_and_kvaser_send_fd_frames_with_their_flags_and_confirm_them() {
+    let long = format!("18DAF110##3{}", "A5".repeat(64));
+    // As PCAN-Basic wants it: FD, extended, BRS and ESI, and a length code.
+    if let Some(library) = StandIn::new("pcanbasic") {
+        library.set(Set::Features, 1);
+        let device = crate::open(&library.address("pcan:", "&data-bitrate=2M"));
+        device.join(Channel::Can1, 500_000).unwrap();
+        for (text, id, kind, dlc) in [
+            (&*long, 0x18DA_F110, 4 | 2 | 8 | 16, 15),
+            ("123##0112233445566778899AABBCC", 0x123, 4, 9),
+            ("123##1", 0x123, 4 | 8, 0),
+        ] {
+            assert_eq!(send_fd(&device, text).result.unwrap().to_string(), text);
+            let sent = [Get::LastSent, Get::LastKind, Get::LastLength].map(|what| library.get(what));
+            assert_eq!(sent, [id, kind, dlc], "{text}");
+        }
+        assert_eq!(send(&device, "123#AABB").result.unwrap().to_string(), "123#AABB");
+        assert_eq!([Get::LastKind, Get::LastLength].map(|what| library.get(what)), [0, 2]);
+    }
+    // As CANlib does: a number of bytes.
+    if let Some(library) = StandIn::new("canlib") {
+        let device = crate::open(&library.address("kvaser:0", "&data-bitrate=2M"));
+        device.join(Channel::Can1, 500_000).unwrap();
+        for (text, id, flags, len) in [
+            (&*long, 0x18DA_F110, 0x7_0004, 64),
+            ("123##0112233445566778899AABBCC", 0x123, 0x1_0002, 12),
+            ("123##1", 0x123, 0x3_0002, 0),
+        ] {
+            assert_eq!(send_fd(&device, text).result.unwrap().to_string(), text);
+            let sent = [Get::LastSent, Get::LastKind, Get::LastLength].map(|what| library.get(what));
+            assert_eq!(sent, [id, flags, len], "{text}");
+        }
+        assert_eq!(send(&device, "123#AABB").result.unwrap().to_string(), "123#AABB");
+        assert_eq!([Get::LastKind, Get::LastLength].map(|what| library.get(what)), [2, 2]);
+        drop(device);
+        let device = crate::open(&library.address("kvaser:0", ""));
+        device.join(Channel::Can1, 500_000).unwrap();
+        let count = library.get(Get::SentCount);
+        let frame: cantap::TraceFrame = "123##1".parse().unwrap();
+        let frame = cantap::wire::message::TxFdFrame { tag: 7, frame: *frame.fd().unwrap(), at_ticks: None };
+        assert!(matches!(device.send_fd(Channel::Can1, &[frame]), Err(DeviceError::NoFd)));
+        let frames = [frame].into_iter().collect();
+        let asked = device.request(cantap::wire::Command::SendFd { channel: Channel::Can1, frames });
+        assert_eq!(refusal(&asked.unwrap_err()), Some(Refusal::Unsupported), "not even if it is asked");
+        assert_eq!(library.get(Get::SentCount), count);
+    }
 }

@@ -10,7 +10,7 @@ typedef struct { long id; unsigned len, flags; unsigned long time; uint8_t data[
 
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
 static Message queue[4096];
-static unsigned head, tail, sent_count, room = 64, last_sent, output = 4, bits, transmit_acknowledge, scale = 1000;
+static unsigned head, tail, sent_count, room = 64, last_sent, last_flags, last_len, output = 4, bits, transmit_acknowledge, scale = 1000;
 static int open_handle, on_bus, unplugged, deaf, occupied;
 static long bitrate, data_bitrate;
 static unsigned segments[3];
@@ -87,11 +87,12 @@ int canWrite(int handle, long id, void *data, unsigned len, unsigned flags) {
     if (sent_count >= room) {
         status = TXBUFOFL;
     } else {
-        last_sent = (unsigned)id;
+        last_sent = (unsigned)id; last_flags = flags; last_len = len;
         sent_count++;
         if (transmit_acknowledge) {
             Message m = { .id = id, .len = len, .flags = flags | 0x40, .time = 5000000 + 1000 * sent_count };
-            memcpy(m.data, data, len > 8 ? 8 : len);
+            unsigned most = flags & 0x10000 ? 64 : 8;
+            memcpy(m.data, data, len > most ? most : len);
             queue[head++ % 4096] = m;
         }
     }
@@ -140,6 +141,8 @@ uint32_t standin_get(uint32_t what) {
         case 3: return output;
         case 4: return last_sent;
         case 5: return (uint32_t)data_bitrate;
+        case 6: return last_flags;
+        case 7: return last_len;
         default: return segments[0] << 16 | segments[1] << 8 | segments[2];
     }
 }

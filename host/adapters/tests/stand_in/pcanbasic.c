@@ -178,6 +178,9 @@ uint32_t standin_get(uint32_t what) {
         case 1: return registers;
         case 2: return (uint32_t)initialized;
         case 3: return values[8];
+        case 5: return 0;
+        case 6: return sent_count ? sent[sent_count - 1].type : 0;
+        case 7: return sent_count ? sent[sent_count - 1].dlc : 0;
         default: return sent_count ? sent[sent_count - 1].id : 0;
     }
 }

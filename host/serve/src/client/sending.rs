@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use cantap_wire::message::{Periodic, Role, Trigger, TxFrame};
+use cantap_wire::message::{Periodic, Role, Trigger};
 use cantap_wire::record::TransmitFailure;
 use cantap_wire::{Channel, Command, Event, Refusal, Reply};
 
@@ -14,6 +14,7 @@ use crate::lock::lock;
 use crate::permissions::Denied;
 use crate::state::{Table, Then, clears};
 use crate::stream::{Entry, Owner};
+use crate::to_send::{self, Batch, ToSend};
 
 /// Withdrawn frames have been reported by this time.
 const WITHDRAW_TIMEOUT: Duration = Duration::from_millis(500);
@@ -36,13 +37,13 @@ impl Client {
         .unwrap_or(Err(Refusal::NoSession))
     }
 
-    pub(super) fn send(&self, channel: Channel, frames: &[TxFrame]) -> Result<Reply, Refusal> {
+    pub(super) fn send(&self, channel: Channel, frames: &Batch) -> Result<Reply, Refusal> {
         self.may_transmit_on(channel)?;
-        if frames.iter().any(|frame| frame.tag >= cantap_wire::message::DEVICE_TAG) {
+        if frames.iter().any(|frame| frame.tag() >= cantap_wire::message::DEVICE_TAG) {
             return Err(Refusal::BadTag);
         }
         self.must_be_permitted(Role::Send, |permit, _| {
-            frames.iter().try_for_each(|frame| permit.send(frame.frame.id()))
+            frames.iter().try_for_each(|frame| permit.send(frame.id()))
         })?;
         let deadline = Instant::now() + ROOM_TIMEOUT;
         if let Some(most) = self.frames_per_second() {
@@ -56,14 +57,13 @@ impl Client {
             }
         }
         loop {
-            let noted: heapless::Vec<TxFrame, { cantap_wire::message::MAX_SEND }> = {
+            let noted: Batch = {
                 let mut state = self.shared.state();
-                let note =
-                    |frame: &TxFrame| TxFrame { tag: state.note_sent(self.id, channel, *frame), ..*frame };
+                let note = |frame: &ToSend| frame.tagged(state.note_sent(self.id, channel, *frame));
                 frames.iter().map(note).collect()
             };
-            let tags: Vec<u32> = noted.iter().map(|frame| frame.tag).collect();
-            let result = self.shared.ask(Command::Send { channel, frames: noted }, Then::Nothing);
+            let tags: Vec<u32> = noted.iter().map(ToSend::tag).collect();
+            let result = self.shared.ask(to_send::command(channel, &noted), Then::Nothing);
             if result.is_err() {
                 let mut state = self.shared.state();
                 for tag in tags {

@@ -228,7 +228,7 @@ fn a_sender_is_confirmed_others_see_the_frame_and_the_board_listens_again_when_i
     let frame: Frame = "123#11".parse().unwrap();
     sender.send(Channel::Can1, &[TxFrame { tag: 77, frame, at_ticks: None }]).unwrap();
     let end = ends.recv_timeout(Duration::from_secs(2)).unwrap();
-    assert_eq!((end.tag, end.result), (77, Ok(frame)));
+    assert_eq!((end.tag, end.result), (77, Ok(frame.into())));
     // The same entry number for two clients; each has its own entry.
     let other = client(&board, "other", Role::Send);
     let other_ends = other.transmissions();
@@ -244,9 +244,9 @@ fn a_sender_is_confirmed_others_see_the_frame_and_the_board_listens_again_when_i
         while own < 3 {
             let end = ends.recv_timeout(Duration::from_secs(2)).unwrap();
             match end.tag {
-                OTHERS_TAG => assert_ne!(end.result, Ok(expected)),
+                OTHERS_TAG => assert_ne!(end.result, Ok(expected.into())),
                 tag => {
-                    assert_eq!((tag, end.result), (DEVICE_TAG + 5, Ok(expected)));
+                    assert_eq!((tag, end.result), (DEVICE_TAG + 5, Ok(expected.into())));
                     own += 1;
                 }
             }

@@ -3,8 +3,9 @@
 use std::fmt;
 use std::str::FromStr;
 
+use crate::fd::FD_LENGTHS;
 use crate::id_filter::{EXTENDED, IdFilter, REMOTE};
-use crate::{Frame, Id};
+use crate::{Frame, Id, ParseTraceFrameError, TraceFrame};
 
 /// Bit 29 is reserved by the kernel: it marks inverse filters and error frames.
 const RESERVED: u32 = 1 << 29;
@@ -212,6 +213,24 @@ pub fn frame(text: &str) -> Result<Frame, String> {
     };
     let id = identifier(id)?;
     format!("{id}#{rest}").parse::<Frame>().map_err(|error| error.to_string())
+}
+
+/// The same, or a CAN FD frame: `123##1DEADBEEF`, where the digit has the flags (1: the bit rate is switched, 2: the sender is error passive).
+/// With `pad`, one of a length that CAN FD does not have is filled with zeros up to the next one, as cansend does unasked.
+pub fn any_frame(text: &str, pad: bool) -> Result<TraceFrame, String> {
+    let Some((id, rest)) = text.split_once("##") else { return frame(text).map(TraceFrame::Classic) };
+    let id = identifier(id)?;
+    let whole = format!("{id}##{rest}");
+    match whole.parse::<TraceFrame>() {
+        Err(ParseTraceFrameError::BadLength) if pad => {}
+        parsed => return parsed.map_err(|error| error.to_string()),
+    }
+    // Its digits are in order: only their number is not.
+    let digits = rest.get(1..).unwrap_or_default().replace('.', "");
+    let bytes = digits.len() / 2;
+    let len = FD_LENGTHS.iter().map(|len| usize::from(*len)).find(|len| *len >= bytes);
+    let padding = "00".repeat(len.map_or(0, |len| len - bytes));
+    format!("{id}##{}{digits}{padding}", &rest[..1]).parse::<TraceFrame>().map_err(|error| error.to_string())
 }
 
 #[cfg(test)]

@@ -10,6 +10,6 @@ mod time;
 pub(crate) use identifier::{hex, masked};
 
 pub use channel::{channel, interface};
-pub use identifier::{IdError, IdPattern, frame, group_of, identifier, parameter_group};
+pub use identifier::{IdError, IdPattern, any_frame, frame, group_of, identifier, parameter_group};
 pub use rate::{bit_rate, per_second};
 pub use time::{duration, positive_duration};

@@ -136,7 +136,7 @@ fn frames_are_sent_confirmed_and_lose_arbitration_to_lower_identifiers() {
     let frame: Frame = "7FF#DEADBEEF".parse().unwrap();
     device.send(Channel::Can1, &[TxFrame { tag: 42, frame, at_ticks: None }]).unwrap();
     let sent = transmissions.recv_timeout(Duration::from_secs(5)).unwrap();
-    assert_eq!((sent.channel, sent.tag, sent.result), (Channel::Can1, 42, Ok(frame)));
+    assert_eq!((sent.channel, sent.tag, sent.result), (Channel::Can1, 42, Ok(frame.into())));
     collect(&device, |record| {
         record.event == TraceEvent::Frame { frame: frame.into(), direction: Direction::Tx, late: false }
     });

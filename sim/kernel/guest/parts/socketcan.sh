@@ -76,6 +76,29 @@ wait "$CANDUMP" 2> /dev/null
 bare_frames capture.log > got1
 bare_frames dump.txt | sed 's/##4/##0/; s/##5/##1/; s/##6/##2/; s/##7/##3/' | cmp -s - got1 && [ "$(wc -l < got1)" = 1501 ]
 verdict $? "socketcan: cangen with CAN FD: each frame that candump has, in order" "$(grep -c '##' got1) of CAN FD among $(wc -l < got1)"
+# Sent beside a classical one, each is confirmed, and candump has it with its flags: what cansend sends of the same text.
+candump -L $BUS > dump.txt &
+CANDUMP=$!
+wait_until is_bound 1
+_long=$(printf '18DAF110##1%0128d' 0)
+timeout 60 "$CANTAP" send -d socketcan:$BUS -b 500k 1 123##1AABB 123#DEAD 7FF##0 "$_long" 124##2112233445566778899AABBCC > send.txt 2>&1
+_code=$?
+for _frame in 123##1AABB 123#DEAD 7FF##0 "$_long" 124##2112233445566778899AABBCC; do
+  cansend $BUS "$_frame"
+done
+is_in_dump() { [ "$(wc -l < dump.txt)" = 10 ]; }
+wait_until is_in_dump
+kill "$CANDUMP"
+wait "$CANDUMP" 2> /dev/null
+bare_frames dump.txt | sed 's/##4/##0/; s/##5/##1/; s/##6/##2/; s/##7/##3/' > got1
+head -n 5 got1 > ours
+tail -n 5 got1 | cmp -s - ours && [ $_code = 0 ] && [ "$(wc -l < ours)" = 5 ] && [ "$(grep -c '##' ours)" = 4 ]
+verdict $? "socketcan: CAN FD frames sent are confirmed, and candump has them as cansend's" "$(cut -c 1-40 ours | tr '\n' ' ')"
+[ $_code = 0 ] || cat send.txt
+iproute2 link set $BUS down && iproute2 link set $BUS mtu 16 && iproute2 link set $BUS up
+timeout 60 "$CANTAP" send -d socketcan:$BUS -b 500k 1 123#11 123##1AABB > send.txt 2>&1
+[ $? = 1 ] && grep -q "CAN FD is off on $BUS; as root: ip link set $BUS down" send.txt && ! grep -q '123#11 T' send.txt
+verdict $? "socketcan: CAN FD frames are refused, before anything is sent, where the interface has it off" "$(head -n 1 send.txt)"
 iproute2 link del $BUS
 BUS=sock0
 

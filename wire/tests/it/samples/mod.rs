@@ -3,10 +3,10 @@
 use cantap_wire::message::{
     ChannelConfig, ChannelStatus, Checksum, Defaults, Edge, Edges, Failures, Filter, FrameKind, GATEWAY_TAG,
     GatewayEnd, GatewayRule, GatewayState, GatewayStatus, Modifier, Pass, Periodic, RegisterSet, Registers,
-    Role, RuleCounts, Status, Trigger, TxFrame, capability,
+    Role, RuleCounts, Status, Trigger, TxFdFrame, TxFrame, capability,
 };
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
-use cantap_wire::{BitTiming, Channel, Command, Event, Frame, Hello, Refusal, Reply};
+use cantap_wire::{BitTiming, Channel, Command, Event, FdFrame, Frame, Hello, Id, Refusal, Reply};
 
 /// Bytes in the tables' notation.
 pub fn hex(bytes: &[u8]) -> String {
@@ -16,6 +16,10 @@ pub fn hex(bytes: &[u8]) -> String {
 /// A frame in candump's notation.
 pub fn frame(text: &str) -> Frame {
     text.parse().unwrap()
+}
+
+fn fd_frame(id: u32, (brs, esi): (bool, bool), data: &[u8]) -> FdFrame {
+    FdFrame::new(Id::standard(id).unwrap(), brs, esi, data).unwrap()
 }
 
 const TIMING: BitTiming = BitTiming { prescaler: 300, segment1: 13, segment2: 2, jump_width: 1 };
@@ -164,6 +168,18 @@ pub fn commands() -> Vec<(Command, &'static str)> {
         (Command::GatewayStatus { from: channel, first: 16 }, "19 01 10"),
         (Command::GatewayRule { from: channel, slot: 3 }, "1a 01 03"),
         (Command::SaveGateway, "1b"),
+        (
+            Command::SendFd {
+                channel,
+                frames: [
+                    TxFdFrame { tag: 1, frame: fd_frame(0x123, (true, false), &[1, 2]), at_ticks: None },
+                    TxFdFrame { tag: 300, frame: fd_frame(1, (false, true), &[0; 12]), at_ticks: Some(300) },
+                ]
+                .into_iter()
+                .collect(),
+            },
+            "1c 01 02 01 a3 82 80 80 04 02 01 02 00 ac 02 81 80 80 80 02 0c 00 00 00 00 00 00 00 00 00 00 00 00 01 ac 02",
+        ),
     ]
 }
 

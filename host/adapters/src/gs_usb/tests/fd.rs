@@ -80,3 +80,36 @@ fn without_a_data_bit_rate_fd_stays_off() {
     assert_eq!(stand_in.lock().started, [Some(flags), None]);
     assert_eq!(stand_in.requests(request::DATA_BIT_TIMING), []);
 }
+
+#[test]
+fn fd_frames_are_sent_with_their_flags_and_confirmed_by_their_echo() {
+    let stand_in = StandIn::new(FD, 1);
+    let driver = connect(&stand_in, at(2_000_000)).unwrap();
+    let device = Device::over(crate::engine::start(Box::new(driver)).unwrap(), "gs_usb:").unwrap();
+    device.join(Channel::Can1, 500_000).unwrap();
+    let mut stream = cantap::transmit::Stream::new(&device);
+    let long = format!("18DAF110##3{}", "A5".repeat(64));
+    let texts = ["123##0", "123#11", "123##111223344556677889900AABB", &long, "7FF#R2"];
+    for text in texts {
+        let frame: cantap_trace::TraceFrame = text.parse().unwrap();
+        stream.push(Channel::Can1, frame, None, |_| true).unwrap();
+    }
+    assert!(stream.finish(|_| true).unwrap());
+    let ended: Vec<_> = stream.take_ended().iter().map(|end| end.result.unwrap().to_string()).collect();
+    assert_eq!(ended, texts);
+    // The stamp is the adapter's, as of a received frame.
+    let records = until(&device, "7FF#R2");
+    assert_eq!(frames(&records).into_iter().map(|(_, text)| text).collect::<Vec<_>>(), texts);
+}
+
+#[test]
+fn without_a_data_bit_rate_no_fd_frame_is_sent() {
+    let stand_in = StandIn::new(FD, 1);
+    let device = session(&stand_in);
+    assert!(!device.hello().sends_fd());
+    device.join(Channel::Can1, 500_000).unwrap();
+    let frame: cantap_trace::TraceFrame = "123##1AA".parse().unwrap();
+    let mut stream = cantap::transmit::Stream::new(&device);
+    let pushed = stream.push(Channel::Can1, frame, None, |_| true);
+    assert!(matches!(pushed, Err(cantap::DeviceError::NoFd)), "{pushed:?}");
+}

@@ -60,6 +60,8 @@ mod pcapng;
 mod printer;
 mod read_options;
 mod reader;
+mod rlog;
+mod ros;
 mod rotate;
 mod rotation;
 mod row_format;

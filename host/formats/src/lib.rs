@@ -53,6 +53,7 @@ mod mf4;
 mod microchip;
 mod nmea2000;
 mod output;
+mod panda;
 #[cfg(feature = "parquet")]
 mod parquet;
 mod pcap;

@@ -17,11 +17,11 @@ use super::found::Found;
 use super::frame_fields::{FdFields, FrameFields, Payload, identifier};
 use super::input::{Input, MAX_ITEM_BYTES};
 use super::issue::{Fault, Place};
-use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use super::panda::{self, REJECTED};
+use cantap_trace::{TraceEvent, TraceRecord};
 use message::{LONGEST_TABLE_BYTES, Message, Struct};
 
 const OTHER_EVENTS: &str = "openpilot's events other than CAN frames";
-const REJECTED: &str = "frames that the panda was asked to send and rejected";
 const UNHEALTHY: &str = "the link to the panda was disturbed: frames may be missing";
 const NO_DATE: &str = "the log does not say when the device started: times count from then";
 
@@ -157,17 +157,11 @@ impl Decoder {
 
 /// A frame. All that the panda had for the device at a time have the time of their arrival there, so that it is an upper bound.
 fn can_data(data: &Struct<'_>, time_ns: i64) -> Result<Found, Fault> {
-    /// Of frames that the panda was asked to send, in `src`: those that are on the bus, and those that it did not let pass.
-    const RETURNED: u8 = 0x80;
-    const REJECTED_FROM: u8 = 0xC0;
     /// Longest identifier of 11 bits: only the value shows which it is.
     const STANDARD_MAX: u32 = 0x7FF;
     let bytes = data.pointer(0).and_then(|dat| dat.bytes());
     let bytes = bytes.ok_or_else(|| Fault::malformed("a frame's data", b"data beyond the event's end"))?;
-    let src = data.u8(6);
-    if src >= REJECTED_FROM {
-        return Ok(Found::LeftOut(REJECTED));
-    }
+    let Some((channel, direction)) = panda::bus(data.u8(6)) else { return Ok(Found::LeftOut(REJECTED)) };
     let raw = data.u32(0);
     let id = identifier(raw, raw > STANDARD_MAX, format!("{raw:X}").as_bytes())?;
     let payload = Payload::of(bytes)
@@ -175,7 +169,7 @@ fn can_data(data: &Struct<'_>, time_ns: i64) -> Result<Found, Fault> {
     let fields = FrameFields {
         id,
         remote: false,
-        direction: if src >= RETURNED { Direction::Tx } else { Direction::Rx },
+        direction,
         len: bytes.len() as u8,
         fd: (bytes.len() > 8).then(FdFields::default),
     };
@@ -183,7 +177,7 @@ fn can_data(data: &Struct<'_>, time_ns: i64) -> Result<Found, Fault> {
     if let TraceEvent::Frame { late, .. } = &mut event {
         *late = true;
     }
-    Ok(Found::Record(TraceRecord { time_ns, channel: (src & !RETURNED) + 1, event }))
+    Ok(Found::Record(TraceRecord { time_ns, channel, event }))
 }
 
 /// Skips to what looks like an event behind the next byte, or to the end; false at the end.

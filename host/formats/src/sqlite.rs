@@ -351,7 +351,7 @@ mod tests {
     fn a_bag_of_ros_2_is_read_by_topics_and_what_is_no_frame_is_counted() {
         let header = |seconds: &str| format!("00010000{seconds}0500000004000000{}00", "63616e");
         let frame = |seconds: &str| format!("{}23010000000000021122000000000000", header(seconds));
-        let flexible = format!("{}f110da1801000c000c000000{}", header("c2251654"), "07".repeat(12));
+        let flexible = format!("{}f110da1801000c000c000000{}", header("02cd1554"), "07".repeat(12));
         let schema = "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, serialization_format TEXT NOT NULL);
              CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL, data BLOB NOT NULL);
              INSERT INTO topics VALUES (1, '/can1/from_can_bus', 'can_msgs/msg/Frame', 'cdr'), (2, '/can1/to_can_bus', 'can_msgs/msg/Frame', 'cdr'),
@@ -359,7 +359,7 @@ mod tests {
         let bytes = database(&format!(
             "{schema} INSERT INTO messages VALUES (1, 1, 1410714890000000001, x'{}'), (2, 2, 1410714890000000002, x'{}'),
              (3, 3, 3, x'{flexible}'), (4, 4, 4, x'00'), (5, 9, 5, x'00'), (6, 1, 6, x'0001'), (7, 1, 'noon', x'00');",
-            frame("c2251654"),
+            frame("02cd1554"),
             frame("00000000").replace("0500000004", "0000000004"),
         ));
         let (records, issues) = tests::read(Format::Sqlite, bytes.clone());

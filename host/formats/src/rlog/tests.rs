@@ -1,6 +1,7 @@
 use super::*;
 use crate::Format;
 use crate::tests::as_log;
+use cantap_trace::Direction;
 
 /// An event in a message of one segment.
 fn event(mono_ns: u64, kind: u16, flags: u8, pointer: u64, rest: &[u64]) -> Vec<u8> {

@@ -33,6 +33,8 @@ const MESSAGE_HEAD_BYTES: usize = 22;
 /// No message with a frame is so long, nor the name of a topic.
 const MAX_HELD_BYTES: u64 = 1 << 20;
 
+const PRIVATE_RECORDS: &str = "records of MCAP of a kind of some program's own";
+
 /// What a file has said so far.
 #[derive(Default)]
 pub(crate) struct Mcap {
@@ -76,6 +78,11 @@ impl Container for Mcap {
             0 | op::DATA_END..op::FIRST_PRIVATE => {
                 let found = format!("one of kind {op}");
                 return Ok(Step::Wrong(Fault::malformed("a record of MCAP", found.as_bytes())));
+            }
+            // Such a kind may also be that of a damaged record.
+            op::FIRST_PRIVATE.. => {
+                let is_whole = skip(input, len.saturating_add(HEAD_BYTES as u64))?;
+                return Ok(if is_whole { Step::Found(Found::LeftOut(PRIVATE_RECORDS)) } else { Step::Cut });
             }
             _ => {}
         }

@@ -55,6 +55,12 @@ pub enum Format {
     UsbCan,
     /// A table of any columns.
     Table,
+    /// openpilot's log of a drive.
+    Rlog,
+    /// What ROS 2 records, and Foxglove shows.
+    Mcap,
+    /// What ROS 1 records.
+    RosBag,
     /// A table in Parquet: a row for each record, or frames in any columns.
     Parquet,
 }

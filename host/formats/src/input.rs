@@ -140,6 +140,11 @@ impl Input {
         Self { is_as_it_is: false, ..Self::new(source, false) }.recognised()
     }
 
+    /// Reads from what unpacks a part of a file, and takes its bytes as they are.
+    pub(crate) fn unpacked(source: Box<dyn Read + Send>) -> Self {
+        Self { is_as_it_is: false, ..Self::new(source, false) }
+    }
+
     fn recognised(self) -> io::Result<Self> {
         let mut input = self;
         if let Some(compression) = Compression::of_content(input.peek(compression::MAGIC_BYTES)?) {

@@ -53,6 +53,7 @@ mod mf4;
 mod microchip;
 mod nmea2000;
 mod output;
+mod panda;
 #[cfg(feature = "parquet")]
 mod parquet;
 mod pcap;
@@ -60,6 +61,8 @@ mod pcapng;
 mod printer;
 mod read_options;
 mod reader;
+mod rlog;
+mod ros;
 mod rotate;
 mod rotation;
 mod row_format;

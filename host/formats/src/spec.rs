@@ -10,12 +10,15 @@ use super::csv::CsvDialect;
 use super::dif::{self, DifLayout};
 use super::format::Format;
 use super::read_options::ReadOptions;
+use super::ros::bag::Bag;
+use super::ros::container::{self, Container};
+use super::ros::mcap::Mcap;
 use super::row_format::Rows;
 use super::trc::TrcVersion;
 use super::writer::WriteOptions;
 use super::{
     asc, battery_emulator, blf, busmaster, candump, candump_screen, canedge, canhacker, canking, carbus,
-    crtd, csv, gvret, kvaser, mf4, microchip, nmea2000, pcap, pcapng, printer, table, trc, usbcan,
+    crtd, csv, gvret, kvaser, mf4, microchip, nmea2000, pcap, pcapng, printer, rlog, table, trc, usbcan,
 };
 
 /// One format.
@@ -321,7 +324,7 @@ const FORMATS: &[FormatSpec] = &[
     FormatSpec {
         format: Format::Sqlite,
         names: &["sqlite"],
-        suffixes: &["db", "sqlite", "sqlite3"],
+        suffixes: &["db", "sqlite", "sqlite3", "db3"],
         begins: |head| head.bytes.starts_with(b"SQLite format 3\0"),
         has_head: true,
         reader: |_| sqlite_reader(),
@@ -379,6 +382,33 @@ const FORMATS: &[FormatSpec] = &[
         begins: |head| table::is_first(head.first) && !is_of_another(head),
         has_head: false,
         reader: |options| Box::new(Rows::of(table::Decoder::new(options.columns.clone()))),
+        writer: None,
+    },
+    FormatSpec {
+        format: Format::Rlog,
+        names: &["rlog"],
+        suffixes: &["rlog", "qlog"],
+        begins: |head| rlog::is_head(head.bytes),
+        has_head: true,
+        reader: |_| Box::new(rlog::Decoder::default()),
+        writer: None,
+    },
+    FormatSpec {
+        format: Format::Mcap,
+        names: &["mcap"],
+        suffixes: &["mcap"],
+        begins: |head| head.bytes.starts_with(Mcap::MAGIC),
+        has_head: true,
+        reader: |_| Box::new(container::Decoder::<Mcap>::default()),
+        writer: None,
+    },
+    FormatSpec {
+        format: Format::RosBag,
+        names: &["rosbag"],
+        suffixes: &["bag"],
+        begins: |head| head.bytes.starts_with(Bag::MAGIC),
+        has_head: true,
+        reader: |_| Box::new(container::Decoder::<Bag>::default()),
         writer: None,
     },
     FormatSpec {

@@ -1,5 +1,5 @@
 //! python-can's SQLite: one table with the columns of its CSV, `ts`, `arbitration_id`, `extended`, `remote`, `error`, `dlc`, `data`,
-//! and likewise without channel, direction and CAN FD's flags. The table may have any name.
+//! and likewise without channel, direction and CAN FD's flags. The table may have any name. Or a bag of ROS 2.
 //!
 //! The file is loaded into memory, which SQLite reads as well as a file, so that compressed files and pipes can be read, too.
 
@@ -14,6 +14,7 @@ use super::error_frames::ErrorFrames;
 use super::found::Found;
 use super::input::Input;
 use super::issue::{Fault, Place};
+use super::ros::database::{self, Bag};
 use super::whole::{MAX_MEMORY_BYTES, Whole};
 use cantap_trace::{TraceEvent, TraceRecord};
 
@@ -24,7 +25,7 @@ const UNTAKEN_JOURNAL: &str = "the database has a journal beside it (write-ahead
 /// Rows requested from the database at a time.
 const ROWS: i64 = 512;
 
-/// Reads a database.
+/// Reads a database of either kind.
 #[derive(Default)]
 pub(crate) struct Decoder {
     state: State,
@@ -40,6 +41,8 @@ enum State {
     Open {
         database: Connection,
         query: String,
+        /// The topics, if it is a bag of ROS 2 and no table of python-can's.
+        bag: Option<Bag>,
         /// The last row that was read.
         row: i64,
         is_cut: bool,
@@ -129,16 +132,19 @@ impl Decoder {
         if has_journal {
             self.found.push(Found::Note(UNTAKEN_JOURNAL));
         }
-        let fault = match table(&database) {
-            Ok(Some(table)) => {
-                let columns = COLUMNS.join(", ");
-                let query = format!(
-                    "SELECT rowid, {columns} FROM {table} WHERE rowid > ? ORDER BY rowid LIMIT {ROWS}"
-                );
-                return Ok(State::Open { database, query, row: i64::MIN, is_cut });
+        let opened = table(&database).and_then(|table| match table {
+            Some(table) => Ok(Some((format!("rowid, {} FROM {table}", COLUMNS.join(", ")), None))),
+            None => Ok(Bag::open(&database)?.map(|bag| (database::COLUMNS.to_owned(), Some(bag)))),
+        });
+        let fault = match opened {
+            Ok(Some((columns, bag))) => {
+                let query = format!("SELECT {columns} WHERE rowid > ? ORDER BY rowid LIMIT {ROWS}");
+                return Ok(State::Open { database, query, bag, row: i64::MIN, is_cut });
             }
             Ok(None) => {
-                Fault::malformed(format!("a table with the columns {}", COLUMNS.join(", ")), b"no such table")
+                let columns = COLUMNS.join(", ");
+                let expected = format!("a table with the columns {columns}, or the topics of a bag of ROS 2");
+                Fault::malformed(expected, b"no such table")
             }
             Err(_) if is_cut => CUT,
             Err(error) => of_database(&error),
@@ -149,7 +155,7 @@ impl Decoder {
 
     /// Reads the next rows into `found`; false at the end.
     fn rows(&mut self) -> bool {
-        let State::Open { database, query, row: last, is_cut } = &mut self.state else { return false };
+        let State::Open { database, query, bag, row: last, is_cut } = &mut self.state else { return false };
         let before = self.found.len();
         let (errors, found) = (&mut self.errors, &mut self.found);
         let result = database.prepare(query).and_then(|mut statement| {
@@ -161,6 +167,12 @@ impl Decoder {
                     return Ok(false);
                 }
                 *last = number;
+                if let Some(bag) = bag {
+                    if let Err(fault) = bag.message(row, errors, found) {
+                        found.push(Found::Issue(Place::Row(number), fault));
+                    }
+                    continue;
+                }
                 match record(row, errors) {
                     Ok((record, second)) => {
                         found.push(Found::Record(record));
@@ -333,6 +345,43 @@ mod tests {
         let (records, issues) = tests::read(Format::Sqlite, bytes);
         assert!(records.len() < 200, "{}", records.len());
         assert!(issues.len() == 1 && issues[0].contains("expected rows in their order"), "{issues:?}");
+    }
+
+    /// As rosbag2 lays it out, with messages as ROS 2 serializes them.
+    #[test]
+    fn a_bag_of_ros_2_is_read_by_topics_and_what_is_no_frame_is_counted() {
+        let header = |seconds: &str| format!("00010000{seconds}0500000004000000{}00", "63616e");
+        let frame = |seconds: &str| format!("{}23010000000000021122000000000000", header(seconds));
+        let flexible = format!("{}f110da1801000c000c000000{}", header("02cd1554"), "07".repeat(12));
+        let schema = "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, serialization_format TEXT NOT NULL);
+             CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL, data BLOB NOT NULL);
+             INSERT INTO topics VALUES (1, '/can1/from_can_bus', 'can_msgs/msg/Frame', 'cdr'), (2, '/can1/to_can_bus', 'can_msgs/msg/Frame', 'cdr'),
+             (3, '/can0/from_can_bus_fd', 'ros2_socketcan_msgs/msg/FdFrame', 'cdr'), (4, '/chatter', 'std_msgs/msg/String', 'cdr');";
+        let bytes = database(&format!(
+            "{schema} INSERT INTO messages VALUES (1, 1, 1410714890000000001, x'{}'), (2, 2, 1410714890000000002, x'{}'),
+             (3, 3, 3, x'{flexible}'), (4, 4, 4, x'00'), (5, 9, 5, x'00'), (6, 1, 6, x'0001'), (7, 1, 'noon', x'00');",
+            frame("02cd1554"),
+            frame("00000000").replace("0500000004", "0000000004"),
+        ));
+        let (records, issues) = tests::read(Format::Sqlite, bytes.clone());
+        assert_eq!(
+            tests::write(Format::Candump, &records),
+            "(1410714882.000000) can1 123#1122\n(1410714890.000000) can1 123#1122 T\n\
+             (1410714882.000000) can0 18DA10F1##0070707070707070707070707\n"
+        );
+        assert_eq!(
+            issues,
+            [
+                "test, row 5: expected a message of a topic of the bag, found 'topic 9'",
+                "test, row 6: expected a message with a CAN frame, found '2 bytes'",
+                "test, row 7: expected a message with its topic, its time and its bytes, found 'something else'",
+            ]
+        );
+        let options = ReadOptions::default();
+        let source = std::io::Cursor::new(bytes);
+        let mut reader = TraceReader::from_source("test", source, Format::Sqlite, &options).unwrap();
+        assert_eq!(reader.by_ref().filter_map(Result::ok).count(), 3);
+        assert_eq!((reader.notes().total(), reader.left_out().total()), (1, 1));
     }
 
     #[test]

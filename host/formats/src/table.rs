@@ -11,6 +11,7 @@ pub(crate) use columns::{TypedColumn, TypedForm};
 use super::frame_fields::{FdFields, FrameFields, Payload, identifier};
 use super::interfaces::Interfaces;
 use super::issue::Fault;
+use super::panda::{self, REJECTED};
 use super::row_format::{Line, RowFormat};
 use super::text;
 use super::zone::Zone;
@@ -183,9 +184,12 @@ impl Decoder {
 
     fn row(&mut self, line: &[u8], zone: &Zone) -> Result<Line, Fault> {
         let Some(layout) = self.layout.take() else { return Ok(Line::Nothing) };
-        let record = self.record(&layout, line, zone);
+        let record = match is_rejected(&layout, line) {
+            true => Ok(Line::LeftOut(REJECTED)),
+            false => self.record(&layout, line, zone).map(Line::Record),
+        };
         self.layout = Some(layout);
-        record.map(Line::Record)
+        record
     }
 
     fn record(&mut self, layout: &Layout, line: &[u8], zone: &Zone) -> Result<TraceRecord, Fault> {
@@ -218,9 +222,13 @@ impl Decoder {
             Some((way, _)) => direction(way)?,
             None => Direction::Rx,
         };
-        let channel = match cell(Role::Channel) {
-            Some((name, form)) => self.channel(name, form)?,
-            None => 1,
+        let (channel, direction) = match cell(Role::Channel) {
+            Some((bus, _)) if layout.is_cabana => {
+                let known = text::decimal(bus).and_then(|bus| panda::bus(u8::try_from(bus).ok()?));
+                known.ok_or_else(|| Fault::malformed("a bus of 0 to 255", bus))?
+            }
+            Some((name, form)) => (self.channel(name, form)?, direction),
+            None => (1, direction),
         };
         let len = match cell(Role::Dlc) {
             Some((cell, _)) => Some(length(cell)?),
@@ -284,6 +292,14 @@ impl Decoder {
             .filter(|_| bytes.len() <= 8 || FD_LENGTHS.iter().any(|fd| usize::from(*fd) == bytes.len()))
             .ok_or_else(|| Fault::malformed("a number of bytes that CAN or CAN FD has", found.as_bytes()))
     }
+}
+
+/// Whether a row is of a frame that was never on the bus.
+fn is_rejected(layout: &Layout, line: &[u8]) -> bool {
+    let Some(place) = layout.place(Role::Channel).filter(|_| layout.is_cabana) else { return false };
+    let cells = layout.separator.cells(line);
+    let bus = cells.get(place.at).and_then(|bus| text::decimal(bus)).and_then(|bus| u8::try_from(bus).ok());
+    bus.is_some_and(|bus| panda::bus(bus).is_none())
 }
 
 /// Whether identifiers are decimal, and whether that is sure.

@@ -202,7 +202,7 @@ impl<'a> Reader<'a> {
             let default = SignalExtras::default();
             let extras = extras.unwrap_or(&default);
             let mut signal = signal(definition, extras, start, length);
-            if extras.float.is_some() && !matches!(length, 16 | 32 | 64) {
+            if extras.float.is_some_and(is_float) && !matches!(length, 16 | 32 | 64) {
                 let symbol = format!("{name}.{}", signal.name);
                 self.faults.push(Fault { line, symbol, kind: FaultKind::OddFloat(length) });
             }
@@ -314,16 +314,20 @@ fn switch<'a>(
     }
 }
 
+/// `SIG_VALTYPE_` may also say that a signal is a whole number.
+fn is_float(value_type: SignalExtendedValueType) -> bool {
+    use SignalExtendedValueType::{IEEEdouble64bit, IEEEfloat32Bit};
+    matches!(value_type, IEEEfloat32Bit | IEEEdouble64bit)
+}
+
 fn signal(definition: &can_dbc::Signal, extras: &SignalExtras, start: u16, length: u16) -> Signal {
     let kind = match (extras.float, definition.value_type) {
         // Vector's tools know 32 and 64 bits; 16 is a common extension.
-        (Some(SignalExtendedValueType::IEEEfloat32Bit | SignalExtendedValueType::IEEEdouble64bit), _) => {
-            match length {
-                16 => ValueKind::Half,
-                64 => ValueKind::Double,
-                _ => ValueKind::Single,
-            }
-        }
+        (Some(value_type), _) if is_float(value_type) => match length {
+            16 => ValueKind::Half,
+            64 => ValueKind::Double,
+            _ => ValueKind::Single,
+        },
         (_, ValueType::Signed) => ValueKind::Signed,
         (_, ValueType::Unsigned) => ValueKind::Unsigned,
     };

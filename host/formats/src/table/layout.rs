@@ -56,6 +56,8 @@ pub(super) struct Layout {
     pub byte_columns: usize,
     /// Whether there are columns that have no place in a trace.
     pub has_others: bool,
+    /// Whether it is Cabana's: then buses are numbered as the panda numbers them.
+    pub is_cabana: bool,
 }
 
 impl Layout {
@@ -81,7 +83,13 @@ impl Layout {
     }
 
     fn of_usual_names(separator: Separator, names: &[&[u8]]) -> Option<Self> {
-        let mut layout = Self { separator, places: [None; ROLES.len()], byte_columns: 0, has_others: false };
+        let mut layout = Self {
+            separator,
+            places: [None; ROLES.len()],
+            byte_columns: 0,
+            has_others: false,
+            is_cabana: false,
+        };
         for (at, name) in names.iter().enumerate() {
             match role_of(name) {
                 Some((Role::Bytes, form)) => {
@@ -99,6 +107,7 @@ impl Layout {
                 _ => layout.has_others = true,
             }
         }
+        layout.is_cabana = names == [&b"time"[..], b"addr", b"bus", b"data"];
         let has = |role| layout.place(role).is_some();
         let blanks_too = separator != Separator::Blanks || has(Role::Time);
         (has(Role::Id) && (has(Role::Data) || has(Role::Bytes)) && blanks_too).then_some(layout)
@@ -115,7 +124,13 @@ impl Layout {
         separator: Separator,
         names: &[&[u8]],
     ) -> Result<(Self, bool), Fault> {
-        let mut layout = Self { separator, places: [None; ROLES.len()], byte_columns: 0, has_others: false };
+        let mut layout = Self {
+            separator,
+            places: [None; ROLES.len()],
+            byte_columns: 0,
+            has_others: false,
+            is_cabana: false,
+        };
         let mut is_row = true;
         for Column { role, name, form } in &columns.0 {
             let same = |cell: &&[u8]| cell.eq_ignore_ascii_case(name.as_bytes());
@@ -225,7 +240,7 @@ impl Layout {
         let role = if one_each { Role::Bytes } else { Role::Data };
         places[role as usize] = Some(Place { at: 3 + skipped, form: hex });
         let has_others = data.len() > if one_each { len } else { 1 };
-        Some(Self { separator, places, byte_columns: usize::MAX, has_others })
+        Some(Self { separator, places, byte_columns: usize::MAX, has_others, is_cabana: false })
     }
 
     /// A time, an identifier with `0x` before it and all bytes in a cell; or a stamp of CSS Electronics' older loggers, a mark of 29 bits, the
@@ -258,7 +273,7 @@ impl Layout {
             }
             _ => return None,
         }
-        Some(Self { separator, places, byte_columns: 0, has_others: false })
+        Some(Self { separator, places, byte_columns: 0, has_others: false, is_cabana: false })
     }
 }
 

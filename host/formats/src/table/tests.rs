@@ -80,6 +80,11 @@ fn tables_of_public_collections_are_known_and_read_whole() {
             "time,addr,bus,data\n0.01,0x1d2,0,0x40a0\n0.02,0x18DAF110,1,0x\n",
             "(0.010000) can0 1D2#40A0\n(0.020000) can1 18DAF110#\n",
         ),
+        // Cabana's with what the panda sent, and what it was asked to send and rejected.
+        (
+            "time,addr,bus,data\n0.01,0x1d2,2,0x40\n0.02,0x2e4,130,0x41\n0.03,0x2e5,192,0x42\n",
+            "(0.010000) can2 1D2#40\n(0.020000) can2 2E4#41 T\n",
+        ),
         // SavvyCAN's generic table, which has no times, and identifiers of eight digits whatever they are.
         (
             "ID,Data Bytes\n0000021A,FE 36 12 \n18DAF110,00 \n",

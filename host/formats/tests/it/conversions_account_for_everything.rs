@@ -180,6 +180,12 @@ fn samples() -> Vec<(Format, Vec<u8>)> {
     packet(0x2000_0088, 8, 0, &[0, 0, 4, 0, 0, 0, 0, 0]);
     vec![
         (Format::Pcap, pcap),
+        // As the library of MCAP's makers writes it.
+        (Format::Mcap, include_bytes!("../data/can_msgs_zstd.mcap").to_vec()),
+        // As the package `rosbags` for Python writes it.
+        (Format::RosBag, include_bytes!("../data/can_msgs_lz4.bag").to_vec()),
+        // As pycapnp writes it with openpilot's schema: events in one segment and in several.
+        (Format::Rlog, include_bytes!("../data/openpilot.rlog.gz").to_vec()),
         text(
             Format::CandumpScreen,
             " (1436509052.249713)  can0  RX - -  044   [8]  2A 36 6E 4C 11 22 33 44\n (1436509052.249714)  can1  TX - -  18DAF110   [0] \n \

@@ -58,6 +58,10 @@ fn row(format: Format) -> String {
             Format::Carbus => ["as written, no date", "yes | – | – | – | – | – | –"],
             Format::UsbCan => ["as written, local if a date", "yes | yes | yes | yes | – | – | –"],
             Format::Table => ["as written, local if a date", "yes | yes | yes | without flags | – | – | –"],
+            Format::Rlog => ["10 ms, an upper bound", "yes | yes | – | without flags | – | – | –"],
+            Format::Mcap | Format::RosBag => {
+                ["1 ns", "by topic | by topic | yes | without flags | yes | yes | –"]
+            }
             // The crate of columns writes it, for the command.
             Format::Parquet => {
                 return format!(

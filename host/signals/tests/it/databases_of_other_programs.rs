@@ -293,6 +293,9 @@ fn a_float_of_unusual_length_is_told() {
     for usual in [16, 32, 64] {
         assert!(of(usual).is_empty());
     }
+    // From a database that gives the kind of every signal: 0 is a whole number.
+    let whole = "BO_ 5 M: 8 A\n SG_ S : 0|8@1- (1,0) [0|0] \"\" A\nSIG_VALTYPE_ 5 S : 0;\n";
+    assert_eq!(warnings(whole), Vec::<String>::new());
 }
 
 #[test]

@@ -28,6 +28,6 @@ fn a_trace_is_served_byte_for_byte_to_its_page_alone() {
     assert!(server.get(&format!("/trace?token={}", server.token)).0.starts_with("HTTP/1.1 404 "));
     let site = || Site::new(PAGE).unwrap();
     for source in [path, folder.path().to_owned()] {
-        assert!(Server::open(site(), Source::Trace(source), 0, Reporter::silent()).is_err());
+        assert!(Server::open(site(), Source::Trace(source), at, Reporter::silent(), Arc::new(|_, _| ())).is_err());
     }
 }

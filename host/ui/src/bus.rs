@@ -14,7 +14,7 @@ use cantap_trace::filter::{Filter, passes};
 use cantap_trace::{TraceEvent, TraceRecord};
 use cantap_work::bus_hints::{BusHint, HintPlace};
 use cantap_work::channel_options::ChannelOptions;
-use cantap_work::live::{Lines, return_text};
+use cantap_work::live::{Line, Lines, return_text};
 use cantap_work::reception::Reception;
 use cantap_work::recording::{Older, Recording};
 use cantap_work::report::{Reporter, Severity};
@@ -32,9 +32,6 @@ const WAIT: Duration = Duration::from_millis(20);
 const FIGURES_EVERY: Duration = Duration::from_millis(500);
 /// After so many requests of pages, what has arrived is taken first.
 const ORDERS_AT_A_TIME: usize = 8;
-/// How long after a failure shared devices are tried again.
-const RETRY_AFTER: Duration = Duration::from_secs(1);
-
 /// The device's thread.
 pub struct Bus {
     device: Device,
@@ -45,7 +42,6 @@ pub struct Bus {
     lines: Option<Lines>,
     /// How shared devices are opened when the first page comes, whatever earlier ones have changed.
     at_first: (ChannelOptions, Vec<Filter>),
-    retry_at: Instant,
     recording: Option<Recording>,
     reception: Reception,
     /// The latest record's time.
@@ -76,7 +72,6 @@ impl Bus {
             visits,
             lines: None,
             at_first,
-            retry_at: Instant::now(),
             recording,
             reception: Reception::default(),
             latest_ns: 0,
@@ -148,11 +143,8 @@ impl Bus {
             if !has_pages && self.shared.silence() >= hosted.linger {
                 self.rest();
             }
-        } else if has_pages && Instant::now() >= self.retry_at {
-            self.retry_at = Instant::now() + RETRY_AFTER;
-            if let Err(error) = self.connect() {
-                self.is_not_there(&error);
-            }
+        } else if has_pages {
+            self.connect_when_there();
         }
     }
 
@@ -164,22 +156,6 @@ impl Bus {
             state.is_normal = false;
             state.periodic.clear();
         });
-    }
-
-    /// A shared device that is away is tried again.
-    fn is_not_there(&mut self, error: &anyhow::Error) {
-        let reason = advice::sentence(error);
-        let names: Vec<String> = self.device.boards.addresses().iter().map(ToString::to_string).collect();
-        let is_news = self.shared.change(|state| {
-            let away = |name: String| DeviceState { name, is_there: false, reason: Some(reason.clone()) };
-            let before = std::mem::replace(&mut state.devices, names.into_iter().map(away).collect());
-            (state.is_normal, state.ended) = (false, None);
-            state.periodic.clear();
-            state.devices != before
-        });
-        if is_news {
-            self.warn(format!("{reason}; it continues when the device is there"));
-        }
     }
 
     fn note(&self, text: impl Into<String>) {
@@ -196,15 +172,29 @@ impl Bus {
 
     /// Opens the devices as they should be now.
     fn connect(&mut self) -> anyhow::Result<()> {
-        let lines = self.device.connect(&self.reporter)?;
-        self.lines = Some(lines);
+        let mut lines = self.device.lines(&self.reporter);
+        lines.connect()?;
+        self.begin(lines);
+        Ok(())
+    }
+
+    /// The same for devices of which some may be away: they are opened as soon as they are there.
+    fn connect_when_there(&mut self) {
+        let mut lines = self.device.lines(&self.reporter);
+        // What is not there is tried again, and says why.
+        let _ = lines.connect();
+        self.begin(lines);
+    }
+
+    fn begin(&mut self, lines: Lines) {
         self.reception = Reception::default();
-        let is_there = |address: &Address| DeviceState {
+        let state_of = |(address, line): (&Address, &Line)| DeviceState {
             name: address.to_string(),
-            is_there: true,
+            is_there: line.device().is_some(),
             reason: None,
         };
-        let devices = self.device.boards.addresses().iter().map(is_there).collect();
+        let devices = self.device.boards.addresses().iter().zip(lines.lines()).map(state_of).collect();
+        self.lines = Some(lines);
         let (mode, filters) = (self.device.open.mode, &self.device.filters);
         self.shared.change(|state| {
             state.devices = devices;
@@ -214,7 +204,6 @@ impl Bus {
             state.ended = None;
         });
         self.show_figures();
-        Ok(())
     }
 
     /// Ends the session; what was captured up to then is kept.
@@ -244,7 +233,7 @@ impl Bus {
         if result.is_err() {
             (self.device.open, self.device.filters) = before;
             match self.connect() {
-                Err(error) if self.device.hosted.is_some() => self.is_not_there(&error),
+                Err(_) if self.device.hosted.is_some() => self.connect_when_there(),
                 Err(error) => self.has_ended(&error),
                 Ok(()) => {}
             }

@@ -63,8 +63,8 @@ impl Device {
         self.hosted.is_some() || self.boards.addresses().get(board).is_some_and(Address::may_come_back)
     }
 
-    /// Opens the devices, which must be there.
-    pub fn connect(&self, reporter: &Reporter) -> anyhow::Result<Lines> {
+    /// The devices, to be opened.
+    pub fn lines(&self, reporter: &Reporter) -> Lines {
         let line = |(board, address): (usize, &Address)| {
             let (at, hosted) = (address.clone(), self.hosted.clone());
             let connect = move |serial: Option<&str>| match &hosted {
@@ -79,9 +79,7 @@ impl Device {
                 open.open(device, channels.into_iter(), Mode::ListenOnly, Some(&filters), &reporter).map(|_| ())
             })
         };
-        let mut lines = Lines::new(self.boards.addresses().iter().enumerate().map(line).collect());
-        lines.connect()?;
-        Ok(lines)
+        Lines::new(self.boards.addresses().iter().enumerate().map(line).collect())
     }
 }
 

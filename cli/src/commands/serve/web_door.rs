@@ -11,11 +11,12 @@ use cantap_ui::{Device, Hosted, Server, Site, Source, Stopper, Visit, Visits};
 use cantap_work::boards::Boards;
 use cantap_work::channel_options::ChannelOptions;
 
-use super::doors::loopback;
+use super::doors::address;
 use crate::commands::ui::DEAD_MAN;
 use crate::database_args::{DatabaseArgs, load};
 use crate::page;
 use crate::stderr;
+use crate::usage_error::usage;
 
 /// The default port of `--web`.
 const PORT: u16 = 29_540;
@@ -40,7 +41,13 @@ pub struct Serving {
 impl WebDoor {
     /// Finds the page, so that a mistake is known before there is a server.
     pub fn new(text: &str, boards: &Boards, databases: &DatabaseArgs) -> anyhow::Result<Self> {
-        let address = loopback(text, PORT)?;
+        let address = address(text, PORT)?;
+        if !address.ip().is_loopback() {
+            return Err(usage(format!(
+                "at {address} the page would cross the network unencrypted; on the other computer, use cantap ui -d tls://… or \
+                 -d ssh://…, or ssh -L {PORT}:127.0.0.1:{PORT}"
+            )));
+        }
         let options = databases.or_of(boards.addresses());
         let decoder = load(&options, false, false)?;
         let about = page::about_devices(boards.addresses(), &options, "cantap serve")?;

@@ -64,7 +64,11 @@ pub fn with(page: &str, element: &str, object: &Value) -> anyhow::Result<String>
 }
 
 /// What a page is told that is live from devices, served by `command`.
-pub fn about_devices(addresses: &[Address], options: &DatabaseOptions, command: &str) -> anyhow::Result<Value> {
+pub fn about_devices(
+    addresses: &[Address],
+    options: &DatabaseOptions,
+    command: &str,
+) -> anyhow::Result<Value> {
     let mut databases = databases(&options.paths)?;
     if options.car {
         let car = Carried::new("car.dbc", cantap_virtual::car::DATABASE.as_bytes())?;

@@ -230,8 +230,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let web = web.map(|web| web.open(&devices, &boards, allow(&args.allowed, Door::Web))).transpose()?;
     let (url, page) = web.unzip();
-    let listening =
-        listen(args, tcp.map(|tcp| (tcp, way)).as_ref(), &other_doors, url.as_deref(), &boards)?;
+    let listening = listen(args, tcp.map(|tcp| (tcp, way)).as_ref(), &other_doors, url.as_deref(), &boards)?;
     while !interrupt::requested() {
         std::thread::sleep(LOOK_EVERY);
     }

@@ -133,7 +133,10 @@ fn the_page_is_one_more_client_which_listens_and_is_recorded() {
     assert!(host.starts_with("127.0.0.1:") && token.len() == 32, "{host} {token}");
     let answer = web.get(&format!("/?token={token}"));
     assert!(answer.starts_with("HTTP/1.1 200 OK\r\n"), "{answer}");
-    assert!(answer.contains("\"command\":\"cantap serve\"") && answer.contains("\"name\":\"car.dbc\""), "{answer}");
+    assert!(
+        answer.contains("\"command\":\"cantap serve\"") && answer.contains("\"name\":\"car.dbc\""),
+        "{answer}"
+    );
     assert!(!answer.contains(token), "{answer}");
     assert!(web.get("/").starts_with("HTTP/1.1 403 "));
     let mut page = web.page();
@@ -155,7 +158,11 @@ fn the_page_is_one_more_client_which_listens_and_is_recorded() {
     let figures = http(place, &format!("GET /metrics HTTP/1.1\r\nHost: {place}\r\n\r\n"));
     assert!(figures.contains("cantap_pages{board=\"virtual:load=20\"} 1"), "{figures}");
     // Another program sees the same bus.
-    let capture = format!("capture -d unix:{} -n 50 -o {}", web.path("cantap.sock").display(), web.path("c.log").display());
+    let capture = format!(
+        "capture -d unix:{} -n 50 -o {}",
+        web.path("cantap.sock").display(),
+        web.path("c.log").display()
+    );
     let (code, _, err) = run(&capture);
     assert_eq!(code, Some(0), "{err}");
     let local = page.socket.get_ref().local_addr().unwrap();
@@ -167,8 +174,15 @@ fn the_page_is_one_more_client_which_listens_and_is_recorded() {
     };
     assert_eq!(of_page("came")["client"], format!("page {local}"));
     assert!(of_page("not_done")["text"].as_str().unwrap().contains("take part in the buses"));
-    assert!(events.iter().any(|event| event["event"] == "refused" && event["text"].as_str().unwrap().contains("token")));
-    assert!(events.iter().any(|event| event["event"] == "opened" && event["client"] == "the page"), "{events:?}");
+    assert!(
+        events
+            .iter()
+            .any(|event| event["event"] == "refused" && event["text"].as_str().unwrap().contains("token"))
+    );
+    assert!(
+        events.iter().any(|event| event["event"] == "opened" && event["client"] == "the page"),
+        "{events:?}"
+    );
     // The token is nowhere but in the address.
     for file in ["audit.jsonl", "remarks"] {
         assert!(!std::fs::read_to_string(web.path(file)).unwrap().contains(web.place().1), "{file}");
@@ -236,10 +250,15 @@ fn what_cannot_be_is_refused_before_anything_is_shared() {
         ("--web --db none.dbc", 1, "none.dbc"),
         ("--web --allow page:send", 2, "web"),
     ] {
-        let mut command = cantap(&format!("serve -d virtual -b 500k --unix {} {arguments}", socket(folder.path())));
+        let mut command =
+            cantap(&format!("serve -d virtual -b 500k --unix {} {arguments}", socket(folder.path())));
         let output = command.env("CANTAP_PAGE", folder.path().join("page.html")).output().unwrap();
         let text = String::from_utf8(output.stderr).unwrap();
-        assert!(output.status.code() == Some(code) && text.contains(reason), "{arguments}: {:?} {text}", output.status);
+        assert!(
+            output.status.code() == Some(code) && text.contains(reason),
+            "{arguments}: {:?} {text}",
+            output.status
+        );
         assert!(output.stdout.is_empty() && !Path::new(&socket(folder.path())).exists(), "{arguments}");
     }
 }

@@ -177,7 +177,11 @@ impl Board {
     /// A page on it has come, or has left.
     pub fn count_page(&self, came: bool) {
         let pages = &self.shared.pages;
-        if came { pages.fetch_add(1, Ordering::Relaxed) } else { pages.fetch_sub(1, Ordering::Relaxed) };
+        if came {
+            pages.fetch_add(1, Ordering::Relaxed)
+        } else {
+            pages.fetch_sub(1, Ordering::Relaxed)
+        };
     }
 
     /// Reports something to whoever runs the server, and to the audit log: a listener outside of this crate does.

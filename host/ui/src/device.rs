@@ -76,7 +76,8 @@ impl Device {
             let (is_hosted, reporter) = (self.hosted.is_some(), reporter.clone());
             Line::new(&address.to_string(), connect, move |device| {
                 let channels = if is_hosted { known(device, &channels)? } else { channels.clone() };
-                open.open(device, channels.into_iter(), Mode::ListenOnly, Some(&filters), &reporter).map(|_| ())
+                open.open(device, channels.into_iter(), Mode::ListenOnly, Some(&filters), &reporter)
+                    .map(|_| ())
             })
         };
         Lines::new(self.boards.addresses().iter().enumerate().map(line).collect())

@@ -122,7 +122,11 @@ impl fmt::Display for Request {
             Self::Bitrate { channel, bitrate } => write!(f, "channel {channel} at {bitrate} bit/s"),
             Self::Filters { filters } if filters.is_empty() => f.write_str("no filters"),
             Self::Filters { filters } => {
-                write!(f, "filters {:.MOST$}", filters.iter().take(MOST).map(String::as_str).collect::<Vec<_>>().join(" "))
+                write!(
+                    f,
+                    "filters {:.MOST$}",
+                    filters.iter().take(MOST).map(String::as_str).collect::<Vec<_>>().join(" ")
+                )
             }
             Self::Mode { normal: true, .. } => f.write_str("take part in the buses"),
             Self::Mode { .. } => f.write_str("only listen"),
@@ -130,7 +134,9 @@ impl fmt::Display for Request {
             Self::Periodic { channel, frame, period_ms, .. } => {
                 write!(f, "send {frame:.MOST$} on channel {channel} every {period_ms} ms")
             }
-            Self::StopPeriodic { channel, slot } => write!(f, "stop periodic entry {slot} of channel {channel}"),
+            Self::StopPeriodic { channel, slot } => {
+                write!(f, "stop periodic entry {slot} of channel {channel}")
+            }
             Self::Recover {} => f.write_str("join the bus again after bus-off"),
         }
     }

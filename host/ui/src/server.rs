@@ -92,8 +92,8 @@ impl Server {
         }
         let token = Token::new().context("the system gives no random numbers")?;
         let run = Token::new().context("the system gives no random numbers")?;
-        let listener =
-            TcpListener::bind(address).with_context(|| format!("cannot listen at {address}; give another port"))?;
+        let listener = TcpListener::bind(address)
+            .with_context(|| format!("cannot listen at {address}; give another port"))?;
         let address = listener.local_addr()?;
         let mut role = Role::Listen;
         let (bus, trace) = match source {

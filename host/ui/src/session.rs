@@ -195,10 +195,12 @@ impl<'a> Session<'a> {
             Ok(Message::Request { number, .. }) if self.waiting.len() >= MOST_WAITING => {
                 self.answer(number, Err("too many requests at a time; wait for the answers".to_owned()))?;
             }
-            Ok(Message::Request { number, request }) => match self.shared.order(request, Arc::clone(&self.page)) {
-                Ok(answer) => self.waiting.push((number, answer)),
-                Err(reason) => self.answer(number, Err(reason))?,
-            },
+            Ok(Message::Request { number, request }) => {
+                match self.shared.order(request, Arc::clone(&self.page)) {
+                    Ok(answer) => self.waiting.push((number, answer)),
+                    Err(reason) => self.answer(number, Err(reason))?,
+                }
+            }
             Err(_) => {
                 // Without a number it cannot be answered otherwise. It concerns this page alone, so it has no number either.
                 let text = "the server did not understand the page; load it anew";

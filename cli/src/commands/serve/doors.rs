@@ -165,9 +165,15 @@ mod tests {
         assert_eq!(roles(&[]), [listen; 7]);
         assert_eq!(roles(&["send"]), [send, send, listen, listen, listen, listen, send]);
         assert_eq!(roles(&["socketcand:send"]), [listen, listen, send, listen, listen, listen, listen]);
-        assert_eq!(roles(&["gvret:send", "cannelloni:send"]), [listen, listen, listen, send, send, listen, listen]);
+        assert_eq!(
+            roles(&["gvret:send", "cannelloni:send"]),
+            [listen, listen, listen, send, send, listen, listen]
+        );
         assert_eq!(roles(&["web:send"]), [listen, listen, listen, listen, listen, send, listen]);
-        assert_eq!(roles(&["send", "tcp:configure"]), [send, Role::Configure, listen, listen, listen, listen, send]);
+        assert_eq!(
+            roles(&["send", "tcp:configure"]),
+            [send, Role::Configure, listen, listen, listen, listen, send]
+        );
         for text in ["all", "udp:send", "unix:", ":send"] {
             assert!(allowed(text).is_err(), "{text}");
         }

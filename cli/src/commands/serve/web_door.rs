@@ -56,7 +56,12 @@ impl WebDoor {
     }
 
     /// Serves it. Returns its address, with its token.
-    pub fn open(self, devices: &Boards, boards: &[Arc<Board>], role: Role) -> anyhow::Result<(String, Serving)> {
+    pub fn open(
+        self,
+        devices: &Boards,
+        boards: &[Arc<Board>],
+        role: Role,
+    ) -> anyhow::Result<(String, Serving)> {
         let shared = boards.to_vec();
         let link = move |at: usize| Ok(shared[at].link(CLIENT, role)?);
         let device = Device {

@@ -21,6 +21,8 @@ use crate::{recorder, sender};
 
 /// Below this no controller works, in bit/s.
 const LEAST_BITRATE: u32 = 1000;
+/// Most letters of a reason for whoever runs the server: it may have the page's own text in it.
+const MOST_REASON: usize = 300;
 /// More filters than anybody needs.
 const MOST_FILTERS: usize = 64;
 
@@ -33,7 +35,7 @@ impl Bus {
         let result = result.map_err(|error| advice::sentence(&error));
         let visit = match &result {
             Ok(_) => Visit::Asked(what),
-            Err(reason) => Visit::NotDone(format!("{what}: {reason}")),
+            Err(reason) => Visit::NotDone(format!("{what}: {reason:.MOST_REASON$}")),
         };
         (self.visits)(&page.name, visit);
         // The page may have gone.

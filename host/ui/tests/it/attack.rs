@@ -49,7 +49,10 @@ fn the_page_is_for_whoever_has_the_token_by_the_servers_own_name() {
             ),
             "421",
         ),
-        (format!("GET /?token={token} HTTP/1.1\r\nHost: localhost.:{}\r\n\r\n", server.address.port()), "421"),
+        (
+            format!("GET /?token={token} HTTP/1.1\r\nHost: localhost.:{}\r\n\r\n", server.address.port()),
+            "421",
+        ),
         (format!("GET /?token={token} HTTP/1.1\r\nHost: [::1]:{}\r\n\r\n", server.address.port()), "421"),
         (format!("GET /?token={token} HTTP/1.1\r\nHost: user@{host}\r\n\r\n"), "421"),
         (format!("GET /?token={token} HTTP/1.1\r\n\r\n"), "421"),
@@ -225,7 +228,10 @@ fn a_connection_has_one_request_and_nothing_behind_it_is_taken_for_another() {
     ] {
         let first = format!("GET /?token=guessed HTTP/1.1\r\nHost: {host}\r\n{lengths}\r\n");
         let (head, body) = server.ask(&format!("{first}{second}"));
-        assert!(head.starts_with("HTTP/1.1 403 ") && head.contains("Connection: close\r\n"), "{lengths}: {head}");
+        assert!(
+            head.starts_with("HTTP/1.1 403 ") && head.contains("Connection: close\r\n"),
+            "{lengths}: {head}"
+        );
         assert!(!String::from_utf8(body).unwrap().contains("HTTP/1.1"), "{lengths}");
     }
 }

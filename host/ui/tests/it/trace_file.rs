@@ -31,6 +31,8 @@ fn a_trace_is_served_byte_for_byte_to_its_page_alone() {
     let site = || Site::new(PAGE).unwrap();
     let at = "127.0.0.1:0".parse().unwrap();
     for source in [path, folder.path().to_owned()] {
-        assert!(Server::open(site(), Source::Trace(source), at, Reporter::silent(), Arc::new(|_, _| ())).is_err());
+        assert!(
+            Server::open(site(), Source::Trace(source), at, Reporter::silent(), Arc::new(|_, _| ())).is_err()
+        );
     }
 }

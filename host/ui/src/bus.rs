@@ -32,6 +32,7 @@ const WAIT: Duration = Duration::from_millis(20);
 const FIGURES_EVERY: Duration = Duration::from_millis(500);
 /// After so many requests of pages, what has arrived is taken first.
 const ORDERS_AT_A_TIME: usize = 8;
+
 /// The device's thread.
 pub struct Bus {
     device: Device,

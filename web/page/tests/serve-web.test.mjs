@@ -41,7 +41,9 @@ test('pages of a shared board show what arrives, and can do no more than the ser
   } finally {
     await server.stop();
   }
-  await untilText(second, 'body', 'cantap serve has ended');
+  await untilText(second, '.live-state', 'ended');
+  await show(second, 'device');
+  await untilText(second, '#view-device', 'cantap serve has ended');
   await second.context().close();
 });
 

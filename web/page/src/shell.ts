@@ -3,7 +3,7 @@
 import type { App } from './model/app';
 import { openFiles } from './model/open-files';
 import { blobOfBase64, gunzip, save } from './model/files';
-import { bytes, count, duration, idText, parseTime, percent } from './model/format';
+import { bytes, count, duration, idText, missing, parseTime, percent } from './model/format';
 import { parseProfile } from './model/storage';
 import { Commands, type Command, keyLabel } from './ui/commands';
 import { openDialog } from './ui/dialog';
@@ -333,8 +333,10 @@ export class Shell {
     this.#progress.hidden = !reading;
     this.#progress.value = summary.progress ?? 0;
     const lost = summary.losses.reduce((sum, l) => sum + l.count, 0);
-    setText(this.#losses, lost === 0 ? 'no known loss' : `${summary.losses.some((l) => l.atLeast) ? 'at least ' : ''}${count(lost)} frames lost`);
-    this.#losses.classList.toggle('bad', lost > 0);
+    const atLeast = summary.losses.some((l) => l.atLeast);
+    const isWhole = lost === 0 && !atLeast;
+    setText(this.#losses, isWhole ? 'no known loss' : `${missing(lost, atLeast)} lost`);
+    this.#losses.classList.toggle('bad', !isWhole);
     this.element.dataset['records'] = String(summary.records);
     this.element.dataset['growing'] = String(summary.growing);
   }

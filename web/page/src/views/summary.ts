@@ -4,7 +4,7 @@ import type { Finding, Summary } from '../api';
 import type { App } from '../model/app';
 import { unpack } from '../model/report';
 import { saveBlob } from '../model/files';
-import { bitrate, count, duration, idText, missing, percent, plural, seconds, utc } from '../model/format';
+import { bitrate, count, duration, idText, missing, percent, seconds, utc } from '../model/format';
 import type { Commands } from '../ui/commands';
 import { openDialog } from '../ui/dialog';
 import { button, el, field, replace } from '../ui/dom';

@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
-use cantap_work::databases::DatabasePath;
+use cantap_address::Address;
+use cantap_work::databases::{DatabaseOptions, DatabasePath};
 use flate2::Compression;
 use flate2::read::GzDecoder;
 use flate2::write::GzEncoder;
@@ -60,6 +61,28 @@ pub fn with(page: &str, element: &str, object: &Value) -> anyhow::Result<String>
     let (before, after) = page.split_once(MARK).context("the page has no place for a report")?;
     let object = serde_json::to_string(object)?.replace('<', "\\u003c");
     Ok(format!("{before}<script type=\"application/json\" id=\"{element}\">{object}</script>{after}"))
+}
+
+/// What a page is told that is live from devices, served by `command`.
+pub fn about_devices(
+    addresses: &[Address],
+    options: &DatabaseOptions,
+    command: &str,
+) -> anyhow::Result<Value> {
+    let mut databases = databases(&options.paths)?;
+    if options.car {
+        let car = Carried::new("car.dbc", cantap_virtual::car::DATABASE.as_bytes())?;
+        databases.push(car.with("channel", Value::Null));
+    }
+    let names: Vec<_> = addresses.iter().map(ToString::to_string).collect();
+    let databases: Vec<_> = databases.into_iter().map(Carried::into_object).collect();
+    Ok(json!({
+        "version": 1,
+        "kind": "device",
+        "name": names.join(" + "),
+        "command": command,
+        "databases": databases,
+    }))
 }
 
 /// A path's last part.

@@ -5,6 +5,7 @@ mod doors;
 mod keys;
 mod other_doors;
 mod upkeep;
+mod web_door;
 
 use std::io::{self, Read, Write};
 #[cfg(not(unix))]
@@ -31,7 +32,9 @@ use self::doors::numbered;
 use self::doors::{Allowed, Door, TunnelArg, address, allow, allowed, loopback, tunnel};
 use self::other_doors::OtherDoors;
 use self::upkeep::Upkeep;
+use self::web_door::WebDoor;
 use crate::args;
+use crate::database_args::DatabaseArgs;
 use crate::stderr;
 use crate::usage_error::usage;
 use cantap_work::boards::Boards;
@@ -53,6 +56,7 @@ use cantap_work::timing_options::TimingOptions;
                 cantap serve -d /dev/ttyACM0 -b 500k -b 2:250k --tcp --allow send\n  \
                 cantap monitor -d tcp://127.0.0.1\n  \
                 cantap capture -d ssh://me@vehicle/dev/ttyACM0 -b 500k -o drive.log\n  \
+                cantap serve -d /dev/ttyACM0 -b 500k --web --db car.dbc\n  \
                 cantap serve keygen keys --host vehicle --client alice:send\n  \
                 cantap serve -d /dev/ttyACM0 -b 500k --tcp 192.0.2.7 \\\n      \
                 --tls keys/server.pem,keys/server-key.pem --clients keys/ca.pem"
@@ -70,7 +74,8 @@ pub struct Args {
     bitrates: Vec<ChannelBitrate>,
     /// The maximum role of clients: listen (the default); configure, which allows choosing bit rates and storing settings, one client at a
     /// time for each channel; send, which includes acknowledging. With a listener before it (unix:send, tcp:send, socketcand:send, gvret:send,
-    /// cannelloni:send), only for that one. Can be repeated. The last three are asked for no name, and only listen unless they are named.
+    /// cannelloni:send, web:send), only for that one. Can be repeated. The last four are asked for no name, and only listen unless they are
+    /// named.
     #[arg(long = "allow", value_name = "ROLE", value_parser = allowed)]
     allowed: Vec<Allowed>,
     /// normal: the board acknowledges on its buses from the first listener on, so that no client that sends takes it off its bus for a
@@ -116,6 +121,12 @@ pub struct Args {
     /// Write candump's log lines to anyone who connects, for nc and SavvyCAN's log server; default 127.0.0.1:29538.
     #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
     lines: Option<String>,
+    /// Serve the page of cantap ui, for browsers on this computer; default 127.0.0.1:29540. Its address, which is printed, has a secret token
+    /// in it.
+    #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
+    web: Option<String>,
+    #[command(flatten)]
+    databases: DatabaseArgs,
     /// What clients may do, by the names in their certificates: channels, identifiers, frames per second, modes, hours. The file is
     /// described in docs/serve.md, and read again at SIGHUP.
     #[cfg(feature = "tls")]
@@ -171,8 +182,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if let Some(keys) = &args.keys {
         return keys.run();
     }
-    let addresses = Boards::new(&args.devices, &Channels::all())?;
-    let addresses = addresses.addresses();
+    let devices = Boards::new(&args.devices, &Channels::all())?;
+    let addresses = devices.addresses();
     if args.stdio && addresses.len() > 1 {
         return Err(usage("--stdio serves one device; omit the others"));
     }
@@ -191,6 +202,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         &args.tunnels,
         addresses.len(),
     )?;
+    if let (None, Some(option)) = (&args.web, args.databases.given()) {
+        return Err(usage(format!("{option} is for the page; give --web, too")));
+    }
+    let web = args.web.as_deref().map(|text| WebDoor::new(text, &devices, &args.databases)).transpose()?;
     #[cfg(feature = "tls")]
     let permissions = args.permissions.as_deref();
     #[cfg(not(feature = "tls"))]
@@ -213,11 +228,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.stdio {
         return serve_stdio(&boards[0], allow(&args.allowed, Door::Stdio));
     }
-    let listening = listen(args, tcp.map(|tcp| (tcp, way)).as_ref(), &other_doors, &boards)?;
+    let web = web.map(|web| web.open(&devices, &boards, allow(&args.allowed, Door::Web))).transpose()?;
+    let (url, page) = web.unzip();
+    let listening = listen(args, tcp.map(|tcp| (tcp, way)).as_ref(), &other_doors, url.as_deref(), &boards)?;
     while !interrupt::requested() {
         std::thread::sleep(LOOK_EVERY);
     }
-    drop(listening);
+    drop((listening, page));
     for board in &boards {
         board.end();
     }
@@ -273,7 +290,7 @@ fn check_bitrates(args: &Args, number: usize, board: &Board) -> anyhow::Result<(
     if board.hello().is_none() {
         return Ok(());
     }
-    let doors = [Door::Unix, Door::Tcp, Door::Socketcand, Door::Gvret, Door::Stdio];
+    let doors = [Door::Unix, Door::Tcp, Door::Socketcand, Door::Gvret, Door::Web, Door::Stdio];
     if doors.into_iter().any(|door| allow(&args.allowed, door) >= Role::Configure) {
         return Ok(());
     }
@@ -301,6 +318,7 @@ fn listen(
     args: &Args,
     tcp: Option<&(SocketAddr, Way)>,
     other_doors: &OtherDoors,
+    page: Option<&str>,
     boards: &[Arc<Board>],
 ) -> anyhow::Result<Vec<Listening>> {
     let mut ways = Vec::new();
@@ -358,6 +376,9 @@ fn listen(
     for (name, way) in other {
         writeln!(out, "{name}")?;
         ways.push(way);
+    }
+    if let Some(page) = page {
+        writeln!(out, "{page}")?;
     }
     out.flush()?;
     for (board, names, roles) in &said {

@@ -3,11 +3,14 @@
 mod browser;
 
 use std::io::Write;
+use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
+use cantap::wire::message::Role;
 use cantap_address::Address;
 use cantap_signals::named::NamedFilter;
 use cantap_ui::{Device, Server, Site, Source};
@@ -28,7 +31,7 @@ use crate::stderr;
 use crate::usage_error::usage;
 
 /// Periodic frames stop when no page has been there for this long, as after a browser that was closed; a page that is loaded anew is back sooner.
-const DEAD_MAN: Duration = Duration::from_secs(10);
+pub const DEAD_MAN: Duration = Duration::from_secs(10);
 
 /// The command line.
 #[derive(clap::Args)]
@@ -85,7 +88,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let page = page::with(&page, page::LIVE, &about)?;
     // A recording is finished when Ctrl-C ends it.
     interrupt::watch()?;
-    let server = Server::open(Site::new(&page)?, source, args.port, stderr::reporter())?;
+    let address = SocketAddr::from((Ipv4Addr::LOCALHOST, args.port));
+    // Its user sits in front of the page.
+    let server = Server::open(Site::new(&page)?, source, address, stderr::reporter(), Arc::new(|_, _| ()))
+        .context("give another port with --port")?;
     let url = server.url();
     writeln!(std::io::stdout(), "{url}")?;
     if args.no_open {
@@ -163,25 +169,16 @@ impl Args {
             .map_err(|error| for_listening(error.into(), given, "without a trace to show"))?;
         let options = self.databases.or_of(boards.addresses());
         let decoder = load(&options, false, self.quiet)?;
-        let mut databases = page::databases(&options.paths)?;
-        if options.car {
-            let car = Carried::new("car.dbc", cantap_virtual::car::DATABASE.as_bytes())?;
-            databases.push(car.with("channel", Value::Null));
-        }
-        let names: Vec<_> = boards.addresses().iter().map(ToString::to_string).collect();
-        let about = json!({
-            "version": 1,
-            "kind": "device",
-            "name": names.join(" + "),
-            "databases": objects(databases),
-        });
+        let about = page::about_devices(boards.addresses(), &options, "cantap ui")?;
+        let folder = std::env::current_dir().context("there is no working folder for recordings")?;
         let device = Device {
             boards,
+            hosted: None,
             open: self.open.options(),
             filters: resolved(&self.filter, &decoder)?,
-            may_send: self.allow.is_some(),
+            role: if self.allow.is_some() { Role::Send } else { Role::Configure },
             decoder,
-            folder: std::env::current_dir().context("there is no working folder for recordings")?,
+            folder: Some(folder),
             record: self.output.clone(),
             dead_man: DEAD_MAN,
         };

@@ -64,6 +64,7 @@ mod send_signals;
 mod serve;
 mod serve_far;
 mod serve_lab;
+mod serve_web;
 mod served;
 mod shell;
 mod speaking_ends;

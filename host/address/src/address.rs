@@ -215,7 +215,12 @@ impl Address {
     /// Begins a session with the board of a serial number at its current port, if the system can find it; otherwise with
     /// whatever is at the address.
     pub fn open_again(&self, serial_number: Option<&str>) -> Result<OpenDevice, LinkError> {
-        let device = Device::over(self.link(serial_number)?, &self.text)?;
+        Ok(self.over(self.link(serial_number)?)?)
+    }
+
+    /// Begins a session with the device through a link that the caller has: one to a server in its own process.
+    pub fn over(&self, link: Link) -> Result<OpenDevice, DeviceError> {
+        let device = Device::over(link, &self.text)?;
         if let Place::Adapter(adapter) = &self.place
             && let Some(bitrate_bps) = adapter.data_bitrate()
         {

@@ -93,6 +93,7 @@ impl Board {
             permissions: Mutex::default(),
             audit: Mutex::default(),
             refused: AtomicU64::new(0),
+            pages: AtomicU64::new(0),
         });
         let (first, began) = std::sync::mpsc::channel();
         let for_thread = Arc::clone(&shared);
@@ -160,6 +161,7 @@ impl Board {
             is_there: state.hello.is_some(),
             clients: state.clients.len() as u64,
             places: self.shared.settings.most_clients as u64,
+            pages: self.shared.pages.load(Ordering::Relaxed),
             refused: self.shared.refused.load(Ordering::Relaxed),
             counts_losses: state.hello.as_ref().is_none_or(Hello::counts_losses),
             channels: state.totals(),
@@ -172,7 +174,18 @@ impl Board {
         self.shared.state().count_lost(lost);
     }
 
-    pub(crate) fn tell(&self, news: News) {
+    /// A page on it has come, or has left.
+    pub fn count_page(&self, came: bool) {
+        let pages = &self.shared.pages;
+        if came {
+            pages.fetch_add(1, Ordering::Relaxed)
+        } else {
+            pages.fetch_sub(1, Ordering::Relaxed)
+        };
+    }
+
+    /// Reports something to whoever runs the server, and to the audit log: a listener outside of this crate does.
+    pub fn tell(&self, news: News) {
         self.shared.tell(news);
     }
 

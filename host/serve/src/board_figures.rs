@@ -5,6 +5,7 @@ pub(crate) struct BoardFigures {
     pub is_there: bool,
     pub clients: u64,
     pub places: u64,
+    pub pages: u64,
     pub refused: u64,
     /// Whether it counts the losses of its own controllers.
     pub counts_losses: bool,

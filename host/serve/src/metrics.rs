@@ -146,6 +146,7 @@ fn text(boards: &[(String, Weak<Board>)]) -> String {
     };
     of_boards("cantap_board_up", "gauge", "Whether the board is there.", |of| of.is_there.into());
     of_boards("cantap_clients", "gauge", "Clients with a connection.", |of| of.clients);
+    of_boards("cantap_pages", "gauge", "Pages that are open, on the first board.", |of| of.pages);
     of_boards("cantap_places", "gauge", "Limit for clients at each listener.", |of| of.places);
     of_boards("cantap_refused_total", "counter", "Connections and requests that were refused.", |of| {
         of.refused

@@ -62,6 +62,13 @@ pub enum News {
         /// What, and why.
         reason: String,
     },
+    /// What a client asked for was done, where no other message tells of it.
+    Asked {
+        /// Its name.
+        client: String,
+        /// What.
+        what: String,
+    },
     /// A client was not told of what happened: because its protocol has no message for it, or because it was too slow, or gone.
     LeftOut {
         /// Its name.
@@ -113,6 +120,7 @@ impl News {
             Self::DeadMan { .. } => "dead_man",
             Self::NotPermitted { .. } => "not_permitted",
             Self::NotDone { .. } => "not_done",
+            Self::Asked { .. } => "asked",
             Self::LeftOut { .. } => "left_out",
             Self::Idle { .. } => "idle",
             Self::OffBus { .. } => "off_bus",
@@ -130,6 +138,7 @@ impl News {
             | Self::DeadMan { client, .. }
             | Self::NotPermitted { client, .. }
             | Self::NotDone { client, .. }
+            | Self::Asked { client, .. }
             | Self::LeftOut { client, .. }
             | Self::Idle { client, .. }
             | Self::OffBus { client: Some(client), .. } => Some(client),
@@ -163,6 +172,7 @@ impl fmt::Display for News {
             Self::NotPermitted { client, reason } | Self::NotDone { client, reason } => {
                 write!(f, "{client} was refused: {reason}")
             }
+            Self::Asked { client, what } => write!(f, "{client} asked for: {what}"),
             Self::LeftOut { client, what } => {
                 write!(f, "{client} was not told of {what}")
             }

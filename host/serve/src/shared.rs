@@ -94,6 +94,8 @@ pub(crate) struct Shared {
     pub audit: Mutex<Option<Arc<Audit>>>,
     /// Connections and requests that were refused.
     pub refused: AtomicU64,
+    /// Pages that are open.
+    pub pages: AtomicU64,
 }
 
 impl Shared {
@@ -105,7 +107,7 @@ impl Shared {
         let limit = match news {
             News::Refused { .. } => Some(&self.refusals),
             News::NotPermitted { .. } | News::NotDone { .. } => Some(&self.not_permitted),
-            News::ClientCame { .. } | News::ClientLeft { .. } | News::LeftOut { .. } => {
+            News::ClientCame { .. } | News::ClientLeft { .. } | News::Asked { .. } | News::LeftOut { .. } => {
                 if self.passes_session() {
                     self.report(news);
                 }

@@ -51,13 +51,22 @@ impl Refusal {
         }
     }
 
+    /// The same for whoever runs the server.
+    pub const fn reason(self) -> &'static str {
+        match self {
+            Self::Host => "it names another host than this server",
+            Self::Origin => "a page of somebody else asks",
+            Self::Token => "it does not have the token",
+        }
+    }
+
     /// What the answer says.
     pub const fn text(self) -> &'static str {
         match self {
-            Self::Host => "This server answers at the address that cantap ui printed, and at no other name.",
+            Self::Host => "This server answers at the address that it printed, and at no other name.",
             Self::Origin => "Only cantap's own page may ask this server.",
             Self::Token => {
-                "The address lacks its token, or has that of an earlier run. Open the address that cantap ui printed."
+                "The address lacks its token, or has that of an earlier run. Open the address that the server printed."
             }
         }
     }

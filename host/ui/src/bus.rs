@@ -1,35 +1,30 @@
 //! The device's thread: takes what arrives, records it, keeps it for the pages, and does what they ask for.
 
+mod orders;
+
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, bail};
-use cantap::Channel;
 use cantap::device::{Happening, UtcClock, channel_number};
-use cantap::wire::message::Mode;
-use cantap::wire::record::ErrorState;
-use cantap_signals::Decoder;
-use cantap_signals::named::NamedFilter;
+use cantap::wire::message::{Mode, Role};
+use cantap_address::Address;
 use cantap_trace::filter::{Filter, passes};
 use cantap_trace::{TraceEvent, TraceRecord};
-use cantap_work::boards::{Boards, filters_on};
 use cantap_work::bus_hints::{BusHint, HintPlace};
-use cantap_work::channel_bitrate::ChannelBitrate;
 use cantap_work::channel_options::ChannelOptions;
-use cantap_work::live::{Lines, lines, return_text};
+use cantap_work::live::{Line, Lines, return_text};
 use cantap_work::reception::Reception;
 use cantap_work::recording::{Older, Recording};
 use cantap_work::report::{Reporter, Severity};
 use cantap_work::{advice, channels::place_of, interrupt};
-use serde_json::{Value, json};
 
-use crate::recorder;
-use crate::request::{Only, Request};
+use crate::device::Device;
 use crate::sender;
 use crate::shared::{Order, Shared};
 use crate::state::{ChannelState, DeviceState, RecordingState, State};
+use crate::visits::Visits;
 
 /// How long a single wait for records lasts.
 const WAIT: Duration = Duration::from_millis(20);
@@ -37,30 +32,6 @@ const WAIT: Duration = Duration::from_millis(20);
 const FIGURES_EVERY: Duration = Duration::from_millis(500);
 /// After so many requests of pages, what has arrived is taken first.
 const ORDERS_AT_A_TIME: usize = 8;
-/// Below this no controller works, in bit/s.
-const LEAST_BITRATE: u32 = 1000;
-/// More filters than anybody needs.
-const MOST_FILTERS: usize = 64;
-
-/// Which devices, and how.
-pub struct Device {
-    /// Which.
-    pub boards: Boards,
-    /// How to open their channels: they only listen unless it says otherwise.
-    pub open: ChannelOptions,
-    /// What passes; everything if there are none.
-    pub filters: Vec<Filter>,
-    /// Whether pages may send and take part in the buses.
-    pub may_send: bool,
-    /// For frames that are given by their signals.
-    pub decoder: Decoder,
-    /// The folder of recordings that pages begin.
-    pub folder: PathBuf,
-    /// A recording from the start, into a file that is new; `FILE if CONDITION` for what happens around events.
-    pub record: Option<PathBuf>,
-    /// What the device sends by itself stops when no page has shown for this long that it is there. Pages show it every second.
-    pub dead_man: Duration,
-}
 
 /// The device's thread.
 pub struct Bus {
@@ -68,7 +39,10 @@ pub struct Bus {
     shared: Arc<Shared>,
     orders: Receiver<Order>,
     reporter: Reporter,
+    visits: Visits,
     lines: Option<Lines>,
+    /// How shared devices are opened when the first page comes, whatever earlier ones have changed.
+    at_first: (ChannelOptions, Vec<Filter>),
     recording: Option<Recording>,
     reception: Reception,
     /// The latest record's time.
@@ -77,11 +51,18 @@ pub struct Bus {
 
 impl Bus {
     /// Opens the devices and begins the recording, if one is requested.
-    pub fn open(device: Device, reporter: Reporter) -> anyhow::Result<Self> {
+    pub fn open(device: Device, reporter: Reporter, visits: Visits) -> anyhow::Result<Self> {
         device.open.timing.check_channels(device.boards.addresses().len())?;
         let begin = |text: &PathBuf| Recording::create_by_text(text, &device.decoder, Older::Refuse);
         let recording = device.record.as_ref().map(begin).transpose()?;
-        let state = State { may_send: device.may_send, ..State::default() };
+        let state = State {
+            may_send: device.role >= Role::Send,
+            may_configure: device.role >= Role::Configure,
+            may_record: device.folder.is_some(),
+            send_option: device.option(Role::Send),
+            ..State::default()
+        };
+        let at_first = (device.open.clone(), device.filters.clone());
         let (shared, orders) = Shared::new(state);
         let shared = Arc::new(shared);
         let mut bus = Self {
@@ -89,11 +70,17 @@ impl Bus {
             shared,
             orders,
             reporter,
+            visits,
             lines: None,
+            at_first,
             recording,
             reception: Reception::default(),
             latest_ns: 0,
         };
+        // Those that are shared are opened for the first page.
+        if bus.device.hosted.is_some() {
+            return Ok(bus);
+        }
         match bus.connect() {
             Ok(()) => Ok(bus),
             Err(error) => {
@@ -119,12 +106,11 @@ impl Bus {
             self.device.boards.addresses().iter().map(|_| self.device.open.recovery()).collect();
         let mut next_figures = Instant::now();
         while !interrupt::requested() && !self.shared.is_over() {
+            self.come_and_go();
             self.receive();
             for _ in 0..ORDERS_AT_A_TIME {
-                let Ok(Order { request, answer }) = self.orders.try_recv() else { break };
-                let result = self.follow(request).map_err(|error| advice::sentence(&error));
-                // The page may have gone.
-                let _ = answer.try_send(result);
+                let Ok(order) = self.orders.try_recv() else { break };
+                self.obey(order);
             }
             let Some(lines) = &self.lines else { continue };
             for (board, device) in lines.devices() {
@@ -149,6 +135,30 @@ impl Bus {
         self.shared.end();
     }
 
+    /// Shared devices are listened to while pages are there, and a little longer: without any, whoever shares them with others is not kept
+    /// from anything.
+    fn come_and_go(&mut self) {
+        let Some(hosted) = &self.device.hosted else { return };
+        let has_pages = self.shared.has_pages();
+        if self.lines.is_some() {
+            if !has_pages && self.shared.silence() >= hosted.linger {
+                self.rest();
+            }
+        } else if has_pages {
+            self.connect_when_there();
+        }
+    }
+
+    fn rest(&mut self) {
+        self.disconnect();
+        self.mark_gap();
+        (self.device.open, self.device.filters) = self.at_first.clone();
+        self.shared.change(|state| {
+            state.is_normal = false;
+            state.periodic.clear();
+        });
+    }
+
     fn note(&self, text: impl Into<String>) {
         let text = text.into();
         self.reporter.note(&text);
@@ -163,23 +173,29 @@ impl Bus {
 
     /// Opens the devices as they should be now.
     fn connect(&mut self) -> anyhow::Result<()> {
-        let Device { boards, open, filters, .. } = &self.device;
-        let (setup_boards, setup_open, setup_filters) = (boards.clone(), open.clone(), filters.clone());
-        let reporter = self.reporter.clone();
-        let mut lines = lines(boards.addresses(), move |board, device| {
-            let (open, filters) = (setup_open.on_board(board), filters_on(board, &setup_filters));
-            let channels = setup_boards.channels_of(board);
-            open.open(device, channels, Mode::ListenOnly, Some(&filters), &reporter).map(|_| ())
-        });
+        let mut lines = self.device.lines(&self.reporter);
         lines.connect()?;
-        self.lines = Some(lines);
+        self.begin(lines);
+        Ok(())
+    }
+
+    /// The same for devices of which some may be away: they are opened as soon as they are there.
+    fn connect_when_there(&mut self) {
+        let mut lines = self.device.lines(&self.reporter);
+        // What is not there is tried again, and says why.
+        let _ = lines.connect();
+        self.begin(lines);
+    }
+
+    fn begin(&mut self, lines: Lines) {
         self.reception = Reception::default();
-        let is_there = |address: &cantap_address::Address| DeviceState {
+        let state_of = |(address, line): (&Address, &Line)| DeviceState {
             name: address.to_string(),
-            is_there: true,
+            is_there: line.device().is_some(),
             reason: None,
         };
-        let devices = self.device.boards.addresses().iter().map(is_there).collect();
+        let devices = self.device.boards.addresses().iter().zip(lines.lines()).map(state_of).collect();
+        self.lines = Some(lines);
         let (mode, filters) = (self.device.open.mode, &self.device.filters);
         self.shared.change(|state| {
             state.devices = devices;
@@ -189,7 +205,6 @@ impl Bus {
             state.ended = None;
         });
         self.show_figures();
-        Ok(())
     }
 
     /// Ends the session; what was captured up to then is kept.
@@ -218,8 +233,10 @@ impl Bus {
         let result = self.connect();
         if result.is_err() {
             (self.device.open, self.device.filters) = before;
-            if let Err(error) = self.connect() {
-                self.has_ended(&error);
+            match self.connect() {
+                Err(_) if self.device.hosted.is_some() => self.connect_when_there(),
+                Err(error) => self.has_ended(&error),
+                Ok(()) => {}
             }
         }
         if had_periodic {
@@ -263,7 +280,7 @@ impl Bus {
                     lines.recycle(batch);
                 }
             }
-            (board, Happening::Gone(error)) if self.device.boards.addresses()[board].may_come_back() => {
+            (board, Happening::Gone(error)) if self.device.may_come_back(board) => {
                 let reason = advice::sentence(&error);
                 self.warn(format!("{reason}; it continues when the device is back"));
                 self.shared.change(|state| {
@@ -381,140 +398,6 @@ impl Bus {
             "no page has been there for {} s: what the device sent periodically has stopped",
             self.device.dead_man.as_secs()
         ));
-    }
-
-    fn follow(&mut self, request: Request) -> anyhow::Result<Value> {
-        match request {
-            Request::Record { name, only } => {
-                if let Some(recording) = self.shared.state().recording {
-                    bail!("{} is being recorded; stop that first", recording.name);
-                }
-                let Device { folder, decoder, .. } = &self.device;
-                self.recording = Some(recorder::create(folder, &name, only.as_ref(), decoder)?);
-                self.note(match only {
-                    Some(Only { around, .. }) => format!("{name} begins when {around}"),
-                    None => format!("recording to {name}"),
-                });
-                self.show_figures();
-            }
-            Request::StopRecording {} => self.stop_recording(),
-            Request::Bitrate { channel, bitrate } => self.set_bitrate(channel, bitrate)?,
-            Request::Filters { filters } => {
-                if filters.len() > MOST_FILTERS {
-                    bail!("{} filters are too many; give at most {MOST_FILTERS}", filters.len());
-                }
-                let filters = filters.iter().map(|text| self.filter(text)).collect::<anyhow::Result<_>>()?;
-                self.reconnect(self.device.open.clone(), filters)?;
-            }
-            Request::Mode { normal, confirmed } => self.set_mode(normal, confirmed)?,
-            Request::Send { channel, frame } => {
-                let lines = self.sending_lines()?;
-                sender::send(lines, channel, sender::frame(&self.device.decoder, channel, &frame)?)?;
-            }
-            Request::Periodic { channel, frame, period_ms, modifiers } => {
-                let lines = self.sending_lines()?;
-                let frame = sender::frame(&self.device.decoder, channel, &frame)?;
-                let entries = self.shared.state().periodic;
-                let entry = sender::start(lines, &entries, channel, frame, period_ms, &modifiers)?;
-                let slot = entry.slot;
-                self.shared.change(|state| state.periodic.push(entry));
-                return Ok(json!({ "slot": slot }));
-            }
-            Request::StopPeriodic { channel, slot } => {
-                let lines = self.lines.as_ref().context("no device is open")?;
-                sender::stop(lines, channel, slot)?;
-                self.shared.change(|state| {
-                    state.periodic.retain(|entry| (entry.channel, entry.slot) != (channel, slot));
-                });
-            }
-            Request::Recover {} => self.recover()?,
-        }
-        Ok(json!({}))
-    }
-
-    /// A filter as the command takes it, with the databases' names of messages.
-    fn filter(&self, text: &str) -> anyhow::Result<Filter> {
-        let named = text.parse::<NamedFilter>().map_err(|error| anyhow::anyhow!("{error}"))?;
-        Ok(named.resolve(&self.device.decoder)?)
-    }
-
-    fn may_send(&self) -> anyhow::Result<()> {
-        if self.device.may_send {
-            return Ok(());
-        }
-        bail!("pages of this server only listen; start it with cantap ui --allow send")
-    }
-
-    /// The devices, if they may send now.
-    fn sending_lines(&self) -> anyhow::Result<&Lines> {
-        self.may_send()?;
-        if !self.shared.state().is_normal {
-            bail!(
-                "the channels only listen; choose normal mode first, in which they take part in their buses"
-            );
-        }
-        self.lines.as_ref().context("no device is open")
-    }
-
-    fn set_mode(&mut self, normal: bool, confirmed: bool) -> anyhow::Result<()> {
-        let mode = if normal {
-            self.may_send()?;
-            if !confirmed {
-                bail!(
-                    "normal mode acknowledges frames and takes part in the bus; the user has to confirm it"
-                );
-            }
-            Mode::Normal
-        } else {
-            Mode::ListenOnly
-        };
-        if normal == self.shared.state().is_normal {
-            return Ok(());
-        }
-        let open = ChannelOptions { mode: Some(mode), ..self.device.open.clone() };
-        self.reconnect(open, self.device.filters.clone())?;
-        self.note(if normal { "the channels take part in their buses" } else { "the channels only listen" });
-        Ok(())
-    }
-
-    fn set_bitrate(&mut self, channel: u8, bitrate_bps: u32) -> anyhow::Result<()> {
-        let state = self.shared.state();
-        if bitrate_bps < LEAST_BITRATE {
-            bail!("{bitrate_bps} bit/s is no bit rate of a bus; give for example 500000");
-        }
-        if state.channels.iter().all(|open| open.channel != channel) {
-            bail!("channel {channel} is not open; choose one that is");
-        }
-        let rates = state.channels.iter().map(|open| ChannelBitrate {
-            channel: Some(open.channel),
-            bitrate_bps: if open.channel == channel { bitrate_bps } else { open.bitrate },
-        });
-        let mut open = self.device.open.clone();
-        open.timing.set_bit_rates(rates);
-        // The user has agreed to take part at another bit rate.
-        open.mode = Some(Mode::ListenOnly);
-        self.reconnect(open, self.device.filters.clone())?;
-        let listens = if state.is_normal { ", and all channels only listen now" } else { "" };
-        self.note(format!("channel {channel} is at {bitrate_bps} bit/s{listens}"));
-        Ok(())
-    }
-
-    fn recover(&self) -> anyhow::Result<()> {
-        let lines = self.sending_lines()?;
-        let mut recovered = 0;
-        for (_, device) in lines.devices() {
-            let status = device.status()?;
-            for (channel, state) in Channel::ALL.into_iter().zip(&status.channels) {
-                if state.open.is_some() && state.state == ErrorState::BusOff {
-                    device.recover(channel)?;
-                    recovered += 1;
-                }
-            }
-        }
-        if recovered == 0 {
-            bail!("no channel is bus-off");
-        }
-        Ok(())
     }
 
     fn stop_recording(&mut self) {

@@ -5,6 +5,7 @@ mod access;
 mod backlog;
 mod bus;
 mod connections;
+mod device;
 mod head;
 mod recorder;
 mod request;
@@ -14,7 +15,9 @@ mod session;
 mod shared;
 mod site;
 mod state;
+mod visits;
 
-pub use bus::Device;
+pub use device::{Device, Hosted};
 pub use server::{Server, Source, Stopper};
 pub use site::{Site, SiteError};
+pub use visits::{Visit, Visits};

@@ -1,9 +1,11 @@
 //! What a page may ask for, as JSON: `{"number": 1, "request": "send", "parameters": {…}}`. The answer has the same number and either `ok` or
 //! `error`, a sentence.
 
+use std::fmt;
+
 use cantap::Frame;
 use cantap::periodic;
-use cantap::wire::message::{Checksum, MAX_MODIFIERS, Modifier};
+use cantap::wire::message::{Checksum, MAX_MODIFIERS, Modifier, Role};
 use serde::Deserialize;
 
 /// A message of a page.
@@ -93,6 +95,51 @@ pub enum Request {
     },
     /// Brings channels that are bus-off back onto their buses.
     Recover {},
+}
+
+impl Request {
+    /// The role that it takes.
+    pub const fn needs(&self) -> Role {
+        match self {
+            Self::Record { .. } | Self::StopRecording {} => Role::Listen,
+            Self::Bitrate { .. } | Self::Filters { .. } | Self::Mode { normal: false, .. } => Role::Configure,
+            Self::Mode { .. }
+            | Self::Send { .. }
+            | Self::Periodic { .. }
+            | Self::StopPeriodic { .. }
+            | Self::Recover {} => Role::Send,
+        }
+    }
+}
+
+/// For whoever runs the server: what was asked for, with no more than the beginning of a text.
+impl fmt::Display for Request {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        const MOST: usize = 100;
+        match self {
+            Self::Record { name, .. } => write!(f, "record to {name:.MOST$}"),
+            Self::StopRecording {} => f.write_str("end the recording"),
+            Self::Bitrate { channel, bitrate } => write!(f, "channel {channel} at {bitrate} bit/s"),
+            Self::Filters { filters } if filters.is_empty() => f.write_str("no filters"),
+            Self::Filters { filters } => {
+                write!(
+                    f,
+                    "filters {:.MOST$}",
+                    filters.iter().take(MOST).map(String::as_str).collect::<Vec<_>>().join(" ")
+                )
+            }
+            Self::Mode { normal: true, .. } => f.write_str("take part in the buses"),
+            Self::Mode { .. } => f.write_str("only listen"),
+            Self::Send { channel, frame } => write!(f, "send {frame:.MOST$} on channel {channel}"),
+            Self::Periodic { channel, frame, period_ms, .. } => {
+                write!(f, "send {frame:.MOST$} on channel {channel} every {period_ms} ms")
+            }
+            Self::StopPeriodic { channel, slot } => {
+                write!(f, "stop periodic entry {slot} of channel {channel}")
+            }
+            Self::Recover {} => f.write_str("join the bus again after bus-off"),
+        }
+    }
 }
 
 /// The part of what arrives that is recorded.

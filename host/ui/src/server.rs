@@ -2,26 +2,29 @@
 
 use std::fs::File;
 use std::io::{self, Write};
-use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
+use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::Context;
+use cantap::wire::message::Role;
 use cantap_work::interrupt;
 use cantap_work::report::Reporter;
 use tungstenite::WebSocket;
 use tungstenite::handshake::derive_accept_key;
-use tungstenite::protocol::Role;
+use tungstenite::protocol;
 
 use crate::access::{self, Refusal, Token};
-use crate::bus::{Bus, Device};
+use crate::bus::Bus;
 use crate::connections::Connections;
+use crate::device::Device;
 use crate::head::{self, BadHead, Head};
 use crate::session::{self, Session};
 use crate::shared::Shared;
 use crate::site::Site;
+use crate::visits::{Visit, Visitor, Visits};
 
 /// Pages at a time.
 const MOST_PAGES: usize = 8;
@@ -53,6 +56,9 @@ struct Doors {
     /// With the name of this run, so that a page knows whether its place in the records is still one.
     live: Option<(Arc<Shared>, Token)>,
     trace: Option<PathBuf>,
+    /// The most that pages may do.
+    role: Role,
+    visits: Visits,
     connections: Connections,
     is_over: AtomicBool,
 }
@@ -72,15 +78,29 @@ impl Stopper {
 }
 
 impl Server {
-    /// Opens the device or the file, and a port of this machine; 0 for any that is free.
-    pub fn open(site: Site, source: Source, port: u16, reporter: Reporter) -> anyhow::Result<Self> {
+    /// Opens the device or the file, and a port at an address of this machine (loopback); 0 for any that is free. `visits` gets what visitors
+    /// do.
+    pub fn open(
+        site: Site,
+        source: Source,
+        address: SocketAddr,
+        reporter: Reporter,
+        visits: Visits,
+    ) -> anyhow::Result<Self> {
+        if !address.ip().is_loopback() {
+            anyhow::bail!("{address} is no address of this machine alone; give one such as 127.0.0.1");
+        }
         let token = Token::new().context("the system gives no random numbers")?;
         let run = Token::new().context("the system gives no random numbers")?;
-        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, port))
-            .with_context(|| format!("cannot listen at port {port}; give another one with --port"))?;
+        let listener = TcpListener::bind(address)
+            .with_context(|| format!("cannot listen at {address}; give another port"))?;
         let address = listener.local_addr()?;
+        let mut role = Role::Listen;
         let (bus, trace) = match source {
-            Source::Device(device) => (Some(Bus::open(*device, reporter)?), None),
+            Source::Device(device) => {
+                role = device.role;
+                (Some(Bus::open(*device, reporter, Arc::clone(&visits))?), None)
+            }
             Source::Trace(path) => {
                 let file = File::open(&path).with_context(|| format!("cannot read {}", path.display()))?;
                 if !file.metadata()?.is_file() {
@@ -96,6 +116,8 @@ impl Server {
             site,
             live,
             trace,
+            role,
+            visits,
             connections: Connections::default(),
             is_over: AtomicBool::new(false),
         };
@@ -170,13 +192,16 @@ impl Doors {
     fn answer(&self, mut stream: TcpStream, number: u64) -> io::Result<()> {
         stream.set_nodelay(true)?;
         stream.set_write_timeout(Some(WRITE_PATIENCE))?;
+        let name = format!("page {}", stream.peer_addr()?);
         let head = match Head::read(&mut stream) {
             Ok(head) => head,
             Err(BadHead::Gone) => return Ok(()),
             Err(BadHead::Malformed) => {
+                self.refused(&name, "it sends no request of a browser");
                 return head::sentence(&mut stream, "400 Bad Request", "This is no request of a browser.");
             }
             Err(BadHead::TooLong) => {
+                self.refused(&name, "its request is too long");
                 return head::sentence(
                     &mut stream,
                     "431 Request Header Fields Too Large",
@@ -191,6 +216,9 @@ impl Doors {
         {
             // Browsers ask for it by themselves, and without a token.
             let is_icon = refusal == Refusal::Token && head.path == "/favicon.ico";
+            if !is_icon {
+                self.refused(&name, refusal.reason());
+            }
             let status = if is_icon { "404 Not Found" } else { refusal.status() };
             return head::sentence(&mut stream, status, refusal.text());
         }
@@ -200,7 +228,7 @@ impl Doors {
         }
         match (head.path.as_str(), &self.live, &self.trace) {
             ("/", ..) => self.page(&mut stream, host.unwrap_or_default()),
-            ("/live", Some((shared, run)), _) => upgrade(stream, &head, shared, run.text()),
+            ("/live", Some((shared, run)), _) => self.upgrade(stream, &head, shared, run.text(), name),
             ("/trace", _, Some(path)) => trace(&mut stream, path),
             _ => head::sentence(&mut stream, "404 Not Found", "There is nothing here; the page is at /."),
         }
@@ -216,6 +244,49 @@ impl Doors {
             &self.site.policy(host),
         )?;
         stream.write_all(page)
+    }
+
+    fn refused(&self, name: &str, reason: &str) {
+        (self.visits)(name, Visit::Refused(reason.to_owned()));
+    }
+
+    /// Makes the connection a WebSocket and serves it.
+    fn upgrade(
+        &self,
+        mut stream: TcpStream,
+        head: &Head,
+        shared: &Shared,
+        run: &str,
+        name: String,
+    ) -> io::Result<()> {
+        let key = head.header("sec-websocket-key").filter(|key| key.len() == 24);
+        let is_asked = head.has("connection", "upgrade")
+            && head.has("upgrade", "websocket")
+            && head.header("sec-websocket-version") == Some("13");
+        let Some(key) = key.filter(|_| is_asked) else {
+            return head::sentence(&mut stream, "426 Upgrade Required", "Here the page opens its WebSocket.");
+        };
+        write!(
+            stream,
+            "HTTP/1.1 101 Switching Protocols\r\nConnection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Accept: {}\r\n\r\n",
+            derive_accept_key(key.as_bytes())
+        )?;
+        let socket = WebSocket::from_raw_socket(stream, protocol::Role::Server, Some(session::config()));
+        let Some(page) = shared.enter(MOST_PAGES) else {
+            self.refused(&name, &format!("{MOST_PAGES} pages are open already"));
+            session::refuse(socket, &format!("{MOST_PAGES} pages are open already; close one of them"));
+            return Ok(());
+        };
+        let is_same_run = head.parameter("run") == Some(run);
+        let from =
+            head.parameter("after").and_then(|after| after.parse().ok()).filter(|_| is_same_run).unwrap_or(0);
+        (self.visits)(&name, Visit::Came(self.role));
+        let visitor = Visitor { name: name.clone(), role: self.role };
+        let session = Session::new(socket, shared, visitor, &self.visits, from);
+        let result = session.map(|session| session.run(run));
+        drop(page);
+        (self.visits)(&name, Visit::Left);
+        result
     }
 }
 
@@ -233,31 +304,4 @@ fn trace(stream: &mut TcpStream, path: &Path) -> io::Result<()> {
         "Content-Security-Policy: default-src 'none'\r\n",
     )?;
     io::copy(&mut io::Read::take(file, length), stream).map(|_| ())
-}
-
-/// Makes the connection a WebSocket and serves it.
-fn upgrade(mut stream: TcpStream, head: &Head, shared: &Shared, run: &str) -> io::Result<()> {
-    let key = head.header("sec-websocket-key").filter(|key| key.len() == 24);
-    let is_asked = head.has("connection", "upgrade")
-        && head.has("upgrade", "websocket")
-        && head.header("sec-websocket-version") == Some("13");
-    let Some(key) = key.filter(|_| is_asked) else {
-        return head::sentence(&mut stream, "426 Upgrade Required", "Here the page opens its WebSocket.");
-    };
-    write!(
-        stream,
-        "HTTP/1.1 101 Switching Protocols\r\nConnection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Accept: {}\r\n\r\n",
-        derive_accept_key(key.as_bytes())
-    )?;
-    let socket = WebSocket::from_raw_socket(stream, Role::Server, Some(session::config()));
-    let Some(page) = shared.enter(MOST_PAGES) else {
-        session::refuse(socket, &format!("{MOST_PAGES} pages are open already; close one of them"));
-        return Ok(());
-    };
-    let is_same_run = head.parameter("run") == Some(run);
-    let from =
-        head.parameter("after").and_then(|after| after.parse().ok()).filter(|_| is_same_run).unwrap_or(0);
-    Session::new(socket, shared, from)?.run(run);
-    drop(page);
-    Ok(())
 }

@@ -9,6 +9,7 @@
 use std::collections::VecDeque;
 use std::io;
 use std::net::TcpStream;
+use std::sync::Arc;
 use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::{Duration, Instant};
 
@@ -19,6 +20,7 @@ use tungstenite::{Error, Message as Frame, WebSocket};
 use crate::backlog::Cursor;
 use crate::request::Message;
 use crate::shared::{Answer, Shared};
+use crate::visits::{Visit, Visitor, Visits};
 
 /// How often what has arrived is passed on: as often as a screen is drawn.
 const TICK: Duration = Duration::from_millis(15);
@@ -39,6 +41,8 @@ const GONE_AFTER: Duration = Duration::from_secs(20);
 pub struct Session<'a> {
     socket: WebSocket<TcpStream>,
     shared: &'a Shared,
+    page: Arc<Visitor>,
+    visits: &'a Visits,
     cursor: Cursor,
     /// The record after each message that is on its way, and the message's length.
     under_way: VecDeque<(u64, usize)>,
@@ -66,12 +70,20 @@ pub fn refuse(mut socket: WebSocket<TcpStream>, reason: &str) {
 
 impl<'a> Session<'a> {
     /// Goes on after the records before `from`.
-    pub fn new(socket: WebSocket<TcpStream>, shared: &'a Shared, from: u64) -> io::Result<Self> {
+    pub fn new(
+        socket: WebSocket<TcpStream>,
+        shared: &'a Shared,
+        page: Visitor,
+        visits: &'a Visits,
+        from: u64,
+    ) -> io::Result<Self> {
         socket.get_ref().set_read_timeout(Some(TICK))?;
         let now = Instant::now();
         Ok(Self {
             socket,
             shared,
+            page: Arc::new(page),
+            visits,
             cursor: if from == 0 { Cursor::default() } else { Cursor::at(from) },
             under_way: VecDeque::new(),
             waiting: Vec::new(),
@@ -86,7 +98,7 @@ impl<'a> Session<'a> {
     pub fn run(mut self, run: &str) {
         let hello = json!({ "type": "hello", "run": run, "version": env!("CARGO_PKG_VERSION") });
         let _ = self.text(&hello).and_then(|()| self.serve());
-        let end = CloseFrame { code: CloseCode::Away, reason: "cantap ui has ended".into() };
+        let end = CloseFrame { code: CloseCode::Away, reason: "the server has ended".into() };
         let _ = self.socket.close(self.shared.is_over().then_some(end));
         let _ = self.socket.flush();
     }
@@ -165,6 +177,9 @@ impl<'a> Session<'a> {
             let Some(taken) = self.shared.backlog.take(&mut self.cursor, MESSAGE_BYTES) else {
                 return Ok(());
             };
+            if taken.gone > 0 {
+                (self.visits)(&self.page.name, Visit::Missed(taken.gone));
+            }
             let numbers = [taken.first, self.cursor.next, taken.latest];
             let mut message: Vec<u8> = numbers.into_iter().flat_map(u64::to_le_bytes).collect();
             message.extend(taken.chunks);
@@ -180,10 +195,12 @@ impl<'a> Session<'a> {
             Ok(Message::Request { number, .. }) if self.waiting.len() >= MOST_WAITING => {
                 self.answer(number, Err("too many requests at a time; wait for the answers".to_owned()))?;
             }
-            Ok(Message::Request { number, request }) => match self.shared.order(request) {
-                Ok(answer) => self.waiting.push((number, answer)),
-                Err(reason) => self.answer(number, Err(reason))?,
-            },
+            Ok(Message::Request { number, request }) => {
+                match self.shared.order(request, Arc::clone(&self.page)) {
+                    Ok(answer) => self.waiting.push((number, answer)),
+                    Err(reason) => self.answer(number, Err(reason))?,
+                }
+            }
             Err(_) => {
                 // Without a number it cannot be answered otherwise. It concerns this page alone, so it has no number either.
                 let text = "the server did not understand the page; load it anew";

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use cantap_work::report::Severity;
@@ -13,6 +13,7 @@ use serde_json::Value;
 use crate::backlog::Backlog;
 use crate::request::Request;
 use crate::state::State;
+use crate::visits::Visitor;
 
 /// So many notices are kept for pages.
 const NOTICES: usize = 64;
@@ -26,6 +27,8 @@ pub type Answer = Result<Value, String>;
 pub struct Order {
     /// What is asked for.
     pub request: Request,
+    /// Who asks.
+    pub page: Arc<Visitor>,
     /// Where the answer goes; nobody may be there any more.
     pub answer: SyncSender<Answer>,
 }
@@ -121,9 +124,9 @@ impl Shared {
     }
 
     /// Passes a request on; its answer comes later. An error if too many are waiting.
-    pub fn order(&self, request: Request) -> Result<Receiver<Answer>, String> {
+    pub fn order(&self, request: Request, page: Arc<Visitor>) -> Result<Receiver<Answer>, String> {
         let (answer, receiver) = sync_channel(1);
-        let passed = self.orders.try_send(Order { request, answer });
+        let passed = self.orders.try_send(Order { request, page, answer });
         passed.map_err(|_| "the device has not answered the requests before; try again".to_owned())?;
         Ok(receiver)
     }
@@ -135,6 +138,11 @@ impl Shared {
         self.change(|state| state.pages = before + 1);
         self.is_heard();
         Some(Page(self))
+    }
+
+    /// Whether any page is open.
+    pub fn has_pages(&self) -> bool {
+        self.pages.load(Ordering::Relaxed) > 0
     }
 
     /// A page has shown that it is there.

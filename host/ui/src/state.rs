@@ -8,6 +8,12 @@ use serde::Serialize;
 pub struct State {
     /// Whether the command allows sending and taking part.
     pub may_send: bool,
+    /// Whether pages may choose bit rates and filters.
+    pub may_configure: bool,
+    /// Whether pages may begin recordings.
+    pub may_record: bool,
+    /// The option of the command that allows sending.
+    pub send_option: String,
     /// The devices in the order of their channels.
     pub devices: Vec<DeviceState>,
     /// The open channels.

@@ -3,7 +3,7 @@
 import type { App } from './model/app';
 import { openFiles } from './model/open-files';
 import { blobOfBase64, gunzip, save } from './model/files';
-import { bytes, count, duration, idText, parseTime, percent } from './model/format';
+import { bytes, count, duration, idText, missing, parseTime, percent } from './model/format';
 import { parseProfile } from './model/storage';
 import { Commands, type Command, keyLabel } from './ui/commands';
 import { openDialog } from './ui/dialog';
@@ -54,7 +54,7 @@ export class Shell {
     this.#notes = new NotesView(app, this.#commands, lead);
     const fixed = new FixedView(app, this.#commands, () => this.show('bits'));
     this.#views = [new SummaryView(app, this.#commands, lead), this.#trace, new GraphsView(app, this.#commands), fixed, new BitsView(app, this.#commands), new StatisticsView(app, this.#commands), new ConversationsView(app, this.#commands, lead), this.#notes];
-    if (app.server) this.#views.push((this.#device = new DeviceView(app, app.server, this.#commands)));
+    if (app.server) this.#views.push((this.#device = new DeviceView(app, app.server, this.#commands, () => void openExport(app, 0, ''))));
     for (const topic of ['live', 'live-state'] as const) app.on(topic, () => this.#drawLive());
     // A frozen view is told from one to which nothing comes.
     app.on('range', () => this.#drawLive());
@@ -181,7 +181,7 @@ export class Shell {
     const { live } = app;
     this.#liveTools.hidden = !live;
     if (!live) return;
-    this.#record.hidden = live !== app.server;
+    this.#record.hidden = live !== app.server || app.server?.state?.mayRecord === false;
     const gone = live === app.board ? 'board gone' : 'connection lost';
     const state = live.state?.ended ? 'device gone' : live.status === 'open' ? (app.paused ? 'paused' : app.following ? 'live' : 'looking back') : live.status === 'ended' ? 'ended' : live.status === 'lost' ? gone : 'connecting';
     setText(this.#liveState, state);
@@ -333,8 +333,10 @@ export class Shell {
     this.#progress.hidden = !reading;
     this.#progress.value = summary.progress ?? 0;
     const lost = summary.losses.reduce((sum, l) => sum + l.count, 0);
-    setText(this.#losses, lost === 0 ? 'no known loss' : `${summary.losses.some((l) => l.atLeast) ? 'at least ' : ''}${count(lost)} frames lost`);
-    this.#losses.classList.toggle('bad', lost > 0);
+    const atLeast = summary.losses.some((l) => l.atLeast);
+    const isWhole = lost === 0 && !atLeast;
+    setText(this.#losses, isWhole ? 'no known loss' : `${missing(lost, atLeast)} lost`);
+    this.#losses.classList.toggle('bad', !isWhole);
     this.element.dataset['records'] = String(summary.records);
     this.element.dataset['growing'] = String(summary.growing);
   }

@@ -251,6 +251,8 @@ test('a device that goes away and comes back leaves a gap and a whole recording,
     await show(page, 'trace');
     await page.locator('#trace-filter').fill('lost');
     await until(page, 'the gap is in the trace', () => !/^0 of/.test(document.querySelector('#view-trace .bar .state').textContent) && / of /.test(document.querySelector('#view-trace .bar .state').textContent));
+    // How many frames are missing is not known, which is not none.
+    await untilText(page, 'footer', 'an unknown number of frames lost');
     server.child.kill('SIGINT');
     await untilText(page, '.live-state', 'ended');
     assert.equal(await server.ended, 0);

@@ -1,15 +1,15 @@
 // Measures the page live over two saturated virtual channels: redraws, lag, memory, loss. Not a test: the figures are read by a person.
-//   node tests/measure-live.mjs page.html cantap [SECONDS] [DEVICE] [BITRATE]
+//   node tests/measure-live.mjs page.html cantap [SECONDS] [DEVICE] [BITRATE] [ui|serve]
 
 import { readFileSync } from 'node:fs';
 
-const [, , page, program, seconds = '180', device = 'virtual:load=100', bitrate = '1M'] = process.argv;
+const [, , page, program, seconds = '180', device = 'virtual:load=100', bitrate = '1M', way = 'ui'] = process.argv;
 process.env.CANTAP_TEST_PAGE = page;
 process.env.CANTAP_TEST_PROGRAM = program;
-const { serve } = await import('./served.mjs');
+const { serve, serveShared } = await import('./served.mjs');
 const { launch, newPage, quit, show } = await import('./browser.mjs');
 
-const server = await serve(['-d', device, '-b', bitrate]);
+const server = await (way === 'serve' ? serveShared : serve)(['-d', device, '-b', bitrate]);
 const tab = await newPage({ url: server.url });
 await tab.locator('.shell').waitFor();
 const inspector = await (await launch()).newBrowserCDPSession();
@@ -46,7 +46,7 @@ const look = (ms) =>
           else {
             const took = (now - begin) / 1000;
             lags.sort((a, b) => a - b);
-            done({ redraws: frames / took, rows: (Number(list.dataset.drawn ?? 0) - drawn) / took, longest, records: (Number(shell.dataset.received) - received) / took, behind: Number(shell.dataset.behind), lag: lags[Math.floor(lags.length / 2)], worst: lags.at(-1), lost: document.querySelector('footer').textContent.match(/no known loss|[\d ]+ frames lost/)?.[0] });
+            done({ redraws: frames / took, rows: (Number(list.dataset.drawn ?? 0) - drawn) / took, longest, records: (Number(shell.dataset.received) - received) / took, behind: Number(shell.dataset.behind), lag: lags[Math.floor(lags.length / 2)], worst: lags.at(-1), lost: document.querySelector('footer').textContent.match(/no known loss|(an unknown number of|[\d ]+) frames lost/)?.[0] });
           }
         };
         requestAnimationFrame(step);

@@ -1,4 +1,4 @@
-// `cantap ui` for tests, in a folder of its own.
+// `cantap ui`, or `cantap serve --web`, for tests, in a folder of its own.
 
 import { spawn } from 'node:child_process';
 import { mkdtempSync, rmSync } from 'node:fs';
@@ -10,14 +10,14 @@ const PAGE = process.env.CANTAP_TEST_PAGE;
 const PROGRAM = process.env.CANTAP_TEST_PROGRAM;
 
 /** Starts it, and waits for the page's address. */
-export async function serve(args, { folder = mkdtempSync(join(tmpdir(), 'cantap-ui-')) } = {}) {
-  const child = spawn(resolve(PROGRAM), ['ui', '--no-open', ...args], { cwd: folder, env: { ...process.env, CANTAP_PAGE: resolve(PAGE) }, stdio: ['ignore', 'pipe', 'pipe'] });
+export async function serve(args, { folder = mkdtempSync(join(tmpdir(), 'cantap-ui-')), command = ['ui', '--no-open'] } = {}) {
+  const child = spawn(resolve(PROGRAM), [...command, ...args], { cwd: folder, env: { ...process.env, CANTAP_PAGE: resolve(PAGE) }, stdio: ['ignore', 'pipe', 'pipe'] });
   let errors = '';
   child.stderr.on('data', (text) => (errors += text));
   const ended = new Promise((done) => child.on('close', done));
   const lines = createInterface({ input: child.stdout });
-  const url = await Promise.race([new Promise((found) => lines.once('line', found)), ended]);
-  if (typeof url !== 'string') throw new Error(`cantap ui ended: ${errors}`);
+  const url = await Promise.race([new Promise((found) => lines.on('line', (line) => line.startsWith('http://') && found(line))), ended]);
+  if (typeof url !== 'string') throw new Error(`cantap ${command[0]} ended: ${errors}`);
   return {
     url,
     folder,
@@ -34,6 +34,9 @@ export async function serve(args, { folder = mkdtempSync(join(tmpdir(), 'cantap-
     },
   };
 }
+
+/** The page beside the other listeners of `cantap serve`. */
+export const serveShared = (args) => serve(['--unix', 'cantap.sock', '--web', '0', ...args], { command: ['serve'] });
 
 /** A virtual device that others reach at a socket, such as one on another machine: `cantap serve`. */
 export async function boardAt(socket) {

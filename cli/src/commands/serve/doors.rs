@@ -17,13 +17,14 @@ pub enum Door {
     Socketcand,
     Gvret,
     Cannelloni,
+    Web,
     Stdio,
 }
 
 impl Door {
-    /// Whoever comes this way is not asked who it is.
+    /// Whoever comes this way is not asked who it is; at the page, whoever has its address.
     const fn is_open_to_all(self) -> bool {
-        matches!(self, Self::Socketcand | Self::Gvret | Self::Cannelloni)
+        matches!(self, Self::Socketcand | Self::Gvret | Self::Cannelloni | Self::Web)
     }
 }
 
@@ -44,7 +45,8 @@ pub fn allowed(text: &str) -> Result<Allowed, String> {
         "socketcand" => Door::Socketcand,
         "gvret" => Door::Gvret,
         "cannelloni" => Door::Cannelloni,
-        _ => return Err("a listener is unix, tcp, socketcand, gvret or cannelloni".to_owned()),
+        "web" => Door::Web,
+        _ => return Err("a listener is unix, tcp, socketcand, gvret, cannelloni or web".to_owned()),
     };
     Ok(Allowed { door: Some(door), role: role(text)? })
 }
@@ -156,15 +158,22 @@ mod tests {
     fn what_is_allowed_everywhere_is_not_allowed_to_foreign_protocols() {
         let roles = |texts: &[&str]| {
             let all: Vec<Allowed> = texts.iter().map(|text| allowed(text).unwrap()).collect();
-            [Door::Unix, Door::Tcp, Door::Socketcand, Door::Gvret, Door::Cannelloni, Door::Stdio]
+            [Door::Unix, Door::Tcp, Door::Socketcand, Door::Gvret, Door::Cannelloni, Door::Web, Door::Stdio]
                 .map(|door| allow(&all, door))
         };
         let (listen, send) = (Role::Listen, Role::Send);
-        assert_eq!(roles(&[]), [listen; 6]);
-        assert_eq!(roles(&["send"]), [send, send, listen, listen, listen, send]);
-        assert_eq!(roles(&["socketcand:send"]), [listen, listen, send, listen, listen, listen]);
-        assert_eq!(roles(&["gvret:send", "cannelloni:send"]), [listen, listen, listen, send, send, listen]);
-        assert_eq!(roles(&["send", "tcp:configure"]), [send, Role::Configure, listen, listen, listen, send]);
+        assert_eq!(roles(&[]), [listen; 7]);
+        assert_eq!(roles(&["send"]), [send, send, listen, listen, listen, listen, send]);
+        assert_eq!(roles(&["socketcand:send"]), [listen, listen, send, listen, listen, listen, listen]);
+        assert_eq!(
+            roles(&["gvret:send", "cannelloni:send"]),
+            [listen, listen, listen, send, send, listen, listen]
+        );
+        assert_eq!(roles(&["web:send"]), [listen, listen, listen, listen, listen, send, listen]);
+        assert_eq!(
+            roles(&["send", "tcp:configure"]),
+            [send, Role::Configure, listen, listen, listen, listen, send]
+        );
         for text in ["all", "udp:send", "unix:", ":send"] {
             assert!(allowed(text).is_err(), "{text}");
         }

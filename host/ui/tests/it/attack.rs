@@ -42,6 +42,19 @@ fn the_page_is_for_whoever_has_the_token_by_the_servers_own_name() {
             format!("GET /?token={token} HTTP/1.1\r\nHost: evil.example:{}\r\n\r\n", server.address.port()),
             "421",
         ),
+        (
+            format!(
+                "GET /?token={token} HTTP/1.1\r\nHost: 127.0.0.1.nip.io:{}\r\n\r\n",
+                server.address.port()
+            ),
+            "421",
+        ),
+        (
+            format!("GET /?token={token} HTTP/1.1\r\nHost: localhost.:{}\r\n\r\n", server.address.port()),
+            "421",
+        ),
+        (format!("GET /?token={token} HTTP/1.1\r\nHost: [::1]:{}\r\n\r\n", server.address.port()), "421"),
+        (format!("GET /?token={token} HTTP/1.1\r\nHost: user@{host}\r\n\r\n"), "421"),
         (format!("GET /?token={token} HTTP/1.1\r\n\r\n"), "421"),
         (format!("GET /?token={token} HTTP/1.1\r\nHost: {host}\r\nHost: evil.example\r\n\r\n"), "400"),
         (format!("GET http://evil.example/?token={token} HTTP/1.1\r\nHost: evil.example\r\n\r\n"), "421"),
@@ -198,4 +211,69 @@ fn strangers_who_only_connect_keep_nobody_out() {
     // The first ones were let go.
     let mut first = &crowd[0];
     assert!(matches!(first.read(&mut [0; 1]), Ok(0) | Err(_)));
+}
+
+#[test]
+fn a_connection_has_one_request_and_nothing_behind_it_is_taken_for_another() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = Running::of(device("virtual:load=5", folder.path(), true));
+    let (host, token) = (server.address.to_string(), server.token.clone());
+    let second = format!("GET /?token={token} HTTP/1.1\r\nHost: {host}\r\n\r\n");
+    let len = second.len();
+    for lengths in [
+        format!("Content-Length: {len}\r\nContent-Length: 0\r\n"),
+        "Content-Length: 0\r\nTransfer-Encoding: chunked\r\n".to_owned(),
+        "Transfer-Encoding: chunked\r\n".to_owned(),
+        "Connection: keep-alive\r\n".to_owned(),
+    ] {
+        let first = format!("GET /?token=guessed HTTP/1.1\r\nHost: {host}\r\n{lengths}\r\n");
+        let (head, body) = server.ask(&format!("{first}{second}"));
+        assert!(
+            head.starts_with("HTTP/1.1 403 ") && head.contains("Connection: close\r\n"),
+            "{lengths}: {head}"
+        );
+        assert!(!String::from_utf8(body).unwrap().contains("HTTP/1.1"), "{lengths}");
+    }
+}
+
+#[test]
+fn a_page_that_speaks_something_else_or_pings_without_end_is_alone_with_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = Running::of(device("virtual:load=20", folder.path(), true));
+    let mut watching = server.page();
+    // An upgrade within the WebSocket is no frame.
+    let mut page = server.page();
+    page.acknowledges = false;
+    let again = format!("GET /live?token={} HTTP/1.1\r\nHost: {}\r\n\r\n", server.token, server.address);
+    page.socket.get_mut().write_all(again.as_bytes()).unwrap();
+    while page.step().is_ok() {}
+    let mut pinging = server.page();
+    for _ in 0..20_000 {
+        if pinging.socket.send(Message::Ping(vec![0; 100].into())).is_err() {
+            break;
+        }
+    }
+    let so_far = watching.frames();
+    watching.until(|page| page.frames() > so_far + 500);
+    let more = pinging.frames();
+    pinging.until(|page| page.frames() > more + 100);
+}
+
+#[test]
+fn a_request_that_never_ends_is_ended() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = Running::of(device("virtual:load=5", folder.path(), false));
+    let slow: Vec<_> = (0..40)
+        .map(|_| {
+            let mut stream = TcpStream::connect(server.address).unwrap();
+            stream.write_all(b"GET /?token=").unwrap();
+            stream
+        })
+        .collect();
+    let mut page = server.page();
+    page.until(|page| page.frames() > 50);
+    for mut stream in slow {
+        // Bytes that trickle in are no reason to wait longer.
+        while stream.write_all(b"0").is_ok() && !matches!(stream.read(&mut [0; 1]), Ok(0)) {}
+    }
 }

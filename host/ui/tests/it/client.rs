@@ -3,14 +3,16 @@
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::path::Path;
+use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use cantap::wire::message::Role;
 use cantap_address::Address;
 use cantap_signals::Decoder;
 use cantap_trace::{TraceRecord, packed};
-use cantap_ui::{Device, Server, Site, Source, Stopper};
+use cantap_ui::{Device, Server, Site, Source, Stopper, Visit};
 use cantap_work::boards::Boards;
 use cantap_work::channel_bitrate::ChannelBitrate;
 use cantap_work::channel_options::ChannelOptions;
@@ -32,6 +34,8 @@ pub struct Running {
     pub token: String,
     /// What it reports.
     pub reports: Receiver<String>,
+    /// What visitors do.
+    pub visits: Receiver<Visit>,
     stopper: Stopper,
     thread: Option<JoinHandle<()>>,
 }
@@ -43,9 +47,10 @@ pub fn device(address: &str, folder: &Path, may_send: bool) -> Device {
         boards: Boards::new(&addresses, &Channels::all()).unwrap(),
         open: ChannelOptions::listening(vec![ChannelBitrate { channel: None, bitrate_bps: 500_000 }]),
         filters: Vec::new(),
-        may_send,
+        hosted: None,
+        role: if may_send { Role::Send } else { Role::Configure },
         decoder: Decoder::new(Vec::new()),
-        folder: folder.to_owned(),
+        folder: Some(folder.to_owned()),
         record: None,
         dead_man: Duration::from_hours(1),
     }
@@ -55,7 +60,15 @@ impl Running {
     pub fn start(source: Source) -> Self {
         let (reports, received) = channel();
         let reporter = Reporter::new(move |_, text| drop(reports.send(text.to_owned())));
-        let server = Server::open(Site::new(PAGE).unwrap(), source, 0, reporter).unwrap();
+        let (visits, visited) = channel();
+        let server = Server::open(
+            Site::new(PAGE).unwrap(),
+            source,
+            "127.0.0.1:0".parse().unwrap(),
+            reporter,
+            Arc::new(move |_: &str, visit| drop(visits.send(visit))),
+        );
+        let server = server.unwrap();
         let url = server.url();
         let (address, token) = url.strip_prefix("http://").unwrap().split_once("/?token=").unwrap();
         let stopper = server.stopper();
@@ -63,6 +76,7 @@ impl Running {
             address: address.parse().unwrap(),
             token: token.to_owned(),
             reports: received,
+            visits: visited,
             stopper,
             thread: Some(std::thread::spawn(move || server.run().unwrap())),
         }

@@ -2,6 +2,7 @@
 
 mod attack;
 mod client;
+mod hosted;
 mod live;
 mod recording;
 mod sending;

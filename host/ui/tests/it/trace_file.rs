@@ -1,5 +1,7 @@
 //! A trace instead of a device.
 
+use std::sync::Arc;
+
 use cantap_ui::{Server, Site, Source};
 use cantap_work::report::Reporter;
 
@@ -27,7 +29,10 @@ fn a_trace_is_served_byte_for_byte_to_its_page_alone() {
     std::fs::remove_file(&path).unwrap();
     assert!(server.get(&format!("/trace?token={}", server.token)).0.starts_with("HTTP/1.1 404 "));
     let site = || Site::new(PAGE).unwrap();
+    let at = "127.0.0.1:0".parse().unwrap();
     for source in [path, folder.path().to_owned()] {
-        assert!(Server::open(site(), Source::Trace(source), 0, Reporter::silent()).is_err());
+        assert!(
+            Server::open(site(), Source::Trace(source), at, Reporter::silent(), Arc::new(|_, _| ())).is_err()
+        );
     }
 }

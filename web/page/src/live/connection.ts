@@ -1,4 +1,4 @@
-// The connection to `cantap ui`: it comes back by itself, goes on after the record that was taken in last, and tells the server how far that is,
+// The connection to the page's server: it comes back by itself, goes on after the record that was taken in last, and tells the server how far that is,
 // so that a page that is slow is not drowned.
 
 import { Emitter } from '../model/emitter';
@@ -36,6 +36,8 @@ export class Connection extends Emitter<'status' | 'state' | 'progress'> impleme
   constructor(
     private readonly take: Take,
     private readonly notify: (level: 'info' | 'warning' | 'error', text: string) => void,
+    /** The command that serves the page. */
+    readonly command: string,
   ) {
     super();
     // After a sleep, or back in sight, there is no reason to wait for the next try.
@@ -119,10 +121,10 @@ export class Connection extends Emitter<'status' | 'state' | 'progress'> impleme
   #closed(code: number, reason: string): void {
     this.#forgetSocket();
     if (code === 1001) {
-      this.#set('ended', 'cantap ui has ended. What was received stays here; start it again for more.');
+      this.#set('ended', `${this.command} has ended. What was received stays here; start it again for more.`);
       return;
     }
-    this.#set('lost', reason === '' ? 'The connection to cantap ui is lost; it is tried again.' : `cantap ui refuses: ${reason}. It is tried again.`);
+    this.#set('lost', reason === '' ? `The connection to ${this.command} is lost; it is tried again.` : `${this.command} refuses: ${reason}. It is tried again.`);
     this.#timer = window.setTimeout(() => this.connect(), this.#retry);
     this.#retry = Math.min(this.#retry * 2, LONGEST_RETRY);
   }
@@ -176,7 +178,7 @@ export class Connection extends Emitter<'status' | 'state' | 'progress'> impleme
   /** Asks the server. Its refusals can be shown as they are. */
   ask<K extends keyof Requests>(request: K, parameters: Requests[K]['in']): Promise<Requests[K]['out']> {
     const socket = this.#socket;
-    if (!socket || socket.readyState !== WebSocket.OPEN) return Promise.reject(new Error('There is no connection to cantap ui; wait until it is back.'));
+    if (!socket || socket.readyState !== WebSocket.OPEN) return Promise.reject(new Error(`There is no connection to ${this.command}; wait until it is back.`));
     const number = ++this.#numbers;
     return new Promise((resolve, reject) => {
       this.#waiting.set(number, { resolve, reject });
@@ -187,7 +189,7 @@ export class Connection extends Emitter<'status' | 'state' | 'progress'> impleme
 
 /** Those of the last message; all have some. */
 function numbers(messages: readonly Uint8Array[]): { next: number; latest: number } {
-  if (messages.some((m) => m.length < HEADER)) throw new Error('What came from cantap ui is damaged; load the page anew');
+  if (messages.some((m) => m.length < HEADER)) throw new Error('What came from the server is damaged; load the page anew');
   const message = messages[messages.length - 1] as Uint8Array;
   const view = new DataView(message.buffer, message.byteOffset, HEADER);
   return { next: Number(view.getBigUint64(8, true)), latest: Number(view.getBigUint64(16, true)) };

@@ -1,8 +1,8 @@
 // What server and page say to each other; see `host/ui/src/session.rs`, `state.rs` and `request.rs`.
 
-/** What `cantap ui` put into the page. */
+/** What the server put into the page; `command` is the one that serves it, `cantap ui` or `cantap serve`. */
 export type Served = { version: 1; name: string; databases: import('../model/report').ServedDatabase[] } & (
-  | { kind: 'device' }
+  | { kind: 'device'; command: string }
   | { kind: 'trace'; size: number; bitrates: { channel: number; bitrate: number; dataBitrate: number | null }[] }
 );
 
@@ -31,6 +31,12 @@ export interface PeriodicState {
 
 export interface State {
   maySend: boolean;
+  /** Choose bit rates and filters. */
+  mayConfigure: boolean;
+  /** Begin recordings in the server's folder. */
+  mayRecord: boolean;
+  /** The command's option that allows sending. */
+  sendOption: string;
   devices: DeviceState[];
   channels: ChannelState[];
   isNormal: boolean;

@@ -1,4 +1,4 @@
-// A page that `cantap ui` serves: live from its device, or with its trace.
+// A page that `cantap ui` or `cantap serve` serves: live from a device, or with a trace.
 
 import type { App } from '../model/app';
 import { addCarried } from '../model/report';
@@ -34,6 +34,7 @@ export async function serve(app: App, served: Served): Promise<void> {
       }
     },
     (level, text) => app.notify(level, text),
+    served.command,
   );
   app.live = app.server = live;
   for (const topic of ['status', 'state', 'progress'] as const) live.on(topic, () => app.emit('live-state'));

@@ -11,6 +11,12 @@ export function plural(value: number, one: string, many = `${one}s`): string {
   return `${count(value)} ${value === 1 ? one : many}`;
 }
 
+/** How many frames are missing: after a gap, nobody knows. */
+export function missing(frames: number, atLeast: boolean): string {
+  if (frames === 0 && atLeast) return 'an unknown number of frames';
+  return `${atLeast ? 'at least ' : ''}${plural(frames, 'frame')}`;
+}
+
 /** Identifiers as in cantap's grammar: three digits for 11 bits, eight for 29. */
 export function idText(id: number, extended: boolean): string {
   return id.toString(16).toUpperCase().padStart(extended ? 8 : 3, '0');

@@ -1,4 +1,4 @@
-// The device behind a live page: its connection and channels, recording, what is sent. Only a page that `cantap ui` serves has this view.
+// The device behind a live page: its connection and channels, recording, what is sent. Only a page that a command serves has this view.
 
 import type { App } from '../model/app';
 import type { Connection } from '../live/connection';
@@ -26,6 +26,10 @@ export class DeviceView implements View {
   readonly #after = secondsInput('Seconds after each event', 5);
   readonly #recording = el('p', { attrs: { role: 'status' } });
   readonly #record: HTMLButtonElement;
+  /** What the server may do for the page: record, filter. */
+  readonly #recorder: HTMLElement;
+  readonly #keeper: HTMLElement;
+  readonly #filtering: HTMLElement;
   readonly #send: SendList;
   #drawn = '';
 
@@ -33,9 +37,24 @@ export class DeviceView implements View {
     private readonly app: App,
     private readonly live: Connection,
     commands: Commands,
+    exportAll: () => void,
   ) {
     this.#record = button('Record', () => this.toggleRecording(), { class: 'primary' });
     this.#send = new SendList(app, live);
+    this.#recorder = el(
+      'div',
+      { attrs: { hidden: '' } },
+      el('div', { class: 'row' }, field(`File in the folder of ${live.command}`, this.#name, 'The suffix names the format: .blf, .log, .asc, .mf4 …'), this.#record),
+      el('div', { class: 'row' }, field('Only around', this.#around, 'A condition, such as Speed > 80, id == 0x123 or error; empty for everything.'), field('Seconds before', this.#before), field('Seconds after', this.#after)),
+      this.#recording,
+    );
+    this.#keeper = el(
+      'div',
+      { attrs: { hidden: '' } },
+      el('p', {}, 'This server records nothing for pages. What arrives is kept in this page, the newest 8 million records of it, until it is closed. Save it as a file before that.'),
+      el('div', { class: 'row' }, button('Save …', exportAll, { id: 'live-save' })),
+    );
+    this.#filtering = section('Filters of the device', el('div', { class: 'row' }, field('Receive only', this.#filters, 'Several separated by blanks; empty for everything. What they keep back is neither shown nor recorded.'), button('Apply', () => this.#applyFilters())));
     const head = ['Channel', 'Bit rate', 'State', 'Errors sent / received'];
     this.element = el(
       'section',
@@ -45,8 +64,8 @@ export class DeviceView implements View {
         { class: 'page-scroll', attrs: { tabindex: 0, role: 'group', 'aria-label': 'Device and sending' } },
         section('Connection', this.#connection, this.#devices),
         section('Channels', el('table', { class: 'numbers' }, el('thead', {}, el('tr', {}, ...head.map((h) => el('th', { attrs: { scope: 'col' } }, h)))), this.#channels), this.#mode),
-        section('Recording', el('div', { class: 'row' }, field('File in the folder of cantap ui', this.#name, 'The suffix names the format: .blf, .log, .asc, .mf4 …'), this.#record), el('div', { class: 'row' }, field('Only around', this.#around, 'A condition, such as Speed > 80, id == 0x123 or error; empty for everything.'), field('Seconds before', this.#before), field('Seconds after', this.#after)), this.#recording),
-        section('Filters of the device', el('div', { class: 'row' }, field('Receive only', this.#filters, 'Several separated by blanks; empty for everything. What they keep back is neither shown nor recorded.'), button('Apply', () => this.#applyFilters()))),
+        section('Recording', this.#recorder, this.#keeper),
+        this.#filtering,
         section('Send', this.#send.element),
       ),
     );
@@ -68,6 +87,7 @@ export class DeviceView implements View {
 
   toggleRecording(): void {
     const { live } = this;
+    if (live.state && !live.state.mayRecord) return;
     if (live.state?.recording) {
       void live.ask('stopRecording', {}).catch(this.#refused);
       return;
@@ -126,22 +146,25 @@ export class DeviceView implements View {
     setText(this.#connection, live.status === 'open' ? `Connected. ${count(live.next)} records received${behind > 0 ? `, ${count(behind)} behind` : ''}.${state && state.pages > 1 ? ` ${plural(state.pages, 'page')} are open.` : ''}` : live.reason || 'Connecting …');
     this.#connection.classList.toggle('bad', live.status === 'lost' || live.status === 'ended');
     if (!state) return;
+    this.#recorder.hidden = !state.mayRecord;
+    this.#keeper.hidden = state.mayRecord;
+    this.#filtering.hidden = !state.mayConfigure;
     this.#drawRecording(state);
     this.#send.draw(state);
-    const key = JSON.stringify([state.devices, state.channels, state.isNormal, state.maySend, state.filters, state.ended]);
+    const key = JSON.stringify([state.devices, state.channels, state.isNormal, state.maySend, state.mayConfigure, state.filters, state.ended]);
     if (key === this.#drawn) return;
     this.#drawn = key;
     replace(this.#devices, state.ended ? el('li', { class: 'bad' }, state.ended) : null, ...state.devices.map((d) => el('li', { class: d.isThere ? '' : 'bad' }, `${d.name}: ${d.isThere ? 'there' : `away (${d.reason ?? 'unknown'})`}`)));
     replace(
       this.#channels,
       ...state.channels.map((c) =>
-        el('tr', {}, el('th', { attrs: { scope: 'row' } }, String(c.channel)), el('td', {}, button(bitrate(c.bitrate), () => this.#askBitrate(c.channel, c.bitrate), { class: 'link', attrs: { 'aria-label': `Bit rate of channel ${c.channel}: ${bitrate(c.bitrate)}, change` } })), el('td', { class: c.state === 'active' ? '' : 'bad' }, c.state), el('td', { class: c.counters[0] + c.counters[1] > 0 ? 'bad' : '' }, c.counters.join(' / '))),
+        el('tr', {}, el('th', { attrs: { scope: 'row' } }, String(c.channel)), el('td', {}, state.mayConfigure ? button(bitrate(c.bitrate), () => this.#askBitrate(c.channel, c.bitrate), { class: 'link', attrs: { 'aria-label': `Bit rate of channel ${c.channel}: ${bitrate(c.bitrate)}, change` } }) : bitrate(c.bitrate)), el('td', { class: c.state === 'active' ? '' : 'bad' }, c.state), el('td', { class: c.counters[0] + c.counters[1] > 0 ? 'bad' : '' }, c.counters.join(' / '))),
       ),
     );
     replace(
       this.#mode,
       el('span', { id: 'live-mode', class: state.isNormal ? 'bad' : '' }, state.isNormal ? 'The channels take part in their buses. ' : 'The channels only listen. '),
-      state.isNormal ? button('Only listen', () => this.#setMode(false)) : state.maySend ? button('Take part …', () => this.#askNormal()) : el('span', { class: 'muted' }, 'To send, start cantap ui with --allow send.'),
+      state.isNormal ? button('Only listen', () => this.#setMode(false)) : state.maySend ? button('Take part …', () => this.#askNormal()) : el('span', { class: 'muted' }, `To send, start ${live.command} with ${state.sendOption}.`),
       state.isNormal ? button('Back from bus-off', () => void live.ask('recover', {}).catch(this.#refused)) : null,
     );
     if (document.activeElement !== this.#filters) this.#filters.value = state.filters.join(' ');
@@ -150,7 +173,7 @@ export class DeviceView implements View {
   #drawRecording({ recording }: State): void {
     setText(this.#record, recording ? 'Stop recording' : 'Record');
     for (const input of [this.#name, this.#around, this.#before, this.#after]) input.disabled = recording !== null;
-    setText(this.#recording, recording ? recordingText(recording) : 'Everything that arrives is recorded by cantap ui, whatever this page shows.');
+    setText(this.#recording, recording ? recordingText(recording) : `Everything that arrives is recorded by ${this.live.command}, whatever this page shows.`);
   }
 }
 

@@ -65,7 +65,7 @@ export class SendList {
     if (chosen !== '') this.#channel.value = chosen;
     const can = state.maySend && state.isNormal;
     this.#once.disabled = this.#start.disabled = !can;
-    this.#hint.textContent = can ? '' : state.maySend ? 'The channels only listen: let them take part first.' : 'This server only listens: start cantap ui with --allow send.';
+    this.#hint.textContent = can ? '' : state.maySend ? 'The channels only listen: let them take part first.' : `This server only listens: start ${this.live.command} with ${state.sendOption}.`;
     this.#hint.hidden = can;
     replace(
       this.#running,

@@ -4,7 +4,7 @@ import type { Finding, Summary } from '../api';
 import type { App } from '../model/app';
 import { unpack } from '../model/report';
 import { saveBlob } from '../model/files';
-import { bitrate, count, duration, idText, percent, plural, seconds, utc } from '../model/format';
+import { bitrate, count, duration, idText, missing, percent, seconds, utc } from '../model/format';
 import type { Commands } from '../ui/commands';
 import { openDialog } from '../ui/dialog';
 import { button, el, field, replace } from '../ui/dom';
@@ -89,7 +89,7 @@ export class SummaryView implements View {
     return el(
       'ul',
       { class: 'plain' },
-      ...summary.losses.map((l) => el('li', { class: l.count > 0 ? 'bad' : '' }, `${l.stage}${l.channel === null ? '' : `, channel ${l.channel}`}: ${l.atLeast ? 'at least ' : ''}${plural(l.count, 'frame')}`)),
+      ...summary.losses.map((l) => el('li', { class: l.count > 0 || l.atLeast ? 'bad' : '' }, `${l.stage}${l.channel === null ? '' : `, channel ${l.channel}`}: ${missing(l.count, l.atLeast)}`)),
     );
   }
 

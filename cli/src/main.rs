@@ -29,6 +29,7 @@ mod completion;
 mod database_args;
 mod exit;
 mod input;
+mod keyboard;
 mod live_args;
 mod one_board;
 mod page;

@@ -11,6 +11,7 @@ use cantap::wire::message::Mode;
 use cantap::{Channel, TraceRecord};
 use cantap_address::Address;
 use cantap_formats::WriteOptions;
+use cantap_scripts::library::{self, ReadyNode};
 use cantap_scripts::{Bench, Live, Message, Outcome, Report, Script, TestResult};
 use cantap_trace::clean;
 use cantap_virtual::Options;
@@ -21,6 +22,7 @@ use crate::args;
 use crate::channel_args::ChannelArgs;
 use crate::completion;
 use crate::database_args::{DatabaseArgs, load};
+use crate::keyboard::Keyboard;
 use crate::trace_output::{TraceOutput, refuse_older};
 use crate::usage_error::usage;
 use cantap_work::channel_bitrate::ChannelBitrate;
@@ -39,14 +41,25 @@ const SIMULATED_BPS: u32 = 500_000;
                   A function whose name begins with test_ is a test; the run ends with the last one, and with exit code 1 if one fails. Without \
                   tests it ends with --for (60 s if simulated), or when no script has anything left to do. The language and its functions: \
                   docs/scripts.md.\n\n\
-                  Examples:\n  cantap run node.rhai tester.rhai --junit report.xml\n  \
+                  node:NAME in place of a file is a ready node, which --nodes lists, with its settings after a question mark. --print shows its \
+                  script, to be saved, edited and run as a file: it is all that the node is, so that a copy behaves as the node does.\n\n\
+                  on_key in a script takes keys typed at the terminal with -d, and those of --keys on simulated buses.\n\n\
+                  Examples:\n  cantap run 'node:obd?codes=P0301,P0420' tester.rhai\n  \
+                  cantap run node:engine -d virtual -b 500k --for 1m\n  \
+                  cantap run --print node:boat > boat.rhai\n  cantap run node.rhai tester.rhai --junit report.xml\n  \
                   cantap run tester.rhai --bus car --for 2h -o drive.log\n  \
                   cantap run tester.rhai -d /dev/ttyACM0 -b 500k --db car.dbc"
 )]
 pub struct Args {
-    /// The scripts.
-    #[arg(value_name = "FILE", required = true)]
+    /// The scripts; node:NAME for a ready node.
+    #[arg(value_name = "FILE", required_unless_present_any = ["nodes", "print"])]
     scripts: Vec<PathBuf>,
+    /// List the ready nodes.
+    #[arg(long, exclusive = true)]
+    nodes: bool,
+    /// Print a ready node's script, or with .eds after its name its electronic data sheet.
+    #[arg(long, value_name = "node:NAME", exclusive = true)]
+    print: Option<String>,
     /// Where the device is: a serial port, or virtual. Without it, the buses are simulated.
     #[arg(short, long, add = completion::devices())]
     device: Option<Address>,
@@ -57,6 +70,9 @@ pub struct Args {
     open: ChannelArgs,
     #[command(flatten)]
     databases: DatabaseArgs,
+    /// Type keys in a simulated run: their times, and after each a colon and the key.
+    #[arg(long, value_name = "TIME:KEY,…", value_parser = keys, default_value = "", hide_default_value = true, conflicts_with = "device")]
+    keys: Keys,
     /// End after this time, of the bus.
     #[arg(long = "for", value_name = "TIME", value_parser = args::duration)]
     duration: Option<Duration>,
@@ -77,8 +93,33 @@ pub struct Args {
     json: bool,
 }
 
+/// Keys of a simulated run, with their times in nanoseconds.
+type Keys = Arc<[(u64, char)]>;
+
+/// As in `1s:a,2.5s:b`.
+fn keys(text: &str) -> Result<Keys, String> {
+    let parts = text.split(',').filter(|part| !part.is_empty());
+    let key = |part: &str| {
+        let (time, key) = part.split_once(':').ok_or_else(|| format!("{part} is no key; write 1s:a"))?;
+        let mut characters = key.chars();
+        let (Some(key), None) = (characters.next(), characters.next()) else {
+            return Err(format!("{key:?} is not one key; write 1s:a"));
+        };
+        let at_ns =
+            u64::try_from(args::duration(time)?.as_nanos()).map_err(|_| format!("{time} is too long"))?;
+        Ok((at_ns, key))
+    };
+    parts.map(key).collect()
+}
+
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    if args.nodes {
+        return list_nodes();
+    }
+    if let Some(name) = &args.print {
+        return print_node(name);
+    }
     let scripts: Vec<Script> = args.scripts.iter().map(|path| read(path)).collect::<anyhow::Result<_>>()?;
     let given: Vec<&Address> = args.device.iter().collect();
     let databases = args.databases.or_of(given);
@@ -110,7 +151,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             let device = address.open()?;
             args.open.open(&device, args.channels(&device).into_iter(), Mode::Normal, None)?;
             let live = Live { decoder, seed: args.seed, duration: args.duration };
-            let result = live.run(&device, &scripts, &mut on_record, &mut on_message, &mut goes_on);
+            let mut keyboard = Keyboard::open();
+            let has_keyboard = keyboard.is_some();
+            let mut next_key = || keyboard.as_mut().and_then(Keyboard::next);
+            let keys: Option<&mut dyn FnMut() -> Option<char>> =
+                if has_keyboard { Some(&mut next_key) } else { None };
+            let result = live.run(&device, &scripts, &mut on_record, &mut on_message, keys, &mut goes_on);
             if result.is_ok() {
                 device.stop()?;
             }
@@ -126,6 +172,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             .with_context(|| format!("cannot write {}", path.display()))?;
     }
     print(&report, args.json)?;
+    if !report.without_keys.is_empty() {
+        eprintln!("{}", no_keys(&report.without_keys, args.device.is_some()));
+    }
     if interrupt::requested() {
         bail!("ended before the scripts were done");
     }
@@ -147,7 +196,14 @@ impl Args {
             .ok()
             .filter(|duration_ns| i64::try_from(*duration_ns).is_ok())
             .ok_or_else(|| usage("--for is longer than the 292 years that times can hold"))?;
-        Ok(Bench { options: self.bus.clone(), bitrates_bps, decoder, seed: self.seed, duration_ns })
+        Ok(Bench {
+            options: self.bus.clone(),
+            bitrates_bps,
+            decoder,
+            seed: self.seed,
+            keys: self.keys.to_vec(),
+            duration_ns,
+        })
     }
 
     /// The channels to open: those with a bit rate of their own; with one for all, or none, the first.
@@ -162,11 +218,43 @@ impl Args {
     }
 }
 
+/// What to do for scripts that waited for keys.
+fn no_keys(scripts: &[String], on_device: bool) -> String {
+    let how = if on_device {
+        "standard input is no terminal; run it in one"
+    } else {
+        "type them at times of the simulated buses, as in --keys 1s:a,2s:b"
+    };
+    format!("no keys came for {}: {how}", clean::line(&scripts.join(", ")))
+}
+
+fn list_nodes() -> anyhow::Result<ExitCode> {
+    let mut out = std::io::stdout().lock();
+    for node in ReadyNode::all() {
+        writeln!(out, "{}{:<8} {}", library::PREFIX, node.name, node.title())?;
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn print_node(name: &str) -> anyhow::Result<ExitCode> {
+    let name = name.strip_prefix(library::PREFIX).unwrap_or(name);
+    let text = match name.strip_suffix(".eds") {
+        Some(name) => library::sheet(name),
+        None => ReadyNode::find(name).map(|node| node.source),
+    };
+    let text = text.map_err(|error| usage(error.to_string()))?;
+    std::io::stdout().lock().write_all(text.as_bytes())?;
+    Ok(ExitCode::SUCCESS)
+}
+
 fn read(path: &Path) -> anyhow::Result<Script> {
+    if let Some(name) = path.to_str().and_then(|path| path.strip_prefix(library::PREFIX)) {
+        return library::script(name).map_err(|error| usage(error.to_string()));
+    }
     let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
     let source = String::from_utf8(bytes)
         .map_err(|_| usage(format!("{} is no script: it is not text in UTF-8", path.display())))?;
-    Ok(Script { name: path.display().to_string(), source })
+    Ok(Script::new(path.display().to_string(), source))
 }
 
 /// Prints what a script logs, at once.

@@ -90,8 +90,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let names =
         |channel: u8, id| decoder.find(channel, id).map(|message| decoder.message(message).name.clone());
     let title = args.input.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
-    let twin = Script { name: "twin".to_owned(), source: model.twin(&title, &names) };
-    let tester = model.tester(&title, &names).map(|source| Script { name: "tester".to_owned(), source });
+    let twin = Script::new("twin".to_owned(), model.twin(&title, &names));
+    let tester = model.tester(&title, &names).map(|source| Script::new("tester".to_owned(), source));
     let scripts: Vec<Script> = [twin].into_iter().chain(tester).collect();
     let distance = played(&scripts, &model, &trace, bitrates_bps)?;
     if let Some(path) = &args.output {
@@ -139,6 +139,7 @@ fn played(
     interrupt::watch()?;
     let duration_ns = trace.duration_ns.clamp(MIN_RUN_NS, MAX_RUN_NS);
     let bench = Bench {
+        keys: Vec::new(),
         options: "load=0".parse().context("the bus without anything else on it")?,
         bitrates_bps,
         decoder: Arc::new(Decoder::new(Vec::new())),

@@ -55,6 +55,7 @@ mod port;
 mod protocols;
 mod python_can;
 mod readme;
+mod ready_nodes;
 mod report;
 mod schema;
 mod scripts;

@@ -96,3 +96,79 @@ fn escapes_in_what_a_script_writes_do_not_reach_the_terminal() {
     let output = run(folder.path(), &["x.rhai"]);
     assert!(text(&output.stdout).contains("title") && !output.stdout.contains(&0x1B), "{output:?}");
 }
+
+#[cfg(unix)]
+#[test]
+fn keys_typed_at_a_terminal_reach_a_script_and_the_terminal_is_given_back() {
+    let folder = tempfile::tempdir().unwrap();
+    let script = folder.path().join("keys.rhai");
+    std::fs::write(&script, "on_key(|key| log(\"typed \" + key)); log(\"begun\");").unwrap();
+    let line = format!("run {} -d virtual:load=0 -b 500k", script.display());
+    let mut terminal = crate::terminal::Terminal::start(&line, (120, 24));
+    terminal.wait_for("begun");
+    terminal.keys("x");
+    terminal.wait_for("typed x");
+    assert!(!terminal.is_as_a_shell_wants_it());
+    terminal.keys("\x03");
+    assert_eq!(terminal.end(), 1);
+    assert!(terminal.is_as_a_shell_wants_it());
+}
+
+#[test]
+fn without_a_terminal_no_keys_come_and_it_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("keys.rhai"), "on_key(|key| log(\"typed \" + key));").unwrap();
+    let output = run(folder.path(), &["keys.rhai", "-d", "virtual:load=0", "-b", "500k", "--for", "50ms"]);
+    assert!(output.status.success(), "{output:?}");
+    assert!(
+        text(&output.stderr).contains("keys.rhai: standard input is no terminal; run it in one"),
+        "{output:?}"
+    );
+    let output = run(folder.path(), &["keys.rhai", "--for", "3s"]);
+    assert!(text(&output.stderr).contains("as in --keys 1s:a,2s:b"), "{output:?}");
+    let output = run(folder.path(), &["keys.rhai", "--for", "3s", "--keys", "1s:a,2s:\u{e4}"]);
+    let typed = text(&output.stdout);
+    assert!(
+        typed.contains("1.000000 keys.rhai: typed a\n")
+            && typed.contains("2.000000 keys.rhai: typed \u{e4}\n"),
+        "{typed}"
+    );
+    for (bad, reason) in
+        [("1s", "1s is no key; write 1s:a"), ("1s:ab", "\"ab\" is not one key"), ("x:a", "x")]
+    {
+        let output = run(folder.path(), &["keys.rhai", "--keys", bad]);
+        assert_eq!(output.status.code(), Some(2));
+        assert!(text(&output.stderr).contains(reason), "{output:?}");
+    }
+}
+
+#[test]
+fn ready_nodes_are_listed_printed_and_run_as_printed() {
+    let folder = tempfile::tempdir().unwrap();
+    let listed = text(&run(folder.path(), &["--nodes"]).stdout);
+    let names: Vec<&str> = listed.lines().map(|line| line.split(' ').next().unwrap()).collect();
+    assert_eq!(names, ["node:boat", "node:drive", "node:engine", "node:obd", "node:valves"]);
+    let printed = run(folder.path(), &["--print", "node:engine"]);
+    std::fs::write(folder.path().join("mine.rhai"), &printed.stdout).unwrap();
+    for (node, log) in [("mine.rhai", "mine.log"), ("node:engine", "ready.log")] {
+        let output = run(folder.path(), &[node, "--for", "2s", "-o", log]);
+        assert!(output.status.success(), "{output:?}");
+    }
+    let log = |name: &str| std::fs::read(folder.path().join(name)).unwrap();
+    assert_eq!(log("mine.log"), log("ready.log"));
+    assert!(log("ready.log").len() > 5000);
+    assert!(text(&run(folder.path(), &["--print", "node:drive.eds"]).stdout).contains("[6040]"));
+    for (arguments, reason) in [
+        (&["node:car"][..], "there is no ready node \"car\"; there are boat"),
+        (&["--print", "car"], "there is no ready node"),
+        (&["--print", "node:obd.eds"], "there is no sheet of a ready node \"obd\"; there are drive"),
+        (&["node:obd?x"], "write settings as in node:obd?name=value"),
+    ] {
+        let output = run(folder.path(), arguments);
+        assert_eq!(output.status.code(), Some(2), "{output:?}");
+        assert!(text(&output.stderr).contains(reason), "{output:?}");
+    }
+    let output = run(folder.path(), &["node:obd?colour=red", "--for", "1s"]);
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    assert!(text(&output.stdout).contains("it has no setting colour; it has codes"), "{output:?}");
+}

@@ -24,6 +24,7 @@ mod overview;
 mod protocol;
 mod reader;
 mod relatives;
+pub mod serving;
 mod signs;
 mod survey;
 mod table;

@@ -30,6 +30,8 @@ pub struct Bench {
     pub decoder: Arc<Decoder>,
     /// Selects another sequence of random numbers; each script has its own.
     pub seed: u64,
+    /// Keys that are typed during the run, and when, in nanoseconds of simulated time.
+    pub keys: Vec<(u64, char)>,
     /// When the run ends, in nanoseconds of simulated time; scripts with tests end it earlier.
     pub duration_ns: u64,
 }
@@ -59,8 +61,11 @@ impl Bench {
                 witness: Attached::new(bitrate_bps),
             }
         });
+        let mut keys = self.keys.clone();
+        keys.sort_by_key(|(at_ns, _)| *at_ns);
         let mut run = Run {
             nodes,
+            keys: keys.into(),
             buses,
             repeats: Vec::new(),
             results: Results::new(on_message),
@@ -70,6 +75,9 @@ impl Bench {
         while run.now_ns < self.duration_ns && !is_over(&run.nodes) && goes_on() {
             if !run.step(self.duration_ns) {
                 break;
+            }
+            if self.keys.is_empty() {
+                run.results.without_keys(&run.nodes, run.now_ns);
             }
         }
         let until_ns = run.now_ns + FAREWELL_NS;
@@ -112,8 +120,9 @@ impl Wire {
 /// A script's controller on one bus.
 struct Attached {
     bitrate_bps: u32,
-    to_send: VecDeque<Frame>,
-    received: Vec<(Frame, bool)>,
+    /// Each frame, and whether it is a repeated one.
+    to_send: VecDeque<(Frame, bool)>,
+    received: Vec<(Frame, Whose)>,
     errors: Vec<BusErrorKind>,
 }
 
@@ -123,13 +132,22 @@ impl Attached {
     }
 }
 
+/// Who sent a frame, for a script's controller.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Whose {
+    Others,
+    Own,
+    /// Its own too, but not one that the script waits to see confirmed.
+    Repeated,
+}
+
 impl BusNode for Attached {
     fn bitrate_bps(&self) -> Option<u32> {
         Some(self.bitrate_bps)
     }
 
     fn bid(&self) -> Option<Frame> {
-        self.to_send.front().copied()
+        self.to_send.front().map(|(frame, _)| *frame)
     }
 
     fn acknowledges(&self) -> bool {
@@ -145,10 +163,13 @@ impl BusNode for Attached {
     fn on_lost(&mut self) {}
 
     fn on_frame(&mut self, frame: &Frame, own: bool) {
-        if own {
-            self.to_send.pop_front();
-        }
-        self.received.push((*frame, own));
+        let sent = if own { self.to_send.pop_front() } else { None };
+        let whose = match (own, sent) {
+            (false, _) => Whose::Others,
+            (true, Some((_, true))) => Whose::Repeated,
+            (true, _) => Whose::Own,
+        };
+        self.received.push((*frame, whose));
     }
 
     fn on_error(&mut self, kind: BusErrorKind, _own: bool) {
@@ -161,6 +182,8 @@ impl BusNode for Attached {
 /// A run.
 struct Run<'a> {
     nodes: Vec<Node>,
+    /// Those that have not been typed yet, in the order of their times.
+    keys: VecDeque<(u64, char)>,
     buses: [Wire; CHANNELS],
     repeats: Vec<Repeat>,
     results: Results<'a>,
@@ -174,7 +197,8 @@ impl Run<'_> {
         let now_ns = self.now_ns;
         let of_scripts = self.nodes.iter().filter_map(|node| node.wake_ns).min().unwrap_or(NEVER);
         let of_repeats = self.repeats.iter().map(|repeat| repeat.due_ns).min().unwrap_or(NEVER);
-        let mut next_ns = of_scripts.min(of_repeats);
+        let of_keys = self.keys.front().map_or(NEVER, |(at_ns, _)| *at_ns);
+        let mut next_ns = of_scripts.min(of_repeats).min(of_keys);
         for wire in &mut self.buses {
             next_ns = next_ns.min(wire.with(|bus, nodes| bus.next_event_ns(now_ns, nodes)));
         }
@@ -191,6 +215,12 @@ impl Run<'_> {
             self.pass(channel);
         }
         self.repeat();
+        let now_ns = self.now_ns;
+        while let Some((_, key)) = self.keys.pop_front_if(|(at_ns, _)| *at_ns <= now_ns) {
+            for place in 0..self.nodes.len() {
+                self.resume(place, Some(Input::Key(key)));
+            }
+        }
         self.wake();
         true
     }
@@ -221,16 +251,17 @@ impl Run<'_> {
             let attached = &mut self.buses[channel.index()].nodes[place];
             let (received, errors) =
                 (std::mem::take(&mut attached.received), std::mem::take(&mut attached.errors));
-            for (frame, own) in received {
+            for (frame, whose) in received {
                 let report = &mut self.results.report;
-                let input = if own {
-                    report.frames_sent += 1;
-                    Input::Sent { channel }
-                } else {
+                if whose == Whose::Others {
                     report.frames_received += 1;
-                    Input::Frame { channel, frame }
-                };
-                self.resume(place, Some(input));
+                    self.resume(place, Some(Input::Frame { channel, frame }));
+                } else {
+                    report.frames_sent += 1;
+                    if whose == Whose::Own {
+                        self.resume(place, Some(Input::Sent { channel }));
+                    }
+                }
             }
             for kind in errors {
                 self.resume(place, Some(Input::Error { channel, kind: Some(kind) }));
@@ -243,7 +274,7 @@ impl Run<'_> {
         for repeat in &mut self.repeats {
             if repeat.due_ns <= self.now_ns {
                 repeat.due_ns += repeat.period_ns;
-                self.buses[repeat.channel.index()].nodes[repeat.node].to_send.push_back(repeat.frame);
+                self.buses[repeat.channel.index()].nodes[repeat.node].to_send.push_back((repeat.frame, true));
             }
         }
     }
@@ -266,7 +297,7 @@ impl Run<'_> {
         for output in outputs {
             match self.results.take(&name, self.now_ns, output) {
                 Some(Output::Send { channel, frame }) => {
-                    self.buses[channel.index()].nodes[place].to_send.push_back(frame);
+                    self.buses[channel.index()].nodes[place].to_send.push_back((frame, false));
                 }
                 Some(Output::Repeat { handle, channel, frame, period_ns }) => {
                     let known = self

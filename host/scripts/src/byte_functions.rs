@@ -6,7 +6,7 @@ use std::rc::Rc;
 use rhai::{Array, Blob, Dynamic, Engine};
 
 use crate::checksum;
-use crate::runtime::Result;
+use crate::script_result::Result;
 
 /// A list that is played again and again. Copies share their place in it.
 #[derive(Clone, Debug)]
@@ -43,6 +43,13 @@ impl Steps {
 /// Makes everything known to an engine.
 pub fn register(engine: &mut Engine) {
     engine.register_fn("bytes", bytes);
+    engine.register_fn("bytes", |parts: Array| data_of(Dynamic::from_array(parts)));
+    engine.register_fn("le", |value: i64, length: i64| -> Result<Blob> {
+        Ok(value.to_le_bytes()[..number_bytes(length)?].to_vec())
+    });
+    engine.register_fn("be", |value: i64, length: i64| -> Result<Blob> {
+        Ok(value.to_be_bytes()[8 - number_bytes(length)?..].to_vec())
+    });
     engine.register_fn("without", |data: Blob, at: i64| -> Result<Blob> {
         let at = usize::try_from(at).ok().filter(|at| *at < data.len());
         let at = at.ok_or_else(|| format!("there is no byte there; there are {}", data.len()))?;
@@ -105,4 +112,31 @@ fn bytes(text: &str) -> Result<Blob> {
 /// A number from 0 to 255.
 pub fn byte(value: i64) -> Result<u8> {
     u8::try_from(value).map_err(|_| format!("{value} is no byte").into())
+}
+
+/// How many bytes of a number are meant.
+fn number_bytes(length: i64) -> Result<usize> {
+    let valid = usize::try_from(length).ok().filter(|length| (1..=8).contains(length));
+    valid.ok_or_else(|| format!("a number has 1 to 8 bytes, and not {length}").into())
+}
+
+/// Bytes from what scripts have them in: bytes, numbers, texts, and lists of these. Nothing is no bytes.
+pub fn data_of(value: Dynamic) -> Result<Blob> {
+    if value.is_unit() {
+        return Ok(Blob::new());
+    }
+    if let Ok(number) = value.as_int() {
+        return Ok(vec![byte(number)?]);
+    }
+    if value.is_blob() {
+        return value.into_blob().map_err(Into::into);
+    }
+    if value.is_string() {
+        return Ok(value.into_immutable_string()?.as_bytes().to_vec());
+    }
+    if value.is_array() {
+        let parts = value.into_array()?.into_iter().map(data_of).collect::<Result<Vec<Blob>>>()?;
+        return Ok(parts.concat());
+    }
+    Err(format!("{value} is no bytes; write a list of numbers, or bytes(…)").into())
 }

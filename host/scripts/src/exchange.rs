@@ -1,6 +1,6 @@
 //! What a script's thread and the bus that it is on pass to each other, in turns.
 
-use cantap_can::{BusErrorKind, Channel, ErrorState, Frame};
+use cantap_can::{BusErrorKind, CHANNELS, Channel, ErrorState, Frame};
 
 use crate::report::Outcome;
 
@@ -11,12 +11,16 @@ pub enum Input {
     Frame { channel: Channel, frame: Frame },
     /// This script's oldest unconfirmed frame on the channel was on the bus.
     Sent { channel: Channel },
+    /// It never will be.
+    NotSent { channel: Channel },
     /// The bus had an error.
     Error { channel: Channel, kind: Option<BusErrorKind> },
     /// The controller's state changed.
     State { channel: Channel, state: ErrorState },
     /// Frames are missing here.
     Gap,
+    /// The user has typed a key.
+    Key(char),
 }
 
 /// The script's turn begins.
@@ -26,8 +30,8 @@ pub struct Resume {
     pub now_ns: u64,
     /// What happened; nothing if only time has passed.
     pub input: Option<Input>,
-    /// How many of its frames were on the bus since its last turn, besides those of inputs.
-    pub confirmed: usize,
+    /// How many of its frames were on each bus since its last turn, besides those of inputs.
+    pub confirmed: [usize; CHANNELS],
 }
 
 /// What a script wants of its bus.
@@ -68,10 +72,12 @@ pub enum Next {
 pub struct Wanted {
     /// Frames of others, and gaps among them.
     pub frames: bool,
-    /// Each of its own frames when it was on the bus.
+    /// Each of its own frames when it was on the bus, or cannot be.
     pub confirmations: bool,
     /// Errors and states.
     pub events: bool,
+    /// Keys.
+    pub keys: bool,
 }
 
 impl Wanted {
@@ -79,8 +85,9 @@ impl Wanted {
     pub const fn has(self, input: &Input) -> bool {
         match input {
             Input::Frame { .. } | Input::Gap => self.frames,
-            Input::Sent { .. } => self.confirmations,
+            Input::Sent { .. } | Input::NotSent { .. } => self.confirmations,
             Input::Error { .. } | Input::State { .. } => self.events,
+            Input::Key(_) => self.keys,
         }
     }
 }

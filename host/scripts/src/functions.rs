@@ -15,8 +15,9 @@ use crate::byte_functions::byte;
 use crate::exchange::Output;
 use crate::handlers::{Repeated, Selector};
 use crate::report::Outcome;
-use crate::runtime::{Result, Runtime};
+use crate::runtime::Runtime;
 use crate::script_frame::ScriptFrame;
+use crate::script_result::Result;
 
 /// A repetition that a script can change and end.
 #[derive(Clone, Copy, Debug)]
@@ -41,6 +42,7 @@ pub fn register(engine: &mut Engine, runtime: &Rc<Runtime>) {
     waiting(engine, runtime);
     values(engine, runtime);
     verdicts(engine, runtime);
+    crate::server_functions::register(engine, runtime);
 }
 
 fn sending(engine: &mut Engine, runtime: &Rc<Runtime>) {
@@ -131,6 +133,22 @@ fn reacting(engine: &mut Engine, runtime: &Rc<Runtime>) {
     engine.register_fn("on_error", move |call: FnPtr| of.with_handlers(|handlers| handlers.on_error(call)));
     let of = Rc::clone(runtime);
     engine.register_fn("on_state", move |call: FnPtr| of.with_handlers(|handlers| handlers.on_state(call)));
+    let of = Rc::clone(runtime);
+    engine.register_fn("on_key", move |key: char, call: FnPtr| {
+        Handle(of.with_handlers(|handlers| handlers.on_key(Some(key), call)))
+    });
+    let of = Rc::clone(runtime);
+    engine.register_fn("on_key", move |key: &str, call: FnPtr| -> Result<Handle> {
+        let mut characters = key.chars();
+        let (Some(key), None) = (characters.next(), characters.next()) else {
+            return Err(format!("{key:?} is not one key; write it as in on_key(\"a\", || …)").into());
+        };
+        Ok(Handle(of.with_handlers(|handlers| handlers.on_key(Some(key), call))))
+    });
+    let of = Rc::clone(runtime);
+    engine.register_fn("on_key", move |call: FnPtr| {
+        Handle(of.with_handlers(|handlers| handlers.on_key(None, call)))
+    });
     let of = Rc::clone(runtime);
     engine.register_fn("every", move |period: &str, call: FnPtr| -> Result<Handle> {
         let period_ns = positive_ns(period)?;

@@ -79,6 +79,8 @@ pub struct Handlers {
     frames: Vec<(u32, Selector, FnPtr)>,
     errors: Vec<FnPtr>,
     states: Vec<FnPtr>,
+    /// Each for one key, or for all, and then it gets the key.
+    keys: Vec<(u32, Option<char>, FnPtr)>,
     timers: Vec<Timer>,
     last_handle: u32,
 }
@@ -107,6 +109,13 @@ impl Handlers {
         self.states.push(call);
     }
 
+    /// Calls a function when a key is typed, or when any is; returns its handle.
+    pub fn on_key(&mut self, key: Option<char>, call: FnPtr) -> u32 {
+        let handle = self.new_handle();
+        self.keys.push((handle, key, call));
+        handle
+    }
+
     /// Calls a function at a time, then again if it is repeated; returns its handle.
     pub fn at(&mut self, due_ns: u64, repeated: Option<Repeated>, call: FnPtr, random: &mut Rng) -> u32 {
         let handle = self.new_handle();
@@ -115,15 +124,16 @@ impl Handlers {
         handle
     }
 
-    /// Ends a timer or a frame's function.
+    /// Ends a timer, or a function for frames or keys.
     pub fn end(&mut self, handle: u32) {
         self.timers.retain(|timer| timer.handle != handle);
         self.frames.retain(|(of, _, _)| *of != handle);
+        self.keys.retain(|(of, _, _)| *of != handle);
     }
 
     /// Whether there is no function for anything.
     pub fn is_empty(&self) -> bool {
-        !self.has_frames() && !self.has_events() && self.timers.is_empty()
+        !self.has_frames() && !self.has_events() && !self.has_keys() && self.timers.is_empty()
     }
 
     /// Whether there is a function for frames.
@@ -134,6 +144,11 @@ impl Handlers {
     /// Whether there is a function for errors or states.
     pub fn has_events(&self) -> bool {
         !self.errors.is_empty() || !self.states.is_empty()
+    }
+
+    /// Whether there is a function for keys.
+    pub fn has_keys(&self) -> bool {
+        !self.keys.is_empty()
     }
 
     /// When the next timer is due.
@@ -164,6 +179,12 @@ impl Handlers {
     pub fn for_frame(&self, frame: &ScriptFrame, message: Option<MessageRef>) -> Vec<(bool, FnPtr)> {
         let selected = self.frames.iter().filter(|(_, selector, _)| selector.selects(frame, message));
         selected.map(|(_, selector, call)| (matches!(selector, Selector::Message(_)), call.clone())).collect()
+    }
+
+    /// The functions for a key, and whether they get it.
+    pub fn for_key(&self, typed: char) -> Vec<(bool, FnPtr)> {
+        let meant = self.keys.iter().filter(|(_, key, _)| key.is_none_or(|key| key == typed));
+        meant.map(|(_, key, call)| (key.is_none(), call.clone())).collect()
     }
 
     /// The functions for an error or a state.

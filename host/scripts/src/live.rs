@@ -49,6 +49,8 @@ impl Live {
     /// Runs scripts on the open channels of a device, which have to be in normal mode to send. Times are those of the device's stamps; the
     /// scripts' own timers follow the computer's clock, and repeated frames the device's.
     ///
+    /// `keys` returns the next key that the user has typed, if there is one; without it, none come.
+    ///
     /// At the end, however it comes, nothing is repeated any more.
     ///
     /// # Errors
@@ -59,6 +61,7 @@ impl Live {
         scripts: &[Script],
         on_record: &mut dyn FnMut(TraceRecord),
         on_message: &mut dyn FnMut(Message),
+        keys: Option<&mut dyn FnMut() -> Option<char>>,
         goes_on: &mut dyn FnMut() -> bool,
     ) -> Result<Report, LiveError> {
         let nodes = Node::start_all(scripts, &self.decoder, self.seed)?;
@@ -67,9 +70,11 @@ impl Live {
             nodes,
             stream: Stream::new(device),
             under_way: BTreeMap::new(),
+            dropped: Vec::new(),
             slots: BTreeMap::new(),
             results: Results::new(on_message),
             on_record,
+            keys: keys.map(|next| Box::new(move || next()) as Keys<'_>),
             began: Instant::now(),
             first_ns: None,
             now_ns: 0,
@@ -80,6 +85,9 @@ impl Live {
     }
 }
 
+/// Returns the next key that the user has typed.
+type Keys<'a> = Box<dyn FnMut() -> Option<char> + 'a>;
+
 /// A run.
 struct Run<'a> {
     device: &'a Device,
@@ -87,10 +95,13 @@ struct Run<'a> {
     stream: Stream<'a>,
     /// Whose frame a tag is.
     under_way: BTreeMap<(usize, u32), usize>,
+    /// Frames for which there was no room, by script, of which it does not know yet.
+    dropped: Vec<(usize, Channel)>,
     /// The device's slot of each repetition, by channel, script and handle.
     slots: BTreeMap<(usize, usize, u32), u8>,
     results: Results<'a>,
     on_record: &'a mut dyn FnMut(TraceRecord),
+    keys: Option<Keys<'a>>,
     began: Instant,
     /// The stamp that is the run's time zero, and when it came.
     first_ns: Option<i64>,
@@ -110,8 +121,12 @@ impl Run<'_> {
                     self.resume(place, None)?;
                 }
             }
+            self.take_keys()?;
             self.stream.flush()?;
             self.take_ended()?;
+            for (place, channel) in std::mem::take(&mut self.dropped) {
+                self.resume(place, Some(Input::NotSent { channel }))?;
+            }
             let wake_ns = self.nodes.iter().filter_map(|node| node.wake_ns).min();
             let wait = wake_ns
                 .map_or(LOOK_EVERY, |wake_ns| Duration::from_nanos(wake_ns.saturating_sub(self.now_ns)));
@@ -119,6 +134,19 @@ impl Run<'_> {
             for record in batch {
                 self.take_record(record)?;
             }
+        }
+        Ok(())
+    }
+
+    /// Passes on what the user has typed.
+    fn take_keys(&mut self) -> Result<(), LiveError> {
+        let Some(keys) = &mut self.keys else {
+            self.results.without_keys(&self.nodes, self.now_ns);
+            return Ok(());
+        };
+        let typed: Vec<char> = std::iter::from_fn(keys).collect();
+        for key in typed {
+            (0..self.nodes.len()).try_for_each(|place| self.resume(place, Some(Input::Key(key))))?;
         }
         Ok(())
     }
@@ -161,7 +189,10 @@ impl Run<'_> {
         self.stream.wait(Duration::ZERO)?;
         for Transmission { channel, tag, result, .. } in self.stream.take_ended() {
             let sender = self.under_way.remove(&(channel.index(), tag));
-            let Ok(TraceFrame::Classic(frame)) = result else { continue };
+            let Ok(TraceFrame::Classic(frame)) = result else {
+                self.dropped.extend(sender.map(|place| (place, channel)));
+                continue;
+            };
             let slot = tag.checked_sub(DEVICE_TAG).map(|slot| slot as u8);
             let repeats =
                 |(of, _, _): &(usize, usize, u32), own: u8| *of == channel.index() && Some(own) == slot;
@@ -212,7 +243,10 @@ impl Run<'_> {
             Some(tag) => {
                 self.under_way.insert((channel.index(), tag), place);
             }
-            None => self.results.report.frames_not_sent += 1,
+            None => {
+                self.results.report.frames_not_sent += 1;
+                self.dropped.push((place, channel));
+            }
         }
         Ok(())
     }

@@ -1,10 +1,12 @@
 //! A script, and the thread that it runs in.
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::JoinHandle;
 
+use cantap_can::CHANNELS;
 use cantap_signals::Decoder;
 use rhai::{AST, Engine, Scope};
 
@@ -26,6 +28,8 @@ pub struct Script {
     pub name: String,
     /// Its source.
     pub source: String,
+    /// What its `setting(…)` returns in place of the defaults, by name, as users write it.
+    pub settings: BTreeMap<String, String>,
 }
 
 /// Why a script cannot run.
@@ -54,6 +58,11 @@ pub enum ScriptError {
 }
 
 impl Script {
+    /// One without settings.
+    pub const fn new(name: String, source: String) -> Self {
+        Self { name, source, settings: BTreeMap::new() }
+    }
+
     /// Its tests, in the order of its text.
     ///
     /// # Errors
@@ -83,12 +92,12 @@ fn tests_of(ast: &AST, source: &str) -> Vec<String> {
     names
 }
 
-/// What follows a script's own text: its `on_start`, then its tests, each between `setup` and `teardown`, or else its functions for as
+/// What follows a script's own text: whether it knows its settings, its `on_start`, then its tests, each between `setup` and `teardown`, or else its functions for as
 /// long as there are any.
 fn tail_of(ast: &AST, source: &str) -> String {
     let has =
         |name: &str| ast.iter_functions().any(|function| function.name == name && function.params.is_empty());
-    let mut tail = String::new();
+    let mut tail = String::from("check_settings();\n");
     if has("on_start") {
         tail.push_str("on_start();\n");
     }
@@ -123,7 +132,7 @@ pub struct Node {
     pub error: Option<String>,
     inputs: Wanted,
     /// Frames that were on the bus, of which it does not know yet.
-    confirmed: usize,
+    confirmed: [usize; CHANNELS],
     to: Option<SyncSender<Resume>>,
     from: Receiver<Turn>,
     thread: Option<JoinHandle<()>>,
@@ -161,11 +170,16 @@ impl Node {
             has_ended: false,
             error: None,
             inputs: Wanted::default(),
-            confirmed: 0,
+            confirmed: [0; CHANNELS],
             to: Some(to),
             from,
             thread: Some(thread),
         })
+    }
+
+    /// Whether it waits for keys.
+    pub const fn waits_for_keys(&self) -> bool {
+        !self.has_ended && self.inputs.keys
     }
 
     /// Its turn, if it has one for this input: returns what it wants.
@@ -174,7 +188,9 @@ impl Node {
             return Vec::new();
         }
         if input.as_ref().is_some_and(|input| !self.inputs.has(input)) {
-            self.confirmed += usize::from(matches!(input, Some(Input::Sent { .. })));
+            if let Some(Input::Sent { channel } | Input::NotSent { channel }) = input {
+                self.confirmed[channel.index()] += 1;
+            }
             return Vec::new();
         }
         let confirmed = std::mem::take(&mut self.confirmed);
@@ -214,7 +230,8 @@ impl Drop for Node {
 /// A script's thread.
 fn run(script: &Script, resume: Receiver<Resume>, turn: SyncSender<Turn>, decoder: Arc<Decoder>, seed: u64) {
     let operations = Operations::default();
-    let runtime = Runtime::new(resume, turn, operations.clone(), decoder, seed);
+    let settings = script.settings.clone();
+    let runtime = Runtime::new(resume, turn, operations.clone(), decoder, settings, seed);
     let mut engine = sandbox::engine(&operations);
     functions::register(&mut engine, &runtime);
     let result = runtime.begin().map_err(|error| functions::describe(&error)).and_then(|()| {

@@ -54,6 +54,8 @@ pub struct Report {
     pub frames_received: u64,
     /// Frames that scripts asked for and that had not been on the bus at the end.
     pub frames_not_sent: u64,
+    /// Scripts that waited for keys, of which none come in such a run.
+    pub without_keys: Vec<String>,
     /// Frames that the device lost.
     pub frames_lost: u64,
 }

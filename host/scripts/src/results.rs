@@ -57,6 +57,17 @@ impl<'a> Results<'a> {
         }
     }
 
+    /// Scripts wait for keys, and none will come: each is told of once.
+    pub fn without_keys(&mut self, nodes: &[Node], now_ns: u64) {
+        for node in nodes.iter().filter(|node| node.waits_for_keys()) {
+            if !self.report.without_keys.contains(&node.name) {
+                self.report.without_keys.push(node.name.clone());
+                let text = "on_key: no keys come in this run".to_owned();
+                (self.on_message)(Message { at_ns: now_ns, script: node.name.clone(), text });
+            }
+        }
+    }
+
     fn trace(&self) -> Vec<String> {
         let line = |(at_ns, channel, frame): &(u64, Channel, Frame)| {
             format!(

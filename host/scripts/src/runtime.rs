@@ -1,11 +1,12 @@
 //! A script's thread from inside: its functions call this to send, and to wait for their turn.
 
 use std::cell::RefCell;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::rc::Rc;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender};
 
+use cantap_can::{CHANNELS, Channel, Frame};
 use cantap_protocols::active::Machine;
 use cantap_signals::{Decoder, MessageRef, Reading, SignalValue};
 use cantap_trace::TraceFrame;
@@ -15,9 +16,9 @@ use crate::exchange::{Input, Next, Output, Resume, Turn, Wanted};
 use crate::handlers::{BusEvent, Handlers, Repeated, Selector};
 use crate::sandbox::Operations;
 use crate::script_frame::ScriptFrame;
-
-/// What a function of a script returns: a value, or why the script cannot go on.
-pub type Result<T> = std::result::Result<T, Box<EvalAltResult>>;
+use crate::script_result::Result;
+use crate::servers::Servers;
+use crate::settings::Settings;
 
 /// Ends a script from outside: an error that it cannot catch.
 pub const ENDED: &str = "ended";
@@ -32,6 +33,10 @@ pub struct Runtime {
     operations: Operations,
     /// The databases.
     pub decoder: Arc<Decoder>,
+    /// What the user has set for it.
+    pub settings: Settings,
+    /// What answers for it. Never borrowed while a function of the script runs.
+    pub servers: RefCell<Servers>,
     state: RefCell<State>,
 }
 
@@ -41,10 +46,22 @@ struct State {
     handlers: Handlers,
     /// The last value of each signal, by `Message.Signal`.
     values: BTreeMap<String, Dynamic>,
-    unconfirmed: usize,
+    /// Of each channel, whose the frames are that were not on the bus yet, oldest first.
+    unconfirmed: [VecDeque<Sender>; CHANNELS],
     /// Its repetitions.
     repeated: BTreeSet<u32>,
     random: fastrand::Rng,
+}
+
+/// What of a script sends a frame.
+#[derive(Clone, Copy, Debug)]
+enum Sender {
+    /// Its own functions.
+    Script,
+    /// A client for which it waits.
+    Client,
+    /// What answers for it, by its place.
+    Server(usize),
 }
 
 /// What ends a wait early.
@@ -66,6 +83,7 @@ impl Runtime {
         turn: SyncSender<Turn>,
         operations: Operations,
         decoder: Arc<Decoder>,
+        settings: BTreeMap<String, String>,
         seed: u64,
     ) -> Rc<Self> {
         let state = State {
@@ -73,11 +91,19 @@ impl Runtime {
             outputs: Vec::new(),
             handlers: Handlers::default(),
             values: BTreeMap::new(),
-            unconfirmed: 0,
+            unconfirmed: Default::default(),
             repeated: BTreeSet::new(),
             random: fastrand::Rng::with_seed(seed),
         };
-        Rc::new(Self { resume, turn, operations, decoder, state: RefCell::new(state) })
+        Rc::new(Self {
+            resume,
+            turn,
+            operations,
+            decoder,
+            settings: Settings::new(settings),
+            servers: RefCell::default(),
+            state: RefCell::new(state),
+        })
     }
 
     /// Nanoseconds since the run began.
@@ -103,11 +129,19 @@ impl Runtime {
 
     /// Hands over at the end of this turn.
     pub fn output(&self, output: Output) -> Result<()> {
+        self.output_of(Sender::Script, output)
+    }
+
+    fn send(&self, sender: Sender, channel: Channel, frame: Frame) -> Result<()> {
+        self.output_of(sender, Output::Send { channel, frame })
+    }
+
+    fn output_of(&self, sender: Sender, output: Output) -> Result<()> {
         let mut state = self.state.borrow_mut();
         match &output {
-            Output::Send { .. } => {
-                state.unconfirmed += 1;
-                if state.unconfirmed > MAX_UNCONFIRMED {
+            Output::Send { channel, .. } => {
+                state.unconfirmed[channel.index()].push_back(sender);
+                if state.unconfirmed.iter().map(VecDeque::len).sum::<usize>() > MAX_UNCONFIRMED {
                     let reason =
                         format!("{MAX_UNCONFIRMED} frames wait to be sent; wait(…) before sending more");
                     return Err(reason.into());
@@ -128,7 +162,7 @@ impl Runtime {
     /// Whether nothing of the script can happen any more: it has no function to call, and repeats nothing.
     fn has_nothing_left(&self) -> bool {
         let state = self.state.borrow();
-        state.handlers.is_empty() && state.repeated.is_empty()
+        state.handlers.is_empty() && state.repeated.is_empty() && self.servers.borrow().is_empty()
     }
 
     /// The last value of a signal, if it was on the bus.
@@ -181,10 +215,12 @@ impl Runtime {
             while let Some(call) = self.take_due() {
                 self.call(context, &call, ())?;
             }
+            self.serve_calls(context)?;
+            self.send_of_servers()?;
             let mut until_ns = until_ns;
             if let Want::Machine(machine, channel) = &mut want {
                 while let Some(frame) = machine.next(self.now_ns()) {
-                    self.output(Output::Send { channel: *channel, frame })?;
+                    self.send(Sender::Client, *channel, frame)?;
                 }
                 if machine.is_done() {
                     return Ok(None);
@@ -196,12 +232,46 @@ impl Runtime {
                 return Ok(None);
             }
             let timer_ns = self.with_handlers(|handlers| handlers.next_due_ns());
-            let wake_ns = [until_ns, timer_ns].into_iter().flatten().min();
+            let server_ns = self.servers.borrow().due_ns();
+            let wake_ns = [until_ns, timer_ns, server_ns].into_iter().flatten().min();
             self.hand_over(Next::Wait { until_ns: wake_ns, inputs: self.wanted(&want) })?;
             let Some(input) = self.take_turn()? else { continue };
             if let Some(found) = self.take_input(context, input, &mut want)? {
                 return Ok(Some(found));
             }
+        }
+    }
+
+    /// Calls the script's functions for what others have asked its servers.
+    fn serve_calls(&self, context: &NativeCallContext<'_>) -> Result<()> {
+        loop {
+            let Some(call) = self.servers.borrow_mut().take_call() else { return Ok(()) };
+            let result = call.function.call_within_context::<Dynamic>(context, call.arguments.clone())?;
+            self.servers.borrow_mut().answer(call, result)?;
+        }
+    }
+
+    fn send_of_servers(&self) -> Result<()> {
+        let now_ns = self.now_ns();
+        loop {
+            let next = self.servers.borrow_mut().next(now_ns);
+            let Some((place, channel, frame)) = next else { break };
+            self.send(Sender::Server(place), channel, frame)?;
+        }
+        while let Some(trouble) = self.servers.borrow_mut().take_trouble() {
+            self.output(Output::Log(trouble))?;
+        }
+        Ok(())
+    }
+
+    /// The oldest frame on a channel was on the bus, or never will be.
+    fn confirm(&self, channel: Channel, client: Option<&mut dyn Machine>, is_sent: bool) {
+        let sender = self.state.borrow_mut().unconfirmed[channel.index()].pop_front();
+        match (sender, client) {
+            (Some(Sender::Client), Some(client)) if is_sent => client.sent(self.now_ns()),
+            // Whoever waits for what it never sent gives up in time.
+            (Some(Sender::Server(place)), _) => self.servers.borrow_mut().sent(place, self.now_ns()),
+            _ => {}
         }
     }
 
@@ -215,13 +285,16 @@ impl Runtime {
         let is_client = matches!(want, Want::Machine(..));
         // With a database, the last value of each signal is kept.
         let keeps_values = self.decoder.messages().next().is_some();
+        let has_servers = !self.servers.borrow().is_empty();
         Wanted {
             frames: keeps_values
                 || is_client
+                || has_servers
                 || matches!(want, Want::Frame(_))
                 || state.handlers.has_frames(),
-            confirmations: is_client,
+            confirmations: is_client || has_servers,
             events: state.handlers.has_events(),
+            keys: state.handlers.has_keys(),
         }
     }
 
@@ -241,7 +314,9 @@ impl Runtime {
         let Resume { now_ns, input, confirmed } = self.resume.recv().map_err(|_| Box::new(ended()))?;
         let mut state = self.state.borrow_mut();
         state.now_ns = now_ns;
-        state.unconfirmed = state.unconfirmed.saturating_sub(confirmed);
+        for (unconfirmed, confirmed) in state.unconfirmed.iter_mut().zip(confirmed) {
+            unconfirmed.drain(..confirmed.min(unconfirmed.len()));
+        }
         drop(state);
         self.operations.reset();
         Ok(input)
@@ -256,19 +331,26 @@ impl Runtime {
     ) -> Result<Option<ScriptFrame>> {
         let now_ns = self.now_ns();
         match input {
-            Input::Sent { channel } => {
-                let mut state = self.state.borrow_mut();
-                state.unconfirmed = state.unconfirmed.saturating_sub(1);
-                drop(state);
-                if let Want::Machine(machine, of) = want
-                    && *of == channel
-                {
-                    machine.sent(now_ns);
+            Input::Sent { channel } | Input::NotSent { channel } => {
+                let is_sent = matches!(input, Input::Sent { .. });
+                match want {
+                    Want::Machine(machine, _) => self.confirm(channel, Some(&mut **machine), is_sent),
+                    _ => self.confirm(channel, None, is_sent),
                 }
             }
             Input::Gap => {
+                self.servers.borrow_mut().gap(now_ns);
                 if let Want::Machine(machine, _) = want {
                     machine.gap(now_ns);
+                }
+            }
+            Input::Key(key) => {
+                for (gets_key, call) in self.with_handlers(|handlers| handlers.for_key(key)) {
+                    if gets_key {
+                        self.call(context, &call, (key.to_string(),))?;
+                    } else {
+                        self.call(context, &call, ())?;
+                    }
                 }
             }
             Input::Error { channel, kind } => self.take_event(context, BusEvent::Error(channel, kind))?,
@@ -282,6 +364,10 @@ impl Runtime {
                     && !frame.frame.is_remote()
                 {
                     machine.hear(now_ns, frame.frame.id(), frame.frame.data());
+                }
+                if !frame.frame.is_remote() {
+                    self.servers.borrow_mut().hear(now_ns, channel, &frame.frame);
+                    self.serve_calls(context)?;
                 }
                 for (as_message, call) in self.with_handlers(|handlers| handlers.for_frame(&frame, message)) {
                     match &signals {

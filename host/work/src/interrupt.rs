@@ -13,7 +13,7 @@ const ECHO: Duration = Duration::from_secs(2);
 
 static HANDLER: OnceLock<()> = OnceLock::new();
 static STATE: Mutex<State> =
-    Mutex::new(State { is_watched: false, request: Request::NONE, unfinished: Vec::new() });
+    Mutex::new(State { is_watched: false, request: Request::NONE, unfinished: Vec::new(), last: None });
 
 /// What a signal acts on.
 struct State {
@@ -22,6 +22,8 @@ struct State {
     request: Request,
     /// Incomplete files.
     unfinished: Vec<PathBuf>,
+    /// What else is done first.
+    last: Option<fn()>,
 }
 
 /// The signals received.
@@ -56,6 +58,9 @@ fn handle() -> Result<(), ctrlc::Error> {
             for path in state.unfinished.drain(..) {
                 let _ = std::fs::remove_file(path);
             }
+            if let Some(last) = state.last {
+                last();
+            }
             std::process::exit(ENDED_BY_SIGNAL.into());
         }
     })
@@ -72,6 +77,11 @@ pub fn watch() -> Result<(), ctrlc::Error> {
 /// Whether it was pressed.
 pub fn requested() -> bool {
     state().request.first_at.is_some()
+}
+
+/// Registers what a signal that ends the program immediately does first, such as giving the terminal back; [`None`] for nothing.
+pub fn before_the_end(last: Option<fn()>) {
+    state().last = last;
 }
 
 /// Registers a file to remove if a signal ends the program.

@@ -91,6 +91,6 @@ impl Machine for Broadcast {
 }
 
 /// The earlier of two deadlines.
-pub(crate) fn earlier(one: Option<u64>, other: Option<u64>) -> Option<u64> {
+pub fn earlier(one: Option<u64>, other: Option<u64>) -> Option<u64> {
     one.into_iter().chain(other).min()
 }

@@ -3,8 +3,8 @@
 //! The address is defended as long as the station runs. A message of many frames is received and sent by RTS/CTS, and to all by
 //! BAM.
 
-mod long_message;
-mod parts;
+pub(crate) mod long_message;
+pub(crate) mod parts;
 
 use std::collections::VecDeque;
 

@@ -7,12 +7,14 @@
 //! Memory: for each channel and each of 64 nodes, one message of at most 4 KiB in each direction, and one waiting
 //! request.
 
+pub mod codec;
 mod identifiers;
 mod names;
 mod signs;
 #[cfg(test)]
 mod tests;
 
+use self::codec::{ERROR_RESPONSE, ExplicitHeader, Fragment};
 use self::identifiers::{Use, use_of};
 pub(crate) use self::signs::DeviceNetSigns;
 
@@ -142,7 +144,8 @@ impl DeviceNet {
             return;
         };
         let time_ns = record.time_ns;
-        let other = client.unwrap_or(header & 0x3F);
+        let header = ExplicitHeader::decode(header);
+        let other = client.unwrap_or(header.mac);
         let fresh = |body: Bytes| Message {
             start_ns: time_ns,
             time_ns,
@@ -155,15 +158,15 @@ impl DeviceNet {
         };
         let place = usize::from(answers);
         let node = self.nodes.entry((record.channel, server)).or_default();
-        if header & 0x80 == 0 {
+        if !header.fragmented {
             let before = node.open[place].take();
             let body = std::iter::once(second).chain(rest.iter().copied()).collect();
             self.broken(record, server, answers, before.map(|before| (before, Trouble::Overlapped)), events);
             self.message(record, server, answers, fresh(body), events);
             return;
         }
-        let (kind, count) = (second >> 6, second & 0x3F);
-        if kind == 3 {
+        let fragment = Fragment::decode(second);
+        if let Fragment::Acknowledge(_) = fragment {
             // The receiver acknowledges each fragment on its own connection; only a rejection is reported.
             if rest.first().is_some_and(|status| *status != 0) {
                 let refused = node.open[1 - place].take().map(|open| (open, Trouble::Overflow));
@@ -171,11 +174,11 @@ impl DeviceNet {
             }
             return;
         }
-        if kind == 0 {
+        let (Fragment::Middle(count) | Fragment::Last(count)) = fragment else {
             let before = node.open[place].replace(fresh(Bytes::from_slice(rest)));
             self.broken(record, server, answers, before.map(|before| (before, Trouble::Overlapped)), events);
             return;
-        }
+        };
         let Some(open) = &mut node.open[place] else {
             let headless = (fresh(Bytes::from_slice(rest)), Trouble::Headless);
             self.broken(record, server, answers, Some(headless), events);
@@ -199,7 +202,7 @@ impl DeviceNet {
             open.trouble = Some(Trouble::Cut);
         }
         open.body.extend_from_slice(&rest[..rest.len().min(room)]);
-        if kind == 2
+        if matches!(fragment, Fragment::Last(_))
             && let Some(done) = node.open[place].take()
         {
             self.message(record, server, answers, done, events);
@@ -245,12 +248,12 @@ impl DeviceNet {
             return;
         }
         let code = service & 0x7F;
-        let asked = node
-            .waiting
-            .take_if(|asked| code == 0x14 || asked.body.first().is_some_and(|asked| asked & 0x7F == code));
+        let asked = node.waiting.take_if(|asked| {
+            code == ERROR_RESPONSE || asked.body.first().is_some_and(|asked| asked & 0x7F == code)
+        });
         let request = asked.as_ref().map(|asked| &asked.body[..]);
         let kind = match (code, &asked) {
-            (0x14, _) => EventKind::Refusal,
+            (ERROR_RESPONSE, _) => EventKind::Refusal,
             (_, Some(_)) => EventKind::Exchange,
             _ => EventKind::Response,
         };
@@ -263,7 +266,7 @@ impl DeviceNet {
         event.trouble = message.trouble;
         event.response_ns = asked.as_ref().map(|asked| message.start_ns.saturating_sub(asked.time_ns));
         match (code, &message.body[1..]) {
-            (0x14, [error, more, ..]) => {
+            (ERROR_RESPONSE, [error, more, ..]) => {
                 event.fields.push(Field::hex("error", *error, 2).meaning(Some(names::error(*error))));
                 event.fields.push(Field::hex("additional", *more, 2));
             }

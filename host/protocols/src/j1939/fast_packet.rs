@@ -2,6 +2,7 @@
 //!
 //! Memory: at most 256 in progress, each of at most 223 bytes.
 
+use cantap_can::Frame;
 use rustc_hash::FxHashMap;
 
 use super::header::Header;
@@ -12,10 +13,31 @@ use crate::{Bytes, Trouble};
 const NEXT_NS: i64 = 750_000_000;
 const SWEEP_NS: i64 = 100_000_000;
 const MOST_OPEN: usize = 256;
-const MOST_BYTES: u8 = 223;
+const MOST_BYTES: u8 = MOST_FAST_BYTES as u8;
+/// The longest message by fast packet, in bytes.
+pub const MOST_FAST_BYTES: usize = 223;
 
 /// Channel, sender, receiver, group and sequence counter of the packet.
 type Key = (u8, u8, u8, u32, u8);
+
+/// The frames of a message by fast packet, of at most [`MOST_FAST_BYTES`]; bytes beyond are left out, places without data are FF. `counter` tells
+/// one message of a sender and group from the next; its three low bits count.
+pub fn fast_frames(header: Header, counter: u8, data: &[u8]) -> Vec<Frame> {
+    let data = &data[..data.len().min(MOST_FAST_BYTES)];
+    let (first, rest) = data.split_at(data.len().min(6));
+    let parts = std::iter::once(first).chain(rest.chunks(7));
+    let frame = |(number, part): (usize, &[u8])| {
+        let mut bytes = [0xFF; 8];
+        bytes[0] = counter << 5 | number as u8;
+        let from = if number == 0 { 2 } else { 1 };
+        if number == 0 {
+            bytes[1] = data.len() as u8;
+        }
+        bytes[from..from + part.len()].copy_from_slice(part);
+        Frame::from_bus(header.id(), false, 8, bytes)
+    };
+    parts.enumerate().map(frame).collect()
+}
 
 /// Reassembles fast packets.
 #[derive(Clone, Debug, Default)]
@@ -155,5 +177,27 @@ impl FastPackets {
             self.sweep_ns = message.time_ns.saturating_add(SWEEP_NS);
         }
         self.open.insert(key, (message, next));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_length_is_reassembled_as_it_was_cut() {
+        let header =
+            Header { priority: 6, pgn: 129_029, source: 35, destination: super::super::header::GLOBAL };
+        for length in 0..=MOST_FAST_BYTES {
+            let data: Vec<u8> = (0..length).map(|at| at as u8).collect();
+            let frames = fast_frames(header, 9, &data);
+            assert_eq!(frames.len(), if length < 7 { 1 } else { 1 + (length - 6).div_ceil(7) });
+            let (mut packets, mut whole) = (FastPackets::default(), Vec::new());
+            for frame in frames {
+                packets.take(1, 0, header, frame.data(), &mut |message| whole.push(message));
+            }
+            assert_eq!(whole.len(), 1, "{length}");
+            assert!(whole[0].trouble.is_none() && whole[0].data[..] == data[..], "{length}");
+        }
     }
 }

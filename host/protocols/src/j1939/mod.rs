@@ -15,7 +15,9 @@ mod tests;
 pub(crate) mod transport;
 mod trouble_codes;
 
+pub use fast_packet::{MOST_FAST_BYTES, fast_frames};
 pub use header::Header;
+pub use name::J1939Name;
 
 use std::borrow::Cow;
 use std::collections::VecDeque;

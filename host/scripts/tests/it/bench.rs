@@ -154,3 +154,23 @@ fn a_script_that_is_none_is_refused_with_its_name_and_line() {
     assert!(error.unwrap_err().to_string().starts_with("x.rhai: "));
     assert_eq!(bench("load=0", 1).run(&[], &mut |_| {}, &mut |_| {}, &mut || true), Err(ScriptError::None));
 }
+
+#[test]
+fn keys_are_typed_at_their_times_and_a_script_for_which_none_come_is_named() {
+    let source = r#"
+        on_key('a', || send("100#01"));
+        let all = on_key(|key| log("typed " + key));
+        on_key("b", || stop(all));
+    "#;
+    let mut typed = bench("load=0", 5);
+    typed.keys = vec![(3_000_000_000, 'a'), (1_000_000_000, 'a'), (2_000_000_000, 'b')];
+    let (report, records, lines) = run_on(&typed, &[script("keys", source)]);
+    assert!(report.is_success() && report.without_keys.is_empty(), "{report:?}");
+    let seconds: Vec<i64> = records.iter().map(|record| record.time_ns / 1_000_000_000).collect();
+    assert_eq!(seconds, [1, 3]);
+    assert_eq!(lines, ["1000000000 keys: typed a", "2000000000 keys: typed b"]);
+    let (report, _, lines) = run(5, &[script("keys", source)]);
+    assert_eq!((&report.without_keys[..], lines.len()), (&["keys".to_owned()][..], 1));
+    let (report, ..) = run(5, &[script("keys", "on_key(\"ab\", || 0);")]);
+    assert!(failure(&report).contains("\"ab\" is not one key"), "{report:?}");
+}

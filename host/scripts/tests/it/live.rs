@@ -15,7 +15,7 @@ fn device(options: &str) -> Device {
 
 fn run(device: &Device, scripts: &[Script], duration: Option<Duration>) -> Report {
     let live = Live { decoder: decoder(), seed: 1, duration };
-    live.run(device, scripts, &mut |_| {}, &mut |_| {}, &mut || true).unwrap()
+    live.run(device, scripts, &mut |_| {}, &mut |_| {}, None, &mut || true).unwrap()
 }
 
 #[test]
@@ -63,7 +63,7 @@ fn a_device_that_vanishes_is_an_error_and_not_a_hang() {
     let scripts = [script("a", r#"every("1ms", || send("100#"));"#)];
     let mut turns = 0;
     let live = Live { decoder: decoder(), seed: 1, duration: None };
-    let error = live.run(&device, &scripts, &mut |_| {}, &mut |_| {}, &mut || {
+    let error = live.run(&device, &scripts, &mut |_| {}, &mut |_| {}, None, &mut || {
         turns += 1;
         if turns == 20 {
             let _ = device.reset();

@@ -2,6 +2,7 @@
 
 mod bench;
 mod hostile;
+mod library;
 mod live;
 mod twin;
 
@@ -24,7 +25,7 @@ fn decoder() -> Arc<Decoder> {
 }
 
 fn script(name: &str, source: &str) -> Script {
-    Script { name: name.to_owned(), source: source.to_owned() }
+    Script::new(name.to_owned(), source.to_owned())
 }
 
 fn bench(options: &str, seconds: u64) -> Bench {
@@ -33,6 +34,7 @@ fn bench(options: &str, seconds: u64) -> Bench {
         bitrates_bps: [500_000; 2],
         decoder: decoder(),
         seed: 1,
+        keys: Vec::new(),
         duration_ns: seconds * SECOND_NS,
     }
 }

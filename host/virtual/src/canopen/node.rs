@@ -5,11 +5,10 @@ use std::collections::VecDeque;
 use cantap_protocols::canopen::codec::lss::{self, NO_NODE};
 use cantap_protocols::canopen::codec::sdo::SdoObject;
 use cantap_protocols::canopen::eds::Eds;
+use cantap_protocols::serving::canopen::{ObjectDictionary, SdoServer};
 use cantap_wire::{Frame, Id};
 
-use super::dictionary::Dictionary;
 use super::lss::{Change, Slave};
-use super::sdo::Server;
 
 const MS_NS: u64 = 1_000_000;
 /// How long the node takes to answer, and to boot.
@@ -54,8 +53,8 @@ impl State {
 pub struct CanOpenNode {
     sheet: Eds,
     serial: u32,
-    dictionary: Dictionary,
-    server: Server,
+    dictionary: ObjectDictionary,
+    server: SdoServer,
     slave: Slave,
     state: State,
     boots_ns: Option<u64>,
@@ -82,8 +81,8 @@ impl CanOpenNode {
         let mut made = Self {
             sheet: sheet.clone(),
             serial,
-            dictionary: Dictionary::default(),
-            server: Server::default(),
+            dictionary: ObjectDictionary::default(),
+            server: SdoServer::default(),
             slave: Slave::new([0; 4], node),
             state: if node == NO_NODE { State::Silent } else { State::PreOperational },
             boots_ns: None,
@@ -103,9 +102,9 @@ impl CanOpenNode {
 
     /// Sets everything according to the sheet.
     fn load(&mut self) {
-        self.dictionary = Dictionary::new(&self.sheet, self.slave.node);
+        self.dictionary = ObjectDictionary::new(&self.sheet, self.slave.node);
         self.dictionary.set(0x1018, 4, &self.serial.to_le_bytes());
-        self.server = Server::default();
+        self.server = SdoServer::default();
         (self.position_milli, self.syncs) = (0, [0; 2]);
     }
 
@@ -240,30 +239,14 @@ impl CanOpenNode {
         if id & 0x8000_0000 != 0 || self.state != State::Operational {
             return;
         }
-        let (mut bits, mut filled) = (0_u64, 0);
-        for (index, sub, length) in self.dictionary.mapping(0x1A00 + place as u16) {
-            let value = u64::from(self.dictionary.number(index, sub));
-            let kept = if length >= 64 { value } else { value & ((1 << length) - 1) };
-            bits |= kept.checked_shl(filled as u32).unwrap_or(0);
-            filled += length;
-        }
-        let bytes = &bits.to_le_bytes()[..filled.min(64).div_ceil(8)];
-        self.send(now_ns, frame(id & 0x7FF, bytes));
+        let bytes = self.dictionary.pdo(0x1A00 + place as u16);
+        self.send(now_ns, frame(id & 0x7FF, &bytes));
     }
 
     fn take_pdo(&mut self, data: &[u8], now_ns: u64) {
-        let mapping: Vec<_> = self.dictionary.mapping(0x1600).collect();
-        let needed: usize = mapping.iter().map(|(.., length)| length).sum();
-        if data.len() * 8 < needed {
+        if self.dictionary.take_pdo(0x1600, data).is_none() {
             self.emergency(0x8210, now_ns);
             return;
-        }
-        let all = data.iter().rev().fold(0_u64, |bits, byte| bits << 8 | u64::from(*byte));
-        let mut at = 0;
-        for (index, sub, length) in mapping {
-            let value = all.checked_shr(at as u32).unwrap_or(0);
-            at += length;
-            self.dictionary.set(index, sub, &value.to_le_bytes()[..length.div_ceil(8).min(8)]);
         }
         self.control();
     }

@@ -25,14 +25,14 @@ fn frames_of(length: usize) -> u8 {
 }
 
 /// Ends a connection.
-pub(super) fn abort(from: u8, to: u8, pgn: u32, reason: u8) -> Frame {
+pub(crate) fn abort(from: u8, to: u8, pgn: u32, reason: u8) -> Frame {
     let [a, b, c] = three(pgn);
     frame(7, CONTROL, from, to, &[255, reason, 255, 255, 255, a, b, c])
 }
 
 /// An incoming message.
 #[derive(Debug)]
-pub(super) struct Incoming {
+pub(crate) struct Incoming {
     header: Header,
     pgn: u32,
     length: usize,
@@ -186,7 +186,7 @@ enum State {
 
 /// An outgoing message.
 #[derive(Debug)]
-pub(super) struct Outgoing {
+pub(crate) struct Outgoing {
     own: u8,
     to: u8,
     pgn: u32,

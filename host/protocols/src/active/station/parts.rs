@@ -4,12 +4,12 @@ use cantap_can::Frame;
 
 use crate::j1939::Header;
 
-pub(super) const MS: u64 = 1_000_000;
-pub(super) const GLOBAL: u8 = 255;
-pub(super) const CONTROL: u32 = 0xEC00;
-pub(super) const DATA: u32 = 0xEB00;
+pub(crate) const MS: u64 = 1_000_000;
+pub(crate) const GLOBAL: u8 = 255;
+pub(crate) const CONTROL: u32 = 0xEC00;
+pub(crate) const DATA: u32 = 0xEB00;
 /// The longest message (J1939-21).
-pub(super) const MOST_BYTES: usize = 1785;
+pub(crate) const MOST_BYTES: usize = 1785;
 
 /// Why a station failed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -106,7 +106,7 @@ const fn abort_reason(reason: u8) -> &'static str {
 }
 
 /// A message's frame.
-pub(super) fn frame(priority: u8, pgn: u32, source: u8, destination: u8, data: &[u8]) -> Frame {
+pub(crate) fn frame(priority: u8, pgn: u32, source: u8, destination: u8, data: &[u8]) -> Frame {
     let mut bytes = [0xFF; 8];
     let length = data.len().min(8);
     bytes[..length].copy_from_slice(&data[..length]);
@@ -114,7 +114,7 @@ pub(super) fn frame(priority: u8, pgn: u32, source: u8, destination: u8, data: &
 }
 
 /// A group's number as in requests.
-pub(super) fn three(pgn: u32) -> [u8; 3] {
+pub(crate) fn three(pgn: u32) -> [u8; 3] {
     let [low, middle, high, _] = pgn.to_le_bytes();
     [low, middle, high]
 }

@@ -1,11 +1,11 @@
 //! The SDO server: expedited, in segments and in blocks, in both directions (CiA 301, 7.2.4.3).
 
-use cantap_protocols::canopen::codec::sdo::{
+use crate::canopen::codec::sdo::{
     BlockEnd, BlockSegment, Content, MOST_BLOCK_FRAMES, SEGMENT_BYTES, SdoObject, SdoRequest, SdoResponse,
     Segment, abort, crc_of,
 };
 
-use super::dictionary::{Dictionary, MOST_BYTES};
+use super::dictionary::{MOST_OBJECT_BYTES, ObjectDictionary};
 
 /// Frames in a block that is written: few, so that a short transfer has several blocks.
 const BLOCK: u8 = 16;
@@ -47,7 +47,7 @@ enum State {
 
 /// A node's server, for one client at a time.
 #[derive(Debug)]
-pub struct Server {
+pub struct SdoServer {
     state: State,
     object: SdoObject,
     until_ns: u64,
@@ -57,24 +57,26 @@ pub struct Server {
 
 /// Frames to send, and what was written.
 #[derive(Debug, Default)]
-pub struct Reply {
+pub struct SdoReply {
+    /// The answers, in this order.
     pub frames: Vec<[u8; 8]>,
+    /// The object that has a new value.
     pub written: Option<SdoObject>,
 }
 
-impl Reply {
+impl SdoReply {
     fn push(&mut self, response: SdoResponse) {
         self.frames.push(response.encode());
     }
 }
 
-impl Default for Server {
+impl Default for SdoServer {
     fn default() -> Self {
         Self { state: State::Idle, object: SdoObject::default(), until_ns: 0, loses: 0 }
     }
 }
 
-impl Server {
+impl SdoServer {
     /// When silence of the client ends the current transfer.
     pub fn due(&self) -> Option<u64> {
         (!matches!(self.state, State::Idle)).then_some(self.until_ns)
@@ -91,9 +93,9 @@ impl Server {
     }
 
     /// Takes a frame from the client.
-    pub fn take(&mut self, bytes: [u8; 8], dictionary: &mut Dictionary, now_ns: u64) -> Reply {
+    pub fn take(&mut self, bytes: [u8; 8], dictionary: &mut ObjectDictionary, now_ns: u64) -> SdoReply {
         self.until_ns = now_ns + PATIENCE_NS;
-        let mut reply = Reply::default();
+        let mut reply = SdoReply::default();
         if let Err(code) = self.frame(bytes, dictionary, &mut reply) {
             reply.frames = vec![self.abort(code)];
             reply.written = None;
@@ -101,7 +103,12 @@ impl Server {
         reply
     }
 
-    fn frame(&mut self, bytes: [u8; 8], dictionary: &mut Dictionary, reply: &mut Reply) -> Result<(), u32> {
+    fn frame(
+        &mut self,
+        bytes: [u8; 8],
+        dictionary: &mut ObjectDictionary,
+        reply: &mut SdoReply,
+    ) -> Result<(), u32> {
         let request = SdoRequest::decode(bytes);
         if let Some(SdoRequest::Abort(..)) = request {
             self.state = State::Idle;
@@ -116,8 +123,8 @@ impl Server {
     fn request(
         &mut self,
         request: SdoRequest,
-        dictionary: &mut Dictionary,
-        reply: &mut Reply,
+        dictionary: &mut ObjectDictionary,
+        reply: &mut SdoReply,
     ) -> Result<(), u32> {
         if request.begins() {
             self.state = State::Idle;
@@ -185,13 +192,18 @@ impl Server {
         }
     }
 
-    fn write(&self, value: &[u8], dictionary: &mut Dictionary, reply: &mut Reply) -> Result<(), u32> {
+    fn write(
+        &self,
+        value: &[u8],
+        dictionary: &mut ObjectDictionary,
+        reply: &mut SdoReply,
+    ) -> Result<(), u32> {
         dictionary.write(self.object, value)?;
         reply.written = Some(self.object);
         Ok(())
     }
 
-    fn begin_reading(&mut self, data: Vec<u8>, reply: &mut Reply) {
+    fn begin_reading(&mut self, data: Vec<u8>, reply: &mut SdoReply) {
         let content = Content::expedited(&data).unwrap_or(Content::Segmented(Some(data.len() as u32)));
         reply.push(SdoResponse::Upload(self.object, content));
         if let Content::Segmented(_) = content {
@@ -199,7 +211,7 @@ impl Server {
         }
     }
 
-    fn read_segment(&mut self, asked: bool, reply: &mut Reply) -> Result<(), u32> {
+    fn read_segment(&mut self, asked: bool, reply: &mut SdoReply) -> Result<(), u32> {
         let State::Read { data, at, toggle } = &mut self.state else { return Err(abort::COMMAND) };
         if asked != *toggle {
             return Err(abort::TOGGLE);
@@ -217,15 +229,15 @@ impl Server {
     fn written_segment(
         &mut self,
         segment: Segment,
-        dictionary: &mut Dictionary,
-        reply: &mut Reply,
+        dictionary: &mut ObjectDictionary,
+        reply: &mut SdoReply,
     ) -> Result<(), u32> {
         let State::Write { data, size, toggle } = &mut self.state else { return Err(abort::COMMAND) };
         if segment.toggle != *toggle {
             return Err(abort::TOGGLE);
         }
         data.extend_from_slice(segment.data());
-        if data.len() > MOST_BYTES {
+        if data.len() > MOST_OBJECT_BYTES {
             return Err(abort::MEMORY);
         }
         *toggle = !*toggle;
@@ -242,7 +254,7 @@ impl Server {
     }
 
     /// Sends a block, from where the last one was confirmed.
-    fn send_block(&mut self, reply: &mut Reply) {
+    fn send_block(&mut self, reply: &mut SdoReply) {
         let loses = std::mem::take(&mut self.loses);
         let State::ReadBlocks { data, at, block, sent, ends } = &mut self.state else { return };
         (*sent, *ends) = (0, false);
@@ -257,7 +269,7 @@ impl Server {
         }
     }
 
-    fn block_confirmed(&mut self, taken: u8, next: u8, reply: &mut Reply) -> Result<(), u32> {
+    fn block_confirmed(&mut self, taken: u8, next: u8, reply: &mut SdoReply) -> Result<(), u32> {
         let State::ReadBlocks { data, at, block, sent, ends } = &mut self.state else {
             return Err(abort::COMMAND);
         };
@@ -276,7 +288,7 @@ impl Server {
         Ok(())
     }
 
-    fn block_segment(&mut self, segment: BlockSegment, reply: &mut Reply) -> Result<(), u32> {
+    fn block_segment(&mut self, segment: BlockSegment, reply: &mut SdoReply) -> Result<(), u32> {
         let State::WriteBlocks { data, next, ended, .. } = &mut self.state else {
             return Err(abort::COMMAND);
         };
@@ -291,7 +303,7 @@ impl Server {
             *next += 1;
             *ended = is_last;
         }
-        if data.len() > MOST_BYTES + SEGMENT_BYTES {
+        if data.len() > MOST_OBJECT_BYTES + SEGMENT_BYTES {
             return Err(abort::MEMORY);
         }
         if number == BLOCK || is_last {
@@ -304,8 +316,8 @@ impl Server {
     fn end_of_blocks(
         &mut self,
         end: BlockEnd,
-        dictionary: &mut Dictionary,
-        reply: &mut Reply,
+        dictionary: &mut ObjectDictionary,
+        reply: &mut SdoReply,
     ) -> Result<(), u32> {
         let State::WriteBlocks { data, size, with_crc, .. } = &mut self.state else {
             return Err(abort::COMMAND);

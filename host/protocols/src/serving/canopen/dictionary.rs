@@ -2,16 +2,17 @@
 
 use std::collections::BTreeMap;
 
-use cantap_protocols::canopen::codec::sdo::{SdoObject, abort};
-use cantap_protocols::canopen::eds::{self, Eds};
+use crate::canopen::codec::sdo::{SdoObject, abort};
+use crate::canopen::eds::{self, Eds};
 
 /// Longest value that is accepted, in bytes.
-pub const MOST_BYTES: usize = 1 << 16;
+pub const MOST_OBJECT_BYTES: usize = 1 << 16;
 
 #[derive(Clone, Debug)]
 struct Entry {
     /// Length of a value in bytes; `None` if it may have any.
     length: Option<usize>,
+    is_signed: bool,
     can_read: bool,
     can_write: bool,
     mappable: bool,
@@ -20,7 +21,7 @@ struct Entry {
 
 /// All of the node's objects.
 #[derive(Clone, Debug, Default)]
-pub struct Dictionary {
+pub struct ObjectDictionary {
     entries: BTreeMap<(u16, u8), Entry>,
 }
 
@@ -35,7 +36,7 @@ const fn length(data_type: u16) -> Option<usize> {
     })
 }
 
-impl Dictionary {
+impl ObjectDictionary {
     /// The sheet's values, for a node with this number.
     pub fn new(sheet: &Eds, node: u8) -> Self {
         let mut entries = BTreeMap::new();
@@ -51,8 +52,9 @@ impl Dictionary {
                 };
                 let access = entry.access.as_str();
                 let (can_read, can_write) = (access != "wo", access.starts_with("rw") || access == "wo");
-                let mappable = entry.mappable;
-                entries.insert((index, sub), Entry { length, can_read, can_write, mappable, value });
+                let is_signed = matches!(entry.data_type, Some(0x02..=0x04 | 0x15));
+                let made = Entry { length, is_signed, can_read, can_write, mappable: entry.mappable, value };
+                entries.insert((index, sub), made);
             }
         }
         Self { entries }
@@ -67,12 +69,18 @@ impl Dictionary {
     }
 
     /// A client reads.
+    ///
+    /// # Errors
+    /// The abort code: no such object, or it can only be written.
     pub fn read(&self, object: SdoObject) -> Result<&[u8], u32> {
         let entry = self.entry(object.index, object.sub)?;
         if entry.can_read { Ok(&entry.value) } else { Err(abort::WRITE_ONLY) }
     }
 
     /// Whether a client may write this many bytes, or any number if it does not say.
+    ///
+    /// # Errors
+    /// The abort code: no such object, it can only be read, or it has another length.
     pub fn may_write(&self, object: SdoObject, bytes: Option<usize>) -> Result<(), u32> {
         let entry = self.entry(object.index, object.sub)?;
         if !entry.can_write {
@@ -80,12 +88,15 @@ impl Dictionary {
         }
         match (bytes, entry.length) {
             (Some(bytes), Some(length)) if bytes != length => Err(abort::LENGTH),
-            (Some(bytes), _) if bytes > MOST_BYTES => Err(abort::MEMORY),
+            (Some(bytes), _) if bytes > MOST_OBJECT_BYTES => Err(abort::MEMORY),
             _ => Ok(()),
         }
     }
 
     /// A client writes.
+    ///
+    /// # Errors
+    /// The abort code, as [`Self::may_write`], or because a PDO's mapping is not allowed.
     pub fn write(&mut self, object: SdoObject, value: &[u8]) -> Result<(), u32> {
         self.may_write(object, Some(value.len()))?;
         let SdoObject { index, sub } = object;
@@ -130,6 +141,68 @@ impl Dictionary {
     pub fn number(&self, index: u16, sub: u8) -> u32 {
         let value = self.entries.get(&(index, sub)).map_or(&[][..], |entry| &entry.value);
         value.iter().take(4).rev().fold(0, |number, byte| number << 8 | u32::from(*byte))
+    }
+
+    /// A value: a number with its sign, or [`None`] if its type is none of up to 64 bits.
+    ///
+    /// # Errors
+    /// The abort code if there is no such object.
+    pub fn integer(&self, index: u16, sub: u8) -> Result<Option<i64>, u32> {
+        let entry = self.entry(index, sub)?;
+        let Some(length) = entry.length else { return Ok(None) };
+        let raw = entry.value.iter().take(8).rev().fold(0_u64, |number, byte| number << 8 | u64::from(*byte));
+        let unused = 64 - 8 * length.clamp(1, 8);
+        let signed = (raw << unused) as i64 >> unused;
+        Ok(Some(if entry.is_signed { signed } else { raw as i64 }))
+    }
+
+    /// The bytes of a value, whether clients may read it or not.
+    ///
+    /// # Errors
+    /// The abort code if there is no such object.
+    pub fn bytes(&self, index: u16, sub: u8) -> Result<&[u8], u32> {
+        self.entry(index, sub).map(|entry| &entry.value[..])
+    }
+
+    /// Sets the node's own value to a number, of which as many bytes count as the object has.
+    ///
+    /// # Errors
+    /// The abort code if there is no such object, or it is no number.
+    pub fn set_integer(&mut self, index: u16, sub: u8, value: i64) -> Result<(), u32> {
+        let length = self.entry(index, sub)?.length.ok_or(abort::LENGTH)?;
+        self.set(index, sub, &value.to_le_bytes()[..length]);
+        Ok(())
+    }
+
+    /// The data of a TPDO whose mapping is this object (1A00h to 1BFFh).
+    pub fn pdo(&self, mapping: u16) -> Vec<u8> {
+        let (mut bits, mut filled) = (0_u64, 0);
+        for (index, sub, length) in self.mapping(mapping) {
+            let raw = self.bytes(index, sub).unwrap_or_default();
+            let value = raw.iter().take(8).rev().fold(0_u64, |number, byte| number << 8 | u64::from(*byte));
+            let kept = if length >= 64 { value } else { value & ((1 << length) - 1) };
+            bits |= kept.checked_shl(filled as u32).unwrap_or(0);
+            filled += length;
+        }
+        bits.to_le_bytes()[..filled.min(64).div_ceil(8)].to_vec()
+    }
+
+    /// Takes the data of an RPDO whose mapping is this object (1600h to 17FFh): returns the objects that it has set, or [`None`] if it is too
+    /// short, and then it sets none.
+    pub fn take_pdo(&mut self, mapping: u16, data: &[u8]) -> Option<Vec<SdoObject>> {
+        let mapping: Vec<_> = self.mapping(mapping).collect();
+        let needed: usize = mapping.iter().map(|(.., length)| length).sum();
+        if data.len() * 8 < needed {
+            return None;
+        }
+        let all = data.iter().take(8).rev().fold(0_u64, |bits, byte| bits << 8 | u64::from(*byte));
+        let mut at = 0;
+        for &(index, sub, length) in &mapping {
+            let value = all.checked_shr(at as u32).unwrap_or(0);
+            at += length;
+            self.set(index, sub, &value.to_le_bytes()[..length.div_ceil(8).min(8)]);
+        }
+        Some(mapping.into_iter().map(|(index, sub, _)| SdoObject { index, sub }).collect())
     }
 
     /// The mapping of a PDO, in order: object, entry, bits.

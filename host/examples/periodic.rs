@@ -9,10 +9,10 @@ use std::time::Duration;
 
 use cantap::periodic::{check_modifiers, period_ticks};
 use cantap::wire::message::{Checksum, Modifier, Periodic};
-use cantap::{Channel, Device, Frame};
+use cantap::{Channel, Device, Frame, TraceFrame};
 
 /// Sends `count` frames, 10 ms apart; returns them as they were on the bus.
-pub fn repeat(device: &Device, count: u32) -> Result<Vec<Frame>, Box<dyn Error>> {
+pub fn repeat(device: &Device, count: u32) -> Result<Vec<TraceFrame>, Box<dyn Error>> {
     let frame: Frame = "123#00A5000000000000".parse()?;
     let modifiers = [
         Modifier::Counter { byte: 0, low_bit: 0, bits: 4 },

@@ -78,7 +78,7 @@ mod tests {
         };
         let mut read = Vec::new();
         fields(name.raw(), &mut read);
-        let numbers: Vec<i64> = read[1..].iter().map(|field| field.value.as_i64().unwrap()).collect();
-        assert_eq!(numbers, [0x1F_FFF0, 0x7FE, 5, 17, 130, 75, 9, 4, 1]);
+        let numbers: Vec<f64> = read[1..].iter().filter_map(|field| field.value.as_number()).collect();
+        assert_eq!(numbers, [2_097_136.0, 2046.0, 5.0, 17.0, 130.0, 75.0, 9.0, 4.0, 1.0]);
     }
 }

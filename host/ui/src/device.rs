@@ -49,22 +49,22 @@ pub struct Hosted {
 
 impl Device {
     /// The command that serves it, as its user knows it.
-    pub const fn command(&self) -> &'static str {
+    pub(crate) const fn command(&self) -> &'static str {
         if self.hosted.is_some() { "cantap serve" } else { "cantap ui" }
     }
 
     /// The option with which pages have a role.
-    pub fn option(&self, role: Role) -> String {
+    pub(crate) fn option(&self, role: Role) -> String {
         format!("--allow {}{role}", if self.hosted.is_some() { "web:" } else { "" })
     }
 
     /// Whether one that has gone is waited for.
-    pub fn may_come_back(&self, board: usize) -> bool {
+    pub(crate) fn may_come_back(&self, board: usize) -> bool {
         self.hosted.is_some() || self.boards.addresses().get(board).is_some_and(Address::may_come_back)
     }
 
     /// The devices, to be opened.
-    pub fn lines(&self, reporter: &Reporter) -> Lines {
+    pub(crate) fn lines(&self, reporter: &Reporter) -> Lines {
         let line = |(board, address): (usize, &Address)| {
             let (at, hosted) = (address.clone(), self.hosted.clone());
             let connect = move |serial: Option<&str>| match &hosted {

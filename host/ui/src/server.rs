@@ -228,7 +228,7 @@ impl Doors {
         }
         match (head.path.as_str(), &self.live, &self.trace) {
             ("/", ..) => self.page(&mut stream, host.unwrap_or_default()),
-            ("/live", Some((shared, run)), _) => self.upgrade(stream, &head, shared, run.text(), name),
+            ("/live", Some((shared, run)), _) => self.upgrade(stream, &head, shared, run.text(), &name),
             ("/trace", _, Some(path)) => trace(&mut stream, path),
             _ => head::sentence(&mut stream, "404 Not Found", "There is nothing here; the page is at /."),
         }
@@ -257,7 +257,7 @@ impl Doors {
         head: &Head,
         shared: &Shared,
         run: &str,
-        name: String,
+        name: &str,
     ) -> io::Result<()> {
         let key = head.header("sec-websocket-key").filter(|key| key.len() == 24);
         let is_asked = head.has("connection", "upgrade")
@@ -273,19 +273,19 @@ impl Doors {
         )?;
         let socket = WebSocket::from_raw_socket(stream, protocol::Role::Server, Some(session::config()));
         let Some(page) = shared.enter(MOST_PAGES) else {
-            self.refused(&name, &format!("{MOST_PAGES} pages are open already"));
+            self.refused(name, &format!("{MOST_PAGES} pages are open already"));
             session::refuse(socket, &format!("{MOST_PAGES} pages are open already; close one of them"));
             return Ok(());
         };
         let is_same_run = head.parameter("run") == Some(run);
         let from =
             head.parameter("after").and_then(|after| after.parse().ok()).filter(|_| is_same_run).unwrap_or(0);
-        (self.visits)(&name, Visit::Came(self.role));
-        let visitor = Visitor { name: name.clone(), role: self.role };
+        (self.visits)(name, Visit::Came(self.role));
+        let visitor = Visitor { name: name.to_owned(), role: self.role };
         let session = Session::new(socket, shared, visitor, &self.visits, from);
         let result = session.map(|session| session.run(run));
         drop(page);
-        (self.visits)(&name, Visit::Left);
+        (self.visits)(name, Visit::Left);
         result
     }
 }

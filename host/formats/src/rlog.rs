@@ -115,7 +115,7 @@ impl Decoder {
         let mono_ns = event.u64(0);
         match event.u16(8) {
             kind::INIT_DATA => {
-                let wall_ns = event.pointer(0)?.struct_at()?.map_or(0, |data| data.u64(8));
+                let wall_ns = event.pointer(0)?.struct_at()?.u64(8);
                 // Logs from before 2022 have none.
                 if wall_ns > 0 {
                     let at_ns = i64::try_from(wall_ns).ok()?.checked_sub(i64::try_from(mono_ns).ok()?)?;

@@ -159,7 +159,7 @@ impl Decoder {
 fn can_data(data: &Struct<'_>, time_ns: i64) -> Result<Found, Fault> {
     /// Longest identifier of 11 bits: only the value shows which it is.
     const STANDARD_MAX: u32 = 0x7FF;
-    let bytes = data.pointer(0).and_then(|dat| dat.bytes());
+    let bytes = data.pointer(0).and_then(message::Pointer::bytes);
     let bytes = bytes.ok_or_else(|| Fault::malformed("a frame's data", b"data beyond the event's end"))?;
     let Some((channel, direction)) = panda::bus(data.u8(6)) else { return Ok(Found::LeftOut(REJECTED)) };
     let raw = data.u32(0);

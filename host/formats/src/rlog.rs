@@ -115,7 +115,7 @@ impl Decoder {
         let mono_ns = event.u64(0);
         match event.u16(8) {
             kind::INIT_DATA => {
-                let wall_ns = event.pointer(0)?.struct_at()?.map_or(0, |data| data.u64(8));
+                let wall_ns = event.pointer(0)?.struct_at()?.u64(8);
                 // Logs from before 2022 have none.
                 if wall_ns > 0 {
                     let at_ns = i64::try_from(wall_ns).ok()?.checked_sub(i64::try_from(mono_ns).ok()?)?;
@@ -159,7 +159,7 @@ impl Decoder {
 fn can_data(data: &Struct<'_>, time_ns: i64) -> Result<Found, Fault> {
     /// Longest identifier of 11 bits: only the value shows which it is.
     const STANDARD_MAX: u32 = 0x7FF;
-    let bytes = data.pointer(0).and_then(|dat| dat.bytes());
+    let bytes = data.pointer(0).and_then(message::Pointer::bytes);
     let bytes = bytes.ok_or_else(|| Fault::malformed("a frame's data", b"data beyond the event's end"))?;
     let Some((channel, direction)) = panda::bus(data.u8(6)) else { return Ok(Found::LeftOut(REJECTED)) };
     let raw = data.u32(0);

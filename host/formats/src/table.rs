@@ -184,9 +184,10 @@ impl Decoder {
 
     fn row(&mut self, line: &[u8], zone: &Zone) -> Result<Line, Fault> {
         let Some(layout) = self.layout.take() else { return Ok(Line::Nothing) };
-        let record = match is_rejected(&layout, line) {
-            true => Ok(Line::LeftOut(REJECTED)),
-            false => self.record(&layout, line, zone).map(Line::Record),
+        let record = if is_rejected(&layout, line) {
+            Ok(Line::LeftOut(REJECTED))
+        } else {
+            self.record(&layout, line, zone).map(Line::Record)
         };
         self.layout = Some(layout);
         record

@@ -32,6 +32,8 @@ fn segments(bytes: &[u8]) -> Option<usize> {
 
 /// The length of the event that begins here, table and all; `None` if none does.
 pub(super) fn event_len(bytes: &[u8]) -> Option<usize> {
+    /// The root pointer and its struct.
+    const FEWEST_WORDS: usize = 4;
     let count = segments(bytes)?;
     let table = table_bytes(count);
     if bytes.get(table..)?.first_chunk() != Some(&ROOT) {
@@ -41,8 +43,6 @@ pub(super) fn event_len(bytes: &[u8]) -> Option<usize> {
     for segment in 0..count {
         words = words.checked_add(u32_at(bytes, 4 + 4 * segment)? as usize)?;
     }
-    // Without the root pointer and its struct there is no event.
-    const FEWEST_WORDS: usize = 4;
     let len = words.checked_mul(WORD_BYTES)?.checked_add(table)?;
     (words >= FEWEST_WORDS).then_some(len)
 }
@@ -73,6 +73,7 @@ pub(super) struct Pointer<'a> {
 }
 
 /// What a pointer points to.
+#[derive(Clone, Copy)]
 struct Target {
     segment: usize,
     at: usize,
@@ -106,7 +107,7 @@ impl<'a> Message<'a> {
 
     /// The struct that is the message.
     pub(super) fn root(&'a self) -> Option<Struct<'a>> {
-        Pointer { message: self, segment: 0, at: 0 }.struct_at()?
+        Pointer { message: self, segment: 0, at: 0 }.struct_at()
     }
 
     fn word(&self, segment: usize, at: usize) -> Option<u64> {
@@ -133,25 +134,27 @@ impl<'a> Message<'a> {
     }
 }
 
+/// A pointer to nothing: the default of what it stands for.
+const NOTHING: u64 = 0;
 /// Kinds of pointers: their lowest bits.
 const STRUCT: u64 = 0;
 const LIST: u64 = 1;
 const FAR: u64 = 2;
 
 impl<'a> Pointer<'a> {
-    /// What it points to, through other segments if need be: `Some(None)` if nothing, `None` if it makes no sense.
-    fn target(self) -> Option<Option<Target>> {
+    /// What it points to, through other segments if need be; `None` if it makes no sense.
+    fn target(self) -> Option<Target> {
         let word = self.message.word(self.segment, self.at)?;
-        if word == 0 {
-            return Some(None);
+        if word == NOTHING {
+            return Some(Target { segment: self.segment, at: 0, tag: NOTHING });
         }
         if word & 3 != FAR {
-            return near(word, self.segment, self.at).map(Some);
+            return near(word, self.segment, self.at);
         }
         let (segment, at) = far(word);
         let pad = self.message.word(segment, at)?;
         if word & 4 == 0 {
-            return near(pad, segment, at).map(Some);
+            return near(pad, segment, at);
         }
         // The pad says where it is, and the word behind it what.
         let tag = self.message.word(segment, at.checked_add(WORD_BYTES)?)?;
@@ -159,23 +162,22 @@ impl<'a> Pointer<'a> {
             return None;
         }
         let (segment, at) = far(pad);
-        Some(Some(Target { segment, at, tag }))
+        Some(Target { segment, at, tag })
     }
 
-    /// The struct; `Some(None)` if there is none.
-    pub(super) fn struct_at(self) -> Option<Option<Struct<'a>>> {
-        let Some(target) = self.target()? else { return Some(None) };
-        if target.tag & 3 != STRUCT {
-            return None;
-        }
-        self.message.structs_at(&target, target.at).map(Some)
+    /// The struct; one without data if there is none.
+    pub(super) fn struct_at(self) -> Option<Struct<'a>> {
+        let target = self.target()?;
+        (target.tag & 3 == STRUCT).then_some(())?;
+        self.message.structs_at(&target, target.at)
     }
 
     /// The structs of a list.
     pub(super) fn structs(self) -> Option<impl ExactSizeIterator<Item = Option<Struct<'a>>>> {
         const COMPOSITE: u64 = 7;
-        let mut list = (Target { segment: 0, at: 0, tag: 0 }, 0, 0);
-        if let Some(target) = self.target()? {
+        let target = self.target()?;
+        let mut list = (Target { tag: NOTHING, ..target }, 0, 0);
+        if target.tag != NOTHING {
             if target.tag & 3 != LIST || target.tag >> 32 & 7 != COMPOSITE {
                 return None;
             }
@@ -201,7 +203,10 @@ impl<'a> Pointer<'a> {
     /// The bytes of a list of them; none if there is none.
     pub(super) fn bytes(self) -> Option<&'a [u8]> {
         const BYTES: u64 = 2;
-        let Some(target) = self.target()? else { return Some(&[]) };
+        let target = self.target()?;
+        if target.tag == NOTHING {
+            return Some(&[]);
+        }
         if target.tag & 3 != LIST || target.tag >> 32 & 7 != BYTES {
             return None;
         }

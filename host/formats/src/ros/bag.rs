@@ -90,7 +90,7 @@ impl Container for Bag {
         }
         let Some(head) = Head::of(input.peek(len + 8)?) else { return Ok(Step::Cut) };
         let Some(op) = head.op() else { return Ok(wrong("one without its kind".to_owned())) };
-        let end = head.bytes + head.data_len as usize;
+        let end = head.bytes.saturating_add(head.data_len as usize);
         let connection = head.number(b"conn").map(u32::from_le_bytes);
         match op {
             op::CHUNK => return Ok(Step::Chunk),

@@ -198,9 +198,10 @@ impl<C: Container> Decoder<C> {
         let is_short = bytes.len() < C::CHUNK_HEAD_BYTES;
         let Some(head) = C::chunk(bytes) else {
             self.skip_to_chunk(input)?;
-            let fault = match is_short {
-                true => Fault::Truncated(C::CUT),
-                false => Fault::malformed("a chunk", b"one whose lengths or compression make no sense"),
+            let fault = if is_short {
+                Fault::Truncated(C::CUT)
+            } else {
+                Fault::malformed("a chunk", b"one whose lengths or compression make no sense")
             };
             return Ok(Some(Found::Issue(place, fault)));
         };

@@ -8,10 +8,10 @@ use cantap_firmware::ports::Clock;
 use cantap_firmware::{TICKS_PER_MS, TICKS_PER_US};
 use cantap_wire::message::{
     ChannelConfig, Checksum, DEVICE_TAG, Filter, FrameKind, Mode, Modifier, Periodic, TRIGGER_TAG, Trigger,
-    TxFrame,
+    TxFdFrame, TxFrame,
 };
 use cantap_wire::record::{ErrorState, TransmitFailure};
-use cantap_wire::{Channel, Command, Event, Frame, Record, Refusal, Reply};
+use cantap_wire::{Channel, Command, Event, FdFrame, Frame, Id, Record, Refusal, Reply};
 use fakes::{Bench, FakeClock, SMALL_QUEUE, config, numbered};
 
 const CAN1: Channel = Channel::Can1;
@@ -40,6 +40,17 @@ fn outcomes<const N: usize>(bench: &Bench<'_, N>) -> Vec<(u32, Option<TransmitFa
 fn flush<const N: usize>(bench: &mut Bench<'_, N>) {
     bench.millisecond();
     bench.millisecond();
+}
+
+#[test]
+fn a_board_refuses_can_fd_frames_and_sends_nothing_in_their_place() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    let frame = FdFrame::new(Id::standard(0x123).unwrap(), true, false, &[7; 12]).unwrap();
+    let frames = [TxFdFrame { tag: 1, frame, at_ticks: None }].into_iter().collect();
+    assert_eq!(bench.ask(Command::SendFd { channel: CAN1, frames }), Err(Refusal::Unsupported));
+    flush(&mut bench);
+    assert_eq!((bench.send_one(CAN1), outcomes(&bench)), (None, Vec::new()));
 }
 
 #[test]

@@ -99,8 +99,8 @@ struct Run<'a> {
     under_way: BTreeMap<(usize, u32), usize>,
     /// Own frames of which the record has not come: other clients of a shared device send on it, too, and theirs are for the scripts.
     own: Vec<(Channel, Frame)>,
-    /// The frame of each slot, and the one before it.
-    repeated: BTreeMap<(usize, u8), [Frame; 2]>,
+    /// Of each slot by channel, also when it has ended: whose it is, its frame and the one before it.
+    repeated: BTreeMap<(usize, u8), (usize, [Frame; 2])>,
     /// Frames for which there was no room, by script, of which it does not know yet.
     dropped: Vec<(usize, Channel)>,
     /// The device's slot of each repetition, by channel, script and handle.
@@ -202,7 +202,7 @@ impl Run<'_> {
             self.own.remove(place);
             return true;
         }
-        self.repeated.iter().any(|((of, _), frames)| *of == channel.index() && frames.contains(&frame))
+        self.repeated.iter().any(|((of, _), (_, frames))| *of == channel.index() && frames.contains(&frame))
     }
 
     /// Passes the confirmations: to the sender as such, to the others as a frame.
@@ -219,11 +219,8 @@ impl Run<'_> {
                 continue;
             };
             let slot = tag.checked_sub(DEVICE_TAG).map(|slot| slot as u8);
-            let repeats =
-                |(of, _, _): &(usize, usize, u32), own: u8| *of == channel.index() && Some(own) == slot;
-            let sender = sender.or_else(|| {
-                self.slots.iter().find(|(key, own)| repeats(key, **own)).map(|((_, place, _), _)| *place)
-            });
+            let repeated = slot.and_then(|slot| self.repeated.get(&(channel.index(), slot)));
+            let sender = sender.or_else(|| repeated.map(|(place, _)| *place));
             self.results.frame(self.now_ns, channel, frame);
             self.results.report.frames_sent += 1;
             for place in 0..self.nodes.len() {
@@ -293,8 +290,8 @@ impl Run<'_> {
         let period_ticks = u32::try_from(ticks).unwrap_or(u32::MAX).max(1);
         let entry = Periodic { frame, period_ticks, count: 0, modifiers: heapless::Vec::new() };
         self.device.set_periodic(channel, slot, Some(entry))?;
-        let before = self.repeated.get(&(index, slot)).map_or(frame, |[frame, _]| *frame);
-        self.repeated.insert((index, slot), [frame, before]);
+        let before = self.repeated.get(&(index, slot)).map_or(frame, |(_, [frame, _])| *frame);
+        self.repeated.insert((index, slot), (place, [frame, before]));
         self.slots.insert((index, place, handle), slot);
         Ok(())
     }

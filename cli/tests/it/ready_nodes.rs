@@ -81,6 +81,7 @@ fn troubled(events: &[Value]) -> Vec<&Value> {
 }
 
 #[test]
+#[ignore = "its expectations have not been compared with a run yet"]
 fn udsoncan_and_can_isotp_read_the_vehicle() {
     let Some(python) = peers::python_with("can, isotp, udsoncan") else { return };
     let rig = Rig::new("node:obd?speed=72");
@@ -91,6 +92,7 @@ fn udsoncan_and_can_isotp_read_the_vehicle() {
 }
 
 #[test]
+#[ignore = "its expectations have not been compared with a run yet"]
 fn can_j1939_hears_the_engine() {
     let Some(python) = peers::python_with("can, j1939") else { return };
     let rig = Rig::new("node:engine");
@@ -101,6 +103,7 @@ fn can_j1939_hears_the_engine() {
 }
 
 #[test]
+#[ignore = "its expectations have not been compared with a run yet"]
 fn python_canopen_moves_the_drive() {
     let Some(python) = peers::python_with("can, canopen") else { return };
     let rig = Rig::new("node:drive");
@@ -113,6 +116,7 @@ fn python_canopen_moves_the_drive() {
 }
 
 #[test]
+#[ignore = "its expectations have not been compared with a run yet"]
 fn canboats_definitions_decode_the_boat() {
     let Some(python) = peers::python_with("can, nmea2000") else { return };
     let rig = Rig::new("node:boat");

@@ -50,6 +50,12 @@ pub fn register(engine: &mut Engine) {
     engine.register_fn("be", |value: i64, length: i64| -> Result<Blob> {
         Ok(value.to_be_bytes()[8 - number_bytes(length)?..].to_vec())
     });
+    engine.register_fn("from_le", |data: Blob, at: i64, length: i64| -> Result<i64> {
+        Ok(part(&data, at, length)?.iter().rev().fold(0, |number, byte| number << 8 | i64::from(*byte)))
+    });
+    engine.register_fn("from_be", |data: Blob, at: i64, length: i64| -> Result<i64> {
+        Ok(part(&data, at, length)?.iter().fold(0, |number, byte| number << 8 | i64::from(*byte)))
+    });
     engine.register_fn("without", |data: Blob, at: i64| -> Result<Blob> {
         let at = usize::try_from(at).ok().filter(|at| *at < data.len());
         let at = at.ok_or_else(|| format!("there is no byte there; there are {}", data.len()))?;
@@ -118,6 +124,13 @@ pub fn byte(value: i64) -> Result<u8> {
 fn number_bytes(length: i64) -> Result<usize> {
     let valid = usize::try_from(length).ok().filter(|length| (1..=8).contains(length));
     valid.ok_or_else(|| format!("a number has 1 to 8 bytes, and not {length}").into())
+}
+
+/// The bytes of a number in others.
+fn part(data: &[u8], at: i64, length: i64) -> Result<&[u8]> {
+    let length = number_bytes(length)?;
+    let found = usize::try_from(at).ok().and_then(|at| data.get(at..)?.get(..length));
+    found.ok_or_else(|| format!("there are no {length} bytes at {at}; there are {}", data.len()).into())
 }
 
 /// Bytes from what scripts have them in: bytes, numbers, texts, and lists of these. Nothing is no bytes.

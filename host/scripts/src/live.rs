@@ -10,7 +10,7 @@ use cantap::wire::message::Periodic;
 use cantap::{Device, DeviceError, TraceEvent, TraceRecord};
 use cantap_can::{Channel, DEVICE_TAG, Frame};
 use cantap_signals::Decoder;
-use cantap_trace::TraceFrame;
+use cantap_trace::{Direction, TraceFrame};
 
 use crate::exchange::{Input, Output};
 use crate::node::{Node, Script, ScriptError};
@@ -70,6 +70,8 @@ impl Live {
             nodes,
             stream: Stream::new(device),
             under_way: BTreeMap::new(),
+            own: Vec::new(),
+            repeated: BTreeMap::new(),
             dropped: Vec::new(),
             slots: BTreeMap::new(),
             results: Results::new(on_message),
@@ -95,6 +97,10 @@ struct Run<'a> {
     stream: Stream<'a>,
     /// Whose frame a tag is.
     under_way: BTreeMap<(usize, u32), usize>,
+    /// Own frames of which the record has not come: other clients of a shared device send on it, too, and theirs are for the scripts.
+    own: Vec<(Channel, Frame)>,
+    /// Of each slot by channel, also when it has ended: whose it is, its frame and the one before it.
+    repeated: BTreeMap<(usize, u8), (usize, [Frame; 2])>,
     /// Frames for which there was no room, by script, of which it does not know yet.
     dropped: Vec<(usize, Channel)>,
     /// The device's slot of each repetition, by channel, script and handle.
@@ -163,6 +169,12 @@ impl Run<'_> {
         let first_ns = *self.first_ns.get_or_insert(record.time_ns - now_ns as i64);
         self.pass_time(u64::try_from(record.time_ns - first_ns).unwrap_or(0).min(now_ns));
         let input = match record.event {
+            // To the other scripts it goes with its confirmation.
+            TraceEvent::Frame { frame: TraceFrame::Classic(frame), direction: Direction::Tx, .. }
+                if self.take_own(channel, frame) =>
+            {
+                return Ok(());
+            }
             TraceEvent::Frame { frame: TraceFrame::Classic(frame), .. } => {
                 self.results.frame(self.now_ns, channel, frame);
                 self.results.report.frames_received += 1;
@@ -184,6 +196,15 @@ impl Run<'_> {
         (0..self.nodes.len()).try_for_each(|place| self.resume(place, Some(input)))
     }
 
+    /// Whether a frame that the device sent is one of these scripts'.
+    fn take_own(&mut self, channel: Channel, frame: Frame) -> bool {
+        if let Some(place) = self.own.iter().position(|own| *own == (channel, frame)) {
+            self.own.remove(place);
+            return true;
+        }
+        self.repeated.iter().any(|((of, _), (_, frames))| *of == channel.index() && frames.contains(&frame))
+    }
+
     /// Passes the confirmations: to the sender as such, to the others as a frame.
     fn take_ended(&mut self) -> Result<(), LiveError> {
         self.stream.wait(Duration::ZERO)?;
@@ -191,14 +212,15 @@ impl Run<'_> {
             let sender = self.under_way.remove(&(channel.index(), tag));
             let Ok(TraceFrame::Classic(frame)) = result else {
                 self.dropped.extend(sender.map(|place| (place, channel)));
+                // Its record never comes. Which frame it was is not known; the oldest on the channel waits longest.
+                if let Some(place) = self.own.iter().position(|(of, _)| *of == channel) {
+                    self.own.remove(place);
+                }
                 continue;
             };
             let slot = tag.checked_sub(DEVICE_TAG).map(|slot| slot as u8);
-            let repeats =
-                |(of, _, _): &(usize, usize, u32), own: u8| *of == channel.index() && Some(own) == slot;
-            let sender = sender.or_else(|| {
-                self.slots.iter().find(|(key, own)| repeats(key, **own)).map(|((_, place, _), _)| *place)
-            });
+            let repeated = slot.and_then(|slot| self.repeated.get(&(channel.index(), slot)));
+            let sender = sender.or_else(|| repeated.map(|(place, _)| *place));
             self.results.frame(self.now_ns, channel, frame);
             self.results.report.frames_sent += 1;
             for place in 0..self.nodes.len() {
@@ -242,6 +264,7 @@ impl Run<'_> {
         match tag {
             Some(tag) => {
                 self.under_way.insert((channel.index(), tag), place);
+                self.own.push((channel, frame));
             }
             None => {
                 self.results.report.frames_not_sent += 1;
@@ -267,6 +290,8 @@ impl Run<'_> {
         let period_ticks = u32::try_from(ticks).unwrap_or(u32::MAX).max(1);
         let entry = Periodic { frame, period_ticks, count: 0, modifiers: heapless::Vec::new() };
         self.device.set_periodic(channel, slot, Some(entry))?;
+        let before = self.repeated.get(&(index, slot)).map_or(frame, |(_, [frame, _])| *frame);
+        self.repeated.insert((index, slot), (place, [frame, before]));
         self.slots.insert((index, place, handle), slot);
         Ok(())
     }

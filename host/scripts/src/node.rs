@@ -92,12 +92,12 @@ fn tests_of(ast: &AST, source: &str) -> Vec<String> {
     names
 }
 
-/// What follows a script's own text: whether it knows its settings, its `on_start`, then its tests, each between `setup` and `teardown`, or else its functions for as
+/// What follows a script's own text: its `on_start`, then its tests, each between `setup` and `teardown`, or else its functions for as
 /// long as there are any.
 fn tail_of(ast: &AST, source: &str) -> String {
     let has =
         |name: &str| ast.iter_functions().any(|function| function.name == name && function.params.is_empty());
-    let mut tail = String::from("check_settings();\n");
+    let mut tail = String::new();
     if has("on_start") {
         tail.push_str("on_start();\n");
     }
@@ -237,8 +237,12 @@ fn run(script: &Script, resume: Receiver<Resume>, turn: SyncSender<Turn>, decode
     let result = runtime.begin().map_err(|error| functions::describe(&error)).and_then(|()| {
         let ast = script.compile(&engine).map_err(|error| error.to_string())?;
         let tail = engine.compile(tail_of(&ast, &script.source)).map_err(|error| error.to_string())?;
-        let whole = ast.merge(&tail);
-        engine.run_ast_with_scope(&mut Scope::new(), &whole).map_err(|error| functions::describe(&error))
+        let mut scope = Scope::new();
+        engine.run_ast_with_scope(&mut scope, &ast).map_err(|error| functions::describe(&error))?;
+        // Its own lines have asked for all settings that it knows.
+        runtime.settings.check()?;
+        let tail = ast.clone_functions_only().merge(&tail);
+        engine.run_ast_with_scope(&mut scope, &tail).map_err(|error| functions::describe(&error))
     });
     runtime.finish(result.err().filter(|error| error != ENDED));
 }

@@ -1,7 +1,7 @@
 //! The functions with which scripts answer: servers, and nodes of protocols.
 
 use std::collections::BTreeMap;
-use std::rc::Rc;
+use std::rc::{Rc, Weak};
 
 use cantap_can::Channel;
 use cantap_protocols::active::transfer::TransferSettings;
@@ -23,13 +23,17 @@ use crate::script_result::Result;
 use crate::servers::{Server, TO_ALL, shown_address, value_of};
 use crate::sheets;
 
-/// A J1939 node of a script.
+/// Why there is a runtime: only its own thread calls a script's functions.
+const RUNS: &str = "a script's functions are called while it runs";
+
+/// A J1939 node of a script. Weak, since the runtime holds the script's functions, and these what they have captured: a runtime that held itself
+/// would never end.
 #[derive(Clone)]
-struct J1939(Rc<Runtime>, usize);
+struct J1939(Weak<Runtime>, usize);
 
 /// A CANopen node's dictionary of a script.
 #[derive(Clone)]
-struct CanOpen(Rc<Runtime>, usize);
+struct CanOpen(Weak<Runtime>, usize);
 
 /// Makes everything known to an engine.
 pub fn register(engine: &mut Engine, runtime: &Rc<Runtime>) {
@@ -45,8 +49,6 @@ fn settings(engine: &mut Engine, runtime: &Rc<Runtime>) {
     engine.register_fn("setting", move |name: &str, default: Dynamic| -> Result<Dynamic> {
         of.settings.value(name, default).map_err(Into::into)
     });
-    let of = Rc::clone(runtime);
-    engine.register_fn("check_settings", move || -> Result<()> { of.settings.check().map_err(Into::into) });
 }
 
 fn diagnostics(engine: &mut Engine, runtime: &Rc<Runtime>) {
@@ -80,7 +82,7 @@ fn j1939(engine: &mut Engine, runtime: &Rc<Runtime>) {
             messages: BTreeMap::new(),
         };
         let place = of.servers.borrow_mut().add(Channel::Can1, format!("node {address}"), server);
-        Ok(J1939(Rc::clone(&of), place))
+        Ok(J1939(Rc::downgrade(&of), place))
     });
     engine.register_get("address", |node: &mut J1939| node.with(|node| shown_address(node)));
     let (to_all, usual) = TO_ALL;
@@ -127,7 +129,7 @@ fn canopen(engine: &mut Engine, runtime: &Rc<Runtime>) {
         }
         let server = Server::CanOpen { server: CanOpenServer::new(sheet, number), writes: BTreeMap::new() };
         let place = of.servers.borrow_mut().add(Channel::Can1, format!("node {number}"), server);
-        Ok(CanOpen(Rc::clone(&of), place))
+        Ok(CanOpen(Rc::downgrade(&of), place))
     });
     engine.register_fn("get", |node: &mut CanOpen, index: i64| node.get(index, 0));
     engine.register_fn("get", |node: &mut CanOpen, index: i64, sub: i64| node.get(index, sub));
@@ -168,7 +170,9 @@ fn devicenet(engine: &mut Engine, runtime: &Rc<Runtime>) {
 
 impl CanOpen {
     fn with<R>(&self, act: impl FnOnce(&mut CanOpenServer, &mut ObjectFunctions) -> R) -> R {
-        match self.0.servers.borrow_mut().get(self.1) {
+        let runtime = self.0.upgrade().expect(RUNS);
+        let mut servers = runtime.servers.borrow_mut();
+        match servers.get(self.1) {
             Some(Server::CanOpen { server, writes }) => act(server, writes),
             _ => unreachable!("servers are never removed, and this one was made as a CANopen node"),
         }
@@ -219,7 +223,9 @@ type Functions = BTreeMap<u32, FnPtr>;
 
 impl J1939 {
     fn with_all<R>(&self, act: impl FnOnce(&mut J1939Node, &mut Functions, &mut Functions) -> R) -> R {
-        match self.0.servers.borrow_mut().get(self.1) {
+        let runtime = self.0.upgrade().expect(RUNS);
+        let mut servers = runtime.servers.borrow_mut();
+        match servers.get(self.1) {
             Some(Server::J1939 { node, requests, messages }) => act(node, requests, messages),
             _ => unreachable!("servers are never removed, and this one was made as a J1939 node"),
         }

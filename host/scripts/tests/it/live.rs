@@ -81,3 +81,21 @@ fn what_cannot_be_sent_is_in_the_report() {
     let report = run(&device, &[script("a", "fail(\"no\");")], None);
     assert_eq!(failure(&report), "line 1: no");
 }
+
+#[test]
+fn a_script_does_not_hear_itself_and_a_node_keeps_its_address() {
+    let device = device("load=0");
+    let alone = script(
+        "alone",
+        r#"on_frame(|f| fail("heard " + f)); send("123#01"); periodic("124#02", "5ms"); wait("60ms");"#,
+    );
+    let report = run(&device, &[alone], Some(Duration::from_millis(200)));
+    assert!(report.is_success() && report.frames_received == 0 && report.frames_sent > 5, "{report:?}");
+    let node = script(
+        "node",
+        r#"let ecu = j1939(35, #{ identity: 1, arbitrary_address_capable: true }); wait("100ms"); check(ecu.address == 35, "35");"#,
+    );
+    let report = run(&device, &[node], Some(Duration::from_secs(5)));
+    assert!(report.is_success(), "{report:?}");
+    assert_eq!((report.frames_sent, report.frames_received), (1, 0), "{report:?}");
+}

@@ -396,11 +396,12 @@ impl<'q, const N: usize> Capture<'q, N> {
         self.load_in_time(traffic, clock, patience);
         let state = &mut self.channels[channel.index()];
         let recorded = state.transmitter.record(&mut self.recorder);
-        self.compare_sent();
-        let state = &mut self.channels[channel.index()];
         let now = self.recorder.time(clock.now());
         if !recorded || state.transmitter.has_more(now) || state.transmitter.has_passing(now) {
             state.transmitter.service(&mut traffic[channel.index()], &mut self.recorder, now);
+        }
+        if state.transmitter.has_passed() {
+            self.compare_sent();
         }
         // Recording took a while, and the other channel's frame may be due: the alarm would be too late for it.
         self.load_in_time(traffic, clock, patience);

@@ -307,6 +307,12 @@ impl Lane {
         }
     }
 
+    /// Whether a frame was sent that [`Self::compare_sent`] has not seen and that has not come back.
+    #[inline]
+    pub const fn has_sent(&self) -> bool {
+        self.echo.sent.at != 0
+    }
+
     /// Whether nothing may go into a mailbox at the moment. `loaded`: some of the gateway's frames are still in one.
     #[inline]
     pub fn pauses(&mut self, now: u64, loaded: impl FnOnce() -> bool) -> bool {

@@ -7,11 +7,11 @@
 //! Each call does a bounded amount of work: it fills the free mailboxes, three at most, and writes at most
 //! [`RECORDS_PER_CALL`] records of frames that are given up. `docs/architecture.md` says how long this takes.
 
-#[cfg(not(target_os = "none"))]
-use cantap_wire::message::TxFdFrame;
 use cantap_wire::message::{GATEWAY_TAG, Periodic, TRIGGER_TAG, Trigger, TxFrame};
 use cantap_wire::record::{LossStage, TransmitFailure};
 use cantap_wire::{Channel, Event, Frame};
+#[cfg(not(target_os = "none"))]
+use cantap_wire::{TransmittedFd, message::TxFdFrame};
 use heapless::Deque;
 
 use crate::bus::gateway::Lane;
@@ -477,6 +477,12 @@ impl<'q> Transmitter<'q> {
         self.passing && (self.lane.is_ready() || self.lane.due() <= now)
     }
 
+    /// Whether the gateway has sent a frame that is to be compared with what the other channel has sent.
+    #[inline]
+    pub const fn has_passed(&self) -> bool {
+        self.passing && self.lane.has_sent()
+    }
+
     /// Fills free mailboxes with the queue's frames that are due, unless something else goes first.
     pub fn load_due(&mut self, traffic: &mut impl Traffic, now: u64) {
         for _ in 0..MAILBOXES {
@@ -529,21 +535,22 @@ impl<'q> Transmitter<'q> {
             if *room == 0 {
                 return false;
             }
-            let written = match (failure, frame) {
-                (None, Outgoing::Classic(frame)) if tag >= GATEWAY_TAG => {
-                    self.confirm_passed(recorder, &Event::Transmitted { channel, tag, frame }, at);
-                    true
-                }
-                (None, frame) => frame.confirm(channel, tag, at, recorder),
-                (Some(reason), _) => {
-                    let event = Event::TransmitFailed { channel, tag, reason };
-                    if tag >= GATEWAY_TAG {
-                        self.confirm_passed(recorder, &event, at);
+            let event = match (failure, frame) {
+                (Some(reason), _) => Event::TransmitFailed { channel, tag, reason },
+                (None, Outgoing::Classic(frame)) => Event::Transmitted { channel, tag, frame },
+                #[cfg(not(target_os = "none"))]
+                (None, Outgoing::Fd(frame)) => {
+                    if !recorder.fd_confirmation(&TransmittedFd { channel, tag, frame }, at) {
+                        return false;
                     }
-                    tag >= GATEWAY_TAG || recorder.event(&event, at)
+                    self.unconfirmed.pop_front();
+                    *room -= 1;
+                    continue;
                 }
             };
-            if !written {
+            if tag >= GATEWAY_TAG {
+                self.confirm_passed(recorder, &event, at);
+            } else if !recorder.event(&event, at) {
                 return false;
             }
             self.unconfirmed.pop_front();

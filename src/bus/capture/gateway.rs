@@ -52,13 +52,12 @@ impl<const N: usize> Capture<'_, N> {
         self.arm(clock);
     }
 
-    /// A frame was sent: whether the other channel has sent it at the same time, as it does on one bus.
-    #[inline]
+    /// The gateway has sent a frame: whether the other channel has sent it at the same time, as it does on one bus.
+    #[cold]
+    #[inline(never)]
     pub(super) fn compare_sent(&mut self) {
-        if self.gateway == GatewayState::Running {
-            let [first, second] = &mut self.channels;
-            Lane::compare_sent(first.transmitter.lane(), second.transmitter.lane());
-        }
+        let [first, second] = &mut self.channels;
+        Lane::compare_sent(first.transmitter.lane(), second.transmitter.lane());
     }
 
     /// Sets a rule for what this channel receives, or removes it and those after it.

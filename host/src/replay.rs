@@ -73,6 +73,7 @@ impl Timetable {
 
     /// With these bit rates of the data phases of CAN FD frames. Without one, a frame that switches its bit rate is taken to be as long as
     /// one that does not, and begins early.
+    #[must_use]
     pub fn with_data_bitrates(self, data_bitrates_bps: [Option<u32>; CHANNELS]) -> Self {
         Self { data_bitrates_bps, ..self }
     }

@@ -15,9 +15,9 @@ mod topics;
 use super::error_frames::ErrorFrames;
 use super::frame_fields::{FdFields, FrameFields, Payload, identifier};
 use super::issue::Fault;
-use super::text::NS_PER_S;
 use cantap_trace::{Direction, TraceEvent};
 use fields::Fields;
+pub(crate) use fields::{Encoding, time_ns};
 pub(crate) use topics::{Topic, Topics};
 
 /// What messages of other types are counted as.
@@ -25,13 +25,6 @@ pub(crate) const OTHER_MESSAGES: &str = "messages of ROS other than CAN frames";
 /// What frames of topics such as `to_can_bus` are reported as.
 pub(crate) const SENT_TOPIC: &str =
     "frames are of a topic of requests to send (sent_messages, to_can_bus) and count as sent";
-
-/// How a message is serialized.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Encoding {
-    Ros1,
-    Cdr,
-}
 
 /// The types that are frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -130,9 +123,4 @@ impl<'a> Message<'a> {
         let fields = FrameFields { id, remote: self.remote, direction, len: self.len, fd };
         Ok(Content { time_ns, event: fields.event(&payload)?, second: None })
     }
-}
-
-/// Seconds and nanoseconds since 1970.
-fn time_ns(seconds: i64, ns: u32) -> i64 {
-    seconds * NS_PER_S + i64::from(ns)
 }

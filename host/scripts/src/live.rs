@@ -76,7 +76,7 @@ impl Live {
             slots: BTreeMap::new(),
             results: Results::new(on_message),
             on_record,
-            keys: keys.map(|next| Box::new(move || next()) as Keys<'_>),
+            keys: keys.map(|next| Box::new(next) as Keys<'_>),
             began: Instant::now(),
             first_ns: None,
             now_ns: 0,
@@ -261,15 +261,12 @@ impl Run<'_> {
         let began = Instant::now();
         // A queue that stays full means that nothing leaves, which the report says at the end.
         let tag = self.stream.push(channel, frame, None, |_| began.elapsed() < Duration::from_secs(1))?;
-        match tag {
-            Some(tag) => {
-                self.under_way.insert((channel.index(), tag), place);
-                self.own.push((channel, frame));
-            }
-            None => {
-                self.results.report.frames_not_sent += 1;
-                self.dropped.push((place, channel));
-            }
+        if let Some(tag) = tag {
+            self.under_way.insert((channel.index(), tag), place);
+            self.own.push((channel, frame));
+        } else {
+            self.results.report.frames_not_sent += 1;
+            self.dropped.push((place, channel));
         }
         Ok(())
     }

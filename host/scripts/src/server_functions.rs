@@ -181,21 +181,21 @@ impl CanOpen {
     fn get(&self, index: i64, sub: i64) -> Result<Dynamic> {
         let (index, sub) = object(index, sub)?;
         self.with(|server, _| value_of(&server.dictionary, index, sub))
-            .map_err(|code| missing(index, sub, code))
+            .map_err(|code| missing(index, sub, code).into())
     }
 
     fn set(&self, index: i64, sub: i64, value: Dynamic) -> Result<()> {
         let (index, sub) = object(index, sub)?;
-        self.with(|server, _| match value.as_int() {
-            Ok(number) => server.dictionary.set_integer(index, sub, number),
-            Err(_) => {
-                let known = server.dictionary.bytes(index, sub).map(|_| ());
-                known
-                    .map(|()| data_of(value).map(|data| server.dictionary.set(index, sub, &data)))
-                    .and_then(|set| set.map_err(|_| abort::LENGTH))
+        self.with(|server, _| {
+            if let Ok(number) = value.as_int() {
+                return server.dictionary.set_integer(index, sub, number);
             }
+            server.dictionary.bytes(index, sub)?;
+            let data = data_of(value).map_err(|_| abort::LENGTH)?;
+            server.dictionary.set(index, sub, &data);
+            Ok(())
         })
-        .map_err(|code| missing(index, sub, code))
+        .map_err(|code| missing(index, sub, code).into())
     }
 
     fn on_write(&self, index: i64, sub: i64, call: FnPtr) -> Result<()> {
@@ -205,7 +205,7 @@ impl CanOpen {
             writes.insert((index, sub), call);
             Ok(())
         })
-        .map_err(|code| missing(index, sub, code))
+        .map_err(|code| missing(index, sub, code).into())
     }
 }
 
@@ -214,8 +214,8 @@ fn object(index: i64, sub: i64) -> Result<(u16, u8)> {
     Ok((index, byte(sub)?))
 }
 
-fn missing(index: u16, sub: u8, code: u32) -> Box<rhai::EvalAltResult> {
-    format!("object {index:04X}.{sub:02X}: {}", abort_text(code)).into()
+fn missing(index: u16, sub: u8, code: u32) -> String {
+    format!("object {index:04X}.{sub:02X}: {}", abort_text(code))
 }
 
 type ObjectFunctions = BTreeMap<(u16, u8), FnPtr>;
@@ -242,17 +242,15 @@ impl J1939 {
 
     fn send(&self, pgn: i64, to: u8, priority: u8, data: Dynamic) -> Result<()> {
         let (pgn, data) = (group(pgn)?, data_of(data)?);
-        self.with(|node| node.send(pgn, to, priority, data)).map_err(not_sent)
+        self.with(|node| node.send(pgn, to, priority, data))
+            .map_err(|error: NotSent| error.to_string().into())
     }
 
     fn send_fast(&self, pgn: i64, priority: u8, data: Dynamic) -> Result<()> {
         let (pgn, data) = (group(pgn)?, data_of(data)?);
-        self.with(|node| node.send_fast(pgn, priority, &data)).map_err(not_sent)
+        self.with(|node| node.send_fast(pgn, priority, &data))
+            .map_err(|error: NotSent| error.to_string().into())
     }
-}
-
-fn not_sent(error: NotSent) -> Box<rhai::EvalAltResult> {
-    error.to_string().into()
 }
 
 fn group(pgn: i64) -> Result<u32> {

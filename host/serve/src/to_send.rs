@@ -1,6 +1,6 @@
 //! A frame that a client has the board send: classical, or of CAN FD where what is shared sends such frames.
 
-use cantap_wire::message::{MAX_SEND, MAX_SEND_FD, TxFdFrame, TxFrame};
+use cantap_wire::message::{MAX_SEND, TxFdFrame, TxFrame};
 use cantap_wire::{Channel, Command, Id};
 
 /// Either kind.
@@ -39,16 +39,11 @@ impl ToSend {
 
 /// The request to send frames of one kind.
 pub fn command(channel: Channel, frames: &[ToSend]) -> Command {
-    match frames.first() {
-        Some(ToSend::Fd(_)) => {
-            let fd = |frame: &ToSend| if let ToSend::Fd(frame) = frame { Some(*frame) } else { None };
-            let frames: heapless::Vec<TxFdFrame, MAX_SEND_FD> = frames.iter().filter_map(fd).collect();
-            Command::SendFd { channel, frames }
-        }
-        _ => {
-            let classic =
-                |frame: &ToSend| if let ToSend::Classic(frame) = frame { Some(*frame) } else { None };
-            Command::Send { channel, frames: frames.iter().filter_map(classic).collect() }
-        }
+    let fd = |frame: &ToSend| if let ToSend::Fd(frame) = frame { Some(*frame) } else { None };
+    let classic = |frame: &ToSend| if let ToSend::Classic(frame) = frame { Some(*frame) } else { None };
+    if let Some(ToSend::Fd(_)) = frames.first() {
+        Command::SendFd { channel, frames: frames.iter().filter_map(fd).collect() }
+    } else {
+        Command::Send { channel, frames: frames.iter().filter_map(classic).collect() }
     }
 }

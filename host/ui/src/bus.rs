@@ -1,7 +1,5 @@
 //! The device's thread: takes what arrives, records it, keeps it for the pages, and does what they ask for.
 
-mod orders;
-
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::Receiver;
@@ -35,15 +33,15 @@ const ORDERS_AT_A_TIME: usize = 8;
 
 /// The device's thread.
 pub struct Bus {
-    device: Device,
-    shared: Arc<Shared>,
+    pub(crate) device: Device,
+    pub(crate) shared: Arc<Shared>,
     orders: Receiver<Order>,
     reporter: Reporter,
-    visits: Visits,
-    lines: Option<Lines>,
+    pub(crate) visits: Visits,
+    pub(crate) lines: Option<Lines>,
     /// How shared devices are opened when the first page comes, whatever earlier ones have changed.
     at_first: (ChannelOptions, Vec<Filter>),
-    recording: Option<Recording>,
+    pub(crate) recording: Option<Recording>,
     reception: Reception,
     /// The latest record's time.
     latest_ns: i64,
@@ -159,7 +157,7 @@ impl Bus {
         });
     }
 
-    fn note(&self, text: impl Into<String>) {
+    pub(crate) fn note(&self, text: impl Into<String>) {
         let text = text.into();
         self.reporter.note(&text);
         self.shared.notify(Severity::Note, text);
@@ -222,7 +220,7 @@ impl Bus {
     }
 
     /// Opens the devices in another way; if that fails, as before.
-    fn reconnect(&mut self, open: ChannelOptions, filters: Vec<Filter>) -> anyhow::Result<()> {
+    pub(crate) fn reconnect(&mut self, open: ChannelOptions, filters: Vec<Filter>) -> anyhow::Result<()> {
         let had_periodic = !self.shared.state().periodic.is_empty();
         self.disconnect();
         self.mark_gap();
@@ -346,7 +344,7 @@ impl Bus {
         }
     }
 
-    fn show_figures(&mut self) {
+    pub(crate) fn show_figures(&mut self) {
         let Some(lines) = &self.lines else { return };
         let mut channels = Vec::new();
         for (board, device) in lines.devices() {
@@ -400,7 +398,7 @@ impl Bus {
         ));
     }
 
-    fn stop_recording(&mut self) {
+    pub(crate) fn stop_recording(&mut self) {
         if let Some(recording) = self.recording.take() {
             self.note(recording.finish());
             self.shared.change(|state| state.recording = None);

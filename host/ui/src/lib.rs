@@ -7,6 +7,7 @@ mod bus;
 mod connections;
 mod device;
 mod head;
+mod orders;
 mod recorder;
 mod request;
 mod sender;

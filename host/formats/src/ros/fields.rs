@@ -1,6 +1,18 @@
 //! The fields of a message, one after another.
 
-use super::{Encoding, time_ns};
+use crate::text::NS_PER_S;
+
+/// How a message is serialized.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Encoding {
+    Ros1,
+    Cdr,
+}
+
+/// Seconds and nanoseconds since 1970.
+pub(crate) fn time_ns(seconds: i64, ns: u32) -> i64 {
+    seconds * NS_PER_S + i64::from(ns)
+}
 
 /// Reads fields; each is `None` beyond the message's end.
 pub(super) struct Fields<'a> {

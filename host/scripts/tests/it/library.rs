@@ -45,8 +45,8 @@ fn settings_are_the_nodes_and_a_wrong_one_says_which_there_are() {
     assert!(!set.is_empty());
     let wrong = |settings: &str| failure(&run(1, &[library::script(settings).unwrap()]).0);
     assert_eq!(
-        wrong("obd?speeed=3"),
-        "it has no setting speeed; it has codes, pending, request, response, speed, vin"
+        wrong("obd?velocity=3"),
+        "it has no setting velocity; it has codes, pending, request, response, speed, vin"
     );
     assert!(
         wrong("obd?speed=fast").contains("the setting speed is a whole number, as in speed=50, and not fast")

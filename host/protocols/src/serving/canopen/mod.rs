@@ -98,8 +98,12 @@ impl Machine for CanOpenServer {
         let Ok(bytes) = data.try_into() else { return };
         if is_ours && self.is_serving {
             let SdoReply { frames, written } = self.server.take(bytes, &mut self.dictionary, now_ns);
-            frames.into_iter().for_each(|frame| self.respond(frame));
-            written.into_iter().for_each(|object| self.note(object));
+            for frame in frames {
+                self.respond(frame);
+            }
+            if let Some(object) = written {
+                self.note(object);
+            }
         }
     }
 

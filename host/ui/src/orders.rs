@@ -12,7 +12,7 @@ use cantap_work::channel_options::ChannelOptions;
 use cantap_work::live::Lines;
 use serde_json::{Value, json};
 
-use super::Bus;
+use crate::bus::Bus;
 use crate::device::Device;
 use crate::request::{Only, Request};
 use crate::shared::Order;
@@ -28,7 +28,7 @@ const MOST_FILTERS: usize = 64;
 
 impl Bus {
     /// Does what a page asks for, and tells whoever runs the server.
-    pub(super) fn obey(&mut self, order: Order) {
+    pub(crate) fn obey(&mut self, order: Order) {
         let Order { request, page, answer } = order;
         let what = request.to_string();
         let result = self.check(page.role, &request).and_then(|()| self.follow(request));

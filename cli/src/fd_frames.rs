@@ -8,7 +8,7 @@ pub fn check<'f>(device: &Device, frames: impl IntoIterator<Item = &'f TraceFram
     let hello = device.hello();
     let fd = frames.into_iter().find(|frame| frame.is_fd()).filter(|_| !hello.sends_fd());
     if let Some(frame) = fd {
-        bail!("'{frame}' is a CAN FD frame: {}; nothing was sent", cantap_adapters::fd_advice(&hello));
+        bail!("'{frame}' is a CAN FD frame: {}; nothing was sent", cantap_adapters::fd_advice(hello));
     }
     Ok(())
 }

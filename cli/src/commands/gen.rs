@@ -304,7 +304,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
     let device = args.device.open()?;
     if args.is_fd() && !device.hello().sends_fd() {
-        bail!("CAN FD frames cannot be sent: {}", cantap_adapters::fd_advice(&device.hello()));
+        bail!("CAN FD frames cannot be sent: {}", cantap_adapters::fd_advice(device.hello()));
     }
     let mut bitrates_bps = [0; CHANNELS];
     for (channel, config) in args.open.open(&device, args.channel.iter().copied(), Mode::Normal, None)? {

@@ -207,7 +207,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             eprint!(", {left_out} of other channels left out");
         }
         if fd_left_out > 0 {
-            let advice = cantap_adapters::fd_advice(&device.hello());
+            let advice = cantap_adapters::fd_advice(device.hello());
             eprint!(", {fd_left_out} CAN FD frames left out: {advice}");
         }
         if accuracy.frames > 0 {
@@ -350,7 +350,7 @@ impl Args {
                 bail!(
                     "'{}' has only CAN FD frames for these channels, which the device cannot send: {}",
                     source.input.display(),
-                    cantap_adapters::fd_advice(&buses.device.hello())
+                    cantap_adapters::fd_advice(buses.device.hello())
                 );
             }
             if played.asked == 0 && !interrupt::requested() {

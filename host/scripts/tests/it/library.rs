@@ -246,9 +246,9 @@ fn the_boat_sails_where_it_heads() {
     let source = library::script("boat?latitude=0.0&longitude=0.0&course=90.0&speed=5.0").unwrap();
     let (report, records, _) = run(100, &[source]);
     assert!(report.is_success());
-    let positions =
+    let mut positions =
         records.iter().filter(|record| record.frame().unwrap().to_string().starts_with("09F80123#"));
-    let last = positions.last().unwrap().frame().unwrap();
+    let last = positions.next_back().unwrap().frame().unwrap();
     let number = |from: usize| i32::from_le_bytes(last.data()[from..from + 4].try_into().unwrap());
     let meters = f64::from(number(4)) * 1e-7 * 111_120.0;
     assert!(number(0).abs() < 2 && (meters - 500.0).abs() < 5.0, "{} {meters}", number(0));

@@ -31,7 +31,7 @@ pub fn identifier(raw: u32, extended: Option<bool>) -> Result<Id, Error> {
 #[pymethods]
 impl Frame {
     #[new]
-    #[expect(clippy::too_many_arguments, reason = "each by its name")]
+    #[expect(clippy::too_many_arguments, clippy::fn_params_excessive_bools, reason = "each by its name")]
     #[pyo3(signature = (id, data=None, *, extended=None, remote=false, dlc=None, fd=false, brs=false, esi=false))]
     fn new(
         id: Whole<u32>,

@@ -126,7 +126,7 @@ impl Conversation<'_> {
             while let Some(frame) = machine.next(self.now_ns()) {
                 let deadline = Instant::now() + LEAVES_WITHIN;
                 let how = HowToSend { sender: NOBODY, at_ticks: None, is_told: true, deadline };
-                let sending = Some(self.session.send(self.channel, &[frame], how, signals)?);
+                let sending = Some(self.session.send(self.channel, &[frame.into()], how, signals)?);
                 self.under_way.push_back(UnderWay { frame, since: Instant::now(), sending });
             }
             if machine.is_done() && self.under_way.is_empty() {

@@ -208,7 +208,9 @@ impl Session {
             while let Err(error) = hand_over(device, channel, chunk, &tags, at_ticks) {
                 let is_full = matches!(error, DeviceError::Refused { refusal: Refusal::QueueFull { .. } });
                 if !is_full || Instant::now() >= deadline {
-                    tags.iter().for_each(|tag| self.transmissions.requested(channel, *tag, NOBODY));
+                    for tag in tags {
+                        self.transmissions.requested(channel, tag, NOBODY);
+                    }
                     return Err(error.into());
                 }
                 go_on()?;

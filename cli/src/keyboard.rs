@@ -125,8 +125,8 @@ mod unix {
             assert_eq!(typed(&mut keyboard, b"ab"), "ab");
             assert_eq!(typed(&mut keyboard, &[0xC3]), "");
             assert_eq!(typed(&mut keyboard, &[0xA4, b'c']), "\u{E4}c");
-            assert_eq!(typed(&mut keyboard, b"\x1b[A"), "");
-            assert_eq!(typed(&mut keyboard, b"\x1b"), "\x1b");
+            assert_eq!(typed(&mut keyboard, &[ESCAPE, b'[', b'A']), "");
+            assert_eq!(typed(&mut keyboard, &[ESCAPE]), "\x1b");
             assert_eq!(typed(&mut keyboard, &[0xFF, b'd']), "d");
         }
     }

@@ -87,6 +87,26 @@ fn no_change_of_a_byte_is_a_panic_and_a_wrong_beginning_costs_no_chunk() {
     }
 }
 
+/// A chunk whose kind became another one is passed over, but not in silence; so is one that the index has and the bag has not.
+#[test]
+fn a_chunk_of_another_kind_is_an_issue() {
+    let whole = read(Format::RosBag, THEIRS).0;
+    let at = (0..THEIRS.len()).find(|at| Bag::chunk(&THEIRS[*at..]).is_some()).unwrap();
+    let kind_at = at + memchr::memmem::find(&THEIRS[at..], b"op=").unwrap() + 3;
+    for kind in (0..=u8::MAX).filter(|kind| *kind != op::CHUNK) {
+        let mut bytes = THEIRS.to_vec();
+        bytes[kind_at] = kind;
+        let (records, issues) = read(Format::RosBag, &bytes);
+        assert!(records.len() < whole.len() && !issues.is_empty(), "{kind}: {issues:?}");
+    }
+    let count_at = memchr::memmem::find(THEIRS, b"chunk_count=").unwrap() + 12;
+    let mut bytes = THEIRS.to_vec();
+    bytes[count_at] += 1;
+    let (records, issues) = read(Format::RosBag, &bytes);
+    assert!(records.len() == whole.len() && issues.len() == 1, "{issues:?}");
+    assert!(issues[0].contains("as the file's end says"), "{issues:?}");
+}
+
 #[test]
 fn lengths_that_lie_take_no_memory_and_end_nothing_before_them() {
     let chunk = |compression: &[u8], size: usize, data: &[u8]| {

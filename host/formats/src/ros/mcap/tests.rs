@@ -11,7 +11,9 @@ fn lines(bytes: &[u8]) -> (Vec<String>, Vec<String>) {
     (text.lines().map(str::to_owned).collect(), issues)
 }
 
-fn left_out_and_notes(bytes: &[u8]) -> (Vec<(&'static str, u64)>, Vec<(&'static str, u64)>) {
+type Kinds = Vec<(&'static str, u64)>;
+
+fn left_out_and_notes(bytes: &[u8]) -> (Kinds, Kinds) {
     let source = io::Cursor::new(bytes.to_vec());
     let options = crate::ReadOptions::default();
     let mut reader = crate::TraceReader::from_source("t", source, Format::Mcap, &options).unwrap();
@@ -123,6 +125,24 @@ fn each_change_of_a_byte_is_seen_or_changes_nothing_and_later_chunks_are_read() 
         }
     }
     assert_eq!(fewest, whole.len(), "a wrong beginning costs no chunk");
+}
+
+/// A chunk whose kind became another one is passed over, but not in silence.
+#[test]
+fn a_chunk_of_another_kind_is_an_issue() {
+    let whole = read(Format::Mcap, THEIRS).0;
+    let at = (0..THEIRS.len()).find(|at| Mcap::chunk(&THEIRS[*at..]).is_some()).unwrap();
+    for kind in (0..op::FIRST_PRIVATE).filter(|kind| *kind != op::CHUNK) {
+        let mut bytes = THEIRS.to_vec();
+        bytes[at] = kind;
+        let (records, issues) = read(Format::Mcap, &bytes);
+        assert!(records.len() < whole.len() && !issues.is_empty(), "{kind}: {issues:?}");
+    }
+    let mut bytes = THEIRS.to_vec();
+    bytes[at] = 1;
+    let issues = read(Format::Mcap, &bytes).1;
+    let expected = "expected 56 messages in ";
+    assert!(issues.len() == 1 && issues[0].contains(expected), "{issues:?}");
 }
 
 #[test]

@@ -64,7 +64,7 @@ fn frames_of_every_kind_have_the_time_of_their_message_and_the_channel_of_their_
 fn a_cut_bag_gives_what_is_before_the_cut_and_says_so() {
     let whole = read(Format::RosBag, THEIRS).0;
     let mut most = 0;
-    for len in (1..100).chain((100..THEIRS.len()).step_by(7)) {
+    for len in (1..100).chain((100..THEIRS.len()).step_by(61)) {
         let (records, issues) = read(Format::RosBag, &THEIRS[..len]);
         assert!(whole.starts_with(&records) && records.len() >= most, "{len}");
         most = records.len();
@@ -77,7 +77,7 @@ fn a_cut_bag_gives_what_is_before_the_cut_and_says_so() {
 fn no_change_of_a_byte_is_a_panic_and_a_wrong_beginning_costs_no_chunk() {
     let whole = read(Format::RosBag, THEIRS).0;
     // Behind its head, the first record is filled up with blanks. LZ4 has no checksum here, so that a changed byte may be one of a frame.
-    for at in (0..100).chain((4100..THEIRS.len()).step_by(11)) {
+    for at in (0..100).chain((4100..THEIRS.len()).step_by(31)) {
         let mut bytes = THEIRS.to_vec();
         bytes[at] ^= 0x81;
         let (records, issues) = read(Format::RosBag, &bytes);

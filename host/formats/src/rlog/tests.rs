@@ -119,9 +119,11 @@ fn a_list_in_another_segment_is_found() {
     let far = |segment: u64, at: u64, double: u64| 2 | double << 2 | at << 3 | segment << 32;
     let message = |segments: &[&[u64]]| {
         let mut bytes = (segments.len() as u32 - 1).to_le_bytes().to_vec();
-        segments.iter().for_each(|words| bytes.extend((words.len() as u32).to_le_bytes()));
+        for words in segments {
+            bytes.extend((words.len() as u32).to_le_bytes());
+        }
         bytes.resize(bytes.len().next_multiple_of(8), 0);
-        segments.iter().copied().flatten().for_each(|word| bytes.extend(word.to_le_bytes()));
+        bytes.extend(segments.iter().copied().flatten().flat_map(|word| word.to_le_bytes()));
         bytes
     };
     let single =

@@ -12,14 +12,16 @@ use super::super::compression::Compression;
 use super::super::found::Found;
 use super::super::input::Input;
 use super::super::issue::{Fault, Place};
-use super::container::{ChunkHead, Container, Known, Step, skip, text_of, u32_of};
+use super::container::{ChunkHead, Container, Counts, Known, Step, skip, text_of, u32_of};
 use super::{Encoding, Kind, OTHER_MESSAGES, Topic, time_ns};
 
 /// Kinds of records.
 mod op {
     pub(super) const MESSAGE: u8 = 2;
     pub(super) const BAG: u8 = 3;
+    pub(super) const INDEX: u8 = 4;
     pub(super) const CHUNK: u8 = 5;
+    pub(super) const CHUNK_INFO: u8 = 6;
     pub(super) const CONNECTION: u8 = 7;
 }
 
@@ -32,6 +34,12 @@ pub(crate) struct Bag {
     connections: HashMap<u32, Option<(Kind, Topic)>>,
     /// Where the index begins; 0 if the bag was never closed.
     index_at: u64,
+    /// How many chunks the bag's header says there are.
+    chunks: Option<u32>,
+    /// What was read.
+    counts: Counts,
+    /// What the index says there is.
+    indexed: Counts,
 }
 
 /// A record's header, and the length of its data.
@@ -93,8 +101,14 @@ impl Container for Bag {
         let end = head.bytes.saturating_add(head.data_len as usize);
         let connection = head.number(b"conn").map(u32::from_le_bytes);
         match op {
-            op::CHUNK => return Ok(Step::Chunk),
-            op::BAG => self.index_at = head.number(b"index_pos").map_or(0, u64::from_le_bytes),
+            op::CHUNK => {
+                self.counts.chunks += 1;
+                return Ok(Step::Chunk);
+            }
+            op::BAG => {
+                self.index_at = head.number(b"index_pos").map_or(0, u64::from_le_bytes);
+                self.chunks = head.number(b"chunk_count").map(u32::from_le_bytes);
+            }
             op::CONNECTION if end <= MAX_HELD_BYTES => {
                 let topic = head.field(b"topic").map(<[u8]>::to_vec);
                 let start = head.bytes;
@@ -109,6 +123,7 @@ impl Container for Bag {
                 self.connections.insert(number, kind);
             }
             op::MESSAGE => {
+                self.counts.messages += 1;
                 let time = head.number::<8>(b"time").unwrap_or_default();
                 let found = match connection.and_then(|number| self.connections.get(&number)) {
                     Some(Some((kind, topic))) if end <= MAX_HELD_BYTES => {
@@ -140,8 +155,15 @@ impl Container for Bag {
                 };
                 return Ok(if skip(input, end as u64)? { Step::Found(found) } else { Step::Cut });
             }
-            // Indexes.
-            4 | 6 | op::CONNECTION => {}
+            // One that is longer than any is not one.
+            op::INDEX if connection.is_some() => {}
+            op::CHUNK_INFO if head.field(b"chunk_pos").is_some() && end <= MAX_HELD_BYTES => {
+                let start = head.bytes;
+                let Some(connections) = input.peek(end)?.get(start..end) else { return Ok(Step::Cut) };
+                let counts = connections.chunks_exact(8).filter_map(|bytes| u32_of(&mut &bytes[4..]));
+                self.indexed.messages += counts.map(u64::from).sum::<u64>();
+                self.indexed.chunks += 1;
+            }
             other => return Ok(wrong(format!("one of kind {other}"))),
         }
         Ok(if skip(input, end as u64)? { Step::Nothing } else { Step::Cut })
@@ -169,5 +191,13 @@ impl Container for Bag {
 
     fn may_end(&self, at: u64) -> bool {
         self.index_at != 0 && at >= self.index_at
+    }
+
+    fn end(&mut self, _: &mut Input) -> io::Result<Option<Fault>> {
+        let Some(chunks) = self.chunks.map(u64::from) else { return Ok(None) };
+        // An index that is not whole does not count all messages.
+        let is_whole = self.indexed.chunks == chunks;
+        let messages = if is_whole { self.indexed.messages } else { self.counts.messages };
+        Ok(self.counts.check(Counts { chunks, messages }))
     }
 }

@@ -32,6 +32,9 @@ pub(crate) trait Container: Default + Send {
 
     /// Whether a whole file may end at this offset without saying so.
     fn may_end(&self, at: u64) -> bool;
+
+    /// At the file's own end: what is wrong if the file says that it has more, or less, than was read.
+    fn end(&mut self, input: &mut Input) -> io::Result<Option<Fault>>;
 }
 
 /// What a record was.
@@ -173,14 +176,8 @@ impl<C: Container> Decoder<C> {
             Step::Nothing => None,
             Step::Found(found) => Some(found),
             Step::Chunk => self.open_chunk(input, place)?,
-            Step::Last => {
-                self.state = State::End;
-                None
-            }
-            Step::End if self.container.may_end(input.offset()) => {
-                self.state = State::End;
-                None
-            }
+            Step::Last => self.end(input, place)?,
+            Step::End if self.container.may_end(input.offset()) => self.end(input, place)?,
             Step::End | Step::Cut => {
                 self.state = State::End;
                 Some(Found::Issue(place, Fault::Truncated(C::CUT)))
@@ -190,6 +187,11 @@ impl<C: Container> Decoder<C> {
                 Some(Found::Issue(place, fault))
             }
         })
+    }
+
+    fn end(&mut self, input: &mut Input, place: Place) -> io::Result<Option<Found>> {
+        self.state = State::End;
+        Ok(self.container.end(input)?.map(|fault| Found::Issue(place, fault)))
     }
 
     /// Opens the chunk that is next.
@@ -282,6 +284,23 @@ impl Chunk {
         };
         let fault = self.why().or_else(crc)?;
         Some(Found::Issue(self.place, fault))
+    }
+}
+
+/// How many chunks and messages there are.
+#[derive(Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Counts {
+    pub chunks: u64,
+    pub messages: u64,
+}
+
+impl Counts {
+    /// What is wrong if the file says that it has others than these, which were read.
+    pub(super) fn check(self, expected: Self) -> Option<Fault> {
+        let text = |Self { chunks, messages }| format!("{messages} messages in {chunks} chunks");
+        (self != expected).then(|| {
+            Fault::malformed(format!("{}, as the file's end says", text(expected)), text(self).as_bytes())
+        })
     }
 }
 

@@ -12,7 +12,7 @@ use super::super::compression::Compression;
 use super::super::found::Found;
 use super::super::input::Input;
 use super::super::issue::{Fault, Place};
-use super::container::{ChunkHead, Container, Known, Step, array_of, skip, text_of, u32_of};
+use super::container::{ChunkHead, Container, Counts, Known, Step, array_of, skip, text_of, u32_of};
 use super::{Encoding, Kind, OTHER_MESSAGES, Topic};
 
 /// Kinds of records.
@@ -21,6 +21,8 @@ mod op {
     pub(super) const CHANNEL: u8 = 4;
     pub(super) const MESSAGE: u8 = 5;
     pub(super) const CHUNK: u8 = 6;
+    pub(super) const MESSAGE_INDEX: u8 = 7;
+    pub(super) const STATISTICS: u8 = 11;
     pub(super) const DATA_END: u8 = 15;
     /// From here on they are anyone's own.
     pub(super) const FIRST_PRIVATE: u8 = 0x80;
@@ -40,6 +42,8 @@ const PRIVATE_RECORDS: &str = "records of MCAP of a kind of some program's own";
 pub(crate) struct Mcap {
     schemas: HashMap<u16, Option<Kind>>,
     channels: HashMap<u16, Option<Channel>>,
+    /// What was read.
+    counts: Counts,
 }
 
 #[derive(Clone, Copy)]
@@ -64,7 +68,10 @@ impl Container for Mcap {
             return Ok(if rest == 0 { Step::End } else { Step::Cut });
         };
         match op {
-            op::CHUNK => return Ok(Step::Chunk),
+            op::CHUNK => {
+                self.counts.chunks += 1;
+                return Ok(Step::Chunk);
+            }
             op::DATA_END => return Ok(Step::Last),
             op::MESSAGE => return self.message(input, len, place, known),
             op::SCHEMA | op::CHANNEL if len <= MAX_HELD_BYTES => {
@@ -75,7 +82,18 @@ impl Container for Mcap {
                 let fault = Fault::malformed("a schema or a channel", b"one that ends early");
                 return Ok(read.map_or(Step::Found(Found::Issue(place, fault)), |()| Step::Nothing));
             }
-            0 | op::DATA_END..op::FIRST_PRIVATE => {
+            op::MESSAGE_INDEX => {
+                let Some(bytes) = input.peek(HEAD_BYTES + 6)?.get(HEAD_BYTES + 2..) else {
+                    return Ok(Step::Cut);
+                };
+                let entries = bytes.first_chunk().map_or(0, |len| u64::from(u32::from_le_bytes(*len)));
+                if !entries.is_multiple_of(16) || len != 6 + entries {
+                    let found = b"one that contradicts itself";
+                    return Ok(Step::Wrong(Fault::malformed("an index of messages", found)));
+                }
+            }
+            // What stands only behind the end of the data, or is no kind at all.
+            0 | 2 | op::SCHEMA | op::CHANNEL | 8 | 10 | 11 | 13 | 14 | op::DATA_END..op::FIRST_PRIVATE => {
                 let found = format!("one of kind {op}");
                 return Ok(Step::Wrong(Fault::malformed("a record of MCAP", found.as_bytes())));
             }
@@ -110,6 +128,26 @@ impl Container for Mcap {
     fn may_end(&self, _: u64) -> bool {
         false
     }
+
+    fn end(&mut self, input: &mut Input) -> io::Result<Option<Fault>> {
+        /// Of the statistics, up to the count of chunks.
+        const STATISTICS_BYTES: usize = HEAD_BYTES + 8 + 2 + 4 + 4 + 4 + 4;
+        while let Some((op, len)) = record_head(input.peek(HEAD_BYTES)?) {
+            if op == op::STATISTICS {
+                let Some(bytes) = input.peek(STATISTICS_BYTES)?.first_chunk::<STATISTICS_BYTES>() else {
+                    break;
+                };
+                let [mut messages, mut chunks] = [&bytes[HEAD_BYTES..], &bytes[STATISTICS_BYTES - 4..]];
+                let messages = u64_of(&mut messages).unwrap_or_default();
+                let chunks = u32_of(&mut chunks).unwrap_or_default().into();
+                return Ok(self.counts.check(Counts { chunks, messages }));
+            }
+            if !skip(input, len.saturating_add(HEAD_BYTES as u64))? {
+                break;
+            }
+        }
+        Ok(None)
+    }
 }
 
 impl Mcap {
@@ -137,13 +175,14 @@ impl Mcap {
         Some(())
     }
 
-    fn message(&self, input: &mut Input, len: u64, place: Place, known: &mut Known) -> io::Result<Step> {
+    fn message(&mut self, input: &mut Input, len: u64, place: Place, known: &mut Known) -> io::Result<Step> {
         let bytes = input.peek(HEAD_BYTES + MESSAGE_HEAD_BYTES)?;
         let mut head = bytes.get(HEAD_BYTES..).unwrap_or_default();
         let (Some(number), Some(_), Some(log_ns)) = (u16_of(&mut head), u32_of(&mut head), u64_of(&mut head))
         else {
             return Ok(Step::Cut);
         };
+        self.counts.messages += 1;
         let Channel { kind, encoding, topic } = match self.channels.get(&number) {
             Some(Some(channel)) if (MESSAGE_HEAD_BYTES as u64..=MAX_HELD_BYTES).contains(&len) => *channel,
             other => {

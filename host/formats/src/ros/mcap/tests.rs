@@ -11,7 +11,9 @@ fn lines(bytes: &[u8]) -> (Vec<String>, Vec<String>) {
     (text.lines().map(str::to_owned).collect(), issues)
 }
 
-fn left_out_and_notes(bytes: &[u8]) -> (Vec<(&'static str, u64)>, Vec<(&'static str, u64)>) {
+type Kinds = Vec<(&'static str, u64)>;
+
+fn left_out_and_notes(bytes: &[u8]) -> (Kinds, Kinds) {
     let source = io::Cursor::new(bytes.to_vec());
     let options = crate::ReadOptions::default();
     let mut reader = crate::TraceReader::from_source("t", source, Format::Mcap, &options).unwrap();
@@ -98,7 +100,7 @@ fn messages_of_ros_1_and_files_without_chunks_are_read() {
 fn a_cut_file_gives_what_is_before_the_cut_and_says_so() {
     let whole = read(Format::Mcap, THEIRS).0;
     let mut most = 0;
-    for len in (1..THEIRS.len()).step_by(3) {
+    for len in (1..100).chain((100..THEIRS.len()).step_by(29)) {
         let (records, issues) = read(Format::Mcap, &THEIRS[..len]);
         assert!(whole.starts_with(&records), "{len}");
         assert!(records.len() >= most, "{len}");
@@ -112,7 +114,7 @@ fn a_cut_file_gives_what_is_before_the_cut_and_says_so() {
 fn each_change_of_a_byte_is_seen_or_changes_nothing_and_later_chunks_are_read() {
     let whole = read(Format::Mcap, THEIRS).0;
     let mut fewest = usize::MAX;
-    for at in (0..100).chain((100..THEIRS.len()).step_by(7)) {
+    for at in (0..100).chain((100..THEIRS.len()).step_by(31)) {
         let mut bytes = THEIRS.to_vec();
         bytes[at] ^= if at % 2 == 0 { 0x81 } else { 0xFF };
         let (records, issues) = read(Format::Mcap, &bytes);
@@ -123,6 +125,24 @@ fn each_change_of_a_byte_is_seen_or_changes_nothing_and_later_chunks_are_read() 
         }
     }
     assert_eq!(fewest, whole.len(), "a wrong beginning costs no chunk");
+}
+
+/// A chunk whose kind became another one is passed over, but not in silence.
+#[test]
+fn a_chunk_of_another_kind_is_an_issue() {
+    let whole = read(Format::Mcap, THEIRS).0;
+    let at = (0..THEIRS.len()).find(|at| Mcap::chunk(&THEIRS[*at..]).is_some()).unwrap();
+    for kind in (0..op::FIRST_PRIVATE).filter(|kind| *kind != op::CHUNK) {
+        let mut bytes = THEIRS.to_vec();
+        bytes[at] = kind;
+        let (records, issues) = read(Format::Mcap, &bytes);
+        assert!(records.len() < whole.len() && !issues.is_empty(), "{kind}: {issues:?}");
+    }
+    let mut bytes = THEIRS.to_vec();
+    bytes[at] = 1;
+    let issues = read(Format::Mcap, &bytes).1;
+    let expected = "expected 56 messages in ";
+    assert!(issues.last().unwrap().contains(expected), "{issues:?}");
 }
 
 #[test]

@@ -81,47 +81,133 @@ fn troubled(events: &[Value]) -> Vec<&Value> {
 }
 
 #[test]
-#[ignore = "its expectations have not been compared with a run yet"]
+#[ignore = "each frame of another client of a shared board reaches a node twice (host/scripts/src/live.rs): it answers twice"]
 fn udsoncan_and_can_isotp_read_the_vehicle() {
     let Some(python) = peers::python_with("can, isotp, udsoncan") else { return };
     let rig = Rig::new("node:obd?speed=72");
     let found = rig.ask(&python, "obd", &[]);
-    assert_eq!(found, json!({}));
+    let expected = json!({
+        "vin": "1CANTAP00VEHICLE7",
+        "uds_codes": [["012800", 0x2F], ["030100", 0x2F], ["045500", 0x07]],
+        "refused": [0x11, 0x11],
+        "answers": [
+            ["0100", "4100BE3FA013"], ["0120", "41208002A001"],
+            // 2980 1/min, 72 km/h, 88 degC.
+            ["010C", "410C2E90"], ["010D", "410D48"], ["0105", "410580"],
+            ["03", "430201280301"], ["07", "47010455"], ["0A", "4A0201280301"], ["020200", "4202000128"],
+            ["0902", "4902013143414E544150303056454849434C4537"], ["0904", "49040143414E5441504F4244323032362D3031"],
+            // Permanent codes are not cleared by a tester.
+            ["04", "44"], ["03", "4300"], ["07", "4700"], ["0A", "4A0201280301"],
+        ],
+    });
+    assert_eq!(found, expected);
     let events = rig.conversations("obd");
+    assert!(!events.is_empty());
     assert_eq!(troubled(&events), [&Value::Null; 0]);
 }
 
 #[test]
-#[ignore = "its expectations have not been compared with a run yet"]
+#[ignore = "each frame of another client of a shared board reaches a node twice (host/scripts/src/live.rs): it sends RTS/CTS packets twice"]
 fn can_j1939_hears_the_engine() {
     let Some(python) = peers::python_with("can, j1939") else { return };
     let rig = Rig::new("node:engine");
     let found = rig.ask(&python, "engine", &[]);
-    assert_eq!(found, json!({}));
+    let component = "CANTAP*ENGINE-6*2026-0042*UNIT-1*";
+    let expected = json!({
+        // 1500 1/min in 1/8, 80 km/h in 1/256, 85 degC + 40.
+        "eec1": "F0A5A3E02E00FFFF", "ccvs": "FF0050FFFFFFFFFF", "temperatures": "7D46002EFFFFFFFF",
+        "component_to_one": component, "component_to_all": component,
+        "dm1": "14FF6E00000364000101BE000207",
+        "trouble": [[110, 0, 3], [100, 1, 1], [190, 2, 7]],
+        "refused": "01FFFFFFF94CFE00", "cleared": "00FFFFFFFFD3FE00", "dm1_after": "00FF00000000FFFF",
+    });
+    assert_eq!(found, expected);
     let events = rig.conversations("j1939");
+    assert!(!events.is_empty());
     assert_eq!(troubled(&events), [&Value::Null; 0]);
 }
 
 #[test]
-#[ignore = "its expectations have not been compared with a run yet"]
+#[ignore = "each frame of another client of a shared board reaches a node twice (host/scripts/src/live.rs): toggle bits of segmented SDO do not alternate"]
 fn python_canopen_moves_the_drive() {
     let Some(python) = peers::python_with("can, canopen") else { return };
     let rig = Rig::new("node:drive");
     let sheet = Command::new(CANTAP).args(["run", "--print", "node:drive.eds"]).output().unwrap();
     std::fs::write(rig.served.folder.path().join("drive.eds"), &sheet.stdout).unwrap();
     let found = rig.ask(&python, "drive", &["drive.eds"]);
-    assert_eq!(found, json!({}));
+    let expected = json!({
+        "beat": "PRE-OPERATIONAL", "name": "cantap drive with a CiA 402 state machine", "booted": true,
+        "states": ["SWITCH ON DISABLED", "READY TO SWITCH ON", "SWITCHED ON", "OPERATION ENABLED"],
+        "mode": "PROFILED VELOCITY", "velocity": 1500, "forward": true, "homed": true, "position": 5000,
+        "fault": ["FAULT", 0x2310, true], "after": ["SWITCH ON DISABLED", 0], "refused": "06010002",
+    });
+    assert_eq!(found, expected);
     let events = rig.conversations("canopen");
-    assert_eq!(troubled(&events), [&Value::Null; 0]);
+    // The write to the status word, which it refuses.
+    let troubled: Vec<_> =
+        troubled(&events).iter().map(|event| (&event["title"], &event["fields"]["abort"])).collect();
+    assert_eq!(troubled, [(&json!("SDO write 6041:00"), &json!(0x0601_0002))]);
 }
 
 #[test]
-#[ignore = "its expectations have not been compared with a run yet"]
 fn canboats_definitions_decode_the_boat() {
     let Some(python) = peers::python_with("can, nmea2000") else { return };
     let rig = Rig::new("node:boat");
-    let found = rig.ask(&python, "boat", &[]);
-    assert_eq!(found, json!({}));
+    let mut found = rig.ask(&python, "boat", &[]);
+    // The boat moves, by 3 m/s, and each message of a cycle has its number.
+    for pgn in ["129025", "129029"] {
+        for (part, begin) in [("latitude", 54.32), ("longitude", 10.14)] {
+            let at = found[pgn][part].take().as_f64().unwrap();
+            assert!(at > begin && at < begin + 0.1, "{part} {at}");
+        }
+    }
+    for pgn in ["129026", "129029", "128267", "130306", "130310"] {
+        assert!(found[pgn]["sid"].take().as_u64().is_some_and(|sid| sid < 253), "{pgn}");
+    }
+    assert!(found["129029"]["time"].take().is_string());
+    // A manufacturer of 2046 is not in canboat's list.
+    let expected = json!({
+        "60928": {
+            "uniqueNumber": 4711, "manufacturerCode": null, "deviceInstanceLower": 0, "deviceInstanceUpper": 0,
+            "deviceFunction": "Atmospheric", "spare": 0, "deviceClass": "External Environment", "systemInstance": 0,
+            "industryGroup": "Marine Industry", "arbitraryAddressCapable": "Yes",
+        },
+        "126996": {
+            "nmea2000Version": 2.1, "productCode": 42, "modelId": "cantap boat", "softwareVersionCode": "1.0",
+            "modelVersion": "1", "modelSerialCode": "0000004711", "certificationLevel": "Level B", "loadEquivalency": 1,
+        },
+        "127488": {
+            "instance": "Single Engine or Dual Engine Port", "speed": 1800.0, "boostPressure": null, "tiltTrim": null,
+            "reserved_48": 65535,
+        },
+        "127489": {
+            "instance": "Single Engine or Dual Engine Port", "oilPressure": 350_000, "oilTemperature": 363.1,
+            "temperature": 358.150_000_000_000_03, "alternatorPotential": 14.1, "fuelRate": 4.2, "totalEngineHours": 720_000,
+            "coolantPressure": null, "fuelPressure": null, "reserved_152": 255, "discreteStatus1": "", "discreteStatus2": "",
+            "engineLoad": 60, "engineTorque": 55,
+        },
+        "128267": {"sid": null, "depth": 8.5, "offset": 0.5, "range": null},
+        "129025": {"latitude": null, "longitude": null},
+        "129026": {
+            "sid": null, "cogReference": "True", "reserved_10": 63, "cog": 0.7853, "sog": 3.0, "reserved_48": 65535,
+        },
+        "129029": {
+            "sid": null, "date": "2026-11-29", "time": null, "latitude": null, "longitude": null, "altitude": 2.0,
+            "gnssType": "GPS", "method": "GNSS fix", "integrity": "No integrity checking", "reserved_258": 63,
+            "numberOfSvs": 9, "hdop": 0.9, "pdop": 1.5, "geoidalSeparation": 42.0, "referenceStations": 0,
+            "referenceStationType": null, "referenceStationId": null, "ageOfDgnssCorrections": null,
+        },
+        "130306": {
+            "sid": null, "windSpeed": 6.0, "windAngle": 0.523_500_000_000_000_1, "reference": "Apparent",
+            "reserved_43": 2_097_151,
+        },
+        "130310": {
+            "sid": null, "waterTemperature": 288.150_000_000_000_03, "outsideAmbientAirTemperature": 293.150_000_000_000_03,
+            "atmosphericPressure": 1_013_200, "reserved_56": 255,
+        },
+    });
+    assert_eq!(found, expected);
     let events = rig.conversations("nmea2000");
+    assert!(!events.is_empty());
     assert_eq!(troubled(&events), [&Value::Null; 0]);
 }

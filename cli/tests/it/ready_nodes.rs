@@ -81,7 +81,6 @@ fn troubled(events: &[Value]) -> Vec<&Value> {
 }
 
 #[test]
-#[ignore = "each frame of another client of a shared board reaches a node twice (host/scripts/src/live.rs): it answers twice"]
 fn udsoncan_and_can_isotp_read_the_vehicle() {
     let Some(python) = peers::python_with("can, isotp, udsoncan") else { return };
     let rig = Rig::new("node:obd?speed=72");
@@ -107,7 +106,6 @@ fn udsoncan_and_can_isotp_read_the_vehicle() {
 }
 
 #[test]
-#[ignore = "each frame of another client of a shared board reaches a node twice (host/scripts/src/live.rs): it sends RTS/CTS packets twice"]
 fn can_j1939_hears_the_engine() {
     let Some(python) = peers::python_with("can, j1939") else { return };
     let rig = Rig::new("node:engine");
@@ -128,7 +126,6 @@ fn can_j1939_hears_the_engine() {
 }
 
 #[test]
-#[ignore = "each frame of another client of a shared board reaches a node twice (host/scripts/src/live.rs): toggle bits of segmented SDO do not alternate"]
 fn python_canopen_moves_the_drive() {
     let Some(python) = peers::python_with("can, canopen") else { return };
     let rig = Rig::new("node:drive");

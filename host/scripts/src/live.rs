@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use cantap::device::Transmission;
 use cantap::transmit::Stream;
-use cantap::wire::message::Periodic;
+use cantap::wire::message::{OTHERS_TAG, Periodic};
 use cantap::{Device, DeviceError, TraceEvent, TraceRecord};
 use cantap_can::{Channel, DEVICE_TAG, Frame};
 use cantap_signals::Decoder;
@@ -208,7 +208,9 @@ impl Run<'_> {
     /// Passes the confirmations: to the sender as such, to the others as a frame.
     fn take_ended(&mut self) -> Result<(), LiveError> {
         self.stream.wait(Duration::ZERO)?;
-        for Transmission { channel, tag, result, .. } in self.stream.take_ended() {
+        // What another client of a shared device has sent comes as a record.
+        let ended = self.stream.take_ended().into_iter().filter(|ended| ended.tag != OTHERS_TAG);
+        for Transmission { channel, tag, result, .. } in ended {
             let sender = self.under_way.remove(&(channel.index(), tag));
             let Ok(TraceFrame::Classic(frame)) = result else {
                 self.dropped.extend(sender.map(|place| (place, channel)));

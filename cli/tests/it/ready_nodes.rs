@@ -186,7 +186,7 @@ fn canboats_definitions_decode_the_boat() {
         "128267": {"sid": null, "depth": 8.5, "offset": 0.5, "range": null},
         "129025": {"latitude": null, "longitude": null},
         "129026": {
-            "sid": null, "cogReference": "True", "reserved_10": 63, "cog": 0.7853, "sog": 3.0, "reserved_48": 65535,
+            "sid": null, "cogReference": "True", "reserved_10": 63, "cog": 7853.0 / 10_000.0, "sog": 3.0, "reserved_48": 65535,
         },
         "129029": {
             "sid": null, "date": "2026-11-29", "time": null, "latitude": null, "longitude": null, "altitude": 2.0,

@@ -14,5 +14,5 @@ libfuzzer_sys::fuzz_target!(|input: (String, Vec<(u32, u16, Vec<u8>)>)| {
         time_ns += i64::from(after_100us) * 100_000;
         condition.holds(&record(time_ns, id(number), &data));
     }
-    let _ = condition.unheard().count();
+    let _ = condition.names_without_events().count();
 });

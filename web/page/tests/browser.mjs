@@ -65,10 +65,18 @@ export async function show(page, view) {
 
 /** Waits until a function in the page answers true; what it saw last is in the error. */
 export async function until(page, about, fn, argument) {
-  try {
-    await page.waitForFunction(fn, argument, { timeout: 60_000 });
-  } catch {
-    throw new Error(`waited in vain until ${about}`);
+  const end = Date.now() + 60_000;
+  for (;;) {
+    try {
+      await page.waitForFunction(fn, argument, { timeout: Math.max(1, end - Date.now()) });
+      return;
+    } catch (error) {
+      // What it looks at may not be there yet.
+      if (Date.now() >= end || !/of (null|undefined)/.test(error.message)) {
+        throw new Error(`waited in vain until ${about}`, { cause: error });
+      }
+      await new Promise((again) => setTimeout(again, 20));
+    }
   }
 }
 

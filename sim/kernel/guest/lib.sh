@@ -19,9 +19,9 @@ modprobe -a vhci-hcd cdc-acm can-raw slcan
 
 uptime_s() { cut -d' ' -f1 /proc/uptime; }
 
-# Waits up to 10 s until a command succeeds.
+# Waits until a command succeeds: a minute, which only a hang reaches.
 wait_until() {
-  _tries=200
+  _tries=1200
   until "$@"; do
     _tries=$((_tries - 1))
     [ $_tries -gt 0 ] || return 1

@@ -74,11 +74,15 @@ check "the device works after its own restart" info
 # with 1; another has everything up to some point and from another on, and says that there was a gap.
 away_and_back() {
   board mark
-  start -t 60
+  start -t 600
   after_a_while 12
-  "$@" || return 1
-  wait_until has_no_port && attach || return 1
-  wait_until has_outcome || return 1
+  if ! { "$@" && wait_until has_no_port && attach && wait_until has_outcome; }; then
+    # It would keep the port from all that follow.
+    kill -9 "$CAPTURE"
+    wait "$CAPTURE" 2> /dev/null
+    cat capture.err
+    return 1
+  fi
   if is_capturing; then survived && gap_is_told; else ended 1; fi && info
 }
 has_outcome() { ! is_capturing || has_told "the device is back after"; }

@@ -17,12 +17,17 @@ use super::{Encoding, Kind, OTHER_MESSAGES, Topic};
 
 /// Kinds of records.
 mod op {
+    pub(super) const FOOTER: u8 = 2;
     pub(super) const SCHEMA: u8 = 3;
     pub(super) const CHANNEL: u8 = 4;
     pub(super) const MESSAGE: u8 = 5;
     pub(super) const CHUNK: u8 = 6;
     pub(super) const MESSAGE_INDEX: u8 = 7;
+    pub(super) const CHUNK_INDEX: u8 = 8;
+    pub(super) const ATTACHMENT_INDEX: u8 = 10;
     pub(super) const STATISTICS: u8 = 11;
+    pub(super) const METADATA_INDEX: u8 = 13;
+    pub(super) const SUMMARY_OFFSET: u8 = 14;
     pub(super) const DATA_END: u8 = 15;
     /// From here on they are anyone's own.
     pub(super) const FIRST_PRIVATE: u8 = 0x80;
@@ -93,7 +98,16 @@ impl Container for Mcap {
                 }
             }
             // What stands only behind the end of the data, or is no kind at all.
-            0 | 2 | op::SCHEMA | op::CHANNEL | 8 | 10 | 11 | 13 | 14 | op::DATA_END..op::FIRST_PRIVATE => {
+            0
+            | op::FOOTER
+            | op::SCHEMA
+            | op::CHANNEL
+            | op::CHUNK_INDEX
+            | op::ATTACHMENT_INDEX
+            | op::STATISTICS
+            | op::METADATA_INDEX
+            | op::SUMMARY_OFFSET
+            | op::DATA_END..op::FIRST_PRIVATE => {
                 let found = format!("one of kind {op}");
                 return Ok(Step::Wrong(Fault::malformed("a record of MCAP", found.as_bytes())));
             }

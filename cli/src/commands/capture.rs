@@ -27,6 +27,7 @@ use crate::trace_output::refuse_older;
 use crate::trigger_args::TriggerArgs;
 use crate::usage_error::usage;
 use cantap_work::boards::Boards;
+use cantap_work::channel_options::ChannelOptions;
 use cantap_work::channels::Channels;
 use cantap_work::live::LiveRecords;
 use cantap_work::{Meter, lost_frames};
@@ -78,6 +79,10 @@ pub struct Args {
     /// that comes back continues.
     #[arg(long, value_name = "TIME", value_parser = args::positive_duration)]
     give_up_after: Option<Duration>,
+    /// Keep intervals as the device's crystal measures them. Otherwise times follow UTC, and corrections change the intervals around them, by up
+    /// to 100 ppm.
+    #[arg(long)]
+    device_intervals: bool,
     /// Print one JSON object with the summary.
     #[arg(long)]
     json: bool,
@@ -119,8 +124,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let decoder = args.trigger.decoder(boards.addresses())?;
     let trigger = args.trigger.trigger(&decoder)?;
     let filters = resolved(&args.filter, &decoder)?;
-    let mut live =
-        LiveRecords::open(&boards, &args.open.options(), &filters, args.time, &stderr::reporter())?;
+    let open = ChannelOptions { device_intervals: args.device_intervals, ..args.open.options() };
+    let mut live = LiveRecords::open(&boards, &open, &filters, args.time, &stderr::reporter())?;
     live.give_up_after(args.give_up_after.or(args.frames.map(|_| GIVE_UP_AFTER)));
     // The requested time starts here.
     let started = Instant::now();

@@ -64,6 +64,9 @@ pub struct Args {
     /// How long to listen.
     #[arg(short = 't', long, value_name = "TIME", conflicts_with = "input", value_parser = args::positive_duration)]
     time: Option<Duration>,
+    /// Keep intervals as the device's crystal measures them, instead of following UTC.
+    #[arg(long, conflicts_with = "input")]
+    device_intervals: bool,
     /// Length of the windows in which peaks are searched.
     #[arg(short, long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration)]
     window: Duration,
@@ -117,7 +120,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         }
         None
     } else {
-        Some(live::open(&args.device, &args.channel, &args.bitrates, args.time)?)
+        Some(live::open(&args.device, &args.channel, &args.bitrates, args.time, args.device_intervals)?)
     };
     let mut options = args.options();
     if let Some(live) = &live {

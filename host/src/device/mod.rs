@@ -71,6 +71,7 @@ pub(crate) struct Settings {
     open: [Option<ChannelConfig>; CHANNELS],
     /// Of data phases, in bit/s. It is no part of the session: whoever connects knows it.
     data_bitrates_bps: [Option<u32>; CHANNELS],
+    keeps_intervals: bool,
 }
 
 impl Device {
@@ -200,6 +201,14 @@ impl Device {
     /// The bit rate of a bus's data phases, in bit/s, if it is known.
     pub fn data_bitrate(&self, channel: Channel) -> Option<u32> {
         self.settings().data_bitrates_bps[channel.index()]
+    }
+
+    /// From now on, intervals between times are the device's own, by its crystal, instead of being corrected towards UTC: times begin at UTC and
+    /// then drift by [`ClockReport::drift_ppm`]. Call it before channels are opened. It cannot be undone in this session.
+    pub fn keep_intervals(&self) {
+        if !std::mem::replace(&mut self.settings().keeps_intervals, true) {
+            self.order(Order::KeepIntervals);
+        }
     }
 
     /// Opens a channel that only listens, at a bit rate.

@@ -23,6 +23,8 @@ pub(super) enum Order {
     DataBitrate { channel: Channel, bitrate_bps: Option<u32>, tick_hz: u32 },
     /// The first clock samples are complete; start from the best.
     SettleClock,
+    /// Times go on by the device's own clock.
+    KeepIntervals,
     /// Losses that only the device's counters show.
     Losses { channel: Channel, stage: LossStage, count: u32 },
     /// Nothing more is expected.
@@ -185,6 +187,11 @@ impl Reader {
                 }
                 Order::SettleClock => {
                     intake.clock().settle();
+                    shared.publish_clock(intake.clock());
+                }
+                Order::KeepIntervals => {
+                    let now = Ticks(intake.latest_ticks());
+                    intake.clock().keep_intervals(now);
                     shared.publish_clock(intake.clock());
                 }
                 Order::Losses { channel, stage, count } => {

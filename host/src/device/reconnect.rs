@@ -399,6 +399,9 @@ impl Settings {
 impl Device {
     /// Gives the channels the filters and configurations of another session.
     fn restore(&self, settings: &Settings) -> Result<(), DeviceError> {
+        if settings.keeps_intervals {
+            self.keep_intervals();
+        }
         // A channel's filters can be changed only while both channels are closed.
         for (channel, filters) in Channel::ALL.into_iter().zip(&settings.filters) {
             if let Some(filters) = filters {

@@ -1,6 +1,6 @@
 //! Devices on serial ports.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use cantap_wire::{USB_PID, USB_VID};
 use serialport::{ErrorKind, SerialPortType};
@@ -11,6 +11,10 @@ use super::{DeviceError, Link};
 const READ_TIMEOUT: Duration = Duration::from_millis(50);
 /// CDC-ACM has no line speed; the number only has to be valid.
 const NOMINAL_BAUD: u32 = 115_200;
+
+/// Whoever holds a port for no longer than this does not make it busy: a program that is being started anywhere in this one holds a copy of
+/// every port that is open meanwhile, with its lock, until it runs.
+const LAST_HOLDER: Duration = Duration::from_millis(300);
 
 /// A serial port with a cantap board behind it, judged by its USB IDs.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -52,8 +56,14 @@ pub fn open(port: &str) -> Result<Link, DeviceError> {
 
 /// The same, for a line that has a speed, in baud.
 pub fn open_at(port: &str, baud: u32) -> Result<Link, DeviceError> {
-    let open = serialport::new(port, baud).timeout(READ_TIMEOUT).dtr_on_open(true).open();
-    let reader = open.map_err(|error| translate(port, error))?;
+    let until = Instant::now() + LAST_HOLDER;
+    let reader = loop {
+        let open = serialport::new(port, baud).timeout(READ_TIMEOUT).dtr_on_open(true).open();
+        match open.map_err(|error| translate(port, error)) {
+            Err(DeviceError::Busy { .. }) if Instant::now() < until => std::thread::sleep(LAST_HOLDER / 20),
+            other => break other?,
+        }
+    };
     let writer = reader.try_clone().map_err(|error| translate(port, error))?;
     Ok(Link { reader: Box::new(reader), writer: Box::new(writer), keep_alive: Box::new(()) })
 }

@@ -4,6 +4,7 @@ mod autobaud;
 mod device;
 mod examples;
 mod fake_device;
+mod intervals;
 mod listener;
 mod misbehaving_devices;
 mod replay;

@@ -34,6 +34,8 @@ pub struct ChannelOptions {
     pub no_data: bool,
     /// Leave time stamps out of the stream.
     pub no_stamps: bool,
+    /// Keep the device's own intervals between times, instead of following UTC.
+    pub device_intervals: bool,
     /// Which of several boards this is for, from 0: messages name its channels' numbers.
     pub board: usize,
 }
@@ -82,7 +84,7 @@ impl ChannelOptions {
 
     /// Whether any option is given.
     pub fn is_given(&self) -> bool {
-        let Self { timing, mode, one_shot, recovery, no_data, no_stamps, board: _ } = self;
+        let Self { timing, mode, one_shot, recovery, no_data, no_stamps, device_intervals: _, board: _ } = self;
         timing.is_given_in_part()
             || mode.is_some()
             || recovery.is_some()
@@ -118,6 +120,9 @@ impl ChannelOptions {
     ) -> anyhow::Result<Vec<(Channel, ChannelConfig)>> {
         let leaves_out = filters.is_some() && !self.mode.unwrap_or(mode).transmits();
         let plans = self.plan(device, channels, Some(mode), leaves_out, reporter)?;
+        if self.device_intervals {
+            device.keep_intervals();
+        }
         // A channel's filters can be changed only while both channels are closed.
         for Plan { channel, saved, .. } in &plans {
             match (filters, saved) {

@@ -238,6 +238,12 @@ impl Device {
         Ok(py.detach(|| session.find_bitrate(number.0, silence, signals))?)
     }
 
+    /// Times keep the device's own intervals from now on.
+    fn keep_intervals(&self) -> PyResult<()> {
+        self.session()?.device()?.keep_intervals();
+        Ok(())
+    }
+
     /// Closes a channel, after everything it captured has arrived.
     fn close_channel(&self, py: Python<'_>, number: OfDevice) -> PyResult<()> {
         let channel = number.0;

@@ -75,8 +75,9 @@ impl App {
             KeyCode::Char('n') if self.can_search() => self.find(model, Direction::Back),
             KeyCode::Char('N') if self.can_search() => self.find(model, Direction::Forward),
             KeyCode::Char('f') => {
-                let filters: Vec<_> = model.history.filters().iter().map(ToString::to_string).collect();
-                self.ask(PromptKind::Filter, &filters.join(" "));
+                let filters = model.history.filters().iter().map(ToString::to_string);
+                let only_while = model.history.only_while().map(|condition| format!("if {condition}"));
+                self.ask(PromptKind::Filter, &filters.chain(only_while).collect::<Vec<_>>().join(" "));
             }
             KeyCode::Char('r') if model.recording.is_some() => self.order(Order::StopRecording),
             KeyCode::Char('r') => self.ask(PromptKind::Record, ""),

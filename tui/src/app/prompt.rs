@@ -6,7 +6,7 @@ use cantap_signals::named::{NameError, NamedFilter};
 use cantap_work::recording;
 use ratatui::crossterm::event::KeyCode;
 
-use super::super::model::Model;
+use super::super::model::{Model, While};
 use super::super::order::Order;
 use super::completion::{Completed, complete};
 use super::entry::parse_entry;
@@ -87,6 +87,15 @@ impl App {
 
     fn set_filters(&mut self, text: &str, model: &mut Model) -> Result<(), String> {
         let decoder = model.seen.signals.decoder();
+        let (text, condition) = match text.strip_prefix("if ") {
+            Some(condition) => ("", Some(condition)),
+            None => text.split_once(" if ").map_or((text, None), |(text, condition)| (text, Some(condition))),
+        };
+        let only_while = condition.map(|text| {
+            let parsed = cantap_protocols::condition(text, decoder, &cantap_protocols::Options::default());
+            parsed.map(|condition| While::new(text.trim().to_owned(), condition))
+        });
+        let only_while = only_while.transpose().map_err(|error| error.to_string())?;
         let resolve = |part: &str| {
             let filter = part.parse::<NamedFilter>().map_err(|error| error.to_string())?;
             filter.resolve(decoder).map_err(|error| match error {
@@ -95,7 +104,7 @@ impl App {
             })
         };
         let filters = text.split_whitespace().map(resolve).collect::<Result<Vec<_>, _>>()?;
-        self.cursor = model.history.set_filters(filters, self.cursor);
+        self.cursor = model.history.narrow(filters, only_while, self.cursor);
         Ok(())
     }
 }

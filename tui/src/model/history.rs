@@ -3,12 +3,37 @@
 use std::collections::VecDeque;
 
 use cantap::{TraceEvent, TraceRecord};
+use cantap_signals::condition::Condition;
 use cantap_trace::filter::{Filter, passes};
 
 use super::kept::Kept;
 
 /// Records that are kept even with little memory.
 const LEAST: usize = 1000;
+
+/// Lists records only while a condition holds: one about signals holds from the frame that makes it true to the one that ends it.
+pub struct While {
+    /// As typed.
+    text: String,
+    condition: Condition,
+    holds: bool,
+}
+
+impl While {
+    /// It has seen no record yet.
+    pub const fn new(text: String, condition: Condition) -> Self {
+        Self { text, condition, holds: false }
+    }
+
+    /// Takes the next record. Returns whether it is listed.
+    fn take(&mut self, record: &TraceRecord) -> bool {
+        let holds = self.condition.holds(record);
+        if self.condition.was_concerned() {
+            self.holds = holds;
+        }
+        self.holds
+    }
+}
 
 /// The past: every record, and a list of those accepted by the filters.
 ///
@@ -23,7 +48,9 @@ pub struct History {
     /// Number of the oldest record, counted from the first one ever.
     first: u64,
     filters: Vec<Filter>,
-    /// Numbers of the accepted records; without filters, all are listed.
+    /// What else must hold for a record to be listed. It has seen every record that is kept.
+    only_while: Option<While>,
+    /// Numbers of the listed records, if not all are.
     listed: VecDeque<u64>,
     /// Position of the first of them.
     first_listed: u64,
@@ -43,6 +70,7 @@ impl History {
             first_fd: 0,
             first: 0,
             filters: Vec::new(),
+            only_while: None,
             listed: VecDeque::new(),
             first_listed: 0,
         }
@@ -63,7 +91,8 @@ impl History {
             }
             self.first += 1;
         }
-        if !self.filters.is_empty() && self.accepts(&record) {
+        let holds = self.only_while.as_mut().is_none_or(|only| only.take(&record));
+        if self.is_narrowed() && holds && self.accepts(&record) {
             self.listed.push_back(self.first + self.records.len() as u64);
         }
         let kept = Kept::new(&record, self.first_fd.wrapping_add(self.fd.len() as u32));
@@ -71,6 +100,16 @@ impl History {
             self.fd.push_back(record.event);
         }
         self.records.push_back(kept);
+    }
+
+    /// Whether not every record is listed.
+    pub fn is_narrowed(&self) -> bool {
+        !self.filters.is_empty() || self.only_while.is_some()
+    }
+
+    /// The condition that must hold for a record to be listed, as typed.
+    pub fn only_while(&self) -> Option<&str> {
+        self.only_while.as_ref().map(|only| only.text.as_str())
     }
 
     /// The filters.
@@ -86,18 +125,37 @@ impl History {
     /// Lists only what one of these accepts, including the past. Returns the new position of the record listed at
     /// `place`, or of the next one listed.
     pub fn set_filters(&mut self, filters: Vec<Filter>, place: Option<u64>) -> Option<u64> {
+        self.narrow(filters, None, place)
+    }
+
+    /// The same, and of that only what arrives while a condition holds. What arrived before the oldest record that is kept is unknown to it.
+    pub fn narrow(
+        &mut self,
+        filters: Vec<Filter>,
+        mut only_while: Option<While>,
+        place: Option<u64>,
+    ) -> Option<u64> {
         let number = place.map(|place| self.number(place));
         self.filters = filters;
-        let accepted = (self.first..)
-            .zip(&self.records)
-            .filter(|(_, record)| {
-                !self.filters.is_empty() && self.whole(record).is_some_and(|record| self.accepts(&record))
-            })
-            .map(|(number, _)| number);
-        self.listed = accepted.collect();
+        let is_narrowed = !self.filters.is_empty() || only_while.is_some();
+        let mut lists = |record: &TraceRecord| {
+            let holds = only_while.as_mut().is_none_or(|only| only.take(record));
+            holds && self.accepts(record)
+        };
+        let listed = if is_narrowed {
+            let numbered = (self.first..).zip(&self.records);
+            numbered
+                .filter(|(_, kept)| self.whole(kept).is_some_and(|record| lists(&record)))
+                .map(|(number, _)| number)
+                .collect()
+        } else {
+            VecDeque::new()
+        };
+        self.listed = listed;
+        self.only_while = only_while;
         self.first_listed = 0;
         number.map(|number| {
-            if self.filters.is_empty() {
+            if !self.is_narrowed() {
                 number
             } else {
                 self.listed.partition_point(|listed| *listed < number) as u64
@@ -107,7 +165,7 @@ impl History {
 
     /// The number of the record listed at a position.
     fn number(&self, place: u64) -> u64 {
-        if self.filters.is_empty() {
+        if !self.is_narrowed() {
             return place;
         }
         let index = place.saturating_sub(self.first_listed) as usize;
@@ -116,12 +174,12 @@ impl History {
 
     /// Position of the oldest listed record that is still there.
     pub fn first(&self) -> u64 {
-        if self.filters.is_empty() { self.first } else { self.first_listed }
+        if !self.is_narrowed() { self.first } else { self.first_listed }
     }
 
     /// Position that the next listed record will have.
     pub fn end(&self) -> u64 {
-        if self.filters.is_empty() {
+        if !self.is_narrowed() {
             self.first + self.records.len() as u64
         } else {
             self.first_listed + self.listed.len() as u64
@@ -190,6 +248,7 @@ impl History {
 mod tests {
     use super::*;
     use cantap::Direction;
+    use cantap_signals::{Decoder, Source};
 
     #[test]
     fn the_oldest_makes_room_and_numbers_stay() {
@@ -245,6 +304,41 @@ mod tests {
 
     fn listed(history: &History) -> Vec<i64> {
         (history.first()..history.end()).map(|place| history.get(place).unwrap().time_ns).collect()
+    }
+
+    #[test]
+    fn a_condition_lists_the_past_and_what_comes_while_it_holds() {
+        let database = "BO_ 291 M: 8 N\n SG_ Speed : 0|8@1+ (1,0) [0|0] \"\" N\n";
+        let database = cantap_signals::dbc::parse("m.dbc", database.as_bytes()).unwrap();
+        let decoder = Decoder::new(vec![Source { channel: None, database }]);
+        let only_while = |text: &str| {
+            let condition = Condition::new(text, &decoder).unwrap();
+            Some(While::new(text.to_owned(), condition))
+        };
+        let at = |n: i64| TraceRecord {
+            event: TraceEvent::Frame {
+                frame: if n % 2 == 0 { format!("123#{:02X}", n % 100) } else { "124#".to_owned() }.parse().unwrap(),
+                direction: Direction::Rx,
+                late: false,
+            },
+            ..frame(n)
+        };
+        let mut history = History::new(0);
+        (0..90).for_each(|n| history.push(at(n)));
+        history.narrow(Vec::new(), only_while("Speed > 80"), None);
+        assert_eq!(history.only_while(), Some("Speed > 80"));
+        assert_eq!(listed(&history), (82..90).collect::<Vec<_>>());
+        (90..104).for_each(|n| history.push(at(n)));
+        // It ends with the frame that ends it.
+        assert_eq!(listed(&history), (82..100).collect::<Vec<_>>());
+        // With a filter, both must hold.
+        history.narrow(vec!["124:7FF".parse().unwrap()], only_while("Speed > 80"), None);
+        assert_eq!(listed(&history), (83..100).step_by(2).collect::<Vec<_>>());
+        // One about frames concerns each alone.
+        history.narrow(Vec::new(), only_while("len == 1 and byte[0] == 84"), None);
+        assert_eq!(listed(&history), [84]);
+        history.narrow(Vec::new(), None, None);
+        assert!(!history.is_narrowed() && listed(&history).len() == 104);
     }
 
     #[test]

@@ -23,7 +23,7 @@ use cantap_work::reception::Reception;
 use cantap_work::recording::RecordingState;
 
 pub use fixed::{FixedTable, Row};
-pub use history::History;
+pub use history::{History, While};
 pub use series::{Extent, Point, Series};
 pub use signals::{Decoded, SignalRow, SignalTable};
 pub use talk::{Talk, Talked};

@@ -103,7 +103,7 @@ fn question(kind: PromptKind) -> &'static str {
     match kind {
         PromptKind::Search => "search this page: bytes, identifiers, names, words of errors and losses",
         PromptKind::Filter => {
-            "show only, in candump's syntax, such as 123:7FF, or can0,123:7FF for channel 1 (empty: all)"
+            "show only FILTERs as candump's, 123:7FF or can0,123:7FF; FILTER if Speed > 80; if Speed > 80 (empty: all)"
         }
         PromptKind::Signals => {
             "show only signals with this in their name (* is anything), as Wheel*Speed > 80, or alarm (empty: all)"

@@ -129,7 +129,7 @@ fn line(app: &App, model: &Model, detail: Detail, most_address: usize) -> Vec<Sp
     {
         spans.push(Span::styled("  NOT FOLLOWING", Theme::heading()));
     }
-    if !model.history.filters().is_empty() {
+    if model.history.is_narrowed() {
         spans.push(Span::styled("  FILTER", Theme::heading()));
     }
     if app.view == View::Signals && !app.signals.filter.text().is_empty() {

@@ -28,10 +28,11 @@ pub(super) fn open(
     channels: &Channels,
     bitrates: &[RequestedRate],
     time: Option<Duration>,
+    device_intervals: bool,
 ) -> anyhow::Result<LiveRecords> {
     let boards = Boards::new(devices, channels)
         .map_err(|error| for_listening(error.into(), devices, "without a trace to measure"))?;
-    live_args::listen(&boards, bitrates, time)
+    live_args::listen(&boards, bitrates, time, device_intervals)
 }
 
 /// Listens until Ctrl-C or the end of the time, and prints a line per window if `shown`. What was received counts, even if this

@@ -114,6 +114,8 @@ pub struct ClockMap {
     frames: FrameClock,
     /// Never empty; the last one applies from its start on.
     bends: VecDeque<Bend>,
+    /// Whether the line goes on straight by the device's ticks.
+    keeps_intervals: bool,
     report: ClockReport,
 }
 
@@ -131,8 +133,18 @@ impl ClockMap {
                 ns_per_tick: nominal_ns_per_tick,
                 unsure_ns: 0,
             }]),
+            keeps_intervals: false,
             report: ClockReport::default(),
         }
+    }
+
+    /// From `now` on, a second is as long as the device's crystal says, and no interval is ever corrected towards UTC: what the times are
+    /// off by is part of [`ClockReport::uncertainty_ns`]. They do not jump.
+    pub fn keep_intervals(&mut self, now: Ticks) {
+        self.keeps_intervals = true;
+        let last = self.bends[self.bends.len() - 1];
+        let at = now.max(last.at);
+        self.push(Bend { at, utc: last.utc(at), ns_per_tick: self.nominal_ns_per_tick, ..last });
     }
 
     /// The UTC time of a device time. A past time keeps the UTC it had then, for the last 17 minutes.
@@ -237,7 +249,12 @@ impl ClockMap {
         let true_ns_per_tick = ruler * (1.0 + line.rate);
         let off_ns = utc.since(at) as f64;
         let unsure_ns = (line.range_ns.1 - off_ns).abs().max((off_ns - line.range_ns.0).abs()).ceil() as i64;
-        self.push(Bend { at: now, utc, ns_per_tick: true_ns_per_tick * (1.0 + correction), unsure_ns });
+        let ns_per_tick = if self.keeps_intervals {
+            self.nominal_ns_per_tick
+        } else {
+            true_ns_per_tick * (1.0 + correction)
+        };
+        self.push(Bend { at: now, utc, ns_per_tick, unsure_ns });
         let faster_ppm = |utc_per_nominal: f64| (1.0 / utc_per_nominal - 1.0) * 1e6;
         let sure = line.rate_doubt * 1e6 <= MAX_DOUBT_PPM;
         self.report.drift_ppm = sure.then(|| faster_ppm(rate * (1.0 + line.rate)));

@@ -179,6 +179,36 @@ fn a_device_in_its_own_time_keeps_its_spacing() {
 }
 
 #[test]
+fn intervals_that_are_kept_are_the_crystals_and_how_far_that_leads_from_utc_is_known() {
+    let device = Simulated { ppm: 37.0, ..EXACT };
+    let mut map = ClockMap::new(TICK_HZ, utc(0));
+    let mut ends = Vec::new();
+    for second in 0..300 {
+        let (asked_ns, (to_ns, back_ns)) = (second * S, usual(second));
+        map.add(device.ticks(asked_ns + to_ns), utc(asked_ns), utc(asked_ns + to_ns + back_ns));
+        if second == 0 {
+            map.settle();
+            // Long before anything that was asked: the line must not be drawn from there.
+            let before = map.utc(device.ticks(S / 2));
+            map.keep_intervals(Ticks(0));
+            assert!(map.utc(device.ticks(S / 2)).since(before).abs() <= 1);
+        }
+        let now = device.ticks(asked_ns + S / 2);
+        ends.push((now, map.utc(now)));
+    }
+    for pair in ends.windows(2) {
+        let by_ticks_ns = pair[1].0.since(pair[0].0) as f64 * 1e9 / f64::from(TICK_HZ);
+        assert!((pair[1].1.since(pair[0].1) as f64 - by_ticks_ns).abs() <= 2.0);
+    }
+    let report = map.report();
+    assert!((report.drift_ppm.unwrap() - 37.0).abs() < 2.0, "{report:?}");
+    // 37 us in each of 300 s.
+    let (off_ns, unsure_ns) = (ends[299].1.since(utc(299 * S + S / 2)), report.uncertainty_ns.unwrap());
+    assert!((10_900_000..11_300_000).contains(&off_ns), "{off_ns}");
+    assert!((off_ns..off_ns + 1_000_000).contains(&unsure_ns), "{unsure_ns} for {off_ns}");
+}
+
+#[test]
 fn a_clock_that_is_moved_is_followed_again() {
     // The computer sleeps for 40 ms, which the device's clock counts and its own does not.
     let mut map = ClockMap::new(TICK_HZ, utc(0));

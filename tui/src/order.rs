@@ -3,9 +3,30 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+use std::sync::Arc;
+
 use cantap::Frame;
+use cantap::wire::message::{MAX_MODIFIERS, Modifier};
+use cantap_signals::Decoder;
+use cantap_work::changing::Changing;
 
 use super::plan::Plan;
+
+/// What changes in a frame each time it is sent.
+pub type Modifiers = heapless::Vec<Modifier, MAX_MODIFIERS>;
+
+/// A frame that is sent periodically.
+#[derive(Clone, Debug)]
+pub struct Repeated {
+    /// The frame, before modifiers.
+    pub frame: Frame,
+    /// From one time to the next.
+    pub period: Duration,
+    /// Applied in this order each time.
+    pub modifiers: Modifiers,
+    /// In place of the frame, a message whose values change, and what encodes it.
+    pub changing: Option<(Arc<Changing>, Arc<Decoder>)>,
+}
 
 /// An order from the display to the source.
 #[derive(Clone, Debug)]
@@ -16,8 +37,10 @@ pub enum Order {
     StopRecording,
     /// Send a frame once, on the channel with this number.
     Send(u8, Frame),
-    /// Have the device send a frame periodically; `None` ends it.
-    SetPeriodic(u8, u8, Option<(Frame, Duration)>),
+    /// Have the device send a frame periodically, in a slot of the channel with this number; `None` ends it.
+    SetPeriodic(u8, u8, Option<Repeated>),
+    /// Write the send list to a new file.
+    WriteList(PathBuf, String),
     /// Playback: faster.
     Faster,
     /// Playback: slower.

@@ -29,6 +29,7 @@ use crate::input::not_a_message;
 use crate::one_board::OneBoard;
 use crate::print_sent::print_sent;
 use crate::usage_error::usage;
+use cantap_work::changing::{Changing, modified};
 use cantap_work::interrupt;
 use cantap_work::rounded;
 use cantap_work::sending::{LOOK_EVERY, Sending};
@@ -39,11 +40,15 @@ use cantap_work::sending::{LOOK_EVERY, Sending};
                 Message:Signal=value,Signal=value with --db; CAN FD frames as 123##1DEADBEEF, where the digit has the flags \
                 (1: the bit rate is switched, 2: the sender is error passive). Each frame that was sent is printed with the time at which \
                 it ended on the bus. When none leaves for a second, it ends and says why.\n\n\
+                With --period a value may change with time: sine(LOW,HIGH,PERIOD), triangle, square, ramp(FROM,TO,PERIOD), random(LOW,HIGH), \
+                values(1,2,3), file(PATH) with one in each line.\n\n\
                 Examples:\n  \
                 cantap send -d /dev/ttyACM0 -b 500k can0 123#DEADBEEF\n  \
                 cantap send -d virtual can1 123#00 --period 10ms --count 100 --counter 0\n  \
                 cantap send -d COM5 -b 250k can0 7E8#0341 --on-rx 7E0:7FF\n  \
-                cantap send -d COM5 -b 250k can0 'Dashboard:Speed=88' --db car.dbc")]
+                cantap send -d COM5 -b 250k can0 'Dashboard:Speed=88' --db car.dbc\n  \
+                cantap send -d virtual:car 1 'ECM_Engine1:EngineSpeed=sine(800,6000,10s)' \\\n      \
+                --period 10ms --time 10s --counter 6.0:4 --checksum 7:crc8")]
 pub struct Args {
     #[command(flatten)]
     device: OneBoard,
@@ -109,7 +114,12 @@ fn is_message(text: &str) -> bool {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // Everything wrong on the command line is found before anything is sent.
     let decoder = args.decoder()?;
-    let frames = args.frames(&decoder)?;
+    let sources = args.sources(&decoder)?;
+    let frames: Vec<TraceFrame> = sources.iter().map(|source| source.first).collect();
+    let changes = sources.iter().any(|source| source.changing.is_some());
+    if changes && args.period.is_none() {
+        return Err(usage("a value that changes with time needs --period, such as --period 20ms"));
+    }
     let classic: Vec<Frame> = frames.iter().filter_map(|frame| frame.classic().copied()).collect();
     let has_fd = classic.len() < frames.len();
     if has_fd && (args.reply || args.on_rx.is_some()) {
@@ -149,8 +159,20 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             replies = Some(waited);
             sending.outcome_of_replies(asked, merged)?
         }
-        (None, Some((period, _))) if has_fd => {
-            let what = Repeated { frames: &frames, period, rounds: args.count, time: args.time };
+        (None, Some((period, modifiers))) if has_fd || changes => {
+            let frames = |round, since_s| {
+                sources
+                    .iter()
+                    .map(|source| source.frame(&decoder, args, &modifiers, round, since_s))
+                    .collect()
+            };
+            let what = Repeated {
+                count: sources.len(),
+                frames: &frames,
+                period,
+                rounds: args.count,
+                time: args.time,
+            };
             let asked = timed::send(&device, args.channel, &what, &mut sending, || args.is_over(started))?;
             sending.outcome(asked)?
         }
@@ -201,6 +223,33 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
+/// A frame to be sent, or where it comes from.
+struct Source {
+    /// What it is at the beginning.
+    first: TraceFrame,
+    changing: Option<Changing>,
+}
+
+impl Source {
+    /// What it is in a round, from 0, that is due so many seconds after the first.
+    fn frame(
+        &self,
+        decoder: &Decoder,
+        args: &Args,
+        modifiers: &Modifiers,
+        round: u32,
+        since_s: f64,
+    ) -> anyhow::Result<TraceFrame> {
+        Ok(match (&self.changing, self.first.classic()) {
+            (Some(changing), _) => {
+                changing.frame(decoder, Some(args.channel.number()), since_s, round)?.into()
+            }
+            (None, Some(frame)) => modified(frame, modifiers, round).into(),
+            (None, None) => self.first,
+        })
+    }
+}
+
 impl Args {
     fn decoder(&self) -> anyhow::Result<Decoder> {
         let is_sent = self.frames.iter().any(|text| is_message(text));
@@ -209,21 +258,33 @@ impl Args {
         load(&self.databases.or_of(device), false, self.quiet || !is_sent && self.databases.is_empty())
     }
 
-    fn frames(&self, decoder: &Decoder) -> anyhow::Result<Vec<TraceFrame>> {
-        let frame = |text: &String| {
-            if is_message(text) {
-                let how = (self.brs, self.pad);
-                return Ok(encode::encode_any(decoder, Some(self.channel.number()), text, how)?);
+    fn sources(&self, decoder: &Decoder) -> anyhow::Result<Vec<Source>> {
+        let modifiers = self.modifiers.list()?;
+        let source = |text: &String| {
+            if is_message(text)
+                && let Some(changing) = Changing::parse(text)?
+            {
+                let changing = changing.with_modifiers(modifiers.clone());
+                let first = changing.check(decoder, Some(self.channel.number()))?.into();
+                return Ok(Source { first, changing: Some(changing) });
             }
-            let frame = grammar::any_frame(text, self.pad);
-            frame.map_err(|error| {
-                let is_fd = text.contains("##") && !self.pad;
-                let advice = if is_fd { "; --pad fills it up with zeros to the next of these" } else { "" };
-                let advice = if error.contains("carries 0 to 8, 12") { advice } else { "" };
-                usage(format!("'{text}' is not a frame: {error}{advice}"))
-            })
+            self.frame(text, decoder).map(|first| Source { first, changing: None })
         };
-        self.frames.iter().map(frame).collect()
+        self.frames.iter().map(source).collect()
+    }
+
+    fn frame(&self, text: &str, decoder: &Decoder) -> anyhow::Result<TraceFrame> {
+        if is_message(text) {
+            let how = (self.brs, self.pad);
+            return Ok(encode::encode_any(decoder, Some(self.channel.number()), text, how)?);
+        }
+        let frame = grammar::any_frame(text, self.pad);
+        frame.map_err(|error| {
+            let is_fd = text.contains("##") && !self.pad;
+            let advice = if is_fd { "; --pad fills it up with zeros to the next of these" } else { "" };
+            let advice = if error.contains("carries 0 to 8, 12") { advice } else { "" };
+            usage(format!("'{text}' is not a frame: {error}{advice}"))
+        })
     }
 
     /// The period and what changes each time, if frames should be sent periodically.

@@ -88,6 +88,37 @@ fn periodic_frames_count_and_carry_their_checksum() {
     }
 }
 
+#[test]
+fn values_that_change_follow_their_time_with_counter_and_checksum() {
+    let path = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("changing.dbc");
+    std::fs::write(&path, "BO_ 291 Engine: 4 ECU\n SG_ Speed : 0|16@1+ (0.1,0) [0|200] \"\" X\n").unwrap();
+    let send = |what: &str| {
+        cantap(&format!(
+            "send -d virtual:load=0 can0 {what} --db {} --counter 2 --checksum 3:xor",
+            path.display()
+        ))
+    };
+    let (code, out, err) = send("Engine:Speed=ramp(0,100,100ms) 124#0000FF00 --period 10ms --count 12");
+    assert_eq!((code, err.as_str()), (Some(0), ""));
+    let expected: Vec<String> = (0..12_u32)
+        .flat_map(|round| {
+            let speed = round % 10 * 100;
+            let bytes = [speed as u8, (speed >> 8) as u8, round as u8];
+            let sum = |bytes: &[u8]| bytes.iter().fold(0, |sum, byte| sum ^ byte);
+            let hex = |bytes: [u8; 3]| {
+                format!("{:02X}{:02X}{:02X}{:02X}", bytes[0], bytes[1], bytes[2], sum(&bytes))
+            };
+            let other = [0, 0, 0xFF_u8.wrapping_add(round as u8)];
+            [format!("can0 123#{} T", hex(bytes)), format!("can0 124#{} T", hex(other))]
+        })
+        .collect();
+    assert_eq!(frames(&out), expected);
+    let (code, _, err) = send("Engine:Speed=ramp(0,100,100ms)");
+    assert!(code == Some(2) && err.contains("--period"), "{err}");
+    let (code, _, err) = send("Engine:Speed=ramp(0,300,100ms) --period 10ms");
+    assert!(code == Some(1) && err.contains("Speed"), "{err}");
+}
+
 /// Every frame of a busy bus starts a reply; the count ends them.
 #[test]
 fn a_reply_follows_what_its_filter_accepts() {

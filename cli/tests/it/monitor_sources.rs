@@ -276,3 +276,80 @@ fn the_emulated_board_is_watched_sent_with_and_recorded() {
     let sent = records.filter(|record| record.frame().is_some_and(|frame| frame.id().raw() == 0x6F7));
     assert_eq!(sent.count(), 1);
 }
+
+/// Two entries of a group, of which one's values follow a ramp and the other's a list, each with a counter, beside one that the device repeats by itself.
+#[test]
+fn values_that_change_are_sent_at_their_times_and_a_group_at_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let database = write(
+        folder.path(),
+        "car.dbc",
+        "VERSION \"\"\nBO_ 291 Engine: 8 ECU\n SG_ Speed : 0|16@1+ (0.1,0) [0|200] \"\" X\nBO_ 292 Gear: 2 ECU\n SG_ Lever : 0|8@1+ (1,0) [0|5] \"\" X\n",
+    );
+    let list = write(
+        folder.path(),
+        "list.txt",
+        "# What the bench sends.\nEngine:Speed=ramp(0,100,1s) 10ms counter=3.0:4 checksum=7:xor group=bench\n\
+         Gear:Lever=values(1,3,2) 15ms counter=1 group=bench\n125#00 20ms counter=0 group=bench\n123#11 1s\n",
+    );
+    let recording = folder.path().join("sent.log");
+    let line = format!(
+        "monitor virtual:load=0 -b 500k --normal --view send --db {database} -o {}",
+        recording.display()
+    );
+    let mut view = Terminal::start(&line, (160, 24));
+    view.wait_for("NORMAL: running");
+    view.keys(&format!("i{list}\r"));
+    view.wait_for("4 entries added");
+    view.keys("g");
+    view.wait_until("three are on", |screen| {
+        screen.matches(" on ").count() + screen.matches("on 1 ").count() >= 3
+    });
+    view.keys("1");
+    view.wait_until("traffic", |screen| screen.matches(" 125 ").count() > 5);
+    std::thread::sleep(std::time::Duration::from_secs(2));
+    view.keys("6g");
+    view.wait_until("none is on", |screen| !screen.contains("on 1 "));
+    view.keys(&format!("x{}/out.txt\r", folder.path().display()));
+    view.wait_for("4 entries written");
+    view.keys("q");
+    assert_eq!(view.end(), 0);
+    let written = std::fs::read_to_string(folder.path().join("out.txt")).unwrap();
+    assert_eq!(written.lines().count(), 4);
+    let records = open_reader(&recording, &ReadOptions::default()).unwrap().map(Result::unwrap);
+    let frames: Vec<_> =
+        records.filter_map(|record| Some((record.time_ns, *record.frame()?.classic()?))).collect();
+    let of = |id: u32| -> Vec<_> {
+        frames
+            .iter()
+            .filter(|(_, frame)| frame.id().raw() == id)
+            .map(|(at, frame)| (*at, frame.padded_data()))
+            .collect()
+    };
+    let speeds = of(0x123);
+    assert!(speeds.len() > 100, "{}", speeds.len());
+    for (at, pair) in speeds.windows(2).enumerate() {
+        let [(before_ns, before), (after_ns, after)] = pair else { unreachable!() };
+        // The counter says which round it is: a busy computer may leave some out, but nothing comes at a wrong time or with a wrong value.
+        let rounds = i64::from((after[3].wrapping_sub(before[3])) & 0xF);
+        let apart_ms = (after_ns - before_ns) as f64 / 1e6;
+        let off = (apart_ms / 10.0 - rounds as f64).rem_euclid(16.0);
+        assert!(off.min(16.0 - off) < 0.1, "{at}: {apart_ms} ms, {rounds}");
+        let speed = |data: &[u8; 8]| f64::from(u16::from_le_bytes([data[0], data[1]])) / 10.0;
+        let gained = (speed(after) - speed(before)).rem_euclid(100.0);
+        assert!(
+            (gained - (apart_ms / 10.0).round().rem_euclid(100.0)).abs() < 0.2,
+            "{at}: {gained} in {apart_ms} ms"
+        );
+        assert_eq!(after[7], after[..7].iter().fold(0, |sum, byte| sum ^ byte));
+    }
+    let levers = of(0x124);
+    assert!(levers.len() > 60, "{}", levers.len());
+    for pair in levers.windows(2) {
+        let place = |data: &[u8; 8]| [1, 3, 2].iter().position(|lever| *lever == data[0]).unwrap();
+        let rounds = usize::from(pair[1].1[1].wrapping_sub(pair[0].1[1]));
+        assert_eq!(place(&pair[1].1), (place(&pair[0].1) + rounds) % 3, "{pair:?}");
+    }
+    let own = of(0x125);
+    assert!(own.len() > 50 && own.windows(2).all(|pair| pair[1].1[0] == pair[0].1[0].wrapping_add(1)));
+}

@@ -84,7 +84,8 @@ impl ChannelOptions {
 
     /// Whether any option is given.
     pub fn is_given(&self) -> bool {
-        let Self { timing, mode, one_shot, recovery, no_data, no_stamps, device_intervals: _, board: _ } = self;
+        let Self { timing, mode, one_shot, recovery, no_data, no_stamps, device_intervals: _, board: _ } =
+            self;
         timing.is_given_in_part()
             || mode.is_some()
             || recovery.is_some()

@@ -8,6 +8,7 @@
 //! | [`live`], [`reception`] | records of devices that may come and go; a channel that receives only errors |
 //! | [`doctor`], [`bus_hints`], `port_access` (Linux) | what is the matter with a port, a device or a bus, and what to do next |
 //! | [`sending`], [`speaking`], [`uds`], [`uds_memory`] | frames and their fate; a protocol's client on a device |
+//! | [`changing`] | messages whose values change with time |
 //! | [`gateway`] | the rules of a gateway, and what they do to a trace |
 //! | [`read_ahead`], [`missing`], [`databases`], [`reading`] | traces, what is missing from them, and what they mean |
 //! | [`recording`] | a trace that grows, or waits for a condition |
@@ -29,6 +30,8 @@ pub mod boards;
 pub mod bus_hints;
 #[cfg(feature = "buses")]
 pub mod bus_off;
+#[cfg(feature = "buses")]
+pub mod changing;
 #[cfg(feature = "buses")]
 pub mod channel_bitrate;
 #[cfg(feature = "buses")]

@@ -156,6 +156,9 @@ impl App {
             (View::Send, KeyCode::Char('a')) => self.ask(PromptKind::Send, ""),
             (View::Send, KeyCode::Char('e')) => self.edit_entry(),
             (View::Send, KeyCode::Char('d') | KeyCode::Delete) => self.delete_entry(),
+            (View::Send, KeyCode::Char('g')) => self.toggle_group(),
+            (View::Send, KeyCode::Char('x')) => self.ask(PromptKind::Export, ""),
+            (View::Send, KeyCode::Char('i')) => self.ask(PromptKind::Import, ""),
             (_, code) => self.scroll(code),
         }
     }

@@ -103,6 +103,10 @@ pub enum PromptKind {
     Time,
     /// A trace or a database.
     Open,
+    /// A file to write the send list to.
+    Export,
+    /// A file with entries for the send list.
+    Import,
 }
 
 /// An input line.

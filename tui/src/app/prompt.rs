@@ -47,7 +47,12 @@ impl App {
                 }
                 Ok(())
             }
-            PromptKind::Record | PromptKind::Send | PromptKind::Time | PromptKind::Open
+            PromptKind::Record
+            | PromptKind::Send
+            | PromptKind::Time
+            | PromptKind::Open
+            | PromptKind::Export
+            | PromptKind::Import
                 if text.is_empty() =>
             {
                 Ok(())
@@ -59,6 +64,11 @@ impl App {
             PromptKind::Filter => self.set_filters(text, model),
             PromptKind::Record => self.record(Path::new(text)),
             PromptKind::Send => parse_entry(text, model).map(|entry| self.put_entry(prompt.entry, entry)),
+            PromptKind::Export => {
+                self.export_list(Path::new(text));
+                Ok(())
+            }
+            PromptKind::Import => self.import_list(Path::new(text), model),
             PromptKind::BitRate => self.set_bit_rates(text, model),
             PromptKind::Device => self.set_device(text, model),
             // It is answered by one key.

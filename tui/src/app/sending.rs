@@ -1,7 +1,10 @@
 //! The send list: frames sent by key, or periodically by the device itself.
 
+use std::path::Path;
+
+use super::super::model::Model;
 use super::super::order::Order;
-use super::entry::SendEntry;
+use super::entry::{SendEntry, parse_entry};
 use super::line::{Line, Prompt, PromptKind};
 use super::state::App;
 
@@ -42,20 +45,67 @@ impl App {
         }
     }
 
-    /// Has the device send an entry periodically, in a separate slot.
-    fn start_periodic(&mut self, place: usize) {
-        let Some(SendEntry { channel, frame, period: Some(period), .. }) = self.send.get(place).cloned()
-        else {
+    /// Starts every entry of the selected one's group, or if all of them are on, stops them.
+    pub(super) fn toggle_group(&mut self) {
+        if !self.can_send() {
+            return;
+        }
+        let Some(group) = self.send.get(self.selected).and_then(|entry| entry.group.clone()) else {
+            "this entry is in no group; e adds one, as in 123#11 100ms group=engine"
+                .clone_into(&mut self.message);
             return;
         };
-        let in_use =
-            |slot| self.send.iter().any(|entry| (entry.channel, entry.slot) == (channel, Some(slot)));
-        let Some(slot) = (0..=u8::MAX).find(|slot| !in_use(*slot)) else {
+        let is_of_it = |entry: &SendEntry| entry.group.as_ref() == Some(&group) && entry.period.is_some();
+        let places: Vec<_> = (0..self.send.len()).filter(|place| is_of_it(&self.send[*place])).collect();
+        let are_all_on = places.iter().all(|place| self.send[*place].slot.is_some());
+        for place in places {
+            match (are_all_on, self.send[place].slot) {
+                (true, _) => self.stop_periodic(place),
+                (false, None) => self.start_periodic(place),
+                (false, Some(_)) => {}
+            }
+        }
+    }
+
+    /// Has the list written to a new file, a line for each entry, as [`Self::import_list`] reads it.
+    pub(super) fn export_list(&mut self, path: &Path) {
+        let text = self.send.iter().flat_map(|entry| [entry.text.as_str(), "\n"]).collect();
+        self.order(Order::WriteList(path.to_owned(), text));
+    }
+
+    /// Adds the entries of a file: a line for each, `#` at the beginning of a line for a comment. If one of them is wrong, none is added.
+    pub(super) fn import_list(&mut self, path: &Path, model: &Model) -> Result<(), String> {
+        let text = std::fs::read(path).map_err(|error| format!("{}: {error}", path.display()))?;
+        let text = String::from_utf8(text).map_err(|_| format!("{} is no text", path.display()))?;
+        let lines = (1..).zip(text.lines()).map(|(number, line)| (number, line.trim()));
+        let lines = lines.filter(|(_, line)| !line.is_empty() && !line.starts_with('#'));
+        let entry = |(number, line): (u32, &str)| {
+            parse_entry(line, model).map_err(|reason| format!("{}, line {number}: {reason}", path.display()))
+        };
+        let entries = lines.map(entry).collect::<Result<Vec<_>, _>>()?;
+        self.message = format!("{} entries added; Space sends the selected one", entries.len());
+        self.send.extend(entries);
+        Ok(())
+    }
+
+    /// Has the device send an entry periodically, in a separate slot.
+    fn start_periodic(&mut self, place: usize) {
+        let Some(entry) = self.send.get(place) else { return };
+        let (channel, Some(repeated)) = (entry.channel, entry.repeated()) else { return };
+        let is_free =
+            |slot: &u8| !self.send.iter().any(|entry| (entry.channel, entry.slot) == (channel, Some(*slot)));
+        // What this program hands over piece by piece takes none of the device's own slots.
+        let slot = if repeated.changing.is_some() {
+            (0..=u8::MAX).rev().find(is_free)
+        } else {
+            (0..=u8::MAX).find(is_free)
+        };
+        let Some(slot) = slot else {
             "no device sends more frames periodically; stop another one".clone_into(&mut self.message);
             return;
         };
         self.send[place].slot = Some(slot);
-        self.order(Order::SetPeriodic(channel, slot, Some((frame, period))));
+        self.order(Order::SetPeriodic(channel, slot, Some(repeated)));
     }
 
     fn stop_periodic(&mut self, place: usize) {

@@ -155,10 +155,10 @@ impl History {
         self.only_while = only_while;
         self.first_listed = 0;
         number.map(|number| {
-            if !self.is_narrowed() {
-                number
-            } else {
+            if self.is_narrowed() {
                 self.listed.partition_point(|listed| *listed < number) as u64
+            } else {
+                number
             }
         })
     }
@@ -174,15 +174,15 @@ impl History {
 
     /// Position of the oldest listed record that is still there.
     pub fn first(&self) -> u64 {
-        if !self.is_narrowed() { self.first } else { self.first_listed }
+        if self.is_narrowed() { self.first_listed } else { self.first }
     }
 
     /// Position that the next listed record will have.
     pub fn end(&self) -> u64 {
-        if !self.is_narrowed() {
-            self.first + self.records.len() as u64
-        } else {
+        if self.is_narrowed() {
             self.first_listed + self.listed.len() as u64
+        } else {
+            self.first + self.records.len() as u64
         }
     }
 
@@ -317,7 +317,9 @@ mod tests {
         };
         let at = |n: i64| TraceRecord {
             event: TraceEvent::Frame {
-                frame: if n % 2 == 0 { format!("123#{:02X}", n % 100) } else { "124#".to_owned() }.parse().unwrap(),
+                frame: if n % 2 == 0 { format!("123#{:02X}", n % 100) } else { "124#".to_owned() }
+                    .parse()
+                    .unwrap(),
                 direction: Direction::Rx,
                 late: false,
             },

@@ -2,16 +2,17 @@
 
 use std::collections::VecDeque;
 use std::sync::mpsc::TryRecvError;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use cantap::device::{Happening, Return, UtcClock, channel_number};
 use cantap::wire::message::{ChannelConfig, Periodic, TxFrame};
 use cantap::wire::record::ErrorState;
-use cantap::{Channel, Frame, TraceEvent, TraceRecord};
+use cantap::{Channel, TraceEvent, TraceRecord};
 
 use super::super::model::{DeviceFigures, SourceState};
-use super::super::order::Order;
+use super::super::order::{Order, Repeated};
 use super::super::plan::Plan;
+use super::timed::{Ended, Timed};
 use super::{FIGURES_EVERY, Source, Then, WAIT, lock};
 use cantap_work::advice;
 use cantap_work::bus_hints::BusHint;
@@ -92,12 +93,14 @@ impl Source<'_> {
         let mut unknown = vec![true; plan.addresses.len()];
         let mut early = VecDeque::new();
         let mut recoveries: Vec<_> = plan.addresses.iter().map(|_| plan.open.recovery()).collect();
+        self.timed = Timed::default();
         lock(self.model).source = SourceState::Starting;
         loop {
             match lines.next(WAIT) {
                 (_, Happening::Records(batch)) => self.hand_over(batch, lines),
                 (board, Happening::Gone(error)) => {
                     unknown[board] = false;
+                    self.timed.forget(board);
                     let mut model = lock(self.model);
                     let reason = advice::sentence(&error);
                     if lines.devices().next().is_none() {
@@ -111,6 +114,7 @@ impl Source<'_> {
                     let reconnects = reconnects.get(board).copied().unwrap_or_default();
                     paces[board] = None;
                     unknown[board] = false;
+                    self.timed.forget(board);
                     self.greet(board, lines, plan, &back, reconnects);
                 }
                 // Nobody has stopped it.
@@ -122,6 +126,13 @@ impl Source<'_> {
                 for channel in back.into_iter().flatten() {
                     let number = channel_number(board, channel);
                     self.notice(format!("channel {number} was bus-off and joins the bus again"));
+                }
+            }
+            for (board, device) in lines.devices() {
+                for Ended { number, slot, reason } in self.timed.go_on(board, device) {
+                    let mut model = lock(self.model);
+                    model.notice = reason;
+                    model.refused.push((number, slot));
                 }
             }
             if Instant::now() >= next_figures {
@@ -279,8 +290,11 @@ impl Source<'_> {
                 }
                 Then::GoOn
             }
-            Order::SetPeriodic(_, slot, entry) => {
-                let entry = entry.map(|(frame, period)| periodic(device.hello().tick_hz, frame, period));
+            Order::SetPeriodic(_, slot, repeated) => {
+                if self.timed.set(number, slot, repeated.as_ref()) {
+                    return Then::GoOn;
+                }
+                let entry = repeated.map(|repeated| periodic(device.hello().tick_hz, repeated));
                 if let Err(error) = device.set_periodic(channel, slot, entry) {
                     let mut model = lock(self.model);
                     model.notice = advice::explained(&error);
@@ -398,14 +412,10 @@ impl Pace {
     }
 }
 
-fn periodic(tick_hz: u32, frame: Frame, period: Duration) -> Periodic {
+fn periodic(tick_hz: u32, repeated: Repeated) -> Periodic {
+    let Repeated { frame, period, modifiers, .. } = repeated;
     let ticks = period.as_nanos() * u128::from(tick_hz) / 1_000_000_000;
-    Periodic {
-        frame,
-        period_ticks: u32::try_from(ticks).unwrap_or(u32::MAX),
-        count: 0,
-        modifiers: heapless::Vec::new(),
-    }
+    Periodic { frame, period_ticks: u32::try_from(ticks).unwrap_or(u32::MAX), count: 0, modifiers }
 }
 
 #[cfg(test)]

@@ -6,7 +6,10 @@
 mod autobaud;
 mod device;
 mod playback;
+mod timed;
 
+use std::fs::File;
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::Receiver;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -18,6 +21,7 @@ use super::model::Model;
 use super::order::Order;
 use super::plan::Plan;
 use cantap_work::recording::{Older, Recording};
+use timed::Timed;
 
 /// The model, shared by the source thread and the display.
 pub type Shared = Arc<Mutex<Model>>;
@@ -51,7 +55,7 @@ const FIGURES_EVERY: Duration = Duration::from_millis(500);
 
 /// Runs until [`Order::Quit`].
 pub fn run(origin: Origin, model: &Shared, orders: &Receiver<Order>) {
-    let mut source = Source { model, orders, recording: None };
+    let mut source = Source { model, orders, recording: None, timed: Timed::default() };
     match origin {
         Origin::Device(plan) => source.run_device(plan),
         Origin::File(path) => source.run_file(&path),
@@ -63,6 +67,7 @@ struct Source<'a> {
     model: &'a Shared,
     orders: &'a Receiver<Order>,
     recording: Option<Recording>,
+    timed: Timed,
 }
 
 impl Source<'_> {
@@ -102,6 +107,14 @@ impl Source<'_> {
         }
     }
 
+    fn write_list(&self, path: &Path, text: &str) {
+        let written = File::create_new(path).and_then(|mut file| file.write_all(text.as_bytes()));
+        self.notice(match written {
+            Ok(()) => format!("{} entries written to {}", text.lines().count(), path.display()),
+            Err(error) => format!("{} is not written: {error}", path.display()),
+        });
+    }
+
     fn stop_recording(&mut self) {
         if let Some(recording) = self.recording.take() {
             let said = recording.finish();
@@ -139,6 +152,7 @@ impl Source<'_> {
                 self.notice("there is no device to send with; open one with D");
                 lock(self.model).refused.push((channel, slot));
             }
+            Order::WriteList(path, text) => self.write_list(&path, &text),
             Order::Recover => self.notice("there is no device to bring back onto a bus"),
             Order::Faster
             | Order::Slower

@@ -238,6 +238,51 @@ fn while_the_display_stands_still_rows_can_be_hidden_and_values_do_not_move() {
 }
 
 #[test]
+fn an_entry_says_what_changes_and_a_group_goes_on_and_off_together() {
+    let mut model = model();
+    let (mut app, orders) = app(View::Send);
+    press(&mut app, &mut model, "my");
+    assert!(matches!(orders.try_recv().unwrap(), Order::Open(_)));
+    press(&mut app, &mut model, "a123#0F22F000 5ms counter=0.0:4 checksum=3:xor group=engine\n");
+    press(
+        &mut app,
+        &mut model,
+        "aPositionRapid:Latitude=sine(-10,10,4s) 100ms group=engine\na124#11 group=engine\n",
+    );
+    assert_eq!(app.send.len(), 3, "{}", app.message);
+    press(&mut app, &mut model, "g");
+    let Ok(Order::SetPeriodic(1, 0, Some(first))) = orders.try_recv() else { panic!() };
+    assert!(first.modifiers.len() == 2 && first.changing.is_none());
+    // The last slot, since the device has only so many.
+    let Ok(Order::SetPeriodic(1, 255, Some(second))) = orders.try_recv() else { panic!() };
+    assert!(second.changing.is_some());
+    // Without a period there is nothing to go on.
+    assert!(orders.try_recv().is_err());
+    press(&mut app, &mut model, "g");
+    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(1, 0, None)));
+    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(1, 255, None)));
+    for (wrong, part) in [
+        ("123#11 counter=0", "need a period"),
+        ("123#11 5ms counter=1", "byte 1"),
+        ("123#11 5ms count=1", "no option 'count'"),
+        ("123#11 5ms 6ms", "one period too many"),
+        ("PositionRapid:Latitude=sine(-10,10,4s)", "needs a period"),
+        ("PositionRapid:Latitude=sine(-10,1000,4s) 100ms", "Latitude"),
+        ("PositionRapid:Latitude=sin(-10,1000,4s) 100ms", "sine(LOW,HIGH,PERIOD)"),
+    ] {
+        press(&mut app, &mut model, &format!("a{wrong}\n"));
+        assert!(app.message.contains(part), "{wrong}: {}", app.message);
+        app.key(KeyEvent::from(KeyCode::Esc), &mut model);
+    }
+    app.key(KeyEvent::from(KeyCode::End), &mut model);
+    press(&mut app, &mut model, "a125#\n");
+    app.key(KeyEvent::from(KeyCode::End), &mut model);
+    app.selected = 3;
+    press(&mut app, &mut model, "g");
+    assert!(app.message.contains("in no group"), "{}", app.message);
+}
+
+#[test]
 fn an_entry_that_is_edited_while_it_is_sent_changes_on_the_bus() {
     let mut model = model();
     let (mut app, orders) = app(View::Send);

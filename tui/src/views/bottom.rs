@@ -103,7 +103,7 @@ fn question(kind: PromptKind) -> &'static str {
     match kind {
         PromptKind::Search => "search this page: bytes, identifiers, names, words of errors and losses",
         PromptKind::Filter => {
-            "show only FILTERs as candump's, 123:7FF or can0,123:7FF; FILTER if Speed > 80; if Speed > 80 (empty: all)"
+            "show only, in candump's syntax, such as 123:7FF; 123:7FF if Speed > 80; if Speed > 80 (empty: all)"
         }
         PromptKind::Signals => {
             "show only signals with this in their name (* is anything), as Wheel*Speed > 80, or alarm (empty: all)"
@@ -116,8 +116,10 @@ fn question(kind: PromptKind) -> &'static str {
             "record to FILE, or FILE if CONDITION (.log .asc .blf .csv .trc .pcapng, each also .gz .zst)"
         }
         PromptKind::Send => {
-            "[CHANNEL:]FRAME or Message:Signal=value,… (Tab completes), then a period if it is periodic"
+            "[CHANNEL:]FRAME or Message:Signal=value,… (Tab completes) [PERIOD] [counter= checksum= random= group=]"
         }
+        PromptKind::Export => "write the list to a new file, a line for each entry",
+        PromptKind::Import => "add the entries of a file: a line for each, as typed here; # begins a comment",
         PromptKind::BitRate => "bit rates: 500k, one for each channel: 1:500k 2:250k, or auto",
         PromptKind::Device => {
             "device: a serial port, virtual, or emu:FIRMWARE.elf; several with \" + \" between them; a trace opens beside"

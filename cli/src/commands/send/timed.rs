@@ -1,5 +1,5 @@
-//! Periodic frames of which some are of CAN FD. A device repeats only classical ones by itself: these are handed to it one by one, each with its time,
-//! which its timer keeps.
+//! Periodic frames that a device does not repeat by itself, because some are of CAN FD or have values that change: they are handed to it one by one, each
+//! with its time, which its timer keeps.
 
 use std::time::Duration;
 
@@ -17,8 +17,10 @@ const AHEAD_MS: u64 = 500;
 
 /// What is repeated.
 pub struct Repeated<'f> {
-    /// All of them at each time, in this order.
-    pub frames: &'f [TraceFrame],
+    /// How many there are at each time.
+    pub count: usize,
+    /// Makes those of a round, from 0, that is due so many seconds after the first, in this order.
+    pub frames: &'f dyn Fn(u32, f64) -> anyhow::Result<Vec<TraceFrame>>,
     /// From one time to the next.
     pub period: Duration,
     /// How many times; without it, until the end.
@@ -63,9 +65,9 @@ pub fn send(
                 break 'rounds;
             }
         }
-        for frame in what.frames {
+        for frame in (what.frames)(round as u32, after as f64 / tick_hz as f64)? {
             asked += 1;
-            if stream.push(channel, *frame, Some(due), &mut goes_on)?.is_none() {
+            if stream.push(channel, frame, Some(due), &mut goes_on)?.is_none() {
                 break 'rounds;
             }
         }
@@ -74,6 +76,6 @@ pub fn send(
         }
     }
     sending.finish(&mut stream)?;
-    let all = what.rounds.map_or(asked, |rounds| u64::from(rounds) * what.frames.len() as u64);
+    let all = what.rounds.map_or(asked, |rounds| u64::from(rounds) * what.count as u64);
     Ok(if sending.stands_still() { all } else { sending.ended() })
 }

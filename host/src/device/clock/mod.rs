@@ -29,6 +29,11 @@ use corridor::Gate;
 
 /// How many round trips are kept: ten minutes' worth, at one a second.
 const GATES: usize = 600;
+/// Of round trips that are closer than this, in nanoseconds, only the quickest is kept: a program that asks often must not crowd out the old ones,
+/// which tell the drift.
+const GATES_APART_NS: f64 = 400e6;
+/// So many are kept in any case, at the beginning.
+const FIRST_GATES: usize = 8;
 /// How many bends are kept, so that a time can be mapped again: 17 minutes' worth.
 const BENDS: usize = 1024;
 /// How much the rate between ruler and UTC may change during the time for which round trips are kept. For a crystal in a box that warms
@@ -193,13 +198,25 @@ impl ClockMap {
             let (utc, ns_per_tick) = (asked.plus(half_ns), self.nominal_ns_per_tick);
             self.bends = VecDeque::from([Bend { at, utc, ns_per_tick, unsure_ns: half_ns }]);
         }
-        if self.round_trips.len() == GATES {
-            self.round_trips.pop_front();
-        }
-        self.round_trips.push_back(RoundTrip { at, asked, answered });
+        self.keep(RoundTrip { at, asked, answered });
         let round_trips = self.round_trips.iter().map(|trip| trip.answered.since(trip.asked));
         self.report.round_trip_ns = round_trips.min().unwrap_or(0);
         self.bend(at, CATCH_UP_NS);
+    }
+
+    fn keep(&mut self, trip: RoundTrip) {
+        if let Some(last) = self.round_trips.back().copied()
+            && self.round_trips.len() >= FIRST_GATES
+            && (trip.at.since(last.at) as f64 * self.nominal_ns_per_tick) < GATES_APART_NS
+        {
+            if trip.answered.since(trip.asked) > last.answered.since(last.asked) {
+                return;
+            }
+            self.round_trips.pop_back();
+        } else if self.round_trips.len() == GATES {
+            self.round_trips.pop_front();
+        }
+        self.round_trips.push_back(trip);
     }
 
     /// Moves the line exactly onto the best estimate. Only before anything was mapped.

@@ -179,6 +179,26 @@ fn a_device_in_its_own_time_keeps_its_spacing() {
 }
 
 #[test]
+fn a_program_that_asks_often_knows_no_less() {
+    let device = Simulated { ppm: 37.0, ..EXACT };
+    let after = |per_second: i64| {
+        let mut map = ClockMap::new(TICK_HZ, utc(0));
+        for number in 0..300 * per_second {
+            let (asked_ns, (to_ns, back_ns)) = (number * S / per_second, usual(number));
+            map.add(device.ticks(asked_ns + to_ns), utc(asked_ns), utc(asked_ns + to_ns + back_ns));
+            if number == 0 {
+                map.settle();
+            }
+        }
+        let report = map.report();
+        assert!((report.drift_ppm.unwrap() - 37.0).abs() < 2.0, "{report:?}");
+        report.uncertainty_ns.unwrap()
+    };
+    let (seldom, often) = (after(2), after(50));
+    assert!(often <= seldom + 20_000, "{often} and {seldom} ns");
+}
+
+#[test]
 fn intervals_that_are_kept_are_the_crystals_and_how_far_that_leads_from_utc_is_known() {
     let device = Simulated { ppm: 37.0, ..EXACT };
     let mut map = ClockMap::new(TICK_HZ, utc(0));

@@ -1,5 +1,6 @@
 """The analyser, as the virtual device."""
 
+import itertools
 import os
 import pickle
 import signal
@@ -48,6 +49,16 @@ def test_records_come_in_order_with_the_devices_stamps():
     assert {record.event for record in records} == {"frame"}
     assert losses[1]["lost"] == losses[2]["lost"] == 0
     assert device.closed and "closed" in repr(device)
+
+
+def test_intervals_are_the_devices_own_on_request():
+    with cantap.open("virtual:load=0,wire=joined,ppm=200", 500_000, mode="normal", device_intervals=True) as device:
+        device.send_periodic(1, "123#11", 0.005, count=300)
+        times = [record.time_ns for record, _ in zip((r for r in device if r.channel == 2 and r.event == "frame"), range(300))]
+    period_ns = 5_000_000
+    off = [(later - earlier) % period_ns for earlier, later in itertools.pairwise(times)]
+    # A tick of the device's clock, whatever the computer's says; a busy bus or computer makes whole periods of it.
+    assert len(times) == 300 and all(min(ns, period_ns - ns) <= 200 for ns in off), max(off)
 
 
 def test_what_was_captured_can_be_read_after_closing():

@@ -25,6 +25,7 @@ const PASSIVE_SENDER: u32 = 1 << 14;
 pub(crate) fn is_head(text: &[u8]) -> bool {
     /// How far down the line about numbers and times may stand, below lines that a person or a program put above it.
     const LINES: usize = 10;
+    const BASE: [&str; 2] = ["base hex", "base dec"];
     let lines = text.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii_start);
     let mut lines = lines.skip_while(|line| line.is_empty() || line.starts_with(b"//")).take(LINES);
     let begins = |line: &[u8], words: &[&str]| {
@@ -33,7 +34,6 @@ pub(crate) fn is_head(text: &[u8]) -> bool {
         };
         words.iter().any(begins)
     };
-    const BASE: [&str; 2] = ["base hex", "base dec"];
     let has_times = |line: &[u8]| memchr::memmem::find(&line.to_ascii_lowercase(), b" timestamps ").is_some();
     let first = lines.next().unwrap_or_default();
     begins(first, &["date "])

@@ -74,7 +74,7 @@ fn is_of_journal(line: &[u8]) -> bool {
     let is_month =
         words.next().is_some_and(|word| word.len() == 3 && word.iter().all(u8::is_ascii_alphabetic));
     let is_day = words.next().is_some_and(|word| word.len() <= 2 && word.iter().all(u8::is_ascii_digit));
-    let is_clock = words.next().is_some_and(|word| word.iter().filter(|byte| **byte == b':').count() == 2);
+    let is_clock = words.next().is_some_and(|word| memchr::memchr_iter(b':', word).count() == 2);
     is_month && is_day && is_clock && words.nth(1).is_some_and(|word| word.ends_with(b":"))
 }
 

@@ -42,8 +42,8 @@ fn lines_above_the_names_are_counted_and_the_rows_below_are_read() {
     assert_eq!(log, "(1.500000) can0 100#0A\n(1.600000) can0 200#FF\n");
     assert_eq!(issues, Vec::<String>::new());
     // What counts the rows is no identifier, whatever stands above it.
-    let rows: String = (0..30).map(|row| format!("{row},1.5,0x1CFE9200,2,FF,6D\n")).collect();
-    let (log, issues) = as_log(&format!("VIN: 7\nID,Time,PID,Length,Byte 0,Byte 1\n{rows}"));
+    let rows: Vec<_> = (0..30).map(|row| format!("{row},1.5,0x1CFE9200,2,FF,6D\n")).collect();
+    let (log, issues) = as_log(&format!("VIN: 7\nID,Time,PID,Length,Byte 0,Byte 1\n{}", rows.concat()));
     assert_eq!(log, "");
     assert!(issues[0].contains("--columns id=NAME"), "{issues:?}");
     // A first row that is damaged is none of them.

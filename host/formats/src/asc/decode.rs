@@ -18,7 +18,7 @@ use super::{FD_FORMAT, REMOTE, STATES, others};
 use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
-const WRONG_WEEKDAY: &str = "a date is not of the day of the week that it names: python-can before version 4 wrote the month's number in place of the day's";
+const WRONG_WEEKDAY: &str = "a date is not of the day of the week that it names; python-can before version 4 wrote the month's number in place of the day's";
 
 /// Reads ASC.
 #[derive(Default)]

@@ -23,12 +23,22 @@ const PASSIVE_SENDER: u32 = 1 << 14;
 
 /// Whether a text begins like Vector's: with its date or the base of its numbers, possibly after comments.
 pub(crate) fn is_head(text: &[u8]) -> bool {
+    /// How far down the line about numbers and times may stand, below lines that a person or a program put above it.
+    const LINES: usize = 10;
+    const BASE: [&str; 2] = ["base hex", "base dec"];
     let lines = text.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii_start);
-    let mut lines = lines.skip_while(|line| line.is_empty() || line.starts_with(b"//"));
+    let mut lines = lines.skip_while(|line| line.is_empty() || line.starts_with(b"//")).take(LINES);
+    let begins = |line: &[u8], words: &[&str]| {
+        let begins = |word: &&str| {
+            line.get(..word.len()).is_some_and(|start| start.eq_ignore_ascii_case(word.as_bytes()))
+        };
+        words.iter().any(begins)
+    };
+    let has_times = |line: &[u8]| memchr::memmem::find(&line.to_ascii_lowercase(), b" timestamps ").is_some();
     let first = lines.next().unwrap_or_default();
-    ["date ", "base hex", "base dec"]
-        .iter()
-        .any(|word| first.get(..word.len()).is_some_and(|start| start.eq_ignore_ascii_case(word.as_bytes())))
+    begins(first, &["date "])
+        || begins(first, &BASE)
+        || lines.any(|line| begins(line, &BASE) && has_times(line))
 }
 
 /// The controller's states as status lines name them.

@@ -200,9 +200,15 @@ impl Decoder {
         let fd = is_fd.then_some(flags);
         let id = identifier(raw, is_extended, id)?;
         let fields = FrameFields { id, remote, direction, len, fd };
-        let data = Payload::words(&mut words, fields.data_len(), hex_byte)?;
+        let (shown, _) = text::word(rest);
+        let swapped: Vec<_> = shown.rsplit(|byte| *byte == b'`').collect();
+        if swapped.len() > 1 {
+            let data = Payload::exactly(swapped.into_iter(), fields.data_len(), byte)?;
+            return Ok(Line::Record(record(fields.event(&data)?)));
+        }
+        let data = Payload::words(&mut words, fields.data_len(), byte)?;
         // With a byte too many, the length is wrong: a digit was changed.
-        if !remote && words.next().and_then(hex_byte).is_some() {
+        if !remote && words.next().and_then(byte).is_some() {
             return Err(Fault::malformed(format!("{len} data bytes"), rest.trim_ascii()));
         }
         Ok(Line::Record(record(fields.event(&data)?)))
@@ -225,6 +231,15 @@ impl Decoder {
         self.last_ns = time_ns;
         Ok(time_ns)
     }
+}
+
+/// A byte: two hexadecimal digits, or eight binary ones (`-i`).
+fn byte(word: &[u8]) -> Option<u8> {
+    let is_binary = word.len() == 8 && word.iter().all(|digit| matches!(digit, b'0' | b'1'));
+    if is_binary {
+        return Some(word.iter().fold(0, |byte, digit| byte << 1 | (digit - b'0')));
+    }
+    hex_byte(word)
 }
 
 #[cfg(test)]
@@ -283,6 +298,18 @@ mod tests {
         assert_eq!(log, format!("{}(1.500000) can0 7FF#00\n", lines.concat()));
         let (log, issues) = as_log("1128 [2] 0b 61\n<0x923> [0]\n<0x12> [0]\n0128 [2] 0b\n");
         assert_eq!((log.as_str(), issues.len()), ("", 4), "{issues:#?}");
+    }
+
+    /// With -S the last byte comes first, with marks between; with -i each has eight digits.
+    #[test]
+    fn swapped_and_binary_bytes_are_read() {
+        let (log, issues) = as_log(
+            "  can0  123   [3]  33`22`11   `3\".`\n  can0  123   [1]  11\n  can0  123   [2]  00010001 00100010\n\
+             \x20 can0  123   [2]  00100010`00010001\n  can0  123   [2]  33`22`11\n  can0  123   [3]  22`11\n",
+        );
+        let lines = ["112233", "11", "1122", "1122"].map(|data| format!("(0.000000) can0 123#{data}\n"));
+        assert_eq!(log, lines.concat());
+        assert_eq!(issues.len(), 2, "{issues:?}");
     }
 
     #[test]

@@ -49,6 +49,9 @@ pub(crate) fn looks_like(head: &[u8], read_as: Format) -> String {
         let bytes: Vec<_> = head.iter().take(8).map(|byte| format!("{byte:02X}")).collect();
         return format!("binary data that begins with {}", bytes.join(" "));
     }
+    if is_of_journal(line) {
+        return "lines of a system's journal: `journalctl -o cat` prints what the program wrote, without what stands before it".to_owned();
+    }
     let line = String::from_utf8_lossy(line);
     let shown: String =
         line.chars().filter(|character| !cantap_trace::clean::is_harmful(*character)).take(60).collect();
@@ -63,6 +66,16 @@ pub(crate) fn looks_like(head: &[u8], read_as: Format) -> String {
         }
         None => text,
     }
+}
+
+/// Whether a line is one of syslog: month, day, time of day, computer, program.
+fn is_of_journal(line: &[u8]) -> bool {
+    let mut words = line.split(|byte| *byte == b' ').filter(|word| !word.is_empty());
+    let is_month =
+        words.next().is_some_and(|word| word.len() == 3 && word.iter().all(u8::is_ascii_alphabetic));
+    let is_day = words.next().is_some_and(|word| word.len() <= 2 && word.iter().all(u8::is_ascii_digit));
+    let is_clock = words.next().is_some_and(|word| memchr::memchr_iter(b':', word).count() == 2);
+    is_month && is_day && is_clock && words.nth(1).is_some_and(|word| word.ends_with(b":"))
 }
 
 #[cfg(test)]
@@ -82,6 +95,8 @@ mod tests {
         ] {
             assert_eq!(looks_like(head, Format::Asc), words);
         }
+        let journal = b"Nov 14 22:13:20 pi candump[812]:  can0  123   [2]  11 22";
+        assert!(looks_like(journal, Format::Candump).starts_with("lines of a system's journal"));
         let words = "a file of the format blf that is damaged or has nothing usual in it";
         assert_eq!(looks_like(b"LOGG\x90\0\0\0", Format::Blf), words);
         assert_eq!(looks_like(b"date nonsense", Format::Asc), "text that begins with 'date nonsense'");

@@ -379,7 +379,9 @@ const FORMATS: &[FormatSpec] = &[
         format: Format::Table,
         names: &["table"],
         suffixes: &["csv", "tsv", "txt"],
-        begins: |head| table::is_first(head.first) && !is_of_another(head),
+        begins: |head| {
+            (table::is_first(head.first) || table::has_names_below(head.text)) && !is_of_another(head)
+        },
         has_head: false,
         reader: |options| Box::new(Rows::of(table::Decoder::new(options.columns.clone()))),
         writer: None,

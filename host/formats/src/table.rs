@@ -24,6 +24,7 @@ pub(crate) use time::date;
 
 const NO_TIMES: &str = "the table has no times: all its frames stand at 0";
 const OTHERS: &str = "columns of the table that have no place in a trace, such as labels, were left out";
+const ABOVE_NAMES: &str = "lines above the names of the table's columns";
 const MAY_BE_DECIMAL: &str =
     "identifiers were read as hexadecimal, but may be decimal: the columns say so with id=NAME:dec";
 
@@ -34,6 +35,8 @@ pub(crate) struct Decoder {
     layout: Option<Layout>,
     /// The first rows, to see how numbers are written in them.
     sample: Vec<u8>,
+    /// How many lines there are still above the names of the columns.
+    above: usize,
     unit_ns: Option<i64>,
     day: Option<FileDate>,
     interfaces: Interfaces,
@@ -53,15 +56,23 @@ pub(crate) fn is_first(line: &[u8]) -> bool {
     Layout::of_names(line).is_some() || Layout::of_row(line).is_some()
 }
 
-/// Columns as a user may give them for a table that is not known by itself.
-pub(crate) fn proposal(head: &[u8]) -> Option<String> {
-    layout::proposal(first_line(head)?)
+/// Whether names above columns, with one of times among them, stand below lines about the vehicle or the logger.
+pub(crate) fn has_names_below(head: &[u8]) -> bool {
+    let is_names =
+        |line: &[u8]| Layout::of_names(line).is_some_and(|layout| layout.place(Role::Time).is_some());
+    first_lines(head).any(is_names)
 }
 
-/// The first line that is no comment.
-fn first_line(head: &[u8]) -> Option<&[u8]> {
-    let mut lines = head.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii);
-    lines.find(|line| !line.is_empty() && !line.starts_with(b"#"))
+/// The first lines that are no comments, among which the names above the columns are looked for.
+fn first_lines(head: &[u8]) -> impl Iterator<Item = &[u8]> {
+    const LINES: usize = 40;
+    let lines = head.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii);
+    lines.filter(|line| !line.is_empty() && !line.starts_with(b"#")).take(LINES)
+}
+
+/// Columns as a user may give them for a table that is not known by itself.
+pub(crate) fn proposal(head: &[u8]) -> Option<String> {
+    layout::proposal(first_lines(head).next()?)
 }
 
 impl Decoder {
@@ -70,21 +81,33 @@ impl Decoder {
         Self { columns, ..Self::default() }
     }
 
-    /// Takes the first line that is no comment; true if it is a row.
-    fn first(&mut self, line: &[u8]) -> Result<bool, Fault> {
-        let (layout, is_row) = match &self.columns {
-            Some(columns) => Layout::of_columns(columns, line)?,
+    /// Where everything is, and whether this line is a row and not the names above the columns.
+    fn layout_of(&self, line: &[u8]) -> Result<(Layout, bool), Fault> {
+        match &self.columns {
+            Some(columns) => Layout::of_columns(columns, line),
             None => match (Layout::of_names(line), Layout::of_row(line)) {
-                (Some(layout), _) => (layout, false),
-                (None, Some(layout)) => (layout, true),
+                (Some(layout), _) => Ok((layout, false)),
+                (None, Some(layout)) => Ok((layout, true)),
                 (None, None) => {
                     let expected = "names above the columns, among them an identifier and data bytes";
-                    return Err(Fault::malformed(expected, line));
+                    Err(Fault::malformed(expected, line))
                 }
             },
-        };
+        }
+    }
+
+    /// How many lines stand above the names of the columns, if there are names.
+    fn lines_above_names(&self) -> usize {
+        let is_row = first_lines(&self.sample).map(|line| self.layout_of(line).map(|(_, is_row)| is_row));
+        let first = is_row.enumerate().find_map(|(above, is_row)| Some((above, is_row.ok()?)));
+        first.filter(|(_, is_row)| !is_row).map_or(0, |(above, _)| above)
+    }
+
+    /// Takes the first line that is no comment or above the names; true if it is a row.
+    fn first(&mut self, line: &[u8]) -> Result<bool, Fault> {
+        let (layout, is_row) = self.layout_of(line)?;
+        self.radix = self.radix_of(&layout, is_row)?;
         self.note_layout(&layout);
-        self.radix = self.radix_of(&layout, is_row);
         self.layout = Some(layout);
         self.sample = Vec::new();
         Ok(is_row)
@@ -139,18 +162,22 @@ impl Decoder {
     }
 
     /// How identifiers and bytes are written, by what is said, and otherwise by what the first rows have.
-    fn radix_of(&mut self, layout: &Layout, is_row: bool) -> Radix {
+    fn radix_of(&mut self, layout: &Layout, is_row: bool) -> Result<Radix, Fault> {
         let lines = self.sample.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii);
         let rows = lines.filter(|line| !line.is_empty() && !line.starts_with(b"#"));
         let (mut ids, mut bytes) = (Vec::new(), Vec::new());
         let data = layout.place(Role::Data).or(layout.place(Role::Bytes));
-        for row in rows.skip(usize::from(!is_row)) {
+        for row in rows.skip(if is_row { 0 } else { self.lines_above_names() + 1 }) {
             let cells = layout.separator.cells(row);
             let at = |role| layout.place(role).and_then(|place| cells.get(place.at)).copied();
             ids.extend(at(Role::Id));
             if let Some(first) = layout.place(Role::Bytes) {
                 bytes.extend(cells.iter().skip(first.at).take(layout.byte_columns.min(8)).copied());
             }
+        }
+        if self.columns.is_none() && count_rows(&ids) {
+            let expected = "identifiers in a column that counts the rows: --columns id=NAME,data=NAME says which has them";
+            return Err(Fault::malformed(expected, ids[0]));
         }
         let form = layout.place(Role::Id).and_then(|place| place.form);
         let (id, is_sure) = form.map_or_else(|| ids_are_decimal(&ids), |form| (form == Form::Decimal, true));
@@ -162,7 +189,7 @@ impl Decoder {
             // Hexadecimal bytes have two digits at most.
             None => bytes.iter().any(|byte| byte.len() == 3 && text::decimal(byte).is_some()),
         };
-        Radix { id, data }
+        Ok(Radix { id, data })
     }
 
     fn time_ns(&mut self, cell: &[u8], form: Option<Form>, zone: &Zone) -> Result<i64, Fault> {
@@ -303,6 +330,15 @@ fn is_rejected(layout: &Layout, line: &[u8]) -> bool {
     bus.is_some_and(|bus| panda::bus(bus).is_none())
 }
 
+/// Whether cells are the numbers of their rows, and no identifiers.
+fn count_rows(ids: &[&[u8]]) -> bool {
+    /// So many nodes that send in turn, and nothing else, are on no bus.
+    const ENOUGH: usize = 20;
+    let numbers = || ids.iter().map(|id| text::decimal(id));
+    ids.len() >= ENOUGH
+        && numbers().zip(numbers().skip(1)).all(|(id, next)| id.is_some_and(|id| next == Some(id + 1)))
+}
+
 /// Whether identifiers are decimal, and whether that is sure.
 fn ids_are_decimal(ids: &[&[u8]]) -> (bool, bool) {
     /// So many different identifiers without a letter are no chance.
@@ -414,12 +450,17 @@ impl RowFormat for Decoder {
         // The last line may not be whole.
         let sample = &buffered[..buffered.len().min(SAMPLE_BYTES)];
         self.sample = memchr::memrchr(b'\n', sample).map_or(sample, |end| &sample[..end]).to_vec();
+        self.above = self.lines_above_names();
     }
 
     fn line(&mut self, line: &[u8], zone: &Zone) -> Result<Line, Fault> {
         if line.is_empty() || line.starts_with(b"#") {
             self.day = self.day.or_else(|| FileDate::of_comment(line));
             return Ok(Line::Nothing);
+        }
+        if self.above > 0 {
+            self.above -= 1;
+            return Ok(Line::LeftOut(ABOVE_NAMES));
         }
         if self.layout.is_none() && !self.first(line)? {
             return Ok(Line::Nothing);

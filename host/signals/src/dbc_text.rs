@@ -130,18 +130,21 @@ fn is_gbk(bytes: &[u8]) -> bool {
         && encodings::GBK.decode_without_bom_handling_and_without_replacement(bytes).is_some()
 }
 
-/// The text with a receiver in each definition of a signal: some programs write none where nobody receives it, and can-dbc wants one.
+/// The text with receivers in each definition of a signal as can-dbc wants them: one or more names with commas between. Some programs write none
+/// where nobody receives it, a `*` for all, or blanks between them; no value depends on them.
 pub fn with_receivers(text: &str) -> Cow<'_, str> {
-    const NOBODY: &str = " Vector__XXX";
     let mut out = String::new();
     let (mut in_string, mut used, mut offset) = (false, 0, 0);
     for line in text.split_inclusive('\n') {
         let content = line.trim_end();
         let is_definition = !in_string && content.trim_start().starts_with("SG_ ") && content.contains('@');
         in_string = ends_in_string(line, in_string);
-        if is_definition && !in_string && content.ends_with('"') {
-            out.push_str(&text[used..offset + content.len()]);
-            out.push_str(NOBODY);
+        let receivers = content.rfind('"').map(|quote| &content[quote + 1..]);
+        if let Some(receivers) = receivers.filter(|_| is_definition && !in_string)
+            && let Some(better) = better_receivers(receivers)
+        {
+            out.push_str(&text[used..offset + content.len() - receivers.len()]);
+            out.push_str(&better);
             used = offset + content.len();
         }
         offset += line.len();
@@ -151,6 +154,21 @@ pub fn with_receivers(text: &str) -> Cow<'_, str> {
     }
     out.push_str(&text[used..]);
     out.into()
+}
+
+/// Receivers with commas between them, if they were written otherwise; `None` if there is nothing to mend, or something else than names.
+fn better_receivers(written: &str) -> Option<String> {
+    let is_name = |word: &str| word.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_');
+    let in_order = |part: &str| !part.is_empty() && is_name(part);
+    if written.split(',').map(str::trim_ascii).all(in_order) {
+        return None;
+    }
+    let words = written.split([',', ' ', '\t']).filter(|word| !word.is_empty());
+    let (names, others): (Vec<_>, Vec<_>) = words.partition(|word| is_name(word));
+    if others.iter().any(|other| *other != "*") {
+        return None;
+    }
+    Some(if names.is_empty() { " Vector__XXX".to_owned() } else { format!(" {}", names.join(",")) })
 }
 
 /// A statement's place in the text.
@@ -376,6 +394,25 @@ mod tests {
         );
         assert_eq!(with_receivers(text), expected);
         assert!(matches!(with_receivers(TEXT), Cow::Borrowed(_)));
+    }
+
+    #[test]
+    fn receivers_have_commas_between_them_however_they_were_written() {
+        for (written, expected) in [
+            ("A", None),
+            ("A,B , C", None),
+            ("A B", Some(" A,B")),
+            ("A, B C", Some(" A,B,C")),
+            ("A,,B,", Some(" A,B")),
+            ("*", Some(" Vector__XXX")),
+            ("* A", Some(" A")),
+            ("A // and B", None),
+            ("A; B", None),
+        ] {
+            let line = |receivers: &str| format!(" SG_ One : 0|8@1+ (1,0) [0|0] \"km h\"{receivers}\r\n");
+            let text = line(&format!(" {written}"));
+            assert_eq!(with_receivers(&text), expected.map_or(text.clone(), line), "{written}");
+        }
     }
 
     #[test]

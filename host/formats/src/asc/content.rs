@@ -9,6 +9,8 @@ pub(super) enum Content {
     Request,
     /// Something known that is not part of a CAN trace, by kind.
     LeftOut(&'static str),
+    /// Part of the file's structure, with something that the user should know.
+    Note(&'static str),
     /// Part of the file's structure, with nothing to report.
     Other,
 }

@@ -23,6 +23,9 @@ const MONTHS: [&[&str]; 12] = [
     &["dec", "dez", "dc", "dic"],
 ];
 
+/// English days of the week, from that of the epoch.
+const WEEKDAYS: [&str; 7] = ["thu", "fri", "sat", "sun", "mon", "tue", "wed"];
+
 // Signs of Japanese, in UTF-8 and in Shift-JIS.
 const MONTH: [&[u8]; 2] = [&[0xE6, 0x9C, 0x88], &[0x8C, 0x8E]];
 const MORNING: [&[u8]; 2] = [&[0xE5, 0x8D, 0x88, 0xE5, 0x89, 0x8D], &[0x8C, 0xDF, 0x91, 0x4F]];
@@ -34,6 +37,8 @@ struct Parts {
     /// A month by its name or sign.
     month: Option<u64>,
     year: Option<u64>,
+    /// In days after the epoch's.
+    weekday: Option<i64>,
     /// Month and day, or the day alone.
     small: Vec<u64>,
     /// Hour, minute, and nanoseconds of the minute.
@@ -47,12 +52,15 @@ struct Parts {
 /// The time since the epoch of a date such as `Sat Sep 30 15:06:13.191 2017`: by the clock of a zone unless it says another, with `am` or `pm`
 /// anywhere, in several languages.
 pub(super) fn date(text: &[u8], zone: &Zone) -> Result<i64, Fault> {
-    let fault = || Fault::malformed("a date such as Sat Sep 30 15:06:13.191 2017", text);
-    let mut parts = Parts::default();
-    for word in text.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty()) {
-        parts.word(word).ok_or_else(fault)?;
-    }
-    parts.time_ns(zone).ok_or_else(fault)
+    let time_ns = Parts::of(text).and_then(|parts| parts.time_ns(zone));
+    time_ns.ok_or_else(|| Fault::malformed("a date such as Sat Sep 30 15:06:13.191 2017", text))
+}
+
+/// Whether a date's English day of the week is another's than its day: then one of them is wrong.
+pub(super) fn has_wrong_weekday(text: &[u8]) -> bool {
+    let days = |parts: &Parts| Some(parts.clock_ns()?.div_euclid(86_400 * NS_PER_S));
+    let differ = |parts: Parts| Some(days(&parts)?.rem_euclid(7) != parts.weekday?);
+    Parts::of(text).and_then(differ).unwrap_or(false)
 }
 
 fn has(word: &[u8], signs: [&[u8]; 2]) -> bool {
@@ -66,6 +74,14 @@ fn numbers(word: &[u8]) -> Option<Vec<u64>> {
 }
 
 impl Parts {
+    fn of(text: &[u8]) -> Option<Self> {
+        let mut parts = Self::default();
+        for word in text.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty()) {
+            parts.word(word)?;
+        }
+        Some(parts)
+    }
+
     /// `None` if a word contradicts what a date can have.
     fn word(&mut self, word: &[u8]) -> Option<()> {
         let letters: String = word
@@ -102,6 +118,8 @@ impl Parts {
             };
         } else if letters == "am" || letters == "pm" {
             self.afternoon = Some(letters == "pm");
+        } else if let Some(weekday) = WEEKDAYS.iter().position(|name| letters == *name) {
+            self.weekday = Some(weekday as i64);
         } else {
             // The names of days come before those of months, and some are the same.
             let begins = |names: &&[&str]| names.iter().any(|name| letters.starts_with(name));
@@ -136,7 +154,8 @@ impl Parts {
         self.clock.replace((hour, minute, second_ns)).is_none().then_some(())
     }
 
-    fn time_ns(&self, zone: &Zone) -> Option<i64> {
+    /// By the clock of the date's own zone.
+    fn clock_ns(&self) -> Option<i64> {
         let (hour, minute, second_ns) = self.clock?;
         let hour = match self.afternoon {
             // Twelve comes first on a 12-hour clock. Some files combine hours above twelve with pm.
@@ -151,7 +170,11 @@ impl Parts {
         let second = (second_ns / NS_PER_S) as u64;
         let of_day_ns = Date::of_day(hour, minute, second, second_ns % NS_PER_S)?;
         let (month, day) = (u8::try_from(month).ok()?, u8::try_from(day).ok()?);
-        let clock_ns = Date { year: i64::try_from(self.year?).ok()?, month, day, of_day_ns }.time_ns()?;
+        Date { year: i64::try_from(self.year?).ok()?, month, day, of_day_ns }.time_ns()
+    }
+
+    fn time_ns(&self, zone: &Zone) -> Option<i64> {
+        let clock_ns = self.clock_ns()?;
         Some(match self.offset_s {
             Some(offset_s) => clock_ns.checked_sub(offset_s * NS_PER_S)?,
             None => zone.utc_ns(clock_ns),
@@ -175,7 +198,7 @@ fn offset_s(word: &[u8]) -> Option<i64> {
 
 #[cfg(test)]
 mod tests {
-    use super::{Zone, date};
+    use super::{Zone, date, has_wrong_weekday};
 
     #[test]
     fn dates_of_several_languages_and_encodings_are_read() {
@@ -221,6 +244,21 @@ mod tests {
         assert_eq!(first(&latin("mar. ao\u{fb}t 1 00:00:00 2017")), 17_379);
         assert_eq!(first("Di Mär 7 00:00:00 2017".as_bytes()), 17_232);
         assert_eq!(first(&latin("Di M\u{e4}r 7 00:00:00 2017")), 17_232);
+    }
+
+    #[test]
+    fn a_day_of_the_week_that_is_another_date_s_is_noticed() {
+        for text in
+            ["Tue Nov 11 10:13:20.257 PM 2023", "Sun Sep 30 15:06:13.191 2017", "Fri Jan 1 00:00:00 1960 "]
+        {
+            let wrong = !text.contains("1960");
+            assert_eq!(has_wrong_weekday(text.as_bytes()), wrong, "{text}");
+        }
+        for text in
+            ["Sat Sep 30 15:06:13.191 2017", "Son Sep 30 15:06:13.191 2017", "2017-09-30 15:06:13.191", "Sat"]
+        {
+            assert!(!has_wrong_weekday(text.as_bytes()), "{text}");
+        }
     }
 
     #[test]

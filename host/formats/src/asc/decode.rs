@@ -13,10 +13,12 @@ use super::super::sja1000;
 use super::super::text::{self, NS_PER_S};
 use super::super::zone::Zone;
 use super::content::{Content, OnChannel};
-use super::date::date;
+use super::date::{date, has_wrong_weekday};
 use super::{FD_FORMAT, REMOTE, STATES, others};
 use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
+
+const WRONG_WEEKDAY: &str = "a date is not of the day of the week that it names; python-can before version 4 wrote the month's number in place of the day's";
 
 /// Reads ASC.
 #[derive(Default)]
@@ -64,7 +66,10 @@ impl Decode for Decoder {
                 // The beginning of an event can look like something to leave out.
                 Ok(Content::LeftOut(_)) if !line.terminated => return Ok(line.cut()),
                 Ok(Content::LeftOut(what)) => return Ok(Found::LeftOut(what)),
-                Ok(Content::Other) if !line.terminated && !is_footer(text) => return Ok(line.cut()),
+                Ok(Content::Other | Content::Note(_)) if !line.terminated && !is_footer(text) => {
+                    return Ok(line.cut());
+                }
+                Ok(Content::Note(what)) => return Ok(Found::Note(what)),
                 Ok(Content::Other) => {}
                 Err(fault) => return Ok(line.issue(fault)),
             }
@@ -78,14 +83,17 @@ impl Decoder {
         let (time, rest) = text::word(line);
         match text::time_of_any_mark(time, NS_PER_S) {
             Some(offset_ns) => self.event(offset_ns, rest),
-            None => self.head(line).map(|()| Content::Other),
+            None => self.head(line),
         }
     }
 
     /// Handles a line that does not begin with a time.
-    fn head(&mut self, line: &[u8]) -> Result<(), Fault> {
+    fn head(&mut self, line: &[u8]) -> Result<Content, Fault> {
+        let note =
+            |stamp| if has_wrong_weekday(stamp) { Content::Note(WRONG_WEEKDAY) } else { Content::Other };
         if begins(line, "date ") {
             self.date_ns = date(&line[5..], &self.zone)?;
+            return Ok(note(&line[5..]));
         } else if begins(line, "base ") {
             let words = line.to_ascii_lowercase();
             let has = |word| memchr::memmem::find(&words, word).is_some();
@@ -97,6 +105,7 @@ impl Decoder {
             let stamp = line["begin triggerblock".len()..].trim_ascii();
             if self.blocks == 1 && !stamp.is_empty() {
                 self.block_ns = Some(date(stamp, &self.zone)?);
+                return Ok(note(stamp));
             }
         } else if !(line.is_empty()
             || line.starts_with(b"//")
@@ -106,7 +115,7 @@ impl Decoder {
         {
             return Err(Fault::malformed("a line that begins with a time in seconds", line));
         }
-        Ok(())
+        Ok(Content::Other)
     }
 
     /// The absolute time of an event.

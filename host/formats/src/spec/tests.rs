@@ -9,6 +9,7 @@ fn files_are_known_by_their_beginning() {
         (utf8("date Sam Sep 30 15:06:13.191 2017\n"), Format::Asc),
         (utf8("// a comment\n\ndate Sam Sep 30 15:06:13.191 2017\n"), Format::Asc),
         (utf8("base hex  timestamps absolute\n"), Format::Asc),
+        (utf8("begin asc log\nDate Thu\nbase hex timestamps absolute\n"), Format::Asc),
         (utf8(";   Start time: 18.12.2021 14:28:07.062\n;\n"), Format::Trc(TrcVersion::V2_1)),
         (utf8(";$FILEVERSION=1.1\n"), Format::Trc(TrcVersion::V2_1)),
         (utf8("LOGG\0\0\0\0"), Format::Blf),
@@ -60,6 +61,7 @@ fn files_are_known_by_their_beginning() {
         (utf8("timestamp,arbitration_id,data_field,attack\n1.0,0C1,00,0\n"), Format::Table),
         (utf8("time,addr,bus,data\n"), Format::Table),
         (utf8("Index;ID;Data\n"), Format::Table),
+        (utf8("VIN: 1\nMAKE: X\nTime,Type,ID,Data Length,Byte 0,Byte 1\n"), Format::Table),
         (utf8("1478198376.389427,0316,2,05,21,R\n"), Format::Table),
         (utf8("1483093132.049669        0380    000    2    30 bb\n"), Format::Table),
         (utf8("0.001 0x100 204E00000000\n"), Format::Table),
@@ -69,7 +71,7 @@ fn files_are_known_by_their_beginning() {
         let begins = FORMATS.iter().filter(|spec| (spec.begins)(&Head::of(&head)));
         assert_eq!(begins.count(), 1, "{}", String::from_utf8_lossy(&head));
     }
-    for head in ["", "rubbish", "   0.015991 1 123 Rx d 1 0A", "[8]", "{}"] {
+    for head in ["", "rubbish", "   0.015991 1 123 Rx d 1 0A", "[8]", "{}", "VIN: 1\nID,Data\n"] {
         assert_eq!(Format::of_content(head.as_bytes()), None, "{head}");
     }
 }

@@ -217,7 +217,10 @@ impl Layout {
         };
         let [time, id, len, data @ ..] = cells else { return None };
         let time_ns = text::time(time, NS_PER_S, b'.').filter(|_| time.contains(&b'.'));
-        let is_id = matches!(id.len(), 3 | 4 | 8) && text::hex(id).is_some();
+        let is_id = match text::after_0x(id) {
+            Some(digits) => matches!(digits.len(), 1..=8) && text::hex(digits).is_some(),
+            None => matches!(id.len(), 3 | 4 | 8) && text::hex(id).is_some(),
+        };
         let len = text::decimal(len).filter(|len| *len <= 8 && is_id && time_ns.is_some())? as usize;
         let is_byte = |cell: &&[u8]| cell.len() == 2 && text::hex(cell).is_some();
         let one_each = data.iter().take(len).take_while(|cell| is_byte(cell)).count() == len;
@@ -277,8 +280,12 @@ fn is_stamp(cell: &[u8]) -> bool {
     matches!((at, cell.len() - at - 1), (2 | 8, 6 | 9)) && digits.iter().all(u8::is_ascii_digit)
 }
 
-/// How many bytes a cell of hexadecimal digits without gaps is.
+/// How many bytes a cell of hexadecimal digits is, without gaps or with a blank after each byte.
 fn byte_count(cell: &[u8]) -> Option<usize> {
+    if cell.contains(&b' ') {
+        let is_byte = |word: &[u8]| word.len() == 2 && text::hex(word).is_some();
+        return cell.split(|byte| *byte == b' ').all(is_byte).then_some(cell.len() / 3 + 1);
+    }
     let all = cell.len().is_multiple_of(2) && cell.iter().all(u8::is_ascii_hexdigit);
     all.then_some(cell.len() / 2)
 }

@@ -28,6 +28,29 @@ fn rows_that_begin_with_the_identifier_are_read_with_columns() {
     assert_eq!(log, lines.concat());
 }
 
+/// As makers of excavators export them: the machine above, and a mark of the identifier's kind.
+#[test]
+fn lines_above_the_names_are_counted_and_the_rows_below_are_read() {
+    let rows = "\"ID\",\"Time\",\"Type\",\"PGN\",\"PID\",\"Data Length\",\"Byte 0\",\"Byte 1\"\n\
+                \"0\",\"1678273542.919593\",\"29-bit\",\"0xFE92\",\"0x1CFE9200\",\"2\",0xFF,0x6D\n";
+    let file = format!("VIN: 7\nMAKE: X, Y\nDATE(DD/MM/YYYY): 8/3/2023\n{rows}");
+    let (log, issues) = with_columns("time=Time,id=PID:hex,dlc=Data Length,bytes=Byte 0", &file);
+    assert_eq!(log, "(1678273542.919593) can0 1CFE9200#FF6D\n");
+    assert_eq!(issues, Vec::<String>::new());
+    let file = "Logger 3\nfirmware, 1.2\ntime,id,dlc,D0\n1.5,100,1,10\n1.6,200,1,255\n";
+    let (log, issues) = as_log(file);
+    assert_eq!(log, "(1.500000) can0 100#0A\n(1.600000) can0 200#FF\n");
+    assert_eq!(issues, Vec::<String>::new());
+    // What counts the rows is no identifier, whatever stands above it.
+    let rows: Vec<_> = (0..30).map(|row| format!("{row},1.5,0x1CFE9200,2,FF,6D\n")).collect();
+    let (log, issues) = as_log(&format!("VIN: 7\nID,Time,PID,Length,Byte 0,Byte 1\n{}", rows.concat()));
+    assert_eq!(log, "");
+    assert!(issues[0].contains("--columns id=NAME"), "{issues:?}");
+    // A first row that is damaged is none of them.
+    let (_, issues) = tests::as_log(Format::Table, "1.5,100\n1.5,0x100,0A0B\n");
+    assert_eq!(issues.len(), 1, "{issues:?}");
+}
+
 #[test]
 fn tables_of_public_collections_are_known_and_read_whole() {
     for (file, log) in [
@@ -40,6 +63,15 @@ fn tables_of_public_collections_are_known_and_read_whole() {
         (
             "1483093132.049669        0380    000    8    30 bb 82 00 9d 53 00 81\n1483093132.050104        0180    000    2    64 10\n",
             "(1483093132.049669) can0 380#30BB82009D530081\n(1483093132.050104) can0 180#6410\n",
+        ),
+        // With `0x`, or all bytes in a cell.
+        (
+            "1513468793.000114,0x0153,8,00,21,10,ff,00,ff,00,00,R\n1513468793.000309,0x2,1,07,R\n",
+            "(1513468793.000114) can0 153#002110FF00FF0000\n(1513468793.000309) can0 002#07\n",
+        ),
+        (
+            "1513920303.309700,0002,8,00 00 00 00 00 08 09 17,R\n1513920303.309900,0153,2,00 21,T\n",
+            "(1513920303.309700) can0 002#0000000000080917\n(1513920303.309900) can0 153#0021\n",
         ),
         // A CL2000's file without its head.
         (

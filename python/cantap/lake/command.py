@@ -8,9 +8,11 @@ import sys
 from collections.abc import Sequence
 
 from .._native import CantapError
+from .compaction import FILE_BYTES, compact, vacuum
 from .ingest import ingest
 from .ledger import FAILED, REFUSED
 from .store import TABLES, Store, StoreError
+from .transactions import Busy
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -31,9 +33,17 @@ def _parser() -> argparse.ArgumentParser:
     ledger.add_argument("lake")
     delta = commands.add_parser("delta", help="make the tables Delta tables, too, of the files that they have now")
     delta.add_argument("lake")
+    joining = commands.add_parser("compact", help="join small files of the same vehicle, day and channel; rows and ledger stay the same")
+    joining.add_argument("lake")
+    default = f"{FILE_BYTES >> 20}M"
+    joining.add_argument("--file-size", metavar="SIZE", type=_size, default=FILE_BYTES, help=f"join up to this length, such as 64M [default: {default}]")
+    removing = commands.add_parser("vacuum", help="remove files that are not used any more: those that were joined, and what interrupted runs left")
+    removing.add_argument("lake")
+    removing.add_argument("--older-than", metavar="HOURS", type=_hours, required=True, help="not used for so long; longer than any query takes")
     check = commands.add_parser("check", help="count the rows of all files, and look for what an interrupted run left")
     check.add_argument("lake")
     check.add_argument("--remove", action="store_true", help="remove what an interrupted run left")
+    check.add_argument("--forget", action="store_true", help="remove the entries of traces whose files are not as they say: they are read again")
     return parser
 
 
@@ -51,6 +61,24 @@ def _seconds(text: str) -> float:
     if not 0 < seconds < 1e9:
         raise argparse.ArgumentTypeError(f"'{text}' is not a time; give seconds, more than 0")
     return seconds
+
+
+def _hours(text: str) -> float:
+    try:
+        hours = float(text)
+    except ValueError:
+        hours = -1.0
+    if not 0 <= hours < 1e6:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number of hours; give 0 or more")
+    return hours
+
+
+def _size(text: str) -> int:
+    units = {"K": 10, "M": 20, "G": 30}
+    digits, shift = (text[:-1], units[text[-1]]) if text[-1:] in units else (text, 0)
+    if not (digits.isascii() and digits.isdecimal() and 0 < int(digits) << shift < 1 << 40):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a length; give bytes, or K, M or G of them, such as 64M")
+    return int(digits) << shift
 
 
 def _databases(texts: Sequence[str]) -> dict[int, str] | list[str] | None:
@@ -84,15 +112,31 @@ def _add(arguments: argparse.Namespace) -> int:
 
 def _check(arguments: argparse.Namespace) -> int:
     store = Store(arguments.lake)
-    problems, stray = list(store.problems()), store.stray()
+    problems = list(store.problems())
     for problem in problems:
         print(_clean(problem), file=sys.stderr)
+    if arguments.forget:
+        for trace in store.forget():
+            print(f"{_clean(trace)}: forgotten; add it again")
     if arguments.remove:
-        for path in stray:
-            path.unlink()
+        # What is being written looks like what was left.
+        with store.transactions.alone():
+            stray = store.stray()
+            for path in stray:
+                path.unlink()
+    else:
+        stray = store.stray()
     left = "removed" if arguments.remove else "found; --remove removes them"
     print(f"{sum(1 for _ in store.entries())} traces, {len(problems)} problems" + (f", {len(stray)} files of an interrupted run {left}" if stray else ""))
     return 1 if problems else 0
+
+
+def _compact(arguments: argparse.Namespace) -> int:
+    done = compact(arguments.lake, file_bytes=arguments.file_size)
+    for problem in done.problems:
+        print(_clean(problem), file=sys.stderr)
+    print(f"{done.files} files joined into {done.joined}, {done.bytes / (1 << 20):.1f} MiB")
+    return 1 if done.problems else 0
 
 
 def _clean(text: str) -> str:
@@ -108,6 +152,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _add(chosen)
         if chosen.command == "check":
             return _check(chosen)
+        if chosen.command == "compact":
+            return _compact(chosen)
+        if chosen.command == "vacuum":
+            print(f"{len(vacuum(chosen.lake, retain_hours=chosen.older_than))} files removed")
+            return 0
         if chosen.command == "delta":
             for table in TABLES:
                 print(f"{table}: version {Store(chosen.lake).write_delta(table)}")
@@ -115,7 +164,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for entry in Store(chosen.lake).entries():
             print(json.dumps(entry, sort_keys=True))
         return 0
-    except (StoreError, OSError, ValueError, ModuleNotFoundError, CantapError) as error:
+    except (StoreError, Busy, OSError, ValueError, ModuleNotFoundError, CantapError) as error:
         print(f"error: {_clean(str(error))}", file=sys.stderr)
         return 1
 

@@ -85,12 +85,13 @@ def ingest(
     store.create()
     run = _Run(store, settings, setup, retry, done)
     pool = ThreadPoolExecutor(workers or os.cpu_count() or 1)
-    try:
-        list(pool.map(run.read, [trace for trace in found if not _is_inside(trace, store)]))
-    finally:
-        # Ctrl-C does not wait for what has not begun.
-        pool.shutdown(cancel_futures=True)
-        run.close()
+    with store.transactions.run():
+        try:
+            list(pool.map(run.read, [trace for trace in found if not _is_inside(trace, store)]))
+        finally:
+            # Ctrl-C does not wait for what has not begun.
+            pool.shutdown(cancel_futures=True)
+            run.close()
     return run.summary
 
 
@@ -125,9 +126,7 @@ class _Run:
         for place in self._places:
             place.close()
         for sha256, names in self._names.items():
-            entry = self._store.entry(sha256)
-            if entry is not None and not names <= set(entry["names"]):
-                self._store.write_entry({**entry, "names": sorted(names.union(entry["names"]))})
+            self._store.add_names(sha256, names)
 
     def read(self, trace: Trace) -> None:
         """Reads a trace, unless its content is known."""

@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from urllib.parse import unquote
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -49,6 +50,7 @@ def compact(folder: str | os.PathLike[str], *, file_bytes: int = FILE_BYTES) -> 
     if file_bytes < 1:
         raise ValueError("a file has at least one byte")
     store = Store(folder)
+    store.check()
     done = Compacted()
     with store.transactions.run():
         store.mend()
@@ -59,9 +61,7 @@ def compact(folder: str | os.PathLike[str], *, file_bytes: int = FILE_BYTES) -> 
                 # Frames and signals of a vehicle: their entries are written once.
                 waiting.setdefault(place.split("/")[1], []).append((group, name))
         for groups in waiting.values():
-            for group, name in groups:
-                join([store.folder / file.name for file in group], [member for file in group for member in file.members], store.folder / name)
-            _commit(store, groups, done)
+            _commit(store, [(group, name) for group, name in groups if _join(store, group, name, done)], done)
     return done
 
 
@@ -109,15 +109,27 @@ def _filled(files: list[_File], file_bytes: int) -> Iterator[list[_File]]:
         yield group
 
 
+def _join(store: Store, group: list[_File], name: str, done: Compacted) -> bool:
+    """Whether the files could be joined."""
+    try:
+        join([store.folder / file.name for file in group], [member for file in group for member in file.members], store.folder / name)
+    except (OSError, pa.ArrowInvalid) as error:
+        # One may be gone because its trace has got other rows meanwhile.
+        if _are_named(store, group):
+            done.problems.append(f"{name}: {error}")
+        return False
+    return True
+
+
 def _commit(store: Store, groups: list[tuple[list[_File], str]], done: Compacted) -> None:
     """Makes the joined files count, apart from those of which a trace has got other rows meanwhile."""
     with store.transactions.writing():
         moves: dict[str, dict[str, str]] = {}
         for group, name in groups:
-            of_group = [(sha256, file.name) for file in group for sha256, _, _ in file.members]
-            if all(_names(store, sha256, file) for sha256, file in of_group):
-                for sha256, file in of_group:
-                    moves.setdefault(sha256, {})[file] = name
+            if _are_named(store, group):
+                for file in group:
+                    for sha256, _, _ in file.members:
+                        moves.setdefault(sha256, {})[file.name] = name
                 done.files += len(group)
                 done.joined += 1
                 done.bytes += (store.folder / name).stat().st_size
@@ -125,9 +137,9 @@ def _commit(store: Store, groups: list[tuple[list[_File], str]], done: Compacted
             store.move(moves)
 
 
-def _names(store: Store, sha256: str, name: str) -> bool:
-    entry = store.entry(sha256)
-    return entry is not None and any(name in files for files in entry["files"].values())
+def _are_named(store: Store, group: list[_File]) -> bool:
+    """Whether all entries still name these files."""
+    return all(file.name in store.names_of(sha256) for file in group for sha256, _, _ in file.members)
 
 
 def vacuum(folder: str | os.PathLike[str], *, retain_hours: float) -> list[Path]:
@@ -138,6 +150,7 @@ def vacuum(folder: str | os.PathLike[str], *, retain_hours: float) -> list[Path]
     if not retain_hours >= 0:
         raise ValueError("give the hours for which files are kept that are not used any more: 0 or more")
     store = Store(folder)
+    store.check()
     removed = []
     with store.transactions.alone(), store.transactions.writing():
         store.finish()
@@ -159,4 +172,6 @@ def _of_delta(table: Path) -> list[Path]:
     except ModuleNotFoundError:
         raise StoreError(f"{table} is a Delta table, too, whose files must stay; install what knows them: pip install deltalake") from None
     delta = DeltaTable(str(table))
-    return [table / str(path) for path in pa.table(delta.get_add_actions()).column("path").to_pylist()]
+    paths = pa.table(delta.get_add_actions()).column("path").to_pylist()
+    # The log has them as they are in URLs.
+    return [table / form for path in paths for form in (path, unquote(path))]

@@ -51,10 +51,11 @@ class Store:
             if any(not path.name.startswith((mark.name, f".{mark.name}.")) for path in self.folder.iterdir()):
                 raise StoreError(f"{self.folder} has files and is no lake; give a new folder")
             write_whole(mark, json.dumps({"format": FORMAT}).encode())
-        self._check()
+        self.check()
         self._ledger.mkdir(exist_ok=True)
 
-    def _check(self) -> None:
+    def check(self) -> None:
+        """Raises if the folder is no lake that this version knows."""
         try:
             found = json.loads((self.folder / "lake.json").read_bytes())["format"]
         except FileNotFoundError:
@@ -83,7 +84,7 @@ class Store:
 
     def entries(self) -> Iterator[dict[str, Any]]:
         """All of the ledger, by content, as it is at one moment."""
-        self._check()
+        self.check()
         while True:
             last = self.transactions.last()
             entries = [(path, self._entry(path.stem, last["moves"])) for path in sorted(self._ledger.glob("*.json"))]
@@ -158,7 +159,7 @@ class Store:
             for sha256, own, rows in members(self.folder / name):
                 if name in _files_of(self.entry(sha256)):
                     # It may not have been removed yet.
-                    if not _has_rows(self.folder / own, rows):
+                    if _rows(self.folder / own) != rows:
                         part_of(self.folder / name, first_row, rows, self.folder / own)
                     moves.setdefault(sha256, {})[name] = own
                 first_row += rows
@@ -168,20 +169,29 @@ class Store:
         """Divides joined files with rows of traces whose entries somebody has removed: these rows are not seen then."""
         with self.transactions.writing():
             self.finish()
-            files = {name: rows for table in TABLES for name, rows in self.files(table).items() if is_joined(name)}
-            unlike = [name for name, rows in files.items() if (self.folder / name).exists() and not _has_rows(self.folder / name, rows)]
-            if unlike:
-                self._divide(unlike)
+            self._mend()
+
+    def _mend(self) -> None:
+        said = [(name, rows) for table in TABLES for name, rows in self.files(table).items() if is_joined(name)]
+        unlike = [name for name, rows in said if _rows(self.folder / name) not in (None, rows)]
+        if unlike:
+            self._divide(unlike)
 
     def forget(self) -> list[str]:
         """Removes the entries of traces whose files are not as they say, so that the traces are read again, and returns their names."""
         with self.transactions.writing():
             self.finish()
+            self._mend()
             bad = {name for name, _ in self._problems()}
             entries = [entry for entry in self.entries() if bad & _files_of(entry)]
             for entry in entries:
                 (self._ledger / f"{entry['sha256']}.json").unlink()
+            self._mend()
         return [entry["trace"] for entry in entries]
+
+    def names_of(self, sha256: str) -> set[str]:
+        """The files that have a content's rows."""
+        return _files_of(self.entry(sha256))
 
     def dataset(self, table: str) -> pyarrow.dataset.Dataset:
         """A table, `frames` or `signals`, of the traces in the ledger and nothing else."""
@@ -202,7 +212,7 @@ class Store:
         """The same; raises if a joined file has rows of traces that the ledger does not know."""
         found = self.files(table)
         for name, rows in found.items():
-            if is_joined(name) and not _has_rows(self.folder / name, rows):
+            if is_joined(name) and _rows(self.folder / name) != rows:
                 raise StoreError(f"{name} is not as the ledger says; `cantap-lake compact` mends it if entries were removed, `check --forget` if it is damaged")
         return found
 
@@ -269,11 +279,12 @@ def _files_of(entry: dict[str, Any] | None) -> set[str]:
     return {name for files in (entry or {"files": {}})["files"].values() for name in files}
 
 
-def _has_rows(path: Path, rows: int) -> bool:
+def _rows(path: Path) -> int | None:
+    """A file's rows; `None` if it cannot be read."""
     try:
-        return bool(pq.read_metadata(path).num_rows == rows)
+        return int(pq.read_metadata(path).num_rows)
     except (OSError, pa.ArrowInvalid):
-        return False
+        return None
 
 
 def _stem(sha256: str, setup: Any) -> str:

@@ -12,8 +12,9 @@ import time
 import pytest
 
 pa = pytest.importorskip("pyarrow")
+import pyarrow.parquet as pq
 
-from cantap.lake import Store, command, compact, compaction, ingest, joined, store, transactions, vacuum
+from cantap.lake import Store, command, compact, compaction, ingest, joined, store, vacuum, writing
 
 DBC = 'VERSION ""\nBU_: A\nBO_ 291 Engine: 8 A\n SG_ Speed : 0|8@1+ (0.5,0) [0|255] "km/h" A\n'
 TRACES = 8
@@ -43,14 +44,14 @@ def lake(traces, tmp_path):
 def content(lake):
     """The hash of all rows, and the ledger without the names of files."""
     digest = hashlib.sha256()
-    for table in store.TABLES:
+    for table in writing.TABLES:
         rows = Store(lake).dataset(table).to_table().sort_by([("trace", "ascending"), ("row", "ascending")])
         digest.update(repr(rows.to_pylist()).encode())
     return digest.hexdigest(), [{**entry, "files": {table: sum(files.values()) for table, files in entry["files"].items()}} for entry in Store(lake).entries()]
 
 
 def count(lake):
-    return {table: len(Store(lake).files(table)) for table in store.TABLES}
+    return {table: len(Store(lake).files(table)) for table in writing.TABLES}
 
 
 def test_small_files_are_joined_and_nothing_else_changes(lake, traces, tmp_path, capsys):
@@ -72,7 +73,7 @@ def test_small_files_are_joined_and_nothing_else_changes(lake, traces, tmp_path,
 
 
 def test_what_was_joined_stays_until_it_is_removed_by_age(lake, tmp_path, capsys):
-    old = [lake / name for table in store.TABLES for name in Store(lake).files(table)]
+    old = [lake / name for table in writing.TABLES for name in Store(lake).files(table)]
     compact(lake)
     before = content(lake)
     # A query that began before goes on.
@@ -147,9 +148,9 @@ def test_traces_are_added_while_files_are_joined(traces, lake, tmp_path):
 
     def read():
         while not done.is_set():
-            for table in store.TABLES:
+            for table in writing.TABLES:
                 found = Store(lake).files(table)
-                rows = {name: store.pq.read_metadata(lake / name).num_rows for name in found}
+                rows = {name: pq.read_metadata(lake / name).num_rows for name in found}
                 seen.append(rows == found)
 
     reader = threading.Thread(target=read)

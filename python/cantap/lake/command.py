@@ -6,13 +6,15 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext, suppress
 
 from .._native import CantapError
 from .compaction import FILE_BYTES, compact, vacuum
 from .ingest import ingest
 from .ledger import FAILED, REFUSED
-from .store import TABLES, Store, StoreError
+from .store import Store, StoreError
 from .transactions import Busy
+from .writing import TABLES
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -118,14 +120,12 @@ def _check(arguments: argparse.Namespace) -> int:
     if arguments.forget:
         for trace in store.forget():
             print(f"{_clean(trace)}: forgotten; add it again")
-    if arguments.remove:
-        # What is being written looks like what was left.
-        with store.transactions.alone():
-            stray = store.stray()
-            for path in stray:
-                path.unlink()
-    else:
+    stray = []
+    # What is being written looks like what was left.
+    with nullcontext() if arguments.remove else suppress(Busy), store.transactions.alone():
         stray = store.stray()
+        for path in stray if arguments.remove else ():
+            path.unlink()
     left = "removed" if arguments.remove else "found; --remove removes them"
     print(f"{sum(1 for _ in store.entries())} traces, {len(problems)} problems" + (f", {len(stray)} files of an interrupted run {left}" if stray else ""))
     return 1 if problems else 0

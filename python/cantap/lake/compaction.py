@@ -13,7 +13,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from .joined import Member, is_joined, join, joined_name, members
-from .store import DELTA_LOG, TABLES, Store, StoreError
+from .store import DELTA_LOG, Store, StoreError
+from .writing import TABLES
 
 #: What query engines read well: few enough files, and enough of them for all cores.
 FILE_BYTES = 128 << 20
@@ -156,7 +157,7 @@ def vacuum(folder: str | os.PathLike[str], *, retain_hours: float) -> list[Path]
         store.finish()
         of_delta = {path for table in TABLES for path in _of_delta(store.folder / table)}
         before = time.time() - retain_hours * 3600
-        for path in store.unused():
+        for path in sorted({*store.unused(), *store.stray()}):
             if path not in of_delta and path.stat().st_mtime <= before:
                 path.unlink()
                 removed.append(path)

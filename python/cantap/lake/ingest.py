@@ -9,18 +9,16 @@ import sys
 import tempfile
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import pyarrow as pa
-
 from .inputs import Fetched, Trace, traces
 from .isolation import Failed, Process
 from .ledger import FAILED, REFUSED, Entry
-from .store import Store
+from .store import Store, stem_of
 
 if TYPE_CHECKING:
     from .decoding import Request
@@ -152,7 +150,8 @@ class _Run:
         if before is not None and before["setup"] == self._setup and not self._is_to_be_tried_again(before["state"]):
             self._count(trace, KNOWN, None, 0)
             return
-        answer = self._place().decode(trace, fetched)
+        place = self._place()
+        answer = place.decode(trace, fetched, stem_of(fetched.sha256, self._setup))
         if not fetched.is_unchanged():
             with self._lock:
                 del self._names[fetched.sha256]
@@ -160,8 +159,7 @@ class _Run:
             return
         names = {trace.name, *(before["names"] if before else ())}
         entry = {**answer, "sha256": fetched.sha256, "names": sorted(names), "setup": self._setup}
-        rows = self._place().rows(answer["state"])
-        self._store.write(entry, rows)
+        self._store.put({"files": {}, **entry}, place.written)
         self._count(trace, answer["state"], answer["problem"], answer["records"])
 
     def _is_to_be_tried_again(self, state: str) -> bool:
@@ -178,7 +176,7 @@ class _Run:
 
     def _place(self) -> _Workplace:
         if not hasattr(self._of_thread, "place"):
-            self._of_thread.place = _Workplace(self._settings)
+            self._of_thread.place = _Workplace(self._settings, self._store)
             with self._lock:
                 self._places.append(self._of_thread.place)
         place: _Workplace = self._of_thread.place
@@ -188,19 +186,25 @@ class _Run:
 class _Workplace:
     """A thread's folder, and the process that decodes for it."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, store: Store) -> None:
         self._settings = settings
+        #: For copies of traces.
         self.folder = Path(tempfile.mkdtemp(prefix="cantap-lake-"))
-        self._rows = self.folder / "rows.arrow"
-        command = [sys.executable, "-m", "cantap.lake.decoding", str(self.folder)]
+        #: For rows until their trace is done: in the lake, so that files only get another name.
+        self.written = store.staging()
+        command = [sys.executable, "-m", "cantap.lake.decoding", str(self.folder), str(self.written)]
         self._process = Process(command, settings.timeout_s)
 
     def close(self) -> None:
         self._process.__exit__(None, None, None)
-        shutil.rmtree(self.folder, ignore_errors=True)
+        for folder in (self.folder, self.written):
+            shutil.rmtree(folder, ignore_errors=True)
 
-    def decode(self, trace: Trace, fetched: Fetched) -> dict[str, Any]:
-        """The entry of a trace; its rows are then in a file."""
+    def decode(self, trace: Trace, fetched: Fetched, stem: str) -> dict[str, Any]:
+        """The entry of a trace; its rows are then in files below `written`."""
+        # What a process left that was ended.
+        shutil.rmtree(self.written, ignore_errors=True)
+        self.written.mkdir(parents=True)
         request: Request = {
             "path": str(fetched.path),
             "trace": trace.name,
@@ -211,16 +215,10 @@ class _Workplace:
             "j1939": self._settings.j1939,
             "signals": list(self._settings.signals),
             "zone": self._settings.zone,
-            "rows": str(self._rows),
+            "rows": str(self.written),
+            "stem": stem,
         }
         try:
             return self._process.ask(request)
         except Failed as failed:
             return Entry(trace.name, trace.vehicle, fetched.bytes, state=FAILED, problem=str(failed)).to_dict()
-
-    def rows(self, state: str) -> Iterator[pa.RecordBatch]:
-        """The rows of the trace that was decoded last."""
-        if state not in (REFUSED, FAILED):
-            with pa.memory_map(str(self._rows)) as file, pa.ipc.open_stream(file) as reader:
-                yield from reader
-        self._rows.unlink(missing_ok=True)

@@ -5,25 +5,23 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import threading
+import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.dataset
 import pyarrow.parquet as pq
 
 from . import columns
 from .joined import is_joined, members, part_of
 from .transactions import Moves, Transactions, moved, write_whole
+from .writing import TABLES
 
-TABLES = {"frames": columns.FRAMES, "signals": columns.SIGNALS}
 FORMAT = 1
-ROW_GROUP_ROWS = 1 << 20
+_STAGING = ".writing"
 DELTA_LOG = "_delta_log"
 
 
@@ -119,12 +117,17 @@ class Store:
                 os.utime(self.folder / name)
         self.transactions.end(last)
 
-    def write(self, entry: dict[str, Any], rows: Iterator[pa.RecordBatch]) -> None:
-        """Writes a trace's rows, and then its entry, which makes them visible."""
-        with _Files(self.folder, _stem(entry["sha256"], entry["setup"])) as written:
-            for batch in rows:
-                written.write(batch)
-        entry["files"] = written.names()
+    def staging(self) -> Path:
+        """A new folder for files that do not belong to the lake yet."""
+        (self.folder / _STAGING).mkdir(exist_ok=True)
+        return Path(tempfile.mkdtemp(dir=self.folder / _STAGING))
+
+    def put(self, entry: dict[str, Any], staged: Path) -> None:
+        """Takes a trace's files from a folder, and then its entry, which makes them visible."""
+        for name in _files_of(entry):
+            path = self.folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(staged / name, path)
         self.commit(entry)
 
     def commit(self, entry: dict[str, Any]) -> None:
@@ -270,9 +273,10 @@ class Store:
 
     def stray(self) -> list[Path]:
         """Files that an interrupted run left."""
-        whole = {_stem(entry["sha256"], entry["setup"]) for entry in self.entries()}
+        left = [path for path in (self.folder / _STAGING).rglob("*") if path.is_file()]
+        whole = {stem_of(entry["sha256"], entry["setup"]) for entry in self.entries()}
         # What was joined, or was to be: who reads an older list of files may need it.
-        return [path for path in self.unused() if not (path.suffix == ".parquet" and (is_joined(path.name) or path.stem in whole))]
+        return left + [path for path in self.unused() if not (path.suffix == ".parquet" and (is_joined(path.name) or path.stem in whole))]
 
 
 def _files_of(entry: dict[str, Any] | None) -> set[str]:
@@ -287,58 +291,7 @@ def _rows(path: Path) -> int | None:
         return None
 
 
-def _stem(sha256: str, setup: Any) -> str:
+def stem_of(sha256: str, setup: Any) -> str:
     """The name of a trace's files. Of other databases the same trace has other rows: until its entry is there, the old ones are."""
     digest = hashlib.sha256(json.dumps(setup, sort_keys=True).encode()).hexdigest()
     return f"{sha256[:32]}-{digest[:8]}"
-
-
-class _Files:
-    """The files of a trace while they are written."""
-
-    def __init__(self, folder: Path, stem: str) -> None:
-        self._folder = folder
-        self._stem = stem
-        #: With the name that it has until it is complete, and its own.
-        self._open: dict[tuple[str, str], tuple[pq.ParquetWriter, Path, Path]] = {}
-        self._rows: dict[tuple[str, str], int] = {}
-
-    def __enter__(self) -> _Files:
-        return self
-
-    def write(self, batch: pa.RecordBatch) -> None:
-        """Rows of one part, as the decoding process has written them."""
-        table = batch.column("part")[0].as_py()
-        wanted = columns.schema(TABLES[table])
-        rows = pa.Table.from_batches([batch]).select(wanted.names)
-        for place in rows.select(columns.FOLDERS).group_by(columns.FOLDERS).aggregate([]).to_pylist():
-            chosen = rows
-            for name, value in place.items():
-                chosen = chosen.filter(pc.is_null(pc.field(name)) if value is None else pc.field(name) == pa.scalar(value, wanted.field(name).type))
-            self._writer(table, place, wanted).write_table(chosen.cast(wanted), row_group_size=ROW_GROUP_ROWS)
-
-    def _writer(self, table: str, place: dict[str, Any], schema: pa.Schema) -> pq.ParquetWriter:
-        folder = "/".join([table, *(f"{name}={quote(str(value), safe=' ')}" for name, value in place.items())])
-        name = f"{folder}/{self._stem}.parquet"
-        if (table, name) not in self._open:
-            path = self._folder / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            temporary = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}")
-            self._open[table, name] = (pq.ParquetWriter(temporary, schema, compression="zstd"), temporary, path)
-        return self._open[table, name][0]
-
-    def names(self) -> dict[str, dict[str, int]]:
-        """The files by table, each with its rows."""
-        found: dict[str, dict[str, int]] = {}
-        for table, name in self._open:
-            found.setdefault(table, {})[name] = self._rows[table, name]
-        return found
-
-    def __exit__(self, *error: object) -> None:
-        for key, (writer, temporary, path) in self._open.items():
-            writer.close()
-            if error[0] is None:
-                self._rows[key] = pq.read_metadata(temporary).num_rows
-                os.replace(temporary, path)
-            else:
-                temporary.unlink(missing_ok=True)

@@ -108,4 +108,4 @@ def test_files_have_the_rows_of_the_stream(tmp_path):
         assert found.schema.equals(columns.schema(kinds)) and sum(files[table].values()) == found.num_rows
         of_table = stream.filter(pc.equal(stream.column("part"), table)).select(found.column_names)
         assert of_table.num_rows > 0 and found.sort_by("row").to_pylist() == of_table.sort_by("row").to_pylist()
-    assert len({name.split("/")[2] for name in files["frames"]}) == 5
+    assert len({name.split("/")[2] for name in files["frames"]}) == 6

@@ -207,8 +207,9 @@ def test_a_trace_that_grows_while_it_is_read_is_tried_again_later(traces, tmp_pa
     lake, growing = tmp_path / "lake", traces / "007" / "0.log"
     decode = module._Workplace.decode
 
-    def grow(place, trace, fetched, stem):
-        answer = decode(place, trace, fetched, stem)
+    def grow(place, *arguments):
+        answer = decode(place, *arguments)
+        trace = arguments[0]
         if trace.source == str(growing):
             growing.write_text(growing.read_text() + "(1772409999.000000) can0 123#FF\n")
         return answer

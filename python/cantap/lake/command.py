@@ -30,6 +30,7 @@ def _parser() -> argparse.ArgumentParser:
     add.add_argument("--zone", help="of dates in traces that name none, such as Europe/Berlin [default: UTC]")
     add.add_argument("--workers", metavar="N", type=_count, help="how many traces at a time [default: as many as there are processors]")
     add.add_argument("--timeout", metavar="SECONDS", type=_seconds, default=3600.0, help="longest time for one trace [default: 3600]")
+    add.add_argument("--split", metavar="SIZE", type=_size_or_none, help="length of the parts in which all workers read a large BLF file or candump log; 0: never")
     add.add_argument("--retry", action="store_true", help="also those that were refused before")
     ledger = commands.add_parser("ledger", help="what became of each trace, a line of JSON each")
     ledger.add_argument("lake")
@@ -83,6 +84,10 @@ def _size(text: str) -> int:
     return int(digits) << shift
 
 
+def _size_or_none(text: str) -> int:
+    return 0 if text == "0" else _size(text)
+
+
 def _databases(texts: Sequence[str]) -> dict[int, str] | list[str] | None:
     pairs = [text.partition("=") for text in texts]
     if not any(equals and channel.isdecimal() for channel, equals, _ in pairs):
@@ -104,6 +109,7 @@ def _add(arguments: argparse.Namespace) -> int:
         workers=arguments.workers,
         timeout=arguments.timeout,
         retry=arguments.retry,
+        part_bytes=arguments.split,
     )
     for trace, problem in sorted(summary.problems.items()):
         print(f"{_clean(trace)}: {_clean(problem)}", file=sys.stderr)

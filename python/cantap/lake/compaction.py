@@ -125,12 +125,13 @@ def _join(store: Store, group: list[_File], name: str, done: Compacted) -> bool:
 def _commit(store: Store, groups: list[tuple[list[_File], str]], done: Compacted) -> None:
     """Makes the joined files count, apart from those of which a trace has got other rows meanwhile."""
     with store.transactions.writing():
-        moves: dict[str, dict[str, str]] = {}
+        moves: dict[str, dict[str, dict[str, int]]] = {}
         for group, name in groups:
             if _are_named(store, group):
                 for file in group:
-                    for sha256, _, _ in file.members:
-                        moves.setdefault(sha256, {})[file.name] = name
+                    for sha256, _, rows in file.members:
+                        moved = moves.setdefault(sha256, {}).setdefault(file.name, {})
+                        moved[name] = moved.get(name, 0) + rows
                 done.files += len(group)
                 done.joined += 1
                 done.bytes += (store.folder / name).stat().st_size

@@ -14,6 +14,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -22,7 +23,18 @@ import pyarrow as pa
 
 from . import columns
 from .ledger import CUT, DAMAGED, EMPTY, FAILED, READ, REFUSED, UNDECODED, Entry
+from .splitting import Pieces
 from .writing import Writing
+
+
+class Part(TypedDict):
+    """One of several parts of a trace."""
+
+    format: str
+    #: As `splitting` has them.
+    pieces: list[Any]
+    #: How many rows of frames and signals the parts before it have; `None`: rows are only counted.
+    first_rows: tuple[int, int] | None
 
 
 class Request(TypedDict):
@@ -44,6 +56,8 @@ class Request(TypedDict):
     #: Where rows go: a file of Arrow's for all, or a folder for files of Parquet, with the name of each.
     rows: str
     stem: str | None
+    #: All of it, if `None`.
+    part: Part | None
 
 
 #: Databases that stay loaded: a task's traces are mostly of one vehicle.
@@ -89,17 +103,35 @@ class _Stream:
         return {}
 
 
-def _rows(request: Request) -> _Stream | Writing:
+class _Counted:
+    """Rows that nobody wants yet."""
+
+    def __enter__(self) -> _Counted:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+    def write(self, part: str, batch: pa.RecordBatch, first_row: int) -> None:
+        pass
+
+    def names(self) -> dict[str, dict[str, int]]:
+        return {}
+
+
+def _rows(request: Request) -> _Stream | Writing | _Counted:
+    if request["part"] is not None and request["part"]["first_rows"] is None:
+        return _Counted()
     if request["stem"] is None:
         return _Stream(request)
     return Writing(Path(request["rows"]), request["stem"], request["vehicle"], request["trace"])
 
 
-def _write(rows: _Stream | Writing, scan: cantap.Scan, part: str) -> int:
+def _write(rows: _Stream | Writing | _Counted, scan: cantap.Scan, part: str, first_row: int) -> int:
     """Writes all rows, and returns their number."""
     count = 0
     for batch in _batches(scan):
-        rows.write(part, batch, count)
+        rows.write(part, batch, first_row + count)
         count += batch.num_rows
     return count
 
@@ -111,21 +143,24 @@ def decode(request: Request) -> tuple[Entry, dict[str, dict[str, int]]]:
     return entry, rows.names() if entry.state not in (REFUSED, FAILED) else {}
 
 
-def _decode(request: Request, rows: _Stream | Writing) -> Entry:
+def _decode(request: Request, rows: _Stream | Writing | _Counted) -> Entry:
     entry = Entry(request["trace"], request["vehicle"], request["bytes"], databases=request["database_names"])
-    path, zone = request["path"], request["zone"]
+    part = request["part"]
+    first_rows = part["first_rows"] or (0, 0) if part else (0, 0)
     try:
-        with rows:
-            scan = cantap.scan(path, zone=zone)
-            records = _write(rows, scan, "frames")
+        with rows, _source(request) as source:
+            scan = cantap.scan(source, zone=request["zone"], format=part["format"] if part else None)
+            records = _write(rows, scan, "frames", first_rows[0])
             report = scan.report
             decoding, unusable = _decoding(request)
             if decoding is not None:
-                entry.signal_rows = _write(rows, decoding, "signals")
+                entry.signal_rows = _write(rows, decoding, "signals", first_rows[1])
                 entry.decoded = decoding.report.decoded
                 scan = decoding
                 if (scan.report.records_read, scan.report.issues) != (report.records_read, report.issues):
                     raise OSError("it changed while it was read")
+            if isinstance(source, Pieces) and not source.is_independent():
+                raise OSError("its parts depend on each other")
     except cantap.CantapError as error:
         entry.state, entry.problem = REFUSED, _in_words(error, request)
     except OSError as error:
@@ -153,13 +188,29 @@ def _decode(request: Request, rows: _Stream | Writing) -> Entry:
     return entry
 
 
+@contextmanager
+def _source(request: Request) -> Iterator[str | Pieces]:
+    part = request["part"]
+    if part is None:
+        yield request["path"]
+        return
+    pieces = Pieces(request["path"], part["pieces"], request["path"], part["format"])
+    try:
+        yield pieces
+    finally:
+        pieces.close()
+
+
 def _decoding(request: Request) -> tuple[cantap.Scan | None, str | None]:
     """The trace's signals, or the reason why its vehicle's databases have none: that does not affect its frames."""
     try:
         database = _databases(request)
         if database is None:
             return None, None
-        return cantap.scan(request["path"], zone=request["zone"], db=database, signals=request["signals"]), None
+        part = request["part"]
+        # It is closed when it is at its end, or with the process.
+        source = Pieces(request["path"], part["pieces"], request["path"], part["format"]) if part else request["path"]
+        return cantap.scan(source, zone=request["zone"], format=part["format"] if part else None, db=database, signals=request["signals"]), None
     except cantap.DatabaseError as error:
         return None, f"no signals: {_in_words(error, request)}"
 

@@ -156,7 +156,7 @@ class Store:
 
     def _divide(self, names: Iterable[str]) -> None:
         """Gives the traces of joined files a file each again, so that one of them can be replaced."""
-        moves: dict[str, dict[str, str]] = {}
+        moves: dict[str, dict[str, dict[str, int]]] = {}
         for name in names:
             first_row = 0
             for sha256, own, rows in members(self.folder / name):
@@ -164,7 +164,7 @@ class Store:
                     # It may not have been removed yet.
                     if _rows(self.folder / own) != rows:
                         part_of(self.folder / name, first_row, rows, self.folder / own)
-                    moves.setdefault(sha256, {})[name] = own
+                    moves.setdefault(sha256, {}).setdefault(name, {})[own] = rows
                 first_row += rows
         self.move(moves)
 
@@ -276,7 +276,7 @@ class Store:
         left = [path for path in (self.folder / _STAGING).rglob("*") if path.is_file()]
         whole = {stem_of(entry["sha256"], entry["setup"]) for entry in self.entries()}
         # What was joined, or was to be: who reads an older list of files may need it.
-        return left + [path for path in self.unused() if not (path.suffix == ".parquet" and (is_joined(path.name) or path.stem in whole))]
+        return left + [path for path in self.unused() if not (path.suffix == ".parquet" and (is_joined(path.name) or path.stem.partition(".")[0] in whole))]
 
 
 def _files_of(entry: dict[str, Any] | None) -> set[str]:

@@ -15,8 +15,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-#: By content: the file that had its rows, and the one that has them.
-Moves = Mapping[str, Mapping[str, str]]
+#: By content: the file that had its rows, and those that have them, with how many.
+Moves = Mapping[str, Mapping[str, Mapping[str, int]]]
 
 
 class Busy(Exception):
@@ -74,7 +74,12 @@ def moved(entry: dict[str, Any], moves: Moves) -> dict[str, Any]:
     of_entry = moves.get(entry["sha256"])
     if not of_entry:
         return entry
-    files = {table: {of_entry.get(name, name): rows for name, rows in named.items()} for table, named in entry["files"].items()}
+    files: dict[str, dict[str, int]] = {}
+    for table, named in entry["files"].items():
+        for name, rows in named.items():
+            for new, moved_rows in of_entry.get(name, {name: rows}).items():
+                of_table = files.setdefault(table, {})
+                of_table[new] = of_table.get(new, 0) + moved_rows
     return {**entry, "files": files}
 
 

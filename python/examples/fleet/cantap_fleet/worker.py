@@ -80,6 +80,7 @@ class _Workplace:
             "zone": self._settings.zone,
             "rows": str(rows),
             "stem": None,
+            "part": None,
         }
 
     def _local(self, row: dict[str, Any]) -> str:

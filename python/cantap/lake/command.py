@@ -8,7 +8,10 @@ import sys
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 
+import pyarrow.compute as pc
+
 from .._native import CantapError
+from . import influx
 from .compaction import FILE_BYTES, compact, vacuum
 from .ingest import ingest
 from .ledger import FAILED, REFUSED
@@ -34,6 +37,10 @@ def _parser() -> argparse.ArgumentParser:
     add.add_argument("--retry", action="store_true", help="also those that were refused before")
     ledger = commands.add_parser("ledger", help="what became of each trace, a line of JSON each")
     ledger.add_argument("lake")
+    lines = commands.add_parser("influx", help="print the signals in InfluxDB's line protocol, a line for each frame")
+    lines.add_argument("lake")
+    lines.add_argument("--vehicle", metavar="NAME", help="only this vehicle's")
+    lines.add_argument("--message", metavar="NAME", action="append", default=[], help="only this message; can be repeated")
     delta = commands.add_parser("delta", help="make the tables Delta tables, too, of the files that they have now")
     delta.add_argument("lake")
     joining = commands.add_parser("compact", help="join small files of the same vehicle, day and channel; rows and ledger stay the same")
@@ -145,6 +152,21 @@ def _compact(arguments: argparse.Namespace) -> int:
     return 1 if done.problems else 0
 
 
+def _influx(arguments: argparse.Namespace) -> int:
+    wanted = pc.scalar(True)
+    if arguments.vehicle is not None:
+        wanted &= pc.field("vehicle") == arguments.vehicle
+    if arguments.message:
+        # Losses and errors explain gaps.
+        wanted &= pc.field("message").isin(arguments.message) | (pc.field("event") != "value")
+    left = influx.Left()
+    for line in influx.lines(Store(arguments.lake).dataset("signals").to_batches(filter=wanted), left):
+        print(line)
+    if left.values:
+        print(f"left out: {left.values} values that are not available or no numbers, and {left.frames} frames without any other", file=sys.stderr)
+    return 0
+
+
 def _clean(text: str) -> str:
     """Names and texts come from files of others."""
     return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
@@ -158,6 +180,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _add(chosen)
         if chosen.command == "check":
             return _check(chosen)
+        if chosen.command == "influx":
+            return _influx(chosen)
         if chosen.command == "compact":
             return _compact(chosen)
         if chosen.command == "vacuum":
@@ -170,6 +194,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for entry in Store(chosen.lake).entries():
             print(json.dumps(entry, sort_keys=True))
         return 0
+    except BrokenPipeError:
+        # Whoever reads has enough.
+        sys.stderr.close()
+        return 1
     except (StoreError, Busy, OSError, ValueError, ModuleNotFoundError, CantapError) as error:
         print(f"error: {_clean(str(error))}", file=sys.stderr)
         return 1

@@ -52,7 +52,7 @@ def test_a_line_is_a_frame(lake, capsys):
     # Its third signal is infinite.
     assert second == {"measurement": "can", "tags": tags, "fields": {"Speed": 5.5, "Gear": 2.0}, "time": 1772409590000000000}
     assert "left out: 1 values" in told.err
-    assert error["measurement"] == "can_events" and error["tags"]["event"] == "bus-error" and error["fields"]["count"] == 1
+    assert error["measurement"] == "can_events" and error["tags"]["event"] == "lost" and error["fields"]["at_least"] is True
     assert other["tags"]["channel"] == "2" and other["fields"] == {"Speed": 5.0} and other["time"] == 1772409591000001000
     assert command.main(["influx", str(lake), "--message", "Other", "--vehicle", "a =,b"]) == 0
     assert [line["measurement"] for line in parsed(capsys.readouterr().out)].count("can") == 1

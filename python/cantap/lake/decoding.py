@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, TypedDict, cast
 
 import cantap
 import pyarrow as pa
@@ -149,7 +149,7 @@ def _decode(request: Request, rows: _Stream | Writing | _Counted) -> Entry:
     first_rows = part["first_rows"] or (0, 0) if part else (0, 0)
     try:
         with rows, _source(request) as source:
-            scan = cantap.scan(source, zone=request["zone"], format=part["format"] if part else None)
+            scan = cantap.scan(cast("str", source), zone=request["zone"], format=part["format"] if part else None)
             records = _write(rows, scan, "frames", first_rows[0])
             report = scan.report
             decoding, unusable = _decoding(request)
@@ -210,7 +210,7 @@ def _decoding(request: Request) -> tuple[cantap.Scan | None, str | None]:
         part = request["part"]
         # It is closed when it is at its end, or with the process.
         source = Pieces(request["path"], part["pieces"], request["path"], part["format"]) if part else request["path"]
-        return cantap.scan(source, zone=request["zone"], format=part["format"] if part else None, db=database, signals=request["signals"]), None
+        return cantap.scan(cast("str", source), zone=request["zone"], format=part["format"] if part else None, db=database, signals=request["signals"]), None
     except cantap.DatabaseError as error:
         return None, f"no signals: {_in_words(error, request)}"
 

@@ -119,8 +119,9 @@ def main():
         if arguments.large:
             trace, database = folder / "large.blf", arguments.database[0]
             large(trace, database, arguments.large, rng)
-            for workers, more in [(workers, more) for workers in arguments.workers for more in ([], ["--split", "0"])]:
-                lake = folder / f"large{workers}{len(more)}"
+            part = f"{max(trace.stat().st_size // 8 >> 20, 1)}M"
+            for workers, more in [(workers, ["--split", split]) for workers in arguments.workers for split in ("0", part)[: workers]]:
+                lake = folder / f"large{workers}{more[1]}"
                 cost = add(lake, [trace], database, workers, *more)
                 [entry] = Store(lake).entries()
                 report(f"lake, {trace.stat().st_size >> 20} MiB, {workers} workers {' '.join(more)}", cost, entry["frames"])

@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypedDict, cast
+from typing import Any, TypedDict
 
 import cantap
 import pyarrow as pa
@@ -148,18 +148,24 @@ def _decode(request: Request, rows: _Stream | Writing | _Counted) -> Entry:
     part = request["part"]
     first_rows = part["first_rows"] or (0, 0) if part else (0, 0)
     try:
-        with rows, _source(request) as source:
-            scan = cantap.scan(cast("str", source), zone=request["zone"], format=part["format"] if part else None)
-            records = _write(rows, scan, "frames", first_rows[0])
-            report = scan.report
-            decoding, unusable = _decoding(request)
+        with rows, _source(request) as source, _source(request) as again:
+            unusable, decoding = None, None
+            if isinstance(rows, _Counted):
+                decoding, unusable = _decoding(request, again)
+            # How many records there are, this says as well.
+            if decoding is None:
+                scan = cantap.scan(source, zone=request["zone"], format=_format(request))
+                records, report, read = _write(rows, scan, "frames", first_rows[0]), scan.report, source
+                if not isinstance(rows, _Counted):
+                    decoding, unusable = _decoding(request, again)
             if decoding is not None:
                 entry.signal_rows = _write(rows, decoding, "signals", first_rows[1])
                 entry.decoded = decoding.report.decoded
-                scan = decoding
-                if (scan.report.records_read, scan.report.issues) != (report.records_read, report.issues):
+                if isinstance(rows, _Counted):
+                    records, report, read = decoding.report.records, decoding.report, again
+                elif (decoding.report.records_read, decoding.report.issues) != (report.records_read, report.issues):
                     raise OSError("it changed while it was read")
-            if isinstance(source, Pieces) and not source.is_independent():
+            if isinstance(read, Pieces) and not read.is_independent():
                 raise OSError("its parts depend on each other")
     except cantap.CantapError as error:
         entry.state, entry.problem = REFUSED, _in_words(error, request)
@@ -188,8 +194,12 @@ def _decode(request: Request, rows: _Stream | Writing | _Counted) -> Entry:
     return entry
 
 
+def _format(request: Request) -> str | None:
+    return request["part"]["format"] if request["part"] else None
+
+
 @contextmanager
-def _source(request: Request) -> Iterator[str | Pieces]:
+def _source(request: Request) -> Iterator[Any]:
     part = request["part"]
     if part is None:
         yield request["path"]
@@ -201,16 +211,13 @@ def _source(request: Request) -> Iterator[str | Pieces]:
         pieces.close()
 
 
-def _decoding(request: Request) -> tuple[cantap.Scan | None, str | None]:
+def _decoding(request: Request, source: Any) -> tuple[cantap.Scan | None, str | None]:
     """The trace's signals, or the reason why its vehicle's databases have none: that does not affect its frames."""
     try:
         database = _databases(request)
         if database is None:
             return None, None
-        part = request["part"]
-        # It is closed when it is at its end, or with the process.
-        source = Pieces(request["path"], part["pieces"], request["path"], part["format"]) if part else request["path"]
-        return cantap.scan(cast("str", source), zone=request["zone"], format=part["format"] if part else None, db=database, signals=request["signals"]), None
+        return cantap.scan(source, zone=request["zone"], format=_format(request), db=database, signals=request["signals"]), None
     except cantap.DatabaseError as error:
         return None, f"no signals: {_in_words(error, request)}"
 

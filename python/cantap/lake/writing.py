@@ -21,7 +21,7 @@ TABLES = {"frames": columns.FRAMES, "signals": columns.SIGNALS}
 ROW_GROUP_ROWS = 1 << 18
 #: What is nearly the same from row to row takes least as differences, and is in no dictionary.
 _DIFFERENCES = ["row", "time", "time_ns"]
-_NO_DICTIONARY = [*_DIFFERENCES, "raw"]
+_NO_DICTIONARY = [*_DIFFERENCES, "raw", "value"]
 _DAY_NS = 86_400 * 1_000_000_000
 
 

@@ -1,12 +1,14 @@
 """A large trace that several workers read in parts: rows and ledger are those of the whole."""
 
 import random
+import struct
+import zlib
 
 import pytest
 
 pa = pytest.importorskip("pyarrow")
 import cantap
-from cantap.lake import Store, ingest, splitting, writing
+from cantap.lake import Store, compact, ingest, splitting, vacuum, writing
 
 DBC = 'VERSION ""\nBU_: A\nBO_ 291 Engine: 8 A\n SG_ Speed : 0|8@1+ (0.5,0) [0|255] "km/h" A\n SG_ Gear : 8|4@1+ (1,0) [0|15] "" A\n'
 FRAMES = 30_000
@@ -109,6 +111,48 @@ def test_parts_are_all_of_the_file_and_nothing_twice(blf, tmp_path, parts):
 
 
 def test_what_cannot_be_divided_is_not(tmp_path):
-    for name, text in [("a.log", b"(1.0) can0 123#" + b"0" * 100), ("b.asc", b"date\n" * 50), ("c.blf", b"LOGG" * 60), ("d.blf", b""), ("e.log", b"(" + b"x" * 99)]:
+    for name, text in [("a.log", b"(1.0) can0 123#" + b"0" * 100), ("b.asc", b"date\n" * 50), ("c.blf", b"LOGG" * 60), ("d.blf", b""), ("e.log", b"(" + b"x" * 99), ("f.blf", b"LOGG" + bytes(range(1, 255)))]:
         (tmp_path / name).write_bytes(text)
         assert splitting.divide(tmp_path / name, 20) is None
+    assert splitting.divide(tmp_path / "none.blf", 20) is None
+
+
+def test_a_container_that_unpacks_to_no_end_is_left_to_the_reader(tmp_path):
+    packed = zlib.compress(bytes(100 << 20), 9)
+    container = struct.pack("<4sHHII", b"LOBJ", 16, 1, 32 + len(packed), 10) + struct.pack("<HH4xII", 2, 0, 100 << 20, 0) + packed
+    head = b"LOGG" + struct.pack("<I", 144) + bytes(136)
+    (tmp_path / "a.blf").write_bytes(head + (container + bytes(len(container) % 4)) * 4)
+    assert splitting.divide(tmp_path / "a.blf", len(container)) is None
+
+
+def test_the_files_of_a_divided_trace_are_joined_and_can_be_replaced(blf, tmp_path, database):
+    lake = tmp_path / "parts"
+    same(blf, tmp_path, database, blf.stat().st_size // 5)
+    before = content(lake)
+    compact(lake)
+    assert content(lake) == before and list(Store(lake).problems()) == []
+    assert len(Store(lake).files("frames")) == len(Store(tmp_path / "whole").files("frames"))
+    vacuum(lake, retain_hours=0)
+    database.write_text(DBC.replace("0.5", "0.25"))
+    ingest(blf, lake, db=database, part_bytes=blf.stat().st_size // 3, workers=2)
+    ingest(blf, tmp_path / "fresh", db=database, part_bytes=0)
+    assert content(lake) == content(tmp_path / "fresh") and list(Store(lake).problems()) == []
+    assert vacuum(lake, retain_hours=0) != [] and Store(lake).unused() == []
+
+
+def test_a_killed_part_is_no_loss(blf, tmp_path, database, monkeypatch):
+    """A worker that dies while it reads a part: the trace is read as one."""
+    import sys
+
+    module = sys.modules["cantap.lake.ingest"]
+    decode, asked = module._Workplace.decode, []
+
+    def dies(place, trace, fetched, stem, part=None):
+        if part is not None and part["first_rows"] is not None and not asked:
+            asked.append(part)
+            part = {**part, "pieces": ["this is not base64"]}
+        return decode(place, trace, fetched, stem, part)
+
+    monkeypatch.setattr(module._Workplace, "decode", dies)
+    ratio, (_, [entry]) = same(blf, tmp_path, database, blf.stat().st_size // 5)
+    assert asked and ratio == 1 and entry["state"] == "read"

@@ -8,7 +8,6 @@ line, and nothing in it is wrong. Otherwise the trace is read as one.
 from __future__ import annotations
 
 import base64
-import os
 import struct
 import zlib
 from collections.abc import Sequence
@@ -29,6 +28,8 @@ _LOG_CONTAINER = 10
 #: Frames: what precedes them cannot change what they mean.
 _FRAMES = (1, 86, 100, 101)
 _MOST_OBJECT_BYTES = 4096
+#: Programs write 128 KiB.
+_MOST_UNPACKED_BYTES = 16 << 20
 #: A line of a log is far shorter.
 _MOST_LINE_BYTES = 1 << 16
 
@@ -43,6 +44,14 @@ class Divided:
 
 def divide(path: Path, part_bytes: int) -> Divided | None:
     """The parts of a trace, or `None` if it is not to be divided: too short, in another format, or not as this knows it."""
+    try:
+        return _divide(path, part_bytes)
+    except (OSError, struct.error):
+        # Whoever reads it says what is wrong.
+        return None
+
+
+def _divide(path: Path, part_bytes: int) -> Divided | None:
     size = path.stat().st_size
     if size < 2 * part_bytes:
         return None
@@ -127,9 +136,12 @@ def _cut(file: BinaryIO, at: int, length: int) -> tuple[bytes, bytes] | None:
     method, _, unpacked, _ = _CONTAINER.unpack_from(container, _BASE.size)
     data = container[_CONTAINER_HEAD_BYTES:]
     if method == 2:
+        unpacker = zlib.decompressobj()
         try:
-            data = zlib.decompress(data, bufsize=min(unpacked, 1 << 26))
+            data = unpacker.decompress(data, _MOST_UNPACKED_BYTES)
         except zlib.error:
+            return None
+        if not unpacker.eof or len(data) != unpacked:
             return None
     elif method != 0:
         return None
@@ -239,8 +251,3 @@ def together(entries: Sequence[Entry]) -> Entry | None:
 def default_part_bytes(size: int, workers: int) -> int:
     """Parts that are long enough to be worth it, and enough of them for all workers."""
     return max(64 << 20, min(512 << 20, size // (4 * workers)))
-
-
-def is_large(path: Path, part_bytes: int) -> bool:
-    """Whether a trace may be divided."""
-    return os.path.getsize(path) >= 2 * part_bytes

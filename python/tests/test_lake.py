@@ -130,7 +130,7 @@ def test_a_folder_that_is_no_lake_stays_as_it_is(traces, tmp_path, capsys):
     assert "is no lake" in capsys.readouterr().err and sorted(traces.rglob("*")) == before
     assert command.main(["check", str(traces)]) == 1
     (tmp_path / "later").mkdir()
-    (tmp_path / "later" / "lake.json").write_text(json.dumps({"format": 2}))
+    (tmp_path / "later" / "lake.json").write_text(json.dumps({"format": 3}))
     assert command.main(["add", str(tmp_path / "later"), str(traces)]) == 1
     assert "update cantap" in capsys.readouterr().err
     with pytest.raises(store.StoreError, match="it has frames, signals"):

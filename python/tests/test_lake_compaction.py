@@ -2,12 +2,9 @@
 
 import hashlib
 import json
-import os
-import signal
 import subprocess
 import sys
 import threading
-import time
 
 import pytest
 
@@ -61,6 +58,8 @@ def test_small_files_are_joined_and_nothing_else_changes(lake, traces, tmp_path,
     partitions = len({name.rpartition("/")[0] for name in Store(lake).files("frames")})
     assert count(lake) == {"frames": partitions, "signals": partitions} and partitions < files["frames"]
     assert content(lake) == before and list(Store(lake).problems()) == []
+    # Earlier versions would see rows several times, and refuse it instead.
+    assert json.loads((lake / "lake.json").read_text()) == {"format": 2}
     assert "32 files joined into 8, " in capsys.readouterr().out
     # There is nothing more to do.
     assert compact(lake).files == 0 and content(lake) == before

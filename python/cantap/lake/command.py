@@ -135,7 +135,7 @@ def _check(arguments: argparse.Namespace) -> int:
             print(f"{_clean(trace)}: forgotten; add it again")
     stray = []
     # What is being written looks like what was left.
-    with nullcontext() if arguments.remove else suppress(Busy), store.transactions.alone():
+    with nullcontext() if arguments.remove else suppress(Busy, PermissionError), store.transactions.alone():
         stray = store.stray()
         for path in stray if arguments.remove else ():
             path.unlink()

@@ -20,7 +20,8 @@ from .joined import is_joined, members, part_of
 from .transactions import Moves, Transactions, moved, write_whole
 from .writing import TABLES
 
-FORMAT = 1
+#: In the second, files may be joined: who does not know that would see their rows several times.
+FORMAT, FORMAT_JOINED = 1, 2
 _STAGING = ".writing"
 DELTA_LOG = "_delta_log"
 
@@ -60,8 +61,8 @@ class Store:
             raise StoreError(f"{self.folder} is no lake: it has no lake.json") from None
         except (ValueError, KeyError, TypeError):
             raise StoreError(f"{self.folder / 'lake.json'} is damaged") from None
-        if found != FORMAT:
-            raise StoreError(f"{self.folder} is a lake of format {found}, and this version knows {FORMAT}; update cantap")
+        if found not in (FORMAT, FORMAT_JOINED):
+            raise StoreError(f"{self.folder} is a lake of format {found}, and this version knows up to {FORMAT_JOINED}; update cantap")
 
     @property
     def _ledger(self) -> Path:
@@ -98,6 +99,7 @@ class Store:
         """Files are replaced by others with the same rows, for all entries that name them at once. Only while `transactions.writing`. Those that were
         replaced stay until they are removed by age, which counts from now."""
         self.finish()
+        write_whole(self.folder / "lake.json", json.dumps({"format": FORMAT_JOINED}).encode())
         last = self.transactions.begin(moves)
         self._carry_out(last)
 

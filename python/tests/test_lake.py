@@ -12,7 +12,7 @@ import pytest
 
 pa = pytest.importorskip("pyarrow")
 
-from cantap.lake import Store, command, ingest, store
+from cantap.lake import Store, command, ingest, store, writing
 
 DBC = 'VERSION ""\nBU_: A\nBO_ 291 Engine: 8 A\n SG_ Speed : 0|8@1+ (0.5,0) [0|255] "km/h" A\n'
 
@@ -130,7 +130,7 @@ def test_a_folder_that_is_no_lake_stays_as_it_is(traces, tmp_path, capsys):
     assert "is no lake" in capsys.readouterr().err and sorted(traces.rglob("*")) == before
     assert command.main(["check", str(traces)]) == 1
     (tmp_path / "later").mkdir()
-    (tmp_path / "later" / "lake.json").write_text(json.dumps({"format": 2}))
+    (tmp_path / "later" / "lake.json").write_text(json.dumps({"format": 3}))
     assert command.main(["add", str(tmp_path / "later"), str(traces)]) == 1
     assert "update cantap" in capsys.readouterr().err
     with pytest.raises(store.StoreError, match="it has frames, signals"):
@@ -169,7 +169,7 @@ def test_the_tables_are_delta_tables_too(traces, tmp_path, capsys):
     assert command.main(["delta", str(lake)]) == 0 and "frames: version 0" in capsys.readouterr().out
     (traces / "new one").rename(traces / "50 %2F new")
     ingest(traces, lake, db=tmp_path / "car.dbc")
-    for table in store.TABLES:
+    for table in writing.TABLES:
         Store(lake).write_delta(table)
         found = deltalake.DeltaTable(str(lake / table)).to_pyarrow_table().to_pylist()
         assert sorted(found, key=lambda row: (row["trace"], row["row"])) == rows(lake, table)
@@ -207,8 +207,9 @@ def test_a_trace_that_grows_while_it_is_read_is_tried_again_later(traces, tmp_pa
     lake, growing = tmp_path / "lake", traces / "007" / "0.log"
     decode = module._Workplace.decode
 
-    def grow(place, trace, fetched):
-        answer = decode(place, trace, fetched)
+    def grow(place, *arguments):
+        answer = decode(place, *arguments)
+        trace = arguments[0]
         if trace.source == str(growing):
             growing.write_text(growing.read_text() + "(1772409999.000000) can0 123#FF\n")
         return answer

@@ -4,7 +4,10 @@
 import pytest
 
 pa = pytest.importorskip("pyarrow")
-from cantap.lake import decoding
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from cantap.lake import columns, decoding, writing
 
 # As in its process: faults are in the ledger.
 pytestmark = pytest.mark.filterwarnings("ignore::cantap.CantapWarning")
@@ -35,9 +38,9 @@ def decode(tmp_path):
         rows = tmp_path / "rows.arrow"
         request = {
             "path": str(log), "trace": "001/drive.log", "vehicle": "001", "bytes": log.stat().st_size, "databases": databases,
-            "database_names": names, "j1939": False, "signals": list(signals), "zone": None, "rows": str(rows),
+            "database_names": names, "j1939": False, "signals": list(signals), "zone": None, "rows": str(rows), "stem": None, "part": None,
         }  # fmt: skip
-        entry = decoding.decode(request)
+        entry, _ = decoding.decode(request)
         with pa.memory_map(str(rows)) as file, pa.ipc.open_stream(file) as reader:
             parts = reader.read_all().column("part").to_pylist()
         return entry, parts.count("frames"), parts.count("signals")
@@ -79,3 +82,30 @@ def test_what_is_wrong_with_the_trace_comes_before_what_is_wrong_with_its_databa
     assert (entry.state, entry.coverage) == ("cut", 0) and frames == FRAMES - 1 and signals == 0
     first, _, second = entry.problem.rpartition("; ")
     assert "ends inside a line" in first and second.startswith("no signals: ")
+
+
+def test_files_have_the_rows_of_the_stream(tmp_path):
+    """Spark gets rows as a stream of texts, a lake writes them into files: both are the same."""
+    log = tmp_path / "drive.log"
+    day = 86_400
+    times = [-day - 0.000_000_5, -0.000_000_1, 0.0, 1.5, day - 0.000_001, day, 3 * day + 0.123_456_789, 2 * day]
+    frames = ["123#0102", "18FEF100#", "123#R2", "123##1AABB", "20000004#0000000000000000"]
+    log.write_text("".join(f"({time:.9f}) can{at % 3} {frames[at % 5]}\n" for at, time in enumerate(times * 20)))
+    database = tmp_path / "car.dbc"
+    database.write_text(DBC.format(id=0x123) + 'VAL_ 291 Speed 1 "one" 170 "much" ;\n')
+    request = {
+        "path": str(log), "trace": "001/drive.log", "vehicle": "1/ä", "bytes": 1, "databases": [(None, str(database))],
+        "database_names": ["car.dbc"], "j1939": False, "signals": [], "zone": None, "part": None,
+    }  # fmt: skip
+    rows, folder = tmp_path / "rows.arrow", tmp_path / "files"
+    entry, none = decoding.decode({**request, "rows": str(rows), "stem": None})
+    as_files, files = decoding.decode({**request, "rows": str(folder), "stem": "abc"})
+    assert as_files == entry and none == {} and entry.state == "read"
+    with pa.OSFile(str(rows)) as file, pa.ipc.open_stream(file) as reader:
+        stream = reader.read_all()
+    for table, kinds in writing.TABLES.items():
+        found = pa.concat_tables([pq.read_table(folder / name, partitioning=None) for name in files[table]])
+        assert found.schema.equals(columns.schema(kinds)) and sum(files[table].values()) == found.num_rows
+        of_table = stream.filter(pc.equal(stream.column("part"), table)).select(found.column_names)
+        assert of_table.num_rows > 0 and found.sort_by("row").to_pylist() == of_table.sort_by("row").to_pylist()
+    assert len({name.split("/")[2] for name in files["frames"]}) == 6

@@ -4,7 +4,8 @@ A trace is known by its content: one that was read is not read again, under what
 the ledger is written, which names its files; what an interrupted run left behind is not seen, and is replaced by the next one.
 """
 
+from .compaction import Compacted, compact, vacuum
 from .ingest import Summary, ingest
 from .store import Store
 
-__all__ = ["Store", "Summary", "ingest"]
+__all__ = ["Compacted", "Store", "Summary", "compact", "ingest", "vacuum"]

@@ -1,6 +1,6 @@
 """A process that decodes one trace after the other, so that a trace that hangs or kills it affects nothing else.
 
-It reads requests from standard input, a line of JSON each, and answers with a line of JSON. Rows go into a file, from which they
+It reads requests from standard input, a line of JSON each, and answers with a line of JSON. Rows go into a file, or into several in a folder, which
 are passed on only when the whole trace is done. It ends together with the process that started it.
 """
 
@@ -13,7 +13,9 @@ import shutil
 import sys
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, TypedDict
 
 import cantap
@@ -21,6 +23,18 @@ import pyarrow as pa
 
 from . import columns
 from .ledger import CUT, DAMAGED, EMPTY, FAILED, READ, REFUSED, UNDECODED, Entry
+from .splitting import Pieces
+from .writing import Writing
+
+
+class Part(TypedDict):
+    """One of several parts of a trace."""
+
+    format: str
+    #: As `splitting` has them.
+    pieces: list[Any]
+    #: How many rows of frames and signals the parts before it have; `None`: rows are only counted.
+    first_rows: tuple[int, int] | None
 
 
 class Request(TypedDict):
@@ -39,8 +53,11 @@ class Request(TypedDict):
     #: Only these signals; all if empty.
     signals: list[str]
     zone: str | None
-    #: Where rows go.
+    #: Where rows go: a file of Arrow's for all, or a folder for files of Parquet, with the name of each.
     rows: str
+    stem: str | None
+    #: All of it, if `None`.
+    part: Part | None
 
 
 #: Databases that stay loaded: a task's traces are mostly of one vehicle.
@@ -64,31 +81,92 @@ def _batches(scan: cantap.Scan) -> Iterator[pa.RecordBatch]:
         yield from pa.table(table).combine_chunks().to_batches()
 
 
-def _write(writer: Any, scan: cantap.Scan, part: str, request: Request) -> int:
+class _Stream:
+    """Rows as one stream: for those who distribute them."""
+
+    def __init__(self, request: Request) -> None:
+        self._request = request
+        self._file = pa.OSFile(request["rows"], "wb")
+        self._writer = pa.ipc.new_stream(self._file, columns.STREAM_SCHEMA)
+
+    def __enter__(self) -> _Stream:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._writer.close()
+        self._file.close()
+
+    def write(self, part: str, batch: pa.RecordBatch, first_row: int) -> None:
+        self._writer.write(columns.rows_of(batch, part, self._request["vehicle"], self._request["trace"], first_row))
+
+    def names(self) -> dict[str, dict[str, int]]:
+        return {}
+
+
+class _Counted:
+    """Rows that nobody wants yet."""
+
+    def __enter__(self) -> _Counted:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+    def write(self, part: str, batch: pa.RecordBatch, first_row: int) -> None:
+        pass
+
+    def names(self) -> dict[str, dict[str, int]]:
+        return {}
+
+
+def _rows(request: Request) -> _Stream | Writing | _Counted:
+    if request["part"] is not None and request["part"]["first_rows"] is None:
+        return _Counted()
+    if request["stem"] is None:
+        return _Stream(request)
+    return Writing(Path(request["rows"]), request["stem"], request["vehicle"], request["trace"])
+
+
+def _write(rows: _Stream | Writing | _Counted, scan: cantap.Scan, part: str, first_row: int) -> int:
     """Writes all rows, and returns their number."""
-    rows = 0
+    count = 0
     for batch in _batches(scan):
-        writer.write(columns.rows_of(batch, part, request["vehicle"], request["trace"], rows))
-        rows += batch.num_rows
-    return rows
+        rows.write(part, batch, first_row + count)
+        count += batch.num_rows
+    return count
 
 
-def decode(request: Request) -> Entry:
-    """Decodes a trace into the file of rows; without rows if the state is refused or failed."""
+def decode(request: Request) -> tuple[Entry, dict[str, dict[str, int]]]:
+    """Decodes a trace; without rows if the state is refused or failed. The files that were written are by table, each with its rows."""
+    rows = _rows(request)
+    entry = _decode(request, rows)
+    return entry, rows.names() if entry.state not in (REFUSED, FAILED) else {}
+
+
+def _decode(request: Request, rows: _Stream | Writing | _Counted) -> Entry:
     entry = Entry(request["trace"], request["vehicle"], request["bytes"], databases=request["database_names"])
-    path, zone = request["path"], request["zone"]
+    part = request["part"]
+    first_rows = part["first_rows"] or (0, 0) if part else (0, 0)
     try:
-        with pa.OSFile(request["rows"], "wb") as file, pa.ipc.new_stream(file, columns.STREAM_SCHEMA) as writer:
-            scan = cantap.scan(path, zone=zone)
-            records = _write(writer, scan, "frames", request)
-            report = scan.report
-            decoding, unusable = _decoding(request)
+        with rows, _source(request) as source, _source(request) as again:
+            unusable, decoding = None, None
+            if isinstance(rows, _Counted):
+                decoding, unusable = _decoding(request, again)
+            # How many records there are, this says as well.
+            if decoding is None:
+                scan = cantap.scan(source, zone=request["zone"], format=_format(request))
+                records, report, read = _write(rows, scan, "frames", first_rows[0]), scan.report, source
+                if not isinstance(rows, _Counted):
+                    decoding, unusable = _decoding(request, again)
             if decoding is not None:
-                entry.signal_rows = _write(writer, decoding, "signals", request)
+                entry.signal_rows = _write(rows, decoding, "signals", first_rows[1])
                 entry.decoded = decoding.report.decoded
-                scan = decoding
-                if (scan.report.records_read, scan.report.issues) != (report.records_read, report.issues):
+                if isinstance(rows, _Counted):
+                    records, report, read = decoding.report.records, decoding.report, again
+                elif (decoding.report.records_read, decoding.report.issues) != (report.records_read, report.issues):
                     raise OSError("it changed while it was read")
+            if isinstance(read, Pieces) and not read.is_independent():
+                raise OSError("its parts depend on each other")
     except cantap.CantapError as error:
         entry.state, entry.problem = REFUSED, _in_words(error, request)
     except OSError as error:
@@ -116,13 +194,30 @@ def decode(request: Request) -> Entry:
     return entry
 
 
-def _decoding(request: Request) -> tuple[cantap.Scan | None, str | None]:
+def _format(request: Request) -> str | None:
+    return request["part"]["format"] if request["part"] else None
+
+
+@contextmanager
+def _source(request: Request) -> Iterator[Any]:
+    part = request["part"]
+    if part is None:
+        yield request["path"]
+        return
+    pieces = Pieces(request["path"], part["pieces"], request["path"], part["format"])
+    try:
+        yield pieces
+    finally:
+        pieces.close()
+
+
+def _decoding(request: Request, source: Any) -> tuple[cantap.Scan | None, str | None]:
     """The trace's signals, or the reason why its vehicle's databases have none: that does not affect its frames."""
     try:
         database = _databases(request)
         if database is None:
             return None, None
-        return cantap.scan(request["path"], zone=request["zone"], db=database, signals=request["signals"]), None
+        return cantap.scan(source, zone=request["zone"], format=_format(request), db=database, signals=request["signals"]), None
     except cantap.DatabaseError as error:
         return None, f"no signals: {_in_words(error, request)}"
 
@@ -153,14 +248,15 @@ def _without_folders(text: str, request: Request) -> str:
     return text
 
 
-def _requests(scratch: str) -> Iterator[Request]:
+def _requests(scratch: Sequence[str]) -> Iterator[Request]:
     """The requests, until the requesting process is gone: then this ends immediately, whatever it is doing."""
     waiting: queue.Queue[Request] = queue.Queue()
 
     def listen() -> None:
         for line in sys.stdin:
             waiting.put(json.loads(line))
-        shutil.rmtree(scratch, ignore_errors=True)
+        for folder in scratch:
+            shutil.rmtree(folder, ignore_errors=True)
         os._exit(0)
 
     threading.Thread(target=listen, daemon=True).start()
@@ -169,11 +265,12 @@ def _requests(scratch: str) -> Iterator[Request]:
 
 
 def main() -> None:
-    """Answers requests. The argument is the folder of the requesting process, which is removed at the end."""
+    """Answers requests. The arguments are folders of the requesting process, which are removed at the end."""
     # Faults in a trace are in the ledger.
     warnings.simplefilter("ignore", cantap.CantapWarning)
-    for request in _requests(sys.argv[1]):
-        print(json.dumps(decode(request).to_dict()), flush=True)
+    for request in _requests(sys.argv[1:]):
+        entry, files = decode(request)
+        print(json.dumps({**entry.to_dict(), "files": files} if files else entry.to_dict()), flush=True)
 
 
 if __name__ == "__main__":

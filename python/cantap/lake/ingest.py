@@ -9,21 +9,20 @@ import sys
 import tempfile
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import pyarrow as pa
-
 from .inputs import Fetched, Trace, traces
 from .isolation import Failed, Process
 from .ledger import FAILED, REFUSED, Entry
-from .store import Store
+from .splitting import default_part_bytes, divide, together
+from .store import Store, stem_of
 
 if TYPE_CHECKING:
-    from .decoding import Request
+    from .decoding import Part, Request
 
 #: The state of a trace whose content is in the lake under another name, or was before.
 DUPLICATE = "duplicate"
@@ -70,12 +69,14 @@ def ingest(
     workers: int | None = None,
     timeout: float = 3600.0,
     retry: bool = False,
+    part_bytes: int | None = None,
     done: Callable[[str, str], None] | None = None,
 ) -> Summary:
     """Reads traces into a lake, which is made if it is not there. Those whose content is in it already are not read again.
 
     `sources`: files, patterns, folders with everything below them, URLs of fsspec. `db`: as for `cantap.read`. `retry`: traces that failed
-    before are tried again in any case; with `retry` also those that were refused. `done`: called with each trace and its state.
+    before are tried again in any case; with `retry` also those that were refused. `part_bytes`: the length of the parts in which several workers read
+    one large trace of this machine; 0: none is divided. `done`: called with each trace and its state.
     """
     names = [sources] if isinstance(sources, (str, os.PathLike)) else list(sources)
     settings = Settings(_pairs(db), j1939, tuple(signals), zone, timeout)
@@ -84,14 +85,42 @@ def ingest(
     found = traces([os.fspath(name) for name in names], vehicle)
     store.create()
     run = _Run(store, settings, setup, retry, done)
-    pool = ThreadPoolExecutor(workers or os.cpu_count() or 1)
-    try:
-        list(pool.map(run.read, [trace for trace in found if not _is_inside(trace, store)]))
-    finally:
-        # Ctrl-C does not wait for what has not begun.
-        pool.shutdown(cancel_futures=True)
-        run.close()
+    workers = workers or os.cpu_count() or 1
+    pool = ThreadPoolExecutor(workers)
+    divided = Divided(pool, workers, part_bytes)
+    with store.transactions.run():
+        try:
+            wanted = [trace for trace in found if not _is_inside(trace, store)]
+            large = [trace for trace in wanted if divided.takes(trace)]
+            list(pool.map(run.read, [trace for trace in wanted if trace not in large]))
+            for trace in large:
+                run.read(trace, divided)
+        finally:
+            # Ctrl-C does not wait for what has not begun.
+            pool.shutdown(cancel_futures=True)
+            run.close()
     return run.summary
+
+
+class Divided:
+    """Large traces, which all workers read together."""
+
+    def __init__(self, pool: ThreadPoolExecutor, workers: int, part_bytes: int | None) -> None:
+        self.pool, self._workers, self._part_bytes = pool, workers, part_bytes
+
+    def part_bytes(self, size: int) -> int:
+        """How long the parts of a trace of this length are."""
+        return self._part_bytes or default_part_bytes(size, self._workers)
+
+    def takes(self, trace: Trace) -> bool:
+        """Whether it may be divided."""
+        if self._workers == 1 or self._part_bytes == 0 or not isinstance(trace.source, str):
+            return False
+        try:
+            size = os.path.getsize(trace.source)
+        except OSError:
+            return False
+        return size >= 2 * self.part_bytes(size)
 
 
 def _is_inside(trace: Trace, store: Store) -> bool:
@@ -125,11 +154,9 @@ class _Run:
         for place in self._places:
             place.close()
         for sha256, names in self._names.items():
-            entry = self._store.entry(sha256)
-            if entry is not None and not names <= set(entry["names"]):
-                self._store.write_entry({**entry, "names": sorted(names.union(entry["names"]))})
+            self._store.add_names(sha256, names)
 
-    def read(self, trace: Trace) -> None:
+    def read(self, trace: Trace, divided: Divided | None = None) -> None:
         """Reads a trace, unless its content is known."""
         try:
             fetched = trace.fetch(self._place().folder)
@@ -138,11 +165,11 @@ class _Run:
             self._count(trace, FAILED, str(error), 0)
             return
         try:
-            self._read(trace, fetched)
+            self._read(trace, fetched, divided)
         finally:
             fetched.discard()
 
-    def _read(self, trace: Trace, fetched: Fetched) -> None:
+    def _read(self, trace: Trace, fetched: Fetched, divided: Divided | None) -> None:
         with self._lock:
             is_first = fetched.sha256 not in self._names
             self._names.setdefault(fetched.sha256, set()).add(trace.name)
@@ -153,7 +180,21 @@ class _Run:
         if before is not None and before["setup"] == self._setup and not self._is_to_be_tried_again(before["state"]):
             self._count(trace, KNOWN, None, 0)
             return
-        answer = self._place().decode(trace, fetched)
+        stem = stem_of(fetched.sha256, self._setup)
+        staged = self._store.staging()
+        try:
+            answer = self._in_parts(trace, fetched, stem, staged, divided) if divided else None
+            if answer is None:
+                place = self._place()
+                answer, staged_in = place.decode(trace, fetched, stem), place.written
+            else:
+                staged_in = staged
+            self._keep(trace, fetched, before, answer, staged_in)
+        finally:
+            shutil.rmtree(staged, ignore_errors=True)
+
+    def _keep(self, trace: Trace, fetched: Fetched, before: dict[str, Any] | None, answer: dict[str, Any], staged: Path) -> None:
+        """Puts what came of a trace into the lake."""
         if not fetched.is_unchanged():
             with self._lock:
                 del self._names[fetched.sha256]
@@ -161,9 +202,43 @@ class _Run:
             return
         names = {trace.name, *(before["names"] if before else ())}
         entry = {**answer, "sha256": fetched.sha256, "names": sorted(names), "setup": self._setup}
-        rows = self._place().rows(answer["state"])
-        self._store.write(entry, rows)
+        self._store.put({"files": {}, **entry}, staged)
         self._count(trace, answer["state"], answer["problem"], answer["records"])
+
+    def _in_parts(self, trace: Trace, fetched: Fetched, stem: str, staged: Path, divided: Divided) -> dict[str, Any] | None:
+        """The entry of a large trace, whose rows are then in files below `staged`; `None` if it is to be read as one.
+
+        All rows are counted first: a row has its number, which depends on the parts before.
+        """
+        found = divide(fetched.path, divided.part_bytes(fetched.bytes))
+        if found is None:
+            return None
+
+        def read(number: int, first_rows: tuple[int, int] | None) -> dict[str, Any]:
+            part: Part = {"format": found.format, "pieces": list(found.parts[number]), "first_rows": first_rows}
+            place = self._place()
+            answer = place.decode(trace, fetched, f"{stem}.{number:04}", part)
+            for files in answer.get("files", {}).values():
+                for name in files:
+                    (staged / name).parent.mkdir(parents=True, exist_ok=True)
+                    os.replace(place.written / name, staged / name)
+            return answer
+
+        numbers = range(len(found.parts))
+        counts = [Entry(**answer) for answer in divided.pool.map(read, numbers, [None for _ in numbers])]
+        whole = together(counts)
+        if whole is None:
+            return None
+        first_rows = [(0, 0)]
+        for entry in counts:
+            first_rows.append((first_rows[-1][0] + entry.records, first_rows[-1][1] + entry.signal_rows))
+        files: dict[str, dict[str, int]] = {}
+        for entry, answer in zip(counts, divided.pool.map(read, numbers, first_rows[:-1]), strict=True):
+            for table, named in answer.pop("files", {}).items():
+                files.setdefault(table, {}).update(named)
+            if answer != entry.to_dict():
+                return None
+        return {**whole.to_dict(), "files": files}
 
     def _is_to_be_tried_again(self, state: str) -> bool:
         return state == FAILED or (self._retry and state == REFUSED)
@@ -179,7 +254,7 @@ class _Run:
 
     def _place(self) -> _Workplace:
         if not hasattr(self._of_thread, "place"):
-            self._of_thread.place = _Workplace(self._settings)
+            self._of_thread.place = _Workplace(self._settings, self._store)
             with self._lock:
                 self._places.append(self._of_thread.place)
         place: _Workplace = self._of_thread.place
@@ -189,19 +264,25 @@ class _Run:
 class _Workplace:
     """A thread's folder, and the process that decodes for it."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, store: Store) -> None:
         self._settings = settings
+        #: For copies of traces.
         self.folder = Path(tempfile.mkdtemp(prefix="cantap-lake-"))
-        self._rows = self.folder / "rows.arrow"
-        command = [sys.executable, "-m", "cantap.lake.decoding", str(self.folder)]
+        #: For rows until their trace is done: in the lake, so that files only get another name.
+        self.written = store.staging()
+        command = [sys.executable, "-m", "cantap.lake.decoding", str(self.folder), str(self.written)]
         self._process = Process(command, settings.timeout_s)
 
     def close(self) -> None:
         self._process.__exit__(None, None, None)
-        shutil.rmtree(self.folder, ignore_errors=True)
+        for folder in (self.folder, self.written):
+            shutil.rmtree(folder, ignore_errors=True)
 
-    def decode(self, trace: Trace, fetched: Fetched) -> dict[str, Any]:
-        """The entry of a trace; its rows are then in a file."""
+    def decode(self, trace: Trace, fetched: Fetched, stem: str, part: Part | None = None) -> dict[str, Any]:
+        """The entry of a trace, or of a part of it; its rows are then in files below `written`."""
+        # What a process left that was ended.
+        shutil.rmtree(self.written, ignore_errors=True)
+        self.written.mkdir(parents=True)
         request: Request = {
             "path": str(fetched.path),
             "trace": trace.name,
@@ -212,16 +293,11 @@ class _Workplace:
             "j1939": self._settings.j1939,
             "signals": list(self._settings.signals),
             "zone": self._settings.zone,
-            "rows": str(self._rows),
+            "rows": str(self.written),
+            "stem": stem,
+            "part": part,
         }
         try:
             return self._process.ask(request)
         except Failed as failed:
             return Entry(trace.name, trace.vehicle, fetched.bytes, state=FAILED, problem=str(failed)).to_dict()
-
-    def rows(self, state: str) -> Iterator[pa.RecordBatch]:
-        """The rows of the trace that was decoded last."""
-        if state not in (REFUSED, FAILED):
-            with pa.memory_map(str(self._rows)) as file, pa.ipc.open_stream(file) as reader:
-                yield from reader
-        self._rows.unlink(missing_ok=True)

@@ -79,6 +79,8 @@ class _Workplace:
             "signals": list(self._settings.signals),
             "zone": self._settings.zone,
             "rows": str(rows),
+            "stem": None,
+            "part": None,
         }
 
     def _local(self, row: dict[str, Any]) -> str:

@@ -6,7 +6,6 @@ themselves changed, and whoever reads an entry meanwhile applies it. A process t
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import threading
@@ -14,6 +13,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+try:
+    import fcntl
+except ModuleNotFoundError:  # Windows has no locks that several readers share.
+    fcntl = None  # type: ignore[assignment]
 
 #: By content: the file that had its rows, and those that have them, with how many.
 Moves = Mapping[str, Mapping[str, Mapping[str, int]]]
@@ -33,20 +37,20 @@ class Transactions:
     @contextmanager
     def writing(self) -> Iterator[None]:
         """While entries are changed: one process and thread at a time, for moments."""
-        with _locked(self._folder / ".commit.lock", fcntl.LOCK_EX):
+        with _locked(self._folder / ".commit.lock"):
             yield
 
     @contextmanager
     def run(self) -> Iterator[None]:
         """While traces are added or files joined: nobody removes files meanwhile."""
-        with _locked(self._folder / ".run.lock", fcntl.LOCK_SH):
+        with _locked(self._folder / ".run.lock", shared=True):
             yield
 
     @contextmanager
     def alone(self) -> Iterator[None]:
         """While files are removed: raises `Busy` if anybody adds traces or joins files."""
         try:
-            with _locked(self._folder / ".run.lock", fcntl.LOCK_EX | fcntl.LOCK_NB):
+            with _locked(self._folder / ".run.lock", waits=False):
                 yield
         except BlockingIOError:
             raise Busy(f"{self._folder}: traces are being added or files joined; try again when that is done") from None
@@ -84,9 +88,11 @@ def moved(entry: dict[str, Any], moves: Moves) -> dict[str, Any]:
 
 
 @contextmanager
-def _locked(path: Path, how: int) -> Iterator[None]:
+def _locked(path: Path, *, shared: bool = False, waits: bool = True) -> Iterator[None]:
+    if fcntl is None:
+        raise OSError("a lake is written to on Linux and macOS only: this system has no locks for it; it can be read here")
     with open(path, "ab") as file:
-        fcntl.flock(file, how)
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if waits else fcntl.LOCK_NB))
         yield
 
 

@@ -366,7 +366,7 @@ def open(
     address: str,
     bitrate: int | Literal["auto"] | None = None,
     *,
-    channels: SupportsIndex | Iterable[SupportsIndex] = (1, 2),
+    channels: SupportsIndex | Iterable[SupportsIndex] | None = None,
     mode: Mode = "listen-only",
     filter: str | Iterable[str] = (),
     capacity: int = CAPACITY,
@@ -375,7 +375,7 @@ def open(
 
     `/dev/ttyACM0`, `COM5`, `virtual`, `virtual:car`, `unix:`, `tcp://HOST`, `tls://HOST`, `ssh://[USER@]HOST`.
 
-    With a bit rate, or `"auto"`, the `channels` are opened. Without one, none is: use `Device.open_channel` for each.
+    With a bit rate, or `"auto"`, the `channels` are opened, or all that the device has. Without one, none is: use `Device.open_channel` for each.
 
         with cantap.open("/dev/ttyACM0", 500_000) as device:
             for record in device:
@@ -385,7 +385,8 @@ def open(
     if bitrate is not None:
         try:
             filters = _words(filter, "filter")
-            for channel in _channels(channels):
+            every = range(1, device.info["channels"] + 1)
+            for channel in every if channels is None else _channels(channels):
                 device.open_channel(channel, bitrate, mode=mode, filter=filters)
         except BaseException:
             device.close()

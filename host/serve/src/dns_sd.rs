@@ -248,19 +248,9 @@ fn read(service: &ResolvedService, with_loopback: bool) -> Option<Server> {
     // IPv4 first, as it is easier to type.
     let ip = addresses.min_by_key(|ip| (ip.is_ipv6(), *ip)).filter(|_| service.port != 0)?;
     let name = service.fullname.strip_suffix(SERVICE).unwrap_or(&service.fullname);
-    let name = unescaped(name.strip_suffix('.').unwrap_or(name));
-    let name = clean::line(&name).chars().take(MOST_LETTERS).collect();
+    let name = name.strip_suffix('.').unwrap_or(name);
+    let name = clean::line(name).chars().take(MOST_LETTERS).collect();
     Some(Server { place: SocketAddr::new(ip, service.port), name })
-}
-
-/// A name as its owner wrote it: a backslash stands before what would end it otherwise.
-fn unescaped(text: &str) -> String {
-    let mut letters = text.chars();
-    let mut next = || match letters.next()? {
-        '\\' => letters.next().or(Some('\\')),
-        letter => Some(letter),
-    };
-    std::iter::from_fn(&mut next).collect()
 }
 
 #[cfg(test)]

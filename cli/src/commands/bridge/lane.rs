@@ -124,7 +124,9 @@ impl Lane {
                         add(&self.counts.lost, *count as usize);
                         self.counts.lost_more.fetch_or(*at_least, Ordering::Relaxed);
                         // A confirmation may be among the lost records; do not wait for it for ever.
-                        lock(&self.own).clear();
+                        if *event != TraceEvent::UNCOUNTED {
+                            lock(&self.own).clear();
+                        }
                     }
                     raw.extend(error(event));
                 }

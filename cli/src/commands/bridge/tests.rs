@@ -295,8 +295,11 @@ fn fd_frames_cross_both_ways_with_their_flags() {
     let frames =
         [&[2, 0, 0, 0, 2][..], &[0, 0, 1, 0x23, 0x80 | 1, 0x01, 0x5A], &[0, 0, 1, 0x24, 1, 0xA5]].concat();
     peer.send_to(&frames, free).unwrap();
-    bridged.until("both frames", |memories| memories[0].written().len() == 2);
-    assert_eq!(bridged.memories[0].written(), ["123##15A", "124#A5"]);
+    // What nobody counted before comes first.
+    let frames =
+        |memory: &Memory| memory.written().into_iter().filter(|text| text.contains('#')).collect::<Vec<_>>();
+    bridged.until("both frames", |memories| frames(&memories[0]).len() == 2);
+    assert_eq!(frames(&bridged.memories[0]), ["123##15A", "124#A5"]);
     let lanes = Arc::clone(&bridged.lanes);
     bridged.until("it is counted as sent", |_| lanes[0].counts.sent.load(Ordering::Relaxed) == 1);
 }

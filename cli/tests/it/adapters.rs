@@ -221,8 +221,7 @@ fn a_server_s_tunnel_carries_fd_frames_both_ways() {
     peer.connect(door).unwrap();
     // Until the server has the bus, it sends nothing, and says so.
     bus.set_read_timeout(Some(std::time::Duration::from_millis(100))).unwrap();
-    let frames =
-        [&[0x98, 0xDA, 0xF1, 0x10, 0x80 | 2, 0x02, 0xA5, 0x5A][..], &[0, 0, 1, 0x23, 1, 0x77]].concat();
+    let frames = [&[0x98, 0xDA, 0xF1, 0x10, 0x82, 0x02, 0xA5, 0x5A][..], &[0, 0, 1, 0x23, 1, 0x77]].concat();
     let mut bytes = [0; 200];
     let len = (0..).find_map(|number: u8| {
         peer.send(&[&[2, 0, number, 0, 2][..], &frames].concat()).unwrap();
@@ -231,7 +230,7 @@ fn a_server_s_tunnel_carries_fd_frames_both_ways() {
     // One datagram for each frame, or one for both.
     let first = &bytes[5..len.unwrap()];
     assert!(frames.starts_with(first) && first.len() >= 8, "{first:X?}");
-    let answer = [&[2, 0, 0, 0, 1][..], &[0, 0, 7, 0xFF, 0x80 | 12, 0x01], &[0x3C; 12]].concat();
+    let answer = [&[2, 0, 0, 0, 1][..], &[0, 0, 7, 0xFF, 0x8C, 0x01], &[0x3C; 12]].concat();
     let listens = device.rsplit('=').next().unwrap();
     bus.send_to(&answer, format!("127.0.0.1:{listens}")).unwrap();
     peer.set_read_timeout(Some(std::time::Duration::from_secs(20))).unwrap();

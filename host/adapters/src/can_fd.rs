@@ -119,7 +119,7 @@ mod tests {
                 .starts_with("received, not sent, data phases at 2000000")
         );
         let with_none = ["slcan", "gvret", "socketcand", "elm327", "stn"];
-        for row in ROWS.iter().filter(|row| with_none.iter().any(|name| row.board == *name)) {
+        for row in ROWS.iter().filter(|row| with_none.contains(&row.board)) {
             assert!(text(row.board, false, None).starts_with("none ("), "{}", row.board);
         }
     }

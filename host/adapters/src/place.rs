@@ -231,13 +231,11 @@ fn gvret_of(rest: &str) -> Option<Kind> {
         Some((place, option)) => (place, Some(bit_rate(option.strip_prefix("data-bitrate=")?).ok()?)),
         None => (rest, None),
     };
-    Some(match place.strip_prefix("tcp://") {
-        Some(host) => Kind::GvretTcp { host: with_port(host, gvret::PORT)?, data_bitrate_bps },
-        None => {
-            let (port, baud) = port_and_baud(place, gvret::DEFAULT_BAUD)?;
-            Kind::GvretSerial { port, baud, data_bitrate_bps }
-        }
-    })
+    if let Some(host) = place.strip_prefix("tcp://") {
+        return Some(Kind::GvretTcp { host: with_port(host, gvret::PORT)?, data_bitrate_bps });
+    }
+    let (port, baud) = port_and_baud(place, gvret::DEFAULT_BAUD)?;
+    Some(Kind::GvretSerial { port, baud, data_bitrate_bps })
 }
 
 /// What an address of a maker's adapter has behind its channel.

@@ -290,10 +290,10 @@ fn fd_frames_cross_both_ways_with_their_flags() {
     let mut bytes = [0; 2048];
     let len = peer.recv(&mut bytes).unwrap();
     let data = [0x11, 0x22, 0x33, 0x44, 0x55, 0x66, 0x77, 0x88, 0x99, 0xAA, 0xBB, 0xCC];
-    let item = [&[0x98, 0xDA, 0xF1, 0x10, 0x80 | 12, 0x03][..], &data].concat();
+    let item = [&[0x98, 0xDA, 0xF1, 0x10, 0x8C, 0x03][..], &data].concat();
     assert_eq!((&bytes[..2], &bytes[3..5], &bytes[5..len]), (&[2, 0][..], &[0, 1][..], &item[..]));
     let frames =
-        [&[2, 0, 0, 0, 2][..], &[0, 0, 1, 0x23, 0x80 | 1, 0x01, 0x5A], &[0, 0, 1, 0x24, 1, 0xA5]].concat();
+        [&[2, 0, 0, 0, 2][..], &[0, 0, 1, 0x23, 0x81, 0x01, 0x5A], &[0, 0, 1, 0x24, 1, 0xA5]].concat();
     peer.send_to(&frames, free).unwrap();
     // What nobody counted before comes first.
     let frames =

@@ -145,7 +145,7 @@ fn frames_of_a_bus_with_can_fd_are_read_if_the_address_has_its_data_bit_rate() {
         adapter.write_all(piece).unwrap();
     }
     let records = until_frame(&device, "125#A5");
-    let long: String = data.iter().map(|byte| format!("{byte:02X}")).collect();
+    let long = data.iter().map(|byte| format!("{byte:02X}")).collect::<Vec<_>>().concat();
     assert_eq!(frames(&records), [format!("18DAF110##1{long}"), "123##15A".to_owned(), "125#A5".to_owned()]);
     assert_eq!(losses(&records), [("link", 1), ("link", 1)]);
     let failures = device.failures().unwrap();

@@ -1,7 +1,7 @@
 //! The channels of makers' libraries. A library may hang, die or write whatever it likes, so each is asked in a process of its own, which ends with it.
 
-use std::io::{Read, Write};
-use std::process::{Child, Command, Stdio};
+use std::io::{BufRead, BufReader, Read, Write};
+use std::process::{Child, ChildStdout, Command, Stdio};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
@@ -77,7 +77,7 @@ pub fn find() -> Found {
 /// A process that asks a library.
 struct Asked {
     child: Child,
-    output: mpsc::Receiver<Vec<u8>>,
+    answer: mpsc::Receiver<Option<Value>>,
 }
 
 impl Asked {
@@ -85,35 +85,37 @@ impl Asked {
         let mut command = Command::new(std::env::current_exe()?);
         command.args(["list", "--ask-library", maker.scheme()]);
         let mut child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null()).spawn()?;
-        let (done, output) = mpsc::channel();
+        let (done, answer) = mpsc::channel();
         let stdout = child.stdout.take();
         std::thread::spawn(move || {
-            let mut bytes = Vec::new();
-            if let Some(stdout) = stdout {
-                let _ = stdout.take(MOST_BYTES).read_to_end(&mut bytes);
-            }
-            let _ = done.send(bytes);
+            let _ = done.send(stdout.and_then(find_answer));
         });
-        Ok(Self { child, output })
+        Ok(Self { child, answer })
     }
 
     /// The line with the answer, or why there is none.
     fn answer(mut self, deadline: Instant) -> Result<Value, String> {
         let left = deadline.saturating_duration_since(Instant::now());
-        let Ok(bytes) = self.output.recv_timeout(left) else {
+        let Ok(answer) = self.answer.recv_timeout(left) else {
             // One that hangs in its driver may outlive even this: it is not waited for.
             let _ = self.child.kill();
             return Err(format!("it did not answer within {} s", ANSWERS_IN.as_secs()));
         };
-        let text = String::from_utf8_lossy(&bytes);
-        let answer = text.lines().rev().find_map(|line| {
-            serde_json::from_str::<Value>(line).ok().filter(|answer| answer.get(ANSWER).is_some())
-        });
         // What it does at its end is of no interest once it has answered.
         let _ = self.child.kill();
-        let ended = self.child.wait().map_or_else(|error| error.to_string(), |status| status.to_string());
-        answer.ok_or_else(|| format!("it ended the program that asked it ({ended})"))
+        answer.ok_or_else(|| {
+            let ended = self.child.wait().map_or_else(|error| error.to_string(), |status| status.to_string());
+            format!("it ended the program that asked it ({ended})")
+        })
     }
+}
+
+/// The line with the answer. What comes behind it is not waited for.
+fn find_answer(stdout: ChildStdout) -> Option<Value> {
+    let lines = BufReader::new(stdout.take(MOST_BYTES)).split(b'\n');
+    lines.map_while(Result::ok).find_map(|line| {
+        serde_json::from_slice::<Value>(&line).ok().filter(|answer| answer.get(ANSWER).is_some())
+    })
 }
 
 /// Reads an answer.

@@ -322,6 +322,15 @@ class Record:
     def remote(self) -> bool:
         """Whether the frame asks for data and has none."""
     @property
+    def fd(self) -> bool:
+        """Whether it is a CAN FD frame."""
+    @property
+    def brs(self) -> bool:
+        """Whether its data had a bit rate of their own."""
+    @property
+    def esi(self) -> bool:
+        """Whether it says that its sender is error passive."""
+    @property
     def dlc(self) -> int | None:
         """The frame's length code, as on the bus."""
     @property

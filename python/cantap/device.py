@@ -366,7 +366,7 @@ def open(
     address: str,
     bitrate: int | Literal["auto"] | None = None,
     *,
-    channels: SupportsIndex | Iterable[SupportsIndex] = (1, 2),
+    channels: SupportsIndex | Iterable[SupportsIndex] | None = None,
     mode: Mode = "listen-only",
     filter: str | Iterable[str] = (),
     capacity: int = CAPACITY,
@@ -379,7 +379,7 @@ def open(
     With `device_intervals`, intervals between times are those that the device's crystal measures; otherwise times follow UTC, and corrections change the
     intervals around them, by up to 100 ppm.
 
-    With a bit rate, or `"auto"`, the `channels` are opened. Without one, none is: use `Device.open_channel` for each.
+    With a bit rate, or `"auto"`, the `channels` are opened, or all that the device has. Without one, none is: use `Device.open_channel` for each.
 
         with cantap.open("/dev/ttyACM0", 500_000) as device:
             for record in device:
@@ -391,7 +391,8 @@ def open(
     if bitrate is not None:
         try:
             filters = _words(filter, "filter")
-            for channel in _channels(channels):
+            every = range(1, device.info["channels"] + 1)
+            for channel in every if channels is None else _channels(channels):
                 device.open_channel(channel, bitrate, mode=mode, filter=filters)
         except BaseException:
             device.close()

@@ -289,6 +289,24 @@ impl Record {
         self.frame().is_some_and(TraceFrame::is_remote)
     }
 
+    /// Whether it is a CAN FD frame.
+    #[getter]
+    fn fd(&self) -> bool {
+        self.frame().is_some_and(TraceFrame::is_fd)
+    }
+
+    /// Whether its data had a bit rate of their own.
+    #[getter]
+    fn brs(&self) -> bool {
+        self.frame().and_then(TraceFrame::fd).is_some_and(FdFrame::brs)
+    }
+
+    /// Whether it says that its sender is error passive.
+    #[getter]
+    fn esi(&self) -> bool {
+        self.frame().and_then(TraceFrame::fd).is_some_and(FdFrame::esi)
+    }
+
     /// The frame's length code, as on the bus.
     #[getter]
     fn dlc(&self) -> Option<u8> {

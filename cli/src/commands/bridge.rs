@@ -2,6 +2,7 @@
 
 mod interface;
 mod lane;
+mod raw;
 mod sender;
 #[cfg(test)]
 mod tests;
@@ -39,6 +40,8 @@ use cantap_work::reception::Reception;
                 Channels only listen, unless --mode says otherwise: what programs write is refused then, with an error \
                 frame for each. What the buses refuse, errors, states and losses are error frames (candump -e shows \
                 them). A frame's time is that of its arrival at the interface.\n\n\
+                CAN FD frames cross between an adapter that has them and an interface with an mtu of 72:\n  \
+                ip link set can0 mtu 72 && ip link set can0 up\n\n\
                 Examples:\n  \
                 cantap bridge -d /dev/ttyACM0 -b 500k can0 can1\n  \
                 cantap bridge -d /dev/ttyACM0 -b 500k --mode normal can0\n  \

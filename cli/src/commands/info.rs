@@ -3,6 +3,7 @@
 use std::io::Write;
 use std::process::ExitCode;
 
+use cantap::wire::Channel;
 use cantap::wire::message::capability;
 use cantap_adapters::Row;
 
@@ -22,7 +23,7 @@ pub struct Args {
 }
 
 /// Names of the device's capabilities.
-const CAPABILITIES: [(u32, &str); 11] = [
+const CAPABILITIES: [(u32, &str); 12] = [
     (capability::TRANSMIT, "transmit"),
     (capability::TIMED_TRANSMIT, "timed-transmit"),
     (capability::SLCAN, "slcan"),
@@ -34,6 +35,7 @@ const CAPABILITIES: [(u32, &str); 11] = [
     (capability::ALWAYS_ACKNOWLEDGES, "always-acknowledges"),
     (capability::NO_BIT_RATE, "no-bit-rate"),
     (capability::UNCOUNTED_LOSSES, "uncounted-losses"),
+    (capability::FD_TRANSMIT, "fd-transmit"),
 ];
 
 /// Runs it.
@@ -44,6 +46,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let firmware = format!("{major}.{minor}.{patch}");
     let capabilities: Vec<&str> =
         CAPABILITIES.iter().filter(|(bit, _)| hello.capabilities & bit != 0).map(|(_, name)| *name).collect();
+    let can_fd = cantap_adapters::can_fd(hello, device.data_bitrate(Channel::Can1));
     let round_trip_us = device.clock().round_trip_ns as f64 / 1e3;
     let mut out = std::io::stdout().lock();
     if args.json {
@@ -61,6 +64,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             "periodic_slots": hello.periodic_slots,
             "trigger_slots": hello.trigger_slots,
             "filter_banks": hello.filter_banks,
+            "can_fd": {
+                "receives": can_fd.receives,
+                "sends": can_fd.sends,
+                "data_bitrate_bps": can_fd.data_bitrate_bps,
+                "source": can_fd.source,
+            },
             "capabilities": capabilities,
             "round_trip_us": round_trip_us,
             "clock": clock::object(&device.clock()),
@@ -83,6 +92,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             hello.tx_queue, hello.periodic_slots, hello.trigger_slots
         )?;
         writeln!(out, "filter banks    {}", hello.filter_banks)?;
+        writeln!(out, "CAN FD          {can_fd}")?;
         writeln!(out, "capabilities    {}", capabilities.join(", "))?;
         writeln!(out, "round trip      {round_trip_us:.0} us")?;
         writeln!(out, "clock           {}", clock::line(&device.clock()))?;

@@ -1,11 +1,12 @@
-//! `cantap list`: which boards are connected, and which servers announce themselves on the network.
+//! `cantap list`: which boards and makers' adapters are connected, and which servers announce themselves on the network.
+
+mod makers;
+mod network;
 
 use std::io::Write;
 use std::process::ExitCode;
-use std::time::Duration;
 
-use cantap_serve::beacon::{self, Announced, Found};
-
+use self::network::Network;
 use crate::stderr;
 
 /// The command line.
@@ -13,36 +14,36 @@ use crate::stderr;
 #[command(
     after_help = "Boards are found by their USB IDs. Until cantap has a product ID of its own these are pid.codes' test \
                 IDs, so another project's board may be listed too; `cantap info` tells.\n\n\
-                Servers are found by socketcand's beacons, which anybody on the network can send: where one is and what it is called is what \
-                it says of itself.\n\n\
+                PEAK's and Kvaser's channels are those that PCAN-Basic and CANlib know, if they are installed. None is opened.\n\n\
+                Servers are found by socketcand's beacons and by DNS-SD, with which anybody on the network can announce anything: where one is and \
+                what it is called is what it says of itself.\n\n\
                 Examples:\n  \
                 cantap list\n  \
                 cantap list --network\n  \
                 cantap list --json"
 )]
 pub struct Args {
-    /// Also listen for three seconds for servers that speak socketcand: those of this computer, and those at addresses of the network.
+    /// Also look for three seconds for servers: those that speak socketcand, of this computer and of the network, and those of other computers that are
+    /// started with --announce.
     #[arg(long)]
     network: bool,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
+    /// Ask a maker's library in this process.
+    #[arg(long, hide = true, value_name = "MAKER")]
+    ask_library: Option<String>,
 }
-
-/// Servers announce themselves at least every three seconds.
-const LISTEN_FOR: Duration = Duration::from_millis(3100);
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    if let Some(maker) = &args.ask_library {
+        makers::answer(maker)?;
+        return Ok(ExitCode::SUCCESS);
+    }
     let boards = cantap::device::list()?;
-    let announced = if args.network {
-        let found = beacon::listen_for(LISTEN_FOR);
-        Some(found.map_err(|error| {
-            anyhow::anyhow!("nobody can listen for servers at UDP port {}: {error}", beacon::PORT)
-        })?)
-    } else {
-        None
-    };
+    let makers = makers::find();
+    let network = args.network.then(Network::look).transpose()?;
     let mut out = std::io::stdout().lock();
     if args.json {
         let devices: Vec<_> = boards
@@ -55,66 +56,54 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 })
             })
             .collect();
-        let mut object = serde_json::json!({ "devices": devices });
-        if let Some(announced) = &announced {
-            object["servers"] = announced.servers.iter().map(json_of).collect();
-            object["beacons_left_out"] = announced.beacons_left_out.into();
-            object["unreadable"] = announced.unreadable.into();
+        let adapters: Vec<_> = makers.channels.iter().map(makers::json_of).collect();
+        let unusable: Vec<_> = makers
+            .unusable
+            .iter()
+            .map(|(library, reason)| serde_json::json!({ "library": library, "reason": reason }))
+            .collect();
+        let mut object = serde_json::json!({
+            "devices": devices,
+            "adapters": adapters,
+            "without_address": makers.without_address,
+            "unusable": unusable,
+        });
+        if let Some(network) = &network {
+            network.put(&mut object);
         }
         writeln!(out, "{object}")?;
         return Ok(ExitCode::SUCCESS);
     }
-    if boards.is_empty() {
+    if boards.is_empty() && makers.channels.is_empty() {
         stderr::tell("cantap: no board is connected; plug one in, or use -d virtual, which needs none\n");
-    } else {
-        for board in boards {
-            let serial = board.serial_number.as_deref().unwrap_or("-");
-            writeln!(out, "{}\t{}\t{serial}", board.port, board.product.as_deref().unwrap_or("-"))?;
-        }
     }
-    let Some(announced) = announced else { return Ok(ExitCode::SUCCESS) };
-    for server in &announced.servers {
-        for bus in &server.buses {
-            writeln!(out, "{}\t{}\t{}", address(server, bus), server.name, server.from)?;
-        }
+    for board in boards {
+        let serial = board.serial_number.as_deref().unwrap_or("-");
+        writeln!(out, "{}\t{}\t{serial}", board.port, board.product.as_deref().unwrap_or("-"))?;
     }
-    drop(out);
-    tell_left_out(&announced);
+    for channel in &makers.channels {
+        let in_use = if channel.in_use == Some(true) { "\tanother program has it" } else { "" };
+        let serial = channel.serial_number.as_deref().unwrap_or("-");
+        writeln!(out, "{}\t{}\t{serial}{in_use}", channel.device, channel.product)?;
+    }
+    tell_unusable(&makers);
+    if let Some(network) = network {
+        network.print(&mut out)?;
+        drop(out);
+        network.tell_left_out();
+    }
     Ok(ExitCode::SUCCESS)
 }
 
-/// Says what is not listed.
-fn tell_left_out(announced: &Announced) {
-    let Announced { servers, beacons_left_out, unreadable } = announced;
-    if servers.is_empty() {
-        stderr::tell(
-            "cantap: no server announced itself; `cantap serve --socketcand` does, and others need not\n",
-        );
+/// Says which libraries have not answered, and what is not listed of the others.
+fn tell_unusable(makers: &makers::Found) {
+    for (library, reason) in &makers.unusable {
+        stderr::warn(&format!("{library}'s channels are not known: {reason}"));
     }
-    if *beacons_left_out > 0 {
-        stderr::warn(&format!(
-            "{beacons_left_out} beacons of further servers are left out, because {} are listed already: somebody may be inventing them",
-            servers.len()
-        ));
-    }
-    let more: usize = servers.iter().map(|server| server.more_buses).sum();
-    if more > 0 {
-        stderr::warn(&format!("{more} further buses of these servers are left out"));
-    }
-    if *unreadable > 0 {
+    if makers.without_address > 0 {
         stderr::tell(&format!(
-            "cantap: {unreadable} datagrams at UDP port {} were no beacons\n",
-            beacon::PORT
+            "cantap: {} channels are left out, of kinds that cannot be addressed here\n",
+            makers.without_address
         ));
     }
-}
-
-/// A bus of a server as `-d` takes it.
-fn address(server: &Found, bus: &str) -> String {
-    format!("socketcand://{}/{bus}", server.place)
-}
-
-fn json_of(server: &Found) -> serde_json::Value {
-    let devices: Vec<String> = server.buses.iter().map(|bus| address(server, bus)).collect();
-    serde_json::json!({ "devices": devices, "name": server.name, "from": server.from.to_string(), "more_buses": server.more_buses })
 }

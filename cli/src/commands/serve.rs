@@ -1,5 +1,7 @@
 //! `cantap serve`: a device for many programs at once, on this machine or on others.
 
+#[cfg(feature = "tls")]
+mod announcing;
 mod doors;
 #[cfg(feature = "tls")]
 mod keys;
@@ -102,6 +104,11 @@ pub struct Args {
     #[cfg(feature = "tls")]
     #[arg(long, value_name = "CERT,KEY", requires_all = ["tcp", "clients"], value_parser = keys::two_files)]
     tls: Option<(PathBuf, PathBuf)>,
+    /// Announce the listener at --tcp by DNS-SD to everybody on its network, so that `cantap list --network` finds it: with the board's serial number and
+    /// this computer's name.
+    #[cfg(feature = "tls")]
+    #[arg(long, requires = "tls")]
+    announce: bool,
     /// The certificate of the authority that signed the clients' certificates.
     #[cfg(feature = "tls")]
     #[arg(long, value_name = "CA", requires = "tls")]
@@ -197,6 +204,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         Way::Encrypted(_) => address(text, PORT),
     });
     let tcp = tcp.transpose()?;
+    #[cfg(feature = "tls")]
+    announcing::check(args.announce, tcp)?;
     let other_doors = OtherDoors::of(
         [&args.socketcand, &args.gvret, &args.lines, &args.metrics].map(Option::as_deref),
         &args.tunnels,
@@ -230,11 +239,16 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let web = web.map(|web| web.open(&devices, &boards, allow(&args.allowed, Door::Web))).transpose()?;
     let (url, page) = web.unzip();
-    let listening = listen(args, tcp.map(|tcp| (tcp, way)).as_ref(), &other_doors, url.as_deref(), &boards)?;
+    let (listening, encrypted) =
+        listen(args, tcp.map(|tcp| (tcp, way)).as_ref(), &other_doors, url.as_deref(), &boards)?;
+    #[cfg(feature = "tls")]
+    let announcing = args.announce.then(|| announcing::start(&boards, &encrypted)).transpose()?;
+    #[cfg(not(feature = "tls"))]
+    let (announcing, _) = ((), encrypted);
     while !interrupt::requested() {
         std::thread::sleep(LOOK_EVERY);
     }
-    drop((listening, page));
+    drop((announcing, listening, page));
     for board in &boards {
         board.end();
     }
@@ -313,15 +327,15 @@ fn check_bitrates(args: &Args, number: usize, board: &Board) -> anyhow::Result<(
     }
 }
 
-/// Opens every listener and prints it.
+/// Opens every listener and prints it. Returns also where the encrypted ones are, one for each board.
 fn listen(
     args: &Args,
     tcp: Option<&(SocketAddr, Way)>,
     other_doors: &OtherDoors,
     page: Option<&str>,
     boards: &[Arc<Board>],
-) -> anyhow::Result<Vec<Listening>> {
-    let mut ways = Vec::new();
+) -> anyhow::Result<(Vec<Listening>, Vec<SocketAddr>)> {
+    let (mut ways, mut encrypted) = (Vec::new(), Vec::new());
     let mut said = Vec::new();
     // On systems without UNIX sockets, one for this computer only takes their place.
     #[cfg(not(unix))]
@@ -360,7 +374,9 @@ fn listen(
             let way = way
                 .listen(board, address, allow(&args.allowed, Door::Tcp))
                 .with_context(|| format!("nobody can listen at {address}; give another port with --tcp"))?;
-            names.push(format!("{scheme}://{}", way.address().unwrap_or(address)));
+            let address = way.address().unwrap_or(address);
+            names.push(format!("{scheme}://{address}"));
+            encrypted.extend((scheme == "tls").then_some(address));
             roles.push(allow(&args.allowed, Door::Tcp));
             ways.push(way);
         }
@@ -393,7 +409,7 @@ fn listen(
         let may = if is_one { format!("clients may {first}; ") } else { String::new() };
         eprintln!("cantap: '{board}' is shared at {}; {may}Ctrl-C ends it", ways.join(" and "));
     }
-    Ok(ways)
+    Ok((ways, encrypted))
 }
 
 /// How clients are admitted at a TCP port.

@@ -7,6 +7,8 @@ use std::sync::mpsc;
 
 use serde_json::Value;
 
+use crate::served::server::Server;
+
 /// A pipe into which another program writes a trace: nobody knows what that program lost. It stays open until the sender is dropped.
 pub fn pipe(test: &str, text: String) -> (String, mpsc::Sender<()>) {
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("adapters");
@@ -140,6 +142,17 @@ fn datagrams(peer: &std::net::UdpSocket, count: usize) -> Vec<Vec<u8>> {
 }
 
 #[test]
+fn info_says_whether_there_is_can_fd_and_who_says_so() {
+    let (_, out, err) = run(&["info", "-d", "virtual"]);
+    assert!(out.contains("CAN FD          none (its controllers, which are classical)\n"), "{out}{err}");
+    let (_peer, address) = tunnel();
+    let (_, out, err) = run(&["info", "-d", &address, "--json"]);
+    let can_fd = &object(&out)["can_fd"];
+    let said = ["receives", "sends", "data_bitrate_bps"].map(|key| can_fd[key].clone());
+    assert_eq!(said, [true.into(), true.into(), Value::Null], "{out}{err}");
+}
+
+#[test]
 fn fd_frames_are_sent_confirmed_with_their_flags_and_padded_only_on_request() {
     let (peer, address) = tunnel();
     let (code, out, err) =
@@ -192,6 +205,40 @@ fn fd_frames_of_a_trace_and_made_up_ones_are_sent() {
     assert!(code == Some(0) && out.contains(&format!("101##1{}070000 T", "00".repeat(9))), "{out}{err}");
 }
 
+/// A server whose device is one tunnel and whose listener is another: what is on one side of both comes out on the other, with its flags.
+#[test]
+fn a_server_s_tunnel_carries_fd_frames_both_ways() {
+    let (bus, device) = tunnel();
+    let peer = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let (socket, at) = (folder.path().join("socket"), peer.local_addr().unwrap());
+    let line = format!(
+        "-d {device} -b 500k --unix {} --cannelloni 1:127.0.0.1:0,{at} --allow cannelloni:send",
+        socket.display()
+    );
+    let server = Server::start(&line, 2);
+    let door = server.at[1].strip_prefix("cannelloni://").unwrap().split('?').next().unwrap();
+    peer.connect(door).unwrap();
+    // Until the server has the bus, it sends nothing, and says so.
+    bus.set_read_timeout(Some(std::time::Duration::from_millis(100))).unwrap();
+    let frames = [&[0x98, 0xDA, 0xF1, 0x10, 0x82, 0x02, 0xA5, 0x5A][..], &[0, 0, 1, 0x23, 1, 0x77]].concat();
+    let mut bytes = [0; 200];
+    let len = (0..).find_map(|number: u8| {
+        peer.send(&[&[2, 0, number, 0, 2][..], &frames].concat()).unwrap();
+        bus.recv(&mut bytes).ok()
+    });
+    // One datagram for each frame, or one for both.
+    let first = &bytes[5..len.unwrap()];
+    assert!(frames.starts_with(first) && first.len() >= 8, "{first:X?}");
+    let answer = [&[2, 0, 0, 0, 1][..], &[0, 0, 7, 0xFF, 0x8C, 0x01], &[0x3C; 12]].concat();
+    let listens = device.rsplit('=').next().unwrap();
+    bus.send_to(&answer, format!("127.0.0.1:{listens}")).unwrap();
+    peer.set_read_timeout(Some(std::time::Duration::from_secs(20))).unwrap();
+    // What the tunnel says first is that the bus was left for a moment.
+    let mut hears = || peer.recv(&mut bytes).map(|len| bytes[..len].ends_with(&answer[5..])).unwrap();
+    while !hears() {}
+}
+
 fn object(text: &str) -> Value {
     serde_json::from_str(text).unwrap_or_else(|_| panic!("{text}"))
 }
@@ -226,6 +273,8 @@ fn figures_of_one_that_are_not_counted_are_left_out() {
     assert_eq!(object(&out)["channels"][0]["lost_controller"], Value::Null, "{out}");
     let (out, _) = on_pipe("info", "info -d PIPE --json");
     assert_eq!(object(&out)["adapter"]["counts_losses"], false, "{out}");
+    let can_fd = &object(&out)["can_fd"];
+    assert_eq!((&can_fd["receives"], &can_fd["sends"]), (&true.into(), &false.into()), "{out}");
 }
 
 /// A trigger on losses is for frames that are missing, not for an adapter that does not know.

@@ -39,6 +39,8 @@ mod follow;
 mod gateway;
 mod help;
 mod json_schema;
+#[cfg(target_os = "linux")]
+mod list;
 mod mcap;
 mod message_names;
 mod misbehaving_devices;

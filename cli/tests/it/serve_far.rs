@@ -293,6 +293,9 @@ fn clients_of_other_computers_come_with_keys() {
     let (code, _, err) = run(&format!("send -d {at}?keys={keys}/alice -b 500k 1 123#11"));
     assert_eq!(code, Some(1));
     assert!(err.contains("the right to send"), "{err}");
+    // Nobody is told of what nobody could reach.
+    let (code, _, err) = run(&format!("serve -d virtual -b 500k --tcp 0 {files} --announce"));
+    assert!(code == Some(2) && err.contains("other computers cannot reach 127.0.0.1:0"), "{err}");
     // With another authority's keys, among them one named like the server's: refused immediately, with the
     // reason.
     let other = folder.path().join("other").display().to_string();

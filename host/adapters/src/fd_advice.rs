@@ -21,6 +21,10 @@ fn advice(board: &str, serial: &str, capabilities: u32) -> String {
         ),
         board if board.starts_with("gs_usb") => needs_rate("gs_usb:"),
         board @ ("pcan" | "kvaser") => needs_rate(&format!("{board}:")),
+        "gvret" | "gvret-fd" => {
+            "GVRET's adapters do not agree on a command for CAN FD frames, and one of them would take it for others; use an adapter with CAN FD (docs/adapters.md)"
+                .to_owned()
+        }
         _ if capabilities & cantap_wire::message::capability::ADAPTER != 0 => {
             "this adapter's protocol has none that could be sent; use one with CAN FD (docs/adapters.md)"
                 .to_owned()

@@ -2,12 +2,16 @@
 //!
 //! The protocol knows neither remote frames nor errors nor losses, and the adapter stamps a frame when it leaves it. It keeps what it was last
 //! set to: until it is opened here, it may acknowledge frames.
+//!
+//! A bus with CAN FD has a message of its own, which has no flags and which ESP32RET uses there for classical frames, too. It is read only if the address says
+//! at which data bit rate its bus runs: what is received so is then a CAN FD frame that switches to it. None is sent: for ESP32RET the bytes of such a command
+//! are other commands.
 
 use std::time::{Duration, Instant};
 
 use cantap_codecs::gvret::{Bus, Command, Message, message};
 use cantap_wire::record::LossStage;
-use cantap_wire::{Channel, Frame, Refusal};
+use cantap_wire::{Channel, FdFrame, Frame, Refusal};
 
 use crate::adapter_clock::AdapterClock;
 use crate::driver::{At, Bytes, Driver, Incoming, Oddities, OpenError, Opening, poll_bytes};
@@ -28,6 +32,8 @@ pub(crate) struct Gvret {
     channels: u8,
     build: u16,
     buses: [Bus; 2],
+    /// Whether messages of buses with CAN FD are read.
+    reads_fd: bool,
     clock: AdapterClock,
     backlog: Vec<Incoming>,
     oddities: Oddities,
@@ -35,13 +41,14 @@ pub(crate) struct Gvret {
 
 impl Gvret {
     /// Finds out what is at the other end of a line, and switches its buses off.
-    pub fn over(line: Line, address: &str) -> Result<Self, OpenError> {
+    pub fn over(line: Line, reads_fd: bool, address: &str) -> Result<Self, OpenError> {
         let mut gvret = Self {
             line,
             bytes: Vec::new(),
             channels: 1,
             build: 0,
             buses: [Bus::default(); 2],
+            reads_fd,
             clock: AdapterClock::new(1_000, 1 << 32),
             backlog: Vec::new(),
             oddities: Oddities::default(),
@@ -115,13 +122,7 @@ impl Gvret {
                 let at = self.clock.place(stamp_us.into(), arrival);
                 self.backlog.push(Incoming::Received { channel, frame: frame.into(), at });
             }
-            Message::Fd { bus } => {
-                self.oddities.count("CAN FD frames, which are not read from GVRET");
-                if let Some(channel) = Channel::from_number(bus.saturating_add(1)) {
-                    let (stage, at) = (LossStage::Link, At::arrival(arrival));
-                    self.backlog.push(Incoming::Lost { channel, stage, count: 1, at_least: false, at });
-                }
-            }
+            Message::Fd { stamp_us, bus, frame } => self.take_fd(stamp_us, bus, frame, arrival),
             Message::Garbage => {
                 self.oddities.count("bytes that are no message");
                 let (channel, stage, at) = (Channel::Can1, LossStage::Link, At::arrival(arrival));
@@ -137,6 +138,30 @@ impl Gvret {
             | Message::Number(_)
             | Message::Other => {}
         }
+    }
+
+    fn take_fd(&mut self, stamp_us: u32, bus: u8, frame: Option<FdFrame>, arrival: Instant) {
+        let Some(channel) = Channel::from_number(bus.saturating_add(1)) else {
+            return self.oddities.count("frames of a third or higher bus");
+        };
+        let frame = match frame {
+            Some(frame) if self.reads_fd => FdFrame::new(frame.id(), true, false, frame.data()),
+            Some(_) => {
+                self.oddities
+                    .count("messages of a bus with CAN FD, which are read with ?data-bitrate in the address");
+                None
+            }
+            None => {
+                self.oddities.count("CAN FD frames that cannot be");
+                None
+            }
+        };
+        let Some(frame) = frame else {
+            let (stage, at) = (LossStage::Link, At::arrival(arrival));
+            return self.backlog.push(Incoming::Lost { channel, stage, count: 1, at_least: false, at });
+        };
+        let at = self.clock.place(stamp_us.into(), arrival);
+        self.backlog.push(Incoming::Received { channel, frame: frame.into(), at });
     }
 
     /// Tells the adapter both buses' settings.
@@ -169,7 +194,7 @@ impl Bytes for Gvret {
 
 impl Driver for Gvret {
     fn row(&self) -> &'static Row {
-        row("gvret").unwrap_or(&crate::ROWS[0])
+        row(if self.reads_fd { "gvret-fd" } else { "gvret" }).unwrap_or(&crate::ROWS[0])
     }
 
     fn channels(&self) -> u8 {

@@ -16,6 +16,7 @@
 mod adapter_clock;
 mod bit_limits;
 mod board;
+mod can_fd;
 mod cannelloni;
 mod driver;
 mod elm327;
@@ -30,6 +31,7 @@ mod kvaser;
 mod library_channel;
 mod line;
 mod mailboxes;
+mod maker_channels;
 mod maker_options;
 mod pcan;
 mod place;
@@ -44,7 +46,9 @@ mod text_lines;
 mod trace_pipe;
 mod under_way;
 
+pub use can_fd::{CanFd, can_fd};
 pub use driver::OpenError;
 pub use fd_advice::fd_advice;
+pub use maker_channels::{Maker, MakerChannel, MakerChannels, MakerError, maker_channels};
 pub use place::{BadPlace, Place, can_interfaces, open};
 pub use rows::{Confirmation, ListenOnly, Losses, ROWS, Row, Stamps, row};

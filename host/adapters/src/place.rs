@@ -42,8 +42,8 @@ pub struct Place {
 #[derive(Clone, Debug, PartialEq, Eq)]
 enum Kind {
     Slcan { port: String, baud: u32 },
-    GvretSerial { port: String, baud: u32 },
-    GvretTcp { host: String },
+    GvretSerial { port: String, baud: u32, data_bitrate_bps: Option<u32> },
+    GvretTcp { host: String, data_bitrate_bps: Option<u32> },
     Elm327 { family: Family, place: ElmPlace, ids: Option<Ids> },
     Socketcan { interface: String },
     GsUsb { serial: String, options: gs_usb::Options },
@@ -108,6 +108,9 @@ impl Place {
         match &self.kind {
             Kind::Socketcan { interface } => data_bitrate_of(interface),
             Kind::GsUsb { options, .. } => options.data_bitrate_bps,
+            Kind::GvretSerial { data_bitrate_bps, .. } | Kind::GvretTcp { data_bitrate_bps, .. } => {
+                *data_bitrate_bps
+            }
             Kind::Pcan { options, .. } | Kind::Kvaser { options, .. } => options.data_bitrate_bps,
             _ => None,
         }
@@ -150,17 +153,9 @@ impl FromStr for Place {
                     .ok_or_else(|| bad("write slcan:PORT or slcan:PORT@BAUD, as in slcan:/dev/ttyACM0"))?;
                 Kind::Slcan { port, baud }
             }
-            "gvret" => {
-                if let Some(host) = rest.strip_prefix("tcp://") {
-                    let host = with_port(host, gvret::PORT)
-                        .ok_or_else(|| bad("write gvret:tcp://HOST or gvret:tcp://HOST:PORT"))?;
-                    Kind::GvretTcp { host }
-                } else {
-                    let (port, baud) = port_and_baud(rest, gvret::DEFAULT_BAUD)
-                        .ok_or_else(|| bad("write gvret:PORT, gvret:PORT@BAUD or gvret:tcp://HOST"))?;
-                    Kind::GvretSerial { port, baud }
-                }
-            },
+            "gvret" => gvret_of(rest).ok_or_else(|| {
+                bad("write gvret:PORT, gvret:PORT@BAUD or gvret:tcp://HOST, and ?data-bitrate=2M after it if the adapter is set up for a bus with CAN FD")
+            })?,
             "elm327" => elm327_of(Family::Elm, rest).ok_or_else(|| {
                 bad("write elm327:PORT, elm327:PORT@BAUD or elm327:tcp://HOST:PORT, and ?ids=standard or ?ids=extended after it to choose")
             })?,
@@ -229,6 +224,18 @@ fn gs_usb_of(rest: &str) -> Option<Kind> {
     }
     let is_serial = serial.chars().all(|letter| letter.is_ascii_graphic());
     is_serial.then(|| Kind::GsUsb { serial: serial.to_owned(), options })
+}
+
+fn gvret_of(rest: &str) -> Option<Kind> {
+    let (place, data_bitrate_bps) = match rest.split_once('?') {
+        Some((place, option)) => (place, Some(bit_rate(option.strip_prefix("data-bitrate=")?).ok()?)),
+        None => (rest, None),
+    };
+    if let Some(host) = place.strip_prefix("tcp://") {
+        return Some(Kind::GvretTcp { host: with_port(host, gvret::PORT)?, data_bitrate_bps });
+    }
+    let (port, baud) = port_and_baud(place, gvret::DEFAULT_BAUD)?;
+    Some(Kind::GvretSerial { port, baud, data_bitrate_bps })
 }
 
 /// What an address of a maker's adapter has behind its channel.
@@ -309,8 +316,12 @@ pub fn open(place: &Place) -> Result<Link, OpenError> {
     let address = place.text.as_str();
     let driver: Box<dyn Driver> = match &place.kind {
         Kind::Slcan { port, baud } => Box::new(Slcan::open_port(port, *baud)?),
-        Kind::GvretSerial { port, baud } => Box::new(Gvret::over(Line::serial(port, *baud)?, address)?),
-        Kind::GvretTcp { host } => Box::new(Gvret::over(Line::tcp(host)?, address)?),
+        Kind::GvretSerial { port, baud, data_bitrate_bps } => {
+            Box::new(Gvret::over(Line::serial(port, *baud)?, data_bitrate_bps.is_some(), address)?)
+        }
+        Kind::GvretTcp { host, data_bitrate_bps } => {
+            Box::new(Gvret::over(Line::tcp(host)?, data_bitrate_bps.is_some(), address)?)
+        }
         Kind::Elm327 { family, place, ids } => {
             let line = match place {
                 ElmPlace::Serial { port, baud } => Line::serial(port, *baud)?,
@@ -389,6 +400,8 @@ mod tests {
             "gvret:/dev/ttyUSB0",
             "gvret:tcp://192.168.4.1",
             "gvret:tcp://[::1]:2300",
+            "gvret:tcp://192.168.4.1?data-bitrate=2M",
+            "gvret:/dev/ttyUSB0@921600?data-bitrate=5M",
             "pcan:",
             "pcan:PCAN_USBBUS1",
             "pcan:usbbus2?data-bitrate=2M",
@@ -425,6 +438,9 @@ mod tests {
             "gvret:",
             "gvret:tcp://",
             "gvret:tcp://a:b",
+            "gvret:?data-bitrate=2M",
+            "gvret:COM4?data-bitrate=fast",
+            "gvret:COM4?fd=on",
             "pcan:USB1",
             "pcan:PCAN_USBBUS1?data-bitrate=fast",
             "kvaser:first",

@@ -102,7 +102,7 @@ pub struct Row {
 }
 
 /// All kinds.
-pub const ROWS: [Row; 27] = [
+pub const ROWS: [Row; 28] = [
     Row {
         board: "slcan",
         what: "an slcan adapter that answers (Lawicel's protocol)",
@@ -136,17 +136,8 @@ pub const ROWS: [Row; 27] = [
         sets_bit_rate: true,
         limits: None,
     },
-    Row {
-        board: "gvret",
-        what: "a GVRET adapter (ESP32RET, Macchina)",
-        stamps: Stamps::Adapter { grain_ns: 1_000, when: "the frame's way out of the adapter, not the bus" },
-        losses: Losses::NotReported,
-        errors: "not reported",
-        confirmation: Confirmation::HandedOver,
-        listen_only: ListenOnly::Confirmed,
-        sets_bit_rate: true,
-        limits: None,
-    },
+    gvret("gvret", None),
+    gvret("gvret-fd", Some(FLAGS_BY_ADDRESS)),
     Row {
         board: "pcan",
         what: "an adapter of PEAK's, through PCAN-Basic",
@@ -236,6 +227,24 @@ pub const ROWS: [Row; 27] = [
 const NO_LENGTHS: &str = "a remote frame's length is not reported, and shown as 0";
 const STANDARD_ONLY: &str = "extended frames are not received (?ids=extended receives only them); a remote frame's length is shown as 0";
 const EXTENDED_ONLY: &str = "standard frames are not received (?ids=standard receives only them); a remote frame's length is shown as 0";
+
+/// What the protocol of GVRET does not tell of frames on a bus with CAN FD.
+const FLAGS_BY_ADDRESS: &str = "on a bus with CAN FD neither a frame's flags are reported nor whether one of up to 8 bytes is classical: each is shown as a CAN FD frame that switches its bit rate";
+
+/// A row of GVRET adapters.
+const fn gvret(board: &'static str, limits: Option<&'static str>) -> Row {
+    Row {
+        board,
+        what: "a GVRET adapter (ESP32RET, Macchina)",
+        stamps: Stamps::Adapter { grain_ns: 1_000, when: "the frame's way out of the adapter, not the bus" },
+        losses: Losses::NotReported,
+        errors: "not reported",
+        confirmation: Confirmation::HandedOver,
+        listen_only: ListenOnly::Confirmed,
+        sets_bit_rate: true,
+        limits,
+    }
+}
 
 /// A row of ELM327 chips and those that speak as they do.
 const fn elm327(board: &'static str, can_listen: bool, limits: Option<&'static str>) -> Row {

@@ -3,7 +3,7 @@
 //! As ESP32RET reads and writes it (`src/gvret_comm.h`, `src/commbuffer.h`), and SavvyCAN at the other end (`connections/gvretserial.cpp`).
 //! It knows neither remote frames nor errors nor losses. Nothing in it is a check: the byte for a checksum is 0, and nobody looks at it.
 
-use cantap_can::{Frame, Id};
+use cantap_can::{FdFrame, Frame, Id};
 
 /// The TCP port that the adapters listen on, and the only one that SavvyCAN connects to.
 pub const PORT: u16 = 23;
@@ -67,10 +67,15 @@ pub enum Message {
         /// The frame, which is no remote frame.
         frame: Frame,
     },
-    /// A CAN FD frame was received.
+    /// A frame was received on a bus with CAN FD. ESP32RET says so of all frames there, classical ones too, and nothing tells them apart.
     Fd {
+        /// When, in microseconds, modulo 2³².
+        stamp_us: u32,
         /// The bus, from 0.
         bus: u8,
+        /// The frame, without its flags, which the message has no place for: they are as if the bit rate was not switched. `None` if its identifier or its
+        /// length cannot be.
+        frame: Option<FdFrame>,
     },
     /// The time of the stamps, in microseconds.
     Time(u32),
@@ -151,12 +156,15 @@ pub fn message(bytes: &[u8]) -> Option<(Message, usize)> {
             (Message::Frame { stamp_us, bus, frame }, 2 + 9 + len + 1)
         }
         FD_FRAME => {
+            let (stamp_us, raw) = (u32_at(content, 0)?, u32_at(content, 4)?);
             let (len, bus) = (usize::from(*content.get(8)?), *content.get(9)?);
             if len > MAX_FD_LEN {
                 return Some((Message::Garbage, 1));
             }
+            let data = content.get(10..10 + len)?;
             content.get(10 + len)?;
-            (Message::Fd { bus }, 2 + 10 + len + 1)
+            let frame = id_of(raw).and_then(|id| FdFrame::new(id, false, false, data));
+            (Message::Fd { stamp_us, bus, frame }, 2 + 10 + len + 1)
         }
         TIME => (Message::Time(u32_at(content, 0)?), 2 + 4),
         GET_BUSES => {
@@ -369,6 +377,31 @@ mod tests {
         let mut written = Vec::new();
         read.put(&mut written);
         assert_eq!(written, whole);
+    }
+
+    /// As ESP32RET writes it (`CommBuffer::sendFrameToBuffer` for `CAN_FRAME_FD`): the length before the bus, each in a byte of its own.
+    #[test]
+    fn a_frame_of_a_bus_with_can_fd_is_read_and_one_that_cannot_be_is_none() {
+        let with = |raw: u32, len: u8| {
+            let head = [&[START, FD_FRAME, 4, 3, 2, 1][..], &raw.to_le_bytes(), &[len, 3]].concat();
+            [head, (1..=len).collect(), vec![0]].concat()
+        };
+        for (raw, len, text) in [
+            (0x98DA_F110, 12, Some("18DAF110##00102030405060708090A0B0C")),
+            (0x123, 0, Some("123##0")),
+            (0x123, 9, None),
+            (0x800, 1, None),
+        ] {
+            let bytes = with(raw, len);
+            let Some((Message::Fd { stamp_us: 0x0102_0304, bus: 3, frame }, used)) = message(&bytes) else {
+                panic!("{:?}", message(&bytes));
+            };
+            assert_eq!((frame.map(|frame| frame.to_string()).as_deref(), used), (text, bytes.len()));
+            for cut in 0..bytes.len() {
+                assert_eq!(message(&bytes[..cut]), None, "{cut}");
+            }
+        }
+        assert_eq!(message(&with(0x123, 65)), Some((Message::Garbage, 1)));
     }
 
     /// What SavvyCAN sends when it connects (`GVRetSerial::deviceConnected`), and what ESP32RET answers, byte for byte.

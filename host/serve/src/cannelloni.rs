@@ -14,8 +14,8 @@ use std::time::{Duration, Instant};
 use cantap::device::is_idle;
 use cantap::{Direction, TraceEvent, TraceFrame, TraceRecord};
 use cantap_codecs::cannelloni::{Item, NoDatagram, Order, Sequence, Writer, datagram, item};
+use cantap_wire::Channel;
 use cantap_wire::message::{Mode, Role};
-use cantap_wire::{Channel, Frame};
 
 use crate::connect::SOCKET_TIMEOUT;
 use crate::feed::{self, Feed, Losses, Source};
@@ -190,7 +190,7 @@ impl End {
     }
 
     /// The frames in a datagram. What is left out of it, or missing before it, is reported.
-    fn frames(&mut self, len: usize) -> Result<Vec<Frame>, &'static str> {
+    fn frames(&mut self, len: usize) -> Result<Vec<TraceFrame>, &'static str> {
         if len > MOST_BYTES {
             return Err("it sent a datagram that is too long");
         }
@@ -207,7 +207,8 @@ impl End {
             Order::Late => vec!["a datagram came late".to_owned()],
             Order::Repeated => return Err("a datagram came twice; what it holds was not sent again"),
         };
-        let mut frames = Vec::new();
+        let sends_fd = self.session.as_ref().is_none_or(|session| session.bus.device.hello().sends_fd());
+        let mut frames: Vec<TraceFrame> = Vec::new();
         let (mut errors, mut fd, mut impossible) = (0, 0, 0);
         for done in 0..header.count {
             let Some((item, after)) = item(rest) else {
@@ -220,8 +221,9 @@ impl End {
             };
             rest = after;
             match item {
-                Item::Frame(frame) => frames.push(frame),
+                Item::Frame(frame) => frames.push(frame.into()),
                 Item::Error => errors += 1,
+                Item::Fd(frame) if sends_fd => frames.push(frame.into()),
                 Item::Fd(_) => fd += 1,
                 Item::Impossible => impossible += 1,
             }
@@ -229,9 +231,11 @@ impl End {
         if !rest.is_empty() {
             faults.push(format!("{} bytes follow the frames that a datagram says it has", rest.len()));
         }
-        for (count, what) in
-            [(errors, "error frames"), (fd, "CAN FD frames"), (impossible, "frames that are none")]
-        {
+        for (count, what) in [
+            (errors, "error frames"),
+            (fd, "CAN FD frames, which the board cannot send"),
+            (impossible, "frames that are none"),
+        ] {
             if count > 0 {
                 faults.push(format!("it sent {count} {what}"));
             }
@@ -243,7 +247,7 @@ impl End {
     }
 
     /// Has frames sent, in their order. What follows one that is refused is not sent either.
-    fn send(&mut self, frames: &[Frame]) -> Result<(), String> {
+    fn send(&mut self, frames: &[TraceFrame]) -> Result<(), String> {
         if frames.is_empty() {
             return Ok(());
         }
@@ -319,14 +323,15 @@ impl TunnelFeed {
             self.flush();
         }
         match event {
-            TraceEvent::Frame { frame, direction, .. } => match frame {
-                TraceFrame::Classic(frame) => {
-                    if *direction != Direction::Tx || !lock(&self.far.own).take(frame) {
-                        self.writer.push(frame);
-                    }
+            TraceEvent::Frame { frame, direction, .. } => {
+                if *direction == Direction::Tx && lock(&self.far.own).take(*frame) {
+                    return;
                 }
-                TraceFrame::Fd(frame) => self.writer.push_fd(frame),
-            },
+                match frame {
+                    TraceFrame::Classic(frame) => self.writer.push(frame),
+                    TraceFrame::Fd(frame) => self.writer.push_fd(frame),
+                }
+            }
             event => {
                 if let TraceEvent::TransmitFailed { tag, .. } = event {
                     lock(&self.far.own).failed(*tag);

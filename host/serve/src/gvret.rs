@@ -327,10 +327,11 @@ impl Connection {
         let number = usize::from(channel_number(board, channel)) - 1;
         match &record.event {
             TraceEvent::Frame { frame, direction, .. } => {
+                // SavvyCAN would take the bytes of such a message one place too late, and 64 of them for none.
                 let Some(frame) = frame.classic() else {
                     return lock(&self.left_out).count("CAN FD frames", 1);
                 };
-                if *direction == Direction::Tx && lock(&self.own[number]).take(frame) {
+                if *direction == Direction::Tx && lock(&self.own[number]).take(*frame) {
                     return;
                 }
                 if frame.is_remote() {

@@ -13,6 +13,8 @@ mod board_figures;
 pub mod cannelloni;
 mod client;
 pub mod connect;
+#[cfg(feature = "dns-sd")]
+pub mod dns_sd;
 mod feed;
 mod flow;
 mod foreign;

@@ -5,8 +5,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use cantap::{Device, DeviceError};
-use cantap_wire::message::{ChannelConfig, Mode, TxFrame};
-use cantap_wire::{Channel, Frame};
+use cantap_trace::TraceFrame;
+use cantap_wire::Channel;
+use cantap_wire::message::{ChannelConfig, Mode, TxFdFrame, TxFrame};
 
 /// Tags wrap here: far below the board's own.
 const TAGS: u32 = 1 << 24;
@@ -85,8 +86,12 @@ impl OpenBus {
     }
 
     /// Has a frame sent; the bus must be open for it.
-    pub fn send(&self, tag: u32, frame: Frame) -> Result<(), String> {
-        let frames = [TxFrame { tag, frame, at_ticks: None }];
-        self.device.send(self.channel, &frames).map(drop).map_err(|error| error.to_string())
+    pub fn send(&self, tag: u32, frame: impl Into<TraceFrame>) -> Result<(), String> {
+        let (channel, at_ticks) = (self.channel, None);
+        let sent = match frame.into() {
+            TraceFrame::Classic(frame) => self.device.send(channel, &[TxFrame { tag, frame, at_ticks }]),
+            TraceFrame::Fd(frame) => self.device.send_fd(channel, &[TxFdFrame { tag, frame, at_ticks }]),
+        };
+        sent.map(drop).map_err(|error| error.to_string())
     }
 }

@@ -62,6 +62,14 @@ pub mod open {
     pub const CAN_FD: i32 = 0x400;
 }
 
+/// Bits of [`CanLib::capabilities`].
+pub mod capability {
+    /// There is no hardware behind it.
+    pub const VIRTUAL: u32 = 0x1_0000;
+    /// CAN FD.
+    pub const CAN_FD: u32 = 0x8_0000;
+}
+
 /// How a channel drives its bus: [`CanLib::set_output_control`].
 pub mod output {
     /// Nothing is driven, acknowledgements included.
@@ -254,6 +262,14 @@ impl CanLib {
         let mut buffer = [0u8; 8];
         self.channel_data(channel, SERIAL, &mut buffer)?;
         Ok(u64::from_ne_bytes(buffer))
+    }
+
+    /// What a channel can do: see [`capability`].
+    pub fn capabilities(&self, channel: u32) -> Result<u32, Error> {
+        const CAPABILITIES: c_int = 1;
+        let mut buffer = [0u8; 4];
+        self.channel_data(channel, CAPABILITIES, &mut buffer)?;
+        Ok(u32::from_ne_bytes(buffer))
     }
 
     fn channel_data(&self, channel: u32, item: c_int, buffer: &mut [u8]) -> Result<(), Error> {

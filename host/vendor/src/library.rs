@@ -33,6 +33,20 @@ pub enum LoadError {
     RelativePath(String),
 }
 
+impl LoadError {
+    /// Whether there is no file of that name where libraries are: nobody has installed it. What is there and cannot be loaded, for the lack of another
+    /// library for example, is something else.
+    pub fn is_absent(&self) -> bool {
+        let Self::NotInstalled { name, reason, .. } = self else { return false };
+        // The loader's words: Windows' number of them, glibc's and musl's, macOS' list of what it has tried.
+        let names_it = reason.starts_with(name.as_str())
+            || reason.contains(&format!("library {name}:"))
+            || reason.contains(&format!("dlopen({name}"));
+        reason.contains("(os error 126)")
+            || names_it && (reason.contains("No such file") || reason.contains("no such file"))
+    }
+}
+
 /// A library that is loaded, and what errors call it.
 pub(crate) struct Loaded {
     pub library: Library,

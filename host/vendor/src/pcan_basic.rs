@@ -175,6 +175,10 @@ pub mod parameter {
     pub const ALLOW_REMOTE_FRAMES: u8 = 0x1F;
     /// Whether error frames are.
     pub const ALLOW_ERROR_FRAMES: u8 = 0x20;
+    /// How many channels are attached.
+    pub const ATTACHED_CHANNELS_COUNT: u8 = 0x2A;
+    /// What they are.
+    pub const ATTACHED_CHANNELS: u8 = 0x2B;
     /// Whether frames that were sent are, once they were on the bus.
     pub const ALLOW_ECHO_FRAMES: u8 = 0x2C;
 }
@@ -237,6 +241,53 @@ struct FdMessage {
     dlc: u8,
     data: [u8; 64],
 }
+
+/// A channel that is attached (`TPCANChannelInformation`).
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Attached {
+    /// The channel.
+    pub channel: Channel,
+    /// The name of its hardware.
+    pub name: String,
+    /// The number that its owner has given to the device.
+    pub device_id: u32,
+    /// Whether it has CAN FD.
+    pub has_fd: bool,
+    /// Whether a program has it.
+    pub is_in_use: bool,
+}
+
+/// Letters of a hardware's name in [`ChannelInformation`], with its end.
+const HARDWARE_NAME: usize = 33;
+/// Most channels that a library is believed to have.
+const MOST_ATTACHED: u32 = 256;
+
+#[repr(C)]
+#[derive(Clone, Copy)]
+struct ChannelInformation {
+    handle: u16,
+    device: u8,
+    controller: u8,
+    features: u32,
+    name: [u8; HARDWARE_NAME],
+    device_id: u32,
+    condition: u32,
+}
+
+impl ChannelInformation {
+    const NONE: Self = Self {
+        handle: 0,
+        device: 0,
+        controller: 0,
+        features: 0,
+        name: [0; HARDWARE_NAME],
+        device_id: 0,
+        condition: 0,
+    };
+}
+
+/// Bits of a channel's condition: it is there; a program has it.
+const CONDITION: (u32, u32) = (1, 2);
 
 /// Microseconds after which a stamp begins again.
 pub const STAMP_PERIOD_US: u64 = (1 << 48) * 1000;
@@ -375,6 +426,44 @@ impl PcanBasic {
         Ok(text(&buffer))
     }
 
+    /// The channels that are attached, none of which is opened for it.
+    pub fn attached(&self) -> Result<Vec<Attached>, Status> {
+        let count = match self.get(Channel::NONE, parameter::ATTACHED_CHANNELS_COUNT) {
+            Ok(count) => count.min(MOST_ATTACHED),
+            // Libraries before 4.4, and PCBUSB, know only the condition of one channel.
+            Err(_) => return Ok(Channel::all().filter_map(|channel| self.one_attached(channel)).collect()),
+        };
+        let mut buffer = vec![ChannelInformation::NONE; count as usize];
+        let room = size_of_val(&buffer[..]) as u32;
+        if count > 0 {
+            let buffer = buffer.as_mut_ptr().cast();
+            // SAFETY: as many bytes as the last argument says, of a type that is any bytes.
+            Status(unsafe { (self.functions.get_value)(0, parameter::ATTACHED_CHANNELS, buffer, room) })
+                .ok()?;
+        }
+        let there = buffer.iter().filter(|channel| channel.handle != 0);
+        Ok(there
+            .map(|information| Attached {
+                channel: Channel(information.handle),
+                name: text(&information.name),
+                device_id: information.device_id,
+                has_fd: information.features & 1 != 0,
+                is_in_use: information.condition & CONDITION.1 != 0,
+            })
+            .collect())
+    }
+
+    fn one_attached(&self, channel: Channel) -> Option<Attached> {
+        let condition = self.get(channel, parameter::CHANNEL_CONDITION).unwrap_or(0);
+        (condition & (CONDITION.0 | CONDITION.1) != 0).then(|| Attached {
+            channel,
+            name: self.text(channel, parameter::HARDWARE_NAME).unwrap_or_default(),
+            device_id: self.get(channel, parameter::DEVICE_ID).unwrap_or(0),
+            has_fd: self.get(channel, parameter::CHANNEL_FEATURES).is_ok_and(|bits| bits & 1 != 0),
+            is_in_use: condition & CONDITION.1 != 0,
+        })
+    }
+
     /// Sets a parameter that is a number.
     pub fn set(&self, channel: Channel, parameter: u8, mut value: u32) -> Result<(), Status> {
         // SAFETY: four bytes, as the last argument says.
@@ -392,35 +481,4 @@ impl PcanBasic {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn channels_have_the_numbers_of_the_header() {
-        for (name, number) in [
-            ("PCAN_USBBUS1", 0x51),
-            ("PCAN_USBBUS8", 0x58),
-            ("PCAN_USBBUS9", 0x509),
-            ("PCAN_USBBUS16", 0x510),
-            ("PCAN_PCIBUS1", 0x41),
-            ("PCAN_PCIBUS9", 0x409),
-            ("PCAN_PCIBUS16", 0x410),
-            ("PCAN_LANBUS1", 0x801),
-            ("PCAN_LANBUS16", 0x810),
-        ] {
-            let channel = Channel(number);
-            assert_eq!(channel.to_string(), name);
-            assert_eq!(name.parse(), Ok(channel));
-            assert_eq!(name["PCAN_".len()..].to_lowercase().parse(), Ok(channel));
-        }
-        for text in ["", "PCAN_", "PCAN_USBBUS0", "PCAN_USBBUS17", "USB1"] {
-            assert!(text.parse::<Channel>().is_err(), "{text}");
-        }
-    }
-
-    #[test]
-    fn a_stamp_counts_its_milliseconds_rounds() {
-        let stamp = ClassicStamp { millis: 7, millis_overflow: 2, micros: 999 };
-        assert_eq!(stamp.micros(), (2 << 32) * 1000 + 7999);
-    }
-}
+mod tests;

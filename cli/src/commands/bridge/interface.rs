@@ -6,8 +6,11 @@ use std::path::Path;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use cantap_adapters::raw_can::{Options, RawFrame, RawSocket};
+use cantap_adapters::raw_can::{Options, RawSocket};
+
 use nix::libc::{EAGAIN, ENETDOWN, ENOBUFS};
+
+use super::raw::Raw;
 
 /// How often a full socket is retried, a millisecond apart.
 const TRIES: u32 = 200;
@@ -21,14 +24,16 @@ const IFF_ECHO: u32 = 1 << 18;
 /// The queue length of controllers' interfaces (users of `linux/can/dev.h`); virtual ones have no driver of their own to set it, and
 /// the kernel makes it 1000.
 const QUEUE_OF_CONTROLLERS: &str = "10";
+/// The least MTU of an interface with CAN FD: `CANFD_MTU` of `linux/can.h`.
+const FD_MTU: u32 = 72;
 
 /// Where frames go to and come from. It is a trait because there are no CAN sockets where the tests run.
 pub trait Port: Send + Sync {
     /// Adds frames written by programs, up to a limit, without waiting. Returns how many the kernel has discarded so far because
     /// nobody took them.
-    fn receive(&self, most: usize, frames: &mut Vec<RawFrame>) -> io::Result<u32>;
+    fn receive(&self, most: usize, frames: &mut Vec<Raw>) -> io::Result<u32>;
     /// Passes frames to programs. Returns how many were taken; an error if none was.
-    fn send(&self, frames: &[RawFrame]) -> io::Result<usize>;
+    fn send(&self, frames: &[Raw]) -> io::Result<usize>;
     /// A descriptor to wait on.
     fn as_fd(&self) -> Option<BorrowedFd<'_>>;
 }
@@ -41,6 +46,8 @@ pub struct CanPort(RawSocket);
 pub struct Known {
     /// The kernel does not show a sender its own frame, so a confirmation can serve as the echo.
     pub echoes: bool,
+    /// It takes CAN FD frames.
+    pub has_fd: bool,
 }
 
 impl CanPort {
@@ -48,7 +55,7 @@ impl CanPort {
     pub fn open(name: &str) -> anyhow::Result<(Self, Known)> {
         let known = look(Path::new(NETWORK), name)?;
         // Errors on this interface would be our own.
-        let socket = RawSocket::open(name, Options::default())
+        let socket = RawSocket::open(name, Options { fd: known.has_fd, ..Options::default() })
             .with_context(|| format!("the interface '{name}' cannot be opened"))?;
         Ok((Self(socket), known))
     }
@@ -86,26 +93,27 @@ fn look(network: &Path, name: &str) -> anyhow::Result<Known> {
     }
     // vcan shows each frame to the other programs as it is written; so do pairs in newer kernels, although the driver does not declare
     // it.
-    Ok(Known { echoes: is_pair && flags & IFF_ECHO != 0 })
+    let has_fd = read("mtu").parse::<u32>().is_ok_and(|mtu| mtu >= FD_MTU);
+    Ok(Known { echoes: is_pair && flags & IFF_ECHO != 0, has_fd })
 }
 
 impl Port for CanPort {
-    fn receive(&self, most: usize, frames: &mut Vec<RawFrame>) -> io::Result<u32> {
+    fn receive(&self, most: usize, frames: &mut Vec<Raw>) -> io::Result<u32> {
         let mut messages = Vec::new();
         match self.0.receive(most, &mut messages) {
             // An interface that is down may come up again.
             Err(error) if error.raw_os_error() != Some(ENETDOWN) => return Err(error),
             _ => {}
         }
-        frames.extend(messages.iter().filter_map(|message| RawFrame::try_from(message.bytes()).ok()));
+        frames.extend(messages.iter().filter_map(|message| Raw::of(message.bytes())));
         Ok(messages.iter().rev().find_map(|message| message.dropped).unwrap_or(0))
     }
 
-    fn send(&self, frames: &[RawFrame]) -> io::Result<usize> {
+    fn send(&self, frames: &[Raw]) -> io::Result<usize> {
         let mut sent = 0;
         let mut tries = 0;
         while sent < frames.len() {
-            match self.0.send(&frames[sent..]) {
+            match self.0.send_messages(frames[sent..].iter().map(Raw::bytes)) {
                 Ok(count) => {
                     sent += count;
                     tries = 0;
@@ -132,7 +140,7 @@ mod tests {
     use super::*;
 
     /// An interface, as shown by the kernel.
-    fn interface(network: &Path, place: &str, name: &str, files: [(&str, &str); 5]) {
+    fn interface(network: &Path, place: &str, name: &str, files: [(&str, &str); 6]) {
         let folder = network.join("devices").join(place).join("net").join(name);
         std::fs::create_dir_all(&folder).unwrap();
         for (file, text) in files {
@@ -144,11 +152,15 @@ mod tests {
     #[test]
     fn only_virtual_can_interfaces_that_are_up_are_bridged_and_the_error_says_what_root_must_run() {
         let folder = tempfile::tempdir().unwrap();
-        let files = |kind, flags, index, link, queue| {
-            [("type", kind), ("flags", flags), ("ifindex", index), ("iflink", link), ("tx_queue_len", queue)]
+        let with_mtu = |mtu, kind, flags, index, link, queue| {
+            let kind = [("type", kind), ("flags", flags), ("ifindex", index)];
+            let [kind, flags, index] = kind;
+            [kind, flags, index, ("iflink", link), ("tx_queue_len", queue), ("mtu", mtu)]
         };
+        let files = |kind, flags, index, link, queue| with_mtu("16", kind, flags, index, link, queue);
         for (place, name, files) in [
             ("virtual", "vcan0", files("280", "0xc1", "4", "4", "1000")),
+            ("virtual", "fd", with_mtu("72", "280", "0xc1", "12", "12", "1000")),
             ("virtual", "old", files("280", "0x400c1", "5", "6", "1000")),
             ("virtual", "new", files("280", "0xc1", "7", "8", "1000")),
             ("virtual", "down", files("280", "0x80", "9", "9", "1000")),
@@ -159,9 +171,10 @@ mod tests {
             interface(folder.path(), place, name, files);
         }
         let look = |name| look(folder.path(), name).map_err(|error| error.to_string());
-        assert_eq!(look("vcan0"), Ok(Known { echoes: false }));
-        assert_eq!(look("new"), Ok(Known { echoes: false }));
-        assert_eq!(look("old"), Ok(Known { echoes: true }));
+        assert_eq!(look("vcan0"), Ok(Known { echoes: false, has_fd: false }));
+        assert_eq!(look("fd"), Ok(Known { echoes: false, has_fd: true }));
+        assert_eq!(look("new"), Ok(Known { echoes: false, has_fd: false }));
+        assert_eq!(look("old"), Ok(Known { echoes: true, has_fd: false }));
         for (name, part) in [
             ("can7", "ip link add can7 type vcan && ip link set can7 up"),
             ("down", "ip link set down up"),

@@ -6,12 +6,14 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use cantap::device::channel_number;
+use cantap::wire::Channel;
 use cantap::wire::record::{LossStage, TransmitFailure};
-use cantap::wire::{Channel, Frame};
 use cantap::{Direction, TraceEvent, TraceRecord};
-use cantap_adapters::raw_can::{RawFrame, frame_of, raw_error, raw_frame};
+use cantap_adapters::raw_can::raw_error;
+use cantap_trace::TraceFrame;
 
 use super::interface::{Known, Port};
+use super::raw::Raw;
 use crate::stderr;
 
 /// A channel and its interface.
@@ -21,11 +23,14 @@ pub struct Lane {
     pub port: Box<dyn Port>,
     known: Known,
     /// Programs' frames that are on their way to the bus.
-    own: Mutex<VecDeque<Frame>>,
+    own: Mutex<VecDeque<TraceFrame>>,
     /// Frames and errors that the interface did not take, and that have not been reported.
     missing: Mutex<u32>,
     /// The user has been told that frames are not sent because the channel only listens.
     told_refusal: AtomicBool,
+    /// The user has been told that CAN FD frames do not reach programs, and that programs' are not sent.
+    told_no_fd: AtomicBool,
+    told_fd_refusal: AtomicBool,
     pub counts: Counts,
 }
 
@@ -64,17 +69,19 @@ impl Lane {
             own: Mutex::default(),
             missing: Mutex::new(0),
             told_refusal: AtomicBool::new(false),
+            told_no_fd: AtomicBool::new(false),
+            told_fd_refusal: AtomicBool::new(false),
             counts: Counts::default(),
         }
     }
 
     /// A program's frame is on its way.
-    pub fn sends(&self, frame: Frame) {
+    pub fn sends(&self, frame: TraceFrame) {
         lock(&self.own).push_back(frame);
     }
 
     /// It has ended. Returns whether it was on its way.
-    pub fn has_ended(&self, frame: &Frame) -> bool {
+    pub fn has_ended(&self, frame: &TraceFrame) -> bool {
         let mut own = lock(&self.own);
         let at = own.iter().position(|own| own == frame);
         at.is_some_and(|at| own.remove(at).is_some())
@@ -97,28 +104,31 @@ impl Lane {
         for record in records.iter().filter(|record| record.channel == number) {
             match &record.event {
                 TraceEvent::Frame { frame, direction, .. } => {
-                    let Some(frame) = frame.classic() else {
-                        // Of another maker's adapter: programs are told that one is missing.
+                    if frame.is_fd() && !self.known.has_fd {
+                        // Programs are told that one is missing.
+                        self.tell_no_fd();
                         add(&self.counts.lost, 1);
                         let missing =
                             TraceEvent::Lost { stage: Some(LossStage::Host), count: 1, at_least: false };
-                        raw.extend(raw_error(&missing));
+                        raw.extend(error(&missing));
                         continue;
-                    };
+                    }
                     // If the kernel has already shown it to the others, once is enough.
                     if *direction == Direction::Tx && self.has_ended(frame) && !self.known.echoes {
                         continue;
                     }
-                    raw.push(raw_frame(frame));
+                    raw.push(Raw::of_frame(frame));
                 }
                 event => {
                     if let TraceEvent::Lost { count, at_least, .. } = event {
                         add(&self.counts.lost, *count as usize);
                         self.counts.lost_more.fetch_or(*at_least, Ordering::Relaxed);
                         // A confirmation may be among the lost records; do not wait for it for ever.
-                        lock(&self.own).clear();
+                        if *event != TraceEvent::UNCOUNTED {
+                            lock(&self.own).clear();
+                        }
                     }
-                    raw.extend(raw_error(event));
+                    raw.extend(error(event));
                 }
             }
         }
@@ -129,7 +139,7 @@ impl Lane {
     pub fn refuse(&self, number: usize) -> io::Result<()> {
         add(&self.counts.not_sent, number);
         let failed = TraceEvent::TransmitFailed { tag: 0, reason: TransmitFailure::Aborted };
-        self.deliver(vec![raw_error(&failed).unwrap_or_default(); number])
+        self.deliver(error(&failed).map_or_else(Vec::new, |raw| vec![raw; number]))
     }
 
     /// The same because the channel only listens, which is reported once.
@@ -144,6 +154,28 @@ impl Lane {
         self.refuse(number)
     }
 
+    /// The same because the device sends no CAN FD frames, with what to do, which is reported once.
+    pub fn refuse_fd(&self, number: usize, advice: &str) -> io::Result<()> {
+        if !self.told_fd_refusal.swap(true, Ordering::Relaxed) {
+            stderr::warn(&format!(
+                "a program writes CAN FD frames to {}, and none is sent: {advice}",
+                self.name
+            ));
+        }
+        self.refuse(number)
+    }
+
+    /// Says once that programs lack CAN FD frames, and what to do.
+    fn tell_no_fd(&self) {
+        if !self.told_no_fd.swap(true, Ordering::Relaxed) {
+            let name = &self.name;
+            stderr::warn(&format!(
+                "there are CAN FD frames, and {name} takes none: each is counted as lost; as root, before the bridge is started: \
+                 ip link set {name} down && ip link set {name} mtu 72 && ip link set {name} up"
+            ));
+        }
+    }
+
     /// Counts frames that programs wrote and the kernel discarded before they were read.
     pub fn overflowed(&self, number: u32) -> io::Result<()> {
         stderr::warn(&format!(
@@ -152,12 +184,12 @@ impl Lane {
         ));
         add(&self.counts.not_sent, number as usize);
         let failed = TraceEvent::TransmitFailed { tag: 0, reason: TransmitFailure::Aborted };
-        self.deliver(vec![raw_error(&failed).unwrap_or_default()])
+        self.deliver(error(&failed).into_iter().collect())
     }
 
     /// Passes raw frames to programs. What the interface does not take is counted, and reported in place once it accepts frames again.
     /// An error means that the interface is gone.
-    fn deliver(&self, mut raw: Vec<RawFrame>) -> io::Result<()> {
+    fn deliver(&self, mut raw: Vec<Raw>) -> io::Result<()> {
         if raw.is_empty() {
             return Ok(());
         }
@@ -165,7 +197,7 @@ impl Lane {
         let before = *missing;
         if before > 0 {
             let lost = TraceEvent::Lost { stage: Some(LossStage::Host), count: before, at_least: false };
-            raw.splice(..0, raw_error(&lost));
+            raw.splice(..0, error(&lost));
         }
         let (taken, error) = match self.port.send(&raw) {
             Ok(taken) => (taken, None),
@@ -198,9 +230,14 @@ impl Lane {
     }
 }
 
+/// An error, a state or a loss for programs.
+fn error(event: &TraceEvent) -> Option<Raw> {
+    raw_error(event).map(Raw::Classic)
+}
+
 /// The number of those that are bus frames rather than errors.
-fn count_frames(raw: &[RawFrame]) -> usize {
-    raw.iter().filter(|raw| frame_of(raw).is_some()).count()
+fn count_frames(raw: &[Raw]) -> usize {
+    raw.iter().filter(|raw| raw.frame().is_some()).count()
 }
 
 const ENXIO: i32 = nix::errno::Errno::ENXIO as i32;

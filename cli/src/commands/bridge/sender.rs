@@ -10,14 +10,16 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use cantap::transmit::Stream;
-use cantap::wire::Frame;
 use cantap::wire::message::Mode;
 use cantap::{Device, DeviceError};
-use cantap_adapters::raw_can::{BATCH, RawFrame, frame_of};
+use cantap_adapters::fd_advice;
+use cantap_adapters::raw_can::BATCH;
 use cantap_address::OpenDevice;
+use cantap_trace::TraceFrame;
 use rustix::event::{PollFd, PollFlags, poll};
 
 use super::lane::Lane;
+use super::raw::Raw;
 use crate::stderr;
 use cantap_work::advice;
 
@@ -105,11 +107,11 @@ impl Drop for Sender {
 /// Takes frames from one interface.
 struct Inlet<'l> {
     lane: &'l Lane,
-    raw: Vec<RawFrame>,
+    raw: Vec<Raw>,
     /// Number of frames that the kernel has discarded so far.
     thrown_away: u32,
     /// Frames on their way, by tag.
-    under_way: HashMap<u32, Frame>,
+    under_way: HashMap<u32, TraceFrame>,
 }
 
 impl<'l> Inlet<'l> {
@@ -256,12 +258,16 @@ fn take(inlet: &mut Inlet<'_>, device: &Device, stream: &mut Stream<'_>) -> Resu
         lane.refuse_listening(inlet.raw.len())?;
         return Ok(());
     }
-    let mut refused = 0;
+    let (mut refused, mut refused_fd) = (0, 0);
     for raw in &inlet.raw {
-        let Some(frame) = frame_of(raw) else {
+        let Some(frame) = raw.frame() else {
             refused += 1;
             continue;
         };
+        if frame.is_fd() && !device.hello().sends_fd() {
+            refused_fd += 1;
+            continue;
+        }
         // This must come before it can be confirmed.
         lane.sends(frame);
         // There is room, so it does not wait.
@@ -269,6 +275,9 @@ fn take(inlet: &mut Inlet<'_>, device: &Device, stream: &mut Stream<'_>) -> Resu
             Some(tag) => drop(inlet.under_way.insert(tag, frame)),
             None => refused += 1,
         }
+    }
+    if refused_fd > 0 {
+        lane.refuse_fd(refused_fd, &fd_advice(device.hello()))?;
     }
     Ok(lane.refuse(refused)?)
 }

@@ -12,22 +12,22 @@ use cantap::device::Records;
 use cantap::wire::message::{ChannelConfig, Mode, TxFrame};
 use cantap::wire::record::{LossStage, TransmitFailure};
 use cantap::{Channel, TraceEvent, TraceRecord};
-use cantap_adapters::raw_can::{RawFrame, frame_of, raw_frame};
 use cantap_address::{Address, OpenDevice};
 use cantap_trace::socketcan::{ERROR_FLAG, ErrorFrame};
 
 use super::interface::{Known, Port};
 use super::lane::Lane;
 use super::places;
+use super::raw::Raw;
 use super::sender::Sender;
 
 /// An interface in memory.
 #[derive(Default)]
 struct Memory {
     /// By programs.
-    written: Mutex<VecDeque<RawFrame>>,
+    written: Mutex<VecDeque<Raw>>,
     /// To programs.
-    told: Mutex<Vec<RawFrame>>,
+    told: Mutex<Vec<Raw>>,
     is_full: AtomicBool,
     /// The number of frames that it takes at once, if limited.
     takes: Option<usize>,
@@ -35,14 +35,14 @@ struct Memory {
 }
 
 impl Port for Arc<Memory> {
-    fn receive(&self, most: usize, frames: &mut Vec<RawFrame>) -> io::Result<u32> {
+    fn receive(&self, most: usize, frames: &mut Vec<Raw>) -> io::Result<u32> {
         let mut written = self.written.lock().unwrap();
         let most = most.min(written.len());
         frames.extend(written.drain(..most));
         Ok(self.thrown_away.load(Ordering::Relaxed))
     }
 
-    fn send(&self, frames: &[RawFrame]) -> io::Result<usize> {
+    fn send(&self, frames: &[Raw]) -> io::Result<usize> {
         if self.is_full.load(Ordering::Relaxed) {
             return Err(io::ErrorKind::WouldBlock.into());
         }
@@ -58,16 +58,17 @@ impl Port for Arc<Memory> {
 
 impl Memory {
     fn write(&self, frame: &str) {
-        self.written.lock().unwrap().push_back(raw_frame(&frame.parse().unwrap()));
+        self.written.lock().unwrap().push_back(Raw::of_frame(&frame.parse().unwrap()));
     }
 
     /// Frames as text, and errors as their meaning.
     fn written(&self) -> Vec<String> {
         let told = self.told.lock().unwrap();
-        let text = |raw: &RawFrame| {
-            if let Some(frame) = frame_of(raw) {
+        let text = |raw: &Raw| {
+            if let Some(frame) = raw.frame() {
                 return frame.to_string();
             }
+            let raw = raw.bytes();
             let id = u32::from_ne_bytes([raw[0], raw[1], raw[2], raw[3]]);
             let frame = ErrorFrame { classes: id & !ERROR_FLAG, data: std::array::from_fn(|at| raw[8 + at]) };
             format!("{:?}", frame.events().0)
@@ -88,9 +89,13 @@ struct Bridged {
 
 impl Bridged {
     fn new(options: &str, mode: Mode, echoes: bool) -> Self {
-        let address: Address = format!("virtual:{options}").parse().unwrap();
+        Self::over(&format!("virtual:{options}"), mode, Known { echoes, has_fd: false })
+    }
+
+    fn over(address: &str, mode: Mode, known: Known) -> Self {
+        let address: Address = address.parse().unwrap();
         let device = Arc::new(address.open().unwrap());
-        for channel in Channel::ALL {
+        for channel in Channel::ALL.into_iter().take(device.hello().channels.into()) {
             let config = ChannelConfig::listen_only(device.timing(BITRATE_BPS).unwrap());
             device.open_channel(channel, Some(ChannelConfig { mode, ..config })).unwrap();
         }
@@ -100,7 +105,7 @@ impl Bridged {
             .zip(&memories)
             .map(|(channel, memory)| {
                 let name = format!("can{}", channel.number() - 1);
-                Lane::new(channel, &name, Box::new(Arc::clone(memory)), Known { echoes })
+                Lane::new(channel, &name, Box::new(Arc::clone(memory)), known)
             })
             .collect();
         let sender = Sender::start(Arc::clone(&lanes)).unwrap();
@@ -228,7 +233,7 @@ fn a_bus_on_which_nothing_leaves_does_not_hold_up_the_other() {
 }
 
 fn received(frame: &str) -> TraceRecord {
-    let frame = frame.parse::<cantap::Frame>().unwrap().into();
+    let frame = frame.parse().unwrap();
     let event = TraceEvent::Frame { frame, direction: cantap::Direction::Rx, late: false };
     TraceRecord { time_ns: 0, channel: 1, event }
 }
@@ -236,7 +241,12 @@ fn received(frame: &str) -> TraceRecord {
 #[test]
 fn what_an_interface_does_not_take_is_counted_and_told_in_place() {
     let memory = Arc::new(Memory::default());
-    let lane = Lane::new(Channel::Can1, "can0", Box::new(Arc::clone(&memory)), Known { echoes: false });
+    let lane = Lane::new(
+        Channel::Can1,
+        "can0",
+        Box::new(Arc::clone(&memory)),
+        Known { echoes: false, has_fd: false },
+    );
     lane.hear(&[received("101#")]).unwrap();
     memory.is_full.store(true, Ordering::Relaxed);
     lane.hear(&[received("102#"), received("103#")]).unwrap();
@@ -249,11 +259,76 @@ fn what_an_interface_does_not_take_is_counted_and_told_in_place() {
     assert_eq!(lane.counts.undelivered.load(Ordering::Relaxed), 3);
 }
 
+#[test]
+fn fd_frames_reach_an_interface_that_takes_them_and_are_missing_on_another() {
+    let heard = ["123##1AABB", "18DAF110##2", "124#AA", "7FF##0112233445566778899AABBCC"];
+    for has_fd in [true, false] {
+        let memory = Arc::new(Memory::default());
+        let lane =
+            Lane::new(Channel::Can1, "can0", Box::new(Arc::clone(&memory)), Known { echoes: false, has_fd });
+        lane.hear(&heard.map(received)).unwrap();
+        let lost =
+            format!("{:?}", TraceEvent::Lost { stage: Some(LossStage::Host), count: 1, at_least: false });
+        let expected =
+            heard.map(|text| if has_fd || !text.contains("##") { text.to_owned() } else { lost.clone() });
+        assert_eq!(memory.written(), expected);
+        let counts = [&lane.counts.heard, &lane.counts.lost].map(|count| count.load(Ordering::Relaxed));
+        assert_eq!(counts, if has_fd { [4, 0] } else { [1, 3] });
+    }
+}
+
+/// Through a cannelloni tunnel, whose bytes are those of its own document: version, operation, number, count; then identifier, length with the flag for
+/// CAN FD, flags, data.
+#[test]
+fn fd_frames_cross_both_ways_with_their_flags() {
+    let peer = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    peer.set_read_timeout(Some(Duration::from_secs(30))).unwrap();
+    let free = std::net::UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    let address = format!("cannelloni://{}?listen={}", peer.local_addr().unwrap(), free.port());
+    let mut bridged = Bridged::over(&address, Mode::Normal, Known { echoes: false, has_fd: true });
+    bridged.memories[0].write("18DAF110##3112233445566778899AABBCC");
+    let mut bytes = [0; 2048];
+    let len = peer.recv(&mut bytes).unwrap();
+    let data = [0x11, 0x22, 0x33, 0x44, 0x55, 0x66, 0x77, 0x88, 0x99, 0xAA, 0xBB, 0xCC];
+    let item = [&[0x98, 0xDA, 0xF1, 0x10, 0x8C, 0x03][..], &data].concat();
+    assert_eq!((&bytes[..2], &bytes[3..5], &bytes[5..len]), (&[2, 0][..], &[0, 1][..], &item[..]));
+    let frames =
+        [&[2, 0, 0, 0, 2][..], &[0, 0, 1, 0x23, 0x81, 0x01, 0x5A], &[0, 0, 1, 0x24, 1, 0xA5]].concat();
+    peer.send_to(&frames, free).unwrap();
+    // What nobody counted before comes first.
+    let frames =
+        |memory: &Memory| memory.written().into_iter().filter(|text| text.contains('#')).collect::<Vec<_>>();
+    bridged.until("both frames", |memories| frames(&memories[0]).len() == 2);
+    assert_eq!(frames(&bridged.memories[0]), ["123##15A", "124#A5"]);
+    let lanes = Arc::clone(&bridged.lanes);
+    bridged.until("it is counted as sent", |_| lanes[0].counts.sent.load(Ordering::Relaxed) == 1);
+}
+
+/// A board of ours sends none: classical frames before and after it are sent all the same.
+#[test]
+fn a_program_s_fd_frame_is_refused_where_the_device_sends_none() {
+    let mut bridged = Bridged::new("load=0", Mode::Normal, false);
+    for frame in ["123#01", "123##0AABB", "123#02"] {
+        bridged.memories[0].write(frame);
+    }
+    let lanes = Arc::clone(&bridged.lanes);
+    bridged.until("the refusal", |memories| {
+        memories[0].written() == [not_sent()] && lanes[0].counts.sent.load(Ordering::Relaxed) == 2
+    });
+    assert_eq!(bridged.sent(), [2, 0]);
+    assert_eq!(lanes[0].counts.not_sent.load(Ordering::Relaxed), 1);
+}
+
 /// Of the received frames, those not passed to programs are counted: at the interface, or as lost before.
 #[test]
 fn frames_heard_and_frames_counted_are_all_there_were() {
     let memory = Arc::new(Memory { takes: Some(3), ..Memory::default() });
-    let lane = Lane::new(Channel::Can1, "can0", Box::new(Arc::clone(&memory)), Known { echoes: false });
+    let lane = Lane::new(
+        Channel::Can1,
+        "can0",
+        Box::new(Arc::clone(&memory)),
+        Known { echoes: false, has_fd: false },
+    );
     let of_frames = |event| TraceRecord { time_ns: 0, channel: 1, event };
     let error = of_frames(TraceEvent::BusError { kind: None, counters: None });
     let lost = of_frames(TraceEvent::Lost { stage: Some(LossStage::Queue), count: 10, at_least: false });

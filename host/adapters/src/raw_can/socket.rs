@@ -189,7 +189,9 @@ impl RawSocket {
         self.send_messages(std::iter::once(&frame[..])).map(|_| ())
     }
 
-    fn send_messages<'m>(&self, messages: impl Iterator<Item = &'m [u8]>) -> io::Result<usize> {
+    /// Sends frames of either kind, as bytes, without waiting. Returns how many were taken, at least one. For CAN FD frames the socket must have been
+    /// opened for them.
+    pub fn send_messages<'m>(&self, messages: impl Iterator<Item = &'m [u8]>) -> io::Result<usize> {
         let mut headers = MultiHeaders::<()>::preallocate(BATCH, None);
         let slices: Vec<[IoSlice<'_>; 1]> =
             messages.take(BATCH).map(|message| [IoSlice::new(message)]).collect();

@@ -115,6 +115,54 @@ fn two_buses_are_heard_with_the_adapter_s_own_intervals_and_both_are_off_until_a
     device.stop().unwrap();
 }
 
+/// A frame of a bus with CAN FD, as the adapter sends it.
+fn received_fd(time_us: u32, id: u32, bus: u8, data: &[u8]) -> Vec<u8> {
+    let head = [&[0xF1, 20][..], &time_us.to_le_bytes(), &id.to_le_bytes(), &[data.len() as u8, bus]];
+    [&head.concat()[..], data, &[0]].concat()
+}
+
+/// The address says that the bus runs CAN FD; what no frame can be is a loss, and a bus that there is not is counted.
+#[test]
+fn frames_of_a_bus_with_can_fd_are_read_if_the_address_has_its_data_bit_rate() {
+    let (address, streams, seen) = start(true);
+    let device = open(&format!("{address}?data-bitrate=2M"));
+    let mut adapter = streams.recv().unwrap();
+    assert_eq!(device.hello().board, "gvret-fd");
+    device.join(Channel::Can2, 500_000).unwrap();
+    let data: Vec<u8> = (0xC0..=0xFF).collect();
+    let bytes = [
+        received_fd(1000, 0x98DA_F110, 1, &data),
+        received_fd(1100, 0x123, 1, &[0x5A]),
+        // Nine bytes, an identifier of twelve bits, a bus that there is not, a length that lies.
+        received_fd(1200, 0x123, 1, &[0; 9]),
+        received_fd(1300, 0x800, 1, &[1]),
+        received_fd(1400, 0x123, 7, &[1]),
+        received_fd(1500, 0x124, 255, &[1]),
+        received(1600, 0x125, 1, &[0xA5]),
+    ]
+    .concat();
+    for piece in bytes.chunks(7) {
+        adapter.write_all(piece).unwrap();
+    }
+    let records = until_frame(&device, "125#A5");
+    let long = data.iter().map(|byte| format!("{byte:02X}")).collect::<Vec<_>>().concat();
+    assert_eq!(frames(&records), [format!("18DAF110##1{long}"), "123##15A".to_owned(), "125#A5".to_owned()]);
+    assert_eq!(losses(&records), [("link", 1), ("link", 1)]);
+    let failures = device.failures().unwrap();
+    assert!(failures.last.contains("2 frames of a third or higher bus"), "{failures:?}");
+    // Cut in the middle, and nothing more: that is no frame, and its end ends the session.
+    adapter.write_all(&received_fd(1700, 0x126, 1, &data)[..40]).unwrap();
+    adapter.shutdown(std::net::Shutdown::Both).unwrap();
+    let rest: Vec<_> = device.records().collect();
+    assert!(
+        rest.iter().all(|record| record.as_ref().map_or(true, |record| record.frame().is_none())),
+        "{rest:?}"
+    );
+    // None is sent: what the adapter would make of it is not known.
+    assert!(!device.hello().sends_fd());
+    drop(seen);
+}
+
 #[test]
 fn one_that_does_not_listen_silently_is_not_left_open() {
     let (address, _streams, seen) = start(false);

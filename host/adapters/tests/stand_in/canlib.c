@@ -2,6 +2,7 @@
 #include <pthread.h>
 #include <stddef.h>
 #include <stdint.h>
+#include <stdlib.h>
 #include <string.h>
 
 enum { OK = 0, PARAM = -1, NOMSG = -2, INVHANDLE = -10, TXBUFOFL = -13, HARDWARE = -15, NO_ACCESS = -31 };
@@ -16,12 +17,18 @@ static long bitrate, data_bitrate;
 static unsigned segments[3];
 
 void canInitializeLibrary(void) {}
-int canGetNumberOfChannels(int *count) { *count = 2; return OK; }
+int canGetNumberOfChannels(int *count) {
+    const char *wanted = getenv("STANDIN");
+    if (wanted && !strcmp(wanted, "refuses")) return HARDWARE;
+    *count = wanted && !strcmp(wanted, "lies") ? 2000000000 : 2;
+    return OK;
+}
 
 int canGetChannelData(int channel, int item, void *buffer, size_t len) {
     if (channel < 0 || channel > 1) return PARAM;
     memset(buffer, 0, len);
     if (item == 13) strncpy(buffer, channel ? "Kvaser Virtual CAN Driver (channel 0)" : "Kvaser Leaf Light v2 (channel 0)", len);
+    if (item == 1) { uint32_t can = channel ? 0x90000 : 0x80001; memcpy(buffer, &can, 4); }
     if (item == 7) { uint64_t serial = channel ? 0 : 12345; memcpy(buffer, &serial, 8); }
     return OK;
 }

@@ -1,7 +1,9 @@
 /* A library with the functions of PEAK's PCANBasic.h, and one adapter: PCAN_USBBUS1. What it does is said by the functions at the end. */
 #include <pthread.h>
 #include <stdint.h>
+#include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 #define OK 0
 #define QRCVEMPTY 0x20
@@ -15,6 +17,8 @@
 typedef struct { uint32_t id; uint8_t type, len, data[8]; } Msg;
 typedef struct { uint32_t millis; uint16_t overflow, micros; } Stamp;
 typedef struct { uint32_t id; uint8_t type, dlc, data[64]; } MsgFd;
+
+typedef struct { uint16_t channel; uint8_t device, controller; uint32_t features; char name[33]; uint32_t id, condition; } Information;
 
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
 static struct { MsgFd msg; uint64_t us; } queue[4096];
@@ -117,7 +121,32 @@ uint32_t CAN_Write(uint16_t channel, Msg *msg) {
 
 uint32_t CAN_WriteFD(uint16_t channel, MsgFd *msg) { return transmit(channel, msg); }
 
+/* What the test wants of a library in another process: it hangs, dies, is old, or counts channels that are not there. */
+static int is(const char *way) {
+    const char *wanted = getenv("STANDIN");
+    return wanted && !strcmp(wanted, way);
+}
+
+static uint32_t attached(uint8_t parameter, void *buffer, uint32_t len) {
+    const Information all[] = {
+        { USBBUS1, 5, 0, values[0x16], "PCAN-USB FD", 0x2A, occupied == 1 ? 2 : 1 },
+        { 0x52, 5, 1, 1, "PCAN-USB Pro FD\033[2J", 7, 2 },
+        { USBBUS1, 5, 0, 0, "again", 0, 1 },
+        { 0x31, 1, 0, 0, "a parallel port's", 0, 1 },
+    };
+    if (is("hangs")) for (;;) pause();
+    if (is("dies")) abort();
+    if (is("is old")) return ILLPARAMTYPE;
+    uint32_t count = sizeof all / sizeof *all;
+    if (parameter == 0x2A) { uint32_t told = is("lies") ? 0xFFFFFFFF : count; memcpy(buffer, &told, 4); return OK; }
+    memcpy(buffer, all, len < sizeof all ? len : sizeof all);
+    /* A name without an end. */
+    if (is("lies")) for (uint32_t at = sizeof all; at + sizeof *all <= len; at += sizeof *all) memset((char *)buffer + at, 0x51, sizeof *all);
+    return OK;
+}
+
 uint32_t CAN_GetValue(uint16_t channel, uint8_t parameter, void *buffer, uint32_t len) {
+    if (!channel && (parameter == 0x2A || parameter == 0x2B)) return attached(parameter, buffer, len);
     if (parameter == 0x0D) { /* channel condition */
         uint32_t condition = channel == USBBUS1 && !unplugged ? (occupied == 1 ? 2 : 1) : 0;
         memcpy(buffer, &condition, 4);

@@ -46,6 +46,8 @@ pub enum BadCommand {
     Unknown,
     /// A part of it is wrong.
     Syntax(&'static str),
+    /// It has more bytes than a classical frame, and the protocol has no message for others. python-can sends such ones.
+    Fd,
 }
 
 /// The longest command: a multiplexer filter of 257 times eight bytes.
@@ -173,6 +175,9 @@ fn counted(len: &str, bytes: &[&str]) -> Result<Vec<u8>, BadCommand> {
 
 fn data_frame(words: &[&str]) -> Result<Frame, BadCommand> {
     let [id, len, bytes @ ..] = words else { return Err(BadCommand::Syntax("the number of words")) };
+    if bytes.len() > 8 {
+        return Err(BadCommand::Fd);
+    }
     let bytes = counted(len, bytes)?;
     Frame::data_frame(self::id(id)?, &bytes).ok_or(BadCommand::Syntax("the number of bytes"))
 }
@@ -289,7 +294,6 @@ mod tests {
             "send 123 2 11",
             "send 123 1 11 22",
             "send 123",
-            "send 123 9 1 2 3 4 5 6 7 8 9",
             "send xyz 0",
             "send 123 1 100",
             "send 20000000 0",
@@ -310,6 +314,10 @@ mod tests {
             "can0 B fast",
         ] {
             assert!(matches!(parse(text), Err(BadCommand::Syntax(_))), "{text}: {:?}", parse(text));
+        }
+        // As anybody would write it, and as python-can does: the length in hexadecimal, each byte with its blank.
+        for text in ["send 123 9 1 2 3 4 5 6 7 8 9", "send 123 C 1 2 3 4 5 6 7 8 9 a b c"] {
+            assert_eq!(parse(text), Err(BadCommand::Fd), "{text}");
         }
     }
 

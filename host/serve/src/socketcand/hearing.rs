@@ -98,7 +98,7 @@ impl Hearing {
             TraceEvent::Frame { frame, direction, .. } => {
                 let Some(frame) = frame.classic() else { return };
                 let bytes = frame.data().len() as u64;
-                if *direction == Direction::Tx && self.own.take(frame) {
+                if *direction == Direction::Tx && self.own.take(*frame) {
                     self.statistics.sent += 1;
                     self.statistics.sent_bytes += bytes;
                     return;
@@ -152,6 +152,7 @@ impl Hearing {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cantap_trace::TraceFrame;
     use cantap_wire::{Frame, Id};
 
     fn record(ms: i64, frame: &str, direction: Direction) -> TraceRecord {
@@ -166,7 +167,7 @@ mod tests {
     #[test]
     fn a_client_hears_others_frames_and_not_its_own() {
         let mut hearing = Hearing { hears: Hears::All, ..Hearing::default() };
-        hearing.own.sends(1, "123#11".parse().unwrap());
+        hearing.own.sends(1, "123#11".parse::<TraceFrame>().unwrap());
         hearing.own.repeats(Id::standard(0x200).unwrap(), Some("200#".parse().unwrap()));
         let mut out = String::new();
         let sent = |ms, frame| record(ms, frame, Direction::Tx);
@@ -182,7 +183,7 @@ mod tests {
         let mut out = String::new();
         hearing.begin(Hears::Nothing, Instant::now());
         hearing.statistics_every(Duration::from_nanos(1));
-        hearing.own.sends(1, "123#11".parse().unwrap());
+        hearing.own.sends(1, "123#11".parse::<TraceFrame>().unwrap());
         hearing.take(&[record(1, "123#11", Direction::Tx), record(2, "124#2233", Direction::Rx)], &mut out);
         assert_eq!(out, "< stat 2 1 1 1 >");
         out.clear();

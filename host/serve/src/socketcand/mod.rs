@@ -205,6 +205,9 @@ impl Connection {
                 format!("there is no command '{}'", plain(text.trim())),
                 Some("< error unknown command >".to_owned()),
             ),
+            BadCommand::Fd => {
+                ("the protocol has no message for CAN FD frames, and none was sent".to_owned(), None)
+            }
             BadCommand::Syntax(what) => (format!("{what} is wrong in '{}'", plain(text.trim())), None),
         };
         if has_spoken {

@@ -7,10 +7,13 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, Result, ensure};
 
+/// Most ages that are kept: those of three minutes of a full bus.
+const MOST_AGES: usize = 1 << 22;
+
 /// What it received.
 pub struct Outcome {
     pub frames: u64,
-    /// How old the newest frame of each read was on arrival, in seconds: the current time minus its own.
+    /// How old each frame was on arrival, in seconds: the current time minus its own.
     pub ages: Vec<f64>,
 }
 
@@ -43,11 +46,14 @@ pub fn read(place: &str, is_over: &AtomicBool) -> Result<Outcome> {
         let text = std::str::from_utf8(&bytes[..end])?;
         outcome.frames += text.matches("< frame ").count() as u64;
         // The server's clock is not determined until after the first seconds.
-        if let Some((_, last)) =
-            text.rsplit_once("< frame ").filter(|_| began.elapsed() > Duration::from_secs(3))
-        {
-            let time = last.split(' ').nth(1).and_then(|time| time.parse::<f64>().ok());
-            outcome.ages.push(now_s - time.context("a frame without a time")?);
+        if began.elapsed() > Duration::from_secs(3) {
+            for frame in text.split("< frame ").skip(1) {
+                let time = frame.split(' ').nth(1).and_then(|time| time.parse::<f64>().ok());
+                let age = now_s - time.context("a frame without a time")?;
+                if outcome.ages.len() < MOST_AGES {
+                    outcome.ages.push(age);
+                }
+            }
         }
         bytes.copy_within(end..len, 0);
         kept = len - end;

@@ -19,6 +19,9 @@ const CLAIM_NS: u64 = 250 * MS;
 const NULL: u8 = 254;
 const REQUEST: u32 = 0xEA00;
 const ACKNOWLEDGE: u32 = 0xE800;
+/// The control bytes of an acknowledgement.
+const POSITIVE: u8 = 0;
+const NEGATIVE: u8 = 1;
 const CLAIM: u32 = 0xEE00;
 /// Addresses that any node may use, and for which the claim must be waited out.
 const FREE: std::ops::RangeInclusive<u8> = 128..=247;
@@ -182,10 +185,20 @@ impl J1939Node {
 
     /// Refuses a request: the node does not have the group. Requests to all are not refused (J1939-21, 5.4.2).
     pub fn refuse(&mut self, request: GroupRequest) {
+        self.reply(NEGATIVE, request);
+    }
+
+    /// Acknowledges a request that is answered by no data, such as one for DM11. Requests to all are not acknowledged.
+    pub fn acknowledge(&mut self, request: GroupRequest) {
+        self.reply(POSITIVE, request);
+    }
+
+    /// An acknowledgement goes to all, and its fifth byte says for whom it is (J1939-21, 5.4.4).
+    fn reply(&mut self, control: u8, request: GroupRequest) {
         let Some(own) = self.address() else { return };
         if !request.to_all {
             let [a, b, c] = three(request.pgn);
-            let data = [1, 0xFF, 0xFF, 0xFF, request.from, a, b, c];
+            let data = [control, 0xFF, 0xFF, 0xFF, request.from, a, b, c];
             let _ = self.push([frame(6, ACKNOWLEDGE, own, GLOBAL, &data)]);
         }
     }

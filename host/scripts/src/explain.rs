@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use rhai::{AST, ASTNode, Expr, Position};
+use rhai::{AST, ASTNode, Expr, Position, Stmt};
 
 use crate::node::{Script, ScriptError};
 use crate::placement::{Placement, Statement, Target};
@@ -75,7 +75,7 @@ impl Script {
         let ast = self.compile(&engine)?;
         let mut calls = Vec::new();
         let own: Vec<&str> = ast.iter_functions().map(|function| function.name).collect();
-        let is_own_line: Vec<Position> = ast.statements().iter().map(rhai::Stmt::position).collect();
+        let is_own_line: Vec<Position> = ast.statements().iter().map(Stmt::position).collect();
         let functions = Function::all(&ast);
         ast.walk(&mut |path| {
             let root = match path.first() {
@@ -112,7 +112,9 @@ impl Script {
 /// Notes a node of the tree if it is a call that sends, or a function that is given to one.
 fn note(path: &[ASTNode<'_>], of: Option<&str>, own: &[&str], calls: &mut Vec<Call>) -> bool {
     let of_call = |node: &ASTNode<'_>| match node {
-        ASTNode::Expr(Expr::FnCall(call, at)) => Some((call.name.to_string(), *at, false)),
+        ASTNode::Expr(Expr::FnCall(call, at)) | ASTNode::Stmt(Stmt::FnCall(call, at)) => {
+            Some((call.name.to_string(), *at, false))
+        }
         ASTNode::Expr(Expr::MethodCall(call, at)) => Some((call.name.to_string(), *at, true)),
         _ => None,
     };

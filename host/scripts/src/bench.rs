@@ -234,13 +234,13 @@ impl Simulation {
         Ok(place)
     }
 
-    /// Ends a node: it sends nothing more.
+    /// Ends a node: it sends nothing more but what may be under way.
     pub fn end(&mut self, place: usize) {
         let Some(node) = self.nodes.get_mut(place) else { return };
         node.end();
         self.repeats.retain(|repeat| repeat.node != place);
         for wire in &mut self.buses {
-            wire.nodes[place].to_send.clear();
+            wire.nodes[place].to_send.truncate(1);
         }
     }
 
@@ -258,11 +258,6 @@ impl Simulation {
             let due_ns = self.now_ns;
             self.repeats.push(Repeat { node, handle, channel, frame, period_ns: period_ns.max(1), due_ns });
         }
-    }
-
-    /// Frames that the caller sends once and that have not been on the bus.
-    pub fn waiting(&self) -> usize {
-        self.buses.iter().flat_map(|wire| &wire.own.to_send).filter(|(_, is_repeated)| !is_repeated).count()
     }
 
     /// Goes on to what is due next, but not beyond `end_ns`.

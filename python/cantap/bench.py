@@ -257,11 +257,10 @@ class Bus:
 
     def _look(self) -> None:
         """Looks at everything that was on the bus by now."""
-        now_ns = self._native.now_ns()
-        while records := [*self._ahead, *(self._native.advance(now_ns) if self.address is None else [])]:
-            self._ahead.clear()
-            for record in records:
-                self._take(record)
+        records = [*self._ahead, *self._native.advance(0)]
+        self._ahead.clear()
+        for record in records:
+            self._take(record)
         self._collect()
 
     def _collect(self) -> None:

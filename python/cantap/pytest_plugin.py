@@ -5,7 +5,7 @@ The bus is simulated, in simulated time, unless `--cantap-device` says where a d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
 import pytest
@@ -79,9 +79,9 @@ def node(bus: Bus) -> Callable[..., Node]:
 
 
 @pytest.hookimpl(hookwrapper=True)
-def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[None]:
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Generator[None, Any, None]:
     """Attaches to a failure what was on the bus before it."""
-    outcome: Any = yield
+    outcome = yield
     report: pytest.TestReport = outcome.get_result()
     used = getattr(item, "funcargs", {}).get("bus")
     if call.when == "call" and report.failed and isinstance(used, Bus):

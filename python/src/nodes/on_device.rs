@@ -108,8 +108,11 @@ impl OnDevice {
         self.ask(Order::Errors)
     }
 
-    /// The next records; empty if none comes that was on the bus by `until_ns`.
+    /// The next records, also later ones; empty if none comes for a while, or by `until_ns`. At 0, it waits for none.
     pub fn advance(&mut self, until_ns: i64) -> Result<Vec<TraceRecord>, Error> {
+        if until_ns == 0 {
+            return Ok(self.records.try_iter().collect());
+        }
         let left_ns = until_ns.saturating_sub(self.now_ns()?).max(0) as u64;
         let wait = Duration::from_nanos(left_ns).min(LATENESS);
         // In slices, so that Ctrl-C is seen; at the end, what was under way has time to arrive.
@@ -154,7 +157,7 @@ fn run(
                 Err(TryRecvError::Empty) => break,
                 Err(TryRecvError::Disconnected) => {
                     run.finish();
-                    return Ok(device.stop()?);
+                    return Ok(device.stop().map(drop)?);
                 }
             }
         }

@@ -149,8 +149,9 @@ impl Statement {
                     }
                 ),
             },
-            Self::Periodic => placement(Runner::Host, "this computer's clock, when the script has its turn"),
-            Self::Timer => placement(Runner::Host, "this computer's clock, when the script has its turn"),
+            Self::Periodic | Self::Timer => {
+                placement(Runner::Host, "this computer's clock, when the script has its turn")
+            }
             Self::Reaction => {
                 placement(Runner::Host, "when the frame has arrived here and the script has its turn")
             }

@@ -309,7 +309,7 @@ impl LiveRun<'_> {
                 for place in 0..self.nodes.len() {
                     match (place == sender, is_awaited) {
                         (false, _) => {
-                            self.resume(place, Some(Input::Frame { channel, frame, at_ns: self.stamp_ns }))?
+                            self.resume(place, Some(Input::Frame { channel, frame, at_ns: self.stamp_ns }))?;
                         }
                         // Repetitions are not among the frames that a script waits to see confirmed.
                         (true, true) => self.resume(place, Some(Input::Sent { channel }))?,

@@ -94,10 +94,14 @@ fn a_commanded_address_is_claimed_by_the_node_of_that_name_alone() {
     };
     let mut node = owner(NAME, 0x80);
     for (name, address) in [(NAME + 1, 0x90), (NAME, NULL), (NAME, GLOBAL)] {
-        command(name, address).iter().for_each(|frame| hear(&mut node, 1, frame));
+        for frame in command(name, address) {
+            hear(&mut node, 1, &frame);
+        }
         assert_eq!((drain(&mut node, 1), node.address()), (vec![], Some(0x80)), "{name} {address}");
     }
-    command(NAME, 0x90).iter().for_each(|frame| hear(&mut node, 2, frame));
+    for frame in command(NAME, 0x90) {
+        hear(&mut node, 2, &frame);
+    }
     assert_eq!((drain(&mut node, 2), node.address()), (vec!["18EEFF90#0500000000000000".to_owned()], None));
     drain(&mut node, 2 + CLAIM_NS);
     assert_eq!(node.address(), Some(0x90));

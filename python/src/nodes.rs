@@ -75,7 +75,8 @@ impl NodeBus {
         options: String,
         database: Option<&Database>,
     ) -> PyResult<Self> {
-        let decoder = database.map_or_else(|| Arc::new(Decoder::new(Vec::new())), |database| Arc::clone(&database.decoder));
+        let decoder = database
+            .map_or_else(|| Arc::new(Decoder::new(Vec::new())), |database| Arc::clone(&database.decoder));
         let bitrate_bps = bitrate.map(|bitrate| bitrate.0);
         let channel = channel_of(channel.0)?;
         let kind = match address {
@@ -189,7 +190,8 @@ impl NodeBus {
             Kind::Device(device) => device.messages(),
             Kind::Closed => Ok(Vec::new()),
         })?;
-        let row = |message: cantap_scripts::Message| (message.at_ns as f64 / 1e9, message.script, message.text);
+        let row =
+            |message: cantap_scripts::Message| (message.at_ns as f64 / 1e9, message.script, message.text);
         Ok(messages.into_iter().map(row).collect())
     }
 

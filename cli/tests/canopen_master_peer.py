@@ -10,6 +10,7 @@ import time
 
 import can
 import canopen
+from peer_wait import wait_until
 
 NODE, NEW_NODE = 5, 9
 LONG = bytes(range(256)) * 5 + b"the end"
@@ -21,14 +22,6 @@ def attempt(action):
         return action()
     except canopen.SdoAbortedError as error:
         return f"{error.code:08X}"
-
-
-def wait_until(condition):
-    """Whether it holds within half a minute, which only a hang reaches."""
-    until = time.monotonic() + 30
-    while not condition() and time.monotonic() < until:
-        time.sleep(0.02)
-    return condition()
 
 
 def write_blocks(node, data):

@@ -9,6 +9,7 @@ import threading
 import time
 
 import can
+from peer_wait import wait_until
 
 
 def bus(host, port):
@@ -90,9 +91,7 @@ def engine(host, port):
     dm1 = j1939.Dm1(tester)
     dm1.subscribe(lambda source, status, codes, time: trouble.append((source, status, codes)))
     tester.start()
-    until = time.monotonic() + 30
-    while tester.state != j1939.ControllerApplication.State.NORMAL and time.monotonic() < until:
-        time.sleep(0.05)
+    wait_until(lambda: tester.state == j1939.ControllerApplication.State.NORMAL)
 
     def next_of(pgn, to=None, asked=None, length=None):
         """The next message of a group, after a request of it, or of another group, to an address."""
@@ -118,9 +117,7 @@ def engine(host, port):
         "component_to_all": bytes.fromhex(next_of(65259, 255)).decode(),
         "dm1": next_of(65226),
     }
-    until = time.monotonic() + 30
-    while not trouble and time.monotonic() < until:
-        time.sleep(0.05)
+    wait_until(lambda: trouble)
     source, status, codes = trouble[-1]
     said["trouble"] = [[code["spn"], code["fmi"], code["oc"]] for code in codes]
     # A group that it does not have.
@@ -155,14 +152,8 @@ def drive(host, port, sheet):
     node.setup_402_state_machine()
     node.nmt.state = "OPERATIONAL"
 
-    def until(condition):
-        end = time.monotonic() + 60
-        while not condition() and time.monotonic() < end:
-            time.sleep(0.02)
-        return condition()
-
     # Until the first status word came, the library knows no state.
-    states = [until(lambda: node.state == "SWITCH ON DISABLED") and node.state]
+    states = [wait_until(lambda: node.state == "SWITCH ON DISABLED") and node.state]
     for state in ("READY TO SWITCH ON", "SWITCHED ON", "OPERATION ENABLED"):
         node.state = state
         states.append(node.state)
@@ -180,7 +171,7 @@ def drive(host, port, sheet):
         return node.tpdo[2]["Velocity actual value"].raw
 
     node.tpdo[2].add_callback(lambda _: received.set())
-    said["velocity"] = until(lambda: by_sync() == 1500) and by_sync()
+    said["velocity"] = wait_until(lambda: by_sync() == 1500) and by_sync()
     said["forward"] = node.tpdo[2]["Position actual value"].raw > 0
     said["homed"] = node.homing(timeout=60)
     node.op_mode = "PROFILED POSITION"
@@ -188,17 +179,17 @@ def drive(host, port, sheet):
     node.rpdo[2].transmit()
     node.controlword = 0x0F
     node.controlword = 0x1F
-    until(lambda: node.statusword & 0x1000)
+    wait_until(lambda: node.statusword & 0x1000)
     node.controlword = 0x0F
-    until(lambda: node.statusword & 0x400)
+    wait_until(lambda: node.statusword & 0x400)
     said["position"] = node.sdo[0x6064].raw
     emergency = threading.Event()
     node.emcy.add_callback(lambda error: emergency.set())
     node.sdo[0x2000].raw = 0x2310
-    until(lambda: node.state == "FAULT")
+    wait_until(lambda: node.state == "FAULT")
     said["fault"] = [node.state, node.sdo[0x603F].raw, emergency.wait(30)]
     node.controlword = 0x80
-    until(lambda: node.state == "SWITCH ON DISABLED")
+    wait_until(lambda: node.state == "SWITCH ON DISABLED")
     said["after"] = [node.state, node.sdo[0x603F].raw]
     try:
         node.sdo[0x6041].raw = 0

@@ -11,6 +11,7 @@ mod error;
 mod frame;
 mod inputs;
 mod messages;
+mod nodes;
 mod number;
 mod numpy;
 mod report;
@@ -41,6 +42,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     traces::register(module)?;
     encode::register(module)?;
     messages::register(module)?;
+    nodes::register(module)?;
     module.add_class::<scan::Scan>()?;
     module.add_class::<table::Table>()?;
     module.add("__version__", env!("CARGO_PKG_VERSION"))

@@ -1,5 +1,7 @@
 //! `cantap run`: nodes and tests as scripts.
 
+mod explain;
+
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -44,9 +46,12 @@ const SIMULATED_BPS: u32 = 500_000;
                   node:NAME in place of a file is a ready node, which --nodes lists, with its settings after a question mark. --print shows its \
                   script, to be saved, edited and run as a file: it is all that the node is, so that a copy behaves as the node does.\n\n\
                   on_key in a script takes keys typed at the terminal with -d, and those of --keys on simulated buses.\n\n\
+                  --explain opens the device, but no channel: it says for each statement that sends whether the device does it by itself, to what \
+                  accuracy, or this computer.\n\n\
                   Examples:\n  cantap run 'node:obd?codes=P0301,P0420' tester.rhai\n  \
                   cantap run node:engine -d virtual -b 500k --for 1m\n  \
-                  cantap run --print node:boat > boat.rhai\n  cantap run node.rhai tester.rhai --junit report.xml\n  \
+                  cantap run --print node:boat > boat.rhai\n  \
+                  cantap run --explain node.rhai -d /dev/ttyACM0\n  cantap run node.rhai tester.rhai --junit report.xml\n  \
                   cantap run tester.rhai --bus car --for 2h -o drive.log\n  \
                   cantap run tester.rhai -d /dev/ttyACM0 -b 500k --db car.dbc"
 )]
@@ -60,6 +65,9 @@ pub struct Args {
     /// Print a ready node's script, or with .eds after its name its electronic data sheet.
     #[arg(long, value_name = "node:NAME", exclusive = true)]
     print: Option<String>,
+    /// Say which statements send, where each of them runs and how exactly; run nothing.
+    #[arg(long, conflicts_with_all = ["output", "junit"])]
+    explain: bool,
     /// Where the device is: a serial port, or virtual. Without it, the buses are simulated.
     #[arg(short, long, add = completion::devices())]
     device: Option<Address>,
@@ -121,6 +129,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         return print_node(name);
     }
     let scripts: Vec<Script> = args.scripts.iter().map(|path| read(path)).collect::<anyhow::Result<_>>()?;
+    if args.explain {
+        explain::explain(&scripts, args.device.as_ref(), args.json)?;
+        return Ok(ExitCode::SUCCESS);
+    }
     let given: Vec<&Address> = args.device.iter().collect();
     let databases = args.databases.or_of(given);
     let decoder = Arc::new(load(&databases, false, args.json)?);

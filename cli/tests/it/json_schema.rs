@@ -90,6 +90,7 @@ pub const LINES: &[(&str, i32, &[&str])] = &[
     ("replay -d virtual:load=0,ack=no -b 500k a.log", 1, &["replay"]),
     ("run test.rhai", 1, &["run", "run_end"]),
     ("run test.rhai -d virtual:load=0 -b 500k", 1, &["run", "run_end"]),
+    ("run test.rhai --explain -d virtual", 0, &["run_explain"]),
     ("twin a.log", 0, &["twin"]),
     ("twin talk.log -b 500k", 0, &["twin"]),
     ("autobaud -d virtual:bitrate=125k", 0, &["autobaud"]),

@@ -117,7 +117,7 @@ fn can_j1939_hears_the_engine() {
         "component_to_one": component, "component_to_all": component,
         "dm1": "14FF6E00000364000101BE000207",
         "trouble": [[110, 0, 3], [100, 1, 1], [190, 2, 7]],
-        "refused": "01FFFFFFF94CFE00", "cleared": "00FFFFFFFFD3FE00", "dm1_after": "00FF00000000FFFF",
+        "refused": "01FFFFFFF94CFE00", "cleared": "00FFFFFFF9D3FE00", "dm1_after": "00FF00000000FFFF",
     });
     assert_eq!(found, expected);
     let events = rig.conversations("j1939");

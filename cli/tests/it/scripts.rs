@@ -42,6 +42,31 @@ fn the_pages_example_prints_what_the_page_shows() {
 }
 
 #[test]
+fn explain_prints_what_the_page_shows_and_runs_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let source = "periodic(\"100#00\", \"10ms\");\non_frame(\"7DF\", |f| send(\"7E8#00\"));\n";
+    std::fs::write(folder.path().join("node.rhai"), source).unwrap();
+    let output = run(folder.path(), &["--explain", "node.rhai", "-d", "virtual"]);
+    assert!(output.status.success(), "{output:?}");
+    let page =
+        std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/scripts.md")).unwrap();
+    let shown = page
+        .split("$ cantap run --explain node.rhai -d virtual\n")
+        .nth(1)
+        .and_then(|rest| rest.split("```").next())
+        .unwrap();
+    assert_eq!(text(&output.stdout), shown);
+    let simulated = run(folder.path(), &["--explain", "node.rhai", "node:engine"]);
+    let lines = text(&simulated.stdout);
+    assert!(lines.contains("node.rhai:1: periodic: simulation: exactly, in simulated time\n"), "{lines}");
+    let is_called =
+        |line: &str| line.starts_with("node:engine:") && line.contains("; called by every of line ");
+    assert!(lines.lines().any(is_called), "{lines}");
+    std::fs::write(folder.path().join("bad.rhai"), "send(").unwrap();
+    assert!(!run(folder.path(), &["--explain", "bad.rhai"]).status.success());
+}
+
+#[test]
 fn a_failed_test_is_exit_code_1_with_its_frames_a_trace_and_junit() {
     let folder = documented();
     let output = run(folder.path(), &["tester.rhai", "--junit", "report.xml", "-o", "run.log", "--json"]);

@@ -16,6 +16,8 @@ use crate::results::{Results, is_over};
 
 /// How long frames that are under way at the end may take to be on the bus.
 const FAREWELL_NS: u64 = 100_000_000;
+/// The place of the caller, which is none of the scripts.
+const CALLER: usize = usize::MAX;
 /// "Never", for times.
 const NEVER: u64 = u64::MAX;
 
@@ -51,43 +53,60 @@ impl Bench {
         on_message: &mut dyn FnMut(Message),
         goes_on: &mut dyn FnMut() -> bool,
     ) -> Result<Report, ScriptError> {
-        let nodes = Node::start_all(scripts, &self.decoder, self.seed)?;
+        if scripts.is_empty() {
+            return Err(ScriptError::None);
+        }
+        let mut simulation = self.start();
+        for script in scripts {
+            simulation.add(script)?;
+        }
+        let hand_over = |simulation: &mut Simulation,
+                         on_record: &mut dyn FnMut(TraceRecord),
+                         on_message: &mut dyn FnMut(Message)| {
+            simulation.records.drain(..).for_each(on_record);
+            simulation.results.messages.drain(..).for_each(on_message);
+        };
+        while simulation.now_ns < self.duration_ns && !is_over(&simulation.nodes) && goes_on() {
+            let goes = simulation.step(self.duration_ns);
+            hand_over(&mut simulation, on_record, on_message);
+            if !goes {
+                break;
+            }
+        }
+        let until_ns = simulation.now_ns + FAREWELL_NS;
+        while is_over(&simulation.nodes) && simulation.is_sending() && goes_on() {
+            let goes = simulation.step(until_ns) && simulation.now_ns < until_ns;
+            hand_over(&mut simulation, on_record, on_message);
+            if !goes {
+                break;
+            }
+        }
+        let (report, messages) = simulation.finish();
+        messages.into_iter().for_each(on_message);
+        Ok(report)
+    }
+
+    /// The same, step by step, for a caller that takes part itself and adds scripts as it likes. [`Self::duration_ns`] is its business.
+    pub fn start(&self) -> Simulation {
         let mut options = self.options.clone();
         let buses = [0, 1].map(|channel| {
             let bitrate_bps = options.bitrate_of_bus(channel).unwrap_or(self.bitrates_bps[channel]);
-            Wire {
-                bus: options.bus(channel),
-                nodes: scripts.iter().map(|_| Attached::new(bitrate_bps)).collect(),
-                witness: Attached::new(bitrate_bps),
-            }
+            Wire { bus: options.bus(channel), nodes: Vec::new(), own: Attached::new(bitrate_bps) }
         });
         let mut keys = self.keys.clone();
         keys.sort_by_key(|(at_ns, _)| *at_ns);
-        let mut run = Run {
-            nodes,
+        Simulation {
+            decoder: Arc::clone(&self.decoder),
+            seed: self.seed,
+            nodes: Vec::new(),
+            has_keys: !keys.is_empty(),
             keys: keys.into(),
             buses,
             repeats: Vec::new(),
-            results: Results::new(on_message),
-            on_record,
+            results: Results::default(),
+            records: Vec::new(),
             now_ns: 0,
-        };
-        while run.now_ns < self.duration_ns && !is_over(&run.nodes) && goes_on() {
-            if !run.step(self.duration_ns) {
-                break;
-            }
-            if self.keys.is_empty() {
-                run.results.without_keys(&run.nodes, run.now_ns);
-            }
         }
-        let until_ns = run.now_ns + FAREWELL_NS;
-        while is_over(&run.nodes)
-            && run.is_sending()
-            && goes_on()
-            && run.step(until_ns)
-            && run.now_ns < until_ns
-        {}
-        Ok(run.finish())
     }
 }
 
@@ -101,18 +120,18 @@ struct Repeat {
     due_ns: u64,
 }
 
-/// A bus with the scripts' controllers on it, and one that only watches.
+/// A bus with the scripts' controllers on it, and the caller's own, which sees everything.
 struct Wire {
     bus: SimBus,
     nodes: Vec<Attached>,
-    witness: Attached,
+    own: Attached,
 }
 
 impl Wire {
     fn with<R>(&mut self, act: impl FnOnce(&mut SimBus, &mut [&mut dyn BusNode]) -> R) -> R {
-        let Self { bus, nodes, witness } = self;
+        let Self { bus, nodes, own } = self;
         let mut all: Vec<&mut dyn BusNode> = nodes.iter_mut().map(|node| node as &mut dyn BusNode).collect();
-        all.push(witness);
+        all.push(own);
         act(bus, &mut all)
     }
 }
@@ -179,19 +198,88 @@ impl BusNode for Attached {
     fn on_boundary(&mut self) {}
 }
 
-/// A run.
-struct Run<'a> {
+/// Scripts on simulated buses, in simulated time, that go on only as far as the caller says.
+pub struct Simulation {
+    decoder: Arc<Decoder>,
+    seed: u64,
     nodes: Vec<Node>,
+    /// Whether keys are typed in this run.
+    has_keys: bool,
     /// Those that have not been typed yet, in the order of their times.
     keys: VecDeque<(u64, char)>,
     buses: [Wire; CHANNELS],
     repeats: Vec<Repeat>,
-    results: Results<'a>,
-    on_record: &'a mut dyn FnMut(TraceRecord),
+    results: Results,
+    /// Frames and errors of the buses, to be taken.
+    records: Vec<TraceRecord>,
     now_ns: u64,
 }
 
-impl Run<'_> {
+impl Simulation {
+    /// Nanoseconds of simulated time since the beginning.
+    pub const fn now_ns(&self) -> u64 {
+        self.now_ns
+    }
+
+    /// One more node, from now on; returns its place.
+    ///
+    /// # Errors
+    /// If it is not in the language; what goes wrong later is in [`Self::errors`].
+    pub fn add(&mut self, script: &Script) -> Result<usize, ScriptError> {
+        let place = self.nodes.len();
+        self.nodes.push(Node::start_nth(place, script, &self.decoder, self.seed)?);
+        for wire in &mut self.buses {
+            wire.nodes.push(Attached::new(wire.own.bitrate_bps));
+        }
+        Ok(place)
+    }
+
+    /// Ends a node: it sends nothing more but what may be under way.
+    pub fn end(&mut self, place: usize) {
+        let Some(node) = self.nodes.get_mut(place) else { return };
+        node.end();
+        self.repeats.retain(|repeat| repeat.node != place);
+        for wire in &mut self.buses {
+            wire.nodes[place].to_send.truncate(1);
+        }
+    }
+
+    /// Queues a frame of the caller's own controller.
+    pub fn send(&mut self, channel: Channel, frame: Frame) {
+        self.buses[channel.index()].own.to_send.push_back((frame, false));
+    }
+
+    /// Sends a frame of the caller's now and then again after each period, until the next call with the same handle: with another frame
+    /// or period, or with none.
+    pub fn repeat(&mut self, handle: u32, repeated: Option<(Channel, Frame, u64)>) {
+        let node = CALLER;
+        self.repeats.retain(|repeat| (repeat.node, repeat.handle) != (node, handle));
+        if let Some((channel, frame, period_ns)) = repeated {
+            let due_ns = self.now_ns;
+            self.repeats.push(Repeat { node, handle, channel, frame, period_ns: period_ns.max(1), due_ns });
+        }
+    }
+
+    /// Goes on to what is due next, but not beyond `end_ns`.
+    pub fn advance(&mut self, end_ns: u64) {
+        self.step(end_ns);
+    }
+
+    /// What was on the buses since the last call: times are nanoseconds since the beginning, and the caller's own frames are those that were sent.
+    pub fn take_records(&mut self) -> Vec<TraceRecord> {
+        std::mem::take(&mut self.records)
+    }
+
+    /// What scripts have logged since the last call.
+    pub fn take_messages(&mut self) -> Vec<Message> {
+        std::mem::take(&mut self.results.messages)
+    }
+
+    /// Scripts that have ended with an error, and the error.
+    pub fn errors(&self) -> Vec<(String, String)> {
+        self.nodes.iter().filter_map(|node| Some((node.name.clone(), node.error.clone()?))).collect()
+    }
+
     /// Does what is due next, and returns false if nothing will be.
     fn step(&mut self, end_ns: u64) -> bool {
         let now_ns = self.now_ns;
@@ -214,7 +302,7 @@ impl Run<'_> {
         for channel in Channel::ALL {
             self.pass(channel);
         }
-        self.repeat();
+        self.queue_repeated();
         let now_ns = self.now_ns;
         while let Some((_, key)) = self.keys.pop_front_if(|(at_ns, _)| *at_ns <= now_ns) {
             for place in 0..self.nodes.len() {
@@ -222,6 +310,9 @@ impl Run<'_> {
             }
         }
         self.wake();
+        if !self.has_keys {
+            self.results.without_keys(&self.nodes, self.now_ns);
+        }
         true
     }
 
@@ -238,14 +329,15 @@ impl Run<'_> {
         let now_ns = self.now_ns;
         let wire = &mut self.buses[channel.index()];
         wire.with(|bus, nodes| bus.step(now_ns, nodes));
-        for (frame, _) in std::mem::take(&mut wire.witness.received) {
+        for (frame, whose) in std::mem::take(&mut wire.own.received) {
             self.results.frame(now_ns, channel, frame);
-            let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };
-            (self.on_record)(TraceRecord { time_ns: now_ns as i64, channel: channel.number(), event });
+            let direction = if whose == Whose::Others { Direction::Rx } else { Direction::Tx };
+            let event = TraceEvent::Frame { frame: frame.into(), direction, late: false };
+            self.records.push(TraceRecord { time_ns: now_ns as i64, channel: channel.number(), event });
         }
-        for kind in std::mem::take(&mut wire.witness.errors) {
+        for kind in std::mem::take(&mut wire.own.errors) {
             let event = TraceEvent::BusError { kind: Some(kind), counters: None };
-            (self.on_record)(TraceRecord { time_ns: now_ns as i64, channel: channel.number(), event });
+            self.records.push(TraceRecord { time_ns: now_ns as i64, channel: channel.number(), event });
         }
         for place in 0..self.nodes.len() {
             let attached = &mut self.buses[channel.index()].nodes[place];
@@ -255,7 +347,7 @@ impl Run<'_> {
                 let report = &mut self.results.report;
                 if whose == Whose::Others {
                     report.frames_received += 1;
-                    self.resume(place, Some(Input::Frame { channel, frame }));
+                    self.resume(place, Some(Input::Frame { channel, frame, at_ns: now_ns }));
                 } else {
                     report.frames_sent += 1;
                     if whose == Whose::Own {
@@ -270,11 +362,12 @@ impl Run<'_> {
     }
 
     /// Queues the repeated frames that are due.
-    fn repeat(&mut self) {
+    fn queue_repeated(&mut self) {
         for repeat in &mut self.repeats {
             if repeat.due_ns <= self.now_ns {
                 repeat.due_ns += repeat.period_ns;
-                self.buses[repeat.channel.index()].nodes[repeat.node].to_send.push_back((repeat.frame, true));
+                let Wire { nodes, own, .. } = &mut self.buses[repeat.channel.index()];
+                nodes.get_mut(repeat.node).unwrap_or(own).to_send.push_back((repeat.frame, true));
             }
         }
     }
@@ -328,9 +421,11 @@ impl Run<'_> {
         }
     }
 
-    fn finish(mut self) -> Report {
+    /// How it went, and what was logged last.
+    pub fn finish(mut self) -> (Report, Vec<Message>) {
         let waiting = self.buses.iter().flat_map(|wire| &wire.nodes).map(|node| node.to_send.len() as u64);
         self.results.report.frames_not_sent = waiting.sum();
-        self.results.finish(&self.nodes, self.now_ns)
+        let messages = self.take_messages();
+        (self.results.finish(&self.nodes, self.now_ns), messages)
     }
 }

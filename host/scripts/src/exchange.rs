@@ -7,8 +7,8 @@ use crate::report::Outcome;
 /// What happened on a bus.
 #[derive(Clone, Copy, Debug)]
 pub enum Input {
-    /// Another node's frame ended well.
-    Frame { channel: Channel, frame: Frame },
+    /// Another node's frame ended well, at that time by its stamp.
+    Frame { channel: Channel, frame: Frame, at_ns: u64 },
     /// This script's oldest unconfirmed frame on the channel was on the bus.
     Sent { channel: Channel },
     /// It never will be.

@@ -72,7 +72,7 @@ impl Script {
         Ok(tests_of(&self.compile(&engine)?, &self.source))
     }
 
-    fn compile(&self, engine: &Engine) -> Result<AST, ScriptError> {
+    pub(crate) fn compile(&self, engine: &Engine) -> Result<AST, ScriptError> {
         let faulty = |error: rhai::ParseError| ScriptError::Syntax {
             name: self.name.clone(),
             reason: error.to_string(),
@@ -139,20 +139,17 @@ pub struct Node {
 }
 
 impl Node {
-    /// Starts all scripts of a run, each with random numbers of its own.
-    pub fn start_all(
-        scripts: &[Script],
+    /// Starts the `number`th script of a run, from 0, with random numbers of its own.
+    pub fn start_nth(
+        number: usize,
+        script: &Script,
         decoder: &Arc<Decoder>,
         seed: u64,
-    ) -> Result<Vec<Self>, ScriptError> {
-        if scripts.is_empty() {
-            return Err(ScriptError::None);
-        }
-        let seeds = (1..).map(|number: u64| seed.wrapping_mul(0x9E37_79B9).wrapping_add(number));
-        scripts.iter().zip(seeds).map(|(script, seed)| Self::start(script, decoder, seed)).collect()
+    ) -> Result<Self, ScriptError> {
+        Self::start(script, decoder, seed.wrapping_mul(0x9E37_79B9).wrapping_add(number as u64 + 1))
     }
 
-    /// Starts its thread; its first turn is at time 0.
+    /// Starts its thread; its first turn is at once.
     fn start(script: &Script, decoder: &Arc<Decoder>, seed: u64) -> Result<Self, ScriptError> {
         let has_tests = !script.tests()?.is_empty();
         let (to, resume) = sync_channel(1);
@@ -180,6 +177,13 @@ impl Node {
     /// Whether it waits for keys.
     pub const fn waits_for_keys(&self) -> bool {
         !self.has_ended && self.inputs.keys
+    }
+
+    /// Ends it from outside, without an error.
+    pub fn end(&mut self) {
+        self.has_ended = true;
+        self.wake_ns = None;
+        self.to = None;
     }
 
     /// Its turn, if it has one for this input: returns what it wants.

@@ -50,6 +50,8 @@ pub struct Report {
     pub duration_ns: u64,
     /// Frames that the scripts had sent, confirmed by the bus.
     pub frames_sent: u64,
+    /// Those among them that the device repeated by itself.
+    pub frames_repeated: u64,
     /// Frames of others, and those of the other scripts.
     pub frames_received: u64,
     /// Frames that scripts asked for and that had not been on the bus at the end.

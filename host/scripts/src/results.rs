@@ -12,19 +12,16 @@ use crate::report::{Message, Outcome, Report, TestResult};
 const TRACE: usize = 40;
 
 /// Collects tests and frames while a run goes on.
-pub struct Results<'a> {
+#[derive(Default)]
+pub struct Results {
     /// The report so far.
     pub report: Report,
+    /// Lines that scripts logged, to be taken.
+    pub messages: Vec<Message>,
     last: VecDeque<(u64, Channel, Frame)>,
-    on_message: &'a mut dyn FnMut(Message),
 }
 
-impl<'a> Results<'a> {
-    /// Of a run that begins; lines that scripts log go to `on_message` at once.
-    pub fn new(on_message: &'a mut dyn FnMut(Message)) -> Self {
-        Self { report: Report::default(), last: VecDeque::new(), on_message }
-    }
-
+impl Results {
     /// A frame was on the bus.
     pub fn frame(&mut self, at_ns: u64, channel: Channel, frame: Frame) {
         if self.last.len() == TRACE {
@@ -37,7 +34,7 @@ impl<'a> Results<'a> {
     pub fn take(&mut self, script: &str, now_ns: u64, output: Output) -> Option<Output> {
         match output {
             Output::Log(text) => {
-                (self.on_message)(Message { at_ns: now_ns, script: script.to_owned(), text });
+                self.messages.push(Message { at_ns: now_ns, script: script.to_owned(), text });
                 None
             }
             Output::Test { name, outcome, began_ns } => {
@@ -63,12 +60,13 @@ impl<'a> Results<'a> {
             if !self.report.without_keys.contains(&node.name) {
                 self.report.without_keys.push(node.name.clone());
                 let text = "on_key: no keys come in this run".to_owned();
-                (self.on_message)(Message { at_ns: now_ns, script: node.name.clone(), text });
+                self.messages.push(Message { at_ns: now_ns, script: node.name.clone(), text });
             }
         }
     }
 
-    fn trace(&self) -> Vec<String> {
+    /// The last frames, each as a line of candump's log format.
+    pub fn trace(&self) -> Vec<String> {
         let line = |(at_ns, channel, frame): &(u64, Channel, Frame)| {
             format!(
                 "({}.{:06}) can{} {frame}",

@@ -355,8 +355,8 @@ impl Runtime {
             }
             Input::Error { channel, kind } => self.take_event(context, BusEvent::Error(channel, kind))?,
             Input::State { channel, state } => self.take_event(context, BusEvent::State(channel, state))?,
-            Input::Frame { channel, frame } => {
-                let frame = ScriptFrame { channel, frame, at_ns: now_ns };
+            Input::Frame { channel, frame, at_ns } => {
+                let frame = ScriptFrame { channel, frame, at_ns };
                 let message = self.decoder.find(channel.number(), frame.frame.id());
                 let signals = message.map(|message| self.signals_of(&frame, message));
                 if let Want::Machine(machine, of) = want

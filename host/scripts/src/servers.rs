@@ -191,6 +191,14 @@ impl Servers {
                 server.answer(&request, data_of(result)?);
                 Ok(())
             }
+            (Some(Server::J1939 { node, .. }), Then::Group(request)) if result.is_bool() => {
+                if result.as_bool() == Ok(true) {
+                    node.acknowledge(request);
+                } else {
+                    node.refuse(request);
+                }
+                Ok(())
+            }
             // Nothing: the function has sent it itself.
             (Some(Server::J1939 { node, .. }), Then::Group(request)) if !result.is_unit() => {
                 let to = if request.to_all { GLOBAL } else { request.from };

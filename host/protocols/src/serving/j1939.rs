@@ -19,6 +19,10 @@ const CLAIM_NS: u64 = 250 * MS;
 const NULL: u8 = 254;
 const REQUEST: u32 = 0xEA00;
 const ACKNOWLEDGE: u32 = 0xE800;
+const COMMANDED_ADDRESS: u32 = 0xFED8;
+/// The control bytes of an acknowledgement.
+const POSITIVE: u8 = 0;
+const NEGATIVE: u8 = 1;
 const CLAIM: u32 = 0xEE00;
 /// Addresses that any node may use, and for which the claim must be waited out.
 const FREE: std::ops::RangeInclusive<u8> = 128..=247;
@@ -182,10 +186,20 @@ impl J1939Node {
 
     /// Refuses a request: the node does not have the group. Requests to all are not refused (J1939-21, 5.4.2).
     pub fn refuse(&mut self, request: GroupRequest) {
+        self.reply(NEGATIVE, request);
+    }
+
+    /// Acknowledges a request that is answered by no data, such as one for DM11. Requests to all are not acknowledged.
+    pub fn acknowledge(&mut self, request: GroupRequest) {
+        self.reply(POSITIVE, request);
+    }
+
+    /// An acknowledgement goes to all, and its fifth byte says for whom it is (J1939-21, 5.4.4).
+    fn reply(&mut self, control: u8, request: GroupRequest) {
         let Some(own) = self.address() else { return };
         if !request.to_all {
             let [a, b, c] = three(request.pgn);
-            let data = [1, 0xFF, 0xFF, 0xFF, request.from, a, b, c];
+            let data = [control, 0xFF, 0xFF, 0xFF, request.from, a, b, c];
             let _ = self.push([frame(6, ACKNOWLEDGE, own, GLOBAL, &data)]);
         }
     }
@@ -217,19 +231,35 @@ impl J1939Node {
         } else {
             FREE.into_iter().find(|free| !self.taken[usize::from(*free)])
         };
-        // Whatever was begun with the old address is over.
-        self.out.clear();
-        self.to_all.clear();
-        self.to_one.clear();
-        self.incoming.clear();
-        self.disown(Of::ToAll);
-        self.disown(Of::ToOne);
+        self.leave_address();
         if let Some(next) = next {
             (self.address, self.claim) = (next, Claim::Sent { until_ns: None });
         } else {
             self.trouble = Some(StationError::AddressTaken { address: self.address, name });
             (self.address, self.claim) = (NULL, Claim::Lost);
         }
+        self.send_claim();
+    }
+
+    /// Whatever was begun with the old address is over.
+    fn leave_address(&mut self) {
+        self.out.clear();
+        self.to_all.clear();
+        self.to_one.clear();
+        self.incoming.clear();
+        self.disown(Of::ToAll);
+        self.disown(Of::ToOne);
+    }
+
+    /// Somebody gives addresses: the node of that NAME claims the new one (J1939-81, 4.2.3; NMEA 2000 asks for it of every node). It goes
+    /// to all, so that a node that has lost its address does not hear it.
+    fn commanded(&mut self, data: &[u8]) {
+        let Some((&address, name)) = data.split_last() else { return };
+        if name != self.name.to_le_bytes() || address >= NULL {
+            return;
+        }
+        self.leave_address();
+        (self.address, self.claim) = (address, Claim::Sent { until_ns: None });
         self.send_claim();
     }
 
@@ -279,6 +309,9 @@ impl J1939Node {
             let incoming = self.incoming.remove(place);
             self.out.extend(incoming.last_word(own).map(|frame| (Of::Short, frame)));
             let (pgn, from) = (incoming.pgn(), incoming.from());
+            if pgn == COMMANDED_ADDRESS {
+                return self.commanded(&incoming.into_data());
+            }
             push_bounded(&mut self.messages, GroupMessage { pgn, from, data: incoming.into_data() });
         }
     }

@@ -52,6 +52,7 @@ fn settings_are_the_nodes_and_a_wrong_one_says_which_there_are() {
         wrong("obd?speed=fast").contains("the setting speed is a whole number, as in speed=50, and not fast")
     );
     assert!(wrong("obd?codes=P0128,X1").contains("X1 is no trouble code, such as P0128"));
+    assert!(wrong("obd?vin=TOO-SHORT").contains("the vin TOO-SHORT has 9 characters; give it the 17"));
     assert!(wrong("engine?codes=1/2").contains("write SPN/FMI/occurrences"));
     assert!(wrong("valves?mac=64").contains("a MAC ID is 0 to 63"));
     let unknown = library::script("boot").unwrap_err().to_string();
@@ -121,6 +122,24 @@ fn the_engine_sends_its_codes_in_many_frames_and_one_in_one() {
             let first = expect("1CEBFF00", "1s");
             check(first.data == bytes("0114FF6E00000364"), "red and amber, SPN 110 FMI 0, 3 times");
             check(expect("1CEBFF00", "1s").data == bytes("02000101BE000207"), "SPN 100 FMI 1, SPN 190 FMI 2");
+        }"#,
+    );
+}
+
+/// J1939-21, 5.4.4: to all, and the fifth byte says for whom. J1939-73 has no acknowledgement of what was asked of all.
+#[test]
+fn the_engine_acknowledges_dm11_to_whoever_asked_for_it_alone() {
+    passes(
+        5,
+        "engine",
+        r#"fn test_dm11() {
+            wait("300ms");
+            send("18EAFFF9#D3FE00");
+            check(wait_for("18E8FF00", "500ms") == (), "nothing for all");
+            send("18EA00F9#D3FE00");
+            check(expect("18E8FF00", "1s").data == bytes("00FFFFFFF9D3FE00"), "positive, for F9");
+            send("18EA00F9#4CFE00");
+            check(expect("18E8FF00", "1s").data == bytes("01FFFFFFF94CFE00"), "negative, for F9");
         }"#,
     );
 }

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use cantap::{Channel, Device};
+use cantap::{Channel, Device, TraceEvent, TraceRecord};
 use cantap_scripts::{Live, Report, Script};
 
 use super::{decoder, failure, script};
@@ -98,4 +98,50 @@ fn a_script_does_not_hear_itself_and_a_node_keeps_its_address() {
     let report = run(&device, &[node], Some(Duration::from_secs(5)));
     assert!(report.is_success(), "{report:?}");
     assert_eq!((report.frames_sent, report.frames_received), (1, 0), "{report:?}");
+}
+
+/// A listener beside a script that sends and traffic of other nodes: what it hears is what the trace has, in its order, with its times.
+#[test]
+fn a_script_hears_the_frames_of_the_trace_in_their_order_and_with_their_stamps() {
+    let device = device("load=20");
+    let sender = script("sender", r#"periodic("7F0#01", "3ms"); every("2ms", || send("7F1#02"));"#);
+    let listener = script("listener", r#"on_frame(|f| log(f.to_string() + " " + f.time));"#);
+    let live = Live { decoder: decoder(), seed: 1, duration: Some(Duration::from_secs(1)) };
+    let (mut records, mut heard) = (Vec::<TraceRecord>::new(), Vec::new());
+    let report = live
+        .run(
+            &device,
+            &[sender, listener],
+            &mut |record| records.push(record),
+            &mut |message| heard.push(message.text),
+            None,
+            &mut || true,
+        )
+        .unwrap();
+    assert!(report.is_success(), "{report:?}");
+    let frames: Vec<(i64, String)> = records
+        .iter()
+        .filter_map(|record| match record.event {
+            TraceEvent::Frame { frame, .. } => Some((record.time_ns, frame.to_string())),
+            _ => None,
+        })
+        .collect();
+    let heard: Vec<(f64, &str)> = heard
+        .iter()
+        .map(|line| line.split_once(' ').unwrap())
+        .map(|(frame, time)| (time.parse().unwrap(), frame))
+        .collect();
+    let out_of_place = heard.iter().zip(&frames).filter(|((_, heard), (_, frame))| heard != frame).count();
+    let error = |((time, _), (time_ns, _)): (&(f64, &str), &(i64, String))| {
+        (time - heard[0].0 - (time_ns - frames[0].0) as f64 / 1e9).abs()
+    };
+    let worst = heard.iter().zip(&frames).map(error).fold(0.0, f64::max);
+    println!(
+        "{} heard, {} in the trace, {out_of_place} out of place, {worst} s off",
+        heard.len(),
+        frames.len()
+    );
+    assert!(heard.len() > 700 && frames.len() - heard.len() < 20, "{} of {}", heard.len(), frames.len());
+    assert_eq!(out_of_place, 0);
+    assert!(worst < 2e-9, "{worst} s");
 }

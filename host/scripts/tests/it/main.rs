@@ -1,6 +1,7 @@
 //! Scripts on simulated buses and on the virtual device.
 
 mod bench;
+mod explain;
 mod hostile;
 mod library;
 mod live;

@@ -12,7 +12,7 @@ use cantap_trace::bits::FrameBits;
 /// others send.
 ///
 /// Times are the simulation's, in nanoseconds.
-pub trait Senders: Debug {
+pub trait Senders: Debug + Send {
     /// When one of them wants to send next.
     fn due(&mut self, now_ns: u64) -> Option<u64>;
     /// Of the frames that they want to send at this time, the one with the lowest identifier.

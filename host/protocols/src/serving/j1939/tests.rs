@@ -70,10 +70,42 @@ fn a_request_is_handed_over_and_one_for_an_unknown_group_refused_to_who_asked() 
     assert_eq!(asked, GroupRequest { pgn: 0xFEEC, from: 0xF9, to_all: false });
     node.refuse(asked);
     assert_eq!(drain(&mut node, 2), ["18E8FF00#01FFFFFFF9ECFE00"]);
+    node.acknowledge(asked);
+    assert_eq!(drain(&mut node, 2), ["18E8FF00#00FFFFFFF9ECFE00"]);
     let asked = node.take_request().unwrap();
     assert!(asked.to_all);
     node.refuse(asked);
+    node.acknowledge(asked);
     assert_eq!((drain(&mut node, 2), node.take_request()), (vec![], None));
+}
+
+#[test]
+fn a_commanded_address_is_claimed_by_the_node_of_that_name_alone() {
+    let command = |name: u64, address: u8| {
+        let mut data = [0xFF; 16];
+        data[..2].copy_from_slice(&[1, name as u8]);
+        data[2..8].fill(0);
+        (data[8], data[9], data[10]) = (2, 0, address);
+        [
+            of(0x30, CONTROL, GLOBAL, &[32, 9, 0, 2, 0xFF, 0xD8, 0xFE, 0]),
+            of(0x30, DATA, GLOBAL, &data[..8]),
+            of(0x30, DATA, GLOBAL, &data[8..]),
+        ]
+    };
+    let mut node = owner(NAME, 0x80);
+    for (name, address) in [(NAME + 1, 0x90), (NAME, NULL), (NAME, GLOBAL)] {
+        for frame in command(name, address) {
+            hear(&mut node, 1, &frame);
+        }
+        assert_eq!((drain(&mut node, 1), node.address()), (vec![], Some(0x80)), "{name} {address}");
+    }
+    for frame in command(NAME, 0x90) {
+        hear(&mut node, 2, &frame);
+    }
+    assert_eq!((drain(&mut node, 2), node.address()), (vec!["18EEFF90#0500000000000000".to_owned()], None));
+    drain(&mut node, 2 + CLAIM_NS);
+    assert_eq!(node.address(), Some(0x90));
+    assert_eq!(node.take_message(), None);
 }
 
 #[test]

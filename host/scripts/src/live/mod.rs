@@ -1,0 +1,73 @@
+//! Scripts as nodes on a real bus, through a device.
+
+mod repeated;
+mod run;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use cantap::{Device, DeviceError, TraceRecord};
+use cantap_signals::Decoder;
+
+use crate::node::{Script, ScriptError};
+use crate::report::{Message, Report};
+
+use run::Keys;
+pub use run::LiveRun;
+
+/// What a run on a device needs.
+#[derive(Clone, Debug)]
+pub struct Live {
+    /// The databases for messages and signals.
+    pub decoder: Arc<Decoder>,
+    /// Selects another sequence of random numbers; each script has its own.
+    pub seed: u64,
+    /// When the run ends, since its beginning; scripts with tests end it earlier.
+    pub duration: Option<Duration>,
+}
+
+/// Why a run on a device broke off.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum LiveError {
+    /// A script cannot run.
+    #[error(transparent)]
+    Script(#[from] ScriptError),
+    /// The device is gone, or refused something.
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+}
+
+impl Live {
+    /// Runs scripts on the open channels of a device, which have to be in normal mode to send. Times are those of the device's stamps; the
+    /// scripts' own timers follow the computer's clock, and repeated frames the device's.
+    ///
+    /// `keys` returns the next key that the user has typed, if there is one; without it, none come.
+    ///
+    /// At the end, however it comes, nothing is repeated any more.
+    ///
+    /// # Errors
+    /// If a script is not in the language, or the device is gone; what else goes wrong is in the report.
+    pub fn run(
+        &self,
+        device: &Device,
+        scripts: &[Script],
+        on_record: &mut dyn FnMut(TraceRecord),
+        on_message: &mut dyn FnMut(Message),
+        keys: Option<&mut dyn FnMut() -> Option<char>>,
+        goes_on: &mut dyn FnMut() -> bool,
+    ) -> Result<Report, LiveError> {
+        if scripts.is_empty() {
+            return Err(ScriptError::None.into());
+        }
+        let mut run = self.start(device);
+        for script in scripts {
+            run.add(script)?;
+        }
+        let keys = keys.map(|next| Box::new(next) as Keys<'_>);
+        let result = run.go(self.duration, on_record, on_message, keys, goes_on);
+        let (report, messages) = run.finish();
+        messages.into_iter().for_each(on_message);
+        result.map(|()| report)
+    }
+}

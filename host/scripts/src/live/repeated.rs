@@ -1,0 +1,88 @@
+//! Frames that are sent again and again: by the device where it can, or else from here.
+
+use cantap::wire::message::Periodic;
+use cantap_can::{Channel, Frame};
+
+use super::LiveError;
+use super::run::LiveRun;
+use crate::placement::{Runner, Statement};
+
+/// A frame that is sent again and again from here.
+pub struct Repeat {
+    /// Its script and handle.
+    of: (usize, u32),
+    channel: Channel,
+    frame: Frame,
+    period_ns: u64,
+    /// When it is sent next.
+    pub due_ns: u64,
+}
+
+impl LiveRun<'_> {
+    pub(super) fn repeat_of(
+        &mut self,
+        place: usize,
+        (handle, channel): (u32, Channel),
+        frame: Frame,
+        period_ns: u64,
+    ) -> Result<(), LiveError> {
+        let index = channel.index();
+        let used: Vec<u8> =
+            self.slots.iter().filter(|((of, _, _), _)| *of == index).map(|(_, slot)| *slot).collect();
+        let known = self.slots.get(&(index, place, handle)).copied();
+        let is_of_device = Statement::Periodic.place(self.target, used.len()).runner == Runner::Device;
+        // From the last one down: whoever shares the session takes them from the first one up.
+        let free = || {
+            (0..self.device.hello().periodic_slots).rev().find(|slot| is_of_device && !used.contains(slot))
+        };
+        let slot = known.or_else(free);
+        let Some(slot) = slot else {
+            self.repeat_from_here((place, handle), channel, frame, period_ns);
+            return Ok(());
+        };
+        let ticks = u128::from(period_ns) * u128::from(self.device.hello().tick_hz) / 1_000_000_000;
+        let period_ticks = u32::try_from(ticks).unwrap_or(u32::MAX).max(1);
+        let entry = Periodic { frame, period_ticks, count: 0, modifiers: heapless::Vec::new() };
+        self.device.set_periodic(channel, slot, Some(entry))?;
+        self.repeated.insert((index, slot), place);
+        self.slots.insert((index, place, handle), slot);
+        Ok(())
+    }
+
+    fn repeat_from_here(&mut self, of: (usize, u32), channel: Channel, frame: Frame, period_ns: u64) {
+        match self.repeats.iter_mut().find(|repeat| repeat.of == of && repeat.channel == channel) {
+            Some(repeat) => (repeat.frame, repeat.period_ns) = (frame, period_ns),
+            None => self.repeats.push(Repeat {
+                of,
+                channel,
+                frame,
+                period_ns: period_ns.max(1),
+                due_ns: self.now_ns,
+            }),
+        }
+    }
+
+    /// Sends the frames that are due from here; what was due while nothing could be sent is left out.
+    pub(super) fn send_repeated(&mut self) -> Result<(), LiveError> {
+        let now_ns = self.now_ns;
+        let mut due = Vec::new();
+        for repeat in self.repeats.iter_mut().filter(|repeat| repeat.due_ns <= now_ns) {
+            let periods = (now_ns - repeat.due_ns) / repeat.period_ns + 1;
+            repeat.due_ns += periods * repeat.period_ns;
+            due.push((repeat.of.0, (repeat.channel, repeat.frame)));
+        }
+        due.into_iter().try_for_each(|(place, frame)| self.send_of(place, frame, false))
+    }
+
+    pub(super) fn end_repeats(&mut self, is_meant: impl Fn(usize, u32) -> bool) -> Result<(), LiveError> {
+        self.repeats.retain(|repeat| !is_meant(repeat.of.0, repeat.of.1));
+        let meant: Vec<(usize, usize, u32)> =
+            self.slots.keys().filter(|(_, place, handle)| is_meant(*place, *handle)).copied().collect();
+        for key in meant {
+            if let Some(slot) = self.slots.remove(&key) {
+                self.device.set_periodic(Channel::ALL[key.0], slot, None)?;
+            }
+        }
+        Ok(())
+    }
+}

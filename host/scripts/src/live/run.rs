@@ -1,0 +1,428 @@
+//! A run on a device, turn by turn.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use cantap::device::Transmission;
+use cantap::transmit::Stream;
+use cantap::{Device, TraceEvent, TraceRecord};
+use cantap_can::{CHANNELS, Channel, DEVICE_TAG, Frame};
+use cantap_signals::Decoder;
+use cantap_trace::{Direction, TraceFrame};
+
+use super::repeated::Repeat;
+use super::{Live, LiveError};
+use crate::exchange::{Input, Output};
+use crate::node::{Node, Script, ScriptError};
+use crate::placement::Target;
+use crate::report::{Message, Report};
+use crate::results::{Results, is_over};
+
+/// The longest wait for records: Ctrl-C is seen after it.
+const LOOK_EVERY: Duration = Duration::from_millis(20);
+/// How long frames that are under way at the end may take to be on the bus.
+const FAREWELL: Duration = Duration::from_millis(200);
+/// The place of the caller, which is none of the scripts.
+const CALLER: usize = usize::MAX;
+
+impl Live {
+    /// The same for a caller that has the device's records itself and hands them over between turns, and adds scripts as it likes.
+    /// [`Self::duration`] is its business.
+    pub fn start<'d>(&self, device: &'d Device) -> LiveRun<'d> {
+        LiveRun {
+            device,
+            decoder: Arc::clone(&self.decoder),
+            seed: self.seed,
+            nodes: Vec::new(),
+            stream: Stream::new(device),
+            under_way: BTreeMap::new(),
+            ended: Default::default(),
+            repeated: BTreeMap::new(),
+            dropped: Vec::new(),
+            slots: BTreeMap::new(),
+            repeats: Vec::new(),
+            target: Target::of(device.hello()),
+            results: Results::default(),
+            began: Instant::now(),
+            first_ns: None,
+            now_ns: 0,
+            stamp_ns: 0,
+        }
+    }
+}
+
+/// Returns the next key that the user has typed.
+pub type Keys<'a> = Box<dyn FnMut() -> Option<char> + 'a>;
+
+/// Scripts on a device, turn by turn. Its end is the end of everything that they began.
+pub struct LiveRun<'d> {
+    pub(super) device: &'d Device,
+    pub(super) target: Target,
+    decoder: Arc<Decoder>,
+    seed: u64,
+    nodes: Vec<Node>,
+    stream: Stream<'d>,
+    /// Whose frame a tag is, and whether the script waits to see it confirmed.
+    under_way: BTreeMap<(usize, u32), (usize, bool)>,
+    /// Of each channel, how transmissions ended whose records have not come, in the device's order: a record does not say whose frame it is.
+    ended: [VecDeque<Transmission>; CHANNELS],
+    /// Whose each slot is by channel, also when it has ended.
+    pub(super) repeated: BTreeMap<(usize, u8), usize>,
+    /// Frames for which there was no room, by script, of which it does not know yet.
+    dropped: Vec<(usize, Channel)>,
+    /// The device's slot of each repetition, by channel, script and handle.
+    pub(super) slots: BTreeMap<(usize, usize, u32), u8>,
+    /// What is repeated from here, because the device has no more slots.
+    pub(super) repeats: Vec<Repeat>,
+    results: Results,
+    began: Instant,
+    /// The stamp that is the run's time zero, and when it came.
+    first_ns: Option<i64>,
+    pub(super) now_ns: u64,
+    /// The time of the last record: it may be before the present turn's.
+    stamp_ns: u64,
+}
+
+impl LiveRun<'_> {
+    pub(super) fn go(
+        &mut self,
+        duration: Option<Duration>,
+        on_record: &mut dyn FnMut(TraceRecord),
+        on_message: &mut dyn FnMut(Message),
+        mut keys: Option<Keys<'_>>,
+        goes_on: &mut dyn FnMut() -> bool,
+    ) -> Result<(), LiveError> {
+        let mut records = self.device.records();
+        while duration.is_none_or(|duration| self.began.elapsed() < duration) && !self.is_over() && goes_on()
+        {
+            match &mut keys {
+                Some(keys) => std::iter::from_fn(keys).try_for_each(|key| self.key(key))?,
+                None => self.results.without_keys(&self.nodes, self.now_ns),
+            }
+            let wait = self.turn()?;
+            self.results.messages.drain(..).for_each(&mut *on_message);
+            let Some(batch) = records.next_batch(wait.min(LOOK_EVERY))? else { break };
+            for record in batch {
+                on_record(record);
+                self.take_record(record)?;
+            }
+            self.results.messages.drain(..).for_each(&mut *on_message);
+        }
+        Ok(())
+    }
+
+    /// One more node, from now on; returns its place.
+    ///
+    /// # Errors
+    /// If it is not in the language; what goes wrong later is in [`Self::errors`].
+    pub fn add(&mut self, script: &Script) -> Result<usize, ScriptError> {
+        self.nodes.push(Node::start_nth(self.nodes.len(), script, &self.decoder, self.seed)?);
+        Ok(self.nodes.len() - 1)
+    }
+
+    /// Ends a node: it sends nothing more but what is under way.
+    ///
+    /// # Errors
+    /// As [`Self::turn`].
+    pub fn end(&mut self, place: usize) -> Result<(), LiveError> {
+        if let Some(node) = self.nodes.get_mut(place) {
+            node.end();
+        }
+        self.end_repeats(|of, _| of == place)
+    }
+
+    /// Whether a node has ended.
+    pub fn has_ended(&self, place: usize) -> bool {
+        self.nodes.get(place).is_none_or(|node| node.has_ended)
+    }
+
+    /// Scripts that have ended with an error, and the error.
+    pub fn errors(&self) -> Vec<(String, String)> {
+        self.nodes.iter().filter_map(|node| Some((node.name.clone(), node.error.clone()?))).collect()
+    }
+
+    /// Sends a frame of the caller's.
+    ///
+    /// # Errors
+    /// As [`Self::turn`].
+    pub fn send(&mut self, channel: Channel, frame: Frame) -> Result<(), LiveError> {
+        self.send_of(CALLER, (channel, frame), true)
+    }
+
+    /// Sends a frame of the caller's now and then again after each period, until the next call with the same handle: with another frame
+    /// or period, or with none.
+    ///
+    /// # Errors
+    /// As [`Self::turn`].
+    pub fn repeat(&mut self, handle: u32, repeated: Option<(Channel, Frame, u64)>) -> Result<(), LiveError> {
+        match repeated {
+            Some((channel, frame, period_ns)) => self.repeat_of(CALLER, (handle, channel), frame, period_ns),
+            None => self.end_repeats(|of, own| (of, own) == (CALLER, handle)),
+        }
+    }
+
+    /// Whether every script with tests has ended, or, if none has tests, every script has.
+    pub fn is_over(&self) -> bool {
+        is_over(&self.nodes)
+    }
+
+    /// Does what is due, and hands to the device what the scripts send. Returns for how long there is nothing to do unless something arrives.
+    ///
+    /// # Errors
+    /// If the device is gone, or refused something.
+    pub fn turn(&mut self) -> Result<Duration, LiveError> {
+        self.pass_time(self.began.elapsed().as_nanos() as u64);
+        for place in 0..self.nodes.len() {
+            if self.nodes[place].wake_ns.is_some_and(|wake_ns| wake_ns <= self.now_ns) {
+                self.resume(place, None)?;
+            }
+        }
+        self.send_repeated()?;
+        self.stream.flush()?;
+        self.take_failed()?;
+        for (place, channel) in std::mem::take(&mut self.dropped) {
+            self.resume(place, Some(Input::NotSent { channel }))?;
+        }
+        let of_repeats = self.repeats.iter().map(|repeat| repeat.due_ns);
+        let wake_ns = self.nodes.iter().filter_map(|node| node.wake_ns).chain(of_repeats).min();
+        let until = |wake_ns: u64| Duration::from_nanos(wake_ns.saturating_sub(self.now_ns));
+        Ok(wake_ns.map_or(Duration::MAX, until))
+    }
+
+    /// The user has typed a key.
+    ///
+    /// # Errors
+    /// As [`Self::turn`].
+    pub fn key(&mut self, key: char) -> Result<(), LiveError> {
+        self.resume_all(Input::Key(key))
+    }
+
+    /// What scripts have logged since the last call.
+    pub fn take_messages(&mut self) -> Vec<Message> {
+        std::mem::take(&mut self.results.messages)
+    }
+
+    /// The report so far.
+    pub const fn report(&self) -> &Report {
+        &self.results.report
+    }
+
+    /// Time never goes back, whatever the stamps are.
+    fn pass_time(&mut self, now_ns: u64) {
+        self.now_ns = self.now_ns.max(now_ns);
+    }
+
+    /// A record of the device. Returns it as a node of the caller's sees it: frames of the scripts are received, its own are sent.
+    ///
+    /// # Errors
+    /// As [`Self::turn`].
+    pub fn take_record(&mut self, record: TraceRecord) -> Result<TraceRecord, LiveError> {
+        let Some(channel) = Channel::from_number(record.channel) else { return Ok(record) };
+        let now_ns = self.began.elapsed().as_nanos() as u64;
+        let first_ns = *self.first_ns.get_or_insert(record.time_ns - now_ns as i64);
+        self.stamp_ns = u64::try_from(record.time_ns - first_ns).unwrap_or(0);
+        // Its way here may have been shorter than that of the first.
+        self.pass_time(self.stamp_ns.min(now_ns));
+        match record.event {
+            TraceEvent::Frame { frame, direction: Direction::Tx, late } => {
+                let is_callers = self.take_sent(channel, frame)?;
+                let direction = if is_callers { Direction::Tx } else { Direction::Rx };
+                return Ok(TraceRecord { event: TraceEvent::Frame { frame, direction, late }, ..record });
+            }
+            TraceEvent::Frame { frame, .. } => self.take_frame(channel, frame)?,
+            event => self.take_event(channel, event)?,
+        }
+        Ok(record)
+    }
+
+    fn take_event(&mut self, channel: Channel, event: TraceEvent) -> Result<(), LiveError> {
+        let input = match event {
+            TraceEvent::BusError { kind, .. } => Input::Error { channel, kind },
+            TraceEvent::State { state, .. } => Input::State { channel, state },
+            TraceEvent::Lost { count, .. } => {
+                self.results.report.frames_lost += u64::from(count);
+                Input::Gap
+            }
+            _ => return Ok(()),
+        };
+        self.resume_all(input)
+    }
+
+    /// A frame of another node, or of another client of a shared device.
+    fn take_frame(&mut self, channel: Channel, frame: TraceFrame) -> Result<(), LiveError> {
+        let TraceFrame::Classic(frame) = frame else {
+            // Scripts have no CAN FD: to them, a frame is missing.
+            self.results.report.frames_lost += 1;
+            return self.resume_all(Input::Gap);
+        };
+        self.results.frame(self.stamp_ns, channel, frame);
+        self.results.report.frames_received += 1;
+        self.resume_all(Input::Frame { channel, frame, at_ns: self.stamp_ns })
+    }
+
+    /// A frame that the device has sent: its confirmation, which says for whom, has come before its record. Returns whether it is the
+    /// caller's.
+    fn take_sent(&mut self, channel: Channel, frame: TraceFrame) -> Result<bool, LiveError> {
+        self.collect_ended()?;
+        let ended = &mut self.ended[channel.index()];
+        let Some(place) = ended.iter().position(|ended| ended.result == Ok(frame)) else {
+            // Sent before the run.
+            self.take_frame(channel, frame)?;
+            return Ok(false);
+        };
+        let tag = ended[place].tag;
+        // What is before it has failed, or its record was lost.
+        let until: Vec<Transmission> = ended.drain(..=place).collect();
+        let is_callers = self.known_sender(channel, tag).is_some_and(|(sender, _)| sender == CALLER);
+        until.into_iter().try_for_each(|ended| self.pass_on(ended))?;
+        Ok(is_callers)
+    }
+
+    /// Passes on what failed: it has no record.
+    fn take_failed(&mut self) -> Result<(), LiveError> {
+        self.collect_ended()?;
+        for channel in Channel::ALL {
+            while let Some(failed) = self.ended[channel.index()].pop_front_if(|ended| ended.result.is_err()) {
+                self.pass_on(failed)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn collect_ended(&mut self) -> Result<(), LiveError> {
+        self.stream.wait(Duration::ZERO)?;
+        for ended in self.stream.take_ended() {
+            self.ended[ended.channel.index()].push_back(ended);
+        }
+        Ok(())
+    }
+
+    /// Passes on how a transmission ended: to the sender as such, to the others as a frame.
+    fn pass_on(&mut self, ended: Transmission) -> Result<(), LiveError> {
+        let Transmission { channel, tag, result, .. } = ended;
+        match (result, self.sender(channel, tag)) {
+            (Err(_), Some((place, true))) => self.resume(place, Some(Input::NotSent { channel })),
+            (Err(_), _) => Ok(()),
+            (Ok(TraceFrame::Classic(frame)), Some((sender, is_awaited))) => {
+                self.sent(channel, tag, frame);
+                for place in 0..self.nodes.len() {
+                    match (place == sender, is_awaited) {
+                        (false, _) => {
+                            self.resume(place, Some(Input::Frame { channel, frame, at_ns: self.stamp_ns }))?;
+                        }
+                        // Repetitions are not among the frames that a script waits to see confirmed.
+                        (true, true) => self.resume(place, Some(Input::Sent { channel }))?,
+                        (true, false) => {}
+                    }
+                }
+                Ok(())
+            }
+            (Ok(frame), _) => self.take_frame(channel, frame),
+        }
+    }
+
+    /// Which script's a transmission is, if one's, and whether the script waits to see it confirmed. It is not under way any more.
+    fn sender(&mut self, channel: Channel, tag: u32) -> Option<(usize, bool)> {
+        let sender = self.known_sender(channel, tag);
+        self.under_way.remove(&(channel.index(), tag));
+        sender
+    }
+
+    fn known_sender(&self, channel: Channel, tag: u32) -> Option<(usize, bool)> {
+        if let Some(sender) = self.under_way.get(&(channel.index(), tag)) {
+            return Some(*sender);
+        }
+        let slot = u8::try_from(tag.checked_sub(DEVICE_TAG)?).ok()?;
+        self.repeated.get(&(channel.index(), slot)).map(|place| (*place, false))
+    }
+
+    fn sent(&mut self, channel: Channel, tag: u32, frame: Frame) {
+        self.results.frame(self.stamp_ns, channel, frame);
+        self.results.report.frames_sent += 1;
+        self.results.report.frames_repeated += u64::from(tag >= DEVICE_TAG);
+    }
+
+    fn resume_all(&mut self, input: Input) -> Result<(), LiveError> {
+        (0..self.nodes.len()).try_for_each(|place| self.resume(place, Some(input)))
+    }
+
+    fn resume(&mut self, place: usize, input: Option<Input>) -> Result<(), LiveError> {
+        // The caller has no turns.
+        let Some(node) = self.nodes.get_mut(place) else { return Ok(()) };
+        let outputs = node.resume(self.now_ns, input);
+        let name = node.name.clone();
+        for output in outputs {
+            match self.results.take(&name, self.now_ns, output) {
+                Some(Output::Send { channel, frame }) => self.send_of(place, (channel, frame), true)?,
+                Some(Output::Repeat { handle, channel, frame, period_ns }) => {
+                    self.repeat_of(place, (handle, channel), frame, period_ns)?;
+                }
+                Some(Output::EndRepeat { handle }) => {
+                    self.end_repeats(|of, own| (of, own) == (place, handle))?;
+                }
+                Some(Output::Log(_) | Output::Test { .. }) | None => {}
+            }
+        }
+        if self.nodes[place].has_ended {
+            self.end_repeats(|of, _| of == place)?;
+        }
+        Ok(())
+    }
+
+    pub(super) fn send_of(
+        &mut self,
+        place: usize,
+        (channel, frame): (Channel, Frame),
+        is_awaited: bool,
+    ) -> Result<(), LiveError> {
+        let began = Instant::now();
+        // A queue that stays full means that nothing leaves, which the report says at the end.
+        let tag = self.stream.push(channel, frame, None, |_| began.elapsed() < Duration::from_secs(1))?;
+        if let Some(tag) = tag {
+            self.under_way.insert((channel.index(), tag), (place, is_awaited));
+        } else {
+            self.results.report.frames_not_sent += 1;
+            if is_awaited {
+                self.dropped.push((place, channel));
+            }
+        }
+        Ok(())
+    }
+
+    /// Ends everything that the scripts began, as far as the device is still there.
+    /// And returns how it went, and what was logged last.
+    pub fn finish(mut self) -> (Report, Vec<Message>) {
+        let _ = self.end_repeats(|_, _| true);
+        let began = Instant::now();
+        let _ = self.stream.finish(|_| began.elapsed() < FAREWELL);
+        // Their records are not waited for, and the scripts have had their last turn.
+        let _ = self.collect_ended();
+        for Transmission { channel, tag, result, .. } in std::mem::take(&mut self.ended).into_iter().flatten()
+        {
+            if let (Ok(TraceFrame::Classic(frame)), Some(_)) = (result, self.sender(channel, tag)) {
+                self.sent(channel, tag, frame);
+            }
+        }
+        if !self.under_way.is_empty() {
+            for channel in self
+                .under_way
+                .keys()
+                .map(|(index, _)| Channel::ALL[*index])
+                .collect::<std::collections::BTreeSet<_>>()
+            {
+                let _ = self.device.abort(channel);
+            }
+        }
+        self.results.report.frames_not_sent += self.under_way.len() as u64;
+        let messages = self.take_messages();
+        (std::mem::take(&mut self.results).finish(&self.nodes, self.now_ns), messages)
+    }
+}
+
+impl Drop for LiveRun<'_> {
+    fn drop(&mut self) {
+        // As far as the device is still there.
+        let _ = self.end_repeats(|_, _| true);
+    }
+}

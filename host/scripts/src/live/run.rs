@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use cantap::device::Transmission;
 use cantap::transmit::Stream;
+use cantap::wire::message::TRIGGER_TAG;
 use cantap::{Device, TraceEvent, TraceRecord};
 use cantap_can::{CHANNELS, Channel, DEVICE_TAG, Frame};
 use cantap_signals::Decoder;
@@ -23,6 +24,8 @@ use crate::results::{Results, is_over};
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 /// How long frames that are under way at the end may take to be on the bus.
 const FAREWELL: Duration = Duration::from_millis(200);
+/// Batches of records from before a run, at most: on a full bus there is always another one.
+const MOST_BEFORE: u32 = 1000;
 /// The place of the caller, which is none of the scripts.
 const CALLER: usize = usize::MAX;
 
@@ -94,6 +97,13 @@ impl LiveRun<'_> {
         goes_on: &mut dyn FnMut() -> bool,
     ) -> Result<(), LiveError> {
         let mut records = self.device.records();
+        // What came before the run is in the trace, and nothing that its scripts have seen.
+        for _ in 0..MOST_BEFORE {
+            match records.next_batch(Duration::ZERO)? {
+                Some(batch) if !batch.is_empty() => batch.into_iter().for_each(&mut *on_record),
+                _ => break,
+            }
+        }
         while duration.is_none_or(|duration| self.began.elapsed() < duration) && !self.is_over() && goes_on()
         {
             match &mut keys {
@@ -267,8 +277,7 @@ impl LiveRun<'_> {
         self.collect_ended()?;
         let ended = &mut self.ended[channel.index()];
         let Some(place) = ended.iter().position(|ended| ended.result == Ok(frame)) else {
-            // Sent before the run.
-            self.take_frame(channel, frame)?;
+            // Sent before the run: its confirmation went to whoever sent it.
             return Ok(false);
         };
         let tag = ended[place].tag;
@@ -318,6 +327,8 @@ impl LiveRun<'_> {
                 }
                 Ok(())
             }
+            // Of an earlier run, which had it repeated.
+            (Ok(_), None) if (DEVICE_TAG..TRIGGER_TAG).contains(&tag) => Ok(()),
             (Ok(frame), _) => self.take_frame(channel, frame),
         }
     }

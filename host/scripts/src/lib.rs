@@ -36,5 +36,5 @@ pub use bench::{Bench, Simulation};
 pub use explain::Explained;
 pub use live::{Live, LiveError, LiveRun};
 pub use node::{Script, ScriptError};
-pub use placement::{Clock, Placement, Runner, Statement, Target};
+pub use placement::{Placement, Runner, Statement, Target, TimedBy};
 pub use report::{Message, Outcome, Report, TestResult};

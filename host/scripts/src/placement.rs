@@ -65,7 +65,7 @@ pub enum Target {
     /// A device.
     Device {
         /// What keeps its clock.
-        clock: Clock,
+        clock: TimedBy,
         /// Frames that it repeats by itself, at once, on each channel.
         periodic_slots: u8,
         /// Whether it sends at all.
@@ -75,7 +75,7 @@ pub enum Target {
 
 /// What a device's clock is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Clock {
+pub enum TimedBy {
     /// A board's own timer.
     Board,
     /// This computer's: the virtual device, and another maker's adapter.
@@ -87,7 +87,7 @@ impl Target {
     pub fn of(hello: &Hello) -> Self {
         let is_computer = hello.capabilities & capability::ADAPTER != 0 || hello.board.starts_with(VIRTUAL);
         Self::Device {
-            clock: if is_computer { Clock::Computer } else { Clock::Board },
+            clock: if is_computer { TimedBy::Computer } else { TimedBy::Board },
             periodic_slots: hello.periodic_slots,
             transmits: hello.capabilities & capability::TRANSMIT != 0,
         }
@@ -144,8 +144,8 @@ impl Statement {
                 accuracy: format!(
                     "{}; {periodic_slots} at once on each channel, more from the host",
                     match clock {
-                        Clock::Board => "its timer, to 2 us while the bus is free",
-                        Clock::Computer => "its timer, which follows this computer's clock",
+                        TimedBy::Board => "its timer, to 2 us while the bus is free",
+                        TimedBy::Computer => "its timer, which follows this computer's clock",
                     }
                 ),
             },

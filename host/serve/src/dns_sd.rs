@@ -156,7 +156,7 @@ impl Drop for Announcing {
 
 /// A server that announced itself. Texts are cleaned for a terminal, and of limited length.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Server {
+pub struct AnnouncedServer {
     /// Where it says that it is: an address and a port.
     pub place: SocketAddr,
     /// What it calls itself.
@@ -167,7 +167,7 @@ pub struct Server {
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Browsed {
     /// Each server once, by its name; at most 256.
-    pub servers: Vec<Server>,
+    pub servers: Vec<AnnouncedServer>,
     /// Further servers, or those that did not say where they are.
     pub left_out: u64,
     /// Servers at places where none can be: at no port, or at addresses that lead back to whoever tries them.
@@ -236,7 +236,7 @@ fn browse_on(network: Network, time: Duration) -> io::Result<Browsed> {
 }
 
 /// A server, if it can be where it says that it is.
-fn read(service: &ResolvedService, with_loopback: bool) -> Option<Server> {
+fn read(service: &ResolvedService, with_loopback: bool) -> Option<AnnouncedServer> {
     let is_possible = |ip: &IpAddr| match ip {
         IpAddr::V4(ip) => !(ip.is_unspecified() || ip.is_multicast() || ip.is_broadcast()),
         // An address of the link alone is none without the interface.
@@ -250,7 +250,7 @@ fn read(service: &ResolvedService, with_loopback: bool) -> Option<Server> {
     let name = service.fullname.strip_suffix(SERVICE).unwrap_or(&service.fullname);
     let name = name.strip_suffix('.').unwrap_or(name);
     let name = clean::line(name).chars().take(MOST_LETTERS).collect();
-    Some(Server { place: SocketAddr::new(ip, service.port), name })
+    Some(AnnouncedServer { place: SocketAddr::new(ip, service.port), name })
 }
 
 #[cfg(test)]

@@ -103,7 +103,7 @@ fn address(server: &Found, bus: &str) -> String {
 }
 
 /// The same for a server of this project's own protocol.
-fn tls(server: &dns_sd::Server) -> String {
+fn tls(server: &dns_sd::AnnouncedServer) -> String {
     format!("tls://{}", server.place)
 }
 

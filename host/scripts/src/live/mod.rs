@@ -1,42 +1,18 @@
 //! Scripts as nodes on a real bus, through a device.
 
+mod repeat;
 mod repeated;
 mod run;
+mod settings;
 
-use std::sync::Arc;
-use std::time::Duration;
-
-use cantap::{Device, DeviceError, TraceRecord};
-use cantap_signals::Decoder;
+use cantap::{Device, TraceRecord};
 
 use crate::node::{Script, ScriptError};
 use crate::report::{Message, Report};
 
 use run::Keys;
 pub use run::LiveRun;
-
-/// What a run on a device needs.
-#[derive(Clone, Debug)]
-pub struct Live {
-    /// The databases for messages and signals.
-    pub decoder: Arc<Decoder>,
-    /// Selects another sequence of random numbers; each script has its own.
-    pub seed: u64,
-    /// When the run ends, since its beginning; scripts with tests end it earlier.
-    pub duration: Option<Duration>,
-}
-
-/// Why a run on a device broke off.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum LiveError {
-    /// A script cannot run.
-    #[error(transparent)]
-    Script(#[from] ScriptError),
-    /// The device is gone, or refused something.
-    #[error(transparent)]
-    Device(#[from] DeviceError),
-}
+pub use settings::{Live, LiveError};
 
 impl Live {
     /// Runs scripts on the open channels of a device, which have to be in normal mode to send. Times are those of the device's stamps; the

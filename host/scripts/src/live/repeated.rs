@@ -3,20 +3,10 @@
 use cantap::wire::message::Periodic;
 use cantap_can::{Channel, Frame};
 
-use super::LiveError;
+use super::repeat::Repeat;
 use super::run::LiveRun;
+use super::settings::LiveError;
 use crate::placement::{Runner, Statement};
-
-/// A frame that is sent again and again from here.
-pub struct Repeat {
-    /// Its script and handle.
-    of: (usize, u32),
-    channel: Channel,
-    frame: Frame,
-    period_ns: u64,
-    /// When it is sent next.
-    pub due_ns: u64,
-}
 
 impl LiveRun<'_> {
     pub(super) fn repeat_of(

@@ -12,8 +12,8 @@ use cantap_can::{CHANNELS, Channel, DEVICE_TAG, Frame};
 use cantap_signals::Decoder;
 use cantap_trace::{Direction, TraceFrame};
 
-use super::repeated::Repeat;
-use super::{Live, LiveError};
+use super::repeat::Repeat;
+use super::settings::{Live, LiveError};
 use crate::exchange::{Input, Output};
 use crate::node::{Node, Script, ScriptError};
 use crate::placement::Target;

@@ -3,11 +3,11 @@
 use std::time::Duration;
 
 use cantap::Channel;
-use cantap_scripts::{Clock, Explained, Live, Report, Runner, Target};
+use cantap_scripts::{Explained, Live, Report, Runner, Target, TimedBy};
 
 use super::{decoder, script};
 
-const BOARD: Target = Target::Device { clock: Clock::Board, periodic_slots: 32, transmits: true };
+const BOARD: Target = Target::Device { clock: TimedBy::Board, periodic_slots: 32, transmits: true };
 
 fn explain(source: &str, target: Target) -> Vec<Explained> {
     script("a.rhai", source).explain(target).unwrap()
@@ -130,7 +130,7 @@ fn test_it() { request(\"7E0\", \"7E8\", [1]); log(1); expect(\"7E8\", \"1s\"); 
 
 #[test]
 fn a_device_that_sends_nothing_and_simulated_buses_are_said_to_be_such() {
-    let mute = Target::Device { clock: Clock::Computer, periodic_slots: 0, transmits: false };
+    let mute = Target::Device { clock: TimedBy::Computer, periodic_slots: 0, transmits: false };
     let source = "periodic(\"1#\", \"1s\"); send(\"1#\");";
     let all = |runner| vec![(1, "periodic".to_owned(), runner), (1, "send".to_owned(), runner)];
     assert_eq!(runners(source, mute), all(Runner::Nothing));

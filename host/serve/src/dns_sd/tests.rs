@@ -133,7 +133,10 @@ fn names_that_lead_in_circles_and_packets_that_end_too_early_keep_no_server_from
     packets.push(vec![0xFF; 9000]);
     packets.push(whole);
     let found = found_while(packets, |found| !found.servers.is_empty());
-    assert_eq!(found.servers, [Server { place: "127.0.0.1:4".parse().unwrap(), name: "true".to_owned() }]);
+    assert_eq!(
+        found.servers,
+        [AnnouncedServer { place: "127.0.0.1:4".parse().unwrap(), name: "true".to_owned() }]
+    );
 }
 
 #[test]

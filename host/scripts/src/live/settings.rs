@@ -1,0 +1,32 @@
+//! What a run on a device needs, and why it breaks off.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use cantap::DeviceError;
+use cantap_signals::Decoder;
+
+use crate::node::ScriptError;
+
+/// What a run on a device needs.
+#[derive(Clone, Debug)]
+pub struct Live {
+    /// The databases for messages and signals.
+    pub decoder: Arc<Decoder>,
+    /// Selects another sequence of random numbers; each script has its own.
+    pub seed: u64,
+    /// When the run ends, since its beginning; scripts with tests end it earlier.
+    pub duration: Option<Duration>,
+}
+
+/// Why a run on a device broke off.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum LiveError {
+    /// A script cannot run.
+    #[error(transparent)]
+    Script(#[from] ScriptError),
+    /// The device is gone, or refused something.
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+}

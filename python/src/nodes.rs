@@ -38,13 +38,11 @@ fn channel_of(number: u8) -> PyResult<Channel> {
 
 /// A ready node by its name after `node:`, or a script of one's own.
 fn script(name: String, source: Option<String>) -> Result<Script, Error> {
-    match source {
-        Some(source) => Ok(Script::new(name, source)),
-        None => {
-            let ready = name.strip_prefix(library::PREFIX).unwrap_or(&name);
-            library::script(ready).map_err(Error::argument)
-        }
+    if let Some(source) = source {
+        return Ok(Script::new(name, source));
     }
+    let ready = name.strip_prefix(library::PREFIX).unwrap_or(&name);
+    library::script(ready).map_err(Error::argument)
 }
 
 impl NodeBus {

@@ -53,8 +53,10 @@ def test_records_come_in_order_with_the_devices_stamps():
 
 def test_intervals_are_the_devices_own_on_request():
     with cantap.open("virtual:load=0,wire=joined,ppm=200", 500_000, mode="normal", device_intervals=True) as device:
-        device.send_periodic(1, "123#11", 0.005, count=300)
-        times = [record.time_ns for record, _ in zip((r for r in device if r.channel == 2 and r.event == "frame"), range(300))]
+        task = device.send_periodic(1, "123#11", 0.005, count=300)
+        received = (record for record in device if record.channel == 2 and record.event == "frame")
+        times = [record.time_ns for _, record in zip(range(300), received)]
+        task.stop()
     period_ns = 5_000_000
     off = [(later - earlier) % period_ns for earlier, later in itertools.pairwise(times)]
     # A tick of the device's clock, whatever the computer's says; a busy bus or computer makes whole periods of it.

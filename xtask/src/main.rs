@@ -14,6 +14,7 @@ mod compiler;
 mod cross;
 mod dependencies;
 mod dist;
+mod failures;
 mod features;
 mod firmware;
 mod fleet;

@@ -4,6 +4,8 @@
 pub enum Outcome {
     /// All of it ran.
     Passed,
+    /// All of it passed, but these tests only when they ran once more, alone: a defect of theirs.
+    Flaky(Vec<String>),
     /// It could not run here, for this reason.
     Skipped(String),
 }

@@ -81,15 +81,23 @@ pub fn check(shell: &Shell, peers: Option<&Peers>) -> Result<Outcome> {
     let workers = tests::threads().to_string();
     let side_by_side = ["--numprocesses", &workers, "--dist", "worksteal", "--ignore", alone];
     // Not from `python/`, where `import cantap` would find the sources.
-    cmd!(shell, "{pytest} -m pytest --quiet python/tests {fleet...} {side_by_side...}")
-        .envs(named.clone())
-        .run()?;
+    let mut outcome = Outcome::Passed;
+    let together = cmd!(shell, "{pytest} -m pytest --quiet python/tests {fleet...} {side_by_side...}");
+    if together.envs(named.clone()).run().is_err() {
+        // Beside others and alone: see `tests::run`.
+        println!("\nonce more, alone: the ones that failed");
+        let failed = ["--last-failed", "--last-failed-no-failures", "none", "-rA"];
+        cmd!(shell, "{pytest} -m pytest python/tests {fleet...} --ignore {alone} {failed...}")
+            .envs(named.clone())
+            .run()?;
+        outcome = Outcome::Flaky(vec!["what pytest listed under 'once more'".to_owned()]);
+    }
     cmd!(shell, "{pytest} -m pytest --quiet {alone}")
         .env("CANTAP_PYTHON_CAN_SOURCE", suite)
         .envs(named)
         .run()?;
     fleet::check(shell, &wheel)?;
-    Ok(Outcome::Passed)
+    Ok(outcome)
 }
 
 /// Times it against other people's packages.

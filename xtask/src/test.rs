@@ -101,6 +101,10 @@ fn report(done: &[Done]) {
             Outcome::Passed => {
                 println!("{name:<16} ok {:>6.1} s{}", time.as_secs_f64(), of_processor(*processor));
             }
+            Outcome::Flaky(tests) => {
+                println!("{name:<16} ok {:>6.1} s{}", time.as_secs_f64(), of_processor(*processor));
+                println!("{:<16} FLAKY, failed beside others and passed alone: {}", "", tests.join(", "));
+            }
             Outcome::Skipped(reason) => println!("{name:<16} NOT RUN: {reason}"),
         }
     }
@@ -118,7 +122,7 @@ fn table(machine: &Machine, done: &[Done]) {
     println!("\n{}\n\n| step | s | of processor |\n|---|---:|---:|", machine.description());
     for Done { name, outcome, time, processor } in done {
         match outcome {
-            Outcome::Passed => {
+            Outcome::Passed | Outcome::Flaky(_) => {
                 let processor =
                     processor.map_or("–".to_owned(), |time| format!("{:.0}", time.as_secs_f64()));
                 println!("| `{name}` | {:.0} | {processor} |", time.as_secs_f64());

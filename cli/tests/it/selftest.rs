@@ -119,18 +119,28 @@ fn ctrl_c_ends_it_within_the_step_and_fails_nothing() {
     use rustix::process::{Pid, Signal, kill_process};
     use std::io::{BufRead, BufReader};
 
-    let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
-    // The load would outlast this test.
-    command.args("selftest -d virtual:load=0 --load-time 60m".split_whitespace()).stdin(Stdio::null());
-    let mut child = command.stdout(Stdio::piped()).spawn().unwrap();
-    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines().map(Result::unwrap);
-    assert!(lines.any(|line| line.contains("  channel 2 transmit queue: ")));
-    kill_process(Pid::from_child(&child), Signal::INT).unwrap();
-    let rest: Vec<String> = lines.collect();
-    assert_eq!(child.wait().unwrap().code(), Some(130), "{rest:#?}");
-    assert_eq!(rest.len(), 3, "{rest:#?}");
-    assert_eq!(rest[0], "skip  both channels saturated, each by itself: Ctrl-C ended it");
-    assert!(rest[2].ends_with("; Ctrl-C ended it, and not all steps were tried"), "{rest:#?}");
+    let run = || {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
+        // The load would outlast this test.
+        command.args("selftest -d virtual:load=0 --load-time 60m".split_whitespace()).stdin(Stdio::null());
+        let mut child = command.stdout(Stdio::piped()).spawn().unwrap();
+        let mut lines = BufReader::new(child.stdout.take().unwrap()).lines().map(Result::unwrap);
+        let mut before: Vec<String> = Vec::new();
+        while !before.last().is_some_and(|line| line.contains("  channel 2 transmit queue: ")) {
+            before.push(lines.next().unwrap());
+        }
+        kill_process(Pid::from_child(&child), Signal::INT).unwrap();
+        let rest: Vec<String> = lines.collect();
+        let says_so = rest.last().unwrap().ends_with("; Ctrl-C ended it, and not all steps were tried");
+        assert!(says_so && !rest.iter().any(|line| line.starts_with("FAIL")), "{before:#?} {rest:#?}");
+        let code = child.wait().unwrap().code();
+        // A busy computer may have failed a step before, or have sent the signal between two steps.
+        let is_busy = before.iter().any(|line| line.starts_with("FAIL"));
+        assert_eq!(code, Some(if is_busy { 1 } else { 130 }), "{before:#?} {rest:#?}");
+        rest.first().map(String::as_str)
+            == Some("skip  both channels saturated, each by itself: Ctrl-C ended it")
+    };
+    assert!((0..10).any(|_| run()));
 }
 
 #[test]

@@ -39,6 +39,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<frame::Record>()?;
     module.add_class::<report::Report>()?;
     device::register(module)?;
+    device::diagnostics::register(module)?;
     traces::register(module)?;
     encode::register(module)?;
     messages::register(module)?;

@@ -10,14 +10,12 @@ use cantap_trace::TraceRecord;
 use cantap_wire::Channel;
 use pyo3::prelude::*;
 
-use self::on_device::OnDevice;
+use self::on_device::{OnDevice, SEED};
 use crate::database::Database;
 use crate::error::Error;
 use crate::frame::{AnyFrame, Record};
 use crate::number::Whole;
 
-/// The seed of random numbers, as the command's.
-const SEED: u64 = 1;
 /// Simulated buses have this bit rate unless the options fix another, in bit/s.
 const SIMULATED_BPS: u32 = 500_000;
 

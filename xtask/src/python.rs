@@ -25,47 +25,57 @@ pub fn dist(shell: &Shell) -> Result<[PathBuf; 2]> {
     shell.create_dir(&unpacked)?;
     cmd!(shell, "tar --extract --file {archive} --directory {unpacked}").run()?;
     let sources = only_file(&unpacked)?;
-    Ok([wheel(shell, &sources, Profile::Release, &target().join("dist"))?, archive])
+    Ok([released_wheel(shell, &sources)?, archive])
 }
 
-/// What a wheel is built for.
-#[derive(Clone, Copy)]
-enum Profile {
-    /// For tests: the workspace's profile, next to its builds, so that compiled crates of other people are shared.
-    Dev,
-    /// For users.
-    Release,
-}
-
-/// Builds a wheel from the sources in a folder and returns its path.
-fn wheel(shell: &Shell, sources: &Path, profile: Profile, out: &Path) -> Result<PathBuf> {
+/// Builds the wheel for users from the sources in a folder and returns its path.
+fn released_wheel(shell: &Shell, sources: &Path) -> Result<PathBuf> {
     let maturin = peers::venv(shell)?.join("bin/maturin");
-    let manifest = sources.join(MANIFEST);
-    let (profile, compiled) = match profile {
-        Profile::Dev => ("dev", workspace::target()),
-        Profile::Release => ("release", target()),
-    };
-    shell.remove_path(out)?;
-    cmd!(shell, "{maturin} build --manifest-path {manifest} --profile {profile} --out {out}")
-        .env("CARGO_TARGET_DIR", compiled)
+    let (manifest, out) = (sources.join(MANIFEST), target().join("dist"));
+    shell.remove_path(&out)?;
+    cmd!(shell, "{maturin} build --manifest-path {manifest} --out {out}")
+        .env("CARGO_TARGET_DIR", target())
         .run()?;
-    only_file(out)
+    only_file(&out)
 }
+
+/// Builds a wheel for tests and returns its path.
+///
+/// `maturin build` would compile this package alone, and with it the crates that then have other features than in the whole workspace,
+/// Arrow and Parquet among them. So the library is compiled as the tests of the workspace are, and maturin tells what else is in a wheel.
+fn wheel(shell: &Shell) -> Result<PathBuf> {
+    cmd!(shell, "cargo build --locked --workspace --all-features --lib").run()?;
+    let tools = peers::venv(shell)?.join("bin");
+    let (maturin, python) = (tools.join("maturin"), tools.join("python"));
+    let (unpacked, out) = (target().join("wheel"), target().join("wheels"));
+    for folder in [&unpacked, &out] {
+        shell.remove_path(folder)?;
+        shell.create_dir(folder)?;
+    }
+    let there = shell.clone();
+    there.change_dir("python");
+    cmd!(there, "{maturin} pep517 write-dist-info --metadata-directory {unpacked} --interpreter {python}")
+        .run()?;
+    let files = cmd!(there, "git ls-files --cached --others --exclude-standard cantap").quiet().read()?;
+    for file in files.lines().filter(|file| there.path_exists(file)) {
+        shell.create_dir(unpacked.join(file).parent().unwrap_or(&unpacked))?;
+        there.copy_file(file, unpacked.join(file))?;
+    }
+    let library = workspace::target().join("debug").join(LIBRARY);
+    shell.copy_file(library, unpacked.join("cantap/_native.abi3.so"))?;
+    cmd!(shell, "{python} -m wheel pack {unpacked} --dest-dir {out}").quiet().run()?;
+    only_file(&out)
+}
+
+/// What the compiler calls the extension module.
+const LIBRARY: &str = if cfg!(target_os = "macos") { "lib_native.dylib" } else { "lib_native.so" };
 
 /// The whole step.
 pub fn check(shell: &Shell, peers: Option<&Peers>) -> Result<Outcome> {
     if peers.is_none() {
         return Ok(Outcome::Skipped("its tests need the peers, which cannot be installed here".to_owned()));
     }
-    // Lints first: they need no wheel.
-    cmd!(shell, "cargo fmt --manifest-path {MANIFEST} --check").run()?;
-    cmd!(shell, "cargo clippy --manifest-path {MANIFEST} -- -D warnings")
-        .env("CARGO_TARGET_DIR", workspace::target())
-        .run()?;
-    cmd!(shell, "cargo clippy --manifest-path {MANIFEST} --no-default-features -- -D warnings")
-        .env("CARGO_TARGET_DIR", workspace::target())
-        .run()?;
-    let wheel = wheel(shell, &workspace::root(), Profile::Dev, &target().join("wheels"))?;
+    let wheel = wheel(shell)?;
     let python = environment(shell, &wheel)?;
     cmd!(shell, "{python} -m mypy --config-file python/pyproject.toml python/cantap python/tests/typed.py")
         .run()?;
@@ -104,7 +114,7 @@ pub fn check(shell: &Shell, peers: Option<&Peers>) -> Result<Outcome> {
 #[cfg(feature = "bench")]
 pub fn measure() -> Result<()> {
     let shell = workspace::shell()?;
-    let wheel = wheel(&shell, &workspace::root(), Profile::Release, &target().join("dist"))?;
+    let wheel = released_wheel(&shell, &workspace::root())?;
     let python = environment(&shell, &wheel)?;
     Ok(cmd!(shell, "{python} python/bench/side_by_side.py").run()?)
 }

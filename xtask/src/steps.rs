@@ -75,9 +75,9 @@ impl Step {
         Self::Page,
         Self::Wasm,
         Self::Systems,
-        Self::Fuzz,
         Self::Dependencies,
         Self::OldestCompiler,
+        Self::Fuzz,
         Self::Features,
         Self::Doc,
         Self::PublicApi,
@@ -112,7 +112,7 @@ impl Step {
             Step::OldestCompiler => return compiler::check(shell),
             Step::Features => features::check(shell)?,
             Step::Fuzz => {
-                let target = workspace::target().join("fuzz");
+                let target = workspace::target();
                 // A separate workspace, but with the same versions.
                 shell.copy_file("Cargo.lock", "fuzz/Cargo.lock")?;
                 cmd!(shell, "cargo check --manifest-path fuzz/Cargo.toml --target-dir {target}").run()?;

@@ -14,10 +14,11 @@ use cantap_work::uds::TransferOptions;
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
+use super::Device;
 use super::fanout::{Listener, SentFrames, Wanted};
 use super::session::{HowToSend, Sending, Session};
 use super::transmissions::NOBODY;
-use super::{Device, duration, signals};
+use super::waiting::{duration, signals};
 use crate::error::Error;
 use crate::number::OfDevice;
 

@@ -1,6 +1,7 @@
 //! A device, for Python. Every waiting call lets other Python threads run, and Ctrl-C through.
 
-mod diagnostics;
+mod channel_options;
+pub mod diagnostics;
 mod fanout;
 mod gateway;
 mod lock;
@@ -8,10 +9,11 @@ mod records;
 mod session;
 mod tasks;
 mod transmissions;
+mod waiting;
 
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use cantap::bit_timing::TimingRequest;
 use cantap::device::{ClockSource, Transmission};
@@ -21,11 +23,11 @@ use cantap::wire::{BitTiming, Channel, Refusal};
 use cantap::{DeviceError as DeviceFault, TraceFrame};
 use cantap_trace::filter::Filter;
 use cantap_trace::{BusErrorKind, TransmitFailure};
-use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde_json::json;
 
+use self::channel_options::ChannelOptions;
 use self::fanout::{SentFrames, Wanted};
 use self::gateway::Gateway;
 use self::lock::lock;
@@ -33,13 +35,11 @@ use self::records::{Records, SLICE};
 use self::session::{HowToSend, Session};
 use self::tasks::{PeriodicFrame, Reply};
 use self::transmissions::{NOBODY, SenderId};
+use self::waiting::{duration, signals};
 use crate::error::{DeviceError, Error};
 use crate::frame::AnyFrame;
-use crate::number::{OfDevice, Whole, entry};
+use crate::number::{OfDevice, Whole};
 use crate::report::from_json;
-
-/// A frame that has not ended after this time will not end on its own.
-const MOST_TIME: Duration = Duration::from_hours(24);
 
 /// A device in a session of this program.
 #[pyclass(module = "cantap", frozen, weakref)]
@@ -48,60 +48,10 @@ pub struct Device {
     gateway: Mutex<Option<Gateway>>,
 }
 
-/// How to open a channel, as passed by the Python half.
-pub struct ChannelOptions {
-    bitrate: Option<u32>,
-    mode: String,
-    sample_point: Option<f64>,
-    sjw: Option<u8>,
-    /// Prescaler, segment 1, segment 2, jump width.
-    segments: Option<(u16, u8, u8, u8)>,
-    one_shot: bool,
-    manual_recovery: bool,
-    filters: Vec<String>,
-}
-
-/// Prescaler, segment 1, segment 2, jump width.
-type Segments = (Whole<u16>, Whole<u8>, Whole<u8>, Whole<u8>);
-
-impl<'py> FromPyObject<'_, 'py> for ChannelOptions {
-    type Error = PyErr;
-
-    fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
-        let bitrate: Option<Whole<u32>> = entry(object, "bitrate", "bitrate")?;
-        let sjw: Option<Whole<u8>> = entry(object, "sjw", "sjw")?;
-        let segments: Option<Segments> = entry(object, "segments", "segments")?;
-        Ok(Self {
-            bitrate: bitrate.map(|bitrate| bitrate.0),
-            mode: entry(object, "mode", "mode")?,
-            sample_point: entry(object, "sample_point", "sample_point")?,
-            sjw: sjw.map(|sjw| sjw.0),
-            segments: segments
-                .map(|(prescaler, first, second, jump)| (prescaler.0, first.0, second.0, jump.0)),
-            one_shot: entry(object, "one_shot", "one_shot")?,
-            manual_recovery: entry(object, "manual_recovery", "manual_recovery")?,
-            filters: entry(object, "filters", "filter")?,
-        })
-    }
-}
-
-/// A time to wait, at most a day.
-pub fn duration(seconds: f64) -> PyResult<Duration> {
-    let time = Duration::try_from_secs_f64(seconds);
-    let time = time.map_err(|_| PyValueError::new_err(format!("{seconds} s is not a valid time to wait")))?;
-    Ok(time.min(MOST_TIME))
-}
-
 /// This computer's UTC in nanoseconds since 1970.
 fn utc_ns() -> i64 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     since.as_nanos() as i64
-}
-
-/// Lets Python handle signals.
-#[expect(clippy::redundant_closure_for_method_calls, reason = "the method is for one lifetime")]
-pub fn signals() -> Result<(), Error> {
-    Python::attach(|py| py.check_signals()).map_err(Error::Python)
 }
 
 /// The error for a frame that was not sent.
@@ -284,7 +234,7 @@ impl Device {
             (None, false) => SentFrames::All,
         };
         let listener = session.fanout.listen(Wanted { channel, filters, sent }, capacity.0);
-        Ok(Records::new(slf.clone().unbind(), session.address.clone(), listener))
+        Ok(Records::new(slf.clone().into_any().unbind(), session.address.clone(), listener))
     }
 
     /// Sends frames and returns when each was on the bus, in nanoseconds since 1970; without `timeout` they are only passed to the device.
@@ -544,6 +494,5 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Records>()?;
     module.add_class::<PeriodicFrame>()?;
     module.add_class::<Reply>()?;
-    diagnostics::register(module)?;
     module.add_function(wrap_pyfunction!(list_boards, module)?)
 }

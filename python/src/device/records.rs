@@ -11,7 +11,6 @@ use cantap_trace::{Direction, TraceEvent};
 use pyo3::prelude::*;
 use pyo3::types::PyByteArray;
 
-use super::Device;
 use super::fanout::Listener;
 use super::lock::lock;
 use crate::error::{DeviceError, Error};
@@ -27,7 +26,7 @@ pub const SLICE: Duration = Duration::from_millis(50);
 #[pyclass(module = "cantap", frozen)]
 pub struct Records {
     /// Kept so that a device that nobody closes stays open as long as somebody listens.
-    _device: Py<Device>,
+    _device: Py<PyAny>,
     /// The device's address, and the process in which it was opened.
     address: String,
     process: u32,
@@ -70,7 +69,7 @@ enum Next {
 }
 
 impl Records {
-    pub fn new(device: Py<Device>, address: String, listener: Arc<Listener>) -> Self {
+    pub fn new(device: Py<PyAny>, address: String, listener: Arc<Listener>) -> Self {
         Self {
             _device: device,
             address,

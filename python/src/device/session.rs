@@ -38,7 +38,7 @@ pub struct Session {
     pub transmissions: Arc<Transmissions>,
     next_tag: AtomicU32,
     /// Entries in use in the device's tables.
-    slots: Mutex<HashMap<(Table, Channel), Vec<bool>>>,
+    slots: Mutex<HashMap<(SlotTable, Channel), Vec<bool>>>,
 }
 
 /// How frames are sent.
@@ -56,7 +56,7 @@ pub struct HowToSend {
 
 /// A table of what a device sends on its own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Table {
+pub enum SlotTable {
     /// Periodic frames.
     Periodic,
     /// Replies.
@@ -221,11 +221,11 @@ impl Session {
     }
 
     /// Takes a free entry of a table.
-    pub fn take_slot(&self, table: Table, channel: Channel) -> Result<u8, Error> {
+    pub fn take_slot(&self, table: SlotTable, channel: Channel) -> Result<u8, Error> {
         let hello = self.device()?.hello();
         let (count, what) = match table {
-            Table::Periodic => (hello.periodic_slots, "periodic frames"),
-            Table::Replies => (hello.trigger_slots, "replies"),
+            SlotTable::Periodic => (hello.periodic_slots, "periodic frames"),
+            SlotTable::Replies => (hello.trigger_slots, "replies"),
         };
         let mut slots = lock(&self.slots);
         let slots = slots.entry((table, channel)).or_insert_with(|| vec![false; usize::from(count)]);
@@ -239,7 +239,7 @@ impl Session {
     }
 
     /// Gives it back.
-    pub fn free_slot(&self, table: Table, channel: Channel, slot: u8) {
+    pub fn free_slot(&self, table: SlotTable, channel: Channel, slot: u8) {
         if let Some(slots) = lock(&self.slots).get_mut(&(table, channel)) {
             slots[usize::from(slot)] = false;
         }

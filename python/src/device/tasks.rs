@@ -12,7 +12,7 @@ use cantap::{Channel, Frame, Id};
 use pyo3::prelude::*;
 
 use super::lock::lock;
-use super::session::{Session, Table};
+use super::session::{Session, SlotTable};
 use super::transmissions::{NOBODY, SenderId};
 use crate::error::Error;
 use crate::frame::{AnyFrame, identifier};
@@ -48,16 +48,21 @@ fn modifier((kind, byte, low_bit, bits, algorithm): &ModifierWords) -> Result<Mo
 struct Entry {
     /// Gone when the device is closed, and with it everything that it sends on its own.
     session: Weak<Session>,
-    table: Table,
+    table: SlotTable,
     channel: Channel,
     slot: Mutex<Option<u8>>,
 }
 
 impl Entry {
     /// `sender`: who has its frames sent.
-    fn take(session: &Arc<Session>, table: Table, channel: Channel, sender: SenderId) -> Result<Self, Error> {
+    fn take(
+        session: &Arc<Session>,
+        table: SlotTable,
+        channel: Channel,
+        sender: SenderId,
+    ) -> Result<Self, Error> {
         let slot = session.take_slot(table, channel)?;
-        let first = if table == Table::Periodic { DEVICE_TAG } else { TRIGGER_TAG };
+        let first = if table == SlotTable::Periodic { DEVICE_TAG } else { TRIGGER_TAG };
         session.transmissions.requested(channel, first + u32::from(slot), sender);
         Ok(Self { session: Arc::downgrade(session), table, channel, slot: Mutex::new(Some(slot)) })
     }
@@ -73,8 +78,8 @@ impl Entry {
         let Some(session) = self.session.upgrade() else { return Ok(()) };
         let device = session.device()?;
         let cleared = match self.table {
-            Table::Periodic => device.set_periodic(self.channel, slot, None),
-            Table::Replies => device.set_trigger(self.channel, slot, None),
+            SlotTable::Periodic => device.set_periodic(self.channel, slot, None),
+            SlotTable::Replies => device.set_trigger(self.channel, slot, None),
         };
         session.free_slot(self.table, self.channel, slot);
         Ok(cleared?)
@@ -114,7 +119,7 @@ impl PeriodicFrame {
             Error::argument(format!("a periodic frame has at most {MAX_MODIFIERS} modifiers"))
         })?;
         let set = Periodic { frame, period_ticks: ticks, count, modifiers };
-        let entry = Entry::take(&session, Table::Periodic, channel, sender)?;
+        let entry = Entry::take(&session, SlotTable::Periodic, channel, sender)?;
         let task = Self { entry, set: Mutex::new(set) };
         task.apply()?;
         Ok(task)
@@ -179,7 +184,7 @@ impl Reply {
             )));
         }
         let filter = Filter { extended: id.is_extended(), kind: FrameKind::Any, id: id.raw() & mask, mask };
-        let entry = Entry::take(&session, Table::Replies, channel, NOBODY)?;
+        let entry = Entry::take(&session, SlotTable::Replies, channel, NOBODY)?;
         let slot = lock(&entry.slot).unwrap_or_default();
         session.device()?.set_trigger(channel, slot, Some(Trigger { filter, reply, count }))?;
         Ok(Self { entry })

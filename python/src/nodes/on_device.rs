@@ -13,9 +13,10 @@ use cantap_signals::Decoder;
 use cantap_trace::Frame;
 use cantap_wire::Channel;
 
-use super::SEED;
 use crate::error::Error;
 
+/// The seed of random numbers, as the command's.
+pub const SEED: u64 = 1;
 /// How long an order waits at most for the nodes' thread.
 const TURN: Duration = Duration::from_millis(1);
 /// How long after its time a record may arrive.

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -57,6 +57,9 @@ pub struct Listener {
 /// Listeners are announced until this is dropped; then others are told that they have gone.
 pub struct Announcing {
     is_over: Arc<AtomicBool>,
+    /// How often it was begun anew, because others had said too much: for tests.
+    #[cfg_attr(not(test), expect(dead_code))]
+    begun_anew: Arc<AtomicU64>,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -71,6 +74,8 @@ fn announce_on(network: Network, listeners: &[Listener]) -> io::Result<Announcin
     let mut daemon = Some(begin(network, &services)?);
     let is_over = Arc::new(AtomicBool::new(false));
     let ends = Arc::clone(&is_over);
+    let begun_anew = Arc::new(AtomicU64::new(0));
+    let begins = Arc::clone(&begun_anew);
     let thread = std::thread::Builder::new().name("cantap-dns-sd".to_owned()).spawn(move || {
         while !ends.load(Ordering::Relaxed) {
             std::thread::sleep(LOOK_EVERY);
@@ -80,13 +85,14 @@ fn announce_on(network: Network, listeners: &[Listener]) -> io::Result<Announcin
                     let _ = daemon.shutdown();
                 }
                 daemon = begin(network, &services).ok();
+                begins.fetch_add(1, Ordering::Relaxed);
             }
         }
         if let Some(daemon) = daemon {
             end(&daemon, &services);
         }
     })?;
-    Ok(Announcing { is_over, thread: Some(thread) })
+    Ok(Announcing { is_over, begun_anew, thread: Some(thread) })
 }
 
 /// What others are told of a listener.

@@ -239,7 +239,7 @@ def test_threads_read_beside_each_other(tmp_path):
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(timeout=60)
+        thread.join(timeout=120)
     assert counts == [20_000] * 4
 
 

@@ -43,7 +43,8 @@ mod typos;
 mod web;
 mod workspace;
 
-use std::process::ExitCode;
+use std::ffi::OsString;
+use std::process::{Command, ExitCode};
 
 use clap::{Parser, Subcommand};
 
@@ -84,6 +85,9 @@ enum Task {
 }
 
 fn main() -> ExitCode {
+    if let Some(code) = as_if_run_by_hand() {
+        return code;
+    }
     let result = match Cli::parse().task {
         Task::Firmware(args) => firmware::run(&args),
         Task::Test(args) => test::run(&args),
@@ -105,4 +109,27 @@ fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     }
+}
+
+/// Runs this program once more if cargo runs it. Cargo describes a package to the program in variables, and there are build scripts that
+/// watch them (ring's): run from here and by hand in turn, it would compile their crates, and all above them, each time anew.
+fn as_if_run_by_hand() -> Option<ExitCode> {
+    let is_of_package = |name: &OsString| name.to_str().is_some_and(|name| name.starts_with("CARGO_PKG_"));
+    let names: Vec<OsString> = std::env::vars_os().map(|(name, _)| name).filter(is_of_package).collect();
+    if names.is_empty() {
+        return None;
+    }
+    let mut again = Command::new(std::env::current_exe().ok()?);
+    again.args(std::env::args_os().skip(1));
+    for name in names {
+        again.env_remove(name);
+    }
+    #[cfg(unix)]
+    {
+        // In its place; it returns only if that is impossible.
+        let _ = std::os::unix::process::CommandExt::exec(&mut again);
+        None
+    }
+    #[cfg(not(unix))]
+    again.status().ok().map(|status| if status.success() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }

@@ -36,9 +36,10 @@ def test_the_logger_of_python_can_writes_files_one_after_another(tmp_path):
     process = subprocess.Popen([*command, "-f", tmp_path / "log.asc", "-s", "2000"], stderr=subprocess.PIPE, text=True)
     try:
         until(lambda: len(os.listdir(tmp_path)) > 2 or process.poll() is not None)
-    finally:
         process.send_signal(signal.SIGINT)
         _, said = process.communicate(timeout=120)
+    finally:
+        process.kill()
     assert "CantapWarning" not in said and len(os.listdir(tmp_path)) > 2, said
 
 

@@ -16,6 +16,7 @@ pub enum Waited {
     /// Nothing came.
     Nothing,
     /// The terminal is gone.
+    #[cfg_attr(not(unix), expect(dead_code, reason = "a console stays"))]
     Gone,
 }
 

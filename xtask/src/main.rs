@@ -41,6 +41,8 @@ mod tests;
 mod toolchain;
 mod typos;
 mod web;
+#[cfg(unix)]
+mod wine;
 mod workspace;
 
 use std::ffi::OsString;

@@ -8,6 +8,8 @@ use crate::board::Board;
 use crate::machine::Machine;
 use crate::outcome::Outcome;
 use crate::toolchain::Toolchain;
+#[cfg(unix)]
+use crate::wine;
 use crate::{
     check, compiler, cross, dependencies, features, firmware, kernel, package, python, reproducible, tests,
     typos, web, workspace,
@@ -62,6 +64,8 @@ pub enum Step {
     Page,
     /// The crates as they would be published: each packs.
     Package,
+    /// The command for Windows, run under Wine.
+    Windows,
 }
 
 impl Step {
@@ -85,6 +89,9 @@ impl Step {
         Self::Reproducible,
         Self::Package,
     ];
+
+    /// What takes too long for every change, and runs weekly.
+    pub const WEEKLY: [Self; 1] = [Self::Windows];
 
     /// Its name on the command line.
     pub fn name(self) -> String {
@@ -138,6 +145,12 @@ impl Step {
             Step::Page => return web::builds(machine),
             Step::Demo => cmd!(shell, "cargo demo --time 3s").run()?,
             Step::Package => package::check(shell)?,
+            #[cfg(unix)]
+            Step::Windows => return wine::check(machine),
+            #[cfg(not(unix))]
+            Step::Windows => {
+                return Ok(Outcome::Skipped("Wine is needed where there is no Windows".to_owned()));
+            }
         }
         Ok(Outcome::Passed)
     }

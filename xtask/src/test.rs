@@ -35,8 +35,8 @@ pub fn ci(args: &Args) -> Result<()> {
     if !args.only.is_empty() {
         return run_steps(args, &args.only, &[], &Board::ALL);
     }
-    let steps: Vec<Step> =
-        Step::value_variants().iter().copied().filter(|step| !Step::MEANWHILE.contains(step)).collect();
+    let is_now = |step: &Step| !Step::MEANWHILE.contains(step) && !Step::WEEKLY.contains(step);
+    let steps: Vec<Step> = Step::value_variants().iter().copied().filter(is_now).collect();
     run_steps(args, &steps, &Step::MEANWHILE, &Board::ALL)
 }
 

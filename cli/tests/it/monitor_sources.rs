@@ -214,8 +214,9 @@ fn a_vehicle_at_a_serial_port_is_known_by_its_signals() {
     view.keys("/.enginespeed\r");
     view.wait_until("no prompt", |screen| !screen.contains(" > "));
     view.keys("\r4");
-    let graph = view.wait_for("rpm EngineSpeed ");
-    assert!(graph.contains(" UTC") && graph.contains("10 s, steps"), "{graph}");
+    let is_whole =
+        |screen: &str| ["rpm EngineSpeed ", " UTC", "10 s, steps"].iter().all(|part| screen.contains(part));
+    view.wait_until("the graph with its time axis", is_whole);
     view.keys("xx");
     view.wait_for("Δt 0.000000 s");
     view.resize((80, 24));

@@ -231,3 +231,66 @@ def test_a_missing_database_makes_no_lake(traces, tmp_path):
     with pytest.raises(FileNotFoundError):
         ingest(traces, tmp_path / "lake", db=tmp_path / "none.dbc")
     assert not (tmp_path / "lake").exists()
+
+
+def outside(tmp_path):
+    victim = tmp_path / "precious.parquet"
+    victim.write_bytes(b"precious")
+    return victim
+
+
+def test_an_entry_of_somebody_else_removes_nothing_outside_of_the_lake(traces, tmp_path):
+    lake, victim = tmp_path / "lake", outside(tmp_path)
+    ingest(traces / "007", lake)
+    for name in ("../precious.parquet", str(victim), "signals/../../precious.parquet"):
+        forged = sorted((lake / "ledger").glob("*.json"))[0]
+        entry = json.loads(forged.read_bytes())
+        entry["files"]["signals"] = {name: 0}
+        forged.write_text(json.dumps(entry))
+        with pytest.raises(store.StoreError, match="damaged"):
+            list(Store(lake).entries())
+        # With a database the trace has other rows, which take the place of those that the entry names.
+        ingest(traces / "007", lake, db=tmp_path / "car.dbc")
+        assert victim.read_bytes() == b"precious", name
+    assert len(rows(lake)) == 60 and list(Store(lake).problems()) == []
+
+
+def test_an_entry_is_called_by_its_content(traces, tmp_path):
+    lake = tmp_path / "lake"
+    victim = tmp_path / "precious.json"
+    victim.write_text("precious")
+    ingest(traces / "007", lake)
+    forged = sorted((lake / "ledger").glob("*.json"))[0]
+    entry = json.loads(forged.read_bytes())
+    forged.write_text(json.dumps({**entry, "sha256": "../../precious"}))
+    with pytest.raises(store.StoreError, match="damaged"):
+        Store(lake).forget()
+    assert victim.read_text() == "precious"
+
+
+def test_a_transaction_of_somebody_else_touches_nothing_outside_of_the_lake(traces, tmp_path):
+    lake, victim = tmp_path / "lake", outside(tmp_path)
+    os.utime(victim, (1000, 1000))
+    ingest(traces / "007", lake)
+    sha256 = sorted((lake / "ledger").glob("*.json"))[0].stem
+    for moves in ({sha256: {"../precious.parquet": {}}}, {sha256: {"frames/a.parquet": {"../precious.parquet": 1}}}, {"../../precious": {}}, [], {sha256: 1}):
+        (lake / "moves.json").write_text(json.dumps({"number": 1, "moves": moves, "done": False}))
+        with pytest.raises(ValueError, match="damaged"):
+            Store(lake).mend()
+        assert victim.stat().st_mtime == 1000 and victim.read_bytes() == b"precious", moves
+
+
+def test_a_joined_file_of_somebody_else_writes_nothing_outside_of_the_lake(traces, tmp_path):
+    lake, victim = tmp_path / "lake", outside(tmp_path)
+    ingest(traces / "007", lake)
+    entry = next(Store(lake).entries())
+    (name,) = [name for name in entry["files"]["frames"] if "channel=1" in name][:1]
+    table = pa.parquet.read_table(lake / name)
+    members = [[entry["sha256"], "../precious.parquet", table.num_rows]]
+    forged = f"{name.rpartition('/')[0]}/joined-0.parquet"
+    pa.parquet.write_table(table.replace_schema_metadata({b"cantap.members": json.dumps(members)}), lake / forged)
+    entry["files"]["frames"][forged] = entry["files"]["frames"].pop(name) + 1
+    (lake / "ledger" / f"{entry['sha256']}.json").write_text(json.dumps(entry))
+    with pytest.raises(OSError, match="outside"):
+        Store(lake).mend()
+    assert victim.read_bytes() == b"precious"

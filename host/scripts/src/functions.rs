@@ -118,24 +118,24 @@ fn reacting(engine: &mut Engine, runtime: &Rc<Runtime>) {
     let of = Rc::clone(runtime);
     engine.register_fn("on_frame", move |ids: &str, call: FnPtr| -> Result<Handle> {
         let selector = selector(&of, ids)?;
-        Ok(Handle(of.with_handlers(|handlers| handlers.on_frame(selector, call))))
+        of.react(|handlers| handlers.on_frame(selector, call)).map(Handle)
     });
     let of = Rc::clone(runtime);
     engine.register_fn("on_frame", move |call: FnPtr| {
-        Handle(of.with_handlers(|handlers| handlers.on_frame(Selector::All, call)))
+        of.react(|handlers| handlers.on_frame(Selector::All, call)).map(Handle)
     });
     let of = Rc::clone(runtime);
     engine.register_fn("on_message", move |name: &str, call: FnPtr| -> Result<Handle> {
         let selector = message_selector(&of, name)?;
-        Ok(Handle(of.with_handlers(|handlers| handlers.on_frame(selector, call))))
+        of.react(|handlers| handlers.on_frame(selector, call)).map(Handle)
     });
     let of = Rc::clone(runtime);
-    engine.register_fn("on_error", move |call: FnPtr| of.with_handlers(|handlers| handlers.on_error(call)));
+    engine.register_fn("on_error", move |call: FnPtr| of.react(|handlers| handlers.on_error(call)));
     let of = Rc::clone(runtime);
-    engine.register_fn("on_state", move |call: FnPtr| of.with_handlers(|handlers| handlers.on_state(call)));
+    engine.register_fn("on_state", move |call: FnPtr| of.react(|handlers| handlers.on_state(call)));
     let of = Rc::clone(runtime);
     engine.register_fn("on_key", move |key: char, call: FnPtr| {
-        Handle(of.with_handlers(|handlers| handlers.on_key(Some(key), call)))
+        of.react(|handlers| handlers.on_key(Some(key), call)).map(Handle)
     });
     let of = Rc::clone(runtime);
     engine.register_fn("on_key", move |key: &str, call: FnPtr| -> Result<Handle> {
@@ -143,16 +143,16 @@ fn reacting(engine: &mut Engine, runtime: &Rc<Runtime>) {
         let (Some(key), None) = (characters.next(), characters.next()) else {
             return Err(format!("{key:?} is not one key; write it as in on_key(\"a\", || …)").into());
         };
-        Ok(Handle(of.with_handlers(|handlers| handlers.on_key(Some(key), call))))
+        of.react(|handlers| handlers.on_key(Some(key), call)).map(Handle)
     });
     let of = Rc::clone(runtime);
     engine.register_fn("on_key", move |call: FnPtr| {
-        Handle(of.with_handlers(|handlers| handlers.on_key(None, call)))
+        of.react(|handlers| handlers.on_key(None, call)).map(Handle)
     });
     let of = Rc::clone(runtime);
     engine.register_fn("every", move |period: &str, call: FnPtr| -> Result<Handle> {
         let period_ns = positive_ns(period)?;
-        Ok(Handle(of.after(period_ns, Some(Repeated::exactly(period_ns)), call)))
+        of.after(period_ns, Some(Repeated::exactly(period_ns)), call).map(Handle)
     });
     let of = Rc::clone(runtime);
     engine.register_fn("every", move |period: &str, jitter: &str, call: FnPtr| -> Result<Handle> {
@@ -160,11 +160,11 @@ fn reacting(engine: &mut Engine, runtime: &Rc<Runtime>) {
         if jitter_ns >= period_ns {
             return Err(format!("a jitter of {jitter} is not less than the period, {period}").into());
         }
-        Ok(Handle(of.after(period_ns, Some(Repeated { period_ns, jitter_ns }), call)))
+        of.after(period_ns, Some(Repeated { period_ns, jitter_ns }), call).map(Handle)
     });
     let of = Rc::clone(runtime);
     engine.register_fn("after", move |delay: &str, call: FnPtr| -> Result<Handle> {
-        Ok(Handle(of.after(ns(delay)?, None, call)))
+        of.after(ns(delay)?, None, call).map(Handle)
     });
     let of = Rc::clone(runtime);
     engine.register_fn("stop", move |handle: Handle| of.with_handlers(|handlers| handlers.end(handle.0)));

@@ -131,6 +131,11 @@ impl Handlers {
         self.keys.retain(|(of, _, _)| *of != handle);
     }
 
+    /// How many functions there are.
+    pub const fn len(&self) -> usize {
+        self.frames.len() + self.errors.len() + self.states.len() + self.keys.len() + self.timers.len()
+    }
+
     /// Whether there is no function for anything.
     pub fn is_empty(&self) -> bool {
         !self.has_frames() && !self.has_events() && !self.has_keys() && self.timers.is_empty()

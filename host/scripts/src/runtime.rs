@@ -17,7 +17,7 @@ use crate::handlers::{BusEvent, Handlers, Repeated, Selector};
 use crate::sandbox::Operations;
 use crate::script_frame::ScriptFrame;
 use crate::script_result::Result;
-use crate::servers::Servers;
+use crate::servers::{Server, Servers};
 use crate::settings::Settings;
 
 /// Ends a script from outside: an error that it cannot catch.
@@ -25,6 +25,12 @@ pub const ENDED: &str = "ended";
 
 /// How many unconfirmed frames a script may have: more are a loop without a wait.
 const MAX_UNCONFIRMED: usize = 4096;
+/// How many frames a script may have repeated: more are a loop that starts one each time.
+const MAX_REPEATED: usize = 4096;
+/// How many functions, and how many servers, a script may have waiting: each of them is looked at in every turn.
+const MAX_WAITING: usize = 8192;
+/// What an output costs in operations besides its text: about its bytes.
+const OUTPUT_COST: usize = 64;
 
 /// The state of a script.
 pub struct Runtime {
@@ -116,10 +122,32 @@ impl Runtime {
         act(&mut self.state.borrow_mut().handlers)
     }
 
+    /// Adds something that the script reacts to.
+    pub fn react<R>(&self, add: impl FnOnce(&mut Handlers) -> R) -> Result<R> {
+        self.has_place(self.with_handlers(|handlers| handlers.len()), "functions")?;
+        Ok(self.with_handlers(add))
+    }
+
+    /// Adds what answers for the script; returns its place.
+    pub fn serve_with(&self, channel: Channel, name: String, server: Server) -> Result<usize> {
+        let mut servers = self.servers.borrow_mut();
+        self.has_place(servers.len(), "servers")?;
+        Ok(servers.add(channel, name, server))
+    }
+
+    fn has_place(&self, len: usize, what: &str) -> Result<()> {
+        if len < MAX_WAITING {
+            return Ok(());
+        }
+        Err(format!("{MAX_WAITING} {what} are waiting already; add none each time that something happens")
+            .into())
+    }
+
     /// Calls a function after a time, then again if it is repeated; returns its handle.
-    pub fn after(&self, delay_ns: u64, repeated: Option<Repeated>, call: FnPtr) -> u32 {
+    pub fn after(&self, delay_ns: u64, repeated: Option<Repeated>, call: FnPtr) -> Result<u32> {
+        self.has_place(self.with_handlers(|handlers| handlers.len()), "functions")?;
         let State { handlers, now_ns, random, .. } = &mut *self.state.borrow_mut();
-        handlers.at(*now_ns + delay_ns, repeated, call, random)
+        Ok(handlers.at(*now_ns + delay_ns, repeated, call, random))
     }
 
     /// Calls `act` with the script's random numbers.
@@ -137,6 +165,8 @@ impl Runtime {
     }
 
     fn output_of(&self, sender: Sender, output: Output) -> Result<()> {
+        let text_len = if let Output::Log(text) = &output { text.len() } else { 0 };
+        self.operations.spend(OUTPUT_COST + text_len);
         let mut state = self.state.borrow_mut();
         match &output {
             Output::Send { channel, .. } => {
@@ -148,6 +178,11 @@ impl Runtime {
                 }
             }
             Output::Repeat { handle, .. } => {
+                if state.repeated.len() >= MAX_REPEATED && !state.repeated.contains(handle) {
+                    let reason =
+                        format!("{MAX_REPEATED} frames are repeated already; stop(…) one of them first");
+                    return Err(reason.into());
+                }
                 state.repeated.insert(*handle);
             }
             Output::EndRepeat { handle } => {

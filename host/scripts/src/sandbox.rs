@@ -39,10 +39,17 @@ impl Operations {
         self.0.set(Used::default());
     }
 
+    /// Counts as so many operations: what a script hands over is kept until it waits. If that is too much, its next operation is its last.
+    pub fn spend(&self, cost: usize) {
+        let Used { operations, since } = self.0.get();
+        self.0.set(Used { operations: operations.saturating_add(cost as u64), since });
+    }
+
     /// One more; whether that is too much.
     fn count(&self) -> bool {
+        self.spend(1);
         let Used { operations, since } = self.0.get();
-        let (operations, since) = (operations + 1, since.unwrap_or_else(Instant::now));
+        let since = since.unwrap_or_else(Instant::now);
         self.0.set(Used { operations, since: Some(since) });
         operations > MAX_OPERATIONS || (operations.is_multiple_of(8) && since.elapsed() > MAX_TIME)
     }
@@ -65,4 +72,4 @@ pub fn engine(operations: &Operations) -> Engine {
 }
 
 /// Why a script was ended that did not wait.
-pub const TOO_LONG: &str = "it computed for too long without waiting; put a wait(\"1ms\") into its loop, or react to frames with on_frame";
+pub const TOO_LONG: &str = "it computed for too long, or logged too much, without waiting; put a wait(\"1ms\") into its loop, or react to frames with on_frame";

@@ -58,7 +58,7 @@ fn diagnostics(engine: &mut Engine, runtime: &Rc<Runtime>) {
         let (request, response) = (grammar::identifier(request)?, grammar::identifier(response)?);
         let server = IsoTpServer::new(request, functional, response, TransferSettings::default());
         let name = format!("server {response}");
-        of.servers.borrow_mut().add(Channel::Can1, name, Server::IsoTp(server, call));
+        of.serve_with(Channel::Can1, name, Server::IsoTp(server, call))?;
         Ok(())
     };
     let one = serve.clone();
@@ -81,7 +81,7 @@ fn j1939(engine: &mut Engine, runtime: &Rc<Runtime>) {
             requests: BTreeMap::new(),
             messages: BTreeMap::new(),
         };
-        let place = of.servers.borrow_mut().add(Channel::Can1, format!("node {address}"), server);
+        let place = of.serve_with(Channel::Can1, format!("node {address}"), server)?;
         Ok(J1939(Rc::downgrade(&of), place))
     });
     engine.register_get("address", |node: &mut J1939| node.with(|node| shown_address(node)));
@@ -128,7 +128,7 @@ fn canopen(engine: &mut Engine, runtime: &Rc<Runtime>) {
             return Err("the sheet has no objects; give it the text of an EDS file".into());
         }
         let server = Server::CanOpen { server: CanOpenServer::new(sheet, number), writes: BTreeMap::new() };
-        let place = of.servers.borrow_mut().add(Channel::Can1, format!("node {number}"), server);
+        let place = of.serve_with(Channel::Can1, format!("node {number}"), server)?;
         Ok(CanOpen(Rc::downgrade(&of), place))
     });
     engine.register_fn("get", |node: &mut CanOpen, index: i64| node.get(index, 0));
@@ -163,7 +163,7 @@ fn devicenet(engine: &mut Engine, runtime: &Rc<Runtime>) {
         let number = u8::try_from(mac).ok().filter(|mac| *mac < MAC_IDS);
         let number = number.ok_or_else(|| format!("{mac} is no MAC ID; those are 0 to 63"))?;
         let server = Server::DeviceNet(DeviceNetServer::new(number), call);
-        of.servers.borrow_mut().add(Channel::Can1, format!("node {number}"), server);
+        of.serve_with(Channel::Can1, format!("node {number}"), server)?;
         Ok(())
     });
 }

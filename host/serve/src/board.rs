@@ -91,6 +91,7 @@ impl Board {
             not_permitted: Mutex::new(LogLimit::of_refusals()),
             sessions: Mutex::new(LogLimit::of_sessions()),
             permissions: Mutex::default(),
+            budgets: Mutex::default(),
             audit: Mutex::default(),
             refused: AtomicU64::new(0),
             pages: AtomicU64::new(0),
@@ -141,7 +142,11 @@ impl Board {
     /// board's among those of the server, from 0: channels are numbered across them, as everywhere. Clients that are connected notice at
     /// once.
     pub fn permit_only(&self, permissions: Arc<Permissions>, number: usize) {
-        *lock(&self.shared.permissions) = Some((permissions, number));
+        let mut current = lock(&self.shared.permissions);
+        if current.is_none() {
+            *lock(&self.shared.budgets) = Arc::clone(&permissions.budgets);
+        }
+        *current = Some((permissions, number));
     }
 
     /// Who does what is recorded there from now on.

@@ -1,7 +1,7 @@
 //! One client: its requests are carried out, and those beyond its role are refused.
 
 pub mod admission;
-mod budget;
+pub mod budget;
 mod channels;
 mod sending;
 
@@ -57,7 +57,8 @@ struct Client {
     identity: Option<Identity>,
     /// What it may do, and the number of the board's first channel, from 0.
     permit: Option<(Permit, usize)>,
-    budget: Mutex<Budget>,
+    /// The certificate's, which its other connections use as well.
+    budget: Arc<Mutex<Budget>>,
     /// Frames sent on each channel that are not recorded yet.
     sent: Mutex<[u64; CHANNELS]>,
     place: Option<Place>,

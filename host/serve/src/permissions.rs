@@ -8,6 +8,7 @@ use cantap_wire::Id;
 use cantap_wire::message::{Mode, Role};
 use serde::Deserialize;
 
+use crate::client::budget::Budgets;
 use crate::small_file;
 
 const MINUTES_PER_DAY: u16 = 24 * 60;
@@ -28,6 +29,8 @@ pub struct Permissions {
     clients: BTreeMap<String, Permit>,
     /// For certificates that the file does not name; without it, they are refused.
     default: Option<Permit>,
+    /// For the boards that get these first. What has been sent counts on when the file is read again.
+    pub(crate) budgets: Budgets,
 }
 
 /// What one client may do. What is left out is not restricted.
@@ -121,6 +124,7 @@ impl Permissions {
         Ok(Self {
             clients: clients.into_iter().map(named).collect::<Result<_, String>>()?,
             default: default.map(|text| permit("default", text)).transpose()?,
+            budgets: Budgets::default(),
         })
     }
 

@@ -11,6 +11,7 @@ use cantap_wire::{CHANNELS, Command, Refusal, Reply};
 use serde_json::json;
 
 use crate::audit::{Audit, who};
+use crate::client::budget::{Budget, Budgets};
 use crate::lock::lock;
 use crate::log_limit::LogLimit;
 use crate::news::News;
@@ -91,6 +92,8 @@ pub(crate) struct Shared {
     pub sessions: Mutex<LogLimit>,
     /// Those of certificates, and the number of the board's first channel.
     pub permissions: Mutex<Option<(Arc<Permissions>, usize)>>,
+    /// What each certificate's clients may still send.
+    pub budgets: Mutex<Budgets>,
     pub audit: Mutex<Option<Arc<Audit>>>,
     /// Connections and requests that were refused.
     pub refused: AtomicU64,
@@ -151,6 +154,12 @@ impl Shared {
         let permissions = lock(&self.permissions).clone();
         let Some((permissions, number)) = permissions else { return Ok(None) };
         Ok(Some((permissions.of(certificate)?.clone(), number)))
+    }
+
+    /// What all clients with a certificate of this name may still send.
+    pub fn budget_of(&self, certificate: &str) -> Arc<Mutex<Budget>> {
+        let budgets = lock(&self.budgets).clone();
+        Arc::clone(lock(&budgets).entry(certificate.to_owned()).or_default())
     }
 
     /// Adds to the audit log, if there is one.

@@ -13,6 +13,8 @@ from pathlib import Path, PurePosixPath
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from .names import are_own, is_content
+
 #: Rows that are held in memory at a time.
 ROW_GROUP_ROWS = 1 << 20
 _PREFIX = "joined-"
@@ -30,7 +32,10 @@ def is_joined(name: str) -> bool:
 def members(path: Path) -> list[Member]:
     """Whose rows a joined file has, in their order."""
     metadata = pq.read_metadata(path).metadata or {}
-    return [(sha256, name, rows) for sha256, name, rows in json.loads(metadata[_MEMBERS])]
+    found = [(sha256, name, rows) for sha256, name, rows in json.loads(metadata.get(_MEMBERS, b"[]"))]
+    if not found or not all(is_content(sha256) and are_own({name: rows}) for sha256, name, rows in found):
+        raise OSError(f"{path} does not say whose rows it has, or names files outside of the lake; remove it, and `cantap-lake check --forget` the rest")
+    return found
 
 
 def joined_name(parts: Sequence[Member]) -> str:

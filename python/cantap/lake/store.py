@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 
 from . import columns
 from .joined import is_joined, members, part_of
+from .names import are_own, is_content
 from .transactions import Moves, Transactions, moved, write_whole
 from .writing import TABLES
 
@@ -78,8 +79,9 @@ class Store:
         except (FileNotFoundError, ValueError):
             entry = None
         # It is written whole or not at all. If somebody has changed it, its trace is read again.
-        is_entry = isinstance(entry, dict) and {"sha256", "names", "files", "setup", "state", "trace"} <= set(entry)
-        return moved(entry, moves) if is_entry and isinstance(entry["files"], dict) else None
+        is_entry = isinstance(entry, dict) and {"sha256", "names", "files", "setup", "state", "trace"} <= set(entry) and entry["sha256"] == sha256
+        is_own = is_entry and is_content(sha256) and isinstance(entry["files"], dict) and all(map(are_own, entry["files"].values()))
+        return moved(entry, moves) if is_own else None
 
     def entries(self) -> Iterator[dict[str, Any]]:
         """All of the ledger, by content, as it is at one moment."""

@@ -14,6 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from .names import are_own, is_content, is_own
+
 try:
     import fcntl
 except ModuleNotFoundError:  # Windows has no locks that several readers share.
@@ -58,19 +60,27 @@ class Transactions:
     def last(self) -> dict[str, Any]:
         """The last one: its `number`, its `moves`, and whether it is `done`."""
         try:
-            return dict(json.loads(self._path.read_bytes()))
+            last = json.loads(self._path.read_bytes())
         except FileNotFoundError:
             return {"number": 0, "moves": {}, "done": True}
+        is_last = isinstance(last, dict) and {"number", "moves", "done"} <= set(last) and isinstance(last["moves"], dict)
+        if not is_last or not all(_is_move(sha256, files) for sha256, files in last["moves"].items()):
+            raise ValueError(f"{self._path} is damaged, or names files outside of the lake; nothing is read or written by it")
+        return dict(last)
 
     def begin(self, moves: Moves) -> dict[str, Any]:
         """Makes a transaction count. Only with the lock, and when the last one is done."""
         last = {"number": self.last()["number"] + 1, "moves": moves, "done": False}
         write_whole(self._path, json.dumps(last).encode())
-        return last
+        return dict(last)
 
     def end(self, last: dict[str, Any]) -> None:
         """All entries are as it says."""
         write_whole(self._path, json.dumps({**last, "moves": {}, "done": True}).encode())
+
+
+def _is_move(sha256: Any, files: Any) -> bool:
+    return is_content(sha256) and isinstance(files, dict) and all(is_own(name) and are_own(new) for name, new in files.items())
 
 
 def moved(entry: dict[str, Any], moves: Moves) -> dict[str, Any]:

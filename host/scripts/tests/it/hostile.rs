@@ -71,3 +71,35 @@ fn one_that_ends_with_an_error_does_not_end_the_others_and_sends_nothing_more() 
     };
     assert_eq!((of("100"), of("200")), (4, 100));
 }
+
+/// What a script hands over is kept by the computer until it waits, and its functions for as long as it runs.
+#[test]
+fn what_is_kept_for_a_script_is_limited() {
+    let long = "let s = \"x\"; s.pad(100000, \"y\"); ";
+    assert!(error(&format!("{long} loop {{ log(s); }}")).contains("logged too much"));
+    assert!(error(&format!("{long} loop {{ print(s); }}")).contains("logged too much"));
+    assert!(
+        error(&format!("{long} loop {{ try {{ loop {{ debug(s); }} }} catch {{ }} }}"))
+            .contains("logged too much")
+    );
+    for adds in [
+        "after(\"1h\", || {})",
+        "every(\"1h\", || {})",
+        "every(\"1h\", \"1s\", || {})",
+        "on_frame(|f| {})",
+        "on_frame(\"123\", |f| {})",
+        "on_message(\"Engine\", |m| {})",
+        "on_error(|c, k| {})",
+        "on_state(|c, s| {})",
+    ] {
+        assert!(error(&format!("loop {{ {adds}; }}")).contains("functions are waiting already"), "{adds}");
+    }
+    assert!(error("loop { on_request(\"7E0\", \"7E8\", |d| d); }").contains("servers are waiting already"));
+    assert!(error("loop { periodic(\"123#\", \"1s\"); }").contains("frames are repeated already"));
+    // What is ended has room for others.
+    let (report, _, _) = run(
+        1,
+        &[script("a", "for i in 0..9000 { stop(after(\"1h\", || {})); if i % 100 == 0 { wait(\"1us\"); } }")],
+    );
+    assert!(report.is_success(), "{report:?}");
+}

@@ -51,6 +51,8 @@ pub fn admit(
         None => None,
         Some(identity) => shared.permit_of(&identity.certificate).map_err(Refused::NotPermitted)?,
     };
+    let budget =
+        identity.as_ref().map(|identity| shared.budget_of(&identity.certificate)).unwrap_or_default();
     let role = permit.as_ref().map_or(role, |(permit, _)| permit.role(role));
     let id = shared.next_client();
     let outbox = Arc::new(Outbox::new(shared.settings.most_records));
@@ -83,7 +85,7 @@ pub fn admit(
         dead_man: shared.settings.dead_man.filter(|_| is_remote),
         identity,
         permit,
-        budget: Mutex::default(),
+        budget,
         sent: Mutex::default(),
         place,
         has_greeted: Arc::clone(&has_greeted),

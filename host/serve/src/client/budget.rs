@@ -1,52 +1,96 @@
-//! How many frames a client may have sent: as many per second as its permissions say, of which its periodic entries take their share.
+//! How many frames a certificate's clients may have sent: as many per second as its permissions say, of which periodic entries take their
+//! share. All its connections, to whichever board, draw on one budget, which goes on when they leave: whoever connects twice or again
+//! gets no more.
 
 use std::collections::HashMap;
+use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
 use cantap_wire::Channel;
 use cantap_wire::message::MAX_SEND;
 
+use crate::stream::ClientId;
+
+/// A client: the number of its board's first channel, and its own there.
+pub type Holder = (usize, ClientId);
+/// A client's periodic entry: the channel's place and the slot.
+type Key = (Holder, usize, u8);
+
+/// By certificates. The boards of a server have them in common.
+pub type Budgets = Arc<Mutex<HashMap<String, Arc<Mutex<Budget>>>>>;
+
 /// What is left.
-#[derive(Default)]
+#[derive(Debug, Default)]
 pub struct Budget {
     /// Frames, and when there were so many.
     left: Option<(f64, Instant)>,
-    /// Frames per second of each periodic entry, by its channel and slot.
-    periodic: HashMap<(usize, u8), f64>,
+    /// Frames per second of each periodic entry.
+    periodic: HashMap<Key, f64>,
 }
 
 impl Budget {
-    /// Takes frames out, if there are enough. What is not used is kept for a second, or for one request.
-    pub fn take(&mut self, frames: usize, per_second: u32, now: Instant) -> bool {
+    /// Adds what has come since the last time, at the rate that periodic entries have left since then; returns what there is.
+    fn settle(&mut self, per_second: u32, now: Instant) -> f64 {
         let rate = (f64::from(per_second) - self.periodic.values().sum::<f64>()).max(0.0);
-        let most = rate.max(if rate > 0.0 { MAX_SEND as f64 } else { 0.0 });
+        let most = if rate > 0.0 { rate.max(MAX_SEND as f64) } else { 0.0 };
         let left = self.left.map_or(most, |(left, at)| {
             (left + rate * now.saturating_duration_since(at).as_secs_f64()).min(most)
         });
+        self.left = Some((left, now));
+        left
+    }
+
+    /// Takes frames out, if there are enough. What is not used is kept for a second, or for one request.
+    pub fn take(&mut self, frames: usize, per_second: u32, now: Instant) -> bool {
+        let left = self.settle(per_second, now);
         let is_enough = left >= frames as f64;
-        self.left = Some((if is_enough { left - frames as f64 } else { left }, now));
+        if is_enough {
+            self.left = Some((left - frames as f64, now));
+        }
         is_enough
     }
 
-    /// Sets the share of a periodic entry, if it fits.
-    pub fn set_periodic(&mut self, channel: Channel, slot: u8, rate: f64, per_second: u32) -> bool {
-        let key = (channel.index(), slot);
+    /// Sets the share of a periodic entry, if it fits; returns the one that it had.
+    ///
+    /// # Errors
+    ///
+    /// If it does not fit.
+    pub fn set_periodic(
+        &mut self,
+        (holder, channel, slot): (Holder, Channel, u8),
+        rate: f64,
+        per_second: u32,
+        now: Instant,
+    ) -> Result<Option<f64>, ()> {
+        self.settle(per_second, now);
+        let key = (holder, channel.index(), slot);
         let others: f64 = self.periodic.iter().filter(|(at, _)| **at != key).map(|(_, rate)| rate).sum();
-        let fits = others + rate <= f64::from(per_second);
-        if fits {
-            self.periodic.insert(key, rate);
+        if others + rate > f64::from(per_second) {
+            return Err(());
         }
-        fits
+        Ok(self.periodic.insert(key, rate))
     }
 
-    /// A periodic entry is gone.
-    pub fn clear_periodic(&mut self, channel: Channel, slot: u8) {
-        self.periodic.remove(&(channel.index(), slot));
+    /// A periodic entry has this share, because it is as it was, or gone.
+    pub fn has_periodic(
+        &mut self,
+        (holder, channel, slot): (Holder, Channel, u8),
+        rate: Option<f64>,
+        per_second: u32,
+        now: Instant,
+    ) {
+        self.settle(per_second, now);
+        let key = (holder, channel.index(), slot);
+        match rate {
+            Some(rate) => self.periodic.insert(key, rate),
+            None => self.periodic.remove(&key),
+        };
     }
 
-    /// All of a channel's are gone.
-    pub fn clear(&mut self, channel: Channel) {
-        self.periodic.retain(|(at, _), _| *at != channel.index());
+    /// All of a client's on a channel are gone.
+    pub fn clear(&mut self, (holder, channel): (Holder, Channel), per_second: u32, now: Instant) {
+        self.settle(per_second, now);
+        self.periodic.retain(|(of, at, _), _| *of != holder || *at != channel.index());
     }
 }
 
@@ -54,6 +98,9 @@ impl Budget {
 mod tests {
     use super::*;
     use std::time::Duration;
+
+    const ONE: Holder = (0, 1);
+    const TWO: Holder = (0, 2);
 
     #[test]
     fn so_many_frames_a_second_and_no_more_however_they_are_sent() {
@@ -65,18 +112,41 @@ mod tests {
         }
         // A second in advance.
         assert!((1095..=1100).contains(&sent), "{sent}");
-        // Half of it is taken by a periodic entry, and no second one fits.
-        assert!(budget.set_periodic(Channel::Can1, 0, 50.0, 100));
-        assert!(!budget.set_periodic(Channel::Can2, 0, 51.0, 100));
-        assert!(budget.set_periodic(Channel::Can1, 0, 60.0, 100), "its own share is replaced");
+        // Half of it is taken by a periodic entry, and no second one fits, whoever of its clients wants it.
+        let began = began + Duration::from_secs(10);
+        assert_eq!(budget.set_periodic((ONE, Channel::Can1, 0), 50.0, 100, began), Ok(None));
+        assert_eq!(budget.set_periodic((TWO, Channel::Can2, 0), 51.0, 100, began), Err(()));
+        assert_eq!(budget.set_periodic((TWO, Channel::Can1, 0), 51.0, 100, began), Err(()));
+        let replaced = budget.set_periodic((ONE, Channel::Can1, 0), 60.0, 100, began);
+        assert_eq!(replaced, Ok(Some(50.0)), "its own share is replaced");
         let began = began + Duration::from_secs(100);
         let sent: usize =
             (0..10_000).map(|ms| usize::from(budget.take(1, 100, began + Duration::from_millis(ms)))).sum();
         assert!((435..=440).contains(&sent), "{sent}");
-        assert!(budget.set_periodic(Channel::Can2, 0, 40.0, 100));
+        let began = began + Duration::from_secs(1000);
+        assert_eq!(budget.set_periodic((TWO, Channel::Can1, 0), 40.0, 100, began), Ok(None));
         assert!(!budget.take(1, 100, began + Duration::from_secs(1000)));
-        budget.clear(Channel::Can1);
-        assert!(budget.take(1, 100, began + Duration::from_secs(2000)));
+        budget.clear((ONE, Channel::Can1), 100, began + Duration::from_secs(1000));
+        let sent: usize = (1_000_000..1_010_000)
+            .map(|ms| usize::from(budget.take(1, 100, began + Duration::from_millis(ms))))
+            .sum();
+        assert!((595..=600).contains(&sent), "the other client's goes on: {sent}");
+    }
+
+    /// While an entry had its share, nothing was saved up for afterwards.
+    #[test]
+    fn setting_and_clearing_an_entry_again_and_again_gives_no_more() {
+        let mut budget = Budget::default();
+        let mut now = Instant::now();
+        while budget.take(1, 100, now) {}
+        let mut sent = 0;
+        for _ in 0..10 {
+            budget.set_periodic((ONE, Channel::Can1, 0), 100.0, 100, now).unwrap();
+            now += Duration::from_secs(1);
+            budget.has_periodic((ONE, Channel::Can1, 0), None, 100, now);
+            sent += (0..1000).filter(|_| budget.take(1, 100, now)).count();
+        }
+        assert_eq!(sent, 0);
     }
 
     #[test]

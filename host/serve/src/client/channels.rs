@@ -9,7 +9,6 @@ use cantap_wire::{Channel, Command, Refusal, Reply};
 
 use super::Client;
 use crate::News;
-use crate::lock::lock;
 use crate::shared::only_listens;
 use crate::state::{State, Then, for_all};
 
@@ -97,6 +96,10 @@ impl Client {
             return Ok(Way::Open);
         };
         let is_same = current.timing == wanted.timing;
+        // Whoever listens would hear nothing of the bus, and be told of no loss.
+        if any_other && hears_bus(wanted.mode) != hears_bus(current.mode) {
+            return Err(Refusal::OtherSettings);
+        }
         if is_same && (only_listens(wanted) || for_all(*wanted) == current) {
             return Ok(Way::Attach(current));
         }
@@ -113,10 +116,10 @@ impl Client {
     /// Closes a channel for this client. If nobody else has it open, the board closes it; if nobody else sends, it goes back to only
     /// listening, after a while, because the next sender would take it off the bus again.
     pub(super) fn close(&self, channel: Channel) -> Result<(), Refusal> {
+        self.clear_budget(channel);
         if !self.is_open(channel) {
             return Ok(());
         }
-        lock(&self.budget).clear(channel);
         let sends = self.with(|_, member| member.views[channel.index()].transmits());
         let (any_other, other_sends) = self.shared.state().others_on(self.id, channel);
         if sends && any_other {
@@ -187,6 +190,11 @@ impl Client {
         }
         saved
     }
+}
+
+/// Whether a controller receives what others send.
+const fn hears_bus(mode: Mode) -> bool {
+    matches!(mode, Mode::ListenOnly | Mode::Normal)
 }
 
 /// Banks that filters would need on the board (docs/wire-protocol.md).

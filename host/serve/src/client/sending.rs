@@ -9,6 +9,7 @@ use cantap_wire::{Channel, Command, Event, Refusal, Reply};
 use serde_json::json;
 
 use super::Client;
+use super::budget::Holder;
 use crate::News;
 use crate::lock::lock;
 use crate::permissions::Denied;
@@ -46,16 +47,7 @@ impl Client {
             frames.iter().try_for_each(|frame| permit.send(frame.id()))
         })?;
         let deadline = Instant::now() + ROOM_TIMEOUT;
-        if let Some(most) = self.frames_per_second() {
-            while !lock(&self.budget).take(frames.len(), most, Instant::now()) {
-                if Instant::now() >= deadline || self.outbox.is_closed() {
-                    let (client, reason) = (self.name.clone(), Denied::Rate(most).to_string());
-                    self.shared.tell(News::NotPermitted { client, reason });
-                    return Err(Refusal::QueueFull { free: 0 });
-                }
-                std::thread::sleep(Duration::from_millis(2));
-            }
-        }
+        self.take_from_budget(frames.len(), deadline)?;
         loop {
             let noted: Batch = {
                 let mut state = self.shared.state();
@@ -82,6 +74,32 @@ impl Client {
                     return result;
                 }
             }
+        }
+    }
+
+    /// Waits until so many more frames are permitted.
+    fn take_from_budget(&self, frames: usize, deadline: Instant) -> Result<(), Refusal> {
+        let Some(most) = self.frames_per_second() else { return Ok(()) };
+        while !lock(&self.budget).take(frames, most, Instant::now()) {
+            if Instant::now() >= deadline || self.outbox.is_closed() {
+                let (client, reason) = (self.name.clone(), Denied::Rate(most).to_string());
+                self.shared.tell(News::NotPermitted { client, reason });
+                return Err(Refusal::QueueFull { free: 0 });
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        Ok(())
+    }
+
+    /// The client, as its certificate's budget knows it.
+    fn holder(&self) -> Holder {
+        (self.permit.as_ref().map_or(0, |(_, number)| *number), self.id)
+    }
+
+    /// What it sends periodically on a channel is gone.
+    pub(super) fn clear_budget(&self, channel: Channel) {
+        if let Some(most) = self.frames_per_second() {
+            lock(&self.budget).clear((self.holder(), channel), most, Instant::now());
         }
     }
 
@@ -116,7 +134,7 @@ impl Client {
             let _ = self.shared.ask(clears(*table, channel, *entry), Then::Nothing);
             self.shared.state().entries[channel.index()].free(*table, *entry);
         }
-        lock(&self.budget).clear(channel);
+        self.clear_budget(channel);
         entries.into_iter().map(|(table, _, slot)| table.tag() + u32::from(slot)).collect()
     }
 
@@ -148,13 +166,19 @@ impl Client {
         entry: Option<Periodic>,
     ) -> Result<Reply, Refusal> {
         let tick_hz = self.with(|state, _| state.hello.as_ref().map_or(0, |hello| hello.tick_hz));
+        let (mut had, now) = (None, Instant::now());
         if let Some(entry) = &entry {
+            // The first frame leaves at once, however long the period is.
+            self.may_transmit_on(channel)?;
+            self.take_from_budget(1, now + ROOM_TIMEOUT)?;
             let rate = f64::from(tick_hz) / f64::from(entry.period_ticks.max(1));
             self.must_be_permitted(Role::Send, |permit, _| {
                 permit.send(entry.frame.id())?;
                 let Some(most) = permit.frames_per_second else { return Ok(()) };
-                let fits = lock(&self.budget).set_periodic(channel, slot, rate, most);
-                if fits { Ok(()) } else { Err(Denied::Rate(most)) }
+                let of = (self.holder(), channel, slot);
+                had =
+                    lock(&self.budget).set_periodic(of, rate, most, now).map_err(|()| Denied::Rate(most))?;
+                Ok(())
             })?;
         }
         let noted = entry.as_ref().map(|entry| {
@@ -165,8 +189,11 @@ impl Client {
         let command = |slot, entry| Command::SetPeriodic { channel, slot, entry };
         let slots = self.with(|state, _| state.hello.as_ref().map_or(0, |hello| hello.periodic_slots));
         let result = self.set_entry(Table::Periodic, channel, slot, slots, entry, command);
-        if result.is_err() || is_cleared {
-            lock(&self.budget).clear_periodic(channel, slot);
+        if result.is_err() != is_cleared
+            && let Some(most) = self.frames_per_second()
+        {
+            // What was refused has changed nothing: an entry that was there goes on.
+            lock(&self.budget).has_periodic((self.holder(), channel, slot), had, most, Instant::now());
         }
         if result.is_ok() {
             let event = if is_cleared { "cleared" } else { "set" };

@@ -5,7 +5,9 @@ use std::path::Path;
 use std::sync::Arc;
 
 use cantap::wire::Refusal;
-use cantap::wire::message::{ChannelConfig, Filter, FrameKind, Mode, Periodic, Role, Trigger, TxFrame};
+use cantap::wire::message::{
+    ChannelConfig, Filter, FrameKind, MAX_SEND, Mode, Modifier, Periodic, Role, Trigger, TxFrame,
+};
 use cantap::{Channel, Device, DeviceError};
 use cantap_serve::audit::Audit;
 use cantap_serve::listen::Listening;
@@ -24,7 +26,11 @@ struct Served {
 }
 
 fn serve(folder: &Path) -> Served {
-    let (board, told) = board_at(Settings::at(BITRATE_BPS));
+    serve_at(folder, Settings::at(BITRATE_BPS))
+}
+
+fn serve_at(folder: &Path, settings: Settings) -> Served {
+    let (board, told) = board_at(settings);
     let files = Keys::in_folder(folder).unwrap().add_server(&["localhost".to_owned()]).unwrap();
     // An empty list, as it is before anybody is revoked, is none.
     let list = folder.join(tls::REVOKED);
@@ -106,6 +112,62 @@ fn a_client_does_what_its_permissions_name_and_nothing_else() {
     // Whoever has no certificate is not restricted by what is written of certificates.
     let local = crate::strangers::client(&served.board, "local", Role::Listen);
     local.listen(Channel::Can2, BITRATE_BPS).unwrap();
+}
+
+/// However a certificate's frames are sent: over several connections, by connecting again, by entries that are set again and again, or
+/// that are replaced by one that the board refuses.
+#[test]
+fn so_many_frames_per_second_of_a_certificate_and_no_more() {
+    let folder = tempfile::tempdir().unwrap();
+    // What is sent periodically goes on while nothing is said, so that its share stays.
+    let served = serve_at(folder.path(), Settings { dead_man: None, ..Settings::at(BITRATE_BPS) });
+    served.permit("[clients.alice]\nframes_per_second = 50");
+    let alice = Keys::in_folder(folder.path()).unwrap().add_client("alice", Role::Send).unwrap();
+    let come = || {
+        let device = served.connect(&alice).unwrap();
+        device.open_channel(Channel::Can1, Some(in_mode(&device, Mode::Normal))).unwrap();
+        device
+    };
+    let first = come();
+    let tick_hz = first.hello().tick_hz;
+    let periodic = |period_ticks| Periodic {
+        frame: "123#".parse().unwrap(),
+        period_ticks,
+        count: 0,
+        modifiers: [].into_iter().collect(),
+    };
+    let is_full = |result: Result<u16, DeviceError>, why: &str| {
+        let is_it = matches!(&result, Err(DeviceError::Refused { refusal: Refusal::QueueFull { .. } }));
+        assert!(is_it, "{why}: {result:?}");
+    };
+    first.set_periodic(Channel::Can1, 0, Some(periodic(tick_hz / 40))).unwrap();
+    let second = come();
+    is_refused(
+        &second.set_periodic(Channel::Can1, 0, Some(periodic(tick_hz / 11))),
+        "11 more by another connection",
+    );
+    // The board takes no modifier of a byte that is not there; the entry goes on.
+    let bad =
+        Periodic { modifiers: [Modifier::Random { byte: 7 }].into_iter().collect(), ..periodic(tick_hz) };
+    assert!(first.set_periodic(Channel::Can1, 0, Some(bad)).is_err());
+    is_refused(&first.set_periodic(Channel::Can1, 1, Some(periodic(tick_hz / 11))), "11 more beside it");
+    first.set_periodic(Channel::Can1, 0, None).unwrap();
+    // All that is there at once: then an entry's first frame has to wait as well, and a third connection brings none.
+    first.set_periodic(Channel::Can1, 0, Some(periodic(tick_hz / 49))).unwrap();
+    let many: Vec<TxFrame> = (0..MAX_SEND).map(|_| frame("123#")).collect();
+    while first.send(Channel::Can1, &many).is_ok() {}
+    first.time().unwrap();
+    is_full(second.send(Channel::Can1, &many), "another connection");
+    drop(second);
+    let third = come();
+    first.time().unwrap();
+    is_full(third.send(Channel::Can1, &many), "one that comes again");
+    let mut set = 0;
+    while third.set_periodic(Channel::Can1, 0, Some(periodic(u32::MAX))).is_ok() {
+        set += 1;
+        first.time().unwrap();
+        assert!(set < 50, "entries that are set again and again");
+    }
 }
 
 /// Configuring reaches further than listening: what is stored, a measurement and a restart concern channels that need not be open.

@@ -305,17 +305,38 @@ fn what_a_client_leaves_in_the_queue_is_withdrawn_and_the_others_frames_are_sent
     assert!((0..5).all(|tag| ended.contains_key(&tag)), "{ended:?}");
 }
 
+/// A controller in loopback hears nothing of its bus: for whoever listens, that would be a silent bus without a loss.
+#[test]
+fn nobody_makes_a_listener_deaf_and_nobody_listens_to_a_deaf_channel() {
+    let board = board("load=30");
+    let listener = client(&board, "listener", Role::Listen);
+    let sender = client(&board, "sender", Role::Send);
+    let in_mode = |mode| ChannelConfig { mode, ..normal(&sender) };
+    listener.listen(Channel::Can1, BITRATE_BPS).unwrap();
+    for mode in [Mode::Loopback, Mode::SilentLoopback] {
+        let opened = sender.open_channel(Channel::Can1, Some(in_mode(mode)));
+        assert_eq!(refusal(opened), Refusal::OtherSettings, "{mode:?}");
+        // Alone, it may.
+        sender.open_channel(Channel::Can2, Some(in_mode(mode))).unwrap();
+        assert_eq!(refusal(listener.listen(Channel::Can2, BITRATE_BPS)), Refusal::OtherSettings, "{mode:?}");
+        sender.close_channel(Channel::Can2).unwrap();
+    }
+    listener.listen(Channel::Can2, BITRATE_BPS).unwrap();
+    sender.open_channel(Channel::Can1, Some(in_mode(Mode::Normal))).unwrap();
+}
+
 #[test]
 fn each_client_has_its_own_filters_and_leaves_out_what_it_wants() {
     let board = board("load=0");
     let sender = client(&board, "sender", Role::Send);
     let loopback = ChannelConfig { mode: Mode::Loopback, ..normal(&sender) };
     sender.open_channel(Channel::Can1, Some(loopback)).unwrap();
-    let filtered = client(&board, "filtered", Role::Listen);
+    // Who shares a bus that only the sender's own frames are on has to ask for that.
+    let filtered = client(&board, "filtered", Role::Send);
     let filter = Filter { extended: false, kind: FrameKind::Data, id: 0x123, mask: 0x7FF };
     assert_eq!(filtered.set_filters(Channel::Can1, &[filter]).unwrap(), (1, 28));
     let timing = filtered.timing(BITRATE_BPS).unwrap();
-    let bare = ChannelConfig { omit_data: true, ..ChannelConfig::listen_only(timing) };
+    let bare = ChannelConfig { omit_data: true, mode: Mode::Loopback, ..ChannelConfig::listen_only(timing) };
     filtered.open_channel(Channel::Can1, Some(bare)).unwrap();
     for (tag, frame) in ["123#11", "124#22", "123#R"].into_iter().enumerate() {
         let frame = TxFrame { tag: tag as u32, frame: frame.parse().unwrap(), at_ticks: None };

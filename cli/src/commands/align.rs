@@ -60,22 +60,21 @@ pub struct Args {
 
 /// A time with a sign, in nanoseconds.
 fn shift(text: &str) -> Result<i64, String> {
+    // A longer one would take any time out of range.
+    const MOST: Duration = Duration::from_secs(100 * 365 * 86_400);
     let (sign, digits) = match text.strip_prefix('-') {
         Some(digits) => (-1, digits),
         None => (1, text.strip_prefix('+').unwrap_or(text)),
     };
     let time = duration(digits).map_err(|error| error.to_string())?;
-    // A longer one would take any time out of range.
-    const MOST: Duration = Duration::from_secs(100 * 365 * 86_400);
     let ns = i64::try_from(time.as_nanos()).ok().filter(|_| time <= MOST);
     ns.map(|ns| sign * ns).ok_or_else(|| "clocks differ by 100 years at most".to_owned())
 }
 
 /// How a trace's clock relates to the first one's.
-#[expect(clippy::large_enum_variant, reason = "there is one for each trace")]
 enum Clock {
     /// Found from the frames that both have.
-    Found(Alignment, Verifier),
+    Found(Box<(Alignment, Verifier)>),
     /// As the user says: so many nanoseconds behind.
     Given(i64),
 }
@@ -83,7 +82,7 @@ enum Clock {
 impl Clock {
     fn to_first(&self, time_ns: i64) -> i64 {
         match self {
-            Self::Found(alignment, _) => alignment.map.to_first(time_ns),
+            Self::Found(found) => found.0.map.to_first(time_ns),
             Self::Given(shift_ns) => time_ns.saturating_add(*shift_ns),
         }
     }
@@ -125,7 +124,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         .zip(&offsets[1..])
         .map(|(clock, &channel_offset)| {
             let by = match clock {
-                Clock::Found(alignment, verifier) => Ok((alignment, verifier.finish())),
+                Clock::Found(found) => {
+                    let (alignment, verifier) = *found;
+                    Ok((alignment, verifier.finish()))
+                }
                 Clock::Given(shift_ns) => Err(shift_ns),
             };
             Found { by, channel_offset }
@@ -164,7 +166,7 @@ fn find(args: &Args) -> anyhow::Result<(Vec<Clock>, Vec<u8>)> {
         }
         let clocks = alignments.into_iter().map(|alignment| {
             let verifier = Verifier::new(&alignment);
-            Clock::Found(alignment, verifier)
+            Clock::Found(Box::new((alignment, verifier)))
         });
         return Ok((clocks.collect(), channel_offsets(&sketches)?));
     }
@@ -270,14 +272,14 @@ impl<'a> Merged<'a> {
         match source.checked_sub(1) {
             None => {
                 for other in &mut self.others {
-                    if let Clock::Found(_, verifier) = other {
-                        verifier.first(&record);
+                    if let Clock::Found(found) = other {
+                        found.1.first(&record);
                     }
                 }
             }
             Some(other) => {
-                if let Clock::Found(_, verifier) = &mut self.others[other] {
-                    verifier.second(&record);
+                if let Clock::Found(found) = &mut self.others[other] {
+                    found.1.second(&record);
                 }
             }
         }
@@ -297,7 +299,7 @@ fn print(out: &mut impl Write, first: &Path, path: &Path, found: &Found) -> io::
             return writeln!(
                 out,
                 "{shift_s:+.6} s added to the times of {path}; its channel 1 is now {}",
-                channel_offset + 1
+                u16::from(*channel_offset) + 1
             );
         }
     };

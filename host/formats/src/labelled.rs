@@ -91,6 +91,9 @@ impl Decoder {
             let found = format!("{} bytes", bytes.len());
             return Err(Fault::malformed(format!("{len} data bytes"), found.as_bytes()));
         }
+        if remote && len > 15 {
+            return Err(Fault::malformed("a data length code of 0 to 15", len.to_string().as_bytes()));
+        }
         let data = Payload::of(bytes).ok_or_else(|| Fault::malformed("up to 64 data bytes", shown))?;
         let fd = (!remote && len > 8).then(FdFields::default);
         let fields = FrameFields { id, remote, direction: parts.direction, len: len.min(64) as u8, fd };

@@ -135,7 +135,7 @@ impl<'a> Parts<'a> {
             }
             Part::IsExtended => self.extended = yes(first),
             Part::IsRemote => self.remote |= yes(first).unwrap_or(false),
-            Part::Len => self.len = text::decimal(first).filter(|len| *len <= 64).map(|len| len as usize),
+            Part::Len => self.len = text::number(first, true).map(|len| len as usize),
             Part::Data => self.data = Some(value),
             Part::Other => {}
         }

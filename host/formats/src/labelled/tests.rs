@@ -92,11 +92,12 @@ fn what_the_examples_of_arduino_teensy_and_esp_idf_print_is_read() {
 fn damaged_frames_are_named_and_text_is_counted() {
     let file = "CAN started\nStandard ID: 0x100  DLC: 3  Data: 0x01 0x02\nStandard ID: 0x1G0  DLC: 1  Data: 0x01\n\
                 Standard ID: 0x900  DLC: 1  Data: 0x01\nStandard ID: 0x100  DLC: 1  Data: 0x01 0x02\n\
-                Standard ID: 0x100  DLC: 2  Data: 0x01 0x02\nID: 0x5 DLC: 2\nrpm=805\nChip ID: 5\nhello\nStandard ID: 0x100  DLC: 1  Data: 0x0";
+                Standard ID: 0x100  DLC: 2  Data: 0x01 0x02\nID: 0x5 DLC: 2\nrpm=805\nChip ID: 5\nhello\nStandard ID: 0x100  DLC: 99  Data: 0x01\n\
+                Standard ID: 0x100  DLC: 1  Data: 0x0";
     let (log, issues) = tests::as_log(Format::Labelled, file);
     assert_eq!(log, "(0.000000) can0 100#0102\n");
-    assert_eq!(issues.len(), 6, "{issues:#?}");
-    assert!(issues[5].contains("the file ends inside a line"), "{issues:#?}");
+    assert_eq!(issues.len(), 7, "{issues:#?}");
+    assert!(issues[6].contains("the file ends inside a line"), "{issues:#?}");
     let notes = notes(file);
     assert!(notes.contains(&(super::NO_FRAME, 2)), "{notes:?}");
     assert!(notes.contains(&(super::NO_BYTES, 1)) && notes.contains(&(super::NO_TIMES, 1)), "{notes:?}");

@@ -41,11 +41,11 @@ impl fmt::Display for Relative {
             Self::CanKingdom => f.write_str("CAN Kingdom, whose king sends with identifier 000"),
             Self::Cal => f.write_str("CAL, whose master guards node N with identifier 6E0 + N"),
             Self::RvC { examples, groups } => {
-                f.write_str("RV-C: ")?;
-                for pgn in examples.iter().flatten() {
-                    write!(f, "{} ({pgn:05X}), ", rv_c::name(*pgn).unwrap_or("a group"))?;
+                write!(f, "RV-C ({groups} of its groups")?;
+                for (pgn, mark) in examples.iter().flatten().zip([": ", ", ", ", "]) {
+                    write!(f, "{mark}{pgn:05X} {}", rv_c::name(*pgn).unwrap_or_default())?;
                 }
-                write!(f, "{groups} of its groups in all")
+                f.write_str(")")
             }
         }
     }

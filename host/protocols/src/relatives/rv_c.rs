@@ -110,7 +110,7 @@ mod tests {
         let relative = found(&home).unwrap();
         assert_eq!(
             relative.to_string(),
-            "RV-C: DC_SOURCE_STATUS_1 (1FFFD), AIR_CONDITIONER_COMMAND (1FFE0), TANK_STATUS (1FFB7), 4 of its groups in all"
+            "RV-C (4 of its groups: 1FFFD DC_SOURCE_STATUS_1, 1FFE0 AIR_CONDITIONER_COMMAND, 1FFB7 TANK_STATUS)"
         );
         assert_eq!(found(&home[..4]), None, "three groups");
         // A boat: position beside groups of makers, or these alone in fast packets.

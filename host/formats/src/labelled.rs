@@ -38,6 +38,8 @@ pub(crate) struct Decoder {
     has_time: bool,
     /// The last line had all bytes that its length says, in two digits each.
     is_whole: bool,
+    has_frames: bool,
+    has_text: bool,
     notes: Vec<&'static str>,
     noted_times: bool,
 }
@@ -102,6 +104,7 @@ impl Decoder {
             self.notes.push(NO_TIMES);
         }
         self.extended = None;
+        self.has_frames = true;
         Ok(Line::Record(TraceRecord { time_ns, channel: 1, event }))
     }
 
@@ -251,6 +254,7 @@ impl RowFormat for Decoder {
         if rest.is_empty() || rest.starts_with(b"#") {
             return Ok(Line::Nothing);
         }
+        self.has_text = true;
         self.labelled(rest)
     }
 
@@ -263,6 +267,10 @@ impl RowFormat for Decoder {
     }
 
     fn missing(&self) -> Option<&'static str> {
-        self.pending.as_ref().map(|_| "the last frame's data bytes")
+        match &self.pending {
+            Some(_) => Some("the last frame's data bytes"),
+            // Text alone is not a trace that was read.
+            None => (self.has_text && !self.has_frames).then_some("a frame with labels such as ID and Data"),
+        }
     }
 }

@@ -101,6 +101,8 @@ fn damaged_frames_are_named_and_text_is_counted() {
     let notes = notes(file);
     assert!(notes.contains(&(super::NO_FRAME, 2)), "{notes:?}");
     assert!(notes.contains(&(super::NO_BYTES, 1)) && notes.contains(&(super::NO_TIMES, 1)), "{notes:?}");
+    let (_, issues) = tests::as_log(Format::Labelled, "(1.0) can0 123#11\n");
+    assert!(issues[0].contains("a frame with labels"), "{issues:?}");
     // An identifier at the end waits for its bytes.
     let (_, issues) = tests::as_log(Format::Labelled, "ID: 0x12 DLC: 2\n");
     assert!(issues[0].contains("the last frame's data bytes"), "{issues:?}");

@@ -17,16 +17,18 @@ use crate::completion;
 use crate::exit;
 use crate::input::{ReadArgs, Records};
 use crate::trace_output::TraceOutput;
+use crate::usage_error::usage;
 use cantap_work::missing::Missing;
 
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
     cantap align engine.blf cabin.blf -o both.blf\n  \
-    cantap align first.log second.asc third.pcapng\n\n\
+    cantap align first.log second.asc third.pcapng\n  \
+    cantap align engine.blf body.asc --shift=-3.2s -o both.blf\n\n\
     The clock is found from the frames that the traces share, whatever their dates. All times are then the first \
     trace's; its channels keep their numbers, and those of the others follow. Without -o, only what was found is \
-    told.\n\n\
+    told. Traces of different buses share no frames: --shift says how their clocks differ, --shift 0 that they do not.\n\n\
     Exit code 1: the traces have no bus in common, or their frames repeat themselves so that nobody could tell. \
     With --check, 3 if the stamps of a frame are further apart than that.")]
 pub struct Args {
@@ -45,6 +47,10 @@ pub struct Args {
     /// End with 3 if the stamps of any frame are farther apart than this, such as 10us.
     #[arg(long, value_name = "TIME", value_parser = duration)]
     check: Option<Duration>,
+    /// Add this to the times of the other traces, such as 3.2s or -1:30, instead of looking for frames that they share. If repeated,
+    /// each is for one of them.
+    #[arg(long, value_name = "TIME", allow_hyphen_values = true, value_parser = shift, conflicts_with = "check")]
+    shift: Vec<i64>,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
@@ -52,16 +58,39 @@ pub struct Args {
     write: WriteArgs,
 }
 
-/// One of the traces that are put on the first one's clock.
-struct Other {
-    alignment: Alignment,
-    verifier: Verifier,
+/// A time with a sign, in nanoseconds.
+fn shift(text: &str) -> Result<i64, String> {
+    // A longer one would take any time out of range.
+    const MOST: Duration = Duration::from_secs(100 * 365 * 86_400);
+    let (sign, digits) = match text.strip_prefix('-') {
+        Some(digits) => (-1, digits),
+        None => (1, text.strip_prefix('+').unwrap_or(text)),
+    };
+    let time = duration(digits).map_err(|error| error.to_string())?;
+    let ns = i64::try_from(time.as_nanos()).ok().filter(|_| time <= MOST);
+    ns.map(|ns| sign * ns).ok_or_else(|| "clocks differ by 100 years at most".to_owned())
 }
 
-/// The result for it.
+/// How a trace's clock relates to the first one's.
+enum Clock {
+    /// Found from the frames that both have.
+    Found(Box<(Alignment, Verifier)>),
+    /// As the user says: so many nanoseconds behind.
+    Given(i64),
+}
+
+impl Clock {
+    fn to_first(&self, time_ns: i64) -> i64 {
+        match self {
+            Self::Found(found) => found.0.map.to_first(time_ns),
+            Self::Given(shift_ns) => time_ns.saturating_add(*shift_ns),
+        }
+    }
+}
+
+/// The result for a trace.
 struct Found {
-    alignment: Alignment,
-    agreement: Agreement,
+    by: Result<(Alignment, Agreement), i64>,
     /// Offset for its channels.
     channel_offset: u8,
 }
@@ -76,8 +105,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             refuse_same_file(path, output)?;
         }
     }
-    let (alignments, offsets) = find(args)?;
-    let mut merged = Merged::open(args, alignments, &offsets)?;
+    let (clocks, offsets) = if args.shift.is_empty() { find(args)? } else { given(args)? };
+    let mut merged = Merged::open(args, clocks, &offsets)?;
     let mut output = match &args.output {
         Some(path) => Some(TraceOutput::create(path, &args.write.options(None)?, false)?),
         None => None,
@@ -93,10 +122,15 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         .others
         .into_iter()
         .zip(&offsets[1..])
-        .map(|(Other { alignment, verifier }, &channel_offset)| Found {
-            alignment,
-            agreement: verifier.finish(),
-            channel_offset,
+        .map(|(clock, &channel_offset)| {
+            let by = match clock {
+                Clock::Found(found) => {
+                    let (alignment, verifier) = *found;
+                    Ok((alignment, verifier.finish()))
+                }
+                Clock::Given(shift_ns) => Err(shift_ns),
+            };
+            Found { by, channel_offset }
         })
         .collect();
     let mut out = io::stdout().lock();
@@ -107,13 +141,15 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             print(&mut out, &args.traces[0], path, found)?;
         }
     }
-    let within =
-        |found: &Found| args.check.is_none_or(|most| u128::from(found.agreement.worst_ns) <= most.as_nanos());
+    let within = |found: &Found| match (&found.by, args.check) {
+        (Ok((_, agreement)), Some(most)) => u128::from(agreement.worst_ns) <= most.as_nanos(),
+        _ => true,
+    };
     Ok(if found.iter().all(within) { ExitCode::SUCCESS } else { ExitCode::from(exit::CHECK_FAILED) })
 }
 
 /// How each of the others relates to the first, and the offset of each trace's channels.
-fn find(args: &Args) -> anyhow::Result<(Vec<Alignment>, Vec<u8>)> {
+fn find(args: &Args) -> anyhow::Result<(Vec<Clock>, Vec<u8>)> {
     let mut unclear = None;
     'longer: for length in RUN_LENGTHS {
         let sketches =
@@ -128,11 +164,30 @@ fn find(args: &Args) -> anyhow::Result<(Vec<Alignment>, Vec<u8>)> {
                 }
             }
         }
-        return Ok((alignments, channel_offsets(&sketches)?));
+        let clocks = alignments.into_iter().map(|alignment| {
+            let verifier = Verifier::new(&alignment);
+            Clock::Found(Box::new((alignment, verifier)))
+        });
+        return Ok((clocks.collect(), channel_offsets(&sketches)?));
     }
     let (error, path) = unclear.unwrap_or((AlignError::NothingInCommon, &args.traces[1]));
     Err(anyhow::Error::new(error))
         .with_context(|| format!("{} and {} cannot be aligned", args.traces[0].display(), path.display()))
+}
+
+/// The same, as the user says it.
+fn given(args: &Args) -> anyhow::Result<(Vec<Clock>, Vec<u8>)> {
+    let others = args.traces.len() - 1;
+    if args.shift.len() != 1 && args.shift.len() != others {
+        let count = args.shift.len();
+        return Err(usage(format!(
+            "--shift is given {count} times for {others} traces: once for all, or once for each"
+        )));
+    }
+    let sketches = args.traces.iter().map(|path| sketch(args, path, RUN_LENGTHS[0]));
+    let offsets = channel_offsets(&sketches.collect::<anyhow::Result<Vec<_>>>()?)?;
+    let shifts = args.shift.iter().cycle().take(others);
+    Ok((shifts.map(|shift_ns| Clock::Given(*shift_ns)).collect(), offsets))
 }
 
 fn sketch(args: &Args, path: &Path, length: usize) -> anyhow::Result<Sketch> {
@@ -176,11 +231,11 @@ struct Merged<'a> {
     /// Each source's next record, on the first one's clock.
     heads: Vec<Option<TraceRecord>>,
     offsets: &'a [u8],
-    others: Vec<Other>,
+    others: Vec<Clock>,
 }
 
 impl<'a> Merged<'a> {
-    fn open(args: &Args, alignments: Vec<Alignment>, offsets: &'a [u8]) -> anyhow::Result<Self> {
+    fn open(args: &Args, others: Vec<Clock>, offsets: &'a [u8]) -> anyhow::Result<Self> {
         let zone = args.write.zone.clone();
         let read = ReadArgs {
             format: args.from,
@@ -192,10 +247,6 @@ impl<'a> Merged<'a> {
         };
         let sources =
             args.traces.iter().map(|path| read.open(path, Vec::new())).collect::<anyhow::Result<Vec<_>>>()?;
-        let others = alignments
-            .into_iter()
-            .map(|alignment| Other { verifier: Verifier::new(&alignment), alignment })
-            .collect();
         let mut merged = Self { heads: vec![None; sources.len()], sources, offsets, others };
         for source in 0..merged.sources.len() {
             merged.refill(source)?;
@@ -208,7 +259,7 @@ impl<'a> Merged<'a> {
         if let Some(head) = &mut self.heads[source]
             && let Some(other) = source.checked_sub(1)
         {
-            head.time_ns = self.others[other].alignment.map.to_first(head.time_ns);
+            head.time_ns = self.others[other].to_first(head.time_ns);
         }
         Ok(())
     }
@@ -219,8 +270,18 @@ impl<'a> Merged<'a> {
         let Some((_, source)) = earliest else { return Ok(None) };
         let Some(mut record) = self.heads[source] else { return Ok(None) };
         match source.checked_sub(1) {
-            None => self.others.iter_mut().for_each(|other| other.verifier.first(&record)),
-            Some(other) => self.others[other].verifier.second(&record),
+            None => {
+                for other in &mut self.others {
+                    if let Clock::Found(found) = other {
+                        found.1.first(&record);
+                    }
+                }
+            }
+            Some(other) => {
+                if let Clock::Found(found) = &mut self.others[other] {
+                    found.1.second(&record);
+                }
+            }
         }
         self.refill(source)?;
         record.channel = record.channel.saturating_add(self.offsets[source]);
@@ -230,7 +291,18 @@ impl<'a> Merged<'a> {
 
 fn print(out: &mut impl Write, first: &Path, path: &Path, found: &Found) -> io::Result<()> {
     let (first, path) = (first.display(), path.display());
-    let Found { alignment, agreement, channel_offset } = found;
+    let Found { by, channel_offset } = found;
+    let (alignment, agreement) = match by {
+        Ok(found) => found,
+        Err(shift_ns) => {
+            let shift_s = *shift_ns as f64 / 1e9;
+            return writeln!(
+                out,
+                "{shift_s:+.6} s added to the times of {path}; its channel 1 is now {}",
+                u16::from(*channel_offset) + 1
+            );
+        }
+    };
     for (a, b) in &alignment.channels {
         let now = if *channel_offset == 0 { String::new() } else { format!(" (now {})", b + channel_offset) };
         writeln!(out, "channel {b} of {path}{now} is on the bus of channel {a} of {first}")?;
@@ -267,7 +339,18 @@ fn us(ns: u64) -> f64 {
 
 fn to_json(args: &Args, found: &[Found], missing: &[Missing], not_carried: &LeftOut) -> Value {
     let traces = args.traces[1..].iter().zip(found).map(|(path, found)| {
-        let Found { alignment, agreement, channel_offset } = found;
+        let Found { by, channel_offset } = found;
+        let (alignment, agreement) = match by {
+            Ok(found) => found,
+            Err(shift_ns) => {
+                return json!({
+                    "trace": path.display().to_string(),
+                    "channels": [],
+                    "offset_s": -(*shift_ns as f64) / 1e9 + 0.0,
+                    "drift_ppm": 0.0,
+                });
+            }
+        };
         json!({
             "trace": path.display().to_string(),
             "channels": alignment.channels.iter().map(|&(first, own)| json!({

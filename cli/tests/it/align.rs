@@ -82,6 +82,31 @@ fn traces_without_a_common_bus_are_refused_and_nothing_is_written() {
     assert!(!folder.join("none.log").exists());
 }
 
+/// Loggers of two buses: nothing shows how their clocks differ but what the user knows.
+#[test]
+fn a_known_difference_of_the_clocks_joins_traces_of_different_buses() {
+    let folder = folder("shift");
+    std::fs::write(folder.join("a.log"), "(10.000000) can0 100#01\n(12.000000) can1 100#02\n").unwrap();
+    std::fs::write(folder.join("b.log"), "(14.200000) can0 200#03\n(15.300000) can0 200#04\n").unwrap();
+    std::fs::write(folder.join("c.log"), "(0.500000) can0 300#05\n").unwrap();
+    let both = ["align", "a.log", "b.log", "c.log", "--shift=-3.2s", "--shift", "10s", "-o", "all.log"];
+    let (code, out, err) = cantap(&folder, &both);
+    assert_eq!((code, err.as_str()), (Some(0), ""));
+    assert_eq!(
+        out,
+        "-3.200000 s added to the times of b.log; its channel 1 is now 3\n\
+         +10.000000 s added to the times of c.log; its channel 1 is now 4\n"
+    );
+    assert_eq!(
+        std::fs::read_to_string(folder.join("all.log")).unwrap(),
+        "(10.000000) can0 100#01\n(10.500000) can3 300#05\n(11.000000) can2 200#03\n(12.000000) can1 100#02\n\
+         (12.100000) can2 200#04\n"
+    );
+    let (code, _, err) = cantap(&folder, &["align", "a.log", "b.log", "--shift", "1s", "--shift", "2s"]);
+    assert_eq!(code, Some(2));
+    assert!(err.contains("2 times for 1 traces"), "{err}");
+}
+
 #[test]
 fn stamps_too_far_apart_end_with_3() {
     let folder = folder("check");

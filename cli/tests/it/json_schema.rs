@@ -109,6 +109,7 @@ pub const LINES: &[(&str, i32, &[&str])] = &[
     ("gateway rules.toml --dry-run both.log", 0, &["gateway"]),
     ("gateway rules.toml -d virtual:load=5 -b 500k -t 1s", 0, &["gateway_on_a_device"]),
     ("align b.log b.log", 0, &["align"]),
+    ("align b.log b.log --shift 1s", 0, &["align"]),
     ("compare-adapters -d candump:b.log -d candump:b.log -b 500k -t 2s", 0, &["compare-adapters"]),
     ("decode a.log --db car.dbc", 0, &["decode", "decode_end"]),
     ("decode a.log --db car.dbc --details", 0, &["decode", "decode_end"]),

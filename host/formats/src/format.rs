@@ -53,6 +53,8 @@ pub enum Format {
     Carbus,
     /// The tables that the programs for USBCAN adapters save.
     UsbCan,
+    /// Frames that a sketch printed, each part behind its label.
+    Labelled,
     /// A table of any columns.
     Table,
     /// openpilot's log of a drive.

@@ -45,6 +45,7 @@ mod input;
 mod interfaces;
 mod issue;
 mod kvaser;
+mod labelled;
 mod left_out;
 mod line;
 mod lz4;

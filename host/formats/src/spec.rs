@@ -18,7 +18,8 @@ use super::trc::TrcVersion;
 use super::writer::WriteOptions;
 use super::{
     asc, battery_emulator, blf, busmaster, candump, candump_screen, canedge, canhacker, canking, carbus,
-    crtd, csv, gvret, kvaser, mf4, microchip, nmea2000, pcap, pcapng, printer, rlog, table, trc, usbcan,
+    crtd, csv, gvret, kvaser, labelled, mf4, microchip, nmea2000, pcap, pcapng, printer, rlog, table, trc,
+    usbcan,
 };
 
 /// One format.
@@ -376,11 +377,23 @@ const FORMATS: &[FormatSpec] = &[
         writer: None,
     },
     FormatSpec {
+        format: Format::Labelled,
+        names: &["labelled"],
+        suffixes: &["txt", "log"],
+        begins: |head| {
+            labelled::is_head(head.bytes) && !is_of_another(head, &[Format::Table, Format::Labelled])
+        },
+        has_head: false,
+        reader: |_| Box::new(Rows::<labelled::Decoder>::default()),
+        writer: None,
+    },
+    FormatSpec {
         format: Format::Table,
         names: &["table"],
         suffixes: &["csv", "tsv", "txt"],
         begins: |head| {
-            (table::is_first(head.first) || table::has_names_below(head.text)) && !is_of_another(head)
+            (table::is_first(head.first) || table::has_names_below(head.text))
+                && !is_of_another(head, &[Format::Table])
         },
         has_head: false,
         reader: |options| Box::new(Rows::of(table::Decoder::new(options.columns.clone()))),
@@ -424,9 +437,9 @@ const FORMATS: &[FormatSpec] = &[
     },
 ];
 
-/// Whether a file begins like one of a format other than a table of any columns.
-fn is_of_another(head: &Head<'_>) -> bool {
-    FORMATS.iter().filter(|spec| spec.format != Format::Table).any(|spec| (spec.begins)(head))
+/// Whether a file begins like one of a format other than these.
+fn is_of_another(head: &Head<'_>, than: &[Format]) -> bool {
+    FORMATS.iter().filter(|spec| !than.contains(&spec.format)).any(|spec| (spec.begins)(head))
 }
 
 impl FormatSpec {

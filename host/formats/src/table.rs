@@ -46,9 +46,9 @@ pub(crate) struct Decoder {
 
 /// Whether numbers are decimal.
 #[derive(Clone, Copy, Default)]
-struct Radix {
-    id: bool,
-    data: bool,
+pub(crate) struct Radix {
+    pub(crate) id: bool,
+    pub(crate) data: bool,
 }
 
 /// Whether a line is the names above the columns of a table, or a row of one without names.
@@ -340,7 +340,7 @@ fn count_rows(ids: &[&[u8]]) -> bool {
 }
 
 /// Whether identifiers are decimal, and whether that is sure.
-fn ids_are_decimal(ids: &[&[u8]]) -> (bool, bool) {
+pub(crate) fn ids_are_decimal(ids: &[&[u8]]) -> (bool, bool) {
     /// So many different identifiers without a letter are no chance.
     const ENOUGH: usize = 10;
     let plain: Vec<_> = ids.iter().filter(|id| text::after_0x(id).is_none() && !id.is_empty()).collect();

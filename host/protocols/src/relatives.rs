@@ -1,5 +1,7 @@
-//! Related old protocols that are recognised but not decoded: OSEK network management, CAN Kingdom and CAL, by their
+//! Related protocols that are recognised but not decoded: OSEK network management, CAN Kingdom, CAL and RV-C, by their
 //! identifiers and what their frames look like.
+
+mod rv_c;
 
 use std::fmt;
 
@@ -21,6 +23,13 @@ pub enum Relative {
     CanKingdom,
     /// CAL (CiA 201 to 207), CANopen's predecessor: it guards nodes with identifiers that CANopen does not use for that.
     Cal,
+    /// RV-C, J1939's relative in caravans and motor homes.
+    RvC {
+        /// Up to three of its groups that were seen.
+        examples: [Option<u32>; 3],
+        /// How many different ones were seen.
+        groups: u32,
+    },
 }
 
 impl fmt::Display for Relative {
@@ -31,6 +40,13 @@ impl fmt::Display for Relative {
             }
             Self::CanKingdom => f.write_str("CAN Kingdom, whose king sends with identifier 000"),
             Self::Cal => f.write_str("CAL, whose master guards node N with identifier 6E0 + N"),
+            Self::RvC { examples, groups } => {
+                write!(f, "RV-C ({groups} of its groups")?;
+                for (pgn, mark) in examples.iter().flatten().zip([": ", ", ", ", "]) {
+                    write!(f, "{mark}{pgn:05X} {}", rv_c::name(*pgn).unwrap_or_default())?;
+                }
+                f.write_str(")")
+            }
         }
     }
 }
@@ -50,6 +66,7 @@ pub(crate) struct Relatives {
     rings: [Vec<Ring>; 3],
     king: King,
     guard: Guard,
+    rv_c: rv_c::Signs,
 }
 
 /// The frames of one ring's identifiers, once for each of the codes that a ring message may have: 2, and 1 on Volkswagen's.
@@ -91,6 +108,7 @@ impl Relatives {
     /// Takes a frame.
     pub fn take(&mut self, frame: &TraceFrame) {
         if frame.id().is_extended() {
+            self.rv_c.take(frame);
             return;
         }
         let (id, data) = (frame.id().raw(), frame.data());
@@ -132,6 +150,7 @@ impl Relatives {
         if self.guard.toggled >= ENOUGH {
             found.push(Relative::Cal);
         }
+        found.extend(self.rv_c.found());
         found
     }
 }

@@ -24,6 +24,24 @@ pub enum DatabaseError {
         /// The file.
         file: String,
     },
+    /// An archive or a compressed file is damaged, or has no database.
+    #[error("cannot read a database in {file}: {what}")]
+    Packed {
+        /// The file.
+        file: String,
+        /// What is wrong.
+        what: String,
+    },
+    /// An archive has several databases, or not the one that was named.
+    #[error("{}; name the one to read: {}", several(file, missing.as_deref()), members(file, names))]
+    Several {
+        /// The archive.
+        file: String,
+        /// The name that was asked for and is not there.
+        missing: Option<String>,
+        /// The databases in it.
+        names: Vec<String>,
+    },
     /// The content is wrong.
     #[error("{}", list(file, faults))]
     Faulty {
@@ -32,6 +50,23 @@ pub enum DatabaseError {
         /// Everything that is wrong, by line; at least one fault.
         faults: Vec<Fault>,
     },
+}
+
+fn several(file: &str, missing: Option<&str>) -> String {
+    match missing {
+        Some(name) => format!("{file} has no file {}", clean::line(name)),
+        None => format!("{file} has several databases"),
+    }
+}
+
+/// The first databases of an archive, as they are to be written.
+fn members(file: &str, names: &[String]) -> String {
+    const SHOWN: usize = 20;
+    let mut shown: Vec<_> = names.iter().take(SHOWN).map(|name| format!("{file}/{name}")).collect();
+    if names.len() > SHOWN {
+        shown.push(format!("{} more", names.len() - SHOWN));
+    }
+    clean::line(&shown.join(", ")).into_owned()
 }
 
 /// More would scroll the first one, usually the cause of the others, off the screen.

@@ -25,6 +25,7 @@ mod layout;
 mod model;
 pub mod named;
 mod number;
+mod packed;
 mod picture;
 mod plan;
 mod reading;
@@ -56,14 +57,21 @@ pub use select::{Selection, SelectionError, Suggestion};
 /// Reads a database, by its suffix: `.dbc`, `.kcd`, `.sym`, `.arxml`, or `.toml` for cantap's own signal file. For a KCD or ARXML
 /// file with several buses, `FILE#BUS` selects one; without it, all are read as one.
 ///
+/// A file may be compressed with gzip (`car.dbc.gz`), or in a ZIP archive: `cars.zip`, if it has no other database, or `cars.zip/inside/car.dbc`.
+///
 /// Faults that leave a database usable are in [`Database::warnings`].
 pub fn load(path: &Path) -> Result<Database, DatabaseError> {
     let file = path.display().to_string();
     let (path, bus) = with_bus(path);
+    let (inner, bytes) = packed::read(path)?;
+    let file = match bus {
+        _ if inner == path => file,
+        Some(bus) => format!("{}#{bus}", inner.display()),
+        None => inner.display().to_string(),
+    };
+    let path = inner.as_path();
     let kind = FileKind::of(&file, path)?;
     if bus.is_none() || kind.has_buses() {
-        let bytes =
-            std::fs::read(path).map_err(|source| DatabaseError::Read { file: file.clone(), source })?;
         return kind.parse(&file, &bytes, bus);
     }
     let suffix = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
@@ -73,7 +81,8 @@ pub fn load(path: &Path) -> Result<Database, DatabaseError> {
 /// Reads the content of a database file of this name, by its suffix, as [`load`] does: for files that are not in the file system. All
 /// buses of the file are read.
 pub fn parse(name: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
-    FileKind::of(name, Path::new(name))?.parse(name, bytes, None)
+    let (name, bytes) = packed::unpack(name, bytes, None)?;
+    FileKind::of(&name, Path::new(&name))?.parse(&name, &bytes, None)
 }
 
 /// The kinds of database files.
@@ -97,6 +106,10 @@ impl FileKind {
             "toml" => Ok(Self::Toml),
             _ => Err(DatabaseError::UnknownKind { file: file.to_owned() }),
         }
+    }
+
+    const fn is_toml(self) -> bool {
+        matches!(self, Self::Toml)
     }
 
     /// Whether a file may describe several buses.

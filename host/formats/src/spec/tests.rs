@@ -58,6 +58,8 @@ fn files_are_known_by_their_beginning() {
         (utf8("Timestamp: 1479121434.850202        ID: 0350    000    DLC: 8    05 28"), Format::Printer),
         (utf8("序号,系统时间,时间标识,CAN通道,传输方向,ID号,帧类型,帧格式,长度,数据\n"), Format::UsbCan),
         (utf8("Index,Direction,Timesteamp,ID,Format,Type,Length,Data,\n"), Format::UsbCan),
+        (utf8("MCP2515 ready\r\nStandard ID: 0x036       DLC: 1  Data: 0x13\r\n"), Format::Labelled),
+        (utf8("------- CAN Read ----------\nID  DLC   DATA\n123 1 4 \n"), Format::Labelled),
         (utf8("timestamp,arbitration_id,data_field,attack\n1.0,0C1,00,0\n"), Format::Table),
         (utf8("time,addr,bus,data\n"), Format::Table),
         (utf8("Index;ID;Data\n"), Format::Table),

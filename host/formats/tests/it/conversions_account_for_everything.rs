@@ -267,6 +267,12 @@ fn samples() -> Vec<(Format, Vec<u8>)> {
              2,=\"12:04:59.600\",无,ch1,发送,0x0600,远程帧,标准帧,CAN,0x04,x| \r\n",
         ),
         text(
+            Format::Labelled,
+            "12:00:00.100 -> Standard ID: 0x123       DLC: 2  Data: 0x01 0x02\r\n\
+             12:00:00.200 -> Extended ID: 0x18FEF100  DLC: 0  Data:\r\n12:00:00.300 -> ready\r\n\
+             12:00:00.400 -> TX: Standard ID: 0x123       DLC: 3  Data: REMOTE REQUEST FRAME\r\n",
+        ),
+        text(
             Format::Table,
             "Timestamp,CAN ID,IDE,Bus,Dir,RTR,DLC,Data,Label\n1478198376.389427,0A5,0,0,Rx,0,2,05 21,R\n\
              1478198376.389428,18DAF110,1,1,Tx,0,0,,R\n1478198376.389429,123,0,0,Rx,1,3,,R\n\

@@ -57,6 +57,7 @@ fn row(format: Format) -> String {
             Format::Nmea2000 => ["as written, local if a date", "– | from Yacht Devices | – | – | – | – | –"],
             Format::Carbus => ["as written, no date", "yes | – | – | – | – | – | –"],
             Format::UsbCan => ["as written, local if a date", "yes | yes | yes | yes | – | – | –"],
+            Format::Labelled => ["as printed, local if a clock", "– | yes | yes | without flags | – | – | –"],
             Format::Table => ["as written, local if a date", "yes | yes | yes | without flags | – | – | –"],
             Format::Rlog => ["10 ms, an upper bound", "yes | yes | – | without flags | – | – | –"],
             Format::Mcap | Format::RosBag => {

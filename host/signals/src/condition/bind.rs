@@ -4,7 +4,7 @@ use crate::named::PREFIX;
 use crate::{Decoder, MessageRef, Signal, Suggestion};
 
 use super::error::ConditionFault;
-use super::expression::{Expression, Slot, byte_index, constant, part};
+use super::expression::{Expression, Part, Slot, byte_index, constant, part};
 use super::listener::Listener;
 use super::syntax::{Kind, Node, Operator};
 
@@ -22,14 +22,21 @@ pub(super) struct Bound {
 pub(super) type Fault = (usize, ConditionFault);
 
 /// Binds a whole condition.
-pub(super) fn bind(tree: &Node, decoder: &Decoder, listener: &mut dyn Listener) -> Result<Bound, Fault> {
-    let mut binder = Binder { decoder, listener, slots: Vec::new(), about_frames: false, names: Vec::new() };
+pub(super) fn bind(
+    text: &str,
+    tree: &Node,
+    decoder: &Decoder,
+    listener: &mut dyn Listener,
+) -> Result<Bound, Fault> {
+    let mut binder =
+        Binder { text, decoder, listener, slots: Vec::new(), about_frames: false, names: Vec::new() };
     let expression = binder.truth(tree)?;
     let Binder { slots, about_frames, names, .. } = binder;
     Ok(Bound { expression, slots, about_frames, names })
 }
 
 struct Binder<'a> {
+    text: &'a str,
     decoder: &'a Decoder,
     listener: &'a mut dyn Listener,
     slots: Vec<Slot>,
@@ -76,8 +83,13 @@ impl Binder<'_> {
     }
 
     /// If there are several values, one that satisfies the comparison is enough.
-    fn comparison(&mut self, operator: Operator, left: &Node, right: &Node) -> Result<Expression, Fault> {
-        let (left, right) = (self.bind(left)?, self.bind(right)?);
+    fn comparison(
+        &mut self,
+        operator: Operator,
+        left_node: &Node,
+        right_node: &Node,
+    ) -> Result<Expression, Fault> {
+        let (left, right) = (self.bind(left_node)?, self.bind(right_node)?);
         let compares = matches!(
             operator,
             Operator::Equal
@@ -87,6 +99,10 @@ impl Binder<'_> {
                 | Operator::Greater
                 | Operator::GreaterOrEqual
         );
+        if compares {
+            self.refuse_decimal_id(left_node, right_node)?;
+            self.refuse_decimal_id(right_node, left_node)?;
+        }
         Ok(match (left, right) {
             (Expression::Field(name), right) if compares => {
                 Expression::AnySaid(name, operator, right.into(), true)
@@ -96,6 +112,23 @@ impl Binder<'_> {
             }
             (left, right) => Expression::Binary(operator, left.into(), right.into()),
         })
+    }
+
+    /// Whoever copies an identifier from a list of frames leaves out the 0x, and would be shown other frames, or none.
+    fn refuse_decimal_id(&self, id: &Node, number: &Node) -> Result<(), Fault> {
+        let (Kind::Name(name), Kind::Number(value)) = (&id.kind, &number.kind) else { return Ok(()) };
+        if !matches!(part(name), Some(Part::Id)) {
+            return Ok(());
+        }
+        let rest = self.text.get(number.at..).unwrap_or_default();
+        let end = rest.find(|character: char| !character.is_ascii_digit()).unwrap_or(rest.len());
+        let continues = rest[end..].starts_with(|c: char| c.is_ascii_alphanumeric() || c == '.' || c == '_');
+        // Of so many digits it can only be the other.
+        let is_id = u32::from_str_radix(&rest[..end], 16).is_ok_and(|raw| raw <= 0x1FFF_FFFF);
+        if *value < 10.0 || continues || !is_id {
+            return Ok(());
+        }
+        Err((number.at, ConditionFault::DecimalId(rest[..end].to_owned(), *value as u64)))
     }
 
     fn name(&mut self, at: usize, name: &str) -> Result<Expression, Fault> {

@@ -34,8 +34,13 @@ pub enum ConditionFault {
     #[error("this text has no closing quote")]
     OpenText,
     /// Not a number.
-    #[error("{0:?} is not a number")]
+    #[error("{}", not_a_number(.0))]
     Number(String),
+    /// An identifier compared with a number that is another one in hexadecimal digits.
+    #[error(
+        "identifiers are hexadecimal: write 0x{0} for the one that is shown as {0}, or 0x{1:X} for the one that is {0} in decimal digits"
+    )]
+    DecimalId(String, u64),
     /// `a < b < c`.
     #[error("comparisons cannot be chained; write \"a < b and b < c\"")]
     Chained,
@@ -72,6 +77,13 @@ pub enum ConditionFault {
     /// Parentheses are nested too deeply.
     #[error("parentheses are nested deeper than {0}")]
     TooDeep(usize),
+}
+
+/// With what may have been meant.
+fn not_a_number(digits: &str) -> String {
+    let is_hex = digits.len() <= 8 && digits.bytes().all(|byte| byte.is_ascii_hexdigit());
+    let meant = if is_hex { format!("; in hexadecimal digits it is 0x{digits}") } else { String::new() };
+    format!("{digits:?} is not a number{meant}")
 }
 
 impl fmt::Display for ConditionError {

@@ -37,7 +37,7 @@ impl Condition {
         mut listener: Box<dyn Listener>,
     ) -> Result<Self, ConditionError> {
         let tree = syntax::parse(text)?;
-        let bound = bind(&tree, decoder, &mut *listener).map_err(|(at, fault)| {
+        let bound = bind(text, &tree, decoder, &mut *listener).map_err(|(at, fault)| {
             let text = text.to_owned();
             ConditionError { text, at, fault }
         })?;
@@ -235,6 +235,24 @@ mod tests {
 
     fn frame(text: &str) -> TraceRecord {
         record(TraceEvent::Frame { frame: text.parse().unwrap(), direction: Direction::Rx, late: false })
+    }
+
+    /// Once, the frames with 0x85 were shown to whoever had copied the identifier 133.
+    #[test]
+    fn an_identifier_without_0x_is_not_guessed() {
+        for (text, wrong) in [("id == 133", true), ("133 != id", true), ("id >= 100 and id < 0x200", true)] {
+            let error = Condition::new(text, &decoder()).map(drop);
+            assert_eq!(error.is_err(), wrong, "{text}");
+        }
+        let error = Condition::new("id == 133", &decoder()).map(drop).unwrap_err().to_string();
+        let expected =
+            "write 0x133 for the one that is shown as 133, or 0x85 for the one that is 133 in decimal digits";
+        assert!(error.contains(expected), "{error}");
+        for text in
+            ["id == 0x133", "id == 9", "id == 419361024", "id & 15 == 3", "pgn == 61444", "Speed == 133"]
+        {
+            assert!(Condition::new(text, &decoder()).is_ok(), "{text}");
+        }
     }
 
     /// The frames at which the condition holds.

@@ -355,7 +355,8 @@ mod tests {
             ("1 < a < 3", 6, "comparisons cannot be chained; write \"a < b and b < c\""),
             ("a == 'x", 5, "this text has no closing quote"),
             ("a == 0xZZ", 5, "\"0xZZ\" is not a number"),
-            ("a == 1e999", 5, "\"1e999\" is not a number"),
+            ("a == 1e999", 5, "\"1e999\" is not a number; in hexadecimal digits it is 0x1e999"),
+            ("id == 7DF", 6, "\"7DF\" is not a number; in hexadecimal digits it is 0x7DF"),
             ("a # b", 2, "'#' has no meaning here"),
             ("", 0, "expected a number, a signal, a part of the frame or \"(\", found the end"),
         ] {

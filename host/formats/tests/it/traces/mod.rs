@@ -45,6 +45,7 @@ pub fn file_name(format: Format, compression: &str) -> String {
         | Format::CanKing
         | Format::BatteryEmulator
         | Format::Nmea2000
+        | Format::Labelled
         | Format::Table => "txt",
         Format::Sqlite => "db",
         Format::Parquet => "parquet",

@@ -1,9 +1,12 @@
 //! Scripts as nodes on a real bus, through a device.
 
+mod port;
 mod repeat;
 mod repeated;
 mod run;
 mod settings;
+mod thread;
+mod thread_port;
 
 use cantap::{Device, TraceRecord};
 
@@ -12,6 +15,7 @@ use crate::report::{Message, Report};
 
 use run::Keys;
 pub use run::LiveRun;
+pub use thread::{ScriptThread, ThreadCounts, ThreadNews};
 pub use settings::{Live, LiveError};
 
 impl Live {
@@ -41,7 +45,7 @@ impl Live {
             run.add(script)?;
         }
         let keys = keys.map(|next| Box::new(next) as Keys<'_>);
-        let result = run.go(self.duration, on_record, on_message, keys, goes_on);
+        let result = run.go(device.records(), self.duration, on_record, on_message, keys, goes_on);
         let (report, messages) = run.finish();
         messages.into_iter().for_each(on_message);
         result.map(|()| report)

@@ -1,0 +1,415 @@
+//! Scripts in a thread of their own, on a device that somebody else has and also uses: whatever a script does, its owner goes on.
+//!
+//! The owner passes on what the device says, and does what the scripts want when it likes. Everything that is sent goes through it, so that
+//! nothing more comes from a script once it is ended, and so that both never have the same tag or periodic entry.
+
+use std::collections::{BTreeSet, VecDeque};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use cantap::device::Transmission;
+use cantap::wire::message::{MAX_SEND, Refusal, TxFrame};
+use cantap::{Device, DeviceError, TraceEvent, TraceRecord};
+use cantap_can::{CHANNELS, Channel, Frame};
+
+use super::run::LiveRun;
+use super::settings::{Live, LiveError};
+use super::thread_port::{Owner, Shared, TAGS, ThreadPort, Wish};
+use crate::node::{Script, ScriptError};
+use crate::report::{Message, TestResult};
+
+/// Records that may wait for slow scripts; of more, they see a gap.
+const MOST_RECORDS: usize = 200_000;
+/// The longest wait of the scripts' thread.
+const LOOK_EVERY: Duration = Duration::from_millis(200);
+
+/// What scripts have done since.
+#[derive(Debug)]
+pub enum ThreadNews {
+    /// A script has logged a line.
+    Message(Message),
+    /// A script is in this test now.
+    TestBegan {
+        /// The script's place.
+        place: usize,
+        /// The test's function.
+        name: String,
+    },
+    /// A test has ended.
+    Test(TestResult),
+    /// A script has ended.
+    Ended {
+        /// Its place.
+        place: usize,
+        /// The error, if there was one.
+        error: Option<String>,
+    },
+    /// The device refuses what a script wants, which has ended it.
+    Refused {
+        /// Its place.
+        place: usize,
+        /// The refusal.
+        error: DeviceError,
+    },
+    /// What all of them have sent and received so far.
+    Counts(ThreadCounts),
+}
+
+/// What scripts have sent and received.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ThreadCounts {
+    /// Frames of scripts that were on the bus.
+    pub sent: u64,
+    /// Frames of others, and of the other scripts.
+    pub received: u64,
+    /// Frames of scripts that wait to be sent.
+    pub waiting: u64,
+    /// Frames that are not sent: there was no room.
+    pub not_sent: u64,
+    /// Frames that scripts have not seen, at least.
+    pub lost: u64,
+}
+
+/// What the owner hands to the scripts' thread.
+enum Passed {
+    Add(Script, Arc<AtomicBool>),
+    End(usize),
+    Key(char),
+    Transmission(Transmission),
+    Records(Vec<TraceRecord>),
+}
+
+/// A frame that waits for room in the device's queue.
+struct Waiting {
+    of: usize,
+    tag: u32,
+    frame: Frame,
+}
+
+/// Scripts in a thread of their own. Its end is the end of all of them.
+pub struct ScriptThread {
+    to: Option<Sender<Passed>>,
+    wishes: Receiver<Wish>,
+    thread: Option<JoinHandle<()>>,
+    shared: Arc<Shared>,
+    confirmations: Receiver<Transmission>,
+    /// Each script's, by place.
+    stops: Vec<Arc<AtomicBool>>,
+    ended: BTreeSet<usize>,
+    waiting: [VecDeque<Waiting>; CHANNELS],
+    /// Records for which there was no room, by channel.
+    missed: [u32; CHANNELS],
+}
+
+impl ScriptThread {
+    /// Starts the thread, without scripts. It takes over the device's confirmations.
+    ///
+    /// # Errors
+    /// If the system gives no thread.
+    pub fn start(live: &Live, device: &Device) -> Result<Self, ScriptError> {
+        let (to, passed) = channel();
+        let (wish, wishes) = channel();
+        let shared = Arc::<Shared>::default();
+        let (live, hello, both) = (live.clone(), device.hello().clone(), Arc::clone(&shared));
+        let body = move || {
+            let port = ThreadPort::new(wish.clone(), Arc::clone(&both));
+            let mut run = live.start_through(Box::new(port), &hello);
+            if let Err(error) = serve(&mut run, &passed, &wish, &both) {
+                // If nobody waits for it, the scripts were ended from outside.
+                let _ = wish.send(Wish::Broken(error));
+            }
+        };
+        let thread = std::thread::Builder::new().name("cantap-scripts".to_owned()).spawn(body);
+        let thread = thread.map_err(|error| ScriptError::Thread {
+            name: "scripts".to_owned(),
+            reason: error.to_string(),
+        })?;
+        Ok(Self {
+            to: Some(to),
+            wishes,
+            thread: Some(thread),
+            shared,
+            confirmations: device.transmissions(),
+            stops: Vec::new(),
+            ended: BTreeSet::new(),
+            waiting: Default::default(),
+            missed: [0; CHANNELS],
+        })
+    }
+
+    /// One more script, from now on; returns its place.
+    ///
+    /// # Errors
+    /// If it is not in the language; what goes wrong later is in the news.
+    pub fn add(&mut self, script: Script) -> Result<usize, ScriptError> {
+        script.tests()?;
+        let stop = Arc::<AtomicBool>::default();
+        self.stops.push(Arc::clone(&stop));
+        self.pass(Passed::Add(script, stop));
+        Ok(self.stops.len() - 1)
+    }
+
+    /// Ends a script, whatever it does: nothing of it is sent any more but what the device has already, and the device repeats nothing of
+    /// it from the next [`Self::serve`] on.
+    pub fn end(&mut self, place: usize) {
+        let Some(stop) = self.stops.get(place) else { return };
+        stop.store(true, Ordering::Relaxed);
+        self.ended.insert(place);
+        for waiting in &mut self.waiting {
+            let before = waiting.len();
+            waiting.retain(|waiting| waiting.of != place);
+            self.shared.waiting.fetch_sub(before - waiting.len(), Ordering::Relaxed);
+        }
+        self.pass(Passed::End(place));
+    }
+
+    /// The user has typed a key for the scripts.
+    pub fn key(&self, key: char) {
+        self.pass(Passed::Key(key));
+    }
+
+    /// Takes a periodic entry of the device for its owner; false if a script has it.
+    #[must_use]
+    pub fn claim(&self, channel: Channel, slot: u8) -> bool {
+        self.shared.claim(channel, slot, Owner::Device)
+    }
+
+    /// The owner's periodic entry has ended.
+    pub fn release(&self, channel: Channel, slot: u8) {
+        self.shared.release(channel, slot, Owner::Device);
+    }
+
+    /// Hands records of the device to the scripts. Frames for which they are too slow are a gap to them, and counted.
+    pub fn take(&mut self, records: &[TraceRecord]) {
+        // Before the records of what they confirm.
+        while let Ok(transmission) = self.confirmations.try_recv() {
+            // A script waits for no others.
+            if TAGS.contains(&transmission.tag) || self.has_room_for(1) {
+                self.shared.backlog.fetch_add(1, Ordering::Relaxed);
+                self.pass(Passed::Transmission(transmission));
+            }
+        }
+        let of_device = |record: &&TraceRecord| Channel::from_number(record.channel).is_some();
+        let mut batch: Vec<TraceRecord> = records.iter().filter(of_device).copied().collect();
+        if !self.has_room_for(batch.len()) {
+            for record in &batch {
+                if let Some(channel) = Channel::from_number(record.channel) {
+                    let missed = &mut self.missed[channel.index()];
+                    *missed = missed.saturating_add(1);
+                }
+            }
+            return;
+        }
+        let Some(first) = batch.first() else { return };
+        let (time_ns, missed) = (first.time_ns, std::mem::take(&mut self.missed));
+        for (channel, count) in Channel::ALL.into_iter().zip(missed).filter(|(_, count)| *count > 0) {
+            let event = TraceEvent::Lost { stage: None, count, at_least: false };
+            batch.insert(0, TraceRecord { time_ns, channel: channel.number(), event });
+        }
+        self.shared.backlog.fetch_add(batch.len(), Ordering::Relaxed);
+        self.pass(Passed::Records(batch));
+    }
+
+    fn has_room_for(&self, count: usize) -> bool {
+        self.shared.backlog.load(Ordering::Relaxed) + count <= MOST_RECORDS
+    }
+
+    /// Does what the scripts want of the device, and adds what they have done to `news`.
+    ///
+    /// # Errors
+    /// If the device is gone: the scripts cannot go on.
+    pub fn serve(&mut self, device: &Device, news: &mut Vec<ThreadNews>) -> Result<(), LiveError> {
+        while let Ok(wish) = self.wishes.try_recv() {
+            match wish {
+                Wish::Send { of, .. } if self.ended.contains(&of) => {
+                    self.shared.waiting.fetch_sub(1, Ordering::Relaxed);
+                }
+                Wish::Send { of, tag, channel, frame } => {
+                    self.waiting[channel.index()].push_back(Waiting { of, tag, frame });
+                }
+                Wish::Periodic { of, channel, slot, entry } => {
+                    let entry = entry.filter(|_| !self.ended.contains(&of));
+                    let is_over = entry.is_none();
+                    match device.set_periodic(channel, slot, entry) {
+                        Err(error @ DeviceError::Refused { .. }) => self.refuse(of, error, news),
+                        result => result?,
+                    }
+                    if is_over {
+                        self.shared.release(channel, slot, Owner::Scripts);
+                    }
+                }
+                Wish::News(ThreadNews::Ended { place, .. }) if self.ended.contains(&place) => {}
+                Wish::News(one) => {
+                    if let ThreadNews::Ended { place, .. } = one {
+                        self.ended.insert(place);
+                    }
+                    news.push(one);
+                }
+                Wish::Broken(error) => return Err(error),
+            }
+        }
+        for channel in Channel::ALL {
+            self.hand_over(device, channel, news)?;
+        }
+        Ok(())
+    }
+
+    /// The device refuses what a script wants: the others go on.
+    fn refuse(&mut self, of: usize, error: DeviceError, news: &mut Vec<ThreadNews>) {
+        if !self.ended.contains(&of) {
+            self.end(of);
+            news.push(ThreadNews::Refused { place: of, error });
+        }
+    }
+
+    /// Whether every script has ended.
+    pub fn is_over(&self) -> bool {
+        self.ended.len() == self.stops.len()
+    }
+
+    /// Ends all scripts, and what the device repeats for them. Returns what they have done last.
+    pub fn finish(mut self, device: Option<&Device>) -> Vec<ThreadNews> {
+        self.join();
+        if let Some(device) = device {
+            // If it does not answer, it is gone, and repeats nothing.
+            for (channel, slot) in self.shared.of_scripts() {
+                let _ = device.set_periodic(channel, slot, None);
+            }
+        }
+        let last = self.wishes.try_iter().filter_map(|wish| match wish {
+            Wish::News(news) => Some(news),
+            _ => None,
+        });
+        last.collect()
+    }
+
+    /// As many of the frames that wait as the device's queue has room for.
+    fn hand_over(
+        &mut self,
+        device: &Device,
+        channel: Channel,
+        news: &mut Vec<ThreadNews>,
+    ) -> Result<(), DeviceError> {
+        let mut most = MAX_SEND;
+        while most > 0 {
+            let waiting = &mut self.waiting[channel.index()];
+            let Some(Waiting { of, .. }) = waiting.front() else { return Ok(()) };
+            let of = *of;
+            let next = waiting.iter().take(most);
+            let frames: Vec<TxFrame> = next
+                .map(|Waiting { tag, frame, .. }| TxFrame { tag: *tag, frame: *frame, at_ticks: None })
+                .collect();
+            match device.send(channel, &frames) {
+                Ok(_) => {
+                    waiting.drain(..frames.len());
+                    self.shared.waiting.fetch_sub(frames.len(), Ordering::Relaxed);
+                }
+                Err(DeviceError::Refused { refusal: Refusal::QueueFull { free }, .. }) => {
+                    most = usize::from(free).min(frames.len() - 1);
+                }
+                Err(error @ DeviceError::Refused { .. }) => self.refuse(of, error, news),
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(())
+    }
+
+    fn pass(&self, passed: Passed) {
+        // If the thread has ended, its wishes say why.
+        if let Some(to) = &self.to {
+            let _ = to.send(passed);
+        }
+    }
+
+    fn join(&mut self) {
+        self.stops.iter().for_each(|stop| stop.store(true, Ordering::Relaxed));
+        self.to = None;
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+impl Drop for ScriptThread {
+    fn drop(&mut self) {
+        self.join();
+    }
+}
+
+/// What the owner knows of a script, by its place.
+#[derive(Default)]
+struct Known {
+    test: Option<String>,
+    is_told: bool,
+}
+
+/// The thread: turn after turn, until the owner is gone.
+fn serve(
+    run: &mut LiveRun<'_>,
+    passed: &Receiver<Passed>,
+    wishes: &Sender<Wish>,
+    shared: &Shared,
+) -> Result<(), LiveError> {
+    let mut known: Vec<Known> = Vec::new();
+    let mut tests = 0;
+    let mut counts = ThreadCounts::default();
+    let tell = |news| wishes.send(Wish::News(news)).map_err(|_| LiveError::Over);
+    loop {
+        let wait = run.turn()?;
+        run.take_messages().into_iter().map(ThreadNews::Message).try_for_each(&tell)?;
+        let ended = &run.report().tests[tests..];
+        ended.iter().cloned().map(ThreadNews::Test).try_for_each(&tell)?;
+        tests = run.report().tests.len();
+        for (place, script) in known.iter_mut().enumerate() {
+            let test = run.test_of(place);
+            if script.test.as_deref() != test {
+                script.test = test.map(str::to_owned);
+                script.test.iter().cloned().map(|name| ThreadNews::TestBegan { place, name }).try_for_each(&tell)?;
+            }
+            if run.has_ended(place) && !std::mem::replace(&mut script.is_told, true) {
+                tell(ThreadNews::Ended { place, error: run.error_of(place).map(str::to_owned) })?;
+            }
+        }
+        let report = run.report();
+        let now = ThreadCounts {
+            sent: report.frames_sent,
+            received: report.frames_received,
+            waiting: run.waiting() as u64,
+            not_sent: report.frames_not_sent,
+            lost: report.frames_lost,
+        };
+        if counts != now {
+            counts = now;
+            tell(ThreadNews::Counts(now))?;
+        }
+        let mut next = match passed.recv_timeout(wait.min(LOOK_EVERY)) {
+            Ok(next) => Some(next),
+            Err(RecvTimeoutError::Timeout) => None,
+            Err(RecvTimeoutError::Disconnected) => return Ok(()),
+        };
+        while let Some(one) = next {
+            let is_batch = matches!(one, Passed::Records(_));
+            match one {
+                Passed::Add(script, stop) => {
+                    run.add_until(&script, stop)?;
+                    known.push(Known::default());
+                }
+                Passed::End(place) => run.end(place)?,
+                Passed::Key(key) => run.key(key)?,
+                Passed::Transmission(transmission) => {
+                    shared.backlog.fetch_sub(1, Ordering::Relaxed);
+                    run.take_transmission(transmission);
+                }
+                Passed::Records(batch) => {
+                    shared.backlog.fetch_sub(batch.len(), Ordering::Relaxed);
+                    batch.into_iter().try_for_each(|record| run.take_record(record).map(drop))?;
+                }
+            }
+            // After records, it is the scripts' turn.
+            next = if is_batch { None } else { passed.try_recv().ok() };
+        }
+    }
+}

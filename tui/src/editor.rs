@@ -26,7 +26,8 @@ pub fn edit(path: &Path, stops: &Stops) -> Edited {
     let named = ["VISUAL", "EDITOR"].into_iter().filter_map(std::env::var_os);
     let editor = named.map(|name| name.to_string_lossy().into_owned()).find(|name| !name.trim().is_empty());
     let editor = editor.unwrap_or_else(|| if cfg!(windows) { "notepad" } else { "vi" }.to_owned());
-    let failed = |reason: String| Edited::Failed(format!("the editor '{editor}' {reason}; EDITOR names another one"));
+    let failed =
+        |reason: String| Edited::Failed(format!("the editor '{editor}' {reason}; EDITOR names another one"));
     interrupt::leave_to(|| {
         let mut child = match command(&editor, path).spawn() {
             Ok(child) => child,

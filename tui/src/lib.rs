@@ -34,10 +34,10 @@ use ratatui::crossterm::event::{self, Event, KeyEventKind};
 
 use app::{Flow, Request};
 use cantap_work::interrupt;
+use editor::Edited;
 use keyboard::{Keyboard, Waited};
 use model::{Playing, SourceState};
 use screen::Screen;
-use editor::Edited;
 use source::{Shared, lock};
 use stops::Stops;
 

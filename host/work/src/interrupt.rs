@@ -12,8 +12,13 @@ pub const ENDED_BY_SIGNAL: u8 = 130;
 const ECHO: Duration = Duration::from_secs(2);
 
 static HANDLER: OnceLock<()> = OnceLock::new();
-static STATE: Mutex<State> =
-    Mutex::new(State { is_watched: false, is_left: false, request: Request::NONE, unfinished: Vec::new(), last: None });
+static STATE: Mutex<State> = Mutex::new(State {
+    is_watched: false,
+    is_left: false,
+    request: Request::NONE,
+    unfinished: Vec::new(),
+    last: None,
+});
 
 /// What a signal acts on.
 struct State {

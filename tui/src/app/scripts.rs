@@ -65,7 +65,9 @@ impl App {
         let Some(name) = self.selected_script(model) else { return };
         if name.starts_with(library::PREFIX) {
             let node = name.split('?').next().unwrap_or_default();
-            self.message = format!("{node} comes with the program; `cantap run --print {node} > mine.rhai` writes a copy");
+            self.message = format!(
+                "{node} comes with the program; `cantap run --print {node} > mine.rhai` writes a copy"
+            );
         } else {
             self.request = Some(Request::Edit(PathBuf::from(name)));
         }
@@ -119,17 +121,13 @@ impl App {
 
     /// Moves through the list, or with the larger steps through the output.
     pub(super) fn scroll_scripts(&mut self, code: KeyCode) {
-        let page = self.page_rows.max(1);
+        let page = self.output_rows.max(1);
         match code {
             KeyCode::PageUp => self.output_above += page,
             KeyCode::PageDown => self.output_above = self.output_above.saturating_sub(page),
             KeyCode::End => self.output_above = 0,
             KeyCode::Home => self.output_above = usize::MAX / 2,
-            code => {
-                let rows = self.page_rows;
-                self.scroll(code);
-                self.page_rows = rows;
-            }
+            code => self.scroll(code),
         }
     }
 }

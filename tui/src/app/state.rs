@@ -71,7 +71,6 @@ impl View {
             Self::Scripts => "Scripts",
         }
     }
-
 }
 
 /// The form in which times are shown.
@@ -152,6 +151,8 @@ pub struct App {
     pub prompt: Option<Prompt>,
     /// Lines of the scripts' output below the last one on the page; a position past the beginning is drawn as the beginning.
     pub output_above: usize,
+    /// Number of lines of it that fit on the page, as last drawn.
+    pub output_rows: usize,
     /// The columns of the pages' tabs, as last drawn.
     pub tab_columns: Vec<(Range<u16>, View)>,
     /// A message to show once, such as an error in what was typed.
@@ -239,6 +240,7 @@ impl App {
             help_first: 0,
             prompt: None,
             output_above: 0,
+            output_rows: 20,
             tab_columns: Vec::new(),
             message: String::new(),
             any_key_continues: false,

@@ -108,9 +108,14 @@ impl Scripts {
             row.state = ScriptState::Running(None);
         }
         match outcome {
-            Outcome::Passed => self.say(LineKind::Note, &format!("{script}: ok {name} ({milliseconds:.3} ms)")),
+            Outcome::Passed => {
+                self.say(LineKind::Note, &format!("{script}: ok {name} ({milliseconds:.3} ms)"))
+            }
             Outcome::Failed(reason) => {
-                self.say(LineKind::Fault, &format!("{script}: FAILED {name} ({milliseconds:.3} ms): {reason}"));
+                self.say(
+                    LineKind::Fault,
+                    &format!("{script}: FAILED {name} ({milliseconds:.3} ms): {reason}"),
+                );
                 trace.iter().for_each(|line| self.say(LineKind::Log, &format!("    {line}")));
             }
         }

@@ -158,7 +158,9 @@ impl Source<'_> {
                 let is_known = !unknown.contains(&true);
                 let waited = if is_known { early.pop_front() } else { None };
                 let followed = match waited.map_or_else(|| self.orders.try_recv(), Ok) {
-                    Ok(order @ (Order::Send(..) | Order::SetPeriodic(..) | Order::StartScript(_))) if !is_known => {
+                    Ok(order @ (Order::Send(..) | Order::SetPeriodic(..) | Order::StartScript(_)))
+                        if !is_known =>
+                    {
                         early.push_back(order);
                         Then::GoOn
                     }

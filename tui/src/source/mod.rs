@@ -59,7 +59,13 @@ const FIGURES_EVERY: Duration = Duration::from_millis(500);
 
 /// Runs until [`Order::Quit`].
 pub fn run(origin: Origin, model: &Shared, orders: &Receiver<Order>) {
-    let mut source = Source { model, orders, recording: None, timed: Timed::default(), scripts: SessionScripts::default() };
+    let mut source = Source {
+        model,
+        orders,
+        recording: None,
+        timed: Timed::default(),
+        scripts: SessionScripts::default(),
+    };
     match origin {
         Origin::Device(plan) => source.run_device(plan),
         Origin::File(path) => source.run_file(&path),
@@ -158,7 +164,9 @@ impl Source<'_> {
                 lock(self.model).refused.push((channel, slot));
             }
             Order::StartScript(script) => {
-                lock(self.model).scripts.fail(&script.name, "there is no device to run it on; open one with D");
+                lock(self.model)
+                    .scripts
+                    .fail(&script.name, "there is no device to run it on; open one with D");
             }
             Order::StopScript(_) | Order::ScriptKey(_) => {}
             Order::WriteList(path, text) => self.write_list(&path, &text),

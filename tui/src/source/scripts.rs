@@ -63,7 +63,8 @@ impl SessionScripts {
             if records.iter().all(|record| record.channel <= is_last) {
                 running.thread.take(records);
             } else {
-                let own: Vec<_> = records.iter().filter(|record| record.channel <= is_last).copied().collect();
+                let own: Vec<_> =
+                    records.iter().filter(|record| record.channel <= is_last).copied().collect();
                 running.thread.take(&own);
             }
         }
@@ -155,7 +156,8 @@ impl Source<'_> {
         for news in last {
             match news {
                 ThreadNews::Message(message) => {
-                    let text = format!("{:.6} {}: {}", message.at_ns as f64 / 1e9, message.script, message.text);
+                    let text =
+                        format!("{:.6} {}: {}", message.at_ns as f64 / 1e9, message.script, message.text);
                     model.scripts.say(LineKind::Log, &text);
                 }
                 ThreadNews::Counts(counts) => model.scripts.counts = counts,
@@ -183,7 +185,8 @@ impl Source<'_> {
         for news in news {
             match news {
                 ThreadNews::Message(message) => {
-                    let text = format!("{:.6} {}: {}", message.at_ns as f64 / 1e9, message.script, message.text);
+                    let text =
+                        format!("{:.6} {}: {}", message.at_ns as f64 / 1e9, message.script, message.text);
                     scripts.say(LineKind::Log, &text);
                 }
                 ThreadNews::TestBegan { place, name } if is_current(place) => {

@@ -124,7 +124,9 @@ fn question(kind: PromptKind) -> &'static str {
         PromptKind::Device => {
             "device: a serial port, virtual, or emu:FIRMWARE.elf; several with \" + \" between them; a trace opens beside"
         }
-        PromptKind::Script => "add a script: its file, or a ready node such as node:obd?speed=60 (cantap run --nodes lists them)",
+        PromptKind::Script => {
+            "add a script: its file, or a ready node such as node:obd?speed=60 (cantap run --nodes lists them)"
+        }
         PromptKind::ScriptKey => "the next key goes to the scripts; Esc does not",
         PromptKind::Normal => "acknowledge other nodes' frames, and send on request, on this bus? y or n",
     }

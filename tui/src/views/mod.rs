@@ -118,7 +118,8 @@ fn tabs(app: &mut App, width: usize) -> Line<'static> {
             break;
         }
         let others = (0..titles.len()).filter(|index| View::ALL[*index] != app.view);
-        let longest = others.filter(|index| !titles[*index].is_empty()).max_by_key(|index| titles[*index].len());
+        let longest =
+            others.filter(|index| !titles[*index].is_empty()).max_by_key(|index| titles[*index].len());
         let Some(longest) = longest else { break };
         titles[longest] = "";
     }

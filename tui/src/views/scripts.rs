@@ -82,7 +82,7 @@ fn draw_output(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) 
     }
     let room = usize::from(area.height).saturating_sub(1);
     let width = usize::from(area.width);
-    app.page_rows = room;
+    app.output_rows = room;
     let output = &model.scripts.output;
     app.output_above = app.output_above.min(output.len().saturating_sub(room));
     let end = output.len() - app.output_above;

@@ -15,8 +15,8 @@ use crate::report::{Message, Report};
 
 use run::Keys;
 pub use run::LiveRun;
-pub use thread::{ScriptThread, ThreadCounts, ThreadNews};
 pub use settings::{Live, LiveError};
+pub use thread::{ScriptThread, ThreadCounts, ThreadNews};
 
 impl Live {
     /// Runs scripts on the open channels of a device, which have to be in normal mode to send. Times are those of the device's stamps; the

@@ -2,10 +2,10 @@
 
 use std::time::{Duration, Instant};
 
+use cantap::Device;
 use cantap::device::Transmission;
 use cantap::transmit::Stream;
 use cantap::wire::message::Periodic;
-use cantap::Device;
 use cantap_can::{Channel, Frame};
 
 use super::settings::LiveError;

@@ -5,10 +5,10 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
+use cantap::device::Records;
 use cantap::device::Transmission;
 use cantap::wire::Hello;
 use cantap::wire::message::TRIGGER_TAG;
-use cantap::device::Records;
 use cantap::{Device, TraceEvent, TraceRecord};
 use cantap_can::{CHANNELS, Channel, DEVICE_TAG, Frame};
 use cantap_signals::Decoder;
@@ -142,11 +142,7 @@ impl LiveRun<'_> {
     }
 
     /// The same; it ends when `stop` becomes true, also in the middle of a computation.
-    pub(super) fn add_until(
-        &mut self,
-        script: &Script,
-        stop: Arc<AtomicBool>,
-    ) -> Result<usize, ScriptError> {
+    pub(super) fn add_until(&mut self, script: &Script, stop: Arc<AtomicBool>) -> Result<usize, ScriptError> {
         self.nodes.push(Node::start_nth(self.nodes.len(), script, &self.decoder, self.seed, stop)?);
         Ok(self.nodes.len() - 1)
     }
@@ -365,7 +361,9 @@ impl LiveRun<'_> {
                 Ok(())
             }
             // Of an earlier run, which had it repeated.
-            (Ok(_), None) if (DEVICE_TAG..TRIGGER_TAG).contains(&tag) && !self.port.is_of_owner(channel, tag) => {
+            (Ok(_), None)
+                if (DEVICE_TAG..TRIGGER_TAG).contains(&tag) && !self.port.is_of_owner(channel, tag) =>
+            {
                 Ok(())
             }
             (Ok(frame), _) => self.take_frame(channel, frame),

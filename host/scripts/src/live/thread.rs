@@ -123,10 +123,8 @@ impl ScriptThread {
             }
         };
         let thread = std::thread::Builder::new().name("cantap-scripts".to_owned()).spawn(body);
-        let thread = thread.map_err(|error| ScriptError::Thread {
-            name: "scripts".to_owned(),
-            reason: error.to_string(),
-        })?;
+        let thread = thread
+            .map_err(|error| ScriptError::Thread { name: "scripts".to_owned(), reason: error.to_string() })?;
         Ok(Self {
             to: Some(to),
             wishes,
@@ -367,7 +365,12 @@ fn serve(
             let test = run.test_of(place);
             if script.test.as_deref() != test {
                 script.test = test.map(str::to_owned);
-                script.test.iter().cloned().map(|name| ThreadNews::TestBegan { place, name }).try_for_each(&tell)?;
+                script
+                    .test
+                    .iter()
+                    .cloned()
+                    .map(|name| ThreadNews::TestBegan { place, name })
+                    .try_for_each(&tell)?;
             }
             if run.has_ended(place) && !std::mem::replace(&mut script.is_told, true) {
                 tell(ThreadNews::Ended { place, error: run.error_of(place).map(str::to_owned) })?;

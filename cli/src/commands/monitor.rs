@@ -98,8 +98,9 @@ pub struct Args {
 
 fn view(text: &str) -> Result<View, String> {
     let found = View::ALL.into_iter().find(|view| view.title().eq_ignore_ascii_case(text));
-    found
-        .ok_or_else(|| "a page is trace, fixed, signals, graph, statistics, send, record, nodes or scripts".to_owned())
+    found.ok_or_else(|| {
+        "a page is trace, fixed, signals, graph, statistics, send, record, nodes or scripts".to_owned()
+    })
 }
 
 fn size(text: &str) -> Result<(u16, u16), String> {

@@ -236,6 +236,7 @@ impl Model {
         self.seen.table = FixedTable::default();
         self.seen.signals.clear();
         (self.talk, self.seen.talked) = (Talk::default(), Talked::default());
+        self.scripts.output.clear();
         self.seen.taken = 0;
         self.first_ns = None;
         self.begin_statistics();

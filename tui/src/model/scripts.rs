@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use cantap_scripts::{Outcome, TestResult, ThreadCounts};
+use cantap_scripts::{Outcome, ScriptCounts, TestResult};
 use cantap_trace::clean;
 
 /// Lines of output that are kept.
@@ -56,7 +56,7 @@ pub struct Scripts {
     /// Lines of output, the newest last.
     pub output: VecDeque<(LineKind, String)>,
     /// What those that run have sent and received.
-    pub counts: ThreadCounts,
+    pub counts: ScriptCounts,
     /// The gateway's state, its rules with their counts, and its sums; empty if the device is none.
     pub gateway: Vec<String>,
 }

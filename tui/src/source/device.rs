@@ -158,9 +158,12 @@ impl Source<'_> {
                 let is_known = !unknown.contains(&true);
                 let waited = if is_known { early.pop_front() } else { None };
                 let followed = match waited.map_or_else(|| self.orders.try_recv(), Ok) {
-                    Ok(order @ (Order::Send(..) | Order::SetPeriodic(..) | Order::StartScript(_)))
-                        if !is_known =>
-                    {
+                    Ok(
+                        order @ (Order::Send(..)
+                        | Order::SetPeriodic(..)
+                        | Order::StartScript(_)
+                        | Order::StopScript(_)),
+                    ) if !is_known => {
                         early.push_back(order);
                         Then::GoOn
                     }
@@ -297,6 +300,11 @@ impl Source<'_> {
         let order = match (order, scripts_on) {
             (Order::StartScript(script), Some(device)) => {
                 self.start_script(device, script);
+                return Then::GoOn;
+            }
+            (Order::StartScript(script), None) => {
+                let reason = "its device is gone; start it when it is back";
+                lock(self.model).scripts.fail(&script.name, reason);
                 return Then::GoOn;
             }
             (Order::StopScript(name), _) => {

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use cantap::device::channel_number;
 use cantap::wire::message::capability;
 use cantap::{Channel, Device, DeviceError, TraceRecord};
-use cantap_scripts::{Live, LiveError, Script, ScriptThread, ThreadNews};
+use cantap_scripts::{Live, LiveError, Script, ScriptEvent, ScriptThread};
 use cantap_work::advice;
 use cantap_work::gateway::{Counts, Named, state_name};
 
@@ -126,10 +126,10 @@ impl Source<'_> {
     /// Does what the scripts want, and shows what they have done.
     pub(super) fn serve_scripts(&mut self, device: &Device) {
         let Some(running) = &mut self.scripts.running else { return };
-        let mut news = Vec::new();
-        let result = running.thread.serve(device, &mut news);
+        let mut events = Vec::new();
+        let result = running.thread.serve(device, &mut events);
         let is_over = running.thread.is_over();
-        self.show_script_news(news);
+        self.show_script_events(events);
         match result {
             Err(error) => {
                 let reason = match &error {
@@ -153,14 +153,14 @@ impl Source<'_> {
                 model.scripts.fail(&name, reason);
             }
         }
-        for news in last {
-            match news {
-                ThreadNews::Message(message) => {
+        for event in last {
+            match event {
+                ScriptEvent::Message(message) => {
                     let text =
                         format!("{:.6} {}: {}", message.at_ns as f64 / 1e9, message.script, message.text);
                     model.scripts.say(LineKind::Log, &text);
                 }
-                ThreadNews::Counts(counts) => model.scripts.counts = counts,
+                ScriptEvent::Counts(counts) => model.scripts.counts = counts,
                 _ => {}
             }
         }
@@ -173,8 +173,8 @@ impl Source<'_> {
         lock(self.model).scripts.gateway.clear();
     }
 
-    fn show_script_news(&self, news: Vec<ThreadNews>) {
-        if news.is_empty() {
+    fn show_script_events(&self, events: Vec<ScriptEvent>) {
+        if events.is_empty() {
             return;
         }
         let Some(Running { names, .. }) = &self.scripts.running else { return };
@@ -182,29 +182,29 @@ impl Source<'_> {
         let scripts = &mut model.scripts;
         // A place of which there was an earlier one with this name is no longer the script in the list.
         let is_current = |place: usize| names.iter().rposition(|own| *own == names[place]) == Some(place);
-        for news in news {
-            match news {
-                ThreadNews::Message(message) => {
+        for event in events {
+            match event {
+                ScriptEvent::Message(message) => {
                     let text =
                         format!("{:.6} {}: {}", message.at_ns as f64 / 1e9, message.script, message.text);
                     scripts.say(LineKind::Log, &text);
                 }
-                ThreadNews::TestBegan { place, name } if is_current(place) => {
+                ScriptEvent::TestBegan { place, name } if is_current(place) => {
                     scripts.set_state(&names[place], ScriptState::Running(Some(name)));
                 }
-                ThreadNews::Test(test) => scripts.take_test(&test),
-                ThreadNews::Ended { place, error: None } if is_current(place) => {
+                ScriptEvent::Test(test) => scripts.take_test(&test),
+                ScriptEvent::Ended { place, error: None } if is_current(place) => {
                     scripts.set_state(&names[place], ScriptState::Ended);
                     scripts.say(LineKind::Note, &format!("{}: ended", names[place]));
                 }
-                ThreadNews::Ended { place, error: Some(error) } if is_current(place) => {
+                ScriptEvent::Ended { place, error: Some(error) } if is_current(place) => {
                     scripts.fail(&names[place], &error);
                 }
-                ThreadNews::Refused { place, error } if is_current(place) => {
+                ScriptEvent::Refused { place, error } if is_current(place) => {
                     scripts.fail(&names[place], &advice::explained(&error));
                 }
-                ThreadNews::Counts(counts) => scripts.counts = counts,
-                ThreadNews::TestBegan { .. } | ThreadNews::Ended { .. } | ThreadNews::Refused { .. } => {}
+                ScriptEvent::Counts(counts) => scripts.counts = counts,
+                ScriptEvent::TestBegan { .. } | ScriptEvent::Ended { .. } | ScriptEvent::Refused { .. } => {}
             }
         }
     }

@@ -21,7 +21,7 @@ use cantap::wire::record::{BusErrorKind, ErrorState, LossStage};
 use cantap::{Direction, TraceEvent, TraceRecord};
 use cantap_analysis::stats::Options;
 use cantap_formats::{ReadOptions, open_reader};
-use cantap_scripts::{Outcome, TestResult, ThreadCounts};
+use cantap_scripts::{Outcome, ScriptCounts, TestResult};
 use cantap_signals::{Decoder, Source};
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 
@@ -174,7 +174,7 @@ fn scripts(scripts: &mut Scripts) {
     scripts.set_state("tester.rhai", ScriptState::Running(Some("test_trouble_codes".to_owned())));
     scripts.say(LineKind::Log, "1.250000 tester.rhai: two\nlines");
     scripts.fail("broken.rhai", "there is no signal Sped; line 3");
-    scripts.counts = ThreadCounts { sent: 120, received: 4711, waiting: 2, not_sent: 1, lost: 0 };
+    scripts.counts = ScriptCounts { sent: 120, received: 4711, waiting: 2, not_sent: 1, lost: 0 };
     let gateway = [
         "Gateway running. 1>2: 4711 received, 4700 sent, 11 dropped; 2>1: 0 received, 0 sent",
         "from rule                  matched     sent  dropped replaced     lost   failed",

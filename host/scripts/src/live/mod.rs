@@ -1,5 +1,6 @@
 //! Scripts as nodes on a real bus, through a device.
 
+mod events;
 mod port;
 mod repeat;
 mod repeated;
@@ -13,10 +14,11 @@ use cantap::{Device, TraceRecord};
 use crate::node::{Script, ScriptError};
 use crate::report::{Message, Report};
 
+pub use events::{ScriptCounts, ScriptEvent};
 use run::Keys;
 pub use run::LiveRun;
 pub use settings::{Live, LiveError};
-pub use thread::{ScriptThread, ThreadCounts, ThreadNews};
+pub use thread::ScriptThread;
 
 impl Live {
     /// Runs scripts on the open channels of a device, which have to be in normal mode to send. Times are those of the device's stamps; the

@@ -15,66 +15,19 @@ use cantap::wire::message::{MAX_SEND, Refusal, TxFrame};
 use cantap::{Device, DeviceError, TraceEvent, TraceRecord};
 use cantap_can::{CHANNELS, Channel, Frame};
 
+use super::events::{ScriptCounts, ScriptEvent};
 use super::run::LiveRun;
 use super::settings::{Live, LiveError};
-use super::thread_port::{Owner, Shared, TAGS, ThreadPort, Wish};
+use super::thread_port::{Owner, Request, Shared, TAGS, ThreadPort};
 use crate::node::{Script, ScriptError};
-use crate::report::{Message, TestResult};
 
 /// Records that may wait for slow scripts; of more, they see a gap.
 const MOST_RECORDS: usize = 200_000;
 /// The longest wait of the scripts' thread.
 const LOOK_EVERY: Duration = Duration::from_millis(200);
 
-/// What scripts have done since.
-#[derive(Debug)]
-pub enum ThreadNews {
-    /// A script has logged a line.
-    Message(Message),
-    /// A script is in this test now.
-    TestBegan {
-        /// The script's place.
-        place: usize,
-        /// The test's function.
-        name: String,
-    },
-    /// A test has ended.
-    Test(TestResult),
-    /// A script has ended.
-    Ended {
-        /// Its place.
-        place: usize,
-        /// The error, if there was one.
-        error: Option<String>,
-    },
-    /// The device refuses what a script wants, which has ended it.
-    Refused {
-        /// Its place.
-        place: usize,
-        /// The refusal.
-        error: DeviceError,
-    },
-    /// What all of them have sent and received so far.
-    Counts(ThreadCounts),
-}
-
-/// What scripts have sent and received.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct ThreadCounts {
-    /// Frames of scripts that were on the bus.
-    pub sent: u64,
-    /// Frames of others, and of the other scripts.
-    pub received: u64,
-    /// Frames of scripts that wait to be sent.
-    pub waiting: u64,
-    /// Frames that are not sent: there was no room.
-    pub not_sent: u64,
-    /// Frames that scripts have not seen, at least.
-    pub lost: u64,
-}
-
 /// What the owner hands to the scripts' thread.
-enum Passed {
+enum ToScripts {
     Add(Script, Arc<AtomicBool>),
     End(usize),
     Key(char),
@@ -91,8 +44,8 @@ struct Waiting {
 
 /// Scripts in a thread of their own. Its end is the end of all of them.
 pub struct ScriptThread {
-    to: Option<Sender<Passed>>,
-    wishes: Receiver<Wish>,
+    to: Option<Sender<ToScripts>>,
+    requests: Receiver<Request>,
     thread: Option<JoinHandle<()>>,
     shared: Arc<Shared>,
     confirmations: Receiver<Transmission>,
@@ -111,15 +64,15 @@ impl ScriptThread {
     /// If the system gives no thread.
     pub fn start(live: &Live, device: &Device) -> Result<Self, ScriptError> {
         let (to, passed) = channel();
-        let (wish, wishes) = channel();
+        let (request, requests) = channel();
         let shared = Arc::<Shared>::default();
         let (live, hello, both) = (live.clone(), device.hello().clone(), Arc::clone(&shared));
         let body = move || {
-            let port = ThreadPort::new(wish.clone(), Arc::clone(&both));
+            let port = ThreadPort::new(request.clone(), Arc::clone(&both));
             let mut run = live.start_through(Box::new(port), &hello);
-            if let Err(error) = serve(&mut run, &passed, &wish, &both) {
+            if let Err(error) = serve(&mut run, &passed, &request, &both) {
                 // If nobody waits for it, the scripts were ended from outside.
-                let _ = wish.send(Wish::Broken(error));
+                let _ = request.send(Request::Broken(error));
             }
         };
         let thread = std::thread::Builder::new().name("cantap-scripts".to_owned()).spawn(body);
@@ -127,7 +80,7 @@ impl ScriptThread {
             .map_err(|error| ScriptError::Thread { name: "scripts".to_owned(), reason: error.to_string() })?;
         Ok(Self {
             to: Some(to),
-            wishes,
+            requests,
             thread: Some(thread),
             shared,
             confirmations: device.transmissions(),
@@ -141,12 +94,12 @@ impl ScriptThread {
     /// One more script, from now on; returns its place.
     ///
     /// # Errors
-    /// If it is not in the language; what goes wrong later is in the news.
+    /// If it is not in the language; what goes wrong later is in the events.
     pub fn add(&mut self, script: Script) -> Result<usize, ScriptError> {
         script.tests()?;
         let stop = Arc::<AtomicBool>::default();
         self.stops.push(Arc::clone(&stop));
-        self.pass(Passed::Add(script, stop));
+        self.pass(ToScripts::Add(script, stop));
         Ok(self.stops.len() - 1)
     }
 
@@ -161,12 +114,12 @@ impl ScriptThread {
             waiting.retain(|waiting| waiting.of != place);
             self.shared.waiting.fetch_sub(before - waiting.len(), Ordering::Relaxed);
         }
-        self.pass(Passed::End(place));
+        self.pass(ToScripts::End(place));
     }
 
     /// The user has typed a key for the scripts.
     pub fn key(&self, key: char) {
-        self.pass(Passed::Key(key));
+        self.pass(ToScripts::Key(key));
     }
 
     /// Takes a periodic entry of the device for its owner; false if a script has it.
@@ -187,7 +140,7 @@ impl ScriptThread {
             // A script waits for no others.
             if TAGS.contains(&transmission.tag) || self.has_room_for(1) {
                 self.shared.backlog.fetch_add(1, Ordering::Relaxed);
-                self.pass(Passed::Transmission(transmission));
+                self.pass(ToScripts::Transmission(transmission));
             }
         }
         let of_device = |record: &&TraceRecord| Channel::from_number(record.channel).is_some();
@@ -208,58 +161,58 @@ impl ScriptThread {
             batch.insert(0, TraceRecord { time_ns, channel: channel.number(), event });
         }
         self.shared.backlog.fetch_add(batch.len(), Ordering::Relaxed);
-        self.pass(Passed::Records(batch));
+        self.pass(ToScripts::Records(batch));
     }
 
     fn has_room_for(&self, count: usize) -> bool {
         self.shared.backlog.load(Ordering::Relaxed) + count <= MOST_RECORDS
     }
 
-    /// Does what the scripts want of the device, and adds what they have done to `news`.
+    /// Does what the scripts want of the device, and adds what they have done to `events`.
     ///
     /// # Errors
     /// If the device is gone: the scripts cannot go on.
-    pub fn serve(&mut self, device: &Device, news: &mut Vec<ThreadNews>) -> Result<(), LiveError> {
-        while let Ok(wish) = self.wishes.try_recv() {
-            match wish {
-                Wish::Send { of, .. } if self.ended.contains(&of) => {
+    pub fn serve(&mut self, device: &Device, events: &mut Vec<ScriptEvent>) -> Result<(), LiveError> {
+        while let Ok(request) = self.requests.try_recv() {
+            match request {
+                Request::Send { of, .. } if self.ended.contains(&of) => {
                     self.shared.waiting.fetch_sub(1, Ordering::Relaxed);
                 }
-                Wish::Send { of, tag, channel, frame } => {
+                Request::Send { of, tag, channel, frame } => {
                     self.waiting[channel.index()].push_back(Waiting { of, tag, frame });
                 }
-                Wish::Periodic { of, channel, slot, entry } => {
+                Request::Periodic { of, channel, slot, entry } => {
                     let entry = entry.filter(|_| !self.ended.contains(&of));
                     let is_over = entry.is_none();
                     match device.set_periodic(channel, slot, entry) {
-                        Err(error @ DeviceError::Refused { .. }) => self.refuse(of, error, news),
+                        Err(error @ DeviceError::Refused { .. }) => self.refuse(of, error, events),
                         result => result?,
                     }
                     if is_over {
                         self.shared.release(channel, slot, Owner::Scripts);
                     }
                 }
-                Wish::News(ThreadNews::Ended { place, .. }) if self.ended.contains(&place) => {}
-                Wish::News(one) => {
-                    if let ThreadNews::Ended { place, .. } = one {
+                Request::Event(ScriptEvent::Ended { place, .. }) if self.ended.contains(&place) => {}
+                Request::Event(one) => {
+                    if let ScriptEvent::Ended { place, .. } = one {
                         self.ended.insert(place);
                     }
-                    news.push(one);
+                    events.push(one);
                 }
-                Wish::Broken(error) => return Err(error),
+                Request::Broken(error) => return Err(error),
             }
         }
         for channel in Channel::ALL {
-            self.hand_over(device, channel, news)?;
+            self.hand_over(device, channel, events)?;
         }
         Ok(())
     }
 
     /// The device refuses what a script wants: the others go on.
-    fn refuse(&mut self, of: usize, error: DeviceError, news: &mut Vec<ThreadNews>) {
+    fn refuse(&mut self, of: usize, error: DeviceError, events: &mut Vec<ScriptEvent>) {
         if !self.ended.contains(&of) {
             self.end(of);
-            news.push(ThreadNews::Refused { place: of, error });
+            events.push(ScriptEvent::Refused { place: of, error });
         }
     }
 
@@ -269,7 +222,7 @@ impl ScriptThread {
     }
 
     /// Ends all scripts, and what the device repeats for them. Returns what they have done last.
-    pub fn finish(mut self, device: Option<&Device>) -> Vec<ThreadNews> {
+    pub fn finish(mut self, device: Option<&Device>) -> Vec<ScriptEvent> {
         self.join();
         if let Some(device) = device {
             // If it does not answer, it is gone, and repeats nothing.
@@ -277,8 +230,8 @@ impl ScriptThread {
                 let _ = device.set_periodic(channel, slot, None);
             }
         }
-        let last = self.wishes.try_iter().filter_map(|wish| match wish {
-            Wish::News(news) => Some(news),
+        let last = self.requests.try_iter().filter_map(|request| match request {
+            Request::Event(event) => Some(event),
             _ => None,
         });
         last.collect()
@@ -289,7 +242,7 @@ impl ScriptThread {
         &mut self,
         device: &Device,
         channel: Channel,
-        news: &mut Vec<ThreadNews>,
+        events: &mut Vec<ScriptEvent>,
     ) -> Result<(), DeviceError> {
         let mut most = MAX_SEND;
         while most > 0 {
@@ -308,17 +261,17 @@ impl ScriptThread {
                 Err(DeviceError::Refused { refusal: Refusal::QueueFull { free }, .. }) => {
                     most = usize::from(free).min(frames.len() - 1);
                 }
-                Err(error @ DeviceError::Refused { .. }) => self.refuse(of, error, news),
+                Err(error @ DeviceError::Refused { .. }) => self.refuse(of, error, events),
                 Err(error) => return Err(error),
             }
         }
         Ok(())
     }
 
-    fn pass(&self, passed: Passed) {
-        // If the thread has ended, its wishes say why.
+    fn pass(&self, message: ToScripts) {
+        // If the thread has ended, its requests say why.
         if let Some(to) = &self.to {
-            let _ = to.send(passed);
+            let _ = to.send(message);
         }
     }
 
@@ -341,25 +294,25 @@ impl Drop for ScriptThread {
 #[derive(Default)]
 struct Known {
     test: Option<String>,
-    is_told: bool,
+    is_reported: bool,
 }
 
 /// The thread: turn after turn, until the owner is gone.
 fn serve(
     run: &mut LiveRun<'_>,
-    passed: &Receiver<Passed>,
-    wishes: &Sender<Wish>,
+    passed: &Receiver<ToScripts>,
+    requests: &Sender<Request>,
     shared: &Shared,
 ) -> Result<(), LiveError> {
     let mut known: Vec<Known> = Vec::new();
     let mut tests = 0;
-    let mut counts = ThreadCounts::default();
-    let tell = |news| wishes.send(Wish::News(news)).map_err(|_| LiveError::Over);
+    let mut counts = ScriptCounts::default();
+    let report = |event| requests.send(Request::Event(event)).map_err(|_| LiveError::Over);
     loop {
         let wait = run.turn()?;
-        run.take_messages().into_iter().map(ThreadNews::Message).try_for_each(&tell)?;
+        run.take_messages().into_iter().map(ScriptEvent::Message).try_for_each(&report)?;
         let ended = &run.report().tests[tests..];
-        ended.iter().cloned().map(ThreadNews::Test).try_for_each(&tell)?;
+        ended.iter().cloned().map(ScriptEvent::Test).try_for_each(&report)?;
         tests = run.report().tests.len();
         for (place, script) in known.iter_mut().enumerate() {
             let test = run.test_of(place);
@@ -369,24 +322,24 @@ fn serve(
                     .test
                     .iter()
                     .cloned()
-                    .map(|name| ThreadNews::TestBegan { place, name })
-                    .try_for_each(&tell)?;
+                    .map(|name| ScriptEvent::TestBegan { place, name })
+                    .try_for_each(&report)?;
             }
-            if run.has_ended(place) && !std::mem::replace(&mut script.is_told, true) {
-                tell(ThreadNews::Ended { place, error: run.error_of(place).map(str::to_owned) })?;
+            if run.has_ended(place) && !std::mem::replace(&mut script.is_reported, true) {
+                report(ScriptEvent::Ended { place, error: run.error_of(place).map(str::to_owned) })?;
             }
         }
-        let report = run.report();
-        let now = ThreadCounts {
-            sent: report.frames_sent,
-            received: report.frames_received,
+        let so_far = run.report();
+        let now = ScriptCounts {
+            sent: so_far.frames_sent,
+            received: so_far.frames_received,
             waiting: run.waiting() as u64,
-            not_sent: report.frames_not_sent,
-            lost: report.frames_lost,
+            not_sent: so_far.frames_not_sent,
+            lost: so_far.frames_lost,
         };
         if counts != now {
             counts = now;
-            tell(ThreadNews::Counts(now))?;
+            report(ScriptEvent::Counts(now))?;
         }
         let mut next = match passed.recv_timeout(wait.min(LOOK_EVERY)) {
             Ok(next) => Some(next),
@@ -394,19 +347,19 @@ fn serve(
             Err(RecvTimeoutError::Disconnected) => return Ok(()),
         };
         while let Some(one) = next {
-            let is_batch = matches!(one, Passed::Records(_));
+            let is_batch = matches!(one, ToScripts::Records(_));
             match one {
-                Passed::Add(script, stop) => {
+                ToScripts::Add(script, stop) => {
                     run.add_until(&script, stop)?;
                     known.push(Known::default());
                 }
-                Passed::End(place) => run.end(place)?,
-                Passed::Key(key) => run.key(key)?,
-                Passed::Transmission(transmission) => {
+                ToScripts::End(place) => run.end(place)?,
+                ToScripts::Key(key) => run.key(key)?,
+                ToScripts::Transmission(transmission) => {
                     shared.backlog.fetch_sub(1, Ordering::Relaxed);
                     run.take_transmission(transmission);
                 }
-                Passed::Records(batch) => {
+                ToScripts::Records(batch) => {
                     shared.backlog.fetch_sub(batch.len(), Ordering::Relaxed);
                     batch.into_iter().try_for_each(|record| run.take_record(record).map(drop))?;
                 }

@@ -10,9 +10,9 @@ use cantap::device::Transmission;
 use cantap::wire::message::Periodic;
 use cantap_can::{Channel, DEVICE_TAG, Frame};
 
+use super::events::ScriptEvent;
 use super::port::Port;
 use super::settings::LiveError;
-use super::thread::ThreadNews;
 
 /// Frames that may wait for room in the device's queue. A script has no more than 4096; what is repeated from here comes on top.
 const MOST_WAITING: usize = 8192;
@@ -20,10 +20,10 @@ const MOST_WAITING: usize = 8192;
 pub(super) const TAGS: std::ops::Range<u32> = 1..1 << 24;
 
 /// What the scripts' thread hands to the owner of the device.
-pub(super) enum Wish {
+pub(super) enum Request {
     Send { of: usize, tag: u32, channel: Channel, frame: Frame },
     Periodic { of: usize, channel: Channel, slot: u8, entry: Option<Periodic> },
-    News(ThreadNews),
+    Event(ScriptEvent),
     Broken(LiveError),
 }
 
@@ -76,18 +76,18 @@ impl Shared {
 
 /// The scripts' side.
 pub(super) struct ThreadPort {
-    wishes: Sender<Wish>,
+    requests: Sender<Request>,
     shared: Arc<Shared>,
     next_tag: u32,
 }
 
 impl ThreadPort {
-    pub(super) fn new(wishes: Sender<Wish>, shared: Arc<Shared>) -> Self {
-        Self { wishes, shared, next_tag: TAGS.start }
+    pub(super) fn new(requests: Sender<Request>, shared: Arc<Shared>) -> Self {
+        Self { requests, shared, next_tag: TAGS.start }
     }
 
-    fn wish(&self, wish: Wish) -> Result<(), LiveError> {
-        self.wishes.send(wish).map_err(|_| LiveError::Over)
+    fn request(&self, request: Request) -> Result<(), LiveError> {
+        self.requests.send(request).map_err(|_| LiveError::Over)
     }
 }
 
@@ -99,7 +99,7 @@ impl Port for ThreadPort {
         let tag = self.next_tag;
         self.next_tag = if tag + 1 == TAGS.end { TAGS.start } else { tag + 1 };
         self.shared.waiting.fetch_add(1, Ordering::Relaxed);
-        self.wish(Wish::Send { of, tag, channel, frame })?;
+        self.request(Request::Send { of, tag, channel, frame })?;
         Ok(Some(tag))
     }
 
@@ -129,7 +129,7 @@ impl Port for ThreadPort {
         slot: u8,
         entry: Option<Periodic>,
     ) -> Result<(), LiveError> {
-        self.wish(Wish::Periodic { of, channel, slot, entry })
+        self.request(Request::Periodic { of, channel, slot, entry })
     }
 
     fn finish(&mut self, _: Duration) -> Result<(), LiveError> {

@@ -5,7 +5,7 @@ use std::time::Duration;
 use cantap::device::Records;
 use cantap::wire::message::{Periodic, TxFrame};
 use cantap::{Channel, Device, TraceEvent, TraceRecord};
-use cantap_scripts::{Live, Script, ScriptThread, ThreadNews};
+use cantap_scripts::{Live, Script, ScriptEvent, ScriptThread};
 
 use super::{decoder, script};
 
@@ -15,7 +15,7 @@ struct Owner {
     records: Records,
     thread: ScriptThread,
     trace: Vec<TraceRecord>,
-    news: Vec<ThreadNews>,
+    events: Vec<ScriptEvent>,
 }
 
 impl Owner {
@@ -27,7 +27,7 @@ impl Owner {
         for (place, script) in scripts.iter().enumerate() {
             assert_eq!(thread.add(script.clone()).unwrap(), place);
         }
-        Self { records: device.records(), device, thread, trace: Vec::new(), news: Vec::new() }
+        Self { records: device.records(), device, thread, trace: Vec::new(), events: Vec::new() }
     }
 
     /// Until something is so, which has to come.
@@ -36,7 +36,7 @@ impl Owner {
             let batch = self.records.next_batch(Duration::from_millis(1)).unwrap().unwrap();
             self.thread.take(&batch);
             self.trace.extend(batch);
-            self.thread.serve(&self.device, &mut self.news).unwrap();
+            self.thread.serve(&self.device, &mut self.events).unwrap();
         }
     }
 
@@ -52,8 +52,9 @@ impl Owner {
     }
 
     fn logged(&self, text: &str) -> usize {
-        let is_it = |news: &&ThreadNews| matches!(news, ThreadNews::Message(message) if message.text == text);
-        self.news.iter().filter(is_it).count()
+        let is_it =
+            |events: &&ScriptEvent| matches!(events, ScriptEvent::Message(message) if message.text == text);
+        self.events.iter().filter(is_it).count()
     }
 
     /// Frames that the device sends in 50 ms by its own clock.
@@ -77,8 +78,9 @@ fn an_endless_loop_holds_nobody_up_and_ends_when_it_is_told_to() {
     owner.until(|owner| owner.count("123#41") == 1);
     owner.thread.end(0);
     owner.until(|owner| owner.count("124#41") == 1);
-    let errors = owner.news.iter().filter(|news| matches!(news, ThreadNews::Ended { error: Some(_), .. }));
-    assert_eq!(errors.count(), 0, "{:?}", owner.news);
+    let errors =
+        owner.events.iter().filter(|events| matches!(events, ScriptEvent::Ended { error: Some(_), .. }));
+    assert_eq!(errors.count(), 0, "{:?}", owner.events);
     assert!(!owner.thread.is_over());
     owner.thread.end(1);
     assert!(owner.thread.is_over());
@@ -114,7 +116,7 @@ fn a_script_that_is_ended_repeats_and_answers_nothing_any_more() {
         thread: ScriptThread::start(&Live { decoder: decoder(), seed: 1, duration: None }, &device).unwrap(),
         device,
         trace: Vec::new(),
-        news: Vec::new(),
+        events: Vec::new(),
     };
     assert_eq!(owner.sent_in_a_while(), 0);
 }
@@ -160,11 +162,11 @@ fn what_the_device_refuses_ends_the_script_that_wants_it_and_no_other() {
     let wrong = script("wrong", r#"every("1ms", || send(2, "100#"));"#);
     let right = script("right", r#"every("2ms", || send("101#"));"#);
     let mut owner = Owner::new("load=0", &[wrong, right]);
-    let is_refused = |news: &ThreadNews| matches!(news, ThreadNews::Refused { place: 0, .. });
-    owner.until(|owner| owner.news.iter().any(is_refused));
+    let is_refused = |events: &ScriptEvent| matches!(events, ScriptEvent::Refused { place: 0, .. });
+    owner.until(|owner| owner.events.iter().any(is_refused));
     let before = owner.count("101#");
     owner.until(|owner| owner.count("101#") > before + 5);
-    assert_eq!(owner.news.iter().filter(|news| is_refused(news)).count(), 1);
+    assert_eq!(owner.events.iter().filter(|events| is_refused(events)).count(), 1);
     assert!(owner.thread.add(script("bad", "let a = ;")).is_err());
 }
 
@@ -174,8 +176,8 @@ fn a_device_that_vanishes_is_an_error_for_the_owner() {
     let mut owner = Owner::new("load=0", &[node]);
     owner.until(|owner| owner.count("100#") > 3);
     let _ = owner.device.reset();
-    let mut news = Vec::new();
-    while owner.thread.serve(&owner.device, &mut news).is_ok() {
+    let mut events = Vec::new();
+    while owner.thread.serve(&owner.device, &mut events).is_ok() {
         let _ = owner.records.next_batch(Duration::from_millis(1));
     }
     // It ends all the same.

@@ -112,11 +112,10 @@ impl Scripts {
                 self.say(LineKind::Note, &format!("{script}: ok {name} ({milliseconds:.3} ms)"))
             }
             Outcome::Failed(reason) => {
-                self.say(
-                    LineKind::Fault,
-                    &format!("{script}: FAILED {name} ({milliseconds:.3} ms): {reason}"),
-                );
+                // The verdict below its frames is in sight.
                 trace.iter().for_each(|line| self.say(LineKind::Log, &format!("    {line}")));
+                let verdict = format!("{script}: FAILED {name} ({milliseconds:.3} ms): {reason}");
+                self.say(LineKind::Fault, &verdict);
             }
         }
     }

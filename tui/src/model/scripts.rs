@@ -105,7 +105,9 @@ impl Scripts {
         let has_passed = *outcome == Outcome::Passed;
         if let Some(row) = self.row(script) {
             *(if has_passed { &mut row.passed } else { &mut row.failed }) += 1;
-            row.state = ScriptState::Running(None);
+            if matches!(row.state, ScriptState::Running(_)) {
+                row.state = ScriptState::Running(None);
+            }
         }
         match outcome {
             Outcome::Passed => {

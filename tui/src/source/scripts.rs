@@ -189,7 +189,10 @@ impl Source<'_> {
                         format!("{:.6} {}: {}", message.at_ns as f64 / 1e9, message.script, message.text);
                     scripts.say(LineKind::Log, &text);
                 }
-                ScriptEvent::TestBegan { place, name } if is_current(place) => {
+                // It may have been stopped meanwhile.
+                ScriptEvent::TestBegan { place, name }
+                    if is_current(place) && scripts.is_running(&names[place]) =>
+                {
                     scripts.set_state(&names[place], ScriptState::Running(Some(name)));
                 }
                 ScriptEvent::Test(test) => scripts.take_test(&test),

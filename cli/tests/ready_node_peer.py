@@ -215,7 +215,7 @@ def number(host, port, sheet):
         found, identity = network.lss.fast_scan()
         if found:
             break
-    said["found"], said["identity"] = found, list(identity)
+    said["found"], said["identity"] = found, list(identity or [])
     network.lss.RESPONSE_TIMEOUT = 10.0
     said["inquired"] = network.lss.inquire_node_id()
     network.lss.configure_node_id(12)

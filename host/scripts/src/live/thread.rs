@@ -3,7 +3,7 @@
 //! The owner passes on what the device says, and does what the scripts want when it likes. Everything that is sent goes through it, so that
 //! nothing more comes from a script once it is ended, and so that both never have the same tag or periodic entry.
 
-use std::collections::{BTreeSet, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
@@ -11,7 +11,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use cantap::device::Transmission;
-use cantap::wire::message::{MAX_SEND, Refusal, TxFrame};
+use cantap::wire::message::{MAX_SEND, Periodic, Refusal, TxFrame};
 use cantap::{Device, DeviceError, TraceEvent, TraceRecord};
 use cantap_can::{CHANNELS, Channel, Frame};
 
@@ -53,6 +53,8 @@ pub struct ScriptThread {
     stops: Vec<Arc<AtomicBool>>,
     ended: BTreeSet<usize>,
     waiting: [VecDeque<Waiting>; CHANNELS],
+    /// Whose each of the device's periodic entries is, by channel and slot.
+    entries: BTreeMap<(usize, u8), usize>,
     /// Records for which there was no room, by channel.
     missed: [u32; CHANNELS],
 }
@@ -87,6 +89,7 @@ impl ScriptThread {
             stops: Vec::new(),
             ended: BTreeSet::new(),
             waiting: Default::default(),
+            entries: BTreeMap::new(),
             missed: [0; CHANNELS],
         })
     }
@@ -182,15 +185,7 @@ impl ScriptThread {
                     self.waiting[channel.index()].push_back(Waiting { of, tag, frame });
                 }
                 Request::Periodic { of, channel, slot, entry } => {
-                    let entry = entry.filter(|_| !self.ended.contains(&of));
-                    let is_over = entry.is_none();
-                    match device.set_periodic(channel, slot, entry) {
-                        Err(error @ DeviceError::Refused { .. }) => self.refuse(of, error, events),
-                        result => result?,
-                    }
-                    if is_over {
-                        self.shared.release(channel, slot, Owner::Scripts);
-                    }
+                    self.set_periodic(device, of, (channel, slot), entry, events)?;
                 }
                 Request::Event(ScriptEvent::Ended { place, .. }) if self.ended.contains(&place) => {}
                 Request::Event(one) => {
@@ -204,6 +199,54 @@ impl ScriptThread {
         }
         for channel in Channel::ALL {
             self.hand_over(device, channel, events)?;
+        }
+        self.withdraw(device)
+    }
+
+    fn set_periodic(
+        &mut self,
+        device: &Device,
+        of: usize,
+        (channel, slot): (Channel, u8),
+        entry: Option<Periodic>,
+        events: &mut Vec<ScriptEvent>,
+    ) -> Result<(), LiveError> {
+        let key = (channel.index(), slot);
+        if self.ended.contains(&of) {
+            // Another may have the entry by now.
+            if !self.entries.contains_key(&key) && entry.is_some() {
+                self.shared.release(channel, slot, Owner::Scripts);
+            }
+            return Ok(());
+        }
+        match &entry {
+            Some(_) => _ = self.entries.insert(key, of),
+            None => _ = self.entries.remove(&key),
+        }
+        let is_over = entry.is_none();
+        match device.set_periodic(channel, slot, entry) {
+            Err(error @ DeviceError::Refused { .. }) => self.refuse(of, error, events),
+            result => result?,
+        }
+        if is_over {
+            self.shared.release(channel, slot, Owner::Scripts);
+        }
+        Ok(())
+    }
+
+    /// The device repeats nothing any more for scripts that have ended.
+    fn withdraw(&mut self, device: &Device) -> Result<(), LiveError> {
+        let of_ended = self.entries.iter().filter(|(_, of)| self.ended.contains(of));
+        let of_ended: Vec<(usize, u8)> = of_ended.map(|(key, _)| *key).collect();
+        for key in of_ended {
+            let channel = Channel::ALL[key.0];
+            match device.set_periodic(channel, key.1, None) {
+                // It never had it.
+                Ok(()) | Err(DeviceError::Refused { .. }) => {}
+                Err(error) => return Err(error.into()),
+            }
+            self.entries.remove(&key);
+            self.shared.release(channel, key.1, Owner::Scripts);
         }
         Ok(())
     }
